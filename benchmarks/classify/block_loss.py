@@ -21,9 +21,10 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.sysid.effusivity import calibration, calibration_prior
+from thermogrip.sysid.effusivity import calibration
 from thermogrip.sysid.effusivity.calibration import linearise
 from thermogrip.sysid.effusivity.data import whiten
+from thermogrip.sysid.effusivity.gripper_model import NOTHING
 from thermogrip.sysid.effusivity.laplace_approximation import LEVEL, ONSET, T_OBJECT
 from thermogrip.sysid.effusivity.posterior import material_evidence
 
@@ -117,10 +118,10 @@ class Bordered:
 
 def main():
     with_loss = fitted()
-    wide = calibration_prior.STACK["ln_g_far"]
-    calibration_prior.STACK["ln_g_far"] = (np.log(calibration_prior.NOTHING), 1e-3)
+    wide = calibration._WIDE["ln_g_far"]
+    calibration._WIDE["ln_g_far"] = (np.log(NOTHING), 1e-3)
     without = fitted()
-    calibration_prior.STACK["ln_g_far"] = wide
+    calibration._WIDE["ln_g_far"] = wide
     device, bare = with_loss[0], without[0]
     at = device.uncertainty.names.index("ln_g_far")
     sd = np.sqrt(device.uncertainty.covariance[at, at])

@@ -31,10 +31,16 @@ from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.effusivity.calibration import calibrate_example_gripper
 from thermogrip.sysid.effusivity.data import touches
 from thermogrip.sysid.effusivity.gripper_model import GripperModel, load_default_gripper
-from thermogrip.sysid.effusivity.laplace_approximation import BUILD, CAPACITY, ONSET, H
+from thermogrip.sysid.effusivity.laplace_approximation import (
+    BUILD,
+    CAPACITY,
+    ONSET,
+    H,
+    free_hypotheses,
+    prior_of,
+)
 from thermogrip.sysid.effusivity.posterior import effusivity_posterior, material_posterior
 from thermogrip.sysid.effusivity.posterior_grid import LN_E_RANGE, MarginalPosterior, grid_posteriors
-from thermogrip.sysid.effusivity.priors import free_hypotheses, prior_of
 
 sys.path.insert(0, str(Path(__file__).parents[2]))  # the oracles of the tests
 from tests.oracles.emcee_posterior import emcee_posterior

@@ -18,8 +18,15 @@ from jax.scipy.special import gammaln
 from thermogrip.sysid.contact.response import stack_modes
 from thermogrip.sysid.effusivity.data import Touches, whiten
 from thermogrip.sysid.effusivity.gripper_model import GripperModel
-from thermogrip.sysid.effusivity.laplace_approximation import BUILD, LEVEL, ONSET, T_OBJECT, nodes_for
-from thermogrip.sysid.effusivity.priors import free_hypotheses, prior_of
+from thermogrip.sysid.effusivity.laplace_approximation import (
+    BUILD,
+    LEVEL,
+    ONSET,
+    T_OBJECT,
+    free_hypotheses,
+    nodes_for,
+    prior_of,
+)
 
 jax.config.update("jax_enable_x64", True)
 

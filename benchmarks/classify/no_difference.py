@@ -43,13 +43,16 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     ONSET,
     T_OBJECT,
     H,
+    Hypotheses,
+    fit_pairs,
     gripper_arguments,
     jacobian,
+    material_hypotheses,
     nodes_for,
+    prior_of,
 )
 from thermogrip.sysid.effusivity.mode_kernel import marginals
 from thermogrip.sysid.effusivity.posterior import material_evidence, material_fit
-from thermogrip.sysid.effusivity.priors import Hypotheses, fit_pairs, material_hypotheses, prior_of
 
 THREE, FIVE = ["copper", "iron", "wood"], ["brass", "copper", "iron", "wood", "zinc"]
 # object, gripper [degC], materials, contact time [s]: exp1 to exp4

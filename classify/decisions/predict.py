@@ -18,8 +18,8 @@ Why a grasp is out of distribution: how far its nuisances are from the training 
 ---------------------------------------------------------------------------------------------------
 
 Under a candidate every nuisance u_k of a grasp has a value that fits best, and training grasps have given
-its mean m_k and standard deviation s_k (:mod:`thermogrip.sysid.effusivity.priors`).  Its standardised
-deviation is
+its mean m_k and standard deviation s_k (:mod:`thermogrip.sysid.effusivity.laplace_approximation`).  Its
+standardised deviation is
 
     w_k = (u_k - m_k) / s_k,
 
@@ -56,8 +56,8 @@ if TYPE_CHECKING:
     from thermogrip.classify.decisions.stopping_rule import StopRule
     from thermogrip.classify.estimators.posterior import PosteriorClassifier
     from thermogrip.sysid.effusivity.gripper_model import GripperModel
+    from thermogrip.sysid.effusivity.laplace_approximation import Hypotheses
     from thermogrip.sysid.effusivity.posterior import EffusivityRow
-    from thermogrip.sysid.effusivity.priors import Hypotheses
 
 Row: TypeAlias = dict[str, Any]
 
@@ -231,7 +231,7 @@ def deviations(device: GripperModel, grasps: Grasps, materials: Sequence[str]) -
     """Return for each of n grasps how far its nuisances and its misfit are from the usual if it is of the
     material named for it, the farthest first."""
     from thermogrip.sysid.effusivity.data import touches
-    from thermogrip.sysid.effusivity.priors import fit_pairs, prior_of
+    from thermogrip.sysid.effusivity.laplace_approximation import fit_pairs, prior_of
 
     data, hypotheses = touches(grasps), _taken_for(device, materials)
     prior = prior_of(device, data, hypotheses)
@@ -259,8 +259,7 @@ def unexplained(
     ``stated`` is the range of unknown object temperatures [degC]; by default 20 K about the room.
     """
     from thermogrip.sysid.effusivity.data import object_range, touches, with_object_range
-    from thermogrip.sysid.effusivity.laplace_approximation import T_OBJECT
-    from thermogrip.sysid.effusivity.priors import fit_pairs
+    from thermogrip.sysid.effusivity.laplace_approximation import T_OBJECT, fit_pairs
 
     data, ends = touches(with_object_range(grasps, stated)), object_range(grasps, stated)
     known = np.isfinite(touches(grasps).t_object)
@@ -304,7 +303,7 @@ def unexplained_effusivities(
 
     ``stated`` is the range of unknown object temperatures [degC].
     """
-    from thermogrip.sysid.effusivity.priors import free_hypotheses
+    from thermogrip.sysid.effusivity.laplace_approximation import free_hypotheses
 
     alone = label_values(grasps, "touch_group") == ""
     ln_e = np.log([row.effusivity for row in rows])
@@ -379,7 +378,7 @@ def _explained(
 
 def _taken_for(device: GripperModel, named: Sequence[str], **finish: str) -> Hypotheses:
     """Return the hypothesis of each named material, a row each."""
-    from thermogrip.sysid.effusivity.priors import material_hypotheses
+    from thermogrip.sysid.effusivity.laplace_approximation import material_hypotheses
 
     names = list(dict.fromkeys(named))
     known = material_hypotheses(device, names, **finish)

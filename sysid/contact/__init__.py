@@ -6,14 +6,12 @@ from importlib import import_module
 from typing import Any
 
 _NAMES = {
-    "finite_bodies": [
-        "Impedance", "block_contact_flux", "block_skin_temperature", "half_space", "layer_on",
-        "layered_temperature", "slab", "slab_heat", "slab_temperature",
-        "slab_temperature_convective", "two_body_flux", "two_body_temperatures",
-    ],
-    "half_spaces": [
-        "contact_flux", "contact_heat", "contact_temperature", "device_temperature",
-        "object_surface_temperature", "object_temperature", "sensor_temperature", "skin_temperature",
+    "closed_forms": [
+        "Impedance", "block_contact_flux", "block_skin_temperature", "contact_flux", "contact_heat",
+        "contact_temperature", "device_temperature", "half_space", "layer_on", "layered_temperature",
+        "object_surface_temperature", "object_temperature", "sensor_temperature", "skin_temperature", "slab",
+        "slab_heat", "slab_temperature", "slab_temperature_convective", "two_body_flux",
+        "two_body_temperatures",
     ],
     "response": ["Stack"],
     "simulation": ["Grip", "simulate_grasps"],

@@ -21,7 +21,7 @@ only:
 - **Contact**: h(t) = h [f0 + (1 - f0) (1 - exp(-t / tau_b))] [1 + c (1 - exp(-t / tau_c))], soft skin that
   meets the block and then settles.
 
-With h constant and one layer this is the closed form of :mod:`thermogrip.sysid.contact.half_spaces`, which
+With h constant and one layer this is the closed form of :mod:`thermogrip.sysid.contact.closed_forms`, which
 the tests use.
 """
 
@@ -34,9 +34,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import eigh
-
-__all__ = ["LAYER_NAMES", "Stack", "StackModes", "TimeNodes", "block_modes", "contact_numbers"]
-__all__ += ["far_response", "nearby_modes", "stack_modes", "step_response", "time_nodes"]
 
 Array = NDArray[np.float64]
 

@@ -30,8 +30,6 @@ from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import Grasps, make_grasps
 from thermogrip.sysid.contact.response import Stack, far_response, step_response, time_nodes
 
-__all__ = ["Blocks", "ContactModel", "Grip", "Touch", "record_touches", "simulate_grasps"]
-
 Array = NDArray[np.float64]
 
 #: A foam finger with a graphite sheet on a copper-filled silicone pipe, of the size of the example rig's.

@@ -64,12 +64,6 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BY_BUILD_UP", "BY_C", "BY_E", "BY_H", "FADED", "INNER", "N_CURVE", "N_MODE", "N_STEPPED"]
-__all__ += ["OUTER", "RATE", "VALUE", "Gripper", "Nodes", "Room", "binned_responses", "contacts", "delay"]
-__all__ += ["delayed_integrals", "fill_delayed", "fill_responses", "first_step", "gripper_of"]
-__all__ += ["gripper_responses", "mode_step", "mode_step_moves", "room_for", "slab", "slab_moves", "slabs"]
-__all__ += ["step_contact"]
-
 Array = NDArray[np.float64]
 
 # sums over modes may be reordered, so that they run in vector registers; infinities stay what they are

@@ -33,7 +33,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -43,12 +43,11 @@ from scipy.optimize import minimize
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.materials import Material, find_material
 from thermogrip.datasets.schema import Grasps, log_name
-from thermogrip.sysid.contact.response import Stack, TimeNodes
+from thermogrip.sysid.contact.response import TimeNodes
 from thermogrip.sysid.effusivity.data import Noise, Touches, noise_fit, stack_touches, touches, whiten
 from thermogrip.sysid.effusivity.gripper_model import (
     INSULATOR,
     LEVEL_SD,
-    NOTHING,
     SHARED_NAMES,
     UNKNOWN_OBJECT_SD,
     Block,
@@ -56,6 +55,8 @@ from thermogrip.sysid.effusivity.gripper_model import (
     ParameterCovariance,
     Spreads,
     block_names,
+    stack_numbers,
+    stack_of,
 )
 from thermogrip.sysid.effusivity.laplace_approximation import (
     BUILD_UP,
@@ -71,14 +72,10 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     predict,
 )
 
-__all__ = ["FIRST_SPREAD", "FLOORS", "SHARED", "STACK", "Anchor", "Linearised", "Problem", "Spread"]
-__all__ += ["ThetaPrior", "anchors", "calibrate_example_gripper", "calibrate_gripper", "joint_step"]
-__all__ += ["linearise", "prior_of_gripper", "renew_spread", "wide_prior"]
-
 Array = NDArray[np.float64]
 
-# name: prior mean and sd; all wide, in the units of the name
-STACK: dict[str, tuple[float, float]] = {
+# of SHARED_NAMES: prior mean and sd; all wide, in the units of the name
+_WIDE: dict[str, tuple[float, float]] = {
     "ln_e_outer": (float(np.log(2e3)), 1.0),
     "ln_z_outer": (float(np.log(0.1)), 1.0),
     "ln_e_inner": (float(np.log(2.5e3)), 1.0),
@@ -92,8 +89,6 @@ STACK: dict[str, tuple[float, float]] = {
     "ln_g_side": (float(np.log(100.0)), 1.5),
     "ln_c_side": (float(np.log(2e4)), 1.0),
     "ln_g_far": (float(np.log(20.0)), 1.5),
-}
-SHARED: dict[str, tuple[float, float]] = {
     "ln_build_up": (float(np.log(0.5)), 1.0),
     "onset": (0.0, 0.3),
     "transit_loss": (0.02, 0.03),
@@ -151,7 +146,7 @@ def anchors(
 
 def wide_prior(known: Sequence[Anchor]) -> ThetaPrior:
     """Return the prior of a gripper that nobody has seen, with blocks of these effusivities."""
-    table = [*STACK.values(), *SHARED.values(), *[_LN_H] * len(known)]
+    table = [*_WIDE.values(), *[_LN_H] * len(known)]
     table += [(float(np.log(row.effusivity)), row.sd_ln) for row in known]
     mean, sd = np.array(table).T
     return ThetaPrior(mean, np.diag(sd**-2.0), dict(FIRST_SPREAD))
@@ -179,18 +174,8 @@ def prior_of_gripper(gripper: GripperModel, labels: Sequence[str], known: Sequen
 def gripper_theta(gripper: GripperModel, labels: Sequence[str], otherwise: Array) -> Array:
     """Return theta of a calibration, (n_theta,); ``otherwise`` where it has no block of a label."""
     theta = otherwise.copy()
-    stack = {f.name: float(getattr(gripper.stack, f.name)) for f in fields(Stack)}
-    for i, name in enumerate(STACK):
-        value = stack[name.removeprefix("ln_")]
-        theta[i] = np.log(max(value, NOTHING)) if name.startswith("ln_") else value
-    shared = (
-        np.log(stack["build_up"]),
-        gripper.onset,
-        gripper.transit_loss,
-        gripper.bias,
-        np.log(gripper.depth_share),
-    )
-    theta[len(STACK) : len(STACK) + len(SHARED)] = shared
+    shared = gripper.onset, gripper.transit_loss, gripper.bias, np.log(gripper.depth_share)
+    theta[: len(SHARED_NAMES)] = [*stack_numbers(gripper.stack), *shared]
     n = len(labels)
     for k, label in enumerate(labels):
         if label in gripper.blocks:
@@ -209,7 +194,6 @@ _COLUMN = {
     "t_object": T_OBJECT,
     "ln_effusivity": EFFUSIVITY,
 }
-_DIFFERENCE = {"leak": 1e-5}
 _LONGEST = 1.5  # of a step of theta, mostly logarithms
 
 
@@ -228,18 +212,6 @@ class Problem:
     which: NDArray[np.int64]
     prior: ThetaPrior
     ln_capacity: Array
-
-    @classmethod
-    def of(
-        cls, data: Touches, known: Mapping[str, Anchor], prior: ThetaPrior, block_length: float
-    ) -> Problem:
-        """Return the problem of these touches; ``known`` has a row for each label of theta, in its order."""
-        labels = tuple(known)
-        return cls(
-            data, nodes_for(data), labels, tuple(known.values()),
-            np.array([labels.index(m) for m in data.material.tolist()]), prior,
-            np.log([row.heat_capacity * block_length for row in known.values()]),
-        )  # fmt: skip
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -263,10 +235,6 @@ class Problem:
         guesses = self.prior.guesses
         return max(guesses, float(self.rows(spread).sum()) - means.get(spread, 1) + guesses)
 
-    def index(self, name: str) -> int:
-        """Return the place of a shared parameter in theta."""
-        return [*STACK, *SHARED].index(name)
-
     def ln_h(self, theta: Array) -> Array:
         """Return ln h of each label, a view into theta."""
         n = len(self.labels)
@@ -276,21 +244,13 @@ class Problem:
         """Return ln e of each label, a view into theta."""
         return theta[-len(self.labels) :]
 
-    def stack(self, theta: Array) -> Stack:
-        """Return the gripper that theta describes."""
-        value = dict(zip([*STACK, *SHARED], theta))
-        names = [*STACK, "ln_build_up"]
-        return Stack(
-            **{k.removeprefix("ln_"): float(np.exp(value[k]) if "ln_" in k else value[k]) for k in names}
-        )
-
     def room_difference(self) -> Array:
         """Return room minus object temperature where both are known, else 0, (n,)."""
         return np.nan_to_num(self.data.t_ambient - self.data.t_object)
 
     def centre(self, theta: Array) -> Array:
         """Return the prior mean of u, (n, 7)."""
-        value = dict(zip([*STACK, *SHARED], theta))
+        value = dict(zip(SHARED_NAMES, theta))
         u = np.empty((self.which.size, N_NUISANCE))
         u[:, H] = self.ln_h(theta)[self.which]
         u[:, BUILD_UP], u[:, ONSET], u[:, LEVEL] = value["ln_build_up"], value["onset"], self.data.level
@@ -325,14 +285,14 @@ def linearise(problem: Problem, theta: Array, w: Array, spread: Spread) -> Linea
     """Return the prediction of every grasp and its derivatives."""
     data, nodes, scale = problem.data, problem.nodes, problem.scales(spread)
     u = problem.centre(theta) + scale * w
-    y, by_u = jacobian(problem.stack(theta), nodes, data, u, np.ones(u.shape, dtype=bool))
+    y, by_u = jacobian(stack_of(theta), nodes, data, u, np.ones(u.shape, dtype=bool))
     k = np.zeros((*y.shape, theta.size))
-    for i, name in enumerate(STACK):
+    for i, name in enumerate(SHARED_NAMES[: SHARED_NAMES.index("ln_build_up")]):
         moved = theta.copy()
-        moved[i] += _DIFFERENCE.get(name, 1e-4)
+        moved[i] += 1e-5 if name == "leak" else 1e-4
         if name == "ln_first" and moved[i] > 0:  # a share is 1 at most: the difference is taken inwards
             moved[i] = theta[i] - 1e-4
-        k[:, :, i] = (predict(problem.stack(moved), nodes, data, u) - y) / (moved[i] - theta[i])
+        k[:, :, i] = (predict(stack_of(moved), nodes, data, u) - y) / (moved[i] - theta[i])
     shared = {
         "ln_build_up": by_u[:, :, BUILD_UP],
         "onset": by_u[:, :, ONSET],
@@ -341,7 +301,7 @@ def linearise(problem: Problem, theta: Array, w: Array, spread: Spread) -> Linea
         "ln_depth": by_u[:, :, CAPACITY],
     }
     for name, values in shared.items():
-        k[:, :, problem.index(name)] = values
+        k[:, :, SHARED_NAMES.index(name)] = values
     n = len(problem.labels)
     for m in range(n):
         own = problem.which == m
@@ -425,7 +385,7 @@ def renew_spread(problem: Problem, spread: Spread, w: Array, variance: Array) ->
 
 def _objective(problem: Problem, theta: Array, w: Array, spread: Spread, whitener: Array) -> float:
     try:
-        stack = problem.stack(theta)
+        stack = stack_of(theta)
     except ValueError:
         return np.inf  # outside the physical range: the step is refused and shortened
     u = problem.centre(theta) + problem.scales(spread) * w
@@ -505,14 +465,17 @@ def calibrate_gripper(
         spread = {k: float(getattr(earlier.spreads, k)) for k in spread}
         noise = earlier.noise
     w = np.zeros((data.y.shape[0], 7))
-    rounds = _ROUNDS if earlier is None else 1
+    rounds, report = _ROUNDS if earlier is None else 1, progress or (lambda fraction, what: None)
     for i in range(rounds):
-        last, w, spread = _fit(problem, theta, w, spread, noise, _reporter(progress, i, rounds))
+
+        def report_round(fraction: float, what: str, i: int = i) -> None:
+            report((i + fraction) / rounds, what)
+
+        last, w, spread = _fit(problem, theta, w, spread, noise, report_round)
         theta = last.theta
         if i < rounds - 1:
             noise = _fit_noise(problem, linearise(problem, theta, w, spread), w, noise)
-    if progress is not None:
-        progress(1.0, "calibrated")
+    report(1.0, "calibrated")
     names = (*(() if prior is None else prior.trained_on), *(log_name(g) for g in grasps))
     return _gripper_model(problem, last, spread, noise, length, names, prior)
 
@@ -536,7 +499,11 @@ def _problem(
     theta = wide_prior([*known.values()])
     if prior is not None:
         theta = prior_of_gripper(prior, labels, [*known.values()])
-    return Problem.of(data, known, theta, block_length)
+    return Problem(
+        data, nodes_for(data), tuple(labels), tuple(known.values()),
+        np.array([labels.index(m) for m in data.material.tolist()]), theta,
+        np.log([row.heat_capacity * block_length for row in known.values()]),
+    )  # fmt: skip
 
 
 def _labelled(grasps: Sequence[Grasps], materials: Mapping[str, Material], least: int) -> Touches:
@@ -578,14 +545,6 @@ def _check_labels(part: Touches, materials: Mapping[str, Material], file: str) -
             problem = f"grasp {first!r} is of {label!r}, which the materials table has not"
             hint = f"{error.hint} (every classifier but posterior takes any name)"
             raise UserError(problem, file=file, column="material", hint=hint) from error
-
-
-def _reporter(progress: Progress | None, i: int, rounds: int) -> Progress:
-    def report(fraction: float, what: str) -> None:
-        if progress is not None:
-            progress((i + fraction) / rounds, what)
-
-    return report
 
 
 def _fit(
@@ -658,9 +617,7 @@ def _gripper_model(
     prior: GripperModel | None,
 ) -> GripperModel:  # fmt: skip
     theta = step.theta
-    shared = {
-        name: float(theta[problem.index(name)]) for name in ("onset", "transit_loss", "bias", "ln_depth")
-    }
+    shared = dict(zip(SHARED_NAMES, theta.tolist()))
     n = len(problem.labels)
     # given the gripper: the scale that all blocks share is no news about one of them
     own = np.sqrt(np.diag(np.linalg.inv(step.precision[-2 * n :, -2 * n :])))
@@ -680,8 +637,9 @@ def _gripper_model(
         for k, (label, row) in enumerate(zip(problem.labels, problem.library))
     }
     slope, level, left = _ln_h_line(blocks)
+    covariance, names_of_theta = np.linalg.inv(step.precision), (*SHARED_NAMES, *block_names(problem.labels))
     return GripperModel(
-        stack=problem.stack(theta),
+        stack=stack_of(theta),
         noise=noise,
         spreads=Spreads(
             **spread, ln_h_of_blocks=left, dof=problem.dof("ln_h"), insulator_dof=problem.dof("ln_effusivity")
@@ -695,15 +653,9 @@ def _gripper_model(
         ln_h_slope=slope,
         blocks=blocks,
         trained_on=names,
-        uncertainty=_uncertainty(problem, step),
+        uncertainty=ParameterCovariance(names_of_theta, 0.5 * (covariance + covariance.T)),
         uncertain=prior is not None and prior.uncertain,
     )
-
-
-def _uncertainty(problem: Problem, step: Step) -> ParameterCovariance:
-    covariance = np.linalg.inv(step.precision)
-    names = (*SHARED_NAMES, *block_names(problem.labels))
-    return ParameterCovariance(names, 0.5 * (covariance + covariance.T))
 
 
 def _ln_h_line(blocks: Mapping[str, Block]) -> tuple[float, float, float]:

@@ -28,9 +28,6 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, check_grasps, log_name
 from thermogrip.sysid.effusivity.quality import check_grasps as check_quality
 
-__all__ = ["UNKNOWN_OBJECT_RANGE", "Noise", "Touches", "noise_covariance", "noise_fit", "object_range"]
-__all__ += ["stack_touches", "touches", "whiten", "with_object_range"]
-
 Array = NDArray[np.float64]
 
 _PUMP_OFF = -1.0  # s: the pump stops about a second before contact

@@ -24,7 +24,7 @@ a finger is made, not learnt from any gripper's grasps:
   conducts by what binder and pressure leave, 30 %; its heat capacity is that of carbon, 10 %;
 - a layer of filled silicone is cast by hand: thickness 25 %; conductivity by filler and settling, 25 %; heat
   capacity by mixing, 10 %;
-- glue lines differ by half: conductance to the pipe's wall and to what stands beside it, 0.5 in the
+- glue lines differ by half: conductance to the pipe's wall and to what is beside it, 0.5 in the
   logarithm, and the sensor's lag through its own bond, 0.5; the water in the pipe 30 %;
 - skin meets a block with another pressure: h of all blocks together 25 %, of each block by itself 10 % more;
   build-up time 0.4, share at first touch 0.5, settling time 0.3, all in the logarithm; creep 0.1;
@@ -55,10 +55,6 @@ from thermogrip.sysid.contact.response import Stack
 from thermogrip.sysid.contact.simulation import Grip
 from thermogrip.sysid.effusivity.data import UNKNOWN_OBJECT_RANGE, Noise
 
-__all__ = ["INSULATOR", "LEVEL_SD", "SHARED_NAMES", "UNKNOWN_OBJECT_SD", "Block", "GripperModel"]
-__all__ += ["GripperSpread", "ParameterCovariance", "Spreads", "another_gripper", "block_names"]
-__all__ += ["load_default_gripper"]
-
 Array = NDArray[np.float64]
 
 # theta but for the blocks, in the order of the calibration
@@ -74,8 +70,23 @@ _FILE_KEYS = {
     "ln_h_of_blocks": "finish", "ln_h_level": "finish_level", "ln_h_slope": "finish_slope",
     "uncertain": "in_doubt",
 }  # fmt: skip
-NOTHING = 1e-3  # what stands for a conductance of nothing, which has no logarithm
+NOTHING = 1e-3  # in place of a conductance of nothing, which has no logarithm
+_STACK_NAMES = SHARED_NAMES[: SHARED_NAMES.index("onset")]  # these make a Stack
 _ROUNDING = 1e-6  # a correlation matrix may have an eigenvalue so far below zero by rounding alone
+
+
+def stack_numbers(stack: Stack) -> Array:
+    """Return the numbers of a stack as they stand in theta, (14,)."""
+    values = {f.name: float(getattr(stack, f.name)) for f in fields(Stack)}
+    return np.array(
+        [np.log(max(values[n[3:]], NOTHING)) if n.startswith("ln_") else values[n] for n in _STACK_NAMES]
+    )
+
+
+def stack_of(theta: Array) -> Stack:
+    """Return the stack that the first numbers of theta describe; ValueError where there can be none."""
+    named = zip(_STACK_NAMES, theta.tolist())
+    return Stack(**{n.removeprefix("ln_"): float(np.exp(v)) if "ln_" in n else v for n, v in named})
 
 
 @dataclass(frozen=True)
@@ -262,15 +273,8 @@ class Spreads:
     insulator_dof: float = 1e6
 
     def __post_init__(self) -> None:
-        sds = (
-            self.ln_h,
-            self.ln_build_up,
-            self.onset,
-            self.t_object,
-            self.ln_effusivity,
-            self.ln_h_of_blocks,
-        )
-        if not (min(sds) >= 0 and min(self.dof, self.insulator_dof) > 0):
+        *sds, dof, insulator_dof = (getattr(self, part.name) for part in fields(self))
+        if not (min(sds) >= 0 and min(dof, insulator_dof) > 0):
             raise ValueError(f"need spreads of 0 or more and degrees of freedom above 0, got {self}")
 
 
@@ -388,9 +392,8 @@ class GripperModel:
         >>> bool(grip.h_c_of["copper"] > grip.h_c_of["wood"]), grip.transit_loss < 0.1
         (True, True)
         """
-        ln_h, ln_e = {}, {}
-        for name, block in self.blocks.items():
-            ln_h[name], ln_e[name] = block.ln_h, block.ln_effusivity
+        ln_h = {name: block.ln_h for name, block in self.blocks.items()}
+        ln_e = {name: block.ln_effusivity for name, block in self.blocks.items()}
         for name, material in load_materials().items():
             if name not in self.blocks:
                 found = np.log(np.array([material.effusivity]))

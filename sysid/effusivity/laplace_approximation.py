@@ -15,6 +15,26 @@ ratio of the two peaks.  b and T_obj enter f linearly, so for them Laplace's met
 marginalisation; the others are nearly Gaussian given them.  A nuisance with sd 0 is known.  Every function
 works on a batch of (grasp, hypothesis) pairs.
 
+What a hypothesis expects before the data
+-----------------------------------------
+
+Three kinds of hypothesis:
+
+- a **material with training grasps**: its block's ln h and ln e as calibrated, with the spread from grasp
+  to grasp;
+- a **material of the library**: its effusivity on the gripper's scale, with the row's uncertainty,
+  on a block of unknown contact conductance;
+- a **free effusivity**: a point of ln e, unknown contact conductance, rho c_p of solids in general (3.2
+  MJ/m^3K for metals, 1.7 for insulators).
+
+What comes from the gripper and the nominal temperature (build-up time, onset, object temperature) is common
+to all of them.  How far a block has gone to the room's temperature is known for rooms like those of the
+calibration only: in a colder one the object's temperature is less well known than its spread.
+
+A spread estimated from n grasps is itself uncertain, and a grasp two and a half of its standard deviations
+out is not unusual where n is small: such a nuisance has Student's t as its prior, with the degrees of freedom
+that the calibration had left.
+
 Uncertain grippers
 ------------------
 
@@ -44,15 +64,18 @@ define, so P is taken given theirs; the scale's own uncertainty is added where e
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs, dtrtrs
 from scipy.special import gammaln
 
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.materials import Material, find_material
 from thermogrip.sysid.contact.response import (
     LAYER_NAMES,
     Stack,
@@ -62,15 +85,16 @@ from thermogrip.sysid.contact.response import (
     stack_modes,
     time_nodes,
 )
-from thermogrip.sysid.effusivity.data import Touches, noise_covariance
-from thermogrip.sysid.effusivity.gripper_model import NOTHING, SHARED_NAMES
-
-if TYPE_CHECKING:
-    from thermogrip.sysid.effusivity.gripper_model import GripperModel
-
-__all__ = ["BUILD_UP", "CAPACITY", "EFFUSIVITY", "LEVEL", "N_NUISANCE", "ONSET", "T_OBJECT", "H", "Mode"]
-__all__ += ["Prior", "find_modes", "gripper_arguments", "jacobian", "nodes_for", "peak_ratio", "predict"]
-__all__ += ["uncertain_gripper_modes"]
+from thermogrip.sysid.effusivity.data import Touches, noise_covariance, whiten
+from thermogrip.sysid.effusivity.gripper_model import (
+    INSULATOR,
+    LEVEL_SD,
+    SHARED_NAMES,
+    UNKNOWN_OBJECT_SD,
+    GripperModel,
+    stack_numbers,
+    stack_of,
+)
 
 Array = NDArray[np.float64]
 
@@ -227,7 +251,6 @@ def _reading(stack: Stack, data: Touches, u: Array, f: Array, total: Array) -> A
     return np.asarray(level + (t_object - level) * f + rate * way * total + drift)
 
 
-_STACK_NAMES = SHARED_NAMES[: SHARED_NAMES.index("onset")]  # these make a Stack
 _AT = {name: i for i, name in enumerate((*SHARED_NAMES, "ln_h", "ln_e"))}
 _ROUNDS = 8
 _STILL = 0.5  # of -2 ln density: a smaller predicted decrease ends the search
@@ -313,7 +336,8 @@ def _pairs(
     # how well the block's mean is known is in the covariance
     sd[:, H] = np.sqrt(np.maximum(sd[:, H] ** 2 - own**2, 1e-12))
     covariance = {b: _covariance(gripper, b) for b in set(block.tolist())}
-    noise, nodes, centre = noise_covariance(data, gripper.noise), nodes_for(data), _numbers(gripper.stack)
+    noise, nodes = noise_covariance(data, gripper.noise), nodes_for(data)
+    centre = stack_numbers(gripper.stack)
     dof = np.full(sd.shape, np.inf) if prior.dof is None else prior.dof
     there = (data.count > 0).sum(axis=1)
     constant = peak_ratio(dof, sd > 0) - 0.5 * np.log(2 * np.pi) * there[row]
@@ -321,20 +345,8 @@ def _pairs(
     for i, r in enumerate(row.tolist()):
         own_prior = Prior(prior.mean[i : i + 1], sd[i : i + 1])
         one = data.take(np.array([r]))
-        out.append(
-            _Pair(
-                one,
-                nodes,
-                whitener[0][r],
-                noise[r],
-                own_prior,
-                dof[i],
-                covariance[int(block[i])],
-                centre,
-                _mean_slopes(one),
-                float(constant[i]),
-            )
-        )
+        known = covariance[int(block[i])], centre, _mean_slopes(one), float(constant[i])
+        out.append(_Pair(one, nodes, whitener[0][r], noise[r], own_prior, dof[i], *known))
     return out
 
 
@@ -357,22 +369,6 @@ def _covariance(gripper: GripperModel, block: int) -> Array:
     # what lies within rounding of zero is known exactly
     known = np.linalg.pinv(full[np.ix_(ln_e, ln_e)], rcond=1e-10, hermitian=True)
     return np.asarray(pick @ full @ pick.T - cross @ known @ cross.T)
-
-
-def _numbers(stack: Stack) -> Array:
-    values = {f.name: float(getattr(stack, f.name)) for f in fields(Stack)}
-    return np.array(
-        [np.log(max(values[n[3:]], NOTHING)) if n.startswith("ln_") else values[n] for n in _STACK_NAMES]
-    )
-
-
-def _stack(numbers: Array) -> Stack | None:
-    """Return the gripper, None where there can be none."""
-    named = zip(_STACK_NAMES, numbers.tolist())
-    try:
-        return Stack(**{n.removeprefix("ln_"): float(np.exp(v)) if "ln_" in n else v for n, v in named})
-    except ValueError:
-        return None
 
 
 def _mean_slopes(data: Touches) -> Array:
@@ -419,8 +415,9 @@ def _start(pair: _Pair, v: Array, a: Array) -> _Point:
 
 def _point(pair: _Pair, v: Array, a: Array) -> _Point | None:
     moved = pair.covariance @ a
-    stack = _stack(pair.centre + moved[: len(_STACK_NAMES)])
-    if stack is None:
+    try:
+        stack = stack_of(pair.centre + moved[: pair.centre.size])
+    except ValueError:
         return None
     u = v + pair.by_mean @ moved
     left = np.where(
@@ -525,3 +522,156 @@ def _slopes(pair: _Pair, here: _Point) -> tuple[Array, Array]:
         k[:, _AT["leak"]] = (data.t_ambient[0] - u[LEVEL]) * data.ramp[0]
     there = (data.count[0] > 0)[:, None]
     return k * there, by_u[0] * there
+
+
+class Hypotheses(NamedTuple):
+    """``n`` hypotheses: mean and sd of ln h, of ln e and of ln(rho c_p), (n,) each.
+
+    ``ln_h_dof`` and ``ln_e_dof`` (n,) are the degrees of freedom behind the first two spreads; ``block`` (n,)
+    is the place in ``gripper.materials`` of a block that was calibrated, -1 for others.
+    """
+
+    ln_h: Array
+    ln_h_sd: Array
+    ln_e: Array
+    ln_e_sd: Array
+    ln_rho_c: Array
+    ln_rho_c_sd: Array
+    ln_h_dof: Array
+    ln_e_dof: Array
+    block: Array
+
+
+def material_hypotheses(
+    gripper: GripperModel, candidates: Sequence[str | Material], finish: str = "known"
+) -> Hypotheses:
+    """Return one hypothesis a candidate, in their order."""
+    if finish not in ("known", "unknown"):
+        raise UserError(f"finish {finish!r} is unknown", hint="use 'known' or 'unknown'")
+    names = [c if isinstance(c, str) else c.name for c in candidates]
+    if not names:
+        raise UserError("no candidate materials", hint="name at least one")
+    for name in names:
+        if names.count(name) > 1:
+            raise UserError(f"candidate {name!r} is named twice", hint="name each once")
+    rows = [
+        _trained(gripper, name, finish)
+        if name in gripper.blocks
+        else _untrained(gripper, candidate if isinstance(candidate, Material) else find_material(name))
+        for name, candidate in zip(names, candidates)
+    ]
+    return Hypotheses(*np.array(rows).T)
+
+
+def free_hypotheses(gripper: GripperModel, ln_e: ArrayLike) -> Hypotheses:
+    """Return one hypothesis for each effusivity ln e on the gripper's own scale, h_c unknown."""
+    x = np.asarray(ln_e, dtype=float).ravel()
+    metal = 1 / (1 + np.exp(-4 * (x - np.log(4500.0))))
+    spread = np.full(x.size, gripper.spreads.ln_h_of_blocks)
+    return Hypotheses(
+        ln_h=gripper.expected_ln_h(x), ln_h_sd=np.hypot(spread, gripper.spreads.ln_h), ln_e=x,
+        ln_e_sd=np.zeros(x.size), ln_rho_c=np.log(1.7e6) + metal * np.log(3.2e6 / 1.7e6),
+        ln_rho_c_sd=0.4 - 0.2 * metal, ln_h_dof=np.full(x.size, np.inf), ln_e_dof=np.full(x.size, np.inf),
+        block=np.full(x.size, -1.0),
+    )  # fmt: skip
+
+
+def prior_of(gripper: GripperModel, data: Touches, hypotheses: Hypotheses) -> Prior:
+    """Return the prior of each (touch, hypothesis) pair, row by row; both have n rows."""
+    n = data.level.size
+    mean, sd = np.empty((n, N_NUISANCE)), np.empty((n, N_NUISANCE))
+    dof = np.full((n, N_NUISANCE), np.inf)
+    spreads = gripper.spreads
+    dof[:, H], dof[:, EFFUSIVITY] = hypotheses.ln_h_dof, hypotheses.ln_e_dof
+    dof[:, BUILD_UP] = dof[:, ONSET] = spreads.dof
+    mean[:, H], sd[:, H] = hypotheses.ln_h, hypotheses.ln_h_sd
+    mean[:, BUILD_UP], sd[:, BUILD_UP] = np.log(gripper.stack.build_up), spreads.ln_build_up
+    mean[:, ONSET], sd[:, ONSET] = gripper.onset, spreads.onset
+    mean[:, LEVEL], sd[:, LEVEL] = data.level, LEVEL_SD
+    known = np.isfinite(data.t_object)
+    lost = gripper.transit_loss * np.nan_to_num(data.t_ambient - data.t_object)
+    room = np.where(np.isfinite(data.t_ambient), data.t_ambient, data.level)
+    mean[:, T_OBJECT] = np.where(known, data.t_object + gripper.bias + lost, room)
+    # normal, so that it can be integrated exactly: with the variance of Student's t, which has none at two
+    # degrees of freedom, of one training grasp a material: then the nominal one counts little
+    beyond = max(spreads.dof - 2, 1e-9)
+    learnt = min(spreads.t_object * np.sqrt(spreads.dof / beyond), UNKNOWN_OBJECT_SD)
+    own = np.where(np.isfinite(data.t_object_sd), data.t_object_sd, learnt)
+    if not gripper.uncertain:  # else it is integrated with all the rest
+        own = np.hypot(own, gripper.nominal_sd(data.t_ambient - data.t_object))
+    sd[:, T_OBJECT] = np.where(known, own, UNKNOWN_OBJECT_SD)
+    mean[:, EFFUSIVITY], sd[:, EFFUSIVITY] = hypotheses.ln_e, hypotheses.ln_e_sd
+    mean[:, CAPACITY] = hypotheses.ln_rho_c + np.log(gripper.block_length * gripper.depth_share)
+    sd[:, CAPACITY] = hypotheses.ln_rho_c_sd
+    return Prior(mean, sd, dof)
+
+
+def fit_pairs(
+    gripper: GripperModel, data: Touches, row: NDArray[np.int64], hypotheses: Hypotheses, *,
+    start: Array | None = None, max_steps: int = 20, noise: tuple[Array, Array] | None = None,
+    prior: Prior | None = None,
+) -> Mode:  # fmt: skip
+    """Return the modes of pairs, hypothesis i against touch ``row[i]``.
+
+    The parameters of an uncertain gripper are integrated over.  ``noise`` and ``prior`` are what
+    :func:`~thermogrip.sysid.effusivity.data.whiten` and :func:`prior_of` give, where a caller has them.
+    """
+    prior = prior_of(gripper, data.take(row), hypotheses) if prior is None else prior
+    noise = whiten(data, gripper.noise) if noise is None else noise
+    if gripper.uncertain:
+        block = hypotheses.block.astype(np.int64)
+        return uncertain_gripper_modes(
+            gripper, data, row, noise, prior, block, start=start, max_steps=max_steps
+        )
+    return find_modes(gripper.stack, data, row, noise, prior, start=start, max_steps=max_steps)
+
+
+def fit_candidates(
+    gripper: GripperModel, data: Touches, candidates: Sequence[str | Material], finish: str = "known", *,
+    start: Array | None = None,
+) -> tuple[Mode, Prior, NDArray[np.int64]]:  # fmt: skip
+    """Return modes of every touch under every candidate, (n m,) rows; the prior and the touch of each.
+
+    ``start`` (n, m, 7) are nuisances to start from.
+    """
+    one = material_hypotheses(gripper, candidates, finish)
+    n, m = data.level.size, len(candidates)
+    row = np.repeat(np.arange(n), m)
+    hypotheses = Hypotheses(*(np.tile(h, n) for h in one))
+    begin = None if start is None else start.reshape(n * m, -1)
+    prior = prior_of(gripper, data.take(row), hypotheses)
+    return fit_pairs(gripper, data, row, hypotheses, start=begin, prior=prior), prior, row
+
+
+def _trained(gripper: GripperModel, name: str, finish: str) -> tuple[float, ...]:
+    block, spreads, own = gripper.blocks[name], gripper.spreads, finish == "known"
+    spread = spreads.ln_h if own else float(np.hypot(spreads.ln_h_of_blocks, spreads.ln_h))
+    scatter = spreads.ln_effusivity if block.library_effusivity < INSULATOR else 0.0
+    return (
+        block.ln_h,
+        float(np.hypot(spread, block.ln_h_sd)),
+        block.ln_effusivity,
+        scatter,
+        float(np.log(block.heat_capacity)),
+        0.0,
+        spreads.dof if own else np.inf,
+        spreads.insulator_dof if scatter else np.inf,
+        float(gripper.materials.index(name)),
+    )
+
+
+def _untrained(gripper: GripperModel, row: Material) -> tuple[float, ...]:
+    found = float(gripper.found_effusivity(np.log([row.effusivity]))[0])
+    scale_sd = gripper.effusivity_scale(np.array([found]))[1]
+    scatter = gripper.spreads.ln_effusivity if row.effusivity < INSULATOR else 0.0
+    return (
+        float(gripper.expected_ln_h(np.array(found))),
+        float(np.hypot(gripper.spreads.ln_h_of_blocks, gripper.spreads.ln_h)),
+        float(found),
+        float(np.sqrt(row.effusivity_sd_ln**2 + float(scale_sd[0]) ** 2 + scatter**2)),
+        float(np.log(row.rho * row.c_p)),
+        0.05,
+        np.inf,
+        np.inf,
+        -1.0,
+    )

@@ -35,8 +35,6 @@ from thermogrip.sysid.contact.time_stepping import (
     room_for,
 )
 
-__all__ = ["marginals", "modes"]
-
 Array = NDArray[np.float64]
 
 _LONGEST = 1.5

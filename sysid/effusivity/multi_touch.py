@@ -78,9 +78,13 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     EFFUSIVITY,
     T_OBJECT,
     H,
+    Hypotheses,
     Mode,
     Prior,
     find_modes,
+    free_hypotheses,
+    material_hypotheses,
+    prior_of,
 )
 from thermogrip.sysid.effusivity.posterior_grid import (
     LN_E_RANGE,
@@ -90,15 +94,10 @@ from thermogrip.sysid.effusivity.posterior_grid import (
     posterior_of,
     refined,
 )
-from thermogrip.sysid.effusivity.priors import Hypotheses, free_hypotheses, material_hypotheses, prior_of
 
 if TYPE_CHECKING:
     from thermogrip.datasets.materials import Material
     from thermogrip.sysid.effusivity.gripper_model import GripperModel
-
-__all__ = ["N_SHARED", "REST", "SHARED", "Coupling", "Factor", "Joint", "TouchGroups", "Traces", "combine"]
-__all__ += ["factor_of", "free_touch_fit", "joint_prior", "learn_coupling", "next_touch_prior"]
-__all__ += ["rested_long", "touch_groups", "traces_of", "two_touch_fit"]
 
 Array = NDArray[np.float64]
 

@@ -33,16 +33,13 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, has_touch_groups
 from thermogrip.sysid.effusivity.data import touches
 from thermogrip.sysid.effusivity.gripper_model import INSULATOR
-from thermogrip.sysid.effusivity.priors import fit_candidates
+from thermogrip.sysid.effusivity.laplace_approximation import fit_candidates
 
 if TYPE_CHECKING:
     from thermogrip.datasets.materials import Material
     from thermogrip.sysid.effusivity.gripper_model import GripperModel
     from thermogrip.sysid.effusivity.multi_touch import Coupling
     from thermogrip.sysid.effusivity.posterior_grid import GridPosterior
-
-__all__ = ["EffusivityRow", "MaterialFit", "OpenSet", "effusivity_posterior", "material_evidence"]
-__all__ += ["material_fit", "material_posterior", "open_set"]
 
 Array = NDArray[np.float64]
 

@@ -49,13 +49,12 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     ONSET,
     T_OBJECT,
     H,
+    fit_pairs,
+    free_hypotheses,
     gripper_arguments,
     nodes_for,
+    prior_of,
 )
-from thermogrip.sysid.effusivity.priors import fit_pairs, free_hypotheses, prior_of
-
-__all__ = ["LN_E_RANGE", "N_COARSE", "SAMPLED", "WIDEN", "GridPosterior", "MarginalPosterior"]
-__all__ += ["grid_posteriors", "log_integrals", "mixture_quantiles", "posterior_of", "refined"]
 
 Array = NDArray[np.float64]
 

@@ -35,17 +35,15 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     LEVEL,
     N_NUISANCE,
     ONSET,
+    fit_candidates,
     jacobian,
     nodes_for,
 )
 from thermogrip.sysid.effusivity.multi_touch import SHARED, Coupling, next_touch_prior
-from thermogrip.sysid.effusivity.priors import fit_candidates
 
 if TYPE_CHECKING:
     from thermogrip.datasets.materials import Material
     from thermogrip.sysid.effusivity.gripper_model import GripperModel
-
-__all__ = ["PosteriorPredictive", "next_touch", "rest_of_contact"]
 
 Array = NDArray[np.float64]
 

@@ -79,9 +79,6 @@ from scipy.special import stdtr
 from thermogrip.datasets.repair import SPIKE_FLOOR_K, SPIKE_LENGTH, find_spikes
 from thermogrip.datasets.schema import Grasps, has_touch_groups, label_values
 
-__all__ = ["BIAS_S", "CONTRARY", "LEAP", "NO_CONTACT", "OUT_OF_RANGE", "GraspQuality", "check_grasps"]
-__all__ += ["contact_faults", "find_contact", "longest_contact", "torn_groups"]
-
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 

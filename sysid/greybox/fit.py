@@ -43,8 +43,6 @@ from thermogrip.sysid.plant.log_grid import cut_stretches, match_logs
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import find_starts, predict
 
-__all__ = ["fit_network", "free_runs", "residual_tau"]
-
 Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]
 

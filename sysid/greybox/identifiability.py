@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from thermogrip.sysid.models.network_spec import Network
     from thermogrip.sysid.plant.plant import Plant
 
-__all__ = ["describe", "identifiability_report", "trade_offs", "weakest_direction"]
-
 Array = NDArray[np.float64]
 
 _EXACT = 1e-11  # eigenvalue of the scaled Hessian below which a direction changes no output

@@ -28,8 +28,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Solution", "levenberg_marquardt"]
-
 Array = NDArray[np.float64]
 
 _DAMPINGS = np.array([1e-2, 0.1, 1.0, 10.0, 100.0])  # times the damping that last succeeded

@@ -43,16 +43,6 @@ from scipy.optimize import minimize
 
 from thermogrip.sysid.plant.fit_record import ErrorNumbers
 
-__all__ = [
-    "Block",
-    "ErrorModel",
-    "Information",
-    "LogData",
-    "band_weights",
-    "information",
-    "learn_error_model",
-]
-
 Array = NDArray[np.float64]
 
 N_SLOW = 2

@@ -51,13 +51,6 @@ from thermogrip.sysid.plant.simulation import Start, find_starts, predict
 if TYPE_CHECKING:
     from thermogrip.sysid.models.network_spec import Parameter
 
-__all__ = [
-    "Problem",
-    "innovations",
-    "make_problem",
-    "prior_plant",
-]
-
 Array = NDArray[np.float64]
 
 

@@ -63,16 +63,6 @@ from thermogrip.sysid.plant.simulation import READING_EVERY, Start, predict
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import Model
 
-__all__ = [
-    "Linearised",
-    "Response",
-    "WarmUp",
-    "discrepancy_responses",
-    "linearise_logs",
-    "signals",
-    "warm_noise",
-]
-
 Array = NDArray[np.float64]
 Parts = list[list[list[Array]]]  # by log, stretch and output
 

@@ -66,8 +66,6 @@ from thermogrip.sysid.greybox.noise_model import ErrorModel, LogData, informatio
 from thermogrip.sysid.greybox.problem import Problem
 from thermogrip.sysid.greybox.random_effects import Linearised, Response, WarmUp, linearise_logs
 
-__all__ = ["LogScores", "ScoreCovariance", "disagreement", "moderated", "score_covariance"]
-
 Array = NDArray[np.float64]
 
 _TERM_SD, _EFFECT_SD = 1.5, 0.7  # prior sd of ln s: of a response, of a random effect
@@ -92,7 +90,7 @@ class ScoreCovariance:
     covariance: Array  # (n_free, n_free), of z, in prior units
     omega: Array  # (n_free, n_free), covariance of the score
     spread: Array  # the part of omega that differs from log to log: without prior and model discrepancy
-    coarsening: float  # T of :mod:`thermogrip.sysid.greybox.randomized_map`
+    coarsening: float  # T of :mod:`thermogrip.sysid.greybox.posterior`
     hessian: Array  # (n_free, n_free), P
     q: float  # phi_0: how much logs differ over how much they should, as a variance
     freedom: float  # n_0 + L - 1

@@ -57,18 +57,6 @@ from thermogrip.sysid.models.network_spec import Network, network_from_dict, rol
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
-__all__ = [
-    "Candidate",
-    "ResidualTerm",
-    "lagging_air",
-    "meaning",
-    "patched",
-    "proposed",
-    "residual_terms",
-    "second_zone",
-    "suggested",
-]
-
 Array = NDArray[np.float64]
 
 LEAST = 0.02  # of the residual's variance on held-out rows

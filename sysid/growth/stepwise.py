@@ -52,8 +52,6 @@ from thermogrip.sysid.models.network import NetworkModel, load_network
 from thermogrip.sysid.plant.fit_record import Identifiability
 from thermogrip.sysid.plant.plant import Plant
 
-__all__ = ["Fold", "Growth", "GrowthRow", "folds_of", "grow", "growth_table"]
-
 Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]
 

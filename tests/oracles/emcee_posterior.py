@@ -23,8 +23,8 @@ from scipy.special import ndtr
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.effusivity.data import Touches, touches
 from thermogrip.sysid.effusivity.gripper_model import GripperModel
+from thermogrip.sysid.effusivity.laplace_approximation import fit_pairs, free_hypotheses
 from thermogrip.sysid.effusivity.posterior_grid import LN_E_RANGE, SAMPLED, MarginalPosterior, grid_posteriors
-from thermogrip.sysid.effusivity.priors import fit_pairs, free_hypotheses
 
 Array = NDArray[np.float64]
 

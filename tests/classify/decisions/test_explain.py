@@ -24,9 +24,8 @@ from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps, make_grasps
 from thermogrip.sysid.effusivity.data import object_range, touches, with_object_range
 from thermogrip.sysid.effusivity.gripper_model import GripperModel, load_default_gripper
-from thermogrip.sysid.effusivity.laplace_approximation import T_OBJECT
+from thermogrip.sysid.effusivity.laplace_approximation import T_OBJECT, material_hypotheses, prior_of
 from thermogrip.sysid.effusivity.posterior import effusivity_posterior
-from thermogrip.sysid.effusivity.priors import material_hypotheses, prior_of
 
 from ...sysid.effusivity.makers import simulated_blocks
 

@@ -6,13 +6,15 @@ import mpmath as mp
 import numpy as np
 import pytest
 
-from thermogrip.sysid.contact.finite_bodies import (
+from thermogrip.sysid.contact.closed_forms import (
     block_contact_flux,
     block_skin_temperature,
+    contact_flux,
     half_space,
     invert_laplace,
     layer_on,
     layered_temperature,
+    skin_temperature,
     slab,
     slab_heat,
     slab_temperature,
@@ -20,7 +22,6 @@ from thermogrip.sysid.contact.finite_bodies import (
     two_body_flux,
     two_body_temperatures,
 )
-from thermogrip.sysid.contact.half_spaces import contact_flux, skin_temperature
 
 COPPER, WATER, BLOCK = 3.64e4, 1.6e3, 68600.0
 UNIT = {"T_dev0": 0.0, "T_obj0": 1.0}

@@ -6,7 +6,7 @@ import mpmath as mp
 import numpy as np
 import pytest
 
-from thermogrip.sysid.contact.half_spaces import (
+from thermogrip.sysid.contact.closed_forms import (
     contact_flux,
     contact_heat,
     contact_temperature,

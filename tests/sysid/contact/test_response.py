@@ -7,15 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermogrip.sysid.contact.finite_bodies import (
+from thermogrip.sysid.contact.closed_forms import (
     block_contact_flux,
     half_space,
     layer_on,
+    sensor_temperature,
     slab,
     two_body_flux,
-)
-from thermogrip.sysid.contact.half_spaces import (
-    sensor_temperature,
 )
 from thermogrip.sysid.contact.response import (
     LAYER_NAMES,

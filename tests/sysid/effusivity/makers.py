@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.contact.simulation import Blocks, simulate_grasps
-from thermogrip.sysid.effusivity import laplace_approximation as laplace
-from thermogrip.sysid.effusivity.gripper_model import SHARED_NAMES, GripperModel
+from thermogrip.sysid.effusivity.gripper_model import SHARED_NAMES, GripperModel, stack_numbers, stack_of
 
 FIVE = ["brass", "copper", "iron", "wood", "zinc"]
 
@@ -45,14 +44,13 @@ def drawn_gripper(gripper: GripperModel, seed: int) -> GripperModel:
     assert known is not None
     move = np.random.default_rng(seed).multivariate_normal(np.zeros(len(known.names)), known.covariance)
     by = dict(zip(known.names, move))
-    stack_names = SHARED_NAMES[: SHARED_NAMES.index("onset")]
-    numbers = dict(zip(stack_names, laplace._numbers(gripper.stack) + [by[name] for name in stack_names]))
-    numbers["ln_first"] = min(numbers["ln_first"], -0.01)
+    numbers = stack_numbers(gripper.stack)
+    numbers += [by[name] for name in SHARED_NAMES[: numbers.size]]
+    first = SHARED_NAMES.index("ln_first")
+    numbers[first] = min(numbers[first], -0.01)
     blocks = {
         name: replace(b, ln_h=b.ln_h + by[f"ln_h {name}"], ln_effusivity=b.ln_effusivity + by[f"ln_e {name}"])
         for name, b in gripper.blocks.items()
     }
     shared = {name: getattr(gripper, name) + by[name] for name in ("onset", "transit_loss", "bias")}
-    stack = laplace._stack(np.array(list(numbers.values())))
-    assert stack is not None
-    return replace(gripper, stack=stack, blocks=blocks, uncertain=False, **shared)
+    return replace(gripper, stack=stack_of(numbers), blocks=blocks, uncertain=False, **shared)

@@ -8,20 +8,20 @@ import pytest
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.sysid.effusivity import calibration
-from thermogrip.sysid.effusivity import laplace_approximation as doubt
 from thermogrip.sysid.effusivity.calibration import calibrate_example_gripper, calibrate_gripper
 from thermogrip.sysid.effusivity.data import touches
 from thermogrip.sysid.effusivity.gripper_model import (
     SHARED_NAMES,
     another_gripper,
     load_default_gripper,
+    stack_numbers,
+)
+from thermogrip.sysid.effusivity.laplace_approximation import (
+    material_hypotheses,
+    prior_of,
 )
 from thermogrip.sysid.effusivity.posterior import (
     material_posterior,
-)
-from thermogrip.sysid.effusivity.priors import (
-    material_hypotheses,
-    prior_of,
 )
 
 from .makers import FIVE, drawn_gripper, simulated, split_of
@@ -185,7 +185,7 @@ def test_what_grasps_teach_is_never_less_than_nothing(device):
     before = other.uncertainty.covariance[np.ix_(at, at)]
     floor = 1e-5  # numbers that count as exact keep a thousandth of a wide prior
     assert np.linalg.eigvalsh(before - model.uncertainty.covariance + floor * np.eye(len(names))).min() > 0
-    off = doubt._numbers(truth.stack) - doubt._numbers(model.stack)
+    off = stack_numbers(truth.stack) - stack_numbers(model.stack)
     sd = np.array([model.uncertainty.sd(name) for name in SHARED_NAMES[: off.size]])
     assert np.abs(off / np.maximum(sd, 1e-3)).max() < 4.5
     assert model.uncertainty.sd("ln_lag") < 0.7 * other.uncertainty.sd("ln_lag")
@@ -202,7 +202,7 @@ def test_one_calibration_after_another_is_both_at_once(device):
     both = calibrate_gripper([train], start=device)
     for name in ("ln_h copper", "ln_e wood", "ln_lag", "onset"):
         sd = both.uncertainty.sd(name)
-        one, other = (doubt_numbers(d)[name] for d in (then, both))
+        one, other = (numbers_of(d)[name] for d in (then, both))
         assert abs(one - other) < 1.0 * sd, name
         assert 0.7 < then.uncertainty.sd(name) / sd < 1.4, name
     assert not then.uncertain
@@ -210,7 +210,7 @@ def test_one_calibration_after_another_is_both_at_once(device):
     assert then.blocks["copper"].n_grasp == both.blocks["copper"].n_grasp
 
 
-def doubt_numbers(device):
+def numbers_of(device):
     """Return some numbers of a device by the names of their covariance."""
     blocks = {f"ln_h {k}": b.ln_h for k, b in device.blocks.items()}
     blocks |= {f"ln_e {k}": b.ln_effusivity for k, b in device.blocks.items()}

@@ -24,15 +24,21 @@ from thermogrip.sysid.effusivity.gripper_model import (
     SHARED_NAMES,
     GripperSpread,
     another_gripper,
+    stack_of,
 )
 from thermogrip.sysid.effusivity.laplace_approximation import (
     N_NUISANCE,
     ONSET,
+    Hypotheses,
     Prior,
     find_modes,
+    fit_pairs,
+    free_hypotheses,
     jacobian,
+    material_hypotheses,
     nodes_for,
     predict,
+    prior_of,
 )
 from thermogrip.sysid.effusivity.multi_touch import (
     two_touch_fit,
@@ -44,13 +50,6 @@ from thermogrip.sysid.effusivity.posterior import (
     material_posterior,
 )
 from thermogrip.sysid.effusivity.predictive import rest_of_contact
-from thermogrip.sysid.effusivity.priors import (
-    Hypotheses,
-    fit_pairs,
-    free_hypotheses,
-    material_hypotheses,
-    prior_of,
-)
 
 from ...oracles.emcee_posterior import emcee_posterior
 from .makers import FIVE, drawn_gripper, simulated
@@ -290,7 +289,7 @@ def test_derivatives_by_the_gripper_are_those_of_its_readings(device, touched):
         step[i] = 1e-6 if name == "leak" else 1e-4
         there, back = (
             predict(
-                laplace._stack(pair.centre + sign * step[: SHARED_NAMES.index("onset")]),
+                stack_of(pair.centre + sign * step[: SHARED_NAMES.index("onset")]),
                 pair.nodes,
                 data,
                 u + sign * pair.by_mean @ step,

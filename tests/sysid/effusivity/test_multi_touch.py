@@ -16,6 +16,7 @@ from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.sysid.effusivity import multi_touch
 from thermogrip.sysid.effusivity.data import touches
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
+from thermogrip.sysid.effusivity.laplace_approximation import material_hypotheses
 from thermogrip.sysid.effusivity.multi_touch import (
     Coupling,
     Factor,
@@ -30,7 +31,6 @@ from thermogrip.sysid.effusivity.multi_touch import (
     two_touch_fit,
 )
 from thermogrip.sysid.effusivity.posterior import effusivity_posterior, material_evidence, material_fit
-from thermogrip.sysid.effusivity.priors import material_hypotheses
 
 from .makers import FIVE
 

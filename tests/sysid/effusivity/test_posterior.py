@@ -19,8 +19,11 @@ from thermogrip.datasets.materials import find_material, load_materials
 from thermogrip.sysid.effusivity.data import touches, whiten
 from thermogrip.sysid.effusivity.laplace_approximation import (
     find_modes,
+    free_hypotheses,
+    material_hypotheses,
     nodes_for,
     predict,
+    prior_of,
 )
 from thermogrip.sysid.effusivity.posterior import (
     effusivity_posterior,
@@ -31,11 +34,6 @@ from thermogrip.sysid.effusivity.posterior import (
 from thermogrip.sysid.effusivity.posterior_grid import (
     LN_E_RANGE,
     grid_posteriors,
-)
-from thermogrip.sysid.effusivity.priors import (
-    free_hypotheses,
-    material_hypotheses,
-    prior_of,
 )
 
 from ...oracles.emcee_posterior import emcee_posterior

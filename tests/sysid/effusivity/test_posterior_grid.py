@@ -12,8 +12,11 @@ from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.sysid.effusivity import posterior_grid
 from thermogrip.sysid.effusivity.data import noise_covariance, touches
 from thermogrip.sysid.effusivity.laplace_approximation import (
+    fit_pairs,
+    free_hypotheses,
     nodes_for,
     predict,
+    prior_of,
 )
 from thermogrip.sysid.effusivity.posterior_grid import (
     SAMPLED,
@@ -21,11 +24,6 @@ from thermogrip.sysid.effusivity.posterior_grid import (
     grid_posteriors,
     log_integrals,
     mixture_quantiles,
-)
-from thermogrip.sysid.effusivity.priors import (
-    fit_pairs,
-    free_hypotheses,
-    prior_of,
 )
 
 LEVELS = (0.05, 0.5, 0.95)

@@ -10,11 +10,15 @@ import pytest
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.sysid.effusivity.data import noise_covariance, touches
-from thermogrip.sysid.effusivity.laplace_approximation import jacobian, nodes_for
+from thermogrip.sysid.effusivity.laplace_approximation import (
+    jacobian,
+    material_hypotheses,
+    nodes_for,
+    prior_of,
+)
 from thermogrip.sysid.effusivity.multi_touch import Coupling, next_touch_prior
 from thermogrip.sysid.effusivity.posterior import material_fit
 from thermogrip.sysid.effusivity.predictive import _extended, next_touch, rest_of_contact
-from thermogrip.sysid.effusivity.priors import material_hypotheses, prior_of
 
 from .makers import simulated
 

@@ -18,9 +18,9 @@ from thermogrip.datasets.schema import Grasps, make_grasps
 from thermogrip.sysid.contact.simulation import simulate_grasps
 from thermogrip.sysid.effusivity.data import touches
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
+from thermogrip.sysid.effusivity.laplace_approximation import free_hypotheses
 from thermogrip.sysid.effusivity.posterior import material_fit, material_posterior
 from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors, mixture_quantiles
-from thermogrip.sysid.effusivity.priors import free_hypotheses
 from thermogrip.sysid.effusivity.quality import (
     BIAS_S,
     NO_CONTACT,

@@ -26,13 +26,13 @@ from thermogrip.sysid.greybox.fit import fit_network
 from thermogrip.sysid.greybox.posterior import (
     Chain,
     Posterior,
+    RandomizedMap,
     problem_hash,
     run_chain,
     sample_posterior,
     with_draws,
 )
 from thermogrip.sysid.greybox.problem import make_problem, prior_plant
-from thermogrip.sysid.greybox.randomized_map import RandomizedMap
 from thermogrip.sysid.greybox.sandwich import score_covariance
 from thermogrip.sysid.models.network_spec import Parameter
 from thermogrip.sysid.models.state_space import StateSpaceModel
