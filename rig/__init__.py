@@ -52,37 +52,20 @@ __all__ = [
     "simulate_grasps",
 ]
 
-_HOME = {
-    "Bridge": "records.rosbridge",
-    "DeviceRig": "drivers.thermogrip",
-    "Grip": "thermogrip.sysid.contact.simulation",
-    "Guard": "guard.guard",
-    "GuardSettings": "guard.guard",
-    "Object": "session.session",
-    "Port": "serial.port",
-    "Reading": "interface",
-    "Rig": "interface",
-    "RunFolder": "records.recorder",
-    "Session": "session.session",
-    "TCLabRig": "drivers.tclab",
-    "Trial": "records.batch",
-    "Trip": "guard.trip",
-    "Twin": "simulation.twin",
-    "VirtualDevice": "simulation.virtual_device",
-    "export_run": "records.export",
-    "open_rig": "drivers.connect",
-    "read_guard": "guard.settings",
-    "read_plan": "records.batch",
-    "read_run": "records.run_folder",
-    "recover": "records.run_folder",
-    "run_batch": "records.batch",
-    "run_session": "session.session",
-    "simulate_grasps": "thermogrip.sysid.contact.simulation",
-}
+_NAMES = {
+    "drivers.connect": ["open_rig"], "drivers.tclab": ["TCLabRig"], "drivers.thermogrip": ["DeviceRig"],
+    "guard.guard": ["Guard", "GuardSettings"], "guard.settings": ["read_guard"], "guard.trip": ["Trip"],
+    "interface": ["Reading", "Rig"], "records.batch": ["Trial", "read_plan", "run_batch"],
+    "records.export": ["export_run"], "records.recorder": ["RunFolder"], "records.rosbridge": ["Bridge"],
+    "records.run_folder": ["read_run", "recover"], "serial.port": ["Port"],
+    "session.session": ["Object", "Session", "run_session"],
+    "simulation.twin": ["Twin"], "simulation.virtual_device": ["VirtualDevice"],
+    ".sysid.contact.simulation": ["Grip", "simulate_grasps"],
+}  # fmt: skip
+_HOME = {name: module for module, names in _NAMES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    home = _HOME[name]
-    return getattr(import_module(home if home.startswith("thermogrip.") else f"{__name__}.{home}"), name)
+    return getattr(import_module(f".{_HOME[name]}", __name__), name)

@@ -10,8 +10,6 @@ import threading
 import time
 from collections.abc import Callable
 
-__all__ = ["BackOff", "Metronome", "ScaledClock", "SteppedClock"]
-
 _LATE_S = 0.5
 
 

@@ -6,11 +6,10 @@ session runs on the twin much faster than on hardware, with the same lines.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
-
-__all__ = ["UNIT_RANGES", "DeviceRefusedError", "Notice", "Reading", "Rig", "SamplingRig"]
 
 #: What a drive may be, by its unit.
 UNIT_RANGES = {"1": (-1.0, 1.0), "percent": (0.0, 100.0), "0_255": (0.0, 255.0)}
@@ -63,6 +62,37 @@ class Notice:
     time_s: float  # the rig's clock
     kind: str
     text: str
+
+
+class NoticeBook:
+    """The notices of a rig, whose clock starts at 0 when it is made."""
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock, self._start = clock, clock()
+        self._notices: deque[Notice] = deque(maxlen=1000)
+
+    def notices(self) -> list[Notice]:
+        """Return what happened since the last call, and forget it."""
+        happened = list(self._notices)
+        self._notices.clear()
+        return happened
+
+    def _now(self) -> float:
+        return round(self._clock() - self._start, 9)
+
+    def _note(self, kind: str, text: str) -> None:
+        self._notices.append(Notice(self._now(), kind, text))
+
+
+def check_order(drive: Mapping[str, float], pump: int, ranges: Mapping[str, tuple[float, float]]) -> None:
+    """Raise ValueError for an unknown input, a value outside its range, or a pump that is neither 0 nor 1."""
+    if set(drive) != set(ranges):
+        raise ValueError(f"drive has {sorted(drive)}, the rig's inputs are {sorted(ranges)}")
+    for name, (low, high) in ranges.items():
+        if not low <= drive[name] <= high:  # also false for NaN
+            raise ValueError(f"{name} = {drive[name]:g} is outside {low:g} to {high:g}")
+    if pump not in (0, 1):
+        raise ValueError(f"pump = {pump} is neither 0 nor 1")
 
 
 @runtime_checkable

@@ -26,8 +26,8 @@ from importlib.resources import files
 from pathlib import Path
 
 from thermogrip.rig.drivers.thermogrip import DeviceRefusedError, DeviceRig
-from thermogrip.rig.serial.framing import LineParser
 from thermogrip.rig.serial.port import Port
+from thermogrip.rig.serial.protocol import LineParser
 
 ARDUINO = Path("/usr/share/arduino/hardware/arduino/avr")
 TOOLS = ("avr-g++", "avr-gcc", "avr-size", "avr-nm", "gcc")

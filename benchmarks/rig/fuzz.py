@@ -32,8 +32,19 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_log
 from thermogrip.rig.drivers.tclab import _NUMBER
 from thermogrip.rig.firmware.reference import DeviceCore
-from thermogrip.rig.serial.framing import Damaged, Line, LineParser, encode_line
-from thermogrip.rig.serial.protocol import Answer, Hello, HostEnd, Read, State, Take, Taken
+from thermogrip.rig.serial.protocol import (
+    Answer,
+    Damaged,
+    Hello,
+    HostEnd,
+    Line,
+    LineParser,
+    Read,
+    State,
+    Take,
+    Taken,
+    encode_line,
+)
 from thermogrip.rig.simulation.cable import spoil
 
 SHARES = {"host": 0.35, "readings": 0.10, "device": 0.40, "tclab": 0.14, "logs": 0.01}

@@ -107,8 +107,8 @@ def main() -> int:
     from thermogrip.mpc import Controller
     from thermogrip.rig.drivers.background_sampler import Sampler
     from thermogrip.rig.drivers.thermogrip import DeviceRig
-    from thermogrip.rig.serial.framing import encode_line
     from thermogrip.rig.serial.port import Port
+    from thermogrip.rig.serial.protocol import encode_line
     from thermogrip.rig.simulation.virtual_device import example_plant
 
     dt, steps = 1 / chosen.rate, []

@@ -29,8 +29,6 @@ from typing import TypeVar
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.interface import Reading, Rig, SamplingRig
 
-__all__ = ["SWITCH_S", "Sampler"]
-
 SWITCH_S = 1e-4
 T = TypeVar("T")
 
@@ -136,7 +134,6 @@ class Sampler:
             k = due
 
     def _ask_rig(self) -> None:
-        """Get what there is from the rig."""
         if isinstance(self.rig, SamplingRig) and self.by_device:
             readings, lost = self.rig.take()
             self.missed += lost

@@ -14,8 +14,6 @@ from thermogrip.rig.drivers.thermogrip import DeviceRig
 from thermogrip.rig.serial.port import AnyPort, Port, PortError
 from thermogrip.rig.serial.protocol import Answer, Boot, Hello, HostEnd, Refused
 
-__all__ = ["open_rig", "recognise"]
-
 _ROUND_S = 0.5
 
 

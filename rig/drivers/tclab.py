@@ -24,18 +24,15 @@ from __future__ import annotations
 
 import re
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from statistics import median
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.clock import Metronome
-from thermogrip.rig.interface import DeviceRefusedError, Notice, Reading
+from thermogrip.rig.interface import DeviceRefusedError, NoticeBook, Reading, check_order
 from thermogrip.rig.serial.port import AnyPort, PortError
 from thermogrip.rig.serial.protocol import REFUSALS
-
-__all__ = ["TCLabRig"]
 
 HEATERS, SENSORS = ("q1", "q2"), ("t1", "t2")
 LOWEST, CEILING = -49.9, 130.0  # degC: outside, the converter is at its end and the sensor open or shorted
@@ -46,7 +43,7 @@ _VERSION = re.compile(rb"TCLab Firmware [ -~]+\r\n")
 _STOP = re.compile(rb"Stop\r\n")
 
 
-class TCLabRig:
+class TCLabRig(NoticeBook):
     """A TCLab behind the rig's interface; inputs ``q1``, ``q2`` in percent, outputs ``t1``, ``t2``.
 
     Parameters
@@ -98,11 +95,10 @@ class TCLabRig:
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         self.port, self.highest, self.jump, self.timeout = port, highest, jump, timeout
-        self._clock, self._sleep, self._start = clock, sleep, clock()
-        self._beat = Metronome(clock)
+        super().__init__(clock)
+        self._sleep, self._beat = sleep, Metronome(clock)
         self._set, self._pump, self._bad = [0.0, 0.0], 0, 0
         self._last: tuple[float, list[float]] | None = None
-        self._notices: deque[Notice] = deque(maxlen=1000)
         self._lost, self.closed = False, False
         self.faults: tuple[str, ...] = ()
         port.open()
@@ -140,13 +136,7 @@ class TCLabRig:
         where a trip is latched, ValueError for an unknown input or a value outside 0 to 100, RuntimeError
         where closed.
         """
-        if set(drive) != set(HEATERS):
-            raise ValueError(f"drive has {sorted(drive)}, the rig's inputs are {sorted(HEATERS)}")
-        for name, value in drive.items():
-            if not 0.0 <= value <= 100.0:  # also false for NaN
-                raise ValueError(f"{name} = {value:g} is outside 0 to 100")
-        if pump not in (0, 1):
-            raise ValueError(f"pump = {pump} is neither 0 nor 1")
+        check_order(drive, pump, dict.fromkeys(HEATERS, (0.0, 100.0)))
         on = any(drive.values())
         if self.closed:
             if on or pump:
@@ -177,12 +167,6 @@ class TCLabRig:
             raise DeviceRefusedError("active", REFUSALS["active"], self.faults)
         self.faults, self._bad = (), 0
 
-    def notices(self) -> list[Notice]:
-        """Return what happened since the last call, and forget it."""
-        happened = list(self._notices)
-        self._notices.clear()
-        return happened
-
     def close(self) -> None:
         """Switch both heaters off and let the port go; never raises, and may be called twice."""
         if self.closed:
@@ -192,12 +176,6 @@ class TCLabRig:
         self._end_heaters()
         self.closed, self._last, self._pump = True, None, 0
         self.port.close()
-
-    def _now(self) -> float:
-        return round(self._clock() - self._start, 9)
-
-    def _note(self, kind: str, text: str) -> None:
-        self._notices.append(Notice(self._now(), kind, text))
 
     def _greet(self, seconds: float) -> str:
         """Ask for the version until the board answers, and switch the heaters off."""

@@ -29,22 +29,20 @@ between two readings is the device's own measure.
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 
 from thermogrip.rig.clock import Metronome
 from thermogrip.rig.firmware.reference import MAX_PERIOD_MS, MIN_PERIOD_MS
-from thermogrip.rig.interface import DeviceRefusedError, Notice, Reading
-from thermogrip.rig.serial.framing import Damaged
+from thermogrip.rig.interface import DeviceRefusedError, NoticeBook, Reading, check_order
 from thermogrip.rig.serial.port import AnyPort, PortError
 from thermogrip.rig.serial.protocol import (
     MAX_TTL_MS,
     REFUSALS,
     Answer,
     Boot,
-    Channel,
     Clear,
+    Damaged,
     Drive,
     Event,
     Grip,
@@ -62,8 +60,6 @@ from thermogrip.rig.serial.protocol import (
     Taken,
     Unexpected,
 )
-
-__all__ = ["DeviceClock", "DeviceRig", "Gathering"]
 
 TTL_S = MAX_TTL_MS / 1000
 RENEW_S = 0.5  # how often a drive is renewed while time passes
@@ -121,16 +117,15 @@ class Gathering:
         return there
 
 
-class _Conversation:
+class _Conversation(NoticeBook):
     """The host's end of the line to a device: questions, repeats, greetings, notices."""
 
     def __init__(
         self, port: AnyPort, *, timeout: float, tries: int, greeting: float, clock: Callable[[], float]
     ) -> None:
+        super().__init__(clock)
         self.port, self.timeout, self.tries = port, timeout, tries
-        self._clock, self._start = clock, clock()
         self._host, self._device_clock = HostEnd(), DeviceClock()
-        self._notices: deque[Notice] = deque(maxlen=1000)
         self._known: State | None = None
         self._heard, self._silent = 0, False  # bytes so far; whether the last question was met with none
         self._greeted_at, self._lost, self.closed = 0, False, False
@@ -141,18 +136,6 @@ class _Conversation:
     def state(self) -> State | None:
         """The device's last state, None while it cannot be reached."""
         return None if self._lost else self._known
-
-    def notices(self) -> list[Notice]:
-        """Return what happened since the last call, and forget it."""
-        happened = list(self._notices)
-        self._notices.clear()
-        return happened
-
-    def _now(self) -> float:
-        return round(self._clock() - self._start, 9)
-
-    def _note(self, kind: str, text: str) -> None:
-        self._notices.append(Notice(self._now(), kind, text))
 
     def _drive_is_over(self) -> None:
         """Note that the device no longer applies the drive."""
@@ -170,7 +153,6 @@ class _Conversation:
         raise PortError("absent", "nothing here speaks our protocol", file=self.port.url, hint=hint)
 
     def _ask(self, request: Request) -> State:
-        """Return the state that answers a question."""
         state = self._content(request)
         assert isinstance(state, State)
         self._compare(state)
@@ -259,7 +241,6 @@ class _Conversation:
                 return None  # bytes without end are no answer either
 
     def _note_event(self, event: Event) -> None:
-        """Note what a session is to record."""
         match event:
             case Damaged(why=why):
                 self._note("damaged", f"a line came damaged ({why})")
@@ -372,9 +353,8 @@ class DeviceRig(_Conversation):
         where it refuses (a latched fault, a drive while the pump is off, a reset since it was greeted),
         ValueError for an unknown input or a value outside its range, RuntimeError where the rig is closed.
         """
-        counts = tuple(_counts(channel, drive) for channel in self._channels(drive))
-        if pump not in (0, 1):
-            raise ValueError(f"pump = {pump} is neither 0 nor 1")
+        check_order(drive, pump, {c.name: (c.low / 1e4, c.high / 1e4) for c in self.identity.drives})
+        counts = self._counts(drive)
         if self.closed:
             if pump or any(counts):
                 raise RuntimeError("the rig is closed")
@@ -461,10 +441,8 @@ class DeviceRig(_Conversation):
     def _drive_is_over(self) -> None:
         self._command = None
 
-    def _channels(self, drive: Mapping[str, float]) -> tuple[Channel, ...]:
-        if set(drive) != set(self.units):
-            raise ValueError(f"drive has {sorted(drive)}, the rig's inputs are {sorted(self.units)}")
-        return self.identity.drives
+    def _counts(self, drive: Mapping[str, float]) -> tuple[int, ...]:
+        return tuple(round(1e4 * drive[channel.name]) for channel in self.identity.drives)
 
     def _reading(self, time_s: float, content: State | Kept) -> Reading:
         values = {
@@ -496,20 +474,11 @@ class DeviceRig(_Conversation):
             self._command = None
             self._note("expired", f"the program stood still for {self._clock() - self._confirmed:.1f} s")
             return
-        counts = tuple(_counts(channel, drive) for channel in self.identity.drives)
         try:
-            self._ask(Drive(MAX_TTL_MS, pump, counts))
+            self._ask(Drive(MAX_TTL_MS, pump, self._counts(drive)))
             self._confirmed = self._clock()
         except PortError:
             self._command = None  # by the time it is back, it has expired: only the loop may drive it again
         except DeviceRefusedError as refused:
             self._command = None
             self._note("refused", str(refused))
-
-
-def _counts(channel: Channel, drive: Mapping[str, float]) -> int:
-    """Return a drive as the device takes it."""
-    value, low, high = drive[channel.name], channel.low / 1e4, channel.high / 1e4
-    if not low <= value <= high:  # also false for NaN
-        raise ValueError(f"{channel.name} = {value:g} is outside {low:g} to {high:g}")
-    return round(1e4 * value)

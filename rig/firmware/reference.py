@@ -35,37 +35,28 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
-from thermogrip.rig.serial.framing import MAX_BODY, Damaged, Line, LineParser, encode_line
 from thermogrip.rig.serial.protocol import (
+    MAX_BODY,
     MAX_TTL_MS,
     Channel,
     Clear,
+    Damaged,
     Drive,
     Grip,
     Hello,
     Identity,
     Kept,
+    Line,
+    LineParser,
     Off,
     Request,
     Sample,
     State,
     Take,
     Taken,
+    encode_line,
     parse_request,
 )
-
-__all__ = [
-    "CELLS",
-    "MAX_PERIOD_MS",
-    "MIN_PERIOD_MS",
-    "VERSION",
-    "Board",
-    "DeviceCore",
-    "Outputs",
-    "Ring",
-    "Sensor",
-    "Value",
-]
 
 CELLS = 120
 MIN_PERIOD_MS, MAX_PERIOD_MS = 10, 1000

@@ -32,16 +32,13 @@ from dataclasses import dataclass, field
 from math import isfinite
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.rig.guard.fault_isolation import by_danger
-from thermogrip.rig.guard.model_checks import ModelMonitor, ModelSettings, Residual
+from thermogrip.rig.guard.model_checks import ModelMonitor, ModelSettings, Residual, by_danger
 from thermogrip.rig.guard.plant_mismatch import PlantDrift
 from thermogrip.rig.guard.rule_checks import RuleMonitor, RuleSettings
 from thermogrip.rig.guard.sensor_checks import SensorMonitor, SensorSettings, room_disturbances, room_sensors
 from thermogrip.rig.guard.trip import KINDS, Trip
 from thermogrip.rig.interface import UNIT_RANGES, Reading
 from thermogrip.sysid.plant.plant import Plant
-
-__all__ = ["LIMIT_MARGIN", "Findings", "Guard", "GuardSettings"]
 
 #: A limit is not exceeded by more than this before power is off [K].
 LIMIT_MARGIN = 2.0
@@ -69,7 +66,7 @@ class GuardSettings:
     clock_slack_s : float
         By how much the rig's clock may differ from ours between two readings [s].
     drive_slack : float
-        By how much the applied drive may differ from what was asked, as a part of half its range.
+        By how much the applied drive may differ from what was asked, a fraction of half its range.
     forget_s : float
         After a touch the skin is what the object made of it for so long [s].
     rooms : tuple of str or None
@@ -239,15 +236,7 @@ class Guard:
     ) -> Findings:
         """Return the accepted values of a reading, and whether to go on.
 
-        Parameters
-        ----------
-        reading : Reading
-        now : float
-            The host's time [s].
-        planned : float, optional
-            How long the loop meant to wait since the last check [s].
-        touching : bool, optional
-            Whether the gripper is closed on an object.
+        ``now`` is the host's time [s], ``planned`` how long the loop meant to wait since the last check [s].
         """
         trip = self._clocks(reading, now, planned)
         seen, late = self._seen == reading.time_s, now > self._now
@@ -283,8 +272,6 @@ class Guard:
         self._last = Findings(values, suspect, fresh, trip)
         return self._last
 
-    # ---- time ----
-
     def _clocks(self, reading: Reading, now: float, planned: float) -> Trip | None:
         s, here, there = self.settings, now - self._now, reading.time_s - self._time
         if here > planned + s.expiry_s:
@@ -303,8 +290,6 @@ class Guard:
             return Trip("clock", reading.time_s, "the rig's clock", expected, measured, figures=figures)
         return None
 
-    # ---- what is applied ----
-
     def _driver(self, reading: Reading) -> Trip | None:
         off = ""
         for name, asked in self._drive.items():
@@ -321,8 +306,6 @@ class Guard:
         return Trip(
             kind, reading.time_s, off, f"{asked:+.3g}, as asked", measured, figures={"applied": applied}
         )
-
-    # ---- limits ----
 
     def _limits(self, time: float, outputs: Mapping[str, float]) -> Trip | None:
         driven = any(self._drive.values())
@@ -350,8 +333,6 @@ class Guard:
         """Return between which temperatures a sensor may read [degC]."""
         s, skin = self.settings, name in (self.skin, f"{self.skin}_2")
         return s.limits.get(name, s.skin_limits if skin else s.other_limits)
-
-    # ---- behaviour ----
 
     def _masked(self, time: float) -> frozenset[str]:
         """Return the outputs that an object determines, now or lately."""
@@ -387,7 +368,6 @@ class Guard:
         return self._against_model(time, max(confirmed, key=lambda a: a.excess)) if confirmed else None
 
     def _against_model(self, time: float, alarm: Residual) -> Trip:
-        """Return the trip of a residual alarm."""
         figures = {"expected": alarm.expected, "measured": alarm.measured, "allowed": alarm.allowed}
         figures |= {"window_s": alarm.window}
         assert self.model is not None
@@ -431,5 +411,4 @@ class Guard:
         return value / max(abs(low), abs(high))
 
     def _plausible(self, values: Mapping[str, float]) -> dict[str, float]:
-        """Return the plausible readings."""
         return {name: value for name, value in values.items() if self.sensors.plausible(value)}

@@ -40,8 +40,6 @@ from thermogrip.rig.interface import UNIT_RANGES
 from thermogrip.sysid.models.model import Array
 from thermogrip.sysid.plant.plant import Plant
 
-__all__ = ["Estimate", "FilterSettings", "History", "InputSteps", "RigFilter", "RigModel"]
-
 
 @dataclass
 class InputSteps:

@@ -47,8 +47,6 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.models.model import Array
 from thermogrip.sysid.plant.plant import Plant
 
-__all__ = ["LEARN_FROM", "MOST_DRIFT", "USUAL_DRIFT", "Evidence", "PlantDrift"]
-
 SCHEMA, VERSION = "thermogrip.plant_drift", 1
 LEARN_FROM = 12  # healthy sessions
 USUAL_DRIFT, MOST_DRIFT = 0.05, 0.2

@@ -21,8 +21,6 @@ from dataclasses import dataclass
 
 from thermogrip.rig.guard.trip import Trip
 
-__all__ = ["RuleMonitor", "RuleSettings"]
-
 
 @dataclass(frozen=True)
 class RuleSettings:

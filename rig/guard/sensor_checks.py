@@ -34,8 +34,6 @@ from thermogrip.datasets.units import guess_role
 from thermogrip.rig.guard.trip import Trip
 from thermogrip.sysid.plant.plant import Plant
 
-__all__ = ["SensorMonitor", "SensorSettings", "repeats_needed", "room_disturbances", "room_sensors"]
-
 
 @dataclass(frozen=True)
 class SensorSettings:

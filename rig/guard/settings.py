@@ -1,6 +1,6 @@
 """What the guard allows, read from TOML: every key with its unit, its default, and the range it may have.
 
-The template in :data:`GUARD_TEMPLATE` is the documentation; ``thermogrip init guard`` writes it.  A file that
+The template, ``guard.toml``, is the documentation; ``thermogrip init guard`` writes it.  A file that
 is wrong anywhere is refused as a whole: a limit that is not understood would be a limit that is not kept.
 No file can switch a check off: each number has a range in which the check still works.
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -22,65 +23,7 @@ from thermogrip.rig.guard.plant_mismatch import MOST_DRIFT
 from thermogrip.rig.guard.rule_checks import RuleSettings
 from thermogrip.rig.guard.sensor_checks import SensorSettings
 
-__all__ = ["GUARD_TEMPLATE", "guard_from_dict", "read_guard"]
-
-GUARD_TEMPLATE = """\
-# What the guard allows.  Every line may be left out; the values here are the defaults.
-
-skin_degC = [3, 55]        # of the skin; the second accepted reading outside ends a session
-others_degC = [-1, 70]     # of every other sensor but the room's
-stale_s = 2.0              # longest time without a new reading
-expiry_s = 2.0             # longest silence of the program: the device's own time to live
-clock_slack_s = 1.0        # between the rig's clock and the computer's, from reading to reading
-drive_slack = 0.05         # between the applied drive and the asked one, a part of half its range
-forget_s = 60.0            # after a touch the skin is not compared for so long
-
-# room_sensors = ["t_lab"] # which read the room, of those that no plant knows; by name where left out
-
-# [limits]                 # of single sensors by name [degC], in place of the two above
-# t_tank = [2, 65]
-
-[sensors]                  # what a reading may be
-believable_degC = [-5, 75]
-rate_K_per_s = 5.0         # fastest change of water
-slack_K = 0.5              # besides, for noise
-bad_in_a_row = 3           # so many suspect readings end a session
-noise_K = 0.04             # white noise of a reading, standard deviation
-alpha = 1e-9               # chance that a healthy sensor is called stuck for its repeats
-pair_limit_K = 4.0         # between x and x_2
-pair_s = 30.0              # for so long they may differ by more
-
-# [[pairs]]                # more sensors of one temperature
-# sensors = ["t_tank", "t_plate"]
-# limit_K = 4.0
-
-[model]                    # how far the rig may be from its plant
-windows_s = [10, 30, 90]
-floors_K = [0.55, 0.35, 0.45]   # of each window, where the plant predicts no change
-share = 0.25               # besides, of the change that it predicts
-switching_K = 0.5          # besides, where the pump was switched in the window
-smooth_s = 3.0             # readings of so long are averaged
-jump_k = 8.0               # a reading so many standard deviations off ...
-jump_floor_K = 3.0         # ... and so many kelvin is suspect
-bias_limit_K = 2.0         # slow bias of a sensor
-drive_limit = 0.25         # slow bias of a drive, a part of half its range
-warm_up_s = 60.0           # nothing is compared for so long where the start is not at rest
-drift = 0.0                # a part by which each parameter of the plant may be off
-state_K_per_sqrt_s = 0.01
-drive_per_sqrt_s = 0.002
-output_K_per_sqrt_s = 0.002
-reading_K = 0.08           # least noise of a reading
-
-[no_model]                 # the rules where there is no plant
-window_s = 60.0
-drive = 0.5                # a drive of at least this part of its range, for the window, must ...
-least_K = 1.0              # ... move something by this with it, unless that is ...
-far_K = 8.0                # ... so far from the room already, and ...
-wrong_K = 2.0              # ... move nothing by more than this against it
-near_K = 1.0               # once so near its target ...
-leave_K = 5.0              # ... an output may be beyond this ...
-area_K_s = 120.0           # ... by this area
-"""
+GUARD_TEMPLATE = (files(__package__) / "guard.toml").read_text(encoding="utf-8")
 
 _TEMPLATE_HINT = "`thermogrip init guard` shows every key with its unit"
 
@@ -160,30 +103,33 @@ _TABLES: dict[str, tuple[str, type[Any], dict[str, _Key]]] = {
 def read_guard(path: str | Path) -> GuardSettings:
     """Read what the guard allows from a TOML file.
 
+    Parameters
+    ----------
+    path : str or Path
+        As ``thermogrip init guard`` writes it; what is left out has its default.
+
+    Returns
+    -------
+    settings : GuardSettings
+
     Raises
     ------
     UserError
         Naming the file and the key that is wrong.
+
+    Examples
+    --------
+    >>> from tempfile import mkdtemp
+    >>> path = Path(mkdtemp()) / "guard.toml"
+    >>> n = path.write_text("[limits]\\nt_tank = [2, 65]\\n")
+    >>> read_guard(path).limits
+    {'t_tank': (2.0, 65.0)}
     """
     return guard_from_dict(read_toml(path, hint="`thermogrip init guard` writes one to edit"), file=path)
 
 
 def guard_from_dict(content: Mapping[str, Any], *, file: str | Path | None = None) -> GuardSettings:
-    """Return settings from plain values; a wrong or unknown key is a :class:`UserError` that names it.
-
-    Examples
-    --------
-    >>> guard_from_dict({"limits": {"t_tank": [2, 65]}, "model": {"share": 0.3}}).limits
-    {'t_tank': (2.0, 65.0)}
-    >>> for wrong in ({"stale_ms": 500}, {"sensors": {"alpha": 0.5}}, {"limits": {"t_tank_degF": [36, 149]}}):
-    ...     try:
-    ...         guard_from_dict(wrong, file="guard.toml")
-    ...     except UserError as error:
-    ...         print(error)
-    guard.toml: stale_ms: no such key; write stale_s; `thermogrip init guard` shows every key with its unit
-    guard.toml: sensors.alpha: 0.5 is not from 1e-15 to 0.001; write one that is, or leave it out for 1e-09
-    guard.toml: limits.t_tank_degF: is not the name of a sensor; write t_tank, and its limits in degC
-    """
+    """Return settings from plain values; a wrong or unknown key is a :class:`UserError` that names it."""
     tables = {name: content[name] for name in (*_TABLES, "limits") if name in content}
     for name, table in tables.items():
         if not isinstance(table, dict):
@@ -218,7 +164,7 @@ def _values(
 
 
 def _instead(name: str, keys: Mapping[str, _Key]) -> str:
-    """Return what to do about an unknown key: its unit, its table, or what it looks like."""
+    """Return what to do about an unknown key: its unit, its table, or a similar key."""
     near = [key for key in keys if key.startswith(f"{name}_")] or get_close_matches(name, keys, 1)
     tables = [table for table, (_, _, others) in _TABLES.items() if name in others]
     if tables:
@@ -227,7 +173,6 @@ def _instead(name: str, keys: Mapping[str, _Key]) -> str:
 
 
 def _value(name: str, value: Any, key: _Key, usual: Any, file: str | Path | None) -> Any:
-    """Return one value as its setting has it."""
     hint = f"write one that is, or leave it out for {_text(usual)}"
     if key.form in ("pair", "list"):
         n = 2 if key.form == "pair" else len(value) if isinstance(value, list) else 0
@@ -252,7 +197,6 @@ def _number(name: str, value: Any, key: _Key, hint: str, file: str | Path | None
 
 
 def _limit(name: str, pair: Any, file: str | Path | None) -> tuple[float, float]:
-    """Return the limits of one sensor."""
     try:
         bare, unit = split_header(name)
     except UserError:
@@ -265,7 +209,6 @@ def _limit(name: str, pair: Any, file: str | Path | None) -> tuple[float, float]
 
 
 def _names(value: Any, file: str | Path | None) -> tuple[str, ...]:
-    """Return the names of the room's sensors."""
     if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
         raise UserError("room_sensors: is no list of names", file=file, hint='write room_sensors = ["t_lab"]')
     return tuple(value)

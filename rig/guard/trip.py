@@ -12,8 +12,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-__all__ = ["ENDLESS", "KINDS", "Trip", "TripError"]
-
 #: kind -> (what to check, how to clear), in the order of the module docstrings of the checks.
 KINDS: dict[str, tuple[str, str]] = {
     "limit": (

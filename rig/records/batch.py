@@ -46,8 +46,6 @@ from thermogrip.rig.records.recorder import RunFolder
 from thermogrip.rig.records.run_folder import mark_bad, read_run
 from thermogrip.rig.session.session import Object, Session, run_session
 
-__all__ = ["AGAIN", "Batch", "Trial", "collect", "read_plan", "run_batch"]
-
 SCHEMA, VERSION = "thermogrip.batch", 1
 #: Trips after which a trial may simply be done again: what they say is over once the rig answers.
 AGAIN = ("cable", "device", "stale", "frozen")
@@ -85,36 +83,35 @@ class Trial:
 
 @dataclass(frozen=True)
 class Batch:
-    """How a batch went.
+    """How a batch went."""
 
-    Attributes
-    ----------
-    done : tuple of Path
-        The folder of the good run of each trial that has one, in the order of the plan.
-    left : int
-        Trials without a good run.
-    verdict : str
-        ``done``, ``stopped`` (by the operator), ``tripped`` or ``not settled``.
-    advice : str
-        What to do before it goes on; empty when done.
-    sessions : int
-        How many were run this time.
-    """
-
-    done: tuple[Path, ...]
-    left: int
-    verdict: str
-    advice: str
-    sessions: int
+    done: tuple[Path, ...]  # folders of the good run of each trial that has one, in the order of the plan
+    left: int  # trials without a good run
+    verdict: str  # ``done``, ``stopped`` (by the operator), ``tripped`` or ``not settled``
+    advice: str  # what to do before it goes on; empty when done
+    sessions: int  # how many were run this time
 
 
 def read_plan(path: str | Path) -> list[Trial]:
     """Return the trials of a plan.
 
+    Parameters
+    ----------
+    path : str or Path
+        A CSV table, see the module.
+
     Raises
     ------
     UserError
         If a column or a cell breaks a rule; the line names row and column.
+
+    Examples
+    --------
+    >>> from tempfile import mkdtemp
+    >>> path = Path(mkdtemp()) / "plan.csv"
+    >>> n = path.write_text("material,t_object_degC,target_degC,block\\ncopper,18,38,c1\\n")
+    >>> read_plan(path)
+    [Trial(material='copper', target=38.0, t_object=18.0, t_object_sd=None, labels={'block': 'c1'})]
     """
     table = read_csv_table(path, text=None)
     unknown = sorted(set(table.text) - _KNOWN)
@@ -224,6 +221,22 @@ def run_batch(
     ------
     UserError
         If the folder holds another plan, or a session's first reading makes no sense.
+
+    Returns
+    -------
+    batch : Batch
+
+    Examples
+    --------
+    >>> from tempfile import mkdtemp
+    >>> from thermogrip.mpc import PIController
+    >>> from thermogrip.rig.simulation.twin import Twin
+    >>> from thermogrip.rig.simulation.virtual_device import example_plant
+    >>> plant = example_plant()
+    >>> plan = [Trial("copper", 30.0, 18.0)]
+    >>> batch = run_batch(Twin(plant, seed=1), PIController(plant), plan, mkdtemp(), grasp_time=2.0)
+    >>> batch.verdict, batch.left
+    ('done', 0)
     """
     path = Path(folder)
     _keep_plan(path, plan)
@@ -239,7 +252,12 @@ def run_batch(
                     return _batch(path, plan, "stopped", "run the same command again to go on", sessions)
                 run = next_folder(path, k)
                 known = _with_temperature(trial, k, plan, path, first_touch)
-                session = _one(source.rig, controller, known, k, run, stop, guard, about, files, options)
+                described = {**(about or {}), "trial": k + 1, **asdict(known)}
+                with RunFolder(run, described, files=files) as recorder:
+                    kept: dict[str, Any] = {"stop": stop, "guard": guard, "recorder": recorder, **options}
+                    thing = _object(known, k)
+                    session = run_session(source.rig, controller, known.target, grasp=thing, **kept)
+                    recorder.finish(session)
                 sessions += 1
                 verdict, advice = _judged(session, k, trial, run, judge)
                 if verdict == "done":
@@ -324,33 +342,10 @@ def _attempts(folder: Path, k: int) -> list[Path]:
     return found
 
 
-def _one(
-    rig: Rig,
-    controller: Controller,
-    trial: Trial,
-    k: int,
-    run: Path,
-    stop: Callable[[Grasps], bool] | None,
-    guard: Guard | None,
-    about: Mapping[str, Any] | None,
-    files: Mapping[str, Path] | None,
-    options: Mapping[str, Any],
-) -> Session:
-    """Run one session into its folder."""
-    thing = Object(
-        trial.material,
-        np.nan if trial.t_object is None else trial.t_object,
-        np.nan if trial.t_object_sd is None else trial.t_object_sd,
-        trial.labels,
-        f"{k + 1:04d}",
-    )
-    described = {**(about or {}), "trial": k + 1, **asdict(trial)}
-    with RunFolder(run, described, files=files) as recorder:
-        session = run_session(
-            rig, controller, trial.target, grasp=thing, stop=stop, guard=guard, recorder=recorder, **options
-        )
-        recorder.finish(session)
-    return session
+def _object(trial: Trial, k: int) -> Object:
+    known = {"t_object": trial.t_object, "t_object_sd": trial.t_object_sd}
+    given: dict[str, Any] = {name: value for name, value in known.items() if value is not None}
+    return Object(trial.material, labels=trial.labels, grasp_id=f"{k + 1:04d}", **given)
 
 
 def _with_temperature(

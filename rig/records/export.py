@@ -19,16 +19,31 @@ from thermogrip.datasets.log_files import write_log
 from thermogrip.datasets.schema import column
 from thermogrip.rig.records.run_folder import Run, read_run
 
-__all__ = ["export_run"]
-
 
 def export_run(folder: str | Path, out: str | Path) -> Path:
-    """Write the log of a run folder to ``out``, by its ending, and return the path.
+    """Write the log of a run folder and return the path.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Of the run.
+    out : str or Path
+        ``.nc``, ``.parquet``, ``.csv`` or ``.mcap``.
 
     Raises
     ------
     UserError
         If the run has no log, the ending is unknown, or MCAP is asked for without the package.
+
+    Examples
+    --------
+    >>> from tempfile import mkdtemp
+    >>> from thermogrip.rig.records.recorder import RunFolder
+    >>> with RunFolder(Path(mkdtemp()) / "run") as run:
+    ...     for k in range(2):
+    ...         run.sample({"time_s": k, "t_surface_degC": 25.5})
+    >>> export_run(run.path, run.path.parent / "log.csv").read_text().split()
+    ['time_s,t_surface_degC', '0.0,25.5', '1.0,25.5']
     """
     run, path = read_run(folder), Path(out)
     if run.log is None:

@@ -40,8 +40,6 @@ from thermogrip.rig.session.loop import Event
 from thermogrip.rig.session.session import Session
 from thermogrip.rig.session.signals import hold_signals
 
-__all__ = ["RESERVE", "RunFolder", "provenance", "refuse_links", "write_sums"]
-
 SCHEMA, VERSION = "thermogrip.run", 1
 RESERVE = 1 << 18  # bytes, for the last words of a run on a full disk
 FILES = ("run.json", "samples.csv", "events.jsonl", "grasps.csv", "grasps_meta.csv")
@@ -69,6 +67,15 @@ class RunFolder:
     ------
     UserError
         If the folder holds a run or a link, or cannot be made.
+
+    Examples
+    --------
+    >>> from tempfile import mkdtemp
+    >>> with RunFolder(Path(mkdtemp()) / "run") as run:
+    ...     run.sample({"time_s": 0.0, "t_surface_degC": 25.0625})
+    >>> print((run.path / "samples.csv").read_text(), end="")
+    time_s,t_surface_degC
+    0,25.0625
     """
 
     def __init__(

@@ -40,8 +40,6 @@ from thermogrip.datasets.units import split_header
 from thermogrip.rig.clock import BackOff
 from thermogrip.rig.session.loop import Event, Recorder
 
-__all__ = ["Bridge", "Messages"]
-
 PREFIX = "/thermogrip"
 MAX_BYTES = 1 << 16  # of a message from the server that is read
 _MOST_BYTES = 1 << 20  # of one that is received at all: a longer one ends the connection
@@ -171,6 +169,13 @@ class Bridge:
     ------
     UserError
         If the package is missing or nothing answers at the start.
+
+    Examples
+    --------
+    What it sends first:
+
+    >>> Messages().hello()
+    ['{"op": "subscribe", "topic": "/thermogrip/target", "type": "std_msgs/Float64"}']
     """
 
     def __init__(
@@ -237,10 +242,7 @@ class Bridge:
     ) -> None:
         self.close()
 
-    # ---- the connection ----
-
     def _connect(self) -> _Link:
-        """Return an open connection after the first messages."""
         try:
             from websockets.exceptions import WebSocketException
         except ImportError as error:
@@ -257,7 +259,6 @@ class Bridge:
         return link
 
     def _take(self, link: _Link) -> None:
-        """Use a connection from now on."""
         self._link, self._since = link, self._monotonic()
         self._hearer = threading.Thread(target=self._hear_all, args=(link,), daemon=True)
         self._hearer.start()
@@ -289,8 +290,6 @@ class Bridge:
             self._report(f"the connection to {self.url} was lost ({why})")
             self._changed.notify_all()
         link.hang_up()
-
-    # ---- the threads ----
 
     def _work(self) -> None:
         """Send what waits; connect again where there is no connection."""
@@ -339,18 +338,14 @@ class Bridge:
             self._waiting.append(item)
             self._changed.notify_all()
 
-    # ---- reports ----
-
     def _report(self, text: str) -> None:
         self.reports = (*self.reports, text)
 
     def _not_sent(self) -> str:
-        """Return in words what was dropped since the last report."""
         more, self._reported = self.dropped - self._reported, self.dropped
         return f"{more} rows and events"
 
     def _record(self) -> None:
-        """Write new reports into the record behind."""
         if self.behind is not None:
             for text in self.reports[self._recorded :]:
                 self._recorded += 1

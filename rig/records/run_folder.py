@@ -40,8 +40,6 @@ from thermogrip.rig.records.recorder import FILES, SCHEMA, VERSION, refuse_links
 from thermogrip.rig.session.loop import PHASES, Event, hold_last_good
 from thermogrip.rig.session.session import grasp_of_rows
 
-__all__ = ["Recovery", "Run", "mark_bad", "read_run", "recover", "sums_agree"]
-
 _NUMBER = re.compile(rb"-?(?:\d+(?:\.\d+)?(?:e[+-]?\d+)?|inf)")
 
 
@@ -81,10 +79,25 @@ class _Whole:
 def read_run(folder: str | Path) -> Run:
     """Return the contents of a run folder; the run may have been killed, or go on.
 
+    Parameters
+    ----------
+    folder : str or Path
+        That a :class:`~thermogrip.rig.records.recorder.RunFolder` wrote.
+
     Raises
     ------
     UserError
         If it is no run folder.
+
+    Examples
+    --------
+    >>> from tempfile import mkdtemp
+    >>> from thermogrip.rig.records.recorder import RunFolder
+    >>> with RunFolder(Path(mkdtemp()) / "run") as run:
+    ...     for k in range(3):
+    ...         run.sample({"time_s": k, "t_surface_degC": 25 + k / 2})
+    >>> read_run(run.path).log["t_surface"].values
+    array([25. , 25.5, 26. ])
     """
     path = Path(folder)
     if not (path / "samples.csv").is_file() and not (path / "run.json").is_file():
@@ -101,12 +114,26 @@ def read_run(folder: str | Path) -> Run:
 
 
 def recover(folder: str | Path) -> Recovery:
-    """Bring the folder of a run that was cut off into the state of a clean end; see the module.
+    """Return what was done to bring the folder of a run that was cut off into the state of a clean end.
+
+    Parameters
+    ----------
+    folder : str or Path
+        As of :func:`read_run`.
 
     Raises
     ------
     UserError
         If it is no run folder, holds a link, or a file was changed after the run ended.
+
+    Examples
+    --------
+    >>> from tempfile import mkdtemp
+    >>> from thermogrip.rig.records.recorder import RunFolder
+    >>> with RunFolder(Path(mkdtemp()) / "run") as run:
+    ...     run.sample({"time_s": 0.0, "t_surface_degC": 25.0})
+    >>> recover(run.path).findings
+    ('every file is as the run left it',)
     """
     path = Path(folder)
     changed = sums_agree(path)
@@ -198,7 +225,6 @@ def _whole_lines(path: Path, good: Any) -> _Whole:
 
 
 def _samples(path: Path) -> tuple[list[str], list[dict[str, float]], _Whole]:
-    """Return header, rows and the whole lines of the samples."""
     width = 0
 
     def good(at: int, line: bytes) -> bool:
@@ -221,7 +247,6 @@ def _samples(path: Path) -> tuple[list[str], list[dict[str, float]], _Whole]:
 
 
 def _names(line: bytes) -> list[str]:
-    """Return the names in the header of the samples."""
     try:
         return [from_csv(cell) for cell in next(csv.reader([line.decode("utf-8", "replace")]), [])]
     except csv.Error:

@@ -37,8 +37,6 @@ from typing import Any, Protocol
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.clock import BackOff
 
-__all__ = ["AnyPort", "Port", "PortError", "PortLock", "port_error"]
-
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 5.0  # of the back-off
 BAUDRATE = 115200
 _CHUNK = 4096
@@ -135,6 +133,16 @@ class Port:
     ----------
     opened : int
         How often it was opened; a change shows that the connection is a new one.
+
+    Examples
+    --------
+    >>> from thermogrip.rig.simulation.cable import SocketLink
+    >>> board = SocketLink()
+    >>> board.plug()
+    >>> with Port(board.url) as port:
+    ...     port.is_open, port.opened
+    (True, 1)
+    >>> board.close()
     """
 
     def __init__(

@@ -28,8 +28,6 @@ from thermogrip.rig.interface import DeviceRefusedError, Reading, Rig, SamplingR
 from thermogrip.rig.serial.port import PortError
 from thermogrip.rig.session.signals import check_stopped, hold_signals
 
-__all__ = ["PHASES", "Event", "Loop", "Recorder", "TripError"]
-
 #: The phases of a session; a log holds their index.
 PHASES = ("settle", "hold", "lead_in", "pump_off", "contact", "release")
 

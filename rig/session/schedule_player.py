@@ -15,11 +15,10 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log
 from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.rig.guard.guard import Guard
+from thermogrip.rig.guard.trip import TripError
 from thermogrip.rig.interface import UNIT_RANGES, Rig
-from thermogrip.rig.session.loop import Loop, Recorder, TripError
+from thermogrip.rig.session.loop import Loop, Recorder
 from thermogrip.rig.session.signals import stop_signals
-
-__all__ = ["Playback", "play"]
 
 
 class Playback:
@@ -45,7 +44,6 @@ class Playback:
     def _check(
         self, name: str, values: NDArray[np.float64], span: tuple[float, float], allowed: str = ""
     ) -> None:
-        """Raise UserError where a value is outside."""
         wrong = np.flatnonzero(~((values >= span[0]) & (values <= span[1])))  # also NaN
         if wrong.size:
             at, hint = int(wrong[0]), allowed or f"{span[0]:g} to {span[1]:g}"
@@ -84,35 +82,10 @@ def play(
     recorder: Recorder | None = None,
     progress: Callable[[float, str], None] | None = None,
 ) -> tuple[Log, str]:
-    """Play a schedule and return the log, and why it ended early.
+    """Play a schedule, sampled every ``dt`` [s]; return the log, and the line of the trip that ended it.
 
-    Parameters
-    ----------
-    rig : Rig
-        Twin or hardware; it is powered down but not closed at the end.
-    schedule : Log
-        As of :class:`Playback`.  While its pump is off nothing is driven.
-    dt : float, optional
-        Sample time [s].
-    guard : Guard, optional
-        The monitor of the rig; by default one without a model.
-    clock : callable, optional
-        The host's time [s], with real hardware; the rig's own where absent.
-    recorder : Recorder, optional
-        Takes every sample and event as it happens.
-    progress : callable, optional
-        Called with (fraction done, what is being done).
-
-    Returns
-    -------
-    log : Log
-    ended : str
-        The line of the trip that ended it; empty when it was played to the end.
-
-    Raises
-    ------
-    UserError
-        If the schedule does not fit the rig, or a trip ended it before there were two rows.
+    The other arguments are those of :func:`~thermogrip.rig.session.session.run_session`.  The rig is powered
+    down but not closed at the end; UserError where a trip comes before there are two rows.
     """
     player = Playback(schedule, rig.units, dt)
     run = Loop(rig, player, recorder, progress, Guard() if guard is None else guard, clock)

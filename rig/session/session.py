@@ -3,9 +3,8 @@
 The same loop runs the twin and hardware: it asks the rig for a reading, the controller for a move, and lets
 the rig pass one sample time.
 
-    settle    regulate until the target has settled (:mod:`~thermogrip.rig.session.settling`) and the guard
-    has
-              compared the skin with the model for long enough, or the time-out is over
+    settle    regulate until the target has settled (below) and the guard has compared the skin with the
+              model for long enough, or the time-out is over
     hold      keep regulating for ``hold`` seconds
     lead_in   one second of fast samples under the last move
     pump_off  pump and drive off, one second, so that no water moves when the object touches
@@ -21,6 +20,24 @@ A session that does not settle is an answer (a verdict), not an error, and so is
 
 The object's temperature is a number (what the warmer is set to), the name of a sensor that is read as the
 gripper closes, or unknown; from an earlier touch of the same block it is a number with its uncertainty.
+
+When has a temperature settled?  A test that allows for noise, and the three figures of a step
+----------------------------------------------------------------------------------------------
+
+Over the last ``window`` seconds the error e = y - target is fitted by a line, e = a + b (t - t_mean).  Its
+two coefficients are uncertain: readings are noisy, quantised, and correlated from sample to sample.
+With the residual standard deviation s, floored at the rounding error quantum / sqrt(12), and its lag-one
+correlation r, the n samples are worth n_eff = n (1 - r) / (1 + r) independent ones, so
+
+    se(a) = s / sqrt(n_eff),        se(b) = sqrt(12) s / (window sqrt(n_eff)).
+
+The temperature has settled if level and drift are inside the band even at two standard errors:
+
+    |a| + 2 se(a) <= band    and    window (|b| + 2 se(b)) <= band.
+
+A single reading inside the band proves nothing (it may be passing through), and a fixed waiting time proves
+less.  The rule errs towards waiting: with noise that could hide a drift of the size of the band it is never
+met.
 """
 
 from __future__ import annotations
@@ -30,19 +47,88 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, Grasps, Log, make_grasps
 from thermogrip.mpc.interface import Controller, Move, Target
 from thermogrip.rig.guard.guard import Guard
-from thermogrip.rig.guard.trip import Trip
+from thermogrip.rig.guard.trip import Trip, TripError
 from thermogrip.rig.interface import Rig
-from thermogrip.rig.session.loop import PHASES, Event, Loop, Recorder, TripError
-from thermogrip.rig.session.settling import has_settled, step_figures
+from thermogrip.rig.session.loop import PHASES, Event, Loop, Recorder
 from thermogrip.rig.session.signals import stop_signals
 from thermogrip.sysid.effusivity.quality import find_contact
 
-__all__ = ["PHASES", "Event", "Object", "Recorder", "Session", "run_session"]
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class StepFigures:
+    """Settling time, overshoot and bias of a regulated step."""
+
+    # time from the start after which the smoothed error stays inside the band [s]; NaN if it does not
+    settle_time: float
+    # of the smoothed temperature beyond the target, in the direction of approach [K]
+    overshoot: float
+    # mean error of the last 120 s, or since it settled where that is shorter [K]; NaN if it did not
+    bias: float
+
+
+def has_settled(
+    time: ArrayLike, error: ArrayLike, *, band: float, window: float = 30.0, quantum: float = 1 / 16
+) -> bool:
+    """Say whether level and drift of the last ``window`` seconds are surely inside the band."""
+    t, e = np.asarray(time, dtype=float), np.asarray(error, dtype=float)
+    if t.size == 0 or t[-1] - t[0] < window:
+        return False
+    recent = (t >= t[-1] - window) & np.isfinite(e)
+    t, e = t[recent], e[recent]
+    if t.size < 5:
+        return False
+    slope, level = np.polyfit(t - t.mean(), e, 1)
+    se_level = _standard_error(e - level - slope * (t - t.mean()), quantum)
+    se_slope = np.sqrt(12.0) * se_level / window
+    level_ok = abs(level) + 2 * se_level <= band
+    return bool(level_ok and window * (abs(slope) + 2 * se_slope) <= band)
+
+
+def step_figures(
+    time: ArrayLike, reading: ArrayLike, target: float, *, band: float = 0.25, smooth: float = 5.0
+) -> StepFigures:
+    """Return settling time, overshoot and bias of a temperature that was brought to a constant target."""
+    t, y = np.asarray(time, dtype=float), np.asarray(reading, dtype=float)
+    t, y = t[np.isfinite(y)], y[np.isfinite(y)]
+    if t.size == 0:
+        return StepFigures(np.nan, 0.0, np.nan)
+    error = _moving_mean(t, y, smooth) - target
+    outside = np.flatnonzero(np.abs(error) > band)
+    approach = np.sign(target - y[0])
+    beyond = approach * error if abs(y[0] - target) > band else np.abs(error)
+    overshoot = max(0.0, float(beyond.max()))
+    if outside.size and outside[-1] == t.size - 1:
+        return StepFigures(np.nan, overshoot, np.nan)
+    settled_at = t[outside[-1] + 1] if outside.size else t[0]
+    last = t >= max(settled_at, t[-1] - 120.0)
+    return StepFigures(float(settled_at - t[0]), overshoot, float(np.mean(y[last] - target)))
+
+
+def _standard_error(residual: Array, quantum: float) -> float:
+    """Return the standard error of the mean of correlated residuals about a line."""
+    n = residual.size
+    sd = max(float(np.sqrt(residual @ residual / (n - 2))), quantum / np.sqrt(12.0))
+    power = float(residual @ residual)
+    lag_one = float(residual[1:] @ residual[:-1]) / power if power > 0 else 0.0
+    # 1/n and 3/n undo the bias of a lag-one correlation about a fitted line
+    r = min(max(lag_one + (1 + 3 * max(lag_one, 0.0)) / n, 0.0), 0.95)
+    return float(sd / np.sqrt(max(n * (1 - r) / (1 + r), 2.0)))
+
+
+def _moving_mean(t: Array, y: Array, width: float) -> Array:
+    """Return the mean of y over the ``width`` seconds round each time (shorter at the ends)."""
+    total = np.concatenate([[0.0], np.cumsum(y)])
+    lo, hi = np.searchsorted(t, t - width / 2, "left"), np.searchsorted(t, t + width / 2, "right")
+    return np.asarray((total[hi] - total[lo]) / (hi - lo))
+
 
 LEAD_S = 1.0  # of fast samples before, and after, the pump stops
 
@@ -89,8 +175,7 @@ class Session:
     advice : str
         What to do about it; empty when settled.
     settle_time, overshoot, bias : float
-        As in :class:`~thermogrip.rig.session.settling.StepFigures`; of the worst output where there are
-        several.
+        [s], [K], [K], as in :class:`StepFigures`; of the worst output where there are several.
     contact : float
         When the skin made contact [s after the "closed" message]; NaN where there was no contact.
     trip : Trip or None
@@ -168,6 +253,16 @@ def run_session(
     ------
     UserError
         If the rig has no sensor of a target's name, or a target or first reading makes no sense.
+
+    Examples
+    --------
+    >>> from thermogrip.mpc import PIController
+    >>> from thermogrip.rig.simulation.twin import Twin
+    >>> from thermogrip.rig.simulation.virtual_device import example_plant
+    >>> plant = example_plant()
+    >>> session = run_session(Twin(plant, seed=1), PIController(plant), 30.0)
+    >>> session.verdict, abs(session.bias) < 0.25
+    ('settled', True)
     """
     run = Loop(rig, controller, recorder, progress, Guard(skin=output) if guard is None else guard, clock)
     thing = Object(*grasp) if isinstance(grasp, tuple) else grasp
@@ -226,7 +321,6 @@ def _settle(run: Loop, timeout: float, band: float) -> bool:
 
 
 def _has_settled(run: Loop, name: str, band: float) -> bool:
-    """Say whether one output has settled."""
     error = run.column(f"{name}_degC", last=40.0) - run.target[name]
     return has_settled(run.column("time_s", last=40.0), error, band=band)
 
@@ -330,7 +424,6 @@ def _contact_time(run: Loop, grasps: Grasps | None) -> float:
 
 
 def _result(run: Loop, verdict: str, grasps: Grasps | None, band: float, trip: Trip | None = None) -> Session:
-    """Return the session as a record."""
     if len(run.rows) < 2:
         raise UserError("the session ended at its first reading", hint="" if trip is None else trip.line())
     contact = _contact_time(run, grasps)

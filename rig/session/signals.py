@@ -22,8 +22,6 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-__all__ = ["check_stopped", "hold_signals", "stop_signals"]
-
 _STOP = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name))
 _HOLD = (signal.SIGINT, *_STOP)
 

@@ -21,8 +21,6 @@ from random import Random
 
 from thermogrip.datasets.errors import UserError
 
-__all__ = ["SPOILS", "PtyLink", "SocketLink", "spoil"]
-
 _CHUNK = 4096
 
 
@@ -146,7 +144,6 @@ def _no_ptys() -> UserError:
 
 
 def _flip(data: bytes, rng: Random) -> bytes:
-    """Flip one to eight bits."""
     spoilt = bytearray(data)
     for _ in range(rng.randint(1, 8)):
         spoilt[rng.randrange(len(spoilt))] ^= 1 << rng.randrange(8)
@@ -154,7 +151,6 @@ def _flip(data: bytes, rng: Random) -> bytes:
 
 
 def _replace(data: bytes, rng: Random) -> bytes:
-    """Put random bytes over a stretch."""
     start, end = _stretch(data, rng)
     return data[:start] + rng.randbytes(end - start) + data[end:]
 
@@ -166,7 +162,6 @@ def _lose(data: bytes, rng: Random) -> bytes:
 
 
 def _invent(data: bytes, rng: Random) -> bytes:
-    """Put random bytes in between."""
     at = rng.randint(0, len(data))
     return data[:at] + rng.randbytes(rng.randint(1, 40)) + data[at:]
 
@@ -181,7 +176,6 @@ def _digit(data: bytes, rng: Random) -> bytes:
 
 
 def _cut(data: bytes, rng: Random) -> bytes:
-    """Keep only the head."""
     return data[: rng.randrange(len(data))]
 
 

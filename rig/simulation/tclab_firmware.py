@@ -27,8 +27,6 @@ from collections.abc import Sequence
 
 from thermogrip.rig.firmware.reference import Board, Outputs, Value
 
-__all__ = ["LSB", "TCLAB_VERSION", "TCLabCore"]
-
 TCLAB_VERSION = "TCLab Firmware 2.0.1 Arduino Leonardo/Micro"
 LSB = 0.322265625  # degC a count of the converter, whose zero is at -50 degC
 CEILINGS = (200.0, 100.0)  # of the pulse widths at the start, for which the plant was identified

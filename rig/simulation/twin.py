@@ -35,12 +35,10 @@ from numpy.typing import NDArray
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.rig.guard.sensor_checks import room_disturbances
-from thermogrip.rig.interface import UNIT_RANGES, Notice, Reading
+from thermogrip.rig.interface import UNIT_RANGES, Notice, Reading, check_order
 from thermogrip.sysid.contact.simulation import ContactModel, Touch
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.plant.plant import Plant
-
-__all__ = ["Twin"]
 
 Array = NDArray[np.float64]
 
@@ -119,6 +117,15 @@ class Twin:
     ----------
     history : list of dict
         One row a native step: time, inputs as integrated, true outputs, ``contact`` (0 or 1).
+
+    Examples
+    --------
+    >>> from thermogrip.rig.simulation.virtual_device import example_plant
+    >>> twin = Twin(example_plant(), ambient=20.0)
+    >>> twin.apply({"drive": 0.5}, pump=1)
+    >>> twin.wait(60.0)
+    >>> twin.time, 21.0 < twin.read().values["t_tank"] < 30.0
+    (60.0, True)
     """
 
     def __init__(
@@ -184,14 +191,7 @@ class Twin:
 
     def apply(self, drive: Mapping[str, float], pump: int) -> None:
         """Set drive and pump from now on; ValueError for an unknown input or a value outside its range."""
-        if set(drive) != set(self._drive):
-            raise ValueError(f"drive has {sorted(drive)}, the rig's inputs are {sorted(self._drive)}")
-        for name, value in drive.items():
-            lo, hi = self.limits[name]
-            if not lo <= value <= hi:  # also false for NaN
-                raise ValueError(f"{name} = {value:g} is outside {lo:g} to {hi:g}")
-        if pump not in (0, 1):
-            raise ValueError(f"pump = {pump} is neither 0 nor 1")
+        check_order(drive, pump, self.limits)
         if self.closed and (pump or any(drive.values())):
             raise RuntimeError("the rig is closed")
         self._drive = {name: float(drive[name]) for name in self._drive}
@@ -284,7 +284,6 @@ class Twin:
         return make_log(table["time_s"], variables, name="twin")
 
     def _state_at_rest(self, temperature: float) -> Array:
-        """Return the state of a plant at rest at one temperature."""
         y = np.full(len(self.plant.outputs), float(temperature))
         return np.asarray(self.plant.model.rest(y, self._input_vector(), self._d, self.plant.p), dtype=float)
 
@@ -309,7 +308,6 @@ class Twin:
         return np.array([given.get(name, self.ambient) for name in self.plant.disturbances], dtype=float)
 
     def _accumulate(self, seconds: float) -> None:
-        """Add what is applied to the integral of this native step."""
         self._applied += seconds * self._input_vector()
         self._elapsed += seconds
 
@@ -320,14 +318,12 @@ class Twin:
         return np.where(switch, np.round(mean), mean)
 
     def _advance(self, u: Array) -> tuple[Array, Array]:
-        """Return state and outputs one native step on."""
         y, x = self.plant.model.rollout(
             self._x[None], u[None, None], self._d[None, None], self.plant.p[None], self.plant.dt
         )
         return x[0], y[0, -1]
 
     def _step(self) -> None:
-        """Take the native step that is complete."""
         u = self._mean_input()
         self._x, self._y = self._advance(u)
         self._k += 1
@@ -357,7 +353,6 @@ class Twin:
         return 0.0 if self._contact is None else self._contact.addition(self.time, alone, self.recovery)
 
     def _sensor(self, name: str, true: float) -> float:
-        """Return what the sensor of an output shows."""
         if name == self.plant.outputs[0]:  # the slow noise of all sensors moves on once a sample
             keep = float(np.exp(-(self.time - self._slow_at) / self.slow_time))
             for each in self._slow:
@@ -373,7 +368,6 @@ class Twin:
         return round(value / self.quantum) * self.quantum if self.quantum > 0 else value
 
     def _write_history(self, u: Array) -> None:
-        """Note the native step."""
         touching = self._contact is not None and np.isinf(self._contact.opened)
         row = {"time_s": self.time, "contact": float(touching)}
         row |= {name: float(v) for name, v in zip(self.plant.inputs, u)}
@@ -381,7 +375,6 @@ class Twin:
 
 
 def _input_range(plant: Plant, name: str) -> tuple[float, float]:
-    """Return the range of an input from its unit."""
     unit = plant.units.get(name, "1")
     if unit not in UNIT_RANGES:
         raise UserError(

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from thermogrip.rig.firmware.reference import Board, DeviceCore, Sensor, Value
-from thermogrip.rig.serial.framing import encode_line
-from thermogrip.rig.serial.protocol import Channel
+from thermogrip.rig.serial.protocol import Channel, encode_line
 
 GRIPPER = Board(
     sensors=(

@@ -11,6 +11,7 @@ from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.rig.clock import SteppedClock
 from thermogrip.rig.drivers.tclab import TCLabRig
 from thermogrip.rig.drivers.thermogrip import DeviceRig
+from thermogrip.rig.guard.model_checks import ModelMonitor, Residual
 from thermogrip.rig.serial.port import Port
 from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
 from thermogrip.sysid.models.state_space import StateSpaceModel
@@ -35,6 +36,14 @@ def make_heater() -> Plant:
     """Return one heater, at rest at 25 degC."""
     block = StateSpaceModel(("q",), (), ("t",), A=[[0.99]], B=[[0.5]], C=[[1.0]], dt=1.0, y0=[25.0])
     return Plant(block, {}, dt=1.0, units={"q": "1"})
+
+
+def follow(
+    monitor: ModelMonitor, time: float, drive: Mapping[str, float], values: Mapping[str, float]
+) -> list[Residual]:
+    """Return the alarms of readings under a drive with the pump on."""
+    monitor.predict(time, drive, 1, values)
+    return monitor.update(time, values)
 
 
 class Constant:

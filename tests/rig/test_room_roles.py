@@ -15,7 +15,6 @@ from tests.rig.makers import Constant
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import names
 from thermogrip.rig.guard.guard import Findings, Guard, GuardSettings
-from thermogrip.rig.guard.kalman_filter import FilterSettings, RigFilter, RigModel
 from thermogrip.rig.guard.sensor_checks import room_sensors
 from thermogrip.rig.guard.settings import guard_from_dict
 from thermogrip.rig.interface import Reading
@@ -120,8 +119,8 @@ def test_a_room_that_stands_still_is_not_stuck_and_a_block_that_does_is() -> Non
     moves = [dict.fromkeys((BLOCK, ROOM), 25.0 + 0.0625 * (k % 2)) for k in range(25)]
     still = [{}] * 60
     assert all(one.trip is None for one in read_by(Guard(PLANT), *moves, *still))
-    stands = [{BLOCK: 25.0}] * 60
-    assert "stuck" in [one.trip.kind for one in read_by(Guard(PLANT), *moves, *stands) if one.trip]
+    block = [{BLOCK: 25.0}] * 60
+    assert "stuck" in [one.trip.kind for one in read_by(Guard(PLANT), *moves, *block) if one.trip]
 
 
 def test_what_is_regulated_is_guarded_without_a_plant_too() -> None:
@@ -139,20 +138,6 @@ def test_without_a_model_the_room_of_the_rules_is_the_one_of_any_name() -> None:
         found = guard.check(Reading(float(k), steady, {"drive": 1.0}, 1), float(k), planned=1.0)
         kinds += [found.trip.kind] if found.trip else []
     assert kinds[0] == "driver"
-
-
-def test_a_limit_may_be_stated_for_an_output_and_for_no_room() -> None:
-    rooms = room_sensors(STEADY, PLANT)
-    GuardSettings(limits={BLOCK: (5.0, 40.0)}).check_sensors(STEADY, rooms)
-    with pytest.raises(UserError, match=f"no sensor '{ROOM}' to guard"):
-        GuardSettings(limits={ROOM: (5.0, 40.0)}).check_sensors(STEADY, rooms)
-
-
-def test_a_start_at_rest_agrees_with_the_room_of_any_name() -> None:
-    rig = RigFilter(RigModel(PLANT), FilterSettings(), 10)
-    for room, at_rest in ((25.0, True), (30.0, False)):
-        rig.reset(0.0, np.array([25.0, 25.0]), np.array([room]))
-        assert rig.at_rest == at_rest
 
 
 def test_a_twin_has_its_room_in_every_measured_temperature_and_asks_for_the_rest() -> None:

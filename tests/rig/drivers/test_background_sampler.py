@@ -129,21 +129,6 @@ def test_what_was_read_before_a_failure_is_taken_first(plant: Plant) -> None:
             sampler.take()
 
 
-def test_a_rig_that_fails_raises_for_whoever_takes(plant: Plant) -> None:
-    rig, readings = Slow(plant), iter([None] * 5)
-
-    def takes() -> None:
-        if next(readings, "none is left"):
-            raise RuntimeError("unplugged")
-
-    rig.takes = takes
-    with Sampler(rig, 0.001) as sampler:
-        wait_for(lambda: sampler._failure is not None)
-        assert len(sampler.take()) == 5
-        with pytest.raises(RuntimeError, match="unplugged"):
-            sampler.take()
-
-
 def test_the_rig_is_asked_between_two_samples(plant: Plant) -> None:
     rig, inside, clash = Slow(plant), threading.Event(), []
 

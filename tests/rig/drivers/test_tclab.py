@@ -255,23 +255,12 @@ def test_a_silent_port_is_no_tclab() -> None:
         TCLabRig(DirectPort(device), greeting=0.05, timeout=0.01)
 
 
-def test_who_is_there_is_found_out(plant: object) -> None:
-    lab = open_rig(DirectPort(VirtualDevice(make_lab(), protocol="tclab", link="none", clock=SteppedClock())))
-    assert isinstance(lab, TCLabRig)
-    lab.close()
-    ours = open_rig(DirectPort(VirtualDevice(make_lab(), link="none", clock=SteppedClock())))
-    assert not isinstance(ours, TCLabRig)
-    ours.close()
-
-
 def test_the_makers_own_client_runs_against_the_virtual_board(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     client = pytest.importorskip("tclab")
     with VirtualDevice(make_lab(), protocol="tclab", clock=SteppedClock(), t_start=25.0) as device:
-        found = [
-            (device.port, "virtual", "USB VID:PID=2341:8036")
-        ]  # it takes only what looks like an Arduino
+        found = [(device.port, "virtual", "USB VID:PID=2341:8036")]  # it takes only an Arduino
         monkeypatch.setattr(client.tclab.list_ports, "comports", lambda: found)
         with client.TCLab(port=device.port) as lab:
             assert lab.version == TCLAB_VERSION

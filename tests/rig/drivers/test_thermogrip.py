@@ -20,7 +20,7 @@ from thermogrip.rig.clock import SteppedClock
 from thermogrip.rig.drivers.background_sampler import Sampler
 from thermogrip.rig.drivers.connect import open_rig, recognise
 from thermogrip.rig.drivers.thermogrip import TTL_S, DeviceClock, DeviceRig, Gathering
-from thermogrip.rig.interface import DeviceRefusedError, Reading, SamplingRig
+from thermogrip.rig.interface import DeviceRefusedError, Reading
 from thermogrip.rig.serial.port import PortError
 from thermogrip.rig.serial.protocol import Kept, Request, Taken, parse_request
 from thermogrip.rig.session.session import run_session
@@ -193,21 +193,6 @@ def test_a_line_that_spoils_half_of_what_it_carries_gives_right_readings_or_none
     direct.device.clear()
 
 
-def test_no_drive_while_the_pump_is_off(bench: Bench) -> None:
-    with pytest.raises(DeviceRefusedError, match="pump is off"):
-        bench.rig.apply(DRIVE, 0)
-    bench.rig.apply({"drive": 0.0}, 0)
-
-
-def test_a_pump_that_stands_still_switches_off(direct: Bench) -> None:
-    direct.rig.apply(DRIVE, 1)
-    direct.device.fault("pump_stall")
-    direct.rig.wait(4.0)
-    with pytest.raises(DeviceRefusedError, match="pump"):
-        direct.rig.apply(DRIVE, 1)
-    assert direct.device.applied_drive == {"drive": 0.0}
-
-
 def test_a_driver_that_is_stuck_is_cut_with_its_supply(bench: Bench) -> None:
     bench.rig.apply(DRIVE, 1)
     for share in (0.25, -1.0):
@@ -215,15 +200,6 @@ def test_a_driver_that_is_stuck_is_cut_with_its_supply(bench: Bench) -> None:
         assert bench.device.applied_drive == {"drive": share}
     bench.rig.apply({"drive": 0.0}, 0)
     assert bench.device.applied_drive == {"drive": 0.0}
-
-
-def test_the_gripper_closes_on_what_is_there(direct: Bench) -> None:
-    direct.device.place("copper", 45.0)
-    direct.rig.grasp("copper", 45.0)
-    direct.rig.wait(5.0)
-    touched = direct.rig.read().values["t_surface"]
-    direct.rig.release()
-    assert touched > 30.0
 
 
 def test_close_never_raises_and_says_what_it_could_not_do(direct: Bench) -> None:
@@ -262,15 +238,15 @@ class Flood(DirectPort):
 def test_a_device_that_never_stops_talking_is_not_waited_for_for_ever(
     plant: Plant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    clock, looks = SteppedClock(), SteppedClock()
+    clock, real = SteppedClock(), SteppedClock()
     device = VirtualDevice(plant, link="none", clock=clock)
-    # what waits for a line asks the computer's clock: here it goes on by a millisecond at each look
-    monkeypatch.setattr(time, "monotonic", lambda: looks.sleep(0.001) or looks())
+    # what waits for a line asks the computer's clock: here it goes on by a millisecond each time
+    monkeypatch.setattr(time, "monotonic", lambda: real.sleep(0.001) or real())
     with pytest.raises(PortError, match="nothing here speaks"):
         DeviceRig(Flood(device), clock=clock, sleep=clock.sleep, timeout=0.02, greeting=0.1)
     with pytest.raises(PortError, match="says only"):
         recognise(Flood(device), seconds=1.0)
-    assert looks() < 10.0
+    assert real() < 10.0
 
 
 def test_a_port_that_vanishes_between_opening_and_reading_is_one_line(plant: Plant) -> None:
@@ -312,33 +288,19 @@ def sampling(plant: Plant) -> Iterator[Sampling]:
     made.close()
 
 
-def test_a_device_with_our_firmware_may_sample_by_itself(sampling: Sampling) -> None:
-    assert isinstance(sampling.rig, SamplingRig)
-
-
-def test_a_host_that_was_held_up_loses_nothing(sampling: Sampling) -> None:
-    for held_up in (0.01, 0.05, 0.2, 0.01, 0.13):
+def test_a_host_that_was_held_up_loses_nothing_and_each_reading_has_its_time_and_drive(
+    sampling: Sampling,
+) -> None:
+    sampling.clock.sleep(0.015)
+    sampling.rig.apply({"drive": 0.5}, 1)
+    for held_up in (0.015, 0.05, 0.2, 0.01, 0.13):
         sampling.clock.sleep(held_up)
         sampling.take()
     assert sampling.lost == 0
-    assert sampling.ticks() == list(range(len(sampling.got)))
-    assert len(sampling.got) == round(sampling.clock() / DT) + 1
-
-
-def test_a_reading_has_the_time_at_which_it_was_measured(sampling: Sampling) -> None:
-    sampling.clock.sleep(0.105)
-    sampling.take()
     assert [reading.time_s for reading in sampling.got] == pytest.approx(
-        [DT * k for k in range(11)], abs=1e-9
+        [DT * k for k in range(43)], abs=1e-9
     )
-
-
-def test_a_reading_says_what_was_applied_then(sampling: Sampling) -> None:
-    sampling.clock.sleep(0.015)
-    sampling.rig.apply({"drive": 0.5}, 1)
-    sampling.clock.sleep(0.015)
-    sampling.take()
-    assert [(r.drive["drive"], r.pump) for r in sampling.got] == [(0.0, 0), (0.0, 0), (0.5, 1), (0.5, 1)]
+    assert [(r.drive["drive"], r.pump) for r in sampling.got[:3]] == [(0.0, 0), (0.0, 0), (0.5, 1)]
 
 
 def test_what_the_device_could_not_keep_is_counted(sampling: Sampling) -> None:

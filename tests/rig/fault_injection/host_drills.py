@@ -21,8 +21,7 @@ from tests.rig.fault_injection.drills import drill_plants
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.clock import ScaledClock
 from thermogrip.rig.records.run_folder import Run, read_run
-from thermogrip.rig.simulation.bench import Moment
-from thermogrip.rig.simulation.virtual_device import VirtualDevice
+from thermogrip.rig.simulation.virtual_device import Moment, VirtualDevice
 
 SPEED = 2.0  # a loaded computer holds up a host for some tenths of a real second
 ROWS = 6  # on disk, before anything is done to the host

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.rig.cores import SCRIPTS, reference, say
-from thermogrip.rig.serial.framing import encode_line
+from thermogrip.rig.serial.protocol import encode_line
 
 SPECIFICATION = Path(__file__).parents[3] / "docs" / "reference" / "protocol.md"
 

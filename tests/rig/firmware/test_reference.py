@@ -14,13 +14,15 @@ from hypothesis import strategies as st
 
 from tests.rig.cores import SCRIPTS, START, last_state, reference, say
 from thermogrip.rig.firmware.reference import CELLS, DeviceCore, Ring
-from thermogrip.rig.serial.framing import MAX_BODY, Line, LineParser, encode_line
 from thermogrip.rig.serial.protocol import (
+    MAX_BODY,
     Answer,
     Event,
     Hello,
     HostEnd,
     Kept,
+    Line,
+    LineParser,
     Read,
     Refused,
     Request,
@@ -28,6 +30,7 @@ from thermogrip.rig.serial.protocol import (
     Take,
     Taken,
     Unexpected,
+    encode_line,
     parse_taken,
 )
 from thermogrip.rig.simulation.cable import spoil
@@ -103,7 +106,7 @@ class Conversation:
         return event.content
 
     def numbers(self, taken: Taken) -> list[int]:
-        """Return the numbers of the readings, each of which carries its own."""
+        """Return the numbers of the readings, each of which holds its own."""
         found = [taken.first + k for k, kept in enumerate(taken.readings) if kept is not None]
         assert found == [kept.temperatures[0] for kept in taken.readings if kept is not None]
         return found

@@ -12,8 +12,7 @@ import pytest
 
 from tests.rig.cores import BOARDS
 from thermogrip.rig.firmware.reference import DeviceCore
-from thermogrip.rig.serial.framing import encode_line
-from thermogrip.rig.serial.protocol import State
+from thermogrip.rig.serial.protocol import State, encode_line
 
 
 def test_a_compiler_reads_the_sketch() -> None:

@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from tests.rig.makers import make_heater
 from thermogrip.rig.guard.kalman_filter import FilterSettings, InputSteps, RigFilter, RigModel
@@ -25,7 +23,7 @@ def plant() -> Plant:
     """Two outputs of which the second is the reference, behind a drive in percent and a step of 2 s."""
     model = StateSpaceModel(
         ("q",),
-        ("t_ambient",),
+        ("hall",),
         ("a", "b"),
         A=A,
         B=B[:, None] / HALF,
@@ -34,7 +32,7 @@ def plant() -> Plant:
         dt=2.0,
         y0=LEVEL,
     )
-    units = {"q": "percent", "t_ambient": "degC", "a": "degC", "b": "degC"}
+    units = {"q": "percent", "hall": "degC", "a": "degC", "b": "degC"}
     offsets = dict(zip("ab", OFFSET.tolist()))
     return Plant(model, {}, dt=2.0, units=units, offsets=offsets, noise={"a": 0.2, "b": 0.01}, reference="b")
 
@@ -67,6 +65,7 @@ class Textbook:
         H, R = self.H[seen], self.R[np.ix_(seen, seen)]
         K = self.P @ H.T @ np.linalg.inv(H @ self.P @ H.T + R)
         self.z = self.z + K @ (y - self.expected())[seen]
+        self.z[2] = np.clip(self.z[2], -0.5, 0.5)  # a drive's bias is at most half of half its range
         self.P = (np.eye(4) - K @ H) @ self.P
 
     def expected(self) -> np.ndarray:
@@ -76,26 +75,17 @@ class Textbook:
         return np.sqrt(np.diag(self.H @ self.P @ self.H.T + self.R))
 
 
-@settings(max_examples=25, deadline=None)
-@given(
-    st.lists(
-        st.tuples(
-            st.floats(20.0, 80.0),
-            st.lists(st.one_of(st.floats(-1.0, 1.0), st.just(np.nan)), min_size=2, max_size=2),
-        ),
-        min_size=1,
-        max_size=25,
-    )
-)
-def test_state_and_biases_are_those_of_the_textbook(rows: list[tuple[float, list[float]]]) -> None:
-    found = at_rest()
+@pytest.mark.parametrize("seed", range(12))
+def test_state_and_biases_are_those_of_the_textbook(seed: int) -> None:
+    rng, found = np.random.default_rng(seed), at_rest()
     want = Textbook(found.x.copy())
-    for k, (q, noise) in enumerate(rows):
-        found.predict(2.0 * (k + 1), np.array([q]), np.array([np.nan]))
+    for k in range(1, 26):
+        q = float(rng.uniform(20.0, 80.0))
+        found.predict(2.0 * k, np.array([q]), np.array([np.nan]))
         want.predict(q)
         np.testing.assert_allclose(found.expected, want.expected(), atol=1e-6)
         np.testing.assert_allclose(found.spread(), want.spread(), rtol=1e-4)
-        y = LEVEL + OFFSET + np.array(noise)
+        y = LEVEL + OFFSET + np.where(rng.random(2) < 0.2, np.nan, rng.uniform(-1.0, 1.0, 2))
         found.correct(y)
         want.correct(y)
         np.testing.assert_allclose([*found.x, found.w[0], found.b[0]], want.z, atol=1e-5)
@@ -112,7 +102,7 @@ def test_a_silence_of_some_steps_makes_as_much_less_known_as_these_steps() -> No
         want.predict(40.0)
     once.predict(6.0, np.array([40.0]), np.array([25.0]))
     np.testing.assert_allclose(once.expected, want.expected(), atol=1e-6)
-    # what comes in between is carried from the end of the silence, not from where it came
+    # what comes in between counts from the end of the silence, not from where it came
     np.testing.assert_allclose(once.spread(), want.spread(), rtol=0.1)
 
 
@@ -206,7 +196,7 @@ def test_a_drive_of_unknown_unit_and_range_goes_from_minus_1_to_1() -> None:
 
 
 @pytest.mark.parametrize("silence", [5, 15, 40])
-def test_a_long_silence_is_carried_as_many_short_waits_are(silence: int) -> None:
+def test_a_long_silence_counts_as_many_short_waits(silence: int) -> None:
     once, often = heater(), heater()
     for made in (once, often):
         made.predict(1.0, np.array([0.2]), NOTHING)

@@ -79,7 +79,7 @@ REFUSED: dict[str, tuple[str, tuple[str, ...]]] = {
     "windows that fall": ("[model]\nwindows_s = [30, 10, 90]", ("model.windows_s", "shortest first")),
     "a window twice": ("[model]\nwindows_s = [10, 10, 90]", ("model.windows_s", "shortest first")),
     "smoother than a window": ("[model]\nsmooth_s = 12", ("model.smooth_s", "shorten")),
-    "a table that is none": ("sensors = 3", ("sensors", "[sensors]")),
+    "a number in place of a table": ("sensors = 3", ("sensors", "[sensors]")),
     "a pair without its limit": ('[[pairs]]\nsensors = ["a", "b"]', ("pairs", "limit_K")),
     "a pair of three": ('[[pairs]]\nsensors = ["a", "b", "c"]\nlimit_K = 2', ("pairs.sensors", "two names")),
     "a pair beyond reason": ('[[pairs]]\nsensors = ["a", "b"]\nlimit_K = 99', ("pairs.limit_K", "0.1 to 50")),

@@ -1,5 +1,4 @@
-"""A batch in words: it goes on where it was stopped, does bad trials again, and labels what classify
-reads."""
+"""A batch in words: it goes on where it was stopped, does bad trials again, and labels its grasps."""
 
 from __future__ import annotations
 
@@ -107,7 +106,7 @@ def test_a_cable_that_was_out_costs_one_trial_again(plant: Plant, controller: An
     assert batch.done[0].name == "0001-2"
 
 
-class Blind(Twin):
+class Masked(Twin):
     """A twin whose skin sensor is gone after a while."""
 
     def read(self) -> Reading:
@@ -118,7 +117,7 @@ class Blind(Twin):
 
 
 def test_a_lost_sensor_stops_the_batch_with_power_off(plant: Plant, controller: Any, tmp_path: Path) -> None:
-    rig = Blind(plant, contact=Grip())
+    rig = Masked(plant, contact=Grip())
     batch = run_batch(rig, controller, PLAN, tmp_path)
     assert (batch.verdict, batch.left, batch.sessions) == ("tripped", 3, 1)
     assert "plug" in batch.advice

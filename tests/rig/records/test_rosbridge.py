@@ -1,5 +1,4 @@
-"""The bridge against a minimal rosbridge server: what is published, what comes in, what a dead network
-costs."""
+"""The bridge against a minimal rosbridge server: what is published, comes in, and is lost."""
 
 from __future__ import annotations
 
@@ -253,16 +252,14 @@ def test_whatever_the_server_sends_is_a_target_inside_the_limits_or_none(text: s
     assert target is None or (10 <= target <= 50 and not why)
 
 
-@given(st.floats(0.0, 60.0))
-def test_a_number_is_a_target_if_it_lies_inside_the_limits(value: float) -> None:
+@pytest.mark.parametrize(
+    ("value", "target"),
+    [(10, 10.0), (50.0, 50.0), (9.99, None), (50.01, None), ("38", None), (True, None), (None, None),
+     ([38], None), (1e400, None), (-1e400, None), ({"data": 38}, None)],
+)  # fmt: skip
+def test_only_a_number_inside_the_limits_is_a_target(value: Any, target: float | None) -> None:
     text = json.dumps({"op": "publish", "topic": "/thermogrip/target", "msg": {"data": value}})
-    assert Messages().hear(text)[0] == (value if 10 <= value <= 50 else None)
-
-
-@pytest.mark.parametrize("value", ["38", True, None, [38], 1e400, -1e400, {"data": 38}])
-def test_only_a_number_is_a_target(value: Any) -> None:
-    text = json.dumps({"op": "publish", "topic": "/thermogrip/target", "msg": {"data": value}})
-    assert Messages().hear(text)[0] is None
+    assert Messages().hear(text)[0] == target
 
 
 def test_after_a_new_connection_topics_are_advertised_again() -> None:

@@ -1,5 +1,4 @@
-"""A run folder after a kill, a power cut and a full disk: every row that was measured is there, and none is
-wrong."""
+"""A run folder after a kill, a power cut and a full disk: every measured row is there, and none is wrong."""
 
 from __future__ import annotations
 

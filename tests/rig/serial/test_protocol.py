@@ -12,16 +12,19 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from thermogrip.rig.firmware.reference import DeviceCore
-from thermogrip.rig.serial.framing import MAX_BODY, Damaged, Line, LineParser, crc16, decode_line, encode_line
 from thermogrip.rig.serial.protocol import (
+    MAX_BODY,
     REFUSALS,
     Answer,
     Boot,
     Clear,
+    Damaged,
     Drive,
     Grip,
     Hello,
     HostEnd,
+    Line,
+    LineParser,
     Off,
     Read,
     Refused,
@@ -29,6 +32,9 @@ from thermogrip.rig.serial.protocol import (
     State,
     Take,
     Unexpected,
+    crc16,
+    decode_line,
+    encode_line,
     parse_identity,
     parse_request,
     parse_state,

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from thermogrip.rig.session.settling import _standard_error, has_settled, step_figures
+from thermogrip.rig.session.session import _standard_error, has_settled, step_figures
 
 T = np.arange(0.0, 61.0, 1.0)
 
@@ -31,18 +31,6 @@ def test_a_true_bias_at_the_edge_of_the_band_is_seldom_called_settled() -> None:
     assert np.mean([has_settled(T, row, band=0.25) for row in noise]) <= 0.023 + 3 * np.sqrt(
         0.023 * 0.977 / 400
     )
-
-
-def test_slow_noise_asks_for_more_margin_than_white_noise() -> None:
-    rng = np.random.default_rng(3)
-    slow = rng.normal(0.0, 1.0, (200, 200))
-    for k in range(1, 200):
-        slow[:, k] = 0.9 * slow[:, k - 1] + np.sqrt(1 - 0.81) * slow[:, k]
-    white = rng.normal(0.0, 1.0, slow.shape)
-    yes = [
-        np.mean([has_settled(T, 0.06 * row[-T.size :], band=0.25) for row in rows]) for rows in (slow, white)
-    ]
-    assert yes[0] < yes[1]
 
 
 def test_a_true_drift_at_the_edge_of_the_band_is_seldom_called_settled() -> None:
