@@ -101,6 +101,8 @@ def test_a_table_is_wide_enough_for_a_file_and_its_numbers_stand_to_the_right(
     assert len(head) > 75
     assert head.index("value") + 5 == first.index("1.5") + 3 == second.index("-") + 1
     assert first.index("x") == head.index("name")
+    Console().table("title", ["name"], [["x" * 300]])
+    assert {len(line) for line in capsys.readouterr().out.splitlines() if line.strip()} == {140}
 
 
 def test_progress_says_each_change_of_work_and_each_twentieth(capsys: pytest.CaptureFixture[str]) -> None:

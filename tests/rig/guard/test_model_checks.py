@@ -10,7 +10,7 @@ import pytest
 
 from tests.rig.fault_injection.drills import drill_plants
 from tests.rig.makers import follow
-from thermogrip.rig.guard.model_checks import Cause, ModelMonitor, by_danger, explain_window
+from thermogrip.rig.guard.model_checks import Cause, ModelMonitor, _wrong_drives, by_danger, explain_window
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.contact.simulation import Grip
 from thermogrip.sysid.models.state_space import StateSpaceModel
@@ -209,6 +209,19 @@ def test_what_happened_is_named_and_nothing_else(story: dict[str, float], said: 
 
 def test_a_heater_neither_cools_nor_has_a_wrong_way_round() -> None:
     assert explained(0.0, unit="percent", full=100.0) == "the driver gives nothing"
+
+
+@pytest.mark.parametrize(
+    ("asked", "left"),
+    [(5.0, "full"), (5.1, "nothing full"), (10.0, "nothing full"), (10.1, "nothing full half"),
+     (94.9, "nothing full half"), (95.0, "nothing half")],
+)  # fmt: skip
+def test_a_fault_that_changes_at_most_a_twentieth_of_the_drive_is_no_hypothesis(
+    asked: float, left: str
+) -> None:
+    found = _wrong_drives(monitor("percent", 100.0, 2)._model, np.full((4, 1), asked))
+    words = ("nothing", "full", "half")
+    assert " ".join(next(word for word in words if word in cause.text) for cause, _ in found) == left
 
 
 def test_the_only_sensor_is_not_called_wrong_by_itself() -> None:
