@@ -222,6 +222,32 @@ def test_a_grasp_that_was_not_written_yet_is_cut_from_the_samples(
     assert any("cut from the samples" in line for line in done.findings)
 
 
+NAN = float("nan")
+
+
+@pytest.mark.parametrize(
+    ("closed", "about", "late", "found"),
+    [(4.0, {"grasp_id": "g"}, (24.0, 25.0), [-2.0, -1.0, 0.0, 1.0]), (None, {}, (24.0, 25.0), None),
+     (4.0, {}, (24.0, 25.0), None), (4.0, {"grasp_id": "g"}, (24.0, NAN), None),
+     (4.5, {"grasp_id": "g"}, (24.0, 25.0), None), (4.0, {"grasp_id": "g"}, (24.0,), None)],
+)  # fmt: skip
+@pytest.mark.parametrize("skin", ["t_surface", "t_skin"])
+def test_a_grasp_needs_its_message_and_two_readings_after_it(
+    skin: str, closed: float | None, about: dict[str, Any], late: tuple[float, ...],
+    found: list[float] | None, tmp_path: Path,
+) -> None:  # fmt: skip
+    with RunFolder(tmp_path / "run") as folder:
+        for k, value in enumerate((20.0, 21.0, 22.0, 23.0, *late)):
+            phase = {"phase": 0.0 if k < 2 else 2.0 if k < 4 else 4.0}
+            folder.sample({"time_s": float(k), f"{skin}_degC": value, f"target_{skin}_degC": 38.0, **phase})
+        if closed is not None:
+            folder.event(Event(closed, "closed", "gripper closed", about))
+    grasps = read_run(tmp_path / "run").grasps
+    assert (None if grasps is None else grasps["time"].values.tolist()) == found
+    if grasps is not None:
+        assert grasps["t_surface"].values.tolist() == [[22.0, 23.0, 24.0, 25.0]]
+
+
 def test_run_json_says_what_the_run_was_made_with(tmp_path: Path) -> None:
     (tmp_path / "controller.json").write_text("{}")
     RunFolder(tmp_path / "run", {"seed": 7}, files={"controller": tmp_path / "controller.json"}).close()

@@ -48,7 +48,7 @@ def test_a_drive_ends_between_two_samples_where_its_time_is_over(plant: Plant) -
     exact = 2.0 * 0.4  # K: 0.4 K/s for two seconds, hardly cooled since
     assert device.trace[21].drive == {"drive": 0.0}
     peak = max(moment.temperatures["t_tank"] for moment in device.trace) - 25.0
-    assert peak == pytest.approx(exact, rel=0.06)
+    assert peak == pytest.approx(exact, rel=0.01)
 
 
 @pytest.mark.parametrize(
