@@ -127,6 +127,29 @@ def test_a_target_beyond_the_logs_is_reported_before_a_run(tank):
     assert "t_surface was 8.0 to 52.0 degC" in said
 
 
+@pytest.mark.parametrize(
+    ("target", "inside"), [(7.5, True), (7.4, False), (52.5, True), (52.6, False), (30.0, True)]
+)
+def test_half_a_degree_beyond_the_logs_is_forgiven_on_either_side(tank, target: float, inside: bool):
+    controller = design_controller(tank, dt=2.0)
+    assert (checks.beyond_logs(controller, target) == []) == inside
+    for span in ((target, 30.0), (30.0, target)):
+        check = checks.valid_range(controller, span)
+        assert check.verdict == ("pass" if inside else "warn")
+        assert check.finding.endswith("beyond: " + f"{target:g} degC") != inside
+
+
+@pytest.mark.parametrize(
+    ("limits", "target", "verdict"),
+    [((20.0, 40.0), 30.0, "pass"), ((31.0, 40.0), 30.0, "fail"), ((20.0, 29.0), 30.0, "fail")],
+)
+def test_a_limit_on_either_side_of_what_a_target_takes_is_a_conflict(
+    tank, limits, target: float, verdict: str
+):
+    controller = design_controller(tank, dt=2.0, limits={"t_tank": limits})
+    assert checks.limits(controller, (target, target)).verdict == verdict
+
+
 def test_a_grasp_by_a_plant_whose_pump_never_stood_is_reported_before_it(tank):
     from thermogrip.mpc.review.checks import beyond_logs
 
