@@ -233,7 +233,7 @@ def curve_figure(rows: Sequence[Row], over: str) -> Figure:
         right.axhline(guess, color="#9aa7b5", lw=0.8, ls=":", label=f"chance: log loss {guess:.2f}")
     left.set(ylim=(0, 1.02), ylabel="accuracy, 95 % interval", xlabel=_LABELS[over])
     right.set(ylabel="log loss", xlabel=_LABELS[over])
-    worst = 2 * max(row["log_loss_chance"] for row in rows)  # what is worse than that is off the page
+    worst = 2 * max(row["log_loss_chance"] for row in rows)  # a log loss above that is off the page
     right.set_ylim(0, min(worst, 1.1 * max(row["log_loss"] for row in rows)))
     if over == "train_per_class":
         for axis in (left, right):

@@ -7,26 +7,22 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from thermogrip.datasets.errors import UserError
-    from thermogrip.datasets.examples import (
-        copy_examples,
-        example_path,
-        load_example_grasps,
-        load_example_logs,
-    )  # fmt: skip
-    from thermogrip.datasets.grasp_files import read_grasp_files, read_grasps, shared_grasps, write_grasps
+    from thermogrip.datasets.examples import example_path, load_example_grasps, load_example_logs
+    from thermogrip.datasets.grasp_files import read_grasp_files, read_grasps, write_grasps
     from thermogrip.datasets.log_files import read_log, write_log
     from thermogrip.datasets.materials import Material, find_material, load_materials
-    from thermogrip.datasets.resample import average, cut, gaps, hold_average
+    from thermogrip.datasets.resample import average, cut, gaps
     from thermogrip.datasets.schema import Grasps, Log, make_grasps, make_log
     from thermogrip.datasets.splits import by_block, by_grasp, by_session, shipped
 
 __all__ = [
-    "Grasps", "Log", "Material", "UserError", "average", "by_block", "by_grasp", "by_session",
-    "copy_examples", "cut", "example_path", "find_material", "gaps", "hold_average", "load_example_grasps",
-    "load_example_logs", "load_materials", "make_grasps", "make_log", "read_grasp_files", "read_grasps",
-    "read_log", "shared_grasps", "shipped", "write_grasps", "write_log",
+    "Grasps", "Log", "Material", "UserError", "average", "by_block", "by_grasp", "by_session", "cut",
+    "example_path", "find_material", "gaps", "load_example_grasps", "load_example_logs", "load_materials",
+    "make_grasps", "make_log", "read_grasp_files", "read_grasps", "read_log", "shipped", "write_grasps",
+    "write_log",
 ]  # fmt: skip
 
+# what is not listed above was a door of 0.1.0
 _MODULES = {
     "errors": ("UserError",),
     "examples": ("copy_examples", "example_path", "load_example_grasps", "load_example_logs"),

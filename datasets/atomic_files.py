@@ -55,6 +55,14 @@ def os_fault(error: OSError, path: str | Path) -> UserError:
     return UserError(problem, file=path, hint=hint)
 
 
+def make_folder(path: str | Path) -> None:
+    """Make a folder, and those above it, where there is none; UserError where that is refused."""
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise os_fault(error, path) from error
+
+
 # Windows writes a line end of two bytes unless it is asked not to; a child process gets no copy on either
 _AS_WRITTEN = sum(getattr(os, name, 0) for name in ("O_BINARY", "O_NOINHERIT", "O_CLOEXEC"))
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)  # Windows has none

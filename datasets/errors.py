@@ -21,7 +21,7 @@ class UserError(ValueError):
     row : int, optional
         Row of the file, counted as an editor counts lines (the header is 1).
     column : str, optional
-        Column name as it stands in the file.
+        Column name as in the file.
     hint : str, optional
         What to do about it, in one clause.
 
@@ -42,14 +42,7 @@ class UserError(ValueError):
         hint: str | None = None,
     ) -> None:
         self.problem, self.file, self.row, self.column, self.hint = problem, file, row, column, hint
-        where = ", ".join(
-            part
-            for part in (
-                str(file) if file is not None else "",
-                f"row {row}" if row is not None else "",
-                f"column {column}" if column is not None else "",
-            )
-            if part
-        )
+        places = (("", file), ("row ", row), ("column ", column))
+        where = ", ".join(filter(None, (f"{word}{place}" for word, place in places if place is not None)))
         text = f"{where}: {problem}" if where else problem
         super().__init__(" ".join(f"{text}; {hint}".split()) if hint else " ".join(text.split()))

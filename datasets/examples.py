@@ -28,7 +28,17 @@ def example_grasps() -> tuple[str, ...]:
 
 
 def example_path(name: str) -> Path:
-    """Return the path of a bundled file by its name without ending.
+    """Return the path of a bundled file.
+
+    Parameters
+    ----------
+    name : str
+        One of :data:`EXAMPLE_LOGS` or of the sets of grasps, without ending.
+
+    Raises
+    ------
+    UserError
+        If there is none; the message names those there are.
 
     Examples
     --------
@@ -43,23 +53,10 @@ def example_path(name: str) -> Path:
 
 
 def copy_examples(folder: str | Path) -> list[Path]:
-    """Write the bundled files for work on the command line, and return their paths.
+    """Write the bundled logs into a folder, the grasps into ``grasps`` in it and what each file is into
+    ``EXAMPLES.md``, and return their paths.
 
-    The logs go into ``folder``, the grasps with their ``_meta.csv.xz`` into ``folder/grasps``, and what each
-    file is into ``folder/EXAMPLES.md``.  A file that is there already is left alone.
-
-    Raises
-    ------
-    UserError
-        If a file of that name is there and is another one, before any is written.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     written = [path.relative_to(folder).as_posix() for path in copy_examples(folder)]
-    >>> len(written), written[:2], written[-1]
-    (31, ['prbs_heating_cooling.csv.xz', 'step_up_down.csv.xz'], 'EXAMPLES.md')
+    A file that is there already is left alone; UserError before any is written where it is another one.
     """
     folder, source = Path(folder), _folder()
     files_of_grasps = [f"{name}{end}.csv.xz" for name in example_grasps() for end in ("", "_meta")]

@@ -60,7 +60,12 @@ _NEEDED = ("time", "t_surface")  # how the columns begin that are read as number
 
 
 def read_grasps(path: str | Path) -> Grasps:
-    """Return the grasps in a file (CSV with its meta file beside it, or NetCDF).
+    """Return the grasps in a file.
+
+    Parameters
+    ----------
+    path : str or Path
+        A CSV file with its meta file beside it, or NetCDF.
 
     Returns
     -------
@@ -104,12 +109,27 @@ def check_grasp_file(path: str | Path) -> None:
 
 
 def write_grasps(grasps: Grasps, path: str | Path) -> Path:
-    """Write grasps as NetCDF, or as CSV with ``NAME_meta.csv`` beside it; return the path.
+    """Write grasps to a file and return its path.
+
+    Parameters
+    ----------
+    grasps : Grasps
+    path : str or Path
+        ``.nc``, or ``.csv``, which gets ``NAME_meta.csv`` beside it.
 
     Raises
     ------
     UserError
         If the ending is unknown or the disk refuses.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> made = make_grasps([-0.1, 0.1], [[23.0, 24.5]], ["g0"], material=["iron"])
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     again = read_grasps(write_grasps(made, Path(folder) / "warm.csv"))
+    >>> again.attrs["name"], again["t_surface"].values.tolist()
+    ('warm', [[23.0, 24.5]])
     """
     check_grasps(grasps)
     if file_format(path) == "netcdf":
@@ -122,12 +142,23 @@ def write_grasps(grasps: Grasps, path: str | Path) -> Path:
 
 
 def read_grasp_files(paths: Sequence[str | Path]) -> list[Grasps]:
-    """Return the records of several files; a folder stands for all its grasp files, in order of name.
+    """Return the records of several files.
+
+    Parameters
+    ----------
+    paths : sequence of str or Path
+        Files as for :func:`read_grasps`; a folder is all its grasp files, in order of name.
 
     Raises
     ------
     UserError
         If a folder holds none, or two files have one name.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.examples import example_path
+    >>> [record.attrs["name"] for record in read_grasp_files([example_path("exp2_dT20")])]
+    ['exp2_dT20']
     """
     files: list[Path] = []
     for path in map(Path, paths):
@@ -141,17 +172,8 @@ def read_grasp_files(paths: Sequence[str | Path]) -> list[Grasps]:
 
 
 def shared_grasps(first: Sequence[Grasps], second: Sequence[Grasps]) -> list[str]:
-    """Return the grasps of the second list, as ``condition/grasp_id``, that stand in the first one too.
-
-    The same grasp_id is enough, and so are the same samples under another name.  Training and test must share
-    none.
-
-    Examples
-    --------
-    >>> g = make_grasps([-0.1, 0.1], [[23.0, 24.0]], ["g0"], name="warm")
-    >>> shared_grasps([g], [g]), shared_grasps([g], [])
-    (['warm/g0'], [])
-    """
+    """Return the grasps of the second list, as ``condition/grasp_id``, that are in the first one too, by
+    grasp_id or by their samples: training and test must share none."""
     known: set[str | bytes] = set()
     for record in first:
         known |= {str(grasp) for grasp in record["grasp"].values}

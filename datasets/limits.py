@@ -10,7 +10,7 @@ one value.  Every reader therefore asks here, with what a file declares, before 
 * a document (JSON, TOML: settings and models, never records) may have 8 MiB or 1 MiB, be nested 64 levels
   deep and hold no number beyond 1e100: what fits in a ``float`` does not always survive a square.
 
-``THERMOGRIP_MAX_MB`` sets the first limit in MB for files that are honest and large; documents keep their
+``THERMOGRIP_MAX_MB`` sets the first limit in MB for files that are large for a reason; documents keep their
 share of it, and the second limit is then left to it.
 """
 

@@ -1,11 +1,11 @@
 """Logs and grasps to and from disk: CSV with units in the header, NetCDF, Parquet; logs from bags.
 
-A CSV file is a table with one row a sample; the header carries the units (:mod:`thermogrip.datasets.units`)::
+A CSV file is a table with one row a sample; the header has the units (:mod:`thermogrip.datasets.units`)::
 
     time_s,drive,pump,t_tank_K,t_surface_degC,t_ambient_degC
 
 Temperatures become degC and times s while reading, and nowhere else.  Findings and repairs
-(:mod:`thermogrip.datasets.repair`) stand in ``attrs["repairs"]``, a line each.  A record that thermogrip
+(:mod:`thermogrip.datasets.repair`) are in ``attrs["repairs"]``, a line each.  A record that thermogrip
 itself wrote as NetCDF or Parquet is marked in its metadata and is read back exactly, without repairs.
 
 A log may be cut: ``run.csv@120:1800`` is its seconds 120 <= t < 1800 and either end may be empty, so that
@@ -121,8 +121,8 @@ def read_log(
         raise UserError("has a time column and nothing else", file=file, hint="add inputs and outputs")
     lists = {"inputs": inputs, "outputs": outputs, "disturbances": disturbances}
     of_model = {name: role for name, role in (known or {}).items() if name in units}
-    carried = _given_roles(table)
-    roles = assign_roles(units, given=carried | of_model, file=str(file), **lists)
+    in_file = _given_roles(table)
+    roles = assign_roles(units, given=in_file | of_model, file=str(file), **lists)
     own = table.meta.get("schema") == "thermogrip.log"
     if own:
         repairs = [line for line in table.meta.get("repairs", "").splitlines() if line]
@@ -130,7 +130,7 @@ def read_log(
         time, columns, found = _repair(time, columns, units, roles, table)
         repairs += found
     listed = {find_column(word, units) for some in lists.values() for word in some or ()}
-    known_roles = {*carried, *of_model, *listed}
+    known_roles = {*in_file, *of_model, *listed}
     guessed = {n: explain_role(n, units[n]) for n in columns if n not in known_roles}
     guesses = [f"{name}: {why}" for name, (role, why) in guessed.items() if role == roles[name]]
     variables = {name: (columns[name], units[name], roles[name]) for name in columns}
@@ -156,10 +156,14 @@ def check_log_file(path: str | Path) -> None:
 
 
 def write_log(log: Log, path: str | Path) -> Path:
-    """Write a log as CSV, NetCDF or Parquet, by the ending, in one step; return the path.
+    """Write a log in one step and return the path.
 
-    NetCDF and Parquet keep units, roles and repairs; CSV keeps units (in the header) and every digit of the
-    numbers.
+    Parameters
+    ----------
+    log : Log
+    path : str or Path
+        ``.csv``, ``.csv.gz`` and ``.csv.xz`` keep units (in the header) and every digit of the numbers,
+        ``.nc`` and ``.parquet`` roles and repairs as well.
 
     Raises
     ------
@@ -190,7 +194,7 @@ def write_log(log: Log, path: str | Path) -> Path:
 def split_cut(path: str | Path) -> tuple[Path, float, float]:
     """Return the file, the start and the stop [s] of ``PATH@START:STOP``.
 
-    A path that exists as it stands is not cut, whatever its name.
+    A path that exists is not cut, whatever its name.
     """
     match = _CUT.match(str(path))
     if match is None or os.path.exists(path):
@@ -284,9 +288,9 @@ def _convert(table: Table) -> tuple[dict[str, Floats], dict[str, str], list[str]
 
 
 def _given_roles(table: Table) -> dict[str, str]:
-    """Return the role of each variable whose column carries one."""
-    carried = {header: attrs["role"] for header, attrs in table.attrs.items() if attrs.get("role")}
-    return {_name_and_unit(header, table)[0]: role for header, role in carried.items()}
+    """Return the role of each variable whose column has one."""
+    roles = {header: attrs["role"] for header, attrs in table.attrs.items() if attrs.get("role")}
+    return {_name_and_unit(header, table)[0]: role for header, role in roles.items()}
 
 
 def _name_and_unit(header: str, table: Table) -> tuple[str, str]:

@@ -6,12 +6,12 @@ What a touch feels is the effusivity (the paper's sqrt(lambda rho c)),
 
 Handbooks disagree about it by 2 to 5 % for pure metals, by 10 % for alloys and plastics, and by a quarter
 for wood, rubber and foams, whose grade and moisture the name does not state.  The spread matters as much
-as the value: zinc and brass are 8 % apart, iron in two handbooks 4 %. So every row carries the relative
+as the value: zinc and brass are 8 % apart, iron in two handbooks 4 %. So every row has the relative
 standard deviation of e, one sigma, estimated from the spread of the sources where there are several, and
 from the kind of material where there is one.
 
 Every row is checked on loading: e against its own k, rho and c_p (2 %), and each number against the range
-that its kind can have.  The checks are there because published tables carry lost decimal points.
+that its kind can have.  The checks are there because published tables have lost decimal points.
 """
 
 from __future__ import annotations
@@ -43,9 +43,23 @@ KINDS: dict[str, tuple[tuple[float, float], tuple[float, float], tuple[float, fl
 class Material:
     """One row of the table.
 
-    ``k`` [W m^-1 K^-1], ``rho`` [kg m^-3], ``c_p`` [J kg^-1 K^-1], ``effusivity`` [W s^0.5 m^-2 K^-1];
-    ``effusivity_sd_ln`` is the relative standard deviation of the effusivity, ``kind`` one of
-    :data:`KINDS`.
+    Attributes
+    ----------
+    name : str
+    k : float
+        Conductivity [W m^-1 K^-1].
+    rho : float
+        Density [kg m^-3].
+    c_p : float
+        Heat capacity [J kg^-1 K^-1].
+    effusivity : float
+        sqrt(k rho c_p) [W s^0.5 m^-2 K^-1].
+    effusivity_sd_ln : float
+        Its relative standard deviation [1].
+    source, kind : str
+        Where the numbers are from, and one of :data:`KINDS`.
+    aliases : tuple of str
+        Other names.
     """
 
     name: str
@@ -83,7 +97,12 @@ def load_materials() -> dict[str, Material]:
 
 
 def find_material(name: str) -> Material:
-    """Return the material of that name or alias, in upper or lower case.
+    """Return the material of that name or alias.
+
+    Parameters
+    ----------
+    name : str
+        In upper or lower case.
 
     Raises
     ------

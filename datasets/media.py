@@ -34,7 +34,7 @@ def printable(text: str) -> str:
 
 
 def csv_cell(cell: object) -> object:
-    """Return a cell that is no formula (an apostrophe stands before it) and one line."""
+    """Return a cell that is no formula (an apostrophe is put before it) and one line."""
     if not isinstance(cell, str):
         return cell
     text = printable(cell).replace("\n", "\\n")

@@ -1,6 +1,6 @@
 """Records and tables in NetCDF-4 files, through h5netcdf.
 
-NetCDF carries the unit of each variable as an attribute, so the names need no suffix. HDF5 stores arrays and
+NetCDF has the unit of each variable as an attribute, so the names need no suffix. HDF5 stores arrays and
 text; opening a file runs no code. Files are written by the CF conventions, so that xarray, Panoply, ncview
 and their like show them as they are meant; those of others, and older ones, need not be.
 

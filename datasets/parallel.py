@@ -110,7 +110,7 @@ def _on_cluster(
 ) -> list[_Result]:
     import distributed
 
-    dask: Any = distributed  # its functions carry no types
+    dask: Any = distributed  # its functions have no types
 
     try:
         client = dask.Client(address, timeout=_CONNECT_S, set_as_default=False)

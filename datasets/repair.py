@@ -163,7 +163,7 @@ def fill_disturbance(name: str, values: Floats, time: Floats) -> tuple[Floats, l
 
 
 def check_plausible(name: str, celsius: Floats, file: str) -> list[str]:
-    """Return a line if a temperature looks like another unit.
+    """Return a line if a temperature is likely in another unit.
 
     UserError if half of it is below absolute zero.
     """

@@ -30,7 +30,13 @@ _AFTER_GAP = "after_gap"
 
 
 def cut(log: Log, start: float = -np.inf, stop: float = np.inf) -> Log:
-    """Return the rows with start <= time < stop [s]; times stay as they are.
+    """Return the rows with start <= time < stop; times stay as they are.
+
+    Parameters
+    ----------
+    log : Log
+    start, stop : float, optional
+        Ends of the cut [s].
 
     Raises
     ------
@@ -55,8 +61,13 @@ def cut(log: Log, start: float = -np.inf, stop: float = np.inf) -> Log:
 def gaps(log: Log, longer_than: float = 10.0) -> list[tuple[int, float, float]]:
     """Return (row before, time before [s], time after [s]) of each gap.
 
-    A gap is longer than ``longer_than`` [s] and than five median steps.  In an averaged log the blocks end
-    where the gaps of the log itself were.
+    In an averaged log the blocks end where the gaps of the log itself were.
+
+    Parameters
+    ----------
+    log : Log
+    longer_than : float, optional
+        A gap is longer than this [s], and than five median steps.
 
     Examples
     --------
@@ -70,27 +81,8 @@ def gaps(log: Log, longer_than: float = 10.0) -> list[tuple[int, float, float]]:
 
 
 def hold_average(log: Log, wanted: tuple[str, ...], grid: ArrayLike) -> NDArray[np.float64]:
-    """Return the exact means of held variables over the cells of a grid.
-
-    Parameters
-    ----------
-    log : Log
-    wanted : tuple of str
-        Names of variables that are held from their row until the next.
-    grid : (n_cell + 1,) array_like
-        Edges of the cells [s], increasing.  Before the first row its value is taken, after the last row the
-        last.
-
-    Returns
-    -------
-    means : (n_cell, n_wanted) ndarray
-
-    Examples
-    --------
-    >>> log = make_log([0.0, 0.5, 2.0], {"pump": ([0, 1, 0], "1", "input")})
-    >>> hold_average(log, ("pump",), [0.0, 1.0, 2.0, 3.0]).ravel()
-    array([0.5, 1. , 0. ])
-    """
+    """Return the exact means (n_cell, n_wanted) of held variables over the cells between the increasing edges
+    ``grid`` (n_cell + 1,) [s]; before the first row its value is taken, after the last row the last."""
     edges = np.asarray(grid, dtype=float)
     if edges.ndim != 1 or edges.size < 2 or np.any(np.diff(edges) <= 0):
         raise ValueError("need at least two increasing edges")
@@ -98,12 +90,18 @@ def hold_average(log: Log, wanted: tuple[str, ...], grid: ArrayLike) -> NDArray[
 
 
 def average(log: Log, seconds: float) -> Log:
-    """Return the log in blocks of that length.
+    """Return the log in blocks.
 
     A block's time is its start.  Inputs and disturbances are averaged as held, so a block's input is the one
     applied until the next block; outputs and others are the mean of the samples present (NaN where there is
     none), so they belong to the middle of the block.  The blocks start anew after each gap: no block mixes
     what was before with what came after.
+
+    Parameters
+    ----------
+    log : Log
+    seconds : float
+        Length of a block [s].
 
     Raises
     ------

@@ -2,7 +2,7 @@
 
 A bag holds messages, each topic at its own times; a Log has one time axis.  A topic map says which field of
 which topic is which column (:data:`TOPICS_TEMPLATE`): it is read from ``<name>.topics.toml`` or
-``topics.toml`` beside the bag.  Without one, every topic that carries a single number becomes a column: a
+``topics.toml`` beside the bag.  Without one, every topic of a single number becomes a column: a
 ``sensor_msgs/Temperature`` a temperature, ``std_msgs`` numbers what their name's suffix says.
 
 A ROS 2 bag is a folder: ``metadata.yaml`` names its files, which may be split and are read as one.  Its
@@ -27,6 +27,7 @@ import struct
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ from numpy.typing import NDArray
 from thermogrip.datasets.atomic_files import os_fault, read_bytes, read_toml
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import Unpacker, check_size, check_source
+from thermogrip.datasets.schema import ROLES
 from thermogrip.datasets.tables import Table, file_stem
 from thermogrip.datasets.units import UNITS, guess_role, split_header
 
@@ -76,7 +78,7 @@ role = "input"
 
 _UNPACK = "unpack it, or write it anew with `ros2 bag convert`, not compressed as a file"
 _STORED = (".mcap", ".db3")  # what a ROS 2 bag is made of
-_ROLES = ("input", "disturbance", "output", "other")
+_NO_NUMBER = (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError)
 _NUMBERS = {"temperature": "degC", "data": ""}  # the one field of a message without a map, and its unit
 
 
@@ -113,13 +115,9 @@ class _Message:
 def read_topic_map(path: str | Path) -> TopicMap:
     """Return the topic map of a TOML file."""
     content = read_toml(path, hint="compare it with `init topics`")
-    known = {"schema", "version", "clock", "stamp", "columns"}
-    unknown = sorted(set(content) - known)
-    if (
-        content.get("schema") != "thermogrip.topics"
-        or unknown
-        or not isinstance(content.get("columns"), dict)
-    ):
+    unknown = sorted(set(content) - {"schema", "version", "clock", "stamp", "columns"})
+    is_map = content.get("schema") == "thermogrip.topics" and isinstance(content.get("columns"), dict)
+    if unknown or not is_map:
         what = f"has the unknown key {unknown[0]!r}" if unknown else "is no topic map"
         raise UserError(what, file=path, hint="write a fresh one with `thermogrip init topics`")
     columns = {name: _column(name, entry, path) for name, entry in content["columns"].items()}
@@ -139,8 +137,8 @@ def _column(name: str, entry: Any, path: str | Path) -> Column:
         raise UserError(
             f"unit {unit!r} is unknown", file=path, column=name, hint=f"use {' '.join(UNITS)} or 1"
         )
-    if role not in (*_ROLES, ""):
-        raise UserError(f"role {role!r} is unknown", file=path, column=name, hint=f"use {', '.join(_ROLES)}")
+    if role not in (*ROLES, ""):
+        raise UserError(f"role {role!r} is unknown", file=path, column=name, hint=f"use {', '.join(ROLES)}")
     return Column(str(entry["topic"]), str(entry.get("field", "data")), unit, role)
 
 
@@ -166,9 +164,6 @@ def read_rosbag_table(path: str | Path, topics: TopicMap | None = None) -> Table
     return _table(file, columns, series, "" if wanted is None else wanted.clock, notes)
 
 
-# ---- columns ----
-
-
 def bag_parts(folder: str | Path) -> list[Path]:
     """Return the files of the ROS 2 bag that a folder is, none where it is no bag.
 
@@ -192,11 +187,10 @@ def bag_parts(folder: str | Path) -> list[Path]:
 
 def _listed(path: Path) -> list[str]:
     """Return the files that the metadata of a bag name, without their folders."""
-    try:
-        from ruamel.yaml import YAML
-        from ruamel.yaml.error import YAMLError
-    except ImportError as error:
-        raise _missing(path, "rosbags") from error
+    _need("rosbags", path)
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
     data = read_bytes(path)
     check_size(len(data), file=path, share=64)
     try:
@@ -221,17 +215,14 @@ def _map_beside(file: Path) -> TopicMap | None:
 
 
 def _guess(message: _Message, columns: dict[str, Column], file: Path) -> None:
-    """Add a column for a topic that is seen for the first time and carries one number."""
+    """Add a column for a topic that is seen for the first time and has one number."""
     if any(column.topic == message.topic for column in columns.values()):
         return
-    field = (
-        "value" if message.attrs.get("units") else next((f for f in _NUMBERS if _has(message.content, f)), "")
-    )
-    if not field:
-        return
+    known = next((f for f in _NUMBERS if _has(message.content, f)), "")
+    field = "value" if message.attrs.get("units") else known
     try:
         float(_field(message.content, field))
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError):
+    except _NO_NUMBER:
         return
     name = message.topic.strip("/").replace("/", "_")
     unit = message.attrs.get("units") or _NUMBERS.get(field, "")
@@ -264,7 +255,7 @@ def _field(content: Any, path: str) -> Any:
 def _number(message: _Message, column: Column, name: str, file: Path) -> float:
     try:
         return float(_field(message.content, column.field))
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
+    except _NO_NUMBER as error:
         problem = f"{message.topic} ({message.type}) has no number {column.field!r}"
         raise UserError(problem, file=file, column=name, hint="correct the field in the topic map") from error
 
@@ -298,9 +289,6 @@ def _check_found(
         raise UserError(problem, file=file, hint="write a topic map (`thermogrip init topics`)")
 
 
-# ---- one axis ----
-
-
 def _table(
     file: Path,
     columns: Mapping[str, Column],
@@ -318,12 +306,11 @@ def _table(
     attrs: dict[str, dict[str, str]] = {"time_s": {}}
     for name, column in columns.items():
         times, values = sorted_series[name]
-        numbers[name] = (
-            _held(axis, times, values) if roles[name] == "input" else _nearest(axis, times, values)
-        )
+        is_input = roles[name] == "input"
+        numbers[name] = (_held if is_input else _nearest)(axis, times, values)
         attrs[name] = {"units": column.unit, "role": roles[name]}
         if name != clock:
-            how = "the last message holds" if roles[name] == "input" else "the nearest message is taken"
+            how = "the last message holds" if is_input else "the nearest message is taken"
             notes.append(f"{name}: {len(times)} messages of {column.topic} on the times of {clock}; {how}")
     return Table(str(file), numbers, {}, np.arange(1, axis.size + 1), attrs, {}, tuple(notes))
 
@@ -345,9 +332,6 @@ def _nearest(axis: Floats, times: Floats, values: Floats) -> Floats:
     at = np.where(np.abs(times[after] - axis) <= np.abs(axis - times[before]), after, before)
     step = float(np.median(np.diff(times))) if times.size > 1 else np.inf
     return np.where(np.abs(times[at] - axis) <= 0.5 * step + 1e-6, values[at], np.nan)
-
-
-# ---- messages ----
 
 
 def _messages(file: Path, notes: list[str]) -> Iterator[_Message]:
@@ -374,12 +358,11 @@ def _messages_of_file(file: Path, notes: list[str]) -> Iterator[_Message]:
 
 def _bag_messages(file: Path) -> Iterator[_Message]:
     """Yield the messages of a .bag or .db3."""
-    try:
-        from rosbags.highlevel import AnyReader, AnyReaderError
-        from rosbags.serde import SerdeError
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise _missing(file, "rosbags") from error
+    _need("rosbags", file)
+    from rosbags.highlevel import AnyReader, AnyReaderError
+    from rosbags.serde import SerdeError
+    from rosbags.typesys import Stores, get_typestore
+
     bag1 = file.suffix.lower() == ".bag"
     store = get_typestore(Stores.ROS1_NOETIC if bag1 else Stores.ROS2_HUMBLE)
     hint = "run `rosbag reindex` on it" if bag1 else "copy it again, or export it as MCAP"
@@ -472,10 +455,11 @@ def _mcap_contents(data: bytes, file: Path) -> Iterator[tuple[Any, Any, Any]]:
 
 def _mcap_messages(file: Path, notes: list[str]) -> Iterator[_Message]:
     """Yield the messages of an MCAP up to its end, or to its first damage, which is noted."""
-    try:
-        from mcap.exceptions import McapError
-    except ImportError as error:
-        raise _missing(file, "mcap") from error
+    _need("mcap", file)
+    from mcap.exceptions import McapError
+    from zstandard import ZstdError
+
+    late = (struct.error, ValueError, EOFError, OSError, KeyError, RuntimeError, MemoryError)
     data, count = read_bytes(file), 0
     last = 0.0
     decoders = _Decoders(file)
@@ -487,7 +471,7 @@ def _mcap_messages(file: Path, notes: list[str]) -> Iterator[_Message]:
             yield _Message(channel.topic, kind, last, content, channel.metadata)
     except UserError:
         raise
-    except _damage(McapError) as error:
+    except (McapError, ZstdError, *late) as error:  # of the reader, of an unpacker, and what follows
         if not count:
             hint = "copy it again; nothing could be read"
             raise UserError(f"is damaged or no MCAP ({error})", file=file, hint=hint) from error
@@ -496,14 +480,6 @@ def _mcap_messages(file: Path, notes: list[str]) -> Iterator[_Message]:
         return
     if not data.endswith(b"\x89MCAP0\r\n"):
         notes.append(f"has no end: its writer died; {count} whole messages were read, the rest is lost")
-
-
-def _damage(own: type[Exception]) -> tuple[type[Exception], ...]:
-    """Return what damage in an MCAP raises: the reader's own error, the unpackers', and what follows."""
-    from zstandard import ZstdError
-
-    late = (struct.error, ValueError, EOFError, OSError, KeyError, RuntimeError, MemoryError)
-    return (own, ZstdError, *late)
 
 
 class _Decoders:
@@ -527,11 +503,10 @@ class _Decoders:
         raise UserError(problem, file=self._file, hint=hint)
 
     def _type(self, schema: Any) -> str:
-        """Return the message's type, registered from the definition that the file carries."""
-        try:
-            from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
-        except ImportError as error:
-            raise _missing(self._file, "rosbags") from error
+        """Return the message's type, registered from the definition in the file."""
+        _need("rosbags", self._file)
+        from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+
         if self._store is None:
             self._store = get_typestore(Stores.EMPTY)
         if schema.name not in self._known:
@@ -546,5 +521,6 @@ class _Decoders:
         return self._known[schema.name]
 
 
-def _missing(file: Path, package: str) -> UserError:
-    return UserError(f"needs the package {package}", file=file, hint="pip install thermogrip[ros]")
+def _need(package: str, file: Path) -> None:
+    if find_spec(package) is None:
+        raise UserError(f"needs the package {package}", file=file, hint="pip install thermogrip[ros]")

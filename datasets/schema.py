@@ -1,7 +1,7 @@
 """The two records that every stage exchanges: ``Log`` and ``Grasps``.
 
 Both are plain :class:`xarray.Dataset` objects that passed the check in this module, so every tool that
-reads a dataset reads them.  Temperatures are degC, time is s; the unit of a variable stands in its
+reads a dataset reads them.  Temperatures are degC, time is s; the unit of a variable is in its
 ``units`` attribute (``"1"`` for a dimensionless one).
 
 A **Log** has the dimension ``time`` [s].  Each variable has a ``role``: ``input`` (what a controller moves,
@@ -151,7 +151,7 @@ def columns(log: Log, wanted: Sequence[str]) -> NDArray[np.float64]:
 
 
 def log_name(log: Log | Grasps) -> str:
-    """Return the record's name as it stands in tables and messages."""
+    """Return the record's name in tables and messages."""
     return str(log.attrs.get("name", "log"))
 
 
@@ -199,6 +199,11 @@ def make_grasps(
         A second sensor [degC].
     **per_grasp : (n_grasp,) array_like
         Any of :data:`GRASP_NUMBERS` (NaN where unknown) and :data:`GRASP_LABELS` ("" where unknown).
+
+    Raises
+    ------
+    UserError
+        If a name is no such variable, or the record breaks a rule of :func:`check_grasps`.
 
     Examples
     --------

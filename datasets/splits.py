@@ -38,6 +38,11 @@ def by_grasp(
     seed : int, optional
         Same seed, same splits.
 
+    Yields
+    ------
+    train, test : ndarray of int
+        Places of grasps in the record.
+
     Raises
     ------
     UserError
@@ -74,10 +79,28 @@ def by_grasp(
 def by_session(grasps: Grasps) -> Iterator[Split]:
     """Yield one split a session: that session is the test, all others the training.
 
+    Parameters
+    ----------
+    grasps : Grasps
+        With ``material`` and ``session``.
+
+    Yields
+    ------
+    train, test : ndarray of int
+        Places of grasps in the record.
+
     Raises
     ------
     UserError
         If there is only one session, or a touch group spans two.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.schema import make_grasps
+    >>> days = {"material": ["iron", "wood"] * 2, "session": ["monday", "monday", "friday", "friday"]}
+    >>> made = make_grasps([-0.1, 0.1], [[23.0, 24.0]] * 4, ["a", "b", "c", "d"], **days)
+    >>> [(train.tolist(), test.tolist()) for train, test in by_session(made)]
+    [([2, 3], [0, 1]), ([0, 1], [2, 3])]
     """
     session, known = label_values(grasps, "session"), label_values(grasps, "material") != ""
     _whole(grasps, session, "session")
@@ -95,10 +118,30 @@ def by_block(grasps: Grasps, *, seed: int = 0) -> Iterator[Split]:
 
     There are as many splits as the material with the fewest blocks has.
 
+    Parameters
+    ----------
+    grasps : Grasps
+        With ``material`` and ``block``.
+    seed : int, optional
+        Of the order in which blocks are held out.
+
+    Yields
+    ------
+    train, test : ndarray of int
+        Places of grasps in the record.
+
     Raises
     ------
     UserError
         If a material has only one block, or a touch group spans two.
+
+    Examples
+    --------
+    >>> from thermogrip.datasets.schema import make_grasps
+    >>> blocks = {"material": ["iron", "iron", "wood", "wood"], "block": ["1", "2", "1", "2"]}
+    >>> made = make_grasps([-0.1, 0.1], [[23.0, 24.0]] * 4, ["a", "b", "c", "d"], **blocks)
+    >>> [(train.tolist(), test.tolist()) for train, test in by_block(made)]
+    [([1, 3], [0, 2]), ([0, 2], [1, 3])]
     """
     material, block = label_values(grasps, "material"), label_values(grasps, "block")
     _whole(grasps, block, "block")
@@ -119,8 +162,12 @@ def by_block(grasps: Grasps, *, seed: int = 0) -> Iterator[Split]:
 
 
 def shipped(grasps: Grasps) -> Split:
-    """Return the split that the record itself carries in ``split`` (train, test; other words are in
-    neither).
+    """Return the split that the record itself holds.
+
+    Parameters
+    ----------
+    grasps : Grasps
+        With ``split``: train or test; other words are in neither.
 
     Raises
     ------

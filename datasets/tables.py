@@ -1,7 +1,7 @@
 """Tables of numbers on disk: CSV (plain, gzip or xz), NetCDF and Parquet, read without running code.
 
 Reading is fast first and exact afterwards: the whole file is parsed at once, and only if that fails is it
-walked line by line to name the row and the column of the bad cell.  A last line that was cut off (a logger
+read line by line to name the row and the column of the bad cell.  A last line that was cut off (a logger
 that lost power) is dropped and noted; any other ragged line is refused.
 """
 
@@ -38,7 +38,7 @@ FORMATS = {
 
 MOST_COLUMNS = 4096  # of a table
 _BEGINNING = 16 << 20  # bytes of a file that are looked at before it is read
-_MOST_EMPTY = 1_000_000  # lines without a cell that are walked over
+_MOST_EMPTY = 1_000_000  # lines without a cell that are passed over
 
 _NULLS = ["", "nan", "NaN", "NAN", "NA", "N/A", "null", "NULL", "None", "-nan", "#N/A"]
 _DATE = re.compile(r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}|\d{1,2}:\d{2}")  # how a date or a time of day begins
@@ -133,7 +133,7 @@ def text_numbers(table: Table, header: str) -> NDArray[np.float64]:
 
 
 def read_parquet_table(path: str | Path) -> Table:
-    """Return the numeric columns of a Parquet file, with the units and roles its columns carry."""
+    """Return the numeric columns of a Parquet file, with the units and roles of its columns."""
     import pyarrow as pa
 
     numbers, attrs = {}, {}
@@ -391,7 +391,7 @@ def _name_fault(data: bytes, skip: int, separator: str, types: dict[str, str], f
 
 
 def _line_numbers(data: bytes, skip: int, n_rows: int) -> NDArray[np.int64]:
-    """Return the file's line of each row; only a file with empty lines has to be walked."""
+    """Return the file's line of each row; only in a file with empty lines they are counted."""
     if data.count(b"\n") - skip + (not data.endswith(b"\n")) == n_rows:
         return np.arange(skip + 1, skip + 1 + n_rows)
     lines = (at for at, raw in enumerate(_lines(data), start=1) if at > skip and raw)

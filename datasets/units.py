@@ -6,8 +6,8 @@ here; ms and min become s::
 
     T[degC] = T[K] - 273.15 = (T[degF] - 32) / 1.8
 
-A suffix that looks like another unit (``_C``, ``_mV``, ``_sec``) is refused rather than guessed, since a
-temperature that is read in the wrong unit still looks like a number.
+A suffix like another unit (``_C``, ``_mV``, ``_sec``) is refused rather than guessed, since a temperature
+that is read in the wrong unit is still a number.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ _OUTPUT = re.compile(r"^(t|y|temp|temperature|level|outlet|position|speed)(\d*|_
 
 
 def split_header(header: str, *, file: str | None = None) -> tuple[str, str]:
-    """Return the variable name and the unit that a column header stands for (``"1"`` without a suffix).
+    """Return the variable name and the unit of a column header (``"1"`` without a suffix).
 
-    UserError if the suffix looks like a unit that is not read, or nothing is left as a name.
+    UserError if the suffix is like a unit that is not read, or nothing is left as a name.
     """
     header = header.strip()
     for unit in UNITS:

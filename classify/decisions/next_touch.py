@@ -111,9 +111,9 @@ class Costs:
     Parameters
     ----------
     rejected : float
-        To say "unknown" of a known material.
+        Weight of "unknown" as the answer for a known material.
     missed : float
-        To name a material that is not among the candidates.
+        Weight of a name for a material that is not among the candidates.
     """
 
     rejected: float = 0.5
@@ -132,7 +132,7 @@ def name_or_unknown(
     Parameters
     ----------
     p : (n, m) array_like
-        Probabilities of the candidates, given that it is one of them; rows sum to 1.  A row of NaN, a grasp
+        The probability of each candidate, given that it is one of them; rows sum to 1.  A row of NaN, a grasp
         that has no answer, is "unknown".
     p_unknown : (n,) array_like
         Probability that it is none of them.
@@ -301,34 +301,11 @@ def advise_touches(
     price: float = 0.001,
     progress: Callable[[float, str], None] | None = None,
 ) -> list[dict[str, float | None]]:
-    """Return what another touch of each grasp's block would bring, a row a grasp.
+    """Return what another touch of each grasp's block would bring (:func:`choose_next_touch`), a row a grasp.
 
-    Parameters
-    ----------
-    classifier, candidates, price
-        As in :func:`choose_next_touch`.
-    grasps : Grasps
-        Rows that share ``touch_group`` are touches of one block and get one answer.
-    progress : callable, optional
-        Called with (fraction done, what).
-
-    Returns
-    -------
-    list of dict
-        ``next_touch_degC``, the gripper temperature of the touch that is worth most, None where none is worth
-        its time; ``next_touch_accuracy``, the accuracy expected after a touch there, or without one.  Both
-        are None where no touch of the block is usable (no contact).
-
-    Examples
-    --------
-    >>> from thermogrip.classify.estimators.posterior import PosteriorClassifier
-    >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
-    >>> known = PosteriorClassifier().with_device(load_default_gripper())
-    >>> copper, wood = 24, 28
-    >>> touched = load_example_grasps()["exp5_two_touch_unknown_object"].isel(grasp=[copper, wood])
-    >>> [row["next_touch_degC"] for row in advise_touches(known, touched)]
-    [12.5, None]
+    ``next_touch_degC`` is the gripper temperature of the touch that is worth most, None where none is worth
+    its time; ``next_touch_accuracy`` is the accuracy expected after a touch there, or without one.  Both are
+    None where no touch of the block is usable (no contact).
     """
     units = unit_names(grasps)
     names = list(dict.fromkeys(units.tolist()))

@@ -7,17 +7,6 @@ as the batch call on the finished grasp.
 What a robot sends is not always a contact.  A reading that leaps by 10 K waits for the next three, which show
 whether it was a spike; a skin that does not move, or has just saturated, ends no contact; and once a skin
 has not moved for three seconds, 10 K from its object, the probabilities are NaN, as no material is there.
-
->>> from thermogrip.classify.estimators.posterior import PosteriorClassifier
->>> from thermogrip.datasets.examples import load_example_grasps
->>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
->>> known = PosteriorClassifier().with_device(load_default_gripper())
->>> grasp = load_example_grasps()["exp2_dT20"].isel(grasp=[21])
->>> touch = Stream(known, candidates=["copper", "iron", "wood"], t_object=28.0, t_ambient=27.0)
->>> for time, temperature in zip(grasp["time"].values[:40], grasp["t_surface"].values[0]):
-...     p = touch.update(float(time), float(temperature))
->>> {name: round(float(v), 3) for name, v in p.items()}
-{'copper': 0.0, 'iron': 0.0, 'wood': 1.0}
 """
 
 from __future__ import annotations
@@ -61,6 +50,19 @@ class Stream:
     ----------
     decided_at : float or None
         When the rule ended the contact [s]; None until then.
+
+    Examples
+    --------
+    >>> from thermogrip.classify.estimators.posterior import PosteriorClassifier
+    >>> from thermogrip.datasets.examples import load_example_grasps
+    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
+    >>> known = PosteriorClassifier().with_device(load_default_gripper())
+    >>> grasp = load_example_grasps()["exp2_dT20"].isel(grasp=[21])
+    >>> touch = Stream(known, candidates=["copper", "iron", "wood"], t_object=28.0, t_ambient=27.0)
+    >>> for time, temperature in zip(grasp["time"].values[:40], grasp["t_surface"].values[0]):
+    ...     p = touch.update(float(time), float(temperature))
+    >>> {name: round(float(v), 3) for name, v in p.items()}
+    {'copper': 0.0, 'iron': 0.0, 'wood': 1.0}
     """
 
     def __init__(

@@ -1,16 +1,16 @@
 """The answer for each grasp: a material, probabilities, and how likely it is none of them.
 
-``material`` is the likeliest known one.  ``p_unknown`` stands beside the probabilities, not in their sum, and
+``material`` is the likeliest known one.  ``p_unknown`` is beside the probabilities, not in their sum, and
 is empty for a classifier that has no model of other materials.  Touches of one block (``touch_group``) are
 one question: a classifier that knows how touches hang together answers it from all of them, of another the
-log probabilities are added, and each of its rows carries the common answer. ``decided_at_s`` is the contact
+log probabilities are added, and each of its rows has the common answer. ``decided_at_s`` is the contact
 time that was used: the last sample of the grasp or of its group's last touch, or where a stop rule
 (:mod:`~thermogrip.classify.decisions.stopping_rule`) would have ended the contact.
 
 For any classifier, a grasp that shows no contact (:mod:`thermogrip.sysid.effusivity.quality`) has no
 material and no probabilities, and is none of the candidates for certain; nor is a trace named that ran into
 the end of its sensor's range (:mod:`thermogrip.sysid.effusivity.quality`) by a classifier that needs whole
-traces.  Of a block such a touch is left out, and its row carries the answer of the others.  Nor is more read
+traces.  Of a block such a touch is left out, and its row has the answer of the others.  Nor is more read
 of a contact than those of the training lasted (:mod:`thermogrip.sysid.effusivity.quality`).  ``note``
 explains each; other rows have none.
 
@@ -89,8 +89,17 @@ def classify_grasps(
     Raises
     ------
     UserError
-        If a candidate is unknown to the classifier, or stands twice, or a rule is to stop touches of one
+        If a candidate is unknown to the classifier, or named twice, or a rule is to stop touches of one
         block, which share an answer.
+
+    Examples
+    --------
+    >>> from thermogrip.classify import make_classifier
+    >>> from thermogrip.datasets.examples import load_example_grasps
+    >>> grasps = load_example_grasps()["exp2_dT20"]
+    >>> row = classify_grasps(make_classifier("features-lda").fit(grasps), grasps)[0]
+    >>> row["material"], round(row["p_copper"], 2), row["decided_at_s"]
+    ('copper', 0.94, 10.0)
     """
     names = [str(c) for c in (classifier.classes_ if candidates is None else candidates)]
     if len(set(names)) < len(names):
@@ -191,7 +200,22 @@ def joined_touches(classifier: GraspClassifier, log_p: Floats, grasps: Grasps) -
 
 
 def write_predictions(rows: Sequence[Row], path: str | Path) -> Path:
-    """Write ``predictions.csv`` whole or not at all; probabilities with six digits, unknown ones empty."""
+    """Write ``predictions.csv`` whole or not at all and return its path.
+
+    Parameters
+    ----------
+    rows : sequence of dict
+        Of :func:`classify_grasps`; probabilities get six digits, unknown ones are empty.
+    path : str or Path
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = write_predictions([{"grasp_id": "g0", "p_iron": 1 / 3}], Path(folder) / "out.csv")
+    ...     print(path.read_text().split())
+    ['grasp_id,p_iron', 'g0,0.333333']
+    """
     return write_atomic(path, table_csv(rows))
 
 
@@ -340,6 +364,17 @@ def reasons(classifier: GraspClassifier, X: Records, rows: Sequence[Row]) -> lis
     -------
     words : (n,) list of str
         Empty too for touches of one block, which have no nominal temperature, and for grasps without a name.
+
+    Examples
+    --------
+    >>> from thermogrip.classify.estimators.posterior import PosteriorClassifier
+    >>> from thermogrip.datasets.examples import load_example_grasps
+    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
+    >>> known = PosteriorClassifier().with_device(load_default_gripper())
+    >>> cork = load_example_grasps()["exp6_other_materials_obj43_grip23"].sel(grasp=["u009"])
+    >>> [why] = reasons(known, cork, classify_grasps(known, cork, ["copper", "wood"]))
+    >>> why.split(" and ")[0]
+    "as wood it needs 0.34 times its block's effusivity (12.6 sd)"
     """
 
     def words(model: PosteriorClassifier, grasps: Grasps, named: list[str]) -> list[str]:

@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import logsumexp
 
-from thermogrip.classify.decisions.next_touch import expected_information
+from thermogrip.classify.decisions.next_touch import expected_information, with_model
 from thermogrip.classify.estimators.base import (
     Floats,
     GraspClassifier,
@@ -70,7 +70,7 @@ class StopRule:
     sure : float
         Stop where the likeliest candidate has this probability.
     gain : float
-        Stop where the rest of the contact is expected to win less accuracy than this; 0 never.
+        Stop where the rest of the contact is expected to win less than this share of right answers; 0 never.
     times : tuple of float
         When it is evaluated [s after the closed message].
     end : float
@@ -115,12 +115,25 @@ class StopRule:
 
 
 def load_stop_rule(folder: str | Path) -> StopRule:
-    """Return the rule that stands beside a classifier.
+    """Return the rule beside a classifier.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Of the classifier.
 
     Raises
     ------
     UserError
         If the classifier was trained without one.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = StopRule(sure=0.97, end=8.0).save(Path(folder) / RULE_FILE)
+    ...     print(load_stop_rule(folder).end)
+    8.0
     """
     file = Path(folder) / RULE_FILE
     if not file.exists():
@@ -160,8 +173,6 @@ def growing_windows(
 ) -> Windows:
     """Return the probabilities at those ``times`` before ``end`` [s] and at the end, from the readings until
     then; without ``gain`` the expected gain is infinite before the end."""
-    from thermogrip.classify.decisions.next_touch import with_model
-
     model = with_model(classifier)
     names = [str(c) for c in (model.classes_ if candidates is None else candidates)]
     model._check_candidates(names)
@@ -255,10 +266,10 @@ def learn_stop_rule(
     error : float, optional
         Share of wrong answers among the contacts that stop because the answer is confident.
     loss : float, optional
-        Accuracy that may be given away by stopping where the rest is not expected to help; 0 never stops for
-        that.
+        Share of right answers that may be given away by stopping where the rest is not expected to help; 0
+        never stops for that.
     times, end : optional
-        As in :func:`growing_windows`.
+        When the rule is evaluated, and when contact ends anyway [s].
     progress : callable, optional
         Called with the fraction done and what is being done.
 
@@ -266,6 +277,17 @@ def learn_stop_rule(
     ------
     UserError
         If so few grasps cannot show so small an error, or a share is none.
+
+    Examples
+    --------
+    >>> from thermogrip.classify.estimators.posterior import PosteriorClassifier
+    >>> from thermogrip.datasets.examples import load_example_grasps
+    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
+    >>> known = PosteriorClassifier().with_device(load_default_gripper())
+    >>> six = load_example_grasps()["exp2_dT20"].isel(grasp=[5, 6, 13, 14, 21, 22])
+    >>> rule = learn_stop_rule(known, six, error=0.2, times=(0.5, 1.0, 2.0))
+    >>> rule.n_grasp, round(rule.sure, 2)
+    (6, 0.8)
     """
     if not (0 < error < 1 and 0 <= loss < 1):
         raise UserError(f"error {error:g} or loss {loss:g} is no share", hint="give numbers between 0 and 1")

@@ -45,7 +45,17 @@ HELD_AT_AN_END = 0.5  # s; a trace that is shorter than its grid by more is refu
 
 
 class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc]  # scikit-learn has no types
-    """Base of the classifiers: checks what comes in, derives what scikit-learn expects."""
+    """Base of the classifiers: checks what comes in, derives what scikit-learn expects.
+
+    Examples
+    --------
+    >>> from thermogrip.classify import make_classifier
+    >>> from thermogrip.datasets.examples import load_example_grasps
+    >>> grasps = load_example_grasps()["exp2_dT20"]
+    >>> model = make_classifier("features-lda").fit(grasps)
+    >>> model.classes_.tolist(), model.predict_proba(grasps).shape
+    (['copper', 'iron', 'wood'], (24, 3))
+    """
 
     learns_from_all_conditions: ClassVar[bool] = False
     """True where the training grasps of every condition describe one gripper together."""
@@ -218,16 +228,15 @@ def grasp_labels(grasps: Grasps, y: ArrayLike | None = None) -> Labels:
     return labels
 
 
-def record_labels(records: Sequence[Grasps], y: ArrayLike | None) -> Labels:
-    """Return the materials of all grasps, record after record: ``y``, or the records' own."""
+def record_labels(records: Sequence[Grasps], y: ArrayLike | None) -> list[Labels]:
+    """Return the materials of each record's grasps: ``y``, which runs through all of them, or their own."""
     if y is None:
-        return np.concatenate([grasp_labels(part) for part in records])
+        return [grasp_labels(part) for part in records]
     labels = np.asarray(y).astype(str).ravel()
     ends = np.cumsum([part.sizes["grasp"] for part in records])
     if labels.size != ends[-1]:
         raise UserError(f"{labels.size} labels for {ends[-1]} grasps")
-    chunks = np.split(labels, ends[:-1])
-    return np.concatenate([grasp_labels(part, chunk) for part, chunk in zip(records, chunks)])
+    return [grasp_labels(part, chunk) for part, chunk in zip(records, np.split(labels, ends[:-1]))]
 
 
 def pick(grasps: Grasps, index: ArrayLike) -> Grasps:
@@ -256,15 +265,6 @@ def join_grasps(records: Sequence[Grasps], *, name: str | None = None) -> Grasps
 
     A variable that only some records hold is unknown in the others; ``t_surface_2`` stays only if all hold
     it.
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.schema import make_grasps
-    >>> a = make_grasps([0.0, 0.1, 0.2], [[1.0, 2.0, 3.0]], ["a"], material=["iron"])
-    >>> b = make_grasps([0.0, 0.1], [[4.0, 5.0]], ["b"], t_object=[43.0])
-    >>> both = join_grasps([a, b])
-    >>> both["t_surface"].values.tolist(), both["material"].values.tolist()
-    ([[1.0, 2.0], [4.0, 5.0]], ['iron', ''])
     """
     if len(records) == 1:
         return check_grasps(records[0])
@@ -369,6 +369,20 @@ def check_shapes(arrays: dict[str, NDArray[Any]], **shapes: tuple[int | None, ..
         found = arrays[name].shape
         if len(found) != len(shape) or any(n not in (None, have) for n, have in zip(shape, found)):
             raise ValueError(f"{name} has shape {found}")
+
+
+def set_arrays(
+    classifier: GraspClassifier, arrays: dict[str, NDArray[Any]], **shapes: tuple[int | None, ...]
+) -> None:
+    """Set the attributes that ``shapes`` names from arrays of a file, of these shapes."""
+    check_shapes(arrays, **shapes)
+    for name in shapes:
+        setattr(classifier, name, arrays[name])
+
+
+def named_arrays(classifier: GraspClassifier, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """Return attributes of a classifier as arrays by name."""
+    return {name: np.asarray(getattr(classifier, name)) for name in names}
 
 
 def two_or_more(labels: Labels, where: str) -> Labels:

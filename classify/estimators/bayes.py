@@ -56,8 +56,10 @@ from thermogrip.classify.estimators.base import (
     Labels,
     Records,
     check_shapes,
+    named_arrays,
     record_labels,
     record_list,
+    set_arrays,
     two_or_more,
 )
 from thermogrip.classify.estimators.features import (
@@ -75,9 +77,8 @@ from thermogrip.datasets.schema import Grasps, log_name
 
 _COVARIANCE_GRID = np.geomspace(0.5, 200.0, 25)  # nu_0 - d - 1, grasps
 _MEAN_GRID = np.geomspace(0.001, 30.0, 16)  # kappa_0, grasps
-_HALF_WEIGHT = (
-    2.0  # K; at this difference its error of some 0.5 K is as large as the difference between metals
-)
+# K; at this difference its error of some 0.5 K is as large as the difference between metals
+_HALF_WEIGHT = 2.0
 _LEAST_WEIGHT = 0.5  # grasps; with less a material's normalised features are unknown
 _T_OBJECT_SD = 0.5  # K, of a nominal object temperature
 _SD_WEIGHT = 4.0  # grasps that this prior counts for
@@ -154,6 +155,15 @@ class FeatureReader:
             usable = np.ones(labels.size, dtype=bool)
         parts = [reader._readings(part, table.reindex(feature=names)) for part, table in zip(records, tables)]
         return reader, _joined(parts), usable, notes
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a JSON-able description."""
+        return {"features": self.names, "normalise": self.normalise, "end": self.end}
+
+    @classmethod
+    def from_dict(cls, content: dict[str, Any]) -> FeatureReader:
+        """Return the reader that :meth:`to_dict` described."""
+        return cls(list(content["features"]), bool(content["normalise"]), float(content["end"]))
 
     def read(self, grasps: Grasps) -> Readings:
         """Return the features of other grasps; one that is half a second shorter than those of the
@@ -235,7 +245,7 @@ class BayesClassifier(GraspClassifier):
         if self.shrinkage is not None and not self.shrinkage > 0:
             raise UserError(f"shrinkage must be > 0 grasps, got {self.shrinkage}")
         records = record_list(X)
-        labels = record_labels(records, y)
+        labels = np.concatenate(record_labels(records, y))
         two_or_more(labels, "+".join(map(log_name, records)))
         self.sensors_ = 2 if all("t_surface_2" in part for part in records) else 1
         self.reader_, all_read, usable, self.notes_ = FeatureReader.learn(
@@ -336,22 +346,18 @@ class BayesClassifier(GraspClassifier):
 
     def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """Return what ``fit`` learnt: numbers, and named arrays."""
-        numbers = {
-            "features": self.feature_names_,
-            "normalise": self.reader_.normalise,
-            "end": self.reader_.end,
+        numbers = self.reader_.to_dict() | {
             "dof": self.dof_,
             "shrinkage": self.shrinkage_,
             "mean_shrinkage": self.mean_shrinkage_,
             "t_object_sd": self.t_object_sd_,
         }
-        keys = ("center_", "scale_", "means_", "covariance_", "mean_covariance_")
-        return numbers, {key: np.asarray(getattr(self, key)) for key in keys}
+        return numbers, named_arrays(self, ("center_", "scale_", "means_", "covariance_", "mean_covariance_"))
 
     def set_state(self, numbers: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
         """Take up what :meth:`get_state` returned; 0.1.0 had no error of the object temperature."""
-        self.feature_names_ = list(numbers["features"])
-        self.reader_ = FeatureReader(self.feature_names_, bool(numbers["normalise"]), float(numbers["end"]))
+        self.reader_ = FeatureReader.from_dict(numbers)
+        self.feature_names_ = self.reader_.names
         self.dof_, self.shrinkage_ = float(numbers["dof"]), float(numbers["shrinkage"])
         self.mean_shrinkage_ = float(numbers["mean_shrinkage"])
         self.t_object_sd_ = number_within({"t_object_sd": 0.0, **numbers}, "t_object_sd", 0.0, 1e3)
@@ -360,11 +366,8 @@ class BayesClassifier(GraspClassifier):
             spread = (arrays["widening_"] - 1)[:, None, None] * arrays["covariance_"]
             arrays = arrays | {"mean_covariance_": spread}
         n, k = len(self.feature_names_), self.classes_.size
-        check_shapes(
-            arrays, center_=(n,), scale_=(n,), means_=(k, n), covariance_=(n, n), mean_covariance_=(k, n, n)
-        )
-        for key in ("center_", "scale_", "means_", "covariance_", "mean_covariance_"):
-            setattr(self, key, arrays[key])
+        square = {"covariance_": (n, n), "mean_covariance_": (k, n, n)}
+        set_arrays(self, arrays, center_=(n,), scale_=(n,), means_=(k, n), **square)
 
 
 def _usable(difference: Floats, labels: Labels) -> tuple[NDArray[np.bool_], list[str]]:
@@ -412,7 +415,7 @@ def _within_class_sd(x: Floats, weight: Floats, means: Floats, center: Floats) -
     total = weight.sum(axis=0)
     freedom = np.maximum(total - np.unique(means, axis=0).shape[0], 1)
     sd = np.sqrt(np.sum(weight * (x - means) ** 2, axis=0) / freedom)
-    # One grasp a material has no within-class spread: the spread of all grasps stands in for it.
+    # One grasp a material has no within-class spread: the spread of all grasps is used.
     spread = np.sqrt(_weighted_mean((x - center) ** 2, weight))
     return np.asarray(np.where(sd > 1e-12, sd, np.where(spread > 0, spread, 1.0)))
 

@@ -23,11 +23,11 @@ from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from thermogrip.classify.estimators.base import (
     Floats,
-    GraspClassifier,
     JoinedClassifier,
     Labels,
     as_array,
-    check_shapes,
+    named_arrays,
+    set_arrays,
     times_from,
 )
 from thermogrip.classify.estimators.bayes import FeatureReader
@@ -66,9 +66,7 @@ class _Lda(JoinedClassifier):
     def _take_up(self, arrays: dict[str, NDArray[Any]], n: int) -> None:
         """Take up the rule for rows of n numbers."""
         k = self.classes_.size
-        check_shapes(arrays, center_=(n,), scale_=(n,), coef_=(k, n), intercept_=(k,))
-        for key in ("center_", "scale_", "coef_", "intercept_"):
-            setattr(self, key, arrays[key])
+        set_arrays(self, arrays, center_=(n,), scale_=(n,), coef_=(k, n), intercept_=(k,))
 
     def _log_proba(self, grasps: Grasps) -> Floats:
         return self._discriminants(self._rows(grasps))
@@ -122,19 +120,14 @@ class FeaturesLda(_Lda):
 
     def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """Return what ``fit`` learnt: feature names, and named arrays."""
-        reader = self.reader_
-        numbers = {
-            "features": self.feature_names_,
-            "normalise": reader.normalise,
-            "end": reader.end,
-            "spread": self.spread_ if np.isfinite(self.spread_) else None,
-        }
-        return numbers, _arrays(self, ("center_", "scale_", "coef_", "intercept_"))
+        spread = self.spread_ if np.isfinite(self.spread_) else None
+        arrays = named_arrays(self, ("center_", "scale_", "coef_", "intercept_"))
+        return self.reader_.to_dict() | {"spread": spread}, arrays
 
     def set_state(self, numbers: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
         """Take up what :meth:`get_state` returned."""
-        self.feature_names_ = list(numbers["features"])
-        self.reader_ = FeatureReader(self.feature_names_, bool(numbers["normalise"]), float(numbers["end"]))
+        self.reader_ = FeatureReader.from_dict(numbers)
+        self.feature_names_ = self.reader_.names
         spread = numbers.get("spread")
         self.spread_ = np.inf if spread is None else float(spread)
         self._take_up(arrays, len(self.feature_names_))
@@ -173,12 +166,11 @@ class PcaLda(_Lda):
     def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """Return what ``fit`` learnt, as named arrays."""
         keys = ("times_", "pca_mean_", "axes_", "center_", "scale_", "coef_", "intercept_")
-        return {}, _arrays(self, keys)
+        return {}, named_arrays(self, keys)
 
     def set_state(self, numbers: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
         """Take up what :meth:`get_state` returned."""
-        check_shapes(arrays, axes_=(None, arrays["pca_mean_"].size))
-        self.times_, self.pca_mean_, self.axes_ = (arrays[k] for k in ("times_", "pca_mean_", "axes_"))
+        set_arrays(self, arrays, times_=(None,), pca_mean_=(None,), axes_=(None, arrays["pca_mean_"].size))
         self._take_up(arrays, self.axes_.shape[0])
 
 
@@ -299,7 +291,3 @@ def one_of_a_kind() -> Iterator[None]:
 def _centred(values: Floats) -> Floats:
     """Return values less their mean over the classes, the last axis: what all share does not decide."""
     return np.asarray(values - values.mean(axis=-1, keepdims=True))
-
-
-def _arrays(estimator: GraspClassifier, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:
-    return {key: np.asarray(getattr(estimator, key)) for key in keys}

@@ -20,7 +20,7 @@ one, on a GPU; weights and batches are drawn by PyTorch's generator in either ca
 same training, to rounding.  PyTorch is the extra ``lstm``; prediction needs neither.
 
 **Augmentation.**  Each copy is one real trace plus white noise on every sample and one shift of the whole
-trace, which is what another initial temperature looks like to a network that sees temperatures.  Copies are
+trace, which is what another initial temperature is to a network that sees temperatures.  Copies are
 not new grasps: they are made from the training grasps alone, after the split, and keep the number of their
 source.
 """
@@ -156,13 +156,9 @@ class LstmClassifier(JoinedClassifier):
         self.times_ = times_from(grasps, self.start)
         real = as_array(grasps, times=self.times_)
         self.mean_, self.sd_ = self._standard(real)
+        size, noise, shift = self.series_per_class, self.noise_sd, self.shift_sd
         made = augment(
-            real,
-            labels,
-            series_per_class=self.series_per_class,
-            noise_sd=self.noise_sd,
-            shift_sd=self.shift_sd,
-            seed=self.random_state,
+            real, labels, series_per_class=size, noise_sd=noise, shift_sd=shift, seed=self.random_state
         )
         target = np.searchsorted(self.classes_, made.labels)
         series = self._series((made.traces - self.mean_) / self.sd_)
@@ -199,12 +195,7 @@ class LstmClassifier(JoinedClassifier):
 
     def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """Return what ``fit`` learnt as named arrays: times, standardisation, weights and the loss curve."""
-        arrays: dict[str, NDArray[Any]] = {
-            "times": self.times_,
-            "mean": self.mean_,
-            "sd": self.sd_,
-            "loss_curve": self.loss_curve_,
-        }
+        arrays = {"times": self.times_, "mean": self.mean_, "sd": self.sd_, "loss_curve": self.loss_curve_}
         return {}, arrays | {f"weights.{k}": v for k, v in self.weights_.items()}
 
     def set_state(self, numbers: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
@@ -218,7 +209,7 @@ class LstmClassifier(JoinedClassifier):
 
 
 class PaperLstm(LstmClassifier):
-    """The paper's LSTM as it stands there, fed with plain temperatures (``"lstm-paper"``).
+    """The paper's LSTM as described there, fed with plain temperatures (``"lstm-paper"``).
 
     Parameters and attributes are those of :class:`LstmClassifier`.
     """
@@ -242,9 +233,7 @@ def _drawn(
         network, readout = torch.nn.LSTM(shape[2], model.hidden), torch.nn.Linear(model.hidden, classes)
         for _ in range(model.epochs):
             orders.append(torch.randperm(rows).split(model.batch))  # type: ignore[no-untyped-call]
-    state = {f"lstm.{k}": v for k, v in network.state_dict().items()}
-    state |= {f"readout.{k}": v for k, v in readout.state_dict().items()}
-    return {k: v.numpy() for k, v in state.items()}, [[b.numpy() for b in order] for order in orders]
+    return _named(network, readout), [[b.numpy() for b in order] for order in orders]
 
 
 def _trainer(device: str) -> Trainer:
@@ -291,9 +280,13 @@ def _train_torch(
             loss.backward()  # type: ignore[no-untyped-call]
             adam.step()
             losses[k] += loss.detach() * (rows.numel() / y.numel())
-    state = {f"lstm.{k}": v for k, v in network.state_dict().items()}
-    state |= {f"readout.{k}": v for k, v in readout.state_dict().items()}
-    return {k: v.cpu().numpy() for k, v in state.items()}, losses.cpu().numpy()
+    return _named(network, readout), losses.cpu().numpy()
+
+
+def _named(network: Any, readout: Any) -> Weights:
+    """Return the weights of both PyTorch modules by name."""
+    parts = {"lstm": network.state_dict(), "readout": readout.state_dict()}
+    return {f"{name}.{k}": v.cpu().numpy() for name, part in parts.items() for k, v in part.items()}
 
 
 def _logits(weights: Mapping[str, NDArray[Any]], series: NDArray[np.float32]) -> Floats:

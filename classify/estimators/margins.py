@@ -128,7 +128,7 @@ def inner_folds(
 ) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
     """Return (fitted, held out) rows of training grasps, whole sessions or whole grasps apart.
 
-    There are none where a class stands in one group only."""
+    There are none where a class is in one group only."""
     groups = unit_names(grasps)
     session = grasps["session"].values.astype(str) if "session" in grasps else groups
     for tried in (session, groups):

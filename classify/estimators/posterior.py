@@ -8,10 +8,10 @@ candidate m.  With prior odds :math:`\pi_m` (equal by default)
 
 Fitting calibrates the gripper, which is one and the same in every condition: training grasps at all
 temperatures describe it together, also those of materials that are no candidates.  Beside the known materials
-stands a free effusivity; its Bayes factor gives the probability that the grasp is of none of them.
+is a free effusivity; its Bayes factor gives the probability that the grasp is of none of them.
 
 Touches of one block (``touch_group``) are one question: their evidence is joint, since they share the block's
-temperature (:mod:`thermogrip.sysid.effusivity.multi_touch`), and each of their rows carries the common
+temperature (:mod:`thermogrip.sysid.effusivity.multi_touch`), and each of their rows has the common
 answer.
 
 A calibration is of one gripper.  For another one of the same kind its numbers are a guess, and an answer
@@ -36,7 +36,6 @@ from thermogrip.classify.estimators.base import (
     Floats,
     GraspClassifier,
     Records,
-    grasp_labels,
     normalised,
     pick,
     record_labels,
@@ -117,9 +116,11 @@ class PosteriorClassifier(GraspClassifier):
         from thermogrip.sysid.effusivity.multi_touch import learn_coupling
 
         self._check_params()
-        records = _labelled(record_list(X), y)
-        labels = np.concatenate([grasp_labels(part) for part in records])
-        self.classes_ = two_or_more(labels, "+".join(str(part.attrs.get("name")) for part in records))
+        records = record_list(X)
+        labels = record_labels(records, y)
+        where = "+".join(str(part.attrs.get("name")) for part in records)
+        self.classes_ = two_or_more(np.concatenate(labels), where)
+        records = [part.assign(material=("grasp", own)) for part, own in zip(records, labels)]
         device = calibrate_gripper(records, start=self.device, seed=self.random_state, progress=progress)
         self.longest_ = longest_contact(records)
         self.coupling_ = None
@@ -297,12 +298,3 @@ def _uncertain_as(device: GripperModel, gripper: str) -> GripperModel:
             )
         return replace(device, uncertain=True)
     return device
-
-
-def _labelled(records: list[Grasps], y: ArrayLike | None) -> list[Grasps]:
-    """Return the records with ``y``, which runs through all of them, as their materials."""
-    if y is None:
-        return records
-    ends = np.cumsum([part.sizes["grasp"] for part in records])
-    chunks = np.split(record_labels(records, y), ends[:-1])
-    return [part.assign(material=("grasp", chunk)) for part, chunk in zip(records, chunks)]

@@ -30,7 +30,7 @@ from sklearn.base import clone
 
 from thermogrip.classify.estimators import CLASSIFIERS, check_name
 from thermogrip.classify.estimators.base import Floats, GraspClassifier, Records
-from thermogrip.datasets.atomic_files import os_fault, read_bytes, read_json, write_atomic, write_json
+from thermogrip.datasets.atomic_files import make_folder, read_bytes, read_json, write_atomic, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
 
@@ -69,7 +69,11 @@ def make_classifier(
     200
     """
     if "+" in name:
-        return _vote(name, quick, seed, params)
+        if params:
+            raise UserError(f"{name} has no parameters of its own", hint="make its members one by one")
+        members = [make_classifier(member, quick=quick, seed=seed) for member in name.split("+")]
+        check_members(members)  # here, not in the middle of a run
+        return VoteClassifier(members)
     if name not in CLASSIFIERS and ("." in name or ":" in name):
         from thermogrip.classify.estimators.lda import ArrayClassifier, imported_estimator
 
@@ -91,14 +95,6 @@ def make_classifier(
         params = {"random_state": seed} | params
     made: GraspClassifier = kind(**params)
     return made
-
-
-def _vote(name: str, quick: bool, seed: int | None, params: dict[str, Any]) -> GraspClassifier:
-    if params:
-        raise UserError(f"{name} has no parameters of its own", hint="make its members one by one")
-    members = [make_classifier(member, quick=quick, seed=seed) for member in name.split("+")]
-    check_members(members)  # here, not in the middle of a run
-    return VoteClassifier(members)
 
 
 def classifier_name(classifier: GraspClassifier) -> str:
@@ -131,30 +127,41 @@ def trainable(
 
 
 def can_be_saved(classifier: GraspClassifier) -> bool:
-    """Return whether a classifier can become a file that is data alone.
-
-    Examples
-    --------
-    >>> [can_be_saved(make_classifier(name)) for name in ("bayes", "rocket", "sklearn.svm:SVC")]
-    [True, False, False]
-    """
+    """Return whether a classifier can become a file that is data alone."""
     return type(classifier).get_state is not GraspClassifier.get_state
 
 
 def save_classifier(classifier: GraspClassifier, folder: str | Path) -> Path:
-    """Write a fitted classifier to a folder, which is made if missing; return the folder.
+    """Write a fitted classifier to a folder and return the folder.
+
+    Parameters
+    ----------
+    classifier : GraspClassifier
+        A fitted one.
+    folder : str or Path
+        Made if missing.
 
     Raises
     ------
     UserError
         If this kind cannot be saved, or the folder cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from thermogrip.datasets.examples import load_example_grasps
+    >>> model = make_classifier("features-lda").fit(load_example_grasps()["exp2_dT20"])
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     [file.name for file in save_classifier(model, folder).iterdir()]
+    ['classifier.json']
     """
     classifier._check_fitted()
     name = classifier_name(classifier)
     if name not in CLASSIFIERS or not can_be_saved(classifier):
         raise UserError(f"{name} cannot be saved", hint="compare it, or train one of " + _SAVED)
     numbers, arrays = classifier.get_state()
-    path = _folder(folder)
+    path = Path(folder)
+    make_folder(path)
     classifier.save_parts(path)
     content = {
         "name": name,
@@ -179,10 +186,26 @@ def save_classifier(classifier: GraspClassifier, folder: str | Path) -> Path:
 def load_classifier(folder: str | Path) -> GraspClassifier:
     """Return the classifier that :func:`save_classifier` wrote; its predictions are the same to the last bit.
 
+    Parameters
+    ----------
+    folder : str or Path
+        What ``train --out`` or :func:`save_classifier` made.
+
     Raises
     ------
     UserError
         If the folder holds no classifier, or a part of it is missing or damaged.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from thermogrip.datasets.examples import load_example_grasps
+    >>> grasps = load_example_grasps()["exp2_dT20"]
+    >>> model = make_classifier("features-lda").fit(grasps)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     again = load_classifier(save_classifier(model, folder))
+    >>> bool((again.predict_proba(grasps) == model.predict_proba(grasps)).all())
+    True
     """
     path = Path(folder)
     if not path.is_dir():
@@ -194,9 +217,7 @@ def load_classifier(folder: str | Path) -> GraspClassifier:
             raise KeyError(content["name"])
         classifier = make_classifier(content["name"], **content["params"])
         classifier.classes_ = np.asarray([str(c) for c in content["classes"]])
-        arrays: dict[str, NDArray[Any]] = {
-            k: np.asarray(v, dtype=float) for k, v in content["arrays"].items()
-        }
+        arrays = {k: np.asarray(v, dtype=float) for k, v in content["arrays"].items()}
         if content["name"] in _NETWORKS:
             arrays = _read_weights(path / "weights.safetensors")
         if content.get("sensors") is not None:
@@ -206,15 +227,6 @@ def load_classifier(folder: str | Path) -> GraspClassifier:
     except (KeyError, TypeError, AttributeError, ValueError, IndexError) as error:
         raise UserError(f"is damaged ({error})", file=file, hint="train the classifier again") from error
     return classifier
-
-
-def _folder(folder: str | Path) -> Path:
-    path = Path(folder)
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise os_fault(error, path) from error
-    return path
 
 
 def _read_weights(file: Path) -> dict[str, NDArray[Any]]:

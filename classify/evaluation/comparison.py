@@ -7,7 +7,7 @@ it is.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from thermogrip.classify.decisions.predict import Row, table_csv
 from thermogrip.classify.evaluation import metrics as s
 from thermogrip.classify.evaluation.metrics import calibration_interval, mean_intervals
-from thermogrip.datasets.atomic_files import os_fault, write_atomic, write_json
+from thermogrip.datasets.atomic_files import make_folder, write_atomic, write_json
 
 POOLED = "pooled"
 
@@ -48,6 +48,8 @@ class Comparison:
         ``classifier, repeat, condition, fit_s, predict_s_per_grasp``.
     notes : tuple of str
         What was left out, and why.
+    level : float
+        Confidence of the intervals.
     """
 
     split: str
@@ -204,10 +206,11 @@ class Comparison:
     ) -> Row:
         right_a = np.array([a[k]["correct"] for k in shared], dtype=float)
         right_b = np.array([b[k]["correct"] for k in shared], dtype=float)
-        gap = _mean_by([(a[k]["condition"], a[k]["grasp_id"]) for k in shared], right_a - right_b)
-        test = s.mcnemar(right_a, right_b)
         loss = np.array([a[k]["log_loss"] - b[k]["log_loss"] for k in shared])
-        columns, grasp = np.column_stack([right_a - right_b, loss]), grasp_numbers([a[k] for k in shared])
+        grasp = grasp_numbers([a[k] for k in shared])
+        gap = np.bincount(grasp, weights=right_a - right_b) / np.bincount(grasp)
+        test = s.mcnemar(right_a, right_b)
+        columns = np.column_stack([right_a - right_b, loss])
         right, lost = mean_intervals(columns, grasp, level=self.level, seed=self.seed)
         return {
             "first": first,
@@ -234,38 +237,27 @@ class Comparison:
         """
         table = []
         for classifier in self.classifiers:
-            rows = [
-                r for r in self.predictions if r["classifier"] == classifier and r["p_unknown"] is not None
-            ]
+            rows = [r for r in self.predictions if r["classifier"] == classifier]
+            rows = [r for r in rows if r["p_unknown"] is not None]
             known = [r["p_unknown"] for r in rows if r["known"] and not r["apart"]]
             strange = [r for r in rows if not r["known"]]
-            for material in sorted({r["material"] for r in strange}):
+            for material in sorted({r["material"] for r in strange}) if known else ():
                 scored = [r["p_unknown"] for r in strange if r["material"] == material]
-                if known:
-                    table.append(
-                        {
-                            "classifier": classifier,
-                            "material": material,
-                            "n_unknown": len(scored),
-                            "n_known": len(known),
-                            "auroc": s.auroc(known, scored),
-                        }
-                    )
+                head = {"classifier": classifier, "material": material}
+                counts = {"n_unknown": len(scored), "n_known": len(known)}
+                table.append(head | counts | {"auroc": s.auroc(known, scored)})
         return table
 
     def save(self, folder: str | Path) -> Path:
         """Write every table as CSV and ``comparison.json`` into a folder; return the folder."""
         path = Path(folder)
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise os_fault(error, path) from error
+        make_folder(path)
         tables = {
             "scores": self.scores(),
             "predictions": list(self.predictions),
-            "confusion": _flat(self._tables(self._confusion_rows)),
-            "calibration": _flat(self._tables(self._calibration_rows)),
-            "differences": _flat(self.differences(c) for c in self._groups()),
+            "confusion": self._each(self._confusion_rows),
+            "calibration": self._each(self.calibration),
+            "differences": [row for c in self._groups() for row in self.differences(c)],
             "leaks": list(self.leaks),
             "open_set": self.open_set(),
         }
@@ -287,21 +279,17 @@ class Comparison:
     def _groups(self) -> list[str]:
         return list(dict.fromkeys(row["condition"] for row in self.scores()))
 
-    def _tables(self, rows_of: Callable[[str, str], list[Row]]) -> Iterable[list[Row]]:
-        return (rows_of(row["classifier"], row["condition"]) for row in self.scores())
+    def _each(self, rows_of: Callable[[str, str], list[Row]]) -> list[Row]:
+        """Return the rows of every classifier and condition, which each row names first."""
+        heads = [{key: row[key] for key in ("classifier", "condition")} for row in self.scores()]
+        return [head | row for head in heads for row in rows_of(head["classifier"], head["condition"])]
 
     def _confusion_rows(self, classifier: str, condition: str) -> list[Row]:
         names, counts = self.confusion(classifier, condition)
-        head = {"classifier": classifier, "condition": condition}
         return [
-            head | {"true": t, "predicted": p, "grasps_a_split": float(counts[i, j])}
-            for i, t in enumerate(names)
-            for j, p in enumerate(names)
+            {"true": names[i], "predicted": names[j], "grasps_a_split": float(n)}
+            for (i, j), n in np.ndenumerate(counts)
         ]
-
-    def _calibration_rows(self, classifier: str, condition: str) -> list[Row]:
-        head = {"classifier": classifier, "condition": condition}
-        return [head | row for row in self.calibration(classifier, condition)]
 
     def _rows(self, classifier: str, condition: str) -> list[Row]:
         return [
@@ -313,10 +301,6 @@ class Comparison:
         ]
 
 
-def _flat(tables: Iterable[list[Row]]) -> list[Row]:
-    return [row for rows in tables for row in rows]
-
-
 def _by_key(rows: Sequence[Row]) -> dict[Any, Row]:
     return {(r["repeat"], r["condition"], r["grasp_id"]): r for r in rows}
 
@@ -325,12 +309,6 @@ def grasp_numbers(rows: Sequence[Row]) -> NDArray[np.int64]:
     """Return the number of the distinct grasp of each row, counted from 0."""
     at: dict[tuple[str, str], int] = {}
     return np.array([at.setdefault((r["condition"], r["grasp_id"]), len(at)) for r in rows])
-
-
-def _mean_by(keys: Sequence[tuple[str, str]], values: Floats) -> Floats:
-    at = {key: i for i, key in enumerate(dict.fromkeys(keys))}
-    of = np.array([at[key] for key in keys])
-    return np.asarray(np.bincount(of, weights=values) / np.bincount(of))
 
 
 def _spread(name: str, found: s.Interval | s.CalibrationError) -> Row:

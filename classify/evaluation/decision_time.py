@@ -56,7 +56,7 @@ Part = tuple[Windows, NDArray[np.int64]]
 @dataclass(frozen=True)
 class Decisions:
     """Where contacts ended: ``rows`` of ``classifier, repeat, condition, grasp_id, time, end, correct,
-    correct_at_end, early, doubt`` (the probability of an error when it ended), the ``rules`` of each
+    correct_at_end, early, p_wrong`` (the probability of an error when it ended), the ``rules`` of each
     classifier, one a repeat, and ``notes`` on those left out."""
 
     rows: tuple[Row, ...]
@@ -163,18 +163,12 @@ def _windows(
     )
     seen = []
     for fold in folds:
-        parts = [
-            growing_windows(
-                fitted,
-                part,
-                candidates=fold.candidates,
-                times=times,
-                end=contact_end(part, fitted.longest_),
-                gain=False,
-            )
+        how: dict[str, Any] = {"candidates": fold.candidates, "times": times, "gain": False}
+        train, test = (
+            (growing_windows(fitted, part, end=contact_end(part, fitted.longest_), **how), _truth(part, fold))
             for part in (fold.train, fold.test)
-        ]
-        seen.append(((parts[0], _truth(fold.train, fold)), (parts[1], _truth(fold.test, fold))))
+        )
+        seen.append((train, test))
     return seen
 
 
@@ -236,7 +230,7 @@ def _stopped(name: str, fold: Fold, rule: StopRule, part: Part) -> list[Row]:
             "correct": bool(found.answer[i] == truth[i]),
             "correct_at_end": bool(last[i] == truth[i]),
             "early": bool(found.early[i]),
-            "doubt": float(found.p_wrong[i]),
+            "p_wrong": float(found.p_wrong[i]),
         }
         for i in range(truth.size)
     ]
@@ -245,9 +239,8 @@ def _stopped(name: str, fold: Fold, rule: StopRule, part: Part) -> list[Row]:
 def _scores(rows: Sequence[Row], level: float, seed: int) -> dict[str, Any]:
     grasp = grasp_numbers(rows)
     n = int(grasp.max()) + 1
-    columns = np.array(
-        [[float(row[k]) for k in ("time", "correct", "correct_at_end", "end")] for row in rows]
-    )
+    keys = ("time", "correct", "correct_at_end", "end")
+    columns = np.array([[float(row[key]) for key in keys] for row in rows])
     time, right, last, end = mean_intervals(columns, grasp, level=level, seed=seed)
     low, high = clopper_pearson(right.value * n, n, level=level)
     return {
@@ -275,5 +268,5 @@ def _early_scores(rows: Sequence[Row], grasp: NDArray[np.int64], level: float) -
     wrong = sum(not rows[i]["correct"] for i in at) / len(at)
     n = np.unique(grasp[at]).size
     low, high = clopper_pearson(wrong * n, n, level=level)
-    expected = sum(rows[i]["doubt"] for i in at) / len(at)
+    expected = sum(rows[i]["p_wrong"] for i in at) / len(at)
     return share | dict(zip(names, (wrong, low, high, expected)))

@@ -1,4 +1,4 @@
-"""One harness for every classifier: the same grasps, the same splits, honest intervals.
+"""One harness for every classifier: the same grasps, splits and intervals.
 
 Rules that it keeps:
 
@@ -9,7 +9,7 @@ Rules that it keeps:
   of them (a classifier declares it with ``learns_from_all_conditions``); never from a test grasp;
 - conditions with two touches or unknown object temperature are scored apart;
 - what cannot be scored is noted, not dropped in silence;
-- a leak probe looks for the label where no touch is.
+- a leak probe tries to predict the label where no touch is.
 
 **Leak probe.**  Everything after -0.5 s is replaced by the trace's own level before contact, with noise of
 the size seen there.  Such a record contains no touch, so a classifier trained and tested on it must be at
@@ -36,6 +36,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import binom
 from sklearn.base import clone
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from thermogrip.classify.decisions.predict import Row, joined_touches
 from thermogrip.classify.estimators.base import Floats, GraspClassifier, grasp_labels, level, pick
@@ -227,20 +228,16 @@ def _jobs(named: Mapping[str, GraspClassifier], plan: Plan, probe: bool) -> list
         if classifier.learns_from_all_conditions:
             for repeat, training in enumerate(plan.training):
                 folds = tuple((i, f) for i, f in numbered if f.repeat == repeat)
-                jobs.append(
-                    _Job(name, classifier, training, folds, "also" if probe and repeat == 0 else "no")
-                )
+                also = "also" if probe and repeat == 0 else "no"
+                jobs.append(_Job(name, classifier, training, folds, also))
             continue
         for i, fold in numbered:
             jobs.append(_Job(name, classifier, (fold.train,), ((i, fold),), "no"))
             if probe and fold.repeat == 0:
                 jobs.append(_Job(name, probe_clone(classifier), (fold.train,), ((i, fold),), "only"))
-    if probe:  # shrinkage LDA looks for the label before touch, levels included
-        path, params = (
-            "sklearn.discriminant_analysis:LinearDiscriminantAnalysis",
-            {"solver": "lsqr", "shrinkage": "auto"},
-        )
-        generic = ArrayClassifier(path, params=params, start=-np.inf, subtract_level=False)
+    if probe:  # shrinkage LDA of what was before touch, levels included
+        lda = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto")
+        generic = ArrayClassifier(lda, start=-np.inf, subtract_level=False)
         jobs += [_Job(_PROBE_NAME, generic, (f.train,), ((i, f),), "only") for i, f in numbered]
     return jobs
 
@@ -311,13 +308,8 @@ def _leaks(probes: Sequence[_Result]) -> list[Row]:
     keys = list(dict.fromkeys((r.classifier, row["condition"]) for r in probes for row in r.rows))
     table = []
     for classifier, condition in keys:
-        rows = [
-            row
-            for r in probes
-            if r.classifier == classifier
-            for row in r.rows
-            if row["condition"] == condition and row["known"]
-        ]
+        rows = [row for r in probes if r.classifier == classifier for row in r.rows]
+        rows = [row for row in rows if row["condition"] == condition and row["known"]]
         if not rows:
             continue
         n = len({row["grasp_id"] for row in rows})

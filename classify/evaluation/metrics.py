@@ -38,7 +38,7 @@ value.  The draws have the noise twice, so their quantiles are no interval of :m
 and the draws do have the distribution of the right-hand sides (with the signs that were found), since they
 contain no absolute value of a mean.  Their quantiles give an interval that covers at least the stated share.
 
-Beside it stands what a *perfectly calibrated* forecaster of the same confidences would show: each grasp draws
+Beside it is what a *perfectly calibrated* forecaster of the same confidences would show: each grasp draws
 one uniform number u and is right in all tests whose confidence exceeds it.  That is the mean of the bias, and
 the share of such forecasters with an ECE as large or larger is a p-value for "calibrated".  Taking all tests
 of a grasp to be right or wrong together overstates the bias a little, on the cautious side.
@@ -104,17 +104,14 @@ def brier(p: ArrayLike, true: ArrayLike) -> Floats:
     return np.asarray(np.sum((rows - truth) ** 2, axis=1))
 
 
-def calibration_bins(
-    confidence: ArrayLike, correct: ArrayLike, *, edges: ArrayLike | None = None
-) -> list[Bin]:
-    """Return confidence beside accuracy in bins of confidence, by default of 0.1; empty bins are left out."""
+def calibration_bins(confidence: ArrayLike, correct: ArrayLike) -> list[Bin]:
+    """Return confidence beside accuracy in bins of confidence of 0.1; empty bins are left out."""
     c, ok = np.asarray(confidence, dtype=float), np.asarray(correct, dtype=float)
-    cuts = np.linspace(0, 1, 11) if edges is None else np.asarray(edges, dtype=float)
-    of = np.clip(np.searchsorted(cuts, c, side="left") - 1, 0, cuts.size - 2)
+    of = _bin_of(c)
     return [
         Bin(
-            low=float(cuts[b]),
-            high=float(cuts[b + 1]),
+            low=float(_EDGES[b]),
+            high=float(_EDGES[b + 1]),
             n=int((of == b).sum()),
             confidence=float(c[of == b].mean()),
             accuracy=float(ok[of == b].mean()),
@@ -156,7 +153,7 @@ def auroc(negative: ArrayLike, positive: ArrayLike) -> float:
 
 _DRAWS = 2000
 _FORECASTERS = 1000
-_EDGES = np.linspace(0, 1, 11)  # as scores.calibration_bins
+_EDGES = np.linspace(0, 1, 11)  # of the bins of confidence
 
 
 class Interval(NamedTuple):
@@ -215,7 +212,7 @@ def calibration_interval(
     tests whose grasps are counted from 0."""
     c, of = np.asarray(confidence, dtype=float), np.asarray(grasp, dtype=int)
     right = np.asarray(correct, dtype=float)
-    bins = _bin_of(c)
+    bins = np.eye(_EDGES.size - 1)[_bin_of(c)]  # (n, 10), one in each row
     tests = np.bincount(of).astype(float)
     gaps = _by_grasp(bins * (c - right)[:, None], of)
     found = gaps.sum(axis=0) / c.size
@@ -250,10 +247,9 @@ def _bca(draws: Floats, value: float, influence: Floats, level: float) -> tuple[
     return float(low), float(high)
 
 
-def _bin_of(confidence: Floats) -> Floats:
-    """Return which bin each confidence is in, (n, 10), one in each row."""
-    of = np.clip(np.searchsorted(_EDGES, confidence, side="left") - 1, 0, _EDGES.size - 2)
-    return np.asarray(np.eye(_EDGES.size - 1)[of])
+def _bin_of(confidence: Floats) -> NDArray[np.int64]:
+    """Return which bin each confidence is in, (n,)."""
+    return np.clip(np.searchsorted(_EDGES, confidence, side="left") - 1, 0, _EDGES.size - 2)
 
 
 def _calibrated(c: Floats, of: NDArray[np.int64], bins: Floats, m: int, seed: int) -> Floats:

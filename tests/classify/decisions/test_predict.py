@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from thermogrip.classify import (
-    advise_touches,
     classify_grasps,
     make_classifier,
     reasons,
     save_classifier,
     write_predictions,
 )
+from thermogrip.classify.decisions.next_touch import advise_touches
 from thermogrip.classify.decisions.stopping_rule import StopRule
 from thermogrip.classify.estimators.base import GraspClassifier, pick
 from thermogrip.classify.estimators.posterior import PosteriorClassifier

@@ -11,9 +11,10 @@ import pytest
 from sklearn.base import BaseEstimator, ClassifierMixin, clone, is_classifier
 from sklearn.exceptions import NotFittedError
 
-from thermogrip.classify import can_be_saved, load_classifier, make_classifier, save_classifier
+from thermogrip.classify import load_classifier, make_classifier, save_classifier
 from thermogrip.classify.estimators.base import GraspClassifier, as_array, join_grasps, pick
 from thermogrip.classify.estimators.lda import ArrayClassifier
+from thermogrip.classify.estimators.registry import can_be_saved
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps, check_grasps, make_grasps

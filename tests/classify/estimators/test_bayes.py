@@ -10,8 +10,8 @@ import pytest
 import xarray as xr
 from scipy.stats import multivariate_t
 
-from thermogrip.classify import join_grasps, load_classifier, make_classifier, save_classifier
-from thermogrip.classify.estimators.base import GraspClassifier, pick
+from thermogrip.classify import load_classifier, make_classifier, save_classifier
+from thermogrip.classify.estimators.base import GraspClassifier, join_grasps, pick
 from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps

@@ -15,7 +15,6 @@ import pytest
 
 from thermogrip.classify import (
     CLASSIFIERS,
-    can_be_saved,
     evaluate,
     load_classifier,
     make_classifier,
@@ -23,7 +22,7 @@ from thermogrip.classify import (
 )
 from thermogrip.classify.estimators.base import GraspClassifier
 from thermogrip.classify.estimators.lda import ArrayClassifier
-from thermogrip.classify.estimators.registry import VoteClassifier, classifier_name
+from thermogrip.classify.estimators.registry import VoteClassifier, can_be_saved, classifier_name
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.effusivity.gripper_model import GripperModel, load_default_gripper

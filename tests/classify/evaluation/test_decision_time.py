@@ -54,8 +54,8 @@ def test_errors_of_ended_contacts_stand_with_their_interval_and_what_was_expecte
     assert binom.cdf(wrong, len(early), row["wrong_early_high"]) == pytest.approx(0.025)
     # every contact that ended was as sure as the rule asks, so none was expected to err more often than that
     [rule] = found.rules["pca-lda"]
-    assert all(r["doubt"] <= 1 - rule.sure + 1e-9 for r in early)
-    assert row["expected_early"] == pytest.approx(np.mean([r["doubt"] for r in early]))
+    assert all(r["p_wrong"] <= 1 - rule.sure + 1e-9 for r in early)
+    assert row["expected_early"] == pytest.approx(np.mean([r["p_wrong"] for r in early]))
 
 
 def test_where_no_contact_ends_early_there_is_nothing_to_be_wrong(make_touches: Maker) -> None:
