@@ -81,7 +81,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -594,14 +594,11 @@ def with_draws(
 
 def _problem(plant: Plant, logs: Sequence[Log], average: float | None) -> Problem:
     """Return the least-squares problem of the fit, with its weights."""
-    specs = getattr(plant.model, "specs", None)
     if not plant.free:
         raise UserError("the plant has no free parameter", hint="fit a network first")
-    if specs is None:
-        raise UserError(
-            f"a {plant.model.kind} model has no priors", hint="fit a network, or a model with priors"
-        )
-    model = cast(GreyModel, plant.model)
+    model = plant.model
+    if not isinstance(model, GreyModel):
+        raise UserError(f"a {model.kind} model has no priors", hint="fit a network, or a model with priors")
     bin_s = average or plant.scores.average_s or model.average
     logs, _ = match_logs(model, logs)
     problem = make_problem(model, logs, average=bin_s, independent=model.independent)

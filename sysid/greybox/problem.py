@@ -11,8 +11,7 @@ correlated: all residuals of an output are divided by sqrt(tau), with tau the bi
 carried through a gap, is estimated anew at each iteration and held while the sensitivities are taken.
 
 **Sensitivities** are differences over all parameters in one batch of the compiled kernel: the step is
-smooth in p, so a relative step of 1e-5 leaves five digits, and a test compares them with CasADi's exact
-ones.
+smooth in p, so a relative step of 1e-5 leaves five digits; a test compares them with an independent solver's.
 
 **Drift.** Over hours a reading drifts from any lumped model: the air of the room moves, a supply drifts,
 the bench warms. The error of bin t of an output is then modelled as
@@ -275,7 +274,6 @@ def make_problem(
     free = tuple(i for i, spec in enumerate(model.specs.values()) if not spec.fixed)
     sd = np.array([model.sensor_sd[name] for name in model.outputs])
     tau = np.full(len(sd), max(1.0, independent / (steps * plant.dt)))
-    drift = getattr(model, "drift", {})  # of a network
     return Problem(
         plant,
         tuple(parts),
@@ -284,7 +282,7 @@ def make_problem(
         steps * plant.dt,
         sd,
         tau,
-        tuple(drift.get(name) for name in model.outputs),
+        tuple(model.drift.get(name) for name in model.outputs),
     )
 
 

@@ -18,7 +18,6 @@ from thermogrip.sysid.contact.closed_forms import (
 from thermogrip.sysid.contact.response import (
     LAYER_NAMES,
     Stack,
-    block_modes,
     nearby_modes,
     stack_modes,
     step_response,
@@ -72,16 +71,6 @@ def test_heat_is_conserved_in_a_closed_gripper():
     assert rise[0, -1] == pytest.approx(capacity / (capacity + own), rel=1e-4)
     given = np.trapezoid(flux[0], nodes.t)
     assert given == pytest.approx(capacity * own / (capacity + own), rel=1e-3)
-
-
-def test_modes_of_a_block_sum_to_its_image_series():
-    e, c = 500.0, 24080.0
-    lam, weight, _ = block_modes([e], [c])
-    for t in (0.01, 0.3, 10.0, 3e3):
-        n = np.arange(1, 40)
-        # theta function: the same kernel as a half-space plus its images
-        want = (1 + 2 * np.exp(-((n * c / e) ** 2) / t).sum()) / (e * np.sqrt(np.pi * t))
-        assert (weight * np.exp(-lam * t)).sum() == pytest.approx(want, rel=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -153,18 +153,6 @@ def test_the_search_ends_where_a_general_optimiser_does(device, data, dof):
     assert found.log_evidence[0] == pytest.approx(want, abs=0.1)
 
 
-def test_few_degrees_of_freedom_forgive_a_far_grasp(device, data):
-    """Twice the usual conductance is far out for a normal spread, less so for one that 5 grasps taught."""
-    block = device.blocks["copper"]
-    far = replace(device, blocks={**device.blocks, "copper": replace(block, ln_h=block.ln_h + 0.7)})
-    unsure = replace(far, spreads=replace(far.spreads, dof=4.0))
-    row = np.array([0])
-    sure, mild = (
-        fit_pairs(d, data, row, material_hypotheses(d, ["copper"])).log_evidence[0] for d in (far, unsure)
-    )
-    assert mild > sure + 10
-
-
 def test_a_search_from_afar_ends_at_the_same_mode(device, data):
     row = np.arange(3)
     hypotheses = free_hypotheses(device, [10.4, 9.7, 6.2])
@@ -173,25 +161,6 @@ def test_a_search_from_afar_ends_at_the_same_mode(device, data):
     again = fit_pairs(device, data, row, hypotheses, start=start)
     np.testing.assert_allclose(again.log_evidence, near.log_evidence, atol=0.02)
     assert again.converged.all()
-
-
-def test_a_later_onset_is_a_later_clock(device, data, u):
-    """Sample by sample: bins are fixed in time, so each has one here."""
-    stack, n, one = replace(device.stack, leak=0.0), data.sample_t.shape[1], data.take(np.array([0]))
-    zero = np.zeros((1, n))  # the leak keeps the pump's clock
-    here = replace(one, sample_bin=np.arange(n)[None], y=zero, t=one.sample_t, ramp=zero, count=zero + 1)
-    here = replace(here, t_ambient=np.full(1, np.nan))
-    there = replace(here, sample_t=here.sample_t + 0.3, t=here.t + 0.3)
-    shifted, nodes = u[:1] + 0.3 * np.eye(N_NUISANCE)[[ONSET]], nodes_for(there)
-    got = predict(stack, nodes, there, shifted)
-    np.testing.assert_allclose(got, predict(stack, nodes, here, u[:1]), rtol=1e-12)
-
-
-def test_equal_temperatures_read_flat(device, data, u):
-    same, data = u.copy(), replace(data, t_ambient=np.full(3, np.nan))
-    same[:, 4] = same[:, 3]
-    got = predict(device.stack, nodes_for(data), data, same)
-    np.testing.assert_allclose(got, np.repeat(same[:, [3]], got.shape[1], axis=1), rtol=1e-13)
 
 
 def test_the_compiled_search_has_the_slopes_of_the_prediction(device):
@@ -353,18 +322,6 @@ def test_confidence_about_another_gripper_is_its_frequency(device):
     low, high = binom.ppf([0.001, 0.999], len(p), np.mean(p))
     assert low <= np.sum(right) <= high
     assert np.mean(p) < 0.75  # metals cannot be identified by a gripper that nobody has calibrated
-
-
-def test_taken_as_exact_another_gripper_is_far_too_sure(device):
-    other = another_gripper(device)
-    grasps = [
-        simulated(drawn_gripper(other, s), FIVE, n=1, t_gripper=23.0, t_object=43.0, seed=s) for s in range(5)
-    ]
-    loss = {
-        name: -np.mean([np.log(np.diag(material_posterior(d, g, FIVE)) + 1e-12).mean() for g in grasps])
-        for name, d in (("exact", device), ("uncertain", other))
-    }
-    assert loss["uncertain"] < 1.4 < loss["exact"]
 
 
 def test_effusivity_by_another_gripper_is_less_well_known(device, touched):

@@ -98,14 +98,6 @@ def x_squared(posterior):
     return (posterior.x - (posterior.mass * posterior.x).sum()) ** 2
 
 
-def test_a_wide_capacity_costs_the_sum_nothing(device, iron):
-    """The rule looks where Laplace's method says; half as wide again it finds the same."""
-    x = np.array([9.55, 9.75])
-    mode = fit_pairs(device, iron, np.zeros(2, dtype=np.int64), free_hypotheses(device, x))
-    got = [log_integrals(device, iron, x, mode.u, share * mode.covariance) for share in (1.0, 1.3)]
-    np.testing.assert_allclose(got[1], got[0], atol=0.05)
-
-
 def test_a_spoiled_record_is_answered_as_by_laplaces_method(device):
     """A sensor that runs away: no effusivity fits, no mode settles, and nothing breaks."""
     record = load_example_grasps()["exp3C_obj18_grip38"].isel(grasp=[0])

@@ -54,11 +54,6 @@ def test_what_comes_later_is_not_looked_at(device, drawn):
     np.testing.assert_array_equal(a.mean, b.mean)
 
 
-def test_at_the_end_nothing_is_to_come(device, drawn):
-    ahead = rest_of_contact(device, drawn, NAMES, until=10.0)
-    assert ahead.mean.shape == (36, 3, 0)
-
-
 def test_a_look_from_an_earlier_one_ends_in_the_same_place(device, drawn):
     few = drawn.isel(grasp=[0, 13, 25])
     early = rest_of_contact(device, few, NAMES, until=1.0)

@@ -8,18 +8,16 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from thermogrip.classify import Stream, classify_grasps, load_classifier, make_classifier, save_classifier
+from thermogrip.classify import Stream, classify_grasps, load_classifier, save_classifier
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
-from thermogrip.cli.main import main
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.datasets.grasp_files import write_grasps
 from thermogrip.datasets.schema import Grasps, make_grasps
 from thermogrip.sysid.contact.simulation import simulate_grasps
 from thermogrip.sysid.effusivity.data import touches
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.effusivity.laplace_approximation import free_hypotheses
-from thermogrip.sysid.effusivity.posterior import material_fit, material_posterior
+from thermogrip.sysid.effusivity.posterior import material_fit
 from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors, mixture_quantiles
 from thermogrip.sysid.effusivity.quality import (
     BIAS_S,
@@ -31,7 +29,7 @@ from thermogrip.sysid.effusivity.quality import (
     torn_groups,
 )
 
-from .makers import simulated, simulated_blocks
+from .makers import simulated_blocks
 
 STEP = 0.0625
 TIME = np.round(np.arange(-20, 101) / 10, 1)
@@ -107,31 +105,6 @@ def test_a_skin_that_moves_as_it_touches_is_reported_with_its_cost():
         assert words.endswith("K too warm or too cold; let the gripper settle")
 
 
-def test_train_warns_and_goes_on(tmp_path, capsys):
-    file, out = tmp_path / "late.nc", tmp_path / "model"
-    delayed(load_example_grasps()["exp2_dT20"], 1.0).to_netcdf(file)
-    assert main(["train", str(file), "--classifier", "pca-lda", "--out", str(out)]) == 0
-    assert "contact shows 1." in capsys.readouterr().err
-
-
-def test_a_grasp_without_contact_has_no_effusivity_and_leaves_the_others_as_they_were(tmp_path, capsys):
-    grasps = load_example_grasps()["exp2_dT20"].isel(grasp=[0, 8, 16])
-    still = grasps.copy(deep=True)
-    still["t_surface"][1] = 48.0 + 0.05 * np.random.default_rng(0).standard_normal(still.sizes["time"])
-    text = []
-    for name, record in (("all", grasps), ("missed", still)):
-        record.to_netcdf(tmp_path / f"{name}.nc")
-        out = tmp_path / f"{name}.csv"
-        assert main(["effusivity", str(tmp_path / f"{name}.nc"), "--out", str(out)]) == 0
-        text.append(out.read_text().splitlines())
-    missing, (full, part) = str(grasps["grasp"].values[1]), text
-    assert f"no contact, so no effusivity: {missing}\n" in capsys.readouterr().out
-    assert (part[0], part[2]) == (full[0], missing + 8 * ",nan")
-    for at in (1, 3):
-        cells, wanted = (np.array(lines[at].split(",")[1:], dtype=float) for lines in (part, full))
-        np.testing.assert_allclose(cells, wanted, rtol=1e-4)  # six digits are written
-
-
 def test_the_best_insulator_of_the_library_is_an_odd_contact_but_no_missing_one():
     touched = simulate_grasps(
         load_default_gripper().grip(), ["expanded polystyrene"], t_object=43.0, t_gripper=23.0, n=20,
@@ -139,18 +112,6 @@ def test_the_best_insulator_of_the_library_is_an_odd_contact_but_no_missing_one(
     )  # fmt: skip
     assert check_grasps(touched).usable.all()
     assert "no contact?" in contact_faults(touched)[0]
-
-
-def test_a_grasp_without_contact_is_none_of_the_candidates():
-    grasps = load_example_grasps()["exp2_dT20"]
-    train, test = (grasps.isel(grasp=grasps["split"].values == which) for which in ("train", "test"))
-    missed = test.copy(deep=True)
-    missed["t_surface"][0] = 48.0 + 0.05 * np.random.default_rng(0).standard_normal(test.sizes["time"])
-    finger = make_classifier("posterior").fit([train])
-    rows, usual = classify_grasps(finger, missed), classify_grasps(finger, test)
-    assert rows[0]["p_unknown"] == 1.0
-    wanted = [row["p_unknown"] for row in usual[1:]]  # to rounding: one grasp fewer is summed over
-    assert [row["p_unknown"] for row in rows[1:]] == pytest.approx(wanted, rel=1e-6, abs=1e-9)
 
 
 def test_spikes_saturation_and_a_wrong_object_temperature_are_reported():
@@ -164,20 +125,6 @@ def test_spikes_saturation_and_a_wrong_object_temperature_are_reported():
     assert words == f"3 spikes in 1 grasp are left out, the first of -127 degC in {name!r}"
     [words] = contact_faults(grasps.assign(t_object=grasps["t_object"] + 40.0))
     assert "24 grasps ('g0176' first): the skin moves away from t_object" in words
-
-
-def test_repairs_of_a_file_of_grasps_are_reported_up_to_six_lines(tmp_path, capsys):
-    grasps = load_example_grasps()["exp2_dT20"]
-    write_grasps(grasps, tmp_path / "twice.csv")
-    head, *rows = (tmp_path / "twice.csv").read_text().splitlines()
-    at_one = [twice for row in rows for twice in [row] * (1 + (",1.0," in row))]
-    (tmp_path / "twice.csv").write_text("\n".join([head, *at_one]) + "\n")
-    words = ["train", str(tmp_path / "twice.csv"), "--classifier", "pca-lda", "--out", str(tmp_path / "m")]
-    assert main(words) == 0
-    said = [line for line in capsys.readouterr().err.splitlines() if "warning: twice:" in line]
-    assert "1 repeated time stamp(s) dropped" in said[0]
-    assert len(said) == 6
-    assert said[5].endswith("more like these")
 
 
 def test_the_rest_before_a_touch_grows_by_touches_that_are_left_out():
@@ -195,22 +142,6 @@ def test_an_object_that_may_be_as_warm_as_the_skin_shows_no_missing_contact():
     for sd, missed in ((np.nan, True), (2.0, True), (8.0, False)):
         found = check_grasps(still.assign(t_object_sd=("grasp", [sd])))
         assert (found.reason == [NO_CONTACT]) == missed
-
-
-def test_effusivity_warns_of_blocks_in_two_files_and_of_rests_longer_than_known(tmp_path, capsys):
-    two = load_example_grasps()["exp5_two_touch_unknown_object"]
-    waited = two.isel(grasp=[28, 76]).assign(rest=("grasp", [np.nan, 300.0]))
-    files = [write_grasps(waited.assign_attrs(name="waited"), tmp_path / "waited.csv")]
-    for touch in (1, 2):
-        some = two.isel(grasp=np.flatnonzero(two["touch"].values == touch)[24:26])
-        files.append(write_grasps(some.assign_attrs(name=f"touch{touch}"), tmp_path / f"touch{touch}.csv"))
-    main(["effusivity", *map(str, files), "--out", str(tmp_path / "e.csv")])
-    said = " ".join(capsys.readouterr().err.split())
-    for words in (
-        "touch_group 'p024' (1 more like it) stands in touch1 and in touch2, and touches are joined",
-        "waited: blocks that rested longer than those that taught how they move between touches",
-    ):
-        assert words in said
 
 
 def test_a_block_whose_touches_stand_in_two_files_is_reported_with_how_many_are_like_it():
@@ -349,21 +280,6 @@ def test_clipped_samples_reach_no_average():
     np.testing.assert_array_equal(whole.y[whole.count > 0], lost.y[lost.count > 0])
 
 
-def test_stated_confidence_is_earned_by_clipped_grasps():
-    """Taken for readings, the samples at this rail make all 120 grasps wood or iron with confidence 1.00."""
-    device = load_default_gripper()
-    names = sorted(device.blocks)
-    grasps = simulated(device, names, n=30, t_gripper=23.0, t_object=43.0, seed=3)
-    cut = bounded(grasps, high=31.0)
-    metals = check_grasps(cut).masked.any(axis=1)
-    assert metals.sum() == 120
-    p = material_posterior(device, cut, names)[metals]
-    right = np.asarray(names)[p.argmax(axis=1)] == grasps["material"].values[metals]
-    # three standard errors of a share of 120
-    assert abs(p.max(axis=1).mean() - right.mean()) < 3 * np.sqrt(0.25 / 120)
-    assert right.mean() > 0.45
-
-
 def test_intervals_of_clipped_grasps_cover():
     """Taken for readings, the samples at this rail leave 0.29 of the effusivities in their 90 % intervals."""
     device, rng, n = load_default_gripper(), np.random.default_rng(5), 60
@@ -460,13 +376,6 @@ def test_a_longer_contact_is_named_by_its_beginning_and_the_answer_reports_it(sh
     )
 
 
-def test_a_gripper_that_was_taught_as_long_reads_all(long):
-    taught = PosteriorClassifier().fit(load_example_grasps()["exp4_cooled5_obj18_grip38_40s"])
-    assert taught.longest_ == 40.0
-    rows = classify_grasps(taught, long)
-    assert all("note" not in row and row["decided_at_s"] == 40.0 for row in rows)
-
-
 def test_a_stream_stays_with_its_answer_once_contact_lasts_longer(short, long):
     touch = Stream(short, t_object=18.0, t_ambient=float(long["t_ambient"].values[0]))
     for time, reading in zip(long["time"].values, long["t_surface"].values[0]):
@@ -503,17 +412,3 @@ def test_a_trace_that_was_lost_early_is_no_longer_contact(long):
     )
     assert check_grasps(lost, longest=10.0).shortened.tolist() == [False, True, True, True, True]
     assert longest_contact([lost.isel(grasp=[0])]) == pytest.approx(8.9)
-
-
-def test_effusivity_reads_as_long_as_its_calibration(long, tmp_path, capsys):
-    taught = load_example_grasps()["exp3C_obj18_grip38"]
-    calibration = write_grasps(taught.assign_attrs(name="taught"), tmp_path / "taught.csv")
-    out = []
-    for name, record in (("long", long), ("begun", check_grasps(long, longest=10.0).cut(long))):
-        file = write_grasps(record.assign_attrs(name=name), tmp_path / f"{name}.csv")
-        csv = tmp_path / f"{name}_e.csv"
-        main(["effusivity", str(file), "--calibrate", str(calibration), "--out", str(csv)])
-        out.append(csv.read_text())
-        said = " ".join(capsys.readouterr().err.split())
-        assert ("long: 5 of 5 contacts are read until 10 s" in said) == (name == "long")
-    assert out[0] == out[1]

@@ -76,6 +76,10 @@ class TwoGains:
     parameters = ("a", "b")
     n_x = 2
     lags = (20.0, 100.0)
+    states = ("soon", "late")
+    smooth = 0.0
+    command_steps: Mapping[str, float] = {}
+    drift: Mapping[str, tuple[float, float]] = {}
     name, dt, average, independent, warmup, search_step = "two gains", 1.0, 4.0, 60.0, 5.0, 2.0
     reference: str | None = None
     units: Mapping[str, str] = {"q": "1", "t": "degC", "a": "K", "b": "K"}

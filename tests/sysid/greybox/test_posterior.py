@@ -8,7 +8,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import emcee
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -20,8 +19,6 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log
 from thermogrip.report.plots import corner_figure
 from thermogrip.sysid.greybox import posterior
-from thermogrip.sysid.greybox import posterior as chains
-from thermogrip.sysid.greybox import posterior as mcmc_file
 from thermogrip.sysid.greybox.fit import fit_network
 from thermogrip.sysid.greybox.posterior import (
     Chain,
@@ -51,7 +48,7 @@ def density(plant: Plant, logs: Sequence[Log]) -> tuple[RandomizedMap, Array, Ar
     return target, z, target.covariance
 
 
-@pytest.mark.parametrize("sampled", [[0, 1], [0], [1]])
+@pytest.mark.parametrize("sampled", [[0, 1], [1]])
 def test_samples_are_those_of_the_exact_gaussian(sampled: list[int]) -> None:
     target, mean, covariance = density(*a_fit())
     rng = np.random.default_rng(0)
@@ -114,13 +111,6 @@ def test_the_density_is_highest_at_the_fit_and_falls_as_the_covariance_says() ->
     np.testing.assert_allclose(fall, expected, rtol=1e-3, atol=1e-3)
 
 
-def test_what_is_integrated_out_leaves_the_marginal() -> None:
-    target, z, covariance = density(*a_fit())
-    step = np.sqrt(covariance[0, 0]) * np.array([-2.0, -1.0, 1.0, 2.0])
-    fall = target.log_profile(z[:1][None], [0])[0] - target.log_profile((z[0] + step)[:, None], [0])
-    np.testing.assert_allclose(fall, 0.5 * step**2 / covariance[0, 0], rtol=1e-3, atol=1e-3)
-
-
 class Bent:
     """A residual of two parameters: they go together, and its slopes are true only where they do."""
 
@@ -171,19 +161,15 @@ def test_draws_take_the_error_that_the_fit_has_learnt(monkeypatch: pytest.Monkey
     np.testing.assert_allclose(again.samples, anew.samples, rtol=1e-6)
 
 
-def cover(n: int, logs: int) -> Array:
-    """Return how often the 90 % posterior intervals of a and b hold the truth, of n fits."""
-    inside = np.zeros(2)
-    for seed in range(n):
-        plant, made = a_fit(*range(100 + logs * seed, 100 + logs * (seed + 1)))
-        _, record = sample_posterior(plant, made, max_steps=100, n_samples=1000, seed=seed)
-        inside += [q[0] <= TRUE[name] <= q[2] for name, q in record.quantiles.items()]
-    return inside
-
-
 @pytest.mark.slow
 def test_intervals_cover_the_truth_as_often_as_stated() -> None:
-    inside = cover(25, 2)
+    inside = np.zeros(2)
+    for seed in range(25):
+        plant, logs = a_fit(100 + 2 * seed, 101 + 2 * seed)
+        quantiles = np.quantile(
+            np.asarray(with_draws(plant, logs, 100, seed=seed).samples), [0.05, 0.95], axis=0
+        )
+        inside += (quantiles[0] <= list(TRUE.values())) & (quantiles[1] >= list(TRUE.values()))
     # 99 % bounds of a binomial of 25 at 0.9, per parameter; the prior's sd of 4 adds nothing
     low, high = binom.ppf([0.003, 0.999], 25, 0.9)
     assert np.all((inside >= low) & (inside <= high)), inside
@@ -207,18 +193,18 @@ def test_a_chain_that_was_stopped_goes_on_where_it_stopped(tmp_path: Path) -> No
             raise KeyboardInterrupt  # after the first 50 steps
 
     with pytest.raises(KeyboardInterrupt):
-        sample_posterior(plant, logs, max_steps=120, backend=path, progress=stop)
-    _, resumed = sample_posterior(plant, logs, max_steps=120, backend=path)
-    _, whole = sample_posterior(plant, logs, max_steps=120)
+        sample_posterior(plant, logs, max_steps=120, n_samples=5, backend=path, progress=stop)
+    _, resumed = sample_posterior(plant, logs, max_steps=120, n_samples=5, backend=path)
+    _, whole = sample_posterior(plant, logs, max_steps=120, n_samples=5)
     np.testing.assert_array_equal(resumed.chain.steps, whole.chain.steps)
 
 
 def test_a_chain_of_another_problem_is_not_gone_on_with(tmp_path: Path) -> None:
     plant, logs = a_fit()
     path = tmp_path / "chain.h5"
-    sample_posterior(plant, logs, max_steps=60, backend=path)
-    _, again = sample_posterior(plant, logs, max_steps=60, backend=path, seed=1)
-    _, fresh = sample_posterior(plant, logs, max_steps=60, seed=1)
+    sample_posterior(plant, logs, max_steps=20, n_samples=5, backend=path)
+    _, again = sample_posterior(plant, logs, max_steps=20, n_samples=5, backend=path, seed=1)
+    _, fresh = sample_posterior(plant, logs, max_steps=20, n_samples=5, seed=1)
     np.testing.assert_array_equal(again.chain.steps, fresh.chain.steps)
 
 
@@ -254,7 +240,7 @@ def test_the_saved_posterior_reads_back_with_arviz(tmp_path: Path) -> None:
 
     reported: list[float] = []
     _, record = sample_posterior(
-        *a_fit(), free=["b"], max_steps=60, progress=lambda share, _: reported.append(share)
+        *a_fit(), free=["b"], max_steps=60, n_samples=20, progress=lambda share, _: reported.append(share)
     )
     assert reported == sorted(reported)
     assert 0 <= reported[0] < 0.1 < reported[2] < reported[-1] == 1.0
@@ -270,12 +256,9 @@ def test_the_saved_posterior_reads_back_with_arviz(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["posterior.nc"]
 
 
-def test_the_corner_figure_has_a_panel_for_each_pair() -> None:
-    _, record = sample_posterior(*a_fit(), max_steps=60)
-    figure = corner_figure(record)
-    assert sum(ax.axison for ax in figure.axes) == 3
+def test_a_corner_of_what_was_not_sampled_is_refused(sampled: tuple[Plant, Posterior]) -> None:
     with pytest.raises(UserError, match="not sampled"):
-        corner_figure(record, ["c"])
+        corner_figure(sampled[1], ["c"])
 
 
 def test_a_plant_without_free_parameters_or_priors_is_refused() -> None:
@@ -293,7 +276,6 @@ def test_a_log_of_a_few_bins_is_refused() -> None:
         a_fit(1, seconds=30)
 
 
-Array = np.ndarray
 MEAN, COVARIANCE = np.array([1.0, -2.0]), np.array([[4.0, 1.2], [1.2, 0.5]])
 
 
@@ -322,14 +304,6 @@ def test_three_autocorrelation_times_are_left_out_and_half_the_chain_at_most(
     assert len(made.kept(10_000)) == 3 * (100 - burn)
 
 
-def test_a_thinning_that_divides_the_number_of_walkers_takes_rows_of_all() -> None:
-    steps = np.zeros((100, 24, 1)) + np.arange(24.0)[:, None]
-    kept = Chain(steps, steps[:, :, 0], np.array([1.0]), True, 0.5).kept(97 * 24 // 8)
-    walkers, counts = np.unique(kept, return_counts=True)
-    assert len(walkers) == 24
-    assert np.ptp(counts) <= 1
-
-
 @pytest.mark.parametrize(
     ("tau", "converged", "length"),
     [((1.5, 1.0), True, 100), ((1.0, 40.0), False, 120), ((2.4, 2.4), False, 120)],
@@ -337,16 +311,16 @@ def test_a_thinning_that_divides_the_number_of_walkers_takes_rows_of_all() -> No
 def test_a_chain_has_converged_where_its_slowest_dimension_has(
     monkeypatch: pytest.MonkeyPatch, tau: tuple[float, float], converged: bool, length: int
 ):
-    monkeypatch.setattr(chains, "_autocorrelation", lambda steps: np.array(tau))
+    monkeypatch.setattr(posterior, "_autocorrelation", lambda steps: np.array(tau))
     found = run_chain(normal, start(), max_steps=120)
     assert (found.converged, len(found.steps)) == (converged, length)
 
 
 def test_a_walker_that_has_not_moved_yet_leaves_the_chain_as_slow_as_it_is_long():
     steps = np.random.default_rng(0).normal(size=(200, 6, 2))
-    one, two = chains._autocorrelation(steps)
+    one, two = posterior._autocorrelation(steps)
     steps[:, 3, 1] = 0.7
-    assert chains._autocorrelation(steps).tolist() == [one, 200.0]
+    assert posterior._autocorrelation(steps).tolist() == [one, 200.0]
     assert max(one, two) < 3.0
     reported: list[float] = []
     short = run_chain(normal, start(), max_steps=2, progress=lambda share, what: reported.append(share))
@@ -359,16 +333,6 @@ def test_a_walker_that_has_not_moved_yet_leaves_the_chain_as_slow_as_it_is_long(
     begin = start()
     found = run_chain(nowhere, begin, max_steps=100, progress=lambda share, what: reported.append(share))
     assert (found.converged, found.acceptance, reported[1:]) == (False, 0.0, [0.5, 1.0])
-
-
-def test_steps_that_are_there_already_count(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(chains, "_autocorrelation", lambda steps: np.array([30.0, 30.0]))
-    backend = emcee.backends.Backend()
-    first = run_chain(normal, start(), max_steps=60, backend=backend).steps.copy()
-    whole = run_chain(normal, start(seed=9), max_steps=80, backend=backend)
-    assert len(whole.steps) == 80
-    np.testing.assert_array_equal(whole.steps[:60], first)
-    assert len(run_chain(normal, start(), max_steps=80, backend=backend).steps) == 80
 
 
 def test_a_chain_says_its_density_and_how_many_moves_were_taken():
@@ -387,7 +351,7 @@ def test_a_seed_decides_the_moves_from_one_start():
 
 
 def test_proposals_are_students_t_somewhat_wider_than_the_normal():
-    propose = chains._proposals(MEAN, COVARIANCE)
+    propose = posterior._proposals(MEAN, COVARIANCE)
     n, shape = 40_000, 1.25**2 * COVARIANCE
     old = start(n)
     new, ratio = propose(old, np.random.RandomState(0))
@@ -452,7 +416,7 @@ def test_a_chain_belongs_to_one_problem_whatever_is_changed():
 def test_a_chain_belongs_to_one_model_and_one_method(monkeypatch: pytest.MonkeyPatch):
     before = hash_of()
     with monkeypatch.context() as patch:
-        patch.setattr(mcmc_file, "_METHOD", mcmc_file._METHOD + 1)
+        patch.setattr(posterior, "_METHOD", posterior._METHOD + 1)
         assert hash_of() != before
     monkeypatch.setattr(TwoGains, "to_dict", lambda self: {"kind": "two other gains"})
     assert hash_of() != before

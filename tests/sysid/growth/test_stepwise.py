@@ -101,14 +101,9 @@ def test_a_gain_that_a_line_in_time_gives_too_is_refused():
     assert "straight line" in _against(ZONE, gain=0.15, se=0.1, straight=0.05)
     assert _against(ZONE, gain=0.15, se=0.1, straight=0.1) == ""
     assert "standard error" in _against(ZONE, gain=0.15, se=0.2, straight=0.15)
-
-
-def test_removing_what_carries_the_heat_away_is_refused():
-    logs = logs_of(patched(block(), ZONE), {"C_core": 30.0, "G_core": 0.7, "G": 0.4, "P": 14.0})
-    without = Candidate("no core", {"nodes": {"core": None}, "links": {"core": None}}, "remove")
-    row = grow(patched(block(), ZONE), logs, [without], rounds=1).rows[1]
-    assert row.verdict == "refused"
-    assert "costs" in row.why
+    less = replace(ZONE, change="remove")
+    assert _against(less, gain=-0.2, se=0.5, straight=0.0) == "its loss costs 20 %"
+    assert [_against(less, gain=g, se=0.02, straight=0.0) == "" for g in (-0.019, -0.021)] == [True, False]
 
 
 def test_what_one_log_alone_shows_is_scored_on_its_second_half():
