@@ -20,7 +20,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_log, write_log
-from thermogrip.datasets.rosbag import TOPICS_TEMPLATE, read_topic_map
+from thermogrip.datasets.rosbag import TOPICS_TEMPLATE, _held, _nearest, read_topic_map
 from thermogrip.datasets.schema import names
 
 SECOND = 1_000_000_000
@@ -272,6 +272,16 @@ def test_the_header_stamp_may_be_the_time(tmp_path: Path) -> None:
     text = MAP.split("[columns.drive]")[0].replace("version = 1", 'version = 1\nstamp = "header"')
     (tmp_path / "topics.toml").write_text(text)
     np.testing.assert_allclose(read_log(file)["time"].values, 0.5 * np.arange(60), atol=1e-6)
+
+
+def test_a_message_holds_and_the_nearest_counts_within_half_a_step() -> None:
+    times, values, nan = np.array([1.0, 2.0, 4.0, 5.0]), np.array([10.0, 20.0, 40.0, 50.0]), np.nan
+    held = _held(np.array([0.9, 1.0, 1.9, 2.0, 9.0]), times, values)
+    np.testing.assert_array_equal(held, [nan, 10.0, 10.0, 20.0, 50.0])
+    axis = np.array([0.4, 0.5, 1.4, 1.5, 1.6, 2.6, 3.0, 5.5, 5.5 + 0.8e-6, 5.5 + 1.5e-6])  # a step is 1 s
+    near = _nearest(axis, times, values)
+    np.testing.assert_array_equal(near, [nan, 10.0, 10.0, 20.0, 20.0, nan, nan, 50.0, 50.0, nan])
+    assert _nearest(np.array([0.0, 99.0]), times[:1], values[:1]).tolist() == [10.0, 10.0]
 
 
 def test_the_template_is_a_topic_map(tmp_path: Path) -> None:

@@ -232,16 +232,25 @@ def lag(valid: tuple[float, float], disturbances: tuple[str, ...] = ()) -> Plant
 
 
 @pytest.mark.parametrize(
-    ("valid", "neutral"), [((0.0, 4.0), 0.0), ((1.0, 4.0), 1.0), ((-4.0, 0.0), 0.0), ((-4.0, -1.0), -1.0)]
-)
+    ("valid", "neutral", "step"),
+    [((0.0, 4.0), 0.0, 0.2), ((1.0, 4.0), 1.0, 0.15), ((-4.0, 0.0), 0.0, -0.2), ((-4.0, -1.0), -1.0, -0.15),
+     ((-3.9, 0.1), 0.0, -0.2)],
+)  # fmt: skip
 def test_no_drive_is_what_is_nearest_to_none_and_a_step_from_there_stays_in_range(
-    valid: tuple[float, float], neutral: float
+    valid: tuple[float, float], neutral: float, step: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plant = lag(valid)
+    plant, driven, run = lag(valid), [], PredictionModel.run
+
+    def kept(self: PredictionModel, x: np.ndarray, u: np.ndarray, d: np.ndarray) -> object:
+        driven.append(u.reshape(2, -1))
+        return run(self, x, u, d)
+
     model = PredictionModel(plant, dt=1.0)
     assert model.neutral.tolist() == [neutral]
     assert model.span.tolist() == [valid[1] - valid[0]]
+    monkeypatch.setattr(PredictionModel, "run", kept)
     answer = step_response(plant, "q", "t")
+    np.testing.assert_allclose(driven[-1].T - [neutral, neutral + step], 0.0, atol=1e-12)
     assert answer.gain == pytest.approx(5.0 * (valid[1] - valid[0]), rel=0.01)
     assert answer.lag == pytest.approx(-1 / np.log(0.98), rel=0.05)
     assert answer.delay < 1.0
