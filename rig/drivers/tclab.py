@@ -9,8 +9,8 @@ here:
 * **What is a number.**  ``digits.three-digits``, ended by CR LF, inside what the converter can give; anything
   else, also the head of a number that a time-out cut, is asked again.
 * **What is plausible.**  A jump of more than ``jump`` since the last scan of less than 10 s ago is asked
-  again, and the median of three counts: without a checksum a flipped digit looks like any other.  A converter
-  at its end is an open or shorted sensor: NaN.
+  again, and the median of three counts: without a checksum a flipped digit is as good as any other.  A
+  converter at its end is an open or shorted sensor: NaN.
 * **Trips.**  Four scans in a row above ``highest`` or with a lost sensor switch both heaters off and latch,
   as our own firmware does; the latch is cleared with :meth:`TCLabRig.clear`.  Where the board could not be
   reached then, its heaters go off at the first scan that shows them on.

@@ -63,7 +63,7 @@ from thermogrip.rig.serial.protocol import (
 
 TTL_S = MAX_TTL_MS / 1000
 RENEW_S = 0.5  # how often a drive is renewed while time passes
-MOST_TRIES = 12  # of one question on a line that spoils half of what it carries
+MOST_TRIES = 12  # of one question on a line that spoils half of it
 
 
 class DeviceClock:
@@ -179,7 +179,7 @@ class _Conversation(NoticeBook):
         return answer.content
 
     def _faults(self) -> tuple[str, ...]:
-        """Return the latched faults, which a refusal does not carry."""
+        """Return the latched faults, which a refusal does not have."""
         answer = self._exchange(Read())
         if not isinstance(answer, Answer) or not isinstance(answer.content, State):
             return ()

@@ -44,7 +44,7 @@ struct Board {
   Sensor sensors[MAX_SENSORS];
   uint8_t n_sensors;
   bool pump;        // must run before anything is driven
-  bool tachometer;  // the pump tells that it turns
+  bool tachometer;  // the pump reports that it turns
 };
 
 // The longest lines that a board can give, without star and check: config.h asserts that they fit.  What did not
@@ -96,7 +96,7 @@ class Core {
   // cause: power, external, brownout, watchdog, software or unknown; boot: how many resets there were.
   void begin(const Board &board, const char *cause, uint16_t boot, uint32_t now_ms);
 
-  // Take one byte; the answer (or nothing) stands in answer() until the next call.  The board must outlive this.
+  // Take one byte; the answer (or nothing) is in answer() until the next call.  The board must outlive this.
   void receive(char byte, uint32_t now_ms);
   const char *answer() const { return said_; }
 

@@ -62,7 +62,7 @@ static void apply() {
 
 static void measure(int32_t *values) {
   for (uint8_t k = 0; k < BOARD.n_sensors; ++k) {
-    uint16_t sum = 0;  // not their mean in whole counts, a tenth of a degC each: noise tells more of eight
+    uint16_t sum = 0;  // not their mean in whole counts, a tenth of a degC each: noise makes eight finer
     for (uint8_t i = 0; i < READINGS; ++i) sum += static_cast<uint16_t>(analogRead(PIN_SENSORS[k]));
     values[k] = thermogrip::thermistor(sum, READINGS, FIXED_OHM, R25_OHM, BETA_K, true);
   }

@@ -12,7 +12,7 @@ after each call.
   a pump with a tachometer that is commanded but does not turn for 3 s while anything is driven.  A latch
   switches drive and pump off until it is cleared by a command, and it cannot be cleared while its cause is
   still there.
-* A Peltier against water that stands still heats or freezes what it touches within seconds, and the water's
+* A Peltier against water that does not move heats or freezes what it touches within seconds, and the water's
   sensor may not see it: with the pump off only a drive of zero is taken.
 * ``outputs.enable`` is the supply of the drivers, through a relay: only there while a drive is in force and
   the pump runs.  A driver that is stuck at full drive is cut with it.

@@ -15,7 +15,7 @@ It asks, in this order:
 and of a move, before it goes out: is it finite, and does it pump heat into standing water?  (drive,
 interlock)
 
-A suspect reading never reaches the controller; the last good one stands in for it, for two samples.  The
+A suspect reading never reaches the controller; the last good one takes its place, for two samples.  The
 guard keeps no clock and opens nothing: a reading, the host's time, and what was asked come in, accepted
 values and a :class:`~thermogrip.rig.guard.trip.Trip` come out.  The loop switches off.
 

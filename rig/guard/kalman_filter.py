@@ -312,7 +312,7 @@ class RigFilter:
     def _agree(self, y: Array) -> bool:
         """Say whether all readings agree, and with the room: then the rig has not run for long.
 
-        A tank that is a little warmer than the skin is not at rest: what stands in the tubes is not known.
+        A tank that is a little warmer than the skin is not at rest: the water in the tubes is not known.
         """
         plant = self.model.plant
         rooms = self.d[[plant.disturbances.index(name) for name in room_disturbances(plant)]]

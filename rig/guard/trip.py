@@ -1,9 +1,9 @@
 """What the guard reports when it ends a session: expected against measured, what to check, how to clear.
 
 A trip without its two numbers is what people work around: "not heating at expected rate" has been answered
-for years by weakening the check.  So every trip carries what was expected and what was measured, with their
+for years by weakening the check.  So every trip has what was expected and what was measured, with their
 units, the likely causes in the order in which they are worth checking, and what clears it.  A trip is data:
-it stands in ``events.jsonl`` as one JSON object, and on the terminal as one line.
+one JSON object in ``events.jsonl``, one line on the terminal.
 """
 
 from __future__ import annotations

@@ -129,11 +129,8 @@ def _trial(cells: Mapping[str, str], path: str | Path, line: int) -> Trial:
     def number(column: str) -> float | None:
         if column not in cells:
             return None
-        try:
-            value = float(cells[column])
-        except ValueError:
-            value = np.nan
-        if not np.isfinite(value):
+        value = _float(cells[column])
+        if value is None or not np.isfinite(value):
             problem = f"{cells[column]!r} is not a number"
             raise UserError(problem, file=path, row=line, column=column, hint="write one")
         return value
@@ -148,7 +145,7 @@ def _trial(cells: Mapping[str, str], path: str | Path, line: int) -> Trial:
         except UserError as error:
             raise UserError(error.problem, file=path, row=line, column="material", hint=error.hint) from error
     given = cells.get("t_object_degC", "")
-    sensor = bool(given) and not _is_number(given)
+    sensor = given != "" and _float(given) is None
     labels: dict[str, Any] = {}
     for column, name in _LABELS.items():
         if column in cells:
@@ -157,12 +154,11 @@ def _trial(cells: Mapping[str, str], path: str | Path, line: int) -> Trial:
     return Trial(material, target, t_object, number("t_object_sd_degC"), labels)
 
 
-def _is_number(text: str) -> bool:
+def _float(text: str) -> float | None:
     try:
-        float(text)
+        return float(text)
     except ValueError:
-        return False
-    return True
+        return None
 
 
 def run_batch(

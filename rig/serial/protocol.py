@@ -247,7 +247,6 @@ MAX_TTL_MS = 2000
 PROTOCOL = "thermogrip/1"
 MODES = ("off", "armed", "expired", "latched")
 CAUSES = ("power", "external", "brownout", "watchdog", "software", "unknown")
-LATCHES = ("over", "under", "open", "short")
 
 #: What a device may refuse with, and what that means.
 REFUSALS = {
@@ -264,6 +263,7 @@ REFUSALS = {
 }
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,15}")
+_FAULT = re.compile(rf"pump|(over|under|open|short):{_NAME.pattern}")
 _VERSION = re.compile(r"[0-9A-Za-z.+-]{1,16}")
 
 
@@ -528,9 +528,12 @@ def parse_state(words: Sequence[str]) -> State | None:
     read = [text if text in LOST else integer(text) for text in temperatures.split(",")]
     latched = () if faults == "-" else tuple(faults.split(","))
     known = mode in MODES and cause in CAUSES and pump in ("0", "1") and grip in ("0", "1")
-    if not known or not all(_is_fault(text) for text in latched) or bool(latched) != (mode == "latched"):
+    faulty = all(_FAULT.fullmatch(text) for text in latched)
+    if not known or not faulty or bool(latched) != (mode == "latched"):
         return None
-    if uptime_ms is None or boots is None or applied is None or not _in_range(uptime_ms, boots):
+    if uptime_ms is None or boots is None or applied is None:
+        return None
+    if not (0 <= uptime_ms <= 0xFFFFFFFF and 0 <= boots <= 0xFFFF):
         return None
     values = tuple(value for value in read if value is not None)
     if len(values) != len(read):
@@ -555,12 +558,3 @@ def _channel(text: str) -> Channel | None:
         return None
     low, high = integer(parts[2]), integer(parts[3])
     return None if low is None or high is None or low > high else Channel(parts[0], parts[1], low, high)
-
-
-def _is_fault(text: str) -> bool:
-    kind, _, name = text.partition(":")
-    return text == "pump" or (kind in LATCHES and bool(_NAME.fullmatch(name)))
-
-
-def _in_range(uptime_ms: int, boots: int) -> bool:
-    return 0 <= uptime_ms <= 0xFFFFFFFF and 0 <= boots <= 0xFFFF

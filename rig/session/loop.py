@@ -129,8 +129,12 @@ class Loop:
             if passed >= seconds:
                 return
             if fresh:
-                self.move = self.controller.step(self.controller_reading(), self.target_of_controller())
-                self.note_status()
+                target: Target = self.target if len(self.target) != 1 else next(iter(self.target.values()))
+                self.move = self.controller.step(self.controller_reading(), target)
+                if self.move.status != self.status:
+                    self.status = self.move.status
+                    advice = f": {self.move.advice}" if self.move.advice else ""
+                    self.note("controller", self.status + advice)
             self.record(phase)
             self.wait(self.controller.dt)
             yield passed
@@ -171,7 +175,9 @@ class Loop:
         self.planned = 0.0
         self.accepted = found.values
         for name, why in found.suspect.items():
-            self.note_once("lost", f"{name} is suspect ({why}); the last good value is used")
+            text = f"{name} is suspect ({why}); the last good value is used"
+            if not any((event.kind, event.text) == ("lost", text) for event in self.events):
+                self.note("lost", text)
         if found.trip is not None:
             raise TripError(self.of_this_rig(found.trip))
         return found.fresh
@@ -179,10 +185,6 @@ class Loop:
     def controller_reading(self) -> dict[str, float]:
         """Return the reading for the controller, the last good value where one is lost."""
         return {**self.reading.as_controller_reading(), **self.accepted}
-
-    def target_of_controller(self) -> Target:
-        """Return a number for one target, a dict for several."""
-        return next(iter(self.target.values())) if len(self.target) == 1 else self.target
 
     def record(self, phase: str) -> None:
         """Apply the present move and write the row; inputs of a row hold from it until the next."""
@@ -322,19 +324,6 @@ class Loop:
             except OSError as error:  # the next sample trips on it; a note alone ends nothing
                 if not self.disk_fault:
                     self.events.append(Event(self.reading.time_s, "disk", error.strerror or str(error)))
-
-    def note_once(self, kind: str, text: str) -> None:
-        """Add an event unless the same one was added before."""
-        if not any(event.kind == kind and event.text == text for event in self.events):
-            self.note(kind, text)
-
-    def note_status(self) -> None:
-        """Add an event when the controller's status changes."""
-        if self.move.status != self.status:
-            self.status = self.move.status
-            self.note(
-                "controller", f"{self.move.status}: {self.move.advice}" if self.move.advice else self.status
-            )
 
     def report(self, fraction: float, what: str) -> None:
         """Report progress."""

@@ -314,15 +314,13 @@ def _settle(run: Loop, timeout: float, band: float) -> bool:
     """Regulate until every target's output has settled; False when the time is over."""
     for passed in run.regulate("settle", timeout):
         run.report(0.9 * passed / timeout, "settling")
-        ready = run.guard.ready(run.reading.time_s)
-        if ready and all(_has_settled(run, name, band) for name in run.target):
+        if not run.guard.ready(run.reading.time_s):
+            continue
+        time = run.column("time_s", last=40.0)
+        errors = [run.column(f"{name}_degC", last=40.0) - value for name, value in run.target.items()]
+        if all(has_settled(time, error, band=band) for error in errors):
             return True
     return False
-
-
-def _has_settled(run: Loop, name: str, band: float) -> bool:
-    error = run.column(f"{name}_degC", last=40.0) - run.target[name]
-    return has_settled(run.column("time_s", last=40.0), error, band=band)
 
 
 def _touch(
@@ -341,12 +339,14 @@ def _touch(
     run.sample("lead_in", n_lead, dt)
     run.move = Move(drive=run.no_drive(), pump=0)
     run.sample("pump_off", n_lead, dt)
-    closed, t_object = run.reading.time_s, _temperature_of(thing, run)
+    closed, known = run.reading.time_s, thing.t_object
+    t_object = float(run.accepted[known] if isinstance(known, str) else known)
     t_gripper = run.target.get(output, np.nan)
     about = {
         "grasp_id": thing.grasp_id, "material": thing.material, "t_object": t_object,
         "t_object_sd": thing.t_object_sd, "t_gripper": t_gripper, **thing.labels,
     }  # fmt: skip
+    as_json = {key: None if value != value else value for key, value in about.items()}
 
     def grasp_so_far() -> Grasps:
         return grasp_of_rows(run.rows[first:], closed, output, about, run.rooms)
@@ -354,7 +354,7 @@ def _touch(
     try:
         run.touching = True
         run.ask(lambda: run.rig.grasp(thing.material, t_object))
-        run.note("closed", f"gripper closed on {thing.material} at {t_object:g} degC", _plain(about))
+        run.note("closed", f"gripper closed on {thing.material} at {t_object:g} degC", as_json)
         for k in range(round(seconds / dt) + 1):
             if run.reading.time_s - closed > seconds + 0.5 * dt:
                 break  # this program was late, its time is over all the same
@@ -383,7 +383,8 @@ def grasp_of_rows(
     """
     room = next((value for name, value in rows[0].items() if name.removesuffix("_degC") in rooms), np.nan)
     labels = {key: [about.get(key) or ""] for key in GRASP_LABELS if about.get(key)}
-    numbers = {key: [_or_nan(about.get(key))] for key in GRASP_NUMBERS if key in about}
+    given = {key: about[key] for key in GRASP_NUMBERS if key in about}
+    numbers = {key: [np.nan if value is None else float(value)] for key, value in given.items()}
     second = f"{output}_2_degC"
     twin = [[row[second] for row in rows]] if second in rows[0] else None
     material, t_object = labels.get("material", [""])[0], numbers.get("t_object", [np.nan])[0]
@@ -395,22 +396,6 @@ def grasp_of_rows(
         t_surface_2=twin,
         **{"t_ambient": [room], **numbers, **labels},
     )
-
-
-def _temperature_of(thing: Object, run: Loop) -> float:
-    """Return the object's temperature [degC]: as set, or what its sensor reads now."""
-    if isinstance(thing.t_object, str):
-        return float(run.accepted[thing.t_object])
-    return float(thing.t_object)
-
-
-def _or_nan(value: Any) -> float:
-    return np.nan if value is None else float(value)
-
-
-def _plain(about: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the labels as JSON has them: None for what is not known."""
-    return {key: None if value != value else value for key, value in about.items()}
 
 
 def _contact_time(run: Loop, grasps: Grasps | None) -> float:

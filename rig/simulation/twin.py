@@ -19,7 +19,7 @@ G being what the room does by the far face of the block.  The integral is Duhame
 difference as it is, not as it was at contact.  Once the pump is off a bare skin drifts to the room, and one
 that is pressed on a metal cannot: where F comes to 1, T_dev stays at T_obj whatever y does.
 
-On release the addition dies out with the time constant ``recovery``; it stands for heat that soaks into the
+On release the addition dies out with the time constant ``recovery``; it is the heat that soaks into the
 finger and the water, which the plant's states do not know, and only matters to what is recorded between
 grasps.
 """
@@ -166,7 +166,8 @@ class Twin:
         self._newest: Reading | None = None
         self._contact: _Contact | None = None
         self._alone: tuple[float, dict[str, float]] | None = None  # time, and the plant's outputs then
-        self._x = self._state_at_rest(ambient if t_start is None else t_start)
+        level = np.full(len(plant.outputs), float(ambient if t_start is None else t_start))
+        self._x = np.asarray(plant.model.rest(level, self._input_vector(), self._d, plant.p), dtype=float)
         self._y = np.array(plant.model.output(self._x.tolist(), plant.p.tolist()), dtype=float)
         self._write_history(self._input_vector())
 
@@ -177,7 +178,7 @@ class Twin:
 
     @property
     def expires_s(self) -> float:
-        """0: its time stands still with the program."""
+        """0: its time stops with the program."""
         return 0.0
 
     def read(self) -> Reading:
@@ -223,8 +224,11 @@ class Twin:
                 f"this plant has no {self.skin}, so it cannot grasp", hint="use a plant with a skin"
             )
         touch = self._draw(material, t_object, self._grasp_rng)
-        self._contact = _Contact(touch, self.time, self._skin_alone())
-        self._contact.follow(self.time, self._outputs_alone()[self.skin])
+        alone = self._outputs_alone()[self.skin]
+        self._contact = _Contact(
+            touch, self.time, alone + self._added(alone)
+        )
+        self._contact.follow(self.time, alone)
 
     def rehearse(self, material: str, t_object: float) -> None:
         """Load and compile what :meth:`grasp` needs, so that a host on a cable does not wait for it."""
@@ -283,10 +287,6 @@ class Twin:
         variables["contact"] = (table["contact"], "1", "other")
         return make_log(table["time_s"], variables, name="twin")
 
-    def _state_at_rest(self, temperature: float) -> Array:
-        y = np.full(len(self.plant.outputs), float(temperature))
-        return np.asarray(self.plant.model.rest(y, self._input_vector(), self._d, self.plant.p), dtype=float)
-
     def _drives(self) -> tuple[str, ...]:
         """Return the inputs that are driven: all but the pump."""
         return tuple(name for name in self.plant.inputs if name != "pump")
@@ -342,11 +342,6 @@ class Twin:
             y = y + self._elapsed / self.plant.dt * (self._advance(self._mean_input())[1] - y)
         self._alone = self.time, {name: float(value) for name, value in zip(self.plant.outputs, y)}
         return dict(self._alone[1])
-
-    def _skin_alone(self) -> float:
-        """Return the skin's temperature now, what is left of an earlier grasp included."""
-        alone = self._outputs_alone()[self.skin]
-        return alone + self._added(alone)
 
     def _added(self, alone: float) -> float:
         """Return what an object adds now to a skin that alone would be at ``alone`` [K]."""
