@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 
-_LATE_S = 0.5
+_LATE_S = 0.5  # work that took longer than this starts a new grid
 
 
 class SteppedClock:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import calendar
 import json
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -60,53 +61,39 @@ def _write_mcap(run: Run, path: Path) -> None:
         from mcap.writer import Writer
     except ImportError as error:
         raise UserError("needs the package mcap", file=path, hint="pip install thermogrip[ros]") from error
-    assert run.log is not None
-    began = _nanoseconds(run)
+    log, began = run.log, _nanoseconds(run)
+    assert log is not None
+    columns = {str(name): column(log, str(name)) for name in log.data_vars}
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start(profile="", library="thermogrip")
         writer.add_metadata("run", {"run.json": json.dumps(run.about)})
-        stamps = [began + round(1e9 * at) for at in run.log["time"].values.tolist()]
-        channels = [(str(name), _channel(writer, run, str(name))) for name in run.log.data_vars]
-        for k, stamp in enumerate(stamps):
-            for name, channel in channels:
-                value = float(column(run.log, name)[k])
-                if value == value:  # a lost reading is no message
-                    content: dict[str, Any] = {"time_s": float(run.log["time"].values[k]), "value": value}
-                    _message(writer, channel, stamp, k, content)
-        events = _schema_and_channel(writer, "/events", "event", {"kind": "string", "text": "string"}, {})
+        channels = {}
+        for name in columns:
+            attrs = {key: str(log[name].attrs[key]) for key in ("units", "role")}
+            channels[name] = _channel(writer, f"/{name}", f"sample_{name}", {"value": "number"}, attrs)
+        events = _channel(writer, "/events", "event", {"kind": "string", "text": "string"}, {})
+        for k, time_s in enumerate(log["time"].values.tolist()):
+            for name, values in columns.items():
+                if values[k] == values[k]:  # a lost reading is no message
+                    content = {"time_s": time_s, "value": float(values[k])}
+                    _message(writer, channels[name], began, k, content)
         for k, event in enumerate(run.events):
-            content = {
-                "time_s": event.time_s,
-                "kind": event.kind,
-                "text": event.text,
-                "data": dict(event.data),
-            }
-            _message(writer, events, began + round(1e9 * event.time_s), k, content)
+            _message(writer, events, began, k, asdict(event))
         writer.finish()  # type: ignore[no-untyped-call]
 
 
-def _channel(writer: Any, run: Run, name: str) -> int:
-    assert run.log is not None
-    attrs = {key: str(run.log[name].attrs[key]) for key in ("units", "role")}
-    return _schema_and_channel(writer, f"/{name}", f"sample_{name}", {"value": "number"}, attrs)
-
-
-def _schema_and_channel(
-    writer: Any, topic: str, title: str, fields: dict[str, str], attrs: dict[str, str]
-) -> int:
+def _channel(writer: Any, topic: str, title: str, fields: dict[str, str], attrs: dict[str, str]) -> int:
+    """Register a channel of JSON messages, whose schema has the time besides these fields."""
     properties = {key: {"type": kind} for key, kind in {"time_s": "number", **fields}.items()}
-    schema = {"title": title, "type": "object", "properties": properties}
-    number = writer.register_schema(
-        name=f"thermogrip.{title}", encoding="jsonschema", data=json.dumps(schema).encode()
-    )
-    return int(
-        writer.register_channel(topic=topic, message_encoding="json", schema_id=number, metadata=attrs)
-    )
+    schema = json.dumps({"title": title, "type": "object", "properties": properties}).encode()
+    number = writer.register_schema(name=f"thermogrip.{title}", encoding="jsonschema", data=schema)
+    channel = writer.register_channel(topic=topic, message_encoding="json", schema_id=number, metadata=attrs)
+    return int(channel)
 
 
-def _message(writer: Any, channel: int, stamp: int, k: int, content: dict[str, Any]) -> None:
-    data = json.dumps(content).encode()
+def _message(writer: Any, channel: int, began: int, k: int, content: dict[str, Any]) -> None:
+    stamp, data = began + round(1e9 * content["time_s"]), json.dumps(content).encode()
     writer.add_message(channel_id=channel, log_time=stamp, publish_time=stamp, sequence=k, data=data)
 
 

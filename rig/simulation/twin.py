@@ -225,9 +225,7 @@ class Twin:
             )
         touch = self._draw(material, t_object, self._grasp_rng)
         alone = self._outputs_alone()[self.skin]
-        self._contact = _Contact(
-            touch, self.time, alone + self._added(alone)
-        )
+        self._contact = _Contact(touch, self.time, alone + self._added(alone))
         self._contact.follow(self.time, alone)
 
     def rehearse(self, material: str, t_object: float) -> None:

@@ -2,35 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from tests.end_to_end.conftest import small_plant
 from thermogrip.mpc.interface import Move, Readings, Target
-from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 
-DT = 0.5
 HEAT, TANK_S, SKIN_S, AIR_S = 0.4, 300.0, 15.0, 2000.0  # K/s at full drive; time constants
 
 
 def make_plant() -> Plant:
-    """Return the plant: dT_tank = 0.4 u - (T_tank - T_amb)/300, dT_skin = pump (T_tank - T_skin)/15 - ..."""
-    a = np.array([[1 - DT / TANK_S, 0.0], [0.0, 1 - DT / AIR_S]])
-    couple = np.array([[0.0, 0.0], [DT / SKIN_S, -DT / SKIN_S]])
-    model = StateSpaceModel(
-        ("drive", "pump"),
-        ("t_ambient",),
-        ("t_tank", "t_surface"),
-        A=a,
-        B=np.array([[DT * HEAT, 0.0], [0.0, 0.0]]),
-        E=np.array([[DT / TANK_S], [DT / AIR_S]]),
-        C=np.eye(2),
-        dt=DT,
-        switches=("pump",),
-        A_switch={"pump": couple},
-    )
-    units = {"drive": "1", "pump": "1", "t_ambient": "degC", "t_tank": "degC", "t_surface": "degC"}
-    return Plant(model, {}, dt=DT, units=units)
+    """Return the small plant of the command line's tests, which knows neither its noise nor its logs."""
+    return replace(small_plant(), noise={}, valid={}, logs=())
 
 
 class Proportional:

@@ -34,12 +34,10 @@ def rig(request: pytest.FixtureRequest, plant: Plant) -> Iterator[Rig]:
         made.close()  # before the device goes
 
 
-def test_it_is_a_rig_with_all_its_members_and_no_news(rig: Rig) -> None:
+def test_it_is_a_rig_whose_reading_names_every_sensor_and_what_is_applied(rig: Rig) -> None:
     assert isinstance(rig, Rig)
     assert rig.notices() == []
-
-
-def test_a_reading_names_every_sensor_and_what_is_applied(rig: Rig) -> None:
+    assert rig.expires_s == (np.inf if "q1" in rig.units else 2.0 if hasattr(rig, "port") else 0.0)
     reading = rig.read()
     assert all(np.isfinite(value) for value in reading.values.values())
     assert set(reading.drive) == set(rig.units)
@@ -47,23 +45,14 @@ def test_a_reading_names_every_sensor_and_what_is_applied(rig: Rig) -> None:
     assert reading.as_controller_reading() == {"time_s": reading.time_s, **reading.values}
 
 
-def test_it_says_how_long_a_drive_outlives_its_host(rig: Rig) -> None:
-    assert rig.expires_s == (np.inf if "q1" in rig.units else 2.0 if hasattr(rig, "port") else 0.0)
-
-
-def test_what_is_applied_is_read_back(rig: Rig) -> None:
+def test_what_is_applied_holds_while_time_passes_and_is_read_back(rig: Rig) -> None:
     rig.apply(dict.fromkeys(rig.units, 0.25), 1)
+    rig.wait(30.0)
     assert set(rig.read().drive.values()) == {0.25}
     assert rig.read().pump == 1
     rig.apply(dict.fromkeys(rig.units, 0.0), 0)
     assert set(rig.read().drive.values()) == {0.0}
     assert rig.read().pump == 0
-
-
-def test_a_drive_holds_while_time_passes(rig: Rig) -> None:
-    rig.apply(dict.fromkeys(rig.units, 0.5), 1)
-    rig.wait(30.0)
-    assert set(rig.read().drive.values()) == {0.5}
 
 
 def test_what_is_driven_gets_warmer(rig: Rig) -> None:

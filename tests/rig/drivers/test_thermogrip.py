@@ -209,13 +209,6 @@ def test_close_never_raises_and_says_what_it_could_not_do(direct: Bench) -> None
     assert any("ends within 2 s" in notice.text for notice in direct.rig.notices())
 
 
-def test_a_port_where_nobody_speaks_our_protocol_is_refused(plant: Plant) -> None:
-    device = VirtualDevice(plant, link="none", clock=SteppedClock())
-    device.fault("silence")
-    with pytest.raises(PortError, match="nothing here speaks our protocol"):
-        DeviceRig(DirectPort(device), greeting=0.1, timeout=0.01)
-
-
 def test_another_device_on_the_same_port_is_not_taken_for_the_first(direct: Bench, plant: Plant) -> None:
     direct.device.fault("cable_pulled")
     direct.rig.read()

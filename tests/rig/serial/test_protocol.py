@@ -154,17 +154,13 @@ def test_endless_noise_without_an_end_of_line_takes_no_memory() -> None:
 
 
 @pytest.mark.parametrize(
-    "parts", [(), ("",), ("two words",), ("star*",), ("line\nend",), ("ä",), ("x" * 160,)]
-)
-def test_words_that_make_no_line_are_refused(parts: tuple[str, ...]) -> None:
+    ("seq", "parts"),
+    [(1, ()), (1, ("",)), (1, ("two words",)), (1, ("star*",)), (1, ("line\nend",)), (1, ("ä",)),
+     (1, ("x" * 160,)), (-1, ("read",)), (65536, ("read",))],
+)  # fmt: skip
+def test_words_that_make_no_line_are_refused(seq: int, parts: tuple[str, ...]) -> None:
     with pytest.raises(ValueError, match=r"line|ascii"):
-        encode_line(1, *parts)
-
-
-@pytest.mark.parametrize("seq", [-1, 65536])
-def test_numbers_out_of_range_are_refused(seq: int) -> None:
-    with pytest.raises(ValueError, match="no line"):
-        encode_line(seq, "read")
+        encode_line(seq, *parts)
 
 
 @pytest.mark.parametrize(
@@ -264,18 +260,10 @@ def test_an_answer_of_another_shape_than_the_device_has_is_not_used() -> None:
     assert host.open == Read()
 
 
-def test_a_reset_is_announced() -> None:
-    assert HostEnd().hear(DeviceCore(cause="watchdog", boot=18).announcement()) == [
-        Boot("watchdog", 18, "0.1.0")
-    ]
-
-
-def test_damage_that_the_device_saw_is_reported() -> None:
-    assert HostEnd().hear(DeviceCore().receive(b"7 reed*06EC819405\n", 0)) == [Refused(None, "corrupt")]
-
-
-def test_a_refusal_of_an_unknown_kind_is_not_used() -> None:
+def test_a_reset_is_announced_damage_is_reported_and_an_unknown_refusal_is_not_used() -> None:
     host = HostEnd()
+    assert host.hear(DeviceCore(cause="watchdog", boot=18).announcement()) == [Boot("watchdog", 18, "0.1.0")]
+    assert host.hear(DeviceCore().receive(b"7 reed*06EC819405\n", 0)) == [Refused(None, "corrupt")]
     host.ask(Read())
     (odd,) = host.hear(encode_line(1, "err", "mood"))
     assert isinstance(odd, Unexpected)

@@ -334,9 +334,7 @@ def test_no_row_of_a_grasp_is_missing_where_the_device_measures(
     assert np.ptp(session.log["time"].values[contact]) == pytest.approx(10.0, abs=0.1)
     time, skin = session.grasps["time"].values, session.grasps["t_surface"].values[0]
     assert skin[-1] > 35.0  # it closed on a block of 45 degC
-    late = (time > 1.0) & (
-        time < 9.5
-    )  # after the step of the touch all rows are one curve
+    late = (time > 1.0) & (time < 9.5)  # after the step of the touch all rows are one curve
     smooth = np.polynomial.Polynomial.fit(time[late], skin[late], 6)
     assert np.abs(skin[late] - smooth(time[late])).max() < 0.3  # noise of 0.04 K, a quantum of 0.06 K
     run = read_run(tmp_path / "run")

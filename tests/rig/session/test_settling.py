@@ -102,13 +102,6 @@ def test_figures_of_a_damped_oscillation_are_those_of_its_formula() -> None:
     assert abs(figures.bias) < 0.01
 
 
-def test_never_settling_has_no_settling_time_and_no_bias() -> None:
-    figures = step_figures(T, 25.0 + 0 * T, 40.0)
-    assert np.isnan(figures.settle_time)
-    assert np.isnan(figures.bias)
-    assert figures.overshoot == 0.0
-
-
 def test_settling_counts_from_the_first_reading_and_ends_with_the_last_one_outside() -> None:
     t = 100.0 + 10.0 * np.arange(40)
     y = np.where(t < 250, 20.0, 40.1)
@@ -119,24 +112,23 @@ def test_settling_counts_from_the_first_reading_and_ends_with_the_last_one_outsi
     assert figures.overshoot == pytest.approx(0.15)
 
 
-def test_the_bias_is_of_what_has_settled_where_that_is_shorter() -> None:
-    y = np.where(T < 40, 20.0, 40.2)
-    assert step_figures(T, y, 40.0, smooth=0.5).bias == pytest.approx(0.2)
+BUMP = (T > 20) & (T < 40)
+PEAK = np.select([T < 5, T == 30], [20.0, 41.0], 40.0)
 
 
-def test_what_begins_at_its_target_overshoots_to_either_side() -> None:
-    for side in (1.0, -1.0):
-        y = 40.1 + np.where((T > 20) & (T < 40), side, 0.0)
-        assert step_figures(T, y, 40.0, smooth=0.5).overshoot == pytest.approx(abs(0.1 + side))
-
-
-def test_extremes_are_of_means_over_both_halves_of_the_smoothing() -> None:
-    y = np.where(T == 30.0, 41.0, 40.0)
-    y[:5] = 20.0
-    assert step_figures(T, y, 40.0, smooth=4.0).overshoot == pytest.approx(1 / 5)
-
-
-def test_cooling_overshoots_downwards() -> None:
-    y = np.where(T < 10, 30.0, 14.0)
-    assert step_figures(T, y, 15.0, smooth=0.5).overshoot == pytest.approx(1.0)
-    assert step_figures(T, 55.0 - y, 40.0, smooth=0.5).overshoot == pytest.approx(1.0)
+@pytest.mark.parametrize(
+    ("y", "target", "smooth", "want"),
+    [
+        (np.full(T.size, 25.0), 40.0, 5.0, (np.nan, 0.0, np.nan)),  # never there
+        (np.where(T < 40, 20.0, 40.2), 40.0, 0.5, (40.0, 0.2, 0.2)),  # the bias is of what has settled
+        (np.where(BUMP, 41.1, 40.1), 40.0, 0.5, (40.0, 1.1, 0.1)),  # what begins there overshoots ...
+        (np.where(BUMP, 39.1, 40.1), 40.0, 0.5, (40.0, 0.9, 0.1)),  # ... to either side
+        (PEAK, 40.0, 4.0, (7.0, 0.2, 1 / 54)),  # means over both halves of the smoothing
+        (np.where(T < 10, 30.0, 14.9), 15.0, 0.5, (10.0, 0.1, -0.1)),  # cooling overshoots downwards
+    ],
+)
+def test_the_figures_of_a_step(
+    y: np.ndarray, target: float, smooth: float, want: tuple[float, float, float]
+) -> None:
+    found = step_figures(T, y, target, smooth=smooth)
+    assert (found.settle_time, found.overshoot, found.bias) == pytest.approx(want, nan_ok=True)

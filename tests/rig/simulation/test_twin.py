@@ -87,11 +87,6 @@ def test_readings_scatter_as_the_sensors_are_specified_to(plant: Plant) -> None:
     assert np.mean(e) == pytest.approx(0.0, abs=4 * 0.03 * np.sqrt(8 / 4000))
 
 
-def test_a_reading_is_a_multiple_of_the_quantum(plant: Plant) -> None:
-    values = Twin(plant, seed=5).read().values
-    assert all((values[name] * 16).is_integer() for name in plant.outputs)
-
-
 def test_one_seed_is_one_run_and_another_seed_another(plant: Plant) -> None:
     def run(seed: int) -> list[float]:
         twin = Twin(plant, seed=seed)
@@ -104,11 +99,9 @@ def test_one_seed_is_one_run_and_another_seed_another(plant: Plant) -> None:
 
     assert run(1) == run(1)
     assert run(1) != run(2)
-
-
-def test_reading_twice_draws_no_new_noise(plant: Plant) -> None:
+    assert all((value * 16).is_integer() for value in run(1))
     twin = Twin(plant, seed=1)
-    assert twin.read() == twin.read()
+    assert twin.read() == twin.read()  # which draws no new noise
 
 
 def test_a_grasp_moves_the_skin_towards_the_object_by_the_response(plant: Plant) -> None:
@@ -238,12 +231,14 @@ def test_a_twin_that_has_not_moved_has_no_log_and_one_step_makes_one(plant: Plan
     assert twin.log()["time"].values.tolist() == [0.0, plant.dt]
 
 
-@pytest.mark.parametrize("material", ["unobtainium", ""])
-def test_an_unknown_material_is_the_users_fault(plant: Plant, material: str) -> None:
-    with pytest.raises(UserError):
-        Twin(plant).grasp(material, 43.0)
-
-
-def test_a_plant_without_a_skin_cannot_grasp(plant: Plant) -> None:
-    with pytest.raises(UserError, match="cannot grasp"):
-        Twin(plant, skin="t_finger").grasp("copper", 43.0)
+@pytest.mark.parametrize(
+    ("skin", "material", "said"),
+    [
+        ("t_surface", "unobtainium", "unobtainium"),
+        ("t_surface", "", "no material"),
+        ("t_nose", "copper", "cannot grasp"),
+    ],
+)
+def test_what_cannot_be_grasped_is_the_users_fault(plant: Plant, skin: str, material: str, said: str) -> None:
+    with pytest.raises(UserError, match=said):
+        Twin(plant, skin=skin).grasp(material, 43.0)
