@@ -36,27 +36,9 @@ T = TypeVar("T")
 class Sampler:
     """Read a rig every ``dt`` seconds in a thread, for as long as a ``with`` block lasts.
 
-    Parameters
-    ----------
-    rig : Rig
-        One that may be read from another thread than the one that made it.
-    dt : float
-        Sample time [s].
-    keep : int, optional
-        Readings that are kept until they are taken; older ones are dropped and counted in ``dropped``.
-    clock, sleep : callable, optional
-        The grid's clock and how to wait on it [s].
-
-    Attributes
-    ----------
-    by_device : bool
-        Whether the rig measures by its own clock; known once the block has begun.
-    missed : int
-        Samples of which there is no reading.
-    dropped : int
-        Readings that nobody took in time.
-    late : deque of float
-        How long after its tick the rig's answer was there, of the last ``keep`` [s].
+    The newest ``keep`` readings wait to be taken; ``dropped`` counts older ones, ``missed`` samples without
+    a reading.  ``late`` [s] is how long after its tick each answer was there, ``by_device`` whether the rig
+    measures by its own clock.  The rig must allow reading from another thread than the one that made it.
     """
 
     def __init__(

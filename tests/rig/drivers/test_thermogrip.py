@@ -161,16 +161,6 @@ def test_a_reset_whose_line_was_lost_is_noted_all_the_same(direct: Bench) -> Non
     assert "reset" in direct.kinds()
 
 
-def test_silence_is_no_reading_and_the_drive_ends(direct: Bench) -> None:
-    direct.rig.apply(DRIVE, 1)
-    direct.device.fault("silence")
-    assert np.isnan(direct.rig.read().values["t_tank"])
-    direct.rig.wait(3.0)
-    assert direct.device.applied_drive == {"drive": 0.0}
-    direct.device.clear()
-    assert np.isfinite(direct.rig.read().values["t_tank"])
-
-
 def test_a_line_that_spoils_half_of_what_it_carries_gives_right_readings_or_none(direct: Bench) -> None:
     direct.rig.timeout = 0.001
     direct.device.fault("garbage", rate=0.5)

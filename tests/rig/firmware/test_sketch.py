@@ -14,40 +14,33 @@ from tests.rig.cores import BOARDS
 from thermogrip.rig.firmware.reference import DeviceCore
 from thermogrip.rig.serial.protocol import State, encode_line
 
+SKETCH = Path(str(files("thermogrip.rig"))) / "firmware"
+STUB = Path(__file__).parents[1] / "arduino_stub"
 
-def test_a_compiler_reads_the_sketch() -> None:
+
+def compiled(*words: str | Path) -> subprocess.CompletedProcess[str]:
+    """Let a compiler read a file."""
     compiler = shutil.which("g++")
     if compiler is None:
         pytest.skip("no g++ on this computer: the sketch cannot be read here")
-    sketch = Path(str(files("thermogrip.rig"))) / "firmware"
-    stub = Path(__file__).parents[1] / "arduino_stub"
-    flags = ["-std=c++11", "-fsyntax-only", "-Wall", "-Wextra", "-Werror", "-Wno-attributes"]
-    flags += ["-I", str(stub), "-I", str(sketch), "-include", str(stub / "Arduino.h"), "-x", "c++"]
-    subprocess.run([compiler, *flags, str(sketch / "firmware.ino")], check=True, timeout=120)
+    command = [compiler, "-std=c++11", "-fsyntax-only", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
 
 
 @pytest.mark.parametrize(("extra", "fits"), [("", True), ("_of_the_second_loop_in_the_left_room" * 2, False)])
-def test_names_that_would_cut_a_line_off_do_not_compile(extra: str, fits: bool, tmp_path: Path) -> None:
-    compiler = shutil.which("g++")
-    if compiler is None:
-        pytest.skip("no g++ on this computer: the sketch cannot be read here")
-    sketch = Path(str(files("thermogrip.rig"))) / "firmware"
-    for path in (p for p in sketch.iterdir() if p.suffix in {".h", ".cpp", ".ino"}):
+def test_a_compiler_reads_the_sketch_unless_names_would_cut_a_line_off(
+    extra: str, fits: bool, tmp_path: Path
+) -> None:
+    for path in (p for p in SKETCH.iterdir() if p.suffix in {".h", ".cpp", ".ino"}):
         (tmp_path / path.name).write_text(path.read_text().replace('{"t_tank"', f'{{"t_tank{extra}"'))
-    stub = Path(__file__).parents[1] / "arduino_stub"
-    flags = ["-std=c++11", "-fsyntax-only", "-Wall", "-Wextra", "-Werror"]
-    flags += ["-I", str(stub), "-I", str(tmp_path), "-include", str(stub / "Arduino.h"), "-x", "c++"]
-    command = [compiler, *flags, str(tmp_path / "firmware.ino")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    flags = ["-Wall", "-Wextra", "-Werror", "-Wno-attributes", "-I", STUB, "-I", tmp_path]
+    done = compiled(*flags, "-include", STUB / "Arduino.h", "-x", "c++", tmp_path / "firmware.ino")
     assert (done.returncode == 0) == fits, done.stderr
     assert fits or "the names are too long for a line" in done.stderr
 
 
 @pytest.mark.parametrize("board", BOARDS)
 def test_the_longest_lines_are_as_long_as_the_sketch_says(board: str, tmp_path: Path) -> None:
-    compiler = shutil.which("g++")
-    if compiler is None:
-        pytest.skip("no g++ on this computer: the firmware cannot be built here")
     it = BOARDS[board]
     core = DeviceCore(it, "watchdog", 65535)
     lowest = tuple(max((c.low, c.high), key=lambda n: len(str(n))) for c in it.drives)
@@ -63,15 +56,12 @@ def test_the_longest_lines_are_as_long_as_the_sketch_says(board: str, tmp_path: 
     sums = [f"longest_{what}({board.upper()}) == {n - 12}" for what, n in zip(("identity", "state"), lengths)]
     asserts = "".join(f'static_assert({said}, "{said}");' for said in sums)
     (tmp_path / "host.cpp").write_text(host.replace("static const", "static constexpr") + asserts)
-    sketch = Path(str(files("thermogrip.rig"))) / "firmware"
-    command = [compiler, "-std=c++11", "-fsyntax-only", "-I", str(sketch), str(tmp_path / "host.cpp")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    done = compiled("-I", SKETCH, tmp_path / "host.cpp")
     assert done.returncode == 0, done.stderr
 
 
 def test_the_sketch_uses_every_pin_that_it_configures() -> None:
-    sketch = Path(str(files("thermogrip.rig"))) / "firmware"
-    used = (sketch / "firmware.ino").read_text()
-    pins = re.findall(r"\bPIN_\w+", (sketch / "config.h").read_text())
+    used = (SKETCH / "firmware.ino").read_text()
+    pins = re.findall(r"\bPIN_\w+", (SKETCH / "config.h").read_text())
     assert pins
     assert all(pin in used for pin in pins)

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.rig.fault_injection.drills import DRILLS, drill_plants, run_drill
-from tests.rig.makers import follow, make_lab
+from tests.rig.makers import follow
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.rig.guard.guard import Guard, GuardSettings
@@ -266,11 +266,6 @@ def test_a_path_may_end_three_standard_deviations_elsewhere() -> None:
     known = replace(unknown(), covariance=cov)
     slopes = np.array([[1.0, 2.0], [0.0, -3.0]])
     assert known.spread(slopes) == pytest.approx([3 * np.sqrt(0.2 - 0.4 + 1.2), 3 * np.sqrt(2.7)])
-
-
-def test_a_plant_without_parameters_cannot_drift() -> None:
-    with pytest.raises(UserError, match="no parameters"):
-        ModelMonitor(make_lab(), replace(ModelSettings(), drift=0.05))
 
 
 def test_without_a_stated_drift_nothing_is_allowed_and_nothing_learnt() -> None:

@@ -118,20 +118,6 @@ def test_what_is_no_target_is_refused_and_the_next_one_taken(
     assert bridge.reports == ()
 
 
-def test_a_server_that_dies_does_not_touch_the_session(plant: Plant, controller: Any) -> None:
-    server = Server()
-    with Bridge(server.url, clock=lambda: 0.0) as bridge:
-
-        def die(fraction: float, what: str) -> None:
-            if server.thread.is_alive() and fraction > 0:
-                assert wait_for(lambda: bridge.sent > 20)
-                server.close()
-
-        session = run_session(Twin(plant, seed=1), controller, 38.0, recorder=bridge, progress=die)
-        assert session.verdict == "settled"
-    server.close()
-
-
 def test_a_slow_network_costs_the_oldest_messages_not_time(server: Server) -> None:
     bridge = Bridge(server.url, clock=lambda: 0.0)
     bridge.close()  # nobody takes from the queue any more
@@ -230,26 +216,9 @@ def test_a_server_that_hangs_up_at_once_is_one_line(server: Server, monkeypatch:
     assert closed
 
 
-NUMBERS = st.one_of(
-    st.floats(0.0, 60.0), st.floats(), st.integers(), st.booleans(), st.none(), st.text(max_size=4)
-)
-
-
-@st.composite
-def messages(draw: st.DrawFn) -> str:
-    """Publications that are almost the one that counts."""
-    content = {"data": draw(NUMBERS)} if draw(st.booleans()) else draw(NUMBERS)
-    topic = draw(st.sampled_from(["/thermogrip/target", "/thermogrip/target", "/thermogrip/skin"]))
-    text = json.dumps(
-        {"op": draw(st.sampled_from(["publish", "publish", "call"])), "topic": topic, "msg": content}
-    )
-    return text[: len(text) - draw(st.sampled_from([0, 0, 0, 1]))]
-
-
-@given(st.one_of(messages(), st.text(max_size=200), st.binary(max_size=200)))
-def test_whatever_the_server_sends_is_a_target_inside_the_limits_or_none(text: str | bytes) -> None:
-    target, why = Messages().hear(text)
-    assert target is None or (10 <= target <= 50 and not why)
+@given(st.text(max_size=200) | st.binary(max_size=200))
+def test_whatever_else_the_server_sends_is_no_target(text: str | bytes) -> None:
+    assert Messages().hear(text)[0] is None
 
 
 @pytest.mark.parametrize(
@@ -260,6 +229,9 @@ def test_whatever_the_server_sends_is_a_target_inside_the_limits_or_none(text: s
 def test_only_a_number_inside_the_limits_is_a_target(value: Any, target: float | None) -> None:
     text = json.dumps({"op": "publish", "topic": "/thermogrip/target", "msg": {"data": value}})
     assert Messages().hear(text)[0] == target
+    assert Messages().hear(text[:-1])[0] is None
+    assert Messages().hear(text.replace("target", "skin")) == (None, "")
+    assert Messages().hear(text.replace("publish", "call")) == (None, "")
 
 
 def test_after_a_new_connection_topics_are_advertised_again() -> None:
