@@ -11,14 +11,14 @@ if TYPE_CHECKING:
     from thermogrip.mpc.controllers.pi import PIController
     from thermogrip.mpc.design.design import Design, default_design
     from thermogrip.mpc.design.spec import SPEC_TEMPLATE, Spec, read_spec
+    from thermogrip.mpc.design_review import Check, review
     from thermogrip.mpc.interface import Move
-    from thermogrip.mpc.review.review import Check, review
     from thermogrip.mpc.tuning.figures import closed_loop_figure
     from thermogrip.mpc.tuning.tune import Tuning, tune
 
 # Loaded at first use: importing the room must not cost what its heaviest module costs.
 _HOME = {
-    "Check": "review.review",
+    "Check": "design_review",
     "ClosedLoop": "closed_loop.simulate",
     "Controller": "controllers.mpc",
     "Design": "design.design",
@@ -32,7 +32,7 @@ _HOME = {
     "default_design": "design.design",
     "design_controller": "controllers.mpc",
     "read_spec": "design.spec",
-    "review": "review.review",
+    "review": "design_review",
     "simulate_closed_loop": "closed_loop.simulate",
     "tune": "tuning.tune",
 }

@@ -9,8 +9,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Protocol, TypeAlias
 
-__all__ = ["STATUSES", "Controller", "Move", "Readings", "Target", "number"]
-
 #: One sample: ``{"time_s": .., "t_tank": .., "t_surface": .., "t_ambient": ..}``, degC.  Without ``time_s``
 #: a call is one sample time.
 Readings: TypeAlias = Mapping[str, float]

@@ -42,7 +42,7 @@ from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.native.runtime import wanted
 from thermogrip.mpc.plant.prediction import PredictionModel
 from thermogrip.mpc.plant.steady_state import holding_drive
-from thermogrip.mpc.tuning.trials import full_drive_bound
+from thermogrip.mpc.tuning.minimum_time import full_drive_bound
 from thermogrip.mpc.tuning.tune import tune
 from thermogrip.sysid.plant.plant import Plant
 

@@ -12,34 +12,27 @@ For each target of the schedule:
 * **bias**: the mean error of the last 120 s (or the last fifth of a shorter segment);
 * **energy**: the integral of the squared drive, in seconds at full drive;  **travel**: the sum of its
   changes.
+
+The log of a session on hardware has what was read and applied, without the controller's status, its advice
+and its step times.  :class:`RecordedController` keeps these, and :func:`session_loop` puts both together as
+the same :class:`ClosedLoop`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.schema import Log, make_log
-from thermogrip.mpc.interface import Controller, Move, Target
+from thermogrip.datasets.schema import Log, column, make_log, names
+from thermogrip.mpc.interface import Controller, Move, Readings, Target
 from thermogrip.mpc.plant.prediction import PredictionModel
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
-
-__all__ = [
-    "ClosedLoop",
-    "Segment",
-    "Surroundings",
-    "Truth",
-    "drive_shares",
-    "record_loop",
-    "segment_of",
-    "simulate_closed_loop",
-]
 
 Array = NDArray[np.float64]
 
@@ -358,4 +351,82 @@ def segment_of(
         energy_s=float(np.sum(drive**2) * length / drive.shape[0]),
         travel=float(np.sum(np.abs(np.diff(drive, axis=0)))),
         full_share=float(np.mean(full[:busy])),
+    )
+
+
+class RecordedController:
+    """A controller that keeps its ``moves``, each with the time of its reading [s], counted in sample
+    times where the reading has none.
+    """
+
+    def __init__(self, controller: Controller) -> None:
+        self.controller = controller
+        self.moves: list[tuple[float, Move]] = []
+
+    @property
+    def dt(self) -> float:
+        """Sample time [s]."""
+        return self.controller.dt
+
+    def reset(self, reading: Readings) -> None:
+        """Let the controller forget the past; the moves are kept."""
+        self.controller.reset(reading)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what else the controller has."""
+        return getattr(self.__dict__["controller"], name)
+
+    def step(self, reading: Readings, target: Target) -> Move:
+        """Return the controller's move, and keep it."""
+        move = self.controller.step(reading, target)
+        self.moves.append((float(reading.get("time_s", self.dt * len(self.moves))), move))
+        return move
+
+
+def session_loop(
+    log: Log,
+    moves: list[tuple[float, Move]],
+    *,
+    drive_range: Mapping[str, tuple[float, float]],
+    band: float = 0.25,
+    figures: Mapping[str, Mapping[str, float]] | None = None,
+) -> ClosedLoop:
+    """Return a session's log (drives, ``pump``, outputs, ``target_<output>``) as the record of a closed loop.
+
+    The moves are those of :class:`RecordedController`; what comes after the last (a grasp) is left out, and
+    fewer than two are a ValueError. Of an output whose noisy readings were evaluated otherwise than sample by
+    sample, ``figures`` has ``settle_s``, ``overshoot`` or ``bias``. Times count from the log's start.
+    """
+    if len(moves) < 2:
+        raise ValueError(f"{len(moves)} moves are no loop")
+    logged = np.asarray(log["time"].values, dtype=float)
+    rows = logged <= moves[-1][0] + 1e-6
+    time = logged[rows] - logged[rows][0]
+    targets = [str(name).removeprefix("target_") for name in log.data_vars if str(name).startswith("target_")]
+    drives = {name: column(log, name)[rows] for name in drive_range}
+    goal = {name: column(log, f"target_{name}")[rows] for name in targets}
+    outputs = {name: column(log, name)[rows] for name in names(log, "output")}
+    by_time = {round(at, 6): move for at, move in moves}
+    # a reading that was rejected was not shown to the controller: its move was held
+    answers = [by_time.get(round(float(at), 6)) for at in logged[rows]]
+    lowest, highest = np.array([drive_range[name] for name in drives], dtype=float).T
+    scaled, full = drive_shares(np.stack(list(drives.values()), axis=1), lowest, highest)
+    segments = []
+    for name, target in goal.items():
+        segment = segment_of(name, time, outputs[name], float(target[0]), scaled, full, band)
+        own: Any = (figures or {}).get(name, {})
+        segments.append(replace(segment, **own))
+    return ClosedLoop(
+        time=time,
+        outputs=outputs,
+        sample_time=time,
+        readings=outputs,
+        drive=drives,
+        target=goal,
+        status=tuple("fallback_plan" if move is None else move.status for move in answers),
+        advice=tuple("" if move is None else move.advice for move in answers),
+        seconds=np.array([move.seconds for _, move in moves]),
+        band=band,
+        drive_range={name: (float(low), float(high)) for name, (low, high) in drive_range.items()},
+        segments=tuple(segments),
     )

@@ -21,8 +21,6 @@ from thermogrip.mpc.native.runtime import CompiledController, CompiledTruth
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
-__all__ = ["compiled_loop"]
-
 Array = NDArray[np.float64]
 
 

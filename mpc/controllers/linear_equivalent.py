@@ -23,8 +23,6 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from thermogrip.mpc.optimiser.rti import ControllerParts, Optimiser
 
-__all__ = ["LinearLaw", "augmented", "linear_law", "linear_move", "plan_gains", "to_control"]
-
 Array = NDArray[np.float64]
 
 

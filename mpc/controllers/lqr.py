@@ -67,8 +67,6 @@ from thermogrip.mpc.plant.prediction import PredictionModel, prediction_model
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
-__all__ = ["LQRController", "regulator_gain"]
-
 Array = NDArray[np.float64]
 
 _LONGEST = 1000.0  # samples that a mean is taken over

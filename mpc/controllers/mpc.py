@@ -63,8 +63,6 @@ if TYPE_CHECKING:
     from thermogrip.sysid.models.model import Model
     from thermogrip.sysid.plant.plant import Plant
 
-__all__ = ["Controller", "design_controller"]
-
 Array = NDArray[np.float64]
 
 _KEPT_DRAWS = 50  # of the posterior, carried in the controller's file for its review

@@ -33,16 +33,6 @@ from thermogrip.mpc.plant.steady_state import holding_drive
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
-__all__ = [
-    "PIController",
-    "as_drive",
-    "clean",
-    "held_drive",
-    "held_move",
-    "read_target",
-    "unseen_advice",
-]
-
 Array = NDArray[np.float64]
 
 #: Readings outside are a broken wire, not a temperature [degC].

@@ -35,15 +35,6 @@ from thermogrip.mpc.plant.prediction import drive_names, drive_range, sample_tim
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
-__all__ = [
-    "LONGEST_HORIZON",
-    "MOST_UNKNOWNS",
-    "Design",
-    "check_design",
-    "default_design",
-    "make_blocks",
-]
-
 #: Samples of a horizon, and block values of a plan; more are hours of work a sample, not a better loop.
 LONGEST_HORIZON, MOST_UNKNOWNS = 1000, 200
 

@@ -20,8 +20,6 @@ from thermogrip.mpc.plant.prediction import PredictionModel, drive_names, step_r
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
-__all__ = ["PILoop", "default_controlled", "pair_loops", "simc"]
-
 
 @dataclass(frozen=True)
 class PILoop:

@@ -19,8 +19,6 @@ from thermogrip.mpc.design.design import Design, default_design
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
-__all__ = ["SPEC_TEMPLATE", "Spec", "read_spec", "spec_from_dict"]
-
 SPEC_TEMPLATE = """\
 # What the controller should do.  Every line may be left out; the values here are the defaults.
 

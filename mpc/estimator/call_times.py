@@ -27,8 +27,6 @@ from numpy.typing import NDArray
 
 from thermogrip.mpc.interface import number
 
-__all__ = ["RESTART_S", "SAME", "CallTimes", "opening", "shifted"]
-
 Array = NDArray[np.float64]
 
 #: A longer silence than this and the past is unknown [s].

@@ -75,18 +75,6 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.estimator.call_times import SAME
 from thermogrip.mpc.plant.prediction import ROOM, PredictionModel
 
-__all__ = [
-    "OFFSET",
-    "DisturbanceModel",
-    "Observer",
-    "ObserverNoise",
-    "RestingState",
-    "choose_disturbances",
-    "detectability_margin",
-    "resting_state",
-    "resting_state_in_room",
-]
-
 Array = NDArray[np.float64]
 
 #: Standard deviation of a sensor's offset that nobody knows [degC].

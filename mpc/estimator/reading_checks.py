@@ -31,8 +31,6 @@ from thermogrip.mpc.interface import number
 if TYPE_CHECKING:
     from thermogrip.mpc.estimator.observer import Observer
 
-__all__ = ["ReadingMonitor", "follows", "stands"]
-
 Array = NDArray[np.float64]
 
 _SPIKE = 6.0  # degC off the prediction in one sample: a loose plug, unless it stays

@@ -19,16 +19,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from thermogrip.mpc.native.codegen import ModelCode
 
-__all__ = [
-    "SOURCES",
-    "build_library",
-    "c_source",
-    "compiler",
-    "model_header",
-    "model_source",
-    "wanted",
-]
-
 #: The C files that every export shares.
 SOURCES = ("tg_qp.h", "tg_qp.c", "tg_controller.h", "tg_controller.c", "tg_observer.c", "tg_optimiser.c")
 

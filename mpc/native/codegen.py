@@ -31,8 +31,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import Model
 
-__all__ = ["ModelCode", "write_model"]
-
 #: How each of CasADi's operations is written in C, and done in Python.
 _OPERATIONS: dict[str, tuple[str, Callable[..., float]]] = {
     "OP_ASSIGN": ("{0}", lambda a: a),

@@ -16,17 +16,6 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from thermogrip.mpc.optimiser.rti import ControllerParts
 
-__all__ = [
-    "Sizes",
-    "as_structure",
-    "bytes_of",
-    "config_header",
-    "initialiser",
-    "numbers_of",
-    "sizes_of",
-    "structure_of",
-]
-
 Array = NDArray[np.float64]
 
 ITERATION_LIMIT = 500

@@ -1,6 +1,6 @@
 """The controller's C, built where gcc is there, in place of the same thing in Python.
 
-The sources of an export (:mod:`thermogrip.mpc.export.export`), with a model's step written by
+The sources of an export (:mod:`thermogrip.mpc.export`), with a model's step written by
 :mod:`thermogrip.mpc.native.codegen`, become a library (:mod:`thermogrip.mpc.native.build`).  A second
 controller of the same structure (any parameters, any weights) finds it built.
 
@@ -24,10 +24,8 @@ from thermogrip.mpc.native.build import (
     SOURCES,
     build_library,
     c_source,
-    compiler,
     model_header,
     model_source,
-    wanted,
 )
 from thermogrip.mpc.native.codegen import ModelCode, write_model
 from thermogrip.mpc.native.design_struct import Sizes, as_structure, config_header, numbers_of, sizes_of
@@ -37,18 +35,6 @@ if TYPE_CHECKING:
     from thermogrip.mpc.optimiser.rti import ControllerParts
     from thermogrip.mpc.plant.prediction import PredictionModel
     from thermogrip.sysid.models.model import Model
-
-__all__ = [
-    "SOURCES",
-    "CompiledController",
-    "CompiledObserver",
-    "CompiledOptimiser",
-    "CompiledTruth",
-    "build_library",
-    "c_source",
-    "compiler",
-    "wanted",
-]
 
 Array = NDArray[np.float64]
 

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from thermogrip.mpc.optimiser.qp import QPAnswer
 
-__all__ = ["ActiveSetQP"]
-
 Array = NDArray[np.float64]
 
 _REGULAR, _TOLERANCE, _SHORT, _CONTRADICTION, _FAR = 1e-11, 1e-10, 1e-5, 1e-6, 1e15

@@ -31,8 +31,6 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LEAST_QUADRATIC", "CondensedQP", "QPAnswer", "QPSolver"]
-
 LEAST_QUADRATIC = 1e-9  # of a scaled row's quadratic penalty
 
 Vector = NDArray[np.float64]

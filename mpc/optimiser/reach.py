@@ -49,8 +49,6 @@ from thermogrip.mpc.optimiser.rti import FADING, Optimiser, allowed_share
 if TYPE_CHECKING:
     from thermogrip.mpc.estimator.observer import Observer
 
-__all__ = ["Reach"]
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 

@@ -40,14 +40,6 @@ from thermogrip.mpc.estimator.observer import DisturbanceModel, Observer
 from thermogrip.mpc.optimiser.qp import CondensedQP, QPSolver
 from thermogrip.mpc.plant.prediction import PredictionModel
 
-__all__ = [
-    "FADING",
-    "ControllerParts",
-    "Optimiser",
-    "Outcome",
-    "allowed_share",
-]
-
 Array = NDArray[np.float64]
 
 _SHARES = np.array([0.5, 0.25, 0.1, 0.0])

@@ -43,17 +43,6 @@ if TYPE_CHECKING:
     from thermogrip.sysid.models.jit_rollout import Kernel
     from thermogrip.sysid.plant.plant import Plant
 
-__all__ = [
-    "ROOM",
-    "PredictionModel",
-    "StepResponse",
-    "drive_names",
-    "drive_range",
-    "prediction_model",
-    "sample_time",
-    "step_response",
-]
-
 
 def drive_names(plant: Plant) -> tuple[str, ...]:
     """Return the inputs that a controller moves: all but those that are on or off."""

@@ -16,8 +16,6 @@ from scipy.optimize import least_squares
 
 from thermogrip.mpc.plant.prediction import PredictionModel
 
-__all__ = ["Holding", "SteadyCurve", "holding_drive", "steady_curve"]
-
 Array = NDArray[np.float64]
 
 _NEWTON_STEPS, _BALANCED = 20, 1e-7  # and by how much a state may move in a sample [degC]

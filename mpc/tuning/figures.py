@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from thermogrip.mpc.tuning.pareto import Pareto
 
-__all__ = ["closed_loop_figure", "pareto_figure", "sensitivity_figure", "step_time_figure"]
-
 # after Okabe and Ito: no kind of colour blindness makes two of them one
 _COLOURS = ("#1f5fa8", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
 _INK, _LINE = "#1d2733", "#9aa7b5"

@@ -34,8 +34,6 @@ from thermogrip.mpc.plant.prediction import PredictionModel, prediction_model
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
-__all__ = ["full_drive_bound"]
-
 Array = NDArray[np.float64]
 
 _LEVELS = np.linspace(0.4, 1.0, 13)

@@ -20,8 +20,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.mpc.tuning.objective import Trial
 
-__all__ = ["Pareto", "front_of", "non_dominated", "scan_of"]
-
 #: Differences that do not count: settling [s], overshoot [degC], energy [share of the largest].
 RESOLUTION = (1.0, 0.05, 0.005)
 

@@ -20,8 +20,6 @@ import numpy as np
 
 from thermogrip.mpc.tuning.objective import Search, Trial, parameters_of
 
-__all__ = ["PARAMETER_WORDS", "Sensitivity", "sensitivity_of", "sensitivity_words"]
-
 #: What each parameter is to a user.
 PARAMETER_WORDS = {
     "move": "the move weight",

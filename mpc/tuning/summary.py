@@ -19,9 +19,7 @@ from typing import Any
 import numpy as np
 
 from thermogrip.mpc.design.spec import Spec
-from thermogrip.mpc.tuning.trials import Bounds, StepResult
-
-__all__ = ["Row", "meets_spec", "rows_of", "verdict_of"]
+from thermogrip.mpc.tuning.objective import Bounds, StepResult
 
 _WON = 0.03  # relative fall of the score that counts
 _NEAR = 1.25  # settling over bound that counts as the actuator's limit

@@ -34,19 +34,19 @@ from thermogrip.mpc.tuning.objective import (
     MPC_PARAMETERS,
     PI_PARAMETERS,
     Search,
+    StepResult,
     Trial,
     parameters_of,
     scaled_loops,
+    score,
+    trial,
 )
 from thermogrip.mpc.tuning.pareto import Pareto, front_of, scan_of
 from thermogrip.mpc.tuning.sensitivity import PARAMETER_WORDS, Sensitivity, sensitivity_of, sensitivity_words
 from thermogrip.mpc.tuning.summary import Row, meets_spec, rows_of, verdict_of
-from thermogrip.mpc.tuning.trials import StepResult, score, trial
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
-
-__all__ = ["Row", "Tuning", "tune"]
 
 Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]

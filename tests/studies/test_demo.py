@@ -234,7 +234,7 @@ def test_a_plant_is_tuned_on_few_draws_and_what_is_reviewed_is_the_file(
     )
     monkeypatch.setattr("thermogrip.mpc.controllers.mpc.Controller.load", lambda path: f"loaded {path.name}")
     monkeypatch.setattr(
-        import_module("thermogrip.mpc.review.review"), "review", lambda given: f"review of {given}"
+        import_module("thermogrip.mpc.design_review"), "review", lambda given: f"review of {given}"
     )
     assert demo._tune(tmp_path, "a plant", SEED, 3, None) == (tuning, "review of loaded controller.json")
     ((plant, spec), options), saved = calls

@@ -136,7 +136,7 @@ def review(
     if report is not None:
         new_file(report, (".html",))
     loaded = load_controller(controller, network)  # first: a design that cannot be is refused sooner
-    from thermogrip.mpc.review.review import review as check
+    from thermogrip.mpc.design_review import review as check
     from thermogrip.report.classification import review_section
     from thermogrip.report.html import write_report
 
@@ -171,7 +171,7 @@ def export(
 
     The folder needs a C compiler and nothing of thermogrip: library, example, Makefile, README.
     """
-    from thermogrip.mpc.export.export import check_export, export_controller
+    from thermogrip.mpc.export import check_export, export_controller
 
     console = Console(as_json)
     loaded = load_controller(controller, network)

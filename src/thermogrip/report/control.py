@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermogrip.mpc.closed_loop.session_record import session_loop
+from thermogrip.mpc.closed_loop.simulate import session_loop
 from thermogrip.mpc.tuning.figures import (
     closed_loop_figure,
     pareto_figure,

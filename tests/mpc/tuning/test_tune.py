@@ -21,11 +21,13 @@ from thermogrip.mpc.tuning.objective import (
     MPC_PARAMETERS,
     PI_PARAMETERS,
     Search,
+    StepResult,
     Trial,
     parameters_of,
     scaled_loops,
+    score,
+    surroundings_of,
 )
-from thermogrip.mpc.tuning.trials import StepResult, score, surroundings_of
 from thermogrip.mpc.tuning.tune import Tuning, tune
 
 QUICK = Spec(steps=[(28, 36)], hold_s=260.0, evaluations=5, sample_time_s=4.0, settle_within_s=250.0)

@@ -47,8 +47,6 @@ from thermogrip.mpc.optimiser.active_set import ActiveSetQP
 if TYPE_CHECKING:
     from thermogrip.mpc.design.design import Design
 
-__all__ = ["Agreement", "Export", "check_export", "export_controller"]
-
 Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]
 

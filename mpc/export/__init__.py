@@ -1,1 +1,0 @@
-"""A controller as C99, checked against Python."""

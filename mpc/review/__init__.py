@@ -1,1 +1,0 @@
-"""Design review: checks of a controller before it meets the rig."""
