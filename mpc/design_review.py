@@ -105,6 +105,17 @@ def review(
     Returns
     -------
     list of Check
+
+    Examples
+    --------
+    >>> from thermogrip.sysid import Plant, load_network
+    >>> kit = load_network("tclab")
+    >>> p, heaters = dict(zip(kit.parameters, kit.prior)), dict.fromkeys(kit.inputs, (0.0, 100.0))
+    >>> plant = Plant(kit, p, dt=kit.dt, units=kit.units, valid=heaters)
+    >>> from thermogrip.mpc import design_controller
+    >>> found = review(design_controller(plant, dt=5.0), wanted=(30.0, 60.0), draws=1)
+    >>> [(check.verdict, check.name) for check in found if check.verdict != "pass"]
+    [('warn', 'every weight does something'), ('warn', 'targets lie where the logs were')]
     """
     starts, targets = _steps(controller)
     span = (min(targets), max(targets)) if wanted is None else wanted
@@ -144,25 +155,20 @@ def _steps(controller: Controller) -> tuple[list[float], list[float]]:
     return [], [float(low), float(high)]
 
 
-class _Counted:
-    """A controller whose steps are counted."""
+class _Counted(Controller):
+    """A controller that keeps the iterations of its steps."""
 
-    def __init__(self, controller: Controller) -> None:
-        self.controller, self.dt, self.controlled = controller, controller.dt, controller.controlled
-        self.iterations: list[int] = []
-
-    def reset(self, reading: Readings) -> None:
-        self.controller.reset(reading)
+    iterations: tuple[int, ...] = ()
 
     def step(self, reading: Readings, target: Target) -> Move:
-        move = self.controller.step(reading, target)
-        self.iterations.append(self.controller.last_iterations)
+        move = super().step(reading, target)
+        self.iterations += (self.last_iterations,)
         return move
 
 
 def _effort(controller: Controller, span: tuple[float, float]) -> list[Check]:
     """Measured on swings across the range and back, where the active set changes most."""
-    fresh = _Counted(Controller(controller.plant, controller.design))
+    fresh = _Counted(controller.plant, controller.design)
     ends = [dict.fromkeys(controller.controlled, end) for end in (span[1], span[0], span[1])]
     schedule = [(end, 40 * controller.dt) for end in ends]
     run = simulate_closed_loop(fresh, controller.plant, schedule, start=span[0])
@@ -183,7 +189,7 @@ def _effort(controller: Controller, span: tuple[float, float]) -> list[Check]:
     return [time, _iterations(controller, fresh.iterations)]
 
 
-def _iterations(controller: Controller, counted: list[int]) -> Check:
+def _iterations(controller: Controller, counted: Sequence[int]) -> Check:
     name, limit = "QP ends long before its limit", ITERATION_LIMIT
     rows = 2 * controller.optimiser.n_b * controller.model.n_u
     soft = len(controller.optimiser.qp.soft) - rows

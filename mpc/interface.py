@@ -64,6 +64,15 @@ class Controller(Protocol):
         ...
 
 
+class Regulator(Controller, Protocol):
+    """A controller whose targets are those of named outputs."""
+
+    @property
+    def controlled(self) -> tuple[str, ...]:
+        """Outputs with a target."""
+        ...
+
+
 def number(reading: Mapping[str, float], name: str) -> float:
     """Return a number of a reading, NaN where it is missing or none."""
     try:

@@ -27,18 +27,6 @@ NO_UNIT = re.compile(
 )
 #: What doors lack yet (``arguments``: any of them); nothing may be added.
 LACKING: dict[str, set[str]] = {
-    "mpc.Design": {"unit of drive", "unit of move", "unit of price", "unit of terminal", "unit of track"},
-    "mpc.PIController": {"Examples"},
-    "mpc.Spec": {"arguments"},
-    "mpc.closed_loop_figure": {"Examples"},
-    "mpc.default_design": {"Examples", "Raises"},
-    "mpc.design_controller": {"Examples"},
-    "mpc.read_spec": {"Examples", "Returns", "argument path"},
-    "mpc.simulate_closed_loop": {"Examples"},
-    "mpc.tune": {"Examples"},
-    "mpc.Controller.load": {"Examples", "Raises", "Returns"},
-    "mpc.Controller.reset": {"Examples", "argument reading"},
-    "mpc.Controller.step": {"Examples"},
 }
 
 

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.schema import Log, column, make_log, names
-from thermogrip.mpc.interface import Controller, Move, Readings, Target
+from thermogrip.mpc.interface import Controller, Move, Readings, Regulator, Target
 from thermogrip.mpc.plant.prediction import PredictionModel
 
 if TYPE_CHECKING:
@@ -154,7 +154,7 @@ class ClosedLoop:
 
 
 def simulate_closed_loop(
-    controller: Controller,
+    controller: Regulator,
     plant: Plant,
     schedule: Sequence[tuple[Target, float]],
     *,
@@ -167,7 +167,7 @@ def simulate_closed_loop(
 
     Parameters
     ----------
-    controller : Controller
+    controller : Regulator
         It is reset first.
     plant : Plant
         The truth; a draw of the controller's plant, or another plant of the same signals.
@@ -184,10 +184,21 @@ def simulate_closed_loop(
     Returns
     -------
     ClosedLoop
+
+    Examples
+    --------
+    >>> from thermogrip.sysid import Plant, load_network
+    >>> kit = load_network("tclab")
+    >>> p, heaters = dict(zip(kit.parameters, kit.prior)), dict.fromkeys(kit.inputs, (0.0, 100.0))
+    >>> plant = Plant(kit, p, dt=kit.dt, units=kit.units, valid=heaters)
+    >>> from thermogrip.mpc import design_controller
+    >>> run = simulate_closed_loop(design_controller(plant, dt=5.0), plant, [(40.0, 300.0)])
+    >>> [(segment.output, segment.settle_s) for segment in run.segments]
+    [('t1', 64.0), ('t2', 75.0)]
     """
     around = Surroundings() if surroundings is None else surroundings
     truth = Truth(plant, controller.dt, around, start, seed)
-    controlled = tuple(getattr(controller, "controlled", ("t_surface",)))
+    controlled = tuple(controller.controlled)
     controller.reset(truth.reading())
     targets: list[dict[str, float]] = []
     readings: list[dict[str, float]] = []

@@ -49,17 +49,10 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc.controllers.pi import (
-    STALE,
-    as_drive,
-    clean,
-    held_drive,
-    held_move,
-    read_target,
-    unseen_advice,
-)
+from thermogrip.mpc.controllers.base import SampledController
+from thermogrip.mpc.controllers.pi import held_drive
 from thermogrip.mpc.design.design import Design
-from thermogrip.mpc.estimator.call_times import RESTART_S, SAME, CallTimes, opening
+from thermogrip.mpc.estimator.call_times import RESTART_S, opening
 from thermogrip.mpc.estimator.observer import Observer, choose_disturbances
 from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.mpc.plant.prediction import PredictionModel, prediction_model
@@ -110,7 +103,7 @@ class _Law:
     live: list[int]
 
 
-class LQRController:
+class LQRController(SampledController):
     """Linear-quadratic regulator behind the interface of every controller."""
 
     def __init__(
@@ -121,36 +114,23 @@ class LQRController:
         observer: Observer | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        self.design, self.controlled = design, design.controlled
-        self.model: PredictionModel = prediction_model(plant, design.dt)
+        model = prediction_model(plant, design.dt)
+        slew = design.dt * np.array([design.slew_per_s[name] for name in model.drives])
+        super().__init__(model, design.controlled, design.drive_range, slew, design.patience_s, clock)
+        self.design = design
         if observer is None:
             count = None if design.offset_free else 0
-            disturbances = choose_disturbances(
-                self.model, design.controlled, ambient=design.ambient, count=count
-            )
-            observer = Observer(self.model, disturbances, design.noise, ambient=design.ambient)
+            disturbances = choose_disturbances(model, design.controlled, ambient=design.ambient, count=count)
+            observer = Observer(model, disturbances, design.noise, ambient=design.ambient)
         self.observer = observer
-        self._rows = [self.model.outputs.index(name) for name in design.controlled]
-        ranges = np.array([design.drive_range[name] for name in self.model.drives], dtype=float)
-        self.lowest, self.highest = ranges.T
-        self.slew = design.dt * np.array([design.slew_per_s[name] for name in self.model.drives])
-        self._neutral = np.clip(np.zeros(self.model.n_u), self.lowest, self.highest)
-        self._clock = clock
         self._laws: dict[tuple[float, ...], _Law | None] = {}
-        self._times = CallTimes(self.model.dt)
-        self._move = Move(as_drive(self.model.drives, self._neutral))
         self._pair = [
-            (self.model.drives.index(loop.drive), self.controlled.index(loop.output))
+            (model.drives.index(loop.drive), self.controlled.index(loop.output))
             for loop in design.loops
             if loop.output in self.controlled
         ]
         self._resting = self._rest_law()
         self.reset({})
-
-    @property
-    def dt(self) -> float:
-        """Sample time [s]."""
-        return self.model.dt
 
     def reset(self, reading: Readings) -> None:
         """Forget the past; the plant is at rest at this reading."""
@@ -160,45 +140,37 @@ class LQRController:
         self._u = self._neutral.copy()
         self._target = np.full(len(self._rows), np.nan)
         self._fresh = True
-        self._unread_s = np.zeros(len(self._rows))  # since each controlled output was read
-        self._times.reset()
+        self._unread_s = np.zeros(len(self._rows))
+        self.times.reset()
 
     def step(self, reading: Readings, target: Target) -> Move:
         """Return the move for this sample; a lost reading is predicted for ``patience_s``."""
-        started = self._clock()
-        self._times.call(reading)
+        started = self.clock()
+        self.times.call(reading)
         if not self._fresh:
-            self.observer.advance(min(self._times.seconds, RESTART_S + self.dt), self._u, self._d)
-        if not self._times.due:
-            return held_move(self._move, self._clock() - started)
+            self.observer.advance(min(self.times.seconds, RESTART_S + self.dt), self._u, self._d)
+        if not self.times.due:
+            return self._held_move(started)
         self.observer.look(self._d)
-        wanted, said = read_target(target, self.controlled, self._target)
-        self._target = wanted
-        y, d = self._read(reading)
-        if self._times.stale:
-            y, said = np.full(len(y), np.nan), said or STALE
+        y, d, wanted, said = self._given(reading, target)
         self._fresh = False
         self._d = np.where(np.isfinite(d), d, self._d)
-        if self._times.seconds > RESTART_S + self.dt and np.isfinite(y).any():
+        if self.times.seconds > RESTART_S + self.dt and np.isfinite(y).any():
             self.observer.reset(y, self._d)  # the past is unknown
         self.observer.update(y)
-        passed = self._times.slew_s
+        passed = self.times.slew_s
         seen = np.isfinite(y[self._rows])
-        self._unread_s = np.where(seen, 0.0, self._unread_s + self._times.waited_s)
+        self._unread_s = np.where(seen, 0.0, self._unread_s + self.times.waited_s)
         lost = self._lost
         if lost.all() or not np.isfinite(wanted).all():
             u, status, said = self._neutral, "off", said or "reading lost: drive to zero"
         else:
             u, status = self.propose(wanted, passed / self.dt), "ok" if seen.all() else "fallback_plan"
             if seen.any() and not seen.all():
-                parked = [self.model.drives[j] for j in self._parked(lost)]
-                said = said or unseen_advice(self.controlled, self._unread_s, lost, parked)
+                said = said or self._unseen([self.model.drives[j] for j in self._parked(lost)])
             said = said or ("" if seen.all() else "reading lost: the state is predicted")
-        self._u = self._limited(u, passed)
-        self._times.moved()
-        pump = 0 if status == "off" and not np.any(self._u) else 1
-        self._move = Move(as_drive(self.model.drives, self._u), pump, status, said, self._clock() - started)
-        return self._move
+        self._u = self._within(u, passed)
+        return self._answer(status, said, started)
 
     def propose(self, target: Array, samples: float = 1.0) -> Array:
         """Return the drives (n_u,) before their limits for targets (n_controlled,) [degC]: their mean over
@@ -225,23 +197,9 @@ class LQRController:
         proposed[live] = opening(np.stack(moves), samples)
         return proposed
 
-    @property
-    def _lost(self) -> NDArray[np.bool_]:
-        """Which controlled outputs have not been read for longer than patience."""
-        return np.asarray(self._unread_s > self.design.patience_s * (1 + SAME))
-
     def _parked(self, lost: NDArray[np.bool_]) -> list[int]:
         """Return the drives whose loops are lost."""
         return [drive for drive, output in self._pair if lost[output]]
-
-    def _limited(self, u: Array, seconds: float) -> Array:
-        u = np.where(np.isfinite(u), u, self._neutral)
-        slew = self.slew * (seconds / self.dt)
-        return np.clip(np.clip(u, self._u - slew, self._u + slew), self.lowest, self.highest)
-
-    def _read(self, reading: Readings) -> tuple[Array, Array]:
-        y = np.array([clean(reading, name) for name in self.model.outputs])
-        return y, np.array([clean(reading, name) for name in self.model.disturbances])
 
     def _law(self, target: Array) -> _Law | None:
         """Return the law about a target, worked out once for it, half a degree of room and what is lost."""

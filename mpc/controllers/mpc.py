@@ -39,18 +39,11 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.controllers.base import STALE, SampledController
 from thermogrip.mpc.controllers.linear_equivalent import to_control
-from thermogrip.mpc.controllers.pi import (
-    STALE,
-    PIController,
-    as_drive,
-    clean,
-    held_move,
-    read_target,
-    unseen_advice,
-)
+from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import SCHEMA, VERSION, Design, check_design, default_design
-from thermogrip.mpc.estimator.call_times import RESTART_S, SAME, CallTimes, opening, shifted
+from thermogrip.mpc.estimator.call_times import RESTART_S, opening, shifted
 from thermogrip.mpc.estimator.observer import Observer, choose_disturbances
 from thermogrip.mpc.estimator.reading_checks import ReadingMonitor, follows, stands
 from thermogrip.mpc.interface import Move, Readings, Target, number
@@ -69,7 +62,7 @@ _KEPT_DRAWS = 50  # of the posterior, carried in the controller's file for its r
 _WEAK = 0.05  # of its gain at rest, below which a drive's bias is not learnt
 
 
-class Controller:
+class Controller(SampledController):
     """Model-predictive controller of a plant.
 
     Parameters
@@ -110,11 +103,11 @@ class Controller:
         clock: Callable[[], float] = time.perf_counter,
         compiled: bool = False,
     ) -> None:
-        self.plant = plant
-        self.design = default_design(plant) if design is None else check_design(design, plant)
-        self.notes = dict(notes or {})
-        design = self.design
-        self.model = prediction_model(plant, design.dt)
+        design = default_design(plant) if design is None else check_design(design, plant)
+        model = prediction_model(plant, design.dt)
+        slew = design.dt * np.array([design.slew_per_s[name] for name in model.drives])
+        super().__init__(model, design.controlled, design.drive_range, slew, design.patience_s, clock)
+        self.plant, self.design, self.notes = plant, design, dict(notes or {})
         self.disturbance = choose_disturbances(
             self.model, design.controlled, ambient=design.ambient, count=None if design.offset_free else 0
         )
@@ -134,17 +127,10 @@ class Controller:
         )
         self.monitor = ReadingMonitor(self.model.n_y)
         self.reach = Reach(self.optimiser, self.observer)
-        self.times = CallTimes(self.model.dt)
-        self.clock = clock
         self.last_iterations = 0  # of the program, in the last step
-        self._move: Move
         self._slew_s = self.dt  # for which the slew limit counts in this step
-        self._u: Array
         self._in_force: Array
-        self._target: Array
         self._plan: Array | None  # (N, n_u), as it was made ``_age_s`` ago
-        self._rows = [self.model.outputs.index(name) for name in design.controlled]
-        self._neutral = self.optimiser.neutral
         self._start(np.full(self.model.n_y, np.nan), np.full(self.model.n_d, design.ambient))
 
     def _compile(self) -> None:
@@ -153,16 +139,6 @@ class Controller:
         self.c = CompiledController(self)
         self.optimiser = CompiledOptimiser(self.optimiser, self.c)
         self.observer = CompiledObserver(self.observer, self.c)
-
-    @property
-    def dt(self) -> float:
-        """Sample time [s]."""
-        return self.model.dt
-
-    @property
-    def controlled(self) -> tuple[str, ...]:
-        """Outputs with a target."""
-        return self.design.controlled
 
     @property
     def plan(self) -> Array | None:
@@ -180,13 +156,34 @@ class Controller:
 
     @classmethod
     def load(cls, path: str | Path, *, model: Model | None = None) -> Controller:
-        """Read a controller that :meth:`save` wrote; anything else is a :class:`UserError`.
+        """Read a controller that :meth:`save` wrote.
 
         Parameters
         ----------
         path : str or Path
         model : Model, optional
-            The equations of its plant, where they are a class of the user's own; otherwise not looked at.
+            The equations of its plant, where they are a class of the user's own; ignored otherwise.
+
+        Returns
+        -------
+        Controller
+
+        Raises
+        ------
+        UserError
+            If the file is absent, is no controller, or its numbers make none.
+
+        Examples
+        --------
+        >>> from thermogrip.sysid import Plant, load_network
+        >>> kit = load_network("tclab")
+        >>> p, heaters = dict(zip(kit.parameters, kit.prior)), dict.fromkeys(kit.inputs, (0.0, 100.0))
+        >>> plant = Plant(kit, p, dt=kit.dt, units=kit.units, valid=heaters)
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     path = design_controller(plant, dt=5.0).save(f"{folder}/controller.json")
+        ...     Controller.load(path).dt
+        5.0
         """
         from thermogrip.sysid.plant.plant import Plant
 
@@ -215,7 +212,24 @@ class Controller:
         return to_control(self)
 
     def reset(self, reading: Readings) -> None:
-        """Forget the past; the plant is at rest at this reading, its drive at zero."""
+        """Forget the past; the plant is at rest at this reading, its drive at zero.
+
+        Parameters
+        ----------
+        reading : mapping of str to float
+            As for :meth:`step`.
+
+        Examples
+        --------
+        >>> from thermogrip.sysid import Plant, load_network
+        >>> kit = load_network("tclab")
+        >>> p, heaters = dict(zip(kit.parameters, kit.prior)), dict.fromkeys(kit.inputs, (0.0, 100.0))
+        >>> plant = Plant(kit, p, dt=kit.dt, units=kit.units, valid=heaters)
+        >>> controller = design_controller(plant, dt=5.0)
+        >>> controller.reset({"t1": 30.0, "t2": 30.0})
+        >>> controller.observer.reading().round(3)
+        array([30., 30.])
+        """
         self._start(*self._read(reading))
         self.pi.reset(reading)
         self.times.reset()
@@ -236,6 +250,18 @@ class Controller:
         Returns
         -------
         Move
+
+        Examples
+        --------
+        >>> from thermogrip.sysid import Plant, load_network
+        >>> kit = load_network("tclab")
+        >>> p, heaters = dict(zip(kit.parameters, kit.prior)), dict.fromkeys(kit.inputs, (0.0, 100.0))
+        >>> plant = Plant(kit, p, dt=kit.dt, units=kit.units, valid=heaters)
+        >>> controller = design_controller(plant, dt=5.0)
+        >>> controller.reset({"t1": 25.0, "t2": 25.0})
+        >>> move = controller.step({"t1": 25.0, "t2": 25.0}, {"t1": 40.0, "t2": 30.0})
+        >>> move.status, {name: round(value, 1) for name, value in move.drive.items()}
+        ('ok', {'q1': 62.5, 'q2': 62.5})
         """
         started = self.clock()
         self.last_iterations = 0
@@ -247,12 +273,12 @@ class Controller:
         applied = self._applied(reading)
         self._pass(self.times.seconds, applied)
         if not self.times.due:
-            return held_move(self._move, self.clock() - started)
+            return self._held_move(started)
         if self.times.stale:
             y = np.full(self.model.n_y, np.nan)
         said = self._absorb(y, d, applied) or (STALE if self.times.stale else "")
         in_force = self._u.copy()
-        wanted, wrong = read_target(target, self.controlled, self._target)
+        wanted, wrong = self._wanted(target)
         if not np.array_equal(wanted, self._target):
             self._side = self._sides(wanted)
         self._target = wanted
@@ -261,11 +287,10 @@ class Controller:
             advice = said or advice
         if wrong and status == "ok":
             status = "infeasible"
-        self._u = self._within(u)
+        self._u = self._within(u, self._slew_s)
         # where the computer is slow, the drive of now goes on while the new one is worked out
         self._in_force = in_force if self.design.move_delay else self._u
-        self.times.moved()
-        return self._answer(self._u, status, wrong or advice or said, started)
+        return self._answer(status, wrong or advice or said, started, self._predicted())
 
     # ---- one step, in order ----
 
@@ -287,10 +312,6 @@ class Controller:
         self.monitor.forget(y)
         self.reach.forget()
         self.optimiser.forget()
-
-    def _read(self, reading: Readings) -> tuple[Array, Array]:
-        y = np.array([clean(reading, name) for name in self.model.outputs])
-        return y, np.array([clean(reading, name) for name in self.model.disturbances])
 
     def _applied(self, reading: Readings) -> Array:
         given = np.array([number(reading, name) for name in self.model.drives])
@@ -347,15 +368,14 @@ class Controller:
 
     def _pause(self, y: Array, d: Array, target: Target, started: float) -> Move:
         """Take the drive back while nothing carries its heat; the estimate starts again afterwards."""
-        u = self._within(self._neutral)
-        wanted, _ = read_target(target, self.controlled, self._target)
+        u = self._within(self._neutral, self._slew_s)
+        wanted, _ = self._wanted(target)
         self._start(y, np.where(np.isfinite(d), d, self._d))
         self._u = self._in_force = u
         self._target, self._side = wanted, self._sides(wanted)
-        self.times.moved()
         advice = f"{', '.join(self.model.model.switches)} is off: drive to zero until it runs"
         # without a pump that is asked for nobody would switch it on again
-        self._move = replace(self._answer(u, "off", advice, started), pump=1)
+        self._move = replace(self._answer("off", advice, started, self._predicted()), pump=1)
         return self._move
 
     def _first_of(self, plan: Array) -> Array:
@@ -408,7 +428,9 @@ class Controller:
         if self.clock() - started > self.design.deadline_s:
             return u, "late", "the step took longer than its deadline"
         if (self._unread_s > 0).any():
-            return u, "fallback_plan", self._unseen()
+            lost = self._lost
+            parked = [name for name, at in zip(self.model.drives, self.optimiser.pair) if lost[at]]
+            return u, "fallback_plan", self._unseen(parked)
         return u, "ok", follows(self.observer, self.controlled)
 
     def _optimise(self, wanted: Array) -> Outcome:
@@ -441,25 +463,14 @@ class Controller:
         return np.asarray(np.add.reduceat(plan, begins, axis=0) / lengths[:, None])
 
     def _without_readings(self) -> tuple[Array, str, str]:
-        if self._unread_s.min() <= self.design.patience_s * (1 + SAME):
+        if not self._lost.all():
             plan = self._young_plan()
             return self._u if plan is None else self._first_of(plan), "fallback_plan", ""
         self._plan = None
         return self._neutral, "off", f"no reading for {self._unread_s.min():.0f} s: check the sensor"
 
-    @property
-    def _lost(self) -> NDArray[np.bool_]:
-        """Which controlled outputs have not been read for longer than patience."""
-        return np.asarray(self._unread_s > self.design.patience_s * (1 + SAME))
-
-    def _unseen(self) -> str:
-        """Return what becomes of the loops whose sensors are lost while others go on."""
-        lost = self._lost
-        parked = [name for name, at in zip(self.model.drives, self.optimiser.pair) if lost[at]]
-        return unseen_advice(self.controlled, self._unread_s, lost, parked)
-
     def _young_plan(self) -> Array | None:
-        return None if self._on_pi or self._age_s > self.design.patience_s * (1 + SAME) else self.plan
+        return None if self._on_pi or self._age_s > self._patience_s else self.plan
 
     def _fall_back(self, status: str, advice: str) -> tuple[Array, str, str]:
         """Follow the plan while it is young; then PI, then off."""
@@ -476,21 +487,8 @@ class Controller:
         u = self.pi.propose(y, self._target, self._d, seconds=self._slew_s)
         return u, "fallback_pi" if status == "fallback_plan" else status, advice
 
-    def _within(self, u: Array) -> Array:
-        """Return drives that are finite, in range, and within the slew limit; range wins over slew."""
-        u = np.where(np.isfinite(u), u, self._neutral)
-        low, high = self.optimiser.lowest, self.optimiser.highest
-        before = np.clip(self._u, low, high)
-        slew = self.optimiser.slew * (self._slew_s / self.dt)
-        slewed = np.clip(u, before - slew, before + slew)
-        return np.asarray(np.clip(slewed, low, high))
-
-    def _answer(self, u: Array, status: str, advice: str, started: float) -> Move:
-        pump = 0 if status == "off" and not np.any(u) else 1
-        plan = {name: tuple(self._y_plan[:, i].tolist()) for i, name in enumerate(self.model.outputs)}
-        seconds = self.clock() - started
-        self._move = Move(as_drive(self.model.drives, u), pump, status, advice, seconds, plan)
-        return self._move
+    def _predicted(self) -> dict[str, tuple[float, ...]]:
+        return {name: tuple(self._y_plan[:, i].tolist()) for i, name in enumerate(self.model.outputs)}
 
 
 def design_controller(plant: Plant, **changes: Any) -> Controller:
@@ -501,5 +499,19 @@ def design_controller(plant: Plant, **changes: Any) -> Controller:
     plant : Plant
     **changes
         ``controlled``, ``dt``, and any other field of :class:`thermogrip.mpc.design.design.Design`.
+
+    Returns
+    -------
+    Controller
+
+    Examples
+    --------
+    >>> from thermogrip.sysid import Plant, load_network
+    >>> kit = load_network("tclab")
+    >>> p, heaters = dict(zip(kit.parameters, kit.prior)), dict.fromkeys(kit.inputs, (0.0, 100.0))
+    >>> plant = Plant(kit, p, dt=kit.dt, units=kit.units, valid=heaters)
+    >>> controller = design_controller(plant, controlled=("t1",), move=2.0)
+    >>> controller.dt, controller.design.move
+    (2.0, 2.0)
     """
     return Controller(plant, default_design(plant, **changes))

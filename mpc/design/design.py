@@ -178,13 +178,17 @@ class Design:
         Largest change of a drive [units per s]; hard.
     loops : tuple of PILoop
         The PI controller that stands in when the optimiser fails.
-    track, terminal, move, drive : float
-        Weights of the cost.
+    track, terminal : float
+        Weight of the squared error of each sample, and of the last one besides [degC^-2].
+    move, drive : float
+        Weight of the squared change of a drive a block, and of a squared drive a sample, in shares of its
+        range.
     overshoot : float
         Band beyond the target that the prediction keeps out of, on the far side [degC]; soft.
     limits : dict of str to (float, float)
-        Ranges of outputs, e.g. the tank's [degC]; soft, at ``price`` per degC and per degC^2.
+        Ranges of outputs, e.g. the tank's [degC]; soft.
     price : float
+        Weight of what exceeds a soft limit [1/degC], and of its square [degC^-2].
     noise : ObserverNoise
     offset_free : bool
         Whether disturbance states are estimated; without them the loop ends off its target.
@@ -283,6 +287,21 @@ def default_design(
     -------
     Design
         Horizon: eight apparent delays, but no more than the delay and three lags, between 20 and 80 samples.
+
+    Raises
+    ------
+    UserError
+        If an output is none of the plant's, is no temperature, or is moved by no drive, or a field cannot be.
+
+    Examples
+    --------
+    >>> from thermogrip.sysid import Plant, load_network
+    >>> kit = load_network("tclab")
+    >>> p, heaters = dict(zip(kit.parameters, kit.prior)), dict.fromkeys(kit.inputs, (0.0, 100.0))
+    >>> plant = Plant(kit, p, dt=kit.dt, units=kit.units, valid=heaters)
+    >>> design = default_design(plant, controlled=("t1",))
+    >>> design.dt, design.horizon_s, design.blocks
+    (2.0, 86.0, (1, 1, 2, 2, 3, 4, 5, 6, 8, 11))
     """
     controlled = default_controlled(plant) if controlled is None else tuple(controlled)
     for name in controlled:

@@ -65,7 +65,36 @@ Range = tuple[Finite, Finite]
 
 
 class Spec(BaseModel):
-    """What is wanted; the fields are explained in :data:`SPEC_TEMPLATE`.
+    """What is wanted of a controller; the defaults are those of :data:`SPEC_TEMPLATE`.
+
+    Attributes
+    ----------
+    steps : list of (float, float)
+        Start and target of each step that is simulated [degC].
+    settle_within_s, hold_s : float
+        How soon a step must have settled, and how long it is simulated [s].
+    band_degC, overshoot_degC, bias_degC : float
+        Half width of the settling band, and the largest overshoot and mean error at the end [degC].
+    energy_weight : float
+        Seconds of settling that are worth one second at full drive.
+    sample_time_s : float, optional
+        Time between moves [s]; read off the plant where absent, like the next ones.
+    slew_per_s : float or dict of str to float, optional
+        Largest change of a drive [its units per s].
+    drive_limits : (float, float) or dict of str to (float, float), optional
+        Narrower range of a drive, in its units.
+    patience_s : float, optional
+        How long the model replaces a lost reading [s].
+    output : str or list of str, optional
+        What is regulated.
+    ambient_degC, noise_degC, sensor_offset_degC : float
+        Of the simulations: the room, noise of a reading, and by how much sensors are off [degC].
+    search_draws, check_draws : int
+        Draws of the plant in the search and in the final comparison.
+    evaluations : int
+        Designs that the search may try.
+    limits : dict of str to (float, float), optional
+        Soft limits of outputs [degC].
 
     Examples
     --------
@@ -206,10 +235,27 @@ def _limits(spec: Spec, plant: Plant, design: Design) -> dict[str, Range]:
 def read_spec(path: str | Path) -> Spec:
     """Read a spec from a TOML file.
 
+    Parameters
+    ----------
+    path : str or Path
+        A file like :data:`SPEC_TEMPLATE`.
+
+    Returns
+    -------
+    Spec
+
     Raises
     ------
     UserError
         Naming the file and the key that is wrong.
+
+    Examples
+    --------
+    >>> from tempfile import NamedTemporaryFile
+    >>> with NamedTemporaryFile("w", suffix=".toml") as file:
+    ...     _ = file.write("settle_within_s = 200"), file.flush()
+    ...     read_spec(file.name).settle_within_s
+    200.0
     """
     return spec_from_dict(read_toml(path, hint="'init spec' writes one to edit"), file=path)
 

@@ -181,58 +181,34 @@ def initialiser(sizes: Sizes, numbers: dict[str, Any]) -> str:
 def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
     """Return every number of the table for a controller; ``k`` is what ``prepare`` gave."""
     model, design, optimiser = controller.model, controller.design, controller.optimiser
-    observer, disturbance = controller.observer, controller.disturbance
-    loops = design.loops
+    observer, disturbance, loops = controller.observer, controller.disturbance, design.loops
     rest = observer.rest_in_room()
     limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2)
-    return {
+    same_names = (
+        (model, "sub dt span C"),
+        (design, "move_delay blocks track terminal move drive price overshoot patience_s ambient"),
+        (optimiser, "pair strongest seen reach lowest highest slew neutral at_rest"),
+        (observer, "fixed offset R Q P0 R_start"),
+        (disturbance, "on_drive on_disturbance on_output"),
+    )
+    return {name: getattr(part, name) for part, names in same_names for name in names.split()} | {
         "n_b": len(design.blocks),
         "N": sum(design.blocks),
-        "sub": model.sub,
         "n_c": len(design.controlled),
         "n_l": len(design.limits),
         "n_loops": len(loops),
-        "move_delay": design.move_delay,
         "iteration_limit": ITERATION_LIMIT,
-        "blocks": design.blocks,
         "controlled": [model.outputs.index(name) for name in design.controlled],
         "limited": [model.outputs.index(name) for name in design.limits],
         "loop_drive": [model.drives.index(loop.drive) for loop in loops],
         "loop_output": [design.controlled.index(loop.output) for loop in loops],
-        "pair": optimiser.pair,
-        "strongest": optimiser.strongest,
-        "seen": optimiser.seen,
-        "fixed": observer.fixed,
         "switched": bool(model.model.switches),
-        "dt": model.dt,
-        **{
-            name: getattr(design, name)
-            for name in ("track", "terminal", "move", "drive", "price", "overshoot")
-        },
-        "patience_s": design.patience_s,
-        "ambient": design.ambient,
-        "reach": optimiser.reach,
-        "lowest": optimiser.lowest,
-        "highest": optimiser.highest,
-        "span": model.span,
-        "slew": optimiser.slew,
-        "neutral": optimiser.neutral,
         "limit_low": limits[:, 0],
         "limit_high": limits[:, 1],
-        "at_rest": optimiser.at_rest,
         "settled_gain": np.zeros(model.n_u) if optimiser.settled_gain is None else optimiser.settled_gain,
         **{name: [getattr(loop, name) for loop in loops] for name in ("Kc", "Ti", "Tt")},
         "k": k,
-        "C": model.C,
         "y0": model.output(np.zeros(model.n_x)),
-        "on_drive": disturbance.on_drive,
-        "on_disturbance": disturbance.on_disturbance,
-        "on_output": disturbance.on_output,
-        "offset": observer.offset,
-        "R": observer.R,
-        "Q": observer.Q,
-        "P0": observer.P0,
-        "R_start": observer.R_start,
         "rest": rest.x,
         "rest_level": rest.by_level,
         "rest_d": rest.by_d,

@@ -11,7 +11,6 @@ Nothing needs them: without gcc, or with ``THERMOGRIP_COMPILED=0`` in the enviro
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -149,39 +148,6 @@ class CompiledController:
         self.advice = self.library.tg_advice_text(int(what[2])).decode()
         return drive, int(what[0]), int(what[1])
 
-    def ask_late(self, late: Callable[[], bool] | None) -> None:
-        """Let the C ask whether time is up; None: never.  A :meth:`reset` takes it back."""
-        self._late = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)(  # it has to live as long as the state
-            (lambda _: int(late())) if late is not None else 0
-        )
-        self.library.tg_host_late(self.state, self._late)
-
-    def solve_qp(
-        self,
-        H: Array,
-        f: Array,
-        A: Array,
-        lower: Array,
-        upper: Array,
-        *,
-        linear: float,
-        quadratic: float,
-        warm: bool = False,
-    ) -> tuple[Array, str, int]:
-        """Solve one QP by itself; return x (n,), its status and its iterations.
-
-        Its rows are bounds, differences of neighbours (both hard), then the soft rows A (s, n); the bounds of
-        all are (2 n + s,), infinite where there is none.
-        """
-        given = [np.ascontiguousarray(v, float) for v in (H, f, np.clip(lower, -1e30, 1e30))]
-        given += [np.ascontiguousarray(np.clip(upper, -1e30, 1e30)), np.ascontiguousarray(A, float)]
-        x, iterations = np.zeros(len(f)), ctypes.c_int()
-        weights = ctypes.c_double(linear), ctypes.c_double(quadratic)
-        out = _at(x), ctypes.byref(iterations)
-        pointers = [_at(values) for values in given]
-        flag = self.library.tg_host_qp(self.state, len(f), len(A), *pointers, *weights, int(warm), *out)
-        return x, QP_STATUS[flag], iterations.value
-
     def view(self, name: str, shape: tuple[int, ...]) -> NDArray[Any]:
         """Return an array that shares memory with a part of the state: ``x``, ``w``, ``P``,
         ``found_offset``, ``innovation``, ``between`` or ``held``."""
@@ -234,7 +200,6 @@ class CompiledOptimiser(Optimiser):
         self._given = np.zeros(sum(lengths))
         ends = np.cumsum(lengths)
         self._parts = [self._given[end - length : end] for end, length in zip(ends, lengths)]
-        self._parts_but_guess = [part for at, part in enumerate(self._parts[:-1]) if at != 2]
         self._arguments = (
             c.state,
             *(_at(part) for part in self._parts),
@@ -243,10 +208,6 @@ class CompiledOptimiser(Optimiser):
             ctypes.byref(self._iterations),
         )
         self._run = c.library.tg_host_optimise
-        self._drive = np.zeros(n_u)
-        self._replan = c.library.tg_host_replan
-        without_guess = self._arguments[:3] + self._arguments[4:9]
-        self._briefly = (*without_guess, _at(self._drive), ctypes.byref(self._iterations))
 
     def solve(
         self,
@@ -277,14 +238,6 @@ class CompiledOptimiser(Optimiser):
             return Outcome(plan, y, status, {}, iterations, authority)
         broken = self._broken(y) if self._over.value > 0.1 else {}
         return Outcome(self._plan.copy(), y, status, broken, iterations, authority)
-
-    def replan(self, *given: Array | float) -> tuple[Array, str, int]:
-        """Improve the plan of the last call, a sample later, in C; return its first move (n_u,), to be
-        read before the next call, status and iterations.
-        """
-        for part, values in zip(self._parts_but_guess, given, strict=True):
-            part[:] = values
-        return self._drive, QP_STATUS[self._replan(*self._briefly)], self._iterations.value
 
     def forget(self) -> None:
         """Start afresh."""

@@ -277,12 +277,6 @@ class PredictionModel:
         """Return the outputs (n_y,) that the plant settles at under drives u."""
         return self.output(self.steady_state(u, d))
 
-    def dc_gain(self, u: ArrayLike, d: ArrayLike) -> Array:
-        """Return the (n_y, n_u) steady-state gain [degC per unit of drive] around drives u."""
-        u, d = np.asarray(u, float).reshape(self.n_u), np.asarray(d, float)
-        _, A, B, _ = self.linearise(self.steady_state(u, d), u, d)
-        return np.asarray(self.C @ np.linalg.solve(np.eye(self.n_x) - A, B))
-
     def room(self, d: ArrayLike) -> float:
         """Return the room's temperature [degC] as the measured disturbances give it, 25 where they do not."""
         d = np.asarray(d, float).reshape(-1)

@@ -51,6 +51,17 @@ def closed_loop_figure(
     figure : matplotlib.figure.Figure
         Made without ``pyplot``: no window system is asked for.  Any status but ``ok`` is a cross on the
         drive.
+
+    Examples
+    --------
+    >>> from thermogrip.sysid import Plant, load_network
+    >>> kit = load_network("tclab")
+    >>> p, heaters = dict(zip(kit.parameters, kit.prior)), dict.fromkeys(kit.inputs, (0.0, 100.0))
+    >>> plant = Plant(kit, p, dt=kit.dt, units=kit.units, valid=heaters)
+    >>> from thermogrip.mpc import design_controller, simulate_closed_loop
+    >>> run = simulate_closed_loop(design_controller(plant, dt=5.0), plant, [(40.0, 300.0)])
+    >>> [axis.get_ylabel() for axis in closed_loop_figure(run).axes]
+    ['regulated [degC]', 'drive']
     """
     others = [name for name in run.outputs if name not in run.target]
     heights = [2.4, *([1.3] if others else []), 1.0, *([0.8] if slew_per_s else [])]

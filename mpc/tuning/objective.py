@@ -35,7 +35,7 @@ from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import Design, make_blocks
 from thermogrip.mpc.design.simc import PILoop
 from thermogrip.mpc.design.spec import Spec
-from thermogrip.mpc.interface import Controller as AnyController
+from thermogrip.mpc.interface import Regulator
 from thermogrip.mpc.native.build import wanted
 from thermogrip.mpc.tuning.minimum_time import full_drive_bound
 
@@ -75,7 +75,7 @@ def surroundings_of(spec: Spec, controlled: Sequence[str], disturbances: Sequenc
 
 
 def trial(
-    controller: AnyController,
+    controller: Regulator,
     plant: Plant,
     spec: Spec,
     step: tuple[float, float],
@@ -87,21 +87,21 @@ def trial(
     in C where the controller is in C.
     """
     loop: Callable[..., ClosedLoop] = simulate_closed_loop
-    if getattr(controller, "c", None) is not None:
+    if isinstance(controller, Controller) and controller.c is not None:
         from thermogrip.mpc.closed_loop.simulate_native import compiled_loop as loop
     return loop(
         controller,
         plant.draw(draw),
         [(step[1], length_s)],
         start=step[0],
-        surroundings=surroundings_of(spec, tuple(getattr(controller, "controlled", ())), plant.disturbances),
+        surroundings=surroundings_of(spec, controller.controlled, plant.disturbances),
         band=spec.band_degC,
         seed=1000 * seed + draw,
     )
 
 
 def run_trials(
-    controller: AnyController,
+    controller: Regulator,
     plant: Plant,
     spec: Spec,
     draws: Sequence[int],
@@ -268,32 +268,33 @@ class Search:
             drive_range=_capped(base.drive_range, parameters.get("drive_share", 1.0)),
         )
 
-    def evaluate(self, parameters: dict[str, float]) -> Trial:
-        """Return the trial of an MPC."""
-        return self._trial("MPC", parameters, self._controller(self.design(parameters)), self.lengths)
+    def evaluate(
+        self, parameters: dict[str, float], name: str = "MPC", lengths: Sequence[float] | None = None
+    ) -> Trial:
+        """Return the trial of an ``"MPC"``, ``"PI"`` or ``"LQR"``; ``lengths`` are seconds by step."""
+        if name == "PI":
+            controller: Regulator = self._pi(scaled_loops(self.baseline.loops, parameters))
+        else:
+            controller = self.made(name, self.design(parameters))
+        if lengths is None:
+            lengths = self.pi_lengths if name == "PI" else self.lengths
+        results = run_trials(controller, self.plant, self.spec, self.draws, lengths=lengths, seed=self.seed)
+        return Trial(
+            controller=name,
+            parameters=dict(parameters),
+            score=score(results, self.spec, self.bounds),
+            settle_s=float(np.mean([result.settle_s for result in results])),
+            overshoot=max(result.overshoot for result in results),
+            energy_s=float(np.mean([result.energy_s for result in results])),
+        )
 
     def evaluate_at_length(self, item: tuple[str, dict[str, float]]) -> Trial:
-        """Return the trial of an ``"MPC"``, ``"PI"`` or ``"LQR"`` at full length: slow ones settle too."""
+        """Return a trial at full length: slow ones settle too."""
         name, parameters = item
-        loops = scaled_loops(self.baseline.loops, parameters) if name == "PI" else ()
-        made = self.pi(loops) if name == "PI" else self.made(name, self.design(parameters))
-        return self._trial(name, parameters, made, [self.spec.hold_s] * len(self.spec.steps))
+        return self.evaluate(parameters, name, [self.spec.hold_s] * len(self.spec.steps))
 
-    def evaluate_lqr(self, parameters: dict[str, float]) -> Trial:
-        """Return the trial of a linear-quadratic regulator."""
-        return self._trial("LQR", parameters, self.lqr(self.design(parameters)), self.lengths)
-
-    def evaluate_pi(self, factors: dict[str, float]) -> Trial:
-        """Return the trial of a PI controller."""
-        loops = scaled_loops(self.baseline.loops, factors)
-        return self._trial("PI", factors, self.pi(loops), self.pi_lengths)
-
-    def lqr(self, design: Design) -> LQRController:
-        """Return the linear-quadratic regulator of a design, its filter in C where there is a compiler."""
-        return LQRController(self.plant, design, observer=self._controller(design).observer)
-
-    def pi(self, loops: tuple[PILoop, ...]) -> PIController:
-        """Return a PI controller under the same limits."""
+    def _pi(self, loops: tuple[PILoop, ...]) -> PIController:
+        """Return a PI controller under the baseline's limits."""
         base = self.baseline
         return PIController(
             self.plant,
@@ -310,11 +311,17 @@ class Search:
         name, design, draw = item
         return run_trials(self.made(name, design), self.plant, self.spec, [draw], seed=self.check_seed)
 
-    def made(self, name: str, design: Design) -> AnyController:
-        """Return the controller of a design: ``"PI"`` and ``"LQR"`` are such, any other name is an MPC."""
+    def made(self, name: str, design: Design) -> Regulator:
+        """Return the controller of a design: ``"PI"`` and ``"LQR"`` are such, any other name is an MPC.
+
+        Filter and optimiser are in C where there is a compiler.
+        """
         if name == "PI":
-            return self.pi(design.loops)
-        return self.lqr(design) if name == "LQR" else self._controller(design)
+            return self._pi(design.loops)
+        controller = self._controller(design)
+        if name == "LQR":
+            return LQRController(self.plant, design, observer=controller.observer)
+        return controller
 
     def _controller(self, design: Design) -> Controller:
         if self._compiled:
@@ -325,19 +332,6 @@ class Search:
                 warnings.warn(f"trials run in Python, ten times slower: {error}", stacklevel=2)
                 self._compiled = False
         return Controller(self.plant, design)
-
-    def _trial(
-        self, name: str, parameters: dict[str, float], controller: AnyController, lengths: Sequence[float]
-    ) -> Trial:
-        results = run_trials(controller, self.plant, self.spec, self.draws, lengths=lengths, seed=self.seed)
-        return Trial(
-            controller=name,
-            parameters=dict(parameters),
-            score=score(results, self.spec, self.bounds),
-            settle_s=float(np.mean([result.settle_s for result in results])),
-            overshoot=max(result.overshoot for result in results),
-            energy_s=float(np.mean([result.energy_s for result in results])),
-        )
 
 
 def _capped(ranges: dict[str, tuple[float, float]], share: float) -> dict[str, tuple[float, float]]:

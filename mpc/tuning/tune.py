@@ -133,6 +133,18 @@ def tune(
     ------
     UserError
         If the spec does not fit the plant, the plant cannot be controlled, or no target can be reached.
+
+    Examples
+    --------
+    >>> from thermogrip.sysid import Plant, load_network
+    >>> kit = load_network("tclab")
+    >>> p, heaters = dict(zip(kit.parameters, kit.prior)), dict.fromkeys(kit.inputs, (0.0, 100.0))
+    >>> plant = Plant(kit, p, dt=kit.dt, units=kit.units, valid=heaters)
+    >>> from thermogrip.mpc import Spec
+    >>> spec = Spec(steps=[(25.0, 35.0)], sample_time_s=5.0, output="t1", hold_s=200.0, evaluations=3)
+    >>> found = tune(plant, spec)
+    >>> found.verdict, [row.controller for row in found.rows]
+    ('actuator-limited', ['baseline', 'tuned', 'PI', 'LQR'])
     """
     spec = Spec() if spec is None else spec
     baseline = spec.design(plant)
@@ -222,7 +234,7 @@ def _optimise(item: tuple[Search, str, dict[str, float], int, Progress | None]) 
     import nlopt
 
     parameters = {"MPC": MPC_PARAMETERS, "PI": PI_PARAMETERS, "LQR": LQR_PARAMETERS}[name]
-    evaluate = {"MPC": search.evaluate, "PI": search.evaluate_pi, "LQR": search.evaluate_lqr}[name]
+    evaluate = partial(search.evaluate, name=name)
     names = [parameter for parameter, _, _ in parameters]
     low = np.log([small for _, small, _ in parameters])
     high = np.log([large for _, _, large in parameters])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Mapping
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import Design, default_design
 from thermogrip.mpc.interface import STATUSES, Move, Target, number
-from thermogrip.mpc.native.runtime import CompiledController
+from thermogrip.mpc.native.runtime import QP_STATUS, CompiledController
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
@@ -74,6 +75,25 @@ def kit(*, dt: float = 5.0, **changes) -> Controller:
     """Return the controller of two heaters and two sensors in a fan's room: drives in percent."""
     plant = network_plant("tclab", t1=(20.0, 60.0), t2=(20.0, 60.0))
     return Controller(plant, default_design(plant, dt=dt, **changes))
+
+
+def ask_late(c: CompiledController, late: bool) -> None:
+    """Let the C of a controller find at every question that time is up, or never."""
+    c.asked = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)((lambda _: 1) if late else 0)  # lives with c
+    c.library.tg_host_late(c.state, c.asked)
+
+
+def solve_in_c(c: CompiledController, H, f, A, lower, upper, *, linear: float, quadratic: float, warm=False):
+    """Return x (n,), status and iterations of one QP: bounds, differences of neighbours, then soft rows A."""
+    bounds = [np.clip(v, -1e30, 1e30) for v in (lower, upper)]
+    given = [np.ascontiguousarray(v, float) for v in (H, f, *bounds, A)]
+    x, iterations = np.zeros(len(f)), ctypes.c_int()
+    pointers = [ctypes.c_void_p(values.ctypes.data) for values in (*given, x)]
+    weights = ctypes.c_double(linear), ctypes.c_double(quadratic)
+    flag = c.library.tg_host_qp(
+        c.state, len(f), len(A), *pointers[:-1], *weights, int(warm), pointers[-1], ctypes.byref(iterations)
+    )
+    return x, QP_STATUS[flag], iterations.value
 
 
 class InC:

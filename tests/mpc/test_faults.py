@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.mpc.makers import InC
+from tests.mpc.makers import InC, ask_late
 from thermogrip.mpc.closed_loop.simulate import Surroundings, Truth
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.interface import STATUSES, Move
-from thermogrip.mpc.native.runtime import compiler
+from thermogrip.mpc.native.build import compiler
 from thermogrip.mpc.optimiser.rti import Outcome
 from thermogrip.mpc.plant.prediction import PredictionModel
 
@@ -207,11 +207,11 @@ class DriverInC(Driver):
         if what == "solver":
             self.controller.c.design.iteration_limit = -1
         elif what == "clock":
-            self.controller.c.ask_late(lambda: True)
+            ask_late(self.controller.c, True)
 
     def mends(self) -> None:
         self.controller.c.design.iteration_limit = 500
-        self.controller.c.ask_late(None)
+        ask_late(self.controller.c, False)
 
 
 @dataclass

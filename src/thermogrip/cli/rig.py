@@ -163,8 +163,8 @@ def run(
     wanted, grasp = _targets(target), _what_to_grasp(obj, material)
     one_rig(port, twin)
     from thermogrip.classify.decisions.online import session_stop
-    from thermogrip.mpc.closed_loop.session_record import RecordedController
-    from thermogrip.mpc.review.checks import beyond_logs
+    from thermogrip.mpc.closed_loop.simulate import RecordedController
+    from thermogrip.mpc.design_review import beyond_logs
     from thermogrip.report.control import session_sections
     from thermogrip.report.html import write_report
     from thermogrip.rig.clock import ScaledClock

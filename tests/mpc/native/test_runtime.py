@@ -14,7 +14,7 @@ from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.native import build
-from thermogrip.mpc.native.runtime import compiler
+from thermogrip.mpc.native.build import compiler
 from thermogrip.mpc.tuning.objective import Search, parameters_of
 from thermogrip.sysid.plant.plant import Plant
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.mpc.makers import solve_in_c
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import default_design
-from thermogrip.mpc.native.runtime import CompiledController, compiler
+from thermogrip.mpc.native.build import compiler
+from thermogrip.mpc.native.runtime import CompiledController
 from thermogrip.mpc.optimiser.active_set import ActiveSetQP
 from thermogrip.mpc.optimiser.qp import CondensedQP
 
@@ -78,7 +80,7 @@ def test_c_takes_the_same_rows_in_and_out(in_c, seed):
     H, f, A, lower, upper, soft, linear, quadratic = random_problem(seed)
     own = ActiveSetQP(soft=soft, linear=linear, quadratic=quadratic).solve(H, f, A, lower, upper)
     rows = A[2 * f.size :]
-    x, status, iterations = in_c.solve_qp(H, f, rows, lower, upper, linear=linear, quadratic=quadratic)
+    x, status, iterations = solve_in_c(in_c, H, f, rows, lower, upper, linear=linear, quadratic=quadratic)
     assert status == "solved"
     assert iterations == own.iterations
     np.testing.assert_allclose(x, own.x, atol=1e-10)
@@ -89,10 +91,10 @@ def test_c_takes_the_same_rows_in_and_out(in_c, seed):
 def test_c_from_the_last_working_set_finds_the_same_answer(in_c, seed):
     H, f, A, lower, upper, _, linear, quadratic = random_problem(seed)
     rows, weights = A[2 * f.size :], {"linear": linear, "quadratic": quadratic}
-    in_c.solve_qp(H, f, rows, lower, upper, **weights)
+    solve_in_c(in_c, H, f, rows, lower, upper, **weights)
     near = f * 1.01
-    x, status, warm = in_c.solve_qp(H, near, rows, lower, upper, **weights, warm=True)
-    cold, _, iterations = in_c.solve_qp(H, near, rows, lower, upper, **weights)
+    x, status, warm = solve_in_c(in_c, H, near, rows, lower, upper, **weights, warm=True)
+    cold, _, iterations = solve_in_c(in_c, H, near, rows, lower, upper, **weights)
     assert status == "solved"
     assert warm <= iterations
     np.testing.assert_allclose(x, cold, atol=1e-9)
@@ -102,8 +104,8 @@ def test_c_from_the_last_working_set_finds_the_same_answer(in_c, seed):
 def test_c_refuses_what_python_refuses(in_c):
     H, f, A, lower, upper, _, linear, quadratic = random_problem(3)
     rows, weights = A[2 * f.size :], {"linear": linear, "quadratic": quadratic}
-    assert in_c.solve_qp(H, np.nan * f, rows, lower, upper, **weights)[1] == "not finite"
-    assert in_c.solve_qp(-H, f, rows, lower, upper, **weights)[1] == "not convex"
+    assert solve_in_c(in_c, H, np.nan * f, rows, lower, upper, **weights)[1] == "not finite"
+    assert solve_in_c(in_c, -H, f, rows, lower, upper, **weights)[1] == "not convex"
     crossed = upper.copy()
     crossed[0] = lower[0] - 1
-    assert in_c.solve_qp(H, f, rows, lower, crossed, **weights)[1] == "infeasible"
+    assert solve_in_c(in_c, H, f, rows, lower, crossed, **weights)[1] == "infeasible"

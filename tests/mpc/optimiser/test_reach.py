@@ -11,7 +11,7 @@ from thermogrip.mpc.closed_loop.simulate import simulate_closed_loop
 from thermogrip.mpc.closed_loop.simulate_native import compiled_loop
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import default_design
-from thermogrip.mpc.native.runtime import wanted
+from thermogrip.mpc.native.build import wanted
 
 LIMIT = {"t_tank": (8.0, 50.0)}
 LEAKY = {"heat": 0.14, "loss": 1 / 150}  # 45.6 degC at most, and the model expects 102

@@ -8,7 +8,7 @@ import pytest
 from thermogrip.mpc.closed_loop.simulate import Surroundings, simulate_closed_loop
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
 from thermogrip.mpc.design.spec import Spec
-from thermogrip.mpc.native.runtime import wanted
+from thermogrip.mpc.native.build import wanted
 from thermogrip.mpc.tuning.minimum_time import full_drive_bound
 
 OPTIMUM = -0.55  # of the reversing tank, whose range ends at -1

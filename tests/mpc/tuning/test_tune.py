@@ -151,14 +151,9 @@ class Paper:
     def design(self, parameters: dict[str, float]) -> Design:
         return Search.design(self, parameters)  # type: ignore[arg-type]
 
-    def evaluate(self, parameters: dict[str, float]) -> Trial:
-        return self.trial("MPC", parameters, valley(parameters, BEST, 1.0))
-
-    def evaluate_pi(self, parameters: dict[str, float]) -> Trial:
-        return self.trial("PI", parameters, valley(parameters, BEST_PI, 1.5))
-
-    def evaluate_lqr(self, parameters: dict[str, float]) -> Trial:
-        return self.trial("LQR", parameters, valley(parameters, BEST_LQR, 1.2))
+    def evaluate(self, parameters: dict[str, float], name: str = "MPC") -> Trial:
+        best, lowest = {"MPC": (BEST, 1.0), "PI": (BEST_PI, 1.5), "LQR": (BEST_LQR, 1.2)}[name]
+        return self.trial(name, parameters, valley(parameters, best, lowest))
 
     def evaluate_at_length(self, item: tuple[str, dict[str, float]]) -> Trial:
         name, parameters = item

@@ -1,0 +1,147 @@
+"""What the controllers share besides their law: when a move is due, what was read, and what may be applied.
+
+Readings are screened for what cannot be a temperature, the last good target stays in force, and a drive is
+finite, inside its range, and within the slew limit of the one before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from thermogrip.mpc.estimator.call_times import SAME, CallTimes
+from thermogrip.mpc.interface import Move, Readings, Target
+from thermogrip.mpc.plant.prediction import PredictionModel
+
+Array = NDArray[np.float64]
+
+#: Readings outside are a broken wire, not a temperature [degC].
+PLAUSIBLE = (-60.0, 200.0)
+#: What a controller reports of a call that comes before its move is due.
+TOO_EARLY = "called before its sample time: the move is held"
+#: And of a reading that it has seen already.
+STALE = "reading is stale: its time has not moved on"
+
+
+def clean(reading: Readings, name: str) -> float:
+    """Return a plausible temperature [degC] from a reading, NaN where it is missing, no number, or absurd."""
+    value = reading.get(name) if isinstance(reading, Mapping) else None
+    try:
+        number = float(value)  # type: ignore[arg-type]  # None and text end in the except
+    except (TypeError, ValueError):
+        return float("nan")
+    return number if PLAUSIBLE[0] <= number <= PLAUSIBLE[1] else float("nan")
+
+
+class SampledController:
+    """A controller of drives in ``lowest`` to ``highest`` that change by at most ``slew`` a sample (n_u,)."""
+
+    def __init__(
+        self,
+        model: PredictionModel,
+        controlled: tuple[str, ...],
+        drive_range: Mapping[str, tuple[float, float]],
+        slew: Array,
+        patience_s: float,
+        clock: Callable[[], float],
+    ) -> None:
+        self.model, self.controlled, self.slew, self.clock = model, controlled, slew, clock
+        self.lowest, self.highest = np.array([drive_range[name] for name in model.drives], dtype=float).T
+        self.times = CallTimes(model.dt)
+        self._rows = [model.outputs.index(name) for name in controlled]
+        self._patience_s = patience_s * (1 + SAME)
+        self._neutral = np.clip(np.zeros(model.n_u), self.lowest, self.highest)
+        self._u = self._neutral
+        self._target = np.full(len(controlled), np.nan)
+        self._unread_s = np.zeros(len(controlled))  # since each controlled output was read
+        self._move = Move(as_drive(model.drives, self._u))
+
+    @property
+    def dt(self) -> float:
+        """Sample time [s]."""
+        return self.model.dt
+
+    @property
+    def _lost(self) -> NDArray[np.bool_]:
+        """Which controlled outputs have not been read for longer than patience."""
+        return np.asarray(self._unread_s > self._patience_s)
+
+    def _read(self, reading: Readings) -> tuple[Array, Array]:
+        """Return the outputs (n_y,) and disturbances (n_d,) of a reading [degC], NaN where they cannot be."""
+        y = np.array([clean(reading, name) for name in self.model.outputs])
+        return y, np.array([clean(reading, name) for name in self.model.disturbances])
+
+    def _given(self, reading: Readings, target: Target) -> tuple[Array, Array, Array, str]:
+        """Return outputs, disturbances and targets in force [degC], and what is wrong; a stale reading is
+        none.
+        """
+        wanted, wrong = self._wanted(target)
+        self._target = wanted
+        y, d = self._read(reading)
+        if self.times.stale:
+            return np.full(len(y), np.nan), d, wanted, wrong or STALE
+        return y, d, wanted, wrong
+
+    def _wanted(self, target: Target) -> tuple[Array, str]:
+        """Return targets (n_controlled,) [degC] and what was wrong with them; the last good one stays.
+
+        A single number is the target of every controlled output.
+        """
+        controlled = self.controlled
+        if isinstance(target, Mapping):
+            wanted = np.array([clean(target, name) for name in controlled])
+            unknown = [name for name in target if name not in controlled]
+            wrong = f"target names {unknown[0]}, controlled is {', '.join(controlled)}" if unknown else ""
+        else:
+            wanted, wrong = np.full(len(controlled), clean({"": target}, "")), ""
+        lost = ~np.isfinite(wanted)
+        if lost.any():
+            name = controlled[int(np.argmax(lost))]
+            wrong = f"target of {name} is missing or absurd: the last good one stands"
+        return np.where(lost, self._target, wanted), wrong
+
+    def _within(self, u: Array, seconds: float) -> Array:
+        """Return drives (n_u,) that are finite, in range, and within the slew limit of so many seconds; range
+        wins over slew.
+        """
+        before = np.clip(self._u, self.lowest, self.highest)
+        slew = self.slew * (seconds / self.dt)
+        slewed = np.clip(np.where(np.isfinite(u), u, self._neutral), before - slew, before + slew)
+        return np.asarray(np.clip(slewed, self.lowest, self.highest))
+
+    def _answer(
+        self,
+        status: str,
+        advice: str,
+        started: float,
+        plan: dict[str, tuple[float, ...]] | None = None,
+    ) -> Move:
+        """Return the move of the drives in force; without any, the pump may rest."""
+        self.times.moved()
+        pump = 0 if status == "off" and not np.any(self._u) else 1
+        drive, seconds = as_drive(self.model.drives, self._u), self.clock() - started
+        self._move = Move(drive, pump, status, advice, seconds, plan or {})
+        return self._move
+
+    def _held_move(self, started: float) -> Move:
+        """Return the last move again, for a call before the next one is due; its advice stays."""
+        return replace(self._move, advice=self._move.advice or TOO_EARLY, seconds=self.clock() - started)
+
+    def _unseen(self, parked: list[str]) -> str:
+        """Return what becomes of the loops whose sensors are lost while others go on."""
+        lost = self._lost
+        if not lost.any():
+            names = [name for name, seconds in zip(self.controlled, self._unread_s) if seconds]
+            return f"{', '.join(names)}: no usable reading, the model stands in"
+        names = [name for name, gone in zip(self.controlled, lost) if gone]
+        rest = f"{', '.join(parked)} to rest, the others go on" if parked else "the others go on"
+        return f"no reading of {', '.join(names)} for {self._unread_s.max():.0f} s: {rest}"
+
+
+def as_drive(drives: tuple[str, ...], u: ArrayLike) -> float | dict[str, float]:
+    """Return drives as a move has them: a number where there is one, else by name."""
+    values = np.asarray(u, dtype=float).tolist()
+    return float(values[0]) if len(drives) == 1 else dict(zip(drives, values))
