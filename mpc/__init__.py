@@ -17,45 +17,24 @@ if TYPE_CHECKING:
     from thermogrip.mpc.tuning.tune import Tuning, tune
 
 # Loaded at first use: importing the room must not cost what its heaviest module costs.
-_HOME = {
-    "Check": "design_review",
-    "ClosedLoop": "closed_loop.simulate",
-    "Controller": "controllers.mpc",
-    "Design": "design.design",
-    "Move": "interface",
-    "PIController": "controllers.pi",
-    "SPEC_TEMPLATE": "design.spec",
-    "Spec": "design.spec",
-    "Surroundings": "closed_loop.simulate",
-    "Tuning": "tuning.tune",
-    "closed_loop_figure": "tuning.figures",
-    "default_design": "design.design",
-    "design_controller": "controllers.mpc",
-    "read_spec": "design.spec",
-    "review": "design_review",
-    "simulate_closed_loop": "closed_loop.simulate",
-    "tune": "tuning.tune",
+_MODULES = {
+    "closed_loop.simulate": ("ClosedLoop", "Surroundings", "simulate_closed_loop"),
+    "controllers.mpc": ("Controller", "design_controller"),
+    "controllers.pi": ("PIController",),
+    "design.design": ("Design", "default_design"),
+    "design.spec": ("SPEC_TEMPLATE", "Spec", "read_spec"),
+    "design_review": ("Check", "review"),
+    "interface": ("Move",),
+    "tuning.figures": ("closed_loop_figure",),
+    "tuning.tune": ("Tuning", "tune"),
 }
+_HOME = {name: module for module, names in _MODULES.items() for name in names}
 
 __all__ = [
-    "SPEC_TEMPLATE",
-    "Check",
-    "ClosedLoop",
-    "Controller",
-    "Design",
-    "Move",
-    "PIController",
-    "Spec",
-    "Surroundings",
-    "Tuning",
-    "closed_loop_figure",
-    "default_design",
-    "design_controller",
-    "read_spec",
-    "review",
-    "simulate_closed_loop",
-    "tune",
-]
+    "SPEC_TEMPLATE", "Check", "ClosedLoop", "Controller", "Design", "Move", "PIController", "Spec",
+    "Surroundings", "Tuning", "closed_loop_figure", "default_design", "design_controller", "read_spec",
+    "review", "simulate_closed_loop", "tune",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

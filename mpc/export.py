@@ -186,7 +186,7 @@ def check_export(
 
 
 class _Clock:
-    """A clock that stands, or runs by a minute at every call."""
+    """A clock that does not move, or by a minute at every call."""
 
     def __init__(self) -> None:
         self.now, self.step = 0.0, 0.0
@@ -200,13 +200,13 @@ class _Clock:
 class _State:
     """A controller in the middle of things, and the sample that it is given."""
 
-    x: Array
+    x: Array  # the estimate
     w: Array
-    d: Array
+    d: Array  # disturbances of the last sample, drives in force, and the plan (N, n_u) that it left, if any
     u: Array
     plan: Array | None
     plan_text: Array
-    target: Array
+    target: Array  # of the last sample
     side: Array
     y: Array
     d_now: Array
@@ -238,20 +238,14 @@ class _Twin(Controller):
             return self._rests[-1]
         return self._rests[rng.integers(_RESTS)]
 
-    def place(
-        self, *, x: Array, w: Array, d: Array, u: Array, plan: Array | None, target: Array, side: Array
-    ) -> None:
-        """Put the loop into the middle of things; what is not named is as after a reset.
-
-        Disturbances d and targets are those of the last sample, the plan (N, n_u) is what it left or None,
-        u are the drives in force.
-        """
-        self._start(np.full(self.model.n_y, self.design.ambient), np.asarray(d, float))
+    def place(self, state: _State) -> None:
+        """Put the loop into the middle of things; what is not named there is as after a reset."""
+        self._start(np.full(self.model.n_y, self.design.ambient), state.d)
         self.observer.found_offset = np.zeros(self.model.n_y)
-        self.observer.x, self.observer.w = np.array(x, float), np.array(w, float)
-        self._u = self._in_force = np.array(u, float)
-        self._plan = None if plan is None else np.array(plan, float)
-        self._target, self._side, self._fresh = np.array(target, float), np.array(side, float), False
+        self.observer.x, self.observer.w = state.x.copy(), state.w.copy()
+        self._u = self._in_force = state.u.copy()
+        self._plan = None if state.plan is None else state.plan.copy()
+        self._target, self._side, self._fresh = state.target.copy(), state.side.copy(), False
 
 
 def _twin(controller: Controller) -> _Twin:
@@ -280,8 +274,8 @@ def _random_state(twin: _Twin, rng: np.random.Generator) -> _State:
     u = twin.optimiser.neutral + share * (u - twin.optimiser.neutral)
     u = u + (rng.random() < 0.02) * 0.1 * span  # now and then out of range
     N = sum(design.blocks)
-    walk = u + np.cumsum(0.05 * span * rng.normal(size=(N, model.n_u)), axis=0)
-    plan = np.clip(walk, twin.optimiser.lowest, twin.optimiser.highest)
+    drift = u + np.cumsum(0.05 * span * rng.normal(size=(N, model.n_u)), axis=0)
+    plan = np.clip(drift, twin.optimiser.lowest, twin.optimiser.highest)
     # near what is expected of this sample, or the reading would be left out as a jump and nothing be solved
     chosen = twin.disturbance
     after = model.next_state(x, u + chosen.on_drive @ w * model.span, room + chosen.on_disturbance @ w)
@@ -312,9 +306,7 @@ def _compare(twin: _Twin, state: _State, answer: list[str]) -> tuple[float, bool
     clock = twin.clock
     if isinstance(clock, _Clock):
         clock.step = 60.0 if state.late else 0.0
-    twin.place(
-        x=state.x, w=state.w, d=state.d, u=state.u, plan=state.plan, target=state.target, side=state.side
-    )
+    twin.place(state)
     reading = dict(zip(model.outputs, state.y.tolist()))
     reading |= dict(zip(model.disturbances, state.d_now.tolist()))
     move = twin.step(reading, dict(zip(twin.controlled, state.wanted.tolist())))
@@ -370,7 +362,7 @@ def _make(folder: Path, *targets: str) -> None:
     except FileNotFoundError:
         raise UserError("no make here to build the export with", hint="install make") from None
     if done.returncode:
-        problem = done.stderr.strip().splitlines()[0] if done.stderr.strip() else "it says nothing"
+        problem = done.stderr.strip().splitlines()[0] if done.stderr.strip() else "without a message"
         raise UserError(f"the export does not build: {problem}", file=folder, hint="report it: it must")
 
 

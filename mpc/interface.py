@@ -1,4 +1,4 @@
-"""What every controller looks like from outside: readings in, one Move out.
+"""The interface of every controller: readings in, one Move out.
 
 This module imports nothing heavy, so that the PI baseline, a session and a robot's loop can share it.
 """

@@ -48,7 +48,7 @@ def linear_move(
     """Return H of the QP, and the plan's gains on the free response and on the drive before.
 
     They are those of :meth:`thermogrip.mpc.optimiser.rti.Optimiser.linear_gains`, linearised where the plant
-    settles without drive, or where it rests if it settles nowhere; ``optimiser`` stands in for the
+    settles without drive, or where it rests if it settles nowhere; by default the optimiser is the
     controller's own.
     """
     model, design = controller.model, controller.design

@@ -24,7 +24,7 @@ so nothing winds up; but the regulator does not know of the limits when it decid
 It does not know either that a Peltier element has an optimum: sent beyond it, more cooling current heats, and
 a gain of fixed sign asks for still more.
 
-**A lost sensor.**  The model stands in for its reading, for ``patience_s``.  Then the drive of its loop goes
+**A lost sensor.**  The model replaces its reading, for ``patience_s``.  Then the drive of its loop goes
 to rest, and the law for the other drives and outputs goes on.
 
 **Time.**  Called late, it will be called late again: then the drive is the mean of the moves that the law

@@ -1,6 +1,6 @@
 r"""The model-predictive controller as a loop sees it: a reading in, one move out, always.
 
-Each sample: carry the estimate on under the drive that was applied, correct it with the reading, improve
+Each sample: advance the estimate under the drive that was applied, correct it with the reading, improve
 the plan (:mod:`thermogrip.mpc.optimiser.rti`), answer with its first move.  The reading of a lost sensor is
 left out; the room's temperature is fed forward as measured.
 
@@ -14,8 +14,8 @@ A loop must never be left without an answer, so every failure has a next best on
   several controlled outputs one may be lost: the optimiser goes on, for ``patience_s`` with the model in
   place of the reading, then without that output, and the drive that is there for it goes to rest;
 * ``fallback_pi``: the plan has run out; PI on the reading, taken over without a bump (and without
-  feed-forward: what is taken over stands for it);
-* ``off``: no reading to act on, or the pump stands; the drive goes to zero.
+  feed-forward: the drive that is taken over has it);
+* ``off``: no reading to act on, or the pump is off; the drive goes to zero.
 
 Whatever the status, a drive is finite, inside its range, and within the slew limit of the one before.  What
 cannot be a reading is found by :mod:`thermogrip.mpc.estimator.reading_checks`.
@@ -45,7 +45,7 @@ from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import SCHEMA, VERSION, Design, check_design, default_design
 from thermogrip.mpc.estimator.call_times import RESTART_S, opening, shifted
 from thermogrip.mpc.estimator.observer import Observer, choose_disturbances
-from thermogrip.mpc.estimator.reading_checks import ReadingMonitor, follows, stands
+from thermogrip.mpc.estimator.reading_checks import ReadingMonitor, follows, is_off
 from thermogrip.mpc.interface import Move, Readings, Target, number
 from thermogrip.mpc.optimiser.reach import Reach
 from thermogrip.mpc.optimiser.rti import Optimiser, Outcome
@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-_KEPT_DRAWS = 50  # of the posterior, carried in the controller's file for its review
+_KEPT_DRAWS = 50  # of the posterior, in the controller's file for its review
 _WEAK = 0.05  # of its gain at rest, below which a drive's bias is not learnt
 
 
@@ -243,7 +243,7 @@ class Controller(SampledController):
             Temperatures by name [degC]; ``time_s`` may be absent, then one sample time has passed.  Before
             its sample time is over a move is held; the seconds count all the same.  A drive's
             own name may stand there too: then that is what was applied, whatever was asked.  So may that of a
-            switch (``"pump": 0``): then nothing carries the heat, and the drive goes to zero until it runs.
+            switch (``"pump": 0``): then no water moves the heat, and the drive goes to zero until it runs.
         target : float or mapping of str to float
             [degC] by output name; a single number is the target of every controlled output.
 
@@ -268,7 +268,7 @@ class Controller(SampledController):
         self.times.call(reading)
         self._slew_s = self.times.slew_s
         y, d = self._read(reading)
-        if stands(self.model.model.switches, reading):
+        if is_off(self.model.model.switches, reading):
             return self._pause(y, d, target, started)
         applied = self._applied(reading)
         self._pass(self.times.seconds, applied)
@@ -367,7 +367,7 @@ class Controller(SampledController):
         return np.where(np.isfinite(wanted), np.sign(wanted - self.observer.reading()[self._rows]), 0.0)
 
     def _pause(self, y: Array, d: Array, target: Target, started: float) -> Move:
-        """Take the drive back while nothing carries its heat; the estimate starts again afterwards."""
+        """Take the drive back while no water moves its heat; the estimate starts again afterwards."""
         u = self._within(self._neutral, self._slew_s)
         wanted, _ = self._wanted(target)
         self._start(y, np.where(np.isfinite(d), d, self._d))

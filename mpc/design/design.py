@@ -177,7 +177,7 @@ class Design:
     slew_per_s : dict of str to float
         Largest change of a drive [units per s]; hard.
     loops : tuple of PILoop
-        The PI controller that stands in when the optimiser fails.
+        The PI controller that takes over when the optimiser fails.
     track, terminal : float
         Weight of the squared error of each sample, and of the last one besides [degC^-2].
     move, drive : float
@@ -200,7 +200,7 @@ class Design:
         Time allowed to a step [s].
     patience_s : float
         How long the plan is followed without a reading, or with a failing solver, before the next fallback
-        [s]; of several controlled outputs, how long the model stands in for one that is lost.
+        [s]; of several controlled outputs, how long the model replaces one that is lost.
     """
 
     dt: float
@@ -225,7 +225,7 @@ class Design:
 
     @property
     def horizon_s(self) -> float:
-        """How far the prediction looks [s]."""
+        """Length of the prediction [s]."""
         return self.dt * sum(self.blocks)
 
     def to_dict(self) -> dict[str, Any]:
@@ -317,14 +317,14 @@ def default_design(
     drives = drive_names(plant)
     ranges = {name: drive_range(plant, name) for name in drives}
     slews = {name: 0.125 * (high - low) for name, (low, high) in ranges.items()}
-    looks = []
+    lengths = []
     for output in controlled:
         answers = [step_response(plant, drive, output) for drive in drives]
         best = max(answers, key=lambda answer: abs(answer.gain))
         if not np.isfinite(best.gain) or best.gain == 0:
             raise _unmoved(plant, output, finite=bool(np.isfinite(best.gain)))
-        looks.append(min(max(8 * best.delay, 20 * dt), best.delay + 3 * best.lag))
-    horizon = int(np.clip(np.ceil(max(looks) / dt), 20, 80))
+        lengths.append(min(max(8 * best.delay, 20 * dt), best.delay + 3 * best.lag))
+    horizon = int(np.clip(np.ceil(max(lengths) / dt), 20, 80))
     values: dict[str, Any] = {
         "dt": dt,
         "controlled": controlled,

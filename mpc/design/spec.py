@@ -36,7 +36,7 @@ energy_weight = 0.0        # seconds of settling that you would give for one sec
 # sample_time_s = 2.0      # by default a quarter of the plant's delay
 # slew_per_s = 0.25        # largest change of a drive [its units per s]; default: an eighth of its range
 # drive_limits = [-1.0, 1.0]      # several drives: drive_limits = { q1 = [0, 100], q2 = [0, 80] }
-# patience_s = 10          # for so long the model stands in for a lost reading, then the drive of that loop
+# patience_s = 10          # for so long the model replaces a lost reading, then the drive of that loop
                            # goes to zero, the others go on; default: five samples, but at least 10 s
 # output = "t_surface"     # what is regulated; several: output = ["t1", "t2"]
 

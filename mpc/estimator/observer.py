@@ -1,7 +1,7 @@
 r"""State and disturbance estimate: an extended Kalman filter that makes regulation free of offset.
 
 The plant never is the model.  What is missing is put into w disturbance states that the model does not
-have, each constant but for a slow random walk, and the controller then drives the *corrected* prediction to
+have, each constant but for slow random noise, and the controller then drives the *corrected* prediction to
 the target:
 
     x+ = f(x, u + W_u w, d + W_d w),     w+ = w + noise,     y = C x + y0 + W_y w + noise.
@@ -18,7 +18,7 @@ that passes, in this order: a bias on each drive (a heat flow that is wrong by a
 controlled outputs (a thermocouple that sits elsewhere), on the other outputs, on the measured disturbances.
 
 The filter uses the Jacobian of the whole sample, delays included, at the current estimate.  A reading that
-is NaN is left out of the update: the prediction stands in for it.  The bias of a drive ends at its whole
+is NaN is left out of the update: the prediction replaces it.  The bias of a drive ends at its whole
 range: what is larger, no drive could make up for.
 Near the optimum of a Peltier element a bias of the drive cannot be seen, and past it, it would be learnt
 with the wrong sign: it is held there.
@@ -28,7 +28,7 @@ Where an output has an offset among the disturbance states, that is where the st
 drift; of the other outputs the start keeps a constant offset.
 
 **Between samples.**  Readings come when they come, and a model whose delays are shift registers can be
-carried on by whole samples alone.  So x stays on a grid of samples, each predicted under the mean of the
+advanced by whole samples alone.  So x stays on a grid of samples, each predicted under the mean of the
 drives that were applied in it, and a reading that comes the share s of a sample after x is one of
 
     x_s = (1 - s) x + s f(x, u, d),     H_s = H ((1 - s) 1 + s F),
@@ -55,7 +55,7 @@ and each reading is off by an offset of its own, b ~ N(0, (0.3 degC)^2).  Linear
 
 and one Kalman update with the readings is the weighted least-squares answer for state, offsets and past drive
 together.  A state that would leave its place by degrees within a sample is not accepted, whatever the sensors
-read: they are off.  What is left open between a state that moves and a sensor that is off stands in the
+read: they are off.  What is left open between a state that moves and a sensor that is off is in the
 covariance, and the next readings decide.  A slow mode moves little wherever it is; what no reading shows of
 it stays within 10 degC of where the plant's own ``rest`` has it at the mean of the readings.
 
@@ -137,7 +137,7 @@ def resting_state_in_room(model: PredictionModel, ambient: float, unit: tuple[fl
     return resting_state(model, x, v, ambient, d, unit=np.array(unit))
 
 
-_REPEATS, _SAME = 5, 1e-3  # of the start on a nonlinear plant, and when it stands still [degC]
+_REPEATS, _SAME = 5, 1e-3  # of the start on a nonlinear plant, and when it is still [degC]
 _REMEMBER = 0.2  # share of the newest innovation in their mean
 #: Of a drive, in fractions of its range: no drive makes up for more.
 LARGEST_BIAS = 1.0
@@ -166,8 +166,8 @@ class ObserverNoise:
     """Noise that the filter assumes, as standard deviations."""
 
     state: float = 0.005  # random heat in the states [degC per sqrt(s)], in units of each state's own swing
-    drive: float = 0.002  # random walk of a drive bias [fraction of its range per sqrt(s)]
-    output: float = 0.002  # random walk of an output bias [degC per sqrt(s)]
+    drive: float = 0.002  # process noise of a drive bias [fraction of its range per sqrt(s)]
+    output: float = 0.002  # process noise of an output bias [degC per sqrt(s)]
     reading: float = 0.05  # of one reading where the plant does not say [degC]
 
 
@@ -286,8 +286,8 @@ class Observer:
         seen = np.sqrt(np.einsum("ij,j,ij->i", model.C, spread**2, model.C)).max()
         self._unit = spread / max(float(seen), 1e-12)
         self.is_drive = disturbance.on_drive.any(axis=0)
-        walk = np.where(self.is_drive, self.noise.drive, self.noise.output)
-        self.Q = np.concatenate([(self.noise.state * self._unit) ** 2, walk**2]) * model.dt
+        noise = np.where(self.is_drive, self.noise.drive, self.noise.output)
+        self.Q = np.concatenate([(self.noise.state * self._unit) ** 2, noise**2]) * model.dt
         self.x = np.zeros(model.n_x)
         self.w = np.zeros(disturbance.n_w)
         self.found_offset = np.zeros(model.n_y)

@@ -15,7 +15,7 @@ mistaken: there the model expects nothing.  (The estimate follows the frozen rea
 what each sample adds is summed, not where the model would have gone by itself.)
 
 **A plant that does not follow.**  The bias that the observer had to assume for the drive is beyond 30 % of
-its range, or that of an output 2 degC: a pump that stands, a plug that has fallen off, another plant.
+its range, or that of an output 2 degC: a pump that is off, a plug that has fallen off, another plant.
 """
 
 from __future__ import annotations
@@ -90,6 +90,6 @@ def follows(observer: Observer, controlled: tuple[str, ...]) -> str:
     return ""
 
 
-def stands(switches: Sequence[str], reading: Mapping[str, float]) -> bool:
+def is_off(switches: Sequence[str], reading: Mapping[str, float]) -> bool:
     """Return whether a reading says that a switch is off that the model has on (the pump)."""
     return any(number(reading, name) < 0.5 for name in switches)

@@ -1,6 +1,6 @@
 r"""The dual active-set method of the exported C, in NumPy: what its iterations are compared with.
 
-The theory stands at the head of ``csource/tg_qp.c``.  Here every factor is made anew at every iteration, by
+The theory is at the head of ``csource/tg_qp.c``.  Here every factor is made anew at every iteration, by
 NumPy; the C updates its own row by row.  Both take the same rows in and out in the same order, so that
 not only their answers but also their iterations must agree.
 """

@@ -50,7 +50,7 @@ _FLAGS = {
 _SOFT = 8  # DAQP's flag of a row that may be broken at a penalty
 _TOLERANCE = 1e-10  # of a scaled row
 _SHORT = 1e-5  # a soft row shorter than this, scaled, cannot be kept by any answer
-_FAR = 1e20  # stands for "no bound"; DAQP takes 1e30 as infinite
+_FAR = 1e20  # means "no bound"; DAQP takes 1e30 as infinite
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,7 @@ _LEAST_SD = 0.05  # degC, of a steady output where no bias is estimated
 _CLIP, _ALLOWANCE, _ALARM = 2.0, 0.5, 3.0  # of Page's test
 _TAKE_BACK = 5  # samples in a row
 _BINS = 12  # of a relaxation's means; when they are full, neighbours are joined
-_STILL = 0.01  # of its range: a drive that moves by less stands still
+_STILL = 0.01  # of its range: a drive that moves by less is still
 _SURE, _KEPT = 3.0, -3.0  # standard deviations of g, to report and to keep
 _CONTRADICTED = 2.0  # sigma that the bias moves while the drives stand still
 

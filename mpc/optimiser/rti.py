@@ -6,7 +6,7 @@ z = v/span. With y(v) ~ y0 + G (v - v0) over the horizon and Delta the differenc
 
     H = 2 ( G'QG + move Delta'Delta + drive L ),    f = 2 ( G'Q (y0 - G v0 - r) - move Delta' e ),
 
-where e carries the drive that is applied now.  Rows: range and slew of each block (hard), the overshoot
+where e has the drive that is applied now.  Rows: range and slew of each block (hard), the overshoot
 band of the controlled outputs and the limits of any output at every sample (soft).
 
 Near the optimum of a Peltier element the linearisation predicts cooling that a whole step does not give,
@@ -20,9 +20,9 @@ A range that ends before the optimum is had whole: its own end is the guard, and
 optimum loses there is a few per cent of its cooling.  One that runs an eighth beyond it, where a runaway
 could, is used to three quarters of the way. (There, 94 % of the cooling is had; and a plant whose optimum
 lies 25 % below the model's is still on the safe side of its own.)  The bias of the drive that the observer
-has found is counted where the gain is looked at, not in the share: it stands for heat, and heat moves no
-optimum.  Where the nonlinear simulation finds the QP's plan worse than the guess, the plan goes only part of
-the way. And since the far side is a trap (there, heating seems to ask for still more cooling current), plain
+has found is counted where the gain is evaluated, not in the share: it is a heat flow, and heat moves no
+optimum.  Where the QP's plan costs more than the guess in the nonlinear simulation, it is taken only part of
+the way.  And since the far side is a trap (there, heating seems to ask for still more cooling current), plain
 ramps that take the drive back, to none and to the other end, are looked at every fifth sample.
 """
 
@@ -191,10 +191,10 @@ class Optimiser:
         """Return the QP's plan, or one that the nonlinear simulation finds better, with its outputs."""
         plans, y = plan[None], predicted(plan[None])
         at_guess, at_plan = merit(np.stack([guess, plan]), np.stack([y_guess, y[0]]))
-        worse = at_plan > at_guess
+        dearer = at_plan > at_guess
         self._solves += 1
-        others = guess + _SHARES[:, None, None] * (plan - guess) if worse else plans[:0]
-        if worse or self._solves % _LOOK_AROUND == 1:
+        others = guess + _SHARES[:, None, None] * (plan - guess) if dearer else plans[:0]
+        if dearer or self._solves % _LOOK_AROUND == 1:
             others = np.concatenate([others, self._park(self._ramps(last, more), last, more)])
         if not len(others):
             return plan, y[0]

@@ -2,8 +2,8 @@ r"""The plant at the controller's sample time: prediction, linearisation along a
 
 A plant is x+ = f(x, u, d; p) at its native step.  A controller moves every dt = n native steps with u
 held, so one sample is f composed n times, or fewer times at a longer step where that changes the prediction
-by less than 0.01 degC.  Delay needs no special case: it stands in the model's states (the water in the
-tubes), and the prediction carries it.
+by less than 0.01 degC.  Delay needs no special case: it is in the model's states (the water in the
+tubes), and so in the prediction.
 
 The optimiser needs the predicted outputs and how they answer to the plan.  With the plan held over blocks,
 u_k = v_b for k in block b, the outputs are linearised **along the predicted trajectory** [1]_:

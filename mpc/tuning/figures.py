@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from thermogrip.mpc.tuning.pareto import Pareto
 
-# after Okabe and Ito: no kind of colour blindness makes two of them one
+# after Okabe and Ito: distinct in every kind of colour vision
 _COLOURS = ("#1f5fa8", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
 _INK, _LINE = "#1d2733", "#9aa7b5"
 _MARKS = {"MPC": "o", "LQR": "s", "PI": "^"}

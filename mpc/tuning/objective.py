@@ -196,6 +196,17 @@ LQR_PARAMETERS = (
 _CHECK_FROM = 100  # draws of the comparison, apart from those of the search
 
 
+class Record:
+    """What is written into a controller's notes."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain JSON, None for what is not finite."""
+        return {
+            key: None if isinstance(value, float) and not np.isfinite(value) else value
+            for key, value in vars(self).items()
+        }
+
+
 @dataclass(frozen=True)
 class Trial:
     """One design that was tried, over all steps and draws."""

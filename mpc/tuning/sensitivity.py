@@ -6,7 +6,7 @@ central difference over a third up and down,
     s = d ln J / d ln k ~ [J(1.3 k) - J(k / 1.3)] / (2 ln(1.3) J(k)),
 
 so s = 0.5 says that one per cent more of the parameter costs half a per cent. Closed-loop cost is not smooth
-(a settling time jumps by samples), so beside s stands what can be trusted: the widest range around k, tried
+(a settling time jumps by samples), so beside s is what can be trusted: the widest range around k, tried
 by factors of 1.3, 3 and 10, over which neither settling, overshoot nor cost moves by more than can be seen.
 """
 
@@ -14,19 +14,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from thermogrip.mpc.tuning.objective import Search, Trial, parameters_of
+from thermogrip.mpc.tuning.objective import Record, Search, Trial, parameters_of
 
 #: What each parameter is to a user.
 PARAMETER_WORDS = {
     "move": "the move weight",
     "terminal": "the terminal weight",
     "overshoot_share": "the band's share of the overshoot",
-    "drive_walk": "the walk of the drive's bias",
-    "output_walk": "the walk of the output's bias",
+    "drive_walk": "the process noise of the drive's bias",
+    "output_walk": "the process noise of the output's bias",
     "horizon": "the horizon",
     "blocks": "the number of blocks",
 }
@@ -37,11 +36,11 @@ _SETTLE, _SHARE, _OVERSHOOT, _COST = 1.0, 0.01, 0.02, 0.01  # s or share of it, 
 
 
 @dataclass(frozen=True)
-class Sensitivity:
+class Sensitivity(Record):
     """What one parameter does."""
 
     knob: str  # the tuning parameter; a key of files
-    value: float  # where it stands
+    value: float  # what it is
     elasticity: float  # of the closed loop's cost, see the module's text
     # mean settling at value / 1.3, at value, at 1.3 value [s]; NaN where it did not settle on all draws
     settle_low_s: float
@@ -52,13 +51,6 @@ class Sensitivity:
     # between these nothing that can be seen changes; both are ``value`` where already 30 % matters
     free_low: float
     free_high: float
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain JSON, None for what is not finite."""
-        return {
-            key: None if isinstance(value, float) and not np.isfinite(value) else value
-            for key, value in vars(self).items()
-        }
 
 
 def sensitivity_of(item: tuple[Search, str, dict[str, float], Trial]) -> Sensitivity:

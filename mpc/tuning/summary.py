@@ -5,7 +5,7 @@
   weights;
 * **improved**: the score fell by more than 3 % against the default design on draws that the search has not
   seen;
-* **flat**: it did not; the default stands.
+* **flat**: it did not; the default is kept.
 
 Whatever the verdict, it reports where a simpler controller, tuned with the same number of trials, is as good.
 """
@@ -14,19 +14,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from thermogrip.mpc.design.spec import Spec
-from thermogrip.mpc.tuning.objective import Bounds, StepResult
+from thermogrip.mpc.tuning.objective import Bounds, Record, StepResult
 
 _WON = 0.03  # relative fall of the score that counts
 _NEAR = 1.25  # settling over bound that counts as the actuator's limit
 
 
 @dataclass(frozen=True)
-class Row:
+class Row(Record):
     """One line of the comparison: a controller on one step, over the draws."""
 
     controller: str  # ``"baseline"``, ``"tuned"``, ``"PI"`` or ``"LQR"``
@@ -43,13 +42,6 @@ class Row:
     travel_mean: float
     full_share: float
     bound_s: float  # before this no drive within the limits is in the band [s], mean over the draws
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain JSON, None for what is not finite."""
-        return {
-            key: None if isinstance(value, float) and not np.isfinite(value) else value
-            for key, value in vars(self).items()
-        }
 
 
 def rows_of(name: str, results: Sequence[StepResult], spec: Spec, bounds: Bounds) -> list[Row]:

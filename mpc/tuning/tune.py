@@ -1,4 +1,4 @@
-r"""Find the weights for what is wanted, and say honestly whether weights were the limit.
+r"""Find the weights for what is wanted, and say whether weights were the limit.
 
 The search varies what a user would have to guess: move suppression, the terminal weight, the overshoot band
 kept free, how fast the observer moves its bias (all as logarithms, by NLopt's subplex, which needs no
@@ -279,7 +279,7 @@ def _conclude(
     kept_rows = [row for row in rows if row.controller == kept]
     verdict, finding = verdict_of(spec, scores, kept_rows, unseen=unseen)
     meets = all(meets_spec(result, spec) for result in results[kept])
-    # the PI found here also stands in when the optimiser fails
+    # the PI found here also takes over when the optimiser fails
     design = replace(candidates[kept], loops=candidates["PI"].loops)
     notes = {
         "verdict": verdict,

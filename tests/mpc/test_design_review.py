@@ -10,7 +10,8 @@ import pytest
 from tests.mpc.makers import network_plant
 from thermogrip.mpc import design_review as checks
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
-from thermogrip.mpc.design.design import default_design, make_blocks
+from thermogrip.mpc.design.design import default_design
+from thermogrip.mpc.design.simc import PILoop
 from thermogrip.mpc.design_review import review, worst
 from thermogrip.mpc.estimator.observer import ObserverNoise
 from thermogrip.mpc.plant.prediction import PredictionModel
@@ -20,7 +21,7 @@ from thermogrip.sysid.plant.plant import Plant
 
 
 def verdicts(controller, **options) -> dict[str, str]:
-    return {check.name: check.verdict for check in review(controller, **options)}
+    return {check.name: check.verdict for check in review(controller, **{"draws": 0} | options)}
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +45,7 @@ def test_every_finding_has_a_number_and_every_fault_a_fix(sound, reversing_tank)
 SIGN, DETECTABLE = "gain keeps its sign over the drive", "disturbances are detectable"
 LIMITS, ROOM = "soft limits agree with the targets", "hard limits leave room"
 HELD, LOGS = "targets can be held in steady state", "targets lie where the logs were"
+FORGETS, STAND_IN = "observer forgets its errors", "a PI controller stands in"
 DEADLINE, PELTIER = "step time fits the sample time", "current stays below the Peltier optimum"
 
 
@@ -60,33 +62,15 @@ DEADLINE, PELTIER = "step time fits the sample time", "current stays below the P
         (LOGS, "warn", "tank", {}, (18.0, 60.0)),
         (DEADLINE, "fail", "tank", {"deadline_s": 1e-7}, None),
         (PELTIER, "pass", "tank", {}, None),  # it has none
+        ("horizon covers delay and lag", "fail", "tank", {"blocks": (1, 1, 1, 1)}, None),
+        (FORGETS, "warn", "tank", {"noise": ObserverNoise(drive=1e-9, output=1e-9)}, None),
+        (STAND_IN, "warn", "tank", {"loops": ()}, None),
+        (STAND_IN, "fail", "tank", {"loops": (PILoop("drive", "t_surface", -0.1, 50.0, 50.0),)}, None),
     ],
 )
 def test_a_planted_fault_is_found_by_its_check(request, name, verdict, plant, changes, wanted):
     controller = design_controller(request.getfixturevalue(plant), dt=2.0, **changes)
     assert verdicts(controller, wanted=wanted)[name] == verdict
-
-
-def test_a_horizon_shorter_than_the_delay_fails(tank):
-    short = design_controller(tank, dt=2.0, blocks=(1, 1, 1, 1))
-    assert verdicts(short)["horizon covers delay and lag"] == "fail"
-    (check,) = [c for c in review(short) if c.name.startswith("horizon")]
-    assert "horizon 8 s, wanted" in check.finding
-
-
-def test_a_loop_with_two_samples_of_horizon_and_no_move_weight_is_found_unstable(tank):
-    design = replace(
-        default_design(tank, dt=2.0),
-        blocks=make_blocks(8, 8),
-        terminal=0.0,
-        move=1e-9,
-        noise=ObserverNoise(state=0.5, drive=0.5, output=1e-5),
-    )
-    checks = {check.name: check for check in review(Controller(tank, design))}
-    sound = {check.name: check for check in review(design_controller(tank, dt=2.0))}
-    size = [float(c["closed loop is stable"].finding.split()[2]) for c in (checks, sound)]
-    assert size[1] < 1
-    assert size[0] > size[1]
 
 
 @pytest.mark.parametrize(
@@ -102,20 +86,6 @@ def test_a_slow_eigenvalue_is_the_loops_fault_unless_the_plant_has_it_by_itself(
     check = checks.eigenvalues([quick, slow])
     assert check.verdict == verdict
     assert ("as without the loop" in check.finding) == (verdict == "pass")
-
-
-def test_the_eigenvalue_of_the_review_is_the_rate_at_which_a_small_error_dies(tank):
-    from thermogrip.mpc.closed_loop.simulate import Surroundings, simulate_closed_loop
-
-    controller = design_controller(tank, dt=2.0)
-    finding = next(c.finding for c in review(controller) if c.name == "closed loop is stable")
-    rate = float(finding.split()[2])
-    quiet = Surroundings(noise=0.0, quantum=0.0, offset={"t_tank": 0.02})
-    run = simulate_closed_loop(controller, tank, [(25.0, 1600.0)], start=25.0, surroundings=quiet)
-    error = np.abs(run.outputs["t_surface"] - 25.0)[::2]
-    late = error[100:] + 1e-15
-    # the error is bounded by the slowest mode: over 200 samples it falls at least as fast
-    assert late[300] <= 1.5 * late[100] * rate**200 + 1e-6
 
 
 def test_a_target_beyond_the_logs_is_reported_before_a_run(tank):
@@ -181,11 +151,6 @@ def test_a_current_beyond_the_optimum_of_the_peltier_warns_with_the_range_to_tak
     assert beyond.fix == f"set drive_limits: drive = [{-0.8 * 0.083 * 291.15 / 7.5 / 4:.2f}, ...]"
 
 
-def test_an_observer_that_does_not_let_its_biases_move_is_too_slow(tank):
-    still = design_controller(tank, dt=2.0, noise=ObserverNoise(drive=1e-9, output=1e-9))
-    assert verdicts(still)["observer forgets its errors"] in ("warn", "fail")
-
-
 def test_an_offset_stays_without_disturbance_states(tank):
     name = "no offset is left in steady state"
     assert verdicts(design_controller(tank, dt=2.0, offset_free=False))[name] == "fail"
@@ -216,13 +181,6 @@ def test_a_program_that_runs_into_its_limit_of_iterations_fails(tank):
     assert found == ["pass", "warn", "fail"]
 
 
-def test_a_missing_stand_in_warns_and_one_that_pushes_the_wrong_way_fails(tank):
-    name, design = "a PI controller stands in", default_design(tank, dt=2.0)
-    assert verdicts(Controller(tank, replace(design, loops=())))[name] == "warn"
-    wrong = tuple(replace(loop, Kc=-loop.Kc) for loop in design.loops)
-    assert verdicts(Controller(tank, replace(design, loops=wrong)))[name] == "fail"
-
-
 def test_a_gain_that_is_wrong_by_its_sign_makes_the_loop_unstable(tank):
     controller = design_controller(tank, dt=2.0)
     loop = checks.loops_of(controller, 0)[0]
@@ -245,6 +203,7 @@ def test_an_integrator_holds_any_target_with_no_drive():
     assert "fail" not in {check.verdict for check in checks.values()}
     assert checks["targets can be held in steady state"].verdict == "pass"
     assert checks["soft limits agree with the targets"].verdict == "pass"
+    assert checks["gain keeps its sign over the drive"].verdict == "warn"
 
 
 def test_what_balances_an_integrator_may_lie_beyond_its_drive():

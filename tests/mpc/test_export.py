@@ -74,9 +74,8 @@ int main() {
 
 @needs_gcc
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no g++ here")
-@pytest.mark.parametrize("make", [None, "heater"])
-def test_a_program_in_cpp_includes_links_and_steps_an_export(controller, make, tmp_path):
-    controller = controller if make is None else heater()
+def test_a_program_in_cpp_includes_links_and_steps_an_export(tmp_path):
+    controller = heater()
     export_controller(controller, tmp_path)
     (tmp_path / "main.cpp").write_text(CPP)
     warn = ["-std=c++11", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror"]
@@ -116,6 +115,7 @@ def test_a_wrong_number_in_the_export_is_found(controller, tmp_path):
         (heater, {"blocks": (1,), "move_delay": 1}),
         (kit, {"dt": 10.0}),  # two steps of the model in a sample
         (kit, {"controlled": ("t2",), "limits": {"t1": (0.0, 50.0)}}),
+        (kit, {"blocks": (1, 2, 3)}),  # ranges, slews that end on them, and a band that is always broken
     ],
 )
 def test_controllers_of_any_size_build_and_do_the_same(make, changes, tmp_path):
@@ -126,15 +126,6 @@ def test_controllers_of_any_size_build_and_do_the_same(make, changes, tmp_path):
     assert found.passed
 
 
-@needs_gcc
-def test_more_rows_at_their_bounds_than_unknowns_and_soft_rows_are_no_trouble(tmp_path):
-    # ranges, and slews that end on them, beside a band that is broken at every sample
-    controller = kit(blocks=(1, 2, 3))
-    found = check_export(export_controller(controller, tmp_path), controller, states=40, seed=3)
-    assert found.same_status == found.same_iterations == 40
-    assert found.difference <= 1e-9
-
-
 @pytest.mark.skipif(os.name == "nt", reason="links need a privilege there")
 def test_an_export_is_not_written_through_a_link(tmp_path):
     (tmp_path / "elsewhere").write_text("somebody's")
@@ -142,19 +133,6 @@ def test_an_export_is_not_written_through_a_link(tmp_path):
     (tmp_path / "out" / "tg_qp.c").symlink_to(tmp_path / "elsewhere")
     export_controller(heater(), tmp_path / "out")
     assert (tmp_path / "elsewhere").read_text() == "somebody's"
-
-
-@pytest.mark.parametrize(("make", "most"), [(heater, 1e-9), (kit, 1.0)])
-def test_the_readme_says_how_far_the_state_at_rest_may_be_off(make, most, tmp_path):
-    export_controller(make(), tmp_path)
-    text = " ".join((tmp_path / "README.md").read_text().split())
-    (off,) = re.findall(r"the full solution by at most (\S+) degC", text)
-    assert 0 <= float(off) < most  # a linear plant's map is exact; the kit radiates, so its is nearly
-
-
-def test_the_example_of_the_readme_has_a_target_for_every_output(tmp_path):
-    export_controller(kit(), tmp_path)
-    assert "double target[2] = {35.0, 35.0};" in (tmp_path / "README.md").read_text()
 
 
 def test_an_export_asks_for_no_memory_and_for_nothing_of_python(controller, tmp_path):
@@ -188,22 +166,6 @@ def test_what_the_parameters_fix_is_worked_out_without_a_compiler(name):
     # every constant has a reader, and no reader is without one
     read = {int(entry) for entry in re.findall(r"\bk\[(\d+)\]", code.source.split("_next(", 1)[1])}
     assert read == set(range(code.n_k))
-
-
-def test_the_export_of_another_design_is_another_export(controller, tmp_path):
-    export_controller(controller, tmp_path / "a")
-    other = Controller(controller.plant, replace(controller.design, move=3.0))
-    export_controller(other, tmp_path / "b")
-    texts = [(tmp_path / name / "tg_design.c").read_text() for name in "ab"]
-    assert texts[0] != texts[1]
-
-
-def test_the_command_writes_the_folder_and_says_what_it_takes(controller, tmp_path, capsys):
-    file = controller.save(tmp_path / "controller.json")
-    assert main(["export", str(file), "--out", str(tmp_path / "c99"), "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said["ram"] > said["constants"] > 0
-    assert (tmp_path / "c99" / "Makefile").is_file()
 
 
 @needs_gcc
@@ -253,9 +215,8 @@ def test_a_difference_is_told_in_shares_of_a_drives_range(make: Any, span: float
     rng, seen = np.random.default_rng(0), set()
     for _ in range(24 if span == 1.0 else 2):
         state = exports._random_state(twin, rng)
-        given = {name: getattr(state, name) for name in ("x", "w", "d", "u", "plan", "target", "side")}
         twin.clock.step = 60.0 if state.late else 0.0
-        twin.place(**given)
+        twin.place(state)
         reading = dict(zip(twin.model.outputs, state.y.tolist())) | dict(
             zip(twin.model.disturbances, state.d_now.tolist())
         )
@@ -334,6 +295,7 @@ def test_the_readme_gives_the_controllers_own_numbers(tmp_path: Path):
     made = exports.export_controller(controller, tmp_path)
     text = " ".join((tmp_path / "README.md").read_text().split())
     assert "q1 in [0, 100]; q2 in [0, 100]" in text
+    assert "double target[2] = {35.0, 35.0};" in text
     for number in (made.ram, made.constants):
         assert f"{number} bytes" in text or str(number) in text
     low, high = exports._range_of(controller)

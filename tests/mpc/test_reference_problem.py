@@ -48,13 +48,6 @@ def test_ten_blocks_cost_half_a_percent_at_most(bench):
     assert max(loop.overshoot()) <= 0.3
 
 
-def test_python_and_c_drive_the_same_loop(bench):
-    if not wanted():
-        pytest.skip("no gcc here")
-    loops = [bench.problem.run_loop(bench.ours.Ours(compiled=c, blocks=10), steps=200) for c in (True, False)]
-    assert loops[0].u == pytest.approx(loops[1].u, abs=1e-8)
-
-
 @pytest.mark.parametrize("blocks", [50, 10])
 def test_where_more_current_heats_the_drive_stays_on_the_safe_side(bench, blocks):
     # 9 A are allowed, the optimum of the true element is near 6.3 A, and 8 degC is not reached in 75 s

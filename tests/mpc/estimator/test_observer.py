@@ -203,13 +203,6 @@ def test_the_start_finds_the_heatsink_of_a_peltier_plant_that_rested_under_a_dri
     assert observer.x[0] == pytest.approx(x[0, 0], abs=0.2)
 
 
-def test_the_disturbances_chosen_are_a_drive_and_the_skin(tank):
-    for plant in (tank, network_plant("gripper")):
-        chosen = choose_disturbances(PredictionModel(plant, dt=2.0), ("t_surface",))
-        assert chosen.names == ("input drive", "output t_surface")
-        assert chosen.margin > 0.1
-
-
 def test_more_disturbances_than_outputs_cannot_be_distinguished():
     A, C = np.diag([0.9, 0.8]), np.eye(2)
     assert detectability_margin(A, C, np.eye(2), np.zeros((2, 2))) > 1

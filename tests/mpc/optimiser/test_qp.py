@@ -86,14 +86,6 @@ def test_an_independent_solver_finds_the_same_cost(seed):
     assert cost(answer.x) <= found.fun + 1e-5 * (1 + abs(found.fun))
 
 
-def test_the_warm_start_takes_no_more_iterations_than_the_cold_one():
-    H, f, A, lower, upper, soft, w, q = random_problem(5)
-    qp = CondensedQP(soft=soft, linear=w, quadratic=q)
-    cold = qp.solve(H, f, A, lower, upper)
-    warm = qp.solve(H, f * 1.001, A, lower, upper)
-    assert warm.iterations <= cold.iterations
-
-
 def test_contradicting_hard_rows_are_infeasible_and_the_next_solve_starts_afresh():
     qp = CondensedQP(soft=[False, False], linear=[0, 0], quadratic=[0, 0])
     A, far = np.array([[1.0], [1.0]]), np.inf

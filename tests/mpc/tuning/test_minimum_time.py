@@ -8,8 +8,6 @@ from itertools import product
 import numpy as np
 import pytest
 
-from thermogrip.mpc.closed_loop.simulate import Surroundings, simulate_closed_loop
-from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.plant.prediction import PredictionModel
 from thermogrip.mpc.tuning.minimum_time import full_drive_bound
@@ -60,14 +58,6 @@ def soonest_of_all(plant: Plant, spec: Spec, levels: np.ndarray, step=STEP) -> t
     stays = np.logical_and.accumulate(inside[:, ::-1], axis=1)[:, ::-1]
     first = [np.where(ok.any(axis=1), np.argmax(ok, axis=1), np.inf).min() for ok in (arrived, stays)]
     return plant.dt * first[0], plant.dt * first[1]
-
-
-def test_the_bound_of_a_pure_integrator_is_distance_over_speed():
-    model = StateSpaceModel(("drive",), (), ("t",), A=[[1.0]], B=[[0.1]], C=[[1.0]], dt=1.0)
-    plant = Plant(model, {}, dt=1.0, units={"drive": "1"}, valid={"drive": (-1.0, 1.0)})
-    spec = spec_of(steps=[(20, 30)], hold_s=300.0, slew_per_s=1.0, sample_time_s=2)
-    bound = full_drive_bound(plant, spec.design(plant), (20.0, 30.0), spec)
-    assert bound == np.ceil((10 - 0.25) / 0.1)
 
 
 @pytest.mark.parametrize(
@@ -143,19 +133,6 @@ def test_what_the_drive_cannot_hold_is_never():
     plant = plant_of([[0.9]], [[1.0]], [[1.0]])
     spec = spec_of(steps=[(25.0, 60.0)], hold_s=600.0)
     assert full_drive_bound(plant, spec.design(plant), (25.0, 60.0), spec) == np.inf
-
-
-def test_a_controller_on_its_own_model_without_noise_is_never_sooner(tank, reversing_tank):
-    for plant, step in ((tank, (25.0, 33.0)), (reversing_tank, (25.0, 21.0))):
-        spec = Spec(steps=[step], hold_s=400.0, sample_time_s=2.0, sensor_offset_degC=0.0)
-        design = spec.design(plant)
-        quiet = Surroundings(noise=0.0, quantum=0.0)
-        run = simulate_closed_loop(
-            Controller(plant, design), plant, [(step[1], 400.0)], start=step[0], surroundings=quiet
-        )
-        bound = full_drive_bound(plant, design, step, spec)
-        assert np.isfinite(bound)
-        assert run.segments[0].settle_s >= bound
 
 
 def test_a_drive_that_cannot_be_off_starts_from_the_least_that_it_gives():

@@ -33,14 +33,6 @@ def test_kept_are_those_that_no_other_beats_by_the_definition(points):
     assert non_dominated(points).tolist() == wanted
 
 
-@given(st.lists(st.tuples(*[st.floats(0, 100)] * 3), min_size=1, max_size=10), st.randoms())
-def test_the_order_of_the_points_does_not_matter(points, random):
-    order = list(range(len(points)))
-    random.shuffle(order)
-    shuffled = non_dominated([points[k] for k in order])
-    assert non_dominated(points)[order].tolist() == shuffled.tolist()
-
-
 def trial_of(settle, overshoot, energy, controller="MPC", **parameters) -> Trial:
     return Trial(controller, {"move": 1.0, **parameters}, 1.0, settle, overshoot, energy)
 
