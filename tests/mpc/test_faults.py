@@ -1,9 +1,9 @@
 """The fault table: what goes wrong, what the controller says in which order, and where the skin goes.
 
 Each row is a closed loop on a plant that is not the model: it settles at 34 degC, the fault comes and goes,
-the loop goes on.  Each runs in Python, with its parts in C, and wholly in C, with the same drives.  Always: every drive
-is finite, in range and within the slew limit, every status but ok has an advice, and the temperatures stay
-inside the tank's limits; after the fault the skin comes back without an offset.
+the loop goes on.  Each runs in Python, with its parts in C, and wholly in C, and the drives are the same.
+Every drive is finite, in range and within the slew limit, every status but ok has an advice, and the
+temperatures stay inside the tank's limits; after the fault the skin comes back without an offset.
 """
 
 from __future__ import annotations
