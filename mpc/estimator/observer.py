@@ -286,8 +286,8 @@ class Observer:
         seen = np.sqrt(np.einsum("ij,j,ij->i", model.C, spread**2, model.C)).max()
         self._unit = spread / max(float(seen), 1e-12)
         self.is_drive = disturbance.on_drive.any(axis=0)
-        noise = np.where(self.is_drive, self.noise.drive, self.noise.output)
-        self.Q = np.concatenate([(self.noise.state * self._unit) ** 2, noise**2]) * model.dt
+        drift = np.where(self.is_drive, self.noise.drive, self.noise.output)
+        self.Q = np.concatenate([(self.noise.state * self._unit) ** 2, drift**2]) * model.dt
         self.x = np.zeros(model.n_x)
         self.w = np.zeros(disturbance.n_w)
         self.found_offset = np.zeros(model.n_y)
