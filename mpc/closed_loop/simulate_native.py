@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Surroundings, Truth, record_loop
+from thermogrip.mpc.controllers.base import as_drive
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.interface import STATUSES, Move
-from thermogrip.mpc.native.runtime import CompiledController, CompiledTruth
+from thermogrip.mpc.native.runtime import CompiledController, CompiledTruth, address
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
@@ -55,10 +56,7 @@ def compiled_loop(
     readings = [dict(zip(names, row)) for row in reading.tolist()]
     controlled = tuple(controller.controlled)
     targets = [dict(zip(controlled, row)) for row in target.tolist()]
-    moves = [
-        Move(row[0] if model.n_u == 1 else dict(zip(model.drives, row)), 1, STATUSES[code])
-        for row, code in zip(drive.tolist(), status.tolist())
-    ]
+    moves = [Move(as_drive(model.drives, row), 1, STATUSES[code]) for row, code in zip(drive, status)]
     return record_loop(truth, controlled, targets, readings, moves, np.cumsum(counts).tolist(), band)
 
 
@@ -86,13 +84,9 @@ def _loop_in_c(
         n,
         truth.sub,
         min(truth.late, truth.sub),
-        *(_at(values) for values in (observed, truth.d, noise)),
-        *(_at(values) for values in (quanta, d_offset, target, y, reading, drive, status)),
+        *(address(values) for values in (observed, truth.d, noise)),
+        *(address(values) for values in (quanta, d_offset, target, y, reading, drive, status)),
     )
     del held  # it had to live until here
     truth.y, truth.time = list(y), n * truth.dt
     return reading, drive, status
-
-
-def _at(values: NDArray[Any]) -> ctypes.c_void_p:
-    return ctypes.c_void_p(values.ctypes.data)

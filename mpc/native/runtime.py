@@ -97,7 +97,7 @@ class CompiledController:
         }
         self.library = _library(build_library(files))
         k = np.zeros(max(1, step.n_k))
-        self.library.tg_host_prepare(_at(np.ascontiguousarray(model.p)), _at(k))
+        self.library.tg_host_prepare(address(np.ascontiguousarray(model.p)), address(k))
         self.design = as_structure(self.sizes, numbers_of(controller, k[: step.n_k]))
         if ctypes.sizeof(self.design) != self.library.tg_host_design_size():
             raise RuntimeError("the C struct and its table disagree")
@@ -114,7 +114,7 @@ class CompiledController:
         """Start at rest at reading y (n_y,), disturbances d (n_d,); with the estimate of an observer, where
         one is given, in place of the one of the plant linearised in its room."""
         given = np.ascontiguousarray(y, float), np.ascontiguousarray(d, float)
-        self.library.tg_host_reset(self.state, _at(given[0]), _at(given[1]))
+        self.library.tg_host_reset(self.state, address(given[0]), address(given[1]))
         if like is not None:
             for name, values in like.estimate().items():
                 self.view(name, values.shape)[...] = values
@@ -140,10 +140,10 @@ class CompiledController:
         self.library.tg_host_step(
             self.state,
             ctypes.c_double(time_s),
-            _at(given[0]),
-            _at(given[1]),
-            None if did is None else _at(did),
-            *(_at(given[2]), _at(drive), ctypes.byref(over), _at(what)),
+            address(given[0]),
+            address(given[1]),
+            None if did is None else address(did),
+            *(address(given[2]), address(drive), ctypes.byref(over), address(what)),
         )
         self.advice = self.library.tg_advice_text(int(what[2])).decode()
         return drive, int(what[0]), int(what[1])
@@ -172,7 +172,7 @@ class CompiledTruth:
         files = {"tg_model.h": model_header(code, "tg_model"), "tg_model.c": model_source(code, "tg_model")}
         self._library = ctypes.CDLL(str(build_library(files)))
         self._k = np.zeros(max(1, code.n_k))
-        self._library.tg_model_prepare(_at(np.ascontiguousarray(model.p)), _at(self._k))
+        self._library.tg_model_prepare(address(np.ascontiguousarray(model.p)), address(self._k))
         self._C = np.ascontiguousarray(model.C)
         self._level = model.output(np.zeros(model.n_x))
 
@@ -180,7 +180,7 @@ class CompiledTruth:
         """Return the C struct at state x (n_x,) behind sensors of offset (n_y,), and what it points to."""
         held = (np.array(x, dtype=float), np.zeros(len(x)), self._k, self._C, self._level + offset)
         after = ctypes.cast(self._library.tg_model_next, ctypes.c_void_p)
-        return _Truth(after, len(x), *(_at(values) for values in held)), held
+        return _Truth(after, len(x), *(address(values) for values in held)), held
 
 
 class CompiledOptimiser(Optimiser):
@@ -202,8 +202,8 @@ class CompiledOptimiser(Optimiser):
         self._parts = [self._given[end - length : end] for end, length in zip(ends, lengths)]
         self._arguments = (
             c.state,
-            *(_at(part) for part in self._parts),
-            *(_at(values) for values in (self._plan, self._y, self._authority_now)),
+            *(address(part) for part in self._parts),
+            *(address(values) for values in (self._plan, self._y, self._authority_now)),
             ctypes.byref(self._over),
             ctypes.byref(self._iterations),
         )
@@ -288,24 +288,25 @@ class CompiledObserver(Observer):
     def update(self, y: Array) -> Array:
         """Correct the estimate with a reading (n_y,), NaN where lost; return the innovation (n_y,)."""
         innovation = y - self.reading()
-        self._c.library.tg_observer_update(self._c.state, _at(np.ascontiguousarray(y, float)))
+        self._c.library.tg_observer_update(self._c.state, address(np.ascontiguousarray(y, float)))
         return np.asarray(innovation)
 
     def predict(self, u: Array, d: Array) -> None:
         """Carry the estimate one sample on under drives u (n_u,) and disturbances d (n_d,)."""
         drives, held = np.ascontiguousarray(u, float), np.ascontiguousarray(d, float)
-        self._c.library.tg_observer_predict(self._c.state, _at(drives), _at(held))
+        self._c.library.tg_observer_predict(self._c.state, address(drives), address(held))
 
     def advance(self, seconds: float, u: Array, d: Array) -> None:
         """Let so many seconds pass under drives u (n_u,) and disturbances d (n_d,)."""
         drives, held = np.ascontiguousarray(u, float), np.ascontiguousarray(d, float)
         passed = ctypes.c_double(seconds)
-        self._c.library.tg_observer_advance(self._c.state, passed, _at(drives), _at(held))
+        self._c.library.tg_observer_advance(self._c.state, passed, address(drives), address(held))
 
     def look(self, d: Array) -> None:
         """Look where :meth:`advance` has come to."""
-        self._c.library.tg_observer_look(self._c.state, _at(np.ascontiguousarray(d, float)))
+        self._c.library.tg_observer_look(self._c.state, address(np.ascontiguousarray(d, float)))
 
 
-def _at(values: NDArray[Any]) -> ctypes.c_void_p:
+def address(values: NDArray[Any]) -> ctypes.c_void_p:
+    """Return the pointer to an array's numbers, for as long as the array lives."""
     return ctypes.c_void_p(values.ctypes.data)

@@ -169,19 +169,39 @@ def tune(
     share = sub_progress(progress, 0.85, 1.0)
     sensitivity = run_parallel(sensitivity_of, items, workers, share, what="sensitivities")
     history = tuple(tried for part in found.values() for tried in part)
-    done = _Found(history, pareto, tuple(sensitivity), scores, kept)
-    return _conclude(search, candidates, results, done)
-
-
-@dataclass(frozen=True)
-class _Found:
-    """What the search left beside the designs."""
-
-    history: tuple[Trial, ...]
-    pareto: Pareto
-    sensitivity: tuple[Sensitivity, ...]
-    scores: dict[str, float]
-    kept: str
+    rows = tuple(row for name, part in results.items() for row in rows_of(name, part, spec, search.bounds))
+    unseen = "under fresh noise (the plant has no uncertainty)" if search.certain else "on unseen draws"
+    kept_rows = [row for row in rows if row.controller == kept]
+    verdict, finding = verdict_of(spec, scores, kept_rows, unseen=unseen)
+    meets = all(meets_spec(result, spec) for result in results[kept])
+    notes = {
+        "verdict": verdict,
+        "finding": finding,
+        "meets_spec": meets,
+        "scores": scores,
+        "sensitivity": [item.to_dict() for item in sensitivity],
+        "in_words": sensitivity_words(sensitivity),
+        "pareto": pareto.rows(),
+        "spec": spec.model_dump(mode="json"),
+        "seed": seed,
+        "rows": [row.to_dict() for row in rows],
+    }
+    # the PI found here also takes over when the optimiser fails
+    controller = Controller(plant, replace(candidates[kept], loops=candidates["PI"].loops), notes=notes)
+    return Tuning(
+        controller=controller,
+        verdict=verdict,
+        finding=finding,
+        rows=rows,
+        scores=scores,
+        pareto=pareto,
+        sensitivity=tuple(sensitivity),
+        history=history,
+        meets_spec=meets,
+        runs=_runs(search, controller, candidates["LQR"]),
+        spec=spec,
+        seed=seed,
+    )
 
 
 def _best(trials: Sequence[Trial]) -> Trial:
@@ -267,47 +287,6 @@ def _compare(
     for (name, _, _), part in zip(items, done, strict=True):
         results[name] += part
     return results
-
-
-def _conclude(
-    search: Search, candidates: dict[str, Design], results: dict[str, list[StepResult]], found: _Found
-) -> Tuning:
-    spec, bounds = search.spec, search.bounds
-    scores, kept = found.scores, found.kept
-    rows = tuple(row for name, part in results.items() for row in rows_of(name, part, spec, bounds))
-    unseen = "under fresh noise (the plant has no uncertainty)" if search.certain else "on unseen draws"
-    kept_rows = [row for row in rows if row.controller == kept]
-    verdict, finding = verdict_of(spec, scores, kept_rows, unseen=unseen)
-    meets = all(meets_spec(result, spec) for result in results[kept])
-    # the PI found here also takes over when the optimiser fails
-    design = replace(candidates[kept], loops=candidates["PI"].loops)
-    notes = {
-        "verdict": verdict,
-        "finding": finding,
-        "meets_spec": meets,
-        "scores": scores,
-        "sensitivity": [item.to_dict() for item in found.sensitivity],
-        "in_words": sensitivity_words(found.sensitivity),
-        "pareto": found.pareto.rows(),
-        "spec": spec.model_dump(mode="json"),
-        "seed": search.seed,
-        "rows": [row.to_dict() for row in rows],
-    }
-    controller = Controller(search.plant, design, notes=notes)
-    return Tuning(
-        controller,
-        verdict,
-        finding,
-        rows,
-        scores,
-        found.pareto,
-        found.sensitivity,
-        found.history,
-        meets,
-        _runs(search, controller, candidates["LQR"]),
-        spec,
-        search.seed,
-    )
 
 
 def _runs(search: Search, controller: Controller, lqr: Design) -> dict[str, ClosedLoop]:
