@@ -153,8 +153,8 @@ class Grip:
         else:
             e, h_c, capacity = (np.asarray(part, dtype=float) for part in blocks)
         onset = self.onset + self.onset_sd * normal[1]
-        carried = t_object + self.bias + self.t_object_sd * normal[2]
-        true = carried + self.transit_loss * (ambient - carried)
+        away = t_object + self.bias + self.t_object_sd * normal[2]
+        true = away + self.transit_loss * (ambient - away)
         nodes = time_nodes(self.until)
         build_up = self.stack.build_up * np.exp(self.build_up_sd_ln * normal[4])
         rise, _, _ = step_response(

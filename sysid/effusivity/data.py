@@ -25,8 +25,9 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtri
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Grasps, check_grasps, log_name
+from thermogrip.datasets.schema import Grasps, check_grasps, label_values, log_name
 from thermogrip.sysid.effusivity.quality import check_grasps as check_quality
+from thermogrip.sysid.effusivity.quality import number_values
 
 Array = NDArray[np.float64]
 
@@ -125,12 +126,12 @@ def touches(grasps: Grasps, *, until: float | None = None) -> Touches:
         (count > 0) & (np.arange(used.size) >= bins[np.searchsorted(time, 0.15)]), y - level[:, None], 0
     )
     return Touches(
-        grasp_id=ids, material=_label(grasps, "material", ids.size),
+        grasp_id=ids, material=label_values(grasps, "material"),
         sample_t=np.broadcast_to(time, data.shape).copy(),
         sample_bin=np.where(good, bins, -1).astype(np.int64), y=y, t=mean(np.broadcast_to(time, data.shape)),
         count=count, ramp=mean(np.broadcast_to(np.maximum(time - _PUMP_OFF, 0.0), data.shape)), level=level,
-        t_object=_number(grasps, "t_object", ids.size), t_object_sd=_number(grasps, "t_object_sd", ids.size),
-        t_ambient=_number(grasps, "t_ambient", ids.size), excursion=np.abs(away).max(axis=1),
+        t_object=number_values(grasps, "t_object"), t_object_sd=number_values(grasps, "t_object_sd"),
+        t_ambient=number_values(grasps, "t_ambient"), excursion=np.abs(away).max(axis=1),
     )  # fmt: skip
 
 
@@ -147,7 +148,7 @@ def object_range(grasps: Grasps, stated: tuple[float, float] | None = None) -> A
             raise UserError(problem, hint="give the lower end first, within -60 to 200 degC")
         return np.tile([low, high], (n, 1)).astype(float)
     skin = grasps["t_surface"].values[:, grasps["time"].values < -0.25]
-    room = _number(grasps, "t_ambient", n)
+    room = number_values(grasps, "t_ambient")
     centre = np.where(np.isfinite(room), room, np.nanmedian(skin, axis=1))
     return np.stack([centre - UNKNOWN_OBJECT_RANGE, centre + UNKNOWN_OBJECT_RANGE], axis=1)
 
@@ -159,8 +160,8 @@ def with_object_range(grasps: Grasps, stated: tuple[float, float] | None) -> Gra
     """
     if stated is None:
         return grasps
-    n, ends = grasps.sizes["grasp"], object_range(grasps, stated)
-    t_object, sd = _number(grasps, "t_object", n), _number(grasps, "t_object_sd", n)
+    ends = object_range(grasps, stated)
+    t_object, sd = number_values(grasps, "t_object"), number_values(grasps, "t_object_sd")
     unknown = ~np.isfinite(t_object)
     t_object = np.where(unknown, ends.mean(axis=1), t_object)
     sd = np.where(unknown, (ends[:, 1] - ends[:, 0]) / np.sqrt(12.0), sd)
@@ -253,16 +254,7 @@ def whiten(data: Touches, noise: Noise) -> tuple[Array, Array]:
     return w, (2 * np.log(diagonal)).sum(axis=1) + there.sum(axis=1) * np.log(2 * np.pi)
 
 
-def _label(grasps: Grasps, name: str, n: int) -> NDArray[np.str_]:
-    return np.asarray(grasps.variables[name].values).astype(str) if name in grasps else np.full(n, "")
-
-
-def _number(grasps: Grasps, name: str, n: int) -> Array:
-    # the variable itself: a DataArray made of it costs more than all its numbers
-    return np.asarray(grasps.variables[name].values, dtype=float) if name in grasps else np.full(n, np.nan)
-
-
 def _check_sd(grasps: Grasps, where: str) -> None:
-    sd = _number(grasps, "t_object_sd", grasps.sizes["grasp"])
+    sd = number_values(grasps, "t_object_sd")
     for i in np.flatnonzero(sd < 0):
         raise UserError(f"grasp {str(grasps['grasp'].values[i])!r} has a negative t_object_sd", file=where)

@@ -94,10 +94,10 @@ from thermogrip.sysid.effusivity.posterior_grid import (
     posterior_of,
     refined,
 )
+from thermogrip.sysid.effusivity.quality import number_values
 
 if TYPE_CHECKING:
     from thermogrip.datasets.materials import Material
-    from thermogrip.sysid.effusivity.gripper_model import GripperModel
 
 Array = NDArray[np.float64]
 
@@ -357,7 +357,7 @@ def touch_groups(grasps: Grasps) -> dict[str, Rows]:
         raise UserError(
             "no touch_group", file=log_name(grasps), hint="give touches of one block the same touch_group"
         )
-    order = np.asarray(grasps["touch"].values if "touch" in grasps else np.zeros(label.size), dtype=float)
+    order = number_values(grasps, "touch")
     rows = {name: np.flatnonzero(label == name) for name in names}
     return {name: at[np.argsort(order[at], kind="stable")] for name, at in rows.items()}
 
@@ -379,7 +379,7 @@ def rested_long(grasps: Grasps, coupling: Coupling | None = None) -> NDArray[np.
 
 def _longest_rests(grasps: Grasps) -> dict[str, float]:
     """Return the longest rest between touches of each group [s], 0 for a single touch."""
-    rest = _numbers(grasps, "rest")
+    rest = number_values(grasps, "rest")
     rest = np.where(np.isfinite(rest), rest, REST)
     return {name: float(rest[at[1:]].max(initial=0.0)) for name, at in touch_groups(grasps).items()}
 
@@ -418,7 +418,7 @@ def free_touch_fit(
     rows = touch_groups(grasps)
     used = coupling or Coupling()
     data = touches(grasps, until=until)
-    whitener, rest = whiten(data, gripper.noise), _numbers(grasps, "rest")
+    whitener, rest = whiten(data, gripper.noise), number_values(grasps, "rest")
 
     def joint(at: Rows, x: Array) -> Joint:
         hypotheses = free_hypotheses(gripper, x)
@@ -522,16 +522,12 @@ class _View(NamedTuple):
 
 
 def _view(
-    gripper: GripperModel,
-    grasps: Grasps,
-    hypotheses: Hypotheses,
-    coupling: Coupling,
-    until: float | None = None,
+    gripper: GripperModel, grasps: Grasps, one: Hypotheses, coupling: Coupling, until: float | None = None
 ) -> _View:
     gripper.require_known("a question of several touches of one block")
     data = touches(grasps, until=until)
-    traces = traces_of(gripper, data, _numbers(grasps, "rest"), hypotheses)
-    return _View(gripper, data, whiten(data, gripper.noise), hypotheses, traces, coupling)
+    traces = traces_of(gripper, data, number_values(grasps, "rest"), one)
+    return _View(gripper, data, whiten(data, gripper.noise), one, traces, coupling)
 
 
 def _own_views(gripper: GripperModel, grasps: Grasps, coupling: Coupling) -> list[tuple[_View, list[Rows]]]:
@@ -618,8 +614,3 @@ def _fits(view: _View, groups: list[Rows]) -> list[Joint]:
     """Return evidence and posterior of each group, factors expanded around what the other touches say."""
     factors = _factors(view, groups, _cavities(view, groups, _factors(view, groups)))
     return [combine(f, *_prior(view, at, view.coupling, f)) for f, at in zip(factors, groups)]
-
-
-def _numbers(grasps: Grasps, name: str) -> Array:
-    n = grasps.sizes["grasp"]
-    return np.array(grasps[name].values, dtype=float) if name in grasps else np.full(n, np.nan)

@@ -103,8 +103,8 @@ def material_fit(
         ``t_object`` and ``t_object_sd`` may be NaN: without a temperature the prior is wide, without its sd
         it is the spread of the training grasps.
     candidates : sequence of str or Material
-        Labels that the gripper was calibrated with, or names or rows of the library, which have no known
-        finish.
+        Labels that the gripper was calibrated with, or names or rows of the library, whose contact
+        conductance is not known.
     finish : {"known", "unknown"}, optional
         Whether the blocks are those of the calibration, or others of the same materials.
     until : float, optional
@@ -115,7 +115,7 @@ def material_fit(
     Raises
     ------
     UserError
-        If a candidate is nowhere known or stands twice, or a grasp has too few samples.
+        If a candidate is nowhere known or named twice, or a grasp has too few samples.
     """
     from thermogrip.sysid.effusivity.laplace_approximation import T_OBJECT, H
 
@@ -182,7 +182,7 @@ def open_set(
     Parameters
     ----------
     gripper, grasps, candidates, until
-        As in :func:`material_fit`; the candidates have equal odds and known finishes.
+        As in :func:`material_fit`; the candidates have equal odds and known conductances.
     prior_unknown : float, optional
         Prior probability that the object is none of them, in (0, 1).
 

@@ -5,7 +5,7 @@ No contact
 
 A grasp that is |dT| >= 10 K from its object has a skin that moves by a share of dT in any contact.  On the
 example rig's gripper the least of the library, expanded polystyrene, moves it by 1.0 % in 10 s, cork by
-3.5 %; a skin alone moves by up to 0.5 % of 20 K as its pump stands.  So a trace whose last second lies within
+3.5 %; a skin alone moves by up to 0.5 % of 20 K as its pump stops.  So a trace whose last second lies within
 0.6 % of its level before contact shows no contact: there is no effusivity in it, and no material.
 
 A skin that moves the other way, by a twentieth of the difference or more, contradicts its object's
@@ -17,7 +17,7 @@ the next of them.
 Saturated sensors
 -----------------
 
-A skin that is pulled past the last reading of its sensor goes on moving; its trace stands still.  Taken for a
+A skin that is pulled past the last reading of its sensor goes on moving; its trace does not.  Taken for a
 temperature such a stretch indicates a heat flow that stopped, which no contact does: a gripper and an object
 come to terms ever slower, as :math:`1 / \sqrt t` at first and exponentially in the end.  So a trace
 **saturates** at its highest or lowest reading where it stays for 2 s or more, and
@@ -285,12 +285,7 @@ class _Trace:
         raw = np.asarray(grasps.variables["t_surface"].values, dtype=float)
         spiked = _spiked(raw)
         clean = np.where(spiked, np.nan, raw)
-        known = [
-            np.asarray(grasps.variables[name].values, dtype=float)
-            if name in grasps
-            else np.full(len(raw), np.nan)
-            for name in ("t_object", "t_object_sd")
-        ]
+        known = number_values(grasps, "t_object"), number_values(grasps, "t_object_sd")
         return cls(time, raw, clean, spiked, *known)
 
     @cached_property
@@ -310,7 +305,7 @@ class _Trace:
 
     @cached_property
     def moved(self) -> Floats:
-        """How far each skin stands above its level in its last second (n,) [K]."""
+        """How far each skin is above its level in its last second (n,) [K]."""
         return _means(self.clean[:, self.time > self.time[-1] - 1.0]) - self.level
 
     def stays(self, share: float) -> Flags:
@@ -331,13 +326,13 @@ class _Trace:
 
     def begins_to_saturate(self) -> Flags:
         """Return which grasps have stood still for 0.3 s after full motion: too early to know why, (n,)."""
-        stands = np.zeros(len(self.clean), dtype=bool)
+        still = np.zeros(len(self.clean), dtype=bool)
         for i, row in enumerate(self.clean):
             seen = row[np.isfinite(row)]
             for sign in (1.0, -1.0):
                 if seen.size and sign * seen[-1] == (sign * seen).max():
-                    stands[i] |= _saturates(self.time, sign * row, float(sign * seen[-1]), _BEGINS)
-        return stands
+                    still[i] |= _saturates(self.time, sign * row, float(sign * seen[-1]), _BEGINS)
+        return still
 
     @property
     def near(self) -> Flags:
@@ -372,13 +367,13 @@ def find_contact(
 ) -> float | None:
     """Return when the skin first felt an object [s after the "closed" message], None where it felt none.
 
-    A line through the readings between ``since`` [s] and 0 is carried on; with its uncertainty there,
+    A line through the readings between ``since`` [s] and 0 is extrapolated; with its uncertainty there,
 
         var(t) = s^2 (1 + 1/n + (t - t_mean)^2 / sum (t_i - t_mean)^2),
 
     s at least that of the sensor's ``quantum`` [K], contact is the first of three readings in a row beyond k
-    standard deviations on one side, carried back along those three to the line.  Contact that was made before
-    the message shows in the readings from which the line is made, and is then found late or not at all.
+    standard deviations on one side, extrapolated back along those three to the line.  Contact that was made
+    before the message shows in the readings of the line itself, and is then found late or not at all.
 
     >>> t = np.arange(-1.0, 3.0, 0.1)
     >>> round(find_contact(t, 23.0 + 2.0 * np.maximum(t - 0.4, 0.0)), 3)
@@ -468,7 +463,7 @@ def torn_groups(records: Sequence[Grasps]) -> list[str]:
     ...     make_grasps([-1.0, 1.0], [[23.0, 25.0]], [name], touch_group=["p1"], name=name) for name in "ab"
     ... )
     >>> torn_groups([one, two])
-    ["touch_group 'p1' stands in a and in b, and touches are joined within a file: one block, one file"]
+    ["touch_group 'p1' is in a and in b, and touches are joined within a file: one block, one file"]
     """
     found: dict[str, list[str]] = {}
     for record in records:
@@ -480,7 +475,7 @@ def torn_groups(records: Sequence[Grasps]) -> list[str]:
     first, files = next(iter(torn.items()))
     more = f" ({len(torn) - 1} more like it)" if len(torn) > 1 else ""
     return [
-        f"touch_group {first!r}{more} stands in {' and in '.join(files[:2])}, and touches are joined "
+        f"touch_group {first!r}{more} is in {' and in '.join(files[:2])}, and touches are joined "
         "within a file: one block, one file"
     ]
 
@@ -581,9 +576,7 @@ def _saturates(time: Floats, row: Floats, top: float, stays_for: float = _STAYS)
 
 def _rests(grasps: Grasps, left_out: Flags) -> Floats:
     """Return each touch's time since the touch before that counts [s], NaN where unknown."""
-    n = left_out.size
-    rest = np.array(grasps["rest"].values if "rest" in grasps else np.full(n, np.nan), dtype=float)
-    order = np.asarray(grasps["touch"].values if "touch" in grasps else np.zeros(n), dtype=float)
+    rest, order = np.array(number_values(grasps, "rest")), number_values(grasps, "touch")
     group, time = label_values(grasps, "touch_group"), grasps["time"].values
     seen = np.isfinite(grasps["t_surface"].values)
     for name in np.unique(group[left_out & (group != "")]):
@@ -595,6 +588,14 @@ def _rests(grasps: Grasps, left_out: Flags) -> Floats:
             elif more > 0:
                 rest[i], more = (rest[i] if np.isfinite(rest[i]) else _REST) + more, 0.0
     return rest
+
+
+def number_values(grasps: Grasps, name: str) -> Floats:
+    """Return a number of each grasp, (n_grasp,), NaN where it is absent."""
+    if name not in grasps:
+        return np.full(grasps.sizes["grasp"], np.nan)
+    # the variable itself: a DataArray made of it costs more than all its numbers
+    return np.asarray(grasps.variables[name].values, dtype=float)
 
 
 def _means(block: Floats) -> Floats:

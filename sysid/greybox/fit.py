@@ -75,7 +75,7 @@ def fit_network(
         Of the global search.
     starts : int, optional
         Starting points from the global search beside the prior medians; by default none unless the first fit
-        looks stuck, then 2.
+        ended badly, then 2.
     near : mapping of str to float, optional
         Values to start from in place of the prior medians, as of an earlier fit; what is not named or not
         free keeps its prior median.
@@ -122,7 +122,7 @@ def fit_network(
     solution = _descend(problem, problem.standard(near or {}), report, (0.0, 0.6))
     wanted = starts if starts is not None else (2 if _looks_stuck(problem, solution) else 0)
     if wanted:
-        solution = _search(problem, solution, model, logs, wanted, seed, report)
+        solution = _search(problem, solution, logs, wanted, seed, report)
     tau = residual_tau(problem.errors(solution.z), problem.tau)
     whiter = (tau < 0.8 * problem.tau) & np.array([slow is None for slow in problem.drift])
     if whiter.any():
@@ -180,7 +180,7 @@ def _looks_stuck(problem: Problem, solution: Solution) -> bool:
 
 def _rms_in_sd(problem: Problem, solution: Solution) -> list[float]:
     errors = problem.errors(solution.z)
-    return [_rms([e for log in errors for s in log for e in [s[k]]]) / sd for k, sd in enumerate(problem.sd)]
+    return [_rms([s[k] for log in errors for s in log]) / sd for k, sd in enumerate(problem.sd)]
 
 
 def _rms(parts: Sequence[Array]) -> float:
@@ -200,15 +200,10 @@ def _on_bound(problem: Problem, z: Array) -> dict[str, str]:
 
 
 def _search(
-    problem: Problem,
-    best: Solution,
-    model: GreyModel,
-    logs: Sequence[Log],
-    starts: int,
-    seed: int,
-    report: Progress,
+    problem: Problem, best: Solution, logs: Sequence[Log], starts: int, seed: int, report: Progress
 ) -> Solution:
     """Return the best of ``best`` and of fits that start where random searches ended."""
+    model = problem.model
     wide, step = _COARSE * model.average, model.search_step
     coarse = make_problem(model, logs, average=wide, independent=model.independent, dt=step)
     for k in range(starts):
@@ -229,8 +224,7 @@ def _random_search(problem: Problem, seed: int, evaluations: int = 1500) -> Arra
 
     def cost(z: Array, _gradient: Array) -> float:
         r = problem.trials(z[None])[0]
-        value = float(np.log1p((np.clip(np.nan_to_num(r, nan=1e6), -1e6, 1e6) ** 2).sum()))
-        return value
+        return float(np.log1p((np.clip(np.nan_to_num(r, nan=1e6), -1e6, 1e6) ** 2).sum()))
 
     nlopt.srand(seed)
     optimiser = nlopt.opt(nlopt.GN_CRS2_LM, len(low))
@@ -306,9 +300,8 @@ def _of_intervals(problem: Problem, spread: ScoreCovariance) -> Intervals:
 
 
 def _valid(model: GreyModel, logs: Sequence[Log]) -> dict[str, tuple[float, float]]:
-    wanted = (*model.inputs, *model.disturbances, *model.outputs)
     out = {}
-    for name in wanted:
+    for name in (*model.inputs, *model.disturbances, *model.outputs):
         values = np.concatenate([column(log, name) for log in logs])
         out[name] = (float(np.nanmin(values)), float(np.nanmax(values)))
     return out

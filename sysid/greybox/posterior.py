@@ -531,7 +531,7 @@ def sample_posterior(
     >>> plant, posterior = sample_posterior(plant, logs)  # minutes  # doctest: +SKIP
     >>> posterior.converged, plant.draw(1).values["flow"]  # doctest: +SKIP
     """
-    report = progress or _silent
+    report = progress or (lambda fraction, what: None)
     report(0.0, "averaging the logs")
     problem = _problem(plant, logs, average)
     z = problem.standard(plant.values)
@@ -684,7 +684,3 @@ def _arviz() -> Any:
         warnings.simplefilter("ignore", FutureWarning)
         import arviz
     return arviz
-
-
-def _silent(fraction: float, what: str) -> None:
-    """Report to nobody."""

@@ -8,7 +8,7 @@ difference is divided by the sensor's ``sd``. The model's error is slow, so neig
 correlated: all residuals of an output are divided by sqrt(tau), with tau the bins per independent one.
 
 **Starts** are nuisances of each log (:mod:`thermogrip.sysid.plant.simulation`): a state at rest, or one
-carried through a gap, is estimated anew at each iteration and held while the sensitivities are taken.
+the one behind a gap, is estimated anew at each iteration and held while the sensitivities are taken.
 
 **Sensitivities** are differences over all parameters in one batch of the compiled kernel: the step is
 smooth in p, so a relative step of 1e-5 leaves five digits; a test compares them with an independent solver's.
@@ -31,7 +31,7 @@ sensitivities are the sensitivities of its innovations.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, cast
 
@@ -145,14 +145,10 @@ class Problem:
 
     def residuals(self, z: Array, starts: Sequence[Sequence[Start]]) -> list[Array]:
         """Return the residuals of each log, (k, m_log) each, at z (k, n_free)."""
-        p, out = self.parameters(z), []
-        for (stretches, bins), begin in zip(self.logs, starts):
-            parts = []
-            for run, cells in zip(predict(self.model, self.plant.dt, p, stretches, begin), bins):
-                for k, (operator, mean) in enumerate(zip(cells.operators, cells.means)):
-                    parts.append(self.scaled(k, (operator @ run[:, :, k].T).T - mean))
-            out.append(np.concatenate(parts, axis=1))
-        return out
+        return [
+            np.concatenate([self.scaled(k, e) for stretch in log for k, e in enumerate(stretch)], axis=1)
+            for log in self._bin_errors(self.parameters(z), starts)
+        ]
 
     def scaled(self, k: int, errors: Array) -> Array:
         """Return the errors (k, m) of output k in sd; of one that drifts, their innovations."""
@@ -165,16 +161,17 @@ class Problem:
 
     def errors(self, z: Array) -> list[list[list[Array]]]:
         """Return the model's errors by log, stretch and output (bins in order of time)."""
-        p, out = self.parameters(z[None]), []
-        for (stretches, bins), begin in zip(self.logs, self.start(z)):
+        found = self._bin_errors(self.parameters(z[None]), self.start(z))
+        return [[[error[0] for error in stretch] for stretch in log] for log in found]
+
+    def _bin_errors(self, p: Array, starts: Sequence[Sequence[Start]]) -> Iterator[list[list[Array]]]:
+        """Yield each log's errors (k, m) by stretch and output, at parameters p (k, n_p)."""
+        for (stretches, bins), begin in zip(self.logs, starts):
             runs = predict(self.model, self.plant.dt, p, stretches, begin)
-            out.append(
-                [
-                    [o @ run[0, :, k] - m for k, (o, m) in enumerate(zip(cells.operators, cells.means))]
-                    for run, cells in zip(runs, bins)
-                ]
-            )
-        return out
+            yield [
+                [(o @ run[:, :, k].T).T - m for k, (o, m) in enumerate(zip(cells.operators, cells.means))]
+                for run, cells in zip(runs, bins)
+            ]
 
     def linearise(self, z: Array) -> tuple[Array, Array]:
         """Return residuals (m + n,) and Jacobian (m + n, n), the prior's rows last."""

@@ -1,7 +1,7 @@
 """What moves the residuals besides the parameters: random effects of each log, and model discrepancy.
 
 **Random effects.** Plain merging of logs assumes that one parameter set made them all, and nothing else. On
-hardware it did not: a thermocouple is plugged in anew, the room sensor stands elsewhere, the pump runs a
+hardware it did not: a thermocouple is plugged in anew, the room sensor is elsewhere, the pump runs a
 little faster. Beside the shared parameters, each log has
 
 ===================  =====================================================  ===============================
@@ -36,7 +36,7 @@ out: a start pulled upwards by one reading is pulled down by those after it, so 
 **Model discrepancy.** A wall that was left out, a dead zone, a resistance that rises with temperature: each
 responds to the inputs in every log alike, so its effect on the parameters does not average out over logs,
 and logs that agree with each other do not reveal it. Which term is missing is not known, so a bank of
-responses stands for all: every input u, its size |u|, u v, v |v| and every disturbance, with v the first
+responses represents all: every input u, its size |u|, u v, v |v| and every disturbance, with v the first
 output above the ambient (else about its mean), each through first-order lags of 2, 8 and 32 bins, on all
 outputs alike.
 

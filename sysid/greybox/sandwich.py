@@ -209,7 +209,7 @@ def _widths(data: Linearised) -> list[float]:
 
 def _log_scores(problem: Problem, data: Linearised, numbers: ErrorModel, n: int) -> tuple[LogScores, Array]:
     """Return what each log adds to the score, and U (n, n_term)."""
-    merge = float(round(data.bin_s / problem.average))  # residuals that one mean stands for
+    merge = float(round(data.bin_s / problem.average))  # residuals in one mean
     parts = [_one_log(log, warm, merge, numbers, n, data.n_shared) for log, warm in zip(data.logs, data.warm)]
     alike = np.sum([part[3] for part in parts], axis=0)
     return LogScores(*(np.array([part[k] for part in parts]) for k in range(3))), alike

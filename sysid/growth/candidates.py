@@ -1,7 +1,7 @@
 """Candidate changes of a network: what it may lack, and which of these the residuals propose.
 
 Each :class:`Candidate` is a patch of the network's tables, merged key by key; ``None`` takes a key away.
-:func:`suggested` looks at a network and returns what it does not have yet, and what could be taken from it.
+:func:`suggested` returns what a network does not have yet, and what could be taken from it.
 
 **Terms of the residual.** Let r = y - v be the error of the free run. A heat flow that the equations lack
 moves it like
@@ -395,7 +395,7 @@ def _to_air(network: Network) -> Iterator[tuple[str, str]]:
 
 
 def _removals(model: NetworkModel) -> Iterator[Candidate]:
-    """Every optional key of an element that a free parameter stands behind, and every node with one link."""
+    """Every optional key of an element that is a free parameter, and every node with one link."""
     network = model.network
     free = {name for name, item in network.parameters.items() if not item.fixed}
     seen: set[str] = set()

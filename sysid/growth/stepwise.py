@@ -13,7 +13,7 @@ it was fitted to. Here each one is kept only for its gain on logs that it has no
 4. An addition is kept if g exceeds its standard error and _LEAST, its new parameters are practically
    identifiable (on no bound, not known from the prior alone), the condition of the scaled Hessian is at
    most _WORST, and half of the gain is left once a straight line in time is taken out of the held-out
-   errors of each: on one log anything slow, a cooling room above all, looks like a drift of the sensor or
+   errors of each: on one log anything slow, a cooling room above all, resembles a drift of the sensor or
    the supply.
 5. A removal is kept if the error does not rise by more than the standard error and _LEAST.
 

@@ -103,7 +103,7 @@ def test_calibration_finds_the_blocks_it_was_shown(device):
     for name in ("copper", "wood"):
         want = device.blocks[name].ln_h - device.blocks["iron"].ln_h
         got = fitted.blocks[name].ln_h - fitted.blocks["iron"].ln_h
-        # two finishes from 16 grasps each, and a tenth for what trades with effusivity
+        # two conductances from 16 grasps each, and a tenth for what trades with effusivity
         assert got == pytest.approx(want, abs=3 * device.spreads.ln_h * np.sqrt(2 / 16) + 0.1)
     # spreads from 48 grasps: chi bounds of one in a thousand, widened for the fitted means
     assert 0.6 < fitted.spreads.t_object / device.spreads.t_object < 1.45
@@ -226,13 +226,13 @@ def learnt():
     )
 
 
-def test_the_dial_is_best_known_in_rooms_like_those_of_the_calibration(learnt):
+def test_the_nominal_temperature_is_best_known_in_rooms_like_those_of_the_calibration(learnt):
     away = np.array([-40.0, -20.0, -3.0, 20.0, 40.0])
     sd = learnt.nominal_sd(away)
     assert sd.argmin() in (1, 2)
     assert min(sd[0], sd[4]) > 2 * sd.min()
     assert learnt.nominal_sd(np.array([np.nan]))[0] == pytest.approx(learnt.uncertainty.sd("bias"))
-    # and an answer carries it
+    # and an answer includes it
     grasp = load_example_grasps()["exp2_dT20"].isel(grasp=[5])
     cold = grasp.assign(t_ambient=grasp["t_ambient"] - 30)
     hypotheses = material_hypotheses(learnt, ["copper"])

@@ -1,4 +1,4 @@
-"""The posterior engine: its own inverse with honest intervals, independent integration, and what it refuses.
+"""The posterior engine: its own inverse, intervals that cover, independent integration, what it refuses.
 
 Of n grasps simulated from the gripper's own populations the number inside a 90 % interval is binomial; a
 bound of one in a thousand on either side is the test.
@@ -51,22 +51,22 @@ def test_every_solid_lies_in_the_prior_s_range_with_room_for_the_scale(device):
     assert (ln_e + scale + 2 * sd).max() > LN_E_RANGE[1] - 0.1
 
 
-def drawn_from_the_prior(device, n, *, gripper, dial, seed):
-    """Simulate what the free hypothesis believes: any effusivity, unknown finish."""
+def drawn_from_the_prior(device, n, *, gripper, nominal, seed):
+    """Simulate what the free hypothesis assumes: any effusivity, unknown conductance."""
     rng = np.random.default_rng(seed)
     ln_e = rng.uniform(np.log(100.0), np.log(8e4), n)
     free = free_hypotheses(device, ln_e)
     ln_h = free.ln_h + free.ln_h_sd * rng.standard_normal(n)
     ln_rho_c = free.ln_rho_c + free.ln_rho_c_sd * rng.standard_normal(n)
     record, t_object = simulated_blocks(
-        device, ln_e=ln_e, ln_h=ln_h, ln_rho_c=ln_rho_c, t_gripper=gripper, t_object=dial, seed=seed
+        device, ln_e=ln_e, ln_h=ln_h, ln_rho_c=ln_rho_c, t_gripper=gripper, t_object=nominal, seed=seed
     )
     return record, ln_e, t_object
 
 
-def test_effusivity_is_recovered_with_honest_intervals(device):
+def test_effusivity_is_recovered_with_intervals_that_cover(device):
     n = 60
-    record, ln_e, t_object = drawn_from_the_prior(device, n, gripper=23.0, dial=43.0, seed=1)
+    record, ln_e, t_object = drawn_from_the_prior(device, n, gripper=23.0, nominal=43.0, seed=1)
     inside = hits_t = 0
     for truth, t, posterior in zip(ln_e, t_object, grid_posteriors(device, touches(record))):
         low, high = np.interp([0.05, 0.95], np.cumsum(posterior.mass), posterior.x)
@@ -80,7 +80,7 @@ def test_effusivity_is_recovered_with_honest_intervals(device):
 
 
 def test_confidence_in_a_material_is_its_frequency(device):
-    """Simulated from its own populations, the classifier is right as often as it says."""
+    """Simulated from its own populations, the classifier is right as often as stated."""
     record = simulated(device, FIVE, t_gripper=23.0, t_object=43.0, seed=3, n=24)
     p = material_posterior(device, record, FIVE)
     right = np.array(FIVE)[p.argmax(axis=1)] == record["material"].values
@@ -88,7 +88,7 @@ def test_confidence_in_a_material_is_its_frequency(device):
     # the number right is a sum of Bernoulli variables with these probabilities
     spread = np.sqrt((sure * (1 - sure)).sum())
     assert abs(right.sum() - sure.sum()) < 3.3 * spread
-    # one touch and a dial of 0.4 K cannot do better than this with metals; more would be a leak
+    # one touch and a temperature to 0.4 K cannot do better than this with metals; more would be a leak
     assert 0.7 < right.mean() < 0.95
 
 
@@ -166,14 +166,14 @@ def test_the_bundled_gripper_names_held_out_grasps(device, files):
 def test_an_unknown_object_temperature_widens_the_answer(device, files):
     record = files["exp2_dT20"].isel(grasp=[5, 13])
     unknown = record.assign(t_object=("grasp", [np.nan, np.nan]))
-    rows, blinds = effusivity_posterior(device, record), effusivity_posterior(device, unknown)
-    assert len(rows) == len(blinds) == 2
-    for known, blind in zip(rows, blinds):
-        assert blind.log10_effusivity_sd > known.log10_effusivity_sd
-        assert blind.t_object_p95 - blind.t_object_p05 > known.t_object_p95 - known.t_object_p05
+    rows, others = effusivity_posterior(device, record), effusivity_posterior(device, unknown)
+    assert len(rows) == len(others) == 2
+    for known, other in zip(rows, others):
+        assert other.log10_effusivity_sd > known.log10_effusivity_sd
+        assert other.t_object_p95 - other.t_object_p05 > known.t_object_p95 - known.t_object_p05
 
 
-def test_a_measured_object_temperature_is_believed(device, files):
+def test_a_measured_object_temperature_is_taken(device, files):
     record = files["exp2_dT20"].isel(grasp=[5])
     exact = record.assign(t_object=("grasp", [28.1]), t_object_sd=("grasp", [0.01]))
     row = effusivity_posterior(device, exact)[0]

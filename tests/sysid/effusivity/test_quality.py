@@ -151,9 +151,9 @@ def test_a_block_whose_touches_stand_in_two_files_is_reported_with_how_many_are_
 
     one, two, three = record("a", ["p", "q", "", "r"]), record("b", ["q", "", "p"]), record("c", ["r", "s"])
     [words] = torn_groups([one, two, three])
-    assert words.startswith("touch_group 'p' (2 more like it) stands in a and in b, and touches are joined")
+    assert words.startswith("touch_group 'p' (2 more like it) is in a and in b, and touches are joined")
     [words] = torn_groups([one, three])
-    assert words.startswith("touch_group 'r' stands in a and in c")
+    assert words.startswith("touch_group 'r' is in a and in c")
     assert torn_groups([two, three]) == []
 
 
@@ -189,7 +189,7 @@ RAMP = 23.0 + 5.0 * np.maximum(TIME - 0.4, 0.0)
         (TIME, step_at((30, 24.0), (31, 24.0)), None),
         (TIME, step_at((30, 24.0), (31, 24.0), (32, 22.0)), None),
         (TIME, step_at((30, 24.0), (31, 24.0), (32, 24.0)), TIME[30]),
-        # carried back by half a second at most
+        # extrapolated back by half a second at most
         (TIME, 23.0 + np.where(TIME >= 2.0, 2.0 + 0.1 * (TIME - 2.0), 0.0), 1.5),
         # four readings before the message are needed, and some after it
         (TIME[17:], RAMP[17:], None),

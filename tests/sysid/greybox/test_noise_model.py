@@ -55,7 +55,7 @@ def test_effects_of_logs_have_the_spread_that_made_them():
         logs.append(log_of(y, (0,), effect=effect))
     found = learn_error_model(logs, np.zeros(1), width=(2.0,))
     assert found.spread[0] == pytest.approx(2.0, rel=4 / np.sqrt(2 * 16))
-    sure = learn_error_model(logs, np.zeros(1), width=(0.01,))  # what was stated beforehand stands
+    sure = learn_error_model(logs, np.zeros(1), width=(0.01,))  # what was stated beforehand stays
     assert sure.spread[0] == pytest.approx(1.0, abs=0.02)
 
 

@@ -103,14 +103,6 @@ def test_draws_are_those_of_the_exact_gaussian() -> None:
     assert np.corrcoef(z.T)[0, 1] == pytest.approx(covariance[0, 1] / sd.prod(), abs=4 / np.sqrt(1000))
 
 
-def test_the_density_is_highest_at_the_fit_and_falls_as_the_covariance_says() -> None:
-    target, z, covariance = density(*a_fit())
-    step = np.random.default_rng(1).multivariate_normal(np.zeros(2), covariance, size=20)
-    fall = target.log_density(z[None])[0] - target.log_density(z + step)
-    expected = 0.5 * np.einsum("bi,ij,bj->b", step, np.linalg.inv(covariance), step)
-    np.testing.assert_allclose(fall, expected, rtol=1e-3, atol=1e-3)
-
-
 class Bent:
     """A residual of two parameters: they go together, and its slopes are true only where they do."""
 
@@ -137,15 +129,6 @@ def test_what_is_integrated_out_is_followed_far_from_the_fit() -> None:
     exact = np.array([logsumexp(row) for row in whole])
     found = target.log_profile(along[:, None], [0])
     np.testing.assert_allclose(found - found[0], exact - exact[0], atol=0.5)
-
-
-def test_intervals_are_those_of_the_fit_and_samples_lie_about_its_values() -> None:
-    plant, logs = a_fit(1, 2, 3)
-    sampled, record = sample_posterior(plant, logs, max_steps=1500, n_samples=1000)
-    assert sampled.intervals(0.9) == plant.intervals(0.9)
-    for name, (low, high) in plant.intervals(0.9).items():
-        assert plant.values[name] == pytest.approx((low + high) / 2)
-    assert record.off_centre < 0.25
 
 
 def test_draws_take_the_error_that_the_fit_has_learnt(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -61,12 +61,12 @@ def test_a_residual_is_an_error_in_sensor_sd_divided_by_the_root_of_tau():
 def test_a_slope_on_a_bound_is_taken_from_inside():
     asked: list[float] = []
 
-    class Watched(Mixed):
+    class Recorded(Mixed):
         def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Any:
             asked.append(float(np.max(np.asarray(p, float)[:, 0])))
             return super().rollout(x0, u, d, p, dt)
 
-    problem = problem_of(Watched(), a_log(1, seconds=200))
+    problem = problem_of(Recorded(), a_log(1, seconds=200))
     z = np.array([problem.box[1][0], 0.0])
     ((_, slopes),) = problem.by_log(z)
     assert max(asked) <= 9.0 * (1 + 1e-12)

@@ -128,13 +128,6 @@ def test_a_parameter_that_may_differ_from_log_to_log_has_an_effect_of_each():
     np.testing.assert_allclose(np.diff(found), np.diff(np.log(shares)), atol=0.02)
 
 
-def test_a_fixed_parameter_cannot_differ_from_log_to_log():
-    content = heater().to_dict()["network"]
-    content["parameters"]["C"]["per_log"] = 0.05
-    with pytest.raises(UserError, match="is fixed, so it cannot differ"):
-        network_from_dict(content)
-
-
 def test_a_parameter_that_no_log_feels_disagrees_with_none():
     felt = np.zeros((3, 2, 2))
     felt[:, 0, 0] = 10.0
