@@ -6,6 +6,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -236,3 +237,27 @@ def test_a_model_that_misses_the_logs_it_was_fitted_to_is_not_called_good(monkey
     found = identify(log, models=["oe"], average=1.0, draws=0)
     assert not found.good
     assert "on a, which it is fitted to, its error for t is" in found.verdict
+
+
+@pytest.mark.parametrize(
+    ("own", "held", "checked", "good", "said"),
+    [(0.49, 0.49, "ok", True, "good for simulation"), (0.49, 0.49, "fail", False, "on held its error"),
+     (0.5, 0.49, "ok", False, "on own, which it is fitted to, its error for t is 50 %"),
+     (0.49, 0.5, "ok", False, "on held its error for t is 50 %"), (0.5, 0.5, "ok", False, "on held its"),
+     (0.49, 1.0, "ok", False, "a model without input does as well on held"),
+     (None, 0.49, "ok", True, "good for simulation"), (None, 0.5, "ok", False, "on held its error")],
+)  # fmt: skip
+def test_a_model_is_good_where_its_error_is_below_half_of_that_without_input_on_every_log(
+    own: float | None, held: float, checked: str, good: bool, said: str
+) -> None:
+    shares = {"better": 0.1, "held": held} | ({} if own is None else {"own": own})
+    rows = [
+        identification.Row(model, "", log, "t", 2.0 * share, 90.0, "K", 100, 2.0, log != "own")
+        for log, share in shares.items()
+        for model, share in (("arx", share), ("other", 0.01))
+    ]
+    quality: Any = SimpleNamespace(verdict=checked)
+    found, words = identification.verdict_of("arx", rows, quality, True)
+    assert found == good
+    assert said in words
+    assert f"RMSE t {np.sqrt((0.2**2 + (2 * held) ** 2) / 2):.2g} K" in words

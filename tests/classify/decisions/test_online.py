@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -28,6 +31,34 @@ def stream(
     for t, y in zip(time[time <= until], readings):
         touch.update(float(t), float(y))
     return touch
+
+
+@pytest.mark.parametrize(
+    ("changes", "asked", "ends"),
+    [({}, 1, True), ({"p": 0.5 - 1e-9}, 1, False), ({"p": 0.5 - 1e-9, "gain": 0.09}, 1, True),
+     ({"gain": 0.1, "p": 0.4}, 1, False), ({"time": 1.0 - 2e-6}, 0, False), ({"time": 1.0 - 0.5e-6}, 1, True),
+     ({"time": 3.0}, 2, True), ({"evaluated": 1}, 1, False), ({"undecided": True}, 1, False),
+     ({"rule": None}, 0, False), ({"decided": 0.5}, 0, False)],
+)  # fmt: skip
+def test_the_rule_is_asked_at_its_times_and_ends_a_contact_from_its_probability_or_below_its_gain(
+    changes: dict[str, Any], asked: int, ends: bool
+) -> None:
+    given = {
+        "p": 0.5,
+        "gain": 0.2,
+        "time": 1.2,
+        "evaluated": 0,
+        "undecided": False,
+        "decided": None,
+    } | changes
+    rule = changes.get("rule", SimpleNamespace(times=(1.0, 2.0), sure=0.5, gain=0.1))
+    touch: Any = SimpleNamespace(
+        _rule=rule, _time=[given["time"]], _evaluated=given["evaluated"], decided_at=given["decided"],
+        log_p=np.log([given["p"], 1e-3]), _gain=lambda grasp, rule: given["gain"],
+    )  # fmt: skip
+    Stream._decide(touch, None, SimpleNamespace(undecided=[given["undecided"]]))
+    assert touch._evaluated == max(asked, given["evaluated"])
+    assert touch.decided_at == (given["time"] if ends else given["decided"])
 
 
 def test_no_contact_ends_nothing_and_names_nothing() -> None:

@@ -19,6 +19,7 @@ from thermogrip.sysid.validation.free_run import FreeRun, free_run
 from thermogrip.sysid.validation.residual_tests import (
     CorrelationTest,
     SlowNoise,
+    _significant,
     learn_slow_noise,
     residual_correlations,
 )
@@ -252,3 +253,15 @@ def test_a_plant_that_errs_more_than_its_fit_did_is_reported():
     assert same.exceeds_fit == {}
     coarse = log_of(q, heated(q, plant) + plate + noise).isel(time=slice(None, None, 20))
     assert not any("err by" in note for note in free_run(plant, coarse, 60.0, 60.0).notes)
+
+
+@pytest.mark.parametrize(
+    ("p", "significant"),
+    [((0.0099,), "x"), ((0.01,), "-"), ((0.0033, 0.0049, 0.0099), "xxx"), ((0.0034, 1e-9, 0.0099), "xxx"),
+     ((0.0034, 0.004, 0.0001), "xxx"), ((0.0033, 0.0051, 0.0099), "x--"), ((0.0034, 0.0035, 0.9), "---"), ((0.9, 0.5, 0.001), "--x")],
+)  # fmt: skip
+def test_one_right_model_in_a_hundred_is_suspected_by_any_of_its_tests(
+    p: tuple[float, ...], significant: str
+) -> None:
+    found = _significant({f"y{k}": {"u": CorrelationTest(value, 1.0)} for k, value in enumerate(p)})
+    assert "".join("x" if row["u"].significant else "-" for row in found.values()) == significant
