@@ -183,9 +183,9 @@ def _library(name: str, *values: Any) -> Vector:
     builder = next(value.builder for value in values if isinstance(value, Vector))
     function = _declared(builder, name, ir.FunctionType(DOUBLE, [DOUBLE] * len(values)))
     filled = ir.Constant(VECTOR, ir.Undefined)
-    for lane in range(WIDTH):
-        numbers = [builder.extract_element(register(value), _PLACE(lane)) for value in values]
-        filled = builder.insert_element(filled, builder.call(function, numbers), _PLACE(lane))
+    for k in range(WIDTH):
+        numbers = [builder.extract_element(register(value), _PLACE(k)) for value in values]
+        filled = builder.insert_element(filled, builder.call(function, numbers), _PLACE(k))
     return Vector(builder, filled)
 
 
@@ -272,9 +272,9 @@ def store(builder: ir.IRBuilder, place: Any, value: Any) -> None:
 def gather(builder: ir.IRBuilder, places: Sequence[Any], index: Any) -> Vector:
     """Return a vector of the entries ``index`` of eight arrays."""
     filled = ir.Constant(VECTOR, ir.Undefined)
-    for lane, place in enumerate(places):
+    for k, place in enumerate(places):
         number = builder.load(builder.gep(place, [index]))
-        filled = builder.insert_element(filled, number, _PLACE(lane))
+        filled = builder.insert_element(filled, number, _PLACE(k))
     return Vector(builder, filled)
 
 
@@ -317,16 +317,12 @@ _FIRST = INTEGER(0)
 
 
 class Equations(Protocol):
-    """A model's step in three parts, on lists of numbers, of NumPy rows or of vectors; lengths ``n_*``."""
+    """A model's step in three parts, on lists of numbers, of NumPy rows or of vectors."""
 
     @property
-    def n_x(self) -> int: ...
-    @property
-    def n_u(self) -> int: ...
-    @property
-    def n_d(self) -> int: ...
-    @property
-    def n_p(self) -> int: ...
+    def sizes(self) -> tuple[int, int, int, int]:
+        """Numbers of states, inputs, disturbances and parameters."""
+        ...
 
     def prepare(self, p: Sequence[Any]) -> list[Any]:
         """Return what depends on the parameters alone, c."""
@@ -375,8 +371,9 @@ class Kernel:
         pieces: int = 1,
     ) -> tuple[Array, Array]:
         """Simulate a batch."""
-        size, batch, n = self.equations, len(x0), u.shape[1]
-        shapes = ((batch, size.n_x), (n, size.n_u), (n, size.n_d), (size.n_p,))
+        batch, n = len(x0), u.shape[1]
+        n_x, n_u, n_d, n_p = self.equations.sizes
+        shapes = ((batch, n_x), (n, n_u), (n, n_d), (n_p,))
         if not all(a.shape[-len(s) :] == s and len(a) in (1, batch) for a, s in zip((x0, u, d, p), shapes)):
             raise ValueError(f"shapes {x0.shape}, {u.shape}, {d.shape}, {p.shape} do not belong together")
         if pieces != 1 and not (self._in_pieces and pieces > 1):
@@ -386,11 +383,11 @@ class Kernel:
             moved[:n] = renew
         arrays = [np.ascontiguousarray(a, dtype=float) for a in (x0, u, d, p)]
         n_block = -(-batch // WIDTH)
-        # which entry of each array a lane begins at; the lanes beyond the last member repeat it
+        # which entry of each array a member begins at; places beyond the last member repeat it
         member = np.minimum(np.arange(n_block * WIDTH), batch - 1).reshape(n_block, 1, WIDTH)
         stride = [a[0].size if len(a) > 1 else 0 for a in arrays]
         begin = np.ascontiguousarray(member * np.array(stride)[:, None])
-        y, x_end = np.empty((self._n_y, n + 1, n_block * WIDTH)), np.empty((size.n_x, n_block * WIDTH))
+        y, x_end = np.empty((self._n_y, n + 1, n_block * WIDTH)), np.empty((n_x, n_block * WIDTH))
 
         def run(block: int) -> None:
             self._rollout(
@@ -446,15 +443,16 @@ class _Writer:
         self._write()
 
     def _write(self) -> None:
-        at, size = self.at, self.equations
+        at, steps = self.at, self.equations
+        n_x, n_u, n_d, n_p = steps.sizes
         head, renew, step, done = (
             self.function.append_basic_block(name) for name in ("head", "renew", "step", "done")
         )
-        c = size.prepare(self._row(3, size.n_p))
-        first = self._row(0, size.n_x)
+        c = steps.prepare(self._row(3, n_p))
+        first = self._row(0, n_x)
         rows = at.add(self.n, INTEGER(1))
         entry = at.block
-        self.n_y = self._put(size.read(first, c), self.y, INTEGER(0), rows)
+        self.n_y = self._put(steps.read(first, c), self.y, INTEGER(0), rows)
         at.branch(head)
 
         at.position_at_end(head)
@@ -462,15 +460,15 @@ class _Writer:
         at.cbranch(at.icmp_signed("<", begin, self.n), renew, done)
 
         at.position_at_end(renew)
-        kept = size.renew(self._row(1, size.n_u, begin), c, self.h)
+        kept = steps.renew(self._row(1, n_u, begin), c, self.h)
         at.branch(step)
 
         at.position_at_end(step)
         t, piece, x = at.phi(INTEGER), at.phi(INTEGER), [at.phi(VECTOR) for _ in first]
-        u, d = self._row(1, size.n_u, t), self._row(2, size.n_d, t)
-        later = size.advance([Vector(at, item) for item in x], u, d, c, kept, self.h)
+        u, d = self._row(1, n_u, t), self._row(2, n_d, t)
+        later = steps.advance([Vector(at, item) for item in x], u, d, c, kept, self.h)
         after, count = at.add(t, INTEGER(1)), at.add(piece, INTEGER(1))
-        self._put(size.read(later, c), self.y, after, rows)  # the last piece has the last word
+        self._put(steps.read(later, c), self.y, after, rows)  # the last piece has the last word
         last = at.icmp_signed(">=", count, self.pieces if self.in_pieces else INTEGER(1))
         moved = at.icmp_signed("!=", at.load(at.gep(self.moved, [after])), BYTE(0))
         following = at.select(last, after, t), at.select(last, INTEGER(0), count)
@@ -490,8 +488,8 @@ class _Writer:
         at.ret_void()
 
     def _places(self, array: Any, begin: Any, k: int) -> list[Any]:
-        """Return where each lane's member begins in an array."""
-        offsets = [self.at.load(self.at.gep(begin, [INTEGER(k * WIDTH + lane)])) for lane in range(WIDTH)]
+        """Return where each member begins in an array."""
+        offsets = [self.at.load(self.at.gep(begin, [INTEGER(k * WIDTH + m)])) for m in range(WIDTH)]
         return [self.at.gep(array, [offset]) for offset in offsets]
 
     def _row(self, k: int, n: int, t: Any = _FIRST) -> list[Vector]:

@@ -117,32 +117,85 @@ class Layout(NamedTuple):
     output: Any  # (n_y,) state that each output reads
 
 
-def coefficients(p: Any, layout: Layout, c: Any) -> None:
-    """Fill ``c`` from the parameters: products of at most two of them and a number."""
-    n_p = len(p)
-    for k in range(len(layout.scale)):
-        value = layout.scale[k] + 0.0 * p[0]
-        if layout.left[k] < n_p:
-            value = value * p[layout.left[k]]
-        if layout.right[k] < n_p:
-            value = value * p[layout.right[k]]
-        c[k] = value
+@dataclass(frozen=True)
+class ThermalSteps:
+    """The three parts of a step; see :class:`thermogrip.sysid.models.jit_rollout.Equations`."""
+
+    layout: Layout
+    n_u: int  # number of inputs
+    n_p: int  # of parameters
+
+    @property
+    def sizes(self) -> tuple[int, int, int, int]:
+        """Numbers of states, inputs, disturbances and parameters."""
+        return self.layout.n_x, self.n_u, self.layout.n_d, self.n_p
+
+    def prepare(self, p: Sequence[Any]) -> list[Any]:
+        """Return the coefficients: products of at most two parameters and a number."""
+        c: list[Any] = []
+        for scale, left, right in zip(self.layout.scale, self.layout.left, self.layout.right):
+            value = scale + 0.0 * p[0]
+            if left < self.n_p:
+                value = value * p[left]
+            if right < self.n_p:
+                value = value * p[right]
+            c.append(value)
+        return c
+
+    def renew(self, u: Sequence[Any], c: Sequence[Any], h: Any) -> list[Any]:
+        """Return the conductances, then the factors of 1 - g h A."""
+        g = _conductances(u, c, self.layout)
+        return [*g, *_factors(c, g, GAMMA * h, self.layout)]
+
+    def advance(
+        self,
+        x: Sequence[Any],
+        u: Sequence[Any],
+        d: Sequence[Any],
+        c: Sequence[Any],
+        kept: Sequence[Any],
+        h: Any,
+    ) -> list[Any]:
+        """Return the state one step of ``h`` [s] on."""
+        layout, n_link = self.layout, len(self.layout.link_to)
+        g, w, outside = kept[:n_link], kept[n_link:], self._outside(d, c)
+        q = _heat([*x, *outside], u, c, g, layout)
+        k = _solved(w, layout, [a / b for a, b in zip(q, c)])
+        q = _heat([*(a + h * b for a, b in zip(x, k)), *outside], u, c, g, layout)
+        k2 = _solved(w, layout, [a / b - 2.0 * e for a, b, e in zip(q, c, k)])
+        return [a + h * (1.5 * e + 0.5 * b) for a, e, b in zip(x, k, k2)]
+
+    def read(self, x: Sequence[Any], c: Sequence[Any]) -> list[Any]:
+        """Return what the sensors read [degC]."""
+        return [x[i] for i in self.layout.output]
+
+    def heat(self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any]) -> list[Any]:
+        """Return the heat that each state receives [W] (sensors: [K])."""
+        c = self.prepare(p)
+        return _heat([*x, *self._outside(d, c)], u, c, _conductances(u, c, self.layout), self.layout)
+
+    def _outside(self, d: Sequence[Any], c: Sequence[Any]) -> list[Any]:
+        """Return the boundary temperatures: measured, then fixed."""
+        at, n_d = self.layout.at_fixed, self.layout.n_d
+        return [*(d[i] for i in range(n_d)), *c[at : at + self.layout.n_fixed]]
 
 
-def conductances(u: Any, c: Any, layout: Layout, g: Any) -> None:
-    """Fill ``g`` with the conductance [W/K] of every link at these switch positions."""
-    for k in range(len(layout.link_to)):
-        g[k] = c[layout.at_link + k]
-        if layout.link_switch[k] >= 0:
+def _conductances(u: Any, c: Any, layout: Layout) -> list[Any]:
+    """Return the conductance [W/K] of every link at these switch positions."""
+    g = []
+    for k, switch in enumerate(layout.link_switch):
+        value = c[layout.at_link + k]
+        if switch >= 0:
             off = c[layout.at_off + k]
-            g[k] = g[k] * (off + (1.0 - off) * u[layout.link_switch[k]])
+            value = value * (off + (1.0 - off) * u[switch])
+        g.append(value)
+    return g
 
 
-def heat(z: Any, u: Any, c: Any, g: Any, layout: Layout, q: Any) -> None:
-    """Fill ``q`` with the heat that each state receives [W], at temperatures z [degC]."""
+def _heat(z: Any, u: Any, c: Any, g: Any, layout: Layout) -> list[Any]:
+    """Return the heat that each state receives [W], at temperatures z [degC]."""
     n = layout.n_x
-    for i in range(n):
-        q[i] = 0.0 * z[i]
+    q = [0.0 * z[i] for i in range(n)]
     for k in range(len(layout.link_to)):
         i, j = layout.link_to[k], layout.link_from[k]
         flow = g[k] * (z[j] - z[i])
@@ -186,14 +239,14 @@ def heat(z: Any, u: Any, c: Any, g: Any, layout: Layout, q: Any) -> None:
         joule = 0.5 * c[at + 1] * (1.0 + c[at + 10] * warm) * square
         q[face] = q[face] + pumped * (z[face] + KELVIN) + joule
         q[sink] = q[sink] - pumped * (z[sink] + KELVIN) + joule
+    return q
 
 
-def factor(c: Any, g: Any, gh: Any, layout: Layout, w: Any) -> None:
-    """Fill ``w`` with the LU factors of 1 - gh A; pivots are stored inverted."""
-    for k in range(layout.n_entry):
-        w[k] = 0.0 * c[0]
-    for i in range(layout.n_x):
-        w[layout.diagonal[i]] = 1.0 + 0.0 * c[0]
+def _factors(c: Any, g: Any, gh: Any, layout: Layout) -> list[Any]:
+    """Return the LU factors of 1 - gh A; pivots are inverted."""
+    w = [0.0 * c[0] for _ in range(layout.n_entry)]
+    for i in layout.diagonal:
+        w[i] = 1.0 + 0.0 * c[0]
     for k in range(len(layout.link_to)):
         i, j = layout.link_to[k], layout.link_from[k]
         share = gh * g[k] / c[i]
@@ -214,10 +267,11 @@ def factor(c: Any, g: Any, gh: Any, layout: Layout, w: Any) -> None:
             for m in range(layout.lower_begin[at], layout.lower_begin[at + 1]):
                 w[layout.update_to[m]] = w[layout.update_to[m]] - w[entry] * w[layout.update_by[m]]
             at += 1
+    return w
 
 
-def solve(w: Any, layout: Layout, q: Any) -> None:
-    """Replace ``q`` by the solution of (1 - gh A) k = q."""
+def _solved(w: Any, layout: Layout, q: list[Any]) -> list[Any]:
+    """Return the solution of (1 - gh A) k = q, in the place of ``q``."""
     for m in range(len(layout.lower_entry)):
         row = layout.lower_row[m]
         q[row] = q[row] - w[layout.lower_entry[m]] * q[layout.lower_pivot[m]]
@@ -228,101 +282,7 @@ def solve(w: Any, layout: Layout, q: Any) -> None:
         for m in range(layout.upper_begin[position], layout.upper_begin[position + 1]):
             value = value - w[layout.upper_entry[m]] * q[layout.upper_column[m]]
         q[i] = value * w[layout.diagonal[i]]
-
-
-def advance(
-    x: Any, u: Any, d: Any, c: Any, g: Any, w: Any, h: Any, layout: Layout, z: Any, q: Any, k: Any
-) -> None:
-    """Move the state ``x`` one step of ``h`` [s] on, with conductances ``g`` and factors ``w``.
-
-    ``z`` (n_x + n_d + n_fixed), ``q`` and ``k`` (n_x) are room to work in.
-    """
-    n = layout.n_x
-    for i in range(n):
-        z[i] = x[i]
-    for i in range(layout.n_d):
-        z[n + i] = d[i]
-    for i in range(layout.n_fixed):
-        z[n + layout.n_d + i] = c[layout.at_fixed + i]
-    heat(z, u, c, g, layout, q)
-    for i in range(n):
-        q[i] = q[i] / c[i]
-    solve(w, layout, q)
-    for i in range(n):
-        k[i] = q[i]
-        z[i] = x[i] + h * k[i]
-    heat(z, u, c, g, layout, q)
-    for i in range(n):
-        q[i] = q[i] / c[i] - 2.0 * k[i]
-    solve(w, layout, q)
-    for i in range(n):
-        x[i] = x[i] + h * (1.5 * k[i] + 0.5 * q[i])
-
-
-@dataclass(frozen=True)
-class ThermalSteps:
-    """The functions of this module as the three parts of a step, on lists of numbers, NumPy rows, vectors or
-    CasADi symbols; see :class:`thermogrip.sysid.models.jit_rollout.Equations`.
-    """
-
-    layout: Layout
-    n_u: int  # number of inputs
-    n_p: int  # of parameters
-
-    @property
-    def n_x(self) -> int:
-        """Number of states."""
-        return self.layout.n_x
-
-    @property
-    def n_d(self) -> int:
-        """Number of measured ambients."""
-        return self.layout.n_d
-
-    def prepare(self, p: Sequence[Any]) -> list[Any]:
-        """Return the coefficients."""
-        c: list[Any] = [0.0] * len(self.layout.scale)
-        coefficients(p, self.layout, c)
-        return c
-
-    def renew(self, u: Sequence[Any], c: Sequence[Any], h: Any) -> list[Any]:
-        """Return the conductances, then the factors of 1 - g h A."""
-        g: list[Any] = [0.0] * len(self.layout.link_to)
-        w: list[Any] = [0.0] * self.layout.n_entry
-        conductances(u, c, self.layout, g)
-        factor(c, g, GAMMA * h, self.layout, w)
-        return [*g, *w]
-
-    def advance(
-        self,
-        x: Sequence[Any],
-        u: Sequence[Any],
-        d: Sequence[Any],
-        c: Sequence[Any],
-        kept: Sequence[Any],
-        h: Any,
-    ) -> list[Any]:
-        """Return the state one step of ``h`` [s] on."""
-        layout, state = self.layout, list(x)
-        z: list[Any] = [0.0] * (layout.n_x + layout.n_d + layout.n_fixed)
-        q: list[Any] = [0.0] * layout.n_x
-        k: list[Any] = [0.0] * layout.n_x
-        n_link = len(layout.link_to)
-        advance(state, u, d, c, kept[:n_link], kept[n_link:], h, layout, z, q, k)
-        return state
-
-    def read(self, x: Sequence[Any], c: Sequence[Any]) -> list[Any]:
-        """Return what the sensors read [degC]."""
-        return [x[i] for i in self.layout.output]
-
-    def heat(self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any]) -> list[Any]:
-        """Return the heat that each state receives [W] (sensors: [K])."""
-        layout, c = self.layout, self.prepare(p)
-        g: list[Any] = [0.0] * len(layout.link_to)
-        q: list[Any] = [0.0] * layout.n_x
-        conductances(u, c, layout, g)
-        heat([*x, *d, *c[layout.at_fixed : layout.at_fixed + layout.n_fixed]], u, c, g, layout, q)
-        return q
+    return q
 
 
 STEFAN_BOLTZMANN = 5.670374419e-8  # W m^-2 K^-4
@@ -356,8 +316,7 @@ def state_names(network: Network) -> tuple[str, ...]:
 
 
 def build_layout(network: Network) -> Layout:
-    """Return the integers of :class:`thermogrip.sysid.models.network_equations.Layout` for a checked
-    network."""
+    """Return the layout of a checked network."""
     states = state_names(network)
     index = {name: i for i, name in enumerate([*states, *network.disturbances, *network.boundaries])}
     links = _links(network, index)

@@ -65,24 +65,10 @@ class OwnSteps:
     code: OwnCode
 
     @property
-    def n_x(self) -> int:
-        """Number of states."""
-        return len(self.code.states)
-
-    @property
-    def n_u(self) -> int:
-        """Number of inputs."""
-        return len(self.code.inputs)
-
-    @property
-    def n_d(self) -> int:
-        """Number of disturbances."""
-        return len(self.code.disturbances)
-
-    @property
-    def n_p(self) -> int:
-        """Number of parameters."""
-        return len(self.code.parameters)
+    def sizes(self) -> tuple[int, int, int, int]:
+        """Numbers of states, inputs, disturbances and parameters."""
+        code = self.code
+        return len(code.states), len(code.inputs), len(code.disturbances), len(code.parameters)
 
     def prepare(self, p: Sequence[Any]) -> list[Any]:
         """Return the parameters."""

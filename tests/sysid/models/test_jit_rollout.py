@@ -25,10 +25,7 @@ class Written:
     """x+ = formula(x, u, d, p), with a gain that is made anew where a switch moves."""
 
     formula: Any
-    n_x: int = 2
-    n_u: int = 2
-    n_d: int = 1
-    n_p: int = 3
+    sizes: tuple[int, int, int, int] = (2, 2, 1, 3)
 
     def prepare(self, p: Sequence[Any]) -> list[Any]:
         return [*p, 1.0, p[0] * p[1]]
