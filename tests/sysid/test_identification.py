@@ -18,6 +18,7 @@ from thermogrip.datasets.schema import make_log
 from thermogrip.sysid import Plant, identification, identify
 from thermogrip.sysid.blackbox.fit import fit_black_box
 from thermogrip.sysid.blackbox.order_selection import Structure, _one_standard_error, folds
+from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import fit_logs
 from thermogrip.sysid.plant.log_grid import make_grid
 from thermogrip.sysid.validation.free_run import free_run
@@ -51,7 +52,7 @@ def test_leaving_one_log_out_gives_a_row_for_every_model_and_log():
 
 
 def test_a_log_is_scored_in_the_fit_with_the_warmup_that_its_held_out_part_had():
-    # with 5 s in one and 50 s in the other, errors of the start made a fit look worse on what it had seen
+    # with 5 s in one and 50 s in the other, errors of the start made a fit seem less good on what it had seen
     logs = [plant_log(500, seed=s, name=name) for s, name in enumerate("abc")]
     one = identify(logs[0], models=["arx"], average=2.0).rows
     assert {row.n for row in one if not row.held_out} == {450}
@@ -79,15 +80,6 @@ def test_an_output_that_ignores_the_input_is_never_called_good():
     assert not found.good
     assert "not good" in found.verdict
     assert found.plant.verdict == found.verdict
-
-
-def test_the_plant_survives_its_file(tmp_path):
-    log = plant_log()
-    plant = identify(log, models=["subspace"], average=2.0).plant
-    plant.save(tmp_path / "plant.json")
-    again = Plant.load(tmp_path / "plant.json")
-    np.testing.assert_array_equal(again.simulate(log)["t"].values, plant.simulate(log)["t"].values)
-    assert again.verdict == plant.verdict
 
 
 def test_progress_goes_from_zero_to_one():
@@ -138,12 +130,9 @@ def test_data_that_say_nothing_are_refused():
     constant["q"].values[:] = 0.3
     with pytest.raises(UserError, match="never moves"):
         identify(constant, models=["arx"])
-    with pytest.raises(UserError, match="too short"):
-        identify(plant_log(50), models=["arx"])
-    lost = plant_log()
-    lost["t"].values[:] = np.nan
+    constant["t"].values[:] = np.nan
     with pytest.raises(UserError, match="column t: has no reading"):
-        identify(lost, models=["arx"])
+        identify(constant, models=["arx"])
 
 
 @needs_real
@@ -173,11 +162,6 @@ def test_an_output_that_never_moves_is_refused_by_name():
     log["dead"] = ("time", np.full(log.sizes["time"], 25.0), {"units": "degC", "role": "output"})
     with pytest.raises(UserError, match=r"column dead: reads 25 whenever it reads.*--outputs"):
         identify(log, models=["arx"], average=1.0)
-    single = np.full(log.sizes["time"], np.nan)
-    single[5] = 20.0
-    log["dead"] = ("time", single, log["dead"].attrs)
-    with pytest.raises(UserError, match="column dead"):
-        identify(log, models=["arx"], average=1.0)
     assert identify(log, outputs=["t"], models=["arx"], average=1.0, draws=0).plant.outputs == ("t",)
 
 
@@ -188,7 +172,8 @@ def test_draws_that_cannot_be_made_are_a_note_and_the_fit_is_kept(monkeypatch, k
         raise np.linalg.LinAlgError("planted")
 
     log = plant_log(500)
-    plant = identify(log, models=["oe"], average=1.0, draws=0).plant
+    block = StateSpaceModel(("q",), (), ("t",), A=[[0.95]], B=[[0.5]], C=[[1.0]], dt=1.0, y0=[25.0])
+    plant = Plant(block, {}, dt=1.0, units={"q": "1", "t": "degC"})
     monkeypatch.setattr("thermogrip.sysid.greybox.fit.fit_network", lambda *_, **__: plant)
     for name in (
         "greybox.posterior.with_draws",

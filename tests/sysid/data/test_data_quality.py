@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_logs
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.data.data_quality import check_data, evidence
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.network import load_network
-from thermogrip.sysid.plant.log_grid import choose_step, dominant_time, make_grid, quantum
 
 
 def plant_log(n=2000, *, seed=0, noise=0.02, level=25.0, name="a", drift=0.0, q=None, time=None):
@@ -30,17 +28,6 @@ def one(logs, check, **how):
 
 def test_a_clean_log_is_ok_throughout():
     assert check_data([plant_log()], average=1.0).verdict == "ok"
-
-
-@pytest.mark.parametrize("q", [0.0625, 0.1, 0.32])
-def test_the_quantum_of_a_converter_is_read_off_the_values(q):
-    values = np.round(np.random.default_rng(0).normal(25, 2, 3000) / q) * q
-    assert quantum(values) == pytest.approx(q, abs=1e-6)
-    assert quantum(np.round(values, 3)) == pytest.approx(q, abs=1e-3)
-
-
-def test_continuous_values_have_no_quantum():
-    assert quantum(np.random.default_rng(0).normal(25, 2, 3000)) == 0.0
 
 
 def test_a_coarse_converter_warns():
@@ -144,65 +131,6 @@ def test_a_drift_says_which_stretch_it_is_of_where_a_gap_leaves_two():
         "the halves of 0 to 1199 s",
         "the halves of 1260 to 2059 s",
     ]
-
-
-def test_the_dominant_time_constant_is_found_through_noise():
-    logs = [plant_log(4000, noise=0.3)]
-    tau = -1 / np.log(0.95)
-    assert dominant_time(logs, inputs=["q"], outputs=["t"]) == pytest.approx(tau, rel=0.5)
-
-
-def test_a_coarse_converter_asks_for_averaging():
-    fine, coarse = plant_log(4000, noise=0.0), plant_log(4000, noise=0.0)
-    coarse["t"].values[:] = np.round(coarse["t"].values / 1.0) * 1.0
-    steps = [choose_step([log], inputs=["q"], outputs=["t"]) for log in (fine, coarse)]
-    assert steps[1] > steps[0] == 1.0
-
-
-def test_the_grid_says_which_rule_set_its_step():
-    log = plant_log(4000, noise=0.0)
-    assert "own" in make_grid([log]).why
-    assert make_grid([log], average=2.0).why == "asked for"
-    log["t"].values[:] = np.round(log["t"].values / 1.0) * 1.0
-    assert "converter's 1 " in make_grid([log]).why
-
-
-def test_an_output_is_averaged_along_the_line_through_its_uneven_samples():
-    rng = np.random.default_rng(1)
-    time = np.cumsum(rng.uniform(0.3, 0.7, 400))
-    t = rng.normal(25, 1, time.size)
-    t[[50, 51, 200]] = np.nan  # the line goes on over what was lost
-    log = make_log(time, {"q": (rng.normal(size=400), "1", "input"), "t": (t, "degC", "output")})
-    segment = make_grid([log], average=3.0).segments[0]
-    known = np.isfinite(t)
-    for at, found in zip(segment.time[1:-1], segment.y[1:-1, 0], strict=True):
-        fine = np.linspace(at - 1.5, at + 1.5, 3001)  # ten kinks of 20 K/s, each off by 20 (1 ms)^2 / 8
-        want = np.trapezoid(np.interp(fine, time[known], t[known]), fine) / 3.0
-        assert found == pytest.approx(want, abs=2e-5)
-
-
-def test_averages_keep_the_mean_and_do_not_shift_in_time():
-    n = 400
-    time = np.arange(n) * 0.5
-    log = make_log(time, {"q": (time % 7, "1", "input"), "t": (20 + 0.1 * time, "degC", "output")})
-    segment = make_grid([log], average=3.0).segments[0]
-    np.testing.assert_allclose(segment.y[1:-1, 0], 20 + 0.1 * segment.time[1:-1], atol=1e-9)
-    assert segment.u.mean() == pytest.approx(np.mean(time[: len(segment.time) * 6] % 7), rel=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [({"average": 0.1}, "shorter than the sample time"), ({"average": 500.0}, "too short")],
-)
-def test_an_impossible_grid_is_refused(change, says):
-    with pytest.raises(UserError, match=says):
-        make_grid([plant_log()], **change)
-
-
-def test_a_log_without_an_input_is_refused():
-    log = make_log(np.arange(100.0), {"t": (np.arange(100.0), "degC", "output")})
-    with pytest.raises(UserError, match="no input"):
-        check_data([log])
 
 
 # ---- what a plant rests on ----

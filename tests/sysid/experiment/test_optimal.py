@@ -76,13 +76,6 @@ def test_constant_full_input_is_best_where_only_the_gain_is_unknown(block):
     np.testing.assert_array_equal(q[6:], 100.0)
 
 
-def test_nothing_is_learnt_from_an_experiment_at_rest(block):
-    forecast = ExperimentForecast(block)
-    at_rest = np.zeros((600, 1))
-    assert forecast.bits(at_rest) == pytest.approx(0.0, abs=1e-9)
-    np.testing.assert_allclose(forecast.covariance(at_rest), block.covariance, rtol=1e-9)
-
-
 def test_twice_the_experiment_is_the_same_experiment_read_twice_as_well(boards):
     u = inputs_of(boards, schedule_for(boards, "prbs", 20.0, lowest=5.0, highest=90.0, seed=0)[0])
     sharper = replace(boards, scores=PlantScores(independent_s={"t1": 10.0, "t2": 10.0}, average_s=5.0))
@@ -206,12 +199,6 @@ def test_a_schedule_is_the_same_with_the_same_seed(boards):
     assert not first.identical(other)
 
 
-def test_widths_are_those_of_the_plants_intervals(boards):
-    widths = interval_widths(boards, boards.covariance)
-    for name, (low, high) in boards.intervals(0.9).items():
-        assert widths[name] == pytest.approx(high - low)
-
-
 @pytest.mark.parametrize("name", ["gripper", "tclab"])
 def test_the_belief_before_any_log_is_the_priors(name):
     model = load_network(name)
@@ -298,7 +285,7 @@ def test_the_forecast_is_right_for_each_parameter(kept):
 
 @pytest.mark.parametrize(
     ("forgotten", "where"),
-    [("the model discrepancy", "t_room"), ("what the warm-up tells of the start", "lag_2")],
+    [("the model discrepancy", "t_room"), ("what the warm-up shows of the start", "lag_2")],
 )
 def test_a_forecast_without_what_a_fit_knows_is_wrong(kept, forgotten, where):
     u, before, stated = kept

@@ -14,10 +14,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.linalg import expm
 
 from thermogrip.sysid.models.jit_rollout import WIDTH, Kernel
-from thermogrip.sysid.models.network import load_network
 
 
 @dataclass
@@ -232,19 +230,3 @@ def test_arrays_that_do_not_belong_together_are_refused(which: int):
     for wrong in (arrays[which][:3], arrays[which][..., :-1]):
         with pytest.raises(ValueError, match="do not belong together"):
             KERNEL.rollout(*arrays[:which], wrong, *arrays[which + 1 :], 0.1)
-
-
-def test_the_gripper_follows_the_exponential_of_its_matrix():
-    """Without drive and at equal ambients the network is linear: x(t) = expm(A t) x(0)."""
-    model, n, h = load_network("gripper"), 400, 0.05
-    p = model.prior.copy()
-    p[model.parameters.index("drive_offset")] = 0.0
-    u, d = np.array([0.0, 1.0]), np.zeros(1)
-    unit = np.eye(model.n_x)
-    rates = np.array(
-        model.flows(list(unit), list(u), list(d), list(p))
-    )  # column j: from one degree of state j
-    A = rates / np.array(model.capacities(list(p)))[:, None]
-    x0 = np.random.default_rng(0).uniform(-5.0, 5.0, (1, model.n_x))
-    _, end = model.rollout(x0, np.tile(u, (1, n, 1)), np.tile(d, (1, n, 1)), p[None], h)
-    np.testing.assert_allclose(end[0], expm(A * n * h) @ x0[0], atol=2e-4)

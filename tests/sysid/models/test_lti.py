@@ -1,4 +1,4 @@
-"""Linear algebra of linear models, each piece against what it stands for."""
+"""Linear algebra of linear models, each piece against its definition."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.export.linearise import linearise_plant
 from thermogrip.sysid.models.lti import (
+    StartPrior,
     constrained_lstsq,
     covariance_root,
+    estimate_starts,
     evaluate_terms,
     product_of,
     read_terms,
@@ -111,3 +113,38 @@ def test_a_plant_that_grows_says_how_fast():
     plant = replace(box(), model=unstable)
     with pytest.raises(UserError, match=rf"grows e-fold in {2.0 / np.log(1.01):.3g} s"):
         linearise_plant(plant, inputs={"q": 1.0}, dt=2.0)
+
+
+@pytest.mark.parametrize(("noise", "nuisance"), [(0.1, 0.0), (0.3, 0.5), (0.05, 2.0)])
+def test_a_start_is_ridge_regression_on_state_and_offsets(noise: float, nuisance: float):
+    rng = np.random.default_rng(2)
+    A, B, C = (
+        np.array([[0.9, 0.05], [0.1, 0.8]]),
+        np.array([[0.4], [0.1]]),
+        np.array([[1.0, 0.0], [0.3, 1.0]]),
+    )
+    spread, scale = np.array([[2.0, 0.5], [0.5, 1.0]]), np.array([3.0, 0.5])
+    model = StateSpaceModel(("q",), (), ("a", "b"), A=A, B=B, C=C, dt=1.0, y0=[20.0, 30.0], spread=spread)
+    u, y = rng.random((15, 1)), np.array([20.0, 30.0]) + rng.normal(size=(15, 2))
+    y[0, 1] = y[4] = np.nan
+    priors = [StartPrior(noise, nuisance), StartPrior(0.2, 0.0)]
+    x0, offset = estimate_starts(model, y, u, np.zeros((15, 0)), dt=1.0, scale=scale, priors=priors)
+
+    rest = model.rest([y[0, 0], y[1, 1]], u.mean(axis=0), [], ())
+    free = model.rollout(rest[None], u[None], np.zeros((1, 15, 0)), (), 1.0)[0][0]
+    rows, right = [], []
+    for k in range(15):
+        for j in (0, 1):
+            if np.isfinite(y[k, j]):
+                by = np.append((C @ np.linalg.matrix_power(A, k))[j], np.eye(2)[j])
+                rows.append(by / (noise * scale[j]))
+                right.append((y[k, j] - free[k, j]) / (noise * scale[j]))
+    state = np.linalg.cholesky(np.linalg.inv(spread)).T
+    rows += [*np.hstack([state, np.zeros((2, 2))])]
+    keep = 4 if nuisance else 2  # without a spread of their own there are no offsets
+    rows += [np.append([0.0, 0.0], e / (nuisance * scale)) for e in np.eye(2)] if nuisance else []
+    right += [0.0] * (keep if nuisance else 2)
+    want = np.linalg.lstsq(np.array(rows)[:, :keep], np.array(right), rcond=None)[0]
+    np.testing.assert_allclose(x0[0], rest + want[:2], atol=1e-6)
+    np.testing.assert_allclose(offset[0], want[2:] if nuisance else [0.0, 0.0], atol=1e-6)
+    assert offset[1].tolist() == [0.0, 0.0]

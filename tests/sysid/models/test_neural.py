@@ -1,4 +1,4 @@
-"""The neural rung: its derivatives, what it learns, that it stays bounded, what it refuses."""
+"""The neural black box: its derivatives, what it learns, that it stays bounded, what it refuses."""
 
 from __future__ import annotations
 
@@ -150,20 +150,13 @@ def test_a_fifth_of_the_readings_lost_costs_little(fit_one):
     assert float(np.sqrt(np.nanmean((seen - segment.y)[50:] ** 2))) < 0.15
 
 
-def test_two_logs_are_one_fit_with_a_start_each(fit_one):
-    logs = [tank_log(400, seed=s, name=str(s)) for s in range(2)]
-    model = fit_one("neural", make_grid(logs, average=1.0), states=2, units=3, members=2)
-    seen, segment = simulated(model, tank_log(seed=3))
-    assert float(np.sqrt(np.nanmean((seen - segment.y)[50:] ** 2))) < 0.25
-
-
 def test_the_rung_chooses_by_free_run_and_its_plant_comes_back_from_its_file(tmp_path):
-    rung = fit_black_box("neural", [tank_log(400)], average=2.0)
-    assert rung.plant.model.kind == "neural"
-    assert rung.choice.structure.label in {f"{n} states, {h} units" for n in (2, 3, 4) for h in (3, 8)}
-    again = Plant.load(rung.plant.save(tmp_path / "plant.json"))
+    found = fit_black_box("neural", [tank_log(400)], average=2.0)
+    assert found.plant.model.kind == "neural"
+    assert found.choice.structure.label in {f"{n} states, {h} units" for n in (2, 3, 4) for h in (3, 8)}
+    again = Plant.load(found.plant.save(tmp_path / "plant.json"))
     fresh = tank_log(seed=4)
-    one, other = (free_run(plant, fresh, warmup=50.0, score_from=50.0) for plant in (rung.plant, again))
+    one, other = (free_run(plant, fresh, warmup=50.0, score_from=50.0) for plant in (found.plant, again))
     assert one.scores["level"].rmse == other.scores["level"].rmse < 0.5
 
 

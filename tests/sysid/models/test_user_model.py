@@ -17,7 +17,7 @@ from scipy.integrate import solve_ivp
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.sysid.greybox.fit import fit_network, free_runs
-from thermogrip.sysid.greybox.posterior import sample_posterior, with_draws
+from thermogrip.sysid.greybox.posterior import with_draws
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.models.network_spec import network_from_dict
@@ -116,25 +116,6 @@ def test_a_class_and_the_same_network_from_a_file_agree():
     np.testing.assert_allclose(got, seen, atol=1e-6)
 
 
-def test_the_fit_of_a_class_is_the_fit_of_the_network():
-    t = np.arange(0.0, 900.0, 1.0)
-    q, air = (t % 200 < 100).astype(float), np.full(t.size, 21.0)
-    truth = prior_plant(own_model(Block))
-    truth = replace(truth, values=truth.values | {"G": 0.8, "P": 17.0})
-    signals = {"q": (q, "1", "input"), "air": (air, "degC", "disturbance")}
-    run = truth.simulate(make_log(t, signals | {"t": (air, "degC", "output")}))
-    rng = np.random.default_rng(0)
-    log = make_log(
-        t, signals | {"t": (run["t"].values + 0.05 * rng.standard_normal(t.size), "degC", "output")}
-    )
-    plant = fit_network(own_model(Block), [log])
-    assert plant.values["G"] == pytest.approx(0.8, rel=0.01)
-    assert plant.values["P"] == pytest.approx(17.0, rel=0.01)
-    low, high = plant.intervals()["G"]
-    assert low < 0.8 < high
-    assert high / low < 1.1
-
-
 def test_the_parameters_of_noisy_tanks_are_found_again():
     truth = {"gain": 0.062, "drain": 0.071}
     plant = fit_network(own_model(Tanks), [pumped(1, sd=0.05, **truth), pumped(2, sd=0.05, **truth)])
@@ -143,16 +124,6 @@ def test_the_parameters_of_noisy_tanks_are_found_again():
     assert plant.noise["level"] < 0.06
     assert "V" in plant.verdict
     assert "degC" not in plant.verdict
-
-
-def test_a_posterior_of_a_class_covers_its_truth():
-    truth = {"gain": 0.062, "drain": 0.071}
-    logs = [pumped(1, sd=0.05, **truth)]
-    plant, record = sample_posterior(fit_network(own_model(Tanks), logs), logs, max_steps=1500)
-    assert record.converged, record.verdict
-    for name, value in truth.items():
-        low, high = plant.intervals(0.99)[name]
-        assert low < value < high, name
 
 
 SCALED = PARAMETERS | {"C": {"unit": "J/K", "value": 50.0, "sd_log": 0.5}}  # ratios alone are seen
@@ -451,21 +422,6 @@ def test_the_example_of_two_tanks_starts_where_its_lower_level_stands_still():
         _, lower, reading = model.code.rhs(x, [0.0], [], p)
         np.testing.assert_allclose([lower, reading], 0.0, atol=1e-12)
         np.testing.assert_allclose(model.output(x, p), level)
-
-
-def test_the_reading_of_the_example_stands_still_when_the_level_turns():
-    _, _, _, read = cascade()
-    _, _, _, free = cascade(slack=0.0)
-    held, now = [], free[0]
-    for value in free:  # the play of a gear, sample by sample
-        now = min(max(now, value - 0.1), value + 0.1)
-        held.append(now)
-    inside = np.array(held) < 9.8  # above, the free reading ends and no longer shows the level
-    lag = np.max(np.abs(np.diff(free, 2))) / 4.0  # both follow within a second: a change of pace parts them
-    assert np.max(np.abs(read - held)[inside]) < lag
-    still = [np.mean(np.abs(np.diff(y))[inside[1:]] < 1e-6) for y in (read, free)]
-    assert still[0] > 0.1
-    assert still[1] == 0.0
 
 
 def test_the_example_finds_the_kink_and_the_play_of_a_sensor_again():
