@@ -9,14 +9,14 @@ boundary temperatures (measured ambients, then fixed ones).  Heat flows through
     heaters        q_i  = P u
     Peltiers       face: a I T_face + R I^2 / 2,    sink: -a I T_sink + R I^2 / 2,    T in kelvin
 
-and C_i dx_i/dt = sum of q.  A sensor is a state too: its time constant stands for C, a unit flow from its
-node for q.  Conductances and flows may hang on a switch u_s (a pump): they carry off + (1 - off) u_s of their
+and C_i dx_i/dt = sum of q.  A sensor is a state too: its time constant is C, a unit flow from its
+node for q.  Conductances and flows may hang on a switch u_s (a pump): they have off + (1 - off) u_s of their
 value. The current follows the command v = u / full + u_0 by two gains, I = I_max (g_heat max(v, 0) + g_cool
 min(v, 0)), and droops by r per 50 K between face and sink.  A pulse-width driver ("duty") pushes I_max (1 -
 r dT / 50) for the share v of the time, so that its Joule heat is proportional to v, not to its square.
-Commands smaller than a dead zone v_d move nothing: v - v_d beyond it stands for v.  a and R may follow the
+Commands smaller than a dead zone v_d move nothing: v - v_d beyond it replaces v.  a and R may follow the
 mean temperature of the element by a share per kelvin from 25 degC.  The bend b of a conductance (natural
-convection carries more the larger the difference) is 0 where the file does not ask for it.
+convection moves more the larger the difference) is 0 where the file does not ask for it.
 
 **Time step.**  ROS2 of Verwer et al. [1]_, for dx/dt = f(x) over a step h with the input held:
 

@@ -1,6 +1,6 @@
 """A user's own class as a model: fitted, sampled, validated and simulated as a thermal network is.
 
-What the class must say stands in :mod:`thermogrip.sysid.models.user_class`; here are its equations in time.
+What the class must say: :mod:`thermogrip.sysid.models.user_class`; here are its equations in time.
 With dx/dt = f(x, u, d, p) and u, d held over a step, each step of the simulation is cut into n pieces, each
 a step of the classical Runge-Kutta rule of fourth order.
 

@@ -104,7 +104,7 @@ class PlantData:
             raise UserError(f"draw {k} is negative", hint="count draws from 0")
         if k == 0:
             return self
-        # a golden-ratio walk visits a chain evenly, however few draws are taken
+        # a golden-ratio sequence visits a chain evenly, however few draws are taken
         along = (k * 0.6180339887498949) % 1.0
         if self.refits:
             return replace(self, model=self.refits[int(along * len(self.refits))])

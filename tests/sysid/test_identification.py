@@ -54,18 +54,18 @@ def test_leaving_one_log_out_gives_a_row_for_every_model_and_log():
 def test_a_log_is_scored_in_the_fit_with_the_warmup_that_its_held_out_part_had():
     # with 5 s in one and 50 s in the other, errors of the start made a fit seem less good on what it had seen
     logs = [plant_log(500, seed=s, name=name) for s, name in enumerate("abc")]
-    one = identify(logs[0], models=["arx"], average=2.0).rows
+    one = identify(logs[0], models=["arx"], average=2.0, draws=0).rows
     assert {row.n for row in one if not row.held_out} == {450}
     assert {row.n for row in one if row.held_out} == {150}
-    several = identify(logs, models=["arx"], average=2.0, leave_one_out=True).rows
+    several = identify(logs, models=["arx"], average=2.0, leave_one_out=True, draws=0).rows
     assert {row.n for row in several} == {495}
 
 
 def test_a_held_out_log_cannot_change_its_own_prediction():
     logs = [plant_log(500, seed=s, name=name) for s, name in enumerate("abc")]
-    first = identify(logs, models=["arx"], leave_one_out=True, average=2.0)
+    first = identify(logs, models=["arx"], leave_one_out=True, average=2.0, draws=0)
     logs[2]["t"].values[10:] += 3.0  # after its warm-up
-    second = identify(logs, models=["arx"], leave_one_out=True, average=2.0)
+    second = identify(logs, models=["arx"], leave_one_out=True, average=2.0, draws=0)
     structures = [next(r.structure for r in f.rows if r.log == "c" and r.held_out) for f in (first, second)]
     assert structures[0] == structures[1]
     errors = [next(r.rmse for r in f.rows if r.log == "c" and r.held_out) for f in (first, second)]
@@ -192,7 +192,7 @@ def test_draws_that_cannot_be_made_are_a_note_and_the_fit_is_kept(monkeypatch, k
 def test_a_signal_that_only_a_later_log_has_is_left_out_and_reported():
     first, second = plant_log(), plant_log(seed=1, name="b")
     second["t_room"] = ("time", np.full(second.sizes["time"], 22.0), {"units": "degC", "role": "disturbance"})
-    found = identify([first, second], models=["arx"], average=1.0, draws=0)
+    found = identify([first, second], models=["arx"], average=2.0, draws=0)
     assert "b: t_room left out, for a has no such signal" in found.notes
 
 

@@ -128,6 +128,7 @@ def _logs(plant: Plant) -> np.ndarray:
     return np.where([plant.scales[name] == "log" for name in plant.free], np.log(np.abs(natural)), natural)
 
 
+@pytest.mark.slow
 def test_fits_have_the_forecast_intervals(boards, designs):
     schedules, _ = designs
     count, volumes = 8, {}
@@ -332,6 +333,7 @@ def world(request, boards, kept):
     return u["optimal"], *_before_and_after(boards, u, y, 8)
 
 
+@pytest.mark.slow
 def test_what_fits_state_falls_into_the_range_of_the_forecast(world):
     u, before, stated = world
     forecasts = [ExperimentForecast(plant, draws=0) for plant in before]

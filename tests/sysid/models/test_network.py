@@ -139,17 +139,6 @@ def test_halving_the_step_quarters_the_error():
     assert errors[1] / errors[2] == pytest.approx(4.0, rel=0.2)
 
 
-def two_nodes(c1: float, c2: float, g: float) -> NetworkModel:
-    return model_of(
-        declare(
-            outputs={"t": {"node": "a"}},
-            nodes={"a": {"capacity": "C1"}, "b": {"capacity": "C2"}},
-            links={"l": {"between": ["a", "b"], "conductance": "G"}},
-            parameters={"C1": fixed("J/K", c1), "C2": fixed("J/K", c2), "G": fixed("W/K", g)},
-        )
-    )
-
-
 def test_peltier_cools_most_at_seebeck_times_temperature_over_resistance():
     model = load_network("gripper")
     p = dict(zip(model.parameters, model.prior)) | {"current": 40.0, "seebeck": 0.05, "resistance": 2.0}
@@ -227,8 +216,8 @@ def test_compiled_rows_and_symbols_run_the_same_equations(name: str):
 
 
 def test_without_llvmlite_the_same_lines_run_in_numpy(monkeypatch: pytest.MonkeyPatch):
-    model = two_nodes(30.0, 60.0, 2.0)
-    u, d, x = np.zeros((1, 20, 1)), np.zeros((1, 20, 0)), np.array([[50.0, 20.0]])
+    model = load_network("tclab")
+    u, d, x = np.full((1, 20, 2), 30.0), np.zeros((1, 20, 0)), np.full((1, 4), 25.0)
     want = model.rollout(x, u, d, model.prior[None], 1.0)[0]
     _kernel.cache_clear()
     monkeypatch.setitem(sys.modules, "thermogrip.sysid.models.jit_rollout", None)
@@ -329,12 +318,14 @@ def test_an_element_sees_its_input_as_a_share_of_full_scale(unit: str, full: flo
     joule = 2.0 * amps**2 / 2
     want = [0.05 * amps * (40.0 + KELVIN) + joule, -0.05 * amps * (20.0 + KELVIN) + joule]
     assert got == pytest.approx(want)
+
+
+def heated(**drive: Any) -> NetworkModel:
+    """A heater of 20 W on the first body."""
     heater = {"h": {"node": "a", "input": "drive", "power": "P"}}
-    inputs = {"drive": {"unit": unit, "range": [0.0, full]}}
     link = {"l": {"between": ["a", "b"], "conductance": "G"}}
     numbers = {"P": ("W", 20.0), "G": ("W/K", 1.0)}
-    model = model_of(declared(numbers, inputs=inputs, heaters=heater, links=link))
-    assert heats(model, [25.0, 25.0], [full]) == pytest.approx([20.0, 0.0])
+    return model_of(declared(numbers, inputs={"drive": drive}, heaters=heater, links=link))
 
 
 @pytest.mark.parametrize(
@@ -351,21 +342,14 @@ def test_an_element_sees_its_input_as_a_share_of_full_scale(unit: str, full: flo
     ],
 )
 def test_full_scale_has_one_meaning(said: dict[str, Any], full: float):
-    heater = {"h": {"node": "a", "input": "drive", "power": "P"}}
-    link = {"l": {"between": ["a", "b"], "conductance": "G"}}
-    numbers = {"P": ("W", 20.0), "G": ("W/K", 1.0)}
-    model = model_of(declared(numbers, inputs={"drive": said}, heaters=heater, links=link))
+    model = heated(**said)
     assert heats(model, [25.0, 25.0], [full / 2]) == pytest.approx([10.0, 0.0])
     again = NetworkModel.from_dict(model.to_dict())
     assert heats(again, [25.0, 25.0], [full / 2]) == pytest.approx([10.0, 0.0])
 
 
 def test_a_plant_of_version_0_1_0_keeps_its_full_scale_of_1():
-    heater = {"h": {"node": "a", "input": "drive", "power": "P"}}
-    link = {"l": {"between": ["a", "b"], "conductance": "G"}}
-    inputs = {"drive": {"unit": "V", "range": [0.0, 10.0]}}
-    numbers = {"P": ("W", 20.0), "G": ("W/K", 1.0)}
-    content = model_of(declared(numbers, inputs=inputs, heaters=heater, links=link)).to_dict()
+    content = heated(unit="V", range=[0.0, 10.0]).to_dict()
     del content["network"]["inputs"]["drive"]["full_scale"]
     assert heats(NetworkModel.from_dict(content), [25.0, 25.0], [0.5]) == pytest.approx([10.0, 0.0])
 

@@ -145,12 +145,12 @@ def test_a_state_at_rest_reads_what_was_asked_and_hardly_moves(tank):
 def test_a_fifth_of_the_readings_lost_costs_little(fit_one):
     fresh = tank_log(seed=2)
     grid = make_grid([tank_log(lost=0.2)], average=1.0)
-    model = fit_one("neural", grid, states=2, units=4, members=4)
+    model = fit_one("neural", grid, states=2, units=4, members=2)
     seen, segment = simulated(model, fresh)
     assert float(np.sqrt(np.nanmean((seen - segment.y)[50:] ** 2))) < 0.15
 
 
-def test_the_rung_chooses_by_free_run_and_its_plant_comes_back_from_its_file(tmp_path):
+def test_the_neural_fit_chooses_by_free_run_and_its_plant_comes_back_from_its_file(tmp_path):
     found = fit_black_box("neural", [tank_log(400)], average=2.0)
     assert found.plant.model.kind == "neural"
     assert found.choice.structure.label in {f"{n} states, {h} units" for n in (2, 3, 4) for h in (3, 8)}
