@@ -165,7 +165,7 @@ class _Steps:
 
     def __init__(self, model: ReferenceModel, h: float) -> None:
         self.model, self.h = model, h
-        self.n_x, self.n_u, self.n_d, self.n_p = model.n_x, 1, 2, 0
+        self.sizes = model.n_x, 1, 2, 0
 
     def prepare(self, p: Any) -> list[Any]:
         return []

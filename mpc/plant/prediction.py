@@ -311,8 +311,6 @@ class _TangentSteps:
     State, inputs and disturbances are the model's, then their directions; of the inputs, the drives alone.
     """
 
-    n_p = 0
-
     def __init__(self, model: PredictionModel) -> None:
         import casadi as ca
 
@@ -322,7 +320,7 @@ class _TangentSteps:
         results = ca.cse([ca.densify(after), ca.densify(slope)])
         self._function = ca.Function("step", [*symbols, *along], results)
         self._names = {getattr(ca, key): key for key in dir(ca) if key.startswith("OP_")}
-        self.n_x, self.n_u, self.n_d = 2 * model.n_x, 2 * model.n_u, 2 * model.n_d
+        self.sizes = 2 * model.n_x, 2 * model.n_u, 2 * model.n_d, 0
         self._C, self._level = model.C.tolist(), model.output(np.zeros(model.n_x)).tolist()
 
     def prepare(self, p: Sequence[Any]) -> list[Any]:
