@@ -66,12 +66,3 @@ def test_early_contact_of_one_material_with_wood_is_the_closed_form(fv: ModuleTy
     rise = 20.0 * e_obj / (e_dev + e_obj) * (1 - erfcx(a * np.sqrt(t_end)))
     face = cells[0, 199] + 0.5 * (cells[0, 199] - cells[0, 198])
     assert face - 23.0 == pytest.approx(rise, rel=0.01)
-
-
-def test_two_touches_hold_their_order_and_hide_the_temperature(fv: ModuleType) -> None:
-    record, true = fv.touched_twice(("copper", "wood"), repeats=1, seed=5)
-    assert record["touch"].values.tolist() == [1.0, 1.0, 2.0, 2.0]
-    assert "t_object" not in record or np.isnan(record["t_object"].values).all()
-    assert true.shape == (2,)
-    gap = np.diff(record["t_gripper"].values.reshape(2, 2), axis=0)
-    assert np.abs(gap).min() >= 15.0

@@ -233,14 +233,6 @@ def test_the_same_grasp_in_training_and_test_is_found_under_any_name(small_grasp
     assert shared_grasps([half], [same_id]) == ["new/g1"]
 
 
-@pytest.mark.parametrize("cut", [0.1, 0.5, 0.9])
-def test_a_truncated_netcdf_is_refused(tmp_path, small_grasps, cut):
-    path = write_grasps(small_grasps, tmp_path / "x.nc")
-    whole = path.read_bytes()
-    path.write_bytes(whole[: int(cut * len(whole))])
-    assert "x.nc" in refused(path)
-
-
 def test_columns_that_nobody_asked_for_are_left_out_and_reported(pair):
     plain = samples("a")
     head, *rows = plain.splitlines()

@@ -224,9 +224,8 @@ def test_a_constant_log_of_an_hour_at_100_hz_is_no_attack(tmp_path: Path) -> Non
     text = io.StringIO()
     text.write("time_s,drive,t_tank_degC\n")
     text.writelines(f"{k / 100:.2f},1,25\n" for k in range(360_000))
-    for name, pack in (("a.csv.gz", gzip.compress), ("a.csv.xz", lzma.compress)):
-        (tmp_path / name).write_bytes(pack(text.getvalue().encode()))
-        assert read_log(tmp_path / name).sizes["time"] == 360_000
+    (tmp_path / "a.csv.xz").write_bytes(lzma.compress(text.getvalue().encode(), preset=1))
+    assert read_log(tmp_path / "a.csv.xz").sizes["time"] == 360_000
 
 
 def test_every_size_that_is_allowed_grows_with_the_packed_one() -> None:

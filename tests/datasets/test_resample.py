@@ -45,15 +45,6 @@ def test_a_held_mean_is_the_integral_of_the_staircase(log, start, cells):
         assert got[cell, 0] == pytest.approx(want, abs=2 * 26 / 20_001)
 
 
-@settings(max_examples=50, deadline=None)
-@given(staircases(), st.integers(1, 5))
-def test_the_held_integral_does_not_depend_on_the_grid(log, n):
-    a, b = log["time"].values[[0, -1]]
-    edges = np.linspace(a, b, n + 1)
-    whole = hold_average(log, ("drive",), [a, b])[0, 0]
-    assert hold_average(log, ("drive",), edges).mean() == pytest.approx(whole, abs=1e-9)
-
-
 def test_an_input_switched_inside_a_cell_counts_by_its_time():
     log = made([0.0, 0.25, 10.0], [0.0, 1.0, 0.0])
     np.testing.assert_allclose(hold_average(log, ("drive",), [0.0, 1.0, 2.0]).ravel(), [0.75, 1.0])
@@ -72,22 +63,6 @@ def test_a_cut_keeps_the_times_and_the_facts(small_log):
     assert (part["time"].values < 3.0).all()
     assert part.attrs == small_log.attrs
     assert part["battery"].attrs == {"units": "V", "role": "other"}
-
-
-@settings(max_examples=50, deadline=None)
-@given(staircases(), st.floats(0, 1))
-def test_two_cuts_at_one_time_are_the_whole_log(log, share):
-    time = log["time"].values
-    at = time[0] + share * (time[-1] - time[0])
-    sizes = []
-    for ends in ((-np.inf, at), (at, np.inf)):
-        try:
-            sizes.append(cut(log, *ends).sizes["time"])
-        except UserError:
-            inside = (time >= ends[0]) & (time < ends[1])
-            assert inside.sum() < 2
-            sizes.append(int(inside.sum()))
-    assert sum(sizes) == time.size
 
 
 def test_the_gap_of_the_example_is_found():
@@ -162,17 +137,3 @@ def test_an_averaged_log_reports_it(small_log):
 def test_blocks_that_cannot_be_are_refused(small_log, seconds, words):
     with pytest.raises(UserError, match=words):
         average(small_log, seconds)
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.integers(0, 1000), st.floats(0.5, 5.0))
-def test_averaging_keeps_the_mean_of_a_regular_log(seed, seconds):
-    rng = np.random.default_rng(seed)
-    log = made(np.arange(400) * 0.5, rng.uniform(-1, 1, 400), rng.normal(20, 1, 400))
-    got = average(log, seconds)
-    end = min(got["time"].values[-1] + seconds, 200.0)
-    widths = np.diff(np.append(got["time"].values, end))
-    mean = np.average(column(got, "drive"), weights=widths)
-    assert mean == pytest.approx(hold_average(log, ("drive",), [0.0, end])[0, 0], abs=1e-9)
-    assert column(log, "t_a").min() <= column(got, "t_a").min()
-    assert column(got, "t_a").max() <= column(log, "t_a").max()

@@ -129,7 +129,21 @@ def test_liquid_nitrogen_and_a_block_of_200_degrees_are_temperatures(t_object: f
     assert grasps["t_object"].values.tolist() == [t_object]
 
 
-@pytest.mark.parametrize("t_object", [293.15, 200.1, -200.1])
-def test_what_only_kelvin_or_a_broken_sensor_shows_is_no_temperature_in_degC(t_object: float) -> None:
-    with pytest.raises(UserError, match=re.escape(f"grasp 'b' has a t_object of {t_object:g} degC")):
-        make_grasps([-1.0, 0.0, 1.0], [[23.0, 23.0, 25.0]] * 2, ["a", "b"], t_object=[43.0, t_object])
+@pytest.mark.parametrize("name", ["t_object", "t_gripper", "t_ambient", "t_surface", "t_surface_2"])
+@pytest.mark.parametrize("value", [293.15, 200.1, -200.1])
+def test_what_only_kelvin_or_a_broken_sensor_shows_is_no_temperature_in_degC(name: str, value: float) -> None:
+    skin = np.full((2, 3), 23.0)
+    about = {"t_surface": skin, "t_surface_2": skin.copy(), "t_object": [43.0, 43.0]}
+    about |= (
+        {name: np.where([[False], [True]], value, 23.0) * np.ones((2, 3))}
+        if "surface" in name
+        else {name: [23.0, value]}
+    )
+    with pytest.raises(UserError, match=re.escape(f"grasp 'b' has a {name} of {value:g} degC; give degrees")):
+        make_grasps([-1.0, 0.0, 1.0], grasp_id=["a", "b"], **about)
+
+
+@pytest.mark.parametrize("label", ["Train", "test ", "TRAIN"])
+def test_a_misspelt_split_is_refused(label: str) -> None:
+    with pytest.raises(UserError, match="is neither train nor test; write 't"):
+        make_grasps([-1.0, 0.0, 1.0], [[23.0] * 3] * 2, ["a", "b"], split=["train", label])

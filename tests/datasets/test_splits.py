@@ -118,15 +118,6 @@ def test_the_shipped_split_is_that_of_the_column():
         assert (grasps["split"].values[test] == "test").all()
 
 
-def test_touches_of_one_block_stay_together_in_the_example():
-    grasps = load_example_grasps()["exp5_two_touch_unknown_object"]
-    splits = list(by_grasp(grasps, train_per_class=3, repeats=5))
-    assert len(splits) == 5
-    for train, test in splits:
-        check_apart(grasps, train, test)
-        assert train.size == 8 * 3 * 2
-
-
 @pytest.mark.parametrize(
     ("call", "words"),
     [

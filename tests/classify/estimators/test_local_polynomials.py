@@ -89,15 +89,6 @@ def test_a_pool_says_what_is_tried(make_touches: Maker, monkeypatch: pytest.Monk
         ExpansionClassifier(pool="huge").fit(fresh)
 
 
-def test_new_grasps_are_named_and_probabilities_sum_to_one(make_touches: Maker) -> None:
-    model = make_classifier("expansions").fit(make_touches())
-    fresh = make_touches(seed=5)
-    p = model.predict_proba(fresh)
-    np.testing.assert_allclose(p.sum(axis=1), 1.0)
-    assert np.mean(model.predict(fresh) == fresh["material"].values) > 0.9
-    assert sum(model.weights_.values()) == pytest.approx(1.0)
-
-
 def test_two_sensors_say_what_one_cannot(make_touches: Maker) -> None:
     """Material or object temperature: one sensor sees their product, two at different levels see both."""
     rng = np.random.default_rng(0)

@@ -68,27 +68,25 @@ def by_pytorch(
     return state, np.array(losses)
 
 
+# double precision compiles all of it once more
+@pytest.mark.parametrize(
+    ("real", "error"),
+    [(np.float32, 5e-6), pytest.param(np.float64, 1e-9, marks=pytest.mark.slow)],
+)
 @pytest.mark.parametrize(
     ("hidden", "sensors", "batch", "n_time"), [(32, 1, 60, 20), (12, 2, 24, 20), (40, 1, 7, 6), (1, 3, 60, 1)]
 )
-def test_double_precision_steps_are_pytorchs(hidden: int, sensors: int, batch: int, n_time: int) -> None:
-    weights, x, target = problem(np.float64, hidden=hidden, sensors=sensors, n_time=n_time)
+def test_steps_are_pytorchs(
+    hidden: int, sensors: int, batch: int, n_time: int, real: type, error: float
+) -> None:
+    weights, x, target = problem(real, hidden=hidden, sensors=sensors, n_time=n_time)
     epochs = shuffled(60, batch, 4)
     got, losses = train_network(weights, x, target, epochs, learning_rate=0.003)
     expected, reference = by_pytorch(weights, x, target, epochs)
-    np.testing.assert_allclose(losses, reference, rtol=1e-9)
+    np.testing.assert_allclose(losses, reference, rtol=error)
     for name, value in expected.items():
         assert got[name].shape == value.shape
-        np.testing.assert_allclose(got[name], value, atol=1e-7)
-
-
-def test_single_precision_agrees_to_rounding() -> None:
-    weights, x, target = problem(np.float32, hidden=32)
-    epochs = shuffled(60, 20, 20)
-    _, losses = train_network(weights, x, target, epochs, learning_rate=0.003)
-    _, reference = by_pytorch(weights, x, target, epochs)
-    assert reference[-1] < 0.8 * reference[0]
-    np.testing.assert_allclose(losses, reference, rtol=5e-6)
+        np.testing.assert_allclose(got[name], value, atol=max(100 * error, 1e-7))
 
 
 def test_the_numbers_do_not_depend_on_threads() -> None:
@@ -110,9 +108,8 @@ def test_what_is_not_a_number_is_not_hidden() -> None:
     assert np.isnan(losses[0])
 
 
-@pytest.mark.parametrize(("real", "most"), [(np.float32, 2e-7), (np.float64, 3e-7)])
-def test_tanh_is_cut_at_8_where_it_is_2e_7_from_1(real: type, most: float) -> None:
-    z = np.linspace(-30, 30, 3201).astype(real)[None]
+def test_tanh_is_cut_at_8_where_it_is_2e_7_from_1() -> None:
+    z = np.linspace(-30, 30, 3201, dtype=np.float32)[None]
     expected = np.tanh(z.astype(float))
-    _to_tanh(z, tuple(map(real, _CURVE)))
-    np.testing.assert_allclose(z, expected, atol=most)
+    _to_tanh(z, tuple(map(np.float32, _CURVE)))
+    np.testing.assert_allclose(z, expected, atol=2e-7)

@@ -134,13 +134,6 @@ def test_probabilities_are_calibrated_and_not_one_hot(machine: GraspClassifier, 
     assert -np.log(p[np.arange(60), np.searchsorted(machine.classes_, fresh["material"].values)]).mean() < 1.0
 
 
-def test_two_classes_have_two_probabilities(machine: GraspClassifier, make_touches: Maker) -> None:
-    grasps = make_touches(("copper", "wood"))
-    p = machine.fit(grasps).predict_proba(grasps)
-    assert p.shape == (16, 2)
-    assert np.mean(machine.predict(grasps) == grasps["material"].values) > 0.9
-
-
 def test_both_sensors_are_seen(machine: GraspClassifier, three: Grasps) -> None:
     """The first sensor alone says nothing here."""
     flat = three.assign(t_surface=0 * three["t_surface"] + 23.0, t_surface_2=three["t_surface"])

@@ -89,12 +89,6 @@ def test_a_metal_is_unknown_to_one_who_knows_only_wood(fitted: PosteriorClassifi
     assert all(0 <= row["p_unknown"] <= 1 for row in rows)
 
 
-def test_it_is_a_clonable_estimator(fitted: PosteriorClassifier) -> None:
-    copy = clone(fitted)
-    assert copy.get_params() == fitted.get_params()
-    assert not hasattr(copy, "device_")
-
-
 @pytest.mark.parametrize(
     ("params", "message"),
     [
