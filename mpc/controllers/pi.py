@@ -7,7 +7,7 @@ One loop for each controlled output, on the drive that moves it most:
 
 The last term (back-calculation) bleeds the integrator while the drive is limited, which is most of the
 time after a step of the target.  ``u_ff`` is the drive that holds the target in steady state, from the
-plant, weighted.  Where readings carry a time, dt is what really passed, for the integrator and for the slew
+plant, weighted.  Where readings have a time, dt is what really passed, for the integrator and for the slew
 alike, and a call before a move is due (:mod:`thermogrip.mpc.estimator.call_times`) holds the last one.
 
 Its loops are tuned by :mod:`thermogrip.mpc.design.simc`.

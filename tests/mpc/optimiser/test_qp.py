@@ -29,7 +29,7 @@ def random_problem(seed: int) -> tuple:
 
 @settings(max_examples=150, deadline=None)
 @given(st.integers(0, 10**6))
-@example(9345)  # a short row whose price is linear alone
+@example(9345)  # a short row whose penalty is linear alone
 def test_the_answer_fulfils_the_optimality_conditions(seed):
     H, f, A, lower, upper, soft, w, q = random_problem(seed)
     qp = CondensedQP(soft=soft, linear=w, quadratic=q)
@@ -43,7 +43,7 @@ def test_the_answer_fulfils_the_optimality_conditions(seed):
         tolerance = 1e-5 * length + 1e-9
         assert np.all((value <= upper + tolerance) | soft)
         assert np.all((value >= lower - tolerance) | soft)
-        # a multiplier stands only where its bound is active, and a soft one costs what its slack says
+        # a multiplier is only where its bound is active, and a soft one costs what its slack says
         assert np.all(
             (np.abs(lam) * length < 1e-7)
             | (np.minimum(np.abs(value - upper), np.abs(value - lower)) < tolerance)
@@ -52,8 +52,8 @@ def test_the_answer_fulfils_the_optimality_conditions(seed):
         assert np.all(lam[value > upper + tolerance] > -1e-9)
         assert np.all(lam[value < lower - tolerance] < 1e-9)
         broken = soft & (answer.slack > 10 * tolerance)
-        price = w + np.maximum(q, LEAST_QUADRATIC / length**2) * answer.slack
-        np.testing.assert_allclose(np.abs(lam)[broken], price[broken], rtol=1e-3, atol=1e-4)
+        penalty = w + np.maximum(q, LEAST_QUADRATIC / length**2) * answer.slack
+        np.testing.assert_allclose(np.abs(lam)[broken], penalty[broken], rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -118,7 +118,7 @@ def test_the_iteration_limit_is_a_status():
 
 
 def test_what_is_broken_is_said_at_either_end_and_of_soft_rows_only():
-    """Nearest to (3, -3) with x1 <= 1 and x2 >= -1 at a price of half a unit, and x1 + x2 = 0 hard."""
+    """Nearest to (3, -3) with x1 <= 1 and x2 >= -1 at a penalty of half a unit, and x1 + x2 = 0 hard."""
     A = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
     solver = CondensedQP(soft=[True, True, False], linear=[0.5, 0.5, 0.0], quadratic=[0.0, 0.0, 0.0])
     answer = solver.solve(
@@ -150,7 +150,7 @@ def test_a_row_that_contradicts_itself_is_an_answer_with_a_status(soft: bool):
 
 
 def test_a_hard_row_of_nothing_is_not_overlooked():
-    """0 x >= 1 is infeasible; the same at a price is paid whatever x is."""
+    """0 x >= 1 is infeasible; the same at a penalty is paid whatever x is."""
     H, f, A = np.eye(2), np.array([-1.0, 0.0]), np.zeros((1, 2))
     for soft, status in ((False, "infeasible"), (True, "solved")):
         solver = CondensedQP(soft=[soft], linear=[1.0], quadratic=[0.0])

@@ -48,9 +48,9 @@ def test_a_target_out_of_reach_is_reported_soon_and_kept_and_no_other_is(row, ta
     if latest is None:
         assert set(after) == {"ok"}
     else:
-        told = after.index("infeasible")
-        assert told <= latest
-        assert set(after[told:]) == {"infeasible"}
+        first_said = after.index("infeasible")
+        assert first_said <= latest
+        assert set(after[first_said:]) == {"infeasible"}
         found = re.search(r"no drive holds .* degC: (-?[0-9.]+) degC can be held", loop.advice[-1])
         assert float(found[1]) == pytest.approx(value, abs=0.6)
     if wanted():

@@ -163,7 +163,7 @@ class Done:
     tuning: Tuning
     search: Paper
     ran: list[dict[str, Any]]
-    told: list[float]
+    shares: list[float]
 
     def tried(self, name: str) -> list[Trial]:
         return [trial for trial in self.tuning.history if trial.controller == name]
@@ -175,7 +175,7 @@ class Done:
 def tuned(tank: Any, spec: Spec = SPEC, **changes: Any) -> Done:
     made: list[Paper] = []
     ran: list[dict[str, Any]] = []
-    told: list[float] = []
+    shares: list[float] = []
 
     def search(*items: Any) -> Paper:
         made.append(Paper(*items, **changes))
@@ -188,8 +188,8 @@ def tuned(tank: Any, spec: Spec = SPEC, **changes: Any) -> Done:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tuner, "Search", search)
         patch.setattr(tuner, "trial", run)
-        found = tune(tank, spec, seed=4, progress=lambda share, what: told.append(share))
-    return Done(found, made[0], ran, told)
+        found = tune(tank, spec, seed=4, progress=lambda share, what: shares.append(share))
+    return Done(found, made[0], ran, shares)
 
 
 @pytest.fixture(scope="module")
@@ -256,7 +256,7 @@ def test_the_kept_design_falls_back_to_the_tuned_pi(done: Done):
     assert loops != done.search.baseline.loops
 
 
-def test_where_the_search_won_nothing_the_default_stands_and_is_what_is_told_about(tank: Any):
+def test_where_the_search_won_nothing_the_default_is_kept_and_is_what_is_reported(tank: Any):
     def evaluate(name: str, draw: int) -> StepResult:
         settle = {"baseline": 140.0, "tuned": 141.0}.get(name, 200.0)
         return step_result(name, draw, settle_s=settle, bias=0.2 if name == "tuned" else 0.01)
@@ -273,7 +273,7 @@ def test_where_the_search_won_nothing_the_default_stands_and_is_what_is_told_abo
         assert found.settle_s == pytest.approx(100 * valley(start, BEST, 1.0))
 
 
-def test_of_the_tuned_design_each_knob_is_told_about(done: Done):
+def test_of_the_tuned_design_each_parameter_is_reported(done: Done):
     best = done.best("MPC")
     values = {found.knob: found.value for found in done.tuning.sensitivity}
     assert values == pytest.approx({parameter: best.parameters[parameter] for parameter in values})
@@ -309,7 +309,7 @@ def test_less_drive_is_taken_where_the_specs_own_score_gains_by_more_than_a_hund
     assert done.tuning.controller.design.move == best.parameters["move"]
     first = done.tuning.pareto
     assert (first.names[0], first.trials[0].parameters) == ("tuned", best.parameters)
-    # what is told about it is told at the search's length, not at that of the trade-offs
+    # what is reported of it is at the search's length, not at that of the trade-offs
     assert done.tuning.sensitivity[0].settle_s == pytest.approx(100 * best.score)
 
 
@@ -362,5 +362,5 @@ def test_the_file_holds_what_was_found(done: Done):
     ]
     # settling over the bound of 100 s, alike in all runs, so that the worst is the mean
     assert found.scores == pytest.approx({name: settle / 100 for name, settle in SETTLES.items()})
-    assert done.told == sorted(done.told)
-    assert done.told[-1] == 1.0
+    assert done.shares == sorted(done.shares)
+    assert done.shares[-1] == 1.0
