@@ -42,21 +42,7 @@ _HOME = {
     "sample_posterior": "sysid.greybox.posterior",
 }
 
-__all__ = [
-    "GripperModel",
-    "Plant",
-    "calibrate_gripper",
-    "check_data",
-    "excite",
-    "fit_network",
-    "free_run",
-    "identify",
-    "linearise_plant",
-    "load_network",
-    "own_model",
-    "read_log",
-    "sample_posterior",
-]
+__all__ = [*_HOME]
 
 
 def __getattr__(name: str) -> Any:

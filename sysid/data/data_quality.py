@@ -164,7 +164,7 @@ def _times(log: str, steps: Array, usual: float, holes: Sequence[tuple[int, floa
     jitter = float(np.std(steps[steps < 3 * usual]) / usual)
     says, even = f"rows are {usual:.3g} s apart, give or take {100 * jitter:.1f} %", jitter < 0.2
     if not even:
-        says += ": time stamps are doubtful, fast dynamics cannot be trusted"
+        says += ": time stamps are uncertain, fast dynamics cannot be trusted"
     found = Finding("jitter", log, "time", jitter, "1", "ok" if even else "warn", says)
     if not holes:
         return [found, Finding("gaps", log, "time", 0.0, "s", "ok", "no gap longer than 10 s")]
@@ -347,20 +347,6 @@ def _shifts(grid: Grid) -> list[Finding]:
     return out
 
 
-def reading_excess(logs: Sequence[Log], outputs: Sequence[str], seconds: float) -> dict[str, float]:
-    """Return by how much a reading lies off the mean of its bin by noise alone, by output, in its unit."""
-    steps = [np.diff(np.asarray(log["time"].values, dtype=float)) for log in logs]
-    within = [max(0.0, 1.0 - float(np.median(dt)) / seconds) for dt in steps]
-    out = {}
-    for name in outputs:
-        squares = [
-            share * _second_differences(column(log, name), dt) for log, dt, share in zip(logs, steps, within)
-        ]
-        known = np.concatenate(squares)
-        out[name] = float(np.sqrt(known.mean() / 6)) if known.size else 0.0
-    return out
-
-
 def _of(segment: Segment, grid: Grid) -> str:
     """Return which seconds of its log a stretch is, where a gap leaves more than one."""
     if sum(other.log == segment.log for other in grid.segments) == 1:
@@ -387,6 +373,20 @@ def _slow(u: Array) -> Array:
     width = max(1, len(u) // 10)
     area = np.vstack([np.repeat(u[:1], width, axis=0), u]).cumsum(axis=0)
     return np.asarray((area[width:] - area[:-width]) / width)
+
+
+def reading_excess(logs: Sequence[Log], outputs: Sequence[str], seconds: float) -> dict[str, float]:
+    """Return by how much a reading lies off the mean of its bin by noise alone, by output, in its unit."""
+    steps = [np.diff(np.asarray(log["time"].values, dtype=float)) for log in logs]
+    within = [max(0.0, 1.0 - float(np.median(dt)) / seconds) for dt in steps]
+    out = {}
+    for name in outputs:
+        squares = [
+            share * _second_differences(column(log, name), dt) for log, dt, share in zip(logs, steps, within)
+        ]
+        known = np.concatenate(squares)
+        out[name] = float(np.sqrt(known.mean() / 6)) if known.size else 0.0
+    return out
 
 
 def _second_differences(y: Array, steps: Array) -> Array:

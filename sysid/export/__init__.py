@@ -14,14 +14,7 @@ _HOME = {
     "to_scipy": "libraries",
 }
 
-__all__ = [
-    "LinearPlant",
-    "linearise_plant",
-    "to_casadi",
-    "to_control",
-    "to_fmu",
-    "to_scipy",
-]
+__all__ = [*_HOME]
 
 
 def __getattr__(name: str) -> Any:

@@ -28,15 +28,24 @@ Array = NDArray[np.float64]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _units(p: Array, h: int, first: int, x: Array, w: Array, t: Array) -> None:
-    """Set t to the outputs of the units; W, U and b begin at ``first``."""
-    n, m = x.shape[0], w.shape[0]
-    iU = first + h * n
-    ib = iU + h * m
+def _begins(n: int, m: int, h: int) -> tuple[int, int, int, int, int]:
+    """Return where c, V, W, U and b begin in theta."""
+    c = n * m
+    V = c + n
+    W = V + n * h
+    U = W + h * n
+    return c, V, W, U, U + h * m
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _units(p: Array, x: Array, w: Array, t: Array) -> None:
+    """Set t to the outputs of the units."""
+    n, m, h = x.shape[0], w.shape[0], t.shape[0]
+    _, _, iW, iU, ib = _begins(n, m, h)
     for i in range(h):
         total = p[ib + i]
         for j in range(n):
-            total += p[first + i * n + j] * x[j]
+            total += p[iW + i * n + j] * x[j]
         for j in range(m):
             total += p[iU + i * m + j] * w[j]
         t[i] = np.tanh(total)
@@ -46,8 +55,7 @@ def _units(p: Array, h: int, first: int, x: Array, w: Array, t: Array) -> None:
 def _advance(A: Array, p: Array, x: Array, w: Array, t: Array, after: Array) -> None:
     """Set ``after`` to the next state, not yet clipped."""
     n, m, h = x.shape[0], w.shape[0], t.shape[0]
-    ic = n * m
-    iV = ic + n
+    ic, iV, _, _, _ = _begins(n, m, h)
     for i in range(n):
         total = p[ic + i]
         for j in range(n):
@@ -60,29 +68,25 @@ def _advance(A: Array, p: Array, x: Array, w: Array, t: Array, after: Array) -> 
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _carry(A: Array, p: Array, first: int, s: Array, S: Array, after: Array) -> None:
-    """Set ``after`` to (A + V diag(s) W) S; W begins at ``first``."""
+def _propagate(A: Array, p: Array, m: int, s: Array, S: Array, after: Array) -> None:
+    """Set ``after`` to (A + V diag(s) W) S, of m drives."""
     n, h = A.shape[0], s.shape[0]
-    iV = first - n * h
+    _, iV, iW, _, _ = _begins(n, m, h)
     after[:] = 0.0
     for i in range(n):
         for j in range(n):
             gain = A[i, j]
             for q in range(h):
-                gain += p[iV + i * h + q] * s[q] * p[first + q * n + j]
+                gain += p[iV + i * h + q] * s[q] * p[iW + q * n + j]
             for q in range(S.shape[1]):
                 after[i, q] += gain * S[j, q]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _add_own(p: Array, x: Array, w: Array, t: Array, s: Array, S: Array) -> None:
-    """Add what each weight does in this step itself."""
+def _add_direct(p: Array, x: Array, w: Array, t: Array, s: Array, S: Array) -> None:
+    """Add E: what each weight does to the state in this step itself."""
     n, m, h = x.shape[0], w.shape[0], t.shape[0]
-    ic = n * m
-    iV = ic + n
-    iW = iV + n * h
-    iU = iW + h * n
-    ib = iU + h * m
+    ic, iV, iW, iU, ib = _begins(n, m, h)
     for i in range(n):
         S[i, ic + i] += 1.0
         for j in range(m):
@@ -102,11 +106,10 @@ def run_states(A: Array, theta: Array, h: int, x0: Array, w: Array, low: Array, 
     """Return states (k, N + 1, n) for A (k, n, n), theta (k, n_theta), x0 (k, n) and one w (N, m)."""
     k, n, rows, n_y = theta.shape[0], x0.shape[1], w.shape[0], low.shape[0]
     x, t, after = np.empty((k, rows + 1, n)), np.empty(h), np.empty(n)
-    first = n * w.shape[1] + n + n * h
     for at in range(k):
         x[at, 0] = x0[at]
         for row in range(rows):
-            _units(theta[at], h, first, x[at, row], w[row], t)
+            _units(theta[at], x[at, row], w[row], t)
             _advance(A[at], theta[at], x[at, row], w[row], t, after)
             for i in range(n_y):
                 after[i] = min(max(after[i], low[i]), high[i])
@@ -123,17 +126,16 @@ def run_with_slopes(
     y, slopes = np.empty((rows, n_y)), np.empty((rows, n_y, n_p + n))
     x, after, t, s = x0.copy(), np.empty(n), np.empty(h), np.empty(h)
     S, S_after = np.zeros((n, n_p + n)), np.empty((n, n_p + n))
-    first = n * w.shape[1] + n + n * h
     for i in range(n):
         S[i, n_p + i] = 1.0
     for row in range(rows):
         y[row], slopes[row] = x[:n_y], S[:n_y]
-        _units(p, h, first, x, w[row], t)
+        _units(p, x, w[row], t)
         for i in range(h):
             s[i] = 1.0 - t[i] * t[i]
         _advance(A, p, x, w[row], t, after)
-        _carry(A, p, first, s, S, S_after)
-        _add_own(p, x, w[row], t, s, S_after)
+        _propagate(A, p, w.shape[1], s, S, S_after)
+        _add_direct(p, x, w[row], t, s, S_after)
         for i in range(n_y):
             if not low[i] < after[i] < high[i]:
                 after[i] = min(max(after[i], low[i]), high[i])

@@ -93,54 +93,30 @@ class Sampling:
 class PlantScores:
     """Numbers of a fit; what a kind of fit does not know keeps its default.
 
-    Parameters
-    ----------
-    held_out : list of HeldOut
-        The model comparison's free runs over logs, or parts of them, that the fit had not seen.
-    average_s, average_why : float, str
-        Averaging step or bin of the fit [s], and which rule set it.
-    reading_excess : dict of output -> float
-        By how much one reading lies off the mean of its bin by noise alone [unit of the output].
-    structure, folds, held_out_rmse, held_out_by_part
-        Of a black box: its orders, the names of the parts held out in turn, and the rms error of each output
-        over all of them and over each.
-    in_sample_rmse : dict of log -> dict of output -> float
-        Of a grey-box fit, like all that follows; in means over its bins.
-    identifiability : Identifiability
-    cost, iterations, converged, seconds, starts
-        How the search ended and what it took; ``starts`` of the global search.
-    independent_s, weight_s : dict of output -> float
-        Seconds between independent residuals, as measured and as the fit weighted them.
-    intervals : Intervals
-    per_log : dict of log -> dict of effect -> (value, sd)
-    posterior : Sampling
-
-    Examples
-    --------
     >>> PlantScores(average_s=2.0, structure="na 1").to_json()
     {'structure': 'na 1', 'average_s': 2.0}
     """
 
-    in_sample_rmse: dict[str, dict[str, float]] = field(default_factory=dict)
+    in_sample_rmse: dict[str, dict[str, float]] = field(default_factory=dict)  # by log and output, over bins
     identifiability: Identifiability | None = None
     cost: float | None = None
     iterations: int | None = None
     converged: bool | None = None
-    structure: str = ""
-    average_s: float | None = None
-    average_why: str = ""
-    reading_excess: dict[str, float] = field(default_factory=dict)
-    folds: list[str] = field(default_factory=list)
-    held_out_rmse: dict[str, float] = field(default_factory=dict)
+    structure: str = ""  # of a black box: its orders
+    average_s: float | None = None  # averaging step or bin of the fit [s]
+    average_why: str = ""  # which rule set it
+    reading_excess: dict[str, float] = field(default_factory=dict)  # one reading off its bin's mean, by noise
+    folds: list[str] = field(default_factory=list)  # of a black box: names of the parts held out in turn
+    held_out_rmse: dict[str, float] = field(default_factory=dict)  # by output, over all of them
     held_out_by_part: dict[str, list[float]] = field(default_factory=dict)
-    independent_s: dict[str, float] = field(default_factory=dict)
-    weight_s: dict[str, float] = field(default_factory=dict)
+    independent_s: dict[str, float] = field(default_factory=dict)  # between independent residuals
+    weight_s: dict[str, float] = field(default_factory=dict)  # the same, as the fit weighted them
     intervals: Intervals | None = None
-    per_log: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
-    seconds: float | None = None
-    starts: int | None = None
+    per_log: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)  # by effect: value, sd
+    seconds: float | None = None  # that the fit took
+    starts: int | None = None  # of the global search
     posterior: Sampling | None = None
-    held_out: list[HeldOut] = field(default_factory=list)
+    held_out: list[HeldOut] = field(default_factory=list)  # free runs over what the fit had not seen
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of key ``scores`` of ``plant.json``; a default is left out."""
