@@ -258,7 +258,8 @@ def test_a_plant_that_errs_more_than_its_fit_did_is_reported():
 @pytest.mark.parametrize(
     ("p", "significant"),
     [((0.0099,), "x"), ((0.01,), "-"), ((0.0033, 0.0049, 0.0099), "xxx"), ((0.0034, 1e-9, 0.0099), "xxx"),
-     ((0.0034, 0.004, 0.0001), "xxx"), ((0.0033, 0.0051, 0.0099), "x--"), ((0.0034, 0.0035, 0.9), "---"), ((0.9, 0.5, 0.001), "--x")],
+     ((0.0034, 0.004, 0.0001), "xxx"), ((0.0033, 0.0051, 0.0099), "x--"), ((0.0034, 0.0035, 0.9), "---"),
+     ((0.9, 0.5, 0.001), "--x")],
 )  # fmt: skip
 def test_one_right_model_in_a_hundred_is_suspected_by_any_of_its_tests(
     p: tuple[float, ...], significant: str
