@@ -71,7 +71,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import dawsn, erfc, erfcx, rgamma
 
 Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Impedance = Callable[[Complex], Complex]
 
+_SWITCH = 0.15  # Fourier number: images below, eigenfunctions above
+_TERMS = 12
 _LEGENDRE = np.polynomial.legendre.leggauss(40)
 
 
@@ -90,8 +94,7 @@ def contact_temperature(*, T_dev0: float, T_obj0: float, gamma: float) -> float:
     >>> round(contact_temperature(T_dev0=23.0, T_obj0=43.0, gamma=1.6e3 / 3.64e4), 2)
     42.16
     """
-    if not gamma > 0:
-        raise ValueError(f"gamma must be positive, got {gamma:g}")
+    _positive(gamma=gamma)
     return (T_obj0 + gamma * T_dev0) / (1 + gamma)
 
 
@@ -284,8 +287,7 @@ def sensor_temperature(
     array([23.25, 36.24])
     """
     t, y = _time_and_root(t, e_dev, e_obj, h_c)
-    if not lag > 0:
-        raise ValueError(f"lag must be positive, got {lag:g} s")
+    _positive(lag=lag)
     share = e_obj / (e_dev + e_obj)
     ratio = t / lag
     if np.isinf(h_c):
@@ -305,61 +307,7 @@ def sensor_temperature(
     return np.asarray(T_dev0 + (T_obj0 - T_dev0) * share * rise)
 
 
-def _time_and_root(t: ArrayLike, e_dev: float, e_obj: float, h_c: float) -> tuple[Array, Array]:
-    """Return t and y = H sqrt(t), inf at perfect contact, after checking what a caller may get wrong."""
-    t = np.asarray(t, dtype=float)
-    if not np.all(t >= 0):
-        raise ValueError(f"time since contact must be >= 0 s, got {t[~(t >= 0)].ravel()[0]:g} s")
-    if not all(value > 0 for value in (e_dev, e_obj, h_c)):
-        raise ValueError(f"need {e_dev=:g}, {e_obj=:g}, {h_c=:g} all > 0")
-    if np.isinf(h_c):
-        return t, np.full(t.shape, np.inf)
-    return t, np.asarray(h_c * (1 / e_dev + 1 / e_obj) * np.sqrt(t))
-
-
-def _series(y: Array, first: int) -> Array:
-    """Return the terms of erfcx(y) = sum (-y)^n / Gamma(n/2 + 1) from ``first`` on, for y below 1/2."""
-    n = np.arange(first, first + 40)
-    return np.asarray(((-y[..., None]) ** n * rgamma(n / 2 + 1)).sum(axis=-1))
-
-
-def _drop(y: ArrayLike) -> Array:
-    """Return 1 - erfcx(y) without cancellation."""
-    y = np.asarray(y, dtype=float)
-    return np.where(y < 0.5, -_series(np.minimum(y, 0.5), 1), 1 - erfcx(y))
-
-
-def _excess(y: ArrayLike) -> Array:
-    """Return erfcx(y) - 1 + 2 y / sqrt(pi) without cancellation."""
-    y = np.asarray(y, dtype=float)
-    return np.where(y < 0.5, _series(np.minimum(y, 0.5), 2), erfcx(y) - 1 + 2 * y / np.sqrt(np.pi))
-
-
-def _difference(xi: Array, y: Array) -> Array:
-    """Return erfcx(xi) - erfcx(xi + y) without cancellation, for xi, y >= 0.
-
-    erfcx(x) = (2/sqrt(pi)) int_0^inf exp(-u^2 - 2 x u) du, so the difference is the integral of the positive
-    exp(-u^2 - 2 xi u) (1 - exp(-2 y u)).
-    """
-    plain = erfcx(xi) - erfcx(xi + y)
-    close = y < 0.5 * (1 + xi)
-    if not np.any(close):
-        return np.asarray(plain)
-    x, d = xi[close][:, None], y[close][:, None]
-    total = np.zeros(x.shape[0])
-    # the integrand lives on a scale 1/(1 + xi): two panels cover it to exp(-36) and beyond
-    for low, high in ((0.0, 4.0), (4.0, 20.0)):
-        u = (low + (high - low) * 0.5 * (_LEGENDRE[0] + 1)) / (1 + x)
-        weight = _LEGENDRE[1] * 0.5 * (high - low) / (1 + x)
-        total += (weight * np.exp(-(u**2) - 2 * x * u) * -np.expm1(-2 * d * u)).sum(axis=1)
-    result = np.array(plain)
-    result[close] = 2 / np.sqrt(np.pi) * total
-    return result
-
-
-def invert_laplace(
-    transform: Callable[[NDArray[np.complex128]], NDArray[np.complex128]], t: ArrayLike, *, n: int = 24
-) -> NDArray[np.float64]:
+def invert_laplace(transform: Callable[[Complex], Complex], t: ArrayLike, *, n: int = 24) -> Array:
     """Return f(t) for a transform F(s) whose singularities lie on the negative real axis."""
     t = np.asarray(t, dtype=float)
     if not (np.all(t > 0) and np.all(np.isfinite(t))):
@@ -373,13 +321,6 @@ def invert_laplace(
     s = z / t[..., None]
     # dz / dphi is 1/t of that in s; 1/(2 pi i) and the step 2 pi / n leave 2/n Im over the upper half
     return np.asarray((transform(s) * weight).imag.sum(axis=-1) * 2 / (n * t))
-
-
-Complex = NDArray[np.complex128]
-Impedance = Callable[[Complex], Complex]
-
-_SWITCH = 0.15  # Fourier number: images below, eigenfunctions above
-_TERMS = 12
 
 
 def half_space(effusivity: float) -> Impedance:
@@ -671,6 +612,57 @@ def layered_temperature(
     below = np.maximum(x - thickness, 0.0)[..., None] / np.sqrt(alpha_base)
     base = (1 + r) * (power * erfc(((2 * n + 1) * z + below) / scale)).sum(axis=-1)
     return np.asarray(T0 + (T_surf - T0) * np.where(x <= thickness, layer, base))
+
+
+def _time_and_root(t: ArrayLike, e_dev: float, e_obj: float, h_c: float) -> tuple[Array, Array]:
+    """Return t and y = H sqrt(t), inf at perfect contact, after checking what a caller may get wrong."""
+    t = np.asarray(t, dtype=float)
+    if not np.all(t >= 0):
+        raise ValueError(f"time since contact must be >= 0 s, got {t[~(t >= 0)].ravel()[0]:g} s")
+    _positive(e_dev=e_dev, e_obj=e_obj, h_c=h_c)
+    if np.isinf(h_c):
+        return t, np.full(t.shape, np.inf)
+    return t, np.asarray(h_c * (1 / e_dev + 1 / e_obj) * np.sqrt(t))
+
+
+def _series(y: Array, first: int) -> Array:
+    """Return the terms of erfcx(y) = sum (-y)^n / Gamma(n/2 + 1) from ``first`` on, for y below 1/2."""
+    n = np.arange(first, first + 40)
+    return np.asarray(((-y[..., None]) ** n * rgamma(n / 2 + 1)).sum(axis=-1))
+
+
+def _drop(y: ArrayLike) -> Array:
+    """Return 1 - erfcx(y) without cancellation."""
+    y = np.asarray(y, dtype=float)
+    return np.where(y < 0.5, -_series(np.minimum(y, 0.5), 1), 1 - erfcx(y))
+
+
+def _excess(y: ArrayLike) -> Array:
+    """Return erfcx(y) - 1 + 2 y / sqrt(pi) without cancellation."""
+    y = np.asarray(y, dtype=float)
+    return np.where(y < 0.5, _series(np.minimum(y, 0.5), 2), erfcx(y) - 1 + 2 * y / np.sqrt(np.pi))
+
+
+def _difference(xi: Array, y: Array) -> Array:
+    """Return erfcx(xi) - erfcx(xi + y) without cancellation, for xi, y >= 0.
+
+    erfcx(x) = (2/sqrt(pi)) int_0^inf exp(-u^2 - 2 x u) du, so the difference is the integral of the positive
+    exp(-u^2 - 2 xi u) (1 - exp(-2 y u)).
+    """
+    plain = erfcx(xi) - erfcx(xi + y)
+    close = y < 0.5 * (1 + xi)
+    if not np.any(close):
+        return np.asarray(plain)
+    x, d = xi[close][:, None], y[close][:, None]
+    total = np.zeros(x.shape[0])
+    # the integrand lives on a scale 1/(1 + xi): two panels cover it to exp(-36) and beyond
+    for low, high in ((0.0, 4.0), (4.0, 20.0)):
+        u = (low + (high - low) * 0.5 * (_LEGENDRE[0] + 1)) / (1 + x)
+        weight = _LEGENDRE[1] * 0.5 * (high - low) / (1 + x)
+        total += (weight * np.exp(-(u**2) - 2 * x * u) * -np.expm1(-2 * d * u)).sum(axis=1)
+    result = np.array(plain)
+    result[close] = 2 / np.sqrt(np.pi) * total
+    return result
 
 
 def _positive(**values: float) -> None:

@@ -353,11 +353,11 @@ class GripperModel:
         """Return the labels that it was calibrated with."""
         return tuple(self.blocks)
 
-    def expected_ln_h(self, ln_effusivity: NDArray[np.float64]) -> NDArray[np.float64]:
+    def expected_ln_h(self, ln_effusivity: Array) -> Array:
         """Return the expected ln h of a block of found effusivity ln e that was not calibrated."""
         return self.ln_h_level + self.ln_h_slope * (np.asarray(ln_effusivity) - 9.0)
 
-    def nominal_sd(self, room_difference: NDArray[np.float64]) -> NDArray[np.float64]:
+    def nominal_sd(self, room_difference: Array) -> Array:
         """Return the sd of ``bias + transit_loss * room_difference`` [K], same shape.
 
         ``room_difference`` is room minus object temperature [K], NaN where either is unknown.  The two were
@@ -472,7 +472,7 @@ class GripperModel:
         """
         return cls.from_dict(read_json(path, _SCHEMA, _VERSION), file=path)
 
-    def found_effusivity(self, ln_effusivity: NDArray[np.float64]) -> NDArray[np.float64]:
+    def found_effusivity(self, ln_effusivity: Array) -> Array:
         """Return what ln e of the library's scale is on the gripper's own, of the same shape."""
         true = np.asarray(ln_effusivity, dtype=float)
         found = true
@@ -480,9 +480,7 @@ class GripperModel:
             found = true + self.effusivity_scale(found)[0]
         return found
 
-    def effusivity_scale(
-        self, ln_effusivity: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def effusivity_scale(self, ln_effusivity: Array) -> tuple[Array, Array]:
         """Return mean and sd of ln(found / true) at found values ln e, of the same shape.
 
         The anchors are the blocks, ln(found / library) with the library's uncertainty and 10 % for the block
@@ -502,7 +500,7 @@ class GripperModel:
         seen = at - np.log([b.library_effusivity for b in blocks])
         variance = np.array([b.library_sd_ln**2 + b.ln_effusivity_sd**2 for b in blocks]) + 0.1**2
 
-        def kernel(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+        def kernel(a: Array, b: Array) -> Array:
             return np.asarray(0.3**2 * np.exp(-0.5 * ((a[:, None] - b[None, :]) / 1.5) ** 2))
 
         cross = kernel(x.ravel(), at)

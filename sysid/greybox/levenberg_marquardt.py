@@ -64,7 +64,12 @@ def levenberg_marquardt(
     tolerance: float = 1e-5,
     callback: Callable[[int, float], None] | None = None,
 ) -> Solution:
-    """Minimise |r|^2 inside a box."""
+    """Minimise |r|^2 inside a box, from ``z0`` (n,).
+
+    ``linearise`` returns r (m,) and J (m, n) at a point, ``residuals`` r (k, m) at k points.  It has
+    converged where a step lowers |r|^2 by less than ``tolerance`` of it, or no damping lowers it any more;
+    else it ends after ``iterations`` linearisations.  ``callback`` gets the number and the cost of each step.
+    """
     z, damping = np.clip(z0, low, high), 1.0
     residual, jacobian = linearise(z)
     cost = float(residual @ residual)

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import emcee
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -316,6 +317,16 @@ def test_a_walker_that_has_not_moved_yet_leaves_the_chain_as_slow_as_it_is_long(
     begin = start()
     found = run_chain(nowhere, begin, max_steps=100, progress=lambda share, what: reported.append(share))
     assert (found.converged, found.acceptance, reported[1:]) == (False, 0.0, [0.5, 1.0])
+
+
+def test_steps_that_are_there_already_count(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(posterior, "_autocorrelation", lambda steps: np.array([30.0, 30.0]))
+    backend = emcee.backends.Backend()
+    first = run_chain(normal, start(), max_steps=60, backend=backend).steps.copy()
+    whole = run_chain(normal, start(seed=9), max_steps=80, backend=backend)
+    assert len(whole.steps) == 80
+    np.testing.assert_array_equal(whole.steps[:60], first)
+    assert len(run_chain(normal, start(), max_steps=80, backend=backend).steps) == 80
 
 
 def test_a_chain_says_its_density_and_how_many_moves_were_taken():
