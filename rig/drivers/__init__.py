@@ -1,1 +1,1 @@
-"""Rigs on a port: our firmware and the TCLab behind the rig's interface."""
+"""Rigs on a port: ``connect.open_rig``, and the drivers of our firmware and of the TCLab behind it."""

@@ -1,1 +1,1 @@
-"""What runs on the device: the Arduino sketch, and its reference in Python."""
+"""What runs on the device: the Arduino sketch, and ``reference.DeviceCore``, the same in Python."""

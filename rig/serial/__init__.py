@@ -1,1 +1,1 @@
-"""Bytes to messages and back: the serial port, framing and the rig's protocol."""
+"""Bytes to messages and back: ``port.Port``, and the lines and messages of ``protocol``."""

@@ -1,1 +1,1 @@
-"""Rigs without hardware: the twin and virtual devices."""
+"""Rigs without hardware: ``twin.Twin`` and ``virtual_device.VirtualDevice``."""

@@ -10,7 +10,7 @@ from tests.rig.makers import PATIENCE_S, STILL, Bench, make_lab
 from thermogrip.rig.clock import ScaledClock, SteppedClock
 from thermogrip.rig.drivers.thermogrip import DeviceRig
 from thermogrip.rig.serial.port import Port
-from thermogrip.rig.simulation.virtual_device import FAULTS, DirectPort, VirtualDevice, example_plant
+from thermogrip.rig.simulation.virtual_device import FAULTS, DirectPort, VirtualDevice
 from thermogrip.sysid.plant.plant import Plant
 
 
@@ -146,11 +146,6 @@ def test_a_device_on_the_computers_clock_runs_by_itself() -> None:
         assert device.time >= before + 10.0
         assert rig.read().values["t1"] == pytest.approx(25.0, abs=1.0)
         rig.close()
-
-
-@pytest.mark.parametrize(("protocol", "inputs"), [("thermogrip", ("drive", "pump")), ("tclab", ("q1", "q2"))])
-def test_there_is_a_plant_for_each_protocol(protocol: str, inputs: tuple[str, ...]) -> None:
-    assert example_plant(protocol).inputs == inputs
 
 
 def test_an_unheated_tclab_stays_at_the_temperature_of_its_room(clock: SteppedClock) -> None:
