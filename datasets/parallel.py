@@ -13,9 +13,10 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from importlib.util import find_spec
 from typing import Any, TypeAlias, TypeVar
 
@@ -27,6 +28,9 @@ Progress: TypeAlias = Callable[[float, str], None]
 Workers: TypeAlias = int | str
 
 _CONNECT_S = 10
+
+#: The processes that :func:`kept_processes` holds, if any.
+_kept: list[ProcessPoolExecutor] = []
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -61,6 +65,23 @@ def run_parallel(
     return _on_processes(function, todo, n, progress, what)
 
 
+@contextmanager
+def kept_processes(workers: Workers) -> Iterator[None]:
+    """Let every :func:`run_parallel` of the block that shares its work out use the same local processes.
+
+    A process takes seconds to import what it needs and to load compiled code; here it does so once.
+    """
+    n = 1 if isinstance(workers, str) else min(workers, os.cpu_count() or 1)
+    if n == 1 or _kept:
+        yield
+        return
+    _kept.append(_processes(n))
+    try:
+        yield
+    finally:
+        _kept.pop().shutdown(wait=True, cancel_futures=True)
+
+
 def check_workers(workers: Workers) -> Workers:
     """Return the workers as they were given, or raise :class:`UserError` before any work is done."""
     if not isinstance(workers, str):
@@ -85,10 +106,12 @@ def sub_progress(progress: Progress | None, start: float, stop: float) -> Progre
 def _on_processes(
     function: Callable[[_Item], _Result], todo: list[_Item], n: int, progress: Progress | None, what: str
 ) -> list[_Result]:
-    pool = ProcessPoolExecutor(n, mp_context=multiprocessing.get_context("spawn"))
+    kept = bool(_kept)
+    pool = _kept[0] if kept else _processes(n)
+    futures: list[Future[_Result]] = []
     try:
-        futures = [pool.submit(function, item) for item in todo]
-        pending: set[Future[_Result]] = set(futures)
+        futures += [pool.submit(function, item) for item in todo]
+        pending = set(futures)
         while pending:
             done, pending = wait(pending, return_when=FIRST_COMPLETED)
             for future in done:
@@ -98,7 +121,14 @@ def _on_processes(
     except BrokenProcessPool as error:
         raise UserError("a worker process was killed", hint="lower --workers; memory may be short") from error
     finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+        for future in futures:
+            future.cancel()  # what has not begun
+        if not kept:
+            pool.shutdown(wait=True)
+
+
+def _processes(n: int) -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(n, mp_context=multiprocessing.get_context("spawn"))
 
 
 def _on_cluster(

@@ -555,10 +555,12 @@ def contacts(
     n, n_node = effusivity.size, nodes[2].size
     rise, slope, flux = np.empty((n, n_node)), np.empty((n, n_node)), np.empty((n, n_node))
     room = room_for(gripper.sensor.size, n_node)
+    asked = np.zeros(3, dtype=np.bool_)  # for constants everything would be compiled once more
     for p in range(n):
         step_contact(
-            nodes[1], gripper, effusivity[p], capacity[p], h_c[p], build_up[p], False, False, False, room
-        )
+            nodes[1], gripper, effusivity[p], capacity[p], h_c[p], build_up[p], asked[0], asked[1], asked[2],
+            room,
+        )  # fmt: skip
         rise[p], slope[p], flux[p] = room.rise[VALUE], room.slope[VALUE], room.flux
     return rise, slope, flux
 

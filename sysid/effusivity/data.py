@@ -128,7 +128,9 @@ def touches(grasps: Grasps, *, until: float | None = None) -> Touches:
     return Touches(
         grasp_id=ids, material=label_values(grasps, "material"),
         sample_t=np.broadcast_to(time, data.shape).copy(),
-        sample_bin=np.where(good, bins, -1).astype(np.int64), y=y, t=mean(np.broadcast_to(time, data.shape)),
+        # one memory layout whatever the record's: the compiled search is compiled anew for another
+        sample_bin=np.ascontiguousarray(np.where(good, bins, -1), dtype=np.int64),
+        y=y, t=mean(np.broadcast_to(time, data.shape)),
         count=count, ramp=mean(np.broadcast_to(np.maximum(time - _PUMP_OFF, 0.0), data.shape)), level=level,
         t_object=number_values(grasps, "t_object"), t_object_sd=number_values(grasps, "t_object_sd"),
         t_ambient=number_values(grasps, "t_ambient"), excursion=np.abs(away).max(axis=1),
@@ -249,7 +251,7 @@ def whiten(data: Touches, noise: Noise) -> tuple[Array, Array]:
     """Return W with W' W = C^-1, (n, n_bin, n_bin), zero for empty bins, and ln det(2 pi C), (n,)."""
     chol = np.linalg.cholesky(noise_covariance(data, noise))
     there = data.count > 0
-    w = _inverse(chol) * there[:, None, :] * there[:, :, None]
+    w = np.ascontiguousarray(_inverse(chol) * there[:, None, :] * there[:, :, None])
     diagonal = np.diagonal(chol, axis1=1, axis2=2)
     return w, (2 * np.log(diagonal)).sum(axis=1) + there.sum(axis=1) * np.log(2 * np.pi)
 

@@ -101,6 +101,7 @@ from thermogrip.sysid.plant.plant import Plant
 Array = NDArray[np.float64]
 
 _STEP = 1e-4  # of z, for differences
+_TOGETHER = 12  # draws whose slopes are taken at once: the runs of more do not fit a cache
 _LONGEST = 1.0  # prior sd that one step may move a parameter
 _FLOOR = 1e-3  # of A: the least that V may be in any direction
 _UNSEEN = 1e-9  # of the largest slope: what moves the runs by less is lost in the differences
@@ -226,6 +227,10 @@ class RandomizedMap:
 
     def _slopes(self, z: Array, xi: Array, noise: Array, moving: NDArray[np.int_]) -> tuple[Array, Array]:
         """Return gradient (n, n_moving) and Gauss-Newton Hessian (n, n_moving, n_moving)."""
+        if len(z) > _TOGETHER:
+            blocks = [slice(k, k + _TOGETHER) for k in range(0, len(z), _TOGETHER)]
+            parts = [self._slopes(z[at], xi[at], noise[at], moving) for at in blocks]
+            return np.concatenate([g for g, _ in parts]), np.concatenate([h for _, h in parts])
         n, d = len(z), moving.size
         sign = np.where(z[:, moving] + _STEP > self.high[moving], -1.0, 1.0)
         ahead = z[:, None] + _STEP * sign[:, :, None] * np.eye(self.z.size)[moving]

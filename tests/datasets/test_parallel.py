@@ -9,7 +9,7 @@ import signal
 import pytest
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.parallel import run_parallel, sub_progress
+from thermogrip.datasets.parallel import kept_processes, run_parallel, sub_progress
 
 
 def test_one_worker_works_here_in_order_and_reports():
@@ -32,6 +32,22 @@ def test_processes_give_the_same_in_the_same_order():
 def test_a_fault_in_a_process_is_raised_here_as_it_was():
     with pytest.raises(ValueError, match="factorial"):
         run_parallel(math.factorial, [3, -1, 4], workers=2)
+
+
+def test_processes_that_are_kept_do_the_work_of_every_call_and_then_end() -> None:
+    """Each item is this process's child: the same two do four pieces of work, also after a fault."""
+    with kept_processes(2), kept_processes(2):
+        first = set(run_parallel(_process, range(4), workers=2))
+        with pytest.raises(ValueError, match="factorial"):
+            run_parallel(math.factorial, [3, -1, 4], workers=2)
+        again = set(run_parallel(_process, range(4), workers=2))
+    assert len(first | again) <= 2
+    assert os.getpid() not in first | again
+    assert not first & set(run_parallel(_process, range(4), workers=2))
+
+
+def _process(_: int) -> int:
+    return os.getpid()
 
 
 @pytest.mark.slow

@@ -131,8 +131,9 @@ def test_classifiers_are_scored_on_test_grasps_and_trained_for_the_twins_on_trai
     assert len((tmp_path / "predictions.csv").read_text().splitlines()) == 3
 
 
+@pytest.mark.parametrize(("workers", "compared"), [(1, (0.87, "x")), (3, (0.76, "train and test"))])
 def test_every_stage_has_its_share_of_the_progress_and_its_section(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    workers: int, compared: tuple[float, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[tuple[float, str]] = []
     asked: dict[str, tuple[Any, ...]] = {}
@@ -146,7 +147,8 @@ def test_every_stage_has_its_share_of_the_progress_and_its_section(
 
         def stage(*args: Any, name: str = name, result: Any = result) -> Any:
             asked[name] = args[:-1]
-            args[-1](0.5, "x")
+            if args[-1] is not None:  # while this process identifies, others compare
+                args[-1](0.5, "x")
             return result
 
         monkeypatch.setattr(demo, name, stage)
@@ -160,15 +162,16 @@ def test_every_stage_has_its_share_of_the_progress_and_its_section(
     )
     monkeypatch.setattr(demo, "comparison_sections", lambda *args: [Section(" ".join(args), ())])
     done = demo.run_demo(
-        tmp_path, seed=SEED, workers=3, progress=lambda fraction, what: seen.append((fraction, what))
+        tmp_path, seed=SEED, workers=workers, progress=lambda fraction, what: seen.append((fraction, what))
     )
     assert seen == [
         (pytest.approx(0.3), "identify: x"), (pytest.approx(0.665), "tune: x"),
-        (pytest.approx(0.745), "run: x"), (pytest.approx(0.87), "compare: x"), (1.0, "done"),
+        (pytest.approx(0.745), "run: x"), (pytest.approx(compared[0]), f"compare: {compared[1]}"),
+        (1.0, "done"),
     ]  # fmt: skip
     assert asked == {
-        "_identify": (tmp_path, SEED), "_tune": (tmp_path, "plant", SEED, 3),
-        "_run": (tmp_path, "tuning", "plant", SEED), "_compare": (tmp_path, SEED, 3),
+        "_identify": (tmp_path, SEED), "_tune": (tmp_path, "plant", SEED, workers),
+        "_run": (tmp_path, "tuning", "plant", SEED), "_compare": (tmp_path, SEED, workers),
     }  # fmt: skip
     assert [section.title for section in done.sections] == [
         "identification of found plant", "free_run of log run plant", "posterior of plant record",
@@ -199,9 +202,9 @@ def test_a_plant_is_fitted_to_three_logs_and_the_first_half_of_the_fourth(
         )
         return fitted
 
-    def sample(plant: Any, logs: Any, *, seed: int, progress: Any) -> Any:
+    def sample(plant: Any, logs: Any, *, n_samples: int, seed: int, progress: Any) -> Any:
         progress(0.5, "y")
-        calls["sample"] = (plant, len(logs), seed)
+        calls["sample"] = (plant, len(logs), n_samples, seed)
         return sampled, "a record"
 
     monkeypatch.setattr("thermogrip.sysid.identification.identify", identify)
@@ -219,7 +222,7 @@ def test_a_plant_is_fitted_to_three_logs_and_the_first_half_of_the_fourth(
     assert (whole.sizes["time"], score_from) == (n, 1350)
     [cut] = [rows for name, rows in zip(names, rows) if name.startswith("pump_on_off")]
     assert 0.4 < cut / n < 0.6
-    assert (calls["sample"], calls["saved"]) == (("a plant", 4, SEED), tmp_path / "plant.json")
+    assert (calls["sample"], calls["saved"]) == (("a plant", 4, 100, SEED), tmp_path / "plant.json")
     assert found[:3] == (fitted, sampled, "a record")
     assert seen == [(pytest.approx(0.3), "x"), (pytest.approx(0.8), "posterior: y")]
 

@@ -7,10 +7,13 @@ small, so that two cores need less than five minutes; the report says what that 
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from thermogrip.datasets.parallel import kept_processes
 from thermogrip.report.classification import (
     comparison_sections,
     review_section,
@@ -38,11 +41,10 @@ if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation.free_run import FreeRun
 
-__all__ = ["DemoResult", "compared_models", "run_demo"]
-
 SPLIT_S = 1350  # the first seconds of pump_on_off are fitted, the rest is held out
 MODELS = ("arx", "oe", "sindy", "network")
 STEPS = ((28.0, 38.0), (28.0, 18.0), (18.0, 43.0))
+SAMPLES = 100  # of the posterior
 DRAW = 3  # the twin's plant, a draw of the posterior
 T_OBJECT, T_GRIPPER, TOUCHED = 18.0, 38.0, ("copper", "wood")  # degC, degC, what the twin grasps
 CANDIDATES = ("copper", "iron", "wood")  # as in the condition at these temperatures
@@ -62,11 +64,20 @@ def run_demo(
     out: Path, *, seed: int = 0, workers: Workers = 2, progress: Progress | None = None
 ) -> DemoResult:
     """Run every stage once and write files and a report into an existing folder, in place of what an earlier
-    demo left there."""
-    found, plant, record, held_out = _identify(out, seed, part(progress, 0.0, 0.6, "identify"))
-    tuning, checks = _tune(out, plant, seed, workers, part(progress, 0.6, 0.73, "tune"))
-    sessions = _run(out, tuning, plant, seed, part(progress, 0.73, 0.76, "run"))
-    comparison, classifier = _compare(out, seed, workers, part(progress, 0.76, 0.98, "compare"))
+    demo left there.
+
+    With several workers they compare classifiers, which needs no plant, while this process identifies one.
+    """
+    with ThreadPoolExecutor(1) as beside, kept_processes(workers):
+        compare = partial(_compare, out, seed, workers)
+        compared = None if workers == 1 else beside.submit(compare, None)
+        found, plant, record, held_out = _identify(out, seed, part(progress, 0.0, 0.6, "identify"))
+        tuning, checks = _tune(out, plant, seed, workers, part(progress, 0.6, 0.73, "tune"))
+        sessions = _run(out, tuning, plant, seed, part(progress, 0.73, 0.76, "run"))
+        share = part(progress, 0.76, 0.98, "compare")
+        if compared is not None and share is not None:
+            share(0.0, "train and test")
+        comparison, classifier = compare(share) if compared is None else compared.result()
     touched = [session.grasps for _, session in sessions if session.grasps is not None]
     sections = [
         identification_section(found, plant),
@@ -113,7 +124,7 @@ def _identify(
     share = part(progress, 0.0, 0.6)
     found = identify(logs, network="gripper", models=MODELS, draws=0, seed=seed, progress=share)
     share = part(progress, 0.6, 1.0, "posterior")
-    plant, record = sample_posterior(found.plant, logs, seed=seed, progress=share)
+    plant, record = sample_posterior(found.plant, logs, n_samples=SAMPLES, seed=seed, progress=share)
     plant.save(out / "plant.json")
     whole = read_log(example_path("pump_on_off"))
     return found, plant, record, (whole, free_run(plant, whole, score_from=SPLIT_S))
