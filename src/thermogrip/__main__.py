@@ -10,8 +10,6 @@ import signal
 import sys
 from types import FrameType
 
-__all__ = ["main"]
-
 
 def main() -> int:
     """Run the words of the process and return the exit code."""

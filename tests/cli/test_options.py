@@ -151,7 +151,7 @@ def test_a_plant_of_one_s_own_is_loaded_with_its_class(stand_in: StandIn) -> Non
 
 def test_logs_and_grasps_are_read_as_they_were_named(stand_in: StandIn) -> None:
     logs = stand_in("thermogrip.datasets.log_files.read_log", lambda path, *_, **__: path)
-    grasps = stand_in("thermogrip.datasets.log_files.read_grasp_files", ["g"])
+    grasps = stand_in("thermogrip.datasets.grasp_files.read_grasp_files", ["g"])
     assert options.load_logs(["a", "b"], ["u"], ["y"], ["d"], known={"u": "input"}) == ["a", "b"]
     assert (logs[1].args, logs[1].known) == (("b", ["u"], ["y"], ["d"]), {"u": "input"})
     assert options.find_grasps(("a", "b")) == ["g"]

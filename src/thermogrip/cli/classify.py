@@ -35,16 +35,6 @@ if TYPE_CHECKING:
     from thermogrip.sysid.effusivity.multi_touch import Coupling
     from thermogrip.sysid.effusivity.posterior import EffusivityRow
 
-__all__ = [
-    "calibrated_device",
-    "classify",
-    "effusivity",
-    "materials",
-    "touched_part",
-    "train",
-    "training_part",
-]
-
 _BUNDLED = 40.0  # s: the longest contacts that taught the bundled gripper
 
 
@@ -161,6 +151,11 @@ def effusivity(
     console = Console(as_json)
     records = find_grasps(grasps)
     warn_of_contacts(console, records)
+    from thermogrip.classify.decisions.predict import unexplained_effusivities
+    from thermogrip.datasets.atomic_files import write_atomic
+    from thermogrip.datasets.media import csv_text
+    from thermogrip.sysid.effusivity.data import with_object_range
+
     device, coupling, longest = calibrated_device(console, calibrate or [], seed)
     records = [_as_taught(console, record, longest, coupling) for record in records]
     unexplained: dict[str, str] = {}
@@ -168,10 +163,11 @@ def effusivity(
         rows = []
         for k, record in enumerate(records):
             progress(k / len(records), log_name(record))
-            found = _effusivities(device, _ranged(record, stated), coupling)
-            unexplained |= _unexplained(device, record, found, stated)
+            found = _effusivities(device, with_object_range(record, stated), coupling)
+            unexplained |= unexplained_effusivities(device, record, found, stated)
             rows += [asdict(row) for row in found]
-    _write_csv(out, list(rows[0]), [list(row.values()) for row in rows])
+    cells = [[f"{cell:.6g}" if isinstance(cell, float) else cell for cell in row.values()] for row in rows]
+    write_atomic(out, csv_text([list(rows[0]), *cells]))
     shown = [
         (r["grasp_id"], r["effusivity"], r["effusivity_p05"], r["effusivity_p95"], r["t_object"])
         for r in rows
@@ -330,9 +326,16 @@ def classify(
     """
     stated = _range(between)
     new_file(out, (".csv",))
-    from thermogrip.classify.decisions.predict import classify_grasps, unexplained_answers, write_predictions
+    from thermogrip.classify.decisions.next_touch import advise_touches
+    from thermogrip.classify.decisions.predict import (
+        classify_grasps,
+        reasons,
+        unexplained_answers,
+        write_predictions,
+    )
     from thermogrip.classify.decisions.stopping_rule import load_stop_rule
     from thermogrip.classify.estimators.registry import load_classifier
+    from thermogrip.sysid.effusivity.data import with_object_range
 
     if (other_gripper or known) and (early or next_touch):
         problem = (
@@ -344,7 +347,7 @@ def classify(
     records = find_grasps(grasps)
     if other_gripper or known:
         model = _for_another_gripper(model, known or [])
-    ranged = [_ranged(record, stated) for record in records]
+    ranged = [with_object_range(record, stated) for record in records]
     rows = classify_grasps(model, ranged, comma(candidates), rule=rule)
     if not early:
         for row, why in zip(rows, unexplained_answers(model, records, rows, stated)):
@@ -352,8 +355,15 @@ def classify(
                 row["note"] = why
     console = Console(as_json)
     warn_of_contacts(console, records)
-    if next_touch:
-        _advise(console, model, ranged, comma(candidates), rows)
+    if next_touch:  # at which temperature another touch of its block would be worth most
+        with console.progress("another touch") as progress:
+            found = [
+                row
+                for record in ranged
+                for row in advise_touches(model, record, candidates=comma(candidates), progress=progress)
+            ]
+        for row, advice in zip(rows, found):
+            row |= advice
     if or_unknown:
         _answer_or_unknown(rows)
     write_predictions(rows, out)
@@ -373,7 +383,11 @@ def classify(
     console.table("Materials", head, shown[:SHOWN])
     _say_more(console, len(shown))
     _say_notes(console, rows)
-    strange = {} if early else _strange(console, model, ranged, rows)
+    strange = {}
+    if not early:
+        strange = {row["grasp_id"]: why for row, why in zip(rows, reasons(model, ranged, rows)) if why}
+    for name, why in list(strange.items())[:SHOWN]:
+        console.say(f"{name} is out of distribution: {why}")
     console.say(f"wrote {out}")
     console.answer({"grasps": rows, "strange": strange, "out": out})
     return 0
@@ -452,22 +466,6 @@ def _range(text: str | None) -> tuple[float, float] | None:
     return low, high
 
 
-def _ranged(record: Grasps, stated: tuple[float, float] | None) -> Grasps:
-    """Return a record whose unknown object temperatures are those of the stated range."""
-    from thermogrip.sysid.effusivity.data import with_object_range
-
-    return with_object_range(record, stated)
-
-
-def _unexplained(
-    device: GripperModel, record: Grasps, rows: Sequence[EffusivityRow], stated: tuple[float, float] | None
-) -> dict[str, str]:
-    """Return which single touches no effusivity explains, and why."""
-    from thermogrip.classify.decisions.predict import unexplained_effusivities
-
-    return unexplained_effusivities(device, record, rows, stated)
-
-
 def _unusable(records: Sequence[Grasps]) -> dict[str, list[str]]:
     """Return the unusable grasps, by reason."""
     from thermogrip.sysid.effusivity.quality import check_grasps
@@ -504,38 +502,6 @@ def _for_another_gripper(model: GraspClassifier, known: Sequence[str]) -> GraspC
     return model.for_another_gripper(find_grasps(known) if known else None)
 
 
-def _advise(
-    console: Console,
-    model: GraspClassifier,
-    records: Sequence[Grasps],
-    candidates: Sequence[str] | None,
-    rows: list[dict[str, Any]],
-) -> None:
-    """Add to each row at which temperature another touch of its block would be worth most."""
-    from thermogrip.classify.decisions.next_touch import advise_touches
-
-    with console.progress("another touch") as progress:
-        found = [
-            row
-            for record in records
-            for row in advise_touches(model, record, candidates=candidates, progress=progress)
-        ]
-    for row, advice in zip(rows, found):
-        row |= advice
-
-
-def _strange(
-    console: Console, model: GraspClassifier, records: Sequence[Grasps], rows: Sequence[dict[str, Any]]
-) -> dict[str, str]:
-    """Say of the grasps that are probably no known material what would have to be unusual if they were."""
-    from thermogrip.classify.decisions.predict import reasons
-
-    found = {row["grasp_id"]: why for row, why in zip(rows, reasons(model, records, rows)) if why}
-    for name, why in list(found.items())[:SHOWN]:
-        console.say(f"{name} is out of distribution: {why}")
-    return found
-
-
 def _answer_or_unknown(rows: list[dict[str, Any]]) -> None:
     """Add the cheaper answer to each row: its material, or that it is none of them."""
     from thermogrip.classify.decisions.next_touch import name_or_unknown
@@ -567,12 +533,3 @@ def _is_candidate(key: str) -> bool:
 def _say_more(console: Console, n: int) -> None:
     if n > SHOWN:
         console.say(f"... and {n - SHOWN} more in the file")
-
-
-def _write_csv(path: Path, head: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
-    """Write a table, whole or not at all."""
-    from thermogrip.datasets.atomic_files import write_atomic
-    from thermogrip.datasets.media import csv_text
-
-    cells = [[f"{cell:.6g}" if isinstance(cell, float) else cell for cell in row] for row in rows]
-    write_atomic(path, csv_text([head, *cells]))

@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from thermogrip.report.console import Progress
     from thermogrip.report.html import Section
 
-__all__ = ["compare"]
-
 BY_DEFAULT = ("lstm", "posterior", "bayes", "features-lda", "pca-lda")
 MOST_CONDITIONS = 4  # that are printed one by one
 
@@ -109,6 +107,7 @@ def compare(
     """
     from thermogrip.classify.estimators.registry import trainable
     from thermogrip.classify.evaluation.harness import evaluate
+    from thermogrip.datasets.parallel import kept_processes
 
     pool, names = workers_of(workers, cluster), comma(classifiers)
     models, missing = trainable(names or BY_DEFAULT, quick=quick, seed=seed)
@@ -128,7 +127,7 @@ def compare(
     records = touched_part(console, records)
     tests = None if tests is None else touched_part(console, tests)
     found = {}
-    with console.progress("compare") as progress:
+    with kept_processes(pool), console.progress("compare") as progress:
         given = tests is not None or _has_split(records)
         anew = tests is None and repeats > 0
         if given and anew and (why := _unsplittable(records, repeats, train_per_class, seed)):

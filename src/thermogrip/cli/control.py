@@ -34,8 +34,6 @@ from thermogrip.report.console import Console
 if TYPE_CHECKING:
     from thermogrip.mpc.controllers.mpc import Controller
 
-__all__ = ["ControllerFile", "export", "load_controller", "review", "tune"]
-
 _CONTROLLER: dict[str, Any] = {
     "metavar": "CONTROLLER",
     "show_default": False,
@@ -78,6 +76,7 @@ def tune(
     You say settling time, overshoot, energy. Runs closed loops on posterior draws of the plant; shows
     baseline, tuned, PI and LQR side by side, what can be traded, and which weights matter.
     """
+    from thermogrip.datasets.parallel import kept_processes
     from thermogrip.mpc.design.spec import Spec, read_spec
     from thermogrip.mpc.tuning.sensitivity import sensitivity_words
     from thermogrip.mpc.tuning.tune import tune as search
@@ -91,7 +90,11 @@ def tune(
     if report is not None:
         new_file(report, (".html",))
     console = Console(as_json)
-    with console.progress("tune") as progress, _naming(spec, tuple(Spec.model_fields)):
+    with (
+        kept_processes(pool),
+        console.progress("tune") as progress,
+        _naming(spec, tuple(Spec.model_fields)),
+    ):
         found = search(loaded, wanted, progress=progress, workers=pool, seed=seed)
     found.save(out)
     if report is not None:

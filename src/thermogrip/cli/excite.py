@@ -38,8 +38,6 @@ if TYPE_CHECKING:
     from thermogrip.sysid.experiment.optimal import Expectation
     from thermogrip.sysid.plant.plant import Plant
 
-__all__ = ["excite", "expected_rows", "optimal_for", "schedule_for"]
-
 KINDS = ("prbs", "multisine", "staircase", "optimal")
 HALVINGS = 12  # of the bisection
 

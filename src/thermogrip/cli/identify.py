@@ -42,8 +42,6 @@ if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation.free_run import FreeRun
 
-__all__ = ["identify", "simulate", "validate"]
-
 MODELS = ("arx", "oe", "subspace", "sindy", "neural", "network")
 ALL_MODELS = ",".join(MODELS)
 DEFAULT_NETWORK = "gripper"  # of logs that have its columns

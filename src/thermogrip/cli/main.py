@@ -25,8 +25,6 @@ from thermogrip.datasets.atomic_files import os_fault
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import printable
 
-__all__ = ["app", "main"]
-
 OK, BUG, USER, INTERRUPTED = 0, 1, 2, 130
 
 app = typer.Typer(

@@ -18,40 +18,6 @@ if TYPE_CHECKING:
     from thermogrip.sysid.models.model import GreyModel
     from thermogrip.sysid.plant.plant import Plant
 
-__all__ = [
-    "ANSWER_IS_NO",
-    "PROTOCOLS",
-    "AsJson",
-    "Cluster",
-    "GraspFiles",
-    "LogFiles",
-    "OwnNetwork",
-    "Report",
-    "Seed",
-    "Verb",
-    "Workers",
-    "choice",
-    "comma",
-    "existing",
-    "existing_controller",
-    "existing_grasps",
-    "existing_logs",
-    "existing_model",
-    "existing_network",
-    "existing_plant",
-    "existing_spec",
-    "find_grasps",
-    "find_network",
-    "load_logs",
-    "load_plant",
-    "log_name",
-    "new_file",
-    "new_folder",
-    "one_of",
-    "warn_of_contacts",
-    "workers_of",
-]
-
 #: Exit code of work that was done and whose answer is no.
 ANSWER_IS_NO = 3
 #: What a rig on a port may speak.

@@ -12,8 +12,6 @@ from thermogrip.cli.options import AsJson, Cluster, Seed, Workers, choice, new_f
 from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
 
-__all__ = ["demo", "init", "paper"]
-
 
 def demo(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Where everything goes.")] = Path(
@@ -63,11 +61,12 @@ def paper(
     """
     new_folder(out)
     pool = workers_of(workers, cluster)
+    from thermogrip.datasets.parallel import kept_processes
     from thermogrip.report.html import write_report
     from thermogrip.studies.paper import repeat_paper
 
     console = Console(as_json)
-    with console.progress("paper") as progress:
+    with kept_processes(pool), console.progress("paper") as progress:
         found = repeat_paper(quick=quick, seed=seed, workers=pool, progress=progress)
     found.bundled.save(out / "bundled")
     found.twin.save(out / "simulated")

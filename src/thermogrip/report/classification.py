@@ -21,17 +21,6 @@ if TYPE_CHECKING:
     from thermogrip.mpc.design_review import Check
     from thermogrip.rig.session.session import Session
 
-__all__ = [
-    "comparison_sections",
-    "curves_section",
-    "decision_section",
-    "review_section",
-    "score_table",
-    "session_section",
-    "strips_section",
-    "touch_section",
-]
-
 SCORE_HEAD = (
     "classifier",
     "condition",

@@ -20,8 +20,6 @@ from typing import Any
 
 from thermogrip.datasets.media import printable
 
-__all__ = ["Console", "Progress", "part", "plain", "short"]
-
 #: What long work calls: fraction done (0 to 1) and what it is at.
 Progress = Callable[[float, str], None]
 

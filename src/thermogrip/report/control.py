@@ -32,19 +32,6 @@ if TYPE_CHECKING:
     from thermogrip.mpc.tuning.tune import Tuning
     from thermogrip.rig.session.session import Session
 
-__all__ = [
-    "TUNING_HEAD",
-    "loop_section",
-    "pareto_section",
-    "sensitivity_section",
-    "session_sections",
-    "spec_section",
-    "timing_section",
-    "tuning_rows",
-    "tuning_section",
-    "tuning_sections",
-]
-
 TUNING_HEAD = (
     "controller",
     "step [degC]",

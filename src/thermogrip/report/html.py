@@ -24,8 +24,6 @@ from thermogrip.report.console import short
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Commands", "Part", "Picture", "Section", "Table", "Text", "html_page", "literal", "write_report"]
-
 TONES = ("plain", "good", "warn", "bad")
 _SUPERSCRIPT = re.compile(r"(\$\^\{-?[0-9.]+\}\$)")
 _DOLLAR = re.compile(r"(?<!\\)\$")

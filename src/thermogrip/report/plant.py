@@ -28,23 +28,6 @@ if TYPE_CHECKING:
     from thermogrip.sysid.validation.free_run import FreeRun
     from thermogrip.sysid.validation.prediction_bands import Band
 
-__all__ = [
-    "MODEL_HEAD",
-    "PARAMETER_HEAD",
-    "SCORE_OF_RUN",
-    "SIGNAL_HEAD",
-    "free_run_section",
-    "growth_section",
-    "identification_section",
-    "identification_sections",
-    "model_rows",
-    "model_table",
-    "parameter_rows",
-    "posterior_section",
-    "run_rows",
-    "signal_rows",
-]
-
 SCORE_OF_RUN = ("log", "output", "RMSE", "unit", "fit [%]", "n", "no input", "mean", "one step")
 
 PARAMETER_HEAD = ("parameter", "value", "unit", "5 %", "95 %", "prior 5 %", "prior 95 %")

@@ -32,20 +32,6 @@ if TYPE_CHECKING:
     from thermogrip.sysid.validation.free_run import FreeRun
     from thermogrip.sysid.validation.prediction_bands import Band
 
-__all__ = [
-    "corner_figure",
-    "difference_unit",
-    "exchange_figure",
-    "free_run_figure",
-    "grasp_figure",
-    "loop_figure",
-    "models_figure",
-    "posterior_figure",
-    "residual_figure",
-    "responses_figure",
-    "steps_figure",
-]
-
 Array = NDArray[np.float64]
 
 MEASURED, MODEL, TARGET = "#9aa7b5", "#1f5fa8", "#1d2733"

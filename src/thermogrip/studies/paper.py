@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
     from thermogrip.report.console import Progress
 
-__all__ = ["CASES", "Case", "PaperResult", "repeat_paper"]
-
 CLASSIFIERS = ("posterior", "bayes", "lstm", "lstm-paper")
 SIMULATED = ("posterior", "bayes", "lstm")
 FIVE, THREE = ("copper", "zinc", "brass", "iron", "wood"), ("copper", "iron", "wood")
