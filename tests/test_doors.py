@@ -19,7 +19,7 @@ METHODS = (  # of the Python contract
     *("mpc.Controller.reset", "mpc.Controller.step"),
 )
 SECTIONS = ("Parameters", "Attributes", "Returns", "Yields", "Raises", "Examples", "Notes", "References")
-#: What is said where a number has no unit in brackets.
+#: Words that take the place of a unit in brackets.
 NO_UNIT = re.compile(
     r"\[[^\]]+\]|\b(seconds?|minutes|hours|degC|kelvin|units?|percent|share|probability|factor|level|ratio"
     r"|number|count|weight|times|multiple|as for|see|scale|confidence|correlation|fraction)\b",
@@ -82,13 +82,13 @@ def lacks(item: Any) -> set[str]:
     """Return what the docstring of a function or class lacks."""
     found, out = sections(item), set()
     arguments = {} if _is_protocol(item) else dict(inspect.signature(item).parameters)
-    told = described(found.get("Parameters", "") + "\n" + found.get("Attributes", ""))
+    documented = described(found.get("Parameters", "") + "\n" + found.get("Attributes", ""))
     for name, parameter in arguments.items():
         if name == "self" or parameter.kind is parameter.VAR_KEYWORD:
             continue
-        if name not in told:
+        if name not in documented:
             out.add(f"argument {name}")
-        elif _is_quantity(parameter) and not NO_UNIT.search(told[name]):
+        elif _is_quantity(parameter) and not NO_UNIT.search(documented[name]):
             out.add(f"unit of {name}")
     if inspect.isfunction(item) or inspect.ismethod(item):
         returned = inspect.signature(item).return_annotation

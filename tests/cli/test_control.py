@@ -12,7 +12,6 @@ import pytest
 
 from tests.cli.conftest import Bench, StandIn, shares, words_of
 from tests.end_to_end.conftest import small_plant
-from thermogrip.cli.control import _naming
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.spec import Spec
@@ -180,21 +179,3 @@ def test_the_class_of_a_plant_of_one_s_own_is_handed_in(controller: Bench, stand
         assert controller.run("review", "c.json", *network).code == 0
     assert [call.args for call in loaded] == [(Path("c.json"),)] * 2
     assert [call.model for call in loaded] == [None, "model of own.py:Own"]
-
-
-@pytest.mark.parametrize(
-    ("spec", "error", "named"),
-    [
-        ("s.toml", UserError("horizon: too long", hint="less"), "s.toml: horizon: too long; less"),
-        ("s.toml", UserError("plant: unstable"), "plant: unstable"),
-        ("s.toml", UserError("horizon: too long", file="p.json"), "p.json: horizon: too long"),
-        (None, UserError("horizon: too long"), "horizon: too long"),
-    ],
-)
-def test_only_an_error_about_a_key_of_the_spec_names_the_specs_file(
-    spec: str | None, error: UserError, named: str
-) -> None:
-    with pytest.raises(UserError) as caught, _naming(None if spec is None else Path(spec), ("horizon",)):
-        raise error
-    assert str(caught.value) == named
-    assert (caught.value is error) == (spec != named.split(":")[0])

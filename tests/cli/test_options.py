@@ -70,30 +70,6 @@ def test_a_folder_is_written_where_one_may_write_and_enter(
         new_folder(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ("validate none.json none.csv", "none.json: no such file or folder; check the path"),
-        ("validate plant.json good.csv none.csv@1:2", "none.csv@1:2: no such file or folder"),
-        (
-            "validate grasps.csv none.csv",
-            "none.csv: no such file or folder",
-        ),  # before plants are looked through
-        ("validate plant.json good.csv --network own.py:Own", "own.py: no such file"),
-        ("validate plant.json good.csv --network here.py", "here.py: names no class; write here.py:CLASS"),
-        ("validate plant.json good.csv --network here.py:", "here.py: names no class; write here.py:CLASS"),
-        ("validate plant.json good.csv --network nothing", "no network 'nothing'"),
-        ("classify good.csv more.csv --out p.csv", "good.csv: is not a folder; give the folder that train"),
-        ("classify none more.csv --out p.csv", "none: is not a folder"),
-    ],
-)
-def test_files_are_looked_for_before_the_work(words: str, said: str, bench: Bench) -> None:
-    bench.write("here.py", "")
-    done = bench.run(*words.split())
-    assert (done.code, len(done.said)) == (2, 1), done
-    assert said in done.said[0]
-
-
 OWN = """
 from thermogrip.sysid.models.network import load_network
 

@@ -45,7 +45,7 @@ def test_the_paper_prints_each_case_beside_ours(bench: Bench, stand_in: StandIn)
         bundled=SimpleNamespace(save=lambda out: saved.append(("bundled", out))),
         twin=SimpleNamespace(save=lambda out: saved.append(("twin", out))),
         sections=lambda: ["a section"], table=lambda: (head, (row,)), verdict="few grasps",
-        copies_verdict="copies tell little", copies=({"case": "1-A"},), epochs=200,
+        copies_verdict="copies are of little worth", copies=({"case": "1-A"},), epochs=200,
     )  # fmt: skip
     ran = stand_in("thermogrip.studies.paper.repeat_paper", repeat)
     pages = stand_in("thermogrip.report.html.write_report")
@@ -54,7 +54,7 @@ def test_the_paper_prints_each_case_beside_ours(bench: Bench, stand_in: StandIn)
     assert done.out.splitlines() == [
         "1-A: object 43, gripper 23.5 degC, 5 materials", "    paper: 100 % (5/5)",
         "    bayes, bundled: 9/12", "    lstm, bundled: 10/12", "few grasps",
-        "copies tell little", "wrote p/report.html",
+        "copies are of little worth", "wrote p/report.html",
     ]  # fmt: skip
     assert (ran[0].quick, ran[0].seed, ran[0].workers) == (True, 4, 3)
     assert saved == [("bundled", Path("p/bundled")), ("twin", Path("p/simulated"))]

@@ -570,7 +570,7 @@ def test_faults_come_in_the_order_of_their_times_and_not_before(bench: Bench, de
     assert device.time == 12.0
 
 
-@pytest.mark.parametrize("text", ["nan:silence", "-5:silence", "silence", "inf:silence"])
+@pytest.mark.parametrize("text", ["nan:silence", "-5:silence", "silence", "inf:silence", "soon:reset"])
 def test_a_fault_without_a_time_is_refused(text: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["virtual", f"--fault={text}", "--seconds", "0"]) == 2
     assert capsys.readouterr().err == f"thermogrip: --fault {text!r} has no time; write 60:sensor_open\n"
@@ -579,11 +579,8 @@ def test_a_fault_without_a_time_is_refused(text: str, capsys: pytest.CaptureFixt
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--protocol", "morse"], "use thermogrip, tclab"),
         (["--pty", "--socket", "0"], "both given"),
-        (["--fault", "soon:sensor_open"], "has no time"),
         (["--fault", "5:ghost"], "--fault 'ghost' is unknown"),
-        (["--plant", "nothing.json"], "nothing.json"),
     ],
 )
 def test_a_device_that_cannot_be_is_one_line(

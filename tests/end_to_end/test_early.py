@@ -60,9 +60,3 @@ def test_early_predictions_say_when_they_were_sure(finger):
         assert refused.code == 2
         assert "has no stop rule" in refused.said[0]
     assert "without a grasp" in finger.run(*words, "--stop-early", "finger").said[0]
-
-
-def test_a_classifier_without_a_model_of_readings_has_no_rule(bench):
-    refused = bench.run("train", "grasps.csv", "--classifier", "bayes", "--stop-error", "0.2", "--out", "m")
-    assert refused.code == 2
-    assert "cannot predict readings" in refused.said[0]

@@ -11,7 +11,6 @@ from thermogrip.datasets.log_files import read_log
 from thermogrip.sysid.experiment import optimal
 from thermogrip.sysid.experiment.information import ExperimentForecast, plant_from_prior
 from thermogrip.sysid.models.network import load_network
-from thermogrip.sysid.plant.plant import Plant
 
 OPTIMAL = ["excite", "--kind", "optimal", "--minutes", "10", "--highest", "70", "--out", "s.csv"]
 
@@ -71,13 +70,6 @@ def test_what_cannot_be_optimal_is_one_line(bench, words, says):
     assert not (bench.path / "s.csv").exists()
 
 
-def test_plain_schedules_fit_a_network_before_any_log(bench):
-    done = bench.run("excite", "--kind", "prbs", "--minutes", "20", "--network", "tclab", "--out", "s.csv")
-    assert done.code == 0, done.err
-    log = read_log("s.csv", inputs=["q1", "q2"], outputs=[])
-    assert 0.0 <= log["q1"].min() < log["q1"].max() <= 100.0
-
-
 def test_ctrl_c_leaves_no_file(bench, monkeypatch):
     def interrupted(*_args: object) -> float:
         raise KeyboardInterrupt
@@ -86,10 +78,3 @@ def test_ctrl_c_leaves_no_file(bench, monkeypatch):
     before = sorted(path.name for path in bench.path.iterdir())
     assert bench.run(*OPTIMAL, "--network", "tclab").code == 130
     assert sorted(path.name for path in bench.path.iterdir()) == before
-
-
-def test_the_plant_of_a_file_and_of_a_network_are_evaluated_alike(tmp_path):
-    plant = plant_from_prior(load_network("tclab"))
-    loaded = Plant.load(plant.save(tmp_path / "p.json"))
-    u = np.full((300, 2), 40.0)
-    assert ExperimentForecast(loaded).bits(u) == pytest.approx(ExperimentForecast(plant).bits(u), rel=1e-12)

@@ -12,7 +12,6 @@ import pytest
 from tests.end_to_end.conftest import Bench
 from thermogrip.datasets.log_files import read_log
 from thermogrip.sysid.greybox.fit import fit_network
-from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.user_class import load_object
 from thermogrip.sysid.models.user_model import own_model
 from thermogrip.sysid.validation.free_run import free_run
@@ -86,14 +85,6 @@ def test_a_wrong_class_is_one_line_and_code_2(tank: Bench, network: str, names: 
     for name in names:
         assert name in done.said[0]
     assert not (tank.path / "x.json").exists()
-
-
-def test_a_plant_without_its_class_says_how_to_hand_it_in(tank: Bench):
-    own = own_model(load_object(tank.path / "tank.py", "Tank"))
-    prior_plant(own).save(tank.path / "tank.json")
-    done = tank.run("validate", "tank.json", "tank.csv")
-    assert done.code == 2
-    assert "--network tank.py:Tank" in done.said[0]
 
 
 @pytest.mark.skipif(

@@ -56,6 +56,11 @@ REFUSED = {
     "identify x.csv --network none --grow --out p.json": "--grow has no thermal network to grow",
     "validate x.csv x.csv --network n.py:Tank": "n.py: no such file",
     "identify nofile.csv@10:20 --out p.json": "nofile.csv@10:20: no such file or folder",
+    "validate x.csv nofile.csv": "nofile.csv: no such file or folder",  # before plants are looked through
+    "validate short.json x.csv --network n.py:": "n.py: names no class; write n.py:CLASS",
+    "validate short.json x.csv --network nothing": "no network 'nothing'",
+    "validate short.json x.csv nofile.csv@1:2": "nofile.csv@1:2: no such file or folder",
+    "classify x.csv x.csv --out p.csv": "x.csv: is not a folder; give the folder that train",
     "validate noplant.json x.csv": "noplant.json: no such file or folder",
     "validate deep.json x.csv": "deep.json: is nested too deeply",
     "validate short.json x.csv": "short.json: is not a whole plant (KeyError: 'values')",

@@ -50,34 +50,8 @@ def test_a_run_is_written_in_other_formats_and_reads_back(tmp_path: Path, name: 
     assert log["drive"].attrs["role"] == "input"
 
 
-def test_a_trial_is_marked_bad(tmp_path: Path) -> None:
-    folder = killed(tmp_path / "run")
-    assert main(["recover", str(folder), "--bad", "it slipped"]) == 0
-    last = json.loads((folder / "events.jsonl").read_text().splitlines()[-1])
-    assert (last["kind"], last["text"]) == ("bad", "it slipped")
-
-
 def test_a_run_without_a_row_is_an_answer_of_no(tmp_path: Path) -> None:
     killed(tmp_path / "batch" / "0001")
     assert main(["recover", str(tmp_path / "batch")]) == 0
     killed(tmp_path / "batch" / "0002", n=0)
     assert main(["recover", str(tmp_path / "batch")]) == 3
-
-
-def test_a_changed_file_and_no_folder_are_the_users_to_repair(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = killed(tmp_path / "run")
-    main(["recover", str(folder)])
-    (folder / "events.jsonl").write_text("")
-    assert main(["recover", str(folder)]) == 2
-    assert "was changed after the run ended (events.jsonl)" in capsys.readouterr().err
-    assert main(["recover", str(tmp_path / "nothing")]) == 2
-
-
-def test_a_batch_without_a_rig_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "plan.csv").write_text("material,t_object_degC,target_degC\ncopper,43,23\n")
-    (tmp_path / "c.json").write_text("{}")
-    words = ["batch", str(tmp_path / "c.json"), str(tmp_path / "plan.csv"), "--out", str(tmp_path / "b")]
-    assert main(words) == 2
-    assert "give --port DEV, or --twin PLANT" in capsys.readouterr().err

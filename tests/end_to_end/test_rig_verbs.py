@@ -67,18 +67,6 @@ def test_virtual_prints_its_port_and_serves_until_it_is_stopped(protocol: str, p
     assert served.returncode == 130, complaint
 
 
-def test_a_schedule_that_cannot_be_followed_is_refused_by_its_name_and_leaves_no_folder(
-    device: VirtualDevice, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    schedule = tmp_path / "schedule.csv"
-    schedule.write_text("time_s,q1_percent,q2_percent\n0,0,0\n5,140,0\n9,0,0\n")
-    words = ["record", str(schedule), "--port", device.port, "--speed", "5", "--out", str(tmp_path / "log")]
-    assert main(words) == 2
-    said = capsys.readouterr().err.strip().splitlines()[-1]
-    assert said == f"thermogrip: {schedule}: the schedule's q1 is 140 at 5 s; write 0 to 100"
-    assert not (tmp_path / "log").exists()
-
-
 def test_a_guard_that_learns_reports_it_in_one_line_where_it_cannot(
     plant_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -120,44 +108,6 @@ def test_run_drives_the_rig_on_a_port_and_leaves_it_off(
     assert json.loads((tmp_path / "run" / "run.json").read_text())["about"]["port"] == device.port
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        ([], "no rig is given"),
-        (["--port", "/dev/null", "--twin", "PLANT"], "both given"),
-        (["--port", "/dev/there-is-none"], "cannot be opened"),
-        (["--port", "socket://127.0.0.1:1"], "cannot be opened"),
-        (["--port", "/dev/ttyX", "--draw", "2"], "--draw"),
-        (["--port", "/dev/ttyX", "--protocol", "morse"], "use thermogrip, tclab"),
-    ],
-)
-def test_a_wrong_port_is_one_line(
-    options: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    controller, plant = tmp_path / "controller.json", lab_plant().save(tmp_path / "plant.json")
-    Controller(lab_plant()).save(controller)
-    options = [str(plant) if word == "PLANT" else word for word in options]
-    assert main(["run", str(controller), "--target", "40", "--out", str(tmp_path / "run"), *options]) == 2
-    complaint = capsys.readouterr().err
-    assert said in complaint
-    assert complaint.count("\n") == 1
-
-
-def test_a_device_ends_after_its_seconds_and_fails_when_asked(
-    plant_file: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ["virtual", "--protocol", "tclab", "--plant", str(plant_file), "--speed", "50", "--seconds", "10"]
-    assert main([*words, "--fault", "2:sensor_open", "--fault", "4:cable_pulled"]) == 0
-    assert "/port" in capsys.readouterr().out
-
-
-def test_socket_0_is_a_free_port_of_the_system_s_choice(
-    plant_file: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["virtual", "--plant", str(plant_file), "--socket", "0", "--seconds", "0"]) == 0
-    assert int(capsys.readouterr().out.rsplit(":", 1)[1]) >= 1024
-
-
 def test_a_limit_of_a_guard_file_ends_a_run_and_is_kept_with_it(
     plant_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -172,34 +122,3 @@ def test_a_limit_of_a_guard_file_ends_a_run_and_is_kept_with_it(
     assert answer["advice"].startswith("limit: t1: expected 10 to 34 degC")
     kept = json.loads((tmp_path / "run" / "run.json").read_text())
     assert kept["files"]["guard"]["path"] == str(limits)
-
-
-@pytest.mark.parametrize("verb", ["run", "batch", "record"])
-def test_a_wrong_guard_file_is_one_line_before_anything_is_opened(
-    verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    controller, limits, plan = (tmp_path / name for name in ("c.json", "guard.toml", "plan.csv"))
-    Controller(lab_plant()).save(controller)
-    limits.write_text("stale_ms = 500\n")
-    plan.write_text("material,target_degC\ncopper,30\n")
-    schedule = tmp_path / "schedule.csv"
-    schedule.write_text("time_s,q1_percent,q2_percent\n0,0,0\n1,0,0\n2,0,0\n")
-    words = {
-        "run": ["run", str(controller), "--target", "30"],
-        "batch": ["batch", str(controller), str(plan)],
-    }
-    words["record"] = ["record", str(schedule)]
-    common = ["--port", "/dev/there-is-none", "--guard", str(limits), "--out", str(tmp_path / "out")]
-    assert main([*words[verb], *common]) == 2
-    complaint = capsys.readouterr().err
-    assert "guard.toml: stale_ms: no such key; write stale_s" in complaint
-    assert complaint.count("\n") == 1
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_batch_without_a_run_has_nothing_to_recover(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "batch.json").write_text("{}")
-    assert main(["recover", str(tmp_path)]) == 2
-    assert "is a batch without a run; give the same batch command again" in capsys.readouterr().err

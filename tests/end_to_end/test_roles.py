@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 from tests.end_to_end.conftest import Bench
-from thermogrip.datasets.log_files import read_log
-from thermogrip.sysid.data.data_quality import check_data
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 
@@ -102,13 +100,6 @@ def test_a_network_that_was_asked_for_and_does_not_apply_is_code_2(
     assert not (house.path / "found.json").exists()
 
 
-def test_a_network_that_nobody_asked_for_is_not_named(house: Bench):
-    words = ("--inputs", "setting", "--outputs", "t_room", "--models", "arx,network", "--out", "found.json")
-    done = house.run("identify", "room.csv", *words)
-    assert done.code == 0, done
-    assert "gripper" not in done.out + done.err
-
-
 def test_the_role_of_every_column_is_printed_and_a_guess_is_marked(house: Bench):
     rows = (house.path / "room.csv").read_text().splitlines()
     more = [f"{row},{18 + 3 * (k // 150)},{20 + k // 200}" for k, row in enumerate(rows[1:])]
@@ -131,22 +122,3 @@ def test_the_role_of_every_column_is_printed_and_a_guess_is_marked(house: Bench)
     page = " ".join(re.sub(r"<[^>]*>", " ", (house.path / "found.html").read_text()).split())
     for name in ("setting", "t_room", "set", "sp1"):
         assert f"{name} {table[name]}" in page
-
-
-@pytest.mark.parametrize(
-    ("kind", "says"),
-    [("held", "wanted stands still but for 2 jumps in 400 rows"), ("computed", "wanted has no noise")],
-)
-def test_an_output_without_noise_is_questioned(house: Bench, kind: str, says: str):
-    rows, k = (house.path / "room.csv").read_text().splitlines(), np.arange(400)
-    odd = 18.0 + 3.0 * (k // 150) ** 2 if kind == "held" else 20.0 + np.sin(k / 60.0)
-    more = [f"{row},{value:.12g}" for row, value in zip(rows[1:], odd)]
-    house.write("odd.csv", "\n".join([f"{rows[0]},wanted_degC", *more]) + "\n")
-    log = read_log(house.path / "odd.csv", outputs=["t_room", "wanted"])
-    said = [finding.says for finding in check_data([log]).of("noise") if finding.verdict == "warn"]
-    assert len(said) == 1
-    assert said[0].startswith(says)
-    words = ("--outputs", "t_room,wanted", "--models", "arx", "--average", "20", "--out", "found.json")
-    done = house.run("identify", "odd.csv", *words)  # too few rows for any model
-    assert done.code == 2
-    assert says in done.said[0]

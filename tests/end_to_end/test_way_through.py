@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import csv
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.end_to_end.conftest import Bench
 from thermogrip.datasets.examples import example_path
-from thermogrip.sysid.plant.plant import Plant
 
 SPEC = """
 steps = [[28, 34]]
@@ -81,15 +79,6 @@ def test_a_plant_becomes_a_controller_that_grasps(bench: Bench) -> None:
     assert "holds a run already" in again.said[0]
 
 
-def test_a_run_that_cannot_settle_is_code_3(bench: Bench) -> None:
-    bench.write("spec.toml", SPEC)
-    assert bench.run("tune", "plant.json", "--spec", "spec.toml", "--out", "c.json").code == 0
-    words = ["run", "c.json", "--target", "50", "--from", "20", "--twin", "plant.json", "--out", "r"]
-    found = answer(bench, *words, "--settle-timeout", "30", code=3)
-    assert found["verdict"] == "not settled"
-    assert json.loads((bench.path / "r/run.json").read_text())["verdict"] == "not settled"
-
-
 def test_grasps_become_materials(bench: Bench) -> None:
     assert answer(bench, "train", "grasps.csv", "--classifier", "features-lda", "--out", "m")["grasps"] == 8
     assert bench.run("classify", "m", "more.csv", "--out", "p.csv").code == 0
@@ -123,24 +112,6 @@ def test_a_comparison_says_n_and_interval(bench: Bench) -> None:
     assert {"report.html", "shipped", "random"} <= {path.name for path in (bench.path / "c").iterdir()}
 
 
-def test_test_files_take_the_place_of_a_split(bench: Bench) -> None:
-    words = ["compare", "grasps.csv", "--test", "more.csv", "--classifiers", "features-lda", "--out", "c"]
-    found = answer(bench, *words)["splits"]
-    assert isinstance(found, dict)
-    assert found["files"]["scores"][0]["n"] == 12
-
-
-def test_a_schedule_stays_inside_the_limits(bench: Bench) -> None:
-    for kind in ("prbs", "multisine", "staircase"):
-        assert bench.run("excite", "--kind", kind, "--minutes", "5", "--out", f"{kind}.csv").code == 0
-        with (bench.path / f"{kind}.csv").open() as file:
-            rows = list(csv.DictReader(file))
-        drive = np.array([float(row["drive"]) for row in rows])
-        assert np.all(np.abs(drive) <= 1)
-        assert np.ptp(drive) > 0.5
-        assert float(rows[-1]["time_s"]) == pytest.approx(300, abs=5)
-
-
 def test_effusivity_without_calibration_warns_and_orders_copper_above_wood(bench: Bench) -> None:
     done = bench.run("effusivity", example_path("exp3B_obj28_grip48"), "--out", "e.csv", "--json")
     assert done.code == 0, done.err
@@ -152,15 +123,3 @@ def test_effusivity_without_calibration_warns_and_orders_copper_above_wood(bench
     of = {row["grasp_id"]: float(row["effusivity"]) for row in rows}
     copper, wood = list(of.values())[:8], list(of.values())[-8:]
     assert np.median(copper) > 10 * np.median(wood)
-
-
-def test_every_draw_of_a_plant_can_be_its_twin(bench: Bench) -> None:
-    plant = Plant.load(bench.path / "plant.json")
-    assert plant.draw(0) is plant  # no uncertainty: draw 0 is all there is
-    bench.write("spec.toml", SPEC)
-    assert bench.run("tune", "plant.json", "--spec", "spec.toml", "--out", "c.json").code == 0
-    words = ["run", "c.json", "--target", "34", "--twin", "plant.json", "--draw", "2", "--out", "r"]
-    done = bench.run(*words)
-    assert done.code == 2
-    assert "draw" in done.said[0]
-    assert not Path("r").exists()

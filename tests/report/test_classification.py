@@ -3,13 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from matplotlib.figure import Figure
 
 from thermogrip.classify import evaluate, make_classifier
 from thermogrip.datasets.examples import load_example_grasps
+from thermogrip.datasets.schema import make_log
+from thermogrip.report import classification
 from thermogrip.report.classification import comparison_sections, curves_section, touch_section
-from thermogrip.report.html import Picture, Section
+from thermogrip.report.html import Picture, Section, Table, Text
+
+
+@pytest.fixture(autouse=True)
+def _no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures have tests of their own."""
+    for name in ("accuracy", "confusion", "curve", "decision", "effusivity", "reliability"):
+        monkeypatch.setattr(f"thermogrip.classify.figures.{name}_figure", lambda *_, **__: Figure())
+    monkeypatch.setattr(classification, "loop_figure", lambda *_, **__: Figure())
 
 
 def captions(sections: list[Section]) -> Iterator[str]:
@@ -59,3 +72,135 @@ def test_a_strange_grasp_stands_with_its_reason() -> None:
         "training: as copper it is cold (4.1 sd)."
     )
     assert section.tone == "warn"
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "said", "tone"),
+    [
+        ("pass pass", "2 of 2 checks pass.", "good"),
+        ("pass warn pass", "2 of 3 checks pass. Warnings: c1.", "warn"),
+        ("fail warn fail", "0 of 3 checks pass. Warnings: c1. Failed: c0, c2.", "bad"),
+    ],
+)
+def test_a_review_counts_what_passes_and_names_the_rest(verdicts: str, said: str, tone: str) -> None:
+    checks = [
+        SimpleNamespace(name=f"c{k}", verdict=verdict, finding=f"f{k}", fix="")
+        for k, verdict in enumerate(verdicts.split())
+    ]
+    section = classification.review_section(checks)
+    assert (section.verdict, section.tone) == (said, tone)
+    assert section.parts[0].rows[0] == ("c0", verdicts.split()[0], "f0", "")
+
+
+def test_sessions_that_did_not_settle_are_counted_and_their_advice_shown() -> None:
+    log = make_log([0.0, 1.0], {"target_t_surface": ([38.0, 38.0], "degC", "other")})
+    rest = {"log": log, "settle_time": 9.0, "overshoot": 0.1, "bias": 0.02}
+    runs = [
+        ("first", SimpleNamespace(verdict="settled", advice="", **rest)),
+        ("second", SimpleNamespace(verdict="tripped", advice="look at the pump", **rest)),
+    ]
+    section = classification.session_section(runs, "the twin")
+    assert (section.verdict, section.tone) == ("1 of 2 sessions settled on the twin.", "warn")
+    assert section.parts[0].rows[1] == ("second", "tripped", 9.0, 0.1, 0.02)
+    assert [part for part in section.parts if isinstance(part, Text)] == [Text("second: look at the pump")]
+    assert classification.session_section(runs[:1], "the twin").tone == "good"
+
+
+@pytest.mark.parametrize(
+    ("ends", "said"),
+    [((0.25, 0.75), "0.500 (.25\N{EN DASH}.75)"), ((0.5, 1.0), "0.500 (.50\N{EN DASH}1.00)")],
+)
+def test_a_score_stands_with_both_ends_or_alone(ends: tuple[float, float], said: str) -> None:
+    assert classification._between(0.5, *ends) == said
+    assert classification._between(0.5, None, None) == "0.500"
+
+
+DECIDED = {
+    "classifier": "slow", "condition": "all", "n": 20, "time": 4.0, "time_low": 3.0, "time_high": 5.26,
+    "end": 10.0,
+    "accuracy": 0.9, "low": 0.68, "high": 0.988, "accuracy_at_end": 0.95, "early": 0.8, "error": 0.05,
+    "wrong_early": 0.1, "wrong_early_low": 0.01, "wrong_early_high": 0.32, "expected_early": 0.04,
+}  # fmt: skip
+
+
+def test_the_fastest_classifier_is_reported_with_what_its_short_contacts_cost() -> None:
+    single = DECIDED | {"classifier": "quick", "n": 1, "time": 2.04, "wrong_early": None}
+    found = SimpleNamespace(table=lambda: [DECIDED, single, single | {"time": 1.0}], notes=("one was cut",))
+    section = classification.decision_section(found)
+    assert section.verdict == (
+        "quick ends contacts after 2.0 s of 10 s on average and names 90 % of n = 1 right then (68 to 99 %), "
+        "95 % at the end of contact."
+    )
+    [table] = [part for part in section.parts if isinstance(part, Table)]
+    slow, quick = table.rows[:2]
+    dash = "\N{EN DASH}"
+    assert slow[3:5] == (f"4.00 (3.0{dash}5.3)", "10")
+    assert slow[7:] == ("80 %", f"10 % (1{dash}32)", "4 %", "5 %")
+    assert (quick[3], *quick[8:10]) == ("2.04", "-", "-")
+    assert Text("Notes: one was cut.") in section.parts
+
+
+def test_more_grasps_are_worth_what_the_best_of_the_most_gains() -> None:
+    row = {"accuracy": 0.5, "low": 0.4, "high": 0.6, "log_loss_chance": 1.1}
+    learning = [
+        row | {"classifier": name, "train_per_class": n, "log_loss": loss}
+        for name, n, loss in (("a", 5, 0.5), ("a", 2, 2.3), ("a", 3, 0.1), ("b", 2, 0.6), ("b", 5, 0.4))
+    ]
+    timed = [row | {"classifier": "a", "contact_s": s, "log_loss": 1 / s} for s in (1.0, 2.0, 10.0)]
+    far = [row | {"classifier": "a", "difference_K": 5.0, "log_loss": 0.3}]
+    section = classification.curves_section(
+        {"train_per_class": learning, "contact_s": timed, "difference_K": far}
+    )
+    assert section.verdict == (
+        "From 2 to 5 training grasps a material the log loss of b goes from 0.60 to 0.40. "
+        "From 1 to 10 s of contact the log loss of a goes from 1.00 to 0.10."
+    )
+    assert len(section.parts) == 3
+
+
+def test_effusivities_inside_their_interval_are_counted_in_the_order_of_the_library() -> None:
+    drawn: list[Any] = []
+    rows = [
+        SimpleNamespace(grasp_id=name, effusivity_p05=low, effusivity_p95=high)
+        for name, low, high in (("w", 100.0, 1e3), ("c", 1e4, 1e5), ("i", 1.0, 2.0))
+    ]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            "thermogrip.classify.figures.effusivity_figure",
+            lambda rows, library, materials: (drawn.extend(materials), Figure())[1],
+        )
+        section = classification.strips_section(rows, ["wood", "copper", "iron"])
+    assert drawn == ["wood", "iron", "copper"]
+    assert "2 of 3 test grasps have the library's value" in section.verdict
+
+
+@pytest.mark.parametrize(
+    ("p_value", "more"), [(0.2, " In accuracy n does not separate it from b."), (0.01, "")]
+)
+def test_who_wins_has_the_least_log_loss_and_is_set_apart_only_where_n_can(p_value: float, more: str) -> None:
+    score = {"condition": "pooled", "log_loss_chance": 1.1, "n": 20, "low": 0.683, "high": 0.988}
+    scores = [
+        score | {"classifier": "b", "log_loss": 0.5, "accuracy": 0.85},
+        score | {"classifier": "a", "log_loss": 0.25, "accuracy": 0.9},
+        score | {"classifier": "c", "log_loss": 0.1, "accuracy": 1.0, "condition": "other"},
+    ]
+    pairs = [
+        {"first": "b", "second": "a", "p_value": p_value},
+        {"first": "b", "second": "c", "p_value": 0.9},
+    ]
+    found = SimpleNamespace(scores=lambda: scores, differences=lambda condition: pairs)
+    assert classification._who_wins(found, "pooled") == (
+        "a has the lowest log loss (0.25; chance 1.10) and 90 % right of n = 20 grasps (68 to 99 %). "
+        f"b: 85 %, log loss 0.50.{more}"
+    )
+
+
+@pytest.mark.parametrize(
+    ("apart", "reported"), [([False, False], False), ([True, True], False), ([False, True], True)]
+)
+def test_conditions_below_the_line_are_reported_where_there_are_others_above_it(
+    apart: list[bool], reported: bool
+) -> None:
+    said = classification._below([{"apart": value} for value in apart])
+    assert bool(said) == reported
+    assert not reported or "touched twice or of unknown temperature, not in the pool" in said

@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Segment
 from thermogrip.report import control
 from thermogrip.report.html import Picture, Table, Text
+
+NAN, INF = float("nan"), float("inf")
 
 STEPS = [(28.0, 38.0), (28.0, 18.0)]
 
@@ -201,3 +204,116 @@ def test_a_session_stands_with_its_events_its_grasp_and_its_loop(
         assert options == {"drive_range": {"q": (0.0, 100.0)}, "figures": figures}
         assert found[2].tone == tone
         assert found[3].verdict == "The slowest of 2 steps took 2.5e+02 ms of the 0.5 s it had."
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said", "tone"),
+    [
+        ([0.001, 0.0123], "The slowest of 2 steps took 12 ms of the 0.5 s it had.", "good"),
+        ([0.5, 0.1], "The slowest of 2 steps took 5e+02 ms of the 0.5 s it had.", "good"),
+        ([0.6, 0.1, 0.7], "2 of 3 steps took longer than their deadline of 0.5 s.", "warn"),
+    ],
+)
+def test_steps_are_late_only_beyond_their_deadline(seconds: list[float], said: str, tone: str) -> None:
+    section = control.timing_section(seconds, SimpleNamespace(deadline_s=0.5, dt=2.0))
+    assert (section.verdict, section.tone) == (said, tone)
+
+
+@pytest.mark.parametrize(
+    ("front", "said"),
+    [
+        (
+            [("A", 50.0, 20.0), ("B", 80.0, 15.0), ("C", 60.0, 18.0)],
+            "B takes 80 s instead of 50 s and 25 % less",
+        ),
+        ([("A", 50.0, 20.0), ("B", 80.0, 19.6)], "Nothing: the fastest design (50 s) is as frugal as any."),
+        ([("A", 50.0, 20.0)], "Nothing: the fastest design (50 s) is as frugal as any."),
+        ([], "No design settled on all draws."),
+    ],
+)
+def test_speed_is_traded_for_energy_along_the_front_of_the_mpc_alone(
+    front: list[tuple[str, float, float]], said: str
+) -> None:
+    rows = [
+        {"name": name, "settle_s": settle, "energy_s": energy, "best": True, "controller": "MPC"}
+        for name, settle, energy in front
+    ]
+    others = [
+        {"name": "x", "settle_s": 1.0, "energy_s": 1.0, "best": best, "controller": of}
+        for best, of in ((False, "MPC"), (True, "PI"))
+    ]
+    assert said in control._trade([*others, *rows])
+
+
+@pytest.mark.parametrize(
+    ("seconds", "shown"), [(12.34, 12.3), (None, "does not settle"), (NAN, "does not settle"), (INF, "never")]
+)
+def test_a_missing_time_is_reported_in_words(seconds: float | None, shown: object) -> None:
+    assert control._shown(seconds) == shown
+
+
+@pytest.mark.parametrize(("value", "shown"), [(0.12345, 0.123), (None, None), (NAN, None), (INF, None)])
+def test_a_number_that_is_none_is_left_out(value: float | None, shown: float | None) -> None:
+    assert control._rounded(value) == shown
+
+
+@pytest.mark.parametrize(
+    ("settle", "tone", "said"),
+    [
+        (41.6, "good", "t from 25.0 to 38 degC settles in 42 s, overshoot 0.25 K, bias -0.010 K."),
+        (NAN, "warn", "t from 25.0 to 38 degC does not settle, overshoot 0.25 K, bias -0.010 K."),
+    ],
+)
+def test_a_closed_loop_is_reported_by_output_with_its_statuses(settle: float, tone: str, said: str) -> None:
+    segment = Segment("t", 25.0, 38.0, 0.0, 100.0, settle, 0.25, -0.01, 0.02, 5.0, 1.0, 0.5)
+    none: Any = np.zeros(3)
+    run = ClosedLoop(
+        none, {}, none, {}, {}, {}, ("ok", "late", "ok"), ("", "wait", "wait"), none, 0.2, {}, (segment,)
+    )
+    section = control.loop_section(run, SimpleNamespace(limits={}, slew_per_s={}), "loop")
+    assert (section.verdict, section.tone) == (said, tone)
+    assert section.parts[0].caption.endswith("By status: 2 ok, 1 late.")
+    assert section.parts[1] == Text("Advice of the controller: wait.")
+    assert (
+        control.loop_section(run, SimpleNamespace(limits={}, slew_per_s={}), "loop", tone="bad").tone == "bad"
+    )
+
+
+@pytest.mark.parametrize(
+    ("contact", "said", "tone"),
+    [
+        (0.42, 'The skin felt the object 0.4 s after the "closed" message.', "good"),
+        (0.04, 'The skin felt the object 0.0 s after the "closed" message.', "good"),
+        (-0.04, 'The skin felt the object 0.0 s after the "closed" message.', "good"),
+        (-0.31, 'The skin felt the object 0.3 s before the "closed" message.', "good"),
+        (NAN, "The skin felt no object: no contact, or one as warm as the skin.", "warn"),
+    ],
+)
+def test_when_the_skin_felt_the_object_is_reported(contact: float, said: str, tone: str) -> None:
+    section = control._contact_section(None, contact)
+    assert (section.verdict, section.tone) == (said, tone)
+
+
+def test_what_never_settled_has_no_bias_and_several_outputs_no_common_figures() -> None:
+    session = SimpleNamespace(settle_time=12.0, overshoot=0.3, bias=NAN)
+    assert control._figures_of(session, ("t",)) == {"t": {"settle_s": 12.0, "overshoot": 0.3}}
+    session.bias = 0.05
+    assert control._figures_of(session, ("t",))["t"]["bias"] == 0.05
+    assert control._figures_of(session, ("t1", "t2")) == {}
+
+
+def test_steps_of_a_tuning_stand_in_the_order_of_the_spec() -> None:
+    row = {
+        "settle_mean_s": 10.04, "settle_worst_s": NAN, "overshoot_mean": 0.12345, "overshoot_worst": 0.5,
+        "bias_worst": 0.01, "energy_mean_s": 7.0, "bound_s": INF,
+    }  # fmt: skip
+    tuning = SimpleNamespace(
+        spec=SimpleNamespace(steps=[(28.0, 38.0), (28.0, 18.0)]),
+        rows=[
+            SimpleNamespace(controller="PI", start=28.0, target=18.0, **row),
+            SimpleNamespace(controller="tuned", start=28.0, target=38.0, **row),
+        ],
+    )
+    first, second = control.tuning_rows(tuning)
+    assert first == ("tuned", "28 to 38", 10.0, "does not settle", 0.123, 0.5, 0.01, 7.0, "never")
+    assert second[:2] == ("PI", "28 to 18")

@@ -38,8 +38,9 @@ def test_a_large_figure_goes_in_as_png() -> None:
 def test_every_text_is_escaped() -> None:
     evil = '<img src=x onerror="alert(1)">'
     part = Table((evil,), ((evil,),), evil)
-    page = html_page(evil, evil, [Section(evil, (Text(evil), Commands((evil,)), part), evil)], footer=evil)
+    page = html_page(evil, evil, [Section(evil, (Text(evil), Commands((evil,)), part), evil)])
     assert "<img src=x" not in page
+    assert page.count("&lt;img src=x") >= 8
 
 
 def test_an_unknown_tone_is_refused() -> None:
@@ -79,3 +80,12 @@ def test_a_page_has_no_control_characters() -> None:
     page = html_page(evil, evil, [Section(evil, (Text(evil), Table((evil,), ((evil,),), evil)), evil)])
     assert "t\\x1b[31m\\u202e\\x00" in page
     assert not set(page) & set("\x1b\u202e\x00")
+
+
+def test_letters_that_the_font_has_not_are_no_warning(tmp_path: Path) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure()
+    figure.subplots().set_title("木")
+    write_report(tmp_path / "r.html", "t", "l", [Section("s", (Picture(figure, "木"),), "v")])
+    assert "木" in (tmp_path / "r.html").read_text(encoding="utf-8")

@@ -224,3 +224,24 @@ def test_growth_and_posterior_stand_where_there_are_any(monkeypatch: pytest.Monk
         "How well are its parameters known?",
     ]  # fmt: skip
     assert len(plant.identification_sections(found, ["a log"], board, None)) == 2
+
+
+def test_the_table_of_models_has_a_column_a_log_of_what_was_held_out() -> None:
+    row = {"output": "t", "unit": "degC", "fit_percent": 90.0, "n": 50}
+    rows = [
+        SimpleNamespace(model=model, log=log, rmse=rmse, no_input_rmse=2 + rmse, held_out=held, **row)
+        for model, log, rmse, held in (
+            ("arx", "a", 0.1, True),
+            ("oe", "b", 0.2, True),
+            ("oe", "a", 0.9, False),
+        )
+    ]
+    found = SimpleNamespace(rows=rows)
+    table = plant.model_table(found)
+    assert table.head == ("model", "output", "a", "b", "unit")
+    assert table.rows == (
+        ("arx", "t", 0.1, None, "degC"),
+        ("oe", "t", None, 0.2, "degC"),
+        ("no\N{NO-BREAK SPACE}input", "t", 2.1, 2.2, "degC"),
+    )
+    assert [row[-1] for row in plant.model_rows(found)] == ["held out", "held out", "in the fit"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
@@ -95,54 +94,6 @@ def a_log(shift: float = 0.0):
     )
 
 
-def test_sessions_and_grasps_have_their_legends_outside_of_what_they_explain():
-    figure = loop_figure({"a": a_log()}, {"a": 30.0}, output="t1")
-    assert all(axis.get_legend() is None for axis in figure.axes)
-    assert {text.get_text() for text in figure.legends[0].get_texts()} == {
-        "t1",
-        "target",
-        "q1 [percent]",
-        "drive",
-    }
-    grasps = make_grasps([-0.1, 0.1], [[23.0, 24.0]] * 2, ["a", "b"], material=["copper", "wood"])
-    figure = grasp_figure([grasps])
-    figure.draw_without_rendering()
-    axis = figure.axes[0]
-    assert axis.get_legend().get_window_extent().x0 >= axis.get_window_extent().x1
-
-
-def test_rows_that_are_not_scored_stand_on_grey():
-    log, run = a_log(), a_log(0.5)
-    late = np.asarray(log["time"].values) >= np.median(log["time"].values)
-    run["scored"] = ("time", late.astype(float), {"units": "1", "role": "other"})
-    grey = free_run_figure(log, run, ("t1",)).axes[1].collections[0]
-    (path,) = grey.get_paths()
-    edges = path.vertices[:, 0]
-    assert edges.min() == log["time"].values[0]
-    assert edges.max() < np.median(log["time"].values)
-    run["scored"] = ("time", np.ones(late.size), {"units": "1", "role": "other"})
-    assert free_run_figure(log, run, ("t1",)).axes[1].collections[0].get_paths() == []
-
-
-@pytest.mark.parametrize(
-    ("contact", "says", "tone"),
-    [
-        (0.2, "felt the object 0.2 s after", "good"),
-        (-0.02, "felt the object 0.0 s after", "good"),
-        (-0.2, "felt the object 0.2 s before", "good"),
-        (np.nan, "The skin felt no object", "warn"),
-    ],
-)
-def test_the_page_of_a_session_shows_its_grasp_and_says_whether_anything_was_felt(contact, says, tone):
-    grasps = make_grasps([-0.1, 0.1], [[23.0, 24.0]], ["a"], material=["copper"])
-    session = Session(a_log(), grasps, (), "settled", "", 10.0, 0.1, 0.0, contact)
-    parts = session_sections(session, [], None, "the twin")  # no moves: no closed loop to draw
-    (felt,) = [section for section in parts if section.title == "What did the skin feel?"]
-    assert says in felt.verdict
-    assert felt.tone == tone
-    assert len(session_sections(replace(session, grasps=None), [], None, "the twin")) == len(parts) - 1
-
-
 def test_the_loop_on_a_session_page_has_the_figures_that_the_command_line_prints():
     t = np.arange(0.0, 60.0, 2.0)
     log = make_log(
@@ -159,20 +110,6 @@ def test_the_loop_on_a_session_page_has_the_figures_that_the_command_line_prints
     controller = SimpleNamespace(controlled=("t",), design=design)
     (loop,) = [s for s in session_sections(session, moves, controller, "the twin") if "loop" in s.title]
     assert "settles in 16 s, overshoot 0.25 K, bias -0.125 K" in loop.verdict
-    never = replace(session, verdict="not settled", settle_time=np.nan, bias=np.nan)
-    (loop,) = [s for s in session_sections(never, moves, controller, "the twin") if "loop" in s.title]
-    assert "does not settle" in loop.verdict
-    assert "nan" not in loop.verdict
-
-
-def test_a_material_has_one_colour_in_two_figures_whatever_comes_first_in_a_record():
-    grasps = make_grasps([-0.1, 0.1], [[23.0, 24.0]] * 2, ["a", "b"], material=["wood", "copper"])
-    figure = responses_figure({"case": grasps}, ("copper", "wood"))
-    said = {
-        text.get_text(): line.get_color()
-        for text, line in zip(figure.legends[0].get_texts(), figure.legends[0].get_lines(), strict=True)
-    }
-    assert said == {"copper": PALETTE[0], "wood": PALETTE[1]}
 
 
 def test_what_a_log_has_of_its_own_has_a_unit():

@@ -105,7 +105,7 @@ def test_classifiers_are_scored_on_test_grasps_and_trained_for_the_twins_on_trai
     monkeypatch.setattr(demo, "CLASSIFIERS", ("bayes", "features-lda"))
     monkeypatch.setattr(demo, "COMPARED", ("exp2_dT10", "exp2_dT20"))
     seen: list[tuple[float, str]] = []
-    comparison, classifier = demo._compare(tmp_path, SEED, 1, lambda *told: seen.append(told))
+    comparison, classifier = demo._compare(tmp_path, SEED, 1, lambda *step: seen.append(step))
     assert {row["condition"]: row["n"] for row in comparison.scores()} == {
         "pooled": 18,
         "exp2_dT10": 9,

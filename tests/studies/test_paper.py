@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from contextlib import redirect_stdout
 from dataclasses import dataclass, replace
@@ -26,7 +25,6 @@ from thermogrip.studies.paper import (
     Case,
     PaperResult,
     _copies,
-    _interval,
     _published,
     _shown,
     _together,
@@ -56,11 +54,6 @@ def test_published_accuracies_are_those_of_the_paper() -> None:
     assert said["1-B"] == "40 %"
     assert [said[name] for name in said if name.startswith("2-")] == ["33.33 %", "66.66 %", *["100 %"] * 3]
     assert [said[f"3-{letter}"] for letter in "ABC"] == ["100 %"] * 3
-
-
-def test_three_of_three_supports_more_than_29_percent() -> None:
-    low, high = _interval(next(case for case in CASES if case.name == "3-A"))
-    assert (low, high) == (pytest.approx(0.025 ** (1 / 3)), 1.0)
 
 
 @pytest.mark.slow
@@ -106,7 +99,7 @@ def test_a_printed_rate_has_both_ends_of_its_interval() -> None:
 
 @dataclass(frozen=True)
 class Repeated:
-    """What the verb printed, wrote and found, and what it told of its progress."""
+    """What the verb printed, wrote and found, and its progress."""
 
     said: str
     found: PaperResult
@@ -191,8 +184,8 @@ def test_every_case_and_every_rate_is_printed(small: Repeated) -> None:
     head, rows = small.table
     assert lines[0] == "1-A: object 43, gripper 23 degC, 5 materials"
     assert lines[1] == "    paper: 100 % (5/5 (48–100))"
-    told = [f"    {title}: {cell}" for row in rows for title, cell in zip(head[6:], row[6:])]
-    assert [line for line in lines if ", bundled: " in line or ", simulated: " in line] == told
+    cells = [f"    {title}: {cell}" for row in rows for title, cell in zip(head[6:], row[6:])]
+    assert [line for line in lines if ", bundled: " in line or ", simulated: " in line] == cells
     assert "leaves open all from 29 % (3 of 3) or 48 % (5 of 5) upwards" in lines[-3]
     assert lines[-2:] == [small.found.copies_verdict, f"wrote {small.out}/report.html"]
     assert {path.name for path in small.out.iterdir()} == {"bundled", "simulated", "report.html"}
@@ -203,19 +196,6 @@ def test_every_case_and_every_rate_is_printed(small: Repeated) -> None:
     assert all(row["copies_right"] < 0.9 * row["copies_n"] for row in small.found.copies)  # after two epochs
     assert "It has not learnt even its own copies in 1-A; 2-C, 10 K" in page
     assert small.found.bundled.leaks == small.found.twin.leaks == ()  # the paper has no such probe
-
-
-def test_the_answer_holds_the_same_rows(
-    small: Repeated, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("thermogrip.studies.paper.CASES", FEW)
-    monkeypatch.setattr("thermogrip.studies.paper.repeat_paper", lambda **options: small.found)
-    monkeypatch.setattr(PaperResult, "sections", lambda found: [])
-    assert main(["paper", "--json", "--out", str(tmp_path / "out")]) == 0
-    answer = json.loads(capsys.readouterr().out)
-    assert answer["cases"] == [dict(zip(head, row)) for head, rows in [small.table] for row in rows]
-    assert answer["copies"] == list(small.found.copies)
-    assert (answer["epochs"], answer["verdict"]) == (2, small.found.verdict)
 
 
 def test_each_stage_of_the_paper_fills_its_share_of_the_progress(small: Repeated) -> None:
@@ -251,7 +231,7 @@ def test_what_is_lost_to_a_known_gripper_is_a_difference_of_log_losses(small: Re
         assert (row[0], row[2], best["n"]) == (case.name, best["log_loss"], 3 * case.of)
         for name, more in zip(("posterior", "bayes", "lstm"), row[3:], strict=True):
             assert more + best["log_loss"] == pytest.approx(losses[name, case.record])
-    # with the numbers known, 10 K or more tell copper, iron and wood apart
+    # with the numbers known, 10 K or more distinguish copper, iron and wood
     assert small.found.known[1]["accuracy"] == 1.0
     assert 0.0 < small.found.known[1]["log_loss"] < 0.1
     assert small.found.known[1]["low"] == pytest.approx(0.025 ** (1 / 9))

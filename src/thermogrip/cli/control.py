@@ -87,8 +87,6 @@ def tune(
     loaded = load_plant(plant, network)
     wanted = Spec() if spec is None else read_spec(spec)
     new_file(out, (".json",))
-    if report is not None:
-        new_file(report, (".html",))
     console = Console(as_json)
     with (
         kept_processes(pool),
@@ -136,8 +134,6 @@ def review(
 
     Each check passes, warns or fails, and says the fix.
     """
-    if report is not None:
-        new_file(report, (".html",))
     loaded = load_controller(controller, network)  # first: a design that cannot be is refused sooner
     from thermogrip.mpc.design_review import review as check
     from thermogrip.report.classification import review_section

@@ -134,15 +134,20 @@ def identify(
     """
     wanted = comma(models) or ()
     new_file(out, (".json",))
-    if report is not None:
-        new_file(report, (".html",))
     sought = None if network == "none" or "network" not in wanted else network or DEFAULT_NETWORK
     wanted_network = None if sought is None else find_network(sought)
     to_grow = _growable(wanted_network) if grow else None
     console = Console(as_json)
     roles = comma(inputs), comma(outputs), comma(disturbances)
-    records = _read(logs, roles, wanted_network)
-    if wanted_network is not None and not (network or grow) and _unfit(wanted_network, records):
+    from thermogrip.sysid.plant.log_grid import misfit, roles_of
+
+    # what a network calls its own has the role that it has there
+    records = load_logs(logs, *roles, known=None if wanted_network is None else roles_of(wanted_network))
+    if (
+        wanted_network is not None
+        and not (network or grow)
+        and any(misfit(wanted_network, log) is not None for log in records)
+    ):
         wanted_network, records = None, load_logs(logs, *roles)
     _warn_of_repairs(console, records)
     from thermogrip.report.html import write_report
@@ -207,21 +212,6 @@ def _sampled(
     if record.converged:
         chain.unlink(missing_ok=True)
     return plant, record, ""
-
-
-def _read(
-    paths: Sequence[str], roles: Sequence[Sequence[str] | None], network: GreyModel | None
-) -> list[Log]:
-    """Read logs for a fit: what a network calls its own has the role that it has there."""
-    from thermogrip.sysid.plant.log_grid import roles_of
-
-    return load_logs(paths, *roles, known=None if network is None else roles_of(network))
-
-
-def _unfit(network: GreyModel, logs: Sequence[Log]) -> bool:
-    from thermogrip.sysid.plant.log_grid import misfit
-
-    return any(misfit(network, log) is not None for log in logs)
 
 
 def _warn_of_repairs(console: Console, logs: Sequence[Log]) -> None:
@@ -331,8 +321,6 @@ def validate(
     """Score a plant by free run.
 
     It sees the inputs and disturbances of the whole log, and measured outputs of the warm-up only."""
-    if report is not None:
-        new_file(report, (".html",))
     loaded = load_plant(plant, network)
     console = Console(as_json)
     records = load_logs(logs, loaded.inputs, loaded.outputs, loaded.disturbances)

@@ -83,24 +83,7 @@ for _name, _verb in (
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command line and return its exit code.
-
-    Parameters
-    ----------
-    argv : sequence of str, optional
-        The words after ``thermogrip``; the process's own by default.
-
-    Returns
-    -------
-    code : int
-        0, 1, 2, 3 or 130.
-
-    Examples
-    --------
-    >>> main(["--version"])
-    thermogrip 0.1.0
-    0
-    """
+    """Run one command line, the words after ``thermogrip``, and return its exit code."""
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")  # matrices here are small: threads cost more than they give
     words = list(sys.argv[1:] if argv is None else argv)
@@ -144,7 +127,7 @@ def _fail(line: str, code: int, debug: bool = False) -> int:
 
 
 def _option_line(error: typer.TyperException) -> str:
-    """Return what is wrong with an option and where its help stands."""
+    """Return what is wrong with an option and where its help is."""
     context = getattr(error, "ctx", None)
     path = context.command_path if context is not None else "thermogrip"
     return f"{error.format_message().rstrip('.')}; see {path} --help"

@@ -61,7 +61,7 @@ def existing_model(ctx: typer.Context, value: Any) -> Any:
 
 
 def _all_exist(value: Paths) -> None:
-    for path in [value] if isinstance(value, str | Path) else value or ():
+    for path in _each(value):
         text = str(path)
         if not (os.path.exists(text) or os.path.exists(text.rpartition("@")[0])):  # LOG@120:1800
             raise UserError("no such file or folder", file=text, hint="check the path")
@@ -96,15 +96,19 @@ def _is_spec(path: Path | None) -> None:
 def _are_logs(value: Paths) -> None:
     from thermogrip.datasets.log_files import check_log_file
 
-    for path in [value] if isinstance(value, str | Path) else value or ():
+    for path in _each(value):
         check_log_file(path)
 
 
 def _are_grasps(value: Paths) -> None:
     from thermogrip.datasets.grasp_files import check_grasp_file
 
-    for path in [value] if isinstance(value, str | Path) else value or ():
+    for path in _each(value):
         check_grasp_file(path)
+
+
+def _each(value: Paths) -> Sequence[str | Path]:
+    return [value] if isinstance(value, str | Path) else value or ()
 
 
 def _existing_and(check: Callable[[Any], None]) -> Callable[[typer.Context, Any], Any]:
@@ -150,6 +154,13 @@ def _is_folder(value: Path | None) -> None:
         raise UserError("is not a folder", file=value, hint="give the folder that train --out made")
 
 
+def new_report(ctx: typer.Context, value: Path | None) -> Path | None:
+    """Ask that a page can be written, once all files were found (``callback=``)."""
+    if value is not None:
+        ctx.meta.setdefault(_LATER, []).append(lambda: new_file(value, (".html",)))
+    return value
+
+
 def one_of(option: str, allowed: Sequence[str]) -> Callable[[str | None], str | None]:
     """Return the check that an option, where it is given, is one of the allowed words (``callback=``)."""
 
@@ -176,7 +187,12 @@ Cluster = Annotated[
 ]
 Report = Annotated[
     Path | None,
-    typer.Option("--report", metavar="FILE.html", help="Also write a one-page report with figures."),
+    typer.Option(
+        "--report",
+        metavar="FILE.html",
+        callback=new_report,
+        help="Also write a one-page report with figures.",
+    ),
 ]
 LogFiles = Annotated[
     list[str],

@@ -174,8 +174,6 @@ def run(
     if stop_early is not None and grasp is None:
         raise UserError("--stop-early without a grasp", hint="give --object and --material too")
     stop = None if stop_early is None else session_stop(stop_early)
-    if report is not None:
-        new_file(report, (".html",))
     loaded = load_controller(controller, network)
     regulator, wanted = RecordedController(loaded), _for_outputs(wanted, loaded.controlled)
     watch = guard_of(guard, loaded.plant, learn)

@@ -1,4 +1,4 @@
-"""What each result looks like on the page: the sections that the verbs and the demo share.
+"""Sections of the page that the verbs and the demo share, one function a result.
 
 Each function takes one room's result and returns sections whose verdict is a sentence.  Numbers come from the
 result alone; nothing is computed here but the choice of words.  Plants have
@@ -36,7 +36,7 @@ SCORE_HEAD = (
 
 ECE_TEXT = (
     "ECE is the mean gap between confidence and accuracy over bins of 0.1. Few grasps raise it: a perfectly "
-    "calibrated classifier of the same confidences would show what stands under 'if calibrated'. "
+    "calibrated classifier of the same confidences would show what is under 'if calibrated'. "
     "Where no grasp was wrong, the interval of the log loss knows of no mistake; that of the accuracy does."
 )
 
@@ -74,7 +74,7 @@ def touch_section(touched: Sequence[Grasps], rows: Sequence[dict[str, Any]], tra
         Picture(grasp_figure(touched), "The grasps as recorded."),
         Table(head, table, f"Posterior classifier, trained on {trained_on}"),
         Text(
-            "Unknown is the probability that the block is none of the candidates; it stands beside "
+            "Unknown is the probability that the block is none of the candidates; it is beside "
             "them, not in their sum; sd counts the spreads of the training grasps. The twin draws what no "
             "two grasps share, such as how far a block is from its nominal temperature. One grasp a material "
             "shows that the stages fit together, not how often they are right."

@@ -26,7 +26,7 @@ Progress = Callable[[float, str], None]
 
 @dataclass(frozen=True)
 class Console:
-    """What one verb prints; with ``as_json`` stdout carries the JSON answer and nothing else."""
+    """What one verb prints; with ``as_json`` stdout has the JSON answer and nothing else."""
 
     as_json: bool = False
 

@@ -1,4 +1,4 @@
-"""What a controller looks like on the page: its tuning, trade-offs, sensitivities and closed loops.
+"""Sections of the page of a controller: its tuning, trade-offs, sensitivities and closed loops.
 
 As in :mod:`thermogrip.report.classification`, each function returns sections whose verdict is a sentence.
 """

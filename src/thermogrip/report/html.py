@@ -62,7 +62,7 @@ class Table:
 
     @property
     def cells(self) -> list[list[tuple[str, bool]]]:
-        """Return (text, stands to the right) for every cell: a number, or its absence among numbers."""
+        """Return (text, right-aligned) for every cell: a number, or its absence among numbers."""
         over = self._over_numbers()
         return [
             [(short(cell), _number(cell) or number) for cell, number in zip(row, over)] for row in self.rows
@@ -70,7 +70,7 @@ class Table:
 
     @property
     def heads(self) -> list[tuple[str, bool]]:
-        """Return (name, stands over numbers) for every column."""
+        """Return (name, right-aligned) for every column."""
         return list(zip(self.head, self._over_numbers()))
 
     def _over_numbers(self) -> list[bool]:
@@ -110,27 +110,8 @@ class Section:
             raise ValueError(f"tone {self.tone!r} is none of {TONES}")
 
 
-def html_page(title: str, lead: str, sections: Sequence[Section], *, footer: str = "") -> str:
-    """Return the page as text.
-
-    Parameters
-    ----------
-    title : str
-        Heading of the page.
-    lead : str
-        What was done, in a sentence or two.
-    sections : sequence of Section
-        The body.
-    footer : str, optional
-        A closing line.
-
-    Examples
-    --------
-    >>> fits = Section("Fits?", (Text("Yes."),), "It fits.", "good")
-    >>> page = html_page("Fit of <a.csv>", "One log.", [fits])
-    >>> "Fit of &lt;a.csv&gt;" in page, "<script" in page, 'class="verdict good"' in page
-    (True, False, True)
-    """
+def html_page(title: str, lead: str, sections: Sequence[Section]) -> str:
+    """Return the page as text; ``lead`` says in a sentence or two what was done."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     loader = PackageLoader("thermogrip", "templates")
@@ -143,12 +124,12 @@ def html_page(title: str, lead: str, sections: Sequence[Section], *, footer: str
         lstrip_blocks=True,
     )
     template = env.get_template("report.html.j2")
-    return template.render(title=title, lead=lead, sections=sections, footer=footer, version=__version__)
+    return template.render(title=title, lead=lead, sections=sections, version=__version__)
 
 
-def write_report(path: Path, title: str, lead: str, sections: Sequence[Section], *, footer: str = "") -> None:
-    """Write the page to ``path``, whole or not at all; arguments as in :func:`html_page`."""
-    write_atomic(path, html_page(title, lead, sections, footer=footer))
+def write_report(path: Path, title: str, lead: str, sections: Sequence[Section]) -> None:
+    """Write the page to ``path``, whole or not at all."""
+    write_atomic(path, html_page(title, lead, sections))
 
 
 def _number(cell: Any) -> bool:
@@ -161,7 +142,7 @@ def _finalize(value: Any) -> Any:
 
 
 def literal(figure: Figure) -> Figure:
-    r"""Return the figure with every text in it set as it stands: no formula, no control character.
+    r"""Return the figure with every text in it set literally: no formula, no control character.
 
     Only the superscripts that thermogrip's own units have are formulas.
     """

@@ -1,4 +1,4 @@
-"""What a plant looks like on the page: the models compared, its parameters, growth, posterior, free runs.
+"""Sections of the page of a plant: the models compared, its parameters, growth, posterior, free runs.
 
 As in :mod:`thermogrip.report.classification`, each function returns sections whose verdict is a sentence.
 """

@@ -1,7 +1,7 @@
 """Figures of a plant and of a session: free runs, posterior, closed loops, one grasp.
 
 They take records and numbers, and return matplotlib figures made without ``pyplot``, so that no window system
-is asked for and nothing global is left behind.  What a classifier's results look like stands in
+is asked for and nothing global is left behind.  Figures of a classifier's results are in
 :mod:`thermogrip.classify.figures`.
 
 The corner figure of a posterior: each pair of parameters, marginals on the diagonal

@@ -133,6 +133,7 @@ def _identify(
 def _tune(
     out: Path, plant: Plant, seed: int, workers: Workers, progress: Progress | None
 ) -> tuple[Tuning, Sequence[Check]]:
+    """Tune on few draws with few evaluations, and review the controller as its file has it."""
     from thermogrip.mpc.controllers.mpc import Controller
     from thermogrip.mpc.design.spec import Spec
     from thermogrip.mpc.design_review import review
@@ -141,7 +142,7 @@ def _tune(
     spec = Spec(steps=list(STEPS), evaluations=6, search_draws=1, check_draws=2)
     tuning = tune(plant, spec, seed=seed, workers=workers, progress=progress)
     tuning.save(out / "controller.json")
-    # what `thermogrip review` will say of the file, which carries some of the posterior's draws
+    # what `thermogrip review` will say of the file, which holds some of the posterior's draws
     return tuning, review(Controller.load(out / "controller.json"))
 
 
