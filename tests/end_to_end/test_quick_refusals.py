@@ -24,6 +24,7 @@ CONTROLLER = {"schema": "thermogrip.controller", "version": 1, "design": {}, "no
 FILES = {
     "x.csv": "time_s\n",
     "r/samples.csv": "time_s\n",
+    "b/batch.json": "{}",
     "deep.json": "[" * 50_000,
     "short.json": '{"schema": "thermogrip.plant", "version": 1}',
     "c.json": json.dumps(CONTROLLER | {"plant": PLANT}),
@@ -94,6 +95,7 @@ REFUSED = {
     "batch c.json x.csv --out d": "no rig is given",
     "recover nodir": "nodir: no such file or folder",
     "recover m": "m: is no run folder",
+    "recover b": "b: is a batch without a run; give the same batch command again",
     "recover x.csv": "x.csv: is no run folder",
     "recover r --out log.foo": "log.foo: cannot write a .foo file here",
     "record noplan.csv --port p --out d": "noplan.csv: no such file or folder",
@@ -110,7 +112,7 @@ REFUSED = {
 
 
 def test_a_mistake_in_the_words_costs_no_import_of_a_room(tmp_path: Path) -> None:
-    for folder in ("m", "r"):
+    for folder in ("m", "r", "b"):
         (tmp_path / folder).mkdir()
     for name, content in FILES.items():
         (tmp_path / name).write_text(content)
@@ -127,4 +129,4 @@ def test_a_mistake_in_the_words_costs_no_import_of_a_room(tmp_path: Path) -> Non
         assert (code, loaded) == (2, []), words
         assert REFUSED[words] in said
     assert len(done.stdout.splitlines()) == len(REFUSED)
-    assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")} == {"m", "r", *FILES}
+    assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")} == {"m", "r", "b", *FILES}

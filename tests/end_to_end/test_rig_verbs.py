@@ -26,7 +26,7 @@ PATIENCE_S = 60.0  # of a loaded machine; nothing waits so long that goes as it 
 
 
 def lab_plant() -> Plant:
-    """Return two heaters; the tests of the rig's room have the same."""
+    """Return two heaters without a room."""
     a = np.array([[1 - 1 / 200, 0.0005], [0.0005, 1 - 1 / 200]])
     model = StateSpaceModel(
         ("q1", "q2"), (), ("t1", "t2"), A=a, B=np.eye(2) * 0.0015, C=np.eye(2), dt=1.0, y0=[25.0, 25.0]

@@ -122,3 +122,17 @@ def test_the_role_of_every_column_is_printed_and_a_guess_is_marked(house: Bench)
     page = " ".join(re.sub(r"<[^>]*>", " ", (house.path / "found.html").read_text()).split())
     for name in ("setting", "t_room", "set", "sp1"):
         assert f"{name} {table[name]}" in page
+
+
+@pytest.mark.parametrize(
+    ("kind", "says"),
+    [("held", "wanted stands still but for 2 jumps in 400 rows"), ("computed", "wanted has no noise")],
+)
+def test_an_output_without_noise_is_questioned(house: Bench, kind: str, says: str):
+    rows, k = (house.path / "room.csv").read_text().splitlines(), np.arange(400)
+    odd = 18.0 + 3.0 * (k // 150) ** 2 if kind == "held" else 20.0 + np.sin(k / 60.0)
+    more = [f"{row},{value:.12g}" for row, value in zip(rows[1:], odd)]
+    house.write("odd.csv", "\n".join([f"{rows[0]},wanted_degC", *more]) + "\n")
+    words = ("--outputs", "t_room,wanted", "--models", "arx", "--average", "20", "--out", "found.json")
+    done = house.run("identify", "odd.csv", *words)  # too few rows for any model
+    assert (done.code, done.said[0].count(says)) == (2, 1)

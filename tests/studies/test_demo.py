@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -202,9 +201,9 @@ def test_a_plant_is_fitted_to_three_logs_and_the_first_half_of_the_fourth(
         )
         return fitted
 
-    def sample(plant: Any, logs: Any, *, n_samples: int, seed: int, progress: Any) -> Any:
+    def sample(plant: Any, logs: Any, *, seed: int, progress: Any, **sizes: int) -> Any:
         progress(0.5, "y")
-        calls["sample"] = (plant, len(logs), n_samples, seed)
+        calls["sample"] = (plant, len(logs), sizes, seed)
         return sampled, "a record"
 
     monkeypatch.setattr("thermogrip.sysid.identification.identify", identify)
@@ -222,26 +221,9 @@ def test_a_plant_is_fitted_to_three_logs_and_the_first_half_of_the_fourth(
     assert (whole.sizes["time"], score_from) == (n, 1350)
     [cut] = [rows for name, rows in zip(names, rows) if name.startswith("pump_on_off")]
     assert 0.4 < cut / n < 0.6
-    assert (calls["sample"], calls["saved"]) == (("a plant", 4, 100, SEED), tmp_path / "plant.json")
+    assert (calls["sample"], calls["saved"]) == (
+        ("a plant", 4, {"n_sampled": 4, "n_samples": 100}, SEED),
+        tmp_path / "plant.json",
+    )
     assert found[:3] == (fitted, sampled, "a record")
     assert seen == [(pytest.approx(0.3), "x"), (pytest.approx(0.8), "posterior: y")]
-
-
-def test_a_plant_is_tuned_on_few_draws_and_what_is_reviewed_is_the_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls: list[Any] = []
-    tuning = SimpleNamespace(save=lambda path: calls.append(path))
-    monkeypatch.setattr(
-        "thermogrip.mpc.tuning.tune.tune", lambda *args, **options: (calls.append((args, options)), tuning)[1]
-    )
-    monkeypatch.setattr("thermogrip.mpc.controllers.mpc.Controller.load", lambda path: f"loaded {path.name}")
-    monkeypatch.setattr(
-        import_module("thermogrip.mpc.design_review"), "review", lambda given: f"review of {given}"
-    )
-    assert demo._tune(tmp_path, "a plant", SEED, 3, None) == (tuning, "review of loaded controller.json")
-    ((plant, spec), options), saved = calls
-    assert (plant, saved) == ("a plant", tmp_path / "controller.json")
-    assert options == {"seed": SEED, "workers": 3, "progress": None}
-    assert (spec.steps, spec.evaluations) == ([(28.0, 38.0), (28.0, 18.0), (18.0, 43.0)], 6)
-    assert (spec.search_draws, spec.check_draws) == (1, 2)
