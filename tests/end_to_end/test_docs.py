@@ -29,7 +29,7 @@ else there), all but `recover`, `materials` and `init` take `--seed`. Progress a
 |---|---|
 | 0 | done |
 | 1 | a bug of ours; `--debug` anywhere on the line shows its traceback |
-| 2 | your input is at fault: one line on stderr names file, row, column and the mend |
+| 2 | your input is at fault: one line on stderr names file, row, column and what to do |
 | 3 | done, but the answer is no: not converged, spec not met, review failed, rig tripped, did not settle |
 | 130 | Ctrl-C; no half-written file is left |
 """

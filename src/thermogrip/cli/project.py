@@ -24,7 +24,7 @@ def demo(
 ) -> int:
     """Do all of the below once on the example data.
 
-    Identify, validate, tune, run on the simulated rig, grasp, compare; under 5 minutes on 2 cores, with a
+    Identify, validate, tune, run on the simulated rig, grasp, compare; under 2 minutes on 2 cores, with a
     report. Without PyTorch the comparison has no LSTM.
     """
     new_folder(out)

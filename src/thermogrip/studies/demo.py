@@ -2,7 +2,7 @@
 
 The example logs and grasps come from a simulated rig that shares no code with thermogrip; sessions run on a
 twin whose plant is a draw of the posterior, so the controller's model is not the truth.  The budgets are
-small, so that two cores need less than five minutes; the report says what that costs.
+small, so that two cores need less than two minutes; the report says what that costs.
 """
 
 from __future__ import annotations
