@@ -42,22 +42,14 @@ class Verb(TyperCommand):
         return super().invoke(ctx)
 
 
-def existing(ctx: typer.Context, value: Any) -> Any:
-    """Ask that every path of an option exists (``callback=``)."""
-    ctx.meta.setdefault(_CHECKS, []).append(lambda: _all_exist(value))
-    return value
+def _asked(check: Callable[[Any], None], when: str = _CHECKS) -> Callable[[typer.Context, Any], Any]:
+    """Return a ``callback=`` that keeps a check of its option's value for :class:`Verb`."""
 
+    def callback(ctx: typer.Context, value: Any) -> Any:
+        ctx.meta.setdefault(when, []).append(lambda: check(value))
+        return value
 
-def existing_network(ctx: typer.Context, value: Any) -> Any:
-    """Ask that the network of an option exists, and that its file is right (``callback=``)."""
-    ctx.meta.setdefault(_CHECKS, []).append(lambda: _is_network(value))
-    return value
-
-
-def existing_model(ctx: typer.Context, value: Any) -> Any:
-    """Ask that the folder of a classifier exists (``callback=``)."""
-    ctx.meta.setdefault(_CHECKS, []).append(lambda: _is_folder(value))
-    return value
+    return callback
 
 
 def _all_exist(value: Paths) -> None:
@@ -113,19 +105,7 @@ def _each(value: Paths) -> Sequence[str | Path]:
 
 def _existing_and(check: Callable[[Any], None]) -> Callable[[typer.Context, Any], Any]:
     """Return a ``callback=`` that asks that files exist and, later, that this check passes."""
-
-    def callback(ctx: typer.Context, value: Any) -> Any:
-        ctx.meta.setdefault(_LATER, []).append(lambda: check(value))
-        return existing(ctx, value)
-
-    return callback
-
-
-existing_plant = _existing_and(_is_plant)
-existing_controller = _existing_and(_is_controller)
-existing_spec = _existing_and(_is_spec)
-existing_logs = _existing_and(_are_logs)
-existing_grasps = _existing_and(_are_grasps)
+    return lambda ctx, value: existing(ctx, _asked(check, _LATER)(ctx, value))
 
 
 def _is_network(text: str | None) -> None:
@@ -149,16 +129,25 @@ def _split_class(text: str) -> tuple[str, str]:
     return (file, name) if file.endswith(".py") else (text, "")
 
 
+def _is_new_page(value: Path | None) -> None:
+    if value is not None:
+        new_file(value, (".html",))
+
+
 def _is_folder(value: Path | None) -> None:
     if value is not None and not value.is_dir():
         raise UserError("is not a folder", file=value, hint="give the folder that train --out made")
 
 
-def new_report(ctx: typer.Context, value: Path | None) -> Path | None:
-    """Ask that a page can be written, once all files were found (``callback=``)."""
-    if value is not None:
-        ctx.meta.setdefault(_LATER, []).append(lambda: new_file(value, (".html",)))
-    return value
+existing = _asked(_all_exist)
+existing_network = _asked(_is_network)
+existing_model = _asked(_is_folder)
+existing_plant = _existing_and(_is_plant)
+existing_controller = _existing_and(_is_controller)
+existing_spec = _existing_and(_is_spec)
+existing_logs = _existing_and(_are_logs)
+existing_grasps = _existing_and(_are_grasps)
+new_report = _asked(_is_new_page, _LATER)
 
 
 def one_of(option: str, allowed: Sequence[str]) -> Callable[[str | None], str | None]:
