@@ -201,9 +201,9 @@ def test_a_plant_is_fitted_to_three_logs_and_the_first_half_of_the_fourth(
         )
         return fitted
 
-    def sample(plant: Any, logs: Any, *, seed: int, progress: Any, **sizes: int) -> Any:
+    def sample(plant: Any, logs: Any, *, seed: int, progress: Any) -> Any:
         progress(0.5, "y")
-        calls["sample"] = (plant, len(logs), sizes, seed)
+        calls["sample"] = (plant, len(logs), seed)
         return sampled, "a record"
 
     monkeypatch.setattr("thermogrip.sysid.identification.identify", identify)
@@ -222,7 +222,7 @@ def test_a_plant_is_fitted_to_three_logs_and_the_first_half_of_the_fourth(
     [cut] = [rows for name, rows in zip(names, rows) if name.startswith("pump_on_off")]
     assert 0.4 < cut / n < 0.6
     assert (calls["sample"], calls["saved"]) == (
-        ("a plant", 4, {"n_sampled": 4, "n_samples": 100}, SEED),
+        ("a plant", 4, SEED),
         tmp_path / "plant.json",
     )
     assert found[:3] == (fitted, sampled, "a record")

@@ -44,7 +44,6 @@ if TYPE_CHECKING:
 SPLIT_S = 1350  # the first seconds of pump_on_off are fitted, the rest is held out
 MODELS = ("arx", "oe", "sindy", "network")
 STEPS = ((28.0, 38.0), (28.0, 18.0), (18.0, 43.0))
-SAMPLED, SAMPLES = 4, 100  # parameters that emcee moves, and samples of all of them
 DRAW = 3  # the twin's plant, a draw of the posterior
 T_OBJECT, T_GRIPPER, TOUCHED = 18.0, 38.0, ("copper", "wood")  # degC, degC, what the twin grasps
 CANDIDATES = ("copper", "iron", "wood")  # as in the condition at these temperatures
@@ -124,9 +123,7 @@ def _identify(
     share = part(progress, 0.0, 0.6)
     found = identify(logs, network="gripper", models=MODELS, draws=0, seed=seed, progress=share)
     share = part(progress, 0.6, 1.0, "posterior")
-    plant, record = sample_posterior(
-        found.plant, logs, n_sampled=SAMPLED, n_samples=SAMPLES, seed=seed, progress=share
-    )
+    plant, record = sample_posterior(found.plant, logs, seed=seed, progress=share)
     plant.save(out / "plant.json")
     whole = read_log(example_path("pump_on_off"))
     return found, plant, record, (whole, free_run(plant, whole, score_from=SPLIT_S))
