@@ -161,18 +161,15 @@ class Stream:
 
     def _evaluate(self) -> None:
         """Take what was read so far for what it is."""
+        from thermogrip.sysid.effusivity.posterior import material_fit
+
         grasp = self.grasps()
         quality = check_grasps(grasp)
         if quality.spiked[0, -1]:  # the next readings show whether it was a spike
             return
         if quality.reason[0]:
             self.log_p = np.full(len(self.candidates), np.nan)
-        else:
-            self._refresh(grasp, quality)
-
-    def _refresh(self, grasp: Grasps, quality: GraspQuality) -> None:
-        from thermogrip.sysid.effusivity.posterior import material_fit
-
+            return
         seen = material_fit(
             self._model.device_, grasp, self.candidates, finish=self._model.finish, start=self._u
         )
