@@ -105,6 +105,8 @@ def test_the_spectrum_of_the_scaled_hessian_knows_no_units():
     ]
     assert reports[0].spectrum == pytest.approx(reports[1].spectrum)
     assert sum(reports[0].spectrum) == pytest.approx(4.0, rel=1e-2)  # a unit diagonal
+    least, *_, most = reports[0].spectrum
+    assert reports[0].condition == pytest.approx(most / least, rel=2e-2)
 
 
 def test_a_plant_without_a_fit_has_nothing_to_say():
