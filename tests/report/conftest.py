@@ -28,7 +28,7 @@ def described(figure: Figure) -> Iterator[str]:
 def _style(axes: Axes) -> str:
     """Return what panels have in common: sizes of type, grid, frame."""
     texts = (axes.title, axes.xaxis.label, axes.yaxis.label)
-    grid = axes.xaxis.get_gridlines()[0]
+    grid = (axes.xaxis.get_gridlines() or axes.yaxis.get_gridlines())[0]  # a colour bar has those of y
     frame = "".join(side[0] for side, spine in axes.spines.items() if spine.get_visible())
     ticks = {**axes.xaxis.get_tick_params(), **axes.yaxis.get_tick_params()}
     shown = " ".join(f"{key}={value}" for key, value in sorted(ticks.items()) if "grid" not in key)

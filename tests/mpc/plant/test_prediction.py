@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -10,7 +12,7 @@ import pytest
 
 from tests.mpc.makers import kit, network_plant
 from thermogrip.mpc.design.design import make_blocks
-from thermogrip.mpc.design.simc import simc
+from thermogrip.mpc.design.simc import default_controlled, simc
 from thermogrip.mpc.plant.prediction import PredictionModel, sample_time, step_response
 from thermogrip.mpc.plant.steady_state import holding_drive, steady_curve
 from thermogrip.sysid.models.state_space import StateSpaceModel
@@ -251,3 +253,15 @@ def test_no_drive_is_what_is_nearest_to_none_and_a_step_from_there_stays_in_rang
 def test_the_room_is_the_first_of_what_is_measured() -> None:
     model = PredictionModel(lag((0.0, 4.0), ("t_room", "t_water")), dt=1.0)
     assert [model.room(d) for d in ([21.0, 30.0], [np.nan, 30.0], [21.0, np.nan])] == [21.0, 25.0, 21.0]
+
+
+@pytest.mark.parametrize(
+    ("drives", "outputs", "controlled"),
+    [(1, "t_surface t_tank", "t_surface"), (1, "t_pipe t_tank", "t_tank"), (2, "t_surface a b", "a b")],
+)
+def test_the_skin_is_controlled_by_one_drive_and_by_several_the_last_outputs(
+    drives: int, outputs: str, controlled: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("thermogrip.mpc.design.simc.drive_names", lambda plant: tuple("uv"[:drives]))
+    plant: Any = SimpleNamespace(outputs=tuple(outputs.split()))
+    assert default_controlled(plant) == tuple(controlled.split())

@@ -1,0 +1,66 @@
+"""Closed loops, step times and tunings on a sheet: every artist is as its record has it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from tests.report.conftest import described
+from thermogrip.mpc.tuning.figures import (
+    closed_loop_figure,
+    pareto_figure,
+    sensitivity_figure,
+    step_time_figure,
+)
+
+DRAWN = Path(__file__).with_name("figures.txt")
+
+
+def designs() -> Any:
+    row = {"settle_s": 100.0, "energy_s": 200.0, "overshoot_degC": 0.2, "best": True}
+    return SimpleNamespace(rows=lambda: [
+        row | {"name": "tuned", "controller": "MPC"},
+        row | {"name": "60 % of the drive", "controller": "MPC", "settle_s": 160.0, "energy_s": 90.0},
+        row | {"name": "PI, tuned", "controller": "PI", "settle_s": 130.0, "best": False},
+        row | {"name": "lost", "controller": "LQR", "settle_s": None},
+    ])  # fmt: skip
+
+
+def run() -> Any:
+    time, sample = np.arange(0.0, 3001.0), np.arange(0.0, 3001.0, 300.0)
+    wave = 30.0 + np.sin(time / 300)
+    segments = [SimpleNamespace(begin_s=at, settle_s=settle) for at, settle in ((0.0, 60.0), (900.0, np.nan))]
+    return SimpleNamespace(
+        time=time, outputs={"skin": wave, "tank": wave + 1}, sample_time=sample, segments=segments, band=0.2,
+        target={"skin": np.full(11, 30.0)}, drive={"q": np.linspace(0.1, 0.9, 11)},
+        drive_range={"q": (0.0, 1.0)}, status=("ok",) * 9 + ("late", "infeasible"),
+    )  # fmt: skip
+
+
+def factors() -> list[Any]:
+    item = {"knob": "move", "value": 2.0, "free_low": 1.0, "free_high": 8.0, "elasticity": 0.1}
+    ends = ({}, {"free_low": 2.0, "free_high": 2.0}, {"free_low": 2.5})
+    return [SimpleNamespace(**item | end) for end in ends]
+
+
+def test_each_figure_shows_what_it_should_in_the_colours_widths_and_units_of_the_record() -> None:
+    """``figures.txt`` has every artist; THERMOGRIP_FIGURES=write writes it anew: read the difference."""
+    alone: Any = SimpleNamespace(**{**vars(run()), "outputs": {"skin": run().outputs["skin"]}})
+    figures: dict[str, Figure] = {
+        "designs": pareto_figure(designs()),
+        "step times": step_time_figure({"MPC": [0.001, 0.002, 0.0], "PI": [1e-4]}, 0.5, 1.0),
+        "factors": sensitivity_figure(factors()),
+        "closed loop": closed_loop_figure(
+            run(), "a run", limits={"tank": (20.0, 45.0)}, slew_per_s={"q": 0.01}
+        ),
+        "closed loop of one output": closed_loop_figure(alone),
+    }
+    found = [line for name, figure in figures.items() for line in (f"# {name}", *described(figure))]
+    if os.environ.get("THERMOGRIP_FIGURES") == "write":
+        DRAWN.write_text("\n".join(found) + "\n", encoding="utf-8")
+    assert found == DRAWN.read_text(encoding="utf-8").splitlines()
