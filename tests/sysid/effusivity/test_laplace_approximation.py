@@ -109,7 +109,7 @@ def test_derivatives_are_those_of_the_prediction(device, data, u, thin, room):
         np.testing.assert_allclose(slopes[:, :, k], (up - down) / 2e-4, atol=atol, err_msg=str(k))
 
 
-@pytest.mark.parametrize("dof", [np.inf, 4.0])
+@pytest.mark.parametrize("dof", [np.inf, 5.0])
 def test_the_search_ends_where_a_general_optimiser_does(device, data, dof):
     """And its evidence is Laplace's, put together again from numerical second derivatives."""
     spreads = device.spreads if np.isinf(dof) else replace(device.spreads, dof=dof, insulator_dof=dof)
@@ -151,6 +151,18 @@ def test_the_search_ends_where_a_general_optimiser_does(device, data, dof):
     peak = (gammaln(0.5 * (nu + 1)) - gammaln(0.5 * nu) - 0.5 * np.log(0.5 * nu)).sum()
     want = -0.5 * (cost(start) + np.linalg.slogdet(curvature)[1] + log_det[0]) + peak
     assert found.log_evidence[0] == pytest.approx(want, abs=0.1)
+
+
+def test_few_degrees_of_freedom_forgive_a_far_grasp(device, data):
+    """Twice the usual conductance is far out for a normal spread, less so for one that 5 grasps taught."""
+    block = device.blocks["copper"]
+    far = replace(device, blocks={**device.blocks, "copper": replace(block, ln_h=block.ln_h + 0.7)})
+    unsure = replace(far, spreads=replace(far.spreads, dof=4.0))
+    row = np.array([0])
+    sure, mild = (
+        fit_pairs(d, data, row, material_hypotheses(d, ["copper"])).log_evidence[0] for d in (far, unsure)
+    )
+    assert mild > sure + 10
 
 
 def test_a_search_from_afar_ends_at_the_same_mode(device, data):
