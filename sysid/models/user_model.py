@@ -10,24 +10,20 @@ anywhere.  For a smooth f the error of 2 n is a sixteenth of that difference; at
 limit, an empty tank) it is less favourable, and the difference shows that as well.  The fit does it at the
 prior and again where it ended.
 
-Rollouts are compiled where that can be; where it cannot, NumPy runs the same lines on whole batches, tens of
-times slower, and :attr:`OwnModel.slow_because` says why.
+Rollouts are compiled where that can be (:mod:`thermogrip.sysid.models.jit_rollout`): the class's functions
+are called once, whatever they call in turn, and a loop in them is unrolled.  What vectors cannot say
+(sorting, say, or a function of SciPy) is left to NumPy, which runs the same lines on whole batches, tens of
+times slower; :attr:`OwnModel.slow_because` says why.
 
-A user's class as steps: the classical Runge-Kutta rule around its ``rhs``, on numbers of any kind
---------------------------------------------------------------------------------------------------
+**A step** of length h is
 
     x+ = x + h/6 (k1 + 2 k2 + 2 k3 + k4),
     k1 = f(x),   k2 = f(x + h/2 k1),   k3 = f(x + h/2 k2),   k4 = f(x + h k3),
 
-after which a state with limits is put back inside them.  The same lines run on NumPy rows, on CasADi symbols
-and on SIMD vectors (:mod:`thermogrip.sysid.models.jit_rollout`), which leave them behind as machine code: the
-class's functions are called once, whatever they call in turn, and a loop in them is unrolled.  What vectors
-cannot say (sorting, say, or a function of SciPy) is left to NumPy, tens of times slower.
+after which a state with limits is put back inside them.
 
-The state at rest of a user's class that has no ``rest`` of its own
--------------------------------------------------------------------
-
-It is the state x that some input v near u holds still and whose outputs read y,
+**The state at rest** of a class that has no ``rest`` of its own is the state x that some input v near u holds
+still and whose outputs read y,
 
     min  |T f(x, v) / s|^2 + w_y |(output(x) - y) / sd|^2 + w_u |(v - u) / range|^2,
 
@@ -56,6 +52,16 @@ from thermogrip.sysid.models.user_class import OwnCode, read_class
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.jit_rollout import Kernel
+
+Array = NDArray[np.float64]
+
+_SENSOR_WEIGHT, _INPUT_WEIGHT = 1e2, 1e-2
+_NUDGE = 1e-6
+_ITERATIONS = 40
+_SETTLED = 1e-9  # relative fall of the cost at which to stop
+_STEP_ERROR = 0.1  # of a sensor's sd (rms), between n pieces and 2 n
+_MOST_PIECES = 256
+_SENSOR_SHARE = 0.02  # of an output's spread in the logs, where the class states no sd
 
 
 @dataclass(frozen=True)
@@ -112,14 +118,6 @@ def compile_steps(code: OwnCode) -> tuple[Kernel | None, str]:
         return Kernel(OwnSteps(code), in_pieces=True), ""
     except UserError as error:
         return None, error.problem
-
-
-Array = NDArray[np.float64]
-
-_SENSOR_WEIGHT, _INPUT_WEIGHT = 1e2, 1e-2
-_NUDGE = 1e-6
-_ITERATIONS = 40
-_SETTLED = 1e-9  # relative fall of the cost at which to stop
 
 
 def still(code: OwnCode, y: Array, u: Array, d: Array, p: Array, *, sd: Array, seconds: float) -> Array:
@@ -183,11 +181,6 @@ def _rows(values: Sequence[Any], n: int) -> Array:
     """Return values, each a number or a row, as an array (len(values), n)."""
     rows = [np.broadcast_to(value, n) for value in values]
     return np.array(rows, dtype=float).reshape(len(values), n)
-
-
-_STEP_ERROR = 0.1  # of a sensor's sd (rms), between n pieces and 2 n
-_MOST_PIECES = 256
-_SENSOR_SHARE = 0.02  # of an output's spread in the logs, where the class states no sd
 
 
 @dataclass(eq=False)
