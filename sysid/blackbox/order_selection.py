@@ -42,8 +42,10 @@ __all__ = [
     "choose",
     "default_terms",
     "drives",
+    "excess_within_noise",
     "folds",
     "free_run_errors",
+    "held_out_runs",
     "with_spread",
 ]
 
@@ -86,6 +88,7 @@ class Choice:
     errors: dict[Structure, Array]  # (n_fold,) mean over outputs of RMSE / sd of the output; inf: refused
     folds: tuple[str, ...]  # what each fold held out
     rmse: Array  # (n_fold, n_y), free-run RMSE of the chosen structure, in the outputs' units
+    warmup: int  # rows at the start of each run that set its state and are not scored
 
     @property
     def error(self) -> float:
@@ -111,6 +114,11 @@ def folds(grid: Grid, *, blocks: int = 4) -> Iterator[tuple[str, Grid, tuple[Seg
         first, last = round(total * block / blocks), round(total * (block + 1) / blocks)
         inside, outside = _split(grid.segments, first, last)
         yield f"block {block + 1} of {blocks}", grid.having(outside), tuple(inside)
+
+
+def held_out_runs(grid: Grid, held: Sequence[Segment]) -> list[Segment]:
+    """Return what is run freely of a held-out part: all of it, and of a block its second half once more."""
+    return [*held, *(s.part(len(s.time) // 2, len(s.time)) for s in held if len(grid.logs) < 3)]
 
 
 def free_run_errors(
@@ -153,7 +161,7 @@ def choose(
     for at, (label, train, held) in enumerate(cases):
         if progress is not None:
             progress(at / len(cases), f"without {label}")
-        starts = [*held, *(s.part(len(s.time) // 2, len(s.time)) for s in held if len(grid.logs) < 3)]
+        starts = held_out_runs(grid, held)
         for structure, model in family(train).items():
             column = errors.setdefault(structure, [refused] * at)
             column.append(
@@ -170,7 +178,7 @@ def choose(
         table[structure], best[structure], rmse[structure] = by_prior[:, at], PRIORS[at], by_output[:, at]
     structure = _one_standard_error(table)
     labels = tuple(label for label, _, _ in cases)
-    return Choice(structure, best[structure], table, labels, rmse[structure])
+    return Choice(structure, best[structure], table, labels, rmse[structure], warmup)
 
 
 def drives(grid: Grid, terms: Sequence[str]) -> list[Array]:
@@ -226,6 +234,11 @@ def with_spread(model: StateSpaceModel, grid: Grid, starts: Sequence[Array]) -> 
     return replace(model, spread=spread + 1e-8 * max(np.trace(spread), 1e-12) * np.eye(model.n_x))
 
 
+def excess_within_noise(excess: Array) -> bool:
+    """Return whether paired differences of log errors are zero to within one standard error and 5 percent."""
+    return bool(excess.mean() <= min(excess.std(ddof=1) / np.sqrt(excess.size), np.log(1.05)))
+
+
 def _one_standard_error(table: Mapping[Structure, Array]) -> Structure:
     usable = {structure: error for structure, error in table.items() if np.isfinite(error).all()}
     if not usable:
@@ -237,8 +250,7 @@ def _one_standard_error(table: Mapping[Structure, Array]) -> Structure:
     best = min(logs, key=lambda s: float(logs[s].mean()))
     good = [best]
     for structure, error in logs.items():
-        excess = error - logs[best]
-        if excess.mean() <= min(excess.std(ddof=1) / np.sqrt(excess.size), np.log(1.05)):
+        if excess_within_noise(error - logs[best]):
             good.append(structure)
     return min(good, key=lambda s: (s.size, float(logs[s].mean())))
 

@@ -117,6 +117,7 @@ class PlantScores:
     starts: int | None = None  # of the global search
     posterior: Sampling | None = None
     held_out: list[HeldOut] = field(default_factory=list)  # free runs over what the fit had not seen
+    new_run_rmse: dict[str, float] = field(default_factory=dict)  # by output, of a plant of one or two logs
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of key ``scores`` of ``plant.json``; a default is left out."""

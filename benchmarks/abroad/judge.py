@@ -1,0 +1,90 @@
+"""What ``identify`` says of ten public sets, beside what is true on the half that it has not seen.
+
+    python benchmarks/abroad/judge.py FOLDER [--sets luca,house] [--each]
+
+By set and output: the error stated for another run, that on the other half, the share of its readings
+inside the 90 % band with the band's interval score; by set: the chosen model, whether it is called good, CPU
+seconds.  ``--each``: every black box beside it, fitted to the whole training half.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+from foreign_sets import SETS, ForeignSet, load
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import column
+from thermogrip.sysid import identify
+from thermogrip.sysid.blackbox.fit import BLACK_BOXES, fit_black_box
+from thermogrip.sysid.identification import stated_error
+from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.validation.free_run import FreeRun, free_run
+from thermogrip.sysid.validation.prediction_bands import free_run_band
+
+
+def run_over(plant: Plant, some: ForeignSet) -> FreeRun:
+    warmup = max(some.warmup, plant.dt)
+    return free_run(plant, some.test, warmup=warmup, score_from=warmup, tests=False)
+
+
+def mean_rmse(run: FreeRun) -> float:
+    return float(np.mean([score.rmse for score in run.scores.values()]))
+
+
+def judge(some: ForeignSet, each: bool) -> None:
+    began = time.process_time()
+    try:
+        found = identify(some.train)
+    except UserError as error:
+        print(f"{some.name:10s} refused: {error}", flush=True)
+        return
+    cpu = time.process_time() - began
+    run = run_over(found.plant, some)
+    print(
+        f"{some.name:10s} {found.model:9s} RMSE {mean_rmse(run):.3f} {'good' if found.good else '-':4s} "
+        f"{cpu:4.0f} s CPU  {found.plant.scores.structure} dt {found.plant.dt:g}",
+        flush=True,
+    )
+    band = free_run_band(found.plant, some.test, run.log, level=0.9)
+    scored = np.asarray(run.log["scored"].values) > 0
+    for name, score in run.scores.items():
+        rows = [row for row in found.rows if row.held_out and row.model == found.model and row.output == name]
+        stated = found.plant.scores.new_run_rmse.get(name) or stated_error(rows, name)
+        miss = np.abs(column(some.test, name) - column(run.log, name))[scored]
+        half = band.half[name][scored]
+        interval = float(np.mean(2 * half + 20 * np.maximum(miss - half, 0.0)))
+        print(
+            f"    {name}: stated {stated:.3g}, other half {score.rmse:.3g} "
+            f"({score.rmse / stated:.2f} times), band holds {band.inside[name]:.2f}, "
+            f"interval score {interval:.3g}",
+            flush=True,
+        )
+    for row in dict.fromkeys((r.model, r.structure) for r in found.rows if r.held_out) if each else ():
+        print(f"    tail: {row[0]:9s} {found.errors()[row[0]]:.3f} {row[1]}", flush=True)
+    for kind in BLACK_BOXES if each else ():
+        began = time.process_time()
+        try:
+            fit = fit_black_box(kind, [some.train])
+            error = mean_rmse(run_over(fit.plant, some))
+            label = f"{fit.choice.structure.label} dt {fit.plant.dt:g} folds {fit.choice.error:.3f}"
+        except UserError as refused:
+            error, label = np.nan, str(refused)
+        print(f"    all:  {kind:9s} {error:.3f} {time.process_time() - began:4.0f} s  {label}", flush=True)
+
+
+def main() -> None:
+    words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    words.add_argument("folder", type=Path)
+    words.add_argument("--sets", default=",".join(SETS))
+    words.add_argument("--each", action="store_true")
+    given = words.parse_args()
+    for name in given.sets.split(","):
+        judge(load(given.folder, name), given.each)
+
+
+if __name__ == "__main__":
+    main()
