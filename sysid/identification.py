@@ -156,8 +156,13 @@ def choose_black_box(fits: Sequence[BlackBoxFit]) -> BlackBoxFit:
 
 def fit_without_tail(fit: BlackBoxFit, train: Sequence[Log]) -> Plant:
     """Return the plant of a black box with the same structure fitted to these parts of its logs."""
-    names = {"inputs": fit.grid.inputs, "outputs": fit.grid.outputs, "disturbances": fit.grid.disturbances}
-    grid = make_grid(train, **names, average=fit.grid.dt)
+    grid = make_grid(
+        train,
+        inputs=fit.grid.inputs,
+        outputs=fit.grid.outputs,
+        disturbances=fit.grid.disturbances,
+        average=fit.grid.dt,
+    )
     model = FAMILIES[fit.kind](grid, only=fit.choice.structure).get(fit.choice.structure)
     if model is None:
         raise UserError(f"{fit.kind}: the chosen structure is unstable without the last part of the logs")

@@ -18,10 +18,12 @@ from thermogrip.datasets.schema import make_log
 from thermogrip.sysid import Plant, identification, identify
 from thermogrip.sysid.blackbox.fit import fit_black_box
 from thermogrip.sysid.blackbox.order_selection import Structure, _one_standard_error, folds
+from thermogrip.sysid.identification import choose_black_box, stated_error
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import fit_logs
 from thermogrip.sysid.plant.log_grid import make_grid
 from thermogrip.sysid.validation.free_run import free_run
+from thermogrip.sysid.validation.prediction_bands import between_runs
 
 REAL = Path(os.environ.get("THERMOGRIP_REAL_DATA", Path(__file__).parents[3] / "shared" / "data" / "real"))
 needs_real = pytest.mark.skipif(
@@ -56,9 +58,55 @@ def test_a_log_is_scored_in_the_fit_with_the_warmup_that_its_held_out_part_had()
     logs = [plant_log(500, seed=s, name=name) for s, name in enumerate("abc")]
     one = identify(logs[0], models=["arx"], average=2.0, draws=0).rows
     assert {row.n for row in one if not row.held_out} == {450}
-    assert {row.n for row in one if row.held_out} == {150}
+    assert {row.n for row in one if row.log.startswith("last")} == {150}
     several = identify(logs, models=["arx"], average=2.0, leave_one_out=True, draws=0).rows
     assert {row.n for row in several} == {495}
+
+
+def test_every_fold_of_every_candidate_is_in_the_table_and_the_tail_of_the_one_that_is_kept():
+    found = identify(plant_log(), models=["arx", "oe", "subspace"], average=2.0)
+    held = [row for row in found.rows if row.held_out]
+    blocks = {f"block {k} of 4" for k in (1, 2, 3, 4)}
+    for model in ("arx", "oe", "subspace"):
+        tail = {"last 30 % of a"} if model == found.model else set()
+        assert {row.log for row in held if row.model == model} == blocks | tail
+    fit = fit_black_box("oe", [plant_log()], average=2.0)
+    rows = [row for row in held if row.model == "oe" and row.log in blocks]
+    assert [row.rmse for row in rows] == fit.choice.rmse[:, 0].tolist()
+    # 450 rows in four blocks of 112 or 113, each scored from its start and from its middle after 25 rows
+    assert sum(row.n for row in rows) == 450 - 4 * 25 + 4 * 57 - 2 - 4 * 25
+    assert all(row.no_input_rmse > 10 * row.rmse for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("errors", "chosen"),
+    [
+        ({"neural": [0.10, 0.10, 0.10, 0.10], "oe": [0.10, 0.11, 0.10, 0.10]}, "oe"),  # within 5 percent
+        ({"neural": [0.10, 0.10, 0.10, 0.10], "oe": [0.12, 0.11, 0.12, 0.12]}, "neural"),
+        ({"subspace": [0.10, 0.10, 0.10, 0.10], "oe": [0.10, 0.11, 0.10, 0.10]}, "subspace"),  # as simple
+        ({"sindy": [0.1, 0.1, 0.1, 9.0], "arx": [0.2, 0.2, 0.2, 0.2]}, "arx"),  # a geometric mean
+    ],
+)
+def test_a_simpler_kind_is_kept_where_it_errs_hardly_more(errors, chosen):
+    def fit(kind, values):
+        choice = SimpleNamespace(structure="s", errors={"s": np.array(values)})
+        return SimpleNamespace(kind=kind, choice=choice)
+
+    assert choose_black_box([fit(*item) for item in errors.items()]).kind == chosen
+
+
+def test_one_log_states_what_another_run_may_add_and_three_do_not():
+    one = identify(plant_log(), models=["oe"], average=2.0)
+    held = [row for row in one.rows if row.held_out]
+    varied = between_runs(one.plant, plant_log())["t"]
+    expected = np.hypot(stated_error(held, "t"), np.sqrt(np.mean(varied**2)))
+    assert one.plant.scores.new_run_rmse["t"] == pytest.approx(expected)
+    assert f"on another run about t {expected:.2g} degC" in one.verdict
+    three = identify(
+        [plant_log(500, seed=s, name=n) for s, n in enumerate("abc")], models=["oe"], average=2.0
+    )
+    assert three.plant.scores.new_run_rmse == {}
+    assert "another run" not in three.verdict
 
 
 def test_a_held_out_log_cannot_change_its_own_prediction():

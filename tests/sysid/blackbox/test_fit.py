@@ -31,7 +31,7 @@ def fit_of(kind, log, **orders):
     """Return the fit of the first structure of these orders, which needs no choosing."""
     grid = make_grid([log], average=1.0)
     structure, model = next(iter(FAMILIES[kind](grid, **{k: (v,) for k, v in orders.items()}).items()))
-    choice = Choice(structure, StartPrior(), {}, (), np.zeros((1, 1)))
+    choice = Choice(structure, StartPrior(), {}, (), np.zeros((1, 1)), warmup=5)
     return BlackBoxFit(kind, Plant(model, {}, dt=1.0), model, choice, grid)
 
 

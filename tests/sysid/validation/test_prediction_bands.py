@@ -20,6 +20,7 @@ from thermogrip.sysid.plant.fit_record import PlantScores
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.prediction_bands import (
     MOST_DISAGREEMENT,
+    between_runs,
     check_ensemble,
     ensemble_disagreement,
     expected_coverage,
@@ -112,6 +113,47 @@ def test_a_band_says_where_its_errors_differ_from_part_to_part(schedule):
     assert expected_coverage(plant)["t2"][0] == pytest.approx(held, abs=0.01)
 
 
+def first_order(gain=1.0, logs=("a",)):
+    A, B = 0.98 * np.eye(2), 0.02 * gain * np.eye(2)
+    block = StateSpaceModel(("q1", "q2"), (), ("t1", "t2"), A=A, B=B, C=np.eye(2), dt=2.0)
+    return Plant(block, {}, dt=2.0, noise={"t1": 0.1, "t2": 0.1}, logs=logs)
+
+
+def test_another_run_adds_what_its_gain_changes(schedule):
+    schedule = schedule.assign({name: 0.0 * schedule[name] for name in ("t1", "t2")})
+    plant = first_order()
+    run = plant.simulate(schedule)
+    added = between_runs(plant, schedule)
+    for name in plant.outputs:  # linear from rest: 7 percent of the response
+        np.testing.assert_allclose(added[name], 0.07 * run[name].values, atol=1e-9)
+    half = free_run_band(plant, schedule, run).half["t1"]
+    np.testing.assert_allclose(half, 1.6449 * np.hypot(0.1, added["t1"]), rtol=1e-3)
+    assert between_runs(first_order(logs=()), schedule) == {}
+    assert between_runs(first_order(logs=("a", "b", "c")), schedule) == {}
+
+
+def test_a_switch_has_no_gain_that_varies(schedule):
+    model = StateSpaceModel(
+        ("q1", "q2"), (), ("t1", "t2"), switches=("q2",), dt=2.0,
+        A=0.98 * np.eye(2), B=0.02 * np.eye(2), C=np.eye(2),
+    )  # fmt: skip
+    schedule["q2"].values[:] = schedule["q2"].values > 0
+    added = between_runs(Plant(model, {}, dt=2.0, logs=("a",)), schedule)
+    assert np.ptp(added["t1"]) > 1.0
+    assert np.ptp(added["t2"]) == 0.0
+
+
+def test_runs_whose_gain_varies_lie_inside_as_often_as_stated(schedule):
+    rng, plant = np.random.default_rng(5), first_order()
+    schedule = schedule.assign({name: 0.0 * schedule[name] for name in ("t1", "t2")})
+    shares = []
+    for k in range(40):
+        log = measured(first_order(1 + 0.07 * rng.standard_normal()), schedule, k)
+        shares.append(np.mean(list(free_run_band(plant, log, plant.simulate(log)).inside.values())))
+    # one gain moves a whole log: sd of a share below 0.25
+    assert np.mean(shares) == pytest.approx(0.9, abs=3 * 0.25 / np.sqrt(40))
+
+
 def test_one_part_alone_has_no_expected_coverage():
     model = StateSpaceModel(("q",), (), ("t", "r"), A=[[0.9]], B=[[0.1]], C=[[1.0], [2.0]], dt=1.0)
     parts = PlantScores(held_out_by_part={"t": [0.3], "r": [0.2, 0.2]})
@@ -158,7 +200,8 @@ def test_the_band_of_a_fit_to_means_covers_readings(heater, schedule):
     log = measured(replace(heater, covariance=None), make_log(t, signals), 3)
     plant = fit_network("tclab", [log])
     assert plant.scores.average_s > 3.0  # of several readings each
-    band = free_run_band(plant, log, plant.simulate(log, warmup=50.0, score_from=50.0))
+    run = plant.simulate(log, warmup=50.0, score_from=50.0)
+    band = free_run_band(replace(plant, logs=("a", "b", "c")), log, run)  # nothing for another run
     assert min(band.inside.values()) == pytest.approx(0.9, abs=0.04)
     assert max(band.inside.values()) == pytest.approx(0.9, abs=0.04)
 
