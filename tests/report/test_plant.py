@@ -245,3 +245,21 @@ def test_the_table_of_models_has_a_column_a_log_of_what_was_held_out() -> None:
         ("no\N{NO-BREAK SPACE}input", "t", 2.1, 2.2, "degC"),
     )
     assert [row[-1] for row in plant.model_rows(found)] == ["held out", "held out", "in the fit"]
+
+
+def test_blocks_of_a_log_share_a_row_that_shows_each() -> None:
+    row = {"model": "oe", "output": "t", "unit": "degC", "held_out": True}
+    rows = [
+        SimpleNamespace(log=log, rmse=rmse, fit_percent=fit, n=n, no_input_rmse=idle, **row)
+        for log, rmse, fit, n, idle in (
+            ("block 1 of 2", 3.0, 80.0, 10, 6.0),
+            ("block 2 of 2", 4.0, 90.0, 30, 2.0),
+            ("last 30 % of a", 5.0, 50.0, 7, 8.0),
+        )
+    ]
+    both, tail = plant.model_rows(SimpleNamespace(rows=rows))
+    assert both[:3] == ("oe", "2 blocks: 3, 4", "t")
+    assert both[3] == pytest.approx(np.sqrt((10 * 9 + 30 * 16) / 40))
+    assert both[4:7] == ("degC", 85.0, 40)
+    assert both[7] == pytest.approx(np.sqrt((10 * 36 + 30 * 4) / 40))
+    assert tail == ("oe", "last 30 % of a", "t", 5.0, "degC", 50.0, 7, 8.0, "held out")

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
+
 from thermogrip.datasets.schema import log_name
 from thermogrip.report.html import Picture, Section, Table, Text
 from thermogrip.report.plots import (
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
     from thermogrip.datasets.schema import Log
     from thermogrip.sysid.greybox.posterior import Posterior
     from thermogrip.sysid.growth.stepwise import Growth
-    from thermogrip.sysid.identification import Identification
+    from thermogrip.sysid.identification import Identification, Row
     from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation.free_run import FreeRun
     from thermogrip.sysid.validation.prediction_bands import Band
@@ -63,21 +65,23 @@ def signal_rows(found: Identification) -> list[tuple[str, str, str, str]]:
 
 
 def model_rows(found: Identification) -> list[tuple[Any, ...]]:
-    """Return the table of candidate models: a row a model, log and output."""
-    return [
-        (
-            row.model,
-            row.log,
-            row.output,
-            row.rmse,
-            row.unit,
-            row.fit_percent,
-            row.n,
-            row.no_input_rmse,
-            "held out" if row.held_out else "in the fit",
+    """Return the table of candidate models: a row a model, log and output; blocks of a log share one row."""
+    groups: dict[tuple[str, str, str, bool], list[Row]] = {}
+    for row in found.rows:
+        log = "blocks" if row.log.startswith("block ") else row.log
+        groups.setdefault((row.model, log, row.output, row.held_out), []).append(row)
+    out = []
+    for (model, log, output, held_out), rows in groups.items():
+        n = np.array([row.n for row in rows])
+        rmse, idle = (
+            float(np.sqrt(n @ np.square([getattr(row, name) for row in rows]) / n.sum()))
+            for name in ("rmse", "no_input_rmse")
         )
-        for row in found.rows
-    ]
+        fit, first = float(np.mean([row.fit_percent for row in rows])), rows[0]
+        what = log if len(rows) == 1 else f"{len(rows)} blocks: {', '.join(f'{r.rmse:.2g}' for r in rows)}"
+        where = "held out" if held_out else "in the fit"
+        out.append((model, what, output, rmse, first.unit, fit, int(n.sum()), idle, where))
+    return out
 
 
 def model_table(found: Identification) -> Table:
