@@ -234,7 +234,8 @@ def relative_error(row: Row) -> float:
 def held_out_scores(rows: Sequence[Row], model: str) -> list[HeldOut]:
     """Return a candidate's held-out rows as a plant's file keeps them."""
     return [
-        HeldOut(row.log, row.output, row.rmse, row.fit_percent, row.unit, row.n)
+        # of a reading that stands still no share can be fitted, and JSON has no NaN
+        HeldOut(row.log, row.output, row.rmse, float(np.nan_to_num(row.fit_percent)), row.unit, row.n)
         for row in rows
         if row.held_out and row.model == model
     ]
