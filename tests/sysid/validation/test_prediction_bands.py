@@ -16,7 +16,7 @@ from thermogrip.sysid.identification import Held, run_held_out
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.neural import NeuralModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.fit_record import PlantScores
+from thermogrip.sysid.plant.fit_record import HeldOut, PlantScores
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.prediction_bands import (
     MOST_DISAGREEMENT,
@@ -130,6 +130,16 @@ def test_another_run_adds_what_its_gain_changes(schedule):
     np.testing.assert_allclose(half, 1.6449 * np.hypot(0.1, added["t1"]), rtol=1e-3)
     assert between_runs(first_order(logs=()), schedule) == {}
     assert between_runs(first_order(logs=("a", "b", "c")), schedule) == {}
+
+
+def test_an_error_of_few_parts_or_of_a_worse_last_part_widens_the_band(schedule):
+    parts = {"t1": [1.0, 1.0, 1.0, 1.0], "t2": [0.5]}
+    last = [HeldOut("last 30 % of a", "t2", 2.0, 50.0, "degC", 100)]
+    scores = PlantScores(held_out_rmse={"t1": 1.0, "t2": 0.5}, held_out_by_part=parts, held_out=last)
+    plant = replace(first_order(logs=()), scores=scores)
+    half = free_run_band(plant, schedule, plant.simulate(schedule)).half
+    assert half["t1"][-1] == pytest.approx(2.1318, rel=1e-3)  # Student's t, 4 degrees of freedom, 95 %
+    assert half["t2"][-1] == pytest.approx(2 * 1.6449, rel=1e-3)
 
 
 def test_a_switch_has_no_gain_that_varies(schedule):
