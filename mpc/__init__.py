@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from thermogrip.mpc.controllers.pi import PIController
     from thermogrip.mpc.design.design import Design, default_design
     from thermogrip.mpc.design.spec import SPEC_TEMPLATE, Spec, read_spec
-    from thermogrip.mpc.design_review import Check, review
     from thermogrip.mpc.interface import Move
+    from thermogrip.mpc.tuning.design_review import Check, review
     from thermogrip.mpc.tuning.figures import closed_loop_figure
     from thermogrip.mpc.tuning.tune import Tuning, tune
 
@@ -23,7 +23,7 @@ _MODULES = {
     "controllers.pi": ("PIController",),
     "design.design": ("Design", "default_design"),
     "design.spec": ("SPEC_TEMPLATE", "Spec", "read_spec"),
-    "design_review": ("Check", "review"),
+    "tuning.design_review": ("Check", "review"),
     "interface": ("Move",),
     "tuning.figures": ("closed_loop_figure",),
     "tuning.tune": ("Tuning", "tune"),

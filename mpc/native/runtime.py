@@ -1,6 +1,6 @@
 """The controller's C, built where gcc is there, in place of the same thing in Python.
 
-The sources of an export (:mod:`thermogrip.mpc.export`), with a model's step written by
+The sources of an export (:mod:`thermogrip.mpc.controllers.export`), with a model's step written by
 :mod:`thermogrip.mpc.native.codegen`, become a library (:mod:`thermogrip.mpc.native.build`).  A second
 controller of the same structure (any parameters, any weights) finds it built.
 

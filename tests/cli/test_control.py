@@ -13,10 +13,10 @@ import pytest
 from tests.cli.conftest import Bench, StandIn, shares, words_of
 from tests.end_to_end.conftest import small_plant
 from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.controllers.export import Agreement, Export
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.spec import Spec
-from thermogrip.mpc.design_review import Check
-from thermogrip.mpc.export import Agreement, Export
+from thermogrip.mpc.tuning.design_review import Check
 from thermogrip.mpc.tuning.sensitivity import Sensitivity
 
 MOVE = Sensitivity("move", 2.0, 0.1, 90.0, 100.0, 110.0, 0.1, 0.2, 0.5, 3.0)
@@ -122,8 +122,8 @@ def test_an_export_is_compared_with_python_only_where_that_is_asked_for(
 
     made = Agreement(1, difference, 5, 7, 7 if code == 0 else 6, 100, 20, 50)
     written = Export(Path("c"), ("a.c", "b.h"), 640, 128)
-    exported = stand_in("thermogrip.mpc.export.export_controller", written)
-    asked = stand_in("thermogrip.mpc.export.check_export", check)
+    exported = stand_in("thermogrip.mpc.controllers.export.export_controller", written)
+    asked = stand_in("thermogrip.mpc.controllers.export.check_export", check)
     words = ["export", "c.json", "--out", "c", "--states", "7", "--seed", "9", *options]
     done = controller.run(*words)
     assert done.code == code
@@ -151,7 +151,7 @@ def test_a_review_is_an_answer_of_no_where_a_check_fails(
     verdicts: str, code: int, controller: Bench, stand_in: StandIn
 ) -> None:
     found = [Check(f"c{k}", verdict, f"found {k}", f"fix {k}") for k, verdict in enumerate(verdicts.split())]
-    reviewed = stand_in("thermogrip.mpc.design_review.review", found)
+    reviewed = stand_in("thermogrip.mpc.tuning.design_review.review", found)
     pages = stand_in("thermogrip.report.html.write_report")
     sections = stand_in("thermogrip.report.classification.review_section", "a section")
     done = controller.run("review", "c.json", "--report", "r.html")
@@ -174,7 +174,7 @@ def test_the_class_of_a_plant_of_one_s_own_is_handed_in(controller: Bench, stand
     controller.write("own.py", "")
     stand_in("thermogrip.cli.control.find_network", lambda text: f"model of {text}")
     loaded = stand_in("thermogrip.mpc.controllers.mpc.Controller.load", "a controller")
-    stand_in("thermogrip.mpc.design_review.review", [])
+    stand_in("thermogrip.mpc.tuning.design_review.review", [])
     for network in ((), ("--network", "own.py:Own")):
         assert controller.run("review", "c.json", *network).code == 0
     assert [call.args for call in loaded] == [(Path("c.json"),)] * 2

@@ -161,7 +161,7 @@ def ran(bench: Bench, stand_in: StandIn, monkeypatch: pytest.MonkeyPatch) -> Sim
     made.rigs = stand_in("thermogrip.cli.rig.rig_of", made.rig)
     made.guards = stand_in("thermogrip.cli.rig.guard_of", "a guard")
     made.sessions = stand_in("thermogrip.rig.session.session.run_session", session)
-    made.beyond = stand_in("thermogrip.mpc.design_review.beyond_logs", ["40 degC is beyond the logs"])
+    made.beyond = stand_in("thermogrip.mpc.tuning.design_review.beyond_logs", ["40 degC is beyond the logs"])
     made.sections = stand_in("thermogrip.report.control.session_sections", ["a section"])
     made.pages = stand_in("thermogrip.report.html.write_report")
     monkeypatch.setattr("thermogrip.rig.records.recorder.RunFolder", Folder)

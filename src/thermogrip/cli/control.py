@@ -135,7 +135,7 @@ def review(
     Each check passes, warns or fails, and says the fix.
     """
     loaded = load_controller(controller, network)  # first: a design that cannot be is refused sooner
-    from thermogrip.mpc.design_review import review as check
+    from thermogrip.mpc.tuning.design_review import review as check
     from thermogrip.report.classification import review_section
     from thermogrip.report.html import write_report
 
@@ -170,7 +170,7 @@ def export(
 
     The folder needs a C compiler and nothing of thermogrip: library, example, Makefile, README.
     """
-    from thermogrip.mpc.export import check_export, export_controller
+    from thermogrip.mpc.controllers.export import check_export, export_controller
 
     console = Console(as_json)
     loaded = load_controller(controller, network)

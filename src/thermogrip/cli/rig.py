@@ -164,7 +164,7 @@ def run(
     one_rig(port, twin)
     from thermogrip.classify.decisions.online import session_stop
     from thermogrip.mpc.closed_loop.simulate import RecordedController
-    from thermogrip.mpc.design_review import beyond_logs
+    from thermogrip.mpc.tuning.design_review import beyond_logs
     from thermogrip.report.control import session_sections
     from thermogrip.report.html import write_report
     from thermogrip.rig.clock import ScaledClock

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from thermogrip.classify.evaluation.comparison import Comparison
     from thermogrip.classify.evaluation.decision_time import Decisions
     from thermogrip.datasets.schema import Grasps
-    from thermogrip.mpc.design_review import Check
+    from thermogrip.mpc.tuning.design_review import Check
     from thermogrip.rig.session.session import Session
 
 SCORE_HEAD = (

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from thermogrip.classify.evaluation.comparison import Comparison
     from thermogrip.datasets.parallel import Workers
     from thermogrip.datasets.schema import Grasps, Log
-    from thermogrip.mpc.design_review import Check
+    from thermogrip.mpc.tuning.design_review import Check
     from thermogrip.mpc.tuning.tune import Tuning
     from thermogrip.report.console import Progress
     from thermogrip.rig.session.session import Session
@@ -135,7 +135,7 @@ def _tune(
     """Tune on few draws with few evaluations, and review the controller as its file has it."""
     from thermogrip.mpc.controllers.mpc import Controller
     from thermogrip.mpc.design.spec import Spec
-    from thermogrip.mpc.design_review import review
+    from thermogrip.mpc.tuning.design_review import review
     from thermogrip.mpc.tuning.tune import tune
 
     spec = Spec(steps=list(STEPS), evaluations=6, search_draws=1, check_draws=2)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermogrip.mpc import design_review as checks
 from thermogrip.mpc.closed_loop.simulate import Surroundings, simulate_closed_loop
 from thermogrip.mpc.controllers.linear_equivalent import linear_law
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
+from thermogrip.mpc.tuning import design_review as checks
 
 REST = {"t_tank": 25.0, "t_surface": 25.0, "t_ambient": 25.0}
 

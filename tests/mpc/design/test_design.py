@@ -13,7 +13,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import LONGEST_HORIZON, Design, check_design, default_design
 from thermogrip.mpc.design.spec import Spec
-from thermogrip.mpc.design_review import review
+from thermogrip.mpc.tuning.design_review import review
 from thermogrip.mpc.tuning.objective import Search
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.network import load_network

@@ -15,10 +15,10 @@ import pytest
 
 from tests.mpc.makers import heater, kit, network_plant
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc import export as exports
+from thermogrip.mpc.controllers import export as exports
+from thermogrip.mpc.controllers.export import Agreement, check_export, export_controller
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import default_design
-from thermogrip.mpc.export import Agreement, check_export, export_controller
 from thermogrip.mpc.interface import STATUSES, Move
 from thermogrip.mpc.native.build import compiler
 from thermogrip.mpc.native.codegen import write_model

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from tests.mpc.makers import network_plant
-from thermogrip.mpc import design_review as checks
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.design.simc import PILoop
-from thermogrip.mpc.design_review import review, worst
 from thermogrip.mpc.estimator.observer import ObserverNoise
 from thermogrip.mpc.plant.prediction import PredictionModel
 from thermogrip.mpc.plant.steady_state import holding_drive
+from thermogrip.mpc.tuning import design_review as checks
+from thermogrip.mpc.tuning.design_review import review, worst
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 
@@ -89,7 +89,7 @@ def test_a_slow_eigenvalue_is_the_loops_fault_unless_the_plant_has_it_by_itself(
 
 
 def test_a_target_beyond_the_logs_is_reported_before_a_run(tank):
-    from thermogrip.mpc.design_review import beyond_logs
+    from thermogrip.mpc.tuning.design_review import beyond_logs
 
     controller = design_controller(tank, dt=2.0)
     assert beyond_logs(controller, 43.0) == []
@@ -121,7 +121,7 @@ def test_a_limit_on_either_side_of_what_a_target_takes_is_a_conflict(
 
 
 def test_a_grasp_by_a_plant_whose_pump_never_stood_is_reported_before_it(tank):
-    from thermogrip.mpc.design_review import beyond_logs
+    from thermogrip.mpc.tuning.design_review import beyond_logs
 
     controller = design_controller(replace(tank, valid={**tank.valid, "pump": (1.0, 1.0)}), dt=2.0)
     assert beyond_logs(controller, 43.0) == []
@@ -136,7 +136,7 @@ def gripper() -> Plant:
 
 
 def test_a_current_beyond_the_optimum_of_the_peltier_warns_with_the_range_to_take(gripper):
-    from thermogrip.mpc.design_review import peltier_optimum
+    from thermogrip.mpc.tuning.design_review import peltier_optimum
 
     def at(resistance: float):
         plant = replace(gripper, values=gripper.values | {"resistance": resistance})
@@ -174,7 +174,7 @@ def test_a_weight_that_does_nothing_is_named(tank):
 
 
 def test_a_program_that_runs_into_its_limit_of_iterations_fails(tank):
-    from thermogrip.mpc.design_review import _iterations
+    from thermogrip.mpc.tuning.design_review import _iterations
 
     controller = design_controller(tank, dt=2.0)
     found = [_iterations(controller, [3, worst]).verdict for worst in (20, 200, 500)]
