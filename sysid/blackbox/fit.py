@@ -214,7 +214,8 @@ def _error(fit: BlackBoxFit, model: Model) -> float:
 
 def _warmup_rows(grid: Grid, warmup: float | None) -> int:
     seconds = warmup or (5.0 if len(grid.logs) >= 3 else 50 * grid.native)
-    return max(2, round(seconds / grid.dt))
+    most = sum(len(segment.time) for segment in grid.segments) // 16  # of a short log, a quarter of a block
+    return max(2, min(round(seconds / grid.dt), most))
 
 
 def _plant(model: Model, grid: Grid, choice: Choice, rows: int, logs: Sequence[Log]) -> Plant:

@@ -51,6 +51,8 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
+FEWEST = 20  # rows of a block that is held out
+
 # How a first error is shared between state and sensor; the free run over held-out rows chooses one.
 PRIORS = tuple(StartPrior(noise=r, nuisance=q) for q in (0.0, 0.1, 0.3, 1.0) for r in (0.03, 0.1, 0.3))
 
@@ -105,7 +107,7 @@ def folds(grid: Grid, *, blocks: int = 4) -> Iterator[tuple[str, Grid, tuple[Seg
             yield name, grid.having(rest), tuple(s for s in grid.segments if s.log == name)
         return
     total = sum(len(segment.time) for segment in grid.segments)
-    if total < 40 * blocks:
+    if total < FEWEST * blocks:
         raise UserError(
             f"{total} rows of {grid.dt:g} s are too short to hold a part out",
             hint="give a longer log or average less",

@@ -147,6 +147,19 @@ def test_four_blocks_hold_out_every_row_once():
         assert not set(np.concatenate([s.time for s in train.segments])) & set(out[0].time)
 
 
+def test_a_record_of_ninety_slow_rows_is_fitted():
+    # a heated room logged each half hour: 90 rows were refused as too short to hold a part out
+    rng, t = np.random.default_rng(3), 1800.0 * np.arange(90)
+    q = np.repeat(rng.random(15), 6)
+    warm = 15 + lfilter([0, 4.0], [1, -0.8], q) + 0.05 * rng.standard_normal(90)
+    log = make_log(t, {"q": (q, "1", "input"), "t_room": (warm, "degC", "output")}, name="room")
+    found = identify(log, models=["arx", "oe"], draws=0)
+    assert found.plant.model.time_constants().max() == pytest.approx(-1800 / np.log(0.8), rel=0.1)
+    assert {row.n for row in found.rows if row.log == "block 1 of 4"} == {22 - 5 + 11 - 5}
+    with pytest.raises(UserError, match="79 rows of 1800 s are too short to hold a part out"):
+        identify(log.isel(time=slice(79)), models=["oe"], draws=0)
+
+
 def test_the_smallest_structure_within_one_standard_error_wins():
     small, middle, large = Structure("small", 1), Structure("middle", 2), Structure("large", 9)
     errors = {
