@@ -14,11 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as parquet
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thermogrip.datasets import limits
+from thermogrip.datasets import limits, netcdf, tables
 from thermogrip.datasets.atomic_files import read_json, read_toml
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.grasp_files import read_grasps
@@ -233,3 +235,103 @@ def test_every_size_that_is_allowed_grows_with_the_packed_one() -> None:
     assert sizes == sorted(sizes)
     assert sizes[-1] == limits.most_bytes()
     assert json.dumps(sizes[0]) == str(8 << 20)
+
+
+@pytest.mark.parametrize(
+    ("check", "most"),
+    [
+        (lambda size: limits.check_size(size, file="a"), 1 << 20),
+        (lambda size: limits.check_size(size, file="a", share=256), 4096),
+        (lambda size: limits.check_unpacked(1, size, file="a"), 1 << 20),
+        (lambda depth: limits.check_content(json.loads("[" * depth + "]" * depth)), 64),
+        (lambda size: limits.number_within({"a": size}, "a", 0, 7), 7),
+        (lambda size: limits.number_within({"a": -size}, "a", -7, 0), 7),
+        (lambda size: limits.array_within({"a": [0, -size]}, "a", 7), 7),
+        (lambda size: limits.array_within({"a": [0, size]}, "a", 7), 7),
+    ],
+)
+def test_a_limit_itself_is_within_it(
+    check: Callable[[int], object], most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("THERMOGRIP_MAX_MB", "1")
+    check(most)
+    with pytest.raises((UserError, ValueError)):
+        check(most + 1)
+
+
+def test_what_is_packed_may_grow_200_times() -> None:
+    limits.check_unpacked(1 << 20, 200 << 20, file="a")
+    with pytest.raises(UserError, match="210 MB or more from 1049 kB"):
+        limits.check_unpacked(1 << 20, (200 << 20) + 1, file="a")
+
+
+@pytest.mark.parametrize(
+    ("value", "most"), [("1", 1 << 20), ("1e9", 10**9 << 20), ("", 2 << 30), ("0.9", None), ("1.1e9", None)]
+)
+def test_the_environment_sets_1_to_1e9_mb(
+    value: str, most: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("THERMOGRIP_MAX_MB", value)
+    if most:
+        assert limits.most_bytes() == most
+    else:
+        with pytest.raises(UserError, match="set it to a number of MB"):
+            limits.most_bytes()
+
+
+@pytest.mark.parametrize(("size", "left"), [(6, 0), (7, 0), (8, 1), (20, 13)])
+def test_a_byte_more_than_the_limit_is_read_and_no_further(size: int, left: int) -> None:
+    stream = io.BytesIO(bytes(size))
+    assert len(limits.read_within(stream, 6)) == size - left
+    assert len(stream.read()) == left
+
+
+def test_a_table_may_have_as_many_columns_and_empty_lines_as_its_limits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tables, "MOST_COLUMNS", 3)
+    monkeypatch.setattr(tables, "_MOST_EMPTY", 3)
+    kept, wide = tmp_path / "a.csv", tmp_path / "b.csv"
+    for empty in range(6):  # the header is a line without a row
+        kept.write_text("time_s,a,b\n" + "\n" * empty + "0,1,2\n1,1,2\n")
+        if empty > 2:
+            assert f"has {empty + 1} empty lines" in refused(read_csv_table, kept)
+        else:
+            assert len(read_csv_table(kept).lines) == 2
+    wide.write_text("time_s,a,b,c\n0,1,2,3\n")
+    assert "has 4 names, more than 3" in refused(read_csv_table, wide)
+    for names in (["time_s", "a", "b"], ["time_s", "a", "b", "c"]):
+        parquet.write_table(pa.table({name: [0.0, 1.0] for name in names}), tmp_path / "a.parquet")
+        if len(names) > 3:
+            assert "has 4 columns, more than 3" in refused(tables.check_table, tmp_path / "a.parquet")
+        else:
+            tables.check_table(tmp_path / "a.parquet")
+
+
+def test_comments_that_fill_half_of_what_is_looked_at_may_stand_before_the_header(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tables, "_BEGINNING", 64)
+    path = tmp_path / "a.csv"
+    path.write_bytes(b"#" * 30 + b"\n")
+    assert "has only comments" in refused(tables.check_table, path)
+    path.write_bytes(b"#" * 31 + b"\n")
+    tables.check_table(path)  # the header may come later
+    path.write_bytes(b"time_s,time_s," + b"a" * 40)
+    assert "stands twice" in refused(tables.check_table, path)
+
+
+def test_a_file_of_as_many_members_as_its_limit_is_checked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    h5py = pytest.importorskip("h5py")
+    path = tmp_path / "a.nc"
+    with h5py.File(path, "w") as file:
+        for name in "abc":
+            file[name] = [1.0, 2.0]
+    for most in (3, 2):
+        monkeypatch.setattr(netcdf, "_MOST_MEMBERS", most)
+        if most < 3:
+            assert "has more than 2 members" in refused(netcdf.check_netcdf, path)
+        else:
+            netcdf.check_netcdf(path)
