@@ -96,7 +96,9 @@ def model_table(found: Identification) -> Table:
         baseline = {row.log: row.no_input_rmse for row in held if row.output == output}
         rows.append(("no\N{NO-BREAK SPACE}input", output, *(baseline.get(log) for log in logs), unit))
     return Table(
-        ("model", "output", *logs, "unit"), tuple(rows), "Free-run RMSE on rows that were not fitted"
+        ("model", "output", *logs, "unit"),
+        tuple(rows),
+        "Free-run RMSE on rows that were not fitted (blocks: of means over a step of the model)",
     )
 
 
