@@ -155,7 +155,8 @@ def test_an_identification_has_its_tables_and_verdict(good: bool, tone: str) -> 
     assert (section.verdict, section.tone) == ("oe is best.", tone)
     tables = [part for part in section.parts if isinstance(part, Table)]
     assert [table.caption for table in tables][:4] == [
-        "Free-run RMSE on rows that were not fitted (blocks: of means over a step of the model)", "Columns of the logs",
+        "Free-run RMSE on rows that were not fitted (blocks: of means over a step of the model)",
+        "Columns of the logs",
         "oe, fitted on everything, on its own logs", "Free parameters",
     ]  # fmt: skip
     assert tables[2].rows == (("b", "t", 0.5, "degC", 90.0, 50),)
