@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import re
 from pathlib import Path
 from typing import Any
 
@@ -122,3 +123,21 @@ def test_the_step_in_c_is_the_models_with_its_switches_on(
     np.testing.assert_allclose(out, A @ sx + B @ su + E @ sd, atol=1e-9)
     if name == "gripper":
         assert model.model.switches  # the pump
+
+
+@pytest.mark.parametrize("name", ["gripper", "tank"])
+def test_an_argument_is_called_unused_exactly_where_the_body_does_not_read_it(name: str):
+    """With -Wextra a compiler warns of the first kind; of the second nobody would."""
+    plant = make_tank() if name == "tank" else network_plant(name)
+    model, seen = PredictionModel(plant, dt=plant.dt), 0
+    code = write_model(model.model, model.drive_index, model.dt, name="tg_model")
+    for part in code.source.split("\n}\n"):
+        if "{" not in part:
+            continue
+        head, body = part.split("{", 1)
+        arguments = [item.split()[-1].lstrip("*") for item in head[head.index("(") + 1 : -2].split(",")]
+        unused = set(re.findall(r"\(void\)(\w+);", body))
+        rest = re.sub(r"\(void\)\w+;", "", body)
+        assert unused == {item for item in arguments if not re.search(rf"\b{item}\b", rest)}, head
+        seen += 1
+    assert seen == 5

@@ -62,6 +62,16 @@ def test_hard_rows_that_contradict_each_other_are_infeasible():
     assert qp.solve(np.eye(2), np.zeros(2), A, lower, upper).status == "infeasible"
 
 
+@pytest.mark.parametrize(("gap", "hard"), [(0.0, "solved"), (1e-13, "infeasible"), (1.0, "infeasible")])
+def test_a_row_whose_ends_cross_is_infeasible_where_it_is_hard(gap: float, hard: str):
+    for soft, status in ((False, hard), (True, "solved")):
+        qp = ActiveSetQP(soft=np.array([soft]), linear=1.0, quadratic=1.0)
+        ends = np.array([1.0 + gap]), np.array([1.0])
+        answer = qp.solve(np.eye(1), np.array([-3.0]), np.ones((1, 1)), *ends)
+        assert answer.status == status
+    np.testing.assert_allclose([*answer.x, *answer.slack], [1.5, 0.5], atol=1e-9)
+
+
 def test_what_is_no_number_is_reported_as_no_number():
     qp = ActiveSetQP(soft=np.zeros(1, bool), linear=1.0, quadratic=1.0)
     one = np.ones((1, 1))

@@ -149,6 +149,16 @@ def test_a_row_that_contradicts_itself_is_an_answer_with_a_status(soft: bool):
         np.testing.assert_allclose(found.x, [1.0], atol=1e-6)
 
 
+@pytest.mark.parametrize(("soft", "status"), [(True, "solved"), (False, "infeasible")])
+def test_ends_that_cross_by_a_rounding_are_infeasible_where_the_row_is_hard(soft: bool, status: str):
+    solver = CondensedQP(soft=[soft], linear=[1.0], quadratic=[1.0])
+    ends = np.array([1.0 + 1e-13]), np.array([1.0])
+    answer = solver.solve(np.eye(1), np.array([-3.0]), np.ones((1, 1)), *ends)
+    assert answer.status == status
+    if soft:  # 0.5 (x - 3)^2 + s + 0.5 s^2 with s = x - 1
+        np.testing.assert_allclose([*answer.x, *answer.slack], [1.5, 0.5], atol=1e-9)
+
+
 def test_a_hard_row_of_nothing_is_not_overlooked():
     """0 x >= 1 is infeasible; the same at a penalty is paid whatever x is."""
     H, f, A = np.eye(2), np.array([-1.0, 0.0]), np.zeros((1, 2))

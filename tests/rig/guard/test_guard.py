@@ -164,3 +164,29 @@ def test_between_sessions_the_guard_keeps_what_it_knows(plant: Plant) -> None:
     guard.start(rig.read(), rig.time, UNITS)
     assert expected()["t_tank"] == pytest.approx(known["t_tank"], abs=0.3)
     assert guard.model.compared_from == 0.0  # no new warm-up
+
+
+@pytest.mark.parametrize(
+    ("time", "ready"), [(10.0, False), (38.9, False), (39.0, True), (48.9, True), (1e4, True)]
+)
+def test_the_skin_is_ready_a_shortest_window_after_the_comparison_began(
+    plant: Plant, time: float, ready: bool
+) -> None:
+    guard = Guard(plant)
+    guard.start(Twin(plant).read(), 0.0, UNITS)
+    guard.model.compared_from = 29.0
+    assert guard.ready(time) is ready
+
+
+def test_the_skin_is_ready_once_the_last_touch_is_forgotten_and_at_once_without_a_model(plant: Plant) -> None:
+    rig, guard = Twin(plant), Guard(plant)
+    guard.start(rig.read(), 0.0, UNITS)
+    for time in range(1, 31):  # touched from 5 s to 20 s; released by the reading of 21 s
+        rig.wait(1.0)
+        check(guard, rig.read(), touching=5 <= time <= 20)
+        if 5 <= time <= 20:
+            assert not guard.ready(1e4)
+    released, window = rig.time - 9.0, guard.settings.model.windows[0]
+    assert not guard.ready(released + guard.settings.forget_s + window - 0.1)
+    assert guard.ready(released + guard.settings.forget_s + window)
+    assert guard_at().ready(0.0)

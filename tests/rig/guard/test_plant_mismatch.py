@@ -23,6 +23,7 @@ from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.plant.plant import Plant
 
 KNOWN, REAL = drill_plants()
+N = len(KNOWN.model.parameters)
 OFF = {"current": 0.96, "C_water": 1.04, "G_tank": 0.96}
 DRIFTED = replace(KNOWN, values={name: v * OFF.get(name, 1.0) for name, v in KNOWN.values.items()})
 
@@ -198,6 +199,8 @@ def test_a_file_that_cannot_be_kept_ends_no_session_and_is_noted(tmp_path: Path)
     ("change", "said"),
     [({"drift": 0.5}, "moved by more"), ({"drift": float("1e-400")}, "moved by more"),
      ({"delta": {"mean": [2.0], "covariance": [[0.1]]}}, "is damaged"),
+     ({"delta": {"mean": [0.0], "covariance": (np.eye(N) / 3).tolist()}}, rf"{N} shares, mean \(1,\)"),
+     ({"delta": {"mean": [0.0] * N, "covariance": [[0.3]]}}, r"covariance \(1, 1\)"),
      ({"sessions": "many"}, "is damaged"), ({"plant": "0"}, "another plant"), ({"version": 9}, "version 9")],
 )  # fmt: skip
 def test_a_file_that_was_tampered_with_is_refused(
