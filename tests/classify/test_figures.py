@@ -47,6 +47,13 @@ def test_accuracy_shows_a_row_a_condition_and_its_count(comparison: Comparison) 
     assert drawn(figure) > 1000
     labels = [text.get_text() for text in figure.axes[0].get_yticklabels()]
     assert labels == ["pooled  (n = 18)", "touches  (n = 9)", "b  (n = 9)", "apart  (n = 9)"]
+    assert figure.axes[0].get_ylim() == (3.5, -0.5)  # the first row on top, each one whole
+    assert figure.axes[0].get_xlim() == (-0.02, 1.02)
+    marks = [line for line in figure.axes[0].lines if len(line.get_xdata()) == 1]
+    for line, row in zip(marks, comparison.scores(), strict=True):
+        at = labels.index(f"{row['condition']}  (n = {row['n']})")
+        assert line.get_xdata()[0] == row["accuracy"]
+        assert abs(line.get_ydata()[0] - at) == pytest.approx(0.175)
 
 
 def test_confusion_has_a_panel_a_classifier(comparison: Comparison) -> None:

@@ -84,7 +84,14 @@ def test_a_pool_says_what_is_tried(make_touches: Maker, monkeypatch: pytest.Monk
     assert len(model.weights_) == 4 * (2 + 1 + 1)
     fresh = make_touches(seed=5, step=0.25)
     assert np.mean(model.predict(fresh) == fresh["material"].values) > 0.9
-    assert len(POOLS["wide"].windows) * len(POOLS["wide"].degrees) == 20
+    tried = {name: (pool.windows, pool.degrees) for name, pool in POOLS.items() if name != "tiny"}
+    assert tried == {
+        "small": ((1.0, 1.5, 2.5, 4.5), (3, 5)),
+        "wide": ((0.5, 1.0, 2.0, 4.0), (2, 3, 4, 5, 6)),
+    }
+    tuned = {name: (pool.components, pool.strengths, pool.pulls) for name, pool in POOLS.items()}
+    assert tuned["small"] == ((6, 12), (3.0,), (10.0,))
+    assert tuned["wide"] == ((4, 8, 12, 16), (0.1, 1.0, 10.0), (3.0, 10.0, 30.0))
     with pytest.raises(UserError, match="no pool 'huge'"):
         ExpansionClassifier(pool="huge").fit(fresh)
 

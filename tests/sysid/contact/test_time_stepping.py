@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -11,7 +12,7 @@ from thermogrip.sysid.contact.response import (
     step_response,
     time_nodes,
 )
-from thermogrip.sysid.contact.time_stepping import first_step, slabs
+from thermogrip.sysid.contact.time_stepping import N_MODE, first_step, slab, slab_moves, slabs
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 
 STACK = load_default_gripper().stack
@@ -28,6 +29,37 @@ def test_modes_of_a_slab_make_its_impedance(block, far):
     k, x = e * np.sqrt(s), np.sqrt(s) * c / e
     want = (k + far * np.tanh(x)) / (k * np.tanh(x) + far) / k
     np.testing.assert_allclose(found, want, rtol=1e-4)
+
+
+@pytest.mark.parametrize("block", [COPPER, IRON, WOOD, (3.64e4, 3e3)])
+@pytest.mark.parametrize("far", [0.0, 3.0, 2000.0])
+def test_the_slopes_of_modes_are_their_differences(block, far):
+    e, c = block
+    lam, weight, moves = np.empty(N_MODE), np.empty(N_MODE), np.empty((4, N_MODE))
+
+    def modes(ln_e, ln_c):
+        own = _modes(e * np.exp(ln_e), c * np.exp(ln_c), far, lam, weight)
+        return lam.copy(), weight.copy(), own
+
+    rate, size, resistance = modes(0.0, 0.0)
+    own = _slopes(e, c, far, rate, moves)
+    h = 1e-5
+    for at, step in enumerate(((h, 0.0), (0.0, h))):
+        low, high = modes(*(-s for s in step)), modes(*step)
+        by_rate, by_size, by_resistance = ((b - a) / (2 * h) for a, b in zip(low, high, strict=True))
+        np.testing.assert_allclose(rate * moves[2 * at], by_rate, rtol=1e-5, atol=1e-9)
+        np.testing.assert_allclose(size * moves[2 * at + 1], by_size, rtol=1e-5, atol=1e-12)
+        np.testing.assert_allclose(resistance * own[at], by_resistance, rtol=1e-5, atol=1e-12)
+
+
+@numba.njit(error_model="numpy")  # what only compiled code calls is compiled for that alone
+def _modes(e, c, far, lam, weight):
+    return slab(e, c, far, lam, weight)
+
+
+@numba.njit(error_model="numpy")
+def _slopes(e, c, far, lam, moves):
+    return slab_moves(e, c, far, lam, moves)
 
 
 def untouched(block, far, t, n=120):

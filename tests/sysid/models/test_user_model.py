@@ -389,6 +389,15 @@ def test_equations_that_give_no_number_are_refused_before_the_fit():
         fit_network(own_model(Unguarded), [make_log(t, signals)])
 
 
+@pytest.mark.parametrize(("rest", "lost"), [((np.nan, 1.0), "upper"), ((1.0, np.inf), "lower")])
+def test_the_state_without_a_number_at_rest_is_named(rest: tuple[float, float], lost: str):
+    model = own_model(varied(Tanks, rest=lambda self, y, u, d, p: list(rest)))
+    with pytest.raises(UserError, match=rf"no finite state at rest \({lost} is not\)"):
+        model.rest([4.0], [1.0], [], model.prior)
+    with pytest.raises(UserError, match="no output has a reading to start from"):
+        model.rest([np.nan], [1.0], [], model.prior)
+
+
 def test_the_class_of_the_how_to_is_accepted(tmp_path):
     page = (Path(__file__).parents[3] / "docs" / "howto" / "own-network.md").read_text()
     file = tmp_path / "tank.py"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from thermogrip.sysid.plant.log_grid import (
     cut_stretches,
     dominant_time,
     make_grid,
+    match_log,
     quantum,
     signals,
     switches_of,
@@ -361,3 +363,40 @@ def test_rows_between_steps_are_on_the_line_between_them():
     assert (first.gap, second.gap) == (0.0, 23.0)
     run = np.arange(0.0, 12.0)[None, :, None] ** 2  # at 0, 2, 4 ... s
     np.testing.assert_allclose(at_rows(first, run, 2.0)[0, :, 0], [0.0, 0.75, 1.75, 9 + 0.5 * 7])
+
+
+@pytest.mark.parametrize(
+    ("unit", "want", "valid", "largest", "made"),
+    [
+        ("percent", "1", (-1.0, 1.0), 60.0, 0.6),
+        ("percent", "1", (0.0, 80.0), 60.0, None),  # the plant's 1 is no share
+        ("percent", "1", (-80.0, 0.0), 60.0, None),
+        ("percent", "1", (0.0, 1.1), 60.0, None),
+        ("1", "percent", (0.0, 100.0), 0.6, 60.0),
+        ("1", "percent", (0.0, 100.0), 1.0, 100.0),
+        ("1", "percent", (0.0, 100.0), 1.1, 1.1),
+        ("1", "percent", (0.0, 100.0), 60.0, 60.0),  # has no unit, and is no share
+        ("percent", "0_255", (0.0, 255.0), 60.0, 153.0),
+        ("percent", "W", (0.0, 1.0), 60.0, None),
+        ("W", "1", (0.0, 1.0), 0.6, None),
+        ("W", "W", (0.0, 9.0), 6.0, 6.0),
+    ],
+)
+def test_a_drive_is_converted_where_both_units_are_shares_of_full_scale(
+    unit: str, want: str, valid: tuple[float, float], largest: float, made: float | None
+):
+    drive = np.where(T < 100, 0.0, largest)
+    model: Any = SimpleNamespace(
+        inputs=("q",), disturbances=(), outputs=("t",), units={"q": want, "t": "degC"}, valid={"q": valid}
+    )
+    log = make_log(T, {"q": (drive, unit, "input"), "t": (0 * T, "degC", "output")})
+    if made is None:
+        said = f"is in '{unit}', the plant's is in '{want}'.*convert it"
+        with pytest.raises(UserError, match=said) as fault:
+            match_log(model, log)
+        assert ("leave the unit away" in str(fault.value)) is (want == "1")
+    else:
+        matched, said = match_log(model, log)
+        np.testing.assert_allclose(matched["q"].values.max(), made, rtol=1e-12)
+        assert matched["q"].attrs["units"] == want
+        assert len(said) == (unit != want)
