@@ -12,7 +12,13 @@ from hypothesis import strategies as st
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import example_path
-from thermogrip.datasets.grasp_files import read_grasp_files, read_grasps, shared_grasps, write_grasps
+from thermogrip.datasets.grasp_files import (
+    check_grasp_file,
+    read_grasp_files,
+    read_grasps,
+    shared_grasps,
+    write_grasps,
+)
 from thermogrip.datasets.schema import make_grasps
 
 META = "grasp_id,material,t_object_nominal_degC,t_gripper_set_degC\n"
@@ -240,6 +246,23 @@ def test_columns_that_nobody_asked_for_are_left_out_and_reported(pair):
     g = read_grasps(pair(more, ONE))
     assert "not used: force_N, remark" in g.attrs["repairs"]
     np.testing.assert_array_equal(g["t_surface"], read_grasps(pair(plain, ONE))["t_surface"])
+
+
+def test_what_is_no_table_is_found_in_a_folder_a_file_and_the_facts_beside_it(tmp_path, small_grasps):
+    path = write_grasps(small_grasps, tmp_path / "a.csv")
+    facts = tmp_path / "a_meta.csv"
+    check_grasp_file(tmp_path)
+    check_grasp_file(path)
+    for spoilt in (facts, path):
+        kept = spoilt.read_bytes()
+        spoilt.write_text("one,one\n1,2\n")
+        for asked in (tmp_path, path):
+            with pytest.raises(UserError, match=rf"{spoilt.name}.*column one.*stands twice"):
+                check_grasp_file(asked)
+        spoilt.write_bytes(kept)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UserError, match="holds no grasp files"):
+        check_grasp_file(tmp_path / "empty")
 
 
 def test_a_spreadsheet_s_semicolons_decimal_commas_and_utf_16_are_the_same_grasps(pair, tmp_path):

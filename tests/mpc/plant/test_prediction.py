@@ -149,6 +149,27 @@ def test_the_gain_turns_over_where_heat_equals_twice_joule(reversing_tank):
     assert curve.rising == (curve.turns[0], 1.0)
 
 
+@pytest.mark.parametrize(
+    ("steady", "turns", "rising"),
+    [
+        (lambda u: np.clip(u, -0.5, 0.5), (), (-1.0, 1.0)),  # flat at both ends is no turn
+        (lambda u: -u, (), (-1.0, 1.0)),
+        (lambda u: 0.0 * u, (), (0.0, 0.0)),  # the drive moves nothing
+        (lambda u: -((u - 0.5) ** 2), (0.5,), (-1.0, 0.5)),
+        (lambda u: (u + 0.5) ** 2, (-0.5,), (-0.5, 1.0)),
+        (lambda u: u - 1.5 * np.maximum(np.abs(u) - 0.5, 0) * np.sign(u), (-0.5, 0.5), (-0.5, 0.5)),
+    ],
+)
+def test_the_gain_keeps_its_sign_between_the_turns_beside_the_neutral_drive(steady, turns, rising):
+    model = SimpleNamespace(
+        drives=("q", "drive"), outputs=("t",), neutral=np.zeros(2), lowest=-np.ones(2), highest=np.ones(2),
+        steady_output=lambda u, d: np.array([steady(u[1]) + d[0] + 9.0 * u[0]]),
+    )  # fmt: skip
+    curve = steady_curve(model, "drive", "t", [20.0], n=9)
+    assert curve.turns == pytest.approx(turns)
+    assert curve.rising == pytest.approx(rising)
+
+
 def test_the_holding_drive_holds_and_says_what_it_misses(tank):
     model = PredictionModel(tank, dt=2.0)
     held = holding_drive(model, ("t_surface",), [38.0], ROOM)
