@@ -16,7 +16,7 @@ one that is kept, and the network, are scored besides on the last 30 percent of 
 and run freely from the log's start, where its state is known.
 
 **Which candidate is kept.**  Among black boxes that of the least error, in units of the outputs' spread, as a
-geometric mean over the folds; a simpler kind where its paired excess is within one standard error and 5
+geometric mean over the folds; a linear one where its paired excess is within one standard error and 5
 percent.  On whole logs, and beside a network, that of the least held-out error over that of a model without
 input; the network also when it is within 10 percent of the best, for its parameters mean something.  A model
 that no output shows to beat a model without input (see :mod:`thermogrip.sysid.validation.free_run`) is never
@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 HELD_OUT_SHARE = 0.3  # of each log, without leave_one_out
 TAIL = f"last {100 * HELD_OUT_SHARE:.0f} % of "
 WITHIN_NOISE = 1.1  # of the best error: then the network is preferred
-SIMPLER = ("arx", "oe", "subspace", "sindy", "neural")  # linear ones first
+LINEAR = ("arx", "oe", "subspace")  # kept where another kind errs hardly less
 USEFUL = 0.5  # of the no-input error: below it a model is called good
 
 
@@ -147,11 +147,11 @@ def fold_rows(fit: BlackBoxFit) -> list[Row]:
 
 
 def choose_black_box(fits: Sequence[BlackBoxFit]) -> BlackBoxFit:
-    """Return the fit of the least error over its folds, or a simpler kind that errs hardly more."""
+    """Return the fit of the least error over its folds, or a linear one that errs hardly more."""
     logs = [np.log(np.maximum(fit.choice.errors[fit.choice.structure], 1e-12)) for fit in fits]
     best = min(logs, key=lambda errors: float(errors.mean()))
     near = [(fit, float(e.mean())) for fit, e in zip(fits, logs) if excess_within_noise(e - best)]
-    return min(near, key=lambda item: (SIMPLER.index(item[0].kind) // 3, item[1]))[0]
+    return min(near, key=lambda item: (item[0].kind not in LINEAR, item[1]))[0]
 
 
 def fit_without_tail(fit: BlackBoxFit, train: Sequence[Log]) -> Plant:
