@@ -25,9 +25,6 @@ NO_UNIT = re.compile(
     r"|number|count|weight|times|multiple|as for|see|scale|confidence|correlation|fraction)\b",
     re.IGNORECASE,
 )
-#: What doors lack yet (``arguments``: any of them); nothing may be added.
-LACKING: dict[str, set[str]] = {
-}
 
 
 def doors() -> list[str]:
@@ -120,11 +117,7 @@ def _raises(function: Any) -> bool:
 
 @pytest.mark.parametrize("name", doors())
 def test_a_door_is_documented_in_full(name: str) -> None:
-    known = LACKING.get(name, set())
-    found = {
-        item for item in lacks(_door(name)) if not ("arguments" in known and item.startswith("argument "))
-    }
-    assert found <= known
+    assert lacks(_door(name)) == set()
 
 
 NUMBER = "Parameters\n----------\nt : float\n    Time [s].\n"
