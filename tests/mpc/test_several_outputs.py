@@ -18,6 +18,7 @@ from thermogrip.sysid.plant.plant import Plant
 from .truths import furnace, linear_model, quadruple_tank
 
 CONTROLLED = ("t2", "t5")
+LOOPS = {"controlled": CONTROLLED, "deadline_s": 1e9}  # on a busy computer a second passes
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +28,7 @@ def furnace_plant() -> Plant:
 
 
 def test_a_single_number_is_the_target_of_every_controlled_output(furnace_plant):
-    design = default_design(furnace_plant, controlled=CONTROLLED)
+    design = default_design(furnace_plant, **LOOPS)
     controllers = [
         Controller(furnace_plant, design),
         LQRController(furnace_plant, design),
@@ -56,7 +57,7 @@ def run(controller, truth, target, seconds):
 @pytest.mark.parametrize("disagree", [0.0, 1.0, 2.0])
 def test_sensors_that_disagree_from_the_start_are_off_and_the_plant_is_at_rest(furnace_plant, disagree):
     truth = furnace(disagree=disagree)
-    controller = Controller(furnace_plant, default_design(furnace_plant, controlled=CONTROLLED))
+    controller = Controller(furnace_plant, default_design(furnace_plant, **LOOPS))
     first = truth.reading()
     controller.reset(first)
     observer, model = controller.observer, controller.model
@@ -72,7 +73,7 @@ def test_sensors_that_disagree_from_the_start_are_off_and_the_plant_is_at_rest(f
 
 def test_a_sensor_that_jumps_for_good_is_off_and_the_others_stay(furnace_plant):
     truth = furnace()
-    controller = Controller(furnace_plant, default_design(furnace_plant, controlled=CONTROLLED))
+    controller = Controller(furnace_plant, default_design(furnace_plant, **LOOPS))
     controller.reset(truth.reading())
     target = {"t2": 45.0, "t5": 45.0}
     run(controller, truth, target, 600.0)
@@ -89,7 +90,7 @@ def test_a_sensor_that_jumps_for_good_is_off_and_the_others_stay(furnace_plant):
 
 def test_when_most_readings_jump_it_is_the_world_that_changed(furnace_plant):
     truth = furnace()
-    controller = Controller(furnace_plant, default_design(furnace_plant, controlled=CONTROLLED))
+    controller = Controller(furnace_plant, default_design(furnace_plant, **LOOPS))
     controller.reset(truth.reading())
     target = {"t2": 45.0, "t5": 45.0}
     run(controller, truth, target, 600.0)
@@ -104,7 +105,7 @@ def test_when_most_readings_jump_it_is_the_world_that_changed(furnace_plant):
 def test_there_is_no_offset_as_long_as_the_drives_are_inside_their_limits(power):
     design_truth = quadruple_tank()
     plant = linear_model(design_truth, design_truth.x, np.full(2, 30.0), dt=2.0)
-    controller = Controller(plant, default_design(plant, controlled=("h1", "h2")))
+    controller = Controller(plant, default_design(plant, controlled=("h1", "h2"), deadline_s=1e9))
     truth = quadruple_tank(power=power)
     controller.reset(truth.reading())
     moves, seen = run(controller, truth, 15.0, 1200.0)
@@ -116,7 +117,7 @@ def test_there_is_no_offset_as_long_as_the_drives_are_inside_their_limits(power)
 
 @pytest.mark.parametrize("kind", [Controller, LQRController])
 def test_one_lost_sensor_is_one_lost_loop(furnace_plant, kind):
-    design = default_design(furnace_plant, controlled=CONTROLLED, patience_s=100.0)
+    design = default_design(furnace_plant, controlled=CONTROLLED, patience_s=100.0, deadline_s=1e9)
     controller, truth = kind(furnace_plant, design), furnace()
     controller.reset(truth.reading())
     target, seen = {"t2": 40.0, "t5": 40.0}, []
@@ -181,7 +182,7 @@ def test_one_lost_sensor_of_two_leaves_the_other_loop_of_a_pi_controller(furnace
 
 
 def test_a_target_out_of_reach_is_reported_within_two_samples_and_kept_reported(furnace_plant):
-    controller = Controller(furnace_plant, default_design(furnace_plant, controlled=CONTROLLED))
+    controller = Controller(furnace_plant, default_design(furnace_plant, **LOOPS))
     truth = furnace()
     truth.noise = 0.2
     controller.reset(truth.reading())
