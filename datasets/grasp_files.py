@@ -167,7 +167,7 @@ def read_grasp_files(paths: Sequence[str | Path]) -> list[Grasps]:
     stems = [log_name(record) for record in records]
     for at, stem in enumerate(stems):
         if stem in stems[:at]:
-            raise UserError("stands twice among the files", file=files[at], hint="give each file once")
+            raise UserError("is given twice", file=files[at], hint="give each file once")
     return records
 
 
@@ -377,7 +377,7 @@ def _matched(table: Table, order: list[str], path: Path, file: str) -> list[int]
     for at, grasp in enumerate(table.text["grasp_id"]):
         if grasp in rows:
             line = int(table.lines[at])
-            raise UserError(f"grasp_id {grasp!r} stands twice", file=path, row=line, hint="give each its own")
+            raise UserError(f"grasp_id {grasp!r} occurs twice", file=path, row=line, hint="give each its own")
         rows[grasp] = at
     missing = next((g for g in order if g not in rows), None)
     if missing is not None:

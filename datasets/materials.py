@@ -141,7 +141,7 @@ def read_materials(text: str, *, file: str = "materials.csv") -> list[Material]:
         material = _check(_material(row, file, line), file, line)
         for name in (material.name, *material.aliases):
             if name in taken:
-                raise UserError(f"{name!r} stands twice", file=file, row=line, hint="keep one")
+                raise UserError(f"{name!r} occurs twice", file=file, row=line, hint="keep one")
             taken.add(name)
         materials.append(material)
     return materials

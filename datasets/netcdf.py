@@ -134,7 +134,7 @@ def check_hdf5(opened: Any, path: str | Path) -> None:
             elif isinstance(member, h5py.Dataset):
                 if member.is_virtual or member.external:
                     hint = "copy it into this"
-                    raise UserError("stands in another file", file=path, column=name, hint=hint)
+                    raise UserError("is stored in another file", file=path, column=name, hint=hint)
                 declared += _in_memory(member)
                 check_unpacked(packed, declared, file=path, what="declares")
 

@@ -257,7 +257,7 @@ def check_grasps(grasps: Grasps) -> Grasps:
     unique, counts = np.unique(ids, return_counts=True)
     if np.any(counts > 1):
         raise UserError(
-            f"grasp_id {str(unique[counts > 1][0])!r} stands twice", file=where, hint="give each its own"
+            f"grasp_id {str(unique[counts > 1][0])!r} occurs twice", file=where, hint="give each its own"
         )
     lost = ~np.isfinite(found["t_surface"].values).any(axis=1)
     if lost.any():
@@ -314,7 +314,7 @@ def _check_touches(grasps: Grasps, where: str) -> None:
             problem = f"grasp {lost!r} of touch_group {str(name)!r} has no touch, others of it have"
             raise UserError(problem, file=where, hint="number all touches of a block, or none")
         if (counts > 1).any():
-            problem = f"touch {numbers[counts > 1][0]:g} of touch_group {str(name)!r} stands twice"
+            problem = f"touch {numbers[counts > 1][0]:g} of touch_group {str(name)!r} occurs twice"
             hint = "number its touches 1, 2, ..., and give a block that is touched anew another touch_group"
             raise UserError(problem, file=where, hint=hint)
 

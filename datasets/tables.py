@@ -294,7 +294,7 @@ def _header(data: bytes, file: str) -> tuple[list[str], int, str]:
         if not name:
             raise UserError(f"column {at + 1} has no name", file=file, row=skip, hint="name it or remove it")
         if name in seen:
-            raise UserError("stands twice", file=file, row=skip, column=name, hint="rename one of them")
+            raise UserError("occurs twice", file=file, row=skip, column=name, hint="rename one of them")
         seen.add(name)
     if all(_NUMBER.fullmatch(name) for name in header):
         hint = "write a first line such as time_s,drive,t_tank_degC"

@@ -168,7 +168,7 @@ def explain_role(name: str, unit: str) -> tuple[str, str]:
         return "output", "its unit is degC"
     if unit in ("percent", "V", "0_255"):
         return "input", f"its unit is {unit}"
-    return "other", "neither its name nor its unit tells what it is"
+    return "other", "neither its name nor its unit shows what it is"
 
 
 def assign_roles(

@@ -19,7 +19,7 @@ event.  What is read is not the level itself, and that is what the training log 
 
 * Its residuals follow the level: what the sensor reads, S(h), runs straight from (0, 0) to a kink at
   (kink, kink_reading) and from there, nearly twice as steep, to (10, 10).
-* Each time the level turns round, the reading stands still for a while and then moves on at full speed, so
+* Each time the level turns round, the reading is constant for a while and then moves on at full speed, so
   there is play in the sensor: the reading follows only where S(h) is further than ``slack`` away.
 
 The reading m is a state, which follows within a second: dm/dt = (m clipped to S(h) -+ slack) - m.

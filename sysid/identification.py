@@ -234,7 +234,7 @@ def relative_error(row: Row) -> float:
 def held_out_scores(rows: Sequence[Row], model: str) -> list[HeldOut]:
     """Return a candidate's held-out rows as a plant's file keeps them."""
     return [
-        # of a reading that stands still no share can be fitted, and JSON has no NaN
+        # of a constant reading no share can be fitted, and JSON has no NaN
         HeldOut(row.log, row.output, row.rmse, float(np.nan_to_num(row.fit_percent)), row.unit, row.n)
         for row in rows
         if row.held_out and row.model == model
@@ -433,7 +433,7 @@ def _signal_roles(
     taken = {name: r for r, group in zip(("input", "disturbance", "output"), groups) for name in group}
     out = []
     for name in (*taken, *(n for n in units if n not in taken)):
-        role, why, guessed = taken.get(name, "left out"), "the log says so", False
+        role, why, guessed = taken.get(name, "left out"), "given by the log", False
         if role != "left out" and name in (lists[role] or ()):
             why = "named"
         elif of_network.get(name) == role and network is not None:

@@ -1,4 +1,4 @@
-"""Ten public sets that nobody here made, as logs: the part to identify from, and the part to be judged on.
+"""Ten public sets that nobody here made, as logs: the part to identify from, and the part to score.
 
 The files are not part of this project.  Each comes from a public repository and lies in one folder under the
 name in :data:`SETS`:
@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ForeignSet:
-    """A log to identify from, one to be judged on, and the seconds of it that set the state."""
+    """A log to identify from, one to score, and the seconds of it that set the state."""
 
     name: str
     train: Log
@@ -48,7 +48,7 @@ class _Kind:
     y: tuple[int, ...]
     unit: str
     dt: float
-    two: bool = False  # the second log is judged on; else the second half of the first one
+    two: bool = False  # the second log is scored; else the second half of the first one
     mean: int = 1  # rows that are averaged to one
 
 

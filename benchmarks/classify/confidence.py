@@ -1,10 +1,10 @@
 """Are stated confidences true, and do block temperatures have a heavier tail than the normal one?
 
-    OMP_NUM_THREADS=1 python benchmarks/classify/confidence.py --comparison ladder/posterior.json
+    OMP_NUM_THREADS=1 python benchmarks/classify/confidence.py --comparison comparison/posterior.json
 
 - bands: right answers beside stated confidence in bands of it, on the example grasps (a comparison that
-  ``ladder.py`` wrote), with an interval that draws whole grasps anew, and how often a forecaster whose
-  confidences are true lies as far off;
+  ``compare_classifiers.py`` wrote), with an interval that draws whole grasps anew, and how often a
+  forecaster whose confidences are true lies as far off;
 - population: the same where grippers that five simulated grasps of each material and condition have taught
   name fresh grasps of the population they came from;
 - finite: the same on grasps by finite volumes, which are no model of the engine;
@@ -40,7 +40,7 @@ BANDS = ((0.0, 0.5), (0.5, 0.6), (0.6, 0.8), (0.8, 0.9), (0.9, 0.99), (0.99, 1.0
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--comparison", type=Path, help="posterior.json of ladder.py")
+    parser.add_argument("--comparison", type=Path, help="posterior.json of compare_classifiers.py")
     parser.add_argument("--refits", type=int, default=4, help="made training sets; 0 for none")
     given = parser.parse_args()
     if given.comparison:

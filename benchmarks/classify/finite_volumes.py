@@ -4,7 +4,7 @@ Gripper and block are rows of cells in metres, with the library's k, rho and c_p
 implicit Euler steps of 20 ms, all grasps of a batch in one tridiagonal solve.  What the inference does not
 have is in here: the block loses heat through its sides and its far face to the room, during the touch and
 between touches; its temperature is uneven when it is touched again; contact builds up by a stretched
-exponential and creeps with the root of time; the sensor is a cell behind the sheet with a lag; water stands
+exponential and creeps with the root of time; the sensor is a cell behind the sheet with a lag; water is
 behind the pipe. Readings are noisy, drift slowly and are rounded to 1/16 degC.
 
     python benchmarks/classify/finite_volumes.py          # checks itself against the closed form
@@ -48,7 +48,7 @@ class Rig:
     far: float = 15.0  # W m^-2 K^-1, far face, and the near one between touches
     sides: float = 10.0  # W m^-2 K^-1, four sides of 20 mm
     room: tuple[float, float] = (22.0, 29.0)  # degC
-    finish: dict[str, float] = field(default_factory=dict)  # factor on h_c of a material's block
+    h_scale: dict[str, float] = field(default_factory=dict)  # factor on h_c of a material's block
     grade: dict[str, float] = field(default_factory=dict)  # factor on its k
     t_object_sd: float = 0.35
     natural_sd: float = 0.05  # of ln k of wood
@@ -167,7 +167,7 @@ def _touch(
 ) -> tuple[Array, Array, Array]:
     """Return sample times, readings (n, n_time) and the blocks' cells when the gripper lets go."""
     n = len(names)
-    h = np.array([rig.h_c.get(m, rig.h_c_else) * rig.finish.get(m, 1.0) for m in names])
+    h = np.array([rig.h_c.get(m, rig.h_c_else) * rig.h_scale.get(m, 1.0) for m in names])
     h = h * np.exp(rig.h_c_sd * rng.standard_normal(n))
     tau = rig.build * np.exp(0.05 * rng.standard_normal(n))
     level = setting + 0.35 * rng.standard_normal(n)

@@ -2,8 +2,8 @@
 
     OMP_NUM_THREADS=1 python benchmarks/classify/fresh.py [--sets 4] [--test 40] [--hundreds 200]
 
-The example files hold 24 or 40 grasps a row: too few to tell a rate of 0.54 from one of 0.62.  Here finite
-volumes (finite_volumes.py) make grasps at the same temperatures, ten seconds each, of blocks whose contact
+The example files hold 24 or 40 grasps a row: too few to distinguish a rate of 0.54 from one of 0.62.
+Here finite volumes (finite_volumes.py) make grasps at the same temperatures, ten seconds each, of blocks whose contact
 conductances are to each other as those of the example rig.  Five of each material and condition train, all
 conditions together, and ``--test`` fresh ones of each material are named, for ``--sets`` such trainings.
 Beside the posterior stand itself, taught by ``--more`` of each, and generic classifiers, trained on the same
@@ -26,7 +26,7 @@ from thermogrip.sysid.effusivity.posterior import material_posterior
 
 ROWS = ("1A", "1B", "2 dT 0", "2 dT 5", "2 dT 10", "2 dT 15", "2 dT 20", "3A", "3B", "3C", "4")
 # contact conductance over the metals' mean, as calibrated on the example rig; wood has 600 W m^-2 K^-1
-RIG = Rig(finish={"copper": 1.13, "brass": 1.07, "zinc": 0.96, "iron": 0.87})
+RIG = Rig(h_scale={"copper": 1.13, "brass": 1.07, "zinc": 0.96, "iron": 0.87})
 GENERIC = ("pca-lda", "svm-pca", "features-lda", "bayes")
 Answers = dict[tuple[str, str], list[tuple[bool, float]]]
 

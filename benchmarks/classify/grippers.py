@@ -86,7 +86,7 @@ def drawn(seed: int) -> Rig:
         build=base.build * factor(0.5),
         h_c={name: h * common for name, h in base.h_c.items()},
         h_c_else=base.h_c_else * common,
-        finish={name: factor(0.1) for name in FIVE},
+        h_scale={name: factor(0.1) for name in FIVE},
         far=base.far * factor(0.5),
         sides=base.sides * factor(0.5),
     )

@@ -95,7 +95,7 @@ def log_density(device: GripperModel, data: Touches) -> Callable[[Any], Any]:
     ramp = stack.leak * data.ramp[0] * np.isfinite(room)
     n_d = gripper.lam.size
 
-    def march(e: Any, c: Any, h: Any, build: Any) -> tuple[Any, Any]:
+    def time_step(e: Any, c: Any, h: Any, build: Any) -> tuple[Any, Any]:
         lam, weight, resistance = block(e, c, stack.g_far)
         lam, w = jnp.concatenate([gripper.lam, lam]), jnp.concatenate([gripper.face, weight])
         r = gripper.resistance + resistance
@@ -104,8 +104,8 @@ def log_density(device: GripperModel, data: Touches) -> Callable[[Any], Any]:
         z = b.sum(axis=1)
         keep, a_lag, b_lag = coefficients(1 / stack.lag, jnp.asarray(nodes.dt))
 
-        def step(carry: Any, xs: Any) -> tuple[Any, Any]:
-            x, q, node, sensor = carry
+        def step(state: Any, xs: Any) -> tuple[Any, Any]:
+            x, q, node, sensor = state
             g, t = xs
             x = decay[g] * x + a[g] * q
             h_now = h * (stack.first + (1 - stack.first) * (1 - jnp.exp(-t / build)))
@@ -130,7 +130,7 @@ def log_density(device: GripperModel, data: Touches) -> Callable[[Any], Any]:
 
     def density(u: Any) -> Any:
         x, ln_h, ln_build, onset, ln_c = u
-        rise, slope = march(jnp.exp(x), jnp.exp(ln_c), jnp.exp(ln_h), jnp.exp(ln_build))
+        rise, slope = time_step(jnp.exp(x), jnp.exp(ln_c), jnp.exp(ln_h), jnp.exp(ln_build))
         t = times - jnp.clip(onset, -0.8, 0.8)
         k = jnp.clip(jnp.searchsorted(nodes.t, t) - 1, 0, nodes.t.size - 2)
         dt = jnp.asarray(nodes.t)[k + 1] - jnp.asarray(nodes.t)[k]

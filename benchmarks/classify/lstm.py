@@ -4,7 +4,7 @@
 
 500 series of 100 samples (five materials, a hundred copies of one grasp each), batches of 100, hidden size
 32.  Both start from the same weights and see the same batches.  Time is taken in alternating blocks of
-epochs, and the best block counts, for the machine may have other work; CPU time stands beside it.  With
+epochs, and the best block counts, for the machine may have other work; CPU time is given too.  With
 ``--epochs`` the two also train so long, one after the other, and their losses are compared: in double
 precision (60 epochs) and in single precision.  Rounding differs between any two orders of a sum, and training
 magnifies it; the yardstick ("again") is the plain loop once more, the rows of each batch in reverse order.

@@ -229,7 +229,7 @@ def tails(device):
 
         normal = least(stats.norm.pdf)
         gains = [f"{nu}: {least(stats.t(nu).pdf) - normal:+.1f}" for nu in (3, 5, 10, 30)]
-        print(f"{what}, {(left < 0.3).sum()} grasps that tell it: Student's t with {', '.join(gains)}")
+        print(f"{what}, {(left < 0.3).sum()} informative grasps: Student's t with {', '.join(gains)}")
 
 
 def integrals(device):

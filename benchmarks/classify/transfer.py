@@ -94,9 +94,9 @@ def targets(test: int) -> dict[str, list[Grasps]]:
 def other_blocks(rig: Rig, seed: int) -> Rig:
     """Return the rig with other blocks of the same materials."""
     rng = np.random.default_rng([seed, 7])
-    finish = {m: float(np.exp(0.25 * rng.standard_normal())) for m in FIVE}
+    h_scale = {m: float(np.exp(0.25 * rng.standard_normal())) for m in FIVE}
     grade = {m: float(np.exp(0.10 * rng.standard_normal())) for m in FIVE}
-    return replace(rig, finish=finish, grade=grade)
+    return replace(rig, h_scale=h_scale, grade=grade)
 
 
 def named(records: list[Grasps], letter: str) -> list[Grasps]:

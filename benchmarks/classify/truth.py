@@ -6,7 +6,8 @@
 stretched exponential that creeps with the root of time).  Blocks have the library's properties exactly, so
 that errors are the engine's.  Prints found over true effusivity, how often 90 % intervals cover the truth,
 and stated confidence beside accuracy, on fresh grasps.  Last, the engine's own bound: grasps of four metals
-drawn from the bundled gripper's populations, finishes too, whose effusivity it finds with nothing to unlearn.
+drawn from the bundled gripper's populations, contact conductance too, whose
+effusivity it finds with nothing to unlearn.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ def netcdf_of_one_text(path: Path, count: int, length: int) -> None:
 
 
 def netcdf_elsewhere(path: Path) -> None:
-    """Let the numbers stand in another file."""
+    """Store the numbers in another file."""
     import h5py
 
     with h5py.File(path, "w") as file:

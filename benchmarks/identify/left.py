@@ -5,7 +5,7 @@
 ``tclab``: logs of a TCLab with the numbers of the virtual board, white noise of 0.043 K, its converter's
 steps; 25 min of random pulses.  ``rig``: logs of the gripper's network, fitted to the bundled ones, with
 their inputs, white noise of 0.04 K, steps of 1/16 K and a slow error.  ``power``: a TCLab that has what the
-fitted network lacks.  Beside the test stands the count of lags outside of their bands, whose place it took.
+fitted network lacks.  With the test is given the count of lags outside of their bands, whose place it took.
 """
 
 from __future__ import annotations

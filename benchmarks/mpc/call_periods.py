@@ -311,7 +311,7 @@ def gripper_cases(plant: Plant, draws: int) -> list[Case]:
 
 
 def identified(seed: int) -> Plant:
-    """Return the gripper as the bundled logs tell it."""
+    """Return the gripper as identified from the bundled logs."""
     from thermogrip.datasets.examples import load_example_logs
     from thermogrip.sysid.identification import identify
 

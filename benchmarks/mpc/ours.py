@@ -41,7 +41,7 @@ def design_of(blocks: int, current: float = 5.0) -> Design:
         overshoot=OVERSHOOT,
         limits={"t_tank": TANK},
         price=PRICE,
-        ambient=0.0,  # of the unknown heat flows [W]: what stands for a room here
+        ambient=0.0,  # of the unknown heat flows [W]: what replaces a room here
         deadline_s=60.0,
         loops=(),
     )

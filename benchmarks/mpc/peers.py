@@ -61,13 +61,13 @@ class DoMPC:
         self.values: dict[str, float] = dict.fromkeys(given, 0.0)
         template = c.get_tvp_template()
 
-        def tell(_: Any) -> Any:
+        def time_varying(_: Any) -> Any:
             for k in range(HORIZON + 1):
                 for name, value in self.values.items():
                     template["_tvp", k, name] = value
             return template
 
-        c.set_tvp_fun(tell)
+        c.set_tvp_fun(time_varying)
         c.setup()
         self.c, self.first = c, True
 

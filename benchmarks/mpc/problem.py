@@ -1,6 +1,6 @@
 r"""The reference problem of the controllers: a skin behind two tubes of water, a Peltier tank, one current.
 
-Two Peltier modules temper a copper tank; a pump carries its water through a tube to a finger whose surface is
+Two Peltier modules temper a copper tank; a pump moves its water through a tube to a finger whose surface is
 to follow a schedule, and back.  With temperatures [degC] of the heatsinks h, the tank's wall c, its water w,
 the finger's water f and its surface s, n modules, the current I (heating where positive) and T in kelvin:
 

@@ -132,7 +132,7 @@ def main() -> None:
 
 
 def identified(seed: int) -> Plant:
-    """Return the gripper as the four bundled logs tell it, with posterior samples."""
+    """Return the gripper as identified from the four bundled logs, with posterior samples."""
     from thermogrip.sysid.greybox.posterior import sample_posterior
     from thermogrip.sysid.identification import identify
 
@@ -178,14 +178,14 @@ def run_all(controller: Controller, cases: Sequence[Case], seed: int) -> list[Re
         slew_per_s=design.slew_per_s,
     )
     mpc = Controller(controller.plant, design, compiled=wanted())
-    tell, results = progress("closed loops"), []
+    report, results = progress("closed loops"), []
     for at, case in enumerate(cases):
         for step in STEPS:
             bound, held = bound_of(design, case, step), holds(design, case, step[1])
             results += [
                 result(name, c, case, step, bound, held, seed) for name, c in (("MPC", mpc), ("PI", pi))
             ]
-        tell((at + 1) / len(cases), f"plant {case.number}")
+        report((at + 1) / len(cases), f"plant {case.number}")
     return results
 
 

@@ -116,7 +116,7 @@ def sizes(elf: Path) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Status:
-    """What a simulated chip tells of itself."""
+    """What a simulated chip reports of itself."""
 
     ms: float
     enable: int
@@ -224,7 +224,7 @@ def check_expiry(chip: Chip, rig: DeviceRig, check: Check, name: str = "expiry")
 
 
 def check_latch(chip: Chip, rig: DeviceRig, check: Check) -> None:
-    """Open, short, too warm, and a pump that stands still: off, refused, cleared when repaired."""
+    """Open, short, too warm, and a pump that has stopped: off, refused, cleared when repaired."""
     for what, millivolt in (("open:t_surface", 5000), ("short:t_surface", 0), ("over:t_surface", 1000)):
         rig.apply({"drive": 0.5}, 1)
         begin = chip.status().ms
@@ -310,7 +310,7 @@ def check_wrap(chip: Chip, rig: DeviceRig, check: Check, elf: Path) -> None:
 
 
 def check_watchdog(chip: Chip, rig: DeviceRig, check: Check) -> None:
-    """A program that stands still is reset by the chip, and the host sees it."""
+    """A program that hangs is reset by the chip, and the host sees it."""
     rig.apply({"drive": 0.5}, 1)
     boots, begin = chip.status().boots, chip.status().ms
     chip.say("hang")

@@ -9,7 +9,7 @@
  *                          the loop [us], the host's lines, boots
  *   forget                 the deepest and the longest begin anew
  *   poke ADDRESS VALUE     writes 32 bits into RAM
- *   hang                   the program stands still in an endless loop
+ *   hang                   the program hangs in an endless loop
  */
 #define _GNU_SOURCE
 #include <fcntl.h>
@@ -67,7 +67,7 @@ static int width(pin_t pin, int compare, int on) {
   return avr->data[board->control] & on ? avr->data[compare] : 255 * level(pin);
 }
 
-/* One byte of the host arrives each 87 us, whether the board looks or not. */
+/* One byte of the host arrives each 87 us, whether the board reads it or not. */
 static avr_cycle_count_t arrive(avr_t *of, avr_cycle_count_t when, void *unused) {
   (void)unused;
   if (head != tail) {

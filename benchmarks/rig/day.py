@@ -18,7 +18,7 @@ when it has tripped the session, or after a minute where it has not.  Four guara
 A trip with no fault on is a false alarm, unless one that nobody had noticed was repaired within the last two
 minutes: a sensor that is right again jumps.
 
-It prints one line an hour and one JSON object at the end; every fault, repair and trip stands in
+It prints one line an hour and one JSON object at the end; every fault, repair and trip is in
 ``OUT/faults.jsonl`` with its time and the folder of its session.
 """
 
@@ -91,23 +91,23 @@ class Day:
 
     def open(self) -> DeviceRig:
         """Open the rig anew, as after an operator repaired it."""
-        self.hint("operator")
+        self.repair("operator")
         self.clock.sleep(1.0)  # the device has sampled its sensors anew
         rig = _Rig(self)
         with suppress(DeviceRefusedError):  # nothing was latched
             rig.clear()
         return rig
 
-    def hint(self, who: str) -> None:
+    def repair(self, who: str) -> None:
         """Let the fault be over."""
         if self.fault:
-            self.tell("mended", fault=self.fault, by=who)
+            self.note("repaired", fault=self.fault, by=who)
             self.device.clear(None)
             if who == "itself":
                 self.unnoticed = (self.fault, self.clock())
             self.fault = ""
 
-    def tell(self, what: str, **more: Any) -> None:
+    def note(self, what: str, **more: Any) -> None:
         """Note what happened."""
         self.reported.append({"time_s": round(self.clock(), 2), "what": what, **more})
 
@@ -115,14 +115,14 @@ class Day:
         """Inject what is due, repair what nobody noticed for a minute, and look at the truth."""
         now = self.clock()
         if self.fault and now - self.since > 60.0:
-            self.hint("itself")
+            self.repair("itself")
         if not self.fault and now >= self.next_at:
             kind, options = FAULTS[int(self.rng.integers(len(FAULTS)))]
             sensor = SENSORS[int(self.rng.integers(2))] if kind.startswith("sensor") else None
             self.device.fault(kind, sensor=sensor, **options)
             self.fault, self.since = f"{kind} {sensor or ''} {options or ''}".strip(), now
             self.injected[kind] += 1
-            self.tell("fault", fault=self.fault)
+            self.note("fault", fault=self.fault)
             self.next_at = now + float(self.rng.exponential(self.every))
         truth = self.device.true_temperatures
         limits = {"t_surface": (3.0, 55.0), "t_tank": (-1.0, 70.0)}
@@ -134,7 +134,7 @@ class Day:
         """Count a session, and note whether an accepted grasp began at a wrong temperature."""
         self.sessions += 1
         if session.trip is not None:
-            self.tell("trip", folder=folder.name, fault=self.fault, line=session.trip.line())
+            self.note("trip", folder=folder.name, fault=self.fault, line=session.trip.line())
             self.tripped[session.trip.kind] += 1
             if self.fault:
                 self.detected.setdefault(self.fault, []).append(self.clock() - self.since)
@@ -153,7 +153,7 @@ class Day:
         off = float(np.median(before[-5:])) - self.at_contact["t_surface"]
         self.worst = max(self.worst, abs(off))
         if abs(off) > self.near:
-            self.tell("wrong", folder=folder.name, kelvin=off, fault=self.fault)
+            self.note("wrong", folder=folder.name, kelvin=off, fault=self.fault)
             self.wrong.append(f"{off:+.2f} K with {self.fault or 'no fault'}")
 
 
@@ -236,7 +236,7 @@ def _one(
         tripped = session.trip is not None
         day.evaluate(session, folder)
     except (UserError, DeviceRefusedError) as error:  # the fault was there at the very start
-        day.tell("refused", folder=folder.name, fault=day.fault, line=str(error))
+        day.note("refused", folder=folder.name, fault=day.fault, line=str(error))
         day.refused[type(error).__name__] += 1
     if not tripped:
         return rig

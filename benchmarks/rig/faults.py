@@ -49,7 +49,7 @@ HEAD = """\
 Every line is a test (`tests/rig/fault_injection/test_drills.py`) on a virtual device behind a real pseudo-terminal; this
 page is written by `python benchmarks/rig/faults.py --out docs/reference/faults.md --nominal nominal.json --day
 day.txt`. The device's plant is a few percent off the model that guard and controller know; the room is 25 degC, the
-skin is on its way from 25 to 36 degC or, where it says *held*, was there.
+skin is on its way from 25 to 36 degC or, where marked *held*, was there.
 
 - **found**: from the fault to the trip, by the device's clock. A sample is 1 s, and the fault comes between two.
 - **off**: from the trip to zero drive at the module. Where the host is dead or the cable out no line of ours
@@ -61,7 +61,7 @@ skin is on its way from 25 to 36 degC or, where it says *held*, was there.
 **A TCLab cannot do this.** Its firmware has no time to live: if its host dies, or its cable is pulled, it heats on
 until somebody pulls the supply. Everything that the host can see is watched on it as well.
 
-**The guard's promise**: no limit is exceeded by more than 2 K before power is off.
+**The guard's guarantee**: no limit is exceeded by more than 2 K before power is off.
 
 | fault | found after [s] | by | off after [s] | beyond [K] | rows |
 |---|---|---|---|---|---|
@@ -70,7 +70,7 @@ until somebody pulls the supply. Everything that the host can see is watched on 
 SLOW = """
 ## Why some take their time
 
-Sooner is lower floors, or fewer repeats, and the price is false alarms. {price}
+Sooner is lower floors, or fewer repeats, at the cost of false alarms. {cost}
 
 Floors are what a window against the model may be off by where the model predicts no change: {floors}; a quarter of
 the change comes on top. With lower ones the same faults are found so much sooner, and healthy sessions are ended:
@@ -90,7 +90,7 @@ What is found late did no harm meanwhile: with none of these drills the water or
 """
 
 SAID = """
-## What is said
+## Messages
 
 One line on the terminal, the same as JSON in `events.jsonl` and `run.json`. Two of them:
 
@@ -168,7 +168,7 @@ def main() -> None:
         )
     slow += drift_section(controller, outcomes) if stated else ""
     said = [
-        f"    {o.message}" for o in outcomes if o.drill.name in ("pump stands still", "driver gives nothing")
+        f"    {o.message}" for o in outcomes if o.drill.name in ("pump stops", "driver gives nothing")
     ]
     kinds = [f"| `{kind}` | {check} | {clear} |" for kind, (check, clear) in KINDS.items()]
     text = HEAD + "\n".join(lines) + "\n" + slow + SAID + "\n\n".join(said) + "\n"
@@ -252,7 +252,7 @@ def _slow(
 ) -> str:
     """Return the section on what takes its time, and what less would cost."""
     most = 24 * float(chi2.ppf(0.95, 2 * (nominal["trips"] + 1))) / (2 * nominal["hours"])
-    price = (
+    cost = (
         f"In {nominal['hours']:.0f} h of sessions without a fault on {nominal['rigs']} rigs (posterior draws of a plant, "
         f"of which the guard knows the fit alone; `benchmarks/rig/nominal.py`) {_tripped(nominal['trips'])}: "
         f"at most {most:.1f} times a day, at 95 %."
@@ -262,7 +262,7 @@ def _slow(
         said = json.loads("{" + day.read_text(encoding="utf-8").partition("\n{")[2])
         n, hours = len(said["false_alarms"]), said["simulated_h"]
         least = 24 * float(chi2.ppf(0.95, 2 * (n + 1))) / (2 * hours)
-        price += (
+        cost += (
             f" In {hours:.1f} h with a fault every ten minutes (`benchmarks/rig/day.py --seed {said['seed']} "
             f"--draw {said['draw']}`) {_tripped(n)} without one: at most {least:.1f} times a day."
         )
@@ -285,7 +285,7 @@ def _slow(
     usual = ModelSettings()
     floors = ", ".join(f"{f:g} K in {w:g} s" for f, w in zip(usual.floors, usual.windows))
     return SLOW.format(
-        price=price,
+        cost=cost,
         floors=floors,
         heads=" | ".join(f"x {share:g}" for share in (1.0, *SHARES)),
         rules="---|" * (1 + len(SHARES)),
@@ -305,7 +305,7 @@ def _of_the_day(said: dict[str, Any]) -> str:
     ]
     accepted = sum(said["accepted_while_a_fault_was_on"].values())
     return f"""
-So, at whatever moment they came in the {said["simulated_h"]:.0f} h with faults, of which each was mended after a minute
+So, at whatever moment they came in the {said["simulated_h"]:.0f} h with faults, of which each was repaired after a minute
 in which nobody noticed it ({accepted} of the {said["grasps"]} grasps were taken with a fault on; the skin of every grasp
 was right to {said["largest_error_of_an_accepted_grasp_K"]:g} K):
 

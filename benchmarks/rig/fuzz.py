@@ -71,7 +71,7 @@ def readings(rng: Random) -> list[bytes]:
     return [*said, *(core.receive(encode_line(9, "take", "0"), 900) for _ in range(3))]
 
 
-def worse(lines: list[bytes], rng: Random) -> bytes:
+def damaged(lines: list[bytes], rng: Random) -> bytes:
     """Return a stream of the lines, spoilt here and there, perhaps spliced."""
     stream = b"".join(spoil(line, rng) if rng.random() < 0.7 else line for line in lines)
     if rng.random() < 0.3 and len(stream) > 2:
@@ -112,7 +112,7 @@ class Fuzz:
         seq = int(said[0].split()[0])
         host = HostEnd()
         host._seq, host._open = seq, Read()
-        stream = worse(self.rng.sample(said, len(said)), self.rng)
+        stream = damaged(self.rng.sample(said, len(said)), self.rng)
         parser, right = LineParser(), {line[:-1] for line in said}
         for line in parser.feed(stream):
             if isinstance(line, Damaged):
@@ -133,7 +133,7 @@ class Fuzz:
         host.ask(Hello())
         host.hear(hello)
         host._seq, host._open = 9, Take(0)
-        for event in host.hear(worse(said, self.rng)):
+        for event in host.hear(damaged(said, self.rng)):
             if isinstance(event, Answer) and isinstance(event.content, Taken):
                 self.count["readings used"] += 1
                 self.count["readings used wrongly"] += encode_line(9, "ok", *event.content.words()) != said[0]
@@ -143,7 +143,7 @@ class Fuzz:
         core = DeviceCore()
         core.sample([25_000, 25_000, 25_000], flow=True, now_ms=0)
         core.receive(encode_line(9, "hello"), 0)
-        stream = worse(self.rng.sample(self.asked, len(self.asked)), self.rng)
+        stream = damaged(self.rng.sample(self.asked, len(self.asked)), self.rng)
         right = {line[:-1] for line in self.asked}
         for line in LineParser().feed(stream):
             if isinstance(line, Line):
@@ -160,7 +160,7 @@ class Fuzz:
     def tclab(self) -> None:
         """A scan of four numbers, spoilt: there is no check, so only what is no number can be refused."""
         lines = [b"%.3f\r\n" % self.rng.uniform(-50, 120) for _ in range(4)]
-        heard = worse(lines, self.rng).splitlines(keepends=True)
+        heard = damaged(lines, self.rng).splitlines(keepends=True)
         for line in heard:
             if _NUMBER.fullmatch(line):
                 assert -1e4 < float(line) < 1e4
@@ -196,7 +196,7 @@ class Fuzz:
             begin = time.perf_counter()
             try:
                 targets[name]()
-            except Exception as error:  # whatever it is, it is what this looks for
+            except Exception as error:  # whatever it is, it is a finding
                 self.failures.append(f"input {k} ({name}): {type(error).__name__}: {error}")
                 if len(self.failures) > 20:
                     return

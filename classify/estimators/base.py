@@ -392,7 +392,7 @@ def two_or_more(labels: Labels, where: str) -> Labels:
         raise UserError(
             f"all grasps are of {str(classes[0])!r}",
             file=where,
-            hint="give at least two materials to tell apart",
+            hint="give at least two materials",
         )
     return np.asarray(classes)
 

@@ -256,7 +256,7 @@ def _refuse_repeated(records: Sequence[Grasps]) -> None:
             key = (str(grasp_id), trace.tobytes())
             if key in seen:
                 raise UserError(
-                    f"grasp {grasp_id!s} stands in {seen[key]} too",
+                    f"grasp {grasp_id!s} is in {seen[key]} too",
                     file=log_name(grasps),
                     hint="leave one out",
                 )

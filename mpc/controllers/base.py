@@ -100,7 +100,7 @@ class SampledController:
         lost = ~np.isfinite(wanted)
         if lost.any():
             name = controlled[int(np.argmax(lost))]
-            wrong = f"target of {name} is missing or absurd: the last good one stands"
+            wrong = f"target of {name} is missing or absurd: the last good one is kept"
         return np.where(lost, self._target, wanted), wrong
 
     def _within(self, u: Array, seconds: float) -> Array:
@@ -135,7 +135,7 @@ class SampledController:
         lost = self._lost
         if not lost.any():
             names = [name for name, seconds in zip(self.controlled, self._unread_s) if seconds]
-            return f"{', '.join(names)}: no usable reading, the model stands in"
+            return f"{', '.join(names)}: no usable reading, the model replaces it"
         names = [name for name, gone in zip(self.controlled, lost) if gone]
         rest = f"{', '.join(parked)} to rest, the others go on" if parked else "the others go on"
         return f"no reading of {', '.join(names)} for {self._unread_s.max():.0f} s: {rest}"

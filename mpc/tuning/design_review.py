@@ -205,7 +205,7 @@ def _iterations(controller: Controller, counted: Sequence[int]) -> Check:
 
 def _stand_in(controller: Controller) -> Check:
     """Where the optimiser fails the PI takes over; it must be there, and push the right way."""
-    name, loops = "a PI controller stands in", controller.design.loops
+    name, loops = "a PI controller takes over", controller.design.loops
     alone = [output for output in controller.controlled if output not in {loop.output for loop in loops}]
     said = "; ".join(f"{p.drive} by {p.output}: Kc {p.Kc:.3g}, Ti {p.Ti:.0f} s" for p in loops)
     if alone:

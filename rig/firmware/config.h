@@ -24,7 +24,7 @@ constexpr thermogrip::Board BOARD = {
     {{"t_tank", 2000, 60000, true}, {"t_surface", 3000, 55000, true}, {"t_ambient", 0, 0, false}},
     3,
     true,   // a pump must run before anything is driven
-    true,   // it has a tachometer; without one write false: nothing then notices that it stands still
+    true,   // it has a tachometer; without one write false: nothing then notices that it has stopped
 };
 
 static_assert(BOARD.n_drives == 1, "the sketch has pins for one drive: give apply() yours");

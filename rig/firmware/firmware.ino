@@ -1,7 +1,7 @@
 // thermogrip's rig: a Peltier on a half bridge, a pump, a gripper, thermistors; docs/reference/protocol.md.
 //
 // Everything that decides is in core.cpp, which is tested on a PC; here are the pins.  The watchdog of the chip
-// resets the board when this loop stands still for a second, and a board that starts has everything off.
+// resets the board when this loop hangs for a second, and a board that starts has everything off.
 
 #include <EEPROM.h>
 #include <avr/wdt.h>

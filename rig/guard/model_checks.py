@@ -29,7 +29,7 @@ Which fault explains a window whose residual is too large?
 ----------------------------------------------------------
 
 The window is simulated again under each fault that may have happened in it, from several onsets on: the
-driver gives nothing, gives everything, gives half, is wired the wrong way round, or the pump stands still.
+driver gives nothing, gives everything, gives half, is wired the wrong way round, or the pump has stopped.
 With e = reading less path, summed over the readings of the window and the outputs,
 
     cost = rarity * sum e^2,
@@ -72,7 +72,7 @@ _FULL_DRIVE = Cause("driver", _DRIVER, "the driver is stuck at full drive", 1.2)
 _FULL_COOLING = Cause("driver", _DRIVER, "the driver is stuck at full cooling", 1.2)
 _REVERSED = Cause("reversed", _MODULE, "the module is wired the wrong way round", 2.0)  # nobody rewires a rig
 _HALF = Cause("driver", _DRIVER, "the driver gives half of what is asked")
-_PUMP = Cause("pump", "the pump", "the pump stands still")
+_PUMP = Cause("pump", "the pump", "the pump has stopped")
 _DANGER = ("driver", "reversed", "pump", "drift", "model")  # the most dangerous first: it does not obey
 _ONSETS = (0.0, 0.25, 0.5, 0.75, 0.85, 0.9, 0.95)  # of a window, where something may have gone wrong
 _LATE_S, _LATE_RARITY = (3.0, 5.0, 8.0), 1.2

@@ -13,7 +13,7 @@ here::
 cannot be sent is dropped, oldest first; the run folder is the record, the bridge is a view.
 
 A lost connection is opened again after 0.1 s, then after twice as long each time, up to 5 s.  That it was
-lost, that it is back and how much was dropped between stands in the record behind the bridge and on
+lost, that it is back and how much was dropped between is in the record behind the bridge and on
 ``/thermogrip/status``.
 
 A target that comes in is a request: it must be a finite number inside ``limits``, else it is refused, which

@@ -356,7 +356,7 @@ _LATCHES = {
     "short": ("lost", "a temperature", "a shorted sensor"),
     "over": ("limit", "less than the device's own limit", "more"),
     "under": ("limit", "more than the device's own limit", "less"),
-    "pump": ("pump", "the pump to turn", "that it stands still"),
+    "pump": ("pump", "the pump to turn", "that it has stopped"),
 }
 
 

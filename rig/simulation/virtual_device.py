@@ -207,7 +207,7 @@ FAULTS = SENSOR_FAULTS | {
     "silence": "its answers are lost",
     "deaf": "the host's lines are lost",
     "reset": "it starts anew, for the reason `cause`; happens once",
-    "pump_stall": "the pump stands still, whatever is commanded",
+    "pump_stall": "the pump has stopped, whatever is commanded",
     "driver_stuck": "every driver gives `share` (-1 to 1) of its full range while it has a supply",
     "cable_pulled": "the port vanishes; its drive runs on until it expires",
 }

@@ -12,7 +12,7 @@ read, and no step lowers it (the EM algorithm: Shumway and Stoffer, J. Time Seri
 ARX models Isaksson, IEEE Trans. Automatic Control 38 (1993)).  A line through the holes is where it
 begins; nothing of it is left at the end.
 
-The covariances are what a filled hole lacks: without them a smooth filling looks like a plant without
+The covariances are what a filled hole lacks: without them a smooth filling resembles a plant without
 noise, and biases the poles.
 """
 

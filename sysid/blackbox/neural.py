@@ -161,8 +161,8 @@ def _together(structures: Iterable[Structure]) -> Structure:
     return Structure("members of all sizes", min((some.size for some in structures), default=0))
 
 
-def _longest_run(stands: NDArray[np.bool_]) -> int:
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], stands.astype(int), [0]])))
+def _longest_run(constant: NDArray[np.bool_]) -> int:
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], constant.astype(int), [0]])))
     return int((edges[1::2] - edges[::2]).max(initial=0))
 
 

@@ -7,7 +7,7 @@ unit spread,
 
 Theta all monomials up to a degree, and Xi sparse: sequentially thresholded least squares (STLSQ; Brunton,
 Proctor, Kutz) drops what is smaller than a threshold, refits, and repeats.  The increment is fitted rather
-than the next value, so that the threshold weighs what moves the plant and not that it stands still.
+than the next value, so that the threshold weighs what moves the plant and not its persistence.
 
 **Weak form.**  One increment of a slow plant is mostly noise.  With a smooth bump phi of a few rows the same
 equations hold for sums,

@@ -5,7 +5,7 @@ Every finding has a verdict (``ok``, ``warn``, ``fail``) and a consequence in wo
 * **quantum** of each channel, against how far the output moves in a sample;
 * **noise** of each output: one that jumps and holds, or has none at all, may be a set point or computed;
 * **jitter** of the sample times, **gaps** of more than 10 s, share of **lost** readings;
-* **saturation**: share of the rows at which an input stands on its own limit;
+* **saturation**: share of the rows at which an input is on its own limit;
 * **excitation**: the order n up to which the input is persistently exciting, that is, the rank of the
   covariance of n successive values, and the condition of the correlation between the inputs;
 * **feedback** from output to input: with u[k] regressed on its own past, does the past of y help?  An F test
@@ -39,7 +39,7 @@ Array = NDArray[np.float64]
 Verdict = Literal["ok", "warn", "fail"]
 
 _FEW_READINGS = 50  # too few to question their noise
-_HELD = 0.05  # share of rows with a move, below which an output stands still but for jumps
+_HELD = 0.05  # share of rows with a move, below which an output is constant but for jumps
 _NO_NOISE = 1e-6  # of the range of an output
 
 _OWN_LAGS = (3, 6, 12, 24, 48)  # rows of an input's own past, to test it for feedback
@@ -186,7 +186,7 @@ def _quantum(channel: _Channel, averaged: float | None) -> Finding:
 
 
 def _noise(channel: _Channel) -> Finding:
-    """Question an output that no sensor reads: one that stands still but for jumps, or has no noise at all.
+    """Question an output that no sensor reads: one that is constant but for jumps, or has no noise at all.
 
     The noise is that of third differences, of which a smooth course has little; its variance is 20 times that
     of white noise.
@@ -199,7 +199,7 @@ def _noise(channel: _Channel) -> Finding:
     jumps = int(np.count_nonzero(moves))
     # a coarse sensor moves by one step of its converter, to and fro
     if jumps < _HELD * values.size and np.abs(moves).max() > 1.5 * np.abs(moves[moves != 0]).min():
-        says = f"{name} stands still but for {jumps} jumps in {values.size} rows: is it a set point?"
+        says = f"{name} is constant but for {jumps} jumps in {values.size} rows: is it a set point?"
     elif noise < _NO_NOISE * spread and jumps > 0.5 * values.size:
         says = f"{name} has no noise: is it computed or smoothed, no reading?"
     else:
@@ -225,7 +225,7 @@ def _saturation(channel: _Channel) -> Finding:
     if levels <= 12:
         says = f"{name} takes {levels} levels only: curvature between them is not seen"
         return channel.found("saturation", at_limit, "1", "ok" if levels > 2 else "warn", says)
-    says = f"{name} stands at its least or greatest value in {100 * at_limit:.0f} % of the rows"
+    says = f"{name} is at its least or greatest value in {100 * at_limit:.0f} % of the rows"
     return channel.found("saturation", at_limit, "1", "ok" if at_limit < 0.2 else "warn", says)
 
 

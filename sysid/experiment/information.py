@@ -110,7 +110,7 @@ class ReadingError:
     unit: Array  # (n_y,), one residual of the fit in the unit of the output
     sensor: Array  # (n_y,), sd of a reading that a start is estimated with, in the unit of the output
     bin_s: float  # width of a bin of ``numbers`` [s]
-    merge: float  # residuals of the fit that one bin stands for
+    merge: float  # residuals of the fit that one bin represents
     phi: float  # by how much the logs of the fit disagreed beyond ``numbers``
     offset: Array  # (n_y,), spread of the outputs' offsets over logs
     bias: Array  # (n_d,), spread of the measured disturbances' biases over logs

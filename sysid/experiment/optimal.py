@@ -154,7 +154,7 @@ def optimal_schedule(
     ranges : mapping of input to (low, high)
         Of each input that is not a switch, in its unit; hard.
     begin : mapping of name to Log, optional
-        Schedules to start from; the result is no worse than those that keep the limits.
+        Schedules to start from; the result is at least as good as those that keep the limits.
     shortest : float, optional
         Time between two changes of an input [s], at least.
     lowest, highest : float, optional

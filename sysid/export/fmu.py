@@ -10,7 +10,7 @@ The state at the start is the plant at rest with its sensors at the ``start_`` t
 near the first one.  A communication step is cut into whole steps of the plant, or where it is no multiple of
 that, into equal shorter ones; a black box has no shorter ones and reports the step as failed.
 
-A model of the user's own is refused: its class stands in no file, and opening a file never runs code.
+A model of the user's own is refused: its class is in no file, and opening a file never runs code.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 :func:`to_control` and :func:`to_scipy` are linear, about an operating point
 (:mod:`thermogrip.sysid.export.linearise`); :func:`to_casadi` is one step of the plant itself, for
-optimisation, with exact derivatives.  The nonlinear plant as an FMU stands in
+optimisation, with exact derivatives.  The nonlinear plant as an FMU is in
 :mod:`thermogrip.sysid.export.fmu`.
 """
 

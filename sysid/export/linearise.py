@@ -37,7 +37,7 @@ ROOM = 25.0  # degC, where no temperature of the room is given
 _NUDGE = 1e-3
 _GROWS = 1e-6  # of the modulus of a pole beyond one, that rounding does not explain
 _INTEGRATES = 1e-10  # of 1 - A, below which a state stays wherever it is put
-_DELAY = 1e-8  # modulus of a discrete pole that stands for a delay
+_DELAY = 1e-8  # modulus of a discrete pole that represents a delay
 
 
 @dataclass(frozen=True, eq=False)

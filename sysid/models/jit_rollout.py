@@ -16,7 +16,7 @@ threads.  A member's numbers do not depend on who its neighbours are.
 
 Importing this module imports llvmlite, so that models do it at their first rollout only.
 
-**Vectors of eight.**  A processor multiplies eight numbers as fast as one.  :class:`Vector` stands for eight
+**Vectors of eight.**  A processor multiplies eight numbers as fast as one.  :class:`Vector` represents eight
 of them in a register, one for each of eight parameter sets.  It has no value; each ``+ - * /`` on it appends
 one instruction of LLVM.  So equations that are called once with vectors in place of numbers,
 

@@ -356,7 +356,7 @@ def _name_faults(network: Network) -> Iterator[tuple[str, str]]:
     for group in ("inputs", "disturbances", "outputs", "nodes", "boundaries", "pipes"):
         for name in getattr(network, group):
             if name in seen:
-                yield f"{group}.{name}: the name stands in {seen[name]} too", "give each its own name"
+                yield f"{group}.{name}: the name is in {seen[name]} too", "give each its own name"
             seen[name] = group
 
 

@@ -199,7 +199,7 @@ def _monomials(exponents: NDArray[np.int_], rows: Array) -> Array:
 
 
 def _factors(powers: NDArray[np.int_]) -> NDArray[np.int_]:
-    """Return which variables each monomial multiplies, (degree, n_monomial); n_variable stands for 1."""
+    """Return which variables each monomial multiplies, (degree, n_monomial); n_variable denotes 1."""
     degree, one = int(powers.sum(axis=1).max(initial=0)), powers.shape[1]
     out = np.full((degree, len(powers)), one)
     for term, row in enumerate(powers):

@@ -109,7 +109,7 @@ class OwnCode:
 
     @property
     def sha256(self) -> str | None:
-        """Of the file that the class stands in, line ends aside; None where there is no file."""
+        """Of the file that the class is in, line ends aside; None where there is no file."""
         if not Path(self.file).is_file():
             return None
         text = Path(self.file).read_bytes().replace(b"\r\n", b"\n")
@@ -186,7 +186,7 @@ class OwnCode:
             raise self.fault("has an rhs that is not a function", hint=f"write {_REQUIRED['rhs']}")
 
     def _table(self, what: str, kind: Any, *, short: str) -> dict[str, Any]:
-        """Return a checked table; a bare value stands for its ``short`` key."""
+        """Return a checked table; a bare value is that of its ``short`` key."""
         table = getattr(self.made, what, {})
         if not isinstance(table, Mapping):
             raise self.fault(f"has {what} that are not a table", hint=f"write {_REQUIRED[what]}")
@@ -268,7 +268,7 @@ def load_object(file: str | Path, name: str) -> Any:
         raise UserError(problem, file=where, hint="correct the file") from error
     if not hasattr(module, name):
         classes = [n for n, item in vars(module).items() if inspect.isclass(item) and hasattr(item, "rhs")]
-        hint = f"it has {', '.join(classes)}" if classes else "name a class that stands in it"
+        hint = f"it has {', '.join(classes)}" if classes else "name a class that is in it"
         raise UserError(f"has no {name!r}", file=path, hint=hint)
     return getattr(module, name)
 

@@ -301,7 +301,7 @@ def dominant_time(logs: Sequence[Log], *, inputs: Sequence[str], outputs: Sequen
     """Return the time constant [s] that dominates the outputs, from a first-order model at a coarse step.
 
     The instrument is the lagged input, so that rounding and noise of the readings do not bias it.  Where the
-    data give no stable answer, a twentieth of the longest log stands in.
+    data give no stable answer, a twentieth of the longest log is used instead.
     """
     found = []
     longest = max(float(np.ptp(log["time"].values)) for log in logs)

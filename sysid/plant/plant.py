@@ -60,7 +60,7 @@ class Plant(PlantData):
         Posterior samples in natural units.
     refits : tuple of Model, optional
         The same structure fitted to resampled logs (:mod:`thermogrip.sysid.blackbox.fit`): what
-        stands for samples where the numbers are in the model.
+        replaces samples where the numbers are in the model.
     noise : dict of str to float, optional
         Standard deviation of each output about the free run [degC], as the fit saw it.
     offsets : dict of str to float, optional

@@ -1,6 +1,6 @@
 """A plant as plain JSON, and its posterior samples as NetCDF.
 
-One dictionary serves the plant's own file, the controller's file that carries its plant inside, and whoever
+One dictionary serves the plant's own file, the controller's file that contains its plant, and whoever
 wants a plant elsewhere: the model's equations as data, values with units, covariance of theta with the scales
 it is in, bounds and ranges (an open end is null, for JSON has no infinity).  Samples stand beside the file
 as ``.nc``, or under ``draws`` where they are few or there is no file.  Reading never runs code.

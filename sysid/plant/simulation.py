@@ -14,7 +14,7 @@ later:
   The warm-up counts as one independent reading every 10 s, for the model's error is not white.
 
 **Gaps.**  Over a gap of more than 10 s the input is unknown.  It is taken to have changed once, from the row
-before to the row after, at a time chosen by the warm-up after the gap; the state that is carried there is
+before to the row after, at a time chosen by the warm-up after the gap; the state propagated to there is
 then corrected like a start.  The 60 s after it are not scored.  ``gaps="hold"`` holds the last row instead.
 """
 
@@ -51,7 +51,7 @@ class Start:
     """How a stretch begins."""
 
     x0: Array  # (n_x,) the state at the parameters that it was estimated with
-    # (n_x,) x0 minus the state at rest of the readings without their offsets, or minus the state carried
+    # (n_x,) x0 minus the state at rest of the readings without their offsets, or minus the state propagated
     # through the gap
     shift: Array
     y_offset: Array  # (n_y,) reading minus model
@@ -103,7 +103,7 @@ def predict(
     """Simulate the stretches of one log for a batch of parameters.
 
     The starts' shifts, offsets and changes are held; what they are relative to (the state at rest, the state
-    carried through a gap) follows the parameters.
+    propagated through a gap) follows the parameters.
     """
     out: list[Array] = []
     x_end = np.empty((len(p), model.n_x))
@@ -212,7 +212,7 @@ def _corrected(
 def _after_gap(
     plant: PlantData, p: Array, before: Stretch, stretch: Stretch, start: Start, warmup: float
 ) -> Start:
-    """Return the start after a gap: when the input changed, and how the carried state is corrected."""
+    """Return the start after a gap: when the input changed, and how the propagated state is corrected."""
     runs = plant.model.rollout(
         start.x0[None], before.u[None], before.d[None] - start.d_offset, p[None], plant.dt
     )
@@ -221,17 +221,17 @@ def _after_gap(
     count = min(int(np.ceil(2 * stretch.gap)) + 1, most)
     times = [0.0] if same else np.linspace(0.0, stretch.gap, count).tolist()
     u, d, dt = _through_gap(before, stretch, start, times, plant.dt)
-    carried = plant.model.rollout(np.repeat(runs[1], len(times), axis=0), u, d, p[None], dt)[1]
+    propagated = plant.model.rollout(np.repeat(runs[1], len(times), axis=0), u, d, p[None], dt)[1]
     here = replace(start, level=None, shift=np.zeros(plant.model.n_x))
-    residual, response = _warm(plant, p, stretch, here, carried, warmup)
+    residual, response = _warm(plant, p, stretch, here, propagated, warmup)
     known = np.isfinite(residual[0])
     spread = response[known] @ plant.model.spread @ response[known].T + np.eye(int(known.sum()))
     cost = np.einsum("bi,bi->b", residual[:, known] @ np.linalg.inv(spread), residual[:, known])
     best = int(np.argmin(cost))
-    how = f"carried through a gap of {stretch.gap:.1f} s"
+    how = f"propagated through a gap of {stretch.gap:.1f} s"
     if not same:
         how += f"; the input is taken to have changed {times[best]:.1f} s into it"
-    here = replace(here, x0=carried[best], change=times[best], how=how)
+    here = replace(here, x0=propagated[best], change=times[best], how=how)
     return _corrected(plant, p, stretch, here, warmup, offsets=False)
 
 

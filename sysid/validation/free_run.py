@@ -17,7 +17,7 @@ correlate with an input beyond the effect of an unknown start, uncertain paramet
 latter leads to the note that a term may be missing, for at most one right model in a hundred.
 
 After a gap of more than 10 s the input is unknown: the run starts afresh from its own warm-up, the next 60
-s are not scored, and the figure with the last row held through the gap stands beside it.
+s are not scored, and the figure with the last row held through the gap is given with it.
 """
 
 from __future__ import annotations

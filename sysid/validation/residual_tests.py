@@ -22,7 +22,7 @@ which each stretch begins, one prior sd in each direction (a few seconds of read
 the bias of an ambient; and the change by draws of the plant's parameters. w is white noise and two slow
 errors, learnt from this residual. x are first-order lags of 1, 4, 16 and 64 blocks of the input: a delay, a
 time constant or a heat flow that the model lacks is nearly a mixture of them. The output's own simulated
-value about its mean, squared and lagged likewise, stands for a loss that curves (radiation, free
+value about its mean, squared and lagged likewise, represents a loss that curves (radiation, free
 convection). With V the covariance of N b + w and beta = 0,
 
     g = x' V^-1 e,      cov g = x' V^-1 x = H,      g' H^-1 g ~ chi-square, rank(H) degrees of freedom,
@@ -31,7 +31,7 @@ gives the probability p of at least this much. Of all pairs of an output and a s
 whose p is too small by Holm's rule at :data:`LEVEL`: at most one right model in a hundred has any, whatever
 the correlation time of its errors and the number of pairs.
 
-An error slower than a third of the log looks like an input that is as slow, and w absorbs it as noise:
+An error slower than a third of the log resembles an input that is as slow, and w absorbs it as noise:
 effects over so long a time are found late. Where N b alone explains much of e by its starts, that is
 reported too, for then a longer warm-up is missing, not a term.
 

@@ -82,7 +82,7 @@ def test_reliability_is_the_calibration_table(comparison: Comparison, condition:
         np.testing.assert_allclose(middle, [(b["low"] + b["high"]) / 2 for b in bins])
         grasps = sum(bar.get_height() for bar in bottom[k].patches)
         (score,) = [s for s in comparison.scores() if (s["classifier"], s["condition"]) == (name, condition)]
-        assert grasps == pytest.approx(score["n"])  # each test grasp stands in one bar
+        assert grasps == pytest.approx(score["n"])  # each test grasp is counted in one bar
     assert drawn(figure) > 1000
 
 

@@ -155,7 +155,7 @@ ONE = META + "a,copper,43,23\n"
         (samples("a"), None, ["g.csv", "meta file is missing", "g_meta.csv"]),
         (samples("a", "b"), ONE, ["g_meta.csv", "no row for grasp 'b' of g.csv"]),
         (samples("a"), ONE + "b,wood,43,23\n", ["g_meta.csv", "row 3", "'b' has no samples in g.csv"]),
-        (samples("a"), ONE + "a,wood,43,23\n", ["row 3", "grasp_id 'a' stands twice"]),
+        (samples("a"), ONE + "a,wood,43,23\n", ["row 3", "grasp_id 'a' occurs twice"]),
         (samples("a") + samples("a").partition("\n")[2], ONE, ["grasp 'a': time runs back"]),
         (samples("a"), ONE.replace("43", "warm"), ["g_meta.csv", "row 2", "t_object_nominal_degC", "'warm'"]),
         (samples("a"), ONE.replace("nominal_degC", "nominal_C"), ["column t_object_nominal_C"]),
@@ -224,7 +224,7 @@ def test_a_folder_is_its_grasp_files(tmp_path, small_grasps):
     (tmp_path / "empty").mkdir()
     with pytest.raises(UserError, match="holds no grasp files"):
         read_grasp_files([tmp_path / "empty"])
-    with pytest.raises(UserError, match="stands twice among the files"):
+    with pytest.raises(UserError, match="is given twice"):
         read_grasp_files([tmp_path / "b.csv", tmp_path / "b.csv"])
 
 

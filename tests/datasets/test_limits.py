@@ -132,7 +132,7 @@ def test_no_number_beyond_use_is_inside_a_document_that_passes(content: Any) -> 
     [
         ("a.nc", lambda made, path: made.netcdf_of_rows(path, 3_000_000_000), "declares 24000 MB, more than"),
         ("a.nc", lambda made, path: made.netcdf_of_rows(path, 10_000_000), "declares 80 MB or more from"),
-        ("a.nc", lambda made, path: made.netcdf_elsewhere(path), "stands in another file"),
+        ("a.nc", lambda made, path: made.netcdf_elsewhere(path), "is stored in another file"),
         ("a.parquet", lambda made, path: made.parquet_of_rows(path, 1 << 22), "declares 67 MB or more from"),
         ("a.csv.xz", lambda made, path: made.xz_of(path, HEAD, b"\n", 40 << 20), "unpacks to 8389 kB or"),
         ("a.csv.xz", lambda made, path: made.xz_of(path, HEAD, b"\n", 3 << 20), "empty lines"),
@@ -318,7 +318,7 @@ def test_comments_that_fill_half_of_what_is_looked_at_may_stand_before_the_heade
     path.write_bytes(b"#" * 31 + b"\n")
     tables.check_table(path)  # the header may come later
     path.write_bytes(b"time_s,time_s," + b"a" * 40)
-    assert "stands twice" in refused(tables.check_table, path)
+    assert "occurs twice" in refused(tables.check_table, path)
 
 
 def test_a_file_of_as_many_members_as_its_limit_is_checked(

@@ -168,7 +168,7 @@ def test_the_unfinished_last_line_of_a_killed_logger_is_dropped(write):
         (HEAD + "0,0,25\n,0,25\n", ["row 3", "has no time"]),
         ("time_s,t_tank_C\n0,1\n1,1\n", ["column t_tank_C", "rename the column to t_tank_degC"]),
         ("time_s,t_degC,t_K\n0,1,1\n1,1,1\n", ["column t_K", "second time"]),
-        ("time_s,t_degC,t_degC\n0,1,1\n1,1,1\n", ["column t_degC", "stands twice"]),
+        ("time_s,t_degC,t_degC\n0,1,1\n1,1,1\n", ["column t_degC", "occurs twice"]),
         ("time_s,,t_degC\n0,1,1\n1,1,1\n", ["column 2 has no name"]),
         (b"time_s,t_degC\n0,1\n1,\xff\xfe\n", ["row 3", "UTF-8"]),
         (b"time_s,t_\xb0C\n0,1\n1,1\n", ["row 1", "UTF-8"]),

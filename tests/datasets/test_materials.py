@@ -119,7 +119,7 @@ def test_an_effusivity_may_be_known_to_one_per_cent_or_to_half(percent):
         ("x,metal,-100,8000,400,17889,5,,s", "is not sqrt"),
         ("x,metal,much,8000,400,17889,5,,s", "column k: is not a number"),
         ("x,metal,100", "is not a number"),
-        ("x,metal,100,8000,400,17889,5,x,s", "'x' stands twice"),
+        ("x,metal,100,8000,400,17889,5,x,s", "'x' occurs twice"),
     ],
 )
 def test_a_bad_row_is_refused_with_its_place(row, words):

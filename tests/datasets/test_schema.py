@@ -65,7 +65,7 @@ def test_columns_come_in_the_order_asked_for(small_log):
 @pytest.mark.parametrize(
     ("kwargs", "words"),
     [
-        ({"grasp_id": ["a", "a"]}, "'a' stands twice"),
+        ({"grasp_id": ["a", "a"]}, "'a' occurs twice"),
         ({"time": [0.0, 0.0, 1.0]}, "time does not increase"),
         ({"t_surface": np.full((2, 3), np.nan)}, "grasp 'a' has no temperature"),
         ({"weight": [1, 2]}, "has no 'weight'"),
@@ -78,7 +78,7 @@ def test_grasps_that_break_a_rule_are_refused(kwargs, words):
 
 
 def test_two_of_three_grasps_with_one_id_are_refused():
-    with pytest.raises(UserError, match="'b' stands twice"):
+    with pytest.raises(UserError, match="'b' occurs twice"):
         make_grasps([-0.1, 0.0, 0.1], np.full((3, 3), 20.0), ["b", "a", "b"])
 
 
@@ -106,7 +106,7 @@ def test_grasps_in_milliseconds_are_refused() -> None:
     ("about", "words"),
     [
         ({"rest": [np.nan, -5.0, 60.0]}, "grasp 'b' has a rest of -5 s"),
-        ({"touch": [1, 2, 1]}, "touch 1 of touch_group 'one' stands twice; number its touches 1, 2, ...,"),
+        ({"touch": [1, 2, 1]}, "touch 1 of touch_group 'one' occurs twice; number its touches 1, 2, ...,"),
         ({"touch": [1, 2, np.nan]}, "grasp 'c' of touch_group 'one' has no touch, others of it have; number"),
     ],
 )

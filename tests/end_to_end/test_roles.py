@@ -126,7 +126,7 @@ def test_the_role_of_every_column_is_printed_and_a_guess_is_marked(house: Bench)
 
 @pytest.mark.parametrize(
     ("kind", "says"),
-    [("held", "wanted stands still but for 2 jumps in 400 rows"), ("computed", "wanted has no noise")],
+    [("held", "wanted is constant but for 2 jumps in 400 rows"), ("computed", "wanted has no noise")],
 )
 def test_an_output_without_noise_is_questioned(house: Bench, kind: str, says: str):
     rows, k = (house.path / "room.csv").read_text().splitlines(), np.arange(400)

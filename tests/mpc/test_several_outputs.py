@@ -126,7 +126,7 @@ def test_one_lost_sensor_is_one_lost_loop(furnace_plant, kind):
     truth.reading = lambda: {**whole(), "t2": float("nan")}
     moves, seen = run(controller, truth, target, 100.0)
     assert {(move.status, move.advice) for move in moves} == {
-        ("fallback_plan", "t2: no usable reading, the model stands in")
+        ("fallback_plan", "t2: no usable reading, the model replaces it")
     }
     np.testing.assert_allclose(seen[:, [1, 4]], 40.0, atol=0.2)
     assert abs(moves[-1].drive["q1"] - held["q1"]) < 2

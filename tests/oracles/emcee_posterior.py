@@ -2,7 +2,7 @@
 
 The five unknowns of :class:`~thermogrip.sysid.effusivity.posterior_grid.MarginalPosterior` have a
 posterior that is curved and, in metals, long.  A sampler is quick where its target is a standard normal, so
-it walks in whitened coordinates z, in which Laplace's method on the grid makes the posterior one,
+it samples in whitened coordinates z, in which Laplace's method on the grid makes the posterior one,
 
     x = Q(Phi(z_0)),   (ln h, ln tau_b, t0, ln C) = m(x) + L(x) (z_1, ..., z_4),
 
@@ -39,7 +39,7 @@ class ChainPosterior:
     """What emcee found for one grasp.
 
     ``ln_effusivity`` (n_sample,) thinned samples on the gripper's scale; ``quantiles`` 5, 50, 95 % of it;
-    ``autocorrelation`` its integrated time [steps]; ``steps`` walked; ``converged`` says whether the chain
+    ``autocorrelation`` its integrated time [steps]; ``steps`` taken; ``converged`` says whether the chain
     outlasted 50 of them; ``acceptance`` fraction.
     """
 

@@ -103,7 +103,7 @@ SCRIPTS = {
         say(4, "off", now=420),
         "pins",
     ],
-    "a pump that stands still latches": [
+    "a pump that has stopped latches": [
         *START,
         say(2, "drive", "2000", "1", "5000", now=10),
         "sample 0 100 25000 25000 25000",

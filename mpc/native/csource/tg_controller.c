@@ -15,7 +15,7 @@
 #define MISS_ALLOWANCE 0.5 /* what it has to exceed, */
 #define MISS_ALARM 3.0     /* and the sum at which a target cannot be had */
 #define TAKE_BACK 5    /* samples in a row, until it is taken back */
-#define STILL 0.01     /* of its range: a drive that moves by less stands still */
+#define STILL 0.01     /* of its range: a drive that moves by less is constant */
 #define SURE 3.0       /* standard deviations by which a relaxing output falls short */
 #define KEPT (-3.0)    /* and from which on that is taken back */
 #define CONTRADICTED 2.0 /* standard deviations that a bias moves while the drives stand still */
@@ -478,7 +478,7 @@ static double missed_by(tg_controller *c)
 {
     const tg_design *s = c->design;
     double limit = c->unreachable ? CAN : CANNOT, held[TG_NC] = {0.0}, by_w[TG_NC * TG_SOME(TG_NW)] = {0.0};
-    double d[TG_SOME(TG_ND)] = {0.0}, on_u[TG_NU], on_y[TG_NY], scaled = -1.0, worst = 0.0, doubt = 1.0;
+    double d[TG_SOME(TG_ND)] = {0.0}, on_u[TG_NU], on_y[TG_NY], scaled = -1.0, worst = 0.0, inflation = 1.0;
     int away = 0, out = 0, alarm = 0;
     record_relaxation(c);
     for (int r = 0; r < s->n_c; r++)
@@ -493,7 +493,7 @@ static double missed_by(tg_controller *c)
     if (!away)
         memset(by_w, 0, sizeof by_w);
     for (int i = 0; i < TG_NY; i++)
-        doubt = fmax(doubt, fabs(c->innovation[i]) / INNOVATION_SD);
+        inflation = fmax(inflation, fabs(c->innovation[i]) / INNOVATION_SD);
     for (int r = 0; r < s->n_c; r++) {
         const double *J = by_w + r * TG_SOME(TG_NW);
         double y_sd = sqrt(s->R[s->controlled[r]]), sd = 0.0, drift = 0.0, miss, end, g;
@@ -507,7 +507,7 @@ static double missed_by(tg_controller *c)
         }
         sd = fmax(sqrt(fmax(sd, 0.0)), LEAST_SD);
         miss = away ? fabs(c->target[r] - held[r]) : 0.0;
-        scaled = fmax(scaled, (miss - CANNOT) / (sd * doubt));
+        scaled = fmax(scaled, (miss - CANNOT) / (sd * inflation));
         g = falls_short(&c->relaxation[r], c->target[r], y_sd, &end);
         if (c->unreachable)
             is_short = g > KEPT;
@@ -725,7 +725,7 @@ const char *tg_advice_text(int advice)
         "no reading for long: the estimate was started again",
         "a reading is lost or absurd",
         "no target yet: drive to zero",
-        "a target is missing or absurd: the last good one stands",
+        "a target is missing or absurd: the last good one is kept",
         "no reading for too long: check the sensor",
         "the optimiser failed: the last plan goes on, then PI",
         "the drive that was applied is out of range: brought back",
@@ -737,7 +737,7 @@ const char *tg_advice_text(int advice)
         "a jump of a reading stays: taken for an offset of the sensor",
         "a jump of the readings stays: the estimate was started again",
         "the plant does not follow the model: does the pump run, is the sensor in place?",
-        "a controlled output has no usable reading: the model stands in, then its drive rests; the others go on",
+        "a controlled output has no usable reading: the model replaces it, then its drive rests; the others go on",
     };
     return advice >= TG_ALL_WELL && advice <= TG_UNSEEN ? text[advice] : "?";
 }

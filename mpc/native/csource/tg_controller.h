@@ -73,7 +73,7 @@ typedef struct {
     /* observer */
     double x[TG_NX], w[TG_SOME(TG_NW)], P[TG_Z * TG_Z], found_offset[TG_NY], innovation[TG_NY];
     int held[TG_Z];
-    double into_s, share, noised;      /* seconds since x; of a sample: where it looks, and what noise is in P */
+    double into_s, share, noised;      /* seconds since x; of a sample: time of the estimate, and the noise in P */
     double dose[TG_NU], ahead[TG_NX];  /* the drives summed over those seconds, and the state there */
     /* when it was called */
     double time_s, back_s, interval_s, passed_s, since_s, assumed_s, spent_s, waited_s, slew_s;
@@ -124,7 +124,7 @@ void tg_observer_set_offsets(tg_controller *c, const double *y, const int *which
 void tg_observer_predict(tg_controller *c, const double *u, const double *d);
 void tg_observer_advance(tg_controller *c, double seconds, const double *u, const double *d);
 void tg_observer_look(tg_controller *c, const double *d);
-const double *tg_now(const tg_controller *c); /* the state where the observer looks */
+const double *tg_now(const tg_controller *c); /* the state at the time of the estimate */
 void tg_biases(const tg_controller *c, double *on_u, double *on_d, double *on_y);
 void tg_expected(const tg_controller *c, double *y);
 /* The controlled outputs nearest to the targets that drives can hold, and their derivatives by w (n_c rows); 0 where

@@ -2,7 +2,7 @@
  *
  *     x+ = f(x, u + Wu w, d + Wd w),     w+ = w,     y = C x + y0 + offset + Wy w.
  *
- * x stands on a grid of samples, because a delay of shift registers can be carried on by whole samples alone;
+ * x is kept on a grid of samples, because a delay of shift registers advances by whole samples only;
  * a reading the share s of a sample after it is one of (1 - s) x + s f(x, u, d), u the mean of the drives since.
  */
 #include "tg_controller.h"
@@ -117,7 +117,7 @@ static void eliminate(double *S, double *B)
         }
 }
 
-/* A lost reading stands as one of which nothing is asked: its row of H P is 0. R: variances of the reading. */
+/* A lost reading is given no weight: its row of H P is 0. R: variances of the reading. */
 static void correct(tg_controller *c, const double *y, const double *R, double remember)
 {
     const tg_design *s = c->design;

@@ -5,10 +5,10 @@
  *
  *     H = 2 ( G'WG + move D'D + drive L ),     f = 2 ( G'W (y0 - G z0 - r) - move D'e ).
  *
- * G is carried forward as tangents of the step, a column for each drive of each block that has begun.
+ * G is propagated as tangents of the step, a column for each drive of each block that has begun.
  * A Peltier's gain fades in proportion to its drive: what is left of it along the guess says where a quarter is
  * left, and no block goes further.  Where the simulated cost of the QP's plan is above that of the guess, or every fifth sample, shorter moves
- * and plain ramps are tried too: near the optimum of a Peltier element the linearisation promises too much,
+ * and plain ramps are tried too: near the optimum of a Peltier element the linearisation overestimates the effect,
  * and beyond it the gain has turned over.
  */
 #include "tg_controller.h"
@@ -335,7 +335,7 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
     const tg_design *s = c->design;
     tg_qp *q = &c->qp;
     double at_guess, cost, guess[TG_Q_N], side[TG_NC];
-    int worse;
+    int uphill;
     q->n = s->n_b * TG_NU;
     q->stride = TG_NU;
     q->s = s->N * (s->n_c + s->n_l);
@@ -367,9 +367,9 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
     simulate(s, x, c->best, drive_bias, d, bias, c->y_best);
     cost = merit(c, c->best, c->y_best, target, side, last);
     c->solves++;
-    worse = cost > at_guess;
-    if (worse || c->solves % LOOK_AROUND == 1)
-        try_others(c, x, guess, d, target, side, bias, drive_bias, last, cost, worse);
+    uphill = cost > at_guess;
+    if (uphill || c->solves % LOOK_AROUND == 1)
+        try_others(c, x, guess, d, target, side, bias, drive_bias, last, cost, uphill);
     find_broken(c);
     return c->qp_status;
 }

@@ -16,7 +16,7 @@
  * is broken most, or be done.  Each move raises the dual, so that no set comes twice.  (D. Goldfarb, A. Idnani,
  * Mathematical Programming 27, 1983, is the method without soft rows.)
  *
- * Rows may depend on one another: a range and a sum of slews that ends on it.  Every K_ii therefore carries a
+ * Rows may depend on one another: a range and a sum of slews that ends on it.  Every K_ii therefore includes a
  * share of 1e-11 of itself, which keeps the factor regular and the dual strictly concave; multipliers that
  * contradict each other run far apart until one reaches its end. What that share does to x is taken back in
  * the end by one step of refinement with K itself. Hard rows that cannot be fulfilled together show there.
@@ -178,7 +178,7 @@ static void set_right(tg_qp *q, int i)
     q->right[i] = sum + (q->state[i] == 2 ? q->linear / q->quadratic : 0.0);
 }
 
-/* Append the factor's row i, whose normal stands in place. */
+/* Append the factor's row i, whose normal is in place. */
 static void append_fit(tg_qp *q, int i)
 {
     const double *m = q->normal + (size_t)i * TG_Q_N;

@@ -5,7 +5,7 @@
  *               lower <= x_i - x_(i-stride) <= upper  rows n .. 2n-1, hard; x_(negative) is 0
  *               lower - s <= A x <= upper + s, s >= 0 rows 2n .. 2n+s-1, soft
  *
- * Theory stands at the head of tg_qp.c.
+ * The theory is at the head of tg_qp.c.
  */
 #ifndef TG_QP_H
 #define TG_QP_H

@@ -318,7 +318,7 @@ def classify(
 
     Touches of one block (touch_group) get one answer from all of them. A grasp that shows no contact gets no
     name, and readings at the end of the sensor's range, or later than contacts of the training lasted, are
-    left out: the column note says so. With --early the stop rule that train --stop-error learnt says when
+    left out: see the column note. With --early the stop rule that train --stop-error learnt says when
     each contact could have ended. --next-touch adds next_touch_degC, empty where no touch gains 0.001 of
     accuracy a second, and the accuracy expected after it; --or-unknown adds answer. A model is trained on
     one gripper: with --other-gripper its answers are as unsure as grippers differ, unless --known says what

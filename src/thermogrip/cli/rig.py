@@ -638,13 +638,13 @@ def _ready(console: Console, n: int) -> Callable[[int, Trial], bool]:
 def _judge(console: Console) -> Callable[[int, Trial, Session], str]:
     """Return what asks whether a grasp was good."""
 
-    def judge(k: int, trial: Trial, session: Session) -> str:
+    def verdict(k: int, trial: Trial, session: Session) -> str:
         if session.contact != session.contact:
             console.warn("the skin felt nothing: no object, or one as warm as the skin")
         said = _asked("Enter to keep it, or what was bad")
         return "" if said.lower() in ("y", "yes", "ok") else said
 
-    return judge
+    return verdict
 
 
 def _asked(question: str) -> str:

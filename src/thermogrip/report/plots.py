@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 MEASURED, MODEL, TARGET = "#9aa7b5", "#1f5fa8", "#1d2733"
-# after Okabe and Ito: eight colours that stay apart under every kind of colour blindness
+# after Okabe and Ito: eight colours that are distinct under every kind of colour-vision deficiency
 PALETTE = ("#1f5fa8", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8a5a00")
 MARKERS = ("o", "s", "D", "^", "v", "P", "X", "*")
 MAX_POINTS = 1500

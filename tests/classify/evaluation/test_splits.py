@@ -65,12 +65,12 @@ def test_a_grasp_in_training_and_test_is_refused(three: Grasps) -> None:
 def test_a_record_given_twice_is_refused(three: Grasps, make_touches: Maker) -> None:
     with pytest.raises(UserError, match="two conditions are called 'touches'"):
         plan_folds([three, three])
-    with pytest.raises(UserError, match="grasp touches-0 stands in touches too"):
+    with pytest.raises(UserError, match="grasp touches-0 is in touches too"):
         plan_folds([three, three.assign_attrs(name="copy")])
     fresh = make_touches(name="fresh", seed=2)
     with pytest.raises(UserError, match="two conditions are called 'fresh'"):
         plan_folds([three], test=[fresh, fresh])
-    with pytest.raises(UserError, match="grasp fresh-0 stands in fresh too"):
+    with pytest.raises(UserError, match="grasp fresh-0 is in fresh too"):
         plan_folds([three], test=[fresh, fresh.assign_attrs(name="copy")])
 
 

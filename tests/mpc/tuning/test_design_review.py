@@ -45,7 +45,7 @@ def test_every_finding_has_a_number_and_every_fault_a_fix(sound, reversing_tank)
 SIGN, DETECTABLE = "gain keeps its sign over the drive", "disturbances are detectable"
 LIMITS, ROOM = "soft limits agree with the targets", "hard limits leave room"
 HELD, LOGS = "targets can be held in steady state", "targets lie where the logs were"
-FORGETS, STAND_IN = "observer forgets its errors", "a PI controller stands in"
+FORGETS, STAND_IN = "observer forgets its errors", "a PI controller takes over"
 DEADLINE, PELTIER = "step time fits the sample time", "current stays below the Peltier optimum"
 
 

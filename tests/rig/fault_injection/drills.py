@@ -110,7 +110,7 @@ DRILLS: tuple[Drill, ...] = (
     Drill("tank sensor late by 5 s", _fault("sensor_lag", sensor="t_tank", seconds=5.0), at=20.0,
           kinds=("drift", "stuck", "model", "driver", "pump"), within=180,
       why="5 s are a floor of 0.35 K where the tank changes by 0.07 K/s; what is slower hides it, unharmed"),
-    Drill("pump stands still", _fault("pump_stall"), kinds=("pump",), within=6,
+    Drill("pump stops", _fault("pump_stall"), kinds=("pump",), within=6,
           why="the device's tachometer"),
     Drill("driver stuck at full drive", _fault("driver_stuck", share=1.0), at=150.0, start=_NEARLY,
           kinds=("driver", "model"), within=20, why=_MODEL),

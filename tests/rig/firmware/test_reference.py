@@ -64,7 +64,7 @@ def test_what_is_out_of_limits_is_named() -> None:
 
 
 def test_a_stalled_pump_switches_off_after_three_seconds_and_has_them_again_when_it_was_cleared() -> None:
-    said = reference(SCRIPTS["a pump that stands still latches"])
+    said = reference(SCRIPTS["a pump that has stopped latches"])
     assert re.findall(r"pins (\d)", said) == ["1", "0", "1", "0"]
     assert "pump" in said
 

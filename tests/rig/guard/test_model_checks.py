@@ -72,7 +72,7 @@ def test_a_driver_that_does_something_else_is_found_for_heating_and_cooling(
 def test_a_pump_that_stands_still_is_distinguished_from_a_driver(plant: Plant) -> None:
     followed = Followed(plant)
     followed.drive(0.8, 40.0)
-    assert followed.drive(0.8, 60.0, pump=0)[1].startswith("the pump stands still")
+    assert followed.drive(0.8, 60.0, pump=0)[1].startswith("the pump has stopped")
 
 
 @pytest.mark.parametrize("name", ["t_tank", "t_surface"])
@@ -234,7 +234,7 @@ def test_before_there_is_a_window_nothing_is_reported() -> None:
 
 
 HALF = Cause("driver", "the driver", "the driver gives half of what is asked")
-PUMP = Cause("pump", "the pump", "the pump stands still")
+PUMP = Cause("pump", "the pump", "the pump has stopped")
 REVERSED = Cause("reversed", "the module", "the module is wired the wrong way round", 2.0)
 LATE, WRONG = (Cause("drift", "a", f"a {words}") for words in ("is late", "alone is wrong"))
 

@@ -56,7 +56,7 @@ def walk_density(segment, theta):
     """ln p of the readings after the first by their dense covariance; theta: pole, rise, level, ln sd."""
     pole, rise, level, ln_sd = theta
     y, q, n = segment.y[:, 0], segment.u[:, 0], len(segment.time)
-    # before the first reading the walk may be anywhere in its spread; a known one is where it is
+    # before the first reading the drift may be anywhere in its spread; a known one is where it is
     known = np.isfinite(y[0])
     first = y[0] if known else np.nanmean(y)
     mean, spread = [], 0.0 if known else np.nanvar(y)

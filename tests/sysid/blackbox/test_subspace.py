@@ -1,4 +1,4 @@
-"""Subspace: exact without noise, its Hankel algebra by hand, several logs, honest refusals."""
+"""Subspace: exact without noise, its Hankel algebra by hand, several logs, refusals."""
 
 from __future__ import annotations
 

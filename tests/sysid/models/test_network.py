@@ -476,7 +476,7 @@ def test_rest_is_the_minimum_that_its_theory_names(name: str, y: list[float], u:
     [
         ("nodes.tank", {"capacity": "C_tnak"}, r"no parameter 'C_tnak'; did you mean 'C_tank'\?"),
         ("nodes", {"lone": {"capacity": "C_tank"}}, "nodes.lone: no element touches it"),
-        ("nodes", {"air": {"capacity": "C_tank"}}, "nodes.air: the name stands in disturbances"),
+        ("nodes", {"air": {"capacity": "C_tank"}}, "nodes.air: the name is in disturbances"),
         ("links.loss", {"speed": "F"}, "links.loss.speed"),
         ("links.loss", {"between": ["tank", "moon"]}, "links.loss.between: no node 'moon'"),
         ("links.loss", {"between": ["air", "room"]}, "joins air and room"),

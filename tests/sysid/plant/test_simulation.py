@@ -300,7 +300,7 @@ def test_over_a_gap_the_input_changes_once_and_the_room_goes_on_a_line():
     np.testing.assert_allclose(
         starts[1].x0, np.linalg.lstsq(C, np.array(y)[end] - 25.0, rcond=None)[0], atol=0.02
     )
-    assert np.abs(starts[1].shift).max() < 0.1  # so what was carried there was nearly right
+    assert np.abs(starts[1].shift).max() < 0.1  # so what was propagated there was nearly right
     runs = predict(made.model, 2.0, np.zeros((1, 0)), stretches, starts)
     np.testing.assert_allclose(runs[1][0, : n - end], np.array(y)[end:], atol=0.1)
     moved = [starts[0], replace(starts[1], shift=starts[1].shift + [1.0, 0.0])]

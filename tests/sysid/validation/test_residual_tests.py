@@ -243,11 +243,11 @@ def test_a_plant_that_errs_more_than_its_fit_did_is_reported():
     plant = replace(plant, noise={"t": 0.05 / np.sqrt(5)}, scores=fitted)
     plate = lfilter([0.0, 1 / 400], [1.0, -1 + 1 / 400], 2.0 * q)
     noise = slow(rng, 0.0)
-    worse = free_run(plant, log_of(q, heated(q, plant) + plate + noise), 20.0, 20.0)
-    stated = [note for note in worse.notes if note.startswith("t: means over 5 s err by")]
+    excess = free_run(plant, log_of(q, heated(q, plant) + plate + noise), 20.0, 20.0)
+    stated = [note for note in excess.notes if note.startswith("t: means over 5 s err by")]
     assert len(stated) == 1
     assert "0.022 degC in the fit" in stated[0]
-    assert worse.exceeds_fit["t"] > 2.0
+    assert excess.exceeds_fit["t"] > 2.0
     same = free_run(plant, log_of(q, heated(q, plant) + noise), 20.0, 20.0)
     assert not any("err by" in note for note in same.notes)
     assert same.exceeds_fit == {}

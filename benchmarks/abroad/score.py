@@ -1,6 +1,6 @@
 """What ``identify`` says of ten public sets, beside what is true on the half that it has not seen.
 
-    python benchmarks/abroad/judge.py FOLDER [--sets luca,house] [--each]
+    python benchmarks/abroad/score.py FOLDER [--sets luca,house] [--each]
 
 By set and output: the error stated for another run, that on the other half, the share of its readings
 inside the 90 % band with the band's interval score; by set: the chosen model, whether it is called good, CPU
@@ -35,7 +35,7 @@ def mean_rmse(run: FreeRun) -> float:
     return float(np.mean([score.rmse for score in run.scores.values()]))
 
 
-def judge(some: ForeignSet, each: bool) -> None:
+def score_set(some: ForeignSet, each: bool) -> None:
     began = time.process_time()
     try:
         found = identify(some.train)
@@ -83,7 +83,7 @@ def main() -> None:
     words.add_argument("--each", action="store_true")
     given = words.parse_args()
     for name in given.sets.split(","):
-        judge(load(given.folder, name), given.each)
+        score_set(load(given.folder, name), given.each)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Predicted widths of an experiment beside those of fits to it, where the prediction may well fail.
 
-    python benchmarks/excite/promise.py
+    python benchmarks/excite/predicted_precision.py
 
 1. The design is optimal at the plant's present values.  Here the truth is one of eight draws of the prior
    instead: is the schedule still better than the plain ones?

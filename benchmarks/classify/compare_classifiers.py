@@ -1,6 +1,7 @@
-"""Every classifier on the eleven conditions of exp1 to exp4: the same random splits by grasp for all.
+r"""Every classifier on the eleven conditions of exp1 to exp4: the same random splits by grasp for all.
 
-    OMP_NUM_THREADS=1 python benchmarks/classify/ladder.py --out ladder [--classifiers A,B] [--splits 20]
+    OMP_NUM_THREADS=1 python benchmarks/classify/compare_classifiers.py --out comparison \
+        [--classifiers A,B] [--splits 20]
 
 Of every condition five grasps a material train and three test, 20 times; the example files hold eight, so n
 in the tables counts 40 or 24 distinct grasps and the intervals do, too.  LSTMs train for 200 epochs
