@@ -2,10 +2,10 @@
 
     OMP_NUM_THREADS=1 python benchmarks/classify/fresh.py [--sets 4] [--test 40] [--hundreds 200]
 
-The example files hold 24 or 40 grasps a row: too few to distinguish a rate of 0.54 from one of 0.62.
-Here finite volumes (finite_volumes.py) make grasps at the same temperatures, ten seconds each, of blocks whose contact
-conductances are to each other as those of the example rig.  Five of each material and condition train, all
-conditions together, and ``--test`` fresh ones of each material are named, for ``--sets`` such trainings.
+The example files hold 24 or 40 grasps a row: too few to distinguish a rate of 0.54 from one of 0.62. Here
+finite volumes (finite_volumes.py) make grasps at the same temperatures, ten seconds each, of blocks whose
+contact conductances are to each other as those of the example rig. Five of each material and condition train,
+all conditions together, and ``--test`` fresh ones of each material are named, for ``--sets`` such trainings.
 Beside the posterior stand itself, taught by ``--more`` of each, and generic classifiers, trained on the same
 five grasps of the row alone, and on ``--hundreds`` of them, which is about what the row allows.
 """
