@@ -257,7 +257,7 @@ def test_what_is_no_table_is_found_in_a_folder_a_file_and_the_facts_beside_it(tm
         kept = spoilt.read_bytes()
         spoilt.write_text("one,one\n1,2\n")
         for asked in (tmp_path, path):
-            with pytest.raises(UserError, match=rf"{spoilt.name}.*column one.*stands twice"):
+            with pytest.raises(UserError, match=rf"{spoilt.name}.*column one.*occurs twice"):
                 check_grasp_file(asked)
         spoilt.write_bytes(kept)
     (tmp_path / "empty").mkdir()
