@@ -116,5 +116,8 @@ def test_a_curve_has_a_line_a_classifier_and_an_axis_that_says_what_varies() -> 
     assert left.get_xlabel() == "training grasps of each material"
     assert [line.get_label() for line in right.get_lines()] == ["bayes", "lstm", "chance: log loss 1.10"]
     assert [round(float(x)) for x in right.get_lines()[0].get_xdata()] == [2, 5]
+    assert left.get_xticks().tolist() == right.get_xticks().tolist() == [2, 5]
+    times = [{**row, "contact_s": row["train_per_class"]} for row in rows]
+    assert len(curve_figure(times, "contact_s").axes[0].get_xticks()) > 2  # an axis of its own round numbers
     with pytest.raises(UserError, match="there is no curve to draw"):
         curve_figure([], "contact_s")

@@ -12,6 +12,7 @@ from scipy.stats import multivariate_t
 
 from thermogrip.classify import load_classifier, make_classifier, save_classifier
 from thermogrip.classify.estimators.base import GraspClassifier, join_grasps, pick
+from thermogrip.classify.estimators.bayes import Readings
 from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
@@ -35,6 +36,14 @@ def test_one_grasp_without_a_difference_leaves_the_others_normalised(name: str, 
     milder = make_touches(MATERIALS, t_object=33.0, seed=5, name="milder")
     assert right(model, milder) >= right(alone, milder) >= 0.9  # in kelvin it was 0.33
     np.testing.assert_allclose(model.predict_proba(milder), alone.predict_proba(milder), atol=0.1)
+
+
+def test_readings_are_normalised_from_a_difference_of_1_kelvin_on() -> None:
+    difference = np.array([-1.0, 1.0, 0.99, -0.99, np.nan])
+    unsure, noise = np.full(5, np.nan), np.full((5, 1, 1), 0.01)
+    x, sd = Readings(np.ones((5, 1)), np.full((5, 1), 2.0), noise, unsure, difference).normalised()
+    np.testing.assert_array_equal(x[:, 0], [0.5, 0.5, np.nan, np.nan, 0.5])
+    np.testing.assert_array_equal(np.isnan(sd[:, 0, 0]), np.isnan(x[:, 0]))
 
 
 @pytest.mark.parametrize("name", LEARNERS)

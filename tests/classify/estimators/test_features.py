@@ -57,6 +57,13 @@ def test_onset_jitter_moves_features_far_less_than_fixed_times_would(onset: floa
     assert np.abs(moved).max() < 0.25 * np.abs(np.array(fixed) / 20).max()
 
 
+@pytest.mark.parametrize("tau", [0.5, 0.8])
+@pytest.mark.parametrize("onset", [-0.2, 0.0, 0.2])
+def test_the_onset_is_read_from_the_first_samples_of_the_rise(onset: float, tau: float) -> None:
+    found = extract_features(make_grasps(T, [rise(onset=onset, tau=tau)], ["g"], t_object=[43.0]))
+    assert float(found.sel(feature="onset").values[0]) == pytest.approx(onset, abs=0.01)
+
+
 def test_an_unknown_object_temperature_leaves_kelvin() -> None:
     unknown = extract_features(make_grasps(T, [rise()], ["g"]))
     known = extract_features(make_grasps(T, [rise()], ["g"], t_object=[43.0]))

@@ -100,6 +100,15 @@ def test_a_target_out_of_reach_is_chased_at_the_end_of_the_range(tank):
     assert loop.drive["drive"][-1] == 1.0
 
 
+@pytest.mark.parametrize(("target", "samples"), [(26.0, 2.0), (34.0, 4.0), (34.0, 10.0), (20.0, 2.0)])
+def test_the_mean_over_several_samples_is_of_moves_within_limits(tank, target, samples):
+    regulator = LQRController(tank, default_design(tank, dt=2.0))
+    regulator.reset({"t_surface": 25.0})
+    (one,), (several,) = (regulator.propose(np.array([target]), n) for n in (1.0, samples))
+    assert abs(one) > 1.0 >= abs(several)  # the first alone is before its limits
+    assert samples > 4.0 or several == np.sign(target - 25.0)
+
+
 def test_a_drive_that_moves_nothing_is_refused(tank):
     model = StateSpaceModel(
         ("q",), (), ("a", "b"), A=np.diag([0.9, 1.0]), B=[[1.0], [0.0]], C=np.eye(2), dt=1.0

@@ -142,6 +142,7 @@ def test_designs_share_a_label_where_their_marks_are_one_to_the_eye():
     [
         ({"tuned": 1.0, "baseline": 1.2, "PI": 1.04, "LQR": 2.0}, "", ""),
         ({"tuned": 1.0, "baseline": 0.9}, "", ""),
+        ({"tuned": 100.0, "baseline": 120.0, "PI": 103.0}, "", ""),
         ({"tuned": 1.2, "baseline": 1.0, "PI": 1.02}, "PI", "2.0 % worse"),
         ({"tuned": 1.0, "baseline": 1.2, "PI": 0.9, "LQR": 0.95}, "PI", "10.0 % better"),
         ({"tuned": 1.0, "baseline": 1.2, "PI": 1.5, "LQR": 1.004}, "LQR", "as well"),
