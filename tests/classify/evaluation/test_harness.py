@@ -229,6 +229,9 @@ def test_what_is_learnt_from_all_conditions_never_sees_a_test_grasp(make_touches
         assert len(seen) == 25
         assert not seen & tested
     assert {r["candidates"] for r in found.predictions} == {2, 3}
+    # by the fit of its own repeat alone: one of another repeat may have seen it
+    answered = [(r["repeat"], r["grasp_id"]) for r in found.predictions]
+    assert len(answered) == len(set(answered))
 
 
 def test_every_table_is_a_file(found: Comparison, three: Grasps, tmp_path: Path) -> None:
