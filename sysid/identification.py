@@ -44,7 +44,7 @@ from thermogrip.sysid.blackbox.fit import (
 )
 from thermogrip.sysid.blackbox.order_selection import excess_within_noise, folds, held_out_runs
 from thermogrip.sysid.data.data_quality import DataCheck, Evidence, check_data, evidence
-from thermogrip.sysid.plant.fit_record import HeldOut
+from thermogrip.sysid.plant.fit_record import HELD_OUT_SHARE, TAIL, HeldOut
 from thermogrip.sysid.plant.log_grid import make_grid, match_logs, misfit, roles_of, signals
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run, no_input_baseline
@@ -59,8 +59,6 @@ from thermogrip.sysid.validation.prediction_bands import (
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import GreyModel
 
-HELD_OUT_SHARE = 0.3  # of each log, without leave_one_out
-TAIL = f"last {100 * HELD_OUT_SHARE:.0f} % of "
 WITHIN_NOISE = 1.1  # of the best error: then the network is preferred
 LINEAR = ("arx", "oe", "subspace")  # kept where another kind errs hardly less
 USEFUL = 0.5  # of the no-input error: below it a model is called good

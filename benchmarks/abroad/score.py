@@ -64,7 +64,7 @@ def score_set(some: ForeignSet, each: bool) -> None:
             flush=True,
         )
     for row in dict.fromkeys((r.model, r.structure) for r in found.rows if r.held_out) if each else ():
-        print(f"    tail: {row[0]:9s} {found.errors()[row[0]]:.3f} {row[1]}", flush=True)
+        print(f"    held: {row[0]:9s} {found.errors()[row[0]]:.3f} {row[1]}", flush=True)
     for kind in BLACK_BOXES if each else ():
         began = time.process_time()
         try:

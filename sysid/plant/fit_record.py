@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from thermogrip.datasets.schema import Log
 
 
+HELD_OUT_SHARE = 0.3  # of each log, where whole logs are not left out
+TAIL = f"last {100 * HELD_OUT_SHARE:.0f} % of "  # how what is held out of a log is called
+
+
 @dataclass(frozen=True)
 class HeldOut:
     """The free run of one output over one log that the fit had not seen; n scored samples."""

@@ -69,6 +69,7 @@ from scipy.special import ndtr, stdtrit
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, column, log_name
 from thermogrip.sysid.models.neural import NeuralModel
+from thermogrip.sysid.plant.fit_record import TAIL
 from thermogrip.sysid.plant.log_grid import cut_stretches
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import find_starts
@@ -220,9 +221,7 @@ def _own_variance(plant: Plant, name: str, drawn: Array, level: float) -> float:
     held_out = plant.scores.held_out_rmse.get(name)
     if held_out is None:
         return float(plant.noise.get(name, 0.0) ** 2)
-    tails = [
-        each.rmse for each in plant.scores.held_out if each.output == name and each.log.startswith("last ")
-    ]
+    tails = [each.rmse for each in plant.scores.held_out if each.output == name and each.log.startswith(TAIL)]
     error = max(held_out, float(np.sqrt(np.mean(np.square(tails)))) if tails else 0.0)
     return float(max(error**2 - drawn.mean(), 0.0)) * _few_parts(plant, name, level) ** 2
 

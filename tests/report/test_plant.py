@@ -256,9 +256,12 @@ def test_blocks_of_a_log_share_a_row_that_shows_each() -> None:
             ("block 1 of 2", 3.0, 80.0, 10, 6.0),
             ("block 2 of 2", 4.0, 90.0, 30, 2.0),
             ("last 30 % of a", 5.0, 50.0, 7, 8.0),
+            ("block copper", 6.0, 50.0, 7, 8.0),  # a log's own name
+            ("block wood", 7.0, 50.0, 7, 8.0),
         )
     ]
-    both, tail = plant.model_rows(SimpleNamespace(rows=rows))
+    both, tail, *logs = plant.model_rows(SimpleNamespace(rows=rows))
+    assert [row[1] for row in logs] == ["block copper", "block wood"]
     assert both[:3] == ("oe", "2 blocks: 3, 4", "t")
     assert both[3] == pytest.approx(np.sqrt((10 * 9 + 30 * 16) / 40))
     assert both[4:7] == ("degC", 85.0, 40)

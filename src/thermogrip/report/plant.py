@@ -5,6 +5,7 @@ As in :mod:`thermogrip.report.classification`, each function returns sections wh
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -68,7 +69,7 @@ def model_rows(found: Identification) -> list[tuple[Any, ...]]:
     """Return the table of candidate models: a row a model, log and output; blocks of a log share one row."""
     groups: dict[tuple[str, str, str, bool], list[Row]] = {}
     for row in found.rows:
-        log = "blocks" if row.log.startswith("block ") else row.log
+        log = "blocks" if re.fullmatch(r"block \d+ of \d+", row.log) else row.log
         groups.setdefault((row.model, log, row.output, row.held_out), []).append(row)
     out = []
     for (model, log, output, held_out), rows in groups.items():
