@@ -7,8 +7,9 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from thermogrip import lazy_exports
 
 if TYPE_CHECKING:
     from thermogrip.datasets.log_files import read_log as read_log
@@ -27,29 +28,20 @@ if TYPE_CHECKING:
 
 # Looked up on first use, so that importing the room pulls in no heavy package.
 _HOME = {
-    "GripperModel": "sysid.effusivity.gripper_model",
-    "Plant": "sysid.plant.plant",
-    "calibrate_gripper": "sysid.effusivity.calibration",
-    "check_data": "sysid.data.data_quality",
-    "excite": "sysid.experiment.schedules",
-    "fit_network": "sysid.greybox.fit",
-    "free_run": "sysid.validation.free_run",
-    "identify": "sysid.identification",
-    "linearise_plant": "sysid.export.linearise",
-    "load_network": "sysid.models.network",
-    "own_model": "sysid.models.user_model",
-    "read_log": "datasets.log_files",
-    "sample_posterior": "sysid.greybox.posterior",
+    "GripperModel": "effusivity.gripper_model",
+    "Plant": "plant.plant",
+    "calibrate_gripper": "effusivity.calibration",
+    "check_data": "data.data_quality",
+    "excite": "experiment.schedules",
+    "fit_network": "greybox.fit",
+    "free_run": "validation.free_run",
+    "identify": "identification",
+    "linearise_plant": "export.linearise",
+    "load_network": "models.network",
+    "own_model": "models.user_model",
+    "read_log": ".datasets.log_files",
+    "sample_posterior": "greybox.posterior",
 }
 
 __all__ = [*_HOME]
-
-
-def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        return getattr(importlib.import_module(f"thermogrip.{_HOME[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+__getattr__, __dir__ = lazy_exports(__name__, _HOME)

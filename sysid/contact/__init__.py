@@ -1,9 +1,6 @@
 """The physics of two bodies that touch, and what a sensor in one of them reads."""
 
-from __future__ import annotations
-
-from importlib import import_module
-from typing import Any
+from thermogrip import lazy_exports
 
 _NAMES = {
     "closed_forms": [
@@ -17,15 +14,5 @@ _NAMES = {
     "simulation": ["Grip", "simulate_grasps"],
 }  # fmt: skip
 _HOME = {name: module for module, names in _NAMES.items() for name in names}
-
-__all__ = list(_HOME)
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+__all__ = [*_HOME]
+__getattr__, __dir__ = lazy_exports(__name__, _HOME)

@@ -647,36 +647,21 @@ def _places(
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def _means(
     nodes: Array, rise: Array, slope: Array, bins: NDArray[np.int64], count: Array,
-    place: NDArray[np.int64], share: Array, out: Array,
+    place: NDArray[np.int64], share: Array, rates: bool, out: Array,
 ) -> None:  # fmt: skip
-    """Fill bin means (n_bin,) of a curve."""
+    """Fill bin means (n_bin,) of a curve, of its slope where ``rates``."""
     out[:] = 0.0
     for i in range(place.size):
         k = place[i]
         if k < 0:
             continue
-        s, dt = share[i], nodes[k + 1] - nodes[k]
-        v = s * s * (3.0 - 2.0 * s)
-        bent = s * (1.0 - s) * dt * ((1.0 - s) * slope[k] - s * slope[k + 1])
-        out[bins[i]] += rise[k] + v * (rise[k + 1] - rise[k]) + bent
-    for m in range(out.size):
-        out[m] = out[m] / count[m] if count[m] > 0.0 else 0.0
-
-
-@numba.njit(**INNER)  # type: ignore[untyped-decorator]
-def _mean_rates(
-    nodes: Array, rise: Array, slope: Array, bins: NDArray[np.int64], count: Array,
-    place: NDArray[np.int64], share: Array, out: Array,
-) -> None:  # fmt: skip
-    """Fill bin means (n_bin,) of a curve's slope."""
-    out[:] = 0.0
-    for i in range(place.size):
-        k = place[i]
-        if k < 0:
-            continue
-        s = share[i]
-        steep = 6.0 * s * (1.0 - s) * (rise[k + 1] - rise[k]) / (nodes[k + 1] - nodes[k])
-        out[bins[i]] += steep + (1.0 - s) * (1.0 - 3.0 * s) * slope[k] + s * (3.0 * s - 2.0) * slope[k + 1]
+        s, dt, high = share[i], nodes[k + 1] - nodes[k], rise[k + 1] - rise[k]
+        if rates:
+            v = 6.0 * s * (1.0 - s) * high / dt
+            out[bins[i]] += v + (1.0 - s) * (1.0 - 3.0 * s) * slope[k] + s * (3.0 * s - 2.0) * slope[k + 1]
+        else:
+            bent = s * (1.0 - s) * dt * ((1.0 - s) * slope[k] - s * slope[k + 1])
+            out[bins[i]] += rise[k] + s * s * (3.0 - 2.0 * s) * high + bent
     for m in range(out.size):
         out[m] = out[m] / count[m] if count[m] > 0.0 else 0.0
 
@@ -702,9 +687,9 @@ def fill_responses(
     wanted = (True, contact, contact, by_e, by_c)
     for curve in range(BY_C + 1):
         if wanted[curve]:
-            _means(t, rise[curve], slope[curve], bins, count, place, share, out[curve])
+            _means(t, rise[curve], slope[curve], bins, count, place, share, False, out[curve])
     if vary[_ONSET]:
-        _mean_rates(t, rise[VALUE], slope[VALUE], bins, count, place, share, out[RATE])
+        _means(t, rise[VALUE], slope[VALUE], bins, count, place, share, True, out[RATE])
 
 
 @numba.njit(**OUTER)  # type: ignore[untyped-decorator]

@@ -14,9 +14,6 @@ The noise is then found by maximum likelihood of the residuals with the nuisance
 its slopes vanish, and the fit is repeated.  Priors of theta are wide; only ln e of each material leans on the
 library, and the depth on the block's length.
 
-What describes the gripper is learnt from all grasps, ln h of a block from its own.  Grasps without a label
-are refused: leave out what a classifier is later tested on.
-
 Priors
 ------
 

@@ -1,16 +1,14 @@
 """Touches of one block: one object temperature, seen from two gripper temperatures.
 
-One touch does not separate a good conductor that is a little warm from a poor one that is hot.  Two touches
-at different gripper temperatures can, since both must agree on the block: on its effusivity, on what its
-contact conductance has in common, and on its temperature, which moves from one touch to the next as the
-coupling says (aluminium by several degrees in one touch: leaving it out ruins metals).
+Two touches at different gripper temperatures must agree on the block: on its effusivity, on what its contact
+conductance has in common, and on its temperature, which moves from one touch to the next as the coupling says
+(aluminium by several degrees in one touch: leaving it out ruins metals).
 
-Under a candidate each touch is a Gaussian factor of what it shares with the others
-(:mod:`~thermogrip.sysid.effusivity.multi_touch`), so that the evidence of all touches of a group, and the
-block's temperature, are in closed form.  The factors are expanded twice, the second time around what the
-other touches say of the block's temperature: a wide prior leaves wood's temperature open by many degrees,
-too far for one expansion.  With a free effusivity in place of a candidate, on a grid, the same algebra gives
-the joint posterior of ln e and of the block's temperature.
+Under a candidate each touch is a Gaussian factor of what it shares with the others, so that the evidence of
+all touches of a group, and the block's temperature, are in closed form.  The factors are expanded twice,
+the second time around what the other touches say of the block's temperature: a wide prior leaves wood's
+temperature open by many degrees, too far for one expansion.  With a free effusivity in place of a
+candidate, on a grid, the same algebra gives the joint posterior of ln e and of the block's temperature.
 
 A touch as a Gaussian factor
 ----------------------------
@@ -50,8 +48,8 @@ room's temperature, most of the spread after long rests and far from it, where n
 
 Contact conductance scatters from touch to touch about the block's own; ``ln_h_sd`` is that scatter in touches
 of one block, which a person or an arm made one after the other, and may be wider than between grasps of a
-series. All of it is learnt from groups of known material by maximum likelihood (:func:`learn_coupling` of
-:mod:`thermogrip.sysid.effusivity.multi_touch`); the defaults are those of the example rig.
+series. All of it is learnt from groups of known material by maximum likelihood (:func:`learn_coupling`); the
+defaults are those of the example rig.
 """
 
 from __future__ import annotations
@@ -114,32 +112,13 @@ _INTO = 2.0  # s into the next touch: where its reading knows most of the block
 
 @dataclass(frozen=True, kw_only=True)
 class Coupling:
-    """How a block moves between two touches.
+    """How a block moves between two touches."""
 
-    Parameters
-    ----------
-    found : float
-        Share a of the first touch's drop that the next one finds.
-    loss : float
-        U, to the room, per contact face [W m^-2 K^-1].
-    sd : float
-        s, what the two leave open [K].
-    ln_h_sd : float
-        Scatter of ln h from touch to touch of one block.
-    longest_rest : float
-        The longest rest that it was learnt from [s]; what a block does in a longer one is a guess.
-
-    Examples
-    --------
-    >>> Coupling().found
-    0.75
-    """
-
-    found: float = 0.75
-    loss: float = 100.0
-    sd: float = 0.36
-    ln_h_sd: float = 0.12
-    longest_rest: float = REST
+    found: float = 0.75  # share a of the first touch's drop that the next one finds
+    loss: float = 100.0  # U, to the room, per contact face [W m^-2 K^-1]
+    sd: float = 0.36  # s, what the two leave open [K]
+    ln_h_sd: float = 0.12  # scatter of ln h from touch to touch of one block
+    longest_rest: float = REST  # that it was learnt from [s]; what a block does in a longer one is a guess
 
     def __post_init__(self) -> None:
         if not (0 <= self.found <= 2 and self.loss >= 0 and self.sd > 0 and self.ln_h_sd > 0):

@@ -1,22 +1,10 @@
 """From grasps to materials and effusivities: the posterior engine.
 
-A grasp of 10 s is a hundred readings and half a dozen unknowns: contact conductance, its build-up, the
-moment of contact, the level before it, the object's temperature, its effusivity and heat capacity.  The
-calibrated gripper (:class:`~thermogrip.sysid.effusivity.gripper_model.Device`, made by
-:func:`~thermogrip.sysid.effusivity.calibration.calibrate_gripper`) predicts the readings from them, and
-Bayes' rule does the rest:
-
-- a **material** fixes effusivity and contact conductance up to their spread: its evidence is an integral over
-  the other unknowns, by Laplace's method, in which the two temperatures are marginalised exactly
-  (:mod:`~thermogrip.sysid.effusivity.laplace_approximation`);
-- an **effusivity** posterior leaves the material open: log-uniform prior on a grid that refines itself
-  (:mod:`~thermogrip.sysid.effusivity.posterior_grid`), contact conductance unknown;
-- an **unknown material** is recognised by the ratio of the two, since a posterior over known
-  materials is most confident where none of them fits.
-
-The answers are valid for this gripper and for blocks like those it was calibrated with,
-whose far faces lose heat to the room as theirs did (:mod:`~thermogrip.sysid.contact.time_stepping`).
-With one touch and a nominal object temperature metals overlap, whatever the method.
+The calibrated gripper (:class:`~thermogrip.sysid.effusivity.gripper_model.GripperModel`) predicts the
+readings of a grasp from seven unknowns, and Bayes' rule does the rest (``docs/explanation/effusivity.md``):
+a **material** fixes effusivity and contact conductance up to their spread; an **effusivity** posterior
+leaves the material open, with a log-uniform prior; an **unknown material** is recognised by the ratio of
+the two evidences, since a posterior over known materials is most confident where none of them fits.
 """
 
 from __future__ import annotations

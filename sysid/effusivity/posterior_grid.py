@@ -5,11 +5,9 @@ Given ln e every other unknown is close to Gaussian, so Laplace's method serves 
 coarse over the prior, then twice refined where the mass is.  Between points the log density is interpolated
 by a monotone cubic.
 
-Where a touch bounds a heat capacity from one side alone, Laplace's method moves the ends
-of the interval by a tenth of a standard deviation.  What it leaves out changes slowly with ln e, so it is
-integrated (:func:`~thermogrip.sysid.effusivity.posterior_grid.log_integrals`) at seven of the points,
-and the rest interpolated.  Its mean over the posterior is left to Laplace's method: the evidence of the
-candidates has the same.
+What Laplace's method leaves out changes slowly with ln e, so it is integrated (:func:`log_integrals`) at
+seven of the points, and the rest interpolated.  Its mean over the posterior is left to Laplace's method:
+the evidence of the candidates has the same.
 
 What Laplace's method leaves out
 --------------------------------

@@ -58,12 +58,10 @@ Contacts longer than those of the calibration
 ---------------------------------------------
 
 What lies deep in a finger shows late: water behind a cast layer, a pad on its metal.  Contacts of 10 s do not
-identify it, and a calibration from them takes it for one more layer without an end.  By finite volumes, 25
-grasps of 10 s train: of fresh contacts of 20 s 0.40 are named right where 0.94 is stated, of 120 s 0.52 where
-1.00 is, and 90 % intervals of the effusivity cover 0.20 of those; read for their first ten seconds 0.72 and
-0.67, stated 0.68 and 0.72, and 0.92 (``benchmarks/classify/unlike_training.py``).  Of a longer contact the
-beginning alone is read, and the answer reports it.  Touches of one block are read whole: each leaves in the
-block what it took as long as it lasted.
+identify it, and a calibration from them takes it for one more layer without an end
+(``docs/records/effusivity.md`` has what answers are worth then).  Of a longer contact the beginning alone is
+read, and the answer reports it.  Touches of one block are read whole: each leaves in the block what it took
+as long as it lasted.
 """
 
 from __future__ import annotations
@@ -114,37 +112,18 @@ _MOVES_BEFORE = 0.04  # of the difference, within the record before contact: the
 
 @dataclass(frozen=True, eq=False)
 class GraspQuality:
-    """What of each grasp of a record is usable; made by :func:`check_grasps`.
+    """What of each grasp of a record is usable; made by :func:`check_grasps`."""
 
-    Attributes
-    ----------
-    reason : (n,) list of str
-        Why nothing of the grasp is usable: ``NO_CONTACT``, ``CONTRARY``, ``OUT_OF_RANGE`` or a sentence;
-        empty where something is.
-    note : (n,) list of str
-        The reason, or what an answer should say of a grasp that is usable in part; empty where all is well.
-    masked, spiked : (n, n_time) ndarray of bool
-        Samples that are no readings (clipped or spikes), and the spikes among them.
-    clipped_from, clipped_at : (n,) ndarray
-        When the sensor first saturates [s], and at which reading [degC]; NaN if never.
-    start, stop : (n,) ndarray
-        Times of the first and the last usable sample [s]; NaN where none is.
-    shortened : (n,) ndarray of bool
-        Contacts that are read until ``longest`` only, and last much longer.
-    longest : float
-        Readings of single touches later than this are not used [s].
-    """
-
+    # (n,), why nothing is usable: ``NO_CONTACT``, ``CONTRARY``, ``OUT_OF_RANGE`` or a sentence; else empty
     reason: list[str]
-    note: list[str]
-    masked: Flags
-    spiked: Flags
-    clipped_from: Floats
-    clipped_at: Floats
-    start: Floats
-    stop: Floats
-    shortened: Flags
-    longest: float
+    note: list[str]  # (n,), the reason, or what an answer should say of what is usable in part; else empty
+    masked: Flags  # (n, n_time), samples that are no readings (clipped or spikes)
+    spiked: Flags  # (n, n_time), the spikes among them
+    clipped_at: Floats  # (n,), the reading at which the sensor saturates [degC]; NaN if never
+    start: Floats  # (n,), time of the first usable sample [s]; NaN where none is
+    stop: Floats  # (n,), time of the last
+    shortened: Flags  # (n,), contacts that are read until ``longest`` only, and last much longer
+    longest: float  # readings of single touches later than this are not used [s]
     _trace: _Trace = field(repr=False)
 
     @property
@@ -264,7 +243,7 @@ def check_grasps(grasps: Grasps, *, longest: float = np.inf, whole_traces: bool 
         np.where(used.any(axis=1), t, np.nan) for t in (time[used.argmax(axis=1)], _ends(time, used))
     )
     return GraspQuality(
-        reason, note, masked, trace.spiked, since, reading, start, stop, shortened, float(longest), trace
+        reason, note, masked, trace.spiked, reading, start, stop, shortened, float(longest), trace
     )
 
 

@@ -50,21 +50,12 @@ _HALVINGS = 10
 
 @dataclass(frozen=True, eq=False)
 class Expectation:
-    """Expected information of schedules, before any is run.
+    """Expected information of schedules, before any is run."""
 
-    Attributes
-    ----------
-    bits : dict of str to float
-        Gain of information by schedule; 0 for ``now``.
-    widths : dict of str to (dict of str to float)
-        Width of each free parameter's 90 % interval in natural units, by schedule.
-    ranges : dict of str to (dict of str to (float, float))
-        Range of a width, by how large the model discrepancy is in the experiment; empty where the plant's
-        fit has learnt none.
-    """
-
-    bits: dict[str, float]
-    widths: dict[str, dict[str, float]]
+    bits: dict[str, float]  # gain of information by schedule; 0 for ``now``
+    widths: dict[str, dict[str, float]]  # of each parameter's 90 % interval in natural units, by schedule
+    # of each width, by how large the model discrepancy is in the experiment; empty where the plant's fit has
+    # learnt none
     ranges: dict[str, dict[str, tuple[float, float]]]
 
     def determinant_ratio(self, kind: str, than: str) -> float:

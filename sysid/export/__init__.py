@@ -1,9 +1,6 @@
 """A plant for other libraries: linearised, python-control, scipy, CasADi, FMU."""
 
-from __future__ import annotations
-
-from importlib import import_module
-from typing import Any
+from thermogrip import lazy_exports
 
 _HOME = {
     "LinearPlant": "linearise",
@@ -13,15 +10,5 @@ _HOME = {
     "to_fmu": "fmu",
     "to_scipy": "libraries",
 }
-
 __all__ = [*_HOME]
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+__getattr__, __dir__ = lazy_exports(__name__, _HOME)

@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.plant.fit_record import Identifiability
 
 if TYPE_CHECKING:
-    from thermogrip.sysid.models.network_spec import Network
     from thermogrip.sysid.plant.plant import Plant
 
 Array = NDArray[np.float64]
@@ -103,8 +103,8 @@ def identifiability_report(plant: Plant) -> list[str]:
 
 def _cause_of_bound(plant: Plant, name: str, on_bounds: int) -> str:
     """Return what most often drives a parameter of this kind onto a bound."""
-    network: Network | None = getattr(plant.model, "network", None)
-    if network is not None:
+    if isinstance(plant.model, NetworkModel):
+        network = plant.model.network
         stated = [(item.input, item.power) for item in network.heaters.values()]
         stated += [(item.input, item.current) for item in network.peltiers.values()]
         driven = [drive for drive, which in stated if which == name or on_bounds >= _MANY_ON_BOUNDS]

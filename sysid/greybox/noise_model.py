@@ -173,12 +173,7 @@ def information(numbers: ErrorModel, logs: Sequence[LogData], ref: Array) -> Inf
     return Information(mean, covariance, own, joint, total)
 
 
-def learn_error_model(
-    logs: Sequence[LogData],
-    ref: Array,
-    *,
-    width: Sequence[float],
-) -> ErrorModel:
+def learn_error_model(logs: Sequence[LogData], ref: Array, *, width: Sequence[float]) -> ErrorModel:
     """Return the numbers that the residuals support best."""
     if sum(block.n for log in logs for block in log.blocks) < 10:
         raise ValueError("need ten bins at least")

@@ -1,31 +1,21 @@
 """Posterior of a grey-box fit: whole parameter vectors from emcee, or a few draws for bands.
 
-**Density** (:class:`RandomizedMap`): its mode is the fit, its width is what the errors of the fit leave
-open, and it bends as the plant does, which no covariance can express. It is narrower than the intervals of
-the fit where model discrepancy affects a parameter: discrepancy changes what a parameter means, and hardly
-what the plant does. So samples are for what a plant does, in bands and closed loops; intervals are for its
-parameters.
+What the samples are for, and why they lie closer than the intervals of the fit, is in
+``docs/explanation/likelihood.md``.
 
 **Sampling.** The few parameters that the data determine best relative to the prior are sampled with emcee;
 all others are integrated out and drawn afterwards, each as a fit of its own, so every sample is a whole
-vector. The walkers start in the normal approximation and move by differential evolution, which needs no
-tuning when parameters trade off against each other. With few walkers it is slow: steps are differences of
-the others, and eight of them are few directions in six dimensions. So half of the moves are proposals
-independent of the walker's position: Student's t about the mean m of the normal approximation of
-covariance C, wider by s,
+vector. The walkers start in the normal approximation and move by differential evolution, which is slow with
+few walkers: steps are differences of the others, and eight of them are few directions in six dimensions. So
+half of the moves are proposals independent of the walker's position: Student's t about the mean m of the
+normal approximation of covariance C, wider by s,
 
     x' ~ t_6(m, s^2 C),      accepted with min(1, p(x') t(x) / (p(x) t(x'))).
 
 A poor approximation costs acceptance, not correctness: the other half of the moves reaches what t misses.
-
-**Converged** means that the chain is longer than 50 integrated autocorrelation times of every parameter, as
-the authors of emcee ask for [1]_. The walkers of one ensemble are not independent chains, so comparing them
-with each other (R-hat) would prove nothing.
-
-**Going on.** With a ``backend`` the chain is kept in an HDF5 file as it grows, with a hash of everything
-that decides its density and its moves: the model, the fitted values and priors, every row of every log, the
-bins, which parameters are sampled, walkers and seed. A run that was stopped goes on from there if the hash
-agrees, and starts anew if anything differs.
+**Converged** means that the chain is longer than 50 integrated autocorrelation times of every parameter [1]_.
+A ``backend`` keeps the chain in an HDF5 file with a hash of everything that decides its density and its
+moves: a run goes on from there if the hash agrees, and starts anew if anything differs.
 
 Randomised maximum a posteriori
 -------------------------------
@@ -408,53 +398,22 @@ def open_backend(path: str | Path, mark: str, shape: tuple[int, ...]) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """The record of a posterior.
+    """The record of a posterior."""
 
-    Attributes
-    ----------
-    free : tuple of str
-        All parameters, in the order of ``samples``.
-    sampled : tuple of str
-        Those that emcee moved; the others were integrated out.
-    samples : (n, n_free) ndarray
-        Whole parameter vectors in natural units.
-    units : dict of str to str
-    fitted : dict of str to float
-        The plant's own values.
-    chain : Chain
-        Of the sampled parameters in natural units.
-    tau : dict of str to float
-        Autocorrelation time of each sampled parameter [steps].
-    n_steps : int
-        Length of the chain.
-    converged : bool
-        Longer than 50 tau throughout.
-    acceptance : float
-        Share of accepted moves.
-    quantiles : dict of str to (float, float, float)
-        5, 50 and 95 % of each free parameter.
-    likelihood : str
-        What was assumed about the residuals, in words.
-    off_centre : float
-        How far the median lies from the fitted value, in standard deviations, at most over parameters.
-    verdict : str
-        One sentence.
-    """
-
-    free: tuple[str, ...]
-    sampled: tuple[str, ...]
-    samples: Array
+    free: tuple[str, ...]  # all parameters, in the order of ``samples``
+    sampled: tuple[str, ...]  # those that emcee moved; the others were integrated out
+    samples: Array  # (n, n_free), whole parameter vectors in natural units
     units: dict[str, str]
-    fitted: dict[str, float]
-    chain: Chain
-    tau: dict[str, float]
-    n_steps: int
-    converged: bool
-    acceptance: float
-    quantiles: dict[str, tuple[float, float, float]]
-    likelihood: str
-    off_centre: float
-    verdict: str
+    fitted: dict[str, float]  # the plant's own values
+    chain: Chain  # of the sampled parameters, in natural units
+    tau: dict[str, float]  # autocorrelation time of each sampled parameter [steps]
+    n_steps: int  # length of the chain
+    converged: bool  # whether it is longer than 50 tau throughout
+    acceptance: float  # share of accepted moves
+    quantiles: dict[str, tuple[float, float, float]]  # 5, 50 and 95 % of each free parameter
+    likelihood: str  # what was assumed about the residuals, in words
+    off_centre: float  # of the medians from the fitted values, in standard deviations, at most
+    verdict: str  # one sentence
 
     def inference_data(self) -> Any:
         """Return the chain and, as ``posterior_whole``, the whole samples: arviz ``InferenceData``."""

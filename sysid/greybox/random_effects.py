@@ -1,8 +1,7 @@
 """What moves the residuals besides the parameters: random effects of each log, and model discrepancy.
 
-**Random effects.** Plain merging of logs assumes that one parameter set made them all, and nothing else. On
-hardware it did not: a thermocouple is plugged in anew, the room sensor is elsewhere, the pump runs a
-little faster. Beside the shared parameters, each log has
+**Random effects.** Between logs a thermocouple is plugged in anew, the room sensor is elsewhere, the pump
+runs a little faster. Beside the shared parameters, each log has
 
 ===================  =====================================================  ===============================
 effect of a log      moves                                                  stated sd
@@ -33,12 +32,11 @@ not see keeps its prior sd; what it sees by correlated readings may be off by mo
 ridge takes them for independent. That errors of the warm-up are in the residuals of the fit too is left
 out: a start pulled upwards by one reading is pulled down by those after it, so the two partly cancel.
 
-**Model discrepancy.** A wall that was left out, a dead zone, a resistance that rises with temperature: each
-responds to the inputs in every log alike, so its effect on the parameters does not average out over logs,
-and logs that agree with each other do not reveal it. Which term is missing is not known, so a bank of
-responses represents all: every input u, its size |u|, u v, v |v| and every disturbance, with v the first
-output above the ambient (else about its mean), each through first-order lags of 2, 8 and 32 bins, on all
-outputs alike.
+**Model discrepancy** responds to the inputs in every log alike, so its effect on the parameters does not
+average out over logs, and logs that agree with each other do not reveal it. Which term is missing is not
+known, so a bank of responses represents all: every input u, its size |u|, u v, v |v| and every disturbance,
+with v the first output above the ambient (else about its mean), each through first-order lags of 2, 8 and
+32 bins, on all outputs alike.
 
 How large each kind is, the error model learns from the residuals: one s per signal, with a log-normal
 prior; at s = 1 all of them together have an rms of half a sensor's sd. Where residuals do not correlate
@@ -199,11 +197,7 @@ class _Column:
 
 
 def linearise_logs(
-    problem: Problem,
-    z: Array,
-    by_log: Sequence[tuple[Array, Array]],
-    *,
-    pieces: int = 1,
+    problem: Problem, z: Array, by_log: Sequence[tuple[Array, Array]], *, pieces: int = 1
 ) -> Linearised:
     """Return residuals, sensitivities and effects of each log at ``z``."""
     starts, p = problem.start(z), problem.parameters(z[None])
@@ -268,7 +262,7 @@ def _effects(
             out.append(_Column(f"bias of {name}", spread, known, _scaled(problem, parts)))
     specs = list(problem.model.specs.values())
     for i, place in enumerate(problem.free):
-        spread = float(getattr(specs[place], "per_log", None) or 0.0)
+        spread = specs[place].per_log or 0.0
         if spread > 0:
             parts = [[s[:, i] * spread / problem.width[i] for s in stretch] for stretch in slopes]
             out.append(_Column(problem.model.parameters[place], spread, 0.0, parts))

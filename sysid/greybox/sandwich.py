@@ -16,7 +16,7 @@ and with P = 1 + sum_l A_l, A_l = J_l' J_l, the estimate is off by P^-1 s(z_0):
 
     covariance = P^-1 Omega P^-1.
 
-It is the sandwich [1]_, with a model of the error in its middle instead of few noisy squares.
+This is the sandwich [1]_, with a model of the error in its middle instead of few noisy squares.
 
 **Disagreement between logs.** Leaving log l out moves the estimate by
 

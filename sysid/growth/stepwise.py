@@ -1,7 +1,7 @@
 """Stepwise growth and pruning of a network, decided on held-out logs.
 
-The residuals of a fitted network suggest terms, and every suggested term lowers the error of the logs that
-it was fitted to. Here each one is kept only for its gain on logs that it has not seen:
+Every term that residuals suggest lowers the error of the logs that it is fitted to. Here each one is kept
+only for its gain on logs that it has not seen:
 
 1. A *candidate* is a named change of the network file: an element more, or one less.
 2. It is fitted and simulated freely in *folds*. With three logs or more each is left out in turn; a log
@@ -81,7 +81,6 @@ class GrowthRow:
     rmse: dict[str, float]  # held-out RMSE by fold, the geometric mean over the outputs
     gain: float  # mean of ln(before / after)
     se: float  # its standard error
-    without_line: float  # the gain with a straight line taken out of each held-out error
     condition: float  # of the scaled Hessian of all logs; NaN where the gain was not worth the fit
     verdict: str  # "kept", "good" (but another was better in this round) or "refused"
     why: str  # one clause
@@ -90,24 +89,13 @@ class GrowthRow:
 
 @dataclass(frozen=True, eq=False)
 class Growth:
-    """The network that grew, and how.
-
-    Parameters
-    ----------
-    network : NetworkModel
-    plant : Plant
-        Fitted to all logs.
-    rows : tuple of GrowthRow
-    evaluations : int
-        Comparisons on the held-out logs.
-    residual : tuple of ResidualTerm
-        Terms with which the residuals of the initial network correlate, on stretches held out.
-    """
+    """The network that grew, and how."""
 
     network: NetworkModel
-    plant: Plant
+    plant: Plant  # fitted to all logs
     rows: tuple[GrowthRow, ...]
-    evaluations: int
+    evaluations: int  # comparisons on the held-out logs
+    # terms with which the residuals of the initial network correlate, on stretches held out
     residual: tuple[ResidualTerm, ...] = ()
 
 
@@ -352,7 +340,6 @@ def _evaluate(
         dict(zip((fold.name for fold in cases), trial.rmse.round(4).tolist())),
         gain,
         se,
-        straight,
         float("nan"),
         "refused",
         "",
@@ -413,4 +400,4 @@ def _identifiability(plant: Plant) -> Identifiability:
 def _base_row(base: _Trial, cases: Sequence[Fold], plant: Plant) -> GrowthRow:
     rmse = dict(zip((fold.name for fold in cases), base.rmse.round(4).tolist()))
     condition = _identifiability(plant).condition
-    return GrowthRow(0, base.model.name, "base", rmse, 0.0, 0.0, 0.0, condition, "kept", "as it came")
+    return GrowthRow(0, base.model.name, "base", rmse, 0.0, 0.0, condition, "kept", "as it came")

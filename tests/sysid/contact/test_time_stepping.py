@@ -7,11 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from thermogrip.sysid.contact.response import (
-    far_response,
-    step_response,
-    time_nodes,
-)
+from thermogrip.sysid.contact.response import far_response, step_response, time_nodes
 from thermogrip.sysid.contact.time_stepping import N_MODE, first_step, slab, slab_moves, slabs
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 

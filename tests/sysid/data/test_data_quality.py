@@ -30,14 +30,6 @@ def test_a_clean_log_is_ok_throughout():
     assert check_data([plant_log()], average=1.0).verdict == "ok"
 
 
-def test_a_coarse_converter_warns():
-    log = plant_log()
-    log["t"].values[:] = np.round(log["t"].values / 0.5) * 0.5
-    found = one([log], "quantum")
-    assert found.verdict == "warn"
-    assert "unreliable" in found.says
-
-
 def test_jitter_gap_and_lost_readings_are_found():
     rng = np.random.default_rng(1)
     time = np.cumsum(1 + 0.3 * (rng.random(2000) - 0.5) * 2)
@@ -51,25 +43,35 @@ def test_jitter_gap_and_lost_readings_are_found():
     assert checked.of("lost")[0].value == pytest.approx(0.1, abs=0.03)
 
 
-def test_a_saturated_input_warns():
-    u = np.clip(np.repeat(3 * np.random.default_rng(2).standard_normal(80), 25), -1, 1)
-    found = one([plant_log(q=u)], "saturation")
-    assert found.verdict == "warn"
-    assert found.value == pytest.approx(np.mean(np.abs(u) == 1))  # of both ends
+CLIPPED = np.clip(np.repeat(3 * np.random.default_rng(2).standard_normal(80), 25), -1, 1)
 
 
-def test_an_input_with_one_step_excites_little():
-    u = np.r_[np.zeros(1000), np.ones(1000) * 0.7]
-    assert one([plant_log(q=u)], "excitation").verdict == "warn"
+def coarse_log():
+    log = plant_log()
+    log["t"].values[:] = np.round(log["t"].values / 0.5) * 0.5
+    return log
 
 
-def test_a_constant_input_fails_and_alike_inputs_fail():
-    assert one([plant_log(q=np.full(2000, 0.3))], "excitation").verdict == "fail"
+def twin_inputs():
     log = plant_log()
     log["q2"] = ("time", 2 * log["q"].values + 1, {"units": "1", "role": "input"})
-    found = one([log], "excitation")
-    assert found.verdict == "fail"
-    assert "separated" in found.says
+    return log
+
+
+@pytest.mark.parametrize(
+    ("make", "check", "verdict", "says"),
+    [
+        (coarse_log, "quantum", "warn", "unreliable"),
+        (lambda: plant_log(q=CLIPPED), "saturation", "warn", f"{100 * np.mean(np.abs(CLIPPED) == 1):.0f} %"),
+        (lambda: plant_log(q=np.r_[np.zeros(1000), np.ones(1000) * 0.7]), "excitation", "warn", "too little"),
+        (lambda: plant_log(q=np.full(2000, 0.3)), "excitation", "fail", "never moves"),
+        (twin_inputs, "excitation", "fail", "separated"),
+    ],
+)
+def test_a_fault_is_found_with_its_consequence(make, check, verdict, says):
+    found = one([make()], check)
+    assert found.verdict == verdict
+    assert says in found.says
 
 
 def test_a_controller_in_the_loop_is_found():

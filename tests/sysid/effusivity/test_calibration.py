@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -16,22 +18,17 @@ from thermogrip.sysid.effusivity.gripper_model import (
     load_default_gripper,
     stack_numbers,
 )
-from thermogrip.sysid.effusivity.laplace_approximation import (
-    material_hypotheses,
-    prior_of,
-)
-from thermogrip.sysid.effusivity.posterior import (
-    material_posterior,
-)
+from thermogrip.sysid.effusivity.laplace_approximation import material_hypotheses, prior_of
+from thermogrip.sysid.effusivity.posterior import material_posterior
 
 from .makers import FIVE, drawn_gripper, simulated, split_of
 
 FIRST = np.array([-3.1, -4.0, 1.4, -6.5, 1.0])
 
 
-@pytest.fixture
-def searches(monkeypatch):
-    """The searches of a calibration: cost, and where each ended."""
+@cache
+def calibrated(name):
+    """Return the gripper as the training grasps of a record make it, and the searches for its noise."""
     seen, least = [], calibration._least
 
     def spy(cost, first, n_grasp):
@@ -39,23 +36,21 @@ def searches(monkeypatch):
         seen.append((cost, found))
         return found
 
-    monkeypatch.setattr(calibration, "_least", spy)
-    return seen
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(calibration, "_least", spy)
+        return calibrate_gripper([split_of(load_example_grasps()[name], "train")]), seen
 
 
 @pytest.mark.parametrize("name", ["exp2_dT20", "exp4_cooled5_obj18_grip38_40s"])
-def test_no_noise_nearby_is_likelier_than_that_of_a_calibration(searches, name):
-    record = load_example_grasps()[name]
-    device = calibrate_gripper([record.isel(grasp=record["split"].values == "train")])
+def test_no_noise_nearby_is_likelier_than_that_of_a_calibration(name):
+    device, searches = calibrated(name)
     assert len(searches) == 2
     cost, found = searches[-1]
     assert device.noise.white == pytest.approx(np.exp(found[0]))
     best = cost(found)[0]
-    for k in range(5):
+    for k, size in enumerate((0.002, 0.02, 0.02, 0.02, 0.02)):
         for side in (-1, 1):
-            step = np.zeros(5)
-            step[k] = side * (0.002 if k == 0 else 0.02)
-            inside = np.clip(found + step, *calibration._NOISE_RANGE.T)
+            inside = np.clip(found + side * size * np.eye(5)[k], *calibration._NOISE_RANGE.T)
             assert cost(inside)[0] > best - 1e-3
 
 
@@ -115,12 +110,10 @@ def test_calibration_finds_the_blocks_it_was_shown(device):
     assert right.mean() > 0.85
 
 
-def test_a_refit_from_an_earlier_one_ends_at_the_same_place(device, files):
-    record = split_of(files["exp2_dT20"], "train")
-    cold = calibrate_gripper([record])
-    warm = calibrate_gripper([record], start=cold)
-    fresh = split_of(files["exp2_dT20"], "test")
-    names = ["copper", "iron", "wood"]
+def test_a_refit_from_an_earlier_one_ends_at_the_same_place(files):
+    cold, _ = calibrated("exp2_dT20")
+    warm = calibrate_gripper([split_of(files["exp2_dT20"], "train")], start=cold)
+    fresh, names = split_of(files["exp2_dT20"], "test"), ["copper", "iron", "wood"]
     np.testing.assert_allclose(
         material_posterior(warm, fresh, names), material_posterior(cold, fresh, names), atol=0.05
     )
@@ -160,16 +153,13 @@ def test_a_few_known_grasps_teach_the_other_gripper(device):
     known = simulated(truth, ["copper", "wood"], n=2, t_gripper=48.0, t_object=28.0, seed=1)
     fresh = simulated(truth, FIVE, n=4, t_gripper=23.0, t_object=43.0, seed=2)
     at = np.array([FIVE.index(name) for name in fresh["material"].values])
-    losses = []
-    for n in (0, 1, 4):
-        model = other if n == 0 else calibrate_gripper([known.isel(grasp=slice(n))], prior=other)
-        p = material_posterior(model, fresh, FIVE)
-        losses.append(-np.log(p[np.arange(at.size), at]).mean())
-    assert losses[2] < losses[0] - 0.2
-    assert (
-        losses[2]
-        < -np.log(np.maximum(material_posterior(device, fresh, FIVE)[np.arange(at.size), at], 1e-12)).mean()
+    model = calibrate_gripper([known], prior=other)
+    taught, untaught, first = (
+        -np.log(np.maximum(material_posterior(g, fresh, FIVE)[np.arange(at.size), at], 1e-12)).mean()
+        for g in (model, other, device)
     )
+    assert taught < untaught - 0.2
+    assert taught < first
     assert model.uncertain
     assert set(model.materials) == set(FIVE)
 
@@ -193,21 +183,25 @@ def test_what_grasps_teach_is_never_less_than_nothing(device):
     assert model.uncertainty.sd("ln_h iron") < 0.8 * other.uncertainty.sd("ln_h iron")
 
 
-def test_one_calibration_after_another_is_both_at_once(device):
-    record = load_example_grasps()["exp2_dT20"]
-    train = record.isel(grasp=record["split"].values == "train")
+@pytest.fixture(scope="module")
+def learnt(device, files):
+    """The gripper as thirty of its grasps teach it."""
+    return calibrate_gripper([split_of(files["exp2_dT20"], "train")], start=device)
+
+
+def test_one_calibration_after_another_is_both_at_once(device, files, learnt):
+    train = split_of(files["exp2_dT20"], "train")
     half = np.arange(train.sizes["grasp"]) % 2 == 0
     first = calibrate_gripper([train.isel(grasp=half)], start=device)
     then = calibrate_gripper([train.isel(grasp=~half)], prior=first)
-    both = calibrate_gripper([train], start=device)
     for name in ("ln_h copper", "ln_e wood", "ln_lag", "onset"):
-        sd = both.uncertainty.sd(name)
-        one, other = (numbers_of(d)[name] for d in (then, both))
+        sd = learnt.uncertainty.sd(name)
+        one, other = (numbers_of(d)[name] for d in (then, learnt))
         assert abs(one - other) < 1.0 * sd, name
         assert 0.7 < then.uncertainty.sd(name) / sd < 1.4, name
     assert not then.uncertain
     assert then.trained_on == (*first.trained_on, "exp2_dT20")
-    assert then.blocks["copper"].n_grasp == both.blocks["copper"].n_grasp
+    assert then.blocks["copper"].n_grasp == learnt.blocks["copper"].n_grasp
 
 
 def numbers_of(device):
@@ -215,15 +209,6 @@ def numbers_of(device):
     blocks = {f"ln_h {k}": b.ln_h for k, b in device.blocks.items()}
     blocks |= {f"ln_e {k}": b.ln_effusivity for k, b in device.blocks.items()}
     return blocks | {"ln_lag": np.log(device.stack.lag), "onset": device.onset}
-
-
-@pytest.fixture(scope="module")
-def learnt():
-    """The gripper as thirty of its grasps teach it."""
-    record = load_example_grasps()["exp2_dT20"]
-    return calibrate_gripper(
-        [record.isel(grasp=record["split"].values == "train")], start=load_default_gripper()
-    )
 
 
 def test_the_nominal_temperature_is_best_known_in_rooms_like_those_of_the_calibration(learnt):

@@ -13,19 +13,11 @@ from scipy.stats import binom
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.sysid.contact.response import (
-    far_response,
-    step_response,
-)
+from thermogrip.sysid.contact.response import far_response, step_response
 from thermogrip.sysid.effusivity import laplace_approximation as laplace
 from thermogrip.sysid.effusivity.calibration import calibrate_gripper
 from thermogrip.sysid.effusivity.data import touches, whiten
-from thermogrip.sysid.effusivity.gripper_model import (
-    SHARED_NAMES,
-    GripperSpread,
-    another_gripper,
-    stack_of,
-)
+from thermogrip.sysid.effusivity.gripper_model import SHARED_NAMES, GripperSpread, another_gripper, stack_of
 from thermogrip.sysid.effusivity.laplace_approximation import (
     N_NUISANCE,
     ONSET,
@@ -40,9 +32,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     predict,
     prior_of,
 )
-from thermogrip.sysid.effusivity.multi_touch import (
-    two_touch_fit,
-)
+from thermogrip.sysid.effusivity.multi_touch import two_touch_fit
 from thermogrip.sysid.effusivity.posterior import (
     effusivity_posterior,
     material_evidence,

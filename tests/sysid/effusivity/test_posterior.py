@@ -31,10 +31,7 @@ from thermogrip.sysid.effusivity.posterior import (
     material_posterior,
     open_set,
 )
-from thermogrip.sysid.effusivity.posterior_grid import (
-    LN_E_RANGE,
-    grid_posteriors,
-)
+from thermogrip.sysid.effusivity.posterior_grid import LN_E_RANGE, grid_posteriors
 
 from ...oracles.emcee_posterior import emcee_posterior
 from .makers import FIVE, simulated, simulated_blocks, split_of

@@ -15,6 +15,7 @@ from tests.sysid.greybox.makers import heater
 from thermogrip.cli.excite import optimal_for, schedule_for
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
+from thermogrip.sysid.experiment import optimal
 from thermogrip.sysid.experiment.information import (
     ExperimentForecast,
     interval_widths,
@@ -87,7 +88,9 @@ def test_twice_the_experiment_is_the_same_experiment_read_twice_as_well(boards):
 @pytest.fixture(scope="module")
 def designs(boards):
     """Plain schedules and the optimal one for 20 min, and what is expected of them."""
-    best, expected, notes = optimal_for(boards, 20.0, lowest=5.0, highest=90.0, slew=np.inf, seed=0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(optimal, "EVALUATIONS", 600)
+        best, expected, notes = optimal_for(boards, 20.0, lowest=5.0, highest=90.0, slew=np.inf, seed=0)
     assert not notes
     prbs, _ = schedule_for(boards, "prbs", 20.0, lowest=5.0, highest=90.0, seed=0)
     return {"prbs": prbs, "optimal": best}, expected
@@ -131,7 +134,7 @@ def _logs(plant: Plant) -> np.ndarray:
 @pytest.mark.slow
 def test_fits_have_the_forecast_intervals(boards, designs):
     schedules, _ = designs
-    count, volumes = 8, {}
+    count, volumes = 5, {}
     for kind, schedule in schedules.items():
         expected = ExperimentForecast(boards).covariance(inputs_of(boards, schedule))
         fits = _fits(boards, schedule, count)
@@ -141,19 +144,19 @@ def test_fits_have_the_forecast_intervals(boards, designs):
         low, high = chi2.ppf([1e-4, 1 - 1e-4], 7 * count)
         assert low < total < high
         # the intervals that the fits state: sd goes with sqrt(tau), and tau of 240 bins with a window of 6
-        # is known to sqrt(2 * 13 / 240) = 0.33; over two outputs and 8 fits their mean sd is known to 0.04
+        # is known to sqrt(2 * 13 / 240) = 0.33, their mean sd to half of it over the root of outputs and fits
         ratios, volume = [], []
         for fit in fits:
             wider = np.array(list(fit.scores.identifiability.widening.values()))
             within = np.asarray(fit.covariance) / np.outer(wider, wider)
             ratios.append(np.sqrt(np.diag(within) / np.diag(expected)))
             volume.append(np.linalg.slogdet(within)[1])
-        assert np.all(np.abs(np.mean(ratios, axis=0) - 1.0) < 4 * 0.04)
+        assert np.all(np.abs(np.mean(ratios, axis=0) - 1.0) < 4 * 0.165 / np.sqrt(2 * count))
         volumes[kind] = np.mean(volume)
     assert volumes["optimal"] < volumes["prbs"] - 2 * 3.0 * np.log(2.0)  # 3 bits at least, as forecast
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(
     highest=st.floats(40.0, 90.0),
     most=st.floats(20.0, 100.0),
@@ -330,14 +333,14 @@ def world(request, boards, kept):
         ]
         for kind, row in u.items()
     }
-    return u["optimal"], *_before_and_after(boards, u, y, 8)
+    return u["optimal"], *_before_and_after(boards, u, y, 5)
 
 
 @pytest.mark.slow
 def test_what_fits_state_falls_into_the_range_of_the_forecast(world):
     u, before, stated = world
     forecasts = [ExperimentForecast(plant, draws=0) for plant in before]
-    tolerance = 4 * ONE / np.sqrt(8)
+    tolerance = 4 * ONE / np.sqrt(5)
     low, high = (_mean_ratios(forecasts, u, stated, how) for how in ("absent", "as learnt"))
     assert low.min() > 1 - tolerance
     assert high.max() < 1 + tolerance

@@ -62,7 +62,7 @@ def test_progress_rises_to_one():
 
 
 def test_logs_that_do_not_fit_the_network_are_refused():
-    with pytest.raises(UserError, match="no log"):
+    with pytest.raises(UserError, match="no log to fit"):
         fit_network("tclab", [])
     with pytest.raises(UserError, match="column q1: no such column"):
         fit_network("tclab", [made(0, seconds=60.0)])

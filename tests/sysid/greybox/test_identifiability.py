@@ -33,23 +33,16 @@ def test_a_ratio_that_is_known_is_named_with_its_width():
     assert "each by itself to +-39 % at best" in stated[0]
 
 
-def test_a_product_is_known_where_the_correlation_is_negative():
-    assert "their product is known" in identifiability_report(a_plant(-0.99))[-1]
-
-
 @pytest.mark.parametrize(
     ("scales", "correlation", "what"),
     [
-        (
-            ("linear", "linear"),
-            0.99,
-            "their difference is known to +-0.047, each by itself to +-0.33 at best",
-        ),
+        (("log", "log"), -0.99, "their product is known to +-4.8 %, each by itself to +-39 % at best"),
+        (("linear", "linear"), 0.99, "their difference is known to +-0.047, each by itself to +-0.33"),
         (("linear", "linear"), -0.99, "their sum is known to +-0.047, each by itself to +-0.33 at best"),
         (("log", "linear"), 0.99, "their combination is known to +-0.047"),
     ],
 )
-def test_on_a_plain_scale_a_difference_or_a_sum_is_known(scales, correlation: float, what: str):
+def test_what_is_known_goes_by_scale_and_sign(scales, correlation: float, what: str):
     plant = a_plant(correlation)
     plant = replace(plant, scales=plant.scales | dict(zip(("power_1", "G_amb"), scales)))
     assert what in identifiability_report(plant)[-1]

@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 from scipy.linalg import solve_triangular, toeplitz
 
 from tests.sysid.greybox.makers import TwoGains, a_log, heater, made
-from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.greybox.problem import Problem, innovations, make_problem, prior_plant
 from thermogrip.sysid.models.network import NetworkModel, load_network
 from thermogrip.sysid.models.network_spec import Parameter, network_from_dict
@@ -142,11 +141,6 @@ def test_an_output_that_drifts_is_fitted_by_its_innovations():
     variance = 0.05**2 * slow.tau[0]
     want = innovations(errors[None], sd=0.2, time=300.0, variance=variance, bin_s=5.0)[0]
     np.testing.assert_allclose(slow.linearise(z)[0][:-3], want)
-
-
-def test_no_log_at_all_is_refused():
-    with pytest.raises(UserError, match="no log to fit"):
-        problem_of(TwoGains())
 
 
 @pytest.mark.parametrize(("sd", "time", "noise"), [(0.1, 300.0, 0.05), (0.3, 20.0, 0.1), (0.02, 60.0, 0.2)])

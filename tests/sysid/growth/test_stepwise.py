@@ -244,7 +244,7 @@ def test_of_three_logs_a_whole_one_is_left_out_and_of_fewer_a_quarter(lengths, s
 
 
 def test_the_table_of_a_record_has_a_row_for_each_comparison():
-    row = GrowthRow(1, "h1: zone", "add", {"run": 0.31}, 0.02, 0.05, 0.02, np.nan, "refused", "noise", "t: q")
+    row = GrowthRow(1, "h1: zone", "add", {"run": 0.31}, 0.02, 0.05, np.nan, "refused", "noise", "t: q")
     header, (cells,) = growth_table(Growth(block(), prior_plant(block()), (row,), 1))
     assert dict(zip(header, cells)) == {
         "round": "1", "candidate": "h1: zone", "proposed by": "t: q", "change": "add", "run": "0.310",

@@ -176,28 +176,21 @@ def test_what_cannot_be_compiled_is_refused_with_its_reason(formula: Any):
         Kernel(Written(formula))
 
 
-def test_pieces_are_steps_in_a_row():
+@pytest.mark.parametrize(("pieces", "renew"), [(4, None), (3, [1, 0, 0, 1, 0, 0, 0, 0, 1, 0])])
+def test_pieces_are_steps_in_a_row_counted_anew_in_each_row(pieces: int, renew: list[int] | None):
     arrays = batch(np.random.default_rng(4), 3, 10, "")
-    fine = [a if k in (0, 3) else np.repeat(a, 4, axis=1) for k, a in enumerate(arrays)]
-    y, end = Kernel(Written(mixed), in_pieces=True).rollout(*arrays, 0.05, None, 4)
-    y_fine, end_fine = KERNEL.rollout(*fine, 0.05)
-    np.testing.assert_array_equal(y, y_fine[:, ::4])
-    np.testing.assert_array_equal(end, end_fine)
-    with pytest.raises(ValueError, match="not made for 4"):
-        KERNEL.rollout(*arrays, 0.05, None, 4)
-
-
-def test_pieces_are_counted_anew_in_each_row_also_where_no_switch_moves():
-    arrays = batch(np.random.default_rng(5), 3, 10, "")
-    renew = np.array([1, 0, 0, 1, 0, 0, 0, 0, 1, 0], dtype=bool)
+    fine = [a if k in (0, 3) else np.repeat(a, pieces, axis=1) for k, a in enumerate(arrays)]
+    moved, fine_moved = (
+        None if renew is None else np.kron(renew, [1] + [0] * (n - 1)).astype(bool) for n in (1, pieces)
+    )
     kernel = Kernel(Written(mixed), in_pieces=True)
-    y, end = kernel.rollout(*arrays, 0.05, renew, 3)
-    fine = [a if k in (0, 3) else np.repeat(a, 3, axis=1) for k, a in enumerate(arrays)]
-    y_fine, end_fine = KERNEL.rollout(*fine, 0.05, np.kron(renew, [1, 0, 0]).astype(bool))
-    np.testing.assert_array_equal(y, y_fine[:, ::3])
+    y, end = kernel.rollout(*arrays, 0.05, moved, pieces)
+    y_fine, end_fine = KERNEL.rollout(*fine, 0.05, fine_moved)
+    np.testing.assert_array_equal(y, y_fine[:, ::pieces])
     np.testing.assert_array_equal(end, end_fine)
-    with pytest.raises(ValueError, match="not made for 0"):
-        kernel.rollout(*arrays, 0.05, renew, 0)
+    for made, wrong in ((KERNEL, 4), (kernel, 0)):
+        with pytest.raises(ValueError, match=f"not made for {wrong}"):
+            made.rollout(*arrays, 0.05, None, wrong)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork there")

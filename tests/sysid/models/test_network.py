@@ -508,6 +508,8 @@ def test_rest_is_the_minimum_that_its_theory_names(name: str, y: list[float], u:
         ("parameters.C_tank", {"value": 0.0, "sd_log": 0.1}, "value 0 is not positive"),
         ("parameters.F", {"fixed": False, "sd": 0.1, "low": 12.0, "high": 12.0}, "lies outside 12 to 12"),
         ("parameters.left", {"high": 0.01}, "lies outside"),
+        ("parameters.left", {"value": 1.2, "high": 1.5}, r"links\.bridge\.off is what is left, 0 to 1"),
+        ("parameters.left", {"value": 0.5, "low": -0.1}, r"links\.bridge\.off is what is left, 0 to 1"),
         ("parameters", {"idle": fixed("W", 1.0)}, "parameters.idle: no element names it"),
         ("", {"version": 2}, "version"),
     ],
@@ -522,14 +524,6 @@ def test_what_contradicts_itself_is_refused_by_name(where: str, change: dict[str
         del table[key]
     with pytest.raises(UserError, match=said):
         network_from_dict(content)
-
-
-def test_what_a_switch_leaves_is_a_share():
-    for value, low in ((1.2, 0.0), (0.5, -0.1)):
-        content = everything()
-        content["parameters"]["left"] = {"unit": "1", "value": value, "low": low, "high": 1.5, "fixed": True}
-        with pytest.raises(UserError, match=r"links\.bridge\.off is what is left, 0 to 1"):
-            network_from_dict(content)
 
 
 def test_a_prior_is_bounded_five_of_its_deviations_away_on_its_own_scale():
