@@ -96,11 +96,16 @@ def check_workers(workers: Workers) -> Workers:
     return workers
 
 
-def sub_progress(progress: Progress | None, start: float, stop: float) -> Progress | None:
-    """Return the progress of a part that is start to stop of the whole."""
+def sub_progress(progress: Progress | None, start: float, stop: float, name: str = "") -> Progress | None:
+    """Return the progress of a part, under a name of its own, that is ``start`` to ``stop`` of the whole."""
     if progress is None:
         return None
-    return lambda fraction, what: progress(start + (stop - start) * fraction, what)
+
+    def show(fraction: float, what: str) -> None:
+        text = ": ".join(piece for piece in (name, what) if piece)
+        progress(start + (stop - start) * min(max(fraction, 0.0), 1.0), text)
+
+    return show
 
 
 def _on_processes(

@@ -26,18 +26,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from thermogrip.datasets.atomic_files import file_hash, read_bytes, read_json, write_atomic, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.grasp_files import read_grasps, write_grasps
 from thermogrip.datasets.media import from_csv
-from thermogrip.datasets.schema import Grasps, Log, make_log
-from thermogrip.datasets.units import guess_role, split_header
+from thermogrip.datasets.schema import Grasps, Log
 from thermogrip.rig.guard.sensor_checks import room_sensors
 from thermogrip.rig.records.recorder import FILES, SCHEMA, VERSION, refuse_links, write_sums
-from thermogrip.rig.session.loop import PHASES, Event, hold_last_good
+from thermogrip.rig.session.loop import PHASES, Event, log_of_rows
 from thermogrip.rig.session.session import grasp_of_rows
 
 _NUMBER = re.compile(rb"-?(?:\d+(?:\.\d+)?(?:e[+-]?\d+)?|inf)")
@@ -107,7 +103,7 @@ def read_run(folder: str | Path) -> Run:
     events, whole = _events(path / "events.jsonl")
     lost = samples.lost + whole.lost
     rooms = _rooms(header, events)
-    log = _log(header, rows, path.name, samples.lost, rooms) if len(rows) > 1 else None
+    log = log_of_rows(rows, rooms, name=path.name, repairs=samples.lost) if len(rows) > 1 else None
     written = (path / "grasps.csv").is_file() and (path / "grasps_meta.csv").is_file()
     grasps = read_grasps(path / "grasps.csv") if written else _grasp(header, rows, events, rooms)
     return Run(about, log, events, grasps, lost)
@@ -275,31 +271,6 @@ def _rooms(header: list[str], events: tuple[Event, ...]) -> frozenset[str]:
     readings = {h.removesuffix("_degC") for h in header if h.endswith("_degC")}
     kept = next((e.data["rooms"] for e in events if e.kind == "phase" and "rooms" in e.data), None)
     return frozenset(readings.intersection(kept)) if isinstance(kept, list) else room_sensors(readings)
-
-
-def _log(
-    header: list[str],
-    rows: list[dict[str, float]],
-    name: str,
-    lost: tuple[str, ...],
-    rooms: frozenset[str],
-) -> Log:
-    """Return the rows as a Log with the roles that the session gave them."""
-    variables: dict[str, tuple[NDArray[np.float64], str, str]] = {}
-    for column in header[1:]:
-        variable, unit = split_header(column)
-        role = guess_role(variable, unit)
-        if variable == "phase" or variable.startswith("target_"):
-            role = "other"
-        elif unit == "degC":
-            role = "disturbance" if variable in rooms else "output"
-        values = np.array([row[column] for row in rows])
-        if not np.isnan(values).all():
-            variables[variable] = (hold_last_good(values) if role == "disturbance" else values, unit, role)
-    log = make_log([row[header[0]] for row in rows], variables, name=name, repairs=lost)
-    if "phase" in log:
-        log["phase"].attrs["flag_meanings"] = " ".join(PHASES)
-    return log
 
 
 def _grasp(

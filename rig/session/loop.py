@@ -10,7 +10,7 @@ move that the guard rejects (:mod:`~thermogrip.rig.guard.guard`), a cable that i
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
@@ -337,18 +337,7 @@ class Loop:
 
     def log(self) -> Log:
         """Return the rows as a Log."""
-        variables, rooms = {}, self.rooms
-        for header in list(self.rows[0])[1:]:
-            name, unit = split_header(header)
-            values = self.column(header)
-            if name in self.reading.values:
-                role = "disturbance" if name in rooms else "output"
-            else:
-                role = "input" if name == "pump" or name in self.reading.drive else "other"
-            variables[name] = (hold_last_good(values) if role == "disturbance" else values, unit, role)
-        log = make_log(self.column("time_s"), variables, name="session")
-        log["phase"].attrs["flag_meanings"] = " ".join(PHASES)
-        return log
+        return log_of_rows(self.rows, self.rooms, name="session")
 
 
 _LATCHES = {
@@ -369,6 +358,28 @@ def trip_of_device(error: DeviceRefusedError, reading: Reading) -> Trip:
             measured += ", latched on the device"
             return Trip(kind, reading.time_s, name or "the pump", expected, measured)
     return Trip("device", reading.time_s, "the device", "to take a drive", str(error))
+
+
+def log_of_rows(
+    rows: Sequence[Mapping[str, float]], rooms: Collection[str], *, name: str, repairs: Sequence[str] = ()
+) -> Log:
+    """Return a session's rows (columns with their unit suffix) as a Log, without what was never read."""
+    time, *headers = rows[0]
+    variables = {}
+    for header in headers:
+        variable, unit = split_header(header)
+        role = "input"
+        if variable == "phase" or variable.startswith("target_"):
+            role = "other"
+        elif unit == "degC":
+            role = "disturbance" if variable in rooms else "output"
+        values = np.array([row[header] for row in rows])
+        if not np.isnan(values).all():
+            variables[variable] = (hold_last_good(values) if role == "disturbance" else values, unit, role)
+    log = make_log([row[time] for row in rows], variables, name=name, repairs=repairs)
+    if "phase" in log:
+        log["phase"].attrs["flag_meanings"] = " ".join(PHASES)
+    return log
 
 
 def hold_last_good(values: Array) -> Array:

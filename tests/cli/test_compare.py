@@ -16,7 +16,7 @@ from thermogrip.classify.evaluation.comparison import POOLED
 from thermogrip.cli import compare as verb
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, make_grasps
-from thermogrip.report.console import Console, part
+from thermogrip.report.console import Console
 from thermogrip.report.html import Section
 
 HEAD = ("classifier", "condition", "accuracy", "Brier", "fit [s]")
@@ -257,7 +257,6 @@ def test_the_curves_stand_after_the_scores(scored: SimpleNamespace, stand_in: St
     assert (call.args[4:6], call.args[7]) == ((4, 3), Path("c"))
     first, last = scored.pages[0].args[3]
     assert (first, last.title) == ("of shipped", "More")
-    assert part(None, 0.0, 1.0) is None
 
 
 @pytest.mark.parametrize(

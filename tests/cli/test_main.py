@@ -78,14 +78,6 @@ def test_python_dash_m_is_the_command() -> None:
     assert (done.returncode, done.stdout[:10]) == (0, "thermogrip"), done.stderr
 
 
-@pytest.mark.parametrize("verb", VERBS)
-def test_every_verb_has_help_that_names_its_options(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([verb, "--help"]) == 0
-    text = capsys.readouterr().out
-    assert "Usage: thermogrip" in text
-    assert "--json" in text
-
-
 def test_the_verbs_are_those_of_the_contract() -> None:
     verbs = "demo identify validate simulate excite tune review export run effusivity train classify compare"
     more = "paper materials init record recover virtual batch"

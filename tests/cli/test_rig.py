@@ -466,6 +466,20 @@ def test_a_schedule_that_cannot_be_played_is_refused_by_its_name_and_the_port_is
     assert not (bench.path / "r").exists()
 
 
+@pytest.mark.parametrize("words", ["run c.json --target 38", "batch c.json plan.csv", "record good.csv"])
+def test_a_guard_file_that_is_wrong_is_refused_before_a_port_is_opened(
+    words: str, bench: Bench, stand_in: StandIn
+) -> None:
+    Controller(small_plant()).save(bench.path / "c.json")
+    bench.write("plan.csv", "material,target_degC\ncopper,30\n")
+    bench.write("g.toml", "stale_ms = 500\n")
+    opened = stand_in("thermogrip.rig.drivers.connect.open_rig", SimpleNamespace(units={"drive": "1"}))
+    done = bench.run(*words.split(), "--port", "COM3", "--guard", "g.toml", "--out", "r")
+    assert (done.code, len(done.said), opened) == (2, 1, [])
+    assert done.said[0].startswith("thermogrip: g.toml: stale_ms: no such key")
+    assert not (bench.path / "r").exists()
+
+
 def test_a_guard_has_its_file_or_the_defaults_and_learns_only_of_a_plant(
     stand_in: StandIn, tmp_path: Path
 ) -> None:

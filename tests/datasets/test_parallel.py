@@ -68,13 +68,14 @@ def test_workers_that_cannot_be_are_refused_before_any_work(workers):
         run_parallel(abs, [1], workers)
 
 
-def test_the_progress_of_a_part_stays_in_its_share():
+def test_the_progress_of_a_part_stays_in_its_share_and_has_its_name():
     seen = []
-    part = sub_progress(lambda f, w: seen.append((f, w)), 0.2, 0.6)
-    assert part is not None
-    part(0.0, "a")
-    part(1.0, "b")
-    assert seen == [(0.2, "a"), (pytest.approx(0.6), "b")]
+    for name, what in (("tune", "run 3"), ("", "run 4"), ("tune", "")):
+        part = sub_progress(lambda f, w: seen.append((f, w)), 0.5, 0.9, name)
+        part(-1.0, what)
+        part(1.5, what)
+    low, high = pytest.approx(0.5), pytest.approx(0.9)
+    assert seen == [(end, words) for words in ("tune: run 3", "run 4", "tune") for end in (low, high)]
     assert sub_progress(None, 0, 1) is None
 
 

@@ -99,6 +99,7 @@ REFUSED = {
     "recover x.csv": "x.csv: is no run folder",
     "recover r --out log.foo": "log.foo: cannot write a .foo file here",
     "record noplan.csv --port p --out d": "noplan.csv: no such file or folder",
+    "identify x.csv --report r.txt --out p.json": "r.txt: cannot write a .txt file here; end it in .html",
     "virtual --protocol foo": "--protocol 'foo' is unknown; use thermogrip, tclab",
     "virtual --plant noplant.json": "noplant.json: no such file or folder",
     "excite --kind prbss --minutes 5 --out s.csv": "--kind 'prbss' is unknown",

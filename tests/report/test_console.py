@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermogrip.report.console import Console, part, plain, short
+from thermogrip.report.console import Console, plain, short
 
 
 def test_with_json_tables_and_words_are_silent(capsys: pytest.CaptureFixture[str]) -> None:
@@ -46,20 +46,6 @@ def test_a_cell_has_four_digits_and_a_dash_for_what_is_absent(cell: object, text
 )  # fmt: skip
 def test_what_json_cannot_hold_is_text_and_collections_are_lists(value: object, held: object) -> None:
     assert plain(value) == held
-
-
-def test_a_part_of_the_work_is_named_where_it_has_a_name() -> None:
-    seen: list[tuple[float, str]] = []
-
-    def note(fraction: float, what: str) -> None:
-        seen.append((fraction, what))
-
-    for name, what in (("tune", "run 3"), ("", "run 4"), ("tune", "")):
-        inner = part(note, 0.5, 0.9, name)
-        assert inner is not None
-        inner(-1.0, what)
-    assert seen == [(0.5, "tune: run 3"), (0.5, "run 4"), (0.5, "tune")]
-    assert part(None, 0.0, 1.0) is None
 
 
 def test_a_table_is_wide_enough_for_a_file_and_its_numbers_stand_to_the_right(

@@ -18,7 +18,7 @@ from thermogrip.classify import make_classifier
 from thermogrip.classify.estimators.base import GraspClassifier
 from thermogrip.cli.main import main
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.report.console import Progress
+from thermogrip.datasets.parallel import Progress
 from thermogrip.report.html import Table
 from thermogrip.studies.paper import (
     CASES,

@@ -26,14 +26,15 @@ from thermogrip.cli.options import (
     workers_of,
 )
 from thermogrip.datasets.errors import UserError
-from thermogrip.report.console import Console, part
+from thermogrip.datasets.parallel import sub_progress
+from thermogrip.report.console import Console
 
 if TYPE_CHECKING:
     from thermogrip.classify.estimators.base import GraspClassifier
     from thermogrip.classify.evaluation.comparison import Comparison
     from thermogrip.classify.evaluation.decision_time import Decisions
+    from thermogrip.datasets.parallel import Progress
     from thermogrip.datasets.schema import Grasps
-    from thermogrip.report.console import Progress
     from thermogrip.report.html import Section
 
 BY_DEFAULT = ("lstm", "posterior", "bayes", "features-lda", "pca-lda")
@@ -134,7 +135,7 @@ def compare(
             console.warn(f"no random splits: {why}")
             anew = False
         parts = _shares(given, anew, by is not None, curves)
-        shares = {name: part(progress, start, end, title) for name, (start, end, title) in parts.items()}
+        shares = {name: sub_progress(progress, *share) for name, share in parts.items()}
         if given:
             found["files" if tests is not None else "shipped"] = evaluate(
                 models, records, test=tests, seed=seed, workers=pool, progress=shares["given"]
@@ -222,12 +223,12 @@ def _curves(
         ("contact_s", "contact time", contact_time_curve, (0.5, 0.8)),
     ):
         try:
-            rows[key] = curve(models, records, **settings, progress=part(progress, *span, title))
+            rows[key] = curve(models, records, **settings, progress=sub_progress(progress, *span, title))
         except UserError as error:  # so few grasps are scored all the same
             console.warn(f"no {title}: {error}")
     rows["difference_K"] = difference_curve(next(iter(found.values())), records)
     sections = [curves_section(rows)]
-    if decided := _decisions(models, records, seed, part(progress, 0.8, 1.0, "time to decision")):
+    if decided := _decisions(models, records, seed, sub_progress(progress, 0.8, 1.0, "time to decision")):
         sections.append(decision_section(decided))
         write_atomic(out / "decisions.csv", table_csv(decided.table()))
     if _has_split(records) and all("t_object" in record for record in records):

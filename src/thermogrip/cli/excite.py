@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from thermogrip.datasets.parallel import Progress
     from thermogrip.datasets.schema import Log
-    from thermogrip.report.console import Progress
     from thermogrip.sysid.experiment.information import ExperimentForecast
     from thermogrip.sysid.experiment.optimal import Expectation
     from thermogrip.sysid.plant.plant import Plant

@@ -27,13 +27,14 @@ from thermogrip.cli.options import (
     new_file,
 )
 from thermogrip.datasets.errors import UserError
-from thermogrip.report.console import Console, part
+from thermogrip.datasets.parallel import sub_progress
+from thermogrip.report.console import Console
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from thermogrip.datasets.parallel import Progress
     from thermogrip.datasets.schema import Log
-    from thermogrip.report.console import Progress
     from thermogrip.sysid.greybox.posterior import Posterior
     from thermogrip.sysid.growth.stepwise import Growth
     from thermogrip.sysid.identification import Identification
@@ -159,7 +160,7 @@ def identify(
         if to_grow is not None:
             from thermogrip.sysid.growth.stepwise import grow as try_terms
 
-            growth = try_terms(to_grow, records, outputs=roles[1], progress=part(progress, 0.0, 0.4))
+            growth = try_terms(to_grow, records, outputs=roles[1], progress=sub_progress(progress, 0.0, 0.4))
             wanted_network = growth.network
         found = fit_models(
             records,
@@ -170,14 +171,16 @@ def identify(
             leave_one_out=leave_one_out,
             draws=0 if posterior else 24,
             seed=seed,
-            progress=part(progress, 0.4 if grow else 0.0, 0.6 if posterior else 1.0),
+            progress=sub_progress(progress, 0.4 if grow else 0.0, 0.6 if posterior else 1.0),
         )
         plant = found.plant
         if network and wanted_network is not None and all(row.model != "network" for row in found.rows):
             why = next((note for note in found.notes if note.startswith("network")), "it was not fitted")
             raise UserError(f"--network {network}: {why}", hint="write --network none to do without")
         if posterior and found.model == "network":
-            plant, record, lost = _sampled(plant, records, out, seed, part(progress, 0.6, 1.0, "posterior"))
+            plant, record, lost = _sampled(
+                plant, records, out, seed, sub_progress(progress, 0.6, 1.0, "posterior")
+            )
     plant.save(out)
     if report is not None:
         lead = f"From {', '.join(log_name(log) for log in records)}."

@@ -313,13 +313,11 @@ def record(
             "--port", metavar="DEV", show_default=False, help="/dev/ttyACM0, COM3, socket://HOST:PORT."
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", show_default=False, help="Folder of the run.")],
+    out: OutOption,
     protocol: ProtocolOption = None,
     dt: Annotated[float, typer.Option("--sample", metavar="S", min=0.05, help="Seconds a row.")] = 1.0,
     guard: GuardOption = None,
-    speed: Annotated[
-        float, typer.Option("--speed", metavar="X", min=0.01, help="That of a virtual device of --speed X.")
-    ] = 1.0,
+    speed: SpeedOption = 1.0,
     seed: Seed = 0,
     as_json: AsJson = False,
 ) -> int:
@@ -445,12 +443,8 @@ def virtual(
     ambient: Annotated[
         float, typer.Option("--ambient", metavar="DEGC", help="Temperature of the room.")
     ] = 23.0,
-    obj: Annotated[
-        float | None, typer.Option("--object", metavar="DEGC", help="Temperature of what is grasped.")
-    ] = None,
-    material: Annotated[
-        str | None, typer.Option("--material", metavar="NAME", help="Material of what is grasped.")
-    ] = None,
+    obj: ObjOption = None,
+    material: MaterialOption = None,
     fault: Annotated[
         list[str] | None,
         typer.Option("--fault", metavar="S:NAME", help="After S seconds let NAME fail; may be repeated."),

@@ -12,16 +12,14 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from thermogrip.datasets.media import printable
-
-#: What long work calls: fraction done (0 to 1) and what it is at.
-Progress = Callable[[float, str], None]
+from thermogrip.datasets.parallel import Progress
 
 
 @dataclass(frozen=True)
@@ -98,19 +96,6 @@ class Console:
                 bars.update(task, completed=fraction, description=printable(what))
 
             yield _onward(show)
-
-
-def part(progress: Progress | None, start: float, end: float, name: str = "") -> Progress | None:
-    """Return a callback that fills only the share ``start`` to ``end`` of another."""
-    if progress is None:
-        return None
-    outer = progress
-
-    def show(fraction: float, what: str) -> None:
-        text = ": ".join(piece for piece in (name, what) if piece)
-        outer(start + (end - start) * min(max(fraction, 0.0), 1.0), text)
-
-    return show
 
 
 def plain(value: Any) -> Any:

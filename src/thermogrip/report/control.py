@@ -86,12 +86,14 @@ def tuning_rows(tuning: Tuning) -> tuple[tuple[Any, ...], ...]:
 
 def tuning_sections(tuning: Tuning) -> list[Section]:
     """Return the whole report of a tuning."""
+    design = tuning.controller.design
+    steps = {title.rpartition(", ")[0]: run for title, run in tuning.runs.items() if title.endswith(", MPC")}
     return [
         tuning_section(tuning),
         pareto_section(tuning),
         sensitivity_section(tuning),
-        *_runs_of(tuning),
-        timing_section(_step_times(tuning), tuning.controller.design),
+        *(loop_section(run, design, f"The step from {step} degC") for step, run in steps.items()),
+        timing_section([float(seconds) for run in steps.values() for seconds in run.seconds], design),
         spec_section(tuning),
     ]
 
@@ -125,6 +127,7 @@ def tuning_section(tuning: Tuning) -> Section:
 
 def pareto_section(tuning: Tuning) -> Section:
     """Return the section of what may be traded: settling, overshoot and energy of many designs."""
+    draws = tuning.spec.search_draws if _uncertain(tuning) else 1
     rows = sorted(tuning.pareto.rows(), key=lambda row: (row["settle_s"] is None, row["settle_s"]))
     table = tuple(
         (
@@ -154,7 +157,7 @@ def pareto_section(tuning: Tuning) -> Section:
         Table(
             head,
             table,
-            f"Means over steps and the draws of the search ({len(_draws(tuning))}), {_hold(tuning)}",
+            f"Means over steps and the draws of the search ({draws}), {tuning.spec.hold_s:g} s each",
         ),
     )
     return Section("What can be traded?", parts, _trade(rows))
@@ -296,22 +299,6 @@ def _contact_section(grasps: Grasps, contact: float) -> Section:
     return Section("What did the skin feel?", parts, felt, "good" if np.isfinite(contact) else "warn")
 
 
-def _runs_of(tuning: Tuning) -> list[Section]:
-    """Return a section for every step of the spec, by the controller as it will run."""
-    found = []
-    for title, run in tuning.runs.items():
-        step, name = title.rsplit(", ", 1)
-        if name == "MPC":
-            found.append(loop_section(run, tuning.controller.design, f"The step from {step} degC"))
-    return found
-
-
-def _step_times(tuning: Tuning) -> list[float]:
-    """Return the step times of the controller as it will run, over all steps of the spec."""
-    runs = [run for title, run in tuning.runs.items() if title.endswith(", MPC")]
-    return [float(seconds) for run in runs for seconds in run.seconds]
-
-
 def _trade(rows: list[dict[str, Any]]) -> str:
     """Return the sentence of the two ends of the front."""
     front = [row for row in rows if row["best"] and row["controller"] == "MPC"]
@@ -341,14 +328,6 @@ def _unseen(tuning: Tuning) -> str:
     if _uncertain(tuning):
         return "The draws of this table were not used in the search"
     return "The plant has no uncertainty, so the table is of the plant itself, under noise of its own"
-
-
-def _draws(tuning: Tuning) -> range:
-    return range(tuning.spec.search_draws if _uncertain(tuning) else 1)
-
-
-def _hold(tuning: Tuning) -> str:
-    return f"{tuning.spec.hold_s:g} s each"
 
 
 def _shown(value: float | None) -> Any:

@@ -13,14 +13,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from thermogrip.datasets.parallel import kept_processes
+from thermogrip.datasets.parallel import kept_processes, sub_progress
 from thermogrip.report.classification import (
     comparison_sections,
     review_section,
     session_section,
     touch_section,
 )
-from thermogrip.report.console import part
 from thermogrip.report.control import tuning_section
 from thermogrip.report.html import Commands, Section, write_report
 from thermogrip.report.plant import free_run_section, identification_section, posterior_section
@@ -30,11 +29,10 @@ if TYPE_CHECKING:
 
     from thermogrip.classify.estimators.base import GraspClassifier
     from thermogrip.classify.evaluation.comparison import Comparison
-    from thermogrip.datasets.parallel import Workers
+    from thermogrip.datasets.parallel import Progress, Workers
     from thermogrip.datasets.schema import Grasps, Log
     from thermogrip.mpc.tuning.design_review import Check
     from thermogrip.mpc.tuning.tune import Tuning
-    from thermogrip.report.console import Progress
     from thermogrip.rig.session.session import Session
     from thermogrip.sysid.greybox.posterior import Posterior
     from thermogrip.sysid.identification import Identification
@@ -70,10 +68,10 @@ def run_demo(
     with ThreadPoolExecutor(1) as beside, kept_processes(workers):
         compare = partial(_compare, out, seed, workers)
         compared = None if workers == 1 else beside.submit(compare, None)
-        found, plant, record, held_out = _identify(out, seed, part(progress, 0.0, 0.6, "identify"))
-        tuning, checks = _tune(out, plant, seed, workers, part(progress, 0.6, 0.73, "tune"))
-        sessions = _run(out, tuning, plant, seed, part(progress, 0.73, 0.76, "run"))
-        share = part(progress, 0.76, 0.98, "compare")
+        found, plant, record, held_out = _identify(out, seed, sub_progress(progress, 0.0, 0.6, "identify"))
+        tuning, checks = _tune(out, plant, seed, workers, sub_progress(progress, 0.6, 0.73, "tune"))
+        sessions = _run(out, tuning, plant, seed, sub_progress(progress, 0.73, 0.76, "run"))
+        share = sub_progress(progress, 0.76, 0.98, "compare")
         if compared is not None and share is not None:
             share(0.0, "train and test")
         comparison, classifier = compare(share) if compared is None else compared.result()
@@ -120,9 +118,9 @@ def _identify(
 
     cuts = {name: f"@:{SPLIT_S}" if name == "pump_on_off" else "" for name in EXAMPLE_LOGS}
     logs = [read_log(f"{example_path(name)}{cut}") for name, cut in cuts.items()]
-    share = part(progress, 0.0, 0.6)
+    share = sub_progress(progress, 0.0, 0.6)
     found = identify(logs, network="gripper", models=MODELS, draws=0, seed=seed, progress=share)
-    share = part(progress, 0.6, 1.0, "posterior")
+    share = sub_progress(progress, 0.6, 1.0, "posterior")
     plant, record = sample_posterior(found.plant, logs, seed=seed, progress=share)
     plant.save(out / "plant.json")
     whole = read_log(example_path("pump_on_off"))
@@ -163,7 +161,7 @@ def _run(
             "seed": seed + k,
         }
         rig = Twin(plant.draw(DRAW), seed=seed + k, t_start=28.0)
-        share = part(progress, k / len(TOUCHED), (k + 1) / len(TOUCHED), name)
+        share = sub_progress(progress, k / len(TOUCHED), (k + 1) / len(TOUCHED), name)
         with RunFolder(_fresh(out / f"run-{name}"), about) as recorder:
             session = run_session(
                 rig, tuning.controller, T_GRIPPER, grasp=(name, T_OBJECT), recorder=recorder, progress=share
@@ -185,7 +183,7 @@ def _compare(
     examples = load_example_grasps()
     models, left_out = compared_models(seed)
     conditions = [examples[name] for name in COMPARED]
-    share = part(progress, 0.0, 0.85)
+    share = sub_progress(progress, 0.0, 0.85)
     comparison = evaluate(models, conditions, seed=seed, workers=workers, probe=False, progress=share)
     comparison = replace(comparison, notes=(*left_out, *comparison.notes))
     comparison.save(out / "comparison")

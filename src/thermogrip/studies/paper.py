@@ -24,14 +24,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from thermogrip.report.classification import comparison_sections
-from thermogrip.report.console import part
 from thermogrip.report.html import Picture, Section, Table, Text
 
 if TYPE_CHECKING:
     from thermogrip.classify.evaluation.comparison import Comparison
-    from thermogrip.datasets.parallel import Workers
+    from thermogrip.datasets.parallel import Progress, Workers
     from thermogrip.datasets.schema import Grasps
-    from thermogrip.report.console import Progress
 
 CLASSIFIERS = ("posterior", "bayes", "lstm", "lstm-paper")
 SIMULATED = ("posterior", "bayes", "lstm")
@@ -263,7 +261,7 @@ def repeat_paper(
     from thermogrip.classify.estimators.registry import make_classifier
     from thermogrip.classify.evaluation.harness import evaluate
     from thermogrip.datasets.examples import load_example_grasps
-    from thermogrip.datasets.parallel import run_parallel
+    from thermogrip.datasets.parallel import run_parallel, sub_progress
 
     models = {name: make_classifier(name, quick=quick, seed=seed) for name in CLASSIFIERS}
     for model in models.values():
@@ -276,7 +274,7 @@ def repeat_paper(
         seed=seed,
         workers=workers,
         probe=False,
-        progress=part(progress, 0.0, 0.5, "bundled grasps"),
+        progress=sub_progress(progress, 0.0, 0.5, "bundled grasps"),
     )
     twins = [_simulated(case, 100 * seed + k) for k, case in enumerate(CASES)]
     twin = evaluate(
@@ -285,13 +283,13 @@ def repeat_paper(
         seed=seed,
         workers=workers,
         probe=False,
-        progress=part(progress, 0.5, 0.8, "simulated grasps"),
+        progress=sub_progress(progress, 0.5, 0.8, "simulated grasps"),
     )
     copies = run_parallel(
         _copies,
         [(case, examples[case.record], quick, seed) for case in CASES],
         workers,
-        part(progress, 0.8, 1.0, "copies of one grasp"),
+        sub_progress(progress, 0.8, 1.0, "copies of one grasp"),
     )
     known = tuple(_known(case, grasps) for case, grasps in zip(CASES, twins))
     epochs = int(models["lstm"].get_params()["epochs"])
