@@ -50,19 +50,8 @@ def test_a_tuning_is_an_answer_of_yes_where_it_meets_the_spec(
 ) -> None:
     tuned.meets_spec = meets
     bench.write("spec.toml", "steps = [[25, 29]]\nhold_s = 77\n")
-    options = [
-        "tune",
-        "plant.json",
-        "--spec",
-        "spec.toml",
-        "--seed",
-        "3",
-        "--workers",
-        "2",
-        "--out",
-        "c.json",
-    ]
-    done = bench.run(*options, "--report", "t.html")
+    options = ["--spec", "spec.toml", "--seed", "3", "--workers", "2", "--out", "c.json"]
+    done = bench.run("tune", "plant.json", *options, "--report", "t.html")
     assert done.code == code, done
     [call] = tuned.asked
     assert (call.args[0].inputs, call.args[1].hold_s) == (("drive", "pump"), 77.0)

@@ -16,27 +16,8 @@ import typer
 from thermogrip.cli.main import app, main
 from thermogrip.datasets.errors import UserError
 
-HEAVY = (
-    "numpy",
-    "scipy",
-    "xarray",
-    "pandas",
-    "casadi",
-    "numba",
-    "llvmlite",
-    "nlopt",
-    "emcee",
-    "arviz",
-    "pysindy",
-    "daqp",
-    "torch",
-    "sklearn",
-    "matplotlib",
-    "pyarrow",
-    "h5py",
-    "serial",
-    "jinja2",
-)
+HEAVY = ["numpy", "scipy", "xarray", "pandas", "casadi", "numba", "llvmlite", "nlopt", "emcee", "arviz"]
+HEAVY += ["pysindy", "daqp", "torch", "sklearn", "matplotlib", "pyarrow", "h5py", "serial", "jinja2"]
 
 VERBS = [command.name for command in app.registered_commands]
 

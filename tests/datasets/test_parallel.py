@@ -98,7 +98,7 @@ def cluster():
         processes=False,
         protocol="tcp",
         host="127.0.0.1",
-        dashboard_address=None,
+        dashboard_address=":0",
     )
     yield made.scheduler_address
     made.close()

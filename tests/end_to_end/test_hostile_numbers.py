@@ -6,6 +6,7 @@ import json
 import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import example_path
 from thermogrip.datasets.grasp_files import read_grasps
 from thermogrip.datasets.log_files import read_log
+from thermogrip.datasets.schema import Grasps
 from thermogrip.mpc import Controller
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.design.spec import Spec, read_spec
@@ -111,14 +113,19 @@ def a_stop_rule() -> dict[str, Any]:
     return asdict(StopRule(sure=0.9)) | {"schema": "thermogrip.stop_rule", "version": 1}
 
 
+@cache
+def two_grasps(name: str, second: int) -> Grasps:
+    """Return the first of the bundled grasps and another one, as touches of one block where they have one."""
+    grasps = read_grasps(example_path(name)).isel(grasp=[0, second])
+    return grasps.assign(touch_group=("grasp", ["one", "one"])) if "touch_group" in grasps else grasps
+
+
 def use_gripper(path: Path) -> None:
-    grasps = read_grasps(example_path("exp2_dT20")).isel(grasp=[0, 12])
-    effusivity_posterior(GripperModel.load(path), grasps)
+    effusivity_posterior(GripperModel.load(path), two_grasps("exp2_dT20", 12))
 
 
 def use_coupling(path: Path) -> None:
-    grasps = read_grasps(example_path("exp5_two_touch_unknown_object")).isel(grasp=[0, 1])
-    grasps["touch_group"][:] = "one"
+    grasps = two_grasps("exp5_two_touch_unknown_object", 1)
     effusivity_posterior(load_default_gripper(), grasps, coupling=Coupling.load(path))
 
 

@@ -180,7 +180,7 @@ def test_a_cluster_finds_the_same_controller_bit_for_bit(lab: Bench):
         processes=False,
         protocol="tcp",
         host="127.0.0.1",
-        dashboard_address=None,
+        dashboard_address=":0",
     )
     try:
         there = tune(plant, spec, workers=cluster.scheduler_address)

@@ -29,19 +29,8 @@ def answer(bench: Bench, *words: object, code: int = 0) -> dict[str, object]:
 
 
 def test_logs_become_a_plant_that_runs_freely(bench: Bench) -> None:
-    words = [
-        "identify",
-        "good.csv",
-        "--network",
-        "none",
-        "--models",
-        "arx",
-        "--average",
-        "1",
-        "--out",
-        "p.json",
-    ]
-    found = answer(bench, *words, "--report", "p.html")
+    options = ["--network", "none", "--models", "arx", "--average", "1", "--out", "p.json"]
+    found = answer(bench, "identify", "good.csv", *options, "--report", "p.html")
     assert found["model"] == "arx"
     scored = answer(bench, "validate", "p.json", "good.csv")["logs"]
     assert isinstance(scored, list)
