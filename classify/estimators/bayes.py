@@ -166,7 +166,7 @@ class FeatureReader:
         return cls(list(content["features"]), bool(content["normalise"]), float(content["end"]))
 
     def read(self, grasps: Grasps) -> Readings:
-        """Return the features of other grasps; one that is half a second shorter than those of the
+        """Return the features of other grasps; one that is more than half a second shorter than those of the
         training, or whose object temperature is unknown where theirs were not, is a :class:`UserError`."""
         last = _last(grasps)
         if (last < self.end - HELD_AT_AN_END).any():

@@ -1,26 +1,34 @@
-"""Every figure draws without a warning and shows what the tables say."""
+"""Every figure shows what the tables say: its artists are those of its record."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from io import BytesIO
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
 
+from tests.report.conftest import described
 from thermogrip.classify import evaluate
 from thermogrip.classify.evaluation.comparison import Comparison
 from thermogrip.classify.figures import (
     accuracy_figure,
     confusion_figure,
     curve_figure,
+    decision_figure,
     effusivity_figure,
     reliability_figure,
 )
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
+
+DRAWN = Path(__file__).with_name("figures.txt")
+NINE = tuple("abcdefghi")  # one more than there are colours and markers
 
 
 def strip(name: str, median: float, low: float, high: float) -> Any:
@@ -35,16 +43,157 @@ def comparison(three: Grasps, make_touches: Callable[..., Grasps]) -> Comparison
     return evaluate(["bayes", "pca-lda"], [three, make_touches(name="b", seed=1), apart], probe=False)
 
 
-def drawn(figure: object) -> int:
-    """Return the size of the figure as PNG; drawing raises what it warns of."""
-    buffer = BytesIO()
-    figure.savefig(buffer, format="png", dpi=60)  # type: ignore[attr-defined]
-    return len(buffer.getvalue())
+def fine_print(figure: Figure) -> Iterator[str]:
+    """Yield lines on the texts, ticks, images and edges of a figure."""
+    if figure._suptitle is not None:  # type: ignore[attr-defined]
+        yield f"  above {figure.get_suptitle()!r} {figure._suptitle.get_fontsize():g}"  # type: ignore[attr-defined]
+    for k, axes in enumerate(figure.axes):
+        for axis in (axes.xaxis, axes.yaxis):
+            ticks = [f"{t.get_text()}" for t in axis.get_ticklabels()]
+            first = axis.get_ticklabels()[0] if ticks else axis.label
+            minor, size = len(axis.get_minor_locator()()), first.get_fontsize()
+            yield f"  {k}: ticks {ticks} {size:g} {first.get_rotation():g} {first.get_ha()} {minor}"
+        for text in axes.texts:
+            at = " ".join(f"{x:.4g}" for x in text.get_position())
+            how = f"{text.get_fontsize():g} {text.get_rotation():g} {text.get_ha()} {text.get_va()}"
+            yield f"  {k}: text {text.get_text()!r} {at} {how} {to_hex(text.get_color())}"
+        for image in axes.images:
+            shares = np.round(np.asarray(image.get_array()), 4).tolist()
+            yield f"  {k}: image {shares} {image.get_clim()} {image.get_cmap().name}"
+        yield from sorted({f"  {k}: edge {_edge(line)}" for line in axes.get_lines()})
+        for found in axes.collections:
+            ends = [np.round(path.vertices, 4).tolist() for path in found.get_paths()]
+            yield f"  {k}: strokes {found.get_alpha()} {ends}"
+        for bar in axes.patches:
+            yield f"  {k}: bar {np.round(bar.get_bbox().extents, 4).tolist()}"
+
+
+def _edge(line: Any) -> str:
+    colours = f"{to_hex(line.get_markerfacecolor())} {to_hex(line.get_markeredgecolor())}"
+    return f"{colours} {line.get_markeredgewidth():g} {line.get_clip_on()} {line.get_solid_capstyle()}"
+
+
+def compared() -> Any:
+    """Return nine classifiers that were scored in two conditions, the first and the last in one apart."""
+    rows = [
+        {"classifier": c, "condition": condition, "apart": condition == "dry", "n": 20 - 3 * i, "low": 0.3,
+         "accuracy": 0.4 + 0.05 * k, "high": 0.85 + 0.01 * k, "log_loss_chance": np.log(3 + i)}
+        for k, c in enumerate(NINE)
+        for i, condition in enumerate(("pooled", "dry", "wet"))
+        if condition != "dry" or c in "ai"
+    ]  # fmt: skip
+    bins = lambda k: [  # noqa: E731
+        {"low": 0.4, "high": 0.5, "n": 6, "confidence": 0.47, "accuracy": 0.3 + k / 50, "accuracy_low": 0.1,
+         "accuracy_high": 0.6},
+        {"low": 0.9, "high": 1.0, "n": 15, "confidence": 0.97, "accuracy": 1.0, "accuracy_low": 0.8,
+         "accuracy_high": 1.0},
+    ]  # fmt: skip
+    counts = np.array([[6.0, 0.0, 2.0], [0.25, 1.25, 1.0], [0.0, 0.0, 0.0]])
+    return SimpleNamespace(
+        classifiers=NINE, repeats=3, conditions=("dry", "wet"), scores=lambda: rows,
+        calibration=lambda name, _: bins(NINE.index(name)),
+        confusion=lambda name, _: ([] if name == "c" else ["iron", "wood", "zinc"], counts + (name == "b")),
+    )  # fmt: skip
+
+
+def several(count: int, condition: str = "wet") -> Any:
+    """Return some of them in one condition."""
+    found = compared()
+    rows = [r for r in found.scores() if r["classifier"] in NINE[:count] and r["condition"] == condition]
+    return SimpleNamespace(**vars(found) | {"classifiers": NINE[:count], "scores": lambda: rows})
+
+
+def points(
+    over: str, at: tuple[float, ...], names: tuple[str, ...], chance: float = 1.1
+) -> list[dict[str, Any]]:
+    """Return a curve, its points in no order."""
+    return [
+        {"classifier": name, over: x, "accuracy": 0.05 * x + 0.03 * k, "low": 0.04 * x, "high": 0.08 * x,
+         "log_loss": 1.3 - 0.1 * x + 0.01 * k, "log_loss_chance": chance + (0.2 if x > 6 else 0)}
+        for k, name in enumerate(names)
+        for x in at
+    ]  # fmt: skip
+
+
+def decided(latest: float, names: tuple[str, ...]) -> Any:
+    """Return when contacts ended; only the first row of a classifier is drawn beside."""
+    row = {
+        "time": 2.5,
+        "time_low": 1.5,
+        "time_high": 4.0,
+        "accuracy": 0.8,
+        "low": 0.6,
+        "high": 0.9,
+        "end": 9.0,
+    }
+    table = [
+        {"classifier": name, "accuracy_at_end": 0.95 - 0.01 * k} | row | {"time": row["time"] + i + 0.1 * k}
+        for k, name in enumerate(names)
+        for i in range(2)
+    ]
+    times = [
+        {"classifier": name, "time": x + k} for k, name in enumerate(names) for x in (latest - k, 0.2, 1.0)
+    ]
+    return SimpleNamespace(table=lambda: table, rows=times)
+
+
+STRIPS = [strip(c, 300.0 * (k + 1), 250.0 * (k + 1), 420.0 * (k + 1)) for k, c in enumerate("abcdefghi")]
+LIBRARY = {
+    "cork": 200.0,
+    "oak": 400.0,
+    "fir": 405.0,
+    "ash": 410.0,
+    "elm": 415.0,
+    "glass": 1400.0,
+    "ice": 1430.0,
+}
+FIGURES: dict[str, Callable[[], Figure]] = {
+    "accuracy": lambda: accuracy_figure(compared()),
+    "accuracy of two": lambda: accuracy_figure(several(2, "wet")),
+    "accuracy apart": lambda: accuracy_figure(several(1, "dry")),
+    **{
+        f"confusion of {n}": lambda n=n: confusion_figure(several(n + (n > 2)), "wet")
+        for n in (1, 4, 5, 6, 7)
+    },
+    "reliability": lambda: reliability_figure(compared(), "dry"),
+    "strips": lambda: effusivity_figure(STRIPS, LIBRARY, materials=[*"zyxwvutsz"[:8], "q"]),
+    "strips of nobody knows what": lambda: effusivity_figure(STRIPS[:2], {"air": 1.0, "copper": 36e3}),
+    "curve of grasps": lambda: curve_figure(points("train_per_class", (5, 2), NINE), "train_per_class"),
+    "curve of time": lambda: curve_figure(points("contact_s", (10.0, 3.0), ("a", "b")), "contact_s"),
+    "curve of warmth": lambda: curve_figure(points("difference_K", (4.0, 1.0), ("a",), 0.5), "difference_K"),
+    "decisions": lambda: decision_figure(decided(25.0, NINE)),
+    "early decisions": lambda: decision_figure(decided(20.0, ("a",))),
+}
+
+
+def test_each_figure_shows_what_it_should_in_the_colours_widths_and_units_of_the_record() -> None:
+    """``figures.txt`` has every artist; THERMOGRIP_FIGURES=write writes it anew: read the difference."""
+    made = {name: draw() for name, draw in FIGURES.items()}
+    found = [
+        line
+        for name, figure in made.items()
+        for line in (f"# {name}", *described(figure), *fine_print(figure))
+    ]
+    if os.environ.get("THERMOGRIP_FIGURES") == "write":
+        DRAWN.write_text("\n".join(found) + "\n", encoding="utf-8")
+    assert found == DRAWN.read_text(encoding="utf-8").splitlines()
+
+
+@pytest.mark.parametrize(
+    ("draw", "message"),
+    [
+        (lambda c: confusion_figure(c, "c"), "nothing was tested in 'c'; there are touches, b, apart"),
+        (lambda c: effusivity_figure([], {}), "no posterior to draw"),
+        (lambda c: curve_figure([], "contact_s"), "there is no curve to draw"),
+    ],
+)
+def test_nothing_is_not_drawn(draw: Callable[[Any], Figure], message: str, comparison: Comparison) -> None:
+    with pytest.raises(UserError, match=message):
+        draw(comparison)
 
 
 def test_accuracy_shows_a_row_a_condition_and_its_count(comparison: Comparison) -> None:
     figure = accuracy_figure(comparison)
-    assert drawn(figure) > 1000
     labels = [text.get_text() for text in figure.axes[0].get_yticklabels()]
     assert labels == ["pooled  (n = 18)", "touches  (n = 9)", "b  (n = 9)", "apart  (n = 9)"]
     assert figure.axes[0].get_ylim() == (3.5, -0.5)  # the first row on top, each one whole
@@ -58,7 +207,6 @@ def test_accuracy_shows_a_row_a_condition_and_its_count(comparison: Comparison) 
 
 def test_confusion_has_a_panel_a_classifier(comparison: Comparison) -> None:
     figure = confusion_figure(comparison)
-    assert drawn(figure) > 1000
     assert [axis.get_title() for axis in figure.axes[:2]] == ["bayes", "pca-lda"]
     for axis, name in zip(figure.axes, comparison.classifiers):
         _, counts = comparison.confusion(name)
@@ -66,8 +214,6 @@ def test_confusion_has_a_panel_a_classifier(comparison: Comparison) -> None:
             (int(t.get_position()[1]), int(t.get_position()[0])): float(t.get_text()) for t in axis.texts
         }
         assert written == {where: n for where, n in np.ndenumerate(counts) if n > 0}
-    with pytest.raises(UserError, match="nothing was tested in 'c'; there are touches, b, apart"):
-        confusion_figure(comparison, "c")
 
 
 @pytest.mark.parametrize("condition", ["pooled", "apart"])
@@ -83,41 +229,3 @@ def test_reliability_is_the_calibration_table(comparison: Comparison, condition:
         grasps = sum(bar.get_height() for bar in bottom[k].patches)
         (score,) = [s for s in comparison.scores() if (s["classifier"], s["condition"]) == (name, condition)]
         assert grasps == pytest.approx(score["n"])  # each test grasp is counted in one bar
-    assert drawn(figure) > 1000
-
-
-def test_strips_stand_on_a_logarithmic_axis_beside_the_library() -> None:
-    rows = [strip("a", 3.6e4, 2e4, 6e4), strip("b", 400.0, 350.0, 450.0)]
-    figure = effusivity_figure(rows, {"copper": 3.64e4, "wood": 367.0}, materials=["copper", "wood"])
-    assert drawn(figure) > 1000
-    assert figure.axes[0].get_xscale() == "log"
-    assert {"copper", "wood"} <= {t.get_text() for t in figure.axes[0].texts}
-    assert drawn(effusivity_figure(rows, {})) > 1000
-    crowd = {"iron": 16142.0, "zinc": 17551.0, "brass": 19084.0, "copper": 36388.0, "wood": 367.0}
-    figure = effusivity_figure(rows, crowd, materials=["copper", "wood"])
-    assert {"wood", "iron, zinc", "brass", "copper"} <= {t.get_text() for t in figure.axes[0].texts}
-    with pytest.raises(UserError, match="no posterior to draw"):
-        effusivity_figure([], {})
-
-
-def test_a_curve_has_a_line_a_classifier_and_an_axis_that_says_what_varies() -> None:
-    def point(name: str, size: int, accuracy: float) -> dict[str, object]:
-        spread = {"low": accuracy - 0.1, "high": accuracy + 0.1, "log_loss": 1 - accuracy}
-        return {
-            "classifier": name,
-            "train_per_class": size,
-            "accuracy": accuracy,
-            "log_loss_chance": 1.1,
-        } | spread
-
-    rows = [point(name, size, 0.1 * size + 0.2) for name in ("bayes", "lstm") for size in (5, 2)]
-    figure = curve_figure(rows, "train_per_class")
-    left, right = figure.axes
-    assert left.get_xlabel() == "training grasps of each material"
-    assert [line.get_label() for line in right.get_lines()] == ["bayes", "lstm", "chance: log loss 1.10"]
-    assert [round(float(x)) for x in right.get_lines()[0].get_xdata()] == [2, 5]
-    assert left.get_xticks().tolist() == right.get_xticks().tolist() == [2, 5]
-    times = [{**row, "contact_s": row["train_per_class"]} for row in rows]
-    assert len(curve_figure(times, "contact_s").axes[0].get_xticks()) > 2  # an axis of its own round numbers
-    with pytest.raises(UserError, match="there is no curve to draw"):
-        curve_figure([], "contact_s")
