@@ -153,8 +153,7 @@ def _held_out(records: Sequence[Grasps], kind: str, seed: int) -> Plan:
         parts = []
         for grasps, key in zip(records, keys):
             name, out = log_name(grasps), np.isin(key, list(held))
-            known = grasp_labels(grasps) != ""
-            train = pick(grasps, known & ~out) if (known & ~out).any() else None
+            train = None if out.all() else pick(grasps, ~out)
             if train is not None:
                 parts.append(train)
             if not out.any():

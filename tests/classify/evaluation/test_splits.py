@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from thermogrip.classify.estimators.base import pick
-from thermogrip.classify.evaluation.splits import plan_folds, scored_apart
+from thermogrip.classify.evaluation.splits import _alike, _copies, plan_folds, scored_apart
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Grasps
+from thermogrip.datasets.schema import Grasps, make_grasps
 
 Maker = Callable[..., Grasps]
 
@@ -35,6 +35,92 @@ def test_random_splits_share_no_grasp_and_differ(three: Grasps) -> None:
     assert len({frozenset(ids(f.test)) for f in folds}) == 4
     again = plan_folds([three], split="random", repeats=4, train_per_class=5, seed=1).folds
     assert [ids(f.test) for f in again] == [ids(f.test) for f in folds]
+
+
+def test_conditions_of_one_size_are_split_differently_and_trained_on_together(make_touches: Maker) -> None:
+    both = [make_touches(name=n, seed=k) for k, n in enumerate(("warm", "cold"))]
+    plan = plan_folds(both, split="random", repeats=3, train_per_class=5, seed=4)
+    assert [(f.condition, f.repeat) for f in plan.folds] == [
+        (n, k) for n in ("warm", "cold") for k in range(3)
+    ]
+    places = [[i.split("-")[1] for i in f.train["grasp"].values] for f in plan.folds]
+    assert all(a != b for a, b in zip(places[:3], places[3:]))
+    for repeat, parts in enumerate(plan.training):
+        assert [ids(part) for part in parts] == [ids(f.train) for f in plan.folds if f.repeat == repeat]
+    assert len(plan.training) == 3
+    of_one = pick(both[1], both[1]["material"].values == "iron")
+    plan = plan_folds([both[0], of_one], split="random", repeats=1)
+    assert plan.notes == ("cold: grasps of one material: left out",)
+    with pytest.raises(UserError, match="0 repeats; give at least one"):
+        plan_folds(both, split="random", repeats=0)
+
+
+def test_a_copy_under_another_name_is_noted_where_its_samples_speak() -> None:
+    """Ten values that differ do; lost samples are none."""
+    rows = [np.arange(12.0) % 10, np.arange(12.0) % 9, np.where(np.arange(12) < 9, np.arange(12.0), np.nan)]
+    a, b, c = (make_grasps(np.arange(12) * 0.1 - 0.5, rows, [n + i for i in "012"], name=n) for n in "abc")
+    assert _copies([a, b, c]) == [
+        f"{n}/{n}0 has the samples of a/a0: a copy in training and in test is a leak" for n in "bc"
+    ]
+
+
+def test_a_copy_in_the_training_and_the_test_file_is_refused(three: Grasps, make_touches: Maker) -> None:
+    copy = three.assign_coords(grasp=[f"other-{i}" for i in range(24)]).assign_attrs(name="fresh")
+    with pytest.raises(
+        UserError, match="fresh/other-0 has the samples of touches/touches-0.*leave one of the"
+    ):
+        plan_folds([three.drop_vars("split")], test=[copy])
+    trainer = three.assign_coords(grasp=copy["grasp"].values).assign_attrs(name="more").drop_vars("split")
+    plan = plan_folds([three, trainer], split="random", repeats=1)  # two of the training: only a note each
+    assert len(plan.notes) == 24
+    fresh = plan_folds([three], test=[make_touches(name="fresh", seed=2)])  # one training file needs no match
+    assert fresh.notes == ("fresh: candidates and training grasps are those of touches",)
+    strange = plan_folds([three], test=[make_touches(("zinc",), name="strange", seed=2)])
+    assert strange.notes[1] == "strange: nothing to score, as no training grasp is of zinc"
+
+
+def alike(name: str, materials: str, *, kin: str = "", t_object: float = 18.0, skin: float = 23.0) -> Grasps:
+    """Return a record of grasps that hold still."""
+    n = len(materials)
+    about = {"experiment": [kin] * n, "t_object": [t_object] * n, "t_gripper": [skin] * n}
+    return make_grasps(
+        [0, 0.1], np.ones((n, 2)), list(materials), name=name, material=list(materials), **about
+    )
+
+
+@pytest.mark.parametrize(
+    ("trains", "expected"),
+    [
+        ([alike("rich", "abc"), alike("kin", "ab", kin="e2"), alike("x", "a")], "x"),
+        ([alike("rich", "abc"), alike("kin", "ab", kin="e2"), alike("y", "a", kin="e1")], "kin"),
+        ([alike("poor", "ab"), alike("rich", "abc", kin="e1"), alike("later", "abd")], "rich"),
+        ([alike("x", "ab", t_object=18.06), alike("warm", "ab", skin=23.2), alike("far", "ab", t_object=17.96)], "far"),
+        ([alike("x", "ab", kin="e2", skin=24.0), alike("x", "ab", t_object=-18.0)], None),
+        ([alike("x", "ab").drop_vars("t_object")], None),
+    ],
+)  # fmt: skip
+def test_training_is_borrowed_at_its_temperatures_by_name_by_experiment_or_of_the_most_materials(
+    trains: list[Grasps], expected: str | None
+) -> None:
+    found = _alike(alike("x", "z", kin="e2"), trains)
+    assert (found if found is None else found.attrs["name"]) == expected
+    if expected == "rich":  # no experiment is not a common one
+        assert _alike(alike("w", "z"), trains).attrs["name"] == expected  # type: ignore[union-attr]
+
+
+def test_a_condition_that_nobody_can_train_is_left_out_with_a_note(make_touches: Maker) -> None:
+    known, cold = make_touches(name="known"), make_touches(name="cold", t_object=18.0, seed=1)
+    cold = pick(cold, cold["split"].values == "test")
+    wood = make_touches(name="one", t_object=33.0, seed=2)
+    wood = pick(wood, (wood["material"].values == "wood") | (wood["split"].values == "test"))
+    plan = plan_folds([known, cold, wood])
+    assert [f.condition for f in plan.folds] == ["known"]
+    assert plan.notes == (
+        "cold: no training grasps, nor a condition at its temperatures: left out",
+        "one: its training grasps are of one material: left out",
+    )
+    with pytest.raises(UserError, match="cold: no condition has a split .*left out; fill the column 'split'"):
+        plan_folds([cold])
 
 
 def test_both_touches_of_a_block_are_on_one_side(three: Grasps) -> None:
@@ -147,6 +233,23 @@ def test_a_block_is_held_out_in_every_condition_at_once(make_touches: Maker) -> 
         assert {m for m, _ in out} == {"copper", "iron", "wood"}
         for part in plan.training[fold.repeat]:
             assert not out & set(zip(part["material"].values, part["block"].values))
+
+
+def test_grasps_without_a_session_or_block_are_of_their_file_or_one_block(make_touches: Maker) -> None:
+    warm, cold = make_touches(name="warm"), make_touches(("iron", "zinc"), name="cold", seed=1)
+    days = np.where(np.arange(24) % 4 == 0, "monday", "")
+    plan = plan_folds([warm.assign(session=("grasp", days)), cold], split="session")
+    held = [(f.condition, f.repeat, f.test.sizes["grasp"], f.train.sizes["grasp"]) for f in plan.folds]
+    assert held == [("warm", 1, 6, 18), ("warm", 2, 18, 6)]  # cold, monday, warm
+    assert [[part.sizes["grasp"] for part in parts] for parts in plan.training] == [[24], [18, 16], [6, 16]]
+    assert plan.notes == ("cold: without cold too little is left to train on",)
+    blocks = np.where(np.arange(24) % 3 == 0, "b1", np.where(np.arange(24) % 3 == 1, "b2", ""))
+    plan = plan_folds([warm.assign(block=("grasp", blocks))], split="block", seed=3)
+    out = [sorted(zip(f.test["material"].values, f.test["block"].values)) for f in plan.folds]
+    assert sum(map(len, out)) == 24  # each grasp is tested once
+    assert all(len(set(o)) == 3 for o in out)
+    other = plan_folds([warm.assign(block=("grasp", blocks))], split="block", seed=5)
+    assert [ids(f.test) for f in other.folds] != [ids(f.test) for f in plan.folds]
 
 
 def test_a_split_by_what_there_is_one_of_is_refused(three: Grasps) -> None:
