@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import norm
+from scipy.stats import multivariate_normal, norm
 
 from thermogrip.classify import Costs, choose_next_touch, make_classifier, name_or_unknown
 from thermogrip.classify.decisions import next_touch
@@ -61,6 +61,30 @@ def test_candidates_are_separated_as_their_densities_are(odds: float, distance: 
     assert found.information[0] == pytest.approx(entropy(log_p)[0] - open_after, abs=0.015)
 
 
+def test_expected_information_is_the_mean_over_the_drawn_readings() -> None:
+    """One reading after another, with scipy's densities; what is less likely than 1e-4 is not drawn."""
+    rng = np.random.default_rng(8)
+    root = rng.standard_normal((2, 4, 2, 2))
+    covariance, mean = root @ root.transpose(0, 1, 3, 2) + 0.2 * np.eye(2), rng.standard_normal((2, 4, 2))
+    p = np.array([[0.6, 0.3 - 3e-4, 0.1, 3e-4], [0.2, 9e-5, 0.5, 0.3 - 9e-5]])
+    found = expected_information(PosteriorPredictive(np.log(p), mean, covariance))
+    half = np.random.default_rng(0).standard_normal((48, 2))
+    for i in range(2):
+        later, right = 0.0, 0.0
+        for k in np.flatnonzero(p[i] > 1e-4):
+            for z in np.concatenate([half, -half]):
+                y = mean[i, k] + np.linalg.cholesky(covariance[i, k]) @ z
+                q = p[i] * [multivariate_normal.pdf(y, mean[i, j], covariance[i, j]) for j in range(4)]
+                q /= q.sum()
+                later -= p[i, k] * np.sum(q * np.log(q)) / 96
+                right += p[i, k] * (q.max() - q[p[i].argmax()]) / 96
+        assert found.information[i] == pytest.approx(-np.sum(p[i] * np.log(p[i])) - later)
+        assert found.gain[i] == pytest.approx(right)
+        assert found.accuracy[i] == pytest.approx(p[i].max() + right)
+    nothing = expected_information(PosteriorPredictive(np.log(p), mean[..., :0], covariance[..., :0, :0]))
+    assert [list(v) for v in nothing] == [[0, 0], [0.6, 0.5], [0, 0]]
+
+
 def test_each_draw_is_used_with_both_signs_so_that_a_mirror_image_adds_as_much() -> None:
     rng = np.random.default_rng(0)
     root = rng.standard_normal((3, 4, 2, 2))
@@ -92,6 +116,8 @@ def test_unknown_is_answered_where_it_is_the_cheaper_mistake() -> None:
     # a rejection that costs little is used where the candidates are alike, too
     careful = Costs(rejected=0.3)
     assert name_or_unknown(p, outside, names, costs=careful).tolist() == ["iron", "unknown", "unknown"]
+    assert Costs() == Costs(rejected=0.5, missed=1.0)
+    assert name_or_unknown([[0.5, 0.5]], [0.0], names).tolist() == ["iron"]  # at equal costs a name
     bold = Costs(rejected=1e6)
     assert name_or_unknown(p, outside, names, costs=bold).tolist() == ["iron"] * 3
     # a grasp without an answer is unknown whatever that costs
@@ -136,8 +162,10 @@ def test_a_slow_gripper_asks_nearer(known: PosteriorClassifier, touched: Grasps)
     dear = choose_next_touch(known, touched, t_gripper=[15.0, 22.0], price=0.002, seconds=slow)
     assert (fast.best, dear.best) == (15.0, 22.0)
     assert not choose_next_touch(known, touched, t_gripper=[15.0, 25.0], price=0.1).worth_it
-    with pytest.raises(UserError, match="rate is not positive"):
-        at_rates(20.0, heating=0.0, cooling=1.0)
+    assert [at_rates(20.0, heating=2.0, cooling=0.5)(t) for t in (25.0, 15.0, 20.0)] == [2.5, 10.0, 0.0]
+    for rates in ((0.0, 1.0), (1.0, 0.0)):
+        with pytest.raises(UserError, match="rate is not positive"):
+            at_rates(20.0, heating=rates[0], cooling=rates[1])
 
 
 def test_values_that_tie_go_to_the_most_information() -> None:
@@ -196,6 +224,14 @@ def test_a_touch_is_worth_what_it_gains_less_the_cost_of_its_seconds(monkeypatch
     np.testing.assert_allclose(weighed[0][0], [4 / 7, 3 / 7])
     assert found.accuracy_now == pytest.approx(4 / 7)
     assert found.entropy == pytest.approx(-np.sum(weighed[0][0] * np.log(weighed[0][0])))
+    plain = choose_next_touch(None, None, t_gripper=[20.0, 30.0, 40.0])  # type: ignore[arg-type]
+    np.testing.assert_allclose(plain.value, [0.03, 0.13, 0.23])  # 60 s of rest, 10 s of touch
+    assert plain.seconds.tolist() == [70.0] * 3
+    every = choose_next_touch(None, None, t_gripper=20.0, price=0.0)  # type: ignore[arg-type]
+    assert every.t_gripper.tolist() == [20.0]
+    assert next_touch.TEMPERATURES == (
+        12.5, 15.0, 17.5, 20.0, 22.5, 25.0, 27.5, 30.0, 32.5, 35.0, 37.5, 40.0, 42.5, 45.0, 47.5, 50.0
+    )  # fmt: skip
 
 
 def test_advice_goes_to_every_touch_at_the_given_cost_per_second(
@@ -218,6 +254,15 @@ def test_advice_goes_to_every_touch_at_the_given_cost_per_second(
     # of the touch that is best, and not of the one that would be right most often
     assert rows[0] == {"next_touch_degC": 30.0, "next_touch_accuracy": 0.7}
     assert rows[1] == {"next_touch_degC": None, "next_touch_accuracy": 0.55}
+    asked.clear()
+    grasps["t_surface"].values[2] = 23.0  # a skin that does not move, 20 K from its block
+    told: list[tuple[float, str]] = []
+    paired = grasps.assign(touch_group=("grasp", ["b", "b", "c", "d", "d", "d"]))
+    rows = advise_touches(None, paired, progress=lambda *at: told.append(at))  # type: ignore[arg-type]
+    assert asked == [{"candidates": None, "price": 0.001}] * 2
+    assert rows[2] == {"next_touch_degC": None, "next_touch_accuracy": None}
+    assert [row["next_touch_degC"] for row in rows] == [30.0, 30.0, None, None, None, None]
+    assert told == [(k / 3, f"another touch of {name}") for k, name in enumerate("bcd")]
 
 
 @pytest.fixture
@@ -237,26 +282,30 @@ def plant() -> Plant:
 HALF, FULL = {"drive": (-0.5, 1.0)}, {}  # downwards; a drive of unknown range goes from full to full
 
 
+LEFT = 0.9975**10  # of a difference from the room: readings of now are met half way through 10 s of rest
+
+
 @pytest.mark.parametrize(
-    ("valid", "now", "there", "left", "within"),
+    ("valid", "now", "there", "left"),
     [
-        (HALF, 25.0, 25.0, 1.0, 1e-9),
-        (HALF, 25.0, 40.0, 1 - 15 / 40, 1.5),
-        (HALF, 25.0, 15.0, 1 - 10 / 20, 1.5),
-        (FULL, 25.0, 10.0, 1 - 15 / 40, 1.5),
-        # from 35 degC in a room of 25: full drive ends at 65, half of it downwards at 5; ten seconds without
-        # drive come first, in which 0.5 K are lost, or 3 s of full drive
-        (HALF, 35.0, 50.0, 15 / 30, 3.0),
-        (HALF, 35.0, 20.0, 15 / 30, 3.0),
-        (HALF, 35.0, 4.0, 0.0, 0.0),
-        (HALF, 25.0, 70.0, 0.0, 0.0),
+        (HALF, 25.0, 25.0, 1.0),
+        (HALF, 25.0, 40.0, 1 - 15 / 40),
+        (HALF, 25.0, 15.0, 1 - 10 / 20),
+        (FULL, 25.0, 10.0, 1 - 15 / 40),
+        # from 35 degC in a room of 25: full drive ends at 65, half of it downwards at 5
+        (HALF, 35.0, 50.0, 15 / (40 - 10 * LEFT)),
+        (HALF, 35.0, 20.0, 15 / (20 + 10 * LEFT)),
+        (HALF, 35.0, 4.0, 0.0),
+        (HALF, 25.0, 70.0, 0.0),
+        (HALF, 25.0, 64.5, 0.5 / 40),  # 876 s
+        (HALF, 25.0, 64.6, 0.0),  # more than 900 s
     ],
 )
 def test_the_time_to_a_temperature_is_the_first_order_step_or_forever(
-    plant: Plant, valid: dict[str, tuple[float, float]], now: float, there: float, left: float, within: float
+    plant: Plant, valid: dict[str, tuple[float, float]], now: float, there: float, left: float
 ) -> None:
     seconds = by_plant(replace(plant, valid=valid), now, t_ambient=25.0)(there)
-    assert seconds == pytest.approx(-200 * np.log(left) if left else np.inf, abs=within)
+    assert seconds == (0.5 * np.ceil(np.log(left) / np.log(0.9975)) if left else np.inf)
 
 
 def test_what_has_no_model_is_refused(plant: Plant, known: PosteriorClassifier, touched: Grasps) -> None:
@@ -264,8 +313,9 @@ def test_what_has_no_model_is_refused(plant: Plant, known: PosteriorClassifier, 
         by_plant(plant, 25.0, t_ambient=25.0, output="t_skin")
     with pytest.raises(UserError, match="cannot predict readings"):
         choose_next_touch(make_classifier("pca-lda"), touched)
-    with pytest.raises(UserError, match="is no number"):
-        choose_next_touch(known, touched, t_gripper=[np.nan])
+    for wrong in ({"t_gripper": [np.nan]}, {"t_gripper": []}, {"price": -1e-9}, {"price": np.inf}):
+        with pytest.raises(UserError, match="is no number"):
+            choose_next_touch(known, touched, **wrong)  # type: ignore[arg-type]
     with pytest.raises(UserError, match="'gold' is no class"):
         choose_next_touch(known, touched, candidates=["gold", "iron"])
 

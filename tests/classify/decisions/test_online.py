@@ -61,6 +61,28 @@ def test_the_rule_is_asked_at_its_times_and_ends_a_contact_from_its_probability_
     assert touch.decided_at == (given["time"] if ends else given["decided"])
 
 
+def test_readings_count_from_a_quarter_of_a_second_to_the_end_of_the_training() -> None:
+    touch = stream(np.array([23.0]), np.array([-1.0]))
+    prior = dict(zip(touch.candidates, np.exp(touch.log_p).tolist()))
+    touch._model.longest_ = last = 10.0
+    taken: list[float] = []
+    touch._evaluate = lambda: taken.append(touch._time[-1])  # type: ignore[method-assign]
+    assert touch.nothing_because == ""
+    for time in (0.25, 0.2500001, 5.0, last, last + 5e-7, last + 2e-6, 12.0):
+        assert touch.update(time, np.nan if time == 5.0 else -200.0 if time == 12 else 24.0) == prior
+    assert taken == [0.2500001, last, last + 5e-7]
+    with pytest.raises(UserError, match=r"a reading of 200\.1 degC"):
+        touch.update(13.0, 200.1)
+    early = stream(np.array([23.0, np.nan]), np.array([-0.25, -0.3 + 0.2]))  # no level before -0.25 s
+    early.update(0.25, 24.0)
+    with pytest.raises(UserError, match="no reading before contact"):
+        early.update(0.26, 24.0)
+
+
+def test_without_a_least_gain_nothing_is_expected() -> None:
+    assert Stream._gain(SimpleNamespace(), None, SimpleNamespace(gain=0.0)) == np.inf  # type: ignore[arg-type]
+
+
 def test_no_contact_ends_nothing_and_names_nothing() -> None:
     flat = 48.0 + 0.05 * np.random.default_rng(0).standard_normal(TIME.size)
     touch = stream(flat, until=3.5)

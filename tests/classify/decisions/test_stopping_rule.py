@@ -9,20 +9,25 @@ import numpy as np
 import pytest
 
 from thermogrip.classify import StopRule, Stream, classify_grasps, learn_stop_rule, load_stop_rule
+from thermogrip.classify.decisions import stopping_rule
 from thermogrip.classify.decisions.online import stop_callback
 from thermogrip.classify.decisions.stopping_rule import (
+    TIMES,
     Windows,
+    _read_by,
     contact_end,
     growing_windows,
     learn_from_windows,
+    silent_windows,
     stops,
 )
 from thermogrip.classify.estimators.base import pick
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.datasets.schema import Grasps
+from thermogrip.datasets.schema import Grasps, make_grasps
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
+from thermogrip.sysid.effusivity.quality import check_grasps
 
 THREE = ["copper", "iron", "wood"]
 
@@ -107,6 +112,98 @@ def test_a_contact_ends_at_its_threshold_and_never_for_a_gain_of_nothing() -> No
     assert stops(StopRule(sure=1.0, gain=1e-9), seen).time.tolist() == [1.0, 1.0]
 
 
+def two_windows(stated: list[float], gain: float = np.inf) -> Windows:
+    """Contacts that are so sure of the second of two candidates at 1 s, and at 10 s."""
+    top = np.array(stated)
+    log_p = np.log(np.tile(np.stack([1 - top, top], axis=1)[:, None], (1, 2, 1)))
+    return Windows(np.array([1.0, 10.0]), log_p, np.tile([gain, 0.0], (top.size, 1)))
+
+
+@pytest.mark.parametrize(
+    ("low", "sure"),
+    [(0.62, 0.65), (0.88, 0.9), (0.93, 0.95), (0.98, 1 - 0.05 * 500 ** (-4 / 27)), (0.99988, 0.9999)],
+)
+def test_the_threshold_is_the_next_of_its_grid_above_those_that_err(low: float, sure: float) -> None:
+    """38 of 39 at nearly 1 are right, 2 / 41 < 0.05; the others are all wrong."""
+    seen = two_windows([1 - 1e-12] * 39 + [low] * 20)
+    true = np.ones(59, dtype=np.int64)
+    true[[0, *range(39, 59)]] = 0
+    assert learn_from_windows([(seen, true)], loss=0.0).sure == pytest.approx(sure, rel=1e-9)
+
+
+def test_as_many_grasps_as_can_just_show_the_error_are_enough() -> None:
+    """1 / (18 + 2) = 0.05; two of 39 + 1 err and one more: (1 + 1) / (38 + 2)."""
+    right = np.ones(38, dtype=np.int64)
+    assert learn_from_windows([(two_windows([1 - 1e-12] * 18), right[:18])], loss=0.0).sure == 0.5
+    with pytest.raises(UserError, match=r"17 training grasps cannot show .* 0\.05; .* at least 0\.053"):
+        learn_from_windows([(two_windows([0.9] * 17), right[:17])])
+    right[3] = 0
+    assert learn_from_windows([(two_windows([1 - 1e-12] * 38), right)], loss=0.0).sure == 0.5
+    assert learn_from_windows([(two_windows([1 - 1e-12] * 37), right[:37])], loss=0.0).sure == 1.0
+
+
+@pytest.mark.parametrize(
+    ("loss", "gain"), [(9e-5, 0.0), (1e-4, 1e-4), (0.01, 1e-4 * 500 ** (20 / 27)), (0.06, 0.05)]
+)
+def test_the_least_gain_is_the_largest_of_its_grid_up_to_the_loss(loss: float, gain: float) -> None:
+    rule = learn_from_windows([(two_windows([0.6] * 30), np.ones(30, dtype=np.int64))], loss=loss, end=8.0)
+    assert rule.gain == pytest.approx(gain, rel=1e-9)
+    assert (rule.sure, rule.end, rule.error, rule.n_grasp) == (1.0, 8.0, 0.05, 30)
+    assert rule.times == (0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
+
+
+def test_a_silent_contact_ends_at_the_end_and_its_error_is_what_is_left() -> None:
+    seen = two_windows([0.9, 0.8, 0.95])
+    found = stops(StopRule(sure=0.85), seen, np.array([[True, True], [False, False], [False, False]]))
+    assert found.time.tolist() == [10.0, 10.0, 1.0]
+    assert found.answer.tolist() == [1, 1, 1]
+    assert found.confident.tolist() == [True, False, True]
+    assert found.early.tolist() == [False, False, True]
+    np.testing.assert_allclose(found.p_wrong, [0.1, 0.2, 0.05])
+    sure = seen._replace(log_p=seen.log_p - seen.log_p.max() + 1e-17)
+    assert stops(StopRule(sure=0.9), sure).p_wrong.min() == 0.0  # never less than nothing
+
+
+def test_readings_of_a_contact_begin_after_a_quarter_of_a_second() -> None:
+    time = np.array([-0.5, 0.25, 0.1 * 3, 0.5])  # 0.1 * 3 is a little more than 0.3
+    rows = [[23.0, 24.0, 25.0, 26.0], [23.0, 24.0, np.nan, 26.0]]
+    grasps = make_grasps(time, rows, ["a", "b"], t_object=[43.0, 43.0])
+    read = [_read_by(grasps, t).tolist() for t in (0.25, 0.3, 0.5)]
+    assert read == [[False, False], [True, False], [True, True]]
+    flat = make_grasps(np.arange(-10, 41) * 0.1, np.full((1, 51), 23.0), ["a"], t_object=[43.0])
+    seen = [check_grasps(flat.sel(time=slice(None, t + 1e-6))).undecided[0] for t in (0.3, 1.0, 3.3)]
+    assert silent_windows(flat, [0.3, 1.0, 3.3]).tolist() == [seen]
+
+
+def test_records_are_followed_to_their_end_among_their_own_materials(
+    known: PosteriorClassifier, fresh: Grasps, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[dict[str, object]] = []
+
+    def followed(classifier: object, grasps: Grasps, **options: object) -> Windows:
+        asked.append(options)
+        return two_windows([0.6] * grasps.sizes["grasp"])
+
+    monkeypatch.setattr(stopping_rule, "growing_windows", followed)
+    short = pick(fresh, [8, 0, 1]).sel(time=slice(None, 4.05)).assign_attrs(name="short")
+    wood, told = pick(fresh, [7]).assign_attrs(name="wood"), list[tuple[float, str]]()
+    records = [fresh, wood, short]
+    rule = learn_stop_rule(known, records, error=0.2, loss=0.0, progress=lambda *at: told.append(at))
+    about = {"times": stopping_rule.TIMES, "gain": False}
+    last = float(short["time"].values[-1])
+    assert asked == [
+        {"candidates": THREE, "end": 10.0, **about},
+        {"candidates": ["copper", "wood"], "end": last, **about},
+    ]
+    assert told == [(k / 3, f"windows of {name}") for k, name in enumerate(("exp2_dT20", "wood", "short"))]
+    assert (rule.n_grasp, rule.gain, rule.error) == (12, 0.0, 0.2)
+    learn_stop_rule(known, fresh, error=0.2, loss=1e-4)
+    assert asked[-1]["gain"] is True
+    for wrong in ({"error": 0.0}, {"error": 1.0}, {"loss": -1e-3}, {"loss": 1.0}):
+        with pytest.raises(UserError, match="is no share"):
+            learn_stop_rule(known, fresh, **wrong)
+
+
 @pytest.mark.parametrize(("loss", "ended"), [(0.0, ""), (0.01, "a"), (0.03, "ab")])
 def test_the_gain_that_ends_a_contact_gives_away_no_more_than_stated(loss: float, ended: str) -> None:
     """Of 400 contacts 292 lose nothing by ending early (a), 8 their answer (b), 100 theirs, foreseen (c)."""
@@ -173,6 +270,7 @@ def test_a_rule_survives_its_file_and_is_asked_for(tmp_path: Path) -> None:
     rule = StopRule(sure=0.97, gain=0.004, times=(0.5, 2.0), end=8.0, error=0.03, n_grasp=55)
     rule.save(tmp_path / "stop_rule.json")
     assert load_stop_rule(tmp_path) == rule
+    assert StopRule(sure=1.0) == StopRule(sure=1.0, gain=0.0, times=TIMES, end=10.0, error=0.05, n_grasp=0)
     (tmp_path / "stop_rule.json").write_text('{"schema": "thermogrip.stop_rule", "version": 1, "sure": "x"}')
     with pytest.raises(UserError, match="not a whole stop rule"):
         load_stop_rule(tmp_path)
@@ -182,12 +280,15 @@ def test_a_rule_survives_its_file_and_is_asked_for(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"sure": 1.5}, {"gain": -0.1}, {"error": 5.0}, {"end": 0.0}, {"times": [-1.0, 0.5]}]
-)
+    "wrong",
+    [{"sure": 1.5}, {"sure": 0.0}, {"gain": -0.1}, {"gain": 1.1}, {"error": 5.0}, {"error": 0.0},
+     {"error": 1.0}, {"end": 0.0},
+     {"end": 3601.0}, {"times": [0.0, 0.5]}, {"times": [3601.0]}, {"n_grasp": -1}],
+)  # fmt: skip
 def test_a_rule_out_of_range_is_refused_by_its_file(wrong: dict[str, object], tmp_path: Path) -> None:
     file = StopRule(sure=0.95).save(tmp_path / "rule.json")
     file.write_text(json.dumps(json.loads(file.read_text()) | wrong))
-    message = r"rule\.json: is not a whole stop rule \((need 0 < sure <= 1|\w+ is .*, not 0 to 1)"
+    message = r"rule\.json: is not a whole stop rule \((need 0 < sure <= 1|\w+ is .*, not |times )"
     with pytest.raises(UserError, match=message):
         StopRule.load(file)
 
