@@ -56,7 +56,9 @@ def compiled_loop(
     readings = [dict(zip(names, row)) for row in reading.tolist()]
     controlled = tuple(controller.controlled)
     targets = [dict(zip(controlled, row)) for row in target.tolist()]
-    moves = [Move(as_drive(model.drives, row), 1, STATUSES[code]) for row, code in zip(drive, status)]
+    moves = [
+        Move(as_drive(model.drives, row), status=STATUSES[code]) for row, code in zip(drive, status)
+    ]
     return record_loop(truth, controlled, targets, readings, moves, np.cumsum(counts).tolist(), band)
 
 
@@ -64,7 +66,7 @@ def _loop_in_c(
     c: CompiledController, observed: Array, truth: Truth, target: Array
 ) -> tuple[Array, Array, NDArray[np.int32]]:
     """Run the loop from an observer's flat estimate to targets (n, n_controlled) [degC]; what the plant did
-    is left in truth.
+    is left in ``truth.y``.
 
     Returns readings (n, n_y + n_d), outputs first, drives (n, n_u), and places (n,) in
     :data:`thermogrip.mpc.interface.STATUSES`.
@@ -88,5 +90,5 @@ def _loop_in_c(
         *(address(values) for values in (quanta, d_offset, target, y, reading, drive, status)),
     )
     del held  # it had to live until here
-    truth.y, truth.time = list(y), n * truth.dt
+    truth.y = list(y)
     return reading, drive, status

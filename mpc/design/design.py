@@ -323,7 +323,7 @@ def default_design(
         best = max(answers, key=lambda answer: abs(answer.gain))
         if not np.isfinite(best.gain) or best.gain == 0:
             raise _unmoved(plant, output, finite=bool(np.isfinite(best.gain)))
-        lengths.append(min(max(8 * best.delay, 20 * dt), best.delay + 3 * best.lag))
+        lengths.append(min(8 * best.delay, best.delay + 3 * best.lag))
     horizon = int(np.clip(np.ceil(max(lengths) / dt), 20, 80))
     values: dict[str, Any] = {
         "dt": dt,

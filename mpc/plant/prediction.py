@@ -179,10 +179,8 @@ class PredictionModel:
         """The compiled step with its derivative in one direction; None where it is more than arithmetic."""
         from thermogrip.sysid.models.jit_rollout import Kernel
 
-        try:
-            return Kernel(_TangentSteps(self))
-        except (TypeError, AttributeError, NotImplementedError):
-            return None
+        steps = _TangentSteps(self)
+        return Kernel(steps) if steps.are_arithmetic else None
 
     def _tangents(self, x: Array, u: Array, d: Array, sx: Array, su: Array, sd: Array) -> tuple[Array, Array]:
         """Run samples u (N, n_u) with directions sx (B, n_x), su (B, N, n_u), sd (B, n_d).
@@ -323,6 +321,13 @@ class _TangentSteps:
         self.sizes = 2 * model.n_x, 2 * model.n_u, 2 * model.n_d, 0
         self._C, self._level = model.C.tolist(), model.output(np.zeros(model.n_x)).tolist()
 
+    @property
+    def are_arithmetic(self) -> bool:
+        """Whether each instruction is one that :meth:`advance` writes."""
+        of = self._function
+        used = {self._names[of.instruction_id(k)] for k in range(of.n_instructions())}
+        return used <= {"OP_INPUT", "OP_OUTPUT", "OP_CONST", *_ARITHMETIC}
+
     def prepare(self, p: Sequence[Any]) -> list[Any]:
         """Return nothing: parameters are numbers in the step."""
         return []
@@ -348,10 +353,8 @@ class _TangentSteps:
                 work[into[0]] = given[out_of[0]][out_of[1]]
             elif name == "OP_CONST":
                 work[into[0]] = float(function.instruction_constant(k))
-            elif name in _ARITHMETIC:
-                work[into[0]] = _ARITHMETIC[name](*(work[place] for place in out_of))
             else:
-                raise NotImplementedError(name)
+                work[into[0]] = _ARITHMETIC[name](*(work[place] for place in out_of))
         return [*results[0], *results[1]]
 
     def read(self, x: Sequence[Any], c: Sequence[Any]) -> list[Any]:
@@ -434,9 +437,10 @@ def step_response(
 
 
 def sample_time(plant: Plant) -> float:
-    """Return a sample time [s] for control: a quarter of the shortest apparent delay, on a 1-2-5 grid.
+    """Return a sample time [s] for control, on a 1-2-5 grid: a quarter of the longest apparent delay of an
+    output behind the drive that moves it most.
 
-    Where there is next to no delay, a 400th of the lag; never below the plant's own step.
+    Where there is next to no delay, a 400th of the lag, 10 s at most; never below the plant's own step.
     """
     found = []
     for output in plant.model.outputs:

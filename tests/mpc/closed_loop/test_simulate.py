@@ -8,11 +8,16 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import make_log
 from thermogrip.mpc.closed_loop.simulate import (
+    ClosedLoop,
+    RecordedController,
+    Segment,
     Surroundings,
     Truth,
     drive_shares,
     segment_of,
+    session_loop,
     simulate_closed_loop,
 )
 from thermogrip.mpc.interface import Move
@@ -82,10 +87,11 @@ def test_settling_overshoot_and_bias_by_hand(side: float) -> None:
 
 
 def test_the_bias_of_a_short_segment_is_that_of_its_last_fifth() -> None:
-    y = np.where(np.arange(201) >= 160, 30.2, 30.1)
-    assert segment(y, 30.0).bias == pytest.approx(0.2)
-    y = np.where(np.arange(241) >= 120, 30.2, 30.1)
-    assert segment(y, 30.0).bias == pytest.approx(0.2)
+    y = np.where(np.arange(201) >= 180, 30.2, 30.1)
+    assert segment(y, 30.0).bias == pytest.approx(0.1 + 0.1 * 21 / 41)  # of the rows 160 to 200
+    y = np.where(np.arange(241) >= 180, 30.2, 30.1)
+    assert segment(y, 30.0).bias == pytest.approx(0.1 + 0.1 * 61 / 121)  # of the rows 120 to 240
+    assert segment(np.array([29.0, 31.5, 30.0, 30.0]), 30.0).overshoot == 1.5  # by where it begins
 
 
 def test_what_leaves_the_band_at_the_end_never_settles_and_what_is_in_it_has_settled() -> None:
@@ -118,6 +124,31 @@ def test_one_drive_at_its_limit_is_enough() -> None:
 
 
 # ---- the truth ----
+
+
+def test_surroundings_are_those_of_a_thermocouple_amplifier_where_nothing_is_given() -> None:
+    assert Surroundings() == Surroundings(25.0, 0.04, 1 / 16, {}, {}, 0.0)
+    assert all(kind.__dataclass_params__.frozen for kind in (Surroundings, Segment, ClosedLoop))
+
+
+def test_two_drives_of_a_plant_of_half_a_second() -> None:
+    model = StateSpaceModel(
+        ("p", "q"), ("room",), ("t",), A=[[0.9]], B=[[1.0, 0.1]], E=[[0.2]], C=[[1.0]], dt=0.5, y0=[25.0],
+        c=[-0.2 * 20.0],
+    )  # fmt: skip
+    plant = Plant(model, {}, dt=0.5, units={"p": "1", "q": "percent"}, valid={"p": (-1.0, 1.0)})
+    around = Surroundings(ambient=20.0, noise=0.3, quantum=0.0, move_delay_s=1.0)
+    truth = Truth(plant, 2.0, around, None, 3)
+    assert (truth.sub, truth.dt, truth.late) == (4, 2.0, 2)
+    first = float(np.random.default_rng(3).standard_normal(1)[0])
+    assert truth.reading() == pytest.approx({"time_s": 0.0, "t": 20.0 + 0.3 * first, "room": 20.0})
+    truth.apply(Move({"q": 50.0, "p": -0.5}))
+    x, want = -5.0, [20.0]
+    for push in (0.0, 0.0, 4.5, 4.5):
+        x = 0.9 * x + push
+        want.append(25.0 + x)
+    np.testing.assert_allclose(np.ravel(truth.y), want, atol=1e-12)
+    assert truth.reading()["time_s"] == 2.0
 
 
 def test_a_move_is_applied_after_its_delay_and_held() -> None:
@@ -155,6 +186,20 @@ def test_readings_have_offsets_noise_and_the_quantum_of_their_converter() -> Non
         Truth(lag(), 1.5, Surroundings(), 25.0, 0)
 
 
+def test_what_no_schedule_says_is_the_band_and_the_seed_and_a_call_is_the_least() -> None:
+    runs = [
+        simulate_closed_loop(
+            Plan([0.1] * 5), lag(), [(30.0, 0.1), (28.0, 5.0), (26.0, 4.0)], start=27.0, **given
+        )
+        for given in ({}, {"seed": 0, "band": 0.25}, {"seed": 1, "band": 5.0})
+    ]
+    assert [run.band for run in runs] == [0.25, 0.25, 5.0]
+    assert [(part.begin_s, part.end_s) for part in runs[0].segments] == [(0.0, 2.0), (2.0, 6.0), (6.0, 10.0)]
+    same = [np.array_equal(run.readings["a"], runs[0].readings["a"]) for run in runs[1:]]
+    assert same == [True, False]
+    assert [run.settled for run in runs] == [False, False, True]
+
+
 class Plan:
     """A controller that answers with a list of drives, and keeps what it was given."""
 
@@ -181,6 +226,7 @@ def test_a_schedule_is_recorded_segment_by_segment() -> None:
     assert plan.begun[0]["a"] == 25.0
     assert [target for _, target in plan.seen] == [30.0] * 5 + [{"a": 26.0}] * 10
     assert run.target["a"].tolist() == [30.0] * 5 + [26.0] * 10
+    assert run.time.tolist() == [float(k) for k in range(31)]
     assert run.sample_time.tolist() == [2.0 * k for k in range(15)]
     assert run.readings["a"].tolist() == run.outputs["a"][:-1:2].tolist()
     first, second = run.segments
@@ -192,3 +238,59 @@ def test_a_schedule_is_recorded_segment_by_segment() -> None:
     assert first.overshoot == pytest.approx(top - 30.0)
     assert run.drive["q"].tolist() == [1.0] * 5 + [0.0] * 10
     assert run.drive_range == {"q": (-1.0, 1.0)}
+    log = run.to_log("by hand")
+    kinds = {str(name): (part.units, part.role) for name, part in log.data_vars.items()}
+    assert kinds == {
+        "q": ("1", "input"), "a": ("degC", "output"), "b": ("degC", "output"),
+        "t_ambient": ("degC", "disturbance"), "target_a": ("degC", "other"),
+    }  # fmt: skip
+    assert log["a"].values.tolist() == run.readings["a"].tolist()
+    assert log["time"].values.tolist() == run.sample_time.tolist()
+    assert log.attrs["name"] == "by hand"
+
+
+# ---- a session ----
+
+
+def test_a_recorder_keeps_each_move_with_the_time_of_its_reading() -> None:
+    plan = Plan([0.3, -0.2, 0.1])
+    kept = RecordedController(plan)
+    kept.reset({"a": 25.0})
+    assert (kept.dt, kept.controlled, plan.begun) == (2.0, ("a",), [{"a": 25.0}])
+    moves = [kept.step(reading, 30.0) for reading in ({"a": 25.0}, {"a": 26.0, "time_s": 2.5}, {"a": 27.0})]
+    assert [move.drive for move in moves] == [0.3, -0.2, 0.1]
+    assert kept.moves == list(zip((0.0, 2.5, 4.0), moves, strict=True))
+    assert plan.seen[1] == ({"a": 26.0, "time_s": 2.5}, 30.0)
+
+
+def test_a_session_is_a_loop_up_to_its_last_move() -> None:
+    q, a = [2.0, 1.0, -0.5, 0.0, 0.0, 9.0, 9.0], [20.0, 25.0, 30.3, 30.1, 30.2, 10.0, 10.0]
+    parts = {"q": (q, "1", "input"), "a": (a, "degC", "output"), "b": (a[::-1], "degC", "output")}
+    parts |= {"t_ambient": ([21.0] * 7, "degC", "disturbance"), "target_a": ([30.0] * 7, "degC", "other")}
+    times, drives = [10.0, 11.0, 13.0000003, 13.9999997], {"q": (-0.5, 2.0)}
+    moves = [
+        (at, Move(0.0, 1, status, status[:2], 0.1 * at))
+        for at, status in zip(times, ("ok", "late", "off", "infeasible"), strict=True)
+    ]
+    log = make_log(np.arange(10.0, 17.0), {k: (np.array(v), *rest) for k, (v, *rest) in parts.items()})
+    run = session_loop(log, moves, drive_range=drives)
+    assert run.time.tolist() == run.sample_time.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert run.status == ("ok", "late", "fallback_plan", "off", "infeasible")  # a reading was rejected
+    assert run.advice == ("ok", "la", "", "of", "in")
+    assert run.seconds.tolist() == pytest.approx([1.0, 1.1, 1.3, 1.4])
+    found = {name: values.tolist() for name, values in {**run.outputs, **run.drive}.items()}
+    assert found == {"a": a[:5], "b": a[:1:-1], "q": q[:5]}
+    assert run.readings is run.outputs
+    assert (run.target["a"].tolist(), run.band, run.drive_range) == ([30.0] * 5, 0.25, drives)
+    (part,) = run.segments
+    assert (part.output, part.start, part.target, part.begin_s, part.end_s) == ("a", 20.0, 30.0, 0.0, 4.0)
+    assert (part.settle_s, part.overshoot, part.bias) == pytest.approx((3.0, 0.3, 0.2))
+    # shares of full drive 1, 0.5, -0.25, 0, 0 over 4 s; at an end of the range in two of four samples
+    assert (part.energy_s, part.travel, part.full_share) == pytest.approx((1.3125 * 0.8, 1.5, 0.5))
+    assert run.settled
+    own = session_loop(log, moves, drive_range=drives, band=0.1, figures={"a": {"bias": 0.7}, "b": {}})
+    assert (own.segments[0].bias, own.settled, own.band) == (0.7, False, 0.1)
+    for count in (0, 1):
+        with pytest.raises(ValueError, match=f"{count} moves are no loop"):
+            session_loop(log, moves[:count], drive_range=drives)
+    assert session_loop(log, moves[:2], drive_range=drives).time.tolist() == [0.0, 1.0]

@@ -11,7 +11,7 @@ import pytest
 from thermogrip.datasets.atomic_files import read_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers.mpc import Controller
-from thermogrip.mpc.design.design import LONGEST_HORIZON, Design, check_design, default_design
+from thermogrip.mpc.design.design import Design, _unmoved, check_design, default_design, make_blocks
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.tuning.design_review import review
 from thermogrip.mpc.tuning.objective import Search
@@ -65,15 +65,15 @@ def block(
 @pytest.mark.parametrize(
     ("delay", "lag", "seconds"),
     [
-        (10, 200.0, 80.0),  # eight delays
-        (10, 10.0, 40.0),  # no more than the delay and three lags
+        (10, 200.0, 80.0),  # eight delays of 9.998 s
+        (10, 10.0, 44.0),  # no more than the delay of 9.95 s and three lags of 11.03 s
         (20, 300.0, 160.0),
     ],
 )
 def test_the_horizon_is_eight_delays_or_the_delay_and_three_lags(delay: int, lag: float, seconds: float):
     design = default_design(block(delay, lag), dt=2.0)
-    # a step of 1 s resolves a delay to 1 s, so eight delays to 8 s
-    assert sum(design.blocks) * 2.0 == pytest.approx(seconds, abs=8 + 2)
+    assert design.horizon_s == sum(design.blocks) * 2.0 == seconds
+    assert (len(design.blocks), design.deadline_s, design.patience_s) == (10, 1.0, 10.0)
 
 
 def test_the_horizon_has_twenty_samples_at_least_and_eighty_at_most():
@@ -85,7 +85,24 @@ def test_the_sample_time_is_a_multiple_of_the_plants_step_and_a_quarter_of_the_d
     assert default_design(block(10, 50.0), dt=2.4).dt == 2.0
     assert default_design(block(10, 50.0), dt=0.1).dt == 1.0
     assert default_design(block(10, 50.0, dt=2.0), dt=5.2).dt == 6.0
-    assert default_design(block(20, 200.0)).dt == 5.0
+    long = default_design(block(20, 200.0))
+    assert (long.dt, long.deadline_s, long.patience_s) == (5.0, 2.5, 25.0)
+
+
+@pytest.mark.parametrize(
+    ("horizon", "count", "lengths"),
+    [
+        (20, 5, (1, 2, 3, 5, 9)),  # of ratio 1.7: 1, 1.7, 2.9, 5.0, 8.6 up to their rounded sums
+        (12, 3, (1, 3, 8)),  # of ratio 2.85: 1, 2.85, 8.15
+        (3, 10, (1, 1, 1)),
+        (7, 1, (7,)),
+        (7, 0, (7,)),
+        (1000, 2, (1, 999)),
+        (30, 3, (1, 5, 24)),  # of ratio 4.9
+    ],
+)
+def test_blocks_grow_from_one_sample_and_sum_to_the_horizon(horizon, count, lengths):
+    assert make_blocks(horizon, count) == lengths
 
 
 @pytest.mark.parametrize(("unit", "ends"), [("percent", (0.0, 100.0)), ("0_255", (0.0, 255.0))])
@@ -102,6 +119,20 @@ def test_what_is_no_temperature_and_what_nothing_moves_is_no_target():
         default_design(block(10, 50.0), controlled=["u"])
     with pytest.raises(UserError, match="no drive moves t"):
         default_design(block(10, 50.0, gain=0.0), dt=1.0)
+
+
+@pytest.mark.parametrize(
+    ("valid", "beyond"),
+    [((30.0, 90.0), False), ((30.1, 90.0), True), ((0.0, 20.0), False), ((0.0, 19.9), True)],
+)
+def test_logs_that_never_were_near_25_degc_are_named_where_no_drive_moves_an_output(valid, beyond):
+    plant = replace(block(10, 50.0), valid={"t": valid})
+    text, begin = str(_unmoved(plant, "t", finite=True)), "identify it with logs that begin at rest, or take"
+    seen = f"no drive moves t at rest at 25 degC, where no log was ({valid[0]:.0f} to {valid[1]:.0f} degC)"
+    assert (seen in text, begin in text) == (beyond, beyond)
+    assert ("logs that move the drive, or take another model" in text) == (not beyond)
+    assert "no drive has a finite effect on t" in str(_unmoved(plant, "t", finite=False))
+    assert "where no log was" not in str(_unmoved(replace(plant, valid={}), "t", finite=True))
 
 
 LOOP = {"drive": "drive", "output": "t_surface", "Kc": 0.1, "Ti": 50.0, "Tt": 50.0, "feedforward": 0.0}
@@ -126,8 +157,31 @@ def design(tank) -> dict:
         ({"patience_s": -1}, "patience_s"),
         ({"deadline_s": -1}, "deadline_s"),
         ({"offset_free": "no"}, "offset_free"),
-        ({"blocks": [LONGEST_HORIZON + 1]}, "blocks"),
-        ({"blocks": [1] * 300}, "unknowns"),
+        ({"blocks": [1001]}, "blocks sum to 1001 samples, more than the 1000"),
+        ({"blocks": [3, 0]}, "blocks must be whole numbers from 1"),
+        ({"blocks": [1] * 201}, "201 blocks of 1 drives are more than 200 unknowns"),
+        ({"dt": 3601.0}, "dt is 3601 s, longer than the 3600 s"),
+        ({"dt": 2.00001}, "no multiple"),
+        ({"dt": -2.0}, "dt is -2 s"),
+        ({"ambient": -60.1}, "ambient is -60.1 degC, which is no room"),
+        ({"ambient": 150.1}, "which is no room"),
+        ({"price": 2e12}, "price is 2e\\+12, beyond 1e\\+"),
+        ({"terminal": -1e-9}, "the others >= 0"),
+        ({"drive": -1e-9}, "the others >= 0"),
+        ({"price": -1e-9}, "the others >= 0"),
+        ({"track": 0.0}, "track and move must be > 0"),
+        ({"noise": {"output": 1.1e6}}, "a standard deviation must be <= 1e\\+06"),
+        ({"drive_range": {"drive": [-1.1, 0.5]}}, "drive is -1.1 to 0.5, beyond"),
+        ({"drive_range": {"drive": [-0.5, 1.1]}}, "beyond the drive's -1 to 1"),
+        ({"drive_range": {"drive": [0.5, 0.5]}}, "drive is 0.5 to 0.5, which is empty"),
+        ({"drive_range": {}}, "nothing for drive drive"),
+        ({"slew_per_s": {"drive": 0.1, "fan": 1.0}}, "slew_per_s: the plant has no drive fan"),
+        ({"limits": {"t_tank": [20.0, 20.0]}}, "20 to 20, which is empty"),
+        ({"controlled": ["t_nose"]}, "controlled: the plant has no output t_nose"),
+        ({"loops": [{**LOOP, "Tt": 0.0}]}, "Ti and Tt of t_surface must be > 0"),
+        ({"colour": 1}, "the design has no field colour"),
+        ({"blocks": None}, "is not a whole controller .TypeError"),
+        ({"limits": {"t_tank": [20.0]}}, "is not a whole controller .IndexError"),
         ({"controlled": []}, "controlled"),
         ({"controlled": ["t_surface", "t_surface"]}, "twice"),
         ({"drive_range": {"drive": [-5.0, 5.0]}}, "beyond the drive's -1 to 1"),
@@ -152,6 +206,26 @@ def design(tank) -> dict:
 def test_a_field_that_cannot_be_is_named(tank, design, change, says):
     with pytest.raises(UserError, match=says):
         check_design(Design.from_dict({**design, **change}), tank)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        *({"dt": dt} for dt in (3600.0, 2.000001)),
+        *({"blocks": blocks} for blocks in ([1000], [1] * 200, [1])),
+        *({"ambient": ambient} for ambient in (-60.0, 150.0)),
+        *({name: 0.0} for name in ("terminal", "drive", "price", "overshoot", "deadline_s", "patience_s")),
+        *({"move_delay": delay} for delay in (0, 1)),
+        {"noise": {"state": 1e6, "drive": 0.0}},
+        {"drive_range": {"drive": [-1 - 9e-10, 1 + 9e-10]}},
+        {"loops": []},
+    ],
+)
+def test_a_field_at_the_end_of_what_can_be_is_taken(tank, design, change):
+    default_noise = {"state": 0.005, "drive": 0.002, "output": 0.002, "reading": 0.05}
+    found = check_design(Design.from_dict({**design, **change}), tank).to_dict()
+    for key, value in change.items():
+        assert found[key] == (default_noise | value if key == "noise" else value)
 
 
 @pytest.mark.parametrize("spec", [{"steps": "abc"}, {"steps": [[1], [None]]}])

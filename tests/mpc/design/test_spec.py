@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
+from tests.mpc.makers import heater
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc.design.spec import SPEC_TEMPLATE, Spec, read_spec, spec_from_dict
+from thermogrip.mpc.design.spec import SPEC_TEMPLATE, Spec, _ranges, read_spec, spec_from_dict
 
 
 def test_the_template_says_the_defaults():
@@ -46,6 +49,22 @@ def test_every_line_of_the_template_that_is_commented_out_is_valid_too():
         ("slew_per_s = 0", "slew_per_s: input should be greater than 0"),
         ("slew_per_s = { drive = -1 }", "slew_per_s.drive: input should be greater than 0"),
         ("limits = { t_tank = [-inf, 60] }", "limits.t_tank.0 is -inf, not a finite number"),
+        ("steps = [[28, 28.25]]", "steps: 28 -> 28.25 stays inside the band"),
+        ("steps = [[28, -21]]", "steps.0.1: input should be greater than or equal to -20"),
+        ("steps = [[151, 28]]", "steps.0.0: input should be less than or equal to 150"),
+        (f"steps = {[[28, 38]] * 21}", "steps: list should have at most 20"),
+        ("hold_s = 9.9", "hold_s: input should be greater than or equal to 10"),
+        ("hold_s = 36001", "hold_s: input should be less than or equal to 36000"),
+        ("noise_degC = -0.1", "noise_degC: input should be greater than or equal to 0"),
+        ("noise_degC = 51", "noise_degC: input should be less than or equal to 50"),
+        ("sensor_offset_degC = -51", "sensor_offset_degC: input should be greater than or equal to -50"),
+        ("energy_weight = -0.1", "energy_weight: input should be greater than or equal to 0"),
+        ("patience_s = -1", "patience_s: input should be greater than or equal to 0"),
+        ("search_draws = 51", "search_draws: input should be less than or equal to 50"),
+        ("check_draws = 201", "check_draws: input should be less than or equal to 200"),
+        ("evaluations = 10001", "evaluations: input should be less than or equal to 10000"),
+        ("drive_limits = { q = [5, 5] }", "drive_limits: 5 to 5 is empty"),
+        ("drive_limits = [-2e12, 1]", "greater than or equal to -1000000000000"),
         ("settle_within_s = 900", "settle_within_s: 900 s is longer than each step is simulated"),
     ],
 )
@@ -59,6 +78,46 @@ def test_a_mistake_in_the_spec_is_one_line_that_names_file_and_key(tmp_path, tex
     assert "\n" not in str(caught.value)
 
 
+def test_what_is_just_allowed_is_taken_and_a_spec_stays_as_it_is():
+    ends = {"steps": [(28.0, 28.26)] * 19 + [(-20.0, 150.0)], "hold_s": 36000, "settle_within_s": 36000}
+    ends |= {"noise_degC": 50, "sensor_offset_degC": -50, "search_draws": 50, "check_draws": 200}
+    ends |= {"evaluations": 10000, "energy_weight": 0, "patience_s": 0, "output": ["a", "b"]}
+    assert spec_from_dict(ends).model_dump(exclude_unset=True) == ends
+    low = {"hold_s": 10, "search_draws": 1, "check_draws": 1, "evaluations": 1, "noise_degC": 0}
+    assert spec_from_dict(low).hold_s == 10.0  # shorter than settling is allowed by default
+    with pytest.raises(ValueError, match="frozen"):
+        Spec().band_degC = 1.0
+
+
+def drives(least: float, most: float) -> SimpleNamespace:
+    return SimpleNamespace(drive_range={"p": (-1.0, 2.0), "q": (least, most)})
+
+
+@pytest.mark.parametrize(
+    ("own", "limits", "problem"),
+    [
+        ((-1.0, 1.0), (-0.5, 0.0), ""),
+        ((-1.0, 1.0), (0.0, 0.5), ""),
+        ((-1.0, 1.0), (0.1, 0.5), "0.1 to 0.5 of q leaves out 0, where a failing loop goes"),
+        ((-1.0, 1.0), (-0.5, -0.1), "-0.5 to -0.1 of q leaves out 0"),
+        ((0.0, 1.0), (0.1, 0.5), "leaves out 0"),
+        ((-1.0, 0.0), (-0.5, -0.1), "leaves out 0"),
+        ((0.1, 1.0), (0.2, 0.5), ""),  # no drive of this range is 0
+        ((-1.0, -0.1), (-0.5, -0.2), ""),
+        ((-1.0, 1.0), (-1.0 - 9e-10, 1.0 + 9e-10), ""),
+        ((-1.0, 1.0), (-1.1, 0.5), "-1.1 to 0.5 of q leaves its range; stay in -1 to 1"),
+        ((-1.0, 1.0), (-0.5, 1.1), "leaves its range"),
+    ],
+)
+def test_limits_of_a_drive_are_inside_its_range_about_0(own, limits, problem):
+    spec = Spec(drive_limits={"q": limits})
+    if problem:
+        with pytest.raises(UserError, match=problem):
+            _ranges(spec, drives(*own))
+    else:
+        assert _ranges(spec, drives(*own)) == {"p": (-1.0, 2.0), "q": limits}
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -69,7 +128,9 @@ def test_a_mistake_in_the_spec_is_one_line_that_names_file_and_key(tmp_path, tex
         ({"slew_per_s": {"fan": 1}}, "fan"),
         ({"sample_time_s": 0.1}, "sample_time_s: 0.1 s is no multiple of the plant's step of 1 s; write 1"),
         ({"sample_time_s": 2.5}, "sample_time_s"),
+        ({"sample_time_s": 2.00001}, "no multiple of the plant's step of 1 s; write 2,"),
         ({"sample_time_s": 200}, "less than 5 samples"),
+        ({"limits": {"t_surface": (38.5, 50)}}, "and a step goes to 38"),
         ({"hold_s": 10, "sample_time_s": 4}, "hold_s: 10 s are less than 5 samples"),
         ({"drive_limits": (0.2, 1)}, "leaves out 0"),
         ({"limits": {"t_surface": (20, 30)}}, "limits: t_surface is to stay in 20 to 30 degC, and a step"),
@@ -94,3 +155,17 @@ def test_the_spec_reaches_the_design(tank):
     assert design.slew_per_s == {"drive": 0.1}
     assert (design.dt, design.overshoot, design.ambient) == (3.0, 0.1, 20.0)
     assert design.limits == {"t_tank": (2.0, 65.0)}
+    assert Spec(output="t_tank").design(tank).limits == {}  # what is regulated has its targets
+    ends = {"t_surface": (18.0, 43.0), "t_tank": (30.0, 31.0)}  # targets 18 to 43; of the tank there is none
+    assert Spec(limits=ends).design(tank, track=3.0).limits == ends
+    assert Spec(limits=ends).design(tank, track=3.0).track == 3.0
+    assert Spec(limits={}, output=["t_tank", "t_surface"]).design(tank).controlled == ("t_tank", "t_surface")
+    assert Spec(hold_s=20, sample_time_s=4).design(tank).dt == 4.0  # five samples are enough
+    assert Spec(sample_time_s=4.000003).design(tank).dt == 4.0
+
+
+def test_a_sample_time_is_held_against_the_step_of_its_plant():
+    plant = replace(heater().plant, valid={"q": (0.0, 1.0)})  # of 5 s
+    assert Spec(sample_time_s=15).design(plant).dt == 15.0
+    with pytest.raises(UserError, match="18 s is no multiple of the plant's step of 5 s; write 20, or"):
+        Spec(sample_time_s=18).design(plant)

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
 
+from tests.mpc.design.test_design import block
 from tests.mpc.makers import kit, network_plant
+from tests.mpc.native.test_codegen import PAIRS, meant
 from thermogrip.mpc.design.design import make_blocks
-from thermogrip.mpc.design.simc import default_controlled, simc
-from thermogrip.mpc.plant.prediction import PredictionModel, sample_time, step_response
-from thermogrip.mpc.plant.steady_state import holding_drive, steady_curve
+from thermogrip.mpc.native.codegen import _OPERATIONS
+from thermogrip.mpc.plant.prediction import _ARITHMETIC, PredictionModel, sample_time, step_response
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 
@@ -43,11 +42,11 @@ def derived(model: PredictionModel, x, u, d) -> list[np.ndarray]:
 def along(model: PredictionModel, x, plan, d, blocks) -> tuple[np.ndarray, np.ndarray]:
     """Return outputs and their derivatives along a plan, by forward sensitivities of CasADi's samples."""
     S, outputs, gains = np.zeros((model.n_x, *plan.shape)), [], []
-    for block, length in enumerate(blocks):
+    for b, length in enumerate(blocks):
         for _ in range(length):
-            after, A, B, _ = derived(model, x, plan[block], d)
+            after, A, B, _ = derived(model, x, plan[b], d)
             S = np.tensordot(A, S, axes=1)
-            S[:, block] += B
+            S[:, b] += B
             x = after.ravel()
             outputs.append(model.output(x))
             gains.append(np.tensordot(model.C, S, axes=1))
@@ -142,49 +141,6 @@ def test_at_steady_state_the_prediction_stays(tank):
     np.testing.assert_allclose(model.next_state(x, u, ROOM), x, atol=1e-6)
 
 
-def test_the_gain_turns_over_where_heat_equals_twice_joule(reversing_tank):
-    curve = steady_curve(PredictionModel(reversing_tank, dt=2.0), "drive", "t_surface", ROOM)
-    assert len(curve.turns) == 1
-    assert curve.turns[0] == pytest.approx(-0.55, abs=0.05)  # heat / (2 joule), on a grid of 0.05
-    assert curve.rising == (curve.turns[0], 1.0)
-
-
-@pytest.mark.parametrize(
-    ("steady", "turns", "rising"),
-    [
-        (lambda u: np.clip(u, -0.5, 0.5), (), (-1.0, 1.0)),  # flat at both ends is no turn
-        (lambda u: -u, (), (-1.0, 1.0)),
-        (lambda u: 0.0 * u, (), (0.0, 0.0)),  # the drive moves nothing
-        (lambda u: -((u - 0.5) ** 2), (0.5,), (-1.0, 0.5)),
-        (lambda u: (u + 0.5) ** 2, (-0.5,), (-0.5, 1.0)),
-        (lambda u: u - 1.5 * np.maximum(np.abs(u) - 0.5, 0) * np.sign(u), (-0.5, 0.5), (-0.5, 0.5)),
-    ],
-)
-def test_the_gain_keeps_its_sign_between_the_turns_beside_the_neutral_drive(steady, turns, rising):
-    model = SimpleNamespace(
-        drives=("q", "drive"), outputs=("t",), neutral=np.zeros(2), lowest=-np.ones(2), highest=np.ones(2),
-        steady_output=lambda u, d: np.array([steady(u[1]) + d[0] + 9.0 * u[0]]),
-    )  # fmt: skip
-    curve = steady_curve(model, "drive", "t", [20.0], n=9)
-    assert curve.turns == pytest.approx(turns)
-    assert curve.rising == pytest.approx(rising)
-
-
-def test_the_holding_drive_holds_and_says_what_it_misses(tank):
-    model = PredictionModel(tank, dt=2.0)
-    held = holding_drive(model, ("t_surface",), [38.0], ROOM)
-    assert held.miss < 1e-6
-    assert held.y[1] == pytest.approx(38.0)
-    assert holding_drive(model, ("t_surface",), [500.0], ROOM).miss > 100
-
-
-def test_of_two_drives_that_hold_the_smaller_is_taken(reversing_tank):
-    model = PredictionModel(reversing_tank, dt=2.0)
-    held = holding_drive(model, ("t_surface",), [18.0], ROOM)
-    assert held.miss < 1e-6
-    assert held.u[0] > -0.55
-
-
 def test_delay_and_lag_are_read_off_the_step_response(tank):
     answer = step_response(tank, "drive", "t_surface")
     steady = [PredictionModel(tank, dt=1.0).steady_output([level], ROOM)[1] for level in (0.0, 0.1)]
@@ -193,16 +149,90 @@ def test_delay_and_lag_are_read_off_the_step_response(tank):
     assert answer.lag == pytest.approx(700, rel=0.1)
 
 
-def test_the_sample_time_is_a_round_part_of_the_delay(tank, gripper):
-    assert sample_time(gripper) == 2.0
-    assert sample_time(tank) in (2.0, 5.0)
+@pytest.mark.parametrize(
+    ("dt", "time_constant", "longest", "end"),
+    [
+        (1.0, 50.0, 14400.0, 400.0),  # of the slope a 2400th is left; at 200 s it were a 45th
+        (1.0, 50.0, 100.0, 100.0),
+        (1.0, 50.0, 101.0, 200.0),
+        (0.5, 1.0, 14400.0, 60.0),  # a minute at least,
+        (2.0, 1.0, 14400.0, 200.0),  # and a hundred steps
+    ],
+)
+def test_a_step_is_watched_until_it_is_over(dt, time_constant, longest, end):
+    answer = step_response(block(10, time_constant, dt=dt), "q", "t", longest=longest)
+    late = np.maximum(answer.time - 10 * dt, 0.0)
+    np.testing.assert_allclose(answer.y, 50 * (1 - np.exp(-late / time_constant)), atol=1e-9)
+    assert (answer.time[0], answer.time[-1], answer.gain) == (0.0, end, answer.y[-1])
+    # the slope is a difference over two steps, largest one step behind the delay
+    slope = 50 * (1 - np.exp(-2 * dt / time_constant)) / (2 * dt)
+    assert answer.lag == pytest.approx(answer.gain / slope)
+    assert answer.delay == pytest.approx(11 * dt - 50 * (1 - np.exp(-dt / time_constant)) / slope)
 
 
-def test_simc_of_a_first_order_plant_is_its_closed_form(tank):
-    answer = step_response(tank, "drive", "t_surface")
-    loop = simc(tank, "drive", "t_surface", tau_c=answer.delay)
-    assert loop.Kc == pytest.approx(2 * answer.lag / (answer.gain * 2 * answer.delay))
-    assert loop.Ti == pytest.approx(min(answer.lag, 8 * answer.delay))
+def test_a_drive_that_moves_nothing_has_no_delay_and_no_lag():
+    answer = step_response(block(10, 50.0, gain=0.0), "q", "t")
+    assert (answer.gain, answer.delay, answer.lag) == (0.0, np.inf, np.inf)
+
+
+def test_the_sample_time_is_a_round_part_of_the_delay_or_of_the_lag(tank, gripper):
+    assert [sample_time(plant) for plant in (gripper, tank)] == [2.0, 5.0]
+    # a quarter of 10 s and of 20 s; without a delay a 400th of 4000 s, and no more; the plant's own step
+    plants = [
+        block(10, 50.0),
+        block(20, 200.0),
+        lag((0.0, 4.0), 4000.0),
+        lag((0.0, 4.0), 9e4),
+        lag((0.0, 4.0)),
+    ]
+    assert [sample_time(plant) for plant in plants] == [2.0, 5.0, 10.0, 10.0, 1.0]
+    assert sample_time(block(3, 800.0, gain=0.0)) == 1.0
+
+
+def test_each_operation_of_a_compiled_step_does_what_casadi_does():
+    for name, done in _ARITHMETIC.items():
+        places = sum(part in _OPERATIONS[name][0] for part in ("{0}", "{1}"))
+        for pair in PAIRS:
+            want = meant(name[3:], pair)
+            if np.isfinite(want):
+                given = (pair[0], 2.5 if name == "OP_CONSTPOW" else pair[1])[:places]
+                assert done(*given) == pytest.approx(want, rel=1e-14), (name, pair)
+
+
+def test_a_steady_state_is_one_that_stays_or_none(tank):
+    model = PredictionModel(two_drives(), dt=0.3)
+    x = model.steady_state([0.3, 0.8], [22.0])
+    np.testing.assert_allclose(x, np.linalg.solve(np.eye(3) - A, B @ [0.3, 0.8] - 3.0 * E[:, 0]), atol=1e-9)
+    assert model.steady_output([0.3, 0.8], [22.0]) == pytest.approx(25.0 + C @ x)
+    model = PredictionModel(tank, dt=2.0)
+    a = np.exp(-1 / 700)  # the tank gains 0.11 K a second and loses its share; the skin reads 2 % of the room
+    warm = 21.0 + 0.3 * 0.11 / (1 - a)
+    assert model.steady_output([0.3], [21.0]) == pytest.approx([warm, 0.98 * warm + 0.02 * 21.0])
+    assert np.isnan(PredictionModel(lag((0.0, 4.0), np.inf), dt=1.0).steady_state([1.0], [])).all()
+
+
+def test_a_plan_may_run_from_several_states_in_several_rooms():
+    model = PredictionModel(two_drives(), dt=0.2)
+    x, d = np.array([[1.0, 2.0, 3.0], [-1.0, 0.5, 0.0]]), np.array([[20.0], [30.0]])
+    u = np.array([[[0.1, 0.9], [0.4, 0.2]], [[0.8, 0.3], [0.0, 1.0]]])
+    y, end = model.run(x, u, d)
+    for k in range(2):
+        state, want = x[k], [25.0 + C @ x[k]]
+        for step in (0, 0, 1, 1):
+            state = A @ state + B @ u[k, step] + E[:, 0] * (d[k, 0] - 25.0)
+            want.append(25.0 + C @ state)
+        np.testing.assert_allclose(y[k], want[::2], atol=1e-12)
+        np.testing.assert_allclose(end[k], state, atol=1e-12)
+    np.testing.assert_allclose(model.run(x, u, d[0])[0][0], y[0], atol=1e-12)
+    assert model.vector({"r": 2.0, "s": 1.0}, ("q", "r")).tolist() == pytest.approx(
+        [np.nan, 2.0], nan_ok=True
+    )
+    state, drives, room = model.at_rest(18.0)
+    assert (model.output(state), drives.tolist(), room.tolist()) == (
+        pytest.approx([18.0]),
+        [0.0, 0.0],
+        [18.0],
+    )
 
 
 A = np.array([[0.9, 0.05, 0.0], [0.0, 0.8, 0.1], [0.1, 0.0, 0.7]])
@@ -237,10 +267,12 @@ def test_slopes_of_a_sample_are_those_of_its_steps():
     np.testing.assert_allclose(G[2, 0], [(C @ a @ a @ b)[0], (C @ a @ b + C @ b)[0]], atol=1e-9)
 
 
-def lag(valid: tuple[float, float], disturbances: tuple[str, ...] = ()) -> Plant:
+def lag(
+    valid: tuple[float, float], seconds: float = -1 / np.log(0.98), disturbances: tuple[str, ...] = ()
+) -> Plant:
     model = StateSpaceModel(
-        ("q",), disturbances, ("t",), A=[[0.98]], B=[[0.1]], E=np.zeros((1, len(disturbances))),
-        C=[[1.0]], dt=1.0, y0=[25.0],
+        ("q",), disturbances, ("t",), A=[[np.exp(-1 / seconds)]], B=[[0.1]], C=[[1.0]],
+        E=np.zeros((1, len(disturbances))), dt=1.0, y0=[25.0],
     )  # fmt: skip
     units = {"q": "W", "t": "degC"} | dict.fromkeys(disturbances, "degC")
     return Plant(model, {}, dt=1.0, units=units, valid={"q": valid})
@@ -272,17 +304,5 @@ def test_no_drive_is_what_is_nearest_to_none_and_a_step_from_there_stays_in_rang
 
 
 def test_the_room_is_the_first_of_what_is_measured() -> None:
-    model = PredictionModel(lag((0.0, 4.0), ("t_room", "t_water")), dt=1.0)
+    model = PredictionModel(lag((0.0, 4.0), disturbances=("t_room", "t_water")), dt=1.0)
     assert [model.room(d) for d in ([21.0, 30.0], [np.nan, 30.0], [21.0, np.nan])] == [21.0, 25.0, 21.0]
-
-
-@pytest.mark.parametrize(
-    ("drives", "outputs", "controlled"),
-    [(1, "t_surface t_tank", "t_surface"), (1, "t_pipe t_tank", "t_tank"), (2, "t_surface a b", "a b")],
-)
-def test_the_skin_is_controlled_by_one_drive_and_by_several_the_last_outputs(
-    drives: int, outputs: str, controlled: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("thermogrip.mpc.design.simc.drive_names", lambda plant: tuple("uv"[:drives]))
-    plant: Any = SimpleNamespace(outputs=tuple(outputs.split()))
-    assert default_controlled(plant) == tuple(controlled.split())

@@ -12,8 +12,6 @@ from thermogrip.mpc.controllers.mpc import Controller, design_controller
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.design.simc import PILoop
 from thermogrip.mpc.estimator.observer import ObserverNoise
-from thermogrip.mpc.plant.prediction import PredictionModel
-from thermogrip.mpc.plant.steady_state import holding_drive
 from thermogrip.mpc.tuning import design_review as checks
 from thermogrip.mpc.tuning.design_review import review, worst
 from thermogrip.sysid.models.state_space import StateSpaceModel
@@ -204,20 +202,6 @@ def test_an_integrator_holds_any_target_with_no_drive():
     assert checks["targets can be held in steady state"].verdict == "pass"
     assert checks["soft limits agree with the targets"].verdict == "pass"
     assert checks["gain keeps its sign over the drive"].verdict == "warn"
-
-
-def test_what_balances_an_integrator_may_lie_beyond_its_drive():
-    model = StateSpaceModel(
-        ("q",), ("leak",), ("t",), A=[[1.0]], B=[[0.5]], E=[[0.1]], C=[[1.0]], dt=1.0, y0=[25.0]
-    )
-    valid = {"q": (-1.0, 1.0), "t": (20.0, 60.0)}
-    plant = Plant(model, {}, dt=1.0, units={"q": "1", "leak": "1"}, valid=valid)
-    prediction = PredictionModel(plant, dt=1.0)
-    for leak in (2.0, -8.0):
-        held = holding_drive(prediction, ("t",), [40.0], [leak])
-        assert held.u == pytest.approx([-0.2 * leak])
-        assert held.y == pytest.approx([40.0])
-        assert held.miss == pytest.approx(0.0, abs=1e-6)
 
 
 def test_where_a_step_starts_need_not_be_a_target():

@@ -15,7 +15,6 @@ from thermogrip.mpc.tuning.figures import _note_all, pareto_figure, sensitivity_
 from thermogrip.mpc.tuning.objective import Trial
 from thermogrip.mpc.tuning.pareto import front_of, non_dominated, scan_of
 from thermogrip.mpc.tuning.sensitivity import sensitivity_of, sensitivity_words
-from thermogrip.mpc.tuning.summary import _simpler
 
 VALUES = st.sampled_from([0.0, 1.0, 2.0, 3.0, float("nan"), float("inf")])
 
@@ -135,20 +134,3 @@ def test_designs_share_a_label_where_their_marks_are_one_to_the_eye():
     marks = {"A": (10, 20), "B, tuned": (15, 21), "C": (10, 30), "D": (30, 20), "E": (10, 1)}
     _note_all(axis, [{"name": name, "settle_s": x, "energy_s": y} for name, (x, y) in marks.items()])
     assert [text.get_text() for text in axis.texts] == ["E", "A and B", "C", "D"]
-
-
-@pytest.mark.parametrize(
-    ("scores", "name", "how"),
-    [
-        ({"tuned": 1.0, "baseline": 1.2, "PI": 1.04, "LQR": 2.0}, "", ""),
-        ({"tuned": 1.0, "baseline": 0.9}, "", ""),
-        ({"tuned": 100.0, "baseline": 120.0, "PI": 103.0}, "", ""),
-        ({"tuned": 1.2, "baseline": 1.0, "PI": 1.02}, "PI", "2.0 % worse"),
-        ({"tuned": 1.0, "baseline": 1.2, "PI": 0.9, "LQR": 0.95}, "PI", "10.0 % better"),
-        ({"tuned": 1.0, "baseline": 1.2, "PI": 1.5, "LQR": 1.004}, "LQR", "as well"),
-    ],
-)
-def test_a_simpler_controller_that_is_as_good_is_named_with_what_it_does_not_know(scores, name, how):
-    missing = ", and knows neither limits of outputs nor where a gain turns over" if name == "LQR" else ""
-    said = f"{name}, tuned with as many trials, scores {how} on this spec{missing}."
-    assert _simpler(scores) == (said if name else "")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import FrozenInstanceError, replace
 from math import inf, nan
 
 import pytest
 
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.tuning.objective import StepResult
-from thermogrip.mpc.tuning.summary import Row, meets_spec, rows_of, verdict_of
+from thermogrip.mpc.tuning.summary import Row, _simpler, meets_spec, rows_of, verdict_of
 
 SPEC = Spec(steps=((28.0, 36.0),), settle_within_s=100.0, overshoot_degC=0.5, bias_degC=0.2)
 BETTER, SAME = {"baseline": 100.0, "tuned": 60.0}, {"baseline": 100.0, "tuned": 100.0}
@@ -77,3 +78,24 @@ def test_a_row_is_the_mean_and_the_worst_of_its_draws() -> None:
     assert (row.bias_mean, row.bias_worst) == (0.2, -0.3)
     assert (row.energy_mean_s, row.energy_worst_s) == (15.0, 20.0)
     assert (row.travel_mean, row.full_share, row.bound_s) == (1.0, 0.5, 50.0)
+    never = replace(row, settle_mean_s=nan, bound_s=inf)
+    assert never.to_dict() == vars(row) | {"settle_mean_s": None, "bound_s": None}
+    with pytest.raises(FrozenInstanceError):
+        row.target = 3.0
+
+
+@pytest.mark.parametrize(
+    ("scores", "name", "how"),
+    [
+        ({"tuned": 1.0, "baseline": 1.2, "PI": 1.04, "LQR": 2.0}, "", ""),
+        ({"tuned": 1.0, "baseline": 0.9}, "", ""),
+        ({"tuned": 100.0, "baseline": 120.0, "PI": 103.0}, "", ""),
+        ({"tuned": 1.2, "baseline": 1.0, "PI": 1.02}, "PI", "2.0 % worse"),
+        ({"tuned": 1.0, "baseline": 1.2, "PI": 0.9, "LQR": 0.95}, "PI", "10.0 % better"),
+        ({"tuned": 1.0, "baseline": 1.2, "PI": 1.5, "LQR": 1.004}, "LQR", "as well"),
+    ],
+)
+def test_a_simpler_controller_that_is_as_good_is_named_with_what_it_does_not_know(scores, name, how):
+    missing = ", and knows neither limits of outputs nor where a gain turns over" if name == "LQR" else ""
+    said = f"{name}, tuned with as many trials, scores {how} on this spec{missing}."
+    assert _simpler(scores) == (said if name else "")
