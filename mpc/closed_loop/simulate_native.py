@@ -56,9 +56,7 @@ def compiled_loop(
     readings = [dict(zip(names, row)) for row in reading.tolist()]
     controlled = tuple(controller.controlled)
     targets = [dict(zip(controlled, row)) for row in target.tolist()]
-    moves = [
-        Move(as_drive(model.drives, row), status=STATUSES[code]) for row, code in zip(drive, status)
-    ]
+    moves = [Move(as_drive(model.drives, row), status=STATUSES[code]) for row, code in zip(drive, status)]
     return record_loop(truth, controlled, targets, readings, moves, np.cumsum(counts).tolist(), band)
 
 

@@ -346,9 +346,10 @@ class Search:
 
 
 def _capped(ranges: dict[str, tuple[float, float]], share: float) -> dict[str, tuple[float, float]]:
-    """Return this share of each range, about no drive."""
+    """Return this share of each range, about no drive or what is nearest to none."""
+    rests = {name: min(max(0.0, low), high) for name, (low, high) in ranges.items()}
     return {
-        name: (min(low, 0.0) * share + max(low, 0.0), max(high, 0.0) * share + min(high, 0.0))
+        name: (rests[name] + share * (low - rests[name]), rests[name] + share * (high - rests[name]))
         for name, (low, high) in ranges.items()
     }
 

@@ -1,0 +1,163 @@
+"""What a search evaluates: lengths of trials, the designs that parameters make, results and their score."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.mpc.makers import make_tank
+from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.closed_loop.simulate import Segment, Surroundings
+from thermogrip.mpc.design.design import make_blocks
+from thermogrip.mpc.design.simc import PILoop
+from thermogrip.mpc.design.spec import Spec
+from thermogrip.mpc.tuning import objective
+from thermogrip.mpc.tuning.objective import Search, StepResult, Trial, parameters_of, scaled_loops, score
+
+STEPS = [(28.0, 36.0), (28.0, 20.0)]
+SPEC = Spec(steps=STEPS, hold_s=300.0, search_draws=2, check_draws=3, sensor_offset_degC=0.4, band_degC=0.3)
+
+
+def search_of(bounds: Any, *, uncertain: bool = True, spec: Spec = SPEC, **changes: Any) -> Search:
+    """Return the search of a tank whose shortest times are a function of (start, target, draw)."""
+    plant = SimpleNamespace(uncertain=uncertain, draw=lambda k: k)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(objective, "full_drive_bound", lambda drawn, design, step, spec: bounds(*step, drawn))
+        return Search(plant, spec, spec.design(make_tank(), **changes), 3)  # type: ignore[arg-type]
+
+
+def test_trials_last_for_what_the_slowest_draw_needs_and_those_of_a_pi_for_longer():
+    search = search_of(lambda start, target, draw: (70.0 if target > 30 else 20.0) + draw)
+    assert (search.draws, search.unseen, search.certain) == ([1, 2], [101, 102, 103], False)
+    assert (search.seed, search.check_seed) == (3, 3)
+    assert set(search.bounds) == {(*step, draw) for step in STEPS for draw in (1, 2, 101, 102, 103)}
+    assert search.bounds[28.0, 20.0, 102] == 122.0
+    assert search.lengths == pytest.approx([1.35 * 72 + 40, 120.0])  # two minutes at least
+    assert search.pi_lengths == pytest.approx([2.5 * 72 + 100, 2.5 * 22 + 100])
+    long = search_of(lambda *at: 250.0)
+    assert (long.lengths, long.pi_lengths) == ([300.0, 300.0], [300.0, 300.0])
+    short = search_of(lambda *at: 1.0, spec=SPEC.model_copy(update={"hold_s": 90.0}))
+    assert (short.lengths, short.pi_lengths) == ([90.0, 90.0], [90.0, 90.0])
+    sure = search_of(lambda *at: 50.0, uncertain=False)
+    assert (sure.draws, sure.unseen, sure.certain, sure.seed, sure.check_seed) == ([0], [0], True, 3, 4)
+
+
+def test_a_spec_of_which_one_step_can_be_reached_is_searched_and_one_of_which_none_can_is_refused():
+    search_of(lambda start, target, draw: np.inf if target < 30 else 50.0)
+    with pytest.raises(UserError, match="full drive does not reach 36 degC, nor any other target"):
+        search_of(lambda *at: np.inf)
+
+
+def test_each_controller_is_tried_for_its_own_length(monkeypatch: pytest.MonkeyPatch):
+    search = search_of(lambda *at: 60.0)
+    seen: list[Any] = []
+
+    def run(
+        controller: Any, plant: Any, spec: Spec, draws: Any, *, lengths: Any, seed: int
+    ) -> list[StepResult]:
+        seen.append((controller, draws, lengths, seed))
+        return [
+            StepResult(28.0, 36.0, 1, 80.0, 0.1, 0.0, 0.0, 20.0, 1.0, 0.5, 100.0),
+            StepResult(28.0, 20.0, 2, 100.0, 0.2, 0.0, 0.0, 40.0, 1.0, 0.5, 100.0),
+        ]
+
+    monkeypatch.setattr(objective, "run_trials", run)
+    monkeypatch.setattr(search, "made", lambda name, design: (name, design.move))
+    monkeypatch.setattr(search, "_pi", lambda loops: ("PI", loops[0].Kc / search.baseline.loops[0].Kc))
+    pi = {"Kc": 2.0, "Ti": 1.0, "Tt": 1.0, "feedforward": 0.5}
+    tried = [search.evaluate({"move": 7.0}), search.evaluate(pi, "PI"), search.evaluate({"move": 4.0}, "LQR")]
+    search.evaluate_at_length(("PI", pi))
+    lengths = [search.lengths, search.pi_lengths, search.lengths, [300.0, 300.0]]
+    names = [("MPC", 7.0), ("PI", 2.0), ("LQR", 4.0), ("PI", 2.0)]
+    assert seen == [(name, [1, 2], length, 3) for name, length in zip(names, lengths, strict=True)]
+    cost = (80 + 100) / 120 + 0.5 * (100 - 90) / 60  # the mean, and half of what the worst is above it
+    assert tried[0] == Trial("MPC", {"move": 7.0}, pytest.approx(cost), 90.0, 0.2, 30.0)
+    assert [trial.controller for trial in tried] == ["MPC", "PI", "LQR"]
+
+
+def test_a_trial_has_a_sensor_that_is_off_and_a_seed_of_its_draw(monkeypatch: pytest.MonkeyPatch):
+    seen: list[Any] = []
+
+    def loop(controller: Any, plant: Any, schedule: Any, **given: Any) -> Any:
+        seen.append((plant, schedule, given))
+        end, rest = schedule[0][0], {"sd": 0.0, "energy_s": 7.0, "travel": 2.0, "full_share": 0.6}
+        parts = [
+            Segment("a", 28.0, end, 5.0, 105.0, 30.0, 0.2, 0.03, **rest),
+            Segment("b", 28.0, end, 5.0, 105.0, 40.0, 0.1, -0.05, **rest),
+        ]
+        y = {"a": np.array([28.0, end + 0.5]), "b": np.array([28.0, end - 0.7])}
+        return SimpleNamespace(segments=parts, outputs=y)
+
+    monkeypatch.setattr(objective, "simulate_closed_loop", loop)
+    plant: Any = SimpleNamespace(disturbances=("room",), draw=lambda k: {"draw": k})
+    controller: Any = SimpleNamespace(controlled=("a", "b"))
+    found = objective.run_trials(controller, plant, SPEC, [1, 2], lengths=[50.0, 60.0], seed=4)
+    offset = {"a": 0.4, "b": 0.4, "room": pytest.approx(0.6)}
+    around = Surroundings(ambient=25.0, noise=0.04, offset=offset)
+    assert seen == [
+        ({"draw": draw}, [(target, length)],
+         {"start": 28.0, "surroundings": around, "band": 0.3, "seed": 4000 + draw})
+        for target, length in ((36.0, 50.0), (20.0, 60.0)) for draw in (1, 2)
+    ]  # fmt: skip
+    last = pytest.approx(-0.7)  # of b: each figure is of the output where it is worst
+    assert found[1] == StepResult(28.0, 36.0, 2, 40.0, 0.2, -0.05, last, 7.0, 2.0, 0.6, 100.0)
+    objective.run_trials(controller, plant, SPEC, [1])
+    assert [given[1][0][1] for given in seen[4:]] == [300.0, 300.0]
+    assert seen[4][2]["seed"] == 1
+
+
+def test_parameters_make_a_design_and_are_read_off_it():
+    search = search_of(lambda *at: 60.0)
+    base, spec = search.baseline, search.spec
+    assert search.design({}) == base
+    made = {"move": 3.0, "terminal": 4.0, "overshoot_share": 0.4, "drive_walk": 5e-3, "output_walk": 6e-3}
+    made |= {"horizon": 31.0, "blocks": 6.0}
+    design = search.design(made | {"drive": 0.7, "drive_share": 0.5})
+    assert parameters_of(design, spec) == pytest.approx(made)
+    assert (design.drive, design.overshoot, design.blocks) == (0.7, pytest.approx(0.12), make_blocks(31, 6))
+    assert design.drive_range == {"drive": (-0.5, 0.5)}
+    assert replace(design.noise, drive=base.noise.drive, output=base.noise.output) == base.noise
+    least = search.design({"horizon": 3.0, "blocks": 1.0})
+    assert least.blocks == make_blocks(10, 2)
+    own = sum(base.blocks), len(base.blocks)
+    assert search.design({"horizon": own[0] + 0.4, "blocks": own[1] - 0.4}).blocks is base.blocks
+    assert search.design({"horizon": own[0]}).blocks is base.blocks
+    assert len(search.design({"blocks": own[1] - 1.0}).blocks) == own[1] - 1
+    assert sum(search.design({"horizon": own[0] - 1.0}).blocks) == own[0] - 1
+
+
+@pytest.mark.parametrize(
+    ("ends", "capped"),
+    [((-1.0, 3.0), (-0.25, 0.75)), ((2.0, 6.0), (2.0, 3.0)), ((-6.0, -2.0), (-3.0, -2.0))],
+)
+def test_a_share_of_a_drive_is_about_none(ends, capped):
+    assert objective._capped({"q": ends}, 0.25) == {"q": pytest.approx(capped)}
+
+
+def test_a_pis_numbers_are_scaled_and_its_feedforward_is_given():
+    loop = PILoop("q", "t", 2.0, 30.0, 40.0, 0.9)
+    (made,) = scaled_loops((loop,), {"Kc": 3.0, "Ti": 0.5, "Tt": 0.1, "feedforward": 0.7})
+    assert made == PILoop("q", "t", 6.0, 15.0, 4.0, 0.7)
+
+
+def test_a_score_is_the_mean_and_half_of_what_the_worst_is_above_it():
+    one = StepResult(28.0, 36.0, 1, 150.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 300.0)
+    two = replace(one, draw=2, settle_s=40.0)
+    bounds = {(28.0, 36.0, 1): 50.0, (28.0, 36.0, 2): 40.0, (28.0, 36.0, 3): np.inf, (28.0, 36.0, 4): 0.2}
+    assert score([one, two], SPEC, bounds) == pytest.approx(2.0 + 0.5 * (3.0 - 2.0))
+    # in units of its whole length where nothing reaches it, and of a second at least
+    assert score([replace(one, draw=3)], SPEC, bounds) == pytest.approx(0.5)
+    assert score([replace(one, draw=4)], SPEC, bounds) == pytest.approx(150.0)
+    never = replace(one, settle_s=np.nan, last_error=-1.5, bias=5.0)  # its bias is not charged besides
+    assert score([never], SPEC, bounds) == pytest.approx(300 / 50 + 3.0)
+
+
+def test_a_note_has_none_for_what_is_no_number():
+    record = objective.Record()
+    vars(record).update(a=1.5, b=np.nan, c=np.inf, d="nan", e=3)
+    assert record.to_dict() == {"a": 1.5, "b": None, "c": None, "d": "nan", "e": 3}
+    assert all(kind.__dataclass_params__.frozen for kind in (StepResult, Trial))
