@@ -7,17 +7,17 @@
 
 #define RESTART_S 30.0 /* a longer silence than this and the past is unknown */
 #define SPIKE 6.0      /* degC off the prediction in one sample: a loose plug, unless it stays */
-#define LEFT_OUT 3     /* samples in a row, at most, that a jump is left out for */
-#define CANNOT 0.1     /* degC from the target: it cannot be had */
-#define CAN 0.05       /* degC from the target: it can */
+#define LEFT_OUT 3     /* samples in a row, at most, that a jump is rejected */
+#define CANNOT 0.1     /* degC from the target: out of reach */
+#define CAN 0.05       /* degC from the target: within reach */
 #define LEAST_SD 0.05  /* degC, of a steady output where no bias is estimated */
 #define MISS_CLIP 2.0      /* of Page's test: the most that a sample adds, */
 #define MISS_ALLOWANCE 0.5 /* what it has to exceed, */
-#define MISS_ALARM 3.0     /* and the sum at which a target cannot be had */
-#define TAKE_BACK 5    /* samples in a row, until it is taken back */
+#define MISS_ALARM 3.0     /* and the sum at which a target is out of reach */
+#define TAKE_BACK 5    /* samples in a row, until that is revoked */
 #define STILL 0.01     /* of its range: a drive that moves by less is constant */
 #define SURE 3.0       /* standard deviations by which a relaxing output falls short */
-#define KEPT (-3.0)    /* and from which on that is taken back */
+#define KEPT (-3.0)    /* and from which on that is revoked */
 #define CONTRADICTED 2.0 /* standard deviations that a bias moves while the drives stand still */
 #define INNOVATION_SD 0.3333333333333333 /* of a mean innovation: sqrt(q / (2 - q)) at REMEMBER q = 0.2 */
 #define STUCK 2.0      /* degC that the model expects of a reading that has not moved at all */
@@ -89,8 +89,8 @@ void tg_reset(tg_controller *c, const tg_design *design, const double *y, const 
 }
 
 /* Note a call at this time: the seconds that passed, each once, whether a move is due, and for how many seconds
- * the slew limit counts.  A stale reading lets no time pass that anybody knows of; such a call is taken to be as
- * far from the last as calls usually are.  A clock that went back by far and goes on from there began anew. */
+ * the slew limit counts.  A stale reading gives no elapsed time; such a call is taken to be as
+ * far from the last as calls usually are.  A clock that went back by far and runs on from there was restarted. */
 static int is_due(tg_controller *c, double now)
 {
     double before = c->time_s, dt = c->design->dt, passed;
@@ -123,7 +123,7 @@ static int is_due(tg_controller *c, double now)
         c->waited_s = fmax(c->since_s - c->spent_s, fmin(c->since_s, dt));
     }
     c->slew_s = c->waited_s;
-    if (c->stale || c->passed_s > RESTART_S + dt) /* nobody knows how long, or where the drives went meanwhile */
+    if (c->stale || c->passed_s > RESTART_S + dt) /* elapsed time and drives are unknown */
         c->slew_s = fmin(c->slew_s, dt);
     return passed >= dt * (1.0 - SAME) - 0.5 * c->interval_s;
 }
@@ -180,7 +180,7 @@ static int drop_stuck(tg_controller *c, double *y)
     return stuck;
 }
 
-/* Leave out jumps, for some samples; one that stays is an offset of its sensor, or another world. */
+/* Reject jumps, for some samples; one that stays is an offset of its sensor, or a change of the plant. */
 static int screen(tg_controller *c, double *y)
 {
     double mean[TG_NY];
@@ -390,7 +390,7 @@ static void go_on_pi(tg_controller *c, double *drive)
     }
 }
 
-/* Follow the plan while it is young; then PI, then off. */
+/* Follow the plan while it is recent; then PI, then off. */
 static void follow(tg_controller *c, tg_move *move, int status, int advice)
 {
     const tg_design *s = c->design;
@@ -454,7 +454,7 @@ static void record_relaxation(tg_controller *c)
  * NAN where that is not known. */
 static double falls_short(const tg_relaxation *m, double target, double sd, double *end)
 {
-    int span = (m->count - 1) / 3; /* the first is left out: the drives' lag is in it */
+    int span = (m->count - 1) / 3; /* the first is omitted: the drives' lag is in it */
     double mean[3] = {0.0}, left, side, d1, d2, slope;
     *end = NAN;
     if (span < 1)
@@ -692,7 +692,7 @@ tg_move tg_step(tg_controller *c, double time_s, const double *y, const double *
     wrong = set_target(c, target);
     decide(c, &move);
     if (move.status == TG_OK && said != TG_ALL_WELL)
-        move.advice = said; /* what happened in this sample, before what has been so for long */
+        move.advice = said; /* events of this sample before lasting conditions */
     if (wrong && move.status == TG_OK)
         move.status = TG_INFEASIBLE;
     if (wrong)
@@ -701,7 +701,7 @@ tg_move tg_step(tg_controller *c, double time_s, const double *y, const double *
         move.advice = said;
     keep_within(c, move.drive);
     memcpy(c->u, move.drive, sizeof c->u);
-    /* where the computer is slow, the drive of now goes on while the new one is worked out */
+    /* where the computer is slow, the present drive stays while the new one is computed */
     memcpy(c->in_force, c->design->move_delay ? in_force : c->u, sizeof c->in_force);
     set_pump(&move);
     c->status = move.status;

@@ -1,4 +1,4 @@
-/* A model-predictive controller of a thermal plant: a reading in, one move out, always.
+/* A model-predictive controller of a thermal plant: one move for every reading.
  *
  *     static tg_controller controller;
  *     tg_reset(&controller, &tg_the_design, y, d);
@@ -53,7 +53,7 @@ typedef struct {
     double drive[TG_NU];
     int pump;       /* 1 running, 0 off */
     int status;     /* enum tg_status */
-    int advice;     /* enum tg_advice; tg_advice_text says it in words */
+    int advice;     /* enum tg_advice; tg_advice_text has its sentence */
     int iterations; /* of the quadratic program */
     double over;    /* by how much a limit will be broken, or a target missed [degC], where the advice is that */
 } tg_move;
@@ -85,7 +85,7 @@ typedef struct {
     double seen[TG_NX];                 /* the state after the newest reading */
     double integral[TG_NC];             /* of the PI controller */
     double steady_x[TG_NX], steady_u[TG_NU], miss_sum; /* nearest to the targets, and evidence that they are missed */
-    int has_steady, in, unreachable;                   /* samples in a row that the targets can be had, since they could not */
+    int has_steady, in, unreachable;                   /* samples in a row within reach again */
     tg_relaxation relaxation[TG_NC];
     int has_plan, fresh, solves, on_pi, status, advice, spikes[TG_NY], lost[TG_NC]; /* lost: they cost nothing */
     /* what the last optimisation gave */
@@ -116,7 +116,7 @@ tg_move tg_step(tg_controller *c, double time_s, const double *y, const double *
 const char *tg_status_text(int status);
 const char *tg_advice_text(int advice);
 
-/* The parts, for tests and for a loop of one's own. */
+/* The parts, for tests and for other loops. */
 void tg_observer_reset(tg_controller *c, const double *y, const double *d);
 void tg_observer_update(tg_controller *c, const double *y);
 /* Take what a reading differs by for offsets of the sensors that are not 0 in which. */
@@ -131,7 +131,7 @@ void tg_expected(const tg_controller *c, double *y);
  * no steady state is found. */
 int tg_find_steady(tg_controller *c, const double *d, const double *on_u, const double *on_y, double *held, double *by_w);
 double tg_allowed_share(double end, double best, double span); /* of the way to an optimum */
-#define TG_FADING 0.3 /* of the gain at rest lost, from which on it is foreseen where it fades */
+#define TG_FADING 0.3 /* of the gain at rest lost, from which on its fall is predicted */
 void tg_hold_drives(tg_controller *c);
 double tg_planned(const tg_controller *c, int k, int j); /* drive j in the k-th sample from now */
 void tg_guess(const tg_controller *c, const double *last, double *guess);

@@ -270,7 +270,7 @@ static const double *sample_jacobian(tg_controller *c, const double *u, const do
 #define CONVERGED 1e-4 /* degC and of the range: the steady state is found */
 #define BEYOND 10.0 /* weight of an output beyond its target */
 #define LIMIT 100.0 /* and of one beyond its limits */
-#define CAN 0.05    /* degC from the target: it can be had */
+#define CAN 0.05    /* degC from the target: within reach */
 #define SIDES (1 + TG_NU + TG_NW)
 #define ROWS (TG_NC + TG_SOME(TG_NL))
 
@@ -348,7 +348,7 @@ static void squares_in_box(int n, const double *weight, const double *G, const d
     }
 }
 
-/* The ends of the drives: no further than the optimiser goes where a gain fades.  G: rows of all outputs. */
+/* The ends of the drives: no further than the optimiser goes where a gain falls.  G: rows of all outputs. */
 static void range_of(const tg_design *s, const double *G, const double *u, const double *on_u, double *low, double *high)
 {
     for (int j = 0; j < TG_NU; j++) {
@@ -525,7 +525,7 @@ void tg_observer_advance(tg_controller *c, double seconds, const double *u, cons
         c->dose[j] += left * u[j];
 }
 
-/* Look where the time has come to, between two samples: readings are compared there. */
+/* Evaluate the state at the present time, between two samples: readings are compared there. */
 void tg_observer_look(tg_controller *c, const double *d)
 {
     const tg_design *s = c->design;

@@ -1,4 +1,4 @@
-/* One sample's optimisation: linearise along the last plan, condense, solve one QP, look whether it holds.
+/* One sample's optimisation: linearise along the last plan, condense, solve one QP, simulate its plan.
  *
  * Unknowns are the drives' block values z in fractions of their range.  With y(z) ~ y0 + G (z - z0) and W the
  * weights of the samples,
@@ -6,10 +6,10 @@
  *     H = 2 ( G'WG + move D'D + drive L ),     f = 2 ( G'W (y0 - G z0 - r) - move D'e ).
  *
  * G is propagated as tangents of the step, a column for each drive of each block that has begun.
- * A Peltier's gain fades in proportion to its drive: what is left of it along the guess says where a quarter is
- * left, and no block goes further.  Where the simulated cost of the QP's plan is above that of the guess, or every fifth sample, shorter moves
- * and plain ramps are tried too: near the optimum of a Peltier element the linearisation overestimates the effect,
- * and beyond it the gain has turned over.
+ * A Peltier's gain falls in proportion to its drive: the gain along the guess gives the drive at which a quarter
+ * remains, and no block goes further.  Where the simulated cost of the QP's plan is above that of the guess, or
+ * every fifth sample, shorter moves and plain ramps are tried too: near the optimum of a Peltier element the
+ * linearisation overestimates the effect, and beyond it the gain changes sign.
  */
 #include "tg_controller.h"
 #include "tg_model.h"
@@ -39,7 +39,7 @@ static double more_slew(const tg_controller *c)
     return c->slew_s > 0.0 ? c->slew_s / c->design->dt - 1.0 : 0.0;
 }
 
-/* A drive that is there for an output that nobody sees goes to rest, as fast as the slew allows. */
+/* A drive whose output has no reading goes to rest, as fast as the slew allows. */
 static int is_parked(const tg_controller *c, int j) { return c->lost[c->design->pair[j]]; }
 
 static void park(const tg_controller *c, const double *last, double *plan)

@@ -18,7 +18,7 @@
  *
  * Rows may depend on one another: a range and a sum of slews that ends on it.  Every K_ii therefore includes a
  * share of 1e-11 of itself, which keeps the factor regular and the dual strictly concave; multipliers that
- * contradict each other run far apart until one reaches its end. What that share does to x is taken back in
+ * contradict each other diverge until one reaches its bound. The effect of that share on x is removed at
  * the end by one step of refinement with K itself. Hard rows that cannot be fulfilled together show there.
  */
 #include "tg_qp.h"
@@ -210,7 +210,7 @@ static void append_fit(tg_qp *q, int i)
     q->pivot[i] = left;
 }
 
-/* Take row r out of the factor: what is left of it is a rank-one change of the rows behind. */
+/* Take row r out of the factor: the remainder is a rank-one change of the rows behind. */
 static void remove_fit(tg_qp *q, int r)
 {
     double spare[TG_Q_M] = {0.0};
@@ -276,7 +276,7 @@ static void put(tg_qp *q, int row, int side, int state, double multiplier)
     append_fit(q, i);
 }
 
-/* Entry r has reached the end of its state: it leaves, or goes on as broken, or as kept. */
+/* Entry r has reached the bound of its state: it leaves the set, or becomes broken, or kept. */
 static void change(tg_qp *q, int r, int upward)
 {
     int row = q->row[r], side = q->side[r], state = q->state[r];
@@ -387,7 +387,7 @@ static void take_up(tg_qp *q)
     }
 }
 
-/* Fulfil the rows of the set as K itself asks, and say whether the hard ones are. */
+/* Fulfil the rows of the set as K itself requires; return whether the hard ones are. */
 static int refine(tg_qp *q)
 {
     for (int i = 0; i < q->n_work; i++) {
