@@ -77,8 +77,8 @@ from thermogrip.datasets.schema import Grasps, log_name
 
 _COVARIANCE_GRID = np.geomspace(0.5, 200.0, 25)  # nu_0 - d - 1, grasps
 _MEAN_GRID = np.geomspace(0.001, 30.0, 16)  # kappa_0, grasps
-# K; at this difference its error of some 0.5 K is as large as the difference between metals
-_HALF_WEIGHT = 2.0
+# K^2; at 2 K the error of some 0.5 K is as large as the difference between metals
+_HALF_WEIGHT = 4.0
 _LEAST_WEIGHT = 0.5  # grasps; with less a material's normalised features are unknown
 _T_OBJECT_SD = 0.5  # K, of a nominal object temperature
 _SD_WEIGHT = 4.0  # grasps that this prior counts for
@@ -262,7 +262,7 @@ class BayesClassifier(GraspClassifier):
         k, (n, d) = self.classes_.size, read.y.shape
         seen = np.isfinite(read.y)
         square = read.difference**2
-        clear = np.where(self.reader_.normalise, square / (square + _HALF_WEIGHT**2), 1.0)
+        clear = np.where(self.reader_.normalise, square / (square + _HALF_WEIGHT), 1.0)
         weight = np.where(seen & (read.gain != 0), clear[:, None], 0.0)
         x = np.divide(read.y, read.gain, out=np.zeros_like(read.y), where=weight > 0)
         self.center_ = _weighted_mean(x, weight)
@@ -373,7 +373,7 @@ class BayesClassifier(GraspClassifier):
 def _usable(difference: Floats, labels: Labels) -> tuple[NDArray[np.bool_], list[str]]:
     """Return which grasps have normalised features of at least two materials, and in words which have not."""
     clear = np.abs(difference) >= LEAST_DIFFERENCE
-    weight = np.where(clear, difference**2 / (difference**2 + _HALF_WEIGHT**2), 0.0)
+    weight = np.where(clear, difference**2 / (difference**2 + _HALF_WEIGHT), 0.0)
     known = [m for m in np.unique(labels) if weight[labels == m].sum() >= _LEAST_WEIGHT]
     if len(known) < 2:
         return np.zeros(labels.size, dtype=bool), [

@@ -12,7 +12,19 @@ from sklearn.base import BaseEstimator, ClassifierMixin, clone, is_classifier
 from sklearn.exceptions import NotFittedError
 
 from thermogrip.classify import load_classifier, make_classifier, save_classifier
-from thermogrip.classify.estimators.base import GraspClassifier, as_array, join_grasps, pick
+from thermogrip.classify.estimators.base import (
+    GraspClassifier,
+    as_array,
+    check_shapes,
+    common_times,
+    grasp_labels,
+    join_grasps,
+    level,
+    pick,
+    record_labels,
+    record_list,
+    times_from,
+)
 from thermogrip.classify.estimators.lda import ArrayClassifier
 from thermogrip.classify.estimators.registry import can_be_saved
 from thermogrip.datasets.errors import UserError
@@ -205,6 +217,74 @@ def test_joining_keeps_what_the_records_share() -> None:
     assert np.isnan(both["t_object"].values[1])
     with pytest.raises(UserError, match="share no time axis"):
         join_grasps([a, make_grasps([0.5, 1.5], [[4, 5]], ["c"])])
+
+
+HALF = np.array([-1.0, -0.75, -0.5, -0.25, 0.0, 0.5])
+READ = np.array([[20.0, 26.0, 23.0, 90.0, np.nan, 40.0], [np.nan, 1.0, 5.0, 7.0, 9.0, np.nan]])
+
+
+def test_traces_are_read_within_half_a_second_of_their_ends_about_their_own_level() -> None:
+    g = make_grasps(HALF, READ, list("ab"), t_surface_2=READ + 1.0)
+    np.testing.assert_array_equal(level(g), [23.0, 3.0])  # of the samples up to -0.5 s
+    np.testing.assert_array_equal(level(g, "t_surface_2"), [24.0, 4.0])
+    got = as_array(g, times=[-1.25, 0.0, 0.5], subtract_level=True)
+    traces = [[20 - 23, (2 * 90 + 40) / 3 - 23, 40 - 23], [1 - 3, 9 - 3, 9 - 3]]
+    np.testing.assert_allclose(got, np.hstack([traces, traces]))
+    np.testing.assert_array_equal(as_array(g, start=-0.25)[:, :3], [[90.0, 220 / 3, 40.0], [7.0, 9.0, 9.0]])
+    for times in ([-1.2500001, 0.0], [0.0, 0.5000001]):  # of b, which is read from -0.75 to 0 s
+        with pytest.raises(UserError, match=r"grasp 'b' covers -0\.75 to 0 s, .* are needed"):
+            as_array(g, times=times)
+    late = make_grasps(HALF[2:], READ[:1, 2:], ["c"])
+    assert level(late).tolist() == [56.5]  # one sample up to -0.5 s: the first three, one of them lost
+    assert times_from(g.assign_coords(time=HALF - 1e-9), 0.0).tolist() == [0.0, 0.5]
+    assert not np.signbit(times_from(make_grasps([-1e-9, 1.0], [[1, 1]], ["a"]), 0.0)[0])
+
+
+def test_labels_and_records_are_taken_one_after_another(three: Grasps) -> None:
+    a, b = pick(three, [0, 9]), pick(three, [17]).assign_attrs(name="b")
+    assert [x.tolist() for x in record_labels([a, b], ["p", "q", "r"])] == [["p", "q"], ["r"]]
+    assert [x.tolist() for x in record_labels([a, b], None)] == [["copper", "iron"], ["wood"]]
+    for y, message in (
+        (["p"] * 4, "4 labels for 3 grasps"),
+        (["p", "q", ""], "b: grasp 'touches-17' has no"),
+    ):
+        with pytest.raises(UserError, match=message):
+            record_labels([a, b], y)
+    with pytest.raises(UserError, match="touches: 1 labels for 2 grasps"):
+        grasp_labels(a, ["p"])
+    with pytest.raises(UserError, match="no grasps were given"):
+        record_list([])
+    with pytest.raises(UserError, match="expected Grasps, got int"):
+        record_list([a, 3])  # type: ignore[list-item]
+    mask = np.arange(24) == 3
+    assert pick(three, mask)["grasp"].values.tolist() == ["touches-3"]
+    assert pick(three, [5, 2])["grasp"].values.tolist() == ["touches-5", "touches-2"]
+
+
+def test_records_share_times_to_a_microsecond_and_fields_that_only_some_have_are_unknown() -> None:
+    a = make_grasps([0, 1, 2], [[1, 2, 3]], ["a"], material=["iron"], name="p")
+    b = make_grasps([1 + 4e-7, 2 - 4e-7, 3], [[4, 5, 6]], ["b"], t_object=[43.0], name="q")
+    assert common_times([a, b]).tolist() == [1.0, 2.0]
+    both = join_grasps([a, b])
+    assert both["t_surface"].values.tolist() == [[2, 3], [4, 5]]
+    assert both["material"].values.tolist() == ["iron", ""]
+    np.testing.assert_array_equal(both["t_object"], [np.nan, 43.0])
+    assert (both.attrs["name"], join_grasps([a, b], name="all").attrs["name"]) == ("p+q", "all")
+    two = join_grasps([g.assign(t_surface_2=g["t_surface"] + 1) for g in (a, b)])
+    assert two["t_surface_2"].values.tolist() == [[3, 4], [5, 6]]
+    with pytest.raises(UserError, match="p and r: the grasps share no time axis"):
+        join_grasps([a, make_grasps([2, 5], [[1, 2]], ["c"], name="r")])  # one instant is no axis
+
+
+@pytest.mark.parametrize(
+    ("shape", "fits"), [((2, 3), True), ((2, None), True), ((3, None), False), ((2,), False)]
+)
+def test_arrays_of_a_file_have_their_shape(shape: tuple[int | None, ...], fits: bool) -> None:
+    if fits:
+        check_shapes({"x": np.zeros((2, 3))}, x=shape)
+    else:
+        with pytest.raises(ValueError, match=r"x has shape \(2, 3\)"):
+            check_shapes({"x": np.zeros((2, 3))}, x=shape)
 
 
 LEARNERS = ["bayes", "features-lda", "pca-lda"]

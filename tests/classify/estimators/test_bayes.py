@@ -331,6 +331,7 @@ def test_the_bayesian_predictive_is_the_t_distribution_of_its_formula(three: Gra
         ]
     )
     assert model.dof_ == pytest.approx(model.shrinkage_ + 24 + 2)
+    assert model.t_object_sd_ == 0.0
     own = np.array([z[8 * m : 8 * m + 8].mean(axis=0) for m in range(3)])
     np.testing.assert_allclose(model.means_, own * 8 / counts, atol=1e-9)
     rest = z - np.repeat(own, 8, axis=0)

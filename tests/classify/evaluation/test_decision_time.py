@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from io import BytesIO
 
 import numpy as np
 import pytest
 from scipy.stats import binom
 
 from thermogrip.classify import evaluate, make_classifier
+from thermogrip.classify.decisions.stopping_rule import StopRule
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.classify.evaluation.decision_time import Decisions, decision_times
-from thermogrip.classify.figures import decision_figure
+from thermogrip.classify.evaluation.metrics import clopper_pearson, mean_intervals
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
@@ -25,6 +25,38 @@ TIMES = (0.6, 1.0, 2.0, 5.0)
 def _follow(grasps: Grasps, **settings: object) -> Decisions:
     models = {"pca-lda": make_classifier("pca-lda")}
     return decision_times(models, [grasps], **({"times": TIMES, "error": 0.1} | settings))
+
+
+def contact(condition: str, grasp: str, time: float, right: bool, p_wrong: float, **more: object) -> dict:
+    """Return one contact of 10 s."""
+    return {
+        "classifier": "a", "repeat": 0, "condition": condition, "grasp_id": grasp, "time": time, "end": 10.0,
+        "correct": right, "correct_at_end": True, "early": time < 10, "p_wrong": p_wrong,
+    } | more  # fmt: skip
+
+
+def test_a_row_is_made_of_its_contacts_and_counts_grasps() -> None:
+    rows = (
+        contact("wet", "i", 1.0, True, 0.1),
+        contact("wet", "i", 3.0, False, 0.3, repeat=1),
+        contact("wet", "w", 10.0, True, 0.4),
+        contact("dry", "i", 2.0, False, 0.2, end=8.0, correct_at_end=False),
+    )
+    rules = tuple(StopRule(sure=0.9, error=error) for error in (0.05, 0.2, 0.1))
+    pooled, wet, dry = Decisions(rows, {"a": rules}, ()).table(level=0.9, seed=3)
+    assert [row["condition"] for row in (pooled, wet, dry)] == ["pooled", "wet", "dry"]
+    time = mean_intervals([[1.0], [3.0], [10.0], [2.0]], [0, 0, 1, 2], level=0.9, seed=3)[0]
+    ends = (*clopper_pearson(1.5, 3, level=0.9), *clopper_pearson(4 / 3, 2, level=0.9))
+    assert pooled == {
+        "classifier": "a", "condition": "pooled", "error": 0.2, "n": 3, "tested": 4, "time": 4.0,
+        "time_low": time.low, "time_high": time.high, "end": 9.5, "accuracy": 0.5, "low": ends[0],
+        "high": ends[1], "accuracy_at_end": 0.75, "early": 0.75, "wrong_early": pytest.approx(2 / 3),
+        "wrong_early_low": pytest.approx(ends[2]), "wrong_early_high": pytest.approx(ends[3]),
+        "expected_early": pytest.approx(0.2),
+    }  # fmt: skip
+    assert (wet["n"], wet["tested"], dry["accuracy_at_end"]) == (2, 3, 0.0)
+    [alone] = Decisions(rows[3:], {"a": rules}, ()).table()
+    assert (alone["condition"], np.isnan(alone["time_low"])) == ("dry", True)
 
 
 @pytest.fixture(scope="module")
@@ -129,16 +161,3 @@ def test_the_posterior_is_followed_without_a_fit_for_each_window() -> None:
     assert row["accuracy_at_end"] == 1.0
     assert row["time"] < 3.0
     assert row["early"] >= 8 / 9  # of one iron block it is not sure after 3 s
-
-
-def test_the_figure_shows_each_classifier_where_its_contacts_ended(found: Decisions) -> None:
-    figure = decision_figure(found)
-    [row] = found.table()
-    curve = figure.axes[0].get_lines()[0]
-    assert curve.get_ydata()[-1] == 1.0
-    markers = [line for line in figure.axes[1].get_lines() if line.get_marker() == "o"]
-    assert [(float(m.get_xdata()[0]), float(m.get_ydata()[0])) for m in markers] == [
-        (row["time"], row["accuracy"]),
-        (row["end"], row["accuracy_at_end"]),
-    ]
-    figure.savefig(BytesIO())
