@@ -25,7 +25,7 @@ This is the sandwich [1]_, with a model of the error in its middle instead of fe
 whose covariance follows from the V's. The mean over logs of d_li^2 over its expectation is q_i, 1 where the
 learnt model is right, with the L - 1 degrees of freedom of L logs. Logs that differ by more, because the
 plant itself varies or because discrepancy meets other inputs, have q_i > 1. Three degrees of freedom
-determine one q_i poorly, so the parameters share strength: the moderated variance of Smyth [3]_ takes the
+determine one q_i poorly, so the parameters share strength: the moderated variance of Smyth [2]_ takes the
 true factors as scaled inverse chi-squared about a common phi_0 with n_0 degrees of freedom, both from the
 mean and the spread of ln q_i, and has
 
@@ -39,15 +39,10 @@ logs their quarters stand for logs; quarters of one log have much in common, so 
 put the estimate further off than the prior allows. Logs remove no prior knowledge, so in no direction is
 the covariance larger than the prior's (1 in units of z): larger eigenvalues become 1.
 
-**The set of z that agrees with the logs** is where s' Omega^-1 s is small, s simulated anew at each z.
-:mod:`thermogrip.sysid.greybox.posterior` samples exp(-s' Omega^-1 s / 2); near the estimate, where it has
-its mode, that is the normal distribution of the covariance above [2]_.
-
 References
 ----------
 .. [1] H. White, "Maximum likelihood estimation of misspecified models", Econometrica 50 (1982).
-.. [2] V. Chernozhukov, H. Hong, "An MCMC approach to classical estimation", J. Econometrics 115 (2003).
-.. [3] G. K. Smyth, "Linear models and empirical Bayes methods for assessing differential expression in
+.. [2] G. K. Smyth, "Linear models and empirical Bayes methods for assessing differential expression in
    microarray experiments", Statistical Applications in Genetics and Molecular Biology 3 (2004), section 6.2.
 """
 
@@ -88,8 +83,7 @@ class ScoreCovariance:
     """Uncertainty of a least-squares fit."""
 
     covariance: Array  # (n_free, n_free), of z, in prior units
-    omega: Array  # (n_free, n_free), covariance of the score
-    spread: Array  # the part of omega that differs from log to log: without prior and model discrepancy
+    spread: Array  # the part of Omega that differs from log to log: without prior and model discrepancy
     coarsening: float  # T of :mod:`thermogrip.sysid.greybox.posterior`
     hessian: Array  # (n_free, n_free), P
     q: float  # phi_0: how much logs differ over how much they should, as a variance
@@ -134,13 +128,11 @@ def score_covariance(
     plain = inverse @ (fixed + whole.spread.sum(axis=0)) @ inverse
     wider = np.sqrt((np.diag(inverse @ fixed @ inverse) + phi * of_logs) / np.diag(plain)) * _tail(freedom)
     covariance = _no_wider_than_prior(plain * np.outer(wider, wider))
-    omega = hessian @ covariance @ hessian
     by_weights = np.trace(inverse @ whole.hessian.sum(axis=0))
     spread = common * whole.spread.sum(axis=0)
     coarsening = max(1.0, float(np.trace(inverse @ spread)) / max(float(by_weights), 1e-12))
     return ScoreCovariance(
         covariance,
-        omega,
         spread,
         coarsening,
         hessian,

@@ -16,27 +16,8 @@ blocks of a single one), and the search stops when the best adds less than :data
 out of each stretch, since sensors have offsets of their own.
 
 **Candidates that a term proposes.** A product of signals is no physics, but each kind has few causes in a
-thermal network:
-
-==============  ==================================================================================
-term            changes of the network that would remove it from the residual
-==============  ==================================================================================
-u               sides that differ, a dead zone, an offset of the drive; a second zone (the term is slow)
-abs(u)          the same
-u u             a driver that droops, a resistance that rises, sides that differ; a second zone (an input that
-                is on or off is its own square)
-u T             a Seebeck coefficient that follows the temperature, a driver that droops
-abs(u) T        a resistance that follows the temperature
-T               a second zone behind the sensor's node, with the term's time constant
-T T             a loss that grows faster than the difference
-d, d d          air about the rig that lags what is read, by the term's time constant; a steady bench
-T d             convection, a steady bench
-s               heat of the pump; a film that follows the flow
-s T, s u, s d   a film that follows the flow
-==============  ==================================================================================
-
-u: an input, T: a simulated output, d: a measured ambient, s: a switch. A term proposes; the held-out rule
-of :mod:`thermogrip.sysid.growth.stepwise` evaluates a proposal like any other candidate.
+thermal network (:data:`_ANSWERS`). A term proposes; the held-out rule of
+:mod:`thermogrip.sysid.growth.stepwise` evaluates a proposal like any other candidate.
 """
 
 from __future__ import annotations
@@ -70,7 +51,6 @@ class ResidualTerm:
 
     output: str  # whose residual
     term: str  # product of signals, such as ``"drive*|drive|"``; a simulated output has its own name
-    coefficient: float  # static gain beside the terms before it [unit of the output per unit of the term]
     tau: float  # time constant of the response [s]
     share: float  # part of the residual's held-out variance that it explains beyond the terms before it
 
@@ -179,9 +159,7 @@ def _grow(
         if at is None:
             break
         chosen.append(at)
-        some = np.column_stack([X[i, :, j] for i, j in chosen])
-        value = float(np.linalg.lstsq(some, r, rcond=None)[0][-1])
-        out.append(ResidualTerm(name, labels[at[1]], value, float(taus[at[0]]), best - reached))
+        out.append(ResidualTerm(name, labels[at[1]], float(taus[at[0]]), best - reached))
         reached = best
     return out
 
@@ -435,17 +413,19 @@ def _without(network: Network, parameter: str) -> dict[str, Any]:
 MOST = 6  # terms that may propose
 
 _SIDES = ("cooling gain", "dead zone", "drive offset")
+# what would remove a term from the residual; u: an input, T: a simulated output, d: a measured ambient, s: a
+# switch
 _ANSWERS: dict[str, tuple[str, ...]] = {
-    "u": (*_SIDES, "second zone"),
+    "u": (*_SIDES, "second zone"),  # where the term is slow
     "|u|": (*_SIDES, "second zone"),
-    "u*u": ("droop", "R(T)", "cooling gain", "second zone"),
+    "u*u": ("droop", "R(T)", "cooling gain", "second zone"),  # an input that is on or off is its own square
     "|u|*u": ("droop", "R(T)", "cooling gain"),
     "|u|*|u|": ("droop", "R(T)", "cooling gain"),
     "T*u": ("S(T)", "droop"),
     "T*|u|": ("R(T)", "S(T)"),
-    "T": ("second zone",),
+    "T": ("second zone",),  # behind the sensor's node, with the term's time constant
     "T*T": ("convection",),
-    "d": ("lagging air", "steady bench"),
+    "d": ("lagging air", "steady bench"),  # air that lags what is read by the term's time constant
     "d*d": ("lagging air", "steady bench"),
     "T*d": ("convection", "steady bench"),
     "s": ("film follows the flow", "heat of the pump"),

@@ -131,7 +131,7 @@ class NetworkModel(Described):
         level = float(np.nanmean(y))
         moved = [i for i, name in enumerate(self.inputs) if name not in self.switches]
         low, high = np.array([self.network.inputs[self.inputs[i]].range for i in moved]).reshape(-1, 2).T
-        full = np.array([_full_scale(self.network, self.inputs[i]) for i in moved])
+        full = np.array([self.network.inputs[self.inputs[i]].full_scale for i in moved])
         z = np.concatenate([np.full(self.n_x, level), np.clip(u[moved], low, high) / full])
         for _ in range(8):  # bilinear and T^4 at most: Gauss-Newton settles in three or four
             rows = self._rest_residuals(
@@ -266,10 +266,6 @@ def _bounded_move(jacobian: Array, residual: Array, v: Array, low: Array, high: 
         left = residual + jacobian[:, beyond] @ move[beyond]
         move[~beyond] = np.linalg.lstsq(jacobian[:, ~beyond], -left, rcond=None)[0]
     return move
-
-
-def _full_scale(network: Network, name: str) -> float:
-    return network.inputs[name].full_scale
 
 
 @lru_cache(maxsize=64)

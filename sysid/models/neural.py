@@ -11,9 +11,7 @@ the data speak they agree, where they do not their errors differ and the mean is
 clipped to a little more than its reach r in the data (a drive that never moved there has r = 0 and moves
 nothing).  So the state is bounded whatever the weights and the inputs,
 
-    |x| <= sum_k |A^k| (|B| r + |c| + |V| 1),
-
-which :meth:`NeuralModel.bound` evaluates.
+    |x| <= sum_k |A^k| (|B| r + |c| + |V| 1).
 
 **Rails.**  An output that has stood still on its least or greatest value in the data is at the end of its
 range (an overflowing tank, the end of a converter); the states of such an output are clipped there.
@@ -103,16 +101,6 @@ class NeuralModel:
     def stable(self) -> bool:
         """Always true: a linear part that is not stable is refused, and the units are bounded."""
         return True
-
-    def bound(self) -> Array:
-        """Return a bound (n_y,) of |output - y_middle| / y_size over all inputs, from x = 0."""
-        push = np.abs(self.B) @ self.reach + np.abs(self.c) + np.abs(self.V).sum(axis=2)
-        power, total = np.broadcast_to(np.eye(self.A.shape[1]), self.A.shape), np.zeros_like(self.c)
-        while (step := np.einsum("kij,kj->ki", np.abs(power), push)).max() > 1e-9 * push.max():
-            total, power = total + step, power @ self.A
-        most = total[:, : len(self.outputs)].mean(axis=0)
-        rail = np.maximum(np.abs(self.low - self.y_middle), np.abs(self.high - self.y_middle)) / self.y_size
-        return np.asarray(np.minimum(most, rail))
 
     # ---- the Model protocol ----
 

@@ -313,13 +313,8 @@ def dominant_time(logs: Sequence[Log], *, inputs: Sequence[str], outputs: Sequen
     return float(np.median(found)) if found else longest / 20
 
 
-def choose_step(logs: Sequence[Log], *, inputs: Sequence[str], outputs: Sequence[str]) -> float:
-    """Return the averaging step [s], a whole multiple of the sample time (see the module's theory)."""
-    return _chosen_step(logs, inputs, outputs)[0]
-
-
 def _chosen_step(logs: Sequence[Log], inputs: Sequence[str], outputs: Sequence[str]) -> tuple[float, str]:
-    """Return the averaging step [s] and which of the rules set it."""
+    """Return the averaging step [s], a whole multiple of the sample time, and which of the rules set it."""
     native = float(np.median([sample_time(log) for log in logs]))
     slow = dominant_time(logs, inputs=inputs, outputs=outputs)
     longest = max(float(np.ptp(log["time"].values)) for log in logs)

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.contact.simulation import Blocks, simulate_grasps
 from thermogrip.sysid.effusivity.gripper_model import SHARED_NAMES, GripperModel, stack_numbers, stack_of
+from thermogrip.sysid.effusivity.laplace_approximation import free_hypotheses
 
 FIVE = ["brass", "copper", "iron", "wood", "zinc"]
 
@@ -31,6 +32,21 @@ def simulated_blocks(
     rng, ambient = np.random.default_rng(given.get("seed", 0)), given.get("ambient", 28.0)
     touches = grip.draw_many(labels, given["t_object"], rng, ambient=ambient, blocks=blocks)
     return grasps, np.array([touch.t_object for touch in touches])
+
+
+def drawn_from_the_prior(
+    gripper: GripperModel, n: int, *, low: float, high: float, seed: int
+) -> tuple[Grasps, NDArray[np.float64], NDArray[np.float64]]:
+    """Return grasps of what the free hypothesis assumes, any effusivity and conductance; ln e and T_obj."""
+    rng = np.random.default_rng(seed)
+    ln_e = rng.uniform(np.log(low), np.log(high), n)
+    free = free_hypotheses(gripper, ln_e)
+    ln_h = free.ln_h + free.ln_h_sd * rng.standard_normal(n)
+    ln_rho_c = free.ln_rho_c + free.ln_rho_c_sd * rng.standard_normal(n)
+    grasps, t_object = simulated_blocks(
+        gripper, ln_e=ln_e, ln_h=ln_h, ln_rho_c=ln_rho_c, t_gripper=23.0, t_object=43.0, seed=seed
+    )
+    return grasps, ln_e, t_object
 
 
 def split_of(grasps: Grasps, split: str) -> Grasps:

@@ -213,8 +213,13 @@ def touched():
     return load_example_grasps()["exp1A_obj43_grip23"].isel(grasp=[5, 13, 21, 29, 37])
 
 
-def test_an_uncertain_gripper_without_spread_changes_nothing(device, touched):
-    exact = replace(device, blocks={k: replace(b, ln_h_sd=0.0) for k, b in device.blocks.items()})
+@pytest.fixture(scope="module")
+def exact(device):
+    """The gripper whose blocks' conductances are known exactly."""
+    return replace(device, blocks={k: replace(b, ln_h_sd=0.0) for k, b in device.blocks.items()})
+
+
+def test_an_uncertain_gripper_without_spread_changes_nothing(exact, touched):
     same = another_gripper(exact, NOTHING)
     assert same.uncertain
     sure, unsure = material_fit(exact, touched, FIVE), material_fit(same, touched, FIVE)
@@ -225,9 +230,8 @@ def test_an_uncertain_gripper_without_spread_changes_nothing(device, touched):
 
 
 @pytest.mark.parametrize("name", ["lag", "sheet_thickness", "contact", "bias", "build_up"])
-def test_evidence_is_the_integral_over_the_grippers(device, touched, name):
+def test_evidence_is_the_integral_over_the_grippers(exact, touched, name):
     """Beside sums over exact grippers on a fine grid of the one number that is uncertain."""
-    exact = replace(device, blocks={k: replace(b, ln_h_sd=0.0) for k, b in device.blocks.items()})
     spread = replace(NOTHING, **{name: 0.3})
     found = material_evidence(another_gripper(exact, spread), touched, FIVE)
     z = np.linspace(-4.5, 4.5, 61)
@@ -295,9 +299,8 @@ def test_theta_moves_the_prior_means_as_another_device_would(device, touched):
         np.testing.assert_allclose(slopes[:, i], (there - here) / step, atol=1e-9, err_msg=name)
 
 
-def test_an_uncertain_bias_is_a_wider_spread_of_the_object(device, touched):
+def test_an_uncertain_bias_is_a_wider_spread_of_the_object(device, exact, touched):
     """Both are normal and enter alike, so that the answers are the same, temperature and all."""
-    exact = replace(device, blocks={k: replace(b, ln_h_sd=0.0) for k, b in device.blocks.items()})
     found = material_fit(
         another_gripper(exact, replace(NOTHING, bias=0.6)), touched, ["brass", "copper", "zinc"]
     )

@@ -19,7 +19,6 @@ from thermogrip.datasets.materials import find_material, load_materials
 from thermogrip.sysid.effusivity.data import touches, whiten
 from thermogrip.sysid.effusivity.laplace_approximation import (
     find_modes,
-    free_hypotheses,
     material_hypotheses,
     nodes_for,
     predict,
@@ -34,7 +33,7 @@ from thermogrip.sysid.effusivity.posterior import (
 from thermogrip.sysid.effusivity.posterior_grid import LN_E_RANGE, grid_posteriors
 
 from ...oracles.emcee_posterior import emcee_posterior
-from .makers import FIVE, simulated, simulated_blocks, split_of
+from .makers import FIVE, drawn_from_the_prior, simulated, split_of
 
 
 def test_every_solid_lies_in_the_prior_s_range_with_room_for_the_scale(device):
@@ -48,22 +47,9 @@ def test_every_solid_lies_in_the_prior_s_range_with_room_for_the_scale(device):
     assert (ln_e + scale + 2 * sd).max() > LN_E_RANGE[1] - 0.1
 
 
-def drawn_from_the_prior(device, n, *, gripper, nominal, seed):
-    """Simulate what the free hypothesis assumes: any effusivity, unknown conductance."""
-    rng = np.random.default_rng(seed)
-    ln_e = rng.uniform(np.log(100.0), np.log(8e4), n)
-    free = free_hypotheses(device, ln_e)
-    ln_h = free.ln_h + free.ln_h_sd * rng.standard_normal(n)
-    ln_rho_c = free.ln_rho_c + free.ln_rho_c_sd * rng.standard_normal(n)
-    record, t_object = simulated_blocks(
-        device, ln_e=ln_e, ln_h=ln_h, ln_rho_c=ln_rho_c, t_gripper=gripper, t_object=nominal, seed=seed
-    )
-    return record, ln_e, t_object
-
-
 def test_effusivity_is_recovered_with_intervals_that_cover(device):
     n = 60
-    record, ln_e, t_object = drawn_from_the_prior(device, n, gripper=23.0, nominal=43.0, seed=1)
+    record, ln_e, t_object = drawn_from_the_prior(device, n, low=100.0, high=8e4, seed=1)
     inside = hits_t = 0
     for truth, t, posterior in zip(ln_e, t_object, grid_posteriors(device, touches(record))):
         low, high = np.interp([0.05, 0.95], np.cumsum(posterior.mass), posterior.x)

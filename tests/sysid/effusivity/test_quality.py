@@ -16,7 +16,6 @@ from thermogrip.datasets.schema import Grasps, make_grasps
 from thermogrip.sysid.contact.simulation import simulate_grasps
 from thermogrip.sysid.effusivity.data import touches
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
-from thermogrip.sysid.effusivity.laplace_approximation import free_hypotheses
 from thermogrip.sysid.effusivity.posterior import material_fit
 from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors, mixture_quantiles
 from thermogrip.sysid.effusivity.quality import (
@@ -29,7 +28,7 @@ from thermogrip.sysid.effusivity.quality import (
     torn_groups,
 )
 
-from .makers import simulated_blocks
+from .makers import drawn_from_the_prior, simulated_blocks
 
 STEP = 0.0625
 TIME = np.round(np.arange(-20, 101) / 10, 1)
@@ -279,16 +278,10 @@ def test_clipped_samples_reach_no_average():
     np.testing.assert_array_equal(whole.y[whole.count > 0], lost.y[lost.count > 0])
 
 
-def test_intervals_of_clipped_grasps_cover():
+def test_intervals_of_clipped_grasps_cover(device):
     """Taken for readings, the samples at this rail leave 0.29 of the effusivities in their 90 % intervals."""
-    device, rng, n = load_default_gripper(), np.random.default_rng(5), 60
-    x = rng.uniform(np.log(2000), np.log(50000), n)
-    block = free_hypotheses(device, x)
-    grasps, _ = simulated_blocks(
-        device, ln_e=x, ln_h=block.ln_h + block.ln_h_sd * rng.standard_normal(n),
-        ln_rho_c=block.ln_rho_c + block.ln_rho_c_sd * rng.standard_normal(n), t_gripper=23.0, t_object=43.0,
-        seed=7,
-    )  # fmt: skip
+    n = 60
+    grasps, x, _ = drawn_from_the_prior(device, n, low=2000.0, high=50000.0, seed=7)
     cut = bounded(grasps, high=30.0)
     assert check_grasps(cut).masked.any(axis=1).mean() > 0.75
     ends = [

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
-from scipy.stats import chi2
 
 from tests.sysid.greybox.makers import heater
 from thermogrip.cli.excite import optimal_for, schedule_for
@@ -118,42 +117,6 @@ def _run(boards: Plant, kind: str, seed: int, u: np.ndarray, y: np.ndarray) -> L
     for k, name in enumerate(boards.outputs):
         columns[name] = (y[:, k] + _noise(rng, len(u), 20.0, 0.4), "degC", "output")
     return make_log(np.arange(float(len(u))), columns, name=f"{kind} {seed}")
-
-
-def _fits(boards: Plant, schedule, count: int) -> list[Plant]:
-    u = inputs_of(boards, schedule)
-    y = ExperimentForecast(boards, draws=0).outputs(u)[0][:-1]
-    return [fit_network(boards.model, [_run(boards, "run", seed, u, y)]) for seed in range(count)]
-
-
-def _logs(plant: Plant) -> np.ndarray:
-    natural = np.array([plant.values[name] for name in plant.free])
-    return np.where([plant.scales[name] == "log" for name in plant.free], np.log(np.abs(natural)), natural)
-
-
-@pytest.mark.slow
-def test_fits_have_the_forecast_intervals(boards, designs):
-    schedules, _ = designs
-    count, volumes = 5, {}
-    for kind, schedule in schedules.items():
-        expected = ExperimentForecast(boards).covariance(inputs_of(boards, schedule))
-        fits = _fits(boards, schedule, count)
-        # the errors themselves: chi2 with 7 degrees of freedom a fit, if the forecast covariance is true
-        errors = [_logs(fit) - _logs(boards) for fit in fits]
-        total = sum(float(e @ np.linalg.solve(expected, e)) for e in errors)
-        low, high = chi2.ppf([1e-4, 1 - 1e-4], 7 * count)
-        assert low < total < high
-        # the intervals that the fits state: sd goes with sqrt(tau), and tau of 240 bins with a window of 6
-        # is known to sqrt(2 * 13 / 240) = 0.33, their mean sd to half of it over the root of outputs and fits
-        ratios, volume = [], []
-        for fit in fits:
-            wider = np.array(list(fit.scores.identifiability.widening.values()))
-            within = np.asarray(fit.covariance) / np.outer(wider, wider)
-            ratios.append(np.sqrt(np.diag(within) / np.diag(expected)))
-            volume.append(np.linalg.slogdet(within)[1])
-        assert np.all(np.abs(np.mean(ratios, axis=0) - 1.0) < 4 * 0.165 / np.sqrt(2 * count))
-        volumes[kind] = np.mean(volume)
-    assert volumes["optimal"] < volumes["prbs"] - 2 * 3.0 * np.log(2.0)  # 3 bits at least, as forecast
 
 
 @settings(max_examples=6, deadline=None)

@@ -151,7 +151,7 @@ def test_intervals_cover_the_truth_as_often_as_stated() -> None:
     for seed in range(25):
         plant, logs = a_fit(100 + 2 * seed, 101 + 2 * seed)
         quantiles = np.quantile(
-            np.asarray(with_draws(plant, logs, 100, seed=seed).samples), [0.05, 0.95], axis=0
+            np.asarray(with_draws(plant, logs, 60, seed=seed).samples), [0.05, 0.95], axis=0
         )
         inside += (quantiles[0] <= list(TRUE.values())) & (quantiles[1] >= list(TRUE.values()))
     # 99 % bounds of a binomial of 25 at 0.9, per parameter; the prior's sd of 4 adds nothing

@@ -139,17 +139,6 @@ def test_halving_the_step_quarters_the_error():
     assert errors[1] / errors[2] == pytest.approx(4.0, rel=0.2)
 
 
-def test_peltier_cools_most_at_seebeck_times_temperature_over_resistance():
-    model = load_network("gripper")
-    p = dict(zip(model.parameters, model.prior)) | {"current": 40.0, "seebeck": 0.05, "resistance": 2.0}
-    drive = np.linspace(-1.0, 0.0, 4001)
-    x = [np.full(drive.size, 25.0)] * model.n_x
-    into_wall = model.flows(x, [drive, 1.0], [25.0], list(p.values()))[model.states.index("wall")]
-    best = -40.0 * drive[np.argmin(into_wall)]
-    assert best == pytest.approx(0.05 * 298.15 / 2.0, rel=1e-3)  # I* = a T / R
-    assert into_wall.min() == pytest.approx(-((0.05 * 298.15) ** 2) / (2 * 2.0), rel=1e-5)
-
-
 def pipe(cells: int) -> NetworkModel:
     return model_of(
         declare(
@@ -170,22 +159,6 @@ def test_a_pipe_delays_by_its_declared_delay(cells: int):
     )
     mean_delay = float(np.sum(1 - (y[0, 1:, 0] + y[0, :-1, 0]) / 2) * h)
     assert mean_delay == pytest.approx(9.0, abs=2e-3)
-
-
-def test_commands_inside_the_dead_zone_move_nothing_and_a_bend_adds_by_the_square():
-    model = model_of(everything())
-    x, p = [25.0] * model.n_x, dict(zip(model.parameters, model.prior.tolist()))
-    u0, v0 = p["u0"], p["v0"]
-    q = np.array([model.flows(x, [v - u0, 0.0, 0.0], [25.0], list(p.values())) for v in (-v0, 0, v0, 2 * v0)])
-    np.testing.assert_allclose(q[:3], np.tile(q[1], (3, 1)), atol=1e-12)
-    assert abs(q[3] - q[1]).max() > 0.1
-    extra = []
-    for dT in (5.0, 10.0):
-        x[1] = 21.0 + dT
-        numbers = [list((p | {"bend": b}).values()) for b in (0.0, 0.4)]
-        straight, bent = (model.flows(x, [-u0, 0.0, 0.0], [25.0], values)[1] for values in numbers)
-        extra.append(bent - straight)
-    assert extra == pytest.approx([-2.0 * 5.0 * 0.2, -2.0 * 10.0 * 0.4])
 
 
 @pytest.mark.parametrize("name", ["gripper", "peltier_chamber", "tclab", "everything"])

@@ -19,8 +19,6 @@ from thermogrip.datasets.schema import Log, make_log
 from thermogrip.sysid.greybox.fit import fit_network, free_runs
 from thermogrip.sysid.greybox.posterior import with_draws
 from thermogrip.sysid.greybox.problem import prior_plant
-from thermogrip.sysid.models.network import NetworkModel
-from thermogrip.sysid.models.network_spec import network_from_dict
 from thermogrip.sysid.models.user_class import load_object
 from thermogrip.sysid.models.user_model import OwnModel, own_model
 from thermogrip.sysid.plant.plant import Plant
@@ -89,31 +87,6 @@ def pumped(seed: int, seconds: float = 2400.0, sd: float = 0.0, **truth: float) 
     read = y[0, :-1, 0] + sd * rng.standard_normal(t.size)
     signals = {"pump": (pump, "V", "input"), "level": (read, "V", "output")}
     return make_log(t, signals, name=f"pumped{seed}")
-
-
-def test_a_class_and_the_same_network_from_a_file_agree():
-    content = {
-        "schema": "thermogrip.network", "version": 1, "name": "block", "dt": 0.02,
-        "inputs": {"q": {"unit": "1", "range": [0.0, 1.0]}},
-        "disturbances": {"air": {}},
-        "outputs": {"t": {"node": "block", "sd": 0.05}},
-        "nodes": {"block": {"capacity": "C"}},
-        "links": {"loss": {"between": ["block", "air"], "conductance": "G"}},
-        "heaters": {"h": {"node": "block", "input": "q", "power": "P"}},
-        "parameters": PARAMETERS,
-    }  # fmt: skip
-    network, own = NetworkModel(network_from_dict(content)), own_model(Block)
-    assert (own.inputs, own.disturbances, own.outputs) == (
-        network.inputs,
-        network.disturbances,
-        network.outputs,
-    )
-    assert own.parameters == network.parameters
-    q = np.repeat([1.0, 0.0, 0.5], 2000)[None, :, None]
-    air = np.full((1, 6000, 1), 21.0)
-    seen, _ = network.rollout([[25.0]], q, air, network.prior[None], 0.02)
-    got, _ = own.rollout([[25.0]], q, air, own.prior[None], 0.02)
-    np.testing.assert_allclose(got, seen, atol=1e-6)
 
 
 def test_the_parameters_of_noisy_tanks_are_found_again():

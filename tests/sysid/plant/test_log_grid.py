@@ -16,7 +16,6 @@ from thermogrip.sysid.plant.log_grid import (
     Segment,
     at_rows,
     bridge,
-    choose_step,
     cut_stretches,
     dominant_time,
     make_grid,
@@ -47,13 +46,14 @@ def lagged(tau: float, n: int, dt: float = 1.0, hold: int = 200, seed: int = 0) 
 
 
 @pytest.mark.parametrize(("hole", "filled"), [(1, True), (5, True), (6, False)])
-def test_holes_of_up_to_five_rows_are_bridged(hole: int, filled: bool):
-    y = 2.0 * np.arange(20.0)[:, None]
+def test_holes_of_up_to_five_rows_are_bridged_each_output_on_its_own_line(hole: int, filled: bool):
+    y = np.column_stack([2.0 * np.arange(20.0), 100 - 3 * np.arange(20.0)])
     broken = y.copy()
-    broken[7 : 7 + hole] = broken[:2] = np.nan
+    broken[7 : 7 + hole, 0] = broken[10:12, 1] = broken[:2] = np.nan
     found = bridge(broken)
     assert np.isnan(found[:2]).all()  # before the first reading there is no line
-    np.testing.assert_array_equal(found[7 : 7 + hole], y[7 : 7 + hole] if filled else broken[7 : 7 + hole])
+    want = y if filled else np.column_stack([broken[:, 0], y[:, 1]])
+    np.testing.assert_allclose(found[2:], want[2:])
 
 
 def test_a_grid_ends_with_the_last_whole_row_and_begins_with_the_first_reading():
@@ -148,13 +148,6 @@ def test_one_reading_on_either_side_of_its_middle_keeps_a_row():
 
 
 # ---- holes ----
-
-
-def test_each_output_is_bridged_on_its_own_line():
-    y = np.column_stack([np.arange(20.0), 100 - 3 * np.arange(20.0)])
-    broken = y.copy()
-    broken[4:8, 0] = broken[10:12, 1] = np.nan
-    np.testing.assert_allclose(bridge(broken), y)
 
 
 def test_a_row_is_whole_where_all_its_outputs_are():
@@ -291,9 +284,8 @@ def test_a_coarse_converter_asks_for_the_longest_step_that_moves_by_less_than_it
     log = log_of(coarse(gain * y, 0.0625), t, u)
     want = longest_below(gain * y, 0.0625)
     assert tau / 75 < want < tau / 10  # above a hundredth of the time constant, below a tenth
-    assert choose_step([log], inputs=["q"], outputs=["t"]) == want
-    said = make_grid([log]).why
-    assert said == "t moves less than its converter's 0.0625 in shorter steps"
+    grid = make_grid([log])
+    assert (grid.dt, grid.why) == (want, "t moves less than its converter's 0.0625 in shorter steps")
 
 
 def test_the_coarsest_log_and_the_moves_of_all_logs_count():
@@ -301,10 +293,10 @@ def test_the_coarsest_log_and_the_moves_of_all_logs_count():
     fine, rough = log_of(5.0 * y, t, u), log_of(coarse(5.0 * y, 0.0625), t, u)
     want = longest_below(5.0 * y, 0.0625)
     for logs in ([fine, rough], [rough, fine], [rough, rough, rough]):
-        assert choose_step(logs, inputs=["q"], outputs=["t"]) == want
+        assert make_grid(logs).dt == want
     # one that moves three times as much beside two that hardly do: the rms is between
     logs = [log_of(coarse(g * y, 0.0625), t, u) for g in (9.0, 2.0, 2.0)]
-    assert choose_step(logs, inputs=["q"], outputs=["t"]) == longest_below(np.sqrt(89 / 3) * y, 0.0625)
+    assert make_grid(logs).dt == longest_below(np.sqrt(89 / 3) * y, 0.0625)
 
 
 def test_a_step_is_held_at_a_tenth_of_the_time_constant():
