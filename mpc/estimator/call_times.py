@@ -107,12 +107,13 @@ def shifted(plan: Array, samples: float) -> Array:
     Between two samples a row of it is the mean of the drives that were planned for those seconds.
     """
     last = len(plan) - 1
-    whole = min(math.floor(samples + SAME), last)
-    share = min(samples - whole, 1.0)
-    ahead = plan[np.minimum(np.arange(len(plan)) + whole, last)]
-    if share <= SAME:
+    samples = min(samples, float(last))
+    whole = math.floor(samples + SAME)
+    rows = np.arange(len(plan)) + whole
+    ahead = plan[np.minimum(rows, last)]
+    if samples - whole <= SAME:
         return np.asarray(ahead)
-    return np.asarray((1 - share) * ahead + share * plan[np.minimum(np.arange(len(plan)) + whole + 1, last)])
+    return np.asarray(ahead + (samples - whole) * (plan[np.minimum(rows + 1, last)] - ahead))
 
 
 def opening(plan: Array, samples: float) -> Array:

@@ -16,7 +16,7 @@ from thermogrip.mpc.controllers.lqr import LQRController
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import default_design
-from thermogrip.mpc.estimator.call_times import CallTimes
+from thermogrip.mpc.estimator.call_times import CallTimes, opening, shifted
 from thermogrip.mpc.estimator.observer import Observer, choose_disturbances
 from thermogrip.mpc.native.build import compiler
 from thermogrip.mpc.plant.prediction import PredictionModel
@@ -151,13 +151,84 @@ def test_the_seconds_of_all_calls_are_the_time_that_passed(gaps):
     assert moved + times.since == pytest.approx(passed, abs=1e-9)
 
 
-def test_a_reading_out_of_order_counts_nothing_twice_and_a_clock_that_begins_anew_goes_on():
+def called(*readings: float | None) -> CallTimes:
+    """Return the times of calls that move the drives wherever a move is due, but at the last of them."""
     times = CallTimes(DT)
-    seconds = []
-    for now in (1000.0, 1002.0, 1001.0, 1004.0, 1004.0, 0.5, 2.5, 4.5):
-        times.call({"time_s": now})
-        seconds.append(times.seconds)
-    assert seconds == [2.0, 2.0, 0.0, 2.0, 0.0, 0.0, 3.0, 2.0]  # 0.5 is a call that nobody knew the time of
+    for at, now in enumerate(readings):
+        times.call({} if now is None else {"time_s": now})
+        if times.due and at < len(readings) - 1:
+            times.moved()
+    return times
+
+
+@pytest.mark.parametrize(
+    ("readings", "seconds", "due", "waited", "slew"),
+    [
+        ([100.0], 2.0, True, 2.0, 2.0),
+        ([100.0, 101.0], 1.0, False, 1.0, 1.0),  # due from dt - interval/2 on
+        ([100.0, 101.0, 101.5], 0.5, False, 1.5, 1.5),
+        ([100.0, 101.0, 101.5, 102.0], 0.5, True, 2.0, 2.0),
+        ([100.0, 100.8, 101.6], 0.8, True, 1.6, 1.6),
+        ([100.0, 100.7, 101.4], 0.7, False, 1.4, 1.4),
+        ([100.0, 132.0], 32.0, True, 32.0, 32.0),
+        ([100.0, 132.5], 32.5, True, 32.5, 2.0),  # of a silence nobody knows how far a drive may go
+        ([100.0, None], 2.0, True, 2.0, 2.0),
+        ([100.0, None, 102.0], 0.0, True, 2.0, 2.0),  # no time is a sample later
+        ([100.0, None, 103.0], 1.0, False, 1.0, 1.0),
+        # a stale call is taken to be as late as the calls are, and at most a sample's slew is spent on it
+        ([100.0, 100.0], 0.0, True, 2.0, 2.0),
+        ([100.0, 105.0, 105.0], 0.0, True, 5.0, 2.0),
+        ([100.0, 100.5, 100.5], 0.0, False, 1.0, 1.0),
+        ([100.0, 100.5, 100.5, 100.5], 0.0, False, 1.5, 1.5),
+        ([100.0, 100.5, 100.5, 100.5, 100.5], 0.0, True, 2.0, 2.0),
+        ([100.0, 100.0, 100.0, 106.0], 6.0, True, 2.0, 2.0),  # 4 s of it counted at the moves before
+        ([100.0, 100.0, 100.0, 103.0], 3.0, True, 2.0, 2.0),
+        ([100.0, 100.0, 100.0, 100.5], 0.5, False, 0.5, 0.5),
+        ([100.0, 100.0, 100.0, 109.0], 9.0, True, 5.0, 5.0),
+        ([100.0, 100.0, 100.0, 103.0, 104.6], 1.6, True, 1.6, 1.6),
+        ([100.0, 100.0, 101.0, 101.3], 0.3, False, 1.3, 1.3),  # two calls in a second: 0.5 s apart
+        # more than 30 s back, and on from there: begun anew
+        ([100.0, 69.5, 70.0], 0.0, True, 2.0, 2.0),
+        ([100.0, 69.0, 69.5], 2.5, True, 2.0, 2.0),
+        ([100.0, 69.0, 69.0], 0.0, True, 2.0, 2.0),
+        ([100.0, 69.0, 68.0, 68.5], 2.5, True, 2.0, 2.0),
+        ([100.0, 69.0, 69.5, 70.0], 0.5, False, 0.5, 0.5),
+        ([100.0, 69.0, 100.5, 69.5], 0.0, False, 0.75, 0.75),  # that clock had not begun anew
+    ],
+)
+def test_what_a_call_counts(readings, seconds, due, waited, slew):
+    times = called(*readings)
+    assert (times.seconds, times.stale) == (pytest.approx(seconds), seconds == 0.0)
+    assert times.due == due
+    assert (times.waited_s, times.slew_s) == pytest.approx((waited, slew))
+    times.reset()
+    assert repr(vars(times)) == repr(vars(CallTimes(DT)))
+
+
+PLAN = np.array([[1.0, 10.0], [2.0, 30.0], [4.0, 20.0], [8.0, 0.0]])
+
+
+@pytest.mark.parametrize(
+    ("samples", "ahead", "mean"),
+    [
+        (0.0, [1, 2, 4, 8], 1.0),
+        (0.25, [1.25, 2.5, 5, 8], 1.0),
+        (1 - 5e-7, [2, 4, 8, 8], 1.0),
+        (1 + 5e-7, [2, 4, 8, 8], 1.0),
+        (1.5, [3, 6, 8, 8], 4 / 3),
+        (2.0, [4, 8, 8, 8], 1.5),
+        (2.5, [6, 8, 8, 8], 2.0),
+        (3.0, [8, 8, 8, 8], 7 / 3),
+        (4.0, [8, 8, 8, 8], 3.75),
+        (9.5, [8, 8, 8, 8], 3.75),
+    ],
+)
+def test_what_is_ahead_of_a_plan_and_the_mean_of_its_opening(samples, ahead, mean):
+    found = shifted(PLAN, samples)
+    np.testing.assert_allclose(found[:, 0], ahead, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(found[:, 1], np.interp(np.arange(4) + samples, range(4), PLAN[:, 1]), atol=1e-4)
+    assert opening(PLAN, samples)[0] == pytest.approx(mean, rel=1e-15)
+    np.testing.assert_allclose(opening(PLAN[:, ::-1], samples)[1], mean, rtol=1e-15)
 
 
 @settings(max_examples=12, deadline=None)
