@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
-from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.interface import STATUSES
 
 REST = {"t_tank": 25.0, "t_surface": 25.0, "t_ambient": 25.0}
@@ -149,15 +148,3 @@ def test_a_damaged_file_is_refused_in_one_line_that_names_it(tank, tmp_path, cha
         Controller.load(path)
     assert "controller.json" in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_the_pi_holds_through_a_lost_reading_then_switches_off(tank):
-    pi = PIController(tank, dt=2.0)
-    pi.reset(REST)
-    before = pi.step(REST, 38.0).drive
-    for _ in range(5):
-        move = pi.step({**REST, "t_surface": NAN}, 38.0)
-        assert (move.status, move.drive) == ("fallback_plan", before)
-    for _ in range(4):
-        move = pi.step({**REST, "t_surface": NAN}, 38.0)
-    assert (move.status, move.drive, move.pump) == ("off", 0.0, 0)

@@ -202,6 +202,7 @@ def test_what_a_call_counts(readings, seconds, due, waited, slew):
     assert times.due == due
     assert (times.waited_s, times.slew_s) == pytest.approx((waited, slew))
     times.reset()
+    assert (times.seconds, times.since, times.stale) == (0.0, 0.0, False)
     assert repr(vars(times)) == repr(vars(CallTimes(DT)))
 
 
@@ -216,6 +217,7 @@ PLAN = np.array([[1.0, 10.0], [2.0, 30.0], [4.0, 20.0], [8.0, 0.0]])
         (1 - 5e-7, [2, 4, 8, 8], 1.0),
         (1 + 5e-7, [2, 4, 8, 8], 1.0),
         (1.5, [3, 6, 8, 8], 4 / 3),
+        (2 - 5e-7, [4, 8, 8, 8], 3 / (2 - 5e-7)),
         (2.0, [4, 8, 8, 8], 1.5),
         (2.5, [6, 8, 8, 8], 2.0),
         (3.0, [8, 8, 8, 8], 7 / 3),
@@ -226,7 +228,9 @@ PLAN = np.array([[1.0, 10.0], [2.0, 30.0], [4.0, 20.0], [8.0, 0.0]])
 def test_what_is_ahead_of_a_plan_and_the_mean_of_its_opening(samples, ahead, mean):
     found = shifted(PLAN, samples)
     np.testing.assert_allclose(found[:, 0], ahead, rtol=0, atol=1e-15)
-    np.testing.assert_allclose(found[:, 1], np.interp(np.arange(4) + samples, range(4), PLAN[:, 1]), atol=1e-4)
+    np.testing.assert_allclose(
+        found[:, 1], np.interp(np.arange(4) + samples, range(4), PLAN[:, 1]), atol=1e-4
+    )
     assert opening(PLAN, samples)[0] == pytest.approx(mean, rel=1e-15)
     np.testing.assert_allclose(opening(PLAN[:, ::-1], samples)[1], mean, rtol=1e-15)
 

@@ -10,10 +10,12 @@ from hypothesis import strategies as st
 from tests.mpc.makers import network_plant
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.estimator.observer import (
+    DisturbanceModel,
     Observer,
     ObserverNoise,
     choose_disturbances,
     detectability_margin,
+    resting_state,
 )
 from thermogrip.mpc.plant.prediction import PredictionModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
@@ -28,16 +30,18 @@ NOISE = ObserverNoise(state=0.03, drive=0.01, output=0.02, reading=0.1)
 DT = 2.0
 
 
-def model() -> PredictionModel:
+def model(
+    gain: float = 1.0, noise: tuple[tuple[str, float], ...] = (("a", 0.2), ("b", 0.001))
+) -> PredictionModel:
     """Two outputs behind a drive in percent, in a room that is measured."""
     plant = StateSpaceModel(
-        ("q",), ("t_room",), ("a", "b"), A=A, B=B[:, None] / SPAN, E=E[:, None], C=C, dt=DT, y0=LEVEL,
+        ("q",), ("t_room",), ("a", "b"), A=A, B=gain * B[:, None] / SPAN, E=E[:, None], C=C, dt=DT, y0=LEVEL,
         spread=np.diag(SPREAD**2),
     )  # fmt: skip
     units = {"q": "percent", "t_room": "degC", "a": "degC", "b": "degC"}
     offsets = dict(zip("ab", OFFSET.tolist()))
-    noise, valid = {"a": 0.2, "b": 0.001}, {"q": (0.0, 80.0)}
-    made = Plant(plant, {}, dt=DT, units=units, offsets=offsets, noise=noise, valid=valid)
+    valid = {"q": (0.0, 80.0)}
+    made = Plant(plant, {}, dt=DT, units=units, offsets=offsets, noise=dict(noise), valid=valid)
     return PredictionModel(made, dt=DT)
 
 
@@ -51,7 +55,8 @@ UNIT = SPREAD / np.sqrt(C**2 @ SPREAD**2).max()  # a state's own swing, as outpu
 def start(y: np.ndarray, room: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Weighted least squares for a plant at rest: state, past drive, the drive's bias, and both offsets."""
     seen = np.isfinite(y)
-    own = MODEL.rest(np.full(2, np.mean((y - OFFSET)[seen])), np.array([room]))
+    level = np.mean((y - OFFSET)[seen]) if seen.any() else room
+    own = MODEL.rest(np.full(2, level), np.array([room]))
     none = np.zeros((2, 3))
     rows = np.vstack([
         np.hstack([np.eye(2) - A, -B[:, None], np.zeros((2, 3))]) / (0.2 * UNIT[:, None]),
@@ -97,14 +102,49 @@ class Textbook:
         self.P = left @ self.P @ left.T + K @ R @ K.T
 
 
-def test_a_drive_and_the_controlled_output_are_what_may_be_off() -> None:
-    assert CHOSEN.names == ("input q", "output b")
-    assert choose_disturbances(MODEL, ("a",)).names == ("input q", "output a")
-    assert choose_disturbances(MODEL, ("b",), count=0).names == ()
+# A per cent of q moves a by 0.1 and b by 0.075 degC, a degree of the room by 1.0526 and 1.0921
+MARGINS = {"q": 0.125, "q, b": 0.0997171, "q, a": 0.0746257, "a or b": 1.0, "room": 1.5168148}
+
+
+@pytest.mark.parametrize(
+    ("controlled", "more", "names", "margin"),
+    [
+        (("b",), {}, ("input q", "output b"), "q, b"),
+        (("a",), {}, ("input q", "output a"), "q, a"),
+        (("b",), {"count": 1}, ("input q",), "q"),
+        (("b",), {"least": 0.12}, ("input q",), "q"),
+        (("a",), {"least": 0.09}, ("input q", "output b"), "q, b"),
+        (("b",), {"least": 0.13}, ("output b", "output a"), "a or b"),
+        (("b",), {"least": 1.2}, ("disturbance t_room",), "room"),
+    ],
+)
+def test_a_drive_and_the_controlled_output_are_what_may_be_off(controlled, more, names, margin) -> None:
+    found = choose_disturbances(MODEL, controlled, **more)
+    assert (found.names, found.n_w) == (names, len(names))
+    assert found.margin == pytest.approx(MARGINS[margin], rel=1e-6)
+    for kind, rows, of in zip(
+        ("input", "disturbance", "output"), (("q",), ("t_room",), ("a", "b")),
+        (found.on_drive, found.on_disturbance, found.on_output), strict=True
+    ):  # fmt: skip
+        np.testing.assert_array_equal(of, [[name == f"{kind} {row}" for name in names] for row in rows])
+
+
+def test_what_no_set_of_disturbances_explains_is_refused() -> None:
+    none = choose_disturbances(MODEL, ("b",), count=0)
+    assert (none.names, none.margin) == ((), 0.0)
+    for least in (0.12, 1e9):
+        with pytest.raises(UserError, match="no disturbance model of 2 states is detectable from a, b"):
+            choose_disturbances(MODEL, ("a", "b"), least=least)
+    weak = choose_disturbances(model(gain=1 / 80), ("b",))  # a per cent of q moves the outputs by 1.5 mK
+    assert weak.names == ("input q", "output b")
     unseen = np.zeros((2, 1))
-    with pytest.raises(UserError, match="no disturbance model"):
-        choose_disturbances(MODEL, ("a", "b"), least=1e9)
     assert detectability_margin(A, C, unseen, unseen) == 0.0
+
+
+def test_what_nobody_says_of_noise_is_assumed() -> None:
+    assert ObserverNoise() == ObserverNoise(state=0.005, drive=0.002, output=0.002, reading=0.05)
+    observer = Observer(model(noise=(("a", 0.2),)), CHOSEN, NOISE)
+    np.testing.assert_allclose(observer.R, [0.2**2, 0.1**2])
 
 
 def test_the_margin_is_the_steady_change_of_the_worst_combination_in_its_own_size() -> None:
@@ -180,14 +220,103 @@ def test_a_bias_of_a_drive_ends_at_its_range_and_an_outputs_goes_on() -> None:
 
 def test_where_a_sensor_is_lost_at_the_start_the_others_say_how_warm_it_is() -> None:
     observer = Observer(MODEL, CHOSEN, NOISE)
-    for y in (np.array([30.0, np.nan]), np.array([np.nan, 31.0])):
+    for y in (np.array([30.0, np.nan]), np.array([np.nan, 31.0]), np.full(2, np.nan)):
         observer.reset(y, np.array([21.0]))
         z, P, levels = start(y, 21.0)
         np.testing.assert_allclose([*observer.x, *observer.w], z, atol=1e-6)
         np.testing.assert_allclose(observer.output_bias, levels - LEVEL + [0.0, z[3]], atol=1e-6)
         np.testing.assert_allclose(observer._P, P, atol=1e-7)
-    observer.reset(np.full(2, np.nan), np.array([21.0]))
-    assert np.isfinite(observer.x).all()
+
+
+@pytest.mark.parametrize(("y", "room"), [([30.0, 27.0], 19.0), ([np.nan, 31.0], 24.0)])
+def test_the_start_of_a_linear_plant_is_that_linearised_in_the_room(y: list[float], room: float) -> None:
+    own, mapped = (Observer(MODEL, CHOSEN, NOISE, ambient=21.0) for _ in range(2))
+    own.reset(np.array(y), np.array([room]))
+    mapped.reset_in_room(np.array(y), np.array([room]))
+    for name, value in own.estimate().items():
+        np.testing.assert_allclose(mapped.estimate()[name], value, atol=1e-9)
+
+
+def test_the_past_drive_of_a_state_is_the_likeliest_that_held_it() -> None:
+    rest = resting_state(MODEL, np.array([1.0, 2.0]), np.array([40.0]), 26.0, np.array([22.0]), unit=UNIT)
+    x, W = np.array([3.0, -1.0]), 1 / (0.2 * UNIT) ** 2
+    left = x - A @ x - E * 22.0  # what the drive has to make up for, but for 0.2 degC a sample
+    assert rest.past_drive(x) == pytest.approx(SPAN * (B * W @ left) / (B * W @ B + 1))
+
+
+def test_the_mean_innovation_takes_a_fifth_of_the_newest_and_nothing_of_a_lost_one() -> None:
+    observer, level = Observer(MODEL, CHOSEN, NOISE), LEVEL + OFFSET
+    observer.reset(level, np.array([22.0]))
+    want, mean = Textbook(level, 22.0), np.zeros(2)
+    for y in (level + [0.4, -0.3], np.array([np.nan, level[1] + 0.5]), level + [-0.2, 0.9]):
+        spread = np.sqrt(np.diag(want.H @ want.P @ want.H.T + want.R))
+        scaled = (y - want.H @ want.z - want.levels) / spread
+        mean = np.where(np.isfinite(y), 0.8 * mean + 0.2 * scaled, mean)
+        observer.update(y)
+        want.correct(y)
+        np.testing.assert_allclose(observer.innovation, mean, rtol=1e-5)
+        assert observer.innovation_bias == pytest.approx(3 * np.abs(mean).max(), rel=1e-5)
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_between_samples_the_filter_is_that_of_the_state_there(held: bool) -> None:
+    """0.6 of a sample at 30 %, a reading, 0.8 of one at 50 %; the drive and the room may be off."""
+    entries = np.array([[1.0, 0.0]]), np.array([[0.0, 1.0]]), np.zeros((2, 2))
+    observer, room = Observer(MODEL, DisturbanceModel(("q", "room"), *entries, 1.0), NOISE), np.array([22.0])
+    observer.reset(LEVEL + OFFSET + [0.5, -0.7], room)
+    observer.hold_drives(np.array([held]))
+    F, H = np.eye(4), np.hstack([C, np.zeros((2, 2))])
+    F[:2] = np.hstack([A, B[:, None], E[:, None]])
+    Q = DT * np.diag([*(0.03 * UNIT) ** 2, 0.0 if held else 0.01**2, 0.02**2])
+    z, P, levels = np.array([*observer.x, *observer.w]), observer._P.copy(), observer.output_bias + LEVEL
+
+    def after(z: np.ndarray, percent: float) -> np.ndarray:
+        return F @ z + np.array([*(B * percent / SPAN + E * 22.0), 0.0, 0.0])
+
+    observer.advance(0.6 * DT, np.array([30.0]), room)
+    observer.look(room)
+    P, between = P + 0.6 * Q, 0.4 * np.eye(4) + 0.6 * F
+    np.testing.assert_allclose(observer.now, (0.4 * z + 0.6 * after(z, 30.0))[:2], atol=1e-9)
+    y = np.array([26.0, 25.5])
+    Hs, R = H @ between, np.diag([0.2**2, 0.02**2])
+    K = P @ Hs.T @ np.linalg.inv(Hs @ P @ Hs.T + R)
+    K[2] = 0.0 if held else K[2]
+    miss = y - levels - H @ (0.4 * z + 0.6 * after(z, 30.0))
+    np.testing.assert_allclose(observer.update(y), miss, atol=1e-9)
+    z = z + K @ miss
+    left = np.eye(4) - K @ Hs
+    P = left @ P @ left.T + K @ R @ K.T
+    for _ in range(2):  # looking twice is looking once
+        np.testing.assert_allclose([*observer.x, *observer.w], z, atol=1e-9)
+        np.testing.assert_allclose(observer.now, (0.4 * z + 0.6 * after(z, 30.0))[:2], atol=1e-9)
+        np.testing.assert_allclose(observer._P, P, atol=1e-12)
+        observer.look(room)
+    np.testing.assert_allclose(observer.disturbance_bias, [z[3]])
+    observer.advance(0.8 * DT, np.array([50.0]), room)
+    z, P = after(z, 0.6 * 30.0 + 0.4 * 50.0), F @ P @ F.T + 0.4 * Q
+    np.testing.assert_allclose([*observer.x, *observer.w], z, atol=1e-9)
+    np.testing.assert_allclose(observer.now, z[:2], atol=1e-9)
+    observer.look(room)
+    np.testing.assert_allclose(observer._P, P + 0.4 * Q, atol=1e-12)
+    np.testing.assert_allclose(observer.now, (0.6 * z + 0.4 * after(z, 50.0))[:2], atol=1e-9)
+    observer.advance(0.6 * DT, np.array([50.0]), room)
+    np.testing.assert_allclose(observer._P, F @ (P + 0.4 * Q) @ F.T + 0.6 * Q, atol=1e-12)
+
+
+def test_of_two_drives_the_weak_one_is_held_alone() -> None:
+    plant = PredictionModel(network_plant("tclab"), dt=10.0)
+    observer = Observer(plant, choose_disturbances(plant, ("t1", "t2")))
+    assert observer.disturbance.names == ("input q1", "input q2")
+    observer.reset(np.array([30.0, 28.0]), np.zeros(plant.n_d))
+    observer.predict(np.array([20.0, 10.0]), np.zeros(plant.n_d))
+    for weak in ([True, False], [False, True]):
+        observer.hold_drives(np.array(weak))
+        before = observer.w
+        observer.update(observer.reading() + [0.3, 0.2])
+        assert (observer.w == before).tolist() == weak
+    before = observer.reading()
+    observer.set_offsets(np.array([40.0, np.nan]), np.array([True, True]))
+    assert observer.reading() == pytest.approx([40.0, before[1]])
 
 
 @pytest.mark.parametrize("drive", [0.3, 0.5])

@@ -23,7 +23,9 @@ EXPECTED = np.array([30.0, 20.0])
         ([36.1, 36.2, NAN, 36.4, 36.5], "00001", "00001"),  # a lost one does not
     ],
 )
-def test_a_jump_is_left_out_three_times_and_counts_at_the_fourth(readings: list[float], kept: str, stays: str):
+def test_a_jump_is_left_out_three_times_and_counts_at_the_fourth(
+    readings: list[float], kept: str, stays: str
+):
     monitor = ReadingMonitor(2)
     monitor.forget(EXPECTED)
     for at, value in enumerate(readings):
@@ -86,7 +88,12 @@ def test_what_the_model_does_not_explain_is_reported_of_the_drive_first(
 
 @pytest.mark.parametrize(
     ("reading", "off"),
-    [({"a": 0, "b": 1}, True), ({"a": 1, "b": 0.49}, True), ({"a": 0.5, "b": 1}, False), ({"b": None}, False)],
+    [
+        ({"a": 0, "b": 1}, True),
+        ({"a": 1, "b": 0.49}, True),
+        ({"a": 0.5, "b": 1}, False),
+        ({"b": None}, False),
+    ],
 )
 def test_a_switch_is_off_below_a_half_and_only_where_it_is_read(reading: dict[str, float], off: bool):
     assert is_off(("a", "b"), reading) == off

@@ -1,0 +1,119 @@
+"""The PI baseline by hand: its moves and integrators, what is lost, and how it takes over."""
+
+from __future__ import annotations
+
+from itertools import count
+
+import numpy as np
+import pytest
+
+from tests.mpc.makers import crossed
+from thermogrip.mpc.controllers.pi import PIController, held_drive
+from thermogrip.mpc.design.simc import PILoop
+from thermogrip.mpc.plant.prediction import PredictionModel
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
+
+PLANT, NAN = crossed(), float("nan")
+LOOPS = (
+    PILoop("q2", "a", Kc=3.0, Ti=20.0, Tt=10.0, feedforward=0.5),
+    PILoop("q1", "b", Kc=2.0, Ti=40.0, Tt=5.0),
+)
+TARGET = {"a": 30.0, "b": 29.5}  # held by 40 % of q2 and 30 % of q1 in a room of 22 degC
+
+
+def pi(**changes) -> PIController:
+    given = {"loops": LOOPS, "controlled": ("b", "a"), "slew_per_s": {"q1": 4.0}, "patience_s": 3.0}
+    made = PIController(PLANT, dt=2.0, clock=count().__next__, **given | changes)
+    made.reset({"a": 22.0, "b": 22.0, "room": 22.0})
+    return made
+
+
+def test_its_moves_and_its_integrators_are_those_of_the_equations():
+    controller = pi()
+    for now, a, b, q1, q2, of_a, of_b in (
+        # q2: 20 + 3 * 8 = 44, of which 12.5 a second; q1: 30 + 2 * 7.5 = 45, of which 4
+        (0.0, 22.0, 22.0, 8.0, 25.0, 2 * (1.2 - 1.9), 2 * (0.375 - 7.4)),
+        (2.0, 24.0, 25.0, 16.0, 36.6, -1.4 + 2 * 0.9, -14.05 + 2 * (0.225 - 1.79)),
+        (5.0, 26.0, 27.0, 17.82, 32.4, 0.4 + 3 * 0.6, -17.18 + 3 * 0.125),
+    ):
+        move = controller.step({"a": a, "b": b, "room": 22.0, "time_s": now}, TARGET)
+        assert (move.status, move.advice, move.pump, move.seconds) == ("ok", "", 1, 1)
+        assert move.drive == pytest.approx({"q1": q1, "q2": q2}, abs=1e-4)
+        assert pytest.approx([of_a, of_b], abs=1e-4) == controller._I
+    held = controller.step({"a": 40.0, "b": 40.0, "room": 22.0, "time_s": 5.5}, TARGET)
+    assert (held.drive, held.advice) == (move.drive, "called before its sample time: the move is held")
+    assert held.seconds == 1
+    lost = [controller.step({"a": 30.0, "b": NAN, "time_s": now}, TARGET) for now in (7.0, 9.0, 11.0, 13.0)]
+    said = {(each.status, each.advice) for each in lost}
+    assert said == {("fallback_plan", "b: no usable reading, the others go on")}
+    drives = [each.drive["q1"] for each in lost]
+    assert drives == pytest.approx([17.82, 9.82, 1.82, 0.0], abs=1e-4)  # held for 3 s, then to rest
+    assert controller._I[1] == pytest.approx(-16.805, abs=1e-4)
+    assert lost[0].drive["q2"] == pytest.approx(20.0 + 2.2, abs=1e-4)
+    controller.reset({"a": 23.0, "b": 24.0})
+    assert controller._I.tolist() == controller._unread_s.tolist() == [0.0, 0.0]
+    assert controller._target.tolist() == [24.0, 23.0]
+    assert np.isnan(controller._room).all()
+
+
+@pytest.mark.parametrize(
+    ("target", "wrong"),
+    [(TARGET, ""), ({"a": 30.0}, "target of b is missing or absurd: the last good one is kept")],
+)
+def test_a_pi_without_readings_holds_then_switches_off(target: dict[str, float], wrong: str):
+    controller = pi()
+    first = controller.step({"a": 22.0, "b": 22.0, "room": 22.0}, TARGET)
+    moves = [controller.step({}, target) for _ in range(4)]
+    assert [move.status for move in moves] == ["fallback_plan", "off", "off", "off"]
+    assert {moves[0].advice} == {wrong or "reading lost: the drive is held"}
+    assert {move.advice for move in moves[1:]} == {wrong or "reading lost: drive to zero"}
+    assert [move.drive for move in moves[:2]] == [first.drive, {"q1": 0.0, "q2": 0.0}]
+    assert [move.pump for move in moves] == [1, 0, 0, 0]
+    again = controller.step({"a": 22.0, "b": 22.0}, target)
+    assert (again.status, again.advice) == ("ok", wrong)
+
+
+def test_patience_is_ten_seconds_or_five_samples():
+    for dt, seconds in ((1.0, 10.0), (2.0, 10.0), (4.0, 20.0)):
+        made = PIController(PLANT, dt=dt, loops=LOOPS, controlled=("a", "b"))
+        assert made._patience_s == pytest.approx(seconds * (1 + 1e-6), rel=1e-9)
+    assert made.slew.tolist() == [50.0, 50.0]  # an eighth of the range a second
+
+
+@pytest.mark.parametrize(
+    ("share", "narrow", "q1"), [(0.5, 100.0, 30.0), (0.0, 100.0, 0.0), (0.5, 20.0, 20.0)]
+)
+def test_a_drive_without_a_loop_gets_what_is_fed_forward(share: float, narrow: float, q1: float):
+    loop = PILoop("q2", "a", Kc=3.0, Ti=20.0, Tt=10.0, feedforward=share)
+    controller = pi(loops=(loop,), drive_range={"q1": (0.0, narrow)}, slew_per_s=None)
+    for _ in range(3):
+        u = controller.propose(np.array([22.0, 29.0]), np.array([29.5, 30.0]), np.array([22.2]))
+        controller.hold(u)
+    assert u[0] == pytest.approx(q1, abs=1e-4)  # a room of 22.2 degC is one of 22
+
+
+def test_an_unknown_room_is_one_of_25_degrees_and_the_last_that_was_read_stays():
+    controller = pi(slew_per_s={"q1": 100.0})
+    for room, ahead in ((NAN, 18.0), (23.6, 24.0), (NAN, 24.0)):  # (29.5 - room) / 0.25
+        controller._I[:] = 0.0
+        move = controller.step({"a": 30.0, "b": 29.5, "room": room}, TARGET)
+        assert move.drive["q1"] == pytest.approx(ahead, abs=1e-4)
+
+
+def test_a_take_over_starts_from_the_drives_that_are_applied():
+    controller = pi()
+    y, target, d = np.array([27.0, 26.0]), np.array([29.5, 30.0]), np.array([22.0])
+    controller.follow(np.array([33.0, 61.0]), y, target, d)
+    assert pytest.approx([61 - 20 - 12, 33 - 30 - 5], abs=1e-4) == controller._I
+    np.testing.assert_allclose(controller.propose(y, target, d), [33.0, 61.0])
+    np.testing.assert_allclose(controller._I, [29 + 2 * 0.6, -2 + 2 * 0.125], atol=1e-4)
+
+
+def test_where_nothing_holds_a_target_nothing_is_fed_forward():
+    model = StateSpaceModel(("q",), (), ("t",), A=[[1.0]], B=[[0.0]], C=[[1.0]], dt=1.0)
+    plant = Plant(model, {}, dt=1.0, units={"q": "1", "t": "degC"}, valid={"q": (0.0, 1.0)})
+    far = StateSpaceModel(("q",), (), ("t",), A=[[1.02]], B=[[0.0]], C=[[1.0]], c=[1.0], dt=1.0)
+    for made in (model, far):
+        u = held_drive(PredictionModel(Plant(made, {}, dt=1.0, units=plant.units)), ("t",), (30.0,), ())
+        assert u.tolist() == [0.0]

@@ -1,0 +1,28 @@
+"""What a number of a reading is, and what the room offers."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from thermogrip import mpc
+from thermogrip.mpc.interface import Move, number
+
+
+@pytest.mark.parametrize("value", [None, "warm", [], math.nan])
+def test_what_is_no_number_is_none(value: object):
+    assert math.isnan(number({"t": value}, "t"))  # type: ignore[dict-item]
+    assert math.isnan(number({}, "t"))
+    assert number({"t": "2.5"}, "t") == 2.5  # type: ignore[dict-item]
+
+
+def test_a_move_says_no_more_than_it_must():
+    assert Move(0.5) == Move(0.5, pump=1, status="ok", advice="", seconds=0.0, plan={})
+
+
+def test_the_room_offers_what_it_lists_and_nothing_else():
+    for name in mpc.__all__:
+        assert getattr(mpc, name) is not None
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        getattr(mpc, "nothing")  # noqa: B009
