@@ -89,7 +89,7 @@ class Optimiser:
         self.slew = design.dt * np.array([design.slew_per_s[name] for name in model.drives])
         # a later block may differ by what the slew allows between the middles of the two
         middles = np.cumsum(self.blocks) - 0.5 * np.array(self.blocks) + 0.5
-        gaps = np.concatenate([[1.0], np.maximum(1.0, np.diff(middles))])
+        gaps = np.concatenate([[1.0], np.diff(middles)])
         self.reach = np.cumsum(gaps)
         self.slews = (gaps[:, None] * self.slew).ravel()
         self._solves = 0

@@ -62,12 +62,12 @@ def network_plant(name: str, **valid: tuple[float, float]) -> Plant:
     return Plant(model, values, dt=model.dt, units=model.units, reference=model.reference, valid=valid)
 
 
-def crossed() -> Plant:
-    """Return two heaters in percent: a = room + 0.2 q2 and b = room + 0.25 q1 at rest, poles 0.9 and 0.8."""
+def crossed(q2: str = "percent") -> Plant:
+    """Return two heaters: at rest a = room + 0.2 q2 and b = room + 0.25 q1; poles 0.9 and 0.8."""
     A, B = np.diag([0.9, 0.8]), np.array([[0.0, 0.02], [0.05, 0.0]])
     E, names = np.array([[0.1], [0.2]]), ("q1", "q2", "room", "a", "b")
     model = StateSpaceModel(names[:2], names[2:3], names[3:], A=A, B=B, E=E, C=np.eye(2), dt=2.0)
-    units = dict.fromkeys(names, "percent") | dict.fromkeys(names[2:], "degC")
+    units = {"q1": "percent", "q2": q2} | dict.fromkeys(names[2:], "degC")
     return Plant(model, {}, dt=2.0, units=units, valid={"q1": (0.0, 100.0), "q2": (0.0, 100.0)})
 
 

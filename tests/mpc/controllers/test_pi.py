@@ -41,6 +41,7 @@ def test_its_moves_and_its_integrators_are_those_of_the_equations():
         assert (move.status, move.advice, move.pump, move.seconds) == ("ok", "", 1, 1)
         assert move.drive == pytest.approx({"q1": q1, "q2": q2}, abs=1e-4)
         assert pytest.approx([of_a, of_b], abs=1e-4) == controller._I
+    assert controller._unread_s.tolist() == [0.0, 0.0]
     held = controller.step({"a": 40.0, "b": 40.0, "room": 22.0, "time_s": 5.5}, TARGET)
     assert (held.drive, held.advice) == (move.drive, "called before its sample time: the move is held")
     assert held.seconds == 1
@@ -78,6 +79,8 @@ def test_patience_is_ten_seconds_or_five_samples():
     for dt, seconds in ((1.0, 10.0), (2.0, 10.0), (4.0, 20.0)):
         made = PIController(PLANT, dt=dt, loops=LOOPS, controlled=("a", "b"))
         assert made._patience_s == pytest.approx(seconds * (1 + 1e-6), rel=1e-9)
+    found = PIController(PLANT, controlled=("b", "a"))
+    assert [(loop.drive, loop.output) for loop in found.loops] == [("q1", "b"), ("q2", "a")]
     assert made.slew.tolist() == [50.0, 50.0]  # an eighth of the range a second
 
 
@@ -88,9 +91,9 @@ def test_a_drive_without_a_loop_gets_what_is_fed_forward(share: float, narrow: f
     loop = PILoop("q2", "a", Kc=3.0, Ti=20.0, Tt=10.0, feedforward=share)
     controller = pi(loops=(loop,), drive_range={"q1": (0.0, narrow)}, slew_per_s=None)
     for _ in range(3):
-        u = controller.propose(np.array([22.0, 29.0]), np.array([29.5, 30.0]), np.array([22.2]))
+        u = controller.propose(np.array([22.0, 29.0]), np.array([29.504, 30.0]), np.array([22.2]))
         controller.hold(u)
-    assert u[0] == pytest.approx(q1, abs=1e-4)  # a room of 22.2 degC is one of 22
+    assert u[0] == pytest.approx(q1, abs=1e-4)  # a room of 22.2 degC is one of 22, and 29.504 is 29.5
 
 
 def test_an_unknown_room_is_one_of_25_degrees_and_the_last_that_was_read_stays():

@@ -237,6 +237,22 @@ def test_the_start_of_a_linear_plant_is_that_linearised_in_the_room(y: list[floa
         np.testing.assert_allclose(mapped.estimate()[name], value, atol=1e-9)
 
 
+def test_how_the_rest_of_a_peltier_plant_answers_to_level_and_room() -> None:
+    plant = PredictionModel(network_plant("gripper"), dt=2.0)
+    x, v, room = plant.at_rest(22.0)
+    unit = np.linspace(0.5, 1.5, plant.n_x)
+    rest, steps = resting_state(plant, x, v, 25.0, room, unit=unit), np.eye(plant.n_d)
+    np.testing.assert_allclose(rest.P, rest.P.T, rtol=1e-12)
+
+    def mean(level: float, step: np.ndarray) -> np.ndarray:
+        return resting_state(plant, x, v, level, room + step, unit=unit).x
+
+    none = np.zeros(plant.n_d)
+    np.testing.assert_allclose(rest.by_level, (mean(26.0, none) - mean(24.0, none)) / 2, atol=1e-7)
+    by_d = [(mean(25.0, step) - mean(25.0, -step)) / 2 for step in steps]
+    np.testing.assert_allclose(rest.by_d.T, by_d, atol=1e-4)
+
+
 def test_the_past_drive_of_a_state_is_the_likeliest_that_held_it() -> None:
     rest = resting_state(MODEL, np.array([1.0, 2.0]), np.array([40.0]), 26.0, np.array([22.0]), unit=UNIT)
     x, W = np.array([3.0, -1.0]), 1 / (0.2 * UNIT) ** 2
@@ -337,7 +353,8 @@ def test_more_disturbances_than_outputs_cannot_be_distinguished():
     assert detectability_margin(A, C, np.eye(2), np.zeros((2, 2))) > 1
     assert detectability_margin(A, C, np.eye(2, 3), np.eye(2, 3)) == 0
     same = np.array([[0.1, 0.2], [0.0, 0.0]])  # two heat flows into one state
-    assert detectability_margin(A, C, same, np.zeros((2, 2))) == 0
+    for poles in (A, np.diag([1.0, 0.8])):
+        assert detectability_margin(poles, C, same, np.zeros((2, 2))) == 0
 
 
 def test_an_unseen_mode_that_does_not_decay_is_not_detectable():

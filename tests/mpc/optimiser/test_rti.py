@@ -1,15 +1,26 @@
-"""How far a drive is pushed towards a Peltier optimum: not beyond three quarters, if its range goes on."""
+"""The program and its cost by hand; how far a drive is pushed towards a Peltier optimum."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from tests.mpc.makers import crossed
 from thermogrip.mpc.closed_loop.simulate import Surroundings, simulate_closed_loop
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
+from thermogrip.mpc.design.design import Design
+from thermogrip.mpc.design.simc import PILoop
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.native.build import wanted
+from thermogrip.mpc.optimiser.qp import QPAnswer
+from thermogrip.mpc.optimiser.rti import Optimiser, allowed_share
+from thermogrip.mpc.plant.prediction import PredictionModel
 from thermogrip.mpc.tuning.minimum_time import full_drive_bound
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
 
 OPTIMUM = -0.55  # of the reversing tank, whose range ends at -1
 WAYS = [False, pytest.param(True, marks=pytest.mark.skipif(not wanted(), reason="no gcc here"))]
@@ -61,3 +72,224 @@ def test_a_tank_that_cools_better_than_its_model_arrives_as_soon_as_its_drive_al
     assert segment.settle_s <= 1.25 * flat_out  # 1.11; 1.41 where a bias moves the optimum
     assert segment.overshoot <= 0.3
     assert abs(segment.bias) <= 0.05
+
+
+# ---- the program of two drives, q1 in percent and q2 of 255, by hand ----
+
+DESIGN = Design(
+    dt=2.0, controlled=("b", "a"), blocks=(1, 2, 3), drive_range={"q1": (-50.0, 100.0), "q2": (0.0, 80.0)},
+    slew_per_s={"q1": 4.0, "q2": 10.0}, track=1.5, terminal=5.0, move=3.0, drive=0.7, overshoot=0.2,
+    limits={"a": (16.0, 28.0)}, price=7.0, deadline_s=0.0,
+)  # fmt: skip
+SPAN, ROOM = np.array([100.0, 255.0]), 22.0
+START, LAST = np.array([25.0, 21.0]), np.array([40.0, 30.0])  # a and b; q1 and q2
+TARGET, BIAS = np.array([27.0, 26.5]), np.array([0.4, -0.3])  # of b and a; of a and b
+PLANS = np.array([
+    [[45.0, 40.0], [30.0, 70.0], [-20.0, 10.0]],
+    [[60.0, 5.0], [90.0, 0.0], [100.0, 80.0]],
+])  # fmt: skip
+
+
+@pytest.fixture
+def optimiser() -> Optimiser:
+    return Optimiser(PredictionModel(crossed("0_255")), DESIGN)
+
+
+def outputs(plan: np.ndarray) -> np.ndarray:
+    """Return a and b (6, 2) under a plan of three blocks."""
+    a, b = START
+    rows = []
+    for q1, q2 in np.repeat(plan, (1, 2, 3), axis=0):
+        a, b = 0.9 * a + 0.02 * q2 + 0.1 * ROOM, 0.8 * b + 0.05 * q1 + 0.2 * ROOM
+        rows.append([a, b])
+    return np.array(rows) + BIAS
+
+
+def cost(plan: np.ndarray, side: tuple[float, float] = (0.0, 0.0), limits: bool = True) -> float:
+    y, before, total = outputs(plan), LAST, 0.0
+    for v, samples in zip(plan, (1, 2, 3), strict=True):
+        total += np.sum(3.0 * ((v - before) / SPAN) ** 2 + 0.7 * samples * (v / SPAN) ** 2)
+        before = v
+    for k, (a, b) in enumerate(y):
+        errors, slack = (b - 27.0, a - 26.5), [max(0.0, 16.0 - a), max(0.0, a - 28.0)] if limits else []
+        total += (1.5 + 5.0 * (k == 5)) * (errors[0] ** 2 + errors[1] ** 2)
+        slack += [max(0.0, way * e - 0.2) for way, e in zip(side, errors, strict=True) if way]
+        total += 7.0 * sum(s + s**2 for s in slack)
+    return float(total)
+
+
+def condensed(optimiser: Optimiser) -> tuple[np.ndarray, np.ndarray]:
+    """Return how the outputs answer to the plan in shares of its range (6, 2, 6), and those without one."""
+    still = outputs(np.zeros((3, 2)))
+    units = np.eye(6).reshape(6, 3, 2) * SPAN
+    return np.stack([outputs(unit) - still for unit in units], axis=-1), still
+
+
+@pytest.mark.parametrize("side", [(0.0, 0.0), (1.0, -1.0), (-1.0, 1.0)])
+def test_the_merit_of_a_plan_is_its_cost(optimiser, side):
+    y = np.stack([outputs(plan) for plan in PLANS])
+    found = optimiser._merit(PLANS, y, TARGET, np.array(side), LAST)
+    np.testing.assert_allclose(found, [cost(plan, side) for plan in PLANS])
+    optimiser._seen_rows = [1]  # b is lost: it costs nothing
+    rest = optimiser._merit(PLANS, y, TARGET, np.array(side), LAST)
+    weights = np.array([1.5] * 5 + [6.5])
+    off = (y[:, :, 1] - 27.0) * (side[0] or 1.0)
+    over = np.maximum(0.0, off - 0.2) * bool(side[0])
+    np.testing.assert_allclose(found - rest, off**2 @ weights + 7.0 * (over + over**2).sum(axis=1))
+
+
+def test_the_program_costs_what_the_plan_costs_and_its_minimum_is_the_linear_law(optimiser):
+    G, free = condensed(optimiser)
+    H, f = optimiser._cost(G, free, TARGET, LAST)
+    one, two = ((plan / SPAN).ravel() for plan in PLANS)
+    found = 0.5 * (two @ H @ two - one @ H @ one) + f @ (two - one)
+    assert found == pytest.approx(cost(PLANS[1], limits=False) - cost(PLANS[0], limits=False))
+    same, on_free, on_last = optimiser.linear_gains(G, [1, 0])
+    np.testing.assert_allclose(same, H)
+    best = on_free @ (free[:, [1, 0]] - TARGET).ravel() + on_last @ LAST
+    np.testing.assert_allclose(best, -np.tile(SPAN, 3) * np.linalg.solve(H, f))
+    optimiser._seen_rows = [1]
+    H, f = optimiser._cost(G, free, TARGET, LAST)
+    lost = 0.5 * (two @ H @ two - one @ H @ one) + f @ (two - one)
+    weights = np.array([1.5] * 5 + [6.5])
+    of_b = [weights @ (outputs(plan)[:, 1] - 27.0) ** 2 for plan in PLANS]
+    assert found - lost == pytest.approx(of_b[1] - of_b[0])
+
+
+@pytest.mark.parametrize(("side", "more"), [((1.0, 0.0), 0.0), ((-1.0, 1.0), 0.5), ((0.0, -1.0), -0.25)])
+def test_the_rows_of_the_program_are_what_a_plan_has_left_to_its_limits(optimiser, side, more):
+    G, free = condensed(optimiser)
+    ends = np.full((3, 2), [-50.0, 0.0]), np.full((3, 2), [100.0, 80.0])
+    A, lower, upper = optimiser._constraints(G, free, TARGET, np.array(side), LAST, ends, more)
+    slew = np.array([1 + more, 1.5, 2.5])[:, None] * [8.0, 20.0]  # between the middles of the blocks
+    for plan in PLANS:
+        y, change = outputs(plan), np.diff(plan, axis=0, prepend=LAST[None])
+        left = [(plan - ends[0]) / SPAN, (change + slew) / SPAN]
+        right = [(ends[1] - plan) / SPAN, (slew - change) / SPAN]
+        for row, target, way in ((1, 27.0, side[0]), (0, 26.5, side[1])):
+            left.append(y[:, row] - (target - 0.2) if way < 0 else np.full(6, np.inf))
+            right.append(target + 0.2 - y[:, row] if way > 0 else np.full(6, np.inf))
+        left, right = [*left, y[:, 0] - 16.0], [*right, 28.0 - y[:, 0]]
+        value = A @ (plan / SPAN).ravel()
+        np.testing.assert_allclose(value - lower, np.concatenate([each.ravel() for each in left]), atol=1e-12)
+        np.testing.assert_allclose(
+            upper - value, np.concatenate([each.ravel() for each in right]), atol=1e-12
+        )
+    qp = optimiser.qp
+    assert qp.soft.tolist() == [False] * 12 + [True] * 18
+    assert (set(qp.linear), set(qp.quadratic), qp.time_limit_s) == ({7.0}, {14.0}, 1e-3)
+
+
+def test_what_a_limit_will_be_broken_by_is_reported_beyond_a_tenth(optimiser):
+    y = np.full((6, 2), 20.0)
+    for a, broken in ((28.09, {}), (28.3, {"a": 0.3}), (15.91, {}), (15.5, {"a": 0.5})):
+        y[2, 0] = a
+        assert optimiser._broken(y) == pytest.approx(broken)
+
+
+@pytest.mark.parametrize(
+    ("more", "q1"), [(0.0, [32.0, 20.0, 0.0]), (0.5, [28.0, 16.0, 0.0]), (-0.5, [36.0, 24.0, 4.0])]
+)
+def test_ramps_take_the_drives_back_to_none_and_to_the_other_end(optimiser, more, q1):
+    back, across = optimiser._ramps(np.array([40.0, 0.0]), more)
+    assert back.tolist() == [[v, 0.0] for v in q1]
+    reach = np.array([1.0, 2.5, 5.0]) + more
+    assert across[:, 0].tolist() == (40.0 - 8.0 * reach).tolist()
+    assert across[:, 1].tolist() == np.minimum(20.0 * reach, 80.0).tolist()
+    optimiser._parked = [0]
+    parked = optimiser._park(PLANS, np.array([40.0, 0.0]), more)
+    assert parked[:, :, 0].tolist() == [q1, q1]
+    assert parked[:, :, 1].tolist() == PLANS[:, :, 1].tolist()
+
+
+@pytest.mark.parametrize(
+    ("end", "share"), [(0.5, 0.75), (0.9, 0.9), (1.0, 1.0), (1.05, 0.9), (1.125, 0.75), (9.0, 0.75)]
+)
+def test_the_share_of_the_way_to_an_optimum(end, share):
+    assert allowed_share(np.array([2 * end]), np.array([2.0]), SPAN[:1]) == pytest.approx(share)
+    assert allowed_share(np.array([end]), np.zeros(1), SPAN[:1]) == 0.75
+
+
+def test_the_range_ends_where_the_gain_will_have_faded_but_no_sooner_than_the_slew_allows(optimiser):
+    last, authority = np.array([60.0, 30.0]), np.full((3, 2), 0.5)
+    authority[:, 1] = 0.7  # of the gain: not less than what is foreseen
+    low, high = optimiser._range(np.full((3, 2), 20.0), np.array([5.0, 9.0]), authority, last, 0.0)
+    # optimum at 25 / 0.5 = 50 and three quarters of it; the slew takes 60 to 52, 40 and 20
+    assert high.tolist() == [[52.0, 80.0], [40.0, 80.0], [37.5, 80.0]]
+    assert low.tolist() == [[-50.0, 0.0]] * 3
+    high = optimiser._range(np.full((3, 2), 20.0), np.array([5.0, 9.0]), authority, last, 1.0)[1]
+    assert high[:, 0].tolist() == [44.0, 37.5, 37.5]
+    low, high = optimiser._range(np.full((3, 2), -20.0), np.array([5.0, 9.0]), authority, last, 0.0)
+    assert low[:, 0].tolist() == [-22.5] * 3  # 15 / 0.5 = 30, and heating now allows no more of cooling
+    assert high[:, 0].tolist() == [100.0] * 3
+    optimiser._parked = [0]
+    low, high = optimiser._range(np.full((3, 2), 20.0), np.zeros(2), authority, last, 0.0)
+    np.testing.assert_allclose(low[:, 0], [52.0 - 1e-5, 40.0 - 1e-5, 20.0 - 1e-5], rtol=1e-12)
+    np.testing.assert_allclose(high[:, 0], [52.0 + 1e-5, 40.0 + 1e-5, 20.0 + 1e-5], rtol=1e-12)
+    assert high[:, 1].tolist() == [80.0] * 3
+
+
+def test_gains_at_rest_and_what_is_left_of_them(optimiser):
+    np.testing.assert_allclose(optimiser.settled_gain, [25.0, 51.0])  # b by q1, a by q2, over their ranges
+    assert (optimiser.strongest.tolist(), optimiser.pair.tolist()) == ([0, 1], [0, 1])
+    G, _ = condensed(optimiser)
+    sums = G.sum(axis=0).reshape(2, 3, 2)
+    np.testing.assert_allclose(optimiser.at_rest, np.stack([sums[1, :, 0], sums[0, :, 1]], axis=1))
+    np.testing.assert_allclose(optimiser._authority(0.6 * G), np.full((3, 2), 0.6))
+    optimiser.seen[1, 0] = False
+    assert optimiser._authority(0.6 * G)[:2, 0].tolist() == [pytest.approx(0.6), 1.0]
+    loops = (PILoop("q2", "b", Kc=1.0, Ti=1.0, Tt=1.0), PILoop("q1", "a", Kc=1.0, Ti=1.0, Tt=1.0))
+    assert Optimiser(optimiser.model, replace(DESIGN, loops=loops)).pair.tolist() == [1, 0]
+
+
+def test_a_plan_is_taken_part_of_the_way_where_whole_it_costs_more_than_the_guess(optimiser):
+    """Of a cost c(first move of q1): the plan's is 50, the guess's 10; 0 and -22 are the ramps'."""
+    plan, guess = np.full((3, 2), 50.0), np.full((3, 2), 10.0)
+    last = np.array([-30.0, 0.0])  # from which a ramp goes to -22
+
+    def best(costs: dict[float, float]) -> float:
+        found, y = optimiser._best(
+            plan, guess, guess[:, :1], last, 0.0, lambda plans: 2 * plans[:, :, :1],
+            lambda plans, y: np.array([costs.get(v, 99.0) for v in plans[:, 0, 0]]),
+        )  # fmt: skip
+        assert (y == 2 * found[:, :1]).all()
+        return float(found[0, 0])
+
+    assert best({50.0: 9.0, 10.0: 9.1, -22.0: 9.0 / 1.03}) == -22.0  # the ramps, at the first solve
+    assert best({50.0: 9.0, 10.0: 9.0, -22.0: 1.0, 30.0: 1.0}) == 50.0
+    for share, first in ((0.5, 30.0), (0.25, 20.0), (0.1, 14.0), (0.0, 10.0)):
+        assert best({50.0: 11.0, 10.0: 10.5, 10 + 40 * share: 10.5}) == first, share
+    ramps = {50.0: 9.0, 10.0: 9.1, -22.0: 1.0}  # again five solves later
+    assert [best(ramps) for _ in range(5)] == [50.0] * 4 + [-22.0]
+    optimiser.forget()
+    assert best({50.0: 9.0, 10.0: 9.1, -22.0: 9.0 / 1.01}) == 50.0  # hardly better
+
+
+def test_a_solve_predicts_what_its_plan_does_and_parks_what_is_lost(optimiser):
+    bias = np.array([4.0, -6.0])
+    room, side, guess = np.array([ROOM]), np.array([1.0, -1.0]), np.tile(LAST, (3, 1))
+    ask = {"target": TARGET, "side": side, "bias": BIAS, "drive_bias": bias}
+    found = optimiser.solve(START, LAST, guess, room, **ask)
+    assert found.status == "solved"
+    np.testing.assert_allclose(found.y, outputs(found.plan + bias), atol=1e-9)
+    assert found.plan[0, 0] - 40.0 == pytest.approx(8.0)  # a is in its band, b far below its target
+    np.testing.assert_allclose(found.authority, [1.0, 1.0])
+    longer = optimiser.solve(START, LAST, guess, room, **ask, slew_s=2.5)
+    assert longer.plan[0, 0] - 40.0 == pytest.approx(10.0)
+    lost = optimiser.solve(START, LAST, guess, room, **ask, lost=np.array([True, False]), slew_s=2.0)
+    np.testing.assert_allclose(lost.plan[:, 0], [32.0, 20.0, 0.0])
+    optimiser.qp = SimpleNamespace(
+        solve=lambda *given: QPAnswer(np.full(6, np.nan), "cycling", 4, None, None)
+    )
+    failed = optimiser.solve(START, LAST, guess, room, **ask)
+    assert (failed.status, failed.broken, failed.iterations) == ("cycling", {}, 4)
+    assert np.isnan(failed.plan).all()
+    np.testing.assert_allclose(failed.y, outputs(guess + bias), atol=1e-9)
+
+
+@pytest.mark.parametrize(("a", "b"), [(1.0, 0.1), (0.9, 0.0)])
+def test_a_plant_that_settles_nowhere_or_is_not_moved_has_no_settled_gain(a, b):
+    model = StateSpaceModel(("q",), (), ("t",), A=[[a]], B=[[b]], C=[[1.0]], dt=2.0)
+    plant = Plant(model, {}, dt=2.0, units={"q": "1", "t": "degC"}, valid={"q": (0.0, 1.0)})
+    design = Design(2.0, ("t",), (1, 1), {"q": (0.0, 1.0)}, {"q": 1.0})
+    assert Optimiser(PredictionModel(plant), design).settled_gain is None
