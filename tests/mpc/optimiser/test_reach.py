@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
 
+from tests.mpc.makers import crossed
 from thermogrip.mpc.closed_loop.simulate import simulate_closed_loop
 from thermogrip.mpc.closed_loop.simulate_native import compiled_loop
 from thermogrip.mpc.controllers.mpc import Controller
-from thermogrip.mpc.design.design import default_design
+from thermogrip.mpc.design.design import Design, default_design
+from thermogrip.mpc.design.simc import PILoop
+from thermogrip.mpc.estimator.observer import Observer, choose_disturbances
 from thermogrip.mpc.native.build import wanted
+from thermogrip.mpc.optimiser.reach import Reach, _least_squares_in_box, _Relaxation
+from thermogrip.mpc.optimiser.rti import Optimiser
+from thermogrip.mpc.plant.prediction import PredictionModel
 
 LIMIT = {"t_tank": (8.0, 50.0)}
 LEAKY = {"heat": 0.14, "loss": 1 / 150}  # 45.6 degC at most, and the model expects 102
@@ -57,3 +66,201 @@ def test_a_target_out_of_reach_is_reported_soon_and_kept_and_no_other_is(row, ta
         compiled = compiled_loop(Controller(plant, design, compiled=True), truth, schedule)
         assert compiled.status == loop.status
         np.testing.assert_allclose(compiled.drive["drive"], loop.drive["drive"], atol=1e-5)
+
+
+# ---- its parts, by hand ----
+
+NAN = float("nan")
+DESIGN = Design(
+    dt=2.0, controlled=("b", "a"), blocks=(1, 2), drive_range={"q1": (-50.0, 100.0), "q2": (0.0, 80.0)},
+    slew_per_s={"q1": 4.0, "q2": 10.0}, limits={"a": (16.0, 28.0)},
+)  # fmt: skip
+MODEL = PredictionModel(crossed("0_255"))
+OBSERVER = Observer(MODEL, choose_disturbances(MODEL, ("b", "a")))
+TARGET, BOTH = np.array([27.0, 26.5]), np.array([True, True])  # of b and a
+NO_SIDE, FREE = np.zeros(2), {"low": np.array([-99.0, 0.0]), "high": np.array([99.0, 0.0])}
+
+
+def reach(**changes) -> Reach:
+    return Reach(Optimiser(MODEL, replace(DESIGN, **changes)), OBSERVER)
+
+
+def test_means_of_a_relaxation_are_joined_when_there_are_twelve():
+    relaxation = _Relaxation()
+    for value in [*range(11), 11.0, 20.0, 30.0, 7.0]:
+        relaxation.add(value)
+    assert relaxation.bins == [0.5, 2.5, 4.5, 6.5, 8.5, 10.5, 25.0]
+    assert (relaxation.per, relaxation.sum, relaxation.n) == (2, 7.0, 1)
+
+
+SLOPE = np.hypot(np.hypot(10.4, 25.8), 17.9)  # of g by the three means, one of which is 10.4 off
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+@pytest.mark.parametrize(
+    ("bins", "target", "g", "limit"),
+    [
+        # means 2, 7, 9.5: d1 = 5, d2 = 2.5, 10.4 left of 10.5: 5 * 10.4 - 2.5 * 12.9, and 9.5 + 2.5
+        ([99.0, 1.0, 3.0, 6.0, 8.0, 10.0, 9.0], 20.0, 19.75 / SLOPE, 12.0),
+        ([99.0, 98.0, 1.0, 3.0, 6.0, 8.0, 10.0, 9.0], 20.0, 19.75 / SLOPE, 12.0),
+        ([99.0, 1.0, 3.0, 6.0, 8.0, 10.0, 9.0], 9.59, NAN, NAN),  # within a tenth of it
+        ([99.0, 2.0, 2.0, 7.0, 7.0, 12.0, 12.0], 20.0, NAN, NAN),  # no slower than before
+        ([2.0, 7.0, 9.5], 20.0, NAN, NAN),
+        # turned back: d2 = -1, 14 left but a tenth: 5 * 13.9 + 12.9, and 6 - 1/6
+        ([99.0, 2.0, 7.0, 6.0], 20.0, 82.4 / np.hypot(np.hypot(13.9, 25.8), 17.9) / 2**0.5, 6 - 1 / 6),
+    ],
+)  # fmt: skip
+def test_a_relaxation_that_ends_short_of_its_target(way, bins, target, g, limit):
+    relaxation = _Relaxation()
+    relaxation.bins, relaxation.per = [way * value for value in bins], 4
+    found = relaxation.falls_short(way * target, 0.3)
+    np.testing.assert_allclose(found, (g * np.sqrt(8) / 0.3, way * limit), rtol=1e-9)
+
+
+def test_least_squares_in_a_box_is_that_of_scipy():
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        G, e, low = rng.normal(size=(4, 3)), rng.normal(size=4), -rng.random(3)
+        want = lsq_linear(G, e, (low, low + 0.7), tol=1e-14).x
+        np.testing.assert_allclose(_least_squares_in_box(G, e, low, low + 0.7), want, atol=1e-6)
+    G = np.array([[2.0, 0.0], [1.0, 0.0]])  # a drive that moves nothing stays
+    found = _least_squares_in_box(G, np.array([3.0, 4.0]), np.full(2, -9.0), np.full(2, 9.0))
+    np.testing.assert_allclose(found, [2.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("target", "side", "seen", "z"),
+    [
+        ([22.0, 26.0], [0.0, 0.0], BOTH, 4.0),
+        ([22.0, 26.0], [1.0, 1.0], BOTH, 206 / 101),  # b beyond its target counts ten times
+        ([18.0, 14.0], [0.0, 0.0], BOTH, (-8.0 - 40000.0) / 10002),  # a below its limit a hundred times
+        ([22.0, 18.0], [-1.0, -1.0], BOTH, 198 / 101),
+        ([22.0, 26.0], [1.0, 1.0], np.array([False, True]), 6.0),
+        ([33.0, 33.0], [0.0, 0.0], BOTH, 80026 / 10002),
+    ],
+)
+def test_the_nearest_outputs_of_one_drive_on_two(target, side, seen, z):
+    G, y = np.array([[1.0, 0.0], [1.0, 0.0]]), np.full(2, 20.0)  # a and b
+    found = reach()._nearest(G, y, np.array(target), np.array(side), seen, **FREE)
+    np.testing.assert_allclose(found, [z, 0.0], rtol=1e-9)
+
+
+def test_the_range_ends_where_a_gain_fades():
+    made, bias = reach(), np.array([5.0, 9.0])
+    G = np.array([[0.0, 0.7 * 51], [0.5 * 25, 0.0]])  # of a and b, half and seven tenths of those at rest
+    low, high = made._range(G, np.array([20.0, 20.0]), bias)
+    assert (low.tolist(), high.tolist()) == ([-50.0, 0.0], [37.5, 80.0])  # 0.75 * 25 / 0.5
+    low, high = made._range(G, np.array([-20.0, 20.0]), bias)
+    assert (low.tolist(), high.tolist()) == ([-22.5, 0.0], [100.0, 80.0])  # 0.75 * 15 / 0.5
+    made._optimiser.settled_gain = None
+    assert made._range(G, np.array([20.0, 20.0]), bias)[1].tolist() == [100.0, 80.0]
+
+
+@pytest.mark.parametrize(
+    ("target", "held"), [([27.0, 26.5], [27.0, 26.5]), ([27.0, 45.0], [27.0, 280045 / 10001])]
+)
+def test_the_steady_outputs_nearest_to_the_targets_and_what_the_biases_do_there(target, held):
+    made = reach()
+    OBSERVER.reset(np.array([22.0, 22.0]), np.array([22.0]))
+    OBSERVER.w = np.array([0.1, -0.05])
+    for _ in range(2):  # from the drives of now, then from the last answer
+        y, J = made._held(OBSERVER, np.array([40.0, 30.0]), np.array([22.0]), np.array(target), NO_SIDE, BOTH)
+        np.testing.assert_allclose(y, held, atol=1e-6)
+        np.testing.assert_allclose(J, np.diag([25.0, 51.0]), atol=1e-9)
+        np.testing.assert_allclose(made._u, [10.0, (held[1] - 22.0) / 0.2 + 0.05 * 255], atol=1e-5)
+
+
+def watcher(held: list[float], *, J=((2.0, 0.0), (0.0, 1.0)), bias: float = 0.5, w=(0.0, 0.0)):
+    """Return a Reach whose steady outputs are these, and an observer: 0.4 degC of b and 0.1 of a unsure."""
+    made = reach()
+    made._held = lambda *given: (np.array(held), np.array(J))
+    P = np.diag([9.0, 9.0, 0.04, 0.01])
+    return made, SimpleNamespace(
+        w=np.array(w), disturbance_bias=np.zeros(1), innovation_bias=bias, estimate=lambda: {"P": P}
+    )
+
+
+def ask(made: Reach, observer, *, seen=BOTH, target=TARGET, ahead=99.0, y=(NAN, NAN)):
+    given = {"y": np.array(y), "target": target, "side": NO_SIDE, "ahead": np.full(2, ahead), "seen": seen}
+    return made.missed(observer, np.array([40.0, 30.0]), np.array([22.0]), **given)
+
+
+@pytest.mark.parametrize(
+    ("off", "more", "samples"),
+    [
+        ([0.54, 0.0], {}, 5),  # (0.54 - 0.1) / 0.4 - 0.5 = 0.6 a sample up to 3
+        ([9.0, 0.0], {}, 2),
+        ([-9.0, 0.0], {}, 2),
+        ([0.94, 0.0], {"bias": 2.0}, 6),  # 0.84 / 0.8 - 0.5
+        ([0.0, 0.16], {"J": np.zeros((2, 2))}, 5),  # of 0.05 degC
+        ([0.0, 0.22], {}, 5),  # 1.2 - 0.5
+        ([0.3, 0.0], {}, None),
+    ],
+)
+def test_a_target_that_the_model_misses_is_unreachable_when_it_is_sure(off, more, samples):
+    made, observer = watcher(TARGET + off, **more)
+    answers = [ask(made, observer) for _ in range(31)]
+    first = next((at + 1 for at, answer in enumerate(answers) if answer is not None), None)
+    assert first in (samples, samples and samples + 1)  # where rounding leaves the sum at 3 - 1e-16
+    if samples:
+        at = int(np.argmax(np.abs(off)))
+        assert answers[-1] == (at, pytest.approx(TARGET[at] + off[at]))
+        assert ask(made, observer, target=TARGET + 0.1) is None  # it moves, and all begins anew
+        assert ask(made, observer, seen=np.array(off) == 0.0) is None
+    assert ask(*watcher(TARGET + off, **more), ahead=27.0, seen=np.array([True, False])) is None
+
+
+def test_a_target_is_reachable_again_after_five_samples_in_a_row():
+    made, observer = watcher([30.0, 26.5])
+    for _ in range(10):
+        answer = ask(made, observer)
+    assert answer == (0, 30.0)
+    for b, times in ((27.06, 9), (27.04, 4), (27.06, 1), (27.04, 4)):  # half of a tenth is in reach now
+        made._held = lambda *given, b=b: (np.array([b, 26.5]), np.zeros((2, 2)))
+        found = [ask(made, observer) for _ in range(times)]
+        assert found == [(0, pytest.approx(27.06, abs=0.021))] * times
+    assert [ask(made, observer) for _ in range(3)] == [None] * 3
+
+
+@pytest.mark.parametrize(
+    ("unreachable", "g", "miss", "w", "short"),
+    [
+        (False, 3.1, 0.11, 0.0, True),
+        (False, 3.0, 0.11, 0.0, False),
+        (False, 3.1, 0.1, 0.0, False),
+        (False, 3.1, 0.0, -0.41, True),  # the bias has moved by 0.82 away from the target, 2 * 0.4 is much
+        (False, 3.1, 0.0, -0.39, False),
+        (False, 3.1, 0.0, 0.41, False),
+        (True, -2.9, 0.0, 0.0, True),
+        (True, -3.1, 0.0, 0.0, False),
+    ],
+)
+def test_what_readings_say_counts_where_the_model_has_no_say(unreachable, g, miss, w, short):
+    made, asked = reach(), []
+    made._unreachable = unreachable
+    made._relaxations = [
+        SimpleNamespace(w=np.zeros(2), falls_short=lambda *given: asked.append(given) or (g, 28.5)),
+        SimpleNamespace(w=np.zeros(2), falls_short=lambda *given: (g, 25.0)),
+    ]
+    J, sd = np.array([[-2.0, 0.0], [0.0, 1.0]]), np.array([0.4, 0.4])
+    seen = np.array([True, False])
+    found, ends = made._readings_say(np.array([w, 0.0]), J, sd, np.array([miss, 9.0]), TARGET, seen)
+    assert found.tolist() == [short, False]
+    np.testing.assert_array_equal(ends, [28.5, NAN])
+    assert asked == [(27.0, pytest.approx(np.sqrt(OBSERVER.R[1])))]
+
+
+def test_a_relaxation_begins_anew_when_its_own_drive_moves_or_its_reading_is_lost():
+    made = reach()
+    for u, y, kept in (
+        ([40.0, 30.0], [25.0, 24.0], [1, 1]),
+        ([41.0, 32.5], [25.0, 24.0], [2, 2]),  # 1 % of its range is still
+        ([41.1, 32.5], [25.0, 24.0], [1, 3]),  # b is q1's
+        ([41.1, 32.6], [25.0, 24.0], [2, 1]),
+        ([41.1, 32.6], [NAN, 24.0], [0, 2]),
+    ):
+        made._record(np.array(y), np.array(u), np.array([0.1, 0.2]))
+        assert [len(relaxation.bins) for relaxation in made._relaxations] == kept
+    assert made._relaxations[0].w.tolist() == [0.1, 0.2]
+    alone = PILoop("q1", "a", Kc=1.0, Ti=1.0, Tt=1.0)
+    assert [each.tolist() for each in reach(loops=(alone,))._movers] == [[0, 1], [0, 1]]

@@ -222,6 +222,9 @@ def test_the_range_ends_where_the_gain_will_have_faded_but_no_sooner_than_the_sl
     low, high = optimiser._range(np.full((3, 2), -20.0), np.array([5.0, 9.0]), authority, last, 0.0)
     assert low[:, 0].tolist() == [-22.5] * 3  # 15 / 0.5 = 30, and heating now allows no more of cooling
     assert high[:, 0].tolist() == [100.0] * 3
+    above = Optimiser(optimiser.model, replace(DESIGN, drive_range={"q1": (10.0, 100.0), "q2": (0.0, 80.0)}))
+    high = above._range(np.full((3, 2), 30.0), np.array([5.0, 9.0]), authority, last, 0.0)[1]
+    assert high[:, 0].tolist() == [52.0, 47.5, 47.5]  # the same, counted from rest at 10
     optimiser._parked = [0]
     low, high = optimiser._range(np.full((3, 2), 20.0), np.zeros(2), authority, last, 0.0)
     np.testing.assert_allclose(low[:, 0], [52.0 - 1e-5, 40.0 - 1e-5, 20.0 - 1e-5], rtol=1e-12)
@@ -278,6 +281,7 @@ def test_a_solve_predicts_what_its_plan_does_and_parks_what_is_lost(optimiser):
     assert longer.plan[0, 0] - 40.0 == pytest.approx(10.0)
     lost = optimiser.solve(START, LAST, guess, room, **ask, lost=np.array([True, False]), slew_s=2.0)
     np.testing.assert_allclose(lost.plan[:, 0], [32.0, 20.0, 0.0])
+    assert abs(lost.y[-1, 0] - 26.5) < 0.5  # while a goes on to its target
     optimiser.qp = SimpleNamespace(
         solve=lambda *given: QPAnswer(np.full(6, np.nan), "cycling", 4, None, None)
     )
