@@ -73,7 +73,7 @@ def untouched(grasps: Grasps, *, seed: int = 0) -> Grasps:
 def has_before(grasps: Grasps) -> bool:
     """Return whether a record has a level before contact, without which there is nothing to probe.
 
-    Contact may precede the message by 0.3 s: what is needed is three readings before that.
+    What is needed is three readings up to 0.25 s before the message, which contact may precede by 0.3 s.
     """
     return bool(np.sum(grasps["time"].values <= _LATEST_LEVEL) >= _LEVEL_SAMPLES)
 

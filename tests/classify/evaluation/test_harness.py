@@ -110,7 +110,7 @@ def test_the_same_seed_gives_the_same_comparison_on_one_process_or_two(three: Gr
 
 def test_clean_grasps_pass_the_leak_probe(three: Grasps, make_touches: Maker) -> None:
     found = evaluate(FAST, [three, make_touches(name="more", seed=6)])
-    assert {r["classifier"] for r in found.leaks} == {*FAST, "untouched traces"}
+    assert list(dict.fromkeys(r["classifier"] for r in found.leaks)) == ["untouched traces", *FAST]
     assert not any(r["leak"] for r in found.leaks)
 
 
@@ -150,6 +150,51 @@ def test_an_untouched_record_keeps_what_was_before_and_nothing_after(three: Gras
     level = np.median(three["t_surface"].values[:, before], axis=1)
     assert np.abs(blank["t_surface"].values[:, after] - level[:, None]).max() < 0.3
     assert np.ptp(three["t_surface"].values) > 10
+
+
+def probed(condition: str, grasps: int, right: int, **more: Any) -> Any:
+    """Return a probe of so many grasps, half of them iron, each tested twice."""
+    rows = [
+        {"condition": condition, "grasp_id": f"g{i % grasps}", "material": "iron" if i % 2 else "wood",
+         "correct": i % grasps < right, "known": True} | more
+        for i in range(2 * grasps)
+    ]  # fmt: skip
+    return SimpleNamespace(classifier="p", rows=rows)
+
+
+def test_leaks_share_their_level_and_count_grasps() -> None:
+    """All seven right at a chance of a half: 1/128 is a leak alone, and none among two."""
+    seven, none = probed("c", 7, 7), probed("d", 6, 3)
+    alone, strange = harness._leaks([seven]), harness._leaks([seven, probed("e", 6, 6, known=False)])
+    assert alone == [
+        {"classifier": "p", "condition": "c", "n": 7, "accuracy": 1.0, "chance": 0.5, "p_value": 1 / 128,
+         "leak": True}
+    ]  # fmt: skip
+    assert [row["leak"] for row in harness._leaks([seven, none])] == [False, False]
+    assert strange == [alone[0] | {"leak": False}]
+    assert harness._leaks([none])[0]["p_value"] == pytest.approx(42 / 64)
+
+
+def test_a_row_is_what_was_said_of_one_grasp(three: Grasps) -> None:
+    test = pick(three, [0, 9, 17])
+    p = np.array([[0.2, 0.5, 0.3], [0.1, 0.6, 0.3], [0.7, 0.2, 0.1]])
+    names, unknown = ("copper", "iron", "tin"), np.array([0.4, np.nan, 0.1])
+    rows = harness._rows(test, np.array(["u", "v", "w"]), p, unknown, names)
+    head = {"candidates": 3, "p_copper": 0.2, "p_iron": 0.5, "p_tin": 0.3}
+    assert rows[0] == {
+        "grasp_id": "u", "material": "copper", "predicted": "iron", "known": True, "correct": False,
+        "confidence": 0.5, "log_loss": pytest.approx(-np.log(0.2)), "p_unknown": 0.4,
+        "brier": pytest.approx(0.64 + 0.25 + 0.09),
+    } | head  # fmt: skip
+    assert (rows[1]["correct"], rows[1]["p_unknown"], rows[1]["confidence"]) == (True, None, 0.6)
+    said = [rows[2][key] for key in ("known", "correct", "log_loss", "brier", "predicted", "p_unknown")]
+    assert said == [False, False, None, None, "copper", 0.1]
+
+
+def test_three_readings_from_before_any_contact_can_be_probed() -> None:
+    for last, there in ((-0.25, True), (-0.24, False)):
+        g = make_grasps([-0.5, -0.4, last, 0.0], np.full((1, 4), 23.0), ["g"])
+        assert harness.has_before(g) is there
 
 
 def test_the_probe_is_the_one_sided_binomial_test() -> None:
