@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 
 from thermogrip.classify import make_classifier
 from thermogrip.classify.estimators.base import pick
@@ -14,6 +15,7 @@ from thermogrip.classify.estimators.local_polynomials import (
     ExpansionClassifier,
     Pool,
     _expanded,
+    _Gaussians,
     chosen_weights,
     mixture_weights,
 )
@@ -48,6 +50,28 @@ def test_the_mixture_beats_its_best_member_where_they_are_right_in_turn() -> Non
     assert weights.sum() == pytest.approx(1.0)
     assert weights == pytest.approx([0.5, 0.5], abs=0.1)
     assert np.log(weights @ said).mean() > np.log(said).mean(axis=1).max()
+
+
+def test_one_round_shares_each_grasp_by_who_said_it_and_adds_one_for_all() -> None:
+    said = np.array([[0.8, 0.2, 0.5], [0.2, 0.6, 0.5]])  # the first has 0.8, 0.25 and 0.5 of them
+    np.testing.assert_allclose(mixture_weights(said, rounds=1), [(1.55 + 0.5) / 4, (1.45 + 0.5) / 4])
+    np.testing.assert_array_equal(mixture_weights(said), mixture_weights(said, rounds=200))
+    assert np.abs(mixture_weights(said, rounds=3) - mixture_weights(said)).max() > 1e-3
+
+
+def test_covariances_are_drawn_towards_the_common_one_as_if_by_so_many_grasps() -> None:
+    rng = np.random.default_rng(4)
+    rows, labels = rng.standard_normal((9, 2)) * [1.0, 3.0], np.array(list("xyxxyzyxz"))
+    own = {c: np.cov(rows[labels == c].T) * (np.sum(labels == c) - 1) for c in "xyz"}
+    common = (sum(own.values()) + 3.0 * 1e-3 * np.eye(2)) / (9 - 3 + 3.0)
+    log_p = [
+        multivariate_normal.logpdf(
+            rows, rows[labels == c].mean(axis=0), (own[c] + 3.0 * common) / (np.sum(labels == c) - 1 + 3.0)
+        )
+        for c in "xyz"
+    ]
+    expected = np.exp(log_p - np.logaddexp.reduce(log_p)).T
+    np.testing.assert_allclose(_Gaussians(3.0).fit(rows, labels).predict_proba(rows), expected)
 
 
 def test_a_machine_that_is_sure_and_wrong_is_left_alone() -> None:
