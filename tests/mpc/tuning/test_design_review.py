@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -77,8 +79,6 @@ def test_a_planted_fault_is_found_by_its_check(request, name, verdict, plant, ch
     ids=["the plant's own", "made by the loop", "made slower or faster by half", "of an integrator"],
 )
 def test_a_slow_eigenvalue_is_the_loops_fault_unless_the_plant_has_it_by_itself(own: float, verdict: str):
-    from types import SimpleNamespace
-
     quick = SimpleNamespace(matrix=np.diag([0.5, 0.9]), A=np.diag([0.8, 0.9]))
     slow = SimpleNamespace(matrix=np.diag([0.5, 0.9999]), A=np.diag([0.8, own]))
     check = checks.eigenvalues([quick, slow])
@@ -210,3 +210,120 @@ def test_where_a_step_starts_need_not_be_a_target():
     found = {check.name: check for check in review(controller)}
     assert found["targets lie where the logs were"].verdict == "pass"
     assert found["targets can be held in steady state"].finding.startswith("30 to 50 degC")
+
+
+def stub(**design) -> Any:
+    """Return as much of a controller as a check asks for: two drives, one output."""
+    usual = {"controlled": ("t",), "dt": 2.0, "horizon_s": 40.0, "blocks": (1, 3), "slew_per_s": {"q": 0.1}}
+    usual |= {"drive_range": {"q": (-1.0, 3.0)}, "limits": {}, "ambient": 22.0}
+    model = SimpleNamespace(drives=("p", "q"), n_u=2, n_d=1, outputs=("t",), span=np.array([1.0, 4.0]))
+    return SimpleNamespace(design=SimpleNamespace(**usual | design), model=model, plant=None, dt=2.0)
+
+
+@pytest.mark.parametrize(
+    ("delay", "lag", "seconds", "verdict", "wanted"),
+    [
+        (10.0, 100.0, 40.0, "pass", "wanted 40 s: four delays (delay 10 s, lag 100 s)"),
+        (10.0, 100.0, 39.9, "warn", "wanted 40 s: four delays"),
+        (10.0, 100.0, 20.0, "warn", "horizon 20 s, wanted 40 s"),
+        (10.0, 100.0, 19.9, "fail", "wanted 40 s"),
+        (10.0, 12.0, 22.0, "pass", "wanted 22 s: delay and lag (delay 10 s, lag 12 s)"),
+        (10.0, 12.0, 21.9, "warn", "wanted 22 s: delay and lag"),
+    ],
+)
+def test_a_horizon_sees_four_delays_or_the_delay_and_the_lag_of_the_strongest_drive(
+    monkeypatch, delay, lag, seconds, verdict, wanted
+):
+    weak = SimpleNamespace(gain=3.0, delay=100.0, lag=900.0)
+    strong = SimpleNamespace(gain=-5.0, delay=delay, lag=lag)
+    monkeypatch.setattr(
+        checks, "step_response", lambda plant, drive, output: weak if drive == "p" else strong
+    )
+    check = checks.horizon(stub(horizon_s=seconds))
+    assert (check.verdict, wanted in check.finding, bool(check.fix)) == (verdict, True, verdict != "pass")
+
+
+@pytest.mark.parametrize(
+    ("ends", "slew", "verdict", "share"),
+    [
+        ((-1.0, 3.0), 0.004, "pass", "-1 to 3, 0.2 % of it a sample"),
+        ((-1.0, 3.0), 0.0039, "warn", "0.2 %"),
+        ((0.0, 4.0), 0.1, "pass", "5.0 %"),
+        ((-4.0, 0.0), 0.1, "pass", "5.0 %"),
+        ((-4.0, -0.1), 0.1, "fail", "5.1 %"),
+        ((0.1, 4.0), 1e-4, "fail", "0.0 %"),
+    ],
+)
+def test_a_range_contains_0_and_is_crossed_within_500_samples(ends, slew, verdict, share):
+    check = checks.room_to_move(stub(drive_range={"q": ends}, slew_per_s={"q": slew}))
+    assert (check.verdict, share in check.finding) == (verdict, True)
+    assert ("500 samples" in check.fix, "contain 0" in check.fix) == (verdict == "warn", verdict == "fail")
+
+
+@pytest.mark.parametrize(
+    ("values", "verdict"),
+    [((2.0, 1.9e8), "pass"), ((2.0, 2.1e8), "warn"), ((2.0, 1.9e12), "warn"), ((2.0, 2.1e12), "fail"),
+     ((0.0, 1.0), "fail"), ((-1.0, 1.0), "fail")],
+)  # fmt: skip
+def test_a_condition_of_eight_digits_warns_and_one_of_twelve_fails(monkeypatch, values, verdict):
+    monkeypatch.setattr(checks, "linear_move", lambda controller: (np.diag([*values, 5.0]), None, None))
+    check = checks.hessian(stub())
+    assert (check.verdict, "3 unknowns" in check.finding) == (verdict, True)
+    if values[0] > 0:
+        assert f"condition {values[1] / values[0]:.1e}" in check.finding
+
+
+@pytest.mark.parametrize(
+    ("weak", "strong", "verdict"),
+    [(0.05, 1.0, "pass"), (0.049, 1.0, "warn"), (1.1e-4, 1.0, "warn"), (0.9e-4, 0.9, "fail"),
+     (9.0, 2700.0, "pass"), (8.9, 2700.0, "warn"), (12.0, 3001.0, "warn"), (0.9, 1e4, "fail")],
+)  # fmt: skip
+def test_gains_are_means_over_the_horizon_and_comparable(weak, strong, verdict):
+    controller = stub()  # four samples; the largest response of two blocks counts, whatever its sign
+    controller.optimiser = SimpleNamespace(at_rest=4 * np.array([[0.5 * weak, -strong], [weak, 0.1]]))
+    check = checks.scaling(controller)
+    assert (check.verdict, f"by p {weak:.3g} degC, q {strong:.3g} degC" in check.finding) == (verdict, True)
+
+
+@pytest.mark.parametrize(
+    ("most", "verdict"), [(125, "pass"), (126, "warn"), (499, "warn"), (500, "fail"), (501, "fail")]
+)
+def test_iterations_near_their_limit_are_counted_with_their_rows(most, verdict):
+    controller = stub()
+    controller.optimiser = SimpleNamespace(n_b=3, qp=SimpleNamespace(soft=np.zeros(17)))
+    check = checks._iterations(controller, [3, most, 2])
+    assert check.verdict == verdict
+    assert check.finding == f"12 hard and 5 soft rows; at most {most} iterations of 500 allowed"
+
+
+@pytest.mark.parametrize(
+    ("size", "verdict", "seconds"),
+    [(0.5, "pass", "3 s"), (np.exp(-2 / 3599), "pass", "3599 s"), (np.exp(-2 / 3602), "warn", "3602 s"),
+     (1.0, "fail", "inf s"), (1.2, "fail", "inf s")],
+)  # fmt: skip
+def test_an_observer_forgets_within_an_hour(size, verdict, seconds):
+    law = SimpleNamespace(forgets=np.array([[0.1, 2.0], [0.0, -size]]))
+    check = checks.observer_stable(stub(), SimpleNamespace(law=law))
+    assert (check.verdict, check.finding.endswith(f"to a third in {seconds}")) == (verdict, True)
+
+
+@pytest.mark.parametrize(("left", "verdict"), [(0.0499, "pass"), (0.05, "fail"), (np.nan, "fail")])
+def test_a_twentieth_of_an_offset_may_be_left_on_the_worst_draw(left, verdict):
+    loops = [SimpleNamespace(left_of_offset=lambda value=value: value) for value in (0.0, left, 0.01)]
+    check = checks.offset_free(loops if np.isfinite(left) else loops[1:])
+    assert (check.verdict, check.finding.endswith(f"plant and {2 - np.isnan(left)} draws")) == (verdict, True)
+
+
+def test_the_worst_of_a_review_is_by_rank_and_steps_are_the_specs_or_the_ends_of_the_logs():
+    found = [checks.Check("a", verdict, "1") for verdict in ("warn", "fail", "pass")]
+    assert [worst(found[k:]) for k in (0, 2, 3)] == ["fail", "pass", "pass"]
+    assert worst([found[0], found[2]]) == "warn"
+    controller = stub()
+    controller.controlled, controller.notes = ("t",), {"spec": {"steps": [[20, 30], [35.5, 10]]}}
+    assert checks._steps(controller) == ([20.0, 35.5], [30.0, 10.0])
+    for notes, valid in (({}, {"t": (5.0, 50.0)}), ({"spec": {}}, {"u": (5.0, 50.0)})):
+        controller.notes, controller.plant = notes, SimpleNamespace(valid=valid)
+        assert checks._steps(controller) == ([], [5.0, 50.0] if "t" in valid else [20.0, 40.0])
+    assert (
+        checks.valid_range(controller, (20.0, 30.0)).finding == "the plant does not say where its logs were"
+    )
