@@ -58,6 +58,49 @@ def test_the_scan_has_the_best_first_and_no_trial_twice():
     assert {parameters.get("drive_share", 1.0) for _, parameters in found} > {1.0, 0.5}
 
 
+@pytest.mark.parametrize(
+    ("one", "other", "kept"),
+    [
+        ((100.0, 0.1, 200.0), (100.4, 0.1, 200.0), True),  # what rounds to the same is the same
+        ((100.0, 0.1, 200.0), (100.6, 0.1, 200.0), False),
+        ((100.0, 0.1, 200.0), (100.0, 0.12, 200.0), True),
+        ((100.0, 0.1, 200.0), (100.0, 0.13, 200.0), False),
+        ((100.0, 0.1, 199.6), (100.0, 0.1, 200.0), True),
+        ((100.0, 0.1, 199.4), (100.0, 0.1, 200.0), False),
+    ],
+)
+def test_a_second_a_quantum_and_half_a_per_cent_of_the_largest_energy_count(one, other, kept):
+    front = front_of([trial_of(*one), trial_of(*other, "PI", move=4.0)], ["a", "b"])
+    assert front.best == (True, kept)
+    assert front.rows()[1] == {
+        "name": "b", "controller": "PI", "settle_s": other[0], "overshoot_degC": other[1],
+        "energy_s": other[2], "best": kept, "knobs": {"move": 4.0},
+    }  # fmt: skip
+
+
+def test_the_scan_has_six_of_the_search_by_score_smaller_drives_and_other_move_weights():
+    best = {"move": 2.0, "drive_share": 0.75}
+    scores = [4.0, 1.0, 7.0, 3.0, 8.0, 2.0, 6.0, 5.0]
+    history = [Trial("MPC", {"move": float(k)}, s, 100.0 - k, 0.1 + k, 1.0) for k, s in enumerate(scores, 10)]
+    history += [Trial("MPC", best, 9.0, 1.0, 0.1, 1.0), Trial("MPC", {"move": 9.0}, 9.0, 95.0, 0.3, 1.0)]
+    found = scan_of(best, history)
+    by_score = [11.0, 15.0, 13.0, 10.0, 17.0, 16.0]
+    assert found[0] == ("tuned", best)
+    assert found[1:7] == [("tried by the search", {"move": move}) for move in by_score]
+    assert found[7:] == [
+        ("60 % of the drive", best | {"drive_share": 0.6}),
+        ("50 % of the drive", best | {"drive_share": 0.5}),
+        ("moves 0.1 times as dear", best | {"move": 0.2}), ("moves 10 times as dear", best | {"move": 20.0}),
+        ("moves 100 times as dear", best | {"move": 200.0}),
+    ]  # fmt: skip
+    whole = [name for name, _ in scan_of({"move": 2.0}, history[:1])]
+    assert whole[:6] == [
+        "tuned",
+        "tried by the search",
+        *(f"{cap} % of the drive" for cap in (90, 75, 60, 50)),
+    ]
+
+
 class PowerLaw:
     """A search whose score is a power of one parameter; settling follows, or jumps at 4."""
 
