@@ -26,18 +26,8 @@ Array = NDArray[np.float64]
 
 KINDS = ("prbs", "multisine", "staircase")
 
-# Feedback taps of maximum-length registers of n bits (primitive trinomials and pentanomials).
-_TAPS = {
-    3: (3, 2),
-    4: (4, 3),
-    5: (5, 3),
-    6: (6, 5),
-    7: (7, 6),
-    8: (8, 6, 5, 4),
-    9: (9, 5),
-    10: (10, 7),
-    11: (11, 9),
-}
+# Feedback taps of maximum-length registers of n bits (primitive trinomials, one pentanomial).
+_TAPS = {3: [1], 4: [1], 5: [2], 6: [1], 7: [1], 8: [2, 3, 4], 9: [4], 10: [3]}
 
 REST = 6.0  # [s] at the middle before anything moves
 
@@ -119,18 +109,14 @@ def prbs(n: int, *, hold: int, seed: int = 0) -> Array:
 
     The register has as many bits as one full period within n samples allows (3 to 10).
     """
+    from scipy.signal import max_len_seq  # slow to import, and the other schedules do without
+
     bits = max(3, min(10, int(np.floor(np.log2(max(n / hold, 7) + 1)))))
-    register = [1] + [0] * (bits - 1)
-    sequence = []
-    for _ in range(2**bits - 1):
-        sequence.append(1.0 if register[-1] else -1.0)
-        new = 0
-        for tap in _TAPS[bits]:
-            new ^= register[tap - 1]
-        register = [new, *register[:-1]]
+    found, _ = max_len_seq(bits, state=[0] * (bits - 1) + [1], taps=_TAPS[bits])
+    sequence = np.where(found, 1.0, -1.0)
     # golden steps: whichever seeds several inputs have, they begin far apart and hardly correlate
     begin = round(seed * 0.6180339887498949 * len(sequence)) % len(sequence)
-    held = np.repeat(sequence[begin:] + sequence[:begin], hold)
+    held = np.repeat(np.roll(sequence, -begin), hold)
     return np.asarray(np.tile(held, -(-n // held.size))[:n])
 
 

@@ -395,9 +395,4 @@ def _interpolated(place: NDArray[np.int64], values: Array, n: int) -> Array:
     """Return values (m, c) known at bins ``place`` at the first n bins: linear between, held beyond."""
     if place.size >= n and place[n - 1] == n - 1:
         return values[:n]
-    at = np.arange(n)
-    right = np.clip(np.searchsorted(place, at), 0, place.size - 1)
-    left = np.where((place[right] > at) & (right > 0), right - 1, right)
-    width = np.maximum(place[right] - place[left], 1)
-    share = np.clip((at - place[left]) / width, 0.0, 1.0)[:, None]
-    return np.asarray((1 - share) * values[left] + share * values[right])
+    return np.column_stack([np.interp(np.arange(n), place, column) for column in values.T])

@@ -75,7 +75,7 @@ def logs_of(model: NetworkModel, values: dict[str, float]) -> list[Log]:
 def test_a_planted_second_zone_is_found_and_convection_that_is_not_there_refused():
     truth = {"C_core": 30.0, "G_core": 0.7, "G": 0.4, "P": 14.0}
     logs = logs_of(patched(block(), ZONE), truth)
-    grown = grow(block(), logs, [BEND, ZONE])
+    grown = grow(block(), logs, [BEND, ZONE], folds=folds_of(block(), logs)[:2])
     kept = [row for row in grown.rows if row.verdict == "kept"]
     assert [row.candidate for row in kept] == ["block", "second zone"]
     assert kept[1].gain > max(0.5, kept[1].se)
@@ -89,10 +89,11 @@ def test_a_planted_second_zone_is_found_and_convection_that_is_not_there_refused
 
 def test_a_term_that_nothing_asks_for_is_refused_and_a_needless_one_dropped():
     logs = logs_of(block(), {"G": 0.4, "P": 14.0})
-    grown = grow(block(), logs, [ZONE, BEND], rounds=1)
+    folds = folds_of(block(), logs)[:2]
+    grown = grow(block(), logs, [ZONE, BEND], folds=folds, rounds=1)
     assert [row.verdict for row in grown.rows] == ["kept", "refused", "refused"]
     needless = Candidate("no zone", {"nodes": {"core": None}, "links": {"core": None}}, "remove")
-    pruned = grow(patched(block(), ZONE), logs, [needless], rounds=1)
+    pruned = grow(patched(block(), ZONE), logs, [needless], folds=folds, rounds=1)
     assert pruned.rows[1].verdict == "kept"
     assert pruned.network.parameters == block().parameters
 
@@ -139,7 +140,7 @@ def test_every_suggestion_is_a_network_of_its_own(name: str):
 def test_an_unmodelled_zone_shows_in_the_residual_proposes_itself_and_is_kept(monkeypatch):
     monkeypatch.setattr("thermogrip.sysid.growth.stepwise.suggested", lambda model: [BEND])
     logs = logs_of(patched(block(), ZONE), {"C_core": 60.0, "G_core": 0.5, "G": 0.4, "P": 14.0})
-    grown = grow(block(), logs, rounds=1)
+    grown = grow(block(), logs, folds=folds_of(block(), logs)[:2], rounds=1)
     kept = next(row for row in grown.rows if row.verdict == "kept" and row.change == "add")
     assert kept.candidate == "block: second zone"
     assert kept.asked.startswith("t: ")
