@@ -18,7 +18,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,10 +33,10 @@ from thermogrip.datasets.repair import (
     check_plausible,
     describe_gaps,
     describe_steps,
-    drop_repeated,
     fill_disturbance,
     fill_input,
     from_first_row,
+    order_rows,
     reject_spikes,
 )
 from thermogrip.datasets.schema import check_log, hash_columns, make_log, names
@@ -45,48 +45,69 @@ from thermogrip.datasets.tables import (
     check_table,
     file_format,
     file_stem,
-    read_csv_table,
+    read_excel_table,
+    read_matlab_table,
     read_parquet_table,
+    read_text_table,
+    unused,
 )
-from thermogrip.datasets.units import (
-    assign_roles,
-    explain_role,
-    find_column,
-    join_header,
-    split_header,
-    to_record_unit,
-)
+from thermogrip.datasets.units import assign_roles, join_header, read_header, to_record_unit
 
 if TYPE_CHECKING:
+    from pandas import DataFrame
+
     from thermogrip.datasets.schema import Log
 
 Floats = NDArray[np.float64]
+
+_TIME_UNITS = ("1", "s", "ms", "min")
+_TIME = re.compile(
+    r"(?i)((elapsed|rel|relative|abs|unix|epoch|utc|local|system|log|sample|test|run|date)_?)*"
+    r"(time|timestamp|time_stamp|date|zeit|uhrzeit|datum|tijd|seconds?|secs?|millis|milliseconds|minutes|hours|epoch"
+    r"|clock|t|ts|ms|us)(_(utc|local|stamp|elapsed|abs|rel))?"
+)
+_COUNTER = re.compile(r"(?i)c1|x|n|k|i|no|nr|id|index|idx|samples?|rows?|steps?|count(er)?|unnamed.*")
+_TIME_WORDS = {"ms": 1e-3, "milli": 1e-3, "us": 1e-6, "minute": 60.0, "hour": 3600.0}  # that begin a name
+_EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))  # from how much on a number since 1970 is in ns, us, ms
+_MONOTONE = 0.9  # share of a time's steps that are none backward
+_MONTH_NAMES = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+_MONTHS = {m: str(at) for at, m in enumerate(_MONTH_NAMES, 1)}
+_STAMP = re.compile(
+    r"()(?:(\d{1,4})[-/.](\d{1,2}|[A-Za-z]{3})[-/.](\d{1,4})(?:,?\s+|T|$))?"
+    r"(?:(\d{1,2}):(\d{2})(?::(\d{2}(?:[.,]\d+)?))?)?\s*([AaPp][Mm])?\s*(Z|UTC|[+-]\d{2}:?\d{2})?$"
+)
 
 _CUT = re.compile(r"^(?P<path>.+)@(?P<start>[^@:/\\]*):(?P<stop>[^@:/\\]*)$")
 
 
 def read_log(
-    path: str | Path,
+    path: str | Path | DataFrame,
     inputs: Sequence[str] | None = None,
     outputs: Sequence[str] | None = None,
     disturbances: Sequence[str] | None = None,
     *,
     known: Mapping[str, str] | None = None,
+    columns: Sequence[str] | None = None,
+    dt: float | None = None,
 ) -> Log:
-    """Return the log in a file.
+    """Return the log in a file, or in a pandas DataFrame.
 
     Parameters
     ----------
-    path : str or Path
-        ``.csv``, ``.csv.gz``, ``.csv.xz``, ``.nc``, ``.parquet``, or a robot's ``.bag``, ``.db3``, ``.mcap``
-        (:mod:`~thermogrip.datasets.rosbag`) or the folder of a ROS 2 bag, optionally cut:
-        ``"run.csv@120:1800"``.
+    path : str, Path or DataFrame
+        Text (``.csv``, ``.csv.gz``, ``.csv.xz``, ``.txt``, ``.dat``, ``.tsv``), ``.nc``, ``.parquet``,
+        ``.mat``, ``.xlsx``, or a robot's ``.bag``, ``.db3``, ``.mcap`` (:mod:`~thermogrip.datasets.rosbag`)
+        or the folder of a ROS 2 bag, optionally cut: ``"run.csv@120:1800"``.
     inputs, outputs, disturbances : sequence of str, optional
         Names of the variables in each role.  Where a list is absent the role is guessed from name and unit;
         where it is given it is complete.
     known : dict of name -> role, optional
         Roles that a model gives to its signals; they stand in for the guess.  Names that the file lacks are
         not looked for.
+    columns : sequence of str, optional
+        Headers in place of those of a text, ``.mat`` or ``.xlsx`` file, one a column; ``-`` leaves one out.
+    dt : float, optional
+        Time between rows [s], in place of the file's times.
 
     Returns
     -------
@@ -109,35 +130,37 @@ def read_log(
     >>> print(log.attrs["repairs"].splitlines()[0])
     t_tank: converted from K to degC
     """
-    file, start, stop = split_cut(path)
-    table = _TABLES[_format(file)](file)
+    if not isinstance(path, str | Path):
+        file, start, stop = Path("DataFrame"), -np.inf, np.inf
+        table = _frame_table(path, columns)
+    else:
+        file, start, stop = split_cut(path)
+        table = _read_table(file, columns)
     if table.meta.get("schema") not in (None, "thermogrip.log"):
         raise UserError(f"holds a {table.meta['schema']}, not a log", file=file, hint="give a log")
-    columns, units, repairs = _convert(table)
-    sha256 = hash_columns(columns)
-    time = columns.pop("time")
+    data, units, names_of, repairs = _convert(table, dt)
+    sha256 = hash_columns(data)
+    time = data.pop("time")
     del units["time"]
-    if not columns:
-        raise UserError("has a time column and nothing else", file=file, hint="add inputs and outputs")
+    if not data:
+        what = "a time column and nothing else" if table.numbers else "no column of numbers"
+        raise UserError(f"has {what}", file=file, hint="add inputs and outputs")
     lists = {"inputs": inputs, "outputs": outputs, "disturbances": disturbances}
     of_model = {name: role for name, role in (known or {}).items() if name in units}
-    in_file = _given_roles(table)
-    roles = assign_roles(units, given=in_file | of_model, file=str(file), **lists)
+    in_file = {names_of[header]: attrs["role"] for header, attrs in table.attrs.items() if attrs.get("role")}
+    roles, reasons = assign_roles(units, given=in_file | of_model, columns=data, file=str(file), **lists)
     own = table.meta.get("schema") == "thermogrip.log"
     if own:
         repairs = [line for line in table.meta.get("repairs", "").splitlines() if line]
     else:
-        time, columns, found = _repair(time, columns, units, roles, table)
+        time, data, found = _repair(time, data, units, roles, table)
         repairs += found
-    listed = {find_column(word, units) for some in lists.values() for word in some or ()}
-    known_roles = {*in_file, *of_model, *listed}
-    guessed = {n: explain_role(n, units[n]) for n in columns if n not in known_roles}
-    guesses = [f"{name}: {why}" for name, (role, why) in guessed.items() if role == roles[name]]
-    variables = {name: (columns[name], units[name], roles[name]) for name in columns}
+    guesses = [f"{name}: {why}" for name, why in reasons.items()]
+    variables = {name: (data[name], units[name], roles[name]) for name in data}
     log = make_log(time, variables, name=str(file), repairs=repairs)  # a fault found here names the file
     log.attrs["name"] = file_stem(file)
     for header, attrs in table.attrs.items():
-        if (words := attrs.get("flag_meanings")) and (flagged := _name_and_unit(header, table)[0]) in log:
+        if (words := attrs.get("flag_meanings")) and (flagged := names_of[header]) in log:
             log[flagged].attrs["flag_meanings"] = words
     log.attrs["sha256"] = sha256
     log.attrs["guesses"] = "\n".join(guesses)
@@ -146,11 +169,26 @@ def read_log(
     return _cut(log, start, stop, file) if (start, stop) != (-np.inf, np.inf) else log
 
 
+def as_logs(logs: Log | DataFrame | Sequence[Log | DataFrame], *lists: Sequence[str] | None) -> list[Log]:
+    """Return logs as they are and DataFrames as :func:`read_log` reads them; ``lists`` are its roles."""
+    from xarray import Dataset
+
+    records = list(logs) if isinstance(logs, Sequence) else [logs]
+    out: list[Log] = []
+    for at, record in enumerate(records, start=1):
+        if isinstance(record, Dataset):
+            out.append(record)
+            continue
+        out.append(read_log(record, *lists))
+        out[-1].attrs["name"] += f" {at}" if len(records) > 1 else ""
+    return out
+
+
 def check_log_file(path: str | Path) -> None:
     """Refuse what is no log by its name, its beginning and what it declares; nothing heavy is loaded."""
     file, _, _ = split_cut(path)
     if _format(file) != "rosbag":
-        check_table(file)
+        check_table(file, log=True)
     elif not os.path.isdir(file):
         check_size(source_size(file), file=file)
 
@@ -182,6 +220,9 @@ def write_log(log: Log, path: str | Path) -> Path:
     """
     check_log(log)
     kind = file_format(path)
+    if kind in ("text", "matlab", "excel"):
+        problem = f"logs are not written with the ending {Path(path).suffix}"
+        raise UserError(problem, file=path, hint="write .csv, .nc or .parquet")
     if kind == "csv":
         return write_atomic(path, _pack(_to_csv(log), path))
     if kind == "netcdf":
@@ -258,62 +299,178 @@ def _read_netcdf_table(path: str | Path) -> Table:
     return Table(str(path), numbers, {}, np.arange(1, data.sizes["time"] + 1), attrs, meta, notes)
 
 
-_TABLES = {
-    "csv": read_csv_table, "netcdf": _read_netcdf_table,
-    "parquet": read_parquet_table, "rosbag": _read_rosbag,
+_WITHOUT_NAMES = {
+    "csv": read_text_table, "text": read_text_table, "matlab": read_matlab_table, "excel": read_excel_table
 }  # fmt: skip
+_WITH_NAMES = {"netcdf": _read_netcdf_table, "parquet": read_parquet_table, "rosbag": _read_rosbag}
 
 
-def _convert(table: Table) -> tuple[dict[str, Floats], dict[str, str], list[str]]:
-    """Return columns in record units by name (``time`` among them), their units, and what was converted."""
-    columns: dict[str, Floats] = {}
-    units: dict[str, str] = {}
-    repairs = list(table.notes)
+def _read_table(file: Path, columns: Sequence[str] | None) -> Table:
+    kind = _format(file)
+    if kind in _WITHOUT_NAMES:
+        return _WITHOUT_NAMES[kind](file, columns)
+    if columns is not None:
+        raise UserError("has names of its own", file=file, hint="leave --columns out")
+    return _WITH_NAMES[kind](file)
+
+
+def _frame_table(frame: Any, columns: Sequence[str] | None) -> Table:
+    """Return the columns of a DataFrame, its index among them unless that only counts rows."""
+    import pandas as pd
+
+    if not isinstance(frame.index, pd.RangeIndex):
+        frame = frame.rename_axis(frame.index.name or "time").reset_index()
+    if columns is not None and len(columns) != frame.shape[1]:
+        raise UserError(f"has {frame.shape[1]} columns, columns= names {len(columns)}", file="DataFrame")
+    if len(frame) < 2:
+        raise UserError(f"{len(frame)} row(s) are not a log", file="DataFrame", hint="give at least two rows")
+    numbers: dict[str, Floats] = {}
+    text: dict[str, list[str]] = {}
+    for at, header in enumerate(map(str, frame.columns if columns is None else columns)):
+        values = frame.iloc[:, at]
+        if header == "-":
+            continue
+        if isinstance(values.dtype, pd.DatetimeTZDtype) or values.dtype.kind == "M":
+            text[header] = [str(stamp) for stamp in values]
+        elif values.dtype.kind == "m":
+            numbers[f"{header}_s"] = values.dt.total_seconds().to_numpy(dtype=float)
+        elif values.dtype.kind in "fiub":
+            numbers[header] = values.to_numpy(dtype=float, na_value=np.nan)
+        else:
+            text[header] = values.astype(str).to_list()
+    return Table("DataFrame", numbers, text, np.arange(1, len(frame) + 1))
+
+
+def _convert(
+    table: Table, dt: float | None
+) -> tuple[dict[str, Floats], dict[str, str], dict[str, str], list[str]]:
+    """Return columns in record units by name (``time`` among them), their units, the name of each header,
+    and what was converted."""
+    headers = [*table.numbers, *table.text]
+    read = {header: read_header(header, headers) for header in headers}
+    read |= {h: (h, attrs["units"], 1.0) for h, attrs in table.attrs.items() if "units" in attrs}
+    time, used, found = _time_of(table, read, dt)
+    columns, units, names_of = {"time": time}, {"time": "s"}, dict.fromkeys(used, "time")
+    repairs, renamed = [*table.notes, *found], []
     for header, values in table.numbers.items():
-        name, unit = _name_and_unit(header, table)
-        if name in columns:
-            raise UserError(
-                f"gives the variable {name} a second time", file=table.file, column=header, hint="rename it"
-            )
-        columns[name], units[name] = to_record_unit(values, unit)
+        if header in used:
+            continue
+        name, unit, scale = read[header]
+        if not np.isfinite(values).any():
+            repairs.append(f"{header}: has no number in any row, left out")
+            continue
+        names_of[header] = name = unused(name or "c", columns)
+        columns[name], units[name] = to_record_unit(values if scale == 1 else values * scale, unit)
+        if header not in (name, f"{name}_{unit}"):
+            renamed.append(f"{header!r} as {name}" + ("" if unit == "1" else f" [{unit}]"))
+        if scale != 1:
+            repairs.append(f"{name}: converted to {unit} (times {scale:g})")
         if units[name] != unit:
             repairs.append(f"{name}: converted from {unit} to {units[name]}")
-        if name != "time" and not np.isfinite(values).any():
-            raise UserError(
-                "has no number in any row", file=table.file, column=header, hint="leave the column out"
-            )
-    if units.get("time") != "s":
-        raise UserError("no time column", file=table.file, hint=_time_hint(table))
-    return columns, units, repairs
+    words = [header for header in table.text if header not in used]
+    repairs += [f"read {', '.join(renamed)}"] if renamed else []
+    repairs += [f"left out, no numbers: {', '.join(words)}"] if words else []
+    return columns, units, names_of, repairs
 
 
-def _given_roles(table: Table) -> dict[str, str]:
-    """Return the role of each variable whose column has one."""
-    roles = {header: attrs["role"] for header, attrs in table.attrs.items() if attrs.get("role")}
-    return {_name_and_unit(header, table)[0]: role for header, role in roles.items()}
+def _time_of(
+    table: Table, read: Mapping[str, tuple[str, str, float]], dt: float | None
+) -> tuple[Floats, set[str], list[str]]:
+    """Return the time of each row [s], the headers it was read from, and what was taken for it."""
+    like = [h for h, (n, unit, _) in read.items() if unit in _TIME_UNITS and _TIME.fullmatch(n)]
+    like.sort(key=lambda header: read[header][0] != "time")
+    unnamed = [h for h in [*table.text, *[*table.numbers][:1]] if h not in like and _counts(h, table)]
+    if dt is not None:
+        instead = f" in place of {', '.join([*like, *unnamed])}" if like or unnamed else ""
+        told = f"time: rows are {dt:g} s apart, as asked{instead}"
+        return np.asarray(np.arange(len(table.lines)) * dt, dtype=float), {*like, *unnamed}, [told]
+    for header in [*like, *unnamed]:
+        if header in table.text:
+            cells, parts = table.text[header], [header]
+            if ":" not in cells[0]:  # a date, with the time of day in another column
+                of_day = [h for h in table.text if ":" in table.text[h][0] and _counts(h, table)]
+                parts += of_day[:1]
+                cells = [" ".join(row) for row in zip(*(table.text[h] for h in parts))]
+            if (clock := read_clock(cells)) is not None:
+                told = f"time: {' and '.join(parts)} counted from the first row, {cells[0]}{clock[1]}"
+                return clock[0] - clock[0][np.isfinite(clock[0]).argmax()], {*parts}, [told]
+            continue
+        values, (name, unit, scale) = table.numbers[header], read[header]
+        stated, finite = name == "time" and unit != "1", values[np.isfinite(values)]
+        rising = finite.size > 1 and np.mean(np.diff(finite) >= 0) >= _MONOTONE and np.ptp(finite) > 0
+        if not (stated or rising):
+            continue
+        if unit == "1":
+            scale = next((f for word, f in _TIME_WORDS.items() if name.lower().startswith(word)), 1.0)
+            scale = next((f for least, f in _EPOCHS if abs(finite[0]) >= least), scale)
+        seconds = to_record_unit(values if scale == 1 else values * scale, unit)[0]
+        if stated and scale == 1:
+            return seconds, {header}, [f"time: converted from {unit} to s"] if unit != "s" else []
+        what = f"{header} is taken as the time in {unit if unit != '1' else 's'}"
+        more = "; --dt S sets another step" if header in unnamed else ""
+        return seconds, {header}, [f"time: {what}{'' if scale == 1 else f', times {scale:g}'}{more}"]
+    step = float(table.meta.get("dt", 1.0))  # of a file that has it beside its columns
+    told = f"no time column: rows are taken {step:g} s apart; --dt S sets another step"
+    return np.asarray(step * np.arange(len(table.lines)), dtype=float), set(), [told]
 
 
-def _name_and_unit(header: str, table: Table) -> tuple[str, str]:
-    """Return name and unit, from the column's attributes where it has them, else from its header."""
-    unit = table.attrs.get(header, {}).get("units")
-    return (header, unit) if unit is not None else split_header(header, file=table.file)
+def _counts(header: str, table: Table) -> bool:
+    """Tell whether a column that is not named as a time may be one: a clock, or even steps."""
+    if header in table.text:
+        return read_clock(table.text[header][:20]) is not None
+    step = np.diff(table.numbers[header])
+    if not _COUNTER.fullmatch(header) or step.size < 4 or not np.all(step > 0):
+        return False
+    return bool(np.mean(np.abs(step - np.median(step)) <= 0.2 * np.median(step)) >= _MONOTONE)
 
 
-def _time_hint(table: Table) -> str:
-    known = re.compile(r"(time|timestamp|datetime|date|seconds|elapsed)(_|$)|t(_s|_ms|_min)?$")
-    like = next((header for header in table.numbers if known.match(header.lower())), None)
-    return (
-        f"rename {like!r} to time_s, time_ms or time_min" if like else "add time_s, the seconds of each row"
-    )
+def read_clock(cells: Sequence[str]) -> tuple[Floats, str] | None:
+    """Return the seconds that dates and times of day mean, and how they were taken; None if they are none.
+
+    Without a date they count from midnight on, across further ones; UTC where no offset is written.
+    """
+    import pandas as pd
+
+    parts = pd.Series(list(cells), dtype=object).str.strip().str.extract(_STAMP)
+    if parts[[1, 4]].isna().all(axis=1).mean() > 1 - _MONOTONE:
+        return None
+
+    def numbers(key: int) -> Floats:
+        return np.asarray(pd.to_numeric(parts[key].str.replace(",", "."), errors="coerce"), dtype=float)
+
+    hour, minute, second = (np.nan_to_num(numbers(key)) for key in (4, 5, 6))
+    half = parts[7].str.lower()
+    hour = np.where(half.notna() & (hour == 12), 0, hour) + 12.0 * (half == "pm").to_numpy()
+    offset = parts[8].str.replace(":", "").str.extract(r"([+-])(\d{2})(\d{2})")
+    shift = pd.to_numeric(offset[1]) * 60 + pd.to_numeric(offset[2])
+    minute = minute - np.nan_to_num(np.asarray(shift.where(offset[0] == "+", -shift), dtype=float))
+    of_day = 3600 * hour + 60 * minute + second
+    of_day[parts[[1, 4]].isna().all(axis=1)] = np.nan
+    if parts[1].isna().all():
+        steps = np.diff(of_day, prepend=of_day[0])
+        return of_day + 86400.0 * np.cumsum(np.nan_to_num(steps) < -43200), ""
+    parts[2] = parts[2].str.lower().map(_MONTHS).fillna(parts[2])
+    first, middle, last = numbers(1), numbers(2), numbers(3)
+    note = ""
+    if np.nanmax(first) > 31:
+        year, month, day = first, middle, last
+    elif np.nanmax(middle) > 12 or (np.nanmax(first) <= 12 and "/" in str(cells[0])):
+        month, day, year = first, middle, last
+        note = "" if np.nanmax(middle) > 12 else " (taken as month/day)"
+    else:
+        day, month, year = first, middle, last
+    year = np.where(year < 100, year + 2000, year)
+    dates = pd.to_datetime(pd.DataFrame({"year": year, "month": month, "day": day}), errors="coerce")
+    days = (dates - pd.Timestamp(0)) / pd.Timedelta(days=1)
+    return np.asarray(days, dtype=float) * 86400.0 + of_day, note
 
 
 def _repair(
     time: Floats, columns: dict[str, Floats], units: dict[str, str], roles: dict[str, str], table: Table
 ) -> tuple[Floats, dict[str, Floats], list[str]]:
     """Return the repaired time and columns, and a line a finding."""
-    keep, repairs = drop_repeated(time, table.lines, table.file)
-    time = time[keep]
-    columns = {name: values[keep] for name, values in columns.items()}
+    time, rows, repairs = order_rows(time, table.lines, table.file)
+    columns = {name: values[rows] for name, values in columns.items()}
     if time.size < 2:
         raise UserError(f"{time.size} row(s) are not a log", file=table.file, hint="give at least two rows")
     time, found = from_first_row(time)
@@ -376,7 +533,7 @@ def _end(value: float) -> str:
 
 
 def _to_csv(log: Log) -> str:
-    header = ["time_s"] + [join_header(str(n), log[n].attrs["units"]) for n in log.data_vars]
+    header = ["time_s"] + [join_header(str(n), v.attrs["units"], [*log]) for n, v in log.data_vars.items()]
     columns = [log["time"].values] + [log[n].values for n in log.data_vars]
     # repr is the shortest text that reads back as the same double
     cells = [["" if v != v else repr(v) for v in column.tolist()] for column in columns]

@@ -2,10 +2,11 @@
 
 Nothing is repaired silently: each function returns the values and one line a finding.
 
-Repeated time stamps are dropped (the first row stays), time that runs backward is refused.  Uneven stamps
-stay as they are and are reported.  A **spike** is a run of at most three samples of an output that leaves
-the running median of 21 samples and comes back.  With d the deviation from that median, a sample is a
-candidate where
+Repeated time stamps are dropped (the first row stays); where a clock is so coarse that more than a quarter
+repeat, the rows are spread evenly between its stamps.  Single rows out of order are sorted, time that runs
+backward otherwise is refused.  Uneven stamps stay as they are and are reported.  A **spike** is a run of at
+most three samples of an output that leaves the running median of 21 samples and comes back.  With d the
+deviation from that median, a sample is a candidate where
 
     |d| > max(floor, 6 s),   s = 1.4826 median |d| over the whole channel,
 
@@ -31,35 +32,49 @@ SPIKE_WINDOW = 21
 SPIKE_LENGTH = 3
 GAP_SECONDS = 10.0
 GAP_STEPS = 5.0
+_FEW, _MOST_MOVED = 0.05, 10  # share of rows whose time may be wrong; rows that one may be out of place
 _CLOCK = 1e8  # s: no log is three years old at its first row
 
 
-def drop_repeated(time: Floats, lines: NDArray[np.int64], file: str) -> tuple[NDArray[np.bool_], list[str]]:
-    """Return which rows stay, and what was dropped.
+def order_rows(
+    time: Floats, lines: NDArray[np.int64], file: str
+) -> tuple[Floats, NDArray[np.int64], list[str]]:
+    """Return strictly increasing times, the rows that they belong to, and what was repaired.
 
-    UserError where a time is missing, runs backward, or most stamps repeat (the clock is too coarse).
+    UserError where many times are missing, or time runs backward.
     """
+    rows, repairs = np.arange(time.size), []
     lost = ~np.isfinite(time)
-    if lost.any():
+    if lost.mean() > _FEW:
         row = int(lines[lost.argmax()])
         raise UserError(
             "has no time", file=file, row=row, column="time", hint="remove the row or give its time"
         )
-    step = np.diff(time)
-    if np.any(step < 0):
-        at = int(np.argmax(step < 0))
-        problem = f"time runs back from {time[at]:g} s to {time[at + 1]:g} s"
-        raise UserError(
-            problem, file=file, row=int(lines[at + 1]), hint="sort the rows, or cut the file there in two"
-        )
-    keep = np.concatenate([[True], step > 0])
-    dropped = lines[~keep]
-    if dropped.size > 0.25 * time.size:
-        problem = f"{dropped.size} of {time.size} rows repeat the time before them"
-        raise UserError(problem, file=file, hint="log the time with more digits, or in _ms")
-    if not dropped.size:
-        return keep, []
-    return keep, [f"{dropped.size} repeated time stamp{_s(dropped.size)} dropped ({_rows(dropped)})"]
+    if lost.any():
+        rows = rows[~lost]
+        repairs.append(f"{lost.sum()} row{_s(int(lost.sum()))} without a time dropped ({_rows(lines[lost])})")
+    back = time[rows] < np.maximum.accumulate(time[rows])
+    order = np.argsort(time[rows], kind="stable")
+    if back.any():
+        if back.mean() > _FEW or np.abs(order - np.arange(rows.size)).max() > _MOST_MOVED:
+            at = int(np.argmax(np.diff(time[rows]) < 0))
+            problem = f"time runs back from {time[rows[at]]:g} s to {time[rows[at + 1]]:g} s"
+            hint = "sort the rows, cut the file there in two, or give the step of all rows with --dt"
+            raise UserError(problem, file=file, row=int(lines[rows[at + 1]]), hint=hint)
+        which = _rows(lines[rows[back]])
+        repairs.append(f"{back.sum()} row{_s(int(back.sum()))} out of order sorted ({which})")
+        rows = rows[order]
+    first = np.concatenate([[True], np.diff(time[rows]) > 0])
+    starts, repeats = np.flatnonzero(first), int((~first).sum())
+    if repeats > 0.25 * rows.size and starts.size > 1:
+        stamps = time[rows[starts]]
+        ends = np.append(starts, rows.size), np.append(stamps, stamps[-1] + np.median(np.diff(stamps)))
+        repairs.append(f"time has {starts.size} stamps for {rows.size} rows: rows spread evenly between them")
+        return np.interp(np.arange(rows.size), *ends), rows, repairs
+    if repeats:
+        which = _rows(lines[rows[~first]])
+        repairs.append(f"{repeats} repeated time stamp{_s(repeats)} dropped ({which})")
+    return time[rows[first]], rows[first], repairs
 
 
 def from_first_row(time: Floats) -> tuple[Floats, list[str]]:

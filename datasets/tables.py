@@ -1,8 +1,13 @@
-"""Tables of numbers on disk: CSV (plain, gzip or xz), NetCDF and Parquet, read without running code.
+"""Tables of numbers on disk: text (plain, gzip or xz), Parquet, MATLAB, Excel, read without running code.
 
 Reading is fast first and exact afterwards: the whole file is parsed at once, and only if that fails is it
 read line by line to name the row and the column of the bad cell.  A last line that was cut off (a logger
 that lost power) is dropped and noted; any other ragged line is refused.
+
+:func:`read_csv_table` reads what thermogrip writes.  :func:`read_text_table` reads what any logger writes:
+the separator is the one of comma, semicolon, tab, bar and blanks that makes the first lines rows of equal
+length whose cells are numbers; the header is the last line of words before them.  What it passes over or
+takes for something is noted; a row or a cell that is broken is left out as long as they are few.
 """
 
 from __future__ import annotations
@@ -14,23 +19,35 @@ import io
 import lzma
 import os
 import re
+import shlex
+import zipfile
 import zlib
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from itertools import islice
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain, count, islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.atomic_files import os_fault, read_bytes, source_size
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.limits import check_size, check_unpacked, most_bytes, read_within, unpack_within
+from thermogrip.datasets.limits import (
+    check_size,
+    check_unpacked,
+    most_bytes,
+    most_unpacked,
+    read_within,
+    unpack_within,
+)
 from thermogrip.datasets.media import from_csv
+from thermogrip.datasets.units import read_header
 
 FORMATS = {
     ".csv": "csv", ".csv.gz": "csv", ".csv.xz": "csv",
+    ".txt": "text", ".dat": "text", ".tsv": "text", ".tab": "text", ".asc": "text", ".log": "text",
+    ".mat": "matlab", ".xlsx": "excel",
     ".nc": "netcdf", ".h5": "netcdf", ".hdf5": "netcdf",
     ".parquet": "parquet", ".pq": "parquet",
     ".bag": "rosbag", ".db3": "rosbag", ".mcap": "rosbag",
@@ -41,7 +58,15 @@ _BEGINNING = 16 << 20  # bytes of a file that are looked at before it is read
 _MOST_EMPTY = 1_000_000  # lines without a cell that are passed over
 
 _NULLS = ["", "nan", "NaN", "NAN", "NA", "N/A", "null", "NULL", "None", "-nan", "#N/A"]
+_LOST = [*_NULLS, "-", "--", "---", "?", "*", "NaT"]
+_COMMENT = ("#", "%", "//")  # how a line begins that is no row
+_LEFT_OUT = "\x1f"  # how the name of a column begins that is not kept
+_NAMELESS = "no header: columns named c1 to c{} by position; --columns a,b,... names them"
+_HEAD_LINES = 200  # of a file, that show how it is a table
 _DATE = re.compile(r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}|\d{1,2}:\d{2}")  # how a date or a time of day begins
+_MANY = 0.9  # share of a column's cells that decide what the others should be
+_MOST_BROKEN = 0.05  # share of rows with too few or too many cells that are left out
+_SWITCH = {"on": 1.0, "off": 0.0, "true": 1.0, "false": 0.0, "yes": 1.0, "no": 0.0}
 _NUMBER = re.compile(
     r"[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|inf|infinity)", re.ASCII | re.IGNORECASE
 )
@@ -94,25 +119,280 @@ def read_csv_table(
     if the header has no comma; then numbers may have a decimal comma, which is noted. ``text`` names the
     columns to leave as text, or states that of a header; None is all of them.
     """
-    file = str(path)
     data = _text_of(path)
-    header, skip, separator = _header(data, file)
+    layout = Layout(*_header(data, str(path)), ())
     is_text = text if callable(text) else lambda name: text is None or name in text
-    types = {name: "text" if is_text(name) else "number" for name in header}
-    data, table, notes = _parse_as_written(data, skip, separator, types)
+    words = frozenset(name for name in layout.names if is_text(name))
+    return _parse_table(data, layout, str(path), words, broken=0.0)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How a text file is a table."""
+
+    names: list[str]  # of the columns, by position where the file has none
+    skip: int  # lines before the first row
+    separator: str
+    notes: tuple[str, ...]
+
+
+def read_text_table(path: str | Path, columns: Sequence[str] | None = None) -> Table:
+    """Return the columns of a text table that any program wrote.
+
+    ``columns`` are names in place of the file's own, one a column, ``-`` to leave one out.
+    """
+    return parse_text(_text_of(path), str(path), columns)
+
+
+def parse_text(data: bytes, file: str, columns: Sequence[str] | None = None) -> Table:
+    """Return the table in the text of a file; see :func:`read_text_table`."""
+    data, coded = _any_coding(data)
+    layout = find_layout(data, file)
+    names, notes = layout.names, (*coded, *layout.notes)
+    if columns is not None:
+        have = len([name for name in names if not name.startswith(_LEFT_OUT)])
+        if len(columns) != have:
+            raise _other_count(file, have, len(columns))
+        given: list[str] = []
+        for name in columns:
+            given.append(unused(_LEFT_OUT if name == "-" else name, given))
+        names = [*given, *names[have:]]
+        notes = tuple(note for note in notes if "--columns" not in note)
+    if layout.separator == " ":
+        data = re.sub(rb"[ \t]+", b" ", re.sub(rb"(?m)^[ \t]+|[ \t\r]+$", b"", data))
+    table = _parse_table(data, replace(layout, names=names, notes=notes), file)
+    kept = {name: values for name, values in table.numbers.items() if not name.startswith(_LEFT_OUT)}
+    return replace(table, numbers=kept)
+
+
+def find_layout(data: bytes, file: str) -> Layout:
+    """Return how a text is a table, from its first lines."""
+    head: list[tuple[int, str]] = []
+    for at, raw in enumerate(_lines(data[: 1 << 20]), start=1):
+        if len(head) < _HEAD_LINES and raw.strip():
+            head.append((at, raw.decode("utf-8", errors="replace").strip("\r\n")))
+    best: tuple[float, int, str, list[list[str]]] | None = None  # share of rows that fit, the first of them
+    for separator in "\t;|, ":
+        rows = [_split(line, separator) for _, line in head]
+        first = next((k for k in range(len(rows)) if _is_row(rows, k, separator)), None)
+        if first is None:
+            continue
+        n, rows = len(rows[first]), rows[first:]
+        fit = float(np.mean([len(r) == n and _values(r, separator) for r in rows])) if n > 1 else 0.0
+        if best is None or fit > best[0] + 1e-9:
+            best = fit, first, separator, rows
+    if best is None:
+        return Layout(*_header(data, file), ())
+    _, first, separator, rows = best
+    n = len(rows[0])
+    if n > MOST_COLUMNS:
+        raise UserError(f"has {n} columns, more than {MOST_COLUMNS}", file=file, hint="leave some out")
+    names, used = _names_above(head[:first], n, separator)
+    hollow = not names[-1] and all(row[-1] == "" for row in rows)  # every line ends with a separator
+    nameless = [f"c{at}" for at, name in enumerate(names[: n - hollow], 1) if not name]
+    notes = [_NAMELESS.format(n - hollow)] if len(nameless) == n - hollow else []
+    if nameless and not notes:
+        notes.append(f"without a name: {', '.join(nameless)}")
+    for at, name in enumerate(names):
+        names[at] = unused(name or f"c{at + 1}", names[:at], "{1}_{0}")  # the unit at the end stays there
+        if name and names[at] != name:
+            notes.append(f"{name} occurs again: named {names[at]}")
+    if hollow:
+        names[-1] = f"{_LEFT_OUT}end"
+    passed = sum(not line.startswith(_COMMENT) for _, line in head[:first]) - used
+    if passed:
+        notes.append(f"{passed} line(s) before the table passed over")
+    return Layout(names, head[first][0] - 1, separator, tuple(notes))
+
+
+def unused(name: str, others: Container[str], numbered: str = "{0}_{1}") -> str:
+    """Return a name that is not among others: itself, or with a number."""
+    return next(n for n in chain([name], (numbered.format(name, k) for k in count(2))) if n not in others)
+
+
+def _split(line: str, separator: str) -> list[str]:
+    if separator == " ":
+        return line.split()
+    try:
+        return [cell.strip() for cell in next(csv.reader([line], delimiter=separator))]
+    except (csv.Error, StopIteration):
+        return []
+
+
+def _is_value(cell: str, separator: str) -> bool:
+    plain = cell if separator == "," else cell.replace(",", ".", 1)
+    return bool(_NUMBER.fullmatch(plain) or _DATE.match(cell)) or cell in _NULLS
+
+
+def _values(row: Sequence[str], separator: str) -> float:
+    """Return the share of a row's cells that are numbers, times or lost."""
+    return sum(_is_value(cell, separator) for cell in row) / max(len(row), 1)
+
+
+def _is_row(rows: Sequence[Sequence[str]], k: int, separator: str) -> bool:
+    """Tell whether line k is one of numbers, as long as the next or the one before."""
+    row, cells = rows[k], [cell for cell in rows[k] if cell]
+    beside = [len(other) for other in (*rows[max(k - 1, 0) : k], *rows[k + 1 : k + 2])]
+    return bool(cells) and _values(cells, separator) >= 0.5 and (not beside or len(row) in beside)
+
+
+def _names_above(lines: Sequence[tuple[int, str]], n: int, separator: str) -> tuple[list[str], int]:
+    """Return the names of n columns, empty where the file has none, and how many lines gave them."""
+    found: list[list[str]] = []
+    for _, line in reversed(lines):
+        comment = line.startswith(_COMMENT)
+        cells = _split(line.lstrip("#%/ ") if comment else line, separator)
+        if separator == " " and len(cells) != n:
+            cells = [cell.strip() for cell in re.split(r"\s{2,}|\t|,|;", line.strip("#%/ "))]
+        if len(cells) in (n, n - 1) and any(cells) and len(found) < 2 and not (comment and found):
+            found.append([*cells, ""][:n])
+        if found and not _are_units(found[0]):
+            break
+    if not found:
+        return [""] * n, 0
+    names = found[-1] if len(found) == 2 else found[0]
+    if len(found) == 2:
+        names = [f"{a} [{b.strip('[]()')}]" if b else a for a, b in zip(names, found[0])]
+    used = sum(not line.startswith(_COMMENT) for _, line in lines[-len(found) :])
+    return [from_csv(name) for name in names], used
+
+
+def _are_units(cells: Sequence[str]) -> bool:
+    """Tell whether a line under the names has their units."""
+    words = [cell for cell in cells if cell]
+    return bool(words) and all(read_header(f"x [{word.strip('[]()')}]")[1] != "1" for word in words)
+
+
+def _any_coding(data: bytes) -> tuple[bytes, tuple[str, ...]]:
+    """Return text in UTF-8; what is not is taken as Windows-1252, and that is noted."""
+    if data.isascii():
+        return data, ()
+    try:
+        data.decode("utf-8")
+    except UnicodeDecodeError:
+        return data.decode("cp1252", "replace").encode(), ("text is not UTF-8: read as Windows-1252",)
+    return data, ()
+
+
+def _parse_table(
+    data: bytes, layout: Layout, file: str, words: frozenset[str] = frozenset(), broken: float = _MOST_BROKEN
+) -> Table:
+    """Return the table in a text, first as it should be, else cell by cell.
+
+    ``words`` are columns to leave as text; up to a share ``broken`` of the rows, and twice as many cells of a
+    column, may be left out.  All that is wrong beyond that is named in one error.
+    """
+    names, separator, skip = layout.names, layout.separator, layout.skip
+    types = {name: "text" if name in words else "number" for name in names}
+    body, table, notes = _parse_as_written(data, skip, separator, types)
+    faults: list[UserError] = []
+    odd: list[int] = []
     if table is None:
-        _name_fault(data, skip, separator, types, file)
-        raise UserError(
-            "is not a table of numbers", file=file, hint="open it in an editor and compare its rows"
-        )
-    _check_empty(data, table.num_rows, file)
-    lines = _line_numbers(data, skip, table.num_rows)
-    if not lines.size:
+        counts: list[int] = []
+
+        def leave_out(row: Any) -> str:
+            counts.append(row.actual_columns)
+            return "skip"
+
+        table = _parse(body, skip, separator, dict.fromkeys(names, "text"), ".", leave_out)
+        if counts or table is None:
+            odd = [at for at, cells in _rows(body, skip, separator, file) if len(cells) != len(names)]
+        if odd and len(odd) > broken * (len(odd) + (table.num_rows if table is not None else 0)):
+            more = f"; {len(odd) - 1} more rows do not fit" if len(odd) > 1 else ""
+            problem = f"has {counts[0] if counts else 0} cell(s), the header has {len(names)}{more}"
+            faults.append(UserError(problem, file=file, row=odd[0], hint="complete or remove the row"))
+        elif odd:
+            notes += (f"{len(odd)} row(s) with too few or too many cells left out ({_some(odd)})",)
+    if table is None:
+        hint = "open it in an editor and compare its rows"
+        raise faults[0] if faults else UserError("is not a table", file=file, hint=hint)
+    _check_empty(body, table.num_rows + len(odd), file)
+    lines = _line_numbers(body, skip, table.num_rows + len(odd))
+    lines = lines[~np.isin(lines, odd)]
+    if len(lines) != table.num_rows:  # a quoted cell may have line ends
+        lines = np.arange(skip + 1, skip + 1 + table.num_rows)
+    if not lines.size and not faults:
         raise UserError("has a header but no rows", file=file, hint="give at least two rows")
-    numbers = {n: _to_float(table.column(n)) for n, kind in types.items() if kind == "number"}
-    texts = [name for name, kind in types.items() if kind == "text"]
-    strings = {name: [from_csv(v.strip()) for v in table.column(name).to_pylist()] for name in texts}
-    return Table(file=file, numbers=numbers, text=strings, lines=lines, notes=notes, separator=separator)
+    numbers: dict[str, NDArray[np.float64]] = {}
+    text: dict[str, list[str]] = {}
+    for name in names:
+        column = table.column(name)
+        if name in words:
+            text[name] = [from_csv(cell.strip()) for cell in column.to_pylist()]
+        elif str(column.type) != "string":
+            numbers[name] = _to_float(column)
+        elif not name.startswith(_LEFT_OUT):
+            notes += _read_cells(name, column, (numbers, text, faults), lines, separator, broken, file)
+    if faults:
+        raise _joined(faults, names)
+    notes = tuple(dict.fromkeys([*layout.notes, *notes]))
+    return Table(file, numbers, text, lines, notes=notes, separator=separator)
+
+
+def _read_cells(
+    name: str,
+    column: Any,
+    found: tuple[dict[str, NDArray[np.float64]], dict[str, list[str]], list[UserError]],
+    lines: NDArray[np.int64],
+    separator: str,
+    broken: float,
+    file: str,
+) -> tuple[str, ...]:
+    """Put a column of text among the numbers, the words or the faults that were found; return the notes."""
+    numbers, text, faults = found
+    cells, values, comma = _cell_numbers(column, separator)
+    lost = cells.isin(_LOST if broken else _NULLS)
+    wrong = np.flatnonzero(np.isnan(values) & ~lost)
+    first = cells.iloc[wrong[0]] if wrong.size else ""
+    if wrong.size <= 2 * broken * int((~lost).sum()):
+        numbers[name] = values
+        where = f"{_some(lines[wrong])}: {_shown(first)}"
+        words = (
+            (f"{name}: {wrong.size} cell(s) that are no numbers left empty ({where})",) if wrong.size else ()
+        )
+        return (*words, *(["numbers have a decimal comma"] if comma else []))
+    if broken and {cell.lower() for cell in cells.unique()} - {""} <= {*_SWITCH}:
+        numbers[name] = cells.str.lower().map(_SWITCH).to_numpy(dtype=float)
+        return (f"{name}: words as {_shown(first)} read as 0 and 1",)
+    if broken and (wrong.size >= _MANY * int((~lost).sum()) or _DATE.match(first)):
+        text[name] = cells.to_list()
+    else:
+        faults.append(_cell_fault(first, file, int(lines[wrong[0]]), name))
+    return ()
+
+
+def _cell_numbers(column: Any, separator: str) -> tuple[Any, NDArray[np.float64], bool]:
+    """Return the stripped cells, their numbers (NaN where they are none), and if decimals have a comma."""
+    import pandas as pd
+
+    cells = plain = column.to_pandas().astype(str).str.strip()
+    comma = separator != "," and bool(cells.str.fullmatch(r"[+-]?\d*,\d+([eE][+-]?\d+)?").any())
+    comma = comma and not cells.str.contains(".", regex=False).any()
+    if comma:
+        plain = cells.str.replace(",", ".", regex=False)
+    return cells, np.asarray(pd.to_numeric(plain, errors="coerce"), dtype=float), comma
+
+
+def _some(lines: Sequence[int] | NDArray[np.int64]) -> str:
+    s = "" if len(lines) == 1 else "s"
+    return f"row{s} {', '.join(str(line) for line in lines[:5])}{', ...' if len(lines) > 5 else ''}"
+
+
+def _shown(cell: str) -> str:
+    return repr(cell if len(cell) <= 40 else cell[:37] + "...")
+
+
+def _joined(faults: Sequence[UserError], names: Sequence[str]) -> UserError:
+    """Return all that is wrong with a file as one error, with the option that reads the rest of it."""
+    first, bad = faults[0], {fault.column for fault in faults}
+    kept = ",".join("-" if name in bad else name.replace(",", " ") for name in names)
+    hint = first.hint
+    if bad - {None} and len(bad) < len(names):
+        hint = f"{hint}, or leave columns out: --columns {shlex.quote(kept)}"
+    if len(faults) == 1:
+        return UserError(first.problem, file=first.file, row=first.row, column=first.column, hint=hint)
+    each = [f"row {f.row}" + (f", column {f.column}" if f.column else "") + f": {f.problem}" for f in faults]
+    return UserError(f"{len(faults)} faults: " + "; ".join(each), file=first.file, hint=hint)
 
 
 def text_numbers(table: Table, header: str) -> NDArray[np.float64]:
@@ -130,6 +410,106 @@ def text_numbers(table: Table, header: str) -> NDArray[np.float64]:
             row, problem = int(table.lines[at]), f"{cell!r} is not a number"
             raise UserError(problem, file=table.file, row=row, column=header, hint=hint) from None
     return values
+
+
+def read_matlab_table(path: str | Path, columns: Sequence[str] | None = None) -> Table:
+    """Return the columns of a MATLAB file (up to version 7): vectors and columns of matrices of one length.
+
+    A matrix alone has columns without names; a scalar ``Ts``, ``dt`` or ``fs`` is the step (``meta["dt"]``).
+    """
+    raw = read_bytes(path)
+    if raw[:10] == b"MATLAB 7.3":
+        raise UserError("is MATLAB 7.3", file=path, hint="save('x.mat', ..., '-v7') in MATLAB, or export CSV")
+    from scipy.io import loadmat
+
+    try:
+        source: Any = io.BytesIO(_unpacked_matlab(raw, path))  # the stubs know names only
+        found = loadmat(source, simplify_cells=True)
+    except UserError:
+        raise
+    except Exception as error:  # scipy raises whatever a damaged file makes it stumble over
+        raise UserError("is no MATLAB file, or is damaged", file=path, hint="save it again") from error
+    arrays = dict(_matlab_arrays({k: v for k, v in found.items() if not k.startswith("__")}))
+    lengths = [values.shape[0] for values in arrays.values() for _ in range(values.shape[1])]
+    if not lengths:
+        hint = "save the signals as vectors or a matrix"
+        raise UserError("has no columns of numbers", file=path, hint=hint)
+    n = max(set(lengths), key=lambda length: (length * lengths.count(length), length))
+    parts = {name: values for name, values in arrays.items() if values.shape[0] == n}
+    numbers = {
+        unused(name if values.shape[1] == 1 else f"{name}_{at + 1}", ()): values[:, at]
+        for name, values in parts.items()
+        for at in range(values.shape[1])
+    }
+    left = [name for name in arrays if name not in parts]
+    notes = [f"left out, of another length: {', '.join(left)}"] if left else []
+    if len(parts) == 1 and len(numbers) > 1:
+        numbers = {f"c{at}": values for at, values in enumerate(numbers.values(), 1)}
+        if columns is None:
+            notes.append(_NAMELESS.format(len(numbers)))
+    if columns is not None:
+        if len(columns) != len(numbers):
+            raise _other_count(path, len(numbers), len(columns))
+        numbers = {name: v for name, v in zip(columns, numbers.values()) if name != "-"}
+    scalars = {key.lower(): v for key, v in found.items() if isinstance(v, int | float) and v > 0}
+    step = scalars.get("ts") or scalars.get("dt") or 1 / scalars.get("fs", 1.0)
+    meta = {"dt": repr(float(step))}
+    return Table(str(path), numbers, {}, np.arange(1, n + 1), meta=meta, notes=tuple(notes))
+
+
+def _matlab_arrays(found: Mapping[str, Any], depth: int = 0) -> Iterator[tuple[str, NDArray[np.float64]]]:
+    """Yield name and columns (n_row, n_column) of each array of numbers, those of structures among them."""
+    for name, value in found.items():
+        if isinstance(value, dict) and depth < 4:
+            yield from _matlab_arrays(value, depth + 1)
+        elif isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.ndim in (1, 2):
+            rows = value[:, None] if value.ndim == 1 else value if len(value) >= value.shape[1] else value.T
+            if len(rows) > 1 and rows.shape[1]:
+                yield name, np.asarray(rows, dtype=float)
+
+
+def _unpacked_matlab(raw: bytes, path: str | Path) -> bytes:
+    """Return a MATLAB 5 file with its parts unpacked, so that what is read is no larger than what is here."""
+    if raw[126:128] not in (b"IM", b"MI"):
+        return raw
+    order: Literal["little", "big"] = "little" if raw[126:128] == b"IM" else "big"
+    out, at, total = [raw[:128]], 128, 0
+    while at < len(raw):
+        kind, size = (int.from_bytes(raw[at + k : at + k + 4], order) for k in (0, 4))
+        part, at = raw[at : at + 8 + size], at + 8 + size
+        if kind == 15:  # miCOMPRESSED
+            unpacker = zlib.decompressobj()
+            part = unpacker.decompress(part[8:], most_unpacked(len(raw)) - total + 1)
+            total += len(part)
+            check_unpacked(len(raw), total, file=path)
+        if at > len(raw):
+            raise ValueError("it was cut off")
+        out.append(part)
+    return b"".join(out)
+
+
+def read_excel_table(path: str | Path, columns: Sequence[str] | None = None) -> Table:
+    """Return the first sheet of an Excel workbook, read as its text would be."""
+    raw = read_bytes(path)
+    try:
+        with zipfile.ZipFile(io.BytesIO(raw)) as packed:
+            check_unpacked(len(raw), sum(entry.file_size for entry in packed.infolist()), file=path)
+        import pandas as pd
+
+        frame = pd.read_excel(io.BytesIO(raw), header=None, engine="openpyxl")
+    except ImportError as error:
+        hint = "pip install openpyxl, or export CSV"
+        raise UserError("needs the package openpyxl", file=path, hint=hint) from error
+    except UserError:
+        raise
+    except Exception as error:  # openpyxl raises whatever a damaged file makes it stumble over
+        raise UserError("is no Excel workbook, or is damaged", file=path, hint="export CSV") from error
+    return parse_text(frame.to_csv(index=False, header=False).encode(), str(path), columns)
+
+
+def _other_count(file: str | Path, have: int, named: int) -> UserError:
+    hint = "write a name for each, - to leave one out"
+    return UserError(f"has {have} columns, --columns names {named}", file=file, hint=hint)
 
 
 def read_parquet_table(path: str | Path) -> Table:
@@ -198,15 +578,18 @@ def _to_float(chunked: Any) -> NDArray[np.float64]:
     return values.copy()
 
 
-def check_table(path: str | Path) -> None:
+def check_table(path: str | Path, *, log: bool = False) -> None:
     """Refuse a file that is no table of numbers by its name, its beginning and what it declares.
 
+    A log may have any header.
     It loads neither pandas nor xarray.  What a shell passes on is read once, so it is not looked at here.
     """
     kind = file_format(path)
     if os.path.exists(path) and not source_size(path) and not os.path.isfile(path):
         return
-    if kind == "csv":
+    if kind == "text" or (kind == "csv" and log):
+        _text_of(path, _BEGINNING)
+    elif kind == "csv":
         text = _text_of(path, _BEGINNING)
         if len(text) < _BEGINNING // 2 or not text.startswith(b"#"):
             _header(text, str(path))
@@ -318,8 +701,15 @@ def _parse_as_written(
     return cut, None, lost
 
 
-def _parse(data: bytes, skip: int, separator: str, types: dict[str, str], decimal: str) -> Any:
-    """Return the pyarrow table, or None where a row or a cell does not fit."""
+def _parse(
+    data: bytes,
+    skip: int,
+    separator: str,
+    types: dict[str, str],
+    decimal: str,
+    left_out: Callable[[Any], str] | None = None,
+) -> Any:
+    """Return the pyarrow table, or None where a cell does not fit, or a row, unless ``left_out`` takes it."""
     import pyarrow as pa
     import pyarrow.csv as arrow_csv
 
@@ -330,7 +720,7 @@ def _parse(data: bytes, skip: int, separator: str, types: dict[str, str], decima
             read_options=arrow_csv.ReadOptions(
                 use_threads=False, skip_rows=skip, column_names=list(types), block_size=block
             ),
-            parse_options=arrow_csv.ParseOptions(delimiter=separator),
+            parse_options=arrow_csv.ParseOptions(delimiter=separator, invalid_row_handler=left_out),
             convert_options=arrow_csv.ConvertOptions(
                 column_types={
                     n: pa.string() if kind == "text" else pa.float64() for n, kind in types.items()
@@ -370,24 +760,12 @@ def _rows(data: bytes, skip: int, separator: str, file: str) -> Iterator[tuple[i
                 ) from error
 
 
-def _name_fault(data: bytes, skip: int, separator: str, types: dict[str, str], file: str) -> None:
-    """Raise the error that names the first bad row or cell."""
-    for line, cells in _rows(data, skip, separator, file):
-        if len(cells) != len(types):
-            problem = f"has {len(cells)} cell(s), the header has {len(types)}"
-            raise UserError(problem, file=file, row=line, hint="complete or remove the row")
-        for (name, kind), cell in zip(types.items(), cells, strict=True):
-            if kind == "number" and cell.strip() not in _NULLS and not _NUMBER.fullmatch(cell.strip()):
-                comma = re.fullmatch(r"\s*[+-]?\d+,\d+\s*", cell)
-                hint = (
-                    "write a decimal point"
-                    if comma
-                    else "write a number, leave the cell empty, or drop the column"
-                )
-                if _DATE.match(cell.strip()):
-                    hint = "write seconds since the first row"
-                shown = cell if len(cell) <= 40 else cell[:37] + "..."
-                raise UserError(f"{shown!r} is not a number", file=file, row=line, column=name, hint=hint)
+def _cell_fault(cell: str, file: str, line: int, name: str) -> UserError:
+    comma = re.fullmatch(r"\s*[+-]?\d+,\d+\s*", cell)
+    hint = "write a decimal point" if comma else "write a number, leave the cell empty, or drop the column"
+    if _DATE.match(cell.strip()):
+        hint = "write seconds since the first row"
+    return UserError(f"{_shown(cell)} is not a number", file=file, row=line, column=name, hint=hint)
 
 
 def _line_numbers(data: bytes, skip: int, n_rows: int) -> NDArray[np.int64]:

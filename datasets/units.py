@@ -6,8 +6,18 @@ here; ms and min become s::
 
     T[degC] = T[K] - 273.15 = (T[degF] - 32) / 1.8
 
-A suffix like another unit (``_C``, ``_mV``, ``_sec``) is refused rather than guessed, since a temperature
-that is read in the wrong unit is still a number.
+A suffix like another unit (``_C``, ``_mV``, ``_sec``) is refused by :func:`split_header`, which reads what
+thermogrip writes.  Logs come from anywhere: :func:`read_header` reads units as people write them, in brackets
+or after a comma, and their multiples.
+
+**Roles.**  Names come first, then units.  Where they show no input or no output, the data do
+(:func:`roles_of_data`): a column that is held between few large moves is an input, one whose next value
+another column's past helps to predict is an output.  With n = 2 lags and N rows the help of column i for
+column j is the gain in the Bayesian information criterion,
+
+    G_ij = N log(RSS_j / RSS_ij) - n log N,
+
+RSS_j of j on its own past, RSS_ij with that of i beside it (Granger 1969); beyond 10 it counts.
 """
 
 from __future__ import annotations
@@ -36,8 +46,15 @@ _FOREIGN = {
     "mm": "", "Ohm": "", "ohm": "", "kOhm": "", "J": "", "kJ": "", "N": "", "lpm": "", "LPM": "",
 }  # fmt: skip
 # those of them that are other units, not other spellings
-_TO_CONVERT = {"h", "hr", "hour", "hours", "us", "ns", "days", "mV", "kV", "mA", "uA", "mW", "kW", "mK"}
-_ODD_CASE = {unit.lower(): f"_{unit}" for unit in ("degC", "degF", "percent", "ms", "min")}
+_TO_CONVERT = {
+    "h": 3600.0, "hr": 3600.0, "hour": 3600.0, "hours": 3600.0, "us": 1e-6, "ns": 1e-9, "days": 86400.0,
+    "mV": 1e-3, "kV": 1e3, "mA": 1e-3, "uA": 1e-6, "mW": 1e-3, "kW": 1e3, "mK": 1e-3,
+}  # fmt: skip
+_ANY_CASE = {word.lower(): word for word in (*_FOREIGN, *UNITS) if len(word) > 2 or word == "ms"}
+_UNIT_AT_END = re.compile(
+    r"(?P<name>.*?)\s*(?:[\[({](?P<inside>[^\])}]*)[\])}]"
+    r"|(?P<mark>[_,/;:]|\s(?:in\s)?)\s*(?P<after>[^\s_,/;:()\[\]{}]+))"
+)
 _BRACKETED = re.compile(r"[\[(]\s*[^\])]*\s*[\])]\s*$")
 
 _SETPOINT = re.compile(
@@ -46,11 +63,19 @@ _SETPOINT = re.compile(
 )
 _SET_DRIVE = re.compile(r"^set(_.*|\d*)$|_set$|^(goal|desired)")  # set_percent is what a drive is set to
 _OF_DRIVES = ("percent", "V", "A", "W", "0_255")
-_AMBIENT = re.compile(r"ambient|(^|_)(amb|room|outside|outdoor)(_|$)")
-_INPUT = re.compile(
-    r"^(drive|pump|pwm|duty|heater|cooler|peltier|tec|valve|fan|flow|cmd|command|power|[qu])(\d*|_.*)$"
+_AMBIENT = re.compile(
+    r"ambient|(^|_)(amb|room|outside|outdoors?|sol|weather|wind)(_|$)|solar|irradia|^(to|te|text|toa|ghi)$"
 )
-_OUTPUT = re.compile(r"^(t|y|temp|temperature|level|outlet|position|speed)(\d*|_.*)$")
+_INPUT = re.compile(
+    r"^(drive|pump|pwm|duty|heater|heating|cooler|cooling|peltier|tec|valve|fan|flow|cmd|command|power|input"
+    r"|actuator|control|relay|mv|q[hc]|[qu])(\d*|_.*)$"
+)
+_OUTPUT = re.compile(
+    r"^(t|y|temp|temperature|level|outlet|position|speed|pv|angle|velocity|response|measured)(\d*|_.*)$"
+)
+NO_CLUE = "neither its name nor its unit shows what it is"
+_HELD_SHARE, _HELD_SIZE = 0.5, 0.05  # of rows with a move; of the range that its median has, at least
+_LAGS, _STRONG, _MOST_ROWS = 2, 10.0, 20_000
 
 
 def split_header(header: str, *, file: str | None = None) -> tuple[str, str]:
@@ -62,9 +87,56 @@ def split_header(header: str, *, file: str | None = None) -> tuple[str, str]:
     for unit in UNITS:
         if header.endswith(f"_{unit}"):
             return _named(header.removesuffix(f"_{unit}"), header, file), unit
-    name, _, suffix = header.rpartition("_")
-    _refuse_foreign(header, name, suffix, file)
+    name, unit, scale = read_header(header)
+    if unit != "1":
+        rename = f"rename the column to {name}_{unit}"
+        hint = rename if scale == 1 else f"convert it and {rename}"
+        raise UserError("unit is spelt another way", file=file, column=header, hint=hint)
+    if _BRACKETED.search(header) or _FOREIGN.get(header.rpartition("_")[2]) == "":
+        raise UserError("unit is unknown", file=file, column=header, hint=f"use one of {_listed()}, or none")
     return _named(header, header, file), "1"
+
+
+def read_header(header: str, others: Sequence[str] = ()) -> tuple[str, str, float]:
+    """Return name, unit and the factor to that unit of a column header as any program writes it.
+
+    A word that is no unit stays a part of the name; so does a letter that others of ``others`` continue
+    (``zone_a``, ``zone_b``, ``zone_c``).  The name is empty where the header has none.
+    """
+    header = header.strip()
+    for unit in UNITS:
+        if header.endswith(f"_{unit}"):
+            return _plain(header.removesuffix(f"_{unit}")), unit, 1.0
+    found = _UNIT_AT_END.fullmatch(header)
+    if found is None:
+        return _plain(header), "1", 1.0
+    name, inside = found["name"], found["inside"]
+    word = (found["after"] if inside is None else inside).strip()
+    if inside is not None and word in ("", "-", "1"):
+        return _plain(name), "1", 1.0
+    unit, scale = _any_unit(word)
+    timed = unit in _TIMES and re.search(r"(?i:time|elapsed)|^t$", name) is None
+    if inside is None and unit and len(word) == 1 and word != "%":
+        series = any(f"{header[:-1]}{letter}" in others for letter in "aAbBdDeE")
+        lower = word.islower() and _INPUT.match(name.lower())
+        unit = "" if series or lower or (found["mark"] or "").isspace() else unit
+    if (inside is None and timed) or (word == "deg" and not re.match(r"(?i)t\d*(_|$)|.*temp", name)):
+        unit = ""
+    return (_plain(name), unit, scale) if unit else (_plain(header), "1", 1.0)
+
+
+def _any_unit(word: str) -> tuple[str, float]:
+    """Return the unit that a word means and the factor to it; an empty one where it means none."""
+    degrees = any(sign in word for sign in "°º˚℃")
+    word = re.sub(r"[°º˚\s]", "", word).replace("℃", "C").replace("µ", "u").replace("μ", "u")
+    word = {"0-255": "0_255", "c": "C", "f": "F", "k": "K"}.get(word, word)
+    word = word if word in UNITS or word in _FOREIGN else _ANY_CASE.get(word.lower(), word)
+    unit = word if word in UNITS else _FOREIGN.get(word, "_degC" if degrees and not word else "").lstrip("_")
+    return unit, _TO_CONVERT.get(word, 1.0)
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[\s,;\"'/()\[\]{}]+", "_", name).strip("_")
 
 
 def _named(name: str, header: str, file: str | None) -> str:
@@ -75,31 +147,6 @@ def _named(name: str, header: str, file: str | None) -> str:
     return name
 
 
-def _refuse_foreign(header: str, name: str, suffix: str, file: str | None) -> None:
-    bracketed = _BRACKETED.search(header)
-    if bracketed:
-        plain = bracketed.group().strip().strip("[]()").replace("°", "").strip()
-        unit = f"_{plain}" if plain in UNITS else _FOREIGN.get(plain, "")
-        before = "_".join(header[: bracketed.start()].split()).rstrip("_")
-        hint = f"write the unit as a suffix, one of {_listed()}"
-        if unit and before and plain not in _TO_CONVERT:
-            hint = f"rename the column to {before}{unit}"
-        raise UserError(
-            f"unit {bracketed.group().strip()!r} in brackets", file=file, column=header, hint=hint
-        )
-    better = _FOREIGN.get(suffix, _ODD_CASE.get(suffix.lower()))
-    if suffix in ("c", "f", "k") and re.match(r"t\d*(_|$)|temp", name):  # pump_a, pump_b, pump_c are no units
-        better = {"c": "_degC", "f": "_degF", "k": "_K"}[suffix]
-    if "°" in suffix:
-        better = "_degC"
-    if not name or better is None:
-        return
-    hint = f"rename the column to {name}{better}" if better else f"use one of {_listed()}, or no unit suffix"
-    if suffix in _TO_CONVERT:
-        hint = f"convert it and rename the column to {name}{better}"
-    raise UserError(f"unit '_{suffix}' is unknown", file=file, column=header, hint=hint)
-
-
 def _listed() -> str:
     return " ".join(f"_{unit}" for unit in UNITS)
 
@@ -108,10 +155,7 @@ def rename_hint(name: str, headers: Sequence[str]) -> str:
     """Return which column to rename where ``name``, a time or a temperature, is missing."""
     wanted = _TIMES if name == "time" else _TEMPERATURES
     for header in headers:
-        bracketed = _BRACKETED.search(header)
-        inside = bracketed.group().strip("[]() \N{DEGREE SIGN}") if bracketed else ""
-        ends = next((unit for unit in wanted if header.endswith(f"_{unit}")), inside)
-        unit = _FOREIGN.get(ends, f"_{ends}").removeprefix("_")
+        unit = read_header(header)[1]
         if unit in wanted and not header.startswith("time"):
             return f"rename {header!r} to {name}_{unit}"
     like = next(
@@ -120,10 +164,10 @@ def rename_hint(name: str, headers: Sequence[str]) -> str:
     return f"rename {like!r} to time_s or time_ms" if like else f"it has {', '.join(headers)}"
 
 
-def join_header(name: str, unit: str) -> str:
-    """Return the column header that :func:`split_header` reads as this name and unit."""
+def join_header(name: str, unit: str, others: Sequence[str] = ()) -> str:
+    """Return the column header that is read as this name and unit, among columns of other names."""
     header = name if unit == "1" else f"{name}_{unit}"
-    if split_header(header) != (name, unit):
+    if read_header(header, others) != (name, unit, 1.0):
         raise UserError(
             f"cannot stand in a header with unit {unit!r}", column=name, hint=f"use {_listed()}, or rename"
         )
@@ -168,7 +212,69 @@ def explain_role(name: str, unit: str) -> tuple[str, str]:
         return "output", "its unit is degC"
     if unit in ("percent", "V", "0_255"):
         return "input", f"its unit is {unit}"
-    return "other", "neither its name nor its unit shows what it is"
+    return "other", NO_CLUE
+
+
+def roles_of_data(
+    columns: Mapping[str, NDArray[np.float64]], units: Mapping[str, str], fixed: Mapping[str, str]
+) -> dict[str, tuple[str, str]]:
+    """Return role and reason, as the data show them, of the columns (n_row,) that ``fixed`` gives no role."""
+    out: dict[str, tuple[str, str]] = {}
+    for name in [name for name in columns if name not in fixed]:
+        values = columns[name][np.isfinite(columns[name])]
+        moves = np.abs(np.diff(values))
+        moves, rows = moves[moves > 0], max(values.size, 1)
+        if not moves.size:
+            out[name] = "other", "it never moves"
+        elif moves.size <= _HELD_SHARE * rows and np.median(moves) >= _HELD_SIZE * np.ptp(values):
+            out[name] = "input", f"it is held between {moves.size} moves in {rows} rows"
+    roles = {**fixed, **{name: role for name, (role, _) in out.items()}}
+    names = [n for n in columns if roles.get(n) != "other" and np.nanmax(columns[n]) > np.nanmin(columns[n])]
+    gain = _predictive_gain([columns[name] for name in names])
+    open_, net = [n for n in names if n not in roles], dict(zip(names, (gain - gain.T).sum(axis=1)))
+    for name in open_:
+        help_ = gain[:, names.index(name)]
+        if help_.max() > _STRONG:
+            out[name] = "output", f"its course follows {names[int(help_.argmax())]}"
+        else:
+            why = "no other column predicts its course"
+            out[name] = ("disturbance" if units[name] == "degC" else "input"), why
+    roles |= {name: role for name, (role, _) in out.items()}
+    if open_ and "input" not in roles.values():
+        lead = dict(zip(names, gain.sum(axis=1)))
+        for name in [n for n in open_ if net[n] > 0] or [max(open_, key=lambda n: lead[n])]:
+            more = "it predicts the others more than they predict it"
+            roles[name], out[name] = "input", ("input", more if net[name] > 0 else "no other is likelier one")
+    if len(open_) > 1 and "output" not in roles.values():
+        name = min(reversed(open_), key=lambda n: net[n])
+        out[name] = "output", "the others predict it more than it predicts them"
+    return out
+
+
+def _predictive_gain(columns: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return G (n, n) of the module's theory, 0 where it is negative; row i helps column j."""
+    n = len(columns)
+    gain = np.zeros((n, n))
+    scaled = []
+    for values in (values[:_MOST_ROWS] for values in columns):
+        at, known = np.arange(values.size), np.isfinite(values)
+        filled = np.interp(at, at[known], values[known]) if known.any() else np.zeros(values.size)
+        scaled.append((filled - filled.mean()) / (np.std(filled) or 1.0))
+    rows = min((len(values) for values in scaled), default=0) - _LAGS
+    if rows < 5 * _LAGS:
+        return gain
+    past = [np.stack([v[_LAGS - k : len(v) - k] for k in range(1, _LAGS + 1)], axis=1) for v in scaled]
+
+    def left(y: NDArray[np.float64], *some: NDArray[np.float64]) -> float:
+        x = np.column_stack([np.ones(rows), *some])
+        return float(np.sum((y - x @ np.linalg.lstsq(x, y, rcond=None)[0]) ** 2)) + 1e-12 * rows
+
+    for j, values in enumerate(scaled):
+        own = left(values[_LAGS:], past[j])
+        for i in (i for i in range(n) if i != j):
+            both = left(values[_LAGS:], past[j], past[i])
+            gain[i, j] = max(0.0, rows * np.log(own / both) - _LAGS * np.log(rows))
+    return gain
 
 
 def assign_roles(
@@ -178,12 +284,14 @@ def assign_roles(
     outputs: Sequence[str] | None = None,
     disturbances: Sequence[str] | None = None,
     given: dict[str, str] | None = None,
+    columns: Mapping[str, NDArray[np.float64]] | None = None,
     file: str | None = None,
-) -> dict[str, str]:
-    """Return the role of each variable of ``units`` (name -> unit).
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the role of each variable of ``units`` (name -> unit), and the reason for each that is a guess.
 
     The lists hold names with or without the unit suffix; a list that is given is complete: no other variable
-    gets its role. ``given`` (name -> role) replaces guesses.
+    gets its role. ``given`` (name -> role) replaces guesses.  Where names and units show no input or no
+    output, ``columns``, the data, are asked.
     """
     lists = {"input": inputs, "output": outputs, "disturbance": disturbances}
     chosen: dict[str, str] = {}
@@ -195,20 +303,27 @@ def assign_roles(
                     f"is listed as {chosen[name]} and as {role}", file=file, column=name, hint="choose one"
                 )
             chosen[name] = role
-    roles = {}
-    for name, unit in units.items():
-        guess = (given or {}).get(name) or guess_role(name, unit)
-        complete = lists.get(guess) is not None
-        roles[name] = chosen.get(name, "other" if complete else guess)
-    return roles
+    guesses = {n: explain_role(n, unit) for n, unit in units.items() if n not in {**(given or {}), **chosen}}
+    clear = {name: role for name, (role, why) in guesses.items() if why != NO_CLUE}
+    fixed = clear | (given or {}) | chosen
+    if columns is not None and not {"input", "output"} <= {*fixed.values()}:
+        guesses |= roles_of_data(columns, units, fixed)
+    roles, reasons = {}, {}
+    for name in units:
+        guess, why = guesses.get(name, ((given or {}).get(name, "other"), ""))
+        roles[name] = chosen.get(name, "other" if lists.get(guess) is not None else guess)
+        if why and roles[name] == guess:
+            reasons[name] = why
+    return roles, reasons
 
 
 def find_column(entry: str, units: Mapping[str, str], file: str | None = None) -> str:
-    """Return the variable that a user's word means: its name, with or without the unit suffix."""
+    """Return the variable that a user's word means: its name or its header, in whatever case."""
     entry = entry.strip()
     if entry in units:
         return entry
-    stripped = next((entry.removesuffix(f"_{u}") for u in UNITS if entry.endswith(f"_{u}")), entry)
-    if stripped not in units:
-        raise UserError("no such column", file=file, column=entry, hint=f"it has {', '.join(units)}")
-    return stripped
+    likely = {entry, _plain(entry), read_header(entry)[0]}
+    for found in (likely & {*units}, {n for n in units if n.lower() in {word.lower() for word in likely}}):
+        if len(found) == 1:
+            return found.pop()
+    raise UserError("no such column", file=file, column=entry, hint=f"it has {', '.join(units)}")

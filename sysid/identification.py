@@ -33,6 +33,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.log_files import as_logs
 from thermogrip.datasets.schema import Log, log_name, names
 from thermogrip.sysid.blackbox.fit import (
     BLACK_BOXES,
@@ -57,6 +58,8 @@ from thermogrip.sysid.validation.prediction_bands import (
 )
 
 if TYPE_CHECKING:
+    from pandas import DataFrame
+
     from thermogrip.sysid.models.model import GreyModel
 
 WITHIN_NOISE = 1.1  # of the best error: then the network is preferred
@@ -281,7 +284,7 @@ class Identification:
 
 
 def identify(
-    logs: Sequence[Log] | Log,
+    logs: Sequence[Log | DataFrame] | Log | DataFrame,
     network: GreyModel | str | Path | None = None,
     inputs: Sequence[str] | None = None,
     outputs: Sequence[str] | None = None,
@@ -299,7 +302,8 @@ def identify(
 
     Parameters
     ----------
-    logs : Log or sequence of Log
+    logs : Log, DataFrame, or sequence of them
+        DataFrames as :func:`~thermogrip.datasets.log_files.read_log` reads them.
     network : GreyModel, str or Path, optional
         A thermal network, or the name or file of one; without it the candidate ``network`` is left out.
     inputs, outputs, disturbances : sequence of str, optional
@@ -341,7 +345,7 @@ def identify(
     >>> found.model, found.good, found.errors()["oe"] < 0.05
     ('oe', True, True)
     """
-    records = [logs] if not isinstance(logs, Sequence) else list(logs)
+    records = as_logs(logs, inputs, outputs, disturbances)
     network, records, converted = _for_network(network if "network" in models else None, records)
     u, y, d = signals(records, inputs=inputs, outputs=outputs, disturbances=disturbances)
     candidates = _candidates(models, network)

@@ -276,9 +276,9 @@ def signals(
             )
     for chosen, what in ((u, "input"), (y, "output")):
         if not chosen:
-            raise UserError(
-                f"no {what} among the columns", file=log_name(logs[0]), hint=f"name it with --{what}s"
-            )
+            have = ", ".join(str(name) for name in logs[0].data_vars)
+            hint = f"name it with --{what}s, of {have}"
+            raise UserError(f"no {what} among the columns", file=log_name(logs[0]), hint=hint)
     return u, y, d
 
 
@@ -528,6 +528,10 @@ def _matched(
     for name in known:
         unit, want = str(log[name].attrs.get("units", "1")), model.units.get(name)
         if want is None or unit == want:
+            continue
+        if unit == "1" and want not in SHARES:
+            changed[name] = column(log, name)
+            said.append(f"{name}: has no unit, taken as {want}")
             continue
         low, high = getattr(model, "valid", {}).get(name, (0.0, 0.0))  # of what a plant was fitted to
         if unit not in SHARES or want not in SHARES or (want == "1" and max(-low, high) > 1 + _SLACK):

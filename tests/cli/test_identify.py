@@ -54,7 +54,9 @@ def found_of(model: str = "network", **changes: Any) -> SimpleNamespace:
 @pytest.fixture
 def room(bench: Bench, stand_in: StandIn, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     """Return a bench whose logs, networks and fits are stand-ins, with their calls."""
-    log = make_log([0.0, 1.0], {"t1": ([20.0, 20.0], "degC", "output")}, name="log a")
+    idle = ([0.0, 0.0], "1", "other")
+    signals = {"t1": ([20.0, 20.0], "degC", "output"), "q1": idle, "q2": idle, "room": idle}
+    log = make_log([0.0, 1.0], signals, name="log a")
     log.attrs["repairs"] = "one row dropped\n\ntwo rows swapped"
 
     def fit(*_: Any, progress: Any, **__: Any) -> SimpleNamespace:
@@ -101,12 +103,12 @@ def test_the_network_is_the_one_asked_for_or_the_gripper_where_the_logs_fit_it(
 
 
 def test_words_reach_the_fit_by_their_meaning(room: SimpleNamespace) -> None:
-    words = "good.csv more.csv --network tclab --inputs q1,q2 --outputs t1 --disturbances room"
+    words = "good.csv more.csv --network tclab --inputs q1,q2 --outputs T1_degC --disturbances room"
     words += " --models arx,network --average 2.5 --leave-one-out --seed 7 --report r.html"
     done = room.bench.run("identify", *words.split(), "--out", "p.json")
     assert done.code == 0, done
-    roles = (("q1", "q2"), ("t1",), ("room",))
-    assert [call.args for call in room.read] == [("good.csv", *roles), ("more.csv", *roles)]
+    words, roles = (("q1", "q2"), ("T1_degC",), ("room",)), (("q1", "q2"), ("t1",), ("room",))
+    assert [call.args for call in room.read] == [("good.csv", *words), ("more.csv", *words)]
     assert room.read[0].known == {"q1": "input", "q2": "input", "t1": "output", "t2": "output"}
     [fit] = room.fits
     assert (len(fit.args[0]), fit.args[2:]) == (2, roles)
@@ -120,6 +122,12 @@ def test_words_reach_the_fit_by_their_meaning(room: SimpleNamespace) -> None:
     assert done.err.count("warning: log a: one row dropped\n") == 2
     assert done.err.count("warning: log a: two rows swapped\n") == 2
     assert "not compiled" not in done.err
+
+
+def test_how_a_table_is_read_is_passed_on_and_the_plant_is_named_after_the_log(room: SimpleNamespace) -> None:
+    done = room.bench.run("identify", "good.csv@:3", "--columns", "time_s,-,t1", "--dt", "2")
+    assert (done.code, "wrote good_plant.json" in done.out) == (0, True)
+    assert [(call.columns, call.dt) for call in room.read] == [(("time_s", "-", "t1"), 2.0)] * len(room.read)
 
 
 def test_what_was_found_is_printed(room: SimpleNamespace) -> None:
@@ -153,6 +161,7 @@ def test_the_answer_of_identify_is_what_was_found(room: SimpleNamespace) -> None
         "intervals_90": {name: list(ends) for name, ends in BOARD.intervals(0.9).items()},
         "identifiability": ["U is identifiable"], "growth": None, "posterior": None,
         "notes": ["arx: slow"], "out": "p.json",
+        "repairs": {"log a": ["one row dropped", "two rows swapped"]},
     }  # fmt: skip
 
 
@@ -297,7 +306,9 @@ def test_a_plant_is_scored_log_by_log_beside_its_baselines(bench: Bench, stand_i
 
     one = {"log": "good@:100", "outputs": table(0.1), "one_step": table(0.2), "left": {"minutes": 1.0},
            "naive": {"no_input": table(0.3), "mean": table(0.4)}, "notes": ["a note"]}  # fmt: skip
-    assert json.loads(bench.run(*words, "--json").out) == {"logs": [one, one | {"log": "good@100:200"}]}
+    repairs = {"good@:100": ["taken from the start to 100 s"], "good@100:200": ["taken from 100 s to 200 s"]}
+    logs = [one, one | {"log": "good@100:200"}]
+    assert json.loads(bench.run(*words, "--json").out) == {"logs": logs, "repairs": repairs}
     assert [(call.warmup, call.score_from, call.average) for call in runs[2:]] == [(5.0, 5.0, None)] * 2
 
 
@@ -311,6 +322,8 @@ def test_a_simulation_is_written_and_counted(bench: Bench, stand_in: StandIn) ->
     bench.run(*words[:3], "--out", "s.csv")
     assert simulated[1].warmup == 5.0
     assert len((bench.path / "s.csv").read_text().splitlines()) == 4
-    assert json.loads(bench.run(*words, "--json").out) == {"log": "good", "rows": 3, "out": "s.csv"}
+    assert json.loads(bench.run(*words, "--json").out) == {
+        "log": "good", "rows": 3, "out": "s.csv", "repairs": []
+    }  # fmt: skip
     stand_in("thermogrip.sysid.plant.log_grid.match_log", (log, ["drive: converted"]))
     assert "drive: converted" in bench.run(*words).err

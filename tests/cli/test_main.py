@@ -68,11 +68,12 @@ def test_the_verbs_are_those_of_the_contract() -> None:
 #: Each verb's arguments and options as scripts use them: =default, >least, <most.
 OPTIONS = """
 demo: --out=thermogrip-demo --seed=0>0 --workers=2>1 --cluster --json=False
-identify: LOGS --out --network --inputs --outputs --disturbances
+identify: LOGS --out --network --inputs --outputs --disturbances --columns --dt>1e-09
   --models=arx,oe,subspace,sindy,neural,network --average>0 --leave-one-out=False --grow=False
   --posterior/--no-posterior=False --report --seed=0>0 --json=False
-validate: PLANT LOGS --warmup=5.0>0 --score-from=5.0>0 --average>0 --network --report --seed=0>0 --json=False
-simulate: PLANT LOG --out --warmup=5.0>0 --network --seed=0>0 --json=False
+validate: PLANT LOGS --warmup=5.0>0 --score-from=5.0>0 --average>0 --network --columns --dt>1e-09
+  --report --seed=0>0 --json=False
+simulate: PLANT LOG --out --warmup=5.0>0 --network --columns --dt>1e-09 --seed=0>0 --json=False
 excite: --kind --minutes>0.1 --out --plant --network --lowest=5.0 --highest=60.0 --hold --slew>1e-09
   --seed=0>0 --json=False
 tune: PLANT --out --spec --report --network --seed=0>0 --workers=1>1 --cluster --json=False
@@ -129,7 +130,7 @@ def test_no_words_show_the_help(capsys: pytest.CaptureFixture[str]) -> None:
         (["identfy", "a.csv"], "Did you mean 'identify'"),
         (["--nope"], "No such option"),
         (["identify"], "Missing argument 'LOG...'; see thermogrip identify --help"),
-        (["identify", "a.csv"], "Missing option '--out'"),
+        (["tune", "a.json"], "Missing option '--out'"),
         (["demo", "--seed", "many"], "'--seed'"),
         (["run", "c.json", "--target", "warm", "--out", "x"], "'--target'"),
         (["init", "everything"], "template 'everything' is unknown"),

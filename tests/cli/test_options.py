@@ -12,6 +12,7 @@ from tests.cli.conftest import Bench, StandIn
 from thermogrip.cli import options
 from thermogrip.cli.options import choice, comma, new_file, new_folder, workers_of
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import make_log
 from thermogrip.report.console import Console
 from thermogrip.sysid.models.network import NetworkModel
 
@@ -126,12 +127,29 @@ def test_a_plant_of_one_s_own_is_loaded_with_its_class(stand_in: StandIn) -> Non
 
 
 def test_logs_and_grasps_are_read_as_they_were_named(stand_in: StandIn) -> None:
-    logs = stand_in("thermogrip.datasets.log_files.read_log", lambda path, *_, **__: path)
+    log = make_log([0.0, 1.0], {"u": ([0, 1], "1", "input")})
+    logs = stand_in("thermogrip.datasets.log_files.read_log", log)
     grasps = stand_in("thermogrip.datasets.grasp_files.read_grasp_files", ["g"])
-    assert options.load_logs(["a", "b"], ["u"], ["y"], ["d"], known={"u": "input"}) == ["a", "b"]
-    assert (logs[1].args, logs[1].known) == (("b", ["u"], ["y"], ["d"]), {"u": "input"})
+    assert options.load_logs(["a", "b"], ["u"], ["y"], ["d"], known={"u": "output"}, dt=2.0) == [log] * 2
+    assert (logs[1].args, logs[1].known) == (("b", ["u"], ["y"], ["d"]), {"u": "output"})
+    assert (logs[0].columns, logs[0].dt) == (None, 2.0)
     assert options.find_grasps(("a", "b")) == ["g"]
     assert grasps[0].args == (["a", "b"],)
+
+
+def test_the_first_log_settles_the_roles_and_what_never_moves_is_no_signal(tmp_path: Path) -> None:
+    rows = [(k, 40 * (k // 5 % 2), 55, 0, 20 + k % 5, 30) for k in range(30)]
+    table = "time_s,a,heater_percent,fan_percent,t_1_degC,t_2_degC\n"
+    for name, more in (("one", rows), ("two", [(k, k % 7 / 3, *row[2:]) for k, row in enumerate(rows)])):
+        text = table + "".join(",".join(map(str, row)) + "\n" for row in more)
+        (tmp_path / f"{name}.csv").write_text(text.replace("heater_percent,fan", "heater_percent,fan"))
+    logs = options.load_logs([f"{tmp_path}/one.csv", f"{tmp_path}/two.csv"])
+    for log in logs:
+        roles = {str(name): item.attrs["role"] for name, item in log.items()}
+        assert roles == {"a": "other", "heater": "other", "fan": "input", "t_1": "output", "t_2": "other"}
+    assert "heater: it never moves" in logs[0].attrs["guesses"]
+    given = options.load_logs([f"{tmp_path}/one.csv"], ["heater"], ["t_2"])
+    assert given[0]["heater"].attrs["role"] == "input"
 
 
 @pytest.mark.parametrize("repaired", [0, 1, 5, 6, 9])

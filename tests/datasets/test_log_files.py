@@ -5,8 +5,11 @@ from __future__ import annotations
 import gzip
 import lzma
 import pickle
+import sys
+import zipfile
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as parquet
 import pytest
@@ -14,10 +17,11 @@ import xarray as xr
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.io import savemat
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import example_path
-from thermogrip.datasets.log_files import read_log, split_cut, write_log
+from thermogrip.datasets.log_files import as_logs, read_log, split_cut, write_log
 from thermogrip.datasets.schema import column, make_log, names
 
 HEAD = "time_s,drive,t_tank_degC\n"
@@ -145,39 +149,29 @@ def test_the_unfinished_last_line_of_a_killed_logger_is_dropped(write):
     ("text", "expected"),
     [
         (HEAD + "0,0.5,25\n1,0.5,warm\n2,0,25\n", ["row 3", "column t_tank_degC", "'warm' is not a number"]),
-        (HEAD + "2026-01-01T10:00:00,0,25\n", ["'2026-01-01T10", "write seconds since the first row"]),
-        (HEAD + "10:00:01.5,0,25\n", ["row 2, column time_s", "write seconds since the first row"]),
         (HEAD + "0,0.5,25\n\n1,0.5,warm\n", ["row 4", "'warm'"]),
-        ("# note\n" + HEAD + "0,x,25\n", ["row 3", "column drive", "'x'"]),
+        ("# note\n" + HEAD + "0,x,25\n1,0,25\n", ["row 3", "column drive", "'x'"]),
+        (HEAD + "0,x,25\n1,0\n2,0,hot\n3,0,25\n",
+         ["3 faults: row 3: has 2 cell(s)", "row 2, column drive: 'x'", "'hot'"]),
+        (HEAD + "0,0.5,25\n1,0.5,warm\n2,0,25\n", ["or leave columns out: --columns time_s,drive,-"]),
         (HEAD + '0,"0,5",25\n1,0,25\n', ["row 2", "column drive", "write a decimal point"]),
         (HEAD.replace(",", ";") + "0;0,5;25\n1;0.5;25\n", ["row 2", "column drive", "write a decimal point"]),
         (HEAD + "0,0.5,25\n1,0.5\n2,0,25\n", ["row 3", "has 2 cell(s), the header has 3"]),
         (HEAD + "0,0.5,25\n1,0.5,25,7\n", ["row 3", "has 4 cell(s)"]),
-        (HEAD + "0,0.5,\n1,0.5,\n", ["column t_tank_degC", "no number in any row"]),
         (HEAD + "0,0.5,25\n", ["1 row(s) are not a log"]),
         (HEAD, ["has a header but no rows"]),
         ("", ["is empty", "header"]),
         (" \n\n", ["is empty"]),
         ("# only\n# comments\n", ["only comments"]),
-        ("0,0.5,25\n1,0.5,25\n", ["no header"]),
-        ("drive,t_tank_degC\n0,1\n", ["no time column", "add time_s"]),
-        ("time,drive,t_tank_degC\n0,1,2\n1,1,2\n", ["no time column", "rename 'time' to time_s"]),
-        ("Timestamp,t_tank_degC\n0,1\n", ["rename 'Timestamp'"]),
         ("time_s\n0\n1\n", ["nothing else"]),
         (HEAD + "0,0,25\n1,0,25\n0.5,0,25\n", ["row 4", "time runs back"]),
         (HEAD + "0,0,25\n,0,25\n", ["row 3", "has no time"]),
-        ("time_s,t_tank_C\n0,1\n1,1\n", ["column t_tank_C", "rename the column to t_tank_degC"]),
-        ("time_s,t_degC,t_K\n0,1,1\n1,1,1\n", ["column t_K", "second time"]),
-        ("time_s,t_degC,t_degC\n0,1,1\n1,1,1\n", ["column t_degC", "occurs twice"]),
-        ("time_s,,t_degC\n0,1,1\n1,1,1\n", ["column 2 has no name"]),
-        (b"time_s,t_degC\n0,1\n1,\xff\xfe\n", ["row 3", "UTF-8"]),
-        (b"time_s,t_\xb0C\n0,1\n1,1\n", ["row 1", "UTF-8"]),
+        (b"time_s,t_degC\n0,1\n1,\xff\xfe\n", ["row 3", "is not a number"]),
         ((HEAD + ROWS).encode("utf-16-le"), ["is not text"]),
         ((HEAD + ROWS).encode("utf-16")[:-1], ["is damaged UTF-16 text", "save it as UTF-8"]),
         (bytes(range(256)) * 20, ["is not text"]),
         (pickle.dumps({"a": 1}), ["is not text"]),
         (b"cos\nsystem\n(S'echo owned'\ntR.", ["log.csv"]),
-        (HEAD + "".join(f"{n // 10},0,25\n" for n in range(100)), ["more digits"]),
         (HEAD + "0,0,-300\n1,0,-300\n", ["absolute zero"]),
         (HEAD + "0,,25\n1,,25\n2,1,25\n", ["unknown until the last row"]),
     ],
@@ -237,7 +231,10 @@ def test_a_flipped_bit_in_the_numbers_of_a_parquet_file_is_found(tmp_path, small
         ("log.csv.gz", b"not gzip", "is damaged"),
         ("log.csv.gz", gzip.compress(b"time_s,a\n" * 99, mtime=0)[:-9], "is damaged"),
         ("log.csv.xz", b"not xz", "is damaged"),
-        ("log.xlsx", b"PK", "ending '.xlsx' is unknown"),
+        ("log.xlsx", b"PK", "is no Excel workbook, or is damaged"),
+        ("log.mat", b"PK", "is no MATLAB file, or is damaged"),
+        ("log.mat", b"MATLAB 7.3 MAT-file" + b" " * 200, "is MATLAB 7.3; save('x.mat', ..., '-v7')"),
+        ("log.odt", b"PK", "ending '.odt' is unknown"),
         ("log", b"x", "is unknown"),
     ],
 )
@@ -458,6 +455,231 @@ def test_a_log_that_a_header_cannot_say_is_refused(tmp_path):
     with pytest.raises(UserError, match="ending"):
         write_log(log, tmp_path / "a.txt")
     assert list(tmp_path.iterdir()) == []
+
+
+FOREIGN = [
+    ("Time (sec), Heater 1 (%), Temperature 1 (degC), Set Point 1 (degC)\n0,10,20,23\n2,10,21,23\n",
+     [0, 2], "Heater_1 percent input 10|Temperature_1 degC output 20|Set_Point_1 degC other 23",
+     ["time: Time (sec) is taken as the time in s", "read 'Heater 1 (%)' as Heater_1 [percent], "]),
+    ("Datum;Uhrzeit;Temp 1 in °C;Heizung [%]\n01.02.2026;10:00:00;20,5;40\n01.02.2026;10:00:02,5;20,6;45\n",
+     [0, 2.5], "Temp_1 degC output 20.5|Heizung percent input 40",
+     ["time: Datum and Uhrzeit counted from the first row, 01.02.2026 10:00:00",
+      "numbers have a decimal comma"]),
+    ("Logger X\nSerial: 12\n\nDate Time,T1 (°F),P [kW],state\n2/13/2026 11:59:58 AM,212,1.5,on\n"
+     "2/13/2026 12:00:01 PM,32,1.5,off\n", [0, 3], "T1 degC output 100|P W other 1500|state 1 input 1",
+     ["2 line(s) before the table passed over",
+      "state: words as 'on' read as 0 and 1", "T1: converted from degF",
+      "P: converted to W (times 1000)"]),
+    ("# made by numpy\n# t u y\n0.0 1 2\n0.5 1 2.5\n", [0, 0.5], "u 1 input 1|y 1 output 2", []),
+    ("Time,Temp,Heater\ns,degC,%\n0,20,1\n1,20,1\n", [0, 1],
+     "Temp degC output 20|Heater percent input 1", []),
+    ("  1.0e+00\t  5.0e-01\t\n  2.0e+00\t  7.0e-01\t\n", [0, 1], "c1 1 input 1|c2 1 input 0.5",
+     ["no header: columns named c1 to c2 by position; --columns", "rows are taken 1 s apart; --dt S"]),
+    ("0,5 1,25\n1,5 1,5\n2,5 1\n", [0, 1, 2], "c1 1 input 0.5|c2 1 output 1.25", ["decimal comma"]),
+    ("n,u,y\n1,4,5\n2,4,6\n3,4,5\n4,4,6\n5,4,5\n", [1, 2, 3, 4, 5], "u 1 input 4|y 1 output 5",
+     ["time: n is taken as the time in s; --dt S sets another step"]),
+    ("ts;q1;y\n1700000000000;1;2\n1700000000500;1;3\n", [0, 0.5], "q1 1 input 1|y 1 output 2",
+     ["time: ts is taken as the time in s, times 0.001", "since 1970"]),
+    ("millis,q1,y\n500,1,2\n1000,1,3\n", [0.5, 1], "q1 1 input 1|y 1 output 2", ["times 0.001"]),
+    ("Elapsed time [h],q1,y\n0,1,2\n0.5,1,3\n", [0, 1800], "q1 1 input 1|y 1 output 2", ["times 3600"]),
+    ("23:59:59,4,5\n00:00:01,4,6\n", [0, 2], "c2 1 other 4|c3 1 input 5",
+     ["c1 counted from the first row, 23:"]),
+    ("time,q1,T_a (°C)\n2026-01-01T00:59:59.5+01:00,1,20\n2026-01-01 00:00:00.5Z,1,20\n", [0, 1],
+     "q1 1 input 1|T_a degC output 20", []),
+    ("Zeit;q1;y\n13.01.26 10:00;1;2\n13.01.26 10:01;1;2\n", [0, 60], "q1 1 input 1|y 1 output 2", []),
+    ("time,q1,y\n02-Jan-2026 10:00:00,1,2\n03-Feb-2026 10:00:00,1,2\n", [0, 32 * 86400],
+     "q1 1 input 1|y 1 output 2", []),
+    ("time,q1,y\n3/4/2026 10:00,1,2\n4/4/2026 10:00,1,2\n", [0, 31 * 86400], "q1 1 input 1|y 1 output 2",
+     ["(taken as month/day)"]),
+    ("time,q1,y\n13/4/2026,1,2\n14/4/2026,1,2\n", [0, 86400], "q1 1 input 1|y 1 output 2", []),
+    ("t,pump_mA,T_C,zone_a,zone_b,zone_c,p (bar)\n0,500,20,1,2,3,4\n1,500,20,1,2,3,4\n", [0, 1],
+     "pump A input .5|T degC output 20|zone_a 1 other 1|zone_b 1 other 2|zone_c 1 other 3|p_bar 1 other 4",
+     ["pump: converted to A (times 0.001)"]),
+    ("time_s,q1,,t_degC,t_degC\n0,1,7,20,30\n1,1,7,20,30\n", [0, 1],
+     "q1 1 input 1|c3 1 other 7|t degC output 20|2_t degC output 30",
+     ["without a name: c3", "t_degC occurs again: named 2_t_degC"]),
+    ("time_s,q1,y,note\n0,1,,a\n1,1,,b\n", [0, 1], "q1 1 input 1",
+     ["y: has no number in any row, left out", "left out, no numbers: note"]),
+    ("drive|t_a_degC|\n0|20|\n1|20|\n", [0, 1], "drive 1 input 0|t_a degC output 20", ["1 s apart; --dt S"]),
+    (b"time_s,T_\xb0C,q1\n0,20,1\n1,20,1\n", [0, 1], "T degC output 20|q1 1 input 1", ["as Windows-1252"]),
+    (HEAD + "".join(f"{k},{'ERR' if k == 4 else .5},20\n" for k in range(40)) + "# end\n", range(40),
+     "drive 1 input .5|t_tank degC output 20",
+     ["1 row(s) with too few or too many cells left out (row 42)",
+      "drive: 1 cell(s) that are no numbers left empty (row 6: 'ERR')", "drive: 1 lost value held"]),
+    (HEAD + "".join(f"{k // 5},.5,20\n" for k in range(20)), np.arange(20) / 5,
+     "drive 1 input .5|t_tank degC output 20", ["time has 4 stamps for 20 rows: rows spread evenly"]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "time", "columns", "notes"), FOREIGN)
+@pytest.mark.parametrize("name", ["log.csv", "log.dat"])
+def test_a_log_of_any_program_is_read_and_what_was_done_is_reported(write, text, time, columns, notes, name):
+    log = read_log(write(text, name))
+    np.testing.assert_allclose(log["time"].values, [*time], rtol=0, atol=1e-9)
+    found = {str(n): (v.attrs["units"], v.attrs["role"], v.values[0]) for n, v in log.data_vars.items()}
+    wanted = [each.split() for each in columns.split("|")]
+    assert found == {n: (unit, role, pytest.approx(float(value))) for n, unit, role, value in wanted}
+    for note in notes:
+        assert note in log.attrs["repairs"]
+    again = read_log(write_log(log, write("", "again.csv")))
+    assert {n: v.attrs["units"] for n, v in again.items()} == {n: v.attrs["units"] for n, v in log.items()}
+
+
+def test_columns_and_the_step_can_be_given(write):
+    text = "".join(f"{k} {k % 3} {20 + k} 7\n" for k in range(6))
+    log = read_log(write(text, "log.txt"), columns=["n", "heater_percent", "T (degF)", "-"], dt=0.5)
+    np.testing.assert_allclose(log["time"].values, np.arange(6) / 2)
+    assert [(n, v.attrs["units"]) for n, v in log.items()] == [("heater", "percent"), ("T", "degC")]
+    assert "--columns" not in log.attrs["repairs"]
+    log = read_log(write(HEAD + ROWS), columns=["-", "u", "y_V"], dt=10)
+    assert (list(log), log["time"].values.tolist()) == (["u", "y"], [0.0, 10.0, 20.0])
+    assert list(read_log(write(text, "log.txt"), columns=["-", "-", "u", "u"])) == ["u", "u_2"]
+    log = read_log(write(HEAD + ROWS), dt=10)
+    assert (list(log), log["time"].values.tolist()) == (["drive", "t_tank"], [0.0, 10.0, 20.0])
+    assert "rows are 10 s apart, as asked in place of time_s" in log.attrs["repairs"]
+    log = read_log(write(text, "log.dat"), dt=2)
+    assert (list(log), log["time"].values[1]) == (["c2", "c3", "c4"], 2.0)
+    line = refused(write(text), columns=["a", "b"])
+    assert "has 4 columns, --columns names 2; write a name for each" in line
+
+
+def test_names_of_roles_may_be_headers_in_any_case(write):
+    path = write("Time (s);Heater 1 (%);Plate\n0;1;2\n1;1;3\n")
+    log = read_log(path, inputs=["heater 1 (%)"], outputs=["PLATE"])
+    assert (names(log, "input"), names(log, "output")) == (("Heater_1",), ("Plate",))
+
+
+def matlab(tmp_path, name="log.mat", **content):
+    savemat(tmp_path / name, content, do_compression=True)
+    return tmp_path / name
+
+
+def test_matlab_vectors_matrices_and_structures_are_columns(tmp_path):
+    rows = np.column_stack([np.arange(9) / 2, np.arange(9) // 5, np.arange(9) ** 2])
+    log = read_log(matlab(tmp_path, data=rows))
+    assert (list(log), log["time"].values[1]) == (["c2", "c3"], 0.5)
+    assert "no header: columns named c1 to c3 by position" in log.attrs["repairs"]
+    log = read_log(matlab(tmp_path, data=rows.T[:2]), columns=["time_s", "q1"])
+    assert (list(log), log["time"].values[1]) == (["q1"], 0.5)
+    parts = {"heater_percent": rows[:, 1], "T_C": rows[:, 2:], "U": rows[:, :2]}
+    log = read_log(matlab(tmp_path, run={"time": rows[:, 0], "more": parts}, fs=[[2.0]], odd=np.ones((3, 2))))
+    assert list(log) == ["heater", "T", "U_1", "U_2"]
+    np.testing.assert_array_equal(log["T"].values, rows[:, 2])
+    assert "left out, of another length: odd" in log.attrs["repairs"]
+    for name, value in (("Ts", 0.25), ("dt", 0.25), ("fs", 4)):
+        log = read_log(matlab(tmp_path, u=rows[:, 1], y=rows[::-1, 2], **{name: value}))
+        assert (list(log), log["time"].values[1]) == (["u", "y"], 0.25)
+    assert "rows are taken 0.25 s apart; --dt" in log.attrs["repairs"]
+    assert "has no columns of numbers" in refused(matlab(tmp_path, name="words.mat", s="text"))
+    assert "has 3 columns, --columns names 1" in refused(matlab(tmp_path, data=rows), columns=["a"])
+
+
+def test_a_matlab_file_that_unpacks_to_too_much_is_refused_and_a_cut_one_too(tmp_path):
+    path = matlab(tmp_path, data=np.zeros((3_000_000, 1)))
+    assert path.stat().st_size < 100_000
+    assert "which no record does" in refused(path)
+    whole = matlab(tmp_path, data=np.random.default_rng(0).random((50, 3))).read_bytes()
+    for end in (100, 130, 200, len(whole) - 9):
+        path.write_bytes(whole[:end])
+        assert "is no MATLAB file, or is damaged" in refused(path)
+
+
+def workbook(path, unpacked=b"<sheet/>"):
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as packed:
+        packed.writestr("xl/worksheets/sheet1.xml", unpacked)
+    return path
+
+
+def test_the_first_sheet_of_a_workbook_is_read_as_its_text_would_be(tmp_path, monkeypatch):
+    stamps = pd.date_range("2026-01-01 23:59:58", periods=3, freq="2s")
+    rows = [["Plant 7", None, None], ["Date", "Heater (%)", "T1 (°C)"]]
+    frame = pd.DataFrame([*rows, *zip(stamps, [0, 1, 1], [20.5, 20.6, 20.7])])
+    monkeypatch.setattr(pd, "read_excel", lambda source, **_: frame)
+    log = read_log(workbook(tmp_path / "log.xlsx"))
+    assert log["time"].values.tolist() == [0.0, 2.0, 4.0]
+    assert (names(log, "input"), column(log, "T1").tolist()) == (("Heater",), [20.5, 20.6, 20.7])
+    assert "1 line(s) before the table passed over" in log.attrs["repairs"]
+    assert read_log(tmp_path / "log.xlsx", columns=["-", "u", "y"]).sizes["time"] == 3
+
+
+def test_a_workbook_without_its_reader_or_of_too_much_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "openpyxl", None)
+    path = workbook(tmp_path / "log.xlsx")
+    assert "needs the package openpyxl; pip install openpyxl, or export CSV" in refused(path)
+    assert "which no record does" in refused(workbook(path, bytes(30 << 20)))
+
+
+def test_a_workbook_of_its_writer_is_a_log(tmp_path):
+    pytest.importorskip("openpyxl", reason="not installed: openpyxl")
+    frame = pd.DataFrame({"time_s": [0.0, 0.5], "q1_percent": [1, 2], "T (°C)": [20.0, 21.0]})
+    frame.to_excel(tmp_path / "log.xlsx", index=False)
+    log = read_log(tmp_path / "log.xlsx")
+    assert (log["time"].values.tolist(), column(log, "T").tolist()) == ([0.0, 0.5], [20.0, 21.0])
+
+
+def test_logs_and_data_frames_are_taken_together():
+    frame = pd.DataFrame({"time_s": [0, 1, 2], "a": [1, 2, 3], "b": [3, 4, 3]})
+    made = make_log([0.0, 1.0], {"u": ([0, 1], "1", "input")})
+    assert as_logs(made) == [made]
+    first, second, third = as_logs([made, frame, frame], ["b"], ["a"])
+    assert (first is made, second.attrs["name"], third.attrs["name"]) == (True, "DataFrame 2", "DataFrame 3")
+    assert (names(second, "input"), names(second, "output")) == (("b",), ("a",))
+    assert as_logs(frame, ["a"])[0].attrs["name"] == "DataFrame"
+
+
+def test_a_data_frame_is_a_log():
+    stamps = pd.date_range("2026-01-01", periods=3, freq="2s", name="when")
+    columns = {"Heater (%)": [1, 2, 3], "T1 [°F]": [32.0, None, 50.0], "note": ["a", "b", "c"]}
+    frame = pd.DataFrame(columns, stamps)
+    log = read_log(frame, outputs=["T1"])
+    assert (log.attrs["name"], log["time"].values.tolist()) == ("DataFrame", [0.0, 2.0, 4.0])
+    np.testing.assert_allclose(column(log, "T1"), [0.0, np.nan, 10.0])
+    assert "left out, no numbers: note" in log.attrs["repairs"]
+    log = read_log(frame.reset_index(drop=True), columns=["u", "y", "-"], dt=3)
+    assert (list(log), log["time"].values.tolist()) == (["u", "y"], [0.0, 3.0, 6.0])
+    lapse = pd.DataFrame({"time": stamps - stamps[0], "y": [1, 2, 3]})
+    assert read_log(lapse)["time"].values.tolist() == [0.0, 2.0, 4.0]
+
+
+STYLES = [
+    (lambda t: f"{t:.3f}", "time_s"), (lambda t: f"{t:.3f}", "Time (sec)"),
+    (lambda t: f"{1e3 * t:.0f}", "time [ms]"), (lambda t: f"{t / 60:.9f}", "Time, min"),
+    (lambda t: f"{1.7e9 + t:.3f}", "epoch"), (lambda t: f"{1.7e12 + 1e3 * t:.0f}", "timestamp"),
+    (lambda t: str(np.datetime64("2026-03-01T22:00:00") + np.timedelta64(round(1e3 * t), "ms")), "Date"),
+]  # fmt: skip
+
+
+@SLOW
+@given(
+    steps=st.lists(st.integers(1, 4000), min_size=5, max_size=30),
+    style=st.sampled_from(STYLES),
+    separator=st.sampled_from([",", ";", "\t", "|", " "]),
+    comma=st.booleans(),
+    bracket=st.sampled_from([" [{}]", "_{}", " ({})", " in {}"]),
+    lead=st.sampled_from(["", "# a comment\n", "Device 7\n\n"]),
+    seed=st.integers(0, 9),
+)
+def test_a_log_survives_every_way_of_writing_it(
+    tmp_path, steps, style, separator, comma, bracket, lead, seed
+):
+    stamp, header = style
+    comma = comma and separator != ","
+    if separator == " ":
+        header, bracket = header.replace(" ", "").replace(",", "_"), "_{}"
+    time = np.concatenate([[0], np.cumsum(steps)]) / 1000
+    rng = np.random.default_rng(seed)
+    drive, temperature = rng.integers(0, 100, time.size), rng.uniform(20, 20.5, time.size).round(3)
+    lines = [separator.join([header, "Heater" + bracket.format("%"), "Plate" + bracket.format("degC")])]
+    for t, u, y in zip(time, drive, temperature):
+        row = [stamp(t), str(u), f"{y:.3f}"]
+        lines.append(separator.join(c.replace(".", ",") if comma else c for c in row))
+    path = tmp_path / "log.txt"
+    path.write_text(lead + "\n".join(lines) + "\n", encoding="utf-8")
+    log = read_log(path)
+    np.testing.assert_allclose(log["time"].values, time, rtol=0, atol=1e-5)
+    np.testing.assert_array_equal(column(log, "Heater"), drive)
+    np.testing.assert_allclose(column(log, "Plate"), temperature, rtol=0, atol=1e-9)
+    assert (names(log, "input"), names(log, "output")) == (("Heater",), ("Plate",))
 
 
 CELLS = st.one_of(

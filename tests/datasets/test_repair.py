@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.repair import (
     check_plausible,
     describe_gaps,
     describe_steps,
-    drop_repeated,
     fill_input,
     find_spikes,
     gap_rows,
+    order_rows,
     reject_spikes,
 )
 
@@ -148,11 +151,39 @@ def test_what_is_rejected_is_lost_and_the_rest_is_untouched(at, size, sign):
     np.testing.assert_array_equal(again, got)
 
 
-def test_repeated_stamps_keep_their_first_row():
-    time, lines = np.array([0.0, 1.0, 1.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0]), np.arange(2, 11)
-    keep, lines = drop_repeated(time, lines, "a.csv")
-    assert np.flatnonzero(~keep).tolist() == [2, 3]
-    assert lines == ["2 repeated time stamps dropped (rows 4, 5)"]
+@pytest.mark.parametrize(
+    ("stamps", "time", "rows", "line"),
+    [
+        ([0, 1, 1, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10], range(11), [0, 1, *range(4, 13)],
+         "2 repeated time stamps dropped (rows 4, 5)"),
+        ([0, 0, 0, 3, 3, 3, 6, 6, 6], range(9), range(9),
+         "time has 3 stamps for 9 rows: rows spread evenly between them"),
+        ([*range(30), 28.5, *range(30, 39)], [*range(29), 28.5, *range(29, 39)],
+         [*range(29), 30, 29, *range(31, 40)],
+         "1 row out of order sorted (row 32)"),
+        ([*range(30), np.nan, *range(30, 39)], range(39), [*range(30), *range(31, 40)],
+         "1 row without a time dropped (row 32)"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_single_times_is_repaired(stamps, time, rows, line):
+    got, kept, said = order_rows(np.array(stamps, dtype=float), np.arange(2, 2 + len(stamps)), "a.csv")
+    np.testing.assert_allclose(got, [*time], rtol=0, atol=1e-12)
+    assert kept.tolist() == [*rows]
+    assert said == [line]
+
+
+@pytest.mark.parametrize(
+    ("stamps", "words"),
+    [
+        ([0, 1, 2, 0, 1, 2], "row 5: time runs back from 2 s to 0 s; sort the rows, cut the file"),
+        ([*range(40), *range(5, 9)], "row 42: time runs back from 39 s to 5 s"),
+        ([*range(100), 50], "row 102: time runs back from 99 s to 50 s"),
+        ([0, np.nan, 2, 3], "row 3, column time: has no time"),
+    ],
+)
+def test_times_that_are_wrong_throughout_are_refused(stamps, words):
+    with pytest.raises(UserError, match=re.escape(words)):
+        order_rows(np.array(stamps, dtype=float), np.arange(2, 2 + len(stamps)), "a.csv")
 
 
 def test_even_stamps_are_not_worth_a_line_and_uneven_ones_are():

@@ -13,6 +13,8 @@ from thermogrip.datasets.units import (
     assign_roles,
     guess_role,
     join_header,
+    read_header,
+    roles_of_data,
     split_header,
     to_record_unit,
 )
@@ -70,7 +72,8 @@ def test_a_header_is_read_as_it_was_written(name, unit):
         ("t_tank [degC]", "rename the column to t_tank_degC"),
         ("t_tank(C)", "rename the column to t_tank_degC"),
         ("Plate temp (°F)", "rename the column to Plate_temp_degF"),
-        ("U [mV]", "write the unit as a suffix"),
+        ("U [mV]", "convert it and rename the column to U_V"),
+        ("p (bar)", "use one of"),
         ("t_tank_°C", "t_tank_degC"),
     ],
 )
@@ -80,6 +83,47 @@ def test_a_suffix_that_looks_like_another_unit_is_refused_with_a_hint(header, hi
     assert hint in str(fault.value)
     assert header in str(fault.value)
     assert "\n" not in str(fault.value)
+
+
+@pytest.mark.parametrize(
+    ("header", "read"),
+    [
+        ("Heater 1 (%)", ("Heater_1", "percent", 1)),
+        ("Temperature, degC", ("Temperature", "degC", 1)),
+        ("T_Celsius", ("T", "degC", 1)),
+        ("Temp 1 in \N{DEGREE SIGN}C", ("Temp_1", "degC", 1)),
+        ("Temp / \N{DEGREE CELSIUS}", ("Temp", "degC", 1)),
+        ("T [\N{DEGREE SIGN}]", ("T", "degC", 1)),
+        ("oven_c", ("oven", "degC", 1)),
+        ("pump_c", ("pump_c", "1", 1)),
+        ("Zone C", ("Zone_C", "1", 1)),
+        ("T (k)", ("T", "K", 1)),
+        ("I [mA]", ("I", "A", 1e-3)),
+        ("P {kW}", ("P", "W", 1e3)),
+        ("Time (\N{MICRO SIGN}s)", ("Time", "s", 1e-6)),
+        ("time_h", ("time", "s", 3600)),
+        ("T min", ("T_min", "1", 1)),
+        ("T [MIN]", ("T", "min", 1)),
+        ("angle_deg", ("angle_deg", "1", 1)),
+        ("temp_deg", ("temp", "degC", 1)),
+        ("PWM [0-255]", ("PWM", "0_255", 1)),
+        ("gain [-]", ("gain", "1", 1)),
+        ("Temp (left)", ("Temp_left", "1", 1)),
+        ("p (bar)", ("p_bar", "1", 1)),
+        ("Plate temp_degF", ("Plate_temp", "degF", 1)),
+        ("(degC)", ("", "degC", 1)),
+        ('a "b"; cd', ("a_b_cd", "1", 1)),
+    ],
+)
+def test_a_header_of_any_program_is_name_unit_and_factor(header, read):
+    assert read_header(header, ["time_h", "oven_c"]) == read
+
+
+def test_a_letter_of_a_series_is_no_unit():
+    assert read_header("T_C", ["T_A", "T_B", "T_C"]) == ("T_C", "1", 1.0)
+    assert join_header("T_C", "1", ["T_A"]) == "T_C"
+    with pytest.raises(UserError, match="cannot stand in a header"):
+        join_header("T_C", "1")
 
 
 @pytest.mark.parametrize("header", ["t_surface_2", "pump_a", "pump_c", "t_tank", "drive", "q1", "x_old"])
@@ -133,7 +177,9 @@ UNITS_OF = {"drive": "1", "pump": "1", "t_tank": "degC", "t_surface": "degC", "t
 
 
 def test_a_given_list_is_complete():
-    roles = assign_roles(UNITS_OF, outputs=["t_surface"])
+    roles, reasons = assign_roles(UNITS_OF, outputs=["t_surface"])
+    assert reasons["t_ambient"] == "its name is that of the surroundings"
+    assert "t_tank" not in reasons
     assert roles == {
         "drive": "input",
         "pump": "input",
@@ -144,7 +190,7 @@ def test_a_given_list_is_complete():
 
 
 def test_lists_override_the_guess_and_take_names_with_units():
-    roles = assign_roles(UNITS_OF, inputs=["drive", "t_ambient_degC"], disturbances=[])
+    roles, _ = assign_roles(UNITS_OF, inputs=["drive", "t_ambient_degC"], disturbances=[])
     assert roles["t_ambient"] == "input"
     assert roles["pump"] == "other"
 
@@ -154,3 +200,70 @@ def test_a_listed_name_must_exist_and_stand_once():
         assign_roles(UNITS_OF, outputs=["t_thank"])
     with pytest.raises(UserError, match="listed as input and as output"):
         assign_roles(UNITS_OF, inputs=["drive"], outputs=["drive"])
+
+
+def plant_of(u, pole=0.9, gain=1.0, noise=0.01, seed=0):
+    """Return the response of a first-order plant to an input, one row later, with noise."""
+    rng, y = np.random.default_rng(seed), np.zeros(len(u))
+    for k in range(1, len(u)):
+        y[k] = pole * y[k - 1] + gain * (1 - pole) * u[k - 1]
+    return y + noise * rng.standard_normal(len(u))
+
+
+RNG = np.random.default_rng(5)
+HELD = np.repeat(RNG.integers(0, 5, 30), 20).astype(float)
+NOISY = RNG.standard_normal(600)
+ROOM = 20 + np.cumsum(0.01 * RNG.standard_normal(600))
+
+
+@pytest.mark.parametrize(
+    ("columns", "fixed", "roles"),
+    [
+        ({"a": HELD, "b": plant_of(HELD)}, {}, {"a": "input", "b": "output"}),
+        ({"a": HELD, "b": np.round(10 * plant_of(HELD, pole=0.97, noise=0)) / 10}, {},
+         {"a": "input", "b": "output"}),
+        ({"b": plant_of(HELD), "a": HELD}, {}, {"a": "input", "b": "output"}),
+        ({"a": NOISY, "b": plant_of(NOISY), "c": np.ones(600)}, {},
+         {"a": "input", "b": "output", "c": "other"}),
+        ({"a": np.sign(NOISY), "b": plant_of(np.sign(NOISY))}, {}, {"a": "input", "b": "output"}),
+        ({"a": HELD, "b": plant_of(HELD + ROOM), "room": ROOM}, {},
+         {"a": "input", "b": "output", "room": "disturbance"}),
+        ({"a": HELD, "b": plant_of(HELD), "c": HELD - 1}, {"c": "other"}, {"a": "input", "b": "output"}),
+        ({"a": NOISY, "b": plant_of(NOISY)}, {"b": "output"}, {"a": "input"}),
+        ({"a": np.where(NOISY > 2.5, np.nan, NOISY), "b": plant_of(NOISY)}, {},
+         {"a": "input", "b": "output"}),
+        ({"a": NOISY[:8], "b": NOISY[8:16]}, {}, {"a": "input", "b": "output"}),
+    ],
+)  # fmt: skip
+def test_the_data_show_what_moves_and_what_follows(columns, fixed, roles):
+    units = dict.fromkeys(columns, "1") | {"room": "degC"}
+    found = roles_of_data(columns, units, fixed)
+    assert {name: role for name, (role, _) in found.items()} == roles
+
+
+@pytest.mark.parametrize(
+    ("gain", "noise", "why"),
+    [(5.0, 0.02, "no other is likelier one"),
+     (3.0, 4.0, "it predicts the others more than they predict it")],
+)  # fmt: skip
+def test_a_controller_s_output_is_an_input_though_its_reading_predicts_it(gain, noise, why):
+    rng, y, u = np.random.default_rng(1), np.full(2000, 30.0), np.zeros(2000)
+    for k in range(1, 2000):
+        y[k] = y[k - 1] + 0.02 * u[k - 1] + 0.02 * rng.standard_normal()
+        u[k] = gain * (30 - y[k - 1]) + noise * rng.standard_normal()
+    units = {"u": "1", "y": "degC", "z": "1"}
+    assert roles_of_data({"u": u, "y": y}, units, {"y": "output"}) == {"u": ("input", why)}
+    found = roles_of_data({"z": plant_of(y, noise=0.001), "y": y, "u": u}, units, {"y": "output"})
+    assert (found["u"], found["z"][0]) == (("input", why), "output")
+
+
+def test_names_go_first_and_data_are_asked_where_these_show_no_input_or_no_output():
+    columns = {"a": HELD, "t_x": plant_of(HELD), "b": NOISY}
+    units = {"a": "1", "t_x": "degC", "b": "1"}
+    roles, reasons = assign_roles(units, columns=columns)
+    assert roles == {"a": "input", "t_x": "output", "b": "input"}
+    assert reasons["a"].startswith("it is held between ")
+    assert reasons["t_x"] == "its name is that of a reading"
+    assert assign_roles(units, columns=columns, inputs=["b"])[0]["a"] == "other"
+    named = {"q1": HELD, "t_x": plant_of(HELD), "b": NOISY}
+    assert assign_roles({"q1": "1", "t_x": "degC", "b": "1"}, columns=named)[0]["b"] == "other"

@@ -26,7 +26,7 @@ def test_an_escape_sequence_in_a_column_reaches_no_terminal(bench: Bench) -> Non
         done = bench.run(*words)
         assert done.code == 2
         assert "\x1b" not in done.out + done.err
-        assert "\\x1b[31m" in done.err
+        assert "\\x1b" in done.err
 
 
 def test_what_the_console_shows_is_text(capsys: pytest.CaptureFixture[str]) -> None:

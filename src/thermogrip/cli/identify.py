@@ -11,10 +11,12 @@ import typer
 from thermogrip.cli.options import (
     ANSWER_IS_NO,
     AsJson,
+    Columns,
     LogFiles,
     OwnNetwork,
     Report,
     Seed,
+    Step,
     choice,
     comma,
     existing_logs,
@@ -25,6 +27,7 @@ from thermogrip.cli.options import (
     load_plant,
     log_name,
     new_file,
+    repairs_of,
 )
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.parallel import sub_progress
@@ -76,7 +79,8 @@ Average = Annotated[
 ]
 
 OutOption = Annotated[
-    Path, typer.Option("--out", metavar="FILE.json", show_default=False, help="Where the plant goes.")
+    Path | None,
+    typer.Option("--out", metavar="FILE.json", help="Where the plant goes; where absent, LOG_plant.json."),
 ]
 NetworkOption = Annotated[
     str | None,
@@ -115,11 +119,13 @@ PosteriorOption = Annotated[
 
 def identify(
     logs: LogFiles,
-    out: OutOption,
+    out: OutOption = None,
     network: NetworkOption = None,
     inputs: InputsOption = None,
     outputs: OutputsOption = None,
     disturbances: DisturbancesOption = None,
+    columns: Columns = None,
+    dt: Step = None,
     models: ModelsOption = ALL_MODELS,
     average: Average = None,
     leave_one_out: LeaveOneOutOption = False,
@@ -134,23 +140,34 @@ def identify(
     Checks the data, fits candidate models, scores each by free run on held-out data, keeps the best one.
     """
     wanted = comma(models) or ()
+    if out is None:
+        from thermogrip.datasets.log_files import split_cut
+        from thermogrip.datasets.tables import file_stem
+
+        out = Path(f"{file_stem(split_cut(logs[0])[0])}_plant.json")
     new_file(out, (".json",))
     sought = None if network == "none" or "network" not in wanted else network or DEFAULT_NETWORK
     wanted_network = None if sought is None else find_network(sought)
     to_grow = _growable(wanted_network) if grow else None
     console = Console(as_json)
     roles = comma(inputs), comma(outputs), comma(disturbances)
+    from thermogrip.datasets.units import find_column
     from thermogrip.sysid.plant.log_grid import misfit, roles_of
 
     # what a network calls its own has the role that it has there
-    records = load_logs(logs, *roles, known=None if wanted_network is None else roles_of(wanted_network))
+    table: dict[str, Any] = {"columns": comma(columns), "dt": dt}
+    of_network = None if wanted_network is None else roles_of(wanted_network)
+    records = load_logs(logs, *roles, known=of_network, **table)
     if (
         wanted_network is not None
         and not (network or grow)
         and any(misfit(wanted_network, log) is not None for log in records)
     ):
-        wanted_network, records = None, load_logs(logs, *roles)
+        wanted_network, records = None, load_logs(logs, *roles, **table)
     _warn_of_repairs(console, records)
+    have = dict.fromkeys(map(str, records[0].data_vars), "")  # what a word means may be written otherwise
+    known = [None if words is None else tuple(find_column(w, have) for w in words) for words in roles]
+    roles = known[0], known[1], known[2]
     from thermogrip.report.html import write_report
     from thermogrip.report.plant import identification_sections
     from thermogrip.sysid.identification import identify as fit_models
@@ -193,7 +210,7 @@ def identify(
     slow = getattr(plant.model, "slow_because", "")
     if slow:
         console.warn(f"{plant.model.kind} model not compiled, tens of times slower: {slow}")
-    console.answer(_identified(found, plant, record, growth, out))
+    console.answer(_identified(found, plant, record, growth, out) | {"repairs": repairs_of(records)})
     return ANSWER_IS_NO if posterior and (record is None or not record.converged) else 0
 
 
@@ -220,7 +237,7 @@ def _sampled(
 def _warn_of_repairs(console: Console, logs: Sequence[Log]) -> None:
     """Warn of what was repaired while the logs were read."""
     for log in logs:
-        for line in filter(None, str(log.attrs.get("repairs", "")).splitlines()):
+        for line in repairs_of([log])[log_name(log)]:
             console.warn(f"{log_name(log)}: {line}")
 
 
@@ -317,6 +334,8 @@ def validate(
     ] = 5.0,
     average: Average = None,
     network: OwnNetwork = None,
+    columns: Columns = None,
+    dt: Step = None,
     report: Report = None,
     seed: Seed = 0,
     as_json: AsJson = False,
@@ -326,7 +345,8 @@ def validate(
     It sees the inputs and disturbances of the whole log, and measured outputs of the warm-up only."""
     loaded = load_plant(plant, network)
     console = Console(as_json)
-    records = load_logs(logs, loaded.inputs, loaded.outputs, loaded.disturbances)
+    roles = loaded.inputs, loaded.outputs, loaded.disturbances
+    records = load_logs(logs, *roles, columns=comma(columns), dt=dt)
     from thermogrip.report.html import write_report
     from thermogrip.report.plant import SCORE_OF_RUN, free_run_section, run_rows
     from thermogrip.sysid.validation.free_run import free_run
@@ -346,7 +366,8 @@ def validate(
     for log, run in zip(records, runs):
         for note in run.notes:
             console.say(f"{log_name(log)}: {note}")
-    console.answer({"logs": [run_answer(log_name(log), run) for log, run in zip(records, runs)]})
+    answers = [run_answer(log_name(log), run) for log, run in zip(records, runs)]
+    console.answer({"logs": answers, "repairs": repairs_of(records)})
     return 0
 
 
@@ -378,6 +399,8 @@ def simulate(
     ],
     warmup: Warmup = 5.0,
     network: OwnNetwork = None,
+    columns: Columns = None,
+    dt: Step = None,
     seed: Seed = 0,
     as_json: AsJson = False,
 ) -> int:
@@ -388,7 +411,8 @@ def simulate(
     new_file(out)
     console = Console(as_json)
     loaded = load_plant(plant, network)
-    (record,) = load_logs([log], loaded.inputs, loaded.outputs, loaded.disturbances)
+    roles = loaded.inputs, loaded.outputs, loaded.disturbances
+    (record,) = load_logs([log], *roles, columns=comma(columns), dt=dt)
     _warn_of_repairs(console, [record])
     record, converted = match_log(loaded, record)
     for line in converted:
@@ -396,5 +420,7 @@ def simulate(
     simulated = loaded.simulate(record, warmup=warmup)
     write_log(simulated, out)
     console.say(f"wrote {out}: {', '.join(loaded.outputs)} at {simulated.sizes['time']} times")
-    console.answer({"log": record.attrs["name"], "rows": simulated.sizes["time"], "out": out})
+    repairs = repairs_of([record])[log_name(record)]
+    rows = simulated.sizes["time"]
+    console.answer({"log": record.attrs["name"], "rows": rows, "out": out, "repairs": repairs})
     return 0

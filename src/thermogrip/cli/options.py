@@ -189,8 +189,19 @@ LogFiles = Annotated[
         metavar="LOG...",
         callback=existing_logs,
         show_default=False,
-        help="CSV, NetCDF or Parquet; LOG@120:1800 takes its seconds 120 to 1800 (either end may be empty).",
+        help="Text, .mat, .xlsx, NetCDF, Parquet; LOG@120:1800 takes seconds 120 to 1800 (either end may be "
+        "empty).",
     ),
+]
+Columns = Annotated[
+    str | None,
+    typer.Option(
+        "--columns", metavar="A,B", help="Headers in place of the log's; - leaves one out."
+    ),
+]
+Step = Annotated[
+    float | None,
+    typer.Option("--dt", metavar="S", min=1e-9, help="Seconds between rows."),
 ]
 OwnNetwork = Annotated[
     str | None,
@@ -276,11 +287,42 @@ def load_logs(
     disturbances: Sequence[str] | None = None,
     *,
     known: Mapping[str, str] | None = None,
+    columns: Sequence[str] | None = None,
+    dt: float | None = None,
 ) -> list[Log]:
-    """Read several logs with the same roles; ``known`` are those that a model gives to its signals."""
+    """Read several logs with the same roles; ``known`` are those that a model gives to its signals.
+
+    What is guessed of the first log is so in all; a column that never moves in any is not guessed to be an
+    input or an output.
+    """
+    import numpy as np
+
     from thermogrip.datasets.log_files import read_log
 
-    return [read_log(path, inputs, outputs, disturbances, known=known) for path in paths]
+    logs: list[Log] = []
+    for path in paths:
+        first = {str(n): str(v.attrs["role"]) for log in logs[:1] for n, v in log.data_vars.items()}
+        roles = {**first, **known} if known else first or None
+        logs.append(read_log(path, inputs, outputs, disturbances, known=roles, columns=columns, dt=dt))
+    for line in str(logs[0].attrs.get("guesses", "")).splitlines():
+        name, why = line.split(": ", 1)[0], "it never moves"
+        values = np.concatenate([log[name].values for log in logs if name in log])
+        level = float(np.nanmax(values))
+        role = logs[0][name].attrs["role"]
+        if level > np.nanmin(values) or (role == "input" and level in (0.0, 1.0)) or role == "other":
+            continue  # a switch that stays as it is may still be a switch
+        for log in (log for log in logs if name in log):
+            log[name].attrs["role"] = "other"
+            log.attrs["guesses"] = str(log.attrs.get("guesses", "")).replace(line, f"{name}: {why}")
+    return logs
+
+
+def repairs_of(logs: Sequence[Log]) -> dict[str, list[str]]:
+    """Return what was repaired while logs were read, by the log's name."""
+    return {
+        log_name(log): [line for line in str(log.attrs.get("repairs", "")).splitlines() if line]
+        for log in logs
+    }
 
 
 def find_grasps(paths: Sequence[str]) -> list[Grasps]:

@@ -372,6 +372,7 @@ def test_rows_between_steps_are_on_the_line_between_them():
         ("percent", "W", (0.0, 1.0), 60.0, None),
         ("W", "1", (0.0, 1.0), 0.6, None),
         ("W", "W", (0.0, 9.0), 6.0, 6.0),
+        ("1", "W", (0.0, 9.0), 6.0, 6.0),
     ],
 )
 def test_a_drive_is_converted_where_both_units_are_shares_of_full_scale(
