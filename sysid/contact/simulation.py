@@ -37,7 +37,7 @@ SOFT_FINGER = Stack(
     e_outer=2000.0, z_outer=0.1, e_inner=3800.0, z_inner=8.0, g_back=0.0, lag=0.1, first=0.01, build_up=0.78,
     creep=0.3,
 )  # fmt: skip
-_PUMP_OFF = -1.0  # s
+PUMP_OFF = -1.0  # s: the pump stops about a second before contact
 
 
 class Blocks(NamedTuple):
@@ -237,7 +237,7 @@ def record_touches(
     true = level[:, None] + (np.array([touch.t_object for touch in touches]) - level)[:, None] * rise
     true += np.stack([touch.by_room(time) for touch in touches])
     if leak:
-        true += leak * (ambient - level)[:, None] * np.maximum(time - _PUMP_OFF, 0.0)
+        true += leak * (ambient - level)[:, None] * np.maximum(time - PUMP_OFF, 0.0)
     keep = np.exp(-dt / correlation_time)
     slow = slow_noise * rng.standard_normal(true.shape)
     slow[:, 1:] *= np.sqrt(1 - keep**2)

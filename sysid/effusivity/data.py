@@ -26,12 +26,12 @@ from scipy.linalg.lapack import dtrtri
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, check_grasps, label_values, log_name
+from thermogrip.sysid.contact.simulation import PUMP_OFF
 from thermogrip.sysid.effusivity.quality import check_grasps as check_quality
 from thermogrip.sysid.effusivity.quality import number_values
 
 Array = NDArray[np.float64]
 
-_PUMP_OFF = -1.0  # s: the pump stops about a second before contact
 UNKNOWN_OBJECT_RANGE = 20.0  # K about the room, or the gripper where no room is stated
 _EDGES = np.concatenate(
     [
@@ -131,7 +131,7 @@ def touches(grasps: Grasps, *, until: float | None = None) -> Touches:
         # one memory layout whatever the record's: the compiled search is compiled anew for another
         sample_bin=np.ascontiguousarray(np.where(good, bins, -1), dtype=np.int64),
         y=y, t=mean(np.broadcast_to(time, data.shape)),
-        count=count, ramp=mean(np.broadcast_to(np.maximum(time - _PUMP_OFF, 0.0), data.shape)), level=level,
+        count=count, ramp=mean(np.broadcast_to(np.maximum(time - PUMP_OFF, 0.0), data.shape)), level=level,
         t_object=number_values(grasps, "t_object"), t_object_sd=number_values(grasps, "t_object_sd"),
         t_ambient=number_values(grasps, "t_ambient"), excursion=np.abs(away).max(axis=1),
     )  # fmt: skip

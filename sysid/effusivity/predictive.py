@@ -29,6 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import logsumexp
 
 from thermogrip.datasets.schema import Grasps
+from thermogrip.sysid.contact.simulation import PUMP_OFF
 from thermogrip.sysid.effusivity.data import Touches, noise_covariance, touches
 from thermogrip.sysid.effusivity.laplace_approximation import (
     BUILD_UP,
@@ -48,7 +49,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _STEP = 0.5  # s: readings to come are taken as means over this
-_PUMP_OFF = -1.0
 _REGULATION = 0.35  # K: how far from its set point a gripper is at contact
 _FIRST = 0.3  # s: before it the moment of contact matters too much for one expansion
 
@@ -154,7 +154,7 @@ def _extended(data: Touches, at: Array, dt: float) -> Touches:
         data, sample_t=joined(data.sample_t, times),
         sample_bin=np.concatenate([data.sample_bin, np.broadcast_to(n_bin + bins, (n, bins.size))], axis=1),
         y=joined(data.y, np.zeros(at.size)), t=joined(data.t, at), count=joined(data.count, count),
-        ramp=joined(data.ramp, at - _PUMP_OFF),
+        ramp=joined(data.ramp, at - PUMP_OFF),
     )  # fmt: skip
 
 
@@ -171,6 +171,6 @@ def _coming(level: Array, room: float, end: float, dt: float) -> Touches:
     return Touches(
         grasp_id=np.full(n, "next"), material=np.full(n, ""), sample_t=each(times),
         sample_bin=np.broadcast_to(bins, (n, bins.size)).copy(), y=np.zeros((n, at.size)), t=each(at),
-        count=each(count), ramp=each(np.maximum(at - _PUMP_OFF, 0.0)), level=level, t_object=unknown,
+        count=each(count), ramp=each(np.maximum(at - PUMP_OFF, 0.0)), level=level, t_object=unknown,
         t_object_sd=unknown, t_ambient=np.full(n, room), excursion=np.zeros(n),
     )  # fmt: skip

@@ -327,7 +327,7 @@ def build_layout(network: Network) -> Layout:
         "off": [(0.0, ()) if link.off is None else (1.0, (link.off,)) for link in links],
         "bend": [(1.0, (link.bend,)) for link in links if link.bend is not None],
         "radiation": [(STEFAN_BOLTZMANN, (r.area, r.emissivity)) for r in network.radiation.values()],
-        "heater": [(1.0 / _full(network, h.input), (h.power,)) for h in network.heaters.values()],
+        "heater": [(1.0 / network.inputs[h.input].full_scale, (h.power,)) for h in network.heaters.values()],
         "peltier": [item for element in network.peltiers.values() for item in _peltier(network, element)],
     }
     begin = dict(zip(parts, np.cumsum([0, *map(len, parts.values())]).tolist()))
@@ -360,10 +360,6 @@ def build_layout(network: Network) -> Layout:
             [index[o.node if o.lag is None else f"{name}.sensor"] for name, o in network.outputs.items()]
         ),
     )
-
-
-def _full(network: Network, name: str) -> float:
-    return network.inputs[name].full_scale
 
 
 def _capacities(network: Network) -> list[Coefficient]:
@@ -420,10 +416,9 @@ def _peltier(network: Network, element: Any) -> list[Coefficient]:
     """Return the coefficients of one element in the order of ``PELTIER``."""
     out: list[Coefficient] = []
     for name in PELTIER:
-        parameter = None if name == "full" else getattr(element, name)
         if name == "full":
-            out.append((_full(network, element.input), ()))
-        elif parameter is None:
+            out.append((network.inputs[element.input].full_scale, ()))
+        elif (parameter := getattr(element, name)) is None:
             out.append((1.0 if name.endswith("gain") else 0.0, ()))
         else:
             out.append((1.0, (parameter,)))

@@ -130,19 +130,21 @@ class SindyModel:
         """Return the distinct monomials of the state and, row by row, their gains (B, N, n_y, n_monomial)."""
         n_x = self.n_x
         powers, place = np.unique(self.exponents[:, :n_x], axis=0, return_inverse=True)
-        outside = _monomials(self.exponents[:, n_x:], w.reshape(-1, w.shape[2])).reshape(*w.shape[:2], -1)
+        factors, rows = _factors(self.exponents[:, n_x:]), w.reshape(-1, w.shape[2])
+        with np.errstate(over="ignore", invalid="ignore"):
+            outside = _products(factors, rows).reshape(*w.shape[:2], -1)
         gains = np.zeros((*w.shape[:2], len(self.outputs), len(powers)))
         for term, monomial in enumerate(place.ravel()):
             gains[..., monomial] += outside[..., term, None] * self.coefficients[:, term]
         return powers, gains
 
-    def equations(self, digits: int = 4) -> tuple[str, ...]:
+    def equations(self) -> tuple[str, ...]:
         """Return one equation per output as text, in natural units."""
         past = ["" if lag == 0 else f"[k-{lag}]" for lag in range(self.memory)]
         names = [f"{name}{at}" for at in past for name in self.outputs]
         names += [*self.inputs, *self.disturbances]
         return tuple(
-            f"{name}[k+1] = {_text(row, self.exponents, names, digits)}"
+            f"{name}[k+1] = {_text(row, self.exponents, names)}"
             for name, row in zip(self.outputs, self.coefficients)
         )
 
@@ -188,16 +190,6 @@ def _monomial(row: NDArray[np.int_], variables: Sequence[Any]) -> Any:
     return value
 
 
-def _monomials(exponents: NDArray[np.int_], rows: Array) -> Array:
-    """Return the terms (n, n_term) of rows (n, n_variable)."""
-    out = np.ones((rows.shape[0], exponents.shape[0]))
-    with np.errstate(over="ignore", invalid="ignore"):
-        for variable in range(exponents.shape[1]):
-            for power in range(1, int(exponents[:, variable].max(initial=0)) + 1):
-                out[:, exponents[:, variable] >= power] *= rows[:, [variable]]
-    return out
-
-
 def _factors(powers: NDArray[np.int_]) -> NDArray[np.int_]:
     """Return which variables each monomial multiplies, (degree, n_monomial); n_variable denotes 1."""
     degree, one = int(powers.sum(axis=1).max(initial=0)), powers.shape[1]
@@ -218,11 +210,11 @@ def _products(factors: NDArray[np.int_], x: Array) -> Array:
     return out
 
 
-def _text(row: Array, exponents: NDArray[np.int_], names: Sequence[str], digits: int) -> str:
+def _text(row: Array, exponents: NDArray[np.int_], names: Sequence[str]) -> str:
     parts = []
     for value, powers in zip(row, exponents):
         if value == 0:
             continue
         factors = [n if p == 1 else f"{n}^{p}" for n, p in zip(names, powers.tolist()) if p]
-        parts.append(" ".join([f"{value:.{digits}g}", *factors]))
+        parts.append(" ".join([f"{value:.4g}", *factors]))
     return " + ".join(parts).replace("+ -", "- ") or "0"

@@ -307,8 +307,8 @@ def reported() -> tuple[Plant, list[Log], Problem, Array]:
     return plant, logs, *problem_of(model, logs, plant)
 
 
-def test_errors_and_offsets_are_those_of_the_fit_log_by_log(reported: Any):
-    plant, _, problem, z = reported
+def test_errors_offsets_and_ranges_are_those_of_the_fit_log_by_log(reported: Any):
+    plant, logs, problem, z = reported
     errors = problem.errors(z)
     by_log = [rms([stretch[0] for stretch in log]) for log in errors]
     assert by_log[1] > 1.2 * by_log[0]
@@ -323,10 +323,6 @@ def test_errors_and_offsets_are_those_of_the_fit_log_by_log(reported: Any):
     assert plant.offsets["t"] == pytest.approx(np.mean(starts), abs=1e-3)
     assert plant.verdict.startswith(f"in-sample error t {whole:.2f} degC")
     assert plant.logs == ("log 1", "log 2", "log 3")
-
-
-def test_ranges_are_those_of_all_logs(reported: Any):
-    plant, logs, _, _ = reported
     for name in ("q", "t"):
         values = np.concatenate([log[name].values for log in logs])
         assert plant.valid[name] == (values.min(), values.max())

@@ -425,7 +425,9 @@ def sampled(fitted: tuple[Plant, list[Log]]) -> tuple[Plant, Posterior]:
     return sample_posterior(*fitted, max_steps=60, n_samples=300, seed=2)
 
 
-def test_the_record_is_in_the_parameters_own_units(fitted: Any, sampled: tuple[Plant, Posterior]):
+def test_the_record_is_in_the_parameters_own_units_and_counts_its_steps(
+    fitted: Any, sampled: tuple[Plant, Posterior]
+):
     plant, record = sampled
     assert record.free == record.sampled == ("a", "b")
     assert record.units == {"a": "K", "b": "W"}
@@ -441,18 +443,11 @@ def test_the_record_is_in_the_parameters_own_units(fitted: Any, sampled: tuple[P
     rows = record.chain.steps.reshape(-1, 2)
     for sample in record.samples[::50]:
         assert np.abs(rows / sample - 1).max(axis=1).min() < 1e-9
-
-
-def test_the_record_says_how_far_its_middle_lies_from_the_fit(fitted: Any, sampled: tuple[Plant, Posterior]):
-    _, record = sampled
+    # how far its middle lies from the fit
     z = np.column_stack([np.log(record.samples[:, 0]), record.samples[:, 1]])
     fit = np.array([np.log(fitted[0].values["a"]), fitted[0].values["b"]])
     off = np.abs(np.median(z, axis=0) - fit) / z.std(axis=0)
     assert record.off_centre == pytest.approx(off.max())
-
-
-def test_the_record_counts_its_steps_in_the_slowest_autocorrelation_time(sampled: tuple[Plant, Posterior]):
-    plant, record = sampled
     slowest = max(record.tau.values())
     assert list(record.tau) == ["a", "b"]
     assert list(record.tau.values()) == record.chain.tau.tolist()
