@@ -2,55 +2,36 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from thermogrip import lazy_exports
 
 if TYPE_CHECKING:
-    from thermogrip.rig.drivers.connect import open_rig
-    from thermogrip.rig.drivers.tclab import TCLabRig
-    from thermogrip.rig.drivers.thermogrip import DeviceRig
-    from thermogrip.rig.guard.guard import Guard, GuardSettings
-    from thermogrip.rig.guard.settings import read_guard
-    from thermogrip.rig.guard.trip import Trip
-    from thermogrip.rig.interface import Reading, Rig
-    from thermogrip.rig.records.batch import Trial, read_plan, run_batch
-    from thermogrip.rig.records.export import export_run
-    from thermogrip.rig.records.recorder import RunFolder
-    from thermogrip.rig.records.rosbridge import Bridge
-    from thermogrip.rig.records.run_folder import read_run, recover
-    from thermogrip.rig.serial.port import Port
-    from thermogrip.rig.session.session import Object, Session, run_session
-    from thermogrip.rig.simulation.twin import Twin
-    from thermogrip.rig.simulation.virtual_device import VirtualDevice
-    from thermogrip.sysid.contact.simulation import Grip, simulate_grasps
-
-__all__ = [
-    "Bridge",
-    "DeviceRig",
-    "Grip",
-    "Guard",
-    "GuardSettings",
-    "Object",
-    "Port",
-    "Reading",
-    "Rig",
-    "RunFolder",
-    "Session",
-    "TCLabRig",
-    "Trial",
-    "Trip",
-    "Twin",
-    "VirtualDevice",
-    "export_run",
-    "open_rig",
-    "read_guard",
-    "read_plan",
-    "read_run",
-    "recover",
-    "run_batch",
-    "run_session",
-    "simulate_grasps",
-]
+    from thermogrip.rig.drivers.connect import open_rig as open_rig
+    from thermogrip.rig.drivers.tclab import TCLabRig as TCLabRig
+    from thermogrip.rig.drivers.thermogrip import DeviceRig as DeviceRig
+    from thermogrip.rig.guard.guard import Guard as Guard
+    from thermogrip.rig.guard.guard import GuardSettings as GuardSettings
+    from thermogrip.rig.guard.settings import read_guard as read_guard
+    from thermogrip.rig.guard.trip import Trip as Trip
+    from thermogrip.rig.interface import Reading as Reading
+    from thermogrip.rig.interface import Rig as Rig
+    from thermogrip.rig.records.batch import Trial as Trial
+    from thermogrip.rig.records.batch import read_plan as read_plan
+    from thermogrip.rig.records.batch import run_batch as run_batch
+    from thermogrip.rig.records.export import export_run as export_run
+    from thermogrip.rig.records.recorder import RunFolder as RunFolder
+    from thermogrip.rig.records.rosbridge import Bridge as Bridge
+    from thermogrip.rig.records.run_folder import read_run as read_run
+    from thermogrip.rig.records.run_folder import recover as recover
+    from thermogrip.rig.serial.port import Port as Port
+    from thermogrip.rig.session.session import Object as Object
+    from thermogrip.rig.session.session import Session as Session
+    from thermogrip.rig.session.session import run_session as run_session
+    from thermogrip.rig.simulation.twin import Twin as Twin
+    from thermogrip.rig.simulation.virtual_device import VirtualDevice as VirtualDevice
+    from thermogrip.sysid.contact.simulation import Grip as Grip
+    from thermogrip.sysid.contact.simulation import simulate_grasps as simulate_grasps
 
 _NAMES = {
     "drivers.connect": ["open_rig"], "drivers.tclab": ["TCLabRig"], "drivers.thermogrip": ["DeviceRig"],
@@ -64,8 +45,5 @@ _NAMES = {
 }  # fmt: skip
 _HOME = {name: module for module, names in _NAMES.items() for name in names}
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f".{_HOME[name]}", __name__), name)
+__all__ = sorted(_HOME)
+__getattr__, __dir__ = lazy_exports(__name__, _HOME)

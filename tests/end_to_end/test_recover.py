@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -23,19 +22,6 @@ def killed(path: Path, n: int = 30) -> Path:
     with (path / "samples.csv").open("ab") as file:
         file.write(b"30,0.1,1,2")
     return path
-
-
-def test_a_killed_run_is_repaired_and_said_line_by_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["recover", str(killed(tmp_path / "run")), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)["runs"][0]
-    assert found["rows"] == 30
-    assert found["verdict"] == "interrupted"
-    assert any("the last 10 bytes" in line for line in found["said"])
-    assert (tmp_path / "run" / "samples.csv.damaged").read_bytes().endswith(b"30,0.1,1,2")
-    assert main(["recover", str(tmp_path / "run"), "--json"]) == 0
-    assert not json.loads(capsys.readouterr().out)["runs"][0]["changed"]
 
 
 @pytest.mark.parametrize("name", ["log.nc", "log.parquet", "log.csv", "log.mcap"])

@@ -106,19 +106,3 @@ def test_run_drives_the_rig_on_a_port_and_leaves_it_off(
     assert max(moment.drive["q1"] for moment in device.trace) > 0.0
     assert device.applied_drive == {"q1": 0.0, "q2": 0.0}
     assert json.loads((tmp_path / "run" / "run.json").read_text())["about"]["port"] == device.port
-
-
-def test_a_limit_of_a_guard_file_ends_a_run_and_is_kept_with_it(
-    plant_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    controller, limits = tmp_path / "controller.json", tmp_path / "guard.toml"
-    Controller(lab_plant()).save(controller)
-    limits.write_text("[limits]\nt1 = [10, 34]\n")
-    words = ["run", str(controller), "--twin", str(plant_file), "--target", "t1=30,t2=30", "--from", "36"]
-    words += ["--guard", str(limits), "--out", str(tmp_path / "run"), "--json"]
-    assert main(words) == 3
-    answer = json.loads(capsys.readouterr().out)
-    assert answer["verdict"] == "tripped"
-    assert answer["advice"].startswith("limit: t1: expected 10 to 34 degC")
-    kept = json.loads((tmp_path / "run" / "run.json").read_text())
-    assert kept["files"]["guard"]["path"] == str(limits)

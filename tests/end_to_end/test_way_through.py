@@ -78,18 +78,6 @@ def test_grasps_become_materials(bench: Bench) -> None:
     assert all(abs(float(row["p_copper"]) + float(row["p_wood"]) - 1) < 1e-5 for row in rows)
 
 
-def test_candidates_are_a_question_put_to_the_model(bench: Bench) -> None:
-    name = "exp3B_obj28_grip48"
-    train = ["train", example_path(name), "--classifier", "features-lda", "--out", "m"]
-    assert bench.run(*train).code == 0
-    assert (
-        bench.run("classify", "m", example_path(name), "--materials", "iron,wood", "--out", "p.csv").code == 0
-    )
-    with (bench.path / "p.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert {row["material"] for row in rows} == {"iron", "wood"}
-
-
 def test_a_comparison_says_n_and_interval(bench: Bench) -> None:
     words = ["compare", "grasps.csv", "--classifiers", "features-lda,pca-lda", "--repeats", "2"]
     found = answer(bench, *words, "--train-per-class", "3", "--out", "c")["splits"]

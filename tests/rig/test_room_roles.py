@@ -162,7 +162,8 @@ def test_a_session_starts_without_its_room_and_not_without_an_output() -> None:
     with pytest.raises(UserError, match=f"{BLOCK} reads nan"):
         run_session(rig, Constant(), 25.0, guard=Guard(PLANT))
     rig.error = {ROOM: nan}
-    assert run_session(rig, Constant(), 25.0, guard=Guard(PLANT)).verdict == "settled"
+    session = run_session(rig, Constant(), 25.0, guard=Guard(PLANT))
+    assert (session.verdict, ROOM in session.log) == ("settled", False)  # it was never read
 
 
 def test_a_sessions_log_and_grasp_have_the_rooms_of_the_plant_and_read_back_so(tmp_path: Path) -> None:

@@ -15,12 +15,12 @@ from thermogrip.cli.options import (
     AsJson,
     Cluster,
     OwnNetwork,
+    PlantFile,
     Report,
     Seed,
     Workers,
     existing,
     existing_controller,
-    existing_plant,
     existing_spec,
     find_network,
     load_plant,
@@ -45,12 +45,7 @@ CheckedController = Annotated[Path, typer.Argument(callback=existing_controller,
 
 
 def tune(
-    plant: Annotated[
-        Path,
-        typer.Argument(
-            metavar="PLANT", show_default=False, callback=existing_plant, help="plant.json of identify."
-        ),
-    ],
+    plant: PlantFile,
     out: Annotated[
         Path,
         typer.Option("--out", metavar="FILE.json", show_default=False, help="Where the controller goes."),

@@ -14,6 +14,7 @@ from thermogrip.cli.options import (
     Columns,
     LogFiles,
     OwnNetwork,
+    PlantFile,
     Report,
     Seed,
     Step,
@@ -21,7 +22,6 @@ from thermogrip.cli.options import (
     comma,
     existing_logs,
     existing_network,
-    existing_plant,
     find_network,
     load_logs,
     load_plant,
@@ -59,12 +59,6 @@ def _known_models(value: str) -> str:
     return value
 
 
-PlantFile = Annotated[
-    Path,
-    typer.Argument(
-        metavar="PLANT", show_default=False, callback=existing_plant, help="plant.json of identify."
-    ),
-]
 Warmup = Annotated[
     float,
     typer.Option(

@@ -183,6 +183,12 @@ Report = Annotated[
         help="Also write a one-page report with figures.",
     ),
 ]
+PlantFile = Annotated[
+    Path,
+    typer.Argument(
+        metavar="PLANT", show_default=False, callback=existing_plant, help="plant.json of identify."
+    ),
+]
 LogFiles = Annotated[
     list[str],
     typer.Argument(
