@@ -33,7 +33,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Log, make_log
 from thermogrip.rig.guard.sensor_checks import room_disturbances
 from thermogrip.rig.interface import UNIT_RANGES, Notice, Reading, check_order
 from thermogrip.sysid.contact.simulation import ContactModel, Touch
@@ -261,29 +260,6 @@ class Twin:
         if self._contact is not None:
             true[self.skin] += self._added(true[self.skin])
         return true
-
-    def log(self) -> Log:
-        """Return the history of native steps as a Log of the true outputs.
-
-        The inputs of a row are those applied from it on, as everywhere.
-        """
-        rows, plant = self.history, self.plant
-        if len(rows) < 2:
-            raise UserError("nothing was simulated yet", hint="let the twin wait first")
-        table = {key: np.array([row[key] for row in rows]) for key in rows[0]}
-        variables = {}
-        for name in plant.inputs:  # a row of history holds the inputs of the step that led to it
-            variables[name] = (
-                np.append(table[name][1:], table[name][-1]),
-                plant.units.get(name, "1"),
-                "input",
-            )
-        for k, name in enumerate(plant.disturbances):
-            variables[name] = (np.full(len(rows), self._d[k]), plant.units.get(name, "degC"), "disturbance")
-        for name in plant.outputs:
-            variables[name] = (table[name], "degC", "output")
-        variables["contact"] = (table["contact"], "1", "other")
-        return make_log(table["time_s"], variables, name="twin")
 
     def _drives(self) -> tuple[str, ...]:
         """Return the inputs that are driven: all but the pump."""

@@ -33,7 +33,6 @@ from thermogrip.rig.serial.protocol import (
     encode_line,
     parse_taken,
 )
-from thermogrip.rig.simulation.cable import spoil
 
 SIZE = CELLS // 5  # of one drive and three sensors
 
@@ -266,15 +265,6 @@ def test_an_answer_damaged_at_any_byte_loses_nothing(how: str) -> None:
         place, end = place + 1, len(back)
 
 
-def test_a_question_damaged_at_any_byte_forgets_nothing() -> None:
-    line = encode_line(9, "take", "14")
-    for place in range(len(line) - 1):
-        talk = Conversation()
-        talk.run(200)
-        talk.core.receive(line[:place] + bytes([line[place] ^ 2]) + line[place + 1 :], talk.now)
-        assert talk.take(0).first == 0
-
-
 def test_a_repeated_question_repeats_its_answer_though_time_went_on() -> None:
     talk = Conversation()
     talk.run(60)
@@ -282,27 +272,3 @@ def test_a_repeated_question_repeats_its_answer_though_time_went_on() -> None:
     first = talk.core.receive(data, talk.now)
     talk.run(300)
     assert talk.core.receive(data, talk.now) == first
-
-
-def test_over_a_line_that_spoils_a_third_of_it_every_tick_is_there_once_or_counted() -> None:
-    talk, rng = Conversation(), Random(4)
-    number, got, lost = 0, [], 0
-    while talk.now < 30_000:
-        talk.run(rng.choice([1, 5, 20, 60]))
-        data = talk.host.ask(Take(number))
-        for _ in range(4):  # then it is given up, and asked for with another number
-            back = talk.core.receive(spoil(data, rng) if rng.random() < 0.3 else data, talk.now)
-            heard = talk.host.hear(spoil(back, rng) if back and rng.random() < 0.3 else back)
-            found = [event.content for event in heard if isinstance(event, Answer)]
-            if found:
-                taken = found[0]
-                assert isinstance(taken, Taken)
-                lost += taken.first - number
-                got += talk.numbers(taken)
-                number = taken.first + len(taken.readings)
-                break
-            data = talk.host.again()
-            talk.run(10)
-    assert got == sorted(set(got))
-    assert len(got) + lost == number
-    assert number >= 0.99 * talk.now / 10 - SIZE
