@@ -35,33 +35,10 @@ from contextlib import suppress
 from thermogrip.rig.clock import Metronome
 from thermogrip.rig.firmware.reference import MAX_PERIOD_MS, MIN_PERIOD_MS
 from thermogrip.rig.interface import DeviceRefusedError, NoticeBook, Reading, check_order
+from thermogrip.rig.serial import protocol
 from thermogrip.rig.serial.port import AnyPort, PortError
-from thermogrip.rig.serial.protocol import (
-    MAX_TTL_MS,
-    REFUSALS,
-    Answer,
-    Boot,
-    Clear,
-    Damaged,
-    Drive,
-    Event,
-    Grip,
-    Hello,
-    HostEnd,
-    Identity,
-    Kept,
-    Off,
-    Read,
-    Refused,
-    Request,
-    Sample,
-    State,
-    Take,
-    Taken,
-    Unexpected,
-)
 
-TTL_S = MAX_TTL_MS / 1000
+TTL_S = protocol.MAX_TTL_MS / 1000
 RENEW_S = 0.5  # how often a drive is renewed while time passes
 MOST_TRIES = 12  # of one question on a line that spoils half of it
 
@@ -98,7 +75,7 @@ class Gathering:
         """Count from 0 again."""
         self.number, self._was_reset = 0, True
 
-    def take(self, taken: Taken, clock: DeviceClock) -> list[tuple[float, Kept]]:
+    def take(self, taken: protocol.Taken, clock: DeviceClock) -> list[tuple[float, protocol.Kept]]:
         """Return the readings of an answer with their time [s], which never goes back."""
         lost = (taken.first - self.number) % 2**32 + sum(kept is None for kept in taken.readings)
         there = []
@@ -125,40 +102,40 @@ class _Conversation(NoticeBook):
     ) -> None:
         super().__init__(clock)
         self.port, self.timeout, self.tries = port, timeout, tries
-        self._host, self._device_clock = HostEnd(), DeviceClock()
-        self._known: State | None = None
+        self._host, self._device_clock = protocol.HostEnd(), DeviceClock()
+        self._known: protocol.State | None = None
         self._heard, self._silent = 0, False  # bytes so far; whether the last question was met with none
         self._greeted_at, self._lost, self.closed = 0, False, False
         port.open()
         self.identity = self._first_hello(greeting)
 
     @property
-    def state(self) -> State | None:
+    def state(self) -> protocol.State | None:
         """The device's last state, None while it cannot be reached."""
         return None if self._lost else self._known
 
     def _drive_is_over(self) -> None:
         """Note that the device no longer applies the drive."""
 
-    def _first_hello(self, seconds: float) -> Identity:
+    def _first_hello(self, seconds: float) -> protocol.Identity:
         """Ask for the device's identity until it answers; an Arduino takes seconds to start."""
         rounds = max(1, round(seconds / self.timeout))
         for _ in range(rounds):
-            answer = self._once(self._host.ask(Hello()))
-            if isinstance(answer, Answer) and isinstance(answer.content, Identity):
+            answer = self._once(self._host.ask(protocol.Hello()))
+            if isinstance(answer, protocol.Answer) and isinstance(answer.content, protocol.Identity):
                 self._greeted_at = self.port.opened
                 return answer.content
         self.port.close()
         hint = "check that it runs thermogrip's firmware, or give --protocol"
         raise PortError("absent", "nothing here speaks our protocol", file=self.port.url, hint=hint)
 
-    def _ask(self, request: Request) -> State:
+    def _ask(self, request: protocol.Request) -> protocol.State:
         state = self._content(request)
-        assert isinstance(state, State)
+        assert isinstance(state, protocol.State)
         self._compare(state)
         return state
 
-    def _content(self, request: Request) -> Identity | State | Taken:
+    def _content(self, request: protocol.Request) -> protocol.Identity | protocol.State | protocol.Taken:
         """Return what answers a question, greeting the device first where it is a new one."""
         if self.closed:
             raise PortError("lost", "is closed", file=self.port.url, hint="open the rig again")
@@ -173,15 +150,15 @@ class _Conversation(NoticeBook):
         if self._lost:
             self._lost = False
             self._note("link", "answers again")
-        if isinstance(answer, Refused):
+        if isinstance(answer, protocol.Refused):
             latched = self._faults() if answer.code in ("latched", "active") else ()
-            raise DeviceRefusedError(answer.code, REFUSALS[answer.code], latched)
+            raise DeviceRefusedError(answer.code, protocol.REFUSALS[answer.code], latched)
         return answer.content
 
     def _faults(self) -> tuple[str, ...]:
         """Return the latched faults, which a refusal does not have."""
-        answer = self._exchange(Read())
-        if not isinstance(answer, Answer) or not isinstance(answer.content, State):
+        answer = self._exchange(protocol.Read())
+        if not isinstance(answer, protocol.Answer) or not isinstance(answer.content, protocol.State):
             return ()
         self._compare(answer.content)
         return answer.content.faults
@@ -193,12 +170,12 @@ class _Conversation(NoticeBook):
         if self._greeted_at == self.port.opened:
             return
         self._host.reset()
-        answer = self._exchange(Hello())
-        if not isinstance(answer, Answer) or answer.content != self.identity:
+        answer = self._exchange(protocol.Hello())
+        if not isinstance(answer, protocol.Answer) or answer.content != self.identity:
             raise PortError("lost", "is another device now", file=self.port.url, hint="start anew")
         self._greeted_at = self.port.opened
 
-    def _exchange(self, request: Request) -> Answer | Refused:
+    def _exchange(self, request: protocol.Request) -> protocol.Answer | protocol.Refused:
         """Repeat a question until it is answered."""
         data, sent = self._host.ask(request), self._now()
         silent, most = 0, 1 if self._silent else self.tries  # one that was silent holds up the loop no longer
@@ -206,7 +183,9 @@ class _Conversation(NoticeBook):
             before = self._heard
             answer = self._once(data)
             self._silent = self._heard == before
-            if isinstance(answer, Answer) and isinstance(answer.content, State | Taken):
+            if isinstance(answer, protocol.Answer) and isinstance(
+                answer.content, protocol.State | protocol.Taken
+            ):
                 self._device_clock.see(sent, self._now(), answer.content.uptime_ms)
             if answer is not None:
                 return answer
@@ -219,7 +198,7 @@ class _Conversation(NoticeBook):
         text = f"was asked {MOST_TRIES} times and only damaged answers came"
         raise PortError("lost", text, file=self.port.url, hint="check cable and ground")
 
-    def _once(self, data: bytes) -> Answer | Refused | None:
+    def _once(self, data: bytes) -> protocol.Answer | protocol.Refused | None:
         """Send a question and return its answer, None if none came in time or it was damaged."""
         self.port.write(data)
         # real time: on a stepped clock an answer that does not come would never be late
@@ -233,29 +212,31 @@ class _Conversation(NoticeBook):
             for event in events:
                 self._note_event(event)
             for event in events:
-                if isinstance(event, Answer) or (isinstance(event, Refused) and event.request is not None):
+                if isinstance(event, protocol.Answer) or (
+                    isinstance(event, protocol.Refused) and event.request is not None
+                ):
                     return event
-            if any(isinstance(event, Damaged | Refused) for event in events):
+            if any(isinstance(event, protocol.Damaged | protocol.Refused) for event in events):
                 return None  # no use in waiting for what was damaged
             if time.monotonic() > end:
                 return None  # bytes without end are no answer either
 
-    def _note_event(self, event: Event) -> None:
+    def _note_event(self, event: protocol.Event) -> None:
         match event:
-            case Damaged(why=why):
+            case protocol.Damaged(why=why):
                 self._note("damaged", f"a line came damaged ({why})")
-            case Refused(request=None):
+            case protocol.Refused(request=None):
                 self._note("damaged", "the device received a damaged line")
-            case Boot(cause=cause, count=count):
+            case protocol.Boot(cause=cause, count=count):
                 self._note("reset", f"the device was reset ({cause}, boot {count}); everything is off")
                 self._greeted_at, self._known = 0, None
                 self._drive_is_over()
-            case Unexpected(why=why):
+            case protocol.Unexpected(why=why):
                 self._note("unexpected", f"a line came that answers nothing ({why})")
             case _:
                 pass
 
-    def _compare(self, state: State) -> None:
+    def _compare(self, state: protocol.State) -> None:
         """Compare with the last state: a reset whose line was lost, a new latch, an expired drive."""
         last, self._known = self._known, state
         if last is None:
@@ -340,7 +321,7 @@ class DeviceRig(_Conversation):
     def read(self) -> Reading:
         """Return the newest sample; NaN everywhere while the device cannot be reached."""
         try:
-            state = self._ask(Read())
+            state = self._ask(protocol.Read())
             return self._reading(self._now(), state)
         except PortError:
             nothing = dict.fromkeys(self.identity.sensors, float("nan"))
@@ -361,7 +342,7 @@ class DeviceRig(_Conversation):
             return
         self._command = None  # whatever was renewed so far is over
         idle = not pump and not any(counts)
-        self._ask(Off() if idle else Drive(MAX_TTL_MS, pump, counts))
+        self._ask(protocol.Off() if idle else protocol.Drive(protocol.MAX_TTL_MS, pump, counts))
         self._command, self._confirmed = None if idle else (dict(drive), pump), self._clock()
 
     def wait(self, seconds: float) -> None:
@@ -389,7 +370,7 @@ class DeviceRig(_Conversation):
         if seconds and not possible:
             return False
         try:
-            self._ask(Sample(period))
+            self._ask(protocol.Sample(period))
         except DeviceRefusedError as refused:
             if refused.code == "unknown":
                 return False
@@ -415,15 +396,15 @@ class DeviceRig(_Conversation):
 
     def grasp(self, material: str, t_object: float) -> None:
         """Close the gripper."""
-        self._ask(Grip(1))
+        self._ask(protocol.Grip(1))
 
     def release(self) -> None:
         """Open the gripper; raises as :meth:`grasp`."""
-        self._ask(Grip(0))
+        self._ask(protocol.Grip(0))
 
     def clear(self) -> None:
         """Clear the fault latch; DeviceRefusedError where the cause is still there."""
-        self._ask(Clear())
+        self._ask(protocol.Clear())
 
     def close(self) -> None:
         """Switch everything off and let the port go; never raises, and may be called twice."""
@@ -431,7 +412,7 @@ class DeviceRig(_Conversation):
             return
         self._command = None
         try:
-            self._ask(Off())
+            self._ask(protocol.Off())
         except (PortError, DeviceRefusedError) as error:
             self._note("link", f"could not be switched off: {error}; its drive ends within {TTL_S:g} s")
         self.closed = True
@@ -444,7 +425,7 @@ class DeviceRig(_Conversation):
     def _counts(self, drive: Mapping[str, float]) -> tuple[int, ...]:
         return tuple(round(1e4 * drive[channel.name]) for channel in self.identity.drives)
 
-    def _reading(self, time_s: float, content: State | Kept) -> Reading:
+    def _reading(self, time_s: float, content: protocol.State | protocol.Kept) -> Reading:
         values = {
             name: float("nan") if isinstance(value, str) else value / 1000
             for name, value in zip(self.identity.sensors, content.temperatures)
@@ -452,18 +433,18 @@ class DeviceRig(_Conversation):
         applied = {channel.name: value / 1e4 for channel, value in zip(self.identity.drives, content.drive)}
         return Reading(time_s, values, applied, content.pump)
 
-    def _next_taken(self, gathering: Gathering) -> Taken | None:
+    def _next_taken(self, gathering: Gathering) -> protocol.Taken | None:
         """Return the device's next readings, None where it cannot be reached or was reset."""
         try:
-            content = self._content(Take(gathering.number))
+            content = self._content(protocol.Take(gathering.number))
         except PortError:
             return None
         except DeviceRefusedError:  # it was reset: it takes none any more, or counts from 0
             gathering.device_was_reset()
             with suppress(PortError):  # then the next call begins
-                self._ask(Sample(gathering.period_ms))
+                self._ask(protocol.Sample(gathering.period_ms))
             return None
-        assert isinstance(content, Taken)
+        assert isinstance(content, protocol.Taken)
         return content
 
     def _renew(self) -> None:
@@ -475,7 +456,7 @@ class DeviceRig(_Conversation):
             self._note("expired", f"the program stood still for {self._clock() - self._confirmed:.1f} s")
             return
         try:
-            self._ask(Drive(MAX_TTL_MS, pump, self._counts(drive)))
+            self._ask(protocol.Drive(protocol.MAX_TTL_MS, pump, self._counts(drive)))
             self._confirmed = self._clock()
         except PortError:
             self._command = None  # by the time it is back, it has expired: only the loop may drive it again

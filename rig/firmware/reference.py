@@ -35,28 +35,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
-from thermogrip.rig.serial.protocol import (
-    MAX_BODY,
-    MAX_TTL_MS,
-    Channel,
-    Clear,
-    Damaged,
-    Drive,
-    Grip,
-    Hello,
-    Identity,
-    Kept,
-    Line,
-    LineParser,
-    Off,
-    Request,
-    Sample,
-    State,
-    Take,
-    Taken,
-    encode_line,
-    parse_request,
-)
+from thermogrip.rig.serial import protocol
 
 CELLS = 120
 MIN_PERIOD_MS, MAX_PERIOD_MS = 10, 1000
@@ -118,13 +97,13 @@ class Ring:
             self.first = (self.first + 1) % _WRAP
         return True
 
-    def at(self, place: int, now_ms: int) -> Kept | None:
+    def at(self, place: int, now_ms: int) -> protocol.Kept | None:
         """Return the reading at a place from the first, with its age; None where the tick has none."""
         slot = self._slots[place]
         if slot is None:
             return None
         age = (now_ms - slot.at_ms) % 2**16  # of the clock only so much is kept
-        return Kept(age, slot.pump, slot.drive, slot.temperatures)
+        return protocol.Kept(age, slot.pump, slot.drive, slot.temperatures)
 
     def __len__(self) -> int:
         return len(self._slots)
@@ -168,7 +147,7 @@ class Sensor:
 class Board:
     """What is wired to the device."""
 
-    drives: tuple[Channel, ...] = (Channel("drive", "1", -10_000, 10_000),)
+    drives: tuple[protocol.Channel, ...] = (protocol.Channel("drive", "1", -10_000, 10_000),)
     sensors: tuple[Sensor, ...] = (
         Sensor("t_tank"),
         Sensor("t_surface"),
@@ -214,7 +193,7 @@ class DeviceCore:
     faults: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        self._parser = LineParser()
+        self._parser = protocol.LineParser()
         self._zero = (0,) * len(self.board.drives)
         self._drive, self._pump, self._grip = self._zero, 0, 0
         self._expires_ms, self._flow_ms = 0, 0
@@ -231,10 +210,10 @@ class DeviceCore:
         return Outputs(int(armed), self._drive, self._pump, self._grip)
 
     @property
-    def identity(self) -> Identity:
+    def identity(self) -> protocol.Identity:
         """The device's identity."""
         names = tuple(sensor.name for sensor in self.board.sensors)
-        return Identity(VERSION, self.board.drives, self.board.pump, names)
+        return protocol.Identity(VERSION, self.board.drives, self.board.pump, names)
 
     @property
     def expires_ms(self) -> int | None:
@@ -243,13 +222,13 @@ class DeviceCore:
 
     def announcement(self) -> bytes:
         """Return the line that a device sends once after a reset."""
-        return encode_line(0, "boot", self.cause, str(self.boot), VERSION)
+        return protocol.encode_line(0, "boot", self.cause, str(self.boot), VERSION)
 
-    def state(self, now_ms: int) -> State:
+    def state(self, now_ms: int) -> protocol.State:
         """Return the whole state."""
         uptime = (now_ms - self.started_ms) % 2**32
         head = (self.mode, uptime, self.cause, self.boot, self.faults)
-        return State(*head, self._pump, self._grip, self._drive, self._values)
+        return protocol.State(*head, self._pump, self._grip, self._drive, self._values)
 
     def receive(self, data: bytes, now_ms: int) -> bytes:
         """Take what came over the line and return what goes back."""
@@ -285,72 +264,72 @@ class DeviceCore:
         self._values = tuple(values)
         self.ring.keep(now_ms, self._pump, self._drive, self._values)
 
-    def _answer(self, line: Line | Damaged, now_ms: int) -> bytes:
+    def _answer(self, line: protocol.Line | protocol.Damaged, now_ms: int) -> bytes:
         """Return the answer to one line; a question that is repeated gets its answer repeated."""
-        if isinstance(line, Damaged):
-            return encode_line(0, "err", "corrupt")
+        if isinstance(line, protocol.Damaged):
+            return protocol.encode_line(0, "err", "corrupt")
         if line.words[0] in _WORDS_OF_A_DEVICE:
             return b""
         if self._last is not None and line.seq == self._last[0] and line.words != ("hello",):
             return self._last[1]
-        request = parse_request(line.words)
+        request = protocol.parse_request(line.words)
         refusal = request if isinstance(request, str) else self._obey(request, now_ms)
         if refusal:
-            answer = encode_line(line.seq, "err", refusal)
-        elif isinstance(request, Hello):
-            answer = encode_line(line.seq, "ok", *self.identity.words())
-        elif isinstance(request, Take):
-            answer = encode_line(line.seq, "ok", *self._taken(line.seq, now_ms).words())
+            answer = protocol.encode_line(line.seq, "err", refusal)
+        elif isinstance(request, protocol.Hello):
+            answer = protocol.encode_line(line.seq, "ok", *self.identity.words())
+        elif isinstance(request, protocol.Take):
+            answer = protocol.encode_line(line.seq, "ok", *self._taken(line.seq, now_ms).words())
         else:
-            answer = encode_line(line.seq, "ok", *self.state(now_ms).words())
+            answer = protocol.encode_line(line.seq, "ok", *self.state(now_ms).words())
         self._last = (line.seq, answer)
         return answer
 
-    def _obey(self, request: Request, now_ms: int) -> str:
+    def _obey(self, request: protocol.Request, now_ms: int) -> str:
         """Execute a request and return nothing, or the code of the refusal."""
         match request:
-            case Hello():
+            case protocol.Hello():
                 self._greeted = True
                 self._switch_off("latched" if self.faults else "off")
-            case Off():
+            case protocol.Off():
                 self._switch_off("latched" if self.faults else "off")
-            case Grip(closed=closed):
+            case protocol.Grip(closed=closed):
                 self._grip = closed
-            case Clear():
+            case protocol.Clear():
                 if any(count.kind for count in self._bad_counts):
                     return "active"
                 self.faults = ()
                 self._switch_off("off")
-            case Drive():
+            case protocol.Drive():
                 return self._set_drive(request, now_ms)
-            case Sample(period_ms=period):
+            case protocol.Sample(period_ms=period):
                 if period and not MIN_PERIOD_MS <= period <= MAX_PERIOD_MS:
                     return "range"
                 self.ring.start(period, now_ms)
-            case Take(number=number):
+            case protocol.Take(number=number):
                 known = self.ring.due_ms is not None
                 return "idle" if not known else "" if self.ring.forget(number) else "range"
         return ""
 
-    def _taken(self, seq: int, now_ms: int) -> Taken:
+    def _taken(self, seq: int, now_ms: int) -> protocol.Taken:
         """Return as many of the readings as fit on a line."""
         head = (now_ms - self.started_ms) % 2**32, self.ring.first, self.ring.next
-        readings: list[Kept | None] = []
-        room = MAX_BODY - len(" ".join([str(seq), "ok", *Taken(*head, ()).words()]))
+        readings: list[protocol.Kept | None] = []
+        room = protocol.MAX_BODY - len(" ".join([str(seq), "ok", *protocol.Taken(*head, ()).words()]))
         for place in range(len(self.ring)):
             reading = self.ring.at(place, now_ms)
             room -= 1 + (1 if reading is None else len(reading.word()))
             if room < 0:
                 break
             readings.append(reading)
-        return Taken(*head, tuple(readings))
+        return protocol.Taken(*head, tuple(readings))
 
-    def _set_drive(self, request: Drive, now_ms: int) -> str:
+    def _set_drive(self, request: protocol.Drive, now_ms: int) -> str:
         if not self._greeted:
             return "hello"
         if self.faults:
             return "latched"
-        if not 1 <= request.ttl_ms <= MAX_TTL_MS:
+        if not 1 <= request.ttl_ms <= protocol.MAX_TTL_MS:
             return "ttl"
         if len(request.drive) != len(self.board.drives):
             return "syntax"

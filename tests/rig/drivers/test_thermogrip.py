@@ -347,7 +347,7 @@ def test_an_older_firmware_is_to_be_polled(plant: Plant, monkeypatch: pytest.Mon
     def of_old(words: Sequence[str]) -> Request | str:
         return "unknown" if words[0] in ("sample", "take") else parse_request(words)
 
-    monkeypatch.setattr("thermogrip.rig.firmware.reference.parse_request", of_old)
+    monkeypatch.setattr("thermogrip.rig.serial.protocol.parse_request", of_old)
     old = Sampling(plant)
     assert not old.rig.sample_every(DT)
     with Sampler(old.rig, DT, clock=old.clock, sleep=old.clock.sleep) as sampler:

@@ -14,25 +14,7 @@ from hypothesis import strategies as st
 
 from tests.rig.cores import SCRIPTS, START, last_state, reference, say
 from thermogrip.rig.firmware.reference import CELLS, DeviceCore, Ring
-from thermogrip.rig.serial.protocol import (
-    MAX_BODY,
-    Answer,
-    Event,
-    Hello,
-    HostEnd,
-    Kept,
-    Line,
-    LineParser,
-    Read,
-    Refused,
-    Request,
-    Sample,
-    Take,
-    Taken,
-    Unexpected,
-    encode_line,
-    parse_taken,
-)
+from thermogrip.rig.serial import protocol
 
 SIZE = CELLS // 5  # of one drive and three sensors
 
@@ -82,12 +64,12 @@ class Conversation:
     """A host and a device on one clock; tick k measures k thousandths of a degC."""
 
     def __init__(self, period_ms: int = 10) -> None:
-        self.host, self.core, self.now = HostEnd(), DeviceCore(), 0
+        self.host, self.core, self.now = protocol.HostEnd(), DeviceCore(), 0
         self.core.sample([25_000, 25_000, 25_000], flow=True, now_ms=0)
-        self.host.hear(self.core.receive(self.host.ask(Hello()), 0))
-        self.ask(Sample(period_ms))
+        self.host.hear(self.core.receive(self.host.ask(protocol.Hello()), 0))
+        self.ask(protocol.Sample(period_ms))
 
-    def ask(self, request: Request) -> Event:
+    def ask(self, request: protocol.Request) -> protocol.Event:
         (event,) = self.host.hear(self.core.receive(self.host.ask(request), self.now))
         return event
 
@@ -98,13 +80,13 @@ class Conversation:
                 self.core.keep([self.core.ring.next, 25_000, 25_000], self.now)
             self.now += 1
 
-    def take(self, number: int) -> Taken:
-        event = self.ask(Take(number))
-        assert isinstance(event, Answer)
-        assert isinstance(event.content, Taken)
+    def take(self, number: int) -> protocol.Taken:
+        event = self.ask(protocol.Take(number))
+        assert isinstance(event, protocol.Answer)
+        assert isinstance(event.content, protocol.Taken)
         return event.content
 
-    def numbers(self, taken: Taken) -> list[int]:
+    def numbers(self, taken: protocol.Taken) -> list[int]:
         """Return the numbers of the readings, each of which holds its own."""
         found = [taken.first + k for k, kept in enumerate(taken.readings) if kept is not None]
         assert found == [kept.temperatures[0] for kept in taken.readings if kept is not None]
@@ -113,13 +95,13 @@ class Conversation:
 
 numbers = st.integers(-(2**31), 2**31 - 1)
 temperatures = st.lists(numbers | st.sampled_from(["open", "short"]), min_size=1, max_size=4).map(tuple)
-kept = st.builds(Kept, st.integers(0, 65535), st.integers(0, 1), st.tuples(numbers), temperatures)
+kept = st.builds(protocol.Kept, st.integers(0, 65535), st.integers(0, 1), st.tuples(numbers), temperatures)
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 2**32 - 1), st.lists(kept | st.none(), max_size=2))
-def test_what_is_taken_reads_back(uptime: int, first: int, readings: list[Kept | None]) -> None:
-    taken = Taken(uptime, first, (first + len(readings)) % 2**32, tuple(readings))
-    assert parse_taken(taken.words(), 1) == taken
+def test_what_is_taken_reads_back(uptime: int, first: int, readings: list[protocol.Kept | None]) -> None:
+    taken = protocol.Taken(uptime, first, (first + len(readings)) % 2**32, tuple(readings))
+    assert protocol.parse_taken(taken.words(), 1) == taken
     assert taken.waiting == 0
 
 
@@ -143,16 +125,16 @@ def test_what_is_taken_reads_back(uptime: int, first: int, readings: list[Kept |
     ],
 )
 def test_readings_that_make_no_sense_are_none(text: str) -> None:
-    assert parse_taken(text.split(), 1) is None
+    assert protocol.parse_taken(text.split(), 1) is None
 
 
 def test_readings_of_another_shape_than_the_device_has_are_not_used() -> None:
     talk = Conversation()
-    talk.host.ask(Take(0))
+    talk.host.ask(protocol.Take(0))
     seq = int(talk.host.again().split()[0])
     for odd in ("4,1,0,25000", "4,1,0,1,2,3,4"):
-        (event,) = talk.host.hear(encode_line(seq, "ok", "1", "0", "1", odd))
-        assert isinstance(event, Unexpected)
+        (event,) = talk.host.hear(protocol.encode_line(seq, "ok", "1", "0", "1", odd))
+        assert isinstance(event, protocol.Unexpected)
 
 
 def test_every_tick_is_taken_once_however_irregularly_the_host_asks() -> None:
@@ -211,22 +193,22 @@ def test_numbers_follow_the_clock_however_long_it_stood(period: int, stood: int,
 def test_a_number_that_has_not_come_is_refused_nothing_is_forgotten_and_a_reset_ends_it() -> None:
     talk = Conversation()
     talk.run(45)
-    assert talk.ask(Take(6)) == Refused(Take(6), "range")
-    talk.ask(Read())
+    assert talk.ask(protocol.Take(6)) == protocol.Refused(protocol.Take(6), "range")
+    talk.ask(protocol.Read())
     assert talk.take(0).first == 0
     assert talk.take(5).readings == ()
     for k in range(20):  # the guards do not check readings that the host asked for
         talk.core.keep(["open", 99_000, 25_000], 100 + 10 * k)
     assert talk.core.faults == ()
     talk.core = DeviceCore(cause="watchdog", boot=2)
-    assert talk.ask(Take(5)) == Refused(Take(5), "idle")
+    assert talk.ask(protocol.Take(5)) == protocol.Refused(protocol.Take(5), "idle")
 
 
 @pytest.mark.parametrize("period", [-10, 1, 9, 1001])
 def test_a_period_that_the_device_cannot_keep_is_refused(period: int) -> None:
     talk = Conversation()
     talk.run(30)
-    assert talk.ask(Sample(period)) == Refused(Sample(period), "range")
+    assert talk.ask(protocol.Sample(period)) == protocol.Refused(protocol.Sample(period), "range")
     assert talk.take(0).next == 3  # what ran goes on
 
 
@@ -236,12 +218,12 @@ def test_an_answer_never_outgrows_a_line_and_always_brings_a_tick() -> None:
     for _ in range(SIZE):
         talk.core.keep([-(2**31), -(2**31), -(2**31)], talk.now)
         talk.now += 1000
-    back = talk.core.receive(encode_line(65535, "take", str(2**32 - 30)), 2**32 - 1)
-    (line,) = LineParser().feed(back)
-    assert isinstance(line, Line)
-    taken = parse_taken(line.words[1:], 1)
+    back = talk.core.receive(protocol.encode_line(65535, "take", str(2**32 - 30)), 2**32 - 1)
+    (line,) = protocol.LineParser().feed(back)
+    assert isinstance(line, protocol.Line)
+    taken = protocol.parse_taken(line.words[1:], 1)
     assert len(taken.readings) >= 2
-    assert len(back) <= MAX_BODY + 12
+    assert len(back) <= protocol.MAX_BODY + 12
 
 
 @pytest.mark.parametrize("how", ["cut", "flip", "lose"])
@@ -250,13 +232,13 @@ def test_an_answer_damaged_at_any_byte_loses_nothing(how: str) -> None:
     while place < end:
         talk = Conversation()
         talk.run(60)
-        back = talk.core.receive(talk.host.ask(Take(0)), talk.now)
+        back = talk.core.receive(talk.host.ask(protocol.Take(0)), talk.now)
         spoilt = {
             "cut": back[:place],
             "flip": back[:place] + bytes([back[place] ^ 1]) + back[place + 1 :],
             "lose": back[:place] + back[place + 1 :],
         }[how]
-        assert not any(isinstance(event, Answer) for event in talk.host.hear(spoilt))
+        assert not any(isinstance(event, protocol.Answer) for event in talk.host.hear(spoilt))
         talk.run(20)
         talk.host.reset()  # half a line may stand there; the host asks anew, with another number
         taken = talk.take(0)
@@ -268,7 +250,7 @@ def test_an_answer_damaged_at_any_byte_loses_nothing(how: str) -> None:
 def test_a_repeated_question_repeats_its_answer_though_time_went_on() -> None:
     talk = Conversation()
     talk.run(60)
-    data = talk.host.ask(Take(0))
+    data = talk.host.ask(protocol.Take(0))
     first = talk.core.receive(data, talk.now)
     talk.run(300)
     assert talk.core.receive(data, talk.now) == first

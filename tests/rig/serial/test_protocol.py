@@ -12,59 +12,34 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from thermogrip.rig.firmware.reference import DeviceCore
-from thermogrip.rig.serial.protocol import (
-    MAX_BODY,
-    REFUSALS,
-    Answer,
-    Boot,
-    Clear,
-    Damaged,
-    Drive,
-    Grip,
-    Hello,
-    HostEnd,
-    Line,
-    LineParser,
-    Off,
-    Read,
-    Refused,
-    Sample,
-    State,
-    Take,
-    Unexpected,
-    crc16,
-    decode_line,
-    encode_line,
-    parse_identity,
-    parse_request,
-    parse_state,
-    request_words,
-)
+from thermogrip.rig.serial import protocol
 from thermogrip.rig.simulation.cable import SPOILS
 
 SPECIFICATION = Path(__file__).parents[3] / "docs" / "reference" / "protocol.md"
 LINES = [
-    encode_line(7, "read"),
-    encode_line(8, "drive", "2000", "1", "-2500"),
-    encode_line(8, "ok", "armed", "81204", "power", "17", "-", "1", "0", "-2500", "31250,open,25000"),
-    encode_line(65535, "err", "interlock"),
-    encode_line(0, "boot", "watchdog", "18", "0.1.0"),
+    protocol.encode_line(7, "read"),
+    protocol.encode_line(8, "drive", "2000", "1", "-2500"),
+    protocol.encode_line(
+        8, "ok", "armed", "81204", "power", "17", "-", "1", "0", "-2500", "31250,open,25000"
+    ),
+    protocol.encode_line(65535, "err", "interlock"),
+    protocol.encode_line(0, "boot", "watchdog", "18", "0.1.0"),
 ]
 STREAM = b"".join(LINES)
-SENT = [decode_line(line[:-1]) for line in LINES]
+SENT = [protocol.decode_line(line[:-1]) for line in LINES]
 
 words = st.text(
     st.characters(min_codepoint=33, max_codepoint=126, exclude_characters="*"), min_size=1, max_size=20
 )
 lines = st.builds(
-    lambda seq, parts: encode_line(seq, *parts),
+    lambda seq, parts: protocol.encode_line(seq, *parts),
     st.integers(0, 65535),
     st.lists(words, min_size=1, max_size=6),
 )
 
 
 def test_the_crc_is_the_catalogues_check_value() -> None:
-    assert crc16(b"123456789") == 0x29B1  # CRC-16/IBM-3740, in the catalogue of parametrised CRCs
+    assert protocol.crc16(b"123456789") == 0x29B1  # CRC-16/IBM-3740, in the catalogue of parametrised CRCs
 
 
 def test_the_vectors_of_the_specification_are_true() -> None:
@@ -72,9 +47,9 @@ def test_the_vectors_of_the_specification_are_true() -> None:
     vectors = re.findall(r"^\| `([^`]+)` \|", right, flags=re.MULTILINE)
     assert len(vectors) >= 12
     for text in vectors:
-        line = decode_line(text.encode())
-        assert isinstance(line, Line), text
-        assert encode_line(line.seq, *line.words) == text.encode() + b"\n"
+        line = protocol.decode_line(text.encode())
+        assert isinstance(line, protocol.Line), text
+        assert protocol.encode_line(line.seq, *line.words) == text.encode() + b"\n"
 
 
 def test_the_bad_lines_of_the_specification_are_refused_for_the_reason_given() -> None:
@@ -82,26 +57,26 @@ def test_the_bad_lines_of_the_specification_are_refused_for_the_reason_given() -
     bad = re.findall(r"^\| `([^`]+)` \| ([a-z]+) \|", wrong, flags=re.MULTILINE)
     assert {why for _, why in bad} == {"check", "length", "crc", "grammar"}
     for text, why in bad:
-        damaged = decode_line(text.encode())
-        assert isinstance(damaged, Damaged)
+        damaged = protocol.decode_line(text.encode())
+        assert isinstance(damaged, protocol.Damaged)
         assert damaged.why == why, text
 
 
 def test_the_specification_names_every_refusal() -> None:
     text = SPECIFICATION.read_text()
-    assert all(f"`{code}`" in text for code in REFUSALS)
+    assert all(f"`{code}`" in text for code in protocol.REFUSALS)
 
 
 @given(lines)
 def test_what_is_encoded_is_decoded(line: bytes) -> None:
-    decoded = decode_line(line[:-1])
-    assert isinstance(decoded, Line)
-    assert encode_line(decoded.seq, *decoded.words) == line
+    decoded = protocol.decode_line(line[:-1])
+    assert isinstance(decoded, protocol.Line)
+    assert protocol.encode_line(decoded.seq, *decoded.words) == line
 
 
-def heard(stream: bytes) -> list[Line]:
+def heard(stream: bytes) -> list[protocol.Line]:
     """Return the whole lines of a stream, each of which was sent."""
-    found = [event for event in LineParser().feed(stream) if isinstance(event, Line)]
+    found = [event for event in protocol.LineParser().feed(stream) if isinstance(event, protocol.Line)]
     assert all(line in SENT for line in found)
     return found
 
@@ -110,7 +85,7 @@ def heard(stream: bytes) -> list[Line]:
 @example([1])
 def test_pieces_of_any_size_give_the_same_lines(places: list[int]) -> None:
     for cuts in (places, *([place] for place in range(len(STREAM) + 1) if places == [1])):
-        parser = LineParser()
+        parser = protocol.LineParser()
         pieces = [event for a, b in pairwise([0, *cuts, len(STREAM)]) for event in parser.feed(STREAM[a:b])]
         assert pieces == SENT
 
@@ -128,12 +103,12 @@ def test_a_byte_spoilt_or_lost_anywhere_costs_its_line_and_at_most_the_next() ->
 def test_every_kind_of_damage_is_noticed(seed: int, kind: str) -> None:
     rng = Random(seed)
     line = rng.choice(LINES)
-    assert heard(SPOILS[kind](line, rng)) in ([], [decode_line(line[:-1])])
+    assert heard(SPOILS[kind](line, rng)) in ([], [protocol.decode_line(line[:-1])])
 
 
 @given(st.binary(max_size=600))
 def test_noise_is_never_a_line(noise: bytes) -> None:
-    assert not any(isinstance(event, Line) for event in LineParser().feed(noise + b"\n"))
+    assert not any(isinstance(event, protocol.Line) for event in protocol.LineParser().feed(noise + b"\n"))
 
 
 @given(st.integers(0, len(STREAM)), st.integers(0, len(STREAM)))
@@ -143,13 +118,13 @@ def test_the_head_of_one_line_never_goes_with_the_tail_of_another(start: int, en
 
 
 def test_endless_noise_without_an_end_of_line_takes_no_memory() -> None:
-    parser = LineParser()
+    parser = protocol.LineParser()
     for _ in range(1000):
         assert parser.feed(b"x" * 1000) == []
-    assert len(parser._pending) <= MAX_BODY + 12
+    assert len(parser._pending) <= protocol.MAX_BODY + 12
     events = parser.feed(b"\n" + LINES[0])
-    assert [type(event) for event in events] == [Damaged, Line]
-    assert isinstance(events[0], Damaged)
+    assert [type(event) for event in events] == [protocol.Damaged, protocol.Line]
+    assert isinstance(events[0], protocol.Damaged)
     assert events[0].why == "overlong"
 
 
@@ -160,25 +135,26 @@ def test_endless_noise_without_an_end_of_line_takes_no_memory() -> None:
 )  # fmt: skip
 def test_words_that_make_no_line_are_refused(seq: int, parts: tuple[str, ...]) -> None:
     with pytest.raises(ValueError, match=r"line|ascii"):
-        encode_line(seq, *parts)
+        protocol.encode_line(seq, *parts)
 
 
 @pytest.mark.parametrize(
     "request_",
-    [Hello(), Read(), Off(), Clear(), Grip(1), Drive(2000, 1, (1, -2)), Drive(1, 0, (0,)), Sample(10),
-     Sample(0), Take(0), Take(2**32 - 1)],
+    [protocol.Hello(), protocol.Read(), protocol.Off(), protocol.Clear(), protocol.Grip(1),
+     protocol.Drive(2000, 1, (1, -2)), protocol.Drive(1, 0, (0,)), protocol.Sample(10), protocol.Sample(0),
+     protocol.Take(0), protocol.Take(2**32 - 1)],
 )  # fmt: skip
-def test_a_question_reads_back(request_: Hello) -> None:
-    assert parse_request(request_words(request_)) == request_
+def test_a_question_reads_back(request_: protocol.Hello) -> None:
+    assert protocol.parse_request(protocol.request_words(request_)) == request_
 
 
 @pytest.mark.parametrize("text", ["sample", "sample x", "sample 1 2", "take", "take -", "take 4294967296"])
 def test_a_question_with_the_wrong_words_is_refused(text: str) -> None:
-    assert parse_request(text.split()) == "syntax"
+    assert protocol.parse_request(text.split()) == "syntax"
 
 
 states = st.builds(
-    State,
+    protocol.State,
     mode=st.sampled_from(["off", "armed", "expired"]),
     uptime_ms=st.integers(0, 2**32 - 1),
     cause=st.sampled_from(["power", "watchdog"]),
@@ -194,8 +170,8 @@ states = st.builds(
 
 
 @given(states)
-def test_a_state_reads_back(state: State) -> None:
-    assert parse_state(state.words()) == state
+def test_a_state_reads_back(state: protocol.State) -> None:
+    assert protocol.parse_state(state.words()) == state
 
 
 @pytest.mark.parametrize(
@@ -216,7 +192,7 @@ def test_a_state_reads_back(state: State) -> None:
     ],
 )
 def test_a_state_that_makes_no_sense_is_none(text: str) -> None:
-    assert parse_state(text.split()) is None
+    assert protocol.parse_state(text.split()) is None
 
 
 @pytest.mark.parametrize(
@@ -226,52 +202,54 @@ def test_a_state_that_makes_no_sense_is_none(text: str) -> None:
      "thermogrip/1 0.1.0 drive:1:-1:1 pump T!", "thermogrip/1 0.1.0 drive:1:-1:1 pump"],
 )  # fmt: skip
 def test_an_identity_that_makes_no_sense_is_none(text: str) -> None:
-    assert parse_identity(text.split()) is None
+    assert protocol.parse_identity(text.split()) is None
 
 
 def _answer(seq: int) -> bytes:
-    return encode_line(seq, *LINES[2].split(b"*")[0].decode().split(" ")[1:])
+    return protocol.encode_line(seq, *LINES[2].split(b"*")[0].decode().split(" ")[1:])
 
 
 def test_only_the_open_question_is_answered() -> None:
-    host = HostEnd()
-    host.ask(Read())
-    host.ask(Read())
+    host = protocol.HostEnd()
+    host.ask(protocol.Read())
+    host.ask(protocol.Read())
     late, answered, twice = host.hear(_answer(1) + _answer(2) + _answer(2))
-    assert (type(late), late.why) == (Unexpected, "late")
-    assert isinstance(answered, Answer)
-    assert (type(twice), twice.why) == (Unexpected, "duplicate")
+    assert (type(late), late.why) == (protocol.Unexpected, "late")
+    assert isinstance(answered, protocol.Answer)
+    assert (type(twice), twice.why) == (protocol.Unexpected, "duplicate")
 
 
 def test_an_echo_is_distinguished_from_an_answer() -> None:
-    host = HostEnd()
-    (echo,) = host.hear(host.ask(Read()))
-    assert (type(echo), echo.why) == (Unexpected, "echo")
-    assert host.open == Read()
+    host = protocol.HostEnd()
+    (echo,) = host.hear(host.ask(protocol.Read()))
+    assert (type(echo), echo.why) == (protocol.Unexpected, "echo")
+    assert host.open == protocol.Read()
 
 
 def test_an_answer_of_another_shape_than_the_device_has_is_not_used() -> None:
-    host, core = HostEnd(), DeviceCore()
-    host.hear(core.receive(host.ask(Hello()), 0))
-    host.ask(Read())
-    two_drives = State("armed", 1, "power", 17, (), 1, 0, (1, 2), (25000, 25000, 25000))
-    (odd,) = host.hear(encode_line(2, "ok", *two_drives.words()))
-    assert isinstance(odd, Unexpected)
-    assert host.open == Read()
+    host, core = protocol.HostEnd(), DeviceCore()
+    host.hear(core.receive(host.ask(protocol.Hello()), 0))
+    host.ask(protocol.Read())
+    two_drives = protocol.State("armed", 1, "power", 17, (), 1, 0, (1, 2), (25000, 25000, 25000))
+    (odd,) = host.hear(protocol.encode_line(2, "ok", *two_drives.words()))
+    assert isinstance(odd, protocol.Unexpected)
+    assert host.open == protocol.Read()
 
 
 def test_a_reset_is_announced_damage_is_reported_and_an_unknown_refusal_is_not_used() -> None:
-    host = HostEnd()
-    assert host.hear(DeviceCore(cause="watchdog", boot=18).announcement()) == [Boot("watchdog", 18, "0.1.0")]
-    assert host.hear(DeviceCore().receive(b"7 reed*06EC819405\n", 0)) == [Refused(None, "corrupt")]
-    host.ask(Read())
-    (odd,) = host.hear(encode_line(1, "err", "mood"))
-    assert isinstance(odd, Unexpected)
+    host = protocol.HostEnd()
+    assert host.hear(DeviceCore(cause="watchdog", boot=18).announcement()) == [
+        protocol.Boot("watchdog", 18, "0.1.0")
+    ]
+    assert host.hear(DeviceCore().receive(b"7 reed*06EC819405\n", 0)) == [protocol.Refused(None, "corrupt")]
+    host.ask(protocol.Read())
+    (odd,) = host.hear(protocol.encode_line(1, "err", "mood"))
+    assert isinstance(odd, protocol.Unexpected)
 
 
 def test_sequence_numbers_go_round_and_leave_out_zero() -> None:
-    host = HostEnd()
-    seen = [int(host.ask(Read()).split()[0]) for _ in range(65537)]
+    host = protocol.HostEnd()
+    seen = [int(host.ask(protocol.Read()).split()[0]) for _ in range(65537)]
     assert seen[:2] == [1, 2]
     assert seen[-2:] == [1, 2]
     assert 0 not in seen
