@@ -94,40 +94,6 @@ def test_a_key_of_the_spec_that_only_the_plant_can_refuse_is_reported_with_its_f
     assert not (lab.path / "c.json").exists()
 
 
-def test_tune_and_run_leave_whole_pages(bench: Bench):
-    bench.write("quick.toml", SPEC)
-    done = bench.run(
-        *("tune", "plant.json", "--spec", "quick.toml", "--out", "c.json", "--report", "tune.html", "--json")
-    )
-    assert done.code in (0, 3), done
-    answer = json.loads(done.out)
-    assert {row["controller"] for row in answer["rows"]} == {"baseline", "tuned", "PI", "LQR"}
-    assert {item["knob"] for item in answer["sensitivity"]} >= {"move", "horizon", "blocks"}
-    assert any(row["best"] for row in answer["pareto"])
-    kept = json.loads((bench.path / "c.json").read_text())["notes"]
-    assert kept["pareto"] == answer["pareto"]
-    assert len(kept["in_words"]) == len(answer["sensitivity"])
-    page = (bench.path / "tune.html").read_text()
-    for heading in (
-        "Does the controller meet the spec?",
-        "What can be traded?",
-        "Which numbers matter?",
-        "fast enough?",
-    ):
-        assert heading in page
-    assert "cannot settle under" in page
-    ran = bench.run(
-        *("run", "c.json", "--twin", "plant.json", "--target", "29", "--out", "r", "--report", "r/run.html")
-    )
-    assert ran.code == 0, ran
-    session = (bench.path / "r" / "run.html").read_text()
-    assert "Settled on plant.json, draw 0." in session
-    assert "as its sensors read it" in session
-    for text in (page, session):
-        assert "http" not in text.replace("http-equiv", "")
-        assert "nan" not in text.split("<main>")[1].replace("data:image", "").lower().split("base64")[0]
-
-
 def test_a_class_of_ones_own_with_two_outputs_is_tuned_and_run(lab: Bench):
     own = ("--network", "lab.py:Lab")
     done = lab.run("tune", "lab.json", *own, "--spec", "lab.toml", "--out", "c.json", "--json")

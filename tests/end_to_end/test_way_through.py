@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,11 +21,10 @@ check_draws = 1
 """
 
 
-def answer(bench: Bench, *words: object, code: int = 0) -> dict[str, object]:
+def answer(bench: Bench, *words: object, code: int = 0) -> dict[str, Any]:
     done = bench.run(*words, "--json")
     assert done.code == code, done.err
     found = json.loads(done.out)
-    assert isinstance(found, dict)
     return found
 
 
@@ -33,7 +33,6 @@ def test_logs_become_a_plant_that_runs_freely(bench: Bench) -> None:
     found = answer(bench, "identify", "good.csv", *options, "--report", "p.html")
     assert found["model"] == "arx"
     scored = answer(bench, "validate", "p.json", "good.csv")["logs"]
-    assert isinstance(scored, list)
     assert scored[0]["outputs"]["t_tank"]["rmse"] < 0.2  # noise 0.02
     assert set(scored[0]["outputs"]["t_tank"]) == {"fit_percent", "rmse", "unit", "n"}
     assert "<svg" not in (bench.path / "p.html").read_text()
@@ -48,22 +47,40 @@ def test_the_plant_simulates_what_was_measured(bench: Bench) -> None:
     assert np.sqrt(np.mean((y - v) ** 2)) < 0.05  # the truth itself, noise 0.02
 
 
-def test_a_plant_becomes_a_controller_that_grasps(bench: Bench) -> None:
+def test_a_plant_becomes_a_controller_that_grasps_and_both_have_whole_pages(bench: Bench) -> None:
     bench.write("spec.toml", SPEC)
     tuned = answer(
         bench, "tune", "plant.json", "--spec", "spec.toml", "--out", "c.json", "--report", "t.html"
     )
     assert tuned["meets_spec"] is True
+    assert {row["controller"] for row in tuned["rows"]} == {"baseline", "tuned", "PI", "LQR"}
+    assert {item["knob"] for item in tuned["sensitivity"]} >= {"move", "horizon", "blocks"}
+    assert any(row["best"] for row in tuned["pareto"])
+    kept = json.loads((bench.path / "c.json").read_text())["notes"]
+    assert kept["pareto"] == tuned["pareto"]
+    assert len(kept["in_words"]) == len(tuned["sensitivity"])
     checks = answer(bench, "review", "c.json")["checks"]
-    assert isinstance(checks, list)
     assert {check["verdict"] for check in checks} <= {"pass", "warn"}
     run = ["run", "c.json", "--target", "34", "--from", "28", "--twin", "plant.json", "--hold", "150"]
-    done = answer(bench, *run, "--object", "18", "--material", "copper", "--grasp-time", "2", "--out", "r")
+    run += ["--object", "18", "--material", "copper", "--grasp-time", "2", "--out", "r"]
+    done = answer(bench, *run, "--report", "r.html")
     assert done["verdict"] == "settled"
     assert abs(float(str(done["bias"]))) < 0.05
     made = {path.name for path in (bench.path / "r").iterdir()}
     assert made == {"run.json", "samples.csv", "events.jsonl", "grasps.csv", "grasps_meta.csv", "SHA256SUMS"}
-    again = bench.run(*run, "--out", "r")
+    pages = [(bench.path / name).read_text() for name in ("t.html", "r.html")]
+    headings = (
+        "Does the controller meet the spec?",
+        "What can be traded?",
+        "Which numbers matter?",
+        "fast enough?",
+    )
+    assert all(words in pages[0] for words in (*headings, "cannot settle under"))
+    assert all(words in pages[1] for words in ("Settled on plant.json, draw 0.", "as its sensors read it"))
+    for page in pages:
+        assert "http" not in page.replace("http-equiv", "")
+        assert "nan" not in page.split("<main>")[1].replace("data:image", "").lower().split("base64")[0]
+    again = bench.run(*run)
     assert again.code == 2
     assert "holds a run already" in again.said[0]
 
@@ -81,7 +98,6 @@ def test_grasps_become_materials(bench: Bench) -> None:
 def test_a_comparison_says_n_and_interval(bench: Bench) -> None:
     words = ["compare", "grasps.csv", "--classifiers", "features-lda,pca-lda", "--repeats", "2"]
     found = answer(bench, *words, "--train-per-class", "3", "--out", "c")["splits"]
-    assert isinstance(found, dict)
     assert set(found) == {"shipped", "random"}
     row = found["shipped"]["scores"][0]
     assert (row["n"], row["accuracy"]) == (4, 1.0)
