@@ -50,18 +50,14 @@ class Blocks(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """One grasp: true ``t_object`` [degC], ``onset`` of contact [s after the message], ``h_c``, and F.
+    """One grasp."""
 
-    ``rise`` (n,) is F at ``times`` (n,) since contact [s], ``room`` (n,) what the room does by the block's
-    far face [K], nothing by default.
-    """
-
-    t_object: float
-    onset: float
+    t_object: float  # true [degC]
+    onset: float  # of contact [s after the "closed" message]
     h_c: float
-    times: Array
-    rise: Array
-    room: Array | None = None
+    times: Array  # (n,), since contact [s]
+    rise: Array  # (n,), F at these times
+    room: Array | None = None  # (n,), what the room does by the block's far face [K], nothing by default
 
     def response(self, t: ArrayLike) -> Array:
         """Return F at times since the "closed" message [s], same shape; 0 before contact."""

@@ -196,19 +196,15 @@ _LONGEST = 1.5  # of a step of theta, mostly logarithms
 
 @dataclass(frozen=True)
 class Problem:
-    """Labelled grasps and priors, fixed during a fit.
+    """Labelled grasps and priors, fixed during a fit."""
 
-    ``data`` of n grasps; ``labels`` the materials, ``which`` (n,) the label of each; ``prior`` of theta;
-    ``ln_capacity`` (n_label,) of rho c_p times the block's length.
-    """
-
-    data: Touches
+    data: Touches  # of n grasps
     nodes: TimeNodes
-    labels: tuple[str, ...]
+    labels: tuple[str, ...]  # the materials
     library: tuple[Anchor, ...]
-    which: NDArray[np.int64]
-    prior: ThetaPrior
-    ln_capacity: Array
+    which: NDArray[np.int64]  # (n,), the label of each grasp
+    prior: ThetaPrior  # of theta
+    ln_capacity: Array  # (n_label,), of rho c_p times the block's length
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -308,20 +304,15 @@ def linearise(problem: Problem, theta: Array, w: Array, spread: Spread) -> Linea
 
 
 class Step(NamedTuple):
-    """One joint Gauss-Newton step.
+    """One joint Gauss-Newton step."""
 
-    New ``theta`` and ``w``, the ``damping`` to go on with, the ``objective`` before it and the log
-    determinant of the nuisances, their posterior variances ``variance`` (n, 7) in units of the prior, and
-    the precision of theta.
-    """
-
-    theta: Array
+    theta: Array  # new, as ``w``
     w: Array
-    damping: float
-    objective: float
-    log_det: float
-    variance: Array
-    precision: Array
+    damping: float  # to go on with
+    objective: float  # before it
+    log_det: float  # of the nuisances, before it
+    variance: Array  # (n, 7), posterior variances of the nuisances in units of the prior
+    precision: Array  # of theta
 
 
 def joint_step(

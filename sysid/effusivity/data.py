@@ -58,27 +58,21 @@ class Noise:
 
 @dataclass(frozen=True)
 class Touches:
-    """``n`` grasps, padded to the longest.
-
-    ``sample_t`` and ``sample_bin`` (n, n_sample): times and bin of each sample, -1 where lost; ``y``, ``t``,
-    ``count``, ``ramp`` (n, n_bin): mean temperature [degC], mean time [s], samples, mean time since the pump
-    stopped [s]; the rest (n,): level before contact, nominal object temperature, its sd, room temperature
-    (NaN where unknown) and excursion [degC].
-    """
+    """``n`` grasps, padded to the longest."""
 
     grasp_id: NDArray[np.str_]
     material: NDArray[np.str_]
-    sample_t: Array
-    sample_bin: NDArray[np.int64]
-    y: Array
-    t: Array
-    count: Array
-    ramp: Array
-    level: Array
-    t_object: Array
-    t_object_sd: Array
-    t_ambient: Array
-    excursion: Array
+    sample_t: Array  # (n, n_sample) [s]
+    sample_bin: NDArray[np.int64]  # (n, n_sample), -1 where the sample is lost
+    y: Array  # (n, n_bin), mean temperature [degC]
+    t: Array  # (n, n_bin), mean time [s]
+    count: Array  # (n, n_bin), samples
+    ramp: Array  # (n, n_bin), mean time since the pump stopped [s]
+    level: Array  # (n,), before contact [degC]
+    t_object: Array  # (n,), nominal [degC]; as the next two NaN where unknown
+    t_object_sd: Array  # (n,) [K]
+    t_ambient: Array  # (n,), of the room [degC]
+    excursion: Array  # (n,) [K]
 
     def take(self, index: NDArray[np.int64]) -> Touches:
         """Return the touches at these rows."""

@@ -17,23 +17,10 @@ time and onset, heat loss in transit, bias of the nominal temperature, depth, an
 Its covariance is a :class:`ParameterCovariance`.  An uncertain gripper is not taken as exact: theta is
 integrated over in every answer (:mod:`thermogrip.sysid.effusivity.laplace_approximation`).
 
-**Another gripper** of the same kind has other numbers.  How far they lie apart is stated here, from how such
-a finger is made, not learnt from any gripper's grasps:
-
-- a sheet of graphite is cut from stock and pressed on: thickness within 20 %; through its thickness it
-  conducts by what binder and pressure leave, 30 %; its heat capacity is that of carbon, 10 %;
-- a layer of filled silicone is cast by hand: thickness 25 %; conductivity by filler and settling, 25 %; heat
-  capacity by mixing, 10 %;
-- glue lines differ by half: conductance to the pipe's wall and to what is beside it, 0.5 in the
-  logarithm, and the sensor's lag through its own bond, 0.5; the water in the pipe 30 %;
-- skin meets a block with another pressure: h of all blocks together 25 %, of each block by itself 10 % more;
-  build-up time 0.4, share at first touch 0.5, settling time 0.3, all in the logarithm; creep 0.1;
-- two thermistors of 1 % agree within 0.2 K; the moment of contact after the message within 0.05 s; the drift
-  to the room once the pump is off, 3e-4 / s.
-
-With conductivity k, heat capacity c and thickness d, ln e = (ln k + ln c) / 2 and ln z = ln d + (ln c - ln k)
-/ 2, so the stack's own numbers are correlated.  The blocks stay the same: their effusivities and depth are as
-well known as before.
+**Another gripper** of the same kind has other numbers.  How far they lie apart (:class:`GripperSpread`) is
+stated from how such a finger is made, not learnt from any gripper's grasps. With conductivity k, heat
+capacity c and thickness d, ln e = (ln k + ln c) / 2 and ln z = ln d + (ln c - ln k) / 2, so the stack's own
+numbers are correlated.  The blocks stay the same: their effusivities and depth are as well known as before.
 """
 
 from __future__ import annotations
@@ -132,33 +119,27 @@ class ParameterCovariance:
 
 @dataclass(frozen=True, kw_only=True)
 class GripperSpread:
-    """Standard deviations between grippers of one kind; of logarithms but for the last five.
+    """Standard deviations between grippers of one kind; of logarithms but for the last five."""
 
-    ``sheet_*`` the outer layer's thickness, conductivity and heat capacity; ``layer_*`` those of the inner
-    one; ``glue`` conductances to what is behind and beside; ``store`` the heat capacity beside; ``lag``;
-    ``contact`` conductance of all blocks alike, ``block_contact`` of each by itself; ``build_up``, ``first``,
-    ``settle`` of contact; ``creep``; ``leak`` [1/s]; ``onset`` [s]; ``transit_loss``; ``bias`` [K].
-    """
-
-    sheet_thickness: float = 0.20
-    sheet_conductivity: float = 0.30
-    sheet_capacity: float = 0.10
-    layer_thickness: float = 0.25
-    layer_conductivity: float = 0.25
-    layer_capacity: float = 0.10
-    glue: float = 0.50
-    store: float = 0.30
-    lag: float = 0.50
-    contact: float = 0.25
-    block_contact: float = 0.10
+    sheet_thickness: float = 0.20  # of the outer layer, graphite that is cut from stock and pressed on
+    sheet_conductivity: float = 0.30  # through its thickness, by what binder and pressure leave
+    sheet_capacity: float = 0.10  # that of carbon
+    layer_thickness: float = 0.25  # of the inner one, filled silicone that is cast by hand
+    layer_conductivity: float = 0.25  # by filler and settling
+    layer_capacity: float = 0.10  # by mixing
+    glue: float = 0.50  # conductances to the pipe's wall and to what is beside it
+    store: float = 0.30  # heat capacity beside, the water in the pipe
+    lag: float = 0.50  # of the sensor, through its own bond
+    contact: float = 0.25  # conductance of all blocks alike: skin meets them with another pressure
+    block_contact: float = 0.10  # of each by itself
     build_up: float = 0.40
-    first: float = 0.50
+    first: float = 0.50  # share at first touch
     settle: float = 0.30
     creep: float = 0.10
-    leak: float = 3e-4
-    onset: float = 0.05
+    leak: float = 3e-4  # [1/s] drift to the room once the pump is off
+    onset: float = 0.05  # [s]
     transit_loss: float = 0.005
-    bias: float = 0.20
+    bias: float = 0.20  # [K] two thermistors of 1 %
 
     def __post_init__(self) -> None:
         for part in fields(self):
@@ -256,21 +237,16 @@ _OF_GRIPPER = {
 
 @dataclass(frozen=True, kw_only=True)
 class Spreads:
-    """Standard deviations from grasp to grasp.
+    """Standard deviations from grasp to grasp."""
 
-    ``ln_h`` of the contact conductance, ``ln_build_up`` of its build-up time, ``onset`` [s], ``t_object`` [K]
-    of the block about its nominal temperature, ``ln_effusivity`` of insulators, ``ln_h_of_blocks`` of ln h
-    from block to block; ``dof`` and ``insulator_dof`` are the degrees of freedom that they were learnt with.
-    """
-
-    ln_h: float
-    ln_build_up: float
-    onset: float
-    t_object: float
-    ln_effusivity: float
-    ln_h_of_blocks: float
-    dof: float = 1e6
-    insulator_dof: float = 1e6
+    ln_h: float  # of the contact conductance
+    ln_build_up: float  # of its build-up time
+    onset: float  # [s]
+    t_object: float  # [K], of the block about its nominal temperature
+    ln_effusivity: float  # of insulators
+    ln_h_of_blocks: float  # of ln h from block to block
+    dof: float = 1e6  # degrees of freedom that these were learnt with
+    insulator_dof: float = 1e6  # those of ``ln_effusivity``
 
     def __post_init__(self) -> None:
         *sds, dof, insulator_dof = (getattr(self, part.name) for part in fields(self))
@@ -280,19 +256,15 @@ class Spreads:
 
 @dataclass(frozen=True, kw_only=True)
 class Block:
-    """The calibrated block of one material.
+    """The calibrated block of one material."""
 
-    ``ln_h`` and ``ln_effusivity`` on the gripper's scale, with the standard deviation of each estimate;
-    ``library_effusivity`` [W s^0.5 m^-2 K^-1] and its relative sd; ``heat_capacity`` rho c_p [J m^-3 K^-1].
-    """
-
-    ln_h: float
-    ln_h_sd: float
+    ln_h: float  # on the gripper's scale, as ``ln_effusivity``
+    ln_h_sd: float  # of this estimate
     ln_effusivity: float
-    ln_effusivity_sd: float
-    library_effusivity: float
-    library_sd_ln: float
-    heat_capacity: float
+    ln_effusivity_sd: float  # of this estimate
+    library_effusivity: float  # [W s^0.5 m^-2 K^-1]
+    library_sd_ln: float  # its relative sd
+    heat_capacity: float  # rho c_p [J m^-3 K^-1]
     n_grasp: int
 
 

@@ -116,17 +116,13 @@ class Prior(NamedTuple):
 
 
 class Mode(NamedTuple):
-    """Where Gauss-Newton ended, a row a pair.
+    """Where Gauss-Newton ended, a row a pair."""
 
-    ``u`` (n, 7); ``covariance`` (n, 7, 7) of u; ``log_evidence`` (n,); ``converged`` (n,); ``misfit`` (n,) is
-    |W (y - f)|^2.
-    """
-
-    u: Array
-    covariance: Array
-    log_evidence: Array
-    converged: NDArray[np.bool_]
-    misfit: Array
+    u: Array  # (n, 7)
+    covariance: Array  # (n, 7, 7), of u
+    log_evidence: Array  # (n,)
+    converged: NDArray[np.bool_]  # (n,)
+    misfit: Array  # (n,), |W (y - f)|^2
 
 
 def nodes_for(data: Touches) -> TimeNodes:
@@ -525,11 +521,7 @@ def _slopes(pair: _Pair, here: _Point) -> tuple[Array, Array]:
 
 
 class Hypotheses(NamedTuple):
-    """``n`` hypotheses: mean and sd of ln h, of ln e and of ln(rho c_p), (n,) each.
-
-    ``ln_h_dof`` and ``ln_e_dof`` (n,) are the degrees of freedom behind the first two spreads; ``block`` (n,)
-    is the place in ``gripper.materials`` of a block that was calibrated, -1 for others.
-    """
+    """``n`` hypotheses: mean and sd of ln h, of ln e and of ln(rho c_p), (n,) each."""
 
     ln_h: Array
     ln_h_sd: Array
@@ -537,9 +529,9 @@ class Hypotheses(NamedTuple):
     ln_e_sd: Array
     ln_rho_c: Array
     ln_rho_c_sd: Array
-    ln_h_dof: Array
-    ln_e_dof: Array
-    block: Array
+    ln_h_dof: Array  # degrees of freedom behind the spread of ln h
+    ln_e_dof: Array  # and of ln e
+    block: Array  # place in ``gripper.materials`` of a block that was calibrated, -1 for others
 
 
 def material_hypotheses(

@@ -159,20 +159,15 @@ class Coupling:
 
 @dataclass(frozen=True, kw_only=True)
 class Traces:
-    """What touches leave in blocks: ``n`` touches, m hypotheses.
+    """What ``n`` touches leave in their blocks, under m hypotheses."""
 
-    ``moved`` (m, n_mode) is each mode's drop of the face at the end of a touch, per degree of initial
-    difference, and ``decay`` (m, n_mode) its rate [1/s]; ``capacity`` (m,) is C [J m^-2 K^-1]; ``skin``,
-    ``room``, ``rest`` (n,) the gripper's temperature in the touch, the room's (NaN where unknown) [degC], and
-    the time since the touch before [s].
-    """
-
+    # (m, n_mode), each mode's drop of the face at the end of a touch, per degree of initial difference
     moved: Array
-    decay: Array
-    capacity: Array
-    skin: Array
-    room: Array
-    rest: Array
+    decay: Array  # (m, n_mode), its rate [1/s]
+    capacity: Array  # (m,), C [J m^-2 K^-1]
+    skin: Array  # (n,), the gripper's temperature in the touch [degC]
+    room: Array  # (n,), the room's, NaN where unknown [degC]
+    rest: Array  # (n,), time since the touch before [s]
 
     def drop(self, rest: float) -> Array:
         """Return rho of each hypothesis after a rest [s], (m,)."""
@@ -243,16 +238,12 @@ N_SHARED = len(SHARED)
 
 
 class Factor(NamedTuple):
-    """Likelihoods of x = (T_obj, ln h, ln e, ln C), a row a (touch, hypothesis) pair.
+    """Likelihoods of x = (T_obj, ln h, ln e, ln C), a row a (touch, hypothesis) pair."""
 
-    ``log_size`` (n,) is ln c; ``centre`` (n, 4) is x0; ``eta`` (n, 4); ``precision`` (n, 4, 4) is Lambda,
-    zero in what is known under the hypothesis.
-    """
-
-    log_size: Array
-    centre: Array
-    eta: Array
-    precision: Array
+    log_size: Array  # (n,), ln c
+    centre: Array  # (n, 4), x0
+    eta: Array  # (n, 4)
+    precision: Array  # (n, 4, 4), Lambda, zero in what is known under the hypothesis
 
     def take(self, index: NDArray[np.int64]) -> Factor:
         """Return the rows of an index of any shape, which becomes the leading shape of each field."""
@@ -314,18 +305,13 @@ _LEAN = np.array([0.5, 1.0, 0.2, 0.2])
 
 @dataclass(frozen=True)
 class TouchGroups:
-    """``n`` blocks that were touched once or more, and m candidates.
+    """``n`` blocks that were touched once or more, and m candidates."""
 
-    ``groups`` (n,) names; ``rows``, the touches of each in their order; ``log_evidence`` (n, m);
-    ``t_object`` and ``t_object_sd`` (n, m), the block's temperature at the first touch under each candidate
-    [degC].
-    """
-
-    groups: tuple[str, ...]
-    rows: tuple[Rows, ...]
-    log_evidence: Array
-    t_object: Array
-    t_object_sd: Array
+    groups: tuple[str, ...]  # (n,), names
+    rows: tuple[Rows, ...]  # (n,), the touches of each in their order
+    log_evidence: Array  # (n, m)
+    t_object: Array  # (n, m), the block's temperature at the first touch under each candidate [degC]
+    t_object_sd: Array  # (n, m) [K]
 
 
 def touch_groups(grasps: Grasps) -> dict[str, Rows]:

@@ -61,21 +61,16 @@ class OpenSet:
 
 @dataclass(frozen=True)
 class MaterialFit:
-    """What each candidate makes of each grasp, all of shape (n_grasp, n_candidate).
-
-    ``log_evidence``; the object's temperature and its sd under the candidate [degC]; its prior mean and sd,
-    which let a caller replace that prior (two touches of one block); ``h_c`` [W m^-2 K^-1]; ``converged``;
-    ``u`` (n_grasp, n_candidate, 7), the modes of the nuisances.
-    """
+    """What each candidate makes of each grasp, all of shape (n_grasp, n_candidate)."""
 
     log_evidence: Array
-    t_object: Array
-    t_object_sd: Array
-    prior_t_object: Array
-    prior_t_object_sd: Array
-    h_c: Array
+    t_object: Array  # the object's temperature under the candidate [degC]
+    t_object_sd: Array  # [K]
+    prior_t_object: Array  # its prior mean, which a caller may replace (two touches of one block) [degC]
+    prior_t_object_sd: Array  # [K]
+    h_c: Array  # [W m^-2 K^-1]
     converged: NDArray[np.bool_]
-    u: Array
+    u: Array  # (n_grasp, n_candidate, 7), the modes of the nuisances
 
 
 def material_fit(

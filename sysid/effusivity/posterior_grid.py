@@ -150,19 +150,15 @@ _KNOTS, _REACH = 7, 8.0  # points to integrate at, and how far below the best th
 
 
 class GridPosterior(NamedTuple):
-    """One grasp's posterior.
+    """One grasp's posterior."""
 
-    ``x`` (n,) fine grid of ln e on the gripper's scale and ``mass`` (n,) of each point; ``log_evidence``
-    under the log-uniform prior; at the m fitted points ``weight``, mean and sd of T_obj [degC], and ln h.
-    """
-
-    x: Array
-    mass: Array
-    log_evidence: float
-    weight: Array
-    t_object: Array
-    t_object_sd: Array
-    ln_h: Array
+    x: Array  # (n,), fine grid of ln e on the gripper's scale
+    mass: Array  # (n,), of each point
+    log_evidence: float  # under the log-uniform prior
+    weight: Array  # (m,), of the fitted points
+    t_object: Array  # (m,), mean of T_obj there [degC]
+    t_object_sd: Array  # (m,) [K]
+    ln_h: Array  # (m,)
 
 
 class _Fitted(NamedTuple):
