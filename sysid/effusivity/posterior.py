@@ -34,20 +34,16 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class EffusivityRow:
-    """One grasp's posterior, one row of ``posterior.csv``.
-
-    Medians and 5 % and 95 % quantiles of the effusivity [W s^0.5 m^-2 K^-1] on the library's scale and of the
-    object's temperature [degC]; the posterior mean of ln h as a conductance [W m^-2 K^-1]; the sd of log10 e.
-    """
+    """One grasp's posterior, one row of ``posterior.csv``."""
 
     grasp_id: str
-    effusivity: float
-    effusivity_p05: float
-    effusivity_p95: float
-    t_object: float
+    effusivity: float  # median [W s^0.5 m^-2 K^-1], on the library's scale
+    effusivity_p05: float  # 5 % quantile
+    effusivity_p95: float  # 95 % quantile
+    t_object: float  # median of the object's temperature [degC]
     t_object_p05: float
     t_object_p95: float
-    h_c: float
+    h_c: float  # posterior mean of ln h as a conductance [W m^-2 K^-1]
     log10_effusivity_sd: float
 
 

@@ -54,16 +54,12 @@ _FIRST = 0.3  # s: before it the moment of contact matters too much for one expa
 
 
 class PosteriorPredictive(NamedTuple):
-    """``n`` situations and m candidates.
+    """``n`` situations and m candidates."""
 
-    ``log_p`` (n, m) now; ``mean`` (n, m, n_reading) and ``covariance`` (n, m, n_reading, n_reading) of the
-    readings to come under each candidate [degC, K^2]; ``u`` (n, m, 7), for the rest of a contact, the modes
-    of the nuisances, from which the next evaluation of the same contact may start.
-    """
-
-    log_p: Array
-    mean: Array
-    covariance: Array
+    log_p: Array  # (n, m), now
+    mean: Array  # (n, m, n_reading), of the readings to come under each candidate [degC]
+    covariance: Array  # (n, m, n_reading, n_reading) [K^2]
+    # (n, m, 7), of the rest of a contact: the modes, from which the next evaluation may start
     u: Array | None = None
 
 

@@ -81,16 +81,13 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class LogData:
-    """The blocks of one log.
-
-    ``kind`` is the index of the sd of each column (parameters, then effects); -1: a parameter, or an effect
-    of known sd.  ``own`` is the number of effects.
-    """
+    """The blocks of one log."""
 
     name: str
     blocks: tuple[Block, ...]
+    # of each column (parameters, then effects) the index of its sd; -1: a parameter, or an effect of known sd
     kind: NDArray[np.int64]
-    own: int
+    own: int  # number of effects
 
 
 @dataclass(frozen=True)
