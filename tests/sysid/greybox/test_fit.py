@@ -303,7 +303,7 @@ def reported() -> tuple[Plant, list[Log], Problem, Array]:
     logs[2]["q"].values[:] *= 0.5
     logs[2]["t"].values[:] -= 3.0
     model = TwoGains(0.4)
-    plant = fit_network(model, logs)
+    plant = fit_network(model, logs, starts=0)
     return plant, logs, *problem_of(model, logs, plant)
 
 
