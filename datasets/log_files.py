@@ -66,6 +66,7 @@ _TIME = re.compile(
     r"(time|timestamp|time_stamp|date|zeit|uhrzeit|datum|tijd|seconds?|secs?|millis|milliseconds|minutes|hours|epoch"
     r"|clock|t|ts|ms|us)(_(utc|local|stamp|elapsed|abs|rel))?"
 )
+_STEP = re.compile(r"(?i)ts|dt|delta_?t|sampl(e|ing)_?(time|period|interval)")
 _COUNTER = re.compile(r"(?i)c1|x|n|k|i|no|nr|id|index|idx|samples?|rows?|steps?|count(er)?|unnamed.*")
 _TIME_WORDS = {"ms": 1e-3, "milli": 1e-3, "us": 1e-6, "minute": 60.0, "hour": 3600.0}  # that begin a name
 _EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))  # from how much on a number since 1970 is in ns, us, ms
@@ -409,9 +410,11 @@ def _time_of(
         what = f"{header} is taken as the time in {unit if unit != '1' else 's'}"
         more = "; --dt S sets another step" if header in unnamed else ""
         return seconds, {header}, [f"time: {what}{'' if scale == 1 else f', times {scale:g}'}{more}"]
-    step = float(table.meta.get("dt", 1.0))  # of a file that has it beside its columns
+    steps = {h: np.unique(v[np.isfinite(v)]) for h, v in table.numbers.items() if _STEP.fullmatch(read[h][0])}
+    known = {h: float(v[0]) for h, v in steps.items() if v.size == 1 and v[0] > 0}
+    step = next(iter(known.values()), float(table.meta.get("dt", 1.0)))  # a file may have it beside
     told = f"no time column: rows are taken {step:g} s apart; --dt S sets another step"
-    return np.asarray(step * np.arange(len(table.lines)), dtype=float), set(), [told]
+    return np.asarray(step * np.arange(len(table.lines)), dtype=float), {*known}, [told]
 
 
 def _counts(header: str, table: Table) -> bool:

@@ -12,12 +12,13 @@ or after a comma, and their multiples.
 
 **Roles.**  Names come first, then units.  Where they show no input or no output, the data do
 (:func:`roles_of_data`): a column that is held between few large moves is an input, one whose next value
-another column's past helps to predict is an output.  With n = 2 lags and N rows the help of column i for
+another column's past helps to predict is an output.  With n lags and N rows the help of column i for
 column j is the gain in the Bayesian information criterion,
 
     G_ij = N log(RSS_j / RSS_ij) - n log N,
 
-RSS_j of j on its own past, RSS_ij with that of i beside it (Granger 1969); beyond 10 it counts.
+RSS_j of j on its own past, RSS_ij with that of i beside it (Granger 1969); beyond 10, with 2 lags and with 6
+(few leave of a smooth input what its output tells of it), it counts.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ _OUTPUT = re.compile(
 )
 NO_CLUE = "neither its name nor its unit shows what it is"
 _HELD_SHARE, _HELD_SIZE = 0.5, 0.05  # of rows with a move; of the range that its median has, at least
-_LAGS, _STRONG, _MOST_ROWS = 2, 10.0, 20_000
+_LAGS, _STRONG, _MOST_ROWS = (2, 6), 10.0, 20_000
 
 
 def split_header(header: str, *, file: str | None = None) -> tuple[str, str]:
@@ -230,7 +231,8 @@ def roles_of_data(
             out[name] = "input", f"it is held between {moves.size} moves in {rows} rows"
     roles = {**fixed, **{name: role for name, (role, _) in out.items()}}
     names = [n for n in columns if roles.get(n) != "other" and np.nanmax(columns[n]) > np.nanmin(columns[n])]
-    gain = _predictive_gain([columns[name] for name in names])
+    chosen = [columns[name][:_MOST_ROWS] for name in names]
+    gain = np.minimum.reduce([_predictive_gain(chosen, lags) for lags in _LAGS])
     open_, net = [n for n in names if n not in roles], dict(zip(names, (gain - gain.T).sum(axis=1)))
     for name in open_:
         help_ = gain[:, names.index(name)]
@@ -251,29 +253,27 @@ def roles_of_data(
     return out
 
 
-def _predictive_gain(columns: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+def _predictive_gain(columns: Sequence[NDArray[np.float64]], lags: int) -> NDArray[np.float64]:
     """Return G (n, n) of the module's theory, 0 where it is negative; row i helps column j."""
-    n = len(columns)
-    gain = np.zeros((n, n))
-    scaled = []
-    for values in (values[:_MOST_ROWS] for values in columns):
+    gain, scaled = np.zeros((len(columns), len(columns))), []
+    for values in columns:
         at, known = np.arange(values.size), np.isfinite(values)
         filled = np.interp(at, at[known], values[known]) if known.any() else np.zeros(values.size)
         scaled.append((filled - filled.mean()) / (np.std(filled) or 1.0))
-    rows = min((len(values) for values in scaled), default=0) - _LAGS
-    if rows < 5 * _LAGS:
+    rows = min((len(values) for values in scaled), default=0) - lags
+    if rows < 5 * lags:
         return gain
-    past = [np.stack([v[_LAGS - k : len(v) - k] for k in range(1, _LAGS + 1)], axis=1) for v in scaled]
+    past = [np.stack([v[lags - k : len(v) - k] for k in range(1, lags + 1)], axis=1) for v in scaled]
 
     def left(y: NDArray[np.float64], *some: NDArray[np.float64]) -> float:
         x = np.column_stack([np.ones(rows), *some])
         return float(np.sum((y - x @ np.linalg.lstsq(x, y, rcond=None)[0]) ** 2)) + 1e-12 * rows
 
     for j, values in enumerate(scaled):
-        own = left(values[_LAGS:], past[j])
-        for i in (i for i in range(n) if i != j):
-            both = left(values[_LAGS:], past[j], past[i])
-            gain[i, j] = max(0.0, rows * np.log(own / both) - _LAGS * np.log(rows))
+        own = left(values[lags:], past[j])
+        for i in (i for i in range(len(columns)) if i != j):
+            both = left(values[lags:], past[j], past[i])
+            gain[i, j] = max(0.0, rows * np.log(own / both) - lags * np.log(rows))
     return gain
 
 

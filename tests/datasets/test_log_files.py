@@ -482,6 +482,8 @@ FOREIGN = [
      ["time: ts is taken as the time in s, times 0.001", "since 1970"]),
     ("millis,q1,y\n500,1,2\n1000,1,3\n", [0.5, 1], "q1 1 input 1|y 1 output 2", ["times 0.001"]),
     ("Elapsed time [h],q1,y\n0,1,2\n0.5,1,3\n", [0, 1800], "q1 1 input 1|y 1 output 2", ["times 3600"]),
+    ("uEst,yEst,Ts (s),\n1,2,4,\n3,2,,\n", [0, 4], "uEst 1 input 1|yEst 1 other 2",
+     ["rows are taken 4 s apart"]),
     ("23:59:59,4,5\n00:00:01,4,6\n", [0, 2], "c2 1 other 4|c3 1 input 5",
      ["c1 counted from the first row, 23:"]),
     ("time,q1,T_a (°C)\n2026-01-01T00:59:59.5+01:00,1,20\n2026-01-01 00:00:00.5Z,1,20\n", [0, 1],

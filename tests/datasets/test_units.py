@@ -99,6 +99,13 @@ def test_a_suffix_that_looks_like_another_unit_is_refused_with_a_hint(header, hi
         ("Zone C", ("Zone_C", "1", 1)),
         ("T (k)", ("T", "K", 1)),
         ("I [mA]", ("I", "A", 1e-3)),
+        ("I [uA]", ("I", "A", 1e-6)),
+        ("U [mV]", ("U", "V", 1e-3)),
+        ("U, kV", ("U", "V", 1e3)),
+        ("P (mW)", ("P", "W", 1e-3)),
+        ("dT [mK]", ("dT", "K", 1e-3)),
+        ("time [days]", ("time", "s", 86400)),
+        ("t (ns)", ("t", "s", 1e-9)),
         ("P {kW}", ("P", "W", 1e3)),
         ("Time (\N{MICRO SIGN}s)", ("Time", "s", 1e-6)),
         ("time_h", ("time", "s", 3600)),
@@ -117,6 +124,23 @@ def test_a_suffix_that_looks_like_another_unit_is_refused_with_a_hint(header, hi
 )
 def test_a_header_of_any_program_is_name_unit_and_factor(header, read):
     assert read_header(header, ["time_h", "oven_c"]) == read
+
+
+@pytest.mark.parametrize("word", ["steps", "multisine", "walk", "ramps", "slow noise"])
+@pytest.mark.parametrize("noise", [0.002, 0.02])
+@pytest.mark.parametrize("pole", [0.9, 0.99])
+def test_an_input_of_any_course_is_told_from_its_output(word, noise, pole):
+    rng, t = np.random.default_rng(3), np.arange(3000)
+    u = {
+        "steps": np.repeat(rng.uniform(0, 1, 30), 100),
+        "multisine": sum(np.sin(2 * np.pi * f * t + 9 * f) for f in (0.002, 0.005, 0.009, 0.02)),
+        "walk": np.cumsum(rng.standard_normal(3000)),
+        "ramps": np.interp(t, np.arange(0, 3001, 100), rng.uniform(0, 1, 31)),
+        "slow noise": plant_of(rng.standard_normal(3000), 0.95, noise=0),
+    }[word]
+    y = plant_of(u, pole, noise=noise * np.std(u))
+    found = roles_of_data({"y": y, "u": u}, {"u": "1", "y": "1"}, {})
+    assert {name: role for name, (role, _) in found.items()} == {"u": "input", "y": "output"}
 
 
 def test_a_letter_of_a_series_is_no_unit():
@@ -165,6 +189,8 @@ def test_a_header_without_a_name_is_refused(header):
         ("heater_set", "percent", "input"),
         ("t_settled", "degC", "output"),
         ("spindle", "percent", "input"),
+        ("spindle", "0_255", "input"),
+        ("spindle", "V", "input"),
         ("battery", "1", "other"),
         ("rest", "s", "other"),
     ],
