@@ -158,8 +158,8 @@ def parse_text(data: bytes, file: str, columns: Sequence[str] | None = None) -> 
             given.append(unused(_LEFT_OUT if name == "-" else name, given))
         names = [*given, *names[have:]]
         notes = tuple(note for note in notes if "--columns" not in note)
-    if layout.separator == " ":
-        data = re.sub(rb"[ \t]+", b" ", re.sub(rb"(?m)^[ \t]+|[ \t\r]+$", b"", data))
+    if layout.separator == " ":  # one run at a time: [ ]+$ would look at each of its blanks again
+        data = re.sub(rb"(?m)^ | ?\r?$", b"", re.sub(rb"[ \t]+", b" ", data))
     table = _parse_table(data, replace(layout, names=names, notes=notes), file)
     kept = {name: values for name, values in table.numbers.items() if not name.startswith(_LEFT_OUT)}
     return replace(table, numbers=kept)

@@ -74,6 +74,7 @@ _INPUT = re.compile(
 _OUTPUT = re.compile(
     r"^(t|y|temp|temperature|level|outlet|position|speed|pv|angle|velocity|response|measured)(\d*|_.*)$"
 )
+_LONGEST = 200  # characters of a header that is looked through for a unit
 NO_CLUE = "neither its name nor its unit shows what it is"
 _HELD_SHARE, _HELD_SIZE = 0.5, 0.05  # of rows with a move; of the range that its median has, at least
 _LAGS, _STRONG, _MOST_ROWS = (2, 6), 10.0, 20_000
@@ -108,7 +109,7 @@ def read_header(header: str, others: Sequence[str] = ()) -> tuple[str, str, floa
     for unit in UNITS:
         if header.endswith(f"_{unit}"):
             return _plain(header.removesuffix(f"_{unit}")), unit, 1.0
-    found = _UNIT_AT_END.fullmatch(header)
+    found = _UNIT_AT_END.fullmatch(header) if len(header) <= _LONGEST else None
     if found is None:
         return _plain(header), "1", 1.0
     name, inside = found["name"], found["inside"]

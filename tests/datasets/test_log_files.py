@@ -545,6 +545,14 @@ def test_columns_and_the_step_can_be_given(write):
     assert "has 4 columns, --columns names 2; write a name for each" in line
 
 
+def test_long_headers_and_runs_of_blanks_are_read_in_one_pass(write):
+    many = 300_000
+    log = read_log(write("time_s," + "[" * 120_000 + ",q1 " + " " * 120_000 + "x\n0,1,2\n1,1,2\n"))
+    assert log["time"].values.tolist() == [0.0, 1.0]
+    log = read_log(write(f"0 1 {' ' * many}7\r\n1 2 {' ' * many}8 \r\n", "log.dat"), columns=["t", "q1", "y"])
+    assert column(log, "y").tolist() == [7.0, 8.0]
+
+
 def test_names_of_roles_may_be_headers_in_any_case(write):
     path = write("Time (s);Heater 1 (%);Plate\n0;1;2\n1;1;3\n")
     log = read_log(path, inputs=["heater 1 (%)"], outputs=["PLATE"])
