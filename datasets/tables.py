@@ -47,6 +47,7 @@ from thermogrip.datasets.units import read_header
 FORMATS = {
     ".csv": "csv", ".csv.gz": "csv", ".csv.xz": "csv",
     ".txt": "text", ".dat": "text", ".tsv": "text", ".tab": "text", ".asc": "text", ".log": "text",
+    ".txt.gz": "text", ".txt.xz": "text", ".dat.gz": "text", ".dat.xz": "text",
     ".mat": "matlab", ".xlsx": "excel",
     ".nc": "netcdf", ".h5": "netcdf", ".hdf5": "netcdf",
     ".parquet": "parquet", ".pq": "parquet",
@@ -388,7 +389,8 @@ def _joined(faults: Sequence[UserError], names: Sequence[str]) -> UserError:
     kept = ",".join("-" if name in bad else name.replace(",", " ") for name in names)
     hint = first.hint
     if bad - {None} and len(bad) < len(names):
-        hint = f"{hint}, or leave columns out: --columns {shlex.quote(kept)}"
+        command = shlex.join(["thermogrip", "identify", str(first.file), "--columns", kept])
+        hint = f"{hint}, or leave columns out: {command}"
     if len(faults) == 1:
         return UserError(first.problem, file=first.file, row=first.row, column=first.column, hint=hint)
     each = [f"row {f.row}" + (f", column {f.column}" if f.column else "") + f": {f.problem}" for f in faults]

@@ -75,7 +75,9 @@ def test_a_compressed_log_is_the_log(write):
     plain = read_log(write(HEAD + ROWS))
     packed = read_log(write(gzip.compress((HEAD + ROWS).encode()), "log.csv.gz"))
     tight = read_log(write(lzma.compress((HEAD + ROWS).encode()), "log.csv.xz"))
+    text = read_log(write(gzip.compress((HEAD + ROWS).encode()), "log.txt.gz"))
     xr.testing.assert_identical(plain, packed)
+    xr.testing.assert_identical(plain, text)
     xr.testing.assert_identical(plain, tight)
 
 
@@ -153,7 +155,8 @@ def test_the_unfinished_last_line_of_a_killed_logger_is_dropped(write):
         ("# note\n" + HEAD + "0,x,25\n1,0,25\n", ["row 3", "column drive", "'x'"]),
         (HEAD + "0,x,25\n1,0\n2,0,hot\n3,0,25\n",
          ["3 faults: row 3: has 2 cell(s)", "row 2, column drive: 'x'", "'hot'"]),
-        (HEAD + "0,0.5,25\n1,0.5,warm\n2,0,25\n", ["or leave columns out: --columns time_s,drive,-"]),
+        (HEAD + "0,0.5,25\n1,0.5,warm\n2,0,25\n",
+         ["or leave columns out: thermogrip identify /", "log.csv --columns time_s,drive,-"]),
         (HEAD + '0,"0,5",25\n1,0,25\n', ["row 2", "column drive", "write a decimal point"]),
         (HEAD.replace(",", ";") + "0;0,5;25\n1;0.5;25\n", ["row 2", "column drive", "write a decimal point"]),
         (HEAD + "0,0.5,25\n1,0.5\n2,0,25\n", ["row 3", "has 2 cell(s), the header has 3"]),
