@@ -16,11 +16,13 @@ one that is kept, and the network, are scored besides on the last 30 percent of 
 and run freely from the log's start, where its state is known.
 
 **Which candidate is kept.**  Among black boxes that of the least error, in units of the outputs' spread, as a
-geometric mean over the folds; a linear one where its paired excess is within one standard error and 5
-percent.  On whole logs, and beside a network, that of the least held-out error over that of a model without
-input; the network also when it is within 10 percent of the best, for its parameters mean something.  A model
-that no output shows to beat a model without input (see :mod:`thermogrip.sysid.validation.free_run`) is never
-called good.
+geometric mean over the folds; where the paired excess is within one standard error and 5 percent the smallest
+one, and a linear one before others. One or two logs do not show what differs between runs: of the error on
+another run, whose gain differs (:mod:`thermogrip.sysid.validation.prediction_bands`), 5 percent count as no
+difference among linear kinds, and 10 percent beside others.  On whole logs, and beside a network, that of the
+least held-out error over that of a model without input; the network also when it is within 10 percent of the
+best, for its parameters mean something.  A model that no output shows to beat a model without input (see
+:mod:`thermogrip.sysid.validation.free_run`) is never called good.
 """
 
 from __future__ import annotations
@@ -43,26 +45,26 @@ from thermogrip.sysid.blackbox.fit import (
     fit_black_box,
     with_refits,
 )
-from thermogrip.sysid.blackbox.order_selection import excess_within_noise, folds, held_out_runs
+from thermogrip.sysid.blackbox.order_selection import (
+    HARDLY_MORE,
+    excess_within_noise,
+    folds,
+    held_out_runs,
+    log_errors,
+)
 from thermogrip.sysid.data.data_quality import DataCheck, Evidence, check_data, evidence
-from thermogrip.sysid.plant.fit_record import HELD_OUT_SHARE, TAIL, HeldOut
+from thermogrip.sysid.plant.fit_record import HELD_OUT_SHARE, RUN_GAIN_SD, SEVERAL, TAIL, HeldOut
 from thermogrip.sysid.plant.log_grid import make_grid, match_logs, misfit, roles_of, signals
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run, no_input_baseline
-from thermogrip.sysid.validation.prediction_bands import (
-    RUN_GAIN_SD,
-    SEVERAL,
-    SHORT,
-    between_runs,
-    expected_coverage,
-)
+from thermogrip.sysid.validation.prediction_bands import SHORT, between_runs, expected_coverage
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from thermogrip.sysid.models.model import GreyModel
+    from thermogrip.sysid.models.model import Array, GreyModel
 
-WITHIN_NOISE = 1.1  # of the best error: then the network is preferred
+WITHIN_NOISE = 1.1  # of the best error: then the network is preferred, and a linear kind on another run
 LINEAR = ("arx", "oe", "subspace")  # kept where another kind errs hardly less
 USEFUL = 0.5  # of the no-input error: below it a model is called good
 
@@ -147,12 +149,38 @@ def fold_rows(fit: BlackBoxFit) -> list[Row]:
     return rows
 
 
-def choose_black_box(fits: Sequence[BlackBoxFit]) -> BlackBoxFit:
-    """Return the fit of the least error over its folds, or a linear one that errs hardly more."""
-    logs = [np.log(np.maximum(fit.choice.errors[fit.choice.structure], 1e-12)) for fit in fits]
+def choose_black_box(fits: Sequence[BlackBoxFit], between: Mapping[str, float]) -> BlackBoxFit:
+    """Return the linear fit of the least error over its folds, or another kind that errs clearly less.
+
+    ``between``: by output the error that differences between runs add to that of any of them.
+    """
+    linear = [fit for fit in fits if fit.kind in LINEAR]
+    others = [fit for fit in fits if fit.kind not in LINEAR]
+    if not (linear and others):
+        return _smallest_of_the_best(fits)
+    grid = fits[0].grid
+    added = [between.get(name, 0.0) / spread for name, spread in zip(grid.outputs, grid.output_spread())]
+    simple, other = _smallest_of_the_best(linear), _smallest_of_the_best(others)
+    of_run = [_fold_errors(fit, float(np.sqrt(np.mean(np.square(added))))) for fit in (simple, other)]
+    excess = of_run[0] - of_run[1]
+    hardly = excess.mean() <= np.log(WITHIN_NOISE) if any(added) else excess_within_noise(excess)
+    return simple if hardly else other
+
+
+def _smallest_of_the_best(fits: Sequence[BlackBoxFit]) -> BlackBoxFit:
+    between = 0.0 if len(fits[0].grid.logs) >= SEVERAL else RUN_GAIN_SD
+    logs = [_fold_errors(fit, between) for fit in fits]
     best = min(logs, key=lambda errors: float(errors.mean()))
-    near = [(fit, float(e.mean())) for fit, e in zip(fits, logs) if excess_within_noise(e - best)]
-    return min(near, key=lambda item: (item[0].kind not in LINEAR, item[1]))[0]
+    near = [
+        (fit, float(e.mean()))
+        for fit, e in zip(fits, logs)
+        if excess_within_noise(e - best) or (between and (e - best).mean() <= HARDLY_MORE)
+    ]
+    return min(near, key=lambda item: (item[0].choice.structure.size, item[1]))[0]
+
+
+def _fold_errors(fit: BlackBoxFit, between: float) -> Array:
+    return log_errors(fit.choice.errors[fit.choice.structure], between)
 
 
 def fit_without_tail(fit: BlackBoxFit, train: Sequence[Log]) -> Plant:
@@ -163,6 +191,7 @@ def fit_without_tail(fit: BlackBoxFit, train: Sequence[Log]) -> Plant:
         outputs=fit.grid.outputs,
         disturbances=fit.grid.disturbances,
         average=fit.grid.dt,
+        ends=fit.grid.ends,
     )
     model = FAMILIES[fit.kind](grid, only=fit.choice.structure).get(fit.choice.structure)
     if model is None:
@@ -371,7 +400,10 @@ def identify(
         return fit_network(network, some, seed=seed, progress=report)
 
     fits, rows, refused = _fit_all(fit, boxes, records, parts)
-    best = choose_black_box(fits) if fits else None
+    best = None
+    if fits:
+        least = min(fits, key=lambda fit: fit.choice.error)
+        best = choose_black_box(fits, _between_runs(least.plant, records))
     if leave_one_out:
         finalists = candidates
     else:
@@ -547,19 +579,24 @@ def no_draws(model: str, what: str, error: Exception) -> str:
     return f"{model}: no {what}, the fit is kept without: {error}"
 
 
+def _between_runs(plant: Plant, logs: Sequence[Log]) -> dict[str, float]:
+    """Return by output the rms of what a gain that varies between runs changes; empty where logs show it."""
+    changes = [between_runs(plant, log) for log in logs]
+    return {
+        name: float(np.sqrt(np.mean(np.concatenate([change[name] for change in changes]) ** 2)))
+        for name in (plant.outputs if all(changes) else ())
+    }
+
+
 def new_run_errors(plant: Plant, logs: Sequence[Log], held: Sequence[Row]) -> dict[str, float]:
     """Return by output the error to expect on another run: of what was held out, and of a gain that varies.
 
     Empty where the logs are so many that what was held out shows what differs between runs.
     """
-    changes = [between_runs(plant, log) for log in logs]
-    if not all(changes):
-        return {}
-    out = {}
-    for name in plant.outputs:
-        varied = np.concatenate([change[name] for change in changes])
-        out[name] = float(np.hypot(stated_error(held, name), np.sqrt(np.mean(varied**2))))
-    return out
+    return {
+        name: float(np.hypot(stated_error(held, name), varied))
+        for name, varied in _between_runs(plant, logs).items()
+    }
 
 
 def _left_out(logs: Sequence[Log], used: Sequence[str]) -> list[str]:

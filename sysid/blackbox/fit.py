@@ -35,7 +35,14 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log
 from thermogrip.sysid.blackbox.arx import arx_family
 from thermogrip.sysid.blackbox.neural import neural_family
-from thermogrip.sysid.blackbox.order_selection import Choice, Family, Model, choose, free_run_errors
+from thermogrip.sysid.blackbox.order_selection import (
+    Choice,
+    Family,
+    Model,
+    choose,
+    excess_within_noise,
+    free_run_errors,
+)
 from thermogrip.sysid.blackbox.output_error import oe_family
 from thermogrip.sysid.blackbox.sindy import sindy_family
 from thermogrip.sysid.blackbox.subspace import subspace_family
@@ -71,7 +78,6 @@ class BlackBoxFit:
 
     kind: str
     plant: Plant
-    model: Model  # of the plant
     choice: Choice  # the structure with its held-out errors
     grid: Grid  # the data that it was fitted to
 
@@ -150,15 +156,27 @@ def fit_black_box(
             best = (grid, choice)
     if best is None:
         raise refused if refused is not None else UserError(f"{kind} could not be fitted")
-    grid, choice = best
-    model = family(grid, only=choice.structure).get(choice.structure)
-    if model is None:
-        raise UserError(
-            f"{kind}: the chosen structure is unstable on all data together",
-            hint="average more, or use another model",
-        )
-    plant = _plant(model, grid, choice, _warmup_rows(grid, warmup), logs)
-    return BlackBoxFit(kind, plant, model, choice, grid)
+    grid, choice = _with_convention(*best, logs, family, warmup)
+    return BlackBoxFit(kind, _plant(grid, choice, logs), choice, grid)
+
+
+def _with_convention(
+    grid: Grid, choice: Choice, logs: Sequence[Log], family: Family, warmup: float | None
+) -> tuple[Grid, Choice]:
+    """Return grid and choice with inputs that were applied up to their rows where that errs clearly less.
+
+    Within a step that was averaged over several rows one row makes no difference.
+    """
+    if grid.dt > 1.5 * grid.native or family in (sindy_family, neural_family):
+        return grid, choice
+    names = {"inputs": grid.inputs, "outputs": grid.outputs, "disturbances": grid.disturbances}
+    moved = make_grid(logs, **names, average=grid.dt, ends=True)
+    try:
+        other = choose(moved, family, warmup=_warmup_rows(moved, warmup))
+    except UserError:  # no structure of it is stable
+        return grid, choice
+    excess = np.log(choice.errors[choice.structure]) - np.log(other.errors[other.structure])
+    return (grid, choice) if excess_within_noise(excess) else (replace(moved, why=grid.why), other)
 
 
 def with_refits(
@@ -174,7 +192,7 @@ def with_refits(
     if len(blocks) < _FEWEST:
         problem = f"the logs are too short to be resampled: {len(blocks)} blocks of {_BLOCK_ROWS} rows"
         raise UserError(problem, hint=f"give logs of {_FEWEST} such blocks")
-    rng, most = np.random.default_rng(seed), _AGREES * _error(fit, fit.model)
+    rng, most = np.random.default_rng(seed), _AGREES * _error(fit, fit.choice.model)
     refits: list[Model] = []
     tried = 0
     while len(refits) < n and tried < _TRIES * n:
@@ -218,9 +236,9 @@ def _warmup_rows(grid: Grid, warmup: float | None) -> int:
     return max(2, min(round(seconds / grid.dt), most))
 
 
-def _plant(model: Model, grid: Grid, choice: Choice, rows: int, logs: Sequence[Log]) -> Plant:
+def _plant(grid: Grid, choice: Choice, logs: Sequence[Log]) -> Plant:
     scale = np.maximum(grid.output_spread(), 1e-9)
-    prior = choice.prior
+    rows, prior = choice.warmup, choice.prior
     # a simulation counts one independent reading in 10 s, the choice counted every row
     independent = min(1 + rows * grid.dt / READING_EVERY, rows + 1) / (rows + 1)
     noise, nuisance = prior.noise * scale * np.sqrt(independent), prior.nuisance * scale
@@ -235,7 +253,7 @@ def _plant(model: Model, grid: Grid, choice: Choice, rows: int, logs: Sequence[L
         held_out_by_part={name: part.tolist() for name, part in zip(grid.outputs, choice.rmse.T)},
     )
     return Plant(
-        model,
+        choice.model,
         {},
         dt=grid.dt,
         units=dict(grid.units),
@@ -245,4 +263,5 @@ def _plant(model: Model, grid: Grid, choice: Choice, rows: int, logs: Sequence[L
         logs=grid.logs,
         scores=scores,
         fitted_to=fit_logs(logs),
+        inputs_end_at_row=grid.ends,
     )

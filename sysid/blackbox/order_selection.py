@@ -12,9 +12,13 @@ smallest structure is taken for which
 
     mean_f ln(e_sf / e_bf) <= min(se_f ln(e_sf / e_bf), ln 1.05),
 
-with the standard error of the paired differences. Logarithms, because a fold whose input lies outside of
+with the standard error of the paired differences. Of one or two logs e_sf^2 has g^2 added, the share by
+which the gain of the inputs is taken to vary from run to run
+(:data:`~thermogrip.sysid.plant.fit_record.RUN_GAIN_SD`): errors far below it do not tell how a model does on
+another day. Logarithms, because a fold whose input lies outside of
 what the rest has seen is bad for every structure alike and must not outweigh the others. Models that are
-unstable or diverge on any fold are refused.
+unstable or diverge on any fold are refused, and structures whose fit to all data is, or errs on them far more
+than on any fold.
 """
 
 from __future__ import annotations
@@ -30,9 +34,11 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.models.lti import StartPrior, estimate_starts, evaluate_terms
 from thermogrip.sysid.models.model import Model as PlantModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.fit_record import RUN_GAIN_SD, SEVERAL
 from thermogrip.sysid.plant.log_grid import Grid, Segment
 
 __all__ = [
+    "HARDLY_MORE",
     "PRIORS",
     "Choice",
     "Family",
@@ -46,11 +52,14 @@ __all__ = [
     "folds",
     "free_run_errors",
     "held_out_runs",
+    "log_errors",
     "with_spread",
 ]
 
 Array = NDArray[np.float64]
 
+HARDLY_MORE = float(np.log(1.05))  # of log errors
+_MOST_ON_ALL = 2.0  # times the worst fold's error: a fit to all data that errs more on them is refused
 FEWEST = 20  # rows of a block that is held out
 
 # How a first error is shared between state and sensor; the free run over held-out rows chooses one.
@@ -91,6 +100,7 @@ class Choice:
     folds: tuple[str, ...]  # what each fold held out
     rmse: Array  # (n_fold, n_y), free-run RMSE of the chosen structure, in the outputs' units
     warmup: int  # rows at the start of each run that set its state and are not scored
+    model: Model  # the structure fitted to all data
 
     @property
     def error(self) -> float:
@@ -178,9 +188,24 @@ def choose(
         with np.errstate(divide="ignore"):
             at = int(np.argmin(np.log(by_prior).mean(axis=0)))
         table[structure], best[structure], rmse[structure] = by_prior[:, at], PRIORS[at], by_output[:, at]
-    structure = _one_standard_error(table)
     labels = tuple(label for label, _, _ in cases)
-    return Choice(structure, best[structure], table, labels, rmse[structure], warmup)
+    between = 0.0 if len(grid.logs) >= SEVERAL else RUN_GAIN_SD
+    left = dict(table)
+    while True:
+        structure = _one_standard_error(left, between)
+        model = family(grid, only=structure).get(structure)
+        most = _MOST_ON_ALL * float(np.max(table[structure]))
+        if model is not None and _error_on_all(model, grid, best[structure], warmup) <= most:
+            return Choice(structure, best[structure], table, labels, rmse[structure], warmup, model)
+        del left[structure]
+
+
+def _error_on_all(model: Model, grid: Grid, prior: StartPrior, warmup: int) -> float:
+    """Return the error over the data of the fit, of runs that start as held-out ones do."""
+    scale = np.maximum(grid.output_spread(), 1e-9)
+    runs = held_out_runs(grid, grid.segments)
+    errors = free_run_errors(model, runs, dt=grid.dt, scale=scale, warmup=warmup, priors=[prior])
+    return float(np.mean(errors / scale))
 
 
 def drives(grid: Grid, terms: Sequence[str]) -> list[Array]:
@@ -238,17 +263,22 @@ def with_spread(model: StateSpaceModel, grid: Grid, starts: Sequence[Array]) -> 
 
 def excess_within_noise(excess: Array) -> bool:
     """Return whether paired differences of log errors are zero to within one standard error and 5 percent."""
-    return bool(excess.mean() <= min(excess.std(ddof=1) / np.sqrt(excess.size), np.log(1.05)))
+    return bool(excess.mean() <= min(excess.std(ddof=1) / np.sqrt(excess.size), HARDLY_MORE))
 
 
-def _one_standard_error(table: Mapping[Structure, Array]) -> Structure:
+def log_errors(errors: Array, between: float) -> Array:
+    """Return the logarithms of errors on another run, whose gain varies by the share ``between``."""
+    return np.asarray(np.log(np.maximum(np.hypot(errors, between), 1e-12)))
+
+
+def _one_standard_error(table: Mapping[Structure, Array], between: float) -> Structure:
     usable = {structure: error for structure, error in table.items() if np.isfinite(error).all()}
     if not usable:
         raise UserError(
             "no structure gives a stable model on every held-out part",
             hint="give a longer log, more excitation, or average more",
         )
-    logs = {structure: np.log(np.maximum(error, 1e-12)) for structure, error in usable.items()}
+    logs = {structure: log_errors(error, between) for structure, error in usable.items()}
     best = min(logs, key=lambda s: float(logs[s].mean()))
     good = [best]
     for structure, error in logs.items():

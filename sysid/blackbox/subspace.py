@@ -13,8 +13,9 @@ with Gamma = [C; CA; ...; CA^(f-1)].  The LQ factorisation of [W_f; Z_p; Y_f] ta
 
 and the left singular vectors of S L32 span Gamma: S = I is PO-MOESP (Verhaegen), and
 S = (L32 L32' + L33 L33')^(-1/2) is CVA (Larimore).  A follows from the shift of Gamma, C is its first block
-row.  B, E, the constant and one initial state per segment enter the *simulated* output linearly, so they
-are a least-squares fit of the free run, not of one step.
+row; poles that it puts outside of the unit circle are moved inside (:func:`stabilised`).  B, E, the constant
+and one initial state per segment enter the *simulated* output linearly, so they are a least-squares fit of
+the free run, not of one step.
 
 Several logs are side by side in the Hankel matrices; a window that touches a gap or a lost reading is left
 out.
@@ -62,16 +63,16 @@ def subspace_family(
     terms: Sequence[tuple[str, ...]] | None = None,
     only: Structure | None = None,
 ) -> Mapping[Structure, StateSpaceModel]:
-    """Return a model for each order, number of block rows f and weighting that gives a stable one.
+    """Return a model for each order, number of block rows f and weighting that the data allow.
 
-    Where absent, ``rows`` are 8, 15 and 30 as far as the data allow, and ``terms`` none and the magnitudes of
-    signed inputs.
+    Where absent, ``rows`` are 3, 5, 8, 15 and 30 as far as the data allow, and ``terms`` none and the
+    magnitudes of signed inputs.
     """
     out: dict[Structure, StateSpaceModel] = {}
     longest = max(len(segment.time) for segment in grid.segments)
     sets = default_terms(grid)[:2] if terms is None else terms
     n_drive, n_y = len(grid.inputs) + len(grid.disturbances), len(grid.outputs)
-    sizes = rows or [f for f in (8, 15, 30) if only is not None or 6 * f < longest]
+    sizes = rows or [f for f in (3, 5, 8, 15, 30) if only is not None or 6 * f < longest]
     for some in sets:
         names = {
             (f, w, n): _structure(n, f, w, some, n_drive, n_y)
@@ -91,7 +92,7 @@ def _structure(n: int, f: int, weighting: str, some: Sequence[str], n_drive: int
 def _realised(
     grid: Grid, wanted: Collection[tuple[int, str, int]], terms: tuple[str, ...]
 ) -> dict[tuple[int, str, int], StateSpaceModel]:
-    """Return the stable models among these block rows, weightings and orders."""
+    """Return the models of these block rows, weightings and orders."""
     out: dict[tuple[int, str, int], StateSpaceModel] = {}
     readings = _readings(grid, terms) if wanted else []
     for f in dict.fromkeys(f for f, _, _ in wanted):
@@ -101,9 +102,7 @@ def _realised(
         for weighting in dict.fromkeys(w for size, w, _ in wanted if size == f):
             gamma, _ = extended_observability(*factor, n_y=len(grid.outputs), weighting=weighting)
             for n in (n for size, w, n in wanted if (size, w) == (f, weighting) and n < gamma.shape[1]):
-                model = _realise(grid, gamma[:, :n], terms)
-                if model is not None:
-                    out[f, weighting, n] = model
+                out[f, weighting, n] = _realise(grid, gamma[:, :n], terms)
     return out
 
 
@@ -171,14 +170,27 @@ def _unit_responses(drive: Array, A: Array, C: Array) -> Array:
     return np.concatenate([forced, free]) @ C.T
 
 
-def _realise(grid: Grid, gamma: Array, terms: tuple[str, ...]) -> StateSpaceModel | None:
-    """Return the model of these columns of Gamma, or None where it is unstable."""
+def _realise(grid: Grid, gamma: Array, terms: tuple[str, ...]) -> StateSpaceModel:
+    """Return the model of these columns of Gamma."""
     n_y = len(grid.outputs)
     A = np.asarray(np.linalg.lstsq(gamma[:-n_y], gamma[n_y:], rcond=None)[0], dtype=float)
-    if np.abs(np.linalg.eigvals(A)).max() >= 1:
-        return None
+    A = stabilised(A, max(len(segment.time) for segment in grid.segments))
     C = gamma[:n_y] * np.maximum(grid.output_spread(), 1e-9)[:, None]
     return fit_inputs(grid, A, C, terms)
+
+
+def stabilised(A: Array, rows: int) -> Array:
+    """Return A with poles beyond exp(-1 / rows) moved onto that circle, along their direction.
+
+    A record of so many rows cannot tell a slower pole, or a growing one, from a time constant of its length.
+    """
+    poles, vectors = np.linalg.eig(A)
+    beyond = np.abs(poles) > np.exp(-1 / rows)
+    if not beyond.any():
+        return A
+    poles[beyond] *= np.exp(-1 / rows) / np.abs(poles[beyond])
+    # of poles that coincide the vectors are dependent; least squares keeps what they span
+    return np.asarray(np.real(vectors * poles @ np.linalg.pinv(vectors)))
 
 
 def _factorise(

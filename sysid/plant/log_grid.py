@@ -9,6 +9,10 @@ is what the driver made of it, and a measured ambient is smoothed over 20 s, for
 coarse.  Readings stay at their own times, and the outputs of the model are interpolated to them (the middle
 of the blocks of an averaged log).
 
+A reading that is logged with the input that led to it, or with the mean of the input since the row before,
+moves in the row of its input.  The logs of such a rig say of an input what was applied up to the row
+(``ends``), and every value is moved by one row.
+
 **Readings on the grid.**  For a black box (:func:`make_grid`) a reading is the mean of the line through the
 samples over [t_k - dt/2, t_k + dt/2], so that it is not shifted in time; where the grid is the log's own,
 the samples stand as they are.  A reading lost while the input is known stays NaN: what is scored or fitted by
@@ -98,6 +102,7 @@ class Grid:
     units: dict[str, str]  # unit of each signal
     why: str = ""  # where the step comes from, in words
     lost: float = 0.0  # share of the rows of all logs that lack a reading; a part of the grid keeps it
+    ends: bool = False  # whether an input was applied up to the row of the log that holds it, not from it on
 
     @property
     def logs(self) -> tuple[str, ...]:
@@ -131,11 +136,14 @@ def make_grid(
     disturbances: Sequence[str] | None = None,
     average: float | None = None,
     min_rows: int = 20,
+    ends: bool = False,
 ) -> Grid:
-    """Return the logs on one even grid."""
+    """Return the logs on one even grid; ``ends``: inputs were applied up to their rows."""
     if not logs:
         raise UserError("no log to identify from", hint="give at least one")
     u, y, d = signals(logs, inputs=inputs, outputs=outputs, disturbances=disturbances)
+    if ends:
+        logs = [from_row_on(log, u) for log in logs]
     native = float(np.median([sample_time(log) for log in logs]))
     step, why = _chosen_step(logs, u, y) if average is None else (float(average), "asked for")
     if step < native * 0.999:
@@ -153,7 +161,7 @@ def make_grid(
         )
     units = {name: str(logs[0][name].attrs.get("units", "1")) for name in (*u, *d, *y)}
     lost = float(np.mean(np.concatenate([~np.isfinite(part.y).all(axis=1) for part in segments])))
-    return Grid(u, d, y, switches_of(logs, u), step, tuple(segments), native, units, why, lost)
+    return Grid(u, d, y, switches_of(logs, u), step, tuple(segments), native, units, why, lost, ends)
 
 
 def cut_stretches(plant: PlantData, log: Log, *, gaps: str = "mend") -> list[Stretch]:
@@ -383,6 +391,8 @@ def _applied(log: Log, plant: PlantData) -> Log:
     A driver that drops what lies behind a multiple of its step is undone row by row; of commands that were
     averaged only the mean of the loss is known, half a step.
     """
+    if plant.inputs_end_at_row:
+        log = from_row_on(log, plant.inputs)
     if not plant.model.command_steps:
         return log
     out = log.copy()
@@ -393,6 +403,15 @@ def _applied(log: Log, plant: PlantData) -> Log:
         else:
             whole = np.trunc(u / step + 1e-9 * np.sign(u)) * step
         out[name] = ("time", whole, log[name].attrs)
+    return out
+
+
+def from_row_on(log: Log, inputs: Sequence[str]) -> Log:
+    """Return a log whose inputs were applied up to their rows with inputs that are applied from them on."""
+    out = log.copy()
+    for name in inputs:
+        values = column(log, name)
+        out[name] = ("time", np.append(values[1:], values[-1:]), log[name].attrs)
     return out
 
 

@@ -80,6 +80,8 @@ class Plant(PlantData):
     fitted_to : tuple of FitLog, optional
         Of each log of the fit the hash of its data and the seconds that were used; a file of version 0.1.0
         has none.
+    inputs_end_at_row : bool, optional
+        Whether an input of the logs was applied up to the row that holds it; where False, from it on.
 
     Examples
     --------

@@ -50,6 +50,7 @@ class PlantData:
     scores: PlantScores = field(default_factory=PlantScores)
     verdict: str = ""
     fitted_to: tuple[FitLog, ...] = ()
+    inputs_end_at_row: bool = False
 
     def __post_init__(self) -> None:
         missing = [name for name in self.model.parameters if name not in self.values]

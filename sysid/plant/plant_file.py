@@ -58,6 +58,8 @@ def plain_content(plant: PlantData) -> dict[str, Any]:
     content |= {name: _listed(getattr(plant, name)) for name in ("bounds", "valid")}
     content["covariance"] = None if plant.covariance is None else np.asarray(plant.covariance).tolist()
     content["samples"] = None
+    if plant.inputs_end_at_row:  # absent otherwise: files of version 0.1.0 have no such key
+        content["inputs_end_at_row"] = True
     if plant.refits:
         content["refits"] = [model.to_dict() for model in plant.refits]
     return content
@@ -83,6 +85,7 @@ def fields_of(content: Mapping[str, Any]) -> dict[str, Any]:
             "fitted_to": tuple(_fit_log(log) for log in content.get("fitted_to", ())),
             "scores": PlantScores.from_json(content["scores"]),
             "verdict": str(content["verdict"]),
+            "inputs_end_at_row": bool(content.get("inputs_end_at_row", False)),
         }
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise not_whole(error) from error

@@ -36,7 +36,7 @@ that drifts, or is driven where it never was, errs by more than any of its parts
 **Another run.** What differs between runs (supply voltage, air about the plant, a sensor that was glued
 anew) is in the errors of whole logs that were held out, so in those of a plant of three logs or more. One or
 two logs cannot show it, and parts of one log share it. Then the gain of the inputs is taken to vary from run
-to run by g = :data:`RUN_GAIN_SD`, and
+to run by g = :data:`~thermogrip.sysid.plant.fit_record.RUN_GAIN_SD`, and
 
     (v(u) - v((1 - g) u))^2
 
@@ -69,7 +69,7 @@ from scipy.special import ndtr, stdtrit
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, column, log_name
 from thermogrip.sysid.models.neural import NeuralModel
-from thermogrip.sysid.plant.fit_record import TAIL
+from thermogrip.sysid.plant.fit_record import RUN_GAIN_SD, SEVERAL, TAIL
 from thermogrip.sysid.plant.log_grid import cut_stretches
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import find_starts
@@ -79,7 +79,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MOST_DISAGREEMENT",
-    "RUN_GAIN_SD",
     "Band",
     "between_runs",
     "check_ensemble",
@@ -90,8 +89,6 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-RUN_GAIN_SD = 0.07  # of the inputs' effect, from run to run
-SEVERAL = 3  # logs of a fit from which on its held-out errors show what differs between runs
 SHORT = 0.1  # of the level: a part on which the expected coverage falls short by more is reported
 
 
@@ -174,7 +171,7 @@ def free_run_band(plant: Plant, log: Log, simulated: Log, *, level: float = 0.9,
 
 
 def between_runs(plant: Plant, log: Log) -> dict[str, Array]:
-    """Return by output what a gain of the inputs that is off by :data:`RUN_GAIN_SD` changes at each row.
+    """Return by output what a gain of the inputs that is off by ``RUN_GAIN_SD`` changes at each row.
 
     Empty for a plant of no log, or of so many that their held-out errors show what differs between runs.
     """

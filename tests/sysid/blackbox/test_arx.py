@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -42,7 +44,7 @@ def test_a_noise_free_system_is_found_exactly_whatever_the_offset(first_order, f
 def test_the_right_delay_is_chosen_by_held_out_free_run():
     grid = make_grid([arx_noise_log()], average=1.0)
     orders = {"poles": (1,), "zeros": (1,), "delays": (1, 2, 3, 4, 5), "terms": ((),)}
-    choice = choose(grid, lambda g: arx_family(g, **orders), warmup=50)
+    choice = choose(grid, partial(arx_family, **orders), warmup=50)
     assert choice.structure.label == "na 1, nb 1, delay 3"
     errors = {s.label: e.mean() for s, e in choice.errors.items()}
     assert all(errors["na 1, nb 1, delay 3"] < errors[f"na 1, nb 1, delay {k}"] for k in (1, 2, 4, 5))

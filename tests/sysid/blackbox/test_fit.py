@@ -12,7 +12,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid import Plant, identify
 from thermogrip.sysid.blackbox.fit import FAMILIES, BlackBoxFit, cut_into_blocks, fit_black_box, with_refits
-from thermogrip.sysid.blackbox.order_selection import Choice
+from thermogrip.sysid.blackbox.order_selection import Choice, Structure, choose
 from thermogrip.sysid.models.lti import StartPrior
 from thermogrip.sysid.plant.log_grid import make_grid
 from thermogrip.sysid.validation.prediction_bands import free_run_band
@@ -31,8 +31,8 @@ def fit_of(kind, log, **orders):
     """Return the fit of the first structure of these orders, which needs no choosing."""
     grid = make_grid([log], average=1.0)
     structure, model = next(iter(FAMILIES[kind](grid, **{k: (v,) for k, v in orders.items()}).items()))
-    choice = Choice(structure, StartPrior(), {}, (), np.zeros((1, 1)), warmup=5)
-    return BlackBoxFit(kind, Plant(model, {}, dt=1.0), model, choice, grid)
+    choice = Choice(structure, StartPrior(), {}, (), np.zeros((1, 1)), warmup=5, model=model)
+    return BlackBoxFit(kind, Plant(model, {}, dt=1.0), choice, grid)
 
 
 @pytest.mark.parametrize(
@@ -44,7 +44,7 @@ def test_refits_spread_as_fits_to_new_logs_do(kind, orders):
     for seed in range(16):
         fit = fit_of(kind, lagged_log(seed), **orders)
         drawn = [plant.model for plant in map(with_refits(fit, 12, seed=seed).draw, range(1, 13))]
-        fitted.append([fit.model.gain()[0, 0], fit.model.time_constants()[0]])
+        fitted.append([fit.choice.model.gain()[0, 0], fit.choice.model.time_constants()[0]])
         spread.append([[m.gain()[0, 0] for m in drawn], [m.time_constants()[0] for m in drawn]])
     from_logs = np.std(fitted, axis=0, ddof=1)
     from_blocks = np.sqrt(np.mean(np.var(spread, axis=2, ddof=1), axis=0))
@@ -74,7 +74,7 @@ def test_refits_of_sparse_equations_spread_as_fits_to_new_logs_do_and_cover_the_
     for seed in range(10):
         fit = fit_of("sindy", curved_log(seed)[0], degrees=2, memories=1, thresholds=0.0, widths=0)
         plant = with_refits(fit, 8, seed=seed)
-        fitted.append(run(fit.model))
+        fitted.append(run(fit.choice.model))
         spread.append(np.var([run(plant.draw(k).model) for k in range(1, 9)], axis=0, ddof=1))
     ratio = np.sqrt(np.mean(spread) / np.mean(np.var(fitted, axis=0, ddof=1)))
     # an sd of 10 values is known to 1/sqrt(18) = 24 %: three such either way
@@ -97,6 +97,43 @@ def test_a_black_box_of_identify_can_be_drawn_saved_and_loaded(tmp_path):
         assert np.abs(want - plant.simulate(log)["t"].values).max() > 1e-4
     assert plant.draw(0) is plant
     assert free_run_band(plant, log, plant.simulate(log)).draws == 30
+
+
+@pytest.mark.parametrize("kind", ["arx", "oe", "subspace"])
+def test_inputs_that_were_logged_behind_their_reading_are_found_out(kind, tmp_path):
+    rng = np.random.default_rng(3)
+    q = rng.random(700)
+    y = 25 + lfilter([0, 2.0], [1, -0.6], q) + 0.02 * rng.standard_normal(700)
+
+    def log_with(q):
+        return make_log(np.arange(700.0), {"q": (q, "1", "input"), "t": (y, "degC", "output")})
+
+    kept, behind = log_with(q), log_with(np.append(q[:1], q[:-1]))  # of each row the input of the row before
+    assert not fit_black_box(kind, [kept], average=1.0).plant.inputs_end_at_row
+    plant = fit_black_box(kind, [behind], average=1.0).plant
+    assert plant.inputs_end_at_row
+    loaded = Plant.load(plant.save(tmp_path / "plant.json"))
+    assert loaded.inputs_end_at_row
+    for some in (plant, loaded):
+        miss = some.simulate(behind, warmup=20.0)["t"].values - y
+        assert np.std(miss[20:]) < 0.025  # of 2 K that the input moves it
+
+
+def test_a_structure_whose_fit_to_all_data_errs_far_more_than_on_any_fold_is_passed_over():
+    grid = make_grid([lagged_log(0, 400)], average=1.0)
+    good = next(iter(FAMILIES["oe"](grid, poles=(2,), zeros=(1,), delays=(2,)).values()))
+    small, large, none = Structure("small", 2), Structure("large", 3), Structure("none", 1)
+
+    def family(part, *, only=None):
+        """Return models that are alike on the folds; on all data one is lost, and one is bad."""
+        models = {none: good, small: good, large: good}
+        if sum(len(segment.time) for segment in part.segments) == 400:
+            models = {small: replace(good, C=3 * good.C), large: good}
+        return {structure: model for structure, model in models.items() if only in (None, structure)}
+
+    choice = choose(grid, family, warmup=20)
+    assert (choice.structure, choice.model) == (large, good)
+    assert len(choice.errors) == 3
 
 
 def test_blocks_hold_every_row_once():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -111,7 +113,7 @@ def test_one_structure_alone_is_fitted_when_it_is_asked_for(first_order):
 
 def test_a_model_with_the_wrong_delay_loses(first_order):
     grid = make_grid([first_order.log(1500)], average=1.0)
-    choice = choose(grid, lambda g: oe_family(g, poles=(1,), zeros=(1,), delays=(1, 3, 6)), warmup=50)
+    choice = choose(grid, partial(oe_family, poles=(1,), zeros=(1,), delays=(1, 3, 6)), warmup=50)
     assert choice.structure.label == f"na 1, nb 1, delay {first_order.delay}"
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.blackbox.subspace import extended_observability, subspace_family
+from thermogrip.sysid.blackbox.subspace import extended_observability, stabilised, subspace_family
 from thermogrip.sysid.plant.log_grid import make_grid
 
 
@@ -71,10 +71,33 @@ def test_a_structure_with_a_term_has_one_number_more_for_each_state():
     assert any("with |q|" in label for label in sizes)
 
 
-def test_the_family_holds_no_unstable_model(coupled):
-    grid = make_grid([coupled.log(1000, reading=0.05)], average=1.0)
-    family = subspace_family(grid, orders=(1, 2, 3), rows=(8,))
-    assert family
+@pytest.mark.parametrize(
+    ("poles", "expected"),  # 50 rows: the circle exp(-1/50) = 0.9802
+    [
+        ((0.5, 0.9), (0.5, 0.9)),
+        ((0.5, 0.99), (0.5, 0.9802)),
+        ((-1.3, 1.1), (-0.9802, 0.9802)),
+        ((0.98, 0.981), (0.98, 0.9802)),
+    ],
+)
+def test_poles_slower_than_the_record_are_moved_along_their_direction(poles, expected):
+    basis = np.array([[1.0, 0.4], [-0.3, 2.0]])
+    A = stabilised(basis @ np.diag(poles) @ np.linalg.inv(basis), 50)
+    np.testing.assert_allclose(np.linalg.inv(basis) @ A @ basis, np.diag(expected), atol=3e-5)
+
+
+def test_a_pair_of_growing_poles_keeps_its_angle_and_a_defective_one_is_stable():
+    turn = 1.2 * np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+    np.testing.assert_allclose(stabilised(turn, 100), turn * np.exp(-0.01) / 1.2, atol=1e-12)
+    A = stabilised(np.array([[1.01, 1.0], [0.0, 1.01]]), 100)
+    assert np.abs(np.linalg.eigvals(A)).max() < 1
+
+
+def test_each_structure_is_stable_whatever_the_record(coupled):
+    log = coupled.log(1000, reading=0.05)
+    log["t1"].values[:] += 2e-5 * np.arange(1000.0) ** 2  # a drift that no input explains
+    family = subspace_family(make_grid([log], average=1.0), orders=(1, 2, 3), rows=(8,))
+    assert len(family) == 6
     assert all(model.stable for model in family.values())
 
 
