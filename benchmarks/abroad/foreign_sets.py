@@ -36,6 +36,7 @@ class ForeignSet:
     train: Log
     test: Log
     warmup: float
+    same_run: bool  # whether both are halves of one log
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,8 @@ def load(folder: Path, name: str) -> ForeignSet:
     else:
         train, test = rows[: len(rows) // 2], rows[len(rows) // 2 :]
     warmup = min(50.0, len(test) // 6) * kind.dt
-    return ForeignSet(name, _log(train, kind, f"{name}_train"), _log(test, kind, f"{name}_test"), warmup)
+    logs = _log(train, kind, f"{name}_train"), _log(test, kind, f"{name}_test")
+    return ForeignSet(name, *logs, warmup, same_run=not kind.two)
 
 
 def _rows(file: Path, mean: int) -> Array:

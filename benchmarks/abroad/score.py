@@ -2,9 +2,10 @@
 
     python benchmarks/abroad/score.py FOLDER [--sets luca,house] [--each]
 
-By set and output: the error stated for another run, that on the other half, the share of its readings
-inside the 90 % band with the band's interval score; by set: the chosen model, whether it is called good, CPU
-seconds.  ``--each``: every black box beside it, fitted to the whole training half.
+By set and output: the error stated (of two boards for another run, of the rest for the run itself), that on
+the other half, the share of its readings inside the 90 % band with the band's interval score; by set: the
+chosen model, whether it is called good, CPU seconds.  ``--each``: every black box beside it, fitted
+to the whole training half.
 """
 
 from __future__ import annotations
@@ -53,7 +54,8 @@ def score_set(some: ForeignSet, each: bool) -> None:
     scored = np.asarray(run.log["scored"].values) > 0
     for name, score in run.scores.items():
         rows = [row for row in found.rows if row.held_out and row.model == found.model and row.output == name]
-        stated = found.plant.scores.new_run_rmse.get(name) or stated_error(rows, name)
+        same = stated_error(rows, name)
+        stated = same if some.same_run else found.plant.scores.new_run_rmse.get(name, same)
         miss = np.abs(column(some.test, name) - column(run.log, name))[scored]
         half = band.half[name][scored]
         interval = float(np.mean(2 * half + 20 * np.maximum(miss - half, 0.0)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -346,6 +347,25 @@ def test_a_driver_drops_what_lies_behind_its_step():
     (mean,) = cut_stretches(plant, chamber(pwm, t, averaged_s=2.0))  # half a step is lost on average
     np.testing.assert_allclose(mean.u[:10, 0], [0, 0, 17.49, 17.5, 18.1, 200.499, 2.5, 54.5, -0.1, -18.1])
     np.testing.assert_allclose(mean.time, t + 1.0)  # the middle of what a row is the mean of
+
+
+def test_inputs_that_end_at_their_rows_are_moved_by_one_and_nothing_else_is():
+    plant, t = prior_plant(load_network("peltier_chamber")), np.arange(0.0, 40.0, 2.0)
+    log = chamber(np.arange(20.0) ** 2, t)
+    room = plant.disturbances[0]
+    log[room].values[:] = 20.0 + np.arange(20.0) ** 2
+    before, (plain,) = log.copy(deep=True), cut_stretches(plant, log)
+    (found,) = cut_stretches(replace(plant, inputs_end_at_row=True), log)
+    # rows of 2 s on a grid of 1 s; after the last row the last value stays
+    assert found.u[:, 0].tolist() == [k**2 for k in (*range(1, 20), 19) for _ in "ab"][: len(found.u)]
+    np.testing.assert_array_equal(found.d, plain.d)
+    np.testing.assert_array_equal(found.y, plain.y)
+    assert log.identical(before)
+    names = {"inputs": plant.inputs, "disturbances": (room,), "outputs": plant.outputs[:1]}
+    log[plant.outputs[0]].values[:] += np.arange(20.0)
+    grid = make_grid([log], **names, average=2.0, ends=True)
+    assert grid.ends
+    assert grid.segments[0].u[:, 0].tolist() == [k**2 for k in (*range(1, 20), 19)]
 
 
 def test_rows_between_steps_are_on_the_line_between_them():
