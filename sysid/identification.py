@@ -50,7 +50,6 @@ from thermogrip.sysid.blackbox.order_selection import (
     excess_within_noise,
     folds,
     held_out_runs,
-    log_errors,
 )
 from thermogrip.sysid.data.data_quality import DataCheck, Evidence, check_data, evidence
 from thermogrip.sysid.plant.fit_record import HELD_OUT_SHARE, RUN_GAIN_SD, SEVERAL, TAIL, HeldOut
@@ -180,7 +179,8 @@ def _smallest_of_the_best(fits: Sequence[BlackBoxFit]) -> BlackBoxFit:
 
 
 def _fold_errors(fit: BlackBoxFit, between: float) -> Array:
-    return log_errors(fit.choice.errors[fit.choice.structure], between)
+    """Return the logarithms of errors on another run, where ``between`` is added to those of the folds."""
+    return np.asarray(np.log(np.maximum(np.hypot(fit.choice.errors[fit.choice.structure], between), 1e-12)))
 
 
 def fit_without_tail(fit: BlackBoxFit, train: Sequence[Log]) -> Plant:

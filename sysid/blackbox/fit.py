@@ -27,6 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -170,13 +171,16 @@ def _with_convention(
     if grid.dt > 1.5 * grid.native or family in (sindy_family, neural_family):
         return grid, choice
     names = {"inputs": grid.inputs, "outputs": grid.outputs, "disturbances": grid.disturbances}
-    moved = make_grid(logs, **names, average=grid.dt, ends=True)
-    try:
-        other = choose(moved, family, warmup=_warmup_rows(moved, warmup))
-    except UserError:  # no structure of it is stable
-        return grid, choice
-    excess = np.log(choice.errors[choice.structure]) - np.log(other.errors[other.structure])
-    return (grid, choice) if excess_within_noise(excess) else (replace(moved, why=grid.why), other)
+    moved = replace(make_grid(logs, **names, average=grid.dt, ends=True), why=grid.why)
+    for tried in (partial(family, only=choice.structure), family):  # the same structure first: one fit a fold
+        try:
+            other = choose(moved, tried, warmup=_warmup_rows(moved, warmup))
+        except UserError:  # no structure of it is stable
+            return grid, choice
+        excess = np.log(choice.errors[choice.structure]) - np.log(other.errors[other.structure])
+        if excess_within_noise(excess):
+            return grid, choice
+    return moved, other
 
 
 def with_refits(

@@ -12,10 +12,7 @@ smallest structure is taken for which
 
     mean_f ln(e_sf / e_bf) <= min(se_f ln(e_sf / e_bf), ln 1.05),
 
-with the standard error of the paired differences. Of one or two logs e_sf^2 has g^2 added, the share by
-which the gain of the inputs is taken to vary from run to run
-(:data:`~thermogrip.sysid.plant.fit_record.RUN_GAIN_SD`): errors far below it do not tell how a model does on
-another day. Logarithms, because a fold whose input lies outside of
+with the standard error of the paired differences. Logarithms, because a fold whose input lies outside of
 what the rest has seen is bad for every structure alike and must not outweigh the others. Models that are
 unstable or diverge on any fold are refused, and structures whose fit to all data is, or errs on them far more
 than on any fold.
@@ -34,7 +31,6 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.models.lti import StartPrior, estimate_starts, evaluate_terms
 from thermogrip.sysid.models.model import Model as PlantModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.fit_record import RUN_GAIN_SD, SEVERAL
 from thermogrip.sysid.plant.log_grid import Grid, Segment
 
 __all__ = [
@@ -52,7 +48,6 @@ __all__ = [
     "folds",
     "free_run_errors",
     "held_out_runs",
-    "log_errors",
     "with_spread",
 ]
 
@@ -189,10 +184,9 @@ def choose(
             at = int(np.argmin(np.log(by_prior).mean(axis=0)))
         table[structure], best[structure], rmse[structure] = by_prior[:, at], PRIORS[at], by_output[:, at]
     labels = tuple(label for label, _, _ in cases)
-    between = 0.0 if len(grid.logs) >= SEVERAL else RUN_GAIN_SD
     left = dict(table)
     while True:
-        structure = _one_standard_error(left, between)
+        structure = _one_standard_error(left)
         model = family(grid, only=structure).get(structure)
         most = _MOST_ON_ALL * float(np.max(table[structure]))
         if model is not None and _error_on_all(model, grid, best[structure], warmup) <= most:
@@ -266,19 +260,14 @@ def excess_within_noise(excess: Array) -> bool:
     return bool(excess.mean() <= min(excess.std(ddof=1) / np.sqrt(excess.size), HARDLY_MORE))
 
 
-def log_errors(errors: Array, between: float) -> Array:
-    """Return the logarithms of errors on another run, whose gain varies by the share ``between``."""
-    return np.asarray(np.log(np.maximum(np.hypot(errors, between), 1e-12)))
-
-
-def _one_standard_error(table: Mapping[Structure, Array], between: float) -> Structure:
+def _one_standard_error(table: Mapping[Structure, Array]) -> Structure:
     usable = {structure: error for structure, error in table.items() if np.isfinite(error).all()}
     if not usable:
         raise UserError(
             "no structure gives a stable model on every held-out part",
             hint="give a longer log, more excitation, or average more",
         )
-    logs = {structure: log_errors(error, between) for structure, error in usable.items()}
+    logs = {structure: np.log(np.maximum(error, 1e-12)) for structure, error in usable.items()}
     best = min(logs, key=lambda s: float(logs[s].mean()))
     good = [best]
     for structure, error in logs.items():
