@@ -65,6 +65,7 @@ if TYPE_CHECKING:
 
 WITHIN_NOISE = 1.1  # of the best error: then the network is preferred, and a linear kind on another run
 LINEAR = ("arx", "oe", "subspace")  # kept where another kind errs hardly less
+SHOWN = 12  # structures of a kind
 USEFUL = 0.5  # of the no-input error: below it a model is called good
 
 
@@ -146,6 +147,23 @@ def fold_rows(fit: BlackBoxFit) -> list[Row]:
             what, unit = (fit.kind, fit.choice.structure.label, label, output), fit.grid.units[output]
             rows.append(Row(*what, float(rmse), percent, unit, n, idle_rmse, held_out=True))
     return rows
+
+
+def searched_rows(fit: BlackBoxFit) -> list[Searched]:
+    """Return the structures of a kind that are usable on every fold, the best first, at most ``SHOWN``."""
+    rows = [
+        Searched(
+            fit.kind,
+            structure.label,
+            float(np.exp(np.mean(np.log(np.maximum(errors, 1e-12))))),
+            tuple(errors.tolist()),
+            structure == fit.choice.structure,
+        )
+        for structure, errors in fit.choice.errors.items()
+        if np.isfinite(errors).all()
+    ]
+    rows.sort(key=lambda row: row.error)
+    return [row for at, row in enumerate(rows) if at < SHOWN or row.kept]
 
 
 def choose_black_box(fits: Sequence[BlackBoxFit], between: Mapping[str, float]) -> BlackBoxFit:
@@ -288,6 +306,17 @@ class SignalRole:
     guessed: bool
 
 
+@dataclass(frozen=True)
+class Searched:
+    """A structure of a black box (orders, delay) that was compared over the folds."""
+
+    model: str  # kind of the candidate
+    structure: str
+    error: float  # geometric mean over the folds of RMSE over the outputs' spread
+    folds: tuple[float, ...]  # the same by fold
+    kept: bool  # whether it stands for its kind
+
+
 @dataclass(frozen=True, eq=False)
 class Identification:
     """What :func:`identify` found."""
@@ -302,6 +331,7 @@ class Identification:
     notes: tuple[str, ...]  # candidates that could not be fitted, and why; the step of a black box, and why
     signals: tuple[SignalRole, ...] = ()  # what each column of the logs was taken for
     runs: tuple[FreeRun, ...] = ()  # of ``plant`` over each log, its residual not tested
+    searched: tuple[Searched, ...] = ()  # structures of the black boxes, by kind, the best first
 
     def errors(self) -> dict[str, float]:
         """Return the mean held-out error of each candidate, relative to the no-input baseline."""
@@ -321,6 +351,8 @@ def identify(
     *,
     models: Sequence[str] = MODELS,
     average: float | None = None,
+    order: int | None = None,
+    delay: int | None = None,
     leave_one_out: bool = False,
     posterior: bool = False,
     draws: int = 24,
@@ -341,6 +373,9 @@ def identify(
         Candidates, of :data:`MODELS`.
     average : float, optional
         Averaging step of the black boxes [s]; chosen where absent.
+    order, delay : int, optional
+        Poles of each output (states, of ``subspace``) and steps of delay of the black boxes that have them;
+        the others are left out then. Searched where absent.
     leave_one_out : bool, optional
         Score each log by a fit to the others (at least two logs).
     posterior : bool, optional
@@ -391,9 +426,8 @@ def identify(
 
     def fit(model: str, some: Sequence[Log], report: Progress | None) -> Plant | BlackBoxFit:
         if model != "network":
-            return fit_black_box(
-                model, some, inputs=u, outputs=y, disturbances=d, average=average, progress=report
-            )
+            fixed = {"average": average, "order": order, "delay": delay}
+            return fit_black_box(model, some, inputs=u, outputs=y, disturbances=d, **fixed, progress=report)
         from thermogrip.sysid.greybox.fit import fit_network  # pulls in llvmlite and nlopt at the first fit
 
         assert network is not None
@@ -448,7 +482,10 @@ def identify(
     plant = replace(plant, verdict=verdict, scores=scores)
     lists = {"input": inputs, "output": outputs, "disturbance": disturbances}
     roles = _signal_roles(records, (u, d, y), lists, network)
-    return Identification(plant, chosen, tuple(rows), checked, covered, good, verdict, notes, roles, runs)
+    searched = tuple(row for some in fits for row in searched_rows(some))
+    return Identification(
+        plant, chosen, tuple(rows), checked, covered, good, verdict, notes, roles, runs, searched
+    )
 
 
 def _signal_roles(

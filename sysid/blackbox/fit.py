@@ -65,6 +65,14 @@ FAMILIES: dict[str, Family] = {
 BLACK_BOXES = tuple(FAMILIES)
 RESAMPLED = ("arx", "oe", "subspace", "sindy")  # a refit of a neural model takes as long as its fit
 
+_FIXED = {  # what a kind calls its order or delay
+    ("arx", "order"): "poles",
+    ("arx", "delay"): "delays",
+    ("oe", "order"): "poles",
+    ("oe", "delay"): "delays",
+    ("subspace", "order"): "orders",
+}
+_MOST_FIXED = 20  # more poles, or steps of delay, than any record determines
 _AVERAGED = ("sindy", "neural")  # fitted at the averaged rate alone
 _MAX_ROWS = 8000  # beyond it the logs' own rate is not tried beside the averaged one
 _BLOCKS, _BLOCK_ROWS = 16, 40  # blocks of the bootstrap in all, each of so many rows at least
@@ -91,6 +99,8 @@ def fit_black_box(
     outputs: Sequence[str] | None = None,
     disturbances: Sequence[str] | None = None,
     average: float | None = None,
+    order: int | None = None,
+    delay: int | None = None,
     warmup: float | None = None,
     progress: Callable[[float, str], None] | None = None,
 ) -> BlackBoxFit:
@@ -104,6 +114,10 @@ def fit_black_box(
         Names of the signals; by role where absent.
     average : float, optional
         Step [s]; both the chosen and the logs' own are tried where absent.
+    order : int, optional
+        Poles of each output of ``arx`` and ``oe``, states of ``subspace``; searched where absent.
+    delay : int, optional
+        Steps of the model from an input to its effect, of ``arx`` and ``oe``; searched where absent.
     warmup : float, optional
         Seconds whose readings set the state of a held-out stretch; 5 s for whole logs (they begin at rest),
         50 samples for stretches cut out of a log, where absent.
@@ -117,7 +131,8 @@ def fit_black_box(
     Raises
     ------
     UserError
-        If there is no such kind, the data are too short, or no structure survives the held-out free run.
+        If there is no such kind, or it has no such order or delay, the data are too short, or no structure
+        survives the held-out free run.
 
     Examples
     --------
@@ -133,9 +148,10 @@ def fit_black_box(
     """
     if kind not in FAMILIES:
         raise UserError(f"no model of kind {kind!r}", hint=f"choose from {', '.join(BLACK_BOXES)}")
+    family = _of_order(kind, order, delay)
     u, y, d = signals(logs, inputs=inputs, outputs=outputs, disturbances=disturbances)
     first = make_grid(logs, inputs=u, outputs=y, disturbances=d, average=average)
-    grids, family = [first], FAMILIES[kind]
+    grids = [first]
     own_rows = sum(len(s.time) for s in first.segments) * first.dt / first.native
     if average is None and first.dt > 1.5 * first.native and own_rows <= _MAX_ROWS and kind not in _AVERAGED:
         own = make_grid(logs, inputs=u, outputs=y, disturbances=d, average=first.native)
@@ -159,6 +175,20 @@ def fit_black_box(
         raise refused if refused is not None else UserError(f"{kind} could not be fitted")
     grid, choice = _with_convention(*best, logs, family, warmup)
     return BlackBoxFit(kind, _plant(grid, choice, logs), choice, grid)
+
+
+def _of_order(kind: str, order: int | None, delay: int | None) -> Family:
+    """Return the family with order and delay as asked for; refuse a kind that has none to fix."""
+    fixed: dict[str, tuple[int, ...]] = {}
+    for what, value in (("order", order), ("delay", delay)):
+        if value is None:
+            continue
+        if (kind, what) not in _FIXED:
+            raise UserError(f"a {kind} model has no {what} to fix", hint=f"leave the {what} away, or {kind}")
+        if not 1 <= value <= _MOST_FIXED:
+            raise UserError(f"{what} {value} is not between 1 and {_MOST_FIXED}", hint="give another")
+        fixed[_FIXED[kind, what]] = (value,)
+    return partial(FAMILIES[kind], **fixed) if fixed else FAMILIES[kind]
 
 
 def _with_convention(

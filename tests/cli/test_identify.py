@@ -17,7 +17,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.data.data_quality import Finding
 from thermogrip.sysid.experiment.information import plant_from_prior
-from thermogrip.sysid.identification import Row, SignalRole
+from thermogrip.sysid.identification import Row, Searched, SignalRole
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.validation.free_run import Score
 
@@ -47,6 +47,7 @@ def found_of(model: str = "network", **changes: Any) -> SimpleNamespace:
         "verdict": "it is good", "data_check": SimpleNamespace(findings=findings),
         "evidence": Covered(3.0), "notes": ("arx: slow",),
         "signals": (SignalRole("q1", "percent", "input", "its unit", True),),
+        "searched": (Searched("arx", "na 1, nb 1, delay 1", 0.25, (0.2, 0.3125), True),),
     }  # fmt: skip
     return SimpleNamespace(**found | changes)
 
@@ -104,7 +105,8 @@ def test_the_network_is_the_one_asked_for_or_the_gripper_where_the_logs_fit_it(
 
 def test_words_reach_the_fit_by_their_meaning(room: SimpleNamespace) -> None:
     words = "good.csv more.csv --network tclab --inputs q1,q2 --outputs T1_degC --disturbances room"
-    words += " --models arx,network --average 2.5 --leave-one-out --seed 7 --report r.html"
+    words += " --models arx,network --average 2.5 --order 2 --delay 3 --leave-one-out"
+    words += " --seed 7 --report r.html"
     done = room.bench.run("identify", *words.split(), "--out", "p.json")
     assert done.code == 0, done
     words, roles = (("q1", "q2"), ("T1_degC",), ("room",)), (("q1", "q2"), ("t1",), ("room",))
@@ -113,6 +115,7 @@ def test_words_reach_the_fit_by_their_meaning(room: SimpleNamespace) -> None:
     [fit] = room.fits
     assert (len(fit.args[0]), fit.args[2:]) == (2, roles)
     assert (fit.models, fit.average, fit.leave_one_out) == (("arx", "network"), 2.5, True)
+    assert (fit.order, fit.delay) == (2, 3)
     assert (fit.draws, fit.seed) == (24, 7)
     [page] = room.pages
     assert page.args == (Path("r.html"), "Identification", "From log a, log a.", ["a section"])
@@ -160,6 +163,10 @@ def test_the_answer_of_identify_is_what_was_found(room: SimpleNamespace) -> None
         },
         "intervals_90": {name: list(ends) for name, ends in BOARD.intervals(0.9).items()},
         "identifiability": ["U is identifiable"], "growth": None, "posterior": None,
+        "searched": [
+            {"model": "arx", "structure": "na 1, nb 1, delay 1", "error": 0.25, "folds": [0.2, 0.3125],
+             "kept": True}
+        ],
         "notes": ["arx: slow"], "out": "p.json",
         "repairs": {"log a": ["one row dropped", "two rows swapped"]},
     }  # fmt: skip

@@ -14,7 +14,7 @@ from thermogrip.report import plant
 from thermogrip.report.html import Picture, Table, Text
 from thermogrip.report.plant import _prior_intervals, free_run_section, parameter_rows
 from thermogrip.sysid.experiment.information import plant_from_prior
-from thermogrip.sysid.identification import SignalRole
+from thermogrip.sysid.identification import Searched, SignalRole
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
@@ -143,7 +143,7 @@ def identified(good: bool = True) -> SimpleNamespace:
     checked = SimpleNamespace(findings=findings)
     return SimpleNamespace(
         rows=rows, data_check=checked, good=good, verdict="oe is best", notes=("arx failed",),
-        model="oe", signals=(), runs=(),
+        model="oe", signals=(), runs=(), searched=(Searched("arx", "na 1", 0.25, (0.2, 0.3125), True),),
     )  # fmt: skip
 
 
@@ -157,8 +157,12 @@ def test_an_identification_has_its_tables_and_verdict(good: bool, tone: str) -> 
     assert [table.caption for table in tables][:4] == [
         "Free-run RMSE on rows that were not fitted (blocks: of means over a step of the model)",
         "Columns of the logs",
-        "oe, fitted on everything, on its own logs", "Free parameters",
+        "oe, fitted on everything, on its own logs",
+        "Structures searched: RMSE over the outputs' spread on each fold, the best of each kind first",
     ]  # fmt: skip
+    assert tables[3].head == ("model", "structure", "mean", "fold 1", "fold 2", "")
+    assert tables[3].rows == (("arx", "na 1", 0.25, 0.2, 0.3125, "kept"),)
+    assert tables[4].caption == "Free parameters"
     assert tables[2].rows == (("b", "t", 0.5, "degC", 90.0, 50),)
     assert tables[-1].rows == (("warn", "gaps", "a", "t", "a gap"),)
     texts = [part for part in section.parts if isinstance(part, Text)]
@@ -169,7 +173,7 @@ def test_an_identification_has_its_tables_and_verdict(good: bool, tone: str) -> 
     captions = [
         part.caption for part in plant.identification_section(clean, black).parts if isinstance(part, Table)
     ]
-    assert captions == [table.caption for table in tables][:3]
+    assert captions == [table.caption for table in tables][:4]
 
 
 @pytest.mark.usefixtures("no_figures")

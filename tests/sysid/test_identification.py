@@ -18,7 +18,7 @@ from thermogrip.datasets.schema import make_log
 from thermogrip.sysid import Plant, identification, identify
 from thermogrip.sysid.blackbox.fit import fit_black_box
 from thermogrip.sysid.blackbox.order_selection import Structure, _one_standard_error, folds
-from thermogrip.sysid.identification import choose_black_box, stated_error
+from thermogrip.sysid.identification import SHOWN, choose_black_box, stated_error
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import fit_logs
 from thermogrip.sysid.plant.log_grid import make_grid
@@ -112,6 +112,21 @@ def test_an_error_far_below_what_differs_between_runs_keeps_a_linear_kind(oe, ch
     fits = [fit_of("neural", [0.03] * 4), fit_of("oe", [oe] * 4)]
     assert choose_black_box(fits, {}).kind == "neural"  # nothing is known to differ
     assert choose_black_box(fits, {"t": 0.14}).kind == chosen
+
+
+def test_what_was_searched_is_listed_with_its_errors_and_a_fixed_order_leaves_others_out():
+    found = identify(plant_log(), models=["oe", "sindy"], average=2.0, order=1, draws=0)
+    assert found.model == "oe"
+    assert any("a sindy model has no order to fix" in note for note in found.notes)
+    assert {row.model for row in found.searched} == {"oe"}
+    assert all("na 1," in row.structure for row in found.searched)
+    assert [row.structure for row in found.searched if row.kept] == [found.plant.scores.structure]
+    for row in found.searched:
+        assert len(row.folds) == 4
+        assert row.error == pytest.approx(np.exp(np.mean(np.log(row.folds))))
+    assert [row.error for row in found.searched] == sorted(row.error for row in found.searched)
+    everything = fit_black_box("oe", [plant_log()], average=2.0)
+    assert len(everything.choice.errors) > SHOWN + 1 >= len(identification.searched_rows(everything)) >= SHOWN
 
 
 def test_one_log_states_what_another_run_may_add_and_three_do_not():

@@ -99,6 +99,16 @@ ModelsOption = Annotated[
 LeaveOneOutOption = Annotated[
     bool, typer.Option("--leave-one-out", help="Score each log by a fit to the others.")
 ]
+OrderOption = Annotated[
+    int | None,
+    typer.Option(
+        "--order", metavar="N", min=1, max=20, help="Poles of ARX and OE, states of subspace models."
+    ),
+]
+DelayOption = Annotated[
+    int | None,
+    typer.Option("--delay", metavar="N", min=1, max=20, help="Delay of ARX and OE, in steps of the model."),
+]
 GrowOption = Annotated[
     bool,
     typer.Option(
@@ -122,6 +132,8 @@ def identify(
     dt: Step = None,
     models: ModelsOption = ALL_MODELS,
     average: Average = None,
+    order: OrderOption = None,
+    delay: DelayOption = None,
     leave_one_out: LeaveOneOutOption = False,
     grow: GrowOption = False,
     posterior: PosteriorOption = False,
@@ -179,6 +191,8 @@ def identify(
             *roles,
             models=wanted,
             average=average,
+            order=order,
+            delay=delay,
             leave_one_out=leave_one_out,
             draws=0 if posterior else 24,
             seed=seed,
@@ -314,6 +328,7 @@ def _identified(
             "residual": [asdict(term) for term in growth.residual],
         },
         "posterior": sampled,
+        "searched": [asdict(row) for row in found.searched],
         "notes": found.notes,
         "out": out,
     }

@@ -124,6 +124,11 @@ def identification_section(found: Identification, plant: Plant) -> Section:
             f"{found.model}, fitted on everything, on its own logs",
         ),
     ]
+    if found.searched:
+        folds = tuple(f"fold {k + 1}" for k in range(len(found.searched[0].folds)))
+        shown = [(s.model, s.structure, s.error, *s.folds, "kept" if s.kept else "") for s in found.searched]
+        title = "Structures searched: RMSE over the outputs' spread on each fold, the best of each kind first"
+        parts.append(Table(("model", "structure", "mean", *folds, ""), tuple(shown), title))
     if plant.free:
         parts.append(Table(PARAMETER_HEAD, tuple(parameter_rows(plant)), "Free parameters"))
         parts += _per_log(plant)

@@ -119,6 +119,38 @@ def test_inputs_that_were_logged_behind_their_reading_are_found_out(kind, tmp_pa
         assert np.std(miss[20:]) < 0.025  # of 2 K that the input moves it
 
 
+@pytest.mark.parametrize(
+    ("kind", "fixed"),
+    [
+        ("arx", {"order": 2, "delay": 3}),
+        ("oe", {"delay": 2}),
+        ("oe", {"order": 1, "delay": 1}),
+        ("subspace", {"order": 3}),
+    ],
+)
+def test_order_and_delay_are_those_asked_for(kind, fixed):
+    fit = fit_black_box(kind, [lagged_log(4, 700)], average=1.0, **fixed)
+    tried = {part for structure in fit.choice.errors for part in structure.label.split(", ")}
+    names = {"order": "order " if kind == "subspace" else "na ", "delay": "delay "}
+    for what, value in fixed.items():
+        assert {part for part in tried if part.startswith(names[what])} == {f"{names[what]}{value}"}
+
+
+@pytest.mark.parametrize(
+    ("kind", "fixed", "says"),
+    [
+        ("subspace", {"delay": 2}, "a subspace model has no delay to fix"),
+        ("neural", {"order": 2}, "a neural model has no order to fix"),
+        ("sindy", {"order": 2}, "a sindy model has no order to fix"),
+        ("arx", {"order": 0}, "order 0 is not between 1 and 20"),
+        ("oe", {"delay": 21}, "delay 21 is not between 1 and 20"),
+    ],
+)
+def test_an_order_or_delay_that_a_kind_cannot_have_is_refused(kind, fixed, says):
+    with pytest.raises(UserError, match=says):
+        fit_black_box(kind, [lagged_log(4, 200)], **fixed)
+
+
 def test_a_structure_whose_fit_to_all_data_errs_far_more_than_on_any_fold_is_passed_over():
     grid = make_grid([lagged_log(0, 400)], average=1.0)
     good = next(iter(FAMILIES["oe"](grid, poles=(2,), zeros=(1,), delays=(2,)).values()))
