@@ -426,8 +426,17 @@ def identify(
 
     def fit(model: str, some: Sequence[Log], report: Progress | None) -> Plant | BlackBoxFit:
         if model != "network":
-            fixed = {"average": average, "order": order, "delay": delay}
-            return fit_black_box(model, some, inputs=u, outputs=y, disturbances=d, **fixed, progress=report)
+            return fit_black_box(
+                model,
+                some,
+                inputs=u,
+                outputs=y,
+                disturbances=d,
+                average=average,
+                order=order,
+                delay=delay,
+                progress=report,
+            )
         from thermogrip.sysid.greybox.fit import fit_network  # pulls in llvmlite and nlopt at the first fit
 
         assert network is not None

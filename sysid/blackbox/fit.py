@@ -29,6 +29,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -179,7 +180,7 @@ def fit_black_box(
 
 def _of_order(kind: str, order: int | None, delay: int | None) -> Family:
     """Return the family with order and delay as asked for; refuse a kind that has none to fix."""
-    fixed: dict[str, tuple[int, ...]] = {}
+    fixed: dict[str, Any] = {}
     for what, value in (("order", order), ("delay", delay)):
         if value is None:
             continue
@@ -200,8 +201,15 @@ def _with_convention(
     """
     if grid.dt > 1.5 * grid.native or family in (sindy_family, neural_family):
         return grid, choice
-    names = {"inputs": grid.inputs, "outputs": grid.outputs, "disturbances": grid.disturbances}
-    moved = replace(make_grid(logs, **names, average=grid.dt, ends=True), why=grid.why)
+    moved = make_grid(
+        logs,
+        inputs=grid.inputs,
+        outputs=grid.outputs,
+        disturbances=grid.disturbances,
+        average=grid.dt,
+        ends=True,
+    )
+    moved = replace(moved, why=grid.why)
     for tried in (partial(family, only=choice.structure), family):  # the same structure first: one fit a fold
         try:
             other = choose(moved, tried, warmup=_warmup_rows(moved, warmup))

@@ -187,10 +187,10 @@ def choose(
     left = dict(table)
     while True:
         structure = _one_standard_error(left)
-        model = family(grid, only=structure).get(structure)
+        fitted = family(grid, only=structure).get(structure)
         most = _MOST_ON_ALL * float(np.max(table[structure]))
-        if model is not None and _error_on_all(model, grid, best[structure], warmup) <= most:
-            return Choice(structure, best[structure], table, labels, rmse[structure], warmup, model)
+        if fitted is not None and _error_on_all(fitted, grid, best[structure], warmup) <= most:
+            return Choice(structure, best[structure], table, labels, rmse[structure], warmup, fitted)
         del left[structure]
 
 
