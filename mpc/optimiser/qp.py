@@ -35,10 +35,8 @@ LEAST_QUADRATIC = 1e-9  # of a scaled row's quadratic penalty
 
 Vector = NDArray[np.float64]
 
-#: What DAQP's exit flags mean; a positive flag is a solution.
+#: What DAQP's exit flags mean where they are not positive: a positive flag is a solution.
 _FLAGS = {
-    1: "solved",
-    2: "solved",
     -1: "infeasible",
     -2: "cycling",
     -3: "unbounded",
@@ -139,8 +137,10 @@ class CondensedQP:
             np.clip(np.where(idle, np.inf, upper / length), -_FAR, _FAR),
             length,
         )
-        if flag <= 0 or not np.isfinite(z).all():
+        if flag <= 0:
             return self._failed(_FLAGS.get(flag, f"solver flag {flag}"), f.size, iterations)
+        if not np.isfinite(z).all():
+            return self._failed("not finite", f.size, iterations)
         x = z * scale
         value = A @ x
         slack = np.maximum(0.0, np.maximum(value - upper, lower - value))

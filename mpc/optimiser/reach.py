@@ -70,8 +70,7 @@ class _Relaxation:
     """Means of a reading since the drives stand still."""
 
     def __init__(self) -> None:
-        self.u = self.w = np.zeros(0)
-        self.restart(np.full(1, np.nan), self.w)
+        self.restart(np.full(1, np.nan), np.zeros(0))
 
     def restart(self, u: Array, w: Array) -> None:
         self.u, self.w = u, w
@@ -177,9 +176,7 @@ class Reach:
     def _record(self, y: Array, u: Array, w: Array) -> None:
         span = self.model.span
         for at, (movers, relaxation) in enumerate(zip(self._movers, self._relaxations, strict=True)):
-            still = len(relaxation.u) == len(u) and np.all(
-                np.abs(u - relaxation.u)[movers] <= _STILL * span[movers]
-            )
+            still = np.all(np.abs(u - relaxation.u)[movers] <= _STILL * span[movers])
             if not still or not np.isfinite(y[at]):
                 relaxation.restart(u.copy(), w.copy())
             if np.isfinite(y[at]):

@@ -119,3 +119,24 @@ def test_c_refuses_what_python_refuses(in_c):
     crossed = upper.copy()
     crossed[0] = lower[0] - 1
     assert solve_in_c(in_c, H, f, rows, lower, crossed, **weights)[1] == "infeasible"
+
+
+@pytest.mark.parametrize("seed", [3, 11, 27])
+def test_the_iterations_that_are_needed_are_enough_and_one_less_is_not(seed):
+    H, f, A, lower, upper, soft, linear, quadratic = random_problem(seed)
+    given = {"soft": soft, "linear": linear, "quadratic": quadratic}
+    need = ActiveSetQP(**given).solve(H, f, A, lower, upper).iterations
+    assert need > 2
+    assert ActiveSetQP(**given, iteration_limit=need).solve(H, f, A, lower, upper).status == "solved"
+    short = ActiveSetQP(**given, iteration_limit=need - 1).solve(H, f, A, lower, upper)
+    assert (short.status, short.iterations, np.isnan(short.x).all()) == ("iteration limit", need, True)
+
+
+@pytest.mark.parametrize(("length", "answer"), [(0.9e-5, 3.0), (1.2e-5, None)])
+def test_a_soft_row_too_short_to_be_kept_is_left_out(length, answer):
+    """Nearest to 3 with a row that a distance of 1 / length would keep, at any price."""
+    qp = ActiveSetQP(soft=np.array([True]), linear=1e9, quadratic=1.0)
+    found = qp.solve(np.eye(1), np.array([-3.0]), np.array([[length]]), np.array([1.0]), np.array([np.inf]))
+    assert found.solved
+    assert (found.x[0] == pytest.approx(3.0)) == (answer is not None)
+    assert found.slack[0] == pytest.approx(max(0.0, 1.0 - length * found.x[0]), abs=1e-9)

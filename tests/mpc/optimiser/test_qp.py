@@ -8,6 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
+from thermogrip.mpc.optimiser.active_set import ActiveSetQP
 from thermogrip.mpc.optimiser.qp import LEAST_QUADRATIC, CondensedQP
 
 
@@ -178,3 +179,57 @@ def test_after_a_failure_the_next_solve_starts_cold():
     assert solver.solve(np.eye(2), np.array([np.nan, 0.0]), A, *ends).status == "not finite"
     assert solver._model is None
     np.testing.assert_allclose(solver.solve(np.eye(2), np.array([-3.0, 0.0]), A, *ends).x, first.x)
+
+
+FLAGS = {
+    2: "solved", 0: "solver flag 0", -1: "infeasible", -2: "cycling", -3: "unbounded", -4: "iteration limit",
+    -5: "not convex", -6: "bad start", -7: "time limit", -8: "solver flag -8",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("flag", "status"), FLAGS.items())
+@pytest.mark.parametrize("z", [0.5, np.nan])
+def test_a_flag_of_the_solver_is_a_status_and_no_number_is_no_solution(monkeypatch, flag, status, z):
+    solver = CondensedQP(soft=[False], linear=[0.0], quadratic=[0.0])
+    monkeypatch.setattr(solver, "_run", lambda *given: (np.full(1, z), np.full(1, 6.0), flag, 7))
+    solver._model = "warm"
+    found = solver.solve(np.array([[4.0]]), np.zeros(1), np.array([[3.0]]), -np.ones(1), np.ones(1))
+    solved = flag > 0 and np.isfinite(z)
+    assert found.status == ("not finite" if flag > 0 and not solved else status)
+    assert (found.solved, found.iterations, solver._model) == (solved, 7, "warm" if solved else None)
+    # x = z / 2; a row of length 3 / 2
+    np.testing.assert_equal(
+        [found.x, found.multipliers, found.slack], [[0.25], [4], [0]] if solved else [[np.nan], [0], [0]]
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [({"linear": [0.0]}, "one penalty a row"), ({"quadratic": [0.0]}, "one penalty a row"),
+     ({"linear": [-1.0, 0.0]}, "penalties must be >= 0"), ({"quadratic": [-1.0, 0.0]}, "penalties must be >= 0"),
+     ({"linear": [0.0, -1.0]}, ""), ({"quadratic": [0.0, -1.0]}, "")],
+)  # fmt: skip
+def test_penalties_are_one_a_row_and_none_is_below_0_where_it_counts(changes, says):
+    given = {"soft": [True, False], "linear": [0.0, 0.0], "quadratic": [0.0, 0.0]} | changes
+    if says:
+        with pytest.raises(ValueError, match=says):
+            CondensedQP(**given)
+        return
+    with pytest.raises(ValueError, match=r"A is \(1, 1\), not \(2, 1\)"):
+        CondensedQP(**given).solve(np.eye(1), np.zeros(1), np.eye(1), np.zeros(1), np.zeros(1))
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize(
+    "solver",
+    [CondensedQP(soft=[True], linear=[1.0], quadratic=[3.0]),
+     ActiveSetQP(soft=np.array([True]), linear=1.0, quadratic=3.0)],
+)  # fmt: skip
+def test_what_breaking_a_row_costs_is_in_its_own_units(solver, side):
+    """2 x^2 - 12 x + s + 1.5 s^2 with s = 2 x - 2 is least at x = 22/16."""
+    far = np.array([np.inf])
+    lower, upper = (-far, np.array([2.0])) if side > 0 else (np.array([-2.0]), far)
+    found = solver.solve(np.array([[4.0]]), np.array([-12.0 * side]), np.array([[2.0]]), lower, upper)
+    np.testing.assert_allclose(found.x, [1.375 * side], rtol=1e-8)
+    np.testing.assert_allclose([*found.slack, *found.multipliers], [0.75, 3.25 * side], rtol=1e-7)
+    assert found.iterations > 0

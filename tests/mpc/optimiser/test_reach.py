@@ -152,6 +152,15 @@ def test_the_range_ends_where_a_gain_fades():
     assert (low.tolist(), high.tolist()) == ([-50.0, 0.0], [37.5, 80.0])  # 0.75 * 25 / 0.5
     low, high = made._range(G, np.array([-20.0, 20.0]), bias)
     assert (low.tolist(), high.tolist()) == ([-22.5, 0.0], [100.0, 80.0])  # 0.75 * 15 / 0.5
+    # the way of q1 is from 10 on: 57.1 = 25 / 0.4375 to the optimum, of which 3 - 2.1 for its end at 60
+    made.model = SimpleNamespace(neutral=np.array([10.0, 0.0]), span=MODEL.span)
+    G[1, 0] = 0.5625 * 25
+    assert made._range(G, np.array([-20.0, 20.0]), bias)[0].tolist() == pytest.approx(
+        [10 - 0.9 * 25 / 0.4375, 0]
+    )
+    assert made._range(G, np.array([25.0, 20.0]), bias)[1].tolist() == pytest.approx(
+        [10 + 0.75 * 20 / 0.4375, 80]
+    )
     made._optimiser.settled_gain = None
     assert made._range(G, np.array([20.0, 20.0]), bias)[1].tolist() == [100.0, 80.0]
 
@@ -168,6 +177,26 @@ def test_the_steady_outputs_nearest_to_the_targets_and_what_the_biases_do_there(
         np.testing.assert_allclose(y, held, atol=1e-6)
         np.testing.assert_allclose(J, np.diag([25.0, 51.0]), atol=1e-9)
         np.testing.assert_allclose(made._u, [10.0, (held[1] - 22.0) / 0.2 + 0.05 * 255], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("u", "range_", "low", "high"),
+    [
+        ([40.0, 30.0], None, [-0.3, -30 / 255], [0.3, 50 / 255]),
+        ([95.0, 99.0], None, [-0.3, -0.3], [0.05, 0.0]),
+        ([-45.0, 2.0], None, [-0.05, -2 / 255], [0.3, 0.3]),
+        ([40.0, 30.0], ([-50.0, 0.0], [-40.0, 20.0]), [-0.3, -30 / 255], [-0.3, -10 / 255]),
+        ([40.0, 30.0], ([90.0, 40.0], [100.0, 80.0]), [0.3, 10 / 255], [0.3, 50 / 255]),
+    ],
+)
+def test_a_step_to_the_steady_state_is_a_third_of_a_range_at_most(monkeypatch, u, range_, low, high):
+    made, asked = reach(), []
+    if range_:
+        monkeypatch.setattr(made, "_range", lambda *given: tuple(np.array(end) for end in range_))
+    monkeypatch.setattr(made, "_nearest", lambda *given: asked.append(given[-2:]) or np.zeros(2))
+    OBSERVER.reset(np.array([22.0, 22.0]), np.array([22.0]))
+    made._held(OBSERVER, np.array(u), np.array([22.0]), TARGET, NO_SIDE, BOTH)
+    np.testing.assert_allclose(asked[0], (low, high), rtol=1e-9, atol=1e-12)
 
 
 def watcher(held: list[float], *, J=((2.0, 0.0), (0.0, 1.0)), bias: float = 0.5, w=(0.0, 0.0)):
@@ -252,15 +281,16 @@ def test_what_readings_say_counts_where_the_model_has_no_say(unreachable, g, mis
 
 def test_a_relaxation_begins_anew_when_its_own_drive_moves_or_its_reading_is_lost():
     made = reach()
-    for u, y, kept in (
-        ([40.0, 30.0], [25.0, 24.0], [1, 1]),
-        ([41.0, 32.5], [25.0, 24.0], [2, 2]),  # 1 % of its range is still
-        ([41.1, 32.5], [25.0, 24.0], [1, 3]),  # b is q1's
-        ([41.1, 32.6], [25.0, 24.0], [2, 1]),
-        ([41.1, 32.6], [NAN, 24.0], [0, 2]),
-    ):
-        made._record(np.array(y), np.array(u), np.array([0.1, 0.2]))
+    rows = (
+        ([40.0, 30.0], [25.0, 24.0], [1, 1], [0, 0]),
+        ([41.0, 32.5], [25.0, 24.0], [2, 2], [0, 0]),  # 1 % of its range is still
+        ([41.1, 32.5], [25.0, 24.0], [1, 3], [2, 0]),  # b is q1's
+        ([41.1, 32.6], [25.0, 24.0], [2, 1], [2, 3]),
+        ([41.1, 32.6], [NAN, 24.0], [0, 2], [4, 3]),
+    )
+    for at, (u, y, kept, since) in enumerate(rows):
+        made._record(np.array(y), np.array(u), np.array([at, 0.2]))
         assert [len(relaxation.bins) for relaxation in made._relaxations] == kept
-    assert made._relaxations[0].w.tolist() == [0.1, 0.2]
+        assert [relaxation.w.tolist() for relaxation in made._relaxations] == [[k, 0.2] for k in since]
     alone = PILoop("q1", "a", Kc=1.0, Ti=1.0, Tt=1.0)
     assert [each.tolist() for each in reach(loops=(alone,))._movers] == [[0, 1], [0, 1]]

@@ -297,3 +297,14 @@ def test_a_plant_that_settles_nowhere_or_is_not_moved_has_no_settled_gain(a, b):
     plant = Plant(model, {}, dt=2.0, units={"q": "1", "t": "degC"}, valid={"q": (0.0, 1.0)})
     design = Design(2.0, ("t",), (1, 1), {"q": (0.0, 1.0)}, {"q": 1.0})
     assert Optimiser(PredictionModel(plant), design).settled_gain is None
+
+
+def test_the_bias_of_a_drive_counts_where_the_range_is_looked_for(optimiser, monkeypatch):
+    asked, find = [], optimiser._range
+    monkeypatch.setattr(optimiser, "_range", lambda *given: asked.append(given) or find(*given))
+    given = {"target": TARGET, "side": np.zeros(2), "bias": BIAS, "drive_bias": np.array([3.0, -5.0])}
+    for slew_s, more in ((5.0, 1.5), (None, 0.0)):
+        optimiser.solve(START, LAST, PLANS[0], np.array([ROOM]), **given, slew_s=slew_s)
+        wanted = (PLANS[0], [3.0, -5.0], np.ones((3, 2)), LAST, more)
+        for value, want in zip(asked.pop(), wanted, strict=True):
+            np.testing.assert_allclose(value, want, rtol=1e-9)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.mpc.makers import network_plant
+from tests.mpc.makers import crossed, network_plant
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.design.simc import PILoop
@@ -18,6 +18,8 @@ from thermogrip.mpc.tuning import design_review as checks
 from thermogrip.mpc.tuning.design_review import review, worst
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
+
+NAN = float("nan")
 
 
 def verdicts(controller, **options) -> dict[str, str]:
@@ -327,3 +329,143 @@ def test_the_worst_of_a_review_is_by_rank_and_steps_are_the_specs_or_the_ends_of
     assert (
         checks.valid_range(controller, (20.0, 30.0)).finding == "the plant does not say where its logs were"
     )
+
+
+TENTH = "the last tenth of the current hardly cools: leave it out"
+
+
+@pytest.mark.parametrize(
+    ("low", "worst_resistance", "gain", "verdict", "said", "fix"),
+    [
+        # I* = 0.04 * 293.15 / 2 = 5.863 A; full drive is 5 A, of which 1.1726 counts: the whole drive
+        (-0.89, None, "g", "pass", "e: I* at -1.00 of q at 20 degC, its range ends at -0.89", ""),
+        (-0.91, None, "g", "warn", "ends at -0.91", TENTH),
+        (-0.999, None, "g", "warn", "ends at -0.999", TENTH),
+        (-1.01, None, "g", "warn", "ends at -1.01", "set drive_limits: q = [-0.80, ...]"),
+        (-1.01, None, "", "pass", "e: I* at -1.17 of q", ""),
+        (-0.71, 2.5, "g", "pass", "e: I* at -1.00 of q at 20 degC, -0.80 on the worst of 2 draws, its", ""),
+        (-0.73, 2.5, "g", "warn", "-0.80 on the worst", TENTH),
+        (-0.81, 2.5, "g", "warn", "-0.80 on the worst", "set drive_limits: q = [-0.64, ...]"),
+    ],
+)  # fmt: skip
+def test_the_optimum_of_an_element_is_at_the_coldest_target_on_the_worst_draw(
+    monkeypatch, low, worst_resistance, gain, verdict, said, fix
+):
+    values = {"S": 0.04, "R": 2.0, "I": 5.0, "g": 1.1726}
+    element = SimpleNamespace(input="q", seebeck="S", resistance="R", current="I", cooling_gain=gain)
+    drawn = {3: SimpleNamespace(values=values | {"R": worst_resistance}), 7: SimpleNamespace(values=values)}
+    controller = stub(drive_range={"q": (low, 3.0)})
+    network = SimpleNamespace(peltiers={"e": element})
+    controller.plant = SimpleNamespace(
+        values=values, model=SimpleNamespace(network=network), draw=drawn.__getitem__
+    )
+    picked = (0, 3, 7) if worst_resistance else (0,)
+    monkeypatch.setattr(checks, "draws_of", lambda plant, draws: picked[: 1 + draws])
+    check = checks.peltier_optimum(controller, (40.0, 20.0), 5)
+    assert (check.verdict, said in check.finding, check.fix) == (verdict, True, fix)
+
+
+@pytest.mark.parametrize(
+    ("y", "turns", "verdict", "finding"),
+    [
+        ([12.0, NAN, 50.55, 31.0], [-1.0, 3.0], "pass", "q: 12.0 to 50.5 degC in steady state"),
+        ([12.0, 50.25, 31.0], [-0.99, 2.5, 3.5], "warn", "q turns over at -0.99, 2.50 of -1 to 3; "
+         "q: 12.0 to 50.2 degC in steady state; rising from -0.25 to 2.50"),
+        ([NAN, NAN], [], "warn", "q: t comes to rest at no drive (it only adds up)"),
+    ],
+)  # fmt: skip
+def test_a_turn_of_the_gain_counts_inside_the_range(monkeypatch, y, turns, verdict, finding):
+    asked = []
+    curve = SimpleNamespace(y=np.array(y), turns=turns, rising=(-0.25, 2.5))
+    monkeypatch.setattr(checks, "steady_curve", lambda *given: asked.append(given[1:]) or curve)
+    check = checks.gain_sign(stub())
+    assert (check.verdict, check.finding) == (verdict, finding)
+    assert [(drive, output, d.tolist()) for drive, output, d in asked] == [("q", "t", [22.0])]
+
+
+@pytest.fixture(scope="module")
+def two() -> Controller:
+    plant = crossed("0_255")
+    return Controller(plant, default_design(plant, controlled=("b", "a"), ambient=21.0))
+
+
+@pytest.mark.parametrize(
+    ("least", "verdict"), [(1e-6, "fail"), (1.1e-6, "warn"), (0.0199, "warn"), (0.02, "pass")]
+)
+def test_disturbances_are_looked_for_over_the_whole_range(two, monkeypatch, least, verdict):
+    margins, given, at = iter([0.5, 0.31, least, 0.62, 0.4]), [], []
+    linearise = two.model.linearise
+
+    def margin(*args, scale):
+        given.append((at[-1], *args, scale))
+        return next(margins)
+
+    monkeypatch.setattr(checks, "detectability_margin", margin)
+    monkeypatch.setattr(
+        type(two.model), "linearise", lambda self, x, u, d: at.append((x, u, d)) or linearise(x, u, d)
+    )
+    check = checks.detectable(two)
+    assert check.verdict == verdict
+    assert check.finding == (
+        f"input q1, input q2; 1 % of the drive or 1 degC shows as {least:.2f} to 0.62 degC"
+    )
+    for share, ((x, u, d), A, C, into, on_output, scale) in zip(
+        (0.1, 0.3, 0.5, 0.7, 0.9), given, strict=True
+    ):
+        np.testing.assert_allclose(u, [100.0 * share, 255.0 * share], rtol=1e-12)
+        np.testing.assert_allclose(x, [21.0 + 0.2 * u[1], 21.0 + 0.25 * u[0]], rtol=1e-6)
+        np.testing.assert_allclose(A, np.diag([0.9, 0.8]))
+        np.testing.assert_allclose(into, [[0.0, 0.02 * 255], [0.05 * 100, 0.0]])
+        np.testing.assert_equal([C, on_output], [np.eye(2), np.zeros((2, 2))])
+        assert (d.tolist(), scale.tolist()) == ([21.0], [0.01, 0.01])
+
+
+@pytest.mark.parametrize(("factor", "verdict"), [(5.0, "pass"), (5.1, "warn"), (9.9, "warn"), (10.1, "fail")])
+def test_the_slowest_step_fits_the_deadline_and_most_a_quarter_of_the_sample(
+    two, monkeypatch, factor, verdict
+):
+    asked = []
+
+    def run(fresh, plant, schedule, start):
+        asked.append((schedule, start))
+        for move in ({"a": 22.0, "b": 22.0, "room": 21.0},) * 2:
+            fresh.step(move, 30.0)
+        asked.append(fresh.iterations)
+        return SimpleNamespace(seconds=np.array([99.0, *(factor * 1e-3 * np.arange(101))]))
+
+    monkeypatch.setattr(checks, "simulate_closed_loop", run)
+    time, iterations = checks._effort(two, (24.0, 40.0))
+    assert time.verdict == verdict
+    assert time.finding == (
+        f"101 steps on swings across the range: median {50 * factor:.1f} ms, p99 {99 * factor:.1f} ms, "
+        f"slowest {100 * factor:.1f} ms; deadline 1000 ms, sample 2 s"
+    )
+    ends = [({"b": end, "a": end}, 80.0) for end in (40.0, 24.0, 40.0)]
+    assert asked[0] == (ends, 24.0)
+    assert len(asked[1]) == 2
+    assert f"at most {max(asked[1])} iterations" in iterations.finding
+
+
+@pytest.mark.parametrize(
+    ("u", "y", "miss", "verdict", "said"),
+    [
+        ([0.04, 2.87], 30.0, 0.05, "pass", "24 to 40 degC in rooms of 18, 30.5 degC"),
+        ([0.029, 2.0], 30.0, 0.0, "warn", "within 3 % of the drive's limit: 24 degC in a room of 18 degC"),
+        ([0.5, 2.89], 30.0, 0.0, "warn", "within 3 % of the drive's limit: 24 degC"),
+        ([-2e-6, 2.0], 30.0, 0.0, "fail", "24 degC in a room of 18 degC (needs a drive of -0.00, 2.00)"),
+        ([0.5, 3.01], 30.0, 0.0, "fail", "40 degC in a room of 30.5 degC (needs a drive of 0.50, 3.01)"),
+        ([0.5, 2.0], 30.0, 0.06, "fail", "24 degC in a room of 18 degC (misses by 0.1 degC)"),
+        ([0.5, 2.0], NAN, 0.0, "fail", "24 degC in a room of 30.5 degC (nothing comes to rest)"),
+    ],
+)  # fmt: skip
+def test_a_target_is_held_well_inside_the_drives(monkeypatch, u, y, miss, verdict, said):
+    asked = []
+    found = SimpleNamespace(u=np.array(u), y=np.array([y]), miss=miss)
+    monkeypatch.setattr(checks, "holding_drive", lambda *given: asked.append(given[1:]) or found)
+    check = checks.reachable(
+        stub(drive_range={"p": (0.0, 1.0), "q": (-1.0, 3.0)}), (24.0, 40.0), (18.0, 30.5)
+    )
+    assert (check.verdict, said in check.finding, bool(check.fix)) == (verdict, True, verdict != "pass")
+    assert [(target.tolist(), d.tolist()) for _, target, d in asked] == [
+        ([target], [room]) for room in (18.0, 30.5) for target in (24.0, 40.0)
+    ]
