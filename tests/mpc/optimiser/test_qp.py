@@ -206,7 +206,8 @@ def test_a_flag_of_the_solver_is_a_status_and_no_number_is_no_solution(monkeypat
 @pytest.mark.parametrize(
     ("changes", "says"),
     [({"linear": [0.0]}, "one penalty a row"), ({"quadratic": [0.0]}, "one penalty a row"),
-     ({"linear": [-1.0, 0.0]}, "penalties must be >= 0"), ({"quadratic": [-1.0, 0.0]}, "penalties must be >= 0"),
+     ({"linear": [-1.0, 0.0]}, "penalties must be >= 0"),
+     ({"quadratic": [-1.0, 0.0]}, "penalties must be >= 0"),
      ({"linear": [0.0, -1.0]}, ""), ({"quadratic": [0.0, -1.0]}, "")],
 )  # fmt: skip
 def test_penalties_are_one_a_row_and_none_is_below_0_where_it_counts(changes, says):
