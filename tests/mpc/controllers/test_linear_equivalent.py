@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.mpc.makers import crossed
 from thermogrip.mpc.closed_loop.simulate import Surroundings, simulate_closed_loop
-from thermogrip.mpc.controllers.linear_equivalent import linear_law
+from thermogrip.mpc.controllers.linear_equivalent import augmented, linear_law, linear_move, plan_gains
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
+from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.tuning import design_review as checks
 
 REST = {"t_tank": 25.0, "t_surface": 25.0, "t_ambient": 25.0}
@@ -64,3 +66,45 @@ def test_a_constant_target_ends_in_a_constant_skin_at_the_target(controller):
 def test_a_warmer_room_is_answered_before_the_skin_feels_it(controller):
     law = linear_law(controller)
     assert law.D[0, law.inputs.index("t_ambient")] < 0
+
+
+def test_the_law_of_two_loops_apart_by_hand():
+    """One block of one sample: a and b are moved by 5.1 and 5 degC by a whole range of q2 and q1."""
+    plant = crossed("0_255")
+    weights = {"move": 3.0, "drive": 0.7, "track": 1.5, "terminal": 5.0}
+    two = Controller(
+        plant, default_design(plant, controlled=("b", "a"), blocks=(1,), ambient=21.0, **weights)
+    )
+    H, on_free, on_last = linear_move(two)
+    # 2 (6.5 * 5^2 + 3 + 0.7) and 2 (6.5 * 5.1^2 + 3.7); the last drive by 2 * 3 / H
+    np.testing.assert_allclose(H, np.diag([332.4, 345.53]), rtol=1e-9)
+    np.testing.assert_allclose(on_free, [[-100 * 65 / 332.4, 0], [0, -255 * 66.3 / 345.53]], rtol=1e-9)
+    np.testing.assert_allclose(on_last, np.diag([6 / 332.4, 6 / 345.53]), rtol=1e-9)
+    F, B, E, out = augmented(two)
+    # of (a, b, bias of q1, bias of q2), biases in ranges
+    np.testing.assert_allclose(F, [[0.9, 0, 0, 5.1], [0, 0.8, 5, 0], [0, 0, 1, 0], [0, 0, 0, 1]], rtol=1e-9)
+    np.testing.assert_allclose(B, [[0, 0.02], [0.05, 0], [0, 0], [0, 0]], rtol=1e-9)
+    np.testing.assert_allclose(E, [[0.1], [0.2], [0], [0]], rtol=1e-9)
+    assert out.tolist() == np.eye(2, 4).tolist()
+    on_z, on_r, on_d, _ = plan_gains(two)
+    first, second = on_free[0, 0], on_free[1, 1]  # the free response is that of one sample
+    by_z = [[0, 0.8 * first, 5 * first, 0], [0.9 * second, 0, 0, 5.1 * second]]
+    np.testing.assert_allclose(on_z, by_z, rtol=1e-9)
+    np.testing.assert_allclose(on_r, [[-first, 0], [0, -second]], rtol=1e-9)
+    np.testing.assert_allclose(on_d, [[0.2 * first], [0.1 * second]], rtol=1e-9)
+    law = linear_law(two)
+    assert law.inputs == ("a", "b", "target_b", "target_a", "room")
+    assert (law.outputs, law.states) == (("q1", "q2"), ("z0", "z1", "z2", "z3", "last_q1", "last_q2"))
+    assert (law.dt, law.n_y) == (2.0, 2)
+    # one step of the law is one of filter, move and model, from any state
+    z, last, y = np.array([1.0, 2.0, 0.1, -0.2]), np.array([7.0, 9.0]), np.array([1.5, 1.8])
+    r, d = np.array([3.0, 4.0]), np.array([0.5])
+    L = two.observer.settled_gain(F)
+    seen = z + L @ (y - z[:2])
+    u = on_z @ seen + on_r @ r + on_d @ d + on_last @ last
+    given = np.concatenate([y, r, d])
+    state = np.concatenate([z, last])
+    np.testing.assert_allclose(law.C @ state + law.D @ given, u, rtol=1e-9)
+    after = np.concatenate([F @ seen + B @ u + E @ d, u])
+    np.testing.assert_allclose(law.A @ state + law.B @ given, after, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(law.forgets, F - F @ L @ out, rtol=1e-9, atol=1e-12)

@@ -10,7 +10,7 @@ import pytest
 
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.plant.prediction import PredictionModel
-from thermogrip.mpc.tuning.minimum_time import full_drive_bound
+from thermogrip.mpc.tuning.minimum_time import _Race, full_drive_bound
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 
@@ -145,3 +145,51 @@ def test_a_drive_that_cannot_be_off_starts_from_the_least_that_it_gives():
     design = replace(spec.design(plant), drive_range={"drive": (0.4, 1.0)})
     # samples of 2 s at 0.6 and 0.8, then all: 0.12 + 0.16 K, and 9.47 K at 0.1 K/s
     assert full_drive_bound(plant, design, (20.0, 30.0), spec) == 4 + np.ceil(9.47 / 0.1)
+
+
+def race() -> _Race:
+    """Return the race of t1 from 25 to 29 degC by two drives, in samples of 10 s of a plant of 5 s."""
+    plant = plant_of(np.diag([0.9, 0.97]), [[2.0, 0.3], [-0.4, 0.7]], np.eye(2), y0=(25.0, 25.0))
+    spec = spec_of(output=["t0", "t1"], sample_time_s=10.0, hold_s=50.0, band_degC=0.25)
+    design = replace(
+        spec.design(plant),
+        drive_range={"q0": (-0.4, 1.0), "q1": (0.1, 0.9)},
+        slew_per_s={"q0": 0.02, "q1": 0.03},
+    )
+    return _Race(plant, design, STEP, spec, "t1")
+
+
+def test_what_a_race_starts_from_and_is_limited_by():
+    made = race()
+    assert (made.row, made.side, made.goal, made.n, made.sub) == (1, 1.0, 28.75, 5, 2)
+    for value, wanted in (
+        (made.low, [-0.4, 0.1]), (made.high, [1.0, 0.9]), (made.neutral, [0.0, 0.1]), (made.slew, [0.2, 0.3]),
+    ):  # fmt: skip
+        np.testing.assert_allclose(value, wanted, rtol=1e-12)
+    assert made._direction().tolist() == [-0.4, 0.9]  # the first drive cools t1
+    plan = np.array([[-0.2, 0.4], [-0.3, 0.7], [-0.3, 0.9], [-0.3, 0.9], [-0.3, 0.9]])
+    np.testing.assert_allclose(made._ramp(np.array([-0.3, 0.9])), plan, rtol=1e-12)
+    heights = made._heights(plan[None])
+    y, rows = 0.0, [25.0]
+    for q0, q1 in ((-0.2, 0.4), (-0.2, 0.4), (-0.3, 0.7), (-0.3, 0.7)):
+        y = 0.97 * y - 0.4 * q0 + 0.7 * q1
+        rows.append(25.0 + y)
+    np.testing.assert_allclose(heights[0, :5], rows, rtol=1e-9)
+    found = made._arrivals(np.array([[28.0, 28.75, 30.0], [28.0, 28.7, 28.0]]))
+    assert (found.tolist(), made._seconds(found[0])) == ([1.0, np.inf], 5.0)
+
+
+@pytest.mark.parametrize(
+    ("trust", "first", "second"),
+    # as much as the slew allows from (0, 0.1) on; then within an eighth of each range about the plan
+    [(np.inf, [-0.2, 0.4], [-0.4, 0.7]), (0.125, [-0.175, 0.3], [-0.175, 0.3])],
+)
+def test_a_programme_goes_where_the_gradient_does_within_slew_range_and_trust(trust, first, second):
+    made = race()
+    plan = np.tile([0.0, 0.2], (5, 1))
+    gradient = made._gradient(plan, 3)  # two samples, the second of which ends after it
+    # by 0.97^2 = 0.9409: 1 + 0.97 by the last sample, times 0.9409 by the one before
+    np.testing.assert_allclose(gradient[:2], 1.97 * np.array([[0.9409], [1.0]]) * [-0.4, 0.7], rtol=1e-9)
+    assert not gradient[2:].any()
+    found = made._programme(gradient, plan, 2, trust)
+    np.testing.assert_allclose(found, [first, *[second] * 4], atol=1e-9)
