@@ -222,6 +222,12 @@ def warm_up_of(log: Log) -> float:
     return min(50.0 * float(np.median(np.diff(log["time"].values))), 60.0)
 
 
+def warm_up_of_fit(plant: Plant, log: Log) -> float:
+    """Return the warm-up [s] that scored a black box of one or two logs; 0 for other plants."""
+    black_box = bool(plant.scores.held_out_by_part)
+    return warm_up_of(log) if black_box and 0 < len(plant.logs) < SEVERAL else 0.0
+
+
 def choose_model(rows: Sequence[Row], complete: int) -> str | None:
     """Return the candidate of the least mean relative error among those scored on every held-out log."""
     errors: dict[str, list[float]] = {}
@@ -662,6 +668,11 @@ def _plant_notes(model: str, plant: Plant) -> list[str]:
     out, scores = [], plant.scores
     if scores.average_why:
         out.append(f"{model}: steps of {scores.average_s:.3g} s ({scores.average_why})")
+    if plant.inputs_end_at_row:
+        out.append(
+            f"{model}: an input moves its own row's reading, so it is taken as applied up to its row and "
+            "not from it on (inputs_end_at_row)"
+        )
     for name, shares in expected_coverage(plant).items():
         worst = int(np.argmin(shares))
         if shares[worst] <= 0.9 - SHORT:

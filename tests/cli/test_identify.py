@@ -319,6 +319,18 @@ def test_a_plant_is_scored_log_by_log_beside_its_baselines(bench: Bench, stand_i
     assert [(call.warmup, call.score_from, call.average) for call in runs[2:]] == [(5.0, 5.0, None)] * 2
 
 
+def test_a_warm_up_shorter_than_that_of_the_fit_is_told(bench: Bench, stand_in: StandIn) -> None:
+    stand_in("thermogrip.sysid.identification.warm_up_of_fit", 50.0)
+    stand_in("thermogrip.sysid.validation.free_run.free_run", SimpleNamespace(notes=()))
+    stand_in("thermogrip.report.plant.run_rows", [])
+    stand_in("thermogrip.cli.identify.run_answer", {})
+    done = bench.run("validate", "plant.json", "good.csv", "--warmup", "8", "--score-from", "9")
+    assert "good: 8 s of readings set the state, the fit was scored with 50 s" in words_of(done.err)
+    assert "--warmup 50 --score-from 50" in words_of(done.err)
+    done = bench.run("validate", "plant.json", "good.csv", "--warmup", "50", "--score-from", "50")
+    assert "set the state" not in done.err
+
+
 def test_a_simulation_is_written_and_counted(bench: Bench, stand_in: StandIn) -> None:
     log = make_log(np.arange(3.0), {"t_tank": (np.full(3, 20.0), "degC", "output")})
     simulated = stand_in("thermogrip.sysid.plant.plant.Plant.simulate", log)

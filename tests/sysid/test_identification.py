@@ -18,7 +18,7 @@ from thermogrip.datasets.schema import make_log
 from thermogrip.sysid import Plant, identification, identify
 from thermogrip.sysid.blackbox.fit import fit_black_box
 from thermogrip.sysid.blackbox.order_selection import Structure, _one_standard_error, folds
-from thermogrip.sysid.identification import SHOWN, choose_black_box, stated_error
+from thermogrip.sysid.identification import SHOWN, choose_black_box, stated_error, warm_up_of_fit
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import fit_logs
 from thermogrip.sysid.plant.log_grid import make_grid
@@ -127,6 +127,20 @@ def test_what_was_searched_is_listed_with_its_errors_and_a_fixed_order_leaves_ot
     assert [row.error for row in found.searched] == sorted(row.error for row in found.searched)
     everything = fit_black_box("oe", [plant_log()], average=2.0)
     assert len(everything.choice.errors) > SHOWN + 1 >= len(identification.searched_rows(everything)) >= SHOWN
+
+
+def test_inputs_of_the_row_are_said_and_the_warm_up_of_a_fit_is_that_of_its_logs():
+    rng = np.random.default_rng(3)
+    q = rng.random(600)
+    y = 25 + lfilter([2.0], [1, -0.6], q) + 0.02 * rng.standard_normal(600)
+    log = make_log(np.arange(600.0), {"q": (q, "1", "input"), "t": (y, "degC", "output")}, name="a")
+    found = identify(log, models=["arx"], average=1.0, draws=0)
+    assert found.plant.inputs_end_at_row
+    assert any("an input moves its own row's reading" in note for note in found.notes)
+    assert warm_up_of_fit(found.plant, log) == 50.0
+    assert warm_up_of_fit(replace(found.plant, logs=("a", "b", "c")), log) == 0.0
+    network = Plant(found.plant.model, {}, dt=1.0, logs=("a",))  # no errors of folds
+    assert warm_up_of_fit(network, log) == 0.0
 
 
 def test_one_log_states_what_another_run_may_add_and_three_do_not():

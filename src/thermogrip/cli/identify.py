@@ -358,9 +358,17 @@ def validate(
     records = load_logs(logs, *roles, columns=comma(columns), dt=dt)
     from thermogrip.report.html import write_report
     from thermogrip.report.plant import SCORE_OF_RUN, free_run_section, run_rows
+    from thermogrip.sysid.identification import warm_up_of_fit
     from thermogrip.sysid.validation.free_run import free_run
 
     _warn_of_repairs(console, records)
+    for log in records:
+        needed, name = warm_up_of_fit(loaded, log), log_name(log)
+        if warmup < needed:
+            console.warn(
+                f"{name}: {warmup:g} s of readings set the state, the fit was scored with {needed:g} s; "
+                f"write --warmup {needed:g} --score-from {needed:g}"
+            )
     runs = []
     with console.progress("validate") as progress:
         for k, log in enumerate(records):
