@@ -276,3 +276,18 @@ def test_a_spreadsheet_s_semicolons_decimal_commas_and_utf_16_are_the_same_grasp
     (tmp_path / "wide.csv").write_bytes(plain.encode("utf-16"))
     (tmp_path / "wide_meta.csv").write_bytes(meta.encode("utf-16"))
     np.testing.assert_array_equal(read_grasps(tmp_path / "wide.csv")["t_surface"], wanted["t_surface"])
+
+
+def test_the_first_and_the_last_sample_of_a_jittering_grasp_are_held_for_half_a_step(tmp_path):
+    lines = ["grasp_id,time_s,t_surface_degC"]
+    meta = ["grasp_id,material,t_object_nominal_degC,t_gripper_set_degC"]
+    inner = (np.arange(-99, 100) / 10 + 0.001).tolist()
+    for grasp, end in (("a", 10.0), ("b", 9.96), ("c", 9.94)):  # of a grid of 0.1 s to 10 s
+        lines += [f"{grasp},{t!r},{20 + t!r}" for t in (-end, *inner, end)]
+        meta.append(f"{grasp},wood,43,23")
+    (tmp_path / "g.csv").write_text("\n".join(lines) + "\n")
+    (tmp_path / "g_meta.csv").write_text("\n".join(meta) + "\n")
+    grasps = read_grasps(tmp_path / "g.csv")
+    assert "interpolated onto a step of 0.1 s" in grasps.attrs["repairs"]
+    ends = grasps["t_surface"].values[:, [0, -1]]
+    np.testing.assert_allclose(ends, [[10.0, 30.0], [10.04, 29.96], [np.nan, np.nan]], atol=1e-9)

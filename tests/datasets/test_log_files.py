@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.io import savemat
 
+from thermogrip.datasets import tables
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import example_path
 from thermogrip.datasets.log_files import as_logs, read_log, split_cut, write_log
@@ -766,3 +767,15 @@ def test_what_is_neither_a_log_nor_a_line_is_noticed(tmp_path, monkeypatch):
 
     monkeypatch.setitem(globals(), "read_log", refuse)
     assert what_is_wrong(path) != ""
+
+
+def test_empty_lines_are_counted_beside_the_short_rows_too(tmp_path, monkeypatch):
+    monkeypatch.setattr(tables, "_MOST_EMPTY", 3)
+    rows = [f"{k},.5,20\n" for k in range(40)]
+    rows.insert(7, "7.5,.5\n")  # a row that is left out is no empty line
+    text = "time_s,drive,t_tank_degC\n" + "".join(rows)
+    (tmp_path / "a.csv").write_text(text + 40 * "\n")
+    assert read_log(tmp_path / "a.csv").sizes["time"] == 40
+    (tmp_path / "a.csv").write_text(text + 41 * "\n")
+    with pytest.raises(UserError, match="empty lines"):
+        read_log(tmp_path / "a.csv")

@@ -311,3 +311,18 @@ def test_logs_are_not_written_as_bags(tmp_path: Path) -> None:
     log = read_log(write_bag(tmp_path, "bag"))
     with pytest.raises(UserError, match="not written as bags"):
         write_log(log, tmp_path / "out.bag")
+
+
+def test_a_channel_without_a_schema_is_named_by_its_encoding(tmp_path):
+    writer_of = pytest.importorskip("mcap.writer").Writer
+    file = tmp_path / "bare.mcap"
+    with file.open("wb") as stream:
+        writer = writer_of(stream)
+        writer.start()
+        schema = writer.register_schema("pkg/Word", "jsonschema", b"{}")
+        for name, its in (("/bare", 0), ("/typed", schema)):
+            channel = writer.register_channel(name, "json", its)
+            writer.add_message(channel, 0, b'{"a": "x"}', 0)
+        writer.finish()
+    with pytest.raises(UserError, match=r"topics: /bare \(json\), /typed \(pkg/Word\)"):
+        read_log(file)

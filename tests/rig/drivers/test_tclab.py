@@ -52,8 +52,9 @@ def core() -> TCLabCore:
     [(b"VER\r\n", TCLAB_VERSION.encode() + b"\r\n"), (b"Q1 50\n", b"50.000\r\n"),
      (b"Q1 120\n", b"100.000\r\n"), (b"q1 50\r", b"50.000\r\n"), (b"Q2 -3\r\n", b"0.000\r\n"),
      (b"Q1 nonsense\r\n", b"0.000\r\n"), (b"Q1 12.5abc\r\n", b"12.500\r\n"), (b"R2\r\n", b"0.000\r\n"),
-     (b"P1 300\r\n", b"255.00\r\n"), (b"LED 7\r\n", b"7.00\r\n"), (b"A\r\n", b"Start\r\n"),
-     (b"X\r\n", b"Stop\r\n"), (b"hello\r\n", b"HELLO\r\n"), (b"\r\n\r\n", b""), (b"Q1", b"")],
+     (b"P1 300\r\n", b"255.00\r\n"), (b"P1 -5\r\n", b"0.00\r\n"), (b"LED 7\r\n", b"7.00\r\n"),
+     (b"A\r\n", b"Start\r\n"), (b"X\r\n", b"Stop\r\n"), (b"hello\r\n", b"HELLO\r\n"),
+     (b"\r\n\r\n", b""), (b"Q1", b"")],
 )  # fmt: skip
 def test_the_board_answers_as_its_sketch_does(said: bytes, answered: bytes) -> None:
     assert core().receive(said, 0) == answered

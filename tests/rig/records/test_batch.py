@@ -12,6 +12,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.grasp_files import read_grasps
 from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.interface import Reading
+from thermogrip.rig.records import batch
 from thermogrip.rig.records.batch import Trial, collect, read_plan, run_batch
 from thermogrip.rig.records.run_folder import read_run
 from thermogrip.rig.serial.port import PortError
@@ -191,3 +192,23 @@ def test_a_wrong_plan_names_row_and_column(tmp_path: Path, text: str, said: str)
     with pytest.raises(UserError) as caught:
         read_plan(tmp_path / "plan.csv")
     assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("t_object", "labels", "asked", "expected"),
+    [
+        (None, {"touch_group": "b"}, True, 25.5),
+        (20.0, {"touch_group": "b"}, True, 20.0),
+        (None, {}, True, None),
+        (None, {"touch_group": "b"}, False, None),
+    ],
+)
+def test_a_temperature_that_is_known_is_not_asked_of_the_first_touch(
+    t_object: float | None, labels: dict[str, str], asked: bool, expected: float | None,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(batch, "good_run", lambda path, k: path)
+    monkeypatch.setattr(batch, "read_grasps", lambda path: path)
+    trial = Trial("wood", 30.0, t_object, None, labels)
+    first_touch = (lambda _: (25.5, 0.7)) if asked else None
+    assert batch._with_temperature(trial, 1, [trial, trial], tmp_path, first_touch).t_object == expected

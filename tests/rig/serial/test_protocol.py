@@ -253,3 +253,12 @@ def test_sequence_numbers_go_round_and_leave_out_zero() -> None:
     assert seen[:2] == [1, 2]
     assert seen[-2:] == [1, 2]
     assert 0 not in seen
+
+
+@pytest.mark.parametrize(
+    ("count", "kind"), [(0, "Boot"), (65535, "Boot"), (65536, "Unexpected"), (-1, "Unexpected")]
+)
+def test_a_reset_is_counted_in_sixteen_bits(count: int, kind: str) -> None:
+    said = protocol.encode_line(0, "boot", "power", str(count), "0.1.0")
+    (event,) = protocol.HostEnd().hear(said)
+    assert type(event).__name__ == kind

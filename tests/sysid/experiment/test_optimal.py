@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -315,3 +316,28 @@ def test_what_fits_state_falls_into_the_range_of_the_forecast(world):
 def _as_log(plant: Plant, u: np.ndarray) -> Log:
     columns = {name: (u[:, k], "percent", "input") for k, name in enumerate(plant.inputs)}
     return make_log(np.arange(float(len(u))), columns, name="schedule")
+
+
+@pytest.mark.parametrize(
+    ("network", "reference", "known"),
+    [
+        ("gripper", "t_ambient", True),
+        ("gripper", None, False),
+        ("tclab", None, False),
+        ("tclab", "t1", False),
+    ],
+)
+def test_the_start_is_known_at_rest_with_a_measured_room_alone(network, reference, known):
+    plant = replace(plant_from_prior(load_network(network)), reference=reference)
+    assert ExperimentForecast(plant)._known == known
+
+
+def test_square_waves_of_several_inputs_are_tried_together_and_a_quarter_apart():
+    def shapes(n):
+        low, high = np.zeros(n), np.ones(n)
+        limits = SimpleNamespace(n_cell=8, low=low, high=high, switch=low > high)
+        return [x.T.astype(int).tolist() for x in optimal._plain_shapes(limits)]
+
+    wave, later = [1, 1, 1, 1, 0, 0, 0, 0], [1, 1, 0, 0, 0, 0, 1, 1]
+    assert (len(shapes(1)), len(shapes(2))) == (2 + 4, 2 + 8)
+    assert shapes(2)[:4] == [[[1] * 8] * 2, [[0] * 8] * 2, [wave, wave], [wave, later]]

@@ -410,3 +410,21 @@ def test_the_example_finds_the_kink_and_the_play_of_a_sensor_again():
     truth = dict(zip(model.parameters, p))
     for name, within in {"kink": 0.02, "kink_reading": 0.02, "slack": 0.005, "gain": 0.0002}.items():
         assert abs(found.values[name] - truth[name]) < within, name
+
+
+@pytest.mark.parametrize(
+    ("air", "off"), [("degC", 0.0), ({"unit": "degC"}, 0.0), ({"unit": "degC", "log_sd": 0.5}, 0.5)]
+)
+def test_a_sensor_has_an_offset_where_its_class_says_so(air: Any, off: float) -> None:
+    class Block:
+        inputs = {"q": {"unit": "1", "range": (0.0, 1.0)}}
+        disturbances = {"air": air}
+        outputs = {"t": {"unit": "degC", "sd": 0.05}}
+        states = {"t": 0.5}
+        parameters = {"G": {"unit": "1/s", "value": 0.5, "sd_log": 1.0}}
+        dt = 1.0
+
+        def rhs(self, x: Any, u: Any, d: Any, p: Any) -> list[Any]:
+            return [u.q - p.G * (x.t - d.air)]
+
+    assert own_model(Block).nuisance == {"t": 0.0, "air": off}

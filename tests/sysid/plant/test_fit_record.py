@@ -6,7 +6,8 @@ import json
 
 import pytest
 
-from thermogrip.sysid.plant.fit_record import PlantScores
+from thermogrip.datasets.schema import data_hash, make_log
+from thermogrip.sysid.plant.fit_record import FitLog, PlantScores, said_of_fit
 
 # as version 0.1.0 wrote them for a network and for a black box, shortened
 NETWORK = {
@@ -59,3 +60,14 @@ def test_what_a_later_version_adds_is_left_out_and_what_an_earlier_one_lacked_ha
 def test_a_wrong_entry_is_named(content, where):
     with pytest.raises(ValueError, match=where):
         PlantScores.from_json(content)
+
+
+def test_rows_of_a_log_are_in_the_fit_where_it_is_the_same_log_at_the_same_time():
+    log = make_log([0.0, 1.0, 2.0, 3.0], {"q": ([0, 1, 0, 1], "percent", "input")}, name="a")
+    same = data_hash(log)
+    others = [FitLog("a", "0" * 64, 0.0, 3.0), FitLog("a", same, 3.0, 5.0), FitLog("a", same, -1.0, 0.0)]
+    assert said_of_fit(others, log) == []
+    (whole,) = said_of_fit([FitLog("a", same, -1.0, 3.0)], log)
+    assert whole.startswith("all of it is in the fit: the scores")
+    (part,) = said_of_fit([FitLog("b", same, 1.0, 9.0)], log)
+    assert part.startswith("1 to 3 s of 0 to 3 s are in the fit (as b): there the scores")
