@@ -45,12 +45,7 @@ from thermogrip.sysid.blackbox.fit import (
     fit_black_box,
     with_refits,
 )
-from thermogrip.sysid.blackbox.order_selection import (
-    HARDLY_MORE,
-    excess_within_noise,
-    folds,
-    held_out_runs,
-)
+from thermogrip.sysid.blackbox.order_selection import HARDLY_MORE, excess_within_noise, folds, held_out_runs
 from thermogrip.sysid.data.data_quality import DataCheck, Evidence, check_data, evidence
 from thermogrip.sysid.plant.fit_record import HELD_OUT_SHARE, RUN_GAIN_SD, SEVERAL, TAIL, HeldOut
 from thermogrip.sysid.plant.log_grid import make_grid, match_logs, misfit, roles_of, signals
@@ -155,7 +150,7 @@ def searched_rows(fit: BlackBoxFit) -> list[Searched]:
         Searched(
             fit.kind,
             structure.label,
-            float(np.exp(np.mean(np.log(np.maximum(errors, 1e-12))))),
+            fit.choice.error_of(structure),
             tuple(errors.tolist()),
             structure == fit.choice.structure,
         )

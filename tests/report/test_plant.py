@@ -40,6 +40,9 @@ def test_a_good_free_run_is_green(run: tuple[Plant, Log, FreeRun]) -> None:
     section = free_run_section(log, found, plant)
     assert section.tone == "good"
     assert section.verdict.startswith("Free run (RMSE): t to 0.0")
+    assert section.verdict.endswith(" degC.")
+    bare = replace(found, scores={name: replace(s, unit="1") for name, s in found.scores.items()})
+    assert free_run_section(log, bare, plant).verdict == section.verdict.replace(" degC", "")
 
 
 def test_one_that_errs_more_than_its_fit_is_not_green_and_says_by_how_much(
@@ -143,7 +146,11 @@ def identified(good: bool = True) -> SimpleNamespace:
     checked = SimpleNamespace(findings=findings)
     return SimpleNamespace(
         rows=rows, data_check=checked, good=good, verdict="oe is best", notes=("arx failed",),
-        model="oe", signals=(), runs=(), searched=(Searched("arx", "na 1", 0.25, (0.2, 0.3125), True),),
+        model="oe", signals=(), runs=(),
+        searched=(
+            *(Searched("arx", f"na {k}", 0.25, (0.2, 0.3125), k == 7) for k in range(1, 9)),
+            Searched("subspace", "order 1", 0.5, (0.5, 0.5), True),
+        ),
     )  # fmt: skip
 
 
@@ -157,14 +164,14 @@ def test_an_identification_has_its_tables_and_verdict(good: bool, tone: str) -> 
     assert [table.caption for table in tables][:4] == [
         "Free-run RMSE on rows that were not fitted (blocks: of means over a step of the model)",
         "Columns of the logs",
-        "oe, fitted on everything, on its own logs",
-        "Structures searched: RMSE over the outputs' spread on each fold, the best of each kind first",
+        "oe, fitted on everything, on its own logs", "Free parameters",
     ]  # fmt: skip
-    assert tables[3].head == ("model", "structure", "mean", "fold 1", "fold 2", "")
-    assert tables[3].rows == (("arx", "na 1", 0.25, 0.2, 0.3125, "kept"),)
-    assert tables[4].caption == "Free parameters"
     assert tables[2].rows == (("b", "t", 0.5, "degC", 90.0, 50),)
-    assert tables[-1].rows == (("warn", "gaps", "a", "t", "a gap"),)
+    assert tables[-2].rows == (("warn", "gaps", "a", "t", "a gap"),)
+    assert tables[-1].head == ("model", "structure", "mean", "fold 1", "fold 2", "")
+    # the best five of each kind, and the one that was kept
+    assert [row[1] for row in tables[-1].rows] == ["na 1", "na 2", "na 3", "na 4", "na 5", "na 7", "order 1"]
+    assert tables[-1].rows[5] == ("arx", "na 7", 0.25, 0.2, 0.3125, "kept")
     texts = [part for part in section.parts if isinstance(part, Text)]
     assert texts == [Text("U is known."), Text("arx failed.")]
     clean = identified()
@@ -173,7 +180,7 @@ def test_an_identification_has_its_tables_and_verdict(good: bool, tone: str) -> 
     captions = [
         part.caption for part in plant.identification_section(clean, black).parts if isinstance(part, Table)
     ]
-    assert captions == [table.caption for table in tables][:4]
+    assert captions == [table.caption for table in (*tables[:3], tables[-1])]
 
 
 @pytest.mark.usefixtures("no_figures")

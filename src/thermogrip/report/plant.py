@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from thermogrip.datasets.schema import Log
     from thermogrip.sysid.greybox.posterior import Posterior
     from thermogrip.sysid.growth.stepwise import Growth
-    from thermogrip.sysid.identification import Identification, Row
+    from thermogrip.sysid.identification import Identification, Row, Searched
     from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation.free_run import FreeRun
     from thermogrip.sysid.validation.prediction_bands import Band
@@ -39,6 +39,7 @@ _BASELINES = (
     "reading (RMSE)"
 )
 SIGNAL_HEAD = ("column", "unit", "role", "why")
+_STRUCTURES = 5  # of each kind, in the table of those searched
 MODEL_HEAD = ("model", "log", "output", "RMSE", "unit", "fit [%]", "n", "no input", "")
 
 
@@ -124,11 +125,6 @@ def identification_section(found: Identification, plant: Plant) -> Section:
             f"{found.model}, fitted on everything, on its own logs",
         ),
     ]
-    if found.searched:
-        folds = tuple(f"fold {k + 1}" for k in range(len(found.searched[0].folds)))
-        shown = [(s.model, s.structure, s.error, *s.folds, "kept" if s.kept else "") for s in found.searched]
-        title = "Structures searched: RMSE over the outputs' spread on each fold, the best of each kind first"
-        parts.append(Table(("model", "structure", "mean", *folds, ""), tuple(shown), title))
     if plant.free:
         parts.append(Table(PARAMETER_HEAD, tuple(parameter_rows(plant)), "Free parameters"))
         parts += _per_log(plant)
@@ -136,8 +132,25 @@ def identification_section(found: Identification, plant: Plant) -> Section:
     if checks:
         parts.append(Table(("verdict", "check", "log", "channel", "finding"), tuple(checks), "Data check"))
     parts += [Text(_sentence(note)) for note in found.notes]
+    if found.searched:
+        parts.append(_structure_table(found.searched))
     tone = "good" if found.good else "warn"
     return Section("Which plant is behind the logs?", tuple(parts), _sentence(found.verdict), tone)
+
+
+def _structure_table(searched: Sequence[Searched]) -> Table:
+    """Return the best structures of each kind, and the one that was kept, with their errors by fold."""
+    head = ("model", "structure", "mean", *(f"fold {k + 1}" for k in range(len(searched[0].folds))), "")
+    rows: list[tuple[Any, ...]] = []
+    for kind in dict.fromkeys(each.model for each in searched):
+        of_kind = [each for each in searched if each.model == kind]
+        rows += [
+            (kind, each.structure, each.error, *each.folds, "kept" if each.kept else "")
+            for place, each in enumerate(of_kind)
+            if place < _STRUCTURES or each.kept
+        ]
+    title = "Structures searched: RMSE over the outputs' spread; kept: the smallest within noise of the best"
+    return Table(head, tuple(rows), title)
 
 
 def identification_sections(
@@ -269,8 +282,9 @@ def free_run_section(log: Log, run: FreeRun, plant: Plant, *, seen: bool = False
     from thermogrip.sysid.validation.prediction_bands import free_run_band
 
     name = log_name(log)
-    words = ", ".join(f"{output} to {score.rmse:.2g} {score.unit}" for output, score in run.scores.items())
-    verdict = f"Free run (RMSE): {words}."
+    units = {output: "" if score.unit == "1" else f" {score.unit}" for output, score in run.scores.items()}
+    words = (f"{output} to {score.rmse:.2g}{units[output]}" for output, score in run.scores.items())
+    verdict = f"Free run (RMSE): {', '.join(words)}."
     if run.no_better:
         verdict += f" {', '.join(run.no_better)}: no better than a model without input."
     if run.exceeds_fit:

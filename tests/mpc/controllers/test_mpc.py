@@ -30,7 +30,7 @@ def controller(tank) -> Controller:
     return controller
 
 
-def legal(move, before: float = 0.0) -> None:
+def assert_legal(move, before: float = 0.0) -> None:
     assert math.isfinite(move.drive)
     assert -1 <= move.drive <= 1
     assert abs(move.drive - before) <= 0.5 + 1e-9
@@ -40,7 +40,7 @@ def legal(move, before: float = 0.0) -> None:
 
 def test_a_good_reading_gives_ok_and_no_advice(controller):
     move = controller.step(REST, 38.0)
-    legal(move)
+    assert_legal(move)
     assert (move.status, move.advice, move.pump) == ("ok", "", 1)
     assert move.drive == pytest.approx(0.5)  # all that the slew limit allows
     assert len(move.plan["t_surface"]) == sum(controller.design.blocks)
@@ -55,7 +55,7 @@ def test_a_lost_skin_reading_follows_the_plan_then_switches_off(controller, bad)
     statuses = []
     for _ in range(8):
         move = controller.step(bad, 38.0)
-        legal(move, before)
+        assert_legal(move, before)
         assert move.advice
         before = move.drive
         statuses.append(move.status)
@@ -84,7 +84,7 @@ def test_the_pi_takes_over_without_a_bump(controller, monkeypatch):
 def test_a_target_that_is_none_leaves_the_last_one_standing(controller, target):
     controller.step(REST, 30.0)
     move = controller.step(REST, target)
-    legal(move, 0.5)
+    assert_legal(move, 0.5)
     assert move.status == "infeasible"
     assert "target" in move.advice
 
@@ -119,7 +119,7 @@ def test_whatever_is_read_and_asked_the_drive_is_legal(tank, rows):
             clock += passed
             reading["time_s"] = clock
         move = controller.step(reading, target)
-        legal(move, before)
+        assert_legal(move, before)
         before = move.drive
 
 
