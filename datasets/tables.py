@@ -106,9 +106,7 @@ def file_stem(path: str | Path) -> str:
 
 def _ending(path: str | Path) -> str:
     name = Path(path).name.lower()
-    return next(
-        (e for e in sorted(FORMATS, key=len, reverse=True) if name.endswith(e)), Path(path).suffix.lower()
-    )
+    return next((e for e in FORMATS if name.endswith(e)), Path(path).suffix.lower())
 
 
 def read_csv_table(
@@ -439,7 +437,7 @@ def read_matlab_table(path: str | Path, columns: Sequence[str] | None = None) ->
     n = max(set(lengths), key=lambda length: (length * lengths.count(length), length))
     parts = {name: values for name, values in arrays.items() if values.shape[0] == n}
     numbers = {
-        unused(name if values.shape[1] == 1 else f"{name}_{at + 1}", ()): values[:, at]
+        name if values.shape[1] == 1 else f"{name}_{at + 1}": values[:, at]
         for name, values in parts.items()
         for at in range(values.shape[1])
     }
@@ -715,7 +713,7 @@ def _parse(
     import pyarrow as pa
     import pyarrow.csv as arrow_csv
 
-    block = min(max(len(data), 1024) + 1, 1 << 30)
+    block = min(len(data) + 1, 1 << 30)
     try:
         return arrow_csv.read_csv(
             pa.BufferReader(data),

@@ -1,0 +1,347 @@
+"""Tables of other programs: where they begin, what their columns are called, which cells are numbers."""
+
+from __future__ import annotations
+
+import gzip
+import lzma
+import struct
+import zlib
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as parquet
+import pytest
+from scipy.io import savemat
+
+from thermogrip.datasets import tables
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.tables import (
+    Table,
+    check_table,
+    file_format,
+    file_stem,
+    find_layout,
+    parse_text,
+    read_csv_table,
+    read_matlab_table,
+    read_parquet_table,
+    text_numbers,
+    unused,
+)
+
+NULLS = ["nan", "NaN", "NAN", "NA", "N/A", "null", "NULL", "None", "-nan", "#N/A"]
+ONES = " ".join(50 * "1")
+BY_POSITION = "no header: columns named c1 to c{} by position; --columns a,b,... names them"
+
+
+def refusal(call, *given):
+    with pytest.raises(UserError) as caught:
+        call(*given)
+    return str(caught.value)
+
+
+def shown(table):
+    """Return the columns as text, - for what is no number, and the lines of the rows."""
+    cells = {name: [f"{v:g}".replace("nan", "-") for v in values] for name, values in table.numbers.items()}
+    return {name: " ".join(values) for name, values in {**cells, **table.text}.items()}, table.lines.tolist()
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "stem"),
+    [("a.b.CSV.gz", "csv", "a.b"), ("x.tsv", "text", "x"), ("x.dat.xz", "text", "x"), ("x.h5", "netcdf", "x"),
+     ("x.pq", "parquet", "x"), ("x.mcap", "rosbag", "x"), ("x.Mat", "matlab", "x"), ("x.xlsx", "excel", "x"),
+     ("x.gz", None, "x"), ("x.odt", None, "x"), ("x", None, "x")],
+)  # fmt: skip
+def test_the_ending_is_the_format_and_the_rest_is_the_name(name, kind, stem):
+    assert file_stem(f"/some/{name}") == stem
+    if kind:
+        assert file_format(f"/some/{name}") == kind
+    else:
+        assert "is unknown; use one of .csv .csv.gz " in refusal(file_format, name)
+
+
+@pytest.mark.parametrize(
+    ("text", "names", "skip", "separator", "notes"),
+    [
+        ("1, 2\n3, 4\n", "c1|c2", 0, ",", BY_POSITION.format(2)),  # blanks would do as well
+        ("1|2\n3|4\n", "c1|c2", 0, "|", BY_POSITION.format(2)),
+        ("1;2,5\n3;4,5\n", "c1|c2", 0, ";", BY_POSITION.format(2)),
+        ("1\n2\n", "c1", 0, "\t", BY_POSITION.format(1)),
+        ("t u\n0.5\t1\n1.5\t2\n", "t u|c2", 1, "\t", "without a name: c2"),
+        ("a,b,\n1,2,\n3,4,\n", "a|b|\x1fend", 1, ",", ""),
+        ("1,2,\n3,4,\n", "c1|c2|\x1fend", 0, ",", BY_POSITION.format(2)),
+        ("a,b,\n1,2,\n3,4,5\n", "a|b|c3", 1, ",", "without a name: c3"),
+        ("a,,,\n1,2,3,\n3,4,5,\n", "a|c2|c3|\x1fend", 1, ",", "without a name: c2, c3"),
+        ("a,b,a\n1,2,3\n3,4,5\n", "a|b|2_a", 1, ",", "a occurs again: named 2_a"),
+        ("x\n0,1,2\n1,2,3\n", "c1|c2|c3", 1, ",",
+         BY_POSITION.format(3) + "; 1 line(s) before the table passed over"),
+        ("Dev 1\n\n# c\nx,y\ns,V\n0,1\n1,2\n", "x [s]|y [V]", 5, ",",
+         "1 line(s) before the table passed over"),
+        ("v,w\nx,y\ns,V\n0,1\n1,2\n", "x [s]|y [V]", 3, ",", "1 line(s) before the table passed over"),
+        ("% c\nx,y\n[s],(V)\n0,1\n1,2\n", "x [s]|y [V]", 3, ",", ""),
+        ("x,y\n,V\n0,1\n1,2\n", "x|y [V]", 2, ",", ""),
+        ("x,y\nfoo,V\n0,1\n1,2\n", "foo|V", 2, ",", "1 line(s) before the table passed over"),
+        ("x,y\n# s,V\n0,1\n1,2\n", "x [s]|y [V]", 2, ",", ""),
+        ("# x,y\n0,1\n1,2\n", "x|y", 1, ",", ""),
+        ("q,r\n# x,y\n0,1\n1,2\n", "x|y", 2, ",", "1 line(s) before the table passed over"),
+        ("// x y\n0 1\n1 2\n", "x|y", 1, " ", ""),
+        ("Time s  Heater power\n0 1\n1 2\n", "Time s|Heater power", 1, " ", ""),
+        ("# Time of day\tHeater\n0 1\n1 2\n", "Time of day|Heater", 1, " ", ""),
+        ("Time of day, Heater\n0 1\n1 2\n", "Time of day|Heater", 1, " ", ""),
+        ("\n'=x,\"y,1\"\n\n1,2\n3,4\n", "=x|y,1", 3, ",", ""),
+        ("2026,1\nx,y\n3,4\n5,6\n", "c1|c2", 0, ",", BY_POSITION.format(2)),  # the first line has numbers
+        ("12\n1,2\n3,4\n", "12|c2", 1, ",", "without a name: c2"),
+        ("a,b,c\n1,x,\n2,,5\n", "a|b|c", 1, ",", ""),  # half of the cells
+        ("a;b,c\n", "a;b|c", 1, ",", ""),
+        ("a,b\n1,2\n", "a|b", 1, ",", ""),  # a row alone stands beside the header
+        *((("x\n" * (198 + more) + "a,b\n0,1\n0,2\n"), *found, ",", note) for more, found, note in [
+            (0, ("a|b", 199), "198 line(s) before the table passed over"), (1, ("x", 1), "")]),
+    ],
+)  # fmt: skip
+def test_where_a_table_begins_and_what_its_columns_are_called(text, names, skip, separator, notes):
+    layout = find_layout(text.encode(), "a.txt")
+    assert ("|".join(layout.names), layout.skip, layout.separator) == (names, skip, separator)
+    assert "; ".join(layout.notes) == notes
+
+
+def rows(n, changed, head="a,b\n"):
+    return head + "".join(changed.get(k, f"{k},{k + 0.5}\n") for k in range(n))
+
+
+SHORT = {k: f"{k}\n" for k in range(3, 9)}
+CELL = "write a number, leave the cell empty, or drop the column, or leave columns out: thermogrip identify "
+LEFT = "row(s) with too few or too many cells left out"
+
+
+@pytest.mark.parametrize(
+    ("text", "noted", "refused"),
+    [
+        (rows(20, {3: "3\n"}), f"1 {LEFT} (row 5)", ""),
+        (rows(19, {3: "3\n"}), "", "row 5: has 1 cell(s), the header has 2; complete or remove the row"),
+        (rows(40, {3: "3\n", 7: "7,1,2\n"}), f"2 {LEFT} (rows 5, 9)", ""),
+        (rows(39, {3: "3,1,2\n", 7: "7\n", 9: "9\n"}), "",
+         "row 5: has 3 cell(s), the header has 2; 2 more rows do not fit; complete"),
+        (rows(120, SHORT), f"6 {LEFT} (rows 5, 6, 7, 8, 9, ...)", ""),
+        (rows(100, {k: SHORT[k] for k in range(3, 8)}), f"5 {LEFT} (rows 5, 6, 7, 8, 9)", ""),
+        (rows(20, {3: "3,x\n", 6: "4,y\n"}),
+         "b: 2 cell(s) that are no numbers left empty (rows 5, 8: 'x')", ""),
+        (rows(19, {3: "3,x\n", 6: "4,y\n"}), "", f"row 5, column b: 'x' is not a number; {CELL}a.txt"),
+        (rows(11, {3: "3,x\n", 4: "4,\n"}), "b: 1 cell(s) that are no numbers left empty (row 5: 'x')", ""),
+        (rows(10, {3: "3,x\n", 4: "4,?\n"}), "", "row 5, column b: 'x' is not a number"),
+        ("a,b\n1,2\n3,\n4", "row 4 is the last and was cut off (1 of 2 cells): dropped", ""),
+        ("a,b\n1,2\n\n\n5,warm\n6,7\n", "", "row 5, column b: 'warm' is not a number"),
+        ('a,b\n1,2\n"3,4\n5,6\n', "", "row 3: has 1 cell(s), the header has 2; complete"),
+        ("a,b\n1,1_0\n2,3\n", "", "'1_0' is not a number"),
+        ("a,b\n1," + "x" * 40 + "\n2,3\n", "", f"'{'x' * 40}' is not a number"),
+        ("a,b\n1," + "x" * 41 + "\n2,3\n", "", f"'{'x' * 37}...' is not a number"),
+        ('a,b,c\n1,"2,5",4\n2,3,4\n', "", "row 2, column b: '2,5' is not a number; write a decimal point, or"
+         " leave columns out: thermogrip identify a.txt --columns a,-,c"),
+        ('"my,col",b c\n1,x\n2,3\n', "", "a.txt --columns 'my col,-'"),
+        ("b\n1\n2\nx\n3\n", "", "write a number, leave the cell empty, or drop the column"),
+        ("a,b\n1,x\n2,y\n3,3\nz,4\n", "", "2 faults: row 5, column a: 'z' is not a number;"
+         " row 2, column b: 'x' is not a number; write a number, leave the cell empty, or drop the column"),
+        ("a,b\n" + "\n" * 3, "", "has a header but no rows; give at least two rows"),
+    ],
+)  # fmt: skip
+def test_a_few_broken_rows_and_cells_are_left_out_and_more_of_them_refused(text, noted, refused):
+    if refused:
+        line = refusal(parse_text, text.encode(), "a.txt")
+        assert refused in line
+        assert ("leave columns out" in line) == ("--columns" in line)
+        return
+    assert parse_text(text.encode(), "a.txt").notes == (noted,)
+
+
+@pytest.mark.parametrize(
+    ("text", "cells", "lines", "notes"),
+    [
+        ("a,b\n0,on\n1,OFF\n2,\n", {"a": "0 1 2", "b": "1 0 -"}, [2, 3, 4],
+         ["b: words as 'on' read as 0 and 1"]),
+        ("a,b\n0,No\n1,yes\n", {"a": "0 1", "b": "0 1"}, [2, 3], ["b: words as 'No' read as 0 and 1"]),
+        ("a,b\n0,true\n1,FALSE\n", {"a": "0 1", "b": "1 0"}, [2, 3], ["b: words as 'true' read as 0 and 1"]),
+        ("a,b\n0,on\n1,maybe\n", {"a": "0 1", "b": "on maybe"}, [2, 3], []),
+        ("a,b\n" + "1,p\n" * 9 + "1,5\n", {"a": "1 " * 9 + "1", "b": "p " * 9 + "5"}, [*range(2, 12)], []),
+        ("a,b\n0,1/2/2026\n1,7\n", {"a": "0 1", "b": "1/2/2026 7"}, [2, 3], []),
+        ("a,b\n0,10:30\n1,7\n", {"a": "0 1", "b": "10:30 7"}, [2, 3], []),
+        ("a;b;c\n1;2,5;x\n2;-3,5e2;y\n", {"a": "1 2", "b": "2.5 -350", "c": "x y"}, [2, 3],
+         ["numbers have a decimal comma"]),
+        ('a,b\n1,"2\n"\n3,4\n', {"a": "1 3", "b": "2 4"}, [2, 3], []),
+        ("a b\n1  2 \n\n3\t4\r\n", {"a": "1 3", "b": "2 4"}, [2, 4], []),
+        ("a,b\n1,+.5e-3\n2,-Infinity\n3,\n4,7.\n", {"a": "1 2 3 4", "b": "0.0005 -inf - 7"},
+         [2, 3, 4, 5], []),
+        ("a,b\n1,5\n" + "".join(f"2,{w}\n" for w in ("-", "--", "---", "?", "*", "NaT")),
+         {"a": "1 2 2 2 2 2 2", "b": "5 - - - - - -"}, [*range(2, 9)], []),
+        ("a,b\n1,5\n" + "".join(f"2,{w}\n" for w in NULLS),
+         {"a": "1" + " 2" * 10, "b": "5" + " -" * 10}, [*range(2, 13)], []),
+        (b"a,b\xb5\n1,2\n3,4\n", {"a": "1 3", "b\xb5": "2 4"}, [2, 3],
+         ["text is not UTF-8: read as Windows-1252"]),
+    ],
+)  # fmt: skip
+def test_cells_are_numbers_switches_times_or_words(text, cells, lines, notes):
+    table = parse_text(text if isinstance(text, bytes) else text.encode(), "a.txt")
+    assert shown(table) == (cells, lines)
+    assert list(table.notes) == notes
+
+
+def test_columns_are_named_anew_and_those_of_a_dash_left_out():
+    for names, kept in ((["-", "x", "x"], {"x": "2 4", "x_2": "3 5"}), (["-", "-", "y"], {"y": "3 5"})):
+        assert shown(parse_text(b"a,b,a\n1,2,3\n3,4,5\n", "a.txt", names))[0] == kept
+    assert parse_text(b"1,2\n3,4\n", "a.txt", ["p", "q"]).notes == ()
+    assert shown(parse_text(b"a,b,\n1,2,\n3,4,\n", "a.txt", ["p", "-"]))[0] == {"p": "1 3"}
+    for names in (["p"], ["p", "q", "r"]):
+        line = refusal(parse_text, b"a,b,\n1,2,\n3,4,\n", "a.txt", names)
+        assert f"has 2 columns, --columns names {len(names)}; write a name for each, - to leave one" in line
+    assert [unused("a", []), unused("a", ["a"]), unused("a", ["a", "a_2"])] == ["a", "a_2", "a_3"]
+
+
+@pytest.mark.parametrize(
+    ("text", "words", "found"),
+    [
+        ("# c\n\na,b\n1, x \n\n3,\n", frozenset("b"), ({"a": "1 3", "b": "x "}, [4, 6])),
+        ("a,b\n1,x\n3,'=y\n", lambda name: name > "a", ({"a": "1 3", "b": "x =y"}, [2, 3])),
+        ("a,b\n1,x\n3,5\n", None, ({"a": "1 3", "b": "x 5"}, [2, 3])),
+        ("a;b\tc\n1;2\n", frozenset(), ({"a": "1", "b\tc": "2"}, [2])),
+        ("a\tb\n1\t2,5\n", frozenset(), ({"a": "1", "b": "2.5"}, [2])),
+        ("a,b\n1,NA\n2,1\n", frozenset(), ({"a": "1 2", "b": "- 1"}, [2, 3])),
+        ("a,b\n" + "1,1\n" * 50 + "7", frozenset(), ({"a": ONES, "b": ONES}, [*range(2, 52)])),
+        ("a,b\n" + "1,1\n" * 50 + "7\n", frozenset(), "row 52: has 1 cell(s), the header has 2"),
+        ("a,b\n" + "1,1\n" * 50 + "7,x\n", frozenset(), "row 52, column b: 'x' is not a number"),
+        ("a,b\n1,on\n2,off\n", frozenset(), "row 2, column b: 'on' is not a number"),
+        ("a,b\n1,-\n2,1\n", frozenset(), "row 2, column b: '-' is not a number"),
+        ("a,b\n1,10:30\n2,1\n", frozenset(), "'10:30' is not a number; write seconds since the first row"),
+        ("a;b,c\n1;2,5\n", frozenset(), "column a;b: '1;2' is not a number"),
+        ("\n1,2\n3,4\n", frozenset(), "row 2: has no header, only numbers; write a first line such as"),
+        ("a,\n1,2\n", frozenset(), "row 1: column 2 has no name; name it or remove it"),
+        ("#\nb,a,b\n1,2,3\n", frozenset(), "row 2, column b: occurs twice; rename one of them"),
+        ("a,\rb\n1,2\n", frozenset(), "row 1: the header is no line of names; end every line with a line"),
+        (b"a\xff,b\n1,2\n", frozenset(), "row 1: the header is not UTF-8 text; save it as UTF-8"),
+        (b"a,b\n1,2\n\n3,\xff\n", None, "not UTF-8 text; save"),
+        (b"a,b\n1,2\n\0\n", frozenset(), "is not text, so it is not CSV; export it as comma-separated text"),
+        (b"\x80a,b\n1,2\n", frozenset(), "is not text, so it is not CSV"),
+    ],
+)  # fmt: skip
+def test_a_table_of_thermogrip_is_read_strictly(tmp_path, text, words, found):
+    path = tmp_path / "a.csv"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    if isinstance(found, str):
+        assert found in refusal(lambda: read_csv_table(path, text=words))
+        return
+    table = read_csv_table(path, text=words)
+    assert shown(table) == found
+    assert [*table.text] == (["a", "b"] if words is None else ["b"] if callable(words) else [*words])
+
+
+def test_a_text_cell_becomes_a_number_where_one_is_wanted():
+    cells = ["1.5", "", "NaN", "na", "-3", "2,5"]
+    lines = np.array([3, 4, 5, 6, 8, 9])
+    table = Table("a.csv", {}, {"x": cells}, lines, separator=";")
+    np.testing.assert_array_equal(text_numbers(table, "x"), [1.5, np.nan, np.nan, np.nan, -3.0, 2.5])
+    line = refusal(text_numbers, Table("a.csv", {}, {"x": cells}, lines), "x")
+    assert "a.csv, row 9, column x: '2,5' is not a number; write a number, or leave the cell empty" in line
+
+
+A = np.arange(6.0)
+
+
+@pytest.mark.parametrize(
+    ("content", "found", "dt", "notes"),
+    [
+        ({"x": A, "y": A + 1, "z": A[:3]}, {"x": "0 1 2 3 4 5", "y": "1 2 3 4 5 6"}, "1.0",
+         ["left out, of another length: z"]),
+        ({"x": A[:2], "y": A[1:3], "z": A[:3]}, {"x": "0 1", "y": "1 2"}, "1.0",
+         ["left out, of another length: z"]),  # 2 x 2 cells against 3
+        ({"x": A[:2], "y": A[:2], "w": A[:4]}, {"w": "0 1 2 3"}, "1.0",
+         ["left out, of another length: x, y"]),
+        ({"m": A.reshape(2, 3)}, {"c1": "0 1 2", "c2": "3 4 5"}, "1.0", [BY_POSITION.format(2)]),
+        ({"m": A[:4].reshape(2, 2)}, {"c1": "0 2", "c2": "1 3"}, "1.0", [BY_POSITION.format(2)]),
+        ({"m": A.reshape(3, 2), "n": A[:3]}, {"m_1": "0 2 4", "m_2": "1 3 5", "n": "0 1 2"}, "1.0", []),
+        ({"x": A[:2], "Ts": 0.5, "dt": 3}, {"x": "0 1"}, "0.5", []),
+        ({"x": A[:2], "ts": 0, "DT": 2}, {"x": "0 1"}, "2.0", []),
+        ({"x": A[:2], "fs": 4}, {"x": "0 1"}, "0.25", []),
+        ({"x": A[:2], "fs": -4}, {"x": "0 1"}, "1.0", []),
+        ({"x": A[:2], "a": {"b": {"c": {"d": {"y": A[2:4], "e": {"z": A[:2]}}}}}}, {"x": "0 1", "y": "2 3"},
+         "1.0", []),
+        ({"x": A[:2] + 1j, "b": A[:2] > 0, "i": A[:2].astype(np.int8), "t": np.zeros((2, 2, 2)), "s": "text"},
+         {"b": "0 1", "i": "0 1"}, "1.0", []),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("packed", [True, False])
+def test_arrays_of_a_matlab_file_are_columns(tmp_path, content, found, dt, notes, packed):
+    savemat(tmp_path / "a.mat", content, do_compression=packed)
+    table = read_matlab_table(tmp_path / "a.mat")
+    n = len(next(iter(table.numbers.values())))
+    assert shown(table) == (found, [*range(1, n + 1)])
+    assert (table.meta, list(table.notes)) == ({"dt": dt}, notes)
+
+
+def test_a_matlab_file_that_was_cut_off_or_is_of_no_byte_order_is_damaged(tmp_path):
+    path = tmp_path / "a.mat"
+    savemat(path, {"x": A, "y": A + 1})
+    whole = path.read_bytes()
+    assert whole[126:128] == b"IM"
+    for data in (whole[:-1], whole[:-8], whole[:126] + b"XX" + whole[128:]):
+        path.write_bytes(data)
+        assert "is no MATLAB file, or is damaged; save it again" in refusal(read_matlab_table, path)
+
+
+@pytest.mark.parametrize(("order", "mark"), [("<", b"IM"), (">", b"MI")])
+@pytest.mark.parametrize("packed", [True, False])
+def test_a_matlab_file_of_either_byte_order_is_read(tmp_path, order, mark, packed):
+    def part(kind, form, *values):
+        data = struct.pack(order + form, *values)
+        return struct.pack(order + "2I", kind, len(data)) + data + bytes(-len(data) % 8)
+
+    inner = part(6, "2I", 6, 0) + part(5, "2i", 3, 1) + part(1, "c", b"x") + part(9, "3d", 0.5, 2.0, -1.0)
+    array = struct.pack(order + "2I", 14, len(inner)) + inner  # flags, size, name and numbers
+    if packed:
+        array = struct.pack(order + "2I", 15, len(zlib.compress(array))) + zlib.compress(array)
+    (tmp_path / "a.mat").write_bytes(b"MATLAB".ljust(124) + struct.pack(order + "H", 256) + mark + array)
+    assert shown(read_matlab_table(tmp_path / "a.mat")) == ({"x": "0.5 2 -1"}, [1, 2, 3])
+
+
+def test_a_parquet_file_is_its_columns_with_what_is_said_of_them(tmp_path):
+    path = tmp_path / "a.parquet"
+    fields = [pa.field("t", pa.int32(), metadata={"units": "s"}), pa.field("b", pa.bool_())]
+    columns = [pa.array([3, 4, None], pa.int32()), pa.array([True, False, True])]
+    parquet.write_table(pa.table(columns, schema=pa.schema(fields, metadata={"schema": "x"})), path)
+    table = read_parquet_table(path)
+    assert shown(table) == ({"t": "3 4 -", "b": "1 0 1"}, [1, 2, 3])
+    assert (table.attrs["t"]["units"], "units" in table.attrs["b"], table.meta["schema"]) == ("s", False, "x")
+    parquet.write_table(pa.table({"t": [1.0], "word": ["a"]}), path)
+    assert "column word: holds string, not numbers; leave it out" in refusal(read_parquet_table, path)
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "strict", "log"),
+    [
+        ("a.csv", b"a,b\n1,2\n", "", ""),
+        ("a.csv", b"a,a\n1,2\n", "occurs twice", ""),
+        ("a.txt", b"a,a\n1,2\n", "", ""),
+        ("a.txt", b"a\0", "is not text", "is not text"),
+        ("a.csv.gz", gzip.compress(b"a,a\n"), "occurs twice", ""),
+        ("a.csv.xz", lzma.compress(b"\0\1"), "is not text", "is not text"),
+        ("a.csv.gz", b"no", "is damaged or not compressed as its name says; copy it again", "is damaged"),
+        ("a.csv", b" \n \n", "is empty; give a header and at least two rows", "is empty"),
+        ("a.parquet", b"PAR1", "is not Parquet, or is damaged; write or copy it again", "is not Parquet"),
+        ("a.nc", b"CDF", "is NetCDF-3; convert it with: nccopy", "is NetCDF-3"),
+        ("a.xlsx", b"", "", ""),
+    ],
+)
+def test_what_is_no_table_is_found_by_its_beginning(tmp_path, name, data, strict, log):
+    (tmp_path / name).write_bytes(data)
+    for said, of_log in ((strict, False), (log, True)):
+        if said:
+            assert said in refusal(lambda of_log=of_log: check_table(tmp_path / name, log=of_log))
+        else:
+            check_table(tmp_path / name, log=of_log)
+
+
+def test_the_beginning_of_utf_16_may_end_within_a_letter(tmp_path, monkeypatch):
+    path = tmp_path / "b.csv"
+    path.write_bytes("a,b\n1,2\n".encode("utf-16"))
+    for most in (6, 7):
+        monkeypatch.setattr(tables, "_BEGINNING", most)
+        check_table(path, log=True)
+    assert shown(read_csv_table(path)) == ({"a": "1", "b": "2"}, [2])
+    path.write_bytes(path.read_bytes()[:-1])
+    assert "is damaged UTF-16 text; save it as UTF-8" in refusal(read_csv_table, path)
