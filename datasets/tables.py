@@ -219,7 +219,7 @@ def _split(line: str, separator: str) -> list[str]:
 
 
 def _is_value(cell: str, separator: str) -> bool:
-    plain = cell if separator == "," else cell.replace(",", ".", 1)
+    plain = cell if separator == "," else cell.replace(",", ".")
     return bool(_NUMBER.fullmatch(plain) or _DATE.match(cell)) or cell in _NULLS
 
 
@@ -368,7 +368,7 @@ def _cell_numbers(column: Any, separator: str) -> tuple[Any, NDArray[np.float64]
     comma = separator != "," and bool(cells.str.fullmatch(r"[+-]?\d*,\d+([eE][+-]?\d+)?").any())
     comma = comma and not cells.str.contains(".", regex=False).any()
     if comma:
-        plain = cells.str.replace(",", ".", regex=False)
+        plain = cells.str.replace(",", ".")
     return cells, np.asarray(pd.to_numeric(plain, errors="coerce"), dtype=float), comma
 
 

@@ -53,8 +53,9 @@ def test_an_input_switched_inside_a_cell_counts_by_its_time():
 def test_a_grid_must_increase():
     with pytest.raises(ValueError, match="increasing"):
         hold_average(made([0.0, 1.0], [0, 1]), ("drive",), [1.0, 1.0])
-    with pytest.raises(ValueError, match="two"):
-        hold_average(made([0.0, 1.0], [0, 1]), ("drive",), [1.0])
+    for grid in ([1.0], [[0.0, 1.0]]):
+        with pytest.raises(ValueError, match="two"):
+            hold_average(made([0.0, 1.0], [0, 1]), ("drive",), grid)
 
 
 def test_a_cut_keeps_the_times_and_the_facts(small_log):
@@ -63,6 +64,31 @@ def test_a_cut_keeps_the_times_and_the_facts(small_log):
     assert (part["time"].values < 3.0).all()
     assert part.attrs == small_log.attrs
     assert part["battery"].attrs == {"units": "V", "role": "other"}
+
+
+def test_a_cut_leaves_two_rows_at_least():
+    log = made([0.5, 1.5, 2.5, 4.0], [0] * 4)
+    assert cut(log, 1.5, 4.0)["time"].values.tolist() == [1.5, 2.5]
+    assert cut(log, stop=2.0).sizes["time"] == cut(log, start=2.0).sizes["time"] == 2
+    said = r"log: the cut 1.5:2.5 s leaves 1 row\(s\); the log goes from 0.5 to 4 s"
+    with pytest.raises(UserError, match=said):
+        cut(log, 1.5, 2.5)
+
+
+def test_blocks_start_anew_after_every_gap_and_the_last_row_is_held_for_a_step():
+    time = np.r_[0:3:0.5, 20:22:0.5, 50.25:52.25:0.5]
+    log = made(time, np.arange(14.0), np.arange(14.0) ** 2)
+    got = average(log, 1.5)
+    assert got["time"].values.tolist() == [0.0, 1.5, 20.0, 21.5, 50.25, 51.75]
+    assert column(got, "drive").tolist() == [1.0, 4.0, 7.0, 9.0, 11.0, 13.0]
+    np.testing.assert_allclose(column(got, "t_a"), [5 / 3, 50 / 3, 149 / 3, 81.0, 365 / 3, 169.0])
+    assert (got.attrs["averaged_s"], got.attrs["after_gap"]) == (1.5, "20.0 50.25")
+    assert gaps(got) == [(1, 1.5, 20.0), (3, 21.5, 50.25)]
+    with pytest.raises(UserError, match="log: 1 block of 99 s is not a log; choose a shorter block"):
+        average(made([0.0, 1.0, 2.0], [0, 1, 2]), 99.0)
+    even = made(np.arange(4) * 0.1, [3.0, 1.0, 4.0, 1.0])
+    assert "after_gap" not in average(even, 0.1).attrs  # as long as a step
+    np.testing.assert_allclose(column(average(even, 0.1), "drive"), [3.0, 1.0, 4.0, 1.0], atol=1e-12)
 
 
 def test_the_gap_of_the_example_is_found():

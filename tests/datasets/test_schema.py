@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
+import struct
 
 import numpy as np
 import pytest
+import xarray as xr
 
+from thermogrip.datasets import schema
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import (
     check_grasps,
     check_log,
     column,
     columns,
+    data_hash,
+    has_touch_groups,
+    hash_columns,
+    label_values,
+    log_name,
     make_grasps,
     make_log,
     names,
+    unit_names,
 )
 
 GOOD = ([20.0, 21.0], "degC", "output")
@@ -26,9 +36,12 @@ GOOD = ([20.0, 21.0], "degC", "output")
     [
         ([0.0], {"t": ([20.0], "degC", "output")}, "1 row"),
         ([0.0, 0.0], {"t": GOOD}, "does not increase after 0 s"),
+        ([0.0, 1.0, 1.0, 0.5], {"t": ([1.0] * 4, "degC", "output")}, "does not increase after 1 s; sort"),
+        ([0.0, 2.0, 1.0], {"t": ([1.0] * 3, "degC", "output")}, "does not increase after 2 s"),
         ([0.0, np.nan], {"t": GOOD}, "not finite"),
         ([0.0, 1.0], {"t": ([np.nan, np.nan], "degC", "output")}, "column t: has no finite value"),
         ([0.0, 1.0, 2.0], {"u": ([np.nan, 1.0, 1.0], "1", "input")}, "column u: input is unknown in 1 row"),
+        ([0.0, 1.0, 2.0], {"d": ([1.0, np.nan, np.nan], "1", "disturbance")}, "unknown in 2 row(s); fill"),
         ([0.0, 1.0], {"d": ([np.inf, 1.0], "degC", "disturbance")}, "disturbance is unknown"),
         ([0.0, 1.0], {"t": ([1.0, 2.0], "degC", "thing")}, "role 'thing'"),
     ],
@@ -38,6 +51,46 @@ def test_a_log_that_breaks_a_rule_is_refused(time, variables, words):
         make_log(time, variables, name="mine")
     assert words in str(fault.value)
     assert "mine" in str(fault.value)
+
+
+def test_the_types_of_records_are_loaded_when_they_are_asked_for():
+    assert schema.Log is schema.Grasps is xr.Dataset
+    with pytest.raises(AttributeError, match=r"'thermogrip.datasets.schema' has no attribute 'Logs'"):
+        _ = schema.Logs
+
+
+def test_a_record_has_its_marks_and_a_variable_only_its_time():
+    log = make_log([0.0, 1.0], {"t": GOOD}, repairs=["one", "two"])
+    assert log.attrs == {"schema": "thermogrip.log", "version": 1, "name": "log", "repairs": "one\ntwo"}
+    assert (log["time"].attrs, log["t"].attrs) == ({"units": "s"}, {"units": "degC", "role": "output"})
+    made = make_grasps([0.0, 1.0], [[1.0, 2.0]], [7], t_surface_2=[[3.0, 4.0]], rest=[5.0], material=["tin"])
+    assert made.attrs == {"schema": "thermogrip.grasps", "version": 1, "name": "grasps"}
+    assert [made[n].attrs.get("units") for n in made] == ["degC", "degC", "s", None]
+    assert (made["grasp"].values.tolist(), made["t_surface_2"].values.tolist()) == (["7"], [[3.0, 4.0]])
+    log["wide"] = (("time", "x"), np.zeros((2, 3)), {"units": "1", "role": "other"})
+    with pytest.raises(UserError, match=r"log, column wide: dims are \('time', 'x'\), not \('time',\)"):
+        check_log(log)
+
+
+def test_the_hash_of_a_log_is_that_of_its_numbers():
+    u, v = np.array([0.0, 1.0, 2.5]), np.array([-1.0, 3.0, 0.5])
+    found = hash_columns({"a": u, "b": v})
+    each = sorted(hashlib.sha256(struct.pack("<3d", *x)).digest() for x in (u, v))
+    assert found == hashlib.sha256(b"".join(each)).hexdigest()
+    assert found == hash_columns({"x": v, "y": u * [-1, 1, 1]})  # -0 is 0
+    assert found != hash_columns({"a": u, "b": v + 1e-15})
+    log = make_log(u, {"b": (v, "1", "other")})
+    assert data_hash(log) == found
+    assert data_hash(log.assign_attrs(sha256="known")) == "known"
+
+
+def test_labels_that_are_absent_are_empty_and_a_touch_group_is_one_unit(small_grasps):
+    assert label_values(small_grasps.drop_vars("split"), "split").tolist() == [""] * 6
+    assert label_values(small_grasps, "split")[:2].tolist() == ["train", "test"]
+    assert unit_names(small_grasps).tolist() == ["g0", "g1", "g2", "g3", "p1", "p1"]
+    found = [has_touch_groups(g) for g in (small_grasps, small_grasps[{"grasp": slice(4)}])]
+    assert found == [True, False]
+    assert log_name(small_grasps.drop_attrs()) == "log"
 
 
 def test_an_output_may_have_lost_samples():
@@ -67,6 +120,11 @@ def test_columns_come_in_the_order_asked_for(small_log):
     [
         ({"grasp_id": ["a", "a"]}, "'a' occurs twice"),
         ({"time": [0.0, 0.0, 1.0]}, "time does not increase"),
+        ({"time": [0.0, 1.0, 0.5]}, "time does not increase"),
+        ({"time": [0.0, 1.0, np.inf]}, "time does not increase"),
+        ({"time": [0.0], "t_surface": [[20.0], [20.0]]}, "time does not increase"),
+        ({"time": [0.0, 1.0, 10.5]}, "samples are 5.25 s apart"),
+        ({"t_surface": [[20.0, 20.0, 20.0], [np.nan] * 3]}, "grasp 'b' has no temperature"),
         ({"t_surface": np.full((2, 3), np.nan)}, "grasp 'a' has no temperature"),
         ({"weight": [1, 2]}, "has no 'weight'"),
     ],
@@ -75,6 +133,10 @@ def test_grasps_that_break_a_rule_are_refused(kwargs, words):
     good = {"time": [-0.1, 0.0, 0.1], "t_surface": np.full((2, 3), 20.0), "grasp_id": ["a", "b"]}
     with pytest.raises(UserError, match=words):
         make_grasps(**(good | kwargs))
+
+
+def test_samples_may_be_5_s_apart():
+    assert make_grasps([0.0, 1.0, 10.0], [[20.0, np.nan, 20.0]], ["a"]).sizes["time"] == 3
 
 
 def test_two_of_three_grasps_with_one_id_are_refused():
@@ -107,6 +169,7 @@ def test_grasps_in_milliseconds_are_refused() -> None:
     [
         ({"rest": [np.nan, -5.0, 60.0]}, "grasp 'b' has a rest of -5 s"),
         ({"touch": [1, 2, 1]}, "touch 1 of touch_group 'one' occurs twice; number its touches 1, 2, ...,"),
+        ({"touch": [1, 2, 2], "rest": [0.0, np.nan, 0.0]}, "touch 2 of touch_group 'one' occurs twice"),
         ({"touch": [1, 2, np.nan]}, "grasp 'c' of touch_group 'one' has no touch, others of it have; number"),
     ],
 )

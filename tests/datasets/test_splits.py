@@ -97,6 +97,18 @@ def test_the_same_seed_gives_the_same_splits_and_another_does_not():
     assert any((first[0][0] != train).any() for train, _ in first[1:])
 
 
+def test_twenty_splits_of_five_a_material_from_seed_0_are_the_default():
+    grasps = load_example_grasps()["exp1A_obj43_grip23"]
+    found = [train.tolist() for train, _ in by_grasp(grasps)]
+    asked = by_grasp(grasps, train_per_class=5, repeats=20, seed=0)
+    assert (len(found), len(found[0])) == (20, 25)  # of five materials
+    assert found == [train.tolist() for train, _ in asked]
+    blocks = record(list("aaaaaaaa"), block=list("12345678"))
+    seeds = {}, {"seed": 0}, {"seed": 1}
+    folds = [[test.tolist() for _, test in by_block(blocks, **seed)] for seed in seeds]
+    assert folds[0] == folds[1] != folds[2]
+
+
 def test_every_grasp_gets_its_turn_in_training():
     grasps = load_example_grasps()["exp2_dT20"]
     counts = np.zeros(grasps.sizes["grasp"])
@@ -121,8 +133,8 @@ def test_the_shipped_split_is_that_of_the_column():
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda: by_grasp(record(["a"] * 3), train_per_class=3), "cannot give 3 to train and one to test"),
-        (lambda: by_grasp(record(["a"] * 3), train_per_class=0), "at least one"),
+        (lambda: by_grasp(record(["a"] * 3), train_per_class=3), "3 grasp(s) of a cannot give 3 to train"),
+        (lambda: by_grasp(record(["a"] * 3), train_per_class=0), "0 training grasps a material; give"),
         (lambda: by_grasp(record(["", ""]), train_per_class=1), "no grasp has a material"),
         (lambda: by_block(record(["", ""])), "no grasp has a material"),
         (lambda: by_session(record(["a", "b"], session=["s", "s"])), "1 session"),
@@ -138,7 +150,15 @@ def test_a_split_that_cannot_be_is_one_line(call, words):
     with pytest.raises(UserError) as fault:
         list(call())
     assert words in str(fault.value)
-    assert "made" in str(fault.value) or "at least" in words
+    assert "made" in str(fault.value) or "0 training" in words
+
+
+@pytest.mark.parametrize(("part", "counts"), [("test", "0 training and 2"), ("train", "2 training and 0")])
+def test_a_part_without_a_grasp_is_no_split(part, counts):
+    with pytest.raises(UserError, match=f"made: column split gives {counts} test grasps; write train and"):
+        shipped(record(["a", "a"], split=[part] * 2))
+    train, test = shipped(record(["a"] * 4, split=["test", "spare", "train", "test"]))
+    assert (train.tolist(), test.tolist()) == ([2], [0, 3])
 
 
 def test_a_shipped_split_that_is_missing_or_leaks_is_refused():

@@ -66,7 +66,11 @@ def test_the_ending_is_the_format_and_the_rest_is_the_name(name, kind, stem):
         ("1, 2\n3, 4\n", "c1|c2", 0, ",", BY_POSITION.format(2)),  # blanks would do as well
         ("1|2\n3|4\n", "c1|c2", 0, "|", BY_POSITION.format(2)),
         ("1;2,5\n3;4,5\n", "c1|c2", 0, ";", BY_POSITION.format(2)),
+        ("1,5;2,5\n3,5;4,5\n", "c1|c2", 0, ";", BY_POSITION.format(2)),
         ("1\n2\n", "c1", 0, "\t", BY_POSITION.format(1)),
+        ("x,y\nINF,Inf\n1,2\n", "x|y", 1, ",", ""),
+        ("x,y\n٣,٤\n1,2\n", "٣|٤", 2, ",", "1 line(s) before the table passed over"),
+        ("a,b,3\n1,2,3\n", "a|b|3", 1, ",", ""),
         ("t u\n0.5\t1\n1.5\t2\n", "t u|c2", 1, "\t", "without a name: c2"),
         ("a,b,\n1,2,\n3,4,\n", "a|b|\x1fend", 1, ",", ""),
         ("1,2,\n3,4,\n", "c1|c2|\x1fend", 0, ",", BY_POSITION.format(2)),
@@ -121,6 +125,9 @@ LEFT = "row(s) with too few or too many cells left out"
         (rows(40, {3: "3\n", 7: "7,1,2\n"}), f"2 {LEFT} (rows 5, 9)", ""),
         (rows(39, {3: "3,1,2\n", 7: "7\n", 9: "9\n"}), "",
          "row 5: has 3 cell(s), the header has 2; 2 more rows do not fit; complete"),
+        (rows(30, {3: "3,1,2\n", 7: "7\n"}), "",
+         "the header has 2; 1 more rows do not fit; complete or remove the row"),
+        (rows(20, {3: "3\n"}, "# c,d,e\na,b\n"), f"1 {LEFT} (row 6)", ""),
         (rows(120, SHORT), f"6 {LEFT} (rows 5, 6, 7, 8, 9, ...)", ""),
         (rows(100, {k: SHORT[k] for k in range(3, 8)}), f"5 {LEFT} (rows 5, 6, 7, 8, 9)", ""),
         (rows(20, {3: "3,x\n", 6: "4,y\n"}),
@@ -147,9 +154,26 @@ def test_a_few_broken_rows_and_cells_are_left_out_and_more_of_them_refused(text,
     if refused:
         line = refusal(parse_text, text.encode(), "a.txt")
         assert refused in line
-        assert ("leave columns out" in line) == ("--columns" in line)
+        assert line.endswith(refused) or not refused.endswith((" row", " column"))
         return
-    assert parse_text(text.encode(), "a.txt").notes == (noted,)
+    table = parse_text(text.encode(), "a.txt")
+    assert table.notes == (noted,)
+    lines = text.splitlines()
+    assert [lines[at - 1].split(",")[0] for at in table.lines] == [f"{a:g}" for a in table.numbers["a"]]
+
+
+def test_rows_are_counted_where_lines_cannot_be():
+    table = parse_text(rows(80, {9: '9,"1\n1,"\n', 79: "79\n"}).encode(), "a.txt")  # a line end in a cell
+    assert table.lines.tolist() == [*range(2, 81)]
+    np.testing.assert_array_equal(table.numbers["b"][8:11], [8.5, np.nan, 10.5])
+
+
+def test_a_table_has_4096_columns_at_most():
+    line = b",".join([b"1"] * 4096)
+    assert find_layout(line + b"\n" + line + b"\n", "a.txt").names[-1] == "c4096"
+    for more in (b"1", b"x"):
+        text = b"\n".join([line.replace(b"1", more) + b"," + more] * 2)
+        assert "4097 " in refusal(find_layout, text, "a.txt")
 
 
 @pytest.mark.parametrize(
@@ -173,6 +197,7 @@ def test_a_few_broken_rows_and_cells_are_left_out_and_more_of_them_refused(text,
          {"a": "1 2 2 2 2 2 2", "b": "5 - - - - - -"}, [*range(2, 9)], []),
         ("a,b\n1,5\n" + "".join(f"2,{w}\n" for w in NULLS),
          {"a": "1" + " 2" * 10, "b": "5" + " -" * 10}, [*range(2, 13)], []),
+        ("a,b\xb5\n1,2\n", {"a": "1", "b\xb5": "2"}, [2], []),
         (b"a,b\xb5\n1,2\n3,4\n", {"a": "1 3", "b\xb5": "2 4"}, [2, 3],
          ["text is not UTF-8: read as Windows-1252"]),
     ],
@@ -255,6 +280,8 @@ A = np.arange(6.0)
         ({"m": A.reshape(2, 3)}, {"c1": "0 1 2", "c2": "3 4 5"}, "1.0", [BY_POSITION.format(2)]),
         ({"m": A[:4].reshape(2, 2)}, {"c1": "0 2", "c2": "1 3"}, "1.0", [BY_POSITION.format(2)]),
         ({"m": A.reshape(3, 2), "n": A[:3]}, {"m_1": "0 2 4", "m_2": "1 3 5", "n": "0 1 2"}, "1.0", []),
+        ({"m": A.reshape(3, 2), "e": np.zeros((0, 3))}, {"c1": "0 2 4", "c2": "1 3 5"}, "1.0",
+         [BY_POSITION.format(2)]),
         ({"x": A[:2], "Ts": 0.5, "dt": 3}, {"x": "0 1"}, "0.5", []),
         ({"x": A[:2], "ts": 0, "DT": 2}, {"x": "0 1"}, "2.0", []),
         ({"x": A[:2], "fs": 4}, {"x": "0 1"}, "0.25", []),
@@ -272,6 +299,13 @@ def test_arrays_of_a_matlab_file_are_columns(tmp_path, content, found, dt, notes
     n = len(next(iter(table.numbers.values())))
     assert shown(table) == (found, [*range(1, n + 1)])
     assert (table.meta, list(table.notes)) == ({"dt": dt}, notes)
+
+
+def test_columns_of_a_matlab_file_may_be_named(tmp_path):
+    savemat(tmp_path / "a.mat", {"m": A.reshape(2, 3)})
+    assert shown(read_matlab_table(tmp_path / "a.mat", ["p", "-"]))[0] == {"p": "0 1 2"}
+    line = refusal(read_matlab_table, tmp_path / "a.mat", ["p"])
+    assert "a.mat: has 2 columns, --columns names 1; write" in line
 
 
 def test_a_matlab_file_that_was_cut_off_or_is_of_no_byte_order_is_damaged(tmp_path):
