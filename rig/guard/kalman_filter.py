@@ -62,8 +62,8 @@ class InputSteps:
         """
         before = self.done
         while (grid := self.start + (self.done + 1) * self.dt) <= until + 1e-9:
-            self._accumulate(max(grid - self.time, 0.0), u)
-            self._u.append(self._total / self._passed if self._passed > 0 else u.copy())
+            self._accumulate(grid - self.time, u)
+            self._u.append(self._total / self._passed)
             self._d.append(d.copy())
             self._total, self._passed, self.time = np.zeros_like(u), 0.0, grid
             self.done += 1

@@ -373,7 +373,7 @@ class ModelMonitor:
         model, now = self._model, self._filter
         n = max(1, round(seconds / self.plant.dt))
         for j, at in enumerate(model.drive_at):
-            if now.u[at] >= -0.3 * model.half[j] or model.ranges[j, 0] >= 0:
+            if now.u[at] >= -0.3 * model.half[j]:
                 continue
             u = np.repeat(now.driven(now.u)[None, None], 2, axis=0).repeat(n, axis=1)
             u[1, :, at] += 0.1 * model.half[j]

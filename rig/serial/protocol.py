@@ -103,7 +103,7 @@ def encode_line(seq: int, *words: str) -> bytes:
     """Return the bytes of a line, its end included; ValueError where the words make no line."""
     body = " ".join([str(seq), *words]).encode("ascii")
     whole = _BODY.fullmatch(body) and body.count(b" ") == len(words)
-    if not 0 <= seq <= 0xFFFF or not whole or len(body) > MAX_BODY:
+    if seq > 0xFFFF or not whole or len(body) > MAX_BODY:
         raise ValueError(f"these words make no line: {body!r}")
     checked = body + b"*%02X" % len(body)
     return checked + b"%04X%04X\n" % (crc16(checked), crc16(checked[::-1]))
@@ -531,9 +531,7 @@ def parse_state(words: Sequence[str]) -> State | None:
     faulty = all(_FAULT.fullmatch(text) for text in latched)
     if not known or not faulty or bool(latched) != (mode == "latched"):
         return None
-    if uptime_ms is None or boots is None or applied is None:
-        return None
-    if not (0 <= uptime_ms <= 0xFFFFFFFF and 0 <= boots <= 0xFFFF):
+    if uptime_ms is None or boots is None or applied is None or uptime_ms < 0 or not 0 <= boots <= 0xFFFF:
         return None
     values = tuple(value for value in read if value is not None)
     if len(values) != len(read):
@@ -546,10 +544,11 @@ def _announcement(line: Line) -> Event:
     if line.words == ("err", "corrupt"):
         return Refused(None, "corrupt")
     boots = integer(line.words[2]) if len(line.words) == 4 else None
-    known = line.words[0] == "boot" and boots is not None and 0 <= boots <= 0xFFFF
-    if not known or line.words[1] not in CAUSES or not _VERSION.fullmatch(line.words[3]):
+    if line.words[0] != "boot" or boots is None or not 0 <= boots <= 0xFFFF:
         return Unexpected("content", line)
-    return Boot(line.words[1], boots or 0, line.words[3])
+    if line.words[1] not in CAUSES or not _VERSION.fullmatch(line.words[3]):
+        return Unexpected("content", line)
+    return Boot(line.words[1], boots, line.words[3])
 
 
 def _channel(text: str) -> Channel | None:

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from thermogrip.rig.clock import Metronome, ScaledClock, SteppedClock
+from thermogrip.rig.clock import BackOff, Metronome, ScaledClock, SteppedClock
 
 
 def test_sums_of_tenths_stay_tenths_a_nanosecond_is_time_and_no_sleep_turns_the_clock_back() -> None:
@@ -67,3 +67,24 @@ def test_a_wait_that_begins_before_the_last_has_ended_is_not_put_behind_it() -> 
     assert beat.next(0.4) == 0.4
     clock.sleep(0.1)  # woken early, by a stop for example
     assert beat.next(0.4) == 0.5
+
+
+def test_a_retry_waits_twice_as_long_each_time_until_one_succeeds() -> None:
+    clock = SteppedClock(7.0)
+    retry, waits = BackOff(clock, first=0.5, longest=1.7), []
+    assert retry.due()
+    for k in range(5):
+        if k == 4:
+            retry.succeeded()
+            assert retry.due()
+        retry.failed()
+        waits.append(round(retry.next_try - clock(), 9))
+        clock.sleep(waits[-1] - 0.001)
+        assert not retry.due()
+        clock.sleep(0.001)
+        assert retry.due()
+    assert waits == [0.5, 1.0, 1.7, 1.7, 0.5]
+
+
+def test_a_clock_runs_at_its_own_speed_unless_told() -> None:
+    assert (ScaledClock().speed, SteppedClock()()) == (1.0, 0.0)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import is_dataclass
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -100,3 +102,26 @@ def test_close_switches_everything_off_for_good_and_may_be_called_twice(rig: Rig
     rig.apply(dict.fromkeys(rig.units, 0.0), 0)
     with pytest.raises(RuntimeError, match="closed"):
         rig.apply(dict.fromkeys(rig.units, 0.5), 0)
+
+
+CHANGING = {"Loop", "InputSteps", "DeviceCore", "_BadCount", "_Memory", "_Contact"}
+
+
+@pytest.mark.parametrize(
+    "module",
+    ["thermogrip.rig.interface", "thermogrip.rig.records.batch", "thermogrip.rig.records.run_folder",
+     "thermogrip.rig.session.loop", "thermogrip.rig.session.session", "thermogrip.rig.firmware.reference",
+     "thermogrip.rig.guard.plant_mismatch", "thermogrip.rig.guard.rule_checks",
+     "thermogrip.rig.guard.settings", "thermogrip.rig.guard.trip", "thermogrip.rig.guard.guard",
+     "thermogrip.rig.guard.model_checks", "thermogrip.rig.guard.kalman_filter",
+     "thermogrip.rig.guard.sensor_checks", "thermogrip.rig.simulation.virtual_device",
+     "thermogrip.rig.simulation.twin", "thermogrip.rig.serial.protocol"],
+)  # fmt: skip
+def test_what_is_handed_on_cannot_be_changed(module: str) -> None:
+    every = [
+        one for one in vars(import_module(module)).values() if isinstance(one, type) and is_dataclass(one)
+    ]
+    made = [one for one in every if one.__module__ == module]
+    assert made
+    for one in made:
+        assert one.__dataclass_params__.frozen == (one.__name__ not in CHANGING), one

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 
 import numpy as np
@@ -90,6 +91,10 @@ def test_it_trips_above_its_limit_and_holds_until_cleared() -> None:
     bench.scan(4)
     assert bench.device.applied_drive == OFF
     assert bench.lab.faults == ("over:t1", "over:t2")
+    text = next(notice.text for notice in bench.lab.notices() if notice.kind == "latched")
+    assert re.fullmatch(
+        r"over:t1, over:t2 \(t1 6[12]\.. degC, t2 6[12]\.. degC, at most 60\); heaters off", text
+    )
     with pytest.raises(DeviceRefusedError, match="over:t1"):
         bench.lab.apply(HALF, 1)
     bench.lab.apply(OFF, 0)
@@ -169,6 +174,8 @@ def test_a_heater_that_answers_nonsense_does_not_keep_the_other_on(bench: Lab, s
     bench.device.exchange = (  # type: ignore[method-assign]
         lambda data: b"7.000\r\n" if data.startswith(spoilt) else whole(data)
     )
+    with pytest.raises(PortError, match=r"took 7 % where q. = (33\.333|66\.667) %"):
+        bench.lab.apply({"q1": 33.333, "q2": 66.667}, 1)
     bench.lab.close()
     assert bench.device.applied_drive == OFF
     assert not any("PULL THE PLUG" in notice.text for notice in bench.lab.notices())
@@ -221,6 +228,28 @@ def test_a_spoilt_line_is_asked_again_and_a_jump_three_times(bench: Lab) -> None
     assert wrong == 0
     assert lost < 50
     bench.device.clear()
+
+
+@pytest.mark.parametrize(
+    ("passed", "scans", "read", "heater"),
+    [(1.0, [(28.0, 0.0)], 28.0, 0.0), (10.0, [(28.1, 0.0), (25.1, 0.0), (25.2, 0.0)], 25.2, 0.0),
+     (10.1, [(59.9, 0.0)], 59.9, 0.0), (10.1, [(60.0, 0.0)] * 3, 60.0, 0.0),  # its highest is 60 degC
+     (10.1, [(-49.8, 0.0)], -49.8, 0.0), (10.1, [(-49.9, 0.0)] * 3, np.nan, 0.0),
+     (1.0, [(129.9, 0.0)] * 3, 129.9, 0.0), (1.0, [(130.0, 0.0)] * 3, np.nan, 0.0),
+     (1.0, [(25.0, 0.002)], 25.0, 0.002), (1.0, [(25.0, 0.003)] * 3, 25.0, 0.003)],
+)  # fmt: skip
+def test_a_scan_that_cannot_be_right_is_asked_three_times(
+    bench: Lab, passed: float, scans: list[tuple[float, float]], read: float, heater: float
+) -> None:
+    lab, left = bench.lab, [(25.0, 0.0), *scans]
+    lab._scan = lambda: [left[0][0], 25.0, 0.0, left.pop(0)[1]]
+    lab.read()
+    bench.clock.sleep(passed)
+    found = lab.read()
+    np.testing.assert_array_equal([found.values["t1"], found.drive["q2"]], [read, heater])
+    assert left == []
+    kinds = {notice.kind for notice in lab.notices()}
+    assert ("damaged" in kinds, "reset" in kinds) == (len(scans) == 3, heater > 0.002)
 
 
 def test_half_a_number_is_no_number(bench: Lab) -> None:

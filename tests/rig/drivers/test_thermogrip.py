@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -207,6 +208,57 @@ def test_another_device_on_the_same_port_is_not_taken_for_the_first(direct: Benc
     port.device = VirtualDevice(make_lab(), link="none", clock=direct.clock)
     with pytest.raises(PortError, match="another device"):
         direct.rig.apply(DRIVE, 1)
+
+
+@pytest.mark.parametrize(
+    ("heard", "asked", "said", "repeated"),
+    [(b"", [3, 1], ["did not answer within 0.15 s", "did not answer within 0.05 s"], 2),
+     (b"noise\n", [12, 12], ["was asked 12 times and only damaged answers came"] * 2, 24)],
+)  # fmt: skip
+def test_a_question_is_asked_so_often_and_once_where_nothing_was_heard(
+    direct: Bench, heard: bytes, asked: list[int], said: list[str], repeated: int
+) -> None:
+    port, written = direct.rig.port, []
+    port.write, port.read = written.append, lambda seconds: heard
+    for n, text in zip(asked, said):
+        written.clear()
+        with pytest.raises(PortError, match=text):
+            direct.rig.apply(DRIVE, 1)
+        assert len(written) == n
+        assert {data.lstrip(b"\n") for data in written} == {written[0]}  # with the same number
+    del port.write, port.read
+    direct.rig.apply(DRIVE, 1)
+    notes = [(notice.kind, notice.text) for notice in direct.rig.notices()]
+    assert notes.count(("repeated", "no answer; asked again")) == repeated
+    assert notes.count(("damaged", "a line came damaged (check)")) == (24 if heard else 0)
+    links = [text for kind, text in notes if kind == "link"]
+    assert (len(links), links[-1]) == (2, "answers again")
+
+
+@pytest.mark.parametrize(
+    ("seconds", "takes"), [(0.01, True), (1.0, True), (0.009, False), (1.001, False), (0.0, False)]
+)
+def test_a_device_keeps_whole_milliseconds_from_10_to_1000(
+    sampling: Sampling, seconds: float, takes: bool
+) -> None:
+    assert sampling.rig.sample_every(seconds) == takes
+    assert (sampling.rig._gathering is not None) == takes
+
+
+def test_ticks_that_were_overwritten_or_missed_are_lost_and_the_next_is_asked_for() -> None:
+    clock, gathering = DeviceClock(), Gathering(10)
+    clock.see(0.0, 0.0, 0)
+    kept = Kept(20, 1, (0,), (1,))
+    assert gathering.take(Taken(1000, 3, 6, (kept, None, replace(kept, age_ms=0))), clock) == [
+        (pytest.approx(0.98), kept), (pytest.approx(1.0), replace(kept, age_ms=0)),
+    ]  # fmt: skip
+    assert (gathering.lost, gathering.number) == (3 + 1, 6)
+    gathering.take(Taken(1010, 2**32 - 1, 3, (replace(kept, age_ms=0),)), clock)
+    assert gathering.number == 0
+    gathering.device_was_reset()
+    gathering.lost = 0
+    gathering.take(Taken(1050, 0, 1, (replace(kept, age_ms=0),)), clock)
+    assert gathering.lost == 3  # 10 ms apart, from 1.01 s to 1.05 s
 
 
 class Flood(DirectPort):

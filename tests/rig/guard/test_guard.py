@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from math import inf, nan
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock, call
 
 import pytest
 
+from tests.rig.makers import make_heater
 from thermogrip.rig.guard.guard import Findings, Guard, GuardSettings
+from thermogrip.rig.guard.model_checks import Cause, Residual
 from thermogrip.rig.guard.rule_checks import RuleMonitor
 from thermogrip.rig.guard.trip import KINDS, Trip
 from thermogrip.rig.interface import Reading
-from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.plant.plant import Plant
 
 UNITS = {"drive": "1"}
@@ -38,6 +41,10 @@ def kind(found: Findings) -> str:
     return "" if found.trip is None else found.trip.kind
 
 
+def said(trip: Trip | None) -> tuple[str, str, str, str] | None:
+    return None if trip is None else (trip.kind, trip.subject, trip.expected, trip.measured)
+
+
 @pytest.mark.parametrize("name", KINDS)
 def test_every_kind_of_trip_says_what_to_check_and_how_to_clear_it(name: str) -> None:
     line = Trip(name, 1.0, "t_tank", "30 degC", "40 degC").line()
@@ -54,34 +61,61 @@ def test_a_trip_is_plain_json_even_where_a_number_is_not_finite() -> None:
         Trip("gremlins", 0.0, "t", "a", "b")
 
 
-def test_a_program_that_was_frozen_longer_than_the_devices_time_to_live_trips() -> None:
-    assert kind(check(guard_at(), reading(2.9, 25.0), now=2.9)) == ""
-    assert kind(check(guard_at(), reading(3.1, 25.0), now=3.1)) == "frozen"
-
-
-def test_readings_that_stop_coming_trip() -> None:
-    guard = guard_at()
-    check(guard, reading(1.0, 25.0))
-    kinds = [kind(check(guard, reading(1.0, 25.0), now=1.0 + 0.5 * k)) for k in range(1, 9)]
-    assert kinds[:4] == ["", "", "", ""]
-    assert "stale" in kinds
-    assert not check(guard, reading(1.0, 25.0), now=5.5).fresh
-
-
-@pytest.mark.parametrize("jump", [-0.5, 3600.0, 5.0])
-def test_a_rigs_clock_that_jumps_trips(jump: float) -> None:
-    guard = guard_at()
-    check(guard, reading(1.0, 25.0))
-    assert kind(check(guard, reading(2.0 + jump - (1.0 if jump < 0 else 0.0), 25.0), now=2.0)) == "clock"
+def clock(since: float, there: float) -> tuple[str, ...]:
+    return "clock", "the rig's clock", f"{since:+.2f} s since the last reading", f"{there:+.2f} s"
 
 
 @pytest.mark.parametrize(
-    ("applied", "expected"),
-    [((50.0, 30.0), ""), ((47.6, 32.4), ""), ((47.4, 30.0), "driver"), ((50.0, 32.6), "driver"),
-     ((0.0, 30.0), "driver"), ((0.0, 0.0), "device")],
+    ("planned", "polls", "want"),
+    [(1.0, [(103.0, 13.0)], None),  # exactly the second of the plan and the device's 2 s
+     (1.0, [(103.1, 13.1)], ("frozen", "this program", "a reading every 1 s", "none for 3.1 s")),
+     (0.05, [(104.0, 14.0)], ("frozen", "this program", "a reading every 0.1 s", "none for 4.0 s")),
+     (1.0, [(101.0, 11.0), (102.0, 11.0), (104.0, 11.0)], None),
+     (1.0, [(101.0, 11.0), (102.0, 11.0), (104.5, 11.0)],
+      ("stale", "readings", "a new one within 3 s", "none for 3.5 s")),
+     (1.0, [(101.0, 12.0)], None), (2.0, [(102.0, 11.0)], None),  # 1 s of slack either way
+     (1.0, [(101.0, 12.5)], clock(1.0, 2.5)), (2.0, [(102.5, 11.0)], clock(2.5, 1.0)),
+     (1.0, [(101.0, 9.5)], clock(1.0, -0.5)),
+     (1.0, [(101.0, 11.0), (102.0, 11.0), (103.0, 13.0)], None)],  # from the last new one
+)  # fmt: skip
+def test_readings_and_the_programs_clock_move_on_together(
+    planned: float, polls: list[tuple[float, float]], want: tuple[str, ...] | None
+) -> None:
+    guard = Guard()
+    guard.start(reading(10.0, 25.0), 100.0, UNITS)
+    *before, trip = [guard.check(reading(t, 25.0), now, planned=planned).trip for now, t in polls]
+    assert before == [None] * (len(polls) - 1)
+    assert said(trip) == want
+    if want is not None:
+        since, there = polls[-1][0] - 100.0 - (want[0] == "stale"), polls[-1][1] - 10.0
+        figures = {"here": since, "there": there} if want[0] == "clock" else {"seconds": since}
+        assert trip.figures == pytest.approx(figures)
+
+
+def test_a_reading_that_was_seen_is_not_checked_again_and_an_old_one_is_not_fresh() -> None:
+    guard = guard_at()
+    spoilt = Reading(1.0, {"t_tank": nan, "t_surface": 25.5, "t_ambient": nan}, {"drive": 0.0}, 1)
+    first = check(guard, spoilt)
+    assert first.values == {"t_tank": 25.0, "t_surface": 25.5, "t_ambient": 25.0}
+    assert (first.suspect, first.fresh) == ({"t_tank": "lost", "t_ambient": "lost"}, False)
+    assert check(guard, spoilt) is first
+    again = check(guard, spoilt, now=1.5)
+    assert (again.values, again.suspect, again.fresh) == (first.values, {}, False)
+    room = Reading(2.0, {"t_tank": 25.0, "t_surface": 25.6, "t_ambient": nan}, {"drive": 0.0}, 1)
+    assert check(guard, room).fresh  # the room's alone is lost
+    nothing = Reading(3.0, {"t_ambient": nan}, {"drive": 0.0}, 1)
+    assert not check(guard, nothing).fresh
+
+
+@pytest.mark.parametrize(
+    ("applied", "want"),
+    [((50.0, 30.0), None), ((47.6, 32.4), None), ((47.4, 30.0), ("driver", "q1", "+50, as asked", "+47.4")),
+     ((50.0, 32.6), ("driver", "q2", "+30, as asked", "+32.6")),
+     ((0.0, 30.0), ("driver", "q1", "+50, as asked", "+0")),
+     ((0.0, 0.0), ("device", "q2", "+30, as asked", "0: the device has switched off"))],
 )  # fmt: skip
 def test_of_two_heaters_each_may_differ_by_the_slack_and_only_both_off_is_the_device(
-    applied: tuple[float, float], expected: str
+    applied: tuple[float, float], want: tuple[str, ...] | None
 ) -> None:
     """The slack is 5 % of half the range: 2.5 of 0 to 100 percent."""
 
@@ -92,101 +126,309 @@ def test_of_two_heaters_each_may_differ_by_the_slack_and_only_both_off_is_the_de
     guard.start(at(0.0), 0.0, {"q1": "percent", "q2": "percent"})
     guard.asked({"q1": 50.0, "q2": 30.0}, 1)
     assert kind(check(guard, at(1.0))) == ""
-    assert kind(check(guard, at(2.0))) == expected
+    trip = check(guard, at(2.0)).trip
+    assert said(trip) == want
+    assert trip is None or trip.figures == {"applied": applied[trip.subject == "q2"]}
 
 
-def test_no_drive_while_the_pump_is_off() -> None:
+def test_a_driver_that_obeys_in_between_is_not_off_twice() -> None:
     guard = guard_at()
-    assert guard.refuse({"drive": 0.0}, 0, 1.0) is None
-    assert guard.refuse({"drive": 0.5}, 1, 1.0) is None
-    for value, expected in ((0.01, "interlock"), (-0.5, "interlock"), (nan, "drive")):
-        trip = guard.refuse({"drive": value}, 0, 1.0)
-        assert trip.kind == expected
+    guard.asked({"drive": 0.5}, 1)
+    drives = (0.0, 0.5, 0.0, 0.45, 0.44, 0.44)  # 0.05 is the slack of a drive of -1 to 1
+    kinds = [kind(check(guard, reading(float(k), 25.0, drive=d))) for k, d in enumerate(drives, start=1)]
+    assert kinds == ["", "", "", "", "", "driver"]
+    assert kind(check(guard, Reading(7.0, {"t_surface": 25.0}, {}, 1))) == ""  # a rig that does not report it
 
 
-@pytest.mark.parametrize(("skin", "trips"), [(54.9, False), (55.1, True), (3.1, False), (2.9, True)])
-def test_the_second_reading_beyond_a_limit_trips(skin: float, trips: bool) -> None:
-    guard = guard_at(skin)
-    assert kind(check(guard, reading(1.0, skin))) == ""
-    assert kind(check(guard, reading(2.0, skin))) == ("limit" if trips else "")
-
-
-def test_a_hot_object_in_the_gripper_is_not_the_rigs_fault() -> None:
-    guard = guard_at(50.0)
-    for k in range(1, 6):
-        assert kind(check(guard, reading(float(k), 50.0 + 2 * k, tank=50.0, pump=0), touching=True)) == ""
-
-
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-@pytest.mark.parametrize(("slope", "expected"), [(0.05, None), (0.0, "driver"), (-0.05, "reversed")])
-def test_without_a_model_the_wrong_way_and_nowhere_trip_for_heating_and_cooling(
-    sign: float, slope: float, expected: str | None
-) -> None:
-    rules, found = RuleMonitor(), {}
-    for k in range(120):
-        tank = 25.0 + sign * slope * k
-        if trip := rules.check(float(k), 0.8 * sign, {"t_tank": tank}, room=25.0, target={}):
-            found.setdefault(trip.kind, k)
-    assert found == ({expected: 57} if expected else {})  # 95 % of a window of 60 s
-
-
-def test_a_rig_at_the_end_of_its_reach_may_stand_still() -> None:
-    monitor = RuleMonitor()
-    assert all(
-        monitor.check(float(k), 0.9, {"t_tank": 48.0}, room=25.0, target={}) is None for k in range(300)
-    )
-
-
-def test_leaving_a_target_that_was_reached_trips_by_its_area() -> None:
-    monitor, at = RuleMonitor(), 0
-    for k in range(400):
-        skin = 38.0 if k < 100 else 38.0 - 8.0
-        if monitor.check(float(k), 0.0, {"t_surface": skin}, room=25.0, target={"t_surface": 38.0}):
-            at = k
-            break
-    assert at == 100 + 40  # 3 K beyond 5 K, 120 K s
-
-
-def test_between_sessions_the_guard_keeps_what_it_knows(plant: Plant) -> None:
-    guard = Guard(plant)
-    rig = Twin(plant)
-    guard.start(rig.read(), 0.0, UNITS)
-    for _ in range(100):
-        guard.asked({"drive": 0.5}, 1)
-        rig.apply({"drive": 0.5}, 1)
-        rig.wait(1.0)
-        assert guard.check(rig.read(), rig.time, planned=1.0).trip is None
-
-    def expected() -> dict[str, float]:
-        return dict(zip(plant.outputs, guard.model._filter.expected.tolist()))
-
-    known = expected()
-    guard.start(rig.read(), rig.time, UNITS)
-    assert expected()["t_tank"] == pytest.approx(known["t_tank"], abs=0.3)
-    assert guard.model.compared_from == 0.0  # no new warm-up
+STANDING = ("interlock", "drive", "no drive while the pump is off")
 
 
 @pytest.mark.parametrize(
-    ("time", "ready"), [(10.0, False), (38.9, False), (39.0, True), (48.9, True), (1e4, True)]
-)
-def test_the_skin_is_ready_a_shortest_window_after_the_comparison_began(
-    plant: Plant, time: float, ready: bool
+    ("drives", "pump", "want"),
+    [({"drive": 0.0}, 0, None), ({"drive": 0.5}, 1, None),
+     ({"q": 0.2, "drive": inf}, 1, ("drive", "drive", "a number", "inf")),
+     ({"q": 0.0, "drive": 0.01}, 0, (*STANDING, "0.01 with the pump off")),
+     ({"drive": -0.5}, 0, (*STANDING, "-0.5 with the pump off"))],
+)  # fmt: skip
+def test_no_drive_while_the_pump_is_off_and_none_that_is_no_number(
+    plant: Plant, drives: dict[str, float], pump: int, want: tuple[str, ...] | None
 ) -> None:
+    for guard in (guard_at(), Guard(plant)):
+        trip = guard.refuse(drives, pump, 1.5)
+        assert said(trip) == want
+        assert trip is None or trip.figures == ({"drive": inf} if pump else {})
+    assert Guard(make_heater()).refuse({"q": 0.5}, 0, 0.0) is None  # no pump, no standing water
+
+
+@pytest.mark.parametrize(
+    ("skins", "drive", "touching", "measured"),
+    [((54.9, 55.0, 55.0), 0.0, False, ""), ((55.1, 55.2), 0.0, False, "55.20"), ((3.1, 3.0), 0.0, False, ""),
+     ((3.1, 2.9, 2.8), 0.0, False, "2.80"), ((55.1, 55.0, 55.1), 0.0, False, ""),
+     ((55.1, 55.2), 0.0, True, ""),  # a hot object is not the rig's fault ...
+     ((55.1, 55.2), 0.1, True, "55.20")],  # ... unless it is driven
+)  # fmt: skip
+def test_the_second_reading_beyond_a_limit_trips(
+    skins: tuple[float, ...], drive: float, touching: bool, measured: str
+) -> None:
+    guard = guard_at(skins[0])
+    guard.asked({"drive": drive}, 1)
+    found = [
+        check(guard, reading(float(k), skin, drive=drive), touching=touching)
+        for k, skin in enumerate(skins, start=1)
+    ]
+    *before, trip = (one.trip for one in found)
+    assert before == [None] * (len(skins) - 1)
+    assert said(trip) == (("limit", "t_surface", "3 to 55 degC", f"{measured} degC") if measured else None)
+    assert trip is None or trip.figures == {"measured": skins[-1]}
+
+
+AT_LEAST = "at least 1 K {} in 57 s of drive {}"
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(
+    ("slope", "drive", "begin", "want"),
+    [(0.0176, 0.8, 25.0, None), (0.0175, 0.8, 25.0, ("driver", "b", AT_LEAST, 0.9975)),
+     (0.0175, 0.49, 25.0, None), (0.0, 0.5, 31.9, ("driver", "a", AT_LEAST, 0.0)),
+     (0.0, 0.8, 33.0, None),  # 8 K from the room a rig may be at its end
+     (-0.035, 0.8, 25.0, ("driver", "a", AT_LEAST, -1.995)),
+     (-0.036, 0.8, 25.0, ("reversed", "a", "{} in 57 s of drive {}", -4.104))],
+)  # fmt: skip
+def test_without_a_model_the_wrong_way_and_nowhere_trip_for_heating_and_cooling(
+    sign: float, slope: float, drive: float, begin: float, want: tuple[str, str, str, float] | None
+) -> None:
+    """The first output goes twice as far as the second where it goes the wrong way, else it stands."""
+    rules, room = RuleMonitor(), 25.0
+    for k in range(58):  # 95 % of a window of 60 s
+        moves = {"a": 2 * slope * k if slope < -0.035 else min(slope * k, 0.0), "b": slope * k, "new": 0.0}
+        values = {name: room + sign * (begin - room + move) for name, move in moves.items()}
+        values = values if k == 57 else {name: values[name] for name in ("a", "b")}
+        trip = rules.check(float(k), drive * sign, values, room=room, target={})
+        assert k == 57 or trip is None
+    if want is None:
+        assert trip is None
+    else:
+        words = want[2].format("warmer" if sign > 0 else "colder", f"{sign * drive:+.2f}")
+        assert said(trip) == (want[0], want[1], words, f"{sign * want[3] + 0.0:+.1f} K")
+        assert trip.figures["moved"] == pytest.approx(sign * want[3])
+
+
+@pytest.mark.parametrize(
+    ("skin", "trips"), [(30.0, 40), (46.0, 40), (33.0, 0), (32.5, 240), (32.9, 0)]
+)  # of 38 degC: beyond 5 K, 120 K s
+def test_leaving_a_target_that_was_reached_trips_by_its_area(skin: float, trips: int) -> None:
+    def leaves(near: float, targets: tuple[float, float], back: int = -1) -> int:
+        monitor = RuleMonitor()
+        for k in range(700):
+            value = near if k < 100 or k == back else skin
+            target = {"gone": 1.0, "t": targets[k >= 100]}
+            if trip := monitor.check(float(k), 0.0, {"t": value}, room=25.0, target=target):
+                assert said(trip) == (
+                    "model",
+                    "t",
+                    "within 5 K of the target 38 degC, where it was",
+                    f"{skin:.1f} degC",
+                )
+                return k - 99
+        return 0
+
+    first = trips + 1 if trips else 0  # the area is more than 120 K s
+    assert leaves(38.0, (38.0, 38.0)) == first
+    assert leaves(39.0, (38.0, 38.0)) == first  # once within 1 K
+    assert leaves(39.1, (38.0, 38.0)) == leaves(38.0, (38.5, 38.0)) == 0  # never near, or another target
+    assert leaves(38.0, (38.0, 38.0), back=110) == (first + 11 if trips else 0)  # it begins anew
+
+
+# ---- what the guard makes of what the model says ----
+
+
+def told(plant: Plant) -> tuple[Guard, Mock]:
+    """Return a guard that has started, and the model monitor that is told what to find."""
     guard = Guard(plant)
-    guard.start(Twin(plant).read(), 0.0, UNITS)
-    guard.model.compared_from = 29.0
-    assert guard.ready(time) is ready
+    guard.model = model = Mock(
+        plant=plant, compared_from=0.0, compared_now=True, drift=None, evidence=["old"]
+    )
+    model.update.return_value, model.explain.return_value, model.past_optimum.return_value = [], [], ""
+    model.is_jump.return_value, model.adopt.side_effect = False, lambda drift: setattr(model, "drift", drift)
+    guard.start(reading(0.0, 25.0, tank=nan), 0.0, UNITS)
+    return guard, model
 
 
-def test_the_skin_is_ready_once_the_last_touch_is_forgotten_and_at_once_without_a_model(plant: Plant) -> None:
-    rig, guard = Twin(plant), Guard(plant)
-    guard.start(rig.read(), 0.0, UNITS)
-    for time in range(1, 31):  # touched from 5 s to 20 s; released by the reading of 21 s
-        rig.wait(1.0)
-        check(guard, rig.read(), touching=5 <= time <= 20)
-        if 5 <= time <= 20:
-            assert not guard.ready(1e4)
-    released, window = rig.time - 9.0, guard.settings.model.windows[0]
-    assert not guard.ready(released + guard.settings.forget_s + window - 0.1)
-    assert guard.ready(released + guard.settings.forget_s + window)
+def test_what_the_model_is_given_and_what_it_finds_suspect(plant: Plant) -> None:
+    guard, model = told(plant)
+    model.compared_from = 1.5
+    guard.asked({"drive": 0.4}, 1)
+    model.is_jump.side_effect = lambda name, value: name == "t_tank"
+    found = check(guard, reading(1.0, 25.0, tank=25.2, drive=0.4))
+    assert found.suspect == {"t_tank": "jump"}
+    check(guard, reading(2.0, 25.0, tank=nan, drive=0.4))
+    given, skins = {"t_surface": 25.0, "t_ambient": 25.0}, {"t_surface", "t_surface_2"}
+    assert [one for one in model.mock_calls if one[0] in ("reset", "predict", "update")] == [
+        call.reset(0.0, given),
+        call.predict(1.0, {"drive": 0.4}, 1, {"t_tank": 25.2, **given}),
+        call.update(1.0, {"t_surface": 25.0}, skins),  # nothing of the skin is known before the comparison
+        call.predict(2.0, {"drive": 0.4}, 1, given),
+        call.update(2.0, {"t_surface": 25.0}, set()),
+    ]
+    assert [guard.ready(time) for time in (11.4, 11.5)] == [False, True]
     assert guard_at().ready(0.0)
+    assert model.evidence == []  # it was of an earlier session
+
+
+@pytest.mark.parametrize(
+    ("gap", "tripped", "known"),
+    [(0.0, False, True), (300.0, False, True), (300.5, False, False), (-0.5, False, False),
+     (5.0, True, False)],
+)  # fmt: skip
+def test_what_is_known_is_kept_for_five_minutes_after_a_session_that_ended_well(
+    plant: Plant, gap: float, tripped: bool, known: bool
+) -> None:
+    guard, model = told(plant)
+    guard.asked({"drive": 0.4}, 1)
+    check(guard, reading(1.0, 25.0, drive=0.4), touching=True)
+    guard.trips = [Trip("lost", 1.0, "t", "a", "b")] if tripped else []
+    begin = 1.0 + gap
+    guard.start(reading(begin, 25.0), 50.0, UNITS)
+    values = dict.fromkeys(("t_tank", "t_surface", "t_ambient"), 25.0)
+    usual = call.predict(begin, {"drive": 0.0}, 0, values) if known else call.reset(begin, values)
+    assert model.mock_calls[-1] == usual
+    assert guard.trips == []
+    # what was touched to the end is released by the start, 60 s are forgotten, and 10 s compared
+    for time, ready in ((begin + 69.9, not known), (begin + 70.0, True)):
+        assert guard.ready(max(time, 10.0)) == ready
+    check(guard, reading(begin + 0.5, 25.0), now=50.5)
+    if known:
+        guard.start(reading(begin + 5.0, 25.0), 55.0, UNITS)
+        assert guard.ready(begin + 70.0)  # a second start without a touch is no second release
+    assert not guard._touched
+
+
+@pytest.mark.parametrize(
+    ("learns", "tripped", "evidence", "want"),
+    [(True, False, [1.0], True), (False, False, [1.0], False), (True, True, [1.0], False),
+     (True, False, [], False)],
+)  # fmt: skip
+def test_only_evidence_of_a_session_without_a_trip_is_learnt(
+    plant: Plant, learns: bool, tripped: bool, evidence: list[float], want: bool
+) -> None:
+    guard, model = told(plant)
+    model.drift = SimpleNamespace(learns=learns, learnt=lambda seen: ("learnt", *seen))
+    model.evidence = evidence
+    guard.trips = [Trip("lost", 1.0, "t", "a", "b")] if tripped else []
+    assert guard.learn() == (("learnt", 1.0) if want else None)
+    assert (model.drift == ("learnt", 1.0)) == want
+    model.drift = None
+    assert guard.learn() is None
+    assert Guard().learn() is None
+
+
+def window(measured: float, subject: str = "t_tank", *, allowed: float = 1.0) -> Residual:
+    return Residual("window", subject, 30.0, 4.0, measured, allowed)
+
+
+ONCE, LARGE, OTHER = window(5.5), window(5.6), window(5.1, "t_surface")
+
+
+@pytest.mark.parametrize(
+    ("script", "at"),
+    [([[ONCE], [ONCE]], 2), ([[ONCE], [], [ONCE]], 0), ([[window(2.4)]], 1), ([[LARGE]], 1),
+     ([[ONCE], [OTHER], [ONCE]], 0), ([[ONCE], None, [ONCE]], 3)],
+)  # fmt: skip
+def test_an_alarm_trips_when_it_comes_again_or_is_half_as_large_again(
+    plant: Plant, script: list[list[Residual] | None], at: int
+) -> None:
+    guard, model = told(plant)
+    found = []
+    for k, alarms in enumerate(script, start=1):
+        model.compared_now = alarms is not None  # the model has made no step
+        model.update.return_value = alarms or []
+        found.append(kind(check(guard, reading(float(k), 25.0))))
+    assert [k for k, one in enumerate(found, start=1) if one] == ([at] if at else [])
+
+
+def test_the_largest_alarm_is_the_trip(plant: Plant) -> None:
+    guard, model = told(plant)
+    model.update.return_value = [window(5.6), window(6.5, "t_surface"), window(5.7)]
+    trip = check(guard, reading(1.0, 25.0)).trip
+    assert said(trip) == ("model", "t_surface", "t_surface +4.00 +- 1.00 K in 30 s", "+6.50 K")
+    assert trip.check == KINDS["model"][0]
+    assert trip.figures == {"expected": 4.0, "measured": 6.5, "allowed": 1.0, "window_s": 30.0}
+
+
+@pytest.mark.parametrize(
+    ("bias", "want"),
+    [(Residual("bias", "drive", 0.0, 0.0, 0.4, 0.25),
+      ("driver", "drive", "within 0.25 of its range of the model", "+0.40 of its range")),
+     (Residual("bias", "t_surface", 0.0, 0.0, -3.5, 2.0),
+      ("drift", "t_surface", "within 2 K of the model", "-3.50 K"))],
+)  # fmt: skip
+def test_a_bias_is_of_the_driver_or_of_the_sensor(
+    plant: Plant, bias: Residual, want: tuple[str, ...]
+) -> None:
+    guard, model = told(plant)
+    model.update.return_value = [bias]
+    trip = check(guard, reading(1.0, 25.0)).trip
+    assert said(trip) == want
+    assert trip.figures["window_s"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("same", "measured", "want"),
+    [(3, 0.5, "driver"), (4, 0.5, "stuck"), (4, 4.5, "driver"), (4, -3.9, "stuck")],
+)
+def test_causes_are_named_by_danger_unless_the_sensor_repeats_itself(
+    plant: Plant, same: int, measured: float, want: str
+) -> None:
+    guard, model = told(plant)
+    nothing = Cause("driver", "the driver", "it gives nothing")
+    model.explain.return_value = [Cause("drift", "t_tank", "t_tank is late"), nothing]
+    for k in range(1, same + 1):
+        check(guard, reading(float(k), 25.0 + 0.1 * k, tank=25.0))
+    model.update.return_value = [window(measured, allowed=0.1)]
+    trip = check(guard, reading(same + 1.0, 25.5, tank=25.0)).trip
+    because = "t_tank is late, or it gives nothing"
+    checks, subject = f"{KINDS['driver'][0]}; or {KINDS['drift'][0]}", "the driver"
+    if want == "stuck":
+        subject, checks, because = "t_tank", KINDS["stuck"][0], "bit for bit the same for 4 s"
+    assert (trip.kind, trip.subject, trip.check) == (want, subject, checks)
+    assert trip.measured == f"{measured:+.2f} K ({because})"
+
+
+def test_a_drive_beyond_the_optimum_for_a_minute_trips(plant: Plant) -> None:
+    guard, model = told(plant)
+    guard.asked({"drive": -0.8}, 1)
+    # asked at 1, 11, 21 ...; true from 21 to 61, false at 71, true from 81 on: a minute later is 141
+    for k in range(1, 142):
+        model.past_optimum.return_value = "" if k <= 20 or k == 71 else "drive"
+        trip = check(guard, reading(float(k), 25.0 + 0.01 * k, drive=-0.8)).trip
+        assert (trip is None) == (k < 141)
+    measured = "-0.80 for 60 s, beyond the Peltier element's optimum"
+    assert said(trip) == ("optimum", "drive", "a drive with which more of it cools more", measured)
+    assert trip.figures == {"drive": -0.8}
+
+
+def test_without_a_model_the_drive_of_the_rules_is_the_largest_share_of_a_range() -> None:
+    guard = Guard()
+    guard.start(reading(0.0, 25.0), 0.0, {"a": "percent", "b": "1", "c": "0_255"})
+    guard.target = {"t_tank": 30.0}
+    asked = []
+    guard.rules = SimpleNamespace(check=lambda *given, **more: asked.append((given, more)))
+    for k, (a, b, c, touching) in enumerate([(60.0, -0.5, 0.0, False), (50.0, -0.6, 51.0, True)], start=1):
+        guard.asked({"a": a, "b": b, "c": c}, 1)
+        values = {"t_tank": 25.0, "t_surface": 25.0, "t_ambient": 20.0}
+        check(guard, Reading(float(k), values, {"a": a, "b": b, "c": c}, 1), touching=touching)
+    both, tank = {"t_tank": 25.0, "t_surface": 25.0}, {"t_tank": 25.0}
+    assert asked == [
+        ((1.0, 0.6, both), {"room": 20.0, "target": {"t_tank": 30.0}}),
+        ((2.0, -0.6, tank), {"room": 20.0, "target": {}}),  # nothing is regulated in a grasp
+    ]
+
+
+def test_a_skin_is_masked_while_it_touches_and_for_a_minute_after(plant: Plant) -> None:
+    guard, model = told(plant)
+    for time, touching in ((1.0, False), (2.0, True), (3.0, False), (62.9, False), (63.0, False)):
+        guard._time, guard._now, guard._fresh_at = time - 1.0, time - 1.0, time - 1.0
+        check(guard, reading(time, 25.0), touching=touching)
+        assert guard.ready(72.9) == (time < 2.0)
+        assert guard.ready(73.0) == (not touching)
+    assert [bool(one.args[2]) for one in model.update.call_args_list] == [False, True, True, True, False]

@@ -7,8 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.end_to_end.conftest import small_plant
 from tests.rig.makers import make_heater
-from thermogrip.rig.guard.kalman_filter import FilterSettings, InputSteps, RigFilter, RigModel
+from thermogrip.rig.guard.kalman_filter import (
+    Estimate,
+    FilterSettings,
+    History,
+    InputSteps,
+    RigFilter,
+    RigModel,
+)
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 
@@ -123,8 +131,10 @@ def test_what_is_not_described_for_a_while_is_known_as_little_as_at_first_beside
     ("y", "room", "rests"),
     [
         ((25.3, 24.9), 25.0, True),  # 25.0 and 25.1 without what the sensors read too much
-        ((25.3, 25.6), 25.0, False),  # 0.8 K apart
-        ((27.4, 26.8), 25.0, False),  # 2.05 K above the room
+        ((25.3, 25.49), 25.0, True),  # 0.69 K apart
+        ((25.3, 25.51), 25.0, False),
+        ((27.29, 26.79), 25.0, True),  # 1.99 K above the room
+        ((23.29, 22.79), 25.0, False),  # 2.01 K below it
         ((25.3, np.nan), 25.0, True),
         ((np.nan, np.nan), 25.0, False),
     ],
@@ -137,10 +147,39 @@ def test_a_rig_rests_where_its_sensors_agree_with_each_other_and_with_the_room(
     assert made.at_rest == rests
     times = Textbook(made.x, 1.0 if rests else 100.0)
     np.testing.assert_allclose(made.spread(), times.spread(), rtol=1e-9)
-    if not rests and np.isfinite(y).all():  # the reference says how warm it is
-        level = y[1] - OFFSET[1]
+    if not rests:  # the reference says how warm it is, the room where nothing does
+        level = np.nan_to_num(y[1] - OFFSET[1], nan=25.0)
         want = made.model.plant.model.rest(np.full(2, level), np.zeros(1), np.array([room]), made.model.p)
         np.testing.assert_allclose(made.x, want, atol=1e-9)
+
+
+def test_a_room_that_is_not_read_is_as_warm_as_the_rig_and_a_pump_runs() -> None:
+    made = RigFilter(RigModel(plant()), BELIEF, 100)
+    made.reset(0.0, np.array([30.3, 29.7]), np.array([np.nan]))
+    assert made.d.tolist() == [30.0]
+    small = RigFilter(RigModel(small_plant()), BELIEF, 9)
+    small.reset(0.0, np.array([25.0, 25.0]), np.array([25.0]))
+    assert small.u.tolist() == [0.0, 1.0]
+
+
+@pytest.mark.parametrize(("spread", "unit"), [(1.0, 0.5), (1e-4, 0.1)])
+def test_a_state_is_as_uncertain_as_the_fit_says_and_no_less_than_a_tenth(spread: float, unit: float) -> None:
+    known = plant()
+    model = replace(known.model, C=np.eye(2), spread=np.diag([4.0, spread]))
+    made = RigFilter(RigModel(replace(known, model=model)), BELIEF, 9)
+    made.reset(0.0, 25.0 + OFFSET, np.array([25.0]))
+    want = [0.5**2 + 0.3**2 + 0.2**2, (0.5 * unit) ** 2 + 0.1**2]
+    np.testing.assert_allclose(made.spread() ** 2, want)
+    np.testing.assert_allclose(made._q, [0.03**2, (0.03 * unit) ** 2, 0.01**2, 0.02**2])
+
+
+def test_a_model_that_diverges_predicts_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = at_rest()
+    x, known = found.x.copy(), found._P.copy()
+    monkeypatch.setattr(found.model, "rollout", lambda x, u, d: (None, np.full((len(x), 2), np.inf)))
+    found.predict(2.0, np.array([40.0]), np.array([25.0]))
+    assert (found.x == x).all()
+    assert (known == found._P).all()
 
 
 def test_a_jump_is_beyond_its_deviations_and_the_floor() -> None:
@@ -191,8 +230,51 @@ def heater() -> RigFilter:
     return made
 
 
-def test_a_drive_of_unknown_unit_and_range_goes_from_minus_1_to_1() -> None:
-    assert RigModel(replace(make_heater(), units={"q": "W"}, valid={})).ranges.tolist() == [[-1.0, 1.0]]
+@pytest.mark.parametrize(
+    ("unit", "valid", "span", "half"),
+    [("W", None, (-1.0, 1.0), 1.0), ("W", (2.0, 8.0), (2.0, 8.0), 3.0),
+     ("percent", (2.0, 8.0), (0.0, 100.0), 50.0), ("0_255", None, (0.0, 255.0), 127.5),
+     (None, (2.0, 8.0), (-1.0, 1.0), 1.0)],
+)  # fmt: skip
+def test_a_drive_has_the_range_of_its_unit_else_of_its_logs(
+    unit: str | None, valid: tuple[float, float] | None, span: tuple[float, float], half: float
+) -> None:
+    units, spans = {} if unit is None else {"q": unit}, {} if valid is None else {"q": valid}
+    model = RigModel(replace(make_heater(), units=units, valid=spans))
+    assert (model.ranges.tolist(), model.half.tolist()) == ([list(span)], [half])
+    assert model.biased(np.array([[2.0], [3.0]]), np.array([0.1])).tolist() == [
+        [2.0 + 0.1 * half],
+        [3.0 + 0.1 * half],
+    ]
+    assert model.offsets.tolist() == [0.0]
+
+
+def estimate(time: float, step: int, *y: float) -> Estimate:
+    return Estimate(time, step, np.zeros(1), np.zeros(1), np.zeros(len(y)), np.array(y))
+
+
+def test_a_history_keeps_its_seconds_and_finds_where_a_window_begins() -> None:
+    steps = InputSteps(dt=1.0, start=0.0, time=0.0)
+    past = History(steps, 3.0)
+    for k in range(6):
+        past.add(estimate(float(k), k))
+    assert past.now == 5.0
+    assert [one.time for one in past.after(0.0)] == [2.0, 3.0, 4.0, 5.0]
+    assert [one.time for one in past.after(4.0)] == [5.0]
+    for time, step in ((2.0, 2), (3.0 - 5e-7, 3), (2.9, 2), (99.0, 5)):
+        assert past.begin(time).step == step
+    assert past.begin(1.9) is None
+    steps.first = 3
+    assert (past.begin(2.9), past.begin(3.0).step) == (None, 3)  # inputs of the second step are lost
+
+
+def test_errors_are_readings_less_paths_at_their_steps_as_far_as_the_paths_go() -> None:
+    past = History(InputSteps(dt=1.0, start=0.0, time=0.0), 99.0)
+    for k, y in ((3, 0.0), (4, 5.0), (6, 7.0), (7, 9.0)):
+        past.add(estimate(float(k), k, y))
+    paths = np.array([[[0.0], [1.0], [2.0], [3.0]], [[0.0], [0.5], [0.0], [10.0]]])
+    errors = past.errors(past.begin(3.0), paths)  # the reading of step 7 is beyond their end
+    assert errors.tolist() == [[[4.0], [4.0]], [[4.5], [-3.0]]]
 
 
 @pytest.mark.parametrize("silence", [5, 15, 40])
@@ -219,3 +301,11 @@ def test_inputs_are_averaged_over_each_native_step() -> None:
     steps = InputSteps(dt=2.0, start=0.0, time=0.0)
     assert [steps.add(t, np.array([u]), NOTHING, keep=10) for t, u in ((1.0, 1.0), (2.5, 0.0))] == [0, 1]
     assert steps.rows(0)[0].tolist() == [[0.5]]
+    assert steps.part(2.5) == 0.25
+    assert (
+        steps.add(6.0 - 5e-10, np.array([4.0]), NOTHING, keep=1) == 2
+    )  # until the third step, but for rounding
+    assert steps.rows(1)[0].tolist() == [[3.0], [4.0]]  # 0.5 s of 0, then 4; those of one call are all kept
+    assert steps.add(6.5, np.array([2.0]), NOTHING, keep=1) == 0
+    assert steps.add(8.0, np.array([6.0]), NOTHING, keep=1) == 1
+    assert steps.rows(3)[0].tolist() == [[5.0]]

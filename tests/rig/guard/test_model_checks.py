@@ -3,14 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import astuple, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from tests.rig.fault_injection.drills import drill_plants
 from tests.rig.makers import follow
-from thermogrip.rig.guard.model_checks import Cause, ModelMonitor, _wrong_drives, by_danger, explain_window
+from thermogrip.rig.guard import model_checks
+from thermogrip.rig.guard.kalman_filter import Estimate, History, InputSteps, RigModel
+from thermogrip.rig.guard.model_checks import (
+    Cause,
+    ModelMonitor,
+    Residual,
+    _hypotheses,
+    _late,
+    _sensor_costs,
+    _window_slopes,
+    _wrong_drives,
+    by_danger,
+    explain_window,
+)
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.contact.simulation import Grip
 from thermogrip.sysid.models.state_space import StateSpaceModel
@@ -112,13 +126,13 @@ def test_a_sensor_that_the_rig_has_not_makes_nothing_less_known(plant: Plant) ->
 def test_a_peltier_past_its_optimum_is_noticed_by_the_model() -> None:
     """Q = S T I - R I^2 / 2 - K dT turns over at I = S T / R; the bundled network, 5 R."""
     known = drill_plants()[0]
-    turned = replace(known, values={**known.values, "resistance": 20.0})
-    for plant, drive, past in ((known, -1.0, False), (turned, -1.0, True), (turned, -0.1, False)):
-        monitor = ModelMonitor(plant)
+    for resistance, drive, past in ((5.0, -1.0, False), (12.0, -0.4, False), (12.0, -0.5, True),
+                                    (40.0, -0.3, False), (40.0, -0.301, True)):  # fmt: skip
+        monitor = ModelMonitor(replace(known, values={**known.values, "resistance": resistance}))
         monitor.reset(0.0, {"t_tank": 25.0, "t_surface": 25.0, "t_ambient": 25.0})
         for k in range(1, 30):
             monitor.predict(float(k), {"drive": drive}, 1, {"t_ambient": 25.0})
-        assert bool(monitor.past_optimum()) == past
+        assert monitor.past_optimum() == ("drive" if past else "")
 
 
 def test_a_rig_that_stood_with_a_warm_tank_is_not_taken_for_one_at_rest() -> None:
@@ -257,3 +271,213 @@ def test_a_sensor_at_the_pump_is_no_pump_whatever_its_name() -> None:
         follow(made, k * DT, {"q": 0.0}, dict(zip(("t_driver", "t_pump"), y.tolist())))
     (cause,) = explain_window(made._model, made._past, 12.0)
     assert (cause.kind, cause.subject) == ("drift", "t_pump")
+
+
+def history(readings: list[list[float]], n_y: int = 2) -> History:
+    """Return estimates a step of 1 s apart, of which the first is at rest at 0, with these readings."""
+    past = History(InputSteps(dt=1.0, start=0.0, time=0.0), 100.0)
+    for k, y in enumerate([[0.0] * n_y, *readings]):
+        past.add(Estimate(float(k), k, np.zeros(1), np.zeros(1), np.zeros(n_y), np.array(y)))
+    return past
+
+
+def test_the_cost_of_a_sensor_that_is_late_or_wrong_is_of_all_readings() -> None:
+    """Path a = k, b = 0 for 20 s; a is read 5 s late and once not at all, b is 2 K off in 3 readings."""
+    model = RigModel(integrator(outputs=("a", "b")))
+    path = np.column_stack([np.arange(21.0), np.zeros(21)])
+    rows = [[max(k - 5.0, 0.0), 2.0 if k > 17 else 0.0] for k in range(1, 21)]
+    rows[9][0] = np.nan
+    past = history(rows)
+    cost = {c.text: v for c, v in _sensor_costs(model, past, past.begin(0.0), path).items()}
+    own = 1 + 4 + 9 + 16 + 25.0 * 15  # 1 to 4 s: k^2; later 5^2, without that of 10 s
+    assert cost == {
+        "a is late": pytest.approx(12.0),
+        "a alone is wrong": pytest.approx(12.0 + 0.15 * own),
+        "b is late": pytest.approx(own + 1.2 * 12.0),
+        "b alone is wrong": pytest.approx(own + 0.15 * 12.0),
+    }
+
+
+def test_a_late_output_is_its_path_shifted_and_the_first_value_before() -> None:
+    path = np.array([[1.0, 5.0], [2.0, 6.0], [4.0, 7.0], [8.0, 9.0]])
+    assert _late(path, 0, 1.6).tolist() == [[1.0, 5.0], [1.0, 6.0], [1.0, 7.0], [2.0, 9.0]]
+    assert _late(path, 1, 99.0)[:, 1].tolist() == [5.0] * 4
+
+
+@pytest.mark.parametrize(
+    ("costs", "left"),
+    [({}, []), ({LATE: 34.9}, [LATE]), ({LATE: 35.0}, []), ({LATE: 10.0, WRONG: 24.9}, [LATE, WRONG]),
+     ({LATE: 10.0, WRONG: 25.0}, [LATE]), ({WRONG: 5.0, LATE: 5.0, PUMP: 5.0}, [WRONG, LATE])],
+)  # fmt: skip
+def test_an_explanation_is_a_third_of_the_cost_and_the_next_is_named_if_alike(
+    monkeypatch: pytest.MonkeyPatch, costs: dict[Cause, float], left: list[Cause]
+) -> None:
+    """One reading of 10 K with no drive: a cost of 100, and full drive explains nothing of it."""
+    made = ModelMonitor(integrator())
+    made.reset(0.0, {"a": 0.0})
+    follow(made, 1.0, {"q": 0.0}, {"a": -10.0})
+    monkeypatch.setattr(model_checks, "_sensor_costs", lambda *given: costs)
+    assert explain_window(made._model, made._past, 1.0) == left
+
+
+def test_each_fault_begins_at_seven_parts_of_the_window_and_a_bias_holds_until_then() -> None:
+    model = RigModel(integrator(pump=True))
+    u = np.column_stack([np.full(20, 0.6), np.ones(20)])
+    causes, rows = _hypotheses(model, u, np.array([0.1]))
+    said = ("", "nothing", "full drive", "half of what is asked", "full cooling", "way round", "has stopped")
+    assert all(cause.text.endswith(words) for cause, words in zip(causes, said))
+    assert len(causes) == len(rows) == 1 + 6 * 7
+    assert rows[0].tolist() == [[pytest.approx(0.7), 1.0]] * 20
+    for part, onset in enumerate((0, 5, 10, 15, 17, 18, 19)):
+        of = rows[1 + 6 * part : 7 + 6 * part]
+        assert (of[:, :onset] == rows[0][:onset]).all()
+        want = [(0.0, 1.0), (1.0, 1.0), (0.3, 1.0), (-1.0, 1.0), (-0.6, 1.0), (0.6, 0.0)]
+        assert of[:, onset:].tolist() == [[list(one)] * (20 - onset) for one in want]
+    still = np.column_stack([np.full(4, 0.6), np.full(4, 0.5)])
+    assert "the pump has stopped" not in [cause.text for cause in _hypotheses(model, still, np.zeros(1))[0]]
+
+
+# ---- what a window compares, in numbers ----
+
+
+def integrator(outputs: tuple[str, ...] = ("a",), *, pump: bool = False) -> Plant:
+    """Return what warms by 0.1 K/s at full drive for ever, with one state that every sensor reads."""
+    n = len(outputs)
+    inputs, switches = (("q", "pump"), ("pump",)) if pump else (("q",), ())
+    model = StateSpaceModel(
+        inputs, (), outputs, A=[[1.0]], B=[[0.1, 0.0][: len(inputs)]], C=np.ones((n, 1)), dt=1.0,
+        y0=[0.0] * n, switches=switches, A_switch={"pump": np.zeros((1, 1))} if pump else {},
+    )  # fmt: skip
+    return Plant(model, {}, dt=1.0, units=dict.fromkeys(inputs, "1"))
+
+
+def driven(made: ModelMonitor, rate: float, until: int, *, pump_off: int = 0) -> list[Residual]:
+    """Rest for 100 s, then ask for full drive while a rises by ``rate`` K/s; return the last alarms."""
+    found = []
+    for k in range(1, until + 1):
+        made.predict(float(k), {"q": float(k > 100)}, int(k != pump_off), {})
+        found = made.update(float(k), {"a": rate * max(k - 100, 0)})
+    return found
+
+
+def test_a_window_compares_the_last_three_seconds_with_where_the_drive_leads() -> None:
+    """At 110 s the model is at 0.8, 0.9 and 1.0 K; the rig came to half of that, and the swing is 1 K."""
+    made = ModelMonitor(integrator(pump=True))
+    made.reset(0.0, {"a": 0.0})
+    found = driven(made, 0.05, 110, pump_off=90)
+    allowed = {10.0: 0.8, 30.0: 0.35 + 0.5 + 0.25, 90.0: 0.45 + 0.5 + 0.25}  # the pump was off at 90 s
+    both = (pytest.approx(0.9), pytest.approx(0.45))
+    want = [("window", "a", w, *both, pytest.approx(x)) for w, x in allowed.items()]
+    assert [astuple(one) for one in made.compare()] == want
+    assert found == []
+    assert Residual("bias", "a", 0.0, 0.0, -3.0, 2.0).excess == 1.5
+
+
+def test_after_a_touch_a_sensors_windows_and_jumps_start_afresh() -> None:
+    made = ModelMonitor(integrator(("a", "b")))
+    made.reset(0.0, {"a": 0.0, "b": 0.0})
+    assert (made.compared_from, made.is_jump("b", 50.0), made.is_jump("c", 50.0)) == (0.0, True, False)
+    for k in range(1, 71):
+        made.predict(float(k), {"q": 0.0}, 1, {})
+        made.update(float(k), {"a": 0.0, "b": 9.0 * (50 <= k < 60)}, frozenset("b" if 50 <= k < 60 else ""))
+        assert made.is_jump("b", 50.0) == (not 50 <= k < 60)
+        if k in (58, 69, 70):
+            subjects = [(one.window, one.subject) for one in made.compare()]
+            assert subjects == [(10.0, "a"), *[(10.0, "b")] * (k == 70), (30.0, "a")]
+        if k == 69:
+            made.predict(69.5, {"q": 0.0}, 1, {})
+            assert made.update(69.5, {"a": 50.0, "b": 50.0}) == []  # the model has made no step
+            assert not made.compared_now
+            made._past._kept.pop()
+    made.reset(5.0, {"a": 0.0, "b": 3.0})  # no rest: a warm-up of a minute
+    assert made.compared_from == 65.0
+    assert not made.is_jump("b", 50.0)
+
+
+@pytest.mark.parametrize(
+    ("time", "b", "w", "since", "want"),
+    [(60.0, 2.01, 0.0, 59.0, [Residual("bias", "b", 0.0, 0.0, 2.01, 2.0)]), (59.9, 2.01, 0.26, 59.0, []),
+     (60.0, -2.0, 0.25, 59.0, []), (60.0, -2.1, 0.0, 60.0, []),
+     (60.0, -2.1, -0.26, 59.0,
+      [Residual("bias", "b", 0.0, 0.0, -2.1, 2.0), Residual("bias", "q", 0.0, 0.0, -0.26, 0.25)])],
+)  # fmt: skip
+def test_a_bias_beyond_its_limit_is_an_alarm_after_a_minute(
+    time: float, b: float, w: float, since: float, want: list[Residual]
+) -> None:
+    made = ModelMonitor(integrator(("a", "b")))
+    made.reset(0.0, {"a": 0.0, "b": 0.0})
+    made._filter.b[:], made._filter.w[:], made._since[:] = (9.0, b), w, since  # the reference has no bias
+    assert made._biases(time, []) == want
+
+
+# ---- a rig that has drifted, in numbers ----
+
+
+def drifted(unbiased: float, spread: float) -> ModelMonitor:
+    """Return a monitor whose windows end ``unbiased`` without biases, and ``spread`` to either side."""
+    made = ModelMonitor(integrator(("a", "b")))
+    made.drift = SimpleNamespace(spread=lambda slopes: slopes @ [1.0], learns=True)
+    made._slopes = lambda window: (np.array([9.0, unbiased]), np.array([[99.0], [spread]]))
+    return made
+
+
+@pytest.mark.parametrize(
+    ("unbiased", "spread", "measured", "expected", "allowed"),
+    [(0.5, 0.4, 0.4, 1.0, 0.6), (0.5, 0.5, 0.4, 0.5, 0.6), (0.75, 0.25, 0.8, 0.75, 0.55),
+     (0.75, 0.25, 0.9, 1.0, 0.55)],
+)  # fmt: skip
+def test_a_window_counts_from_the_nearer_path_and_is_at_most_twice_as_wide(
+    unbiased: float, spread: float, measured: float, expected: float, allowed: float
+) -> None:
+    one = Residual("window", "b", 30.0, 1.0, measured, 0.3)
+    got = drifted(unbiased, spread)._with_drift(one)
+    assert astuple(got) == ("window", "b", 30.0, expected, measured, pytest.approx(allowed))
+    assert ModelMonitor(integrator())._with_drift(one) is one
+
+
+@pytest.mark.parametrize(
+    ("spread", "window", "allowed", "want"),
+    [(0.5, 90.0, 0.5, True), (0.49, 90.0, 0.5, False), (0.5, 90.0, 0.49, False), (0.5, 30.0, 0.5, False)],
+)  # fmt: skip
+def test_a_drives_bias_is_no_fault_where_its_effect_may_be_the_plants(
+    spread: float, window: float, allowed: float, want: bool
+) -> None:
+    made = drifted(0.5, spread)
+    two = [Residual("window", "a", 90.0, 9.0, 0.0, 1.0), Residual("window", "b", window, 1.0, 0.0, allowed)]
+    assert made._drifted(two[1:]) == want
+    assert made._drifted(two) == (want or window < 90.0)  # of the longest windows alone
+    assert not ModelMonitor(integrator())._drifted(two)
+
+
+def test_the_longest_windows_are_evidence_one_after_another() -> None:
+    made = drifted(0.75, 0.25)
+    made.reset(0.0, {"a": 0.0, "b": 0.0})
+    two = [Residual("window", "b", 30.0, 1.0, 0.5, 0.3), Residual("window", "b", 90.0, 1.0, 0.5, 0.6)]
+    counts = []
+    for time in (95.0, 184.9, 185.0):
+        made._weigh(time, two)
+        made._weigh(time + 200.0, two[:1])
+        counts.append(len(made.evidence))
+    assert counts == [1, 1, 2]
+    one = made.evidence[0]
+    assert (one.residual, one.slopes.tolist(), one.sd) == (-0.25, [0.25], pytest.approx(0.2))
+
+
+def test_slopes_are_of_each_parameters_own_step() -> None:
+    """The path is p0 k + p1 k^2; of 12 s the last three readings count, at 10, 11 and 12 s."""
+    past = history([[0.0]] * 12, 1)
+    for k in range(1, 13):
+        past.steps.add(float(k), np.array([1.0]), np.zeros(0), 99)
+
+    def rollout(x: np.ndarray, u: np.ndarray, d: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, ...]:
+        assert (x.shape, u.shape, d.shape) == ((3, 1), (3, 11, 1), (3, 11, 0))
+        k = np.arange(12.0)
+        return ((1.0 + p[:, :1] * k + p[:, 1:] * k**2)[:, :, None],)
+
+    model = SimpleNamespace(p=np.array([2.0, 3.0]), rollout=rollout)
+    goes, slopes = _window_slopes(model, past, 3.0, 11.0, np.array([0.1, 0.2]))
+    first, second = (9 + 10 + 11) / 3, (81 + 100 + 121) / 3
+    assert goes.tolist() == [pytest.approx(2 * first + 3 * second)]
+    np.testing.assert_allclose(slopes, [[0.1 * first, 0.2 * second]])
+    assert _window_slopes(model, past, 3.0, 12.5, np.array([0.1, 0.2])) is None  # nothing is so old
+    assert _window_slopes(model, past, 3.0, 0.0, np.array([0.1, 0.2])) is None

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from thermogrip.rig.guard.sensor_checks import SensorMonitor, SensorSettings, repeats_needed
+from thermogrip.rig.guard.trip import Trip
 
 
 def monitor(name: str = "t", **settings: object) -> SensorMonitor:
@@ -114,3 +115,47 @@ def test_a_healthy_sensor_is_not_called_stuck_in_a_day_and_a_stuck_one_is_in_a_m
     trips = [made.check(86_400.0 + k, {"t": value})[2] for k in range(1, 60)]
     first = next(k for k, trip in enumerate(trips, start=1) if trip is not None)
     assert first <= 38
+
+
+def said(trip: Trip) -> tuple[str, str, str, str, dict[str, float]]:
+    return trip.kind, trip.subject, trip.expected, trip.measured, dict(trip.figures)
+
+
+def test_each_trip_of_a_sensor_has_its_two_numbers() -> None:
+    made, trips, near = monitor(), [], "near the last good 25.00 degC"
+    for value in (80.0, 80.0, 80.0, 25.0, 40.0, 41.0, 42.0):
+        trips.append(made.check(1.0, {"t": value})[2])
+    for at, kind, value, expected in ((2, "lost", 80.0, "-5 to 75 degC"), (6, "jump", 42.0, near)):
+        figures = {"measured": value, "last": 25.0}
+        assert said(trips[at]) == (kind, "t", expected, f"{value:g} degC, 3 readings in a row", figures)
+    made = monitor(alpha=0.5)  # ten repeats are enough then
+    for k in range(1, 31):
+        trip = made.check(float(k), {"t": 25.0 + 0.125 * (k % 2 if k < 22 else 1)})[2]
+        assert trip is None
+    figures = {"measured": 25.125, "seconds": 10.0}
+    said_ = ("a change of 0.125 degC every few readings", "25.125 degC 11 times in a row, for 10 s", figures)
+    assert said(made.check(31.0, {"t": 25.125})[2])[2:] == said_
+    made = SensorMonitor(SensorSettings(pairs={("a", "b"): 1.0}))
+    made.start(0.0, {"a": 20.0, "b": 20.0})
+    assert made.check(1.0, {"a": 20.0, "b": 21.0})[2] is None  # the limit itself
+    for time, value in ((2.0, 21.25), (31.9, 21.5)):
+        assert made.check(time, {"a": 20.0, "b": value})[2] is None
+    assert made.check(31.95, {"a": 20.0})[2] is None  # the other is not read
+    pair = (
+        "disagree",
+        "a and b",
+        "within 1 K of each other",
+        "20.00 and 21.50 degC for 30 s",
+        {"apart": -1.5},
+    )
+    assert said(made.check(32.0, {"a": 20.0, "b": 21.5})[2]) == pair
+
+
+def test_a_reading_that_jumped_against_the_model_is_suspect_and_a_new_sensor_begins_where_it_reads() -> None:
+    made = monitor()
+    assert made.check(1.0, {"t": 25.1}, jumped=frozenset("t"))[:2] == ({}, {"t": "jump"})
+    assert made.check(1.1, {"t": 25.1, "new": 60.0})[1] == {}
+    assert made.last_good() == {"t": 25.1, "new": 60.0}
+    assert (made.same_for("nobody"), made.same_for("new")) == ((0, 0.0), (1, 0.0))
+    trips = [made.check(2.0 + k, {"t": 90.0}, rooms=frozenset("t"))[2] for k in range(5)]
+    assert trips == [None] * 5  # a room may be lost

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from contextlib import nullcontext
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -97,6 +98,82 @@ def test_a_mistake_is_one_line_with_file_key_and_hint(what: str, tmp_path: Path)
     assert refused.value.hint
     for name in names:
         assert name in line
+
+
+RANGES = """stale_s .5 60; expiry_s .5 2; clock_slack_s .1 60; drive_slack .005 .5; forget_s 0 3600;
+sensors.rate_K_per_s .05 100; sensors.slack_K 0 10; sensors.bad_in_a_row 1 20; sensors.noise_K .001 5;
+sensors.alpha 1e-15 1e-3; sensors.pair_limit_K .1 50; sensors.pair_s 0 3600; model.share 0 2;
+model.switching_K 0 20; model.jump_k 3 100; model.jump_floor_K .1 50; model.bias_limit_K .1 20;
+model.drive_limit .01 .45; model.warm_up_s 0 3600; model.drift 0 .2; model.state_K_per_sqrt_s 1e-4 1;
+model.drive_per_sqrt_s 1e-5 .1; model.output_K_per_sqrt_s 1e-5 1; model.reading_K .001 5;
+no_model.drive .01 1; no_model.window_s 5 3600; no_model.least_K .05 50; no_model.far_K .5 100;
+no_model.wrong_K .05 50; no_model.near_K .05 50; no_model.leave_K .1 50; no_model.area_K_s 1 1e5"""
+
+
+def test_each_number_has_a_range_in_which_its_check_works() -> None:
+    content = tomllib.loads(GUARD_TEMPLATE)
+    every = {key for key, value in content.items() if isinstance(value, float)}
+    every |= {
+        f"{t}.{key}"
+        for t in ("sensors", "model", "no_model")
+        for key in content[t]
+        if key != "believable_degC"
+    }
+    every -= {"model.windows_s", "model.floors_K", "model.smooth_s"}
+    known = [line.split() for line in RANGES.split(";")]
+    assert {name for name, _, _ in known} == every
+    for name, low, high in known:
+        table, _, key = name.rpartition(".")
+        step = 1 if key == "bad_in_a_row" else 1e-9
+        ends, said = (float(low), float(high)), f"{name}: .* is not from {float(low):g} to {float(high):g}"
+        for value in (*ends, ends[0] - step, ends[1] + step):
+            with nullcontext() if value in ends else pytest.raises(UserError, match=said):
+                guard_from_dict({table: {key: value}} if table else {key: value})
+
+
+WIDE = {"sensors": {"believable_degC": [-50, 150]}}
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [({**WIDE, "skin_degC": [-50, 150], "others_degC": [-50, 150], "limits": {"t": [-50, 150]}}, ""),
+     ({**WIDE, "skin_degC": [-50.1, 5]}, "skin_degC: -50.1 is not from -50 to 150"),
+     ({**WIDE, "others_degC": [5, 150.1]}, "others_degC: 150.1 is not from -50 to 150"),
+     ({"sensors": {"believable_degC": [-50.1, 75]}}, "believable_degC: -50.1 is not from -50 to 150"),
+     ({"sensors": {"believable_degC": [-5, 150.1]}}, "believable_degC: 150.1 is not"),
+     ({"skin_degC": [-5, 75]}, ""), ({"skin_degC": [-5.1, 75]}, "skin_degC: -5.1 to 75 reaches beyond"),
+     ({"skin_degC": [5, 5]}, "skin_degC: 5 to 5 is empty; write the lower one first"),
+     ({"model": {"windows_s": [2, 600], "floors_K": [0.05, 20], "smooth_s": 1.9}}, ""),
+     ({"model": {"windows_s": [1.9], "floors_K": [1], "smooth_s": 1}}, "windows_s: 1.9 is not from 2 to 600"),
+     ({"model": {"windows_s": [601], "floors_K": [1]}}, "windows_s: 601 is not"),
+     ({"model": {"windows_s": [2], "floors_K": [0.049]}}, "floors_K: 0.049 is not from 0.05 to 20"),
+     ({"model": {"windows_s": [2], "floors_K": [20.1]}}, "floors_K: 20.1 is not"),
+     ({"model": {"windows_s": [100], "floors_K": [1], "smooth_s": 61}}, "smooth_s: 61 is not from 0 to 60"),
+     ({"model": {"windows_s": [3], "floors_K": [1]}}, "3 is not less than the shortest window, 3; shorten"),
+     ({"model": {"windows_s": []}},
+      "is not a list of 1 to 6 numbers; write one that is, or leave it out for [10, 30, 90]"),
+     ({"model": {"windows_s": [10, 20, 30, 40, 50, 60], "floors_K": [1] * 6}}, ""),
+     ({"model": {"windows_s": [10, 20, 30, 40, 50, 60, 70], "floors_K": [1] * 7}}, "1 to 6 numbers"),
+     ({"model": {"windows_s": 10}}, "windows_s: 10 is not a list"),
+     ({"skin_degC": [1, 2, 3]}, "is not a pair"),
+     ({"pairs": [{"sensors": ["a", "b"], "limit_K": 0.1}]}, ""),
+     ({"pairs": {"sensors": ["a", "b"], "limit_K": 50}}, ""),
+     ({"pairs": [{"sensors": ["a", "b"], "limit_K": 0.09}]}, "pairs.limit_K: 0.09 is not from 0.1 to 50"),
+     ({"pairs": [{"sensors": ["a", 3], "limit_K": 4}]}, "pairs.sensors: is not two names; write [[pairs]]"),
+     ({"pairs": [{"sensors": ["a", "b"], "limit_K": 4, "for": 3}]}, "needs sensors and limit_K, nothing"),
+     ({"room_sensors": ["t_lab", 3]}, "is no list of names; write room_sensors"),
+     ({"pairs_limit_K": 3}, "pairs_limit_K: no such key; `thermogrip"),
+     ({"windows_s": [1]}, "write it below [model]")],
+)  # fmt: skip
+def test_what_a_file_may_hold_at_its_bounds(content: dict[str, Any], said: str) -> None:
+    if not said:
+        settings = guard_from_dict(content)
+        assert settings.file == ""
+        assert ("pairs" in content) == (("a", "b") in settings.sensors.pairs)
+        return
+    with pytest.raises(UserError) as refused:
+        guard_from_dict(content)
+    assert said in str(refused.value)
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:

@@ -10,6 +10,8 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import nullcontext
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +21,12 @@ import pytest
 from tests.rig.fault_injection.drills import drill_plants
 from tests.rig.makers import Bench, Constant
 from thermogrip.datasets.errors import UserError
+from thermogrip.rig.guard.trip import Trip
 from thermogrip.rig.records import recorder
 from thermogrip.rig.records.recorder import RESERVE, RunFolder
 from thermogrip.rig.records.run_folder import mark_bad, read_run, recover, sums_agree
-from thermogrip.rig.session.session import run_session
+from thermogrip.rig.session.loop import Event
+from thermogrip.rig.session.session import Session, run_session
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.plant.plant import Plant
 
@@ -222,3 +226,79 @@ def test_a_run_with_a_link_is_not_repaired(name: str, hint: Any, tmp_path: Path)
     with pytest.raises(UserError, match=f"{name} is a link"):
         hint(run)
     assert {path.name: path.read_bytes() for path in run.iterdir()} == before
+
+
+def test_a_row_has_the_columns_of_the_first_and_a_lost_number_is_an_empty_cell(tmp_path: Path) -> None:
+    with RunFolder(tmp_path / "run") as folder:
+        assert (tmp_path / "run" / ".reserve").stat().st_size == 262_144
+        folder.sample({"time_s": 0.1 + 0.2, "a,b": float("nan"), "t": 1234.567891234})
+        with pytest.raises(ValueError, match="columns changed"):
+            folder.sample({"time_s": 1.0, "t": 2.0, "a,b": 3.0})
+        folder.event(Event(1.5, "lost", "t", {"k": None}))
+        folder.event(Event(2.0, "mood", "\u00b0C"))
+    folder.close()
+    assert (tmp_path / "run" / "samples.csv").read_text() == 'time_s,"a,b",t\n0.3,,1234.56789\n'
+    assert (tmp_path / "run" / "events.jsonl").read_text(encoding="utf-8").splitlines() == [
+        '{"time_s": 1.5, "kind": "lost", "text": "t", "data": {"k": null}}',
+        '{"time_s": 2.0, "kind": "mood", "text": "\u00b0C"}',
+    ]
+    sums = (tmp_path / "run" / "SHA256SUMS").read_text().splitlines()
+    assert [line[64:] for line in sums] == ["  run.json", "  samples.csv", "  events.jsonl"]
+    assert sums[1][:64] == sha256((tmp_path / "run" / "samples.csv").read_bytes()).hexdigest()
+    assert not (tmp_path / "run" / ".reserve").exists()
+    with pytest.raises(OSError, match="Bad file"):
+        folder.sample({"time_s": 1.0, "a,b": 1.0, "t": 2.0})
+
+
+@pytest.mark.parametrize(
+    ("error", "verdict", "advice"),
+    [(None, "running", None), (KeyboardInterrupt("SIGTERM"), "interrupted", "KeyboardInterrupt: SIGTERM"),
+     (RuntimeError("odd"), "failed", "RuntimeError: odd")],
+)  # fmt: skip
+def test_what_ends_a_run_is_its_verdict(
+    tmp_path: Path, error: BaseException | None, verdict: str, advice: str | None
+) -> None:
+    with pytest.raises(type(error)) if error else nullcontext(), RunFolder(tmp_path / "run"):
+        if error is not None:
+            raise error
+    about = read_run(tmp_path / "run").about
+    assert (about["verdict"], about.get("advice")) == (verdict, advice)
+
+
+@pytest.mark.parametrize(("ended", "verdict"), [("", "played"), ("lost: t", "tripped")])
+def test_a_schedule_was_played_or_tripped(tmp_path: Path, ended: str, verdict: str) -> None:
+    with RunFolder(tmp_path / "run") as folder:
+        folder.played(ended)
+        assert not (tmp_path / "run" / ".reserve").exists()
+    about = read_run(tmp_path / "run").about
+    assert (about["verdict"], about["advice"]) == (verdict, ended)
+
+
+@pytest.mark.parametrize("trip", [None, Trip("lost", 4.0, "t", "a", "b", figures={"x": float("nan")})])
+def test_a_verdict_has_its_figures_and_nothing_that_is_no_json(tmp_path: Path, trip: Trip | None) -> None:
+    session = Session(None, None, (), "settled", "go on", 12.5, 0.25, -0.125, trip=trip)
+    with RunFolder(tmp_path / "run") as folder:
+        folder.finish(session)
+    about = read_run(tmp_path / "run").about
+    figures = {
+        key: about[key] for key in ("verdict", "advice", "settle_time", "overshoot", "bias", "contact_s")
+    }
+    assert list(figures.values()) == ["settled", "go on", 12.5, 0.25, -0.125, None]
+    assert about.get("trip") == (None if trip is None else trip.as_dict())
+
+
+@pytest.mark.parametrize(
+    ("head", "files", "commit"),
+    [("abc123\n", {}, "abc123"), ("ref: refs/heads/main\n", {"refs/heads/main": "d4\n"}, "d4"),
+     ("ref: refs/heads/main", {"packed-refs": "# pack\ne0 refs/heads/x-main\ne5 refs/heads/main\n"}, "e5"),
+     ("ref: refs/heads/main", {"packed-refs": "e5 refs/heads/other\n"}, ""),
+     ("ref: refs/heads/main", {}, ""), (None, {}, "")],
+)  # fmt: skip
+def test_the_commit_that_is_checked_out_is_read_without_git(
+    tmp_path: Path, head: str | None, files: dict[str, str], commit: str
+) -> None:
+    for name, text in {**({} if head is None else {"HEAD": head}), **files}.items():
+        path = tmp_path / ".git" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    assert recorder._commit(tmp_path / "a" / "b") == commit

@@ -21,8 +21,9 @@ from thermogrip.datasets.atomic_files import read_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import names
 from thermogrip.rig.records import recorder
+from thermogrip.rig.records.export import _nanoseconds, export_run
 from thermogrip.rig.records.recorder import RunFolder
-from thermogrip.rig.records.run_folder import mark_bad, read_run, recover, sums_agree
+from thermogrip.rig.records.run_folder import Run, mark_bad, read_run, recover, sums_agree
 from thermogrip.rig.session.loop import Event
 from thermogrip.rig.session.session import run_session
 from thermogrip.rig.simulation.twin import Twin
@@ -100,15 +101,88 @@ def test_whatever_a_power_cut_leaves_reads_as_the_whole_rows_before_it(
         assert (path / "samples.csv.damaged").read_bytes() == left  # nothing is thrown away
 
 
-def test_a_row_damaged_in_the_middle_is_left_out_and_said(tmp_path: Path) -> None:
-    write(tmp_path / "run", 10).close()
+CUT = "bytes are no whole line (cut off while it was written)"
+HEAD = "time_s,t_surface_degC,phase\n"
+
+
+@pytest.mark.parametrize(
+    ("rows", "times", "lost"),
+    [("0,20,0\n1,,0\n2,-inf,1e-05\n,22,0\n3,nan,0\n4,1.,0\n5,21\n6,21,0,9\n7,21.5,4\n", [0, 1, 2, 7],
+      [f"samples.csv, line {at}: is damaged ({n} bytes); left out"
+       for at, n in ((5, 5), (6, 7), (7, 6), (8, 4), (9, 8))]),
+     ("0,20,0\n1,21,0\n+1,20,0\n8,2", [0, 1], [f"samples.csv: the last 11 {CUT}"]),
+     ("0,20,0\n1,21,0\n\n", [0, 1], [f"samples.csv: the last 1 {CUT}"]),
+     ("0,20,0\n", None, []), ("0,20,0\n1,21,0\n", [0, 1], [])],
+)  # fmt: skip
+def test_a_line_counts_if_it_is_whole_and_the_others_are_named(
+    tmp_path: Path, rows: str, times: list[int] | None, lost: list[str]
+) -> None:
+    write(tmp_path / "run", 0).close()
     (tmp_path / "run" / "SHA256SUMS").unlink()
-    lines = (tmp_path / "run" / "samples.csv").read_text().splitlines()
-    lines[4] = lines[4].replace("23", "2x3")
-    (tmp_path / "run" / "samples.csv").write_text("\n".join(lines) + "\n")
+    (tmp_path / "run" / "samples.csv").write_text(HEAD + rows)
     run = read_run(tmp_path / "run")
-    assert run.log["time"].values.tolist() == [0, 1, 2, 4, 5, 6, 7, 8, 9]
-    assert run.lost == (f"samples.csv, line 5: is damaged ({len(lines[4])} bytes); left out",)
+    assert (None if run.log is None else run.log["time"].values.tolist()) == times
+    assert list(run.lost) == lost
+    assert [run.log.attrs["repairs"]] == ["\n".join(lost)] if times else not lost
+    done = recover(tmp_path / "run")
+    kept = ["samples.csv as it was found is kept as samples.csv.damaged"] if lost else []
+    n = len(times or ())
+    last = [
+        "the run did not end by itself: its verdict is now interrupted",
+        f"{n} rows and 1 events are whole",
+    ]
+    assert list(done.findings) == [*lost, *kept, *last]
+    assert done.run.about["about"] == {"seed": 3}
+    assert not (tmp_path / "run" / ".reserve").exists()
+    if lost:
+        (tmp_path / "run" / "SHA256SUMS").unlink()
+        (tmp_path / "run" / "samples.csv").write_text(HEAD + rows)
+        again = recover(tmp_path / "run").findings
+        assert "samples.csv as it was found is kept as samples.csv.damaged-2" in again
+        assert len(again) == len(lost) + 2  # its verdict is interrupted already
+
+
+@pytest.mark.parametrize("samples", ["", "t,x\n0,1\n", "time_s\0\n0\n1\n"])
+def test_samples_without_their_header_are_none(tmp_path: Path, samples: str) -> None:
+    write(tmp_path / "run", 0).close()
+    (tmp_path / "run" / "samples.csv").write_text(samples)
+    run = read_run(tmp_path / "run")
+    assert (run.log, run.grasps) == (None, None)
+    assert len(run.lost) == bool(samples)
+
+
+def test_events_that_make_no_sense_are_left_out_and_a_lost_run_json_is_a_run_that_did_not_end(
+    tmp_path: Path,
+) -> None:
+    write(tmp_path / "run", 3).close()
+    lines = ['{"time_s": 1, "kind": "bad", "text": ""}', '{"time_s": "x", "kind": "a", "text": "b"}', "[1]",
+             '{"time_s": 2, "text": "b"}',
+             '{"time_s": 3, "kind": "closed", "text": "b", "data": {"k": 1}}']  # fmt: skip
+    (tmp_path / "run" / "events.jsonl").write_text("\n".join(lines) + "\n")
+    (tmp_path / "run" / "run.json").unlink()
+    run = read_run(tmp_path / "run")
+    assert run.about == {"about": {}, "verdict": "running"}
+    assert run.events == (Event(1.0, "bad", ""), Event(3.0, "closed", "b", {"k": 1}))
+    assert run.bad == "bad"
+    assert [line.split(":")[0] for line in run.lost] == [f"events.jsonl, line {at}" for at in (2, 3, 4)]
+    (tmp_path / "run" / "samples.csv").unlink()
+    with pytest.raises(UserError, match="is no run folder"):
+        read_run(tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("data", "role"),
+    [(None, "disturbance"), ({"rooms": []}, "output"), ({"rooms": ["t_ambient", "t_gone"]}, "disturbance"),
+     ({"rooms": "all"}, "disturbance")],
+)  # fmt: skip
+def test_the_rooms_are_those_that_the_session_wrote_else_by_name(
+    tmp_path: Path, data: Any, role: str
+) -> None:
+    with RunFolder(tmp_path / "run") as folder:
+        folder.event(Event(0.0, "phase", "settle", data or {}))
+        for k in range(2):
+            folder.sample({"time_s": float(k), "t_ambient_degC": 20.0})
+    assert read_run(tmp_path / "run").log["t_ambient"].attrs["role"] == role
 
 
 def test_a_clean_run_is_left_as_it_is_and_a_changed_one_is_refused(tmp_path: Path) -> None:
@@ -259,19 +333,41 @@ def test_run_json_says_what_the_run_was_made_with(tmp_path: Path) -> None:
     assert about["began"].startswith(time.strftime("%Y", time.gmtime()))
 
 
-def test_a_trial_that_is_marked_bad_keeps_every_byte_of_its_samples(tmp_path: Path) -> None:
-    write(tmp_path / "run", close=True)
-    before = (tmp_path / "run" / "samples.csv").read_bytes()
+@pytest.mark.parametrize(("n", "at"), [(20, 19.0), (0, 0.0)])
+def test_a_trial_that_is_marked_bad_keeps_every_byte_of_its_samples(
+    tmp_path: Path, n: int, at: float
+) -> None:
+    write(tmp_path / "run", n, close=True)
+    before, events = ((tmp_path / "run" / name).read_bytes() for name in ("samples.csv", "events.jsonl"))
     mark_bad(tmp_path / "run", "the block slipped")
-    assert read_run(tmp_path / "run").bad == "the block slipped"
+    mark_bad(tmp_path / "run", "twice, by 3 \u00b0C")
+    run = read_run(tmp_path / "run")
+    assert run.bad == "twice, by 3 \u00b0C"
+    assert run.events[-2] == Event(at, "bad", "the block slipped")
+    assert (tmp_path / "run" / "events.jsonl").read_bytes().startswith(events)
     assert (tmp_path / "run" / "samples.csv").read_bytes() == before
     assert sums_agree(tmp_path / "run") == []
+    (tmp_path / "run" / "SHA256SUMS").unlink()
+    mark_bad(tmp_path / "run", "again")
+    assert sums_agree(tmp_path / "run") is None
 
 
-def test_sums_that_name_another_file_open_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("line", "wrong"),
+    [(f"{'0' * 64}  ../../etc/passwd", "../../etc/passwd"),
+     ("no sum at all", "SHA256SUMS"), ("0  " + "x" * 99, "x" * 80),
+     (f"{'0' * 64}  grasps.csv", "grasps.csv"), (f"{'0' * 64}  run.json", "run.json")],
+)  # fmt: skip
+def test_sums_that_do_not_agree_are_named_and_open_no_other_file(
+    tmp_path: Path, line: str, wrong: str
+) -> None:
     write(tmp_path / "run", close=True)
-    (tmp_path / "run" / "SHA256SUMS").write_text(f"{'0' * 64}  ../../etc/passwd\n")
-    assert sums_agree(tmp_path / "run") == ["../../etc/passwd"]
+    (tmp_path / "run" / "SHA256SUMS").write_text(f"{line}\n")
+    assert sums_agree(tmp_path / "run") == [wrong]
+    with pytest.raises(
+        UserError, match=r"was changed after the run ended .*; restore that file, or remove SHA256SUMS"
+    ):
+        recover(tmp_path / "run")
 
 
 def test_the_folder_of_an_earlier_demo_takes_the_next_one(tmp_path: Path) -> None:
@@ -283,3 +379,16 @@ def test_the_folder_of_an_earlier_demo_takes_the_next_one(tmp_path: Path) -> Non
 def test_what_is_no_run_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="is no run folder"):
         read_run(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("began", "ns"), [("1970-01-02T00:00:01Z", 86_401 * 10**9), ("yesterday", 0), (None, 0)]
+)
+def test_a_run_began_at_its_date_in_nanoseconds(began: str | None, ns: int) -> None:
+    assert _nanoseconds(Run({} if began is None else {"began": began}, None, (), None, ())) == ns
+
+
+def test_a_run_without_two_rows_is_not_exported(tmp_path: Path) -> None:
+    write(tmp_path / "run", 1).close()
+    with pytest.raises(UserError, match="fewer than two rows"):
+        export_run(tmp_path / "run", tmp_path / "log.csv")

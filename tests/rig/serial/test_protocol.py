@@ -148,9 +148,27 @@ def test_a_question_reads_back(request_: protocol.Hello) -> None:
     assert protocol.parse_request(protocol.request_words(request_)) == request_
 
 
-@pytest.mark.parametrize("text", ["sample", "sample x", "sample 1 2", "take", "take -", "take 4294967296"])
+@pytest.mark.parametrize(
+    "text",
+    ["sample", "sample x", "sample 1 2", "take", "take -", "take 4294967296", "hello 1", "grip", "grip 2",
+     "grip 0 1", "drive 1 1", "drive x 1 1", "drive 1 1 x", "drive 1 2 1", "drive 1 1 1 1"],
+)  # fmt: skip
 def test_a_question_with_the_wrong_words_is_refused(text: str) -> None:
     assert protocol.parse_request(text.split()) == "syntax"
+    assert protocol.parse_request(["fly", *text.split()[1:]]) == "unknown"
+
+
+def test_numbers_of_readings_go_round_and_the_longest_line_is_whole() -> None:
+    kept = protocol.Kept(24, 1, (2500,), (31250, "open"))
+    taken = protocol.Taken(9, 2**32 - 2, 3, (kept, None))
+    assert (taken.waiting, protocol.parse_taken(taken.words(), 1)) == (3, taken)
+    for ticks, found in ((2**31 - 1, True), (2**31, False)):
+        assert (protocol.parse_taken(["9", "0", str(ticks), "-"], 1) is not None) == found
+    longest = protocol.encode_line(65535, "x" * 154)
+    assert protocol.decode_line(longest[:-1]) == protocol.Line(65535, ("x" * 154,))
+    with pytest.raises(ValueError, match="line"):
+        protocol.encode_line(65535, "x" * 155)
+    assert protocol.decode_line(b"a" * 172) == protocol.Damaged("overlong", b"a" * 171)
 
 
 states = st.builds(
@@ -256,9 +274,12 @@ def test_sequence_numbers_go_round_and_leave_out_zero() -> None:
 
 
 @pytest.mark.parametrize(
-    ("count", "kind"), [(0, "Boot"), (65535, "Boot"), (65536, "Unexpected"), (-1, "Unexpected")]
-)
-def test_a_reset_is_counted_in_sixteen_bits(count: int, kind: str) -> None:
-    said = protocol.encode_line(0, "boot", "power", str(count), "0.1.0")
-    (event,) = protocol.HostEnd().hear(said)
-    assert type(event).__name__ == kind
+    ("text", "want"),
+    [("boot power 0 0.1.0", protocol.Boot("power", 0, "0.1.0")),
+     ("boot unknown 65535 2", protocol.Boot("unknown", 65535, "2")), ("boot power 65536 0.1.0", None),
+     ("boot power -1 0.1.0", None), ("boot mood 0 0.1.0", None), ("boot power 0 v!", None),
+     ("boot power 0", None), ("boat power 0 0.1.0", None), ("err range", None)],
+)  # fmt: skip
+def test_a_device_announces_a_reset_and_nothing_else(text: str, want: protocol.Event | None) -> None:
+    (event,) = protocol.HostEnd().hear(protocol.encode_line(0, *text.split()))
+    assert event == (want or protocol.Unexpected("content", protocol.Line(0, tuple(text.split()))))

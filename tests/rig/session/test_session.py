@@ -9,18 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.rig.makers import Bench, Constant
+from tests.rig.makers import Bench
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Grasps, names
+from thermogrip.datasets.schema import Grasps
 from thermogrip.mpc.controllers.mpc import Controller
-from thermogrip.mpc.interface import Move
 from thermogrip.rig.drivers.thermogrip import DeviceRig
 from thermogrip.rig.guard.guard import Guard
-from thermogrip.rig.interface import DeviceRefusedError, Reading
+from thermogrip.rig.interface import Reading
 from thermogrip.rig.records.recorder import RunFolder
 from thermogrip.rig.records.run_folder import read_run
 from thermogrip.rig.serial.port import PortError
-from thermogrip.rig.session.loop import PHASES, hold_last_good, trip_of_device
+from thermogrip.rig.session.loop import PHASES, hold_last_good
 from thermogrip.rig.session.session import Session, run_session
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.contact.simulation import Grip
@@ -124,15 +123,6 @@ def test_the_grasp_stops_the_pump_one_second_before_and_lasts_ten(plant: Plant, 
     assert set(order.astype(int)) == {PHASES.index(p) for p in ("settle", "lead_in", "pump_off", "contact")}
 
 
-def test_the_log_is_what_the_fitters_read(plant: Plant, controller: Any) -> None:
-    log = run_session(Twin(plant, seed=2), controller, 30.0).log
-    assert names(log, "input") == ("drive", "pump")
-    assert names(log, "disturbance") == ("t_ambient",)
-    assert names(log, "output") == ("t_tank", "t_surface")
-    assert names(log, "other") == ("target_t_surface", "phase")
-    assert log["phase"].attrs["flag_meanings"].split() == list(PHASES)
-
-
 def test_lost_values_of_a_room_are_held() -> None:
     lost = np.array([np.nan, 20.0, np.nan, 21.0, np.inf])
     assert hold_last_good(lost).tolist() == [20.0, 20.0, 20.0, 21.0, 21.0]
@@ -163,23 +153,6 @@ def test_the_third_bad_reading_in_a_row_trips(plant: Plant, controller: Any, err
     assert is_off(twin)
 
 
-def test_two_bad_readings_do_not_trip_and_never_reach_the_controller(plant: Plant, controller: Any) -> None:
-    rig = Spoilt(Twin(plant), {"t_surface": float("nan")}, since=50.0, until=52.0)
-    session = run_session(rig, controller, 38.0)
-    assert session.verdict == "settled"
-    assert len(controller.seen) > 50
-    assert all(np.isfinite(list(seen.values())).all() for seen in controller.seen)
-    assert [event.kind for event in session.events].count("lost") == 1
-
-
-def test_losing_the_room_sensor_holds_its_last_value(plant: Plant, controller: Any) -> None:
-    session = run_session(Spoilt(Twin(plant), {"t_ambient": float("nan")}, since=20.0), controller, 38.0)
-    assert session.verdict == "settled"
-    assert [seen["t_ambient"] for seen in controller.seen[20:]] == [25.0] * (len(controller.seen) - 20)
-    assert len(controller.seen) > 20
-    assert np.all(session.log["t_ambient"].values == 25.0)
-
-
 @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError, MemoryError])
 def test_power_is_off_whatever_ends_it(plant: Plant, controller: Any, error: type[BaseException]) -> None:
     twin = Twin(plant)
@@ -191,20 +164,6 @@ def test_power_is_off_whatever_ends_it(plant: Plant, controller: Any, error: typ
     with pytest.raises(error):
         run_session(twin, controller, 45.0, progress=break_off)
     assert is_off(twin)
-
-
-def test_status_of_the_controller_becomes_an_event(plant: Plant, controller: Any) -> None:
-    plain = controller.step
-
-    def step(reading: Mapping[str, float], target: float) -> Move:
-        move = plain(reading, target)
-        late = 10 <= reading["time_s"] < 12
-        return Move(drive=move.drive, status="late", advice="give it more time") if late else move
-
-    controller.step = step
-    events = run_session(Twin(plant), controller, 38.0).events
-    said = [(event.time_s, event.text) for event in events if event.kind == "controller"]
-    assert said == [(10.0, "late: give it more time"), (12.0, "ok")]
 
 
 def test_a_decision_ends_the_contact_early(plant: Plant, controller: Any) -> None:
@@ -266,16 +225,6 @@ def test_a_driver_that_sticks_in_a_grasp_is_found_though_samples_are_faster_than
     assert session.trip.kind in ("driver", "pump", "model")
     closed = next(event.time_s for event in session.events if event.kind == "closed")
     assert 6.0 < session.trip.time_s - closed < 8.5
-
-
-def test_a_drive_that_the_device_cannot_take_is_a_trip_with_power_off(plant: Plant) -> None:
-    bench, greedy = Bench(plant), Constant()
-    greedy.step = lambda reading, target: Move(drive=1.0 if reading["time_s"] < 3 else 1.5)
-    session = run_session(bench.rig, greedy, 40.0, clock=bench.clock)
-    assert session.trip.kind == "drive"
-    assert "1.5 is outside -1 to 1" in session.trip.line()
-    assert bench.device.applied_drive == {"drive": 0.0}
-    bench.close()
 
 
 # ---- a program that is held up in a grasp: the device has measured, and the rows are filled in ----
@@ -355,8 +304,3 @@ def test_samples_that_the_device_could_not_keep_are_counted(plant: Plant, contro
     (lost,) = [event.text for event in session.events if event.kind == "lost"]
     assert int(lost.split()[0]) == pytest.approx(60 - 24, abs=4)
     assert np.diff(session.log["time"].values[-150:]).max() > 0.2  # nothing is made up
-
-
-def test_a_device_that_refuses_without_a_fault_trips_in_its_own_words() -> None:
-    trip = trip_of_device(DeviceRefusedError("off", "it is off"), Reading(4.0, {}, {}, 0))
-    assert (trip.kind, trip.time_s, trip.measured) == ("device", 4.0, "the device refuses: it is off")

@@ -60,6 +60,17 @@ def test_the_standard_error_is_that_of_the_mean_of_correlated_readings(
     assert least < np.median(found) / true < 1.05
 
 
+@pytest.mark.parametrize(
+    ("residual", "quantum", "error"),
+    [([1.0, 1.0, -1.0, -1.0] * 4, 0.1, 0.306681),  # s = sqrt(16/14); lag 1/16, r = 0.13672, n_eff = 12.151
+     ([1.0, -1.0] * 2, 0.1, np.sqrt(2) / 2), ([0.0] * 8, 0.1, 0.0115728),  # r = 0; r = 1/8, n_eff = 6.2222
+     ([1.0] * 50 + [-1.0] * 50, 0.1, np.sqrt(100 / 98 / (100 * 0.05 / 1.95))),  # r is 0.95 at most
+     ([2.0, 2.0, -2.0, -2.0], 0.1, 2.0), ([1.0, -1.0] * 2, 9.0, 9 / np.sqrt(12) / 2)],  # n_eff is 2 at least
+)  # fmt: skip
+def test_the_standard_error_in_numbers(residual: list[float], quantum: float, error: float) -> None:
+    assert _standard_error(np.array(residual), quantum) == pytest.approx(error, rel=1e-5)
+
+
 def test_a_quantum_alone_asks_for_its_rounding_error() -> None:
     """31 equal readings of 1/16 K: 0.0180 / sqrt(29.1) = 0.0033 K of level, 0.0116 K of drift, twice.
 
@@ -120,6 +131,7 @@ PEAK = np.select([T < 5, T == 30], [20.0, 41.0], 40.0)
     ("y", "target", "smooth", "want"),
     [
         (np.full(T.size, 25.0), 40.0, 5.0, (np.nan, 0.0, np.nan)),  # never there
+        (np.full(T.size, np.nan), 40.0, 5.0, (np.nan, 0.0, np.nan)),  # nor read
         (np.where(T < 40, 20.0, 40.2), 40.0, 0.5, (40.0, 0.2, 0.2)),  # the bias is of what has settled
         (np.where(BUMP, 41.1, 40.1), 40.0, 0.5, (40.0, 1.1, 0.1)),  # what begins there overshoots ...
         (np.where(BUMP, 39.1, 40.1), 40.0, 0.5, (40.0, 0.9, 0.1)),  # ... to either side

@@ -9,7 +9,9 @@ import pytest
 from tests.rig.makers import PATIENCE_S, STILL, Bench, make_lab
 from thermogrip.rig.clock import ScaledClock, SteppedClock
 from thermogrip.rig.drivers.thermogrip import DeviceRig
+from thermogrip.rig.firmware.reference import Board, Sensor
 from thermogrip.rig.serial.port import Port
+from thermogrip.rig.serial.protocol import Channel
 from thermogrip.rig.simulation.virtual_device import FAULTS, DirectPort, VirtualDevice
 from thermogrip.sysid.plant.plant import Plant
 
@@ -86,6 +88,32 @@ def test_a_stalled_pump_moves_no_water(plant: Plant) -> None:
     assert device.truth().pump == 0
     device.clear("pump_stall")
     assert device.truth().pump == 1
+
+
+def test_a_device_fits_its_plant_and_counts_its_resets(plant: Plant, clock: SteppedClock) -> None:
+    gripper, lab = (VirtualDevice(one, link="none", clock=clock, **STILL) for one in (plant, make_lab()))
+    assert gripper.bench.board == Board(
+        (Channel("drive", "1", -10_000, 10_000),),
+        (
+            Sensor("t_tank", 2_000, 60_000),
+            Sensor("t_surface", 3_000, 55_000),
+            Sensor("t_ambient", guarded=False),
+        ),
+    )
+    assert (lab.bench.board.pump, lab.bench.board.tachometer) == (False, False)
+    assert lab.bench.board.sensors[:2] == (Sensor("t1", 2_000, 80_000), Sensor("t2", 2_000, 80_000))
+    for cause, boot in (({}, 2), ({"cause": "watchdog"}, 3)):
+        gripper.fault("reset", **cause)
+        assert (gripper.core.cause, gripper.core.boot) == (cause.get("cause", "external"), boot)
+    gripper.fault("sensor_offset")  # the skin's, and of 3 K
+    gripper.fault("sensor_drift", sensor="t_tank")  # of 20 mK/s
+    gripper.fault("driver_stuck")
+    clock.sleep(10.0)
+    assert (shown(gripper, "t_surface"), shown(gripper, "t_tank")) == (28.0, 25.2)
+    assert gripper.truth().drive == {"drive": 0.0}  # without a supply
+    gripper.clear("sensor_drift")
+    assert (gripper.bench.stuck, list(gripper.bench._faults)) == (1.0, ["t_surface"])
+    assert gripper.ordered == -float("inf")
 
 
 def test_every_fault_can_be_set_and_cleared(plant: Plant) -> None:
