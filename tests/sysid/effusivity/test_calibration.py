@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
+from thermogrip.datasets.materials import find_material
 from thermogrip.sysid.effusivity import calibration
 from thermogrip.sysid.effusivity.calibration import calibrate_example_gripper, calibrate_gripper
 from thermogrip.sysid.effusivity.data import touches
@@ -113,6 +115,7 @@ def test_calibration_finds_the_blocks_it_was_shown(device):
 def test_a_refit_from_an_earlier_one_ends_at_the_same_place(files):
     cold, _ = calibrated("exp2_dT20")
     warm = calibrate_gripper([split_of(files["exp2_dT20"], "train")], start=cold)
+    assert warm.noise == cold.noise
     fresh, names = split_of(files["exp2_dT20"], "test"), ["copper", "iron", "wood"]
     np.testing.assert_allclose(
         material_posterior(warm, fresh, names), material_posterior(cold, fresh, names), atol=0.05
@@ -223,3 +226,60 @@ def test_the_nominal_temperature_is_best_known_in_rooms_like_those_of_the_calibr
     hypotheses = material_hypotheses(learnt, ["copper"])
     sds = [prior_of(learnt, touches(g), hypotheses).sd[0, 4] for g in (grasp, cold)]
     assert sds[1] > sds[0]
+
+
+def test_the_noise_stays_within_its_range():
+    low, high = [-6.0, -8.0, -1.0, -9.0, 0.0], [0.0, 0.0, 4.0, -3.0, 2.0]
+    for sign, want in ((1.0, low), (-1.0, high)):
+        slopes = 100 * sign * np.array([1.0, 2.0, 3.0, 4.0, 5.0])
+        found = calibration._least(lambda q, s=slopes: (float(s @ q), s), FIRST, n_grasp=1)
+        np.testing.assert_allclose(found, want)
+
+
+def test_a_label_without_a_row_is_named_with_its_first_grasp_and_may_be_given_one(files):
+    grasps = files["exp2_dT20"].isel(grasp=[0, 8, 9, 16])
+    label = grasps["material"].values.astype(object)
+    label[[1, 2]] = "bismuth"
+    odd = grasps.assign(material=("grasp", label.astype(str)))
+    name = str(grasps["grasp"].values[1])
+    with pytest.raises(UserError, match=f"grasp '{name}' is of 'bismuth', which the materials table has not"):
+        calibration._labelled([odd], {}, least=2)
+    row = replace(find_material("iron"), name="bismuth", rho=8000.0, c_p=200.0, effusivity=9e3)
+    problem = calibration._problem(
+        calibration._labelled([odd], {"bismuth": row}, 2), {"bismuth": row}, None, 0.03
+    )
+    assert problem.labels[0] == "bismuth"
+    assert problem.library[0].effusivity == 9e3
+    assert problem.ln_capacity[0] == pytest.approx(np.log(8000.0 * 200.0 * 0.03))
+    assert problem.which[[1, 2]].tolist() == [0, 0]
+
+
+def test_an_earlier_calibration_is_a_prior_of_what_it_knows(device):
+    """Of a new block nothing is known but its row; an exact number keeps a thousandth of the wide prior."""
+    other = another_gripper(device)
+    known = calibration.anchors(["copper", "glass"], {"glass": find_material("glass")}, other)
+    assert known[0] == calibration.Anchor(
+        device.blocks["copper"].library_effusivity, device.blocks["copper"].library_sd_ln,
+        device.blocks["copper"].heat_capacity,
+    )  # fmt: skip
+    prior = calibration.prior_of_gripper(other, ["copper", "glass"], known)
+    names = [*SHARED_NAMES, "ln_h copper", "ln_h glass", "ln_e copper", "ln_e glass"]
+    mean, cov = dict(zip(names, prior.mean)), np.linalg.inv(prior.precision)
+    sd = dict(zip(names, np.sqrt(np.diag(cov))))
+    assert mean["ln_h copper"] == pytest.approx(device.blocks["copper"].ln_h)
+    assert mean["ln_e copper"] == pytest.approx(device.blocks["copper"].ln_effusivity)
+    assert (mean["ln_h glass"], mean["ln_e glass"]) == pytest.approx(
+        (np.log(1500), np.log(known[1].effusivity))
+    )
+    assert (mean["ln_depth"], mean["bias"]) == pytest.approx((np.log(device.depth_share), device.bias))
+    assert (sd["ln_h glass"], sd["ln_e glass"]) == pytest.approx((1.0, known[1].sd_ln))
+    assert sd["ln_lag"] == pytest.approx(np.hypot(0.5, 1e-3), rel=1e-9)
+    assert sd["ln_depth"] == pytest.approx(0.05e-3, rel=1e-6)
+    at = [names.index("ln_e_outer"), names.index("ln_z_outer")]
+    assert cov[at[0], at[1]] == pytest.approx((0.1**2 - 0.3**2) / 4, rel=1e-6)
+    assert (prior.guesses, prior.spread["onset"]) == (10.0, device.spreads.onset)
+    few = replace(other, spreads=replace(other.spreads, dof=4.0))
+    assert calibration.prior_of_gripper(few, ["copper"], known[:1]).guesses == 4.0
+    off = prior.mean.copy()
+    off[-1] += 2 * known[1].sd_ln
+    assert prior.penalty(off) == pytest.approx(4.0)

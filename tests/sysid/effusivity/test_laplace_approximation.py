@@ -13,11 +13,20 @@ from scipy.stats import binom
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
+from thermogrip.datasets.materials import find_material
+from thermogrip.datasets.schema import make_grasps
 from thermogrip.sysid.contact.response import far_response, step_response
 from thermogrip.sysid.effusivity import laplace_approximation as laplace
 from thermogrip.sysid.effusivity.calibration import calibrate_gripper
 from thermogrip.sysid.effusivity.data import touches, whiten
-from thermogrip.sysid.effusivity.gripper_model import SHARED_NAMES, GripperSpread, another_gripper, stack_of
+from thermogrip.sysid.effusivity.gripper_model import (
+    SHARED_NAMES,
+    GripperSpread,
+    ParameterCovariance,
+    another_gripper,
+    block_names,
+    stack_of,
+)
 from thermogrip.sysid.effusivity.laplace_approximation import (
     N_NUISANCE,
     ONSET,
@@ -359,3 +368,73 @@ def test_what_needs_a_known_gripper_is_refused(device, touched):
     with pytest.raises(UserError, match="both start and prior"):
         calibrate_gripper([train], start=device, prior=other)
     assert isinstance(material_hypotheses(other, FIVE), Hypotheses)
+
+
+def test_what_is_open_about_the_gripper_and_a_block(device):
+    """Of a calibrated block its own ln h and ln e; of another one the mean ln h, all ln e being known."""
+    names = (*SHARED_NAMES, *block_names(device.materials))
+    matrix = np.diag(np.arange(1.0, len(names) + 1))
+    lag, h, e = names.index("ln_lag"), names.index("ln_h brass"), names.index("ln_e brass")
+    matrix[lag, e] = matrix[e, lag] = 2.0
+    other = replace(device, uncertain=True, uncertainty=ParameterCovariance(names, matrix))
+    own = laplace._covariance(other, 0)
+    np.testing.assert_array_equal(np.diag(own), [*range(1, 19), h + 1, e + 1])
+    assert own[lag, 19] == own[19, lag] == 2.0
+    new = laplace._covariance(other, -1)
+    want = np.diag([*np.arange(1.0, 19), sum(range(h + 1, h + 6)) / 25, 0.0])
+    want[lag, lag] -= 4.0 / (e + 1)
+    np.testing.assert_allclose(new, want, atol=1e-12)
+
+
+def test_what_each_kind_of_hypothesis_expects(device):
+    block, spreads = device.blocks["wood"], device.spreads
+    rows = material_hypotheses(device, ["copper", "wood", "cork"])
+    other = material_hypotheses(device, ["wood"], "unknown")
+    cork = find_material("cork")
+    found = float(device.found_effusivity(np.log([cork.effusivity]))[0])
+    anew = np.hypot(spreads.ln_h_of_blocks, spreads.ln_h)
+    np.testing.assert_allclose(rows.ln_h[1:], [block.ln_h, device.expected_ln_h(found)])
+    np.testing.assert_allclose(rows.ln_h_sd[1:], [np.hypot(spreads.ln_h, block.ln_h_sd), anew])
+    np.testing.assert_allclose(rows.ln_e[1:], [block.ln_effusivity, found])
+    scale_sd = device.effusivity_scale(np.array([found]))[1][0]
+    own = np.sqrt(cork.effusivity_sd_ln**2 + scale_sd**2 + spreads.ln_effusivity**2)
+    np.testing.assert_allclose(rows.ln_e_sd, [0.0, spreads.ln_effusivity, own])
+    np.testing.assert_allclose(rows.ln_rho_c[1:], np.log([block.heat_capacity, cork.rho * cork.c_p]))
+    assert rows.ln_rho_c_sd.tolist() == [0.0, 0.0, 0.05]
+    assert rows.ln_h_dof.tolist() == [spreads.dof, spreads.dof, np.inf]
+    assert rows.ln_e_dof.tolist() == [np.inf, spreads.insulator_dof, np.inf]
+    assert rows.block.tolist() == [device.materials.index("copper"), device.materials.index("wood"), -1]
+    assert other.ln_h_sd[0] == pytest.approx(np.hypot(anew, block.ln_h_sd))
+    assert (other.ln_h_dof[0], other.ln_e_dof[0]) == (np.inf, spreads.insulator_dof)
+    # half way from insulators to metals at 4500
+    free = free_hypotheses(device, np.log([4500.0, 10.0, 1e6]))
+    np.testing.assert_allclose(np.exp(free.ln_rho_c), [np.sqrt(1.7e6 * 3.2e6), 1.7e6, 3.2e6], rtol=1e-4)
+    np.testing.assert_allclose(free.ln_rho_c_sd, [0.3, 0.4, 0.2], atol=1e-4)
+    np.testing.assert_allclose(free.ln_h_sd, anew)
+    by = free_hypotheses(device, np.log(4500.0) + 0.25)  # exp(-4 / 4): 1 / (1 + 1 / e) of the way
+    assert by.ln_rho_c_sd[0] == pytest.approx(0.4 - 0.2 / (1 + np.exp(-1)))
+
+
+@pytest.mark.parametrize(
+    ("t_object", "sd", "room", "dof", "mean", "want"),
+    [
+        (43.0, np.nan, 28.0, 12.0, 43.0 + 0.1 - 0.02 * 15, 0.4 * np.sqrt(12 / 10)),
+        (43.0, 0.3, 28.0, 12.0, 42.8, 0.3), (43.0, np.nan, np.nan, 12.0, 43.1, 0.4 * np.sqrt(12 / 10)),
+        (43.0, np.nan, 28.0, 2.0, 42.8, 20 / 3**0.5), (np.nan, 0.3, 28.0, 12.0, 28.0, 20 / 3**0.5),
+        (np.nan, np.nan, np.nan, 12.0, 23.0, 20 / 3**0.5),
+    ],
+)  # fmt: skip
+def test_what_a_nominal_temperature_says_of_the_object(device, t_object, sd, room, dof, mean, want):
+    ours = replace(
+        device, bias=0.1, transit_loss=0.02, spreads=replace(device.spreads, t_object=0.4, dof=dof)
+    )
+    data = touches(make_grasps([-1.0, 1.0, 2.0], [[23.0, 24.0, 25.0]], ["a"], t_object=[t_object],
+                               t_object_sd=[sd], t_ambient=[room]))  # fmt: skip
+    prior = prior_of(ours, data, material_hypotheses(ours, ["wood"]))
+    assert (prior.mean[0, 4], prior.sd[0, 4]) == (pytest.approx(mean), pytest.approx(want))
+    assert (prior.mean[0, 3], prior.sd[0, 3], prior.mean[0, 2]) == (23.0, 3.0, ours.onset)
+    assert prior.mean[0, 6] == pytest.approx(
+        np.log(ours.blocks["wood"].heat_capacity * ours.block_length * ours.depth_share)
+    )
+    insulators = ours.spreads.insulator_dof
+    assert prior.dof[0].tolist() == [dof, dof, dof, np.inf, np.inf, insulators, np.inf]

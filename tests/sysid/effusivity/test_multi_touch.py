@@ -13,18 +13,23 @@ from thermogrip.classify import classify_grasps
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
+from thermogrip.datasets.schema import make_grasps
+from thermogrip.sysid.contact.response import step_response, time_nodes
 from thermogrip.sysid.effusivity import multi_touch
 from thermogrip.sysid.effusivity.data import touches
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
-from thermogrip.sysid.effusivity.laplace_approximation import material_hypotheses
+from thermogrip.sysid.effusivity.laplace_approximation import fit_pairs, material_hypotheses, prior_of
 from thermogrip.sysid.effusivity.multi_touch import (
+    SHARED,
     Coupling,
     Factor,
     Traces,
     combine,
+    factor_of,
     free_touch_fit,
     joint_prior,
     learn_coupling,
+    next_touch_prior,
     rested_long,
     touch_groups,
     traces_of,
@@ -239,3 +244,171 @@ def test_the_way_begins_where_the_touches_found_the_block(record):
     variance = 0.36**2 + (0.15 * (1 - stay) * (room - left)) ** 2
     np.testing.assert_allclose(p[:, 4, 4], (stay * (1 - taken)) ** 2 * p[:, 0, 0] + variance, rtol=0.05)
     assert variance.max() > 1.2 * 0.36**2
+
+
+def test_three_touches_move_one_block_as_computed_by_hand():
+    """A drop of 0.2 + 0.1 / 2 of which 0.8 is found; half of the way to the room in each rest of 60 s."""
+    traces = Traces(
+        moved=np.array([[0.2, 0.1]]), decay=np.array([[0.0, np.log(2) / 62]]),
+            capacity=np.array([6e3 / np.log(2)]),
+        skin=np.array([30.0, 25.0, 20.0]), room=np.array([12.0, 99.0, 10.0]), rest=np.array([60.0, 60.0,
+            7.0]),
+    )  # fmt: skip
+    coupling, rows = Coupling(found=0.8, loss=100.0, sd=0.5, ln_h_sd=0.1), np.array([2, 0, 1])
+    shared = (np.array([4.0]), np.array([0.01]), np.array([0.09]))
+    one = np.array([[50.0, 7.0, 9.0, 11.0]]), np.array([9.0])
+    for about, ways in ((None, (0.0, 0.0)), (np.array([[45.0, 28.0, np.nan]]), (-15.0, -8.2))):
+        mu, p = joint_prior(coupling, traces, rows, one, shared, about)
+        np.testing.assert_allclose(mu, [[50, 7, 9, 11, 27, 7, 9, 11, 19.8, 7, 9, 11]])
+        want = np.kron(np.ones((3, 3)), np.diag([0.0, 4.0, 0.01, 0.09]))
+        want[[1, 5, 9], [1, 5, 9]] += 0.01
+        second = 0.16 * 9 + 0.25 + (0.15 * ways[0]) ** 2
+        third = 0.16 * second + 0.25 + (0.15 * ways[1]) ** 2
+        want[np.ix_([0, 4, 8], [0, 4, 8])] = [
+            [9.0, 3.6, 1.44], [3.6, second, 0.4 * second], [1.44, 0.4 * second, third]
+        ]  # fmt: skip
+        np.testing.assert_allclose(p[0], want, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["copper", "wood"])
+def test_what_a_touch_leaves_is_what_cells_keep(device, record, name):
+    """The face of an insulated block of 200 cells, under the flux of the touch and then at rest."""
+    data, hypothesis = touches(record), material_hypotheses(device, [name])
+    traces = traces_of(device, data, np.array([np.nan, 45.0] * (data.level.size // 2)), hypothesis)
+    assert traces.rest[:2].tolist() == [60.0, 45.0]
+    assert (traces.skin[3], traces.room[3]) == (data.level[3], data.t_ambient[3])
+    e, h = (float(np.exp(v[0])) for v in (hypothesis.ln_e, hypothesis.ln_h))
+    capacity = float(np.exp(hypothesis.ln_rho_c[0])) * 0.02 * device.depth_share
+    assert traces.capacity == pytest.approx(capacity)
+    nodes = time_nodes(10.0)
+    flux = step_response(device.stack, nodes, effusivity=[e], capacity=[capacity], h_c=[h])[2][0]
+    n = 200
+    link, cell = n * e**2 / capacity, capacity / n
+    matrix = (
+        (np.diag(np.full(n - 1, 1.0), 1) + np.diag(np.full(n - 1, 1.0), -1) - 2 * np.eye(n)) * link / cell
+    )
+    matrix[0, 0] = matrix[-1, -1] = -link / cell
+    lam, vectors = np.linalg.eigh(matrix)
+    t = np.linspace(0.0, nodes.t[nodes.t <= 10.0][-1], 4001)  # the flux is taken until its last node
+    for rest in (0.0, 30.0, 300.0):
+        face = vectors[0] ** 2 @ np.exp(lam[:, None] * (10.0 - t + rest + 2.0)) / cell
+        want = np.trapezoid(face * np.interp(t, nodes.t, flux), t)
+        assert traces.drop(rest)[0] == pytest.approx(want, rel=0.01)
+
+
+def test_dividing_the_prior_out_and_multiplying_it_in_again_is_nothing(device, record):
+    """Also where a nuisance is known: the factor of a touch, with its own prior, is the fit itself."""
+    data, hypotheses = touches(record.isel(grasp=[0])), material_hypotheses(device, ["wood"])
+    prior = prior_of(device, data, hypotheses)
+    mode = fit_pairs(device, data, np.array([0]), hypotheses, prior=prior._replace(dof=None))
+    factor, at = factor_of(mode, prior), list(SHARED)
+    joint = combine(factor, prior.mean[:, at][0], np.diag(prior.sd[0, at] ** 2))
+    assert np.count_nonzero(prior.sd[0, at]) == 3
+    assert joint.log_evidence == pytest.approx(mode.log_evidence[0], abs=1e-8)
+    np.testing.assert_allclose(joint.mean, mode.u[0, at], atol=1e-9)
+    np.testing.assert_allclose(joint.covariance, mode.covariance[0][np.ix_(at, at)], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("given", "fine"),
+    [
+        ({"found": 0.0}, True), ({"found": 2.0}, True), ({"found": -0.01}, False), ({"found": 2.01}, False),
+        ({"loss": 0.0}, True), ({"loss": -1.0}, False), ({"sd": 0.0}, False), ({"ln_h_sd": 0.0}, False),
+        ({"longest_rest": 0.0}, True),
+    ],
+)  # fmt: skip
+def test_which_couplings_there_are(given, fine):
+    whole = {"found": 0.75, "loss": 100.0, "sd": 0.36, "ln_h_sd": 0.12, "longest_rest": 60.0}
+    assert Coupling().to_dict() == whole
+    assert Coupling(sd=0.3).touch_sd == 0.15
+    if fine:
+        assert Coupling.from_dict(whole | given) == Coupling(**given)
+        return
+    with pytest.raises(ValueError, match="need 0 <= found <= 2, loss >= 0, sd > 0, ln_h_sd > 0"):
+        Coupling(**given)
+    with pytest.raises(UserError, match="is not a whole coupling of touches"):
+        Coupling.from_dict(whole | given)
+
+
+def test_a_coupling_is_learnt_from_where_it_starts_and_keeps_the_longest_rest(device, record):
+    """Two groups move it a little: of found by up to half, of the two scatters by up to a fifth each."""
+    two = record.isel(grasp=np.flatnonzero(np.isin(record["touch_group"].values, ["p000", "p028"])))
+    two = two.assign(rest=("grasp", np.where(two["touch"].values == 1, 900.0, 70.0)))
+    start = Coupling(found=0.9, loss=80.0, sd=0.5, ln_h_sd=0.2, longest_rest=40.0)
+    learnt, longer = (
+        learn_coupling(device, two, start=replace(start, longest_rest=r)) for r in (40.0, 400.0)
+    )
+    assert (learnt.longest_rest, longer.longest_rest) == (70.0, 400.0)
+    assert learnt.sd == pytest.approx(longer.sd)
+    assert learn_coupling(device, two).longest_rest == 70.0
+    moved = np.log([getattr(learnt, k) / getattr(start, k) for k in ("found", "loss", "sd", "ln_h_sd")])
+    assert np.all(np.abs(moved) < 2 * np.array([0.5, 1.0, 0.2, 0.2]))
+    assert np.abs(moved).max() > 0.01
+
+
+@pytest.mark.parametrize("touched", [1, 2])
+def test_another_touch_expects_what_the_touches_found_moved_on(device, record, touched):
+    """The block's posterior after the last touch, by the linear law of the coupling; h scatters anew."""
+    at, names = np.arange(touched), ["copper", "wood"]
+    block = record.isel(grasp=touch_groups(record)["p000"][:touched])
+    coupling = Coupling(found=0.8, loss=0.0, sd=0.3, ln_h_sd=0.2)
+    evidence, mean, cov = next_touch_prior(device, block, names, coupling=coupling, rest=30.0)
+    if touched > 1:
+        fit = two_touch_fit(device, block, names, coupling=coupling)
+        np.testing.assert_allclose(evidence, fit.log_evidence[0], atol=1e-9)
+    view = multi_touch._view(device, block, material_hypotheses(device, names), coupling)
+    factors = multi_touch._factors(view, [at])
+    if touched > 1:
+        factors = multi_touch._factors(view, [at], multi_touch._cavities(view, [at], factors))
+    joint = combine(factors[0], *multi_touch._prior(view, at, coupling, factors[0]))
+    taken = 0.8 * view.traces.drop(30.0)
+    skin, t_last = view.data.level[-1], joint.mean[:, -4]
+    np.testing.assert_allclose(mean[:, 0], (1 - taken) * t_last + taken * skin, atol=1e-6)
+    np.testing.assert_allclose(cov[:, 0, 0], (1 - taken) ** 2 * joint.covariance[:, -4, -4] + 0.09, rtol=1e-6)
+    np.testing.assert_allclose(mean[:, 2:], joint.mean[:, -2:], atol=1e-6)
+    assert np.all(cov[:, 1, 1] > 0.04)
+    assert next_touch_prior(device, block, names)[1][0, 0] == pytest.approx(
+        next_touch_prior(device, block, names, rest=60.0, finish="known")[1][0, 0]
+    )
+
+
+def test_which_records_are_of_one_block(record):
+    pair = record.isel(grasp=touch_groups(record)["p000"])
+    assert multi_touch._one_block(pair.isel(grasp=[0]).drop_vars("touch_group")).tolist() == [0]
+    assert multi_touch._one_block(pair.isel(grasp=[1, 0])).tolist() == [1, 0]
+    stray = pair.isel(grasp=[0, 1, 1])
+    stray = stray.assign(touch_group=("grasp", ["p000", "p000", ""]))
+    for several in (record.isel(grasp=[0, 1, 2, 3]), stray):
+        with pytest.raises(UserError, match="touches of several blocks; give those of one block"):
+            multi_touch._one_block(several)
+
+
+def test_the_longest_rest_is_between_touches():
+    skins = [[23.0, 23.0, 30.0]] * 4
+    grasps = make_grasps(
+        [-1.0, 0.0, 5.0], skins, list("abcd"), touch_group=["p", "p", "q", "p"], touch=[2, 1, 1, 3],
+        rest=[45.0, 500.0, 500.0, np.nan],
+    )  # fmt: skip
+    assert multi_touch._longest_rests(grasps) == {"p": 60.0, "q": 0.0}
+    assert not rested_long(grasps.drop_vars("touch_group")).any()
+
+
+def test_a_temperature_that_contradicts_its_touch_is_not_taken_from_the_others(device, record):
+    """Five standard deviations apart: between them the others' temperature, beyond the prior."""
+    at = np.array([0, 1])
+    view = multi_touch._view(device, record, material_hypotheses(device, ["copper"]), Coupling())
+    one = multi_touch._factors(view, [at])[0]
+    for off, taken in ((0.9, True), (1.1, False)):
+        prior = multi_touch._prior(view, at, view.coupling, one)
+        by_first, first_sd = multi_touch._t_object(combine(multi_touch._without(one, [1]), *prior), 1)
+        eta, precision = np.zeros((1, 2, 4)), np.zeros((1, 2, 4, 4))
+        eta[:, 0], precision[:, 0] = one.eta[:, 0], one.precision[:, 0]
+        apart = by_first + off * 5.0 * np.hypot(first_sd, 0.01)
+        precision[0, 1, 0, 0] = 1e4  # the second touch alone knows its temperature to 0.01 K
+        eta[0, 1, 0] = 1e4 * (apart[0] - one.centre[0, 1, 0])
+        made = Factor(one.log_size, one.centre, eta, precision)
+        ((mean, sd),) = multi_touch._cavities(view, [at], [made])
+        if taken:
+            assert (mean[0, 1], sd[0, 1]) == pytest.approx((by_first[0], first_sd[0]), rel=0.02)
+        else:
+            assert (mean[0, 1], sd[0, 1]) == pytest.approx((one.centre[0, 1, 0], 20 / 3**0.5))

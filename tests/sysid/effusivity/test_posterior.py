@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import xarray as xr
 from scipy.special import logsumexp
 from scipy.stats import binom, multivariate_t, norm
 from scipy.stats import t as student_t
@@ -25,12 +26,13 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     prior_of,
 )
 from thermogrip.sysid.effusivity.posterior import (
+    _row,
     effusivity_posterior,
     material_evidence,
     material_posterior,
     open_set,
 )
-from thermogrip.sysid.effusivity.posterior_grid import LN_E_RANGE, grid_posteriors
+from thermogrip.sysid.effusivity.posterior_grid import LN_E_RANGE, GridPosterior, grid_posteriors
 
 from ...oracles.emcee_posterior import emcee_posterior
 from .makers import FIVE, drawn_from_the_prior, simulated, split_of
@@ -233,3 +235,53 @@ def test_reported_effusivity_is_the_found_one_over_the_scale(device, files):
     row = effusivity_posterior(replace(device, blocks=same), record)[0]
     bent = effusivity_posterior(replace(device, blocks=lower), record)[0]
     assert row.effusivity / bent.effusivity == pytest.approx(1.3, rel=0.05)
+
+
+def test_a_row_is_made_of_two_mixtures(device):
+    """Over two effusivities and two temperatures; the scale's error and an insulator's scatter on top."""
+    x, mass, weight = np.array([7.0, 7.2]), np.array([0.3, 0.7]), np.array([0.25, 0.75])
+    for shift in (0.0, 2.0):  # an insulator, a metal
+        made = GridPosterior(x + shift, mass, 0.0, weight, np.array([20.0, 24.0]), np.array([0.1, 0.2]), x)
+        row = _row(device, "g", made)
+        scale, sd = device.effusivity_scale(made.x)
+        sd = np.sqrt(sd**2 + (device.spreads.ln_effusivity**2 if shift == 0 else 0.0) + 1e-8)
+        below = [
+            (mass * norm.cdf((np.log(e) - made.x + scale) / sd)).sum()
+            for e in (row.effusivity_p05, row.effusivity, row.effusivity_p95)
+        ]
+        np.testing.assert_allclose(below, [0.05, 0.5, 0.95], atol=1e-7)
+        mean = mass @ (made.x - scale)
+        variance = mass @ ((made.x - scale) ** 2 + sd**2) - mean**2
+        assert row.log10_effusivity_sd == pytest.approx(np.sqrt(variance) / 2.302585)
+        below = [
+            weight @ norm.cdf((t - made.t_object) / made.t_object_sd)
+            for t in (row.t_object_p05, row.t_object, row.t_object_p95)
+        ]
+        np.testing.assert_allclose(below, [0.05, 0.5, 0.95], atol=1e-7)
+        assert (row.grasp_id, row.h_c) == ("g", pytest.approx(np.exp(7.15)))
+
+
+def test_odds_of_an_unknown_are_prior_odds_times_the_bayes_factor(device, files):
+    record = split_of(files["exp1A_obj43_grip23"], "test").isel(grasp=[0, 4, 9])
+    known = material_evidence(device, record, FIVE)
+    free = [p.log_evidence for p in grid_posteriors(device, touches(record))]
+    found, usual = (open_set(device, record, FIVE, **prior) for prior in ({"prior_unknown": 0.25}, {}))
+    np.testing.assert_allclose(found.log_bayes_factor, np.log(np.exp(known).mean(axis=1)) - free)
+    np.testing.assert_allclose(found.p_unknown, 1 / (1 + 3 * np.exp(found.log_bayes_factor)))
+    np.testing.assert_allclose(usual.p_unknown, 1 / (1 + 9 * np.exp(found.log_bayes_factor)))
+    for p in (0.0, 1.0):
+        with pytest.raises(UserError, match=f"prior_unknown is {p:g}; give a probability between 0 and 1"):
+            open_set(device, record, FIVE, prior_unknown=p)
+
+
+def test_grasps_with_and_without_a_group_share_a_record(device, files):
+    two = files["exp5_two_touch_unknown_object"]
+    pair = two.isel(grasp=np.flatnonzero(two["touch_group"].values == "p028"))
+    alone = two.isel(grasp=[0]).assign(touch_group=("grasp", [""]))
+    mixed = xr.concat([alone, pair], "grasp", combine_attrs="override")
+    rows = effusivity_posterior(device, mixed)
+    first, *others = (*effusivity_posterior(device, alone), *effusivity_posterior(device, pair))
+    for row, want in zip(rows, [first, *others], strict=True):
+        assert row.grasp_id == want.grasp_id
+        assert row.effusivity == pytest.approx(want.effusivity, rel=1e-6)
+        assert row.t_object == pytest.approx(want.t_object, rel=1e-6)

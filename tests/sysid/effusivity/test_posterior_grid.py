@@ -135,3 +135,40 @@ def test_marginal_density_is_that_of_the_joint_normal(device, files):
     got = MarginalPosterior(device, data)(points)
     np.testing.assert_allclose(np.diff(got), np.diff(want), rtol=1e-6)
     assert MarginalPosterior(device, data)(np.array([[0.0, 7.0, -0.8, 0.0, 11.0]]))[0] == -np.inf
+
+
+def test_priors_are_the_densities_of_their_laws():
+    """But for the normal density's root of 2 pi, which is left to the weights."""
+    x, left = np.array([-1.0, 0.4, 3.0]), 0.5 * np.log(2 * np.pi)
+    for dof, law in ((7.0, student_t(7, 0.5, 2.0)), (np.inf, norm(0.5, 2.0))):
+        np.testing.assert_allclose(posterior_grid._log_student(x, 0.5, 2.0, dof), law.logpdf(x) + left)
+    np.testing.assert_allclose(posterior_grid._log_normal(x, 0.5, 2.0), norm(0.5, 2.0).logpdf(x) + left)
+
+
+@pytest.mark.parametrize(
+    ("value", "low", "high"),
+    [([-20, -13, -11, 0, -12.5, -40], 1.0, 4.0), ([0, -1, -13, -20, -30, -40], 0.0, 2.0),
+     ([-40, -30, -20, -13, -11, 0], 3.0, 5.0)],
+)  # fmt: skip
+def test_new_points_lie_between_the_neighbours_of_those_near_the_best(value, low, high):
+    order = [3, 0, 5, 1, 4, 2]
+    got = posterior_grid.refined(np.arange(6.0)[order], np.array(value, dtype=float)[order], 12.0)
+    np.testing.assert_allclose(got, low + (high - low) * (np.arange(18) + 0.5) / 18)
+
+
+def test_the_posterior_of_a_normal_density_is_that_density():
+    """Points in any order, one of them twice; far tails belong to no mixture."""
+    x = np.concatenate([np.linspace(6.0, 12.0, 121), [8.0]])[::-1]
+    value = 5.0 - 0.5 * ((x - 9.1) / 0.3) ** 2
+    found = posterior_grid.posterior_of(x, value, 2 * x, 0.1 * x, 3 * x)
+    range_ = np.log(1.1e5 / 17.0)
+    assert found.log_evidence == pytest.approx(5.0 + np.log(0.3 * np.sqrt(2 * np.pi) / range_), abs=1e-3)
+    assert found.mass.sum() == pytest.approx(1.0)
+    assert found.mass @ found.x == pytest.approx(9.1, abs=1e-4)
+    assert found.mass @ (found.x - 9.1) ** 2 == pytest.approx(0.09, rel=1e-3)
+    # 20 nats are 6.32 sd, and the grid goes on to the next point; 1e-9 of the peak is at 6.44 sd
+    assert (found.x[0], found.x[-1], found.x.size) == pytest.approx((7.2, 11.0, 500))
+    assert (found.t_object.min() / 2, found.t_object.max() / 2) == pytest.approx((7.2, 11.0))
+    assert found.weight @ found.t_object / 2 == pytest.approx(9.1, abs=1e-3)
+    np.testing.assert_allclose(found.t_object_sd, found.t_object / 20)
+    np.testing.assert_allclose(found.ln_h, 1.5 * found.t_object)
