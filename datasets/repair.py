@@ -14,8 +14,10 @@ floor is 0.6 K for a temperature and 2 % of the channel's 1-99 % range (at least
 increments) otherwise; and the run is a spike only if it is entered and left by jumps of opposite sign, each
 larger than the same threshold and than five times the 70 % quantile of the increments around it.  A step is
 entered but not left; the tip of a ramp of any slope is entered and left by increments like those around it:
-both stay.  Spikes become NaN, as lost samples are: an output is never filled.  A lost input is held from
-the last row, since that is what an actuator does; a lost disturbance is interpolated.
+both stay.  In rows of a minute or more a plant moves and comes back by itself: there a spike lies outside of
+all other samples as well, by more than their range.  Spikes become NaN, as lost samples are: an output is
+never filled.  A lost input is held from the last row, since that is what an actuator does; a lost disturbance
+is interpolated.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ Floats = NDArray[np.float64]
 SPIKE_FLOOR_K = 0.6
 SPIKE_WINDOW = 21
 SPIKE_LENGTH = 3
+_SLOW_ROWS = 60.0  # s
 GAP_SECONDS = 10.0
 GAP_STEPS = 5.0
 _FEW, _MOST_MOVED = 0.05, 10  # share of rows whose time may be wrong; rows that one may be out of place
@@ -121,10 +124,11 @@ def describe_gaps(time: Floats, inputs: dict[str, Floats]) -> list[str]:
     return repairs
 
 
-def find_spikes(values: Floats, *, floor: float | None) -> NDArray[np.bool_]:
+def find_spikes(values: Floats, *, floor: float | None, step: float = 0.0) -> NDArray[np.bool_]:
     """Return which samples (n,) of a channel are spikes, by the rule above; NaN is skipped.
 
-    ``floor`` is the least deviation that can be one, None to derive it from the channel.
+    ``floor`` is the least deviation that can be one, None to derive it from the channel; ``step`` is the time
+    between rows [s].
     """
     spikes = np.zeros(values.shape, dtype=bool)
     seen = np.flatnonzero(np.isfinite(values))
@@ -142,6 +146,10 @@ def find_spikes(values: Floats, *, floor: float | None) -> NDArray[np.bool_]:
     for start in np.flatnonzero(far & entered):
         length = _spike_length(good, far, int(start), threshold)
         spikes[seen[start : start + length]] = True
+    if step >= _SLOW_ROWS and spikes.any():
+        others = good[~spikes[seen]]
+        low, high = float(others.min()), float(others.max())
+        spikes[seen] &= (good < low - (high - low)) | (good > high + (high - low))
     return spikes
 
 
@@ -149,7 +157,7 @@ def reject_spikes(
     name: str, values: Floats, time: Floats, *, floor: float | None
 ) -> tuple[Floats, list[str]]:
     """Return the channel with its spikes as NaN, and what was found."""
-    spikes = find_spikes(values, floor=floor)
+    spikes = find_spikes(values, floor=floor, step=float(np.median(np.diff(time))))
     if not spikes.any():
         return values, []
     worst = ", ".join(f"{values[at]:g} at {time[at]:.2f} s" for at in np.flatnonzero(spikes)[:5])

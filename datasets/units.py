@@ -19,6 +19,10 @@ column j is the gain in the Bayesian information criterion,
 
 RSS_j of j on its own past, RSS_ij with that of i beside it (Granger 1969); beyond 10, with 2 lags and with 6
 (few leave of a smooth input what its output tells of it), it counts.
+
+A column that is computed from others is neither: a copy in another unit, or what is left between a set point
+and a reading.  A unit alone is a weak sign of an input: where some inputs are held, a column of volts that
+moves in every row is a reading.
 """
 
 from __future__ import annotations
@@ -74,9 +78,16 @@ _INPUT = re.compile(
 _OUTPUT = re.compile(
     r"^(t|y|temp|temperature|level|outlet|position|speed|pv|angle|velocity|response|measured)(\d*|_.*)$"
 )
+_BOOKKEEPING = re.compile(
+    r"^(error|err|control_error|integral|derivative|[pid]_?(term|part|action)|k_?[pidc]|pid_[pid]"
+    r"|hour|day|month|year|week|weekday|row|index|id|iteration|sample|record|counter)(_of_[a-z]+|_?no|_?\d+)?$"
+)
 _LONGEST = 200  # characters of a header that is looked through for a unit
 NO_CLUE = "neither its name nor its unit shows what it is"
 _HELD_SHARE, _HELD_SIZE = 0.5, 0.05  # of rows with a move; of the range that its median has, at least
+_FEW = 20  # rows: too few to tell chance from rule
+_COUNTS = 0.9  # of the rows have the same step
+_EXACT, _ROUNDED = 1e-6, 0.05  # of a column's range; of its standard deviation, that rounding takes at most
 _LAGS, _STRONG, _MOST_ROWS = (2, 6), 10.0, 20_000
 
 
@@ -204,6 +215,8 @@ def explain_role(name: str, unit: str) -> tuple[str, str]:
     lower = name.lower()
     if _SETPOINT.search(lower) and not (_SET_DRIVE.search(lower) and unit in _OF_DRIVES):
         return "other", "its name is that of a set point"
+    if _BOOKKEEPING.match(lower):
+        return "other", "its name is that of a number of the clock's or the controller's"
     if _AMBIENT.search(lower):
         return "disturbance", "its name is that of the surroundings"
     if _INPUT.match(lower) and unit not in ("degC", "s"):
@@ -224,12 +237,13 @@ def roles_of_data(
     out: dict[str, tuple[str, str]] = {}
     for name in [name for name in columns if name not in fixed]:
         values = columns[name][np.isfinite(columns[name])]
-        moves = np.abs(np.diff(values))
-        moves, rows = moves[moves > 0], max(values.size, 1)
-        if not moves.size:
+        steps, rows = np.diff(values), max(values.size, 1)
+        if not steps.any():
             out[name] = "other", "it never moves"
-        elif moves.size <= _HELD_SHARE * rows and np.median(moves) >= _HELD_SIZE * np.ptp(values):
-            out[name] = "input", f"it is held between {moves.size} moves in {rows} rows"
+        elif rows >= _FEW and _mostly_even(steps):
+            out[name] = "other", "it counts rows or time"
+        elif _is_held(values):
+            out[name] = "input", f"it is held between {np.count_nonzero(steps)} moves in {rows} rows"
     roles = {**fixed, **{name: role for name, (role, _) in out.items()}}
     names = [n for n in columns if roles.get(n) != "other" and np.nanmax(columns[n]) > np.nanmin(columns[n])]
     chosen = [columns[name][:_MOST_ROWS] for name in names]
@@ -252,6 +266,80 @@ def roles_of_data(
         name = min(reversed(open_), key=lambda n: net[n])
         out[name] = "output", "the others predict it more than it predicts them"
     return out
+
+
+def _mostly_even(steps: NDArray[np.float64]) -> bool:
+    usual = np.median(steps)
+    return bool(np.mean(np.abs(steps - usual) < _EXACT * np.abs(usual)) >= _COUNTS)
+
+
+def _is_held(values: NDArray[np.float64]) -> bool:
+    """Tell whether a column moves in few rows, and then far, as what a person or a relay sets does."""
+    known = values[np.isfinite(values)]
+    moves = np.abs(np.diff(known))
+    held = 0 < np.count_nonzero(moves) <= _HELD_SHARE * known.size
+    return bool(held and np.median(moves[moves > 0]) >= _HELD_SIZE * np.ptp(known))
+
+
+def _unlike_inputs(
+    columns: Mapping[str, NDArray[np.float64]], guesses: Mapping[str, tuple[str, str]], stated: Sequence[str]
+) -> dict[str, tuple[str, str]]:
+    """Return the columns that are inputs by their unit alone and move in most rows, where another is held.
+
+    ``stated``: inputs that need no guess. Where none is held a controller moves them, in every row.
+    """
+    by_unit = [
+        name for name, (_, why) in guesses.items() if why.startswith("its unit is") and why[12:] != "degC"
+    ]
+    likely = [n for n, (role, why) in guesses.items() if role == "input" or why == NO_CLUE]
+    held = next((name for name in (*stated, *likely) if _is_held(columns[name])), None)
+    moving = [
+        name
+        for name in by_unit
+        if np.count_nonzero(np.diff(columns[name])) > _HELD_SHARE * len(columns[name])
+    ]
+    why = f"it moves in most rows, and {held} is held between its moves, as inputs are"
+    return dict.fromkeys(moving if held else (), ("other", why))
+
+
+def _computed(
+    columns: Mapping[str, NDArray[np.float64]], guessed: Mapping[str, bool]
+) -> dict[str, tuple[str, str]]:
+    """Return the columns that are copies of others, or of a set point less a reading, with what they are of.
+
+    ``guessed``: name -> whether a clue says what the column is, for those whose role is no user's; of two
+    copies the one with a clue, else the first, stays.
+    """
+    shown = {n: v[:_MOST_ROWS] for n, v in columns.items() if np.isfinite(v).all() and np.ptp(v) > 0}
+    out: dict[str, tuple[str, str]] = {}
+    order = sorted(shown, key=lambda n: (n in guessed) + (not guessed.get(n, True)))
+    for at, name in enumerate(order):
+        if name not in guessed:
+            continue
+        kept = [n for n in order[:at] if n not in out]
+        of = next((n for n in kept if _explains(shown[name], shown[n])), None)
+        if of is not None:
+            out[name] = "other", f"it is {of} in another unit"
+            continue
+        goals = [n for n in shown if n != name and (_SETPOINT.search(n.lower()) or _is_held(shown[n]))]
+        pairs = ((g, n) for g in goals for n in kept if n not in goals) if not guessed[name] else ()
+        both = next(((g, n) for g, n in pairs if _explains(shown[name], shown[g], shown[n])), None)
+        if both is not None:
+            out[name] = "other", f"it is computed from {both[0]} and {both[1]}"
+    return out
+
+
+def _explains(y: NDArray[np.float64], *some: NDArray[np.float64]) -> bool:
+    """Tell whether a column is a sum of multiples of others but for rounding."""
+    x = np.column_stack([np.ones(y.size), *some])
+    head = slice(0, 200)  # most that are no copies show it here
+    moves = np.abs(np.diff(y))
+    least = max(_EXACT * float(np.ptp(y)), float(moves[moves > 0].min(initial=np.inf)))
+    for rows in (head, slice(None)):
+        left = y[rows] - x[rows] @ np.linalg.lstsq(x[rows], y[rows], rcond=None)[0]
+        if np.abs(left).max() > least or left.std() > _ROUNDED * y.std():
+            return False
+    return True
 
 
 def _predictive_gain(columns: Sequence[NDArray[np.float64]], lags: int) -> NDArray[np.float64]:
@@ -304,9 +392,12 @@ def assign_roles(
                     f"is listed as {chosen[name]} and as {role}", file=file, column=name, hint="choose one"
                 )
             chosen[name] = role
-    guesses = {n: explain_role(n, unit) for n, unit in units.items() if n not in {**(given or {}), **chosen}}
-    clear = {name: role for name, (role, why) in guesses.items() if why != NO_CLUE}
-    fixed = clear | (given or {}) | chosen
+    stated = (given or {}) | chosen
+    guesses = {n: explain_role(n, unit) for n, unit in units.items() if n not in stated}
+    if columns is not None and all(len(values) >= _FEW for values in columns.values()):
+        guesses |= _computed(columns, {n: why != NO_CLUE for n, (_, why) in guesses.items()})
+        guesses |= _unlike_inputs(columns, guesses, [n for n, role in stated.items() if role == "input"])
+    fixed = {name: role for name, (role, why) in guesses.items() if why != NO_CLUE} | stated
     if columns is not None and not {"input", "output"} <= {*fixed.values()}:
         guesses |= roles_of_data(columns, units, fixed)
     roles, reasons = {}, {}

@@ -36,7 +36,7 @@ import numpy as np
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import as_logs
-from thermogrip.datasets.schema import Log, log_name, names
+from thermogrip.datasets.schema import Log, column, log_name, names
 from thermogrip.sysid.blackbox.fit import (
     BLACK_BOXES,
     FAMILIES,
@@ -412,15 +412,19 @@ def identify(
     """
     records = as_logs(logs, inputs, outputs, disturbances)
     network, records, converted = _for_network(network if "network" in models else None, records)
+    if network is None:
+        records = _without_still(records)
     u, y, d = signals(records, inputs=inputs, outputs=outputs, disturbances=disturbances)
     candidates = _candidates(models, network)
     if leave_one_out and len(records) < 2:
         raise UserError("leaving one log out needs at least two logs", hint="give another log")
     checked = check_data(records, inputs=u, outputs=y, disturbances=d, average=average)
-    for finding in checked.of("excitation"):
-        if finding.verdict == "fail":
-            hint = "move it in the experiment, or leave it out"
-            raise UserError(finding.says, file=log_name(records[0]), column=finding.channel, hint=hint)
+    failed = [finding for finding in checked.of("excitation") if finding.verdict == "fail"]
+    if failed:
+        says, kept = "; ".join(f.says for f in failed), [n for n in u if n not in {f.channel for f in failed}]
+        hint = "move it in the experiment, or leave it out"
+        hint += f" with --inputs {','.join(kept)}" if 0 < len(kept) < len(u) else ""
+        raise UserError(says, file=log_name(records[0]), column=failed[0].channel, hint=hint)
     cases = list(cases_of(records, leave_one_out))
     boxes = [] if leave_one_out else [model for model in candidates if model != "network"]
     parts = _Parts(progress, len(boxes) + len(cases) * (len(candidates) if leave_one_out else 2) + 2)
@@ -498,6 +502,33 @@ def identify(
     )
 
 
+def _without_still(logs: list[Log]) -> list[Log]:
+    """Return the logs with guessed inputs and outputs that never move as ``other``, if others of them do."""
+    guesses = _guesses(logs)
+    for role in ("input", "output"):
+        group = names(logs[0], role)
+        still = [name for name in group if not _moves(logs, name)]
+        if len(still) < len(group):
+            changed = [name for name in still if name in guesses]
+            logs = [
+                log.assign({n: log[n].assign_attrs(role="other") for n in changed if n in log})
+                for log in logs
+            ]
+    return logs
+
+
+def _moves(logs: Sequence[Log], name: str) -> bool:
+    """Tell whether the readings of a column, if it has any, differ over the logs."""
+    values = np.concatenate([column(log, name) for log in logs if name in log])
+    return not np.isfinite(values).any() or bool(np.nanmax(values) > np.nanmin(values))
+
+
+def _guesses(logs: Sequence[Log]) -> dict[str, str]:
+    """Return by column what the guess of its role rests on; the first log has precedence."""
+    lines = [line for log in reversed(logs) for line in str(log.attrs.get("guesses", "")).splitlines()]
+    return dict(line.split(": ", 1) for line in lines if ": " in line)
+
+
 def _signal_roles(
     logs: Sequence[Log],
     groups: tuple[Sequence[str], Sequence[str], Sequence[str]],
@@ -505,11 +536,9 @@ def _signal_roles(
     network: GreyModel | None,
 ) -> tuple[SignalRole, ...]:
     """Return what each column of the logs was taken for: inputs, disturbances, outputs, the rest."""
-    units, guesses = dict[str, str](), dict[str, str]()
+    units, guesses = dict[str, str](), _guesses(logs)
     for log in reversed(logs):  # the first log has precedence
         units |= {str(name): str(item.attrs.get("units", "1")) for name, item in log.items()}
-        lines = str(log.attrs.get("guesses", "")).splitlines()
-        guesses |= dict(line.split(": ", 1) for line in lines if ": " in line)
     of_network = {} if network is None else roles_of(network)
     taken = {name: r for r, group in zip(("input", "disturbance", "output"), groups) for name in group}
     out = []
@@ -521,6 +550,8 @@ def _signal_roles(
             why = f"network {network.name}"
         elif name in guesses:
             why, guessed = guesses[name], True
+            if role == "left out" and why.startswith("its ") and not _moves(logs, name):
+                why += ", but it never moves"
         elif role == "left out":
             why = "not named"
         out.append(SignalRole(name, units[name], role, why, guessed))

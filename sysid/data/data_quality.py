@@ -4,7 +4,7 @@ Every finding has a verdict (``ok``, ``warn``, ``fail``) and a consequence in wo
 
 * **quantum** of each channel, against how far the output moves in a sample;
 * **noise** of each output: one that jumps and holds, or has none at all, may be a set point or computed;
-* **jitter** of the sample times, **gaps** of more than 10 s, share of **lost** readings;
+* **jitter** of the sample times, **gaps** of more than 10 s and five rows, share of **lost** readings;
 * **saturation**: share of the rows at which an input is on its own limit;
 * **excitation**: the order n up to which the input is persistently exciting, that is, the rank of the
   covariance of n successive values, and the condition of the correlation between the inputs;
@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import f as f_distribution
 
+from thermogrip.datasets.repair import GAP_SECONDS, GAP_STEPS
 from thermogrip.datasets.resample import gaps
 from thermogrip.datasets.schema import Log, column, log_name
 from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid, quantum, sample_time, signals
@@ -396,7 +397,6 @@ def _second_differences(y: Array, steps: Array) -> Array:
     return np.asarray(squares[np.isfinite(squares)])
 
 
-_LONGEST = 10.0  # [s] that a row may stand for; beyond it the input is unknown
 _SMALL = 0.05  # of an input's range: that is no drive
 THIN_MINUTES, THIN_SHARE = 15.0, 0.15  # below either, a side of the drive is thinly covered
 
@@ -449,8 +449,9 @@ def evidence(plant: Plant, logs: Sequence[Log]) -> Evidence:
 
 def _spent(steps: Array) -> Array:
     """Return the seconds that each row's input was held, from those between rows."""
-    held = np.append(steps, np.median(steps) if steps.size else 0.0)
-    return np.asarray(np.minimum(held, _LONGEST))
+    usual = np.median(steps) if steps.size else 0.0
+    # beyond a gap the input is unknown
+    return np.asarray(np.minimum(np.append(steps, usual), max(GAP_SECONDS, GAP_STEPS * usual)))
 
 
 def _kinds(name: str, values: Sequence[Array], *, on_off: bool) -> dict[str, list[NDArray[np.bool_]]]:

@@ -293,3 +293,54 @@ def test_names_go_first_and_data_are_asked_where_these_show_no_input_or_no_outpu
     assert assign_roles(units, columns=columns, inputs=["b"])[0]["a"] == "other"
     named = {"q1": HELD, "t_x": plant_of(HELD), "b": NOISY}
     assert assign_roles({"q1": "1", "t_x": "degC", "b": "1"}, columns=named)[0]["b"] == "other"
+
+
+READING = np.round(4 * (20 + 5 * plant_of(HELD, noise=0.02))) / 4  # degC, a converter of 0.25
+GOAL = np.repeat([30.0, 60.0], 300)
+
+
+@pytest.mark.parametrize(
+    ("columns", "roles", "reason"),
+    [
+        # a PID's log: what it computes is neither moved nor read
+        ({"u": ("1", HELD), "t_a": ("degC", READING), "setpoint": ("1", GOAL), "dev": ("1", GOAL - READING)},
+         "input output other other", "it is computed from setpoint and t_a"),
+        ({"u": ("1", HELD), "t_a": ("degC", READING), "setpoint": ("1", GOAL),
+          "dev": ("1", np.trunc(GOAL - READING))},
+         "input output other other", "it is computed from setpoint and t_a"),
+        ({"u": ("1", HELD), "t_a": ("degC", READING), "raw": ("1", 100 - 2.5 * READING)},
+         "input output other", "it is t_a in another unit"),
+        ({"u": ("1", HELD), "t_a": ("degC", READING), "t_f": ("degC", 1.8 * READING + 32)},
+         "input output other", "it is t_a in another unit"),
+        ({"a": ("1", 2.55 * HELD), "q1": ("1", HELD), "t_a": ("degC", READING)},
+         "other input output", "it is q1 in another unit"),
+        # a second sensor of the same thing is none
+        ({"u": ("1", HELD), "t_a": ("degC", READING), "t_b": ("degC", READING + 0.02 * NOISY)},
+         "input output output", "its name is that of a reading"),
+        # volts: of a sensor where the drive is held, of a drive where a controller moves it or it is held
+        ({"a": ("1", HELD), "t_a": ("degC", READING), "cell": ("V", NOISY)},
+         "input output other", "it moves in most rows, and a is held between its moves, as inputs are"),
+        ({"t_a": ("degC", READING), "cell": ("V", NOISY)}, "output input", "its unit is V"),
+        ({"t_a": ("degC", READING), "cell": ("V", HELD)}, "output input", "its unit is V"),
+        # counts of rows, and of the hours of a day
+        ({"a": ("1", HELD), "t_a": ("degC", READING), "b": ("1", np.arange(600.0))},
+         "input output other", "it counts rows or time"),
+        ({"a": ("1", HELD), "t_a": ("degC", READING), "b": ("1", np.arange(600) % 24.0)},
+         "input output other", "it counts rows or time"),
+        ({"a": ("1", HELD), "t_a": ("degC", READING), "Hour": ("1", HELD[::-1])},
+         "input output other", "its name is that of a number of the clock's or the controller's"),
+        ({"u1": ("1", HELD), "t_a": ("degC", READING), "Kp": ("1", HELD[::-1])},
+         "input output other", "its name is that of a number of the clock's or the controller's"),
+    ],
+)  # fmt: skip
+def test_what_is_computed_or_counted_is_neither_moved_nor_read(columns, roles, reason):
+    units = {name: unit for name, (unit, _) in columns.items()}
+    values = {name: v for name, (_, v) in columns.items()}
+    found, reasons = assign_roles(units, columns=values)
+    assert [found[name] for name in columns] == roles.split()
+    odd = [name for name in columns if found[name] == "other" and name != "setpoint"]
+    assert reasons[(odd or [*columns])[-1]] == reason
+    # a user's word goes before, and twenty rows are what it takes to compare
+    assert assign_roles(units, columns=values, outputs=[[*columns][-1]])[0][[*columns][-1]] == "output"
+    few = {name: v[:19] for name, v in values.items()}
+    assert not any("in another unit" in why for why in assign_roles(units, columns=few)[1].values())

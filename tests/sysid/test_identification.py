@@ -305,6 +305,35 @@ def test_a_signal_that_only_a_later_log_has_is_left_out_and_reported():
     assert "b: t_room left out, for a has no such signal" in found.notes
 
 
+def with_still(role="input", **more):
+    log = plant_log()
+    for name, value in more.items():
+        log[name] = ("time", np.full(900, value), {"units": "1", "role": role})
+    return log
+
+
+def test_a_guessed_column_that_never_moves_is_left_out_and_reported():
+    log = with_still(fan=0.4, valve=7.0)
+    log.attrs["guesses"] = "fan: its name is that of a drive\nvalve: its unit is V"
+    found = identify(log, models=["arx"], average=2.0, draws=0)
+    assert found.plant.inputs == ("q",)
+    whys = {s.name: (s.role, s.why) for s in found.signals}
+    assert whys["fan"] == ("left out", "its name is that of a drive, but it never moves")
+    assert whys["valve"] == ("left out", "its unit is V, but it never moves")
+    assert log["fan"].attrs["role"] == "input"  # the caller's log is as it was
+    moved = with_still(fan=0.4)
+    moved["fan"].values[400:500] = 0.9
+    moved.attrs = dict(log.attrs, name="b")
+    both = identify([log, moved], models=["arx"], average=2.0, draws=0)
+    assert both.plant.inputs == ("q", "fan")
+
+
+def test_stated_inputs_that_never_move_are_refused_together_with_the_way_out():
+    with pytest.raises(UserError, match=r"fan never moves.*; valve never moves") as refused:
+        identify(with_still(fan=0.4, valve=7.0), models=["arx"], average=2.0)
+    assert "leave it out with --inputs q" in str(refused.value)
+
+
 @pytest.mark.parametrize("kind", ["oe", "subspace"])
 def test_an_input_that_never_moves_has_no_gain(kind):
     log = plant_log()

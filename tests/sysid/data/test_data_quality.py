@@ -167,6 +167,15 @@ def test_a_gap_does_not_count_as_minutes(gripper):
     assert evidence(gripper, [make_log(time, signals)]).total == pytest.approx(20.0, abs=0.3)
 
 
+def test_rows_of_an_hour_are_no_gaps(gripper):
+    log = load_example_logs()["step_up_down"].isel(time=slice(0, 200))
+    signals = {name: (log[name].values, log[name].attrs["units"], log[name].attrs["role"]) for name in log}
+    time = 3600.0 * np.arange(200)
+    assert evidence(gripper, [make_log(time, signals)]).total == pytest.approx(200 * 60)
+    time[100:] += 6 * 3600.0  # a step of seven hours counts as five
+    assert evidence(gripper, [make_log(time, signals)]).total == pytest.approx(204 * 60)
+
+
 def test_an_input_of_one_sign_is_described_by_its_halves():
     plant = prior_plant(load_network("tclab"))
     t = np.arange(0.0, 3600.0)
