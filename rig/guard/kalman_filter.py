@@ -138,12 +138,11 @@ class History:
         return [m for m in self._kept if m.time > time]
 
     def errors(self, begin: Estimate, y: Array) -> Array:
-        """Return reading less path (B, n_readings, n_y) of every later estimate that the paths reach.
+        """Return reading less path (B, n_readings, n_y) of every later estimate.
 
         ``y`` (B, N + 1, n_y) are the paths' outputs [degC] at native steps, that of ``begin`` first.
         """
-        last = y.shape[1] - 1
-        later = [m for m in self.after(begin.time) if m.step - begin.step <= last]
+        later = self.after(begin.time)
         at = [m.step - begin.step for m in later]
         return np.asarray(np.array([m.y for m in later])[None] - y[:, at])
 

@@ -237,7 +237,7 @@ def _window_slopes(
     p[np.arange(1, n + 1), np.arange(n)] += steps
     many = [np.repeat(part[None], n + 1, axis=0) for part in (begin.x, u, d)]
     y = np.asarray(model.rollout(many[0], many[1], many[2], p)[0])
-    at = [min(m.step - begin.step, y.shape[1] - 1) for m in _recent(past, begin, smooth)]
+    at = [m.step - begin.step for m in _recent(past, begin, smooth)]
     ends = y[:, at].mean(axis=1)
     return ends[0] - y[0, 0], (ends[1:] - ends[0]).T
 
@@ -266,7 +266,7 @@ def _compare(
     switched = [at for at, name in enumerate(plant.inputs) if name in plant.model.switches]
     floor = window.floor + (settings.switching if np.ptp(u[:, switched], axis=0).any() else 0.0)
     readings = np.array([m.y for m in recent])
-    ends = np.array([path[min(m.step - begin.step, len(path) - 1)] for m in recent])
+    ends = path[[m.step - begin.step for m in recent]]
     found = []
     for k in np.flatnonzero(known & np.isfinite(readings).all(axis=0)):
         measured, expected = float(readings[:, k].mean()), float(ends[:, k].mean())
@@ -301,7 +301,7 @@ class ModelMonitor:
         if drift is not None:
             self.adopt(drift)
         keep = int(np.ceil(max(self.settings.windows) / plant.dt)) + 8
-        self._filter = RigFilter(self._model, self.settings, keep)
+        self._filter, self._seconds = RigFilter(self._model, self.settings, keep), keep * plant.dt
 
     def adopt(self, drift: PlantDrift) -> None:
         """Use what is known of the rig's parameters from now on, and forget the evidence."""
@@ -313,8 +313,7 @@ class ModelMonitor:
         y = _in_order(self.plant.outputs, values)
         self._filter.reset(time, y, _in_order(self.plant.disturbances, values))
         self.compared_from = time + (0.0 if self._filter.at_rest else self.settings.warm_up)
-        seconds = max(self.settings.windows) + 4 * self.settings.smooth + 5
-        self._past = History(self._filter.steps, seconds)
+        self._past = History(self._filter.steps, self._seconds)
         self._past.add(self._filter.moment(time, y))
         self._masked: frozenset[str] = frozenset()
         self._since = np.full(len(self.plant.outputs), self.compared_from)

@@ -129,17 +129,6 @@ def test_what_is_regulated_is_guarded_without_a_plant_too() -> None:
     assert [one.trip is None for one in read_by(guard, *[{BLOCK: nan}] * 3)] == [True, True, False]
 
 
-def test_without_a_model_the_room_of_the_rules_is_the_one_of_any_name() -> None:
-    guard, steady = Guard(), {"t_surface": 25.0, ROOM: 25.0}
-    guard.start(Reading(0.0, steady, {"drive": 0.0}, 1), 0.0, {"drive": "1"})
-    kinds = []
-    for k in range(1, 70):  # full drive moves nothing, and no skin was far from the room before
-        guard.asked({"drive": 1.0}, 1)
-        found = guard.check(Reading(float(k), steady, {"drive": 1.0}, 1), float(k), planned=1.0)
-        kinds += [found.trip.kind] if found.trip else []
-    assert kinds[0] == "driver"
-
-
 def test_a_twin_has_its_room_in_every_measured_temperature_and_asks_for_the_rest() -> None:
     assert Twin(PLANT, ambient=21.0).read().values[ROOM] == 21.0
     with pytest.raises(UserError, match="the plant has the disturbance 'heat_ambient'"):

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -281,6 +282,11 @@ def test_a_device_that_never_stops_talking_is_not_waited_for_for_ever(
         DeviceRig(Flood(device), clock=clock, sleep=clock.sleep, timeout=0.02, greeting=0.1)
     with pytest.raises(PortError, match="says only"):
         recognise(Flood(device), seconds=1.0)
+    for seconds, rounds in ((0.0, 1), (3.0, 3)):  # of two questions and 0.5 s each
+        port = Mock(url="COM3", **{"read.return_value": b""})
+        with pytest.raises(PortError, match="says nothing; check power and firmware"):
+            recognise(port, seconds=seconds)
+        assert port.write.call_count == port.drop_input.call_count == 2 * rounds
     assert real() < 10.0
 
 

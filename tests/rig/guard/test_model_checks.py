@@ -326,6 +326,11 @@ def test_each_fault_begins_at_seven_parts_of_the_window_and_a_bias_holds_until_t
     causes, rows = _hypotheses(model, u, np.array([0.1]))
     said = ("", "nothing", "full drive", "half of what is asked", "full cooling", "way round", "has stopped")
     assert all(cause.text.endswith(words) for cause, words in zip(causes, said))
+    usual = ("driver", "the driver")
+    assert [(c.kind, c.subject, c.rarity) for c in causes[:7]] == [
+        ("model", "", 1.0), (*usual, 1.0), (*usual, 1.2), (*usual, 1.0), (*usual, 1.2),
+        ("reversed", "the module", 2.0), ("pump", "the pump", 1.0),
+    ]  # fmt: skip
     assert len(causes) == len(rows) == 1 + 6 * 7
     assert rows[0].tolist() == [[pytest.approx(0.7), 1.0]] * 20
     for part, onset in enumerate((0, 5, 10, 15, 17, 18, 19)):
@@ -333,6 +338,14 @@ def test_each_fault_begins_at_seven_parts_of_the_window_and_a_bias_holds_until_t
         assert (of[:, :onset] == rows[0][:onset]).all()
         want = [(0.0, 1.0), (1.0, 1.0), (0.3, 1.0), (-1.0, 1.0), (-0.6, 1.0), (0.6, 0.0)]
         assert of[:, onset:].tolist() == [[list(one)] * (20 - onset) for one in want]
+    narrow = RigModel(replace(integrator(), units={"q": "W"}, valid={"q": (-0.5, 1.0)}))
+    assert [rows[0, 0] for _, rows in _wrong_drives(narrow, np.full((4, 1), 0.8))] == [
+        0.0,
+        1.0,
+        0.4,
+        -0.5,
+        -0.5,
+    ]
     still = np.column_stack([np.full(4, 0.6), np.full(4, 0.5)])
     assert "the pump has stopped" not in [cause.text for cause in _hypotheses(model, still, np.zeros(1))[0]]
 
@@ -371,6 +384,15 @@ def test_a_window_compares_the_last_three_seconds_with_where_the_drive_leads() -
     assert [astuple(one) for one in made.compare()] == want
     assert found == []
     assert Residual("bias", "a", 0.0, 0.0, -3.0, 2.0).excess == 1.5
+
+
+@pytest.mark.parametrize(("period", "windows"), [(49.0, [10.0, 30.0, 90.0]), (33.0, [10.0, 30.0])])
+def test_a_window_begins_at_a_reading_up_to_eight_steps_earlier(period: float, windows: list[float]) -> None:
+    made = ModelMonitor(integrator())
+    made.reset(0.0, {"a": 0.0})
+    for k in range(1, 51):
+        follow(made, period * k, {"q": 0.0}, {"a": 0.0})
+    assert [one.window for one in made.compare()] == windows
 
 
 def test_after_a_touch_a_sensors_windows_and_jumps_start_afresh() -> None:
