@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from thermogrip.rig.records.recorder import RunFolder
 from thermogrip.rig.records.run_folder import read_run
 from thermogrip.rig.serial.port import PortError
 from thermogrip.rig.session.loop import PHASES, hold_last_good
-from thermogrip.rig.session.session import Session, run_session
+from thermogrip.rig.session.session import Object, Session, _result, grasp_of_rows, run_session
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.contact.simulation import Grip
 from thermogrip.sysid.plant.plant import Plant
@@ -166,13 +167,68 @@ def test_power_is_off_whatever_ends_it(plant: Plant, controller: Any, error: typ
     assert is_off(twin)
 
 
-def test_a_decision_ends_the_contact_early(plant: Plant, controller: Any) -> None:
-    def enough(grasp: Grasps) -> bool:
-        return bool(grasp["time"].values[-1] >= 2.0)
+def test_a_grasp_has_its_labels_and_ends_where_that_is_decided(plant: Plant, controller: Any) -> None:
+    asked, told = [], []
 
-    session = run_session(Twin(plant), controller, 38.0, grasp=("copper", 18.0), stop=enough)
-    assert session.grasps["time"].values[-1] == pytest.approx(2.0)
-    assert any(event.kind == "decided" for event in session.events)
+    def enough(grasp: Grasps) -> bool:
+        asked.append(float(grasp["time"].values[-1]))
+        return len(asked) == 2
+
+    thing = Object("copper", "t_ambient", 0.3, {"block": "b1", "repeat": 2.0}, "g7")
+    report = lambda *given: told.append((round(given[0], 6), given[1]))  # noqa: E731
+    options = {"grasp": thing, "grasp_time": 2.0, "stop": enough, "progress": report}
+    session = run_session(Twin(plant), controller, 38.0, settle_timeout=400.0, **options)
+    assert asked == [0.2, 0.3]  # not of two samples
+    events = {event.kind: event for event in session.events}
+    assert events["decided"].text == "stopped 0.3 s after contact"
+    assert events["closed"].text == "gripper closed on copper at 25 degC"
+    about = {"grasp_id": "g7", "material": "copper", "t_object": 25.0, "t_object_sd": 0.3, "t_gripper": 38.0}
+    assert events["closed"].data == {**about, "block": "b1", "repeat": 2.0}
+    found = session.grasps
+    want = {**about, "grasp": about.pop("grasp_id"), "repeat": 2.0, "t_ambient": 25.0, "block": "b1"}
+    del want["grasp_id"]
+    assert {key: found[key].values.tolist()[0] for key in want} == want
+    assert told[:2] == [(0.0, "settling"), (round(0.9 / 400, 6), "settling")]
+    assert told[-5:] == [(f, "grasping") for f in (0.9, 0.9, 0.905, 0.91, 0.915)]
+    whole = run_session(Twin(plant), controller, 38.0, grasp=("wood", 38.0), grasp_time=0.5)
+    assert whole.grasps["time"].values[-1] == 0.5
+    assert np.isnan(whole.contact)
+    assert "no contact" in [event.kind for event in whole.events]
+
+
+def test_a_grasp_of_rows_has_what_they_and_its_labels_have() -> None:
+    same = {"t_lab_degC": 21.0, "t_skin_2_degC": 31.0}
+    rows = [{"time_s": 9.9 + k / 3, "t_skin_degC": 30.0 - k, **same} for k in range(3)]
+    about = {"grasp_id": 7, "material": "", "t_object": None, "t_gripper": 38.0, "block": "b", "mood": 1}
+    found = grasp_of_rows(rows, 10.0, "t_skin", about, {"t_lab"})
+    assert found["time"].values.tolist() == [-0.1, 0.233333, 0.566667]
+    assert found["t_surface"].values.tolist() == [[30.0, 29.0, 28.0]]
+    assert found["t_surface_2"].values.tolist() == [[31.0] * 3]
+    single = {name: found[name].values.tolist()[0] for name in ("grasp", "t_gripper", "block", "t_ambient")}
+    assert single == {"grasp": "7", "t_gripper": 38.0, "block": "b", "t_ambient": 21.0}
+    assert np.isnan(found["t_object"].values).all()
+    assert found.attrs["name"] == " at nan degC"
+    assert "t_surface_2" not in grasp_of_rows(rows, 10.0, "t_lab", about, ())
+
+
+def test_of_several_targets_the_worst_figures_are_the_sessions() -> None:
+    """a comes to 30.2 degC at 50 s, b goes 2 K beyond 20 degC; what the contact does counts for neither."""
+    t = np.arange(0.0, 201.0)
+    columns = {
+        "time_s": t, "phase": np.where(t <= 180, t > 100, 4.0), "a_degC": np.where(t < 50, 10.0, 30.2),
+        "b_degC": np.where(t < 20, 10.0, np.where(t < 30, 22.0, 19.9)),
+    }  # fmt: skip
+    columns |= {name: np.where(t <= 180, columns[name], 99.0) for name in ("a_degC", "b_degC")}
+    run = SimpleNamespace(
+        rows=[{}, {}], target={"a": 30.0, "b": 20.0}, column=columns.__getitem__, events=[], log=lambda: None
+    )
+    found = _result(run, "not settled", None, 0.25)
+    assert (found.settle_time, found.bias) == (pytest.approx(50, abs=3), pytest.approx(0.2))
+    assert found.overshoot == pytest.approx(2.0)
+    assert "give it more time" in found.advice
+    run.rows = run.rows[:1]
+    with pytest.raises(UserError, match="ended at its first reading"):
+        _result(run, "settled", None, 0.25)
 
 
 @pytest.mark.parametrize(
