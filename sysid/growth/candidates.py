@@ -332,6 +332,8 @@ def _of_nodes(network: Network) -> Iterator[Candidate]:
             yield Candidate(f"{name}: convection", patch, about="loss that grows faster than the difference")
     for node, conductance in _to_air(network):
         place, T, G = f"{node}_bench", f"t_{node}_bench", f"G_{node}_bench"
+        if place in network.boundaries:
+            continue
         value = 0.5 * network.parameters[conductance].value
         patch = {
             "boundaries": {place: {"temperature": T}},

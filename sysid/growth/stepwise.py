@@ -157,9 +157,7 @@ def grow(
     base = _try(model, cases, wanted, warmup, None)
     plant = fit_network(model, list(logs))
     residual = residual_terms(plant, logs, warmup=warmup)
-    left = (
-        [(c, "") for c in candidates or ()] if candidates is not None else _proposals(model, residual, wanted)
-    )
+    left = _proposals(model, residual, wanted) if candidates is None else [(c, "") for c in candidates]
     rows = [_base_row(base, cases, plant)]
     for number in range(1, rounds + 1):
         found: list[tuple[GrowthRow, _Trial, Plant | None]] = []

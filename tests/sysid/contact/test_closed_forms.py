@@ -285,3 +285,24 @@ def test_inversion_error_falls_as_predicted():
 def test_what_no_body_has_is_refused(call):
     with pytest.raises(ValueError, match=r"must|need|positive"):
         call()
+
+
+def test_a_sensor_on_a_perfect_contact_follows_a_step():
+    """The skin steps at once, so that the sensor relaxes to it; a stiff contact comes near."""
+    of = {"e_dev": WATER, "e_obj": COPPER, "lag": 0.8, **WARM}
+    t = np.array([0.0, 0.4, 3.0])
+    want = 23.0 + 20.0 * COPPER / (WATER + COPPER) * (1 - np.exp(-t / 0.8))
+    np.testing.assert_allclose(sensor_temperature(t, **of), want, rtol=1e-12)
+    np.testing.assert_allclose(sensor_temperature(t, h_c=1e7, **of), want, atol=2e-3)
+
+
+def test_heat_and_profiles_begin_at_nothing_and_end_in_balance():
+    heat = slab_heat([0.0, 1e9], T0=23.0, T_surf=43.0, capacity=5e4, effusivity=1e4)
+    np.testing.assert_allclose(heat, [0.0, 20.0 * 5e4])
+    of = {"T0": 43.0, "thickness": 0.02, "alpha": 1e-5}
+    np.testing.assert_allclose(slab_temperature([0.0, 1e9], 0.01, T_surf=23.0, **of), [43.0, 23.0])
+    met = slab_temperature_convective([0.0, 1e9], [0.0, 0.02], T_fluid=23.0, h=500.0, k=70.0, **of)
+    np.testing.assert_allclose(met, [43.0, 23.0])
+    assert contact_heat([0.0], e_dev=WATER, e_obj=COPPER, h_c=800.0, **WARM)[0] == 0.0
+    perfect = contact_heat([4.0], e_dev=WATER, e_obj=COPPER, **WARM)[0]  # twice the flux times the time
+    assert perfect == pytest.approx(8.0 * contact_flux([4.0], e_dev=WATER, e_obj=COPPER, **WARM)[0])

@@ -99,3 +99,60 @@ def test_nearby_modes_are_right_to_first_order():
             exact = stack_modes(replace(stack, **{name: float(moved[i])}))
             off.append(np.abs(nearby_modes(stack, moved[None]).lam[0] - exact.lam)[:20].max())
         assert off[1] < 0.02 * off[0] + 1e-9, name  # a hundredth: the error is of second order
+
+
+@pytest.mark.parametrize(
+    ("end", "dt", "repeat", "last"),
+    [(0.005, [0.01], [2], 0.02), (0.1, [0.01], [10], 0.1), (0.101, [0.01, 0.02], [10, 2], 0.14),
+     (10.0, 0.01 * 2.0 ** np.arange(7), [10] * 6 + [6], 10.14)],
+)  # fmt: skip
+def test_steps_double_after_ten_until_the_end_is_past(end, dt, repeat, last):
+    nodes = time_nodes(end)
+    np.testing.assert_allclose(nodes.dt, dt)
+    assert nodes.repeat.tolist() == repeat
+    assert (nodes.t[0], nodes.t[-1], nodes.t.size) == (0.0, pytest.approx(last), sum(repeat) + 1)
+    fine = time_nodes(0.7, first=0.1, per_group=2)  # 0.1, 0.1, 0.2, 0.2, then 0.4 twice
+    np.testing.assert_allclose(fine.t, [0.0, 0.1, 0.2, 0.4, 0.6, 1.0, 1.4])
+
+
+def test_in_the_end_heat_flows_through_all_resistances_in_a_row():
+    """1 / 500 of the contact, 0.4 / 600 of the sheet, 5 / 1600 behind it and 1 / 200 at the back."""
+    stack = replace(PLAIN, e_outer=600.0, z_outer=0.4, z_inner=5.0, g_back=200.0, g_side=300.0, c_side=2e3)
+    nodes = time_nodes(3000.0)
+    given = {"effusivity": [1e8], "capacity": [1e12], "h_c": [500.0]}
+    rise, _, flux = step_response(stack, nodes, **given)
+    through = 1 / (1 / 500 + 0.4 / 600 + 5 / 1600 + 1 / 200)
+    assert flux[0, -1] == pytest.approx(through, rel=1e-3)
+    assert rise[0, -1] == pytest.approx(1 - through * (1 / 500 + 0.4 / 600), rel=1e-3)
+    # a contact that creeps by a fifth ends at 600 of it
+    creeping = step_response(replace(stack, creep=0.2, first=0.5), nodes, **given)[2][0, -1]
+    assert creeping == pytest.approx(1 / (1 / through - 1 / 500 + 1 / 600), rel=1e-3)
+
+
+def test_a_contact_builds_up_and_then_creeps():
+    """Between two bodies that resist nothing the flux is h(t): 0.1 to 1 of it in 0.5 s,
+    and a half more in 3 s."""
+    stack = replace(
+        PLAIN, e_outer=1e7, e_inner=1e7, first=0.1, build_up=0.5, creep=0.5, settle=3.0, g_back=1e9
+    )
+    nodes = time_nodes(8.0)
+    given = {"effusivity": [1e7], "capacity": [1e12], "h_c": [200.0]}
+    for tau, asked in ((0.5, {}), (0.9, {"build_up": [0.9]})):
+        flux, t = step_response(stack, nodes, **given, **asked)[2][0], nodes.t
+        want = 200 * (0.1 + 0.9 * -np.expm1(-t / tau)) * (1 + 0.5 * -np.expm1(-t / 3.0))
+        np.testing.assert_allclose(flux, want, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("given", "fine"),
+    [({"first": 0.0}, True), ({"first": 1.0}, True), ({"creep": -0.2}, True), ({"creep": -0.21}, False),
+     ({"first": -0.01}, False), ({"first": 1.01}, False), ({"g_back": -1.0}, False), ({"g_far": -1.0}, False),
+     ({"c_side": 0.0}, False), ({"settle": 0.0}, False), ({"build_up": 0.0}, False)],
+)  # fmt: skip
+def test_which_stacks_there_are(given, fine):
+    assert (PLAIN.leak, PLAIN.g_side, PLAIN.c_side, PLAIN.settle, PLAIN.g_far) == (0.0, 0.0, 1e4, 2.5, 0.0)
+    if fine:
+        assert replace(PLAIN, **given) != given
+        return
+    with pytest.raises(ValueError, match=f"{next(iter(given))} must be positive|need 0 <= first <= 1"):
+        replace(PLAIN, **given)

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.materials import load_materials
-from thermogrip.sysid.contact.simulation import Grip, simulate_grasps
+from thermogrip.sysid.contact.response import far_response, step_response, time_nodes
+from thermogrip.sysid.contact.simulation import (
+    SOFT_FINGER,
+    Blocks,
+    Grip,
+    Touch,
+    record_touches,
+    simulate_grasps,
+)
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 
 STILL = {"build_up_sd_ln": 0.0, "onset": 0.0, "onset_sd": 0.0, "t_object_sd": 0.0, "transit_loss": 0.0}
@@ -143,3 +151,67 @@ def test_the_contact_build_up_time_spreads_from_grasp_to_grasp():
     both = grip.draw_many(["copper"] * 20, 43.0, rng, ambient=28.0)
     off = [np.log(touch.h_c) for touch in both], [touch.response([0.3])[0] for touch in both]
     assert np.corrcoef(*off)[0, 1] > 0.4
+
+
+def test_each_circumstance_has_its_own_draw_in_a_fixed_order():
+    """h, onset, temperature, effusivity, build-up: a seed makes the same grasps in every version."""
+    grip = Grip(bias=0.5, transit_loss=0.1, effusivity_sd_ln={"wood": 0.2, "copper": 0.1}, build_up_sd_ln=0.3)
+    z = np.random.default_rng(3).standard_normal((5, 2))
+    names = ["copper", "wood"]
+    touches = grip.draw_many(names, 43.0, np.random.default_rng(3), ambient=28.0)
+    e = [load_materials()[name].effusivity for name in names] * np.exp(np.array([0.1, 0.2]) * z[3])
+    h = np.array([1600.0, 910.0]) * np.exp(0.09 * z[0])
+    away = 43.5 + 0.4 * z[2]
+    nodes = time_nodes(60.0)
+    capacity = [load_materials()[name].rho * load_materials()[name].c_p * 0.02 for name in names]
+    stack = replace(SOFT_FINGER, g_far=50.0)
+    build_up = 0.78 * np.exp(0.3 * z[4])
+    rise = step_response(stack, nodes, effusivity=e, capacity=capacity, h_c=h, build_up=build_up)[0]
+    room = far_response(stack, nodes, rise, effusivity=e, capacity=capacity)
+    lossy = replace(grip, stack=stack).draw_many(names, 43.0, np.random.default_rng(3), ambient=28.0)
+    for i, touch in enumerate(touches):
+        true = away[i] + 0.1 * (28.0 - away[i])
+        assert (touch.h_c, touch.onset, touch.t_object) == pytest.approx((h[i], 0.02 + 0.09 * z[1, i], true))
+        t = touch.onset + np.array([-1.0, 0.2, 3.0])
+        np.testing.assert_allclose(lossy[i].response(t), np.interp(t - touch.onset, nodes.t, rise[i]))
+        np.testing.assert_allclose(
+            lossy[i].by_room(t), (28.0 - true) * np.interp(t - touch.onset, nodes.t, room[i])
+        )
+        assert replace(touch, room=None).by_room(t).tolist() == [0.0, 0.0, 0.0]
+    blocks = Blocks([5e3, 6e3], [300.0, 400.0], [2e4, 3e4])
+    given = grip.draw_many(["", ""], 43.0, np.random.default_rng(3), ambient=28.0, blocks=blocks)
+    assert [touch.h_c for touch in given] == [300.0, 400.0]
+    assert given[1].onset == touches[1].onset
+
+
+def test_readings_are_made_of_level_response_room_drift_and_noise():
+    """The same numbers drawn again: level, slow noise, white noise; then the sensor's step of a sixteenth."""
+    times, rise = np.array([0.0, 4.0]), np.array([0.0, 0.8])
+    touches = [Touch(43.0, 0.5, 1.0, times, rise, np.array([0.0, 2.0])), Touch(33.0, 0.0, 1.0, times, rise)]
+    time, reading = record_touches(touches, np.random.default_rng(6), t_gripper=23.0, leak=0.01)
+    np.testing.assert_allclose(time, np.arange(-20, 101) / 10)
+    rng = np.random.default_rng(6)
+    level, slow, white = rng.standard_normal(2), rng.standard_normal((2, 121)), rng.standard_normal((2, 121))
+    level, keep = 23.0 + 0.35 * level, np.exp(-0.1 / 4.0)
+    slow *= 0.018 * np.where(np.arange(121) > 0, np.sqrt(1 - keep**2), 1.0)
+    for k in range(1, 121):
+        slow[:, k] += keep * slow[:, k - 1]
+    since = np.clip([time - 0.5, time], 0.0, 4.0)
+    want = level[:, None] + (np.array([[43.0], [33.0]]) - level[:, None]) * 0.2 * since
+    want += [[0.5], [0.0]] * since + 0.01 * (28.0 - level[:, None]) * np.maximum(time + 1.0, 0.0)
+    np.testing.assert_array_equal(reading, np.round((want + slow + 0.04 * white) * 16) / 16)
+    short = record_touches(touches, rng, t_gripper=23.0, until=3.0, dt=0.25)[0]
+    np.testing.assert_allclose(short, np.arange(-8, 13) / 4)
+
+
+def test_a_simulated_record_says_what_it_is_of():
+    g = simulate_grasps(Grip(until=1.0), ["copper", "wood"], t_object=43.0, t_gripper=23.0, until=0.5)
+    assert g["grasp"].values.tolist() == ["s0000", "s0001"]
+    assert [set(g[k].values.tolist()) for k in ("t_object", "t_gripper", "t_ambient")] == [
+        {43.0},
+        {23.0},
+        {28.0},
+    ]
+    assert (g.attrs["name"], "split" in g and set(g["split"].values.tolist()) - {""}) in (
+        ("simulated", False), ("simulated", set())
+    )  # fmt: skip

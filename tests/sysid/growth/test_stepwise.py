@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from tests.sysid.greybox.makers import heater
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.growth import stepwise
 from thermogrip.sysid.growth.candidates import (
     Candidate,
     ResidualTerm,
@@ -23,7 +25,7 @@ from thermogrip.sysid.growth.candidates import (
     residual_terms,
     suggested,
 )
-from thermogrip.sysid.growth.stepwise import Growth, GrowthRow, _against, folds_of, grow, growth_table
+from thermogrip.sysid.growth.stepwise import Fold, Growth, GrowthRow, _against, folds_of, grow, growth_table
 from thermogrip.sysid.models.network import NetworkModel, load_network
 from thermogrip.sysid.models.network_spec import network_from_dict
 from thermogrip.sysid.models.state_space import StateSpaceModel
@@ -104,13 +106,125 @@ def test_a_term_that_nothing_asks_for_is_refused_and_a_needless_one_dropped():
     assert pruned.network.parameters == block().parameters
 
 
-def test_a_gain_that_a_line_in_time_gives_too_is_refused():
-    assert "straight line" in _against(ZONE, gain=0.15, se=0.1, straight=0.05)
-    assert _against(ZONE, gain=0.15, se=0.1, straight=0.1) == ""
-    assert "standard error" in _against(ZONE, gain=0.15, se=0.2, straight=0.15)
-    less = replace(ZONE, change="remove")
-    assert _against(less, gain=-0.2, se=0.5, straight=0.0) == "its loss costs 20 %"
-    assert [_against(less, gain=g, se=0.02, straight=0.0) == "" for g in (-0.019, -0.021)] == [True, False]
+@pytest.mark.parametrize(
+    ("change", "gain", "se", "straight", "why"),
+    [
+        ("add", 0.15, 0.1, 0.075, ""), ("add", 0.15, 0.15, 0.15, ""), ("add", 0.01, 0.005, 0.01, ""),
+        ("add", 0.15, 0.1, 0.074, "a straight line in time explains its gain as well"),
+        ("add", 0.15, 0.151, 0.15, "gain within one standard error"),
+        ("add", 0.0099, 0.001, 0.0099, "no gain on held-out logs"),
+        ("add", -0.0099, 0.001, 0.0, "no gain on held-out logs"),
+        ("add", -0.0101, 0.001, 0.0, "larger error on held-out logs"),
+        ("remove", -0.2, 0.5, 0.0, "its loss costs 20 %"), ("remove", -0.0299, 0.5, 0.0, ""),
+        ("remove", -0.0301, 0.5, 0.0, "its loss costs 3 %"), ("remove", -0.019, 0.02, 0.0, ""),
+        ("remove", -0.021, 0.02, 0.0, "its loss costs 2 %"), ("remove", -0.0099, 0.001, 0.0, ""),
+        ("remove", -0.0101, 0.001, 0.0, "its loss costs 1 %"),
+    ],
+)  # fmt: skip
+def test_what_held_out_logs_refuse(change, gain, se, straight, why):
+    assert _against(replace(ZONE, change=change), gain=gain, se=se, straight=straight) == why
+
+
+def test_errors_are_compared_in_pairs_as_geometric_means():
+    assert stepwise._size([np.array([2.0, -2.0]), np.array([8.0, 8.0, 8.0])]) == pytest.approx(4.0)
+    gain, se = stepwise._gain(np.array([2.0, 4.0]), np.array([1.0, 4.0]))
+    assert (gain, se) == pytest.approx((np.log(2) / 2, np.log(2) / 2))
+    assert stepwise._gain(np.array([2.0]), np.array([1.0])) == (pytest.approx(np.log(2)), np.inf)
+    time, odd = np.array([100.0, 101.0, 102.0, 103.0]), np.array([1.0, -1.0, -1.0, 1.0])
+    np.testing.assert_allclose(stepwise._without_line(time, 3.0 + 2.0 * time + odd), odd, atol=1e-9)
+
+
+def report(**given):
+    return SimpleNamespace(
+        **({"on_bound": [], "prior_only": [], "condition": 10.0, "weakest": "a and b"} | given)
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "after", "before", "why"),
+    [
+        ("add", {}, {}, ""), ("add", {"on_bound": ["P"]}, {"on_bound": ["P"]}, ""),
+        ("add", {"on_bound": ["P", "G_core"]}, {"on_bound": ["P"]}, "on a bound: G_core"),
+        ("add", {"prior_only": ["P"]}, {}, ""),
+        ("add", {"prior_only": ["C_core", "G_core"]}, {}, "known from the prior only: C_core, G_core"),
+        ("add", {"condition": 1e7}, {}, ""), ("add", {"condition": 1.1e7}, {}, "badly conditioned: a and b"),
+        ("add", {"condition": 2.9e8}, {"condition": 1e8}, ""), ("remove", {"condition": 1e9}, {}, ""),
+        ("add", {"condition": 3.1e8}, {"condition": 1e8}, "badly conditioned: a and b"),
+    ],
+)  # fmt: skip
+def test_what_is_not_identifiable_is_refused(change, after, before, why):
+    candidate, grown = replace(ZONE, change=change), patched(block(), ZONE)
+    assert stepwise._not_identifiable(candidate, block(), grown, report(**after), report(**before)) == why
+
+
+@pytest.mark.parametrize(
+    ("warmup", "score_from", "used"),
+    [(5.0, 0.0, (5.0, 5.0)), (0.2, 100.0, (1.0, 100.0)), (200.0, 100.0, (100.0, 100.0))],
+)
+def test_a_held_out_log_is_scored_behind_its_warm_up(warmup, score_from, used):
+    air = np.full(4, 21.0)
+    signals = {"q": (air, "1", "input"), "air": (air, "degC", "disturbance")}
+    log = make_log(np.arange(4.0), signals | {"t": ([1.0, 2.0, np.nan, 4.0], "degC", "output")})
+    seen = {}
+
+    def simulate(test, **given):
+        seen.update(given)
+        return test.assign(t=test["t"] + [9.0, 0.5, 0.5, 0.25], scored=("time", [0, 1, 1, 1]))
+
+    fold = Fold("a", (), log, score_from)
+    ((time, error),) = stepwise._held_out_errors(SimpleNamespace(simulate=simulate), fold, ["t"], warmup)
+    assert (seen["warmup"], seen["score_from"]) == used
+    assert (time.tolist(), error.tolist()) == ([1.0, 3.0], [0.5, 0.25])
+
+
+def test_growth_goes_from_the_best_candidate_on(monkeypatch):
+    """Held-out errors by what a network has: its zone saves a half, its bend a tenth, both together more."""
+    errors = {(): 1.0, ("zone",): 0.5, ("bend",): 0.9, ("bend", "zone"): 0.4}
+    seen = []
+
+    def trial(model, cases, wanted, warmup, base):
+        has = tuple(n for n, key in (("bend", "bend"), ("zone", "C_core")) if key in model.parameters)
+        seen.append((has, len(cases), wanted, warmup, None if base is None else base.rmse[0]))
+        return stepwise._Trial(model, (), errors[has] * np.ones(2), errors[has] * np.array([1.0, 1.001]))
+
+    fits = []
+    monkeypatch.setattr(stepwise, "_try", trial)
+    monkeypatch.setattr(
+        stepwise, "fit_network", lambda m, logs, near=None: (fits.append(near), prior_plant(m))[1]
+    )
+    monkeypatch.setattr(stepwise, "_identifiability", lambda plant: report(condition=len(plant.values)))
+    monkeypatch.setattr(stepwise, "residual_terms", lambda plant, logs, warmup: (warmup,))
+    cases, told = [SimpleNamespace(name="f"), SimpleNamespace(name="g")], []
+    grown = grow(block(), [], [ZONE, BEND, replace(BEND, name="again")], folds=cases, warmup=7.0,
+                 progress=lambda f, w: told.append((f, w)))  # fmt: skip
+    about = [(r.round, r.candidate, r.verdict, r.why, r.condition) for r in grown.rows]
+    assert about == [
+        (0, "block", "kept", "as it came", 3), (1, "second zone", "kept", "50 % less error", 5),
+        (1, "convection", "good", "10 % less error", 4), (1, "again", "good", "10 % less error", 4),
+        (2, "convection", "kept", "20 % less error", 6), (2, "again", "good", "20 % less error", 6),
+    ]  # fmt: skip
+    assert grown.rows[1].gain == pytest.approx(np.log(2))
+    assert (grown.rows[1].rmse, grown.evaluations, grown.residual) == ({"f": 0.5, "g": 0.5}, 5, (7.0,))
+    assert set(grown.network.parameters) == {"C", "G", "P", "C_core", "G_core", "bend"}
+    assert seen[0] == ((), 2, ("t",), 7.0, None)
+    assert [s[4] for s in seen[1:]] == [1.0, 1.0, 1.0, 0.5, 0.5]
+    assert fits[:2] == [None, prior_plant(block()).values]
+    assert [round(f, 3) for f, _ in told] == [0.0, 0.167, 0.333, 0.5, 0.75, 1.0]
+    assert (told[1][1], told[-1][1]) == ("round 1: convection", "grown")
+    with pytest.raises(UserError, match="no output 'x'; there are t"):
+        grow(block(), [], [ZONE], folds=cases, outputs=["x"])
+    # once, where one round is asked for; what costs nothing goes
+    assert [r.round for r in grow(block(), [], [ZONE], folds=cases, rounds=1).rows] == [0, 1]
+    errors[()] = 0.5
+    less = Candidate("no zone", {"nodes": {"core": None}, "links": {"core": None}}, "remove")
+    pruned = grow(patched(block(), ZONE), [], [less], folds=cases)
+    assert [(r.verdict, r.why) for r in pruned.rows[1:]] == [("kept", "costs nothing")]
+    monkeypatch.setattr(
+        stepwise, "_identifiability", lambda plant: report(prior_only=["C_core"], condition=2.0)
+    )
+    errors[()] = 1.0
+    (_, row) = grow(block(), [], [ZONE], folds=cases).rows
+    assert (row.verdict, row.why, row.condition) == ("refused", "known from the prior only: C_core", 2.0)
 
 
 def test_what_one_log_alone_shows_is_scored_on_its_second_half():
@@ -122,13 +236,20 @@ def test_what_one_log_alone_shows_is_scored_on_its_second_half():
     assert [len(fold.train) for fold in folds] == [2, 2, 3]
 
 
-def test_one_log_is_cut_into_blocks_that_are_never_fitted_and_scored_at_once():
-    log = logs_of(block(), {})[0]
-    for fold in folds_of(block(), [log]):
+def test_fewer_logs_are_cut_into_blocks_that_are_never_fitted_and_scored_at_once():
+    log, other = (part.isel(time=slice(0, 361)) for part in logs_of(block(), {})[:2])
+    folds = folds_of(block(), [log, other])
+    assert [fold.name for fold in folds] == [f"run{i}, part {k}" for i in (0, 1) for k in (1, 2, 3)]
+    assert [len(fold.train) for fold in folds] == [2, 3, 2] * 2
+    assert {fold.score_from for fold in folds} == {100.0}
+    ends = [fold.test["time"].values[[0, -1]].tolist() for fold in folds[:3]]
+    np.testing.assert_allclose(ends, [[0, 120], [120, 240], [240, 360]], atol=1.0)
+    for fold in folds:
+        assert fold.train[0] is (other if fold.name.startswith("run0") else log)
         tested = set(fold.test["time"].values.tolist())
-        assert all(tested.isdisjoint(part["time"].values.tolist()) for part in fold.train)
-    with pytest.raises(UserError, match="too short"):
-        folds_of(block(), [log.isel(time=slice(0, 200))])
+        assert all(tested.isdisjoint(part["time"].values.tolist()) for part in fold.train[1:])
+    with pytest.raises(UserError, match="too short to hold a part out; give a longer log"):
+        folds_of(block(), [log.isel(time=slice(0, 360))])
 
 
 @pytest.mark.parametrize("name", ["gripper", "peltier_chamber", "tclab"])
