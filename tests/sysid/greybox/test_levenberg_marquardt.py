@@ -114,3 +114,23 @@ def test_a_start_that_cannot_be_improved_is_where_it_ends():
     assert (found.z.tolist(), found.converged) == ([2.0], True)
     held = solve(lambda z: z - 2.0, lambda z: np.eye(1), 1.0, low=np.zeros(1), high=np.ones(1))
     assert (held.z.tolist(), held.converged) == ([1.0], True)
+
+
+def test_a_step_that_bends_too_far_is_taken_straight():
+    """z + c z^2 / 2 = y: half of the bend, -c y^2, is more than 0.75 of the step y from |c y| = 1.5 on."""
+    for y, found in ((1.4, 1.4 - 1.4**2 / 2), (1.6, None)):
+        asked = []
+
+        def r(z, y=y, asked=asked):
+            asked.append(z)
+            return 1e4 * (z + z**2 / 2 - y)
+
+        solve(r, lambda z: np.array([[1e4 * (1 + z[0])]]), 0.0, iterations=1)
+        bent = asked[2][5:, 0]  # those straight come first
+        straight = asked[2][:5, 0]
+        np.testing.assert_allclose(asked[1][:, 0], 0.1 * straight)
+        if found is None:
+            np.testing.assert_array_equal(bent, straight)
+        else:
+            np.testing.assert_allclose(bent[0], found, rtol=1e-5)
+    np.testing.assert_allclose(straight, 1.6 * 1e8 / (1e8 + np.array([1e-2, 0.1, 1.0, 10.0, 100.0])))

@@ -545,3 +545,73 @@ def test_what_is_integrated_out_goes_with_its_own_sample() -> None:
     assert all(np.abs(rows - value).min() < 1e-9 for value in kept[::30])
     # the logs distinguish a from b by how soon it is warm: they trade off, sample by sample
     assert np.corrcoef(record.samples.T)[0, 1] < -0.3
+
+
+def bent_map(fit: float = 0.0) -> RandomizedMap:
+    slope = Bent.STEEP * np.array([[-1.0, 1.0]])
+    return RandomizedMap(Bent(), np.full(2, fit), SimpleNamespace(spread=slope.T @ slope, coarsening=4.0))  # type: ignore[arg-type]
+
+
+def test_the_density_is_that_of_the_prior_of_moves_along_the_slopes_and_off_them() -> None:
+    """d = 5 (x + 0.3 x^3) in the first reading, and V = A: half of (d / 5)^2 in units of the span's 5."""
+    target = bent_map(0.7)
+    z = np.array([[0.7, 0.7], [0.2, 1.4], [9.0, 9.0], [-9.0, -9.0], [9.1, 9.0]])
+    d = 5 * (1.2 + 0.3 * 1.2**3)
+    want = [0.0, -0.5 * (0.25 + 0.49) - 0.5 * d**2 / 1.001, -(8.3**2), -(9.7**2), -np.inf]
+    np.testing.assert_allclose(target.log_density(z), want, rtol=1e-6)
+    np.testing.assert_allclose(target.information, 25 / 1.001 * np.array([[1, -1], [-1, 1]]), rtol=1e-6)
+    np.testing.assert_allclose(target.covariance, np.linalg.inv(np.eye(2) + target.information))
+    assert np.isneginf(target.log_profile(np.array([[9.1], [-9.1]]), [0])).all()
+    both = target.log_profile(z[:2], [0, 1])
+    np.testing.assert_allclose(both, target.log_density(z[:2]))
+
+
+def test_slopes_are_differences_inside_the_box() -> None:
+    target, rng = bent_map(), np.random.default_rng(0)
+    z = np.vstack([rng.uniform(-1, 1, (13, 2)), [[9.0, 8.5]]])  # more than are taken at once; one at a bound
+    xi, noise = rng.normal(size=z.shape), rng.normal(size=(14, len(target._root)))
+    gradient, hessian = target._slopes(z, xi, noise, np.array([0, 1]))
+    for k, step in enumerate(1e-5 * np.eye(2)):
+        rise = (target._cost(z + step, xi, noise) - target._cost(z - step, xi, noise)) / 2e-5
+        np.testing.assert_allclose(gradient[:, k], rise, rtol=2e-3, atol=2e-2)
+    apart = z[:, 1] - z[:, 0]
+    bend = (1 + 0.9 * apart**2) ** 2 * 25 / 1.001
+    np.testing.assert_allclose(hessian[:, 0, 1], -bend, rtol=5e-3)
+    np.testing.assert_allclose(hessian[:, 0, 0], 1 + bend, rtol=5e-3)
+    one = target._slopes(z, xi, noise, np.array([1]))
+    np.testing.assert_allclose(one[0][:, 0], gradient[:, 1])
+
+
+def test_a_step_is_damped_shortened_and_held_at_a_bound() -> None:
+    box: Any = SimpleNamespace(low=np.array([-1.0, -9.0, -2.0]), high=np.array([1.0, 9.0, 2.0]))
+    z = np.array([[-1.0, -2.0], [1.0, 2.0], [0.0, 0.0], [-1.0, 2.0]])
+    gradient = np.array([[0.3, -0.2], [-0.3, 0.2], [4.0, 0.4], [-0.3, -0.6]])
+    hessian = np.tile(np.array([[1.0, 0.5], [0.5, 2.0]]), (4, 1, 1))
+    got = RandomizedMap._steps(box, z, gradient, hessian, np.array([0.0, 1.0, 0.0, 0.5]), np.array([0, 2]))
+    free = -np.linalg.solve(hessian[0], gradient[2])
+    want = [[0.0, 0.1], [0.0, -0.05], free / np.abs(free).max(), [0.2, 0.0]]
+    np.testing.assert_allclose(got, want)
+
+
+def test_what_blew_up_has_no_pull_and_no_density() -> None:
+    target = bent_map()
+    found = target._gradient(np.array([[0.1, 0.2], [0.0, 1e200], [0.3, 0.1]]))
+    assert np.isfinite(found[0]).all()
+    assert (found[0][1].tolist(), found[1][1]) == ([0.0, 0.0], np.inf)
+    assert np.all(found[0][[0, 2]] != 0)
+    gradient = target._gradient(np.array([[0.1, 0.1 + 1e-4]]))[0]
+    np.testing.assert_allclose(gradient, [[0.1, 0.1001]] + 25e-4 / 1.001 * np.array([[-1, 1]]), rtol=1e-4)
+
+
+def test_draws_tell_how_far_they_are(fitted: tuple[Plant, list[Log]]) -> None:
+    told: list[tuple[float, str]] = []
+    drawn = with_draws(*fitted, 2, progress=lambda share, what: told.append((share, what)))
+    assert told == [(k / 8, "plants that agree with the logs") for k in range(8)]
+    assert np.asarray(drawn.samples).shape == (2, 2)
+    assert np.asarray(with_draws(*fitted).samples).shape == (24, 2)
+    told.clear()
+    sample_posterior(
+        *fitted, max_steps=2, n_samples=3, progress=lambda share, what: told.append((share, what))
+    )
+    assert [what for _, what in told][:2] == ["averaging the logs", "learning the model error"]
+    assert told[-2] == (0.95, "completing the samples")

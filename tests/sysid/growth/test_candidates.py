@@ -11,6 +11,7 @@ from scipy.signal import lfilter
 from thermogrip.sysid.growth import candidates
 from thermogrip.sysid.growth.candidates import (
     LEAST,
+    Candidate,
     ResidualTerm,
     lagging_air,
     patched,
@@ -245,3 +246,21 @@ def test_rows_are_block_means_of_a_four_hundredth_of_the_longest_log(monkeypatch
     assert 399 <= residual.size <= 401
     assert np.isnan(residual[:19]).all()  # the warm-up is not scored
     assert np.isfinite(residual[22:]).all()
+
+
+def test_what_was_taken_from_a_module_is_suggested_again_but_a_cooling_gain_of_one_that_only_warms():
+    for name, two_sided in (("gripper", True), ("peltier_chamber", False)):
+        model = load_network(name)
+        for key, kind, value in (
+            ("cooling_gain", "cooling gain", (1.0, 0.3, 0.2)),
+            ("offset", "drive offset", (0.0, 0.05, None)),
+        ):
+            less = patched(model, Candidate("less", {"peltiers": {"module": {key: None}}}))
+            found = {
+                c.name: c.patch["parameters"][f"module_{key}"]
+                for c in suggested(less)
+                if c.name == f"module: {kind}"
+            }
+            assert bool(found) == (two_sided or key == "offset")
+            for made in found.values():
+                assert (made["value"], made["sd"], made.get("low")) == value

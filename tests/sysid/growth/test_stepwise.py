@@ -213,6 +213,19 @@ def test_growth_goes_from_the_best_candidate_on(monkeypatch):
     assert (told[1][1], told[-1][1]) == ("round 1: convection", "grown")
     with pytest.raises(UserError, match="no output 'x'; there are t"):
         grow(block(), [], [ZONE], folds=cases, outputs=["x"])
+    # without candidates the residual proposes, anew behind each change but the last
+    asked = []
+    monkeypatch.setattr(
+        stepwise,
+        "_proposals",
+        lambda m, terms, wanted, others=None: (
+            asked.append((len(m.parameters), terms, wanted, others)),
+            [(ZONE if len(asked) == 1 else BEND, f"t: {len(asked)}")],
+        )[1],
+    )
+    named = [(r.candidate, r.asked, r.verdict) for r in grow(block(), [], folds=cases, warmup=7.0).rows[1:]]
+    assert named == [("second zone", "t: 1", "kept"), ("convection", "t: 2", "kept")]
+    assert asked == [(3, (7.0,), ("t",), None), (5, (7.0,), ("t",), [])]
     # once, where one round is asked for; what costs nothing goes
     assert [r.round for r in grow(block(), [], [ZONE], folds=cases, rounds=1).rows] == [0, 1]
     errors[()] = 0.5
