@@ -117,18 +117,6 @@ def test_the_order_of_the_touches_is_that_of_the_column(record):
         assert shuffled["grasp"].values[at].tolist() == [f"{name}_1", f"{name}_2"]
 
 
-def test_a_metal_forgets_where_it_was_touched_and_wood_does_not(device, record):
-    """In metal the drop is the heat that left over the heat capacity at any time; in wood it fades."""
-    data = touches(record)
-    rest = np.full(data.level.size, 60.0)
-    left = traces_of(device, data, rest, material_hypotheses(device, ["copper", "wood"]))
-    early, late = left.drop(30.0), left.drop(600.0)
-    assert late[0] == pytest.approx(early[0], rel=1e-3)
-    assert late[1] < 0.6 * early[1]
-    even = left.moved[:, 0] * np.exp(-left.decay[:, 0] * 60.0)  # the mode of even temperature
-    assert left.drop(60.0)[0] == pytest.approx(even[0], rel=1e-3)
-
-
 def test_learnt_coupling_makes_its_groups_likelier(device, record):
     train = record.isel(grasp=np.flatnonzero(record["split"].values == "train"))
     learnt = learn_coupling(device, train)

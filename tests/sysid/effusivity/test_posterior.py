@@ -224,19 +224,6 @@ def test_what_cannot_be_answered_is_refused(device, files, ask, match):
         ask(device, files["exp2_dT20"])
 
 
-def test_reported_effusivity_is_the_found_one_over_the_scale(device, files):
-    """A library that holds every block for 30 % lower must lower what is reported by as much."""
-    lower = {
-        k: replace(b, library_effusivity=b.library_effusivity / 1.3, library_sd_ln=0.01)
-        for k, b in device.blocks.items()
-    }
-    same = {k: replace(b, library_sd_ln=0.01) for k, b in device.blocks.items()}
-    record = files["exp2_dT20"].isel(grasp=[21])
-    row = effusivity_posterior(replace(device, blocks=same), record)[0]
-    bent = effusivity_posterior(replace(device, blocks=lower), record)[0]
-    assert row.effusivity / bent.effusivity == pytest.approx(1.3, rel=0.05)
-
-
 def test_a_row_is_made_of_two_mixtures(device):
     """Over two effusivities and two temperatures; the scale's error and an insulator's scatter on top."""
     x, mass, weight = np.array([7.0, 7.2]), np.array([0.3, 0.7]), np.array([0.25, 0.75])

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.sysid.effusivity.data import noise_covariance, touches
 from thermogrip.sysid.effusivity.laplace_approximation import (
@@ -16,7 +15,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     nodes_for,
     prior_of,
 )
-from thermogrip.sysid.effusivity.multi_touch import Coupling, next_touch_prior
+from thermogrip.sysid.effusivity.multi_touch import next_touch_prior
 from thermogrip.sysid.effusivity.posterior import material_fit
 from thermogrip.sysid.effusivity.predictive import _coming, _extended, next_touch, rest_of_contact
 
@@ -61,33 +60,6 @@ def test_a_look_from_an_earlier_one_ends_in_the_same_place(device, drawn):
     cold = material_fit(device, few, NAMES)
     near = cold.log_evidence > cold.log_evidence.max(axis=1, keepdims=True) - 20
     np.testing.assert_allclose(warm.log_evidence[near], cold.log_evidence[near], atol=1e-3)
-
-
-def test_a_block_that_nothing_moves_keeps_its_temperature(device):
-    """No loss and no heat left to find: the next touch expects what this one found, s wider."""
-    grasp = load_example_grasps()["exp5_two_touch_unknown_object"].isel(grasp=[0])
-    still = Coupling(found=0.0, loss=0.0, sd=0.2)
-    evidence, mean, covariance = next_touch_prior(device, grasp, NAMES, coupling=still)
-    found = material_fit(device, grasp, NAMES)
-    best = int(evidence.argmax())
-    assert mean[best, 0] == pytest.approx(found.t_object[0, best], abs=0.1)
-    assert covariance[best, 0, 0] >= 0.2**2
-
-
-def test_a_gripper_as_warm_as_the_block_reads_nothing(device):
-    """The response scales with the difference: candidates that agree on T_obj read the same at T_obj."""
-    grasp = load_example_grasps()["exp5_two_touch_unknown_object"].isel(grasp=[0])
-    _, mean, _ = next_touch_prior(device, grasp, ["copper", "iron"])
-    level = float(mean[:, 0].mean())
-    ahead = next_touch(device, grasp, ["copper", "iron"], [level, level - 20.0])
-    same, far = (np.abs(ahead.mean[k, 0] - ahead.mean[k, 1]).max() for k in (0, 1))
-    assert same < 0.15 * far
-
-
-def test_touches_of_several_blocks_are_refused(device):
-    grasps = load_example_grasps()["exp5_two_touch_unknown_object"].isel(grasp=[0, 1])
-    with pytest.raises(UserError, match="several blocks"):
-        next_touch(device, grasps, NAMES, [20.0])
 
 
 def test_the_outlook_is_the_conditional_of_one_joint_normal(device):

@@ -245,26 +245,6 @@ def test_the_slope_is_known_as_well_as_its_sd_states():
     assert np.median(sd) == pytest.approx(0.045 / np.sqrt(16 * (16**2 - 1) / 12 * 0.1**2), rel=0.1)
 
 
-def test_a_fast_drift_is_found_and_noise_lost_readings_and_early_contacts_are_none():
-    def unsettled(y: np.ndarray) -> list[bool]:
-        return check_grasps(make_grasps(TIME, y, [str(k) for k in range(len(y))])).unsettled.tolist()
-
-    assert not check_grasps(noisy(0.0)).unsettled.any()
-    assert check_grasps(noisy(-0.3)).unsettled.all()
-    assert 0.2 < check_grasps(noisy(0.17)).unsettled.mean() < 0.8  # where the docstring says that it begins
-    jitter = 0.05 * ((TIME * 10) % 2)
-    early = 30.0 + np.where(TIME > -0.35, 8.0 * (TIME + 0.35), 0.0) + jitter
-    # readings of one value know no better than their step: one rounding that turns over
-    flat = np.stack([np.full(TIME.size, 30.0), np.where(TIME > -0.55, 30.0625, 30.0)])
-    assert unsettled(np.concatenate([early[None], flat])) == [False] * 3
-    y = np.tile(30.0 + 0.5 * TIME + jitter, (2, 1))
-    y[0, 3:6], y[1, 5:20] = np.nan, np.nan
-    assert unsettled(y) == [True, False]
-    slope, sd = check_grasps(make_grasps(TIME, y, ["some", "few"])).drift
-    assert slope[0] == pytest.approx(0.5, abs=3 * sd[0])
-    assert np.isnan([slope[1], sd[1]]).all()
-
-
 @pytest.mark.parametrize(("name", "seconds"), [("copper", 12.0), ("iron", 17.0)])
 def test_a_drift_that_lasts_moves_a_metal_by_so_many_seconds_of_it(name, seconds):
     """The drift as the object lets it be: less the integral of the response, by trapezes."""

@@ -304,15 +304,6 @@ def test_terms_propose_what_they_stand_for_the_largest_first_and_nothing_that_is
     assert "water: second zone" not in [c.name for c in suggested(grown)]
 
 
-@pytest.mark.parametrize("term", ["drive", "|drive|", "drive*drive", "t_tank*drive", "t_ambient", "pump"])
-def test_whatever_a_term_proposes_is_a_network(term: str):
-    gripper = load_network("gripper")
-    asked = proposed(gripper, [ResidualTerm("t_surface", term, 100.0, 0.2)])
-    assert asked
-    for candidate, _ in asked:
-        assert len(patched(gripper, candidate).parameters) > len(gripper.parameters), candidate.name
-
-
 def test_lagging_air_is_the_ambient_through_a_first_order_lag():
     model = patched(block(), lagging_air(block().network, "air", tau=100.0))
     t = np.arange(0.0, 2000.0)
