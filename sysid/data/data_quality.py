@@ -220,7 +220,7 @@ def _lost(channel: _Channel) -> Finding:
 def _saturation(channel: _Channel) -> Finding:
     values, name = channel.values, channel.name
     low, high = values.min(), values.max()
-    room = 1e-6 * max(high - low, 1e-12)
+    room = 1e-6 * (high - low)
     at_limit = float(np.mean((values >= high - room) | (values <= low + room)))
     levels = np.unique(np.round(values, 9)).size
     if levels <= 12:
@@ -234,7 +234,7 @@ def _excitation(grid: Grid, most: int = 6) -> list[Finding]:
     """Rank of the covariance of successive input values: each input alone, then all together."""
     out = []
     rows = np.concatenate([segment.u for segment in grid.segments])
-    moves = np.ptp(rows, axis=0) > 1e-9 * np.maximum(np.abs(rows).max(axis=0), 1e-300)  # averages round
+    moves = np.ptp(rows, axis=0) > 1e-9 * np.abs(rows).max(axis=0)  # averages round
     for at, name in enumerate(grid.inputs):
         if not moves[at]:
             says = f"{name} never moves: nothing can be learnt about it"
@@ -259,12 +259,8 @@ def _excitation(grid: Grid, most: int = 6) -> list[Finding]:
 def _order(grid: Grid, which: list[int], most: int) -> int:
     stacked = []
     for segment in grid.segments:
-        w = segment.u[:, which]
-        if len(w) > most:
-            view = np.lib.stride_tricks.sliding_window_view(w, most, axis=0)
-            stacked.append(view.reshape(len(view), -1))
-    if not stacked:
-        return 0
+        view = np.lib.stride_tricks.sliding_window_view(segment.u[:, which], most, axis=0)
+        stacked.append(view.reshape(len(view), -1))
     z = np.concatenate(stacked)
     size = np.linalg.svd(np.cov(z.T), compute_uv=False)
     return int(np.sum(size > 1e-6 * size[0]))
@@ -449,7 +445,7 @@ def evidence(plant: Plant, logs: Sequence[Log]) -> Evidence:
 
 def _spent(steps: Array) -> Array:
     """Return the seconds that each row's input was held, from those between rows."""
-    usual = np.median(steps) if steps.size else 0.0
+    usual = np.median(steps)
     # beyond a gap the input is unknown
     return np.asarray(np.minimum(np.append(steps, usual), max(GAP_SECONDS, GAP_STEPS * usual)))
 

@@ -232,7 +232,7 @@ def bridge(y: Array) -> Array:
     for i in range(y.shape[1]):
         known = np.flatnonzero(np.isfinite(y[:, i]))
         for before, after in pairwise(known.tolist()):
-            if 1 < after - before <= BRIDGED + 1:
+            if after - before <= BRIDGED + 1:
                 out[before : after + 1, i] = np.linspace(y[before, i], y[after, i], after - before + 1)
     return out
 

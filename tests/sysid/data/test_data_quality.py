@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 
 from thermogrip.datasets.examples import load_example_logs
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.data.data_quality import check_data, evidence
+from thermogrip.sysid.data.data_quality import check_data, evidence, reading_excess
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.network import load_network
 
@@ -135,7 +135,336 @@ def test_a_drift_says_which_stretch_it_is_of_where_a_gap_leaves_two():
     ]
 
 
+# ---- each finding, number and words ----
+
+K = np.arange(200)
+ODD = (-1.0) ** K  # third differences of +-8, second of +-4
+RISES = np.minimum(K, 100.0)
+
+
+def lost(y, n):
+    return np.where(n > K, np.nan, y)
+
+
+def jumps(n, largest):
+    """An output with n jumps; one is ``largest`` times as large as the others, which are of 2 K."""
+    steps = np.zeros(200)
+    steps[10 : 10 + 7 * n : 7] = 2.0
+    steps[10] *= largest
+    return steps.cumsum()
+
+
+def found_in(y, check, *, q=ODD, time=K, average=1.0, channel="t", unit="1"):
+    log = make_log(np.asarray(time, dtype=float), {"q": (q, unit, "input"), "t": (y, "degC", "output")})
+    (found,) = (f for f in check_data([log], average=average).of(check) if f.channel == channel)
+    return found.value, found.unit, found.verdict, found.says
+
+
+def dented(n, by):
+    """An input of 15 levels from 5 to 6 with n rows at either end, or ``by`` from it."""
+    q = 5.1 + 0.8 * (K % 13) / 12
+    q[10 : 10 + n], q[100 : 100 + n] = 5.0 + by, 6.0 - by
+    q[0], q[1] = 5.0, 6.0
+    return q
+
+
+RUNS_AWAY = ": time stamps are uncertain, fast dynamics cannot be trusted"
+COARSE = ": coarse, equation-error fits are unreliable at the log's own rate"
+LEAVE = " Leave it out with --outputs"
+COMPUTED = "t has no noise: is it computed or smoothed, no reading?" + LEAVE
+NOISE = 8 / 0.6745 / np.sqrt(20)  # of ODD
+
+
+@pytest.mark.parametrize(
+    ("check", "y", "value", "verdict", "says"),
+    [
+        ("lost", lost(ODD, 3), 0.015, "ok", "1.5 % of t is lost"),
+        ("lost", lost(ODD, 4), 0.02, "warn", "2 % of t is lost: fits leave these rows out"),
+        ("lost", lost(ODD, 59), 0.295, "warn", "30 % of t is lost: fits leave these rows out"),
+        ("lost", lost(ODD, 60), 0.3, "fail", "30 % of t is lost: fits leave these rows out"),
+        ("noise", lost(ODD, 151), 0.0, "ok", "t: too few readings to see noise"),
+        ("noise", lost(ODD, 150), NOISE, "ok", "t has noise of 2.7 degC"),
+        ("noise", jumps(9, 1.5), 0.0, "ok", "t has noise of 0 degC"),
+        ("noise", jumps(9, 1.6), 0.0, "warn",
+         "t is constant but for 9 jumps in 200 rows: is it a set point?" + LEAVE),
+        ("noise", jumps(9, -1.6), 0.0, "warn",
+         "t is constant but for 9 jumps in 200 rows: is it a set point?" + LEAVE),
+        ("noise", jumps(10, 1.6), 0.0, "ok", "t has noise of 0 degC"),
+        ("noise", RISES, 0.0, "ok", "t has noise of 0 degC"),  # 100 moves in 200 rows
+        ("noise", np.minimum(K, 101.0), 0.0, "warn", COMPUTED),
+        ("noise", K + 5e-5 * ODD, 5e-5 * NOISE, "warn", COMPUTED),  # 1.3e-4 K of 199 K, then 2.7e-4 K
+        ("noise", K + 1e-4 * ODD, 1e-4 * NOISE, "ok", "t has noise of 0.00027 degC"),
+        ("quantum", 0.25 * (K % 68), 0.25, "warn", "t moves in steps of 0.25 degC" + COARSE),  # sd 4.9 K
+        ("quantum", 0.25 * (K % 83), 0.25, "ok", "t moves in steps of 0.25 degC"),  # sd 5.9 K
+        ("quantum", np.sin(K), 0.0, "ok", "t shows no quantisation"),
+    ],
+)  # fmt: skip
+def test_an_output_is_described_in_numbers_and_words(check, y, value, verdict, says):
+    found = found_in(y, check)
+    assert found[0] == pytest.approx(value, rel=1e-9, abs=1e-12)
+    assert found[2:] == (verdict, says)
+    assert found[1] == ("1" if check == "lost" else "degC")
+
+
+def test_a_step_of_the_fits_beyond_one_and_a_half_rows_is_reported_with_the_quantum():
+    for average, says in ((1.5, ""), (2.0, "; averaged over 2 s before the fits")):
+        got = found_in(0.25 * (K % 68), "quantum", average=average)[3]
+        assert got == "t moves in steps of 0.25 degC" + says + COARSE
+
+
+def test_an_output_that_rests_in_one_log_has_no_noise_there():
+    logs = [make_log(1.0 * K, {"q": (ODD, "1", "input"), "t": (y, "degC", "output")}) for y in (0 * ODD, ODD)]
+    says = [f.says for f in check_data(logs, average=1.0).of("noise")]
+    assert says == ["t: too few readings to see noise", "t has noise of 2.7 degC"]
+
+
+@pytest.mark.parametrize(
+    ("q", "value", "verdict", "says"),
+    [
+        (K % 12, 33 / 200, "ok", "q takes 12 levels only: curvature between them is not seen"),
+        (K % 13, 31 / 200, "ok", "q is at its least or greatest value in 16 % of the rows"),
+        (0.2 + K % 2, 1.0, "warn", "q takes 2 levels only: curvature between them is not seen"),
+        (0.2 + K % 3, 133 / 200, "ok", "q takes 3 levels only: curvature between them is not seen"),
+        (dented(19, 0.0), 0.2, "warn", "q is at its least or greatest value in 20 % of the rows"),
+        (dented(18, 0.9e-6), 0.19, "ok", "q is at its least or greatest value in 19 % of the rows"),
+        (dented(19, 1.1e-6), 0.01, "ok", "q is at its least or greatest value in 1 % of the rows"),
+    ],
+)
+def test_rows_at_the_ends_of_an_input_are_counted_within_a_millionth_of_its_range(q, value, verdict, says):
+    assert found_in(ODD, "saturation", q=q, channel="q") == (value, "1", verdict, says)
+
+
+@pytest.mark.parametrize(
+    ("steps", "jitter", "verdict", "gap"),
+    [
+        (np.append(np.tile([0.81, 1.19], 99), 1.0), 0.19, "ok", None),
+        (np.append(np.tile([0.79, 1.21], 99), 1.0), 0.21, "warn", None),
+        (np.where(K[1:] == 50, 3.0, 1.0), 0.0, "ok", None),  # a row that fails is no jitter
+        (np.where(K[1:] == 50, 61.0, np.where(K[1:] == 90, 12.0, 1.0)), 0.0, "ok", (2, 61)),
+    ],
+)
+def test_times_are_described_in_numbers_and_words(steps, jitter, verdict, gap):
+    time = np.append(0.0, np.cumsum(steps))
+    got = found_in(ODD, "jitter", time=time, average=2.0, channel="time")
+    assert got[0] == pytest.approx(jitter, abs=1e-3)
+    says = f"rows are 1 s apart, give or take {100 * got[0]:.1f} %"
+    assert got[1:] == ("1", verdict, says + (RUNS_AWAY if verdict == "warn" else ""))
+    said = (0.0, "s", "ok", "no gap longer than 10 s")
+    if gap:
+        says = f"{gap[0]} gap(s), the longest {gap[1]} s: the input is unknown there"
+        said = (float(gap[1]), "s", "warn", says)
+    assert found_in(ODD, "gaps", time=time, average=2.0, channel="time") == said
+
+
+def moved(n):
+    return 0.3 + np.cumsum(np.isin(K, 20 * np.arange(1, n + 1))) % 2
+
+
+LITTLE = ": too little for more than a gain"
+QUARTER = np.array([0.0, 1.0, 0.0, -1.0])[K % 4]  # a sine of 4 rows, of two orders
+
+
+@pytest.mark.parametrize(
+    ("q", "value", "verdict", "says"),
+    [
+        (moved(3), 6.0, "warn", "q moves 3 times and excites 6 of 6 orders" + LITTLE),
+        (moved(4), 6.0, "ok", "q moves 4 times and excites 6 of 6 orders"),
+        (QUARTER, 2.0, "warn", "q moves 199 times and excites 2 of 6 orders" + LITTLE),
+        (ODD + QUARTER, 3.0, "ok", "q moves 199 times and excites 3 of 6 orders"),
+        # its rows have b^2 / 4 of the largest value of the covariance
+        (ODD + 2.2e-3 * QUARTER, 3.0, "ok", "q moves 199 times and excites 3 of 6 orders"),
+        (ODD + 1.8e-3 * QUARTER, 1.0, "warn",
+         "q moves 199 times and excites 1 of 6 orders" + LITTLE),
+        (1000 + 0.9e-6 * (K > 99), 0.0, "fail", "q never moves: nothing can be learnt about it"),
+        (1000 + 1.1e-6 * (K > 99), 6.0, "warn",
+         "q moves 1 times and excites 6 of 6 orders" + LITTLE),
+        (0.0 * K, 0.0, "warn", "q never moves: nothing can be learnt about it"),  # a switch
+        ((K > 99) * 1.0, 6.0, "ok", "q moves 1 times and excites 6 of 6 orders"),
+    ],
+)  # fmt: skip
+def test_the_excitation_of_an_input_is_counted(q, value, verdict, says):
+    assert found_in(K / 10, "excitation", q=q, channel="q") == (value, "orders", verdict, says)
+
+
+@pytest.mark.parametrize(
+    ("condition", "verdict", "says"),
+    [
+        (9e3, "ok", "inputs move apart"),
+        (1.5e4, "fail", "the inputs move together: their effects cannot be separated"),
+    ],
+)
+def test_the_condition_of_two_inputs_is_that_of_their_correlation(condition, verdict, says):
+    """With r = cos(a) it is (1 + r) / (1 - r) = cot(a / 2)^2; one that rests does not count."""
+    other = 5.0 + 3 * (ODD + np.tan(2 * np.arctan(condition**-0.5)) * np.array([1, 1, -1, -1])[K % 4])
+    more = {name: (v, "V", "input") for name, v in (("p", other), ("still", 0 * K + 2.0), ("q", ODD))}
+    log = make_log(1.0 * K, more | {"t": (K / 10, "degC", "output")})
+    (found,) = (f for f in check_data([log], average=1.0).of("excitation") if f.channel == "all inputs")
+    assert found.value == pytest.approx(condition, rel=1e-4)
+    assert (found.unit, found.verdict, found.says) == ("1", verdict, says)
+
+
+def step(size, n):
+    """A step in the middle of n rows of +-1."""
+    return 20 + (-1.0) ** np.arange(n) + size * (np.arange(n) >= n // 2)
+
+
+@pytest.mark.parametrize(("size", "verdict"), [(0.5, "ok"), (0.6, "warn"), (-0.6, "warn")])
+def test_a_drift_or_shift_beyond_half_the_spread_is_reported(size, verdict):
+    """The spread is sqrt(1 + size^2 / 4): 1.03 K and 1.04 K."""
+    told = [found_in(step(size, 200), "drift", q=np.full(200, 0.3))]
+    log = [
+        make_log(1.0 * K, {"q": (np.full(200, 0.3), "1", "input"), "t": (y, "degC", "output")}, name=name)
+        for name, y in (("a", 20 + ODD), ("b", 20 + ODD + size))
+    ]
+    (found,) = check_data(log, average=1.0).of("shift between logs")
+    told += [(found.value, found.unit, found.verdict, found.says)]
+    assert [item[0] for item in told] == pytest.approx([size, abs(size)])
+    says = f"the level of t differs by {abs(size):.2g} degC between logs beyond what a static fit says"
+    says += ": score on logs left out, not on the logs of the fit" if verdict == "warn" else ""
+    assert [item[1:] for item in told] == [
+        ("degC", verdict, f"t drifts by {size:+.2g} degC between the halves beyond what a static fit says"),
+        ("degC", verdict, says),
+    ]
+
+
+def test_a_drift_is_of_the_later_half_of_an_odd_number_of_rows_and_none_where_a_half_is_lost():
+    q, time = np.full(201, 0.3), np.arange(201.0)
+    jump = 20 + 2.0 * (time >= 100)
+    assert found_in(jump, "drift", q=q, time=time)[0] == pytest.approx(2.0)
+    for hidden in (time < 100, time >= 100):
+        y = np.where(hidden, np.nan, np.sin(time / 7))
+        assert found_in(y, "drift", q=q, time=time)[0] == 0.0
+
+
+def test_what_the_mean_input_of_the_last_tenth_explains_is_no_drift():
+    q = np.where(K < 130, 0.2, 0.9) + 0.1 * (K % 7)
+    mean = [np.append(np.full(19, q[0]), q)[k : k + 20].mean() for k in K]
+    assert abs(found_in(20 + 3 * np.array(mean), "drift", q=q)[0]) < 1e-9
+    air = (K > 120) * 1.0  # nor what a disturbance does
+    signals = {"q": (q, "1", "input"), "air": (air, "degC", "disturbance"), "t": (air + q, "degC", "output")}
+    assert check_data([make_log(1.0 * K, signals)], average=1.0).of("drift")[0].verdict == "ok"
+    signals["t"] = (mean + 5 * air, "degC", "output")
+    assert abs(check_data([make_log(1.0 * K, signals)], average=1.0).of("drift")[0].value) < 1e-9
+
+
+def driven(n, by, seed=0, own=1.0):
+    """A log whose input is noise and ``by`` times the reading of its row, which is noise as well."""
+    y, noise = np.random.default_rng(seed).standard_normal((2, n))
+    q = own * noise + by * y
+    return make_log(np.arange(float(n)), {"q": (q, "V", "input"), "t": (y, "degC", "output")})
+
+
+@pytest.mark.parametrize(
+    ("n", "by", "share", "verdict"),
+    [
+        (4000, 1.0, 0.5, "warn"),  # by^2 / (1 + by^2) of its moves
+        (4000, -0.5, 0.2, "warn"),
+        (4000, 0.18, 0.0314, "warn"),
+        (4000, 0.11, 0.012, "ok"),  # beyond doubt, but next to nothing
+        (110, 0.3, 0.0826, "ok"),  # may be chance
+    ],
+)
+def test_the_share_of_an_inputs_moves_that_the_readings_explain(n, by, share, verdict):
+    found = one([driven(n, by)], "feedback")
+    assert found.value == pytest.approx(share, abs=0.01 if n == 4000 else 0.16)
+    assert found.verdict == verdict
+    says = (
+        f"q follows the outputs ({100 * found.value:.0f} % of its moves): recorded in closed loop; noise is "
+    )
+    says += "in the input too, so trust simulation-error fits and not one-step fits"
+    assert found.says == (says if verdict == "warn" else "no sign that q was driven by the outputs")
+
+
+@pytest.mark.parametrize("average", [1.0, 1.5, 1.6])
+def test_means_over_rows_have_seen_what_the_input_did(average):
+    """Means of both over the same seconds: only those of the rows before may show who follows whom."""
+    log = driven(3000, 1.0)
+    (found,) = check_data([log], average=average).of("feedback")
+    assert (found.verdict == "warn") is (average < 1.6)
+
+
+@pytest.mark.parametrize(("moves", "tested"), [(29, False), (30, True)])
+def test_feedback_needs_three_moves_a_coefficient(moves, tested):
+    """Six rows of its own past, which levels of four rows ask for, three of the output's and a constant."""
+    q = np.random.default_rng(0).random(moves + 1)[np.minimum(np.maximum(np.arange(250) - 60, 0) // 4, moves)]
+    y = np.random.default_rng(1).standard_normal(250)
+    value, _, verdict, says = found_in(y, "feedback", q=q, time=np.arange(250), channel="q")
+    assert (verdict, np.isfinite(value)) == ("ok", tested)
+    words = (
+        "no sign that q was driven by the outputs"
+        if tested
+        else "q moves too seldom to be tested for feedback"
+    )
+    assert says == words
+
+
+def test_a_log_without_48_rows_before_one_is_not_tested_for_feedback():
+    for n, finite in ((48, False), (100, True)):
+        assert np.isfinite(check_data([driven(n, 1.0)], average=1.0).of("feedback")[0].value) == finite
+
+
+@pytest.mark.parametrize(
+    ("steps", "y", "seconds", "excess"),
+    [
+        (1.0, 0.3 * ODD, 4.0, 0.3 * np.sqrt(0.75 * 16 / 6)),  # second differences of 4, one row in 4 s
+        (2.0, 0.3 * ODD, 4.0, 0.3 * np.sqrt(0.5 * 16 / 6)),
+        (1.0, 0.3 * ODD, 0.5, 0.0),
+        (np.where(K[1:] == 90, 1.5, 1.0), 0.3 * ODD + 50 * (K > 89), 4.0, 0.3 * np.sqrt(2)),  # across a gap
+        (np.where(K[1:] == 90, 1.4, 1.0), K + 9.0 * (K > 89), 4.0, np.sqrt(0.75 * 2 * 81 / 198 / 6)),
+        (1.0, np.where(K == 9, np.nan, 0.3 * ODD), 4.0, 0.3 * np.sqrt(2)),
+        (1.0, np.where(K % 2 == 1, np.nan, 0.3), 4.0, 0.0),
+    ],
+)
+def test_the_noise_of_a_reading_off_its_bins_mean(steps, y, seconds, excess):
+    time = np.append(0.0, np.cumsum(np.broadcast_to(steps, 199)))
+    log = make_log(time, {"q": (ODD, "1", "input"), "t": (y, "degC", "output")})
+    assert reading_excess([log], ["t"], seconds) == {"t": pytest.approx(excess)}
+    slow = make_log(4.0 * K, {"q": (ODD, "1", "input"), "t": (K, "degC", "output")})
+    if np.isfinite(y).all():  # rows of 4 s are means of themselves
+        assert reading_excess([log, slow], ["t"], seconds)["t"] < max(0.8 * excess, 1e-9)
+
+
 # ---- what a plant rests on ----
+
+
+@pytest.mark.parametrize(
+    ("drive", "pump", "minutes", "thin"),
+    [
+        # rows of 6 s, 0.1 min each; the rows of a drive within 5 % of the largest are of neither kind
+        ([(100, 1.0), (100, -2.0), (200, 0.1), (100, 0.11)], 0.5, (20.0, 10.0, 0.0), ["drive none"]),
+        ([(100, 2.0), (100, -0.1), (300, -0.11)], 0.6, (10.0, 30.0, 50.0), []),
+        ([(75, 1.0), (425, -1.0)], 0.0, (7.5, 42.5, 0.0), []),  # 15 % of 50 min
+        ([(74, 1.0), (426, -1.0)], 0.0, (7.4, 42.6, 0.0), ["drive > 0"]),
+        ([(149, 1.0), (2000, -1.0)], 1.0, (14.9, 200.0, 214.9), ["drive > 0"]),
+        ([(150, 1.0), (2000, -1.0)], 1.0, (15.0, 200.0, 215.0), []),
+    ],
+)
+def test_the_minutes_of_a_drive_to_either_side_are_counted(drive, pump, minutes, thin):
+    plant = prior_plant(load_network("gripper"))
+    value = np.concatenate([np.full(n, v) for n, v in drive])
+    signals = {"drive": (value, plant.units["drive"], "input"), "pump": (0 * value + pump, "1", "input")}
+    signals |= dict.fromkeys(plant.disturbances, (20 + 0 * value, "degC", "disturbance"))
+    signals |= {name: (np.sin(np.arange(value.size)), "degC", "output") for name in plant.outputs}
+    seen = evidence(plant, [make_log(6.0 * np.arange(value.size), signals)])
+    got = [seen.minutes[kind] for kind in ("drive > 0", "drive < 0", "pump on")]
+    assert got == pytest.approx(minutes)
+    assert seen.total == pytest.approx(value.size / 10) == pytest.approx(seen.minutes["pump off"] + got[2])
+    assert [kind for kind in seen.thin if "pump" not in kind] == [t for t in thin if "none" not in t]
+    never = "pump off" if pump > 0.5 else "pump on"
+    assert seen.sentence(plant.units).endswith(f"{never} never occurs")
+
+
+def test_a_row_stands_for_ten_seconds_or_five_rows_at_most_and_the_last_for_the_usual():
+    plant = prior_plant(load_network("tclab"))
+    for times, minutes in (
+        ([0.0, 1.0, 2.0, 13.0], 13.0 / 60),
+        ([0.0, 40.0, 80.0], 2.0),
+        ([0.0, 4.0, 8.0, 30.0], 32.0 / 60),
+    ):
+        n = len(times)
+        signals = {name: (np.linspace(0, 9, n), "percent", "input") for name in plant.inputs}
+        signals |= {name: (np.linspace(0, 9, n), "degC", "output") for name in plant.outputs}
+        assert evidence(plant, [make_log(np.array(times), signals)]).total == pytest.approx(minutes)
 
 
 @pytest.fixture

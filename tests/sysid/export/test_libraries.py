@@ -217,6 +217,52 @@ def test_a_communication_step_may_be_long_or_odd_for_a_network_only():
     assert not black.advance(3.0)
 
 
+def test_the_core_of_an_fmu_has_the_variables_of_its_plant():
+    core = Core(PLANTS["gripper"])
+    ports = {port.name: (port.causality, port.variability, port.unit) for port in core.ports}
+    assert list(ports)[:5] == ["drive", "pump", "t_ambient", "t_tank", "t_surface"]
+    assert ports["drive"] == ("input", "continuous", PLANTS["gripper"].units["drive"])
+    assert ports["t_ambient"] == ("input", "continuous", "degC")
+    assert ports["t_tank"] == ("output", "continuous", "degC")
+    assert ports["flow"] == ("parameter", "tunable", "W/K")
+    assert ports["start_t_tank"] == ("parameter", "fixed", "degC")
+    assert len(ports) == len(core.ports) == 5 + len(PLANTS["gripper"].values) + 2
+    assert [core.get(name) for name in ("drive", "pump", "t_ambient", "start_t_tank")] == [
+        0.0,
+        1.0,
+        25.0,
+        25.0,
+    ]
+    assert core.get("t_tank") == pytest.approx(25.0, abs=1e-3)  # at rest before it is begun
+    core.set("start_t_tank", 31.0)
+    core.set("t_ambient", 22.0)
+    core.set("flow", 17.0)
+    assert [core.get(name) for name in ("start_t_tank", "t_ambient", "flow")] == [31.0, 22.0, 17.0]
+    assert core.get("t_tank") == pytest.approx(31.0, abs=1e-2)
+    with pytest.raises(KeyError, match="t_tank"):
+        core.set("t_tank", 3.0)
+    assert core.advance(1.0)  # begins by itself
+    assert core.get("t_tank") != core.get("start_t_tank")
+
+
+def test_starts_are_those_of_a_room_or_nought_where_no_temperature_is_read():
+    model = StateSpaceModel(
+        ("q",), ("wind",), ("t", "n"), A=[[0.9]], B=[[1.0]], E=[[0.0]], C=[[1.0], [2.0]], dt=2.0
+    )
+    units = {"q": "1", "wind": "m/s", "t": "degC", "n": "rpm"}
+    core = Core(Plant(model, {}, dt=2.0, units=units, valid={"wind": (2.0, 8.0)}))
+    assert [core.get(name) for name in ("wind", "start_t", "start_n")] == [5.0, 25.0, 0.0]
+    assert core.ports[-1].unit == "rpm"
+    runaway = Core(Plant(replace(model, A=np.array([[1e300]])), {}, dt=2.0, units=units))
+    assert not runaway.advance(8.0)
+    core.begin()
+    core.set("q", 3.0)
+    before = core.get("t")
+    assert core.advance(4.0 + 1e-9)  # two steps, for all the rounding
+    assert core.get("t") == pytest.approx(0.81 * before + 1.9 * 3.0)
+    assert not core.advance(4.0 + 1e-3)
+
+
 def test_what_has_no_linear_model_is_refused_in_one_line():
     def refused(plant: Plant, says: str, **point) -> None:
         with pytest.raises(UserError, match=says) as found:

@@ -17,9 +17,11 @@ from thermogrip.sysid.models.lti import (
     covariance_root,
     estimate_starts,
     evaluate_terms,
+    join_columns,
     product_of,
     read_terms,
     switched_states,
+    whole_steps,
 )
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
@@ -35,6 +37,72 @@ def test_two_switches_that_move_at_different_times_are_followed_row_by_row(seed:
         x.append((A + p[0, k] * more + q[0, k] * other) @ x[-1] + push[0, k])
     got = switched_states(A, {"p": (p, more), "q": (q, other)}, push, x[0][None])
     np.testing.assert_allclose(got[0], x, rtol=1e-9, atol=1e-9)
+
+
+def test_members_with_switches_of_their_own_run_each_by_itself():
+    A, more = np.array([[0.5, 0.2], [0.0, 0.4]]), np.array([[0.1, 0.0], [0.3, -0.2]])
+    on = np.array([[0.0, 1.0, 1.0, 0.0], [1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    push, x0 = (
+        np.random.default_rng(0).standard_normal((3, 4, 2)),
+        np.array([[1.0, 2.0], [3.0, -1.0], [0.5, 0.0]]),
+    )
+    got = switched_states(A, {"p": (on, more)}, push, x0)
+    assert got.shape == (3, 5, 2)
+    for b in range(3):
+        x = x0[b]
+        for k in range(4):
+            np.testing.assert_allclose(got[b, k], x)
+            x = (A + on[b, k] * more) @ x + push[b, k]
+        np.testing.assert_allclose(got[b, 4], x)
+
+
+def test_columns_are_joined_in_the_last_axis_and_batches_broadcast():
+    u, d = np.arange(6.0).reshape(1, 3, 2), 10 + np.arange(6.0).reshape(2, 3, 1)
+    both = join_columns(u, d)
+    assert both.shape == (2, 3, 3)
+    assert both[1].tolist() == [[0.0, 1.0, 13.0], [2.0, 3.0, 14.0], [4.0, 5.0, 15.0]]
+    flipped = join_columns(d, u)
+    assert flipped[1, 2].tolist() == [15.0, 4.0, 5.0]
+    terms = evaluate_terms(["a*|b|"], ["a", "b"], -np.ones((2, 3, 2)) * np.arange(1.0, 4.0)[:, None])
+    assert terms.tolist() == [[[-1.0], [-4.0], [-9.0]]] * 2
+
+
+@pytest.mark.parametrize(
+    ("dt", "times"), [(2.0, 1), (6.0, 3), (6.0 * (1 + 9e-7), 3), (6.0 * (1 + 2e-6), 0), (1.0, 0)]
+)
+def test_a_step_is_a_whole_number_of_steps_within_a_millionth(dt: float, times: int):
+    if times:
+        assert whole_steps(dt, 2.0) == times
+    else:
+        with pytest.raises(ValueError, match=rf"step of {dt:g} s is not a whole multiple of the model's 2 s"):
+            whole_steps(dt, 2.0)
+
+
+def test_no_reading_or_a_run_that_diverges_leaves_the_start_at_rest():
+    model = StateSpaceModel(("q",), (), ("t",), A=[[0.5]], B=[[1.0]], C=[[1.0]], dt=1.0)
+    u, none, priors = np.full((4, 1), 2.0), np.zeros((4, 0)), [StartPrior(), StartPrior(0.2, 0.3)]
+    assert (priors[0].noise, priors[0].nuisance) == (0.1, 0.0)
+    how = {"dt": 1.0, "scale": np.ones(1), "priors": priors}
+    x0, offset = estimate_starts(model, np.full((4, 1), np.nan), u, none, **how)
+    np.testing.assert_allclose(x0, model.rest([np.nan], [2.0], [], ())[None].repeat(2, axis=0))
+    assert offset.tolist() == [[0.0], [0.0]]
+    wild = replace(model, A=np.array([[1e200]]))
+    y = np.array([[3.0], [3.5], [3.2], [3.1]])
+    x0, offset = estimate_starts(wild, y, u, none, **how)
+    assert (x0.tolist(), offset.tolist()) == ([[3.0], [3.0]], [[0.0], [0.0]])
+
+
+def test_directions_that_nearly_repeat_others_are_left_out():
+    """A second condition that differs from the first by 2e-10 of it counts, by 5e-11 it does not."""
+    for off, n in ((1e-9, 2), (5e-11, 1)):
+        fixed = np.array([[1.0, 0.0], [1.0, off]])
+        z = constrained_lstsq(np.eye(2), np.array([0.0, 7.0]), fixed, np.array([3.0, 3.0]))
+        np.testing.assert_allclose(z, [3.0, 0.0 if n == 2 else 7.0], atol=1e-5)
+    assert covariance_root(np.diag([4.0, 4e-13])).shape == (2, 1)
+    assert covariance_root(np.diag([4.0, 8e-12])).shape == (2, 2)
+    assert covariance_root(np.diag([1e-3, 3e-15])).shape == (2, 2)
+    assert covariance_root(np.zeros((2, 2))).shape == (2, 0)
+    assert covariance_root(np.zeros((0, 0))).shape == (0, 0)
 
 
 @given(
@@ -100,6 +168,61 @@ def test_the_matrices_of_a_linear_model_are_its_own_whatever_its_level():
     np.testing.assert_allclose(near.gain(), np.array([[1.0], [-3.0]]) @ [[5.0, 2.0]], rtol=1e-5)
     room = linearise_plant(box(wind="degC"), inputs={"q": 1.0}, dt=2.0)
     assert room.w.tolist() == [1.0, 25.0]
+
+
+def test_a_point_is_of_what_is_named_and_where_the_plant_is_put():
+    plant = box(wind="degC")
+    near = linearise_plant(plant, inputs={"q": 2.0}, disturbances={"wind": 7.0}, state=[3.0], dt=4.0)
+    assert (near.w.tolist(), near.x.tolist(), near.y.tolist()) == ([2.0, 7.0], [3.0], [23.0, 41.0])
+    assert (near.states, near.inputs, near.outputs) == (("x1",), ("q", "wind"), ("t", "t2"))
+    assert (near.dt, near.name) == (4.0, "plant")
+    np.testing.assert_allclose([*near.A[0], *near.B[0]], [0.81, 0.95, 0.38], rtol=1e-6)  # two steps
+    # from the operating point, under changes of 1 and 2
+    got = near.simulate([[3.0, 9.0], [2.0, 7.0]])
+    x = 0.95 + 2 * 0.38
+    np.testing.assert_allclose(
+        got, [[23.0, 41.0], [23 + x, 41 - 3 * x], [23 + 0.81 * x, 41 - 2.43 * x]], rtol=1e-6
+    )
+    with pytest.raises(ValueError, match="a continuous model has no step"):
+        linearise_plant(plant, inputs={"q": 2.0}).simulate([[1.0, 1.0]])
+    with pytest.raises(UserError, match="has no q there; its inputs and disturbances are q, wind"):
+        linearise_plant(plant, disturbances={"q": 2.0})
+    none = replace(plant, units=plant.units | {"wind": "1"}, valid={})
+    assert linearise_plant(none).w.tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("A", "settles"), [(1 - 1e-6, True), (1.0, False), (1 + 5e-7, True), (1 + 2e-6, None), (-0.5, True)]
+)
+def test_a_plant_that_integrates_does_not_settle_and_one_that_grows_runs_away(A: float, settles: bool | None):
+    """A pole a millionth beyond one is rounding; where the plant settles may be far: 0.5 / (1 - A)."""
+    plant = replace(box(), model=replace(box().model, A=np.array([[A]]), E=np.zeros((1, 1))))
+    point = {"inputs": {"q": 2e-6}, "dt": 2.0}
+    if settles:
+        near = linearise_plant(plant, **point)
+        np.testing.assert_allclose(near.x, [1e-6 / (1 - A)], rtol=1e-3)
+    else:
+        with pytest.raises(UserError, match="does not settle" if settles is False else "runs away"):
+            linearise_plant(plant, **point)
+
+
+@pytest.mark.parametrize(("pole", "fits"), [(2e-8, True), (5e-9, False), (-0.3, False)])
+def test_a_pole_at_or_below_zero_has_no_continuous_equal(pole: float, fits: bool):
+    plant = replace(box(), model=replace(box().model, A=np.array([[pole]])))
+    if fits:
+        A = linearise_plant(plant, inputs={"q": 1.0}).A
+        np.testing.assert_allclose(np.exp(2.0 * A), [[pole]], rtol=1e-2)
+    else:
+        with pytest.raises(UserError, match=r"delay or a pole below zero.*; export it at its own step, dt=2"):
+            linearise_plant(plant, inputs={"q": 1.0})
+
+
+def test_poles_that_turn_by_more_than_a_right_angle_have_a_continuous_equal():
+    turn = 0.8 * np.array([[np.cos(2.0), -np.sin(2.0)], [np.sin(2.0), np.cos(2.0)]])
+    model = StateSpaceModel(("q",), (), ("t",), A=turn, B=[[1.0], [0.5]], C=[[1.0, 2.0]], dt=4.0)
+    near = linearise_plant(Plant(model, {}, dt=4.0), inputs={"q": 1.0})
+    np.testing.assert_allclose(sorted(np.linalg.eigvals(near.A).imag), [-0.5, 0.5], rtol=1e-6)  # 2 rad in 4 s
+    np.testing.assert_allclose(near.gain(), model.gain(), rtol=1e-6)
 
 
 @pytest.mark.parametrize("dt", [4.05, 3.9, 1.9, 0.0, -2.0])

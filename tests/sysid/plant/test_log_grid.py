@@ -14,6 +14,7 @@ from thermogrip.datasets.schema import Log, make_log
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.plant.log_grid import (
+    Grid,
     Segment,
     at_rows,
     bridge,
@@ -21,6 +22,8 @@ from thermogrip.sysid.plant.log_grid import (
     dominant_time,
     make_grid,
     match_log,
+    match_logs,
+    misfit,
     quantum,
     signals,
     switches_of,
@@ -99,6 +102,14 @@ def test_every_signal_has_the_range_and_spread_of_its_own_readings():
     assert grid.units == {"q": "percent", "p": "A", "room": "degC", "t": "degC", "t2": "degC"}
     part = grid.segments[0].part(3, 6)
     assert part.time.tolist() == [3.0, 4.0, 5.0]
+    assert part.d.shape == (3, 1)
+    less = grid.having([part])
+    assert (less.segments, less.inputs, less.lost) == ((part,), grid.inputs, grid.lost)
+    assert grid.lost == 1 / 200
+    bare = Grid(("q",), (), ("t",), (), 1.0, (part,), 1.0, {})
+    assert (bare.why, bare.lost, bare.ends) == ("", 0.0, False)
+    named = make_grid([log_of(y, **more)], inputs=["p"], outputs=["t"], disturbances=[], average=1.0)
+    assert (named.inputs, named.outputs, named.disturbances) == (("p",), ("t",), ())
     assert (part.y[:, 0].tolist(), part.u[:, 1].tolist()) == (y[3:6].tolist(), [9.0, 12.0, 15.0])
 
 
@@ -129,14 +140,54 @@ def test_uneven_rows_are_put_on_an_even_grid():
     np.testing.assert_allclose(part.y[1:-1, 0], 3.0 * part.time[1:-1], atol=1e-9)
 
 
-@pytest.mark.parametrize("step", [3.0, 5.0, 4.0])
+@pytest.mark.parametrize("step", [3.0, 5.0, 4.0, 2.0])
 def test_a_row_is_the_mean_of_the_line_through_the_readings_about_it(step: float):
-    y = np.random.default_rng(1).normal(20.0, 1.0, T.size)
-    (part,) = make_grid([log_of(y)], average=step).segments
-    fine = np.linspace(-0.5, 0.5, 4001)[:-1] + 0.5 / 4000  # middles of 4000 slices
-    inner = part.time[1:-1]
-    want = np.interp(inner[:, None] + step * fine, T, y).mean(axis=1)
-    np.testing.assert_allclose(part.y[1:-1, 0], want, atol=1e-5)
+    y, t = np.random.default_rng(1).normal(20.0, 1.0, T.size), T + 50.0
+    (part,) = make_grid([log_of(y, t)], average=step).segments
+    fine = np.linspace(-1.0, 1.0, 4001)[:-1] + 0.5 / 2000  # middles of 4000 slices
+    half = np.minimum(step / 2, np.minimum(part.time - 50.0, 249.0 - part.time))  # the ends have less
+    want = np.interp(part.time[:, None] + half[:, None] * fine, t, y).mean(axis=1)
+    np.testing.assert_allclose(part.y[:, 0], want, atol=1e-5)
+
+
+@pytest.mark.parametrize(("t", "average", "rows"), [
+    (0.1 * np.arange(21), 0.3, 7),  # (2.0 + 0.1) / 0.3 falls short of 7 by rounding
+    (T[:20] + 1.1, 1.0, 20),
+    (T[:3] + 7.0, 1.0, 3),
+    (T[:2] + 7.0, 1.0, 2),
+])  # fmt: skip
+def test_a_stretch_has_as_many_rows_as_steps_fit_into_it(t: np.ndarray, average: float, rows: int):
+    (part,) = make_grid([log_of(t, t)], average=average, min_rows=2).segments
+    np.testing.assert_allclose(part.time, t[0] + average * np.arange(rows))
+
+
+@pytest.mark.parametrize("average", [1.0, 4.0])
+def test_a_lone_row_between_gaps_is_no_stretch(average: float):
+    t = np.concatenate([T[:50], [100.0], T[:50] + 150.0])
+    grid = make_grid([log_of(t, t)], average=average, min_rows=2)
+    assert [part.time[0] for part in grid.segments] == [0.0, 150.0]
+
+
+@pytest.mark.parametrize(("longer", "jitter", "own"), [
+    (5e-7, 0.0, True), (2e-6, 0.0, False), (0.0, 0.3, True), (0.0, 0.6, False)
+])  # fmt: skip
+def test_samples_stand_as_they_are_on_their_own_even_grid(longer: float, jitter: float, own: bool):
+    """A step off by a millionth of 20 s, or steps that differ by 2 % of it, are the limits."""
+    t = 20.0 * T + jitter * (T % 10 == 5) / 2  # a longer step before it, a shorter one behind
+    y = T**2
+    (part,) = make_grid([log_of(y, t)], average=20.0 * (1 + longer)).segments
+    assert (part.y[:, 0].tolist() == y.tolist()) is own
+
+
+def test_an_output_needs_two_readings_for_a_line_and_the_others_stand():
+    logs = []
+    for n in (1, 2):
+        first, second = T.copy(), 3 * T
+        first[n:] = np.nan
+        logs.append(log_of(first, t2=(second, "degC", "output")))
+    for part, known in zip(make_grid(logs, average=2.0).segments, (0, 2)):
+        assert np.isfinite(part.y[:, 0]).sum() == known
+        assert np.isfinite(part.y[:, 1]).all()
 
 
 def test_one_reading_on_either_side_of_its_middle_keeps_a_row():
@@ -157,6 +208,15 @@ def test_a_row_is_whole_where_all_its_outputs_are():
     none = np.zeros((200, 0))
     (found,) = whole_readings([Segment(T, y, none, none, "a")], 3)
     assert np.isfinite(found[5:-5]).all()
+
+
+@pytest.mark.parametrize("lost", [1, 3])
+def test_windows_at_either_end_count(lost: int):
+    """Of three windows of three rows one is whole."""
+    y = np.arange(5.0)[:, None]
+    y[lost] = np.nan
+    (found,) = whole_readings([Segment(T[:5], y, np.zeros((5, 0)), np.zeros((5, 0)), "a")], 3)
+    assert found[:, 0].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
 
 
 @pytest.mark.parametrize(("every", "filled"), [(5, True), (6, False), (8, False)])
@@ -199,6 +259,12 @@ def test_what_cannot_be_fitted_is_refused_by_name():
         signals([make_log(T, {"t": (T, "degC", "output")})])
     with pytest.raises(UserError, match="no stretch has 20 rows of 20 s"):
         make_grid([log_of(T)], average=20.0)
+    mute = log_of(3.0 * T, name="b")
+    mute["t"].values[:] = np.nan
+    with pytest.raises(UserError, match=r"^b, column t: has no reading; leave the log out"):
+        signals([log_of(T), mute])
+    with pytest.raises(UserError, match="no log to identify from"):
+        make_grid([])
 
 
 def test_switches_are_shares_that_are_nought_or_one():
@@ -224,6 +290,9 @@ def test_a_staircase_with_steps_that_were_never_read_has_the_quantum_of_its_othe
 def test_a_channel_without_steps_has_no_quantum():
     assert quantum(np.random.default_rng(0).normal(size=500)) == 0.0
     assert quantum(np.where(T > 100, 20.0, 21.0)) == 0.0  # two levels may be anything
+    assert quantum(0.5 * (T % 3)) == 0.5
+    assert quantum(0.5 * (T[:10] % 5)) == 0.5  # half as many levels as readings
+    assert quantum(0.5 * (T[:9] % 5)) == 0.0
 
 
 @pytest.mark.parametrize(("n", "dt"), [(4000, 1.0), (130, 20.0)])
@@ -233,6 +302,25 @@ def test_the_dominant_time_is_that_of_the_lag(n: int, dt: float):
     t, q, y = lagged(tau, n, dt, hold=max(1, round(200 / dt)))
     found = dominant_time([log_of(y, t, q)], inputs=["q"], outputs=["t"])
     assert found == pytest.approx(tau, rel=0.35 if n == 4000 else 0.01)
+
+
+@pytest.mark.parametrize(("tau", "n", "found"), [
+    (50.0, 22, 50.0),  # 20 rows with one before and one after them
+    (50.0, 21, 20.0),  # a twentieth of 400 s
+    (20.0 / 3.8, 130, 20.0 / 3.8),
+    (20.0 / 4.0, 130, 129.0),  # less than 0.02 is left after a step
+])  # fmt: skip
+def test_a_time_constant_needs_twenty_rows_and_some_memory(tau: float, n: int, found: float):
+    t, q, y = lagged(tau, n, 20.0, hold=2)
+    few = np.where(t < 60.0, y, np.nan)  # another sensor does not keep it from being found
+    log = log_of(y, t, q, few=(few, "degC", "output"))
+    assert dominant_time([log], inputs=["q"], outputs=["few", "t"]) == pytest.approx(found, rel=1e-6)
+
+
+def test_an_integrator_has_no_time_constant():
+    t, q, _ = lagged(1.0, 130, 20.0, hold=4)
+    whole = np.append(0.0, np.cumsum(q - 0.4)[:-1])
+    assert dominant_time([log_of(whole, t, q)], inputs=["q"], outputs=["t"]) == 129.0
 
 
 def test_of_several_logs_the_dominant_time_is_the_median():
@@ -277,16 +365,31 @@ def longest_below(y: np.ndarray, q: float) -> int:
     return max(n for n in TRIED if all(moves[k] < q for k in TRIED if k <= n))
 
 
-@pytest.mark.parametrize(("tau", "gain"), [(400.0, 2.5), (400.0, 5.0), (400.0, 9.0), (150.0, 5.7)])
+@pytest.mark.parametrize(
+    ("tau", "n", "gain", "want", "dt"),
+    [
+        (100.0, 3000, 7.36, 3, 1.0), (100.0, 3000, 5.94, 4, 0.5), (100.0, 3000, 4.79, 5, 1.0),
+        (100.0, 3000, 3.86, 6, 2.0), (100.0, 3000, 2.95, 8, 1.0), (150.0, 4000, 3.29, 10, 1.0),
+        (150.0, 4000, 2.8, 12, 0.5), (400.0, 12_000, 5.63, 15, 1.0), (400.0, 12_000, 4.3, 20, 1.0),
+        (400.0, 12_000, 3.47, 25, 1.0), (400.0, 12_000, 2.5, 30, 1.0), (600.0, 14_000, 3.11, 40, 1.0),
+        (600.0, 14_000, 1.18, 50, 1.0),
+    ],
+)  # fmt: skip
 def test_a_coarse_converter_asks_for_the_longest_step_that_moves_by_less_than_its_quantum(
-    tau: float, gain: float
+    tau: float, n: int, gain: float, want: int, dt: float
 ):
-    t, u, y = lagged(tau, 12_000)
-    log = log_of(coarse(gain * y, 0.0625), t, u)
-    want = longest_below(gain * y, 0.0625)
+    t, u, y = lagged(tau, n)
+    log = log_of(coarse(gain * y, 0.0625), dt * t, u)
+    assert longest_below(gain * y, 0.0625) == want
     assert tau / 75 < want < tau / 10  # above a hundredth of the time constant, below a tenth
     grid = make_grid([log])
-    assert (grid.dt, grid.why) == (want, "t moves less than its converter's 0.0625 in shorter steps")
+    assert (grid.dt, grid.why) == (want * dt, "t moves less than its converter's 0.0625 in shorter steps")
+
+
+def test_a_step_that_happens_to_be_a_period_is_not_asked_for():
+    t = np.arange(3000.0)
+    log = log_of(coarse(5 * np.sin(t * np.pi / 10), 0.25), t, 0.5 + 0.5 * np.cos(t * np.pi / 10))
+    assert make_grid([log]).dt == 1.0
 
 
 def test_the_coarsest_log_and_the_moves_of_all_logs_count():
@@ -368,6 +471,77 @@ def test_inputs_that_end_at_their_rows_are_moved_by_one_and_nothing_else_is():
     assert grid.segments[0].u[:, 0].tolist() == [k**2 for k in (*range(1, 20), 19)]
 
 
+def heater(**more: Any) -> Any:
+    """A plant of one input and one output, of steps of 2 s."""
+    model = SimpleNamespace(smooth=None, command_steps=more.pop("command_steps", {}))
+    roles: dict[str, Any] = {
+        "inputs": ("q",),
+        "outputs": ("t",),
+        "disturbances": (),
+        "inputs_end_at_row": False,
+    }
+    plant = SimpleNamespace(dt=2.0, model=model, **roles)
+    vars(model)["smooth"] = more.pop("smooth", None)
+    vars(plant).update(more)
+    return plant
+
+
+def test_commands_are_cut_to_whole_steps_of_their_driver():
+    q = np.array([0.0, 0.3, -0.3, 0.5, 0.74, 1.0])
+    log = log_of(T[:6], 2 * T[:6], q)
+    (plain,) = cut_stretches(heater(), log)
+    (found,) = cut_stretches(heater(command_steps={"q": 0.25}, smooth=3.0), log)
+    assert plain.u[:, 0].tolist() == q[: len(plain.u)].tolist()
+    assert found.u[:, 0].tolist() == [0.0, 0.25, -0.25, 0.5, 0.5, 1.0][: len(found.u)]
+    assert found.d.shape == (len(found.u), 0)
+
+
+@pytest.mark.parametrize(
+    ("smooth", "want"),
+    [
+        (6.0, [14 / 4, 55 / 6, 139 / 6, 271 / 6, 230 / 4]),  # means of k^2 over 3 s to either side of 1, 3 ..
+        (0.5, [0.5, 6.5, 20.5, 42.5, 72.5]),  # no less than the step
+        (None, [0.5, 6.5, 20.5, 42.5, 72.5]),
+    ],
+)
+def test_a_disturbance_is_smoothed_about_the_middle_of_each_step(smooth: Any, want: list[float]):
+    t = T[:10]
+    log = log_of(t, t + 3.0, room=(t**2, "degC", "disturbance"))
+    (found,) = cut_stretches(heater(disturbances=("room",), smooth=smooth), log)
+    np.testing.assert_allclose(found.d[:, 0], want)
+
+
+def test_gaps_may_be_held_and_steps_are_as_many_as_reach_the_last_row():
+    t = np.append(T[:17], T[:5] + 60.0) + 1.1  # the sixteenth second is 2e-15 s late
+    log = log_of(t, t)
+    first, second = cut_stretches(heater(dt=1.0), log)
+    assert (len(first.u), len(second.u), second.gap) == (16, 4, 44.0)
+    (whole,) = cut_stretches(heater(dt=1.0), log, gaps="hold")
+    assert (len(whole.u), whole.time[-1]) == (64, pytest.approx(64.0))
+
+
+@pytest.mark.parametrize("name", ["q", "room"])
+def test_a_run_needs_every_input_and_room_for_its_grid(name: str, monkeypatch: pytest.MonkeyPatch):
+    log = log_of(T[:9], 2 * T[:9], room=(3 * T[:9], "degC", "disturbance"))
+    plant = heater(disturbances=("room",))
+    asked: list[int] = []
+
+    def most(arrays: int) -> int:
+        asked.append(arrays)
+        return room
+
+    monkeypatch.setattr("thermogrip.sysid.plant.log_grid.most_bytes", most)
+    room = 8 * 8 * 3  # 8 bytes, 8 steps of three signals
+    assert len(cut_stretches(plant, log)[0].u) == 8
+    assert asked == [4]
+    room -= 1
+    with pytest.raises(UserError, match="a: would be simulated in 8 steps of 2 s; cut the log, or use"):
+        cut_stretches(plant, log)
+    log[name].values[4] = np.nan
+    with pytest.raises(UserError, match=f"a, column {name}: is unknown in some rows; fill or cut them"):
+        cut_stretches(plant, log)
+
+
 def test_rows_between_steps_are_on_the_line_between_them():
     plant, t = prior_plant(load_network("peltier_chamber")), np.array([0.0, 1.5, 2.5, 7.0, 30.0, 31.0, 33.0])
     log = chamber(np.zeros(7), t)
@@ -375,6 +549,8 @@ def test_rows_between_steps_are_on_the_line_between_them():
     assert (first.gap, second.gap) == (0.0, 23.0)
     run = np.arange(0.0, 12.0)[None, :, None] ** 2  # at 0, 2, 4 ... s
     np.testing.assert_allclose(at_rows(first, run, 2.0)[0, :, 0], [0.0, 0.75, 1.75, 9 + 0.5 * 7])
+    late = replace(first, time=np.array([0.0, 21.0, 22.0, 23.0, 99.0]))  # the run ends at 22 s
+    assert at_rows(late, run, 2.0)[0, :, 0].tolist() == [0.0, 110.5, 121.0, 121.0, 121.0]
 
 
 @pytest.mark.parametrize(
@@ -384,6 +560,11 @@ def test_rows_between_steps_are_on_the_line_between_them():
         ("percent", "1", (0.0, 80.0), 60.0, None),  # the plant's 1 is no share
         ("percent", "1", (-80.0, 0.0), 60.0, None),
         ("percent", "1", (0.0, 1.1), 60.0, None),
+        ("percent", "1", (0.0, 1 + 5e-10), 60.0, 0.6),
+        ("percent", "1", (0.0, 1 + 1.5e-9), 60.0, None),
+        ("percent", "1", None, 60.0, 0.6),
+        ("1", "percent", (0.0, 100.0), 1 + 5e-10, 100 + 5e-8),
+        ("1", "percent", (0.0, 100.0), 1 + 1.5e-9, 1 + 1.5e-9),
         ("1", "percent", (0.0, 100.0), 0.6, 60.0),
         ("1", "percent", (0.0, 100.0), 1.0, 100.0),
         ("1", "percent", (0.0, 100.0), 1.1, 1.1),
@@ -396,12 +577,14 @@ def test_rows_between_steps_are_on_the_line_between_them():
     ],
 )
 def test_a_drive_is_converted_where_both_units_are_shares_of_full_scale(
-    unit: str, want: str, valid: tuple[float, float], largest: float, made: float | None
+    unit: str, want: str, valid: tuple[float, float] | None, largest: float, made: float | None
 ):
     drive = np.where(T < 100, 0.0, largest)
     model: Any = SimpleNamespace(
-        inputs=("q",), disturbances=(), outputs=("t",), units={"q": want, "t": "degC"}, valid={"q": valid}
+        inputs=("q",), disturbances=(), outputs=("t",), units={"q": want, "t": "degC"}
     )
+    if valid:
+        model.valid = {"q": valid}
     log = make_log(T, {"q": (drive, unit, "input"), "t": (0 * T, "degC", "output")})
     if made is None:
         said = f"is in '{unit}', the plant's is in '{want}'.*convert it"
@@ -413,3 +596,50 @@ def test_a_drive_is_converted_where_both_units_are_shares_of_full_scale(
         np.testing.assert_allclose(matched["q"].values.max(), made, rtol=1e-12)
         assert matched["q"].attrs["units"] == want
         assert len(said) == (unit != want)
+
+
+def bare(**units: str) -> Any:
+    """A model of the signals of the logs here."""
+    return SimpleNamespace(inputs=("q", "p"), disturbances=("room",), outputs=("t",), units=units)
+
+
+def test_what_was_converted_is_reported_once_and_columns_take_the_models_roles():
+    columns = {
+        "q": (T, "1"),
+        "p": (T / 2, "1"),
+        "room": (T, "K"),
+        "t": (0 * T, "1"),
+        "n": (T, "s"),
+    }
+    log = make_log(T, {name: (*item, "input") for name, item in columns.items()})
+    log["t"].values[:] = np.nan
+    model = bare(q="W", p="percent", t="degC")
+    said = ["q: has no unit, taken as W", "p: has no unit and values up to 99.5, taken as percent",
+            "t: has no unit, taken as degC"]  # fmt: skip
+    for keep, note in ((False, "other"), (True, "input")):
+        (got, again), lines = match_logs(model, [log, log], keep_others=keep)
+        assert lines == said
+        assert [got[name].attrs["role"] for name in columns] == [
+            "input",
+            "input",
+            "disturbance",
+            "output",
+            note,
+        ]
+        assert [got[name].attrs["units"] for name in columns] == ["W", "percent", "K", "degC", "s"]
+        assert got.identical(again)
+    assert match_logs(model, [got], keep_others=True)[0][0] is got
+    matched, lines = match_log(bare(), log)  # nothing to convert, but its roles
+    assert (lines, matched["room"].attrs["role"], log["room"].attrs["role"]) == ([], "disturbance", "input")
+    assert match_logs(model, []) == ([], [])
+    assert match_logs(bare(p="percent"), [log.assign(p=log["p"] / 100)])[1] == [
+        "p: converted from 1 to percent"
+    ]
+
+
+def test_a_log_that_does_not_fit_is_refused_by_what_it_lacks():
+    log = log_of(T, p=(T, "1", "input"), room=(T, "degC", "disturbance"))
+    assert misfit(bare(), log) is None
+    lost = misfit(bare(), log.drop_vars(["p", "t"]))
+    assert str(lost) == "a: has no input p, no output t; its columns are q, room"
+    assert "is in 'percent', the plant's is in 'W'" in str(misfit(bare(q="W"), log))
