@@ -94,8 +94,8 @@ class OwnSteps:
         k3 = rhs([a + h / 2 * k for a, k in zip(x, k2)], u, d, c)
         k4 = rhs([a + h * k for a, k in zip(x, k3)], u, d, c)
         state = [a + h / 6 * (s + 2 * (q + r) + t) for a, s, q, r, t in zip(x, k1, k2, k3, k4)]
-        for i, name in enumerate(self.code.states):
-            low, high = self.code.limits.get(name, (-np.inf, np.inf))
+        for name, (low, high) in self.code.limits.items():
+            i = list(self.code.states).index(name)
             if np.isfinite(low):
                 state[i] = np.maximum(state[i], low)
             if np.isfinite(high):
@@ -161,6 +161,9 @@ def _settle(residuals: Callable[[Array], Array], z: Array, low: Array, high: Arr
         return np.full(n, np.nan)
     for _ in range(_ITERATIONS):
         jacobian = np.nan_to_num((rows[:, 1:] - rows[:, :1]) / _NUDGE)
+        slope = jacobian.T @ rows[:, 0]
+        # what rests on a bound and would leave it stays there, and the others move without it
+        jacobian[:, (z <= low) & (slope > 0) | (z >= high) & (slope < 0)] = 0.0
         step = np.linalg.solve(jacobian.T @ jacobian + damping * np.eye(n), -jacobian.T @ rows[:, 0])
         trial = np.clip(z + step, low, high)
         again = residuals(trial[:, None] + moves)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -133,6 +135,72 @@ def test_at_rest_under_an_input_that_has_just_begun_means_rest_under_the_input_b
     np.testing.assert_allclose(x, [25.0, 0.0, 0.0, 0.0], atol=1e-4)
 
 
+@pytest.mark.parametrize("spread", [0.01, 1.0, 9.0])
+def test_rest_goes_by_no_scale_of_the_states_and_shares_what_is_missing_by_slopes(spread: float):
+    """With u = (2, 3) the delayed drives are 0.5 u1 |u1| = 2 and u2 = 3; 100 K ask for 10, 5 more.
+
+    An input's share goes by its slope, 0.5 * 2 |u1| = 2 and 1: D 2 / 5 = 2 and D / 5 = 1.
+    """
+    A = np.array([[0.9, 1.0, 1.0], [0, 0, 0], [0, 0, 0]])
+    model = StateSpaceModel(
+        ("a", "b"), (), ("t",), A=A, B=[[0, 0], [0, 0], [0, 1.0]], C=[[1.0, 0, 0]], dt=1.0, y0=[4.0],
+        terms=("a*|a|",), F=[[0], [0.5], [0]], spread=spread * np.eye(3),
+    )  # fmt: skip
+    np.testing.assert_allclose(model.rest([104.0], [2.0, 3.0], [], ()), [100.0, 6.0, 4.0], rtol=1e-4)
+
+
+def test_a_start_without_noise_has_a_tenth_of_the_spread_of_the_outputs():
+    model = replace(block(), spread=np.diag([4.0, 1.0, 2.0, 3.0]))
+    u, d, y = np.full((6, 1), 0.3), np.full((6, 1), 25.0), np.linspace(30.0, 27.0, 6)[:, None]
+    plain = model.start(y, u, d)
+    np.testing.assert_allclose(plain, model.start(y, u, d, noise=[0.2]), rtol=1e-12)
+    assert np.abs(plain - model.start(y, u, d, noise=[0.4])).max() > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("dt", "u", "want"),
+    [
+        (3.0, [1.0, 4.0], [5.0, 1.75, 4.0]),  # own steps of 2 s have the means 1, 2.5 and 4
+        (0.5, [1.0, 2.0, 3.0, 6.0], [5.0, 4.5, 4.0, 3.5, 3.0]),  # one own step, of the mean 3
+        (0.5, [2.0, 4.0], [5.0, 4.0, 3.0]),
+        (2.0 * (1 + 5e-7), [1.0, 4.0], [5.0, 1.0, 4.0]),
+    ],
+)
+def test_steps_that_are_no_multiple_lie_on_lines_between_own_steps(
+    dt: float, u: list[float], want: list[float]
+):
+    model = StateSpaceModel(("q",), (), ("t",), A=[[0.0]], B=[[1.0]], C=[[1.0]], dt=2.0)
+    y, end = model.rollout([[5.0]], np.array(u)[None, :, None], np.zeros((1, len(u), 0)), (), dt)
+    np.testing.assert_allclose(y[0, :, 0], want)
+    assert end.tolist() == [[want[-1]]]
+
+
+def test_poles_are_those_of_the_worst_position_of_the_switches():
+    switches = ("a", "b")
+    model = StateSpaceModel(
+        switches, (), ("t",), A=np.diag([0.5, 0.1]), B=np.zeros((2, 2)), C=[[1.0, 0.0]], dt=2.0,
+        switches=switches, A_switch={"a": np.diag([0.3, 0.0]), "b": np.diag([0.2, 0.0])},
+    )  # fmt: skip
+    assert sorted(model.poles().real) == pytest.approx([0.1, 1.0])  # both on
+    assert not model.stable
+    assert model.time_constants().tolist() == [np.inf, pytest.approx(-2.0 / np.log(0.1))]
+    less = replace(model, A_switch={"a": np.diag([-1.2, 0.0])})
+    assert sorted(less.poles().real) == pytest.approx([-0.7, 0.1])
+    assert less.stable
+    assert less.time_constants()[0] == pytest.approx(-2.0 / np.log(0.7))
+
+
+def test_the_gain_is_of_the_matrices_as_they_stand():
+    model = StateSpaceModel(
+        ("q",), (), ("t",), A=[[0.5, 0.2], [0.0, 0.6]], B=[[1.0], [2.0]], C=[[1.0, 3.0]], dt=1.0
+    )
+    # x2 = 2 / 0.4 = 5, x1 = (1 + 0.2 * 5) / 0.5 = 4
+    np.testing.assert_allclose(model.gain(), [[4.0 + 15.0]])
+    assert (model.origin, model.spread.tolist(), model.E.shape, model.c.tolist()) == (
+        "statespace", np.eye(2).tolist(), (2, 0), [0.0, 0.0]
+    )  # fmt: skip
+
+
 def test_start_finds_the_state_of_a_moving_plant_and_ignores_lost_samples():
     model = block()
     rng = np.random.default_rng(3)
@@ -163,8 +231,8 @@ def test_a_dict_makes_the_model_again():
     again = StateSpaceModel.from_dict(model.to_dict())
     both = [some.rollout(np.ones((1, 3)), u[None], d[None], (), 2.0)[0] for some in (model, again)]
     np.testing.assert_array_equal(both[0], both[1])
-    assert again.terms == model.terms
-    assert again.switches == model.switches
+    assert again.to_dict() == model.to_dict()
+    assert (again.terms, again.switches, again.origin) == (model.terms, model.switches, "statespace")
 
 
 @pytest.mark.parametrize("change", [{"A": [[1.0]]}, {"dt": "fast"}, {"terms": ["heat"]}, {"A": None}])
@@ -178,5 +246,13 @@ def test_matrices_that_do_not_fit_or_are_not_numbers_are_refused():
         StateSpaceModel(("q",), (), ("t",), A=np.eye(2), B=[[1.0]], C=[[1.0, 0.0]], dt=1.0)
     with pytest.raises(ValueError, match="not finite"):
         StateSpaceModel(("q",), (), ("t",), A=[[np.nan]], B=[[1.0]], C=[[1.0]], dt=1.0)
+    for change, said in (
+        ({"dt": 0.0}, "dt must be > 0 s, got 0"),
+        ({"spread": [[1.0, 0.0]]}, "spread has shape"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            StateSpaceModel(
+                ("q",), (), ("t",), **({"A": [[0.5]], "B": [[1.0]], "C": [[1.0]], "dt": 1.0} | change)
+            )
     with pytest.raises(ValueError, match="switches must be inputs"):
         StateSpaceModel(("q",), (), ("t",), A=[[0.5]], B=[[1.0]], C=[[1.0]], dt=1.0, switches=("fan",))

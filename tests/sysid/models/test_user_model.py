@@ -20,7 +20,7 @@ from thermogrip.sysid.greybox.fit import fit_network, free_runs
 from thermogrip.sysid.greybox.posterior import with_draws
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.user_class import load_object
-from thermogrip.sysid.models.user_model import OwnModel, own_model
+from thermogrip.sysid.models.user_model import OwnModel, _settle, own_model
 from thermogrip.sysid.plant.plant import Plant
 
 PARAMETERS = {
@@ -210,6 +210,178 @@ def test_a_plant_at_rest_is_held_there_by_some_input():
     held = 0.05 * np.sqrt(4.0) / 0.05
     rate = model.code.rhs(list(x), [held], [], list(model.prior))
     np.testing.assert_allclose(rate, 0.0, atol=1e-5)
+
+
+def lag(**said: Any) -> OwnModel:
+    """A state that follows its input, which reaches from 0 to 2; its reading is next to nothing."""
+    content = {"inputs": {"q": {"unit": "1", "range": (0.0, 2.0)}}, "disturbances": {"air": "degC"},
+               "outputs": {"t": {"unit": "degC", "sd": 1e4}}, "states": {"t": 0.5}, "dt": 1.0,
+               "parameters": {"k": {"value": 1.0, "sd_log": 1.0}},
+               "rhs": lambda self, x, u, d, p: [p.k * (u.q - x.t)]}  # fmt: skip
+    return own_model(type("Lag", (), content | said))
+
+
+def test_rest_weighs_readings_and_inputs_as_its_theory_does():
+    """The flow is nought where x = v: left are (100 (x - y) / 1e4)^2 + (0.01 (x - u) / 2)^2."""
+    x = lag().rest([1.8], [0.3], [0.0], [1.0])
+    np.testing.assert_allclose(x, (4 * 1.8 + 0.3) / 5, rtol=1e-4)
+    # out of reach of the input v = 2, with sd 50: (50 (2 - x) / 0.5)^2 + (100 (x - 9) / 50)^2
+    x = lag(outputs={"t": {"unit": "degC", "sd": 50.0}}).rest([9.0], [0.3], [0.0], [1.0])
+    np.testing.assert_allclose(x, (1e4 * 2.0 + 4 * 9.0) / 10004, rtol=1e-6)
+    # the same with a warm-up of 1 s and a state of 4: (0.25 (2 - x))^2 + (2 (x - 9))^2
+    wide = {"warmup": 1.0, "states": {"t": 4.0}, "outputs": {"t": {"unit": "degC", "sd": 50.0}}}
+    np.testing.assert_allclose(
+        lag(**wide).rest([9.0], [0.3], [0.0], [1.0]), (2.0 / 16 + 4 * 9.0) / (1 / 16 + 4), rtol=1e-6
+    )
+    # a switch stays where it is, and an input without a range is bounded by nothing
+    free = {"q": {"unit": "1"}}
+    np.testing.assert_allclose(lag(**wide, inputs=free).rest([9.0], [0.3], [0.0], [1.0]), 9.0, rtol=1e-4)
+    held = {"q": {"unit": "1", "switch": True}}
+    np.testing.assert_allclose(
+        lag(**wide, inputs=held).rest([9.0], [0.3], [0.0], [1.0]), (0.3 / 16 + 4 * 9.0) / (1 / 16 + 4)
+    )
+    assert lag(limits={"t": (None, 1.2)}).rest([1.8], [0.3], [0.0], [1.0]) == pytest.approx([1.2], rel=1e-3)
+    own = lag(limits={"t": (0.4, None)}, rest=lambda self, y, u, d, p: [y.t - u.q - d.air])
+    assert [own.rest([1.8], [0.3], [air], [1.0])[0] for air in (1.0, 1.4)] == pytest.approx([0.5, 0.4])
+
+
+@pytest.mark.parametrize(("y", "root"), [(2.0, 2.0), (3.5, 7.5)])
+def test_rest_is_found_near_the_readings(y: float, root: float):
+    """|x - 4| reads the same on both sides; a state that no output is named after begins at their mean."""
+    model = lag(states={"hot": 4.0}, outputs={"t": {"unit": "degC", "sd": 1e-3}}, inputs={"q": "1"},
+                rhs=lambda self, x, u, d, p: [u.q + 0 * x.hot],
+                output=lambda self, x, p: [abs(x.hot - 4.0) * (1 + 0 * p.k)])  # fmt: skip
+    start = model.rest([y], [0.0], [0.0], [1.0])
+    np.testing.assert_allclose(start, root if y < 3 else 4.0 - y, atol=1e-3)
+
+
+def settled(residual: Any, z: float, low: float = -np.inf, high: float = np.inf) -> tuple[float, int]:
+    """Where the search ends in one unknown, and after how many evaluations."""
+    seen = []
+
+    def rows(at: np.ndarray) -> np.ndarray:
+        seen.append(at)
+        return np.asarray(residual(at))
+
+    return float(_settle(rows, np.array([z]), np.array([low]), np.array([high]))[0]), len(seen)
+
+
+@pytest.mark.parametrize(
+    ("residual", "start", "ends", "end", "evaluations"),
+    [
+        (lambda z: z - 3.0, 0.0, (), 3.0, 5),  # what is left: 3, 3e-3, 3e-7, 3e-12; then no move
+        (
+            lambda z: z - 3.0,
+            0.0,
+            (-1.0, 2.0),
+            2.0,
+            9,
+        ),  # on the bound no step helps: 1e-5 grows hundredfold to 1e9
+        (lambda z: np.arctan(z), 3.0, (), 0.0, 10),  # a whole step overshoots: damped until it does not
+        (lambda z: 1 + np.abs(z), 0.0, (), 0.0, 8),  # no step helps: 1e-3 grows a hundredfold to 1e11
+        (lambda z: np.sqrt(z - 1.0), 0.0, (), np.nan, 1),
+        (lambda z: np.where(z > 2.5, np.nan, z - 3.0), 0.0, (), 2.5, None),  # not past where it is known
+    ],
+)
+def test_the_search_for_rest_ends_where_its_cost_does(
+    residual: Any, start: float, ends: tuple[float, ...], end: float, evaluations: int | None
+):
+    with np.errstate(invalid="ignore"):
+        found, count = settled(residual, start, *ends)
+    if evaluations:
+        np.testing.assert_allclose(found, end, atol=1e-9)
+        assert count == evaluations
+    else:
+        assert 2.0 < found <= end
+
+
+def test_what_a_class_does_not_state_follows_from_its_step():
+    plain, said = own_model(Block), own_model(varied(Block, average=7.0, warmup=33.0, dt=0.5))
+    assert (plain.average, plain.independent, plain.warmup, plain.search_step) == (5.0, 20.0, 50.0, 1.0)
+    assert (said.average, said.independent, said.warmup, said.search_step) == (7.0, 28.0, 33.0, 0.5)
+    assert (plain.pieces, plain.compiled, plain.sensor_sd, plain.spread.tolist()) == (
+        1,
+        True,
+        {"t": 0.05},
+        [[0.25]],
+    )
+    unknown = own_model(varied(Block, outputs={"t": "degC"}))
+    assert unknown.sensor_sd == {"t": 1.0}
+    assert replace(unknown, sd={"t": 0.3}).sensor_sd == {"t": 0.3}
+    assert own_model(Tanks).limits.tolist() == [[-np.inf, np.inf], [0.0, 10.0]]
+    assert [replace(own_model(Tanks), pieces=3)._pieces(dt) for dt in (4.0, 2.0, 0.1, 8.0)] == [3, 2, 1, 6]
+    assert (
+        replace(
+            own_model(varied(Block, rhs=lambda s, x, u, d, p: [np.sort(x.t)])), compiled=False
+        ).slow_because
+        == ""
+    )
+    assert unknown.to_dict() == {
+        "kind": "own", "class": "Block", "file": Path(__file__).name, "sha256": unknown.code.sha256,
+        "inputs": ["q"], "disturbances": ["air"], "outputs": ["t"], "states": ["t"], "pieces": 1,
+        "sd": {"t": 1.0},
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("off", "pieces"),
+    [
+        (lambda n: 0.0, 1),
+        (lambda n: 0.0099 * (n > 1), 1),  # a tenth of the sd, 0.1 K, in all rows
+        (lambda n: 0.0101 * (n > 1), 2),
+        (lambda n: np.append(np.zeros(2499), 0.099 * (n > 1)), 1),  # the sd itself in one row of many
+        (lambda n: np.append(np.zeros(2499), 0.101 * (n > 1)), 2),
+        (lambda n: np.nan if n < 4 else 0.0, 4),
+        (lambda n: 0.02 * np.log2(min(n, 256)), 256),
+        (lambda n: 0.02 * np.log2(n), None),
+        (lambda n: np.append(np.zeros(2499), np.nan), None),
+    ],
+)
+def test_pieces_are_doubled_until_runs_agree(off: Any, pieces: int | None):
+    """The second of two runs is off by so much; the class states no sd: it is 2 % of 5 K."""
+    tried = []
+
+    def runs(model: OwnModel, logs: Any, p: np.ndarray) -> Any:
+        tried.append(model.pieces)
+        return [
+            ("first", np.zeros((1, 9, 1))),
+            ("second", (off(model.pieces) + np.zeros(2500))[None, :, None]),
+        ]
+
+    model = own_model(varied(Block, outputs={"t": "degC"}, dt=0.5))
+    t = np.arange(0.0, 100.0)
+    signals = {"q": (t, "1", "input"), "air": (t, "degC", "disturbance")}
+    logs = [make_log(t, signals | {"t": (20 + 5 * (-1.0) ** t, "degC", "output")})]
+    if pieces:
+        ready = model.prepared(logs, free_runs=runs)
+        assert (ready.pieces, ready.sd) == (pieces, {"t": pytest.approx(0.1)})
+        assert tried == [2**k for k in range(len(tried))]
+        assert tried[-1] == 2 * pieces
+        assert ready.prepared(logs, free_runs=runs).pieces == pieces
+    else:
+        lost = not np.isfinite(off(1)).all()
+        said = (
+            r"no finite output 1249.5 s into second, with .*np\.maximum"
+            if lost
+            else r"too fast for 256 .* in dt = 0.5 s"
+        )
+        with pytest.raises(UserError, match=said):
+            model.prepared(logs, free_runs=runs)
+        assert tried[-1] == 512
+
+
+def test_what_a_plant_file_says_of_a_class_is_checked():
+    model = own_model(Block)
+    said = {"kind": "own", "class": "Block", "sha256": None, "pieces": 6, "sd": {"t": 0.4}}
+    assert (model.restored(said).pieces, model.restored(said).sd) == (6, {"t": 0.4})
+    assert model.restored(said | {"pieces": 0}).pieces == 1
+    for change in ({"pieces": "many"}, {"sd": None}, {"sd": {"t": None}}, {"pieces": None}):
+        with pytest.raises(UserError, match="its model is not whole; fit the plant again"):
+            model.restored(said | change)
+    with pytest.raises(UserError, match="equations are a statespace, not Block"):
+        model.restored({"kind": "statespace"})
+    with pytest.raises(UserError, match=r"class None of FILE\.py.*--network FILE\.py:None"):
+        OwnModel.from_dict({})
 
 
 def test_a_class_may_call_what_it_likes_and_what_cannot_be_compiled_runs_in_numpy_and_reports_it():

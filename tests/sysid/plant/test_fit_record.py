@@ -7,7 +7,7 @@ import json
 import pytest
 
 from thermogrip.datasets.schema import data_hash, make_log
-from thermogrip.sysid.plant.fit_record import FitLog, PlantScores, said_of_fit
+from thermogrip.sysid.plant.fit_record import TAIL, FitLog, Intervals, PlantScores, fit_logs, said_of_fit
 
 # as version 0.1.0 wrote them for a network and for a black box, shortened
 NETWORK = {
@@ -71,3 +71,16 @@ def test_rows_of_a_log_are_in_the_fit_where_it_is_the_same_log_at_the_same_time(
     assert whole.startswith("all of it is in the fit: the scores")
     (part,) = said_of_fit([FitLog("b", same, 1.0, 9.0)], log)
     assert part.startswith("1 to 3 s of 0 to 3 s are in the fit (as b): there the scores")
+    both = said_of_fit([FitLog("a", same, 0.0, 1.0), *others, FitLog("a", same, 2.0, 9.0)], log)
+    assert [line.split(" in the fit: there the scores say")[0] for line in both] == [
+        "0 to 1 s of 0 to 3 s are", "2 to 3 s of 0 to 3 s are"
+    ]  # fmt: skip
+    assert fit_logs([log, log]) == (FitLog("a", same, 0.0, 3.0),) * 2
+    assert whole.endswith("the scores say how well the plant is fitted, not how well it predicts")
+    assert TAIL == "last 30 % of "
+
+
+def test_what_a_fit_does_not_know_is_left_out_of_its_scores():
+    assert PlantScores().to_json() == {}
+    bare = Intervals()
+    assert (bare.numbers, bare.stretches, bare.between_logs, bare.error) == (None, 1, 1.0, "")

@@ -8,14 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.experiment.information import plant_from_prior
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.fit_record import PlantScores
+from thermogrip.sysid.plant.fit_record import FitLog, PlantScores
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.plant_file import check_plant_file
 
 
 @pytest.fixture(scope="module")
@@ -69,12 +71,93 @@ def test_units_and_covariance_stand_in_the_text_by_name():
         ({"values": {"seebeck": float("nan")}}, "seebeck is nan"),
         ({"covariance": [[1.0]]}, "covariance is"),
         ({"draws": [[1.0]]}, "samples are"),
+        ({"noise": {"t": -1e-9}}, "t is -1e-09"),
+        ({"noise": {"t": 1.01e6}}, r"t is 1.01e\+06, not"),
+        ({"nuisance": {"t": -1e-9}}, "t is -1e-09"),
+        ({"nuisance": {"t": 1.01e6}}, r"t is 1.01e\+06, not"),
+        ({"offsets": {"t": -1.01e6}}, r"t is -1.01e\+06, not"),
+        ({"offsets": {"t": 1.01e6}}, r"t is 1.01e\+06, not"),
+        ({"valid": {"t": [2.0, 1.0]}}, "valid of t is 2 to 1"),
+        ({"valid": {"t": [-1.1e9, 1.0]}}, "valid of t is -1.1e\\+09 to 1"),
+        ({"covariance": [[1.0, 0.0], [0.0, -1e-12]]}, "covariance has a negative variance"),
+        ({"covariance": [1.0, 2.0]}, "covariance"),
+        ({"free": ["zz"], "covariance": None}, "the model has no parameter zz"),
+        ({"fitted_to": [{"name": "a"}]}, "start_s"),
     ],
 )
 def test_what_is_not_a_plant_is_refused_in_one_line(change, says):
     with pytest.raises(UserError, match=says) as refused:
         Plant.from_dict(_plants()[0].to_dict() | change)
     assert "\n" not in str(refused.value)
+
+
+def test_the_ends_of_what_a_plant_may_hold_are_held(tmp_path: Path):
+    bare = _plants()[2]
+    edge = {"noise": {"t": 1e6}, "offsets": {"t": -1e6}, "nuisance": {"t": 0.0}}
+    edge |= {"valid": {"t": [3.0, 3.0], "q": [-1e9, None]}}
+    back = Plant.from_dict(bare.to_dict() | edge)
+    assert (back.noise, back.offsets, back.nuisance) == ({"t": 1e6}, {"t": -1e6}, {"t": 0.0})
+    assert back.valid == {"t": (3.0, 3.0), "q": (-1e9, np.inf)}
+    assert "inputs_end_at_row" not in bare.to_dict()
+    assert "refits" not in bare.to_dict()
+    log = FitLog("a", "0" * 64, -3.0, 7.5)
+    more = replace(bare, refits=(bare.model, bare.model), inputs_end_at_row=True, fitted_to=(log,))
+    again = Plant.load(more.save(tmp_path / "plant.json"))
+    assert (len(again.refits), again.inputs_end_at_row, again.fitted_to) == (2, True, (log,))
+    assert not Plant.from_dict(bare.to_dict()).inputs_end_at_row
+    with pytest.raises(ValueError, match=f"no value for {_plants()[0].model.parameters[0]}"):
+        replace(_plants()[0], values={})
+
+
+def test_the_plant_within_another_file_is_looked_through(tmp_path: Path):
+    path = tmp_path / "some.json"
+    content = {"schema": "thermogrip.controller", "version": 1, "plant": _plants()[0].to_dict()}
+    for change, says in (
+        ({}, ""),
+        ({"plant": None}, r"some\.json: plant is missing; write the file again"),
+        ({"plant": content["plant"] | {"dt": -1.0}}, r"some\.json: .*dt is -1"),
+    ):
+        path.write_text(json.dumps(content | change))
+        if says:
+            with pytest.raises(UserError, match=says):
+                check_plant_file(path, inside="thermogrip.controller")
+        else:
+            assert check_plant_file(path, inside="thermogrip.controller") == content
+
+
+def test_draws_are_thinned_evenly_and_as_many_as_64_stand_in_the_file(plant: Plant, tmp_path: Path):
+    samples = np.arange(65.0)[:, None] + np.ones(len(plant.free))
+    kept = [row[0] for row in replace(plant, samples=samples[:7]).to_dict(draws=3)["draws"]]
+    assert kept == [1.0, 4.0, 7.0]
+    assert len(replace(plant, samples=samples[:7]).to_dict(draws=9)["draws"]) == 7
+    assert len(replace(plant, samples=samples[:7]).to_dict()["draws"]) == 7
+    for n, files in ((64, ["p.json"]), (65, ["p.json", "p.nc"])):
+        replace(plant, samples=samples[:n]).save(tmp_path / "p.json")
+        assert sorted(path.name for path in tmp_path.iterdir()) == files
+    with xr.open_dataset(tmp_path / "p.nc", engine="h5netcdf") as record:
+        said = dict(zip(record["parameter"].values.tolist(), record["units"].values.tolist()))
+    assert said == {name: plant.units.get(name, "1") for name in plant.free}
+    samples[3, 1] = np.nan
+    replace(plant, samples=samples).save(tmp_path / "p.json")
+    with pytest.raises(UserError, match=r"p\.json: its samples p\.nc cannot be read; draw the posterior"):
+        Plant.load(tmp_path / "p.json")
+    (tmp_path / "p.nc").write_bytes(b"no samples")
+    with pytest.raises(UserError, match=r"p\.json: its samples p\.nc: "):
+        Plant.load(tmp_path / "p.json")
+
+
+def test_a_plant_passes_on_how_it_is_to_be_simulated(monkeypatch: pytest.MonkeyPatch):
+    seen = []
+    monkeypatch.setattr(
+        "thermogrip.sysid.plant.plant.simulate", lambda *args, **how: seen.append((args, how))
+    )
+    block = _plants()[2]
+    block.simulate("log")
+    block.simulate("log", 7.0, score_from=3.0, gaps="hold")
+    assert seen == [
+        ((block, "log"), {"warmup": 5.0, "score_from": None, "gaps": "mend"}),
+        ((block, "log"), {"warmup": 7.0, "score_from": 3.0, "gaps": "hold"}),
+    ]
 
 
 def test_samples_stand_beside_the_plant_and_move_with_it(plant: Plant, tmp_path: Path):
@@ -140,6 +223,38 @@ def test_laplace_draws_have_the_stated_covariance(plant: Plant):
     np.testing.assert_allclose(np.var(theta, axis=0), np.diag(plant.covariance), rtol=5 * np.sqrt(2 / 1500))
     assert plant.draw(0) is plant
     assert plant.draw(3).values == plant.draw(3).values != plant.draw(4).values
+
+
+def test_draws_are_rows_of_samples_or_refits_at_multiples_of_the_golden_ratio(plant: Plant):
+    """0.618, 0.236 and 0.854 of the way along."""
+    sampled = replace(plant, samples=np.tile(np.arange(1.0, 101.0)[:, None], (1, len(plant.free))))
+    assert [sampled.draw(k).values["G_amb"] for k in (1, 2, 3)] == [62.0, 24.0, 86.0]
+    held = next(name for name in plant.model.parameters if name not in plant.free)
+    assert sampled.draw(1).values[held] == plant.values[held]
+    bare = replace(sampled, covariance=None)
+    first = bare.intervals(0.8)["G_amb"]
+    assert first == pytest.approx((10.9, 90.1))  # of 1 to 100
+    refits = tuple(load_network("tclab") for _ in range(10))
+    again = replace(sampled, refits=refits)
+    assert [refits.index(again.draw(k).model) for k in (1, 2, 3)] == [6, 2, 8]
+    assert [p.uncertain for p in (bare, replace(again, samples=None, covariance=None), plant)] == [True] * 3
+    with pytest.raises(UserError, match="draw -1 is negative"):
+        plant.draw(-1)
+
+
+def test_draws_and_intervals_stay_inside_the_bounds(plant: Plant):
+    name = next(n for n in plant.free if plant.scales[n] == "linear")
+    at, middle = plant.free.index(name), plant.values[name]
+    wide = np.diag(np.full(len(plant.free), 4.0))
+    open_ended = replace(plant, covariance=wide, bounds={})
+    assert open_ended.intervals(0.9)[name] == pytest.approx((middle - 3.28971, middle + 3.28971))
+    kept = replace(open_ended, bounds={name: (middle - 0.5, middle + 1.5)})
+    assert kept.intervals(0.9)[name] == (middle - 0.5, middle + 1.5)
+    drawn = [kept.draw(k).values[name] for k in range(1, 40)]
+    assert (min(drawn), max(drawn)) == (middle - 0.5, middle + 1.5)
+    assert open_ended.theta[at] == middle
+    with pytest.raises(ValueError, match=r"level must lie between 0 and 1, got 0"):
+        plant.intervals(0.0)
 
 
 def test_draws_from_samples_visit_the_chain_evenly(plant: Plant):
