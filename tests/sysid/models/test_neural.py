@@ -146,6 +146,116 @@ def test_a_state_at_rest_reads_what_was_asked_and_hardly_moves(tank):
     assert y[0, 1, 0] == pytest.approx(6.0, abs=0.03)
 
 
+def bent(**change):
+    """Two members of two states, one output with rails, an input, a switch and a disturbance."""
+    rng = np.random.default_rng(5)
+    K, n, h, m = 2, 2, 3, 3
+    shapes = {"B": (n, m), "c": (n,), "V": (n, h), "W": (h, n), "U": (h, m), "b": (h,)}
+    content = {
+        "inputs": ("q", "pump"), "disturbances": ("room",), "outputs": ("t",), "switches": ("pump",),
+        "dt": 2.0,
+        "A": [[[0.5, 0.2], [-0.1, 0.6]], [[0.3, -0.4], [0.2, 0.7]]],
+        **{key: 0.4 * rng.standard_normal((K, *shape)) for key, shape in shapes.items()},
+        "y_middle": [25.0], "y_size": [4.0], "w_middle": [0.5, 0.4, 20.0], "w_size": [0.3, 0.5, 3.0],
+        "reach": [2.0, 1.5, 1.0], "low": [22.0], "high": [27.0],
+    }  # fmt: skip
+    return NeuralModel(**(content | change))
+
+
+def test_one_unit_by_hand():
+    scales = {"y_middle": [25.0], "y_size": [4.0], "w_middle": [0.5, 20.0], "w_size": [0.3, 3.0]}
+    one = {"A": [[[0.5]]], "B": [[[0.2, -0.3]]], "c": [[0.05]], "V": [[[0.7]]], "W": [[[0.4]]],
+           "U": [[[0.6, -0.1]]], "b": [[0.15]], "reach": [2.0, 1.0],
+           "low": [-np.inf], "high": [np.inf]}  # fmt: skip
+    model = bent(inputs=("q",), switches=(), **scales, **one)
+    w = np.array([1.0, -1.0])  # q = 0.8; the room of 11 degC is clipped from -3 to -1
+    after = (
+        0.5 * 0.9 + 0.2 * w[0] - 0.3 * w[1] + 0.05 + 0.7 * np.tanh(0.4 * 0.9 + 0.6 * w[0] - 0.1 * w[1] + 0.15)
+    )
+    assert model.step([0.9], [0.8], [11.0], (), 2.0) == pytest.approx([after])
+    assert model.output([0.9], ()) == pytest.approx([25.0 + 4 * 0.9])
+    y, end = model.rollout([[0.9]], [[[0.8]]], [[[11.0]]], (), 2.0)
+    assert end[0] == pytest.approx([after])
+    assert y[0, :, 0] == pytest.approx([28.6, 25.0 + 4 * after])
+
+
+@pytest.mark.parametrize("rails", [{}, {"low": [-np.inf]}, {"high": [np.inf]}])
+def test_drives_disturbances_and_rails_are_those_of_the_step(rails):
+    model, rng = bent(**rails), np.random.default_rng(1)
+    u, d = rng.uniform(-0.5, 1.5, (2, 25, 2)), rng.uniform(15, 25, (2, 25, 1))
+    x0 = 2 * rng.standard_normal((2, 4))
+    for times in (1, 2):
+        y, end = model.rollout(x0, u, d, (), 2.0 * times)
+        together, _ = model.rollout(x0, u[:1], d[:1], (), 2.0 * times)
+        np.testing.assert_allclose(together[0], y[0], rtol=1e-12)
+        for b in range(2):
+            x = list(x0[b])
+            for k in range(25):
+                np.testing.assert_allclose(y[b, k], model.output(x, ()), rtol=1e-9)
+                x = model.step(x, u[b, k], d[b, k], (), 2.0 * times)
+            np.testing.assert_allclose(end[b], x, rtol=1e-9, atol=1e-12)
+    met = (y[:, 1:] == 22.0).any(), (y[:, 1:] == 27.0).any()
+    assert met == (model.low[0] == 22.0, model.high[0] == 27.0) or len(rails) == 1
+    np.testing.assert_array_equal(model.rollout(x0, u, d, (), 0.9)[0], model.rollout(x0, u, d, (), 2.0)[0])
+
+
+@pytest.mark.parametrize("reading", [26.0, np.nan])
+def test_rest_of_linear_members_is_the_least_squares_of_its_theory(reading):
+    """Unknown are the hidden state, the reading where it is lost, and the input, but not the switch."""
+    model = bent(V=np.zeros((2, 2, 3)), low=[-np.inf], high=[np.inf])
+    x = model.rest([reading], [0.6, 0.8], [22.0], ()).reshape(2, 2)
+    w = np.clip((np.array([0.6, 0.8, 22.0]) - model.w_middle) / model.w_size, -model.reach, model.reach)
+    for k in range(2):
+        flow = np.hstack([model.A[k] - np.eye(2), model.B[k]])
+        free = [1, 2] if np.isfinite(reading) else [0, 1, 2]
+        known = np.concatenate([[0.25 if np.isfinite(reading) else 0.0, 0.0], w])
+        weight = np.diag([1e-2 if i == 2 else 1e-4 for i in free])
+        rows, right = (
+            np.vstack([flow[:, free], weight]),
+            np.concatenate([-(flow @ known + model.c[k]), 0 * weight[0]]),
+        )
+        z = known.copy()
+        z[free] += np.linalg.lstsq(rows, right, rcond=None)[0]
+        np.testing.assert_allclose(x[k], z[:2], atol=1e-6)
+
+
+def test_a_rest_far_from_the_middle_is_reached_in_steps_of_one_spread():
+    """One state that no reading fixes, with x = 0.5 x + 2: at 4, four spreads away."""
+    shapes = {"B": (2, 3), "V": (2, 3), "W": (3, 2), "U": (3, 3), "b": (3,)}
+    none = {key: np.zeros((1, *shape)) for key, shape in shapes.items()}
+    lone = bent(A=[[[0.5, 0.0], [0.0, 0.5]]], c=[[2.0, 2.0]], **none)
+    np.testing.assert_allclose(lone.rest([np.nan], [0.6, 0.8], [22.0], ()), [4.0, 4.0], atol=1e-5)
+    np.testing.assert_allclose(lone.rest([27.0], [0.6, 0.8], [22.0], ()), [0.5, 4.0], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"W": np.full((2, 3, 2), np.nan)}, r"W has shape \(2, 3, 2\), expected finite \(2, 3, 2\)"),
+        ({"U": np.zeros((2, 3, 2))}, r"U has shape \(2, 3, 2\), expected finite \(2, 3, 3\)"),
+        ({"y_size": [1.0, 1.0]}, "y_size must have 1 entries"),
+        ({"low": []}, "low must have 1 entries"),
+        ({"reach": [1.0]}, "reach must have 3 entries"),
+        ({"w_middle": [1.0]}, "w_middle must have 3 entries"),
+        ({"outputs": tuple("abc"), **dict.fromkeys(("y_middle", "y_size", "low", "high"), [1.0] * 3)},
+         "2 states cannot hold 3 outputs"),
+        ({"A": [np.eye(2), 0.5 * np.eye(2)]}, "the linear part of a member is not stable"),
+    ],
+)  # fmt: skip
+def test_parts_that_do_not_fit_are_refused(change, said):
+    with pytest.raises(ValueError, match=said):
+        bent(**change)
+
+
+def test_a_neural_model_comes_back_from_its_dict_with_its_rails():
+    for rails in ({}, {"low": [-np.inf]}, {"high": [np.inf]}):
+        model = bent(**rails)
+        again = NeuralModel.from_dict(model.to_dict())
+        assert again.to_dict() == model.to_dict()
+        assert (again.low.tolist(), again.high.tolist()) == (model.low.tolist(), model.high.tolist())
+    assert (model.n_x, model.spread.tolist(), model.stable) == (4, np.eye(4).tolist(), True)
+
+
 def test_a_fifth_of_the_readings_lost_costs_little(fit_one):
     fresh = tank_log(seed=2)
     grid = make_grid([tank_log(lost=0.2)], average=1.0)
