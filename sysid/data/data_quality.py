@@ -445,7 +445,7 @@ def evidence(plant: Plant, logs: Sequence[Log]) -> Evidence:
 
 def _spent(steps: Array) -> Array:
     """Return the seconds that each row's input was held, from those between rows."""
-    usual = np.median(steps)
+    usual = float(np.median(steps))
     # beyond a gap the input is unknown
     return np.asarray(np.minimum(np.append(steps, usual), max(GAP_SECONDS, GAP_STEPS * usual)))
 
