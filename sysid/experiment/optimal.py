@@ -271,9 +271,7 @@ class _Frame:
         held = np.repeat(cells, self.cell * each, axis=0)
         u = np.vstack([np.tile(self.still, (rest, 1)), held])[:n]
         if np.isfinite(self.slew):
-            most = (
-                self.slew * self.dt * each / self.ratio * np.where(self.switch, np.inf, self.high - self.low)
-            )
+            most = self.slew * self.dt / each * np.where(self.switch, np.inf, self.high - self.low)
             for k in range(1, len(u)):
                 u[k] = u[k - 1] + np.clip(u[k] - u[k - 1], -most, most)
         return u
