@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
@@ -362,3 +363,58 @@ def test_a_fit_that_runs_out_of_iterations_says_so(monkeypatch: pytest.MonkeyPat
     plant = fit_network(TwoGains(), logs)
     assert "the fit ran out of iterations" in plant.verdict
     assert plant.scores.converged is False
+
+
+def test_a_random_search_begins_near_the_prior_and_counts_what_blew_up(monkeypatch: pytest.MonkeyPatch):
+    """A cost that grows by its logarithm, so that one wild residual is no more than a far one."""
+    box = np.array([-9.0, -1.5, -0.01]), np.array([9.0, 1.0, 0.01])
+    wild = np.array([[3.0, np.nan], [2e6, 0.0], [-np.inf, 0.0], [1.0, 2.0]])
+    told: dict[str, Any] = {}
+
+    class Optimiser:
+        def __init__(self, kind: str, n: int) -> None:
+            told.update(kind=kind, n=n)
+
+        def optimize(self, z: Array) -> Array:
+            told["start"] = z
+            told["costs"] = [told["objective"](np.full(3, float(k)), None) for k in range(4)]
+            return z
+
+        def __getattr__(self, name: str) -> Any:
+            return lambda value: told.update({"objective" if name == "set_min_objective" else name: value})
+
+    fake = SimpleNamespace(srand=lambda s: told.update(seed=s), opt=Optimiser, GN_CRS2_LM="crs")
+    monkeypatch.setitem(sys.modules, "nlopt", fake)
+    begun: list[Array] = []
+    problem: Any = SimpleNamespace(box=box, linearise=begun.append, trials=lambda z: wild[[int(z[0, 0])]])
+    found = greybox._random_search(problem, 4)
+    assert (told["kind"], told["n"], told["seed"], told["set_maxeval"]) == ("crs", 3, 4, 1500)
+    np.testing.assert_array_equal(told["set_lower_bounds"], [-2.0, -1.5, -0.01])
+    np.testing.assert_array_equal(told["set_upper_bounds"], [2.0, 1.0, 0.01])
+    want = np.clip(0.5 * np.random.default_rng(4).standard_normal(3), [-2, -1.5, -0.01], [2, 1, 0.01])
+    np.testing.assert_allclose(found, want)
+    np.testing.assert_array_equal(begun, [[0.0, 0.0, 0.0]])
+    np.testing.assert_allclose(told["costs"], np.log1p([1e12 + 9, 1e12, 1e12, 5.0]))
+
+
+def test_free_runs_are_named_by_their_logs():
+    logs, model = [a_log(1, seconds=100), a_log(2, seconds=120)], TwoGains()
+    found = greybox.free_runs(model, logs, np.array([3.0, 5.0]))
+    assert [name for name, _ in found] == ["log 1", "log 2"]
+    for (_, run), log in zip(found, logs):
+        y, _ = model.rollout(np.zeros((1, 2)), log["q"].values[None, :, None], np.zeros(0), [[3.0, 5.0]], 1.0)
+        n = log.sizes["time"] - 1
+        np.testing.assert_allclose(run[0, :n, 0], y[0, :n, 0], atol=0.05)
+
+
+def test_scores_are_rounded_and_a_search_tells_which_it_is(reported: Any, monkeypatch: pytest.MonkeyPatch):
+    plant, logs, *_ = reported
+    scores = plant.scores
+    for value, digits in ((scores.cost, 3), (scores.seconds, 2), (scores.in_sample_rmse["log 1"]["t"], 4)):
+        assert value == round(value, digits)
+    told: list[tuple[float, str]] = []
+    monkeypatch.setattr(greybox, "_random_search", lambda problem, seed: np.zeros(2))
+    problem = make_problem(TwoGains(), logs[:1], average=4.0, independent=60.0)
+    best: Any = SimpleNamespace(cost=-1.0)
+    assert greybox._search(problem, best, logs[:1], 2, 0, lambda f, w: told.append((f, w))) is best
+    assert told == [(0.6, "global search 1 of 2"), (0.7, "global search 2 of 2")]

@@ -123,3 +123,37 @@ def test_a_parameter_on_its_bound_is_reported_with_the_likely_cause(reach, bound
     assert len(stated) == len(bounds)
     for name, line in zip(bounds, stated):
         assert line.startswith(f"{name} is on its upper bound {plant.bounds[name][1]:.3g}: {cause}")
+
+
+def test_what_a_fit_says_of_its_parameters():
+    """Two alike but for 2 % of one, one that moves nothing: of the scaled Hessian 0, 1e-4 (nearly) and 2."""
+    jacobian = np.array([[1.0, 1.0, 0.0], [0.0, 0.02, 0.0]])
+    sd = np.array([0.89, 0.91, 1.0])
+    for tilt, flat in (
+        (0.018, ["c up", "a up, b down"]),
+        (0.016, ["c up", "a up, b down"]),
+        (0.022, ["c up"]),
+    ):
+        jacobian[1, 1] = tilt
+        found = describe("abc", jacobian, np.diag(sd**2), np.array([1.2345, 1.0, 2.0]), {"a": "low"})
+        least = 1 - 1 / np.sqrt(1 + tilt**2)
+        assert found.spectrum == pytest.approx([0.0, least, 2 - least], rel=5e-3)
+        assert [way.replace("a down, b up", "a up, b down") for way in found.flat] == (
+            flat if least < 1e-4 or len(flat) == 1 else ["c up"]
+        )
+    assert found.prior_only == ["b", "c"]
+    assert (found.identifiable, found.weakest, found.on_bound) == (False, "c up", {"a": "low"})
+    assert found.widening == {"a": 1.234, "b": 1.0, "c": 2.0}
+    assert found.condition == pytest.approx((2 - least) / 1e-18, rel=1e-3)
+    alone = describe("ab", jacobian[:, :2], np.eye(2), np.ones(2), {})
+    assert alone.identifiable
+    assert alone.condition == pytest.approx((2 - least) / least, rel=1e-6)
+
+
+def test_a_trade_off_begins_at_nine_tenths_and_where_both_are_known_better():
+    for r, stated in ((0.899, False), (0.901, True)):
+        assert bool(trade_offs("ab", np.array([[1.0, r], [r, 1.0]]))) == stated
+    # 1 and 4 at 0.95: of the difference 3.07 remain
+    assert trade_offs("ab", np.array([[1.0, 3.8], [3.8, 16.0]])) == []
+    covariance = 0.05 * np.eye(8) + 0.95
+    assert len(trade_offs("abcdefgh", covariance)) == 28

@@ -603,15 +603,22 @@ def test_what_blew_up_has_no_pull_and_no_density() -> None:
     np.testing.assert_allclose(gradient, [[0.1, 0.1001]] + 25e-4 / 1.001 * np.array([[-1, 1]]), rtol=1e-4)
 
 
-def test_draws_tell_how_far_they_are(fitted: tuple[Plant, list[Log]]) -> None:
+def test_draws_tell_how_far_they_are(
+    fitted: tuple[Plant, list[Log]], monkeypatch: pytest.MonkeyPatch
+) -> None:
     told: list[tuple[float, str]] = []
-    drawn = with_draws(*fitted, 2, progress=lambda share, what: told.append((share, what)))
+
+    def progress(share: float, what: str) -> None:
+        told.append((share, what))
+
+    drawn = with_draws(*fitted, 2, progress=progress)
     assert told == [(k / 8, "plants that agree with the logs") for k in range(8)]
     assert np.asarray(drawn.samples).shape == (2, 2)
     assert np.asarray(with_draws(*fitted).samples).shape == (24, 2)
     told.clear()
-    sample_posterior(
-        *fitted, max_steps=2, n_samples=3, progress=lambda share, what: told.append((share, what))
-    )
+    monkeypatch.setattr(posterior, "_CHECK_EVERY", 2)
+    sample_posterior(*fitted, max_steps=4, n_samples=3, progress=progress)
     assert [what for _, what in told][:2] == ["averaging the logs", "learning the model error"]
     assert told[-2] == (0.95, "completing the samples")
+    sampling = [share for share, what in told if what.startswith("sampling, ")]
+    assert sampling == pytest.approx([0.525, 0.95])
