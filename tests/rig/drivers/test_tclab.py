@@ -242,11 +242,12 @@ def test_a_scan_that_cannot_be_right_is_asked_three_times(
     bench: Lab, passed: float, scans: list[tuple[float, float]], read: float, heater: float
 ) -> None:
     lab, left = bench.lab, [(25.0, 0.0), *scans]
-    lab._scan = lambda: [left[0][0], 25.0, 0.0, left.pop(0)[1]]
+    lab._set[0] = 70.0  # a heater may be beyond what a temperature may be
+    lab._scan = lambda: [left[0][0], 25.0, 70.0 + left[0][1], left.pop(0)[1]]
     lab.read()
     bench.clock.sleep(passed)
     found = lab.read()
-    np.testing.assert_array_equal([found.values["t1"], found.drive["q2"]], [read, heater])
+    np.testing.assert_array_equal([found.values["t1"], *found.drive.values()], [read, 70.0 + heater, heater])
     assert left == []
     kinds = {notice.kind for notice in lab.notices()}
     assert ("damaged" in kinds, "reset" in kinds) == (len(scans) == 3, heater > 0.002)
@@ -270,8 +271,27 @@ def test_it_cannot_grasp(bench: Lab) -> None:
 def test_a_silent_port_is_no_tclab() -> None:
     device = VirtualDevice(make_lab(), protocol="tclab", link="none", clock=SteppedClock())
     device.fault("silence")
+    port, written = DirectPort(device), []
+    port.write = written.append
     with pytest.raises(PortError, match="no TCLab answers"):
-        TCLabRig(DirectPort(device), greeting=0.05, timeout=0.01)
+        TCLabRig(port, greeting=0.05, timeout=0.01)
+    assert written == [b"VER\r\n"] * 5
+
+
+def test_a_board_that_does_not_answer_is_asked_three_times_and_then_once(bench: Lab) -> None:
+    port, written = bench.lab.port, []
+    bench.lab.apply(HALF, 1)
+    write, port.write = port.write, lambda data: written.append(data) or write(data)
+    bench.lab.apply(HALF, 1)
+    assert written == [b"Q1 50.000\r\n", b"Q2 0.000\r\n"]  # once where the board took it
+    bench.lab.notices()
+    bench.device.fault("silence")
+    for n, kinds in ((3, ["repeated"] * 3 + ["link"]), (1, ["repeated"])):
+        written.clear()
+        with pytest.raises(PortError, match="does not answer"):
+            bench.lab.apply(HALF, 1)
+        assert written == [b"Q1 50.000\r\n"] * n
+        assert [notice.kind for notice in bench.lab.notices()] == kinds
 
 
 def test_the_makers_own_client_runs_against_the_virtual_board(

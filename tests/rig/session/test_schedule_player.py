@@ -57,6 +57,20 @@ def test_an_order_that_is_not_whole_or_that_no_rig_can_follow_is_refused_before_
         Playback(schedule(tmp_path, change), {"drive": "1"}, 1.0)
 
 
+def test_a_row_is_in_force_until_the_next_and_the_last_as_long_as_the_one_before() -> None:
+    columns = {"drive": ([0.1, 0.2, 0.3], "1", "input"), "pump": ([1, 1, 0], "1", "input")}
+    plan = make_log([100.0, 105.0, 107.0], columns, name="schedule")
+    player = Playback(plan, {"drive": "1"}, 0.5)
+    player.reset({"time_s": 7.0})
+    moves = [player.step({"time_s": 7.0 + t}, 0.0) for t in (0.0, 4.99, 5.0 - 5e-10, 7.0, 50.0)]
+    found = [(move.drive["drive"], move.pump) for move in moves]
+    assert found == [(0.1, 1), (0.1, 1), (0.2, 1), (0.0, 0), (0.0, 0)]
+    assert (player.seconds, player.dt) == (9.0, 0.5)
+    assert Playback(plan.isel(time=[0]), {"drive": "1"}, 0.5).seconds == 0.5
+    bare = Playback(plan.drop_vars("pump"), {"drive": "1"}, 0.5).step({"time_s": 7.0}, 0.0)
+    assert (bare.drive, bare.pump) == ({"drive": 0.3}, 1)
+
+
 def test_a_schedule_that_was_played_reports_it_and_is_not_recovered(plant: Plant, tmp_path: Path) -> None:
     bench = Bench(plant)
     with RunFolder(tmp_path / "run") as folder:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.rig.makers import STILL
+from tests.rig.makers import STILL, make_lab
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.contact.simulation import Grip, Touch
@@ -98,8 +98,13 @@ def test_one_seed_is_one_run_and_another_seed_another(plant: Plant) -> None:
     assert run(1) == run(1)
     assert run(1) != run(2)
     assert all((value * 16).is_integer() for value in run(1))
-    twin = Twin(plant, seed=1)
+    twin, rehearsed = Twin(plant, seed=1), Twin(plant, seed=1)
     assert twin.read() == twin.read()  # which draws no new noise
+    rehearsed.rehearse("copper", 43.0)  # which draws none of its own
+    assert rehearsed.read() == twin.read()
+    with pytest.raises(UserError, match="unobtainium"):
+        rehearsed.rehearse("unobtainium", 43.0)
+    assert (twin.units, Twin(make_lab()).units) == ({"drive": "1"}, {"q1": "percent", "q2": "percent"})
 
 
 def test_a_grasp_moves_the_skin_towards_the_object_by_the_response(plant: Plant) -> None:

@@ -105,6 +105,7 @@ def test_a_device_fits_its_plant_and_counts_its_resets(plant: Plant, clock: Step
     for cause, boot in (({}, 2), ({"cause": "watchdog"}, 3)):
         gripper.fault("reset", **cause)
         assert (gripper.core.cause, gripper.core.boot) == (cause.get("cause", "external"), boot)
+    clock.sleep(5.0)
     gripper.fault("sensor_offset")  # the skin's, and of 3 K
     gripper.fault("sensor_drift", sensor="t_tank")  # of 20 mK/s
     gripper.fault("driver_stuck")
