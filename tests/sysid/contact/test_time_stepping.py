@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from thermogrip.sysid.contact import time_stepping as kernel
 from thermogrip.sysid.contact.response import far_response, step_response, time_nodes
 from thermogrip.sysid.contact.time_stepping import N_MODE, first_step, slab, slab_moves, slabs
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
@@ -97,3 +98,58 @@ def test_a_step_without_an_exponential_is_one_less_it():
     got = [first_step.py_func(v) for v in x]
     np.testing.assert_allclose(got, -np.expm1(-x), rtol=1e-14)
     assert first_step.py_func(1e6) == 1.0
+
+
+@pytest.mark.parametrize("x", [1e-6, 0.99e-3, 1.01e-3, 0.3, 5.0])
+def test_a_step_of_a_mode_is_its_answer_to_a_flux_that_changes_along_a_line(x):
+    """Integrals of exp(-lam (dt - s)) times 1 - s / dt and s / dt, and their slopes by ln lam."""
+    dt, (node, weight) = 0.4, np.polynomial.legendre.leggauss(30)
+    share, weight = 0.5 * (1 + node), 0.5 * weight
+
+    def exact(x):
+        fade = np.exp(-x * (1 - share))
+        return dt * (weight * fade * (1 - share)).sum(), dt * (weight * fade * share).sum()
+
+    m = -np.expm1(-x)
+    got = kernel.mode_step.py_func(x / dt, dt, m)
+    np.testing.assert_allclose(got, exact(x), rtol=2e-9)
+    h = 1e-4
+    rise = [(up - down) / (2 * h) for up, down in zip(exact(x * np.exp(h)), exact(x * np.exp(-h)))]
+    moves = kernel.mode_step_moves.py_func(x / dt, dt, m, got[1])
+    np.testing.assert_allclose(moves, rise, rtol=2e-6, atol=1e-11)
+
+
+def test_conductance_grows_over_steps_that_double():
+    numbers, repeat, dt = np.array([0.0, 0.1, 0.2, 0.5, 3.0, 0.0]), np.array([2, 3]), np.array([0.1, 0.2])
+    t = np.array([0.0, 0.1, 0.2, 0.4, 0.6, 0.8])
+
+    def grown(tau):
+        out = np.empty((2, 6))
+        kernel._grow.py_func(repeat, dt, 700.0, tau, numbers, out)
+        return out
+
+    want = 700 * (0.2 + 0.8 * -np.expm1(-t / 0.5)) * (1 + 0.5 * -np.expm1(-t / 3.0))
+    np.testing.assert_allclose(grown(0.5)[0], want)
+    rise = (grown(0.5 * np.exp(1e-5))[0] - grown(0.5 * np.exp(-1e-5))[0]) / 2e-5
+    np.testing.assert_allclose(grown(0.5)[1], rise, rtol=1e-6, atol=1e-6)
+
+
+def test_a_delayed_integral_goes_by_straight_lines_between_the_points_that_count():
+    """Readings 0, 2, 4 at 1, 2, 4 s, one lost between: integrals 0, 1, 7; looked at half a second late."""
+    t, count = np.array([1.0, 2.0, 3.0, 4.0, 4.5]), np.array([1.0, 2.0, 0.0, 1.0, 3.0])
+    curve, total, value = np.array([0.0, 2.0, 99.0, 4.0, 4.0]), np.empty(5), np.empty(5)
+    kernel.fill_delayed.py_func(t, count, 0.5, curve, total, value)
+    np.testing.assert_allclose(value, [0.0, 1.0, 0.0, 3.5, 4.0])
+    np.testing.assert_allclose(total, [0.0, 0.25, 0.0, 1 + 1.5 * 2.75, 7.0])
+    kernel.fill_delayed.py_func(t, count, 0.0, curve, total, value)
+    np.testing.assert_allclose(total, [0.0, 1.0, 0.0, 7.0, 9.0])
+    assert kernel.delay.py_func(np.log(3.0), np.log(18.0)) == pytest.approx(6.0)
+
+
+def test_samples_find_their_nodes_whichever_way_they_come():
+    nodes, times = np.array([0.0, 1.0, 2.0, 4.0]), np.array([0.5, 3.5, 9.0, 1.5, 2.5, 3.0, 1.6])
+    bins = np.array([0, 0, 0, 0, -1, 0, 0])
+    place, share = np.empty(7, dtype=np.int64), np.zeros(7)
+    kernel._places.py_func(nodes, 0.5, times, bins, place, share)
+    assert place.tolist() == [-1, 2, 2, 1, -1, 2, 1]
+    np.testing.assert_allclose(share[[1, 2, 3, 5, 6]], [0.5, 1.0, 0.0, 0.25, 0.1])

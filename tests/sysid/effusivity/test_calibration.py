@@ -283,3 +283,16 @@ def test_an_earlier_calibration_is_a_prior_of_what_it_knows(device):
     off = prior.mean.copy()
     off[-1] += 2 * known[1].sd_ln
     assert prior.penalty(off) == pytest.approx(4.0)
+
+
+def test_grasps_of_one_material_add_to_a_prior(device, files):
+    train, told = files["exp2_dT20"].isel(grasp=[0, 1]), []
+    assert set(train["material"].values.tolist()) == {"copper"}
+    found = calibrate_gripper([train], prior=device, progress=lambda f, w: told.append((f, w)))
+    count = {name: block.n_grasp for name, block in device.blocks.items()}
+    assert {n: b.n_grasp for n, b in found.blocks.items()} == count | {"copper": count["copper"] + 2}
+    assert found.block_length == device.block_length
+    assert found.noise == device.noise
+    assert found.trained_on == (*device.trained_on, "exp2_dT20")
+    assert told[-1] == (1.0, "calibrated")
+    assert told[:-1] == [(i / 40, "gripper from 2 grasps") for i in range(len(told) - 1)]

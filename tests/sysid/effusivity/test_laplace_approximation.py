@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -438,3 +439,82 @@ def test_what_a_nominal_temperature_says_of_the_object(device, t_object, sd, roo
     )
     insulators = ours.spreads.insulator_dof
     assert prior.dof[0].tolist() == [dof, dof, dof, np.inf, np.inf, insulators, np.inf]
+
+
+def test_a_contact_is_made_within_0_8_s_of_the_message(device, data, u):
+    nodes, early, late = nodes_for(data), u.copy(), u.copy()
+    assert nodes.t[-1] >= data.end + 0.8
+    for at, onset in ((early, -0.8), (late, 0.8)):
+        at[:, ONSET] = onset
+        beyond = at.copy()
+        beyond[:, ONSET] = 1.5 * onset
+        np.testing.assert_array_equal(*(predict(device.stack, nodes, data, v) for v in (at, beyond)))
+    assert (
+        np.abs(predict(device.stack, nodes, data, early) - predict(device.stack, nodes, data, late)).max() > 1
+    )
+
+
+def test_the_penalty_has_the_slope_and_curvatures_of_the_priors_density():
+    mean, sd = np.arange(7.0), np.array([0.3, 0.5, 0.1, 3.0, 0.4, 0.0, 0.2])
+    dof = np.array([np.inf, 6.0, 4.0, np.inf, np.inf, np.inf, np.inf])
+    pair = SimpleNamespace(prior=Prior(mean[None], sd[None]), dof=dof)
+    w = np.array([0.5, 0.8, 5.0, 0.1, -0.2, 0.0, -0.3])
+    value, slope, bound, own = laplace._penalty(pair, mean + w * sd)
+    np.testing.assert_allclose(value[[0, 1]], [0.25, 7 * np.log(1 + 0.64 / 6)])
+    h = 1e-5
+    ahead, back = (laplace._penalty(pair, mean + (w + s * h) * sd) for s in (1, -1))
+    np.testing.assert_allclose(slope, (ahead[0] - back[0]) / (4 * h), atol=1e-8)
+    moving = [0, 1, 2, 3, 4, 6]
+    np.testing.assert_allclose(bound[moving], slope[moving] / w[moving])
+    curved = [0, 1, 3, 4, 6]  # the third lies where the density's own turns negative
+    np.testing.assert_allclose(own[curved], ((ahead[1] - back[1]) / (2 * h))[curved], rtol=1e-6)
+    assert (own[2], bound[5], own[5]) == (1e-3, 1.0, 1.0)
+
+
+def test_a_step_is_shortened_to_two_fifths_until_the_density_rises(monkeypatch):
+    here = SimpleNamespace(v=np.zeros(7), a=np.ones(3), cost=5.0)
+    ahead = SimpleNamespace(dv=np.full(7, 2.0), a=np.full(3, 3.0))
+    for falls_at, tried in ((0.4**2, 3), (0.4**5, 6), (0.4**6, 6)):
+        parts = []
+
+        def point(pair, v, a, parts=parts, falls_at=falls_at):
+            part = v[0] / 2.0
+            parts.append(part)
+            np.testing.assert_allclose(a, 1 + 2 * part)
+            return None if part == 1.0 else SimpleNamespace(cost=4.9 if part <= falls_at * 1.001 else 5.0)
+
+        monkeypatch.setattr(laplace, "_point", point)
+        found = laplace._step(None, here, ahead)
+        np.testing.assert_allclose(parts, 0.4 ** np.arange(tried))
+        assert (found is None) == (falls_at == 0.4**6)
+
+
+def test_a_hopeless_hypothesis_is_left_unsettled(device, touched):
+    """Where it is already behind,
+    whatever one more round would bring; from the other's gripper where it is better."""
+    other = another_gripper(device)
+    data, row = touches(touched.isel(grasp=[1])), np.zeros(1, dtype=np.int64)
+    hypotheses = material_hypotheses(device, ["brass"])
+    u = fit_pairs(device, data, row, hypotheses).u
+    prior = prior_of(device, data, hypotheses)
+    pair = laplace._pairs(other, data, row, whiten(data, device.noise), prior, np.array([0]))[0]
+    nothing = np.zeros(len(laplace._AT))
+    whole, _ = laplace._settle(pair, u[0], nothing, -np.inf)
+    left, _ = laplace._settle(pair, u[0], nothing, np.inf)
+    assert (whole.converged.tolist(), left.converged.tolist()) == ([True], [False])
+    assert whole.log_evidence[0] > left.log_evidence[0] - 1.0
+
+
+@pytest.mark.parametrize(("cost", "taken"), [(4.9, True), (5.0, False), (None, False)])
+def test_a_search_starts_from_the_likeliest_hypothesis_gripper_where_that_is_better(monkeypatch, cost, taken):
+    asked = []
+
+    def point(pair, v, a):
+        asked.append(a.any())
+        found = cost if a.any() else 5.0
+        return None if found is None else SimpleNamespace(a=a, cost=found)
+
+    monkeypatch.setattr(laplace, "_point", point)
+    assert laplace._start(None, np.zeros(7), np.ones(3)).a.any() == taken
+    assert not laplace._start(None, np.zeros(7), np.zeros(3)).a.any()
+    assert asked == [False, True, False]

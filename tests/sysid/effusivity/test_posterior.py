@@ -29,6 +29,7 @@ from thermogrip.sysid.effusivity.posterior import (
     _row,
     effusivity_posterior,
     material_evidence,
+    material_fit,
     material_posterior,
     open_set,
 )
@@ -272,3 +273,26 @@ def test_grasps_with_and_without_a_group_share_a_record(device, files):
         assert row.grasp_id == want.grasp_id
         assert row.effusivity == pytest.approx(want.effusivity, rel=1e-6)
         assert row.t_object == pytest.approx(want.t_object, rel=1e-6)
+
+
+def test_fits_are_laid_out_by_grasp_and_candidate_and_may_start_from_another(device, files):
+    record = split_of(files["exp2_dT20"], "test").isel(grasp=[0, 3, 8])
+    names = ["copper", "wood"]
+    whole = material_fit(device, record, names)
+    alone = material_fit(device, record.isel(grasp=[1]), ["wood"])
+    assert whole.u.shape == (3, 2, 7)
+    np.testing.assert_allclose(whole.u[1, 1], alone.u[0, 0], atol=1e-9)
+    for part in (
+        "log_evidence",
+        "t_object",
+        "t_object_sd",
+        "prior_t_object",
+        "prior_t_object_sd",
+        "h_c",
+        "converged",
+    ):
+        assert getattr(whole, part)[1, 1] == pytest.approx(getattr(alone, part)[0, 0])
+    assert alone.h_c == pytest.approx(np.exp(alone.u[:, :, 0]))
+    assert alone.t_object == pytest.approx(alone.u[:, :, 4])
+    again = material_fit(device, record, names, start=whole.u)
+    np.testing.assert_allclose(again.log_evidence, whole.log_evidence, atol=0.5)
