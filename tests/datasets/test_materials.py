@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from dataclasses import FrozenInstanceError
 
+import numpy as np
 import pytest
 
 from thermogrip.datasets.errors import UserError
@@ -76,6 +78,9 @@ def test_names_are_found_in_any_case_and_by_alias():
 
 
 def test_a_material_that_is_not_there_gets_its_nearest_names():
+    for name, near in (("aluminim", "aluminium, alumina"), ("poly", "polycarbonate, ptfe, pvc, pom")):
+        with pytest.raises(UserError, match=rf"no material '{name}'; did you mean {near}\?$"):
+            find_material(name)
     with pytest.raises(UserError, match=r"no material 'brras'; did you mean brass\?"):
         find_material("brras")
     with pytest.raises(UserError, match="lists them all"):
@@ -100,6 +105,37 @@ def test_the_effusivity_column_may_be_rounded_by_two_per_cent(percent):
             read_materials(HEAD + row, file="mine.csv")
 
 
+# of k, rho and c_p
+RANGES = """metal 7 450 1700 23000 110 1100
+ceramic 0.8 500 1800 6100 450 1100
+mineral 0.1 4 350 3100 750 2150
+polymer 0.1 0.55 850 2250 850 2300
+wood 0.04 0.25 150 1100 1300 2900
+insulation 0.015 0.13 5 800 600 2400
+liquid 0.1 0.7 600 1400 1500 4250
+biological 0.15 0.65 900 1300 2000 4000"""
+
+
+@pytest.mark.parametrize("line", RANGES.splitlines())
+def test_every_kind_has_its_range(line):
+    kind, *ends = line.split()
+    low, high = np.array(ends, dtype=float).reshape(3, 2).T
+    for edge, beyond in ((low, 0.999), (high, 1.001)):
+        for at in (None, 0, 1, 2):
+            values = edge.copy()
+            if at is not None:
+                values[at] *= beyond
+            e = math.sqrt(values.prod())
+            row = HEAD + f"x,{kind},{','.join(map(repr, values.tolist()))},{e!r},5,,s\n"
+            if at is None:
+                assert read_materials(row)[0].effusivity == pytest.approx(e)
+                continue
+            said = f"{values[at]:g} is outside {low[at]:g} to {high[at]:g}, where a {kind} can be; look"
+            column = ("k", "rho", "c_p")[at]
+            with pytest.raises(UserError, match=re.escape(f"materials.csv, row 2, column {column}: {said}")):
+                read_materials(row)
+
+
 @pytest.mark.parametrize("percent", [1, 50])
 def test_an_effusivity_may_be_known_to_one_per_cent_or_to_half(percent):
     found = read_materials(HEAD + f"x,metal,100,8000,400,17889,{percent},,s\n", file="mine.csv")[0]
@@ -115,6 +151,9 @@ def test_an_effusivity_may_be_known_to_one_per_cent_or_to_half(percent):
         ("x,metal,100,8000,400,17889,0,,s", "column effusivity_sd_percent"),
         ("x,metal,100,8000,400,17889,90,,s", "column effusivity_sd_percent"),
         ("x,metal,100,8000,400,17889,5,,", "no source"),
+        (",metal,100,8000,400,17889,5,,s", "has no name or no source; say where it comes from"),
+        ("x,metal,100,8000,400,17889,0.9,,s", "0.9 % is not between 1 and 50 %; estimate it anew"),
+        ("x,metal,100,8000,400,17889,51,,s", "51 % is not between 1 and 50 %"),
         ("x,cheese,100,8000,400,17889,5,,s", "kind 'cheese' is unknown"),
         ("x,metal,-100,8000,400,17889,5,,s", "is not sqrt"),
         ("x,metal,much,8000,400,17889,5,,s", "column k: is not a number"),

@@ -28,6 +28,10 @@ def test_no_text_steers_a_terminal(text: str) -> None:
     shown.encode("utf-8")
 
 
+def test_control_characters_are_written_out() -> None:
+    assert printable("a\x1b\x9f\u200e\u2028\xff\t\n") == "a\\x1b\\x9f\\u200e\\u2028\xff\t\n"
+
+
 PLAIN = st.text(st.characters(exclude_categories=["Cs", "Cc", "Cf", "Zl", "Zp"], include_characters="\t"))
 
 

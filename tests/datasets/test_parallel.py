@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import signal
+import time
+from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 
 import pytest
 
+from thermogrip import __version__
+from thermogrip.datasets import parallel
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.parallel import kept_processes, run_parallel, sub_progress
 
@@ -53,6 +59,88 @@ def test_processes_that_are_kept_do_the_work_of_every_call_and_then_end() -> Non
 def test_a_killed_process_is_one_line():
     with pytest.raises(UserError, match="a worker process was killed"):
         run_parallel(signal.raise_signal, [signal.SIGKILL] * 3, workers=2)
+
+
+@pytest.fixture
+def pools(monkeypatch):
+    """Eight processors, and threads in place of processes: a list of how many each pool was asked for."""
+    made = []
+    monkeypatch.setattr(parallel, "_processes", lambda n: made.append(n) or ThreadPoolExecutor(n))
+    monkeypatch.setattr(parallel.os, "cpu_count", lambda: 8)
+    return made
+
+
+def test_no_more_processes_are_started_than_there_are_items_or_processors(pools, monkeypatch):
+    seen = []
+    got = run_parallel(math.factorial, [4, 1, 3, 2, 0], workers=3, progress=lambda *a: seen.append(a))
+    assert got == [24, 1, 6, 2, 1]
+    assert seen[-1] == (1.0, "working")
+    assert {round(5 * f) / 5 for f, _ in seen} >= {f for f, _ in seen}
+    for workers in (6, 99, 1):
+        run_parallel(abs, [-1] * 6, workers=workers)
+    run_parallel(abs, [-1] * 20, workers=99)
+    monkeypatch.setattr(parallel.os, "cpu_count", lambda: None)
+    run_parallel(abs, [-1] * 20, workers=99)
+    assert pools == [3, 6, 6, 8]
+
+
+def test_a_fault_stops_what_has_not_begun_and_a_killed_process_is_one_line(pools):
+    done = []
+
+    def work(n):
+        time.sleep(0.01)
+        done.append(n)
+        if n == 1:
+            raise BrokenProcessPool
+        return n
+
+    with pytest.raises(UserError, match="a worker process was killed; lower --workers; memory may be short"):
+        run_parallel(work, range(200), workers=2)
+    assert len(done) < 100
+
+
+def test_kept_processes_are_those_of_the_outermost_block(pools):
+    for workers in (1, 5, 99):
+        with kept_processes(workers), kept_processes(workers + 1):
+            kept = [*parallel._kept]
+            assert run_parallel(abs, [-1, 2], workers=2) == [1, 2]
+        assert len(kept) == 1
+        assert not parallel._kept
+        with pytest.raises(RuntimeError, match="after shutdown"):
+            kept[0].submit(abs, 1)
+    assert pools == [2, 5, 8]  # one keeps none
+    with kept_processes("tcp://a:1"):
+        assert not parallel._kept
+
+
+class Cluster:
+    def __init__(self, workers, versions):
+        self._workers, self._versions = workers, versions
+
+    def scheduler_info(self):
+        return {"workers": self._workers}
+
+    def run(self, _function):
+        if self._versions is None:
+            raise ModuleNotFoundError
+        return self._versions
+
+
+@pytest.mark.parametrize(
+    ("workers", "versions", "words"),
+    [
+        ({}, {}, "the cluster at tcp://a:1 has no workers; run 'dask worker tcp://a:1'"),
+        ({"w": 1}, None, f"a worker of tcp://a:1 has no thermogrip; install thermogrip {__version__} on all"),
+        ({"w": 1}, {"w": "0.3", "v": __version__, "u": "0.2"}, "tcp://a:1 has thermogrip 0.2, 0.3; install"),
+        ({"w": 1}, {"w": __version__}, ""),
+    ],
+)
+def test_a_cluster_has_workers_of_this_version(workers, versions, words):
+    if not words:
+        parallel._check_cluster(Cluster(workers, versions), "tcp://a:1")
+        return
+    with pytest.raises(UserError, match=re.escape(words)):
+        parallel._check_cluster(Cluster(workers, versions), "tcp://a:1")
 
 
 @pytest.mark.parametrize("workers", [4, "tcp://127.0.0.1:9"])
