@@ -39,7 +39,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import Unpacker, check_size, check_source
 from thermogrip.datasets.schema import ROLES
 from thermogrip.datasets.tables import Table, file_stem
-from thermogrip.datasets.units import UNITS, guess_role, split_header
+from thermogrip.datasets.units import UNITS, guess_role, split_header, to_record_unit
 
 Floats = NDArray[np.float64]
 
@@ -297,7 +297,8 @@ def _table(
     notes: list[str],
 ) -> Table:
     sorted_series = {name: _in_order(*pair) for name, pair in series.items()}
-    roles = {name: column.role or guess_role(name, column.unit) for name, column in columns.items()}
+    units = {name: to_record_unit(v, columns[name].unit)[1] for name, (_, v) in sorted_series.items()}
+    roles = {name: column.role or guess_role(name, units[name]) for name, column in columns.items()}
     if not clock:
         outputs = [name for name in columns if roles[name] == "output"] or list(columns)
         clock = max(outputs, key=lambda name: len(sorted_series[name][0]))

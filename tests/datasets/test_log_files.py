@@ -22,7 +22,7 @@ from scipy.io import savemat
 from thermogrip.datasets import tables
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import example_path
-from thermogrip.datasets.log_files import as_logs, read_log, split_cut, write_log
+from thermogrip.datasets.log_files import as_logs, check_log_file, read_clock, read_log, split_cut, write_log
 from thermogrip.datasets.schema import column, make_log, names
 
 HEAD = "time_s,drive,t_tank_degC\n"
@@ -461,6 +461,81 @@ def test_a_log_that_a_header_cannot_say_is_refused(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+DAY, HOUR = 86400, 3600
+ISO = [f"1970-01-01 00:00:{k:02d}" for k in range(10)]
+
+
+@pytest.mark.parametrize(
+    ("cells", "seconds", "note"),
+    [
+        (["12:00 AM", "12:30 pm", "1:30:15.5 PM", "11:59 am"],
+         [0, 12.5 * HOUR, 13.5 * HOUR + 15.5, 12 * HOUR - 60], ""),
+        (["23:59:59", "00:00:01", "23:59:59", "0:00"], [DAY - 1, DAY + 1, 2 * DAY - 1, 2 * DAY], ""),
+        (["12:00:00,25", "01:00:00", "13:00:00", "01:00:00"],
+         [12 * HOUR + 0.25, HOUR, 13 * HOUR, HOUR], ""),  # half a day back is no midnight
+        (["1970-01-02 00:00:00Z", "1970-01-02T01:00:00+01:30", "1970-01-02 01:00-0130", "1970-01-02"],
+         [DAY, DAY - HOUR / 2, DAY + 2.5 * HOUR, DAY], ""),
+        (["1/2/1970", "12/3/1970"], [DAY, 336 * DAY], " (taken as month/day)"),
+        (["1/2/1970", "13/2/1970"], [31 * DAY, 43 * DAY], ""),
+        (["1/12/1970", "1/13/1970"], [11 * DAY, 12 * DAY], ""),
+        (["2/12/1970", "3/12/1970"], [42 * DAY, 70 * DAY], " (taken as month/day)"),
+        (["1.2.1970 0:00", "31.2.1970 0:00"], [31 * DAY, np.nan], ""),
+        (["2-Jan-1970", "03-feb-70"], [DAY, 36558 * DAY], ""),  # 2070: 100 years with 25 leap days
+        (["32-1-2", "32-1-3"], [22646 * DAY, 22647 * DAY], ""),  # 2 January 2032, 62 years with 15 leap days
+        ([*ISO, "x"], [*range(10), np.nan], ""),
+        ([*ISO[:8], "x"], None, ""),
+        (["5", "6"], None, ""),
+    ],
+)  # fmt: skip
+def test_a_clock_is_seconds_since_1970_or_midnight(cells, seconds, note):
+    found = read_clock(cells)
+    assert (found is None) == (seconds is None)
+    if found is not None:
+        np.testing.assert_allclose(found[0], seconds, rtol=0, atol=1e-6)
+        assert found[1] == note
+
+
+@pytest.mark.parametrize(
+    ("text", "time", "left"),
+    [
+        ("t,time,q1\n5,0,1\n6,2,1\n", [0, 2], ["t", "q1"]),  # the plainer name goes first
+        ("time_s,t,q1\n0,5,1\n2,6,1\n", [0, 2], ["t", "q1"]),
+        ("ts,q1\n100000000000000000,1\n100000002500000000,1\n", [0, 2.5], ["q1"]),  # ns
+        ("ts,q1\n100000000000000,1\n100000002500000,1\n", [0, 2.5], ["q1"]),  # us
+        ("ts,q1\n100000000000,1\n100000002500,1\n", [0, 2.5], ["q1"]),  # ms
+        ("ts,q1\n99999999999,1\n100000000001.5,1\n", [0, 2.5], ["q1"]),
+        ("hours,q1\n1,1\n1.5,1\n", [3600, 5400], ["q1"]),
+        ("minutes,q1\n1,1\n1.5,1\n", [60, 90], ["q1"]),
+        ("us,q1\n1000,1\n1500,1\n", [1e-3, 1.5e-3], ["q1"]),
+        ("n,q1\n0,1\n10,1\n20,1\n30,1\n42,1\n", [0, 10, 20, 30, 42], ["q1"]),
+        ("n,q1\n0,1\n10,1\n20,1\n30,1\n43,1\n", [0, 1, 2, 3, 4], ["n", "q1"]),
+        ("n,q1\n0,1\n10,1\n20,1\n30,1\n", [0, 1, 2, 3], ["n", "q1"]),
+        ("q1,dt,delta_t\n1,2.5,4\n1,2.5,5\n", [0, 2.5], ["q1", "delta_t"]),
+        ("q1,dt\n1,0\n1,0\n", [0, 1], ["q1", "dt"]),
+        ("seconds,q1\n5,1\n5,1\n", [0, 1], ["seconds", "q1"]),
+        ("seconds,q1\n" + "".join(f"{k},1\n" for k in (5, 4, 6, 8)), [0, 1, 2, 3], ["seconds", "q1"]),
+    ],
+)
+def test_which_column_is_the_time_and_in_what_unit(write, text, time, left):
+    log = read_log(write(text))
+    np.testing.assert_allclose(log["time"].values, time, rtol=0, atol=1e-9)
+    assert list(log) == left
+
+
+def test_what_a_log_may_have_is_checked_before_it_is_read(write, tmp_path):
+    check_log_file(write("a,a\n1,2\n"))
+    check_log_file(f"{write(HEAD + ROWS)}@0:2")
+    with pytest.raises(UserError, match="is not text"):
+        check_log_file(write(b"\0"))
+    with pytest.raises(UserError, match=r"a\.bag: no such file"):
+        check_log_file(tmp_path / "a.bag")
+    late = xr.Dataset({"a": ("time", [1.0, 2.0, 3.0])}, {"time": ("time", [0.0, 2.0, 1.0], {"units": "s"})})
+    late.to_netcdf(tmp_path / "late.nc", engine="h5netcdf")
+    assert "row 3: time runs back from 2 s to 1 s" in refused(tmp_path / "late.nc")
+    with pytest.raises(UserError, match="has names of its own; leave --columns out"):
+        read_log(tmp_path / "late.nc", columns=["a"])
+
+
 FOREIGN = [
     ("Time (sec), Heater 1 (%), Temperature 1 (degC), Set Point 1 (degC)\n0,10,20,23\n2,10,21,23\n",
      [0, 2], "Heater_1 percent input 10|Temperature_1 degC output 20|Set_Point_1 degC other 23",
@@ -653,6 +728,10 @@ def test_a_data_frame_is_a_log():
     assert (list(log), log["time"].values.tolist()) == (["u", "y"], [0.0, 3.0, 6.0])
     lapse = pd.DataFrame({"time": stamps - stamps[0], "y": [1, 2, 3]})
     assert read_log(lapse)["time"].values.tolist() == [0.0, 2.0, 4.0]
+    bare = pd.DataFrame({"y": [1.0, 2.0]}, index=[0.5, 2.0])
+    assert read_log(bare)["time"].values.tolist() == [0.5, 2.0]
+    assert "DataFrame: 1 row(s) are not a log; give at least two" in refused(bare[:1].reset_index())
+    assert "DataFrame: has 2 columns, columns= names 1" in refused(bare.reset_index(), columns=["t"])
 
 
 STYLES = [

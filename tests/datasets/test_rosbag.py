@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,9 +20,22 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
+from thermogrip.datasets import rosbag
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_log, write_log
-from thermogrip.datasets.rosbag import TOPICS_TEMPLATE, _held, _nearest, read_topic_map
+from thermogrip.datasets.rosbag import (
+    TOPICS_TEMPLATE,
+    Column,
+    TopicMap,
+    _Decoders,
+    _field,
+    _held,
+    _Message,
+    _nearest,
+    _stamped,
+    read_rosbag_table,
+    read_topic_map,
+)
 from thermogrip.datasets.schema import names
 
 SECOND = 1_000_000_000
@@ -215,11 +230,14 @@ def test_a_cut_off_mcap_gives_what_is_whole_and_reports_it(tmp_path: Path) -> No
             writer.add_message(channel, START + k * SECOND, data, START + k * SECOND)
         writer.finish()
     whole = file.read_bytes()
+    file.write_bytes(whole)
+    assert "lost" not in read_log(file).attrs["repairs"]
     for share in (0.3, 0.55, 0.8):
         file.write_bytes(whole[: int(share * len(whole))])
         log = read_log(file)
         n = log.sizes["time"]
         assert 0.2 * 400 * share < n < 400
+        assert re.search(rf"damaged after {n} messages|{n} whole messages were read", log.attrs["repairs"])
         np.testing.assert_allclose(log["t_tank"].values, 20.0 + 0.01 * np.arange(n))
         assert "the rest is lost" in log.attrs["repairs"] + str(log.attrs)
 
@@ -246,7 +264,13 @@ def test_a_damaged_chunk_is_never_read_as_numbers(tmp_path: Path) -> None:
         (('unit = "K"', 'unit = "Kelvin"'), "unit 'Kelvin' is unknown"),
         (("thermogrip.topics", "thermogrip.topic"), "is no topic map"),
         (('role = "input"', 'role = "in"'), "role 'in' is unknown"),
-        (("version = 1", 'version = 1\nclock = "t3"'), "clock 't3' is no column"),
+        (("version = 1", 'version = 1\nclock = "t3"'), "clock 't3' is no column; use one of t_tank"),
+        (("version = 1", 'version = 1\nclocks = "t3"'), "has the unknown key 'clocks'; write a fresh one"),
+        (("version = 1", 'version = 1\nstamp = "now"'), "stamp 'now' is unknown; use log or header"),
+        (('topic = "/cmd"', ""), "column drive: needs topic, field, unit, role; name its topic"),
+        (('role = "input"', 'rôle = "input"'.replace("ô", "u")), "column drive: needs topic, field"),
+        ((MAP[MAP.index("[columns.t_tank]") :], "[columns]\nx = 1"), "column x: needs topic, field"),
+        ((MAP[MAP.index("[columns.t_tank]") :], "columns = 1"), "is no topic map"),
     ],
 )
 def test_a_wrong_map_is_one_line_that_says_what_repairs_it(
@@ -284,11 +308,103 @@ def test_a_message_holds_and_the_nearest_counts_within_half_a_step() -> None:
     assert _nearest(np.array([0.0, 99.0]), times[:1], values[:1]).tolist() == [10.0, 10.0]
 
 
+def said(topic: str, at: float, content: Any, **attrs: str) -> _Message:
+    return _Message(topic, "pkg/Kind", at, content, attrs)
+
+
+SAID = [
+    said("/skin_K", 11.5, {"data": 301.0}), said("/skin_K", 10.5, {"data": 300.0}),  # not in order
+    *(said("/a/tank/", 10.0 + k, SimpleNamespace(temperature=25 + k / 4)) for k in range(4)),
+    said("/pump", 9.0, {"data": True}), said("/pump", 11.5, {"data": False}), said("/pump", 9.5, {"data": 3}),
+    said("/pump", 12.0, {"data": 2}), said("/pump", 14.0, {"data": 7}),
+    said("/u", 12.9, {"value": [1], "data": 9.0}), said("/u", 10.8, {"data": 8}),
+    said("/u_2", 13.0, {"value": 4.5}, units="V", role="other"),
+    said("/word", 1.0, {"data": "none"}), said("/odd", 2.0, {"other": 1.0}),
+]  # fmt: skip
+
+
+def table_of(monkeypatch: Any, messages: list[_Message], topics: TopicMap | None = None) -> Any:
+    monkeypatch.setattr(rosbag, "_messages", lambda _file, _notes: iter(messages))
+    return read_rosbag_table("run.mcap", topics)
+
+
+def test_topics_of_a_number_stand_on_the_times_of_the_output_with_most_messages(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    table, nan = table_of(monkeypatch, SAID), np.nan
+    wanted = {
+        "time_s": [0.0, 1.0, 2.0, 3.0], "skin": [300.0, 301.0, 301.0, nan],
+        "a_tank": [25.0, 25.25, 25.5, 25.75], "pump": [3.0, 3.0, 2.0, 2.0],
+        "u": [nan, 8.0, 8.0, 9.0], "u_2": [4.5] * 4,
+    }  # fmt: skip
+    assert list(table.numbers) == list(wanted)
+    for name, values in wanted.items():
+        np.testing.assert_array_equal(table.numbers[name], values, err_msg=name)
+    about = {name: tuple(of.values()) for name, of in table.attrs.items()}
+    assert about == {"time_s": (), "skin": ("K", "output"), "a_tank": ("degC", "output"),
+                     "pump": ("1", "input"), "u": ("1", "input"), "u_2": ("V", "other")}  # fmt: skip
+    assert table.lines.tolist() == [1, 2, 3, 4]
+    held, near = "the last message holds", "the nearest message is taken"
+    of = {"skin": ("2 messages of /skin_K", near), "pump": ("5 messages of /pump", held),
+          "u": ("2 messages of /u", held), "u_2": ("1 messages of /u_2", near)}  # fmt: skip
+    assert table.notes == tuple(f"{n}: {had} on the times of a_tank; {how}" for n, (had, how) in of.items())
+
+
+def test_a_map_names_the_clock_or_the_topic_with_most_messages_is_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    columns = {"p": Column("/pump", "data", "1", "input"), "v": Column("/u", "data", "1", "input")}
+    found = table_of(monkeypatch, SAID, TopicMap(columns)).numbers
+    assert found["time_s"].tolist() == [0.0, 0.5, 2.5, 3.0, 5.0]
+    assert found["p"].tolist() == [1.0, 3.0, 0.0, 2.0, 7.0]
+    found = table_of(monkeypatch, SAID, TopicMap(columns, clock="v")).numbers
+    np.testing.assert_allclose(found["time_s"], [0.0, 2.1])
+    assert (found["p"].tolist(), found["v"].tolist()) == ([3.0, 2.0], [8.0, 9.0])
+
+
+@pytest.mark.parametrize(
+    ("messages", "words"),
+    [
+        ([said("/a/b", 1.0, {"data": 1}), said("/a_b", 1.0, {"data": 1})],
+         "run.mcap: two topics would be a_b; write a topic map (`thermogrip init topics`)"),
+        ([said("/odd", 2.0, {"other": 1.0}), said("/a", 2.0, {})],
+         "has no topic with a single number (topics: /a (pkg/Kind), /odd (pkg/Kind)); write a topic map"),
+        ([], "has no topic with a single number (topics: none)"),
+        ([said("/a", 1.0, {"data": 1}), said("/a", 2.0, {"data": "x"})],
+         "column a: /a (pkg/Kind) has no number 'data'; correct the field in the topic map"),
+    ],
+)  # fmt: skip
+def test_topics_that_make_no_table_are_one_line(
+    monkeypatch: pytest.MonkeyPatch, messages: list[_Message], words: str
+) -> None:
+    with pytest.raises(UserError, match=re.escape(words)):
+        table_of(monkeypatch, messages)
+
+
+def test_a_field_is_a_path_of_names_and_places_and_a_stamp_that_of_its_header() -> None:
+    content = {"joints": SimpleNamespace(effort=[1.5, {"x": 2.5}]), "-": 1}
+    found = [_field(content, path) for path in ("joints.effort.0", "joints.effort.-1.x", "joints.effort.1.x")]
+    assert found == [1.5, 2.5, 2.5]
+    with pytest.raises(KeyError, match="__class__"):
+        _field(content, "joints.__class__")
+    for parts in (("sec", "nanosec"), ("secs", "nsecs")):
+        stamp = dict(zip(parts, (3, 250_000_000)))
+        message = said("/a", 7.5, {"header": {"stamp": stamp}})
+        assert (_stamped(message, "header", Path("a")), _stamped(message, "log", Path("a"))) == (3.25, 7.5)
+    with pytest.raises(UserError, match=re.escape("a: /b (pkg/Kind) has no header.stamp; set stamp = ")):
+        _stamped(said("/b", 7.5, {"header": 1}), "header", Path("a"))
+    for encoding, schema in (("protobuf", 1), ("cdr", None)):
+        channel = SimpleNamespace(message_encoding=encoding, topic="/x")
+        with pytest.raises(UserError, match=f"a: /x is encoded as '{encoding}', which is not read; export"):
+            _Decoders(Path("a")).decode(schema, channel, b"")
+
+
 def test_the_template_is_a_topic_map(tmp_path: Path) -> None:
     (tmp_path / "topics.toml").write_text(TOPICS_TEMPLATE)
     found = read_topic_map(tmp_path / "topics.toml")
     assert set(found.columns) == {"t_surface", "t_tank", "drive", "pump"}
-    assert found.clock == "t_surface"
+    assert (found.clock, found.stamp) == ("t_surface", "log")
+    assert found.columns["drive"] == Column("/peltier/command", "data", "1", "input")
+    (tmp_path / "topics.toml").write_text('schema = "thermogrip.topics"\n[columns.a]\ntopic = "/b"\n')
+    assert read_topic_map(tmp_path / "topics.toml") == TopicMap({"a": Column("/b", "data", "1")}, "", "log")
 
 
 @pytest.mark.parametrize("name", ["run.bag", "run.db3", "run.mcap"])
