@@ -34,6 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.limits import MOST_NUMBER
 
 UNITS = ("degC", "K", "degF", "percent", "V", "A", "W", "s", "ms", "min", "0_255")
 
@@ -310,7 +311,9 @@ def _computed(
     ``guessed``: name -> whether a clue says what the column is, for those whose role is no user's; of two
     copies the one with a clue, else the first, stays.
     """
-    shown = {n: v[:_MOST_ROWS] for n, v in columns.items() if np.isfinite(v).all() and np.ptp(v) > 0}
+    # what is beyond all use is no reading, and its squares are none either
+    useful = {n: v for n, v in columns.items() if (np.abs(v) <= MOST_NUMBER).all()}
+    shown = {n: v[:_MOST_ROWS] for n, v in useful.items() if np.ptp(v) > 0}
     out: dict[str, tuple[str, str]] = {}
     order = sorted(shown, key=lambda n: (n in guessed) + (not guessed.get(n, True)))
     for at, name in enumerate(order):
