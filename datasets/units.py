@@ -333,7 +333,9 @@ def _computed(
 
 
 def _explains(y: NDArray[np.float64], *some: NDArray[np.float64]) -> bool:
-    """Tell whether a column is a sum of multiples of others but for rounding."""
+    """Tell whether a column is a sum of multiples of others but for rounding; few values always are one."""
+    if np.unique(y).size < len(some) + 2:
+        return False
     x = np.column_stack([np.ones(y.size), *some])
     head = slice(0, 200)  # most that are no copies show it here
     moves = np.abs(np.diff(y))
