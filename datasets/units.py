@@ -88,6 +88,7 @@ NO_CLUE = "neither its name nor its unit shows what it is"
 _HELD_SHARE, _HELD_SIZE = 0.5, 0.05  # of rows with a move; of the range that its median has, at least
 _FEW = 20  # rows: too few to tell chance from rule
 _COUNTS = 0.9  # of the rows have the same step
+_SHOWS = 5  # moves of two columns, by which they may be copies
 _EXACT, _ROUNDED = 1e-6, 0.05  # of a column's range; of its standard deviation, that rounding takes at most
 _LAGS, _STRONG, _MOST_ROWS = (2, 6), 10.0, 20_000
 
@@ -333,8 +334,8 @@ def _computed(
 
 
 def _explains(y: NDArray[np.float64], *some: NDArray[np.float64]) -> bool:
-    """Tell whether a column is a sum of multiples of others but for rounding; few values always are one."""
-    if np.unique(y).size < len(some) + 2:
+    """Tell whether a column is a sum of multiples of others but for rounding; of few moves nobody can."""
+    if min(np.count_nonzero(np.diff(v)) for v in (y, some[-1])) < _SHOWS:
         return False
     x = np.column_stack([np.ones(y.size), *some])
     head = slice(0, 200)  # most that are no copies show it here
