@@ -48,6 +48,7 @@ def direct(plant: Plant) -> Iterator[Bench]:
 
 
 def test_readings_are_the_plants(bench: Bench) -> None:
+    assert (TTL_S, bench.rig.expires_s) == (2.0, 2.0)
     bench.rig.apply(DRIVE, 1)
     bench.rig.wait(100.0)
     read, true = bench.rig.read().values, bench.device.true_temperatures
@@ -73,6 +74,19 @@ def test_a_drive_holds_while_waits_follow_each_other(direct: Bench, step: float)
     assert direct.device.applied_drive == DRIVE
     assert direct.rig.read().drive == DRIVE
     assert not direct.kinds()
+
+
+def test_a_drive_is_renewed_each_half_second_and_at_the_end_of_a_wait_after_a_second(
+    direct: Bench,
+) -> None:
+    direct.rig.apply(DRIVE, 1)
+    counts, port, write = [], direct.rig.port, direct.rig.port.write
+    for seconds in (1.0, 0.3, 0.3, 0.5):
+        written: list[bytes] = []
+        port.write = lambda data, to=written: to.append(data) or write(data)
+        direct.rig.wait(seconds)
+        counts.append(len(written))
+    assert counts == [1, 0, 1, 0]
 
 
 def test_a_program_that_stood_still_does_not_renew_what_it_wanted_before(direct: Bench) -> None:
@@ -260,6 +274,8 @@ def test_ticks_that_were_overwritten_or_missed_are_lost_and_the_next_is_asked_fo
     gathering.lost = 0
     gathering.take(Taken(1050, 0, 1, (replace(kept, age_ms=0),)), clock)
     assert gathering.lost == 3  # 10 ms apart, from 1.01 s to 1.05 s
+    gathering.take(Taken(1200, 1, 2, (replace(kept, age_ms=0),)), clock)
+    assert gathering.lost == 3  # a tick that was late is not lost
 
 
 class Flood(DirectPort):

@@ -190,8 +190,9 @@ def test_a_grasp_has_its_labels_and_ends_where_that_is_decided(plant: Plant, con
     assert {key: found[key].values.tolist()[0] for key in want} == want
     assert told[:2] == [(0.0, "settling"), (round(0.9 / 400, 6), "settling")]
     assert told[-5:] == [(f, "grasping") for f in (0.9, 0.9, 0.905, 0.91, 0.915)]
-    whole = run_session(Twin(plant), controller, 38.0, grasp=("wood", 38.0), grasp_time=0.5)
-    assert whole.grasps["time"].values[-1] == 0.5
+    options = {"grasp": ("wood", 38.0), "grasp_time": 2.0, "grasp_dt": 1.0}
+    whole = run_session(Twin(plant), controller, 38.0, **options)
+    assert whole.grasps["time"].values.tolist() == [-2.0, -1.0, 0.0, 1.0, 2.0]
     assert np.isnan(whole.contact)
     assert "no contact" in [event.kind for event in whole.events]
 

@@ -10,9 +10,9 @@ from tests.rig.makers import PATIENCE_S, STILL, Bench, make_lab
 from thermogrip.rig.clock import ScaledClock, SteppedClock
 from thermogrip.rig.drivers.thermogrip import DeviceRig
 from thermogrip.rig.firmware.reference import Board, Sensor
-from thermogrip.rig.serial.port import Port
+from thermogrip.rig.serial.port import Port, PortError
 from thermogrip.rig.serial.protocol import Channel
-from thermogrip.rig.simulation.virtual_device import FAULTS, DirectPort, VirtualDevice
+from thermogrip.rig.simulation.virtual_device import FAULTS, DirectPort, VirtualDevice, example_plant
 from thermogrip.sysid.plant.plant import Plant
 
 
@@ -73,8 +73,8 @@ def test_a_sensors_fault_is_in_the_sensor_alone(
         past[k + 1] = device.true_temperatures["t_tank"]
     true, got = past[60], shown(device, "t_tank")
     want = {"7 more": true + 7.0, "6 less": true - 6.0, "20 s ago": past[40]}.get(expected, expected)
-    assert got == want if isinstance(want, str) else got == pytest.approx(want, abs=0.05)
-    assert shown(device, "t_surface") == pytest.approx(device.true_temperatures["t_surface"], abs=0.05)
+    assert got == want if isinstance(want, str) else got == pytest.approx(want, abs=0.001)
+    assert shown(device, "t_surface") == pytest.approx(device.true_temperatures["t_surface"], abs=0.001)
     device.clear(fault)
     clock.sleep(0.1)
     assert shown(device, "t_tank") == pytest.approx(device.true_temperatures["t_tank"], abs=0.05)
@@ -106,6 +106,9 @@ def test_a_device_fits_its_plant_and_counts_its_resets(plant: Plant, clock: Step
         gripper.fault("reset", **cause)
         assert (gripper.core.cause, gripper.core.boot) == (cause.get("cause", "external"), boot)
     clock.sleep(5.0)
+    gripper.core.boot = 65_535
+    gripper.fault("reset")
+    assert gripper.core.boot == 0  # 16 bits
     gripper.fault("sensor_offset")  # the skin's, and of 3 K
     gripper.fault("sensor_drift", sensor="t_tank")  # of 20 mK/s
     gripper.fault("driver_stuck")
@@ -152,9 +155,29 @@ def test_a_port_without_its_cable_says_that_it_is_closed(clock: SteppedClock) ->
     port.close()
     device.fault("cable_pulled")
     assert not port.try_open()
+    for call, kind in ((port.open, "absent"), (lambda: port.read(0.0), "lost")):
+        with pytest.raises(PortError) as refused:
+            call()
+        assert refused.value.kind == kind
     device.clear()  # without a name: all faults
     assert port.try_open()
     assert (port.opened, port.try_open(), port.opened) == (2, True, 2)
+
+
+def test_every_line_is_spoilt_at_a_rate_of_one_and_half_of_them_by_default(clock: SteppedClock) -> None:
+    device, lines = VirtualDevice(make_lab(), link="none", clock=clock), b"7 read*06EC819405\n" * 400
+    for options, least, most in (({"rate": 1.0}, 360, 400), ({}, 150, 250), ({"rate": 0.0}, 0, 0)):
+        device.fault("garbage", **options)
+        whole = device._spoilt(lines).split(b"\n").count(b"7 read*06EC819405")
+        assert least <= 400 - whole <= most
+    assert device._spoilt(b"") == b""
+
+
+def test_a_bundled_board_is_off_its_network_so_that_a_fit_finds_something() -> None:
+    board, usual = example_plant("tclab", room=19.0), example_plant("tclab")
+    off = {"G_amb": 0.013, "G_between": 0.006, "power_1": 0.86, "power_2": 0.61, "lag_1": 16.0, "lag_2": 19.0}
+    assert {name: board.values[name] for name in off} == {name: usual.values[name] for name in off} == off
+    assert board.values["t_room"] == 19.0 != usual.values["t_room"]
 
 
 def test_a_day_takes_no_memory(clock: SteppedClock) -> None:
