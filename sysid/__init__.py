@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from thermogrip.sysid.effusivity.calibration import calibrate_gripper as calibrate_gripper
     from thermogrip.sysid.effusivity.gripper_model import GripperModel as GripperModel
     from thermogrip.sysid.experiment.schedules import excite as excite
+    from thermogrip.sysid.export.dynamics import plant_dynamics as plant_dynamics
     from thermogrip.sysid.export.linearise import linearise_plant as linearise_plant
     from thermogrip.sysid.greybox.fit import fit_network as fit_network
     from thermogrip.sysid.greybox.posterior import sample_posterior as sample_posterior
@@ -39,6 +40,7 @@ _HOME = {
     "linearise_plant": "export.linearise",
     "load_network": "models.network",
     "own_model": "models.user_model",
+    "plant_dynamics": "export.dynamics",
     "read_log": ".datasets.log_files",
     "sample_posterior": "greybox.posterior",
 }

@@ -550,7 +550,10 @@ def _signal_roles(
             why = f"network {network.name}"
         elif name in guesses:
             why, guessed = guesses[name], True
-            if role == "left out" and why.startswith("its ") and not _moves(logs, name):
+            taken_for = why.startswith(
+                ("its name is that of a drive", "its name is that of a read", "its unit")
+            )
+            if role == "left out" and taken_for and not _moves(logs, name):
                 why += ", but it never moves"
         elif role == "left out":
             why = "not named"

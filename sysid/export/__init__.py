@@ -3,8 +3,10 @@
 from thermogrip import lazy_exports
 
 _HOME = {
+    "Dynamics": "dynamics",
     "LinearPlant": "linearise",
     "linearise_plant": "linearise",
+    "plant_dynamics": "dynamics",
     "to_casadi": "libraries",
     "to_control": "libraries",
     "to_fmu": "fmu",

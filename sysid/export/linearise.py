@@ -17,14 +17,17 @@ the hold; a delay (a pole at zero) has no such logarithm and is refused.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import logm
 
+from thermogrip.datasets.atomic_files import atomic_path, write_atomic
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.models.model import GreyModel
 
@@ -139,13 +142,41 @@ def linearise_plant(
     if dt is None:
         A, B = _continuous(plant, x, u, d, moved, A, B)
     else:
-        A, B = _composed(A, B, steps_in(plant, dt))
+        A, B = composed(A, B, steps_in(plant, dt))
     zero = _output(plant, np.zeros(x.size))
     C: Array = np.stack([_output(plant, row) - zero for row in np.eye(x.size)], axis=1)
     names = (*(plant.inputs[k] for k in moved), *plant.disturbances)
     w = np.concatenate([u[moved], d])
     labels = state_labels(plant)
     return LinearPlant(A, B, C, labels, names, plant.outputs, x, w, _output(plant, x), dt)
+
+
+def save_linear(near: LinearPlant, path: str | Path) -> Path:
+    """Write the matrices, names and operating point as JSON, CSV (a row an entry) or MATLAB file."""
+    file = Path(path)
+    matrices = {"A": near.A, "B": near.B, "C": near.C, "D": np.zeros((len(near.outputs), len(near.inputs)))}
+    labels = {"states": near.states, "inputs": near.inputs, "outputs": near.outputs}
+    point = {"x0": near.x, "u0": near.w, "y0": near.y}
+    if file.suffix == ".mat":
+        from scipy.io import savemat
+
+        names = {name: np.array(words, dtype=object) for name, words in labels.items()}
+        with atomic_path(file) as temporary:
+            savemat(temporary, matrices | names | point | {"dt": near.dt or 0.0}, appendmat=False)
+        return file
+    if file.suffix == ".json":
+        numbers = {name: value.tolist() for name, value in (matrices | point).items()}
+        text = json.dumps(numbers | {name: list(words) for name, words in labels.items()} | {"dt": near.dt})
+        return write_atomic(file, (text + "\n").encode())
+    axes = {"A": ("states", "states"), "B": ("states", "inputs"), "C": ("outputs", "states")}
+    axes["D"] = ("outputs", "inputs")
+    lines = ["matrix,row,column,value"]
+    for name, (down, across) in axes.items():
+        for row, values in zip(labels[down], matrices[name]):
+            lines += [f"{name},{row},{at},{value!r}" for at, value in zip(labels[across], values.tolist())]
+    for name, words in (("x0", "states"), ("u0", "inputs"), ("y0", "outputs")):
+        lines += [f"{name},{label},,{value!r}" for label, value in zip(labels[words], point[name].tolist())]
+    return write_atomic(file, ("\n".join(lines) + "\n").encode())
 
 
 def operating_point(
@@ -243,7 +274,7 @@ def steps_in(plant: Plant, dt: float) -> int:
     return n
 
 
-def _composed(A: Array, B: Array, n: int) -> tuple[Array, Array]:
+def composed(A: Array, B: Array, n: int) -> tuple[Array, Array]:
     """Return the matrices of n steps with the input held."""
     n_x, n_w = B.shape
     whole = np.block([[A, B], [np.zeros((n_w, n_x)), np.eye(n_w)]])

@@ -210,6 +210,11 @@ class Plant(PlantData):
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise not_whole(error) from error
 
+    def free_run(self, log: Log, **how: Any) -> Any:
+        """Return the plant's free run over a log, with its scores and ``band()``; see
+        :func:`thermogrip.sysid.validation.free_run.free_run`."""
+        return import_module("thermogrip.sysid.validation.free_run").free_run(self, log, **how)
+
     def to_control(self, **point: Any) -> Any:
         """Return the plant about an operating point for python-control; see
         :func:`thermogrip.sysid.export.libraries.to_control`."""

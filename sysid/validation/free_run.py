@@ -47,6 +47,7 @@ from thermogrip.sysid.validation.residual_tests import (
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
+    from thermogrip.sysid.validation.prediction_bands import Band
 
 __all__ = ["FreeRun", "Score", "free_run", "no_input_baseline", "score"]
 
@@ -98,6 +99,10 @@ class FreeRun:
         What limits these numbers.
     warmup : float
         Seconds whose readings set the state.
+    plant : Plant
+        What was run.
+    measured : Log
+        Over what, in the plant's units.
     """
 
     log: Log
@@ -112,6 +117,15 @@ class FreeRun:
     no_better: tuple[str, ...]
     notes: tuple[str, ...]
     warmup: float
+    plant: Plant
+    measured: Log
+
+    def band(self, level: float = 0.9) -> Band:
+        """Return the band about the run that a new run's readings should lie in, and how many of these do;
+        see :func:`thermogrip.sysid.validation.prediction_bands.free_run_band`."""
+        from thermogrip.sysid.validation.prediction_bands import free_run_band  # scipy.special
+
+        return free_run_band(self.plant, self.measured, self.log, level=level)
 
 
 def free_run(
@@ -204,7 +218,20 @@ def free_run(
     exceeds_fit = {name: here / there for name, (here, there) in beyond.items()}
     naive = {"mean": mean, "no_input": no_input}
     return FreeRun(
-        seen, scores, one, naive, held, whiteness, left, residual, exceeds_fit, no_better, notes, warmup
+        seen,
+        scores,
+        one,
+        naive,
+        held,
+        whiteness,
+        left,
+        residual,
+        exceeds_fit,
+        no_better,
+        notes,
+        warmup,
+        plant,
+        log,
     )
 
 

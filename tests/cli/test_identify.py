@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.io import loadmat
 
 from tests.cli.conftest import Bench, StandIn, shares, words_of
 from tests.end_to_end.conftest import small_plant
@@ -17,11 +18,15 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.data.data_quality import Finding
 from thermogrip.sysid.experiment.information import plant_from_prior
+from thermogrip.sysid.export.dynamics import plant_dynamics
+from thermogrip.sysid.export.linearise import linearise_plant
 from thermogrip.sysid.identification import Row, Searched, SignalRole
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.validation.free_run import Score
+from thermogrip.sysid.validation.prediction_bands import Band
 
 BOARD = plant_from_prior(load_network("tclab"))
+DYNAMICS = plant_dynamics(BOARD, inputs={"q1": 30.0, "q2": 10.0}, draws=9)
 IDENTIFICATION = "thermogrip.sysid.identification"
 
 
@@ -65,7 +70,8 @@ def room(bench: Bench, stand_in: StandIn, monkeypatch: pytest.MonkeyPatch) -> Si
         progress(0.5, "b")
         return made.found
 
-    made = SimpleNamespace(bench=bench, misfit=None, found=found_of(), record=None)
+    made = SimpleNamespace(bench=bench, misfit=None, found=found_of(), record=None, dynamics=DYNAMICS)
+    made.asked = stand_in("thermogrip.sysid.export.dynamics.plant_dynamics", lambda *_, **__: made.dynamics)
     made.read = stand_in("thermogrip.datasets.log_files.read_log", log)
     made.networks = stand_in("thermogrip.cli.identify.find_network", load_network)
     made.fits = stand_in(f"{IDENTIFICATION}.identify", fit)
@@ -120,7 +126,8 @@ def test_words_reach_the_fit_by_their_meaning(room: SimpleNamespace) -> None:
     [page] = room.pages
     assert page.args == (Path("r.html"), "Identification", "From log a, log a.", ["a section"])
     [asked] = room.sections
-    assert (asked.args[0], asked.args[2:]) == (room.found, (BOARD, None, None))
+    assert (asked.args[0], asked.args[2:]) == (room.found, (BOARD, None, None, DYNAMICS))
+    assert room.asked[0].args == (BOARD,)
     assert shares(done.err, "identify") == [0, 50]
     assert done.err.count("warning: log a: one row dropped\n") == 2
     assert done.err.count("warning: log a: two rows swapped\n") == 2
@@ -139,7 +146,11 @@ def test_what_was_found_is_printed(room: SimpleNamespace) -> None:
     for words in (
         "arx log a t1 0.1234 degC 91.5 77 2.5 held out",
         "q1 percent input guess: its unit",
-        "U is identifiable warn: log a: t1 is noisy fail: a gap note: arx: slow it is good wrote p.json",
+        "input output gain low high unit dead time [s] 63 % after [s]",
+        f"q2 t1 {DYNAMICS.gain.value[0, 1]:.4g} {DYNAMICS.gain.low[0, 1]:.4g}",
+        "about q1 30 percent, q2 10 percent: time constants ",
+        "90 % intervals from 9 draws U is identifiable",
+        "warn: log a: t1 is noisy fail: a gap note: arx: slow it is good wrote p.json",
     ):
         assert words in said
     assert said.startswith("Columns of the logs")
@@ -148,6 +159,15 @@ def test_what_was_found_is_printed(room: SimpleNamespace) -> None:
     assert not room.pages
     room.found = found_of("arx", plant=small_plant())
     assert "Free parameters" not in room.bench.run("identify", "good.csv", "--out", "p.json").out
+
+
+def test_a_plant_that_does_not_settle_has_no_gains(room: SimpleNamespace, stand_in: StandIn) -> None:
+    stand_in("thermogrip.sysid.export.dynamics.plant_dynamics", UserError("the plant runs away"))
+    done = room.bench.run("identify", "good.csv", "--out", "p.json")
+    assert "no gains at rest: the plant runs away" in done.out
+    assert "Gains at rest" not in done.out
+    done = room.bench.run("identify", "good.csv", "--out", "p.json", "--json")
+    assert json.loads(done.out)["dynamics"] is None
 
 
 def test_the_answer_of_identify_is_what_was_found(room: SimpleNamespace) -> None:
@@ -167,7 +187,7 @@ def test_the_answer_of_identify_is_what_was_found(room: SimpleNamespace) -> None
             {"model": "arx", "structure": "na 1, nb 1, delay 1", "error": 0.25, "folds": [0.2, 0.3125],
              "kept": True}
         ],
-        "notes": ["arx: slow"], "out": "p.json",
+        "notes": ["arx: slow"], "out": "p.json", "dynamics": DYNAMICS.to_dict(),
         "repairs": {"log a": ["one row dropped", "two rows swapped"]},
     }  # fmt: skip
 
@@ -286,6 +306,7 @@ def test_a_plant_is_scored_log_by_log_beside_its_baselines(bench: Bench, stand_i
     run = SimpleNamespace(
         scores=score(0.1), one_step=score(0.2), naive={"no_input": score(0.3), "mean": score(0.4)},
         residual=SimpleNamespace(to_json=lambda: {"minutes": 1.0}), notes=("a note",),
+        band=lambda: Band(0.9, {}, {"t_tank": 0.875, "t_lost": np.nan}, 12, "its errors"),
     )  # fmt: skip
     runs = stand_in("thermogrip.sysid.validation.free_run.free_run", run)
     sections = stand_in("thermogrip.report.plant.free_run_section", "a section")
@@ -305,14 +326,19 @@ def test_a_plant_is_scored_log_by_log_beside_its_baselines(bench: Bench, stand_i
     assert pages[0].args[3] == ["a section"] * 2
     said = words_of(done.out)
     assert "good@:100 t_tank 0.1 degC 90 12 0.3 0.4 0.2" in said
-    assert said.endswith("good@:100: a note good@100:200: a note")
+    band = (
+        "90 % band from 12 draws of the parameters and its errors; it covers 88 % of t_tank, nan % of t_lost"
+    )
+    assert said.endswith(f"good@:100: {band} good@:100: a note good@100:200: {band} good@100:200: a note")
     assert shares(done.err, "validate") == [0, 50]
 
     def table(rmse: float) -> dict[str, Any]:
         return {"t_tank": {"fit_percent": 90.0, "rmse": rmse, "unit": "degC", "n": 12}}
 
     one = {"log": "good@:100", "outputs": table(0.1), "one_step": table(0.2), "left": {"minutes": 1.0},
-           "naive": {"no_input": table(0.3), "mean": table(0.4)}, "notes": ["a note"]}  # fmt: skip
+           "naive": {"no_input": table(0.3), "mean": table(0.4)}, "notes": ["a note"],
+           "band": {"level": 0.9, "coverage": {"t_tank": 0.875, "t_lost": None}, "own_error": "its errors",
+                    "draws": 12}}  # fmt: skip
     repairs = {"good@:100": ["taken from the start to 100 s"], "good@100:200": ["taken from 100 s to 200 s"]}
     logs = [one, one | {"log": "good@100:200"}]
     assert json.loads(bench.run(*words, "--json").out) == {"logs": logs, "repairs": repairs}
@@ -321,7 +347,8 @@ def test_a_plant_is_scored_log_by_log_beside_its_baselines(bench: Bench, stand_i
 
 def test_a_warm_up_shorter_than_that_of_the_fit_is_told(bench: Bench, stand_in: StandIn) -> None:
     stand_in("thermogrip.sysid.identification.warm_up_of_fit", 50.0)
-    stand_in("thermogrip.sysid.validation.free_run.free_run", SimpleNamespace(notes=()))
+    stand_in("thermogrip.sysid.validation.free_run.free_run", SimpleNamespace(notes=(), band=lambda: None))
+    stand_in("thermogrip.report.plant.band_words", "a band")
     stand_in("thermogrip.report.plant.run_rows", [])
     stand_in("thermogrip.cli.identify.run_answer", {})
     done = bench.run("validate", "plant.json", "good.csv", "--warmup", "8", "--score-from", "9")
@@ -346,3 +373,70 @@ def test_a_simulation_is_written_and_counted(bench: Bench, stand_in: StandIn) ->
     }  # fmt: skip
     stand_in("thermogrip.sysid.plant.log_grid.match_log", (log, ["drive: converted"]))
     assert "drive: converted" in bench.run(*words).err
+
+
+def test_a_simulation_has_the_ends_of_its_bands(bench: Bench, stand_in: StandIn) -> None:
+    log = make_log(np.arange(3.0), {"t_tank": ([20.0, 21.0, 22.0], "degC", "output")})
+    stand_in("thermogrip.sysid.plant.plant.Plant.simulate", log)
+    band = Band(0.9, {"t_tank": np.array([0.5, 1.0, 1.5])}, {"t_tank": 1.0}, 0)
+    asked = stand_in("thermogrip.sysid.validation.prediction_bands.free_run_band", band)
+    words = ["simulate", "plant.json", "good.csv", "--out", "s.csv"]
+    assert bench.run(*words, "--bands").code == 0
+    assert (bench.path / "s.csv").read_text().splitlines() == [
+        "time_s,t_tank_degC,t_tank_low_degC,t_tank_high_degC",
+        "0.0,20.0,19.5,20.5", "1.0,21.0,20.0,22.0", "2.0,22.0,20.5,23.5",
+    ]  # fmt: skip
+    assert asked[0].args[2] is log
+    assert bench.run(*words).code == 0
+    assert len(asked) == 1
+
+
+def test_a_plant_is_linearised_where_it_is_asked_for(bench: Bench) -> None:
+    (bench.path / "board.json").write_text(json.dumps(replace(BOARD, samples=None).to_dict()))
+    done = bench.run("linearise", "board.json", "--at", "q1=30, q2=20", "--dt", "4", "--out", "l.json")
+    assert done.code == 0, done
+    near = linearise_plant(BOARD, inputs={"q1": 30.0, "q2": 20.0}, dt=4.0)
+    said = words_of(done.out)
+    assert "Gains at rest of board.json" in said
+    assert "about q1 30 percent, q2 20 percent: time constants 124 s" in said
+    assert said.endswith("wrote l.json")
+    written = json.loads((bench.path / "l.json").read_text())
+    assert {key: written[key] for key in ("states", "inputs", "outputs", "dt")} == {
+        "states": list(near.states), "inputs": ["q1", "q2"], "outputs": ["t1", "t2"], "dt": 4.0,
+    }  # fmt: skip
+    for key, wanted in (("A", near.A), ("B", near.B), ("C", near.C), ("D", np.zeros((2, 2)))):
+        np.testing.assert_allclose(written[key], wanted, rtol=1e-9)
+    np.testing.assert_allclose(written["x0"] + written["u0"] + written["y0"], [*near.x, *near.w, *near.y])
+    assert bench.run("linearise", "board.json", "--at", "q1=30,q2=0", "--out", "l.csv").code == 0
+    rows = [line.split(",") for line in (bench.path / "l.csv").read_text().splitlines()]
+    assert rows[0] == ["matrix", "row", "column", "value"]
+    continuous = linearise_plant(BOARD, inputs={"q1": 30.0, "q2": 0.0})
+    entry = {tuple(row[:3]): row[3] for row in rows[1:]}
+    assert len(entry) == 16 + 8 + 8 + 4 + 4 + 2 + 2
+    assert float(entry["B", "heater1", "q1"]) == pytest.approx(continuous.B[0, 0], rel=1e-9)
+    assert float(entry["y0", "t1", ""]) == pytest.approx(continuous.y[0])
+    assert bench.run("linearise", "board.json", "--at", "q1=30,q2=0", "--out", "l.mat").code == 0
+    matlab = loadmat(bench.path / "l.mat")
+    np.testing.assert_allclose(matlab["A"], continuous.A, rtol=1e-9)
+    assert (matlab["dt"].item(), [name.item() for name in matlab["inputs"][0]]) == (0.0, ["q1", "q2"])
+    answer = json.loads(bench.run("linearise", "board.json", "--json").out)
+    assert answer["operating_point"] == pytest.approx({"q1": 50.0, "q2": 50.0})
+    assert len(answer["gains"]) == 4
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ("--at q9=3", "the plant has no q9"),
+        ("--at q1", "--at 'q1' is no NAME=NUMBER"),
+        ("--at q1=hot", "--at 'q1=hot' is no NAME=NUMBER"),
+        ("--dt 0.3 --out l.json", "no whole multiple"),
+        ("--out l.txt", "l.txt"),
+    ],
+)
+def test_what_cannot_be_linearised_is_refused_in_one_line(words: str, says: str, bench: Bench) -> None:
+    (bench.path / "board.json").write_text(json.dumps(replace(BOARD, samples=None).to_dict()))
+    done = bench.run("linearise", "board.json", *words.split())
+    assert (done.code, len(done.said)) == (2, 1)
+    assert says in done.said[0]
+    assert not (bench.path / "l.json").exists()

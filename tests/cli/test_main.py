@@ -61,7 +61,7 @@ def test_python_dash_m_is_the_command() -> None:
 
 def test_the_verbs_are_those_of_the_contract() -> None:
     verbs = "demo identify validate simulate excite tune review export run effusivity train classify compare"
-    more = "paper materials init record recover virtual batch"
+    more = "linearise paper materials init record recover virtual batch"
     assert set(VERBS) == {*verbs.split(), *more.split()}
 
 
@@ -73,7 +73,9 @@ identify: LOGS --out --network --inputs --outputs --disturbances --columns --dt>
   --leave-one-out=False --grow=False --posterior/--no-posterior=False --report --seed=0>0 --json=False
 validate: PLANT LOGS --warmup=5.0>0 --score-from=5.0>0 --average>0 --network --columns --dt>1e-09
   --report --seed=0>0 --json=False
-simulate: PLANT LOG --out --warmup=5.0>0 --network --columns --dt>1e-09 --seed=0>0 --json=False
+simulate: PLANT LOG --out --warmup=5.0>0 --bands=False --network --columns --dt>1e-09 --seed=0>0
+  --json=False
+linearise: PLANT --at --dt>1e-09 --out --report --network --seed=0>0 --json=False
 excite: --kind --minutes>0.1 --out --plant --network --lowest=5.0 --highest=60.0 --hold --slew>1e-09
   --seed=0>0 --json=False
 tune: PLANT --out --spec --report --network --seed=0>0 --workers=1>1 --cluster --json=False

@@ -107,7 +107,8 @@ def test_the_role_of_every_column_is_printed_and_a_guess_is_marked(house: Bench)
     words = ("--outputs", "t_room", "--models", "arx", "--average", "10", "--out", "found.json")
     done = house.run("identify", "set.csv", *words)
     assert done.code == 0, done
-    table = {line.split()[0]: " ".join(line.split()[1:]) for line in done.out.splitlines() if line.split()}
+    roles = done.out.split("Free runs")[0]
+    table = {line.split()[0]: " ".join(line.split()[1:]) for line in roles.splitlines() if line.split()}
     assert table["setting"] == "0_255 input guess: its unit is 0_255"
     assert table["t_room"] == "degC output named"
     assert table["set"] == table["sp1"] == "degC left out guess: its name is that of a set point"

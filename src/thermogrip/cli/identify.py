@@ -1,4 +1,4 @@
-"""identify, validate, simulate: from logs to a plant, and from a plant back to logs."""
+"""identify, validate, simulate, linearise: from logs to a plant, and what a plant says."""
 
 from __future__ import annotations
 
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
     from thermogrip.datasets.parallel import Progress
     from thermogrip.datasets.schema import Log
+    from thermogrip.sysid.export.dynamics import Dynamics
     from thermogrip.sysid.greybox.posterior import Posterior
     from thermogrip.sysid.growth.stepwise import Growth
     from thermogrip.sysid.identification import Identification
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from thermogrip.sysid.models.network import NetworkModel
     from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation.free_run import FreeRun
+    from thermogrip.sysid.validation.prediction_bands import Band
 
 MODELS = ("arx", "oe", "subspace", "sindy", "neural", "network")
 ALL_MODELS = ",".join(MODELS)
@@ -207,18 +209,22 @@ def identify(
                 plant, records, out, seed, sub_progress(progress, 0.6, 1.0, "posterior")
             )
     plant.save(out)
+    dynamics, nothing = _dynamics(plant)
     if report is not None:
         lead = f"From {', '.join(log_name(log) for log in records)}."
-        sections = identification_sections(found, records, plant, record, growth)
+        sections = identification_sections(found, records, plant, record, growth, dynamics)
         write_report(report, "Identification", lead, sections)
-    _show_identified(console, found, plant, growth)
+    _show_identified(console, found, plant, growth, dynamics)
+    if dynamics is None:
+        console.say(nothing)
     if posterior:
         console.say(lost if record is None else record.verdict)
     console.say(f"wrote {out}")
     slow = getattr(plant.model, "slow_because", "")
     if slow:
         console.warn(f"{plant.model.kind} model not compiled, tens of times slower: {slow}")
-    console.answer(_identified(found, plant, record, growth, out) | {"repairs": repairs_of(records)})
+    more = {"dynamics": None if dynamics is None else dynamics.to_dict(), "repairs": repairs_of(records)}
+    console.answer(_identified(found, plant, record, growth, out) | more)
     return ANSWER_IS_NO if posterior and (record is None or not record.converged) else 0
 
 
@@ -260,15 +266,30 @@ def _growable(network: GreyModel | None) -> NetworkModel:
     raise UserError("--grow has no thermal network to grow", hint=hint)
 
 
-def _show_identified(console: Console, found: Identification, plant: Plant, growth: Growth | None) -> None:
-    """Print growth, models, parameters and their identifiability, the data check and the verdict."""
+def _dynamics(plant: Plant) -> tuple[Dynamics | None, str]:
+    """Return gains and responses of the plant, or in words why it has none."""
+    from thermogrip.sysid.export.dynamics import plant_dynamics
+
+    try:
+        return plant_dynamics(plant), ""
+    except UserError as error:
+        return None, f"no gains at rest: {error.problem}"
+
+
+def _show_identified(
+    console: Console, found: Identification, plant: Plant, growth: Growth | None, dynamics: Dynamics | None
+) -> None:
+    """Print growth, models, parameters and their identifiability, gains, the data check and the verdict."""
     from thermogrip.report.plant import (
+        GAIN_HEAD,
         MODEL_HEAD,
         PARAMETER_HEAD,
         SIGNAL_HEAD,
+        gain_rows,
         model_rows,
         parameter_rows,
         signal_rows,
+        time_constant_words,
     )
     from thermogrip.sysid.greybox.identifiability import identifiability_report
 
@@ -285,6 +306,9 @@ def _show_identified(console: Console, found: Identification, plant: Plant, grow
     console.table("Free runs (RMSE)", MODEL_HEAD, model_rows(found))
     if plant.free:
         console.table("Free parameters of the plant", PARAMETER_HEAD, parameter_rows(plant))
+    if dynamics is not None:
+        console.table("Gains at rest", GAIN_HEAD, gain_rows(dynamics))
+        console.say(time_constant_words(dynamics))
     for sentence in identifiability_report(plant):
         console.say(sentence)
     for finding in found.data_check.findings:
@@ -357,7 +381,7 @@ def validate(
     roles = loaded.inputs, loaded.outputs, loaded.disturbances
     records = load_logs(logs, *roles, columns=comma(columns), dt=dt)
     from thermogrip.report.html import write_report
-    from thermogrip.report.plant import SCORE_OF_RUN, free_run_section, run_rows
+    from thermogrip.report.plant import SCORE_OF_RUN, band_words, free_run_section, run_rows
     from thermogrip.sysid.identification import warm_up_of_fit
     from thermogrip.sysid.validation.free_run import free_run
 
@@ -380,15 +404,17 @@ def validate(
         write_report(report, f"Free runs of {plant.name}", lead, sections)
     rows = [row for log, run in zip(records, runs) for row in run_rows(log_name(log), run)]
     console.table(f"Free run of {plant.name}", SCORE_OF_RUN, rows)
-    for log, run in zip(records, runs):
+    bands = [run.band() for run in runs]
+    for log, run, band in zip(records, runs, bands):
+        console.say(f"{log_name(log)}: {band_words(band)}")
         for note in run.notes:
             console.say(f"{log_name(log)}: {note}")
-    answers = [run_answer(log_name(log), run) for log, run in zip(records, runs)]
+    answers = [run_answer(log_name(log), run, band) for log, run, band in zip(records, runs, bands)]
     console.answer({"logs": answers, "repairs": repairs_of(records)})
     return 0
 
 
-def run_answer(name: str, run: FreeRun) -> dict[str, Any]:
+def run_answer(name: str, run: FreeRun, band: Band) -> dict[str, Any]:
     """Return one log's free run as the JSON answer has it."""
     return {
         "log": name,
@@ -396,6 +422,12 @@ def run_answer(name: str, run: FreeRun) -> dict[str, Any]:
         "one_step": {output: asdict(score) for output, score in run.one_step.items()},
         "naive": {kind: {o: asdict(s) for o, s in scores.items()} for kind, scores in run.naive.items()},
         "left": run.residual.to_json(),
+        "band": {
+            "level": band.level,
+            "coverage": {output: share if share == share else None for output, share in band.inside.items()},
+            "own_error": band.own_error,
+            "draws": band.draws,
+        },
         "notes": run.notes,
     }
 
@@ -415,6 +447,10 @@ def simulate(
         Path, typer.Option("--out", metavar="SIM.csv", show_default=False, help="Where the log goes.")
     ],
     warmup: Warmup = 5.0,
+    bands: Annotated[
+        bool,
+        typer.Option("--bands", help="Add the ends of each output's 90 % band, OUTPUT_low and OUTPUT_high."),
+    ] = False,
     network: OwnNetwork = None,
     columns: Columns = None,
     dt: Step = None,
@@ -423,6 +459,7 @@ def simulate(
 ) -> int:
     """Simulate a plant over the inputs of a log."""
     from thermogrip.datasets.log_files import write_log
+    from thermogrip.datasets.schema import column
     from thermogrip.sysid.plant.log_grid import match_log
 
     new_file(out)
@@ -435,9 +472,96 @@ def simulate(
     for line in converted:
         console.warn(f"{log_name(record)}: {line}")
     simulated = loaded.simulate(record, warmup=warmup)
+    if bands:
+        from thermogrip.sysid.validation.prediction_bands import free_run_band
+
+        for name, half in free_run_band(loaded, record, simulated).half.items():
+            for end, sign in (("low", -1), ("high", 1)):
+                attrs = {"units": simulated[name].attrs["units"], "role": "other"}
+                simulated[f"{name}_{end}"] = ("time", column(simulated, name) + sign * half, attrs)
     write_log(simulated, out)
     console.say(f"wrote {out}: {', '.join(loaded.outputs)} at {simulated.sizes['time']} times")
     repairs = repairs_of([record])[log_name(record)]
     rows = simulated.sizes["time"]
     console.answer({"log": record.attrs["name"], "rows": rows, "out": out, "repairs": repairs})
     return 0
+
+
+def linearise(
+    plant: PlantFile,
+    at: Annotated[
+        str | None,
+        typer.Option(
+            "--at",
+            metavar="NAME=X,...",
+            show_default=False,
+            help="Inputs and disturbances of the operating point; the others are in the middle of the logs.",
+        ),
+    ] = None,
+    dt: Annotated[
+        float | None,
+        typer.Option(
+            "--dt", metavar="S", min=1e-9, show_default=False, help="Step of the matrices; continuous without."
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="FILE",
+            show_default=False,
+            help="Matrices as .json, .csv (a row an entry) or .mat.",
+        ),
+    ] = None,
+    report: Report = None,
+    network: OwnNetwork = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Show a plant about an operating point: gains, time constants, dead times, matrices.
+
+    Gains have 90 % intervals where the plant has draws."""
+    if out is not None:
+        new_file(out, (".json", ".csv", ".mat"))
+    loaded, console = load_plant(plant, network), Console(as_json)
+    from thermogrip.report.html import write_report
+    from thermogrip.report.plant import GAIN_HEAD, dynamics_section, gain_rows, time_constant_words
+    from thermogrip.sysid.export.dynamics import plant_dynamics
+    from thermogrip.sysid.export.linearise import linearise_plant, save_linear
+
+    named = _numbers("--at", at)
+    inputs = {name: value for name, value in named.items() if name not in loaded.disturbances}
+    disturbances = {name: value for name, value in named.items() if name in loaded.disturbances}
+    found = plant_dynamics(loaded, inputs=inputs, disturbances=disturbances)
+    console.table(f"Gains at rest of {plant.name}", GAIN_HEAD, gain_rows(found))
+    console.say(time_constant_words(found))
+    if report is not None:
+        write_report(
+            report,
+            f"Linear model of {plant.name}",
+            "Small changes about an operating point.",
+            [dynamics_section(found)],
+        )
+    answer = found.to_dict()
+    if out is not None:
+        point = dict(zip(found.near.inputs, found.near.w.tolist()))
+        switches = {name: value for name, value in inputs.items() if name in loaded.model.switches}
+        u = {name: value for name, value in point.items() if name in loaded.inputs} | switches
+        d = {name: value for name, value in point.items() if name in loaded.disturbances}
+        save_linear(linearise_plant(loaded, inputs=u, disturbances=d, dt=dt), out)
+        console.say(f"wrote {out}")
+        answer["out"] = out
+    console.answer(answer)
+    return 0
+
+
+def _numbers(option: str, text: str | None) -> dict[str, float]:
+    """Return the numbers of ``NAME=X,...`` by name."""
+    out = {}
+    for word in comma(text) or ():
+        name, _, number = word.partition("=")
+        try:
+            out[name.strip()] = float(number)
+        except ValueError:
+            raise UserError(f"{option} {word!r} is no NAME=NUMBER", hint="write q1=30,t_ambient=22") from None
+    return out

@@ -62,6 +62,7 @@ for _name, _verb in (
     ("identify", identify.identify),
     ("validate", identify.validate),
     ("simulate", identify.simulate),
+    ("linearise", identify.linearise),
     ("excite", excite.excite),
     ("tune", control.tune),
     ("review", control.review),

@@ -201,9 +201,7 @@ LogFiles = Annotated[
 ]
 Columns = Annotated[
     str | None,
-    typer.Option(
-        "--columns", metavar="A,B", help="Headers in place of the log's; - leaves one out."
-    ),
+    typer.Option("--columns", metavar="A,B", help="Headers in place of the log's; - leaves one out."),
 ]
 Step = Annotated[
     float | None,

@@ -13,17 +13,20 @@ import numpy as np
 from thermogrip.datasets.schema import log_name
 from thermogrip.report.html import Picture, Section, Table, Text
 from thermogrip.report.plots import (
+    bode_figure,
     difference_unit,
     free_run_figure,
     models_figure,
     posterior_figure,
     residual_figure,
+    step_response_figure,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from thermogrip.datasets.schema import Log
+    from thermogrip.sysid.export.dynamics import Dynamics
     from thermogrip.sysid.greybox.posterior import Posterior
     from thermogrip.sysid.growth.stepwise import Growth
     from thermogrip.sysid.identification import Identification, Row, Searched
@@ -39,7 +42,9 @@ _BASELINES = (
     "reading (RMSE)"
 )
 SIGNAL_HEAD = ("column", "unit", "role", "why")
+_TIME_CONSTANTS = 6  # the slowest, in a sentence
 _STRUCTURES = 5  # of each kind, in the table of those searched
+GAIN_HEAD = ("input", "output", "gain", "low", "high", "unit", "dead time [s]", "63 % after [s]")
 MODEL_HEAD = ("model", "log", "output", "RMSE", "unit", "fit [%]", "n", "no input", "")
 
 
@@ -159,8 +164,9 @@ def identification_sections(
     plant: Plant,
     record: Posterior | None,
     growth: Growth | None = None,
+    dynamics: Dynamics | None = None,
 ) -> list[Section]:
-    """Return the report of an identification: the model comparison, any growth and posterior, every log.
+    """Return the report of an identification: the model comparison, responses, growth, posterior, every log.
 
     ``plant`` is the chosen one, with samples where ``record`` says how they were drawn.  Its free runs
     are those of the comparison, now with residual tests.
@@ -168,6 +174,8 @@ def identification_sections(
     from thermogrip.sysid.validation.free_run import free_run
 
     sections = [identification_section(found, plant)]
+    if dynamics is not None:
+        sections.append(dynamics_section(dynamics))
     if growth is not None:
         sections.append(growth_section(growth))
     if record is not None:
@@ -176,6 +184,50 @@ def identification_sections(
         run = free_run(plant, log, known.warmup, known.warmup, known=known)
         sections.append(free_run_section(log, run, plant, seen=True))
     return sections
+
+
+def gain_rows(found: Dynamics) -> list[tuple[Any, ...]]:
+    """Return the gains at rest with their intervals, dead times and rise times: a row an input and output."""
+    return [tuple(row.values()) for row in found.rows()]
+
+
+def time_constant_words(found: Dynamics) -> str:
+    """Return the operating point, the time constants and what the intervals are of, in a sentence."""
+    near = found.near
+    point = ", ".join(
+        f"{name} {w:.3g}{_spaced(found.units.get(name, '1'))}" for name, w in zip(near.inputs, near.w)
+    )
+    slow = [(tau, s) for tau, s in zip(found.time_constants, found.poles) if s.imag >= 0]
+    taus = ", ".join(
+        f"{tau:.3g} s" + (f" (period {2 * np.pi / s.imag:.3g} s)" if s.imag > 1e-9 * abs(s) else "")
+        for tau, s in slow[:_TIME_CONSTANTS]
+    )
+    taus += f" and {len(slow) - _TIME_CONSTANTS} faster" if len(slow) > _TIME_CONSTANTS else ""
+    words = f"about {point}: time constants {taus or 'none'}"
+    if np.isnan(found.gain.low).all():
+        return f"{words}; no intervals, for the plant has no draws"
+    words += f"; {100 * found.level:.0f} % intervals from {len(found.draws)} draws"
+    if found.gain_sd.any():
+        words += f" and a gain that varies by {100 * found.gain_sd.max():.0f} % from run to run"
+    return words
+
+
+def dynamics_section(found: Dynamics) -> Section:
+    """Return the section of gains, step and frequency responses."""
+    parts = (
+        Table(GAIN_HEAD, tuple(gain_rows(found)), "Gains at rest, with intervals"),
+        Picture(
+            step_response_figure(found),
+            "Response of each output to a step of one unit of each input; shaded: the interval.",
+        ),
+        Picture(bode_figure(found), "Frequency response from each input; shaded: the interval."),
+    )
+    words = time_constant_words(found)
+    return Section("How does the plant respond?", parts, _sentence(words[0].upper() + words[1:]))
+
+
+def _spaced(unit: str) -> str:
+    return "" if unit == "1" else f" {unit}"
 
 
 def growth_section(growth: Growth) -> Section:
@@ -298,7 +350,7 @@ def free_run_section(log: Log, run: FreeRun, plant: Plant, *, seen: bool = False
         Picture(
             free_run_figure(log, run.log, tuple(run.scores), band),
             f"{name}: measured, simulated from the inputs alone, and their difference. Readings of the first "
-            f"{run.warmup:.3g} s set the state; nothing is fed back after that. {_band_words(band)} "
+            f"{run.warmup:.3g} s set the state; nothing is fed back after that. Shaded: {band_words(band)}. "
             "On grey: not scored.",
         ),
         Table(SCORE_OF_RUN, tuple(run_rows(name, run)), _BASELINES),
@@ -328,11 +380,11 @@ def _followed(run: FreeRun) -> list[str]:
     return found
 
 
-def _band_words(band: Band) -> str:
+def band_words(band: Band) -> str:
     """Return what the shaded band is, and how many readings it covers."""
     inside = ", ".join(f"{100 * share:.0f} % of {name}" for name, share in band.inside.items())
     draws = f"{band.draws} draws of the parameters and " if band.draws else ""
-    return f"Shaded: {100 * band.level:.0f} % band from {draws}{band.own_error}; it covers {inside}."
+    return f"{100 * band.level:.0f} % band from {draws}{band.own_error}; it covers {inside}"
 
 
 def _sentence(text: str) -> str:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from thermogrip.mpc.closed_loop.simulate import ClosedLoop
+    from thermogrip.sysid.export.dynamics import Dynamics
     from thermogrip.sysid.greybox.posterior import Posterior
     from thermogrip.sysid.identification import Row
     from thermogrip.sysid.validation.free_run import FreeRun
@@ -113,6 +114,51 @@ def models_figure(rows: Sequence[Row]) -> Figure:
         unit = next(row.unit for row in held if row.output == output)
         axis.set_xlabel(f"{output}: free-run RMSE [{unit}]")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", fontsize=7, ncols=2)
+    return figure
+
+
+def step_response_figure(found: Dynamics) -> Figure:
+    """Draw the response of each output, a row each, to a unit step of each input, a column each."""
+    outputs, inputs = found.near.outputs, found.near.inputs
+    time, step = found.step_response()
+    size = (max(4.6, 2.6 * len(inputs)), 0.6 + 1.5 * len(outputs))
+    figure, axes = _grid(len(outputs), len(inputs), size=size)
+    for i, name in enumerate(outputs):
+        unit = difference_unit(found.units.get(name, "1"))
+        axes[i, 0].set_ylabel(name if unit == "1" else f"{name} [{unit}]")
+        for j, axis in enumerate(axes[i]):
+            axis.axhline(0, color=TARGET, lw=0.6)
+            axis.fill_between(time, step.low[:, i, j], step.high[:, i, j], color=MODEL, alpha=0.18, lw=0)
+            axis.plot(time, step.value[:, i, j], color=MODEL, lw=1.2)
+    for j, name in enumerate(inputs):
+        by = found.units.get(name, "1")
+        axes[0, j].set_title(f"{name} + 1{'' if by == '1' else ' ' + difference_unit(by)}", fontsize=8)
+        axes[-1, j].set_xlabel("time [s]")
+    return figure
+
+
+def bode_figure(found: Dynamics) -> Figure:
+    """Draw magnitude and phase from each input, a column each, to every output, a line each."""
+    outputs, inputs = found.near.outputs, found.near.inputs
+    omega, *parts = found.frequency_response()
+    figure, axes = _grid(2, len(inputs), size=(max(4.6, 2.6 * len(inputs)), 3.6))
+    for j, (name, column_of) in enumerate(zip(inputs, axes.T)):
+        for axis, part in zip(column_of, parts):
+            axis.set_xscale("log")
+            for i in range(len(outputs)):
+                colour, low = PALETTE[i % 8], part.low[:, i, j]
+                if axis is column_of[0]:
+                    low = np.maximum(low, 1e-3 * part.value[:, i, j])  # the scale has no zero
+                axis.fill_between(omega, low, part.high[:, i, j], color=colour, alpha=0.15, lw=0)
+                axis.plot(omega, part.value[:, i, j], color=colour, lw=1.2, label=outputs[i])
+        column_of[0].set_yscale("log")
+        column_of[0].set_ylim(bottom=1e-4 * parts[0].value[:, :, j].max() or None)
+        column_of[0].set_title(name, fontsize=8)
+        column_of[1].set_xlabel("frequency [rad/s]")
+    axes[0, 0].set_ylabel("magnitude")
+    axes[1, 0].set_ylabel("phase [deg]")
+    lines = axes[0, 0].get_lines()
+    figure.legend(handles=lines, loc="outside upper center", ncols=6, frameon=False, fontsize=8)
     return figure
 
 

@@ -1,0 +1,281 @@
+r"""Poles, gains, step and frequency responses of a plant about an operating point, with their uncertainty.
+
+All follow from the matrices of :func:`thermogrip.sysid.export.linearise.linearise_plant` at the plant's own
+step h, and from the same of other plants that agree with the logs (:meth:`Plant.draw`: posterior samples, or
+refits to resampled logs). Each pole z of the step has the continuous equivalent s = ln(z) / h and the time
+constant -1 / Re s; poles at zero are delays. With G the quantity of the plant and G_k those of the draws, the
+interval is
+
+    G +- z_p sqrt(mean (G_k - G)^2 + (g G)^2),
+
+g the spread of an input's gain between runs that few logs cannot show
+(:data:`~thermogrip.sysid.plant.fit_record.RUN_GAIN_SD`), 0 for disturbances and phases.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.sysid.export.linearise import LinearPlant, composed, linearise_plant
+from thermogrip.sysid.plant.fit_record import RUN_GAIN_SD, SEVERAL
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.plant.plant import Plant
+
+__all__ = ["Dynamics", "Estimate", "plant_dynamics"]
+
+Array = NDArray[np.float64]
+
+_DELAY = 1e-6  # modulus of a discrete pole that is part of a delay
+_ROUNDING = 1e-9  # of the largest entry of A
+_NOTHING = 1e-6  # of the largest coefficient of an impulse response: before it is dead time
+_LONG = 5.0  # slowest time constants that a step response shows
+_FEWEST = 8  # draws of an interval
+_RISEN = 1 - np.exp(-1)
+
+
+class Estimate(NamedTuple):
+    """A quantity with its interval, arrays of one shape; ``nan`` where a plant has too few draws for one."""
+
+    value: Array
+    low: Array
+    high: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Dynamics:
+    """How a plant responds to small changes about an operating point.
+
+    Attributes
+    ----------
+    near : LinearPlant
+        The discrete linear plant, with its operating point and the names of its signals.
+    draws : tuple of LinearPlant
+        The same of other plants that agree with the logs; empty where the plant has no uncertainty.
+    gain_sd : (n_w,) ndarray
+        Standard deviation of the gain of each input between runs [1, of the gain], 0 where the logs show it.
+    units : dict of str to str
+        Of inputs, disturbances and outputs.
+    level : float
+        Probability inside of the intervals.
+    """
+
+    near: LinearPlant
+    draws: tuple[LinearPlant, ...]
+    gain_sd: Array
+    units: dict[str, str]
+    level: float = 0.9
+
+    @property
+    def dt(self) -> float:
+        """Step [s]."""
+        assert self.near.dt is not None
+        return self.near.dt
+
+    @property
+    def poles(self) -> NDArray[np.complex128]:
+        """Continuous equivalents [1/s] of the poles that are no delay, the slowest first."""
+        A = self.near.A  # rounding of a difference in a delay of n steps makes a pole of its n-th root
+        z = np.linalg.eigvals(np.where(np.abs(A) > _ROUNDING * np.abs(A).max(), A, 0.0)).astype(complex)
+        s = np.log(z[np.abs(z) > _DELAY]) / self.dt
+        return np.asarray(s[np.argsort(-s.real, kind="stable")])
+
+    @property
+    def time_constants(self) -> Array:
+        """Time constants [s] of the poles, the slowest first (``inf`` of an integrator)."""
+        rate = -self.poles.real
+        return np.asarray(np.divide(1.0, rate, out=np.full(rate.shape, np.inf), where=rate > 1e-12 / self.dt))
+
+    @property
+    def gain(self) -> Estimate:
+        """Change of each output at rest for one unit of each input, (n_y, n_w)."""
+        return self._estimate(LinearPlant.gain)
+
+    @property
+    def dead_time(self) -> Array:
+        """Seconds from an input until each output begins to move, (n_y, n_w); ``nan`` where it never does."""
+        near, reach, seen = self.near, self.near.B, []
+        for _ in range(len(near.A)):
+            seen.append(np.abs(near.C @ reach))
+            reach = near.A @ reach
+        size = np.array(seen)
+        moved = size > _NOTHING * size.max(axis=(0, 2), keepdims=True)
+        return np.where(moved.any(axis=0), moved.argmax(axis=0) * self.dt, np.nan)
+
+    @property
+    def rise_time(self) -> Array:
+        """Seconds until a step has moved each output by 63 % of its gain, (n_y, n_w); ``nan``: never."""
+        time, step = self.step_response(2000)
+        share = step.value / np.where(step.value[-1] == 0, np.nan, step.value[-1])
+        there = share >= _RISEN
+        return np.where(there.any(axis=0), time[there.argmax(axis=0)], np.nan)
+
+    def step_response(self, n: int = 300) -> tuple[Array, Estimate]:
+        """Return times (n + 1,) [s] and the response (n + 1, n_y, n_w) to a unit step of each input at 0 s.
+
+        The last time is five of the slowest time constants.
+        """
+        slowest = self.time_constants[np.isfinite(self.time_constants)].max(initial=self.dt)
+        steps = max(1, round(_LONG * slowest / (n * self.dt)))
+
+        def rise(near: LinearPlant) -> Array:
+            A, B = composed(near.A, near.B, steps)
+            x, out = np.zeros_like(B), [np.zeros((len(near.outputs), len(near.inputs)))]
+            for _ in range(n):
+                x = A @ x + B
+                out.append(near.C @ x)
+            return np.array(out)
+
+        return steps * self.dt * np.arange(n + 1), self._estimate(rise)
+
+    def frequency_response(self, n: int = 100) -> tuple[Array, Estimate, Estimate]:
+        """Return frequencies (n,) [rad/s], magnitude and phase [deg] (n, n_y, n_w) from inputs to outputs.
+
+        From a tenth of the slowest pole to the Nyquist frequency of the step.
+        """
+        slowest = self.time_constants[np.isfinite(self.time_constants)].max(initial=self.dt)
+        omega = np.geomspace(min(0.1 / slowest, 0.1 / self.dt), np.pi / self.dt, n)
+
+        def response(near: LinearPlant) -> NDArray[np.complex128]:
+            turned = np.exp(1j * omega * self.dt)[:, None, None] * np.eye(len(near.A)) - near.A
+            return np.asarray(near.C @ np.linalg.solve(turned, np.broadcast_to(near.B, (n, *near.B.shape))))
+
+        def phase(near: LinearPlant) -> Array:
+            whole = np.unwrap(np.angle(response(near)), axis=0)
+            # from -270 to 90 deg at the first frequency: a gain below zero begins at -180 and not at +180
+            return np.asarray(
+                np.degrees(whole - 2 * np.pi * np.floor((whole[:1] + 1.5 * np.pi) / (2 * np.pi)))
+            )
+
+        magnitude = self._estimate(lambda near: np.abs(response(near)))
+        return omega, magnitude, self._estimate(phase, np.zeros(len(self.gain_sd)))
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return a record for each pair of an input and an output: gain with interval, times [s], unit."""
+        gain, dead, rise = self.gain, self.dead_time, self.rise_time
+        out = []
+        for j, name in enumerate(self.near.inputs):
+            for i, output in enumerate(self.near.outputs):
+                numbers = (float(part[i, j]) for part in (*gain, dead, rise))
+                value, low, high, late, risen = (v if np.isfinite(v) else None for v in numbers)
+                out.append(
+                    {
+                        "input": name,
+                        "output": output,
+                        "gain": value,
+                        "low": low,
+                        "high": high,
+                        "unit": _per(self.units.get(output, "1"), self.units.get(name, "1")),
+                        "dead_time_s": late,
+                        "rise_time_s": risen,
+                    }
+                )
+        return out
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return poles, gains and the operating point as plain JSON."""
+        near = self.near
+        return {
+            "level": self.level,
+            "draws": len(self.draws),
+            "gain_sd_between_runs": float(self.gain_sd.max(initial=0.0)),
+            "operating_point": dict(zip(near.inputs, near.w.tolist())),
+            "at_rest": dict(zip(near.outputs, near.y.tolist())),
+            "poles": [{"re": float(s.real), "im": float(s.imag)} for s in self.poles],
+            "time_constants_s": [float(tau) if np.isfinite(tau) else None for tau in self.time_constants],
+            "gains": self.rows(),
+        }
+
+    def _estimate(self, of: Callable[[LinearPlant], Array], gain_sd: Array | None = None) -> Estimate:
+        """Return a quantity whose last axis is that of the inputs, with its interval."""
+        value = np.asarray(of(self.near))
+        if len(self.draws) < _FEWEST:  # a plant that cannot be drawn is less certain, not more
+            return Estimate(value, *np.full((2, *value.shape), np.nan))
+        variance = np.mean([(of(other) - value) ** 2 for other in self.draws], axis=0)
+        sd = np.sqrt(variance + ((self.gain_sd if gain_sd is None else gain_sd) * value) ** 2)
+        half = NormalDist().inv_cdf(0.5 + self.level / 2) * sd
+        return Estimate(value, value - half, value + half)
+
+
+def plant_dynamics(
+    plant: Plant,
+    *,
+    inputs: Mapping[str, float] | None = None,
+    disturbances: Mapping[str, float] | None = None,
+    level: float = 0.9,
+    draws: int = 24,
+) -> Dynamics:
+    """Return poles, gains, step and frequency responses of a plant about an operating point.
+
+    Parameters
+    ----------
+    plant : Plant
+    inputs, disturbances : mapping of name to float, optional
+        Where they are held, in their units.  By default in the middle of what the logs cover, an input that
+        goes both ways in the middle of its positive half, and a switch on.
+    level : float, optional
+        Probability inside of the intervals, between 0 and 1.
+    draws : int, optional
+        Other plants that agree with the logs; none of a plant without uncertainty.
+
+    Returns
+    -------
+    Dynamics
+
+    Raises
+    ------
+    UserError
+        If a name is unknown, or the plant does not settle or runs away there.
+
+    Examples
+    --------
+    A first-order lag of 20 s and gain 10, three steps of 1 s late:
+
+    >>> from thermogrip.sysid.models.state_space import StateSpaceModel
+    >>> from thermogrip.sysid.plant.plant import Plant
+    >>> a = np.exp(-1 / 20)
+    >>> A = [[a, 1, 0], [0, 0, 1], [0, 0, 0]]
+    >>> late = StateSpaceModel(("q",), (), ("t",), A=A, B=[[0], [0], [10 * (1 - a)]], C=[[1, 0, 0]], dt=1.0)
+    >>> found = plant_dynamics(Plant(late, {}, dt=1.0, units={"q": "percent", "t": "degC"}))
+    >>> found.time_constants.round(6).tolist(), found.gain.value.round(6).tolist(), found.dead_time.tolist()
+    ([20.0], [[10.0]], [[2.0]])
+    >>> found.rows()[0]["unit"]
+    'K/percent'
+    """
+    if not 0 < level < 1:
+        raise UserError(f"level {level:g} is not between 0 and 1", hint="0.9 is usual")
+    u = {name: _middle(plant, name) for name in plant.inputs if name not in plant.model.switches}
+    d = {name: _middle(plant, name) for name in plant.disturbances if name in plant.valid}
+    u, d = u | dict(inputs or {}), d | dict(disturbances or {})
+
+    def about(k: int) -> LinearPlant:
+        return linearise_plant(plant.draw(k), inputs=u, disturbances=d, dt=plant.dt)
+
+    near, others = about(0), []
+    for k in range(1, (draws if plant.uncertain else 0) + 1):
+        try:
+            others.append(about(k))
+        except UserError:  # a draw that does not settle there has no gain
+            continue
+    few = 0 < len(plant.logs) < SEVERAL
+    spread = np.array([RUN_GAIN_SD if few and name in plant.inputs else 0.0 for name in near.inputs])
+    return Dynamics(near, tuple(others), spread, dict(plant.units), level)
+
+
+def _middle(plant: Plant, name: str) -> float:
+    low, high = plant.valid.get(name, (0.0, 0.0))
+    return (max(low, 0.0) if high > 0 else low) / 2 + high / 2
+
+
+def _per(output: str, name: str) -> str:
+    """Return the unit of a gain: a change of the output for one unit of the input."""
+    of = "K" if output == "degC" else output
+    by = "K" if name == "degC" else name
+    return "1" if of == by else of if by == "1" else f"{of}/{by}"
