@@ -14,6 +14,7 @@ from scipy.optimize import least_squares
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.models.network import NetworkModel, _kernel, load_network
+from thermogrip.sysid.models.network_equations import PELTIER
 from thermogrip.sysid.models.network_spec import builtin_networks, network_from_dict, read_network
 
 KELVIN = 273.15
@@ -274,6 +275,88 @@ def test_a_bent_link_between_two_bodies_takes_from_one_what_it_gives_to_the_othe
         assert heats(model, [a, b], [0.0]) == pytest.approx([given, -given])
 
 
+def test_of_two_elements_of_each_kind_each_has_its_own_numbers():
+    bodies = {"r1": {"between": ["a", "b"], "area": "A1", "emissivity": "e1"},
+              "r2": {"between": ["room", "a"], "area": "A2", "emissivity": "e2"}}  # fmt: skip
+    heaters = {
+        "h1": {"node": "a", "input": "q", "power": "P1"},
+        "h2": {"node": "b", "input": "v", "power": "P2"},
+    }
+    inputs = {"q": {"unit": "percent", "range": [0.0, 100.0]}, "v": {"unit": "V", "range": [0.0, 12.0]},
+              "s": {"unit": "1", "range": [0.0, 1.0], "switch": True}}  # fmt: skip
+    links = {"l1": {"between": ["a", "b"], "conductance": "G1", "bend": "n1"},
+             "l2": {"between": ["b", "room"], "conductance": "G2", "switch": "s", "off": "o2"},
+             "l3": {"between": ["room", "a"], "conductance": "G3", "bend": "n3", "switch": "s",
+                    "off": "o3"}}  # fmt: skip
+    numbers = {"A1": ("m2", 0.5), "e1": ("1", 0.9), "A2": ("m2", 2.0), "e2": ("1", 0.3), "P1": ("W", 20.0),
+               "P2": ("W", 50.0), "G1": ("W/K", 2.0), "n1": ("1", 0.4), "G2": ("W/K", 3.0),
+               "G3": ("W/K", 5.0), "n3": ("1", 0.7), "t_room": ("degC", 15.0), "o2": ("1", 0.25), "o3": ("1", 0.5)}  # fmt: skip
+    content = declared(numbers, inputs=inputs, heaters=heaters, radiation=bodies, links=links)
+    content["boundaries"] = {"room": {"temperature": "t_room"}}
+    for name in ("o2", "o3"):
+        content["parameters"][name] |= {"low": 0.0, "high": 1.0}
+    model, black = model_of(content), 5.670374419e-8
+    for on in (1.0, 0.0):
+        kept2, kept3 = 0.25 + 0.75 * on, 0.5 + 0.5 * on
+        one = 2.0 * 20 * (1 + 0.4 * 2.0) + 0.45 * black * ((50 + KELVIN) ** 4 - (30 + KELVIN) ** 4)
+        room = 5.0 * kept3 * -15 * (1 + 0.7 * 1.5) + 0.6 * black * ((15 + KELVIN) ** 4 - (30 + KELVIN) ** 4)
+        want = [one + room + 20.0 * 0.4, -one + 3.0 * kept2 * -35 + 50.0 * 0.25]
+        assert heats(model, [30.0, 50.0], [40.0, 3.0, on]) == pytest.approx(want)
+
+
+def test_of_two_peltiers_each_has_its_own_numbers():
+    names = (*PELTIER[:2], "conductance", "current", *PELTIER[3:7], "dead_zone")
+    units = ["V/K", "ohm", "W/K", "A", "1", "1", "1", "1", "1"]
+    first = [0.05, 2.0, 0.3, 6.0, 0.1, 0.9, 0.8, 0.2, 0.05]
+    second = [0.02, 3.0, 0.7, 4.0, -0.2, 1.1, 0.7, 0.1, 0.1]
+    numbers = {
+        f"{n}{k}": (u, v) for k, each in enumerate((first, second)) for n, u, v in zip(names, units, each)
+    }
+    elements = {
+        f"tec{k}": {"face": face, "sink": sink, "input": drive} | {n: f"{n}{k}" for n in names}
+        for k, (face, sink, drive) in enumerate((("a", "b", "x"), ("b", "a", "y")))
+    }
+    inputs = {name: {"unit": "1", "range": [-1.0, 1.0]} for name in "xy"}
+    model, want = model_of(declared(numbers, inputs=inputs, peltiers=elements)), np.zeros(2)
+    t = np.array([40.0, 20.0])
+    for (s, R, K, top, u0, up, down, r, dead), face, v in ((first, 0, 0.5), (second, 1, -0.4)):
+        v += u0
+        v = np.sign(v) * max(abs(v) - dead, 0.0)
+        rise = t[face] - t[1 - face]
+        amps = top * v * (up if v > 0 else down) * (1 - np.sign(v) * r * rise / 50)
+        want[face] += s * amps * (t[face] + KELVIN) + R * amps**2 / 2 - K * rise
+        want[1 - face] += -s * amps * (t[1 - face] + KELVIN) + R * amps**2 / 2 + K * rise
+    assert heats(model, t.tolist(), [0.5, -0.4]) == pytest.approx(want.tolist())
+
+
+def test_what_a_network_says_of_its_signals_is_what_its_file_says():
+    content = everything()
+    content["outputs"] = {
+        "t": {"node": "far", "lag": "lag", "sd": 0.3, "log_sd": 0.2, "wander": 0.4, "wander_time": 900.0},
+        "ref": {"node": "tank", "reference": True},
+    }
+    content["disturbances"]["air"] = {"log_sd": 0.7}
+    content["inputs"]["q"]["step"] = 0.5
+    content["nodes"]["sink"]["start_sd"] = 3.0
+    model = model_of(content | {"average": 7.0, "dt": 0.5})
+    assert (model.reference, model.sensor_sd) == ("ref", {"t": 0.3, "ref": 0.1})
+    assert (model.drift, model.command_steps) == ({"t": (0.4, 900.0)}, {"q": 0.5})
+    assert model.nuisance == {"t": 0.2, "ref": 0.0, "air": 0.7}
+    assert (model.switches, model.average, model.dt) == (("pump",), 7.0, 0.5)
+    assert (model.independent, model.warmup, model.smooth) == (60.0, 60.0, 20.0)
+    np.testing.assert_allclose(np.sqrt(np.diag(model.spread)), [1.0, 3.0, 1.0] + [0.5] * 6)
+    assert [float(c) for c in model.capacities(model.prior.tolist())] == pytest.approx(
+        [500.0, 200.0, 80.0, 48.0, 15.0, 48.0, 15.0, 96.0, 3.0]
+    )
+    plain = model_of(everything())
+    assert (plain.reference, plain.drift, plain.command_steps) == (None, {}, {})
+    assert "lag" not in model.to_dict()["network"]["outputs"]["ref"]
+    with pytest.raises(UserError, match="the model holds no network; save the plant again"):
+        NetworkModel.from_dict({"kind": "network"})
+    with pytest.raises(UserError, match="no output has a reading to start from"):
+        model.rest([np.nan, np.nan], [0.0, 1.0, 0.0], [20.0], model.prior)
+
+
 def peltier(unit: str, full: float, **more: str) -> NetworkModel:
     numbers = {
         "s": ("V/K", 0.05), "R": ("ohm", 2.0), "I": ("A", 6.0), "u0": ("1", 0.1), "r": ("1", 0.2)
@@ -472,6 +555,9 @@ def test_rest_is_the_minimum_that_its_theory_names(name: str, y: list[float], u:
         ("inputs.q", {"unit": "furlong"}, "inputs.q.unit"),
         ("inputs.q", {"range": [5.0, 5.0]}, r"inputs.q.range: \[5.0, 5.0\] is empty"),
         ("parameters.C_tank", {"value": -5.0}, "parameters.C_tank: nodes.tank.capacity must be positive"),
+        ("parameters.C_tank", {"value": 0.0}, "parameters.C_tank: nodes.tank.capacity must be positive"),
+        ("pipes.out", {"cells": 61}, "pipes.out.cells"),
+        ("nodes.tank", {"start_sd": 0.0}, "nodes.tank.start_sd"),
         ("parameters.C_tank", {"low": -1.0}, "parameters.C_tank: nodes.tank.capacity must be positive"),
         ("parameters.C_tank", {"unit": "W/K"}, "'W/K', but nodes.tank.capacity is in J/K"),
         ("parameters.C_tank", {"unit": None}, "parameters.C_tank.unit"),
@@ -506,4 +592,10 @@ def test_a_prior_is_bounded_five_of_its_deviations_away_on_its_own_scale():
     found = network_from_dict(content).parameters
     assert found["F"].bounds == pytest.approx((2.0 * np.exp(-1.0), 2.0 * np.exp(1.0)))
     assert (found["delay"].bounds, found["lag"].bounds) == ((0.1, 5.5), (3.0, 3.0))
+    content["parameters"]["delay"] = {"unit": "s", "value": 3.0, "sd": 0.5, "high": 4.0}
+    assert network_from_dict(content).parameters["delay"].bounds == (0.5, 4.0)
+    content["parameters"]["u0"] = fixed("1", -0.02)  # an offset may have either sign
+    assert network_from_dict(content).parameters["u0"].value == -0.02
+    content["pipes"]["out"]["cells"] = 60
+    assert network_from_dict(content).pipes["out"].cells == 60
     assert [found[name].scale for name in ("F", "delay")] == ["log", "linear"]

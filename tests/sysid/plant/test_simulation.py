@@ -17,7 +17,15 @@ from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import Stretch, cut_stretches
 from thermogrip.sysid.plant.plant import Plant
-from thermogrip.sysid.plant.simulation import _binned, find_starts, predict
+from thermogrip.sysid.plant.simulation import (
+    Start,
+    _binned,
+    _first_reading,
+    _noise,
+    _through_gap,
+    find_starts,
+    predict,
+)
 
 A = np.array([[0.97, 0.01], [0.05, 0.9]])
 B, E = np.array([0.3, 0.05]), np.array([0.02, 0.05])
@@ -219,6 +227,72 @@ def test_a_fit_sees_the_errors_that_its_plant_makes_also_where_a_warm_log_shows_
     errors = problem.errors(z)[0][0]
     scaled = np.concatenate([problem.scaled(k, e[None])[0] for k, e in enumerate(errors)])
     np.testing.assert_allclose(problem.by_log(z)[0][0], scaled, atol=1e-6)
+
+
+def stretch_of(time: Any, y: Any = None, steps: int = 5, gap: float = 0.0, **held: float) -> Stretch:
+    time = np.asarray(time, float)
+    u, d = (np.full((steps, 1), held.get(name, 0.0)) for name in ("u", "d"))
+    return Stretch(slice(0, time.size), time, np.zeros((time.size, 2)) if y is None else y, u, d, gap, "a")
+
+
+@pytest.mark.parametrize(
+    ("last", "gap", "times", "width", "u", "d"),
+    [
+        (10.0, 8.0, [3.0], 2.0, [[4.0, 1.0, -2.0, -2.0]], [10.5, 12.5, 14.5, 16.5]),
+        (10.0, 8.0, [0.0, 8.0], 2.0, [[-2.0] * 4, [4.0] * 4], [10.5, 12.5, 14.5, 16.5]),
+        (
+            9.0,
+            7.0,
+            [3.0],
+            2.0,
+            [[4.0, 1.0, -2.0]],
+            [10 + 4 / 3 - 0.5, 13.5, 14 + 8 / 3 - 0.5],
+        ),  # of a step 1 s is over
+        (9.0, 1.0, [0.0], 1e-3, [[-2.0]], [13.5]),
+    ],
+)
+def test_through_a_gap_the_input_changes_once_and_what_is_measured_lies_on_a_line(
+    last: float, gap: float, times: list[float], width: float, u: list[list[float]], d: list[float]
+):
+    before, after = stretch_of([0.0, last], u=4.0, d=10.0), stretch_of([0.0], gap=gap, u=-2.0, d=18.0)
+    zero = np.zeros(2)
+    start = Start(zero, zero, zero, np.array([0.5]), None, 0.0, "")
+    got = _through_gap(before, after, start, times, 2.0)
+    np.testing.assert_allclose(got[0][:, :, 0], u, atol=1e-12)
+    np.testing.assert_allclose(got[1][0, :, 0], d, atol=1e-12)
+    assert got[2] == pytest.approx(width)
+
+
+@pytest.mark.parametrize(("dt", "warmup", "rows", "factor"), [
+    (2.0, 10.0, 6, 6 / 2), (2.0, 9.0, 6, 6 / 2), (2.0, 100.0, 6, 6 / 2), (2.0, 0.1, 2, 2 / 1.2),
+    (20.0, 20.0, 2, 1.0),
+])  # fmt: skip
+def test_bins_of_a_warm_up_count_together_as_a_reading_every_ten_seconds(
+    dt: float, warmup: float, rows: int, factor: float
+):
+    made, stretch = plant(dt=dt, noise={"b": 0.0}), stretch_of([0.0])
+    found = _noise(made, stretch, warmup)
+    np.testing.assert_allclose(found, np.tile(np.sqrt(factor) * np.array([0.1, 1e-6]), (rows, 1)))
+
+
+def test_a_first_reading_is_of_two_seconds_or_else_of_the_first_minute():
+    time = np.array([0.0, 2.0, 3.0, 59.0, 60.0])
+    y = np.array([[1.0, np.nan], [4.0, np.nan], [90.0, np.nan], [90.0, 7.0], [90.0, 8.0]])
+    assert _first_reading(stretch_of(time, y)).tolist() == [2.5, 7.0]
+    y[3, 1] = np.nan
+    assert _first_reading(stretch_of(time, y))[0] == 2.5
+    assert np.isnan(_first_reading(stretch_of(time, y))[1])
+    y[:, 1] = np.nan
+    assert np.isnan(_first_reading(stretch_of(time, y))[1])
+
+
+def test_without_a_reference_or_a_warm_up_no_start_is_at_rest():
+    log = log_of(T, [24.0, 24.0], 0.0, 24.0)
+    (start,) = find_starts(plant(), P, cut_stretches(plant(), log), 5.0)
+    assert start.level is None
+    for seconds in (0.0, -1.0):
+        with pytest.raises(UserError, match=f"a warm-up of {seconds:g} s says nothing"):
+            plant().simulate(log, warmup=seconds)
 
 
 # ---- rows and names ----
