@@ -306,7 +306,7 @@ def _moves(grid: Grid, at: int, *, own: int, others: int) -> tuple[Array, Array]
         rows.append(np.hstack(past)[whole])
         target.append(u[first:][whole])
     if not rows:
-        return np.empty((0, own + 1 + others * len(grid.outputs))), np.empty(0)
+        return np.empty((0, 1)), np.empty(0)
     return np.concatenate(rows), np.concatenate(target)
 
 
@@ -367,7 +367,7 @@ def _some(part: Array, half: int) -> bool:
 
 def _slow(u: Array) -> Array:
     """Mean of the input over the tenth of the segment before each row: a static fit must not blame lag."""
-    width = max(1, len(u) // 10)
+    width = len(u) // 10
     area = np.vstack([np.repeat(u[:1], width, axis=0), u]).cumsum(axis=0)
     return np.asarray((area[width:] - area[:-width]) / width)
 

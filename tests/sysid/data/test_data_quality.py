@@ -30,50 +30,6 @@ def test_a_clean_log_is_ok_throughout():
     assert check_data([plant_log()], average=1.0).verdict == "ok"
 
 
-def test_jitter_gap_and_lost_readings_are_found():
-    rng = np.random.default_rng(1)
-    time = np.cumsum(1 + 0.3 * (rng.random(2000) - 0.5) * 2)
-    time[1200:] += 60
-    log = plant_log(time=time)
-    log["t"].values[rng.random(2000) < 0.1] = np.nan
-    checked = check_data([log], average=2.0)
-    assert checked.of("gaps")[0].value == pytest.approx(61, abs=1.5)
-    assert checked.of("gaps")[0].verdict == "warn"
-    assert checked.of("jitter")[0].value == pytest.approx(0.3 / np.sqrt(3), rel=0.1)
-    assert checked.of("lost")[0].value == pytest.approx(0.1, abs=0.03)
-
-
-CLIPPED = np.clip(np.repeat(3 * np.random.default_rng(2).standard_normal(80), 25), -1, 1)
-
-
-def coarse_log():
-    log = plant_log()
-    log["t"].values[:] = np.round(log["t"].values / 0.5) * 0.5
-    return log
-
-
-def twin_inputs():
-    log = plant_log()
-    log["q2"] = ("time", 2 * log["q"].values + 1, {"units": "1", "role": "input"})
-    return log
-
-
-@pytest.mark.parametrize(
-    ("make", "check", "verdict", "says"),
-    [
-        (coarse_log, "quantum", "warn", "unreliable"),
-        (lambda: plant_log(q=CLIPPED), "saturation", "warn", f"{100 * np.mean(np.abs(CLIPPED) == 1):.0f} %"),
-        (lambda: plant_log(q=np.r_[np.zeros(1000), np.ones(1000) * 0.7]), "excitation", "warn", "too little"),
-        (lambda: plant_log(q=np.full(2000, 0.3)), "excitation", "fail", "never moves"),
-        (twin_inputs, "excitation", "fail", "separated"),
-    ],
-)
-def test_a_fault_is_found_with_its_consequence(make, check, verdict, says):
-    found = one([make()], check)
-    assert found.verdict == verdict
-    assert says in found.says
-
-
 def test_a_controller_in_the_loop_is_found():
     rng = np.random.default_rng(3)
     n = 2000
@@ -110,16 +66,6 @@ def test_a_smooth_input_in_open_loop_is_not_accused_of_feedback():
     u = np.sum([np.sin(2 * np.pi * k * t / 400 + phase) for k, phase in enumerate(phases, 1)], axis=0)
     noisy = u + 1e-3 * np.random.default_rng(1).standard_normal(1000)
     assert one([plant_log(1000, q=noisy, noise=0.0)], "feedback").verdict == "ok"
-
-
-def test_drift_within_a_log_and_a_shift_between_logs_are_found():
-    assert one([plant_log(drift=12.0)], "drift").verdict == "warn"
-    logs = [plant_log(seed=1, name="a"), plant_log(seed=2, name="b", level=35.0)]
-    found = one(logs, "shift between logs")
-    assert found.verdict == "warn"
-    assert found.value == pytest.approx(10, abs=1.0)
-    same = [plant_log(seed=1, name="a"), plant_log(seed=2, name="b")]
-    assert one(same, "shift between logs").verdict == "ok"
 
 
 def test_a_drift_says_which_stretch_it_is_of_where_a_gap_leaves_two():
@@ -296,7 +242,7 @@ def test_the_excitation_of_an_input_is_counted(q, value, verdict, says):
 def test_the_condition_of_two_inputs_is_that_of_their_correlation(condition, verdict, says):
     """With r = cos(a) it is (1 + r) / (1 - r) = cot(a / 2)^2; one that rests does not count."""
     other = 5.0 + 3 * (ODD + np.tan(2 * np.arctan(condition**-0.5)) * np.array([1, 1, -1, -1])[K % 4])
-    more = {name: (v, "V", "input") for name, v in (("p", other), ("still", 0 * K + 2.0), ("q", ODD))}
+    more = {name: (v, "V", "input") for name, v in (("p", other), ("still", 0 * K + 1e10), ("q", ODD))}
     log = make_log(1.0 * K, more | {"t": (K / 10, "degC", "output")})
     (found,) = (f for f in check_data([log], average=1.0).of("excitation") if f.channel == "all inputs")
     assert found.value == pytest.approx(condition, rel=1e-4)
@@ -401,6 +347,8 @@ def test_feedback_needs_three_moves_a_coefficient(moves, tested):
 def test_a_log_without_48_rows_before_one_is_not_tested_for_feedback():
     for n, finite in ((48, False), (100, True)):
         assert np.isfinite(check_data([driven(n, 1.0)], average=1.0).of("feedback")[0].value) == finite
+    both = check_data([driven(48, 1.0), driven(100, 1.0)], average=1.0).of("feedback")[0]
+    assert both.value == check_data([driven(100, 1.0)], average=1.0).of("feedback")[0].value
 
 
 @pytest.mark.parametrize(

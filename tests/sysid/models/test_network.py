@@ -290,7 +290,8 @@ def test_of_two_elements_of_each_kind_each_has_its_own_numbers():
                     "off": "o3"}}  # fmt: skip
     numbers = {"A1": ("m2", 0.5), "e1": ("1", 0.9), "A2": ("m2", 2.0), "e2": ("1", 0.3), "P1": ("W", 20.0),
                "P2": ("W", 50.0), "G1": ("W/K", 2.0), "n1": ("1", 0.4), "G2": ("W/K", 3.0),
-               "G3": ("W/K", 5.0), "n3": ("1", 0.7), "t_room": ("degC", 15.0), "o2": ("1", 0.25), "o3": ("1", 0.5)}  # fmt: skip
+               "G3": ("W/K", 5.0), "n3": ("1", 0.7), "t_room": ("degC", 15.0), "o2": ("1", 0.25),
+               "o3": ("1", 0.5)}  # fmt: skip
     content = declared(numbers, inputs=inputs, heaters=heaters, radiation=bodies, links=links)
     content["boundaries"] = {"room": {"temperature": "t_room"}}
     for name in ("o2", "o3"):

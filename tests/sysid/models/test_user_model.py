@@ -474,6 +474,15 @@ def test_a_plant_refuses_a_class_that_has_changed_or_is_another(tmp_path):
         ({"dt": 0.0}, "has dt = 0.0"),
         ({"limits": {"level": (0, 1)}}, "limits 'level', which is no state"),
         ({"limits": {"t": (3, 1)}}, "limits t"),
+        ({"limits": {"t": (1, 1)}}, r"limits t to \(1, 1\); write \(lowest, highest\), None for open"),
+        ({"limits": {"t": 3}}, "limits t to 3; write"),
+        ({"limits": {"t": ("a", 1)}}, r"limits t to \('a', 1\); write"),
+        ({"dt": True}, "has dt = True; give seconds, more than 0"),
+        ({"average": float("inf")}, "has average = inf"),
+        ({"warmup": "long"}, "has warmup = 'long'"),
+        ({"states": {"_t": 1.0}}, "has '_t' in states; use letters"),
+        ({"outputs": {}}, r"has no outputs; write outputs|has no outputs; outputs = "),
+        ({"__init__": lambda self, size: None}, r"cannot be made without arguments \(TypeError"),
         ({"limit": {"t": (0, 1)}}, "'limit', which nothing reads; call it 'limits'"),
         ({"rhs": lambda self, x, u, d, p: [x.t, x.t]}, "returns 2 numbers from rhs, not 1"),
         ({"rhs": lambda self, x, u, d, p: [p.K * x.t]}, "'K' is not among its parameters; they are C, G, P"),
@@ -502,7 +511,8 @@ def test_an_exception_in_a_users_function_names_its_line(tmp_path, monkeypatch):
     [
         ("class Tank(:\n", r"bad\.py:1: fails with SyntaxError"),
         ("import math\nmath.nothing\n", r"bad\.py:2: fails with AttributeError"),
-        ("class Other:\n    rhs = None\n", r"bad\.py: has no 'Tank'; it has Other"),
+        ("class Other:\n    rhs = None\nclass Plain: pass\n", r"bad\.py: has no 'Tank'; it has Other$"),
+        ("size = 3\n", r"bad\.py: has no 'Tank'; name a class that is in it"),
     ],
 )
 def test_a_file_that_fails_is_refused_with_its_line(tmp_path, monkeypatch, text, line):
@@ -510,6 +520,22 @@ def test_a_file_that_fails_is_refused_with_its_line(tmp_path, monkeypatch, text,
     Path("bad.py").write_text(text)
     with pytest.raises(UserError, match=line):
         load_object("bad.py", "Tank")
+
+
+def test_a_file_counts_by_its_text_and_must_be_one_of_python(tmp_path):
+    file = written(tmp_path)
+    first = own_model(load_object(file, "Tank")).code.sha256
+    file.write_bytes(file.read_bytes().replace(b"\n", b"\r\n"))
+    assert own_model(load_object(file, "Tank")).code.sha256 == first
+    assert own_model(type("Typed", (), {**vars(Block), "__module__": "nowhere"})).code.sha256 is None
+    for name, said in (
+        ("none.py", "no such file; check the path"),
+        ("tank.txt", "cannot be imported; give a Python"),
+    ):
+        if name == "tank.txt":
+            (tmp_path / name).write_text("x = 1\n")
+        with pytest.raises(UserError, match=rf"{name}: {said}"):
+            load_object(tmp_path / name, "Tank")
 
 
 def test_equations_that_give_no_number_are_refused_before_the_fit():

@@ -257,14 +257,6 @@ def test_draws_and_intervals_stay_inside_the_bounds(plant: Plant):
         plant.intervals(0.0)
 
 
-def test_draws_from_samples_visit_the_chain_evenly(plant: Plant):
-    samples = np.tile(np.arange(1.0, 101.0)[:, None], (1, len(plant.free)))
-    sampled = replace(plant, samples=samples)
-    rows = sorted(sampled.draw(k).values["G_amb"] for k in range(1, 51))
-    assert np.max(np.diff(rows)) <= 6
-    assert len(set(rows)) > 45
-
-
 def test_an_interval_is_a_factor_for_a_positive_parameter(plant: Plant):
     assert plant.covariance is not None
     low, high = plant.intervals(0.9)["G_amb"]
