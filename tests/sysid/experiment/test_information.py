@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.sysid.experiment.makers import EVERY, POWER, SD, C, G, heated_block
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.experiment.information import (
     Experiment,
@@ -236,6 +237,94 @@ def test_draws_keep_the_limits_too_and_are_counted(gripper: Plant):
     assert kept.evaluate(u) == -np.inf
     assert ExperimentForecast(gripper, draws=0, highest=float(spread[0].max()) + 1e-9).stays(u)
     assert few.evaluate(u) == pytest.approx(few.bits(u), rel=1e-9)
+
+
+def test_the_information_of_a_step_is_the_integral_in_closed_form():
+    block, n, tau = heated_block(), 1200, C / G
+    u = np.full((n, 1), 100.0)
+    t, rise = float(n), POWER / G
+    # y is proportional to P, so dy/dln P = y - room
+    square = rise**2 * (t - 2 * tau * (1 - np.exp(-t / tau)) + tau / 2 * (1 - np.exp(-2 * t / tau)))
+    F = square / (SD**2 * EVERY)
+    forecast = ExperimentForecast(block)
+    # the sum over steps of 1 s beside the integral: half a step of the last value, 1e-3 of the whole
+    np.testing.assert_allclose(forecast.covariance(u), [[1 / (1 + F)]], rtol=3e-3)
+    assert forecast.bits(u) == pytest.approx(0.5 * np.log2(1 + F), rel=3e-4)
+
+
+def test_noise_is_what_the_fit_saw_and_never_less_than_the_sensors():
+    seen = PlantScores(independent_s={"t1": 20.0, "t2": 20.0}, average_s=5.0)
+    board = replace(plant_from_prior(load_network("tclab")), scores=seen, noise={"t1": 0.9, "t2": 0.01})
+    sd, seconds = reading_noise(board)
+    assert (sd.tolist(), seconds.tolist()) == ([0.9, 0.4], [20.0, 20.0])
+
+
+@pytest.mark.parametrize("name", ["gripper", "tclab"])
+def test_the_belief_before_any_log_is_the_priors(name):
+    model = load_network(name)
+    plant = plant_from_prior(model)
+    sd = dict(zip(plant.free, np.sqrt(np.diag(np.asarray(plant.covariance)))))
+    wanted = {n: s.sd_log if s.scale == "log" else s.sd for n, s in model.specs.items() if n in plant.free}
+    assert sd == pytest.approx(wanted)
+    assert {model.specs[n].scale for n in sd} == {"log", "linear"}
+    assert plant.valid == {n: item.range for n, item in model.network.inputs.items() if item.range}
+
+
+@pytest.mark.parametrize(
+    ("network", "rows", "seconds"), [("gripper", 10_000, 0.0), ("tclab", 10_000, 60.0), ("tclab", 10, 5.0)]
+)
+def test_the_warm_up_informs_of_a_start_that_is_not_known(network: str, rows: int, seconds: float) -> None:
+    """The gripper starts at rest with its measured room; of a short experiment half may be warm-up."""
+    assert ExperimentForecast(plant_from_prior(load_network(network)))._warm_up(rows) == seconds
+
+
+@pytest.mark.parametrize(
+    ("network", "reference", "known"),
+    [
+        ("gripper", "t_ambient", True),
+        ("gripper", None, False),
+        ("tclab", None, False),
+        ("tclab", "t1", False),
+    ],
+)
+def test_the_start_is_known_at_rest_with_a_measured_room_alone(network, reference, known):
+    plant = replace(plant_from_prior(load_network(network)), reference=reference)
+    assert ExperimentForecast(plant)._known == known
+
+
+def test_a_learnt_error_moves_disturbances_and_starts_too_and_scales_what_they_do(gripper: Plant):
+    n = len(gripper.free)
+    numbers = ErrorNumbers((0.1, 0.2), (3.0,), ((0.4, 0.5),), (0.6,), (0.7, 0.8), 10.0, 1, (1.1,))
+    spread = {"bias of t_ambient": 0.4, gripper.free[0]: 0.5}
+    fit = Intervals(numbers, np.eye(n).tolist(), spread_over_logs=spread)
+    plant = replace(gripper, scores=PlantScores(intervals=fit))
+    forecast = ExperimentForecast(plant, room=21.0)
+    rows, begin, d = forecast._moved
+    bare, bare_begin, bare_d = ExperimentForecast(gripper, room=21.0)._moved
+    modes = gripper.model.n_x
+    assert (len(bare), len(rows)) == (1 + n, 1 + n + 1 + modes)
+    np.testing.assert_array_equal(rows[: 1 + n], bare)
+    np.testing.assert_array_equal(rows[1 + n :], np.tile(bare[0], (1 + modes, 1)))
+    assert (bare_d.ravel().tolist(), d.ravel().tolist()) == (
+        [21.0] * (1 + n),
+        [21.0] * (1 + n) + [21.1] + [21.0] * modes,
+    )
+    np.testing.assert_array_equal(begin[: 2 + n], np.vstack([bare_begin, bare_begin[:1]]))
+    aside = (begin[2 + n :] - begin[0]) / 0.1
+    np.testing.assert_allclose(aside.T @ aside, gripper.model.spread, atol=1e-9)
+    assert len(ExperimentForecast(plant, starts=False)._moved[0]) == 2 + n
+    change = np.arange(1.0, len(rows))[:, None, None] * np.ones((1, 3, 2))
+    effects, starts = forecast._effects(forecast._error, change)
+    step = 1e-3 * np.sqrt(np.asarray(gripper.covariance)[0, 0])
+    np.testing.assert_allclose(effects[:, 0, 0], [0.5 / step, (n + 1) * 0.4 / 0.1], rtol=1e-6)
+    np.testing.assert_allclose(starts[:, 0, 0], np.arange(n + 2, n + 2 + modes) / 0.1)
+    u = np.tile([0.3, 1.0], (60, 1))
+    both = forecast.outputs(u)[0], forecast._run(u, *forecast._moved)
+    np.testing.assert_allclose(both[1][0], both[0], atol=1e-9)  # the plant's own run comes first
+    after = forecast.covariance(u)
+    np.testing.assert_allclose(after, after.T)
+    gain = forecast._gain(u, both[1])
+    np.testing.assert_allclose(after, forecast._root @ np.linalg.inv(gain) @ forecast._root.T, rtol=1e-6)
 
 
 def test_a_reading_counts_once_a_bin_or_correlation_time(gripper: Plant):

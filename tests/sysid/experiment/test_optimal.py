@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from tests.sysid.greybox.makers import heater
+from tests.sysid.experiment.makers import heated_block
 from thermogrip.cli.excite import optimal_for, schedule_for
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
@@ -20,7 +20,6 @@ from thermogrip.sysid.experiment.information import (
     ExperimentForecast,
     interval_widths,
     plant_from_prior,
-    reading_noise,
 )
 from thermogrip.sysid.experiment.optimal import Expectation, expect, inputs_of, optimal_schedule
 from thermogrip.sysid.greybox.fit import fit_network
@@ -30,21 +29,10 @@ from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import PlantScores
 from thermogrip.sysid.plant.plant import Plant
 
-C, G, POWER, SD, EVERY = 50.0, 0.2, 4.0, 0.1, 60.0  # J/K, W/K, W, degC, s
-
 
 @pytest.fixture(scope="module")
 def block() -> Plant:
-    """A heated block of which only the power is unknown: y = (P u / G) (1 - exp(-t G / C)) + room."""
-    content = heater().to_dict()["network"]
-    content["inputs"]["q"] = {"unit": "percent", "range": [0.0, 100.0]}
-    content["outputs"]["t"] = {"node": "block", "sd": SD, "reference": True}
-    content["parameters"] = {
-        "C": {"unit": "J/K", "value": C, "fixed": True},
-        "G": {"unit": "W/K", "value": G, "fixed": True},
-        "P": {"unit": "W", "value": POWER, "sd_log": 1.0},
-    }
-    return plant_from_prior(NetworkModel(network_from_dict(content)))
+    return heated_block()
 
 
 @pytest.fixture(scope="module")
@@ -55,19 +43,6 @@ def boards() -> Plant:
     return replace(
         plant, values=values, scores=PlantScores(independent_s={"t1": 20.0, "t2": 20.0}, average_s=5.0)
     )
-
-
-def test_the_information_of_a_step_is_the_integral_in_closed_form(block):
-    n, tau = 1200, C / G
-    u = np.full((n, 1), 100.0)
-    t, rise = float(n), POWER / G
-    # y is proportional to P, so dy/dln P = y - room
-    square = rise**2 * (t - 2 * tau * (1 - np.exp(-t / tau)) + tau / 2 * (1 - np.exp(-2 * t / tau)))
-    F = square / (SD**2 * EVERY)
-    forecast = ExperimentForecast(block)
-    # the sum over steps of 1 s beside the integral: half a step of the last value, 1e-3 of the whole
-    np.testing.assert_allclose(forecast.covariance(u), [[1 / (1 + F)]], rtol=3e-3)
-    assert forecast.bits(u) == pytest.approx(0.5 * np.log2(1 + F), rel=3e-4)
 
 
 def test_constant_full_input_is_best_where_only_the_gain_is_unknown(block):
@@ -167,23 +142,6 @@ def test_a_schedule_is_the_same_with_the_same_seed(boards):
     assert not first.identical(other)
 
 
-@pytest.mark.parametrize("name", ["gripper", "tclab"])
-def test_the_belief_before_any_log_is_the_priors(name):
-    model = load_network(name)
-    plant = plant_from_prior(model)
-    sd = dict(zip(plant.free, np.sqrt(np.diag(np.asarray(plant.covariance)))))
-    wanted = {n: s.sd_log if s.scale == "log" else s.sd for n, s in model.specs.items() if n in plant.free}
-    assert sd == pytest.approx(wanted)
-    assert {model.specs[n].scale for n in sd} == {"log", "linear"}
-    assert plant.valid == {n: item.range for n, item in model.network.inputs.items() if item.range}
-
-
-def test_noise_is_what_the_fit_saw_and_never_less_than_the_sensors(boards):
-    sd, seconds = reading_noise(replace(boards, noise={"t1": 0.9, "t2": 0.01}))
-    np.testing.assert_array_equal(sd, [0.9, 0.4])
-    np.testing.assert_array_equal(seconds, [20.0, 20.0])
-
-
 def test_what_cannot_be_designed_is_refused(boards, block):
     black = StateSpaceModel(("q",), (), ("t",), A=[[0.9]], B=[[4.0]], C=[[1.0]], dt=10.0)
     plant = Plant(black, {}, dt=10.0, units={"q": "percent", "t": "degC"}, noise={"t": 0.1})
@@ -267,14 +225,6 @@ def test_a_forecast_without_what_a_fit_knows_is_wrong(kept, forgotten, where):
     assert abs(ratio - 1.0) > TOLERANCE
 
 
-@pytest.mark.parametrize(
-    ("network", "rows", "seconds"), [("gripper", 10_000, 0.0), ("tclab", 10_000, 60.0), ("tclab", 10, 5.0)]
-)
-def test_the_warm_up_informs_of_a_start_that_is_not_known(network: str, rows: int, seconds: float) -> None:
-    """The gripper starts at rest with its measured room; of a short experiment half may be warm-up."""
-    assert ExperimentForecast(plant_from_prior(load_network(network)))._warm_up(rows) == seconds
-
-
 @pytest.fixture(scope="module", params=[0.0, 0.004], ids=["as modelled", "on a board that the model lacks"])
 def world(request, boards, kept):
     """Fits before and after, where both heaters lose as many W/K to a board of 6 J/K; none: there is none."""
@@ -316,20 +266,6 @@ def test_what_fits_state_falls_into_the_range_of_the_forecast(world):
 def _as_log(plant: Plant, u: np.ndarray) -> Log:
     columns = {name: (u[:, k], "percent", "input") for k, name in enumerate(plant.inputs)}
     return make_log(np.arange(float(len(u))), columns, name="schedule")
-
-
-@pytest.mark.parametrize(
-    ("network", "reference", "known"),
-    [
-        ("gripper", "t_ambient", True),
-        ("gripper", None, False),
-        ("tclab", None, False),
-        ("tclab", "t1", False),
-    ],
-)
-def test_the_start_is_known_at_rest_with_a_measured_room_alone(network, reference, known):
-    plant = replace(plant_from_prior(load_network(network)), reference=reference)
-    assert ExperimentForecast(plant)._known == known
 
 
 def test_square_waves_of_several_inputs_are_tried_together_and_a_quarter_apart():

@@ -245,14 +245,16 @@ def test_rest_weighs_readings_and_inputs_as_its_theory_does():
     assert [own.rest([1.8], [0.3], [air], [1.0])[0] for air in (1.0, 1.4)] == pytest.approx([0.5, 0.4])
 
 
-@pytest.mark.parametrize(("y", "root"), [(2.0, 2.0), (3.5, 7.5)])
-def test_rest_is_found_near_the_readings(y: float, root: float):
-    """|x - 4| reads the same on both sides; a state that no output is named after begins at their mean."""
-    model = lag(states={"hot": 4.0}, outputs={"t": {"unit": "degC", "sd": 1e-3}}, inputs={"q": "1"},
-                rhs=lambda self, x, u, d, p: [u.q + 0 * x.hot],
-                output=lambda self, x, p: [abs(x.hot - 4.0) * (1 + 0 * p.k)])  # fmt: skip
-    start = model.rest([y], [0.0], [0.0], [1.0])
-    np.testing.assert_allclose(start, root if y < 3 else 4.0 - y, atol=1e-3)
+@pytest.mark.parametrize(
+    ("state", "second", "root"), [("t", 40.0, 2.0), ("hot", 40.0, 6.0), ("hot", 1.0, 2.0)]
+)
+def test_rest_is_found_near_the_readings(state: str, second: float, root: float):
+    """|x - 4| = 2 on both sides; a state that no output is named after begins at the mean of all."""
+    two = {"t": {"unit": "degC", "sd": 1e-3}, "s": {"unit": "degC", "sd": 1e3}}
+    model = lag(states={state: 4.0}, outputs=two, inputs={"q": "1"},
+                rhs=lambda self, x, u, d, p: [u.q + 0 * x[0]],
+                output=lambda self, x, p: [abs(x[0] - 4.0) * (1 + 0 * p.k), second + 0 * x[0]])  # fmt: skip
+    np.testing.assert_allclose(model.rest([2.0, second], [0.0], [0.0], [1.0]), root, atol=1e-3)
 
 
 def settled(residual: Any, z: float, low: float = -np.inf, high: float = np.inf) -> tuple[float, int]:
@@ -380,6 +382,8 @@ def test_what_a_plant_file_says_of_a_class_is_checked():
             model.restored(said | change)
     with pytest.raises(UserError, match="equations are a statespace, not Block"):
         model.restored({"kind": "statespace"})
+    with pytest.raises(UserError, match="equations are Block, not Block"):
+        model.restored({"kind": "network", "class": "Block"})
     with pytest.raises(UserError, match=r"class None of FILE\.py.*--network FILE\.py:None"):
         OwnModel.from_dict({})
 
