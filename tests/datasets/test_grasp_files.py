@@ -10,6 +10,7 @@ import xarray as xr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from thermogrip.datasets import grasp_files
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import example_path
 from thermogrip.datasets.grasp_files import (
@@ -134,6 +135,23 @@ def test_jittering_stamps_are_interpolated_onto_one_axis(pair, seed, size):
     np.testing.assert_allclose(got[:, 2:-2], np.broadcast_to(ramp, got.shape)[:, 2:-2], atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("steps", "common"),
+    [([0.1, np.nan, 0.1009, 0.1009], 0.1), ([0.1015] * 3, 0.1015), ([0.1, 0.1, 0.11999], 0.1),
+     ([1.23456, np.nan], 1.235), ([0.1, 0.121, 0.1], "grasp 'b' has a step of 0.121 s, the others 0.1 s")],
+)  # fmt: skip
+def test_the_step_is_the_median_in_two_digits_if_that_is_within_one_per_cent(steps, common):
+    if isinstance(common, str):
+        with pytest.raises(UserError, match=common):
+            grasp_files._common_step(np.array(steps), list("abcd"), "g.csv")
+    else:
+        assert grasp_files._common_step(np.array(steps), list("abcd"), "g.csv") == common
+    assert grasp_files._step_of(np.array([0.0, 0.25, 0.5, 1.25])) == 0.25  # with a hole of two samples
+    assert np.isnan(grasp_files._step_of(np.array([1.0])))
+    axes = [[0, 1, 2, 4], [0, 1, 2.03], [0, 1, 2.05], [0, 0.4, 1.4]]
+    assert [grasp_files._is_even(np.array(axis, float), 1.0) for axis in axes] == [True, True, False, False]
+
+
 def test_a_hole_in_a_jittering_grasp_stays_a_hole(pair):
     rng = np.random.default_rng(1)
     time = 0.1 * (np.arange(-20, 101) + 0.2 * rng.uniform(-1, 1, 121))
@@ -156,7 +174,7 @@ ONE = META + "a,copper,43,23\n"
         (samples("a", "b"), ONE, ["g_meta.csv", "no row for grasp 'b' of g.csv"]),
         (samples("a"), ONE + "b,wood,43,23\n", ["g_meta.csv", "row 3", "'b' has no samples in g.csv"]),
         (samples("a"), ONE + "a,wood,43,23\n", ["row 3", "grasp_id 'a' occurs twice"]),
-        (samples("a") + samples("a").partition("\n")[2], ONE, ["grasp 'a': time runs back"]),
+        (samples("a") + samples("a").partition("\n")[2], ONE, ["'a': time runs back from 1 s to -0.5 s"]),
         (samples("a"), ONE.replace("43", "warm"), ["g_meta.csv", "row 2", "t_object_nominal_degC", "'warm'"]),
         (samples("a"), ONE.replace("nominal_degC", "nominal_C"), ["column t_object_nominal_C"]),
         (samples("a"), ONE.replace("nominal_degC", "nominal_V"), ["unit 'V' does not fit"]),
