@@ -141,13 +141,12 @@ def staircase(n: int, *, hold: float, seed: int = 0) -> Array:
     half = max(1, round(stairs / 2 / 2))
     up = np.linspace(0.0, 1.0, half + 1)[1:]
     levels = np.concatenate([up, up[::-1][1:], [0.0], -up, -up[::-1][1:], [0.0]])
-    place = np.minimum((np.arange(n) * levels.size) // n, levels.size - 1)
-    return np.asarray((-1.0) ** (seed % 2) * levels[place])
+    return np.asarray((-1.0) ** (seed % 2) * levels[(np.arange(n) * levels.size) // n])
 
 
 def _slewed(wanted: Array, most: float) -> Array:
     """Follow the wanted values with at most ``most`` change from row to row."""
-    if not np.isfinite(most) or np.abs(np.diff(wanted)).max(initial=0.0) <= most:
+    if not np.isfinite(most) or np.abs(np.diff(wanted)).max() <= most:
         return wanted
     out = np.empty_like(wanted)
     out[0] = wanted[0]

@@ -66,6 +66,8 @@ def test_a_schedule_is_its_shape_between_the_limits_behind_a_rest():
         less = excite(kind, 20.0, low=0.2, high=0.6, pump=False)
         np.testing.assert_allclose(less["drive"].values, 0.4 + 0.2 * log["drive"].values, atol=1e-15)
         assert less["pump"].values.tolist() == [0.0] * 2400
+    quick = excite("staircase", 20.0, tau_slow=50.0)["drive"].values
+    assert quick[12:].tolist() == staircase(2388, hold=300).tolist()
     slow = excite("prbs", 20.0, dt=4.0, tau_fast=22.0, seed=3)["drive"].values
     assert slow.tolist() == [0.0] * 2 + prbs(298, hold=6, seed=3).tolist()  # 5.5 rows, and 6 s are two
 

@@ -254,6 +254,9 @@ def test_a_neural_model_comes_back_from_its_dict_with_its_rails():
         assert again.to_dict() == model.to_dict()
         assert (again.low.tolist(), again.high.tolist()) == (model.low.tolist(), model.high.tolist())
     assert (model.n_x, model.spread.tolist(), model.stable) == (4, np.eye(4).tolist(), True)
+    sizes = {"y_middle": [25.0, 1.0], "y_size": [4.0, 2.0], "low": [-np.inf] * 2, "high": [np.inf] * 2}
+    two = bent(outputs=("t", "s"), **sizes)
+    assert two.output([1.0, 2.0, 3.0, 6.0], ()) == [25.0 + 4 * 2.0, 1.0 + 2 * 4.0]
 
 
 def test_a_fifth_of_the_readings_lost_costs_little(fit_one):

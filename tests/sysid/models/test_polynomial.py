@@ -53,6 +53,9 @@ def test_a_run_ten_ranges_from_the_middle_has_diverged_for_good(
     y, end = plain.rollout([[0.1]], u, np.zeros((1, 3, 0)), (), 2.0)
     assert y[0, :, 0].tolist() == ([0.1, 0.5, np.inf, np.inf] if gone else [0.1, 0.5, peak, 0.6])
     assert end.tolist() == [[np.inf if gone else 0.6]]
+    y, end = plain.rollout([[0.1]], u[:, [0, 2, 1]], np.zeros((1, 3, 0)), (), 2.0)
+    assert end[0, 0] == y[0, -1, 0] == (np.inf if gone else peak)
+    assert SindyModel.from_dict(plain.to_dict()).memory == 1
 
 
 def test_at_rest_past_readings_are_the_present_ones_and_what_is_not_read_is_in_the_middle():
@@ -93,5 +96,7 @@ def test_a_model_comes_back_from_its_dict():
     ],
 )
 def test_what_is_no_model_is_refused(change: dict[str, Any]):
+    with pytest.raises(ValueError, match="coefficients finite"):
+        model(coefficients=[[np.nan] * 5] * 2)
     with pytest.raises(UserError, match=r"not a SINDy model .*; save it again"):
         SindyModel.from_dict(model().to_dict() | change)
