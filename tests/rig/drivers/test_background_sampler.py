@@ -163,3 +163,4 @@ def test_pythons_switching_is_as_before_afterwards(plant: Plant) -> None:
 def test_a_grid_without_a_step_is_refused(plant: Plant) -> None:
     with pytest.raises(ValueError, match="every 0 s"):
         Sampler(Twin(plant), 0.0)
+    assert not Sampler(Twin(plant), 0.01).by_device  # before it has asked
