@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 
 from thermogrip.datasets.resample import average
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.blackbox.arx import arx_family
+from thermogrip.sysid.blackbox.arx import _columns, _Orders, arx_family
 from thermogrip.sysid.blackbox.order_selection import choose, default_terms
 from thermogrip.sysid.plant.log_grid import make_grid
 
@@ -108,3 +108,17 @@ def test_an_unequal_peltier_with_a_pump_needs_the_magnitude_and_the_switch(fit_o
 
 def test_too_few_rows_give_no_model(first_order):
     assert not arx_family(make_grid([first_order.log(40)], average=1.0), poles=(9,), zeros=(9,))
+
+
+@pytest.mark.parametrize(
+    ("orders", "n_s", "output", "columns"),  # of 2 outputs and 3 drives at lags 1 to 4, and a constant
+    [
+        ((2, 1, 3, True, False), 0, 1, [0, 1, 2, 3, 14, 15, 16, 20]),
+        ((2, 2, 1, False, False), 0, 1, [1, 3, 8, 9, 10, 11, 12, 13, 20]),
+        ((1, 1, 4, False, False), 1, 0, [0, 25, 26, 27, 28]),  # a switch that is not used
+        ((2, 1, 1, True, True), 1, 0, [0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 28]),
+        ((1, 1, 2, False, True), 2, 1, [1, 9, 17, 27, 28, 29, 36]),
+    ],
+)
+def test_a_structure_uses_its_lags_of_the_one_regression(orders, n_s, output, columns):
+    assert _columns(_Orders(*orders), 4, 2, n_s, 3, output) == columns

@@ -175,6 +175,9 @@ def test_blocks_hold_every_row_once():
         rows = np.concatenate([block.time for block in blocks if block.log == segment.log])
         assert set(segment.time) <= set(rows)
     assert sum(len(block.time) for block in blocks) == sum(len(s.time) for s in grid.segments)
+    for n, rows in ((1200, [75] * 16), (300, [43] * 6 + [42]), (79, [79])):  # a sixteenth, but 40 at least
+        blocks = cut_into_blocks((grid.segments[0].part(0, n),))
+        assert sorted((len(block.time) for block in blocks), reverse=True) == rows
 
 
 def test_short_logs_are_not_resampled_and_that_is_reported():

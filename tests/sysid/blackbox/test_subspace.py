@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.blackbox.subspace import extended_observability, stabilised, subspace_family
+from thermogrip.sysid.blackbox.subspace import _windows, extended_observability, stabilised, subspace_family
 from thermogrip.sysid.plant.log_grid import make_grid
 
 
@@ -105,3 +105,11 @@ def test_too_few_windows_give_no_model_and_unknown_weights_are_refused(coupled):
     assert not subspace_family(make_grid([coupled.log(60)], average=1.0), orders=(2,), rows=(15,))
     with pytest.raises(ValueError, match="weighting"):
         extended_observability(np.eye(3), np.eye(3), n_y=1, weighting="n4sid")
+
+
+def test_a_window_has_future_and_past_drives_a_constant_and_past_and_future_readings():
+    z = np.arange(15.0).reshape(5, 3)  # two drives and a reading
+    wanted = [[6, 7, 9, 10, 1, 0, 1, 3, 4, 2, 5, 8, 11], [9, 10, 12, 13, 1, 3, 4, 6, 7, 5, 8, 11, 14]]
+    assert _windows(z, 2, 2).tolist() == wanted
+    z[0, 2] = np.nan
+    assert _windows(z, 2, 2).tolist() == wanted[1:]
