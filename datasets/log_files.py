@@ -463,6 +463,7 @@ def read_clock(cells: Sequence[str]) -> tuple[Floats, str] | None:
     else:
         day, month, year = first, middle, last
     year = np.where(year < 100, year + 2000, year)
+    year[(year < 1900) | (year > 2200)] = np.nan  # beyond what pandas counts in nanoseconds
     dates = pd.to_datetime(pd.DataFrame({"year": year, "month": month, "day": day}), errors="coerce")
     days = (dates - pd.Timestamp(0)) / pd.Timedelta(days=1)
     return np.asarray(days, dtype=float) * 86400.0 + of_day, note
