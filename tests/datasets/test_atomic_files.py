@@ -200,7 +200,8 @@ def test_what_is_not_the_expected_json_is_one_line(tmp_path, content, words):
 
 
 def test_an_unknown_refusal_keeps_the_systems_words():
-    assert "Too many links" in str(os_fault(OSError(errno.EMLINK, "Too many links"), "a"))
+    for error in (OSError(errno.EMLINK, "Too many links"), OSError("Too many links")):
+        assert str(os_fault(error, "a")) == "a: Too many links; check the path and the disk"
 
 
 def test_json_is_an_object_with_its_keys_first(tmp_path):

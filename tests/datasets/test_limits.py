@@ -259,6 +259,12 @@ def test_a_limit_itself_is_within_it(
         check(most + 1)
 
 
+def test_numbers_within_their_limits_are_returned() -> None:
+    content = {"a": [[1, -7]], "b": 7}
+    assert limits.array_within(content, "a", 7).tolist() == [[1.0, -7.0]]
+    assert limits.number_within(content, "b", 0, 7) == 7.0
+
+
 def test_what_is_packed_may_grow_200_times() -> None:
     limits.check_unpacked(1 << 20, 200 << 20, file="a")
     with pytest.raises(UserError, match="210 MB or more from 1049 kB"):

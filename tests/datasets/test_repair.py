@@ -64,6 +64,7 @@ TOUCH = 23.0 + 12 * -np.expm1(-np.maximum(np.arange(200) * 0.1 - 5, 0) / 0.3)
         pytest.param(
             level({100: 20.32, 200: 21.28, 300: 21.92}, 20.0, 400), None, [300], id="steps of a converter"
         ),
+        pytest.param(level({100: 20.1, 200: 20.4, 300: 20.6}, 20.0, 400), None, [300], id="of a finer one"),
         *(pytest.param(level({(0, n): 60.0}), 0.6, [], id=f"{n} at the start") for n in (1, 2, 3)),
         *(pytest.param(level({(100 - n, 100): 60.0}), 0.6, [], id=f"{n} at the end") for n in (1, 2, 3)),
     ],

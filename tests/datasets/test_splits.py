@@ -87,6 +87,7 @@ def test_sessions_and_blocks_are_kept_whole(grasps, seed):
         check_apart(grasps, train, test)
         assert {whole[i] for i in train}.isdisjoint(whole[i] for i in test)
         assert set(grasps["material"].values[test]) <= set(grasps["material"].values[train])
+        assert len({whole[i] for i in test}) == len(set(grasps["material"].values[test]))  # a block of each
 
 
 def test_the_same_seed_gives_the_same_splits_and_another_does_not():
