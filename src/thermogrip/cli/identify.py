@@ -501,7 +501,7 @@ def linearise(
     dt: Annotated[
         float | None,
         typer.Option(
-            "--dt", metavar="S", min=1e-9, show_default=False, help="Step of the matrices; continuous without."
+            "--dt", metavar="S", min=1e-9, show_default=False, help="Step of the matrices; none: continuous."
         ),
     ] = None,
     out: Annotated[
