@@ -566,7 +566,7 @@ def _problem(plant: Plant, logs: Sequence[Log], average: float | None) -> Proble
     bin_s = average or plant.scores.average_s or model.average
     logs, _ = match_logs(model, logs)
     problem = make_problem(model, logs, average=bin_s, independent=model.independent)
-    weights = plant.scores.weight_s
+    weights, bin_s = plant.scores.weight_s, problem.average
     tau = [weights.get(name, t * bin_s) / bin_s for name, t in zip(model.outputs, problem.tau)]
     return problem.with_tau(np.maximum(tau, 1.0))
 

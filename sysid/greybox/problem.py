@@ -43,7 +43,7 @@ from scipy.signal import lfilter
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, log_name
 from thermogrip.sysid.models.model import GreyModel
-from thermogrip.sysid.plant.log_grid import Stretch, cut_stretches
+from thermogrip.sysid.plant.log_grid import Stretch, cut_stretches, sample_time
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import Start, find_starts, predict
 
@@ -51,6 +51,8 @@ if TYPE_CHECKING:
     from thermogrip.sysid.models.network_spec import Parameter
 
 Array = NDArray[np.float64]
+
+_WARM_ROWS = 30  # of a log, from whose readings its start is estimated at least
 
 
 def innovations(errors: Array, *, sd: float, time: float, variance: float, bin_s: float) -> Array:
@@ -211,8 +213,10 @@ class Problem:
         return self._warmup(self.logs[at][0])
 
     def _warmup(self, stretches: Sequence[Stretch]) -> float:
-        """Return what the model asks for (more than a free run's), or half of a short log."""
-        return min(self.model.warmup, max(float(stretches[0].time[-1]) / 2, self.plant.dt))
+        """Return what the model asks for (more than a free run's) and thirty rows, or half of a short log."""
+        first = stretches[0].time
+        wanted = max(self.model.warmup, _WARM_ROWS * float(np.median(np.diff(first))))
+        return min(wanted, max(float(first[-1]) / 2, self.plant.dt))
 
     @property
     def _free_specs(self) -> list[Parameter]:
@@ -254,9 +258,10 @@ def prior_plant(model: GreyModel) -> Plant:
 def make_problem(
     model: GreyModel, logs: Sequence[Log], *, average: float, independent: float, dt: float | None = None
 ) -> Problem:
-    """Put logs on the model's grid and into bins."""
+    """Put logs on the model's grid and into bins of ``average`` [s], or of a row where rows are longer."""
     if not logs:
         raise UserError("no log to fit", hint="give at least one")
+    average = max(average, *map(sample_time, logs))
     plant = prior_plant(model)
     if dt is not None:
         plant = replace(plant, dt=dt)

@@ -22,6 +22,8 @@ from thermogrip.sysid.export.dynamics import plant_dynamics
 from thermogrip.sysid.export.linearise import linearise_plant
 from thermogrip.sysid.identification import Row, Searched, SignalRole
 from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.models.network_spec import builtin_networks
+from thermogrip.sysid.plant.log_grid import roles_of
 from thermogrip.sysid.validation.free_run import Score
 from thermogrip.sysid.validation.prediction_bands import Band
 
@@ -70,12 +72,15 @@ def room(bench: Bench, stand_in: StandIn, monkeypatch: pytest.MonkeyPatch) -> Si
         progress(0.5, "b")
         return made.found
 
-    made = SimpleNamespace(bench=bench, misfit=None, found=found_of(), record=None, dynamics=DYNAMICS)
+    made = SimpleNamespace(bench=bench, like="gripper", found=found_of(), record=None, dynamics=DYNAMICS)
     made.asked = stand_in("thermogrip.sysid.export.dynamics.plant_dynamics", lambda *_, **__: made.dynamics)
     made.read = stand_in("thermogrip.datasets.log_files.read_log", log)
     made.networks = stand_in("thermogrip.cli.identify.find_network", load_network)
     made.fits = stand_in(f"{IDENTIFICATION}.identify", fit)
-    made.misfits = stand_in("thermogrip.sysid.plant.log_grid.misfit", lambda *_: made.misfit)
+    made.misfits = stand_in(
+        "thermogrip.sysid.plant.log_grid.misfit",
+        lambda network, _: None if network.name == made.like else UserError("lacks a column"),
+    )
     stand_in("thermogrip.sysid.greybox.identifiability.identifiability_report", ["U is identifiable"])
     made.sections = stand_in("thermogrip.report.plant.identification_sections", ["a section"])
     made.pages = stand_in("thermogrip.report.html.write_report")
@@ -83,30 +88,34 @@ def room(bench: Bench, stand_in: StandIn, monkeypatch: pytest.MonkeyPatch) -> Si
 
 
 @pytest.mark.parametrize(
-    ("words", "misfit", "network"),
+    ("words", "like", "network"),
     [
-        ("", False, "gripper"),
-        ("", True, None),
-        ("--network tclab", True, "tclab"),
-        ("--network none", False, None),
-        ("--models arx,network", False, "gripper"),
-        ("--models arx,oe --network tclab", False, None),
+        ("", "gripper", "gripper"),
+        ("", "thermal_chamber", "thermal_chamber"),
+        ("", "none of them", None),
+        ("--network tclab", "none of them", "tclab"),
+        ("--network none", "gripper", None),
+        ("--models arx,network", "room", "room"),
+        ("--models arx,oe --network tclab", "tclab", None),
+        ("--models arx,oe", "gripper", None),
     ],
 )
-def test_the_network_is_the_one_asked_for_or_the_gripper_where_the_logs_fit_it(
-    words: str, misfit: bool, network: str | None, room: SimpleNamespace
+def test_the_network_is_the_one_asked_for_or_a_shipped_one_whose_columns_the_logs_have(
+    words: str, like: str, network: str | None, room: SimpleNamespace
 ) -> None:
-    room.misfit = UserError("lacks a column") if misfit else None
+    room.like = like
     done = room.bench.run("identify", "good.csv", *words.split(), "--out", "p.json")
     assert done.code == 0, done
     [fit] = room.fits
     assert (fit.args[1] if fit.args[1] is None else fit.args[1].name) == network
-    known = room.read[0].known
-    assert (known is None) == (not room.networks)
-    assert all(call.args[0].name == "gripper" for call in room.misfits)
+    # read by its names and units first, then again in the network's roles
+    roles = None if network is None else roles_of(load_network(network))
+    chosen = network is not None and "--network" not in words
+    assert [call.known for call in room.read] == [None] * chosen + [roles]
+    tried = [] if "--network" in words or words == "--models arx,oe" else builtin_networks()
+    tried = tried[: tried.index(like) + 1] if like in tried else tried
+    assert [call.args[0].name for call in room.misfits] == [*tried]
     assert not fit.leave_one_out
-    again = network is None and bool(room.networks)  # read once more, without the network's roles
-    assert [call.known for call in room.read[1:]] == [None] * again
 
 
 def test_words_reach_the_fit_by_their_meaning(room: SimpleNamespace) -> None:

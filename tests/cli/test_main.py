@@ -98,7 +98,7 @@ compare: GRASPS --out --test --classifiers --repeats=20>0 --train-per-class=5>1 
   --quick=False --seed=0>0 --workers=1>1 --cluster --json=False
 paper: --out --quick=False --seed=0>0 --workers=1>1 --cluster --json=False
 materials: NAME --json=False
-init: WHAT --out --json=False
+init: WHAT --like --out --json=False
 """
 
 

@@ -11,6 +11,8 @@ import pytest
 
 from tests.cli.conftest import Bench, StandIn, shares
 from thermogrip.report.html import Section
+from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.models.network_spec import builtin_networks
 
 
 def test_the_demo_prints_its_verdicts_and_where_its_report_is(bench: Bench, stand_in: StandIn) -> None:
@@ -89,6 +91,25 @@ def test_a_template_is_printed_or_written_once(what: str, key: str, bench: Bench
         2, [f"thermogrip: {path}: exists already; remove it or choose another name"],
     )  # fmt: skip
     assert bench.run("init", what, "--out", bench.path / "x.txt").code == 2
+
+
+@pytest.mark.parametrize("name", builtin_networks())
+def test_a_network_starts_from_a_shipped_one(name: str, bench: Bench) -> None:
+    done = bench.run("init", "network", "--like", name, "--out", "mine.toml")
+    assert (done.code, done.out) == (0, "wrote mine.toml\n")
+    assert load_network("mine.toml").name == name
+    assert (bench.path / "mine.toml").read_text().startswith("# ")  # it says what it is
+    assert name in " ".join(bench.run("init", "--help").out.split())
+
+
+def test_what_is_like_no_network_is_refused(bench: Bench) -> None:
+    for words, says in (
+        ("network --like oven", "--like 'oven' is unknown; use furnace"),
+        ("spec --like tank", "not of spec"),
+    ):
+        done = bench.run("init", *words.split())
+        assert (done.code, len(done.said)) == (2, 1)
+        assert says in done.said[0]
 
 
 def test_the_examples_come_out_ready_to_use(bench: Bench) -> None:

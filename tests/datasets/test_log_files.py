@@ -153,10 +153,14 @@ def test_the_unfinished_last_line_of_a_killed_logger_is_dropped(write):
     [
         (HEAD + "0,0.5,25\n1,0.5,warm\n2,0,25\n", ["row 3", "column t_tank_degC", "'warm' is not a number"]),
         ("# note\n" + HEAD + "0,x,25\n1,0,25\n", ["row 3", "column drive", "'x'"]),
-        (HEAD + "0,x,25\n1,0\n2,0,hot\n3,0,25\n",
-         ["3 faults: row 3: has 2 cell(s)", "row 2, column drive: 'x'", "'hot'"]),
-        (HEAD + "0,0.5,25\n1,0.5,warm\n2,0,25\n",
-         ["or leave columns out: thermogrip identify /", "log.csv --columns time_s,drive,-"]),
+        (
+            HEAD + "0,x,25\n1,0\n2,0,hot\n3,0,25\n",
+            ["3 faults: row 3: has 2 cell(s)", "row 2, column drive: 'x'", "'hot'"],
+        ),
+        (
+            HEAD + "0,0.5,25\n1,0.5,warm\n2,0,25\n",
+            ["or leave columns out: thermogrip identify /", "log.csv --columns time_s,drive,-"],
+        ),
         (HEAD.replace(",", ";") + "0;0,5;25\n1;0.5;25\n", ["row 2", "column drive", "write a decimal point"]),
         (HEAD + "0,0.5,25\n", ["1 row(s) are not a log"]),
         ("", ["is empty", "header"]),

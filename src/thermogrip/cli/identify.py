@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 MODELS = ("arx", "oe", "subspace", "sindy", "neural", "network")
 ALL_MODELS = ",".join(MODELS)
-DEFAULT_NETWORK = "gripper"  # of logs that have its columns
+DEFAULT_NETWORK = "gripper"  # of --grow
 NO_POSTERIOR = "no posterior: the model that was kept is a black box, only networks have parameters to sample"
 
 
@@ -84,8 +84,8 @@ NetworkOption = Annotated[
         "--network",
         metavar="NAME|FILE",
         callback=existing_network,
-        help="gripper, tclab, peltier_chamber, none, FILE.toml, FILE.py:CLASS (which runs the file); "
-        "where absent, gripper if the logs have its columns.",
+        help="A shipped one (init network --like), none, FILE.toml, FILE.py:CLASS (which runs the file); "
+        "where absent, the shipped one whose columns the logs have.",
     ),
 ]
 InputsOption = Annotated[str | None, typer.Option("--inputs", metavar="A,B", help="Columns that are moved.")]
@@ -154,24 +154,25 @@ def identify(
 
         out = Path(f"{file_stem(split_cut(logs[0])[0])}_plant.json")
     new_file(out, (".json",))
-    sought = None if network == "none" or "network" not in wanted else network or DEFAULT_NETWORK
-    wanted_network = None if sought is None else find_network(sought)
+    if network == "none" or "network" not in wanted:
+        wanted_network = None
+    else:
+        wanted_network = find_network(network or DEFAULT_NETWORK) if network or grow else None
     to_grow = _growable(wanted_network) if grow else None
     console = Console(as_json)
     roles = comma(inputs), comma(outputs), comma(disturbances)
     from thermogrip.datasets.units import find_column
-    from thermogrip.sysid.plant.log_grid import misfit, roles_of
+    from thermogrip.sysid.plant.log_grid import roles_of
 
-    # what a network calls its own has the role that it has there
     table: dict[str, Any] = {"columns": comma(columns), "dt": dt}
-    of_network = None if wanted_network is None else roles_of(wanted_network)
-    records = load_logs(logs, *roles, known=of_network, **table)
-    if (
-        wanted_network is not None
-        and not (network or grow)
-        and any(misfit(wanted_network, log) is not None for log in records)
-    ):
-        wanted_network, records = None, load_logs(logs, *roles, **table)
+    records = None
+    if network is None and not grow and "network" in wanted:
+        records = load_logs(logs, *roles, **table)
+        wanted_network = _shipped_network(records)
+    if wanted_network is not None:  # what a network calls its own has the role that it has there
+        records = load_logs(logs, *roles, known=roles_of(wanted_network), **table)
+    elif records is None:
+        records = load_logs(logs, *roles, **table)
     _warn_of_repairs(console, records)
     have = dict.fromkeys(map(str, records[0].data_vars), "")  # what a word means may be written otherwise
     known = [None if words is None else tuple(find_column(w, have) for w in words) for words in roles]
@@ -253,6 +254,18 @@ def _warn_of_repairs(console: Console, logs: Sequence[Log]) -> None:
     for log in logs:
         for line in repairs_of([log])[log_name(log)]:
             console.warn(f"{log_name(log)}: {line}")
+
+
+def _shipped_network(logs: Sequence[Log]) -> GreyModel | None:
+    """Return the network of the package whose signals all logs have, if there is one."""
+    from thermogrip.sysid.models.network_spec import builtin_networks
+    from thermogrip.sysid.plant.log_grid import misfit
+
+    for name in builtin_networks():
+        network = find_network(name)
+        if all(misfit(network, log) is None for log in logs):
+            return network
+    return None
 
 
 def _growable(network: GreyModel | None) -> NetworkModel:

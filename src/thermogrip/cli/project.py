@@ -95,6 +95,16 @@ def init(
             metavar="spec|network|topics|guard|examples", show_default=False, help="What to start from."
         ),
     ],
+    like: Annotated[
+        str | None,
+        typer.Option(
+            "--like",
+            metavar="NAME",
+            show_default=False,
+            help="Of a network: start from gripper, tclab, peltier_chamber, room, hotend, furnace, tank "
+            "or thermal_chamber.",
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -112,9 +122,11 @@ def init(
     examples: logs and grasps of a simulated rig, to try every verb on."""
     choice("template", what, ("spec", "network", "topics", "guard", "examples"))
     console = Console(as_json)
+    if like is not None and what != "network":
+        raise UserError(f"--like {like} is of a network, not of {what}", hint="write init network --like")
     if what == "examples":
         return _examples(console, out or Path())
-    text = _template(what)
+    text = _template(what) if like is None else _like(like)
     if out is None:
         console.say(text.rstrip("\n"))
     else:
@@ -139,6 +151,16 @@ def _examples(console: Console, folder: Path) -> int:
     console.say(f"simulated, not measured; described in {folder / 'EXAMPLES.md'}")
     console.answer({"template": "examples", "files": paths, "out": folder})
     return 0
+
+
+def _like(name: str) -> str:
+    """Return the text of a shipped network."""
+    from thermogrip.sysid.models.network_spec import builtin_networks
+
+    choice("--like", name, builtin_networks())
+    return (
+        resources.files("thermogrip.sysid").joinpath("networks", f"{name}.toml").read_text(encoding="utf-8")
+    )
 
 
 def _template(what: str) -> str:
