@@ -27,7 +27,7 @@ from thermogrip.datasets.schema import Log, column, log_name
 from thermogrip.sysid.data.data_quality import reading_excess
 from thermogrip.sysid.greybox.identifiability import describe
 from thermogrip.sysid.greybox.levenberg_marquardt import Solution, levenberg_marquardt
-from thermogrip.sysid.greybox.problem import Problem, make_problem
+from thermogrip.sysid.greybox.problem import Problem, make_problem, start_seconds
 from thermogrip.sysid.greybox.sandwich import ScoreCovariance, score_covariance
 from thermogrip.sysid.models.model import GreyModel
 from thermogrip.sysid.models.network import load_network

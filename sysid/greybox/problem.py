@@ -140,7 +140,8 @@ class Problem:
         if self._starts.z is None or not np.array_equal(z, self._starts.z):
             p = self.parameters(z[None])[0]
             self._starts.last = [
-                find_starts(self.plant, p, stretches, self._warmup(stretches)) for stretches, _ in self.logs
+                find_starts(self.plant, p, stretches, start_seconds(self.model, stretches, self.plant.dt))
+                for stretches, _ in self.logs
             ]
             self._starts.z = z.copy()
         return self._starts.last
@@ -210,13 +211,7 @@ class Problem:
 
     def warm_up(self, at: int) -> float:
         """Return the seconds at the beginning of a log from which its start is estimated."""
-        return self._warmup(self.logs[at][0])
-
-    def _warmup(self, stretches: Sequence[Stretch]) -> float:
-        """Return what the model asks for (more than a free run's) and thirty rows, or half of a short log."""
-        first = stretches[0].time
-        wanted = max(self.model.warmup, _WARM_ROWS * float(np.median(np.diff(first))))
-        return min(wanted, max(float(first[-1]) / 2, self.plant.dt))
+        return start_seconds(self.model, self.logs[at][0], self.plant.dt)
 
     @property
     def _free_specs(self) -> list[Parameter]:
@@ -286,6 +281,14 @@ def make_problem(
         tau,
         tuple(model.drift.get(name) for name in model.outputs),
     )
+
+
+def start_seconds(model: GreyModel, stretches: Sequence[Stretch], dt: float) -> float:
+    """Return the seconds from which a log's start is estimated: what the model asks for (more than a free
+    run's) and thirty rows, or half of a short log."""
+    first = stretches[0].time
+    wanted = max(model.warmup, _WARM_ROWS * float(np.median(np.diff(first))))
+    return min(wanted, max(float(first[-1]) / 2, dt))
 
 
 def _bins(stretch: Stretch, dt: float, steps: int) -> _Bins:
