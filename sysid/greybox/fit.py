@@ -334,6 +334,6 @@ def free_runs(model: GreyModel, logs: Sequence[Log], p: Array) -> list[tuple[str
     out: list[tuple[str, Array]] = []
     for log in logs:
         stretches = cut_stretches(plant, log)
-        starts = find_starts(plant, p, stretches, model.warmup)
+        starts = find_starts(plant, p, stretches, start_seconds(model, stretches, model.dt))
         out += [(log_name(log), run) for run in predict(model, model.dt, p[None], stretches, starts)]
     return out
