@@ -30,12 +30,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import as_logs
+from thermogrip.datasets.parallel import Workers, run_parallel
 from thermogrip.datasets.schema import Log, column, log_name, names
 from thermogrip.sysid.blackbox.fit import (
     BLACK_BOXES,
@@ -358,6 +359,7 @@ def identify(
     posterior: bool = False,
     draws: int = 24,
     seed: int = 0,
+    workers: Workers = 1,
     progress: Progress | None = None,
 ) -> Identification:
     """Find the plant behind one or several logs.
@@ -385,6 +387,9 @@ def identify(
         Without the posterior: so many plants that agree with the logs stand in for it; of a black box, refits
         to resampled logs.
     seed : int, optional
+    workers : int or str, optional
+        Local processes, or the address of a Dask scheduler, for the kinds of black boxes. The result is the
+        same.
     progress : callable, optional
         Called with (fraction done, what).
 
@@ -429,25 +434,24 @@ def identify(
     boxes = [] if leave_one_out else [model for model in candidates if model != "network"]
     parts = _Parts(progress, len(boxes) + len(cases) * (len(candidates) if leave_one_out else 2) + 2)
 
+    settings: dict[str, Any] = {
+        "inputs": u,
+        "outputs": y,
+        "disturbances": d,
+        "average": average,
+        "order": order,
+        "delay": delay,
+    }
+
     def fit(model: str, some: Sequence[Log], report: Progress | None) -> Plant | BlackBoxFit:
         if model != "network":
-            return fit_black_box(
-                model,
-                some,
-                inputs=u,
-                outputs=y,
-                disturbances=d,
-                average=average,
-                order=order,
-                delay=delay,
-                progress=report,
-            )
+            return fit_black_box(model, some, **settings, progress=report)
         from thermogrip.sysid.greybox.fit import fit_network  # pulls in llvmlite and nlopt at the first fit
 
         assert network is not None
         return fit_network(network, some, seed=seed, progress=report)
 
-    fits, rows, refused = _fit_all(fit, boxes, records, parts)
+    fits, rows, refused = _fit_all(boxes, records, settings, parts, workers)
     best = None
     if fits:
         least = min(fits, key=lambda fit: fit.choice.error)
@@ -584,25 +588,34 @@ def _for_network(
 
 
 def _fit_all(
-    fit: Callable[[str, Sequence[Log], Progress | None], Plant | BlackBoxFit],
-    boxes: Sequence[str],
-    logs: Sequence[Log],
-    parts: _Parts,
+    boxes: Sequence[str], logs: Sequence[Log], settings: dict[str, Any], parts: _Parts, workers: Workers
 ) -> tuple[list[BlackBoxFit], list[Row], list[str]]:
     """Return each black box fitted to all logs, the rows of its folds, and why others could not be fitted."""
-    fits: list[BlackBoxFit] = []
-    rows: list[Row] = []
-    refused: list[str] = []
-    for model in boxes:
-        try:
-            fitted = fit(model, logs, parts.part(model))
-            assert isinstance(fitted, BlackBoxFit)
-            fits.append(fitted)
-            rows += fold_rows(fitted)
-        except UserError as error:
-            refused.append(f"{model}: {error}")
-        parts.next()
-    return fits, rows, refused
+    if workers == 1:
+        found = []
+        for kind in boxes:
+            found.append(_fit_or_refusal((kind, logs, settings | {"progress": parts.part(kind)})))
+            parts.next()
+    else:
+        report = parts.part("black boxes", of=len(boxes))
+        # the neural one takes longest, so it begins first
+        order = sorted(boxes, key=lambda kind: kind != "neural")
+        items = [(kind, logs, settings) for kind in order]
+        done = dict(zip(order, run_parallel(_fit_or_refusal, items, workers, report, what="fitting")))
+        found = [done[kind] for kind in boxes]
+        parts.next(len(boxes))
+    fits = [each for each in found if isinstance(each, BlackBoxFit)]
+    rows = [row for each in fits for row in fold_rows(each)]
+    return fits, rows, [each for each in found if isinstance(each, str)]
+
+
+def _fit_or_refusal(item: tuple[str, Sequence[Log], dict[str, Any]]) -> BlackBoxFit | str:
+    """Return a kind of black box fitted to all logs, or why it could not be."""
+    kind, logs, settings = item
+    try:
+        return fit_black_box(kind, logs, **settings)
+    except UserError as error:
+        return f"{kind}: {error}"
 
 
 def _compare(
@@ -719,14 +732,14 @@ class _Parts:
     def __init__(self, progress: Progress | None, parts: int) -> None:
         self._progress, self._parts, self._done = progress, parts, 0
 
-    def part(self, what: str) -> Progress | None:
+    def part(self, what: str, of: int = 1) -> Progress | None:
         if self._progress is None:
             return None
         whole, begin, parts = self._progress, self._done, self._parts
-        return lambda done, detail: whole((begin + done) / parts, f"{what}: {detail}")
+        return lambda done, detail: whole((begin + of * done) / parts, f"{what}: {detail}")
 
-    def next(self) -> None:
-        self._done += 1
+    def next(self, parts: int = 1) -> None:
+        self._done += parts
 
 
 def _candidates(models: Sequence[str], network: GreyModel | None) -> list[str]:

@@ -121,7 +121,7 @@ def test_the_network_is_the_one_asked_for_or_a_shipped_one_whose_columns_the_log
 def test_words_reach_the_fit_by_their_meaning(room: SimpleNamespace) -> None:
     words = "good.csv more.csv --network tclab --inputs q1,q2 --outputs T1_degC --disturbances room"
     words += " --models arx,network --average 2.5 --order 2 --delay 3 --leave-one-out"
-    words += " --seed 7 --report r.html"
+    words += " --seed 7 --report r.html --workers 3"
     done = room.bench.run("identify", *words.split(), "--out", "p.json")
     assert done.code == 0, done
     words, roles = (("q1", "q2"), ("T1_degC",), ("room",)), (("q1", "q2"), ("t1",), ("room",))
@@ -131,7 +131,7 @@ def test_words_reach_the_fit_by_their_meaning(room: SimpleNamespace) -> None:
     assert (len(fit.args[0]), fit.args[2:]) == (2, roles)
     assert (fit.models, fit.average, fit.leave_one_out) == (("arx", "network"), 2.5, True)
     assert (fit.order, fit.delay) == (2, 3)
-    assert (fit.draws, fit.seed) == (24, 7)
+    assert (fit.draws, fit.seed, fit.workers) == (24, 7, 3)
     [page] = room.pages
     assert page.args == (Path("r.html"), "Identification", "From log a, log a.", ["a section"])
     [asked] = room.sections

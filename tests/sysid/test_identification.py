@@ -312,6 +312,40 @@ def with_still(role="input", **more):
     return log
 
 
+def test_kinds_fitted_side_by_side_give_the_same_plant(monkeypatch):
+    log, asked, seen = plant_log(400), [], []
+
+    def in_turn(function, items, workers, progress, *, what):
+        asked.append((workers, [kind for kind, _, _ in items]))
+        progress(0.5, what)
+        return [function(item) for item in items]
+
+    monkeypatch.setattr(identification, "run_parallel", in_turn)
+    how = {"models": ["arx", "oe"], "average": 4.0, "draws": 0, "delay": 1}
+    alone = identify(log, **how)
+    assert asked == []
+    both = identify(log, **how, workers=2, progress=lambda share, what: seen.append((round(share, 3), what)))
+    assert asked == [(2, ["arx", "oe"])]
+    assert (both.rows, both.notes, both.searched) == (alone.rows, alone.notes, alone.searched)
+    assert (0.167, "black boxes: fitting") in seen  # half of two of six parts
+
+
+def test_the_kind_that_takes_longest_is_begun_first_and_reported_in_its_place(monkeypatch):
+    asked = []
+
+    def refused(_function, items, workers, _progress, *, what):
+        asked.append((workers, [kind for kind, _, _ in items]))
+        return [f"{kind}: {what}" for kind, _, _ in items]
+
+    monkeypatch.setattr(identification, "run_parallel", refused)
+    parts = identification._Parts(None, 5)
+    kinds = ["arx", "neural", "oe"]
+    found = identification._fit_all(kinds, [], {}, parts, "tcp://a:1")
+    assert found == ([], [], [f"{kind}: fitting" for kind in kinds])
+    assert asked == [("tcp://a:1", ["neural", "arx", "oe"])]
+    assert parts._done == 3
+
+
 def test_a_guessed_column_that_never_moves_is_left_out_and_reported():
     log = with_still(fan=0.4, valve=7.0)
     log.attrs["guesses"] = "fan: its name is that of a drive\nvalve: its unit is V"

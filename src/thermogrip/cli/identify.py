@@ -18,6 +18,7 @@ from thermogrip.cli.options import (
     Report,
     Seed,
     Step,
+    Workers,
     choice,
     comma,
     existing_logs,
@@ -141,6 +142,7 @@ def identify(
     posterior: PosteriorOption = False,
     report: Report = None,
     seed: Seed = 0,
+    workers: Workers = 1,
     as_json: AsJson = False,
 ) -> int:
     """Find the plant behind one or several logs.
@@ -199,6 +201,7 @@ def identify(
             leave_one_out=leave_one_out,
             draws=0 if posterior else 24,
             seed=seed,
+            workers=workers,
             progress=sub_progress(progress, 0.4 if grow else 0.0, 0.6 if posterior else 1.0),
         )
         plant = found.plant
