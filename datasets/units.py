@@ -79,6 +79,7 @@ _INPUT = re.compile(
 _OUTPUT = re.compile(
     r"^(t|y|temp|temperature|level|outlet|position|speed|pv|angle|velocity|response|measured)(\d*|_.*)$"
 )
+_INFLOW = re.compile(r"(^|_)(inlet|inflow|supply_air)(_|$)")
 _BOOKKEEPING = re.compile(
     r"^(error|err|control_error|integral|derivative|[pid]_?(term|part|action)|k_?[pidc]|pid_[pid]"
     r"|hour|day|month|year|week|weekday|row|index|id|iteration|sample|record|counter)(_of_[a-z]+|_?no|_?\d+)?$"
@@ -221,6 +222,8 @@ def explain_role(name: str, unit: str) -> tuple[str, str]:
         return "other", "its name is that of a number of the clock's or the controller's"
     if _AMBIENT.search(lower):
         return "disturbance", "its name is that of the surroundings"
+    if _INFLOW.search(lower) and (unit == "degC" or "temp" in lower):
+        return "disturbance", "its name is that of what flows in"
     if _INPUT.match(lower) and unit not in ("degC", "s"):
         return "input", "its name is that of a drive"
     if _OUTPUT.match(lower) and unit != "s":
