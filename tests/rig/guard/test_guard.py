@@ -131,10 +131,12 @@ def test_of_two_heaters_each_may_differ_by_the_slack_and_only_both_off_is_the_de
     assert trip is None or trip.figures == {"applied": applied[trip.subject == "q2"]}
 
 
-def test_a_driver_that_obeys_in_between_is_not_off_twice() -> None:
-    guard = guard_at()
+@pytest.mark.parametrize("unit", ["1", "V"])
+def test_a_driver_that_obeys_in_between_is_not_off_twice(unit: str) -> None:
+    guard = Guard()
+    guard.start(reading(0.0, 25.0), 0.0, {"drive": unit})
     guard.asked({"drive": 0.5}, 1)
-    drives = (0.0, 0.5, 0.0, 0.45, 0.44, 0.44)  # 0.05 is the slack of a drive of -1 to 1
+    drives = (0.0, 0.5, 0.0, 0.45, 0.44, 0.44)  # 0.05 is the slack of a drive of -1 to 1, or of another unit
     kinds = [kind(check(guard, reading(float(k), 25.0, drive=d))) for k, d in enumerate(drives, start=1)]
     assert kinds == ["", "", "", "", "", "driver"]
     assert kind(check(guard, Reading(7.0, {"t_surface": 25.0}, {}, 1))) == ""  # a rig that does not report it

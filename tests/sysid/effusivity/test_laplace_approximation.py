@@ -239,6 +239,17 @@ def test_an_uncertain_gripper_without_spread_changes_nothing(exact, touched):
     np.testing.assert_allclose(unsure.t_object_sd[near], sure.t_object_sd[near], rtol=0.01)
 
 
+@pytest.mark.parametrize("uncertain", [False, True])
+def test_degrees_of_freedom_of_a_number_that_has_no_spread_are_none(exact, touched, uncertain):
+    gripper = another_gripper(exact, NOTHING) if uncertain else exact
+    data, row, rows = touches(touched), np.array([1]), material_hypotheses(exact, ["copper"])
+    mean, sd, dof = prior_of(gripper, data.take(row), rows)
+    sd[:, ONSET], many, few = 0.0, dof.copy(), dof.copy()
+    many[:, ONSET], few[:, ONSET] = np.inf, 3.0
+    one, same = (fit_pairs(gripper, data, row, rows, prior=Prior(mean, sd, nu)) for nu in (many, few))
+    assert one.log_evidence[0] == pytest.approx(same.log_evidence[0], abs=1e-9)
+
+
 @pytest.mark.parametrize("name", ["lag", "sheet_thickness", "contact", "bias", "build_up"])
 def test_evidence_is_the_integral_over_the_grippers(exact, touched, name):
     """Beside sums over exact grippers on a fine grid of the one number that is uncertain."""

@@ -184,6 +184,9 @@ def test_what_cannot_be_tested_is_left_alone():
     assert free_run(plant, own).residual.start.keys() <= {"t"}  # its own simulation: nothing is left
     short = log_of(q, heated(q, plant) + 0.1).isel(time=slice(0, 15))
     assert residual_correlations(plant, short, plant.simulate(short)).tests == {}
+    slow_rows = log_of(q, heated(q, plant) + 0.1 * q).isel(time=slice(0, 160, 4))  # 40, slower than the plant
+    found = residual_correlations(plant, slow_rows, plant.simulate(slow_rows)).tests["t"]
+    assert found.keys() == {"q", "t squared"}
     wild = heater(1.5)  # it diverges
     assert free_run(wild, own).residual.tests == {}
 
