@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from statistics import NormalDist
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -172,18 +174,6 @@ def test_one_part_alone_has_no_expected_coverage():
     assert np.allclose(shares["r"], 0.9)  # parts that err alike predict each other
 
 
-def test_a_black_box_has_the_error_of_its_fit_alone(schedule):
-    block = StateSpaceModel(
-        ("q1", "q2"), (), ("t1", "t2"), A=0.9 * np.eye(2), B=0.01 * np.eye(2), C=np.eye(2), dt=2.0
-    )
-    plant = Plant(block, {}, dt=2.0, noise={"t1": 1.0, "t2": 2.0})
-    band = free_run_band(plant, schedule, plant.simulate(schedule))
-    assert band.draws == 0
-    assert np.allclose(band.half["t2"], 2 * 1.6449, rtol=1e-3)
-    with pytest.raises(ValueError, match="between 0 and 1"):
-        free_run_band(plant, schedule, plant.simulate(schedule), level=90)
-
-
 def test_what_noise_adds_to_a_mean_is_found_from_the_logs_whatever_moves_slowly():
     rng, t = np.random.default_rng(1), np.arange(0.0, 4000.0, 0.5)
     slow = 30 + 5 * np.sin(t / 60)
@@ -316,3 +306,69 @@ def test_no_held_out_figure_comes_of_members_that_disagree():
         run_held_out(pair(5.0), held, unseen=True)
     assert run_held_out(pair(0.1), held, unseen=True).scores
     assert len(run_held_out(pair(5.0), held).scores) == 1
+
+
+def still(**scores):
+    """A plant at rest whose error is 0.4 K, a log of 12 readings and its run."""
+    block = StateSpaceModel(("q",), (), ("t",), A=[[0.9]], B=[[0.1]], C=[[1.0]], dt=1.0)
+    signals = {"q": (np.zeros(12), "1", "input"), "t": (np.zeros(12), "degC", "output")}
+    plant = Plant(block, {}, dt=1.0, noise={"t": 0.4}, scores=PlantScores(**scores))
+    log = make_log(np.arange(12.0), signals)
+    return plant, log, plant.simulate(log)
+
+
+def test_a_band_counts_scored_readings_and_adds_draws_the_fit_and_single_readings(monkeypatch):
+    plant, log, run = still(reading_excess={"t": 0.3})
+    log["t"].values[:] = [9, 9, 9, 9, 9, 0.82, -0.83, 0.82, np.nan, -0.82, 0.83, 0.0]  # 1.6449 * 0.5 = 0.822
+    band = free_run_band(plant, log, run)
+    assert (band.level, band.draws, band.own_error) == (0.9, 0, "the error of the fit")
+    np.testing.assert_allclose(band.half["t"], 1.644854 * 0.5, rtol=1e-6)
+    assert band.inside["t"] == 4 / 6
+    assert np.isnan(free_run_band(plant, log, run.assign(scored=0 * run["scored"])).inside["t"])
+    with pytest.raises(ValueError, match="between 0 and 1, got 90"):
+        free_run_band(plant, log, run, level=90)
+    seeds = []
+
+    def draw(_plant, k):
+        seeds.append(k)
+        return SimpleNamespace(simulate=lambda _log: run.assign(t=run["t"] + k))
+
+    monkeypatch.setattr(Plant, "draw", draw)
+    drawn = free_run_band(replace(plant, refits=(plant.model,)), log, run, draws=3)
+    np.testing.assert_allclose(drawn.half["t"], 1.644854 * np.sqrt((1 + 4 + 9) / 3 + 0.25), rtol=1e-6)
+    assert drawn.draws == 3
+    assert free_run_band(replace(plant, refits=(plant.model,)), log, run).draws == 30
+    assert seeds == [1, 2, 3, *range(1, 31)]
+
+
+@pytest.mark.parametrize(
+    ("tails", "parts", "squared"),
+    [([], [], 4.0), ([3.0, 1.0], [], 5.0), ([1.0], [], 4.0), ([], [1.0], 4.0),
+     # Student's t at 95 % of 2 and 4 degrees of freedom over 1.6449
+     ([], [1.0] * 2, 4 * (2.919986 / 1.644854) ** 2), ([], [1.0] * 4, 4 * (2.131847 / 1.644854) ** 2)],
+)  # fmt: skip
+def test_the_own_error_of_a_black_box_is_the_larger_one_of_folds_and_last_parts(tails, parts, squared):
+    others = [HeldOut("a", "t", 9.0, 0.0, "K", 9), HeldOut("last 30 % of a", "r", 9.0, 0.0, "K", 9)]
+    held = [HeldOut("last 30 % of a", "t", error, 0.0, "K", 9) for error in tails]
+    plant, log, run = still(
+        held_out_rmse={"t": 2.0}, held_out=[*others, *held], held_out_by_part={"t": parts}
+    )
+    np.testing.assert_allclose(
+        free_run_band(plant, log, run).half["t"] ** 2, 1.644854**2 * squared, rtol=1e-5
+    )
+
+
+@pytest.mark.parametrize(("worst", "says"), [(1.27, ""), (1.29, "80"), (3.0, "42")])
+def test_the_words_of_a_band_name_a_part_on_which_it_covers_a_tenth_less(worst, says):
+    # 2 Phi(1.6449 / 1.2835) - 1 = 0.8; against 3.0: 2 Phi(0.5483) - 1 = 0.416
+    plant, log, run = still(held_out_rmse={"t": 1.0}, held_out_by_part={"t": [worst, 1.0, 1.0]})
+    words = "the errors of free runs over parts held out of it"
+    more = ", which differ: too narrow where errors are as on the worst part, of which a band of the others "
+    assert free_run_band(plant, log, run).own_error == words + (
+        f"{more}should cover {says} %" if says else ""
+    )
+    assert expected_coverage(plant)["t"][0] == pytest.approx(2 * NormalDist().cdf(1.644854 / worst) - 1)
+    again = " and a gain that varies by 7 % from run to run (assumed: {} cannot show it)"
+    for logs, how in ((("a",), "one log"), (("a", "b"), "two logs"), (("a", "b", "c"), None), ((), None)):
+        band = free_run_band(replace(still()[0], logs=logs), log, run)
+        assert band.own_error == "the error of the fit" + (again.format(how) if how else "")
