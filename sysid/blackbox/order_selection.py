@@ -147,8 +147,6 @@ def free_run_errors(
         return refused
     total, count = np.zeros((len(priors), len(scale))), np.zeros(len(scale))
     for segment in segments:
-        if len(segment.time) <= warmup:
-            continue
         head = (segment.y[:warmup], segment.u[:warmup], segment.d[:warmup])
         x0, offset = estimate_starts(model, *head, dt=dt, scale=scale, priors=priors)
         seen, _ = model.rollout(x0, segment.u[None], segment.d[None], (), dt)

@@ -17,11 +17,10 @@ from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid import Plant, identification, identify
 from thermogrip.sysid.blackbox.fit import fit_black_box
-from thermogrip.sysid.blackbox.order_selection import Structure, _one_standard_error, folds, held_out_runs
+from thermogrip.sysid.blackbox.order_selection import Structure, folds, held_out_runs
 from thermogrip.sysid.identification import SHOWN, choose_black_box, stated_error, warm_up_of_fit
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import fit_logs
-from thermogrip.sysid.plant.log_grid import make_grid
 from thermogrip.sysid.validation.free_run import free_run
 from thermogrip.sysid.validation.prediction_bands import between_runs
 
@@ -190,14 +189,6 @@ def test_progress_goes_from_zero_to_one():
     assert all("arx" in what for _, what in calls)
 
 
-def test_four_blocks_hold_out_every_row_once():
-    grid = make_grid([plant_log(1000)], average=1.0)
-    held = [segment for _, _, out in folds(grid) for segment in out]
-    np.testing.assert_array_equal(np.concatenate([s.time for s in held]), grid.segments[0].time)
-    for _, train, out in folds(grid):
-        assert not set(np.concatenate([s.time for s in train.segments])) & set(out[0].time)
-
-
 def test_a_record_of_ninety_slow_rows_is_fitted():
     # a heated room logged each half hour: 90 rows were refused as too short to hold a part out
     rng, t = np.random.default_rng(3), 1800.0 * np.arange(90)
@@ -209,17 +200,6 @@ def test_a_record_of_ninety_slow_rows_is_fitted():
     assert {row.n for row in found.rows if row.log == "block 1 of 4"} == {22 - 5 + 11 - 5}
     with pytest.raises(UserError, match="79 rows of 1800 s are too short to hold a part out"):
         identify(log.isel(time=slice(79)), models=["oe"], draws=0)
-
-
-def test_the_smallest_structure_within_one_standard_error_wins():
-    small, middle, large = Structure("small", 1), Structure("middle", 2), Structure("large", 9)
-    errors = {
-        small: np.array([2.0, 2.0, 2.0, 2.0]),
-        middle: np.array([1.00, 1.03, 1.00, 1.01]),
-        large: np.array([1.01, 1.00, 0.99, 1.01]),
-    }
-    assert _one_standard_error(errors) == middle
-    assert _one_standard_error(errors | {middle: np.array([1.0, np.inf, 1.0, 1.0])}) == large
 
 
 @pytest.mark.parametrize(
@@ -256,17 +236,6 @@ def test_a_tclab_log_is_predicted_as_well_as_by_the_best_subspace_tools():
     # PO-MOESP of nfoursid reaches 0.740 and N4SID of SIPPY 0.786 on the same halves
     assert np.mean([s.rmse for s in run.scores.values()]) < 0.74
     assert all(s.n == 2500 for s in run.scores.values())
-
-
-def test_a_log_that_alone_moves_an_input_does_not_score_fits_to_the_others():
-    logs = [plant_log(300, seed=s, name=name) for s, name in enumerate("abc")]
-    still, moved = np.ones(300), np.repeat([1.0, 0.0, 1.0], 100)
-    for log, pump in zip(logs, (still, still, moved)):
-        log["pump"] = ("time", pump, {"units": "1", "role": "input"})
-    grid = make_grid(logs, average=1.0)
-    assert [name for name, _, _ in folds(grid)] == ["a", "b"]
-    logs[0]["pump"].values[50:90] = 0.0
-    assert [name for name, _, _ in folds(make_grid(logs, average=1.0))] == ["a", "b", "c"]
 
 
 def test_an_output_that_never_moves_is_refused_by_name():

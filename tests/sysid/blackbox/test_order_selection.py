@@ -1,0 +1,273 @@
+"""The parts of the choice by held-out free run, by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.sysid.blackbox import order_selection as selection
+from thermogrip.sysid.blackbox.order_selection import Choice, Structure
+from thermogrip.sysid.models.lti import StartPrior
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.log_grid import Grid, Segment
+
+SMALL, MIDDLE, LARGE = Structure("small", 2), Structure("middle", 3), Structure("large", 5)
+
+
+def segment(y, u=None, d=None, log="a"):
+    y = np.asarray(y, dtype=float)
+    u, d = (np.zeros((len(y), 0)) if some is None else np.asarray(some, dtype=float) for some in (u, d))
+    return Segment(np.arange(float(len(y))), y, u, d, log)
+
+
+def grid_of(*segments, inputs=(), disturbances=(), outputs=("t",), switches=()):
+    return Grid(inputs, disturbances, outputs, switches, 2.0, segments, 2.0, {})
+
+
+def rows(n, log="a"):
+    return segment(np.arange(n)[:, None], log=log)
+
+
+def test_each_noise_is_tried_with_each_offset():
+    want = [(r, q) for q in (0.0, 0.1, 0.3, 1.0) for r in (0.03, 0.1, 0.3)]
+    assert [(some.noise, some.nuisance) for some in selection.PRIORS] == want
+
+
+def spans(segments):
+    return [(s.log, int(s.time[0]), int(s.time[-1]) + 1) for s in segments]
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "inside", "outside"),  # of 50 rows of a and 40 of b; what remains has 20 rows at least
+    [
+        (10, 60, [("a", 10, 50), ("b", 0, 10)], [("b", 10, 40)]),
+        (20, 30, [("a", 20, 30)], [("a", 0, 20), ("a", 30, 50), ("b", 0, 40)]),
+        (19, 31, [("a", 19, 31)], [("b", 0, 40)]),
+        (50, 70, [("b", 0, 20)], [("a", 0, 50), ("b", 20, 40)]),
+    ],
+)
+def test_a_block_is_cut_out_of_the_rows_of_all_segments(first, last, inside, outside):
+    found = selection._split([rows(50), rows(40, "b")], first, last)
+    assert [spans(part) for part in found] == [inside, outside]
+
+
+def test_two_logs_are_cut_into_four_blocks_of_twenty_rows_at_least():
+    grid = grid_of(rows(50), rows(40, "b"))
+    cases = [(name, spans(train.segments), spans(held)) for name, train, held in selection.folds(grid)]
+    assert cases == [  # at 22.5, 45 and 67.5 rows, of which halves go to the even one
+        ("block 1 of 4", [("a", 22, 50), ("b", 0, 40)], [("a", 0, 22)]),
+        ("block 2 of 4", [("a", 0, 22), ("b", 0, 40)], [("a", 22, 45)]),
+        ("block 3 of 4", [("a", 0, 45), ("b", 18, 40)], [("a", 45, 50), ("b", 0, 18)]),
+        ("block 4 of 4", [("a", 0, 50)], [("b", 18, 40)]),
+    ]
+    assert len(list(selection.folds(grid_of(rows(80))))) == 4
+    with pytest.raises(UserError, match="79 rows of 2 s are too short"):
+        next(selection.folds(grid_of(rows(79))))
+    # of a block its second half is run once more, of a whole log not
+    assert spans(selection.held_out_runs(grid, [rows(7), rows(4)])) == [
+        ("a", 0, 7), ("a", 0, 4), ("a", 3, 7), ("a", 2, 4),
+    ]  # fmt: skip
+    assert len(selection.held_out_runs(grid_of(rows(9), rows(9, "b"), rows(9, "c")), [rows(7)])) == 1
+
+
+@pytest.mark.parametrize(
+    ("moving", "held"),  # the logs that move q, and those that move p
+    [
+        (("abc", "abc"), "abc"),
+        (("abc", "c"), "ab"),
+        (("a", "c"), "abc"),
+        (("ab", ""), "abc"),
+        (("c", ""), "ab"),
+    ],
+)
+def test_a_log_that_alone_moves_an_input_is_not_held_out_where_two_others_are_left(moving, held):
+    logs = []
+    for name in "abc":
+        u = 3.0 * np.ones((30, 2))
+        u[10:] += [name in some for some in moving]
+        logs.append(segment(np.arange(30)[:, None], u, log=name))
+    cases = [
+        (name, train.logs, {s.log for s in part}) for name, train, part in selection.folds(grid_of(*logs))
+    ]
+    assert cases == [(name, tuple(n for n in "abc" if n != name), {name}) for name in held]
+
+
+class Stands:
+    """A model of two outputs that stand where they begin."""
+
+    def __init__(self, *, stable=True, lost=()):
+        self.stable, self.spread, self.lost = stable, np.zeros((2, 2)), lost
+
+    def rest(self, y, u, d, more):
+        return np.asarray(y)
+
+    def rollout(self, x0, u, d, more, dt):
+        y = np.repeat(x0[:, None], u.shape[1] + 1, axis=1)
+        for row, column in self.lost:
+            y[:, row:, column] = np.nan
+        return y, x0
+
+
+def test_errors_of_a_free_run_are_those_of_the_rows_after_the_warm_up_for_each_prior():
+    long = segment([[10, 5], [12, 5], [14, 5], [13.5, 6], [np.nan, 7], [15.5, np.nan]])
+    short = segment([[20, 5], [20, 5], [20, 5], [22, 2]])
+    skipped = segment([[20, 5], [20, 5], [90, 5]])
+    priors = [StartPrior(noise=0.5, nuisance=0.0), StartPrior(noise=1.0, nuisance=1.0)]
+    how = {"dt": 2.0, "scale": np.array([2.0, 1.0]), "warmup": 3, "priors": priors}
+    found = selection.free_run_errors(Stands(), [long, short, skipped], **how)
+    # misses of 3.5, 5.5, 2 and 1, 2, -3; half of (0, 2, 4) times 3/(3 + 1) taken as offset: 1.5 less
+    want = [[np.sqrt(46.5 / 3), np.sqrt(14 / 3)], [np.sqrt((4 + 16 + 4) / 3), np.sqrt(14 / 3)]]
+    np.testing.assert_allclose(found, want)
+    lost = selection.free_run_errors(
+        Stands(lost=[(4, 0)]), [long.part(0, 5)], **how
+    )  # where nothing was read
+    np.testing.assert_allclose(lost[0], [3.5, np.sqrt(2.5)])
+    silent = segment([[10, 5], [12, 5], [14, 5], [np.nan, 6]])
+    for model, some in ((Stands(stable=False), long), (Stands(lost=[(4, 1)]), long), (Stands(), silent)):
+        assert np.isinf(selection.free_run_errors(model, [some], **how)).tolist() == [[True] * 2] * 2
+
+
+@pytest.mark.parametrize(
+    ("on_all", "chosen"), [(0.8, "small"), (0.801, "middle"), (None, "middle")]
+)  # twice the 0.4 of its worst fold; one that cannot be fitted
+def test_the_choice_has_the_errors_of_its_structure_and_of_its_best_prior(monkeypatch, on_all, chosen):
+    grid = grid_of(
+        *(segment(np.outer([0, 1] * 15, [4, 20]), log=n) for n in "abc"), outputs=("s", "t")
+    )  # spreads of 2 and 10
+    by_fold = {  # prior 4 serves all three best by the mean of logs, prior 7 by the mean
+        SMALL: {"a": 0.2, "b": 0.3, "c": 0.4},
+        MIDDLE: {"a": 0.21, "b": 0.29, "c": 0.4},
+        LARGE: {"a": 0.01, "b": 0.01},
+    }
+    asked, said = [], []
+
+    def family(part, *, only=None):
+        asked.append((part.logs, only))
+        of = set("abc") - set(part.logs)
+        return {
+            s: s
+            for s, errors in by_fold.items()
+            if only in (None, s) and of <= set(errors) and (only != SMALL or on_all)
+        }
+
+    def errors_of(model, segments, *, dt, scale, warmup, priors):
+        assert (dt, scale.tolist(), warmup) == (2.0, [2.0, 10.0], 6)
+        if len(priors) == 1:
+            assert priors[0] == selection.PRIORS[4]
+            error, shape = on_all if model == SMALL else 0.1, np.ones((1, 1))
+        else:
+            (log,) = {s.log for s in segments}
+            error, shape = by_fold[model][log], np.full((12, 1), 3.0)
+            shape[4], shape[7] = 1.0, {"a": 1.2, "b": 1.2, "c": 0.8}[log]
+        return error * shape * scale * [1.5, 0.5]  # their mean is 1
+
+    monkeypatch.setattr(selection, "free_run_errors", errors_of)
+    choice = selection.choose(grid, family, warmup=6, progress=lambda *what: said.append(what))
+    errors = list(by_fold[choice.structure].values())
+    assert (choice.structure.label, choice.model) == (chosen, choice.structure)
+    assert (choice.prior, choice.folds, choice.warmup) == (selection.PRIORS[4], ("a", "b", "c"), 6)
+    np.testing.assert_allclose(choice.errors[choice.structure], errors)
+    np.testing.assert_allclose(choice.rmse, np.outer(errors, [2 * 1.5, 10 * 0.5]))
+    assert choice.error == pytest.approx(np.prod(errors) ** (1 / 3))
+    assert np.isinf(choice.errors[LARGE]).tolist() == [False, False, True]
+    assert said == [(0.0, "without a"), (1 / 3, "without b"), (2 / 3, "without c")]
+    assert asked[:3] == [(("b", "c"), None), (("a", "c"), None), (("a", "b"), None)]
+    late = {SMALL: {"b": 0.1, "c": 0.1}, MIDDLE: {"a": 0.2, "b": 0.2, "c": 0.2}}
+    by_fold = late  # not fitted on the first fold
+    choice = selection.choose(grid, family, warmup=6)
+    assert (choice.structure, np.isinf(choice.errors[SMALL]).tolist()) == (MIDDLE, [True, False, False])
+
+
+@pytest.mark.parametrize(
+    ("excess", "within"),
+    [
+        ((0.0, 0.0), True),
+        ((0.04, 0.04), False),
+        ((-0.01, 0.0, 0.12), True),  # mean 0.0367, standard error sqrt(0.010467 / 2 / 3) = 0.0418
+        ((0.01, 0.01, 0.1), False),  # 0.04, 0.03
+        ((-0.3, 0.39), True),  # 0.045 of ln 1.05 = 0.0488
+        ((-0.3, 0.4), False),
+    ],
+)
+def test_an_excess_is_noise_within_a_standard_error_and_five_percent(excess, within):
+    assert selection.excess_within_noise(np.array(excess)) is within
+
+
+@pytest.mark.parametrize(
+    ("table", "chosen"),
+    [
+        ({MIDDLE: (0.1, 0.1), Structure("even", 3): (0.099, 0.1)}, "even"),  # of one size the better one
+        ({SMALL: (2, 2, 2), MIDDLE: (1, 1.03, 1), LARGE: (1.01, 1, 0.99)}, "middle"),
+        ({SMALL: (0.1, np.inf), LARGE: (0.5, 0.5)}, "large"),
+        ({SMALL: (1e-13, 1e-13), LARGE: (0.0, 0.0)}, "small"),  # both no error at all
+        ({SMALL: (1e-11, 1e-11), LARGE: (0.0, 0.0)}, "large"),
+    ],
+)
+def test_the_smallest_of_the_good_ones_is_taken(table, chosen):
+    assert selection._one_standard_error({s: np.array(e) for s, e in table.items()}).label == chosen
+    with pytest.raises(UserError, match="no structure gives a stable model"):
+        selection._one_standard_error({SMALL: np.array([0.1, np.inf])})
+
+
+@pytest.mark.parametrize(("errors", "mean"), [((0.02, 0.5), 0.1), ((0.0, 4.0), 2e-6)])
+def test_the_error_of_a_choice_is_a_geometric_mean(errors, mean):
+    choice = Choice(SMALL, StartPrior(), {SMALL: np.array(errors)}, (), np.zeros((2, 1)), 3, None)
+    assert choice.error == pytest.approx(mean)
+
+
+def test_drives_are_inputs_disturbances_and_products_of_which_still_ones_are_none():
+    u = np.array([[-2.0, 5.0, 0.0], [3.0, 5.0 + 4e-9, 7.0], [1.0, 5.0, 7.0]])
+    d = np.array([[20.0], [20.0 + 3e-8], [20.0]])  # a billionth of it is 2e-8
+    parts = (segment(np.zeros((3, 1)), u, d), segment(np.zeros((1, 1)), u[1:2], d[:1]))
+    grid = grid_of(*parts, inputs=("q", "still", "p"), disturbances=("room",))
+    first, second = selection.drives(grid, ("|q|", "q*|q|"))
+    want = np.column_stack([u[:, 0], [0] * 3, u[:, 2], d, [2, 3, 1], [-4, 9, 1]])
+    np.testing.assert_array_equal(first, want)
+    np.testing.assert_array_equal(second, [[3.0, 0.0, 7.0, 20.0, 3.0, 9.0]])
+
+
+@pytest.mark.parametrize(
+    ("lowest", "highest", "pump", "switched", "count"),
+    [(-1, 1, 1, True, 6), (-1, 1, 1, False, 3), (-1, 1, 0, True, 3), (0, 1, 1, True, 2), (-1, 0, 0, True, 1)],
+)
+def test_magnitudes_of_signed_inputs_and_products_with_moving_switches_are_tried(
+    lowest, highest, pump, switched, count
+):
+    u = np.array([[lowest, 0], [highest, pump]])
+    grid = grid_of(
+        segment(np.zeros((2, 1)), u), inputs=("q", "pump"), disturbances=("room",), switches=("pump",)
+    )
+    sets = [(), ("|q|",), ("|q|", "q*|q|")][: 3 if lowest * highest else 1]
+    products = [(*some, "pump*q", "pump*room") for some in sets]
+    want = sets + (products if pump and switched else [])
+    assert list(selection.default_terms(grid, switched=switched)) == want
+    assert len(want) == count
+
+
+def test_the_spread_of_the_states_is_that_of_the_run_and_a_trace_more():
+    parts = {"A": np.diag([0.5, 0.0]), "B": [[2.0], [0.0]], "C": [[1.0, 0.0]], "c": [0.0, 0.0]}
+    grid = grid_of(
+        segment(np.zeros((2, 1)), [[1.0], [2.0]]), segment(np.zeros((1, 1)), [[3.0]]), inputs=("q",)
+    )
+    W, A = np.array(parts["B"]), np.array(parts["A"])
+    model = selection.as_state_space(grid, A, W, np.eye(1, 2), np.zeros(2), terms=(), origin="arx")
+    assert (model.dt, model.origin, model.outputs) == (2.0, "arx", ("t",))
+    found = selection.with_spread(model, grid, [np.array([4.0, 0.0]), np.array([1.0, 0.0])])
+    # states 4, 4, 6 and 1, 6.5: sum 21.5, squares 111.25, so 18.8 / 4
+    assert np.trace(found.spread) == pytest.approx(4.7 * (1 + 2e-8), rel=1e-12)
+    assert found.spread[1, 1] == pytest.approx(4.7e-8)
+    assert isinstance(found, StateSpaceModel)
+    still = grid_of(segment(np.zeros((2, 1)), [[0.0], [0.0]]), inputs=("q",))
+    spread = selection.with_spread(model, still, [np.zeros(2)]).spread
+    np.testing.assert_allclose(spread, 1e-20 * np.eye(2), rtol=1e-6)
+    assert selection.with_spread(model, grid, [np.array([np.inf, 0.0]), np.zeros(2)]) is model
+
+
+def test_products_have_columns_of_their_own_after_inputs_and_disturbances():
+    grid = grid_of(inputs=("q", "p"), disturbances=("room",))
+    W = np.array([[1.0, 2.0, 3.0, 4.0]])
+    how = {"terms": ("|q|",), "origin": "oe"}
+    model = selection.as_state_space(grid, np.eye(1) / 2, W, np.eye(1), np.ones(1), **how, y0=np.array([7.0]))
+    assert [part.tolist() for part in (model.B, model.E, model.F)] == [[[1.0, 2.0]], [[3.0]], [[4.0]]]
+    assert (model.y0.tolist(), model.c.tolist(), model.terms) == ([7.0], [1.0], ("|q|",))
