@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,15 +12,22 @@ from scipy.signal import lfilter
 from scipy.stats import binom
 
 from thermogrip.datasets.schema import Log, make_log
-from thermogrip.sysid.greybox.noise_model import Block
+from thermogrip.sysid.greybox.noise_model import Block, band_weights
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import PlantScores
+from thermogrip.sysid.plant.log_grid import Stretch
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.simulation import Start
+from thermogrip.sysid.validation import residual_tests as tests
 from thermogrip.sysid.validation.free_run import FreeRun, free_run
 from thermogrip.sysid.validation.residual_tests import (
+    Correlation,
     CorrelationTest,
+    ResidualCorrelations,
     SlowNoise,
     _significant,
+    autocorrelation,
+    cross_correlation,
     learn_slow_noise,
     residual_correlations,
 )
@@ -191,19 +199,6 @@ def test_what_cannot_be_tested_is_left_alone():
     assert free_run(wild, own).residual.tests == {}
 
 
-def test_block_means_of_a_slow_process_have_the_stated_variances():
-    # 400 series of an Ornstein-Uhlenbeck process in fine steps, averaged over 20 of them
-    rng, fine, n, tau = np.random.default_rng(13), 20, 64, 6.0
-    keep = np.exp(-1 / (tau * fine))
-    drive = rng.standard_normal((400, n * fine + 4000)) * np.sqrt(1 - keep**2)
-    series = lfilter([1.0], [1.0, -keep], drive, axis=1)[:, 4000:].reshape(400, n, fine).mean(axis=2)
-    block = Block.of(series.T[:, None, :], (0,))
-    got = np.einsum("bkk->b", block.products[:, 0, 0]) / 400 / block.sizes
-    want = SlowNoise(0.0, (1.0, 0.0), (tau, 1.0)).variances(n)
-    # the mean square of 400 values and more is known to 7 %, three times that for the worst of the bands
-    np.testing.assert_allclose(got, want, rtol=0.22)
-
-
 def test_products_in_cosine_coordinates_are_those_of_the_covariance_in_time():
     noise, n = SlowNoise(0.5, (1.0, 0.7), (3.0, 20.0)), 200
     lag = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
@@ -216,17 +211,6 @@ def test_products_in_cosine_coordinates_are_those_of_the_covariance_in_time():
     want = X.T @ cho_solve(cho_factor(V), X)
     got = noise.products([Block.of(X[:, None, :], (0,))])
     np.testing.assert_allclose(got, want, rtol=0.1)
-
-
-def test_noise_is_learnt_from_one_series():
-    rng, fits = np.random.default_rng(15), []
-    for _ in range(10):
-        e = 0.6 * rng.standard_normal(400) + 0.8 * slow(rng, 0.97, 1.0)[:400]
-        noise = learn_slow_noise([Block.of(e[:, None, None], (0,))])
-        fits.append([noise.white**2, noise.variances(400)[8]])
-    # AR(1): at frequency f its density is (1 - a^2) / |1 - a exp(-i w)|^2, w = pi f / n
-    there = 0.36 + 0.64 * (1 - 0.97**2) / abs(1 - 0.97 * np.exp(-1j * np.pi * 8 / 400)) ** 2
-    np.testing.assert_allclose(np.mean(fits, axis=0), [0.36, there], rtol=0.25)
 
 
 def test_an_input_that_the_fit_has_not_seen_like_that_is_no_missing_term():
@@ -269,3 +253,153 @@ def test_one_right_model_in_a_hundred_is_suspected_by_any_of_its_tests(
 ) -> None:
     found = _significant({f"y{k}": {"u": CorrelationTest(value, 1.0)} for k, value in enumerate(p)})
     assert "".join("x" if row["u"].significant else "-" for row in found.values()) == significant
+
+
+def stretch(n: int, u: float | np.ndarray = 0.0, d: float | None = None) -> Stretch:
+    room = np.zeros((n, 0)) if d is None else np.full((n, 1), d)
+    return Stretch(slice(0, n), np.arange(float(n)), np.zeros((n, 1)), np.zeros((n, 1)) + u, room, 0.0, "a")
+
+
+def test_blocks_are_means_where_read_and_lines_between():
+    # cells of 2 s from the first reading on: readings of the 3rd and 5th block are lost
+    time, values = np.arange(46.0), np.arange(46.0) ** 2
+    residual = np.zeros((46, 1))
+    residual[[0, 1, 8, 9, 12], 0] = np.nan
+    rows = stretch(46)
+    blocks = tests._Blocks(rows, residual, 2.0)
+    assert (blocks.n, blocks.enough) == (22, True)
+    got = blocks.of_readings(values[:, None, None])[:, 0, 0]
+    assert got[[0, 2, 3, 5, 21]].tolist() == [6.5, 42.5, (42.5 + 110.5) / 2, 169.0, 1980.5]
+    assert blocks.of_inputs(values[:, None])[[0, 3, 5, 21], 0].tolist() == [6.5, 72.5, 156.5, 1980.5]
+    for end, enough in ((44, True), (42, False)):  # twenty with readings, and nineteen
+        part = np.where(time[:, None] < end, residual, np.nan)
+        assert tests._Blocks(rows, part, 2.0).enough == enough
+    assert tests._Blocks(rows, np.full((46, 1), np.nan), 2.0).n == 0
+
+
+@pytest.mark.parametrize(
+    ("off", "tested"),
+    [(1.0, True), (2.01e6, False), (1.99e6, True), (1.9e-9, False), (2.1e-9, True), (np.inf, False)],
+)
+def test_a_run_that_diverged_or_made_the_log_has_no_residual(off, tested):
+    read = np.where(np.arange(10) % 2 > 0, 2.0, 0.0)  # they range over 2 K
+    log, scored = log_of(np.zeros(10), read), np.arange(10.0) > 2
+    seen = log.assign(t=log["t"] - off, scored=("time", 1.0 * scored))
+    found = tests._residual(heater(), log, seen)
+    assert (found is not None) == tested
+    if found is not None:
+        np.testing.assert_allclose(found[:, 0], np.where(scored, off, np.nan), rtol=1e-6)
+    assert tests._residual(heater(), log, seen.assign(scored=0 * seen["scored"])) is None
+
+
+def test_noise_is_the_most_likely_under_the_stated_priors():
+    # medians of the sizes, and of the times: 3 blocks and a twelfth of the series, 9 blocks at least
+    rng = np.random.default_rng(20)
+    for n in (60, 240):
+        x, e = np.linspace(-1, 1, n), 0.3 * rng.standard_normal(n) + 0.5 * slow(rng, 0.9, 1.0)[:n]
+        block = Block.of(np.column_stack([x, e])[:, None, :], (0,))
+
+        def cost(v, block=block, n=n):
+            noise = SlowNoise(v[0], (v[1], v[2]), (v[3], v[4]))
+            P = np.tensordot(1 / noise.variances(n), block.products[:, 0, 0], axes=1)
+            z = np.log(np.divide(v, [0.3, 0.5, 0.5, 3.0, max(n / 12, 9.0)])) / [2.0, 2.0, 2.0, 1.0, 1.2]
+            like = block.sizes @ np.log(noise.variances(n)) + P[1, 1] - P[0, 1] ** 2 / (1 + P[0, 0])
+            return 0.5 * (like + np.log(1 + P[0, 0]) + z @ z)
+
+        found = learn_slow_noise([block])
+        best = np.array([found.white, *found.sd, *found.tau])
+        slopes = [cost(best * np.exp(d)) - cost(best * np.exp(-d)) for d in 0.03 * np.eye(5)]
+        np.testing.assert_allclose(slopes, 0.0, atol=0.004)
+    assert SlowNoise(0.0, (0.0, 0.0), (1.0, 1.0)).variances(4).tolist() == [1e-6] * len(band_weights(4))
+
+
+@pytest.mark.parametrize(
+    ("H", "g", "p", "beta"),
+    [([[4.0]], [4.0], 0.0455003, [1.0]),  # (4 / 2)^2 of one degree of freedom
+     ([[4.0, 0.0], [0.0, 25.0]], [4.0, 5.0], np.exp(-2.5), [1.0, 0.2]),  # 4 + 1 of two: exp(-5 / 2)
+     ([[4.0, 4.0], [4.0, 4.0]], [4.0, 4.0], 0.0455003, [0.5, 0.5]),  # the other once more
+     ([[0.0, 0.0], [0.0, 0.0]], [1.0, 1.0], 1.0, [0.0, 0.0]),
+     ([[0.0, 0.0], [0.0, 4.0]], [9.0, 4.0], 0.0455003, [0.0, 1.0])],
+)  # fmt: skip
+def test_scores_of_one_direction_and_of_two(H, g, p, beta):
+    found, size = tests._score_test(np.array(H), np.array(g))
+    assert found == pytest.approx(p, rel=1e-5)
+    np.testing.assert_allclose(size, beta, atol=1e-12)
+
+
+def test_directions_of_a_start_that_move_nothing_or_diverge_are_left_out():
+    moves = np.zeros((25, 1, 4))
+    moves[0, 0], moves[1, 0, 1], moves[2, 0, 0] = [0.0, 0.0, 1e6, 0.0], 90.0, 0.021
+    moves[3, 0, 3] = 0.019  # of 0.02 at least; 90 is taken as 30; 1e6 diverged
+    modes = tests._modes(moves)
+    assert sorted(np.abs(modes).max(axis=(0, 1)).tolist()) == pytest.approx([0.021, 30.0])
+
+
+def test_draws_are_one_sd_all_together_and_of_thirty_rms_at_most(monkeypatch):
+    plant, log = heater(), log_of(np.zeros(30), np.zeros(30))
+    seen, seeds = log.assign(t=log["t"] + 1.0), []
+
+    def draw(_plant, k):
+        seeds.append(k)
+        far = {1: 2.0, 2: -90.0, 3: np.inf}.get(k, 0.0)
+        return SimpleNamespace(simulate=lambda _log, warmup: seen.assign(t=seen["t"] + far * warmup))
+
+    monkeypatch.setattr(Plant, "draw", draw)
+    sure = tests._of_draws(plant, log, seen, np.array([0.5]), 1.0)
+    found = tests._of_draws(replace(plant, refits=(plant.model,)), log, seen, np.array([0.5]), 1.0)
+    assert (sure.shape, found.shape, seeds) == ((30, 1, 0), (30, 1, 23), list(range(1, 25)))
+    np.testing.assert_allclose(found[0, 0, :3] * np.sqrt(23), [2.0, -15.0, 0.0])
+
+
+def test_signals_are_lags_of_the_input_and_of_the_square_of_the_output():
+    plant, n = heater(), 60
+    u = np.where(np.arange(n) < 10, 2.0, 3.0)
+    rows = stretch(n, u[:, None])
+    blocks = tests._Blocks(rows, np.zeros((n, 1)), 2.0)
+    run = np.append(np.zeros(30), np.full(31, 6.1))[:, None]
+    found = tests._tested(plant, rows, run, [0], blocks, 2.0)
+    lags = np.array([1.0, 4.0, 16.0, 64.0]) * 2  # of blocks of 2 s
+    after = np.maximum(np.arange(n) - 10, 0.0)[:, None]  # a step of 1 at 10 s
+    want = (1 - np.exp(-after / lags)).reshape(30, 2, 4).mean(axis=1)
+    np.testing.assert_allclose(found["q"], want / want.max(), atol=1e-9)
+    square = np.append(np.full(30, 3.1**2), np.full(30, 3.0**2))  # about the mean of 61 values, 3.1
+    want = lfilter([1 - np.exp(-1 / 2)], [1, -np.exp(-1 / 2)], square)
+    want = np.append(0.0, want)[:60].reshape(30, 2).mean(axis=1)
+    np.testing.assert_allclose(found["t squared"][:, 0], want / want.max(), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("after_gap", "level", "start", "bias"),
+    [(False, None, 1.0, 0.3), (True, 0.0, 3.0, 0.05), (False, 0.0, 0.1, 0.05)],
+)
+def test_a_start_counts_three_times_after_a_gap_and_a_tenth_at_rest(after_gap, level, start, bias):
+    model = StateSpaceModel(
+        ("q",), ("room",), ("t",), A=[[0.9]], B=[[0.5]], E=[[0.1]], C=[[2.0]], dt=1.0, spread=[[0.25]]
+    )
+    plant, n = Plant(model, {}, dt=1.0, nuisance={"room": 0.3}), np.arange(30.0)
+    begin = Start(np.ones(1), np.zeros(1), np.zeros(1), np.full(1, 2.0), level, 0.0, "")
+    runs = tests._runs(plant, stretch(30, 1.0, 7.0), begin, after_gap=after_gap)
+    np.testing.assert_allclose(np.abs(runs.starts[:, 0, 0]), start * 0.5 * 2 * 0.9**n)
+    np.testing.assert_allclose(runs.biases[:, 0, 0], -bias * 2 * (1 - 0.9**n))  # 0.1 / (1 - 0.9) = 1
+    np.testing.assert_allclose(runs.nominal[:30, 0], 2 * (10 - 9 * 0.9**n))  # (0.5 + 0.1 * 5) / 0.1
+
+
+def test_correlations_of_nothing_and_of_huge_values():
+    empty = Correlation(np.zeros(2), np.full(2, np.nan), 0.1)
+    assert np.isnan(empty.share_outside)
+    assert not empty.independent
+    e, u = np.random.default_rng(0).standard_normal((2, 200))
+    for none in (np.full(200, np.nan), np.full(200, 3.0)):
+        assert np.isnan(cross_correlation(e, none).values).all()
+        assert np.isnan(cross_correlation(none, u).values).all()
+    auto, cross = autocorrelation(e), cross_correlation(e, u)
+    assert (auto.lags[[0, -1]].tolist(), cross.lags[[0, -1]].tolist()) == ([1, 40], [0, 40])
+    np.testing.assert_allclose(cross_correlation(1e200 * e, 1e-100 * u).values, cross.values, atol=1e-12)
+    ra, ru = (np.correlate(x - x.mean(), x - x.mean(), "full")[200:249] / (200 * x.var()) for x in (e, u))
+    assert cross.band == pytest.approx(1.96 * np.sqrt(max(1 + 2 * ra @ ru, 1.0) / 200))
+
+
+def test_the_json_of_the_tests():
+    found = ResidualCorrelations({"t": {"q": CorrelationTest(0.2, 0.3, True)}}, {"t": 0.4})
+    follows = {"t": {"q": {"p": 0.2, "size": 0.3, "named": True}}}
+    assert found.to_json() == {"follows": follows, "start": {"t": 0.4}}
