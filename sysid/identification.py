@@ -236,7 +236,7 @@ def choose_model(rows: Sequence[Row], complete: int) -> str | None:
     if not mean:
         return None
     best = min(mean, key=lambda model: mean[model])
-    return "network" if mean.get("network", np.inf) <= WITHIN_NOISE * mean[best] else best
+    return "network" if mean.get("network", np.nan) <= WITHIN_NOISE * mean[best] else best
 
 
 def verdict_of(model: str, rows: Sequence[Row], checked: DataCheck, whole_logs: bool) -> tuple[bool, str]:

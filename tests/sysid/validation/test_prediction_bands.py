@@ -11,7 +11,6 @@ import pytest
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.data.data_quality import reading_excess
 from thermogrip.sysid.greybox.fit import fit_network
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.identification import Held, run_held_out
@@ -68,16 +67,6 @@ def test_readings_of_a_drawn_plant_lie_inside_as_often_as_stated(heater, schedul
     assert np.mean(shares) == pytest.approx(0.9, abs=3 * 0.17 / np.sqrt(count))
 
 
-def test_the_band_widens_with_the_level_and_the_covariance(heater, schedule):
-    log = measured(heater, schedule, 0)
-    run = heater.simulate(log)
-    narrow = free_run_band(heater, log, run, level=0.5).half["t1"]
-    wide = free_run_band(heater, log, run, level=0.9).half["t1"]
-    assert np.allclose(wide / narrow, 1.6449 / 0.6745, rtol=1e-3)
-    uncertain = replace(heater, covariance=9 * heater.covariance)
-    assert free_run_band(uncertain, log, run).half["t1"][-1] > 2 * wide[-1]
-
-
 def test_what_the_draws_do_not_explain_of_the_held_out_errors_is_in_the_band(schedule):
     def block(pole):
         A, B = pole * np.eye(2), 0.01 * np.eye(2)
@@ -93,26 +82,6 @@ def test_what_the_draws_do_not_explain_of_the_held_out_errors_is_in_the_band(sch
     assert np.mean(band["t1"] ** 2) == pytest.approx(1.6449**2, rel=1e-3)  # no wider on average, and not even
     assert np.ptp(band["t1"]) > 0.01
     assert np.mean(band["t2"] ** 2) > (1.6449 * 0.001) ** 2  # draws that run further apart than it erred
-
-
-def test_a_band_says_where_its_errors_differ_from_part_to_part(schedule):
-    A, B = 0.9 * np.eye(2), 0.01 * np.eye(2)
-    block = StateSpaceModel(("q1", "q2"), (), ("t1", "t2"), A=A, B=B, C=np.eye(2), dt=2.0)
-    even, uneven = [1.0, 1.1, 0.9, 1.0], [1.0, 0.3, 0.3, 0.3]
-
-    def words(parts):
-        rmse = {name: float(np.sqrt(np.mean(np.square(part)))) for name, part in parts.items()}
-        plant = Plant(block, {}, dt=2.0, scores=PlantScores(held_out_rmse=rmse, held_out_by_part=parts))
-        return plant, free_run_band(plant, schedule, plant.simulate(schedule)).own_error
-
-    assert words({"t1": even, "t2": even})[1] == "the errors of free runs over parts held out of it"
-    plant, stated = words({"t1": even, "t2": uneven})
-    assert "too narrow where errors are as on the worst part" in stated
-    assert "should cover 38 %" in stated
-    # independent: normal errors of that part in a band of the others
-    errors = np.random.default_rng(0).normal(0.0, 1.0, 100_000)
-    held = np.mean(np.abs(errors) <= 1.6449 * 0.3)
-    assert expected_coverage(plant)["t2"][0] == pytest.approx(held, abs=0.01)
 
 
 def first_order(gain=1.0, logs=("a",)):
@@ -134,16 +103,6 @@ def test_another_run_adds_what_its_gain_changes(schedule):
     assert between_runs(first_order(logs=("a", "b", "c")), schedule) == {}
 
 
-def test_an_error_of_few_parts_or_of_a_worse_last_part_widens_the_band(schedule):
-    parts = {"t1": [1.0, 1.0, 1.0, 1.0], "t2": [0.5]}
-    last = [HeldOut("last 30 % of a", "t2", 2.0, 50.0, "degC", 100)]
-    scores = PlantScores(held_out_rmse={"t1": 1.0, "t2": 0.5}, held_out_by_part=parts, held_out=last)
-    plant = replace(first_order(logs=()), scores=scores)
-    half = free_run_band(plant, schedule, plant.simulate(schedule)).half
-    assert half["t1"][-1] == pytest.approx(2.1318, rel=1e-3)  # Student's t, 4 degrees of freedom, 95 %
-    assert half["t2"][-1] == pytest.approx(2 * 1.6449, rel=1e-3)
-
-
 def test_a_switch_has_no_gain_that_varies(schedule):
     model = StateSpaceModel(
         ("q1", "q2"), (), ("t1", "t2"), switches=("q2",), dt=2.0,
@@ -155,41 +114,12 @@ def test_a_switch_has_no_gain_that_varies(schedule):
     assert np.ptp(added["t2"]) == 0.0
 
 
-def test_runs_whose_gain_varies_lie_inside_as_often_as_stated(schedule):
-    rng, plant = np.random.default_rng(5), first_order()
-    schedule = schedule.assign({name: 0.0 * schedule[name] for name in ("t1", "t2")})
-    shares = []
-    for k in range(40):
-        log = measured(first_order(1 + 0.07 * rng.standard_normal()), schedule, k)
-        shares.append(np.mean(list(free_run_band(plant, log, plant.simulate(log)).inside.values())))
-    # one gain moves a whole log: sd of a share below 0.25
-    assert np.mean(shares) == pytest.approx(0.9, abs=3 * 0.25 / np.sqrt(40))
-
-
 def test_one_part_alone_has_no_expected_coverage():
     model = StateSpaceModel(("q",), (), ("t", "r"), A=[[0.9]], B=[[0.1]], C=[[1.0], [2.0]], dt=1.0)
     parts = PlantScores(held_out_by_part={"t": [0.3], "r": [0.2, 0.2]})
     shares = expected_coverage(Plant(model, {}, dt=1.0, scores=parts), 0.9)
     assert set(shares) == {"r"}
     assert np.allclose(shares["r"], 0.9)  # parts that err alike predict each other
-
-
-def test_what_noise_adds_to_a_mean_is_found_from_the_logs_whatever_moves_slowly():
-    rng, t = np.random.default_rng(1), np.arange(0.0, 4000.0, 0.5)
-    slow = 30 + 5 * np.sin(t / 60)
-    for noise in (0.0, 0.05, 0.5):
-        log = make_log(t, {"t": (slow + noise * rng.standard_normal(t.size), "degC", "output")})
-        excess = reading_excess([log], ["t"], 5.0)["t"]
-        assert excess == pytest.approx(noise * np.sqrt(0.9), rel=0.03, abs=2e-3)
-        assert reading_excess([log], ["t"], 0.5)["t"] == 0.0  # bins of one reading
-
-
-def test_lost_readings_and_a_gap_are_no_noise():
-    t = np.concatenate([np.arange(300.0), np.arange(400.0, 700.0)])
-    y = np.where(t < 350, 20.0, 40.0)
-    y[100:110] = np.nan
-    log = make_log(t, {"t": (y, "degC", "output")})
-    assert reading_excess([log], ["t"], 5.0)["t"] == 0.0
 
 
 def test_the_band_of_a_fit_to_means_covers_readings(heater, schedule):
