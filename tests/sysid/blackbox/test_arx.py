@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from thermogrip.datasets.resample import average
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.blackbox.arx import _columns, _Orders, arx_family
-from thermogrip.sysid.blackbox.order_selection import choose, default_terms
+from thermogrip.sysid.blackbox.order_selection import default_terms
 from thermogrip.sysid.plant.log_grid import make_grid
 
 
@@ -39,23 +36,6 @@ def test_a_noise_free_system_is_found_exactly_whatever_the_offset(first_order, f
     model = fit_one("arx", make_grid([log], average=1.0), poles=1, zeros=1, delays=first_order.delay)
     assert np.abs(model.poles()).max() == pytest.approx(first_order.pole, abs=1e-6)
     assert model.gain()[0, 0] == pytest.approx(first_order.gain / (1 - first_order.pole), rel=1e-5)
-
-
-def test_the_right_delay_is_chosen_by_held_out_free_run():
-    grid = make_grid([arx_noise_log()], average=1.0)
-    orders = {"poles": (1,), "zeros": (1,), "delays": (1, 2, 3, 4, 5), "terms": ((),)}
-    choice = choose(grid, partial(arx_family, **orders), warmup=50)
-    assert choice.structure.label == "na 1, nb 1, delay 3"
-    errors = {s.label: e.mean() for s, e in choice.errors.items()}
-    assert all(errors["na 1, nb 1, delay 3"] < errors[f"na 1, nb 1, delay {k}"] for k in (1, 2, 4, 5))
-
-
-def test_an_averaged_log_is_still_cut_at_its_gaps(first_order):
-    log = first_order.log(1200, noise=0.0, gap=True)
-    fine, coarse = make_grid([log], average=1.0), make_grid([average(log, 30.0)], average=30.0, min_rows=2)
-    assert len(fine.segments) == len(coarse.segments) == 2
-    for short, long in zip(fine.segments, coarse.segments):
-        assert long.time[0] == pytest.approx(short.time[0])
 
 
 def test_no_regressor_reaches_across_a_gap(first_order, fit_one):

@@ -9,9 +9,10 @@ from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
 from thermogrip.datasets.schema import make_log
+from thermogrip.sysid.blackbox import missing_data
 from thermogrip.sysid.blackbox.fit import BLACK_BOXES, FAMILIES
 from thermogrip.sysid.blackbox.missing_data import MANY, expected_moments, fill_readings
-from thermogrip.sysid.plant.log_grid import Segment, bridge, make_grid
+from thermogrip.sysid.plant.log_grid import Segment, make_grid
 
 
 def heater_log(n=900, *, seed=0, lost=0.0):
@@ -34,13 +35,6 @@ def test_every_black_box_fits_with_a_fifth_of_the_readings_lost(kind):
     assert np.isnan(heater_log(lost=0.2)["t"].values).mean() == pytest.approx(0.2, abs=0.04)
     models = FAMILIES[kind](make_grid([heater_log(lost=0.2)], average=1.0)).values()
     assert min(error(model, fresh) for model in models) < 0.15  # of a spread of 2.4 degC
-
-
-def test_long_holes_and_open_ends_are_not_bridged():
-    y = np.array([np.nan, 1.0, *[np.nan] * 6, 8.0, np.nan, 10.0, np.nan])[:, None]
-    filled = bridge(y)[:, 0]
-    assert np.isnan(filled[[0, 2, 7, 11]]).all()
-    assert filled[9] == 9.0
 
 
 def pulled_walk(n, *, seed=0, lost=0.4, pole=0.8, rise=1.0):
@@ -89,16 +83,6 @@ def test_the_moments_are_those_of_the_greatest_likelihood_of_what_was_read():
     read = int(np.isfinite(segment.y[1:]).sum())
     own = found.log_likelihood[-1] - read * np.log(np.nanstd(segment.y))
     assert own == pytest.approx(-best.fun, abs=0.1)
-
-
-def test_whole_readings_have_the_moments_that_they_have():
-    segment, q = pulled_walk(80, lost=0.0)
-    none = np.zeros((80, 0))
-    found = expected_moments([segment], [q], [none], past_y=1, past_w=2)
-    y = segment.y[:, 0]
-    X = np.column_stack([y[1:-1], 0 * y[1:-1], q[1:-1], q[:-2], np.ones(78)])
-    np.testing.assert_allclose(found.gram, X.T @ X, atol=1e-9)
-    np.testing.assert_allclose(found.cross[:, 0], X.T @ y[2:], atol=1e-9)
 
 
 @pytest.mark.parametrize(("lost", "burst"), [(0.3, 1), (0.5, 1), (0.5, 10)])
@@ -164,3 +148,34 @@ def test_subspace_models_of_a_log_with_long_holes_are_those_of_the_whole_log(cou
         gain = fit_one("subspace", grid, orders=2, rows=15, variant="moesp").gain()
         misses.append(np.abs(gain - true).max() / np.abs(true).max())
     assert misses[1] < misses[0] + 0.1
+
+
+def test_whole_readings_with_a_switch_have_columns_lag_by_lag():
+    rng, n = np.random.default_rng(2), 40
+    y, q, on = rng.normal(size=(n, 2)) + [3, -7], rng.normal(size=(n, 2)) * [1, 5], rng.random((n, 1))
+    parts = [Segment(np.arange(float(len(some))), some, some, some, "a") for some in (y, y[:4])]
+    found = expected_moments(parts, [q, q[:4]], [on, on[:4]], past_y=2, past_w=3)
+    late = [y[2:-1], y[1:-2], 0 * y[:-3]]  # a third lag that no reading has; four rows are too few
+    X = np.hstack([*late, *(on[2:-1] * some for some in late), q[2:-1], q[1:-2], q[:-3], np.ones((37, 1))])
+    np.testing.assert_allclose(found.gram, X.T @ X, atol=1e-8)
+    np.testing.assert_allclose(found.cross, X.T @ y[3:], atol=1e-8)
+    assert found.read == 74
+
+
+def test_covariances_enter_the_sums_with_the_factors_of_their_row():
+    y = np.array([[1.0], [3.0], [np.nan], [5.0]])  # sd 1.633
+    on, q = np.array([[0.5], [0.25], [2.0], [9.0]]), np.zeros((4, 1))
+    em = missing_data._Em([(Segment(np.arange(4.0), y, q, q, "a"), q, on)], 1, 1)
+    (z, V) = em.bridged()[0]
+    V[1] = [[4.0, 3.0], [3.0, 2.0]]  # of [y2, y1]: the row of factor 0.25
+    none = em.sums([(z, 0 * V)])
+    more = [some - other for some, other in zip(em.sums([(z, V)]), none)]
+    np.testing.assert_allclose(more[0][:2, :2], [[2, 0.5], [0.5, 0.125]])
+    assert np.abs(more[0]).sum() == pytest.approx(3.125)
+    np.testing.assert_allclose(more[1][:, 0], [3, 0.75, 0, 0])
+    np.testing.assert_allclose(more[2], [[4]])
+    natural = em.sums([(z, V)], natural=True)[0] - em.sums([(z, 0 * V)], natural=True)[0]
+    np.testing.assert_allclose(natural[:2, :2], np.array([[2, 0.5], [0.5, 0.125]]) * 8 / 3)
+    np.testing.assert_allclose(z * np.sqrt(8 / 3) + 3, [[3, 1], [4, 3], [5, 4]])  # a line through the hole
+    A = em._transitions(np.array([[0.7], [0.1], [9.0], [9.0]]), np.array([[0.0], [2.0]]))
+    np.testing.assert_allclose(A, [[[0.7, 0], [1, 0]], [[0.9, 0], [1, 0]]])

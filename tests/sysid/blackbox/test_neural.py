@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from thermogrip.sysid.blackbox import neural
-from thermogrip.sysid.blackbox.neural import _Data, _Linear, _Member, saturation_levels
+from thermogrip.sysid.blackbox.neural import _Data, _Linear, saturation_levels
+from thermogrip.sysid.models.neural_kernel import run_states
 from thermogrip.sysid.plant.log_grid import Grid, Segment
 
 
@@ -17,13 +18,6 @@ def grid_of(*readings, u=None):
         w = np.zeros((len(y), 3)) if u is None else np.asarray(u[at], dtype=float)
         parts.append(Segment(np.arange(float(len(y))), np.asarray(y, float), w[:, :2], w[:, 2:], "a"))
     return Grid(("q", "p"), ("room",), ("s", "t"), (), 1.0, tuple(parts), 1.0, {})
-
-
-@pytest.mark.parametrize(
-    ("row", "longest"), [([], 0), ([0, 0], 0), ([1, 1, 0, 1], 2), ([1, 0, 1, 1, 1], 3), ([1, 1], 2)]
-)
-def test_the_longest_run(row, longest):
-    assert neural._longest_run(np.array(row, dtype=bool)) == longest
 
 
 @pytest.mark.parametrize(
@@ -42,13 +36,6 @@ def test_eight_rows_at_an_end_are_a_rail(rows, scatter, stands):
     ]
     if not scatter:
         assert saturation_levels(grid_of(low - 1, part))[0].tolist() == [-1.0 if stands else -np.inf, -np.inf]
-
-
-def test_a_structure_has_its_numbers_and_all_together_the_least():
-    one, other = (neural.structure_of(grid_of(np.eye(2)), *size) for size in ((4, 3), (3, 8)))
-    # A 16, B 12, c 4; V and W 24, U 9, b 3
-    assert (one, other) == (("4 states, 3 units", 68), ("3 states, 8 units", 101))
-    assert [neural._together(some).size for some in ([other, one], [])] == [68, 0]
 
 
 @pytest.mark.parametrize(
@@ -82,63 +69,11 @@ def test_how_many_members_are_trained(monkeypatch, readings, how, only, seeds):
     assert found == want | ({together.label: every} if len(seeds) > 1 else {})
 
 
-def test_data_are_scaled_by_their_spread_and_what_never_moves_is_zero():
-    y = [[[1.0, 10.0], [3.0, np.nan]], [[1.0, 30.0], [3.0, 20.0]]]
-    u = [[[0.0, 5.0, 20.0], [2.0, 5.0, 20.0]], [[4.0, 5.0, 20.0], [2.0, 5.0, 28.0]]]
-    data = neural._scaled(grid_of(*y, u=u))
-    assert (data.y_middle.tolist(), data.w_middle.tolist()) == ([2.0, 20.0], [2.0, 5.0, 22.0])
-    np.testing.assert_allclose(
-        [*data.y_size, *data.w_size], [1, np.sqrt(200 / 3), np.sqrt(2), 1, np.sqrt(12)]
-    )
-    np.testing.assert_allclose(data.y[1], [[-1, np.sqrt(1.5)], [1, 0]])
-    np.testing.assert_allclose(data.w[1], [[np.sqrt(2), 0, -np.sqrt(1 / 3)], [0, 0, np.sqrt(3)]], atol=1e-15)
-    np.testing.assert_allclose(data.reach, [1.25 * np.sqrt(2), 0, 1.25 * np.sqrt(3)])
-    assert (data.low.tolist(), data.high.tolist()) == ([-np.inf] * 2, [np.inf] * 2)
-    railed = np.column_stack([[0.0, 4.0] * 2 + [7.0] * 8, np.arange(12.0)])
-    data = neural._scaled(grid_of(railed))
-    assert data.high[0] * data.y_size[0] + data.y_middle[0] == pytest.approx(7.0)
-
-
-def test_padding_keeps_every_number_in_its_place():
-    # A 1 x 1, B 1 x 2, c, V 1 x 2, W 2 x 1, U 2 x 2, b 2
-    one = _Member(np.array([[0.5]]), np.arange(1.0, 14.0), np.array([[7.0], [8.0]]), 2, 0.3)
-    more = one.padded(2, 3)
-    want = [1, 2, 0, 0, 3, 0, 4, 5, 0, 0, 0, 0, 6, 0, 7, 0, 0, 0, 8, 9, 10, 11, 0, 0, 12, 13, 0]
-    assert more.weights.tolist() == want
-    assert (more.A.tolist(), more.x0.tolist()) == ([[0.5, 0], [0, 0]], [[7, 0], [8, 0]])
-    assert (more.h, more.miss) == (3, 0.3)
-
-
 def data_of(w, y=()):
     one, none = np.ones(1), -np.full(1, np.inf)
     return _Data(
         list(y), [np.asarray(some, float) for some in w], 0 * one, one, 0 * one, one, one, none, -none
     )
-
-
-def constant(value, miss=0.0, gain=0.0):
-    """One state, which is value + gain w after the first row; one unit that does nothing."""
-    return _Member(np.zeros((1, 1)), np.array([gain, value, 0, 0, 0, 0.0]), np.zeros((1, 1)), 1, miss)
-
-
-@pytest.mark.parametrize(
-    ("values", "kept"),
-    [((0, 9), [0, 1]), ((9, 0, 1), [0, 1, 2]), ((0, 9, 1, 2), [0, 2, 3]), ((4, 1, 2, 3, 0), [0, 1, 2, 3])],
-)
-def test_three_quarters_nearest_to_the_median_are_kept(values, kept):
-    members = [constant(v) for v in values]
-    assert neural._nearest_to_median(data_of([np.zeros((5, 1))]), members, 1).tolist() == kept
-
-
-def test_the_inputs_run_in_reverse_order_and_the_quarter_that_fits_worst_is_left_out(monkeypatch):
-    w = data_of([np.array([[5.0], [0.0], [0.0]])])  # reversed, all but the run's end is alike
-    gains = [constant(0, gain=g) for g in (0.0, 1.0, 0.1, 0.2)]
-    assert neural._nearest_to_median(w, gains, 1).tolist() == [0, 2, 3]
-    monkeypatch.setattr(neural, "_as_model", lambda grid, data, members, h: [m.weights[1] for m in members])
-    monkeypatch.setattr(neural, "_with_spread", lambda model, grid, starts: (model, starts.shape))
-    misses = (0.5, 0.1, 0.9, 0.2, 0.3)  # of five four fit; of four three agree
-    members = [constant(v, m) for v, m in zip((1.0, 9.0, 1.5, 1.2, 1.1), misses)]
-    assert neural._averaged(None, w, members) == ([1.0, 1.2, 1.1], (3, 1, 1))
 
 
 def test_a_linear_record_keeps_its_linear_fit_and_random_weights_are_drawn_to_zero():
@@ -148,28 +83,13 @@ def test_a_linear_record_keeps_its_linear_fit_and_random_weights_are_drawn_to_ze
         x.append(0.5 * x[-1] + 0.4 * drive + 0.1)
     y = np.array(x)[:, None]
     y[7] = np.nan
-    linear = _Linear(np.array([[0.5]]), np.array([[0.4]]), np.array([0.1]), [np.array([0.7])])
-    data = data_of([w], [y])
+    linear = _Linear(np.array([[0.5]]), np.array([[0.4]]), np.array([0.1]), 2 * [np.array([0.7])])
+    data = data_of([w, w], [y, y])
     found = neural._train(data, linear, 2, seed=0)
     np.testing.assert_allclose(found.weights, [0.4, 0.1, *[0.0] * 8], atol=1e-5)
     assert (found.x0[0, 0], found.h) == (pytest.approx(0.7, abs=1e-5), 2)
     assert found.miss < 1e-8
     off = neural._train(data, _Linear(linear.A, linear.B, linear.c + 0.2, linear.x0), 2, seed=0)
     assert off.weights[1] == pytest.approx(0.1, abs=0.02)  # drawn back by the readings
-    assert off.miss < 0.05
-
-
-def test_steps_end_at_the_least_squares_and_stop_where_none_lowers_the_cost():
-    target, calls = np.array([3.0, -2.0]), []
-
-    def linearise(z):
-        calls.append(z)
-        return np.array([2.0, 1.0]) * (z - target), np.diag([2.0, 1.0])
-
-    found = neural._descend(linearise, lambda z: np.array([2.0, 1.0]) * (z - target), np.zeros(2))
-    np.testing.assert_allclose(found, target, atol=1e-2)
-    # damped by 0.1, 0.01, ...: 2 * 3 / 41 and 2 / 11 are left of it, then hardly anything
-    np.testing.assert_allclose(calls[1], target * [1 - 0.1 / 4.1, 1 - 0.1 / 1.1])
-    np.testing.assert_allclose(target - calls[2], (target - calls[1]) * [0.01 / 4.01, 0.01 / 1.01])
-    stuck = neural._descend(linearise, lambda z: np.full((len(z), 2), 9.0), np.zeros(2))
-    assert stuck.tolist() == [0.0, 0.0]
+    run = run_states(np.array(2 * [[[0.5]]]), np.tile(off.weights, (2, 1)), 2, off.x0, w, data.low, data.high)
+    assert off.miss == pytest.approx(np.nansum((run[:, :-1] - y) ** 2))
