@@ -151,6 +151,7 @@ def test_order_and_delay_are_those_asked_for(kind, fixed):
 def test_an_order_or_delay_that_a_kind_cannot_have_is_refused(kind, fixed, says):
     with pytest.raises(UserError, match=says):
         fit_black_box(kind, [lagged_log(4, 200)], **fixed)
+    assert fitting._of_order("arx", 20, 1).keywords == {"poles": (20,), "delays": (1,)}
 
 
 def test_blocks_hold_every_row_once():
@@ -185,19 +186,19 @@ def stub_grid(rows=(400,), dt=1.0, **more):
         Segment(np.arange(float(n)), np.outer(np.arange(n) % 2, [4.0, 20.0]), *2 * [np.zeros((n, 0))], log)
         for n, log in zip(rows, "abcd")
     ]
-    return Grid((), (), ("s", "t"), (), dt, tuple(parts), 1.0, {"s": "K", "t": "V"}, **more)
+    return Grid((), (), ("s", "t"), (), dt, tuple(parts), 0.5, {"s": "K", "t": "V"}, **more)
 
 
 @pytest.mark.parametrize(
     ("kind", "dt", "rows", "average", "errors", "kept"),  # by step, None: refused
     [
-        ("arx", 2.0, 4000, None, {2.0: 0.3, 1.0: 0.2}, 1.0),
-        ("arx", 2.0, 4000, None, {2.0: 0.2, 1.0: 0.2}, 2.0),
-        ("arx", 2.0, 4000, None, {2.0: None, 1.0: 0.9}, 1.0),
-        ("arx", 2.0, 4000, None, {2.0: 0.9, 1.0: None}, 2.0),
-        ("arx", 2.0, 4000, None, {2.0: None, 1.0: None}, None),
-        ("arx", 2.0, 4001, None, {2.0: 0.3}, 2.0),  # 8002 rows of the log
-        ("arx", 1.5, 400, None, {1.5: 0.3}, 1.5),
+        ("arx", 2.0, 2000, None, {2.0: 0.3, 0.5: 0.2}, 0.5),
+        ("arx", 2.0, 2000, None, {2.0: 0.2, 0.5: 0.2}, 2.0),
+        ("arx", 2.0, 2000, None, {2.0: None, 0.5: 0.9}, 0.5),
+        ("arx", 2.0, 2000, None, {2.0: 0.9, 0.5: None}, 2.0),
+        ("arx", 2.0, 2000, None, {2.0: None, 0.5: None}, None),
+        ("arx", 2.0, 2001, None, {2.0: 0.3}, 2.0),  # 8004 rows of the log
+        ("arx", 0.75, 400, None, {0.75: 0.3}, 0.75),
         ("oe", 2.0, 400, 2.0, {2.0: 0.3}, 2.0),
         ("sindy", 2.0, 400, None, {2.0: 0.3}, 2.0),
         ("neural", 2.0, 400, None, {2.0: 0.3}, 2.0),
@@ -223,12 +224,12 @@ def test_the_logs_own_rate_is_tried_beside_a_chosen_one(monkeypatch, kind, dt, r
         return fit_black_box(kind, [], average=average, progress=lambda *what: said.append(what))
 
     if kept is None:
-        with pytest.raises(UserError, match="at 1 s"):
+        with pytest.raises(UserError, match=r"at 0\.5 s"):
             fit()
     else:
         found = fit()
         assert (found.kind, found.grid.dt, found.choice.error) == (kind, kept, errors[kept])
         own = "the logs' own: held-out free runs err less than at 2 s"
-        assert found.grid.why == (own if kept == 1.0 else "")
+        assert found.grid.why == (own if kept == 0.5 else "")
     assert tried == list(errors)
     assert said == [((k + 0.5) / len(errors), f"{kind}, x") for k in range(len(errors))]
