@@ -200,10 +200,9 @@ def _factorise(
     signals = [np.hstack(pair) for pair in zip(drives(grid, terms), readings)]
     whole = np.concatenate(signals)
     mean, size = np.nanmean(whole, axis=0), np.nanstd(whole, axis=0)
-    n_w = whole.shape[1] - len(grid.outputs)
-    parts = [_windows((z - mean) / np.where(size > 0, size, 1.0), n_w, f) for z in signals if len(z) > 2 * f]
     n_y = len(grid.outputs)
-    parts = [part for part in parts if part.size]
+    n_w = whole.shape[1] - n_y
+    parts = [_windows((z - mean) / np.where(size > 0, size, 1.0), n_w, f) for z in signals if len(z) > 2 * f]
     stacked = np.concatenate(parts) if parts else np.empty((0, 0))
     if stacked.shape[0] < 1.5 * stacked.shape[1] or not stacked.size:
         return None
