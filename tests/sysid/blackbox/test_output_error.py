@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.blackbox.order_selection import choose, drives
-from thermogrip.sysid.blackbox.output_error import Records, oe_family, solve
+from thermogrip.sysid.blackbox.output_error import Records, oe_family, real_pole_starts, solve, with_pole
 from thermogrip.sysid.plant.log_grid import make_grid
 
 
@@ -87,6 +87,9 @@ def test_shifted_columns_are_the_filtered_lags():
     lags = [held[4 - lag : 64 - lag, j] for j in range(2) for lag in (3, 4)]
     X = lfilter([1.0], [1.0, *a], np.column_stack([*lags, np.ones(60), np.eye(60, 2)]), axis=0)
     np.testing.assert_allclose(found.outputs[0], X @ np.linalg.lstsq(X, y, rcond=None)[0], atol=1e-6)
+    np.testing.assert_allclose(with_pole(np.array([-1.3, 0.4])), np.poly([0.8, 0.5, 0.0625])[1:])
+    found = [np.roots([1.0, *some]) for some in real_pole_starts(Records([y], [w]), 2)[::5]]  # 3 to 20 rows
+    np.testing.assert_allclose(found, np.exp([[-1 / 3, -4 / 3], [-1 / 20, -1 / 5]]))
 
 
 def test_a_search_over_many_structures_ends_no_worse_than_one_from_all_starts(first_order, fit_one):
