@@ -14,7 +14,7 @@ from thermogrip.datasets.schema import make_log
 from thermogrip.sysid import Plant, identify
 from thermogrip.sysid.blackbox import fit as fitting
 from thermogrip.sysid.blackbox.fit import FAMILIES, BlackBoxFit, cut_into_blocks, fit_black_box, with_refits
-from thermogrip.sysid.blackbox.order_selection import Choice
+from thermogrip.sysid.blackbox.order_selection import Choice, Structure
 from thermogrip.sysid.models.lti import StartPrior
 from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid
 from thermogrip.sysid.validation.prediction_bands import free_run_band
@@ -190,6 +190,54 @@ def stub_grid(rows=(400,), dt=1.0, **more):
 
 
 @pytest.mark.parametrize(
+    ("rows", "dt", "wanted", "expected"),
+    [
+        ((100, 100, 120), 0.5, None, 10),  # 5 s of whole logs
+        ((1000, 900), 2.0, None, 12),  # 50 samples of 0.5 s, 12.5 steps
+        ((111,), 1.0, None, 6),  # a sixteenth of the rows
+        ((20,), 1.0, None, 2),
+        ((1000,), 2.0, 30.0, 15),
+    ],
+)
+def test_the_warm_up_is_five_seconds_of_whole_logs_and_fifty_samples_of_parts(rows, dt, wanted, expected):
+    assert fitting._warmup_rows(stub_grid(rows, dt), wanted) == expected
+
+
+@pytest.mark.parametrize(
+    ("rows", "warmup"), [((100, 62), 15), ((400,), 50), ((4,), 2)]
+)  # a quarter of the shortest, 2 to 50
+def test_a_refit_errs_by_its_worst_output(monkeypatch, rows, warmup):
+    def errors_of(model, segments, *, dt, scale, warmup, priors):
+        asked.append((model, len(segments), dt, scale.tolist(), warmup, priors))
+        return np.array([[0.3, 0.1]])
+
+    asked, fit = [], SimpleNamespace(grid=stub_grid(rows, 2.0), choice=SimpleNamespace(prior="p"))
+    monkeypatch.setattr(fitting, "free_run_errors", errors_of)
+    assert fitting._error(fit, "m") == 0.3
+    assert asked == [("m", len(rows), 2.0, [2.0, 10.0], warmup, ["p"])]
+
+
+@pytest.mark.parametrize(("dt", "share"), [(2.0, 0.24), (20.0, 1.0)])  # (1 + 19 dt / 10) of 20 readings
+def test_a_plant_keeps_what_the_choice_found(monkeypatch, dt, share):
+    monkeypatch.setattr(fitting, "reading_excess", lambda logs, names, dt: {names[0]: dt})
+    grid, rmse = stub_grid((100, 60), dt, why="so", ends=True), np.array([[3.0, 1.0], [4.0, 7.0]])
+    model = fit_of("oe", lagged_log(0, 100), poles=1, zeros=1, delays=1).plant.model
+    model = replace(model, outputs=("s", "t"), C=np.ones((2, model.n_x)), y0=np.zeros(2))
+    prior = StartPrior(noise=0.1, nuisance=0.3)
+    choice = Choice(Structure("lag", 3), prior, {}, ("a", "b"), rmse, warmup=19, model=model)
+    plant = fitting._plant(grid, choice, [lagged_log(0, 100)])
+    assert plant.noise == pytest.approx({"s": 0.2 * share**0.5, "t": share**0.5})
+    assert plant.nuisance == pytest.approx({"s": 0.6, "t": 3.0})
+    assert (plant.units, plant.valid) == ({"s": "K", "t": "V"}, {"s": (0.0, 4.0), "t": (0.0, 20.0)})
+    assert (plant.dt, plant.logs, plant.inputs_end_at_row) == (dt, ("a", "b"), True)
+    scores = plant.scores
+    assert (scores.structure, scores.average_s, scores.average_why) == ("lag", dt, "so")
+    assert scores.held_out_rmse == pytest.approx({"s": 12.5**0.5, "t": 5.0})
+    assert scores.held_out_by_part == {"s": [3.0, 4.0], "t": [1.0, 7.0]}
+    assert (scores.folds, scores.reading_excess) == (["a", "b"], {"s": dt})
+
+
+@pytest.mark.parametrize(
     ("kind", "dt", "rows", "average", "errors", "kept"),  # by step, None: refused
     [
         ("arx", 2.0, 2000, None, {2.0: 0.3, 0.5: 0.2}, 0.5),
@@ -233,3 +281,60 @@ def test_the_logs_own_rate_is_tried_beside_a_chosen_one(monkeypatch, kind, dt, r
         assert found.grid.why == (own if kept == 0.5 else "")
     assert tried == list(errors)
     assert said == [((k + 0.5) / len(errors), f"{kind}, x") for k in range(len(errors))]
+
+
+@pytest.mark.parametrize(
+    ("dt", "family", "others", "moved"),  # errors of the same structure and of any, which were 0.2
+    [
+        (0.75, "oe", [0.1, 0.1], True),
+        (0.8, "oe", [], False),
+        (0.5, "sindy", [], False),
+        (0.5, "neural", [], False),
+        (0.5, "oe", [0.2], False),
+        (0.5, "oe", [0.1, 0.2], False),
+        (0.5, "oe", [None], False),
+    ],
+)
+def test_inputs_up_to_their_rows_are_taken_where_that_errs_clearly_less(
+    monkeypatch, dt, family, others, moved
+):
+    def choice_of(error):
+        return SimpleNamespace(structure="s", errors={"s": error * np.array([1.0, 1.0, 1.0])})
+
+    def choose_next(grid, family, *, warmup):
+        asked.append((grid.ends, getattr(family, "keywords", None), warmup))
+        if others[len(asked) - 1] is None:
+            raise UserError("unstable")
+        return choice_of(others[len(asked) - 1])
+
+    asked, first = [], choice_of(0.2)
+    monkeypatch.setattr(fitting, "make_grid", lambda *a, average, ends, **n: stub_grid(dt=average, ends=ends))
+    monkeypatch.setattr(fitting, "choose", choose_next)
+    grid = stub_grid(dt=dt, why="so")
+    found, choice = fitting._with_convention(grid, first, [], FAMILIES[family], 9.0)
+    assert (found.ends, found.dt, found.why, choice is not first) == (moved, dt, "so", moved)
+    assert asked == [(True, {"only": "s"}, 9 / dt), (True, None, 9 / dt)][: len(others)]
+
+
+@pytest.mark.parametrize(("agree", "n"), [(6, 6), (1, 2)])  # of the tries after the first
+def test_refits_that_err_more_than_half_as_much_again_are_left_out(monkeypatch, agree, n):
+    made = []
+
+    def family(grid, *, only):
+        made.append((only, len(grid.segments)))
+        return {only: None if len(made) == 1 else len(made)}
+
+    errors = {0: 0.2, **{k: 0.3 if k <= agree + 1 else 0.301 for k in range(1, 99)}}
+    monkeypatch.setitem(fitting.FAMILIES, "oe", family)
+    monkeypatch.setattr(fitting, "_error", lambda fit, model: errors[model])
+    plant = fit_of("arx", lagged_log(0, 320), poles=1, zeros=1, delays=1, terms=()).plant
+    choice = SimpleNamespace(structure="s", model=0)
+    fit, said = BlackBoxFit("oe", plant, choice, stub_grid((320,))), []
+    if agree < n:
+        with pytest.raises(UserError, match="oe: of 6 refits to resampled blocks only 1 agree"):
+            with_refits(fit, n)
+    else:
+        found = with_refits(fit, n, progress=lambda *what: said.append(what))
+        assert found.refits == tuple(range(2, n + 2))
+        assert said == [(k / n, "oe, refits to resampled blocks") for k in (0, *range(n))]
+    assert (set(made), len(made)) == ({("s", 8)}, 7 if agree == n else 6)

@@ -179,3 +179,31 @@ def test_covariances_enter_the_sums_with_the_factors_of_their_row():
     np.testing.assert_allclose(z * np.sqrt(8 / 3) + 3, [[3, 1], [4, 3], [5, 4]])  # a line through the hole
     A = em._transitions(np.array([[0.7], [0.1], [9.0], [9.0]]), np.array([[0.0], [2.0]]))
     np.testing.assert_allclose(A, [[[0.7, 0], [1, 0]], [[0.9, 0], [1, 0]]])
+
+
+@pytest.mark.parametrize(
+    ("rows", "rounds"), [(29, 0), (30, 5)]
+)  # more than 2 (4 (1 + 2) + 1) readings after 4 rows
+def test_five_rounds_are_a_first_guess_where_readings_suffice(monkeypatch, rows, rounds):
+    rng, count = np.random.default_rng(0), []
+    own = missing_data._Em.smoothed
+    monkeypatch.setattr(missing_data._Em, "smoothed", lambda *args: count.append(1) or own(*args))
+    y, q = rng.normal(size=(rows, 1)) + 20, rng.normal(size=(rows, 2))
+    y[2], y[20] = np.nan, np.nan
+    parts = [Segment(np.arange(float(len(some))), some, some, some, "a") for some in (y, y[:5], y[:6])]
+    filled = fill_readings(parts, [q, q[:5], q[:6]])
+    assert len(count) == rounds
+    assert np.isnan(filled[1]).sum() == 1  # too short to be filled
+    assert [filled[0].shape, filled[2].shape] == [y.shape, (6, 1)]
+    assert filled[0][2, 0] == pytest.approx((y[1, 0] + y[3, 0]) / 2)  # before the first regression a line
+
+
+def test_rounds_end_where_they_gain_less_than_a_fiftieth(monkeypatch):
+    segment, q = pulled_walk(30)
+    costs = iter([1.0, 1.5, 1.52, 1.535, 9.0])
+    own = missing_data._Em.smoothed
+    monkeypatch.setattr(missing_data._Em, "smoothed", lambda *args: (own(*args)[0], next(costs)))
+    found = expected_moments([segment], [q], [np.zeros((30, 0))], past_y=1, past_w=1)
+    assert found.log_likelihood == (1.0, 1.5, 1.52, 1.535)
+    costs = iter(range(100))
+    assert expected_moments([segment], [q], [np.zeros((30, 0))], past_y=1, past_w=1).log_likelihood[-1] == 59

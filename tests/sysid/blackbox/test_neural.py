@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from thermogrip.sysid.blackbox import neural
-from thermogrip.sysid.blackbox.neural import _Data, _Linear, saturation_levels
+from thermogrip.sysid.blackbox.neural import _Data, _Linear, _Member, saturation_levels
 from thermogrip.sysid.models.neural_kernel import run_states
-from thermogrip.sysid.plant.log_grid import Grid, Segment
+from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid
 
 
 def grid_of(*readings, u=None):
@@ -18,6 +20,13 @@ def grid_of(*readings, u=None):
         w = np.zeros((len(y), 3)) if u is None else np.asarray(u[at], dtype=float)
         parts.append(Segment(np.arange(float(len(y))), np.asarray(y, float), w[:, :2], w[:, 2:], "a"))
     return Grid(("q", "p"), ("room",), ("s", "t"), (), 1.0, tuple(parts), 1.0, {})
+
+
+@pytest.mark.parametrize(
+    ("row", "longest"), [([], 0), ([0, 0], 0), ([1, 1, 0, 1], 2), ([1, 0, 1, 1, 1], 3), ([1, 1], 2)]
+)
+def test_the_longest_run(row, longest):
+    assert neural._longest_run(np.array(row, dtype=bool)) == longest
 
 
 @pytest.mark.parametrize(
@@ -36,6 +45,13 @@ def test_eight_rows_at_an_end_are_a_rail(rows, scatter, stands):
     ]
     if not scatter:
         assert saturation_levels(grid_of(low - 1, part))[0].tolist() == [-1.0 if stands else -np.inf, -np.inf]
+
+
+def test_a_structure_has_its_numbers_and_all_together_the_least():
+    one, other = (neural.structure_of(grid_of(np.eye(2)), *size) for size in ((4, 3), (3, 8)))
+    # A 16, B 12, c 4; V and W 24, U 9, b 3
+    assert (one, other) == (("4 states, 3 units", 68), ("3 states, 8 units", 101))
+    assert [neural._together(some).size for some in ([other, one], [])] == [68, 0]
 
 
 @pytest.mark.parametrize(
@@ -69,11 +85,63 @@ def test_how_many_members_are_trained(monkeypatch, readings, how, only, seeds):
     assert found == want | ({together.label: every} if len(seeds) > 1 else {})
 
 
+def test_data_are_scaled_by_their_spread_and_what_never_moves_is_zero():
+    y = [[[1.0, 10.0], [3.0, np.nan]], [[1.0, 30.0], [3.0, 20.0]]]
+    u = [[[0.0, 5.0, 20.0], [2.0, 5.0, 20.0]], [[4.0, 5.0, 20.0], [2.0, 5.0, 28.0]]]
+    data = neural._scaled(grid_of(*y, u=u))
+    assert (data.y_middle.tolist(), data.w_middle.tolist()) == ([2.0, 20.0], [2.0, 5.0, 22.0])
+    np.testing.assert_allclose(
+        [*data.y_size, *data.w_size], [1, np.sqrt(200 / 3), np.sqrt(2), 1, np.sqrt(12)]
+    )
+    np.testing.assert_allclose(data.y[1], [[-1, np.sqrt(1.5)], [1, 0]])
+    np.testing.assert_allclose(data.w[1], [[np.sqrt(2), 0, -np.sqrt(1 / 3)], [0, 0, np.sqrt(3)]], atol=1e-15)
+    np.testing.assert_allclose(data.reach, [1.25 * np.sqrt(2), 0, 1.25 * np.sqrt(3)])
+    assert (data.low.tolist(), data.high.tolist()) == ([-np.inf] * 2, [np.inf] * 2)
+    railed = np.column_stack([[0.0, 4.0] * 2 + [7.0] * 8, np.arange(12.0)])
+    data = neural._scaled(grid_of(railed))
+    assert data.high[0] * data.y_size[0] + data.y_middle[0] == pytest.approx(7.0)
+
+
+def test_padding_keeps_every_number_in_its_place():
+    # A 1 x 1, B 1 x 2, c, V 1 x 2, W 2 x 1, U 2 x 2, b 2
+    one = _Member(np.array([[0.5]]), np.arange(1.0, 14.0), np.array([[7.0], [8.0]]), 2, 0.3)
+    more = one.padded(2, 3)
+    want = [1, 2, 0, 0, 3, 0, 4, 5, 0, 0, 0, 0, 6, 0, 7, 0, 0, 0, 8, 9, 10, 11, 0, 0, 12, 13, 0]
+    assert more.weights.tolist() == want
+    assert (more.A.tolist(), more.x0.tolist()) == ([[0.5, 0], [0, 0]], [[7, 0], [8, 0]])
+    assert (more.h, more.miss) == (3, 0.3)
+
+
 def data_of(w, y=()):
     one, none = np.ones(1), -np.full(1, np.inf)
     return _Data(
         list(y), [np.asarray(some, float) for some in w], 0 * one, one, 0 * one, one, one, none, -none
     )
+
+
+def constant(value, miss=0.0, gain=0.0):
+    """One state, which is value + gain w after the first row; one unit that does nothing."""
+    return _Member(np.zeros((1, 1)), np.array([gain, value, 0, 0, 0, 0.0]), np.zeros((1, 1)), 1, miss)
+
+
+@pytest.mark.parametrize(
+    ("values", "kept"),
+    [((0, 9), [0, 1]), ((9, 0, 1), [0, 1, 2]), ((0, 9, 1, 2), [0, 2, 3]), ((4, 1, 2, 3, 0), [0, 1, 2, 3])],
+)
+def test_three_quarters_nearest_to_the_median_are_kept(values, kept):
+    members = [constant(v) for v in values]
+    assert neural._nearest_to_median(data_of([np.zeros((5, 1))]), members, 1).tolist() == kept
+
+
+def test_the_inputs_run_in_reverse_order_and_the_quarter_that_fits_worst_is_left_out(monkeypatch):
+    w = data_of([np.array([[5.0], [0.0], [0.0]])])  # reversed, all but the run's end is alike
+    gains = [constant(0, gain=g) for g in (0.0, 1.0, 0.1, 0.2)]
+    assert neural._nearest_to_median(w, gains, 1).tolist() == [0, 2, 3]
+    monkeypatch.setattr(neural, "_as_model", lambda grid, data, members, h: [m.weights[1] for m in members])
+    monkeypatch.setattr(neural, "_with_spread", lambda model, grid, starts: (model, starts.shape))
+    misses = (0.5, 0.1, 0.9, 0.2, 0.3)  # of five four fit; of four three agree
+    members = [constant(v, m) for v, m in zip((1.0, 9.0, 1.5, 1.2, 1.1), misses)]
+    assert neural._averaged(None, w, members) == ([1.0, 1.2, 1.1], (3, 1, 1))
 
 
 def test_a_linear_record_keeps_its_linear_fit_and_random_weights_are_drawn_to_zero():
@@ -93,3 +161,75 @@ def test_a_linear_record_keeps_its_linear_fit_and_random_weights_are_drawn_to_ze
     assert off.weights[1] == pytest.approx(0.1, abs=0.02)  # drawn back by the readings
     run = run_states(np.array(2 * [[[0.5]]]), np.tile(off.weights, (2, 1)), 2, off.x0, w, data.low, data.high)
     assert off.miss == pytest.approx(np.nansum((run[:, :-1] - y) ** 2))
+
+
+def test_steps_end_at_the_least_squares_and_stop_where_none_lowers_the_cost():
+    target, calls = np.array([3.0, -2.0]), []
+
+    def linearise(z):
+        calls.append(z)
+        return np.array([2.0, 1.0]) * (z - target), np.diag([2.0, 1.0])
+
+    found = neural._descend(linearise, lambda z: np.array([2.0, 1.0]) * (z - target), np.zeros(2))
+    np.testing.assert_allclose(found, target, atol=1e-2)
+    # damped by 0.1, 0.01, ...: 2 * 3 / 41 and 2 / 11 are left of it, then hardly anything
+    np.testing.assert_allclose(calls[1], target * [1 - 0.1 / 4.1, 1 - 0.1 / 1.1])
+    np.testing.assert_allclose(target - calls[2], (target - calls[1]) * [0.01 / 4.01, 0.01 / 1.01])
+    stuck = neural._descend(linearise, lambda z: np.full((len(z), 2), 9.0), np.zeros(2))
+    assert stuck.tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize(("rows", "head"), [(4, 3), (16, 4), (199, 49), (400, 50)])
+def test_a_start_is_that_of_a_quarter_of_the_readings_of_three_to_fifty(rows, head):
+    asked = SimpleNamespace(start=lambda *parts: [len(part) for part in parts] + [part[0] for part in parts])
+    signals = (np.full(rows, k) for k in (1, 2, 3))
+    assert neural._head_start(asked, *signals) == [head] * 3 + [1, 2, 3]
+
+
+def test_linear_starts_run_as_the_best_subspace_model_in_scaled_units(coupled):
+    grid = make_grid([coupled.log(n, seed=n, reading=0.05) for n in (300, 200)], average=1.0)
+    data = neural._scaled(grid)
+    starts = neural._linear_starts(grid, data, [2, 3])
+    family = list(neural.subspace_family(grid, orders=(2, 3), terms=((),)).values())
+    for n, linear in starts.items():
+        runs = []
+        for model in (some for some in family if some.n_x == n and np.abs(some.poles()).max() <= 0.9995):
+            x0 = [neural._head_start(model, s.y, s.u, s.d) for s in grid.segments]
+            run = [
+                model.rollout(x[None], s.u[None], s.d[None], (), 1.0)[0][0, :-1]
+                for x, s in zip(x0, grid.segments)
+            ]
+            off = [(some - s.y) / data.y_size for some, s in zip(run, grid.segments)]
+            runs.append((sum(np.sum(some**2) for some in off), run))
+        best = min(runs, key=lambda pair: pair[0])[1]
+        for x, w, run in zip(linear.x0, data.w, best):
+            seen = []
+            for row in w:
+                seen.append(x[:2])
+                x = linear.A @ x + linear.B @ row + linear.c
+            np.testing.assert_allclose(seen, (run - data.y_middle) / data.y_size, atol=1e-6)
+    assert list(starts) == [2, 3]
+
+
+def test_members_of_two_sizes_are_one_model_in_the_units_of_the_readings():
+    u = [np.array([[0.0, 5.0, 20.0], [2.0, 7.0, 23.0], [4.0, 5.0, 20.0]])]
+    grid = grid_of([[[1.0, 10.0], [3.0, 20.0], [2.0, 60.0]]][0], u=u)
+    data, rng = neural._scaled(grid), np.random.default_rng(4)
+    sizes = [(2, 3), (3, 1)]  # of n (3 + 1) + 2 n h + 3 h + h numbers
+    members = [
+        _Member(0.3 * np.eye(n), rng.normal(size=n * 4 + 2 * n * h + 4 * h), rng.normal(size=(1, n)), h, 0.1)
+        for n, h in sizes
+    ]
+    model = neural._averaged(grid, data, members)
+    assert (model.A.shape, model.V.shape, model.U.shape) == ((2, 3, 3), (2, 3, 3), (2, 3, 3))
+    x0, drive = np.concatenate([some.padded(3, 3).x0[0] for some in members])[None], u[0][None]
+    rows = model.states(x0, drive[:, :, :2], drive[:, :, 2:], 1.0)[0]
+    spread = np.cov(rows.T)
+    np.testing.assert_allclose(model.spread, spread + 1e-8 * np.trace(spread) * np.eye(6), rtol=1e-12)
+    n, h = sizes[0]
+    B, c, V, W, U, b = np.split(members[0].weights, np.cumsum([6, 2, 6, 6, 9]))
+    w = data.w[0][0]
+    x = members[0].x0[0]
+    z = np.tanh(W.reshape(h, n) @ x + U.reshape(h, 3) @ w + b)
+    np.testing.assert_allclose(rows[1][:2], 0.3 * x + B.reshape(n, 3) @ w + c + V.reshape(n, h) @ z)
+    assert (model.y_middle.tolist(), model.low.tolist()) == ([2.0, 30.0], [-np.inf] * 2)

@@ -7,8 +7,9 @@ import pytest
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.blackbox import order_selection as selection
-from thermogrip.sysid.blackbox.order_selection import Structure
+from thermogrip.sysid.blackbox.order_selection import Choice, Structure
 from thermogrip.sysid.models.lti import StartPrior
+from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import Grid, Segment
 
 SMALL, MIDDLE, LARGE = Structure("small", 2), Structure("middle", 3), Structure("large", 5)
@@ -35,6 +36,20 @@ def test_each_noise_is_tried_with_each_offset():
 
 def spans(segments):
     return [(s.log, int(s.time[0]), int(s.time[-1]) + 1) for s in segments]
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "inside", "outside"),  # of 50 rows of a and 40 of b; what remains has 20 rows at least
+    [
+        (10, 60, [("a", 10, 50), ("b", 0, 10)], [("b", 10, 40)]),
+        (20, 30, [("a", 20, 30)], [("a", 0, 20), ("a", 30, 50), ("b", 0, 40)]),
+        (19, 31, [("a", 19, 31)], [("b", 0, 40)]),
+        (50, 70, [("b", 0, 20)], [("a", 0, 50), ("b", 20, 40)]),
+    ],
+)
+def test_a_block_is_cut_out_of_the_rows_of_all_segments(first, last, inside, outside):
+    found = selection._split([rows(50), rows(40, "b")], first, last)
+    assert [spans(part) for part in found] == [inside, outside]
 
 
 def test_two_logs_are_cut_into_four_blocks_of_twenty_rows_at_least():
@@ -187,3 +202,66 @@ def test_the_smallest_of_the_good_ones_is_taken(table, chosen):
     assert selection._one_standard_error({s: np.array(e) for s, e in table.items()}).label == chosen
     with pytest.raises(UserError, match="no structure gives a stable model"):
         selection._one_standard_error({SMALL: np.array([0.1, np.inf])})
+
+
+@pytest.mark.parametrize(("errors", "mean"), [((0.02, 0.5), 0.1), ((0.0, 4.0), 2e-6)])
+def test_the_error_of_a_choice_is_a_geometric_mean(errors, mean):
+    choice = Choice(SMALL, StartPrior(), {SMALL: np.array(errors)}, (), np.zeros((2, 1)), 3, None)
+    assert choice.error == pytest.approx(mean)
+
+
+def test_drives_are_inputs_disturbances_and_products_of_which_still_ones_are_none():
+    u = np.array([[-2.0, 5.0, 0.0], [3.0, 5.0 + 4e-9, 7.0], [1.0, 5.0, 7.0]])
+    d = np.array([[20.0], [20.0 + 3e-8], [20.0]])  # a billionth of it is 2e-8
+    parts = (segment(np.zeros((3, 1)), u, d), segment(np.zeros((1, 1)), u[1:2], d[:1]))
+    grid = grid_of(*parts, inputs=("q", "still", "p"), disturbances=("room",))
+    first, second = selection.drives(grid, ("|q|", "q*|q|"))
+    want = np.column_stack([u[:, 0], [0] * 3, u[:, 2], d, [2, 3, 1], [-4, 9, 1]])
+    np.testing.assert_array_equal(first, want)
+    np.testing.assert_array_equal(second, [[3.0, 0.0, 7.0, 20.0, 3.0, 9.0]])
+
+
+@pytest.mark.parametrize(
+    ("lowest", "highest", "pump", "switched", "count"),
+    [(-1, 1, 1, True, 6), (-1, 1, 1, False, 3), (-1, 1, 0, True, 3), (0, 1, 1, True, 2), (-1, 0, 0, True, 1)],
+)
+def test_magnitudes_of_signed_inputs_and_products_with_moving_switches_are_tried(
+    lowest, highest, pump, switched, count
+):
+    u = np.array([[lowest, 0], [highest, pump]])
+    grid = grid_of(
+        segment(np.zeros((2, 1)), u), inputs=("q", "pump"), disturbances=("room",), switches=("pump",)
+    )
+    sets = [(), ("|q|",), ("|q|", "q*|q|")][: 3 if lowest * highest else 1]
+    products = [(*some, "pump*q", "pump*room") for some in sets]
+    want = sets + (products if pump and switched else [])
+    assert list(selection.default_terms(grid, switched=switched)) == want
+    assert len(want) == count
+
+
+def test_the_spread_of_the_states_is_that_of_the_run_and_a_trace_more():
+    parts = {"A": np.diag([0.5, 0.0]), "B": [[2.0], [0.0]], "C": [[1.0, 0.0]], "c": [0.0, 0.0]}
+    grid = grid_of(
+        segment(np.zeros((2, 1)), [[1.0], [2.0]]), segment(np.zeros((1, 1)), [[3.0]]), inputs=("q",)
+    )
+    W, A = np.array(parts["B"]), np.array(parts["A"])
+    model = selection.as_state_space(grid, A, W, np.eye(1, 2), np.zeros(2), terms=(), origin="arx")
+    assert (model.dt, model.origin, model.outputs) == (2.0, "arx", ("t",))
+    found = selection.with_spread(model, grid, [np.array([4.0, 0.0]), np.array([1.0, 0.0])])
+    # states 4, 4, 6 and 1, 6.5: sum 21.5, squares 111.25, so 18.8 / 4
+    assert np.trace(found.spread) == pytest.approx(4.7 * (1 + 2e-8), rel=1e-12)
+    assert found.spread[1, 1] == pytest.approx(4.7e-8)
+    assert isinstance(found, StateSpaceModel)
+    still = grid_of(segment(np.zeros((2, 1)), [[0.0], [0.0]]), inputs=("q",))
+    spread = selection.with_spread(model, still, [np.zeros(2)]).spread
+    np.testing.assert_allclose(spread, 1e-20 * np.eye(2), rtol=1e-6)
+    assert selection.with_spread(model, grid, [np.array([np.inf, 0.0]), np.zeros(2)]) is model
+
+
+def test_products_have_columns_of_their_own_after_inputs_and_disturbances():
+    grid = grid_of(inputs=("q", "p"), disturbances=("room",))
+    W = np.array([[1.0, 2.0, 3.0, 4.0]])
+    how = {"terms": ("|q|",), "origin": "oe"}
+    model = selection.as_state_space(grid, np.eye(1) / 2, W, np.eye(1), np.ones(1), **how, y0=np.array([7.0]))
+    assert [part.tolist() for part in (model.B, model.E, model.F)] == [[[1.0, 2.0]], [[3.0]], [[4.0]]]
+    assert (model.y0.tolist(), model.c.tolist(), model.terms) == ([7.0], [1.0], ("|q|",))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import casadi as ca
@@ -13,7 +14,7 @@ from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.blackbox import sindy
 from thermogrip.sysid.blackbox.sindy import sindy_family
 from thermogrip.sysid.models.polynomial import SindyModel
-from thermogrip.sysid.plant.log_grid import make_grid
+from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid
 
 
 def radiating_log(n: int = 1500, seed: int = 0, name: str = "a"):
@@ -145,3 +146,57 @@ def test_the_structures_are_degrees_thresholds_memories_and_widths(grid, monkeyp
         only=("degree 0, memory 1, threshold 0.3", 1),
     ).values()
     assert only == (0, 1, 0.3, 0)
+
+
+def test_rows_are_cut_at_lost_readings_scaled_and_summed_with_bumps():
+    y = np.array([1.0, 4.0, 9.0, 16.0, 25.0, 36.0, 49.0, 64.0, *[np.nan] * 6, *[7.0] * 5, np.nan])[:, None]
+    q = np.arange(20.0)[:, None]
+    part = Segment(np.arange(20.0), y, q, 10 * q, "a")
+    assert sindy._whole(part) == [(0, 8), (14, 19)]
+    two = Grid(("q",), ("room",), ("t",), (), 1.0, (part,), 1.0, {})
+    x, w, move = sindy._trajectories(two, 2)  # runs of 7 rows at least
+    assert [some.tolist() for some in x] == [[[4, 1], [9, 4], [16, 9], [25, 16], [36, 25], [49, 36]]]
+    assert (w[0][:, 0].tolist(), w[0][0, 1]) == ([1, 2, 3, 4, 5, 6], 10.0)
+    assert move[0][:, 0].tolist() == [5, 7, 9, 11, 13, 15]
+    short, *_ = sindy._trajectories(replace(two, segments=(part.part(0, 7), part.part(0, 6))), 2)
+    assert [len(some) for some in short] == [5]
+    rows, middle, size = sindy._scaled([np.array([[1.0], [5.0]])], [np.array([[3.0], [3.0]])])
+    assert (rows[0].tolist(), middle.tolist(), size.tolist()) == ([[-1, 0], [1, 0]], [3, 3], [2, 1])
+    terms = sindy._Features(
+        [np.eye(8)[:, :1], np.eye(7)], [np.arange(16.0).reshape(8, 2), np.eye(7)], None, None, None, 1
+    )
+    theta, moved = sindy._bumped(replace(terms, theta=terms.theta[:1], move=terms.move[:1]), 8)
+    # (1 - v^2)^2 at v = 7/8, 5/8, 3/8, 1/8, of norm 1.8029
+    bump = np.array([0.054932, 0.371338, 0.738525, 0.968994]) / 1.802930
+    np.testing.assert_allclose(theta, [[bump[0]]], rtol=1e-4)
+    np.testing.assert_allclose(moved, [[14 * bump.sum(), 16 * bump.sum()]], rtol=1e-4)
+    assert [
+        len(part) for part in sindy._bumped(replace(terms, theta=[np.eye(13)], move=[np.eye(12)]), 8)
+    ] == [3, 3]
+    assert [
+        part.shape for part in sindy._bumped(replace(terms, theta=[np.eye(7)], move=[np.eye(7)]), 8)
+    ] == 2 * [(0, 7)]
+
+
+def test_a_polynomial_of_scaled_variables_is_expanded():
+    # 3 z1^2 z2 with z1 = (x - 2) / 4, z2 = (w + 1) / 5: 3/80 (x^2 - 4 x + 4) (w + 1); and 7
+    powers = np.array([[2, 1], [0, 0], [2, 0], [1, 1], [1, 0], [0, 1]])
+    scaling = np.array([2.0, -1.0]), np.array([4.0, 5.0])
+    powers, found = sindy._natural(powers, np.array([[3.0, 7.0, 0, 0, 0, 0]]), *scaling)
+    want = {(2, 1): 1, (2, 0): 1, (1, 1): -4, (1, 0): -4, (0, 1): 4, (0, 0): 4 + 7 * 80 / 3}
+    assert dict(zip(map(tuple, powers.tolist()), found[0] * 80 / 3)) == pytest.approx(want)
+
+
+@pytest.mark.parametrize(
+    ("rows", "width", "fits"), [(24, 0, True), (23, 0, False), (82, 36, True), (81, 36, False)]
+)
+def test_terms_need_rows(rows, width, fits):
+    # 3 * 1 + 20 increments; with a bump of 36 (81 - 36) / 9 + 1 sums, two for each of three terms
+    found = sindy_family(
+        make_grid([radiating_log(rows)], average=1.0),
+        degrees=(1,),
+        thresholds=(0.0,),
+        memories=(1,),
+        widths=(width,),
+    )
+    assert bool(found) == fits

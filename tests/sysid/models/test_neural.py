@@ -286,27 +286,6 @@ def test_what_is_not_a_model_is_refused(tank):
         NeuralModel.from_dict(broken)
 
 
-def test_members_of_all_sizes_are_one_more_structure_whose_padding_does_nothing():
-    grid = make_grid([tank_log(300)], average=1.0)
-    how = {"states": (1, 2), "units": (2, 3), "members": 1}
-    family = neural_family(grid, **how)
-    together = list(family)[-1]
-    assert together.label == "members of all sizes"
-    assert together.size == min(some.size for some in family if some != together)
-    u, d = grid.segments[0].u[None], grid.segments[0].d[None]
-    single = [model for some, model in family.items() if some != together]  # one member each
-    n, count = 2, family[together].A.shape[0]
-    assert family[together].A.shape == (count, n, n)
-    own = [model.rollout(np.zeros((1, model.n_x)), u, d, (), 1.0)[0][0] for model in single]
-    whole = family[together].rollout(np.zeros((1, count * n)), u, d, (), 1.0)[0][0]
-    assert count == 3
-    parts = [(sum(own) - left_out) / 3 for left_out in own]  # three of the four
-    assert min(np.abs(whole - part).max() for part in parts) < 1e-9
-    alone = neural_family(grid, **how, only=together)
-    assert list(alone) == [together]
-    np.testing.assert_array_equal(alone[together].W, family[together].W)
-
-
 def test_the_same_data_give_the_same_model():
     grid = make_grid([tank_log(300)], average=1.0)
     one, other = (neural_family(grid, states=(2,), units=(3,), members=2) for _ in range(2))
