@@ -15,6 +15,7 @@ from thermogrip.sysid.effusivity import calibration
 from thermogrip.sysid.effusivity.calibration import calibrate_example_gripper, calibrate_gripper
 from thermogrip.sysid.effusivity.data import touches
 from thermogrip.sysid.effusivity.gripper_model import (
+    INSULATOR,
     SHARED_NAMES,
     another_gripper,
     load_default_gripper,
@@ -87,6 +88,13 @@ def test_the_bundled_gripper_is_what_its_training_grasps_make():
         assert again.blocks[label].ln_h == pytest.approx(block.ln_h, abs=1e-4)
         assert again.blocks[label].ln_effusivity == pytest.approx(block.ln_effusivity, abs=1e-4)
     assert again.trained_on == bundled.trained_on
+
+
+def test_a_block_at_the_bound_of_insulators_is_none():
+    library = tuple(calibration.Anchor(e, 0.1, 2e6) for e in (2999.0, INSULATOR, 3001.0))
+    which = np.array([1, 0, 2, 0])
+    problem = calibration.Problem(None, None, ("a", "b", "c"), library, which, None, np.zeros(3))
+    assert problem.insulating.tolist() == [False, True, False, True]
 
 
 def test_calibration_finds_the_blocks_it_was_shown(device):

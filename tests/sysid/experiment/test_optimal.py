@@ -395,6 +395,7 @@ def test_ratios_of_schedules_are_powers_of_two_of_their_bits():
     found = Expectation({"now": 0.0, "a": 3.0, "b": 1.0, "c": 900.0}, {"b": {"x": 1.0, "y": 2.0}}, {})
     assert (found.determinant_ratio("a", "b"), found.narrower("a", "b")) == (16.0, 2.0)
     assert found.determinant_ratio("c", "now") == 2.0**1000
+    assert found in {found}  # itself alone, and a key although its fields are none
 
 
 def test_a_schedule_without_a_switch_has_it_on(block):

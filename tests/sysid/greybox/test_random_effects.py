@@ -223,6 +223,22 @@ def test_the_first_bins_of_a_log_say_how_it_began():
     assert random_effects._warm_up(drifting, 0, start, 2, [lead]) is None
 
 
+def test_a_start_after_a_gap_is_three_times_less_certain_than_the_first():
+    model = load_network("tclab")
+    t = np.r_[0.0:300.0, 500.0:800.0]
+    columns = dict.fromkeys(model.inputs, (0 * t, "percent", "input"))
+    columns |= dict.fromkeys(model.outputs, (0 * t + 25.0, "degC", "output"))
+    problem = make_problem(model, [make_log(t, columns)], average=5.0, independent=5.0)
+    z = np.zeros(len(problem.free))
+    start, p = problem.start(z)[0][0], problem.parameters(z[None])
+    before, after = (random_effects._of_start(problem, 0, k, p, start)[-1].parts for k in (0, 1))
+    for j in range(len(model.outputs)):
+        assert not before[1][j].any()
+        assert not after[0][j].any()
+        np.testing.assert_allclose(np.abs(after[1][j]), 3 * np.abs(before[0][j]), rtol=2e-3)
+    assert max(np.abs(part).max() for part in before[0]) > 0.1
+
+
 def test_signals_of_the_discrepancy_are_about_the_air_or_the_mean():
     model = SimpleNamespace(inputs=("drive", "pump"), disturbances=("air",), switches=("pump",))
     u, d = np.array([[-1.0, 1.0], [2.0, 0.0]]), np.array([[20.0], [21.0]])
