@@ -293,9 +293,7 @@ def _unlike_inputs(
 
     ``stated``: inputs that need no guess. Where none is held a controller moves them, in every row.
     """
-    by_unit = [
-        name for name, (_, why) in guesses.items() if why.startswith("its unit is") and why[12:] != "degC"
-    ]
+    by_unit = [n for n, (role, why) in guesses.items() if role == "input" and why.startswith("its unit")]
     likely = [n for n, (role, why) in guesses.items() if role == "input" or why == NO_CLUE]
     held = next((name for name in (*stated, *likely) if _is_held(columns[name])), None)
     moving = [

@@ -112,36 +112,27 @@ class Dynamics:
     @property
     def rise_time(self) -> Array:
         """Seconds until a step has moved each output by 63 % of its gain, (n_y, n_w); ``nan``: never."""
-        time, step = self.step_response(2000)
-        share = step.value / np.where(step.value[-1] == 0, np.nan, step.value[-1])
+        steps = self._steps(2000)
+        rise = _rise(self.near, steps, 2000)
+        share = rise / np.where(rise[-1] == 0, np.nan, rise[-1])
         there = share >= _RISEN
-        return np.where(there.any(axis=0), time[there.argmax(axis=0)], np.nan)
+        return np.where(there.any(axis=0), there.argmax(axis=0) * steps * self.dt, np.nan)
 
     def step_response(self, n: int = 300) -> tuple[Array, Estimate]:
         """Return times (n + 1,) [s] and the response (n + 1, n_y, n_w) to a unit step of each input at 0 s.
 
         The last time is five of the slowest time constants.
         """
-        slowest = self.time_constants[np.isfinite(self.time_constants)].max(initial=self.dt)
-        steps = max(1, round(_LONG * slowest / (n * self.dt)))
-
-        def rise(near: LinearPlant) -> Array:
-            A, B = composed(near.A, near.B, steps)
-            x, out = np.zeros_like(B), [np.zeros((len(near.outputs), len(near.inputs)))]
-            for _ in range(n):
-                x = A @ x + B
-                out.append(near.C @ x)
-            return np.array(out)
-
-        return steps * self.dt * np.arange(n + 1), self._estimate(rise)
+        steps = self._steps(n)
+        time = np.asarray(steps * self.dt * np.arange(n + 1), dtype=float)
+        return time, self._estimate(lambda near: _rise(near, steps, n))
 
     def frequency_response(self, n: int = 100) -> tuple[Array, Estimate, Estimate]:
         """Return frequencies (n,) [rad/s], magnitude and phase [deg] (n, n_y, n_w) from inputs to outputs.
 
         From a tenth of the slowest pole to the Nyquist frequency of the step.
         """
-        slowest = self.time_constants[np.isfinite(self.time_constants)].max(initial=self.dt)
-        omega = np.geomspace(min(0.1 / slowest, 0.1 / self.dt), np.pi / self.dt, n)
+        omega = np.geomspace(min(0.1 / self._slowest, 0.1 / self.dt), np.pi / self.dt, n)
 
         def response(near: LinearPlant) -> NDArray[np.complex128]:
             turned = np.exp(1j * omega * self.dt)[:, None, None] * np.eye(len(near.A)) - near.A
@@ -193,6 +184,15 @@ class Dynamics:
             "gains": self.rows(),
         }
 
+    @property
+    def _slowest(self) -> float:
+        taus = self.time_constants
+        return float(taus[np.isfinite(taus)].max(initial=self.dt))
+
+    def _steps(self, n: int) -> int:
+        """Return how many steps of the plant lie between n points of a step response."""
+        return max(1, round(_LONG * self._slowest / (n * self.dt)))
+
     def _estimate(self, of: Callable[[LinearPlant], Array], gain_sd: Array | None = None) -> Estimate:
         """Return a quantity whose last axis is that of the inputs, with its interval."""
         value = np.asarray(of(self.near))
@@ -202,6 +202,16 @@ class Dynamics:
         sd = np.sqrt(variance + ((self.gain_sd if gain_sd is None else gain_sd) * value) ** 2)
         half = NormalDist().inv_cdf(0.5 + self.level / 2) * sd
         return Estimate(value, value - half, value + half)
+
+
+def _rise(near: LinearPlant, steps: int, n: int) -> Array:
+    """Return the response (n + 1, n_y, n_w) to a unit step of each input, every so many steps."""
+    A, B = composed(near.A, near.B, steps)
+    x, out = np.zeros_like(B), [np.zeros((len(near.outputs), len(near.inputs)))]
+    for _ in range(n):
+        x = A @ x + B
+        out.append(near.C @ x)
+    return np.array(out)
 
 
 def plant_dynamics(
@@ -251,9 +261,7 @@ def plant_dynamics(
     """
     if not 0 < level < 1:
         raise UserError(f"level {level:g} is not between 0 and 1", hint="0.9 is usual")
-    u = {name: _middle(plant, name) for name in plant.inputs if name not in plant.model.switches}
-    d = {name: _middle(plant, name) for name in plant.disturbances if name in plant.valid}
-    u, d = u | dict(inputs or {}), d | dict(disturbances or {})
+    u, d = usual_point(plant, inputs, disturbances)
 
     def about(k: int) -> LinearPlant:
         return linearise_plant(plant.draw(k), inputs=u, disturbances=d, dt=plant.dt)
@@ -267,6 +275,16 @@ def plant_dynamics(
     few = 0 < len(plant.logs) < SEVERAL
     spread = np.array([RUN_GAIN_SD if few and name in plant.inputs else 0.0 for name in near.inputs])
     return Dynamics(near, tuple(others), spread, dict(plant.units), level)
+
+
+def usual_point(
+    plant: Plant, inputs: Mapping[str, float] | None, disturbances: Mapping[str, float] | None
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the inputs and disturbances that are named, and the others in the middle of what the logs cover;
+    see :func:`plant_dynamics`."""
+    u = {name: _middle(plant, name) for name in plant.inputs if name not in plant.model.switches}
+    d = {name: _middle(plant, name) for name in plant.disturbances if name in plant.valid}
+    return u | dict(inputs or {}), d | dict(disturbances or {})
 
 
 def _middle(plant: Plant, name: str) -> float:

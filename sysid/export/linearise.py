@@ -29,6 +29,7 @@ from scipy.linalg import logm
 
 from thermogrip.datasets.atomic_files import atomic_path, write_atomic
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.media import csv_text
 from thermogrip.sysid.models.model import GreyModel
 
 if TYPE_CHECKING:
@@ -167,16 +168,16 @@ def save_linear(near: LinearPlant, path: str | Path) -> Path:
     if file.suffix == ".json":
         numbers = {name: value.tolist() for name, value in (matrices | point).items()}
         text = json.dumps(numbers | {name: list(words) for name, words in labels.items()} | {"dt": near.dt})
-        return write_atomic(file, (text + "\n").encode())
+        return write_atomic(file, text + "\n")
     axes = {"A": ("states", "states"), "B": ("states", "inputs"), "C": ("outputs", "states")}
     axes["D"] = ("outputs", "inputs")
-    lines = ["matrix,row,column,value"]
+    rows: list[tuple[object, ...]] = [("matrix", "row", "column", "value")]
     for name, (down, across) in axes.items():
         for row, values in zip(labels[down], matrices[name]):
-            lines += [f"{name},{row},{at},{value!r}" for at, value in zip(labels[across], values.tolist())]
+            rows += [(name, row, at, value) for at, value in zip(labels[across], values.tolist())]
     for name, words in (("x0", "states"), ("u0", "inputs"), ("y0", "outputs")):
-        lines += [f"{name},{label},,{value!r}" for label, value in zip(labels[words], point[name].tolist())]
-    return write_atomic(file, ("\n".join(lines) + "\n").encode())
+        rows += [(name, label, "", value) for label, value in zip(labels[words], point[name].tolist())]
+    return write_atomic(file, csv_text(rows))
 
 
 def operating_point(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.data.data_quality import Finding
 from thermogrip.sysid.experiment.information import plant_from_prior
 from thermogrip.sysid.export.dynamics import plant_dynamics
-from thermogrip.sysid.export.linearise import linearise_plant
+from thermogrip.sysid.export.linearise import linearise_plant, save_linear
 from thermogrip.sysid.identification import Row, Searched, SignalRole
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.network_spec import builtin_networks
@@ -328,7 +329,8 @@ def test_a_plant_is_scored_log_by_log_beside_its_baselines(bench: Bench, stand_i
     assert all(
         (call.args[0].inputs, call.args[1].attrs["name"][:4]) == (("drive", "pump"), "good") for call in runs
     )
-    assert sections[0].args == (runs[0].args[1], run, runs[0].args[0])
+    assert sections[0].args[:2] == (runs[0].args[1], run)
+    assert sections[0].args[2].draws == 12
     assert len(sections) == 2
     assert pages[0].args[:2] == (Path("v.html"), "Free runs of plant.json")
     assert pages[0].args[2].endswith("scored from 9 s on.")
@@ -431,6 +433,14 @@ def test_a_plant_is_linearised_where_it_is_asked_for(bench: Bench) -> None:
     answer = json.loads(bench.run("linearise", "board.json", "--json").out)
     assert answer["operating_point"] == pytest.approx({"q1": 50.0, "q2": 50.0})
     assert len(answer["gains"]) == 4
+
+
+def test_names_in_a_table_of_matrices_are_cells_and_no_formulas(tmp_path: Path) -> None:
+    near = linearise_plant(BOARD, inputs={"q1": 30.0, "q2": 20.0})
+    save_linear(replace(near, inputs=("=cmd()", "a,b")), tmp_path / "l.csv")
+    rows = list(csv.reader((tmp_path / "l.csv").read_text().splitlines()))
+    assert {len(row) for row in rows} == {4}
+    assert {row[2] for row in rows if row[0] == "B"} == {"'=cmd()", "a,b"}
 
 
 @pytest.mark.parametrize(

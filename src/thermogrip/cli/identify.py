@@ -414,13 +414,13 @@ def validate(
         for k, log in enumerate(records):
             progress(k / len(records), log_name(log))
             runs.append(free_run(loaded, log, warmup=warmup, score_from=score_from, average=average))
+    bands = [run.band() for run in runs]
     if report is not None:
-        sections = [free_run_section(log, run, loaded) for log, run in zip(records, runs)]
+        sections = [free_run_section(*each) for each in zip(records, runs, bands)]
         lead = f"Inputs in, outputs out, nothing fed back; scored from {score_from:g} s on."
         write_report(report, f"Free runs of {plant.name}", lead, sections)
     rows = [row for log, run in zip(records, runs) for row in run_rows(log_name(log), run)]
     console.table(f"Free run of {plant.name}", SCORE_OF_RUN, rows)
-    bands = [run.band() for run in runs]
     for log, run, band in zip(records, runs, bands):
         console.say(f"{log_name(log)}: {band_words(band)}")
         for note in run.notes:
@@ -542,13 +542,16 @@ def linearise(
     loaded, console = load_plant(plant, network), Console(as_json)
     from thermogrip.report.html import write_report
     from thermogrip.report.plant import GAIN_HEAD, dynamics_section, gain_rows, time_constant_words
-    from thermogrip.sysid.export.dynamics import plant_dynamics
+    from thermogrip.sysid.export.dynamics import plant_dynamics, usual_point
     from thermogrip.sysid.export.linearise import linearise_plant, save_linear
 
     named = _numbers("--at", at)
-    inputs = {name: value for name, value in named.items() if name not in loaded.disturbances}
-    disturbances = {name: value for name, value in named.items() if name in loaded.disturbances}
-    found = plant_dynamics(loaded, inputs=inputs, disturbances=disturbances)
+    u, d = usual_point(
+        loaded,
+        {name: value for name, value in named.items() if name not in loaded.disturbances},
+        {name: value for name, value in named.items() if name in loaded.disturbances},
+    )
+    found = plant_dynamics(loaded, inputs=u, disturbances=d)
     console.table(f"Gains at rest of {plant.name}", GAIN_HEAD, gain_rows(found))
     console.say(time_constant_words(found))
     if report is not None:
@@ -560,10 +563,6 @@ def linearise(
         )
     answer = found.to_dict()
     if out is not None:
-        point = dict(zip(found.near.inputs, found.near.w.tolist()))
-        switches = {name: value for name, value in inputs.items() if name in loaded.model.switches}
-        u = {name: value for name, value in point.items() if name in loaded.inputs} | switches
-        d = {name: value for name, value in point.items() if name in loaded.disturbances}
         save_linear(linearise_plant(loaded, inputs=u, disturbances=d, dt=dt), out)
         console.say(f"wrote {out}")
         answer["out"] = out

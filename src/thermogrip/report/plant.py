@@ -182,7 +182,7 @@ def identification_sections(
         sections.append(posterior_section(plant, record))
     for log, known in zip(logs, found.runs):
         run = free_run(plant, log, known.warmup, known.warmup, known=known)
-        sections.append(free_run_section(log, run, plant, seen=True))
+        sections.append(free_run_section(log, run, seen=True))
     return sections
 
 
@@ -326,13 +326,15 @@ def _prior_intervals(plant: Plant) -> dict[str, tuple[float, float]]:
     return plant_from_prior(cast(GreyModel, plant.model)).intervals(0.9)
 
 
-def free_run_section(log: Log, run: FreeRun, plant: Plant, *, seen: bool = False, title: str = "") -> Section:
+def free_run_section(
+    log: Log, run: FreeRun, band: Band | None = None, *, seen: bool = False, title: str = ""
+) -> Section:
     """Return the section of one log: free run beside the measurement, scores, residual tests, notes.
 
-    ``seen`` says that the log was in the fit; ``title`` takes the place of the usual one.
+    ``band`` is that of the run, where it is known already; ``seen`` says that the log was in the fit;
+    ``title`` takes the place of the usual one.
     """
-    from thermogrip.sysid.validation.prediction_bands import free_run_band
-
+    band = run.band() if band is None else band
     name = log_name(log)
     units = {output: "" if score.unit == "1" else f" {score.unit}" for output, score in run.scores.items()}
     words = (f"{output} to {score.rmse:.2g}{units[output]}" for output, score in run.scores.items())
@@ -345,7 +347,6 @@ def free_run_section(log: Log, run: FreeRun, plant: Plant, *, seen: bool = False
     follows = _followed(run)
     if follows:
         verdict += f" Residual correlation: {'; '.join(follows)}."
-    band = free_run_band(plant, log, run.log)
     parts: list[Any] = [
         Picture(
             free_run_figure(log, run.log, tuple(run.scores), band),

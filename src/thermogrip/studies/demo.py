@@ -78,7 +78,7 @@ def run_demo(
     touched = [session.grasps for _, session in sessions if session.grasps is not None]
     sections = [
         identification_section(found, plant),
-        free_run_section(*held_out, plant, title="Does it predict the half of a log that was held out?"),
+        free_run_section(*held_out, title="Does it predict the half of a log that was held out?"),
         posterior_section(plant, record),
         tuning_section(tuning),
         review_section(checks),
