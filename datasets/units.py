@@ -296,11 +296,8 @@ def _unlike_inputs(
     by_unit = [n for n, (role, why) in guesses.items() if role == "input" and why.startswith("its unit")]
     likely = [n for n, (role, why) in guesses.items() if role == "input" or why == NO_CLUE]
     held = next((name for name in (*stated, *likely) if _is_held(columns[name])), None)
-    moving = [
-        name
-        for name in by_unit
-        if np.count_nonzero(np.diff(columns[name])) > _HELD_SHARE * len(columns[name])
-    ]
+    finite = {name: columns[name][np.isfinite(columns[name])] for name in by_unit}
+    moving = [n for n, v in finite.items() if np.count_nonzero(np.diff(v)) > _HELD_SHARE * len(v)]
     why = f"it moves in most rows, and {held} is held between its moves, as inputs are"
     return dict.fromkeys(moving if held else (), ("other", why))
 

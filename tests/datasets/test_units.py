@@ -324,6 +324,8 @@ GOAL = np.repeat([30.0, 60.0], 300)
         # volts: of a sensor where the drive is held, of a drive where a controller moves it or it is held
         ({"a": ("1", HELD), "t_a": ("degC", READING), "cell": ("V", NOISY)},
          "input output other", "it moves in most rows, and a is held between its moves, as inputs are"),
+        ({"a": ("1", HELD), "t_a": ("degC", READING), "cell": ("V", np.r_[[np.inf] * 3, NOISY[3:]])},
+         "input output other", "it moves in most rows, and a is held between its moves, as inputs are"),
         ({"t_a": ("degC", READING), "cell": ("V", NOISY)}, "output input", "its unit is V"),
         ({"t_a": ("degC", READING), "cell": ("V", HELD)}, "output input", "its unit is V"),
         # counts of rows, and of the hours of a day
