@@ -352,7 +352,7 @@ def test_a_parquet_file_is_its_columns_with_what_is_said_of_them(tmp_path):
         ("a.csv", b"a,a\n1,2\n", "occurs twice", ""),
         ("a.txt", b"a,a\n1,2\n", "", ""),
         ("a.txt", b"a\0", "is not text", "is not text"),
-        ("a.csv.gz", gzip.compress(b"a,a\n"), "occurs twice", ""),
+        ("a.csv.gz", gzip.compress(b"a,a\n", mtime=0), "occurs twice", ""),
         ("a.csv.xz", lzma.compress(b"\0\1"), "is not text", "is not text"),
         ("a.csv.gz", b"no", "is damaged or not compressed as its name says; copy it again", "is damaged"),
         ("a.csv", b" \n \n", "is empty; give a header and at least two rows", "is empty"),
