@@ -33,6 +33,9 @@ model has no say: its own steady output falls short as well, or its estimated bi
 2 sigma away from the target since the drives stand still.  (A slow part that the model lacks relaxes like a
 loss at first, and no short record distinguishes them: there the report is early, and taken back.)
 
+**The design's answer.**  A target that lies more than 0.1 degC beyond its output's own limits is reported at
+once: those are known.
+
 A target that cannot be reached can be again after five samples in a row in which neither answer says
 otherwise, or when it moves.
 """
@@ -111,6 +114,8 @@ class Reach:
         self._rows = [model.outputs.index(name) for name in design.controlled]
         self._limited = [model.outputs.index(name) for name in design.limits]
         self._limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2).T
+        own = [design.limits.get(name, (-np.inf, np.inf)) for name in design.controlled]
+        self._own = np.array(own, dtype=float).T
         self._sd = np.sqrt(observer.R[self._rows])
         pair = optimiser.pair
         self._movers = [
@@ -159,16 +164,19 @@ class Reach:
         scaled = (miss - _OUT) / (sd * max(1.0, observer.innovation_bias))
         self._sum = min(max(0.0, self._sum + float(np.clip(scaled.max(), -1, _CLIP)) - _ALLOWANCE), _ALARM)
         short, ends = self._readings_say(observer.w, J, sd, miss, target, seen)
-        out = (miss > limit) | short
+        allowed = np.clip(target, *self._own)
+        barred = seen & (np.abs(target - allowed) > _OUT)
+        out = (miss > limit) | short | barred
         if self._unreachable:
             self._in = 0 if out.any() else self._in + 1
             self._unreachable = self._in < _TAKE_BACK
         else:
-            self._in, self._unreachable = 0, self._sum >= _ALARM or bool(short.any())
+            self._in, self._unreachable = 0, self._sum >= _ALARM or bool((short | barred).any())
         if not self._unreachable:
             return None
         if out.any():
             ends = np.where(miss > limit, held, ends)
+            ends = np.where(barred & ~(np.abs(target - ends) > np.abs(target - allowed)), allowed, ends)
             self._worst = int(np.argmax(np.where(out, np.abs(target - ends), -1.0)))
             self._value = float(ends[self._worst])
         return self._worst, self._value

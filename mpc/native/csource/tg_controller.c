@@ -473,6 +473,17 @@ static double falls_short(const tg_relaxation *m, double target, double sd, doub
     return (d1 * left - d2 * (d2 + left)) / (slope * sd / sqrt((double)(span * m->per)));
 }
 
+/* By how much the target of controlled output r lies beyond that output's own limits [degC]. */
+static double beyond_own_limit(const tg_controller *c, int r)
+{
+    const tg_design *s = c->design;
+    double beyond = 0.0;
+    for (int l = 0; l < s->n_l; l++)
+        if (s->limited[l] == s->controlled[r])
+            beyond = fmax(beyond, fmax(s->limit_low[l] - c->target[r], c->target[r] - s->limit_high[l]));
+    return beyond;
+}
+
 /* Whether a target cannot be held: by how much it is missed [degC], 0 where all can. */
 static double missed_by(tg_controller *c)
 {
@@ -497,7 +508,8 @@ static double missed_by(tg_controller *c)
     for (int r = 0; r < s->n_c; r++) {
         const double *J = by_w + r * TG_SOME(TG_NW);
         double y_sd = sqrt(s->R[s->controlled[r]]), sd = 0.0, drift = 0.0, miss, end, g;
-        int is_short;
+        double beyond = beyond_own_limit(c, r);
+        int is_short, is_barred = beyond > CANNOT;
         if (c->unread_s[r] > 0.0)
             continue;
         for (int i = 0; i < TG_NW; i++) {
@@ -513,9 +525,10 @@ static double missed_by(tg_controller *c)
             is_short = g > KEPT;
         else
             is_short = g > SURE && (miss > CANNOT || (end > c->target[r] ? drift : -drift) > CONTRADICTED * sd);
-        out = out || miss > limit || is_short;
-        alarm = alarm || is_short;
+        out = out || miss > limit || is_short || is_barred;
+        alarm = alarm || is_short || is_barred;
         worst = fmax(worst, miss > limit ? miss : is_short ? fabs(c->target[r] - end) : 0.0);
+        worst = fmax(worst, is_barred ? beyond : 0.0);
     }
     c->miss_sum = fmin(fmax(0.0, c->miss_sum + fmin(scaled, MISS_CLIP) - MISS_ALLOWANCE), MISS_ALARM);
     c->in = c->unreachable && !out ? c->in + 1 : 0;

@@ -23,6 +23,7 @@ from thermogrip.mpc.optimiser.rti import Optimiser
 from thermogrip.mpc.plant.prediction import PredictionModel
 
 LIMIT = {"t_tank": (8.0, 50.0)}
+OWN = {"t_surface": (20.0, 48.0)}  # of what is controlled
 LEAKY = {"heat": 0.14, "loss": 1 / 150}  # 45.6 degC at most, and the model expects 102
 WEAK = {"heat": 0.02}  # 38.7 degC at most
 OPTIMUM = {"joule": 0.1}  # 5.5 degC at least, as far as its drive may go
@@ -35,6 +36,9 @@ ROWS = {
     "more loss than the model's, in reach": (LEAKY, {}, {}, [(34, 180), (45, 300)], None, 0),
     "a limit of the tank": ({}, {}, LIMIT, [(34, 180), (60, 500)], 1, 49.5),
     "nearly a limit of the tank": ({}, {}, LIMIT, [(34, 180), (48, 500)], None, 0),
+    "half a degree above its own limit": ({}, {}, OWN, [(34, 180), (48.5, 400)], 0, 48.0),
+    "half a degree below its own limit": ({}, {}, OWN, [(34, 180), (19.5, 400)], 0, 20.0),
+    "hardly above its own limit": ({}, {}, OWN, [(34, 180), (48.08, 400)], None, 0),
     "an optimum": (OPTIMUM, OPTIMUM, {}, [(0, 600)], 2, 5.5),
     "far beyond an optimum": (OPTIMUM, OPTIMUM, {}, [(-20, 600)], 3, 5.5),
     "nearly an optimum": (OPTIMUM, OPTIMUM, {}, [(6, 600)], None, 0),
@@ -237,6 +241,25 @@ def test_a_target_that_the_model_misses_is_unreachable_when_it_is_sure(off, more
         assert ask(made, observer, target=TARGET + 0.1) is None  # it moves, and all begins anew
         assert ask(made, observer, seen=np.array(off) == 0.0) is None
     assert ask(*watcher(TARGET + off, **more), ahead=27.0, seen=np.array([True, False])) is None
+
+
+@pytest.mark.parametrize(
+    ("target", "held", "answer"),
+    [  # of a, whose limits are 16 and 28
+        (28.5, 28.004, 28.0),
+        (28.5, 28.5, 28.0),  # the model says nothing
+        (28.5, 25.0, 25.0),  # no drive holds its limit
+        (15.5, 15.99, 16.0),
+        (28.09, 28.09, None),
+        (28.09, 28.0, None),
+    ],
+)
+def test_a_target_beyond_its_own_limit_is_told_at_once(target, held, answer):
+    made, observer = watcher([27.0, held])
+    wanted = np.array([27.0, target])
+    assert ask(made, observer, target=wanted) == (answer and (1, answer))
+    made, observer = watcher([27.0, held])
+    assert ask(made, observer, target=wanted, seen=np.array([True, False])) is None
 
 
 def test_a_target_is_reachable_again_after_five_samples_in_a_row():
