@@ -7,21 +7,22 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from thermogrip.classify.estimators import classifier_names
 from thermogrip.cli.options import (
     AsJson,
     GraspFiles,
     Seed,
+    argument,
     comma,
     existing_grasps,
     existing_model,
     find_grasps,
+    flag,
     log_name,
     new_file,
     new_folder,
     one_of,
+    option,
     warn_of_contacts,
 )
 from thermogrip.datasets.errors import UserError
@@ -111,27 +112,25 @@ _HEADS = {"answer": "answer", "next_touch_degC": "touch at [degC]", "next_touch_
 
 ObjectRange = Annotated[
     str | None,
-    typer.Option(
+    option(
         "--object-range",
-        metavar="A,B",
-        help="Objects of unknown temperature are between A and B degC [default: 20 K about the room].",
+        "A,B",
+        "Objects of unknown temperature are between A and B degC [default: 20 K about the room].",
     ),
 ]
-Quick = Annotated[bool, typer.Option("--quick", help="200 epochs in place of 2000 for the LSTM.")]
+Quick = Annotated[bool, flag("--quick", "200 epochs in place of 2000 for the LSTM.")]
 
 
 def effusivity(
     grasps: GraspFiles,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="FILE.csv", show_default=False, help="Where the table goes.")
-    ],
+    out: Annotated[Path, option("--out", "FILE.csv", "Where the table goes.")],
     calibrate: Annotated[
         list[str] | None,
-        typer.Option(
+        option(
             "--calibrate",
-            metavar="GRASPS",
-            callback=existing_grasps,
-            help="Labelled grasps that describe your gripper; may be repeated.",
+            "GRASPS",
+            "Labelled grasps that describe your gripper; may be repeated.",
+            existing_grasps,
         ),
     ] = None,
     between: ObjectRange = None,
@@ -190,34 +189,31 @@ def train(
     grasps: GraspFiles,
     classifier: Annotated[
         str,
-        typer.Option(
+        option(
             "--classifier",
-            metavar="NAME",
-            show_default=False,
-            callback=classifier_names,
-            help="posterior, bayes, features-lda, pca-lda, lstm, lstm-paper.",
+            "NAME",
+            "posterior, bayes, features-lda, pca-lda, lstm, lstm-paper.",
+            classifier_names,
         ),
     ],
-    out: Annotated[
-        Path, typer.Option("--out", metavar="MODEL_DIR", show_default=False, help="Where the model goes.")
-    ],
+    out: Annotated[Path, option("--out", "MODEL_DIR", "Where the model goes.")],
     split: Annotated[
         str | None,
-        typer.Option(
+        option(
             "--split",
-            metavar="train|all",
-            callback=one_of("--split", ("train", "all")),
-            help="Which grasps to learn from [default: train where the column exists].",
+            "train|all",
+            "Which grasps to learn from [default: train where the column exists].",
+            one_of("--split", ("train", "all")),
         ),
     ] = None,
     stop_error: Annotated[
         float | None,
-        typer.Option(
+        option(
             "--stop-error",
-            metavar="SHARE",
+            "SHARE",
+            "Also learn when a contact may end, at this share of wrong answers [posterior].",
             min=0.001,
             max=0.5,
-            help="Also learn when a contact may end, at this share of wrong answers [posterior].",
         ),
     ] = None,
     quick: Quick = False,
@@ -265,49 +261,32 @@ def train(
 
 
 def classify(
-    model_dir: Annotated[
-        Path,
-        typer.Argument(
-            metavar="MODEL_DIR", show_default=False, callback=existing_model, help="Folder that train wrote."
-        ),
-    ],
+    model_dir: Annotated[Path, argument("MODEL_DIR", "Folder that train wrote.", existing_model)],
     grasps: GraspFiles,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="FILE.csv", show_default=False, help="Where the predictions go.")
-    ],
+    out: Annotated[Path, option("--out", "FILE.csv", "Where the predictions go.")],
     candidates: Annotated[
-        str | None,
-        typer.Option(
-            "--materials", metavar="A,B,C", help="The candidates [default: all that the model knows]."
-        ),
+        str | None, option("--materials", "A,B,C", "The candidates [default: all that the model knows].")
     ] = None,
     early: Annotated[
-        bool,
-        typer.Option("--early", help="Use of each contact what was read until the stop rule ended it."),
+        bool, flag("--early", "Use of each contact what was read until the stop rule ended it.")
     ] = False,
     next_touch: Annotated[
         bool,
-        typer.Option(
-            "--next-touch", help="Also say at which temperature another touch is worth its time [posterior]."
-        ),
+        flag("--next-touch", "Also say at which temperature another touch is worth its time [posterior]."),
     ] = False,
     or_unknown: Annotated[
-        bool,
-        typer.Option("--or-unknown", help="Also give the answer that may be 'unknown' [posterior]."),
+        bool, flag("--or-unknown", "Also give the answer that may be 'unknown' [posterior].")
     ] = False,
     other_gripper: Annotated[
-        bool,
-        typer.Option(
-            "--other-gripper", help="Another gripper of the same kind took these grasps [posterior]."
-        ),
+        bool, flag("--other-gripper", "Another gripper of the same kind took these grasps [posterior].")
     ] = False,
     known: Annotated[
         list[str] | None,
-        typer.Option(
+        option(
             "--known",
-            metavar="GRASPS",
-            callback=existing_grasps,
-            help="Labelled grasps of that other gripper, one or more; may be repeated.",
+            "GRASPS",
+            "Labelled grasps of that other gripper, one or more; may be repeated.",
+            existing_grasps,
         ),
     ] = None,
     between: ObjectRange = None,
@@ -394,9 +373,7 @@ def classify(
 
 
 def materials(
-    name: Annotated[
-        str | None, typer.Argument(metavar="[NAME]", show_default=False, help="One material.")
-    ] = None,
+    name: Annotated[str | None, argument("[NAME]", "One material.")] = None,
     as_json: AsJson = False,
 ) -> int:
     """List the materials table, or show one row of it."""

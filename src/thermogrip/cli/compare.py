@@ -7,8 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from thermogrip.classify.estimators import classifier_names
 from thermogrip.cli.classify import Quick, touched_part, training_part
 from thermogrip.cli.options import (
@@ -20,8 +18,10 @@ from thermogrip.cli.options import (
     comma,
     existing_grasps,
     find_grasps,
+    flag,
     new_folder,
     one_of,
+    option,
     warn_of_contacts,
     workers_of,
 )
@@ -40,60 +40,45 @@ if TYPE_CHECKING:
 BY_DEFAULT = ("lstm", "posterior", "bayes", "features-lda", "pca-lda")
 MOST_CONDITIONS = 4  # that are printed one by one
 
-OutOption = Annotated[
-    Path, typer.Option("--out", metavar="DIR", show_default=False, help="Where tables and report go.")
-]
-TestOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--test",
-        metavar="GRASPS",
-        callback=existing_grasps,
-        help="Test on these grasps, not on a split; may be repeated.",
-    ),
-]
-ClassifiersOption = Annotated[
-    str | None,
-    typer.Option(
-        "--classifiers",
-        metavar="LIST",
-        callback=classifier_names,
-        help="Those of train, svm-pca, rocket, expansions, A+B (their mean), or module:Class of scikit-learn "
-        "(imported) [default: lstm where PyTorch is installed, posterior, bayes, features-lda, pca-lda].",
-    ),
-]
-RepeatsOption = Annotated[
-    int, typer.Option("--repeats", min=0, help="Random splits by grasp, beside the shipped split.")
-]
-ByOption = Annotated[
-    str | None,
-    typer.Option(
-        "--by",
-        metavar="session|block",
-        callback=one_of("--by", ("session", "block")),
-        help="Also hold out whole sessions or blocks in turn.",
-    ),
-]
-CurvesOption = Annotated[
-    bool,
-    typer.Option(
-        "--curves", help="Also learning curve, contact time, time to decision, difference, effusivity strips."
-    ),
-]
-TrainPerClassOption = Annotated[
-    int, typer.Option("--train-per-class", min=1, help="Training grasps a material in a random split.")
-]
-
 
 def compare(
     grasps: GraspFiles,
-    out: OutOption,
-    test: TestOption = None,
-    classifiers: ClassifiersOption = None,
-    repeats: RepeatsOption = 20,
-    train_per_class: TrainPerClassOption = 5,
-    by: ByOption = None,
-    curves: CurvesOption = False,
+    out: Annotated[Path, option("--out", "DIR", "Where tables and report go.")],
+    test: Annotated[
+        list[str] | None,
+        option("--test", "GRASPS", "Test on these grasps, not on a split; may be repeated.", existing_grasps),
+    ] = None,
+    classifiers: Annotated[
+        str | None,
+        option(
+            "--classifiers",
+            "LIST",
+            "Those of train, svm-pca, rocket, expansions, A+B (their mean), or module:Class of scikit-learn "
+            "(imported) [default: lstm where PyTorch is installed, posterior, bayes, features-lda, pca-lda].",
+            classifier_names,
+        ),
+    ] = None,
+    repeats: Annotated[
+        int, option("--repeats", None, "Random splits by grasp, beside the shipped split.", min=0)
+    ] = 20,
+    train_per_class: Annotated[
+        int, option("--train-per-class", None, "Training grasps a material in a random split.", min=1)
+    ] = 5,
+    by: Annotated[
+        str | None,
+        option(
+            "--by",
+            "session|block",
+            "Also hold out whole sessions or blocks in turn.",
+            one_of("--by", ("session", "block")),
+        ),
+    ] = None,
+    curves: Annotated[
+        bool,
+        flag(
+            "--curves", "Also learning curve, contact time, time to decision, difference, effusivity strips."
+        ),
+    ] = False,
     quick: Quick = False,
     seed: Seed = 0,
     workers: Workers = 1,

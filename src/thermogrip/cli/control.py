@@ -8,8 +8,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from thermogrip.cli.options import (
     ANSWER_IS_NO,
     AsJson,
@@ -19,13 +17,16 @@ from thermogrip.cli.options import (
     Report,
     Seed,
     Workers,
+    argument,
     existing,
     existing_controller,
     existing_spec,
     find_network,
+    flag,
     load_plant,
     new_file,
     new_folder,
+    option,
     workers_of,
 )
 from thermogrip.datasets.errors import UserError
@@ -34,29 +35,19 @@ from thermogrip.report.console import Console
 if TYPE_CHECKING:
     from thermogrip.mpc.controllers.mpc import Controller
 
-_CONTROLLER: dict[str, Any] = {
-    "metavar": "CONTROLLER",
-    "show_default": False,
-    "help": "controller.json of tune.",
-}
+_HELP = "controller.json of tune."
 #: Of verbs that have words to check first; the others look through the file at once.
-ControllerFile = Annotated[Path, typer.Argument(callback=existing, **_CONTROLLER)]
-CheckedController = Annotated[Path, typer.Argument(callback=existing_controller, **_CONTROLLER)]
+ControllerFile = Annotated[Path, argument("CONTROLLER", _HELP, existing)]
+CheckedController = Annotated[Path, argument("CONTROLLER", _HELP, existing_controller)]
 
 
 def tune(
     plant: PlantFile,
-    out: Annotated[
-        Path,
-        typer.Option("--out", metavar="FILE.json", show_default=False, help="Where the controller goes."),
-    ],
+    out: Annotated[Path, option("--out", "FILE.json", "Where the controller goes.")],
     spec: Annotated[
         Path | None,
-        typer.Option(
-            "--spec",
-            metavar="SPEC.toml",
-            callback=existing_spec,
-            help="What is wanted; `thermogrip init spec` writes one to edit.",
+        option(
+            "--spec", "SPEC.toml", "What is wanted; `thermogrip init spec` writes one to edit.", existing_spec
         ),
     ] = None,
     report: Report = None,
@@ -150,13 +141,11 @@ def review(
 
 def export(
     controller: CheckedController,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", show_default=False, help="Folder of the C files.")
-    ],
+    out: Annotated[Path, option("--out", "DIR", "Folder of the C files.")],
     check: Annotated[
-        bool, typer.Option("--check", help="Build it (gcc) and compare it with Python on random states.")
+        bool, flag("--check", "Build it (gcc) and compare it with Python on random states.")
     ] = False,
-    states: Annotated[int, typer.Option("--states", min=1, help="Random states of --check.")] = 3_000,
+    states: Annotated[int, option("--states", None, "Random states of --check.", min=1)] = 3_000,
     network: OwnNetwork = None,
     seed: Seed = 0,
     as_json: AsJson = False,

@@ -12,8 +12,6 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from thermogrip.cli.options import (
     AsJson,
     Seed,
@@ -24,6 +22,7 @@ from thermogrip.cli.options import (
     load_plant,
     new_file,
     one_of,
+    option,
 )
 from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
@@ -44,52 +43,28 @@ HALVINGS = 12  # of the bisection
 
 def excite(
     kind: Annotated[
-        str,
-        typer.Option(
-            "--kind",
-            metavar="|".join(KINDS),
-            show_default=False,
-            callback=one_of("--kind", KINDS),
-            help="Shape of the excitation.",
-        ),
+        str, option("--kind", "|".join(KINDS), "Shape of the excitation.", one_of("--kind", KINDS))
     ],
-    minutes: Annotated[
-        float,
-        typer.Option("--minutes", metavar="M", min=0.1, show_default=False, help="Length of the experiment."),
-    ],
-    out: Annotated[
-        Path, typer.Option("--out", metavar="SCHEDULE.csv", show_default=False, help="Where it goes.")
-    ],
+    minutes: Annotated[float, option("--minutes", "M", "Length of the experiment.", min=0.1)],
+    out: Annotated[Path, option("--out", "SCHEDULE.csv", "Where it goes.")],
     plant: Annotated[
         Path | None,
-        typer.Option(
-            "--plant",
-            metavar="PLANT",
-            callback=existing_plant,
-            help="Fit time constants and amplitude to this plant.",
-        ),
+        option("--plant", "PLANT", "Fit time constants and amplitude to this plant.", existing_plant),
     ] = None,
     network: Annotated[
         str | None,
-        typer.Option(
+        option(
             "--network",
-            metavar="NAME|FILE",
-            callback=existing_network,
-            help="Before any log: a network at its priors; with a plant of your own, its FILE.py:CLASS.",
+            "NAME|FILE",
+            "Before any log: a network at its priors; with a plant of your own, its FILE.py:CLASS.",
+            existing_network,
         ),
     ] = None,
-    lowest: Annotated[
-        float, typer.Option("--lowest", metavar="DEGC", help="With a plant: no output below this.")
-    ] = 5.0,
-    highest: Annotated[
-        float, typer.Option("--highest", metavar="DEGC", help="With a plant: no output above this.")
-    ] = 60.0,
-    hold: Annotated[
-        str | None, typer.Option("--hold", metavar="A,B", help="With optimal: inputs that do not move.")
-    ] = None,
+    lowest: Annotated[float, option("--lowest", "DEGC", "With a plant: no output below this.")] = 5.0,
+    highest: Annotated[float, option("--highest", "DEGC", "With a plant: no output above this.")] = 60.0,
+    hold: Annotated[str | None, option("--hold", "A,B", "With optimal: inputs that do not move.")] = None,
     slew: Annotated[
-        float | None,
-        typer.Option("--slew", metavar="PER_S", min=1e-9, help="With optimal: a drive changes no faster."),
+        float | None, option("--slew", "PER_S", "With optimal: a drive changes no faster.", min=1e-9)
     ] = None,
     seed: Seed = 0,
     as_json: AsJson = False,

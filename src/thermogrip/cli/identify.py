@@ -6,8 +6,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from thermogrip.cli.options import (
     ANSWER_IS_NO,
     AsJson,
@@ -19,15 +17,18 @@ from thermogrip.cli.options import (
     Seed,
     Step,
     Workers,
+    argument,
     choice,
     comma,
     existing_logs,
     existing_network,
     find_network,
+    flag,
     load_logs,
     load_plant,
     log_name,
     new_file,
+    option,
     repairs_of,
 )
 from thermogrip.datasets.errors import UserError
@@ -63,83 +64,55 @@ def _known_models(value: str) -> str:
 
 
 Warmup = Annotated[
-    float,
-    typer.Option(
-        "--warmup", metavar="S", min=0, help="Measured outputs of these first seconds may set the state."
-    ),
+    float, option("--warmup", "S", "Measured outputs of these first seconds may set the state.", min=0)
 ]
 Average = Annotated[
-    float | None,
-    typer.Option(
-        "--average", metavar="S", min=0, help="Average over S seconds first (coarse sensors need it)."
-    ),
-]
-
-OutOption = Annotated[
-    Path | None,
-    typer.Option("--out", metavar="FILE.json", help="Where the plant goes; where absent, LOG_plant.json."),
-]
-NetworkOption = Annotated[
-    str | None,
-    typer.Option(
-        "--network",
-        metavar="NAME|FILE",
-        callback=existing_network,
-        help="A shipped one (init network --like), none, FILE.toml, FILE.py:CLASS (which runs the file); "
-        "where absent, the shipped one whose columns the logs have.",
-    ),
-]
-InputsOption = Annotated[str | None, typer.Option("--inputs", metavar="A,B", help="Columns that are moved.")]
-OutputsOption = Annotated[str | None, typer.Option("--outputs", metavar="C,D", help="Columns to predict.")]
-DisturbancesOption = Annotated[
-    str | None,
-    typer.Option("--disturbances", metavar="E", help="Columns that are measured and not moved."),
-]
-ModelsOption = Annotated[
-    str,
-    typer.Option("--models", metavar="LIST", callback=_known_models, help="Which candidate models to fit."),
-]
-LeaveOneOutOption = Annotated[
-    bool, typer.Option("--leave-one-out", help="Score each log by a fit to the others.")
-]
-OrderOption = Annotated[
-    int | None,
-    typer.Option(
-        "--order", metavar="N", min=1, max=20, help="Poles of ARX and OE, states of subspace models."
-    ),
-]
-DelayOption = Annotated[
-    int | None,
-    typer.Option("--delay", metavar="N", min=1, max=20, help="Delay of ARX and OE, in steps of the model."),
-]
-GrowOption = Annotated[
-    bool,
-    typer.Option(
-        "--grow", help="Try terms that the network lacks, and its own, on held-out logs; print what was kept."
-    ),
-]
-PosteriorOption = Annotated[
-    bool,
-    typer.Option("--posterior/--no-posterior", help="Sample the parameters' posterior until it converges."),
+    float | None, option("--average", "S", "Average over S seconds first (coarse sensors need it).", min=0)
 ]
 
 
 def identify(
     logs: LogFiles,
-    out: OutOption = None,
-    network: NetworkOption = None,
-    inputs: InputsOption = None,
-    outputs: OutputsOption = None,
-    disturbances: DisturbancesOption = None,
+    out: Annotated[
+        Path | None, option("--out", "FILE.json", "Where the plant goes; where absent, LOG_plant.json.")
+    ] = None,
+    network: Annotated[
+        str | None,
+        option(
+            "--network",
+            "NAME|FILE",
+            "A shipped one (init network --like), none, FILE.toml, FILE.py:CLASS (which runs the file); "
+            "where absent, the shipped one whose columns the logs have.",
+            existing_network,
+        ),
+    ] = None,
+    inputs: Annotated[str | None, option("--inputs", "A,B", "Columns that are moved.")] = None,
+    outputs: Annotated[str | None, option("--outputs", "C,D", "Columns to predict.")] = None,
+    disturbances: Annotated[
+        str | None, option("--disturbances", "E", "Columns that are measured and not moved.")
+    ] = None,
     columns: Columns = None,
     dt: Step = None,
-    models: ModelsOption = ALL_MODELS,
+    models: Annotated[
+        str, option("--models", "LIST", "Which candidate models to fit.", _known_models)
+    ] = ALL_MODELS,
     average: Average = None,
-    order: OrderOption = None,
-    delay: DelayOption = None,
-    leave_one_out: LeaveOneOutOption = False,
-    grow: GrowOption = False,
-    posterior: PosteriorOption = False,
+    order: Annotated[
+        int | None, option("--order", "N", "Poles of ARX and OE, states of subspace models.", min=1, max=20)
+    ] = None,
+    delay: Annotated[
+        int | None, option("--delay", "N", "Delay of ARX and OE, in steps of the model.", min=1, max=20)
+    ] = None,
+    leave_one_out: Annotated[bool, flag("--leave-one-out", "Score each log by a fit to the others.")] = False,
+    grow: Annotated[
+        bool,
+        flag(
+            "--grow", "Try terms that the network lacks, and its own, on held-out logs; print what was kept."
+        ),
+    ] = False,
+    posterior: Annotated[
+        bool, flag("--posterior/--no-posterior", "Sample the parameters' posterior until it converges.")
+    ] = False,
     report: Report = None,
     seed: Seed = 0,
     workers: Workers = 1,
@@ -379,7 +352,7 @@ def validate(
     logs: LogFiles,
     warmup: Warmup = 5.0,
     score_from: Annotated[
-        float, typer.Option("--score-from", metavar="S", min=0, help="Samples before this are not scored.")
+        float, option("--score-from", "S", "Samples before this are not scored.", min=0)
     ] = 5.0,
     average: Average = None,
     network: OwnNetwork = None,
@@ -450,22 +423,11 @@ def run_answer(name: str, run: FreeRun, band: Band) -> dict[str, Any]:
 
 def simulate(
     plant: PlantFile,
-    log: Annotated[
-        str,
-        typer.Argument(
-            metavar="LOG",
-            show_default=False,
-            callback=existing_logs,
-            help="Inputs and warm-up come from here.",
-        ),
-    ],
-    out: Annotated[
-        Path, typer.Option("--out", metavar="SIM.csv", show_default=False, help="Where the log goes.")
-    ],
+    log: Annotated[str, argument("LOG", "Inputs and warm-up come from here.", existing_logs)],
+    out: Annotated[Path, option("--out", "SIM.csv", "Where the log goes.")],
     warmup: Warmup = 5.0,
     bands: Annotated[
-        bool,
-        typer.Option("--bands", help="Add the ends of each output's 90 % band, OUTPUT_low and OUTPUT_high."),
+        bool, flag("--bands", "Add the ends of each output's 90 % band, OUTPUT_low and OUTPUT_high.")
     ] = False,
     network: OwnNetwork = None,
     columns: Columns = None,
@@ -507,27 +469,17 @@ def linearise(
     plant: PlantFile,
     at: Annotated[
         str | None,
-        typer.Option(
+        option(
             "--at",
-            metavar="NAME=X,...",
-            show_default=False,
-            help="Inputs and disturbances of the operating point; the others are in the middle of the logs.",
+            "NAME=X,...",
+            "Inputs and disturbances of the operating point; the others are in the middle of the logs.",
         ),
     ] = None,
     dt: Annotated[
-        float | None,
-        typer.Option(
-            "--dt", metavar="S", min=1e-9, show_default=False, help="Step of the matrices; none: continuous."
-        ),
+        float | None, option("--dt", "S", "Step of the matrices; none: continuous.", min=1e-9)
     ] = None,
     out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            metavar="FILE",
-            show_default=False,
-            help="Matrices as .json, .csv (a row an entry) or .mat.",
-        ),
+        Path | None, option("--out", "FILE", "Matrices as .json, .csv (a row an entry) or .mat.")
     ] = None,
     report: Report = None,
     network: OwnNetwork = None,

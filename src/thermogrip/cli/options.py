@@ -159,71 +159,65 @@ def one_of(option: str, allowed: Sequence[str]) -> Callable[[str | None], str | 
     return check
 
 
-AsJson = Annotated[
-    bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else there.")
-]
-Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of everything random.")]
-Workers = Annotated[
-    int, typer.Option("--workers", min=1, help="Local processes for work that can be shared out.")
-]
+def option(
+    name: str,
+    metavar: str | None,
+    words: str,
+    check: Callable[..., Any] | None = None,
+    *,
+    min: float | None = None,
+    max: float | None = None,
+) -> Any:
+    """Return the Typer option of a name, what stands for its value, its help, a ``callback=``, its bounds."""
+    return typer.Option(name, metavar=metavar, help=words, callback=check, min=min, max=max)
+
+
+def flag(name: str, words: str) -> Any:
+    """Return the Typer option that is there or not."""
+    return typer.Option(name, help=words)
+
+
+def argument(metavar: str, words: str, check: Callable[..., Any] | None = None) -> Any:
+    """Return the Typer argument of a place on the command line."""
+    return typer.Argument(metavar=metavar, help=words, callback=check)
+
+
+AsJson = Annotated[bool, flag("--json", "Print one JSON object on stdout and nothing else there.")]
+Seed = Annotated[int, option("--seed", None, "Seed of everything random.", min=0)]
+Workers = Annotated[int, option("--workers", None, "Local processes for work that can be shared out.", min=1)]
 Cluster = Annotated[
     str | None,
-    typer.Option(
-        "--cluster",
-        metavar="tcp://HOST:PORT",
-        help="Dask cluster that does this work in place of local processes.",
-    ),
+    option("--cluster", "tcp://HOST:PORT", "Dask cluster that does this work in place of local processes."),
 ]
 Report = Annotated[
-    Path | None,
-    typer.Option(
-        "--report",
-        metavar="FILE.html",
-        callback=new_report,
-        help="Also write a one-page report with figures.",
-    ),
+    Path | None, option("--report", "FILE.html", "Also write a one-page report with figures.", new_report)
 ]
-PlantFile = Annotated[
-    Path,
-    typer.Argument(
-        metavar="PLANT", show_default=False, callback=existing_plant, help="plant.json of identify."
-    ),
-]
+PlantFile = Annotated[Path, argument("PLANT", "plant.json of identify.", existing_plant)]
 LogFiles = Annotated[
     list[str],
-    typer.Argument(
-        metavar="LOG...",
-        callback=existing_logs,
-        show_default=False,
-        help="Text, .mat, .xlsx, NetCDF, Parquet; LOG@120:1800 takes seconds 120 to 1800 (either end may be "
+    argument(
+        "LOG...",
+        "Text, .mat, .xlsx, NetCDF, Parquet; LOG@120:1800 takes seconds 120 to 1800 (either end may be "
         "empty).",
+        existing_logs,
     ),
 ]
 Columns = Annotated[
-    str | None,
-    typer.Option("--columns", metavar="A,B", help="Headers in place of the log's; - leaves one out."),
+    str | None, option("--columns", "A,B", "Headers in place of the log's; - leaves one out.")
 ]
-Step = Annotated[
-    float | None,
-    typer.Option("--dt", metavar="S", min=1e-9, help="Seconds between rows."),
-]
+Step = Annotated[float | None, option("--dt", "S", "Seconds between rows.", min=1e-9)]
 OwnNetwork = Annotated[
     str | None,
-    typer.Option(
+    option(
         "--network",
-        metavar="FILE.py:CLASS",
-        callback=existing_network,
-        help="The class that the plant was fitted with, where it is your own (which runs the file).",
+        "FILE.py:CLASS",
+        "The class that the plant was fitted with, where it is your own (which runs the file).",
+        existing_network,
     ),
 ]
 GraspFiles = Annotated[
     list[str],
-    typer.Argument(
-        metavar="GRASPS...",
-        callback=existing_grasps,
-        show_default=False,
-        help="Grasp files (CSV with its _meta.csv, or NetCDF) or folders.",
-    ),
+    argument("GRASPS...", "Grasp files (CSV with its _meta.csv, or NetCDF) or folders.", existing_grasps),
 ]
 
 

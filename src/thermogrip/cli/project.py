@@ -6,17 +6,25 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from thermogrip.cli.options import AsJson, Cluster, Seed, Workers, choice, new_file, new_folder, workers_of
+from thermogrip.cli.options import (
+    AsJson,
+    Cluster,
+    Seed,
+    Workers,
+    argument,
+    choice,
+    flag,
+    new_file,
+    new_folder,
+    option,
+    workers_of,
+)
 from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
 
 
 def demo(
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Where everything goes.")] = Path(
-        "thermogrip-demo"
-    ),
+    out: Annotated[Path, option("--out", "DIR", "Where everything goes.")] = Path("thermogrip-demo"),
     seed: Seed = 0,
     workers: Workers = 2,
     cluster: Cluster = None,
@@ -46,10 +54,8 @@ def demo(
 
 
 def paper(
-    out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", show_default=False, help="Where everything goes.")
-    ],
-    quick: Annotated[bool, typer.Option("--quick", help="LSTM of 200 epochs instead of 2000.")] = False,
+    out: Annotated[Path, option("--out", "DIR", "Where everything goes.")],
+    quick: Annotated[bool, flag("--quick", "LSTM of 200 epochs instead of 2000.")] = False,
     seed: Seed = 0,
     workers: Workers = 1,
     cluster: Cluster = None,
@@ -89,29 +95,19 @@ def paper(
 
 
 def init(
-    what: Annotated[
-        str,
-        typer.Argument(
-            metavar="spec|network|topics|guard|examples", show_default=False, help="What to start from."
-        ),
-    ],
+    what: Annotated[str, argument("spec|network|topics|guard|examples", "What to start from.")],
     like: Annotated[
         str | None,
-        typer.Option(
+        option(
             "--like",
-            metavar="NAME",
-            show_default=False,
-            help="Of a network: start from gripper, tclab, peltier_chamber, room, hotend, furnace, tank "
+            "NAME",
+            "Of a network: start from gripper, tclab, peltier_chamber, room, hotend, furnace, tank "
             "or thermal_chamber.",
         ),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out",
-            metavar="FILE.toml|DIR",
-            help="Where it goes [default: stdout; of the examples: this folder].",
-        ),
+        option("--out", "FILE.toml|DIR", "Where it goes [default: stdout; of the examples: this folder]."),
     ] = None,
     as_json: AsJson = False,
 ) -> int:

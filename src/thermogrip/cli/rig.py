@@ -18,14 +18,17 @@ from thermogrip.cli.options import (
     OwnNetwork,
     Report,
     Seed,
+    argument,
     choice,
     existing,
     existing_model,
     existing_plant,
+    flag,
     load_plant,
     new_file,
     new_folder,
     one_of,
+    option,
 )
 from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
@@ -46,87 +49,49 @@ if TYPE_CHECKING:
 
 LOWEST_TARGET, HIGHEST_TARGET = 10.0, 50.0  # degC, of the skin
 
-TargetOption = Annotated[
-    str,
-    typer.Option(
-        "--target",
-        metavar="DEGC",
-        show_default=False,
-        callback=lambda value: (_targets(value), value)[1],  # refused before a file is looked for
-        help="Skin temperature at contact, 10 to 50; of several outputs t1=40,t2=35.",
-    ),
-]
-OutOption = Annotated[
-    Path, typer.Option("--out", metavar="DIR", show_default=False, help="Folder of the run.")
-]
+OutOption = Annotated[Path, option("--out", "DIR", "Folder of the run.")]
 TwinOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--twin", metavar="PLANT", callback=existing_plant, help="Simulate this plant; no hardware is opened."
-    ),
+    Path | None, option("--twin", "PLANT", "Simulate this plant; no hardware is opened.", existing_plant)
 ]
 PortOption = Annotated[
-    str | None,
-    typer.Option("--port", metavar="DEV", help="The rig: /dev/ttyACM0, COM3, socket://HOST:PORT."),
+    str | None, option("--port", "DEV", "The rig: /dev/ttyACM0, COM3, socket://HOST:PORT.")
 ]
 ProtocolOption = Annotated[
     str | None,
-    typer.Option(
-        "--protocol",
-        metavar="NAME",
-        callback=one_of("--protocol", PROTOCOLS),
-        help="thermogrip or tclab [default: found out].",
+    option(
+        "--protocol", "NAME", "thermogrip or tclab [default: found out].", one_of("--protocol", PROTOCOLS)
     ),
 ]
-SpeedOption = Annotated[
-    float,
-    typer.Option("--speed", metavar="X", min=0.01, help="With --port: that of a virtual device."),
-]
-DrawOption = Annotated[
-    int, typer.Option("--draw", min=0, help="Posterior draw of the twin's plant (0: the fit).")
-]
+SpeedOption = Annotated[float, option("--speed", "X", "With --port: that of a virtual device.", min=0.01)]
+DrawOption = Annotated[int, option("--draw", None, "Posterior draw of the twin's plant (0: the fit).", min=0)]
 StartOption = Annotated[
-    float | None,
-    typer.Option("--from", metavar="DEGC", help="Temperature at the start [default: the room's]."),
+    float | None, option("--from", "DEGC", "Temperature at the start [default: the room's].")
 ]
-HoldOption = Annotated[
-    float, typer.Option("--hold", metavar="S", min=0, help="Regulate this long after settling.")
-]
-ObjOption = Annotated[
-    float | None, typer.Option("--object", metavar="DEGC", help="Temperature of the object.")
-]
-MaterialOption = Annotated[
-    str | None, typer.Option("--material", metavar="NAME", help="Material of the object.")
-]
-GraspTimeOption = Annotated[
-    float, typer.Option("--grasp-time", metavar="S", min=0.5, help="Recorded time of contact.")
-]
+ObjOption = Annotated[float | None, option("--object", "DEGC", "Temperature of the object.")]
+MaterialOption = Annotated[str | None, option("--material", "NAME", "Material of the object.")]
+GraspTimeOption = Annotated[float, option("--grasp-time", "S", "Recorded time of contact.", min=0.5)]
 StopEarlyOption = Annotated[
     Path | None,
-    typer.Option(
+    option(
         "--stop-early",
-        metavar="MODEL_DIR",
-        callback=existing_model,
-        help="End the contact once this classifier (train --stop-error) has seen enough.",
+        "MODEL_DIR",
+        "End the contact once this classifier (train --stop-error) has seen enough.",
+        existing_model,
     ),
 ]
 SettleTimeoutOption = Annotated[
-    float, typer.Option("--settle-timeout", metavar="S", min=1, help="Give up settling after this long.")
+    float, option("--settle-timeout", "S", "Give up settling after this long.", min=1)
 ]
 GuardOption = Annotated[
     Path | None,
-    typer.Option(
-        "--guard",
-        metavar="GUARD.toml",
-        help="What the guard allows; `thermogrip init guard` writes one to edit.",
-    ),
+    option("--guard", "GUARD.toml", "What the guard allows; `thermogrip init guard` writes one to edit."),
 ]
 LearnOption = Annotated[
     Path | None,
-    typer.Option(
+    option(
         "--learn",
-        metavar="RIG.json",
-        help="Let the guard learn from this rig's first healthy sessions how far it is from the plant.",
+        "RIG.json",
+        "Let the guard learn from this rig's first healthy sessions how far it is from the plant.",
     ),
 ]
 
@@ -134,7 +99,15 @@ LearnOption = Annotated[
 @stop_signals()
 def run(
     controller: ControllerFile,
-    target: TargetOption,
+    target: Annotated[
+        str,
+        option(
+            "--target",
+            "DEGC",
+            "Skin temperature at contact, 10 to 50; of several outputs t1=40,t2=35.",
+            lambda value: (_targets(value), value)[1],
+        ),
+    ],
     out: OutOption,
     port: PortOption = None,
     protocol: ProtocolOption = None,
@@ -142,7 +115,7 @@ def run(
     twin: TwinOption = None,
     draw: DrawOption = 0,
     start: StartOption = None,
-    hold: HoldOption = 0.0,
+    hold: Annotated[float, option("--hold", "S", "Regulate this long after settling.", min=0)] = 0.0,
     obj: ObjOption = None,
     material: MaterialOption = None,
     grasp_time: GraspTimeOption = 10.0,
@@ -224,16 +197,13 @@ def batch(
     controller: ControllerFile,
     plan: Annotated[
         Path,
-        typer.Argument(
-            metavar="PLAN.csv",
-            callback=existing,
-            show_default=False,
-            help="A row a grasp: material,t_object_degC,target_degC[,block,repeat,touch_group,...].",
+        argument(
+            "PLAN.csv",
+            "A row a grasp: material,t_object_degC,target_degC[,block,repeat,touch_group,...].",
+            existing,
         ),
     ],
-    out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", show_default=False, help="Folder of the batch.")
-    ],
+    out: Annotated[Path, option("--out", "DIR", "Folder of the batch.")],
     port: PortOption = None,
     protocol: ProtocolOption = None,
     speed: SpeedOption = 1.0,
@@ -244,9 +214,7 @@ def batch(
     settle_timeout: SettleTimeoutOption = 900.0,
     guard: GuardOption = None,
     learn: LearnOption = None,
-    ask: Annotated[
-        bool, typer.Option("--ask/--no-ask", help="With --port: ask before and after each grasp.")
-    ] = True,
+    ask: Annotated[bool, flag("--ask/--no-ask", "With --port: ask before and after each grasp.")] = True,
     network: OwnNetwork = None,
     seed: Seed = 0,
     as_json: AsJson = False,
@@ -301,21 +269,11 @@ def batch(
 
 @stop_signals()
 def record(
-    schedule: Annotated[
-        str,
-        typer.Argument(
-            metavar="SCHEDULE", show_default=False, callback=existing, help="schedule.csv of excite."
-        ),
-    ],
-    port: Annotated[
-        str,
-        typer.Option(
-            "--port", metavar="DEV", show_default=False, help="/dev/ttyACM0, COM3, socket://HOST:PORT."
-        ),
-    ],
+    schedule: Annotated[str, argument("SCHEDULE", "schedule.csv of excite.", existing)],
+    port: Annotated[str, option("--port", "DEV", "/dev/ttyACM0, COM3, socket://HOST:PORT.")],
     out: OutOption,
     protocol: ProtocolOption = None,
-    dt: Annotated[float, typer.Option("--sample", metavar="S", min=0.05, help="Seconds a row.")] = 1.0,
+    dt: Annotated[float, option("--sample", "S", "Seconds a row.", min=0.05)] = 1.0,
     guard: GuardOption = None,
     speed: SpeedOption = 1.0,
     seed: Seed = 0,
@@ -356,26 +314,12 @@ def record(
 
 
 def recover(
-    folder: Annotated[
-        Path,
-        typer.Argument(
-            metavar="DIR",
-            show_default=False,
-            callback=existing,
-            help="Folder of a run, or of a batch of runs.",
-        ),
-    ],
+    folder: Annotated[Path, argument("DIR", "Folder of a run, or of a batch of runs.", existing)],
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out",
-            metavar="FILE",
-            help="Also write the run's log: .nc, .parquet, .csv, or .mcap (with ros).",
-        ),
+        option("--out", "FILE", "Also write the run's log: .nc, .parquet, .csv, or .mcap (with ros)."),
     ] = None,
-    bad: Annotated[
-        str | None, typer.Option("--bad", metavar="WHY", help="Mark the trial as bad; nothing is removed.")
-    ] = None,
+    bad: Annotated[str | None, option("--bad", "WHY", "Mark the trial as bad; nothing is removed.")] = None,
     as_json: AsJson = False,
 ) -> int:
     """Repair a run that was killed or lost its power.
@@ -414,44 +358,25 @@ def recover(
 
 def virtual(
     protocol: Annotated[
-        str,
-        typer.Option(
-            "--protocol",
-            metavar="NAME",
-            callback=one_of("--protocol", PROTOCOLS),
-            help="thermogrip or tclab.",
-        ),
+        str, option("--protocol", "NAME", "thermogrip or tclab.", one_of("--protocol", PROTOCOLS))
     ] = "thermogrip",
     plant: Annotated[
         Path | None,
-        typer.Option(
-            "--plant",
-            metavar="PLANT",
-            callback=existing_plant,
-            help="plant.json of identify [default: a bundled network].",
-        ),
+        option("--plant", "PLANT", "plant.json of identify [default: a bundled network].", existing_plant),
     ] = None,
-    pty: Annotated[bool, typer.Option("--pty", help="On a pseudo-terminal, as a serial port.")] = False,
+    pty: Annotated[bool, flag("--pty", "On a pseudo-terminal, as a serial port.")] = False,
     socket: Annotated[
-        int | None,
-        typer.Option("--socket", metavar="PORT", min=0, max=65535, help="On a TCP port of this computer."),
+        int | None, option("--socket", "PORT", "On a TCP port of this computer.", min=0, max=65535)
     ] = None,
-    speed: Annotated[
-        float, typer.Option("--speed", metavar="X", min=0.01, help="Its time runs X times as fast.")
-    ] = 1.0,
+    speed: Annotated[float, option("--speed", "X", "Its time runs X times as fast.", min=0.01)] = 1.0,
     start: StartOption = None,
-    ambient: Annotated[
-        float, typer.Option("--ambient", metavar="DEGC", help="Temperature of the room.")
-    ] = 23.0,
+    ambient: Annotated[float, option("--ambient", "DEGC", "Temperature of the room.")] = 23.0,
     obj: ObjOption = None,
     material: MaterialOption = None,
     fault: Annotated[
-        list[str] | None,
-        typer.Option("--fault", metavar="S:NAME", help="After S seconds let NAME fail; may be repeated."),
+        list[str] | None, option("--fault", "S:NAME", "After S seconds let NAME fail; may be repeated.")
     ] = None,
-    seconds: Annotated[
-        float | None, typer.Option("--seconds", metavar="S", min=0, help="End after this long.")
-    ] = None,
+    seconds: Annotated[float | None, option("--seconds", "S", "End after this long.", min=0)] = None,
     seed: Seed = 0,
     as_json: AsJson = False,
 ) -> int:
