@@ -197,7 +197,8 @@ def free_run(
     units = {name: _unit(log, name) for name in plant.outputs}
     mean = {n: score(y, np.full(y.shape, np.nanmean(y)), units[n]) for n, (_, y, _) in both.items()}
     no_input = {n: score(y, no_input_baseline(time, y), units[n]) for n, (time, y, _) in both.items()}
-    one = {n: score(y[1:], y[:-1] + np.diff(v), units[n]) for n, (_, y, v) in _known(both).items()}
+    with np.errstate(invalid="ignore"):  # a run that went to infinity makes no step there
+        one = {n: score(y[1:], y[:-1] + np.diff(v), units[n]) for n, (_, y, v) in _known(both).items()}
     no_better = tuple(
         name for name in plant.outputs if not scores[name].rmse < NO_BETTER * no_input[name].rmse
     )

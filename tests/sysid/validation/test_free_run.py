@@ -56,6 +56,14 @@ def test_the_rmse_of_the_true_plant_is_the_noise():
     assert run.no_better == ()
 
 
+def test_a_run_to_infinity_scores_infinity_in_one_step_too_and_warns_of_nothing():
+    run = free_run(lag_plant(), lag_log(noise=0.1), tests=False)
+    run.log["t"][500:] = np.inf
+    again = free_run(lag_plant(), lag_log(noise=0.1), tests=False, known=run)
+    assert (again.scores["t"].rmse, again.one_step["t"].rmse) == (np.inf, np.inf)
+    assert again.no_better == ("t",)
+
+
 def test_readings_after_the_warmup_do_not_change_the_free_run():
     log, spoilt = lag_log(), lag_log()
     spoilt["t"].values[5:] += 30.0
