@@ -37,7 +37,7 @@ def tuned(stand_in: StandIn) -> SimpleNamespace:
         pareto=SimpleNamespace(rows=lambda: [{"a": 1}]),
     )  # fmt: skip
     found.asked = stand_in("thermogrip.mpc.tuning.tune.tune", tune)
-    stand_in("thermogrip.report.control.tuning_rows", ROWS)
+    stand_in("thermogrip.report.control.tuning_table", (tuple("abcdefghi"), ROWS))
     stand_in("thermogrip.mpc.tuning.sensitivity.sensitivity_words", ["move matters", "horizon does not"])
     stand_in("thermogrip.report.control.tuning_sections", ["a section"])
     found.pages = stand_in("thermogrip.report.html.write_report")

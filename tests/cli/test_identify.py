@@ -360,7 +360,7 @@ def test_a_warm_up_shorter_than_that_of_the_fit_is_told(bench: Bench, stand_in: 
     stand_in("thermogrip.sysid.identification.warm_up_of_fit", 50.0)
     stand_in("thermogrip.sysid.validation.free_run.free_run", SimpleNamespace(notes=(), band=lambda: None))
     stand_in("thermogrip.report.plant.band_words", "a band")
-    stand_in("thermogrip.report.plant.run_rows", [])
+    stand_in("thermogrip.report.plant.run_table", ((), ()))
     stand_in("thermogrip.cli.identify.run_answer", {})
     done = bench.run("validate", "plant.json", "good.csv", "--warmup", "8", "--score-from", "9")
     assert "good: 8 s of readings set the state, the fit was scored with 50 s" in words_of(done.err)

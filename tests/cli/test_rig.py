@@ -333,7 +333,7 @@ def test_a_batch_stops_at_q_alone_and_keeps_what_nobody_calls_bad(
     said: str, goes_on: bool, bad: str, stand_in: StandIn
 ) -> None:
     stand_in("thermogrip.cli.rig.typer.prompt", said)
-    assert verbs._ready(Console(), 2)(0, Trial("copper", 30.0, 18.0)) is goes_on
+    assert verbs._ready(2)(0, Trial("copper", 30.0, 18.0)) is goes_on
     assert verbs._judge(Console())(0, Trial("copper", 30.0), SimpleNamespace(contact=0.1)) == bad
 
 
@@ -346,7 +346,7 @@ def test_a_batch_stops_at_q_alone_and_keeps_what_nobody_calls_bad(
 )
 def test_the_operator_is_asked_for_the_next_object(trial: Trial, words: str, stand_in: StandIn) -> None:
     asked = stand_in("thermogrip.cli.rig.typer.prompt", "")
-    verbs._ready(Console(), 5)(1, trial)
+    verbs._ready(5)(1, trial)
     assert asked[0].args == (f"{words}Enter when it is ready, q to stop",)
     assert (asked[0].default, asked[0].show_default) == ("", False)
 

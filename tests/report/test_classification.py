@@ -124,7 +124,8 @@ DECIDED = {
 
 
 def test_the_fastest_classifier_is_reported_with_what_its_short_contacts_cost() -> None:
-    single = DECIDED | {"classifier": "quick", "n": 1, "time": 2.04, "wrong_early": None}
+    single = DECIDED | {"classifier": "quick", "n": 1, "time": 2.04}
+    single |= {"wrong_early": None, "expected_early": None}
     found = SimpleNamespace(table=lambda: [DECIDED, single, single | {"time": 1.0}], notes=("one was cut",))
     section = classification.decision_section(found)
     assert section.verdict == (

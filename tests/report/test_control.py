@@ -82,7 +82,7 @@ def test_a_tuned_controller_stands_with_its_scores_and_what_it_did_not_know(
     section = control.tuning_section(tuning)
     assert (section.verdict, section.tone) == (f"Tuned. {says} Faster.", tone)
     table, picture, about, scores = section.parts
-    assert (table.head, table.caption) == (control.TUNING_HEAD, f"Closed loops on {of}")
+    assert (table.head, table.caption) == (control.tuning_table(tuning)[0], f"Closed loops on {of}")
     assert isinstance(picture, Picture)
     unseen = "were not used in the search" if known else "no uncertainty, so the table is of the plant itself"
     assert about.text.startswith("Band 0.25 degC. ")
@@ -314,6 +314,10 @@ def test_steps_of_a_tuning_stand_in_the_order_of_the_spec() -> None:
             SimpleNamespace(controller="tuned", start=28.0, target=38.0, **row),
         ],
     )
-    first, second = control.tuning_rows(tuning)
+    head, (first, second) = control.tuning_table(tuning)
+    assert head == (
+        "controller", "step [degC]", "settles in [s], mean", "worst", "overshoot [K], mean", "worst",
+        "bias [K], worst", "energy [s at full drive]", "minimum time [s]",
+    )  # fmt: skip
     assert first == ("tuned", "28 to 38", 10.0, "does not settle", 0.123, 0.5, 0.01, 7.0, "never")
     assert second[:2] == ("PI", "28 to 18")

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.report import plant
 from thermogrip.report.html import Picture, Table, Text
-from thermogrip.report.plant import _prior_intervals, free_run_section, parameter_rows
+from thermogrip.report.plant import _prior_intervals, free_run_section, parameter_table
 from thermogrip.sysid.experiment.information import plant_from_prior
 from thermogrip.sysid.identification import Searched, SignalRole
 from thermogrip.sysid.models.network import load_network
@@ -76,8 +76,10 @@ def test_one_whose_residual_follows_something_is_not_green_and_says_what(
 def test_the_prior_of_a_network_stands_beside_what_was_learnt_and_a_black_box_has_none(
     run: tuple[Plant, Log, FreeRun],
 ) -> None:
-    rows = parameter_rows(plant_from_prior(load_network("tclab")))  # of a plant that has learnt nothing
+    learnt_nothing = plant_from_prior(load_network("tclab"))
+    head, rows = parameter_table(learnt_nothing)
     assert len(rows) > 3
+    assert head == ("parameter", "value", "unit", "5 %", "95 %", "prior 5 %", "prior 95 %")
     for _, value, _, *learnt_and_prior in rows:
         low, high, *prior = learnt_and_prior
         assert low < value < high
@@ -118,9 +120,10 @@ def test_signals_are_shown_with_their_roles_and_guesses_are_marked() -> None:
         SignalRole("q", "W", "input", "named", False),
         SignalRole("s", "degC", "left out", "its name", True),
     )
-    assert plant.signal_rows(SimpleNamespace(signals=signals)) == [
-        ("q", "W", "input", "named"), ("s", "degC", "left out", "guess: its name"),
-    ]  # fmt: skip
+    assert plant.signal_table(SimpleNamespace(signals=signals)) == (
+        ("column", "unit", "role", "why"),
+        (("q", "W", "input", "named"), ("s", "degC", "left out", "guess: its name")),
+    )
 
 
 @pytest.fixture
@@ -208,7 +211,7 @@ def test_growth_and_posterior_stand_where_there_are_any(monkeypatch: pytest.Monk
         sampled=("a", "b"), likelihood="normal", n_steps=500, acceptance=0.3, off_centre=0.123,
         converged=True, verdict="sampled",
     )  # fmt: skip
-    section = plant.posterior_section(None, record)
+    section = plant.posterior_section(record)
     assert (section.verdict, section.tone) == ("sampled.", "good")
     assert section.parts[0].caption.startswith("Marginals of 200 samples")
     assert section.parts[2] == Text("normal.")
@@ -218,7 +221,7 @@ def test_growth_and_posterior_stand_where_there_are_any(monkeypatch: pytest.Monk
         "deviations of the fitted values."
     )
     record.converged = False
-    assert plant.posterior_section(None, record).tone == "warn"
+    assert plant.posterior_section(record).tone == "warn"
     monkeypatch.setattr(plant, "free_run_section", lambda *args, **options: (args, options))
     asked: list[tuple[object, ...]] = []
     monkeypatch.setattr(
@@ -256,7 +259,7 @@ def test_the_table_of_models_has_a_column_a_log_of_what_was_held_out() -> None:
         ("oe", "t", None, 0.2, "degC"),
         ("no\N{NO-BREAK SPACE}input", "t", 2.1, 2.2, "degC"),
     )
-    assert [row[-1] for row in plant.model_rows(found)] == ["held out", "held out", "in the fit"]
+    assert [row[-1] for row in plant.held_out_table(found)[1]] == ["held out", "held out", "in the fit"]
 
 
 def test_blocks_of_a_log_share_a_row_that_shows_each() -> None:
@@ -271,7 +274,8 @@ def test_blocks_of_a_log_share_a_row_that_shows_each() -> None:
             ("block wood", 7.0, 50.0, 7, 8.0),
         )
     ]
-    both, tail, *logs = plant.model_rows(SimpleNamespace(rows=rows))
+    head, (both, tail, *logs) = plant.held_out_table(SimpleNamespace(rows=rows))
+    assert head == ("model", "log", "output", "RMSE", "unit", "fit [%]", "n", "no input", "")
     assert [row[1] for row in logs] == ["block copper", "block wood"]
     assert both[:3] == ("oe", "2 blocks: 3, 4", "t")
     assert both[3] == pytest.approx(np.sqrt((10 * 9 + 30 * 16) / 40))

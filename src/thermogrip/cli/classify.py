@@ -391,7 +391,7 @@ def materials(
     ]
     count = f"{len(rows)} material{'s' if len(rows) > 1 else ''}"
     console.table(f"{count}, effusivity in W s^0.5 m^-2 K^-1", head, body)
-    console.answer({"materials": [asdict(m) for m in rows]})
+    console.answer({"materials": rows})
     return 0
 
 

@@ -66,7 +66,7 @@ def tune(
     from thermogrip.mpc.design.spec import Spec, read_spec
     from thermogrip.mpc.tuning.sensitivity import sensitivity_words
     from thermogrip.mpc.tuning.tune import tune as search
-    from thermogrip.report.control import TUNING_HEAD, tuning_rows, tuning_sections
+    from thermogrip.report.control import tuning_sections, tuning_table
     from thermogrip.report.html import write_report
 
     pool = workers_of(workers, cluster)
@@ -84,17 +84,17 @@ def tune(
     if report is not None:
         lead = f"A controller for {plant.name}, tuned in simulation on draws of the plant."
         write_report(report, "Tuning", lead, tuning_sections(found))
-    console.table("Closed loops on draws of the plant", TUNING_HEAD, tuning_rows(found))
+    console.table("Closed loops on draws of the plant", *tuning_table(found))
     console.say(f"{found.verdict}: {found.finding}")
     words = sensitivity_words(found.sensitivity)
     for line in words:
         console.say(line)
     meets = "meets" if found.meets_spec else "does not meet"
     console.say(f"The controller {meets} the spec on every draw; wrote {out}")
-    result = {"verdict": found.verdict, "finding": found.finding, "meets_spec": found.meets_spec}
-    result |= {"scores": found.scores, "rows": [asdict(row) for row in found.rows]}
-    result |= {"sensitivity": [asdict(item) for item in found.sensitivity], "in_words": words}
-    console.answer({**result, "pareto": found.pareto.rows(), "out": out, "report": report})
+    keys = ("verdict", "finding", "meets_spec", "scores", "rows", "sensitivity")
+    result = {key: getattr(found, key) for key in keys}
+    result |= {"in_words": words, "pareto": found.pareto.rows(), "out": out, "report": report}
+    console.answer(result)
     return 0 if found.meets_spec else ANSWER_IS_NO
 
 
@@ -135,7 +135,7 @@ def review(
     if report is not None:
         console.say(f"wrote {report}")
     failed = any(c.verdict == "fail" for c in checks)
-    console.answer({"passed": not failed, "checks": [asdict(c) for c in checks], "report": report})
+    console.answer({"passed": not failed, "checks": checks, "report": report})
     return ANSWER_IS_NO if failed else 0
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -270,14 +269,10 @@ def _show_identified(
 ) -> None:
     """Print growth, models, parameters and their identifiability, gains, the data check and the verdict."""
     from thermogrip.report.plant import (
-        GAIN_HEAD,
-        MODEL_HEAD,
-        PARAMETER_HEAD,
-        SIGNAL_HEAD,
-        gain_rows,
-        model_rows,
-        parameter_rows,
-        signal_rows,
+        gain_table,
+        held_out_table,
+        parameter_table,
+        signal_table,
         time_constant_words,
     )
     from thermogrip.sysid.greybox.identifiability import identifiability_report
@@ -291,12 +286,12 @@ def _show_identified(
         for term in growth.residual:
             share = f"{100 * term.share:.0f} % of the residual's variance, {term.tau:.3g} s"
             console.say(f"before growth, the residual of {term.output} correlated with {term.term} ({share})")
-    console.table("Columns of the logs", SIGNAL_HEAD, signal_rows(found))
-    console.table("Free runs (RMSE)", MODEL_HEAD, model_rows(found))
+    console.table("Columns of the logs", *signal_table(found))
+    console.table("Free runs (RMSE)", *held_out_table(found))
     if plant.free:
-        console.table("Free parameters of the plant", PARAMETER_HEAD, parameter_rows(plant))
+        console.table("Free parameters of the plant", *parameter_table(plant))
     if dynamics is not None:
-        console.table("Gains at rest", GAIN_HEAD, gain_rows(dynamics))
+        console.table("Gains at rest", *gain_table(dynamics))
         console.say(time_constant_words(dynamics))
     for sentence in identifiability_report(plant):
         console.say(sentence)
@@ -315,33 +310,29 @@ def _identified(
     """Return the JSON answer of ``identify``."""
     from thermogrip.sysid.greybox.identifiability import identifiability_report
 
-    sampled = None
+    sampled, grown = None, None
     if record is not None:
         sampled = {
             key: getattr(record, key) for key in ("converged", "verdict", "tau", "n_steps", "likelihood")
         }
+    if growth is not None:
+        grown = {"looks": growth.evaluations, "rows": growth.rows, "residual": growth.residual}
     return {
         "model": found.model,
         "good": found.good,
         "verdict": found.verdict,
-        "signals": [asdict(signal) for signal in found.signals],
-        "rows": [asdict(row) for row in found.rows],
-        "data_check": [asdict(finding) for finding in found.data_check.findings],
-        "evidence": asdict(found.evidence),
+        "signals": found.signals,
+        "rows": found.rows,
+        "data_check": found.data_check.findings,
+        "evidence": found.evidence,
         "parameters": {
             name: {"value": plant.values[name], "unit": plant.units.get(name, "1")} for name in plant.free
         },
         "intervals_90": plant.intervals(0.9),
         "identifiability": identifiability_report(plant),
-        "growth": None
-        if growth is None
-        else {
-            "looks": growth.evaluations,
-            "rows": [asdict(row) for row in growth.rows],
-            "residual": [asdict(term) for term in growth.residual],
-        },
+        "growth": grown,
         "posterior": sampled,
-        "searched": [asdict(row) for row in found.searched],
+        "searched": found.searched,
         "notes": found.notes,
         "out": out,
     }
@@ -370,7 +361,7 @@ def validate(
     roles = loaded.inputs, loaded.outputs, loaded.disturbances
     records = load_logs(logs, *roles, columns=comma(columns), dt=dt)
     from thermogrip.report.html import write_report
-    from thermogrip.report.plant import SCORE_OF_RUN, band_words, free_run_section, run_rows
+    from thermogrip.report.plant import band_words, free_run_section, run_table
     from thermogrip.sysid.identification import warm_up_of_fit
     from thermogrip.sysid.validation.free_run import free_run
 
@@ -392,8 +383,7 @@ def validate(
         sections = [free_run_section(*each) for each in zip(records, runs, bands)]
         lead = f"Inputs in, outputs out, nothing fed back; scored from {score_from:g} s on."
         write_report(report, f"Free runs of {plant.name}", lead, sections)
-    rows = [row for log, run in zip(records, runs) for row in run_rows(log_name(log), run)]
-    console.table(f"Free run of {plant.name}", SCORE_OF_RUN, rows)
+    console.table(f"Free run of {plant.name}", *run_table(list(zip(records, runs))))
     for log, run, band in zip(records, runs, bands):
         console.say(f"{log_name(log)}: {band_words(band)}")
         for note in run.notes:
@@ -407,9 +397,9 @@ def run_answer(name: str, run: FreeRun, band: Band) -> dict[str, Any]:
     """Return one log's free run as the JSON answer has it."""
     return {
         "log": name,
-        "outputs": {output: asdict(score) for output, score in run.scores.items()},
-        "one_step": {output: asdict(score) for output, score in run.one_step.items()},
-        "naive": {kind: {o: asdict(s) for o, s in scores.items()} for kind, scores in run.naive.items()},
+        "outputs": run.scores,
+        "one_step": run.one_step,
+        "naive": run.naive,
         "left": run.residual.to_json(),
         "band": {
             "level": band.level,
@@ -493,7 +483,7 @@ def linearise(
         new_file(out, (".json", ".csv", ".mat"))
     loaded, console = load_plant(plant, network), Console(as_json)
     from thermogrip.report.html import write_report
-    from thermogrip.report.plant import GAIN_HEAD, dynamics_section, gain_rows, time_constant_words
+    from thermogrip.report.plant import dynamics_section, gain_table, time_constant_words
     from thermogrip.sysid.export.dynamics import plant_dynamics, usual_point
     from thermogrip.sysid.export.linearise import linearise_plant, save_linear
 
@@ -504,7 +494,7 @@ def linearise(
         {name: value for name, value in named.items() if name in loaded.disturbances},
     )
     found = plant_dynamics(loaded, inputs=u, disturbances=d)
-    console.table(f"Gains at rest of {plant.name}", GAIN_HEAD, gain_rows(found))
+    console.table(f"Gains at rest of {plant.name}", *gain_table(found))
     console.say(time_constant_words(found))
     if report is not None:
         write_report(

@@ -245,7 +245,7 @@ def batch(
             loaded,
             trials,
             new_folder(out),
-            ready=_ready(console, len(trials)) if asks else None,
+            ready=_ready(len(trials)) if asks else None,
             judge=_judge(console) if asks else None,
             stop=None if stop_early is None else session_stop(stop_early),
             guard=watch,
@@ -543,7 +543,7 @@ def _what_to_grasp(obj: float | None, material: str | None) -> tuple[str, float]
     return find_material(material).name, obj
 
 
-def _ready(console: Console, n: int) -> Callable[[int, Trial], bool]:
+def _ready(n: int) -> Callable[[int, Trial], bool]:
     """Return what asks for the next object."""
 
     def ready(k: int, trial: Trial) -> bool:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from thermogrip.report.console import Cells, Columns, cells
 from thermogrip.report.html import Picture, Section, Table, Text
 from thermogrip.report.plots import grasp_figure, loop_figure
 
@@ -21,17 +22,17 @@ if TYPE_CHECKING:
     from thermogrip.mpc.tuning.design_review import Check
     from thermogrip.rig.session.session import Session
 
-SCORE_HEAD = (
-    "classifier",
-    "condition",
-    "n",
-    "accuracy",
-    "log loss",
-    "by chance",
-    "Brier",
-    "ECE",
-    "if calibrated",
-    "fit [s]",
+_SCORES: Columns = (
+    ("classifier", lambda row: row["classifier"]),
+    ("condition", lambda row: row["condition"]),
+    ("n", lambda row: row["n"]),
+    ("accuracy", lambda row: _between(row["accuracy"], row["low"], row["high"])),
+    ("log loss", lambda row: _between(row["log_loss"], row["log_loss_low"], row["log_loss_high"])),
+    ("by chance", lambda row: f"{row['log_loss_chance']:.2f}"),
+    ("Brier", lambda row: _between(row["brier"], row["brier_low"], row["brier_high"])),
+    ("ECE", lambda row: _between(row["ece"], row["ece_low"], row["ece_high"])),
+    ("if calibrated", lambda row: f"{row['ece_calibrated']:.3f}"),
+    ("fit [s]", lambda row: f"{row['fit_s']:.2f}"),
 )
 
 ECE_TEXT = (
@@ -159,25 +160,9 @@ def _confusion_caption(comparison: Comparison, shown: str) -> str:
     return f"Confusion, {shown}: rows true, columns predicted; {counted}. Shade: share of the row."
 
 
-def score_table(comparison: Comparison) -> tuple[tuple[str, ...], tuple[tuple[Any, ...], ...]]:
-    """Return head and rows of all scores, each with its interval."""
-    return SCORE_HEAD, tuple(_scored(row) for row in comparison.scores())
-
-
-def _scored(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    """Return the cells of one row of scores."""
-    return (
-        row["classifier"],
-        row["condition"],
-        row["n"],
-        _between(row["accuracy"], row["low"], row["high"]),
-        _between(row["log_loss"], row["log_loss_low"], row["log_loss_high"]),
-        f"{row['log_loss_chance']:.2f}",
-        _between(row["brier"], row["brier_low"], row["brier_high"]),
-        _between(row["ece"], row["ece_low"], row["ece_high"]),
-        f"{row['ece_calibrated']:.3f}",
-        f"{row['fit_s']:.2f}",
-    )
+def score_table(comparison: Comparison) -> Cells:
+    """Return all scores, each with its interval."""
+    return cells(_SCORES, comparison.scores())
 
 
 def _seconds(row: dict[str, Any]) -> str:
@@ -226,25 +211,6 @@ def decision_section(found: Decisions) -> Section:
     from thermogrip.classify.figures import decision_figure
 
     table = found.table()
-    head = (
-        *("classifier", "condition", "n", "mean time [s]", "of [s]", "right when ended", "right at the end"),
-        *("ended early", "wrong of these", "expected", "stated"),
-    )
-    rows = tuple(
-        (
-            row["classifier"],
-            row["condition"],
-            row["n"],
-            _seconds(row),
-            f"{row['end']:.3g}",
-            _between(row["accuracy"], row["low"], row["high"]),
-            f"{row['accuracy_at_end']:.3f}",
-            f"{100 * row['early']:.0f} %",
-            *_wrong_early(row),
-            f"{100 * row['error']:.2g} %",
-        )
-        for row in table
-    )
     caption = (
         "A contact ends once the classifier is as sure as its training grasps showed to be enough for the "
         "stated share of wrong answers among those that end early; expected is what it then thought of them "
@@ -253,20 +219,38 @@ def decision_section(found: Decisions) -> Section:
     )
     parts: list[Any] = [
         Picture(decision_figure(found), "When contacts ended, and how often the answer was right then."),
-        Table(head, rows, caption, dense=True),
+        Table(*cells(_DECISIONS, table), caption, dense=True),
     ]
     if found.notes:
         parts.append(Text("Notes: " + "; ".join(found.notes) + "."))
     return Section("How soon is it decided?", tuple(parts), _shortest(table), "plain")
 
 
-def _wrong_early(row: Mapping[str, Any]) -> tuple[str, str]:
-    """Return the share of wrong answers among contacts that ended early, and what was expected."""
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.0f} %"
+
+
+def _wrong_early(row: Mapping[str, Any]) -> str:
+    """Return the share of wrong answers among contacts that ended early."""
     if row["wrong_early"] is None:
-        return "-", "-"
+        return "-"
     low, high = row["wrong_early_low"], row["wrong_early_high"]
-    wrong = f"{100 * row['wrong_early']:.0f} % ({100 * low:.0f}\N{EN DASH}{100 * high:.0f})"
-    return wrong, f"{100 * row['expected_early']:.0f} %"
+    return f"{_percent(row['wrong_early'])} ({100 * low:.0f}\N{EN DASH}{100 * high:.0f})"
+
+
+_DECISIONS: Columns = (
+    ("classifier", lambda row: row["classifier"]),
+    ("condition", lambda row: row["condition"]),
+    ("n", lambda row: row["n"]),
+    ("mean time [s]", _seconds),
+    ("of [s]", lambda row: f"{row['end']:.3g}"),
+    ("right when ended", lambda row: _between(row["accuracy"], row["low"], row["high"])),
+    ("right at the end", lambda row: f"{row['accuracy_at_end']:.3f}"),
+    ("ended early", lambda row: _percent(row["early"])),
+    ("wrong of these", _wrong_early),
+    ("expected", lambda row: _percent(row["expected_early"])),
+    ("stated", lambda row: f"{100 * row['error']:.2g} %"),
+)
 
 
 def _shortest(table: Sequence[dict[str, Any]]) -> str:

@@ -12,14 +12,19 @@ import json
 import math
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from thermogrip.datasets.media import printable
 from thermogrip.datasets.parallel import Progress
+
+#: Head and rows of a table.
+Cells: TypeAlias = tuple[tuple[str, ...], tuple[tuple[Any, ...], ...]]
+#: The columns of a table: their names, and what each shows of an item.
+Columns: TypeAlias = Sequence[tuple[str, Callable[[Any], Any]]]
 
 
 @dataclass(frozen=True)
@@ -98,12 +103,20 @@ class Console:
             yield _onward(show)
 
 
+def cells(columns: Columns, items: Iterable[Any]) -> Cells:
+    """Return the table of some items, a row an item."""
+    rows = (tuple(show(item) for _, show in columns) for item in items)
+    return tuple(name for name, _ in columns), tuple(rows)
+
+
 def plain(value: Any) -> Any:
     """Return the value as what JSON can hold: dicts, lists, text, numbers, null."""
     if value is None or isinstance(value, bool | str):
         return value
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
+    if is_dataclass(value):
+        return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, list | tuple | set | frozenset):
         return [plain(item) for item in value]
     if isinstance(value, Path):

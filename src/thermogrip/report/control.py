@@ -17,7 +17,7 @@ from thermogrip.mpc.tuning.figures import (
     step_time_figure,
 )
 from thermogrip.mpc.tuning.sensitivity import sensitivity_words
-from thermogrip.report.console import short
+from thermogrip.report.console import Cells, Columns, cells, short
 from thermogrip.report.html import Picture, Section, Table, Text
 from thermogrip.report.plots import grasp_figure, steps_figure
 
@@ -31,18 +31,6 @@ if TYPE_CHECKING:
     from thermogrip.mpc.interface import Move
     from thermogrip.mpc.tuning.tune import Tuning
     from thermogrip.rig.session.session import Session
-
-TUNING_HEAD = (
-    "controller",
-    "step [degC]",
-    "settles in [s], mean",
-    "worst",
-    "overshoot [K], mean",
-    "worst",
-    "bias [K], worst",
-    "energy [s at full drive]",
-    "minimum time [s]",
-)
 
 _STEPS_CAPTION = (
     "Closed loops on one draw of the plant; dashed: the target. MPC is drawn broad and LQR thin, so that "
@@ -65,22 +53,21 @@ _SPEC_WORDS = {
 }
 
 
-def tuning_rows(tuning: Tuning) -> tuple[tuple[Any, ...], ...]:
-    """Return the comparison of baseline, tuned, PI and LQR as table rows, step by step."""
-    rows = sorted(tuning.rows, key=lambda row: tuning.spec.steps.index((row.start, row.target)))
-    return tuple(
-        (
-            row.controller,
-            f"{row.start:g} to {row.target:g}",
-            _shown(row.settle_mean_s),
-            _shown(row.settle_worst_s),
-            _rounded(row.overshoot_mean),
-            _rounded(row.overshoot_worst),
-            _rounded(row.bias_worst),
-            _shown(row.energy_mean_s),
-            _shown(row.bound_s),
-        )
-        for row in rows
+def tuning_table(tuning: Tuning) -> Cells:
+    """Return the comparison of baseline, tuned, PI and LQR, step by step."""
+    columns: Columns = (
+        ("controller", lambda row: row.controller),
+        ("step [degC]", lambda row: f"{row.start:g} to {row.target:g}"),
+        ("settles in [s], mean", lambda row: _shown(row.settle_mean_s)),
+        ("worst", lambda row: _shown(row.settle_worst_s)),
+        ("overshoot [K], mean", lambda row: _rounded(row.overshoot_mean)),
+        ("worst", lambda row: _rounded(row.overshoot_worst)),
+        ("bias [K], worst", lambda row: _rounded(row.bias_worst)),
+        ("energy [s at full drive]", lambda row: _shown(row.energy_mean_s)),
+        ("minimum time [s]", lambda row: _shown(row.bound_s)),
+    )
+    return cells(
+        columns, sorted(tuning.rows, key=lambda row: tuning.spec.steps.index((row.start, row.target)))
     )
 
 
@@ -107,7 +94,7 @@ def tuning_section(tuning: Tuning) -> Section:
     )
     scores = ", ".join(f"{name} {value:.3f}" for name, value in tuning.scores.items())
     parts: list[Any] = [
-        Table(TUNING_HEAD, tuning_rows(tuning), f"Closed loops on {_checked(tuning)}"),
+        Table(*tuning_table(tuning), f"Closed loops on {_checked(tuning)}"),
         Picture(steps_figure(tuning.runs), _STEPS_CAPTION),
         Text(
             f"Band {tuning.spec.band_degC:g} degC. {_unseen(tuning)}; "
@@ -129,24 +116,13 @@ def pareto_section(tuning: Tuning) -> Section:
     """Return the section of what may be traded: settling, overshoot and energy of many designs."""
     draws = tuning.spec.search_draws if _uncertain(tuning) else 1
     rows = sorted(tuning.pareto.rows(), key=lambda row: (row["settle_s"] is None, row["settle_s"]))
-    table = tuple(
-        (
-            row["controller"],
-            row["name"],
-            _shown(row["settle_s"]),
-            _rounded(row["overshoot_degC"]),
-            _shown(row["energy_s"]),
-            "yes" if row["best"] else "",
-        )
-        for row in rows
-    )
-    head = (
-        "controller",
-        "design",
-        "settling [s]",
-        "overshoot, worst [K]",
-        "energy [s at full drive]",
-        "unbeaten",
+    columns: Columns = (
+        ("controller", lambda row: row["controller"]),
+        ("design", lambda row: row["name"]),
+        ("settling [s]", lambda row: _shown(row["settle_s"])),
+        ("overshoot, worst [K]", lambda row: _rounded(row["overshoot_degC"])),
+        ("energy [s at full drive]", lambda row: _shown(row["energy_s"])),
+        ("unbeaten", lambda row: "yes" if row["best"] else ""),
     )
     parts = (
         Picture(
@@ -155,8 +131,7 @@ def pareto_section(tuning: Tuning) -> Section:
             "better in one. Differences of a second, 0.05 K or half a per cent of energy do not count.",
         ),
         Table(
-            head,
-            table,
+            *cells(columns, rows),
             f"Means over steps and the draws of the search ({draws}), {tuning.spec.hold_s:g} s each",
         ),
     )

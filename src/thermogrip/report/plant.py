@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from thermogrip.datasets.schema import log_name
+from thermogrip.report.console import Cells
 from thermogrip.report.html import Picture, Section, Table, Text
 from thermogrip.report.plots import (
     bode_figure,
@@ -34,45 +35,34 @@ if TYPE_CHECKING:
     from thermogrip.sysid.validation.free_run import FreeRun
     from thermogrip.sysid.validation.prediction_bands import Band
 
-SCORE_OF_RUN = ("log", "output", "RMSE", "unit", "fit [%]", "n", "no input", "mean", "one step")
-
-PARAMETER_HEAD = ("parameter", "value", "unit", "5 %", "95 %", "prior 5 %", "prior 95 %")
 _BASELINES = (
     "Beside the free run: the best decay without input, the log's mean, and one step from each last "
     "reading (RMSE)"
 )
-SIGNAL_HEAD = ("column", "unit", "role", "why")
 _TIME_CONSTANTS = 6  # the slowest, in a sentence
 _STRUCTURES = 5  # of each kind, in the table of those searched
-GAIN_HEAD = ("input", "output", "gain", "low", "high", "unit", "dead time [s]", "63 % after [s]")
-MODEL_HEAD = ("model", "log", "output", "RMSE", "unit", "fit [%]", "n", "no input", "")
 
 
-def run_rows(name: str, run: FreeRun) -> list[tuple[Any, ...]]:
-    """Return a free run's scores beside its baselines (RMSE), a row an output."""
-    return [
-        (
-            name,
-            output,
-            score.rmse,
-            score.unit,
-            score.fit_percent,
-            score.n,
-            run.naive["no_input"][output].rmse,
-            run.naive["mean"][output].rmse,
-            run.one_step[output].rmse,
-        )
-        for output, score in run.scores.items()
-    ]
+def run_table(runs: Sequence[tuple[Log, FreeRun]]) -> Cells:
+    """Return the scores of free runs of logs beside their baselines (RMSE), a row a log and output."""
+    head = ("log", "output", "RMSE", "unit", "fit [%]", "n", "no input", "mean", "one step")
+    rows = []
+    for log, run in runs:
+        for output, score in run.scores.items():
+            naive = (run.naive[kind][output].rmse for kind in ("no_input", "mean"))
+            scores = (score.rmse, score.unit, score.fit_percent, score.n, *naive, run.one_step[output].rmse)
+            rows.append((log_name(log), output, *scores))
+    return head, tuple(rows)
 
 
-def signal_rows(found: Identification) -> list[tuple[str, str, str, str]]:
-    """Return what each column of the logs was taken for, and whether that is a guess: a row a column."""
-    return [(s.name, s.unit, s.role, f"guess: {s.why}" if s.guessed else s.why) for s in found.signals]
+def signal_table(found: Identification) -> Cells:
+    """Return what each column of the logs was taken for, and whether that is a guess."""
+    rows = ((s.name, s.unit, s.role, f"guess: {s.why}" if s.guessed else s.why) for s in found.signals)
+    return ("column", "unit", "role", "why"), tuple(rows)
 
 
-def model_rows(found: Identification) -> list[tuple[Any, ...]]:
-    """Return the table of candidate models: a row a model, log and output; blocks of a log share one row."""
+def held_out_table(found: Identification) -> Cells:
+    """Return the errors of candidate models: a row a model, log and output; blocks of a log share one row."""
     groups: dict[tuple[str, str, str, bool], list[Row]] = {}
     for row in found.rows:
         log = "blocks" if re.fullmatch(r"block \d+ of \d+", row.log) else row.log
@@ -88,7 +78,7 @@ def model_rows(found: Identification) -> list[tuple[Any, ...]]:
         what = log if len(rows) == 1 else f"{len(rows)} blocks: {', '.join(f'{r.rmse:.2g}' for r in rows)}"
         where = "held out" if held_out else "in the fit"
         out.append((model, what, output, rmse, first.unit, fit, int(n.sum()), idle, where))
-    return out
+    return ("model", "log", "output", "RMSE", "unit", "fit [%]", "n", "no input", ""), tuple(out)
 
 
 def model_table(found: Identification) -> Table:
@@ -121,7 +111,7 @@ def identification_section(found: Identification, plant: Plant) -> Section:
             models_figure(found.rows), "Free-run error of every model on rows that it was not fitted to."
         ),
         model_table(found),
-        Table(SIGNAL_HEAD, tuple(signal_rows(found)), "Columns of the logs"),
+        Table(*signal_table(found), "Columns of the logs"),
         Table(
             ("log", "output", "RMSE", "unit", "fit [%]", "n"),
             tuple(
@@ -131,7 +121,7 @@ def identification_section(found: Identification, plant: Plant) -> Section:
         ),
     ]
     if plant.free:
-        parts.append(Table(PARAMETER_HEAD, tuple(parameter_rows(plant)), "Free parameters"))
+        parts.append(Table(*parameter_table(plant), "Free parameters"))
         parts += _per_log(plant)
         parts += [Text(_sentence(said)) for said in identifiability_report(plant)]
     if checks:
@@ -179,16 +169,17 @@ def identification_sections(
     if growth is not None:
         sections.append(growth_section(growth))
     if record is not None:
-        sections.append(posterior_section(plant, record))
+        sections.append(posterior_section(record))
     for log, known in zip(logs, found.runs):
         run = free_run(plant, log, known.warmup, known.warmup, known=known)
         sections.append(free_run_section(log, run, seen=True))
     return sections
 
 
-def gain_rows(found: Dynamics) -> list[tuple[Any, ...]]:
+def gain_table(found: Dynamics) -> Cells:
     """Return the gains at rest with their intervals, dead times and rise times: a row an input and output."""
-    return [tuple(row.values()) for row in found.rows()]
+    head = ("input", "output", "gain", "low", "high", "unit", "dead time [s]", "63 % after [s]")
+    return head, tuple(tuple(row.values()) for row in found.rows())
 
 
 def time_constant_words(found: Dynamics) -> str:
@@ -215,7 +206,7 @@ def time_constant_words(found: Dynamics) -> str:
 def dynamics_section(found: Dynamics) -> Section:
     """Return the section of gains, step and frequency responses."""
     parts = (
-        Table(GAIN_HEAD, tuple(gain_rows(found)), "Gains at rest, with intervals"),
+        Table(*gain_table(found), "Gains at rest, with intervals"),
         Picture(
             step_response_figure(found),
             "Response of each output to a step of one unit of each input; shaded: the interval.",
@@ -253,7 +244,7 @@ def growth_section(growth: Growth) -> Section:
     return Section("Which terms does the network need?", tuple(parts), verdict)
 
 
-def posterior_section(plant: Plant, record: Posterior) -> Section:
+def posterior_section(record: Posterior) -> Section:
     """Return the section of the parameters' posterior: marginals, corner plot, how it was sampled."""
     from thermogrip.report.plots import corner_figure
 
@@ -277,20 +268,12 @@ def posterior_section(plant: Plant, record: Posterior) -> Section:
     return Section("How well are its parameters known?", tuple(parts), _sentence(record.verdict), tone)
 
 
-def parameter_rows(plant: Plant) -> list[tuple[Any, ...]]:
+def parameter_table(plant: Plant) -> Cells:
     """Return the free parameters with their 90 % intervals, and those of the prior."""
-    intervals, before = plant.intervals(0.9), _prior_intervals(plant)
-    nothing = (None, None)
-    return [
-        (
-            name,
-            plant.values[name],
-            plant.units.get(name, "1"),
-            *intervals.get(name, nothing),
-            *before.get(name, nothing),
-        )
-        for name in plant.free
-    ]
+    intervals, before, nothing = plant.intervals(0.9), _prior_intervals(plant), (None, None)
+    ends = {name: (*intervals.get(name, nothing), *before.get(name, nothing)) for name in plant.free}
+    rows = ((name, plant.values[name], plant.units.get(name, "1"), *ends[name]) for name in plant.free)
+    return ("parameter", "value", "unit", "5 %", "95 %", "prior 5 %", "prior 95 %"), tuple(rows)
 
 
 def _per_log(plant: Plant) -> list[Table]:
@@ -354,7 +337,7 @@ def free_run_section(
             f"{run.warmup:.3g} s set the state; nothing is fed back after that. Shaded: {band_words(band)}. "
             "On grey: not scored.",
         ),
-        Table(SCORE_OF_RUN, tuple(run_rows(name, run)), _BASELINES),
+        Table(*run_table([(log, run)]), _BASELINES),
         Picture(
             residual_figure(run),
             "Correlation of the residuals with themselves and with the inputs before them; shaded: 95 % of "

@@ -79,7 +79,7 @@ def run_demo(
     sections = [
         identification_section(found, plant),
         free_run_section(*held_out, title="Does it predict the half of a log that was held out?"),
-        posterior_section(plant, record),
+        posterior_section(record),
         tuning_section(tuning),
         review_section(checks),
         session_section(sessions, f"the twin (posterior draw {DRAW})"),
