@@ -7,7 +7,7 @@ Okabe and Ito, which differ for every kind of colour vision, and each classifier
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from thermogrip.classify.decisions.predict import Row
 from thermogrip.classify.evaluation.comparison import POOLED, Comparison
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.media import panels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,7 +38,7 @@ def accuracy_figure(comparison: Comparison) -> Figure:
         key=lambda c: (c != POOLED, any(r["apart"] for r in rows if r["condition"] == c)),
     )
     count = len(comparison.classifiers)
-    figure, [[axis]] = make_grid(1, 1, size=(7.2, 1.5 + len(order) * (0.22 + 0.11 * count)))
+    figure, [[axis]] = panels(1, 1, size=(7.2, 1.5 + len(order) * (0.22 + 0.11 * count)), ticks=7)
     for row in rows:
         k = comparison.classifiers.index(row["classifier"])
         y = order.index(row["condition"]) + 0.7 * ((k + 0.5) / count - 0.5)
@@ -68,7 +69,7 @@ def confusion_figure(comparison: Comparison, condition: str = POOLED) -> Figure:
     across = len(names) if len(names) < 5 else 3 if len(names) < 7 else 4
     down = -(-len(names) // across)
     wide = 3.1 if across < 4 else 2.5
-    figure, axes = make_grid(down, across, size=(wide * across, wide * down + 0.2))
+    figure, axes = panels(down, across, size=(wide * across, wide * down + 0.2), ticks=7)
     for axis, name in zip(axes.ravel(), names):
         _confusion(axis, *comparison.confusion(name, condition))
         axis.set_title(name, fontsize=9)
@@ -81,7 +82,9 @@ def confusion_figure(comparison: Comparison, condition: str = POOLED) -> Figure:
 def reliability_figure(comparison: Comparison, condition: str = POOLED) -> Figure:
     """Draw accuracy against confidence of each classifier, with intervals, and how many grasps are where."""
     count = len(comparison.classifiers)
-    figure, axes = make_grid(2, count, size=(2.4 * count, 3.2), heights=(3, 1), sharex="col", sharey="row")
+    figure, axes = panels(
+        2, count, size=(2.4 * count, 3.2), heights=(3, 1), sharex="col", sharey="row", ticks=7
+    )
     for k, name in enumerate(comparison.classifiers):
         bins = comparison.calibration(name, condition)
         top, bottom = axes[0, k], axes[1, k]
@@ -118,7 +121,7 @@ def effusivity_figure(
         raise UserError("there is no posterior to draw", hint="give at least one grasp")
     truth = list(materials) if materials is not None else [""] * len(rows)
     kinds = list(dict.fromkeys(truth))
-    figure, [[axis]] = make_grid(1, 1, size=(7.2, 1.2 + 0.16 * len(rows)))
+    figure, [[axis]] = panels(1, 1, size=(7.2, 1.2 + 0.16 * len(rows)), ticks=7)
     for i, (row, name) in enumerate(zip(rows, truth)):
         colour = PALETTE[kinds.index(name) % 8]
         axis.plot([row.effusivity_p05, row.effusivity_p95], [i, i], color=colour, lw=4, alpha=0.45)
@@ -177,31 +180,6 @@ def _library_lines(axis: Axes, library: Mapping[str, float]) -> None:
         )
 
 
-def make_grid(
-    down: int,
-    across: int,
-    *,
-    size: tuple[float, float],
-    heights: Sequence[float] | None = None,
-    sharex: Any = False,
-    sharey: Any = False,
-) -> tuple[Figure, NDArray[Any]]:
-    """Return a figure and its (down, across) axes, in the style of this room."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, layout="constrained")
-    ratios = {"height_ratios": heights} if heights is not None else {}
-    axes = figure.subplots(down, across, squeeze=False, sharex=sharex, sharey=sharey, gridspec_kw=ratios)
-    for axis in axes.ravel():
-        axis.spines[["top", "right"]].set_visible(False)
-        axis.tick_params(labelsize=7)
-        axis.xaxis.label.set_size(8)
-        axis.yaxis.label.set_size(8)
-        axis.grid(True, lw=0.4, color="#e6eaef")
-        axis.set_axisbelow(True)
-    return figure, axes
-
-
 _LABELS = {
     "train_per_class": "training grasps of each material",
     "contact_s": "contact time [s]",
@@ -214,7 +192,7 @@ def curve_figure(rows: Sequence[Row], over: str) -> Figure:
     ``difference_K`` of rows of :mod:`thermogrip.classify.evaluation.harness`."""
     if not rows:
         raise UserError("there is no curve to draw", hint="give at least one point")
-    figure, [[left, right]] = make_grid(1, 2, size=(7.6, 3.0))
+    figure, [[left, right]] = panels(1, 2, size=(7.6, 3.0), ticks=7)
     names = list(dict.fromkeys(row["classifier"] for row in rows))
     span = max(row[over] for row in rows) - min(row[over] for row in rows)
     for k, name in enumerate(names):
@@ -245,7 +223,7 @@ def curve_figure(rows: Sequence[Row], over: str) -> Figure:
 def decision_figure(found: Decisions) -> Figure:
     """Draw the share of contacts that has ended by each time, and accuracy beside mean time: a marker where
     contacts ended, with intervals, and a hollow one at their full length."""
-    figure, [[ended, beside]] = make_grid(1, 2, size=(8.4, 3.6))
+    figure, [[ended, beside]] = panels(1, 2, size=(8.4, 3.6), ticks=7)
     first: dict[str, dict[str, float]] = {}
     for row in found.table():
         first.setdefault(row["classifier"], row)

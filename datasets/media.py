@@ -9,7 +9,7 @@ medium is written, so that records keep the text as it was:
   characters are escaped by the template),
 * :func:`csv_text` for every CSV with a cell of text, undone by :func:`from_csv` when one is read,
 * :func:`markdown` for the README of an export,
-* :func:`thermogrip.report.html.literal` for figures.
+* :func:`thermogrip.report.html.literal` for figures, whose axes :func:`panels` makes.
 """
 
 from __future__ import annotations
@@ -18,6 +18,11 @@ import csv
 import io
 import re
 from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from numpy.typing import NDArray
 
 # C0 but tab and line feed, DEL, C1, line and paragraph separators, and what turns the direction of writing
 _CONTROL = re.compile(
@@ -56,6 +61,34 @@ def csv_text(rows: Iterable[Sequence[object]]) -> str:
 def markdown(text: str) -> str:
     r"""Return text as Markdown shows it, on one line."""
     return _MARKDOWN.sub(lambda found: "\\" + found[0], printable(" ".join(text.split())))
+
+
+def panels(
+    down: int,
+    across: int,
+    *,
+    size: tuple[float, float],
+    heights: Sequence[float] | None = None,
+    sharex: Any = False,
+    sharey: Any = False,
+    ticks: float = 8,
+) -> tuple[Figure, NDArray[Any]]:
+    """Return a figure and its (down, across) axes in thermogrip's style.
+
+    It is made without ``pyplot``: no window system is asked for, and nothing global is left behind.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(down, across, squeeze=False, sharex=sharex, sharey=sharey, height_ratios=heights)
+    for axis in axes.ravel():
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.tick_params(labelsize=ticks)
+        axis.xaxis.label.set_fontsize(8)
+        axis.yaxis.label.set_fontsize(8)
+        axis.grid(True, lw=0.4, color="#e6eaef")
+        axis.set_axisbelow(True)
+    return figure, axes
 
 
 def _written_out(found: re.Match[str]) -> str:

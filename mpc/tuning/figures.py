@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from thermogrip.datasets.media import panels
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop
 from thermogrip.mpc.tuning.sensitivity import PARAMETER_WORDS, Sensitivity
 
@@ -65,7 +66,10 @@ def closed_loop_figure(
     """
     others = [name for name in run.outputs if name not in run.target]
     heights = [2.4, *([1.3] if others else []), 1.0, *([0.8] if slew_per_s else [])]
-    figure, axes = _panels(heights, (8.6, 1.1 + 1.05 * sum(heights)))
+    figure, grid = panels(
+        len(heights), 1, size=(8.6, 1.1 + 1.05 * sum(heights)), heights=heights, sharex=True
+    )
+    axes = grid[:, 0]
     _regulated(axes[0], run)
     if others:
         _watched(axes[1], run, others, limits or {})
@@ -85,7 +89,7 @@ def step_time_figure(seconds: Mapping[str, ArrayLike], deadline_s: float, dt: fl
     """Draw how long the steps took (given in s, drawn in ms, logarithmic), beside the deadline and the
     sample time.
     """
-    figure, (axis,) = _panels([1.0], (8.6, 2.2))
+    figure, [[axis]] = panels(1, 1, size=(8.6, 2.2))
     shown = {name: 1e3 * np.asarray(values, float) for name, values in seconds.items()}
     everything = np.concatenate([values[values > 0] for values in shown.values()] or [np.ones(1)])
     low, high = np.min(everything, initial=1e3 * deadline_s), 1e3 * max(deadline_s, dt)
@@ -107,7 +111,7 @@ def pareto_figure(pareto: Pareto) -> Figure:
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    figure, (axis,) = _panels([1.0], (8.6, 3.8))
+    figure, [[axis]] = panels(1, 1, size=(8.6, 3.8))
     rows = [row for row in pareto.rows() if row["settle_s"] is not None]
     colour = Normalize(0.0, max([0.05, *(row["overshoot_degC"] for row in rows)]))
     front = sorted((row for row in rows if row["best"]), key=lambda row: row["settle_s"])
@@ -142,7 +146,7 @@ def pareto_figure(pareto: Pareto) -> Figure:
 
 def sensitivity_figure(found: Sequence[Sensitivity]) -> Figure:
     """Draw by what factor each parameter may change before anything that can be seen does."""
-    figure, (axis,) = _panels([1.0], (8.6, 0.9 + 0.34 * len(found)))
+    figure, [[axis]] = panels(1, 1, size=(8.6, 0.9 + 0.34 * len(found)))
     for k, item in enumerate(found):
         low, high = item.free_low / item.value, item.free_high / item.value
         if low < high:
@@ -227,21 +231,6 @@ def _note_all(axis: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     for x, y, names in shared:
         label = " and ".join(dict.fromkeys(names))
         axis.annotate(label, (x, y), textcoords="offset points", xytext=(7, 5), fontsize=7, color="#5b6776")
-
-
-def _panels(heights: Sequence[float], size: tuple[float, float]) -> tuple[Figure, list[Axes]]:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=list(heights))[:, 0]
-    for axis in axes:
-        axis.spines[["top", "right"]].set_visible(False)
-        axis.tick_params(labelsize=8)
-        axis.xaxis.label.set_fontsize(8)
-        axis.yaxis.label.set_fontsize(8)
-        axis.grid(True, lw=0.4, color="#e6eaef")
-        axis.set_axisbelow(True)
-    return figure, list(axes)
 
 
 def _legend(axis: Axes) -> None:

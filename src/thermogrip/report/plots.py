@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.media import panels
 from thermogrip.datasets.schema import Grasps, Log, column, log_name, names
 
 if TYPE_CHECKING:
@@ -45,7 +46,9 @@ MAX_POINTS = 1500
 def free_run_figure(log: Log, simulated: Log, outputs: Sequence[str], band: Band | None = None) -> Figure:
     """Draw outputs measured and in free run, their difference and the inputs, a column an output; rows whose
     ``scored`` is 0 stand on grey, and where a band is given readings are expected in the shade."""
-    figure, axes = _grid(3, len(outputs), heights=(3, 1.2, 1.0), size=(5.2 * len(outputs), 4.4))
+    figure, axes = panels(
+        3, len(outputs), heights=(3, 1.2, 1.0), size=(5.2 * len(outputs), 4.4), sharex="col"
+    )
     t = np.asarray(log["time"].values, dtype=float)
     keep = _thin(t.size)
     unscored = column(simulated, "scored") == 0 if "scored" in simulated else np.zeros(t.shape, dtype=bool)
@@ -80,7 +83,7 @@ def residual_figure(run: FreeRun) -> Figure:
     outputs = tuple(run.whiteness)
     inputs = tuple(run.input_correlation[outputs[0]])
     size = (2.6 * (1 + len(inputs)), 1.7 * len(outputs))
-    figure, axes = _grid(len(outputs), 1 + len(inputs), size=size)
+    figure, axes = panels(len(outputs), 1 + len(inputs), size=size, sharex="col")
     for row, name in zip(axes, outputs):
         shown = {f"{name}, own": run.whiteness[name]}
         shown |= {f"{name} after {u}": found for u, found in run.input_correlation[name].items()}
@@ -102,7 +105,7 @@ def models_figure(rows: Sequence[Row]) -> Figure:
     outputs = list(dict.fromkeys(row.output for row in held))
     models = list(dict.fromkeys(row.model for row in held))
     logs = list(dict.fromkeys(row.log for row in held))
-    figure, axes = _grid(1, len(outputs), size=(4.6 * len(outputs), 0.9 + 0.42 * len(models)), sharex=False)
+    figure, axes = panels(1, len(outputs), size=(4.6 * len(outputs), 0.9 + 0.42 * len(models)))
     for axis, output in zip(axes[0], outputs):
         for k, log in enumerate(logs):
             mine = {row.model: row.rmse for row in held if row.output == output and row.log == log}
@@ -122,7 +125,7 @@ def step_response_figure(found: Dynamics) -> Figure:
     outputs, inputs = found.near.outputs, found.near.inputs
     time, step = found.step_response()
     size = (max(4.6, 2.6 * len(inputs)), 0.6 + 1.5 * len(outputs))
-    figure, axes = _grid(len(outputs), len(inputs), size=size)
+    figure, axes = panels(len(outputs), len(inputs), size=size, sharex="col")
     for i, name in enumerate(outputs):
         unit = difference_unit(found.units.get(name, "1"))
         axes[i, 0].set_ylabel(name if unit == "1" else f"{name} [{unit}]")
@@ -141,7 +144,7 @@ def bode_figure(found: Dynamics) -> Figure:
     """Draw magnitude and phase from each input, a column each, to every output, a line each."""
     outputs, inputs = found.near.outputs, found.near.inputs
     omega, *parts = found.frequency_response()
-    figure, axes = _grid(2, len(inputs), size=(max(4.6, 2.6 * len(inputs)), 3.6))
+    figure, axes = panels(2, len(inputs), size=(max(4.6, 2.6 * len(inputs)), 3.6), sharex="col")
     for j, (name, column_of) in enumerate(zip(inputs, axes.T)):
         for axis, part in zip(column_of, parts):
             axis.set_xscale("log")
@@ -169,7 +172,7 @@ def posterior_figure(
     interval and the fitted value."""
     across = min(5, max(1, len(free)))
     down = -(-len(free) // across)
-    figure, axes = _grid(down, across, size=(2.1 * across, 1.55 * down), sharex=False)
+    figure, axes = panels(down, across, size=(2.1 * across, 1.55 * down))
     for k, axis in enumerate(axes.ravel()):
         if k >= len(free):
             axis.set_axis_off()
@@ -188,7 +191,7 @@ def posterior_figure(
 def loop_figure(runs: Mapping[str, Log], targets: Mapping[str, float], output: str = "t_surface") -> Figure:
     """Draw closed loops side by side by title: the regulated temperature and its target [degC] above, the
     drive below."""
-    figure, axes = _grid(2, len(runs), heights=(2.4, 1), size=(3.6 * len(runs), 3.6))
+    figure, axes = panels(2, len(runs), heights=(2.4, 1), size=(3.6 * len(runs), 3.6), sharex="col")
     for k, (title, log) in enumerate(runs.items()):
         t = np.asarray(log["time"].values, dtype=float)
         t, keep = t - t[0], _thin(t.size)
@@ -214,7 +217,7 @@ def loop_figure(runs: Mapping[str, Log], targets: Mapping[str, float], output: s
 def steps_figure(runs: Mapping[str, ClosedLoop]) -> Figure:
     """Draw simulated closed loops by "<step>, <controller>", a column a step, controllers over each other."""
     steps = list(dict.fromkeys(key.rsplit(", ", 1)[0] for key in runs))
-    figure, axes = _grid(2, len(steps), heights=(2.4, 1), size=(3.6 * len(steps), 3.6))
+    figure, axes = panels(2, len(steps), heights=(2.4, 1), size=(3.6 * len(steps), 3.6), sharex="col")
     for title, run in runs.items():
         step, controller = title.rsplit(", ", 1)
         top, bottom = axes[:, steps.index(step)]
@@ -236,8 +239,7 @@ def steps_figure(runs: Mapping[str, ClosedLoop]) -> Figure:
 
 def grasp_figure(records: Sequence[Grasps], title: str = "") -> Figure:
     """Draw the traces of grasps, a colour for each material."""
-    figure, axes = _grid(1, 1, size=(6.4, 3.0))
-    axis = axes[0, 0]
+    figure, [[axis]] = panels(1, 1, size=(6.4, 3.0))
     colours: dict[str, str] = {}
     for grasps in records:
         time = np.asarray(grasps["time"].values, dtype=float)
@@ -259,7 +261,7 @@ def responses_figure(records: Mapping[str, Grasps], materials: Sequence[str] = (
     get the first colours, the same as in another figure."""
     across = min(4, len(records))
     down = -(-len(records) // across)
-    figure, axes = _grid(down, across, size=(2.9 * across, 2.2 * down), sharex=False)
+    figure, axes = panels(down, across, size=(2.9 * across, 2.2 * down))
     colours = {name: PALETTE[k % 8] for k, name in enumerate(materials)}
     for axis, (title, grasps) in zip(axes.ravel(), records.items()):
         for row, name in zip(grasps["t_surface"].values, grasps["material"].values.astype(str)):
@@ -286,7 +288,7 @@ def exchange_figure(
     The flux e_dev (T_s - T_dev) / sqrt(pi t), T_s - T_dev = dT / (1 + e_dev / e_obj), has the integral
     2 e_dev dT sqrt(t / pi) / (1 + e_dev / e_obj).
     """
-    figure, axes = _grid(1, 2, size=(7.6, 3.0), sharex=False)
+    figure, axes = panels(1, 2, size=(7.6, 3.0))
     difference, areas = np.linspace(0, 20, 41), np.linspace(0, 6e-4, 41)
     for k, (name, e_obj) in enumerate(effusivity.items()):
         share = 2 * e_dev * np.sqrt(seconds / np.pi) / (1 + e_dev / e_obj)
@@ -298,33 +300,6 @@ def exchange_figure(
     axes[0, 0].set_ylabel(f"heat in {seconds:g} s [J]")
     axes[0, 0].legend(frameon=False, fontsize=8)
     return figure
-
-
-def _grid(
-    rows: int,
-    across: int,
-    *,
-    size: tuple[float, float],
-    heights: Sequence[float] | None = None,
-    sharex: Any = "col",
-) -> tuple[Figure, NDArray[Any]]:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, layout="constrained")
-    ratios = {"height_ratios": heights} if heights is not None else {}
-    axes = figure.subplots(rows, across, squeeze=False, sharex=sharex, gridspec_kw=ratios)
-    for axis in axes.ravel():
-        _quiet(axis)
-    return figure, axes
-
-
-def _quiet(axis: Axes) -> None:
-    axis.spines[["top", "right"]].set_visible(False)
-    axis.tick_params(labelsize=8)
-    axis.xaxis.label.set_fontsize(8)
-    axis.yaxis.label.set_fontsize(8)
-    axis.grid(True, lw=0.4, color="#e6eaef")
-    axis.set_axisbelow(True)
 
 
 def _log_scale(axis: Axes, values: Sequence[float]) -> None:
