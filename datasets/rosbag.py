@@ -1,7 +1,7 @@
 """Logs out of robots: ROS 1 .bag, ROS 2 .db3 and .mcap, and MCAP files of JSON, without ROS installed.
 
 A bag holds messages, each topic at its own times; a Log has one time axis.  A topic map says which field of
-which topic is which column (:data:`TOPICS_TEMPLATE`): it is read from ``<name>.topics.toml`` or
+which topic is which column (as in ``data/topics.toml``): it is read from ``<name>.topics.toml`` or
 ``topics.toml`` beside the bag.  Without one, every topic of a single number becomes a column: a
 ``sensor_msgs/Temperature`` a temperature, ``std_msgs`` numbers what their name's suffix says.
 
@@ -42,39 +42,6 @@ from thermogrip.datasets.tables import Table, file_stem
 from thermogrip.datasets.units import UNITS, guess_role, split_header, to_record_unit
 
 Floats = NDArray[np.float64]
-
-TOPICS_TEMPLATE = """\
-# Which field of which topic is which column of the log.  Name this file <bag>.topics.toml, or topics.toml in
-# the folder of the bag.  `ros2 bag info BAG` (or `rosbag info`) lists the topics.
-schema = "thermogrip.topics"
-version = 1
-
-clock = "t_surface"        # rows are at this column's times; default: the output with the most messages
-stamp = "log"              # "log": when the message was recorded; "header": the message's own stamp
-
-[columns.t_surface]
-topic = "/gripper/skin"    # sensor_msgs/Temperature: the field is temperature, in degC
-field = "temperature"      # nested fields with dots, elements of arrays with numbers: effort.0
-unit = "degC"              # degC K degF percent V A W s ms min 0_255, or 1
-role = "output"            # input, disturbance, output, other; default: guessed from name and unit
-
-[columns.t_tank]
-topic = "/tank/temperature"
-field = "temperature"
-unit = "degC"
-
-[columns.drive]
-topic = "/peltier/command" # std_msgs/Float64
-field = "data"
-unit = "1"
-role = "input"
-
-[columns.pump]
-topic = "/pump"            # std_msgs/Bool
-field = "data"
-unit = "1"
-role = "input"
-"""
 
 _UNPACK = "unpack it, or write it anew with `ros2 bag convert`, not compressed as a file"
 _STORED = (".mcap", ".db3")  # what a ROS 2 bag is made of

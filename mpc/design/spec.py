@@ -6,6 +6,7 @@ The template in :data:`SPEC_TEMPLATE` is the documentation: ``thermogrip init sp
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,38 +20,7 @@ from thermogrip.mpc.design.design import Design, default_design
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
-SPEC_TEMPLATE = """\
-# What the controller should do.  Every line may be left out; the values here are the defaults.
-
-# Steps of the skin that are tested in simulation, from -> to [degC].  Each starts with the plant at rest.
-steps = [[28, 38], [28, 18], [18, 43]]
-
-settle_within_s = 450      # inside the band, and staying there, after this long
-band_degC = 0.25           # half width of the band
-overshoot_degC = 0.3       # beyond the target, at most
-bias_degC = 0.05           # mean error at the end, at most
-hold_s = 600               # how long each step is simulated
-
-energy_weight = 0.0        # seconds of settling that you would give for one second at full drive
-
-# sample_time_s = 2.0      # by default a quarter of the plant's delay
-# slew_per_s = 0.25        # largest change of a drive [its units per s]; default: an eighth of its range
-# drive_limits = [-1.0, 1.0]      # several drives: drive_limits = { q1 = [0, 100], q2 = [0, 80] }
-# patience_s = 10          # for so long the model replaces a lost reading, then the drive of that loop
-                           # goes to zero, the others go on; default: five samples, but at least 10 s
-# output = "t_surface"     # what is regulated; several: output = ["t1", "t2"]
-
-ambient_degC = 25.0        # the room of the simulations
-noise_degC = 0.04          # of one reading (a quantum of 1/16 degC comes on top)
-sensor_offset_degC = 0.2   # thermocouple and room sensor are off by this, unknown to the controller
-
-search_draws = 2           # posterior draws of the plant in the search
-check_draws = 5            # and in the final comparison
-evaluations = 20           # designs that the search may try
-
-# [limits]                 # soft limits of outputs [degC]; default for a water tank:
-# t_tank = [2, 65]
-"""
+SPEC_TEMPLATE = (files(__package__) / "spec.toml").read_text(encoding="utf-8")
 
 _WATER = (2.0, 65.0)  # degC: neither ice nor scald in a tank of water
 _SAMPLES = 5  # of a step, at least

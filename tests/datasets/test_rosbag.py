@@ -24,7 +24,6 @@ from thermogrip.datasets import rosbag
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_log, write_log
 from thermogrip.datasets.rosbag import (
-    TOPICS_TEMPLATE,
     Column,
     TopicMap,
     _Decoders,
@@ -398,8 +397,7 @@ def test_a_field_is_a_path_of_names_and_places_and_a_stamp_that_of_its_header() 
 
 
 def test_the_template_is_a_topic_map(tmp_path: Path) -> None:
-    (tmp_path / "topics.toml").write_text(TOPICS_TEMPLATE)
-    found = read_topic_map(tmp_path / "topics.toml")
+    found = read_topic_map(Path(rosbag.__file__).with_name("data") / "topics.toml")
     assert set(found.columns) == {"t_surface", "t_tank", "drive", "pump"}
     assert (found.clock, found.stamp) == ("t_surface", "log")
     assert found.columns["drive"] == Column("/peltier/command", "data", "1", "input")

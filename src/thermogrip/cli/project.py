@@ -22,6 +22,13 @@ from thermogrip.cli.options import (
 from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
 
+TEMPLATES = {  # the package and the file of each
+    "spec": ("thermogrip.mpc.design", "spec.toml"),
+    "network": ("thermogrip", "templates/network.toml"),
+    "topics": ("thermogrip.datasets", "data/topics.toml"),
+    "guard": ("thermogrip.rig.guard", "guard.toml"),
+}
+
 
 def demo(
     out: Annotated[Path, option("--out", "DIR", "Where everything goes.")] = Path("thermogrip-demo"),
@@ -116,13 +123,13 @@ def init(
     spec: what tune aims at; network: a thermal network for identify --network; topics: which
     topic of a ROS bag or MCAP file is which column of a log; guard: what run and batch allow;
     examples: logs and grasps of a simulated rig, to try every verb on."""
-    choice("template", what, ("spec", "network", "topics", "guard", "examples"))
+    choice("template", what, (*TEMPLATES, "examples"))
     console = Console(as_json)
     if like is not None and what != "network":
         raise UserError(f"--like {like} is of a network, not of {what}", hint="write init network --like")
     if what == "examples":
         return _examples(console, out or Path())
-    text = _template(what) if like is None else _like(like)
+    text = _template(what, like)
     if out is None:
         console.say(text.rstrip("\n"))
     else:
@@ -149,28 +156,11 @@ def _examples(console: Console, folder: Path) -> int:
     return 0
 
 
-def _like(name: str) -> str:
-    """Return the text of a shipped network."""
-    from thermogrip.sysid.models.network_spec import builtin_networks
+def _template(what: str, like: str | None) -> str:
+    """Return the text of a template, or of a shipped network that one is to start from."""
+    package, name = TEMPLATES[what]
+    if like is not None:
+        from thermogrip.sysid.models.network_spec import builtin_networks
 
-    choice("--like", name, builtin_networks())
-    return (
-        resources.files("thermogrip.sysid").joinpath("networks", f"{name}.toml").read_text(encoding="utf-8")
-    )
-
-
-def _template(what: str) -> str:
-    """Return the text of a template."""
-    if what == "spec":
-        from thermogrip.mpc.design.spec import SPEC_TEMPLATE
-
-        return SPEC_TEMPLATE
-    if what == "topics":
-        from thermogrip.datasets.rosbag import TOPICS_TEMPLATE
-
-        return TOPICS_TEMPLATE
-    if what == "guard":
-        from thermogrip.rig.guard.settings import GUARD_TEMPLATE
-
-        return GUARD_TEMPLATE
-    return resources.files("thermogrip").joinpath("templates", "network.toml").read_text(encoding="utf-8")
+        package, name = "thermogrip.sysid", f"networks/{choice('--like', like, builtin_networks())}.toml"
+    return resources.files(package).joinpath(name).read_text(encoding="utf-8")
