@@ -11,13 +11,13 @@ from collections.abc import Callable
 
 from thermogrip.rig.drivers.tclab import TCLabRig
 from thermogrip.rig.drivers.thermogrip import DeviceRig
-from thermogrip.rig.serial.port import AnyPort, Port, PortError
+from thermogrip.rig.serial.port import Port, PortError
 from thermogrip.rig.serial.protocol import Answer, Boot, Hello, HostEnd, Refused
 
 _ROUND_S = 0.5
 
 
-def recognise(port: AnyPort, *, seconds: float = 6.0) -> str:
+def recognise(port: Port, *, seconds: float = 6.0) -> str:
     """Return the protocol behind an open port, ``thermogrip`` or ``tclab``, or raise PortError.
 
     An Arduino starts anew when its port is opened, so it has ``seconds`` (real ones) to answer.
@@ -37,7 +37,7 @@ def recognise(port: AnyPort, *, seconds: float = 6.0) -> str:
 
 
 def open_rig(
-    url: str | AnyPort,
+    url: str | Port,
     protocol: str | None = None,
     *,
     clock: Callable[[], float] = time.monotonic,
@@ -69,7 +69,7 @@ def open_rig(
     {'q1': 'percent', 'q2': 'percent'}
     >>> rig.close()
     """
-    port: AnyPort = Port(url, clock=clock) if isinstance(url, str) else url
+    port: Port = Port(url, clock=clock) if isinstance(url, str) else url
     port.open()
     try:
         spoken = recognise(port) if protocol is None else protocol
@@ -80,7 +80,7 @@ def open_rig(
         raise
 
 
-def _hear(port: AnyPort, question: bytes) -> bytes:
+def _hear(port: Port, question: bytes) -> bytes:
     """Return what comes within a round, up to its first pause after a whole line."""
     port.drop_input()
     port.write(question)

@@ -31,7 +31,7 @@ from statistics import median
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.clock import Metronome
 from thermogrip.rig.interface import DeviceRefusedError, NoticeBook, Reading, check_order
-from thermogrip.rig.serial.port import AnyPort, PortError
+from thermogrip.rig.serial.port import Port, PortError
 from thermogrip.rig.serial.protocol import REFUSALS
 
 HEATERS, SENSORS = ("q1", "q2"), ("t1", "t2")
@@ -85,7 +85,7 @@ class TCLabRig(NoticeBook):
 
     def __init__(
         self,
-        port: AnyPort,
+        port: Port,
         *,
         highest: float = 80.0,
         jump: float = 3.0,

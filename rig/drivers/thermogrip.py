@@ -36,7 +36,7 @@ from thermogrip.rig.clock import Metronome
 from thermogrip.rig.firmware.reference import MAX_PERIOD_MS, MIN_PERIOD_MS
 from thermogrip.rig.interface import DeviceRefusedError, NoticeBook, Reading, check_order
 from thermogrip.rig.serial import protocol
-from thermogrip.rig.serial.port import AnyPort, PortError
+from thermogrip.rig.serial.port import Port, PortError
 
 TTL_S = protocol.MAX_TTL_MS / 1000
 RENEW_S = 0.5  # how often a drive is renewed while time passes
@@ -98,7 +98,7 @@ class _Conversation(NoticeBook):
     """The host's end of the line to a device: questions, repeats, greetings, notices."""
 
     def __init__(
-        self, port: AnyPort, *, timeout: float, tries: int, greeting: float, clock: Callable[[], float]
+        self, port: Port, *, timeout: float, tries: int, greeting: float, clock: Callable[[], float]
     ) -> None:
         super().__init__(clock)
         self.port, self.timeout, self.tries = port, timeout, tries
@@ -294,7 +294,7 @@ class DeviceRig(_Conversation):
 
     def __init__(
         self,
-        port: AnyPort,
+        port: Port,
         *,
         timeout: float = 0.25,
         tries: int = 3,

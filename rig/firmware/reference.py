@@ -5,34 +5,17 @@ over the line, :meth:`DeviceCore.sample` with the sensors' values ten times a se
 with them whenever :attr:`DeviceCore.ring` says that a reading is due, and applies :attr:`DeviceCore.outputs`
 after each call.
 
-**What protects the rig when nobody is there.**
-
-* A drive lives for its time and no longer; then drive and pump are off (mode ``expired``) until the next one.
-* Four samples in a row outside a guarded sensor's limits, or open, or short, latch (``over:t_tank``); so does
-  a pump with a tachometer that is commanded but does not turn for 3 s while anything is driven.  A latch
-  switches drive and pump off until it is cleared by a command, and it cannot be cleared while its cause is
-  still there.
-* A Peltier against water that does not move heats or freezes what it touches within seconds, and the water's
-  sensor may not see it: with the pump off only a drive of zero is taken.
-* ``outputs.enable`` is the supply of the drivers, through a relay: only there while a drive is in force and
-  the pump runs.  A driver that is stuck at full drive is cut with it.
-* After a reset nothing is driven until the host has said hello, so the host cannot miss that there was one.
-* Readings that it takes by its own clock (``sample``) change nothing of all this: the guards look ten times a
-  second, whatever is asked.
-* The gripper keeps its place whatever happens: opening it would drop what it holds.
-
-**The ring buffer** keeps the readings that a device took by its own clock until the host has them.  Ticks are
-numbered from 0, one every period.  A tick has a reading, or none if the device itself came too late for it.
-The ring holds the newest; an older one is overwritten, and its number is then missing before the first, so a
-loss always shows.  The size is what an Arduino Uno has room for: 120 numbers, of which a reading takes one
-for its time and one for each drive and sensor.
+What protects the rig when nobody is there (expiry, latch, interlock, the supply of the drivers, the hello
+after a reset) and the ring of readings that the device takes by its own clock are specified in
+``docs/reference/protocol.md``.  A ring has what an Arduino Uno has room for: 120 numbers, of which a reading
+takes one for its time and one for each drive and sensor.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 from thermogrip.rig.serial import protocol
@@ -42,21 +25,11 @@ MIN_PERIOD_MS, MAX_PERIOD_MS = 10, 1000
 _WRAP = 2**32
 
 
-@dataclass(frozen=True)
-class _Slot:
-    """One tick's reading: the clock then [ms], and what was measured."""
-
-    at_ms: int
-    pump: int
-    drive: tuple[int, ...]
-    temperatures: tuple[int | str, ...]
-
-
 class Ring:
     """Readings by number; not running before :meth:`start`."""
 
     def __init__(self, n_numbers: int) -> None:
-        self._slots: deque[_Slot | None] = deque(maxlen=CELLS // (1 + n_numbers))
+        self._slots: deque[tuple[int, protocol.Kept] | None] = deque(maxlen=CELLS // (1 + n_numbers))
         self.period_ms, self.first, self._due_ms = 0, 0, 0
 
     @property
@@ -85,7 +58,7 @@ class Ring:
         late = (now_ms - self._due_ms) % _WRAP // self.period_ms
         for _ in range(self._skip(late)):
             self._push(None)
-        self._push(_Slot(now_ms, pump, drive, temperatures))
+        self._push((now_ms, protocol.Kept(0, pump, drive, temperatures)))
 
     def forget(self, number: int) -> bool:
         """Forget everything before this number; False if that has not come yet."""
@@ -102,8 +75,7 @@ class Ring:
         slot = self._slots[place]
         if slot is None:
             return None
-        age = (now_ms - slot.at_ms) % 2**16  # of the clock only so much is kept
-        return protocol.Kept(age, slot.pump, slot.drive, slot.temperatures)
+        return replace(slot[1], age_ms=(now_ms - slot[0]) % 2**16)  # of the clock only so much is kept
 
     def __len__(self) -> int:
         return len(self._slots)
@@ -117,7 +89,7 @@ class Ring:
             self._slots.clear()
         return min(late, most)
 
-    def _push(self, slot: _Slot | None) -> None:
+    def _push(self, slot: tuple[int, protocol.Kept] | None) -> None:
         full = len(self._slots) == self._slots.maxlen
         self.first = (self.first + full) % _WRAP
         self._slots.append(slot)

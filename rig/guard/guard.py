@@ -32,6 +32,7 @@ from dataclasses import dataclass, field
 from math import isfinite
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.limits import keyed
 from thermogrip.rig.guard.model_checks import ModelMonitor, ModelSettings, Residual, by_danger
 from thermogrip.rig.guard.plant_mismatch import PlantDrift
 from thermogrip.rig.guard.rule_checks import RuleMonitor, RuleSettings
@@ -78,13 +79,13 @@ class GuardSettings:
     """
 
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    skin_limits: tuple[float, float] = (3.0, 55.0)
-    other_limits: tuple[float, float] = (-1.0, 70.0)
-    expiry_s: float = 2.0
-    stale_s: float = 2.0
-    clock_slack_s: float = 1.0
-    drive_slack: float = 0.05
-    forget_s: float = 60.0
+    skin_limits: tuple[float, float] = keyed((3.0, 55.0), "skin_degC", -50, 150)
+    other_limits: tuple[float, float] = keyed((-1.0, 70.0), "others_degC", -50, 150)
+    expiry_s: float = keyed(2.0, "expiry_s", 0.5, 2)
+    stale_s: float = keyed(2.0, "stale_s", 0.5, 60)
+    clock_slack_s: float = keyed(1.0, "clock_slack_s", 0.1, 60)
+    drive_slack: float = keyed(0.05, "drive_slack", 0.005, 0.5)
+    forget_s: float = keyed(60.0, "forget_s", 0, 3600)
     sensors: SensorSettings = field(default_factory=SensorSettings)
     rooms: tuple[str, ...] | None = None
     model: ModelSettings = field(default_factory=ModelSettings)

@@ -35,6 +35,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.datasets.limits import keyed
 from thermogrip.rig.guard.sensor_checks import room_disturbances
 from thermogrip.rig.interface import UNIT_RANGES
 from thermogrip.sysid.models.model import Array
@@ -207,12 +208,12 @@ _NOT_AT_REST = 100.0  # times the variance of the states
 class FilterSettings:
     """Noise intensities of the filter, and the innovation that makes a reading suspect."""
 
-    jump_k: float = 8.0  # standard deviations ...
-    jump_floor: float = 3.0  # ... and kelvin
-    state: float = 0.01  # process noise of the states [K/sqrt(s)]
-    drive: float = 0.002  # of a drive's bias [1/sqrt(s)]
-    output: float = 0.002  # of an output's bias [K/sqrt(s)]
-    reading: float = 0.08  # least noise of a reading [K]
+    jump_k: float = keyed(8.0, "jump_k", 3, 100)  # standard deviations ...
+    jump_floor: float = keyed(3.0, "jump_floor_K", 0.1, 50)  # ... and kelvin
+    state: float = keyed(0.01, "state_K_per_sqrt_s", 1e-4, 1)  # process noise of the states [K/sqrt(s)]
+    drive: float = keyed(0.002, "drive_per_sqrt_s", 1e-5, 0.1)  # of a drive's bias [1/sqrt(s)]
+    output: float = keyed(0.002, "output_K_per_sqrt_s", 1e-5, 1)  # of an output's bias [K/sqrt(s)]
+    reading: float = keyed(0.08, "reading_K", 0.001, 5)  # least noise of a reading [K]
 
 
 class RigFilter:

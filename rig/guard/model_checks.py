@@ -49,8 +49,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.datasets.limits import keyed
 from thermogrip.rig.guard.kalman_filter import Estimate, FilterSettings, History, RigFilter, RigModel
-from thermogrip.rig.guard.plant_mismatch import Evidence, PlantDrift
+from thermogrip.rig.guard.plant_mismatch import MOST_DRIFT, Evidence, PlantDrift
 from thermogrip.sysid.models.model import Array
 from thermogrip.sysid.plant.plant import Plant
 
@@ -176,15 +177,16 @@ _BIAS_AFTER_S = 60.0  # a bias is not evaluated before the filter has seen somet
 class ModelSettings(FilterSettings):
     """How far the rig may be from its model; measured in docs/reference/faults.md."""
 
-    windows: tuple[float, ...] = (10.0, 30.0, 90.0)  # lengths H [s], rising
-    floors: tuple[float, ...] = (0.55, 0.35, 0.45)  # of each, where the model predicts no change [K]
-    share: float = 0.25  # allowed part of the change in the window
-    switching: float = 0.5  # allowed besides where the pump was switched in the window [K]
-    smooth: float = 3.0  # readings of so long are averaged [s]
-    bias_limit: float = 2.0  # of an output [K]
-    drive_limit: float = 0.25  # of a drive's bias, as a fraction of half its range
-    warm_up: float = 60.0  # nothing is compared for so long where the start is not at rest [s]
-    drift: float = 0.0  # share by which each parameter of the plant may have drifted
+    windows: tuple[float, ...] = keyed((10.0, 30.0, 90.0), "windows_s", 2, 600)  # lengths H [s], rising
+    # of each, where the model predicts no change [K]
+    floors: tuple[float, ...] = keyed((0.55, 0.35, 0.45), "floors_K", 0.05, 20)
+    share: float = keyed(0.25, "share", 0, 2)  # allowed part of the change in the window
+    switching: float = keyed(0.5, "switching_K", 0, 20)  # besides, where the pump was switched in it [K]
+    smooth: float = keyed(3.0, "smooth_s", 0, 60)  # readings of so long are averaged [s]
+    bias_limit: float = keyed(2.0, "bias_limit_K", 0.1, 20)  # of an output [K]
+    drive_limit: float = keyed(0.25, "drive_limit", 0.01, 0.45)  # of a drive's bias, of half its range
+    warm_up: float = keyed(60.0, "warm_up_s", 0, 3600)  # nothing is compared where it starts not at rest [s]
+    drift: float = keyed(0.0, "drift", 0, MOST_DRIFT)  # share by which each plant parameter may have drifted
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from thermogrip.datasets.limits import keyed
 from thermogrip.rig.guard.trip import Trip
 
 
@@ -26,14 +27,14 @@ from thermogrip.rig.guard.trip import Trip
 class RuleSettings:
     """Numbers of the rules; see the module."""
 
-    window: float = 60.0
-    drive: float = 0.5
-    wrong: float = 2.0
-    least: float = 1.0
-    far: float = 8.0
-    near: float = 1.0
-    leave: float = 5.0
-    area: float = 120.0
+    window: float = keyed(60.0, "window_s", 5, 3600)
+    drive: float = keyed(0.5, "drive", 0.01, 1)
+    wrong: float = keyed(2.0, "wrong_K", 0.05, 50)
+    least: float = keyed(1.0, "least_K", 0.05, 50)
+    far: float = keyed(8.0, "far_K", 0.5, 100)
+    near: float = keyed(1.0, "near_K", 0.05, 50)
+    leave: float = keyed(5.0, "leave_K", 0.1, 50)
+    area: float = keyed(120.0, "area_K_s", 1, 1e5)
 
 
 class RuleMonitor:

@@ -30,6 +30,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from math import ceil, erf, isfinite, log, sqrt
 
+from thermogrip.datasets.limits import keyed
 from thermogrip.datasets.units import guess_role
 from thermogrip.rig.guard.trip import Trip
 from thermogrip.sysid.plant.plant import Plant
@@ -39,15 +40,17 @@ from thermogrip.sysid.plant.plant import Plant
 class SensorSettings:
     """What a sensor may do."""
 
-    plausible: tuple[float, float] = (-5.0, 75.0)  # a reading outside is suspect [degC]
-    rate: float = 5.0  # fastest change of water [K/s]
-    slack: float = 0.5  # noise allowance of a change [K]
-    bad_in_a_row: int = 3  # so many suspect readings trip
-    noise: float = 0.04  # least white noise of a reading, standard deviation [K]
-    alpha: float = 1e-9  # probability that a healthy sensor repeats itself until it counts as stuck
+    # a reading outside is suspect [degC]
+    plausible: tuple[float, float] = keyed((-5.0, 75.0), "believable_degC", -50, 150)
+    rate: float = keyed(5.0, "rate_K_per_s", 0.05, 100)  # fastest change of water [K/s]
+    slack: float = keyed(0.5, "slack_K", 0, 10)  # noise allowance of a change [K]
+    bad_in_a_row: int = keyed(3, "bad_in_a_row", 1, 20)  # so many suspect readings trip
+    noise: float = keyed(0.04, "noise_K", 0.001, 5)  # least white noise, standard deviation [K]
+    # probability that a healthy sensor repeats itself until it counts as stuck
+    alpha: float = keyed(1e-9, "alpha", 1e-15, 1e-3)
     pairs: Mapping[tuple[str, str], float] = field(default_factory=dict)  # may differ by so much [K]
-    pair_limit: float = 4.0  # of ``x`` and ``x_2``, which are always a pair [K]
-    pair_s: float = 30.0  # for how long a pair may differ by more [s]
+    pair_limit: float = keyed(4.0, "pair_limit_K", 0.1, 50)  # of ``x`` and ``x_2``, always a pair [K]
+    pair_s: float = keyed(30.0, "pair_s", 0, 3600)  # for how long a pair may differ by more [s]
 
 
 @dataclass

@@ -32,7 +32,6 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from functools import partial
 from math import inf, isfinite, nan
-from types import TracebackType
 from typing import Any
 
 from thermogrip.datasets.errors import UserError
@@ -237,9 +236,7 @@ class Bridge:
     def __enter__(self) -> Bridge:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def _connect(self) -> _Link:

@@ -31,8 +31,7 @@ import time
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Protocol
+from typing import Any
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.clock import BackOff
@@ -55,44 +54,6 @@ class PortError(UserError):
     def __init__(self, kind: str, problem: str, *, file: str, hint: str) -> None:
         self.kind = kind
         super().__init__(problem, file=file, hint=hint)
-
-
-class AnyPort(Protocol):
-    """What a rig needs of a port; see :class:`Port`."""
-
-    @property
-    def url(self) -> str:
-        """Its name."""
-        ...
-
-    @property
-    def opened(self) -> int:
-        """How often it was opened."""
-        ...
-
-    def try_open(self) -> bool:
-        """Open it if that is due; say whether it is open."""
-        ...
-
-    def open(self) -> None:
-        """Open it or raise."""
-        ...
-
-    def write(self, data: bytes) -> None:
-        """Send."""
-        ...
-
-    def read(self, seconds: float) -> bytes:
-        """Return what came."""
-        ...
-
-    def drop_input(self) -> None:
-        """Throw away what came."""
-        ...
-
-    def close(self) -> None:
-        """Let it go."""
-        ...
 
 
 class PortLock:
@@ -240,9 +201,7 @@ class Port:
         self.open()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def _opened(self) -> Any:

@@ -1,72 +1,35 @@
 r"""The rig's protocol, with no port and no clock.
 
-The host asks and the device answers once, with the number of the question (without the check):
+The page ``docs/reference/protocol.md`` is the specification; its vectors are tests of this module and of the
+firmware.  The host asks and the device answers once, with the number of the question (without the check):
 
     7 drive 2000 1 2500            ->   7 ok armed 81204 power 17 - 1 0 2500 31250,30812,25000
     8 drive 2000 0 2500            ->   8 err interlock
+    9 take 118                     ->   9 ok 82310 118 120 24,1,2500,31250,30812,25000 -
                                         0 boot watchdog 18 0.1.0
 
-Questions: ``hello`` (its identity; switches everything off), ``read``, ``drive TTL_MS PUMP D[,D]``, ``grip
-0|1``, ``off``, ``clear`` (the latch), ``sample PERIOD_MS`` (take readings by your own clock) and ``take N``.
-A drive holds for its time to live and no longer, at most 2000 ms, and is refused after a reset until the host
-has said hello again, so that no reset passes unseen.  Every answer but those of hello and take is the whole
-state, so one exchange a sample both drives and reads.
-
-Everything is an integer, so that the same bytes mean the same on both sides: temperatures in thousandths of a
-degC (``open`` or ``short`` for a lost sensor), drives in ten-thousandths of their unit, times in
-milliseconds.
-
+Every answer but those of hello and take is the whole state, so one exchange a sample both drives and reads.
 A question that got no answer is asked again with the same number; the device repeats its answer and does
 nothing twice.  An answer to anything but the question that is open is reported and never used.
 
-The page ``docs/reference/protocol.md`` is the specification; its vectors are tests of this module and of the
-firmware.
+**What the check detects.**  A line ends in its length, the CRC-16 of what is before it, and that of the same
+bytes backwards: a check of 31 bits, since the two codes share only the factor x + 1.  The length is there for
+the usual damage of a serial line, an overrun that drops bytes so that the head of one line meets the tail of
+the next, and the grammar (single spaces, printable words, whole numbers in one spelling) finds most of the
+rest.
 
-**Readings by the device's own clock.**
-
-    7 take 118            ->   7 ok 82310 118 121 24,1,2500,31250,30812,25000 14,1,2500,31262,30812,25000 -
-
-are three ticks.  The first has the number 118 and was 24 ms old when the device answered, at 82 310 ms of its
-own; for the last one (``-``) the device itself came too late.  121 is the number of the tick that is still to
-come.  A reading is its age [ms], pump, drives and temperatures, as in a state.
-
-``take N`` confirms that everything before N has arrived, so asking again, with the same number of the
-question or with another, can lose nothing: what did not fit or did not arrive is in the next answer.  An
-answer that begins after N shows how many ticks were overwritten.
-
-Numbers are whole, in one spelling, so that the same value is the same bytes on both sides.
-
-Bytes to lines and back: framing and checks, so that nothing corrupt is taken for a message
--------------------------------------------------------------------------------------------
-
-A line is ASCII, made of words with one space between them, and closed by a check:
-
-    SEQ WORD WORD...*LLCCCCRRRR\n        e.g.  7 read*06EC819405
-
-``SEQ`` is 0 to 65535 without leading zeros, ``LL`` the number of bytes before the star, ``CCCC`` the CRC-16
-of everything up to and with ``LL`` and ``RRRR`` that of the same bytes backwards, all in upper-case
-hexadecimal.  The CRC is CCITT (polynomial 0x1021, start 0xFFFF; ``123456789`` gives 29B1), which
-:func:`binascii.crc_hqx` computes in C.
-
-**What the check detects.**  One CRC-16 finds every error of up to three bits and every burst of up to 16,
-and lets 2**-16 of all others through: too many where numbers stand, since a digit that becomes another leaves
-the line well formed. Backwards the same code has the reciprocal polynomial; the two share only the factor x +
-1, so together they are a check of 31 bits.  The length is there for the usual damage of a serial line, an
-overrun that drops bytes so that the head of one line meets the tail of the next, and the grammar (single
-spaces, no leading zeros, printable words) finds most of the rest.
-
-The parser knows no port and no clock: bytes go in, in pieces of any size, and events come out.  A line that
-is cut, damaged or overlong becomes a :class:`Damaged` event; after it the parser goes on at the next end of
-line. Empty lines mean nothing: a host sends one to end what the other side has received by half.
+Bytes go in, in pieces of any size, and events come out.  A line that is cut, damaged or overlong becomes a
+:class:`Damaged` event; after it the parser goes on at the next end of line.  Empty lines mean nothing: a host
+sends one to end what the other side has received by half.
 """
 
 from __future__ import annotations
 
 import re
 from binascii import crc_hqx
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias, get_args
 
 #: Most bytes before the star.
 MAX_BODY = 160
@@ -161,17 +124,29 @@ class LineParser:
 _INT = re.compile(r"0|-?[1-9][0-9]{0,9}")
 
 
-def integer(text: str) -> int | None:
-    """Return a 32-bit integer, signed or not, in its one spelling; None for anything else."""
-    value = int(text) if _INT.fullmatch(text) else None
-    return value if value is not None and -(2**31) <= value <= 0xFFFFFFFF else None
+def integer(text: str) -> int:
+    """Return a 32-bit integer, signed or not, in its one spelling; ValueError for anything else."""
+    _check(_INT.fullmatch(text) is not None and -(2**31) <= int(text) <= 0xFFFFFFFF)
+    return int(text)
 
 
-def integers(text: str) -> tuple[int, ...] | None:
-    """Return integers with commas between them, None if one is none."""
-    values = [integer(word) for word in text.split(",")]
-    whole = tuple(value for value in values if value is not None)
-    return whole if len(whole) == len(values) else None
+def integers(text: str) -> tuple[int, ...]:
+    """Return integers with commas between them."""
+    return tuple(map(integer, text.split(",")))
+
+
+def _switch(text: str) -> int:
+    _check(text in ("0", "1"))
+    return int(text)
+
+
+def _temperatures(words: Sequence[str]) -> tuple[int | str, ...]:
+    return tuple(word if word in LOST else integer(word) for word in words)
+
+
+def _check(sound: bool) -> None:
+    if not sound:
+        raise ValueError("malformed")
 
 
 def join(values: Sequence[int | str]) -> str:
@@ -217,30 +192,22 @@ class Taken:
         return (str(self.uptime_ms), str(self.first), str(self.next), *kept)
 
 
-def parse_taken(words: Sequence[str], n_drives: int) -> Taken | None:
-    """Return the readings of the words after ``ok``, None where they are malformed."""
-    head = integers(join(words[:3]))
-    if head is None or len(words) < 3 or min(head) < 0:
-        return None
-    uptime_ms, first, to_come = head
-    readings = [None if word == _HOLE else _kept(word, n_drives) for word in words[3:]]
-    if any(reading is None and word != _HOLE for reading, word in zip(readings, words[3:])):
-        return None
+def parse_taken(words: Sequence[str], n_drives: int) -> Taken:
+    """Return the readings of the words after ``ok``, ValueError where they are malformed."""
+    uptime_ms, first, to_come = map(integer, words[:3])
+    readings = tuple(None if word == _HOLE else _kept(word, n_drives) for word in words[3:])
     ticks = (to_come - first) % 2**32
     stuck = ticks > 0 and not readings  # would be requested for ever
-    sound = len(readings) <= ticks < 2**31 and not stuck
-    return Taken(uptime_ms, first, to_come, tuple(readings)) if sound else None
+    _check(min(uptime_ms, first, to_come) >= 0 and len(readings) <= ticks < 2**31 and not stuck)
+    return Taken(uptime_ms, first, to_come, readings)
 
 
-def _kept(word: str, n_drives: int) -> Kept | None:
-    parts = word.split(",")
-    numbers = integers(join(parts[: 2 + n_drives]))
-    values = [part if part in LOST else integer(part) for part in parts[2 + n_drives :]]
-    known = tuple(value for value in values if value is not None)
-    if numbers is None or not values or len(known) < len(values):
-        return None
-    age, pump, *drive = numbers
-    return Kept(age, pump, tuple(drive), known) if age >= 0 and pump in (0, 1) else None
+def _kept(word: str, n_drives: int) -> Kept:
+    age, pump, *rest = word.split(",")
+    drive = tuple(map(integer, rest[:n_drives]))
+    kept = Kept(integer(age), _switch(pump), drive, _temperatures(rest[n_drives:]))
+    _check(kept.age_ms >= 0 and bool(kept.temperatures))
+    return kept
 
 
 MAX_TTL_MS = 2000
@@ -318,7 +285,10 @@ class Take:
 
 
 Request: TypeAlias = Hello | Read | Drive | Grip | Off | Clear | Sample | Take
-_BARE: dict[str, Request] = {"hello": Hello(), "read": Read(), "off": Off(), "clear": Clear()}
+_FORMS: dict[str, tuple[Callable[[str], Any], ...]] = {
+    "drive": (integer, _switch, integers), "grip": (_switch,), "sample": (integer,), "take": (integer,),
+}  # fmt: skip
+_KINDS: dict[str, type[Request]] = {kind.__name__.lower(): kind for kind in get_args(Request)}
 
 
 @dataclass(frozen=True)
@@ -448,27 +418,29 @@ class HostEnd:
             return Unexpected("echo", line)
         if self._open is None or line.seq != self._seq:
             return Unexpected("duplicate" if line.seq == self._seq else "late", line)
-        answered: Event
-        if kind == "err":
-            known = len(rest) == 1 and rest[0] in REFUSALS
-            answered = Refused(self._open, rest[0]) if known else Unexpected("content", line)
-        else:
-            content = self._content(rest)
-            answered = Unexpected("content", line) if content is None else Answer(self._open, content)
-        if not isinstance(answered, Unexpected):
-            self._open = None
+        try:
+            if kind == "err":
+                _check(len(rest) == 1 and rest[0] in REFUSALS)
+                answered: Event = Refused(self._open, rest[0])
+            else:
+                answered = Answer(self._open, self._content(rest))
+        except ValueError:
+            return Unexpected("content", line)
+        self._open = None
         return answered
 
-    def _content(self, words: Sequence[str]) -> Identity | State | Taken | None:
+    def _content(self, words: Sequence[str]) -> Identity | State | Taken:
         if isinstance(self._open, Hello):
-            heard = parse_identity(words)
-            self.identity = heard or self.identity
-            return heard
+            self.identity = parse_identity(words)
+            return self.identity
         if isinstance(self._open, Take):
-            taken = parse_taken(words, len(self.identity.drives)) if self.identity else None
-            return taken if taken and all(self._fits(kept) for kept in taken.readings if kept) else None
+            _check(self.identity is not None)
+            taken = parse_taken(words, len(self.identity.drives) if self.identity else 0)
+            _check(all(self._fits(kept) for kept in taken.readings if kept))
+            return taken
         state = parse_state(words)
-        return state if state is None or self._fits(state) else None
+        _check(self._fits(state))
+        return state
 
     def _fits(self, heard: State | Kept) -> bool:
         """Say whether it has as many numbers as the device has drives and sensors, where known."""
@@ -478,82 +450,57 @@ class HostEnd:
 
 
 def request_words(request: Request) -> tuple[str, ...]:
-    """Return the words of a question."""
-    if isinstance(request, Drive):
-        return ("drive", str(request.ttl_ms), str(request.pump), join(request.drive))
-    if isinstance(request, Grip):
-        return ("grip", str(request.closed))
-    if isinstance(request, Sample):
-        return ("sample", str(request.period_ms))
-    if isinstance(request, Take):
-        return ("take", str(request.number))
-    return (next(word for word, bare in _BARE.items() if bare == request),)
+    """Return the words of a question: its name, and its numbers in their order."""
+    numbers = (join(value) if isinstance(value, tuple) else str(value) for value in vars(request).values())
+    return (type(request).__name__.lower(), *numbers)
 
 
 def parse_request(words: Sequence[str]) -> Request | str:
     """Return the question that the words are, or the code to refuse them with."""
-    word, rest = words[0], words[1:]
-    if word in _BARE:
-        return "syntax" if rest else _BARE[word]
-    if word == "grip":
-        return Grip(int(rest[0])) if len(rest) == 1 and rest[0] in ("0", "1") else "syntax"
-    if word in ("sample", "take"):
-        number = integer(rest[0]) if len(rest) == 1 else None
-        return "syntax" if number is None else Sample(number) if word == "sample" else Take(number)
-    if word == "drive" and len(rest) == 3:
-        ttl, drive = integer(rest[0]), integers(rest[2])
-        if ttl is not None and drive is not None and rest[1] in ("0", "1"):
-            return Drive(ttl, int(rest[1]), drive)
-    return "syntax" if word == "drive" else "unknown"
+    word, *rest = words
+    if word not in _KINDS:
+        return "unknown"
+    try:
+        return _KINDS[word](*(form(text) for form, text in zip(_FORMS.get(word, ()), rest, strict=True)))
+    except ValueError:
+        return "syntax"
 
 
-def parse_identity(words: Sequence[str]) -> Identity | None:
-    """Return the identity that the words after ``ok`` are, None where they are none."""
-    if len(words) != 5 or words[0] != PROTOCOL or not _VERSION.fullmatch(words[1]):
-        return None
-    channels = [_channel(text) for text in words[2].split(",")]
-    sensors = tuple(words[4].split(","))
-    if words[3] not in ("pump", "-") or not all(_NAME.fullmatch(name) for name in sensors):
-        return None
-    drives = tuple(channel for channel in channels if channel is not None)
-    return Identity(words[1], drives, words[3] == "pump", sensors) if len(drives) == len(channels) else None
+def parse_identity(words: Sequence[str]) -> Identity:
+    """Return the identity that the words after ``ok`` are, ValueError where they are none."""
+    protocol, version, drives, pump, sensors = words
+    names = tuple(sensors.split(","))
+    _check(protocol == PROTOCOL and _VERSION.fullmatch(version) is not None and pump in ("pump", "-"))
+    _check(all(_NAME.fullmatch(name) for name in names))
+    return Identity(version, tuple(map(_channel, drives.split(","))), pump == "pump", names)
 
 
-def parse_state(words: Sequence[str]) -> State | None:
-    """Return the state that the words after ``ok`` are, None where they are none."""
-    if len(words) != 9:
-        return None
+def parse_state(words: Sequence[str]) -> State:
+    """Return the state that the words after ``ok`` are, ValueError where they are none."""
     mode, uptime, cause, boot, faults, pump, grip, drive, temperatures = words
-    uptime_ms, boots, applied = integer(uptime), integer(boot), integers(drive)
-    read = [text if text in LOST else integer(text) for text in temperatures.split(",")]
     latched = () if faults == "-" else tuple(faults.split(","))
-    known = mode in MODES and cause in CAUSES and pump in ("0", "1") and grip in ("0", "1")
-    faulty = all(_FAULT.fullmatch(text) for text in latched)
-    if not known or not faulty or bool(latched) != (mode == "latched"):
-        return None
-    if uptime_ms is None or boots is None or applied is None or uptime_ms < 0 or not 0 <= boots <= 0xFFFF:
-        return None
-    values = tuple(value for value in read if value is not None)
-    if len(values) != len(read):
-        return None
-    return State(mode, uptime_ms, cause, boots, latched, int(pump), int(grip), applied, values)
+    _check(mode in MODES and cause in CAUSES and bool(latched) == (mode == "latched"))
+    _check(all(_FAULT.fullmatch(text) for text in latched))
+    uptime_ms, boots = integer(uptime), integer(boot)
+    _check(uptime_ms >= 0 and 0 <= boots <= 0xFFFF)
+    applied = (_switch(pump), _switch(grip), integers(drive))
+    return State(mode, uptime_ms, cause, boots, latched, *applied, _temperatures(temperatures.split(",")))
 
 
 def _announcement(line: Line) -> Event:
     """Return the event of a line that answers no question: a reset, or damage that the device saw."""
     if line.words == ("err", "corrupt"):
         return Refused(None, "corrupt")
-    boots = integer(line.words[2]) if len(line.words) == 4 else None
-    if line.words[0] != "boot" or boots is None or not 0 <= boots <= 0xFFFF:
+    try:
+        word, cause, boots, version = line.words
+        _check(word == "boot" and cause in CAUSES and 0 <= integer(boots) <= 0xFFFF)
+        _check(_VERSION.fullmatch(version) is not None)
+        return Boot(cause, int(boots), version)
+    except ValueError:
         return Unexpected("content", line)
-    if line.words[1] not in CAUSES or not _VERSION.fullmatch(line.words[3]):
-        return Unexpected("content", line)
-    return Boot(line.words[1], boots, line.words[3])
 
 
-def _channel(text: str) -> Channel | None:
-    parts = text.split(":")
-    if len(parts) != 4 or not _NAME.fullmatch(parts[0]) or not parts[1]:
-        return None
-    low, high = integer(parts[2]), integer(parts[3])
-    return None if low is None or high is None or low > high else Channel(parts[0], parts[1], low, high)
+def _channel(text: str) -> Channel:
+    name, unit, low, high = text.split(":")
+    _check(_NAME.fullmatch(name) is not None and bool(unit) and integer(low) <= integer(high))
+    return Channel(name, unit, int(low), int(high))

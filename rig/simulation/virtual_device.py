@@ -30,13 +30,12 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from random import Random
-from types import TracebackType
 from typing import Any
 
 from thermogrip.rig.clock import ScaledClock
 from thermogrip.rig.firmware.reference import Board, DeviceCore, Outputs, Sensor, Value
 from thermogrip.rig.guard.sensor_checks import room_disturbances
-from thermogrip.rig.serial.port import PortError
+from thermogrip.rig.serial.port import Port, PortError
 from thermogrip.rig.serial.protocol import Channel
 from thermogrip.rig.simulation.cable import PtyLink, SocketLink, spoil
 from thermogrip.rig.simulation.tclab_firmware import TCLabCore
@@ -405,9 +404,7 @@ class VirtualDevice:
     def __enter__(self) -> VirtualDevice:
         return self.start() if self._link is not None else self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.stop()
 
     def _serve(self) -> None:
@@ -516,28 +513,28 @@ class VirtualDevice:
         )
 
 
-class DirectPort:
-    """A :class:`~thermogrip.rig.serial.port.Port` with no cable, to a device with ``link="none"``."""
+class DirectPort(Port):
+    """A port with no cable, to a device with ``link="none"``."""
 
     def __init__(self, device: VirtualDevice) -> None:
-        self.device, self.url, self.opened = device, "direct", 1
-        self._answer = b""
-        self.is_open = True
+        super().__init__("direct")
+        self.device, self._answer = device, b""
+        self._serial, self.opened = device, 1
 
     def open(self) -> None:
         """Open it."""
         if self.device.is_pulled:
             raise PortError("absent", "is not there", file=self.url, hint="plug the cable in")
         self.opened += not self.is_open
-        self.is_open = True
+        self._serial = self.device
 
     def close(self) -> None:
         """Close it."""
-        self.is_open, self._answer = False, b""
+        self._serial, self._answer = None, b""
 
     def try_open(self) -> bool:
         """Open it if the cable is in; say whether it is open."""
-        if not self.is_open and not self.device.is_pulled:
+        if not self.device.is_pulled:
             self.open()
         return self.is_open
 
@@ -551,10 +548,6 @@ class DirectPort:
         self._check()
         answer, self._answer = self._answer or self.device.exchange(b""), b""
         return answer
-
-    def drop_input(self) -> None:
-        """Throw away what has come and was not read."""
-        self.read(0.0)
 
     def _check(self) -> None:
         if not self.is_open or self.device.is_pulled:

@@ -124,8 +124,9 @@ def test_what_is_taken_reads_back(uptime: int, first: int, readings: list[protoc
         "01 2 3 4,1,0,25000",
     ],
 )
-def test_readings_that_make_no_sense_are_none(text: str) -> None:
-    assert protocol.parse_taken(text.split(), 1) is None
+def test_readings_that_make_no_sense_are_malformed(text: str) -> None:
+    with pytest.raises(ValueError, match="malformed|unpack"):
+        protocol.parse_taken(text.split(), 1)
 
 
 def test_readings_of_another_shape_than_the_device_has_are_not_used() -> None:

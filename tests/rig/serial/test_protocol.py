@@ -188,8 +188,9 @@ def test_numbers_of_readings_go_round_and_the_longest_line_is_whole() -> None:
     kept = protocol.Kept(24, 1, (2500,), (31250, "open"))
     taken = protocol.Taken(9, 2**32 - 2, 3, (kept, None))
     assert (taken.waiting, protocol.parse_taken(taken.words(), 1)) == (3, taken)
-    for ticks, found in ((2**31 - 1, True), (2**31, False)):
-        assert (protocol.parse_taken(["9", "0", str(ticks), "-"], 1) is not None) == found
+    assert protocol.parse_taken(["9", "0", str(2**31 - 1), "-"], 1).waiting == 2**31 - 2
+    with pytest.raises(ValueError, match="malformed"):
+        protocol.parse_taken(["9", "0", str(2**31), "-"], 1)
     longest = protocol.encode_line(65535, "x" * 154)
     assert protocol.decode_line(longest[:-1]) == protocol.Line(65535, ("x" * 154,))
     with pytest.raises(ValueError, match="line"):
@@ -235,8 +236,9 @@ def test_a_state_reads_back(state: protocol.State) -> None:
         "armed 1 power 17 - 1 0 2500 nan",
     ],
 )
-def test_a_state_that_makes_no_sense_is_none(text: str) -> None:
-    assert protocol.parse_state(text.split()) is None
+def test_a_state_that_makes_no_sense_is_malformed(text: str) -> None:
+    with pytest.raises(ValueError, match="malformed|unpack"):
+        protocol.parse_state(text.split())
 
 
 @pytest.mark.parametrize(
@@ -245,8 +247,9 @@ def test_a_state_that_makes_no_sense_is_none(text: str) -> None:
      "thermogrip/1 0.1.0 drive:1:-1 pump t", "thermogrip/1 0.1.0 drive:1:-1:1 fan t",
      "thermogrip/1 0.1.0 drive:1:-1:1 pump T!", "thermogrip/1 0.1.0 drive:1:-1:1 pump"],
 )  # fmt: skip
-def test_an_identity_that_makes_no_sense_is_none(text: str) -> None:
-    assert protocol.parse_identity(text.split()) is None
+def test_an_identity_that_makes_no_sense_is_malformed(text: str) -> None:
+    with pytest.raises(ValueError, match="malformed|unpack"):
+        protocol.parse_identity(text.split())
 
 
 def _answer(seq: int) -> bytes:
