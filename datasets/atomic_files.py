@@ -11,7 +11,6 @@ integer). Reading one runs no code, whatever the file holds.
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import os
@@ -24,7 +23,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, as_user_error, os_fault, os_faults
 from thermogrip.datasets.limits import check_content, check_size, check_source, most_bytes, read_within
 
 #: A document's part of what a file of records may have (:mod:`thermogrip.datasets.limits`): 8 MiB, 1 MiB.
@@ -33,34 +32,11 @@ _LONG_KEY = re.compile(
     r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){32}""", re.ASCII
 )  # possessive: linear in the text
 
-_MENDS = {
-    errno.ENOENT: ("no such file or folder", "check the path"),
-    errno.EACCES: ("permission denied", "choose another folder or change its permissions"),
-    errno.EPERM: ("permission denied", "choose another folder or change its permissions"),
-    errno.EROFS: ("the disk is read-only", "choose another folder"),
-    errno.ENOSPC: ("the disk is full", "free some space or choose another folder"),
-    errno.EDQUOT: ("the disk quota is used up", "free some space or choose another folder"),
-    errno.EISDIR: ("is a folder", "name a file"),
-    errno.ENOTDIR: ("a part of the path is not a folder", "check the path"),
-    errno.ENAMETOOLONG: ("the name is too long", "shorten it"),
-    errno.EEXIST: ("exists already", "choose another name"),
-}
-
-
-def os_fault(error: OSError, path: str | Path) -> UserError:
-    """Return the :class:`UserError` for what the operating system refused."""
-    problem, hint = _MENDS.get(
-        error.errno or 0, (error.strerror or str(error), "check the path and the disk")
-    )
-    return UserError(problem, file=path, hint=hint)
-
 
 def make_folder(path: str | Path) -> None:
     """Make a folder, and those above it, where there is none; UserError where that is refused."""
-    try:
+    with os_faults(path):
         Path(path).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise os_fault(error, path) from error
 
 
 # Windows writes a line end of two bytes unless it is asked not to; a child process gets no copy on either
@@ -115,38 +91,22 @@ def open_new(path: str | Path) -> int:
     return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _NO_LINK | _AS_WRITTEN, 0o666)
 
 
-def source_size(path: str | Path) -> int:
-    """Return the size of a file [bytes], 0 where it is a pipe; UserError where there is none to read."""
-    try:
-        return check_source(path)
-    except OSError as error:
-        raise os_fault(error, path) from error
-
-
 def read_bytes(path: str | Path, *, share: int = 1) -> bytes:
     """Return the bytes of a file, at most one ``share``-th of what any file may hold."""
-    try:
+    # a null byte in the name is a ValueError
+    with as_user_error(ValueError, "{error}", file=repr(str(path)), hint="check the path"), os_faults(path):
         check_size(check_source(path), file=path, share=share)
         with open(path, "rb") as stream:
             data = read_within(stream, most_bytes(share))
-    except OSError as error:
-        raise os_fault(error, path) from error
-    except ValueError as error:  # a null byte in the name
-        if isinstance(error, UserError):
-            raise
-        raise UserError(str(error), file=repr(str(path)), hint="check the path") from error
     check_size(len(data), file=path, share=share)  # a pipe says no size, and a file may grow
     return data
 
 
 def file_hash(path: str | Path) -> str:
     """Return the SHA-256 of a file as 64 hexadecimal digits."""
-    try:
-        check_source(path)
-        with open(path, "rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError as error:
-        raise os_fault(error, path) from error
+    check_source(path)
+    with os_faults(path), open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def write_json(path: str | Path, content: Mapping[str, Any], *, schema: str, version: int) -> Path:
@@ -161,17 +121,13 @@ def write_json(path: str | Path, content: Mapping[str, Any], *, schema: str, ver
 def read_toml(path: str | Path, *, hint: str) -> dict[str, Any]:
     """Return the content of a TOML file; ``hint`` says where a good one comes from."""
     raw = read_bytes(path, share=_TOML_SHARE)
-    try:
+    too_deep = as_user_error(RecursionError, "is nested too deeply", file=path, hint=hint)
+    # no TOML, no text, or an integer of thousands of digits
+    with too_deep, as_user_error(ValueError, "is not TOML ({error})", file=path, hint=hint):
         text = raw.decode("utf-8")
         if _LONG_KEY.search(text):  # tomllib takes the square of the parts of a key
             raise UserError("has a key of more than 32 parts", file=path, hint=hint)
         content = tomllib.loads(text)
-    except UserError:
-        raise
-    except RecursionError as error:
-        raise UserError("is nested too deeply", file=path, hint=hint) from error
-    except ValueError as error:  # no TOML, no text, or an integer of thousands of digits
-        raise UserError(f"is not TOML ({str(error)[:200]})", file=path, hint=hint) from error
     check_content(content, file=path)
     return content
 

@@ -6,7 +6,24 @@ prints its one line and exits with code 2.  Any other exception is our bug and e
 
 from __future__ import annotations
 
+import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+_MENDS = {
+    errno.ENOENT: ("no such file or folder", "check the path"),
+    errno.EACCES: ("permission denied", "choose another folder or change its permissions"),
+    errno.EPERM: ("permission denied", "choose another folder or change its permissions"),
+    errno.EROFS: ("the disk is read-only", "choose another folder"),
+    errno.ENOSPC: ("the disk is full", "free some space or choose another folder"),
+    errno.EDQUOT: ("the disk quota is used up", "free some space or choose another folder"),
+    errno.EISDIR: ("is a folder", "name a file"),
+    errno.ENOTDIR: ("a part of the path is not a folder", "check the path"),
+    errno.ENAMETOOLONG: ("the name is too long", "shorten it"),
+    errno.EEXIST: ("exists already", "choose another name"),
+}
 
 
 class UserError(ValueError):
@@ -46,3 +63,34 @@ class UserError(ValueError):
         where = ", ".join(filter(None, (f"{word}{place}" for word, place in places if place is not None)))
         text = f"{where}: {problem}" if where else problem
         super().__init__(" ".join(f"{text}; {hint}".split()) if hint else " ".join(text.split()))
+
+
+@contextmanager
+def as_user_error(
+    kinds: type[Exception] | tuple[type[Exception], ...], problem: str, **where: Any
+) -> Iterator[None]:
+    """Raise an exception of these kinds as the :class:`UserError` of a problem (``{error}`` in it is what it
+    says) and a place; one that is a UserError already stays what it is."""
+    try:
+        yield
+    except UserError:
+        raise
+    except kinds as error:
+        raise UserError(problem.replace("{error}", str(error)[:200]), **where) from error
+
+
+def os_fault(error: OSError, path: str | Path) -> UserError:
+    """Return the :class:`UserError` for what the operating system refused."""
+    problem, hint = _MENDS.get(
+        error.errno or 0, (error.strerror or str(error), "check the path and the disk")
+    )
+    return UserError(problem, file=path, hint=hint)
+
+
+@contextmanager
+def os_faults(path: str | Path) -> Iterator[None]:
+    """Raise what the operating system refuses of a path as :class:`UserError`."""
+    try:
+        yield
+    except OSError as error:
+        raise os_fault(error, path) from error

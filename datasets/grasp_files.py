@@ -26,8 +26,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.atomic_files import os_fault, write_atomic
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.atomic_files import write_atomic
+from thermogrip.datasets.errors import UserError, os_faults
 from thermogrip.datasets.media import csv_text
 from thermogrip.datasets.netcdf import open_netcdf, record_unit, write_netcdf
 from thermogrip.datasets.schema import (
@@ -192,10 +192,8 @@ def _print_of(samples: Floats) -> bytes:
 
 
 def _in_folder(folder: Path) -> list[Path]:
-    try:
+    with os_faults(folder):
         files = sorted(p for p in folder.iterdir() if p.name.lower().endswith((*_ENDINGS, ".nc")))
-    except OSError as error:
-        raise os_fault(error, folder) from error
     files = [p for p in files if not file_stem(p).endswith("_meta") and not p.name.startswith(".")]
     if not files:
         raise UserError("holds no grasp files", file=folder, hint="give a folder with .csv or .nc files")

@@ -25,7 +25,7 @@ from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, os_faults
 
 if TYPE_CHECKING:
     import numpy as np
@@ -55,8 +55,9 @@ def most_unpacked(packed: int) -> int:
 
 
 def check_source(path: str | Path) -> int:
-    """Return the size of a file [bytes], 0 where it is a pipe; OSError where there is none."""
-    found = os.stat(path)
+    """Return the size of a file [bytes], 0 where it is a pipe; UserError where there is none to read."""
+    with os_faults(path):
+        found = os.stat(path)
     if stat.S_ISDIR(found.st_mode):
         raise UserError("is a folder", file=path, hint="name a file")
     # what a shell makes of <(command), and stdin

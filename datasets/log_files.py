@@ -23,9 +23,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.atomic_files import atomic_path, source_size, write_atomic
-from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.limits import check_size
+from thermogrip.datasets.atomic_files import atomic_path, write_atomic
+from thermogrip.datasets.errors import UserError, as_user_error
+from thermogrip.datasets.limits import check_size, check_source
 from thermogrip.datasets.media import csv_text
 from thermogrip.datasets.netcdf import convention_unit, open_netcdf, write_netcdf
 from thermogrip.datasets.repair import (
@@ -191,7 +191,7 @@ def check_log_file(path: str | Path) -> None:
     if _format(file) != "rosbag":
         check_table(file, log=True)
     elif not os.path.isdir(file):
-        check_size(source_size(file), file=file)
+        check_size(check_source(file), file=file)
 
 
 def write_log(log: Log, path: str | Path) -> Path:
@@ -243,11 +243,9 @@ def split_cut(path: str | Path) -> tuple[Path, float, float]:
         return Path(path), -np.inf, np.inf
     ends = []
     for text, empty in ((match["start"], -np.inf), (match["stop"], np.inf)):
-        try:
+        hint = "write PATH@START:STOP in seconds"
+        with as_user_error(ValueError, f"{text!r} is not a time", file=str(path), hint=hint):
             ends.append(float(text) if text.strip() else empty)
-        except ValueError:
-            hint = "write PATH@START:STOP in seconds"
-            raise UserError(f"{text!r} is not a time", file=str(path), hint=hint) from None
     start, stop = ends
     if not start < stop:
         raise UserError(f"the cut {start:g}:{stop:g} is empty", file=str(path), hint="write the start first")

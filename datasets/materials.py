@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, as_user_error
 
 # kind -> (k [W/mK], rho [kg/m3], c_p [J/kgK]), each (least, greatest) near room temperature
 KINDS: dict[str, tuple[tuple[float, float], tuple[float, float], tuple[float, float]]] = {
@@ -150,10 +150,9 @@ def read_materials(text: str, *, file: str = "materials.csv") -> list[Material]:
 def _material(row: dict[str, str], file: str, line: int) -> Material:
     numbers = {}
     for key in ("k", "rho", "c_p", "effusivity", "effusivity_sd_percent"):
-        try:
+        wrong = (KeyError, TypeError, ValueError)
+        with as_user_error(wrong, "is not a number", file=file, row=line, column=key, hint="write one"):
             numbers[key] = float(row[key])
-        except (KeyError, TypeError, ValueError) as error:
-            raise UserError("is not a number", file=file, row=line, column=key, hint="write one") from error
     if not row.get("source") or not row.get("name"):
         raise UserError("has no name or no source", file=file, row=line, hint="say where it comes from")
     e = _effusivity(numbers, file, line)

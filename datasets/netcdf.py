@@ -26,6 +26,7 @@ References
 from __future__ import annotations
 
 import math
+from contextlib import AbstractContextManager
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,8 +34,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.atomic_files import atomic_path, os_fault
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.atomic_files import atomic_path
+from thermogrip.datasets.errors import UserError, as_user_error, os_faults
 from thermogrip.datasets.limits import check_source, check_unpacked, most_bytes, most_unpacked
 from thermogrip.datasets.units import UNITS, to_record_unit
 
@@ -73,26 +74,18 @@ _ALIASES = {
 
 def check_netcdf(path: str | Path) -> None:
     """Refuse what is no NetCDF-4 file, or declares more than it may hold, before xarray is loaded."""
-    try:
-        check_source(path)
-        with Path(path).open("rb") as stream:
-            magic = stream.read(8)
-    except OSError as error:
-        raise os_fault(error, path) from error
+    check_source(path)
+    with os_faults(path), Path(path).open("rb") as stream:
+        magic = stream.read(8)
     if magic[:3] == b"CDF":
         raise UserError("is NetCDF-3", file=path, hint="convert it with: nccopy -k nc4 OLD NEW")
     if magic != b"\x89HDF\r\n\x1a\n":
         raise UserError("is not NetCDF", file=path, hint="give a NetCDF-4 file or the right ending")
     h5py = import_module("h5py")
-    try:
-        # damage here leaves h5netcdf half built, and complaining when it is collected
-        with h5py.File(path, "r") as tried:
-            tried.attrs.get("_nc3_strict")
-            check_hdf5(tried, path)
-    except UserError:
-        raise
-    except _DAMAGE as error:
-        raise _damaged(path) from error
+    # damage here leaves h5netcdf half built, and complaining when it is collected
+    with _not_damaged(path), h5py.File(path, "r") as tried:
+        tried.attrs.get("_nc3_strict")
+        check_hdf5(tried, path)
 
 
 def open_netcdf(path: str | Path) -> xr.Dataset:
@@ -101,16 +94,15 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
     check_netcdf(path)
     import xarray as xr
 
-    try:
-        with xr.open_dataset(path, engine="h5netcdf", decode_times=False, decode_timedelta=False) as data:
-            loaded = data.load()
-    except _DAMAGE as error:
-        raise _damaged(path) from error
+    options = {"engine": "h5netcdf", "decode_times": False, "decode_timedelta": False}
+    with _not_damaged(path), xr.open_dataset(path, **options) as data:
+        loaded = data.load()
     return from_cf(_text_as_str(loaded))
 
 
-def _damaged(path: str | Path) -> UserError:
-    return UserError("is damaged or not NetCDF-4", file=path, hint="copy or write it again")
+def _not_damaged(path: str | Path) -> AbstractContextManager[None]:
+    hint = "copy or write it again"
+    return as_user_error(_DAMAGE, "is damaged or not NetCDF-4", file=path, hint=hint)
 
 
 def check_hdf5(opened: Any, path: str | Path) -> None:

@@ -21,7 +21,7 @@ from importlib.util import find_spec
 from typing import Any, TypeAlias, TypeVar
 
 from thermogrip import __version__
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, as_user_error
 
 Progress: TypeAlias = Callable[[float, str], None]
 #: How many local processes, or the address of a Dask scheduler.
@@ -147,12 +147,9 @@ def _on_cluster(
 
     dask: Any = distributed  # its functions have no types
 
-    try:
+    hint = "start one with 'dask scheduler', or check the address"
+    with as_user_error((OSError, ValueError), f"no scheduler answers at {address}", hint=hint):
         client = dask.Client(address, timeout=_CONNECT_S, set_as_default=False)
-    except (OSError, TimeoutError, ValueError) as error:
-        raise UserError(
-            f"no scheduler answers at {address}", hint="start one with 'dask scheduler', or check the address"
-        ) from error
     try:
         _check_cluster(client, address)
         futures = client.map(function, todo, pure=False)
@@ -170,18 +167,12 @@ def _check_cluster(client: Any, address: str) -> None:
     """Refuse a cluster without workers, or one that would run other code."""
     if not client.scheduler_info()["workers"]:
         raise UserError(f"the cluster at {address} has no workers", hint=f"run 'dask worker {address}'")
-    try:
+    hint = f"install thermogrip {__version__} on all of them"
+    with as_user_error(ModuleNotFoundError, f"a worker of {address} has no thermogrip", hint=hint):
         versions = set(client.run(_version).values())
-    except ModuleNotFoundError as error:
-        raise UserError(
-            f"a worker of {address} has no thermogrip",
-            hint=f"install thermogrip {__version__} on all of them",
-        ) from error
     if versions != {__version__}:
         found = ", ".join(sorted(versions - {__version__}))
-        raise UserError(
-            f"a worker of {address} has thermogrip {found}", hint=f"install {__version__} on all of them"
-        )
+        raise UserError(f"a worker of {address} has thermogrip {found}", hint=hint)
 
 
 def _version() -> str:

@@ -34,8 +34,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.atomic_files import os_fault, read_bytes, read_toml
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.atomic_files import read_bytes, read_toml
+from thermogrip.datasets.errors import UserError, as_user_error, os_fault
 from thermogrip.datasets.limits import Unpacker, check_size, check_source
 from thermogrip.datasets.schema import ROLES
 from thermogrip.datasets.tables import Table, file_stem
@@ -160,12 +160,11 @@ def _listed(path: Path) -> list[str]:
 
     data = read_bytes(path)
     check_size(len(data), file=path, share=64)
-    try:
+    wrong = (YAMLError, KeyError, TypeError, ValueError, RecursionError)
+    with as_user_error(wrong, "is no metadata of a ROS 2 bag", file=path, hint="copy the bag again"):
         found = YAML(typ="safe").load(data)["rosbag2_bagfile_information"]
         names = [Path(str(name)).name for name in found["relative_file_paths"]]
         packed_whole = str(found.get("compression_mode", "")).lower() == "file"
-    except (YAMLError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise UserError("is no metadata of a ROS 2 bag", file=path, hint="copy the bag again") from error
     if packed_whole:
         raise UserError(
             f"names {names[0] if names else 'files'}, which is compressed whole", file=path, hint=_UNPACK
@@ -479,12 +478,13 @@ class _Decoders:
             self._store = get_typestore(Stores.EMPTY)
         if schema.name not in self._known:
             name = schema.name if "/msg/" in schema.name else schema.name.replace("/", "/msg/", 1)
-            try:
+            problem, wrong = (
+                f"the definition of {schema.name} cannot be read",
+                (TypesysError, UnicodeDecodeError),
+            )
+            with as_user_error(wrong, f"{problem} ({{error}})", file=self._file, hint="write the file again"):
                 found = get_types_from_msg(schema.data.decode(), name)
                 self._store.register({k: v for k, v in found.items() if k not in self._store.fielddefs})
-            except (TypesysError, UnicodeDecodeError) as error:
-                problem = f"the definition of {schema.name} cannot be read ({error})"
-                raise UserError(problem, file=self._file, hint="write the file again") from error
             self._known[schema.name] = name
         return self._known[schema.name]
 

@@ -23,6 +23,7 @@ import shlex
 import zipfile
 import zlib
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from itertools import chain, count, islice
 from pathlib import Path
@@ -31,10 +32,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.atomic_files import os_fault, read_bytes, source_size
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.atomic_files import read_bytes
+from thermogrip.datasets.errors import UserError, as_user_error, os_faults
 from thermogrip.datasets.limits import (
     check_size,
+    check_source,
     check_unpacked,
     most_bytes,
     most_unpacked,
@@ -403,12 +405,10 @@ def text_numbers(table: Table, header: str) -> NDArray[np.float64]:
         if cell.lower() in ("", "nan", "na"):
             continue
         decimal_comma = table.separator != "," and re.fullmatch(r"[+-]?\d+,\d+", cell)
-        try:
+        hint = "write a number, or leave the cell empty if it is unknown"
+        where = {"file": table.file, "row": int(table.lines[at]), "column": header, "hint": hint}
+        with as_user_error(ValueError, f"{cell!r} is not a number", **where):
             values[at] = float(cell.replace(",", ".") if decimal_comma else cell)
-        except ValueError:
-            hint = "write a number, or leave the cell empty if it is unknown"
-            row, problem = int(table.lines[at]), f"{cell!r} is not a number"
-            raise UserError(problem, file=table.file, row=row, column=header, hint=hint) from None
     return values
 
 
@@ -422,13 +422,10 @@ def read_matlab_table(path: str | Path, columns: Sequence[str] | None = None) ->
         raise UserError("is MATLAB 7.3", file=path, hint="save('x.mat', ..., '-v7') in MATLAB, or export CSV")
     from scipy.io import loadmat
 
-    try:
+    # scipy raises whatever a damaged file makes it stumble over
+    with as_user_error(Exception, "is no MATLAB file, or is damaged", file=path, hint="save it again"):
         source: Any = io.BytesIO(_unpacked_matlab(raw, path))  # the stubs know names only
         found = loadmat(source, simplify_cells=True)
-    except UserError:
-        raise
-    except Exception as error:  # scipy raises whatever a damaged file makes it stumble over
-        raise UserError("is no MATLAB file, or is damaged", file=path, hint="save it again") from error
     arrays = dict(_matlab_arrays({k: v for k, v in found.items() if not k.startswith("__")}))
     lengths = [values.shape[0] for values in arrays.values() for _ in range(values.shape[1])]
     if not lengths:
@@ -491,19 +488,15 @@ def _unpacked_matlab(raw: bytes, path: str | Path) -> bytes:
 def read_excel_table(path: str | Path, columns: Sequence[str] | None = None) -> Table:
     """Return the first sheet of an Excel workbook, read as its text would be."""
     raw = read_bytes(path)
-    try:
+    absent, hint = "needs the package openpyxl", "pip install openpyxl, or export CSV"
+    # openpyxl raises whatever a damaged file makes it stumble over
+    with as_user_error(Exception, "is no Excel workbook, or is damaged", file=path, hint="export CSV"):
         with zipfile.ZipFile(io.BytesIO(raw)) as packed:
             check_unpacked(len(raw), sum(entry.file_size for entry in packed.infolist()), file=path)
         import pandas as pd
 
-        frame = pd.read_excel(io.BytesIO(raw), header=None, engine="openpyxl")
-    except ImportError as error:
-        hint = "pip install openpyxl, or export CSV"
-        raise UserError("needs the package openpyxl", file=path, hint=hint) from error
-    except UserError:
-        raise
-    except Exception as error:  # openpyxl raises whatever a damaged file makes it stumble over
-        raise UserError("is no Excel workbook, or is damaged", file=path, hint="export CSV") from error
+        with as_user_error(ImportError, absent, file=path, hint=hint):
+            frame = pd.read_excel(io.BytesIO(raw), header=None, engine="openpyxl")
     return parse_text(frame.to_csv(index=False, header=False).encode(), str(path), columns)
 
 
@@ -518,34 +511,32 @@ def read_parquet_table(path: str | Path) -> Table:
 
     numbers, attrs = {}, {}
     raw = read_bytes(path)
-    try:
+    with _sound_parquet(path):
         with _open_parquet(path, io.BytesIO(raw), len(raw)) as opened:
             table = opened.read()
         for entry in table.schema:
             numbers[entry.name] = _to_float(table.column(entry.name).cast(pa.float64()))
             attrs[entry.name] = _decode(entry.metadata)
         meta = _decode(table.schema.metadata)
-    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        raise _no_parquet(path) from error
     return Table(str(path), numbers, {}, np.arange(1, table.num_rows + 1), attrs, meta)
 
 
 def _open_parquet(path: str | Path, source: Any, packed: int) -> Any:
     """Return the open file, its columns and sizes checked."""
-    import pyarrow as pa
     import pyarrow.parquet as parquet
 
     check_size(packed, file=path)
-    try:
+    with _sound_parquet(path):
         opened = parquet.ParquetFile(source, page_checksum_verification=True)
         _check_parquet(opened, packed, path)
-    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        raise _no_parquet(path) from error
     return opened
 
 
-def _no_parquet(path: str | Path) -> UserError:
-    return UserError("is not Parquet, or is damaged", file=path, hint="write or copy it again")
+def _sound_parquet(path: str | Path) -> AbstractContextManager[None]:
+    import pyarrow as pa
+
+    wrong = (pa.ArrowException, OSError, UnicodeDecodeError)
+    return as_user_error(wrong, "is not Parquet, or is damaged", file=path, hint="write or copy it again")
 
 
 def _check_parquet(opened: Any, packed: int, path: str | Path) -> None:
@@ -585,7 +576,7 @@ def check_table(path: str | Path, *, log: bool = False) -> None:
     It loads neither pandas nor xarray.  What a shell passes on is read once, so it is not looked at here.
     """
     kind = file_format(path)
-    if os.path.exists(path) and not source_size(path) and not os.path.isfile(path):
+    if os.path.exists(path) and not check_source(path) and not os.path.isfile(path):
         return
     if kind == "text" or (kind == "csv" and log):
         _text_of(path, _BEGINNING)
@@ -594,7 +585,7 @@ def check_table(path: str | Path, *, log: bool = False) -> None:
         if len(text) < _BEGINNING // 2 or not text.startswith(b"#"):
             _header(text, str(path))
     elif kind == "parquet":
-        _open_parquet(path, str(path), source_size(path)).close()
+        _open_parquet(path, str(path), check_source(path)).close()
     elif kind == "netcdf":
         from thermogrip.datasets.netcdf import check_netcdf
 
@@ -606,23 +597,20 @@ def _text_of(path: str | Path, most: int | None = None) -> bytes:
 
     ``most`` is how much of its beginning is enough [bytes].
     """
-    check_size(source_size(path), file=path)
+    check_size(check_source(path), file=path)
     openers: dict[str, Any] = {".gz": gzip.open, ".xz": lzma.open}
     opener = openers.get(Path(path).suffix.lower())
-    try:
-        with open(path, "rb") as file:
-            if opener is None:
-                data = read_within(file, most_bytes() if most is None else most)
-            else:
-                with opener(file, "rb") as stream:
-                    _check_text(stream.read(4096), path)
-                    stream.seek(0)
-                    data = unpack_within(stream, file, file=path, most=most)
-    except (gzip.BadGzipFile, lzma.LZMAError, zlib.error, EOFError) as error:
-        problem = "is damaged or not compressed as its name says"
-        raise UserError(problem, file=path, hint="copy it again") from error
-    except OSError as error:
-        raise os_fault(error, path) from error
+    damage = (gzip.BadGzipFile, lzma.LZMAError, zlib.error, EOFError)
+    problem = "is damaged or not compressed as its name says"
+    spoilt = as_user_error(damage, problem, file=path, hint="copy it again")
+    with os_faults(path), spoilt, open(path, "rb") as file:
+        if opener is None:
+            data = read_within(file, most_bytes() if most is None else most)
+        else:
+            with opener(file, "rb") as stream:
+                _check_text(stream.read(4096), path)
+                stream.seek(0)
+                data = unpack_within(stream, file, file=path, most=most)
     if most is None:
         check_size(len(data), file=path)  # a pipe says no size, and a file may grow
     data = _as_utf8(data, path, whole=most is None).removeprefix(b"\xef\xbb\xbf")
@@ -643,10 +631,8 @@ def _as_utf8(data: bytes, path: str | Path, *, whole: bool) -> bytes:
     """Return UTF-16 text, as spreadsheets write it, in UTF-8; any other bytes as they are."""
     if not data.startswith((b"\xff\xfe", b"\xfe\xff")):
         return data
-    try:
+    with as_user_error(UnicodeDecodeError, "is damaged UTF-16 text", file=path, hint="save it as UTF-8"):
         return codecs.getincrementaldecoder("utf-16")().decode(data, whole).encode("utf-8")
-    except UnicodeDecodeError as error:
-        raise UserError("is damaged UTF-16 text", file=path, hint="save it as UTF-8") from error
 
 
 def _header(data: bytes, file: str) -> tuple[list[str], int, str]:
@@ -656,32 +642,25 @@ def _header(data: bytes, file: str) -> tuple[list[str], int, str]:
     if first is None:
         raise UserError("has only comments", file=file, hint="give a header and at least two rows")
     skip, raw = first
-    try:
+    at: dict[str, Any] = {"file": file, "row": skip}
+    with as_user_error(UnicodeDecodeError, "the header is not UTF-8 text", **at, hint="save it as UTF-8"):
         line = raw.decode("utf-8").strip()
-    except UnicodeDecodeError as error:
-        raise UserError(
-            "the header is not UTF-8 text", file=file, row=skip, hint="save it as UTF-8"
-        ) from error
     separator = next((s for s in ",;\t" if s in line), ",")
-    try:
+    # such as a carriage return alone between two names
+    hint = "end every line with a line feed"
+    with as_user_error(csv.Error, "the header is no line of names", **at, hint=hint):
         header = [from_csv(cell.strip()) for cell in next(csv.reader([line], delimiter=separator))]
-    except csv.Error as error:  # such as a carriage return alone between two names
-        raise UserError(
-            "the header is no line of names", file=file, row=skip, hint="end every line with a line feed"
-        ) from error
     if len(header) > MOST_COLUMNS:
         problem = f"the header has {len(header)} names, more than {MOST_COLUMNS}"
-        raise UserError(problem, file=file, row=skip, hint="leave out what is not needed")
-    seen: set[str] = set()
-    for at, name in enumerate(header):
+        raise UserError(problem, **at, hint="leave out what is not needed")
+    for k, name in enumerate(header):
         if not name:
-            raise UserError(f"column {at + 1} has no name", file=file, row=skip, hint="name it or remove it")
-        if name in seen:
-            raise UserError("occurs twice", file=file, row=skip, column=name, hint="rename one of them")
-        seen.add(name)
+            raise UserError(f"column {k + 1} has no name", **at, hint="name it or remove it")
+        if name in header[:k]:
+            raise UserError("occurs twice", **at, column=name, hint="rename one of them")
     if all(_NUMBER.fullmatch(name) for name in header):
         hint = "write a first line such as time_s,drive,t_tank_degC"
-        raise UserError("has no header, only numbers", file=file, row=skip, hint=hint)
+        raise UserError("has no header, only numbers", **at, hint=hint)
     return header, skip, separator
 
 
@@ -751,13 +730,11 @@ def _rows(data: bytes, skip: int, separator: str, file: str) -> Iterator[tuple[i
             try:
                 yield line, next(csv.reader([raw.decode("utf-8")], delimiter=separator))
             except UnicodeDecodeError as error:
-                raise UserError(
-                    "is not UTF-8 text", file=file, row=line, hint="save the file as UTF-8"
-                ) from error
+                hint = "save the file as UTF-8"
+                raise UserError("is not UTF-8 text", file=file, row=line, hint=hint) from error
             except csv.Error as error:
-                raise UserError(
-                    f"cannot be split ({error})", file=file, row=line, hint="correct the row"
-                ) from error
+                problem = f"cannot be split ({error})"
+                raise UserError(problem, file=file, row=line, hint="correct the row") from error
 
 
 def _cell_fault(cell: str, file: str, line: int, name: str) -> UserError:

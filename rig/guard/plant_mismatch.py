@@ -43,7 +43,7 @@ from typing import Any
 import numpy as np
 
 from thermogrip.datasets.atomic_files import read_json, write_json
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, as_user_error
 from thermogrip.sysid.models.model import Array
 from thermogrip.sysid.plant.plant import Plant
 
@@ -92,10 +92,9 @@ class PlantDrift:
     def load(cls, path: str | Path, plant: Plant) -> PlantDrift:
         """Return what a file holds; one that is damaged or of another plant is a :class:`UserError`."""
         content = read_json(path, SCHEMA, VERSION)
-        try:
+        wrong, hint = (KeyError, TypeError, ValueError), "remove it to learn anew"
+        with as_user_error(wrong, "is damaged ({error})", file=path, hint=hint):
             found = cls._of(content, Path(path))
-        except (KeyError, TypeError, ValueError) as error:
-            raise UserError(f"is damaged ({error})", file=path, hint="remove it to learn anew") from error
         if found.plant != _hash(plant) or found.names != tuple(plant.model.parameters):
             hint = "name another file: what is learnt of a rig holds for one plant"
             raise UserError("was learnt with another plant", file=path, hint=hint)

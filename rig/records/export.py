@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from thermogrip.datasets.atomic_files import atomic_path
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, as_user_error
 from thermogrip.datasets.log_files import write_log
 from thermogrip.datasets.schema import column
 from thermogrip.rig.records.run_folder import Run, read_run
@@ -57,10 +57,9 @@ def export_run(folder: str | Path, out: str | Path) -> Path:
 
 
 def _write_mcap(run: Run, path: Path) -> None:
-    try:
+    hint = "pip install thermogrip[ros]"
+    with as_user_error(ImportError, "needs the package mcap", file=path, hint=hint):
         from mcap.writer import Writer
-    except ImportError as error:
-        raise UserError("needs the package mcap", file=path, hint="pip install thermogrip[ros]") from error
     log, began = run.log, _nanoseconds(run)
     assert log is not None
     columns = {str(name): column(log, str(name)) for name in log.data_vars}

@@ -33,8 +33,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from thermogrip.datasets.atomic_files import file_hash, open_new, os_fault, write_atomic, write_json
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.atomic_files import file_hash, open_new, write_atomic, write_json
+from thermogrip.datasets.errors import UserError, os_faults
 from thermogrip.datasets.media import csv_text
 from thermogrip.rig.session.loop import Event
 from thermogrip.rig.session.session import Session
@@ -90,19 +90,17 @@ class RunFolder:
         if self.path.is_symlink():
             raise UserError("is a link", file=self.path, hint="name the folder that it leads to")
         self._made = provenance(files or {})
-        with ExitStack() as undo:  # a run that cannot begin leaves no file behind
-            try:
-                self.path.mkdir(parents=True, exist_ok=True)
-                refuse_used(self.path)
-                self._reserve = _Reserve(self.path / _RESERVE)
-                undo.callback(self._reserve.give_back)
-                self._write_about({"verdict": "running"})
-                undo.callback((self.path / "run.json").unlink)
-                self._samples = _Lines(self.path / "samples.csv", self._reserve)
-                undo.callback(self._samples.remove)
-                self._events = _Lines(self.path / "events.jsonl", self._reserve)
-            except OSError as error:
-                raise os_fault(error, self.path) from error
+        # a run that cannot begin leaves no file behind
+        with ExitStack() as undo, os_faults(self.path):
+            self.path.mkdir(parents=True, exist_ok=True)
+            refuse_used(self.path)
+            self._reserve = _Reserve(self.path / _RESERVE)
+            undo.callback(self._reserve.give_back)
+            self._write_about({"verdict": "running"})
+            undo.callback((self.path / "run.json").unlink)
+            self._samples = _Lines(self.path / "samples.csv", self._reserve)
+            undo.callback(self._samples.remove)
+            self._events = _Lines(self.path / "events.jsonl", self._reserve)
             undo.pop_all()
         self._header: tuple[str, ...] = ()
         self._clock, self._synced = clock, clock()

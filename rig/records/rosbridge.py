@@ -34,7 +34,7 @@ from functools import partial
 from math import inf, isfinite, nan
 from typing import Any
 
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, as_user_error
 from thermogrip.datasets.units import split_header
 from thermogrip.rig.clock import BackOff
 from thermogrip.rig.session.loop import Event, Recorder
@@ -240,10 +240,9 @@ class Bridge:
         self.close()
 
     def _connect(self) -> _Link:
-        try:
+        hint = "pip install thermogrip[ros]"
+        with as_user_error(ImportError, "a bridge needs websockets", hint=hint):
             from websockets.exceptions import WebSocketException
-        except ImportError as error:
-            raise UserError("a bridge needs websockets", hint="pip install thermogrip[ros]") from error
         link = _Link()
         try:
             link.open(self.url, self._timeout)

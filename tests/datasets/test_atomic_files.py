@@ -15,13 +15,12 @@ from thermogrip.datasets import atomic_files
 from thermogrip.datasets.atomic_files import (
     atomic_path,
     file_hash,
-    os_fault,
     read_bytes,
     read_json,
     write_atomic,
     write_json,
 )
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, os_fault
 
 KEYS = {"schema": "thermogrip.test", "version": 2}
 

@@ -21,8 +21,7 @@ import typer
 from thermogrip import __version__
 from thermogrip.cli import classify, compare, control, excite, identify, project, rig
 from thermogrip.cli.options import Verb
-from thermogrip.datasets.atomic_files import os_fault
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, os_fault
 from thermogrip.datasets.media import printable
 
 OK, BUG, USER, INTERRUPTED = 0, 1, 2, 130

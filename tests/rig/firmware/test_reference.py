@@ -125,7 +125,7 @@ def test_what_is_taken_reads_back(uptime: int, first: int, readings: list[protoc
     ],
 )
 def test_readings_that_make_no_sense_are_malformed(text: str) -> None:
-    with pytest.raises(ValueError, match="malformed|unpack"):
+    with pytest.raises(ValueError, match=r"malformed|unpack"):
         protocol.parse_taken(text.split(), 1)
 
 

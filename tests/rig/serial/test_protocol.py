@@ -237,7 +237,7 @@ def test_a_state_reads_back(state: protocol.State) -> None:
     ],
 )
 def test_a_state_that_makes_no_sense_is_malformed(text: str) -> None:
-    with pytest.raises(ValueError, match="malformed|unpack"):
+    with pytest.raises(ValueError, match=r"malformed|unpack"):
         protocol.parse_state(text.split())
 
 
@@ -248,7 +248,7 @@ def test_a_state_that_makes_no_sense_is_malformed(text: str) -> None:
      "thermogrip/1 0.1.0 drive:1:-1:1 pump T!", "thermogrip/1 0.1.0 drive:1:-1:1 pump"],
 )  # fmt: skip
 def test_an_identity_that_makes_no_sense_is_malformed(text: str) -> None:
-    with pytest.raises(ValueError, match="malformed|unpack"):
+    with pytest.raises(ValueError, match=r"malformed|unpack"):
         protocol.parse_identity(text.split())
 
 
