@@ -94,7 +94,7 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
     check_netcdf(path)
     import xarray as xr
 
-    options = {"engine": "h5netcdf", "decode_times": False, "decode_timedelta": False}
+    options: dict[str, Any] = {"engine": "h5netcdf", "decode_times": False, "decode_timedelta": False}
     with _not_damaged(path), xr.open_dataset(path, **options) as data:
         loaded = data.load()
     return from_cf(_text_as_str(loaded))
