@@ -34,22 +34,20 @@ takes a little longer; one that is tuned for time comes close (the tuning report
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
-from thermogrip.classify.estimators.base import Floats, GraspClassifier, Labels, pick
+from thermogrip.classify.estimators.base import Floats, GraspClassifier, Labels, normalised, pick
+from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, Log, make_log, unit_names
-from thermogrip.sysid.effusivity.predictive import PosteriorPredictive
+from thermogrip.sysid.effusivity.predictive import PosteriorPredictive, next_touch
 from thermogrip.sysid.effusivity.quality import check_grasps
-
-if TYPE_CHECKING:
-    from thermogrip.classify.estimators.posterior import PosteriorClassifier
-    from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.plant import Plant
 
 _NEGLIGIBLE = 1e-4  # of probability: such a candidate's futures are not drawn
 
@@ -167,30 +165,14 @@ def name_or_unknown(
 
 @dataclass(frozen=True)
 class NextTouch:
-    """Whether to touch again, and at which gripper temperature.
+    """Whether to touch again, and at which of n gripper temperatures."""
 
-    Attributes
-    ----------
-    t_gripper : (n,) ndarray
-        Temperatures that were weighed [degC].
-    information : (n,) ndarray
-        Expected information of a touch at each [nat].
-    accuracy : (n,) ndarray
-        Expected accuracy after it.
-    seconds : (n,) ndarray
-        What it takes: reaching the temperature, resting, touching.
-    value : (n,) ndarray
-        Gain of accuracy less the cost of the seconds.
-    entropy, accuracy_now : float
-        Before it [nat], [1].
-    """
-
-    t_gripper: Floats
-    information: Floats
-    accuracy: Floats
-    seconds: Floats
-    value: Floats
-    entropy: float
+    t_gripper: Floats  # (n,), that were weighed [degC]
+    information: Floats  # (n,), expected of a touch at each [nat]
+    accuracy: Floats  # (n,), expected after it
+    seconds: Floats  # (n,), what it takes: reaching the temperature, resting, touching
+    value: Floats  # (n,), gain of accuracy less the cost of the seconds
+    entropy: float  # before it [nat]
     accuracy_now: float
 
     @property
@@ -206,10 +188,8 @@ class NextTouch:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-able description."""
-        table = {name: getattr(self, name).tolist() for name in ("t_gripper", "information", "accuracy")}
-        table |= {"seconds": self.seconds.tolist(), "value": self.value.tolist()}
-        now = {"entropy": self.entropy, "accuracy_now": self.accuracy_now}
-        return table | now | {"best": self.best, "worth_it": self.worth_it}
+        table = {name: np.asarray(value).tolist() for name, value in asdict(self).items()}
+        return table | {"best": self.best, "worth_it": self.worth_it}
 
 
 def choose_next_touch(
@@ -265,20 +245,16 @@ def choose_next_touch(
     >>> choice.worth_it, choice.best, bool(choice.accuracy_now < choice.accuracy.max())
     (True, 20.0, True)
     """
-    from thermogrip.sysid.effusivity.predictive import next_touch
-
     model = with_model(classifier)
     levels = np.atleast_1d(np.asarray(t_gripper, dtype=float))
     if not (np.isfinite(levels).all() and levels.size and np.isfinite(price) and price >= 0):
         raise UserError("a temperature or the price is no number", hint="give degC, and a price of 0 or more")
-    names = [str(c) for c in (model.classes_ if candidates is None else candidates)]
-    model._check_candidates(names)
+    names = model.asked(candidates)
     forecast = next_touch(
         model.device_, grasps, names, levels,
         coupling=model.coupling_, rest=rest, end=end, finish=model.finish,
     )  # fmt: skip
-    log_p = forecast.log_p + model.log_prior(names)
-    forecast = forecast._replace(log_p=log_p - logsumexp(log_p, axis=1, keepdims=True))
+    forecast = forecast._replace(log_p=normalised(forecast.log_p + model.log_prior(names)))
     found = expected_information(forecast, draws=draws, seed=seed)
     reach = np.array([0.0 if seconds is None else float(seconds(float(t))) for t in levels])
     whole = np.maximum(reach, rest) + end
@@ -339,8 +315,6 @@ def at_rates(now: float, *, heating: float, cooling: float) -> Callable[[float],
 
 def with_model(classifier: GraspClassifier) -> PosteriorClassifier:
     """Return the classifier if it can predict readings."""
-    from thermogrip.classify.estimators.posterior import PosteriorClassifier
-
     if not isinstance(classifier, PosteriorClassifier):
         raise UserError(
             f"a {type(classifier).__name__} cannot predict readings", hint="train the classifier 'posterior'"

@@ -13,19 +13,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import logsumexp
 
 from thermogrip.classify.decisions.next_touch import expected_information, with_model
-from thermogrip.classify.estimators.base import Floats, GraspClassifier
+from thermogrip.classify.decisions.stopping_rule import StopRule, load_stop_rule
+from thermogrip.classify.estimators.base import Floats, GraspClassifier, normalised
+from thermogrip.classify.estimators.registry import load_classifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import HOTTEST, Grasps, make_grasps
+from thermogrip.sysid.effusivity.posterior import material_fit
+from thermogrip.sysid.effusivity.predictive import rest_of_contact
 from thermogrip.sysid.effusivity.quality import GraspQuality, check_grasps
-
-if TYPE_CHECKING:
-    from thermogrip.classify.decisions.stopping_rule import StopRule
 
 _CONTACT = 0.25  # s after the closed message: before it there is no contact
 _SAME = 1e-6  # s
@@ -76,8 +75,8 @@ class Stream:
         rule: StopRule | None = None,
     ) -> None:
         self._model = with_model(classifier)
-        self.candidates = tuple(str(c) for c in (self._model.classes_ if candidates is None else candidates))
-        self._model._check_candidates(self.candidates)
+        self.candidates = tuple(self._model.asked(candidates))
+        self._odds = self._model.log_prior(self.candidates)
         self._about = {"t_object": t_object, "t_object_sd": t_object_sd, "t_ambient": t_ambient}
         self._rule = rule
         self._time: list[float] = []
@@ -85,7 +84,7 @@ class Stream:
         self._u: Floats | None = None
         self._evaluated = 0
         self.decided_at: float | None = None
-        self.log_p: Floats = self._prior()
+        self.log_p: Floats = normalised(self._odds[None])[0]
         self._warm()
 
     def update(self, time_s: float, t_surface: float) -> dict[str, float]:
@@ -148,21 +147,14 @@ class Stream:
     def _has_level(self) -> bool:
         return any(t < -_CONTACT and np.isfinite(y) for t, y in zip(self._time, self._reading))
 
-    def _prior(self) -> Floats:
-        odds = self._model.log_prior(self.candidates)
-        return np.asarray(odds - logsumexp(odds))
 
     def _warm(self) -> None:
         """Look at a made-up contact once, so that no sample waits for the compiler."""
-        from thermogrip.sysid.effusivity.posterior import material_fit
-
         made_up = make_grasps([-1.0, -0.5, 0.5], [[23.0, 23.0, 23.0]], ["warm"])
         material_fit(self._model.device_, made_up, self.candidates[:1], finish=self._model.finish)
 
     def _evaluate(self) -> None:
         """Take what was read so far for what it is."""
-        from thermogrip.sysid.effusivity.posterior import material_fit
-
         grasp = self.grasps()
         quality = check_grasps(grasp)
         if quality.spiked[0, -1]:  # the next readings show whether it was a spike
@@ -174,8 +166,7 @@ class Stream:
             self._model.device_, grasp, self.candidates, finish=self._model.finish, start=self._u
         )
         self._u = seen.u
-        p = seen.log_evidence[0] + self._model.log_prior(self.candidates)
-        self.log_p = np.asarray(p - logsumexp(p))
+        self.log_p = normalised(seen.log_evidence + self._odds)[0]
         self._decide(grasp, quality)
 
     def _decide(self, grasp: Grasps, quality: GraspQuality) -> None:
@@ -193,8 +184,6 @@ class Stream:
             self.decided_at = now
 
     def _gain(self, grasp: Grasps, rule: StopRule) -> float:
-        from thermogrip.sysid.effusivity.predictive import rest_of_contact
-
         if rule.gain <= 0:
             return np.inf
         ahead = rest_of_contact(
@@ -233,8 +222,4 @@ def stop_callback(
 
 def session_stop(folder: str | Path, *, candidates: Sequence[str] | None = None) -> Callable[[Grasps], bool]:
     """Return :func:`stop_callback` of the classifier and the stop rule in a folder of ``train``."""
-    from thermogrip.classify.decisions.stopping_rule import load_stop_rule
-    from thermogrip.classify.estimators.registry import load_classifier
-
-    rule = load_stop_rule(folder)
-    return stop_callback(load_classifier(folder), rule, candidates=candidates)
+    return stop_callback(load_classifier(folder), load_stop_rule(folder), candidates=candidates)

@@ -33,11 +33,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.classify.decisions.stopping_rule import (
+    StopRule,
+    contact_end,
+    growing_windows,
+    silent_windows,
+    stops,
+)
 from thermogrip.classify.estimators.base import (
     Floats,
     GraspClassifier,
@@ -46,18 +53,27 @@ from thermogrip.classify.estimators.base import (
     pick,
     record_list,
 )
+from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import csv_text
 from thermogrip.datasets.schema import Grasps, has_touch_groups, label_values, log_name, unit_names
+from thermogrip.sysid.effusivity.data import object_range, touches, with_object_range
+from thermogrip.sysid.effusivity.gripper_model import GripperModel
+from thermogrip.sysid.effusivity.laplace_approximation import (
+    BUILD_UP,
+    EFFUSIVITY,
+    ONSET,
+    T_OBJECT,
+    H,
+    Hypotheses,
+    fit_pairs,
+    free_hypotheses,
+    material_hypotheses,
+    prior_of,
+)
+from thermogrip.sysid.effusivity.posterior import EffusivityRow
 from thermogrip.sysid.effusivity.quality import NO_CONTACT, check_grasps
-
-if TYPE_CHECKING:
-    from thermogrip.classify.decisions.stopping_rule import StopRule
-    from thermogrip.classify.estimators.posterior import PosteriorClassifier
-    from thermogrip.sysid.effusivity.gripper_model import GripperModel
-    from thermogrip.sysid.effusivity.laplace_approximation import Hypotheses
-    from thermogrip.sysid.effusivity.posterior import EffusivityRow
 
 Row: TypeAlias = dict[str, Any]
 
@@ -159,13 +175,6 @@ def _stopped(
     classifier: GraspClassifier, grasps: Grasps, names: list[str], rule: StopRule
 ) -> tuple[Floats, Floats, Floats]:
     """Return log probabilities, p_unknown and times where the rule ends each contact."""
-    from thermogrip.classify.decisions.stopping_rule import (
-        contact_end,
-        growing_windows,
-        silent_windows,
-        stops,
-    )
-
     if has_touch_groups(grasps):
         problem = "touches of one block are answered together, no rule ends one of them"
         raise UserError(problem, file=log_name(grasps), hint="leave --early out, or the column touch_group")
@@ -254,9 +263,6 @@ class Deviation(NamedTuple):
 def deviations(device: GripperModel, grasps: Grasps, materials: Sequence[str]) -> list[list[Deviation]]:
     """Return for each of n grasps how far its nuisances and its misfit are from the usual if it is of the
     material named for it, the farthest first."""
-    from thermogrip.sysid.effusivity.data import touches
-    from thermogrip.sysid.effusivity.laplace_approximation import fit_pairs, prior_of
-
     data, hypotheses = touches(grasps), _taken_for(device, materials)
     prior = prior_of(device, data, hypotheses)
     mode = fit_pairs(device, data, np.arange(len(materials)), hypotheses)
@@ -282,9 +288,6 @@ def unexplained(
 
     ``stated`` is the range of unknown object temperatures [degC]; by default 20 K about the room.
     """
-    from thermogrip.sysid.effusivity.data import object_range, touches, with_object_range
-    from thermogrip.sysid.effusivity.laplace_approximation import T_OBJECT, fit_pairs
-
     data, ends = touches(with_object_range(grasps, stated)), object_range(grasps, stated)
     known = np.isfinite(touches(grasps).t_object)
     mode = fit_pairs(device, data, np.arange(ends.shape[0]), hypotheses)
@@ -327,8 +330,6 @@ def unexplained_effusivities(
 
     ``stated`` is the range of unknown object temperatures [degC].
     """
-    from thermogrip.sysid.effusivity.laplace_approximation import free_hypotheses
-
     alone = label_values(grasps, "touch_group") == ""
     ln_e = np.log([row.effusivity for row in rows])
     at = np.flatnonzero(alone & np.isfinite(ln_e))
@@ -393,8 +394,6 @@ def _explained(
     wanted: Callable[[Row], bool],
 ) -> list[str]:
     """Return the words on each wanted row that is a named single touch of an exactly known gripper."""
-    from thermogrip.classify.estimators.posterior import PosteriorClassifier
-
     out = [""] * len(rows)
     # an uncertain gripper may be the reason itself
     if not isinstance(classifier, PosteriorClassifier) or classifier.device_.uncertain:
@@ -413,8 +412,6 @@ def _explained(
 
 def _taken_for(device: GripperModel, named: Sequence[str], **finish: str) -> Hypotheses:
     """Return the hypothesis of each named material, a row each."""
-    from thermogrip.sysid.effusivity.laplace_approximation import material_hypotheses
-
     names = list(dict.fromkeys(named))
     known = material_hypotheses(device, names, **finish)
     return type(known)(*(column[[names.index(name) for name in named]] for column in known))
@@ -422,8 +419,6 @@ def _taken_for(device: GripperModel, named: Sequence[str], **finish: str) -> Hyp
 
 def _nuisances(off: NDArray[np.float64], sd: NDArray[np.float64], nominal: bool) -> list[Deviation]:
     """Return the deviations of one grasp's nuisances, of those that are uncertain at all."""
-    from thermogrip.sysid.effusivity.laplace_approximation import BUILD_UP, EFFUSIVITY, ONSET, T_OBJECT, H
-
     warmer = "warmer" if off[T_OBJECT] > 0 else "colder"
     late = "late" if off[ONSET] > 0 else "early"
     words = {

@@ -27,11 +27,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import logsumexp
 
 from thermogrip.classify.decisions.next_touch import expected_information, with_model
 from thermogrip.classify.estimators.base import (
@@ -39,17 +38,17 @@ from thermogrip.classify.estimators.base import (
     GraspClassifier,
     Records,
     grasp_labels,
+    normalised,
     pick,
     record_list,
 )
+from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import LARGEST, array_within, number_within
 from thermogrip.datasets.schema import Grasps, log_name
+from thermogrip.sysid.effusivity.predictive import rest_of_contact
 from thermogrip.sysid.effusivity.quality import check_grasps
-
-if TYPE_CHECKING:
-    from thermogrip.classify.estimators.posterior import PosteriorClassifier
 
 TIMES = (0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
 RULE_FILE = "stop_rule.json"  # beside classifier.json
@@ -174,8 +173,7 @@ def growing_windows(
     """Return the probabilities at those ``times`` before ``end`` [s] and at the end, from the readings until
     then; without ``gain`` the expected gain is infinite before the end."""
     model = with_model(classifier)
-    names = [str(c) for c in (model.classes_ if candidates is None else candidates)]
-    model._check_candidates(names)
+    names = model.asked(candidates)
     at = np.array([*(t for t in sorted(times) if t < end), end])
     log_p, won = [], []
     u: Floats | None = None
@@ -199,17 +197,14 @@ def _window(
 
     A contact without a reading yet has the prior ones; without any in the end it is a :class:`UserError`.
     """
-    from thermogrip.sysid.effusivity.predictive import rest_of_contact
-
     odds = model.log_prior(names)
     read = _read_by(grasps, t) | (t >= end)
-    log_p, gain = np.tile(odds - logsumexp(odds), (read.size, 1)), np.full(read.size, np.inf)
+    log_p, gain = normalised(np.tile(odds, (read.size, 1))), np.full(read.size, np.inf)
     if not read.any():
         return log_p, gain, None
     part, start = (grasps, u) if read.all() else (pick(grasps, read), None)
     ahead = rest_of_contact(model.device_, part, names, until=t, end=end, finish=model.finish, start=start)
-    p = ahead.log_p + odds
-    log_p[read] = p - logsumexp(p, axis=1, keepdims=True)
+    log_p[read] = normalised(ahead.log_p + odds)
     if weigh:
         gain[read] = expected_information(ahead._replace(log_p=log_p[read])).gain
     return log_p, gain, ahead.u if read.all() else None

@@ -121,8 +121,8 @@ class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc
 
     def candidate_log_proba(self, X: Records, candidates: Sequence[str]) -> Floats:
         """Return log probabilities over a subset of ``classes_``, shape (n_grasp, n_candidate)."""
-        at = self._check_candidates(candidates)
-        return normalised(self.predict_log_proba(X)[:, at])
+        names, known = self.asked(candidates), self.asked()
+        return normalised(self.predict_log_proba(X)[:, [known.index(name) for name in names]])
 
     def open_set_log_proba(self, X: Records, candidates: Sequence[str]) -> tuple[Floats, Floats]:
         """Return :meth:`candidate_log_proba` and :meth:`p_unknown`."""
@@ -133,18 +133,19 @@ class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc
         empty."""
         return [""] * grasps.sizes["grasp"]
 
-    def _check_candidates(self, candidates: Sequence[str]) -> list[int]:
-        """Return the candidates' places among ``classes_``."""
+    def asked(self, candidates: Sequence[str] | None = None) -> list[str]:
+        """Return the candidates, each of them one of ``classes_``; by default all of these."""
         self._check_fitted()
         known = [str(c) for c in self.classes_]
-        for name in candidates:
+        names = known if candidates is None else [str(c) for c in candidates]
+        for name in names:
             if name not in known:
                 raise UserError(
                     f"{name!r} is no class of this classifier", hint=f"it knows {', '.join(known)}"
                 )
-        if len(candidates) < 1:
+        if not names:
             raise UserError("no candidate is given", hint=f"name some of {', '.join(known)}")
-        return [known.index(name) for name in candidates]
+        return names
 
     def _check_fitted(self) -> None:
         if not hasattr(self, "classes_"):

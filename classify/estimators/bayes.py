@@ -115,18 +115,18 @@ class Readings:
         return np.where(small[:, None], np.nan, x), np.where(small[:, None, None], np.nan, noise)
 
 
+@dataclass(eq=False)
 class FeatureReader:
     """Which features a classifier was trained on, and how to read them again.
 
     Features come from a rise that is fitted to the whole of a contact, up to 10 s: of a shorter contact they
     are other numbers, and a classifier was right in 0.2 to 0.5 of 300 such simulated grasps at stated
     probabilities of 0.7 to 1.0.  So a contact that is shorter than those of the training is refused.
-
-    ``end`` [s] is the median end of the training grasps, up to 10 s.
     """
 
-    def __init__(self, names: list[str], normalise: bool, end: float) -> None:
-        self.names, self.normalise, self.end = names, normalise, end
+    names: list[str]
+    normalise: bool
+    end: float  # median end of the training grasps, up to 10 s
 
     @classmethod
     def learn(
@@ -212,32 +212,18 @@ class FeatureReader:
             )
 
 
+@dataclass(eq=False, repr=False)
 class BayesClassifier(GraspClassifier):
     """Posterior-predictive Gaussian classifier on physics features (``"bayes"``).
 
-    Records of several conditions, sample rates and lengths are learnt from together.
-
-    Parameters
-    ----------
-    shrinkage : float, optional
-        Prior degrees of freedom beyond d + 1, in grasps; by default the most evident of a grid.
-
-    Attributes
-    ----------
-    classes_ : (K,) ndarray of str
-    feature_names_ : list of str
-    shrinkage_, mean_shrinkage_ : float
-        What was used of nu_0 - d - 1 and kappa_0 [grasps].
-    t_object_sd_ : float
-        By how much object temperatures were off their nominal ones [K].
-    notes_ : list of str
-        What could not be learnt from, in words.
+    Records of several conditions, sample rates and lengths are learnt from together.  ``shrinkage_`` and
+    ``mean_shrinkage_`` are what was used of nu_0 - d - 1 and kappa_0 [grasps], ``t_object_sd_`` by how much
+    object temperatures were off their nominal ones [K].
     """
 
     fits_in_a_blink: ClassVar[bool] = True
 
-    def __init__(self, shrinkage: float | None = None) -> None:
-        self.shrinkage = shrinkage
+    shrinkage: float | None = None  # nu_0 - d - 1 [grasps]; by default the most evident of a grid
 
     def fit(self, X: Records, y: ArrayLike | None = None) -> Self:
         """Learn from one record or several; ``y`` (n_grasp,) are their materials, record after record, by

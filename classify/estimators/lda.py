@@ -12,6 +12,7 @@ import warnings
 from abc import abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, ClassVar
 
@@ -133,22 +134,14 @@ class FeaturesLda(_Lda):
         self._take_up(arrays, len(self.feature_names_))
 
 
+@dataclass(eq=False, repr=False)
 class PcaLda(_Lda):
-    """Shrinkage LDA on principal components of the traces (``"pca-lda"``).
-
-    Parameters
-    ----------
-    components : int, optional
-        Components kept; fewer where there are fewer grasps.
-    start : float, optional
-        First time [s] that is used.
-    """
+    """Shrinkage LDA on principal components of the traces (``"pca-lda"``)."""
 
     reads_both_sensors: ClassVar[bool] = True
 
-    def __init__(self, components: int = 4, start: float = 0.0) -> None:
-        self.components = components
-        self.start = start
+    components: int = 4  # kept; fewer where there are fewer grasps
+    start: float = 0.0  # first time that is used [s]
 
     def _fit(self, grasps: Grasps, labels: Labels) -> None:
         if self.components < 1:
@@ -174,6 +167,7 @@ class PcaLda(_Lda):
         self._take_up(arrays, self.axes_.shape[0])
 
 
+@dataclass(eq=False, repr=False)
 class ArrayClassifier(JoinedClassifier):
     """Any scikit-learn classifier on the traces as a matrix.
 
@@ -205,21 +199,12 @@ class ArrayClassifier(JoinedClassifier):
 
     reads_both_sensors: ClassVar[bool] = True
 
-    def __init__(
-        self,
-        estimator: BaseEstimator | str = "sklearn.linear_model.LogisticRegression",
-        params: dict[str, Any] | None = None,
-        start: float = 0.0,
-        subtract_level: bool = True,
-        standardise: bool = True,
-        random_state: int | None = None,
-    ) -> None:
-        self.estimator = estimator
-        self.params = params
-        self.start = start
-        self.subtract_level = subtract_level
-        self.standardise = standardise
-        self.random_state = random_state
+    estimator: BaseEstimator | str = "sklearn.linear_model.LogisticRegression"
+    params: dict[str, Any] | None = None
+    start: float = 0.0
+    subtract_level: bool = True
+    standardise: bool = True
+    random_state: int | None = None
 
     def _fit(self, grasps: Grasps, labels: Labels) -> None:
         self.times_ = times_from(grasps, self.start)

@@ -72,36 +72,19 @@ POOLS = {
 RULES = ("stack", "nested")
 
 
+@dataclass(eq=False, repr=False)
 class ExpansionClassifier(JoinedClassifier):
     """Pool of classifiers on value, slope and curvature of the last seconds (``"expansions"``).
 
-    Parameters
-    ----------
-    start : float, optional
-        First time [s] that may be used.
-    random_state : int, optional
-        Of the folds inside the training.
-    pool : {"small", "wide"}, optional
-        What is tried.
-    rule : {"stack", "nested"}, optional
-        A mixture, or the mixture or its best machine, as held-out grasps decide.
-
-    Attributes
-    ----------
-    classes_ : (K,) ndarray of str
-    weights_ : dict of str to float
-        Share of each machine.
+    ``weights_`` has the share of each machine by name.
     """
 
     reads_both_sensors: ClassVar[bool] = True
 
-    def __init__(
-        self, start: float = 0.0, random_state: int = 0, pool: str = "small", rule: str = "stack"
-    ) -> None:
-        self.start = start
-        self.random_state = random_state
-        self.pool = pool
-        self.rule = rule
+    start: float = 0.0  # first time that may be used [s]
+    random_state: int = 0  # of the folds inside the training
+    pool: str = "small"  # what is tried, of POOLS
+    rule: str = "stack"  # a mixture; "nested": that or its best machine, as held-out grasps decide
 
     def _fit(self, grasps: Grasps, labels: Labels) -> None:
         if self.pool not in POOLS or self.rule not in RULES:
@@ -154,11 +137,11 @@ def _first(X: Floats, *, count: int) -> Floats:
     return X[:, :count]
 
 
+@dataclass(eq=False, repr=False)
 class _Gaussians(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # scikit-learn has no types
     """A Gaussian a class, its covariance drawn towards the common one as if by ``pull`` grasps of that."""
 
-    def __init__(self, pull: float) -> None:
-        self.pull = pull
+    pull: float
 
     def fit(self, X: Floats, y: Labels) -> _Gaussians:
         """Learn means and covariances."""

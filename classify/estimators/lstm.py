@@ -29,6 +29,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from multiprocessing import parent_process
 from typing import Any, ClassVar, NamedTuple
@@ -89,67 +90,28 @@ _LEAST_SD = 0.05  # degC; before contact a smaller spread is noise, not to be bl
 _MOST_THREADS = 2  # a batch of 100 is two pieces
 
 
+@dataclass(eq=False, repr=False)
 class LstmClassifier(JoinedClassifier):
     """The paper's LSTM, fed with what differs between grasps (``"lstm"``).
 
-    Parameters
-    ----------
-    hidden : int, optional
-        Size of the hidden state.
-    epochs : int, optional
-        Passes over the augmented training set; 2000 in the paper, 200 is quick and undertrained.
-    batch : int, optional
-        Series in a batch.
-    learning_rate : float, optional
-        Of Adam.
-    series_per_class, noise_sd, shift_sd : optional
-        The augmentation, see :func:`~thermogrip.classify.estimators.lstm.augment`.
-    start : float, optional
-        First time [s] that the network sees.
-    feed : {"each_time", "trace"}, optional
-        Standardise every sample time by itself, or all with one mean and one scale; the latter is the default
-        of ``lstm-paper``.
-    device : {"auto", "cpu", "cuda"}, optional
-        Where to train; ``auto`` is the GPU where there is one.
-    random_state : int, optional
-        Seed of weights, copies and batches; the same seed gives the same network on the same machine.
-
-    Attributes
-    ----------
-    classes_ : (K,) ndarray of str
-    loss_curve_ : (epochs,) ndarray
-        Mean training cross entropy of each epoch.
+    ``loss_curve_`` (epochs,) is the mean training cross entropy of each epoch.
     """
 
     reads_both_sensors: ClassVar[bool] = True
     needs: ClassVar[tuple[str, str] | None] = ("torch", "lstm")
     own_feed: ClassVar[str] = "each_time"
 
-    def __init__(
-        self,
-        hidden: int = 32,
-        epochs: int = PAPER_EPOCHS,
-        batch: int = 100,
-        learning_rate: float = 1e-3,
-        series_per_class: int = 100,
-        noise_sd: float = 0.05,
-        shift_sd: float = 0.3,
-        start: float = 0.0,
-        feed: str | None = None,
-        device: str = "auto",
-        random_state: int = 0,
-    ) -> None:
-        self.hidden = hidden
-        self.epochs = epochs
-        self.batch = batch
-        self.learning_rate = learning_rate
-        self.series_per_class = series_per_class
-        self.noise_sd = noise_sd
-        self.shift_sd = shift_sd
-        self.start = start
-        self.feed = feed
-        self.device = device
-        self.random_state = random_state
+    hidden: int = 32  # size of the state
+    epochs: int = PAPER_EPOCHS  # over the augmented training set; 200 is quick and undertrained
+    batch: int = 100  # series
+    learning_rate: float = 1e-3  # of Adam
+    series_per_class: int = 100  # of :func:`augment`, as the next two
+    noise_sd: float = 0.05
+    shift_sd: float = 0.3
+    start: float = 0.0  # first time that the network sees [s]
+    feed: str | None = None  # "each_time", or "trace", the default of ``lstm-paper``
+    device: str = "auto"  # where to train: the GPU where there is one; "cpu" or "cuda"
+    random_state: int = 0  # of weights, copies and batches: the same network on the same machine
 
     def _fit(self, grasps: Grasps, labels: Labels) -> None:
         self._check_params()
@@ -209,10 +171,7 @@ class LstmClassifier(JoinedClassifier):
 
 
 class PaperLstm(LstmClassifier):
-    """The paper's LSTM as described there, fed with plain temperatures (``"lstm-paper"``).
-
-    Parameters and attributes are those of :class:`LstmClassifier`.
-    """
+    """The paper's LSTM as described there, fed with plain temperatures (``"lstm-paper"``)."""
 
     own_feed: ClassVar[str] = "trace"
 

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -87,25 +88,15 @@ class MarginClassifier(JoinedClassifier):
         return np.asarray(log_softmax(self.scale_ * _margins(self.machine_, self._rows(grasps)), axis=1))
 
 
+@dataclass(eq=False, repr=False)
 class SvmPca(MarginClassifier):
-    """Support vector machine on principal components of the rise (``"svm-pca"``).
-
-    Parameters
-    ----------
-    components : int, optional
-        Components kept; fewer where there are fewer grasps.
-    start : float, optional
-        First time [s] that is used.
-    random_state : int, optional
-        Of the folds inside the training.
-    """
+    """Support vector machine on principal components of the rise (``"svm-pca"``)."""
 
     fits_in_a_blink: ClassVar[bool] = True
 
-    def __init__(self, components: int = 10, start: float = 0.0, random_state: int = 0) -> None:
-        self.components = components
-        self.start = start
-        self.random_state = random_state
+    components: int = 10  # kept; fewer where there are fewer grasps
+    start: float = 0.0  # first time that is used [s]
+    random_state: int = 0  # of the folds inside the training
 
     def _learn_rows(self, grasps: Grasps) -> None:
         if self.components < 1:
@@ -180,25 +171,15 @@ _LEAST_SD = 1e-4  # a share that never changes is no feature
 _ALPHAS = np.geomspace(1e-5, 10, 7)  # ridge, a feature
 
 
+@dataclass(eq=False, repr=False)
 class RocketClassifier(MarginClassifier):
-    """MiniRocket and ridge regression, with calibrated probabilities (``"rocket"``).
-
-    Parameters
-    ----------
-    kernels : int, optional
-        Features, about.
-    start : float, optional
-        First time [s] that is used.
-    random_state : int, optional
-        Of the thresholds, and of the folds inside the training.
-    """
+    """MiniRocket and ridge regression, with calibrated probabilities (``"rocket"``)."""
 
     needs: ClassVar[tuple[str, str] | None] = ("aeon", "rocket")
 
-    def __init__(self, kernels: int = 10_000, start: float = 0.0, random_state: int = 0) -> None:
-        self.kernels = kernels
-        self.start = start
-        self.random_state = random_state
+    kernels: int = 10_000  # features, about
+    start: float = 0.0  # first time that is used [s]
+    random_state: int = 0  # of the thresholds, and of the folds inside the training
 
     def _learn_rows(self, grasps: Grasps) -> None:
         from aeon.transformations.collection.convolution_based import MiniRocket

@@ -24,9 +24,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -44,67 +44,44 @@ from thermogrip.classify.estimators.base import (
 )
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, has_touch_groups, label_values
+from thermogrip.sysid.effusivity.calibration import calibrate_gripper
+from thermogrip.sysid.effusivity.data import touches
+from thermogrip.sysid.effusivity.gripper_model import GripperModel, GripperSpread, another_gripper
+from thermogrip.sysid.effusivity.multi_touch import (
+    Coupling,
+    free_touch_fit,
+    learn_coupling,
+    rested_long,
+    two_touch_fit,
+)
+from thermogrip.sysid.effusivity.posterior import material_evidence
+from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors
 from thermogrip.sysid.effusivity.quality import check_grasps, longest_contact
-
-if TYPE_CHECKING:
-    from thermogrip.sysid.effusivity.gripper_model import GripperModel, GripperSpread
-    from thermogrip.sysid.effusivity.multi_touch import Coupling
 
 GRIPPERS = ("same", "uncertain", "another")
 
 
+@dataclass(eq=False, repr=False)
 class PosteriorClassifier(GraspClassifier):
     """Evidence of each material under the calibrated gripper (``"posterior"``).
 
-    Parameters
-    ----------
-    finish : {"known", "unknown"}, optional
-        Whether the test blocks are those of the training, or others of the same material.
-    priors : dict of str to float, optional
-        Prior odds of the materials; equal by default.
-    prior_unknown : float, optional
-        Prior probability of a material that is not among the candidates.
-    device : GripperModel, optional
-        A calibration to start from: fitting is quicker.
-    random_state : int, optional
-        Seed of the calibration.
-    gripper : {"same", "uncertain", "another"}, optional
-        Which gripper took the grasps: the one that was calibrated, its parameters taken as the file has them
-        (as exact, unless that marks them uncertain); the same, with their uncertainty integrated over; or
-        another one of its kind.
-
-    Attributes
-    ----------
-    classes_ : (K,) ndarray of str
-    device_ : GripperModel
-        The calibrated gripper.
-    coupling_ : Coupling or None
-        How blocks move between touches, where groups of touches taught it.
-    longest_ : float
-        How long the longest training contact lasted [s]: of single touches no more is read.
+    ``gripper`` is which one took the grasps: the ``same`` that was calibrated, its parameters taken as the
+    file has them (as exact, unless that marks them uncertain); the same, but ``uncertain``: integrated over;
+    or ``another`` one of its kind.  ``device_`` is the calibrated one, ``coupling_`` (or None) how blocks
+    move between touches, where groups of touches taught it.
     """
 
     learns_from_all_conditions: ClassVar[bool] = True
     reads_beginnings: ClassVar[bool] = True
     joins_touches: ClassVar[bool] = True
     leaves_samples_out: ClassVar[bool] = True
-    coupling_: Coupling | None = None
 
-    def __init__(
-        self,
-        finish: str = "known",
-        priors: dict[str, float] | None = None,
-        prior_unknown: float = 0.1,
-        device: GripperModel | None = None,
-        random_state: int = 0,
-        gripper: str = "same",
-    ) -> None:
-        self.finish = finish
-        self.gripper = gripper
-        self.priors = priors
-        self.prior_unknown = prior_unknown
-        self.device = device
-        self.random_state = random_state
+    finish: str = "known"  # the test blocks are those of the training; "unknown": others of their materials
+    priors: dict[str, float] | None = None  # odds of the materials; equal by default
+    prior_unknown: float = 0.1  # probability of a material that is not among the candidates
+    device: GripperModel | None = None  # a calibration to start from: fitting is quicker
+    random_state: int = 0  # of the calibration
+    gripper: str = "same"
 
     def fit(
         self, X: Records, y: ArrayLike | None = None, *, progress: Callable[[float, str], None] | None = None
@@ -112,9 +89,6 @@ class PosteriorClassifier(GraspClassifier):
         """Calibrate the gripper on labelled grasps of one or several conditions, which need not share a
         time axis; ``y`` (n_grasp,) are their materials, record after record, by default each record's
         own."""
-        from thermogrip.sysid.effusivity.calibration import calibrate_gripper
-        from thermogrip.sysid.effusivity.multi_touch import learn_coupling
-
         self._check_params()
         records = record_list(X)
         labels = record_labels(records, y)
@@ -123,7 +97,7 @@ class PosteriorClassifier(GraspClassifier):
         records = [part.assign(material=("grasp", own)) for part, own in zip(records, labels)]
         device = calibrate_gripper(records, start=self.device, seed=self.random_state, progress=progress)
         self.longest_ = longest_contact(records)
-        self.coupling_ = None
+        self.coupling_: Coupling | None = None
         for part in records:
             if has_touch_groups(part):
                 self.coupling_ = learn_coupling(device, part, start=self.coupling_)
@@ -140,19 +114,12 @@ class PosteriorClassifier(GraspClassifier):
     def for_another_gripper(
         self, known: Records | None = None, *, spread: GripperSpread | None = None
     ) -> PosteriorClassifier:
-        """Return this classifier for another gripper of the same kind.
+        """Return this classifier for another gripper of the same kind, ``spread`` from it as their making
+        allows by default.
 
-        Parameters
-        ----------
-        known : Grasps or list of Grasps, optional
-            Grasps of the other gripper whose material is known: one helps most, three to ten of two materials
-            reach nearly all.  Without them answers are as uncertain as grippers differ.
-        spread : GripperSpread, optional
-            How far grippers lie apart; default what their making allows.
+        Of ``known``, grasps of the other gripper whose material is known, one helps most, three to ten of two
+        materials reach nearly all.  Without them answers are as uncertain as grippers differ.
         """
-        from thermogrip.sysid.effusivity.calibration import calibrate_gripper
-        from thermogrip.sysid.effusivity.gripper_model import another_gripper
-
         self._check_fitted()
         device = another_gripper(self.device_, spread)
         if known is not None:
@@ -174,14 +141,11 @@ class PosteriorClassifier(GraspClassifier):
             raise UserError("a prior is not positive", hint="leave a material out of the candidates instead")
 
     def _log_proba(self, grasps: Grasps) -> Floats:
-        names = [str(c) for c in self.classes_]
+        names = self.asked()
         return np.asarray(self._evidence(grasps, names) + self.log_prior(names))
 
     def _evidence(self, grasps: Grasps, names: Sequence[str]) -> Floats:
         """Return the log evidence of each candidate, (n_grasp, n_name), joint for touches of one block."""
-        from thermogrip.sysid.effusivity.multi_touch import two_touch_fit
-        from thermogrip.sysid.effusivity.posterior import material_evidence
-
         evidence = np.empty((grasps.sizes["grasp"], len(names)))
         alone, part = self._ungrouped(grasps)
         if part is not None:
@@ -206,35 +170,29 @@ class PosteriorClassifier(GraspClassifier):
 
     def candidate_log_proba(self, X: Records, candidates: Sequence[str]) -> Floats:
         """Return log probabilities over a subset of ``classes_``: only their evidence is computed."""
-        self._check_candidates(candidates)
-        prior = self.log_prior(candidates)
-        return np.vstack([normalised(self._evidence(part, candidates) + prior) for part in record_list(X)])
+        names = self.asked(candidates)
+        prior = self.log_prior(names)
+        return np.vstack([normalised(self._evidence(part, names) + prior) for part in record_list(X)])
 
     def open_set_log_proba(self, X: Records, candidates: Sequence[str]) -> tuple[Floats, Floats]:
         """Return :meth:`candidate_log_proba` and :meth:`p_unknown` from one evaluation of the evidence."""
-        self._check_candidates(candidates)
-        prior, log_p, unknown = self.log_prior(candidates), [], []
+        names = self.asked(candidates)
+        prior, log_p, unknown = self.log_prior(names), [], []
         for part in record_list(X):
-            evidence = self._evidence(part, candidates)
+            evidence = self._evidence(part, names)
             log_p.append(normalised(evidence + prior))
-            unknown.append(self._none_of(part, candidates, evidence))
+            unknown.append(self._none_of(part, names, evidence))
         return np.vstack(log_p), np.concatenate(unknown)
 
     def p_unknown(self, X: Records, candidates: Sequence[str] | None = None) -> Floats:
         """Return the probability that a grasp is of none of the candidates, shape (n_grasp,)."""
-        self._check_fitted()
-        names = [str(c) for c in (self.classes_ if candidates is None else candidates)]
+        names = self.asked() if candidates is None else [str(c) for c in candidates]
         parts = record_list(X)
         return np.concatenate([self._none_of(part, names, self._evidence(part, names)) for part in parts])
 
     def _none_of(self, grasps: Grasps, names: Sequence[str], evidence: Floats) -> Floats:
         """Return the posterior probability of a free effusivity beside the candidates, at equal odds of
         these."""
-        from thermogrip.sysid.effusivity.data import touches
-        from thermogrip.sysid.effusivity.multi_touch import free_touch_fit
-        from thermogrip.sysid.effusivity.posterior import material_evidence
-        from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors
-
         free, known = np.empty(evidence.shape[0]), evidence
         alone, part = self._ungrouped(grasps)
         if part is not None:
@@ -251,8 +209,6 @@ class PosteriorClassifier(GraspClassifier):
 
     def beyond_training(self, grasps: Grasps) -> list[str]:
         """Return in words which blocks rested longer between touches than those of the training."""
-        from thermogrip.sysid.effusivity.multi_touch import Coupling, rested_long
-
         known = (self.coupling_ or Coupling()).longest_rest
         words = f"rested longer than the {known:g} s of the training: the answer may be too confident"
         return [words if long else "" for long in rested_long(grasps, self.coupling_)]
@@ -276,9 +232,6 @@ class PosteriorClassifier(GraspClassifier):
 
     def load_parts(self, folder: Path) -> None:
         """Read what :meth:`save_parts` wrote."""
-        from thermogrip.sysid.effusivity.gripper_model import GripperModel
-        from thermogrip.sysid.effusivity.multi_touch import Coupling
-
         self._check_params()
         self.device_ = GripperModel.load(folder / "device.json")
         file = folder / "coupling.json"
@@ -287,8 +240,6 @@ class PosteriorClassifier(GraspClassifier):
 
 def _uncertain_as(device: GripperModel, gripper: str) -> GripperModel:
     """Return a calibrated gripper with the parameter uncertainty that the question requires."""
-    from thermogrip.sysid.effusivity.gripper_model import another_gripper
-
     if gripper == "another":
         return another_gripper(device)
     if gripper == "uncertain":

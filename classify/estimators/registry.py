@@ -19,6 +19,7 @@ from __future__ import annotations
 import inspect
 import json
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Self
@@ -239,12 +240,12 @@ def _read_weights(file: Path) -> dict[str, NDArray[Any]]:
         raise UserError(f"is damaged ({error})", file=file, hint="train the classifier again") from error
 
 
+@dataclass(eq=False, repr=False)
 class VoteClassifier(GraspClassifier):
     """The mean of the probabilities of ``members``, at least two unfitted classifiers, none of which learns
     from the grasps of other conditions than its own."""
 
-    def __init__(self, members: Sequence[GraspClassifier] = ()) -> None:
-        self.members = members
+    members: Sequence[GraspClassifier] = ()
 
     def fit(self, X: Records, y: ArrayLike | None = None) -> Self:
         """Fit each member to labelled grasps; what a member raises is raised."""

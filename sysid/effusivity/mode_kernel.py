@@ -371,35 +371,21 @@ def marginals(
     Their prior means stand in ``u``, their sds in ``level_sd`` and ``t_sd`` (n,).
     """
     scratch = _scratch(gripper.sensor.size, nodes[2].size, times.size, y.size)
-    vary, result = np.zeros(7, dtype=np.bool_), np.empty(u.shape[0])
-    given, f, far = scratch.given, scratch.white[VALUE], scratch.far
-    _whiten_given(whitener, y, ramp, leak, room, given)
+    vary, sd, result = np.zeros(7, dtype=np.bool_), np.zeros(7), np.empty(u.shape[0])
+    matrix, gradient = np.zeros((7, 7)), np.zeros(7)
+    _whiten_given(whitener, y, ramp, leak, room, scratch.given)
     for p in range(u.shape[0]):
         fill_responses(
             nodes, gripper, u[p], vary, times, bins, count, scratch.room, scratch.place, scratch.share,
             scratch.curves,
         )  # fmt: skip
-        _whiten(whitener, scratch.curves[VALUE], f)
-        rate = g_far * np.exp(-u[p, _C]) if np.isfinite(room) else 0.0
-        way = room - u[p, _T] if np.isfinite(room) else 0.0
-        fill_delayed(t, count, delay(u[p, _E], u[p, _C]), scratch.curves[VALUE], far[2], far[3])
-        _whiten(whitener, far[2], far[4])
-        difference = u[p, _T] - u[p, _LEVEL]
-        away = room - u[p, _LEVEL] if np.isfinite(room) else 0.0
-        rr = r1 = r2 = v12 = 0.0
-        v11 = v22 = 1.0
-        for i in range(y.size):
-            a = given[_Y, i] - u[p, _LEVEL] * given[_ONE, i] - difference * f[i] - away * given[_RAMP, i]
-            a -= rate * way * far[4, i]
-            b = (given[_ONE, i] - f[i] - given[_RAMP, i]) * level_sd
-            c = (f[i] - rate * far[4, i]) * t_sd[p]
-            rr += a * a
-            r1 += a * b
-            r2 += a * c
-            v11 += b * b
-            v12 += b * c
-            v22 += c * c
+        sd[_LEVEL], sd[_T] = level_sd, t_sd[p]
+        square = _normal_equations(
+            whitener, t, count, u[p], vary, sd, g_far, room, scratch, matrix, gradient
+        )
+        r1, r2 = gradient[_LEVEL], gradient[_T]
+        v11, v12, v22 = 1.0 + matrix[_LEVEL, _LEVEL], matrix[_T, _LEVEL], 1.0 + matrix[_T, _T]
         det = v11 * v22 - v12 * v12
         gain = (v22 * r1 * r1 - 2.0 * v12 * r1 * r2 + v11 * r2 * r2) / det
-        result[p] = -0.5 * (rr - gain) - 0.5 * np.log(det)
+        result[p] = -0.5 * (square - gain) - 0.5 * np.log(det)
     return result

@@ -58,7 +58,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,6 +67,7 @@ from scipy.optimize import minimize
 from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import number_within
+from thermogrip.datasets.materials import Material
 from thermogrip.datasets.schema import Grasps, label_values, log_name
 from thermogrip.sysid.contact.response import block_modes, step_response, time_nodes
 from thermogrip.sysid.effusivity.data import Touches, touches, whiten
@@ -93,9 +94,6 @@ from thermogrip.sysid.effusivity.posterior_grid import (
     refined,
 )
 from thermogrip.sysid.effusivity.quality import number_values
-
-if TYPE_CHECKING:
-    from thermogrip.datasets.materials import Material
 
 Array = NDArray[np.float64]
 

@@ -11,23 +11,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
+from scipy.special import expit, logit, logsumexp
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.materials import Material
 from thermogrip.datasets.schema import Grasps, has_touch_groups
 from thermogrip.sysid.effusivity.data import touches
-from thermogrip.sysid.effusivity.gripper_model import INSULATOR
-from thermogrip.sysid.effusivity.laplace_approximation import fit_candidates
-
-if TYPE_CHECKING:
-    from thermogrip.datasets.materials import Material
-    from thermogrip.sysid.effusivity.gripper_model import GripperModel
-    from thermogrip.sysid.effusivity.multi_touch import Coupling
-    from thermogrip.sysid.effusivity.posterior_grid import GridPosterior
+from thermogrip.sysid.effusivity.gripper_model import INSULATOR, GripperModel
+from thermogrip.sysid.effusivity.laplace_approximation import T_OBJECT, H, fit_candidates
+from thermogrip.sysid.effusivity.multi_touch import Coupling, free_touch_fit, touch_groups
+from thermogrip.sysid.effusivity.posterior_grid import GridPosterior, grid_posteriors, mixture_quantiles
 
 Array = NDArray[np.float64]
 
@@ -96,8 +92,6 @@ def material_fit(
     UserError
         If a candidate is nowhere known or named twice, or a grasp has too few samples.
     """
-    from thermogrip.sysid.effusivity.laplace_approximation import T_OBJECT, H
-
     data = touches(grasps, until=until)
     mode, prior, _ = fit_candidates(gripper, data, candidates, finish, start=start)
     n, m = data.level.size, len(candidates)
@@ -179,16 +173,13 @@ def open_set(
     >>> bool((open_set(load_default_gripper(), cork, ["copper", "iron", "wood"]).p_unknown > 0.99).all())
     True
     """
-    from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors
-
     if not 0 < prior_unknown < 1:
         raise UserError(f"prior_unknown is {prior_unknown:g}", hint="give a probability between 0 and 1")
     evidence = material_evidence(gripper, grasps, candidates, until=until)
     known = logsumexp(evidence, axis=1) - np.log(len(candidates))
     free = np.array([p.log_evidence for p in grid_posteriors(gripper, touches(grasps, until=until))])
     odds = known - free
-    shifted = np.clip(odds + np.log1p(-prior_unknown) - np.log(prior_unknown), -700, 700)
-    return OpenSet(log_bayes_factor=odds, p_unknown=1 / (1 + np.exp(shifted)))
+    return OpenSet(log_bayes_factor=odds, p_unknown=expit(logit(prior_unknown) - odds))
 
 
 def effusivity_posterior(
@@ -219,9 +210,6 @@ def effusivity_posterior(
     >>> [row.effusivity_p05 < e < row.effusivity_p95 for row, e in ((copper, 3.64e4), (wood, 367.0))]
     [True, True]
     """
-    from thermogrip.sysid.effusivity.multi_touch import free_touch_fit, touch_groups
-    from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors
-
     rows = touch_groups(grasps) if has_touch_groups(grasps) else {}
     alone = np.setdiff1d(np.arange(grasps.sizes["grasp"]), np.concatenate([[], *rows.values()]).astype(int))
     found: dict[int, GridPosterior] = {}
@@ -235,8 +223,6 @@ def effusivity_posterior(
 
 
 def _row(gripper: GripperModel, name: str, posterior: GridPosterior) -> EffusivityRow:
-    from thermogrip.sysid.effusivity.posterior_grid import mixture_quantiles
-
     scale, scale_sd = gripper.effusivity_scale(posterior.x)
     scatter = np.where(np.exp(posterior.x) < INSULATOR, gripper.spreads.ln_effusivity, 0.0)
     x, sd = posterior.x - scale, np.hypot(np.hypot(scale_sd, scatter), 1e-4)

@@ -22,15 +22,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import logsumexp
 
+from thermogrip.datasets.materials import Material
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.contact.simulation import PUMP_OFF
 from thermogrip.sysid.effusivity.data import Touches, noise_covariance, touches
+from thermogrip.sysid.effusivity.gripper_model import GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import (
     BUILD_UP,
     LEVEL,
@@ -41,10 +43,6 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     nodes_for,
 )
 from thermogrip.sysid.effusivity.multi_touch import SHARED, Coupling, next_touch_prior
-
-if TYPE_CHECKING:
-    from thermogrip.datasets.materials import Material
-    from thermogrip.sysid.effusivity.gripper_model import GripperModel
 
 Array = NDArray[np.float64]
 

@@ -16,16 +16,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 from statistics import NormalDist
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.plant.fit_record import Identifiability
-
-if TYPE_CHECKING:
-    from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.plant import Plant
 
 Array = NDArray[np.float64]
 

@@ -33,7 +33,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,12 +43,10 @@ from scipy.signal import lfilter
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, log_name
 from thermogrip.sysid.models.model import GreyModel
+from thermogrip.sysid.models.network_spec import Parameter
 from thermogrip.sysid.plant.log_grid import Stretch, cut_stretches, sample_time
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import Start, find_starts, predict
-
-if TYPE_CHECKING:
-    from thermogrip.sysid.models.network_spec import Parameter
 
 Array = NDArray[np.float64]
 

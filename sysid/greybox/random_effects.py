@@ -48,7 +48,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,10 +55,8 @@ from scipy.signal import lfilter
 
 from thermogrip.sysid.greybox.noise_model import Block, ErrorModel, LogData
 from thermogrip.sysid.greybox.problem import Problem
+from thermogrip.sysid.models.model import Model
 from thermogrip.sysid.plant.simulation import READING_EVERY, Start, predict
-
-if TYPE_CHECKING:
-    from thermogrip.sysid.models.model import Model
 
 Array = NDArray[np.float64]
 Parts = list[list[list[Array]]]  # by log, stretch and output

@@ -25,18 +25,18 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, columns, log_name
+from thermogrip.sysid.models.lti import evaluate_terms
 from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.models.network_spec import Network, network_from_dict, roles
-
-if TYPE_CHECKING:
-    from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.plant import Plant
 
 Array = NDArray[np.float64]
 
@@ -89,12 +89,8 @@ def _rows(plant: Plant, log: Log, step: float, warmup: float) -> tuple[Array, Ar
 
 def _means(values: Array, cell: NDArray[np.int_]) -> Array:
     """Return means (n_cell, n) of the finite values in each cell that has rows; NaN where none is finite."""
-    _, place = np.unique(cell, return_inverse=True)
-    known = np.isfinite(values)
-    total, count = np.zeros((place[-1] + 1, values.shape[1])), np.zeros((place[-1] + 1, values.shape[1]))
-    np.add.at(total, place, np.where(known, values, 0.0))
-    np.add.at(count, place, known.astype(float))
-    return np.asarray(np.where(count > 0, total / np.maximum(count, 1.0), np.nan))
+    known = pd.DataFrame(np.where(np.isfinite(values), values, np.nan))
+    return known.groupby(cell).mean().to_numpy()
 
 
 def _parts(lengths: Sequence[int]) -> NDArray[np.int_]:
@@ -116,8 +112,6 @@ def _filtered(
     runs: Sequence[tuple[Array, Array, Array]], labels: Sequence[str], plant: Plant, tau: float
 ) -> Array:
     """Return the terms (rows, n_term), filtered by a first-order lag log by log."""
-    from thermogrip.sysid.models.lti import evaluate_terms
-
     names = (*plant.inputs, *plant.disturbances, *plant.outputs)
     out = []
     for time, signals, _ in runs:
@@ -165,10 +159,7 @@ def _grow(
 
 
 def _levelled(values: Array, where: NDArray[np.int_]) -> Array:
-    out = values.copy()
-    for part in np.unique(where):
-        out[where == part] -= out[where == part].mean(axis=0)
-    return out
+    return values - pd.DataFrame(values).groupby(where).transform("mean").to_numpy()
 
 
 def _explained(X: Array, r: Array, where: NDArray[np.int_]) -> float:

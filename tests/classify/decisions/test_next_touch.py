@@ -193,8 +193,8 @@ def made_up(monkeypatch: pytest.MonkeyPatch, gain: list[float], information: lis
     """Let a touch gain so much at each temperature; return the probabilities that it was weighed with."""
     weighed: list[Any] = []
     model = SimpleNamespace(
-        classes_=["a", "b"], device_=None, coupling_=None, finish=None,
-        log_prior=lambda names: np.log([0.8, 0.2]), _check_candidates=lambda names: None,
+        device_=None, coupling_=None, finish=None,
+        log_prior=lambda names: np.log([0.8, 0.2]), asked=lambda names: ["a", "b"],
     )  # fmt: skip
     said = np.array(gain)
 
@@ -205,7 +205,7 @@ def made_up(monkeypatch: pytest.MonkeyPatch, gain: list[float], information: lis
     monkeypatch.setattr(next_touch, "with_model", lambda classifier: model)
     monkeypatch.setattr(next_touch, "expected_information", expected)
     monkeypatch.setattr(
-        "thermogrip.sysid.effusivity.predictive.next_touch",
+        "thermogrip.classify.decisions.next_touch.next_touch",
         lambda *a, **o: Forecast(np.log([[0.25, 0.75], [0.5, 0.5]])),
     )
     return weighed

@@ -103,7 +103,7 @@ def test_what_more_contact_would_bring_is_worked_out_only_for_a_rule_that_asks(
     def windows(*_: object, gain: bool, **__: object) -> None:
         raise Seen(gain)
 
-    monkeypatch.setattr("thermogrip.classify.decisions.stopping_rule.growing_windows", windows)
+    monkeypatch.setattr("thermogrip.classify.decisions.predict.growing_windows", windows)
     with pytest.raises(Seen) as seen:
         classify_grasps(make_classifier("bayes").fit(three), three, rule=StopRule(sure=0.99, gain=gain))
     assert seen.value.args == (asked,)
