@@ -285,9 +285,9 @@ def summed_evidence(device, data, mode, prior, k, r, n=3000):
     u[:, vary] = points
     whitener, log_det = whiten(one, device.noise)
     likelihood = marginals(
-        *gripper_arguments(device.stack, nodes_for(one)), device.stack.leak, device.stack.g_far,
-        one.sample_t[0], one.sample_bin[0], one.count[0], one.t[0], one.y[0], one.ramp[0],
-        float(one.t_ambient[0]), whitener[0], float(prior.sd[k, LEVEL]), np.full(n, prior.sd[k, T_OBJECT]), u,
+        *gripper_arguments(device.stack, nodes_for(one)), one.sample_t[0], one.sample_bin[0], one.count[0],
+        one.t[0], one.y[0], one.ramp[0], float(one.t_ambient[0]), whitener[0],
+        *prior.sd[k, [LEVEL, T_OBJECT]].tolist(), u,
     )  # fmt: skip
     return logsumexp(likelihood + log_prior - proposed) - np.log(n) - 0.5 * log_det[0]
 

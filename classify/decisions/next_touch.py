@@ -2,18 +2,14 @@ r"""Decisions: name the material or say "unknown"; touch again, and at which tem
 
 **Open set.**  With :math:`p_u` the probability that the object is none of the candidates, naming the
 likeliest one m is wrong with probability :math:`p_u + (1 - p_u)(1 - p_m)`, "unknown" with probability
-:math:`1 - p_u`.  The user gives the cost of each mistake (:class:`Costs`), and the answer is the cheaper
-one.  Chow's rule is the case without unknown materials: answer only where :math:`1 - p_m` is below the cost
-of not answering.
+:math:`1 - p_u`.  The answer is the cheaper one at the user's :class:`Costs`.  Chow's rule is the case
+without unknown materials.
 
-**Another touch.**  The gripper chooses its temperature, so it can choose the most informative touch.  For
-each temperature the posterior predictive of the next touch gives the expected information and the expected
-accuracy; reaching the temperature, resting and touching take seconds, which have a cost.  A touch is worth
-it where
+**Another touch** at one of several gripper temperatures is worth it where
 
 .. math:: V \, (A_{after} - A_{now}) > c \, (t_{reach} + t_{rest} + t_{touch}),
 
-V being what a right answer is worth (1 here) and c the cost of a second.
+V being what a right answer is worth (1 here), A the expected accuracy and c the cost of a second.
 
 **Expected information.**  With p_m the probability of candidate m now and a normal distribution of the
 readings y to come under each (:mod:`thermogrip.sysid.effusivity.predictive`), the probabilities after y are
@@ -25,10 +21,6 @@ are the expected information [nat] and the expected accuracy of naming the likel
 averages over draws of y under each candidate.  Accuracy is never lost by reading on: with k* the candidate
 that is likeliest now, the gain is :math:`E[\max_k p_k(y) - p_{k*}(y)]`, which no draw makes negative and
 which is exactly zero where no reading could change the answer.
-
-**Time to a temperature**, by an identified plant: its free run at full drive in either direction, pump on,
-from rest at the present temperature, shows when the skin first passes another one.  A controller that settles
-takes a little longer; one that is tuned for time comes close (the tuning report shows both).
 """
 
 from __future__ import annotations
@@ -329,10 +321,12 @@ _REST = 10.0  # s at the present temperature, of which the plant takes its state
 def by_plant(
     plant: Plant, now: float, *, t_ambient: float, output: str = "t_surface", longest: float = 900.0
 ) -> Callable[[float], float]:
-    """Return the time [s] from temperature ``now`` [degC] to another at full ``drive``, for
-    ``choose_next_touch(seconds=...)``; infinite beyond ``longest`` [s].
+    """Return the time [s] from temperature ``now`` [degC] to another, for ``choose_next_touch(seconds=...)``;
+    infinite beyond ``longest`` [s].
 
-    A plant without that output or an input ``drive`` is a :class:`UserError`.
+    It is when the plant's free run at full ``drive``, pump on, from rest first passes the other one; a
+    controller that settles there takes a little longer.  A plant without that output or an input ``drive`` is
+    a :class:`UserError`.
     """
     for name, there in ((output, plant.outputs), ("drive", plant.inputs)):
         if name not in there:

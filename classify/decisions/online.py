@@ -147,7 +147,6 @@ class Stream:
     def _has_level(self) -> bool:
         return any(t < -_CONTACT and np.isfinite(y) for t, y in zip(self._time, self._reading))
 
-
     def _warm(self) -> None:
         """Look at a made-up contact once, so that no sample waits for the compiler."""
         made_up = make_grasps([-1.0, -0.5, 0.5], [[23.0, 23.0, 23.0]], ["warm"])

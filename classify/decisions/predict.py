@@ -1,32 +1,18 @@
 """The answer for each grasp: a material, probabilities, and how likely it is none of them.
 
-``material`` is the likeliest known one.  ``p_unknown`` is beside the probabilities, not in their sum, and
-is empty for a classifier that has no model of other materials.  Touches of one block (``touch_group``) are
-one question: a classifier that knows how touches hang together answers it from all of them, of another the
-log probabilities are added, and each of its rows has the common answer. ``decided_at_s`` is the contact
-time that was used: the last sample of the grasp or of its group's last touch, or where a stop rule
-(:mod:`~thermogrip.classify.decisions.stopping_rule`) would have ended the contact.
+``material`` is the likeliest known one.  ``p_unknown`` is beside the probabilities, not in their sum.
+Touches of one block (``touch_group``) are one question: a classifier that knows how touches hang together
+answers it from all of them, of another the log probabilities are added, and each row has the common answer.
+``decided_at_s`` is the contact time that was used: the last sample of the grasp or of its group's last
+touch, or where a stop rule would have ended the contact.  What of a grasp is usable is decided in
+:mod:`thermogrip.sysid.effusivity.quality`, and ``note`` explains what is not: a grasp without contact is
+none of the candidates for certain, and the row of a left-out touch has the answer of its block's others.
 
-For any classifier, a grasp that shows no contact (:mod:`thermogrip.sysid.effusivity.quality`) has no
-material and no probabilities, and is none of the candidates for certain; nor is a trace named that ran into
-the end of its sensor's range (:mod:`thermogrip.sysid.effusivity.quality`) by a classifier that needs whole
-traces.  Of a block such a touch is left out, and its row has the answer of the others.  Nor is more read
-of a contact than those of the training lasted (:mod:`thermogrip.sysid.effusivity.quality`).  ``note``
-explains each; other rows have none.
-
-Why a grasp is out of distribution: how far its nuisances are from the training under each material
----------------------------------------------------------------------------------------------------
-
-Under a candidate every nuisance u_k of a grasp has a value that fits best, and training grasps have given
-its mean m_k and standard deviation s_k (:mod:`thermogrip.sysid.effusivity.laplace_approximation`).  Its
-standardised deviation is
-
-    w_k = (u_k - m_k) / s_k,
-
-and what is left of the trace, whitened residuals r of n bins, has |r|^2 of about n under the model; its
-deviation is (|r|^2 - n) / sqrt(2 n).  A grasp with a large ``p_unknown`` has large deviations under every
-known material, and they show what to check: a block that was not at its nominal temperature, a contact that
-closed badly, or a trace that no such block gives.
+**Why a grasp is out of distribution.**  Under a candidate every nuisance u_k has a value that fits best, and
+training grasps have given its mean m_k and standard deviation s_k.  A large ``p_unknown`` comes with large
+deviations (u_k - m_k) / s_k under every known material, or with whitened residuals r of n bins whose
+(|r|^2 - n) / sqrt(2 n) is large.  They show what to check: a block that was not at its nominal temperature,
+a contact that closed badly, or a trace that no such block gives.
 """
 
 from __future__ import annotations

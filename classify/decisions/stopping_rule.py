@@ -12,14 +12,9 @@ the grasps that stop for it are wrong no more often than stated: with k of n wro
 error, the posterior mean of a rate after k of n (Laplace's rule of succession), so that n grasps cannot show
 an error below 1 / (n + 2).  And the classifier itself must expect no more: the mean of 1 - max p over them is
 at most the error too, since training grasps, which calibrated the gripper, are wrong less often than fresh
-ones.  By finite volumes, 25 grasps of five materials train: of fresh ones that stopped at a stated error of
-0.1 and 0.2 shares of 0.120 and 0.216 were wrong where the count alone decides, 0.085 and 0.169 with both
-(24 trainings, ``benchmarks/classify/unlike_training.py``).  g is what the user gives away in accuracy; as
-learnt it is lowered until the training grasps lose no more than that.  A rule is for the times at which it
-was learnt: evaluating it more often stops earlier and errs more.
-
-The rule is evaluated at fixed times, close together at first, since copper and wood part within half a
-second.
+ones (``docs/records/touches-and-stops.md``).  g is what the user gives away in accuracy; as learnt it is
+lowered until the training grasps lose no more than that.  A rule is for the times at which it was learnt,
+close together at first: evaluating it more often stops earlier and errs more.
 """
 
 from __future__ import annotations

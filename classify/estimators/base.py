@@ -129,8 +129,7 @@ class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc
         return self.candidate_log_proba(X, candidates), self.p_unknown(X, candidates)
 
     def beyond_training(self, grasps: Grasps) -> list[str]:
-        """Return in words what makes the answer of each grasp overconfident, beyond the training; or
-        empty."""
+        """Return in words what makes the answer of each grasp overconfident; empty where nothing does."""
         return [""] * grasps.sizes["grasp"]
 
     def asked(self, candidates: Sequence[str] | None = None) -> list[str]:
@@ -215,8 +214,7 @@ def record_list(X: Records) -> list[Grasps]:
 
 
 def grasp_labels(grasps: Grasps, y: ArrayLike | None = None) -> Labels:
-    """Return the labels of the grasps, shape (n_grasp,): ``y``, or the record's materials, none of them
-    empty."""
+    """Return the labels (n_grasp,), ``y`` or the record's materials, none of them empty."""
     where = log_name(grasps)
     if y is None and "material" not in grasps:
         raise UserError("the grasps have no material", file=where, hint="add the column 'material' or give y")
@@ -247,8 +245,7 @@ def pick(grasps: Grasps, index: ArrayLike) -> Grasps:
 
 
 def common_times(records: Sequence[Grasps]) -> Floats:
-    """Return the sample times [s] that all records share, to 1 us; fewer than two are a
-    :class:`UserError`."""
+    """Return the sample times [s] that all records share, to 1 us, at least two of them."""
     shared = np.round(records[0]["time"].values, 6)
     for part in records[1:]:
         shared = np.intersect1d(shared, np.round(part["time"].values, 6))

@@ -20,11 +20,10 @@ several) give the weights of their mixture
 by expectation maximisation from equal weights (stacking).  One grasp more, to which all machines give the
 same probability, keeps the weights from zero; with nothing held out they stay equal.
 
-Two pools are ready.  ``small``, 30 machines, was chosen with the contacts of two sensors in view on which
-the page of classifiers scores it.  ``wide`` is a grid in octaves that was written down before it was scored
-anywhere: what a pool of 30 left to choice, held-out training grasps decide there.  The rule ``nested``
-lets them decide, too, whether the mixture or its best machine is to speak: both are made without one fold of
-the held-out grasps and scored on it, fold after fold.
+Two pools are ready: ``small``, 30 machines, was chosen with the contacts of two sensors in view on which the
+page of classifiers scores it; ``wide`` is a grid in octaves that was written down before it was scored
+anywhere.  The rule ``nested`` lets held-out grasps decide, too, whether the mixture or its best machine is to
+speak: both are made without one fold of them and scored on it, fold after fold.
 """
 
 from __future__ import annotations

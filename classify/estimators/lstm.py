@@ -20,9 +20,7 @@ one, on a GPU; weights and batches are drawn by PyTorch's generator in either ca
 same training, to rounding.  PyTorch is the extra ``lstm``; prediction needs neither.
 
 **Augmentation.**  Each copy is one real trace plus white noise on every sample and one shift of the whole
-trace, which is what another initial temperature is to a network that sees temperatures.  Copies are
-not new grasps: they are made from the training grasps alone, after the split, and keep the number of their
-source.
+trace, which is what another initial temperature is to a network that sees temperatures.
 """
 
 from __future__ import annotations

@@ -2,9 +2,8 @@ r"""Time to decision: how long contacts last that end by a confidence threshold,
 right.
 
 Each test contact is followed through growing windows and ends where the likeliest candidate reaches a
-threshold c, or where contact ends anyway.  c is learnt on training grasps alone
-(:mod:`thermogrip.classify.decisions.stopping_rule`): the least one at which those that stop are wrong no
-more often than stated.  Two kinds of classifiers can be followed:
+threshold that training grasps alone have taught (:mod:`thermogrip.classify.decisions.stopping_rule`), or
+where contact ends anyway.  Two kinds of classifiers can be followed:
 
 - one that reads any beginning of a trace (the effusivity posterior) is fitted once; its training grasps are
   those that calibrated the gripper, a handful of common numbers;

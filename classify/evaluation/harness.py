@@ -2,14 +2,12 @@
 
 Rules that it keeps:
 
-- the unit of a split is the grasp (or the block that was touched twice), and whatever a classifier does with
-  its training grasps, augmentation included, happens inside ``fit``;
+- splits are those of :mod:`thermogrip.classify.evaluation.splits`, and whatever a classifier does with its
+  training grasps, augmentation included, happens inside ``fit``;
 - each record is one condition, and its candidates are the materials of its training grasps;
 - what describes the gripper, and is the same in all conditions, may be learnt from the training grasps of all
-  of them (a classifier declares it with ``learns_from_all_conditions``); never from a test grasp;
-- conditions with two touches or unknown object temperature are scored apart;
-- what cannot be scored is noted, not dropped in silence;
-- a leak probe tries to predict the label where no touch is.
+  of them (``learns_from_all_conditions``); never from a test grasp;
+- what cannot be scored is noted, not dropped in silence.
 
 **Leak probe.**  Everything after -0.5 s is replaced by the trace's own level before contact, with noise of
 the size seen there.  Such a record contains no touch, so a classifier trained and tested on it must be at
@@ -18,11 +16,8 @@ order of the grasps, in a column of the record.  On public touch data such a pro
 is 0.17.  Its test is one-sided binomial: how likely are k or more right of n grasps, at the share of the
 commonest material.
 
-Accuracy and log loss against what an experimenter can choose: training grasps, contact time, difference
---------------------------------------------------------------------------------------------------------
-
-Every point is a comparison of its own on the same random splits by grasp, and its interval counts distinct
-grasps.  Contact time cuts training and test grasps alike: a classifier for 1 s was trained on 1 s.
+**Curves.**  Every point is a comparison of its own on the same random splits by grasp.  Contact time cuts
+training and test grasps alike: a classifier for 1 s was trained on 1 s.
 """
 
 from __future__ import annotations

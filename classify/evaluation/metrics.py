@@ -7,9 +7,8 @@ r"""Scores of predictions, each with the interval that its sample size allows.
   m p, which need not be whole) is conservative, and does not collapse to a point where all were right.
 - **Log loss** :math:`-\ln p_{true}` and **Brier** :math:`\sum_k (p_k - y_k)^2` score probabilities.
 - **Calibration**: confidence beside accuracy in bins; their mean absolute gap, weighted by bin, is the ECE.
-- **Two classifiers on the same grasps**: exact McNemar (b and c grasps where only one was right; under the
-  null b is
-  Binomial(b + c, 1/2)); for repeated splits a sign-flip test on each grasp's mean difference.
+- **Two classifiers on the same grasps**: exact McNemar; for repeated splits a sign-flip test on each grasp's
+  mean difference.
 
 Intervals by drawing whole grasps anew: of means, and of the calibration error
 ------------------------------------------------------------------------------

@@ -33,6 +33,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import make_interp_spline
 from scipy.linalg import eigh
 
 Array = NDArray[np.float64]
@@ -198,16 +199,13 @@ def far_response(
 
     ``rise`` (n, n_node) as :func:`step_response` gives it for the same blocks.
     """
-    from thermogrip.sysid.contact.time_stepping import delayed_integrals
-
-    given = (np.asarray(v, dtype=float) for v in (effusivity, capacity))
-    e, c = (np.broadcast_to(v, rise.shape[:1]).copy() for v in given)
-    t = np.broadcast_to(nodes.t, rise.shape).copy()
-    total, _, _ = delayed_integrals(t, np.ones(rise.shape), np.log(e), np.log(c), rise[:, None])
-    return np.asarray((stack.g_far / c)[:, None] * total[:, 0])
+    e, c = (np.broadcast_to(np.asarray(v, dtype=float), rise.shape[:1]) for v in (effusivity, capacity))
+    since = np.maximum(nodes.t - (c**2 / (6 * e**2))[:, None], 0.0)
+    total = [make_interp_spline(nodes.t, f, k=1).antiderivative()(s) for f, s in zip(rise, since)]
+    return np.asarray((stack.g_far / c)[:, None] * np.array(total))
 
 
 def contact_numbers(stack: Stack, modes: StackModes) -> Array:
-    """Return resistance, lag, first, creep, settle and far loss, which the time stepping needs too, (6,)."""
-    own = (stack.lag, stack.first, stack.creep, stack.settle, stack.g_far)
+    """Return resistance, lag, first, creep, settle, far loss and leak, which are beside the modes, (7,)."""
+    own = (stack.lag, stack.first, stack.creep, stack.settle, stack.g_far, stack.leak)
     return np.array([float(modes.resistance), *own])

@@ -207,8 +207,8 @@ class Gripper(NamedTuple):
 
     ``dt`` (n_group,); ``steps`` (3, n_group, n_mode): E, E b + a and b; ``alive`` (n_group,) modes that keep
     a state; ``sums`` (n_group, 2): of b, and of a past the alive ones; ``sensed`` (n_group, 6): the same as
-    the sensor sees them, E, a and b of its lag, and its rate; ``sensor`` (n_mode,) weights; ``numbers`` (6,):
-    resistance, lag, first, creep, settle, and what the block's far face loses per degree.
+    the sensor sees them, E, a and b of its lag, and its rate; ``sensor`` (n_mode,) weights; ``numbers`` (7,):
+    resistance, lag, first, creep, settle, what the block's far face loses per degree, and the skin's leak.
     """
 
     dt: Array
@@ -603,23 +603,6 @@ def fill_delayed(t: Array, count: Array, late: float, curve: Array, total: Array
         value[i] = curve[before] + rise * ahead
 
 
-@numba.njit(**OUTER)  # type: ignore[untyped-decorator]
-def delayed_integrals(
-    t: Array, count: Array, ln_e: Array, ln_c: Array, curves: Array
-) -> tuple[Array, Array, Array]:
-    """Return integrals and values of ``curves`` (n, n_curve, n_bin) up to and at t less the delay, and the
-    delay (n,) [s].
-
-    ``t``, ``count`` (n, n_bin) the bins, ``ln_e`` and ``ln_c`` (n,) the blocks.
-    """
-    total, value, late = np.zeros(curves.shape), np.zeros(curves.shape), np.empty(curves.shape[0])
-    for p in range(curves.shape[0]):
-        late[p] = delay(ln_e[p], ln_c[p])
-        for k in range(curves.shape[1]):
-            fill_delayed(t[p], count[p], late[p], curves[p, k], total[p, k], value[p, k])
-    return total, value, late
-
-
 RATE = 5  # the row of the slope, after the stepped curves
 N_CURVE = 6
 _LATEST_ONSET = 0.8
@@ -690,46 +673,3 @@ def fill_responses(
             _means(t, rise[curve], slope[curve], bins, count, place, share, False, out[curve])
     if vary[_ONSET]:
         _means(t, rise[VALUE], slope[VALUE], bins, count, place, share, True, out[RATE])
-
-
-@numba.njit(**OUTER)  # type: ignore[untyped-decorator]
-def binned_responses(
-    nodes: Nodes, gripper: Gripper, u: Array, vary: NDArray[np.bool_], times: Array,
-    bins: NDArray[np.int64], count: Array,
-) -> Array:  # fmt: skip
-    """Return what :func:`fill_responses` finds for n pairs, (n, 6, n_bin), zero where not wanted.
-
-    ``u``, ``vary`` (n, 7) the nuisances and which of them are unknown; ``times``, ``bins`` (n, n_sample) and
-    ``count`` (n, n_bin) the samples.
-    """
-    n, n_sample = times.shape
-    out = np.zeros((n, N_CURVE, count.shape[1]))
-    room = room_for(gripper.sensor.size, nodes[2].size)
-    place, share = np.empty(n_sample, dtype=np.int64), np.empty(n_sample)
-    for p in range(n):
-        fill_responses(nodes, gripper, u[p], vary[p], times[p], bins[p], count[p], room, place, share, out[p])
-        for curve, at in ((BY_H, _H), (BY_BUILD_UP, _BUILD_UP)):
-            if not vary[p, at]:
-                out[p, curve] = 0.0
-    return out
-
-
-@numba.njit(**OUTER)  # type: ignore[untyped-decorator]
-def gripper_responses(
-    nodes: Nodes, lam: Array, face: Array, sensor: Array, numbers: Array, u: Array, times: Array,
-    bins: NDArray[np.int64], count: Array,
-) -> Array:  # fmt: skip
-    """Return bin means of the response of n grippers to one contact, (n, n_bin).
-
-    ``lam``, ``face``, ``sensor`` (n, n_mode) are their modes; ``numbers`` (n, 6) are face resistance, lag,
-    first, creep, settle and loss of the far face of each; ``u`` (7,) the nuisances; ``times``, ``bins``
-    (n_sample,) and ``count`` (n_bin,) the samples.
-    """
-    n, n_sample = lam.shape[0], times.size
-    out, vary = np.zeros((n, N_CURVE, count.size)), np.zeros(7, dtype=np.bool_)
-    room = room_for(lam.shape[1], nodes[2].size)
-    place, share = np.empty(n_sample, dtype=np.int64), np.empty(n_sample)
-    for p in range(n):
-        one = gripper_of(nodes[0], lam[p], face[p], sensor[p], numbers[p])
-        fill_responses(nodes, one, u, vary, times, bins, count, room, place, share, out[p])
-    return out[:, VALUE]

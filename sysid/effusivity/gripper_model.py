@@ -14,13 +14,12 @@ library) against ln(found), which reported effusivities are divided by.
 
 A calibration ends with a posterior of theta, the parameters that all grasps share: the stack, mean build-up
 time and onset, heat loss in transit, bias of the nominal temperature, depth, and ln h and ln e of each block.
-Its covariance is a :class:`ParameterCovariance`.  An uncertain gripper is not taken as exact: theta is
-integrated over in every answer (:mod:`thermogrip.sysid.effusivity.laplace_approximation`).
+Over an uncertain gripper's theta every answer integrates
+(:mod:`thermogrip.sysid.effusivity.laplace_approximation`).
 
-**Another gripper** of the same kind has other numbers.  How far they lie apart (:class:`GripperSpread`) is
-stated from how such a finger is made, not learnt from any gripper's grasps. With conductivity k, heat
-capacity c and thickness d, ln e = (ln k + ln c) / 2 and ln z = ln d + (ln c - ln k) / 2, so the stack's own
-numbers are correlated.  The blocks stay the same: their effusivities and depth are as well known as before.
+**Another gripper** of the same kind differs by how such fingers are made (:class:`GripperSpread`).  With
+conductivity k, heat capacity c and thickness d, ln e = (ln k + ln c) / 2 and ln z = ln d + (ln c - ln k) / 2,
+so the stack's own numbers are correlated.  The blocks stay the same.
 """
 
 from __future__ import annotations
@@ -357,12 +356,6 @@ class GripperModel:
 
         A material without a block in the calibration has its library effusivity on the gripper's scale and
         the contact conductance that the calibration expects of it.
-
-        Examples
-        --------
-        >>> grip = load_default_gripper().grip()
-        >>> bool(grip.h_c_of["copper"] > grip.h_c_of["wood"]), grip.transit_loss < 0.1
-        (True, True)
         """
         ln_h = {name: block.ln_h for name, block in self.blocks.items()}
         ln_e = {name: block.ln_effusivity for name, block in self.blocks.items()}
@@ -435,13 +428,7 @@ class GripperModel:
 
     @classmethod
     def load(cls, path: str | Path) -> GripperModel:
-        """Return the gripper in a JSON file.
-
-        Raises
-        ------
-        UserError
-            If the file is missing, is not such a JSON, or lacks an entry.
-        """
+        """Return the gripper in a JSON file; :class:`UserError` where it is missing or not whole."""
         return cls.from_dict(read_json(path, _SCHEMA, _VERSION), file=path)
 
     def found_effusivity(self, ln_effusivity: Array) -> Array:
@@ -458,13 +445,6 @@ class GripperModel:
         The anchors are the blocks, ln(found / library) with the library's uncertainty and 10 % for the block
         itself.  Between them a Gaussian process interpolates (prior sd 0.3, correlation length 1.5 in ln
         e), so a found value far from every known block is reported with that prior's uncertainty.
-
-        Examples
-        --------
-        >>> gripper = load_default_gripper()
-        >>> mean, sd = gripper.effusivity_scale(np.log([450.0, 3.6e4]))
-        >>> bool(sd[0] < 0.3), bool(abs(mean[1]) < 0.3)
-        (True, True)
         """
         x = np.asarray(ln_effusivity, dtype=float)
         blocks = [*self.blocks.values()]

@@ -18,32 +18,24 @@ works on a batch of (grasp, hypothesis) pairs.
 What a hypothesis expects before the data
 -----------------------------------------
 
-Three kinds of hypothesis:
-
-- a **material with training grasps**: its block's ln h and ln e as calibrated, with the spread from grasp
-  to grasp;
-- a **material of the library**: its effusivity on the gripper's scale, with the row's uncertainty,
-  on a block of unknown contact conductance;
-- a **free effusivity**: a point of ln e, unknown contact conductance, rho c_p of solids in general (3.2
+- A **material with training grasps**: its block's ln h and ln e as calibrated, with the spread from grasp to
+  grasp.
+- A **material of the library**: its effusivity on the gripper's scale, with the row's uncertainty, on a block
+  of unknown contact conductance.
+- A **free effusivity**: a point of ln e, unknown contact conductance, rho c_p of solids in general (3.2
   MJ/m^3K for metals, 1.7 for insulators).
 
 What comes from the gripper and the nominal temperature (build-up time, onset, object temperature) is common
-to all of them.  How far a block has gone to the room's temperature is known for rooms like those of the
-calibration only: in a colder one the object's temperature is less well known than its spread.
-
-A spread estimated from n grasps is itself uncertain, and a grasp two and a half of its standard deviations
-out is not unusual where n is small: such a nuisance has Student's t as its prior, with the degrees of freedom
-that the calibration had left.
+to all of them.
 
 Uncertain grippers
 ------------------
 
-A calibration leaves theta (stack, mean onset, heat loss in transit, bias, depth, the block's ln h and ln e)
-with a covariance P (:mod:`thermogrip.sysid.effusivity.gripper_model`), large for a gripper that was
-never calibrated.  theta moves the response, and the prior means of the nuisances: u = v + M (theta - t0),
-with v as it was for the gripper t0.  With J = df/du and K = df/dtheta, the latter along with u, the
-prediction around a guess (v, t) is f + J dv + K dtheta, and theta ~ N(t0, P) makes the data a problem in v
-alone, with more noise and shifted readings:
+A calibration leaves theta (:mod:`thermogrip.sysid.effusivity.gripper_model`) with a covariance P.  theta
+moves the response, and the prior means of the nuisances: u = v + M (theta - t0), with v as it was for the
+gripper t0.  With J = df/du and K = df/dtheta, the latter along with u, the prediction around a guess (v, t)
+is f + J dv + K dtheta, and theta ~ N(t0, P) makes the data a problem in v alone, with more noise and shifted
+readings:
 
     y - f + K (t - t0) = J dv + noise,   cov(noise) = C + K P K' = S.
 
@@ -51,12 +43,10 @@ Its solution in dv gives the next guess of theta, t0 + P a with
 
     a = K' S^-1 [y - f + K (t - t0) - J dv],
 
-until the joint density of (v, theta) grows no more.  That is Gauss-Newton for both together, halved where
-the density would fall, and the evidence at its end is Laplace's for both.  Every hypothesis finds a gripper
-of its own: the one that a poor hypothesis needs costs it what such a gripper is improbable by.
-
-Since it is the same finger, a hypothesis starts from the gripper of the likeliest one, through a, which
-unlike theta does not depend on the block.  One that is 50 nats behind is left there, unsettled.
+until the joint density of (v, theta) grows no more.  That is Gauss-Newton for both together, and the evidence
+at its end is Laplace's for both.  Every hypothesis finds a gripper of its own, and starts from that of the
+likeliest one, through a, which unlike theta does not depend on the block.  One that is 50 nats behind is left
+there, unsettled.
 
 Where the block is not of the calibration its effusivity is on the scale that the calibration's blocks
 define, so P is taken given theirs; the scale's own uncertainty is added where effusivities are reported.
@@ -132,35 +122,21 @@ def nodes_for(data: Touches) -> TimeNodes:
 
 def predict(stack: Stack, nodes: TimeNodes, data: Touches, u: Array) -> Array:
     """Return the bin means that nuisances u (n_pair, 7) predict, (n_pair, n_bin) [degC]."""
-    f = _responses(stack, nodes, data, u, np.zeros(u.shape, dtype=bool))[:, 0]
-    return _reading(stack, data, u, f, far_integrals(data, u, f[:, None])[0][:, 0])
+    return jacobian(stack, nodes, data, u, np.zeros(u.shape, dtype=bool))[0]
 
 
 def jacobian(
     stack: Stack, nodes: TimeNodes, data: Touches, u: Array, vary: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
     """Return the prediction (n_pair, n_bin) and its derivatives by u, (n_pair, n_bin, 7), zero where not
-    ``vary``.
+    ``vary`` (n_pair, 7), the unknown nuisances."""
+    from thermogrip.sysid.effusivity.mode_kernel import readings
 
-    ``vary`` (n_pair, 7) marks the unknown nuisances.
-    """
-    found = _responses(stack, nodes, data, u, vary)
-    f = found[:, 0]
-    slopes = np.zeros((*f.shape, N_NUISANCE))
-    difference = (u[:, T_OBJECT] - u[:, LEVEL])[:, None]
-    rate, way = far_rate(stack, data, u)
-    total, value, late = far_integrals(data, u, found)
-    slopes[:, :, ONSET] = -difference * found[:, 5] - rate * way * total[:, 5]
-    slopes[:, :, T_OBJECT] = f - rate * total[:, 0]
-    known_room = np.isfinite(data.t_ambient)[:, None]
-    slopes[:, :, LEVEL] = 1 - f - stack.leak * data.ramp * known_room
-    for curve, k in enumerate((H, BUILD_UP, EFFUSIVITY, CAPACITY), start=1):
-        slopes[:, :, k] = difference * found[:, curve] + rate * way * total[:, curve]
-    # a denser or less conducting block passes the loss on later
-    later = 2 * late[:, None] * value[:, 0]
-    slopes[:, :, EFFUSIVITY] += rate * way * later
-    slopes[:, :, CAPACITY] -= rate * way * (later + total[:, 0])
-    return _reading(stack, data, u, f, total[:, 0]), slopes * vary[:, None, :]
+    y, slopes = readings(
+        *gripper_arguments(stack, nodes), data.sample_t, data.sample_bin, data.count, data.t, data.ramp,
+        data.t_ambient, np.ascontiguousarray(u), vary,
+    )  # fmt: skip
+    return y, slopes
 
 
 def find_modes(
@@ -184,7 +160,7 @@ def find_modes(
     w_matrix, log_det = whitener
     arguments = gripper_arguments(stack, nodes_for(data))
     covariance, objective, misfit, settled = modes(
-        *arguments, stack.leak, stack.g_far, row, data.sample_t, data.sample_bin, data.count, data.t, data.y,
+        *arguments, row, data.sample_t, data.sample_bin, data.count, data.t, data.y,
         data.ramp, data.t_ambient, w_matrix, np.stack([prior.mean, prior.sd, dof], axis=1), u, max_steps,
     )  # fmt: skip
     evidence = -0.5 * (objective + log_det[row]) + peak_ratio(dof, vary)
@@ -211,40 +187,6 @@ def _gripper(stack: Stack, steps: tuple[float, ...]) -> Any:
 def gripper_arguments(stack: Stack, nodes: TimeNodes) -> tuple[Any, ...]:
     """Return the first arguments of the compiled functions, kept from call to call for each gripper."""
     return tuple(nodes), _gripper(stack, tuple(nodes.dt.tolist()))
-
-
-def _responses(stack: Stack, nodes: TimeNodes, data: Touches, u: Array, vary: NDArray[np.bool_]) -> Array:
-    from thermogrip.sysid.contact.time_stepping import binned_responses
-
-    samples = (data.sample_t, data.sample_bin, data.count)
-    return np.asarray(
-        binned_responses(*gripper_arguments(stack, nodes), np.ascontiguousarray(u), vary, *samples)
-    )
-
-
-def far_rate(stack: Stack, data: Touches, u: Array) -> tuple[Array, Array]:
-    """Return the rate at which the block goes to the room [1/s], and how far it has to go [K], (n, 1) each;
-    zero where the room is unknown.
-    """
-    known = np.isfinite(data.t_ambient)
-    rate = np.where(known, stack.g_far * np.exp(-u[:, CAPACITY]), 0.0)
-    return rate[:, None], np.where(known, data.t_ambient - u[:, T_OBJECT], 0.0)[:, None]
-
-
-def far_integrals(data: Touches, u: Array, curves: Array) -> Any:
-    """Return the delayed integrals of curves (n, n_curve, n_bin) that the far face asks for."""
-    from thermogrip.sysid.contact.time_stepping import delayed_integrals
-
-    block = (np.ascontiguousarray(u[:, k]) for k in (EFFUSIVITY, CAPACITY))
-    return delayed_integrals(data.t, data.count, *block, np.ascontiguousarray(curves))
-
-
-def _reading(stack: Stack, data: Touches, u: Array, f: Array, total: Array) -> Array:
-    level, t_object = u[:, LEVEL, None], u[:, T_OBJECT, None]
-    room = np.where(np.isfinite(data.t_ambient)[:, None], data.t_ambient[:, None], level)
-    rate, way = far_rate(stack, data, u)
-    drift = stack.leak * (room - level) * data.ramp
-    return np.asarray(level + (t_object - level) * f + rate * way * total + drift)
 
 
 _AT = {name: i for i, name in enumerate((*SHARED_NAMES, "ln_h", "ln_e"))}
@@ -489,7 +431,7 @@ def _whole_covariance(pair: _Pair, ahead: _Expansion, k: Array, j: Array) -> Arr
 
 def _slopes(pair: _Pair, here: _Point) -> tuple[Array, Array]:
     """Return the derivatives of the bin means by theta, (n_bin, n_theta), and by u, (n_bin, 7)."""
-    from thermogrip.sysid.contact.time_stepping import gripper_responses
+    from thermogrip.sysid.effusivity.mode_kernel import gripper_readings
 
     data, u, stack = pair.data, here.u, here.stack
     _, by_u = jacobian(stack, pair.nodes, data, u[None], np.ones((1, u.size), dtype=bool))
@@ -501,19 +443,16 @@ def _slopes(pair: _Pair, here: _Point) -> tuple[Array, Array]:
     own = contact_numbers(stack, base)
     contact = np.repeat(own[None], len(_MOVED) + 1, axis=0)
     contact[:n, 0] = near.resistance
-    contact[np.arange(n, n + 5), np.arange(1, 6)] += _DIFFERENCE * np.where(_BY_LOGARITHM, own[1:], 1.0)
+    contact[np.arange(n, n + 5), np.arange(1, 6)] += _DIFFERENCE * np.where(_BY_LOGARITHM, own[1:6], 1.0)
     lam, face, sensor = (
         np.concatenate([moved, np.repeat(here_[None], len(_CONTACT) + 1, axis=0)])
         for moved, here_ in zip(near[:3], base[:3])
     )
-    f = gripper_responses(
-        tuple(pair.nodes), lam, face, sensor, contact, u, data.sample_t[0], data.sample_bin[0], data.count[0],
+    y = gripper_readings(
+        tuple(pair.nodes), lam, face, sensor, contact, data.sample_t[0], data.sample_bin[0], data.count[0],
+        data.t[0], data.ramp[0], float(data.t_ambient[0]), u,
     )  # fmt: skip
-    by = (f[:-1] - f[-1])[None] / _DIFFERENCE
-    rate, way = (float(v[0, 0]) for v in far_rate(stack, data, u[None]))
-    total = far_integrals(data, u[None], np.concatenate([by, f[None, -1:]], axis=1))[0][0]
-    k[:, _MOVED] = ((u[T_OBJECT] - u[LEVEL]) * by[0] + rate * way * total[:-1]).T
-    k[:, _AT["ln_g_far"]] += rate * way * total[-1]
+    k[:, _MOVED] = ((y[:-1] - y[-1]) / _DIFFERENCE).T
     if np.isfinite(data.t_ambient[0]):
         k[:, _AT["leak"]] = (data.t_ambient[0] - u[LEVEL]) * data.ramp[0]
     there = (data.count[0] > 0)[:, None]

@@ -3,9 +3,8 @@
 
 Each pair takes damped Gauss-Newton steps on the responses of :mod:`thermogrip.sysid.contact.time_stepping`
 until the next one would gain less than 0.005 nat; that last step is taken on the quadratic model alone, and
-its predicted decrease counted.  All columns of the problem are combinations of the response, its derivatives,
-the readings and time, so these alone are whitened.  Two expansions are kept, at the point reached and at the
-trial, and change places where the trial is better.
+its predicted decrease counted.  Two expansions are kept, at the point reached and at the trial, and change
+places where the trial is better.
 """
 
 from __future__ import annotations
@@ -32,6 +31,7 @@ from thermogrip.sysid.contact.time_stepping import (
     delay,
     fill_delayed,
     fill_responses,
+    gripper_of,
     room_for,
 )
 
@@ -40,26 +40,26 @@ Array = NDArray[np.float64]
 _LONGEST = 1.5
 _LEAST_DECREASE = 0.01  # of -2 ln posterior: smaller predicted decreases end the search
 _H, _BUILD_UP, _ONSET, _LEVEL, _T, _E, _C = range(7)
-_Y, _ONE, _RAMP = range(3)
 
 
 class _Scratch(NamedTuple):
     """What one search works in.
 
     ``room`` of the time stepping; ``place`` and ``share`` (n_sample,) of the samples; ``curves`` (6, n_bin)
-    and ``white`` (6, n_bin) responses, plain and whitened; ``given`` (3, n_bin) readings, ones and the ramp,
-    whitened; ``columns`` (8, n_bin) of the problem, the residual last; ``far`` (5, n_bin) of the far face:
-    delayed integral and value of a curve, those of F, and the integral of F whitened.
+    the responses; ``far`` (4, n_bin) of the far face: delayed integral and value of F, then those of a
+    derivative; ``reading`` (n_bin,) that is predicted and ``slopes`` (7, n_bin) its derivatives by u;
+    ``left`` (n_bin,) what was read beyond it; ``columns`` (8, n_bin) the slopes and, last, that, whitened.
     """
 
     room: Room
     place: NDArray[np.int64]
     share: Array
     curves: Array
-    white: Array
-    given: Array
-    columns: Array
     far: Array
+    reading: Array
+    slopes: Array
+    left: Array
+    columns: Array
 
 
 class _Expansion(NamedTuple):
@@ -100,8 +100,8 @@ def _work() -> _Work:
 def _scratch(n_mode: int, n_node: int, n_sample: int, n_bin: int) -> _Scratch:
     return _Scratch(
         room_for(n_mode, n_node), np.empty(n_sample, dtype=np.int64), np.empty(n_sample),
-        np.zeros((N_CURVE, n_bin)), np.zeros((N_CURVE, n_bin)), np.zeros((3, n_bin)), np.zeros((8, n_bin)),
-        np.zeros((5, n_bin)),
+        np.zeros((N_CURVE, n_bin)), np.zeros((4, n_bin)), np.zeros(n_bin), np.zeros((7, n_bin)),
+        np.zeros(n_bin), np.zeros((8, n_bin)),
     )  # fmt: skip
 
 
@@ -116,15 +116,6 @@ def _whiten(whitener: Array, row: Array, out: Array) -> None:
 
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
-def _whiten_given(whitener: Array, y: Array, ramp: Array, leak: float, room: float, given: Array) -> None:
-    """Fill the whitened readings, ones and drift to the room per degree, zero where the room is unknown."""
-    _whiten(whitener, y, given[_Y])
-    _whiten(whitener, np.ones(y.size), given[_ONE])
-    _whiten(whitener, ramp, given[_RAMP])
-    given[_RAMP] *= leak if np.isfinite(room) else 0.0
-
-
-@numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def _dot(a: Array, b: Array) -> Any:
     total = 0.0
     for i in range(a.size):
@@ -133,58 +124,55 @@ def _dot(a: Array, b: Array) -> Any:
 
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
-def _far_face(
-    t: Array, count: Array, u: Array, vary: NDArray[np.bool_], rate: float, way: float, scratch: _Scratch
-) -> None:
-    """Turn the derivatives of F into those of the reading, the far face included.
-
-    The block goes to the room at ``rate`` [1/s] with ``way`` [K] to go; the delayed integral of F is left in
-    ``scratch.far[2]``.
-    """
-    curves, far, late = scratch.curves, scratch.far, delay(u[_E], u[_C])
-    difference = u[_T] - u[_LEVEL]
-    fill_delayed(t, count, late, curves[VALUE], far[2], far[3])
+def _predict(
+    nodes: Nodes, gripper: Gripper, u: Array, vary: NDArray[np.bool_], times: Array, bins: NDArray[np.int64],
+    count: Array, t: Array, ramp: Array, room: float, scratch: _Scratch,
+) -> None:  # fmt: skip
+    """Fill the bin means that ``u`` predicts, their derivatives by level and T_obj, and those of ``vary``."""
+    curves, far, reading, slopes = scratch.curves, scratch.far, scratch.reading, scratch.slopes
+    fill_responses(
+        nodes, gripper, u, vary, times, bins, count, scratch.room, scratch.place, scratch.share, curves
+    )
+    known, late, difference = np.isfinite(room), delay(u[_E], u[_C]), u[_T] - u[_LEVEL]
+    leak = gripper.numbers[6] if known else 0.0
+    away = leak * (room - u[_LEVEL]) if known else 0.0
+    # the block goes to the room by its far face at ``rate`` [1/s], ``way`` [K]
+    rate = gripper.numbers[5] * np.exp(-u[_C]) if known else 0.0
+    way = room - u[_T] if known else 0.0
+    fill_delayed(t, count, late, curves[VALUE], far[0], far[1])
+    for i in range(t.size):
+        f, lost = curves[VALUE, i], rate * far[0, i]
+        reading[i] = u[_LEVEL] + difference * f + way * lost + away * ramp[i]
+        slopes[_T, i], slopes[_LEVEL, i] = f - lost, 1.0 - f - leak * ramp[i]
     for curve, at in ((BY_H, _H), (BY_BUILD_UP, _BUILD_UP), (RATE, _ONSET), (BY_E, _E), (BY_C, _C)):
         if not vary[at]:
             continue
-        fill_delayed(t, count, late, curves[curve], far[0], far[1])
+        fill_delayed(t, count, late, curves[curve], far[2], far[3])
+        sign = -1.0 if at == _ONSET else 1.0
         for i in range(t.size):
-            extra = far[0, i]
-            if at == _E:
-                extra += 2.0 * late * far[3, i]
+            extra = far[2, i]
+            if at == _E:  # a denser or less conducting block passes the loss on later
+                extra += 2.0 * late * far[1, i]
             elif at == _C:
-                extra -= 2.0 * late * far[3, i] + far[2, i]
-            curves[curve, i] = difference * curves[curve, i] + rate * way * extra
+                extra -= 2.0 * late * far[1, i] + far[0, i]
+            slopes[at, i] = sign * (difference * curves[curve, i] + rate * way * extra)
 
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def _normal_equations(
-    whitener: Array, t: Array, count: Array, u: Array, vary: NDArray[np.bool_], sd: Array, g_far: float,
-    room: float, scratch: _Scratch, matrix: Array, gradient: Array,
-) -> Any:  # fmt: skip
+    whitener: Array, y: Array, sd: Array, scratch: _Scratch, matrix: Array, gradient: Array
+) -> Any:
     """Fill J' J and J' r in units of the prior's sd; return |r|^2, r = W (y - f)."""
-    curves, white, given, columns = scratch.curves, scratch.white, scratch.given, scratch.columns
-    difference = u[_T] - u[_LEVEL]
-    away = room - u[_LEVEL] if np.isfinite(room) else 0.0
-    rate = g_far * np.exp(-u[_C]) if np.isfinite(room) else 0.0
-    way = room - u[_T] if np.isfinite(room) else 0.0
-    _far_face(t, count, u, vary, rate, way, scratch)
-    _whiten(whitener, curves[VALUE], white[VALUE])
-    _whiten(whitener, scratch.far[2], scratch.far[4])
-    for curve, at in ((BY_H, _H), (BY_BUILD_UP, _BUILD_UP), (RATE, _ONSET), (BY_E, _E), (BY_C, _C)):
-        if sd[at] > 0.0:
-            _whiten(whitener, curves[curve], white[curve])
-            scale = -sd[at] if at == _ONSET else sd[at]
-            for i in range(given.shape[1]):
-                columns[at, i] = white[curve, i] * scale
-    for i in range(given.shape[1]):
-        f, far = white[VALUE, i], rate * scratch.far[4, i]
-        columns[7, i] = given[_Y, i] - u[_LEVEL] * given[_ONE, i] - difference * f - away * given[_RAMP, i]
-        columns[7, i] -= way * far
-        columns[_T, i] = (f - far) * sd[_T]
-        columns[_LEVEL, i] = (given[_ONE, i] - f - given[_RAMP, i]) * sd[_LEVEL]
+    columns, left = scratch.columns, scratch.left
+    for i in range(y.size):
+        left[i] = y[i] - scratch.reading[i]
+    _whiten(whitener, left, columns[7])
     for a in range(7):
-        gradient[a] = _dot(columns[a], columns[7]) if sd[a] > 0.0 else 0.0
+        gradient[a] = 0.0
+        if sd[a] > 0.0:
+            _whiten(whitener, scratch.slopes[a], columns[a])
+            columns[a] *= sd[a]
+            gradient[a] = _dot(columns[a], columns[7])
         for b in range(a + 1):
             matrix[a, b] = _dot(columns[a], columns[b]) if sd[a] > 0.0 and sd[b] > 0.0 else 0.0
     return _dot(columns[7], columns[7])
@@ -250,18 +238,13 @@ def _solve(low: Array, rhs: Array, step: Array) -> None:
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def _evaluate(
     nodes: Nodes, gripper: Gripper, u: Array, law: Array, vary: NDArray[np.bool_], times: Array,
-    bins: NDArray[np.int64], count: Array, t: Array, g_far: float, room: float, whitener: Array,
+    bins: NDArray[np.int64], count: Array, t: Array, y: Array, ramp: Array, room: float, whitener: Array,
     scratch: _Scratch, at: _Expansion,
 ) -> None:  # fmt: skip
     """Fill what the objective and its expansion are at ``u``."""
-    fill_responses(
-        nodes, gripper, u, vary, times, bins, count, scratch.room, scratch.place, scratch.share,
-        scratch.curves,
-    )  # fmt: skip
+    _predict(nodes, gripper, u, vary, times, bins, count, t, ramp, room, scratch)
     at.u[:] = u
-    square = _normal_equations(
-        whitener, t, count, u, vary, law[1], g_far, room, scratch, at.matrix, at.gradient
-    )
+    square = _normal_equations(whitener, y, law[1], scratch, at.matrix, at.gradient)
     at.cost[0] = square + _penalty(u, law[0], law[1], law[2], at.slope, at.curvature)
     at.cost[1] = square
 
@@ -308,9 +291,9 @@ def _conclude(here: _Expansion, law: Array, work: _Work, covariance: Array) -> A
 
 @numba.njit(**OUTER)  # type: ignore[untyped-decorator]
 def modes(
-    nodes: Nodes, gripper: Gripper, leak: float, g_far: float, row: NDArray[np.int64], times: Array,
-    bins: NDArray[np.int64], count: Array, t: Array, y: Array, ramp: Array, room: Array, whitener: Array,
-    law: Array, u: Array, max_steps: int,
+    nodes: Nodes, gripper: Gripper, row: NDArray[np.int64], times: Array, bins: NDArray[np.int64],
+    count: Array, t: Array, y: Array, ramp: Array, room: Array, whitener: Array, law: Array, u: Array,
+    max_steps: int,
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
     """Move ``u`` (n, 7) to the mode of each pair; return covariance (n, 7, 7), objective, misfit and state.
 
@@ -326,10 +309,8 @@ def modes(
     for p in range(n):
         i, sd, damping = row[p], law[p, 1], 1e-3
         vary = sd > 0.0
-        if p == 0 or i != row[p - 1]:
-            _whiten_given(whitener[i], y[i], ramp[i], leak, room[i], scratch.given)
         _evaluate(
-            nodes, gripper, u[p], law[p], vary, times[i], bins[i], count[i], t[i], g_far, room[i],
+            nodes, gripper, u[p], law[p], vary, times[i], bins[i], count[i], t[i], y[i], ramp[i], room[i],
             whitener[i], scratch, here,
         )  # fmt: skip
         for _ in range(max_steps):
@@ -345,8 +326,8 @@ def modes(
             for a in range(7):
                 trial[a] = here.u[a] + part * work.step[a] * sd[a]
             _evaluate(
-                nodes, gripper, trial, law[p], vary, times[i], bins[i], count[i], t[i], g_far, room[i],
-                whitener[i], scratch, there,
+                nodes, gripper, trial, law[p], vary, times[i], bins[i], count[i], t[i], y[i], ramp[i],
+                room[i], whitener[i], scratch, there,
             )  # fmt: skip
             if there.cost[0] < here.cost[0]:
                 here, there = there, here
@@ -362,30 +343,63 @@ def modes(
 
 @numba.njit(**OUTER)  # type: ignore[untyped-decorator]
 def marginals(
-    nodes: Nodes, gripper: Gripper, leak: float, g_far: float, times: Array, bins: NDArray[np.int64],
-    count: Array, t: Array, y: Array, ramp: Array, room: float, whitener: Array, level_sd: float, t_sd: Array,
-    u: Array,
+    nodes: Nodes, gripper: Gripper, times: Array, bins: NDArray[np.int64], count: Array, t: Array, y: Array,
+    ramp: Array, room: float, whitener: Array, level_sd: float, t_sd: float, u: Array,
 ) -> Array:  # fmt: skip
     """Return ln p(y | u) up to a constant for n points ``u`` (n, 7) of one grasp, level and T_obj integrated.
 
-    Their prior means stand in ``u``, their sds in ``level_sd`` and ``t_sd`` (n,).
+    Their prior means stand in ``u``, their sds are ``level_sd`` and ``t_sd``.
     """
     scratch = _scratch(gripper.sensor.size, nodes[2].size, times.size, y.size)
     vary, sd, result = np.zeros(7, dtype=np.bool_), np.zeros(7), np.empty(u.shape[0])
     matrix, gradient = np.zeros((7, 7)), np.zeros(7)
-    _whiten_given(whitener, y, ramp, leak, room, scratch.given)
+    sd[_LEVEL], sd[_T] = level_sd, t_sd
     for p in range(u.shape[0]):
-        fill_responses(
-            nodes, gripper, u[p], vary, times, bins, count, scratch.room, scratch.place, scratch.share,
-            scratch.curves,
-        )  # fmt: skip
-        sd[_LEVEL], sd[_T] = level_sd, t_sd[p]
-        square = _normal_equations(
-            whitener, t, count, u[p], vary, sd, g_far, room, scratch, matrix, gradient
-        )
+        _predict(nodes, gripper, u[p], vary, times, bins, count, t, ramp, room, scratch)
+        square = _normal_equations(whitener, y, sd, scratch, matrix, gradient)
         r1, r2 = gradient[_LEVEL], gradient[_T]
         v11, v12, v22 = 1.0 + matrix[_LEVEL, _LEVEL], matrix[_T, _LEVEL], 1.0 + matrix[_T, _T]
         det = v11 * v22 - v12 * v12
         gain = (v22 * r1 * r1 - 2.0 * v12 * r1 * r2 + v11 * r2 * r2) / det
         result[p] = -0.5 * (square - gain) - 0.5 * np.log(det)
     return result
+
+
+@numba.njit(**OUTER)  # type: ignore[untyped-decorator]
+def readings(
+    nodes: Nodes, gripper: Gripper, times: Array, bins: NDArray[np.int64], count: Array, t: Array,
+    ramp: Array, room: Array, u: Array, vary: NDArray[np.bool_],
+) -> tuple[Array, Array]:  # fmt: skip
+    """Return the bin means (n, n_bin) that ``u`` (n, 7) predicts of n touches, and their derivatives.
+
+    Those are (n, n_bin, 7), zero where not ``vary`` (n, 7).
+    """
+    n, n_bin = count.shape
+    y, slopes = np.empty((n, n_bin)), np.zeros((n, n_bin, 7))
+    scratch = _scratch(gripper.sensor.size, nodes[2].size, times.shape[1], n_bin)
+    for p in range(n):
+        _predict(nodes, gripper, u[p], vary[p], times[p], bins[p], count[p], t[p], ramp[p], room[p], scratch)
+        y[p] = scratch.reading
+        for a in range(7):
+            if vary[p, a]:
+                slopes[p, :, a] = scratch.slopes[a]
+    return y, slopes
+
+
+@numba.njit(**OUTER)  # type: ignore[untyped-decorator]
+def gripper_readings(
+    nodes: Nodes, lam: Array, face: Array, sensor: Array, numbers: Array, times: Array,
+    bins: NDArray[np.int64], count: Array, t: Array, ramp: Array, room: float, u: Array,
+) -> Array:  # fmt: skip
+    """Return the bin means (n, n_bin) that ``u`` (7,) predicts of one touch by n grippers.
+
+    ``lam``, ``face``, ``sensor`` (n, n_mode) are their modes, ``numbers`` (n, 7) those of their contacts.
+    """
+    n, vary = lam.shape[0], np.zeros(7, dtype=np.bool_)
+    out = np.empty((n, count.size))
+    scratch = _scratch(lam.shape[1], nodes[2].size, times.size, count.size)
+    for p in range(n):
+        one = gripper_of(nodes[0], lam[p], face[p], sensor[p], numbers[p])
+        _predict(nodes, one, u, vary, times, bins, count, t, ramp, room, scratch)
+        out[p] = scratch.reading
+    return out

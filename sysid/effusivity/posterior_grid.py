@@ -109,9 +109,9 @@ class MarginalPosterior:
             dof = np.inf if common.dof is None else common.dof[0, k]
             log_prior += _log_student(points[:, column], common.mean[0, k], common.sd[0, k], dof)
         likelihood = marginals(
-            *self._arguments, self.gripper.stack.leak, self.gripper.stack.g_far, data.sample_t[0],
-            data.sample_bin[0], data.count[0], data.t[0], data.y[0], data.ramp[0], float(data.t_ambient[0]),
-            self.whitener, float(common.sd[0, LEVEL]), np.full(points.shape[0], common.sd[0, T_OBJECT]), u,
+            *self._arguments, data.sample_t[0], data.sample_bin[0], data.count[0], data.t[0], data.y[0],
+            data.ramp[0], float(data.t_ambient[0]), self.whitener,
+            *common.sd[0, [LEVEL, T_OBJECT]].tolist(), u,
         )  # fmt: skip
         return np.asarray(log_prior + likelihood)
 

@@ -9,10 +9,9 @@ example rig's gripper the least of the library, expanded polystyrene, moves it b
 0.6 % of its level before contact shows no contact: there is no effusivity in it, and no material.
 
 A skin that moves the other way, by a twentieth of the difference or more, contradicts its object's
-temperature: the number is wrong, or not in degC, and whatever is inferred with it is too.  Nor is there a
-material in a grasp without a reading within its sensor's range before contact or after it.  Of touches of one
-block an unusable one is left out: the answer is that of the others, and the block has rested longer before
-the next of them.
+temperature: the number is wrong, or not in degC.  Nor is there a material in a grasp without a reading within
+its sensor's range before contact or after it.  Of touches of one block an unusable one is left out, and the
+block has rested longer before the next of them.
 
 Saturated sensors
 -----------------
@@ -30,8 +29,7 @@ come to terms ever slower, as :math:`1 / \sqrt t` at first and exponentially in 
 Where no reading of the record lies beyond, that is the rail of the sensor, and the samples at it are clipped
 in every grasp of the record, with those between the first and the last of them: jitter that dips below a
 rail is half a jitter.  Of a trace that others pass, the sensor stuck, and its own stretch is clipped alone.
-Clipped samples are masked as lost ones are: which those are depends on the readings, and "at least this much"
-is not used, so answers are a little less confident than they could be.
+Clipped samples are masked as lost ones are; that the skin was "at least this warm" is not used.
 
 A **spike** (a bus that answered 85 or -127 degC, or 0 for a lost reading) is masked too: one to three samples
 that a trace leaves for and comes back from, by the rule of :mod:`thermogrip.datasets.repair`, or with which
@@ -40,28 +38,20 @@ it begins or ends, a leap of 10 K away from the rest.
 Drift of the skin before contact
 --------------------------------
 
-The model's skin has one level before contact, and drifts afterwards as its calibration says.  One that was
-not settled goes on moving for a while, and an object that answers to it is found too warm or too cold: a skin
-that moves by s [K/s] and keeps to it puts the temperature of a metal off by 12 to 17 s times s (simulated
-copper and iron at 20 K, 10 s of contact), half of that where it settles within 10 s; of an insulator it is
-the effusivity that moves, 0.13 in log10 e for 0.05 K/s.
+A skin that was not settled goes on moving for a while, and an object that answers to it is found too warm or
+too cold: a skin that moves by s [K/s] and keeps to it puts the temperature of a metal off by 12 to 17 s times
+s (simulated copper and iron at 20 K, 10 s of contact), half of that where it settles within 10 s; of an
+insulator it is the effusivity that moves, 0.13 in log10 e for 0.05 K/s.
 
-That drift is no unknown of the model: a second and a half before contact leaves 0.02 K/s open at 10 Hz, the
-contact itself, with all else unknown, 0.014 K/s.  With that for a prior every metal's temperature would be
-known to 0.3 K instead of 0.1; the 195 training grasps of the example rig want 0.002 K/s (-2 ln likelihood -4;
-+58 at 0.01 K/s), which moves nothing.  So it is reported: a line through the last five seconds before contact
-whose slope noise would make once in 100 000 grasps.  Of the second and a half that the example rig records
-that is 0.17 K/s, of five seconds 0.03 K/s; a slower drift passes, and only a session that has settled rules
-it out.
+That drift is no unknown of the model: readings before contact leave it so open that every metal's temperature
+would be known to 0.3 K instead of 0.1, and the 195 training grasps of the example rig want 0.002 K/s, which
+moves nothing.  So it is reported: a line through the last five seconds before contact whose slope noise would
+make once in 100 000 grasps.  Of the second and a half that the example rig records that is 0.17 K/s, of five
+seconds 0.03 K/s; only a session that has settled rules out a slower drift.
 
-Contacts longer than those of the calibration
----------------------------------------------
-
-What lies deep in a finger shows late: water behind a cast layer, a pad on its metal.  Contacts of 10 s do not
-identify it, and a calibration from them takes it for one more layer without an end
-(``docs/records/effusivity.md`` has what answers are worth then).  Of a longer contact the beginning alone is
-read, and the answer reports it.  Touches of one block are read whole: each leaves in the block what it took
-as long as it lasted.
+**Contacts longer than those of the calibration** show what that could not identify, such as water behind a
+cast layer.  Their beginning alone is read, and the answer reports it.  Touches of one block are read whole:
+each leaves in the block what it took as long as it lasted.
 """
 
 from __future__ import annotations
@@ -386,16 +376,7 @@ def longest_contact(records: Sequence[Grasps]) -> float:
 
 
 def contact_faults(grasps: Grasps) -> list[str]:
-    """Return in words what is wrong with the contacts of a record; nothing where all is well.
-
-    >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> grasps = load_example_grasps()["exp2_dT20"]
-    >>> contact_faults(grasps)
-    []
-    >>> [words] = contact_faults(grasps.assign(t_surface=0.0 * grasps["t_surface"] + 48.0))
-    >>> words
-    "24 grasps ('g0176' first) 20 K from their object stay as they are: no contact?"
-    """
+    """Return in words what is wrong with the contacts of a record; nothing where all is well."""
     quality = check_grasps(grasps)
     trace, spiked, drift, unsettled = quality._trace, quality.spiked, quality.drift[0], quality.unsettled
     clipped, difference = np.isfinite(quality.clipped_at), trace.difference
@@ -435,15 +416,7 @@ def contact_faults(grasps: Grasps) -> list[str]:
 
 
 def torn_groups(records: Sequence[Grasps]) -> list[str]:
-    """Return in words which blocks have touches in several records: no answer joins those.
-
-    >>> from thermogrip.datasets.schema import make_grasps
-    >>> one, two = (
-    ...     make_grasps([-1.0, 1.0], [[23.0, 25.0]], [name], touch_group=["p1"], name=name) for name in "ab"
-    ... )
-    >>> torn_groups([one, two])
-    ["touch_group 'p1' is in a and in b, and touches are joined within a file: one block, one file"]
-    """
+    """Return in words which blocks have touches in several records: no answer joins those."""
     found: dict[str, list[str]] = {}
     for record in records:
         for name in dict.fromkeys(filter(None, label_values(record, "touch_group").tolist())):

@@ -5,28 +5,21 @@ What the samples are for, and why they lie closer than the intervals of the fit,
 
 **Sampling.** The few parameters that the data determine best relative to the prior are sampled with emcee;
 all others are integrated out and drawn afterwards, each as a fit of its own, so every sample is a whole
-vector. The walkers start in the normal approximation and move by differential evolution, which is slow with
-few walkers: steps are differences of the others, and eight of them are few directions in six dimensions. So
-half of the moves are proposals independent of the walker's position: Student's t about the mean m of the
-normal approximation of covariance C, wider by s,
+vector. Half of the walkers' moves are differential evolution, which with few walkers has few directions, half
+proposals independent of the walker's position: Student's t about the mean m of the normal approximation of
+covariance C, wider by s,
 
     x' ~ t_6(m, s^2 C),      accepted with min(1, p(x') t(x) / (p(x) t(x'))).
 
-A poor approximation costs acceptance, not correctness: the other half of the moves reaches what t misses.
-**Converged** means that the chain is longer than 50 integrated autocorrelation times of every parameter [1]_.
-A ``backend`` keeps the chain in an HDF5 file with a hash of everything that decides its density and its
-moves: a run goes on from there if the hash agrees, and starts anew if anything differs.
+A poor approximation costs acceptance, not correctness. **Converged** means that the chain is longer than 50
+integrated autocorrelation times of every parameter [1]_. A ``backend`` keeps the chain in an HDF5 file with a
+hash of everything that decides its density and its moves: a run goes on from there if the hash agrees.
 
 Randomised maximum a posteriori
 -------------------------------
 
-A fit of many parameters has valleys: combinations along which the free runs hardly change. They are curved,
-so a draw from a normal distribution, which is straight, leaves them and is a plant that contradicts the
-logs. Draws of this density follow them.
-
-**Density.** Least squares weigh the residuals as if the model's error had a correlation time below a
-minute, which it has not. What a fit leaves open is how far its free runs may move, d(z) = r(z) - r(z_fit),
-all logs together:
+**Density.** What a fit leaves open is how far its free runs may move, d(z) = r(z) - r(z_fit), all logs
+together:
 
     ln p(z) = -1/2 |z - z_fit|^2 - 1/2 |K^(1/2) Q'd(z)|^2 - 1/(2 T) |d(z) - Q Q'd(z)|^2.
 

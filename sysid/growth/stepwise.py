@@ -18,11 +18,9 @@ only for its gain on logs that it has not seen:
 5. A removal is kept if the error does not rise by more than the standard error and _LEAST.
 
 The terms with which the residuals of the first network correlate
-(:func:`~thermogrip.sysid.growth.candidates.residual_terms`) stand beside the record, and propose: the
-largest terms bring the candidates that they stand for (:mod:`thermogrip.sysid.growth.candidates`), with
-their own time constants, and after each change that is kept the new residual proposes again. A proposal is
-evaluated like any other candidate. A term that brings none is one that the file has already, or cannot
-express yet.
+(:func:`~thermogrip.sysid.growth.candidates.residual_terms`) stand beside the record, and the largest propose
+the candidates that they stand for, with their own time constants; after each change that is kept the new
+residual proposes again. A proposal is evaluated like any other candidate.
 
 The best candidate of a round becomes the base of the next. Every comparison uses the held-out logs again,
 and the best of many comparisons is biased: :attr:`Growth.evaluations` is their number.

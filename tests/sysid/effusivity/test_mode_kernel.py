@@ -111,15 +111,3 @@ def test_the_covariance_has_the_densitys_own_curvature(plain, matrix):
     whole = matrix + np.diag(own)
     assert log_det == pytest.approx(np.linalg.slogdet(whole)[1])
     np.testing.assert_allclose(covariance, np.linalg.inv(whole) * np.outer(SD, SD), atol=1e-12)
-
-
-def test_readings_ones_and_drift_are_whitened_and_an_unknown_room_draws_nothing(plain):
-    whitener, y, ramp = (
-        np.tril(np.arange(9.0).reshape(3, 3)),
-        np.array([1.0, 3.0, 2.0]),
-        np.array([0.0, 2.0, 5.0]),
-    )
-    for room, leak in ((21.0, 0.5), (np.nan, 0.0)):
-        given = np.empty((3, 3))
-        kernel._whiten_given.py_func(whitener, y, ramp, 0.5, room, given)
-        np.testing.assert_allclose(given, [whitener @ y, whitener @ np.ones(3), leak * (whitener @ ramp)])
