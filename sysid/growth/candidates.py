@@ -159,7 +159,7 @@ def _grow(
 
 
 def _levelled(values: Array, where: NDArray[np.int_]) -> Array:
-    return values - pd.DataFrame(values).groupby(where).transform("mean").to_numpy()
+    return np.asarray(values - pd.DataFrame(values).groupby(where).transform("mean").to_numpy())
 
 
 def _explained(X: Array, r: Array, where: NDArray[np.int_]) -> float:
