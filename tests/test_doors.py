@@ -8,9 +8,12 @@ import inspect
 import re
 import textwrap
 from dataclasses import is_dataclass
+from pathlib import Path
 from typing import Any
 
 import pytest
+
+from thermogrip import sysid
 
 ROOMS = ("datasets", "sysid", "mpc", "rig", "classify")
 FOLDERS = ("sysid.export",)  # folders whose exports are for users as well
@@ -113,6 +116,22 @@ def _is_quantity(parameter: inspect.Parameter) -> bool:
 def _raises(function: Any) -> bool:
     tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
     return any(isinstance(node, ast.Raise) and node.exc is not None for node in ast.walk(tree))
+
+
+STUBS = sorted(Path(str(sysid.__file__)).parent.glob("**/__init__.pyi"))
+
+
+def test_what_a_stub_names_is_loaded_and_listed_and_nothing_else() -> None:
+    assert len(STUBS) == 9
+    for stub in STUBS:
+        folder = ".".join(stub.parent.relative_to(Path(str(sysid.__file__)).parent).parts)
+        package = importlib.import_module(f"thermogrip.sysid.{folder}".rstrip("."))
+        lines = stub.read_text(encoding="utf-8").splitlines()
+        names = sorted(line.split(" as ")[1] for line in lines)
+        assert names == package.__all__ == dir(package)
+        assert all(getattr(package, name) is not None for name in names)
+        with pytest.raises(AttributeError, match=f"module '{package.__name__}' has no attribute 'nothing'"):
+            package.nothing  # noqa: B018
 
 
 @pytest.mark.parametrize("name", doors())

@@ -6,25 +6,32 @@ one way: logs -> plant -> controller -> session -> grasps -> classifier -> repor
 
 from __future__ import annotations
 
+import ast
 import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 __version__ = "0.1.0"
 
 
 def lazy_exports(
-    package: str, home: Mapping[str, str]
-) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Return ``__getattr__`` and ``__dir__`` of a package whose exports are loaded at first use (PEP 562).
+    package: str, also: Mapping[str, str] | None = None
+) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
+    """Return ``__all__``, ``__getattr__`` and ``__dir__`` of a package that loads its exports at first use
+    (PEP 562): what the ``__init__.pyi`` beside its ``__init__.py`` imports, for type checkers as well.
 
-    ``home`` is the module of each exported name, relative to the package (``.datasets.schema`` is beside it).
+    ``also`` has the modules, relative to the package, of names that are found and not listed.
     """
+    stub = Path(str(sys.modules[package].__file__)).with_suffix(".pyi").read_text(encoding="utf-8")
+    imports = [node for node in ast.parse(stub).body if isinstance(node, ast.ImportFrom)]
+    listed = {alias.name: str(node.module) for node in imports for alias in node.names}
+    home = listed | {name: f"{package}.{module}" for name, module in (also or {}).items()}
 
     def load(name: str) -> Any:
         if name not in home:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(import_module(f".{home[name]}", package), name)
+        return getattr(import_module(home[name]), name)
 
-    return load, lambda: sorted({*vars(sys.modules[package]), *home})
+    return sorted(listed), load, lambda: sorted(listed)

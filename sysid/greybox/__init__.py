@@ -2,6 +2,4 @@
 
 from thermogrip import lazy_exports
 
-_HOME = {"Posterior": "posterior", "fit_network": "fit", "sample_posterior": "posterior"}
-__all__ = [*_HOME]
-__getattr__, __dir__ = lazy_exports(__name__, _HOME)
+__all__, __getattr__, __dir__ = lazy_exports(__name__)

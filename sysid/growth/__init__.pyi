@@ -1,0 +1,2 @@
+from thermogrip.sysid.growth.stepwise import Growth as Growth
+from thermogrip.sysid.growth.stepwise import grow as grow
