@@ -173,7 +173,7 @@ def test_every_stage_has_its_share_of_the_progress_and_its_section(
         "_run": (tmp_path, "tuning", "plant", SEED), "_compare": (tmp_path, SEED, workers),
     }  # fmt: skip
     assert [section.title for section in done.sections] == [
-        "identification of found plant", "free_run of log run", "posterior of plant record",
+        "identification of found plant", "free_run of log run", "posterior of record",
         "tuning of tuning", "review of checks",
         f"session of {results['_run']} the twin (posterior draw 3)", "touch of model ['a grasp']",
         "shipped comparison", "The same with your files",

@@ -29,12 +29,10 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
 
 if TYPE_CHECKING:
-    from thermogrip.classify.decisions.stopping_rule import StopRule
-    from thermogrip.classify.estimators.base import GraspClassifier
-    from thermogrip.datasets.schema import Grasps
-    from thermogrip.sysid.effusivity.gripper_model import GripperModel
-    from thermogrip.sysid.effusivity.multi_touch import Coupling
-    from thermogrip.sysid.effusivity.posterior import EffusivityRow
+    from thermogrip.classify import GraspClassifier, StopRule
+    from thermogrip.datasets import Grasps
+    from thermogrip.sysid import GripperModel
+    from thermogrip.sysid.effusivity import Coupling, EffusivityRow
 
 _BUNDLED = 40.0  # s: the longest contacts that taught the bundled gripper
 
@@ -305,15 +303,15 @@ def classify(
     """
     stated = _range(between)
     new_file(out, (".csv",))
-    from thermogrip.classify.decisions.next_touch import advise_touches
-    from thermogrip.classify.decisions.predict import (
+    from thermogrip.classify import (
         classify_grasps,
+        load_classifier,
+        load_stop_rule,
         reasons,
-        unexplained_answers,
         write_predictions,
     )
-    from thermogrip.classify.decisions.stopping_rule import load_stop_rule
-    from thermogrip.classify.estimators.registry import load_classifier
+    from thermogrip.classify.decisions.next_touch import advise_touches
+    from thermogrip.classify.decisions.predict import unexplained_answers
     from thermogrip.sysid.effusivity.data import with_object_range
 
     if (other_gripper or known) and (early or next_touch):
@@ -416,8 +414,7 @@ def _as_taught(console: Console, record: Grasps, longest: float, coupling: Coupl
 
 def _effusivities(device: GripperModel, record: Grasps, coupling: Coupling | None) -> list[EffusivityRow]:
     """Return a row a grasp; one without contact has no numbers, and no part in its block."""
-    from thermogrip.sysid.effusivity.posterior import EffusivityRow, effusivity_posterior
-    from thermogrip.sysid.effusivity.quality import check_grasps
+    from thermogrip.sysid.effusivity import EffusivityRow, check_grasps, effusivity_posterior
 
     quality = check_grasps(record)
     touched = quality.usable_grasps(record)

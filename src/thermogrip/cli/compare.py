@@ -30,11 +30,10 @@ from thermogrip.datasets.parallel import sub_progress
 from thermogrip.report.console import Console
 
 if TYPE_CHECKING:
-    from thermogrip.classify.estimators.base import GraspClassifier
-    from thermogrip.classify.evaluation.comparison import Comparison
+    from thermogrip.classify import Comparison, GraspClassifier
     from thermogrip.classify.evaluation.decision_time import Decisions
+    from thermogrip.datasets import Grasps
     from thermogrip.datasets.parallel import Progress
-    from thermogrip.datasets.schema import Grasps
     from thermogrip.report.html import Section
 
 BY_DEFAULT = ("lstm", "posterior", "bayes", "features-lda", "pca-lda")

@@ -26,14 +26,13 @@ from thermogrip.report.plots import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from thermogrip.datasets.schema import Log
-    from thermogrip.sysid.export.dynamics import Dynamics
-    from thermogrip.sysid.greybox.posterior import Posterior
-    from thermogrip.sysid.growth.stepwise import Growth
+    from thermogrip.datasets import Log
+    from thermogrip.sysid import Plant
+    from thermogrip.sysid.export import Dynamics
+    from thermogrip.sysid.greybox import Posterior
+    from thermogrip.sysid.growth import Growth
     from thermogrip.sysid.identification import Identification, Row, Searched
-    from thermogrip.sysid.plant.plant import Plant
-    from thermogrip.sysid.validation.free_run import FreeRun
-    from thermogrip.sysid.validation.prediction_bands import Band
+    from thermogrip.sysid.validation import Band, FreeRun
 
 _BASELINES = (
     "Beside the free run: the best decay without input, the log's mean, and one step from each last "

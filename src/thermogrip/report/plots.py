@@ -27,12 +27,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from thermogrip.mpc.closed_loop.simulate import ClosedLoop
-    from thermogrip.sysid.export.dynamics import Dynamics
-    from thermogrip.sysid.greybox.posterior import Posterior
+    from thermogrip.mpc import ClosedLoop
+    from thermogrip.sysid.export import Dynamics
+    from thermogrip.sysid.greybox import Posterior
     from thermogrip.sysid.identification import Row
-    from thermogrip.sysid.validation.free_run import FreeRun
-    from thermogrip.sysid.validation.prediction_bands import Band
+    from thermogrip.sysid.validation import Band, FreeRun
 
 Array = NDArray[np.float64]
 
