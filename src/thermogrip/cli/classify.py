@@ -29,10 +29,10 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
 
 if TYPE_CHECKING:
-    from thermogrip.classify import GraspClassifier, StopRule
-    from thermogrip.datasets import Grasps
-    from thermogrip.sysid import GripperModel
-    from thermogrip.sysid.effusivity import Coupling, EffusivityRow
+    from thermogrip.classify.decisions.stopping_rule import StopRule
+    from thermogrip.classify.estimators.base import GraspClassifier
+    from thermogrip.datasets.schema import Grasps
+    from thermogrip.sysid.effusivity import Coupling, EffusivityRow, GripperModel
 
 _BUNDLED = 40.0  # s: the longest contacts that taught the bundled gripper
 
@@ -46,8 +46,7 @@ def calibrated_device(
     training lasted [s].
     """
     from thermogrip.datasets.schema import has_touch_groups
-    from thermogrip.sysid.effusivity.calibration import calibrate_gripper
-    from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
+    from thermogrip.sysid.effusivity import calibrate_gripper, load_default_gripper
     from thermogrip.sysid.effusivity.multi_touch import learn_coupling
     from thermogrip.sysid.effusivity.quality import longest_contact
 
@@ -303,15 +302,15 @@ def classify(
     """
     stated = _range(between)
     new_file(out, (".csv",))
-    from thermogrip.classify import (
+    from thermogrip.classify.decisions.next_touch import advise_touches
+    from thermogrip.classify.decisions.predict import (
         classify_grasps,
-        load_classifier,
-        load_stop_rule,
         reasons,
+        unexplained_answers,
         write_predictions,
     )
-    from thermogrip.classify.decisions.next_touch import advise_touches
-    from thermogrip.classify.decisions.predict import unexplained_answers
+    from thermogrip.classify.decisions.stopping_rule import load_stop_rule
+    from thermogrip.classify.estimators.registry import load_classifier
     from thermogrip.sysid.effusivity.data import with_object_range
 
     if (other_gripper or known) and (early or next_touch):

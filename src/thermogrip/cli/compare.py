@@ -30,10 +30,11 @@ from thermogrip.datasets.parallel import sub_progress
 from thermogrip.report.console import Console
 
 if TYPE_CHECKING:
-    from thermogrip.classify import Comparison, GraspClassifier
+    from thermogrip.classify.estimators.base import GraspClassifier
+    from thermogrip.classify.evaluation.comparison import Comparison
     from thermogrip.classify.evaluation.decision_time import Decisions
-    from thermogrip.datasets import Grasps
     from thermogrip.datasets.parallel import Progress
+    from thermogrip.datasets.schema import Grasps
     from thermogrip.report.html import Section
 
 BY_DEFAULT = ("lstm", "posterior", "bayes", "features-lda", "pca-lda")
@@ -197,8 +198,7 @@ def _curves(
     from thermogrip.classify.evaluation.harness import contact_time_curve, difference_curve, learning_curve
     from thermogrip.datasets.atomic_files import write_atomic
     from thermogrip.report.classification import curves_section, decision_section, strips_section
-    from thermogrip.sysid.effusivity.calibration import calibrate_gripper
-    from thermogrip.sysid.effusivity.posterior import effusivity_posterior
+    from thermogrip.sysid.effusivity import calibrate_gripper, effusivity_posterior
 
     settings: dict[str, Any] = {"seed": seed, "workers": workers, "repeats": 5}
     rows = {}

@@ -63,9 +63,9 @@ def tune(
     baseline, tuned, PI and LQR side by side, what can be traded, and which weights matter.
     """
     from thermogrip.datasets.parallel import kept_processes
-    from thermogrip.mpc import Spec, read_spec
-    from thermogrip.mpc import tune as search
+    from thermogrip.mpc.design.spec import Spec, read_spec
     from thermogrip.mpc.tuning.sensitivity import sensitivity_words
+    from thermogrip.mpc.tuning.tune import tune as search
     from thermogrip.report.control import tuning_sections, tuning_table
     from thermogrip.report.html import write_report
 

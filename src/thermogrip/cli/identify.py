@@ -37,15 +37,15 @@ from thermogrip.report.console import Console
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from thermogrip.datasets import Log
     from thermogrip.datasets.parallel import Progress
-    from thermogrip.sysid import Plant
+    from thermogrip.datasets.schema import Log
     from thermogrip.sysid.export import Dynamics
     from thermogrip.sysid.greybox import Posterior
     from thermogrip.sysid.growth import Growth
     from thermogrip.sysid.identification import Identification
     from thermogrip.sysid.models.model import GreyModel
     from thermogrip.sysid.models.network import NetworkModel
+    from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation import Band, FreeRun
 
 MODELS = ("arx", "oe", "subspace", "sindy", "neural", "network")

@@ -35,12 +35,16 @@ from thermogrip.report.console import Console
 from thermogrip.rig.session.signals import check_stopped, stop_signals
 
 if TYPE_CHECKING:
-    from thermogrip.datasets import Grasps
-    from thermogrip.mpc import Controller
-    from thermogrip.rig import Guard, Rig, Session, Trial, Twin
+    from thermogrip.datasets.schema import Grasps
+    from thermogrip.mpc.controllers.mpc import Controller
     from thermogrip.rig.clock import ScaledClock
+    from thermogrip.rig.guard.guard import Guard
     from thermogrip.rig.guard.plant_mismatch import PlantDrift
-    from thermogrip.sysid import Plant
+    from thermogrip.rig.interface import Rig
+    from thermogrip.rig.records.batch import Trial
+    from thermogrip.rig.session.session import Session
+    from thermogrip.rig.simulation.twin import Twin
+    from thermogrip.sysid.plant.plant import Plant
 
 
 LOWEST_TARGET, HIGHEST_TARGET = 10.0, 50.0  # degC, of the skin
@@ -136,8 +140,9 @@ def run(
     from thermogrip.mpc.tuning.design_review import beyond_logs
     from thermogrip.report.control import session_sections
     from thermogrip.report.html import write_report
-    from thermogrip.rig import RunFolder, run_session
     from thermogrip.rig.clock import ScaledClock
+    from thermogrip.rig.records.recorder import RunFolder
+    from thermogrip.rig.session.session import run_session
 
     if stop_early is not None and grasp is None:
         raise UserError("--stop-early without a grasp", hint="give --object and --material too")
@@ -278,10 +283,11 @@ def record(
 
     identify reads samples.csv of the folder. Everything is switched off on every way out, Ctrl-C included.
     """
-    from thermogrip.rig import RunFolder, open_rig
+    from thermogrip.datasets.log_files import read_log
     from thermogrip.rig.clock import ScaledClock
+    from thermogrip.rig.drivers.connect import open_rig
+    from thermogrip.rig.records.recorder import RunFolder
     from thermogrip.rig.session.schedule_player import Playback, play
-    from thermogrip.sysid import read_log
 
     plan = read_log(schedule)
     watch = guard_of(guard, None)
@@ -465,7 +471,8 @@ def _twin(
 
 def guard_of(path: Path | None, plant: Plant | None, learn: Path | None = None) -> Guard:
     """Return the guard of a rig; what no file says is as by default."""
-    from thermogrip.rig import Guard, GuardSettings, read_guard
+    from thermogrip.rig.guard.guard import Guard, GuardSettings
+    from thermogrip.rig.guard.settings import read_guard
 
     settings = GuardSettings() if path is None else read_guard(path)
     drift = None if learn is None or plant is None else _drift_of(learn, plant, settings.model.drift)

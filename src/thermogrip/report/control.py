@@ -24,9 +24,13 @@ from thermogrip.report.plots import grasp_figure, steps_figure
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from thermogrip.datasets import Grasps
-    from thermogrip.mpc import ClosedLoop, Controller, Design, Move, Tuning
-    from thermogrip.rig import Session
+    from thermogrip.datasets.schema import Grasps
+    from thermogrip.mpc.closed_loop.simulate import ClosedLoop
+    from thermogrip.mpc.controllers.mpc import Controller
+    from thermogrip.mpc.design.design import Design
+    from thermogrip.mpc.interface import Move
+    from thermogrip.mpc.tuning.tune import Tuning
+    from thermogrip.rig.session.session import Session
 
 _STEPS_CAPTION = (
     "Closed loops on one draw of the plant; dashed: the target. MPC is drawn broad and LQR thin, so that "

@@ -26,12 +26,12 @@ from thermogrip.report.plots import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from thermogrip.datasets import Log
-    from thermogrip.sysid import Plant
+    from thermogrip.datasets.schema import Log
     from thermogrip.sysid.export import Dynamics
     from thermogrip.sysid.greybox import Posterior
     from thermogrip.sysid.growth import Growth
     from thermogrip.sysid.identification import Identification, Row, Searched
+    from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation import Band, FreeRun
 
 _BASELINES = (

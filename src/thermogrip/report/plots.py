@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from thermogrip.mpc import ClosedLoop
+    from thermogrip.mpc.closed_loop.simulate import ClosedLoop
     from thermogrip.sysid.export import Dynamics
     from thermogrip.sysid.greybox import Posterior
     from thermogrip.sysid.identification import Row

@@ -27,15 +27,17 @@ from thermogrip.report.plant import free_run_section, identification_section, po
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from thermogrip.classify import Comparison, GraspClassifier
-    from thermogrip.datasets import Grasps, Log
+    from thermogrip.classify.estimators.base import GraspClassifier
+    from thermogrip.classify.evaluation.comparison import Comparison
     from thermogrip.datasets.parallel import Progress, Workers
-    from thermogrip.mpc import Check, Tuning
-    from thermogrip.rig import Session
-    from thermogrip.sysid import Plant
-    from thermogrip.sysid.greybox import Posterior
+    from thermogrip.datasets.schema import Grasps, Log
+    from thermogrip.mpc.tuning.design_review import Check
+    from thermogrip.mpc.tuning.tune import Tuning
+    from thermogrip.rig.session.session import Session
+    from thermogrip.sysid.greybox.posterior import Posterior
     from thermogrip.sysid.identification import Identification
-    from thermogrip.sysid.validation import FreeRun
+    from thermogrip.sysid.plant.plant import Plant
+    from thermogrip.sysid.validation.free_run import FreeRun
 
 SPLIT_S = 1350  # the first seconds of pump_on_off are fitted, the rest is held out
 MODELS = ("arx", "oe", "sindy", "network")
@@ -108,9 +110,11 @@ def _identify(
     out: Path, seed: int, progress: Progress | None
 ) -> tuple[Identification, Plant, Posterior, tuple[Log, FreeRun]]:
     """Fit three logs and half of the fourth, sample the posterior, and run freely over the held-out half."""
-    from thermogrip.datasets import example_path
-    from thermogrip.datasets.examples import EXAMPLE_LOGS
-    from thermogrip.sysid import free_run, identify, read_log, sample_posterior
+    from thermogrip.datasets.examples import EXAMPLE_LOGS, example_path
+    from thermogrip.datasets.log_files import read_log
+    from thermogrip.sysid.greybox.posterior import sample_posterior
+    from thermogrip.sysid.identification import identify
+    from thermogrip.sysid.validation.free_run import free_run
 
     cuts = {name: f"@:{SPLIT_S}" if name == "pump_on_off" else "" for name in EXAMPLE_LOGS}
     logs = [read_log(f"{example_path(name)}{cut}") for name, cut in cuts.items()]
@@ -127,7 +131,10 @@ def _tune(
     out: Path, plant: Plant, seed: int, workers: Workers, progress: Progress | None
 ) -> tuple[Tuning, Sequence[Check]]:
     """Tune on few draws with few evaluations, and review the controller as its file has it."""
-    from thermogrip.mpc import Controller, Spec, review, tune
+    from thermogrip.mpc.controllers.mpc import Controller
+    from thermogrip.mpc.design.spec import Spec
+    from thermogrip.mpc.tuning.design_review import review
+    from thermogrip.mpc.tuning.tune import tune
 
     spec = Spec(steps=list(STEPS), evaluations=6, search_draws=1, check_draws=2)
     tuning = tune(plant, spec, seed=seed, workers=workers, progress=progress)
@@ -140,7 +147,9 @@ def _run(
     out: Path, tuning: Tuning, plant: Plant, seed: int, progress: Progress | None
 ) -> list[tuple[str, Session]]:
     """Bring the twin to the grasping temperature and grasp, once for each material."""
-    from thermogrip.rig import RunFolder, Twin, run_session
+    from thermogrip.rig.records.recorder import RunFolder
+    from thermogrip.rig.session.session import run_session
+    from thermogrip.rig.simulation.twin import Twin
 
     sessions = []
     for k, name in enumerate(TOUCHED):
@@ -167,8 +176,9 @@ def _compare(
     out: Path, seed: int, workers: Workers, progress: Progress | None
 ) -> tuple[Comparison, GraspClassifier]:
     """Compare on bundled grasps, and train one posterior classifier for the twin's grasps."""
-    from thermogrip.classify import evaluate, make_classifier, save_classifier
-    from thermogrip.datasets import load_example_grasps
+    from thermogrip.classify.estimators.registry import make_classifier, save_classifier
+    from thermogrip.classify.evaluation.harness import evaluate
+    from thermogrip.datasets.examples import load_example_grasps
 
     examples = load_example_grasps()
     models, left_out = compared_models(seed)

@@ -232,7 +232,8 @@ class PaperResult:
     def _figures(self) -> Section:
         """Return the paper's figures, drawn anew: exchange, responses, confusions."""
         from thermogrip.classify.figures import confusion_figure
-        from thermogrip.datasets import find_material, load_example_grasps
+        from thermogrip.datasets.examples import load_example_grasps
+        from thermogrip.datasets.materials import find_material
         from thermogrip.report.plots import exchange_figure, responses_figure
 
         examples = load_example_grasps()
@@ -257,8 +258,9 @@ def repeat_paper(
 ) -> PaperResult:
     """Repeat the paper's experiments, with ``quick`` at 200 epochs of the LSTM in place of 2000; UserError if
     PyTorch, which trains it, is not installed."""
-    from thermogrip.classify import evaluate, make_classifier
-    from thermogrip.datasets import load_example_grasps
+    from thermogrip.classify.estimators.registry import make_classifier
+    from thermogrip.classify.evaluation.harness import evaluate
+    from thermogrip.datasets.examples import load_example_grasps
     from thermogrip.datasets.parallel import run_parallel, sub_progress
 
     models = {name: make_classifier(name, quick=quick, seed=seed) for name in CLASSIFIERS}
