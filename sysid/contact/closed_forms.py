@@ -33,10 +33,10 @@ domain:
     body Z2
 
 C = rho c_p L.  Two bodies meet through h_c, q(s) = dT/s / (1/h_c + Z_dev + Z_obj), and the inverse
-transform below gives fluxes and temperatures to 1e-11 of themselves for any effusivity ratio.
+transform below gives fluxes and temperatures to 1e-11 of themselves for any effusivity ratio.  So it does
+where a surface or a fluid has a given temperature: in a slab, of times in units of L^2 / alpha, q = sqrt(s),
 
-Where a surface temperature is given there are classical series: eigenfunctions for large Fourier numbers
-alpha t / L^2, images for small ones, each summed where it converges in a few terms.
+    rise(x) = cosh(q (1 - x)) / (s (cosh(q) + (q / Bi) sinh(q))),   Bi = h L / k, infinite at a held surface.
 
 Numerical inversion of Laplace transforms of heat conduction
 ------------------------------------------------------------
@@ -68,14 +68,12 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import dawsn, erfc, erfcx, rgamma
+from scipy.special import dawsn, erfcx, rgamma
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Impedance = Callable[[Complex], Complex]
 
-_SWITCH = 0.15  # Fourier number: images below, eigenfunctions above
-_TERMS = 12
 _LEGENDRE = np.polynomial.legendre.leggauss(40)
 
 
@@ -476,11 +474,7 @@ def slab_temperature(
     array([43.   , 23.053])
     """
     fo, x = _fourier(t, depth, thickness, alpha)
-    late = fo >= _SWITCH
-    left = np.where(
-        late, _slab_modes(np.maximum(fo, _SWITCH), x), 1 - _slab_images(np.minimum(fo, _SWITCH), x)
-    )
-    return np.asarray(T_surf + (T0 - T_surf) * left)
+    return T0 + (T_surf - T0) * _slab_rise(fo, x, np.inf)
 
 
 def slab_heat(t: ArrayLike, *, T0: float, T_surf: float, capacity: float, effusivity: float) -> Array:
@@ -498,14 +492,12 @@ def slab_heat(t: ArrayLike, *, T0: float, T_surf: float, capacity: float, effusi
     if not np.all(t >= 0):
         raise ValueError("time must be >= 0 s")
     fo = t * (effusivity / capacity) ** 2
-    m = (np.arange(_TERMS) + 0.5) * np.pi
-    late = 1 - (2 / m**2 * np.exp(-(m**2) * np.maximum(fo, _SWITCH)[..., None])).sum(axis=-1)
-    root = np.sqrt(np.clip(fo, 1e-300, _SWITCH))[..., None]
-    n = np.arange(1, _TERMS)
-    z = n / root
-    ierfc = np.exp(-(z**2)) / np.sqrt(np.pi) - z * erfc(z)
-    early = 2 * root[..., 0] * (1 / np.sqrt(np.pi) + 2 * ((-1.0) ** n * ierfc).sum(axis=-1))
-    return np.asarray(capacity * (T_surf - T0) * np.where(fo >= _SWITCH, late, np.where(fo > 0, early, 0.0)))
+
+    def transform(s: Complex) -> Complex:
+        fade = np.exp(-2 * np.sqrt(s))
+        return np.asarray((1 - fade) / (1 + fade) / s**1.5)
+
+    return capacity * (T_surf - T0) * _after_start(transform, fo)
 
 
 def slab_temperature_convective(
@@ -513,9 +505,6 @@ def slab_temperature_convective(
     alpha: float,
 ) -> Array:  # fmt: skip
     """Return the temperature in a slab whose face meets a fluid through a film conductance, back insulated.
-
-    Eigenfunctions of beta tan(beta) = Bi = h L / k for large Fourier numbers, inverse transform for small
-    ones.
 
     Parameters
     ----------
@@ -541,23 +530,7 @@ def slab_temperature_convective(
     """
     _positive(h=h, k=k)
     fo, x = _fourier(t, depth, thickness, alpha)
-    biot = h * thickness / k
-    beta = _biot_roots(biot, _TERMS)
-    weight = 4 * np.sin(beta) / (2 * beta + np.sin(2 * beta))
-    modes = np.exp(-(beta**2) * np.maximum(fo, _SWITCH)[..., None]) * np.cos(beta * (1 - x[..., None]))
-    left = (weight * modes).sum(axis=-1)
-    soon = (fo < _SWITCH) & (fo > 0)
-    if np.any(soon):
-        at = x[soon][:, None]
-
-        def transform(s: Complex) -> Complex:
-            root = np.sqrt(s)
-            shape = np.exp(-root * at) + np.exp(-root * (2 - at))
-            fade = np.exp(-2 * root)
-            return np.asarray(shape / (s * ((1 + fade) + root / biot * (1 - fade))))
-
-        left[soon] = 1 - invert_laplace(transform, fo[soon])
-    return np.asarray(T_fluid + (T0 - T_fluid) * np.where(fo > 0, left, 1.0))
+    return T0 + (T_fluid - T0) * _slab_rise(fo, x, h * thickness / k)
 
 
 def layered_temperature(
@@ -566,13 +539,12 @@ def layered_temperature(
 ) -> Array:  # fmt: skip
     """Return the temperature in a layer on a half-space whose face is held at ``T_surf`` from t = 0.
 
-    Heat that reaches the joint is reflected by r = (e_layer - e_base) / (e_layer + e_base), at the face by
-    -1: a series of images.
+    Heat is reflected by r = (e_layer - e_base) / (e_layer + e_base) at the joint, by -1 at the face.
 
     Parameters
     ----------
     t : array_like
-        Time [s], positive; up to some 1000 diffusion times of the layer.
+        Time [s], positive.
     depth : array_like
         Distance from the face [m], in the layer or below it; broadcast against ``t``.
     T0, T_surf : float
@@ -599,19 +571,16 @@ def layered_temperature(
     t, x = np.broadcast_arrays(np.asarray(t, dtype=float), np.asarray(depth, dtype=float))
     if not np.all(t > 0) or np.any(x < 0):
         raise ValueError("need t > 0 s and depth >= 0 m")
-    r = (e_layer - e_base) / (e_layer + e_base)
-    scale = 2 * np.sqrt(t)[..., None]
-    z = thickness / np.sqrt(alpha_layer)
-    # an image further than erfc(27) reaches is zero in double precision
-    n = np.arange(int(np.ceil(27 * np.sqrt(t.max()) / z)) + 2)
-    power = (-r) ** n
+    r, z = (e_layer - e_base) / (e_layer + e_base), thickness / np.sqrt(alpha_layer)
     inside = np.minimum(x, thickness)[..., None] / np.sqrt(alpha_layer)
-    layer = (power * (erfc((2 * n * z + inside) / scale) + r * erfc((2 * (n + 1) * z - inside) / scale))).sum(
-        axis=-1
-    )
     below = np.maximum(x - thickness, 0.0)[..., None] / np.sqrt(alpha_base)
-    base = (1 + r) * (power * erfc(((2 * n + 1) * z + below) / scale)).sum(axis=-1)
-    return np.asarray(T0 + (T_surf - T0) * np.where(x <= thickness, layer, base))
+
+    def transform(s: Complex) -> Complex:
+        q = np.sqrt(s)
+        rise = (np.exp(-q * inside) + r * np.exp(-q * (2 * z - inside))) * np.exp(-q * below)
+        return np.asarray(rise / (s * (1 + r * np.exp(-2 * q * z))))
+
+    return T0 + (T_surf - T0) * invert_laplace(transform, t)
 
 
 def _time_and_root(t: ArrayLike, e_dev: float, e_obj: float, h_c: float) -> tuple[Array, Array]:
@@ -681,24 +650,18 @@ def _fourier(t: ArrayLike, depth: ArrayLike, thickness: float, alpha: float) -> 
     return np.array(fo), np.array(x)
 
 
-def _slab_modes(fo: Array, x: Array) -> Array:
-    m = (np.arange(_TERMS) + 0.5) * np.pi
-    return np.asarray((2 / m * np.exp(-(m**2) * fo[..., None]) * np.sin(m * x[..., None])).sum(axis=-1))
+def _slab_rise(fo: Array, x: Array, biot: float) -> Array:
+    """Return the rise of a slab at depths x towards what its face meets, both 1 in the end."""
+    at = x[..., None]
+
+    def transform(s: Complex) -> Complex:
+        q, fade = np.sqrt(s), np.exp(-2 * np.sqrt(s))
+        shape = np.exp(-q * at) + np.exp(-q * (2 - at))
+        return np.asarray(shape / (s * ((1 + fade) + q / biot * (1 - fade))))
+
+    return _after_start(transform, fo)
 
 
-def _slab_images(fo: Array, x: Array) -> Array:
-    n = np.arange(_TERMS)
-    root = 2 * np.sqrt(np.maximum(fo, 1e-300))[..., None]
-    pair = erfc((2 * n + x[..., None]) / root) + erfc((2 * (n + 1) - x[..., None]) / root)
-    return np.asarray(((-1.0) ** n * pair).sum(axis=-1))
-
-
-def _biot_roots(biot: float, n: int) -> Array:
-    """Return the first n roots of beta tan(beta) = Bi, one in each (m pi, m pi + pi/2), by bisection."""
-    low = np.arange(n) * np.pi
-    high = low + 0.5 * np.pi
-    for _ in range(80):
-        middle = 0.5 * (low + high)
-        under = middle * np.sin(middle - np.arange(n) * np.pi) < biot * np.cos(middle - np.arange(n) * np.pi)
-        low, high = np.where(under, middle, low), np.where(under, high, middle)
-    return np.asarray(0.5 * (low + high))
+def _after_start(transform: Callable[[Complex], Complex], t: Array) -> Array:
+    """Return f(t), 0 at t = 0."""
+    return np.where(t > 0, invert_laplace(transform, np.where(t > 0, t, 1.0)), 0.0)
