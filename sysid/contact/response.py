@@ -9,11 +9,9 @@ shift of time; what the room does by the block's far face comes on top (:func:`f
 the block (effusivity e, heat capacity per face C = rho c_p L), on the contact conductance and on the gripper
 only:
 
-- **Block**: a slab whose far face loses U per degree.  Its near one falls, per unit flux drawn, by modes of
-  rate (beta_j e / C)^2, beta tan(beta) = U C / e^2, with weights near 2/C (1/C of the first); with U = 0,
-  (j pi e / C)^2, 1/C and 2/C.  Modes beyond the first dozen are grouped by
-  Gauss quadrature over ln j (Euler-Maclaurin, midpoint rule), modes faster than a millisecond are a series
-  resistance; so 37 numbers serve copper (diffusion time C^2/e^2 of 4 s) and wood (over an hour) alike.
+- **Block**: a slab whose far face loses U per degree, as modes
+  (:mod:`thermogrip.sysid.contact.time_stepping`), of which 37 serve copper (diffusion time C^2/e^2 of 4 s)
+  and wood (over an hour) alike.
 - **Gripper**: a stack of layers in the coordinate z = x / sqrt(alpha) [s^0.5], in which a layer is its
   effusivity alone (a cell holds e dz and conducts e / dz).  An outer sheet, the sensor, an inner layer, a
   conductance to what is behind; beside the sensor a store of heat, since the pipe that it is glued to holds

@@ -37,23 +37,15 @@ Heat loss of the block by its far face
 A block of capacity C per face whose far face loses U (T_obj - T_room) warms or cools at its near face,
 untouched there, by
 
-.. math:: d(t) = \frac{U (T_{room} - T_{obj})}{C} \int_0^t \vartheta(s) ds
-          \approx \frac{U (T_{room} - T_{obj})}{C} \max(t - L^2 / 6 \alpha, 0),
+.. math:: d(t) \approx \frac{U (T_{room} - T_{obj})}{C} \max(t - L^2 / 6 \alpha, 0),
 
 since the mean time of the way through the slab is :math:`L^2 / 6 \alpha = C^2 / 6 e^2`: 0.6 s in 20 mm of
-copper, 3 s in iron, minutes in wood, which within a grasp shows nothing of it.  The sensor answers to d as to
-every change of the face, by the step response F, so the reading gains
+copper, 3 s in iron, minutes in wood.  The sensor answers to d by the step response F, so the reading gains
 
 .. math:: \frac{U}{C} (T_{room} - T_{obj}) G(t), \quad G(t) = \int_0^{t - C^2 / 6 e^2} F(s) ds.
 
 That is the first order in U: the loss of what the gripper itself has warmed is left out (of the size of
 U t / C, 2 % in 10 s, of a few kelvin).
-
-Means over bins
----------------
-
-The curves are read between their nodes by cubic Hermite interpolation, at the samples' times less the onset,
-and averaged bin by bin.
 """
 
 from __future__ import annotations
@@ -632,7 +624,7 @@ def _means(
     nodes: Array, rise: Array, slope: Array, bins: NDArray[np.int64], count: Array,
     place: NDArray[np.int64], share: Array, rates: bool, out: Array,
 ) -> None:  # fmt: skip
-    """Fill bin means (n_bin,) of a curve, of its slope where ``rates``."""
+    """Fill bin means (n_bin,) of a curve by cubic Hermite interpolation, of its slope where ``rates``."""
     out[:] = 0.0
     for i in range(place.size):
         k = place[i]

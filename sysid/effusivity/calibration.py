@@ -10,20 +10,14 @@ theta, so the w are eliminated grasp by grasp:
 
 After each step a spread is renewed as s^2 = sum(posterior mean^2 + posterior variance) / dof, one step of EM
 for restricted likelihood: dof counts the grasps less the means fitted to them, and two for a first guess.
-The noise is then found by maximum likelihood of the residuals with the nuisances marginalised, searched until
-its slopes vanish, and the fit is repeated.  Priors of theta are wide; only ln e of each material leans on the
-library, and the depth on the block's length.
+The noise is then found by maximum likelihood of the residuals with the nuisances marginalised, and the fit is
+repeated.
 
-Priors
-------
-
-theta is laid out as the stack, the shared means (both in the order of
-:data:`~thermogrip.sysid.effusivity.gripper_model.SHARED_NAMES`), then ln h and ln e of each block;
-logarithms are named ``ln_...``.  For a new gripper every prior is wide, and only the effusivities lean on the
-library.  With an earlier calibration (of this gripper, or of another one with the spread between grippers
-added) theta ~ N(its parameters, its covariance); blocks that it has but that are not touched now stay in
-theta, since what they have in common with the touched ones moves with them.  Its spreads from grasp to grasp
-count as ten grasps: another gripper or another day is alike, not the same.
+theta is laid out in the order of :data:`~thermogrip.sysid.effusivity.gripper_model.SHARED_NAMES`, then ln h
+and ln e of each block.  For a new gripper every prior is wide; only ln e leans on the library, and the depth
+on the block's length.  With an earlier calibration theta ~ N(its parameters, its covariance); blocks that it
+has but that are not touched now stay in theta, since what they have in common with the touched ones moves
+with them.  Its spreads from grasp to grasp count as ten grasps: another day is alike, not the same.
 """
 
 from __future__ import annotations

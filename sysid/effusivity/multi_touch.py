@@ -1,22 +1,18 @@
 """Touches of one block: one object temperature, seen from two gripper temperatures.
 
-Two touches at different gripper temperatures must agree on the block: on its effusivity, on what its contact
-conductance has in common, and on its temperature, which moves from one touch to the next as the coupling says
-(aluminium by several degrees in one touch: leaving it out ruins metals).
-
-Under a candidate each touch is a Gaussian factor of what it shares with the others, so that the evidence of
-all touches of a group, and the block's temperature, are in closed form.  The factors are expanded twice,
-the second time around what the other touches say of the block's temperature: a wide prior leaves wood's
-temperature open by many degrees, too far for one expansion.  With a free effusivity in place of a
-candidate, on a grid, the same algebra gives the joint posterior of ln e and of the block's temperature.
+Two touches at different gripper temperatures must agree on the block: on its effusivity, its heat capacity,
+what its contact conductance has in common, and its temperature, which moves from one touch to the next
+(aluminium's by several degrees in one touch).  Under a candidate each touch is a Gaussian factor of what it
+shares with the others.  The factors are expanded twice, the second time around what the other touches say of
+the block's temperature: a wide prior leaves wood's open by many degrees, too far for one expansion.  With a
+free effusivity in place of a candidate, on a grid, the same algebra gives the joint posterior of ln e and of
+the block's temperature.
 
 A touch as a Gaussian factor
 ----------------------------
 
-Touches of one block share its effusivity, its heat capacity, part of its contact conductance, and a
-temperature that moves in a known way from one to the next.  Under a candidate, Laplace's method gives the
-posterior of a touch's nuisances; dividing out its prior leaves the likelihood of x = (T_obj, ln h, ln e, ln
-C) alone,
+Under a candidate, Laplace's method gives the posterior of a touch's nuisances; dividing out its prior leaves
+the likelihood of x = (T_obj, ln h, ln e, ln C) alone,
 
     L(x) = c exp(eta' d - d' Lambda d / 2),   d = x - x0,
 
@@ -42,14 +38,10 @@ may be touched at another face).  Meanwhile the block relaxes towards the room w
 
     T_2 = T_room + exp(-U rest / C) (T_1 - a rho (T_1 - T_grip) - T_room) + N(0, s^2 + (0.15 way)^2).
 
-One time constant is not the law of a slab, and U is not the same wherever a block lies and however warm it
-is.  So of the way that the block went towards the room 15 % are uncertain: little after a minute near the
-room's temperature, most of the spread after long rests and far from it, where nothing was learnt.
-
-Contact conductance scatters from touch to touch about the block's own; ``ln_h_sd`` is that scatter in touches
-of one block, which a person or an arm made one after the other, and may be wider than between grasps of a
-series. All of it is learnt from groups of known material by maximum likelihood (:func:`learn_coupling`); the
-defaults are those of the example rig.
+One time constant is not the law of a slab, so of the way that the block went towards the room 15 % are
+uncertain.  Contact conductance scatters from touch to touch about the block's own by ``ln_h_sd``, which may
+be wider than between grasps of a series.  All of it is learnt from groups of known material by maximum
+likelihood (:func:`learn_coupling`); the defaults are those of the example rig.
 """
 
 from __future__ import annotations
@@ -328,10 +320,8 @@ def touch_groups(grasps: Grasps) -> dict[str, Rows]:
 def rested_long(grasps: Grasps, coupling: Coupling | None = None) -> NDArray[np.bool_]:
     """Return which grasps are of blocks that rested much longer than the coupling was learnt from, (n,).
 
-    The coupling takes a block to the room with one time constant.  From rests of one length it learns what
-    becomes of a block in that time, and not the law: wood's face is at the room's temperature long before its
-    middle.  The uncertain share of the way covers that on blocks by finite volumes
-    (``benchmarks/classify/touches.py --parts elsewhere``); others may lie further off.
+    From rests of one length it learns what becomes of a block in that time, and not the law: wood's face is
+    at the room's temperature long before its middle.
     """
     label = label_values(grasps, "touch_group")
     if (label == "").all():

@@ -5,22 +5,16 @@ Given ln e every other unknown is close to Gaussian, so Laplace's method serves 
 coarse over the prior, then twice refined where the mass is.  Between points the log density is interpolated
 by a monotone cubic.
 
-What Laplace's method leaves out changes slowly with ln e, so it is integrated (:func:`log_integrals`) at
-seven of the points, and the rest interpolated.  Its mean over the posterior is left to Laplace's method:
-the evidence of the candidates has the same.
-
-What Laplace's method leaves out
---------------------------------
-
-With y = X(u) beta + c(u) + noise, beta = (b, T_obj) ~ N(beta0, S) and whitener W, the residual r = W (y - X
-beta0 - c) has covariance I + V V', V = W X S^1/2, so
+**What Laplace's method leaves out** changes slowly with ln e, so it is integrated (:func:`log_integrals`) at
+seven of the points, and the rest interpolated.  Its mean over the posterior is left to Laplace's method: the
+evidence of the candidates has the same.  With y = X(u) beta + c(u) + noise, beta = (b, T_obj) ~ N(beta0, S)
+and whitener W, the residual r = W (y - X beta0 - c) has covariance I + V V', V = W X S^1/2, so
 
     ln p(y | u) = -1/2 (r' r - r' V (I + V' V)^-1 V' r) - 1/2 ln det(I + V' V) + const.
 
-Four nuisances are left, (ln C, ln h, ln tau_b, t0).  Given ln e, Laplace's method calls their posterior
-N(m, Sigma).  That is nearly true of the last three; but of the heat capacity a touch often knows only that it
-is not below some value, and a wall on one side of a mode is not normal.  With Sigma = L L', ln C first, and
-u = m + L z, z_0 moves ln C and takes the others along as they go with it, so that
+Four nuisances are left, (ln C, ln h, ln tau_b, t0), of which ln C is the one that is not nearly normal: a
+touch often knows only that it is not below some value.  With the posterior N(m, Sigma) of Laplace's method,
+Sigma = L L', ln C first, and u = m + L z, z_0 moves ln C and takes the others along, so that
 
     int p(u) du = |L| sum_i dz sum_k w_k p(m + L (z_0i, s_k)) exp(s_k' s_k / 2) (2 pi)^(3/2)
 

@@ -7,21 +7,19 @@ positive; z ~ N(0, 1) is the prior and adds n residuals z to the cost.
 difference is divided by the sensor's ``sd``. The model's error is slow, so neighbouring bins are
 correlated: all residuals of an output are divided by sqrt(tau), with tau the bins per independent one.
 
-**Starts** are nuisances of each log (:mod:`thermogrip.sysid.plant.simulation`): a state at rest, or one
-the one behind a gap, is estimated anew at each iteration and held while the sensitivities are taken.
+**Starts** are nuisances of each log (:mod:`thermogrip.sysid.plant.simulation`), estimated anew at each
+iteration and held while the sensitivities are taken.
 
 **Sensitivities** are differences over all parameters in one batch of the compiled kernel: the step is
 smooth in p, so a relative step of 1e-5 leaves five digits; a test compares them with an independent solver's.
 
-**Drift.** Over hours a reading drifts from any lumped model: the air of the room moves, a supply drifts,
-the bench warms. The error of bin t of an output is then modelled as
+**Drift.** Over hours a reading drifts from any lumped model. The error of bin t of an output is then modelled
+as
 
     e_t = s_t + w_t,    s_(t+1) = rho s_t + sqrt(1 - rho^2) sd eta_t,    rho = exp(-bin / time),
 
 an AR(1) drift s of standard deviation ``sd`` and correlation time ``time``, and white w_t of variance r per
-bin. Least squares on e itself counts an hour of drift as hundreds of independent readings and bends
-conductances to follow it. Its maximum-likelihood counterpart is least squares on the innovations of the
-steady Kalman filter of s,
+bin. Maximum likelihood is then least squares on the innovations of the steady Kalman filter of s,
 
     v_t = (e_t - s_t) / sqrt(P + r),    s_(t+1) = rho (s_t + K v_t sqrt(P + r)),    K = P / (P + r),
 

@@ -13,12 +13,10 @@ a parameter          one with ``per_log`` in the network                    ``pe
                                                                             positive
 ===================  =====================================================  ===============================
 
-A log that began at rest has measured its sensors' offsets in its first seconds; 0.05 K of them stays
-unknown. Any other start is estimated from the warm-up, which leaves less unknown than the stated sd.
-
-**Error of a start that was estimated from the warm-up.** State and sensor offsets, s in units of their
-prior sd, are taken from the first bins y_w = B s + e_w (:mod:`thermogrip.sysid.plant.simulation`) by a
-ridge regression that assumes white e_w of standard deviation r:
+A log that began at rest has measured its sensors' offsets in its first seconds. Of any other start, state and
+sensor offsets, s in units of their prior sd, are estimated from the first bins y_w = B s + e_w
+(:mod:`thermogrip.sysid.plant.simulation`) by a ridge regression that assumes white e_w of standard deviation
+r:
 
     s_fit = K y_w,      K = (B'B / r^2 + 1)^-1 B' / r^2.
 
@@ -27,21 +25,16 @@ the variances D of s,
 
     cov(s_fit - s) = (1 - K B) D (1 - K B)' + K C_w K',
 
-and not D: a heater that may be 2 K from rest is known to a few tenths after a minute. What the warm-up does
-not see keeps its prior sd; what it sees by correlated readings may be off by more than that, since the
-ridge takes them for independent. That errors of the warm-up are in the residuals of the fit too is left
-out: a start pulled upwards by one reading is pulled down by those after it, so the two partly cancel.
+and not D: a heater that may be 2 K from rest is known to a few tenths after a minute. That errors of the
+warm-up are in the residuals of the fit too is left out: a start pulled upwards by one reading is pulled down
+by those after it, so the two partly cancel.
 
 **Model discrepancy** responds to the inputs in every log alike, so its effect on the parameters does not
-average out over logs, and logs that agree with each other do not reveal it. Which term is missing is not
-known, so a bank of responses represents all: every input u, its size |u|, u v, v |v| and every disturbance,
-with v the first output above the ambient (else about its mean), each through first-order lags of 2, 8 and
-32 bins, on all outputs alike.
-
-How large each kind is, the error model learns from the residuals: one s per signal, with a log-normal
-prior; at s = 1 all of them together have an rms of half a sensor's sd. Where residuals do not correlate
-with the inputs s shrinks to nothing, and so does its share of the intervals. The forecast of an experiment
-has the same terms (:mod:`thermogrip.sysid.experiment.information`).
+average out over logs. A bank of responses represents all that may be missing: every input u, its size |u|,
+u v, v |v| and every disturbance, with v the first output above the ambient (else about its mean), each
+through first-order lags of 2, 8 and 32 bins, on all outputs alike. How large each kind is, the error model
+learns from the residuals: one s per signal, with a log-normal prior; at s = 1 all of them together have an
+rms of half a sensor's sd. Where residuals do not correlate with the inputs s shrinks to nothing.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Covariance of a least-squares fit from the covariance of its score.
 
 **The estimate** solves s(z) = z + sum_l J_l' r_l(z) = 0, the gradient of |z|^2 + sum |r_l|^2 / tau (prior
-rows, then the weighted residuals of each log). A plant is for free runs, so the estimate stays that of
-least squares; but its weights are no noise model, and the inverse Hessian is not its covariance.
+rows, then the weighted residuals of each log), whose weights are no noise model.
 
 **The truth** z_0 has s(z_0) = z_0 + sum_l J_l' r_l(z_0): a draw from the prior, the contribution of noise,
 model error and random effects of the logs (of a start what its warm-up left unknown,
@@ -35,9 +34,8 @@ The covariance is scaled so that its 90 per cent intervals are those of the t. W
 expected, the error model counts as one more log: phi_0 is at least (1 + (L - 1) phi_0) / L. With one or two
 logs their quarters stand for logs; quarters of one log have much in common, so then phi_0 is at least 1.
 
-**Never wider than the prior.** Least squares that weigh a large error too little, or the tail of the t, can
-put the estimate further off than the prior allows. Logs remove no prior knowledge, so in no direction is
-the covariance larger than the prior's (1 in units of z): larger eigenvalues become 1.
+**Never wider than the prior.** Logs remove no prior knowledge, so in no direction is the covariance larger
+than the prior's (1 in units of z): larger eigenvalues become 1.
 
 References
 ----------
