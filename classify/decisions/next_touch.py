@@ -332,7 +332,15 @@ def by_plant(
         if name not in there:
             raise UserError(f"the plant has no {name!r}", hint=f"it has {', '.join(there)}")
     low, high = plant.valid.get("drive", (-1.0, 1.0))
-    up, down = (_passed(plant, now, t_ambient, output, longest, drive) for drive in (high, low))
+
+    def passed(drive: float) -> tuple[Floats, Floats]:
+        """Return times [s] and the skin's temperature under one drive."""
+        run = plant.simulate(_log(plant, now, t_ambient, longest, drive), warmup=_REST)
+        time = np.asarray(run["time"].values, dtype=float) - _REST
+        after = time >= 0
+        return time[after], np.asarray(run[output].values, dtype=float)[after]
+
+    up, down = passed(high), passed(low)
 
     def seconds(there: float) -> float:
         time, skin = up if there > now else down
@@ -342,16 +350,6 @@ def by_plant(
         return float(time[int(past.argmax())]) if past.any() else np.inf
 
     return seconds
-
-
-def _passed(
-    plant: Plant, now: float, t_ambient: float, output: str, longest: float, drive: float
-) -> tuple[Floats, Floats]:
-    """Return times [s] and the skin's temperature under one drive."""
-    run = plant.simulate(_log(plant, now, t_ambient, longest, drive), warmup=_REST)
-    time = np.asarray(run["time"].values, dtype=float) - _REST
-    after = time >= 0
-    return time[after], np.asarray(run[output].values, dtype=float)[after]
 
 
 def _log(plant: Plant, now: float, t_ambient: float, longest: float, drive: float) -> Log:

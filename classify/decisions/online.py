@@ -88,28 +88,15 @@ class Stream:
         self._warm()
 
     def update(self, time_s: float, t_surface: float) -> dict[str, float]:
-        """Take one sample and return the probabilities.
+        """Take one sample and return the probability of each candidate.
 
-        Parameters
-        ----------
-        time_s : float
-            Since the closed message [s], negative before it, growing from call to call; start at -1 s or
-            before.
-        t_surface : float
-            The reading [degC]; NaN where it was lost.
+        ``time_s`` [s] since the closed message grows from call to call, from -1 s or before; ``t_surface``
+        [degC] is NaN where it was lost.  Probabilities are the prior ones until a quarter of a second after
+        the message, NaN for a contact that is not usable (:attr:`nothing_because`), and stay as they are once
+        it lasts longer than those of the training.
 
-        Returns
-        -------
-        p : dict of str to float
-            By candidate; the prior ones until a quarter of a second after the message, NaN for a contact that
-            is not usable (:attr:`nothing_because`).  They stay as they are once contact lasts
-            longer than those of the training.
-
-        Raises
-        ------
-        UserError
-            If time does not grow or is no number, a reading is not in degC, or contact begins without a
-            reading before it.  The sample is not taken, the next one may follow.
+        Time that does not grow, a reading that is not in degC, or a contact without a reading before it is a
+        :class:`UserError`.  That sample is not taken, the next one may follow.
         """
         if not np.isfinite(time_s) or (self._time and not time_s > self._time[-1]):
             after = f" after {self._time[-1]:g} s" if self._time else ""

@@ -331,7 +331,6 @@ class BayesClassifier(GraspClassifier):
         return out
 
     def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-        """Return what ``fit`` learnt: numbers, and named arrays."""
         numbers = self.reader_.to_dict() | {
             "dof": self.dof_,
             "shrinkage": self.shrinkage_,

@@ -120,13 +120,11 @@ class FeaturesLda(_Lda):
         return np.asarray(share[:, None] * self._discriminants(x))
 
     def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-        """Return what ``fit`` learnt: feature names, and named arrays."""
         spread = self.spread_ if np.isfinite(self.spread_) else None
         arrays = named_arrays(self, ("center_", "scale_", "coef_", "intercept_"))
         return self.reader_.to_dict() | {"spread": spread}, arrays
 
     def set_state(self, numbers: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
-        """Take up what :meth:`get_state` returned."""
         self.reader_ = FeatureReader.from_dict(numbers)
         self.feature_names_ = self.reader_.names
         spread = numbers.get("spread")
@@ -157,12 +155,10 @@ class PcaLda(_Lda):
         return np.asarray((as_array(grasps, times=self.times_) - self.pca_mean_) @ self.axes_.T)
 
     def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-        """Return what ``fit`` learnt, as named arrays."""
         keys = ("times_", "pca_mean_", "axes_", "center_", "scale_", "coef_", "intercept_")
         return {}, named_arrays(self, keys)
 
     def set_state(self, numbers: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
-        """Take up what :meth:`get_state` returned."""
         set_arrays(self, arrays, times_=(None,), pca_mean_=(None,), axes_=(None, arrays["pca_mean_"].size))
         self._take_up(arrays, self.axes_.shape[0])
 

@@ -154,12 +154,10 @@ class LstmClassifier(JoinedClassifier):
         return _logits(self.weights_, self._series(x))
 
     def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-        """Return what ``fit`` learnt as named arrays: times, standardisation, weights and the loss curve."""
         arrays = {"times": self.times_, "mean": self.mean_, "sd": self.sd_, "loss_curve": self.loss_curve_}
         return {}, arrays | {f"weights.{k}": v for k, v in self.weights_.items()}
 
     def set_state(self, numbers: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
-        """Take up what :meth:`get_state` returned."""
         self.times_, self.mean_, self.sd_ = arrays["times"], arrays["mean"], arrays["sd"]
         self.loss_curve_ = arrays["loss_curve"]
         n, k = self.times_.size * (getattr(self, "sensors_", None) or 1), self.classes_.size

@@ -185,7 +185,6 @@ class PosteriorClassifier(GraspClassifier):
         return np.vstack(log_p), np.concatenate(unknown)
 
     def p_unknown(self, X: Records, candidates: Sequence[str] | None = None) -> Floats:
-        """Return the probability that a grasp is of none of the candidates, shape (n_grasp,)."""
         names = self.asked() if candidates is None else [str(c) for c in candidates]
         parts = record_list(X)
         return np.concatenate([self._none_of(part, names, self._evidence(part, names)) for part in parts])
@@ -225,13 +224,11 @@ class PosteriorClassifier(GraspClassifier):
             raise ValueError(f"longest_contact_s {longest}")  # the reader adds the file
 
     def save_parts(self, folder: Path) -> None:
-        """Write ``device.json``, and ``coupling.json`` where touches of one block taught it."""
         self.device_.save(folder / "device.json")
         if self.coupling_ is not None:
             self.coupling_.save(folder / "coupling.json")
 
     def load_parts(self, folder: Path) -> None:
-        """Read what :meth:`save_parts` wrote."""
         self._check_params()
         self.device_ = GripperModel.load(folder / "device.json")
         file = folder / "coupling.json"

@@ -248,14 +248,12 @@ class VoteClassifier(GraspClassifier):
     members: Sequence[GraspClassifier] = ()
 
     def fit(self, X: Records, y: ArrayLike | None = None) -> Self:
-        """Fit each member to labelled grasps; what a member raises is raised."""
         check_members(self.members)
         self.members_ = [clone(member).fit(X, y) for member in self.members]
         self.classes_ = self.members_[0].classes_
         return self
 
     def check_installed(self) -> None:
-        """Raise :class:`UserError` where a member needs a package that is not installed."""
         for member in self.members:
             member.check_installed()
 

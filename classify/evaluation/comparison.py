@@ -7,9 +7,10 @@ it is.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -186,36 +187,22 @@ class Comparison:
         test, or for repeated splits of the sign-flip test over grasps (named in ``test``).
         """
         table = []
-        for i, first in enumerate(self.classifiers):
-            for second in self.classifiers[i + 1 :]:
-                a = _by_key(self._rows(first, condition))
-                b = _by_key(self._rows(second, condition))
-                shared = [k for k in a if k in b]
-                if shared:
-                    table.append(self._difference(first, second, condition, a, b, shared))
+        for first, second in combinations(self.classifiers, 2):
+            a, b = (_by_key(self._rows(name, condition)) for name in (first, second))
+            if shared := [(a[k], b[k]) for k in a if k in b]:
+                head = {"first": first, "second": second, "condition": condition}
+                table.append(head | self._difference(shared))
         return table
 
-    def _difference(
-        self,
-        first: str,
-        second: str,
-        condition: str,
-        a: Mapping[Any, Row],
-        b: Mapping[Any, Row],
-        shared: list[Any],
-    ) -> Row:
-        right_a = np.array([a[k]["correct"] for k in shared], dtype=float)
-        right_b = np.array([b[k]["correct"] for k in shared], dtype=float)
-        loss = np.array([a[k]["log_loss"] - b[k]["log_loss"] for k in shared])
-        grasp = grasp_numbers([a[k] for k in shared])
+    def _difference(self, shared: Sequence[tuple[Row, Row]]) -> Row:
+        right_a, right_b = np.array([[a["correct"], b["correct"]] for a, b in shared], dtype=float).T
+        loss = np.array([a["log_loss"] - b["log_loss"] for a, b in shared])
+        grasp = grasp_numbers([a for a, _ in shared])
         gap = np.bincount(grasp, weights=right_a - right_b) / np.bincount(grasp)
         test = s.mcnemar(right_a, right_b)
         columns = np.column_stack([right_a - right_b, loss])
         right, lost = mean_intervals(columns, grasp, level=self.level, seed=self.seed)
         return {
-            "first": first,
-            "second": second,
-            "condition": condition,
             "n": int(gap.size),
             "difference": right.value,
             "low": _known(right.low),

@@ -117,25 +117,19 @@ class RandomizedMap:
         """Covariance (n_free, n_free) of z near the fit."""
         return np.asarray(np.linalg.inv(np.eye(self.z.size) + self.information))
 
-    def log_density(self, z: Array) -> Array:
-        """Return ln p (n,) up to a constant at z (n, n_free); -inf outside of the bounds."""
-        inside = np.all((z >= self.low) & (z <= self.high), axis=1)
-        out = np.full(len(z), -np.inf)
-        if inside.any():
-            out[inside] = -self._cost(z[inside], np.zeros(self.z.size), np.zeros(len(self._root)))
-        return out
-
     def log_profile(self, z: Array, columns: Sequence[int]) -> Array:
-        """Return ln p (n,) of the parameters ``columns`` at z (n, n_columns), the others integrated out."""
+        """Return ln p (n,) of the parameters ``columns`` at z (n, n_columns), the others integrated out;
+        -inf outside of the bounds."""
         others = np.setdiff1d(np.arange(self.z.size), np.array(columns, dtype=int))
         whole = np.tile(self.z, (len(z), 1))
         whole[:, list(columns)] = z
-        if not others.size:
-            return self.log_density(whole)
         out = np.full(len(z), -np.inf)
         inside = np.all((whole >= self.low) & (whole <= self.high), axis=1)
         at = whole[inside]
         if not len(at):
+            return out
+        if not others.size:
+            out[inside] = -self._gradient(at)[1]
             return out
         H = np.eye(self.z.size) + self.information
         factor = cho_factor(H[np.ix_(others, others)], lower=True)
