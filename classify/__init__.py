@@ -12,7 +12,7 @@ _ALSO = {
     "advise_touches": "decisions.next_touch",
     "can_be_saved": "estimators.registry",
     "join_grasps": "estimators.base",
-    "session_stop": "decisions.online",
+    "session_stop": "decisions.stopping_rule",
 }
 
 __all__, __getattr__, __dir__ = lazy_exports(__name__, _ALSO)

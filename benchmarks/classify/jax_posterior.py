@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import gammaln
 
-from thermogrip.sysid.contact.response import stack_modes
+from thermogrip.sysid.contact.simulation import stack_modes
 from thermogrip.sysid.effusivity.data import Touches, whiten
 from thermogrip.sysid.effusivity.gripper_model import GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import (

@@ -25,9 +25,9 @@ from scipy.special import logsumexp
 
 from thermogrip.classify import make_classifier
 from thermogrip.classify.decisions.next_touch import choose_next_touch
-from thermogrip.classify.decisions.online import Stream
 from thermogrip.classify.decisions.stopping_rule import (
     StopRule,
+    Stream,
     Windows,
     growing_windows,
     learn_from_windows,

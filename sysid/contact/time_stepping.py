@@ -1,4 +1,4 @@
-r"""Compiled time stepping of one contact: the inner loop of :mod:`thermogrip.sysid.contact.response`.
+r"""Compiled time stepping of one contact: the inner loop of :mod:`thermogrip.sysid.contact.simulation`.
 
 Both bodies are sums of exponential modes, so one step of length ``dt`` with a flux linear in time is exact:
 

@@ -34,7 +34,7 @@ from scipy.optimize import minimize
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.materials import Material, find_material
 from thermogrip.datasets.schema import Grasps, log_name
-from thermogrip.sysid.contact.response import TimeNodes
+from thermogrip.sysid.contact.simulation import TimeNodes
 from thermogrip.sysid.effusivity.data import Noise, Touches, noise_fit, stack_touches, touches, whiten
 from thermogrip.sysid.effusivity.gripper_model import (
     INSULATOR,

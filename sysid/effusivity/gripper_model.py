@@ -37,8 +37,7 @@ from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import number_within
 from thermogrip.datasets.materials import load_materials
-from thermogrip.sysid.contact.response import Stack
-from thermogrip.sysid.contact.simulation import Grip
+from thermogrip.sysid.contact.simulation import Grip, Stack
 from thermogrip.sysid.effusivity.data import UNKNOWN_OBJECT_RANGE, Noise
 
 Array = NDArray[np.float64]

@@ -66,7 +66,7 @@ from scipy.special import gammaln
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.materials import Material, find_material
-from thermogrip.sysid.contact.response import (
+from thermogrip.sysid.contact.simulation import (
     LAYER_NAMES,
     Stack,
     TimeNodes,

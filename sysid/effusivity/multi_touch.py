@@ -61,7 +61,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import number_within
 from thermogrip.datasets.materials import Material
 from thermogrip.datasets.schema import Grasps, label_values, log_name
-from thermogrip.sysid.contact.response import block_modes, step_response, time_nodes
+from thermogrip.sysid.contact.simulation import block_modes, step_response, time_nodes
 from thermogrip.sysid.effusivity.data import Touches, touches, whiten
 from thermogrip.sysid.effusivity.gripper_model import UNKNOWN_OBJECT_SD, GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import (

@@ -171,7 +171,7 @@ def ran(bench: Bench, stand_in: StandIn, monkeypatch: pytest.MonkeyPatch) -> Sim
 def test_words_reach_the_session_on_a_twin(ran: SimpleNamespace, stand_in: StandIn) -> None:
     (ran.bench.path / "model").mkdir()
     ran.bench.write("g.toml", "")
-    stops = stand_in("thermogrip.classify.decisions.online.session_stop", "stop")
+    stops = stand_in("thermogrip.classify.decisions.stopping_rule.session_stop", "stop")
     words = (
         "run c.json --target 40 --twin plant.json --draw 2 --from 28 --hold 30 --object 18 --material copper"
     )
@@ -272,7 +272,7 @@ def test_a_batch_keeps_on_what_it_ran_and_fails_while_a_trial_is_left(
     batches = stand_in("thermogrip.rig.records.batch.run_batch", ran)
     opened = stand_in("thermogrip.cli.rig.rig_of", "a rig")
     guards = stand_in("thermogrip.cli.rig.guard_of", "a guard")
-    stops = stand_in("thermogrip.classify.decisions.online.session_stop", "stop")
+    stops = stand_in("thermogrip.classify.decisions.stopping_rule.session_stop", "stop")
     Controller(small_plant()).save(bench.path / "c.json")
     bench.write("plan.csv", "material,target_degC\ncopper,30\nwood,30\n")
     bench.write("g.toml", "")

@@ -135,7 +135,7 @@ def run(
     """
     wanted, grasp = _targets(target), _what_to_grasp(obj, material)
     one_rig(port, twin)
-    from thermogrip.classify.decisions.online import session_stop
+    from thermogrip.classify.decisions.stopping_rule import session_stop
     from thermogrip.mpc.closed_loop.simulate import RecordedController
     from thermogrip.mpc.tuning.design_review import beyond_logs
     from thermogrip.report.control import session_sections
@@ -226,7 +226,7 @@ def batch(
     labelled for classify.
     """
     one_rig(port, twin)
-    from thermogrip.classify.decisions.online import session_stop
+    from thermogrip.classify.decisions.stopping_rule import session_stop
     from thermogrip.rig.clock import ScaledClock
     from thermogrip.rig.records.batch import read_plan, run_batch
 

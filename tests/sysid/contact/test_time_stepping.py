@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from thermogrip.sysid.contact import time_stepping as kernel
-from thermogrip.sysid.contact.response import far_response, step_response, time_nodes
+from thermogrip.sysid.contact.simulation import far_response, step_response, time_nodes
 from thermogrip.sysid.contact.time_stepping import N_MODE, first_step, slab, slab_moves, slabs
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 

@@ -10,7 +10,7 @@ import pytest
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.materials import load_materials
-from thermogrip.sysid.contact.response import Stack
+from thermogrip.sysid.contact.simulation import Stack
 from thermogrip.sysid.effusivity.data import Noise
 from thermogrip.sysid.effusivity.gripper_model import (
     NOTHING,

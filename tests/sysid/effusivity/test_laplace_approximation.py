@@ -16,7 +16,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import make_grasps
-from thermogrip.sysid.contact.response import far_response, step_response
+from thermogrip.sysid.contact.simulation import far_response, step_response
 from thermogrip.sysid.effusivity import laplace_approximation as laplace
 from thermogrip.sysid.effusivity.calibration import calibrate_gripper
 from thermogrip.sysid.effusivity.data import touches, whiten

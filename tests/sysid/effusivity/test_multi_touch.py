@@ -14,7 +14,7 @@ from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import make_grasps
-from thermogrip.sysid.contact.response import step_response, time_nodes
+from thermogrip.sysid.contact.simulation import step_response, time_nodes
 from thermogrip.sysid.effusivity import multi_touch
 from thermogrip.sysid.effusivity.data import touches
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper

@@ -19,8 +19,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log
 from thermogrip.sysid.greybox import noise_model
 from thermogrip.sysid.greybox import sandwich as module
-from thermogrip.sysid.greybox.fit import fit_network
-from thermogrip.sysid.greybox.levenberg_marquardt import levenberg_marquardt
+from thermogrip.sysid.greybox.fit import fit_network, levenberg_marquardt
 from thermogrip.sysid.greybox.noise_model import Block, ErrorModel, LogData, information
 from thermogrip.sysid.greybox.problem import Problem, make_problem
 from thermogrip.sysid.greybox.sandwich import (
