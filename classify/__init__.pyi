@@ -1,11 +1,11 @@
 from thermogrip.classify.decisions.next_touch import Costs as Costs
 from thermogrip.classify.decisions.next_touch import choose_next_touch as choose_next_touch
 from thermogrip.classify.decisions.next_touch import name_or_unknown as name_or_unknown
-from thermogrip.classify.decisions.stopping_rule import Stream as Stream
 from thermogrip.classify.decisions.predict import classify_grasps as classify_grasps
 from thermogrip.classify.decisions.predict import reasons as reasons
 from thermogrip.classify.decisions.predict import write_predictions as write_predictions
 from thermogrip.classify.decisions.stopping_rule import StopRule as StopRule
+from thermogrip.classify.decisions.stopping_rule import Stream as Stream
 from thermogrip.classify.decisions.stopping_rule import learn_stop_rule as learn_stop_rule
 from thermogrip.classify.decisions.stopping_rule import load_stop_rule as load_stop_rule
 from thermogrip.classify.estimators import CLASSIFIERS as CLASSIFIERS
