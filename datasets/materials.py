@@ -23,6 +23,7 @@ import math
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
+from typing import Any
 
 from thermogrip.datasets.errors import UserError, as_user_error
 
@@ -138,7 +139,7 @@ def read_materials(text: str, *, file: str = "materials.csv") -> list[Material]:
     materials: list[Material] = []
     taken: set[str] = set()
     for line, row in enumerate(csv.DictReader(io.StringIO(text)), start=2):
-        material = _check(_material(row, file, line), file, line)
+        material = _material(row, {"file": file, "row": line})
         for name in (material.name, *material.aliases):
             if name in taken:
                 raise UserError(f"{name!r} occurs twice", file=file, row=line, hint="keep one")
@@ -147,49 +148,30 @@ def read_materials(text: str, *, file: str = "materials.csv") -> list[Material]:
     return materials
 
 
-def _material(row: dict[str, str], file: str, line: int) -> Material:
+def _material(row: dict[str, str], at: dict[str, Any]) -> Material:
+    """Return the material of a row, checked; the column of e is a check on k, rho and c_p."""
     numbers = {}
     for key in ("k", "rho", "c_p", "effusivity", "effusivity_sd_percent"):
         wrong = (KeyError, TypeError, ValueError)
-        with as_user_error(wrong, "is not a number", file=file, row=line, column=key, hint="write one"):
+        with as_user_error(wrong, "is not a number", **at, column=key, hint="write one"):
             numbers[key] = float(row[key])
     if not row.get("source") or not row.get("name"):
-        raise UserError("has no name or no source", file=file, row=line, hint="say where it comes from")
-    e = _effusivity(numbers, file, line)
-    return Material(
-        name=row["name"],
-        k=numbers["k"],
-        rho=numbers["rho"],
-        c_p=numbers["c_p"],
-        effusivity=e,
-        effusivity_sd_ln=numbers["effusivity_sd_percent"] / 100,
-        source=row["source"],
-        kind=row.get("kind") or "",
-        aliases=tuple(a for a in (row.get("aliases") or "").split(";") if a),
-    )
-
-
-def _effusivity(numbers: dict[str, float], file: str, line: int) -> float:
-    """Return sqrt(k rho c_p); the column is a check on the other three."""
-    product = numbers["k"] * numbers["rho"] * numbers["c_p"]
-    if product > 0 and abs(numbers["effusivity"] / math.sqrt(product) - 1) <= 0.02:
-        return math.sqrt(product)
-    problem = f"{numbers['effusivity']:g} is not sqrt(k rho c_p) within 2 %"
-    raise UserError(
-        problem, file=file, row=line, column="effusivity", hint="check the four numbers of the row"
-    )
-
-
-def _check(material: Material, file: str, line: int) -> Material:
-    if material.kind not in KINDS:
+        raise UserError("has no name or no source", **at, hint="say where it comes from")
+    k, rho, c_p, stated, percent = numbers.values()
+    if not (k * rho * c_p > 0 and abs(stated / math.sqrt(k * rho * c_p) - 1) <= 0.02):
+        problem = f"{stated:g} is not sqrt(k rho c_p) within 2 %"
+        raise UserError(problem, **at, column="effusivity", hint="check the four numbers of the row")
+    kind = row.get("kind") or ""
+    if kind not in KINDS:
         hint = f"use one of {', '.join(KINDS)}"
-        raise UserError(f"kind {material.kind!r} is unknown", file=file, row=line, column="kind", hint=hint)
-    for name, (least, greatest) in zip(("k", "rho", "c_p"), KINDS[material.kind], strict=True):
-        value = getattr(material, name)
-        if not least <= value <= greatest:
-            problem = f"{value:g} is outside {least:g} to {greatest:g}, where a {material.kind} can be"
-            raise UserError(problem, file=file, row=line, column=name, hint="look for a lost decimal point")
-    if not 0.01 <= material.effusivity_sd_ln <= 0.5:
-        problem = f"{100 * material.effusivity_sd_ln:g} % is not between 1 and 50 %"
-        raise UserError(problem, file=file, row=line, column="effusivity_sd_percent", hint="estimate it anew")
-    return material
+        raise UserError(f"kind {kind!r} is unknown", **at, column="kind", hint=hint)
+    for name, (least, greatest) in zip(("k", "rho", "c_p"), KINDS[kind], strict=True):
+        if not least <= numbers[name] <= greatest:
+            problem = f"{numbers[name]:g} is outside {least:g} to {greatest:g}, where a {kind} can be"
+            raise UserError(problem, **at, column=name, hint="look for a lost decimal point")
+    if not 1 <= percent <= 50:
+        problem = f"{percent:g} % is not between 1 and 50 %"
+        raise UserError(problem, **at, column="effusivity_sd_percent", hint="estimate it anew")
+    e, aliases = math.sqrt(k * rho * c_p), (row.get("aliases") or "").split(";")
+    names = tuple(alias for alias in aliases if alias)
+    return Material(row["name"], k, rho, c_p, e, percent / 100, row["source"], kind, names)

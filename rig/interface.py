@@ -102,40 +102,31 @@ class Rig(Protocol):
     @property
     def units(self) -> Mapping[str, str]:
         """Units of the driven inputs, by name: ``"1"`` (-1...1), ``"percent"``, ``"0_255"``."""
-        ...
 
     @property
     def expires_s(self) -> float:
         """How long a drive that is not renewed lasts on the device [s]; infinite where nothing ends it."""
-        ...
 
     def read(self) -> Reading:
         """Return the newest sample."""
-        ...
 
     def apply(self, drive: Mapping[str, float], pump: int) -> None:
         """Set drive (inside the input's range, else it raises) and pump until the next call."""
-        ...
 
     def wait(self, seconds: float) -> None:
         """Let time pass; the twin simulates it, hardware waits."""
-        ...
 
     def grasp(self, material: str, t_object: float) -> None:
         """Close the gripper on an object; time 0 of the grasp is now."""
-        ...
 
     def release(self) -> None:
         """Open the gripper."""
-        ...
 
     def notices(self) -> list[Notice]:
         """Return what happened since the last call, and forget it."""
-        ...
 
     def close(self) -> None:
         """Switch all power off and let the rig go."""
-        ...
 
 
 @runtime_checkable
@@ -144,8 +135,6 @@ class SamplingRig(Rig, Protocol):
 
     def sample_every(self, seconds: float) -> bool:
         """Take a reading every so many seconds from now on, 0 for none; False where it cannot."""
-        ...
 
     def take(self) -> tuple[list[Reading], int]:
         """Return the readings since the last call, oldest first, and how many were lost since."""
-        ...

@@ -47,7 +47,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from thermogrip.datasets.limits import keyed
 from thermogrip.rig.guard.kalman_filter import Estimate, FilterSettings, History, RigFilter, RigModel
@@ -211,18 +210,6 @@ class Residual:
         return abs(self.measured - self.expected)
 
 
-def _compare_windows(model: RigModel, past: History, settings: ModelSettings, since: Array) -> list[Residual]:
-    """Return the residuals of every window that ends now and began after ``since`` (n_y,) [s]."""
-    found = []
-    for length, floor in zip(settings.windows, settings.floors):
-        begin = past.begin(past.now - length)
-        if begin is None or begin.step >= past.steps.done:
-            continue
-        window = _Window(begin, length, floor)
-        found += _compare(model, past, settings, window, since <= begin.time)
-    return found
-
-
 def _window_slopes(
     model: RigModel, past: History, smooth: float, length: float, steps: Array
 ) -> tuple[Array, Array] | None:
@@ -247,37 +234,6 @@ def _window_slopes(
 def _recent(past: History, begin: Estimate, smooth: float) -> list[Estimate]:
     """Return the estimates that the end of a window is the mean of."""
     return [m for m in past.after(past.now - smooth) if m.time > begin.time]
-
-
-@dataclass(frozen=True)
-class _Window:
-    begin: Estimate
-    length: float
-    floor: float
-
-
-def _compare(
-    model: RigModel, past: History, settings: ModelSettings, window: _Window, known: NDArray[np.bool_]
-) -> list[Residual]:
-    begin, plant = window.begin, model.plant
-    recent = _recent(past, begin, settings.smooth)
-    if not recent or not known.any():
-        return []
-    u, d = past.steps.rows(begin.step)
-    path = model.run(begin.x[None], model.biased(u, begin.w)[None], d[None])[0] + model.offsets + begin.b
-    switched = [at for at, name in enumerate(plant.inputs) if name in plant.model.switches]
-    floor = window.floor + (settings.switching if np.ptp(u[:, switched], axis=0).any() else 0.0)
-    readings = np.array([m.y for m in recent])
-    ends = path[[m.step - begin.step for m in recent]]
-    found = []
-    for k in np.flatnonzero(known & np.isfinite(readings).all(axis=0)):
-        measured, expected = float(readings[:, k].mean()), float(ends[:, k].mean())
-        start = float(path[0, k])
-        swing = max(float(np.ptp(path[:, k])), abs(measured - start))
-        allowed = floor + settings.share * swing
-        change = expected - start, measured - start
-        found.append(Residual("window", plant.outputs[k], window.length, *change, allowed))
-    return found
 
 
 class ModelMonitor:
@@ -358,7 +314,26 @@ class ModelMonitor:
 
     def compare(self) -> list[Residual]:
         """Return every window and output that can be compared now, whether within what is allowed or not."""
-        return _compare_windows(self._model, self._past, self.settings, self._since)
+        model, past, s, plant = self._model, self._past, self.settings, self.plant
+        switches = [at for at, name in enumerate(plant.inputs) if name in plant.model.switches]
+        found = []
+        for length, floor in zip(s.windows, s.floors):
+            begin = past.begin(past.now - length)
+            if begin is None or begin.step >= past.steps.done:
+                continue
+            recent = _recent(past, begin, s.smooth)
+            u, d = past.steps.rows(begin.step)
+            path = model.run(begin.x[None], model.biased(u, begin.w)[None], d[None])[0]
+            path = path + model.offsets + begin.b
+            least = floor + (s.switching if np.ptp(u[:, switches], axis=0).any() else 0.0)
+            readings = np.array([m.y for m in recent])
+            ends = path[[m.step - begin.step for m in recent]]
+            for k in np.flatnonzero((self._since <= begin.time) & np.isfinite(readings).all(axis=0)):
+                start, measured = float(path[0, k]), float(readings[:, k].mean())
+                swing = max(float(np.ptp(path[:, k])), abs(measured - start))
+                change = float(ends[:, k].mean()) - start, measured - start
+                found.append(Residual("window", plant.outputs[k], length, *change, least + s.share * swing))
+        return found
 
     def explain(self, alarm: Residual) -> list[Cause]:
         """Return what explains the readings of an alarm's window best; nothing where nothing does."""
@@ -416,31 +391,32 @@ class ModelMonitor:
         near = min(may, key=lambda change: abs(one.measured - change))
         return replace(one, expected=near, allowed=one.allowed + min(more, one.allowed))
 
-    def _weigh(self, time: float, compared: list[Residual]) -> None:
-        """Keep the evidence of the longest windows, one after another."""
+    def _longest(self, compared: list[Residual]) -> tuple[list[Residual], list[int], Array, Array] | None:
+        """Return the residuals of the longest windows, their outputs, and how far the path goes without the
+        drives' biases, with its slopes; None where there is none of them, or no drift."""
         longest = max(self.settings.windows)
         of_all = [one for one in compared if one.window == longest]
-        if not of_all or self.drift is None or not self.drift.learns or time - self._weighed < longest:
-            return
-        found = self._slopes(longest)
-        if found is None:
+        found = self._slopes(longest) if of_all else None
+        return found and (of_all, [self.plant.outputs.index(one.subject) for one in of_all], *found)
+
+    def _weigh(self, time: float, compared: list[Residual]) -> None:
+        """Keep the evidence of the longest windows, one after another."""
+        early = time - self._weighed < max(self.settings.windows)
+        if self.drift is None or not self.drift.learns or early or not (found := self._longest(compared)):
             return
         self._weighed = time
-        for one in of_all:
-            k = self.plant.outputs.index(one.subject)
-            rest = one.measured - float(found[0][k])
-            self.evidence.append(Evidence(rest, found[1][k], one.allowed / 3))
+        of_all, at, goes, slopes = found
+        for one, k in zip(of_all, at):
+            self.evidence.append(Evidence(one.measured - float(goes[k]), slopes[k], one.allowed / 3))
 
     def _drifted(self, compared: list[Residual]) -> bool:
         """Say whether the effect of the drives' biases in a longest window may be the plant's parameters."""
-        longest = max(self.settings.windows)
-        of_all = [one for one in compared if one.window == longest]
-        found = self._slopes(longest)
-        if not of_all or found is None or self.drift is None:
+        found = self._longest(compared)
+        if found is None or self.drift is None:
             return False
-        at = [self.plant.outputs.index(one.subject) for one in of_all]
-        does = np.abs(np.array([one.expected for one in of_all]) - found[0][at])
-        may = np.minimum(self.drift.spread(found[1])[at], [one.allowed for one in of_all])
+        of_all, at, goes, slopes = found
+        does = np.abs(np.array([one.expected for one in of_all]) - goes[at])
+        may = np.minimum(self.drift.spread(slopes)[at], [one.allowed for one in of_all])
         return bool((does <= may).all())
 
     def _biases(self, time: float, compared: list[Residual]) -> list[Residual]:

@@ -34,7 +34,7 @@ from functools import partial
 from math import inf, isfinite, nan
 from typing import Any
 
-from thermogrip.datasets.errors import UserError, as_user_error
+from thermogrip.datasets.errors import as_user_error
 from thermogrip.datasets.units import split_header
 from thermogrip.rig.clock import BackOff
 from thermogrip.rig.session.loop import Event, Recorder
@@ -115,25 +115,12 @@ class Messages:
         return [*found, _text(op="publish", topic=topic, msg=content)]
 
 
-class _Link:
-    """One connection, from its opening to its end."""
-
-    def __init__(self) -> None:
-        self._open = ExitStack()
-        self.socket: Any = None
-
-    def open(self, url: str, timeout: float) -> None:
-        from websockets.sync.client import connect
-
-        opening = connect(url, open_timeout=timeout, close_timeout=timeout, max_size=_MOST_BYTES)
-        self.socket = self._open.enter_context(opening)
-
-    def hang_up(self, *, at_once: bool = False) -> None:
-        """Close it; a network that is gone cannot be closed better than this."""
-        with suppress(Exception):
-            if at_once:  # a thread hangs in it
-                self.socket.socket.shutdown(socket.SHUT_RDWR)
-            self._open.close()
+def _hang_up(link: Any, *, at_once: bool = False) -> None:
+    """Close a connection; a network that is gone cannot be closed better than this."""
+    with suppress(Exception):
+        if at_once:  # a thread hangs in it
+            link.socket.shutdown(socket.SHUT_RDWR)
+        link.close()
 
 
 class Bridge:
@@ -196,7 +183,7 @@ class Bridge:
         self._waiting: deque[Callable[[], list[str]]] = deque()
         self._changed = threading.Condition()  # of all that the threads share
         self._recorded, self._reported, self._time, self._ending = 0, 0, 0.0, False
-        self._link: _Link | None = None
+        self._link: Any | None = None
         self._take(self._connect())
         self._sender = threading.Thread(target=self._work, daemon=True)
         self._sender.start()
@@ -228,7 +215,7 @@ class Bridge:
             if self.dropped > self._reported:
                 self._report(f"{self._not_sent()} were not sent")
         if link is not None:
-            link.hang_up(at_once=self._sender.is_alive())
+            _hang_up(link, at_once=self._sender.is_alive())
             self._hearer.join(self._timeout)
         with suppress(OSError):  # it is closed already, or its disk is full, which the run itself records
             self._record()
@@ -239,22 +226,23 @@ class Bridge:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def _connect(self) -> _Link:
+    def _connect(self) -> Any:
         hint = "pip install thermogrip[ros]"
         with as_user_error(ImportError, "a bridge needs websockets", hint=hint):
             from websockets.exceptions import WebSocketException
-        link = _Link()
-        try:
-            link.open(self.url, self._timeout)
+            from websockets.sync.client import connect
+        wait, hint = self._timeout, "start rosbridge_server, or check host and port"
+        wrong = (OSError, TimeoutError, WebSocketException, ValueError)
+        refused = as_user_error(wrong, "no rosbridge answers ({error})", file=self.url, hint=hint)
+        with refused, ExitStack() as undo:
+            opening = connect(self.url, open_timeout=wait, close_timeout=wait, max_size=_MOST_BYTES)
+            link = undo.enter_context(opening)
             for text in self.messages.hello():
-                link.socket.send(text)
-        except (OSError, TimeoutError, WebSocketException, ValueError) as error:
-            link.hang_up()
-            hint = "start rosbridge_server, or check host and port"
-            raise UserError(f"no rosbridge answers ({error})", file=self.url, hint=hint) from error
+                link.send(text)
+            undo.pop_all()  # from now on it is for _hang_up
         return link
 
-    def _take(self, link: _Link) -> None:
+    def _take(self, link: Any) -> None:
         self._link, self._since = link, self._monotonic()
         self._hearer = threading.Thread(target=self._hear_all, args=(link,), daemon=True)
         self._hearer.start()
@@ -272,9 +260,9 @@ class Bridge:
                 self._waiting.appendleft(partial(self.messages.status, text))
                 self._take(link)
                 return
-        link.hang_up()
+        _hang_up(link)
 
-    def _lose(self, link: _Link, why: str) -> None:
+    def _lose(self, link: Any, why: str) -> None:
         """Drop a connection that was lost; whichever thread notices first reports it."""
         with self._changed:
             if self._link is not link:
@@ -285,7 +273,7 @@ class Bridge:
             self._back_off.failed()
             self._report(f"the connection to {self.url} was lost ({why})")
             self._changed.notify_all()
-        link.hang_up()
+        _hang_up(link)
 
     def _work(self) -> None:
         """Send what waits; connect again where there is no connection."""
@@ -302,20 +290,20 @@ class Bridge:
             elif link is None and self._back_off.due():
                 self._connect_again()
 
-    def _send(self, link: _Link, item: Callable[[], list[str]]) -> None:
+    def _send(self, link: Any, item: Callable[[], list[str]]) -> None:
         try:
             for text in item():
-                link.socket.send(text)
+                link.send(text)
                 self.sent += 1
         except Exception as error:  # of whatever kind: the view is gone, the session goes on
             with self._changed:
                 self.dropped += 1
             self._lose(link, _reason(error))
 
-    def _hear_all(self, link: _Link) -> None:
+    def _hear_all(self, link: Any) -> None:
         why = "the server closed it"
         try:
-            for text in link.socket:
+            for text in link:
                 target, refused = self.messages.hear(text)
                 if target is not None:
                     self.target = target

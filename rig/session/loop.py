@@ -49,11 +49,9 @@ class Recorder(Protocol):
 
     def sample(self, row: Mapping[str, float]) -> None:
         """Take one row of the log, names with their unit suffix."""
-        ...
 
     def event(self, event: Event) -> None:
         """Take one event."""
-        ...
 
 
 @dataclass

@@ -22,6 +22,7 @@ There is no checksum, no number, no time-out and no trip: heaters stay on for go
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Sequence
 
@@ -123,13 +124,8 @@ class TCLabCore:
 
 def _to_float(text: str) -> float:
     """Return the number that a text begins with, 0 for none, as the Arduino's toFloat does."""
-    digits = ""
-    for character in text.strip():
-        if character not in "0123456789.-+" or (character in "+-" and digits):
-            break
-        digits += character
     try:
-        return float(digits)
+        return float(re.split(r"(?<!^)[+-]|[^0-9.+-]", text.strip())[0])
     except ValueError:
         return 0.0
 
