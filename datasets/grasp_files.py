@@ -1,14 +1,8 @@
 """Grasps to and from disk.
 
-As CSV a condition is two files: ``NAME.csv``, long, one row a sample ::
-
-    grasp_id,time_s,t_surface_degC,pump[,t_surface_2_degC]
-
-and ``NAME_meta.csv``, one row a grasp, with any of ``material``, ``experiment``, ``repeat``, ``split``,
-``t_object_nominal_degC``, ``t_object_sd_degC``, ``t_gripper_set_degC``, ``t_ambient_degC``, ``touch_group``,
-``touch``, ``rest_s``, ``session``, ``block``.  An empty cell is unknown.  A missing ``session`` is the
-file, a missing ``block`` the material: so blocks are never split between training and test by accident of a
-missing column.
+As CSV a condition is two files, ``NAME.csv``, long, one row a sample, and ``NAME_meta.csv``, one row a grasp:
+``docs/reference/files.md`` has their columns.  A missing ``session`` is the file, a missing ``block`` the
+material: so blocks are never split between training and test by accident of a missing column.
 
 The grasps of one file share one time axis.  Where their stamps agree they are taken as they are; where they
 jitter each grasp is interpolated linearly onto the common step, which is noted in ``attrs["repairs"]``, and

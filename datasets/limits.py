@@ -1,14 +1,9 @@
 """How large a file may be, and how far it may unpack: one limit for all readers, checked before the memory.
 
 A few kilobytes can claim gigabytes: a compressed line of blanks, an array that was never written, a table of
-one value.  Every reader therefore asks here, with what a file declares, before it allocates anything:
-
-* no file may hold more than :func:`most_bytes` of numbers or text (2 GiB; a day of 20 columns at 100 Hz is
-  1.3 GiB),
-* what is packed may grow to 8 MiB, or to 200 times its size, whichever is more (a log of 500 000 rows whose
-  sensors never move, packed with xz, grows 104 times),
-* a document (JSON, TOML: settings and models, never records) may have 8 MiB or 1 MiB, be nested 64 levels
-  deep and hold no number beyond 1e100: what fits in a ``float`` does not always survive a square.
+one value.  Every reader therefore asks here, with what a file declares, before it allocates anything; the
+limits are listed in ``docs/reference/files.md``.  What is packed may grow 200 times: a log of 500 000 rows
+whose sensors never move, packed with xz, grows 104 times.
 
 ``THERMOGRIP_MAX_MB`` sets the first limit in MB for files that are large for a reason; documents keep their
 share of it, and the second limit is then left to it.

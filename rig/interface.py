@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from dataclasses import dataclass, field
+from typing import Any, Protocol, runtime_checkable
 
 #: What a drive may be, by its unit.
 UNIT_RANGES = {"1": (-1.0, 1.0), "percent": (0.0, 100.0), "0_255": (0.0, 255.0)}
@@ -52,16 +52,17 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Notice:
-    """Something that happened on the line or the device, which a session writes down once.
+class Event:
+    """Something that happened: when [s, the rig's clock], of which kind, in words, and as data (JSON).
 
-    Kinds are ``link`` (lost, found), ``reset``, ``latched``, ``expired``, ``damaged``, ``repeated``,
-    ``refused`` and ``unexpected``.
+    What happens on the line or the device is of the kinds ``link`` (lost, found), ``reset``, ``latched``,
+    ``expired``, ``damaged``, ``repeated``, ``refused`` and ``unexpected``.
     """
 
-    time_s: float  # the rig's clock
+    time_s: float
     kind: str
     text: str
+    data: Mapping[str, Any] = field(default_factory=dict)
 
 
 class NoticeBook:
@@ -69,9 +70,9 @@ class NoticeBook:
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock, self._start = clock, clock()
-        self._notices: deque[Notice] = deque(maxlen=1000)
+        self._notices: deque[Event] = deque(maxlen=1000)
 
-    def notices(self) -> list[Notice]:
+    def notices(self) -> list[Event]:
         """Return what happened since the last call, and forget it."""
         happened = list(self._notices)
         self._notices.clear()
@@ -81,7 +82,7 @@ class NoticeBook:
         return round(self._clock() - self._start, 9)
 
     def _note(self, kind: str, text: str) -> None:
-        self._notices.append(Notice(self._now(), kind, text))
+        self._notices.append(Event(self._now(), kind, text))
 
 
 def check_order(drive: Mapping[str, float], pump: int, ranges: Mapping[str, tuple[float, float]]) -> None:
@@ -122,7 +123,7 @@ class Rig(Protocol):
     def release(self) -> None:
         """Open the gripper."""
 
-    def notices(self) -> list[Notice]:
+    def notices(self) -> list[Event]:
         """Return what happened since the last call, and forget it."""
 
     def close(self) -> None:

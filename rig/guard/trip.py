@@ -8,96 +8,19 @@ one JSON object in ``events.jsonl``, one line on the terminal.
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from importlib.resources import files
 from typing import Any
 
+_WORDS = tomllib.loads((files(__package__) / "trips.toml").read_text(encoding="utf-8"))
+
 #: kind -> (what to check, how to clear), in the order of the module docstrings of the checks.
-KINDS: dict[str, tuple[str, str]] = {
-    "limit": (
-        "the target, the water level, whether the driver obeys (does the drive's LED go off at drive 0?)",
-        "let it come back inside the limits, then start again",
-    ),
-    "lost": (
-        "the sensor's plug and wire (open or shorted), then the converter's supply",
-        "repair it until the reading is plausible, then start again",
-    ),
-    "stuck": (
-        "the converter (does its reading change when the sensor is warmed by hand?), a frozen driver program",
-        "power-cycle the converter, then start again",
-    ),
-    "jump": (
-        "the sensor's plug and wire for a loose contact",
-        "repair it, then start again",
-    ),
-    "disagree": (
-        "which of the two sensors is wrong: compare both with a third, or in one cup of water",
-        "replug or replace the wrong one, then start again",
-    ),
-    "drift": (
-        "the sensor's seat (has it come off its place?), its converter, its calibration",
-        "compare it with a thermometer; if the plant itself has changed, identify it anew",
-    ),
-    "model": (
-        "pump, tube and water level; the driver and its supply; fan and heatsink; the sensor's seat",
-        "find the cause; if the rig was changed on purpose, identify the plant anew",
-    ),
-    "pump": (
-        "the pump: its supply, a kinked tube, air in the loop, the water level",
-        "see water move, then start again",
-    ),
-    "driver": (
-        "the current driver: its supply and fuse, its wiring to the module, a shorted output stage",
-        "switch the supply off by hand if the rig still heats or cools; repair the driver, then start again; "
-        "if it is in order, identify the plant anew",
-    ),
-    "reversed": (
-        "the polarity of the module's two wires",
-        "swap them, then start again; if they are right, identify the plant anew",
-    ),
-    "stale": (
-        "the cable, the device's power, what else keeps the computer busy",
-        "see readings arrive, then start again",
-    ),
-    "frozen": (
-        "what stopped the program (Ctrl-Z, a suspended or overloaded computer)",
-        "the device has switched off by itself after its 2 s; start again",
-    ),
-    "clock": (
-        "whether the device was reset (its supply, its cable) or its clock was set",
-        "start again; rows before the jump are good",
-    ),
-    "device": (
-        "what the device's own message says",
-        "repair the cause; a new connection clears the device's latch; then start again",
-    ),
-    "cable": (
-        "the cable at both ends, the device's power",
-        "plug it in; the device has switched off by itself after its 2 s; start again",
-    ),
-    "drive": (
-        "whether the controller file fits this rig, and whether another program drives it",
-        "start again with a controller that was tuned for this rig",
-    ),
-    "interlock": (
-        "the controller: with the pump off no heat may be pumped into standing water",
-        "start again; if it comes back, the controller does not fit this rig",
-    ),
-    "optimum": (
-        "fan and heatsink (too warm?), the lower end of drive_limits in the spec",
-        "limit the cooling drive to where more of it still cools, tune again",
-    ),
-    "disk": (
-        "the space on the disk of the run folder",
-        "free some space; what is on disk is whole; go on with the same folder's batch, or start again",
-    ),
-}  # fmt: skip
+KINDS: dict[str, tuple[str, str]] = {kind: (row["check"], row["clear"]) for kind, row in _WORDS.items()}
 
 #: How to clear, where nothing on the device ends its drive (a TCLab).
-ENDLESS: dict[str, str] = {
-    "frozen": "nothing on this device ended its drive meanwhile; it is off now; start again",
-    "cable": "PULL THE PLUG of its supply, nothing on this device ends its drive; then start again",
-}
+ENDLESS: dict[str, str] = {kind: row["endless"] for kind, row in _WORDS.items() if "endless" in row}
 
 
 @dataclass(frozen=True)
@@ -154,13 +77,10 @@ class Trip:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain JSON; a number that is not finite becomes None."""
-        plain = {
-            key: getattr(self, key) for key in ("kind", "subject", "expected", "measured", "check", "clear")
-        }
         numbers = {
             key: float(value) if abs(value) < float("inf") else None for key, value in self.figures.items()
         }
-        return {**plain, "time_s": self.time_s, "figures": numbers}
+        return {**asdict(self), "figures": numbers}
 
 
 class TripError(Exception):

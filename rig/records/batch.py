@@ -1,13 +1,7 @@
 """A batch of grasps: a plan, one run folder a trial, resumed where it was stopped.
 
-The plan is a table, one row a grasp::
-
-    material,t_object_degC,target_degC[,t_object_sd_degC,block,repeat,session,experiment,split,
-        touch_group,touch,rest_s]
-
-``t_object_degC`` is a number, empty where it is not known, or the name of a sensor.  Trial k of the plan is
-in the folder ``0001``, ``0002``, ... of the batch; a trial that was not good (tripped, did not settle, marked
-bad, cut off) is kept as it is and done again in ``0002-2``, ``0002-3``, ...
+The columns of a plan and the folder of a batch are described in ``docs/reference/files.md``.  A trial that
+was not good (tripped, did not settle, marked bad, cut off) is kept as it is and done again in ``0002-2``.
 
 A batch that was stopped, by whatever, goes on where it was: :func:`run_batch` with the same plan and folder
 skips every trial that has a good grasp on disk.  The plan is kept in ``batch.json``; another plan in the same
@@ -15,9 +9,6 @@ folder is refused.
 
 After a trip the batch stops, unless its kind is one of ``again``: a cable that was out and is in, a device
 that was reset.  Then the trial is done once more, at most ``tries`` times.
-
-An object's temperature is what the warmer is set to, what a sensor reads as the gripper closes, or comes from
-the first touch of its ``touch_group``.
 
 The grasps of all good trials are :func:`collect` -ed into one record, labelled for ``classify``.
 """

@@ -1,11 +1,6 @@
 """The run folder: a session sample by sample, readable after a crash.
 
-    run.json       what was run: schema ``thermogrip.run``, versions, seed, hashes, at the end the verdict
-    samples.csv    one line a sample, written through at every line; the header names the units
-    events.jsonl   one JSON object a line: ``time_s``, ``kind``, ``text``, and ``data`` where there is some
-    grasps.csv, grasps_meta.csv    the grasp, where there was one
-    SHA256SUMS     of all of them, when the run is closed
-
+Its files, and which folders are refused, are described in ``docs/reference/files.md``.
 Lines of text are the one format that a killed process leaves whole; everything else is exported from it
 later. Each line is one ``write``, so that ``kill -9`` loses none, and the files are forced to disk once a
 second, so that a power cut loses at most the last one.
@@ -14,9 +9,6 @@ second, so that a power cut loses at most the last one.
 a file of their own from the start; they are given back then, so that the line at hand, the reason and the
 verdict still find room.  The caller gets the ``OSError``, and the loop switches off.  What was on
 disk stays.
-
-**A folder that somebody else can write to.**  Every file of a run is one that the run itself made: nothing
-that is there is opened, and no symbolic link is followed.  A folder with a link in it is refused.
 """
 
 from __future__ import annotations
@@ -36,7 +28,7 @@ from typing import Any
 from thermogrip.datasets.atomic_files import file_hash, open_new, write_atomic, write_json
 from thermogrip.datasets.errors import UserError, os_faults
 from thermogrip.datasets.media import csv_text
-from thermogrip.rig.session.loop import Event
+from thermogrip.rig.interface import Event
 from thermogrip.rig.session.session import Session
 from thermogrip.rig.session.signals import hold_signals
 

@@ -37,7 +37,8 @@ from typing import Any
 from thermogrip.datasets.errors import as_user_error
 from thermogrip.datasets.units import split_header
 from thermogrip.rig.clock import BackOff
-from thermogrip.rig.session.loop import Event, Recorder
+from thermogrip.rig.interface import Event
+from thermogrip.rig.session.loop import Recorder
 
 PREFIX = "/thermogrip"
 MAX_BYTES = 1 << 16  # of a message from the server that is read

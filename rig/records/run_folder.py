@@ -1,19 +1,12 @@
-"""A run folder read back, and repaired after a crash without touching a measured number.
+"""A run folder read back, repaired after a crash without touching a measured number, and exported.
 
 **Reading.**  A line counts if it is whole: ended, of the header's width, every cell a number or empty.  After
 a power cut a file system may leave half a line, or zeros, at the end; lines after the last whole one are the
 tail.  A bad line with whole ones after it is damage of another kind; it is skipped and reported.  The log and
 the grasps are made of the whole rows, never of anything else.
 
-**Recovering.**  :func:`recover` brings a folder into the state in which a clean end would have left it:
-
-1. where ``samples.csv`` or ``events.jsonl`` has lines that are not whole, the file as it is goes to
-   ``<name>.damaged`` (a copy, byte for byte), and the whole lines are written anew, byte for byte;
-2. a grasp that was recorded but not yet written (the session ended after "closed") is cut from the samples;
-3. ``run.json`` says ``interrupted`` in place of ``running``; SHA256SUMS is written.
-
-A folder whose sums agree is left as it is; one whose sums do not agree is refused, because then a file was
-changed after the run, and so is one with a symbolic link.
+**Recovering.**  :func:`recover` brings a folder into the state in which a clean end would have left it; what
+it does, and what it refuses, is in ``docs/reference/files.md``.
 """
 
 from __future__ import annotations
@@ -22,18 +15,28 @@ import csv
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from thermogrip.datasets.atomic_files import file_hash, read_bytes, read_json, write_atomic, write_json
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.atomic_files import (
+    atomic_path,
+    file_hash,
+    read_bytes,
+    read_json,
+    write_atomic,
+    write_json,
+)
+from thermogrip.datasets.errors import UserError, as_user_error
 from thermogrip.datasets.grasp_files import read_grasps, write_grasps
+from thermogrip.datasets.log_files import write_log
 from thermogrip.datasets.media import from_csv
-from thermogrip.datasets.schema import Grasps, Log
+from thermogrip.datasets.schema import Grasps, Log, column
 from thermogrip.rig.guard.sensor_checks import room_sensors
+from thermogrip.rig.interface import Event
 from thermogrip.rig.records.recorder import FILES, SCHEMA, VERSION, refuse_links, write_sums
-from thermogrip.rig.session.loop import PHASES, Event, log_of_rows
+from thermogrip.rig.session.loop import PHASES, log_of_rows
 from thermogrip.rig.session.session import grasp_of_rows
 
 _NUMBER = re.compile(rb"-?(?:\d+(?:\.\d+)?(?:e[+-]?\d+)?|inf)")
@@ -176,6 +179,94 @@ def mark_bad(folder: str | Path, why: str) -> None:
     write_atomic(path / "events.jsonl", before + line.encode() + b"\n")
     if (path / "SHA256SUMS").is_file():
         write_sums(path)
+
+
+def export_run(folder: str | Path, out: str | Path) -> Path:
+    """Write the log of a run folder and return the path.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Of the run.
+    out : str or Path
+        ``.nc``, ``.parquet``, ``.csv`` or ``.mcap``.
+
+    Raises
+    ------
+    UserError
+        If the run has no log, the ending is unknown, or MCAP is asked for without the package.
+
+    Examples
+    --------
+    >>> from tempfile import mkdtemp
+    >>> from thermogrip.rig.records.recorder import RunFolder
+    >>> with RunFolder(Path(mkdtemp()) / "run") as run:
+    ...     for k in range(2):
+    ...         run.sample({"time_s": k, "t_surface_degC": 25.5})
+    >>> export_run(run.path, run.path.parent / "log.csv").read_text().split()
+    ['time_s,t_surface_degC', '0.0,25.5', '1.0,25.5']
+    """
+    run, path = read_run(folder), Path(out)
+    if run.log is None:
+        raise UserError("has fewer than two rows", file=folder, hint="give a run that recorded something")
+    if path.suffix.lower() != ".mcap":
+        return write_log(run.log, path)
+    with atomic_path(path) as temporary:
+        _write_mcap(run, temporary)
+    return path
+
+
+def _write_mcap(run: Run, path: Path) -> None:
+    """Write one channel a variable of the log, as JSON messages (``{"time_s": .., "value": ..}``) with a JSON
+    schema that carries unit and role, so that any MCAP reader shows it without our types, and one of events.
+
+    Times are nanoseconds since 1970, counted from the run's date in ``run.json``.
+    """
+    hint = "pip install thermogrip[ros]"
+    with as_user_error(ImportError, "needs the package mcap", file=path, hint=hint):
+        from mcap.writer import Writer
+    log, began = run.log, _nanoseconds(run)
+    assert log is not None
+    columns = {str(name): column(log, str(name)) for name in log.data_vars}
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="", library="thermogrip")
+        writer.add_metadata("run", {"run.json": json.dumps(run.about)})
+        channels = {}
+        for name in columns:
+            attrs = {key: str(log[name].attrs[key]) for key in ("units", "role")}
+            channels[name] = _channel(writer, f"/{name}", f"sample_{name}", {"value": "number"}, attrs)
+        events = _channel(writer, "/events", "event", {"kind": "string", "text": "string"}, {})
+        for k, time_s in enumerate(log["time"].values.tolist()):
+            for name, values in columns.items():
+                if values[k] == values[k]:  # a lost reading is no message
+                    content = {"time_s": time_s, "value": float(values[k])}
+                    _message(writer, channels[name], began, k, content)
+        for k, event in enumerate(run.events):
+            _message(writer, events, began, k, asdict(event))
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+def _channel(writer: Any, topic: str, title: str, fields: dict[str, str], attrs: dict[str, str]) -> int:
+    """Register a channel of JSON messages, whose schema has the time besides these fields."""
+    properties = {key: {"type": kind} for key, kind in {"time_s": "number", **fields}.items()}
+    schema = json.dumps({"title": title, "type": "object", "properties": properties}).encode()
+    number = writer.register_schema(name=f"thermogrip.{title}", encoding="jsonschema", data=schema)
+    channel = writer.register_channel(topic=topic, message_encoding="json", schema_id=number, metadata=attrs)
+    return int(channel)
+
+
+def _message(writer: Any, channel: int, began: int, k: int, content: dict[str, Any]) -> None:
+    stamp, data = began + round(1e9 * content["time_s"]), json.dumps(content).encode()
+    writer.add_message(channel_id=channel, log_time=stamp, publish_time=stamp, sequence=k, data=data)
+
+
+def _nanoseconds(run: Run) -> int:
+    """Return when the run began [ns since 1970], 0 where not known."""
+    try:
+        return round(datetime.fromisoformat(str(run.about.get("began", ""))).timestamp()) * 1_000_000_000
+    except ValueError:
+        return 0
 
 
 def sums_agree(folder: Path) -> list[str] | None:

@@ -24,7 +24,7 @@ from thermogrip.datasets.units import join_header, split_header
 from thermogrip.mpc.interface import Controller, Move, Target
 from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.guard.trip import ENDLESS, Trip, TripError
-from thermogrip.rig.interface import DeviceRefusedError, Reading, Rig, SamplingRig
+from thermogrip.rig.interface import DeviceRefusedError, Event, Reading, Rig, SamplingRig
 from thermogrip.rig.serial.port import PortError
 from thermogrip.rig.session.signals import check_stopped, hold_signals
 
@@ -32,16 +32,6 @@ from thermogrip.rig.session.signals import check_stopped, hold_signals
 PHASES = ("settle", "hold", "lead_in", "pump_off", "contact", "release")
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Event:
-    """Something that happened: when [s, the rig's clock], of which kind, in words, and as data (JSON)."""
-
-    time_s: float
-    kind: str
-    text: str
-    data: Mapping[str, Any] = field(default_factory=dict)
 
 
 class Recorder(Protocol):

@@ -54,8 +54,8 @@ from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, Grasps, Log,
 from thermogrip.mpc.interface import Controller, Move, Target
 from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.guard.trip import Trip, TripError
-from thermogrip.rig.interface import Rig
-from thermogrip.rig.session.loop import PHASES, Event, Loop, Recorder
+from thermogrip.rig.interface import Event, Rig
+from thermogrip.rig.session.loop import PHASES, Loop, Recorder
 from thermogrip.rig.session.signals import stop_signals
 from thermogrip.sysid.effusivity.quality import find_contact
 

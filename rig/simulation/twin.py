@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.guard.sensor_checks import room_disturbances
-from thermogrip.rig.interface import UNIT_RANGES, Notice, Reading, check_order
+from thermogrip.rig.interface import UNIT_RANGES, Event, Reading, check_order
 from thermogrip.sysid.contact.simulation import ContactModel, Touch
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.plant.plant import Plant
@@ -246,7 +246,7 @@ class Twin:
             self._contact.left = self._added(self._outputs_alone()[self.skin])
             self._contact.opened = self.time
 
-    def notices(self) -> list[Notice]:
+    def notices(self) -> list[Event]:
         """Return nothing: no line and no device can fail here."""
         return []
 

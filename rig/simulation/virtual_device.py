@@ -15,9 +15,6 @@ quickest.
 ``trace`` keeps the truth of the last hour (or as many samples as asked), so that a test knows when the
 drive went to zero and how warm it got, whatever the sensors showed.
 
-The plant behind a virtual device, with sensors, drivers, pump and gripper that can fail
-----------------------------------------------------------------------------------------
-
 The plant is a :class:`~thermogrip.rig.simulation.twin.Twin`.  A fault sits where the real one would: a
 sensor's between the true temperature and the device, a stuck driver's between the device and the plant (only
 the supply cuts it), a stalled pump's in the pump, whatever was commanded.

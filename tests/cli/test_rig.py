@@ -383,7 +383,7 @@ def test_runs_are_repaired_one_by_one(rows: tuple[int | None, ...], bench: Bench
     found = stand_in("thermogrip.cli.rig._run_folders", folders)
     stand_in("thermogrip.rig.records.run_folder.recover", lambda folder: done_of[folder])
     marked = stand_in("thermogrip.rig.records.run_folder.mark_bad")
-    written = stand_in("thermogrip.rig.records.export.export_run")
+    written = stand_in("thermogrip.rig.records.run_folder.export_run")
     (bench.path / "runs").mkdir()
     done = bench.run("recover", "runs")
     assert (done.code, found[0].args) == (3 if not rows[1] else 0, (Path("runs"),))

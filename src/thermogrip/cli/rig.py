@@ -332,8 +332,7 @@ def recover(
         raise UserError("holds several runs", file=folder, hint="give the folder of one of them")
     if out is not None:
         new_file(out, (".nc", ".parquet", ".csv", ".mcap"))
-    from thermogrip.rig.records.export import export_run
-    from thermogrip.rig.records.run_folder import mark_bad, recover
+    from thermogrip.rig.records.run_folder import export_run, mark_bad, recover
 
     console = Console(as_json)
     results = []

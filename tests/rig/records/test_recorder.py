@@ -22,10 +22,10 @@ from tests.rig.fault_injection.drills import drill_plants
 from tests.rig.makers import Bench, Constant
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.guard.trip import Trip
+from thermogrip.rig.interface import Event
 from thermogrip.rig.records import recorder
 from thermogrip.rig.records.recorder import RESERVE, RunFolder
 from thermogrip.rig.records.run_folder import mark_bad, read_run, recover, sums_agree
-from thermogrip.rig.session.loop import Event
 from thermogrip.rig.session.session import Session, run_session
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.plant.plant import Plant

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from tests.rig.makers import PATIENCE_S
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.clock import SteppedClock
+from thermogrip.rig.interface import Event
 from thermogrip.rig.records.rosbridge import Bridge, Messages
-from thermogrip.rig.session.loop import Event
 from thermogrip.rig.session.session import run_session
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.plant.plant import Plant

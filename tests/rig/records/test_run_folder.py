@@ -20,11 +20,18 @@ from hypothesis import strategies as st
 from thermogrip.datasets.atomic_files import read_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import names
+from thermogrip.rig.interface import Event
 from thermogrip.rig.records import recorder
-from thermogrip.rig.records.export import _nanoseconds, export_run
 from thermogrip.rig.records.recorder import RunFolder
-from thermogrip.rig.records.run_folder import Run, mark_bad, read_run, recover, sums_agree
-from thermogrip.rig.session.loop import Event
+from thermogrip.rig.records.run_folder import (
+    Run,
+    _nanoseconds,
+    export_run,
+    mark_bad,
+    read_run,
+    recover,
+    sums_agree,
+)
 from thermogrip.rig.session.session import run_session
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.studies.demo import _fresh
@@ -33,7 +40,7 @@ from thermogrip.sysid.plant.plant import Plant
 WRITER = """
 import sys
 from thermogrip.rig.records.recorder import RunFolder
-from thermogrip.rig.session.loop import Event
+from thermogrip.rig.interface import Event
 folder = RunFolder(sys.argv[1], {"who": "a process that will be killed"})
 folder.event(Event(0.0, "phase", "settle"))
 k = 0

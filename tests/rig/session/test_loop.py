@@ -13,7 +13,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.rig.guard.guard import Guard, GuardSettings
 from thermogrip.rig.guard.trip import ENDLESS, KINDS, TripError
-from thermogrip.rig.interface import DeviceRefusedError, Notice, Reading
+from thermogrip.rig.interface import DeviceRefusedError, Event, Reading
 from thermogrip.rig.serial.port import PortError
 from thermogrip.rig.session.loop import Loop, log_of_rows, trip_of_device
 
@@ -219,7 +219,7 @@ def test_after_a_reset_or_an_expired_drive_the_last_row_is_not_known(
     kinds: tuple[str, ...], kind: str, expected: str
 ) -> None:
     run = started()
-    run.rig.notices.return_value = [Notice(1.0, one, f"{one} it was") for one in kinds]
+    run.rig.notices.return_value = [Event(1.0, one, f"{one} it was") for one in kinds]
     if not kind:
         run.wait(0.5)
     else:
