@@ -34,6 +34,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import as_logs
 from thermogrip.datasets.parallel import Workers, run_parallel
@@ -57,7 +58,7 @@ from thermogrip.sysid.validation.prediction_bands import SHORT, between_runs, ex
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from thermogrip.sysid.models.model import Array, GreyModel
+    from thermogrip.sysid.models.model import GreyModel
 
 WITHIN_NOISE = 1.1  # of the best error: then the network is preferred, and a linear kind on another run
 LINEAR = ("arx", "oe", "subspace")  # kept where another kind errs hardly less

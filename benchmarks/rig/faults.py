@@ -167,9 +167,7 @@ def main() -> None:
             share=share, percent=100 * share, n=n, sessions=run["sessions"], hours=run["hours"]
         )
     slow += drift_section(controller, outcomes) if stated else ""
-    said = [
-        f"    {o.message}" for o in outcomes if o.drill.name in ("pump stops", "driver gives nothing")
-    ]
+    said = [f"    {o.message}" for o in outcomes if o.drill.name in ("pump stops", "driver gives nothing")]
     kinds = [f"| `{kind}` | {check} | {clear} |" for kind, (check, clear) in KINDS.items()]
     text = HEAD + "\n".join(lines) + "\n" + slow + SAID + "\n\n".join(said) + "\n"
     ends = [f"- `{kind}`: {clear}" for kind, clear in ENDLESS.items()]

@@ -25,16 +25,14 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.schema import Log, column, make_log, names
 from thermogrip.mpc.interface import Controller, Move, Readings, Regulator, Target
 from thermogrip.mpc.plant.prediction import PredictionModel
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -329,14 +327,14 @@ def _segments(
     return tuple(found)
 
 
-def drive_shares(drives: Array, lowest: Array, highest: Array) -> tuple[Array, NDArray[np.bool_]]:
+def drive_shares(drives: Array, lowest: Array, highest: Array) -> tuple[Array, Mask]:
     """Return drives (n, n_u) in fractions of full drive, and at which samples (n,) one is at its limit."""
     full = np.any(np.isclose(drives, lowest) | np.isclose(drives, highest), axis=1)
     return drives / np.maximum(np.abs(lowest), np.abs(highest)), full
 
 
 def segment_of(
-    name: str, time: Array, y: Array, goal: float, drive: Array, full: NDArray[np.bool_], band: float
+    name: str, time: Array, y: Array, goal: float, drive: Array, full: Mask, band: float
 ) -> Segment:
     """Return one target of a run: outputs y (n,) [degC] at times (n,) [s], drives (k, n_u) by sample in
     fractions of full drive, ``full`` (k,) where one is at its limit.

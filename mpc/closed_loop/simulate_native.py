@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Surroundings, Truth, record_loop
 from thermogrip.mpc.controllers.base import as_drive
 from thermogrip.mpc.controllers.mpc import Controller
@@ -21,8 +22,6 @@ from thermogrip.mpc.native.runtime import CompiledController, CompiledTruth, add
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 def compiled_loop(

@@ -10,13 +10,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.mpc.estimator.call_times import SAME, CallTimes
 from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.mpc.plant.prediction import PredictionModel
-
-Array = NDArray[np.float64]
 
 #: Readings outside are a broken wire, not a temperature [degC].
 PLAUSIBLE = (-60.0, 200.0)
@@ -65,7 +64,7 @@ class SampledController:
         return self.model.dt
 
     @property
-    def _lost(self) -> NDArray[np.bool_]:
+    def _lost(self) -> Mask:
         """Which controlled outputs have not been read for longer than patience."""
         return np.asarray(self._unread_s > self._patience_s)
 

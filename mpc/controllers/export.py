@@ -17,17 +17,18 @@ a loop of its own, C and Python stay within 1e-11 all the way.
 from __future__ import annotations
 
 import subprocess
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import markdown
+from thermogrip.datasets.parallel import Progress
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.estimator.observer import Observer
 from thermogrip.mpc.interface import STATUSES
@@ -46,9 +47,6 @@ from thermogrip.mpc.optimiser.active_set import ActiveSetQP
 
 if TYPE_CHECKING:
     from thermogrip.mpc.design.design import Design
-
-Array = NDArray[np.float64]
-Progress = Callable[[float, str], None]
 
 _COPIED = (*SOURCES, "Makefile", "example.c", "check.c")
 # of a drive's range; where dozens of soft rows are broken, a plan is a small difference of large multipliers,

@@ -18,12 +18,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from thermogrip.datasets.arrays import Array
 
 if TYPE_CHECKING:
     from thermogrip.mpc.optimiser.rti import ControllerParts, Optimiser
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

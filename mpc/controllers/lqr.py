@@ -45,9 +45,9 @@ from math import ceil
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
+from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers.base import SampledController
 from thermogrip.mpc.controllers.pi import held_drive
@@ -59,8 +59,6 @@ from thermogrip.mpc.plant.prediction import PredictionModel, prediction_model
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
-
-Array = NDArray[np.float64]
 
 _LONGEST = 1000.0  # samples that a mean is taken over
 _LEAST_WEIGHT = 1e-6  # of a drive: without one, two drives on one output would drift against each other
@@ -197,7 +195,7 @@ class LQRController(SampledController):
         proposed[live] = opening(np.stack(moves), samples)
         return proposed
 
-    def _parked(self, lost: NDArray[np.bool_]) -> list[int]:
+    def _parked(self, lost: Mask) -> list[int]:
         """Return the drives whose loops are lost."""
         return [drive for drive, output in self._pair if lost[output]]
 
@@ -216,7 +214,7 @@ class LQRController(SampledController):
                 self._laws[key] = self._rest_law_without(lost) if lost.any() else self._resting
         return self._laws[key]
 
-    def _rest_law_without(self, lost: NDArray[np.bool_]) -> _Law | None:
+    def _rest_law_without(self, lost: Mask) -> _Law | None:
         try:
             return self._law_at(self._resting.point, lost)
         except (np.linalg.LinAlgError, ValueError):
@@ -233,7 +231,7 @@ class LQRController(SampledController):
                 hint="control an output that a drive moves",
             ) from error
 
-    def _law_at(self, point: _Point, lost: NDArray[np.bool_]) -> _Law:
+    def _law_at(self, point: _Point, lost: Mask) -> _Law:
         seen = np.flatnonzero(~lost).tolist()
         parked = self._parked(lost)
         live = [drive for drive in range(self.model.n_u) if drive not in parked]

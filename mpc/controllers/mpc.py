@@ -35,8 +35,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers.base import STALE, SampledController
@@ -55,8 +55,6 @@ if TYPE_CHECKING:
     from thermogrip.mpc.native.runtime import CompiledController
     from thermogrip.sysid.models.model import Model
     from thermogrip.sysid.plant.plant import Plant
-
-Array = NDArray[np.float64]
 
 _KEPT_DRAWS = 50  # of the posterior, in the controller's file for its review
 _WEAK = 0.05  # of its gain at rest, below which a drive's bias is not learnt
@@ -353,7 +351,7 @@ class Controller(SampledController):
         stuck = ", stuck: it should have moved" if self.monitor.stuck.any() else ""
         return jumped or (f"{', '.join(lost)}: no usable reading{stuck}" if lost else "")
 
-    def _accept_jump(self, y: Array, stays: NDArray[np.bool_]) -> str:
+    def _accept_jump(self, y: Array, stays: Mask) -> str:
         """Take a jump that stays for an offset of its sensor, or for another world; return what it was."""
         names = ", ".join(name for name, jumped in zip(self.model.outputs, stays) if jumped)
         if 2 * stays.sum() < np.isfinite(y).sum():

@@ -21,8 +21,8 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.controllers.base import SampledController
 from thermogrip.mpc.design.simc import PILoop, default_controlled, pair_loops
 from thermogrip.mpc.interface import Move, Readings, Target
@@ -31,8 +31,6 @@ from thermogrip.mpc.plant.steady_state import holding_drive
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 class PIController(SampledController):

@@ -23,11 +23,9 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.interface import number
-
-Array = NDArray[np.float64]
 
 #: A longer silence than this and the past is unknown [s].
 RESTART_S = 30.0

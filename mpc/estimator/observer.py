@@ -68,14 +68,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
+from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.estimator.call_times import SAME
 from thermogrip.mpc.plant.prediction import ROOM, PredictionModel
-
-Array = NDArray[np.float64]
 
 #: Standard deviation of a sensor's offset that nobody knows [degC].
 OFFSET = 0.3
@@ -293,14 +291,14 @@ class Observer:
         self.found_offset = np.zeros(model.n_y)
         self.P0 = np.where(self.is_drive, 0.03, OFFSET) ** 2
         # a sensor without an offset among the disturbance states is read as loosely, once
-        self.fixed: NDArray[np.bool_] = np.asarray(~disturbance.on_output.any(axis=1))
+        self.fixed: Mask = np.asarray(~disturbance.on_output.any(axis=1))
         self.R_start = self.R + np.where(self.fixed, OFFSET**2, 0.0)
         self._P = np.zeros((model.n_x + disturbance.n_w,) * 2)
         self._held = np.zeros(model.n_x + disturbance.n_w, dtype=bool)
         self.innovation = np.zeros(model.n_y)
         self._on_sample()
 
-    def hold_drives(self, weak: NDArray[np.bool_]) -> None:
+    def hold_drives(self, weak: Mask) -> None:
         """Stop learning the bias of drives (n_u,) whose gain is weak or has turned over.
 
         There a bias explains nothing, or everything with the wrong sign; the other disturbances go on.
@@ -352,7 +350,7 @@ class Observer:
         """Return what the filter knows: ``x``, ``w``, their covariance ``P``, and ``found_offset``."""
         return {"x": self.x, "w": self.w, "P": self._P, "found_offset": self.found_offset}
 
-    def set_offsets(self, y: Array, which: NDArray[np.bool_]) -> None:
+    def set_offsets(self, y: Array, which: Mask) -> None:
         """Take what a reading (n_y,) differs by for offsets of the sensors ``which`` (n_y,)."""
         seen = which & np.isfinite(y)
         self.found_offset = self.found_offset + np.where(seen, np.nan_to_num(y) - self.reading(), 0.0)

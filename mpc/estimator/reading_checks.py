@@ -24,14 +24,12 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.mpc.interface import number
 
 if TYPE_CHECKING:
     from thermogrip.mpc.estimator.observer import Observer
-
-Array = NDArray[np.float64]
 
 _SPIKE = 6.0  # degC off the prediction in one sample: a loose plug, unless it stays
 _LEFT_OUT = 3  # samples in a row, at most, that a jump is left out for
@@ -58,11 +56,11 @@ class ReadingMonitor:
         self._moved = self._moved + change
 
     @property
-    def stuck(self) -> NDArray[np.bool_]:
+    def stuck(self) -> Mask:
         """Which readings (n_y,) have stayed the same too long to be true."""
         return np.asarray(np.abs(self._moved) > _STUCK)
 
-    def screen(self, y: Array, expected: Array) -> tuple[Array, NDArray[np.bool_]]:
+    def screen(self, y: Array, expected: Array) -> tuple[Array, Mask]:
         """Return a reading y (n_y,) [degC], NaN where it cannot be, and which of its sensors (n_y,) have
         jumped and stay there; ``expected`` (n_y,) is the prediction.
         """

@@ -11,12 +11,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from thermogrip.datasets.arrays import Array
 
 if TYPE_CHECKING:
     from thermogrip.mpc.optimiser.rti import ControllerParts
-
-Array = NDArray[np.float64]
 
 ITERATION_LIMIT = 500
 _BINS = 12  # TG_BINS of tg_controller.h

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.mpc.estimator.observer import Observer
 from thermogrip.mpc.native.build import (
     SOURCES,
@@ -34,8 +35,6 @@ if TYPE_CHECKING:
     from thermogrip.mpc.optimiser.rti import ControllerParts
     from thermogrip.mpc.plant.prediction import PredictionModel
     from thermogrip.sysid.models.model import Model
-
-Array = NDArray[np.float64]
 
 #: What tg_qp.h calls its answers.
 QP_STATUS = ("solved", "infeasible", "iteration limit", "not convex", "not finite", "time limit")
@@ -221,7 +220,7 @@ class CompiledOptimiser(Optimiser):
         bias: Array,
         drive_bias: Array,
         slew_s: float | None = None,
-        lost: NDArray[np.bool_] | None = None,
+        lost: Mask | None = None,
     ) -> Outcome:
         """Improve a plan; see :meth:`Optimiser.solve`."""
         *parts, slew = self._parts

@@ -10,11 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.mpc.optimiser.qp import QPAnswer
-
-Array = NDArray[np.float64]
 
 _REGULAR, _TOLERANCE, _SHORT, _CONTRADICTION, _FAR = 1e-11, 1e-10, 1e-5, 1e-6, 1e15
 _HARD, _KEPT, _BROKEN = 0, 1, 2
@@ -35,9 +33,7 @@ class ActiveSetQP:
     always cold.
     """
 
-    def __init__(
-        self, *, soft: NDArray[np.bool_], linear: float, quadratic: float, iteration_limit: int = 500
-    ) -> None:
+    def __init__(self, *, soft: Mask, linear: float, quadratic: float, iteration_limit: int = 500) -> None:
         self.soft, self.linear, self.quadratic = np.asarray(soft, bool), linear, quadratic
         self.iteration_limit = iteration_limit
 

@@ -31,6 +31,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Mask
+
 LEAST_QUADRATIC = 1e-9  # of a scaled row's quadratic penalty
 
 Vector = NDArray[np.float64]
@@ -71,7 +73,7 @@ class QPAnswer:
 class QPSolver(Protocol):
     """What solves an optimiser's program."""
 
-    soft: NDArray[np.bool_]
+    soft: Mask
 
     def solve(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QPAnswer:
         """Return the minimiser with its status."""

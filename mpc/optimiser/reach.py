@@ -47,12 +47,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.optimiser.rti import FADING, Optimiser, allowed_share
 
 if TYPE_CHECKING:
     from thermogrip.mpc.estimator.observer import Observer
-
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _STEPS, _SWEEPS = 12, 200

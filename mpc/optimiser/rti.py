@@ -35,12 +35,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.mpc.design.design import Design
 from thermogrip.mpc.estimator.observer import DisturbanceModel, Observer
 from thermogrip.mpc.optimiser.qp import CondensedQP, QPSolver
 from thermogrip.mpc.plant.prediction import PredictionModel
-
-Array = NDArray[np.float64]
 
 _SHARES = np.array([0.5, 0.25, 0.1, 0.0])
 _SAFE = 0.75  # of the way to the optimum, where the range runs on beyond it
@@ -119,7 +118,7 @@ class Optimiser:
         bias: Array,
         drive_bias: Array,
         slew_s: float | None = None,
-        lost: NDArray[np.bool_] | None = None,
+        lost: Mask | None = None,
     ) -> Outcome:
         """Improve a plan: return :class:`Outcome` for state x, drives ``last`` applied now, and the plan
         ``guess`` (n_b, n_u) to linearise along.

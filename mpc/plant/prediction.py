@@ -35,8 +35,9 @@ from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from thermogrip.datasets.arrays import Array, Values
 from thermogrip.datasets.errors import UserError
 
 if TYPE_CHECKING:
@@ -66,8 +67,6 @@ def drive_range(plant: Plant, name: str) -> tuple[float, float]:
         raise UserError(f"drive {name} was constant in the logs", hint="identify with a log that moves it")
     return float(low), float(high)
 
-
-Array = NDArray[np.float64]
 
 _STEP_ERROR = 0.01  # degC, of the prediction by a coarser step
 #: The room's temperature where nothing is known of it [degC].
@@ -328,17 +327,15 @@ class _TangentSteps:
         used = {self._names[of.instruction_id(k)] for k in range(of.n_instructions())}
         return used <= {"OP_INPUT", "OP_OUTPUT", "OP_CONST", *_ARITHMETIC}
 
-    def prepare(self, p: Sequence[Any]) -> list[Any]:
+    def prepare(self, p: Values) -> list[Any]:
         """Return nothing: parameters are numbers in the step."""
         return []
 
-    def renew(self, u: Sequence[Any], c: Sequence[Any], h: Any) -> list[Any]:
+    def renew(self, u: Values, c: Values, h: Any) -> list[Any]:
         """Return nothing: switches stay on."""
         return []
 
-    def advance(
-        self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], c: Sequence[Any], kept: Any, h: Any
-    ) -> list[Any]:
+    def advance(self, x: Values, u: Values, d: Values, c: Values, kept: Values, h: Any) -> list[Any]:
         """Return the state after the step, then its direction, by CasADi's instructions one by one."""
         halves = [(values[: len(values) // 2], values[len(values) // 2 :]) for values in (x, u, d)]
         given = [half[0] for half in halves] + [half[1] for half in halves]
@@ -357,7 +354,7 @@ class _TangentSteps:
                 work[into[0]] = _ARITHMETIC[name](*(work[place] for place in out_of))
         return [*results[0], *results[1]]
 
-    def read(self, x: Sequence[Any], c: Sequence[Any]) -> list[Any]:
+    def read(self, x: Values, c: Values) -> list[Any]:
         """Return the outputs, then their direction."""
         half = len(x) // 2
         rows = [(level, x[:half]) for level in self._level], [(0.0, x[half:]) for _ in self._level]

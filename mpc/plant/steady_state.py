@@ -11,12 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.plant.prediction import PredictionModel
-
-Array = NDArray[np.float64]
 
 _NEWTON_STEPS, _BALANCED = 20, 1e-7  # and by how much a state may move in a sample [degC]
 

@@ -33,8 +33,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.closed_loop.simulate import simulate_closed_loop
 from thermogrip.mpc.controllers.linear_equivalent import LinearLaw, linear_law, linear_move
@@ -46,8 +46,6 @@ from thermogrip.mpc.optimiser.rti import Optimiser
 from thermogrip.mpc.plant.prediction import PredictionModel, step_response
 from thermogrip.mpc.plant.steady_state import holding_drive, steady_curve
 from thermogrip.mpc.tuning.objective import draws_of
-
-Array = NDArray[np.float64]
 
 _RANK = {"pass": 0, "warn": 1, "fail": 2}
 _KELVIN = 273.15

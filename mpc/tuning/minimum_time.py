@@ -23,18 +23,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linprog
 from scipy.sparse import diags_array, kron, vstack
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.design.design import Design
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.plant.prediction import PredictionModel, prediction_model
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
-
-Array = NDArray[np.float64]
 
 _LEVELS = np.linspace(0.4, 1.0, 13)
 _CLIMBS = 12

@@ -25,7 +25,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Surroundings, simulate_closed_loop
@@ -41,8 +40,6 @@ from thermogrip.mpc.tuning.minimum_time import full_drive_bound
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from thermogrip.datasets.arrays import Mask
 from thermogrip.mpc.tuning.objective import Trial
 
 #: Differences that do not count: settling [s], overshoot [degC], energy [share of the largest].
@@ -52,7 +53,7 @@ class Pareto:
         ]
 
 
-def non_dominated(points: ArrayLike) -> NDArray[np.bool_]:
+def non_dominated(points: ArrayLike) -> Mask:
     """Return which points (n, k), to be made small, no other dominates (n,)."""
     values = np.asarray(points, dtype=float)
     finite = np.isfinite(values).all(axis=1)

@@ -15,16 +15,16 @@ whether weights were the limit at all (:mod:`thermogrip.mpc.tuning.summary`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from thermogrip.datasets.parallel import Workers, run_parallel, sub_progress
+from thermogrip.datasets.arrays import Array
+from thermogrip.datasets.parallel import Progress, Workers, run_parallel, sub_progress
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import Design
@@ -47,9 +47,6 @@ from thermogrip.mpc.tuning.summary import Row, meets_spec, rows_of, verdict_of
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
-
-Array = NDArray[np.float64]
-Progress = Callable[[float, str], None]
 
 _WORTH = 0.01  # by which a traded design must be better on the spec's own score to be taken
 

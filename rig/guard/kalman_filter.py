@@ -35,10 +35,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.limits import keyed
 from thermogrip.rig.guard.sensor_checks import room_disturbances
 from thermogrip.rig.interface import UNIT_RANGES
-from thermogrip.sysid.models.model import Array
 from thermogrip.sysid.plant.plant import Plant
 
 

@@ -48,10 +48,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.limits import keyed
 from thermogrip.rig.guard.kalman_filter import Estimate, FilterSettings, History, RigFilter, RigModel
 from thermogrip.rig.guard.plant_mismatch import MOST_DRIFT, Evidence, PlantDrift
-from thermogrip.sysid.models.model import Array
 from thermogrip.sysid.plant.plant import Plant
 
 

@@ -42,9 +42,9 @@ from typing import Any
 
 import numpy as np
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError, as_user_error
-from thermogrip.sysid.models.model import Array
 from thermogrip.sysid.plant.plant import Plant
 
 SCHEMA, VERSION = "thermogrip.plant_drift", 1

@@ -27,16 +27,15 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import f as f_distribution
 
+from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.repair import GAP_SECONDS, GAP_STEPS
 from thermogrip.datasets.resample import gaps
 from thermogrip.datasets.schema import Log, column, log_name
 from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid, quantum, sample_time, signals
 from thermogrip.sysid.plant.plant import Plant
 
-Array = NDArray[np.float64]
 Verdict = Literal["ok", "warn", "fail"]
 
 _FEW_READINGS = 50  # too few to question their noise
@@ -450,7 +449,7 @@ def _spent(steps: Array) -> Array:
     return np.asarray(np.minimum(np.append(steps, usual), max(GAP_SECONDS, GAP_STEPS * usual)))
 
 
-def _kinds(name: str, values: Sequence[Array], *, on_off: bool) -> dict[str, list[NDArray[np.bool_]]]:
+def _kinds(name: str, values: Sequence[Array], *, on_off: bool) -> dict[str, list[Mask]]:
     """Return the kinds of drive of an input and which rows are of each."""
     if on_off:
         return {f"{name} on": [v > 0.5 for v in values], f"{name} off": [v <= 0.5 for v in values]}

@@ -73,8 +73,8 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.greybox.noise_model import Block, ErrorModel
 from thermogrip.sysid.greybox.problem import prior_plant
@@ -83,7 +83,6 @@ from thermogrip.sysid.models.model import GreyModel
 from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.plant.plant import Plant
 
-Array = NDArray[np.float64]
 Discrepancy = Literal["rescaled", "absent", "as learnt"]
 
 _TINY = 1e-9  # keeps the score's covariance invertible in directions without information

@@ -31,14 +31,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.parallel import Progress
 from thermogrip.datasets.schema import Log, column, make_log
 from thermogrip.sysid.experiment.information import ROOM, Discrepancy, ExperimentForecast, interval_widths
 from thermogrip.sysid.experiment.schedules import REST
 from thermogrip.sysid.plant.plant import Plant
-
-Array = NDArray[np.float64]
-Progress = Callable[[float, str], None]
 
 EVALUATIONS = 1500
 OTHER_DISCREPANCY: tuple[Discrepancy, ...] = ("absent", "as learnt")  # the model discrepancy may be instead
@@ -227,7 +226,7 @@ class _Frame:
     rest: int  # steps of the plant before the first cell
     low: Array
     high: Array
-    switch: NDArray[np.bool_]
+    switch: Mask
     together: NDArray[np.int64]  # cells that change as one, by input
     still: Array
     slew: float

@@ -17,12 +17,10 @@ A slew limit is kept by ramps.  The first 6 s rest at the middle, so that the st
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
-
-Array = NDArray[np.float64]
 
 KINDS = ("prbs", "multisine", "staircase")
 

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.export.linearise import LinearPlant, composed, linearise_plant
 from thermogrip.sysid.plant.fit_record import RUN_GAIN_SD, SEVERAL
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
 __all__ = ["Dynamics", "Estimate", "plant_dynamics"]
-
-Array = NDArray[np.float64]
 
 _DELAY = 1e-6  # modulus of a discrete pole that is part of a delay
 _ROUNDING = 1e-9  # of the largest entry of A

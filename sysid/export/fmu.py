@@ -27,15 +27,13 @@ from typing import Any
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import atomic_path
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.export.libraries import needed
 from thermogrip.sysid.export.linearise import operating_point
 from thermogrip.sysid.plant.plant import Plant
-
-Array = NDArray[np.float64]
 
 START = "start_"  # with the name of an output: what it reads when the simulation begins
 

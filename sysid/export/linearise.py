@@ -24,9 +24,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.linalg import logm
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import atomic_path, write_atomic
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import csv_text
@@ -34,8 +35,6 @@ from thermogrip.sysid.models.model import GreyModel
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
-
-Array = NDArray[np.float64]
 
 ROOM = 25.0  # degC, where no temperature of the room is given
 _NUDGE = 1e-3

@@ -47,6 +47,8 @@ import numpy as np
 from llvmlite import binding, ir
 from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array, Values
+
 #: Numbers side by side.
 WIDTH = 8
 
@@ -244,7 +246,7 @@ _SAME = (
 _LIBRARY = {getattr(np, name): name for name in _SAME} | {np.arctan: "atan", np.arctan2: "atan2"}
 
 
-def _elementary(function: Any, method: str, inputs: Sequence[Any], options: dict[str, Any]) -> Any:
+def _elementary(function: Any, method: str, inputs: Values, options: dict[str, Any]) -> Any:
     """Return a function of NumPy, of vectors and plain numbers."""
     if method != "__call__" or options or not (function in _OWN or function in _LIBRARY):
         name = getattr(function, "__name__", function)
@@ -269,7 +271,7 @@ def store(builder: ir.IRBuilder, place: Any, value: Any) -> None:
     builder.store(register(value), builder.bitcast(place, VECTOR.as_pointer()), align=8)
 
 
-def gather(builder: ir.IRBuilder, places: Sequence[Any], index: Any) -> Vector:
+def gather(builder: ir.IRBuilder, places: Values, index: Any) -> Vector:
     """Return a vector of the entries ``index`` of eight arrays."""
     filled = ir.Constant(VECTOR, ir.Undefined)
     for k, place in enumerate(places):
@@ -309,8 +311,6 @@ def _is(value: Any, number: float) -> bool:
     return not isinstance(value, Vector) and value == number
 
 
-Array = NDArray[np.float64]
-
 # Fewer steps of a block than this are done sooner than another thread takes over.
 _WORTH_THREADS = 1000
 _FIRST = INTEGER(0)
@@ -324,27 +324,19 @@ class Equations(Protocol):
         """Numbers of states, inputs, disturbances and parameters."""
         ...
 
-    def prepare(self, p: Sequence[Any]) -> list[Any]:
+    def prepare(self, p: Values) -> list[Any]:
         """Return what depends on the parameters alone, c."""
         ...
 
-    def renew(self, u: Sequence[Any], c: Sequence[Any], h: Any) -> list[Any]:
+    def renew(self, u: Values, c: Values, h: Any) -> list[Any]:
         """Return what depends on the switches among the inputs besides, and on the step h [s]."""
         ...
 
-    def advance(
-        self,
-        x: Sequence[Any],
-        u: Sequence[Any],
-        d: Sequence[Any],
-        c: Sequence[Any],
-        kept: Sequence[Any],
-        h: Any,
-    ) -> list[Any]:
+    def advance(self, x: Values, u: Values, d: Values, c: Values, kept: Values, h: Any) -> list[Any]:
         """Return the state after h seconds."""
         ...
 
-    def read(self, x: Sequence[Any], c: Sequence[Any]) -> list[Any]:
+    def read(self, x: Values, c: Values) -> list[Any]:
         """Return the outputs."""
         ...
 
@@ -497,7 +489,7 @@ class _Writer:
         base = self.at.mul(t, INTEGER(n))
         return [gather(self.at, self.places[k], self.at.add(base, INTEGER(i))) for i in range(n)]
 
-    def _put(self, values: Sequence[Any], array: Any, row: Any, length: Any) -> int:
+    def _put(self, values: Values, array: Any, row: Any, length: Any) -> int:
         """Write values[m] to the block's columns of array[m, row]; return how many there are."""
         for m, value in enumerate(values):
             offset = self.at.mul(self.at.add(self.at.mul(INTEGER(m), length), row), self.columns)

@@ -19,12 +19,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from thermogrip.datasets.arrays import Array, Values
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import Model
-
-Array = NDArray[np.float64]
 
 
 def evaluate_terms(terms: Sequence[str], names: Sequence[str], rows: Array) -> Array:
@@ -124,7 +123,7 @@ def read_terms(terms: Sequence[str], names: Sequence[str]) -> list[list[tuple[in
     return out
 
 
-def product_of(factors: Sequence[tuple[int, bool]], u: Sequence[Any], d: Sequence[Any], n_u: int) -> Any:
+def product_of(factors: Sequence[tuple[int, bool]], u: Values, d: Values, n_u: int) -> Any:
     """Return one product of inputs and disturbances in plain arithmetic (numbers or symbols)."""
     value: Any = 1.0
     for index, magnitude in factors:

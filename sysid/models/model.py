@@ -18,16 +18,20 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol, runtime_checkable
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, runtime_checkable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from thermogrip.datasets.arrays import Array, Mask, Run, Values
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.limits import STEP_RANGE, array_within, number_within
 from thermogrip.datasets.schema import Log
 from thermogrip.sysid.models.network_spec import Parameter
 
-Array = NDArray[np.float64]
+if TYPE_CHECKING:
+    from thermogrip.sysid.models.jit_rollout import Equations
 
 SMOOTH = 20.0  # [s] mean of a measured ambient, for its sensor is slow and coarse
 
@@ -76,19 +80,15 @@ class Model(Protocol):
         """Return the state (n_x,) of a plant at rest whose outputs read y, held by some input near u."""
         ...
 
-    def step(
-        self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any], dt: float
-    ) -> list[Any]:
+    def step(self, x: Values, u: Values, d: Values, p: Values, dt: float) -> list[Any]:
         """Return the state one step later; u and d are held over the step."""
         ...
 
-    def output(self, x: Sequence[Any], p: Sequence[Any]) -> list[Any]:
+    def output(self, x: Values, p: Values) -> list[Any]:
         """Return the outputs at state x."""
         ...
 
-    def rollout(
-        self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float
-    ) -> tuple[Array, Array]:
+    def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
         """Simulate a batch: x0 (B, n_x), u (B|1, N, n_u), d (B|1, N, n_d), p (B|1, n_p).
 
         Returns y (B, N + 1, n_y), row 0 at x0, and the last state (B, n_x).
@@ -100,11 +100,46 @@ class Model(Protocol):
         ...
 
 
-def check_spread(spread: Any) -> None:
-    """Raise ValueError where the covariance of a state has a variance that is not positive."""
-    found = np.asarray(spread, dtype=float)
-    if found.ndim == 2 and not (np.diagonal(found) > 0).all():
-        raise ValueError("spread has a variance that is not positive")
+@dataclass(frozen=True, eq=False)
+class BlackBox:
+    """What linear, polynomial and neural models share: their numbers are fields, and keys of a file."""
+
+    kind: ClassVar[str]
+    title: ClassVar[str]
+    labels: ClassVar[tuple[str, ...]] = ("inputs", "disturbances", "outputs", "switches")
+    arrays: ClassVar[tuple[str, ...]]
+    parameters: ClassVar[tuple[str, ...]] = ()
+    smooth: ClassVar[float] = SMOOTH
+    command_steps: ClassVar[Mapping[str, float]] = {}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the model as plain lists and numbers, for JSON."""
+        return {"kind": self.kind} | {entry.name: _plain(getattr(self, entry.name)) for entry in fields(self)}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """Return the model of :meth:`to_dict`; raise :class:`UserError` where a field is missing or wrong."""
+        try:
+            content: dict[str, Any] = {key: tuple(str(name) for name in data[key]) for key in cls.labels}
+            content |= {key: array_within(data, key) for key in cls.arrays}
+            if content["spread"].ndim == 2 and not (np.diagonal(content["spread"]) > 0).all():
+                raise ValueError("spread has a variance that is not positive")
+            return cls(**content, dt=number_within(data, "dt", *STEP_RANGE), **cls.others(data))
+        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+            raise UserError(f"not a {cls.title} ({error})", hint="save it again with this version") from error
+
+    @staticmethod
+    def others(data: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the fields that are neither names nor plain arrays."""
+        return {}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return list(value) if isinstance(value, tuple) else value
 
 
 def load_model(content: Mapping[str, Any], *, code: Model | None = None) -> Model:
@@ -192,8 +227,29 @@ class Described:
         self.units: dict[str, str] = {name: item.unit for group in groups for name, item in group.items()}
         sensors = (*tables.outputs.items(), *tables.disturbances.items())
         self.nuisance: dict[str, float] = {name: item.log_sd for name, item in sensors}
+        self.prior = np.array([item.value for item in self.specs.values()])  # (n_p,), median or mean
 
-    @property
-    def prior(self) -> Array:
-        """Prior median (mean) of each parameter, shape (n_p,)."""
-        return np.array([item.value for item in self.specs.values()])
+
+def roll_rows(
+    steps: Equations,
+    x0: Array,
+    u: Array,
+    d: Array,
+    p: Array,
+    h: float,
+    renew: Mask | None = None,
+    pieces: int = 1,
+) -> Run:
+    """Do without a compiler what a compiled kernel does: the same lines on rows with one entry a member."""
+    n_batch, n = len(x0), u.shape[1]
+    c, x, kept = steps.prepare(list(p.T)), list(x0.T.copy()), list[Any]()
+    u_rows, d_rows = list(u.transpose(1, 2, 0)), list(d.transpose(1, 2, 0))
+    with np.errstate(all="ignore"):  # what is not finite is found afterwards
+        seen = steps.read(x, c)
+        for t in range(n):
+            kept = steps.renew(u_rows[t], c, h) if renew is None or renew[t] else kept
+            for _ in range(pieces):
+                x = steps.advance(x, u_rows[t], d_rows[t], c, kept, h)
+            seen += steps.read(x, c)
+    y, last = ([np.broadcast_to(value, n_batch) for value in values] for values in (seen, x))
+    return np.array(y, dtype=float).reshape(n + 1, -1, n_batch).transpose(2, 0, 1), np.array(last).T

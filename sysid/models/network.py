@@ -17,23 +17,22 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from thermogrip.datasets.arrays import Array, Run, Values
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log
-from thermogrip.sysid.models.model import SMOOTH, Described, FreeRuns
+from thermogrip.sysid.models.model import SMOOTH, Described, FreeRuns, roll_rows
 from thermogrip.sysid.models.network_equations import ThermalSteps, build_layout, state_names
 from thermogrip.sysid.models.network_spec import Network, named_network, network_from_dict
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.jit_rollout import Kernel
-
-Array = NDArray[np.float64]
 
 _SENSOR_WEIGHT, _INPUT_WEIGHT, _LEVEL_WEIGHT = 1e2, 1e-3, 1e-6
 
@@ -49,75 +48,41 @@ class NetworkModel(Described):
         super().__init__(network)
         self.network = network
         self.steps = ThermalSteps(build_layout(network), len(network.inputs), len(network.parameters))
-        self.states: tuple[str, ...] = state_names(network)
-
-    @property
-    def n_x(self) -> int:
-        """Number of states."""
-        return len(self.states)
-
-    @property
-    def reference(self) -> str | None:
-        """The sensor that defines the temperature scale, if one does."""
-        return next((name for name, item in self.network.outputs.items() if item.reference), None)
-
-    @property
-    def sensor_sd(self) -> dict[str, float]:
-        """How far a bin's mean reading is from the model, by output [degC]."""
-        return {name: item.sd for name, item in self.network.outputs.items()}
-
-    @property
-    def average(self) -> float:
-        """Length of the bins of a fit [s]."""
-        return self.network.average or max(5.0, 5 * self.dt)
-
-    @property
-    def drift(self) -> dict[str, tuple[float, float]]:
-        """Standard deviation [degC] and correlation time [s] of the slow error, by output."""
-        return {
+        self.states = state_names(network)
+        self.n_x = len(self.states)
+        self.reference = next((name for name, item in network.outputs.items() if item.reference), None)
+        self.sensor_sd = {name: item.sd for name, item in network.outputs.items()}
+        self.drift = {
             name: (item.wander, item.wander_time)
-            for name, item in self.network.outputs.items()
+            for name, item in network.outputs.items()
             if item.wander is not None and item.wander_time is not None
         }
-
-    @property
-    def command_steps(self) -> dict[str, float]:
-        """What the driver of an input drops: all behind a multiple of this."""
-        return {name: item.step for name, item in self.network.inputs.items() if item.step is not None}
-
-    @property
-    def search_step(self) -> float:
-        """Step of a global search [s]."""
-        return max(self.dt, 2.0)
+        self.command_steps = {k: item.step for k, item in network.inputs.items() if item.step is not None}
+        self.average = network.average or max(5.0, 5 * self.dt)
+        self.search_step = max(self.dt, 2.0)
+        sd = np.full(self.n_x, 0.5)
+        sd[: len(network.nodes)] = [node.start_sd for node in network.nodes.values()]
+        self.spread = np.diag(sd**2)
 
     def prepared(self, logs: Sequence[Log], p: Array | None = None, *, free_runs: FreeRuns) -> NetworkModel:
         """Return the network itself: its implicit step is accurate whatever the logs."""
         return self
 
-    @cached_property
-    def spread(self) -> Array:
-        """Prior covariance (n_x, n_x) of a state about :meth:`rest`."""
-        sd = np.full(self.n_x, 0.5)
-        sd[: len(self.network.nodes)] = [node.start_sd for node in self.network.nodes.values()]
-        return np.diag(sd**2)
-
-    def step(
-        self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any], dt: float
-    ) -> list[Any]:
+    def step(self, x: Values, u: Values, d: Values, p: Values, dt: float) -> list[Any]:
         """Return the state after ``dt`` seconds; numbers, NumPy rows or CasADi symbols alike."""
         steps = self.steps
         c = steps.prepare(p)
         return steps.advance(x, u, d, c, steps.renew(u, c, dt), dt)
 
-    def output(self, x: Sequence[Any], p: Sequence[Any]) -> list[Any]:
+    def output(self, x: Values, p: Values) -> list[Any]:
         """Return what the sensors read at state x [degC], a list of length n_y."""
         return self.steps.read(x, ())
 
-    def flows(self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any]) -> list[Any]:
+    def flows(self, x: Values, u: Values, d: Values, p: Values) -> list[Any]:
         """Return the heat that each state receives [W] (sensors: [K]), a list of length n_x."""
         return self.steps.heat(x, u, d, p)
 
-    def capacities(self, p: Sequence[Any]) -> list[Any]:
+    def capacities(self, p: Values) -> list[Any]:
         """Return the heat capacity of each state [J/K] (sensors: lag [s]), a list of length n_x."""
         return self.steps.prepare(p)[: self.n_x]
 
@@ -172,36 +137,16 @@ class NetworkModel(Described):
             ]
         )
 
-    def rollout(
-        self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float
-    ) -> tuple[Array, Array]:
+    def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
         """Simulate a batch, compiled where llvmlite is there."""
         x0, u, d, p = (np.ascontiguousarray(value, dtype=float) for value in (x0, u, d, p))
         switched = [self.inputs.index(name) for name in self.switches]
         renew = np.ones(u.shape[1], dtype=bool)
         renew[1:] = np.any(u[:, 1:, switched] != u[:, :-1, switched], axis=(0, 2))
         kernel = _kernel(self.steps)
-        if kernel is not None:
-            y, x = kernel.rollout(x0, u, d, p, float(dt), renew)
-            return y, x
-        return self._rollout_rows(x0, u, d, p, float(dt), renew)
-
-    def _rollout_rows(
-        self, x0: Array, u: Array, d: Array, p: Array, dt: float, renew: NDArray[np.bool_]
-    ) -> tuple[Array, Array]:
-        """Simulate a batch without a compiler: the same lines on rows with one entry a member."""
-        steps, n_batch, n = self.steps, len(x0), u.shape[1]
-        c, x = steps.prepare(list(p.T)), list(x0.T)
-        kept: list[Any] = []
-        u_rows, d_rows = list(u.transpose(1, 2, 0)), list(d.transpose(1, 2, 0))
-        y = np.empty((len(self.outputs), n + 1, n_batch))
-        y[:, 0] = steps.read(x, c)
-        for t in range(n):
-            kept = steps.renew(u_rows[t], c, dt) if renew[t] else kept
-            x = steps.advance(x, u_rows[t], d_rows[t], c, kept, dt)
-            y[:, t + 1] = steps.read(x, c)
-        last = np.array([np.broadcast_to(row, n_batch) for row in x])
-        return y.transpose(2, 1, 0), last.T
+        if kernel is None:
+            return roll_rows(self.steps, x0, u, d, p, float(dt), renew)
+        return kernel.rollout(x0, u, d, p, float(dt), renew)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the whole network as plain JSON."""

@@ -46,12 +46,13 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from thermogrip.datasets.arrays import Values
 from thermogrip.sysid.models.network_spec import Network, Pipe
 
 GAMMA = 0.2928932188134524  # 1 - 1/sqrt(2)
@@ -72,7 +73,7 @@ class Layout(NamedTuple):
 
     Coefficients stand in one list c: capacities, fixed temperatures, links, their off-factors, bends,
     radiation, heaters, Peltiers; ``at_*`` is where each part begins.  Coefficient k is
-    ``scale[k] * p[left[k]] * p[right[k]]``, where index n_p means 1.
+    ``scale * p[left] * p[right]`` of ``coefficients[k]``, where index n_p means 1.
     """
 
     n_x: int
@@ -85,36 +86,23 @@ class Layout(NamedTuple):
     at_radiation: int
     at_heater: int
     at_peltier: int
-    scale: Any  # (n_c,) float
-    left: Any  # (n_c,)
-    right: Any  # (n_c,)
-    link_to: Any  # (n_link,) state that receives
-    link_from: Any  # (n_link,) index into z
-    link_both: Any  # (n_link,) 1: taken from link_from as well
-    link_switch: Any  # (n_link,) input, or -1
-    bent: Any  # (n_bent,) links whose conductance depends on their temperature difference
-    radiation_to: Any
-    radiation_from: Any
-    heater_to: Any
-    heater_input: Any
-    peltier_face: Any
-    peltier_sink: Any
-    peltier_input: Any
-    peltier_duty: Any  # 1: pulse-width driver
-    place: Any  # (n_link, 4) entries (to, to), (to, from), (from, from), (from, to) of the matrix, or -1
-    diagonal: Any  # (n_x,) entry of each pivot
-    order: Any  # (n_x,) elimination order
-    lower_entry: Any  # (n_lower,) entries below the diagonal, pivot by pivot
-    lower_row: Any
-    lower_pivot: Any  # the state that is eliminated
-    lower_begin: Any  # (n_lower + 1,) its updates
-    update_to: Any  # entry -= lower * update_by
-    update_by: Any
-    upper_begin: Any  # (n_x + 1,) entries right of the diagonal, by position in ``order``
-    upper_entry: Any
-    upper_column: Any
+    coefficients: tuple[tuple[float, int, int], ...]
+    links: tuple[
+        tuple[int, int, bool, int], ...
+    ]  # (to, from: an index into z, taken from there, switch or -1)
+    bent: tuple[int, ...]  # links whose conductance depends on their temperature difference
+    radiation: tuple[tuple[int, int], ...]  # (to, from)
+    heaters: tuple[tuple[int, int], ...]  # (state, input)
+    peltiers: tuple[tuple[int, int, int, bool], ...]  # (face, sink, input, whether by a pulse-width driver)
+    # of each link the entries (to, to), (to, from), (from, from), (from, to) of the matrix, or -1
+    place: tuple[tuple[int, int, int, int], ...]
+    diagonal: tuple[int, ...]  # (n_x,) entry of each pivot
+    order: tuple[int, ...]  # (n_x,) elimination order
+    # pivot by pivot the entries below the diagonal: (entry, row, updates), each w[to] -= entry w[by]
+    lower: tuple[tuple[tuple[int, int, tuple[tuple[int, int], ...]], ...], ...]
+    upper: tuple[tuple[tuple[int, int], ...], ...]  # pivot by pivot: (entry, column) right of the diagonal
     n_entry: int
-    output: Any  # (n_y,) state that each output reads
+    output: tuple[int, ...]  # (n_y,) state that each output reads
 
 
 @dataclass(frozen=True)
@@ -130,10 +118,10 @@ class ThermalSteps:
         """Numbers of states, inputs, disturbances and parameters."""
         return self.layout.n_x, self.n_u, self.layout.n_d, self.n_p
 
-    def prepare(self, p: Sequence[Any]) -> list[Any]:
+    def prepare(self, p: Values) -> list[Any]:
         """Return the coefficients: products of at most two parameters and a number."""
         c: list[Any] = []
-        for scale, left, right in zip(self.layout.scale, self.layout.left, self.layout.right):
+        for scale, left, right in self.layout.coefficients:
             value = scale + 0.0 * p[0]
             if left < self.n_p:
                 value = value * p[left]
@@ -142,22 +130,14 @@ class ThermalSteps:
             c.append(value)
         return c
 
-    def renew(self, u: Sequence[Any], c: Sequence[Any], h: Any) -> list[Any]:
+    def renew(self, u: Values, c: Values, h: Any) -> list[Any]:
         """Return the conductances, then the factors of 1 - g h A."""
         g = _conductances(u, c, self.layout)
         return [*g, *_factors(c, g, GAMMA * h, self.layout)]
 
-    def advance(
-        self,
-        x: Sequence[Any],
-        u: Sequence[Any],
-        d: Sequence[Any],
-        c: Sequence[Any],
-        kept: Sequence[Any],
-        h: Any,
-    ) -> list[Any]:
+    def advance(self, x: Values, u: Values, d: Values, c: Values, kept: Values, h: Any) -> list[Any]:
         """Return the state one step of ``h`` [s] on."""
-        layout, n_link = self.layout, len(self.layout.link_to)
+        layout, n_link = self.layout, len(self.layout.links)
         g, w, outside = kept[:n_link], kept[n_link:], self._outside(d, c)
         q = _heat([*x, *outside], u, c, g, layout)
         k = _solved(w, layout, [a / b for a, b in zip(q, c)])
@@ -165,16 +145,16 @@ class ThermalSteps:
         k2 = _solved(w, layout, [a / b - 2.0 * e for a, b, e in zip(q, c, k)])
         return [a + h * (1.5 * e + 0.5 * b) for a, e, b in zip(x, k, k2)]
 
-    def read(self, x: Sequence[Any], c: Sequence[Any]) -> list[Any]:
+    def read(self, x: Values, c: Values) -> list[Any]:
         """Return what the sensors read [degC]."""
         return [x[i] for i in self.layout.output]
 
-    def heat(self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any]) -> list[Any]:
+    def heat(self, x: Values, u: Values, d: Values, p: Values) -> list[Any]:
         """Return the heat that each state receives [W] (sensors: [K])."""
         c = self.prepare(p)
         return _heat([*x, *self._outside(d, c)], u, c, _conductances(u, c, self.layout), self.layout)
 
-    def _outside(self, d: Sequence[Any], c: Sequence[Any]) -> list[Any]:
+    def _outside(self, d: Values, c: Values) -> list[Any]:
         """Return the boundary temperatures: measured, then fixed."""
         at, n_d = self.layout.at_fixed, self.layout.n_d
         return [*(d[i] for i in range(n_d)), *c[at : at + self.layout.n_fixed]]
@@ -183,7 +163,7 @@ class ThermalSteps:
 def _conductances(u: Any, c: Any, layout: Layout) -> list[Any]:
     """Return the conductance [W/K] of every link at these switch positions."""
     g = []
-    for k, switch in enumerate(layout.link_switch):
+    for k, (_, _, _, switch) in enumerate(layout.links):
         value = c[layout.at_link + k]
         if switch >= 0:
             off = c[layout.at_off + k]
@@ -196,39 +176,31 @@ def _heat(z: Any, u: Any, c: Any, g: Any, layout: Layout) -> list[Any]:
     """Return the heat that each state receives [W], at temperatures z [degC]."""
     n = layout.n_x
     q = [0.0 * z[i] for i in range(n)]
-    for k in range(len(layout.link_to)):
-        i, j = layout.link_to[k], layout.link_from[k]
-        flow = g[k] * (z[j] - z[i])
+
+    def move(i: int, j: int, flow: Any, both: bool = True) -> None:
         q[i] = q[i] + flow
-        if layout.link_both[k] == 1 and j < n:
+        if both and j < n:
             q[j] = q[j] - flow
-    for m in range(len(layout.bent)):
-        k = layout.bent[m]
-        i, j = layout.link_to[k], layout.link_from[k]
+
+    for (i, j, both, _), conductance in zip(layout.links, g):
+        move(i, j, conductance * (z[j] - z[i]), both)
+    for m, k in enumerate(layout.bent):
+        i, j, both, _ = layout.links[k]
         rise = z[j] - z[i]
-        flow = g[k] * c[layout.at_bend + m] / BEND_SPAN * rise * abs(rise)
-        q[i] = q[i] + flow
-        if layout.link_both[k] == 1 and j < n:
-            q[j] = q[j] - flow
-    for k in range(len(layout.radiation_to)):
-        i, j = layout.radiation_to[k], layout.radiation_from[k]
+        move(i, j, g[k] * c[layout.at_bend + m] / BEND_SPAN * rise * abs(rise), both)
+    for k, (i, j) in enumerate(layout.radiation):
         a, b = z[i] + KELVIN, z[j] + KELVIN
-        flow = c[layout.at_radiation + k] * (b * b * b * b - a * a * a * a)
-        q[i] = q[i] + flow
-        if j < n:
-            q[j] = q[j] - flow
-    for k in range(len(layout.heater_to)):
-        i = layout.heater_to[k]
-        q[i] = q[i] + c[layout.at_heater + k] * u[layout.heater_input[k]]
-    for k in range(len(layout.peltier_face)):
+        move(i, j, c[layout.at_radiation + k] * (b * b * b * b - a * a * a * a))
+    for k, (i, by) in enumerate(layout.heaters):
+        q[i] = q[i] + c[layout.at_heater + k] * u[by]
+    for k, (face, sink, by, duty) in enumerate(layout.peltiers):
         at = layout.at_peltier + len(PELTIER) * k
-        face, sink = layout.peltier_face[k], layout.peltier_sink[k]
-        v = u[layout.peltier_input[k]] / c[at + 7] + c[at + 3]
+        v = u[by] / c[at + 7] + c[at + 3]
         v = v - 0.5 * (abs(v + c[at + 8]) - abs(v - c[at + 8]))
         size = abs(v)
         up, down = c[at + 4] * 0.5 * (v + size), c[at + 5] * 0.5 * (v - size)
         droop = c[at + 6] / DROOP_SPAN * (z[face] - z[sink])
-        if layout.peltier_duty[k] == 1:
+        if duty:
             on = c[at + 2] * (1.0 - droop)
             current, square = up * on, up * on * on
         else:
@@ -247,41 +219,35 @@ def _factors(c: Any, g: Any, gh: Any, layout: Layout) -> list[Any]:
     w = [0.0 * c[0] for _ in range(layout.n_entry)]
     for i in layout.diagonal:
         w[i] = 1.0 + 0.0 * c[0]
-    for k in range(len(layout.link_to)):
-        i, j = layout.link_to[k], layout.link_from[k]
-        share = gh * g[k] / c[i]
-        w[layout.place[k][0]] = w[layout.place[k][0]] + share
-        if layout.place[k][1] >= 0:
-            w[layout.place[k][1]] = w[layout.place[k][1]] - share
-        if layout.place[k][2] >= 0:
-            share = gh * g[k] / c[j]
-            w[layout.place[k][2]] = w[layout.place[k][2]] + share
-            w[layout.place[k][3]] = w[layout.place[k][3]] - share
-    at = 0
-    for position in range(layout.n_x):
-        pivot = layout.order[position]
-        w[layout.diagonal[pivot]] = 1.0 / w[layout.diagonal[pivot]]
-        while at < len(layout.lower_entry) and layout.lower_pivot[at] == pivot:
-            entry = layout.lower_entry[at]
-            w[entry] = w[entry] * w[layout.diagonal[pivot]]
-            for m in range(layout.lower_begin[at], layout.lower_begin[at + 1]):
-                w[layout.update_to[m]] = w[layout.update_to[m]] - w[entry] * w[layout.update_by[m]]
-            at += 1
+    for (i, j, _, _), conductance, (to_to, to_from, from_from, from_to) in zip(layout.links, g, layout.place):
+        share = gh * conductance / c[i]
+        w[to_to] = w[to_to] + share
+        if to_from >= 0:
+            w[to_from] = w[to_from] - share
+        if from_from >= 0:
+            share = gh * conductance / c[j]
+            w[from_from] = w[from_from] + share
+            w[from_to] = w[from_to] - share
+    for pivot, below in zip(layout.order, layout.lower):
+        at = layout.diagonal[pivot]
+        w[at] = 1.0 / w[at]
+        for entry, _, updates in below:
+            w[entry] = w[entry] * w[at]
+            for to, by in updates:
+                w[to] = w[to] - w[entry] * w[by]
     return w
 
 
 def _solved(w: Any, layout: Layout, q: list[Any]) -> list[Any]:
     """Return the solution of (1 - gh A) k = q, in the place of ``q``."""
-    for m in range(len(layout.lower_entry)):
-        row = layout.lower_row[m]
-        q[row] = q[row] - w[layout.lower_entry[m]] * q[layout.lower_pivot[m]]
-    for back in range(layout.n_x):
-        position = layout.n_x - 1 - back
-        i = layout.order[position]
-        value = q[i]
-        for m in range(layout.upper_begin[position], layout.upper_begin[position + 1]):
-            value = value - w[layout.upper_entry[m]] * q[layout.upper_column[m]]
-        q[i] = value * w[layout.diagonal[i]]
+    for pivot, below in zip(layout.order, layout.lower):
+        for entry, row, _ in below:
+            q[row] = q[row] - w[entry] * q[pivot]
+    for pivot, right in zip(reversed(layout.order), reversed(layout.upper)):
+        value = q[pivot]
+        for entry, column in right:
+            value = value - w[entry] * q[column]
+        q[pivot] = value * w[layout.diagonal[pivot]]
     return q
 
 
@@ -331,33 +297,29 @@ def build_layout(network: Network) -> Layout:
         "peltier": [item for element in network.peltiers.values() for item in _peltier(network, element)],
     }
     begin = dict(zip(parts, np.cumsum([0, *map(len, parts.values())]).tolist()))
-    scale, left, right = _monomials([item for part in parts.values() for item in part], network)
-    inputs = list(network.inputs)
-    glow = [_receiver(r.between, index, len(states)) for r in network.radiation.values()]
+    inputs, place = list(network.inputs), {name: i for i, name in enumerate(network.parameters)}
+    fixed = len(place)  # the place of a factor 1
     return Layout(
         n_x=len(states),
         n_d=len(network.disturbances),
         n_fixed=len(network.boundaries),
         **{f"at_{name}": at for name, at in begin.items() if name != "capacity"},
-        scale=scale,
-        left=left,
-        right=right,
-        link_to=_ints(link.to for link in links),
-        link_from=_ints(link.source for link in links),
-        link_both=_ints(link.both for link in links),
-        link_switch=_ints(link.switch for link in links),
-        bent=_ints(k for k, link in enumerate(links) if link.bend is not None),
-        radiation_to=_ints([i for i, _ in glow]),
-        radiation_from=_ints([j for _, j in glow]),
-        heater_to=_ints([index[h.node] for h in network.heaters.values()]),
-        heater_input=_ints([inputs.index(h.input) for h in network.heaters.values()]),
-        peltier_face=_ints([index[e.face] for e in network.peltiers.values()]),
-        peltier_sink=_ints([index[e.sink] for e in network.peltiers.values()]),
-        peltier_input=_ints([inputs.index(e.input) for e in network.peltiers.values()]),
-        peltier_duty=_ints([int(e.driver == "duty") for e in network.peltiers.values()]),
-        **elimination(len(states), [(link.to, link.source, int(link.both)) for link in links]),
-        output=_ints(
-            [index[o.node if o.lag is None else f"{name}.sensor"] for name, o in network.outputs.items()]
+        coefficients=tuple(
+            (scale, *[*(place[name] for name in names), fixed, fixed][:2])
+            for part in parts.values()
+            for scale, names in part
+        ),
+        links=tuple((link.to, link.source, link.both, link.switch) for link in links),
+        bent=tuple(k for k, link in enumerate(links) if link.bend is not None),
+        radiation=tuple(_receiver(r.between, index, len(states)) for r in network.radiation.values()),
+        heaters=tuple((index[h.node], inputs.index(h.input)) for h in network.heaters.values()),
+        peltiers=tuple(
+            (index[e.face], index[e.sink], inputs.index(e.input), e.driver == "duty")
+            for e in network.peltiers.values()
+        ),
+        **elimination(len(states), [(link.to, link.source, link.both) for link in links]),
+        output=tuple(
+            index[o.node if o.lag is None else f"{name}.sensor"] for name, o in network.outputs.items()
         ),
     )
 
@@ -425,21 +387,13 @@ def _peltier(network: Network, element: Any) -> list[Coefficient]:
     return out
 
 
-def _monomials(
-    items: list[Coefficient], network: Network
-) -> tuple[tuple[float, ...], tuple[int, ...], tuple[int, ...]]:
-    index = {name: i for i, name in enumerate(network.parameters)}
-    factors = [[*(index[name] for name in names), len(index), len(index)][:2] for _, names in items]
-    return tuple(scale for scale, _ in items), _ints(k for k, _ in factors), _ints(k for _, k in factors)
-
-
 def _receiver(between: list[str], index: Mapping[str, int], n_x: int) -> tuple[int, int]:
     """Return (to, from) such that the receiver is a state."""
     a, b = (index[name] for name in between)
     return (a, b) if a < n_x else (b, a)
 
 
-def elimination(n: int, links: list[tuple[int, int, int]]) -> dict[str, Any]:
+def elimination(n: int, links: list[tuple[int, int, bool]]) -> dict[str, Any]:
     """Return the elimination lists of the matrix whose rows are coupled by (to, from, both) links."""
     pattern: list[set[int]] = [{i} for i in range(n)]
     for to, source, both in links:
@@ -448,33 +402,23 @@ def elimination(n: int, links: list[tuple[int, int, int]]) -> dict[str, Any]:
             if both:
                 pattern[source].add(to)
     order = _minimum_degree(pattern)
-    entry: dict[tuple[int, int], int] = {}
-    for row in range(n):
-        for column in sorted(pattern[row]):
-            entry[row, column] = len(entry)
-    lower, update, upper = _play(order, pattern, entry)
-    place = [
-        (
-            entry[to, to],
-            entry[to, source] if source < n else -1,
-            entry[source, source] if both and source < n else -1,
-            entry[source, to] if both and source < n else -1,
-        )
-        for to, source, both in links
-    ]
+    places = [(row, column) for row in range(n) for column in sorted(pattern[row])]
+    entry = {at: k for k, at in enumerate(places)}
+    lower, upper = _play(order, pattern, entry)
     return {
-        "place": tuple(place),
-        "diagonal": _ints([entry[i, i] for i in range(n)]),
-        "order": _ints(order),
-        "lower_entry": _ints([item[0] for item in lower]),
-        "lower_row": _ints([item[1] for item in lower]),
-        "lower_pivot": _ints([item[2] for item in lower]),
-        "lower_begin": _ints([item[3] for item in lower] + [len(update)]),
-        "update_to": _ints([to for to, _ in update]),
-        "update_by": _ints([by for _, by in update]),
-        "upper_begin": _ints(np.cumsum([0, *map(len, upper)]).tolist()),
-        "upper_entry": _ints([entry[i, j] for i, row in zip(order, upper) for j in row]),
-        "upper_column": _ints([j for row in upper for j in row]),
+        "place": tuple(
+            (
+                entry[to, to],
+                entry[to, source] if source < n else -1,
+                entry[source, source] if both and source < n else -1,
+                entry[source, to] if both and source < n else -1,
+            )
+            for to, source, both in links
+        ),
+        "diagonal": tuple(entry[i, i] for i in range(n)),
+        "order": tuple(order),
+        "lower": tuple(lower),
+        "upper": tuple(upper),
         "n_entry": len(entry),
     }
 
@@ -496,29 +440,22 @@ def _minimum_degree(pattern: list[set[int]]) -> list[int]:
     return order
 
 
-def _play(
-    order: list[int], pattern: list[set[int]], entry: dict[tuple[int, int], int]
-) -> tuple[list[tuple[int, int, int, int]], list[tuple[int, int]], list[list[int]]]:
-    """Eliminate on the pattern alone; fill-in is added to ``entry`` as it appears."""
-    lower: list[tuple[int, int, int, int]] = []
-    update: list[tuple[int, int]] = []
-    upper: list[list[int]] = []
-    rows = [set(row) for row in pattern]
+def _play(order: list[int], pattern: list[set[int]], entry: dict[tuple[int, int], int]) -> tuple[Any, Any]:
+    """Eliminate on the pattern alone; return ``lower`` and ``upper``, fill-in is added to ``entry``."""
+    lower, upper, rows = [], [], [set(row) for row in pattern]
     for position, pivot in enumerate(order):
         later = order[position + 1 :]
         right = [j for j in later if j in rows[pivot]]
-        upper.append(right)
-        for row in later:
-            if pivot not in rows[row]:
-                continue
-            lower.append((entry[row, pivot], row, pivot, len(update)))
+        upper.append(tuple((entry[pivot, j], j) for j in right))
+        below = [row for row in later if pivot in rows[row]]
+        for row in below:
+            rows[row].update(right)
             for j in right:
-                if j not in rows[row]:
-                    rows[row].add(j)
-                    entry[row, j] = len(entry)
-                update.append((entry[row, j], entry[pivot, j]))
-    return lower, update, upper
-
-
-def _ints(values: Iterable[int]) -> tuple[int, ...]:
-    return tuple(int(value) for value in values)
+                entry.setdefault((row, j), len(entry))
+        lower.append(
+            tuple(
+                (entry[row, pivot], row, tuple((entry[row, j], entry[pivot, j]) for j in right))
+                for row in below
+            )
+        )
+    return lower, upper

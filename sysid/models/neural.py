@@ -19,27 +19,22 @@ range (an overflowing tank, the end of a converter); the states of such an outpu
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.limits import STEP_RANGE, array_within, number_within
+from thermogrip.datasets.arrays import Array, Run, Values
 from thermogrip.sysid.models.lti import join_columns, whole_steps
-from thermogrip.sysid.models.model import SMOOTH, check_spread
+from thermogrip.sysid.models.model import BlackBox
 
-Array = NDArray[np.float64]
-
-_LABELS = ("inputs", "disturbances", "outputs", "switches")
-_SCALES = ("y_middle", "y_size", "w_middle", "w_size", "reach", "low", "high")
-_ARRAYS = ("A", "B", "c", "V", "W", "U", "b", *_SCALES, "spread")
+_RAILS = ("low", "high")
 
 
 @dataclass(frozen=True, eq=False)
-class NeuralModel:
+class NeuralModel(BlackBox):
     """A mean of K small neural state-space models in scaled units."""
 
     inputs: tuple[str, ...]
@@ -65,12 +60,14 @@ class NeuralModel:
 
     kind = "neural"
     origin = "neural"
-    parameters: tuple[str, ...] = ()
-    smooth = SMOOTH
-    command_steps: ClassVar[Mapping[str, float]] = {}
+    title = "neural model"
+    arrays = (
+        *("A", "B", "c", "V", "W", "U", "b"),
+        *("y_middle", "y_size", "w_middle", "w_size", "reach", "spread"),
+    )
 
     def __post_init__(self) -> None:
-        for name in _ARRAYS:
+        for name in (*self.arrays, *_RAILS):
             object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), dtype=float))
         members, n = self.A.shape[:2]
         h, m, n_y = self.b.shape[1], len(self.inputs) + len(self.disturbances), len(self.outputs)
@@ -104,9 +101,7 @@ class NeuralModel:
 
     # ---- the Model protocol ----
 
-    def step(
-        self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any], dt: float
-    ) -> list[Any]:
+    def step(self, x: Values, u: Values, d: Values, p: Values, dt: float) -> list[Any]:
         """Return the state one step later, in plain arithmetic (dt: a multiple of the model's)."""
         outside = [u[i] for i in range(len(self.inputs))] + [d[i] for i in range(len(self.disturbances))]
         scaled = [(v - float(a)) / float(s) for v, a, s in zip(outside, self.w_middle, self.w_size)]
@@ -118,7 +113,7 @@ class NeuralModel:
             now = [v for k in range(len(self.A)) for v in self._member_step(k, now[k * n : (k + 1) * n], w)]
         return now
 
-    def output(self, x: Sequence[Any], p: Sequence[Any]) -> list[Any]:
+    def output(self, x: Values, p: Values) -> list[Any]:
         """Return the mean of the members' outputs, in natural units."""
         n, members = self.A.shape[1], len(self.A)
         return [
@@ -158,9 +153,7 @@ class NeuralModel:
             z[:, free] += np.clip(step, -1.0, 1.0)
         return np.asarray(z[:, :n]).ravel()
 
-    def rollout(
-        self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float
-    ) -> tuple[Array, Array]:
+    def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
         """Simulate a batch."""
         x = self.states(x0, u, d, dt)
         members, n, n_y = len(self.A), self.A.shape[1], len(self.outputs)
@@ -191,28 +184,14 @@ class NeuralModel:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the model as plain lists and numbers, for JSON (``None``: no rail)."""
-        named = {key: list(getattr(self, key)) for key in _LABELS}
-        arrays = {key: getattr(self, key).tolist() for key in _ARRAYS}
-        for key in ("low", "high"):
-            arrays[key] = [v if np.isfinite(v) else None for v in arrays[key]]
-        return {"kind": self.kind, **named, "dt": self.dt, **arrays}
+        rails = {key: [v if np.isfinite(v) else None for v in getattr(self, key)] for key in _RAILS}
+        return super().to_dict() | rails
 
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> NeuralModel:
-        """Return the model of :meth:`to_dict`; raise :class:`UserError` where a field is missing or wrong."""
-        try:
-            named: dict[str, Any] = {key: tuple(str(name) for name in data[key]) for key in _LABELS}
-            free = ("low", "high")  # where None is no rail
-            arrays: dict[str, Any] = {k: data[k] if k in free else array_within(data, k) for k in _ARRAYS}
-            check_spread(arrays["spread"])
-            dt = number_within(data, "dt", *STEP_RANGE)
-            arrays["low"] = [-np.inf if v is None else v for v in arrays["low"]]
-            arrays["high"] = [np.inf if v is None else v for v in arrays["high"]]
-            return cls(**named, **arrays, dt=dt)
-        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-            raise UserError(
-                f"not a neural model ({error})", hint="save it again with this version"
-            ) from error
+    @staticmethod
+    def others(data: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the rails."""
+        open_ends = zip(_RAILS, (-np.inf, np.inf))
+        return {key: [free if v is None else v for v in data[key]] for key, free in open_ends}
 
     def _theta(self) -> Array:
         members = len(self.A)
@@ -224,7 +203,7 @@ class NeuralModel:
         t = np.tanh(_times(self.W, x) + _times(self.U, w) + self.b)
         return np.asarray(_times(self.A, x) + _times(self.B, w) + self.c + _times(self.V, t))
 
-    def _member_step(self, k: int, x: Sequence[Any], w: Sequence[Any]) -> list[Any]:
+    def _member_step(self, k: int, x: Values, w: Values) -> list[Any]:
         units = zip(self.W[k], self.U[k], self.b[k])
         t = [_tanh(_dot(row, x) + _dot(column, w) + float(shift)) for row, column, shift in units]
         after = [
@@ -244,7 +223,7 @@ def _times(matrices: Array, vectors: Array) -> Array:
     return np.asarray(np.einsum("kij,kj->ki", matrices, vectors))
 
 
-def _dot(row: Array, values: Sequence[Any]) -> Any:
+def _dot(row: Array, values: Values) -> Any:
     return sum(float(gain) * value for gain, value in zip(row, values))
 
 

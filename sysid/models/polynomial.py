@@ -10,23 +10,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.limits import STEP_RANGE, array_within, number_within
+from thermogrip.datasets.arrays import Array, Run, Values
+from thermogrip.datasets.limits import array_within, number_within
 from thermogrip.sysid.models.lti import join_columns, whole_steps
-from thermogrip.sysid.models.model import SMOOTH, check_spread
-
-Array = NDArray[np.float64]
+from thermogrip.sysid.models.model import BlackBox
 
 BOUND = 10.0  # spreads beyond the range of the data: a simulation that leaves it has diverged
+_MOST_DEGREE, _MOST_MEMORY = 20, 1000
 
 
 @dataclass(frozen=True, eq=False)
-class SindyModel:
+class SindyModel(BlackBox):
     """Polynomial difference equations of the outputs."""
 
     inputs: tuple[str, ...]
@@ -46,9 +45,8 @@ class SindyModel:
 
     kind = "sindy"
     origin = "sindy"
-    parameters: tuple[str, ...] = ()
-    smooth = SMOOTH
-    command_steps: ClassVar[Mapping[str, float]] = {}
+    title = "SINDy model"
+    arrays = ("coefficients", "low", "high", "spread")
 
     def __post_init__(self) -> None:
         for name in ("coefficients", "low", "high"):
@@ -76,9 +74,7 @@ class SindyModel:
         """Always true: the fit refuses equations that diverge, and every free run is bounded besides."""
         return True
 
-    def step(
-        self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any], dt: float
-    ) -> list[Any]:
+    def step(self, x: Values, u: Values, d: Values, p: Values, dt: float) -> list[Any]:
         """Return the state one step later, in plain arithmetic (dt: a multiple of the model's)."""
         now = [x[i] for i in range(self.n_x)]
         outside = [*(u[i] for i in range(len(self.inputs))), *(d[i] for i in range(len(self.disturbances)))]
@@ -90,7 +86,7 @@ class SindyModel:
             now = [*after, *now[: self.n_x - n_y]]
         return now
 
-    def output(self, x: Sequence[Any], p: Sequence[Any]) -> list[Any]:
+    def output(self, x: Values, p: Values) -> list[Any]:
         """Return the outputs, the first states."""
         return [x[i] for i in range(len(self.outputs))]
 
@@ -99,9 +95,7 @@ class SindyModel:
         y = np.asarray(y, dtype=float)
         return np.tile(np.where(np.isfinite(y), y, (self.low + self.high) / 2), self.memory)
 
-    def rollout(
-        self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float
-    ) -> tuple[Array, Array]:
+    def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
         """Simulate a batch.
 
         A state that leaves :data:`BOUND` times the range of the data has diverged and is infinite from
@@ -149,40 +143,17 @@ class SindyModel:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the model as plain lists and numbers, for JSON."""
-        arrays = ("exponents", "coefficients", "low", "high", "spread")
-        labels = ("inputs", "disturbances", "outputs", "switches")
-        named = {key: list(getattr(self, key)) for key in labels}
-        return {
-            "kind": self.kind,
-            **named,
-            "dt": self.dt,
-            "memory": self.memory,
-            **{key: getattr(self, key).tolist() for key in arrays},
-            "equations": list(self.equations()),
-        }
+        """Return the model as plain lists and numbers, for JSON, and its equations for readers."""
+        return super().to_dict() | {"equations": list(self.equations())}
 
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> SindyModel:
-        """Return the model of :meth:`to_dict`; raise :class:`UserError` where a field is missing or wrong."""
-        try:
-            labels = ("inputs", "disturbances", "outputs", "switches")
-            named: dict[str, Any] = {key: tuple(str(name) for name in data[key]) for key in labels}
-            arrays: dict[str, Any] = {key: array_within(data, key) for key in _FLOATS}
-            powers = array_within(data, "exponents", _MOST_DEGREE).astype(int)
-            check_spread(arrays["spread"])
-            dt = number_within(data, "dt", *STEP_RANGE)
-            memory = int(number_within(data, "memory", 1, _MOST_MEMORY))
-            return cls(**named, **arrays, exponents=powers, dt=dt, memory=memory)
-        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-            raise UserError(f"not a SINDy model ({error})", hint="save it again with this version") from error
+    @staticmethod
+    def others(data: Mapping[str, Any]) -> dict[str, Any]:
+        """Return exponents and memory."""
+        powers = array_within(data, "exponents", _MOST_DEGREE).astype(int)
+        return {"exponents": powers, "memory": int(number_within(data, "memory", 1, _MOST_MEMORY))}
 
 
-_MOST_DEGREE, _MOST_MEMORY = 20, 1000
-_FLOATS = ("coefficients", "low", "high", "spread")
-
-
-def _monomial(row: NDArray[np.int_], variables: Sequence[Any]) -> Any:
+def _monomial(row: NDArray[np.int_], variables: Values) -> Any:
     value: Any = 1.0
     for power, variable in zip(row.tolist(), variables):
         for _ in range(power):

@@ -22,16 +22,16 @@ data of the fit.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.limits import STEP_RANGE, array_within, number_within
+from thermogrip.datasets.arrays import Array, Run, Values
+from thermogrip.datasets.limits import array_within
 from thermogrip.sysid.models.lti import (
     StartPrior,
     constrained_lstsq,
@@ -44,16 +44,11 @@ from thermogrip.sysid.models.lti import (
     switched_states,
     whole_steps,
 )
-from thermogrip.sysid.models.model import SMOOTH, check_spread
-
-Array = NDArray[np.float64]
-
-_NAMES = ("inputs", "disturbances", "outputs", "switches", "terms")
-_ARRAYS = ("A", "B", "C", "E", "c", "y0", "F", "spread")
+from thermogrip.sysid.models.model import BlackBox
 
 
 @dataclass(frozen=True, eq=False)
-class StateSpaceModel:
+class StateSpaceModel(BlackBox):
     """A linear model with offsets, delays as states, and optional products of the inputs."""
 
     inputs: tuple[str, ...]  # names, in the order of the columns of ``B``, ``E`` and the rows of ``C``
@@ -76,9 +71,9 @@ class StateSpaceModel:
     origin: str = "statespace"  # the method that made the model, for tables
 
     kind = "statespace"
-    parameters: tuple[str, ...] = ()
-    smooth = SMOOTH
-    command_steps: ClassVar[Mapping[str, float]] = {}
+    title = "state-space model"
+    labels = (*BlackBox.labels, "terms")
+    arrays = ("A", "B", "C", "E", "c", "y0", "F", "spread")
 
     def __post_init__(self) -> None:
         n_x, n_y = np.atleast_2d(self.A).shape[0], len(self.outputs)
@@ -115,9 +110,7 @@ class StateSpaceModel:
 
     # ---- the Model protocol ----
 
-    def step(
-        self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any], dt: float
-    ) -> list[Any]:
+    def step(self, x: Values, u: Values, d: Values, p: Values, dt: float) -> list[Any]:
         """Return the state one step later, in plain arithmetic (numbers, NumPy rows or CasADi symbols)."""
         phi = [product_of(factors, u, d, len(self.inputs)) for factors in self._term_factors]
         push = [
@@ -133,7 +126,7 @@ class StateSpaceModel:
             ]
         return now
 
-    def output(self, x: Sequence[Any], p: Sequence[Any]) -> list[Any]:
+    def output(self, x: Values, p: Values) -> list[Any]:
         """Return the outputs y = C x + y0 as a list of length n_y, in plain arithmetic."""
         return [_dot(self.C[i], x) + self.y0[i] for i in range(len(self.outputs))]
 
@@ -157,9 +150,7 @@ class StateSpaceModel:
         fixed = np.hstack([self.C[known], np.zeros((int(known.sum()), n_v))])
         return constrained_lstsq(rows, right, fixed, (y - self.y0)[known])[: self.n_x]
 
-    def rollout(
-        self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float
-    ) -> tuple[Array, Array]:
+    def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
         """Simulate a batch."""
         x = self.states(x0, u, d, dt)
         return x @ self.C.T + self.y0, x[:, -1]
@@ -185,34 +176,11 @@ class StateSpaceModel:
             x = scan_states(self.A, push, x0)
         return x[:, ::times]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the model as plain lists and numbers, for JSON."""
-        arrays = {key: getattr(self, key).tolist() for key in _ARRAYS}
-        named = {key: list(getattr(self, key)) for key in _NAMES}
-        switched = {key: matrix.tolist() for key, matrix in self.A_switch.items()}
-        return {
-            "kind": self.kind,
-            **named,
-            **arrays,
-            "A_switch": switched,
-            "dt": self.dt,
-            "origin": self.origin,
-        }
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> StateSpaceModel:
-        """Return the model of :meth:`to_dict`; raise :class:`UserError` where a field is missing or wrong."""
-        try:
-            named: dict[str, Any] = {key: tuple(str(name) for name in data[key]) for key in _NAMES}
-            dt = number_within(data, "dt", *STEP_RANGE)
-            arrays: dict[str, Any] = {key: array_within(data, key) for key in _ARRAYS}
-            switched = {str(key): array_within(data["A_switch"], key) for key in data["A_switch"]}
-            check_spread(arrays["spread"])
-            return cls(**named, **arrays, A_switch=switched, dt=dt, origin=str(data["origin"]))
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise UserError(
-                f"not a state-space model ({error})", hint="save it again with this version"
-            ) from error
+    @staticmethod
+    def others(data: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the fields that are neither names nor plain arrays."""
+        switched = {str(key): array_within(data["A_switch"], key) for key in data["A_switch"]}
+        return {"A_switch": switched, "origin": str(data["origin"])}
 
     # ---- what only a linear model can do ----
 
@@ -309,7 +277,7 @@ def _shaped(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
     return array
 
 
-def _dot(row: Array, values: Sequence[Any]) -> Any:
+def _dot(row: Array, values: Values) -> Any:
     """Return the dot product without the zero entries, so that symbolic graphs stay small."""
     total: Any = 0.0
     for i in np.flatnonzero(row):

@@ -28,12 +28,13 @@ import keyword
 import sys
 import traceback
 from collections import namedtuple
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from thermogrip.datasets.arrays import Values
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.models.network_spec import Parameter
 
@@ -115,21 +116,19 @@ class OwnCode:
         text = Path(self.file).read_bytes().replace(b"\r\n", b"\n")
         return hashlib.sha256(text).hexdigest()
 
-    def rhs(self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any]) -> list[Any]:
+    def rhs(self, x: Values, u: Values, d: Values, p: Values) -> list[Any]:
         """Return dx/dt, a list of length n_x."""
         args = (self.X(*x), self.U(*u), self.D(*d), self.P(*p))
         return self._call("rhs", self.states, args)
 
-    def output(self, x: Sequence[Any], p: Sequence[Any]) -> list[Any]:
+    def output(self, x: Values, p: Values) -> list[Any]:
         """Return what the outputs read, a list of length n_y."""
         if not hasattr(self.made, "output"):
             named = dict(zip(self.states, x))
             return [named[name] for name in self.outputs]
         return self._call("output", self.outputs, (self.X(*x), self.P(*p)))
 
-    def rest(
-        self, y: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any]
-    ) -> list[Any] | None:
+    def rest(self, y: Values, u: Values, d: Values, p: Values) -> list[Any] | None:
         """Return the class's own state at rest, None where it has no such function."""
         if not hasattr(self.made, "rest"):
             return None

@@ -37,23 +37,22 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from thermogrip.datasets.arrays import Array, Run, Values
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, columns
-from thermogrip.sysid.models.model import Described, FreeRuns
+from thermogrip.sysid.models.model import Described, FreeRuns, roll_rows
 from thermogrip.sysid.models.user_class import OwnCode, read_class
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.jit_rollout import Kernel
-
-Array = NDArray[np.float64]
 
 _SENSOR_WEIGHT, _INPUT_WEIGHT = 1e2, 1e-2
 _NUDGE = 1e-6
@@ -76,17 +75,15 @@ class OwnSteps:
         code = self.code
         return len(code.states), len(code.inputs), len(code.disturbances), len(code.parameters)
 
-    def prepare(self, p: Sequence[Any]) -> list[Any]:
+    def prepare(self, p: Values) -> list[Any]:
         """Return the parameters."""
         return list(p)
 
-    def renew(self, u: Sequence[Any], c: Sequence[Any], h: Any) -> list[Any]:
+    def renew(self, u: Values, c: Values, h: Any) -> list[Any]:
         """Return nothing: no part of a class is known to hang on switches alone."""
         return []
 
-    def advance(
-        self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], c: Sequence[Any], kept: Any, h: Any
-    ) -> list[Any]:
+    def advance(self, x: Values, u: Values, d: Values, c: Values, kept: Values, h: Any) -> list[Any]:
         """Return the state one step of ``h`` on."""
         rhs = self.code.rhs
         k1 = rhs(x, u, d, c)
@@ -102,7 +99,7 @@ class OwnSteps:
                 state[i] = np.minimum(state[i], high)
         return state
 
-    def read(self, x: Sequence[Any], c: Sequence[Any]) -> list[Any]:
+    def read(self, x: Values, c: Values) -> list[Any]:
         """Return the outputs."""
         return self.code.output(x, c)
 
@@ -180,7 +177,7 @@ def _settle(residuals: Callable[[Array], Array], z: Array, low: Array, high: Arr
     return z
 
 
-def _rows(values: Sequence[Any], n: int) -> Array:
+def _rows(values: Values, n: int) -> Array:
     """Return values, each a number or a row, as an array (len(values), n)."""
     rows = [np.broadcast_to(value, n) for value in values]
     return np.array(rows, dtype=float).reshape(len(values), n)
@@ -202,58 +199,22 @@ class OwnModel(Described):
     drift: ClassVar[dict[str, tuple[float, float]]] = {}
 
     def __post_init__(self) -> None:
-        super().__init__(self.code)
-        self.states = tuple(self.code.states)
-
-    @property
-    def n_x(self) -> int:
-        """Number of states."""
-        return len(self.code.states)
-
-    @property
-    def sensor_sd(self) -> dict[str, float]:
-        """How far a bin's mean reading is from the model, by output."""
+        code = self.code
+        super().__init__(code)
+        self.states, self.n_x = tuple(code.states), len(code.states)
         found = dict(self.sd or {})
-        return {name: item.sd or found.get(name, 1.0) for name, item in self.code.outputs.items()}
-
-    @property
-    def average(self) -> float:
-        """Length of the bins of a fit [s]: what the class asks for, or five steps."""
-        return self.code.average or 5 * self.dt
-
-    @property
-    def independent(self) -> float:
-        """Seconds per independent residual until a fit has measured it: four bins."""
-        return 4 * self.average
-
-    @property
-    def warmup(self) -> float:
-        """Seconds of a log from which a fit estimates its start: what the class asks for, or fifty steps."""
-        return self.code.warmup or 50 * self.dt
-
-    @property
-    def search_step(self) -> float:
-        """Step of a global search [s]."""
-        return self.dt
-
-    @cached_property
-    def spread(self) -> Array:
-        """Prior covariance (n_x, n_x) of a state about :meth:`rest`."""
-        return np.diag(np.square(list(self.code.states.values())))
-
-    @cached_property
-    def limits(self) -> Array:
-        """Where each state may lie, (n_x, 2)."""
-        return np.array([self.code.limits.get(name, (-np.inf, np.inf)) for name in self.code.states])
+        self.sensor_sd = {name: item.sd or found.get(name, 1.0) for name, item in code.outputs.items()}
+        self.average, self.warmup = code.average or 5 * self.dt, code.warmup or 50 * self.dt
+        self.independent, self.search_step = 4 * self.average, self.dt
+        self.spread = np.diag(np.square(list(code.states.values())))
+        self.limits = np.array([code.limits.get(name, (-np.inf, np.inf)) for name in code.states])
 
     @property
     def slow_because(self) -> str:
         """Why NumPy does the rollouts though they should be compiled; "" where it does not."""
         return compile_steps(self.code)[1] if self.compiled else ""
 
-    def step(
-        self, x: Sequence[Any], u: Sequence[Any], d: Sequence[Any], p: Sequence[Any], dt: float
-    ) -> list[Any]:
+    def step(self, x: Values, u: Values, d: Values, p: Values, dt: float) -> list[Any]:
         """Return the state after ``dt`` seconds; numbers, NumPy rows or CasADi symbols alike."""
         n, steps = self._pieces(dt), OwnSteps(self.code)
         state, u, d, p = (_for_numpy(values) for values in (x, u, d, p))
@@ -261,7 +222,7 @@ class OwnModel(Described):
             state = steps.advance(state, u, d, p, (), dt / n)
         return _bare(state)
 
-    def output(self, x: Sequence[Any], p: Sequence[Any]) -> list[Any]:
+    def output(self, x: Values, p: Values) -> list[Any]:
         """Return what the outputs read at state x, a list of length n_y."""
         return _bare(self.code.output(_for_numpy(x), _for_numpy(p)))
 
@@ -285,17 +246,14 @@ class OwnModel(Described):
             raise self.code.fault(f"has no finite state at rest ({lost} is not)", hint=hint)
         return np.asarray(np.clip(x, *self.limits.T))
 
-    def rollout(
-        self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float
-    ) -> tuple[Array, Array]:
+    def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
         """Simulate a batch."""
         x0, u, d, p = (np.ascontiguousarray(value, dtype=float) for value in (x0, u, d, p))
         n = self._pieces(dt)
         kernel = compile_steps(self.code)[0] if self.compiled else None
-        if kernel is not None:
-            y, x = kernel.rollout(x0, u, d, p, dt / n, pieces=n)
-            return y, x
-        return self._rollout_rows(x0, u, d, p, dt)
+        if kernel is None:
+            return roll_rows(OwnSteps(self.code), x0, u, d, p, dt / n, pieces=n)
+        return kernel.rollout(x0, u, d, p, dt / n, pieces=n)
 
     def prepared(self, logs: Sequence[Log], p: Array | None = None, *, free_runs: FreeRuns) -> OwnModel:
         """Return the model with steps short enough for these logs, its sensors' sd known.
@@ -363,20 +321,6 @@ class OwnModel(Described):
         """Return into how many Runge-Kutta steps dt is cut."""
         return max(1, int(np.ceil(self.pieces * dt / self.dt - 1e-9)))
 
-    def _rollout_rows(self, x0: Array, u: Array, d: Array, p: Array, dt: float) -> tuple[Array, Array]:
-        """Simulate a batch on rows with one entry a member."""
-        n_batch, n = len(x0), u.shape[1]
-        y = np.empty((n + 1, len(self.outputs), n_batch))
-        x, rows = list(x0.T.copy()), list(p.T)
-        with np.errstate(all="ignore"):  # what is not finite is found afterwards
-            for k in range(n + 1):
-                for j, value in enumerate(self.output(x, rows)):
-                    y[k, j] = value
-                if k < n:
-                    x = self.step(x, list(u[:, k].T), list(d[:, k].T), rows, dt)
-        last = np.array([np.broadcast_to(row, n_batch) for row in x])
-        return np.ascontiguousarray(y.transpose(2, 0, 1)), last.T.copy()
-
     def _agree(self, runs: Sequence[tuple[str, Array]], finer: Sequence[tuple[str, Array]]) -> bool:
         with np.errstate(all="ignore"):
             change = [np.abs(a - b) / self._sensors for (_, a), (_, b) in zip(runs, finer)]
@@ -425,7 +369,7 @@ class _Symbol(NDArrayOperatorsMixin):
         return value.view if isinstance(value, _Symbol) else value
 
 
-def _for_numpy(values: Sequence[Any]) -> list[Any]:
+def _for_numpy(values: Values) -> list[Any]:
     """Return values with CasADi's symbols made such that NumPy's functions take them."""
     casadi = sys.modules.get("casadi")  # not loaded: there is no symbol
     view = getattr(casadi, "ArrayInterface", None)  # CasADi without it has no such warning
@@ -435,7 +379,7 @@ def _for_numpy(values: Sequence[Any]) -> list[Any]:
     return [_Symbol(view(value, ndim=0)) if isinstance(value, kinds) else value for value in values]
 
 
-def _bare(values: Sequence[Any]) -> list[Any]:
+def _bare(values: Values) -> list[Any]:
     """Return values with CasADi's symbols as CasADi knows them."""
     return [
         sys.modules["casadi"].vertcat(value.view) if isinstance(value, _Symbol) else value for value in values

@@ -40,8 +40,8 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import most_bytes
 from thermogrip.datasets.resample import gaps as gaps_of
@@ -51,8 +51,6 @@ from thermogrip.datasets.schema import names as names_of
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant_data import PlantData
-
-Array = NDArray[np.float64]
 
 GAP = 10.0  # [s], beyond it the input is unknown
 BRIDGED = 5  # rows
@@ -582,5 +580,5 @@ def _matched(
     return out, said
 
 
-def _largest(columns: Sequence[NDArray[np.float64]]) -> float:
+def _largest(columns: Sequence[Array]) -> float:
     return max((float(np.nanmax(np.abs(values), initial=0.0)) for values in columns), default=0.0)

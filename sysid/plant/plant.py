@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import check_json, read_json, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log
-from thermogrip.sysid.models.model import Array, Model, load_model
+from thermogrip.sysid.models.model import Model, load_model
 from thermogrip.sysid.plant.plant_data import PlantData
 from thermogrip.sysid.plant.plant_file import (
     SCHEMA,

@@ -20,10 +20,10 @@ from statistics import NormalDist
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.models.model import Array, Model
+from thermogrip.sysid.models.model import Model
 from thermogrip.sysid.plant.fit_record import FitLog, PlantScores
 
 
@@ -155,7 +155,7 @@ class PlantData:
         return np.asarray(np.clip(natural, low, high))
 
     @property
-    def log_scaled(self) -> NDArray[np.bool_]:
+    def log_scaled(self) -> Mask:
         """Which free parameters (n_free,) are logarithms in ``theta``."""
         return np.array([self.scales.get(name) == "log" for name in self.free], dtype=bool)
 

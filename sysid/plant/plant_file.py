@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import atomic_path, read_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import LARGEST, MOST_NUMBER, STEP_RANGE, array_within, number_within
@@ -24,8 +24,6 @@ from thermogrip.sysid.plant.fit_record import FitLog, PlantScores
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant_data import PlantData
-
-Array = NDArray[np.float64]
 
 SCHEMA, VERSION = "thermogrip.plant", 1
 _MOST_ERROR, _MOST_READING = 1e6, 1e9  # of a sensor, in any unit

@@ -26,8 +26,8 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, columns, log_name, make_log
 from thermogrip.sysid.plant.log_grid import Stretch, at_rows, cut_stretches, match_log
@@ -35,8 +35,6 @@ from thermogrip.sysid.plant.log_grid import Stretch, at_rows, cut_stretches, mat
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import Model
     from thermogrip.sysid.plant.plant_data import PlantData
-
-Array = NDArray[np.float64]
 
 AFTER_GAP = 60.0  # [s] unscored after a gap
 AT_REST = 1.0  # [K] between any two sensors of a rig at rest
@@ -292,7 +290,7 @@ def _root(covariance: Array) -> Array:
     return np.asarray(axes * np.sqrt(np.maximum(size, 0.0)))
 
 
-def _as_log(plant: PlantData, log: Log, y: Array, scored: NDArray[np.bool_], notes: list[str]) -> Log:
+def _as_log(plant: PlantData, log: Log, y: Array, scored: Mask, notes: list[str]) -> Log:
     variables = {
         name: (y[:, k], plant.units.get(name, "degC"), "output") for k, name in enumerate(plant.outputs)
     }

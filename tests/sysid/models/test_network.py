@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.sysid.models.model import roll_rows
 from thermogrip.sysid.models.network import NetworkModel, _kernel, load_network
 from thermogrip.sysid.models.network_equations import PELTIER
 from thermogrip.sysid.models.network_spec import builtin_networks, network_from_dict, read_network
@@ -174,7 +175,7 @@ def test_compiled_rows_and_symbols_run_the_same_equations(name: str):
     x0 = rng.uniform(15.0, 45.0, (batch, model.n_x))
     p = model.prior * rng.uniform(0.8, 1.2, (batch, model.prior.size))
     y, end = model.rollout(x0, u, d, p, model.dt)
-    y_rows, end_rows = model._rollout_rows(x0, u, d, p, model.dt, np.ones(n, dtype=bool))
+    y_rows, end_rows = roll_rows(model.steps, x0, u, d, p, model.dt, np.ones(n, dtype=bool))
     np.testing.assert_allclose(y_rows, y, rtol=0, atol=1e-10)
     np.testing.assert_allclose(end_rows, end, rtol=0, atol=1e-10)
     parts = [
