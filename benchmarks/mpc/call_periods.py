@@ -45,7 +45,7 @@ from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.interface import STATUSES, Move
-from thermogrip.mpc.native.build import wanted
+from thermogrip.mpc.native.runtime import wanted
 from thermogrip.sysid.plant.plant import Plant
 
 Array = NDArray[np.float64]

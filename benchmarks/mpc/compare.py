@@ -25,7 +25,7 @@ from problem import HORIZON, MODEL, TRUE, Answer, Loop, plant_of, run_loop
 from thermogrip.mpc.closed_loop.simulate import Surroundings, simulate_closed_loop
 from thermogrip.mpc.closed_loop.simulate_native import compiled_loop
 from thermogrip.mpc.controllers.mpc import Controller
-from thermogrip.mpc.native.build import wanted
+from thermogrip.mpc.native.runtime import wanted
 
 OURS: dict[str, Callable[[], Answer]] = {
     "thermogrip, Python, N = 50": lambda: Ours(compiled=False),

@@ -39,9 +39,8 @@ from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import Design
 from thermogrip.mpc.design.spec import Spec
-from thermogrip.mpc.native.build import wanted
-from thermogrip.mpc.plant.prediction import PredictionModel
-from thermogrip.mpc.plant.steady_state import holding_drive
+from thermogrip.mpc.native.runtime import wanted
+from thermogrip.mpc.plant.prediction import PredictionModel, holding_drive
 from thermogrip.mpc.tuning.minimum_time import full_drive_bound
 from thermogrip.mpc.tuning.tune import tune
 from thermogrip.sysid.plant.plant import Plant

@@ -32,7 +32,6 @@ from thermogrip.datasets.parallel import Progress
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.estimator.observer import Observer
 from thermogrip.mpc.interface import STATUSES
-from thermogrip.mpc.native.build import SOURCES, c_source, compiler, model_header, model_source
 from thermogrip.mpc.native.codegen import write_model
 from thermogrip.mpc.native.design_struct import (
     ITERATION_LIMIT,
@@ -43,6 +42,7 @@ from thermogrip.mpc.native.design_struct import (
     numbers_of,
     sizes_of,
 )
+from thermogrip.mpc.native.runtime import SOURCES, c_source, compiler, model_header, model_source
 from thermogrip.mpc.optimiser.active_set import ActiveSetQP
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ time after a step of the target.  ``u_ff`` is the drive that holds the target in
 plant, weighted.  Where readings have a time, dt is what really passed, for the integrator and for the slew
 alike, and a call before a move is due (:mod:`thermogrip.mpc.estimator.call_times`) holds the last one.
 
-Its loops are tuned by :mod:`thermogrip.mpc.design.simc`.
+Its loops are tuned by :mod:`thermogrip.mpc.design.design`.
 """
 
 from __future__ import annotations
@@ -24,10 +24,9 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.controllers.base import SampledController
-from thermogrip.mpc.design.simc import PILoop, default_controlled, pair_loops
+from thermogrip.mpc.design.design import PILoop, default_controlled, pair_loops
 from thermogrip.mpc.interface import Move, Readings, Target
-from thermogrip.mpc.plant.prediction import ROOM, PredictionModel, prediction_model
-from thermogrip.mpc.plant.steady_state import holding_drive
+from thermogrip.mpc.plant.prediction import ROOM, PredictionModel, holding_drive, prediction_model
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant

@@ -9,11 +9,18 @@ Temperatures count in degC, so ``move = 1`` means: one whole range in one sample
 for one sample.  ``default_design`` reads everything off the plant: sample time and horizon from its delay
 and lag, blocks that double from one sample on, and one move weight that the tuner then improves.
 
-What a design must be before it may close a loop: every field, against the plant that it is for
------------------------------------------------------------------------------------------------
+**Checks.**  A controller's file can be edited, cut short, or written for another plant.  Whatever is in it,
+either the loop does what the file says or one line says which field cannot be: nothing is rounded, clipped or
+left out.
 
-A controller's file can be edited, cut short, or written for another plant.  Whatever is in it, either the
-loop does what the file says or one line says which field cannot be: nothing is rounded, clipped or left out.
+**PI loops** follow Skogestad's rule (SIMC), with gain k, delay L and lag T of the step response:
+
+    Kc = T / (k (tau_c + L)),   Ti = min(T, 4 (tau_c + L)),   tau_c = L   [1]_.
+
+References
+----------
+.. [1] S. Skogestad, "Simple analytic rules for model reduction and PID controller tuning", Journal of Process
+   Control 13(4), 2003.
 """
 
 from __future__ import annotations
@@ -28,12 +35,68 @@ import numpy as np
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import LARGEST
-from thermogrip.mpc.design.simc import PILoop, default_controlled, pair_loops
 from thermogrip.mpc.estimator.observer import ObserverNoise
-from thermogrip.mpc.plant.prediction import drive_names, drive_range, sample_time, step_response
+from thermogrip.mpc.plant.prediction import (
+    PredictionModel,
+    drive_names,
+    drive_range,
+    sample_time,
+    step_response,
+)
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
+
+
+@dataclass(frozen=True)
+class PILoop:
+    """One loop."""
+
+    drive: str  # what it moves and what it controls
+    output: str
+    Kc: float  # gain [drive units per degC]
+    Ti: float  # integral and anti-windup times [s]
+    Tt: float
+    feedforward: float = 1.0  # share of the holding drive that is fed forward, 0 to 1
+
+
+def simc(plant: Plant, drive: str, output: str, *, tau_c: float | None = None) -> PILoop:
+    """Return SIMC settings of one loop for a closed-loop time constant tau_c [s], by default the apparent
+    delay; a drive that does not move the output is a ValueError.
+    """
+    model = PredictionModel(plant, dt=plant.dt)
+    answer = step_response(plant, drive, output)
+    if answer.gain == 0:
+        raise ValueError(f"drive {drive} does not move {output}")
+    delay = max(answer.delay, plant.dt)
+    closed = max(delay, 2 * plant.dt) if tau_c is None else tau_c
+    span = float(model.span[model.drives.index(drive)])
+    Kc = span * answer.lag / (answer.gain * (closed + delay))
+    Ti = min(answer.lag, 4 * (closed + delay))
+    return PILoop(drive, output, Kc, Ti, Tt=Ti)
+
+
+def default_controlled(plant: Plant) -> tuple[str, ...]:
+    """Return what to control where nobody said: the skin, else the last outputs, one for each drive."""
+    n_u = len(drive_names(plant))
+    if n_u == 1 and "t_surface" in plant.outputs:
+        return ("t_surface",)
+    return tuple(plant.outputs[-n_u:])
+
+
+def pair_loops(plant: Plant, controlled: tuple[str, ...]) -> tuple[PILoop, ...]:
+    """Return one SIMC loop for each controlled output, on the drive of largest gain that is still free."""
+    free = list(drive_names(plant))
+    loops = []
+    for output in controlled:
+        gains = {drive: abs(step_response(plant, drive, output).gain) for drive in free}
+        if not gains or max(gains.values()) == 0:
+            continue
+        drive = max(gains, key=lambda name: gains[name])
+        free.remove(drive)
+        loops.append(simc(plant, drive, output))
+    return tuple(loops)
+
 
 #: Samples of a horizon, and block values of a plan; more are hours of work a sample, not a better loop.
 LONGEST_HORIZON, MOST_UNKNOWNS = 1000, 200

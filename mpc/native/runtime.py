@@ -1,8 +1,9 @@
 """The controller's C, built where gcc is there, in place of the same thing in Python.
 
 The sources of an export (:mod:`thermogrip.mpc.controllers.export`), with a model's step written by
-:mod:`thermogrip.mpc.native.codegen`, become a library (:mod:`thermogrip.mpc.native.build`).  A second
-controller of the same structure (any parameters, any weights) finds it built.
+:mod:`thermogrip.mpc.native.codegen`, become a library in the user's cache directory.  It is named by the hash
+of all that went into it: sources, flags, and what the compiler says of the machine.  A second controller of
+the same structure (any parameters, any weights) finds it built; anything else is built beside it.
 
 :class:`CompiledOptimiser` and :class:`CompiledObserver` answer what their Python parents answer, to 1e-10.
 Nothing needs them: without gcc, or with ``THERMOGRIP_COMPILED=0`` in the environment, Python does the work.
@@ -11,7 +12,13 @@ Nothing needs them: without gcc, or with ``THERMOGRIP_COMPILED=0`` in the enviro
 from __future__ import annotations
 
 import ctypes
+import hashlib
+import os
+import shutil
+import subprocess
+import tempfile
 from functools import cache
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,13 +27,6 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.mpc.estimator.observer import Observer
-from thermogrip.mpc.native.build import (
-    SOURCES,
-    build_library,
-    c_source,
-    model_header,
-    model_source,
-)
 from thermogrip.mpc.native.codegen import ModelCode, write_model
 from thermogrip.mpc.native.design_struct import Sizes, as_structure, config_header, numbers_of, sizes_of
 from thermogrip.mpc.optimiser.rti import Optimiser, Outcome
@@ -35,6 +35,88 @@ if TYPE_CHECKING:
     from thermogrip.mpc.optimiser.rti import ControllerParts
     from thermogrip.mpc.plant.prediction import PredictionModel
     from thermogrip.sysid.models.model import Model
+
+#: The C files that every export shares.
+SOURCES = ("tg_qp.h", "tg_qp.c", "tg_controller.h", "tg_controller.c", "tg_observer.c", "tg_optimiser.c")
+
+# sums may be done in any order and pairs of operations at once; NaN keeps its meaning
+_FLAGS = (
+    "-std=c99",
+    "-O3",
+    "-march=native",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-fno-signed-zeros",
+    "-fassociative-math",
+    "-ffp-contract=fast",
+    "-fPIC",
+    "-shared",
+)
+
+
+def compiler() -> str | None:
+    """Return the path of gcc, None where there is none."""
+    return shutil.which("gcc")
+
+
+def wanted() -> bool:
+    """Return whether compiled code is to be used: gcc is there, and nobody said no."""
+    return os.environ.get("THERMOGRIP_COMPILED", "1") != "0" and compiler() is not None
+
+
+def c_source(name: str) -> str:
+    """Return a C file of the package."""
+    return (resources.files("thermogrip.mpc.native") / "csource" / name).read_text(encoding="utf-8")
+
+
+def model_header(code: ModelCode, name: str) -> str:
+    """Return the header of a model's C, which C++ may include."""
+    guard = f"{name.upper()}_H"
+    begin, end = '#ifdef __cplusplus\nextern "C" {\n#endif\n', "#ifdef __cplusplus\n}\n#endif\n"
+    return f"#ifndef {guard}\n#define {guard}\n\n{begin}\n{code.header}\n{end}\n#endif\n"
+
+
+def model_source(code: ModelCode, name: str) -> str:
+    """Return a model's C file."""
+    return f'#include "{name}.h"\n\n#include <math.h>\n\n{code.source}'
+
+
+def build_library(files: dict[str, str]) -> Path:
+    """Return a shared library of these C files, from the cache where it was built before; a RuntimeError
+    has the first words of a compiler that refuses.
+    """
+    gcc = compiler()
+    if gcc is None:
+        raise RuntimeError("no gcc")
+    text = "\n".join(f"{name}\n{content}" for name, content in sorted(files.items()))
+    key = hashlib.sha256("\n".join([*_FLAGS, _machine(gcc), text]).encode()).hexdigest()[:32]
+    path = _cache() / f"mpc-{key}.so"
+    if path.is_file():
+        return path
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        for name, content in files.items():
+            (Path(folder) / name).write_text(content, encoding="utf-8")
+        units = [name for name in files if name.endswith(".c")]
+        command = [gcc, *_FLAGS, *units, "-lm", "-o", "built.so"]
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise RuntimeError(f"gcc refused: {done.stderr.strip()[:300]}")
+        os.replace(Path(folder) / "built.so", path)  # whole, or not there
+    return path
+
+
+def _cache() -> Path:
+    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    return Path(base) / "thermogrip"
+
+
+@cache
+def _machine(gcc: str) -> str:
+    """Return what the compiler says of itself and of this machine."""
+    command = [gcc, "-march=native", "-dM", "-E", "-x", "c", os.devnull]
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout
+
 
 #: What tg_qp.h calls its answers.
 QP_STATUS = ("solved", "infeasible", "iteration limit", "not convex", "not finite", "time limit")

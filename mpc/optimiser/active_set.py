@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermogrip.datasets.arrays import Array, Mask
-from thermogrip.mpc.optimiser.qp import QPAnswer
+from thermogrip.mpc.optimiser.qp import CondensedQP, QPAnswer
 
 _REGULAR, _TOLERANCE, _SHORT, _CONTRADICTION, _FAR = 1e-11, 1e-10, 1e-5, 1e-6, 1e15
 _HARD, _KEPT, _BROKEN = 0, 1, 2
@@ -28,26 +28,17 @@ class _Entry:
     multiplier: float
 
 
-class ActiveSetQP:
-    """Solves what :class:`thermogrip.mpc.optimiser.qp.CondensedQP` solves, one penalty for all soft rows,
-    always cold.
-    """
+class ActiveSetQP(CondensedQP):
+    """The same program, with one penalty for all soft rows; always cold."""
 
     def __init__(self, *, soft: Mask, linear: float, quadratic: float, iteration_limit: int = 500) -> None:
-        self.soft, self.linear, self.quadratic = np.asarray(soft, bool), linear, quadratic
-        self.iteration_limit = iteration_limit
+        rows = np.ones(len(soft))
+        super().__init__(
+            soft=soft, linear=linear * rows, quadratic=quadratic * rows, iteration_limit=iteration_limit
+        )
+        self._linear, self._quadratic = linear, quadratic
 
-    def forget(self) -> None:
-        """Do nothing: every solve is cold."""
-
-    def solve(self, H: Array, f: Array, A: Array, lower: Array, upper: Array) -> QPAnswer:
-        """Return the minimiser with its status; see :meth:`thermogrip.mpc.optimiser.qp.CondensedQP.solve`."""
-        none = np.zeros(len(lower))
-        given = np.isfinite(H).all() and np.isfinite(f).all() and np.isfinite(A).all()
-        if not given or np.isnan(lower).any() or np.isnan(upper).any():
-            return QPAnswer(np.full(f.size, np.nan), "not finite", 0, none, none)
-        if np.any((lower > upper)[~self.soft]):
-            return QPAnswer(np.full(f.size, np.nan), "infeasible", 0, none, none)
+    def _solve(self, H: Array, f: Array, A: Array, lower: Array, upper: Array) -> QPAnswer:
         length = np.linalg.norm(A / np.sqrt(np.diag(H)), axis=1)
         self._idle = self.soft & (length <= _SHORT)
         self._weight = 1.0 / np.where(self._idle, 1.0, length)
@@ -68,7 +59,7 @@ class ActiveSetQP:
             iterations += 1
             row, side = found
             self._set.append(_Entry(row, side, _KEPT if self.soft[row] else _HARD, 0.0))
-        return QPAnswer(np.full(f.size, np.nan), "iteration limit", iterations, none, none)
+        return self._failed("iteration limit", f.size, iterations)
 
     def _system(self) -> tuple[Array, Array]:
         """Return K, with its regular share, and the right side, of the set."""
@@ -78,8 +69,8 @@ class ActiveSetQP:
         right = -np.array([self._bound(entry) for entry in self._set]) - m @ self._c
         for at, entry in enumerate(self._set):
             if entry.state == _BROKEN:
-                K[at, at] += 1.0 / self.quadratic
-                right[at] += self.linear / self.quadratic
+                K[at, at] += 1.0 / self._quadratic
+                right[at] += self._linear / self._quadratic
         return K, right
 
     def _bound(self, entry: _Entry) -> float:
@@ -94,8 +85,8 @@ class ActiveSetQP:
         slack = 1e-13 * float(np.max(np.abs(wanted)))
         share, which, upward = 1.0, -1, False
         for at, (entry, there) in enumerate(zip(self._set, wanted.tolist())):
-            low = self.linear if entry.state == _BROKEN else 0.0
-            high = self.linear if entry.state == _KEPT else np.inf
+            low = self._linear if entry.state == _BROKEN else 0.0
+            high = self._linear if entry.state == _KEPT else np.inf
             here = entry.multiplier
             if there < low - slack:
                 part = (here - low) / (here - there) if here > low else 0.0
@@ -113,9 +104,9 @@ class ActiveSetQP:
         """Let an entry that has reached the end of its state leave, or go on in the next one."""
         entry = self._set.pop(at)
         if entry.state == _KEPT and upward:
-            self._set.append(_Entry(entry.row, entry.side, _BROKEN, self.linear))
+            self._set.append(_Entry(entry.row, entry.side, _BROKEN, self._linear))
         elif entry.state == _BROKEN:
-            self._set.append(_Entry(entry.row, entry.side, _KEPT, self.linear))
+            self._set.append(_Entry(entry.row, entry.side, _KEPT, self._linear))
 
     def _answer(self) -> Array:
         v = -self._c.copy()
@@ -142,7 +133,7 @@ class ActiveSetQP:
             rest = np.array([e.side * (self._A[e.row] @ x) - self._bound(e) for e in self._set])
             for at, entry in enumerate(self._set):
                 if entry.state == _BROKEN:
-                    rest[at] -= (entry.multiplier - self.linear) / self.quadratic
+                    rest[at] -= (entry.multiplier - self._linear) / self._quadratic
             for entry, more in zip(self._set, np.linalg.solve(self._system()[0], rest).tolist()):
                 entry.multiplier += more
             x = self._answer()

@@ -26,16 +26,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from thermogrip.datasets.arrays import Mask
+from thermogrip.datasets.arrays import Array
 
 LEAST_QUADRATIC = 1e-9  # of a scaled row's quadratic penalty
-
-Vector = NDArray[np.float64]
 
 #: What DAQP's exit flags mean where they are not positive: a positive flag is a solution.
 _FLAGS = {
@@ -57,31 +54,17 @@ _FAR = 1e20  # means "no bound"; DAQP takes 1e30 as infinite
 class QPAnswer:
     """What the solver says."""
 
-    x: Vector  # (n,) the minimiser; NaN where there is none
+    x: Array  # (n,) the minimiser; NaN where there is none
     status: str  # ``"solved"``, ``"infeasible"``, ``"iteration limit"``, ``"time limit"``, ``"not finite"``
     iterations: int  # active-set changes
     # (m,) of the rows, positive at the upper bound, negative at the lower one: H x + f + A' multipliers = 0
-    multipliers: Vector
-    slack: Vector  # (m,) by how much each row is broken, in the row's own units, 0 where it holds
+    multipliers: Array
+    slack: Array  # (m,) by how much each row is broken, in the row's own units, 0 where it holds
 
     @property
     def solved(self) -> bool:
         """Whether x is the minimiser."""
         return self.status == "solved"
-
-
-class QPSolver(Protocol):
-    """What solves an optimiser's program."""
-
-    soft: Mask
-
-    def solve(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QPAnswer:
-        """Return the minimiser with its status."""
-        ...
-
-    def forget(self) -> None:
-        """Throw a warm start away."""
-        ...
 
 
 class CondensedQP:
@@ -113,7 +96,7 @@ class CondensedQP:
         """Throw the warm start away."""
         self._model = None
 
-    def solve(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> QPAnswer:
+    def solve(self, H: Array, f: Array, A: Array, lower: Array, upper: Array) -> QPAnswer:
         """Return the minimiser for H (n, n), positive definite, f (n,) and rows A (m, n) between bounds
         that are infinite where there is none.
         """
@@ -124,10 +107,13 @@ class CondensedQP:
             return self._failed("not finite", f.size)
         if np.any((lower > upper)[~self.soft]):
             return self._failed("infeasible", f.size)
-        diagonal = np.diag(H)
-        if np.any(diagonal <= 0):
+        if np.any(np.diag(H) <= 0):
             return self._failed("not convex", f.size)
-        scale = 1.0 / np.sqrt(diagonal)
+        return self._solve(H, f, A, lower, upper)
+
+    def _solve(self, H: Array, f: Array, A: Array, lower: Array, upper: Array) -> QPAnswer:
+        """Return the minimiser of a program that may have one."""
+        scale = 1.0 / np.sqrt(np.diag(H))
         rows = A * scale
         length = np.maximum(np.linalg.norm(rows, axis=1), 1e-12)
         idle = self.soft & (length < _SHORT)
@@ -149,8 +135,8 @@ class CondensedQP:
         return QPAnswer(x, "solved", iterations, multipliers / length, np.where(self.soft, slack, 0.0))
 
     def _run(
-        self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector, length: Vector
-    ) -> tuple[Vector, Vector, int, int]:
+        self, H: Array, f: Array, A: Array, lower: Array, upper: Array, length: Array
+    ) -> tuple[Array, Array, int, int]:
         """Hand the scaled problem to DAQP: from the last active set where there is one."""
         if self._model is None:
             self._model, started = self._fresh(H, f, A, lower, upper)
@@ -164,7 +150,7 @@ class CondensedQP:
             self.on_info(info)
         return np.asarray(z), np.asarray(info["lam"]), int(flag), int(info["iterations"])
 
-    def _fresh(self, H: Vector, f: Vector, A: Vector, lower: Vector, upper: Vector) -> tuple[Any, int]:
+    def _fresh(self, H: Array, f: Array, A: Array, lower: Array, upper: Array) -> tuple[Any, int]:
         """Return DAQP's model and the flag of its setup, negative where that saw that there is no answer."""
         from daqp import Model
 
@@ -180,7 +166,7 @@ class CondensedQP:
         model.settings = settings
         return model, int(flag)
 
-    def _penalise(self, length: Vector) -> None:
+    def _penalise(self, length: Array) -> None:
         """Set the penalties in scaled units; DAQP takes the reciprocal of the quadratic one."""
         reciprocal = 1.0 / np.maximum(self.quadratic * length**2, LEAST_QUADRATIC)
         linear = np.where(self.soft, self.linear * length, 0.0)

@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.mpc.design.design import Design
 from thermogrip.mpc.estimator.observer import DisturbanceModel, Observer
-from thermogrip.mpc.optimiser.qp import CondensedQP, QPSolver
+from thermogrip.mpc.optimiser.qp import CondensedQP
 from thermogrip.mpc.plant.prediction import PredictionModel
 
 _SHARES = np.array([0.5, 0.25, 0.1, 0.0])
@@ -99,7 +99,7 @@ class Optimiser:
         self.settled_gain = self._settled_gain()
         self.seen = np.abs(self.at_rest) > 0.02 * np.max(np.abs(self.at_rest), axis=0)
         soft = self.N * (len(self._rows) + len(self._limited))
-        self.qp: QPSolver = CondensedQP(
+        self.qp = CondensedQP(
             soft=np.concatenate([np.zeros(2 * n, bool), np.ones(soft, bool)]),
             linear=np.full(2 * n + soft, design.price),
             quadratic=np.full(2 * n + soft, 2 * design.price),

@@ -43,8 +43,7 @@ from thermogrip.mpc.estimator.observer import choose_disturbances, detectability
 from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.mpc.native.design_struct import ITERATION_LIMIT
 from thermogrip.mpc.optimiser.rti import Optimiser
-from thermogrip.mpc.plant.prediction import PredictionModel, step_response
-from thermogrip.mpc.plant.steady_state import holding_drive, steady_curve
+from thermogrip.mpc.plant.prediction import PredictionModel, holding_drive, steady_curve, step_response
 from thermogrip.mpc.tuning.objective import draws_of
 
 _RANK = {"pass": 0, "warn": 1, "fail": 2}

@@ -13,13 +13,13 @@ from numpy.typing import ArrayLike
 
 from thermogrip.datasets.media import panels
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop
-from thermogrip.mpc.tuning.sensitivity import PARAMETER_WORDS, Sensitivity
+from thermogrip.mpc.tuning.trade_offs import PARAMETER_WORDS, Sensitivity
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from thermogrip.mpc.tuning.pareto import Pareto
+    from thermogrip.mpc.tuning.trade_offs import Pareto
 
 # after Okabe and Ito: distinct in every kind of colour vision
 _COLOURS = ("#1f5fa8", "#D55E00", "#009E73", "#CC79A7", "#E69F00")

@@ -31,11 +31,10 @@ from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Surroundings, simula
 from thermogrip.mpc.controllers.lqr import LQRController
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
-from thermogrip.mpc.design.design import Design, make_blocks
-from thermogrip.mpc.design.simc import PILoop
+from thermogrip.mpc.design.design import Design, PILoop, make_blocks
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.interface import Regulator
-from thermogrip.mpc.native.build import wanted
+from thermogrip.mpc.native.runtime import wanted
 from thermogrip.mpc.tuning.minimum_time import full_drive_bound
 
 if TYPE_CHECKING:

@@ -8,9 +8,9 @@ terminal weight and hardly the rest, 40 reach all of them. Each design is evalua
 of the plant's posterior, never on the model itself. A PI controller and a linear-quadratic regulator are
 tuned with the same number of trials, and stand beside it.
 
-Trade-offs that remain are reported: designs of which none is better in all of settling, overshoot and energy
-(:mod:`thermogrip.mpc.tuning.pareto`), what each weight does (:mod:`thermogrip.mpc.tuning.sensitivity`), and
-whether weights were the limit at all (:mod:`thermogrip.mpc.tuning.summary`).
+Trade-offs that remain are reported: designs of which none is better in all of settling, overshoot and energy,
+what each weight does (:mod:`thermogrip.mpc.tuning.trade_offs`), and whether weights were the limit at all
+(:mod:`thermogrip.mpc.tuning.summary`).
 """
 
 from __future__ import annotations
@@ -41,9 +41,16 @@ from thermogrip.mpc.tuning.objective import (
     score,
     trial,
 )
-from thermogrip.mpc.tuning.pareto import Pareto, front_of, scan_of
-from thermogrip.mpc.tuning.sensitivity import PARAMETER_WORDS, Sensitivity, sensitivity_of, sensitivity_words
 from thermogrip.mpc.tuning.summary import Row, meets_spec, rows_of, verdict_of
+from thermogrip.mpc.tuning.trade_offs import (
+    PARAMETER_WORDS,
+    Pareto,
+    Sensitivity,
+    front_of,
+    scan_of,
+    sensitivity_of,
+    sensitivity_words,
+)
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant

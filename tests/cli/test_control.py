@@ -17,7 +17,7 @@ from thermogrip.mpc.controllers.export import Agreement, Export
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.tuning.design_review import Check
-from thermogrip.mpc.tuning.sensitivity import Sensitivity
+from thermogrip.mpc.tuning.trade_offs import Sensitivity
 
 MOVE = Sensitivity("move", 2.0, 0.1, 90.0, 100.0, 110.0, 0.1, 0.2, 0.5, 3.0)
 ROWS = (("tuned", "28 to 38", 90.0, 95.0, 0.1, 0.2, 0.01, 7.0, 80.0),)
@@ -38,7 +38,7 @@ def tuned(stand_in: StandIn) -> SimpleNamespace:
     )  # fmt: skip
     found.asked = stand_in("thermogrip.mpc.tuning.tune.tune", tune)
     stand_in("thermogrip.report.control.tuning_table", (tuple("abcdefghi"), ROWS))
-    stand_in("thermogrip.mpc.tuning.sensitivity.sensitivity_words", ["move matters", "horizon does not"])
+    stand_in("thermogrip.mpc.tuning.trade_offs.sensitivity_words", ["move matters", "horizon does not"])
     stand_in("thermogrip.report.control.tuning_sections", ["a section"])
     found.pages = stand_in("thermogrip.report.html.write_report")
     return found

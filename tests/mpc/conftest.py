@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.mpc.makers import make_tank
-from thermogrip.mpc.native import build
+from thermogrip.mpc.native import runtime as build
 from thermogrip.sysid.plant.plant import Plant
 
 

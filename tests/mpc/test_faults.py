@@ -22,7 +22,7 @@ from thermogrip.mpc.closed_loop.simulate import Surroundings, Truth
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.interface import STATUSES, Move
-from thermogrip.mpc.native.build import compiler
+from thermogrip.mpc.native.runtime import compiler
 from thermogrip.mpc.optimiser.rti import Outcome
 from thermogrip.mpc.plant.prediction import PredictionModel
 

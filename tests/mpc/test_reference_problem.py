@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import pytest
 
-from thermogrip.mpc.native.build import wanted
+from thermogrip.mpc.native.runtime import wanted
 
 FOLDER = Path(__file__).parents[2] / "benchmarks" / "mpc"
 

@@ -12,7 +12,7 @@ from thermogrip.mpc.controllers.lqr import LQRController
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import default_design
-from thermogrip.mpc.native.build import compiler
+from thermogrip.mpc.native.runtime import compiler
 from thermogrip.sysid.plant.plant import Plant
 
 from .truths import furnace, linear_model, quadruple_tank

@@ -64,7 +64,7 @@ def tune(
     """
     from thermogrip.datasets.parallel import kept_processes
     from thermogrip.mpc.design.spec import Spec, read_spec
-    from thermogrip.mpc.tuning.sensitivity import sensitivity_words
+    from thermogrip.mpc.tuning.trade_offs import sensitivity_words
     from thermogrip.mpc.tuning.tune import tune as search
     from thermogrip.report.control import tuning_sections, tuning_table
     from thermogrip.report.html import write_report

@@ -20,8 +20,8 @@ from thermogrip.mpc.controllers.export import Agreement, check_export, export_co
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.interface import STATUSES, Move
-from thermogrip.mpc.native.build import compiler
 from thermogrip.mpc.native.codegen import write_model
+from thermogrip.mpc.native.runtime import compiler
 from thermogrip.sysid.models.network import load_network
 
 needs_gcc = pytest.mark.skipif(compiler() is None or shutil.which("make") is None, reason="no gcc here")

@@ -9,7 +9,7 @@ import pytest
 
 from tests.mpc.makers import crossed
 from thermogrip.mpc.controllers.pi import PIController, held_drive
-from thermogrip.mpc.design.simc import PILoop
+from thermogrip.mpc.design.design import PILoop
 from thermogrip.mpc.plant.prediction import PredictionModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant

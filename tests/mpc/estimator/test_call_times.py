@@ -18,7 +18,7 @@ from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.estimator.call_times import CallTimes, opening, shifted
 from thermogrip.mpc.estimator.observer import Observer, choose_disturbances
-from thermogrip.mpc.native.build import compiler
+from thermogrip.mpc.native.runtime import compiler
 from thermogrip.mpc.plant.prediction import PredictionModel
 
 DT, SLEW = 2.0, 0.25  # s, and what a drive may change in a second

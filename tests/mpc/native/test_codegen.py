@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from tests.mpc.makers import make_tank, network_plant
-from thermogrip.mpc.native.build import build_library, compiler, model_header, model_source
 from thermogrip.mpc.native.codegen import _OPERATIONS, write_model
+from thermogrip.mpc.native.runtime import build_library, compiler, model_header, model_source
 from thermogrip.mpc.plant.prediction import PredictionModel
 
 needs_gcc = pytest.mark.skipif(compiler() is None, reason="no gcc here")

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
+import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,8 +16,8 @@ from thermogrip.mpc.closed_loop.simulate_native import compiled_loop
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.design.spec import Spec
-from thermogrip.mpc.native import build
-from thermogrip.mpc.native.build import compiler
+from thermogrip.mpc.native import runtime as build
+from thermogrip.mpc.native.runtime import build_library, compiler, wanted
 from thermogrip.mpc.tuning.objective import Search, parameters_of
 from thermogrip.sysid.plant.plant import Plant
 
@@ -159,3 +162,63 @@ def test_where_gcc_refuses_trials_run_in_python_and_that_is_reported(plant, tmp_
 def test_an_uncompiled_controller_has_no_loop_in_c(plant):
     with pytest.raises(ValueError, match="not compiled"):
         compiled_loop(Controller(plant), plant, [(30.0, 10.0)])
+
+
+needs_gcc = pytest.mark.skipif(compiler() is None, reason="no gcc here")
+
+
+@needs_gcc
+def test_no_compiler_is_used_where_the_environment_forbids_it(monkeypatch):
+    monkeypatch.setenv("THERMOGRIP_COMPILED", "0")
+    assert not wanted()
+    monkeypatch.delenv("THERMOGRIP_COMPILED")
+    assert wanted()
+    monkeypatch.setenv("PATH", "")
+    assert not wanted()
+
+
+@needs_gcc
+def test_a_library_is_built_once(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    files = {"one.c": "int one(void);\nint one(void) { return 1; }\n"}
+    path = build_library(files)
+    built = os.stat(path).st_mtime_ns
+    assert build_library(files) == path
+    assert os.stat(path).st_mtime_ns == built
+    other = build_library({"one.c": files["one.c"].replace("1;", "2;")})
+    assert other != path
+    with pytest.raises(RuntimeError, match="gcc refused"):
+        build_library({"one.c": "int one(void) { return }"})
+    assert sorted(tmp_path.joinpath("thermogrip").iterdir()) == sorted([path, other])  # nothing half-built
+
+
+@needs_gcc
+def test_a_library_is_another_where_compiler_flags_or_machine_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    files = {"one.c": "int one(void);\nint one(void) { return 1; }\n", "one.h": "\n"}
+    first = build_library(files)
+    assert first.parent == tmp_path / "thermogrip"
+    seen = {first, build_library({"one.c": files["one.c"], "two.h": "\n"})}
+    monkeypatch.setattr(build, "_machine", lambda gcc: "another")
+    seen.add(build_library(files))
+    monkeypatch.setattr(build, "_FLAGS", build._FLAGS[:1] + build._FLAGS[2:])
+    seen.add(build_library(files))
+    assert len(seen) == 4
+    assert build_library(dict(reversed(files.items()))) in seen  # the order of the files says nothing
+
+
+@needs_gcc
+def test_a_nan_stays_one_in_a_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    source = "int lost(double x);\nint lost(double x) { return x != x; }\n"
+    library = ctypes.CDLL(str(build_library({"lost.c": source})))
+    library.lost.argtypes = [ctypes.c_double]
+    assert [library.lost(x) for x in (0.0, float("inf"), float("nan"))] == [0, 0, 1]
+
+
+def test_without_gcc_no_library_is_built(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(RuntimeError, match="no gcc"):
+        build_library({"one.c": "\n"})

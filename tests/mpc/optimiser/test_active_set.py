@@ -8,8 +8,7 @@ import pytest
 from tests.mpc.makers import solve_in_c
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import default_design
-from thermogrip.mpc.native.build import compiler
-from thermogrip.mpc.native.runtime import CompiledController
+from thermogrip.mpc.native.runtime import CompiledController, compiler
 from thermogrip.mpc.optimiser.active_set import ActiveSetQP
 from thermogrip.mpc.optimiser.qp import CondensedQP
 

@@ -14,10 +14,9 @@ from tests.mpc.makers import crossed
 from thermogrip.mpc.closed_loop.simulate import simulate_closed_loop
 from thermogrip.mpc.closed_loop.simulate_native import compiled_loop
 from thermogrip.mpc.controllers.mpc import Controller
-from thermogrip.mpc.design.design import Design, default_design
-from thermogrip.mpc.design.simc import PILoop
+from thermogrip.mpc.design.design import Design, PILoop, default_design
 from thermogrip.mpc.estimator.observer import Observer, choose_disturbances
-from thermogrip.mpc.native.build import wanted
+from thermogrip.mpc.native.runtime import wanted
 from thermogrip.mpc.optimiser.reach import Reach, _least_squares_in_box, _Relaxation
 from thermogrip.mpc.optimiser.rti import Optimiser
 from thermogrip.mpc.plant.prediction import PredictionModel

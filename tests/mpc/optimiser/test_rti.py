@@ -11,10 +11,9 @@ import pytest
 from tests.mpc.makers import crossed
 from thermogrip.mpc.closed_loop.simulate import Surroundings, simulate_closed_loop
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
-from thermogrip.mpc.design.design import Design
-from thermogrip.mpc.design.simc import PILoop
+from thermogrip.mpc.design.design import Design, PILoop
 from thermogrip.mpc.design.spec import Spec
-from thermogrip.mpc.native.build import wanted
+from thermogrip.mpc.native.runtime import wanted
 from thermogrip.mpc.optimiser.qp import QPAnswer
 from thermogrip.mpc.optimiser.rti import Optimiser, allowed_share
 from thermogrip.mpc.plant.prediction import PredictionModel

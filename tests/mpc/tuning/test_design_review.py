@@ -11,8 +11,7 @@ import pytest
 
 from tests.mpc.makers import crossed, network_plant
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
-from thermogrip.mpc.design.design import default_design
-from thermogrip.mpc.design.simc import PILoop
+from thermogrip.mpc.design.design import PILoop, default_design
 from thermogrip.mpc.estimator.observer import ObserverNoise
 from thermogrip.mpc.tuning import design_review as checks
 from thermogrip.mpc.tuning.design_review import review, worst

@@ -12,8 +12,7 @@ import pytest
 from tests.mpc.makers import make_tank
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.closed_loop.simulate import Segment, Surroundings
-from thermogrip.mpc.design.design import make_blocks
-from thermogrip.mpc.design.simc import PILoop
+from thermogrip.mpc.design.design import PILoop, make_blocks
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.tuning import objective
 from thermogrip.mpc.tuning.objective import Search, StepResult, Trial, parameters_of, scaled_loops, score
