@@ -63,13 +63,7 @@ class Surroundings:
     move_delay_s: float = 0.0
 
     def steps_of(self, names: tuple[str, ...]) -> Array:
-        """Return the step of a reading of each of these sensors (n,) [degC].
-
-        Examples
-        --------
-        >>> Surroundings(quanta={"t_ambient": 0.1}).steps_of(("t_tank", "t_ambient"))
-        array([0.0625, 0.1   ])
-        """
+        """Return the step of a reading of each of these sensors (n,) [degC]."""
         return np.array([self.quanta.get(name, self.quantum) for name in names], dtype=float)
 
 
@@ -161,7 +155,7 @@ def simulate_closed_loop(
     band: float = 0.25,
     seed: int = 0,
 ) -> ClosedLoop:
-    """Run a controller against a plant.
+    """Return the record of a controller that is run against a plant.
 
     Parameters
     ----------
@@ -178,10 +172,6 @@ def simulate_closed_loop(
         Half width of the settling band [degC].
     seed : int, optional
         Of the noise.
-
-    Returns
-    -------
-    ClosedLoop
 
     Examples
     --------

@@ -87,22 +87,7 @@ class Agreement:
 
 
 def export_controller(controller: Controller, folder: str | Path) -> Export:
-    """Write a controller as C99.
-
-    Parameters
-    ----------
-    controller : Controller
-    folder : str or Path
-        Made where absent; files of the same names are replaced.
-
-    Returns
-    -------
-    Export
-
-    Examples
-    --------
-    See :func:`check_export`.
-    """
+    """Write a controller as C99 into a folder, made where absent; files of the same names are replaced."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     model = controller.model

@@ -154,17 +154,13 @@ class Controller(SampledController):
 
     @classmethod
     def load(cls, path: str | Path, *, model: Model | None = None) -> Controller:
-        """Read a controller that :meth:`save` wrote.
+        """Return the controller that :meth:`save` wrote.
 
         Parameters
         ----------
         path : str or Path
         model : Model, optional
             The equations of its plant, where they are a class of the user's own; ignored otherwise.
-
-        Returns
-        -------
-        Controller
 
         Raises
         ------
@@ -202,11 +198,8 @@ class Controller(SampledController):
             raise UserError(problem, file=path, hint="tune the controller again") from error
 
     def to_control(self) -> Any:
-        """Return the controller without its limits as a python-control ``StateSpace``.
-
-        Inputs are the readings, ``target_<name>`` and the measured disturbances, outputs the drives, all in
-        changes from rest (:mod:`thermogrip.mpc.controllers.linear_equivalent`).
-        """
+        """Return the controller without its limits as a python-control ``StateSpace`` from readings,
+        ``target_<name>`` and measured disturbances to drives, all in changes from rest."""
         return to_control(self)
 
     def reset(self, reading: Readings) -> None:
@@ -244,10 +237,6 @@ class Controller(SampledController):
             switch (``"pump": 0``): then no water moves the heat, and the drive goes to zero until it runs.
         target : float or mapping of str to float
             [degC] by output name; a single number is the target of every controlled output.
-
-        Returns
-        -------
-        Move
 
         Examples
         --------
@@ -497,10 +486,6 @@ def design_controller(plant: Plant, **changes: Any) -> Controller:
     plant : Plant
     **changes
         ``controlled``, ``dt``, and any other field of :class:`thermogrip.mpc.design.design.Design`.
-
-    Returns
-    -------
-    Controller
 
     Examples
     --------

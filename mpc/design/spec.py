@@ -210,10 +210,6 @@ def read_spec(path: str | Path) -> Spec:
     path : str or Path
         A file like :data:`SPEC_TEMPLATE`.
 
-    Returns
-    -------
-    Spec
-
     Raises
     ------
     UserError

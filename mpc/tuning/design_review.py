@@ -99,10 +99,6 @@ def review(
     draws : int, optional
         Posterior draws on which the closed loop is checked.
 
-    Returns
-    -------
-    list of Check
-
     Examples
     --------
     >>> from thermogrip.sysid import Plant, load_network

@@ -129,10 +129,6 @@ def tune(
     seed : int, optional
         Of the noise.
 
-    Returns
-    -------
-    Tuning
-
     Raises
     ------
     UserError

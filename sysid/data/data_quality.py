@@ -62,12 +62,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class DataCheck:
-    """All findings.
-
-    Parameters
-    ----------
-    findings : tuple of Finding
-    """
+    """All findings."""
 
     findings: tuple[Finding, ...]
 

@@ -69,21 +69,9 @@ class Expectation:
 
 
 def expect(plant: Plant, schedules: Mapping[str, Log], *, room: float = ROOM) -> Expectation:
-    """Return what each schedule is expected to leave of the plant's uncertainty.
+    """Return what each schedule is expected to leave of a plant's uncertainty, from rest at ``room`` degC.
 
-    Parameters
-    ----------
-    plant : Plant
-        With a covariance.
-    schedules : mapping of name to Log
-        With the plant's inputs, on its step.
-    room : float, optional
-        Temperature at the start [degC].
-
-    Raises
-    ------
-    UserError
-        If the plant has no covariance, or a schedule lacks an input.
+    A UserError where the plant has no covariance, or a schedule, on the plant's step, lacks an input.
     """
     forecast = ExperimentForecast(plant, room=room, draws=0)
     inputs = {name: inputs_of(plant, log) for name, log in schedules.items()}
@@ -133,55 +121,15 @@ def optimal_schedule(
     evaluations: int | None = None,
     progress: Progress | None = None,
 ) -> Log:
-    """Return the schedule expected to gain most information on the plant's parameters.
+    """Return the schedule expected to gain most information, a row every ``plant.dt``.
 
-    Parameters
-    ----------
-    plant : Plant
-        With a covariance.
-    minutes : float
-        Length.
-    ranges : mapping of input to (low, high)
-        Of each input that is not a switch, in its unit; hard.
-    begin : mapping of name to Log, optional
-        Schedules to start from; the result is at least as good as those that keep the limits.
-    shortest : float, optional
-        Time between two changes of an input [s], at least.
-    lowest, highest : float, optional
-        Where every output in degC must stay, of the plant and of eight draws of it [degC].
-    slew : float, optional
-        Greatest change of an input in a second, in shares of its range.
-    switch_hold : float, optional
-        Time that a switch stays on or off, at least [s].
-    hold : collection of str, optional
-        Inputs that stay as at the start: a switch on, any other at 0 or what is nearest to it.
-    room : float, optional
-        Temperature at the start [degC].
-    seed : int, optional
-        Of the search.
-    evaluations : int, optional
-        How many schedules are tried; 1500 where absent.
-    progress : callable, optional
-        Called with (fraction done, what).
-
-    Returns
-    -------
-    Log
-        The plant's inputs, a row every ``plant.dt``.
-
-    Raises
-    ------
-    UserError
-        If the plant has no covariance, or nothing that moves an input keeps the limits.
-
-    Examples
-    --------
-    >>> from thermogrip.sysid.experiment.information import plant_from_prior
-    >>> from thermogrip.sysid.models.network import load_network
-    >>> plant = plant_from_prior(load_network("tclab"))
-    >>> log = optimal_schedule(plant, 20.0, ranges=plant.valid, highest=80.0, evaluations=50)
-    >>> log.sizes["time"], bool(0.0 <= log["q1"].min() < log["q1"].max() <= 100.0)
-    (1200, True)
+    ``ranges`` (low, high) are hard, of each input that is not a switch. The result is at least as good as
+    those schedules of ``begin`` that keep the limits: ``shortest`` seconds between two changes of an input,
+    ``slew`` shares of its range in a second at most, ``switch_hold`` seconds in each position of a switch,
+    and every output in degC between ``lowest`` and ``highest``, of the plant and of eight draws of it.
+    Inputs on ``hold`` stay as at the start, in a room of ``room`` [degC]: a switch on, any other at 0 or
+    what is nearest to it. ``evaluations`` schedules are tried, 1500 where absent. A UserError where the
+    plant has no covariance, or nothing that moves an input keeps the limits.
     """
     if not set(plant.inputs) - set(plant.model.switches) <= set(ranges):
         raise ValueError("ranges must name every input that is not a switch")

@@ -234,10 +234,6 @@ def plant_dynamics(
     draws : int, optional
         Other plants that agree with the logs; none of a plant without uncertainty.
 
-    Returns
-    -------
-    Dynamics
-
     Raises
     ------
     UserError

@@ -127,14 +127,8 @@ class Plant(PlantData):
         return simulate(self, log, warmup=warmup, score_from=score_from, gaps=gaps)
 
     def to_dict(self, *, draws: int | None = None) -> dict[str, Any]:
-        """Return the whole plant as plain JSON: equations, values, units, covariance, samples.
-
-        Parameters
-        ----------
-        draws : int, optional
-            So many posterior samples, evenly spread, are kept; all where absent, for only then is the k-th
-            :meth:`draw` the same on both sides.
-        """
+        """Return the whole plant as plain JSON, with so many posterior samples, evenly spread; with all where
+        ``draws`` is absent, for only then is the k-th :meth:`draw` the same on both sides."""
         content: dict[str, Any] = {"schema": SCHEMA, "version": VERSION} | plain_content(self)
         if self.samples is not None:
             content["draws"] = thin(self.samples, draws).tolist()
@@ -143,13 +137,7 @@ class Plant(PlantData):
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], *, model: Model | None = None) -> Plant:
-        """Return the plant that :meth:`to_dict` wrote; ``model`` as for :meth:`load`.
-
-        Raises
-        ------
-        UserError
-            If it is not a plant, or its equations are a class that was not handed in.
-        """
+        """Return the plant that :meth:`to_dict` wrote; ``model`` and errors as for :meth:`load`."""
         body = {key: value for key, value in content.items() if key != "draws"}
         check_json(body, SCHEMA, VERSION)
         draws = content.get("draws")
@@ -168,7 +156,7 @@ class Plant(PlantData):
 
     @classmethod
     def load(cls, path: str | Path, *, model: Model | None = None) -> Plant:
-        """Read a plant that :meth:`save` wrote.
+        """Return the plant that :meth:`save` wrote.
 
         Parameters
         ----------
@@ -177,10 +165,6 @@ class Plant(PlantData):
             The equations, where they are the user's own code:
             :func:`thermogrip.sysid.models.user_model.own_model` of the class that was fitted (opening a file
             never runs code).
-
-        Returns
-        -------
-        Plant
 
         Raises
         ------

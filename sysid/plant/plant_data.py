@@ -94,12 +94,8 @@ class PlantData:
         """Return the plant with the parameters of the k-th draw.
 
         Draw 0 is the plant itself.  Others come from the saved samples or refits where there are any (evenly
-        spread over them), else from the Laplace approximation N(theta, covariance) with seed k.
-
-        Raises
-        ------
-        UserError
-            If k > 0 and the plant has nothing to draw from.
+        spread over them), else from the Laplace approximation N(theta, covariance) with seed k; a UserError
+        where there is nothing to draw from.
         """
         if k < 0:
             raise UserError(f"draw {k} is negative", hint="count draws from 0")
@@ -118,16 +114,11 @@ class PlantData:
         return replace(self, values=self.values | dict(zip(self.free, drawn.tolist())))
 
     def intervals(self, level: float = 0.9) -> dict[str, tuple[float, float]]:
-        """Return the central interval of each free parameter in natural units, by name.
+        """Return the central interval of probability ``level`` of each free parameter, in natural units.
 
         theta +- z sd, clipped to the bounds; quantiles of the samples where there is no covariance.  Samples
         are of plants that agree with the logs, and what their parameters mean may still be off
         (:mod:`thermogrip.sysid.greybox.posterior`).
-
-        Parameters
-        ----------
-        level : float, optional
-            Probability inside, between 0 and 1.
         """
         if not 0 < level < 1:
             raise ValueError(f"level must lie between 0 and 1, got {level:g}")
