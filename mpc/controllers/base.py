@@ -53,10 +53,14 @@ class SampledController:
         self._rows = [model.outputs.index(name) for name in controlled]
         self._patience_s = patience_s * (1 + SAME)
         self._neutral = np.clip(np.zeros(model.n_u), self.lowest, self.highest)
-        self._u = self._neutral
-        self._target = np.full(len(controlled), np.nan)
-        self._unread_s = np.zeros(len(controlled))  # since each controlled output was read
+        self._forget()
         self._move = Move(as_drive(model.drives, self._u))
+
+    def _forget(self) -> None:
+        """Return to no drive and no target, every output just read."""
+        self._u = self._neutral.copy()
+        self._target = np.full(len(self.controlled), np.nan)
+        self._unread_s = np.zeros(len(self.controlled))  # since each controlled output was read
 
     @property
     def dt(self) -> float:

@@ -30,7 +30,6 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import markdown
 from thermogrip.datasets.parallel import Progress
 from thermogrip.mpc.controllers.mpc import Controller
-from thermogrip.mpc.estimator.observer import Observer
 from thermogrip.mpc.interface import STATUSES
 from thermogrip.mpc.native.codegen import write_model
 from thermogrip.mpc.native.design_struct import (
@@ -401,7 +400,7 @@ def _rest_error(controller: Controller, low: float, high: float) -> float:
     """Return by how much the state at rest is off that is linearised in the room, at most [degC]."""
     model, ambient = controller.model, controller.design.ambient
     room = np.full(model.n_d, ambient)
-    observer = Observer(model, controller.disturbance, controller.design.noise, ambient=ambient)
+    observer = controller.design.observer(model)
     worst = 0.0
     for level in np.linspace(low, high, 5):
         y = np.full(model.n_y, level)

@@ -53,7 +53,7 @@ from thermogrip.mpc.controllers.base import SampledController
 from thermogrip.mpc.controllers.pi import held_drive
 from thermogrip.mpc.design.design import Design
 from thermogrip.mpc.estimator.call_times import RESTART_S, opening
-from thermogrip.mpc.estimator.observer import Observer, choose_disturbances
+from thermogrip.mpc.estimator.observer import Observer
 from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.mpc.plant.prediction import PredictionModel, prediction_model
 
@@ -117,9 +117,7 @@ class LQRController(SampledController):
         super().__init__(model, design.controlled, design.drive_range, slew, design.patience_s, clock)
         self.design = design
         if observer is None:
-            count = None if design.offset_free else 0
-            disturbances = choose_disturbances(model, design.controlled, ambient=design.ambient, count=count)
-            observer = Observer(model, disturbances, design.noise, ambient=design.ambient)
+            observer = design.observer(model)
         self.observer = observer
         self._laws: dict[tuple[float, ...], _Law | None] = {}
         self._pair = [
@@ -135,10 +133,8 @@ class LQRController(SampledController):
         y, d = self._read(reading)
         self._d = np.where(np.isfinite(d), d, self.design.ambient)
         self.observer.reset(y, self._d)
-        self._u = self._neutral.copy()
-        self._target = np.full(len(self._rows), np.nan)
+        self._forget()
         self._fresh = True
-        self._unread_s = np.zeros(len(self._rows))
         self.times.reset()
 
     def step(self, reading: Readings, target: Target) -> Move:

@@ -44,7 +44,6 @@ from thermogrip.mpc.controllers.linear_equivalent import to_control
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import SCHEMA, VERSION, Design, check_design, default_design
 from thermogrip.mpc.estimator.call_times import RESTART_S, opening, shifted
-from thermogrip.mpc.estimator.observer import Observer, choose_disturbances
 from thermogrip.mpc.estimator.reading_checks import ReadingMonitor, follows, is_off
 from thermogrip.mpc.interface import Move, Readings, Target, number
 from thermogrip.mpc.optimiser.reach import Reach
@@ -106,10 +105,8 @@ class Controller(SampledController):
         slew = design.dt * np.array([design.slew_per_s[name] for name in model.drives])
         super().__init__(model, design.controlled, design.drive_range, slew, design.patience_s, clock)
         self.plant, self.design, self.notes = plant, design, dict(notes or {})
-        self.disturbance = choose_disturbances(
-            self.model, design.controlled, ambient=design.ambient, count=None if design.offset_free else 0
-        )
-        self.observer = Observer(self.model, self.disturbance, design.noise, ambient=design.ambient)
+        self.observer = design.observer(self.model)
+        self.disturbance = self.observer.disturbance
         self.optimiser = Optimiser(self.model, design)
         self.c: CompiledController | None = None
         if compiled:
@@ -284,14 +281,13 @@ class Controller(SampledController):
     def _start(self, y: Array, d: Array) -> None:
         self._d = np.where(np.isfinite(d), d, self.design.ambient)
         self.observer.reset(y, self._d)
-        self._u = self._in_force = self._neutral.copy()
-        self._target = np.full(len(self._rows), np.nan)
+        self._forget()
+        self._in_force = self._u
         self._side = np.zeros(len(self._rows))
         self._plan = None
         self._y_plan = np.zeros((0, self.model.n_y))
         self._age_s = 0.0  # since the plan was made
         self._silent_s = 0.0  # that nobody called, where it was too long to know the past
-        self._unread_s = np.zeros(len(self._rows))  # since each controlled output was read
         self._y = y
         self._seen = self.observer.now  # where the estimate stood after the last reading
         self._fresh = True

@@ -92,16 +92,17 @@ class PIController(SampledController):
             clock,
         )
         self.loops = pair_loops(plant, self.controlled) if loops is None else loops
+        # of each loop its drive and its output, counted from 0
+        self._ends = [(model.drives.index(p.drive), self.controlled.index(p.output)) for p in self.loops]
         self._I = np.zeros(len(self.loops))
         self._room = np.full(model.n_d, np.nan)
 
     def reset(self, reading: Readings) -> None:
         """Forget the past; the plant is at rest at this reading."""
-        self._u = self._neutral
+        self._forget()
         self._I = np.zeros(len(self.loops))
         self._target = self._read(reading)[0][self._rows]
         self._room = np.full(self.model.n_d, np.nan)
-        self._unread_s = np.zeros(len(self.controlled))
         self.times.reset()
 
     def step(self, reading: Readings, target: Target) -> Move:
@@ -136,23 +137,17 @@ class PIController(SampledController):
         (n_controlled,) are NaN where lost, d (n_d,) feeds the holding drive [degC].
         """
         seconds = self.dt if seconds is None else seconds
-        ahead = self._feedforward(target, d)
+        ahead, error = self._feedforward(target, d), target - y
         v = ahead.copy()
-        for at, loop in enumerate(self.loops):
-            error = target[self.controlled.index(loop.output)] - y[self.controlled.index(loop.output)]
-            j = self.model.drives.index(loop.drive)
-            if np.isfinite(error):
-                v[j] = loop.feedforward * ahead[j] + loop.Kc * error + self._I[at]
+        for at, (loop, (j, i)) in enumerate(zip(self.loops, self._ends)):
+            if np.isfinite(error[i]):
+                v[j] = loop.feedforward * ahead[j] + loop.Kc * error[i] + self._I[at]
             else:
-                lost = self._lost[self.controlled.index(loop.output)]
-                v[j] = self._neutral[j] if lost else self._u[j]
+                v[j] = self._neutral[j] if self._lost[i] else self._u[j]
         u = self._within(v, seconds)
-        for at, loop in enumerate(self.loops):
-            error = target[self.controlled.index(loop.output)] - y[self.controlled.index(loop.output)]
-            if not np.isfinite(error):
-                continue
-            j = self.model.drives.index(loop.drive)
-            self._I[at] += seconds * (loop.Kc / loop.Ti * error + (u[j] - v[j]) / loop.Tt)
+        for at, (loop, (j, i)) in enumerate(zip(self.loops, self._ends)):
+            if np.isfinite(error[i]):
+                self._I[at] += seconds * (loop.Kc / loop.Ti * error[i] + (u[j] - v[j]) / loop.Tt)
         return u
 
     def hold(self, u: Array) -> None:
@@ -165,11 +160,9 @@ class PIController(SampledController):
         The other arguments are those of :meth:`propose`.
         """
         self._u = np.asarray(u, dtype=float)
-        ahead = self._feedforward(target, d)
-        for at, loop in enumerate(self.loops):
-            error = target[self.controlled.index(loop.output)] - y[self.controlled.index(loop.output)]
-            j = self.model.drives.index(loop.drive)
-            self._I[at] = self._u[j] - loop.feedforward * ahead[j] - loop.Kc * error
+        ahead, error = self._feedforward(target, d), target - y
+        for at, (loop, (j, i)) in enumerate(zip(self.loops, self._ends)):
+            self._I[at] = self._u[j] - loop.feedforward * ahead[j] - loop.Kc * error[i]
 
     def _feedforward(self, target: Array, d: Array) -> Array:
         """Return the drives that hold the target; worked out once for a target and half a degree of room."""

@@ -29,13 +29,13 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from numbers import Real
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import LARGEST
-from thermogrip.mpc.estimator.observer import ObserverNoise
+from thermogrip.mpc.estimator.observer import Observer, ObserverNoise, choose_disturbances
 from thermogrip.mpc.plant.prediction import (
     PredictionModel,
     drive_names,
@@ -111,10 +111,9 @@ def check_design(design: Design, plant: Plant) -> Design:
     drives = drive_names(plant)
     for what, values in _numbers_of(design):
         for value in values:
-            if isinstance(value, bool) or not isinstance(value, Real) or not np.isfinite(float(value)):
-                _refuse(f"{what} must be a finite number, not {value!r}")
-            if abs(float(value)) > LARGEST:
-                _refuse(f"{what} is {float(value):g}, beyond {LARGEST:g}")
+            wrong = isinstance(value, bool) or not isinstance(value, Real) or not np.isfinite(float(value))
+            _refuse(wrong, f"{what} must be a finite number, not {value!r}")
+            _refuse(abs(float(value)) > LARGEST, f"{what} is {float(value):g}, beyond {LARGEST:g}")
     _check_time(design, plant)
     _check_outputs(design, plant)
     _check_drives(design, plant, drives)
@@ -123,8 +122,10 @@ def check_design(design: Design, plant: Plant) -> Design:
     return design
 
 
-def _refuse(problem: str) -> NoReturn:
-    raise UserError(problem, hint="correct the spec or tune again")
+def _refuse(wrong: object, problem: str) -> None:
+    """Raise the problem where there is one."""
+    if wrong:
+        raise UserError(problem, hint="correct the spec or tune again")
 
 
 def _numbers_of(design: Design) -> Iterator[tuple[str, Sequence[Any]]]:
@@ -146,78 +147,69 @@ def _numbers_of(design: Design) -> Iterator[tuple[str, Sequence[Any]]]:
 
 def _check_time(design: Design, plant: Plant) -> None:
     steps = design.dt / plant.dt
-    if not design.dt > 0 or abs(steps - round(steps)) > 1e-6 * steps:
-        _refuse(f"dt is {design.dt:g} s, no multiple of the plant's step of {plant.dt:g} s")
-    if design.dt > _LONGEST_SAMPLE:
-        _refuse(f"dt is {design.dt:g} s, longer than the {_LONGEST_SAMPLE:g} s of a sample")
-    if not design.blocks or min(design.blocks) < 1:
-        _refuse("blocks must be whole numbers from 1")
-    if sum(design.blocks) > LONGEST_HORIZON:
-        _refuse(f"blocks sum to {sum(design.blocks)} samples, more than the {LONGEST_HORIZON} of a horizon")
-    if design.move_delay not in (0, 1):
-        _refuse("move_delay must be 0 or 1")
-    if not isinstance(design.offset_free, bool):
-        _refuse("offset_free must be true or false")
-    if min(design.deadline_s, design.patience_s) < 0:
-        _refuse("deadline_s and patience_s must be >= 0")
-    if not _ROOMS[0] <= design.ambient <= _ROOMS[1]:
-        _refuse(f"ambient is {design.ambient:g} degC, which is no room")
+    wrong = not design.dt > 0 or abs(steps - round(steps)) > 1e-6 * steps
+    _refuse(wrong, f"dt is {design.dt:g} s, no multiple of the plant's step of {plant.dt:g} s")
+    wrong = design.dt > _LONGEST_SAMPLE
+    _refuse(wrong, f"dt is {design.dt:g} s, longer than the {_LONGEST_SAMPLE:g} s of a sample")
+    _refuse(not design.blocks or min(design.blocks) < 1, "blocks must be whole numbers from 1")
+    wrong = sum(design.blocks) > LONGEST_HORIZON
+    _refuse(
+        wrong, f"blocks sum to {sum(design.blocks)} samples, more than the {LONGEST_HORIZON} of a horizon"
+    )
+    _refuse(design.move_delay not in (0, 1), "move_delay must be 0 or 1")
+    _refuse(not isinstance(design.offset_free, bool), "offset_free must be true or false")
+    _refuse(min(design.deadline_s, design.patience_s) < 0, "deadline_s and patience_s must be >= 0")
+    wrong = not _ROOMS[0] <= design.ambient <= _ROOMS[1]
+    _refuse(wrong, f"ambient is {design.ambient:g} degC, which is no room")
 
 
 def _check_outputs(design: Design, plant: Plant) -> None:
-    if not design.controlled:
-        _refuse("controlled names no output")
+    _refuse(not design.controlled, "controlled names no output")
     for name in design.controlled:
-        if name not in plant.outputs:
-            _refuse(f"controlled: the plant has no output {name}")
-        if design.controlled.count(name) > 1:
-            _refuse(f"controlled names {name} twice")
+        _refuse(name not in plant.outputs, f"controlled: the plant has no output {name}")
+        _refuse(design.controlled.count(name) > 1, f"controlled names {name} twice")
     for name, (low, high) in design.limits.items():
-        if name not in plant.outputs:
-            _refuse(f"limits: the plant has no output {name}")
-        if not low < high:
-            _refuse(f"limits of {name} are {low:g} to {high:g}, which is empty")
+        _refuse(name not in plant.outputs, f"limits: the plant has no output {name}")
+        _refuse(not low < high, f"limits of {name} are {low:g} to {high:g}, which is empty")
 
 
 def _check_drives(design: Design, plant: Plant, drives: Sequence[str]) -> None:
-    if len(design.blocks) * len(drives) > MOST_UNKNOWNS:
-        _refuse(f"{len(design.blocks)} blocks of {len(drives)} drives are more than {MOST_UNKNOWNS} unknowns")
+    wrong = len(design.blocks) * len(drives) > MOST_UNKNOWNS
+    _refuse(
+        wrong, f"{len(design.blocks)} blocks of {len(drives)} drives are more than {MOST_UNKNOWNS} unknowns"
+    )
     for key, given in (("drive_range", design.drive_range), ("slew_per_s", design.slew_per_s)):
-        unknown = [name for name in given if name not in drives]
-        if unknown:
-            _refuse(f"{key}: the plant has no drive {unknown[0]}")
+        for name in given:
+            _refuse(name not in drives, f"{key}: the plant has no drive {name}")
     for name in drives:
-        if name not in design.drive_range or name not in design.slew_per_s:
-            _refuse(f"drive_range, slew_per_s: nothing for drive {name}")
+        wrong = name not in design.drive_range or name not in design.slew_per_s
+        _refuse(wrong, f"drive_range, slew_per_s: nothing for drive {name}")
         low, high = design.drive_range[name]
-        if not low < high:
-            _refuse(f"drive_range of {name} is {low:g} to {high:g}, which is empty")
+        _refuse(not low < high, f"drive_range of {name} is {low:g} to {high:g}, which is empty")
         least, most = drive_range(plant, name)
-        if low < least - 1e-9 or high > most + 1e-9:
-            _refuse(f"drive_range of {name} is {low:g} to {high:g}, beyond the drive's {least:g} to {most:g}")
-        if not design.slew_per_s[name] > 0:
-            _refuse(f"slew_per_s of {name} must be > 0")
+        wrong = low < least - 1e-9 or high > most + 1e-9
+        _refuse(
+            wrong, f"drive_range of {name} is {low:g} to {high:g}, beyond the drive's {least:g} to {most:g}"
+        )
+        _refuse(not design.slew_per_s[name] > 0, f"slew_per_s of {name} must be > 0")
 
 
 def _check_loops(design: Design, drives: Sequence[str]) -> None:
     for at, loop in enumerate(design.loops):
-        if loop.drive not in drives or loop.output not in design.controlled:
-            _refuse(f"loops: {loop.output} by {loop.drive} is no pair of a regulated output and a drive")
-        if any(loop.drive == other.drive or loop.output == other.output for other in design.loops[:at]):
-            _refuse(f"loops: {loop.output} by {loop.drive} is there twice")
-        if loop.Ti <= 0 or loop.Tt <= 0:
-            _refuse(f"loops: Ti and Tt of {loop.output} must be > 0")
+        wrong = loop.drive not in drives or loop.output not in design.controlled
+        _refuse(wrong, f"loops: {loop.output} by {loop.drive} is no pair of a regulated output and a drive")
+        wrong = any(loop.drive == other.drive or loop.output == other.output for other in design.loops[:at])
+        _refuse(wrong, f"loops: {loop.output} by {loop.drive} is there twice")
+        _refuse(loop.Ti <= 0 or loop.Tt <= 0, f"loops: Ti and Tt of {loop.output} must be > 0")
 
 
 def _check_weights(design: Design) -> None:
-    if min(design.track, design.move) <= 0 or min(design.terminal, design.drive, design.price) < 0:
-        _refuse("weights: track and move must be > 0, the others >= 0")
-    if design.overshoot < 0:
-        _refuse("overshoot must be >= 0")
-    if min(vars(design.noise).values()) < 0:
-        _refuse("noise: a standard deviation must be >= 0")
-    if max(vars(design.noise).values()) > _MOST_NOISE:
-        _refuse(f"noise: a standard deviation must be <= {_MOST_NOISE:g}")
+    wrong = min(design.track, design.move) <= 0 or min(design.terminal, design.drive, design.price) < 0
+    _refuse(wrong, "weights: track and move must be > 0, the others >= 0")
+    _refuse(design.overshoot < 0, "overshoot must be >= 0")
+    _refuse(min(vars(design.noise).values()) < 0, "noise: a standard deviation must be >= 0")
+    wrong = max(vars(design.noise).values()) > _MOST_NOISE
+    _refuse(wrong, f"noise: a standard deviation must be <= {_MOST_NOISE:g}")
 
 
 SCHEMA, VERSION = "thermogrip.controller", 1
@@ -290,6 +282,12 @@ class Design:
     def horizon_s(self) -> float:
         """Length of the prediction [s]."""
         return self.dt * sum(self.blocks)
+
+    def observer(self, model: PredictionModel) -> Observer:
+        """Return the filter of this design for a plant at its sample time."""
+        count = None if self.offset_free else 0
+        chosen = choose_disturbances(model, self.controlled, ambient=self.ambient, count=count)
+        return Observer(model, chosen, self.noise, ambient=self.ambient)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the design as plain JSON."""

@@ -6,6 +6,7 @@ The template in :data:`SPEC_TEMPLATE` is the documentation: ``thermogrip init sp
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -144,7 +145,7 @@ class Spec(BaseModel):
         if self.patience_s is not None:
             values["patience_s"] = self.patience_s
         values |= {"limits": _limits(self, plant, design), "overshoot": 0.5 * self.overshoot_degC}
-        return Design.from_dict({**design.to_dict(), **_plain(values), **changes})
+        return replace(design, **values, **changes)
 
 
 def _check_sample(spec: Spec, plant: Plant) -> None:
@@ -251,14 +252,3 @@ def _by_drive(key: str, value: Any, drives: tuple[str, ...]) -> dict[str, Any]:
         if name not in drives:
             raise UserError(f"{key}: the plant has no drive {name}", hint=f"it has {', '.join(drives)}")
     return dict(value)
-
-
-def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values as JSON has them: pairs are lists."""
-    out: dict[str, Any] = {}
-    for key, value in values.items():
-        if isinstance(value, dict):
-            out[key] = {name: list(v) if isinstance(v, tuple) else v for name, v in value.items()}
-        else:
-            out[key] = value
-    return out

@@ -16,7 +16,6 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import (
     Design,
-    PILoop,
     _unmoved,
     check_design,
     default_controlled,
@@ -268,7 +267,6 @@ def test_simc_of_a_delayed_lag_is_its_closed_form(delay, lag, tau_c, closed, int
     assert answer.lag / answer.gain == pytest.approx((lag + 1) / 50, rel=2e-3)
     assert loop.Ti == loop.Tt == pytest.approx(integral, rel=1e-3)
     assert (loop.drive, loop.output, loop.feedforward) == ("q", "t", 1.0)
-    assert PILoop(**loop.to_dict()) == loop
 
 
 def test_a_drive_of_the_other_sign_has_a_loop_of_the_other_sign_and_one_of_no_gain_has_none():
