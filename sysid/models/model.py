@@ -124,7 +124,7 @@ class BlackBox:
             content |= {key: array_within(data, key) for key in cls.arrays}
             if content["spread"].ndim == 2 and not (np.diagonal(content["spread"]) > 0).all():
                 raise ValueError("spread has a variance that is not positive")
-            return cls(**content, dt=number_within(data, "dt", *STEP_RANGE), **cls.others(data))
+            return cls(**content | {"dt": number_within(data, "dt", *STEP_RANGE)} | cls.others(data))
         except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
             raise UserError(f"not a {cls.title} ({error})", hint="save it again with this version") from error
 

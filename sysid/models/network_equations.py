@@ -297,18 +297,13 @@ def build_layout(network: Network) -> Layout:
         "peltier": [item for element in network.peltiers.values() for item in _peltier(network, element)],
     }
     begin = dict(zip(parts, np.cumsum([0, *map(len, parts.values())]).tolist()))
-    inputs, place = list(network.inputs), {name: i for i, name in enumerate(network.parameters)}
-    fixed = len(place)  # the place of a factor 1
+    inputs = list(network.inputs)
     return Layout(
         n_x=len(states),
         n_d=len(network.disturbances),
         n_fixed=len(network.boundaries),
         **{f"at_{name}": at for name, at in begin.items() if name != "capacity"},
-        coefficients=tuple(
-            (scale, *[*(place[name] for name in names), fixed, fixed][:2])
-            for part in parts.values()
-            for scale, names in part
-        ),
+        coefficients=tuple(_monomial(item, network) for part in parts.values() for item in part),
         links=tuple((link.to, link.source, link.both, link.switch) for link in links),
         bent=tuple(k for k, link in enumerate(links) if link.bend is not None),
         radiation=tuple(_receiver(r.between, index, len(states)) for r in network.radiation.values()),
@@ -385,6 +380,13 @@ def _peltier(network: Network, element: Any) -> list[Coefficient]:
         else:
             out.append((1.0, (parameter,)))
     return out
+
+
+def _monomial(item: Coefficient, network: Network) -> tuple[float, int, int]:
+    scale, names = item
+    places, one = list(network.parameters), len(network.parameters)  # the place of a factor 1
+    left, right = [*map(places.index, names), one, one][:2]
+    return scale, left, right
 
 
 def _receiver(between: list[str], index: Mapping[str, int], n_x: int) -> tuple[int, int]:
