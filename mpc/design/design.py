@@ -152,10 +152,8 @@ def _check_time(design: Design, plant: Plant) -> None:
     wrong = design.dt > _LONGEST_SAMPLE
     _refuse(wrong, f"dt is {design.dt:g} s, longer than the {_LONGEST_SAMPLE:g} s of a sample")
     _refuse(not design.blocks or min(design.blocks) < 1, "blocks must be whole numbers from 1")
-    wrong = sum(design.blocks) > LONGEST_HORIZON
-    _refuse(
-        wrong, f"blocks sum to {sum(design.blocks)} samples, more than the {LONGEST_HORIZON} of a horizon"
-    )
+    N = sum(design.blocks)
+    _refuse(N > LONGEST_HORIZON, f"blocks sum to {N} samples, more than the {LONGEST_HORIZON} of a horizon")
     _refuse(design.move_delay not in (0, 1), "move_delay must be 0 or 1")
     _refuse(not isinstance(design.offset_free, bool), "offset_free must be true or false")
     _refuse(min(design.deadline_s, design.patience_s) < 0, "deadline_s and patience_s must be >= 0")
@@ -174,10 +172,8 @@ def _check_outputs(design: Design, plant: Plant) -> None:
 
 
 def _check_drives(design: Design, plant: Plant, drives: Sequence[str]) -> None:
-    wrong = len(design.blocks) * len(drives) > MOST_UNKNOWNS
-    _refuse(
-        wrong, f"{len(design.blocks)} blocks of {len(drives)} drives are more than {MOST_UNKNOWNS} unknowns"
-    )
+    n_b, n_u = len(design.blocks), len(drives)
+    _refuse(n_b * n_u > MOST_UNKNOWNS, f"{n_b} blocks of {n_u} drives are more than {MOST_UNKNOWNS} unknowns")
     for key, given in (("drive_range", design.drive_range), ("slew_per_s", design.slew_per_s)):
         for name in given:
             _refuse(name not in drives, f"{key}: the plant has no drive {name}")
@@ -187,10 +183,8 @@ def _check_drives(design: Design, plant: Plant, drives: Sequence[str]) -> None:
         low, high = design.drive_range[name]
         _refuse(not low < high, f"drive_range of {name} is {low:g} to {high:g}, which is empty")
         least, most = drive_range(plant, name)
-        wrong = low < least - 1e-9 or high > most + 1e-9
-        _refuse(
-            wrong, f"drive_range of {name} is {low:g} to {high:g}, beyond the drive's {least:g} to {most:g}"
-        )
+        beyond = f"is {low:g} to {high:g}, beyond the drive's {least:g} to {most:g}"
+        _refuse(low < least - 1e-9 or high > most + 1e-9, f"drive_range of {name} {beyond}")
         _refuse(not design.slew_per_s[name] > 0, f"slew_per_s of {name} must be > 0")
 
 
