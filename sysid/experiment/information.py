@@ -79,6 +79,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.greybox.noise_model import Block, ErrorModel
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.greybox.random_effects import Response, WarmUp, signals, warm_noise
+from thermogrip.sysid.models.lti import symmetric_root
 from thermogrip.sysid.models.model import GreyModel
 from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.plant.plant import Plant
@@ -344,8 +345,7 @@ class ExperimentForecast:
         covariance = np.asarray(self.plant.covariance)
         if not np.isfinite(covariance).all():
             raise UserError("the plant's covariance is not finite", hint="identify it again")
-        size, axes = np.linalg.eigh(covariance)
-        return np.asarray(axes * np.sqrt(np.maximum(size, 0.0)))
+        return symmetric_root(covariance)
 
     @cached_property
     def _steps(self) -> Array:
@@ -447,8 +447,8 @@ def _natural(plant: Plant, theta: Array) -> Array:
 
 def _spread_root(plant: Plant) -> Array:
     """Return columns (n_x, n_mode) by which a state at rest may be off."""
-    size, axes = np.linalg.eigh(plant.model.spread)
-    return np.asarray((axes * np.sqrt(np.maximum(size, 0.0)))[:, size > 0])
+    root = symmetric_root(plant.model.spread)
+    return root[:, root.any(axis=0)]
 
 
 def _is_celsius(plant: Plant, name: str) -> bool:

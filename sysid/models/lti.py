@@ -110,6 +110,12 @@ def covariance_root(covariance: Array) -> Array:
     return np.asarray(vectors[:, keep] * np.sqrt(size[keep]))
 
 
+def symmetric_root(covariance: Array) -> Array:
+    """Return R with R R' = covariance, one column an axis; a variance lost to rounding is 0."""
+    size, axes = np.linalg.eigh(covariance)
+    return np.asarray(axes * np.sqrt(np.maximum(size, 0.0)))
+
+
 def read_terms(terms: Sequence[str], names: Sequence[str]) -> list[list[tuple[int, bool]]]:
     """Read each term as a list of (column, whether its magnitude is meant)."""
     out = []

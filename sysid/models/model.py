@@ -27,10 +27,10 @@ from numpy.typing import ArrayLike
 from thermogrip.datasets.arrays import Array, Mask, Run, Values
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import STEP_RANGE, array_within, number_within
-from thermogrip.datasets.schema import Log
 from thermogrip.sysid.models.network_spec import Parameter
 
 if TYPE_CHECKING:
+    from thermogrip.datasets.schema import Log
     from thermogrip.sysid.models.jit_rollout import Equations
 
 SMOOTH = 20.0  # [s] mean of a measured ambient, for its sensor is slow and coarse
@@ -208,7 +208,7 @@ class GreyModel(Model, Protocol):
 
 
 # (model, logs, p (n_p,)) -> (log's name, simulated outputs (1, N + 1, n_y)) of each stretch without a gap
-FreeRuns = Callable[[GreyModel, Sequence[Log], Array], list[tuple[str, Array]]]
+FreeRuns = Callable[[GreyModel, Sequence["Log"], Array], list[tuple[str, Array]]]
 
 
 class Described:

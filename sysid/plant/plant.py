@@ -19,10 +19,10 @@ from thermogrip.datasets.atomic_files import check_json, read_json, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log
 from thermogrip.sysid.models.model import Model, load_model
-from thermogrip.sysid.plant.plant_data import PlantData
-from thermogrip.sysid.plant.plant_file import (
+from thermogrip.sysid.plant.plant_data import (
     SCHEMA,
     VERSION,
+    PlantData,
     draws_of,
     fields_of,
     not_whole,

@@ -11,18 +11,28 @@ natural units.
 **One log is not another.**  Thermocouples are plugged anew and rooms change, so each log has sensor offsets
 of its own.  ``nuisance`` says by how much (a standard deviation per signal);
 :mod:`thermogrip.sysid.plant.simulation` estimates them from the warm-up of the log that it simulates.
+
+**Files.**  One dictionary serves the plant's own file, the controller's file that contains its plant, and whoever
+wants a plant elsewhere: the model's equations as data, values with units, covariance of theta with the scales
+it is in, bounds and ranges (an open end is null, for JSON has no infinity).  Samples stand beside the file
+as ``.nc``, or under ``draws`` where they are few or there is no file.  Reading never runs code.
+This module loads no xarray, so that a file can be refused at once.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from statistics import NormalDist
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
 from thermogrip.datasets.arrays import Array, Mask
+from thermogrip.datasets.atomic_files import atomic_path, read_json
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.limits import LARGEST, MOST_NUMBER, STEP_RANGE, array_within, number_within
 from thermogrip.sysid.models.model import Model
 from thermogrip.sysid.plant.fit_record import FitLog, PlantScores
 
@@ -155,3 +165,167 @@ class PlantData:
         size, axes = np.linalg.eigh(np.asarray(self.covariance))
         step = axes @ (np.sqrt(np.maximum(size, 0.0)) * rng.standard_normal(len(size)))
         return self._natural(self.theta + step)
+
+
+SCHEMA, VERSION = "thermogrip.plant", 1
+_MOST_ERROR, _MOST_READING = 1e6, 1e9  # of a sensor, in any unit
+_PLAIN = ("values", "units", "scales", "noise", "offsets", "nuisance", "reference", "verdict")
+
+
+def check_plant_file(path: str | Path, *, inside: str | None = None) -> dict[str, Any]:
+    """Look through a plant, or that inside a file of another schema, before what its model needs is loaded.
+
+    Returns what the file holds; UserError if it is beyond the limits of a document or a field is not what it
+    should be.
+    """
+    content = read_json(path, inside or SCHEMA, VERSION)
+    try:
+        if inside and not isinstance(content.get("plant"), dict):
+            raise UserError("plant is missing", hint="write the file again")
+        fields_of(content["plant"] if inside else content)
+    except UserError as error:
+        raise UserError(error.problem, file=path, hint=error.hint) from error
+    return content
+
+
+def plain_content(plant: PlantData) -> dict[str, Any]:
+    """Return everything of the plant but its samples as plain JSON."""
+    content: dict[str, Any] = {"model": plant.model.to_dict(), "dt": plant.dt}
+    content |= {name: getattr(plant, name) for name in _PLAIN}
+    content |= {"free": list(plant.free), "logs": list(plant.logs)}
+    content["scores"] = plant.scores.to_json()
+    content["fitted_to"] = [asdict(log) for log in plant.fitted_to]
+    content |= {name: _listed(getattr(plant, name)) for name in ("bounds", "valid")}
+    content["covariance"] = None if plant.covariance is None else np.asarray(plant.covariance).tolist()
+    content["samples"] = None
+    if plant.inputs_end_at_row:  # absent otherwise: files of version 0.1.0 have no such key
+        content["inputs_end_at_row"] = True
+    if plant.refits:
+        content["refits"] = [model.to_dict() for model in plant.refits]
+    return content
+
+
+def fields_of(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of a plant from :func:`plain_content`, but for model and samples."""
+    try:
+        return {
+            "values": _numbers(content, "values"),
+            "dt": number_within(content, "dt", *STEP_RANGE),
+            "units": _texts(content["units"]),
+            "free": tuple(str(name) for name in content["free"]),
+            "scales": _texts(content["scales"]),
+            "bounds": _ranges(content["bounds"]),
+            "covariance": _covariance(content),
+            "noise": _numbers(content, "noise", 0.0, _MOST_ERROR),
+            "offsets": _numbers(content, "offsets", -_MOST_ERROR, _MOST_ERROR),
+            "nuisance": _numbers(content, "nuisance", 0.0, _MOST_ERROR),
+            "reference": content["reference"],
+            "valid": _valid(content["valid"]),
+            "logs": tuple(str(name) for name in content["logs"]),
+            "fitted_to": tuple(_fit_log(log) for log in content.get("fitted_to", ())),
+            "scores": PlantScores.from_json(content["scores"]),
+            "verdict": str(content["verdict"]),
+            "inputs_end_at_row": bool(content.get("inputs_end_at_row", False)),
+        }
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise not_whole(error) from error
+
+
+def not_whole(error: Exception) -> UserError:
+    """Return the error for content that is not a whole plant."""
+    problem = f"is not a whole plant ({type(error).__name__}: {error})"
+    return UserError(problem, hint="save the plant again")
+
+
+def thin(samples: Array, draws: int | None) -> Array:
+    """Return so many rows of the samples, evenly spread; all where ``draws`` is None."""
+    n = len(samples)
+    rows = np.unique(np.linspace(0, n - 1, n if draws is None else min(n, draws)).astype(int))
+    return np.asarray(np.asarray(samples)[rows], dtype=float)
+
+
+def draws_of(rows: Any) -> Array:
+    """Return samples that stand in the JSON itself."""
+    try:
+        return np.asarray(rows, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise not_whole(error) from error
+
+
+def write_samples(path: Path, free: Sequence[str], samples: Array, units: Mapping[str, str]) -> None:
+    """Write posterior samples (n, n_free) with their names and units."""
+    import xarray as xr
+
+    record = xr.Dataset(
+        {"samples": (("draw", "parameter"), np.asarray(samples, dtype=float))},
+        coords={"parameter": list(free), "units": ("parameter", [units.get(name, "1") for name in free])},
+        attrs={"schema": "thermogrip.samples", "version": 1},
+    )
+    with atomic_path(path) as temporary:
+        record.to_netcdf(temporary, engine="h5netcdf")
+
+
+def read_samples(plant: Path, name: str | None, free: Sequence[str]) -> Array | None:
+    """Return the samples that stand beside a plant's file, None where it has none."""
+    if name is None:
+        return None
+    from thermogrip.datasets.netcdf import open_netcdf
+
+    path = plant.parent / Path(str(name)).name  # beside the plant, wherever both were moved to
+    if not path.is_file():
+        raise UserError(f"its samples {path.name} are missing", hint="keep the .nc file beside the plant")
+    try:
+        record = open_netcdf(path)
+    except UserError as error:
+        raise UserError(f"its samples {path.name}: {error.problem}", hint=error.hint) from error
+    try:
+        samples = np.asarray(record["samples"].sel(parameter=list(free)).values, dtype=float)
+        if not np.isfinite(samples).all():
+            raise ValueError("a sample is not finite")
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f"its samples {path.name} cannot be read", hint="draw the posterior again") from error
+    return samples
+
+
+def _fit_log(content: Mapping[str, Any]) -> FitLog:
+    start_s, stop_s = (number_within(content, name, -LARGEST, LARGEST) for name in ("start_s", "stop_s"))
+    return FitLog(str(content["name"]), str(content["sha256"]), start_s, stop_s)
+
+
+def _texts(content: Mapping[str, Any]) -> dict[str, str]:
+    return {str(name): str(value) for name, value in content.items()}
+
+
+def _numbers(
+    content: Mapping[str, Any], key: str, low: float = -LARGEST, high: float = LARGEST
+) -> dict[str, float]:
+    return {str(name): number_within(content[key], name, low, high) for name in content[key]}
+
+
+def _covariance(content: Mapping[str, Any]) -> Array | None:
+    if content["covariance"] is None:
+        return None
+    found = array_within(content, "covariance", MOST_NUMBER)
+    if found.ndim != 2 or (np.diag(found) < 0).any():
+        raise ValueError("covariance has a negative variance")
+    return found
+
+
+def _valid(content: Mapping[str, Sequence[float | None]]) -> dict[str, tuple[float, float]]:
+    ranges = _ranges(content)
+    for name, (low, high) in ranges.items():
+        if not (low <= high and all(abs(end) <= _MOST_READING or np.isinf(end) for end in (low, high))):
+            raise ValueError(f"valid of {name} is {low:g} to {high:g}")
+    return ranges
+
+
+def _listed(ranges: Mapping[str, tuple[float, float]]) -> dict[str, list[float | None]]:
+    """Return ranges as JSON has them; an open end is null, for JSON has no infinity."""
+    return {name: [end if np.isfinite(end) else None for end in ends] for name, ends in ranges.items()}
+
+
+def _ranges(content: Mapping[str, Sequence[float | None]]) -> dict[str, tuple[float, float]]:
+    return {
+        str(name): (-np.inf if low is None else float(low), np.inf if high is None else float(high))
+        for name, (low, high) in content.items()
+    }

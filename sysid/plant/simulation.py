@@ -30,6 +30,7 @@ import numpy as np
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, columns, log_name, make_log
+from thermogrip.sysid.models.lti import symmetric_root
 from thermogrip.sysid.plant.log_grid import Stretch, at_rows, cut_stretches, match_log
 
 if TYPE_CHECKING:
@@ -186,7 +187,7 @@ def _corrected(
     pooled = np.array([plant.offsets.get(name, 0.0) for name in plant.outputs])
     for _ in range(2):
         residual, response = _warm(plant, p, stretch, start, start.x0[None], warmup)
-        root = _root(plant.model.spread)
+        root = symmetric_root(plant.model.spread)
         blocks = [response @ root]
         free = np.array([plant.nuisance.get(name, 0.0) for name in plant.outputs]) * float(offsets)
         blocks.append(np.concatenate([np.diag(free / noise) for noise in _noise(plant, stretch, warmup)]))
@@ -283,11 +284,6 @@ def _noise(plant: PlantData, stretch: Stretch, warmup: float) -> Array:
     sd = np.array([max(plant.noise.get(name, 0.1), _LEAST_NOISE) for name in plant.outputs])
     readings = 1 + n * plant.dt / READING_EVERY
     return np.tile(sd * np.sqrt((n + 1) / min(readings, n + 1)), (n + 1, 1))
-
-
-def _root(covariance: Array) -> Array:
-    size, axes = np.linalg.eigh(covariance)
-    return np.asarray(axes * np.sqrt(np.maximum(size, 0.0)))
 
 
 def _as_log(plant: PlantData, log: Log, y: Array, scored: Mask, notes: list[str]) -> Log:

@@ -61,14 +61,14 @@ def _all_exist(value: Paths) -> None:
 
 def _is_plant(path: Path | None) -> None:
     if path is not None:
-        from thermogrip.sysid.plant.plant_file import check_plant_file
+        from thermogrip.sysid.plant.plant_data import check_plant_file
 
         check_plant_file(path)
 
 
 def _is_controller(path: Path) -> None:
     from thermogrip.datasets.limits import STEP_RANGE, number_within
-    from thermogrip.sysid.plant.plant_file import check_plant_file
+    from thermogrip.sysid.plant.plant_data import check_plant_file
 
     content = check_plant_file(path, inside="thermogrip.controller")
     try:

@@ -17,7 +17,7 @@ from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import FitLog, PlantScores
 from thermogrip.sysid.plant.plant import Plant
-from thermogrip.sysid.plant.plant_file import check_plant_file
+from thermogrip.sysid.plant.plant_data import check_plant_file
 
 
 @pytest.fixture(scope="module")
