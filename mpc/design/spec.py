@@ -204,7 +204,7 @@ def _limits(spec: Spec, plant: Plant, design: Design) -> dict[str, Range]:
 
 
 def read_spec(path: str | Path) -> Spec:
-    """Read a spec from a TOML file.
+    """Return the spec in a TOML file.
 
     Parameters
     ----------

@@ -29,7 +29,6 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
@@ -137,7 +136,7 @@ def optimal_schedule(
         raise UserError(
             f"cannot hold {', '.join(hold)}", hint=f"leave one of {', '.join(plant.inputs)} to move"
         )
-    frame = _Frame.of(plant, minutes, ranges, shortest, switch_hold, slew, hold)
+    frame = _Frame(plant, minutes, ranges, shortest, switch_hold, slew, hold)
     report = progress or (lambda fraction, what: None)
     fine = ExperimentForecast(plant, lowest=lowest, highest=highest, room=room)
     coarse = ExperimentForecast(plant, lowest=lowest, highest=highest, room=room, dt=frame.dt, starts=False)
@@ -162,26 +161,11 @@ def optimal_schedule(
     return make_log(time, columns, name="optimal schedule")
 
 
-@dataclass(frozen=True, eq=False)
 class _Frame:
     """How cells become inputs: n steps of the plant, cells of ``cell`` coarse steps, the ranges."""
 
-    n: int
-    ratio: int  # steps of the plant in a step of the search
-    dt: float  # of the search [s]
-    cell: int  # steps of the search in a cell
-    n_cell: int
-    rest: int  # steps of the plant before the first cell
-    low: Array
-    high: Array
-    switch: Mask
-    together: NDArray[np.int64]  # cells that change as one, by input
-    still: Array
-    slew: float
-
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         plant: Plant,
         minutes: float,
         ranges: Mapping[str, tuple[float, float]],
@@ -189,27 +173,28 @@ class _Frame:
         switch_hold: float,
         slew: float,
         hold: Collection[str],
-    ) -> _Frame:
-        n = round(60.0 * minutes / plant.dt)
-        rest = int(np.ceil(REST / plant.dt))
-        if n < rest + 10:
-            raise UserError(f"{minutes:g} min are too short", hint=f"take {(rest + 10) * plant.dt / 60:.1f}")
+    ) -> None:
+        self.n, self.slew = round(60.0 * minutes / plant.dt), slew
+        self.rest = int(np.ceil(REST / plant.dt))  # steps of the plant before the first cell
+        if self.n < self.rest + 10:
+            least = (self.rest + 10) * plant.dt / 60
+            raise UserError(f"{minutes:g} min are too short", hint=f"take {least:.1f}")
         cell = max(shortest, 60.0 * minutes / _CELLS, plant.dt)
-        ratio = max(1, min(n // _STEPS, int(cell / plant.dt / 2)))
-        cell_steps = max(1, round(cell / (ratio * plant.dt)))
+        self.ratio = max(1, min(self.n // _STEPS, int(cell / plant.dt / 2)))  # of the plant in a step
+        self.dt = self.ratio * plant.dt  # of the search [s]
+        self.cell = max(1, round(cell / self.dt))  # steps of the search in a cell
+        self.n_cell = max(1, -(-(self.n - self.rest) // (self.ratio * self.cell)))
         switch = np.array([name in plant.model.switches for name in plant.inputs])
         ends = [(0.0, 1.0) if s else ranges[name] for name, s in zip(plant.inputs, switch)]
         low, high = np.array(ends, dtype=float).T
-        still = np.where(switch, 1.0, np.clip(0.0, low, high))
+        self.still = np.where(switch, 1.0, np.clip(0.0, low, high))
         held = np.array([name in hold for name in plant.inputs])
-        low, high = np.where(held, still, low), np.where(held, still, high)
-        switch = switch & ~held
-        n_cell = max(1, -(-(n - rest) // (ratio * cell_steps)))
-        if not np.any(low < high):
+        self.low, self.high = np.where(held, self.still, low), np.where(held, self.still, high)
+        self.switch: Mask = switch & ~held
+        if not np.any(self.low < self.high):
             raise UserError("no input has a range to move in", hint="give limits that differ")
-        step = ratio * plant.dt
-        together = np.where(switch, max(1, int(np.ceil(switch_hold / (cell_steps * step)))), 1)
-        return cls(n, ratio, step, cell_steps, n_cell, rest, low, high, switch, together, still, slew)
+        # cells that change as one, by input
+        self.together = np.where(self.switch, max(1, int(np.ceil(switch_hold / (self.cell * self.dt)))), 1)
 
     def inputs(self, cells: Array, *, coarse: bool) -> Array:
         """Return the inputs (N, n_u) of cells (n_cell, n_u), on the search's step or on the plant's."""

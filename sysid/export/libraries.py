@@ -9,7 +9,7 @@ optimisation, with exact derivatives.  The nonlinear plant as an FMU is in
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -54,18 +54,17 @@ def to_control(
     >>> system.input_labels, system.output_labels, bool(max(system.poles().real) < 0)
     (['q1', 'q2'], ['t1', 't2'], True)
     """
-    control = needed("control", "control")
     near = linearise_plant(plant, inputs=inputs, disturbances=disturbances, state=state, dt=dt)
-    return control.StateSpace(
-        near.A,
-        near.B,
-        near.C,
-        np.zeros((len(near.outputs), len(near.inputs))),
-        0 if dt is None else dt,
-        inputs=list(near.inputs),
-        outputs=list(near.outputs),
-        states=list(near.states),
-        name=near.name,
+    D = np.zeros((len(near.outputs), len(near.inputs)))
+    return control_system(near, (near.A, near.B, near.C, D, near.dt or 0), near.name)
+
+
+def control_system(labels: Any, numbers: Sequence[Any], name: str) -> Any:
+    """Return A, B, C, D, dt as a ``StateSpace`` with the inputs, outputs and states that ``labels`` has."""
+    return needed("control", "control").StateSpace(
+        *numbers,
+        **{what: list(getattr(labels, what)) for what in ("inputs", "outputs", "states")},
+        name=name,
         remove_useless_states=False,
     )
 

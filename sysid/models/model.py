@@ -104,6 +104,10 @@ class Model(Protocol):
 class BlackBox:
     """What linear, polynomial and neural models share: their numbers are fields, and keys of a file."""
 
+    inputs: tuple[str, ...]
+    disturbances: tuple[str, ...]
+    outputs: tuple[str, ...]
+
     kind: ClassVar[str]
     title: ClassVar[str]
     labels: ClassVar[tuple[str, ...]] = ("inputs", "disturbances", "outputs", "switches")
@@ -111,6 +115,11 @@ class BlackBox:
     parameters: ClassVar[tuple[str, ...]] = ()
     smooth: ClassVar[float] = SMOOTH
     command_steps: ClassVar[Mapping[str, float]] = {}
+
+    @property
+    def stable(self) -> bool:
+        """Whether free runs stay bounded; true where the fit or the model's own form sees to that."""
+        return True
 
     def to_dict(self) -> dict[str, Any]:
         """Return the model as plain lists and numbers, for JSON."""

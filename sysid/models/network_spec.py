@@ -340,7 +340,7 @@ def _faults(network: Network) -> Iterator[tuple[str, str]]:
     yield from _name_faults(network)
     yield from _reference_faults(network)
     yield from _parameter_faults(network)
-    linked = {end for _, _, _, ends in _ends(network) for end in ends}
+    linked = {name for _, _, names in _references(network) for name in names}
     for node in network.nodes:
         if node not in linked:
             yield f"nodes.{node}: no element touches it", "link it or leave it out"
@@ -360,49 +360,44 @@ def _name_faults(network: Network) -> Iterator[tuple[str, str]]:
             seen[name] = group
 
 
-def _ends(network: Network) -> Iterator[tuple[str, str, bool, tuple[str, ...]]]:
-    """Yield (table, key, a boundary is allowed, named places)."""
-    for name, link in network.links.items():
-        yield f"links.{name}", "between", True, tuple(link.between)
-    for name, glow in network.radiation.items():
-        yield f"radiation.{name}", "between", True, tuple(glow.between)
-    for name, pipe in network.pipes.items():
-        yield f"pipes.{name}", "from", True, (pipe.source,)
-        yield f"pipes.{name}", "to", False, (pipe.target,)
-        if pipe.surroundings is not None:
-            yield f"pipes.{name}", "surroundings", True, (pipe.surroundings,)
-    for name, heater in network.heaters.items():
-        yield f"heaters.{name}", "node", False, (heater.node,)
-    for name, peltier in network.peltiers.items():
-        yield f"peltiers.{name}", "face", False, (peltier.face,)
-        yield f"peltiers.{name}", "sink", False, (peltier.sink,)
-    for name, output in network.outputs.items():
-        yield f"outputs.{name}", "node", False, (output.node,)
+#: Where elements name something: table, keys, and of what; a place is a node, a disturbance or a boundary.
+_REFERENCES = (
+    ("links", ("between",), "place"),
+    ("radiation", ("between",), "place"),
+    ("pipes", ("from", "surroundings"), "place"),
+    ("pipes", ("to",), "node"),
+    ("heaters", ("node",), "node"),
+    ("peltiers", ("face", "sink"), "node"),
+    ("outputs", ("node",), "node"),
+    ("links", ("switch",), "switch"),
+    ("pipes", ("switch",), "switch"),
+    ("heaters", ("input",), "input"),
+    ("peltiers", ("input",), "input"),
+)
+
+
+def _references(network: Network) -> Iterator[tuple[str, str, list[str]]]:
+    """Yield (table and key, of what, names) for each reference of :data:`_REFERENCES` that is made."""
+    for group, keys, kind in _REFERENCES:
+        for name, element in getattr(network, group).items():
+            for key in keys:
+                found = getattr(element, {"from": "source", "to": "target"}.get(key, key))
+                if found is not None:
+                    yield f"{group}.{name}.{key}", kind, found if isinstance(found, list) else [found]
 
 
 def _reference_faults(network: Network) -> Iterator[tuple[str, str]]:
     outside = [*network.disturbances, *network.boundaries]
-    for table, key, boundary, ends in _ends(network):
-        known = [*network.nodes, *outside] if boundary else list(network.nodes)
-        for end in ends:
-            if end not in known:
-                yield f"{table}.{key}: no node {end!r}", _near(end, known)
-        if len(ends) == 2 and (ends[0] == ends[1] or set(ends) <= set(outside)):
-            yield f"{table}.{key}: joins {ends[0]} and {ends[1]}", "join two places, one of them a node"
-    for group in ("links", "pipes"):
-        for name, element in getattr(network, group).items():
-            if element.switch is not None and element.switch not in _switches(network):
-                yield (
-                    f"{group}.{name}.switch: no switch {element.switch!r}",
-                    _near(element.switch, _switches(network)),
-                )
-    for group in ("heaters", "peltiers"):
-        for name, element in getattr(network, group).items():
-            if element.input not in network.inputs:
-                yield (
-                    f"{group}.{name}.input: no input {element.input!r}",
-                    _near(element.input, network.inputs),
-                )
+    switches = [name for name, item in network.inputs.items() if item.switch]
+    known = {"place": [*network.nodes, *outside], "node": [*network.nodes], "switch": switches}
+    known["input"] = [*network.inputs]
+    for where, kind, names in _references(network):
+        for name in names:
+            if name not in known[kind]:
+                what = "node" if kind == "place" else kind
+                yield f"{where}: no {what} {name!r}", _near(name, known[kind])
+        if len(names) == 2 and (names[0] == names[1] or set(names) <= set(outside)):
+            yield f"{where}: joins {names[0]} and {names[1]}", "join two places, one of them a node"
 
 
 def _parameter_faults(network: Network) -> Iterator[tuple[str, str]]:
@@ -425,10 +420,6 @@ def _parameter_faults(network: Network) -> Iterator[tuple[str, str]]:
     for name in network.parameters:
         if name not in used:
             yield f"parameters.{name}: no element names it", "use it or leave it out"
-
-
-def _switches(network: Network) -> list[str]:
-    return [name for name, item in network.inputs.items() if item.switch]
 
 
 def _near(name: str, known: Iterable[str]) -> str:

@@ -37,9 +37,6 @@ _RAILS = ("low", "high")
 class NeuralModel(BlackBox):
     """A mean of K small neural state-space models in scaled units."""
 
-    inputs: tuple[str, ...]
-    disturbances: tuple[str, ...]
-    outputs: tuple[str, ...]
     switches: tuple[str, ...]
     dt: float  # step [s]
     A: Array  # (K, n, n) linear part, stable
@@ -93,11 +90,6 @@ class NeuralModel(BlackBox):
     def n_x(self) -> int:
         """Number of states of all members together."""
         return int(self.A.shape[0] * self.A.shape[1])
-
-    @property
-    def stable(self) -> bool:
-        """Always true: a linear part that is not stable is refused, and the units are bounded."""
-        return True
 
     # ---- the Model protocol ----
 

@@ -28,9 +28,6 @@ _MOST_DEGREE, _MOST_MEMORY = 20, 1000
 class SindyModel(BlackBox):
     """Polynomial difference equations of the outputs."""
 
-    inputs: tuple[str, ...]
-    disturbances: tuple[str, ...]
-    outputs: tuple[str, ...]
     switches: tuple[str, ...]
     dt: float  # step [s]
     # how many past values of each output the equations see, at least 1; the state is [y[k], y[k-1], ...]
@@ -68,11 +65,6 @@ class SindyModel(BlackBox):
     def n_x(self) -> int:
         """Number of states."""
         return self.memory * len(self.outputs)
-
-    @property
-    def stable(self) -> bool:
-        """Always true: the fit refuses equations that diverge, and every free run is bounded besides."""
-        return True
 
     def step(self, x: Values, u: Values, d: Values, p: Values, dt: float) -> list[Any]:
         """Return the state one step later, in plain arithmetic (dt: a multiple of the model's)."""

@@ -51,9 +51,6 @@ from thermogrip.sysid.models.model import BlackBox
 class StateSpaceModel(BlackBox):
     """A linear model with offsets, delays as states, and optional products of the inputs."""
 
-    inputs: tuple[str, ...]  # names, in the order of the columns of ``B``, ``E`` and the rows of ``C``
-    disturbances: tuple[str, ...]
-    outputs: tuple[str, ...]
     A: Array  # (n_x, n_x)
     B: Array  # (n_x, n_u)
     C: Array  # (n_y, n_x)

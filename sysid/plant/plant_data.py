@@ -12,8 +12,8 @@ natural units.
 of its own.  ``nuisance`` says by how much (a standard deviation per signal);
 :mod:`thermogrip.sysid.plant.simulation` estimates them from the warm-up of the log that it simulates.
 
-**Files.**  One dictionary serves the plant's own file, the controller's file that contains its plant, and whoever
-wants a plant elsewhere: the model's equations as data, values with units, covariance of theta with the scales
+**Files.**  One dictionary serves the plant's own file, the controller's file that contains its plant, and who
+else wants a plant: the model's equations as data, values with units, covariance of theta with the scales
 it is in, bounds and ranges (an open end is null, for JSON has no infinity).  Samples stand beside the file
 as ``.nc``, or under ``draws`` where they are few or there is no file.  Reading never runs code.
 This module loads no xarray, so that a file can be refused at once.

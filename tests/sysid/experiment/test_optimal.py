@@ -284,7 +284,7 @@ def frame(
 ):
     """A drive from -2 to 3 and a pump that keeps its position for 25 s, on steps of 1 s."""
     plant = SimpleNamespace(dt=1.0, inputs=("q", "pump"), model=SimpleNamespace(switches=("pump",)))
-    return optimal._Frame.of(plant, minutes, {"q": (-2.0, 3.0)} | ranges, shortest, 25.0, slew, hold)
+    return optimal._Frame(plant, minutes, {"q": (-2.0, 3.0)} | ranges, shortest, 25.0, slew, hold)
 
 
 @pytest.mark.parametrize(
