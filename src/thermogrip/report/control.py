@@ -140,7 +140,7 @@ def pareto_section(tuning: Tuning) -> Section:
 
 def sensitivity_section(tuning: Tuning) -> Section:
     """Return the section of what each weight does."""
-    words = sensitivity_words(tuning.trade_offs)
+    words = sensitivity_words(tuning.sensitivity)
     matter = [line for line in words if not line.startswith("settling does not depend")]
     verdict = (
         f"{len(matter)} of {len(words)} numbers matter within 30 %: {'; '.join(matter)}."
@@ -149,7 +149,7 @@ def sensitivity_section(tuning: Tuning) -> Section:
     )
     parts: list[Any] = [
         Picture(
-            sensitivity_figure(tuning.trade_offs),
+            sensitivity_figure(tuning.sensitivity),
             "How far each number may go, by factors of up to ten, before settling moves by 1 s or 1 %, "
             "overshoot by 0.02 K or the score by 1 %. Horizon and blocks were moved by 30 % only.",
         ),
