@@ -59,7 +59,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     prior_of,
 )
 from thermogrip.sysid.effusivity.posterior import EffusivityRow
-from thermogrip.sysid.effusivity.quality import NO_CONTACT, check_grasps
+from thermogrip.sysid.effusivity.quality import NO_CONTACT, begun, check_grasps
 
 Row: TypeAlias = dict[str, Any]
 
@@ -116,7 +116,7 @@ def _answers(
     whole = not classifier.leaves_samples_out
     quality = check_grasps(grasps, longest=classifier.longest_, whole_traces=whole)
     notes = [note or more for note, more in zip(quality.note, classifier.beyond_training(grasps))]
-    usable = quality.usable_part(grasps)
+    usable = quality.usable_grasps(quality.read(grasps))
     found = [] if usable is None else _named(classifier, usable, names, rule)
     units = unit_names(grasps)
     of_unit = {} if usable is None else dict(zip(unit_names(usable).tolist(), found))
@@ -365,8 +365,7 @@ def reasons(classifier: GraspClassifier, X: Records, rows: Sequence[Row]) -> lis
     """
 
     def words(model: PosteriorClassifier, grasps: Grasps, named: list[str]) -> list[str]:
-        part = check_grasps(grasps, longest=model.longest_).cut(grasps)
-        found = deviations(model.device_, part, named)
+        found = deviations(model.device_, begun(grasps, model.longest_), named)
         return [deviation_words(name, row) for name, row in zip(named, found)]
 
     return _explained(classifier, X, rows, words, lambda row: (row["p_unknown"] or 0.0) > _STRANGE)

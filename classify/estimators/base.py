@@ -36,6 +36,7 @@ from thermogrip.datasets.schema import (
     make_grasps,
 )
 from thermogrip.sysid.effusivity.quality import check_grasps as check_quality
+from thermogrip.sysid.effusivity.quality import without
 
 Floats: TypeAlias = NDArray[np.float64]
 Labels: TypeAlias = NDArray[np.str_]
@@ -210,7 +211,7 @@ def record_list(X: Records) -> list[Grasps]:
                 f"expected Grasps, got {type(part).__name__}", hint="use make_grasps or read_grasps"
             )
         check_grasps(part)
-    return [check_quality(part).without_spikes(part) for part in parts]
+    return [without(part, check_quality(part).spiked) for part in parts]
 
 
 def grasp_labels(grasps: Grasps, y: ArrayLike | None = None) -> Labels:

@@ -54,9 +54,9 @@ from thermogrip.sysid.effusivity.multi_touch import (
     rested_long,
     two_touch_fit,
 )
-from thermogrip.sysid.effusivity.posterior import material_evidence
+from thermogrip.sysid.effusivity.posterior import material_fit
 from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors
-from thermogrip.sysid.effusivity.quality import check_grasps, longest_contact
+from thermogrip.sysid.effusivity.quality import begun, longest_contact
 
 GRIPPERS = ("same", "uncertain", "another")
 
@@ -149,7 +149,7 @@ class PosteriorClassifier(GraspClassifier):
         evidence = np.empty((grasps.sizes["grasp"], len(names)))
         alone, part = self._ungrouped(grasps)
         if part is not None:
-            evidence[alone] = material_evidence(self.device_, part, names, finish=self.finish)
+            evidence[alone] = material_fit(self.device_, part, names, finish=self.finish).log_evidence
         if has_touch_groups(grasps):
             fit = two_touch_fit(self.device_, grasps, names, coupling=self.coupling_, finish=self.finish)
             for at, row in zip(fit.rows, fit.log_evidence):
@@ -161,8 +161,7 @@ class PosteriorClassifier(GraspClassifier):
         alone = np.flatnonzero(label_values(grasps, "touch_group") == "")
         if not alone.size:
             return alone, None
-        part = pick(grasps, alone)
-        return alone, check_grasps(part, longest=self.longest_).cut(part)
+        return alone, begun(pick(grasps, alone), self.longest_)
 
     def log_prior(self, names: Sequence[str]) -> Floats:
         """Return the log prior odds of some materials, (n_name,)."""
@@ -198,7 +197,7 @@ class PosteriorClassifier(GraspClassifier):
             free[alone] = [fit.log_evidence for fit in grid_posteriors(self.device_, touches(part))]
             if self.finish != "known":  # a free effusivity has the finish of the training's blocks
                 known = evidence.copy()
-                known[alone] = material_evidence(self.device_, part, names)
+                known[alone] = material_fit(self.device_, part, names).log_evidence
         if has_touch_groups(grasps):
             group = label_values(grasps, "touch_group")
             for name, fits in free_touch_fit(self.device_, grasps, coupling=self.coupling_).items():

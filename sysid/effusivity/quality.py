@@ -145,10 +145,6 @@ class GraspQuality:
         chance = 2 * stdtr(np.maximum(n - 2, 1), -np.abs(slope) / np.maximum(sd, 1e-9))
         return np.asarray(chance < _CHANCE)
 
-    def without_spikes(self, grasps: Grasps) -> Grasps:
-        """Return the record with its spikes lost (NaN); the record itself where there are none."""
-        return _without(grasps, self.spiked)
-
     def usable_grasps(self, grasps: Grasps) -> Grasps | None:
         """Return the usable grasps with all their samples, None where there are none.
 
@@ -163,19 +159,21 @@ class GraspQuality:
             return kept
         return kept.assign(rest=("grasp", _rests(grasps, ~self.usable)[self.usable]))
 
-    def cut(self, grasps: Grasps) -> Grasps:
-        """Return the record up to ``longest``, whole where it has touches of one block."""
-        if float(grasps["time"].values[-1]) <= self.longest or has_touch_groups(grasps):
-            return grasps
-        return grasps.sel(time=slice(None, self.longest + 1e-9))
-
     def read(self, grasps: Grasps) -> Grasps:
         """Return the record with masked samples lost (NaN), and cut."""
-        return self.cut(_without(grasps, self.masked))
+        return begun(without(grasps, self.masked), self.longest)
 
-    def usable_part(self, grasps: Grasps) -> Grasps | None:
-        """Return the usable samples of the usable grasps, None where there are none."""
-        return self.usable_grasps(self.read(grasps))
+
+def begun(grasps: Grasps, longest: float) -> Grasps:
+    """Return the record up to ``longest`` [s], whole where it has touches of one block."""
+    if float(grasps["time"].values[-1]) <= longest or has_touch_groups(grasps):
+        return grasps
+    return grasps.sel(time=slice(None, longest + 1e-9))
+
+
+def without(grasps: Grasps, samples: Flags) -> Grasps:
+    """Return the record with these samples (n, n_time) lost (NaN); the record itself where there are none."""
+    return grasps.assign(t_surface=grasps["t_surface"].where(~samples)) if samples.any() else grasps
 
 
 def check_grasps(grasps: Grasps, *, longest: float = np.inf, whole_traces: bool = False) -> GraspQuality:
@@ -203,8 +201,8 @@ def check_grasps(grasps: Grasps, *, longest: float = np.inf, whole_traces: bool 
     >>> quality = check_grasps(grasps)
     >>> quality.reason, float(quality.stop[0]), int(quality.masked[0].sum())
     (['', 'no contact'], 10.0, 0)
-    >>> quality.usable_part(grasps)["grasp"].values.tolist() == grasps["grasp"].values[:1].tolist()
-    True
+    >>> quality.usable_grasps(quality.read(grasps)).sizes["grasp"]
+    1
     """
     trace = _Trace.of(grasps)
     time, seen = trace.time, np.isfinite(trace.clean)
@@ -462,10 +460,6 @@ def _medians(block: Floats) -> Floats:
 
 def _counted(n: int) -> str:
     return "1 grasp" if n == 1 else f"{n} grasps"
-
-
-def _without(grasps: Grasps, samples: Flags) -> Grasps:
-    return grasps.assign(t_surface=grasps["t_surface"].where(~samples)) if samples.any() else grasps
 
 
 def _spiked(data: Floats) -> Flags:

@@ -131,14 +131,17 @@ def test_a_record_says_which_contacts_lasted_longer_than_those_that_taught(
 ) -> None:
     record = record_of(["a", "b", "c"])
     rested = stand_in("thermogrip.sysid.effusivity.multi_touch.rested_long", np.array([False, True, False]))
-    longer = SimpleNamespace(shortened=np.array([True, False, True]), cut=lambda given: ("cut", given))
+    longer = SimpleNamespace(shortened=np.array([True, False, True]))
     checked = stand_in(f"{QUALITY}.check_grasps", longer)
-    assert verb._as_taught(Console(), record, 9.5, "coupling")[1] is record
+    begun = verb._as_taught(Console(), record, record["time"].values[-2], "coupling")
+    np.testing.assert_array_equal(begun["time"], record["time"].values[:-1])
+    capsys.readouterr()
+    assert verb._as_taught(Console(), record, 9.5, "coupling") is record
     first, second = capsys.readouterr().err.splitlines()
     assert "mine: 2 of 3 contacts are read until 9.5 s" in first
     assert "mine: blocks that rested longer" in second
     assert (rested[0].args[0] is record, rested[0].args[1]) == (True, "coupling")
-    assert (checked[0].args[0] is record, checked[0].longest) == (True, 9.5)
+    assert (checked[1].args[0] is record, checked[1].longest) == (True, 9.5)
     stand_in("thermogrip.sysid.effusivity.multi_touch.rested_long", np.zeros(3, dtype=bool))
     longer.shortened = np.zeros(3, dtype=bool)
     verb._as_taught(Console(), record, 9.5, None)

@@ -395,7 +395,7 @@ def materials(
 def _as_taught(console: Console, record: Grasps, longest: float, coupling: Coupling | None) -> Grasps:
     """Return a record without what its contacts did later than those that taught the gripper."""
     from thermogrip.sysid.effusivity.multi_touch import rested_long
-    from thermogrip.sysid.effusivity.quality import check_grasps
+    from thermogrip.sysid.effusivity.quality import begun, check_grasps
 
     quality = check_grasps(record, longest=longest)
     if (more := quality.shortened).any():
@@ -408,7 +408,7 @@ def _as_taught(console: Console, record: Grasps, longest: float, coupling: Coupl
             f"{log_name(record)}: blocks that rested longer than those that taught how they move between "
             "touches: intervals may be too narrow"
         )
-    return quality.cut(record)
+    return begun(record, longest)
 
 
 def _effusivities(device: GripperModel, record: Grasps, coupling: Coupling | None) -> list[EffusivityRow]:
