@@ -186,15 +186,15 @@ def free_run(
             hint=f"score from {warmup:g} s on",
         )
     seen = plant.simulate(log, warmup=warmup, score_from=score_from) if known is None else known.log
+    units = {name: str(log[name].attrs.get("units", "1")) for name in plant.outputs}
     both = _beside(plant, log, seen, average)
-    scores, found = _scores(plant, log, both), gaps(log)
+    scores, found = _scores(both, units), gaps(log)
     held: dict[str, Score] = {}
     if found and known is not None:
         held = known.held
     elif found:
         through = plant.simulate(log, warmup=warmup, score_from=score_from, gaps="hold")
-        held = _scores(plant, log, _beside(plant, log, through, average))
-    units = {name: _unit(log, name) for name in plant.outputs}
+        held = _scores(_beside(plant, log, through, average), units)
     mean = {n: score(y, np.full(y.shape, np.nanmean(y)), units[n]) for n, (_, y, _) in both.items()}
     no_input = {n: score(y, no_input_baseline(time, y), units[n]) for n, (time, y, _) in both.items()}
     with np.errstate(invalid="ignore"):  # a run that went to infinity makes no step there
@@ -203,18 +203,19 @@ def free_run(
         name for name in plant.outputs if not scores[name].rmse < NO_BETTER * no_input[name].rmse
     )
     whiteness = {name: autocorrelation(y - v) for name, (_, y, v) in both.items()}
-    left = _input_left(plant, _averaged(log, average), both)
+    left = _input_left(plant, log if average is None else average_log(log, average), both)
     residual = (
         residual_correlations(plant, log, seen, warmup=warmup) if tests else ResidualCorrelations({}, {})
     )
-    beyond = _beyond_fit(plant, log, seen, residual)
+    beyond, outside = _beyond_fit(plant, log, seen, residual), _outside(plant, log)
+    unseen = [name for name in outside if name not in plant.outputs]
     notes = (
         *said_of_fit(plant.fitted_to, log),
         *converted,
-        *_notes(log, found, held, no_better),
-        *_residual_notes(whiteness, residual, units, warmup, _unseen(plant, log)),
+        *_notes(float(log["time"].values[0]), found, held, no_better),
+        *_residual_notes(whiteness, residual, units, warmup, unseen),
         *_excess_notes(plant, beyond, units),
-        *_outside(plant, log),
+        *_outside_notes(plant, outside),
     )
     exceeds_fit = {name: here / there for name, (here, there) in beyond.items()}
     naive = {"mean": mean, "no_input": no_input}
@@ -275,7 +276,7 @@ def _beside(
     for name in plant.outputs:
         pair[name] = ("time", np.where(scored, column(log, name), np.nan), log[name].attrs)
         pair[f"{name} simulated"] = ("time", np.where(scored, column(seen, name), np.nan), log[name].attrs)
-    pair = _averaged(pair, average)
+    pair = pair if average is None else average_log(pair, average)
     time = np.asarray(pair["time"].values, dtype=float)
     if not scored.any():
         problem = f"nothing of its {np.ptp(time):g} s is left to score"
@@ -304,24 +305,15 @@ def _input_left(
     }
 
 
-def _averaged(log: Log, average: float | None) -> Log:
-    return log if average is None else average_log(log, average)
-
-
-def _scores(plant: Plant, log: Log, both: Mapping[str, tuple[Array, Array, Array]]) -> dict[str, Score]:
-    return {name: score(both[name][1], both[name][2], _unit(log, name)) for name in plant.outputs}
-
-
-def _unit(log: Log, name: str) -> str:
-    return str(log[name].attrs.get("units", "1"))
+def _scores(both: Mapping[str, tuple[Array, Array, Array]], units: Mapping[str, str]) -> dict[str, Score]:
+    return {name: score(y, v, units[name]) for name, (_, y, v) in both.items()}
 
 
 def _notes(
-    log: Log, found: list[tuple[int, float, float]], held: Mapping[str, Score], no_better: tuple[str, ...]
+    first: float, found: list[tuple[int, float, float]], held: Mapping[str, Score], no_better: tuple[str, ...]
 ) -> list[str]:
-    """Return notes on the run's start, its gaps and its baselines."""
+    """Return notes on the run's start at ``first`` [s], its gaps and its baselines."""
     notes = []
-    first = float(log["time"].values[0])
     if first > 60:
         notes.append(
             f"the run starts at {first:g} s from its warm-up alone: what was warm and unseen is guessed; "
@@ -410,22 +402,17 @@ def _excess_notes(
     ]
 
 
-def _unseen(plant: Plant, log: Log) -> list[str]:
-    """Return the inputs and disturbances that leave the range that the fit has seen."""
-    return [name for name in _shares_outside(plant, log) if name not in plant.outputs]
-
-
-def _outside(plant: Plant, log: Log) -> list[str]:
+def _outside_notes(plant: Plant, outside: Mapping[str, float]) -> list[str]:
     """Return which signals leave the range that the fit has seen."""
     out = []
-    for name, share in _shares_outside(plant, log).items():
+    for name, share in outside.items():
         low, high = plant.valid[name]
         where = f"{low:g} to {high:g}, the range of the fit, in {100 * share:.0f} % of the rows"
         out.append(f"{name} lies outside of {where}")
     return out
 
 
-def _shares_outside(plant: Plant, log: Log) -> dict[str, float]:
+def _outside(plant: Plant, log: Log) -> dict[str, float]:
     """Return by signal the share of rows outside of the range that the fit has seen, from 1 % on."""
     out = {}
     for name, (low, high) in plant.valid.items():

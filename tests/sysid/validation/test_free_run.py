@@ -276,19 +276,18 @@ def test_more_than_one_row_in_a_hundred_beyond_a_twentieth_of_the_range_is_outsi
     log, _ = offset_run(0.0, n=100, q=np.where(np.arange(100) < rows, far, 1.0))
     plant = replace(lag_plant(), valid={"q": (0.0, 2.0), "t": (5.0, 6.0), "absent": (0.0, 1.0)})
     found = [("q", "0 to 2", share)] if share else []
-    assert module._outside(plant, log) == [
+    outside = module._outside(plant, log)
+    assert module._outside_notes(plant, outside) == [
         f"{name} lies outside of {where}, the range of the fit, in {part} % of the rows"
         for name, where, part in [*found, ("t", "5 to 6", 100)]
     ]
-    assert module._unseen(plant, log) == (["q"] if share else [])
+    assert list(outside) == [*(["q"] if share else []), "t"]
 
 
 def test_notes_of_the_start_of_gaps_and_of_the_residual_to_the_letter():
-    log, _ = offset_run(0.0)
-    early, late = (log.assign_coords(time=log["time"].values + start) for start in (60.0, 61.5))
-    assert module._notes(early, [], {}, ()) == []
+    assert module._notes(60.0, [], {}, ()) == []
     held = {"t": Score(1.0, 0.12345, "K", 3), "r": Score(1.0, 2.0, "degC", 3)}
-    assert module._notes(late, [(1, 5.0, 70.25)], held, ("r",)) == [
+    assert module._notes(61.5, [(1, 5.0, 70.25)], held, ("r",)) == [
         "the run starts at 61.5 s from its warm-up alone: what was warm and unseen is guessed; "
         "give the whole log and score from 61.5 s to start where the log starts",
         "no row from 5 to 70.25 s: the run starts afresh after it, the next 60 s are not scored "
