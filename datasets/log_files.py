@@ -381,8 +381,8 @@ def _time_of(
     unnamed = [h for h in [*table.text, *[*table.numbers][:1]] if h not in like and _counts(h, table)]
     if dt is not None:
         instead = f" in place of {', '.join([*like, *unnamed])}" if like or unnamed else ""
-        told = f"time: rows are {dt:g} s apart, as asked{instead}"
-        return np.asarray(np.arange(len(table.lines)) * dt, dtype=float), {*like, *unnamed}, [told]
+        note = f"time: rows are {dt:g} s apart, as asked{instead}"
+        return np.asarray(np.arange(len(table.lines)) * dt, dtype=float), {*like, *unnamed}, [note]
     for header in [*like, *unnamed]:
         if header in table.text:
             cells, parts = table.text[header], [header]
@@ -391,8 +391,8 @@ def _time_of(
                 parts += of_day[:1]
                 cells = [" ".join(row) for row in zip(*(table.text[h] for h in parts))]
             if (clock := read_clock(cells)) is not None:
-                told = f"time: {' and '.join(parts)} counted from the first row, {cells[0]}{clock[1]}"
-                return clock[0] - clock[0][np.isfinite(clock[0]).argmax()], {*parts}, [told]
+                note = f"time: {' and '.join(parts)} counted from the first row, {cells[0]}{clock[1]}"
+                return clock[0] - clock[0][np.isfinite(clock[0]).argmax()], {*parts}, [note]
             continue
         values, (name, unit, scale) = table.numbers[header], read[header]
         stated, finite = name == "time" and unit != "1", values[np.isfinite(values)]
@@ -411,12 +411,12 @@ def _time_of(
     steps = {h: np.unique(v[np.isfinite(v)]) for h, v in table.numbers.items() if _STEP.fullmatch(read[h][0])}
     known = {h: float(v[0]) for h, v in steps.items() if v.size == 1 and v[0] > 0}
     step = next(iter(known.values()), float(table.meta.get("dt", 1.0)))  # a file may have it beside
-    told = f"no time column: rows are taken {step:g} s apart; --dt S sets another step"
-    return np.asarray(step * np.arange(len(table.lines)), dtype=float), {*known}, [told]
+    note = f"no time column: rows are taken {step:g} s apart; --dt S sets another step"
+    return np.asarray(step * np.arange(len(table.lines)), dtype=float), {*known}, [note]
 
 
 def _counts(header: str, table: Table) -> bool:
-    """Tell whether a column that is not named as a time may be one: a clock, or even steps."""
+    """Return whether a column that is not named as a time may be one: a clock, or even steps."""
     if header in table.text:
         return read_clock(table.text[header][:20]) is not None
     step = np.diff(table.numbers[header])

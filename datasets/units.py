@@ -18,7 +18,7 @@ column j is the gain in the Bayesian information criterion,
     G_ij = N log(RSS_j / RSS_ij) - n log N,
 
 RSS_j of j on its own past, RSS_ij with that of i beside it (Granger 1969); beyond 10, with 2 lags and with 6
-(few leave of a smooth input what its output tells of it), it counts.
+(of a smooth input few leave what its output contains of it), it counts.
 
 A column that is computed from others is neither: a copy in another unit, or what is left between a set point
 and a reading.  A unit alone is a weak sign of an input: where some inputs are held, a column of volts that
@@ -87,7 +87,7 @@ _BOOKKEEPING = re.compile(
 _LONGEST = 200  # characters of a header that is looked through for a unit
 NO_CLUE = "neither its name nor its unit shows what it is"
 _HELD_SHARE, _HELD_SIZE = 0.5, 0.05  # of rows with a move; of the range that its median has, at least
-_FEW = 20  # rows: too few to tell chance from rule
+_FEW = 20  # rows: too few to distinguish chance from rule
 _COUNTS = 0.9  # of the rows have the same step
 _SHOWS = 5  # moves of two columns, by which they may be copies
 _EXACT, _ROUNDED = 1e-6, 0.05  # of a column's range; of its standard deviation, that rounding takes at most

@@ -182,7 +182,7 @@ def _realise(grid: Grid, gamma: Array, terms: tuple[str, ...]) -> StateSpaceMode
 def stabilised(A: Array, rows: int) -> Array:
     """Return A with poles beyond exp(-1 / rows) moved onto that circle, along their direction.
 
-    A record of so many rows cannot tell a slower pole, or a growing one, from a time constant of its length.
+    A record of so many rows cannot distinguish a slower pole, or a growing one, from one of its own length.
     """
     poles, vectors = np.linalg.eig(A)
     beyond = np.abs(poles) > np.exp(-1 / rows)

@@ -334,7 +334,7 @@ def test_a_batch_stops_at_q_alone_and_keeps_what_nobody_calls_bad(
 ) -> None:
     stand_in("thermogrip.cli.rig.typer.prompt", said)
     assert verbs._ready(2)(0, Trial("copper", 30.0, 18.0)) is goes_on
-    assert verbs._judge(Console())(0, Trial("copper", 30.0), SimpleNamespace(contact=0.1)) == bad
+    assert verbs._verdict(Console())(0, Trial("copper", 30.0), SimpleNamespace(contact=0.1)) == bad
 
 
 @pytest.mark.parametrize(
@@ -356,7 +356,7 @@ def test_no_contact_is_reported_to_the_operator(
     contact: float, warned: bool, stand_in: StandIn, capsys: pytest.CaptureFixture[str]
 ) -> None:
     stand_in("thermogrip.cli.rig.typer.prompt", "")
-    verbs._judge(Console())(0, Trial("copper", 30.0), SimpleNamespace(contact=contact))
+    verbs._verdict(Console())(0, Trial("copper", 30.0), SimpleNamespace(contact=contact))
     assert ("the skin felt nothing" in capsys.readouterr().err) == warned
 
 

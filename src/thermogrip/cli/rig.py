@@ -246,7 +246,7 @@ def batch(
             trials,
             new_folder(out),
             ready=_ready(len(trials)) if asks else None,
-            judge=_judge(console) if asks else None,
+            judge=_verdict(console) if asks else None,
             stop=None if stop_early is None else session_stop(stop_early),
             guard=watch,
             first_touch=_first_touch,
@@ -553,7 +553,7 @@ def _ready(n: int) -> Callable[[int, Trial], bool]:
     return ready
 
 
-def _judge(console: Console) -> Callable[[int, Trial, Session], str]:
+def _verdict(console: Console) -> Callable[[int, Trial, Session], str]:
     """Return what asks whether a grasp was good."""
 
     def verdict(k: int, trial: Trial, session: Session) -> str:
