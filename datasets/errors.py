@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-_MENDS = {
+_HINTS = {
     errno.ENOENT: ("no such file or folder", "check the path"),
     errno.EACCES: ("permission denied", "choose another folder or change its permissions"),
     errno.EPERM: ("permission denied", "choose another folder or change its permissions"),
@@ -81,7 +81,7 @@ def as_user_error(
 
 def os_fault(error: OSError, path: str | Path) -> UserError:
     """Return the :class:`UserError` for what the operating system refused."""
-    problem, hint = _MENDS.get(
+    problem, hint = _HINTS.get(
         error.errno or 0, (error.strerror or str(error), "check the path and the disk")
     )
     return UserError(problem, file=path, hint=hint)

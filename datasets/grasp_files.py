@@ -48,7 +48,7 @@ Floats = NDArray[np.float64]
 
 # name in the meta file (without unit) -> name in the record
 _FROM_META = {"t_object_nominal": "t_object", "t_gripper_set": "t_gripper"}
-_TO_META = {"t_object": "t_object_nominal", "t_gripper": "t_gripper_set"}
+_TO_META = {ours: theirs for theirs, ours in _FROM_META.items()}
 _ENDINGS = (".csv", ".csv.gz", ".csv.xz")
 _NEEDED = ("time", "t_surface")  # how the columns begin that are read as numbers
 

@@ -19,7 +19,6 @@ on one other grasp a material as the paper seems to have done, and on all others
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -93,8 +92,7 @@ class PaperResult:
 
     def table(self) -> tuple[tuple[str, ...], tuple[tuple[Any, ...], ...]]:
         """Return head and rows of the table: the paper's accuracy and interval, then ours."""
-        head = ["case", "object [degC]", "gripper [degC]", "materials"]
-        head += ["paper", "paper: k/n (95 %)"]
+        head = ["case", "object [degC]", "gripper [degC]", "materials", "paper", "paper: k/n (95 %)"]
         for name in CLASSIFIERS:
             head += [f"{name}, bundled", *([f"{name}, simulated"] if name in SIMULATED else [])]
         rows = []
@@ -151,9 +149,10 @@ class PaperResult:
 
     def sections(self) -> list[Section]:
         """Return the report."""
+        head, rows = self.regret()
         lost = Table(
-            self.regret()[0],
-            tuple((*row[:2], *(f"{value:.3f}" for value in row[2:])) for row in self.regret()[1]),
+            head,
+            tuple((*row[:2], *(f"{value:.3f}" for value in row[2:])) for row in rows),
             f"Simulated grasps up to {LONGEST_KNOWN:g} s, {TWIN_TEST} a material; log loss in nat a grasp.",
         )
         return [
@@ -193,19 +192,17 @@ class PaperResult:
         return Section("The paper's table, and ours", tuple(parts), self.verdict, "plain")
 
     def _worth_of_copies(self) -> Section:
-        head = (
-            "case",
-            "training grasps",
-            "further copies",
-            "one other grasp a material",
-            "all other grasps",
-            "mean confidence on these",
-        )
+        kinds = {
+            "copies": "further copies",
+            "one": "one other grasp a material",
+            "others": "all other grasps",
+        }
+        head = ("case", "training grasps", *kinds.values(), "mean confidence on these")
         rows = tuple(
             (
                 row["case"],
                 row["train_grasps"],
-                *(f"{row[f'{kind}_right']}/{row[f'{kind}_n']}" for kind in ("copies", "one", "others")),
+                *(f"{row[f'{kind}_right']}/{row[f'{kind}_n']}" for kind in kinds),
                 f"{100 * row['confidence']:.0f} %",
             )
             for row in self.copies
@@ -407,11 +404,9 @@ def _published(case: Case) -> tuple[str, str]:
 
 def _ours(comparison: Comparison, classifier: str, condition: str) -> str:
     """Return one of our accuracies with n and interval."""
-    rows: Sequence[dict[str, Any]] = comparison.scores()
-    for row in rows:
-        if (row["classifier"], row["condition"]) == (classifier, condition):
-            return _shown(row)
-    return "-"
+    mine = (classifier, condition)
+    found = (row for row in comparison.scores() if (row["classifier"], row["condition"]) == mine)
+    return next(map(_shown, found), "-")
 
 
 def _shown(row: dict[str, Any]) -> str:
