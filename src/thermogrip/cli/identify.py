@@ -127,10 +127,9 @@ def identify(
 
         out = Path(f"{file_stem(split_cut(logs[0])[0])}_plant.json")
     new_file(out, (".json",))
-    if network == "none" or "network" not in wanted:
-        wanted_network = None
-    else:
-        wanted_network = find_network(network or DEFAULT_NETWORK) if network or grow else None
+    a_network = "network" in wanted and network != "none"
+    named = a_network and bool(network or grow)
+    wanted_network = find_network(network or DEFAULT_NETWORK) if named else None
     to_grow = _growable(wanted_network) if grow else None
     console = Console(as_json)
     roles = comma(inputs), comma(outputs), comma(disturbances)
@@ -138,14 +137,11 @@ def identify(
     from thermogrip.sysid.plant.log_grid import roles_of
 
     table: dict[str, Any] = {"columns": comma(columns), "dt": dt}
-    records = None
-    if network is None and not grow and "network" in wanted:
+    if wanted_network is None:
         records = load_logs(logs, *roles, **table)
-        wanted_network = _shipped_network(records)
+        wanted_network = _shipped_network(records) if a_network else None
     if wanted_network is not None:  # what a network calls its own has the role that it has there
         records = load_logs(logs, *roles, known=roles_of(wanted_network), **table)
-    elif records is None:
-        records = load_logs(logs, *roles, **table)
     _warn_of_repairs(console, records)
     have = dict.fromkeys(map(str, records[0].data_vars), "")  # what a word means may be written otherwise
     known = [None if words is None else tuple(find_column(w, have) for w in words) for words in roles]

@@ -59,11 +59,10 @@ def _all_exist(value: Paths) -> None:
             raise UserError("no such file or folder", file=text, hint="check the path")
 
 
-def _is_plant(path: Path | None) -> None:
-    if path is not None:
-        from thermogrip.sysid.plant.plant_data import check_plant_file
+def _is_plant(path: str | Path) -> None:
+    from thermogrip.sysid.plant.plant_data import check_plant_file
 
-        check_plant_file(path)
+    check_plant_file(path)
 
 
 def _is_controller(path: Path) -> None:
@@ -78,25 +77,22 @@ def _is_controller(path: Path) -> None:
         raise UserError(problem, file=path, hint="tune the controller again") from error
 
 
-def _is_spec(path: Path | None) -> None:
-    if path is not None:
-        from thermogrip.datasets.atomic_files import read_toml
+def _is_spec(path: str | Path) -> None:
+    from thermogrip.datasets.atomic_files import read_toml
 
-        read_toml(path, hint="'init spec' writes one to edit")
+    read_toml(path, hint="'init spec' writes one to edit")
 
 
-def _are_logs(value: Paths) -> None:
+def _is_log(path: str | Path) -> None:
     from thermogrip.datasets.log_files import check_log_file
 
-    for path in _each(value):
-        check_log_file(path)
+    check_log_file(path)
 
 
-def _are_grasps(value: Paths) -> None:
+def _is_grasps(path: str | Path) -> None:
     from thermogrip.datasets.grasp_files import check_grasp_file
 
-    for path in _each(value):
-        check_grasp_file(path)
+    check_grasp_file(path)
 
 
 def _each(value: Paths) -> Sequence[str | Path]:
@@ -104,8 +100,13 @@ def _each(value: Paths) -> Sequence[str | Path]:
 
 
 def _existing_and(check: Callable[[Any], None]) -> Callable[[typer.Context, Any], Any]:
-    """Return a ``callback=`` that asks that files exist and, later, that this check passes."""
-    return lambda ctx, value: existing(ctx, _asked(check, _LATER)(ctx, value))
+    """Return a ``callback=`` that asks that files exist and, later, that each passes this check."""
+
+    def each(value: Paths) -> None:
+        for path in _each(value):
+            check(path)
+
+    return lambda ctx, value: existing(ctx, _asked(each, _LATER)(ctx, value))
 
 
 def _is_network(text: str | None) -> None:
@@ -145,8 +146,8 @@ existing_model = _asked(_is_folder)
 existing_plant = _existing_and(_is_plant)
 existing_controller = _existing_and(_is_controller)
 existing_spec = _existing_and(_is_spec)
-existing_logs = _existing_and(_are_logs)
-existing_grasps = _existing_and(_are_grasps)
+existing_logs = _existing_and(_is_log)
+existing_grasps = _existing_and(_is_grasps)
 new_report = _asked(_is_new_page, _LATER)
 
 
