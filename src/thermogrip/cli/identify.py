@@ -28,7 +28,6 @@ from thermogrip.cli.options import (
     log_name,
     new_file,
     option,
-    repairs_of,
 )
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.parallel import sub_progress
@@ -142,7 +141,7 @@ def identify(
         wanted_network = _shipped_network(records) if a_network else None
     if wanted_network is not None:  # what a network calls its own has the role that it has there
         records = load_logs(logs, *roles, known=roles_of(wanted_network), **table)
-    _warn_of_repairs(console, records)
+    repairs = _repaired(console, records)
     have = dict.fromkeys(map(str, records[0].data_vars), "")  # what a word means may be written otherwise
     known = [None if words is None else tuple(find_column(w, have) for w in words) for words in roles]
     roles = known[0], known[1], known[2]
@@ -194,7 +193,7 @@ def identify(
     slow = getattr(plant.model, "slow_because", "")
     if slow:
         console.warn(f"{plant.model.kind} model not compiled, tens of times slower: {slow}")
-    more = {"dynamics": None if dynamics is None else dynamics.to_dict(), "repairs": repairs_of(records)}
+    more = {"dynamics": None if dynamics is None else dynamics.to_dict(), "repairs": repairs}
     console.answer(_identified(found, plant, record, growth, out) | more)
     return ANSWER_IS_NO if posterior and (record is None or not record.converged) else 0
 
@@ -219,11 +218,14 @@ def _sampled(
     return plant, record, ""
 
 
-def _warn_of_repairs(console: Console, logs: Sequence[Log]) -> None:
-    """Warn of what was repaired while the logs were read."""
+def _repaired(console: Console, logs: Sequence[Log]) -> dict[str, list[str]]:
+    """Return what was repaired while the logs were read, by the log's name, and warn of it."""
+    found = {}
     for log in logs:
-        for line in repairs_of([log])[log_name(log)]:
+        found[log_name(log)] = [line for line in str(log.attrs.get("repairs", "")).splitlines() if line]
+        for line in found[log_name(log)]:
             console.warn(f"{log_name(log)}: {line}")
+    return found
 
 
 def _shipped_network(logs: Sequence[Log]) -> GreyModel | None:
@@ -360,7 +362,7 @@ def validate(
     from thermogrip.sysid.identification import warm_up_of_fit
     from thermogrip.sysid.validation.free_run import free_run
 
-    _warn_of_repairs(console, records)
+    repairs = _repaired(console, records)
     for log in records:
         needed, name = warm_up_of_fit(loaded, log), log_name(log)
         if warmup < needed:
@@ -384,7 +386,7 @@ def validate(
         for note in run.notes:
             console.say(f"{log_name(log)}: {note}")
     answers = [run_answer(log_name(log), run, band) for log, run, band in zip(records, runs, bands)]
-    console.answer({"logs": answers, "repairs": repairs_of(records)})
+    console.answer({"logs": answers, "repairs": repairs})
     return 0
 
 
@@ -430,7 +432,7 @@ def simulate(
     loaded = load_plant(plant, network)
     roles = loaded.inputs, loaded.outputs, loaded.disturbances
     (record,) = load_logs([log], *roles, columns=comma(columns), dt=dt)
-    _warn_of_repairs(console, [record])
+    repairs = _repaired(console, [record])[log_name(record)]
     record, converted = match_log(loaded, record)
     for line in converted:
         console.warn(f"{log_name(record)}: {line}")
@@ -444,7 +446,6 @@ def simulate(
                 simulated[f"{name}_{end}"] = ("time", column(simulated, name) + sign * half, attrs)
     write_log(simulated, out)
     console.say(f"wrote {out}: {', '.join(loaded.outputs)} at {simulated.sizes['time']} times")
-    repairs = repairs_of([record])[log_name(record)]
     rows = simulated.sizes["time"]
     console.answer({"log": record.attrs["name"], "rows": rows, "out": out, "repairs": repairs})
     return 0

@@ -316,14 +316,6 @@ def load_logs(
     return logs
 
 
-def repairs_of(logs: Sequence[Log]) -> dict[str, list[str]]:
-    """Return what was repaired while logs were read, by the log's name."""
-    return {
-        log_name(log): [line for line in str(log.attrs.get("repairs", "")).splitlines() if line]
-        for log in logs
-    }
-
-
 def find_grasps(paths: Sequence[str]) -> list[Grasps]:
     """Read grasp files and folders, one record a file; no two files may be the same condition."""
     from thermogrip.datasets.grasp_files import read_grasp_files
