@@ -34,8 +34,6 @@ from thermogrip.sysid.blackbox.order_selection import (
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import Grid
 
-__all__ = ["arx_family"]
-
 Array = NDArray[np.float64]
 
 

@@ -54,8 +54,6 @@ from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid, signals
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import READING_EVERY
 
-__all__ = ["BLACK_BOXES", "FAMILIES", "RESAMPLED", "BlackBoxFit", "fit_black_box", "with_refits"]
-
 FAMILIES: dict[str, Family] = {
     "arx": arx_family,
     "oe": oe_family,

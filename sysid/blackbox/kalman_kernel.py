@@ -26,8 +26,6 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["run_filter", "run_smoother"]
-
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 

@@ -26,8 +26,6 @@ from numpy.typing import NDArray
 
 from thermogrip.sysid.plant.log_grid import Segment
 
-__all__ = ["MANY", "Moments", "expected_moments", "fill_readings"]
-
 Array = NDArray[np.float64]
 
 MANY = 0.005  # of the rows lack a reading: below it they are left out, for little is lost with them

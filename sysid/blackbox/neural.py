@@ -43,8 +43,6 @@ from thermogrip.sysid.models.neural import NeuralModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import Grid
 
-__all__ = ["neural_family", "saturation_levels"]
-
 Array = NDArray[np.float64]
 
 RIDGE = 3.0  # rho; the data count as many readings as there are rows

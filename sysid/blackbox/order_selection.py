@@ -33,24 +33,6 @@ from thermogrip.sysid.models.model import Model as PlantModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import Grid, Segment
 
-__all__ = [
-    "HARDLY_MORE",
-    "PRIORS",
-    "Choice",
-    "Family",
-    "Model",
-    "Structure",
-    "as_state_space",
-    "choose",
-    "default_terms",
-    "drives",
-    "excess_within_noise",
-    "folds",
-    "free_run_errors",
-    "held_out_runs",
-    "with_spread",
-]
-
 Array = NDArray[np.float64]
 
 HARDLY_MORE = float(np.log(1.05))  # of log errors

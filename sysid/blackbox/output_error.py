@@ -49,8 +49,6 @@ from thermogrip.sysid.blackbox.order_selection import (
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import Grid, bridge
 
-__all__ = ["Filter", "Records", "Solution", "oe_family", "solve"]
-
 Array = NDArray[np.float64]
 
 RIDGE = 1e-10  # of unit columns: two that are alike share their effect

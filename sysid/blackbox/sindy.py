@@ -36,8 +36,6 @@ from thermogrip.sysid.blackbox.order_selection import Structure
 from thermogrip.sysid.models.polynomial import SindyModel
 from thermogrip.sysid.plant.log_grid import Grid, Segment, whole_readings
 
-__all__ = ["sindy_family"]
-
 Array = NDArray[np.float64]
 
 

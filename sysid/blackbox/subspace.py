@@ -48,8 +48,6 @@ from thermogrip.sysid.models.lti import scan_states
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import Grid
 
-__all__ = ["extended_observability", "subspace_family"]
-
 Array = NDArray[np.float64]
 
 _WEIGHTINGS = ("moesp", "cva")

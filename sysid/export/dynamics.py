@@ -30,8 +30,6 @@ from thermogrip.sysid.plant.fit_record import RUN_GAIN_SD, SEVERAL
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
-__all__ = ["Dynamics", "Estimate", "plant_dynamics"]
-
 _DELAY = 1e-6  # modulus of a discrete pole that is part of a delay
 _ROUNDING = 1e-9  # of the largest entry of A
 _NOTHING = 1e-6  # of the largest coefficient of an impulse response: before it is dead time

@@ -49,8 +49,6 @@ if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation.prediction_bands import Band
 
-__all__ = ["FreeRun", "Score", "free_run", "no_input_baseline", "score"]
-
 Array = NDArray[np.float64]
 
 EXCEEDS = 2.0  # times the error of the fit, from which that is reported

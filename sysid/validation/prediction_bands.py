@@ -77,16 +77,6 @@ from thermogrip.sysid.plant.simulation import find_starts
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
-__all__ = [
-    "MOST_DISAGREEMENT",
-    "Band",
-    "between_runs",
-    "check_ensemble",
-    "ensemble_disagreement",
-    "expected_coverage",
-    "free_run_band",
-]
-
 Array = NDArray[np.float64]
 
 SHORT = 0.1  # of the level: a part on which the expected coverage falls short by more is reported

@@ -74,19 +74,6 @@ from thermogrip.sysid.plant.simulation import Start, find_starts
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
-__all__ = [
-    "LEVEL",
-    "SQUARED",
-    "Correlation",
-    "CorrelationTest",
-    "ResidualCorrelations",
-    "SlowNoise",
-    "autocorrelation",
-    "cross_correlation",
-    "learn_slow_noise",
-    "residual_correlations",
-]
-
 Array = NDArray[np.float64]
 
 
