@@ -68,7 +68,7 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import dawsn, erfcx, rgamma
+from scipy.special import erfcx, rgamma
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -260,12 +260,6 @@ def sensor_temperature(
 ) -> Array:
     """Return what a sensor on the skin reads that follows with a first-order lag.
 
-    With w = lag^-1/2 and H = h_c (1/e_dev + 1/e_obj) the rise over that at perfect contact is
-
-        1 - [w^2 erfcx(H sqrt(t)) + H^2 exp(-t/lag) + H w (2/sqrt(pi)) D(sqrt(t/lag))] / (H^2 + w^2),
-
-    D being Dawson's integral (partial fractions of H / (s (sqrt(s) + H) (1 + lag s))).
-
     Parameters
     ----------
     t, T_dev0, T_obj0, e_dev, e_obj, h_c
@@ -284,25 +278,14 @@ def sensor_temperature(
     ...                    h_c=800.0).round(2)
     array([23.25, 36.24])
     """
-    t, y = _time_and_root(t, e_dev, e_obj, h_c)
+    t, _ = _time_and_root(t, e_dev, e_obj, h_c)
     _positive(lag=lag)
-    share = e_obj / (e_dev + e_obj)
-    ratio = t / lag
-    if np.isinf(h_c):
-        return np.asarray(T_dev0 + (T_obj0 - T_dev0) * share * -np.expm1(-ratio))
-    # u = w / H, so that neither a stiff nor a weak contact overflows
-    u = 1 / (h_c * (1 / e_dev + 1 / e_obj) * np.sqrt(lag))
-    mixed = u**2 * erfcx(y) + np.exp(-ratio) + u * 2 / np.sqrt(np.pi) * dawsn(np.sqrt(ratio))
-    rise = 1 - mixed / (1 + u**2)
-    early = (ratio < 1) & (y < 2)
-    if np.any(early):
-        # the closed form cancels early; with s = t v^2 the convolution is an integral of smooth positive
-        # terms
-        v, weight = 0.5 * (_LEGENDRE[0] + 1), 0.5 * _LEGENDRE[1]
-        r, root = np.atleast_1d(ratio)[..., None], np.atleast_1d(y)[..., None]
-        part = (2 * v * weight * r * np.exp(-r * (1 - v**2)) * _drop(root * v)).sum(axis=-1)
-        rise = np.where(early, part.reshape(np.shape(rise)), rise)
-    return np.asarray(T_dev0 + (T_obj0 - T_dev0) * share * rise)
+    dev, obj = half_space(e_dev), half_space(e_obj)
+
+    def transform(s: Complex) -> Complex:
+        return dev(s) / (s * (1 / h_c + dev(s) + obj(s)) * (1 + lag * s))
+
+    return T_dev0 + (T_obj0 - T_dev0) * _after_start(transform, t)
 
 
 def invert_laplace(transform: Callable[[Complex], Complex], t: ArrayLike, *, n: int = 24) -> Array:
