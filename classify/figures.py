@@ -238,16 +238,12 @@ def decision_figure(found: Decisions) -> Figure:
         beside.plot([row["time"]] * 2, [row["low"], row["high"]], color=color, lw=1.4)
         beside.plot(row["time"], row["accuracy"], marker, color=color, ms=6, mec="white")
         beside.plot(row["end"], row["accuracy_at_end"], marker, mfc="white", mec=color, ms=6)
-    _over_time(ended)
+    ended.set(xscale="log", xlabel="contact time [s]")
+    ended.set_xticks([0.3, 1, 3, 10], ["0.3", "1", "3", "10"])
+    ended.minorticks_off()
     if max(row["time"] for row in found.rows) > 20:
         ended.set_xticks([0.3, 1, 3, 10, 30], ["0.3", "1", "3", "10", "30"])
     ended.set(ylabel="share of contacts ended", ylim=(0, 1.03))
     beside.set(xlabel="mean contact time [s]", ylabel="accuracy (hollow: whole contact)", xlim=(0, None))
     figure.legend(loc="outside upper center", ncols=5, frameon=False, fontsize=8)
     return figure
-
-
-def _over_time(axis: Axes) -> None:
-    axis.set(xscale="log", xlabel="contact time [s]")
-    axis.set_xticks([0.3, 1, 3, 10], ["0.3", "1", "3", "10"])
-    axis.minorticks_off()

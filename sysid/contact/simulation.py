@@ -165,16 +165,13 @@ def _modes(lam: Array, vectors: Array, root: Array, half: Array) -> StackModes:
     return StackModes(np.maximum(lam, 0.0), shape[:, 0] ** 2, sensor / face, 1 / half[:, 0])
 
 
-def block_modes(effusivity: ArrayLike, capacity: ArrayLike) -> tuple[Array, Array, Array]:
-    """Return decay rates [1/s], weights (n, 37) and series resistance (n,) [m^2 K W^-1] of insulated slabs.
+@lru_cache(maxsize=64)
+def compiled_gripper(stack: Stack, steps: tuple[float, ...]) -> Any:
+    """Return what is common to all contacts of a gripper at these steps: it costs more than one contact."""
+    from thermogrip.sysid.contact.time_stepping import gripper_of
 
-    ``effusivity`` and ``capacity`` (n,): e [W s^0.5 m^-2 K^-1] and C = rho c_p L [J m^-2 K^-1].
-    """
-    from thermogrip.sysid.contact.time_stepping import slabs
-
-    e, c = (np.atleast_1d(np.asarray(v, dtype=float)) for v in (effusivity, capacity))
-    lam, weight, resistance = slabs(e, c, 0.0)
-    return lam, weight, resistance
+    found = stack_modes(stack)
+    return gripper_of(np.array(steps), found.lam, found.face, found.sensor, contact_numbers(stack, found))
 
 
 def step_response(
@@ -186,15 +183,14 @@ def step_response(
     ``effusivity``, ``capacity``, settled ``h_c`` and ``build_up`` (default the stack's) are (n,);
     one that is not positive and finite raises a ValueError.
     """
-    from thermogrip.sysid.contact.time_stepping import contacts, gripper_of
+    from thermogrip.sysid.contact.time_stepping import contacts
 
     given = (effusivity, capacity, h_c, stack.build_up if build_up is None else build_up)
     e, c, h, tau = np.broadcast_arrays(*(np.atleast_1d(np.asarray(v, dtype=float)) for v in given))
     for name, value in (("effusivity", e), ("capacity", c), ("h_c", h)):
         if not (np.all(np.isfinite(value)) and np.all(value > 0)):
             raise ValueError(f"{name} must be positive and finite, got {value[~(value > 0)][:3]}")
-    found = stack_modes(stack)
-    gripper = gripper_of(nodes.dt, found.lam, found.face, found.sensor, contact_numbers(stack, found))
+    gripper = compiled_gripper(stack, tuple(nodes.dt.tolist()))
     rise, slope, flux = contacts(tuple(nodes), gripper, *(np.ascontiguousarray(v) for v in (e, c, h, tau)))
     return rise, slope, flux
 

@@ -379,27 +379,16 @@ def _prepare_moved(dt: float, low: int, curve: int, slab_parts: Array, moved: Ar
 
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
-def _shift(low: int, high: int, b: Array, x: Array, q: float) -> None:
-    """Add b q to the modes of a curve."""
-    part, of = b[low:high], x[low:high]
-    for j in range(part.size):
-        of[j] += part[j] * q
-
-
-@numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def _shift_all(
     low: int, high: int, steps: Array, moved: Array, x: Array, now: Array, contact: bool, by_e: bool,
     by_c: bool, sign: float,
 ) -> None:  # fmt: skip
     """Add b q to the modes of all curves, or take it off them."""
-    _shift(low, high, steps[2], x[VALUE], sign * now[0, VALUE])
-    if contact:
-        _shift(low, high, steps[2], x[BY_H], sign * now[0, BY_H])
-        _shift(low, high, steps[2], x[BY_BUILD_UP], sign * now[0, BY_BUILD_UP])
-    for curve, wanted in ((BY_E, by_e), (BY_C, by_c)):
+    for curve, wanted in ((VALUE, True), (BY_H, contact), (BY_BUILD_UP, contact), (BY_E, by_e), (BY_C, by_c)):
         if wanted:
-            _shift(low, high, steps[2], x[curve], sign * now[0, curve])
-            _shift(low, N_MODE, moved[curve - BY_E, 2], x[curve], sign * now[0, VALUE])
+            x[curve, low:high] += steps[2, low:high] * (sign * now[0, curve])
+            if curve >= BY_E:
+                x[curve, low:N_MODE] += moved[curve - BY_E, 2, low:N_MODE] * (sign * now[0, VALUE])
 
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]

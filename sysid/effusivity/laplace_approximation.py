@@ -56,7 +56,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -70,6 +69,7 @@ from thermogrip.sysid.contact.simulation import (
     LAYER_NAMES,
     Stack,
     TimeNodes,
+    compiled_gripper,
     contact_numbers,
     nearby_modes,
     stack_modes,
@@ -175,18 +175,9 @@ def peak_ratio(dof: Array, vary: NDArray[np.bool_]) -> Array:
     return np.asarray(np.where(heavy, ratio, 0.0).sum(axis=1))
 
 
-@lru_cache(maxsize=64)
-def _gripper(stack: Stack, steps: tuple[float, ...]) -> Any:
-    """Return what is common to all contacts of a gripper: it costs more than one contact."""
-    from thermogrip.sysid.contact.time_stepping import gripper_of
-
-    found = stack_modes(stack)
-    return gripper_of(np.array(steps), found.lam, found.face, found.sensor, contact_numbers(stack, found))
-
-
 def gripper_arguments(stack: Stack, nodes: TimeNodes) -> tuple[Any, ...]:
     """Return the first arguments of the compiled functions, kept from call to call for each gripper."""
-    return tuple(nodes), _gripper(stack, tuple(nodes.dt.tolist()))
+    return tuple(nodes), compiled_gripper(stack, tuple(nodes.dt.tolist()))
 
 
 _AT = {name: i for i, name in enumerate((*SHARED_NAMES, "ln_h", "ln_e"))}

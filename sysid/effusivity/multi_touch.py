@@ -61,7 +61,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import number_within
 from thermogrip.datasets.materials import Material
 from thermogrip.datasets.schema import Grasps, label_values, log_name
-from thermogrip.sysid.contact.simulation import block_modes, step_response, time_nodes
+from thermogrip.sysid.contact.simulation import step_response, time_nodes
 from thermogrip.sysid.effusivity.data import Touches, touches, whiten
 from thermogrip.sysid.effusivity.gripper_model import UNKNOWN_OBJECT_SD, GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import (
@@ -166,6 +166,8 @@ class Traces:
 
 def traces_of(gripper: GripperModel, data: Touches, rest: Array, hypotheses: Hypotheses) -> Traces:
     """Return what the touches leave in their blocks; ``rest`` (n,) [s] is NaN where unknown."""
+    from thermogrip.sysid.contact.time_stepping import slabs
+
     capacity = np.exp(hypotheses.ln_rho_c) * gripper.block_length * gripper.depth_share
     effusivity = np.exp(hypotheses.ln_e)
     nodes = time_nodes(data.end)
@@ -174,7 +176,7 @@ def traces_of(gripper: GripperModel, data: Touches, rest: Array, hypotheses: Hyp
     )[2]
     inside = nodes.t <= data.end
     t, q = nodes.t[inside], flux[:, inside]
-    lam, weight, _ = block_modes(effusivity, capacity)
+    lam, weight, _ = slabs(effusivity, capacity, 0.0)
     history = np.exp(-lam[:, :, None] * (data.end - t)) * q[:, None, :]
     return Traces(
         moved=weight * np.trapezoid(history, t, axis=2), decay=lam, capacity=capacity, skin=data.level,

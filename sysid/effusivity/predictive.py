@@ -105,16 +105,10 @@ def next_touch(
     data = _coming(np.repeat(temperature, m), room, end, _sample_time(grasps))
     u, spread = np.zeros((n * m, N_NUISANCE)), np.zeros((n * m, N_NUISANCE, N_NUISANCE))
     u[:, BUILD_UP], u[:, ONSET], u[:, LEVEL] = np.log(gripper.stack.build_up), gripper.onset, data.level
-    for k, sd in (
-        (BUILD_UP, gripper.spreads.ln_build_up),
-        (ONSET, gripper.spreads.onset),
-        (LEVEL, _REGULATION),
-    ):
-        spread[:, k, k] = sd**2
-    for i, a in enumerate(SHARED):
-        u[:, a] = np.tile(x_mean[:, i], n)
-        for j, b in enumerate(SHARED):
-            spread[:, a, b] = np.tile(x_cov[:, i, j], n)
+    own = [BUILD_UP, ONSET, LEVEL]
+    spread[:, own, own] = np.square([gripper.spreads.ln_build_up, gripper.spreads.onset, _REGULATION])
+    u[:, SHARED] = np.tile(x_mean, (n, 1))
+    spread[:, np.array(SHARED)[:, None], SHARED] = np.tile(x_cov, (n, 1, 1))
     vary = np.diagonal(spread, axis1=1, axis2=2) > 0
     y, slopes = jacobian(gripper.stack, nodes_for(data), data, u, vary)
     excursion = np.abs(y[:, 1:] - data.level[:, None]).max(axis=1)
