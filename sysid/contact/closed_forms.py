@@ -1,5 +1,7 @@
 """Heat exchange between the gripper skin and a grasped object, in closed form.
 
+A negative time, a depth outside its body, or a property that is not positive is a ValueError everywhere.
+
 Half-spaces
 -----------
 
@@ -82,11 +84,6 @@ def contact_temperature(*, T_dev0: float, T_obj0: float, gamma: float) -> float:
 
     ``gamma`` is e_dev / e_obj; with T_dev0 = T_obj0 + dT0 it reads T_dev0 - dT0 / (1 + gamma), eq. (10).
 
-    Raises
-    ------
-    ValueError
-        If ``gamma`` is not positive.
-
     Examples
     --------
     >>> round(contact_temperature(T_dev0=23.0, T_obj0=43.0, gamma=1.6e3 / 3.64e4), 2)
@@ -167,11 +164,6 @@ def device_temperature(
     Returns
     -------
     T : ndarray of the broadcast shape [degC]
-
-    Raises
-    ------
-    ValueError
-        If a time or depth is negative, or a property is not positive.
 
     Examples
     --------
@@ -266,11 +258,6 @@ def sensor_temperature(
         As in :func:`skin_temperature`.
     lag : float
         Time constant of the sensor [s], positive.
-
-    Raises
-    ------
-    ValueError
-        If a time is negative, or a property or the lag is not positive.
 
     Examples
     --------
@@ -446,11 +433,6 @@ def slab_temperature(
     alpha : float
         Thermal diffusivity [m^2/s], positive.
 
-    Raises
-    ------
-    ValueError
-        If a time is negative, a depth outside the slab, or a property not positive.
-
     Examples
     --------
     >>> slab_temperature([1.0, 100.0], 0.02, T0=43.0, T_surf=23.0, thickness=0.02, alpha=1.0e-5).round(3)
@@ -500,11 +482,6 @@ def slab_temperature_convective(
     k : float
         Conductivity of the slab [W m^-1 K^-1], positive.
 
-    Raises
-    ------
-    ValueError
-        If a time is negative, a depth outside the slab, or a property not positive.
-
     Examples
     --------
     >>> slab_temperature_convective([1.0, 100.0], 0.0, T0=43.0, T_fluid=23.0, h=500.0, k=73.0, thickness=0.02,
@@ -536,11 +513,6 @@ def layered_temperature(
         Of the layer [m].
     e_layer, e_base, alpha_layer, alpha_base : float
         Effusivities [W s^0.5 m^-2 K^-1] and diffusivities [m^2/s].
-
-    Raises
-    ------
-    ValueError
-        If a time is not positive, a depth negative, or a property not positive.
 
     Examples
     --------
