@@ -34,6 +34,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import expit
 
 from thermogrip.classify.estimators.base import (
     Floats,
@@ -251,13 +252,9 @@ def _logits(weights: Mapping[str, NDArray[Any]], series: NDArray[np.float32]) ->
     state = cell = np.zeros((series.shape[0], recurrent.shape[0]), dtype=np.float32)
     for t in range(series.shape[1]):
         i, f, g, o = np.split(series[:, t] @ inputs + state @ recurrent + bias, 4, axis=1)
-        cell = _logistic(f) * cell + _logistic(i) * np.tanh(g)
-        state = _logistic(o) * np.tanh(cell)
+        cell = expit(f) * cell + expit(i) * np.tanh(g)
+        state = expit(o) * np.tanh(cell)
     return np.asarray(state @ weights["readout.weight"].T + weights["readout.bias"], dtype=float)
-
-
-def _logistic(x: NDArray[Any]) -> NDArray[Any]:
-    return np.asarray(0.5 + 0.5 * np.tanh(0.5 * x))
 
 
 def _part(named: dict[str, Any], prefix: str) -> dict[str, Any]:

@@ -352,23 +352,16 @@ def _point(pair: _Pair, v: Array, a: Array) -> _Point | None:
     left = np.where(
         pair.data.count[0] > 0, pair.data.y[0] - predict(stack, pair.nodes, pair.data, u[None])[0], 0.0
     )
-    cost = float(((pair.whitener @ left) ** 2).sum()) + float(_penalty(pair, v)[0].sum()) + float(a @ moved)
+    cost = float(((pair.whitener @ left) ** 2).sum()) + _penalty(pair, v)[0] + float(a @ moved)
     return _Point(v, a, moved, u, stack, left, cost)
 
 
-def _penalty(pair: _Pair, v: Array) -> tuple[Array, Array, Array, Array]:
-    """Return -2 ln prior density of each nuisance, relative to its peak, and by (v - mean) / sd, halved, its
-    slope, a curvature that bounds it, and the curvature itself, (7,) each.
-    """
-    sd, nu = pair.prior.sd[0], pair.dof
-    vary, heavy = sd > 0, np.isfinite(nu)
-    w = np.where(vary, v - pair.prior.mean[0], 0.0) / np.where(vary, sd, 1.0)
-    n = np.where(heavy, nu, 1.0)
-    value = np.where(heavy, (n + 1) * np.log1p(w**2 / n), w**2)
-    slope = np.where(heavy, (n + 1) * w / (n + w**2), w)
-    bound = np.where(heavy, (n + 1) / (n + w**2), 1.0)
-    own = np.where(heavy, np.maximum((n + 1) * (n - w**2) / (n + w**2) ** 2, 1e-3), 1.0)
-    return value, slope, np.where(vary, bound, 1.0), np.where(vary, own, 1.0)
+def _penalty(pair: _Pair, v: Array) -> tuple[float, Array, Array, Array]:
+    """Return the prior's -2 ln density, its slopes, bounds of the curvatures and these, (7,) each."""
+    from thermogrip.sysid.effusivity.mode_kernel import penalty
+
+    parts = np.empty((3, N_NUISANCE))
+    return float(penalty(v, pair.prior.mean[0], pair.prior.sd[0], pair.dof, *parts)), *parts
 
 
 def _expand(pair: _Pair, here: _Point, k: Array, j: Array) -> _Expansion:
@@ -381,7 +374,7 @@ def _expand(pair: _Pair, here: _Point, k: Array, j: Array) -> _Expansion:
     square = jw.T @ jw
     dw = dpotrs(_factor(square + np.diag(bound)), jw.T @ rest - slope, lower=1)[0]
     after = rest - jw @ dw
-    cost = float(after @ after + value.sum() + 2 * slope @ dw + dw @ (bound * dw))
+    cost = float(after @ after + value + 2 * slope @ dw + dw @ (bound * dw))
     curved = _factor(square + np.diag(own))
     log_det = float(np.log(np.diagonal(chol)).sum() + np.log(np.diagonal(curved)).sum())
     evidence = pair.constant - 0.5 * cost - log_det

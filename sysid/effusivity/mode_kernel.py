@@ -65,8 +65,8 @@ class _Scratch(NamedTuple):
 class _Expansion(NamedTuple):
     """The objective's expansion at a point ``u`` (7,).
 
-    ``matrix`` (7, 7) J' J, ``gradient`` (7,) J' r, ``slope`` and ``curvature`` (7,) of the prior; ``cost``
-    (2,): the objective and |r|^2.
+    ``matrix`` (7, 7) J' J, ``gradient`` (7,) J' r, ``slope``, bound of the ``curvature`` and its ``own`` (7,)
+    of the prior; ``cost`` (2,): the objective and |r|^2.
     """
 
     u: Array
@@ -74,6 +74,7 @@ class _Expansion(NamedTuple):
     gradient: Array
     slope: Array
     curvature: Array
+    own: Array
     cost: Array
 
 
@@ -88,7 +89,8 @@ class _Work(NamedTuple):
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def _expansion() -> _Expansion:
-    return _Expansion(np.zeros(7), np.zeros((7, 7)), np.zeros(7), np.zeros(7), np.zeros(7), np.zeros(2))
+    one = np.zeros((5, 7))
+    return _Expansion(one[0], np.zeros((7, 7)), one[1], one[2], one[3], one[4], np.zeros(2))
 
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
@@ -178,15 +180,16 @@ def _normal_equations(
     return _dot(columns[7], columns[7])
 
 
-@numba.njit(**INNER)  # type: ignore[untyped-decorator]
-def _penalty(u: Array, mean: Array, sd: Array, dof: Array, first: Array, second: Array) -> float:
-    """Fill slope and curvature of the prior's -2 ln density, halved, in units of sd; return its value.
+@numba.njit(**OUTER)  # type: ignore[untyped-decorator]
+def penalty(u: Array, mean: Array, sd: Array, dof: Array, first: Array, bound: Array, own: Array) -> float:
+    """Return the prior's -2 ln density relative to its peak; fill its halved slopes and curvatures by u / sd.
 
-    Normal where ``dof`` is infinite, else Student's t.
+    Normal where ``dof`` is infinite, else Student's t.  ``bound`` is positive and bounds the curvature from
+    above, so that a step on it cannot overshoot; ``own`` is kept from turning negative far out in the tail.
     """
     total = 0.0
     for a in range(7):
-        first[a], second[a] = 0.0, 1.0
+        first[a], bound[a], own[a] = 0.0, 1.0, 1.0
         if sd[a] <= 0.0:
             continue
         w = (u[a] - mean[a]) / sd[a]
@@ -194,11 +197,11 @@ def _penalty(u: Array, mean: Array, sd: Array, dof: Array, first: Array, second:
             first[a] = w
             total += w * w
         else:
-            nu = dof[a]
-            first[a] = (nu + 1.0) * w / (nu + w * w)
-            # positive: it bounds the curvature from above, and a step on it cannot overshoot
-            second[a] = (nu + 1.0) / (nu + w * w)
-            total += (nu + 1.0) * np.log1p(w * w / nu)
+            nu, w2 = dof[a], w * w
+            first[a] = (nu + 1.0) * w / (nu + w2)
+            bound[a] = (nu + 1.0) / (nu + w2)
+            own[a] = max((nu + 1.0) * (nu - w2) / (nu + w2) ** 2, 1e-3)
+            total += (nu + 1.0) * np.log1p(w2 / nu)
     return total
 
 
@@ -245,7 +248,7 @@ def _evaluate(
     _predict(nodes, gripper, u, vary, times, bins, count, t, ramp, room, scratch)
     at.u[:] = u
     square = _normal_equations(whitener, y, law[1], scratch, at.matrix, at.gradient)
-    at.cost[0] = square + _penalty(u, law[0], law[1], law[2], at.slope, at.curvature)
+    at.cost[0] = square + penalty(u, law[0], law[1], law[2], at.slope, at.curvature, at.own)
     at.cost[1] = square
 
 
@@ -272,13 +275,8 @@ def _shorten(step: Array, sd: Array) -> Any:
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def _conclude(here: _Expansion, law: Array, work: _Work, covariance: Array) -> Any:
     """Fill the covariance at the mode; return the log determinant of the curvature in units of sd."""
-    mean, sd, dof = law[0], law[1], law[2]
-    for a in range(7):
-        work.diagonal[a] = here.curvature[a]
-        if sd[a] > 0.0 and not np.isinf(dof[a]):
-            w2, nu = ((here.u[a] - mean[a]) / sd[a]) ** 2, dof[a]
-            # the density's own curvature, kept from turning negative far out in the tail
-            work.diagonal[a] = max((nu + 1) * (nu - w2) / (nu + w2) ** 2, 1e-3)
+    sd = law[1]
+    penalty(here.u, law[0], sd, law[2], work.rhs, work.step, work.diagonal)
     log_det = _cholesky(here.matrix, work.diagonal, work.low)
     for b in range(7):
         for a in range(7):

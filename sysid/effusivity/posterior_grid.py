@@ -96,9 +96,9 @@ class MarginalPosterior:
         free, common, data = free_hypotheses(self.gripper, points[:, 0]), self._prior, self.data
         u = np.repeat(common.mean, points.shape[0], axis=0)
         u[:, SAMPLED] = points
-        log_prior = _log_normal(points[:, 1], free.ln_h, free.ln_h_sd)
+        log_prior = _log_student(points[:, 1], free.ln_h, free.ln_h_sd)
         ln_length = np.log(self.gripper.block_length * self.gripper.depth_share)
-        log_prior += _log_normal(points[:, 4], free.ln_rho_c + ln_length, free.ln_rho_c_sd)
+        log_prior += _log_student(points[:, 4], free.ln_rho_c + ln_length, free.ln_rho_c_sd)
         for column, k in ((2, BUILD_UP), (3, ONSET)):
             dof = np.inf if common.dof is None else common.dof[0, k]
             log_prior += _log_student(points[:, column], common.mean[0, k], common.sd[0, k], dof)
@@ -124,11 +124,7 @@ def log_integrals(
     return np.asarray(total + volume + _LOG_WEIGHT - 0.5 * target.log_det)
 
 
-def _log_normal(x: Array, mean: Array, sd: Array) -> Array:
-    return np.asarray(-0.5 * ((x - mean) / sd) ** 2 - np.log(sd))
-
-
-def _log_student(x: Array, mean: float, sd: float, dof: float) -> Array:
+def _log_student(x: Array, mean: Array | float, sd: Array | float, dof: float = np.inf) -> Array:
     w = (x - mean) / sd
     if np.isinf(dof):
         return np.asarray(-0.5 * w**2 - np.log(sd))

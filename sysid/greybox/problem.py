@@ -71,10 +71,11 @@ _STEP = 1e-4  # of a prior sd
 
 @dataclass(frozen=True, eq=False)
 class _Bins:
-    """Averages of one stretch: per output the operator from the grid to the bins, and the readings' means."""
+    """Averages of one stretch, per output."""
 
-    operators: tuple[sparse.csr_matrix, ...]
-    means: tuple[Array, ...]
+    operators: tuple[sparse.csr_matrix, ...]  # from the grid to the bins
+    means: tuple[Array, ...]  # of the readings
+    places: tuple[NDArray[np.int64], ...]  # which bins these are
 
 
 @dataclass(eq=False)
@@ -295,6 +296,7 @@ def _bins(stretch: Stretch, dt: float, steps: int) -> _Bins:
     share, cell = place - left, np.minimum(place.astype(int), n_grid - 2) // steps
     operators: list[sparse.csr_matrix] = []
     means: list[Array] = []
+    places: list[NDArray[np.int64]] = []
     for k in range(stretch.y.shape[1]):
         known = np.flatnonzero(np.isfinite(stretch.y[:, k]))
         filled, where, count = np.unique(cell[known], return_inverse=True, return_counts=True)
@@ -303,4 +305,5 @@ def _bins(stretch: Stretch, dt: float, steps: int) -> _Bins:
         at = (np.tile(where, 2), np.concatenate([left[known], left[known] + 1]))
         operators.append(sparse.csr_matrix((entries, at), shape=(filled.size, n_grid)))
         means.append(np.bincount(where, weight * stretch.y[known, k], filled.size).astype(float))
-    return _Bins(tuple(operators), tuple(means))
+        places.append(filled)
+    return _Bins(tuple(operators), tuple(means), tuple(places))

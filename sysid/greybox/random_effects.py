@@ -310,7 +310,7 @@ def _warm_up(
     ]
     seconds, bin_s = problem.warm_up(at), merge * problem.average
     n = min(max(1, round(seconds / bin_s)), _n_bins(problem, at, 0) // merge)
-    places = _places(problem, at, 0)
+    places = problem.logs[at][1][0].places
     outputs = [j for j, place in enumerate(places) if n and place.size >= _KNOWN * n * merge]
     if not read or not outputs:
         return None
@@ -338,18 +338,8 @@ def _scaled(problem: Problem, parts: list[list[Array]]) -> list[list[Array]]:
     return [[problem.scaled(k, part[None])[0] for k, part in enumerate(stretch)] for stretch in parts]
 
 
-def _places(problem: Problem, at: int, k: int) -> list[NDArray[np.int64]]:
-    """Return which bins of stretch k each output has."""
-    steps, out = max(1, round(problem.average / problem.plant.dt)), []
-    for operator in problem.logs[at][1][k].operators:
-        some = operator.shape[0] > 0
-        first = np.minimum.reduceat(operator.indices, operator.indptr[:-1]) if some else np.zeros(0)
-        out.append((first // steps).astype(np.int64))
-    return out
-
-
 def _n_bins(problem: Problem, at: int, k: int) -> int:
-    return max((int(place[-1]) + 1 for place in _places(problem, at, k) if place.size), default=0)
+    return max((int(place[-1]) + 1 for place in problem.logs[at][1][k].places if place.size), default=0)
 
 
 def _merge(problem: Problem) -> int:
@@ -369,7 +359,7 @@ def _blocks(
     residual: list[Array],
 ) -> list[Block]:
     """Return the pieces of stretch k of a log on a regular grid of bins; none where it is too short."""
-    places, n = _places(problem, at, k), _n_bins(problem, at, k) // merge * merge
+    places, n = problem.logs[at][1][k].places, _n_bins(problem, at, k) // merge * merge
     outputs = [j for j, place in enumerate(places) if n and place.size >= _KNOWN * n]
     if not outputs or n < _LEAST * merge * pieces:
         return []

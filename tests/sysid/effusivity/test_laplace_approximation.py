@@ -465,23 +465,6 @@ def test_a_contact_is_made_within_0_8_s_of_the_message(device, data, u):
     )
 
 
-def test_the_penalty_has_the_slope_and_curvatures_of_the_priors_density():
-    mean, sd = np.arange(7.0), np.array([0.3, 0.5, 0.1, 3.0, 0.4, 0.0, 0.2])
-    dof = np.array([np.inf, 6.0, 4.0, np.inf, np.inf, np.inf, np.inf])
-    pair = SimpleNamespace(prior=Prior(mean[None], sd[None]), dof=dof)
-    w = np.array([0.5, 0.8, 5.0, 0.1, -0.2, 0.0, -0.3])
-    value, slope, bound, own = laplace._penalty(pair, mean + w * sd)
-    np.testing.assert_allclose(value[[0, 1]], [0.25, 7 * np.log(1 + 0.64 / 6)])
-    h = 1e-5
-    ahead, back = (laplace._penalty(pair, mean + (w + s * h) * sd) for s in (1, -1))
-    np.testing.assert_allclose(slope, (ahead[0] - back[0]) / (4 * h), atol=1e-8)
-    moving = [0, 1, 2, 3, 4, 6]
-    np.testing.assert_allclose(bound[moving], slope[moving] / w[moving])
-    curved = [0, 1, 3, 4, 6]  # the third lies where the density's own turns negative
-    np.testing.assert_allclose(own[curved], ((ahead[1] - back[1]) / (2 * h))[curved], rtol=1e-6)
-    assert (own[2], bound[5], own[5]) == (1e-3, 1.0, 1.0)
-
-
 def test_a_step_is_shortened_to_two_fifths_until_the_density_rises(monkeypatch):
     here = SimpleNamespace(v=np.zeros(7), a=np.ones(3), cost=5.0)
     ahead = SimpleNamespace(dv=np.full(7, 2.0), a=np.full(3, 3.0))

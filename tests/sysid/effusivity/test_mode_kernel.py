@@ -28,9 +28,9 @@ def plain(monkeypatch):
 
 
 def law(u, mean):
-    slope, curvature = np.empty(7), np.empty(7)
-    value = kernel._penalty.py_func(u, mean, SD, DOF, slope, curvature)
-    return value, slope, curvature
+    slope, bound, own = np.empty((3, 7))
+    value = kernel.penalty.py_func(u, mean, SD, DOF, slope, bound, own)
+    return value, slope, bound, own
 
 
 def test_the_penalty_is_the_priors_density_beside_its_peak():
@@ -39,13 +39,15 @@ def test_the_penalty_is_the_priors_density_beside_its_peak():
     u = mean + rng.normal(size=7)
     w = np.where(SD > 0, (u - mean) / np.where(SD > 0, SD, 1.0), 0.0)
     laws = [norm() if np.isinf(v) else student_t(v) for v in DOF]
-    value, slope, curvature = law(u, mean)
+    value, slope, curvature, own = law(u, mean)
     want = sum(2 * (one.logpdf(0) - one.logpdf(x)) for one, x in zip(laws, w))
     assert value == pytest.approx(want)
     for a in range(7):
         h = 1e-6 * SD[a] * (np.arange(7) == a)
         rise = (law(u + h, mean)[0] - law(u - h, mean)[0]) / 4e-6 if SD[a] > 0 else 0.0
         assert slope[a] == pytest.approx(rise, rel=1e-5, abs=1e-8)
+        bend = (law(u + h, mean)[1][a] - law(u - h, mean)[1][a]) / 2e-6 if SD[a] > 0 else 1.0
+        assert own[a] == pytest.approx(max(bend, 1e-3), rel=1e-5)
         # what makes of the slope a step to the mean; 1 of a normal law, and of what is known
         assert curvature[a] == pytest.approx(slope[a] / w[a] if w[a] else 1.0)
 
@@ -67,7 +69,7 @@ def test_triangular_systems_are_those_of_linear_algebra(matrix):
 
 @pytest.mark.parametrize("damping", [0.0, 0.3])
 def test_a_step_is_that_of_the_quadratic_model(plain, matrix, damping):
-    here = kernel._Expansion(*(np.zeros(0),) * 6)._replace(
+    here = kernel._Expansion(*(np.zeros(0),) * 7)._replace(
         matrix=matrix, gradient=np.arange(7.0), slope=np.linspace(1, 2, 7), curvature=np.linspace(0.5, 1.1, 7)
     )
     work = kernel._Work(np.zeros((7, 7)), *(np.zeros(7) for _ in range(3)))
@@ -99,13 +101,11 @@ def test_the_covariance_has_the_densitys_own_curvature(plain, matrix):
     """Of Student's t (nu + 1) (nu - w^2) / (nu + w^2)^2, a thousandth at least: it is negative far out."""
     w = np.array([0.5, 0.8, 5.0, 0.1, 0.2, 0.0, 0.3])
     mean = np.arange(7.0)
-    here = kernel._Expansion(
-        mean + w * SD, matrix, *(np.zeros(7),) * 2, np.linspace(0.5, 1.1, 7), np.zeros(2)
-    )
+    here = kernel._Expansion(mean + w * SD, matrix, *(np.zeros(7),) * 4, np.zeros(2))
     work = kernel._Work(np.zeros((7, 7)), *(np.zeros(7) for _ in range(3)))
     covariance = np.zeros((7, 7))
     log_det = kernel._conclude.py_func(here, np.stack([mean, SD, DOF]), work, covariance)
-    own = here.curvature.copy()
+    own = np.ones(7)
     own[1] = 7 * (6 - 0.64) / (6 + 0.64) ** 2
     own[2] = 1e-3
     whole = matrix + np.diag(own)

@@ -142,7 +142,7 @@ def test_priors_are_the_densities_of_their_laws():
     x, left = np.array([-1.0, 0.4, 3.0]), 0.5 * np.log(2 * np.pi)
     for dof, law in ((7.0, student_t(7, 0.5, 2.0)), (np.inf, norm(0.5, 2.0))):
         np.testing.assert_allclose(posterior_grid._log_student(x, 0.5, 2.0, dof), law.logpdf(x) + left)
-    np.testing.assert_allclose(posterior_grid._log_normal(x, 0.5, 2.0), norm(0.5, 2.0).logpdf(x) + left)
+    np.testing.assert_allclose(posterior_grid._log_student(x, 0.5, 2.0), norm(0.5, 2.0).logpdf(x) + left)
 
 
 @pytest.mark.parametrize(

@@ -91,6 +91,7 @@ def test_bins_are_whole_steps_and_hold_the_means_of_their_rows():
     cell = np.minimum(t, 201.0).astype(int) // 4  # the last row ends the last step
     want = [np.nanmean(y[cell == k]) for k in range(51) if k != 10]  # of 40 to 43 s none is left
     np.testing.assert_allclose(cells.means[0], want)
+    np.testing.assert_array_equal(cells.places[0], np.delete(np.arange(51), 10))
     line = 3.0 * np.arange(203.0) + 1.0  # of a run on the grid, at the times of the same rows
     at = [np.mean((3.0 * t + 1.0)[(cell == k) & np.isfinite(y)]) for k in range(51) if k != 10]
     np.testing.assert_allclose(cells.operators[0] @ line, at)

@@ -134,16 +134,15 @@ def binned(*of_log):
         at, values = (np.concatenate(part) for part in zip(*rows))
         return sparse.csr_matrix((values, (np.repeat(np.arange(len(rows)), 4), at)), shape=(len(rows), 400))
 
-    logs = [
-        ([None] * len(log), [SimpleNamespace(operators=[operator(h) for h in k]) for k in log])
-        for log in of_log
-    ]
+    def cells(k):
+        return SimpleNamespace(operators=[operator(h) for h in k], places=[np.array(h, dtype=int) for h in k])
+
+    logs = [([None] * len(log), [cells(k) for k in log]) for log in of_log]
     return SimpleNamespace(logs=logs, average=4.0, plant=SimpleNamespace(dt=1.0), tau=np.array([4.0, 9.0]))
 
 
 def test_bins_stand_where_their_readings_do():
     problem = binned([[[0, 2, 5], []]], [[[1], [0, 7]], [[3], [3]]])
-    assert [place.tolist() for place in random_effects._places(problem, 0, 0)] == [[0, 2, 5], []]
     assert [random_effects._n_bins(problem, *at) for at in ((0, 0), (1, 0), (1, 1))] == [6, 8, 4]
     assert random_effects._n_bins(binned([[[], []]]), 0, 0) == 0
     # at most 400 bins of a stretch are taken
