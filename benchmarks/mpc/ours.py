@@ -12,6 +12,7 @@ from problem import DRIVE, HORIZON, LAST, MODEL, MOVE, OVERSHOOT, PRICE, TANK, T
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import Design, make_blocks
 from thermogrip.mpc.native.runtime import CompiledOptimiser
+from thermogrip.mpc.optimiser.rti import Sample
 
 __all__ = ["TEN_BLOCKS", "Ours", "design_of"]
 
@@ -83,7 +84,7 @@ class Ours:
             guess = np.add.reduceat(self.plan, self.begins, axis=0) / self.blocks[:, None]
         about = {"target": np.array([goal]), "side": np.array([side])}
         bias, drive_bias = self.zero
-        found = self.optimiser.solve(x, last, guess, q, bias=bias, drive_bias=drive_bias, **about)
+        found = self.optimiser.solve(Sample(x, last, guess, q, bias=bias, drive_bias=drive_bias, **about))
         if found.status != "solved":
             return float("nan")
         plan = np.repeat(found.plan, self.blocks, axis=0)

@@ -47,7 +47,7 @@ from thermogrip.mpc.estimator.call_times import RESTART_S, opening, shifted
 from thermogrip.mpc.estimator.reading_checks import ReadingMonitor, follows, is_off
 from thermogrip.mpc.interface import Move, Readings, Target, number
 from thermogrip.mpc.optimiser.reach import Reach
-from thermogrip.mpc.optimiser.rti import Optimiser, Outcome
+from thermogrip.mpc.optimiser.rti import Optimiser, Outcome, Sample
 from thermogrip.mpc.plant.prediction import prediction_model
 
 if TYPE_CHECKING:
@@ -423,17 +423,9 @@ class Controller(SampledController):
         x = observer.now
         if self.design.move_delay:  # the drive applied now stays for one more sample
             x = self.model.next_state(x, last + observer.drive_bias, d)
+        guess, biases = self._guess(wanted, last), (observer.output_bias, observer.drive_bias)
         return self.optimiser.solve(
-            x,
-            last,
-            self._guess(wanted, last),
-            d,
-            target=wanted,
-            side=self._side,
-            bias=observer.output_bias,
-            drive_bias=observer.drive_bias,
-            slew_s=self._slew_s,
-            lost=self._lost,
+            Sample(x, last, guess, d, wanted, self._side, *biases, slew_s=self._slew_s, lost=self._lost)
         )
 
     def _guess(self, wanted: Array, last: Array) -> Array:

@@ -25,11 +25,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.arrays import Array, Mask
+from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.estimator.observer import Observer
 from thermogrip.mpc.native.codegen import ModelCode, write_model
 from thermogrip.mpc.native.design_struct import Sizes, as_structure, config_header, numbers_of, sizes_of
-from thermogrip.mpc.optimiser.rti import Optimiser, Outcome
+from thermogrip.mpc.optimiser.rti import Optimiser, Outcome, Sample
 
 if TYPE_CHECKING:
     from thermogrip.mpc.optimiser.rti import ControllerParts
@@ -290,28 +290,13 @@ class CompiledOptimiser(Optimiser):
         )
         self._run = c.library.tg_host_optimise
 
-    def solve(
-        self,
-        x: Array,
-        last: Array,
-        guess: Array,
-        d: Array,
-        *,
-        target: Array,
-        side: Array,
-        bias: Array,
-        drive_bias: Array,
-        slew_s: float | None = None,
-        lost: Mask | None = None,
-    ) -> Outcome:
+    def solve(self, sample: Sample) -> Outcome:
         """Improve a plan; see :meth:`Optimiser.solve`."""
         *parts, slew = self._parts
-        for part, values in zip(
-            parts, (x, last, guess.ravel(), d, target, side, bias, drive_bias), strict=True
-        ):
-            part[:] = values
-        slew[:] = self.design.dt if slew_s is None else slew_s
-        self._lost[:] = 0 if lost is None else lost
+        for part, values in zip(parts, sample[:8], strict=True):
+            part[:] = values.ravel()
+        slew[:] = self.design.dt if sample.slew_s is None else sample.slew_s
+        self._lost[:] = 0 if sample.lost is None else sample.lost
         status = QP_STATUS[self._run(*self._arguments)]
         y, authority, iterations = self._y.copy(), self._authority_now[0].copy(), self._iterations.value
         if status != "solved":

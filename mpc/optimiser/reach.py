@@ -48,7 +48,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.mpc.optimiser.rti import FADING, Optimiser, allowed_share
+from thermogrip.mpc.optimiser.rti import Optimiser
 
 if TYPE_CHECKING:
     from thermogrip.mpc.estimator.observer import Observer
@@ -264,17 +264,10 @@ class Reach:
     def _range(self, G: Array, u: Array, drive_bias: Array) -> tuple[Array, Array]:
         """Return the ends (n_u,) of the drives: no further than the optimiser goes where a gain fades."""
         optimiser, neutral = self._optimiser, self.model.neutral
-        low, high = optimiser.lowest, optimiser.highest
         if optimiser.settled_gain is None:
-            return low, high
-        away = u - neutral
+            return optimiser.lowest, optimiser.highest
         gain = G[np.array(self._rows)[optimiser.strongest], np.arange(len(u))]
-        left = gain / optimiser.settled_gain
-        best = np.abs(away + drive_bias) / np.maximum(1 - left, FADING)
-        room = best * allowed_share(np.abs(np.where(away < 0, low, high) - neutral), best, self.model.span)
-        fading = left < 1 - FADING
-        low = np.where(fading & (away < 0), np.maximum(low, neutral - room), low)
-        return low, np.where(fading & (away > 0), np.minimum(high, neutral + room), high)
+        return optimiser.faded_range(u - neutral, drive_bias, gain / optimiser.settled_gain, neutral)
 
 
 def _least_squares_in_box(G: Array, e: Array, low: Array, high: Array) -> Array:

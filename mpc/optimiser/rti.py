@@ -28,9 +28,9 @@ ramps that take the drive back, to none and to the other end, are looked at ever
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,21 @@ FADING = 0.3  # of the gain at rest lost, from which on it is foreseen where it 
 _LOOK_AROUND = 5  # samples between two trials of the ramps
 _LITTLE = 1e-7  # of its range, that a parked drive may be off in the program
 _BARELY = 1.02  # a plan that is hardly better than the QP's is not worth a jump
+
+
+class Sample(NamedTuple):
+    """What one optimisation starts from, and what is asked of it."""
+
+    x: Array  # (n_x,) state
+    last: Array  # (n_u,) drives that are applied now
+    guess: Array  # (n_b, n_u) plan to linearise along
+    d: Array  # (n_d,) disturbances, their bias included
+    target: Array  # (n_controlled,) [degC]
+    side: Array  # (n_controlled,) from where a target is approached: +1 below, -1 above, 0 neither
+    bias: Array  # (n_y,) reading minus model
+    drive_bias: Array  # (n_u,) in the drives' units
+    slew_s: float | None = None  # seconds that the slew limit of the first move counts; a sample where absent
+    lost: Mask | None = None  # (n_controlled,) outputs that cost nothing, and whose drives go to rest
 
 
 @dataclass(frozen=True)
@@ -106,29 +121,9 @@ class Optimiser:
             time_limit_s=max(design.deadline_s, 1e-3),
         )
 
-    def solve(
-        self,
-        x: Array,
-        last: Array,
-        guess: Array,
-        d: Array,
-        *,
-        target: Array,
-        side: Array,
-        bias: Array,
-        drive_bias: Array,
-        slew_s: float | None = None,
-        lost: Mask | None = None,
-    ) -> Outcome:
-        """Improve a plan: return :class:`Outcome` for state x, drives ``last`` applied now, and the plan
-        ``guess`` (n_b, n_u) to linearise along.
-
-        Disturbances d include their bias; targets (n_controlled,) are in degC, ``side`` is from where they
-        are approached (+1 below, -1 above, 0 neither); ``bias`` (n_y,) is reading minus model, ``drive_bias``
-        in the drives' units. The slew limit of the first move counts ``slew_s`` seconds, by default a sample.
-        Outputs that are ``lost`` (n_controlled,) cost nothing, and the drives that are there for them go to
-        rest.
-        """
+    def solve(self, sample: Sample) -> Outcome:
+        """Improve a plan."""
+        x, last, guess, d, target, side, bias, drive_bias, slew_s, lost = sample
         model, n_u = self.model, self.model.n_u
         # in samples, by how much more or less than in one the first move may go
         more = 0.0 if slew_s is None else slew_s / self.design.dt - 1.0
@@ -241,18 +236,24 @@ class Optimiser:
     ) -> tuple[Array, Array]:
         """Return the range (n_b, n_u) of each block: no further than where its gain will have faded."""
         away, held = guess - self.neutral, last - self.neutral
-        best = np.abs(away + drive_bias) / np.maximum(1 - authority, FADING)  # where the gain is nothing
-        end = np.abs(np.where(away < 0, self.lowest, self.highest) - self.neutral)
-        room = best * allowed_share(end, best, self.model.span)
         reach = (self.reach[:, None] + more) * self.slew
-        room = np.maximum(room, np.where(away * held > 0, np.abs(held) - reach, 0.0))  # what the slew allows
-        fading = authority < 1 - FADING
-        low = np.where(fading & (away < 0), self.neutral - room, self.lowest)
-        high = np.where(fading & (away > 0), self.neutral + room, self.highest)
-        low, high = np.maximum(low, self.lowest), np.minimum(high, self.highest)
+        least = np.where(away * held > 0, np.abs(held) - reach, 0.0)  # what the slew allows
+        low, high = self.faded_range(away, drive_bias, authority, self.neutral, least)
         little = np.zeros(self.model.n_u)
         little[self._parked] = _LITTLE * self.model.span[self._parked]
         return self._park(low, last, more) - little, self._park(high, last, more) + little
+
+    def faded_range(
+        self, away: Array, bias: Array, left: Array, neutral: Array, least: Array | float = 0.0
+    ) -> tuple[Array, Array]:
+        """Return the ends of drives that are ``away`` from neutral, where what is ``left`` of their gain at rest
+        will have faded; never nearer than the ``least`` distance."""
+        best = np.abs(away + bias) / np.maximum(1 - left, FADING)  # where the gain is nothing
+        end = np.abs(np.where(away < 0, self.lowest, self.highest) - neutral)
+        room = np.maximum(best * allowed_share(end, best, self.model.span), least)
+        low = np.where((left < 1 - FADING) & (away < 0), neutral - room, self.lowest)
+        high = np.where((left < 1 - FADING) & (away > 0), neutral + room, self.highest)
+        return np.maximum(low, self.lowest), np.minimum(high, self.highest)
 
     def _simulate(self, x: Array, plans: Array, d: Array) -> Array:
         """Return the outputs (B, N, n_y) of plans (B, n_b, n_u)."""
@@ -299,27 +300,27 @@ class Optimiser:
         gain are the first move.
         """
         n_u, span = self.model.n_u, np.tile(self.model.span, self.n_b)
-        H = self._fixed.copy()
-        linear = np.zeros((H.shape[0], self.N, len(rows)))
-        for at, row in enumerate(rows):
-            weighted = G[:, row, :].T * self._weight
-            H += 2 * weighted @ G[:, row, :]
-            linear[:, :, at] = 2 * weighted
+        H, weighted = self._hessian(G, rows)
+        linear = 2 * np.stack(weighted, axis=2)
         before = np.zeros((H.shape[0], n_u))
         before[:n_u] = np.diag(1 / self.model.span)
         last = 2 * self.design.move * self.differences.T @ before
         on_free = -span[:, None] * np.linalg.solve(H, linear.reshape(H.shape[0], -1))
         return H, on_free, span[:, None] * np.linalg.solve(H, last)
 
+    def _hessian(self, G: Array, rows: Sequence[int]) -> tuple[Array, list[Array]]:
+        """Return H, and by output the response (n, N) of each sample times its weight."""
+        H, weighted = self._fixed.copy(), [G[:, row, :].T * self._weight for row in rows]
+        for row, part in zip(rows, weighted):
+            H += 2 * part @ G[:, row, :]
+        return H, weighted
+
     def _cost(self, G: Array, free: Array, target: Array, last: Array) -> tuple[Array, Array]:
-        H = self._fixed.copy()
+        rows = [self._rows[at] for at in self._seen_rows]
+        H, weighted = self._hessian(G, rows)
         f = np.zeros(H.shape[0])
-        for at in self._seen_rows:
-            row = self._rows[at]
-            g = G[:, row, :]
-            weighted = g.T * self._weight
-            H += 2 * weighted @ g
-            f += 2 * weighted @ (free[:, row] - target[at])
+        for at, row, part in zip(self._seen_rows, rows, weighted):
+            f += 2 * part @ (free[:, row] - target[at])
         before = np.zeros(H.shape[0])
         before[: self.model.n_u] = last / self.model.span
         f -= 2 * self.design.move * self.differences.T @ before

@@ -266,7 +266,7 @@ def test_a_prediction_that_fails_is_a_fallback_and_no_target_is_off(two, monkeyp
 )
 def test_the_optimiser_starts_where_the_next_drive_will_act(monkeypatch, move_delay, x):
     two, asked = make_two(move_delay=move_delay), []
-    monkeypatch.setattr(two.optimiser, "solve", lambda *args, **kwargs: asked.append((args, kwargs)) or FOUND)
+    monkeypatch.setattr(two.optimiser, "solve", lambda sample: asked.append(sample) or FOUND)
     two.observer.x, two.observer.w, two.observer.found_offset = (
         np.array([20.0, 30.0]), np.array([0.03, -0.02]), np.array([0.4, 0.7]),
     )  # fmt: skip
@@ -281,15 +281,12 @@ def test_the_optimiser_starts_where_the_next_drive_will_act(monkeypatch, move_de
     ):
         two._plan, two._age_s = plan, 2.0
         two._optimise(np.array([33.0, 30.0]))
-        args, rest = asked.pop()
-        for value, wanted in zip(args, (x, [100.0, 60.0], guess, [22.0]), strict=True):
-            np.testing.assert_allclose(value, wanted, rtol=1e-12)
-        assert rest.pop("slew_s") == 5.0
         for name, wanted in {
+            "x": x, "last": [100.0, 60.0], "guess": guess, "d": [22.0], "slew_s": 5.0,
             "target": [33.0, 30.0], "side": [1.0, -1.0], "bias": [0.4, 0.7], "drive_bias": [3.0, -2.0],
             "lost": [False, True],
         }.items():  # fmt: skip
-            np.testing.assert_allclose(rest[name], wanted, rtol=1e-12)
+            np.testing.assert_allclose(getattr(asked[-1], name), wanted, rtol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.native import runtime as build
 from thermogrip.mpc.native.runtime import build_library, compiler, wanted
+from thermogrip.mpc.optimiser.rti import Sample
 from thermogrip.mpc.tuning.objective import Search, parameters_of
 from thermogrip.sysid.plant.plant import Plant
 
@@ -53,8 +54,8 @@ def test_a_plan_is_the_same_in_c(pair):
         guess = np.clip(last + np.cumsum(0.2 * rng.normal(size=(python.optimiser.n_b, 1)), 0), -1, 1)
         about = {"target": rng.uniform(10, 50, 1), "side": rng.choice([-1.0, 0, 1], 1)}
         about |= {"bias": 0.2 * rng.normal(size=2), "drive_bias": 0.02 * rng.normal(size=1)}
-        one = python.optimiser.solve(x, last, guess, d, **about)
-        two = c.optimiser.solve(x, last, guess, d, **about)
+        one = python.optimiser.solve(Sample(x, last, guess, d, **about))
+        two = c.optimiser.solve(Sample(x, last, guess, d, **about))
         assert one.status == two.status == "solved"
         np.testing.assert_allclose(two.plan, one.plan, atol=1e-9)
         np.testing.assert_allclose(two.y, one.y, atol=1e-8)

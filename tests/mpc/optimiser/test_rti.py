@@ -15,7 +15,7 @@ from thermogrip.mpc.design.design import Design, PILoop
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.native.runtime import wanted
 from thermogrip.mpc.optimiser.qp import QPAnswer
-from thermogrip.mpc.optimiser.rti import Optimiser, allowed_share
+from thermogrip.mpc.optimiser.rti import Optimiser, Sample, allowed_share
 from thermogrip.mpc.plant.prediction import PredictionModel
 from thermogrip.mpc.tuning.minimum_time import full_drive_bound
 from thermogrip.sysid.models.state_space import StateSpaceModel
@@ -271,20 +271,20 @@ def test_a_solve_predicts_what_its_plan_does_and_parks_what_is_lost(optimiser):
     bias = np.array([4.0, -6.0])
     room, side, guess = np.array([ROOM]), np.array([1.0, -1.0]), np.tile(LAST, (3, 1))
     ask = {"target": TARGET, "side": side, "bias": BIAS, "drive_bias": bias}
-    found = optimiser.solve(START, LAST, guess, room, **ask)
+    found = optimiser.solve(Sample(START, LAST, guess, room, **ask))
     assert found.status == "solved"
     np.testing.assert_allclose(found.y, outputs(found.plan + bias), atol=1e-9)
     assert found.plan[0, 0] - 40.0 == pytest.approx(8.0)  # a is in its band, b far below its target
     np.testing.assert_allclose(found.authority, [1.0, 1.0])
-    longer = optimiser.solve(START, LAST, guess, room, **ask, slew_s=2.5)
+    longer = optimiser.solve(Sample(START, LAST, guess, room, **ask, slew_s=2.5))
     assert longer.plan[0, 0] - 40.0 == pytest.approx(10.0)
-    lost = optimiser.solve(START, LAST, guess, room, **ask, lost=np.array([True, False]), slew_s=2.0)
+    lost = optimiser.solve(Sample(START, LAST, guess, room, **ask, lost=np.array([True, False]), slew_s=2.0))
     np.testing.assert_allclose(lost.plan[:, 0], [32.0, 20.0, 0.0])
     assert abs(lost.y[-1, 0] - 26.5) < 0.5  # while a goes on to its target
     optimiser.qp = SimpleNamespace(
         solve=lambda *given: QPAnswer(np.full(6, np.nan), "cycling", 4, None, None)
     )
-    failed = optimiser.solve(START, LAST, guess, room, **ask)
+    failed = optimiser.solve(Sample(START, LAST, guess, room, **ask))
     assert (failed.status, failed.broken, failed.iterations) == ("cycling", {}, 4)
     assert np.isnan(failed.plan).all()
     np.testing.assert_allclose(failed.y, outputs(guess + bias), atol=1e-9)
@@ -303,7 +303,7 @@ def test_the_bias_of_a_drive_counts_where_the_range_is_looked_for(optimiser, mon
     monkeypatch.setattr(optimiser, "_range", lambda *given: asked.append(given) or find(*given))
     given = {"target": TARGET, "side": np.zeros(2), "bias": BIAS, "drive_bias": np.array([3.0, -5.0])}
     for slew_s, more in ((5.0, 1.5), (None, 0.0)):
-        optimiser.solve(START, LAST, PLANS[0], np.array([ROOM]), **given, slew_s=slew_s)
+        optimiser.solve(Sample(START, LAST, PLANS[0], np.array([ROOM]), **given, slew_s=slew_s))
         wanted = (PLANS[0], [3.0, -5.0], np.ones((3, 2)), LAST, more)
         for value, want in zip(asked.pop(), wanted, strict=True):
             np.testing.assert_allclose(value, want, rtol=1e-9)
