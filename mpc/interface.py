@@ -5,7 +5,7 @@ This module imports nothing heavy, so that the PI baseline, a session and a robo
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, TypeAlias
 
@@ -45,6 +45,10 @@ class Move:
     advice: str = ""
     seconds: float = 0.0
     plan: dict[str, tuple[float, ...]] = field(default_factory=dict)
+
+    def drives(self, names: Sequence[str]) -> list[float]:
+        """Return what to apply in the order of these inputs."""
+        return [self.drive[name] for name in names] if isinstance(self.drive, dict) else [float(self.drive)]
 
 
 class Controller(Protocol):

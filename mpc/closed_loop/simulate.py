@@ -219,10 +219,8 @@ class Truth:
         warmth = around.ambient if start is None else start
         self.x = native.rest(np.full(native.n_y, warmth), self.d)
         self.u = native.neutral
-        self.offset = native.vector(
-            {name: plant.offsets.get(name, 0.0) + around.offset.get(name, 0.0) for name in native.outputs},
-            native.outputs,
-        )
+        given = [plant.offsets.get(name, 0.0) + around.offset.get(name, 0.0) for name in native.outputs]
+        self.offset = np.array(given, dtype=float)
         self.rng = np.random.default_rng(seed)
         self.late = round(around.move_delay_s / native.dt)
         self.y = [native.output(self.x) + self.offset]
@@ -241,12 +239,7 @@ class Truth:
 
     def apply(self, move: Move) -> None:
         """Let one sample pass under this move."""
-        drive = move.drive
-        new = (
-            self.model.vector(drive, self.model.drives)
-            if isinstance(drive, dict)
-            else np.array([float(drive)])
-        )
+        new = np.array(move.drives(self.model.drives), dtype=float)
         u = np.repeat(new[None, None, :], self.sub, axis=1)
         u[:, : min(self.late, self.sub)] = self.u
         y, x = self.model.run(self.x[None, :], u, self.d)
@@ -272,12 +265,7 @@ def record_loop(
     model = truth.model
     y = np.stack(truth.y)
     fine = np.asarray(model.dt * np.arange(y.shape[0]), dtype=np.float64)
-    drives = np.array(
-        [
-            [move.drive[name] for name in model.drives] if isinstance(move.drive, dict) else [move.drive]
-            for move in moves
-        ]
-    )
+    drives = np.array([move.drives(model.drives) for move in moves])
     return ClosedLoop(
         time=fine,
         outputs={name: y[:, i] for i, name in enumerate(model.outputs)},

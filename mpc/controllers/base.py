@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.mpc.estimator.call_times import SAME, CallTimes
-from thermogrip.mpc.interface import Move, Readings, Target
+from thermogrip.mpc.interface import Move, Readings, Target, number
 from thermogrip.mpc.plant.prediction import PredictionModel
 
 #: Readings outside are a broken wire, not a temperature [degC].
@@ -27,12 +27,8 @@ STALE = "reading is stale: its time has not moved on"
 
 def clean(reading: Readings, name: str) -> float:
     """Return a plausible temperature [degC] from a reading, NaN where it is missing, no number, or absurd."""
-    value = reading.get(name) if isinstance(reading, Mapping) else None
-    try:
-        number = float(value)  # type: ignore[arg-type]  # None and text end in the except
-    except (TypeError, ValueError):
-        return float("nan")
-    return number if PLAUSIBLE[0] <= number <= PLAUSIBLE[1] else float("nan")
+    value = number(reading, name)
+    return value if PLAUSIBLE[0] <= value <= PLAUSIBLE[1] else float("nan")
 
 
 class SampledController:

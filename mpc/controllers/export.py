@@ -292,7 +292,7 @@ def _compare(twin: _Twin, state: _State, answer: list[str]) -> tuple[float, bool
     reading = dict(zip(model.outputs, state.y.tolist()))
     reading |= dict(zip(model.disturbances, state.d_now.tolist()))
     move = twin.step(reading, dict(zip(twin.controlled, state.wanted.tolist())))
-    drive = model.vector(move.drive, model.drives) if isinstance(move.drive, dict) else np.array([move.drive])
+    drive = np.array(move.drives(model.drives))
     plan = np.zeros((0, model.n_u)) if twin.plan is None else twin.plan
     ours = np.concatenate([drive[None], plan])
     theirs = np.array([float.fromhex(word) for word in answer[2:]]).reshape(-1, model.n_u)

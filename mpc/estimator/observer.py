@@ -275,7 +275,7 @@ class Observer:
         self.model, self.disturbance, self.ambient = model, disturbance, ambient
         self.noise = noise if noise is not None else ObserverNoise()
         plant = model.plant
-        self.offset = model.vector(dict.fromkeys(model.outputs, 0.0) | plant.offsets, model.outputs)
+        self.offset = np.array([float(plant.offsets.get(name, 0.0)) for name in model.outputs])
         sd = [max(plant.noise.get(name, self.noise.reading), 0.02) for name in model.outputs]
         self.R = np.array(sd) ** 2
         self._H = np.hstack([model.C, disturbance.on_output])

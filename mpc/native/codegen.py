@@ -255,20 +255,14 @@ def _write(line: _Line, name: str) -> ModelCode:
 
 def _hand_over(line: _Line, needed: set[int], stage: int, letter: str) -> list[int]:
     """Return the values of a stage that a later one reads, and say where it finds them."""
-    read = {use for at in needed if line.values[at].stage > stage for use in line.values[at].uses}
-    read |= {at for found in line.outputs for at in found.values()}
-    kept = sorted(
-        at for at in read if line.values[at].stage == stage and (line.values[at].uses or stage == 1)
-    )
-    if stage == 2:  # what is an input of the step is none of the tangent
-        kept = sorted(at for at in read if line.values[at].stage == 2 and at in _read_by(line, needed, 3))
+    later = [at for at in needed if line.values[at].stage > stage]
+    read = {use for at in later for use in line.values[at].uses}
+    if stage == 1:  # what is a result of the step is none of the tangent's business
+        read |= {at for found in line.outputs for at in found.values()}
+    kept = sorted(at for at in read if line.values[at].stage == stage)
     for entry, at in enumerate(kept):
         line.values[at].place = f"{letter}[{entry}]"
     return kept
-
-
-def _read_by(line: _Line, needed: set[int], stage: int) -> set[int]:
-    return {use for at in needed if line.values[at].stage == stage for use in line.values[at].uses}
 
 
 def _body(line: _Line, stage: int, roots: Sequence[int], stores: Sequence[str]) -> list[str]:

@@ -246,7 +246,7 @@ class Optimiser:
     def faded_range(
         self, away: Array, bias: Array, left: Array, neutral: Array, least: Array | float = 0.0
     ) -> tuple[Array, Array]:
-        """Return the ends of drives that are ``away`` from neutral, where what is ``left`` of their gain at rest
+        """Return the ends of drives ``away`` from neutral, where what is ``left`` of their gain at rest
         will have faded; never nearer than the ``least`` distance."""
         best = np.abs(away + bias) / np.maximum(1 - left, FADING)  # where the gain is nothing
         end = np.abs(np.where(away < 0, self.lowest, self.highest) - neutral)

@@ -31,7 +31,7 @@ References
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
@@ -281,10 +281,6 @@ class PredictionModel:
         """Return the room's temperature [degC] as the measured disturbances give it, 25 where they do not."""
         d = np.asarray(d, float).reshape(-1)
         return float(d[0]) if d.size and np.isfinite(d[0]) else ROOM
-
-    def vector(self, values: Mapping[str, float], names: Sequence[str]) -> Array:
-        """Return values by name as an array in the order of names, NaN where one is missing."""
-        return np.array([float(values.get(name, np.nan)) for name in names])
 
 
 def _symbols(model: PredictionModel, prefix: str = "") -> list[Any]:

@@ -547,11 +547,15 @@ def largest_eigenvalue(matrix: Array) -> float:
     return float(np.max(np.abs(np.linalg.eigvals(matrix))))
 
 
+@dataclass(frozen=True, eq=False)
 class LinearLoop:
     """A plant under the linear law, as one linear map; targets 0, no noise."""
 
-    def __init__(self, law: LinearLaw, A: Array, B: Array, C: Array, rows: list[int]) -> None:
-        self.law, self.A, self.B, self.C, self.rows = law, A, B, C, rows
+    law: LinearLaw
+    A: Array
+    B: Array
+    C: Array
+    rows: list[int]  # controlled outputs
 
     @property
     def matrix(self) -> Array:
