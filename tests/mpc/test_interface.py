@@ -20,6 +20,9 @@ def test_what_is_no_number_is_none(value: object):
 def test_a_move_says_no_more_than_it_must():
     assert Move(0.5) == Move(0.5, pump=1, status="ok", advice="", seconds=0.0, plan={})
 
+    assert Move({"q1": 1.0, "q2": 2.0}).drives(("q2", "q1")) == [2.0, 1.0]
+    assert Move(3).drives(("q",)) == [3.0]
+
 
 def test_the_room_offers_what_it_lists_and_nothing_else():
     for name in mpc.__all__:

@@ -189,7 +189,7 @@ def test_sanitizers_must_not_change_an_answer():
 
 def answer_of(move: Move, twin: Any, shift: float = 0.0) -> list[str]:
     model = twin.model
-    drive = model.vector(move.drive, model.drives) if isinstance(move.drive, dict) else np.array([move.drive])
+    drive = np.array(move.drives(model.drives))
     plan = np.zeros((0, model.n_u)) if twin.plan is None else twin.plan
     numbers = np.concatenate([drive[None] + shift, plan]).ravel().tolist()
     return [str(STATUSES.index(move.status)), str(twin.last_iterations), *(v.hex() for v in numbers)]

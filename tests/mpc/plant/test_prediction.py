@@ -232,9 +232,6 @@ def test_a_plan_may_run_from_several_states_in_several_rooms():
         np.testing.assert_allclose(y[k], want[::2], atol=1e-12)
         np.testing.assert_allclose(end[k], state, atol=1e-12)
     np.testing.assert_allclose(model.run(x, u, d[0])[0][0], y[0], atol=1e-12)
-    assert model.vector({"r": 2.0, "s": 1.0}, ("q", "r")).tolist() == pytest.approx(
-        [np.nan, 2.0], nan_ok=True
-    )
     state, drives, room = model.at_rest(18.0)
     assert (model.output(state), drives.tolist(), room.tolist()) == (
         pytest.approx([18.0]),
