@@ -1,20 +1,13 @@
 r"""When a controller is called: how many seconds passed, and whether a move is due.
 
-A controller is designed for one sample time and called whenever its loop comes round.  Two things follow
-from the times of its readings and must not be mixed up:
+Estimate, plan and slew limit count each second once, whatever the rate (``docs/explanation/mpc.md``).  A move
+is due at the call that is nearest to a sample time after the last one,
 
-* **elapsed time**, which the estimate, the plan and the slew limit count: each second once, whatever the
-  rate;
-* **whether a move is due.**  Called more often than its sample time the controller holds its move until the
-  call that is nearest to a sample time after the last one,
+    since >= dt - interval / 2,
 
-      since >= dt - interval / 2,
-
-  where ``interval`` is that of the last call.  Called more seldom it moves at every call.
-
-A reading without a time counts as one sample time.  A reading whose time has not moved on is stale: no time
-has passed that anybody knows of, and the call is taken to be as far from the last as calls usually are.  A
-clock that went back by more than 30 s and goes on from there has begun anew.
+where ``interval`` is that of the last call.  A reading whose time has not moved on is stale: the call is
+taken to be as far from the last as calls usually are.  A clock that went back by more than 30 s and goes on
+from there has begun anew.
 """
 
 from __future__ import annotations

@@ -10,9 +10,8 @@ the changes that the model expects of it sum up,
 
     m+ = m + |C (f(x, u, d) - x)|  with its sign,      m = 0 whenever the reading changes.
 
-Beyond 2 degC it is taken for lost until it moves.  A quantised reading that rests at its target is not
-mistaken: there the model expects nothing.  (The estimate follows the frozen reading meanwhile, so that only
-what each sample adds is summed, not where the model would have gone by itself.)
+Beyond 2 degC it is taken for lost until it moves.  (The estimate follows the frozen reading meanwhile, so
+that only what each sample adds is summed, not where the model would have gone by itself.)
 
 **A plant that does not follow.**  The bias that the observer had to assume for the drive is beyond 30 % of
 its range, or that of an output 2 degC: a pump that is off, a plug that has fallen off, another plant.

@@ -14,16 +14,13 @@ and beyond it more current heats. Three guards stand there. A Peltier's gain fad
 drive, to nothing at the optimum: from what is left of it along the guess, against that at rest, follows
 where the optimum is, and how far a block may go, as a share of the way there,
 
-    share = max(3/4, min(e, 3 - 2 e)),     e = end of the range / optimum.
+    share = max(3/4, min(e, 3 - 2 e)),     e = end of the range / optimum
 
-A range that ends before the optimum is had whole: its own end is the guard, and what a plant with an earlier
-optimum loses there is a few per cent of its cooling.  One that runs an eighth beyond it, where a runaway
-could, is used to three quarters of the way. (There, 94 % of the cooling is had; and a plant whose optimum
-lies 25 % below the model's is still on the safe side of its own.)  The bias of the drive that the observer
-has found is counted where the gain is evaluated, not in the share: it is a heat flow, and heat moves no
-optimum.  Where the QP's plan costs more than the guess in the nonlinear simulation, it is taken only part of
-the way.  And since the far side is a trap (there, heating seems to ask for still more cooling current), plain
-ramps that take the drive back, to none and to the other end, are looked at every fifth sample.
+(``docs/explanation/mpc.md`` says what that costs).  The bias of the drive that the observer has found is
+counted where the gain is evaluated, not in the share: it is a heat flow, and heat moves no optimum.  Where
+the QP's plan costs more than the guess in the nonlinear simulation, it is taken only part of the way.  And
+since the far side is a trap (there, heating seems to ask for still more cooling current), plain ramps that
+take the drive back, to none and to the other end, are looked at every fifth sample.
 """
 
 from __future__ import annotations

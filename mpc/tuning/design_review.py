@@ -1,30 +1,20 @@
 r"""Design review: what would go wrong with this controller, found before the rig finds it.
 
-Each check passes, warns or fails, with its numbers and the fix.  None of them needs the rig.
+Each check passes, warns or fails, with its numbers and the fix (``docs/explanation/mpc.md`` lists them).
+None needs the rig.
 
-**What the plant allows.**  The horizon must see past the delay, and past the point where braking must begin;
-each temperature of the wanted range must be held by a drive inside its limits, in a cold and in a warm room;
-the gain must not turn over inside the drive's range, nor the current pass a Peltier's optimum; hard limits
-must leave room to move, soft ones must not forbid the wanted range; targets must lie where the logs were.
+**What the plant allows.**  The cold face of a Peltier element takes Q = S I T_c - I^2 R / 2 - K (T_h - T_c)
+out, T_c in kelvin, which is largest at I* = S T_c / R; beyond it more current cools less.  Only S I and I^2 R
+are identifiable from temperatures, so I* is given as a share of full drive, which needs no more.  With a
+heatsink that warms up the whole plant turns over earlier still; that is what the check of the gain's sign
+follows.
 
-The cold face of a Peltier element takes Q = S I T_c - I^2 R / 2 - K (T_h - T_c) out, T_c in kelvin, which is
-largest at I* = S T_c / R; beyond it more current cools less.  Only S I and I^2 R are identifiable from
-temperatures, so I* is given as a share of full drive, which needs no more.  With a heatsink that warms up
-the whole plant turns over earlier still; that is what the check of the gain's sign follows.
-
-**What the loop does by itself.**  The disturbance states must be detectable; the observer must forget its
-errors; the loop must be stable, on the plant and on draws of it, and leave no offset; the QP must be well
-conditioned and scaled, and its weights must do something.
-
-While no limit is near the controller is a linear system
+**What the loop does by itself.**  While no limit is near the controller is a linear system
 (:mod:`thermogrip.mpc.controllers.linear_equivalent`) from readings to drives. Together with a plant x+ = A x
 + B u, y = C x + q, it is one matrix M.  Its eigenvalues must lie inside the unit circle, on the plant and on
 draws of it; those of the observer alone are of F (I - L H).  With a constant offset q of an output, in
 steady state s = (I - M)^-1 b q, the controlled output must be back at its target: that is what free of
 offset means.
-
-**What it costs** (here): the slowest step, its iterations at the worst moment, and who takes over when it
-fails.
 """
 
 from __future__ import annotations
