@@ -116,7 +116,7 @@ def plan_gains(controller: ControllerParts) -> tuple[Array, Array, Array, Array]
 
 def to_control(controller: ControllerParts) -> Any:
     """Return the law as a python-control ``StateSpace``; see :meth:`Controller.to_control`."""
-    from thermogrip.sysid.export.libraries import control_system
+    from thermogrip.sysid.export.linearise import control_system
 
     law = linear_law(controller)
     return control_system(law, (law.A, law.B, law.C, law.D, law.dt), "controller")

@@ -246,8 +246,7 @@ class Search:
         self.__dict__.update(state)
         model = None
         if where is not None:
-            from thermogrip.sysid.models.user_class import load_object
-            from thermogrip.sysid.models.user_model import own_model
+            from thermogrip.sysid.models.user_model import load_object, own_model
 
             model = own_model(load_object(*where))
         self.plant = Plant.from_dict(state["plant"], model=model)

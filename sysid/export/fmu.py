@@ -31,8 +31,7 @@ import numpy as np
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import atomic_path
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.export.libraries import needed
-from thermogrip.sysid.export.linearise import operating_point
+from thermogrip.sysid.export.linearise import needed, operating_point
 from thermogrip.sysid.plant.plant import Plant
 
 START = "start_"  # with the name of an output: what it reads when the simulation begins

@@ -202,16 +202,16 @@ class Plant(PlantData):
 
     def to_control(self, **point: Any) -> Any:
         """Return the plant about an operating point for python-control; see
-        :func:`thermogrip.sysid.export.libraries.to_control`."""
+        :func:`thermogrip.sysid.export.linearise.to_control`."""
         return _exporter("to_control")(self, **point)
 
     def to_scipy(self, **point: Any) -> Any:
         """Return the plant about an operating point for scipy; see
-        :func:`thermogrip.sysid.export.libraries.to_scipy`."""
+        :func:`thermogrip.sysid.export.linearise.to_scipy`."""
         return _exporter("to_scipy")(self, **point)
 
     def to_casadi(self, *, dt: float | None = None) -> Any:
-        """Return one step as a CasADi function; see :func:`thermogrip.sysid.export.libraries.to_casadi`."""
+        """Return one step as a CasADi function; see :func:`thermogrip.sysid.export.linearise.to_casadi`."""
         return _exporter("to_casadi")(self, dt=dt)
 
     def to_fmu(self, path: str | Path) -> Path:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from thermogrip.datasets.log_files import read_log
-from thermogrip.sysid.models.user_class import load_object
+from thermogrip.sysid.models.user_model import load_object
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

@@ -12,8 +12,7 @@ import pytest
 from tests.end_to_end.conftest import Bench
 from thermogrip.datasets.log_files import read_log
 from thermogrip.sysid.greybox.fit import fit_network
-from thermogrip.sysid.models.user_class import load_object
-from thermogrip.sysid.models.user_model import own_model
+from thermogrip.sysid.models.user_model import load_object, own_model
 from thermogrip.sysid.validation.free_run import free_run
 
 REAL = Path(os.environ.get("THERMOGRIP_REAL_DATA", Path(__file__).parents[3] / "shared" / "data" / "real"))

@@ -12,8 +12,7 @@ from tests.end_to_end.conftest import Bench, small_plant
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.tuning.tune import tune
 from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.models.user_class import load_object
-from thermogrip.sysid.models.user_model import own_model
+from thermogrip.sysid.models.user_model import load_object, own_model
 from thermogrip.sysid.plant.plant import Plant
 
 SPEC = """

@@ -344,12 +344,11 @@ def warn_of_contacts(console: Console, records: Sequence[Grasps]) -> None:
 def find_network(text: str) -> GreyModel:
     """Return the model of ``--network``: a network by name or TOML file, or ``FILE.py:NAME``, which runs it.
 
-    NAME is a class of the user's own (:mod:`thermogrip.sysid.models.user_class`), or a class or function
+    NAME is a class of the user's own (:mod:`thermogrip.sysid.models.user_model`), or a class or function
     without arguments that makes a :class:`~thermogrip.sysid.models.network.NetworkModel`.
     """
     from thermogrip.sysid.models.network import NetworkModel, load_network
-    from thermogrip.sysid.models.user_class import load_object
-    from thermogrip.sysid.models.user_model import own_model
+    from thermogrip.sysid.models.user_model import load_object, own_model
 
     file, name = _split_class(text)
     if not name:

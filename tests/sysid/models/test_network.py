@@ -14,8 +14,7 @@ from scipy.optimize import least_squares
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.models.model import roll_rows
-from thermogrip.sysid.models.network import NetworkModel, _kernel, load_network
-from thermogrip.sysid.models.network_equations import PELTIER
+from thermogrip.sysid.models.network import PELTIER, NetworkModel, _kernel, load_network
 from thermogrip.sysid.models.network_spec import builtin_networks, network_from_dict, read_network
 
 KELVIN = 273.15

@@ -19,8 +19,7 @@ from thermogrip.datasets.schema import Log, make_log
 from thermogrip.sysid.greybox.fit import fit_network, free_runs
 from thermogrip.sysid.greybox.posterior import with_draws
 from thermogrip.sysid.greybox.problem import prior_plant
-from thermogrip.sysid.models.user_class import load_object
-from thermogrip.sysid.models.user_model import OwnModel, _settle, own_model
+from thermogrip.sysid.models.user_model import OwnModel, _settle, load_object, own_model
 from thermogrip.sysid.plant.plant import Plant
 
 PARAMETERS = {

@@ -12,7 +12,7 @@ from scipy.linalg import expm
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.blackbox.sindy import SindyModel
-from thermogrip.sysid.export import libraries
+from thermogrip.sysid.export import linearise as libraries
 from thermogrip.sysid.export.fmu import Core
 from thermogrip.sysid.export.linearise import linearise_plant
 from thermogrip.sysid.greybox.problem import prior_plant
