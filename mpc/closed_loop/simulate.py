@@ -266,6 +266,13 @@ def record_loop(
     y = np.stack(truth.y)
     fine = np.asarray(model.dt * np.arange(y.shape[0]), dtype=np.float64)
     drives = np.array([move.drives(model.drives) for move in moves])
+    scaled, full = drive_shares(drives, model.lowest, model.highest)
+    segments = []
+    for first, last in zip([0, *stops[:-1]], stops):
+        rows, part = slice(first * truth.sub, last * truth.sub + 1), slice(first, last)
+        for i, name in ((model.outputs.index(name), name) for name in controlled):
+            goal = targets[first][name]
+            segments.append(segment_of(name, fine[rows], y[rows, i], goal, scaled[part], full[part], band))
     return ClosedLoop(
         time=fine,
         outputs={name: y[:, i] for i, name in enumerate(model.outputs)},
@@ -280,29 +287,8 @@ def record_loop(
         seconds=np.array([move.seconds for move in moves]),
         band=band,
         drive_range={n: (float(a), float(b)) for n, a, b in zip(model.drives, model.lowest, model.highest)},
-        segments=_segments(truth, controlled, targets, drives, stops, band),
+        segments=tuple(segments),
     )
-
-
-def _segments(
-    truth: Truth,
-    controlled: tuple[str, ...],
-    targets: list[dict[str, float]],
-    drives: Array,
-    stops: list[int],
-    band: float,
-) -> tuple[Segment, ...]:
-    """Return a segment for each stop and controlled output; arguments as of :func:`record_loop`."""
-    model, y = truth.model, np.stack(truth.y)
-    time = np.asarray(model.dt * np.arange(y.shape[0]), dtype=np.float64)
-    scaled, full = drive_shares(drives, model.lowest, model.highest)
-    found = []
-    for first, last in zip([0, *stops[:-1]], stops):
-        rows, part = slice(first * truth.sub, last * truth.sub + 1), slice(first, last)
-        for name in controlled:
-            values, goal = y[rows, model.outputs.index(name)], targets[first][name]
-            found.append(segment_of(name, time[rows], values, goal, scaled[part], full[part], band))
-    return tuple(found)
 
 
 def drive_shares(drives: Array, lowest: Array, highest: Array) -> tuple[Array, Mask]:

@@ -181,32 +181,19 @@ class GreyModel(Model, Protocol):
     global search [s], which may be coarser.
     """
 
-    @property
-    def name(self) -> str: ...
-    @property
-    def dt(self) -> float: ...
-    @property
-    def specs(self) -> Mapping[str, Parameter]: ...
-    @property
-    def units(self) -> dict[str, str]: ...
-    @property
-    def states(self) -> tuple[str, ...]: ...
-    @property
-    def sensor_sd(self) -> dict[str, float]: ...
-    @property
-    def drift(self) -> dict[str, tuple[float, float]]: ...
-    @property
-    def nuisance(self) -> dict[str, float]: ...
-    @property
-    def reference(self) -> str | None: ...
-    @property
-    def average(self) -> float: ...
-    @property
-    def independent(self) -> float: ...
-    @property
-    def warmup(self) -> float: ...
-    @property
-    def search_step(self) -> float: ...
+    name: str
+    dt: float
+    specs: dict[str, Parameter]
+    units: dict[str, str]
+    states: tuple[str, ...]
+    sensor_sd: dict[str, float]
+    drift: dict[str, tuple[float, float]]
+    nuisance: dict[str, float]
+    reference: str | None
+    average: float
+    independent: float
+    warmup: float
+    search_step: float
 
     def prepared(self, logs: Sequence[Log], p: Array | None = None, *, free_runs: FreeRuns) -> GreyModel:
         """Return the model made ready for these logs, its step short enough at p (at the prior where absent).

@@ -470,10 +470,8 @@ class OwnModel(Described):
     compiled: bool = True  # False leaves all rollouts to NumPy
 
     kind = "own"
-    reference = None  # no output defines a scale: a log that starts at rest is not recognised as such
     smooth = 0.0  # nothing says that its disturbances are of heat
     command_steps: ClassVar[dict[str, float]] = {}
-    drift: ClassVar[dict[str, tuple[float, float]]] = {}
 
     def __post_init__(self) -> None:
         code = self.code
@@ -483,6 +481,9 @@ class OwnModel(Described):
         self.sensor_sd = {name: item.sd or found.get(name, 1.0) for name, item in code.outputs.items()}
         self.average, self.warmup = code.average or 5 * self.dt, code.warmup or 50 * self.dt
         self.independent, self.search_step = 4 * self.average, self.dt
+        self.drift: dict[str, tuple[float, float]] = {}
+        # no output defines a scale: a log that starts at rest is not recognised as such
+        self.reference: str | None = None
         self.spread = np.diag(np.square(list(code.states.values())))
         self.limits = np.array([code.limits.get(name, (-np.inf, np.inf)) for name in code.states])
 

@@ -37,7 +37,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -50,7 +50,10 @@ from thermogrip.datasets.schema import Log, column, columns, log_name
 from thermogrip.datasets.schema import names as names_of
 
 if TYPE_CHECKING:
+    from thermogrip.sysid.models.model import GreyModel
     from thermogrip.sysid.plant.plant_data import PlantData
+
+    Signals: TypeAlias = PlantData | GreyModel
 
 GAP = 10.0  # [s], beyond it the input is unknown
 BRIDGED = 5  # rows
@@ -482,19 +485,6 @@ def _first_order_times(part: Segment, step: float) -> list[float]:
 #: What full scale reads in the units of a share of it.
 SHARES = {"1": 1.0, "percent": 100.0, "0_255": 255.0}
 _SLACK = 1e-9  # beyond 1, by rounding
-
-
-class Signals(Protocol):
-    """What is asked of a plant or of a model here."""
-
-    @property
-    def inputs(self) -> tuple[str, ...]: ...
-    @property
-    def disturbances(self) -> tuple[str, ...]: ...
-    @property
-    def outputs(self) -> tuple[str, ...]: ...
-    @property
-    def units(self) -> Mapping[str, str]: ...
 
 
 def roles_of(model: Signals) -> dict[str, str]:
