@@ -47,8 +47,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, Grasps, Log, make_grasps
 from thermogrip.mpc.interface import Controller, Move, Target
@@ -58,8 +59,6 @@ from thermogrip.rig.interface import Event, Rig
 from thermogrip.rig.session.loop import PHASES, Loop, Recorder
 from thermogrip.rig.session.signals import stop_signals
 from thermogrip.sysid.effusivity.quality import find_contact
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

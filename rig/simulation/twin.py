@@ -30,16 +30,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.guard.sensor_checks import room_disturbances
 from thermogrip.rig.interface import UNIT_RANGES, Event, Reading, check_order
 from thermogrip.sysid.contact.simulation import ContactModel, Touch
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.plant.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 @dataclass

@@ -72,7 +72,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import erfcx, rgamma
 
-Array = NDArray[np.float64]
+from thermogrip.datasets.arrays import Array
+
 Complex = NDArray[np.complex128]
 Impedance = Callable[[Complex], Complex]
 

@@ -40,10 +40,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.linalg import eigh
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import Grasps, make_grasps
-
-Array = NDArray[np.float64]
 
 LAYER_NAMES = ("e_outer", "z_outer", "e_inner", "z_inner", "g_back", "g_side", "c_side")  # what shapes modes
 

@@ -56,7 +56,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from thermogrip.datasets.arrays import Array, Mask
 
 # sums over modes may be reordered, so that they run in vector registers; infinities stay what they are
 _FAST = {"reassoc", "contract", "arcp", "nsz"}
@@ -632,7 +632,7 @@ def _means(
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def fill_responses(
-    nodes: Nodes, gripper: Gripper, u: Array, vary: NDArray[np.bool_], times: Array,
+    nodes: Nodes, gripper: Gripper, u: Array, vary: Mask, times: Array,
     bins: NDArray[np.int64], count: Array, room: Room, place: NDArray[np.int64], share: Array, out: Array,
 ) -> None:  # fmt: skip
     """Fill bin means of F, of its derivatives by ln h, ln tau_b, ln e, ln C, and of its slope, (6, n_bin).

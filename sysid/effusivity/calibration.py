@@ -31,8 +31,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.materials import Material, find_material
+from thermogrip.datasets.parallel import Progress
 from thermogrip.datasets.schema import Grasps, log_name
 from thermogrip.sysid.contact.simulation import TimeNodes
 from thermogrip.sysid.effusivity.data import Noise, Touches, noise_fit, stack_touches, touches, whiten
@@ -62,8 +64,6 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     nodes_for,
     predict,
 )
-
-Array = NDArray[np.float64]
 
 # of SHARED_NAMES: prior mean and sd; all wide, in the units of the name
 _WIDE: dict[str, tuple[float, float]] = {
@@ -201,16 +201,16 @@ class Problem:
     ln_capacity: Array  # (n_label,), of rho c_p times the block's length
 
     @property
-    def known(self) -> NDArray[np.bool_]:
+    def known(self) -> Mask:
         """Return where the object's temperature was known, (n,)."""
         return np.isfinite(self.data.t_object)
 
     @property
-    def insulating(self) -> NDArray[np.bool_]:
+    def insulating(self) -> Mask:
         """Return which grasps are of insulators, (n,)."""
         return np.array([m.effusivity < INSULATOR for m in self.library])[self.which]
 
-    def rows(self, spread: str) -> NDArray[np.bool_]:
+    def rows(self, spread: str) -> Mask:
         """Return which grasps inform a spread, (n,)."""
         everywhere = np.ones(self.which.size, dtype=bool)
         return {"t_object": self.known, "ln_effusivity": self.insulating}.get(spread, everywhere)
@@ -375,8 +375,6 @@ def _objective(problem: Problem, theta: Array, w: Array, spread: Spread, whitene
     residual = np.einsum("nij,nj->ni", whitener, problem.data.y - y)
     return float((residual**2).sum() + (w**2).sum()) + problem.prior.penalty(theta)
 
-
-Progress = Callable[[float, str], None]
 
 _ROUNDS = 3  # of fit and noise
 _STEPS = 40

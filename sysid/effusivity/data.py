@@ -24,13 +24,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtri
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, check_grasps, label_values, log_name
 from thermogrip.sysid.contact.simulation import PUMP_OFF
 from thermogrip.sysid.effusivity.quality import check_grasps as check_quality
 from thermogrip.sysid.effusivity.quality import number_values
-
-Array = NDArray[np.float64]
 
 UNKNOWN_OBJECT_RANGE = 20.0  # K about the room, or the gripper where no room is stated
 _EDGES = np.concatenate(

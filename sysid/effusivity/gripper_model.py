@@ -31,16 +31,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import number_within
 from thermogrip.datasets.materials import load_materials
 from thermogrip.sysid.contact.simulation import Grip, Stack
 from thermogrip.sysid.effusivity.data import UNKNOWN_OBJECT_RANGE, Noise
-
-Array = NDArray[np.float64]
 
 # theta but for the blocks, in the order of the calibration
 SHARED_NAMES = (

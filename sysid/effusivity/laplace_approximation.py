@@ -63,6 +63,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs, dtrtrs
 from scipy.special import gammaln
 
+from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.materials import Material, find_material
 from thermogrip.sysid.contact.simulation import (
@@ -85,8 +86,6 @@ from thermogrip.sysid.effusivity.gripper_model import (
     stack_numbers,
     stack_of,
 )
-
-Array = NDArray[np.float64]
 
 H, BUILD_UP, ONSET, LEVEL, T_OBJECT, EFFUSIVITY, CAPACITY = range(7)
 N_NUISANCE = 7
@@ -111,7 +110,7 @@ class Mode(NamedTuple):
     u: Array  # (n, 7)
     covariance: Array  # (n, 7, 7), of u
     log_evidence: Array  # (n,)
-    converged: NDArray[np.bool_]  # (n,)
+    converged: Mask  # (n,)
     misfit: Array  # (n,), |W (y - f)|^2
 
 
@@ -125,9 +124,7 @@ def predict(stack: Stack, nodes: TimeNodes, data: Touches, u: Array) -> Array:
     return jacobian(stack, nodes, data, u, np.zeros(u.shape, dtype=bool))[0]
 
 
-def jacobian(
-    stack: Stack, nodes: TimeNodes, data: Touches, u: Array, vary: NDArray[np.bool_]
-) -> tuple[Array, Array]:
+def jacobian(stack: Stack, nodes: TimeNodes, data: Touches, u: Array, vary: Mask) -> tuple[Array, Array]:
     """Return the prediction (n_pair, n_bin) and its derivatives by u, (n_pair, n_bin, 7), zero where not
     ``vary`` (n_pair, 7), the unknown nuisances."""
     from thermogrip.sysid.effusivity.mode_kernel import readings
@@ -167,7 +164,7 @@ def find_modes(
     return Mode(u, covariance, evidence, settled > 0, misfit)
 
 
-def peak_ratio(dof: Array, vary: NDArray[np.bool_]) -> Array:
+def peak_ratio(dof: Array, vary: Mask) -> Array:
     """Return the log of Student's peak density over the normal one of the same scale, summed, (n_pair,)."""
     heavy = vary & np.isfinite(dof)
     nu = np.where(heavy, dof, 1.0)

@@ -15,6 +15,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.sysid.contact.time_stepping import (
     BY_BUILD_UP,
     BY_C,
@@ -34,8 +35,6 @@ from thermogrip.sysid.contact.time_stepping import (
     gripper_of,
     room_for,
 )
-
-Array = NDArray[np.float64]
 
 _LONGEST = 1.5
 _LEAST_DECREASE = 0.01  # of -2 ln posterior: smaller predicted decreases end the search
@@ -127,7 +126,7 @@ def _dot(a: Array, b: Array) -> Any:
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def _predict(
-    nodes: Nodes, gripper: Gripper, u: Array, vary: NDArray[np.bool_], times: Array, bins: NDArray[np.int64],
+    nodes: Nodes, gripper: Gripper, u: Array, vary: Mask, times: Array, bins: NDArray[np.int64],
     count: Array, t: Array, ramp: Array, room: float, scratch: _Scratch,
 ) -> None:  # fmt: skip
     """Fill the bin means that ``u`` predicts, their derivatives by level and T_obj, and those of ``vary``."""
@@ -240,7 +239,7 @@ def _solve(low: Array, rhs: Array, step: Array) -> None:
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def _evaluate(
-    nodes: Nodes, gripper: Gripper, u: Array, law: Array, vary: NDArray[np.bool_], times: Array,
+    nodes: Nodes, gripper: Gripper, u: Array, law: Array, vary: Mask, times: Array,
     bins: NDArray[np.int64], count: Array, t: Array, y: Array, ramp: Array, room: float, whitener: Array,
     scratch: _Scratch, at: _Expansion,
 ) -> None:  # fmt: skip
@@ -366,7 +365,7 @@ def marginals(
 @numba.njit(**OUTER)  # type: ignore[untyped-decorator]
 def readings(
     nodes: Nodes, gripper: Gripper, times: Array, bins: NDArray[np.int64], count: Array, t: Array,
-    ramp: Array, room: Array, u: Array, vary: NDArray[np.bool_],
+    ramp: Array, room: Array, u: Array, vary: Mask,
 ) -> tuple[Array, Array]:  # fmt: skip
     """Return the bin means (n, n_bin) that ``u`` (n, 7) predicts of n touches, and their derivatives.
 

@@ -56,6 +56,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import number_within
@@ -86,8 +87,6 @@ from thermogrip.sysid.effusivity.posterior_grid import (
     refined,
 )
 from thermogrip.sysid.effusivity.quality import number_values
-
-Array = NDArray[np.float64]
 
 _SCHEMA, _VERSION = "thermogrip.coupling", 1
 _RANGES = {  # of the numbers of a file
@@ -319,7 +318,7 @@ def touch_groups(grasps: Grasps) -> dict[str, Rows]:
     return {name: at[np.argsort(order[at], kind="stable")] for name, at in rows.items()}
 
 
-def rested_long(grasps: Grasps, coupling: Coupling | None = None) -> NDArray[np.bool_]:
+def rested_long(grasps: Grasps, coupling: Coupling | None = None) -> Mask:
     """Return which grasps are of blocks that rested much longer than the coupling was learnt from, (n,).
 
     From rests of one length it learns what becomes of a block in that time, and not the law: wood's face is

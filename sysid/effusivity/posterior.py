@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import expit, logit, logsumexp
 
+from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.materials import Material
 from thermogrip.datasets.schema import Grasps, has_touch_groups
@@ -24,8 +24,6 @@ from thermogrip.sysid.effusivity.gripper_model import INSULATOR, GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import T_OBJECT, H, fit_candidates
 from thermogrip.sysid.effusivity.multi_touch import Coupling, free_touch_fit, touch_groups
 from thermogrip.sysid.effusivity.posterior_grid import GridPosterior, grid_posteriors, mixture_quantiles
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,7 @@ class MaterialFit:
     prior_t_object: Array  # its prior mean, which a caller may replace (two touches of one block) [degC]
     prior_t_object_sd: Array  # [K]
     h_c: Array  # [W m^-2 K^-1]
-    converged: NDArray[np.bool_]
+    converged: Mask
     u: Array  # (n_grasp, n_candidate, 7), the modes of the nuisances
 
 

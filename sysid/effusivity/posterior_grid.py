@@ -27,10 +27,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.special import gammaln, logsumexp, ndtr
 
+from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.sysid.effusivity.data import Touches, whiten
 from thermogrip.sysid.effusivity.gripper_model import GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import (
@@ -47,8 +47,6 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     nodes_for,
     prior_of,
 )
-
-Array = NDArray[np.float64]
 
 # On the gripper's scale.  Of solids at room temperature plastic foams have least (expanded polystyrene, 32),
 # diamond most (6.3e4, of one isotope 7.7e4); that far from its blocks a calibration's scale is known to 0.30
@@ -158,7 +156,7 @@ class _Fitted(NamedTuple):
     value: Array
     u: Array
     covariance: Array
-    settled: NDArray[np.bool_]
+    settled: Mask
 
 
 def grid_posteriors(gripper: GripperModel, data: Touches) -> list[GridPosterior]:
@@ -229,7 +227,7 @@ def mixture_quantiles(weight: Array, mean: Array, sd: Array, levels: tuple[float
 
 
 def _evaluate(
-    gripper: GripperModel, data: Touches, noise: tuple[Array, Array], grid: Array, wanted: NDArray[np.bool_],
+    gripper: GripperModel, data: Touches, noise: tuple[Array, Array], grid: Array, wanted: Mask,
     start: Array | None, steps: int,
 ) -> _Fitted:  # fmt: skip
     """Return the fits at the ``wanted`` points of a grid (n, m), zeros elsewhere."""

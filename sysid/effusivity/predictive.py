@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import logsumexp
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.materials import Material
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.contact.simulation import PUMP_OFF
@@ -43,8 +44,6 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     nodes_for,
 )
 from thermogrip.sysid.effusivity.multi_touch import SHARED, Coupling, next_touch_prior
-
-Array = NDArray[np.float64]
 
 _STEP = 0.5  # s: readings to come are taken as means over this
 _REGULATION = 0.35  # K: how far from its set point a gripper is at contact

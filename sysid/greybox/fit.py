@@ -41,8 +41,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
+from thermogrip.datasets.parallel import Progress
 from thermogrip.datasets.schema import Log, column, log_name
 from thermogrip.sysid.data.data_quality import reading_excess
 from thermogrip.sysid.greybox.identifiability import describe
@@ -61,8 +62,6 @@ from thermogrip.sysid.plant.fit_record import (
 from thermogrip.sysid.plant.log_grid import cut_stretches, match_logs
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import find_starts, predict
-
-Array = NDArray[np.float64]
 
 _DAMPINGS = np.array([1e-2, 0.1, 1.0, 10.0, 100.0])  # times the damping that last succeeded
 _PROBE = 0.1  # of the step, for the second derivative along it
@@ -159,8 +158,6 @@ def _bounded(r: Array) -> Array:
     """Replace what is not finite by a huge residual, so that it never wins and never overflows."""
     return np.asarray(np.clip(np.nan_to_num(r, nan=_HUGE, posinf=_HUGE, neginf=-_HUGE), -_HUGE, _HUGE))
 
-
-Progress = Callable[[float, str], None]
 
 _STUCK = 5.0  # rms residual in sensor sd from which the end of the local fit is not accepted
 _COARSE = 6  # times the usual bins, for the global search

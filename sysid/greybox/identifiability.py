@@ -19,13 +19,11 @@ from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.plant.fit_record import Identifiability
 from thermogrip.sysid.plant.plant import Plant
-
-Array = NDArray[np.float64]
 
 _EXACT = 1e-11  # eigenvalue of the scaled Hessian below which a direction changes no output
 _FLAT = 1e-4  # eigenvalue of the scaled Hessian below which a direction is hardly identifiable

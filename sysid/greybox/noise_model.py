@@ -41,9 +41,8 @@ from numpy.typing import NDArray
 from scipy.fft import dct, irfft, rfft
 from scipy.optimize import minimize
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.sysid.plant.fit_record import ErrorNumbers
-
-Array = NDArray[np.float64]
 
 N_SLOW = 2
 _SINGLE, _GROWTH = 12, 1.2  # bands of one frequency, then wider and wider

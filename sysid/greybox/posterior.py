@@ -70,6 +70,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import atomic_path
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, columns, log_name
@@ -80,8 +81,6 @@ from thermogrip.sysid.models.model import GreyModel
 from thermogrip.sysid.plant.fit_record import Sampling
 from thermogrip.sysid.plant.log_grid import match_logs
 from thermogrip.sysid.plant.plant import Plant
-
-Array = NDArray[np.float64]
 
 _STEP = 1e-4  # of z, for differences
 _TOGETHER = 12  # draws whose slopes are taken at once: the runs of more do not fit a cache

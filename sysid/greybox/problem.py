@@ -34,10 +34,10 @@ from dataclasses import dataclass, field, replace
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.signal import lfilter
 
+from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, log_name
 from thermogrip.sysid.models.model import GreyModel
@@ -45,8 +45,6 @@ from thermogrip.sysid.models.network_spec import Parameter
 from thermogrip.sysid.plant.log_grid import Stretch, cut_stretches, sample_time
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import Start, find_starts, predict
-
-Array = NDArray[np.float64]
 
 _WARM_ROWS = 30  # of a log, from whose readings its start is estimated at least
 
@@ -216,7 +214,7 @@ class Problem:
         return [specs[i] for i in self.free]
 
     @property
-    def _log(self) -> NDArray[np.bool_]:
+    def _log(self) -> Mask:
         return np.array([spec.sd_log is not None for spec in self._free_specs], dtype=bool)
 
     @property

@@ -46,12 +46,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.sysid.greybox.noise_model import Block, ErrorModel, LogData
 from thermogrip.sysid.greybox.problem import Problem
 from thermogrip.sysid.models.model import Model
 from thermogrip.sysid.plant.simulation import READING_EVERY, Start, predict
 
-Array = NDArray[np.float64]
 Parts = list[list[list[Array]]]  # by log, stretch and output
 
 _LAGS = (2.0, 8.0, 32.0)  # [bins]

@@ -50,16 +50,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import digamma, ndtri, polygamma, stdtrit
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.greybox.noise_model import ErrorModel, LogData, information, learn_error_model
 from thermogrip.sysid.greybox.problem import Problem
 from thermogrip.sysid.greybox.random_effects import Linearised, Response, WarmUp, linearise_logs
-
-Array = NDArray[np.float64]
 
 _TERM_SD, _EFFECT_SD = 1.5, 0.7  # prior sd of ln s: of a response, of a random effect
 _ENOUGH = 4  # parameters, to estimate how far their factors differ

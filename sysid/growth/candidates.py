@@ -31,14 +31,13 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, columns, log_name
 from thermogrip.sysid.models.lti import evaluate_terms
 from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.models.network_spec import Network, network_from_dict, roles
 from thermogrip.sysid.plant.plant import Plant
-
-Array = NDArray[np.float64]
 
 LEAST = 0.02  # of the residual's variance on held-out rows
 ROWS = 400  # of the longest log: a residual is slow

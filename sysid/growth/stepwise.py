@@ -28,13 +28,14 @@ and the best of many comparisons is biased: :attr:`Growth.evaluations` is their 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.parallel import Progress
 from thermogrip.datasets.resample import cut
 from thermogrip.datasets.schema import Log, column, log_name
 from thermogrip.sysid.greybox.fit import fit_network
@@ -49,9 +50,6 @@ from thermogrip.sysid.growth.candidates import (
 from thermogrip.sysid.models.network import NetworkModel, load_network
 from thermogrip.sysid.plant.fit_record import Identifiability
 from thermogrip.sysid.plant.plant import Plant
-
-Array = NDArray[np.float64]
-Progress = Callable[[float, str], None]
 
 _LEAST = 0.01  # a gain of 1 % is not worth a parameter
 _WORST = 1e7  # condition of the scaled Hessian

@@ -27,8 +27,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.resample import average as average_log
 from thermogrip.datasets.resample import gaps
@@ -48,8 +48,6 @@ from thermogrip.sysid.validation.residual_tests import (
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation.prediction_bands import Band
-
-Array = NDArray[np.float64]
 
 EXCEEDS = 2.0  # times the error of the fit, from which that is reported
 START = 0.1  # share of the squared error due to the start, from which that is reported

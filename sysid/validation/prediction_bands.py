@@ -63,9 +63,9 @@ from statistics import NormalDist
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, column, log_name
 from thermogrip.sysid.models.neural import NeuralModel
@@ -76,8 +76,6 @@ from thermogrip.sysid.plant.simulation import find_starts
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
-
-Array = NDArray[np.float64]
 
 SHORT = 0.1  # of the level: a part on which the expected coverage falls short by more is reported
 

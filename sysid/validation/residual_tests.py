@@ -66,6 +66,7 @@ from scipy.optimize import minimize
 from scipy.signal import lfilter
 from scipy.special import chdtrc
 
+from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.schema import Log, columns
 from thermogrip.sysid.greybox.noise_model import Block, band_weights
 from thermogrip.sysid.plant.log_grid import Stretch, at_rows, cut_stretches
@@ -73,8 +74,6 @@ from thermogrip.sysid.plant.simulation import Start, find_starts
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,7 +296,7 @@ class _Blocks:
         """Return means (n, q) of values (rows, q) that are known at every row."""
         return self._means(values, (self._cell >= 0) & (self._cell < self.n))
 
-    def _means(self, values: Array, known: NDArray[np.bool_]) -> Array:
+    def _means(self, values: Array, known: Mask) -> Array:
         place, where, count = np.unique(self._cell[known], return_inverse=True, return_counts=True)
         at, out = np.arange(self.n), np.empty((self.n, values.shape[1]))
         for k, column in enumerate(values[known].T):

@@ -17,8 +17,8 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import panels
 from thermogrip.datasets.schema import Grasps, Log, column, log_name, names
@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from thermogrip.sysid.greybox import Posterior
     from thermogrip.sysid.identification import Row
     from thermogrip.sysid.validation import Band, FreeRun
-
-Array = NDArray[np.float64]
 
 MEASURED, MODEL, TARGET = "#9aa7b5", "#1f5fa8", "#1d2733"
 # after Okabe and Ito: eight colours that are distinct under every kind of colour-vision deficiency
