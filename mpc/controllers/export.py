@@ -47,7 +47,7 @@ from thermogrip.mpc.optimiser.active_set import ActiveSetQP
 if TYPE_CHECKING:
     from thermogrip.mpc.design.design import Design
 
-_COPIED = (*SOURCES, "Makefile", "example.c", "check.c")
+_COPIED = (*SOURCES, "tg_design.h", "Makefile", "example.c", "check.c")
 # of a drive's range; where dozens of soft rows are broken, a plan is a small difference of large multipliers,
 # and C as well as Python is up to 1e-10 off the exact one
 _TOLERANCE = 1e-9
@@ -98,35 +98,15 @@ def export_controller(controller: Controller, folder: str | Path) -> Export:
         "tg_config.h": config_header(sizes),
         "tg_model.h": model_header(code, "tg_model"),
         "tg_model.c": model_source(code, "tg_model"),
-        "tg_design.h": _DESIGN_HEADER,
-        "tg_design.c": _DESIGN_SOURCE.format(initialiser(sizes, numbers)),
+        "tg_design.c": '#include "tg_design.h"\n\nconst tg_design tg_the_design = {\n'
+        + initialiser(sizes, numbers)
+        + "\n};\n",
     }
     ram, constants = bytes_of(sizes)
     files["README.md"] = _readme(controller, sizes, ram, constants)
     for name, content in files.items():
         write_atomic(folder / name, content)
     return Export(folder, tuple(sorted(files)), ram, constants)
-
-
-_DESIGN_HEADER = """/* The numbers of this controller. */
-#ifndef TG_DESIGN_H
-#define TG_DESIGN_H
-
-#include "tg_controller.h"
-
-#ifdef __cplusplus
-extern "C" {
-#endif
-
-extern const tg_design tg_the_design;
-
-#ifdef __cplusplus
-}
-#endif
-
-#endif
-"""
-_DESIGN_SOURCE = '#include "tg_design.h"\n\nconst tg_design tg_the_design = {{\n{}\n}};\n'
 
 
 def check_export(

@@ -22,6 +22,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from importlib import resources
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement
@@ -150,44 +151,6 @@ def core_of(path: Path) -> Any:
     return Core(Plant.from_dict(json.loads(path.read_text(encoding="utf-8"))))
 
 
-# its own names begin with an underscore, so that no name of a plant can hide one of them
-_SCRIPT = '''"""The plant {name}, by thermogrip; it needs thermogrip in the Python that runs it."""
-
-from pathlib import Path as _Path
-
-import pythonfmu as _fmi
-from thermogrip.sysid.export.fmu import core_of as _core_of
-from thermogrip.sysid.export.fmu import described as _described
-
-
-class {name}(_fmi.Fmi2Slave):
-    description = "{name}: a plant identified by thermogrip"
-
-    def __init__(self, **kwargs):
-        super().__init__(**kwargs)
-        self.core = _core_of(_Path(__file__).parent / "{name}.json")
-        self.default_experiment = _fmi.DefaultExperiment(start_time=0.0, step_size=self.core.plant.dt)
-        for port in self.core.ports:
-            self.register_variable(self._real(port), nested=False)
-
-    def _real(self, port):
-        name, core = port.name, self.core
-        kind = dict(causality=_fmi.Fmi2Causality[port.causality])
-        kind["variability"] = _fmi.Fmi2Variability[port.variability]
-        setter = None if port.causality == "output" else lambda value: core.set(name, value)
-        return _fmi.Real(name, getter=lambda: core.get(name), setter=setter, **kind)
-
-    def to_xml(self, *args, **kwargs):
-        return _described(super().to_xml(*args, **kwargs), self.core.ports)
-
-    def exit_initialization_mode(self):
-        self.core.begin()
-
-    def do_step(self, current_time, step_size):
-        return self.core.advance(step_size)
-'''
-
-
 def to_fmu(plant: Plant, path: str | Path) -> Path:
     """Write the plant as an FMU (FMI 2.0, co-simulation) and return the path.
 
@@ -227,7 +190,9 @@ def to_fmu(plant: Plant, path: str | Path) -> Path:
     with tempfile.TemporaryDirectory() as folder, atomic_path(target) as temporary:
         module = f"thermogrip_slave_{name}"
         script, beside = Path(folder) / f"{module}.py", Path(folder) / f"{name}.json"
-        script.write_text(_SCRIPT.format(name=name), encoding="utf-8")
+        # names in it begin with an underscore, so that no name of a plant can hide one of them
+        text = (resources.files("thermogrip.sysid.export") / "slave.py.in").read_text(encoding="utf-8")
+        script.write_text(text.format(name=name), encoding="utf-8")
         beside.write_text(json.dumps(replace(plant, samples=None).to_dict()), encoding="utf-8")
         path_before = list(sys.path)
         sys.modules.pop(module, None)  # the builder imports the script by its name
