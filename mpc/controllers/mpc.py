@@ -111,15 +111,7 @@ class Controller(SampledController):
         self.c: CompiledController | None = None
         if compiled:
             self._compile()
-        self.pi = PIController(
-            plant,
-            dt=design.dt,
-            loops=tuple(replace(loop, feedforward=0.0) for loop in design.loops),
-            controlled=design.controlled,
-            drive_range=design.drive_range,
-            slew_per_s=design.slew_per_s,
-            patience_s=design.patience_s,
-        )
+        self.pi = PIController.of(plant, design, tuple(replace(p, feedforward=0.0) for p in design.loops))
         self.monitor = ReadingMonitor(self.model.n_y)
         self.reach = Reach(self.optimiser, self.observer)
         self.last_iterations = 0  # of the program, in the last step

@@ -24,7 +24,7 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.controllers.base import SampledController
-from thermogrip.mpc.design.design import PILoop, default_controlled, pair_loops
+from thermogrip.mpc.design.design import Design, PILoop, default_controlled, pair_loops
 from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.mpc.plant.prediction import ROOM, PredictionModel, holding_drive, prediction_model
 
@@ -96,6 +96,19 @@ class PIController(SampledController):
         self._ends = [(model.drives.index(p.drive), self.controlled.index(p.output)) for p in self.loops]
         self._I = np.zeros(len(self.loops))
         self._room = np.full(model.n_d, np.nan)
+
+    @classmethod
+    def of(cls, plant: Plant, design: Design, loops: tuple[PILoop, ...]) -> PIController:
+        """Return PI loops under the limits of a design."""
+        return cls(
+            plant,
+            dt=design.dt,
+            loops=loops,
+            controlled=design.controlled,
+            drive_range=design.drive_range,
+            slew_per_s=design.slew_per_s,
+            patience_s=design.patience_s,
+        )
 
     def reset(self, reading: Readings) -> None:
         """Forget the past; the plant is at rest at this reading."""

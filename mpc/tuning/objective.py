@@ -279,7 +279,8 @@ class Search:
     ) -> Trial:
         """Return the trial of an ``"MPC"``, ``"PI"`` or ``"LQR"``; ``lengths`` are seconds by step."""
         if name == "PI":
-            controller: Regulator = self._pi(scaled_loops(self.baseline.loops, parameters))
+            loops = scaled_loops(self.baseline.loops, parameters)
+            controller: Regulator = PIController.of(self.plant, self.baseline, loops)
         else:
             controller = self.made(name, self.design(parameters))
         if lengths is None:
@@ -299,19 +300,6 @@ class Search:
         name, parameters = item
         return self.evaluate(parameters, name, [self.spec.hold_s] * len(self.spec.steps))
 
-    def _pi(self, loops: tuple[PILoop, ...]) -> PIController:
-        """Return a PI controller under the baseline's limits."""
-        base = self.baseline
-        return PIController(
-            self.plant,
-            dt=base.dt,
-            loops=loops,
-            controlled=base.controlled,
-            drive_range=base.drive_range,
-            slew_per_s=base.slew_per_s,
-            patience_s=base.patience_s,
-        )
-
     def check(self, item: tuple[str, Design, int]) -> list[StepResult]:
         """Return the results of a controller on one draw, at full length."""
         name, design, draw = item
@@ -323,7 +311,7 @@ class Search:
         Filter and optimiser are in C where there is a compiler.
         """
         if name == "PI":
-            return self._pi(design.loops)
+            return PIController.of(self.plant, self.baseline, design.loops)
         controller = self._controller(design)
         if name == "LQR":
             return LQRController(self.plant, design, observer=controller.observer)
