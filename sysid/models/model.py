@@ -169,31 +169,21 @@ def load_model(content: Mapping[str, Any], *, code: Model | None = None) -> Mode
 
 @runtime_checkable
 class GreyModel(Model, Protocol):
-    """Equations with priors.
+    """Equations with priors."""
 
-    ``name`` is what tables call it; ``dt`` the step of the simulation [s]; ``specs`` unit, prior and bounds
-    of each parameter; ``units`` those of signals and parameters; ``sensor_sd`` the sd of the mean over a bin
-    about the model, by output; ``drift`` sd and correlation time [s] of the slow error, of the outputs that
-    have one; ``nuisance`` how far each output and disturbance is off, from log to log; ``reference`` the
-    output that has no offset of its own, if one does not; ``average`` the length of the bins of a fit [s],
-    where none is asked for; ``independent`` the seconds per independent residual, until that is measured;
-    ``warmup`` the seconds of a log from which a fit may estimate how it starts; ``search_step`` the step of a
-    global search [s], which may be coarser.
-    """
-
-    name: str
-    dt: float
-    specs: dict[str, Parameter]
-    units: dict[str, str]
+    name: str  # what tables call it
+    dt: float  # step of the simulation [s]
+    specs: dict[str, Parameter]  # unit, prior and bounds of each parameter
+    units: dict[str, str]  # of signals and parameters
     states: tuple[str, ...]
-    sensor_sd: dict[str, float]
-    drift: dict[str, tuple[float, float]]
-    nuisance: dict[str, float]
-    reference: str | None
-    average: float
-    independent: float
-    warmup: float
-    search_step: float
+    sensor_sd: dict[str, float]  # of the mean over a bin about the model, by output
+    drift: dict[str, tuple[float, float]]  # sd and correlation time [s] of the slow error, by output
+    nuisance: dict[str, float]  # how far each output and disturbance is off, from log to log
+    reference: str | None  # the output that has no offset of its own, if one does not
+    average: float  # length of the bins of a fit [s], where none is asked for
+    independent: float  # seconds per independent residual, until that is measured
+    warmup: float  # seconds of a log from which a fit may estimate how it starts
+    search_step: float  # of a global search [s], which may be coarser
 
     def prepared(self, logs: Sequence[Log], p: Array | None = None, *, free_runs: FreeRuns) -> GreyModel:
         """Return the model made ready for these logs, its step short enough at p (at the prior where absent).
@@ -241,7 +231,7 @@ def roll_rows(
     c, x, kept = steps.prepare(list(p.T)), list(x0.T.copy()), list[Any]()
     u_rows, d_rows = list(u.transpose(1, 2, 0)), list(d.transpose(1, 2, 0))
     with np.errstate(all="ignore"):  # what is not finite is found afterwards
-        seen = steps.read(x, c)
+        seen = [*steps.read(x, c)]
         for t in range(n):
             kept = steps.renew(u_rows[t], c, h) if renew is None or renew[t] else kept
             for _ in range(pieces):
