@@ -41,7 +41,7 @@ from thermogrip.mpc.native.design_struct import (
     numbers_of,
     sizes_of,
 )
-from thermogrip.mpc.native.runtime import SOURCES, c_source, compiler, model_header, model_source
+from thermogrip.mpc.native.runtime import SOURCES, c_source, compiler
 from thermogrip.mpc.optimiser.active_set import ActiveSetQP
 
 if TYPE_CHECKING:
@@ -90,14 +90,12 @@ def export_controller(controller: Controller, folder: str | Path) -> Export:
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     model = controller.model
-    code = write_model(model.model, model.drive_index, model.dt / model.sub, name="tg_model")
+    code = write_model(model.model, model.drive_index, model.dt / model.sub)
     sizes = sizes_of(controller, code.n_k, code.n_m, room=False)
     numbers = numbers_of(controller, np.array(code.constants(model.p.tolist())))
-    files = {name: c_source(name) for name in _COPIED}
+    files = {name: c_source(name) for name in _COPIED} | code.files
     files |= {
         "tg_config.h": config_header(sizes),
-        "tg_model.h": model_header(code, "tg_model"),
-        "tg_model.c": model_source(code, "tg_model"),
         "tg_design.c": '#include "tg_design.h"\n\nconst tg_design tg_the_design = {\n'
         + initialiser(sizes, numbers)
         + "\n};\n",

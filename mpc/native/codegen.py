@@ -68,15 +68,19 @@ _OPERATIONS |= {
         *("asinh", "acosh", "atanh", "floor", "ceil", "erf", "log1p", "expm1"),
     )
 }
+_STATE = "const double *x, const double *u, const double *d, const double *k, double *xn"
+_COLUMNS = (
+    "int n, int w, const double *m, const double *k, const double *restrict sx, const double *restrict su"
+)
 _HEADS = {
-    "prepare": "void {0}_prepare(const double *p, double *k)",
-    "next": "void {0}_next(const double *x, const double *u, const double *d, const double *k, double *xn)",
-    "partials": "void {0}_partials(const double *x, const double *u, const double *d, const double *k,"
-    " double *xn, double *m)",
-    "tangent": "void {0}_tangent(int n, int w, const double *m, const double *k, const double *restrict sx,"
-    " const double *restrict su, double *restrict out)",
-    "tangent_d": "void {0}_tangent_d(int n, int w, const double *m, const double *k,"
-    " const double *restrict sx, const double *restrict su, const double *restrict sd, double *restrict out)",
+    part: f"void tg_model_{part}({arguments})"
+    for part, arguments in {
+        "prepare": "const double *p, double *k",
+        "next": _STATE,
+        "partials": f"{_STATE}, double *m",
+        "tangent": f"{_COLUMNS}, double *restrict out",
+        "tangent_d": f"{_COLUMNS}, const double *restrict sd, double *restrict out",
+    }.items()
 }
 
 
@@ -102,12 +106,19 @@ class _Line:
 class ModelCode:
     """C of one model at one step length."""
 
-    # definitions of ``NAME_prepare``, ``NAME_next``, ``NAME_partials``, ``NAME_tangent``, ``NAME_tangent_d``
-    source: str
+    source: str  # definitions of ``tg_model_prepare`` and the others of the module's text
     header: str  # their declarations
     n_k: int  # length of what ``prepare`` and ``partials`` leave behind
     n_m: int
     line: _Line
+
+    @property
+    def files(self) -> dict[str, str]:
+        """Header, which C++ may include, and source by file name."""
+        begin, end = '#ifdef __cplusplus\nextern "C" {\n#endif\n', "#ifdef __cplusplus\n}\n#endif\n"
+        guarded = f"#ifndef TG_MODEL_H\n#define TG_MODEL_H\n\n{begin}\n{self.header}\n{end}\n#endif\n"
+        source = f'#include "tg_model.h"\n\n#include <math.h>\n\n{self.source}'
+        return {"tg_model.h": guarded, "tg_model.c": source}
 
     def constants(self, p: Sequence[float]) -> list[float]:
         """Return what ``prepare`` leaves behind for parameters p, without a compiler."""
@@ -127,14 +138,12 @@ class ModelCode:
         return [kept[entry] for entry in range(self.n_k)]
 
 
-def write_model(model: Model, drives: Sequence[int], h: float, *, name: str) -> ModelCode:
-    """Return the C of a model's step of length h [s], whose functions' names begin with ``name``; inputs
-    that are no drives are switches, and on.
-    """
+def write_model(model: Model, drives: Sequence[int], h: float) -> ModelCode:
+    """Return the C of a model's step of length h [s]; inputs that are no drives are switches, and on."""
     sparse, tangents = (_straight(_graph(model, drives, h, jacobian=way)) for way in (True, False))
     # a tangent is done for a dozen directions, four side by side; all else once
     line = min(sparse, tangents, key=lambda item: _work(item, 12.0 / 4.0))
-    return _write(line, name)
+    return _write(line)
 
 
 def _graph(model: Model, drives: Sequence[int], h: float, *, jacobian: bool) -> Any:
@@ -217,7 +226,7 @@ def _work(line: _Line, directions: float) -> float:
     return stages.count(2) + directions * stages.count(3)
 
 
-def _write(line: _Line, name: str) -> ModelCode:
+def _write(line: _Line) -> ModelCode:
     outputs = [list(found.items()) for found in line.outputs]
     roots = [[at for _, at in found] for found in outputs]
     everything = _needed(line, [at for part in roots for at in part])
@@ -237,7 +246,7 @@ def _write(line: _Line, name: str) -> ModelCode:
     }
     source = []
     for part, lines in parts.items():
-        head = _HEADS[part].format(name)
+        head = _HEADS[part]
         arguments = [item.split()[-1].lstrip("*") for item in head[head.index("(") + 1 : -1].split(",")]
         body = "\n".join(lines)
         unused = [
@@ -246,9 +255,7 @@ def _write(line: _Line, name: str) -> ModelCode:
         if part.startswith("tangent"):
             lines = ["    for (int c = 0; c < n; c++) {", *("    " + item for item in lines), "    }"]
         source.append("\n".join([head, "{", *unused, *lines, "}", ""]))
-    heads = [
-        _HEADS[part].format(name).replace(" restrict ", " ").replace("*restrict ", "*") for part in parts
-    ]
+    heads = [_HEADS[part].replace(" restrict ", " ").replace("*restrict ", "*") for part in parts]
     header = ";\n".join([*heads, ""])  # C++ has no such word, and to C it is the same declaration
     return ModelCode("\n".join(source), header, len(k), len(m), line)
 

@@ -69,18 +69,6 @@ def c_source(name: str) -> str:
     return (resources.files("thermogrip.mpc.native") / "csource" / name).read_text(encoding="utf-8")
 
 
-def model_header(code: ModelCode, name: str) -> str:
-    """Return the header of a model's C, which C++ may include."""
-    guard = f"{name.upper()}_H"
-    begin, end = '#ifdef __cplusplus\nextern "C" {\n#endif\n', "#ifdef __cplusplus\n}\n#endif\n"
-    return f"#ifndef {guard}\n#define {guard}\n\n{begin}\n{code.header}\n{end}\n#endif\n"
-
-
-def model_source(code: ModelCode, name: str) -> str:
-    """Return a model's C file."""
-    return f'#include "{name}.h"\n\n#include <math.h>\n\n{code.source}'
-
-
 def build_library(files: dict[str, str]) -> Path:
     """Return a shared library of these C files, from the cache where it was built before; a RuntimeError
     has the first words of a compiler that refuses.
@@ -123,8 +111,12 @@ QP_STATUS = ("solved", "infeasible", "iteration limit", "not convex", "not finit
 
 
 @cache
-def _written(model: _ByStructure, drives: tuple[int, ...], h: float, name: str) -> ModelCode:
-    return write_model(model.model, drives, h, name=name)
+def _written(model: _ByStructure, drives: tuple[int, ...], h: float) -> ModelCode:
+    return write_model(model.model, drives, h)
+
+
+def _code_of(model: PredictionModel) -> ModelCode:
+    return _written(_ByStructure(model.model), tuple(model.drive_index), model.dt / model.sub)
 
 
 class _ByStructure:
@@ -166,17 +158,10 @@ class CompiledController:
 
     def __init__(self, controller: ControllerParts) -> None:
         model = controller.model
-        structure = _ByStructure(model.model)
-        drives = tuple(model.drive_index)
-        step = _written(structure, drives, model.dt / model.sub, "tg_model")
+        step = _code_of(model)
         self.sizes: Sizes = sizes_of(controller, step.n_k, step.n_m, room=True)
-        files = {name: c_source(name) for name in (*SOURCES, "tg_host.c")}
-        files |= {
-            "tg_config.h": config_header(self.sizes),
-            "tg_model.h": model_header(step, "tg_model"),
-            "tg_model.c": model_source(step, "tg_model"),
-        }
-        self.library = _library(build_library(files))
+        files = {name: c_source(name) for name in (*SOURCES, "tg_host.c")} | step.files
+        self.library = _library(build_library(files | {"tg_config.h": config_header(self.sizes)}))
         k = np.zeros(max(1, step.n_k))
         self.library.tg_host_prepare(address(np.ascontiguousarray(model.p)), address(k))
         self.design = as_structure(self.sizes, numbers_of(controller, k[: step.n_k]))
@@ -248,10 +233,8 @@ class CompiledTruth:
     """A plant in C that closes a loop."""
 
     def __init__(self, model: PredictionModel) -> None:
-        structure = _ByStructure(model.model)
-        code = _written(structure, tuple(model.drive_index), model.dt / model.sub, "tg_model")
-        files = {"tg_model.h": model_header(code, "tg_model"), "tg_model.c": model_source(code, "tg_model")}
-        self._library = ctypes.CDLL(str(build_library(files)))
+        code = _code_of(model)
+        self._library = ctypes.CDLL(str(build_library(code.files)))
         self._k = np.zeros(max(1, code.n_k))
         self._library.tg_model_prepare(address(np.ascontiguousarray(model.p)), address(self._k))
         self._C = np.ascontiguousarray(model.C)

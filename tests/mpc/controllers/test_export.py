@@ -155,7 +155,7 @@ def test_without_gcc_a_check_is_refused_in_one_line(controller, tmp_path, monkey
 def test_what_the_parameters_fix_is_worked_out_without_a_compiler(name):
     model = load_network(name)
     drives = [i for i, key in enumerate(model.inputs) if key not in model.switches]
-    code = write_model(model, drives, model.dt, name="tg_model")
+    code = write_model(model, drives, model.dt)
     k = code.constants(model.prior.tolist())
     assert len(k) == code.n_k
     assert np.isfinite(k).all()

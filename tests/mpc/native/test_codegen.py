@@ -13,7 +13,7 @@ import pytest
 
 from tests.mpc.makers import make_tank, network_plant
 from thermogrip.mpc.native.codegen import _OPERATIONS, write_model
-from thermogrip.mpc.native.runtime import build_library, compiler, model_header, model_source
+from thermogrip.mpc.native.runtime import build_library, compiler
 from thermogrip.mpc.plant.prediction import PredictionModel
 
 needs_gcc = pytest.mark.skipif(compiler() is None, reason="no gcc here")
@@ -95,9 +95,8 @@ def test_the_step_in_c_is_the_models_with_its_switches_on(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     plant = make_tank(joule=0.05) if name == "tank" else network_plant(name)
     model, rng = PredictionModel(plant, dt=plant.dt), np.random.default_rng(0)
-    code = write_model(model.model, model.drive_index, model.dt, name="tg_model")
-    files = {"tg_model.h": model_header(code, "tg_model"), "tg_model.c": model_source(code, "tg_model")}
-    library = ctypes.CDLL(str(build_library(files)))
+    code = write_model(model.model, model.drive_index, model.dt)
+    library = ctypes.CDLL(str(build_library(code.files)))
     at = ctypes.POINTER(ctypes.c_double)
 
     def given(values: Any) -> Any:
@@ -130,7 +129,7 @@ def test_an_argument_is_called_unused_exactly_where_the_body_does_not_read_it(na
     """With -Wextra a compiler warns of the first kind; of the second nobody would."""
     plant = make_tank() if name == "tank" else network_plant(name)
     model, seen = PredictionModel(plant, dt=plant.dt), 0
-    code = write_model(model.model, model.drive_index, model.dt, name="tg_model")
+    code = write_model(model.model, model.drive_index, model.dt)
     for part in code.source.split("\n}\n"):
         if "{" not in part:
             continue
