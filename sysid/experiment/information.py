@@ -353,7 +353,7 @@ class ExperimentForecast:
         size = _STEP * np.sqrt(np.maximum(np.diag(self._root @ self._root.T), 1e-20))
         theta = self.plant.theta + size
         free = [self.plant.bounds.get(name, (-np.inf, np.inf))[1] for name in self.plant.free]
-        return np.where(_natural(self.plant, theta) > np.array(free), -size, size)
+        return np.where(self.plant.natural(theta) > np.array(free), -size, size)
 
     @cached_property
     def _moved(self) -> tuple[Array, Array, Array]:
@@ -362,7 +362,7 @@ class ExperimentForecast:
         theta = np.vstack([self.plant.theta, self.plant.theta + np.diag(self._steps)])
         rows = np.repeat(self.plant.p[None], len(theta), axis=0)
         at = [self.plant.model.parameters.index(name) for name in self.plant.free]
-        rows[:, at] = np.array([_natural(self.plant, row) for row in theta])
+        rows[:, at] = np.array([self.plant.natural(row) for row in theta])
         first = self._rest(rows[0])
         begin = [first, *(first if self._known else self._rest(row) for row in rows[1:])]
         d = np.repeat(self._d[None], len(rows), axis=0)
@@ -437,12 +437,6 @@ def _sensor_sd(plant: Plant) -> dict[str, float]:
 
 def _bits(gain: Array) -> float:
     return float(0.5 * np.linalg.slogdet(gain)[1] / np.log(2.0))
-
-
-def _natural(plant: Plant, theta: Array) -> Array:
-    """Return parameters from theta, without clipping to the bounds."""
-    logs = plant.log_scaled
-    return np.where(logs, np.exp(np.where(logs, theta, 0.0)), theta)
 
 
 def _spread_root(plant: Plant) -> Array:

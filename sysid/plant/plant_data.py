@@ -134,7 +134,7 @@ class PlantData:
             raise ValueError(f"level must lie between 0 and 1, got {level:g}")
         if self.covariance is not None:
             half = NormalDist().inv_cdf(0.5 + level / 2) * np.sqrt(np.diag(self.covariance))
-            low, high = self._natural(self.theta - half), self._natural(self.theta + half)
+            low, high = self._inside(self.theta - half), self._inside(self.theta + half)
         elif self.samples is not None:
             tails = [0.5 - level / 2, 0.5 + level / 2]
             low, high = np.quantile(self.samples, tails, axis=0)
@@ -149,11 +149,14 @@ class PlantData:
         logs = self.log_scaled
         return np.where(logs, np.log(np.where(logs, natural, 1.0)), natural)
 
-    def _natural(self, theta: Array) -> Array:
-        natural = np.where(self.log_scaled, np.exp(np.where(self.log_scaled, theta, 0.0)), theta)
+    def natural(self, theta: Array) -> Array:
+        """Return the free parameters (n_free,) in their units, wherever ``theta`` is."""
+        return np.where(self.log_scaled, np.exp(np.where(self.log_scaled, theta, 0.0)), theta)
+
+    def _inside(self, theta: Array) -> Array:
         pairs = [self.bounds.get(name, (-np.inf, np.inf)) for name in self.free]
         low, high = np.array(pairs, dtype=float).reshape(-1, 2).T
-        return np.asarray(np.clip(natural, low, high))
+        return np.asarray(np.clip(self.natural(theta), low, high))
 
     @property
     def log_scaled(self) -> Mask:
@@ -164,7 +167,7 @@ class PlantData:
         # eigh, not Cholesky: a weakly determined direction may have lost its last digits
         size, axes = np.linalg.eigh(np.asarray(self.covariance))
         step = axes @ (np.sqrt(np.maximum(size, 0.0)) * rng.standard_normal(len(size)))
-        return self._natural(self.theta + step)
+        return self._inside(self.theta + step)
 
 
 SCHEMA, VERSION = "thermogrip.plant", 1
