@@ -66,7 +66,8 @@ def test_each_controller_is_tried_for_its_own_length(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(objective, "run_trials", run)
     monkeypatch.setattr(search, "made", lambda name, design: (name, design.move))
-    monkeypatch.setattr(search, "_pi", lambda loops: ("PI", loops[0].Kc / search.baseline.loops[0].Kc))
+    scale = search.baseline.loops[0].Kc
+    monkeypatch.setattr(objective.PIController, "of", lambda plant, base, loops: ("PI", loops[0].Kc / scale))
     pi = {"Kc": 2.0, "Ti": 1.0, "Tt": 1.0, "feedforward": 0.5}
     tried = [search.evaluate({"move": 7.0}), search.evaluate(pi, "PI"), search.evaluate({"move": 4.0}, "LQR")]
     search.evaluate_at_length(("PI", pi))
