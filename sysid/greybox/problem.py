@@ -34,6 +34,7 @@ from dataclasses import dataclass, field, replace
 from typing import cast
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 from scipy.signal import lfilter
 
