@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
@@ -122,6 +123,13 @@ def test_the_step_in_c_is_the_models_with_its_switches_on(
     np.testing.assert_allclose(out, A @ sx + B @ su + E @ sd, atol=1e-9)
     if name == "gripper":
         assert model.model.switches  # the pump
+
+
+def test_a_state_that_parameters_alone_decide_is_handed_over():
+    model: Any = SimpleNamespace(disturbances=(), parameters=("a",), n_x=1, inputs=("q",))
+    model.step = lambda x, u, d, p, h: [2.0 * p[0]]
+    code = write_model(model, [0], 1.0)
+    assert (code.constants([3.0]), "xn[0] = k[0];" in code.source) == ([6.0], True)
 
 
 @pytest.mark.parametrize("name", ["gripper", "tank"])
