@@ -84,10 +84,7 @@ def write_atomic(path: str | Path, content: bytes | str) -> Path:
 
 
 def open_new(path: str | Path) -> int:
-    """Return the descriptor of a new file for writing.
-
-    OSError if its name is there already, if only as a link.
-    """
+    """Return the descriptor of a new file for writing; OSError if its name is there, if only as a link."""
     return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _NO_LINK | _AS_WRITTEN, 0o666)
 
 
@@ -110,10 +107,7 @@ def file_hash(path: str | Path) -> str:
 
 
 def write_json(path: str | Path, content: Mapping[str, Any], *, schema: str, version: int) -> Path:
-    """Write a JSON object with ``schema`` and ``version``, return the path.
-
-    ValueError if a number is not finite.
-    """
+    """Write a JSON object of finite numbers with ``schema`` and ``version``, return the path."""
     whole = {"schema": schema, "version": version} | dict(content)
     return write_atomic(path, json.dumps(whole, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
 
@@ -135,18 +129,15 @@ def read_toml(path: str | Path, *, hint: str) -> dict[str, Any]:
 def read_json(path: str | Path, schema: str, version: int) -> dict[str, Any]:
     """Return the JSON object in ``path``, which must have this schema and no newer version."""
     raw = read_bytes(path, share=JSON_SHARE)
-    made_by = f"it must be a JSON file of schema {schema!r}"
+    at = {"file": path, "hint": f"it must be a JSON file of schema {schema!r}"}
+    with as_user_error(UnicodeDecodeError, "is not text, so it is not JSON", **at):
+        text = raw.decode("utf-8")
     try:
-        content = json.loads(raw.decode("utf-8"), parse_constant=_refuse_constant)
-    except UnicodeDecodeError as error:
-        raise UserError("is not text, so it is not JSON", file=path, hint=made_by) from error
+        with as_user_error(RecursionError, "is nested too deeply", **at):
+            content = json.loads(text, parse_constant=_refuse_constant)
     except json.JSONDecodeError as error:
         problem = f"is not JSON ({error.msg}, column {error.colno})"
-        raise UserError(problem, file=path, row=error.lineno, hint=made_by) from error
-    except RecursionError as error:
-        raise UserError("is nested too deeply", file=path, hint=made_by) from error
-    except ValueError as error:
-        raise UserError(f"is not JSON ({str(error)[:200]})", file=path, hint=made_by) from error
+        raise UserError(problem, **at, row=error.lineno) from error
     check_json(content, schema, version, file=path)
     check_content(content, file=path)
     whole: dict[str, Any] = content

@@ -115,10 +115,7 @@ class Unpacker:
         self._file, self._packed, self._found = file, Path(file).stat().st_size, 0
 
     def __call__(self, packing: str, data: bytes) -> bytes:
-        """Return what ``data``, packed with bz2, lz4 or zstd, holds.
-
-        KeyError if it is packed with another.
-        """
+        """Return what ``data``, packed with bz2, lz4 or zstd, holds; KeyError if it is with another."""
         found = _PACKINGS[packing](data, most_unpacked(self._packed) - self._found + 1)
         self._found += len(found)
         check_unpacked(self._packed, self._found, file=self._file)

@@ -39,7 +39,9 @@ from thermogrip.datasets.repair import (
     order_rows,
     reject_spikes,
 )
-from thermogrip.datasets.schema import check_log, hash_columns, make_log, names
+from thermogrip.datasets.resample import cut
+from thermogrip.datasets.rosbag import bag_parts, read_rosbag_table
+from thermogrip.datasets.schema import check_log, hash_columns, make_log
 from thermogrip.datasets.tables import (
     Table,
     check_table,
@@ -126,8 +128,8 @@ def read_log(
     --------
     >>> from thermogrip.datasets.examples import example_path
     >>> log = read_log(f"{example_path('step_up_down')}@:600")
-    >>> log.sizes["time"], log["t_tank"].attrs["units"], names(log, "input")
-    (1200, 'degC', ('drive', 'pump'))
+    >>> log.sizes["time"], log["t_tank"].attrs["units"], log["pump"].attrs["role"]
+    (1200, 'degC', 'input')
     >>> print(log.attrs["repairs"].splitlines()[0])
     t_tank: converted from K to degC
     """
@@ -234,10 +236,7 @@ def write_log(log: Log, path: str | Path) -> Path:
 
 
 def split_cut(path: str | Path) -> tuple[Path, float, float]:
-    """Return the file, the start and the stop [s] of ``PATH@START:STOP``.
-
-    A path that exists is not cut, whatever its name.
-    """
+    """Return file, start and stop [s] of ``PATH@START:STOP``; a path that exists is whole, whatever it is."""
     match = _CUT.match(str(path))
     if match is None or os.path.exists(path):
         return Path(path), -np.inf, np.inf
@@ -256,17 +255,9 @@ def _format(path: Path) -> str:
     """Return the format of a log: that of a folder is known by what is in it."""
     if not os.path.isdir(path):
         return file_format(path)
-    from thermogrip.datasets.rosbag import bag_parts
-
     if not bag_parts(path):
         raise UserError("is a folder, and no ROS 2 bag", file=path, hint="name a file in it")
     return "rosbag"
-
-
-def _read_rosbag(path: str | Path) -> Table:
-    from thermogrip.datasets.rosbag import read_rosbag_table
-
-    return read_rosbag_table(path)
 
 
 def _read_netcdf_table(path: str | Path) -> Table:
@@ -301,7 +292,7 @@ def _read_netcdf_table(path: str | Path) -> Table:
 _WITHOUT_NAMES = {
     "csv": read_text_table, "text": read_text_table, "matlab": read_matlab_table, "excel": read_excel_table
 }  # fmt: skip
-_WITH_NAMES = {"netcdf": _read_netcdf_table, "parquet": read_parquet_table, "rosbag": _read_rosbag}
+_WITH_NAMES = {"netcdf": _read_netcdf_table, "parquet": read_parquet_table, "rosbag": read_rosbag_table}
 
 
 def _read_table(file: Path, columns: Sequence[str] | None) -> Table:
@@ -518,8 +509,6 @@ def _drop_unknown_start(
 
 
 def _cut(log: Log, start: float, stop: float, file: Path) -> Log:
-    from thermogrip.datasets.resample import cut
-
     part = cut(log, start, stop)
     part.attrs["name"] = f"{log.attrs['name']}@{_end(start)}:{_end(stop) or 'end'}"
     repairs = [line for line in str(log.attrs["repairs"]).splitlines() if line]
@@ -558,14 +547,12 @@ def _write_parquet(log: Log, path: str | Path) -> Path:
     import pyarrow.parquet as parquet
 
     fields = [pa.field("time", pa.float64(), metadata={"units": "s"})]
-    for name in names(log, "input") + names(log, "disturbance") + names(log, "output") + names(log, "other"):
-        kept = {key: log[name].attrs[key] for key in ("units", "role")}
-        fields.append(pa.field(name, pa.float64(), metadata=kept))
-    order = [f.name for f in fields[:1]] + [str(n) for n in log.data_vars]
-    by_name = {f.name: f for f in fields}
-    meta = {str(key): str(value) for key, value in log.attrs.items()}
-    schema = pa.schema([by_name[n] for n in order], metadata=meta)
-    table = pa.Table.from_arrays([pa.array(log[n].values, from_pandas=False) for n in order], schema=schema)
+    for name, variable in log.data_vars.items():
+        kept = {key: variable.attrs[key] for key in ("units", "role")}
+        fields.append(pa.field(str(name), pa.float64(), metadata=kept))
+    schema = pa.schema(fields, metadata={str(key): str(value) for key, value in log.attrs.items()})
+    arrays = [pa.array(log[field.name].values, from_pandas=False) for field in fields]
+    table = pa.Table.from_arrays(arrays, schema=schema)
     with atomic_path(path) as temporary:
         parquet.write_table(table, temporary, write_page_checksum=True)
     return Path(path)

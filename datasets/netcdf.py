@@ -166,10 +166,7 @@ def write_netcdf(data: xr.Dataset, path: str | Path) -> Path:
 
 
 def record_unit(variable: xr.DataArray, name: str, file: str) -> tuple[NDArray[np.float64], str]:
-    """Return a variable's numbers and unit as records have them.
-
-    UserError without numbers or a known unit.
-    """
+    """Return a variable's numbers and unit as records have them; UserError where it has none."""
     if variable.dtype.kind not in "fiub":
         raise UserError(f"holds {variable.dtype}, not numbers", file=file, column=name, hint="leave it out")
     if "units" not in variable.attrs:

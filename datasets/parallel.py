@@ -14,7 +14,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -57,11 +57,7 @@ def run_parallel(
         return _on_cluster(function, todo, workers, progress, what) if todo else []
     n = min(workers, len(todo), os.cpu_count() or 1)
     if n <= 1:
-        results = []
-        for at, item in enumerate(todo):
-            results.append(function(item))
-            _tell(progress, (at + 1) / len(todo), what)
-        return results
+        return _counted(map(function, todo), len(todo), progress, what)
     return _on_processes(function, todo, n, progress, what)
 
 
@@ -116,12 +112,7 @@ def _on_processes(
     futures: list[Future[_Result]] = []
     try:
         futures += [pool.submit(function, item) for item in todo]
-        pending = set(futures)
-        while pending:
-            done, pending = wait(pending, return_when=FIRST_COMPLETED)
-            for future in done:
-                future.result()
-            _tell(progress, 1 - len(pending) / len(todo), what)
+        _counted((future.result() for future in as_completed(futures)), len(todo), progress, what)
         return [future.result() for future in futures]
     except BrokenProcessPool as error:
         raise UserError("a worker process was killed", hint="lower --workers; memory may be short") from error
@@ -153,9 +144,8 @@ def _on_cluster(
     try:
         _check_cluster(client, address)
         futures = client.map(function, todo, pure=False)
-        for n, future in enumerate(dask.as_completed(futures, loop=client.loop)):
-            future.result()  # the first fault ends it
-            _tell(progress, (n + 1) / len(todo), what)
+        done = dask.as_completed(futures, loop=client.loop)
+        _counted((future.result() for future in done), len(todo), progress, what)  # the first fault ends it
         return list(client.gather(futures))
     except dask.KilledWorker as error:
         raise UserError(f"a worker of {address} was killed", hint="give its workers more memory") from error
@@ -179,6 +169,11 @@ def _version() -> str:
     return __version__
 
 
-def _tell(progress: Progress | None, fraction: float, what: str) -> None:
-    if progress is not None:
-        progress(fraction, what)
+def _counted(results: Iterable[_Result], n: int, progress: Progress | None, what: str) -> list[_Result]:
+    """Return the n results, and report the progress with each."""
+    found: list[_Result] = []
+    for result in results:
+        found.append(result)
+        if progress is not None:
+            progress(len(found) / n, what)
+    return found

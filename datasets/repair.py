@@ -42,10 +42,8 @@ _CLOCK = 1e8  # s: no log is three years old at its first row
 def order_rows(
     time: Floats, lines: NDArray[np.int64], file: str
 ) -> tuple[Floats, NDArray[np.int64], list[str]]:
-    """Return strictly increasing times, the rows that they belong to, and what was repaired.
-
-    UserError where many times are missing, or time runs backward.
-    """
+    """Return strictly increasing times, the rows that they belong to, and what was repaired; UserError where
+    many times are missing, or time runs backward."""
     rows, repairs = np.arange(time.size), []
     lost = ~np.isfinite(time)
     if lost.mean() > _FEW:
@@ -186,10 +184,7 @@ def fill_disturbance(name: str, values: Floats, time: Floats) -> tuple[Floats, l
 
 
 def check_plausible(name: str, celsius: Floats, file: str) -> list[str]:
-    """Return a line if a temperature is likely in another unit.
-
-    UserError if half of it is below absolute zero.
-    """
+    """Return a line if a temperature is likely in another unit; UserError if half is below absolute zero."""
     median = float(np.nanmedian(celsius))
     if median < -273.15:
         problem = f"median of {median:g} degC is below absolute zero"

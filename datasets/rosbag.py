@@ -132,10 +132,8 @@ def read_rosbag_table(path: str | Path, topics: TopicMap | None = None) -> Table
 
 
 def bag_parts(folder: str | Path) -> list[Path]:
-    """Return the files of the ROS 2 bag that a folder is, none where it is no bag.
-
-    UserError if its ``metadata.yaml`` names no file, or one that is missing or not read.
-    """
+    """Return the files of the ROS 2 bag that a folder is, none where it is no bag; UserError if its
+    ``metadata.yaml`` names no file, or one that is missing or not read."""
     place = Path(folder)
     listed = place / "metadata.yaml"
     if not listed.is_file():

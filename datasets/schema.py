@@ -17,7 +17,7 @@ record is one condition (one file).
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -95,39 +95,42 @@ def make_log(
 
 def check_log(log: Log) -> Log:
     """Return the log as it is, or raise :class:`UserError` naming the variable and the rule it breaks."""
-    where = log.attrs.get("name", "log")
+    for problem, hint in _time_faults(log):
+        raise UserError(problem, file=log_name(log), hint=hint)
+    for name, variable in log.data_vars.items():
+        for problem, hint in _variable_faults(variable):
+            raise UserError(problem, file=log_name(log), column=str(name), hint=hint)
+    return log
+
+
+def _time_faults(log: Log) -> Iterator[tuple[str, str]]:
+    """Yield (problem, hint) of a log's time axis; each check needs those before it."""
     if "time" not in log.coords or log["time"].dims != ("time",):
-        raise UserError("no time axis", file=where, hint="give the record a dimension 'time' in seconds")
+        yield "no time axis", "give the record a dimension 'time' in seconds"
     time = log["time"].values
     if time.size < 2:
-        raise UserError(f"{time.size} row(s) are not a log", file=where, hint="give at least two rows")
+        yield f"{time.size} row(s) are not a log", "give at least two rows"
     if not np.all(np.isfinite(time)):
-        raise UserError("time is not finite everywhere", file=where, hint="remove the rows without a time")
+        yield "time is not finite everywhere", "remove the rows without a time"
     if np.any(np.diff(time) <= 0):
         at = int(np.argmax(np.diff(time) <= 0))
-        raise UserError(
-            f"time does not increase after {time[at]:g} s", file=where, hint="sort the rows by time"
-        )
-    for key, variable in log.data_vars.items():
-        name = str(key)
-        if variable.dims != ("time",):
-            raise UserError(f"dims are {variable.dims}, not ('time',)", file=where, column=name)
-        if "units" not in variable.attrs:
-            raise UserError(
-                "no unit", file=where, column=name, hint="set attrs['units'], '1' if dimensionless"
-            )
-        role = variable.attrs.get("role")
-        if role not in ROLES:
-            raise UserError(f"role {role!r} is unknown", file=where, column=name, hint=f"use one of {ROLES}")
-        finite = np.isfinite(variable.values)
-        if not finite.any():
-            raise UserError("has no finite value", file=where, column=name, hint="leave the column out")
-        if role in ("input", "disturbance") and not finite.all():
-            lost = int((~finite).sum())
-            raise UserError(
-                f"{role} is unknown in {lost} row(s)", file=where, column=name, hint="fill or cut them"
-            )
-    return log
+        yield f"time does not increase after {time[at]:g} s", "sort the rows by time"
+
+
+def _variable_faults(variable: xr.DataArray) -> Iterator[tuple[str, str | None]]:
+    """Yield (problem, hint) of a log's variable; each check needs those before it."""
+    if variable.dims != ("time",):
+        yield f"dims are {variable.dims}, not ('time',)", None
+    if "units" not in variable.attrs:
+        yield "no unit", "set attrs['units'], '1' if dimensionless"
+    role = variable.attrs.get("role")
+    if role not in ROLES:
+        yield f"role {role!r} is unknown", f"use one of {ROLES}"
+    finite = np.isfinite(variable.values)
+    if not finite.any():
+        yield "has no finite value", "leave the column out"
+    if role in ("input", "disturbance") and not finite.all():
+        yield f"{role} is unknown in {int((~finite).sum())} row(s)", "fill or cut them"
 
 
 def names(log: Log, role: str) -> tuple[str, ...]:
@@ -236,39 +239,38 @@ def make_grasps(
 
 def check_grasps(grasps: Grasps) -> Grasps:
     """Return the record as it is, or raise :class:`UserError` naming the grasp and the rule it breaks."""
-    where = log_name(grasps)
+    for faults in (_axis_faults, _temperature_faults, _touch_faults):
+        for problem, hint in faults(grasps):
+            raise UserError(problem, file=log_name(grasps), hint=hint)
+    return grasps
+
+
+def _axis_faults(grasps: Grasps) -> Iterator[tuple[str, str | None]]:
+    """Yield (problem, hint) of axes and labels; each check needs those before it."""
     for need in ("grasp", "time"):
         if need not in grasps.coords:
-            raise UserError(f"no {need} axis", file=where, hint="give the record dims 'grasp' and 'time'")
+            yield f"no {need} axis", "give the record dims 'grasp' and 'time'"
     found = grasps.variables  # a DataArray made of one costs more than to check it
     if "t_surface" not in grasps or found["t_surface"].dims != ("grasp", "time"):
-        raise UserError("no t_surface of dims (grasp, time)", file=where)
+        yield "no t_surface of dims (grasp, time)", None
     time, ids = found["time"].values, found["grasp"].values
     if ids.size == 0:
-        raise UserError("holds no grasp", file=where, hint="give at least one")
+        yield "holds no grasp", "give at least one"
     if time.size < 2 or not np.all(np.isfinite(time)) or np.any(np.diff(time) <= 0):
-        raise UserError("time does not increase", file=where, hint="sort the samples of each grasp by time")
+        yield "time does not increase", "sort the samples of each grasp by time"
     if time[-1] - time[0] > _SLOWEST * (time.size - 1):
-        raise UserError(
-            f"samples are {np.mean(np.diff(time)):g} s apart",
-            file=where,
-            hint="give times in seconds since the closed message",
-        )
+        hint = "give times in seconds since the closed message"
+        yield f"samples are {np.mean(np.diff(time)):g} s apart", hint
     unique, counts = np.unique(ids, return_counts=True)
     if np.any(counts > 1):
-        raise UserError(
-            f"grasp_id {str(unique[counts > 1][0])!r} occurs twice", file=where, hint="give each its own"
-        )
+        yield f"grasp_id {str(unique[counts > 1][0])!r} occurs twice", "give each its own"
     lost = ~np.isfinite(found["t_surface"].values).any(axis=1)
     if lost.any():
-        raise UserError(f"grasp {str(ids[lost][0])!r} has no temperature", file=where, hint="remove it")
-    _check_temperatures(grasps, where)
-    _check_touches(grasps, where)
+        yield f"grasp {str(ids[lost][0])!r} has no temperature", "remove it"
     for label in np.unique(found["split"].values.astype(str)) if "split" in grasps else ():
         plain = label.strip().lower()
         if plain != label and plain in ("train", "test"):  # it would be left out of both without a word
-            raise UserError(f"split {label!r} is neither train nor test", file=where, hint=f"write {plain!r}")
-    return grasps
+            yield f"split {label!r} is neither train nor test", f"write {plain!r}"
 
 
 def label_values(grasps: Grasps, name: str) -> NDArray[np.str_]:
@@ -289,18 +291,13 @@ def unit_names(grasps: Grasps) -> NDArray[np.str_]:
     return np.where(groups == "", np.asarray(grasps["grasp"].values).astype(str), groups)
 
 
-def _check_touches(grasps: Grasps, where: str) -> None:
-    """Raise UserError where the order of a block's touches, or the time between them, is none."""
+def _touch_faults(grasps: Grasps) -> Iterator[tuple[str, str]]:
+    """Yield (problem, hint) where the order of a block's touches, or the time between them, is none."""
     ids = grasps.variables["grasp"].values
-    if "rest" in grasps:
-        wrong = grasps.variables["rest"].values < 0  # NaN compares false
-        if wrong.any():
-            i = int(np.argmax(wrong))
-            raise UserError(
-                f"grasp {str(ids[i])!r} has a rest of {float(grasps['rest'].values[i]):g} s",
-                file=where,
-                hint="give the seconds since the touch before, or leave it empty",
-            )
+    rest = grasps.variables["rest"].values if "rest" in grasps else np.zeros(len(ids))
+    for k in np.flatnonzero(rest < 0):  # NaN compares false
+        hint = "give the seconds since the touch before, or leave it empty"
+        yield f"grasp {str(ids[k])!r} has a rest of {float(rest[k]):g} s", hint
     if "touch" not in grasps or "touch_group" not in grasps:
         return
     group = label_values(grasps, "touch_group")
@@ -312,25 +309,18 @@ def _check_touches(grasps: Grasps, where: str) -> None:
         if known.any() and not known.all():
             lost = str(ids[at[~known][0]])
             problem = f"grasp {lost!r} of touch_group {str(name)!r} has no touch, others of it have"
-            raise UserError(problem, file=where, hint="number all touches of a block, or none")
+            yield problem, "number all touches of a block, or none"
         if (counts > 1).any():
-            problem = f"touch {numbers[counts > 1][0]:g} of touch_group {str(name)!r} occurs twice"
             hint = "number its touches 1, 2, ..., and give a block that is touched anew another touch_group"
-            raise UserError(problem, file=where, hint=hint)
+            yield f"touch {numbers[counts > 1][0]:g} of touch_group {str(name)!r} occurs twice", hint
 
 
-def _check_temperatures(grasps: Grasps, where: str) -> None:
-    """Raise UserError where a temperature is one that no gripper and no object has [degC]."""
+def _temperature_faults(grasps: Grasps) -> Iterator[tuple[str, str]]:
+    """Yield (problem, hint) where a temperature is one that no gripper and no object has [degC]."""
     for name in ("t_surface", "t_surface_2", "t_object", "t_gripper", "t_ambient"):
-        if name not in grasps:
-            continue
-        wrong = np.abs(grasps.variables[name].values) > HOTTEST  # NaN compares false
-        if wrong.any():
-            row = wrong if wrong.ndim == 1 else wrong.any(axis=1)
-            i = int(np.argmax(row))
-            worst = np.ravel(grasps[name].values[i])[np.argmax(np.ravel(wrong[i]))]
-            raise UserError(
-                f"grasp {str(grasps['grasp'].values[i])!r} has a {name} of {worst:g} degC",
-                file=where,
-                hint="give degrees Celsius, or end the column's name in _K if it is kelvin",
-            )
+        if name in grasps:
+            values = grasps.variables[name].values
+            values = values[:, None] if values.ndim == 1 else values
+            for i, k in np.argwhere(np.abs(values) > HOTTEST)[:1]:  # NaN compares false
+                problem = f"grasp {str(grasps['grasp'].values[i])!r} has a {name} of {values[i, k]:g} degC"
+                yield problem, "give degrees Celsius, or end the column's name in _K if it is kelvin"

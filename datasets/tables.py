@@ -44,6 +44,7 @@ from thermogrip.datasets.limits import (
     unpack_within,
 )
 from thermogrip.datasets.media import from_csv
+from thermogrip.datasets.netcdf import check_netcdf
 from thermogrip.datasets.units import read_header
 
 FORMATS = {
@@ -572,8 +573,7 @@ def _to_float(chunked: Any) -> NDArray[np.float64]:
 def check_table(path: str | Path, *, log: bool = False) -> None:
     """Refuse a file that is no table of numbers by its name, its beginning and what it declares.
 
-    A log may have any header.
-    It loads neither pandas nor xarray.  What a shell passes on is read once, so it is not looked at here.
+    A log may have any header.  Neither pandas nor xarray is loaded.  What a shell passes on is read once, so it is not looked at here.
     """
     kind = file_format(path)
     if os.path.exists(path) and not check_source(path) and not os.path.isfile(path):
@@ -587,8 +587,6 @@ def check_table(path: str | Path, *, log: bool = False) -> None:
     elif kind == "parquet":
         _open_parquet(path, str(path), check_source(path)).close()
     elif kind == "netcdf":
-        from thermogrip.datasets.netcdf import check_netcdf
-
         check_netcdf(path)
 
 

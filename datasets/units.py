@@ -95,10 +95,8 @@ _LAGS, _STRONG, _MOST_ROWS = (2, 6), 10.0, 20_000
 
 
 def split_header(header: str, *, file: str | None = None) -> tuple[str, str]:
-    """Return the variable name and the unit of a column header (``"1"`` without a suffix).
-
-    UserError if the suffix is like a unit that is not read, or nothing is left as a name.
-    """
+    """Return the variable name and the unit of a column header (``"1"`` without a suffix); UserError if the
+    suffix is like a unit that is not read, or nothing is left as a name."""
     header = header.strip()
     for unit in UNITS:
         if header.endswith(f"_{unit}"):
@@ -204,35 +202,27 @@ def to_record_unit(values: NDArray[np.float64], unit: str) -> tuple[NDArray[np.f
 
 
 def guess_role(name: str, unit: str) -> str:
-    """Return the role that a name and a unit suggest: input, disturbance, output or other.
-
-    Names come first (``drive``, ``pump``, ``q1``, ``flow`` ... are inputs, ``t_...``, ``level`` outputs, a
-    setpoint is neither), then units: percent, V and 0_255 are what a controller moves, other temperatures
-    are outputs.
-    """
+    """Return the role that a name and a unit suggest: input, disturbance, output or other."""
     return explain_role(name, unit)[0]
 
 
 def explain_role(name: str, unit: str) -> tuple[str, str]:
-    """Return the role that a name and a unit suggest, and why."""
-    lower = name.lower()
-    if _SETPOINT.search(lower) and not (_SET_DRIVE.search(lower) and unit in _OF_DRIVES):
-        return "other", "its name is that of a set point"
-    if _BOOKKEEPING.match(lower):
-        return "other", "its name is that of a number of the clock's or the controller's"
-    if _AMBIENT.search(lower):
-        return "disturbance", "its name is that of the surroundings"
-    if _INFLOW.search(lower) and (unit == "degC" or "temp" in lower):
-        return "disturbance", "its name is that of what flows in"
-    if _INPUT.match(lower) and unit not in ("degC", "s"):
-        return "input", "its name is that of a drive"
-    if _OUTPUT.match(lower) and unit != "s":
-        return "output", "its name is that of a reading"
-    if unit == "degC":
-        return "output", "its unit is degC"
-    if unit in ("percent", "V", "0_255"):
-        return "input", f"its unit is {unit}"
-    return "other", NO_CLUE
+    """Return the role that a name and a unit suggest, and why: names come first, then units."""
+    lower, celsius = name.lower(), unit == "degC"
+    set_drive = _SET_DRIVE.search(lower) and unit in _OF_DRIVES
+    rows = (
+        (_SETPOINT.search(lower) and not set_drive, "other", "its name is that of a set point"),
+        (_BOOKKEEPING.match(lower), "other",
+         "its name is that of a number of the clock's or the controller's"),
+        (_AMBIENT.search(lower), "disturbance", "its name is that of the surroundings"),
+        (_INFLOW.search(lower) and (celsius or "temp" in lower), "disturbance",
+         "its name is that of what flows in"),
+        (_INPUT.match(lower) and unit not in ("degC", "s"), "input", "its name is that of a drive"),
+        (_OUTPUT.match(lower) and unit != "s", "output", "its name is that of a reading"),
+        (celsius, "output", "its unit is degC"),
+        (unit in ("percent", "V", "0_255"), "input", f"its unit is {unit}"),
+    )  # fmt: skip
+    return next(((role, why) for applies, role, why in rows if applies), ("other", NO_CLUE))
 
 
 def roles_of_data(

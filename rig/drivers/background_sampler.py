@@ -3,10 +3,8 @@
 A thread reads the rig on a grid, t_k = t_0 + k dt, and keeps every reading until it is taken.
 
 * A rig that can (:class:`~thermogrip.rig.interface.SamplingRig`; our firmware) measures by its own clock and
-  keeps its readings until they are fetched.  A host that is held up, as any computer is now and then for tens
-  of milliseconds, fetches them later and loses none, up to what the device can keep.
-* Any other rig is read at each tick.  A tick that was missed because the one before took longer than dt has
-  no reading: what was not asked for in time was not measured.
+  keeps its readings until they are fetched: a host that is held up fetches them later and loses none.
+* Any other rig is read at each tick; what was not asked for in time was not measured.
 
 Either way missing readings are counted, never interpolated.
 

@@ -3,18 +3,14 @@
 A drive is sent with :data:`TTL_S` to live and renewed while :meth:`DeviceRig.wait` lets time pass, so it ends
 by itself within that time when the program freezes, dies, or loses its cable, and it holds while all is well.
 
-**What fails how.**  A reading that cannot be had is a reading: every temperature NaN and the drive 0, so a
-session sees it, records it and can decide.  A drive that was not confirmed raises, because it must not count
-as applied: :class:`~thermogrip.rig.serial.port.PortError` where the device cannot be reached,
-:class:`DeviceRefusedError` where it refuses.
+**What fails how.**  A reading that cannot be had is a reading, so a session sees it, records it and can
+decide.  A drive that was not confirmed raises, because it must not count as applied.
 
 **The conversation.**  A question that is met with silence, or whose answer came damaged, is repeated with the
 same number, and the device does nothing twice.  A lost port is tried again (with back-off) at each question;
 a device that answers again after it was lost or reset is greeted anew, which switches everything off.
 
-**Readings by the device's clock.**  :meth:`DeviceRig.sample_every` lets the device measure by itself and
-:meth:`DeviceRig.take` fetches its readings: a program that is held up for less than the device can keep loses
-none, and what is lost is counted.  An answer at device time u was made between the moment its question was
+**Readings by the device's clock.**  An answer at device time u was made between the moment its question was
 sent and the moment it was received, so the host's time less the device's, the offset o, is bounded by each
 exchange:
 
@@ -94,14 +90,60 @@ class Gathering:
         return there
 
 
-class _Conversation(NoticeBook):
-    """The host's end of the line to a device: questions, repeats, greetings, notices."""
+class DeviceRig(NoticeBook):
+    """A device with our firmware, behind the rig's interface.
+
+    Parameters
+    ----------
+    port : Port
+        Not open yet, or open.
+    timeout : float, optional
+        How long an answer may take, in real seconds.
+    tries : int, optional
+        So often a question is met with silence before the device counts as lost.
+    greeting : float, optional
+        How long the device may take to say hello after the port opened, in real seconds: an Arduino starts
+        anew when its port is opened.
+    clock, sleep : callable, optional
+        The rig's clock and how it waits [s].
+
+    Raises
+    ------
+    PortError
+        If the port cannot be opened, or nothing behind it speaks our protocol.
+
+    Examples
+    --------
+    >>> from thermogrip.rig.clock import SteppedClock
+    >>> from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
+    >>> clock = SteppedClock()
+    >>> device = VirtualDevice(link="none", clock=clock, t_start=25.0)
+    >>> rig = DeviceRig(DirectPort(device), clock=clock, sleep=clock.sleep)
+    >>> rig.units
+    {'drive': '1'}
+    >>> rig.apply({"drive": 0.8}, pump=1)
+    >>> rig.wait(60.0)
+    >>> rig.read().values["t_tank"] > 25.5
+    True
+    >>> rig.close()
+    """
 
     def __init__(
-        self, port: Port, *, timeout: float, tries: int, greeting: float, clock: Callable[[], float]
+        self,
+        port: Port,
+        *,
+        timeout: float = 0.25,
+        tries: int = 3,
+        greeting: float = 6.0,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         super().__init__(clock)
         self.port, self.timeout, self.tries = port, timeout, tries
+        self._sleep, self._beat = sleep, Metronome(clock)
+        self._command: tuple[dict[str, float], int] | None = None
+        self._confirmed = 0.0  # when the device last took the drive
+        self._gathering: Gathering | None = None
         self._host, self._device_clock = protocol.HostEnd(), DeviceClock()
         self._known: protocol.State | None = None
         self._heard, self._silent = 0, False  # bytes so far; whether the last question was met with none
@@ -110,12 +152,162 @@ class _Conversation(NoticeBook):
         self.identity = self._first_hello(greeting)
 
     @property
+    def units(self) -> dict[str, str]:
+        """Units of the driven inputs, by name."""
+        return {channel.name: channel.unit for channel in self.identity.drives}
+
+    @property
     def state(self) -> protocol.State | None:
         """The device's last state, None while it cannot be reached."""
         return None if self._lost else self._known
 
-    def _drive_is_over(self) -> None:
-        """Note that the device no longer applies the drive."""
+    @property
+    def expires_s(self) -> float:
+        """How long a drive lives on the device when nobody renews it [s]."""
+        return TTL_S
+
+    def read(self) -> Reading:
+        """Return the newest sample; NaN everywhere while the device cannot be reached."""
+        try:
+            state = self._ask(protocol.Read())
+            return self._reading(self._now(), state)
+        except PortError:
+            nothing = dict.fromkeys(self.identity.sensors, float("nan"))
+            return Reading(self._now(), nothing, dict.fromkeys(self.units, 0.0), 0)
+
+    def apply(self, drive: Mapping[str, float], pump: int) -> None:
+        """Drive from now on, until the next call; returns when the device has confirmed it.
+
+        Raises PortError where it cannot be reached (what it did last ends by itself), DeviceRefusedError
+        where it refuses (a latched fault, a drive while the pump is off, a reset since it was greeted),
+        ValueError for an unknown input or a value outside its range, RuntimeError where the rig is closed.
+        """
+        check_order(drive, pump, {c.name: (c.low / 1e4, c.high / 1e4) for c in self.identity.drives})
+        counts = self._counts(drive)
+        if self.closed:
+            if pump or any(counts):
+                raise RuntimeError("the rig is closed")
+            return
+        self._command = None  # whatever was renewed so far is over
+        idle = not pump and not any(counts)
+        self._ask(protocol.Off() if idle else protocol.Drive(protocol.MAX_TTL_MS, pump, counts))
+        self._command, self._confirmed = None if idle else (dict(drive), pump), self._clock()
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass and renew the drive; one that cannot be renewed ends on the device.
+
+        Waits that follow each other end on a grid (:class:`~thermogrip.rig.clock.Metronome`).
+        """
+        if not seconds >= 0:
+            raise ValueError(f"cannot wait {seconds:g} s")
+        end = self._beat.next(seconds)
+        while (left := end - self._clock()) > 0:
+            self._sleep(min(left, RENEW_S))
+            old = self._clock() - self._confirmed >= 2 * RENEW_S  # many short waits follow each other
+            if self._command is not None and (old or end - self._clock() > 0):
+                self._renew()
+
+    def sample_every(self, seconds: float) -> bool:
+        """Let the device take a reading every so many seconds by its own clock; 0 ends it.
+
+        Returns False where its firmware is older, or it cannot keep this time.
+        """
+        period = round(1000 * seconds)
+        possible = MIN_PERIOD_MS <= period <= MAX_PERIOD_MS and abs(period - 1000 * seconds) < 1e-6
+        self._gathering = None
+        if seconds and not possible:
+            return False
+        try:
+            self._ask(protocol.Sample(period))
+        except DeviceRefusedError as refused:
+            if refused.code == "unknown":
+                return False
+            raise
+        self._gathering = Gathering(period) if period else None
+        return period > 0
+
+    def take(self) -> tuple[list[Reading], int]:
+        """Return the device's own readings since the last call, oldest first, and how many were lost.
+
+        None come while the device cannot be reached; it goes on taking them.
+        """
+        gathering = self._gathering
+        if gathering is None:
+            raise RuntimeError("the device takes no readings of its own; see sample_every")
+        before, readings = gathering.lost, []
+        while taken := self._next_taken(gathering):
+            there = gathering.take(taken, self._device_clock)
+            readings += [self._reading(time, kept) for time, kept in there]
+            if not taken.waiting:
+                break
+        return readings, gathering.lost - before
+
+    def grasp(self, material: str, t_object: float) -> None:
+        """Close the gripper."""
+        self._ask(protocol.Grip(1))
+
+    def release(self) -> None:
+        """Open the gripper; raises as :meth:`grasp`."""
+        self._ask(protocol.Grip(0))
+
+    def clear(self) -> None:
+        """Clear the fault latch; DeviceRefusedError where the cause is still there."""
+        self._ask(protocol.Clear())
+
+    def close(self) -> None:
+        """Switch everything off and let the port go; never raises, and may be called twice."""
+        if self.closed:
+            return
+        self._command = None
+        try:
+            self._ask(protocol.Off())
+        except (PortError, DeviceRefusedError) as error:
+            self._note("link", f"could not be switched off: {error}; its drive ends within {TTL_S:g} s")
+        self.closed = True
+        self._known = None
+        self.port.close()
+
+    def _counts(self, drive: Mapping[str, float]) -> tuple[int, ...]:
+        return tuple(round(1e4 * drive[channel.name]) for channel in self.identity.drives)
+
+    def _reading(self, time_s: float, content: protocol.State | protocol.Kept) -> Reading:
+        values = {
+            name: float("nan") if isinstance(value, str) else value / 1000
+            for name, value in zip(self.identity.sensors, content.temperatures)
+        }
+        applied = {channel.name: value / 1e4 for channel, value in zip(self.identity.drives, content.drive)}
+        return Reading(time_s, values, applied, content.pump)
+
+    def _next_taken(self, gathering: Gathering) -> protocol.Taken | None:
+        """Return the device's next readings, None where it cannot be reached or was reset."""
+        try:
+            content = self._content(protocol.Take(gathering.number))
+        except PortError:
+            return None
+        except DeviceRefusedError:  # it was reset: it takes none any more, or counts from 0
+            gathering.device_was_reset()
+            with suppress(PortError):  # then the next call begins
+                self._ask(protocol.Sample(gathering.period_ms))
+            return None
+        assert isinstance(content, protocol.Taken)
+        return content
+
+    def _renew(self) -> None:
+        """Send the drive again; a failure shows at the next reading."""
+        assert self._command is not None
+        drive, pump = self._command
+        if self._clock() - self._confirmed >= TTL_S:  # this program stood still: the loop has to decide anew
+            self._command = None
+            self._note("expired", f"the program stood still for {self._clock() - self._confirmed:.1f} s")
+            return
+        try:
+            self._ask(protocol.Drive(protocol.MAX_TTL_MS, pump, self._counts(drive)))
+            self._confirmed = self._clock()
+        except PortError:
+            self._command = None  # by the time it is back, it has expired: only the loop may drive it again
+        except DeviceRefusedError as refused:
+            self._command = None
+            self._note("refused", str(refused))
 
     def _first_hello(self, seconds: float) -> protocol.Identity:
         """Ask for the device's identity until it answers; an Arduino takes seconds to start."""
@@ -230,7 +422,7 @@ class _Conversation(NoticeBook):
             case protocol.Boot(cause=cause, count=count):
                 self._note("reset", f"the device was reset ({cause}, boot {count}); everything is off")
                 self._greeted_at, self._known = 0, None
-                self._drive_is_over()
+                self._command = None
             case protocol.Unexpected(why=why):
                 self._note("unexpected", f"a line came that answers nothing ({why})")
             case _:
@@ -244,222 +436,9 @@ class _Conversation(NoticeBook):
         if state.boot != last.boot:
             self._note("reset", f"the device was reset ({state.cause}, boot {state.boot}); everything is off")
             self._greeted_at = 0
-            self._drive_is_over()
+            self._command = None
         if set(state.faults) - set(last.faults):
             self._note("latched", f"{', '.join(state.faults)}; repair it, then clear the latch")
-            self._drive_is_over()
+            self._command = None
         if state.mode == "expired" and last.mode != "expired":
             self._note("expired", f"a drive outlived its {TTL_S:g} s; drive and pump are off")
-
-
-class DeviceRig(_Conversation):
-    """A device with our firmware, behind the rig's interface.
-
-    Parameters
-    ----------
-    port : Port
-        Not open yet, or open.
-    timeout : float, optional
-        How long an answer may take, in real seconds.
-    tries : int, optional
-        So often a question is met with silence before the device counts as lost.
-    greeting : float, optional
-        How long the device may take to say hello after the port opened, in real seconds: an Arduino starts
-        anew when its port is opened.
-    clock, sleep : callable, optional
-        The rig's clock and how it waits [s].
-    units
-        Given by the device: units of the driven inputs, by name.
-
-    Raises
-    ------
-    PortError
-        If the port cannot be opened, or nothing behind it speaks our protocol.
-
-    Examples
-    --------
-    >>> from thermogrip.rig.clock import SteppedClock
-    >>> from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
-    >>> clock = SteppedClock()
-    >>> device = VirtualDevice(link="none", clock=clock, t_start=25.0)
-    >>> rig = DeviceRig(DirectPort(device), clock=clock, sleep=clock.sleep)
-    >>> rig.units
-    {'drive': '1'}
-    >>> rig.apply({"drive": 0.8}, pump=1)
-    >>> rig.wait(60.0)
-    >>> rig.read().values["t_tank"] > 25.5
-    True
-    >>> rig.close()
-    """
-
-    def __init__(
-        self,
-        port: Port,
-        *,
-        timeout: float = 0.25,
-        tries: int = 3,
-        greeting: float = 6.0,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
-    ) -> None:
-        self._sleep, self._beat = sleep, Metronome(clock)
-        self._command: tuple[dict[str, float], int] | None = None
-        self._confirmed = 0.0  # when the device last took the drive
-        self._gathering: Gathering | None = None
-        super().__init__(port, timeout=timeout, tries=tries, greeting=greeting, clock=clock)
-
-    @property
-    def units(self) -> dict[str, str]:
-        """Units of the driven inputs, by name."""
-        return {channel.name: channel.unit for channel in self.identity.drives}
-
-    @property
-    def expires_s(self) -> float:
-        """How long a drive lives on the device when nobody renews it [s]."""
-        return TTL_S
-
-    def read(self) -> Reading:
-        """Return the newest sample; NaN everywhere while the device cannot be reached."""
-        try:
-            state = self._ask(protocol.Read())
-            return self._reading(self._now(), state)
-        except PortError:
-            nothing = dict.fromkeys(self.identity.sensors, float("nan"))
-            return Reading(self._now(), nothing, dict.fromkeys(self.units, 0.0), 0)
-
-    def apply(self, drive: Mapping[str, float], pump: int) -> None:
-        """Drive from now on, until the next call; returns when the device has confirmed it.
-
-        Raises PortError where it cannot be reached (what it did last ends by itself), DeviceRefusedError
-        where it refuses (a latched fault, a drive while the pump is off, a reset since it was greeted),
-        ValueError for an unknown input or a value outside its range, RuntimeError where the rig is closed.
-        """
-        check_order(drive, pump, {c.name: (c.low / 1e4, c.high / 1e4) for c in self.identity.drives})
-        counts = self._counts(drive)
-        if self.closed:
-            if pump or any(counts):
-                raise RuntimeError("the rig is closed")
-            return
-        self._command = None  # whatever was renewed so far is over
-        idle = not pump and not any(counts)
-        self._ask(protocol.Off() if idle else protocol.Drive(protocol.MAX_TTL_MS, pump, counts))
-        self._command, self._confirmed = None if idle else (dict(drive), pump), self._clock()
-
-    def wait(self, seconds: float) -> None:
-        """Let time pass and renew the drive; one that cannot be renewed ends on the device.
-
-        Waits that follow each other end on a grid (:class:`~thermogrip.rig.clock.Metronome`).
-        """
-        if not seconds >= 0:
-            raise ValueError(f"cannot wait {seconds:g} s")
-        end = self._beat.next(seconds)
-        while (left := end - self._clock()) > 0:
-            self._sleep(min(left, RENEW_S))
-            old = self._clock() - self._confirmed >= 2 * RENEW_S  # many short waits follow each other
-            if self._command is not None and (old or end - self._clock() > 0):
-                self._renew()
-
-    def sample_every(self, seconds: float) -> bool:
-        """Let the device take a reading every so many seconds by its own clock; 0 ends it.
-
-        Returns False where its firmware is older, or it cannot keep this time.
-        """
-        period = round(1000 * seconds)
-        possible = MIN_PERIOD_MS <= period <= MAX_PERIOD_MS and abs(period - 1000 * seconds) < 1e-6
-        self._gathering = None
-        if seconds and not possible:
-            return False
-        try:
-            self._ask(protocol.Sample(period))
-        except DeviceRefusedError as refused:
-            if refused.code == "unknown":
-                return False
-            raise
-        self._gathering = Gathering(period) if period else None
-        return period > 0
-
-    def take(self) -> tuple[list[Reading], int]:
-        """Return the device's own readings since the last call, oldest first, and how many were lost.
-
-        None come while the device cannot be reached; it goes on taking them.
-        """
-        gathering = self._gathering
-        if gathering is None:
-            raise RuntimeError("the device takes no readings of its own; see sample_every")
-        before, readings = gathering.lost, []
-        while taken := self._next_taken(gathering):
-            there = gathering.take(taken, self._device_clock)
-            readings += [self._reading(time, kept) for time, kept in there]
-            if not taken.waiting:
-                break
-        return readings, gathering.lost - before
-
-    def grasp(self, material: str, t_object: float) -> None:
-        """Close the gripper."""
-        self._ask(protocol.Grip(1))
-
-    def release(self) -> None:
-        """Open the gripper; raises as :meth:`grasp`."""
-        self._ask(protocol.Grip(0))
-
-    def clear(self) -> None:
-        """Clear the fault latch; DeviceRefusedError where the cause is still there."""
-        self._ask(protocol.Clear())
-
-    def close(self) -> None:
-        """Switch everything off and let the port go; never raises, and may be called twice."""
-        if self.closed:
-            return
-        self._command = None
-        try:
-            self._ask(protocol.Off())
-        except (PortError, DeviceRefusedError) as error:
-            self._note("link", f"could not be switched off: {error}; its drive ends within {TTL_S:g} s")
-        self.closed = True
-        self._known = None
-        self.port.close()
-
-    def _drive_is_over(self) -> None:
-        self._command = None
-
-    def _counts(self, drive: Mapping[str, float]) -> tuple[int, ...]:
-        return tuple(round(1e4 * drive[channel.name]) for channel in self.identity.drives)
-
-    def _reading(self, time_s: float, content: protocol.State | protocol.Kept) -> Reading:
-        values = {
-            name: float("nan") if isinstance(value, str) else value / 1000
-            for name, value in zip(self.identity.sensors, content.temperatures)
-        }
-        applied = {channel.name: value / 1e4 for channel, value in zip(self.identity.drives, content.drive)}
-        return Reading(time_s, values, applied, content.pump)
-
-    def _next_taken(self, gathering: Gathering) -> protocol.Taken | None:
-        """Return the device's next readings, None where it cannot be reached or was reset."""
-        try:
-            content = self._content(protocol.Take(gathering.number))
-        except PortError:
-            return None
-        except DeviceRefusedError:  # it was reset: it takes none any more, or counts from 0
-            gathering.device_was_reset()
-            with suppress(PortError):  # then the next call begins
-                self._ask(protocol.Sample(gathering.period_ms))
-            return None
-        assert isinstance(content, protocol.Taken)
-        return content
-
-    def _renew(self) -> None:
-        """Send the drive again; a failure shows at the next reading."""
-        assert self._command is not None
-        drive, pump = self._command
-        if self._clock() - self._confirmed >= TTL_S:  # this program stood still: the loop has to decide anew
-            self._command = None
-            self._note("expired", f"the program stood still for {self._clock() - self._confirmed:.1f} s")
-            return
-        try:
-            self._ask(protocol.Drive(protocol.MAX_TTL_MS, pump, self._counts(drive)))
-            self._confirmed = self._clock()
-        except PortError:
-            self._command = None  # by the time it is back, it has expired: only the loop may drive it again
-        except DeviceRefusedError as refused:
-            self._command = None
-            self._note("refused", str(refused))

@@ -127,11 +127,7 @@ class History:
 
     def begin(self, time: float) -> Estimate | None:
         """Return the newest estimate up to a time [s]; None where there is none or inputs since are lost."""
-        found = None
-        for one in self._kept:
-            if one.time > time + 1e-6:
-                break
-            found = one
+        found = next((one for one in reversed(self._kept) if one.time <= time + 1e-6), None)
         return found if found is not None and found.step >= self.steps.first else None
 
     def after(self, time: float) -> list[Estimate]:

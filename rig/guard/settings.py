@@ -36,16 +36,12 @@ def _keys(kind: type[Any]) -> dict[str, Field[Any]]:
 
 
 def read_guard(path: str | Path) -> GuardSettings:
-    """Read what the guard allows from a TOML file.
+    """Return what the guard allows, from a TOML file.
 
     Parameters
     ----------
     path : str or Path
         As ``thermogrip init guard`` writes it; what is left out has its default.
-
-    Returns
-    -------
-    settings : GuardSettings
 
     Raises
     ------

@@ -170,7 +170,7 @@ def run_batch(
     progress: Callable[[float, str], None] | None = None,
     **options: Any,
 ) -> Batch:
-    """Do every trial of the plan that has no good grasp in the folder yet.
+    """Do every trial of the plan that has no good grasp in the folder yet; return how that went.
 
     Parameters
     ----------
@@ -208,10 +208,6 @@ def run_batch(
     ------
     UserError
         If the folder holds another plan, or a session's first reading makes no sense.
-
-    Returns
-    -------
-    batch : Batch
 
     Examples
     --------

@@ -27,6 +27,7 @@ from typing import Any
 
 from thermogrip.datasets.atomic_files import file_hash, open_new, write_atomic, write_json
 from thermogrip.datasets.errors import UserError, os_faults
+from thermogrip.datasets.grasp_files import write_grasps
 from thermogrip.datasets.media import csv_text
 from thermogrip.rig.interface import Event
 from thermogrip.rig.session.session import Session
@@ -130,10 +131,6 @@ class RunFolder:
         """Write the verdict, and the grasp where there is one; call it before :meth:`close`."""
         self._reserve.give_back()
         if session.grasps is not None:
-            from thermogrip.datasets.grasp_files import (
-                write_grasps,  # reads tables: not needed before the end
-            )
-
             write_grasps(session.grasps, self.path / "grasps.csv")
         figures = {
             "settle_time": session.settle_time, "overshoot": session.overshoot, "bias": session.bias,

@@ -102,7 +102,8 @@ class LineParser:
         *ended, rest = data.split(b"\n")
         for piece in ended:
             self._add(piece)
-            events += self._end()
+            events += [decode_line(bytes(self._pending))] if self._pending else []
+            self.reset()
         self._add(rest)
         return events
 
@@ -114,11 +115,6 @@ class LineParser:
         """Keep at most one byte more than the longest line."""
         room = MAX_BODY + _CHECK + 1 - len(self._pending)
         self._pending += piece[:room]
-
-    def _end(self) -> list[Line | Damaged]:
-        data = bytes(self._pending)
-        self.reset()
-        return [decode_line(data)] if data else []
 
 
 _INT = re.compile(r"0|-?[1-9][0-9]{0,9}")
@@ -152,6 +148,12 @@ def _check(sound: bool) -> None:
 def join(values: Sequence[int | str]) -> str:
     """Return the values with commas between them."""
     return ",".join(str(value) for value in values)
+
+
+def _words(message: Request | State) -> tuple[str, ...]:
+    """Return the fields of a message in their order, each as a word."""
+    values = vars(message).values()
+    return tuple((join(v) or "-") if isinstance(v, tuple) else str(v) for v in values)
 
 
 LOST = ("open", "short")
@@ -333,9 +335,7 @@ class State:
 
     def words(self) -> tuple[str, ...]:
         """Return the words after ``ok``."""
-        numbers = (str(self.pump), str(self.grip), join(self.drive), join(self.temperatures))
-        faults = ",".join(self.faults) or "-"
-        return (self.mode, str(self.uptime_ms), self.cause, str(self.boot), faults, *numbers)
+        return _words(self)
 
 
 @dataclass(frozen=True)
@@ -450,9 +450,8 @@ class HostEnd:
 
 
 def request_words(request: Request) -> tuple[str, ...]:
-    """Return the words of a question: its name, and its numbers in their order."""
-    numbers = (join(value) if isinstance(value, tuple) else str(value) for value in vars(request).values())
-    return (type(request).__name__.lower(), *numbers)
+    """Return the words of a question: its name, and its numbers."""
+    return (type(request).__name__.lower(), *_words(request))
 
 
 def parse_request(words: Sequence[str]) -> Request | str:

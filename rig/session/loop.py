@@ -152,10 +152,8 @@ class Loop:
             return
         for reading in readings:
             if last["time_s"] + 0.5 * dt < reading.time_s < newest - 0.5 * dt:
-                row = {**last, "time_s": reading.time_s}
-                row |= {f"{name}_degC": value for name, value in reading.values.items()}
-                self.rows.append(row)
-                self._write(row)
+                self.rows.append({**last, **_measured(reading)})
+                self._write(self.rows[-1])
 
     def check(self) -> bool:
         """Have the guard check the newest reading; say whether the controller may be asked."""
@@ -190,29 +188,24 @@ class Loop:
         if phase != self.phase:
             first, self.phase = not self.phase, phase
             self.note("phase", phase, {"rooms": sorted(self.rooms)} if first else None)
-        row = {"time_s": self.reading.time_s}
-        row |= {join_header(name, self.rig.units[name]): value for name, value in drive.items()}
-        row["pump"] = float(self.move.pump)
-        row |= {f"{name}_degC": value for name, value in self.reading.values.items()}
+        row = {"time_s": self.reading.time_s, **self._orders(drive), **_measured(self.reading)}
         row |= {f"target_{name}_degC": value for name, value in self.target.items()}
-        row["phase"] = float(PHASES.index(phase))
-        self.rows.append(row)
-        self._write(row)
+        self.rows.append(row | {"phase": float(PHASES.index(phase))})
+        self._write(self.rows[-1])
 
     def record_last(self) -> None:
         """Record the reading that ended it, with the drive that is applied from then on: none."""
         if self.phase and self.reading.time_s > self.rows[-1]["time_s"]:
             self.move = Move(drive=self.no_drive(), pump=0)
-            row = {
-                **self.rows[-1],
-                **dict.fromkeys((join_header(n, u) for n, u in self.rig.units.items()), 0.0),
-            }
-            row |= {"time_s": self.reading.time_s, "pump": 0.0}
-            row |= {f"{name}_degC": value for name, value in self.reading.values.items()}
-            self.rows.append(row)
+            self.rows.append(self.rows[-1] | self._orders(self.no_drive()) | _measured(self.reading))
             if self.recorder is not None:
                 with suppress(OSError):  # it is being ended already, and the row is in the session's log
-                    self.recorder.sample(row)
+                    self.recorder.sample(self.rows[-1])
+
+    def _orders(self, drive: Mapping[str, float]) -> dict[str, float]:
+        """Return a row's columns of what is applied: the drives, and the pump of the present move."""
+        drives = {join_header(name, self.rig.units[name]): value for name, value in drive.items()}
+        return drives | {"pump": float(self.move.pump)}
 
     def wait(self, seconds: float) -> None:
         """Let time pass and read."""
@@ -346,6 +339,11 @@ def trip_of_device(error: DeviceRefusedError, reading: Reading) -> Trip:
             measured += ", latched on the device"
             return Trip(kind, reading.time_s, name or "the pump", expected, measured)
     return Trip("device", reading.time_s, "the device", "to take a drive", str(error))
+
+
+def _measured(reading: Reading) -> dict[str, float]:
+    """Return a row's columns of a reading."""
+    return {"time_s": reading.time_s} | {f"{name}_degC": value for name, value in reading.values.items()}
 
 
 def log_of_rows(

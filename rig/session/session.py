@@ -211,7 +211,7 @@ def run_session(
     recorder: Recorder | None = None,
     progress: Callable[[float, str], None] | None = None,
 ) -> Session:
-    """Bring the skin to a temperature, stop the pump, grasp, record.
+    """Bring the skin to a temperature, stop the pump, grasp, record; return what came of it.
 
     Parameters
     ----------
@@ -243,10 +243,6 @@ def run_session(
         Takes every sample and event as it happens, e.g. :class:`~thermogrip.rig.records.recorder.RunFolder`.
     progress : callable, optional
         Called with (fraction done, what is being done).
-
-    Returns
-    -------
-    session : Session
 
     Raises
     ------
