@@ -129,15 +129,16 @@ def read_toml(path: str | Path, *, hint: str) -> dict[str, Any]:
 def read_json(path: str | Path, schema: str, version: int) -> dict[str, Any]:
     """Return the JSON object in ``path``, which must have this schema and no newer version."""
     raw = read_bytes(path, share=JSON_SHARE)
-    at = {"file": path, "hint": f"it must be a JSON file of schema {schema!r}"}
+    at: dict[str, Any] = {"file": path, "hint": f"it must be a JSON file of schema {schema!r}"}
     with as_user_error(UnicodeDecodeError, "is not text, so it is not JSON", **at):
         text = raw.decode("utf-8")
-    try:
-        with as_user_error(RecursionError, "is nested too deeply", **at):
+    too_deep = as_user_error(RecursionError, "is nested too deeply", **at)
+    with too_deep, as_user_error(ValueError, "is not JSON ({error})", **at):
+        try:
             content = json.loads(text, parse_constant=_refuse_constant)
-    except json.JSONDecodeError as error:
-        problem = f"is not JSON ({error.msg}, column {error.colno})"
-        raise UserError(problem, **at, row=error.lineno) from error
+        except json.JSONDecodeError as error:
+            problem = f"is not JSON ({error.msg}, column {error.colno})"
+            raise UserError(problem, **at, row=error.lineno) from error
     check_json(content, schema, version, file=path)
     check_content(content, file=path)
     whole: dict[str, Any] = content

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError, os_faults
-from thermogrip.datasets.media import csv_text
+from thermogrip.datasets.media import csv_cell, csv_text
 from thermogrip.datasets.netcdf import open_netcdf, record_unit, write_netcdf
 from thermogrip.datasets.schema import (
     GRASP_LABELS,
@@ -452,10 +452,7 @@ def _meta_text(grasps: Grasps) -> str:
 def _samples_text(grasps: Grasps) -> str:
     """Return the long table; a sample that is NaN in every channel has no row."""
     channels = [name for name in ("t_surface", "t_surface_2") if name in grasps]
-    rows: list[Sequence[str]] = [["grasp_id", "time_s", *(f"{name}_degC" for name in channels)]]
-    time = [repr(t) for t in grasps["time"].values.tolist()]
-    for at, grasp in enumerate(grasps["grasp"].values):
-        for t, *values in zip(time, *(grasps[name].values[at].tolist() for name in channels), strict=True):
-            if any(v == v for v in values):
-                rows.append([str(grasp), t, *("" if v != v else repr(v) for v in values)])
-    return csv_text(rows)
+    table = grasps[channels].to_dataframe(["grasp", "time"])[channels].dropna(how="all").reset_index()
+    table["grasp"] = table["grasp"].map(csv_cell)
+    header = ["grasp_id", "time_s", *(f"{name}_degC" for name in channels)]
+    return table.to_csv(index=False, header=header, lineterminator="\n")

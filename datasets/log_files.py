@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from thermogrip.datasets.atomic_files import atomic_path, write_atomic
 from thermogrip.datasets.errors import UserError, as_user_error
 from thermogrip.datasets.limits import check_size, check_source
-from thermogrip.datasets.media import csv_text
+from thermogrip.datasets.media import csv_cell
 from thermogrip.datasets.netcdf import convention_unit, open_netcdf, write_netcdf
 from thermogrip.datasets.repair import (
     SPIKE_FLOOR_K,
@@ -39,7 +39,6 @@ from thermogrip.datasets.repair import (
     order_rows,
     reject_spikes,
 )
-from thermogrip.datasets.resample import cut
 from thermogrip.datasets.rosbag import bag_parts, read_rosbag_table
 from thermogrip.datasets.schema import check_log, hash_columns, make_log
 from thermogrip.datasets.tables import (
@@ -509,6 +508,8 @@ def _drop_unknown_start(
 
 
 def _cut(log: Log, start: float, stop: float, file: Path) -> Log:
+    from thermogrip.datasets.resample import cut  # it loads xarray
+
     part = cut(log, start, stop)
     part.attrs["name"] = f"{log.attrs['name']}@{_end(start)}:{_end(stop) or 'end'}"
     repairs = [line for line in str(log.attrs["repairs"]).splitlines() if line]
@@ -524,11 +525,10 @@ def _end(value: float) -> str:
 
 
 def _to_csv(log: Log) -> str:
-    header = ["time_s"] + [join_header(str(n), v.attrs["units"], [*log]) for n, v in log.data_vars.items()]
-    columns = [log["time"].values] + [log[n].values for n in log.data_vars]
-    # repr is the shortest text that reads back as the same double
-    cells = [["" if v != v else repr(v) for v in column.tolist()] for column in columns]
-    return csv_text([header]) + "".join(",".join(row) + "\n" for row in zip(*cells, strict=True))
+    """Return a log as text; each number is the shortest that reads back as the same double."""
+    names = [join_header(str(n), v.attrs["units"], [*log]) for n, v in log.data_vars.items()]
+    header = [str(csv_cell(name)) for name in names]
+    return log.to_dataframe().to_csv(header=header, index_label="time_s", lineterminator="\n")
 
 
 def _pack(text: str, path: str | Path) -> bytes:

@@ -5,7 +5,7 @@ sample measures memory.  The unit here is the touch group, or the grasp where th
 split keeps a unit whole.  Splits by session and by block keep those whole as well, and answer harder
 questions: does it work tomorrow, does it work on another block of the same material.
 
-Every function yields index arrays into the record's ``grasp`` dimension, sorted and disjoint.
+A split is two index arrays into the record's ``grasp`` dimension, (train, test), sorted and disjoint.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Split: TypeAlias = tuple[NDArray[np.int64], NDArray[np.int64]]
 def by_grasp(
     grasps: Grasps, *, train_per_class: int = 5, repeats: int = 20, seed: int = 0
 ) -> Iterator[Split]:
-    """Yield random splits with so many training units of each material; the others are the test.
+    """Return random splits with so many training units of each material; the others are the test.
 
     Parameters
     ----------
@@ -37,11 +37,6 @@ def by_grasp(
         Number of splits.
     seed : int, optional
         Same seed, same splits.
-
-    Yields
-    ------
-    train, test : ndarray of int
-        Places of grasps in the record.
 
     Raises
     ------
@@ -77,17 +72,12 @@ def by_grasp(
 
 
 def by_session(grasps: Grasps) -> Iterator[Split]:
-    """Yield one split a session: that session is the test, all others the training.
+    """Return one split a session: that session is the test, all others the training.
 
     Parameters
     ----------
     grasps : Grasps
         With ``material`` and ``session``.
-
-    Yields
-    ------
-    train, test : ndarray of int
-        Places of grasps in the record.
 
     Raises
     ------
@@ -113,7 +103,7 @@ def by_session(grasps: Grasps) -> Iterator[Split]:
 
 
 def by_block(grasps: Grasps, *, seed: int = 0) -> Iterator[Split]:
-    """Yield splits in which no block of the test was touched in training: one block of each material is
+    """Return splits in which no block of the test was touched in training: one block of each material is
     held out.
 
     There are as many splits as the material with the fewest blocks has.
@@ -124,11 +114,6 @@ def by_block(grasps: Grasps, *, seed: int = 0) -> Iterator[Split]:
         With ``material`` and ``block``.
     seed : int, optional
         Of the order in which blocks are held out.
-
-    Yields
-    ------
-    train, test : ndarray of int
-        Places of grasps in the record.
 
     Raises
     ------

@@ -573,7 +573,8 @@ def _to_float(chunked: Any) -> NDArray[np.float64]:
 def check_table(path: str | Path, *, log: bool = False) -> None:
     """Refuse a file that is no table of numbers by its name, its beginning and what it declares.
 
-    A log may have any header.  Neither pandas nor xarray is loaded.  What a shell passes on is read once, so it is not looked at here.
+    A log may have any header.  Neither pandas nor xarray is loaded.  What a shell passes on is read once, so
+    it is not looked at here.
     """
     kind = file_format(path)
     if os.path.exists(path) and not check_source(path) and not os.path.isfile(path):

@@ -17,9 +17,8 @@ from typing import Any
 from thermogrip.datasets.atomic_files import read_toml
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.units import split_header
-from thermogrip.rig.guard.guard import GuardSettings
+from thermogrip.rig.guard.guard import GuardSettings, RuleSettings
 from thermogrip.rig.guard.model_checks import ModelSettings
-from thermogrip.rig.guard.rule_checks import RuleSettings
 from thermogrip.rig.guard.sensor_checks import SensorSettings
 
 GUARD_TEMPLATE = (files(__package__) / "guard.toml").read_text(encoding="utf-8")

@@ -1,12 +1,5 @@
 """A device without hardware: either protocol on a pty or a socket, a simulated plant, faults on demand.
 
-    with VirtualDevice(plant, protocol="thermogrip") as device:
-        rig = DeviceRig(Port(device.port))
-        device.fault("sensor_open", sensor="t_tank")
-        device.fault("cable_pulled")
-        device.clear("cable_pulled")
-        device.applied_drive, device.true_temperatures
-
 The device lives in a thread of its own and moves its plant and its firmware ten times a second of its own
 clock: the computer's, many times that, or one that the host steps (:mod:`~thermogrip.rig.clock`).  What it
 does on a stepped clock depends on no scheduler.  :class:`DirectPort` leaves out thread and cable: the
@@ -259,6 +252,7 @@ class VirtualDevice:
     >>> clock.sleep(60.0)
     >>> device.true_temperatures["t1"] > 30.0
     True
+    >>> device.fault("sensor_open", sensor="t1")
     """
 
     def __init__(
@@ -445,21 +439,18 @@ class VirtualDevice:
             (self._link.pull if pull else self._link.plug)()
 
     def _set_fault(self, name: str, sensor: str | None, options: Mapping[str, Any]) -> None:
-        match name:
-            case "garbage":
-                self._garbage = float(options.get("rate", 0.5))
-            case "silence" | "deaf":
-                self._lost.add(name)
-            case "cable_pulled":
-                pass
-            case "reset":
-                self._reset(str(options.get("cause", "external")))
-            case "pump_stall":
-                self.bench.pump_stalled = True
-            case "driver_stuck":
-                self.bench.stuck = float(options.get("share", 1.0))
-            case _:
-                self.bench.set_fault(name, sensor, **options)
+        if name == "garbage":
+            self._garbage = float(options.get("rate", 0.5))
+        elif name in ("silence", "deaf", "cable_pulled"):
+            self._lost.add(name)
+        elif name == "reset":
+            self._reset(str(options.get("cause", "external")))
+        elif name == "pump_stall":
+            self.bench.pump_stalled = True
+        elif name == "driver_stuck":
+            self.bench.stuck = float(options.get("share", 1.0))
+        else:
+            self.bench.set_fault(name, sensor, **options)
         self.bench.apply(self.core.outputs)
 
     def _reset(self, cause: str) -> None:

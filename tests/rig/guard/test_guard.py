@@ -10,9 +10,8 @@ from unittest.mock import Mock, call
 import pytest
 
 from tests.rig.makers import make_heater
-from thermogrip.rig.guard.guard import Findings, Guard, GuardSettings
+from thermogrip.rig.guard.guard import Findings, Guard, GuardSettings, RuleMonitor
 from thermogrip.rig.guard.model_checks import Cause, Residual
-from thermogrip.rig.guard.rule_checks import RuleMonitor
 from thermogrip.rig.guard.trip import KINDS, Trip
 from thermogrip.rig.interface import Reading
 from thermogrip.sysid.plant.plant import Plant

@@ -12,9 +12,8 @@ import pytest
 
 from tests.rig.makers import Constant
 from thermogrip.datasets.errors import UserError
-from thermogrip.rig.guard.guard import LIMIT_MARGIN, Guard, GuardSettings
+from thermogrip.rig.guard.guard import LIMIT_MARGIN, Guard, GuardSettings, RuleSettings
 from thermogrip.rig.guard.model_checks import ModelSettings
-from thermogrip.rig.guard.rule_checks import RuleSettings
 from thermogrip.rig.guard.sensor_checks import SensorSettings
 from thermogrip.rig.guard.settings import GUARD_TEMPLATE, guard_from_dict, read_guard
 from thermogrip.rig.session.session import run_session
