@@ -103,7 +103,7 @@ def check_log(log: Log) -> Log:
     return log
 
 
-def _time_faults(log: Log) -> Iterator[tuple[str, str]]:
+def _time_faults(log: Log) -> Iterator[tuple[str, str | None]]:
     """Yield (problem, hint) of a log's time axis; each check needs those before it."""
     if "time" not in log.coords or log["time"].dims != ("time",):
         yield "no time axis", "give the record a dimension 'time' in seconds"
