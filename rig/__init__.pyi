@@ -10,8 +10,8 @@ from thermogrip.rig.interface import Rig as Rig
 from thermogrip.rig.records.batch import Trial as Trial
 from thermogrip.rig.records.batch import read_plan as read_plan
 from thermogrip.rig.records.batch import run_batch as run_batch
-from thermogrip.rig.records.recorder import RunFolder as RunFolder
 from thermogrip.rig.records.rosbridge import Bridge as Bridge
+from thermogrip.rig.records.run_folder import RunFolder as RunFolder
 from thermogrip.rig.records.run_folder import export_run as export_run
 from thermogrip.rig.records.run_folder import read_run as read_run
 from thermogrip.rig.records.run_folder import recover as recover

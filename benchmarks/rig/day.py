@@ -44,8 +44,7 @@ from thermogrip.rig.drivers.thermogrip import DeviceRefusedError, DeviceRig
 from thermogrip.rig.guard.guard import LIMIT_MARGIN, Guard
 from thermogrip.rig.guard.plant_mismatch import PlantDrift
 from thermogrip.rig.records.batch import Trial, good_run, next_folder
-from thermogrip.rig.records.recorder import RunFolder
-from thermogrip.rig.records.run_folder import read_run
+from thermogrip.rig.records.run_folder import RunFolder, read_run
 from thermogrip.rig.session.session import Object, Session, run_session
 from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
 from thermogrip.sysid.plant.plant import Plant

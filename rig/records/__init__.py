@@ -1,5 +1,5 @@
 """Run folders: written during a session, read and repaired after it, exported and streamed.
 
-Others use ``recorder.RunFolder``, ``run_folder.read_run``, ``recover`` and ``export_run``,
-``batch.run_batch`` and ``rosbridge.Bridge``.
+Others use ``run_folder.RunFolder``, ``read_run``, ``recover`` and ``export_run``, ``batch.run_batch`` and
+``rosbridge.Bridge``.
 """

@@ -33,8 +33,7 @@ from thermogrip.datasets.tables import read_csv_table
 from thermogrip.mpc.interface import Controller
 from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.interface import Rig
-from thermogrip.rig.records.recorder import RunFolder
-from thermogrip.rig.records.run_folder import mark_bad, read_run
+from thermogrip.rig.records.run_folder import RunFolder, mark_bad, read_run
 from thermogrip.rig.session.session import Object, Session, run_session
 
 SCHEMA, VERSION = "thermogrip.batch", 1
@@ -191,7 +190,7 @@ def run_batch(
     guard : Guard, optional
         One for the whole batch: what it has learnt lasts from session to session.
     about, files : mapping, optional
-        As of :class:`~thermogrip.rig.records.recorder.RunFolder`.
+        As of :class:`~thermogrip.rig.records.run_folder.RunFolder`.
     again : sequence of str, optional
         Kinds of trips after which the trial is done again at once.
     tries : int, optional

@@ -240,7 +240,7 @@ def run_session(
     stop : callable, optional
         Asked with the grasp so far after each sample of the contact; True ends it early.
     recorder : Recorder, optional
-        Takes every sample and event as it happens, e.g. :class:`~thermogrip.rig.records.recorder.RunFolder`.
+        Takes every sample and event as it happens: :class:`~thermogrip.rig.records.run_folder.RunFolder`.
     progress : callable, optional
         Called with (fraction done, what is being done).
 

@@ -164,7 +164,7 @@ def ran(bench: Bench, stand_in: StandIn, monkeypatch: pytest.MonkeyPatch) -> Sim
     made.beyond = stand_in("thermogrip.mpc.tuning.design_review.beyond_logs", ["40 degC is beyond the logs"])
     made.sections = stand_in("thermogrip.report.control.session_sections", ["a section"])
     made.pages = stand_in("thermogrip.report.html.write_report")
-    monkeypatch.setattr("thermogrip.rig.records.recorder.RunFolder", Folder)
+    monkeypatch.setattr("thermogrip.rig.records.run_folder.RunFolder", Folder)
     return made
 
 
@@ -434,7 +434,7 @@ def test_a_schedule_is_played_and_its_rows_are_counted(
     tried = stand_in("thermogrip.rig.session.schedule_player.Playback")
     plays = stand_in("thermogrip.rig.session.schedule_player.play", play)
     guards = stand_in("thermogrip.cli.rig.guard_of", "a guard")
-    monkeypatch.setattr("thermogrip.rig.records.recorder.RunFolder", Folder)
+    monkeypatch.setattr("thermogrip.rig.records.run_folder.RunFolder", Folder)
     bench.write("g.toml", "")
     words = ["record", "good.csv", "--port", "COM3", "--out", "r"]
     done = bench.run(*words, "--sample", "0.5", "--guard", "g.toml", "--speed", "4", "--protocol", "tclab",

@@ -9,7 +9,7 @@ import pytest
 from thermogrip.cli.main import main
 from thermogrip.datasets.log_files import read_log
 from thermogrip.rig.interface import Event
-from thermogrip.rig.records.recorder import RunFolder
+from thermogrip.rig.records.run_folder import RunFolder
 
 
 def killed(path: Path, n: int = 30) -> Path:

@@ -18,8 +18,7 @@ from thermogrip.rig.guard.guard import Findings, Guard, GuardSettings
 from thermogrip.rig.guard.sensor_checks import room_sensors
 from thermogrip.rig.guard.settings import guard_from_dict
 from thermogrip.rig.interface import Reading
-from thermogrip.rig.records.recorder import RunFolder
-from thermogrip.rig.records.run_folder import read_run
+from thermogrip.rig.records.run_folder import RunFolder, read_run
 from thermogrip.rig.session.session import run_session
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.contact.simulation import Grip

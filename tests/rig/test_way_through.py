@@ -14,7 +14,7 @@ from thermogrip.mpc import Controller
 from thermogrip.rig.clock import SteppedClock
 from thermogrip.rig.drivers.connect import open_rig
 from thermogrip.rig.guard.guard import Guard
-from thermogrip.rig.records.recorder import RunFolder
+from thermogrip.rig.records.run_folder import RunFolder
 from thermogrip.rig.session.schedule_player import play
 from thermogrip.rig.session.session import run_session
 from thermogrip.rig.simulation.virtual_device import VirtualDevice

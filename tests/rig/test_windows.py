@@ -50,7 +50,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.rig.clock import SteppedClock
 from thermogrip.rig.drivers.connect import open_rig
 from thermogrip.rig.session.schedule_player import play
-from thermogrip.rig.records.recorder import RunFolder
+from thermogrip.rig.records.run_folder import RunFolder
 from thermogrip.rig.records.run_folder import read_run
 from thermogrip.rig.simulation.virtual_device import VirtualDevice
 from thermogrip.datasets.schema import make_log

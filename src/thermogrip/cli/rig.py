@@ -141,7 +141,7 @@ def run(
     from thermogrip.report.control import session_sections
     from thermogrip.report.html import write_report
     from thermogrip.rig.clock import ScaledClock
-    from thermogrip.rig.records.recorder import RunFolder
+    from thermogrip.rig.records.run_folder import RunFolder
     from thermogrip.rig.session.session import run_session
 
     if stop_early is not None and grasp is None:
@@ -286,7 +286,7 @@ def record(
     from thermogrip.datasets.log_files import read_log
     from thermogrip.rig.clock import ScaledClock
     from thermogrip.rig.drivers.connect import open_rig
-    from thermogrip.rig.records.recorder import RunFolder
+    from thermogrip.rig.records.run_folder import RunFolder
     from thermogrip.rig.session.schedule_player import Playback, play
 
     plan = read_log(schedule)

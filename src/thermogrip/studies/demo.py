@@ -147,7 +147,7 @@ def _run(
     out: Path, tuning: Tuning, plant: Plant, seed: int, progress: Progress | None
 ) -> list[tuple[str, Session]]:
     """Bring the twin to the grasping temperature and grasp, once for each material."""
-    from thermogrip.rig.records.recorder import RunFolder
+    from thermogrip.rig.records.run_folder import RunFolder
     from thermogrip.rig.session.session import run_session
     from thermogrip.rig.simulation.twin import Twin
 
@@ -226,7 +226,7 @@ def _how_to_repeat() -> Section:
 
 def _fresh(folder: Path) -> Path:
     """Return the folder without the run that an earlier demo left there."""
-    from thermogrip.rig.records.recorder import NAMES
+    from thermogrip.rig.records.run_folder import NAMES
 
     if (folder / "run.json").exists():
         for name in NAMES:

@@ -35,8 +35,7 @@ from thermogrip.rig.drivers.thermogrip import DeviceRig
 from thermogrip.rig.guard.guard import Guard, GuardSettings
 from thermogrip.rig.guard.plant_mismatch import PlantDrift
 from thermogrip.rig.interface import Reading
-from thermogrip.rig.records.recorder import RunFolder
-from thermogrip.rig.records.run_folder import read_run
+from thermogrip.rig.records.run_folder import RunFolder, read_run
 from thermogrip.rig.serial.port import Port
 from thermogrip.rig.session.session import Session, run_session
 from thermogrip.rig.simulation.virtual_device import VirtualDevice, example_plant

@@ -31,12 +31,12 @@ import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell starts behind itself ignores Ctrl-C
 from pathlib import Path
 from thermogrip.mpc.interface import Move
-from thermogrip.rig.records import recorder
+from thermogrip.rig.records import run_folder
 from thermogrip.rig.clock import ScaledClock
 from thermogrip.rig.drivers.thermogrip import DeviceRig
 from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.serial.port import Port
-from thermogrip.rig.records.recorder import RunFolder
+from thermogrip.rig.records.run_folder import RunFolder
 from thermogrip.rig.session.session import run_session
 
 class Full:
@@ -51,14 +51,14 @@ class Full:
 clock = ScaledClock(float(sys.argv[3]))
 rig = DeviceRig(Port(sys.argv[1], clock=clock), clock=clock, sleep=clock.sleep)
 if sys.argv[4] == "fill":
-    write, left = recorder._write, [700]
+    write, left = run_folder._write, [700]
     def full(file, data):
         if (Path(sys.argv[2]) / ".reserve").exists():
             left[0] -= len(data)
             if left[0] < 0:
                 raise OSError(28, "No space left on device")
         return write(file, data)
-    recorder._write = full
+    run_folder._write = full
 try:
     with RunFolder(sys.argv[2]) as folder:
         session = run_session(rig, Full(), 45.0, guard=Guard(), clock=clock, recorder=folder)

@@ -15,8 +15,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.rig.interface import Event
-from thermogrip.rig.records.recorder import RunFolder
-from thermogrip.rig.records.run_folder import recover
+from thermogrip.rig.records.run_folder import RunFolder, recover
 from thermogrip.rig.session.schedule_player import Playback, play
 from thermogrip.sysid.plant.plant import Plant
 

@@ -17,8 +17,7 @@ from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.rig.drivers.thermogrip import DeviceRig
 from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.interface import Reading
-from thermogrip.rig.records.recorder import RunFolder
-from thermogrip.rig.records.run_folder import read_run
+from thermogrip.rig.records.run_folder import RunFolder, read_run
 from thermogrip.rig.serial.port import PortError
 from thermogrip.rig.session.loop import PHASES, hold_last_good
 from thermogrip.rig.session.session import Object, Session, _result, grasp_of_rows, run_session

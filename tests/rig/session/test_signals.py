@@ -16,9 +16,8 @@ import pytest
 
 from tests.rig.makers import Constant
 from thermogrip.mpc.interface import Move, Readings, Target
-from thermogrip.rig.records import recorder
-from thermogrip.rig.records.recorder import RunFolder
-from thermogrip.rig.records.run_folder import recover, sums_agree
+from thermogrip.rig.records import run_folder as recorder
+from thermogrip.rig.records.run_folder import RunFolder, recover, sums_agree
 from thermogrip.rig.session.session import run_session
 from thermogrip.rig.session.signals import hold_signals, stop_signals
 from thermogrip.rig.simulation.twin import Twin
