@@ -198,9 +198,8 @@ def _read_samples(path: str | Path) -> tuple[list[str], Floats, dict[str, Floats
     """Return grasp_id of each row, its time [s], the temperature channels [degC], and what was repaired."""
     table = read_csv_table(path, text=lambda header: not header.startswith(_NEEDED))
     if "grasp_id" not in table.text:
-        raise UserError(
-            "no column grasp_id", file=path, hint="a grasp file has grasp_id,time_s,t_surface_degC"
-        )
+        problem = "no column grasp_id"
+        raise UserError(problem, file=path, hint="a grasp file has grasp_id,time_s,t_surface_degC")
     channels, repairs = {}, list(table.notes)
     unused = [header for header in table.text if header not in ("grasp_id", "pump")]
     repairs += [f"not used: {', '.join(unused)}"] if unused else []
@@ -215,9 +214,8 @@ def _read_samples(path: str | Path) -> tuple[list[str], Floats, dict[str, Floats
             repairs.append(f"{name}: converted from {unit} to {after}")
     for need, wanted in (("time", "time_s"), ("t_surface", "t_surface_degC")):
         if need not in channels:
-            raise UserError(
-                f"no column {wanted}", file=path, hint=rename_hint(need, [*table.text, *table.numbers])
-            )
+            problem = f"no column {wanted}"
+            raise UserError(problem, file=path, hint=rename_hint(need, [*table.text, *table.numbers]))
     time = channels["time"]
     if not np.isfinite(time).all():
         row = int(table.lines[np.argmin(np.isfinite(time))])
@@ -400,9 +398,8 @@ def _check_contact(grasps: Grasps, file: str) -> Grasps:
     ):
         if not has.all():
             grasp = str(grasps["grasp"].values[int(np.argmin(has))])
-            raise UserError(
-                f"grasp {grasp!r} has no sample {side} the closed message at 0 s", file=file, hint=hint
-            )
+            problem = f"grasp {grasp!r} has no sample {side} the closed message at 0 s"
+            raise UserError(problem, file=file, hint=hint)
     return grasps
 
 

@@ -263,9 +263,8 @@ def _read_netcdf_table(path: str | Path) -> Table:
     """Return the variables over ``time`` of a NetCDF file as a table."""
     data = open_netcdf(path)
     if "time" not in data.dims or "time" not in data.variables:
-        raise UserError(
-            "no time axis", file=path, hint="give it a dimension and a variable 'time' in seconds"
-        )
+        problem = "no time axis"
+        raise UserError(problem, file=path, hint="give it a dimension and a variable 'time' in seconds")
     numbers, attrs, left = {}, {}, []
     for key in ["time", *data.data_vars]:
         name, variable = str(key), data[key]
@@ -273,9 +272,8 @@ def _read_netcdf_table(path: str | Path) -> Table:
             left.append(name)
             continue
         if variable.dtype.kind not in "fiub":
-            raise UserError(
-                f"holds {variable.dtype}, not numbers", file=path, column=name, hint="leave it out"
-            )
+            problem = f"holds {variable.dtype}, not numbers"
+            raise UserError(problem, file=path, column=name, hint="leave it out")
         numbers[name] = np.asarray(variable.values, dtype=float)
         unit = variable.attrs.get("units")
         attrs[name] = {"role": str(variable.attrs.get("role", ""))}
@@ -500,9 +498,8 @@ def _drop_unknown_start(
     if first == 0:
         return time, columns, []
     if time.size - first < 2:
-        raise UserError(
-            "an input is unknown until the last row", file=file, hint="give its value from the start"
-        )
+        problem = "an input is unknown until the last row"
+        raise UserError(problem, file=file, hint="give its value from the start")
     columns = {name: values[first:] for name, values in columns.items()}
     return time[first:], columns, [f"{first} row(s) before the first value of an input dropped"]
 

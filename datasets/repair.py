@@ -48,9 +48,8 @@ def order_rows(
     lost = ~np.isfinite(time)
     if lost.mean() > _FEW:
         row = int(lines[lost.argmax()])
-        raise UserError(
-            "has no time", file=file, row=row, column="time", hint="remove the row or give its time"
-        )
+        problem = "has no time"
+        raise UserError(problem, file=file, row=row, column="time", hint="remove the row or give its time")
     if lost.any():
         rows = rows[~lost]
         repairs.append(f"{lost.sum()} row{_s(int(lost.sum()))} without a time dropped ({_rows(lines[lost])})")

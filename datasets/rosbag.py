@@ -101,9 +101,8 @@ def _column(name: str, entry: Any, path: str | Path) -> Column:
         raise UserError("needs topic, field, unit, role", file=path, column=name, hint="name its topic")
     unit, role = str(entry.get("unit", "1")), str(entry.get("role", ""))
     if unit not in (*UNITS, "1"):
-        raise UserError(
-            f"unit {unit!r} is unknown", file=path, column=name, hint=f"use {' '.join(UNITS)} or 1"
-        )
+        problem = f"unit {unit!r} is unknown"
+        raise UserError(problem, file=path, column=name, hint=f"use {' '.join(UNITS)} or 1")
     if role not in (*ROLES, ""):
         raise UserError(f"role {role!r} is unknown", file=path, column=name, hint=f"use {', '.join(ROLES)}")
     return Column(str(entry["topic"]), str(entry.get("field", "data")), unit, role)
@@ -164,9 +163,8 @@ def _listed(path: Path) -> list[str]:
         names = [Path(str(name)).name for name in found["relative_file_paths"]]
         packed_whole = str(found.get("compression_mode", "")).lower() == "file"
     if packed_whole:
-        raise UserError(
-            f"names {names[0] if names else 'files'}, which is compressed whole", file=path, hint=_UNPACK
-        )
+        problem = f"names {names[0] if names else 'files'}, which is compressed whole"
+        raise UserError(problem, file=path, hint=_UNPACK)
     return names
 
 

@@ -230,9 +230,8 @@ def make_grasps(
         elif key in GRASP_LABELS:
             data[key] = ("grasp", np.asarray([str(v) for v in values]))
         else:
-            raise UserError(
-                f"a grasp has no {key!r}", hint=f"use {', '.join([*GRASP_NUMBERS, *GRASP_LABELS])}"
-            )
+            problem = f"a grasp has no {key!r}"
+            raise UserError(problem, hint=f"use {', '.join([*GRASP_NUMBERS, *GRASP_LABELS])}")
     data.attrs.update(schema="thermogrip.grasps", version=1, name=name)
     return check_grasps(data)
 

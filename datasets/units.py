@@ -155,9 +155,8 @@ def _plain(name: str) -> str:
 
 def _named(name: str, header: str, file: str | None) -> str:
     if not name or not re.fullmatch(r"[^\s,;\"'/]+", name):
-        raise UserError(
-            f"{name!r} is no name for a variable", file=file, column=header, hint="name the column"
-        )
+        problem = f"{name!r} is no name for a variable"
+        raise UserError(problem, file=file, column=header, hint="name the column")
     return name
 
 
@@ -182,9 +181,8 @@ def join_header(name: str, unit: str, others: Sequence[str] = ()) -> str:
     """Return the column header that is read as this name and unit, among columns of other names."""
     header = name if unit == "1" else f"{name}_{unit}"
     if read_header(header, others) != (name, unit, 1.0):
-        raise UserError(
-            f"cannot stand in a header with unit {unit!r}", column=name, hint=f"use {_listed()}, or rename"
-        )
+        problem = f"cannot stand in a header with unit {unit!r}"
+        raise UserError(problem, column=name, hint=f"use {_listed()}, or rename")
     return header
 
 
@@ -382,9 +380,8 @@ def assign_roles(
         for entry in wanted or ():
             name = find_column(entry, units, file)
             if chosen.get(name, role) != role:
-                raise UserError(
-                    f"is listed as {chosen[name]} and as {role}", file=file, column=name, hint="choose one"
-                )
+                problem = f"is listed as {chosen[name]} and as {role}"
+                raise UserError(problem, file=file, column=name, hint="choose one")
             chosen[name] = role
     stated = (given or {}) | chosen
     guesses = {n: explain_role(n, unit) for n, unit in units.items() if n not in stated}

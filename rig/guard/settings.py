@@ -7,7 +7,7 @@ No file can switch a check off: each number has a range in which the check still
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import Field, fields
 from difflib import get_close_matches
 from importlib.resources import files
@@ -157,28 +157,28 @@ def _pairs(tables: Any, file: str | Path | None) -> dict[tuple[str, str], float]
     return found
 
 
-def _faults(settings: GuardSettings) -> Sequence[tuple[str, str]]:
-    """Return (problem, hint) for numbers that contradict each other."""
-    found = []
+def _faults(settings: GuardSettings) -> Iterator[tuple[str, str]]:
+    """Yield (problem, hint) for numbers that contradict each other."""
     low, high = settings.sensors.plausible
     ranges = {"skin_degC": settings.skin_limits, "others_degC": settings.other_limits}
     ranges |= {f"limits.{name}": pair for name, pair in settings.limits.items()}
     for name, (least, most) in {"sensors.believable_degC": (low, high), **ranges}.items():
         if not least < most:
-            found.append((f"{name}: {least:g} to {most:g} is empty", "write the lower one first"))
+            yield f"{name}: {least:g} to {most:g} is empty", "write the lower one first"
         elif not low <= least <= most <= high:
             problem = f"{name}: {least:g} to {most:g} reaches beyond the plausible range, {low:g} to {high:g}"
-            found.append((problem, "narrow it, or widen sensors.believable_degC"))
+            yield problem, "narrow it, or widen sensors.believable_degC"
     w = settings.model
     if len(w.windows) != len(w.floors):
-        problem = f"model: {len(w.windows)} windows_s and {len(w.floors)} floors_K"
-        found.append((problem, "write a floor for each window"))
+        yield (
+            f"model: {len(w.windows)} windows_s and {len(w.floors)} floors_K",
+            "write a floor for each window",
+        )
     if list(w.windows) != sorted(set(w.windows)):
-        found.append((f"model.windows_s: {_text(w.windows)} do not rise", "write the shortest first"))
+        yield f"model.windows_s: {_text(w.windows)} do not rise", "write the shortest first"
     elif not w.smooth < w.windows[0]:
         problem = f"model.smooth_s: {w.smooth:g} is not less than the shortest window, {w.windows[0]:g}"
-        found.append((problem, "shorten it"))
-    return found
+        yield problem, "shorten it"
 
 
 def _text(value: Any) -> str:

@@ -431,11 +431,8 @@ def recover(folder: str | Path) -> Recovery:
     if changed == []:
         return Recovery(False, ("every file is as the run left it",), read_run(path))
     if changed:
-        raise UserError(
-            f"was changed after the run ended ({', '.join(changed)})",
-            file=path,
-            hint="restore that file, or remove SHA256SUMS to take it as it is",
-        )
+        hint = "restore that file, or remove SHA256SUMS to take it as it is"
+        raise UserError(f"was changed after the run ended ({', '.join(changed)})", file=path, hint=hint)
     run = read_run(path)
     refuse_links(path)
     findings = list(run.lost)

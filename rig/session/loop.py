@@ -95,9 +95,8 @@ class Loop:
         self.move = Move(drive=self.no_drive(), pump=1)
         for name, value in self.reading.values.items():
             if name not in self.rooms and not self.guard.sensors.plausible(value):
-                raise UserError(
-                    f"the rig's {name} reads {value:g} degC", hint="check the sensor before starting"
-                )
+                problem = f"the rig's {name} reads {value:g} degC"
+                raise UserError(problem, hint="check the sensor before starting")
         self.open_gripper()  # a session that lost its rig in contact has left it closed on the object
         self.guard.start(self.reading, self.now(), self.rig.units)
         if self.guard.model is not None and (drift := self.guard.model.drift) is not None:

@@ -217,9 +217,8 @@ class Twin:
         before the call shows from the call on.
         """
         if self.skin not in self.plant.outputs:
-            raise UserError(
-                f"this plant has no {self.skin}, so it cannot grasp", hint="use a plant with a skin"
-            )
+            problem = f"this plant has no {self.skin}, so it cannot grasp"
+            raise UserError(problem, hint="use a plant with a skin")
         touch = self._draw(material, t_object, self._grasp_rng)
         alone = self._outputs_alone()[self.skin]
         self._contact = _Contact(touch, self.time, alone + self._added(alone))
@@ -274,9 +273,8 @@ class Twin:
         rooms = room_disturbances(self.plant)
         for name in self.plant.disturbances:
             if name not in given and name not in rooms:
-                raise UserError(
-                    f"the plant has the disturbance {name!r}", hint=f"give it: disturbances={{{name!r}: ..}}"
-                )
+                problem = f"the plant has the disturbance {name!r}"
+                raise UserError(problem, hint=f"give it: disturbances={{{name!r}: ..}}")
         return np.array([given.get(name, self.ambient) for name in self.plant.disturbances], dtype=float)
 
     def _accumulate(self, seconds: float) -> None:
@@ -344,7 +342,6 @@ class Twin:
 def _input_range(plant: Plant, name: str) -> tuple[float, float]:
     unit = plant.units.get(name, "1")
     if unit not in UNIT_RANGES:
-        raise UserError(
-            f"the range of {name} [{unit}] is unknown", hint=f"give it: limits={{{name!r}: (lo, hi)}}"
-        )
+        problem = f"the range of {name} [{unit}] is unknown"
+        raise UserError(problem, hint=f"give it: limits={{{name!r}: (lo, hi)}}")
     return UNIT_RANGES[unit]
