@@ -431,8 +431,8 @@ def test_a_schedule_is_played_and_its_rows_are_counted(
     closed: list[bool] = []
     made = SimpleNamespace(units={"drive": "1"}, close=lambda: closed.append(True))
     opened = stand_in("thermogrip.rig.drivers.connect.open_rig", made)
-    tried = stand_in("thermogrip.rig.session.schedule_player.Playback")
-    plays = stand_in("thermogrip.rig.session.schedule_player.play", play)
+    tried = stand_in("thermogrip.rig.session.session.Playback")
+    plays = stand_in("thermogrip.rig.session.session.play", play)
     guards = stand_in("thermogrip.cli.rig.guard_of", "a guard")
     monkeypatch.setattr("thermogrip.rig.records.run_folder.RunFolder", Folder)
     bench.write("g.toml", "")
@@ -460,7 +460,7 @@ def test_a_schedule_that_cannot_be_played_is_refused_by_its_name_and_the_port_is
     closed: list[bool] = []
     made = SimpleNamespace(units={}, close=lambda: closed.append(True))
     stand_in("thermogrip.rig.drivers.connect.open_rig", made)
-    stand_in("thermogrip.rig.session.schedule_player.Playback", UserError("too high", hint="lower"))
+    stand_in("thermogrip.rig.session.session.Playback", UserError("too high", hint="lower"))
     done = bench.run("record", "good.csv", "--port", "COM3", "--out", "r")
     assert (done.code, done.said, closed) == (2, ["thermogrip: good.csv: too high; lower"], [True])
     assert not (bench.path / "r").exists()

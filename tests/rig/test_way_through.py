@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 
 from tests.rig.makers import make_lab
-from tests.rig.session.test_schedule_player import steps
+from tests.rig.session.test_session import steps
 from thermogrip.datasets.log_files import read_log
 from thermogrip.mpc import Controller
 from thermogrip.rig.clock import SteppedClock
 from thermogrip.rig.drivers.connect import open_rig
 from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.records.run_folder import RunFolder
-from thermogrip.rig.session.schedule_player import play
-from thermogrip.rig.session.session import run_session
+from thermogrip.rig.session.session import play, run_session
 from thermogrip.rig.simulation.virtual_device import VirtualDevice
 from thermogrip.sysid import identify
 

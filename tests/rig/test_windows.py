@@ -49,7 +49,7 @@ import json
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.clock import SteppedClock
 from thermogrip.rig.drivers.connect import open_rig
-from thermogrip.rig.session.schedule_player import play
+from thermogrip.rig.session.session import play
 from thermogrip.rig.records.run_folder import RunFolder
 from thermogrip.rig.records.run_folder import read_run
 from thermogrip.rig.simulation.virtual_device import VirtualDevice

@@ -287,7 +287,7 @@ def record(
     from thermogrip.rig.clock import ScaledClock
     from thermogrip.rig.drivers.connect import open_rig
     from thermogrip.rig.records.run_folder import RunFolder
-    from thermogrip.rig.session.schedule_player import Playback, play
+    from thermogrip.rig.session.session import Playback, play
 
     plan = read_log(schedule)
     watch = guard_of(guard, None)
