@@ -14,6 +14,8 @@ A log may be cut: ``run.csv@120:1800`` is its seconds 120 <= t < 1800 and either
 
 from __future__ import annotations
 
+import gzip
+import lzma
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -529,9 +531,6 @@ def _to_csv(log: Log) -> str:
 
 
 def _pack(text: str, path: str | Path) -> bytes:
-    import gzip
-    import lzma
-
     data = text.encode()
     ending = Path(path).suffix.lower()
     if ending == ".gz":

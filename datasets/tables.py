@@ -542,8 +542,11 @@ def _sound_parquet(path: str | Path) -> AbstractContextManager[None]:
 
 def _check_parquet(opened: Any, packed: int, path: str | Path) -> None:
     """Refuse columns that are no numbers, and a table that would be too large, before any of it is read."""
+    import pyarrow.types as kinds
+
+    numbers = (kinds.is_floating, kinds.is_integer, kinds.is_boolean)
     for entry in opened.schema_arrow:
-        if not _is_number(entry.type):
+        if not any(is_one(entry.type) for is_one in numbers):
             problem = f"holds {entry.type}, not numbers"
             raise UserError(problem, file=path, column=entry.name, hint="leave it out")
     about, columns = opened.metadata, len(opened.schema_arrow)
@@ -553,12 +556,6 @@ def _check_parquet(opened: Any, packed: int, path: str | Path) -> None:
     rows = max(about.num_rows, sum(group.num_rows for group in groups))
     pages = sum(group.column(at).total_uncompressed_size for group in groups for at in range(columns))
     check_unpacked(packed, max(8 * rows * columns, pages), file=path, what="declares")
-
-
-def _is_number(kind: Any) -> bool:
-    import pyarrow as pa
-
-    return bool(pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_boolean(kind))
 
 
 def _decode(metadata: dict[bytes, bytes] | None) -> dict[str, str]:

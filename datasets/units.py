@@ -37,6 +37,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import MOST_NUMBER
 
 UNITS = ("degC", "K", "degF", "percent", "V", "A", "W", "s", "ms", "min", "0_255")
+_SUFFIXES = " ".join(f"_{unit}" for unit in UNITS)
 
 _TIMES, _TEMPERATURES = ("s", "ms", "min"), ("degC", "K", "degF")
 
@@ -107,7 +108,7 @@ def split_header(header: str, *, file: str | None = None) -> tuple[str, str]:
         hint = rename if scale == 1 else f"convert it and {rename}"
         raise UserError("unit is spelt another way", file=file, column=header, hint=hint)
     if _BRACKETED.search(header) or _FOREIGN.get(header.rpartition("_")[2]) == "":
-        raise UserError("unit is unknown", file=file, column=header, hint=f"use one of {_listed()}, or none")
+        raise UserError("unit is unknown", file=file, column=header, hint=f"use one of {_SUFFIXES}, or none")
     return _named(header, header, file), "1"
 
 
@@ -160,10 +161,6 @@ def _named(name: str, header: str, file: str | None) -> str:
     return name
 
 
-def _listed() -> str:
-    return " ".join(f"_{unit}" for unit in UNITS)
-
-
 def rename_hint(name: str, headers: Sequence[str]) -> str:
     """Return which column to rename where ``name``, a time or a temperature, is missing."""
     wanted = _TIMES if name == "time" else _TEMPERATURES
@@ -182,7 +179,7 @@ def join_header(name: str, unit: str, others: Sequence[str] = ()) -> str:
     header = name if unit == "1" else f"{name}_{unit}"
     if read_header(header, others) != (name, unit, 1.0):
         problem = f"cannot stand in a header with unit {unit!r}"
-        raise UserError(problem, column=name, hint=f"use {_listed()}, or rename")
+        raise UserError(problem, column=name, hint=f"use {_SUFFIXES}, or rename")
     return header
 
 

@@ -399,20 +399,14 @@ def grasp_of_rows(
     )
 
 
-def _contact_time(run: Loop, grasps: Grasps | None) -> float:
-    """Return when the skin made contact [s]; NaN where it did not, which is noted."""
-    if grasps is None:
-        return np.nan
-    found = find_contact(grasps["time"].values, grasps["t_surface"].values[0])
-    if found is None:
-        run.note("no contact", "no contact was found: no object, or one as warm as the skin")
-    return np.nan if found is None else found
-
-
 def _result(run: Loop, verdict: str, grasps: Grasps | None, band: float, trip: Trip | None = None) -> Session:
     if len(run.rows) < 2:
         raise UserError("the session ended at its first reading", hint="" if trip is None else trip.line())
-    contact = _contact_time(run, grasps)
+    contact: float | None = np.nan
+    if grasps is not None:
+        contact = find_contact(grasps["time"].values, grasps["t_surface"].values[0])
+    if contact is None:
+        run.note("no contact", "no contact was found: no object, or one as warm as the skin")
     regulated = run.column("phase") <= PHASES.index("hold")
     time = run.column("time_s")[regulated]
     figures = [
@@ -434,7 +428,7 @@ def _result(run: Loop, verdict: str, grasps: Grasps | None, band: float, trip: T
         settle_time=float(np.max([figure.settle_time for figure in figures])),
         overshoot=float(np.max([figure.overshoot for figure in figures])),
         bias=float(biases[int(np.argmax(np.abs(biases)))]),
-        contact=contact,
+        contact=np.nan if contact is None else contact,
         trip=trip,
     )
 
