@@ -197,6 +197,7 @@ def test_a_header_without_a_name_is_refused(header):
         ("spindle", "V", "input"),
         ("battery", "1", "other"),
         ("rest", "s", "other"),
+        ("t_settled", "s", "other"),
     ],
 )
 def test_roles_guessed_from_names_and_units(name, unit, role):
