@@ -16,11 +16,12 @@ one that is kept, and the network, are scored besides on the last 30 percent of 
 and run freely from the log's start, where its state is known.
 
 **Which candidate is kept.**  Among black boxes that of the least error, in units of the outputs' spread, as a
-geometric mean over the folds; where the paired excess is within one standard error and 5 percent the smallest
-one, and a linear one before others. One or two logs do not show what differs between runs: of the error on
-another run, whose gain differs (:mod:`thermogrip.sysid.validation.prediction_bands`), 5 percent count as no
-difference among linear kinds, and 10 percent beside others.  On whole logs, and beside a network, that of the
-least held-out error over that of a model without input; the network also when it is within 10 percent of the
+geometric mean over the folds; where the paired excess is within one standard error and 5 percent an average
+of structures, else the smallest one, and a linear one before others.  One or two logs do not show what
+differs between runs: of the error on another run, whose gain differs
+(:mod:`thermogrip.sysid.validation.prediction_bands`), 5 percent count as no difference among linear kinds,
+and 10 percent beside others.  On whole logs, and beside a network, that of the least held-out error over that
+of a model without input; the network also when it is within 10 percent of the
 best, for its parameters mean something.  A model that no output shows to beat a model without input (see
 :mod:`thermogrip.sysid.validation.free_run`) is never called good.
 """
@@ -171,17 +172,18 @@ def choose_black_box(fits: Sequence[BlackBoxFit], between: Mapping[str, float]) 
     linear = [fit for fit in fits if fit.kind in LINEAR]
     others = [fit for fit in fits if fit.kind not in LINEAR]
     if not (linear and others):
-        return _smallest_of_the_best(fits)
+        return _preferred(fits)
     grid = fits[0].grid
     added = [between.get(name, 0.0) / spread for name, spread in zip(grid.outputs, grid.output_spread())]
-    simple, other = _smallest_of_the_best(linear), _smallest_of_the_best(others)
-    of_run = [_fold_errors(fit, float(np.sqrt(np.mean(np.square(added))))) for fit in (simple, other)]
-    excess = of_run[0] - of_run[1]
+    simple, other = _preferred(linear), _preferred(others)
+    run = float(np.sqrt(np.mean(np.square(added))))
+    least = min((_fold_errors(fit, run) for fit in linear), key=np.mean)
+    excess = least - _fold_errors(other, run)
     hardly = excess.mean() <= np.log(WITHIN_NOISE) if any(added) else excess_within_noise(excess)
     return simple if hardly else other
 
 
-def _smallest_of_the_best(fits: Sequence[BlackBoxFit]) -> BlackBoxFit:
+def _preferred(fits: Sequence[BlackBoxFit]) -> BlackBoxFit:
     between = 0.0 if len(fits[0].grid.logs) >= SEVERAL else RUN_GAIN_SD
     logs = [_fold_errors(fit, between) for fit in fits]
     best = min(logs, key=lambda errors: float(errors.mean()))
@@ -190,7 +192,7 @@ def _smallest_of_the_best(fits: Sequence[BlackBoxFit]) -> BlackBoxFit:
         for fit, e in zip(fits, logs)
         if excess_within_noise(e - best) or (between and (e - best).mean() <= HARDLY_MORE)
     ]
-    return min(near, key=lambda item: (item[0].choice.structure.size, item[1]))[0]
+    return min(near, key=lambda item: (not (of := item[0].choice.structure).members, of.size, item[1]))[0]
 
 
 def _fold_errors(fit: BlackBoxFit, between: float) -> Array:

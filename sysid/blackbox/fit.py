@@ -155,6 +155,7 @@ def fit_black_box(
     if average is None and first.dt > 1.5 * first.native and own_rows <= _MAX_ROWS and kind not in _AVERAGED:
         own = make_grid(logs, inputs=u, outputs=y, disturbances=d, average=first.native)
         grids.append(replace(own, why=f"the logs' own: held-out free runs err less than at {first.dt:.3g} s"))
+    average = kind == "subspace"  # structures of it differ in how they see the same states
     best: tuple[Grid, Choice] | None = None
     refused: UserError | None = None
     for at, grid in enumerate(grids):
@@ -164,7 +165,8 @@ def fit_black_box(
                 progress((at + done) / len(grids), f"{kind}, {what}")
 
         try:
-            choice = choose(grid, family, warmup=_warmup_rows(grid, warmup), progress=report)
+            rows = _warmup_rows(grid, warmup)
+            choice = choose(grid, family, warmup=rows, average=average, progress=report)
         except UserError as error:
             refused = error
             continue
@@ -172,7 +174,7 @@ def fit_black_box(
             best = (grid, choice)
     if best is None:
         raise refused if refused is not None else UserError(f"{kind} could not be fitted")
-    grid, choice = _with_convention(*best, logs, family, warmup)
+    grid, choice = _with_convention(*best, logs, family, warmup, average)
     return BlackBoxFit(kind, _plant(grid, choice, logs), choice, grid)
 
 
@@ -191,7 +193,7 @@ def _of_order(kind: str, order: int | None, delay: int | None) -> Family:
 
 
 def _with_convention(
-    grid: Grid, choice: Choice, logs: Sequence[Log], family: Family, warmup: float | None
+    grid: Grid, choice: Choice, logs: Sequence[Log], family: Family, warmup: float | None, average: bool
 ) -> tuple[Grid, Choice]:
     """Return grid and choice with inputs that were applied up to their rows where that errs clearly less.
 
@@ -210,7 +212,7 @@ def _with_convention(
     moved = replace(moved, why=grid.why)
     for tried in (partial(family, only=choice.structure), family):  # the same structure first: one fit a fold
         try:
-            other = choose(moved, tried, warmup=_warmup_rows(moved, warmup))
+            other = choose(moved, tried, warmup=_warmup_rows(moved, warmup), average=average)
         except UserError:  # no structure of it is stable
             return grid, choice
         excess = np.log(choice.errors[choice.structure]) - np.log(other.errors[other.structure])

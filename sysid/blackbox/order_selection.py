@@ -16,12 +16,22 @@ with the standard error of the paired differences. Logarithms, because a fold wh
 what the rest has seen is bad for every structure alike and must not outweigh the others. Models that are
 unstable or diverge on any fold are refused, and structures whose fit to all data is, or errs on them far more
 than on any fold.
+
+**Averages.** Structures that err alike on the folds may differ by much on another day, where each errs in its
+own way.  The mean of their free runs errs at most as much as they do in the mean, and less as far as their
+errors differ.  So of one or two logs, which do not show what differs between days, the average of the ten,
+five or three best structures is taken instead of the one above if
+
+    mean_f ln(hypot(e_af, s) / hypot(e_1f, s)) <= ln 1.05
+
+with the error s that another run adds, 7 percent of the outputs' spread.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -31,11 +41,13 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.models.lti import StartPrior, estimate_starts, evaluate_terms
 from thermogrip.sysid.models.model import Model as PlantModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.fit_record import RUN_GAIN_SD, SEVERAL
 from thermogrip.sysid.plant.log_grid import Grid, Segment
 
 Array = NDArray[np.float64]
 
 HARDLY_MORE = float(np.log(1.05))  # of log errors
+_AVERAGED = (10, 5, 3)  # structures
 _MOST_ON_ALL = 2.0  # times the worst fold's error: a fit to all data that errs more on them is refused
 FEWEST = 20  # rows of a block that is held out
 
@@ -57,6 +69,7 @@ class Structure(NamedTuple):
 
     label: str
     size: int
+    members: tuple[Structure, ...] = ()  # of what is the average of several
 
 
 class Family(Protocol):
@@ -142,40 +155,104 @@ def free_run_errors(
 
 
 def choose(
-    grid: Grid, family: Family, *, warmup: int, progress: Callable[[float, str], None] | None = None
+    grid: Grid,
+    family: Family,
+    *,
+    warmup: int,
+    average: bool = False,
+    progress: Callable[[float, str], None] | None = None,
 ) -> Choice:
-    """Fit every structure of the family on every fold and choose by the one-standard-error rule."""
-    scale = np.maximum(grid.output_spread(), 1e-9)
-    errors: dict[Structure, list[Array]] = {}
+    """Fit every structure of the family on every fold and choose by the one-standard-error rule.
+
+    ``average``: of one or two logs the average of the best ones is taken where it errs hardly more.
+    """
     cases = list(folds(grid))
+    scored = _score(grid, family, cases, warmup, progress)
+    left = {structure: errors.mean for structure, errors in scored.items()}
+    fitted = None
+    while fitted is None:
+        structure = _one_standard_error(left)
+        fitted = _fit_to_all(grid, family, structure, scored[structure], warmup)
+        del left[structure]
+    best = scored[structure].mean
+    for each in _averages_of(scored) if average and len(grid.logs) < SEVERAL else ():
+        scored |= _score(grid, partial(family, only=each), cases, warmup)
+        if each in scored and _hardly_worse(scored[each].mean, best):
+            averaged = _fit_to_all(grid, family, each, scored[each], warmup)
+            if averaged is not None:
+                structure, fitted = each, averaged
+                break
+    errors, labels = scored[structure], tuple(label for label, _, _ in cases)
+    table = {each: item.mean for each, item in scored.items()}
+    return Choice(structure, errors.prior, table, labels, errors.rmse, warmup, fitted)
+
+
+class _Errors(NamedTuple):
+    """The errors of a structure on the folds, from the start that served it best."""
+
+    prior: StartPrior
+    mean: Array  # (n_fold,) over the outputs, of RMSE / spread; inf: refused
+    rmse: Array  # (n_fold, n_y)
+
+
+def _score(
+    grid: Grid,
+    fit: Callable[[Grid], Mapping[Structure, Model]],
+    cases: Sequence[tuple[str, Grid, tuple[Segment, ...]]],
+    warmup: int,
+    progress: Callable[[float, str], None] | None = None,
+) -> dict[Structure, _Errors]:
+    """Return the errors of each structure that ``fit`` makes of the rest of the folds."""
+    scale = np.maximum(grid.output_spread(), 1e-9)
     refused = np.full((len(PRIORS), len(scale)), np.inf)
+    errors: dict[Structure, list[Array]] = {}
     for at, (label, train, held) in enumerate(cases):
         if progress is not None:
             progress(at / len(cases), f"without {label}")
         starts = held_out_runs(grid, held)
-        for structure, model in family(train).items():
+        for structure, model in fit(train).items():
             column = errors.setdefault(structure, [refused] * at)
             column.append(
                 free_run_errors(model, starts, dt=grid.dt, scale=scale, warmup=warmup, priors=PRIORS)
             )
         for column in errors.values():  # a structure that could not be fitted on this fold is refused
             column.extend([refused] * (at + 1 - len(column)))
-    table, best, rmse = {}, {}, {}
+    out = {}
     for structure, columns in errors.items():
         by_output = np.stack(columns)  # (n_fold, n_prior, n_y)
         by_prior = np.mean(by_output / scale, axis=2)
         with np.errstate(divide="ignore"):
             at = int(np.argmin(np.log(by_prior).mean(axis=0)))
-        table[structure], best[structure], rmse[structure] = by_prior[:, at], PRIORS[at], by_output[:, at]
-    labels = tuple(label for label, _, _ in cases)
-    left = dict(table)
-    while True:
-        structure = _one_standard_error(left)
-        fitted = family(grid, only=structure).get(structure)
-        most = _MOST_ON_ALL * float(np.max(table[structure]))
-        if fitted is not None and _error_on_all(fitted, grid, best[structure], warmup) <= most:
-            return Choice(structure, best[structure], table, labels, rmse[structure], warmup, fitted)
-        del left[structure]
+        out[structure] = _Errors(PRIORS[at], by_prior[:, at], by_output[:, at])
+    return out
+
+
+def _averages_of(scored: Mapping[Structure, _Errors]) -> list[Structure]:
+    """Return the averages of the ten, five and three best structures, as far as there are so many."""
+    logs = {s: float(np.log(np.maximum(errors.mean, 1e-12)).mean()) for s, errors in scored.items()}
+    best = sorted((structure for structure in logs if np.isfinite(logs[structure])), key=logs.__getitem__)
+    return [
+        Structure(f"average of the best {n}", sum(s.size for s in best[:n]) // n, tuple(best[:n]))
+        for n in _AVERAGED
+        if n <= len(best)
+    ]
+
+
+def _hardly_worse(errors: Array, least: Array) -> bool:
+    """Return whether errors on the folds hardly exceed others on another run, where the gain differs too."""
+    excess = np.log(np.hypot(errors, RUN_GAIN_SD)) - np.log(np.hypot(least, RUN_GAIN_SD))
+    return bool(excess.mean() <= HARDLY_MORE)
+
+
+def _fit_to_all(
+    grid: Grid, family: Family, structure: Structure, errors: _Errors, warmup: int
+) -> Model | None:
+    """Return the structure fitted to all data; None if it is unstable, or errs far more than on any fold."""
+    fitted = family(grid, only=structure).get(structure)
+    most = _MOST_ON_ALL * float(np.max(errors.mean))
+    if fitted is None or _error_on_all(fitted, grid, errors.prior, warmup) > most:
+        return None
+    return fitted
 
 
 def _error_on_all(model: Model, grid: Grid, prior: StartPrior, warmup: int) -> float:

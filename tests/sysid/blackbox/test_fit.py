@@ -248,6 +248,7 @@ def test_a_plant_keeps_what_the_choice_found(monkeypatch, dt, share):
         ("arx", 2.0, 2001, None, {2.0: 0.3}, 2.0),  # 8004 rows of the log
         ("arx", 0.75, 400, None, {0.75: 0.3}, 0.75),
         ("oe", 2.0, 400, 2.0, {2.0: 0.3}, 2.0),
+        ("subspace", 2.0, 400, 2.0, {2.0: 0.3}, 2.0),
         ("sindy", 2.0, 400, None, {2.0: 0.3}, 2.0),
         ("neural", 2.0, 400, None, {2.0: 0.3}, 2.0),
     ],
@@ -255,7 +256,8 @@ def test_a_plant_keeps_what_the_choice_found(monkeypatch, dt, share):
 def test_the_logs_own_rate_is_tried_beside_a_chosen_one(monkeypatch, kind, dt, rows, average, errors, kept):
     tried, said = [], []
 
-    def choose_by_step(grid, family, *, warmup, progress):
+    def choose_by_step(grid, family, *, warmup, average, progress):
+        assert average == (kind == "subspace")
         tried.append(grid.dt)
         progress(0.5, "x")
         if errors[grid.dt] is None:
@@ -301,7 +303,8 @@ def test_inputs_up_to_their_rows_are_taken_where_that_errs_clearly_less(
     def choice_of(error):
         return SimpleNamespace(structure="s", errors={"s": error * np.array([1.0, 1.0, 1.0])})
 
-    def choose_next(grid, family, *, warmup):
+    def choose_next(grid, family, *, warmup, average):
+        assert average == "as before"
         asked.append((grid.ends, getattr(family, "keywords", None), warmup))
         if others[len(asked) - 1] is None:
             raise UserError("unstable")
@@ -311,7 +314,7 @@ def test_inputs_up_to_their_rows_are_taken_where_that_errs_clearly_less(
     monkeypatch.setattr(fitting, "make_grid", lambda *a, average, ends, **n: stub_grid(dt=average, ends=ends))
     monkeypatch.setattr(fitting, "choose", choose_next)
     grid = stub_grid(dt=dt, why="so")
-    found, choice = fitting._with_convention(grid, first, [], FAMILIES[family], 9.0)
+    found, choice = fitting._with_convention(grid, first, [], FAMILIES[family], 9.0, "as before")
     assert (found.ends, found.dt, found.why, choice is not first) == (moved, dt, "so", moved)
     assert asked == [(True, {"only": "s"}, 9 / dt), (True, None, 9 / dt)][: len(others)]
 

@@ -9,6 +9,7 @@ import pytest
 
 from thermogrip.sysid.blackbox import neural
 from thermogrip.sysid.blackbox.neural import _Data, _Linear, _Member, saturation_levels
+from thermogrip.sysid.blackbox.order_selection import Structure
 from thermogrip.sysid.models.neural_kernel import run_states
 from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid
 
@@ -50,7 +51,7 @@ def test_eight_rows_at_an_end_are_a_rail(rows, scatter, stands):
 def test_a_structure_has_its_numbers_and_all_together_the_least():
     one, other = (neural.structure_of(grid_of(np.eye(2)), *size) for size in ((4, 3), (3, 8)))
     # A 16, B 12, c 4; V and W 24, U 9, b 3
-    assert (one, other) == (("4 states, 3 units", 68), ("3 states, 8 units", 101))
+    assert (one, other) == (Structure("4 states, 3 units", 68), Structure("3 states, 8 units", 101))
     assert [neural._together(some).size for some in ([other, one], [])] == [68, 0]
 
 

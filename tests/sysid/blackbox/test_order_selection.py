@@ -174,6 +174,58 @@ def test_the_choice_has_the_errors_of_its_structure_and_of_its_best_prior(monkey
 
 
 @pytest.mark.parametrize(
+    ("logs", "errors", "on_all", "chosen"),
+    [  # errors on all folds of the averages of ten, five and three; the best one errs 0.1
+        ("a", (0.1, 0.1, 0.1), 0.2, 10),
+        ("a", (0.1085, 0.1, 0.1), 0.1, 5),  # hypot(0.1085, 0.07) is 1.058 times hypot(0.1, 0.07)
+        ("a", (0.107, 0.1, 0.1), 0.1, 10),  # 1.047
+        ("a", (np.inf, None, 0.1), 0.1, 3),
+        ("a", (0.11, 0.11, 0.11), 0.1, 1),
+        ("a", (0.1, 0.11, 0.05), 0.21, 1),  # twice the error of its folds, on all data
+        ("ab", (0.1, 0.1, 0.1), 0.1, 10),
+        ("abc", (0.01, 0.01, 0.01), 0.1, 1),  # whose folds are other runs
+    ],
+)
+def test_an_average_is_chosen_where_it_errs_hardly_more_on_another_run(
+    monkeypatch, logs, errors, on_all, chosen
+):
+    grid = grid_of(*(segment(np.outer([0, 1] * 60, [4]), log=n) for n in logs))
+    single = {Structure(f"s{k}", 10 + k): 0.1 + 0.01 * k for k in range(10)}
+    of = dict(zip((10, 5, 3), errors))
+
+    def family(part, *, only=None):
+        if only is None:
+            return {s: (1, e) for s, e in single.items()}
+        if not only.members:
+            return {only: (1, single[only])}
+        assert only.members == tuple(single)[: len(only.members)]
+        assert (only.label, only.size) == (
+            f"average of the best {len(only.members)}",
+            {10: 14, 5: 12, 3: 11}[len(only.members)],
+        )
+        error = of[len(only.members)]
+        return {} if error is None else {only: (len(only.members), error)}
+
+    def errors_of(model, segments, *, dt, scale, warmup, priors):
+        error = on_all if len(priors) == 1 and model[0] > 1 else model[1]
+        return np.full((len(priors), 1), error) * scale
+
+    monkeypatch.setattr(selection, "free_run_errors", errors_of)
+    choice = selection.choose(grid, family, warmup=6, average=True)
+    assert (len(choice.structure.members) or 1, choice.model[0]) == (chosen, chosen)
+    assert choice.error == pytest.approx(choice.model[1])
+    assert not selection.choose(grid, family, warmup=6).structure.members
+    few = dict(list(single.items())[:2])
+    two = selection.choose(
+        grid,
+        lambda part, only=None: {s: (1, e) for s, e in few.items() if only in (None, s)},
+        warmup=6,
+        average=True,
+    )
+    assert two.structure.label == "s0"
+
+
+@pytest.mark.parametrize(
     ("excess", "within"),
     [
         ((0.0, 0.0), True),

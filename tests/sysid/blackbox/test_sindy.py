@@ -12,6 +12,7 @@ import pytest
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.blackbox import sindy
+from thermogrip.sysid.blackbox.order_selection import Structure
 from thermogrip.sysid.blackbox.sindy import sindy_family
 from thermogrip.sysid.models.polynomial import SindyModel
 from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid
@@ -135,7 +136,7 @@ def test_the_structures_are_degrees_thresholds_memories_and_widths(grid, monkeyp
     for (n, m), count in terms.items():
         for w, (at, h) in product((0, 12, 36) if m == 1 else (0,), enumerate((0.0, 0.01, 0.05))):
             label = f"degree {n}, memory {m}, threshold {h:g}" + f", weak over {w} rows" * (w > 0)
-            want[label, count - at] = n, m, h, w
+            want[Structure(label, count - at)] = n, m, h, w
     assert found == want
     (only,) = sindy_family(
         grid,
@@ -143,7 +144,7 @@ def test_the_structures_are_degrees_thresholds_memories_and_widths(grid, monkeyp
         memories=(1,),
         widths=(0,),
         thresholds=(0.3, 0.2),
-        only=("degree 0, memory 1, threshold 0.3", 1),
+        only=Structure("degree 0, memory 1, threshold 0.3", 1),
     ).values()
     assert only == (0, 1, 0.3, 0)
 
