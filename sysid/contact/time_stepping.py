@@ -311,26 +311,6 @@ def _value_pass(decay: Array, gain: Array, sensor: Array, x: Array, q: float) ->
 
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
-def _contact_pass(
-    decay: Array, gain: Array, sensor: Array, x: Array, x1: Array, x2: Array, q: float, q1: float, q2: float
-) -> tuple[float, float, float, float, float, float]:
-    """Move value and derivatives by the contact on, which share all but the flux; return their sums."""
-    w = w1 = w2 = n = n1 = n2 = 0.0
-    for j in range(x.size):
-        v = decay[j] * x[j] + gain[j] * q
-        v1 = decay[j] * x1[j] + gain[j] * q1
-        v2 = decay[j] * x2[j] + gain[j] * q2
-        x[j], x1[j], x2[j] = v, v1, v2
-        w += v
-        w1 += v1
-        w2 += v2
-        n += sensor[j] * v
-        n1 += sensor[j] * v1
-        n2 += sensor[j] * v2
-    return w, w1, w2, n, n1, n2
-
-
-@numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def _moved_pass(
     decay: Array, gain: Array, sensor: Array, d_decay: Array, d_gain: Array, x0: Array, x: Array, q0: float,
     q: float,
@@ -462,7 +442,9 @@ def _followed_steps(
             w3, p3 = _moved_pass(decay, gain, sensor, d_decay3, d_gain3, x0, x3, q, q3)
         if by_c:
             w4, p4 = _moved_pass(decay, gain, sensor, d_decay4, d_gain4, x0, x4, q, q4)
-        w, w1, w2, p, p1, p2 = _contact_pass(decay, gain, sensor, x0, x1, x2, q, q1, q2)
+        w, p = _value_pass(decay, gain, sensor, x0, q)
+        w1, p1 = _value_pass(decay, gain, sensor, x1, q1)
+        w2, p2 = _value_pass(decay, gain, sensor, x2, q2)
         gap = (1.0 - w - fast * q) * invert
         q_new = h * gap
         flux[i] = q_new
