@@ -138,10 +138,10 @@ def test_differences_are_of_the_tests_that_both_have() -> None:
         "McNemar exact",
     )
     three = Comparison("shipped", 1, 0, tuple(said(c, "wet", "i1", c != "b", 0.9) for c in "abc"))
-    assert [(r["first"], r["second"], r["low"]) for r in three.differences()] == [
-        ("a", "b", None),
-        ("a", "c", None),
-        ("b", "c", None),
+    assert [(r["first"], r["second"], r["difference"], r["low"]) for r in three.differences()] == [
+        ("a", "b", 1.0, None),
+        ("a", "c", 0.0, None),
+        ("b", "c", -1.0, None),
     ]
 
 

@@ -178,7 +178,7 @@ def test_six_terms_propose_and_the_first_that_asks_is_named():
 
 def test_block_means_leave_out_what_is_lost():
     cell = np.array([0, 0, 2, 2, 2, 5])
-    values = np.array([[1.0, 2.0], [3.0, np.nan], [4.0, np.nan], [np.nan, np.nan], [8.0, np.nan], [9.0, 1.0]])
+    values = np.array([[1.0, 2.0], [3.0, np.nan], [4.0, np.nan], [np.inf, np.nan], [8.0, np.nan], [9.0, 1.0]])
     np.testing.assert_array_equal(candidates._means(values, cell), [[2.0, 2.0], [6.0, np.nan], [9.0, 1.0]])
 
 
