@@ -21,8 +21,8 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.sysid.blackbox.missing_data import MANY, expected_moments
 from thermogrip.sysid.blackbox.order_selection import (
     Structure,
@@ -33,8 +33,6 @@ from thermogrip.sysid.blackbox.order_selection import (
 )
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import Grid
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from thermogrip.datasets.arrays import Array
+
 Index = NDArray[np.int64]
 
 _LOG_2PI = float(np.log(2 * np.pi))

@@ -22,11 +22,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.sysid.plant.log_grid import Segment
-
-Array = NDArray[np.float64]
 
 MANY = 0.005  # of the rows lack a reading: below it they are left out, for little is lost with them
 ENOUGH = 0.02  # of ln p: a round that gains less is the last one

@@ -37,13 +37,12 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.blas import dsyrk
 
+from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.sysid.blackbox.order_selection import Structure
 from thermogrip.sysid.blackbox.subspace import subspace_family
 from thermogrip.sysid.models.neural import NeuralModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import Grid
-
-Array = NDArray[np.float64]
 
 RIDGE = 3.0  # rho; the data count as many readings as there are rows
 STANDS = 8  # rows in a row at the end of the range make a saturation level
@@ -159,7 +158,7 @@ def _together(structures: Iterable[Structure]) -> Structure:
     return Structure("members of all sizes", min((some.size for some in structures), default=0))
 
 
-def _longest_run(constant: NDArray[np.bool_]) -> int:
+def _longest_run(constant: Mask) -> int:
     edges = np.flatnonzero(np.diff(np.concatenate([[0], constant.astype(int), [0]])))
     return int((edges[1::2] - edges[::2]).max(initial=0))
 

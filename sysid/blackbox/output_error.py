@@ -35,10 +35,10 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.signal import lfilter
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.sysid.blackbox.order_selection import (
     Structure,
     as_state_space,
@@ -48,8 +48,6 @@ from thermogrip.sysid.blackbox.order_selection import (
 )
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import Grid, bridge
-
-Array = NDArray[np.float64]
 
 RIDGE = 1e-10  # of unit columns: two that are alike share their effect
 ENOUGH = 1e-5  # of the cost: a step that gains less is the last one

@@ -32,11 +32,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.sysid.blackbox.order_selection import Structure
 from thermogrip.sysid.models.polynomial import SindyModel
 from thermogrip.sysid.plant.log_grid import Grid, Segment, whole_readings
-
-Array = NDArray[np.float64]
 
 
 def sindy_family(
