@@ -499,3 +499,9 @@ def test_a_stream_that_begins_with_the_contact_reports_it() -> None:
     touch.update(0.1, 45.0)
     with pytest.raises(UserError, match=r"no reading before contact, and now it is 0\.3 s; start at -1 s"):
         touch.update(0.3, 45.0)
+
+
+def test_a_stream_begins_at_the_prior_odds():
+    known = PosteriorClassifier(priors={"copper": 3.0}).with_device(load_default_gripper())
+    touch = Stream(known, candidates=["copper", "wood"], t_object=28.0, t_ambient=27.0)
+    assert touch.update(-1.0, 23.0) == pytest.approx({"copper": 0.75, "wood": 0.25})
