@@ -89,11 +89,8 @@ def read_within(stream: BinaryIO, most: int) -> bytes:
 
 
 def unpack_within(stream: BinaryIO, source: BinaryIO, *, file: str | Path, most: int | None = None) -> bytes:
-    """Return what ``stream`` unpacks from the open file ``source``, or its first ``most`` bytes.
-
-    What has come out is compared with what has been read so far, so a file that grows too much is refused
-    after 8 MiB, whatever its size.
-    """
+    """Return what ``stream`` unpacks from the open file ``source``, or its first ``most`` bytes; what came
+    out is compared with what has been read so far, so what grows too much is refused after 8 MiB."""
     found = io.BytesIO()
     while most is None or found.tell() < most:
         left = most_unpacked(source.tell()) + 1 - found.tell()

@@ -131,11 +131,8 @@ def find_material(name: str) -> Material:
 
 
 def read_materials(text: str, *, file: str = "materials.csv") -> list[Material]:
-    """Return the materials in a CSV text, each checked.
-
-    Its columns are name, kind, k, rho, c_p, effusivity, effusivity_sd_percent, aliases (separated by ``;``),
-    source.
-    """
+    """Return the materials in a CSV text, each checked: name, kind, k, rho, c_p, effusivity,
+    effusivity_sd_percent, aliases (separated by ``;``), source."""
     materials: list[Material] = []
     taken: set[str] = set()
     for line, row in enumerate(csv.DictReader(io.StringIO(text)), start=2):

@@ -22,6 +22,8 @@ is interpolated.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -52,7 +54,8 @@ def order_rows(
         raise UserError(problem, file=file, row=row, column="time", hint="remove the row or give its time")
     if lost.any():
         rows = rows[~lost]
-        repairs.append(f"{lost.sum()} row{_s(int(lost.sum()))} without a time dropped ({_rows(lines[lost])})")
+        which = name_rows(lines[lost])
+        repairs.append(f"{lost.sum()} row{_s(int(lost.sum()))} without a time dropped ({which})")
     back = time[rows] < np.maximum.accumulate(time[rows])
     order = np.argsort(time[rows], kind="stable")
     if back.any():
@@ -61,7 +64,7 @@ def order_rows(
             problem = f"time runs back from {time[rows[at]]:g} s to {time[rows[at + 1]]:g} s"
             hint = "sort the rows, cut the file there in two, or give the step of all rows with --dt"
             raise UserError(problem, file=file, row=int(lines[rows[at + 1]]), hint=hint)
-        which = _rows(lines[rows[back]])
+        which = name_rows(lines[rows[back]])
         repairs.append(f"{back.sum()} row{_s(int(back.sum()))} out of order sorted ({which})")
         rows = rows[order]
     first = np.concatenate([[True], np.diff(time[rows]) > 0])
@@ -72,7 +75,7 @@ def order_rows(
         repairs.append(f"time has {starts.size} stamps for {rows.size} rows: rows spread evenly between them")
         return np.interp(np.arange(rows.size), *ends), rows, repairs
     if repeats:
-        which = _rows(lines[rows[~first]])
+        which = name_rows(lines[rows[~first]])
         repairs.append(f"{repeats} repeated time stamp{_s(repeats)} dropped ({which})")
     return time[rows[first]], rows[first], repairs
 
@@ -122,11 +125,8 @@ def describe_gaps(time: Floats, inputs: dict[str, Floats]) -> list[str]:
 
 
 def find_spikes(values: Floats, *, floor: float | None, step: float = 0.0) -> NDArray[np.bool_]:
-    """Return which samples (n,) of a channel are spikes, by the rule above; NaN is skipped.
-
-    ``floor`` is the least deviation that can be one, None to derive it from the channel; ``step`` is the time
-    between rows [s].
-    """
+    """Return which samples (n,) of a channel are spikes, by the rule above; NaN is skipped.  ``floor`` is the
+    least deviation that can be one, None to derive it from the channel; ``step`` is that of the rows [s]."""
     spikes = np.zeros(values.shape, dtype=bool)
     seen = np.flatnonzero(np.isfinite(values))
     if seen.size < SPIKE_WINDOW:
@@ -227,6 +227,6 @@ def _s(count: int) -> str:
     return "" if count == 1 else "s"
 
 
-def _rows(lines: NDArray[np.int64]) -> str:
-    shown = ", ".join(str(line) for line in lines[:8]) + (", ..." if lines.size > 8 else "")
-    return f"row{_s(lines.size)} {shown}"
+def name_rows(lines: Sequence[int] | NDArray[np.int64], most: int = 8) -> str:
+    """Return rows in words, the first few by their lines."""
+    return f"row{_s(len(lines))} {', '.join(map(str, lines[:most]))}{', ...' if len(lines) > most else ''}"

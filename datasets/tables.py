@@ -45,6 +45,7 @@ from thermogrip.datasets.limits import (
 )
 from thermogrip.datasets.media import from_csv
 from thermogrip.datasets.netcdf import check_netcdf
+from thermogrip.datasets.repair import name_rows
 from thermogrip.datasets.units import read_header
 
 FORMATS = {
@@ -139,10 +140,8 @@ class Layout:
 
 
 def read_text_table(path: str | Path, columns: Sequence[str] | None = None) -> Table:
-    """Return the columns of a text table that any program wrote.
-
-    ``columns`` are names in place of the file's own, one a column, ``-`` to leave one out.
-    """
+    """Return the columns of a text table that any program wrote; ``columns`` are names in place of the file's
+    own, one a column, ``-`` to leave one out."""
     return parse_text(_text_of(path), str(path), columns)
 
 
@@ -304,7 +303,7 @@ def _parse_table(
             problem = f"has {counts[0] if counts else 0} cell(s), the header has {len(names)}{more}"
             faults.append(UserError(problem, file=file, row=odd[0], hint="complete or remove the row"))
         elif odd:
-            notes += (f"{len(odd)} row(s) with too few or too many cells left out ({_some(odd)})",)
+            notes += (f"{len(odd)} row(s) with too few or too many cells left out ({name_rows(odd, 5)})",)
     if table is None:
         hint = "open it in an editor and compare its rows"
         raise faults[0] if faults else UserError("is not a table", file=file, hint=hint)
@@ -348,7 +347,7 @@ def _read_cells(
     first = cells.iloc[wrong[0]] if wrong.size else ""
     if wrong.size <= 2 * broken * int((~lost).sum()):
         numbers[name] = values
-        where = f"{_some(lines[wrong])}: {_shown(first)}"
+        where = f"{name_rows(lines[wrong], 5)}: {_shown(first)}"
         words = (
             (f"{name}: {wrong.size} cell(s) that are no numbers left empty ({where})",) if wrong.size else ()
         )
@@ -373,11 +372,6 @@ def _cell_numbers(column: Any, separator: str) -> tuple[Any, NDArray[np.float64]
     if comma:
         plain = cells.str.replace(",", ".")
     return cells, np.asarray(pd.to_numeric(plain, errors="coerce"), dtype=float), comma
-
-
-def _some(lines: Sequence[int] | NDArray[np.int64]) -> str:
-    s = "" if len(lines) == 1 else "s"
-    return f"row{s} {', '.join(str(line) for line in lines[:5])}{', ...' if len(lines) > 5 else ''}"
 
 
 def _shown(cell: str) -> str:
@@ -589,10 +583,8 @@ def check_table(path: str | Path, *, log: bool = False) -> None:
 
 
 def _text_of(path: str | Path, most: int | None = None) -> bytes:
-    """Return the text of a file, unpacked, within the limits of :mod:`thermogrip.datasets.limits`.
-
-    ``most`` is how much of its beginning is enough [bytes].
-    """
+    """Return the text of a file, unpacked, within the limits of :mod:`thermogrip.datasets.limits`, or as much
+    of its beginning as ``most`` [bytes]."""
     check_size(check_source(path), file=path)
     openers: dict[str, Any] = {".gz": gzip.open, ".xz": lzma.open}
     opener = openers.get(Path(path).suffix.lower())

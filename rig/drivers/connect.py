@@ -18,10 +18,8 @@ _ROUND_S = 0.5
 
 
 def recognise(port: Port, *, seconds: float = 6.0) -> str:
-    """Return the protocol behind an open port, ``thermogrip`` or ``tclab``, or raise PortError.
-
-    An Arduino starts anew when its port is opened, so it has ``seconds`` (real ones) to answer.
-    """
+    """Return the protocol behind an open port, ``thermogrip`` or ``tclab``, or raise PortError; an Arduino
+    starts anew when its port is opened, so it has ``seconds`` (real ones) to answer."""
     host, heard_all = HostEnd(), b""
     for _ in range(max(1, round(seconds / (2 * _ROUND_S)))):
         for question in (b"\n" + host.ask(Hello()), b"\r\nVER\r\n"):

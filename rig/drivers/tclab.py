@@ -115,10 +115,8 @@ class TCLabRig(NoticeBook):
         return float("inf")
 
     def read(self) -> Reading:
-        """Return the newest scan; NaN where a sensor is lost, everywhere while the board does not answer.
-
-        Of a board that does not answer the heaters are what they were set to: nothing there ends them.
-        """
+        """Return the newest scan; NaN where a sensor is lost, everywhere while the board does not answer (its
+        heaters are then what they were set to: nothing there ends them)."""
         try:
             temperatures, heaters = self._checked_scan()
             if self.faults and any(heaters):  # it tripped while the board could not be reached

@@ -56,11 +56,8 @@ class DeviceClock:
 
 
 class Gathering:
-    """Fetches the readings that a device takes by its own clock, each once.
-
-    ``number`` is that of the reading to ask for next, ``lost`` counts ticks of which no reading will ever
-    come.
-    """
+    """Fetches the readings that a device takes by its own clock, each once: ``number`` is that of the next
+    to ask for, ``lost`` counts ticks of which no reading will ever come."""
 
     def __init__(self, period_ms: int) -> None:
         self.period_ms, self.number, self.lost = period_ms, 0, 0
@@ -194,10 +191,8 @@ class DeviceRig(NoticeBook):
         self._command, self._confirmed = None if idle else (dict(drive), pump), self._clock()
 
     def wait(self, seconds: float) -> None:
-        """Let time pass and renew the drive; one that cannot be renewed ends on the device.
-
-        Waits that follow each other end on a grid (:class:`~thermogrip.rig.clock.Metronome`).
-        """
+        """Let time pass, on a grid of consecutive waits, and renew the drive; one that cannot be renewed ends
+        on the device."""
         if not seconds >= 0:
             raise ValueError(f"cannot wait {seconds:g} s")
         end = self._beat.next(seconds)
@@ -208,10 +203,8 @@ class DeviceRig(NoticeBook):
                 self._renew()
 
     def sample_every(self, seconds: float) -> bool:
-        """Let the device take a reading every so many seconds by its own clock; 0 ends it.
-
-        Returns False where its firmware is older, or it cannot keep this time.
-        """
+        """Let the device take a reading every so many seconds by its own clock, 0 for none; False where its
+        firmware is older, or it cannot keep this time."""
         period = round(1000 * seconds)
         possible = MIN_PERIOD_MS <= period <= MAX_PERIOD_MS and abs(period - 1000 * seconds) < 1e-6
         self._gathering = None
@@ -227,10 +220,8 @@ class DeviceRig(NoticeBook):
         return period > 0
 
     def take(self) -> tuple[list[Reading], int]:
-        """Return the device's own readings since the last call, oldest first, and how many were lost.
-
-        None come while the device cannot be reached; it goes on taking them.
-        """
+        """Return the device's own readings since the last call, oldest first, and how many were lost; none
+        come while it cannot be reached, and it goes on taking them."""
         gathering = self._gathering
         if gathering is None:
             raise RuntimeError("the device takes no readings of its own; see sample_every")

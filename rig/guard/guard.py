@@ -98,11 +98,8 @@ class RuleMonitor:
         room: float,
         target: Mapping[str, float],
     ) -> Trip | None:
-        """Return the trip, if any.
-
-        ``drive`` is what was applied since the last call, -1...1 of its range, positive heats; temperatures
-        and targets are in degC, no target where nothing is regulated.
-        """
+        """Return the trip, if any; ``drive`` is what was applied since the last call, -1...1 of its range,
+        positive heats; temperatures and targets are in degC, no target where nothing is regulated."""
         self._past.append((time, drive, dict(accepted)))
         while self._past and time - self._past[0][0] > self.settings.window:
             self._past.popleft()
@@ -275,10 +272,8 @@ class Guard:
         self._time, self._released, self._touched = float("-inf"), float("-inf"), False
 
     def start(self, reading: Reading, now: float, units: Mapping[str, str]) -> None:
-        """Begin a session at a reading, the host's time [s] and the drives' units; nothing is driven yet.
-
-        What the model knows of the rig is kept from a session that ended well a few minutes ago.
-        """
+        """Begin a session at a reading, the host's time [s] and the drives' units, nothing driven yet and
+        what the model knows of the rig from a session that ended well a few minutes ago."""
         age = reading.time_s - self._time
         known = not self.trips and 0 <= age <= _KEPT_S
         self._span = {name: UNIT_RANGES.get(unit, (-1.0, 1.0)) for name, unit in units.items()}
@@ -344,10 +339,8 @@ class Guard:
     def check(
         self, reading: Reading, now: float, *, planned: float = 0.0, touching: bool = False
     ) -> Findings:
-        """Return the accepted values of a reading, and whether to go on.
-
-        ``now`` is the host's time [s], ``planned`` how long the loop meant to wait since the last check [s].
-        """
+        """Return the accepted values of a reading, and whether to go on; ``now`` is the host's time [s],
+        ``planned`` how long the loop meant to wait since the last check [s]."""
         trip = self._clocks(reading, now, planned)
         seen, late = self._seen == reading.time_s, now > self._now
         self._now = now

@@ -135,10 +135,8 @@ class History:
         return [m for m in self._kept if m.time > time]
 
     def errors(self, begin: Estimate, y: Array) -> Array:
-        """Return reading less path (B, n_readings, n_y) of every later estimate.
-
-        ``y`` (B, N + 1, n_y) are the paths' outputs [degC] at native steps, that of ``begin`` first.
-        """
+        """Return reading less path (B, n_readings, n_y) of every later estimate, for paths with the outputs
+        ``y`` (B, N + 1, n_y) [degC] at native steps, that of ``begin`` first."""
         later = self.after(begin.time)
         at = [m.step - begin.step for m in later]
         return np.asarray(np.array([m.y for m in later])[None] - y[:, at])
@@ -306,10 +304,8 @@ class RigFilter:
         return out
 
     def _agree(self, y: Array) -> bool:
-        """Say whether all readings agree, and with the room: then the rig has not run for long.
-
-        A tank that is a little warmer than the skin is not at rest: the water in the tubes is not known.
-        """
+        """Say whether all readings agree, and with the room: then the rig has not run for long.  A tank that
+        is a little warmer than the skin is not at rest: the water in the tubes is not known."""
         plant = self.model.plant
         rooms = self.d[[plant.disturbances.index(name) for name in room_disturbances(plant)]]
         if not np.isfinite(y).any():

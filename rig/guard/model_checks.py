@@ -109,10 +109,8 @@ def by_danger(causes: Sequence[Cause], output: str) -> list[tuple[str, str]]:
 
 
 def _hypotheses(model: RigModel, u: Array, w: Array) -> tuple[list[Cause], Array]:
-    """Return causes (no fault first) and inputs (B, N, n_u) of what was applied (N, n_u) with biases w.
-
-    The biases of the drives hold until the onset, and not for what a broken driver gives.
-    """
+    """Return causes (no fault first) and inputs (B, N, n_u) of what was applied (N, n_u) with biases w of the
+    drives, which hold until the onset, and not for what a broken driver gives."""
     causes, rows = [_NO_FAULT], [model.biased(u, w)]
     for part in _ONSETS:
         since = int(part * len(u))

@@ -121,10 +121,8 @@ class RunFolder:
         self._closed = False
 
     def sample(self, row: Mapping[str, float]) -> None:
-        """Write one row; the first one sets the columns, and others are a ValueError.
-
-        OSError where the disk is full or gone; the row is on disk if the reserve had room for it.
-        """
+        """Write one row; the first one sets the columns, and others are a ValueError.  OSError where the disk
+        is full or gone; the row is on disk if the reserve had room for it."""
         if not self._header:
             self._header = tuple(row)
             self._samples.write(csv_text([self._header]).rstrip("\n"))

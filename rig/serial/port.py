@@ -57,10 +57,8 @@ class PortError(UserError):
 
 
 class PortLock:
-    """A lock on a port's name (links to one device are one lock) that dies with its process.
-
-    It raises PortError where another program, or another Port of this one, holds it.
-    """
+    """A lock on a port's name (links to one device are one lock) that dies with its process; PortError where
+    another program, or another Port of this one, holds it."""
 
     def __init__(self, url: str, folder: str | Path | None = None) -> None:
         name = url if "://" in url else os.path.realpath(url)
@@ -175,10 +173,8 @@ class Port:
             raise self._lost(error) from error
 
     def read(self, seconds: float) -> bytes:
-        """Return what has come within so many (real) seconds, empty if nothing did.
-
-        A port that is lost is closed and raises PortError.
-        """
+        """Return what has come within so many (real) seconds, empty if nothing did; a port that is lost is
+        closed and raises PortError."""
         try:
             port = self._opened()
             # changing pyserial's time-out would set up the whole line anew; Windows can wait for sockets only

@@ -230,10 +230,8 @@ class Loop:
         return replace(trip, clear=ENDLESS[trip.kind]) if endless else trip
 
     def _note_notices(self) -> None:
-        """Note what happened on the rig: damaged lines, a lost link.
-
-        After a reset or an expired drive the last row's drive is not known: that is a trip.
-        """
+        """Note what happened on the rig; after a reset or an expired drive the last row's drive is not known,
+        which is a trip."""
         trip = None
         for notice in self.rig.notices():
             self.note(notice.kind, notice.text)

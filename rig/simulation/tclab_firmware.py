@@ -84,11 +84,10 @@ class TCLabCore:
             case "A" | "X":
                 self._power = [0.0, 0.0]
                 return ["Start" if word == "A" else "Stop"]
-            case "Q1" | "Q2":
-                self._power[int(word[1]) - 1] = _clip(value, 100.0)
-                return [f"{self._power[int(word[1]) - 1]:.3f}"]
-            case "R1" | "R2":
-                return [f"{self._power[int(word[1]) - 1]:.3f}"]
+            case "Q1" | "Q2" | "R1" | "R2":
+                at = int(word[1]) - 1
+                self._power[at] = _clip(value, 100.0) if word[0] == "Q" else self._power[at]
+                return [f"{self._power[at]:.3f}"]
             case "P1" | "P2":
                 self._ceilings[int(word[1]) - 1] = _clip(value, 255.0)
                 return [f"{self._ceilings[int(word[1]) - 1]:.2f}"]
