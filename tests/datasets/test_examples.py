@@ -96,6 +96,7 @@ def test_every_exported_name_is_there():
     for name in (*thermogrip.datasets.__all__, "copy_examples", "hold_average", "shared_grasps"):
         assert getattr(thermogrip.datasets, name) is not None
     assert dir(thermogrip.datasets) == sorted(thermogrip.datasets.__all__)
+    assert "copy_examples" not in thermogrip.datasets.__all__
     assert not hasattr(thermogrip.datasets, "nothing_such")
 
 

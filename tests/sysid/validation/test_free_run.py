@@ -100,6 +100,10 @@ def test_inputs_outside_of_the_fit_are_noted():
     log = lag_log()
     log["q"].values[500:] += 5.0
     assert any("lies outside" in note for note in free_run(lag_plant(), log).notes)
+    narrow = replace(lag_plant(gain=0.7), valid={"q": (0.0, 1.0), "t": (0.0, 0.1)})
+    said = [note for note in free_run(narrow, log).notes if "correlates with q" in note]
+    assert len(said) == 1
+    assert "the fit has not seen q as here" in said[0]
 
 
 @pytest.mark.parametrize(
