@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from thermogrip.report.console import Console, plain, short
+
+
+@dataclass(frozen=True)
+class Ends:
+    low: float
+    both: tuple[float, float]
 
 
 def test_with_json_tables_and_words_are_silent(capsys: pytest.CaptureFixture[str]) -> None:
