@@ -49,7 +49,7 @@ def test_a_cell_has_four_digits_and_a_dash_for_what_is_absent(cell: object, text
     ("value", "held"),
     [(Path("a") / "b", "a/b"), ((1, {2}), [1, [2]]), (frozenset({3}), [3]), ({4: None}, {"4": None}),
      (True, True), (5, 5), (2.5, 2.5), (1j, "1j"), ("x", "x"),
-     (Console(as_json=True), {"as_json": True}), (float("inf"), None),
+     (Ends(float("nan"), (1.0, float("inf"))), {"low": None, "both": [1.0, None]}), (float("inf"), None),
      (np.array([1.0, np.nan]), [1.0, None]), (np.bool_(True), True)],
 )  # fmt: skip
 def test_what_json_cannot_hold_is_text_and_collections_are_lists(value: object, held: object) -> None:
