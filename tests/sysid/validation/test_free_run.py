@@ -12,6 +12,7 @@ from scipy.stats import binom
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_log, write_log
+from thermogrip.datasets.resample import average
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import PlantScores, fit_logs
@@ -94,6 +95,17 @@ def test_averages_score_block_means():
     plain, mean = (free_run(lag_plant(), log, average=a).scores["t"] for a in (None, 10.0))
     assert mean.n == pytest.approx(plain.n / 10, abs=1)
     assert mean.rmse == pytest.approx(plain.rmse / np.sqrt(10), rel=0.15)
+
+
+def test_means_of_the_residual_are_correlated_with_means_of_the_input():
+    log, fast = lag_log(2000, noise=0.3, seed=2), np.resize([0.0, 1.0, 1.0, 0.0, 1.0], 2000)
+    log["q"] = ("time", log["q"].values + fast, log["q"].attrs)
+    run = free_run(lag_plant(), log, average=10.0, tests=False)
+    [(time, y, v)] = module._beside(lag_plant(), log, run.log, 10.0).values()
+    means = average(log, 10.0)
+    q = np.interp(time, means["time"].values, means["q"].values)
+    wanted = cross_correlation(y - v, q)
+    np.testing.assert_array_equal(run.input_correlation["t"]["q"].values, wanted.values)
 
 
 def test_inputs_outside_of_the_fit_are_noted():
