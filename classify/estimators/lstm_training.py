@@ -29,9 +29,10 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from typing import Any, TypeAlias
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from thermogrip.datasets.compiled import numba
 
 Reals: TypeAlias = NDArray[Any]
 Rows: TypeAlias = NDArray[np.int64]

@@ -22,11 +22,11 @@ This file alone imports numba, so nothing pays for the compiler before a reading
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array
+from thermogrip.datasets.compiled import numba
 
 Index = NDArray[np.int64]
 

@@ -52,11 +52,11 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array, Mask
+from thermogrip.datasets.compiled import numba
 
 # sums over modes may be reordered, so that they run in vector registers; infinities stay what they are
 _FAST = {"reassoc", "contract", "arcp", "nsz"}

@@ -20,10 +20,10 @@ This file alone imports numba, so nothing pays for the compiler before a model o
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
+from thermogrip.datasets.compiled import numba
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]

@@ -1,0 +1,48 @@
+"""Numba, with compiled code that is kept while the sources of the kernels are the same.
+
+Numba keeps compiled code beside a module until the module's file is written again: each installation would
+compile all kernels anew, a minute of work, and a kernel that calls a changed one of another module would go
+on with the old one.  Here a digest of the sources of all kernels decides.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numba as numba
+from numba.core import caching
+
+_ROOMS = Path(__file__).parents[1]
+KERNELS = tuple(
+    _ROOMS / name
+    for name in (
+        "classify/estimators/lstm_training.py",
+        "sysid/blackbox/kalman_kernel.py",
+        "sysid/contact/time_stepping.py",
+        "sysid/effusivity/mode_kernel.py",
+        "sysid/models/neural_kernel.py",
+    )
+)
+
+
+@cache
+def sources_digest() -> str:
+    """Return the SHA-256 of the sources of all kernels."""
+    return hashlib.sha256(b"\0".join(path.read_bytes() for path in KERNELS)).hexdigest()
+
+
+class _BySources(caching.InTreeCacheLocator):  # type: ignore[misc]
+    """Where the compiled code of a kernel lies, and until when it may be used."""
+
+    @classmethod
+    def from_function(cls, py_func: Any, py_file: str) -> Any:
+        return super().from_function(py_func, py_file) if Path(py_file) in KERNELS else None
+
+    def get_source_stamp(self) -> str:
+        return sources_digest()
+
+
+caching.CacheImpl._locator_classes.insert(1, _BySources)  # after the folder of NUMBA_CACHE_DIR
