@@ -143,7 +143,7 @@ def _structure_table(searched: Sequence[Searched]) -> Table:
             for place, each in enumerate(of_kind)
             if place < _STRUCTURES or each.kept
         ]
-    title = "Structures searched: RMSE over the outputs' spread; kept: the smallest within noise of the best"
+    title = "Structures searched: RMSE over outputs' spread; kept: an average or the smallest near the best"
     return Table(head, tuple(rows), title)
 
 
