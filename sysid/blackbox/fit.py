@@ -155,7 +155,7 @@ def fit_black_box(
     if average is None and first.dt > 1.5 * first.native and own_rows <= _MAX_ROWS and kind not in _AVERAGED:
         own = make_grid(logs, inputs=u, outputs=y, disturbances=d, average=first.native)
         grids.append(replace(own, why=f"the logs' own: held-out free runs err less than at {first.dt:.3g} s"))
-    average = kind == "subspace"  # structures of it differ in how they see the same states
+    averages = kind == "subspace"  # structures of it differ in how they see the same states
     best: tuple[Grid, Choice] | None = None
     refused: UserError | None = None
     for at, grid in enumerate(grids):
@@ -166,7 +166,7 @@ def fit_black_box(
 
         try:
             rows = _warmup_rows(grid, warmup)
-            choice = choose(grid, family, warmup=rows, average=average, progress=report)
+            choice = choose(grid, family, warmup=rows, average=averages, progress=report)
         except UserError as error:
             refused = error
             continue
@@ -174,7 +174,7 @@ def fit_black_box(
             best = (grid, choice)
     if best is None:
         raise refused if refused is not None else UserError(f"{kind} could not be fitted")
-    grid, choice = _with_convention(*best, logs, family, warmup, average)
+    grid, choice = _with_convention(*best, logs, family, warmup, averages)
     return BlackBoxFit(kind, _plant(grid, choice, logs), choice, grid)
 
 

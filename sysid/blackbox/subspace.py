@@ -57,7 +57,7 @@ Fitted = tuple[StateSpaceModel, Sequence[Array]]  # with the initial state of ea
 
 _WEIGHTINGS = ("moesp", "cva")
 _NEAR = 0.1  # of the error: how far an average's run may be from the mean of its members'
-_MOST_STATES = 14  # of an average
+_MOST_STATES = 14  # of an average, or those of its smallest member
 
 
 def subspace_family(
@@ -192,7 +192,8 @@ def average(grid: Grid, members: Sequence[Fitted]) -> StateSpaceModel:
     """Return a model of low order whose free run is the mean of those of the members.
 
     The members side by side, about their rest at the mean drive, are truncated in balanced coordinates to the
-    fewest states whose run is near the mean of theirs over the data; the gains at rest are kept.
+    fewest states whose run is near the mean of theirs over the data, 14 where none is; the gains at rest are
+    kept.
     """
     scale = np.maximum(grid.output_spread(), 1e-9)
     models = [model for model, _ in members]
@@ -211,7 +212,7 @@ def average(grid: Grid, members: Sequence[Fitted]) -> StateSpaceModel:
     miss = _rms([(segment.y - y) / scale for segment, y in zip(grid.segments, mean)])
     left, right = balanced(A, B * w.std(axis=0), C / scale[:, None])
     least = min(model.n_x for model in models)
-    for n in range(least, min(_MOST_STATES, len(A)) + 1):
+    for n in range(least, max(least, min(_MOST_STATES, len(A))) + 1):
         a, c = left[:n] @ A @ right[:, :n], C @ right[:, :n]
         at_rest = c @ np.linalg.inv(np.eye(n) - a)
         b = left[:n] @ B

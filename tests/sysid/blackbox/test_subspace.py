@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.blackbox import subspace
+from thermogrip.sysid.blackbox.fit import fit_black_box
 from thermogrip.sysid.blackbox.order_selection import Structure, as_state_space
 from thermogrip.sysid.blackbox.subspace import (
     _windows,
@@ -192,6 +194,22 @@ def test_the_average_of_models_that_are_alike_has_no_more_states_than_one():
     assert model.spread[0, 0] > 0
     # five of which one is 5 % off in its gain are within a tenth of errors of 3 degC
     assert average(grid, members_of(grid, *[(0.9, 4.0, (), 20.0)] * 4, (0.8, 4.2, (), 20.0))).n_x == 1
+
+
+def test_the_average_of_large_models_has_the_states_of_the_smallest(monkeypatch):
+    monkeypatch.setattr(subspace, "_MOST_STATES", 0)
+    grid = signed_grid()
+    assert average(grid, members_of(grid, (0.9, 4.0, (), 20.0), (0.5, 8.0, (), 23.0))).n_x == 1
+
+
+def test_an_order_above_the_most_states_of_an_average_can_be_fixed():
+    rng = np.random.default_rng(8)
+    q = np.repeat(rng.uniform(-1, 1, 150), 10)
+    t = 25 + lfilter([0, 0.3], [1, -0.9], q) + 0.01 * rng.standard_normal(1500)
+    columns = {"q": (q, "1", "input"), "t": (t, "degC", "output")}
+    fit = fit_black_box("subspace", [make_log(np.arange(1500.0), columns)], average=1.0, order=16)
+    assert fit.choice.structure.members
+    assert fit.plant.model.n_x == 16
 
 
 def test_an_average_is_fitted_where_each_member_can_be(coupled):
