@@ -86,7 +86,7 @@ def hold_average(log: Log, wanted: tuple[str, ...], grid: ArrayLike) -> NDArray[
     edges = np.asarray(grid, dtype=float)
     if edges.ndim != 1 or edges.size < 2 or np.any(np.diff(edges) <= 0):
         raise ValueError("need at least two increasing edges")
-    return _held_means(log["time"].values, columns(log, wanted), edges)
+    return held_means(log["time"].values, columns(log, wanted), edges)
 
 
 def average(log: Log, seconds: float) -> Log:
@@ -156,7 +156,7 @@ def _blocks(
     edges = time[0] + seconds * np.arange(int(block[-1]) + 2)
     edges[-1] = min(edges[-1], time[-1] + step)  # the last row is held for one step, not for the whole block
     means = np.empty((filled.size, values.shape[1]))
-    means[:, is_held] = _held_means(time, values[:, is_held], edges)[filled]
+    means[:, is_held] = held_means(time, values[:, is_held], edges)[filled]
     for at in np.flatnonzero(~is_held):
         there = np.isfinite(values[:, at])
         count = np.bincount(where[there], minlength=filled.size)
@@ -165,7 +165,7 @@ def _blocks(
     return edges[filled], means
 
 
-def _held_means(time: Floats, values: Floats, edges: Floats) -> Floats:
+def held_means(time: Floats, values: Floats, edges: Floats) -> Floats:
     """Return the means of the staircases (n_time, n) over the cells between the edges."""
     area = np.zeros_like(values)
     np.cumsum(values[:-1] * np.diff(time)[:, None], axis=0, out=area[1:])

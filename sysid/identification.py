@@ -418,22 +418,22 @@ def identify(
     >>> found.model, found.good, found.errors()["oe"] < 0.05
     ('oe', True, True)
     """
-    records = as_logs(logs, inputs, outputs, disturbances)
-    network, records, converted = _for_network(network if "network" in models else None, records)
+    logs = as_logs(logs, inputs, outputs, disturbances)
+    network, logs, converted = _for_network(network if "network" in models else None, logs)
     if network is None:
-        records = _without_still(records)
-    u, y, d = signals(records, inputs=inputs, outputs=outputs, disturbances=disturbances)
+        logs = _without_still(logs)
+    u, y, d = signals(logs, inputs=inputs, outputs=outputs, disturbances=disturbances)
     candidates = _candidates(models, network)
-    if leave_one_out and len(records) < 2:
+    if leave_one_out and len(logs) < 2:
         raise UserError("leaving one log out needs at least two logs", hint="give another log")
-    checked = check_data(records, inputs=u, outputs=y, disturbances=d, average=average)
+    checked = check_data(logs, inputs=u, outputs=y, disturbances=d, average=average)
     failed = [finding for finding in checked.of("excitation") if finding.verdict == "fail"]
     if failed:
         says, kept = "; ".join(f.says for f in failed), [n for n in u if n not in {f.channel for f in failed}]
         hint = "move it in the experiment, or leave it out"
         hint += f" with --inputs {','.join(kept)}" if 0 < len(kept) < len(u) else ""
-        raise UserError(says, file=log_name(records[0]), column=failed[0].channel, hint=hint)
-    cases = list(cases_of(records, leave_one_out))
+        raise UserError(says, file=log_name(logs[0]), column=failed[0].channel, hint=hint)
+    cases = list(cases_of(logs, leave_one_out))
     boxes = [] if leave_one_out else [model for model in candidates if model != "network"]
     parts = _Parts(progress, len(boxes) + len(cases) * (len(candidates) if leave_one_out else 2) + 2)
 
@@ -446,63 +446,58 @@ def identify(
         "delay": delay,
     }
 
-    def fit(model: str, some: Sequence[Log], report: Progress | None) -> Plant | BlackBoxFit:
-        if model != "network":
-            return fit_black_box(model, some, **settings, progress=report)
-        from thermogrip.sysid.greybox.fit import fit_network  # pulls in llvmlite and nlopt at the first fit
-
-        assert network is not None
-        return fit_network(network, some, seed=seed, progress=report)
-
-    fits, rows, refused = _fit_all(boxes, records, settings, parts, workers)
+    fits, rows, refused = _fit_all(boxes, logs, settings, parts, workers)
     best = None
     if fits:
         least = min(fits, key=lambda fit: fit.choice.error)
-        best = choose_black_box(fits, _between_runs(least.plant, records))
+        best = choose_black_box(fits, _between_runs(least.plant, logs))
     if leave_one_out:
         finalists = candidates
     else:
         finalists = [*([best.kind] if best else []), *(["network"] if "network" in candidates else [])]
 
-    def fit_part(model: str, some: Sequence[Log], report: Progress | None) -> Plant:
+    def fit(model: str, train: Sequence[Log], report: Progress | None) -> Plant | BlackBoxFit:
         if best is not None and model == best.kind:
-            return fit_without_tail(best, some)
-        fitted = fit(model, some, report)
-        return fitted if isinstance(fitted, Plant) else fitted.plant
+            return best if train is logs else fit_without_tail(best, train)
+        if model != "network":
+            return fit_black_box(model, train, **settings, progress=report)
+        from thermogrip.sysid.greybox.fit import fit_network  # pulls in llvmlite and nlopt at the first fit
 
-    scored, more = _compare(fit_part, finalists, cases, parts)
+        assert network is not None
+        return fit_network(network, train, seed=seed, progress=report)
+
+    scored, more = _compare(fit, finalists, cases, parts)
     rows, refused = rows + scored, refused + more
     chosen = choose_model(scored, len(cases)) or (best.kind if best else None)
     if chosen is None:
         noisy = [finding.says for finding in checked.of("noise") if finding.verdict != "ok"]
         problem = f"no model could be fitted ({refused[0] if refused else 'none was asked for'})"
         raise UserError(problem, hint="; ".join(noisy) or None)
-    if best is not None and chosen == best.kind:
-        fitted: Plant | BlackBoxFit = best
-    else:
-        fitted = fit(chosen, records, parts.part(f"{chosen} on all logs"))
+    fitted = fit(chosen, logs, parts.part(f"{chosen} on all logs"))
     parts.next()
-    plant, lost = _with_draws(fitted, records, parts, posterior=posterior, draws=draws, seed=seed)
-    unused = _left_out(records, (*u, *y, *d)) if inputs is outputs is disturbances is None else []
+    plant, lost = _with_draws(fitted, logs, parts, posterior=posterior, draws=draws, seed=seed)
+    lists = {"input": inputs, "output": outputs, "disturbance": disturbances}
+    roles, unused = _signal_roles(logs, (u, d, y), lists, network)
     notes = (*converted, *refused, *unused, *lost, *_plant_notes(chosen, plant))
     # the same warm-up as on what was held out, or errors of the start would stand beside ones without
-    whole = [Held(log, log_name(log), 0.0 if leave_one_out else warm_up_of(log)) for log in records]
+    whole = [Held(log, log_name(log), 0.0 if leave_one_out else warm_up_of(log)) for log in logs]
     runs = tuple(run_held_out(plant, held) for held in whole)
     for held, run in zip(whole, runs):
         rows += rows_of(chosen, plant, held.name, run, held_out=False)
     good, verdict = verdict_of(chosen, rows, checked, leave_one_out)
-    other = new_run_errors(plant, records, [row for row in rows if row.held_out and row.model == chosen])
+    mine = [row for row in rows if row.held_out and row.model == chosen]
+    # what was held out, and a gain that varies; empty where the logs show what differs between runs
+    varied = _between_runs(plant, logs)
+    other = {name: float(np.hypot(stated_error(mine, name), varied[name])) for name in varied}
     if other:
         units = {row.output: "" if row.unit == "1" else f" {row.unit}" for row in rows}
         sizes = ", ".join(f"{name} {error:.2g}{units[name]}" for name, error in other.items())
         verdict += f"; on another run about {sizes}, its gain off by {100 * RUN_GAIN_SD:.0f} %"
         verdict += f" (assumed: it takes {SEVERAL} logs to show how runs differ)"
-    covered = evidence(plant, records)
+    covered = evidence(plant, logs)
     verdict += "; " + covered.sentence(plant.units)
     scores = replace(plant.scores, held_out=held_out_scores(rows, chosen), new_run_rmse=other)
     plant = replace(plant, verdict=verdict, scores=scores)
-    lists = {"input": inputs, "output": outputs, "disturbance": disturbances}
-    roles = _signal_roles(records, (u, d, y), lists, network)
     searched = tuple(row for some in fits for row in searched_rows(some))
     return Identification(
         plant, chosen, tuple(rows), checked, covered, good, verdict, notes, roles, runs, searched
@@ -541,8 +536,12 @@ def _signal_roles(
     groups: tuple[Sequence[str], Sequence[str], Sequence[str]],
     lists: Mapping[str, Sequence[str] | None],
     network: GreyModel | None,
-) -> tuple[SignalRole, ...]:
-    """Return what each column of the logs was taken for: inputs, disturbances, outputs, the rest."""
+) -> tuple[tuple[SignalRole, ...], list[str]]:
+    """Return what each column of the logs was taken for: inputs, disturbances, outputs, the rest.
+
+    And, where no list names them, a line for each log with signals that the first one, which says what is
+    used, does not have.
+    """
     units, guesses = dict[str, str](), _guesses(logs)
     for log in reversed(logs):  # the first log has precedence
         units |= {str(name): str(item.attrs.get("units", "1")) for name, item in log.items()}
@@ -565,7 +564,12 @@ def _signal_roles(
         elif role == "left out":
             why = "not named"
         out.append(SignalRole(name, units[name], role, why, guessed))
-    return tuple(out)
+    unused = []
+    for log in logs[1:] if all(words is None for words in lists.values()) else ():
+        signals_of = (name for role in ("input", "output", "disturbance") for name in names(log, role))
+        if more := ", ".join(name for name in signals_of if name not in taken):
+            unused.append(f"{log_name(log)}: {more} left out, for {log_name(logs[0])} has no such signal")
+    return tuple(out), unused
 
 
 def _for_network(
@@ -622,7 +626,7 @@ def _fit_or_refusal(item: tuple[str, Sequence[Log], dict[str, Any]]) -> BlackBox
 
 
 def _compare(
-    fit: Callable[[str, Sequence[Log], Progress | None], Plant],
+    fit: Callable[[str, Sequence[Log], Progress | None], Plant | BlackBoxFit],
     candidates: Sequence[str],
     cases: Sequence[tuple[list[Log], Held]],
     parts: _Parts,
@@ -636,7 +640,8 @@ def _compare(
             what = f"{model} without {held.name}"
             try:
                 if (model, id(train)) not in plants:
-                    plants[model, id(train)] = fit(model, train, parts.part(what))
+                    fitted = fit(model, train, parts.part(what))
+                    plants[model, id(train)] = fitted if isinstance(fitted, Plant) else fitted.plant
                 plant = plants[model, id(train)]
                 run = run_held_out(plant, held, unseen=True)
                 rows += rows_of(model, plant, held.name, run, held_out=True)
@@ -683,29 +688,6 @@ def _between_runs(plant: Plant, logs: Sequence[Log]) -> dict[str, float]:
         name: float(np.sqrt(np.mean(np.concatenate([change[name] for change in changes]) ** 2)))
         for name in (plant.outputs if all(changes) else ())
     }
-
-
-def new_run_errors(plant: Plant, logs: Sequence[Log], held: Sequence[Row]) -> dict[str, float]:
-    """Return by output the error to expect on another run: of what was held out, and of a gain that varies.
-
-    Empty where the logs are so many that what was held out shows what differs between runs.
-    """
-    return {
-        name: float(np.hypot(stated_error(held, name), varied))
-        for name, varied in _between_runs(plant, logs).items()
-    }
-
-
-def _left_out(logs: Sequence[Log], used: Sequence[str]) -> list[str]:
-    """Return a line for each log with signals that the first one, which says what is used, does not have."""
-    out = []
-    for log in logs[1:]:
-        signals_of = (name for role in ("input", "output", "disturbance") for name in names(log, role))
-        if more := [name for name in signals_of if name not in used]:
-            out.append(
-                f"{log_name(log)}: {', '.join(more)} left out, for {log_name(logs[0])} has no such signal"
-            )
-    return out
 
 
 def _plant_notes(model: str, plant: Plant) -> list[str]:

@@ -44,7 +44,7 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.parallel import Progress
-from thermogrip.datasets.schema import Log, column, log_name
+from thermogrip.datasets.schema import Log, columns, log_name
 from thermogrip.sysid.data.data_quality import reading_excess
 from thermogrip.sysid.greybox.identifiability import describe
 from thermogrip.sysid.greybox.problem import Problem, make_problem, start_seconds
@@ -248,10 +248,18 @@ def fit_network(
         )
         solution = _descend(problem, solution.z, report, (0.9, 0.95))
     report(0.95, "covariance")
-    plant = _as_plant(problem, solution, logs, tau)
-    seconds = round(time.perf_counter() - began, 2)
+    plant = _as_plant(problem, solution, tau)
+    scores = replace(
+        plant.scores,
+        reading_excess=reading_excess(logs, model.outputs, problem.average),
+        seconds=round(time.perf_counter() - began, 2),
+        starts=wanted,
+    )
+    signals = (*model.inputs, *model.disturbances, *model.outputs)
+    every = np.concatenate([columns(log, signals) for log in logs])
+    valid = zip(np.nanmin(every, axis=0).tolist(), np.nanmax(every, axis=0).tolist())
     report(1.0, "fitted")
-    return replace(plant, scores=replace(plant.scores, seconds=seconds, starts=wanted))
+    return replace(plant, valid=dict(zip(signals, valid)), fitted_to=fit_logs(logs), scores=scores)
 
 
 def residual_tau(errors: Sequence[Sequence[Sequence[Array]]], least: Array) -> Array:
@@ -349,7 +357,7 @@ def _random_search(problem: Problem, seed: int, evaluations: int = 1500) -> Arra
     return np.asarray(optimiser.optimize(np.clip(0.5 * rng.standard_normal(len(low)), low, high)))
 
 
-def _as_plant(problem: Problem, solution: Solution, logs: Sequence[Log], tau: Array) -> Plant:
+def _as_plant(problem: Problem, solution: Solution, tau: Array) -> Plant:
     model, z = problem.model, solution.z
     names = tuple(model.parameters[i] for i in problem.free)
     by_log = problem.by_log(z, central=True)
@@ -372,7 +380,6 @@ def _as_plant(problem: Problem, solution: Solution, logs: Sequence[Log], tau: Ar
         iterations=solution.iterations,
         converged=solution.converged,
         average_s=problem.average,
-        reading_excess=reading_excess(logs, model.outputs, problem.average),
         independent_s={k: round(t * problem.average, 1) for k, t in zip(model.outputs, tau)},
         weight_s={k: float(t * problem.average) for k, t in zip(model.outputs, problem.tau)},
         intervals=_of_intervals(problem, spread),
@@ -385,9 +392,7 @@ def _as_plant(problem: Problem, solution: Solution, logs: Sequence[Log], tau: Ar
         covariance=spread.covariance * np.outer(problem.width, problem.width),
         noise=noise,
         offsets=offsets,
-        valid=_valid(model, logs),
-        logs=tuple(log_name(log) for log in logs),
-        fitted_to=fit_logs(logs),
+        logs=problem.names,
         scores=scores,
         verdict=_verdict(problem, solution, identifiability),
     )
@@ -410,14 +415,6 @@ def _of_intervals(problem: Problem, spread: ScoreCovariance) -> Intervals:
         between_logs=round(spread.q, 3),
         spread_over_logs={name: round(value, 4) for name, value in spread.spreads.items()},
     )
-
-
-def _valid(model: GreyModel, logs: Sequence[Log]) -> dict[str, tuple[float, float]]:
-    out = {}
-    for name in (*model.inputs, *model.disturbances, *model.outputs):
-        values = np.concatenate([column(log, name) for log in logs])
-        out[name] = (float(np.nanmin(values)), float(np.nanmax(values)))
-    return out
 
 
 def _verdict(problem: Problem, solution: Solution, identifiability: Identifiability) -> str:

@@ -170,19 +170,16 @@ def fit_logs(logs: Sequence[Log]) -> tuple[FitLog, ...]:
     return tuple(FitLog(log_name(log), data_hash(log), *_ends(log["time"].values)) for log in logs)
 
 
-def said_of_fit(fitted_to: Sequence[FitLog], log: Log) -> list[str]:
-    """Return a line for each log of the fit that holds rows of this one."""
-    from thermogrip.datasets.schema import data_hash, log_name
-
-    start, stop = _ends(log["time"].values)
-    sha256, said = data_hash(log), []
+def said_of_fit(fitted_to: Sequence[FitLog], seen: FitLog) -> list[str]:
+    """Return a line for each log of the fit that holds rows of the one that is ``seen``."""
+    start, stop, said = seen.start_s, seen.stop_s, []
     for used in fitted_to:
         first, last = max(start, used.start_s), min(stop, used.stop_s)
-        if used.sha256 != sha256 or not first < last:
+        if used.sha256 != seen.sha256 or not first < last:
             continue
         whole = (first, last) == (start, stop)
         what = "all of it is" if whole else f"{first:g} to {last:g} s of {start:g} to {stop:g} s are"
-        name = "" if used.name == log_name(log) else f" (as {used.name})"
+        name = "" if used.name == seen.name else f" (as {used.name})"
         meaning = "the scores say how well the plant is fitted, not how well it predicts"
         said.append(f"{what} in the fit{name}: {'' if whole else 'there '}{meaning}")
     return said

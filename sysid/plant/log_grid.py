@@ -34,7 +34,7 @@ model's own unit; values beyond 1 distinguish them.  Any other difference of uni
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, TypeAlias
@@ -45,7 +45,7 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import most_bytes
 from thermogrip.datasets.resample import gaps as gaps_of
-from thermogrip.datasets.resample import hold_average
+from thermogrip.datasets.resample import held_means
 from thermogrip.datasets.schema import Log, column, columns, log_name
 from thermogrip.datasets.schema import names as names_of
 
@@ -146,7 +146,7 @@ def make_grid(
     if ends:
         logs = [from_row_on(log, u) for log in logs]
     native = float(np.median([sample_time(log) for log in logs]))
-    step, why = _chosen_step(logs, u, y) if average is None else (float(average), "asked for")
+    step, why = _chosen_step(logs, u, y, native) if average is None else (float(average), "asked for")
     if step < native * 0.999:
         raise UserError(
             f"averaging over {step:g} s is shorter than the sample time {native:g} s", hint="average longer"
@@ -162,7 +162,11 @@ def make_grid(
         )
     units = {name: str(logs[0][name].attrs.get("units", "1")) for name in (*u, *d, *y)}
     lost = float(np.mean(np.concatenate([~np.isfinite(part.y).all(axis=1) for part in segments])))
-    return Grid(u, d, y, switches_of(logs, u), step, tuple(segments), native, units, why, lost, ends)
+    moves = np.concatenate([columns(log, u) for log in logs])
+    switches = tuple(
+        name for name, on in zip(u, moves.T) if units[name] == "1" and np.isin(on, (0.0, 1.0)).all()
+    )
+    return Grid(u, d, y, switches, step, tuple(segments), native, units, why, lost, ends)
 
 
 def cut_stretches(plant: PlantData, log: Log, *, gaps: str = "mend") -> list[Stretch]:
@@ -178,45 +182,59 @@ def cut_stretches(plant: PlantData, log: Log, *, gaps: str = "mend") -> list[Str
         _check_steps(n, plant, log_name(log))
         return n
 
-    groups = plant.outputs, plant.inputs, plant.disturbances
+    if plant.inputs_end_at_row:
+        log = from_row_on(log, plant.inputs)
+    y, u, d = (columns(log, group) for group in (plant.outputs, plant.inputs, plant.disturbances))
+    for name, step in plant.model.command_steps.items():
+        # a driver drops what lies behind a multiple of its step; of averaged commands only the mean of the
+        # loss is known, half a step
+        command = u[:, plant.inputs.index(name)]
+        if "averaged_s" in log.attrs:
+            command -= np.sign(command) * np.minimum(np.abs(command), step / 2)
+        else:
+            command[:] = np.trunc(command / step + 1e-9 * np.sign(command)) * step
     found = _stretches(
-        _applied(log, plant),
-        *groups,
+        np.asarray(log["time"].values, dtype=float),
+        *(y, u, d),
+        after=() if gaps == "hold" else [row + 1 for row, _, _ in gaps_of(log, GAP)],
         step=plant.dt,
         steps=steps,
         smooth=plant.model.smooth,
-        whole=gaps == "hold",
+        log=log_name(log),
     )
     return [replace(stretch, time=stretch.time + middle) for stretch in found]
 
 
 def _stretches(
-    log: Log,
-    y: Sequence[str],
-    u: Sequence[str],
-    d: Sequence[str],
+    time: Array,
+    y: Array,
+    u: Array,
+    d: Array,
     *,
+    after: Sequence[int],
     step: float,
     steps: Callable[[float], int],
+    log: str,
     smooth: float | None = None,
-    whole: bool = False,
 ) -> Iterator[Stretch]:
-    """Yield a log's stretches of two rows or more on a grid of ``step`` [s], ``steps(length [s])`` each."""
-    time, readings = np.asarray(log["time"].values, dtype=float), columns(log, tuple(y))
-    after = [] if whole else [row + 1 for row, _, _ in gaps_of(log, GAP)]
+    """Yield stretches of two rows or more on a grid of ``step`` [s], ``steps(length [s])`` each.
+
+    Rows have times (n,), readings (n, n_y), inputs (n, n_u) and disturbances (n, n_d); those in ``after``
+    follow a gap.
+    """
     for begin, end in pairwise([0, *after, time.size]):
         rows, t = slice(begin, end), time[begin:end]
         n = steps(t[-1] - t[0])
         if n < 1:
             continue
-        part, edges = log.isel(time=rows), t[0] + step * np.arange(n + 1)
-        held = hold_average(part, tuple(u), edges)
+        edges = t[0] + step * np.arange(n + 1)
+        held = held_means(t, u[rows], edges)
         if smooth is None:
-            beside = hold_average(part, tuple(d), edges)
+            beside = held_means(t, d[rows], edges)
         else:
-            beside = _smooth(part, tuple(d), edges, smooth)
+            beside = _smooth(t, d[rows], edges, smooth)
         gap = float(t[0] - time[begin - 1]) if begin else 0.0
-        yield Stretch(rows, t - t[0], readings[rows], held, beside, gap, log_name(log))
+        yield Stretch(rows, t - t[0], y[rows], held, beside, gap, log)
 
 
 def at_rows(stretch: Stretch, run: Array, dt: float) -> Array:
@@ -322,9 +340,10 @@ def dominant_time(logs: Sequence[Log], *, inputs: Sequence[str], outputs: Sequen
     return float(np.median(found)) if found else longest / 20
 
 
-def _chosen_step(logs: Sequence[Log], inputs: Sequence[str], outputs: Sequence[str]) -> tuple[float, str]:
+def _chosen_step(
+    logs: Sequence[Log], inputs: Sequence[str], outputs: Sequence[str], native: float
+) -> tuple[float, str]:
     """Return the averaging step [s], a whole multiple of the sample time, and which of the rules set it."""
-    native = float(np.median([sample_time(log) for log in logs]))
     slow = dominant_time(logs, inputs=inputs, outputs=outputs)
     longest = max(float(np.ptp(log["time"].values)) for log in logs)
     most = min(slow / 10, longest / 200)  # whatever the time constant, rows must be left to fit
@@ -333,7 +352,7 @@ def _chosen_step(logs: Sequence[Log], inputs: Sequence[str], outputs: Sequence[s
     for name in outputs:
         q = max(quantum(column(log, name)) for log in logs)
         for times in (1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40, 50):
-            moves = [_rms_move(log, name, times * native) for log in logs]
+            moves = [_rms_move(log["time"].values, column(log, name), times * native) for log in logs]
             if np.sqrt(np.mean(np.square(moves))) >= q:
                 break
             if times * native > needed:
@@ -343,16 +362,6 @@ def _chosen_step(logs: Sequence[Log], inputs: Sequence[str], outputs: Sequence[s
         why += f"; held at {max(native, most):.3g} s, so that the dynamics keep their rows"
     step = min(needed, max(native, most))
     return native * max(1, round(step / native)), why
-
-
-def switches_of(logs: Sequence[Log], inputs: Sequence[str]) -> tuple[str, ...]:
-    """Return the inputs that take the values 0 and 1 alone (and are not in percent or counts)."""
-    out = []
-    for name in inputs:
-        values = np.unique(np.concatenate([np.unique(column(log, name)) for log in logs]))
-        if set(values.tolist()) <= {0.0, 1.0} and logs[0][name].attrs.get("units", "1") == "1":
-            out.append(name)
-    return tuple(out)
 
 
 def _segments(
@@ -366,11 +375,12 @@ def _segments(
 
     out = []
     time, own = np.asarray(log["time"].values, dtype=float), abs(step - native) < 1e-6 * native
-    for part in _stretches(log, y, u, d, step=step, steps=steps):
+    Y, U, D = (columns(log, group) for group in (y, u, d))
+    after = [row + 1 for row, _, _ in gaps_of(log, GAP)]
+    for part in _stretches(time, Y, U, D, after=after, step=step, steps=steps, log=log_name(log)):
         t = time[part.rows]
         if own and np.ptp(np.diff(t)) < 0.02 * native:  # the samples stand as they are
-            U, D = (columns(log, tuple(group))[part.rows] for group in (u, d))
-            out.append(Segment(t, part.y, U, D, part.log))
+            out.append(Segment(t, part.y, U[part.rows], D[part.rows], part.log))
         else:
             grid = t[0] + step * np.arange(len(part.u))
             out.append(Segment(grid, _line_mean(t, part.y, grid, step), part.u, part.d, part.log))
@@ -386,27 +396,6 @@ def _check_steps(n: int, plant: PlantData, log: str) -> None:
         raise UserError(f"would be simulated in {took}", file=log, hint=hint)
 
 
-def _applied(log: Log, plant: PlantData) -> Log:
-    """Return the log with what the drivers made of its commands.
-
-    A driver that drops what lies behind a multiple of its step is undone row by row; of commands that were
-    averaged only the mean of the loss is known, half a step.
-    """
-    if plant.inputs_end_at_row:
-        log = from_row_on(log, plant.inputs)
-    if not plant.model.command_steps:
-        return log
-    out = log.copy()
-    for name, step in plant.model.command_steps.items():
-        u = columns(log, (name,))[:, 0]
-        if "averaged_s" in log.attrs:
-            whole = u - np.sign(u) * np.minimum(np.abs(u), step / 2)
-        else:
-            whole = np.trunc(u / step + 1e-9 * np.sign(u)) * step
-        out[name] = ("time", whole, log[name].attrs)
-    return out
-
-
 def from_row_on(log: Log, inputs: Sequence[str]) -> Log:
     """Return a log whose inputs were applied up to their rows with inputs that are applied from them on."""
     out = log.copy()
@@ -416,15 +405,13 @@ def from_row_on(log: Log, inputs: Sequence[str]) -> Log:
     return out
 
 
-def _smooth(log: Log, names: tuple[str, ...], edges: Array, seconds: float) -> Array:
+def _smooth(time: Array, values: Array, edges: Array, seconds: float) -> Array:
     """Return means (N, n_d) over ``seconds`` (the step, if longer) about the middle of each step."""
-    if not names:
-        return np.empty((len(edges) - 1, 0))
     middle = (edges[1:] + edges[:-1]) / 2
     half = max(seconds, edges[1] - edges[0]) / 2
     low, high = np.maximum(middle - half, edges[0]), np.minimum(middle + half, edges[-1])
     ends, place = np.unique(np.concatenate([low, high]), return_inverse=True)
-    parts = hold_average(log, names, ends) * np.diff(ends)[:, None]
+    parts = held_means(time, values, ends) * np.diff(ends)[:, None]
     area = np.vstack([np.zeros(parts.shape[1]), np.cumsum(parts, axis=0)])[place]
     return np.asarray((area[len(low) :] - area[: len(low)]) / (high - low)[:, None])
 
@@ -456,10 +443,9 @@ def _area_at(at: Array, s: Array, v: Array, area: Array) -> Array:
     return np.asarray(area[i] + v[i] * run + slope * run**2 / 2)
 
 
-def _rms_move(log: Log, name: str, step: float) -> float:
+def _rms_move(time: Array, values: Array, step: float) -> float:
     """Root mean square change of a reading over ``step`` seconds, of means so that rounding is out."""
-    time, values = np.asarray(log["time"].values, dtype=float), column(log, name)
-    coarse = max(step, 8 * sample_time(log))  # the slope over a longer stretch, scaled down
+    coarse = max(step, 8 * float(np.median(np.diff(time))))  # the slope over a longer stretch, scaled down
     grid = np.arange(time[0], time[-1], coarse)
     mean = _line_mean(time, values[:, None], grid, coarse)[:, 0]
     return float(np.sqrt(np.nanmean(np.diff(mean) ** 2)) * step / coarse)
@@ -500,16 +486,10 @@ def misfit(model: Signals, log: Log) -> UserError | None:
         have = ", ".join(str(name) for name in log.data_vars)
         return UserError(f"has no {', no '.join(lost)}", file=log_name(log), hint=f"its columns are {have}")
     try:
-        match_log(model, log)
+        match_logs(model, [log])
     except UserError as error:
         return error
     return None
-
-
-def match_log(model: Signals, log: Log) -> tuple[Log, list[str]]:
-    """Return one log in the model's roles and units, and what was converted; see :func:`match_logs`."""
-    logs, said = match_logs(model, [log])
-    return logs[0], said
 
 
 def match_logs(
@@ -519,55 +499,51 @@ def match_logs(
 
     A log that fits as it is is returned itself.
     """
-    largest = {name: _largest([column(log, name) for log in logs]) for name in roles_of(model)}
+    known = roles_of(model)
+    largest = {name: _largest([column(log, name) for log in logs]) for name in known}
     out, said = [], dict[str, None]()
     for log in logs:
-        matched, words = _matched(model, log, largest, keep_others)
-        out.append(matched)
-        said |= dict.fromkeys(words)
+        changed = {}
+        for name in known:
+            found = _converted(model, name, log[name].attrs.get("units", "1"), largest[name], log_name(log))
+            if found is not None:
+                changed[name] = column(log, name) * found[0]
+                said[found[1]] = None
+        roles = {str(n): str(item.attrs.get("role")) if keep_others else "other" for n, item in log.items()}
+        roles |= known
+        if changed or any(item.attrs.get("role") != roles[str(n)] for n, item in log.items()):
+            log = log.copy()
+            for name, role in roles.items():
+                attrs = log[name].attrs | {"role": role}
+                attrs |= {"units": model.units[name]} if name in changed else {}
+                log[name] = ("time", changed.get(name, log[name].values), attrs)
+        out.append(log)
     return out, list(said)
 
 
-def _matched(
-    model: Signals, log: Log, largest: Mapping[str, float], keep_others: bool
-) -> tuple[Log, list[str]]:
-    known, changed, said = roles_of(model), {}, []
-    for name in known:
-        unit, want = str(log[name].attrs.get("units", "1")), model.units.get(name)
-        if want is None or unit == want:
-            continue
-        if unit == "1" and want not in SHARES:
-            changed[name] = column(log, name)
-            said.append(f"{name}: has no unit, taken as {want}")
-            continue
-        low, high = getattr(model, "valid", {}).get(name, (0.0, 0.0))  # of what a plant was fitted to
-        if unit not in SHARES or want not in SHARES or (want == "1" and max(-low, high) > 1 + _SLACK):
-            raise UserError(
-                f"is in {unit!r}, the plant's is in {want!r}",
-                file=log_name(log),
-                column=name,
-                hint="convert it" if want != "1" else "convert it, or leave the unit away if it is the same",
-            )
-        if unit == "1" and largest[name] > 1 + _SLACK:
-            changed[name] = column(log, name)
-            said.append(f"{name}: has no unit and values up to {largest[name]:g}, taken as {want}")
-        else:
-            changed[name] = column(log, name) * (SHARES[want] / SHARES[unit])
-            said.append(f"{name}: converted from {unit} to {want}")
-    roles = {
-        str(key): known.get(str(key), str(item.attrs.get("role")) if keep_others else "other")
-        for key, item in log.items()
-    }
-    if not changed and all(item.attrs.get("role") == roles[str(key)] for key, item in log.items()):
-        return log, said
-    out = log.copy()
-    for key, item in log.items():
-        name = str(key)
-        attrs = item.attrs | {"role": roles[name]}
-        if name in changed:
-            attrs["units"] = model.units[name]
-        out[name] = ("time", changed.get(name, item.values), attrs)
-    return out, said
+def _converted(
+    model: Signals, name: str, unit: str, largest: float, log: str
+) -> tuple[float, str] | None:
+    """Return a signal's factor to the model's unit and a note, None where it is in it; refuse another unit.
+
+    ``largest`` is the greatest size of its values in all logs.
+    """
+    want = model.units.get(name)
+    if want is None or unit == want:
+        return None
+    if unit == "1" and want not in SHARES:
+        return 1.0, f"{name}: has no unit, taken as {want}"
+    low, high = getattr(model, "valid", {}).get(name, (0.0, 0.0))  # of what a plant was fitted to
+    if unit not in SHARES or want not in SHARES or (want == "1" and max(-low, high) > 1 + _SLACK):
+        raise UserError(
+            f"is in {unit!r}, the plant's is in {want!r}",
+            file=log,
+            column=name,
+            hint="convert it" if want != "1" else "convert it, or leave the unit away if it is the same",
+        )
+    if unit == "1" and largest > 1 + _SLACK:
+        return 1.0, f"{name}: has no unit and values up to {largest:g}, taken as {want}"
+    return SHARES[want] / SHARES[unit], f"{name}: converted from {unit} to {want}"
 
 
 def _largest(columns: Sequence[Array]) -> float:

@@ -17,8 +17,9 @@ import numpy as np
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import check_json, read_json, write_json
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Log
+from thermogrip.datasets.schema import Log, column, log_name, make_log
 from thermogrip.sysid.models.model import Model, load_model
+from thermogrip.sysid.plant.log_grid import at_rows, cut_stretches, match_logs
 from thermogrip.sysid.plant.plant_data import (
     SCHEMA,
     VERSION,
@@ -31,7 +32,7 @@ from thermogrip.sysid.plant.plant_data import (
     thin,
     write_samples,
 )
-from thermogrip.sysid.plant.simulation import simulate
+from thermogrip.sysid.plant.simulation import AFTER_GAP, find_starts, predict
 
 _INSIDE = 64  # so many samples stand in the plant's own file
 
@@ -96,7 +97,7 @@ class Plant(PlantData):
     def simulate(
         self, log: Log, warmup: float = 5.0, *, score_from: float | None = None, gaps: str = "mend"
     ) -> Log:
-        """Return the free run over the log; see :func:`thermogrip.sysid.plant.simulation.simulate`.
+        """Return the free run over the log (:mod:`thermogrip.sysid.plant.simulation`).
 
         Parameters
         ----------
@@ -124,7 +125,33 @@ class Plant(PlantData):
         >>> Plant(block, {}, dt=10.0).simulate(log, warmup=50.0)["t"].values[[59, -1]].round(1).tolist()
         [0.0, 39.9]
         """
-        return simulate(self, log, warmup=warmup, score_from=score_from, gaps=gaps)
+        if gaps not in ("mend", "hold"):
+            raise ValueError(f"gaps is 'mend' or 'hold', not {gaps!r}")
+        if not warmup > 0:
+            raise UserError(f"a warm-up of {warmup:g} s says nothing", hint="give it a few seconds")
+        (log,), notes = match_logs(self, [log])
+        stretches = cut_stretches(self, log, gaps=gaps)
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges is infinite, an answer
+                starts = find_starts(self, self.p, stretches, warmup)
+                runs = predict(self.model, self.dt, self.p[None], stretches, starts)
+                at = [at_rows(stretch, run, self.dt)[0] for stretch, run in zip(stretches, runs)]
+        except np.linalg.LinAlgError as error:
+            hint = "identify the plant again"
+            raise UserError("the plant's run is not finite", file=log_name(log), hint=hint) from error
+        time, y = log["time"].values, np.empty((log.sizes["time"], len(self.outputs)))
+        scored = time - float(time[0]) >= (warmup if score_from is None else score_from)
+        for stretch, readings in zip(stretches, at):
+            y[stretch.rows] = readings
+            if stretch.gap:
+                scored[stretch.rows] &= stretch.time >= AFTER_GAP
+        variables = {n: (y[:, k], self.units.get(n, "degC"), "output") for k, n in enumerate(self.outputs)}
+        for role, group in (("input", self.inputs), ("disturbance", self.disturbances)):
+            variables |= {n: (column(log, n), str(log[n].attrs["units"]), role) for n in group}
+        variables["scored"] = (scored.astype(float), "1", "other")
+        run = make_log(time, variables, name=log_name(log))
+        run.attrs["notes"] = "\n".join([*notes, *(start.how for start in starts)])
+        return run
 
     def to_dict(self, *, draws: int | None = None) -> dict[str, Any]:
         """Return the whole plant as plain JSON, with so many posterior samples, evenly spread; with all where

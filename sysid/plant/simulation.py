@@ -27,11 +27,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermogrip.datasets.arrays import Array, Mask
-from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Log, columns, log_name, make_log
+from thermogrip.datasets.arrays import Array
 from thermogrip.sysid.models.lti import symmetric_root
-from thermogrip.sysid.plant.log_grid import Stretch, at_rows, cut_stretches, match_log
+from thermogrip.sysid.plant.log_grid import Stretch
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import Model
@@ -58,34 +56,6 @@ class Start:
     level: float | None  # the uniform temperature of a log that starts at rest
     change: float  # seconds after the row before the gap at which the input changed
     how: str  # one clause for notes
-
-
-def simulate(
-    plant: PlantData, log: Log, *, warmup: float = 5.0, score_from: float | None = None, gaps: str = "mend"
-) -> Log:
-    """Return the free run of ``plant`` over ``log``."""
-    if gaps not in ("mend", "hold"):
-        raise ValueError(f"gaps is 'mend' or 'hold', not {gaps!r}")
-    if not warmup > 0:
-        raise UserError(f"a warm-up of {warmup:g} s says nothing", hint="give it a few seconds")
-    log, said = match_log(plant, log)
-    stretches = cut_stretches(plant, log, gaps=gaps)
-    try:
-        with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges is infinite, and an answer
-            starts = find_starts(plant, plant.p, stretches, warmup)
-            runs = predict(plant.model, plant.dt, plant.p[None], stretches, starts)
-            at = [at_rows(stretch, run, plant.dt)[0] for stretch, run in zip(stretches, runs)]
-    except np.linalg.LinAlgError as error:
-        hint = "identify the plant again"
-        raise UserError("the plant's run is not finite", file=log_name(log), hint=hint) from error
-    y = np.empty((log.sizes["time"], len(plant.outputs)))
-    since = np.asarray(log["time"].values, dtype=float) - float(log["time"].values[0])
-    scored = since >= (warmup if score_from is None else score_from)
-    for stretch, readings in zip(stretches, at):
-        y[stretch.rows] = readings
-        if stretch.gap:
-            scored[stretch.rows] &= stretch.time >= AFTER_GAP
-    return _as_log(plant, log, y, scored, [*said, *(start.how for start in starts)])
 
 
 def find_starts(plant: PlantData, p: Array, stretches: Sequence[Stretch], warmup: float) -> list[Start]:
@@ -284,16 +254,3 @@ def _noise(plant: PlantData, stretch: Stretch, warmup: float) -> Array:
     sd = np.array([max(plant.noise.get(name, 0.1), _LEAST_NOISE) for name in plant.outputs])
     readings = 1 + n * plant.dt / READING_EVERY
     return np.tile(sd * np.sqrt((n + 1) / min(readings, n + 1)), (n + 1, 1))
-
-
-def _as_log(plant: PlantData, log: Log, y: Array, scored: Mask, notes: list[str]) -> Log:
-    variables = {
-        name: (y[:, k], plant.units.get(name, "degC"), "output") for k, name in enumerate(plant.outputs)
-    }
-    for role, group in (("input", plant.inputs), ("disturbance", plant.disturbances)):
-        for name in group:
-            variables[name] = (columns(log, (name,))[:, 0], str(log[name].attrs["units"]), role)
-    variables["scored"] = (scored.astype(float), "1", "other")
-    out = make_log(log["time"].values, variables, name=log_name(log))
-    out.attrs["notes"] = "\n".join(notes)
-    return out

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -33,8 +33,8 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.resample import average as average_log
 from thermogrip.datasets.resample import gaps
 from thermogrip.datasets.schema import Log, column, log_name
-from thermogrip.sysid.plant.fit_record import said_of_fit
-from thermogrip.sysid.plant.log_grid import match_log
+from thermogrip.sysid.plant.fit_record import fit_logs, said_of_fit
+from thermogrip.sysid.plant.log_grid import match_logs
 from thermogrip.sysid.validation.residual_tests import (
     SQUARED,
     Correlation,
@@ -175,7 +175,7 @@ def free_run(
     >>> run.scores["t"].rmse < 0.01, run.scores["t"].n, run.no_better
     (True, 195, ())
     """
-    log, converted = match_log(plant, log)
+    (log,), converted = match_logs(plant, [log])
     if score_from < warmup:
         raise UserError(
             f"scoring from {score_from:g} s would score readings of the {warmup:g} s warm-up",
@@ -183,30 +183,35 @@ def free_run(
         )
     seen = plant.simulate(log, warmup=warmup, score_from=score_from) if known is None else known.log
     units = {name: str(log[name].attrs.get("units", "1")) for name in plant.outputs}
-    both = _beside(plant, log, seen, average)
+    pairs = _beside(plant, log, seen, average)
+    both = pairs.outputs
     scores, found = _scores(both, units), gaps(log)
     held: dict[str, Score] = {}
     if found and known is not None:
         held = known.held
     elif found:
         through = plant.simulate(log, warmup=warmup, score_from=score_from, gaps="hold")
-        held = _scores(_beside(plant, log, through, average), units)
-    mean = {n: score(y, np.full(y.shape, np.nanmean(y)), units[n]) for n, (_, y, _) in both.items()}
-    no_input = {n: score(y, no_input_baseline(time, y), units[n]) for n, (time, y, _) in both.items()}
+        held = _scores(_beside(plant, log, through, average).outputs, units)
+    mean = {n: score(y, np.full(y.shape, np.nanmean(y)), units[n]) for n, (y, _) in both.items()}
+    no_input = {n: score(y, no_input_baseline(pairs.time, y), units[n]) for n, (y, _) in both.items()}
     with np.errstate(invalid="ignore"):  # a run that went to infinity makes no step there
-        one = {n: score(y[1:], y[:-1] + np.diff(v), units[n]) for n, (_, y, v) in _known(both).items()}
+        one = {n: _one_step(y, v, units[n]) for n, (y, v) in both.items()}
     no_better = tuple(
         name for name in plant.outputs if not scores[name].rmse < NO_BETTER * no_input[name].rmse
     )
-    whiteness = {name: autocorrelation(y - v) for name, (_, y, v) in both.items()}
-    left = _input_left(plant, log if average is None else average_log(log, average), both)
+    whiteness = {name: autocorrelation(y - v) for name, (y, v) in both.items()}
+    moved = {u: values for u, values in pairs.inputs.items() if np.ptp(values) > 0}
+    left = {n: {u: cross_correlation(y - v, w) for u, w in moved.items()} for n, (y, v) in both.items()}
     residual = (
         residual_correlations(plant, log, seen, warmup=warmup) if tests else ResidualCorrelations({}, {})
     )
-    beyond, outside = _beyond_fit(plant, log, seen, residual), _outside(plant, log)
+    # means over the fit's own blocks: an error as slow as the log correlates with no input, but shows here
+    blocks = _blocks_of_fit(plant, np.asarray(log["time"].values, dtype=float))
+    beyond = _beyond_fit(plant, residual, _beside(plant, log, seen, blocks).outputs if blocks else {})
+    outside = _outside(plant, {name: column(log, name) for name in plant.valid if name in log})
     unseen = [name for name in outside if name not in plant.outputs]
     notes = (
-        *said_of_fit(plant.fitted_to, log),
+        *said_of_fit(plant.fitted_to, *fit_logs([log])),
         *converted,
         *_notes(float(log["time"].values[0]), found, held, no_better),
         *_residual_notes(whiteness, residual, units, warmup, unseen),
@@ -262,12 +267,18 @@ def no_input_baseline(time: Array, measured: Array) -> Array:
     return best
 
 
-def _beside(
-    plant: Plant, log: Log, seen: Log, average: float | None
-) -> dict[str, tuple[Array, Array, Array]]:
-    """Return time, measured and simulated of each output, NaN where not scored."""
+class _Pairs(NamedTuple):
+    """Readings beside the run at the same times (n,), NaN where not scored, and the inputs there."""
+
+    time: Array
+    outputs: dict[str, tuple[Array, Array]]  # measured, simulated
+    inputs: dict[str, Array]
+
+
+def _beside(plant: Plant, log: Log, seen: Log, average: float | None) -> _Pairs:
+    """Return what was measured beside the run ``seen``, in means over ``average`` [s] if that is given."""
     scored = np.asarray(seen["scored"].values) > 0
-    pair = log[list(plant.outputs)]
+    pair = log[[*plant.outputs, *plant.inputs]]
     pair.attrs = dict(log.attrs)
     for name in plant.outputs:
         pair[name] = ("time", np.where(scored, column(log, name), np.nan), log[name].attrs)
@@ -277,32 +288,19 @@ def _beside(
     if not scored.any():
         problem = f"nothing of its {np.ptp(time):g} s is left to score"
         raise UserError(problem, file=log_name(log), hint="give a longer log, or score from an earlier time")
-    return {name: (time, column(pair, name), column(pair, f"{name} simulated")) for name in plant.outputs}
+    outputs = {name: (column(pair, name), column(pair, f"{name} simulated")) for name in plant.outputs}
+    return _Pairs(time, outputs, {name: column(pair, name) for name in plant.inputs})
 
 
-def _known(both: Mapping[str, tuple[Array, Array, Array]]) -> dict[str, tuple[Array, Array, Array]]:
-    """Return the rows whose reading is known: the last reading is the last one that came."""
-    out = {}
-    for name, (time, y, v) in both.items():
-        known = np.isfinite(y)
-        out[name] = (time[known], y[known], v[known])
-    return out
+def _one_step(y: Array, v: Array, unit: str) -> Score:
+    """Return the score of the last reading that came plus the run's move."""
+    known = np.isfinite(y)
+    y, v = y[known], v[known]
+    return score(y[1:], y[:-1] + np.diff(v), unit)
 
 
-def _input_left(
-    plant: Plant, drive: Log, both: Mapping[str, tuple[Array, Array, Array]]
-) -> dict[str, dict[str, Correlation]]:
-    """Correlate each residual with each input before it, if the input moves at all."""
-    at = np.asarray(drive["time"].values, dtype=float)
-    moved = {u: column(drive, u) for u in plant.inputs if np.ptp(column(drive, u)) > 0}
-    return {
-        name: {u: cross_correlation(y - v, np.interp(time, at, values)) for u, values in moved.items()}
-        for name, (time, y, v) in both.items()
-    }
-
-
-def _scores(both: Mapping[str, tuple[Array, Array, Array]], units: Mapping[str, str]) -> dict[str, Score]:
-    return {name: score(y, v, units[name]) for name, (_, y, v) in both.items()}
+def _scores(both: Mapping[str, tuple[Array, Array]], units: Mapping[str, str]) -> dict[str, Score]:
+    return {name: score(y, v, units[name]) for name, (y, v) in both.items()}
 
 
 def _notes(
@@ -365,21 +363,20 @@ def _correlation_note(name: str, signal: str, found: CorrelationTest, unit: str,
     return f"{name}: the residual correlates with {what} (rms {size}, p = {found.p:.1g}): {why}"
 
 
-def _beyond_fit(
-    plant: Plant, log: Log, seen: Log, residual: ResidualCorrelations
-) -> dict[str, tuple[float, float]]:
-    """Return the errors here and in the fit of outputs whose error exceeds that of the fit by much.
-
-    In means over the fit's own blocks: an error as slow as the log correlates with no input, but shows here.
-    """
+def _blocks_of_fit(plant: Plant, time: Array) -> float | None:
+    """Return the length of the blocks of a grey-box fit [s]; None where these rows make no such means."""
     seconds = plant.scores.average_s
-    time = np.asarray(log["time"].values, dtype=float)
     if not plant.scores.in_sample_rmse or seconds is None:  # a black box's noise is no error of its fit
-        return {}
-    if not float(np.median(np.diff(time))) <= float(seconds) <= np.ptp(time) / 10:  # rows are no such means
-        return {}
+        return None
+    return seconds if float(np.median(np.diff(time))) <= seconds <= np.ptp(time) / 10 else None
+
+
+def _beyond_fit(
+    plant: Plant, residual: ResidualCorrelations, blocks: Mapping[str, tuple[Array, Array]]
+) -> dict[str, tuple[float, float]]:
+    """Return the errors here and in the fit of outputs whose error exceeds that of the fit by much."""
     found = {}
-    for name, (_, y, v) in _beside(plant, log, seen, float(seconds)).items():
+    for name, (y, v) in blocks.items():
         here, there = score(y, v).rmse, plant.noise.get(name, 0.0)
         if here > EXCEEDS * there > 0 and residual.start.get(name, 0.0) <= START:
             found[name] = (here, there)
@@ -408,11 +405,11 @@ def _outside_notes(plant: Plant, outside: Mapping[str, float]) -> list[str]:
     return out
 
 
-def _outside(plant: Plant, log: Log) -> dict[str, float]:
+def _outside(plant: Plant, signals: Mapping[str, Array]) -> dict[str, float]:
     """Return by signal the share of rows outside of the range that the fit has seen, from 1 % on."""
     out = {}
-    for name, (low, high) in plant.valid.items():
-        if name in log:
-            values, room = column(log, name), 0.05 * (high - low)
-            out[name] = float(np.mean((values < low - room) | (values > high + room)))
+    for name, values in signals.items():
+        low, high = plant.valid[name]
+        room = 0.05 * (high - low)
+        out[name] = float(np.mean((values < low - room) | (values > high + room)))
     return {name: share for name, share in out.items() if share > 0.01}

@@ -245,12 +245,14 @@ def residual_correlations(plant: Plant, log: Log, seen: Log, *, warmup: float = 
 
     Empty where the run diverged, has no residual, or has fewer than twenty blocks.
     """
-    residual = _residual(plant, log, seen)
+    run, scored = columns(seen, plant.outputs), np.asarray(seen["scored"].values) > 0
+    residual = _residual(columns(log, plant.outputs), run, scored)
     rms = np.sqrt(np.nanmean(residual**2, axis=0)) if residual is not None else np.zeros(1)
     if residual is None or not rms.all():
         return ResidualCorrelations({}, {})
-    drawn = _of_draws(plant, log, seen, rms, warmup)
-    parts = _parts(plant, log, residual, drawn, rms, warmup)
+    draws = [plant.draw(k) for k in range(1, _DRAWS + 1)] if plant.uncertain else []
+    drawn = _of_draws([columns(draw.simulate(log, warmup=warmup), plant.outputs) for draw in draws], run, rms)
+    parts = _parts(plant, cut_stretches(plant, log), residual, drawn, rms, warmup)
     if not parts:
         return ResidualCorrelations({}, {})
     signals = list(parts[0].tested)
@@ -304,10 +306,8 @@ class _Blocks:
         return out
 
 
-def _residual(plant: Plant, log: Log, seen: Log) -> Array | None:
+def _residual(read: Array, run: Array, scored: Mask) -> Array | None:
     """Return readings less free run (rows, n_y), NaN where not scored; None where nothing can be tested."""
-    read, run = columns(log, plant.outputs), columns(seen, plant.outputs)
-    scored = np.asarray(seen["scored"].values) > 0
     known = np.isfinite(read) & scored[:, None]
     if not known.any(axis=0).all() or not np.isfinite(run[scored]).all():
         return None
@@ -318,19 +318,20 @@ def _residual(plant: Plant, log: Log, seen: Log) -> Array | None:
     return np.where(known, read - run, np.nan)
 
 
-def _of_draws(plant: Plant, log: Log, seen: Log, rms: Array, warmup: float) -> Array:
+def _of_draws(runs: Sequence[Array], nominal: Array, rms: Array) -> Array:
     """Return the change of each draw of the parameters, (rows, n_y, n_draw), one sd all together."""
-    nominal, out = columns(seen, plant.outputs), []
-    for k in range(1, _DRAWS + 1) if plant.uncertain else ():
-        change = columns(plant.draw(k).simulate(log, warmup=warmup), plant.outputs) - nominal
+    out = []
+    for run in runs:
+        change = run - nominal
         if np.isfinite(change).all():  # a draw that diverges has no information on small changes
             out.append(change / max(1.0, float((np.abs(change).max(axis=0) / (_WIDE * rms)).max())))
     return np.stack(out, axis=2) / np.sqrt(len(out)) if out else np.zeros((*nominal.shape, 0))
 
 
-def _parts(plant: Plant, log: Log, residual: Array, drawn: Array, rms: Array, warmup: float) -> list[_Part]:
+def _parts(
+    plant: Plant, stretches: Sequence[Stretch], residual: Array, drawn: Array, rms: Array, warmup: float
+) -> list[_Part]:
     """Return the stretches that are long enough."""
-    stretches = cut_stretches(plant, log)
     starts = find_starts(plant, plant.p, stretches, warmup)
     step = max(plant.dt, *(float(np.median(np.diff(s.time))) for s in stretches if s.time.size > 1), 1e-9)
     width = step * max(1, int(np.ceil(max(s.time[-1] for s in stretches) / step / _BLOCKS)))

@@ -382,7 +382,7 @@ def test_a_simulation_is_written_and_counted(bench: Bench, stand_in: StandIn) ->
     assert json.loads(bench.run(*words, "--json").out) == {
         "log": "good", "rows": 3, "out": "s.csv", "repairs": []
     }  # fmt: skip
-    stand_in("thermogrip.sysid.plant.log_grid.match_log", (log, ["drive: converted"]))
+    stand_in("thermogrip.sysid.plant.log_grid.match_logs", ([log], ["drive: converted"]))
     assert "drive: converted" in bench.run(*words).err
 
 

@@ -466,7 +466,8 @@ def test_columns_are_what_was_named_what_the_network_has_or_what_was_guessed():
     assert identification._moves([first.assign(lamp=first["lamp"] * np.nan)], "lamp")
     network: Any = SimpleNamespace(name="block", inputs=("q",), disturbances=("room",), outputs=("t",))
     lists = {"input": ["q"], "disturbance": None, "output": None}
-    found = identification._signal_roles(logs, (("q",), ("room",), ("t",)), lists, network)
+    found, unused = identification._signal_roles(logs, (("q",), ("room",), ("t",)), lists, network)
+    assert unused == []  # a list says what is used
     assert [(s.name, s.unit, s.role, s.why, s.guessed) for s in found] == [
         ("q", "1", "input", "named", False),
         ("room", "1", "disturbance", "network block", False),

@@ -425,7 +425,7 @@ def simulate(
     """Simulate a plant over the inputs of a log."""
     from thermogrip.datasets.log_files import write_log
     from thermogrip.datasets.schema import column
-    from thermogrip.sysid.plant.log_grid import match_log
+    from thermogrip.sysid.plant.log_grid import match_logs
 
     new_file(out)
     console = Console(as_json)
@@ -433,7 +433,7 @@ def simulate(
     roles = loaded.inputs, loaded.outputs, loaded.disturbances
     (record,) = load_logs([log], *roles, columns=comma(columns), dt=dt)
     repairs = _repaired(console, [record])[log_name(record)]
-    record, converted = match_log(loaded, record)
+    (record,), converted = match_logs(loaded, [record])
     for line in converted:
         console.warn(f"{log_name(record)}: {line}")
     simulated = loaded.simulate(record, warmup=warmup)

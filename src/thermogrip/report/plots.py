@@ -65,7 +65,7 @@ def free_run_figure(log: Log, simulated: Log, outputs: Sequence[str], band: Band
         middle.axhline(0, color=TARGET, lw=0.6)
         middle.set_ylabel(f"error [{difference_unit(log[name].attrs['units'])}]")
         for j, u in enumerate(names(log, "input")):
-            label, colour = _with_unit(log, u), PALETTE[(2 + j) % 8]
+            label, colour = _with_unit(u, log[u].attrs["units"]), PALETTE[(2 + j) % 8]
             bottom.step(t[keep], column(log, u)[keep], where="post", lw=0.8, color=colour, label=label)
         bottom.set_xlabel("time [s]")
         bottom.set_ylabel("inputs")
@@ -201,7 +201,7 @@ def loop_figure(runs: Mapping[str, Log], targets: Mapping[str, float], output: s
         top.axhline(targets[title], color=TARGET, lw=0.8, ls="--", label="target")
         top.set_title(title, fontsize=9)
         for j, u in enumerate(names(log, "input")):
-            label, colour = _with_unit(log, u), PALETTE[(1 + j) % 8]
+            label, colour = _with_unit(u, log[u].attrs["units"]), PALETTE[(1 + j) % 8]
             bottom.step(t[keep], column(log, u)[keep], where="post", lw=0.9, color=colour, label=label)
         bottom.set_xlabel("time [s]")
     axes[0, 0].set_ylabel("temperature [degC]")
@@ -313,9 +313,8 @@ def _log_scale(axis: Axes, values: Sequence[float]) -> None:
     axis.xaxis.set_minor_formatter(NullFormatter())
 
 
-def _with_unit(log: Log, name: str) -> str:
+def _with_unit(name: str, unit: str) -> str:
     """Return the variable with its unit, where it has one."""
-    unit = log[name].attrs["units"]
     return name if unit == "1" else f"{name} [{unit}]"
 
 

@@ -65,13 +65,14 @@ def test_a_wrong_entry_is_named(content, where):
 def test_rows_of_a_log_are_in_the_fit_where_it_is_the_same_log_at_the_same_time():
     log = make_log([0.0, 1.0, 2.0, 3.0], {"q": ([0, 1, 0, 1], "percent", "input")}, name="a")
     same = data_hash(log)
+    (seen,) = fit_logs([log])
     others = [FitLog("a", "0" * 64, 0.0, 3.0), FitLog("a", same, 3.0, 5.0), FitLog("a", same, -1.0, 0.0)]
-    assert said_of_fit(others, log) == []
-    (whole,) = said_of_fit([FitLog("a", same, -1.0, 3.0)], log)
+    assert said_of_fit(others, seen) == []
+    (whole,) = said_of_fit([FitLog("a", same, -1.0, 3.0)], seen)
     assert whole.startswith("all of it is in the fit: the scores")
-    (part,) = said_of_fit([FitLog("b", same, 1.0, 9.0)], log)
+    (part,) = said_of_fit([FitLog("b", same, 1.0, 9.0)], seen)
     assert part.startswith("1 to 3 s of 0 to 3 s are in the fit (as b): there the scores")
-    both = said_of_fit([FitLog("a", same, 0.0, 1.0), *others, FitLog("a", same, 2.0, 9.0)], log)
+    both = said_of_fit([FitLog("a", same, 0.0, 1.0), *others, FitLog("a", same, 2.0, 9.0)], seen)
     assert [line.split(" in the fit: there the scores say")[0] for line in both] == [
         "0 to 1 s of 0 to 3 s are", "2 to 3 s of 0 to 3 s are"
     ]  # fmt: skip

@@ -21,12 +21,10 @@ from thermogrip.sysid.plant.log_grid import (
     cut_stretches,
     dominant_time,
     make_grid,
-    match_log,
     match_logs,
     misfit,
     quantum,
     signals,
-    switches_of,
     whole_readings,
 )
 
@@ -271,8 +269,9 @@ def test_switches_are_shares_that_are_nought_or_one():
     on = (T > 50).astype(float)
     more = {"half": (0.5 * on, "1"), "s": (on, "1"), "c": (on, "0_255"), "a": (on, "A")}
     log = log_of(T, q=on, **{name: (*item, "input") for name, item in more.items()})
-    assert switches_of([log], ["q", "half", "s", "c", "a"]) == ("s",)
-    assert switches_of([log_of(T, s=(0 * on, "1", "input"))], ["s"]) == ("s",)  # off throughout
+    assert make_grid([log], average=1.0).switches == ("s",)
+    off = log_of(T, s=(0 * on, "1", "input"))
+    assert make_grid([off], inputs=["s"], average=1.0).switches == ("s",)  # off throughout
 
 
 # ---- the step ----
@@ -590,10 +589,10 @@ def test_a_drive_is_converted_where_both_units_are_shares_of_full_scale(
     if made is None:
         said = f"is in '{unit}', the plant's is in '{want}'.*convert it"
         with pytest.raises(UserError, match=said) as fault:
-            match_log(model, log)
+            match_logs(model, [log])
         assert ("leave the unit away" in str(fault.value)) is (want == "1")
     else:
-        matched, said = match_log(model, log)
+        (matched,), said = match_logs(model, [log])
         np.testing.assert_allclose(matched["q"].values.max(), made, rtol=1e-12)
         assert matched["q"].attrs["units"] == want
         assert len(said) == (unit != want)
@@ -630,7 +629,7 @@ def test_what_was_converted_is_reported_once_and_columns_take_the_models_roles()
         assert [got[name].attrs["units"] for name in columns] == ["W", "percent", "K", "degC", "s"]
         assert got.identical(again)
     assert match_logs(model, [got], keep_others=True)[0][0] is got
-    matched, lines = match_log(bare(), log)  # nothing to convert, but its roles
+    (matched,), lines = match_logs(bare(), [log])  # nothing to convert, but its roles
     assert (lines, matched["room"].attrs["role"], log["room"].attrs["role"]) == ([], "disturbance", "input")
     assert match_logs(model, []) == ([], [])
     assert match_logs(bare(p="percent"), [log.assign(p=log["p"] / 100)])[1] == [

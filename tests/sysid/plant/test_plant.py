@@ -146,20 +146,6 @@ def test_draws_are_thinned_evenly_and_as_many_as_64_stand_in_the_file(plant: Pla
         Plant.load(tmp_path / "p.json")
 
 
-def test_a_plant_passes_on_how_it_is_to_be_simulated(monkeypatch: pytest.MonkeyPatch):
-    seen = []
-    monkeypatch.setattr(
-        "thermogrip.sysid.plant.plant.simulate", lambda *args, **how: seen.append((args, how))
-    )
-    block = _plants()[2]
-    block.simulate("log")
-    block.simulate("log", 7.0, score_from=3.0, gaps="hold")
-    assert seen == [
-        ((block, "log"), {"warmup": 5.0, "score_from": None, "gaps": "mend"}),
-        ((block, "log"), {"warmup": 7.0, "score_from": 3.0, "gaps": "hold"}),
-    ]
-
-
 def test_samples_stand_beside_the_plant_and_move_with_it(plant: Plant, tmp_path: Path):
     samples = np.exp(np.random.default_rng(1).normal(size=(80, len(plant.free))))
     replace(plant, samples=samples).save(tmp_path / "plant.json")

@@ -101,10 +101,10 @@ def test_means_of_the_residual_are_correlated_with_means_of_the_input():
     log, fast = lag_log(2000, noise=0.3, seed=2), np.resize([0.0, 1.0, 1.0, 0.0, 1.0], 2000)
     log["q"] = ("time", log["q"].values + fast, log["q"].attrs)
     run = free_run(lag_plant(), log, average=10.0, tests=False)
-    [(time, y, v)] = module._beside(lag_plant(), log, run.log, 10.0).values()
-    means = average(log, 10.0)
-    q = np.interp(time, means["time"].values, means["q"].values)
-    wanted = cross_correlation(y - v, q)
+    pairs = module._beside(lag_plant(), log, run.log, 10.0)
+    means, (y, v) = average(log, 10.0), pairs.outputs["t"]
+    np.testing.assert_array_equal(pairs.time, means["time"].values)
+    wanted = cross_correlation(y - v, means["q"].values)
     np.testing.assert_array_equal(run.input_correlation["t"]["q"].values, wanted.values)
 
 
@@ -278,10 +278,13 @@ def test_an_error_of_more_than_twice_that_of_the_fit_is_stated(here, noise, seco
     scores = PlantScores(average_s=seconds, in_sample_rmse={"fit": {"t": noise}})
     plant = replace(lag_plant(), noise={"t": noise}, scores=scores)
     residual = ResidualCorrelations({}, {"t": start})
-    beyond = module._beyond_fit(plant, *offset_run(here), residual)
+    log, seen = offset_run(here)
+    blocks = module._blocks_of_fit(plant, log["time"].values)
+    pairs = module._beside(plant, log, seen, blocks).outputs if blocks else {}
+    beyond = module._beyond_fit(plant, residual, pairs)
     assert beyond == ({"t": (pytest.approx(here), noise)} if found else {})
     black_box = replace(plant, scores=PlantScores(average_s=5.0))
-    assert module._beyond_fit(black_box, *offset_run(here), residual) == {}
+    assert module._blocks_of_fit(black_box, log["time"].values) is None
 
 
 @pytest.mark.parametrize(
@@ -292,7 +295,7 @@ def test_more_than_one_row_in_a_hundred_beyond_a_twentieth_of_the_range_is_outsi
     log, _ = offset_run(0.0, n=100, q=np.where(np.arange(100) < rows, far, 1.0))
     plant = replace(lag_plant(), valid={"q": (0.0, 2.0), "t": (5.0, 6.0), "absent": (0.0, 1.0)})
     found = [("q", "0 to 2", share)] if share else []
-    outside = module._outside(plant, log)
+    outside = module._outside(plant, {name: log[name].values for name in ("q", "t")})
     assert module._outside_notes(plant, outside) == [
         f"{name} lies outside of {where}, the range of the fit, in {part} % of the rows"
         for name, where, part in [*found, ("t", "5 to 6", 100)]
