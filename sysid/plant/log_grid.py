@@ -521,9 +521,7 @@ def match_logs(
     return out, list(said)
 
 
-def _converted(
-    model: Signals, name: str, unit: str, largest: float, log: str
-) -> tuple[float, str] | None:
+def _converted(model: Signals, name: str, unit: str, largest: float, log: str) -> tuple[float, str] | None:
     """Return a signal's factor to the model's unit and a note, None where it is in it; refuse another unit.
 
     ``largest`` is the greatest size of its values in all logs.

@@ -115,6 +115,11 @@ class Plant(PlantData):
         Log
             The model's outputs at the log's times, its inputs and disturbances, and ``scored`` (1 or 0).
 
+        Raises
+        ------
+        UserError
+            If a signal is missing or in another unit, or the warm-up is not positive.
+
         Examples
         --------
         >>> from thermogrip.datasets.schema import make_log
