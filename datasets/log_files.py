@@ -177,15 +177,11 @@ def as_logs(logs: Log | DataFrame | Sequence[Log | DataFrame], *lists: Sequence[
     """Return logs as they are and DataFrames as :func:`read_log` reads them; ``lists`` are its roles."""
     from xarray import Dataset
 
-    records = list(logs) if isinstance(logs, Sequence) else [logs]
-    out: list[Log] = []
-    for at, record in enumerate(records, start=1):
-        if isinstance(record, Dataset):
-            out.append(record)
-            continue
-        out.append(read_log(record, *lists))
-        out[-1].attrs["name"] += f" {at}" if len(records) > 1 else ""
-    return out
+    given = list(logs) if isinstance(logs, Sequence) else [logs]
+    found: list[Log] = [log if isinstance(log, Dataset) else read_log(log, *lists) for log in given]
+    for at, (log, before) in enumerate(zip(found, given), start=1):
+        log.attrs["name"] += "" if log is before or len(given) == 1 else f" {at}"
+    return found
 
 
 def check_log_file(path: str | Path) -> None:

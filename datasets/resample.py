@@ -137,13 +137,11 @@ def average(log: Log, seconds: float) -> Log:
     }
     repairs = [line for line in str(log.attrs.get("repairs", "")).splitlines() if line]
     repairs.append(f"averaged over {seconds:g} s")
-    averaged = make_log(begins, variables, name=log_name(log), repairs=repairs)
-    averaged.attrs["averaged_s"] = (
-        seconds  # a free run compares with the middle of a block, not with its start
-    )
+    log = make_log(begins, variables, name=log_name(log), repairs=repairs)
+    log.attrs["averaged_s"] = seconds  # a free run compares with the middle of a block, not with its start
     if len(parts) > 1:
-        averaged.attrs[_AFTER_GAP] = " ".join(repr(float(t[0])) for t, _ in parts[1:])
-    return averaged
+        log.attrs[_AFTER_GAP] = " ".join(repr(float(t[0])) for t, _ in parts[1:])
+    return log
 
 
 def _blocks(

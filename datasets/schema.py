@@ -86,28 +86,28 @@ def make_log(
     """
     import xarray as xr
 
-    data = xr.Dataset(coords={"time": ("time", np.asarray(time, dtype=float), {"units": "s"})})
+    log = xr.Dataset(coords={"time": ("time", np.asarray(time, dtype=float), {"units": "s"})})
     for key, (values, unit, role) in variables.items():
-        data[key] = ("time", np.asarray(values, dtype=float), {"units": unit, "role": role})
-    data.attrs.update(schema="thermogrip.log", version=1, name=name, repairs="\n".join(repairs))
-    return check_log(data)
+        log[key] = ("time", np.asarray(values, dtype=float), {"units": unit, "role": role})
+    log.attrs.update(schema="thermogrip.log", version=1, name=name, repairs="\n".join(repairs))
+    return check_log(log)
 
 
 def check_log(log: Log) -> Log:
     """Return the log as it is, or raise :class:`UserError` naming the variable and the rule it breaks."""
-    for problem, hint in _time_faults(log):
+    if "time" not in log.coords or log["time"].dims != ("time",):
+        hint = "give the record a dimension 'time' in seconds"
+        raise UserError("no time axis", file=log_name(log), hint=hint)
+    for problem, hint in _time_faults(log["time"].values):
         raise UserError(problem, file=log_name(log), hint=hint)
     for name, variable in log.data_vars.items():
-        for problem, hint in _variable_faults(variable):
-            raise UserError(problem, file=log_name(log), column=str(name), hint=hint)
+        for problem, advice in _variable_faults(variable):
+            raise UserError(problem, file=log_name(log), column=str(name), hint=advice)
     return log
 
 
-def _time_faults(log: Log) -> Iterator[tuple[str, str | None]]:
+def _time_faults(time: NDArray[np.float64]) -> Iterator[tuple[str, str]]:
     """Yield (problem, hint) of a log's time axis; each check needs those before it."""
-    if "time" not in log.coords or log["time"].dims != ("time",):
-        yield "no time axis", "give the record a dimension 'time' in seconds"
-    time = log["time"].values
     if time.size < 2:
         yield f"{time.size} row(s) are not a log", "give at least two rows"
     if not np.all(np.isfinite(time)):

@@ -450,7 +450,7 @@ def identify(
     best = None
     if fits:
         least = min(fits, key=lambda fit: fit.choice.error)
-        best = choose_black_box(fits, _between_runs(least.plant, logs))
+        best = choose_black_box(fits, _rms(between_runs(least.plant, logs)))
     if leave_one_out:
         finalists = candidates
     else:
@@ -487,7 +487,7 @@ def identify(
     good, verdict = verdict_of(chosen, rows, checked, leave_one_out)
     mine = [row for row in rows if row.held_out and row.model == chosen]
     # what was held out, and a gain that varies; empty where the logs show what differs between runs
-    varied = _between_runs(plant, logs)
+    varied = _rms(between_runs(plant, logs))
     other = {name: float(np.hypot(stated_error(mine, name), varied[name])) for name in varied}
     if other:
         units = {row.output: "" if row.unit == "1" else f" {row.unit}" for row in rows}
@@ -681,13 +681,8 @@ def no_draws(model: str, what: str, error: Exception) -> str:
     return f"{model}: no {what}, the fit is kept without: {error}"
 
 
-def _between_runs(plant: Plant, logs: Sequence[Log]) -> dict[str, float]:
-    """Return by output the rms of what a gain that varies between runs changes; empty where logs show it."""
-    changes = [between_runs(plant, log) for log in logs]
-    return {
-        name: float(np.sqrt(np.mean(np.concatenate([change[name] for change in changes]) ** 2)))
-        for name in (plant.outputs if all(changes) else ())
-    }
+def _rms(changes: Mapping[str, Array]) -> dict[str, float]:
+    return {name: float(np.sqrt(np.mean(change**2))) for name, change in changes.items()}
 
 
 def _plant_notes(model: str, plant: Plant) -> list[str]:

@@ -33,7 +33,7 @@ from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.repair import GAP_SECONDS, GAP_STEPS
 from thermogrip.datasets.resample import gaps
 from thermogrip.datasets.schema import Log, column, log_name
-from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid, quantum, sample_time, signals
+from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid, quantum, signals
 from thermogrip.sysid.plant.plant import Plant
 
 Verdict = Literal["ok", "warn", "fail"]
@@ -122,10 +122,12 @@ def check_data(
     found: list[Finding] = []
     for log in logs:
         channels = {
-            name: _Channel(log_name(log), name, _unit(log, name), column(log, name)) for name in (*u, *y)
+            name: _Channel(log_name(log), name, str(log[name].attrs.get("units", "1")), column(log, name))
+            for name in (*u, *y)
         }
-        usual = sample_time(log)
-        found += _times(log_name(log), np.diff(log["time"].values), usual, gaps(log))
+        steps = np.diff(log["time"].values)
+        usual = float(np.median(steps))
+        found += _times(log_name(log), steps, usual, gaps(log))
         for name in y:
             channel, averaged = channels[name], grid.dt if grid.dt > 1.5 * usual else None
             found += [_quantum(channel, averaged), _lost(channel), _noise(channel)]
@@ -148,10 +150,6 @@ class _Channel(NamedTuple):
 
     def found(self, check: str, value: float, unit: str, verdict: Verdict, says: str) -> Finding:
         return Finding(check, self.log, self.name, value, unit, verdict, says)
-
-
-def _unit(log: Log, name: str) -> str:
-    return str(log[name].attrs.get("units", "1"))
 
 
 def _times(log: str, steps: Array, usual: float, holes: Sequence[tuple[int, float, float]]) -> list[Finding]:

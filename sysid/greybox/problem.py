@@ -43,7 +43,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, log_name
 from thermogrip.sysid.models.model import GreyModel
 from thermogrip.sysid.models.network_spec import Parameter
-from thermogrip.sysid.plant.log_grid import Stretch, cut_stretches, sample_time
+from thermogrip.sysid.plant.log_grid import Stretch, cut_stretches
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import Start, find_starts, predict
 
@@ -252,7 +252,7 @@ def make_problem(
     """Put logs on the model's grid and into bins of ``average`` [s], or of a row where rows are longer."""
     if not logs:
         raise UserError("no log to fit", hint="give at least one")
-    average = max(average, *map(sample_time, logs))
+    average = max(average, *(float(np.median(np.diff(log["time"].values))) for log in logs))
     plant = prior_plant(model)
     if dt is not None:
         plant = replace(plant, dt=dt)

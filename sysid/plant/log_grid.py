@@ -61,6 +61,34 @@ _GRIDS = 4  # arrays of a run's size that are held at a time
 
 
 @dataclass(frozen=True, eq=False)
+class Rows:
+    """The signals of a model in a log, row by row."""
+
+    time: Array  # (n,) [s]
+    y: Array  # (n, n_y) readings, NaN where lost
+    u: Array  # (n, n_u) inputs
+    d: Array  # (n, n_d) disturbances
+    after: tuple[int, ...]  # which rows follow a gap
+    log: str  # name of the log
+
+    @property
+    def step(self) -> float:
+        """The median time between rows [s]."""
+        return float(np.median(np.diff(self.time)))
+
+    def from_row_on(self) -> Rows:
+        """Return inputs that were applied up to their rows as inputs that are applied from them on."""
+        return replace(self, u=np.concatenate([self.u[1:], self.u[-1:]]))
+
+
+def rows_of(log: Log, inputs: Sequence[str], outputs: Sequence[str], disturbances: Sequence[str]) -> Rows:
+    """Return the columns of a log by role."""
+    u, d, y = (columns(log, group) for group in (inputs, disturbances, outputs))
+    after = tuple(row + 1 for row, _, _ in gaps_of(log, GAP))
+    return Rows(np.asarray(log["time"].values, dtype=float), y, u, d, after, log_name(log))
+
+
+@dataclass(frozen=True, eq=False)
 class Stretch:
     """A part of a log without a gap, its inputs and disturbances on an even grid from its first row on."""
 
@@ -143,98 +171,73 @@ def make_grid(
     if not logs:
         raise UserError("no log to identify from", hint="give at least one")
     u, y, d = signals(logs, inputs=inputs, outputs=outputs, disturbances=disturbances)
-    if ends:
-        logs = [from_row_on(log, u) for log in logs]
-    native = float(np.median([sample_time(log) for log in logs]))
-    step, why = _chosen_step(logs, u, y, native) if average is None else (float(average), "asked for")
+    rows = [rows_of(log, u, y, d) for log in logs]
+    rows = [each.from_row_on() for each in rows] if ends else rows
+    native = float(np.median([each.step for each in rows]))
+    step, why = _chosen_step(rows, y, native) if average is None else (float(average), "asked for")
     if step < native * 0.999:
         raise UserError(
             f"averaging over {step:g} s is shorter than the sample time {native:g} s", hint="average longer"
         )
-    segments = [
-        part for log in logs for part in _segments(log, u, y, d, step, native) if len(part.time) >= min_rows
-    ]
+    segments = [part for each in rows for part in _segments(each, step, native) if len(part.time) >= min_rows]
     if not segments:
         raise UserError(
             f"the logs are too short: no stretch has {min_rows} rows of {step:g} s",
-            file=log_name(logs[0]),
+            file=rows[0].log,
             hint="give a longer log or average less",
         )
     units = {name: str(logs[0][name].attrs.get("units", "1")) for name in (*u, *d, *y)}
     lost = float(np.mean(np.concatenate([~np.isfinite(part.y).all(axis=1) for part in segments])))
-    moves = np.concatenate([columns(log, u) for log in logs])
-    switches = tuple(
-        name for name, on in zip(u, moves.T) if units[name] == "1" and np.isin(on, (0.0, 1.0)).all()
-    )
+    moves = np.concatenate([each.u for each in rows]).T
+    switches = tuple(n for n, on in zip(u, moves) if units[n] == "1" and np.isin(on, (0.0, 1.0)).all())
     return Grid(u, d, y, switches, step, tuple(segments), native, units, why, lost, ends)
 
 
 def cut_stretches(plant: PlantData, log: Log, *, gaps: str = "mend") -> list[Stretch]:
     """Return the stretches of a log, which is in the plant's units, on the plant's grid."""
-    for name in (*plant.inputs, *plant.disturbances):
-        if not np.isfinite(column(log, name)).all():
+    rows = rows_of(log, plant.inputs, plant.outputs, plant.disturbances)
+    for name, values in zip((*plant.inputs, *plant.disturbances), (*rows.u.T, *rows.d.T)):
+        if not np.isfinite(values).all():
             problem, hint = "is unknown in some rows", "fill or cut them"
-            raise UserError(problem, file=log_name(log), column=name, hint=hint)
+            raise UserError(problem, file=rows.log, column=name, hint=hint)
     middle = float(log.attrs.get("averaged_s", 0.0)) / 2  # where the mean of a block belongs
 
     def steps(seconds: float) -> int:
         n = max(1, int(np.ceil((seconds + middle) / plant.dt - 1e-9)))
-        _check_steps(n, plant, log_name(log))
+        _check_steps(n, plant, rows.log)
         return n
 
-    if plant.inputs_end_at_row:
-        log = from_row_on(log, plant.inputs)
-    y, u, d = (columns(log, group) for group in (plant.outputs, plant.inputs, plant.disturbances))
+    rows = rows.from_row_on() if plant.inputs_end_at_row else rows
     for name, step in plant.model.command_steps.items():
         # a driver drops what lies behind a multiple of its step; of averaged commands only the mean of the
         # loss is known, half a step
-        command = u[:, plant.inputs.index(name)]
+        command = rows.u[:, plant.inputs.index(name)]
         if "averaged_s" in log.attrs:
             command -= np.sign(command) * np.minimum(np.abs(command), step / 2)
         else:
             command[:] = np.trunc(command / step + 1e-9 * np.sign(command)) * step
-    found = _stretches(
-        np.asarray(log["time"].values, dtype=float),
-        *(y, u, d),
-        after=() if gaps == "hold" else [row + 1 for row, _, _ in gaps_of(log, GAP)],
-        step=plant.dt,
-        steps=steps,
-        smooth=plant.model.smooth,
-        log=log_name(log),
-    )
+    rows = replace(rows, after=()) if gaps == "hold" else rows
+    found = _stretches(rows, step=plant.dt, steps=steps, smooth=plant.model.smooth)
     return [replace(stretch, time=stretch.time + middle) for stretch in found]
 
 
 def _stretches(
-    time: Array,
-    y: Array,
-    u: Array,
-    d: Array,
-    *,
-    after: Sequence[int],
-    step: float,
-    steps: Callable[[float], int],
-    log: str,
-    smooth: float | None = None,
+    rows: Rows, *, step: float, steps: Callable[[float], int], smooth: float | None = None
 ) -> Iterator[Stretch]:
-    """Yield stretches of two rows or more on a grid of ``step`` [s], ``steps(length [s])`` each.
-
-    Rows have times (n,), readings (n, n_y), inputs (n, n_u) and disturbances (n, n_d); those in ``after``
-    follow a gap.
-    """
-    for begin, end in pairwise([0, *after, time.size]):
-        rows, t = slice(begin, end), time[begin:end]
+    """Yield stretches of two rows or more on a grid of ``step`` [s], ``steps(length [s])`` each."""
+    for begin, end in pairwise([0, *rows.after, rows.time.size]):
+        part, t = slice(begin, end), rows.time[begin:end]
         n = steps(t[-1] - t[0])
         if n < 1:
             continue
         edges = t[0] + step * np.arange(n + 1)
-        held = held_means(t, u[rows], edges)
+        held = held_means(t, rows.u[part], edges)
         if smooth is None:
-            beside = held_means(t, d[rows], edges)
+            beside = held_means(t, rows.d[part], edges)
         else:
-            beside = _smooth(t, d[rows], edges, smooth)
-        gap = float(t[0] - time[begin - 1]) if begin else 0.0
-        yield Stretch(rows, t - t[0], y[rows], held, beside, gap, log)
+            beside = _smooth(t, rows.d[part], edges, smooth)
+        gap = float(t[0] - rows.time[begin - 1]) if begin else 0.0
+        yield Stretch(part, t - t[0], rows.y[part], held, beside, gap, rows.log)
 
 
 def at_rows(stretch: Stretch, run: Array, dt: float) -> Array:
@@ -309,11 +312,6 @@ def signals(
     return u, y, d
 
 
-def sample_time(log: Log) -> float:
-    """Return the median time between rows [s]."""
-    return float(np.median(np.diff(log["time"].values)))
-
-
 def quantum(values: Array) -> float:
     """Return the step of the converter behind a channel, 0 where its values are not discrete."""
     finite = values[np.isfinite(values)]
@@ -324,35 +322,31 @@ def quantum(values: Array) -> float:
     return float(np.round(np.median(np.diff(levels)), 6))
 
 
-def dominant_time(logs: Sequence[Log], *, inputs: Sequence[str], outputs: Sequence[str]) -> float:
+def dominant_time(logs: Sequence[Rows]) -> float:
     """Return the time constant [s] that dominates the outputs, from a first-order model at a coarse step.
 
     The instrument is the lagged input, so that rounding and noise of the readings do not bias it.  Where the
     data give no stable answer, a twentieth of the longest log is used instead.
     """
-    found = []
-    longest = max(float(np.ptp(log["time"].values)) for log in logs)
-    for step in (longest / 400, longest / 150):
-        native = max(sample_time(log) for log in logs)
-        for log in logs:
-            for part in _segments(log, tuple(inputs), tuple(outputs), (), max(step, native), native):
-                found += _first_order_times(part, max(step, native))
+    longest = max(float(np.ptp(rows.time)) for rows in logs)
+    native = max(rows.step for rows in logs)
+    steps = [max(step, native) for step in (longest / 400, longest / 150)]
+    parts = [(part, step) for step in steps for rows in logs for part in _segments(rows, step, native)]
+    found = [time for part, step in parts for time in _first_order_times(part, step)]
     return float(np.median(found)) if found else longest / 20
 
 
-def _chosen_step(
-    logs: Sequence[Log], inputs: Sequence[str], outputs: Sequence[str], native: float
-) -> tuple[float, str]:
+def _chosen_step(logs: Sequence[Rows], outputs: Sequence[str], native: float) -> tuple[float, str]:
     """Return the averaging step [s], a whole multiple of the sample time, and which of the rules set it."""
-    slow = dominant_time(logs, inputs=inputs, outputs=outputs)
-    longest = max(float(np.ptp(log["time"].values)) for log in logs)
+    slow = dominant_time(logs)
+    longest = max(float(np.ptp(rows.time)) for rows in logs)
     most = min(slow / 10, longest / 200)  # whatever the time constant, rows must be left to fit
     needed = max(native, slow / 100)  # finer steps cost time and add nothing
     why = "the logs' own" if needed == native else f"a hundredth of the dominant time constant, {slow:.3g} s"
-    for name in outputs:
-        q = max(quantum(column(log, name)) for log in logs)
+    for k, name in enumerate(outputs):
+        q = max(quantum(rows.y[:, k]) for rows in logs)
         for times in (1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40, 50):
-            moves = [_rms_move(log["time"].values, column(log, name), times * native) for log in logs]
+            moves = [_rms_move(rows.time, rows.y[:, k], times * native) for rows in logs]
             if np.sqrt(np.mean(np.square(moves))) >= q:
                 break
             if times * native > needed:
@@ -364,9 +358,7 @@ def _chosen_step(
     return native * max(1, round(step / native)), why
 
 
-def _segments(
-    log: Log, u: Sequence[str], y: Sequence[str], d: Sequence[str], step: float, native: float
-) -> list[Segment]:
+def _segments(rows: Rows, step: float, native: float) -> list[Segment]:
     """Return a log's stretches of two steps or more with the readings on the grid."""
 
     def steps(seconds: float) -> int:
@@ -374,13 +366,11 @@ def _segments(
         return n if n > 1 else 0
 
     out = []
-    time, own = np.asarray(log["time"].values, dtype=float), abs(step - native) < 1e-6 * native
-    Y, U, D = (columns(log, group) for group in (y, u, d))
-    after = [row + 1 for row, _, _ in gaps_of(log, GAP)]
-    for part in _stretches(time, Y, U, D, after=after, step=step, steps=steps, log=log_name(log)):
-        t = time[part.rows]
+    own = abs(step - native) < 1e-6 * native
+    for part in _stretches(rows, step=step, steps=steps):
+        t = rows.time[part.rows]
         if own and np.ptp(np.diff(t)) < 0.02 * native:  # the samples stand as they are
-            out.append(Segment(t, part.y, U[part.rows], D[part.rows], part.log))
+            out.append(Segment(t, part.y, rows.u[part.rows], rows.d[part.rows], part.log))
         else:
             grid = t[0] + step * np.arange(len(part.u))
             out.append(Segment(grid, _line_mean(t, part.y, grid, step), part.u, part.d, part.log))
@@ -394,15 +384,6 @@ def _check_steps(n: int, plant: PlantData, log: str) -> None:
         took = f"{n} steps of {plant.dt:g} s"
         hint = "cut the log, or use a plant of a longer step"
         raise UserError(f"would be simulated in {took}", file=log, hint=hint)
-
-
-def from_row_on(log: Log, inputs: Sequence[str]) -> Log:
-    """Return a log whose inputs were applied up to their rows with inputs that are applied from them on."""
-    out = log.copy()
-    for name in inputs:
-        values = column(log, name)
-        out[name] = ("time", np.append(values[1:], values[-1:]), log[name].attrs)
-    return out
 
 
 def _smooth(time: Array, values: Array, edges: Array, seconds: float) -> Array:
@@ -499,10 +480,9 @@ def match_logs(
 
     A log that fits as it is is returned itself.
     """
-    known = roles_of(model)
+    known, matched, said = roles_of(model), list(logs), dict[str, None]()
     largest = {name: _largest([column(log, name) for log in logs]) for name in known}
-    out, said = [], dict[str, None]()
-    for log in logs:
+    for at, log in enumerate(logs):
         changed = {}
         for name in known:
             found = _converted(model, name, log[name].attrs.get("units", "1"), largest[name], log_name(log))
@@ -512,13 +492,12 @@ def match_logs(
         roles = {str(n): str(item.attrs.get("role")) if keep_others else "other" for n, item in log.items()}
         roles |= known
         if changed or any(item.attrs.get("role") != roles[str(n)] for n, item in log.items()):
-            log = log.copy()
+            matched[at] = log.copy()
             for name, role in roles.items():
                 attrs = log[name].attrs | {"role": role}
                 attrs |= {"units": model.units[name]} if name in changed else {}
-                log[name] = ("time", changed.get(name, log[name].values), attrs)
-        out.append(log)
-    return out, list(said)
+                matched[at][name] = ("time", changed.get(name, log[name].values), attrs)
+    return matched, list(said)
 
 
 def _converted(model: Signals, name: str, unit: str, largest: float, log: str) -> tuple[float, str] | None:

@@ -154,9 +154,9 @@ class Plant(PlantData):
         for role, group in (("input", self.inputs), ("disturbance", self.disturbances)):
             variables |= {n: (column(log, n), str(log[n].attrs["units"]), role) for n in group}
         variables["scored"] = (scored.astype(float), "1", "other")
-        run = make_log(time, variables, name=log_name(log))
-        run.attrs["notes"] = "\n".join([*notes, *(start.how for start in starts)])
-        return run
+        simulated = make_log(time, variables, name=log_name(log))
+        simulated.attrs["notes"] = "\n".join([*notes, *(start.how for start in starts)])
+        return simulated
 
     def to_dict(self, *, draws: int | None = None) -> dict[str, Any]:
         """Return the whole plant as plain JSON, with so many posterior samples, evenly spread; with all where

@@ -181,9 +181,9 @@ def free_run(
             f"scoring from {score_from:g} s would score readings of the {warmup:g} s warm-up",
             hint=f"score from {warmup:g} s on",
         )
-    seen = plant.simulate(log, warmup=warmup, score_from=score_from) if known is None else known.log
+    simulated = plant.simulate(log, warmup=warmup, score_from=score_from) if known is None else known.log
     units = {name: str(log[name].attrs.get("units", "1")) for name in plant.outputs}
-    pairs = _beside(plant, log, seen, average)
+    pairs = _beside(plant, log, simulated, average)
     both = pairs.outputs
     scores, found = _scores(both, units), gaps(log)
     held: dict[str, Score] = {}
@@ -203,11 +203,11 @@ def free_run(
     moved = {u: values for u, values in pairs.inputs.items() if np.ptp(values) > 0}
     left = {n: {u: cross_correlation(y - v, w) for u, w in moved.items()} for n, (y, v) in both.items()}
     residual = (
-        residual_correlations(plant, log, seen, warmup=warmup) if tests else ResidualCorrelations({}, {})
+        residual_correlations(plant, log, simulated, warmup=warmup) if tests else ResidualCorrelations({}, {})
     )
     # means over the fit's own blocks: an error as slow as the log correlates with no input, but shows here
     blocks = _blocks_of_fit(plant, np.asarray(log["time"].values, dtype=float))
-    beyond = _beyond_fit(plant, residual, _beside(plant, log, seen, blocks).outputs if blocks else {})
+    beyond = _beyond_fit(plant, residual, _beside(plant, log, simulated, blocks).outputs if blocks else {})
     outside = _outside(plant, {name: column(log, name) for name in plant.valid if name in log})
     unseen = [name for name in outside if name not in plant.outputs]
     notes = (
@@ -221,7 +221,7 @@ def free_run(
     exceeds_fit = {name: here / there for name, (here, there) in beyond.items()}
     naive = {"mean": mean, "no_input": no_input}
     return FreeRun(
-        seen,
+        simulated,
         scores,
         one,
         naive,
@@ -275,14 +275,14 @@ class _Pairs(NamedTuple):
     inputs: dict[str, Array]
 
 
-def _beside(plant: Plant, log: Log, seen: Log, average: float | None) -> _Pairs:
-    """Return what was measured beside the run ``seen``, in means over ``average`` [s] if that is given."""
-    scored = np.asarray(seen["scored"].values) > 0
+def _beside(plant: Plant, log: Log, simulated: Log, average: float | None) -> _Pairs:
+    """Return what was measured beside the free run, in means over ``average`` [s] if that is given."""
+    scored = np.asarray(simulated["scored"].values) > 0
     pair = log[[*plant.outputs, *plant.inputs]]
     pair.attrs = dict(log.attrs)
     for name in plant.outputs:
-        pair[name] = ("time", np.where(scored, column(log, name), np.nan), log[name].attrs)
-        pair[f"{name} simulated"] = ("time", np.where(scored, column(seen, name), np.nan), log[name].attrs)
+        for key, values in ((name, column(log, name)), (f"{name} simulated", column(simulated, name))):
+            pair[key] = ("time", np.where(scored, values, np.nan), log[name].attrs)
     pair = pair if average is None else average_log(pair, average)
     time = np.asarray(pair["time"].values, dtype=float)
     if not scored.any():

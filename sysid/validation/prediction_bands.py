@@ -58,24 +58,21 @@ without input errs by about S, and one that errs by half of that is not called g
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.special import ndtr, stdtrit
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Log, column, log_name
+from thermogrip.datasets.schema import Log, column, columns, log_name
 from thermogrip.sysid.models.neural import NeuralModel
 from thermogrip.sysid.plant.fit_record import RUN_GAIN_SD, SEVERAL, TAIL
 from thermogrip.sysid.plant.log_grid import cut_stretches
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import find_starts
-
-if TYPE_CHECKING:
-    from thermogrip.sysid.plant.plant import Plant
 
 SHORT = 0.1  # of the level: a part on which the expected coverage falls short by more is reported
 
@@ -139,12 +136,12 @@ def free_run_band(plant: Plant, log: Log, simulated: Log, *, level: float = 0.9,
         raise ValueError(f"level must lie between 0 and 1, got {level:g}")
     wide = NormalDist().inv_cdf(0.5 + level / 2)
     taken = draws if plant.uncertain else 0
-    runs = [plant.draw(k).simulate(log) for k in range(1, taken + 1)]
+    runs = [columns(plant.draw(k).simulate(log), plant.outputs) for k in range(1, taken + 1)]
     scored = np.asarray(simulated["scored"].values) > 0
-    half, inside, other_run = {}, {}, between_runs(plant, log)
-    for name in plant.outputs:
+    half, inside, other_run = {}, {}, between_runs(plant, [log])
+    for at, name in enumerate(plant.outputs):
         nominal = column(simulated, name)
-        spread = np.array([column(run, name) - nominal for run in runs]).reshape(taken, len(nominal))
+        spread = np.array([run[:, at] - nominal for run in runs]).reshape(taken, len(nominal))
         variance = np.mean(spread**2, axis=0) if taken else np.zeros(len(nominal))
         own = _own_variance(plant, name, variance, level) + plant.scores.reading_excess.get(name, 0.0) ** 2
         half[name] = wide * np.sqrt(variance + own + other_run.get(name, 0.0) ** 2)
@@ -158,18 +155,22 @@ def free_run_band(plant: Plant, log: Log, simulated: Log, *, level: float = 0.9,
     return Band(level, half, inside, taken, words)
 
 
-def between_runs(plant: Plant, log: Log) -> dict[str, Array]:
-    """Return by output what a gain of the inputs that is off by ``RUN_GAIN_SD`` changes at each row.
+def between_runs(plant: Plant, logs: Sequence[Log]) -> dict[str, Array]:
+    """Return by output what a gain of the inputs that is off by ``RUN_GAIN_SD`` changes at each row of the
+    logs, one after the other.
 
     Empty for a plant of no log, or of so many that their held-out errors show what differs between runs.
     """
     if not 0 < len(plant.logs) < SEVERAL:
         return {}
-    weaker = log.copy()
-    for name in set(plant.inputs) - set(plant.model.switches):
-        weaker[name] = log[name].copy(data=(1 - RUN_GAIN_SD) * column(log, name))
-    both = [plant.simulate(some) for some in (log, weaker)]
-    return {name: column(both[0], name) - column(both[1], name) for name in plant.outputs}
+    changes = []
+    for log in logs:
+        change = columns(plant.simulate(log), plant.outputs)
+        log = log.copy()
+        for name in set(plant.inputs) - set(plant.model.switches):
+            log[name] = log[name].copy(data=(1 - RUN_GAIN_SD) * column(log, name))
+        changes.append(change - columns(plant.simulate(log), plant.outputs))
+    return dict(zip(plant.outputs, np.concatenate(changes).T))
 
 
 def expected_coverage(plant: Plant, level: float = 0.9) -> dict[str, Array]:

@@ -240,12 +240,14 @@ class ResidualCorrelations:
         return {"follows": follows, "start": self.start}
 
 
-def residual_correlations(plant: Plant, log: Log, seen: Log, *, warmup: float = 5.0) -> ResidualCorrelations:
-    """Test the residual of the free run ``seen`` of a plant over a log.
+def residual_correlations(
+    plant: Plant, log: Log, simulated: Log, *, warmup: float = 5.0
+) -> ResidualCorrelations:
+    """Test the residual of the free run ``simulated`` of a plant over a log.
 
     Empty where the run diverged, has no residual, or has fewer than twenty blocks.
     """
-    run, scored = columns(seen, plant.outputs), np.asarray(seen["scored"].values) > 0
+    run, scored = columns(simulated, plant.outputs), np.asarray(simulated["scored"].values) > 0
     residual = _residual(columns(log, plant.outputs), run, scored)
     rms = np.sqrt(np.nanmean(residual**2, axis=0)) if residual is not None else np.zeros(1)
     if residual is None or not rms.all():

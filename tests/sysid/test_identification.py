@@ -162,7 +162,7 @@ def test_inputs_of_the_row_are_said_and_the_warm_up_of_a_fit_is_that_of_its_logs
 def test_one_log_states_what_another_run_may_add_and_three_do_not():
     one = identify(plant_log(), models=["oe"], average=2.0)
     held = [row for row in one.rows if row.held_out]
-    varied = between_runs(one.plant, plant_log())["t"]
+    varied = between_runs(one.plant, [plant_log()])["t"]
     expected = np.hypot(stated_error(held, "t"), np.sqrt(np.mean(varied**2)))
     assert one.plant.scores.new_run_rmse["t"] == pytest.approx(expected)
     assert f"on another run about t {expected:.2g} degC" in one.verdict

@@ -69,7 +69,7 @@ Average = Annotated[
 
 
 def identify(
-    logs: LogFiles,
+    paths: LogFiles,
     out: Annotated[
         Path | None, option("--out", "FILE.json", "Where the plant goes; where absent, LOG_plant.json.")
     ] = None,
@@ -124,7 +124,7 @@ def identify(
         from thermogrip.datasets.log_files import split_cut
         from thermogrip.datasets.tables import file_stem
 
-        out = Path(f"{file_stem(split_cut(logs[0])[0])}_plant.json")
+        out = Path(f"{file_stem(split_cut(paths[0])[0])}_plant.json")
     new_file(out, (".json",))
     a_network = "network" in wanted and network != "none"
     named = a_network and bool(network or grow)
@@ -137,12 +137,12 @@ def identify(
 
     table: dict[str, Any] = {"columns": comma(columns), "dt": dt}
     if wanted_network is None:
-        records = load_logs(logs, *roles, **table)
-        wanted_network = _shipped_network(records) if a_network else None
+        logs = load_logs(paths, *roles, **table)
+        wanted_network = _shipped_network(logs) if a_network else None
     if wanted_network is not None:  # what a network calls its own has the role that it has there
-        records = load_logs(logs, *roles, known=roles_of(wanted_network), **table)
-    repairs = _repaired(console, records)
-    have = dict.fromkeys(map(str, records[0].data_vars), "")  # what a word means may be written otherwise
+        logs = load_logs(paths, *roles, known=roles_of(wanted_network), **table)
+    repairs = _repaired(console, logs)
+    have = dict.fromkeys(map(str, logs[0].data_vars), "")  # what a word means may be written otherwise
     known = [None if words is None else tuple(find_column(w, have) for w in words) for words in roles]
     roles = known[0], known[1], known[2]
     from thermogrip.report.html import write_report
@@ -154,10 +154,10 @@ def identify(
         if to_grow is not None:
             from thermogrip.sysid.growth.stepwise import grow as try_terms
 
-            growth = try_terms(to_grow, records, outputs=roles[1], progress=sub_progress(progress, 0.0, 0.4))
+            growth = try_terms(to_grow, logs, outputs=roles[1], progress=sub_progress(progress, 0.0, 0.4))
             wanted_network = growth.network
         found = fit_models(
-            records,
+            logs,
             wanted_network,
             *roles,
             models=wanted,
@@ -176,13 +176,13 @@ def identify(
             raise UserError(f"--network {network}: {why}", hint="write --network none to do without")
         if posterior and found.model == "network":
             plant, record, lost = _sampled(
-                plant, records, out, seed, sub_progress(progress, 0.6, 1.0, "posterior")
+                plant, logs, out, seed, sub_progress(progress, 0.6, 1.0, "posterior")
             )
     plant.save(out)
     dynamics, nothing = _dynamics(plant)
     if report is not None:
-        lead = f"From {', '.join(log_name(log) for log in records)}."
-        sections = identification_sections(found, records, plant, record, growth, dynamics)
+        lead = f"From {', '.join(log_name(log) for log in logs)}."
+        sections = identification_sections(found, logs, plant, record, growth, dynamics)
         write_report(report, "Identification", lead, sections)
     _show_identified(console, found, plant, growth, dynamics)
     if dynamics is None:
@@ -337,7 +337,7 @@ def _identified(
 
 def validate(
     plant: PlantFile,
-    logs: LogFiles,
+    paths: LogFiles,
     warmup: Warmup = 5.0,
     score_from: Annotated[
         float, option("--score-from", "S", "Samples before this are not scored.", min=0)
@@ -356,14 +356,14 @@ def validate(
     loaded = load_plant(plant, network)
     console = Console(as_json)
     roles = loaded.inputs, loaded.outputs, loaded.disturbances
-    records = load_logs(logs, *roles, columns=comma(columns), dt=dt)
+    logs = load_logs(paths, *roles, columns=comma(columns), dt=dt)
     from thermogrip.report.html import write_report
     from thermogrip.report.plant import band_words, free_run_section, run_table
     from thermogrip.sysid.identification import warm_up_of_fit
     from thermogrip.sysid.validation.free_run import free_run
 
-    repairs = _repaired(console, records)
-    for log in records:
+    repairs = _repaired(console, logs)
+    for log in logs:
         needed, name = warm_up_of_fit(loaded, log), log_name(log)
         if warmup < needed:
             console.warn(
@@ -372,20 +372,20 @@ def validate(
             )
     runs = []
     with console.progress("validate") as progress:
-        for k, log in enumerate(records):
-            progress(k / len(records), log_name(log))
+        for k, log in enumerate(logs):
+            progress(k / len(logs), log_name(log))
             runs.append(free_run(loaded, log, warmup=warmup, score_from=score_from, average=average))
     bands = [run.band() for run in runs]
     if report is not None:
-        sections = [free_run_section(*each) for each in zip(records, runs, bands)]
+        sections = [free_run_section(*each) for each in zip(logs, runs, bands)]
         lead = f"Inputs in, outputs out, nothing fed back; scored from {score_from:g} s on."
         write_report(report, f"Free runs of {plant.name}", lead, sections)
-    console.table(f"Free run of {plant.name}", *run_table(list(zip(records, runs))))
-    for log, run, band in zip(records, runs, bands):
+    console.table(f"Free run of {plant.name}", *run_table(list(zip(logs, runs))))
+    for log, run, band in zip(logs, runs, bands):
         console.say(f"{log_name(log)}: {band_words(band)}")
         for note in run.notes:
             console.say(f"{log_name(log)}: {note}")
-    answers = [run_answer(log_name(log), run, band) for log, run, band in zip(records, runs, bands)]
+    answers = [run_answer(log_name(log), run, band) for log, run, band in zip(logs, runs, bands)]
     console.answer({"logs": answers, "repairs": repairs})
     return 0
 
@@ -410,7 +410,7 @@ def run_answer(name: str, run: FreeRun, band: Band) -> dict[str, Any]:
 
 def simulate(
     plant: PlantFile,
-    log: Annotated[str, argument("LOG", "Inputs and warm-up come from here.", existing_logs)],
+    path: Annotated[str, argument("LOG", "Inputs and warm-up come from here.", existing_logs)],
     out: Annotated[Path, option("--out", "SIM.csv", "Where the log goes.")],
     warmup: Warmup = 5.0,
     bands: Annotated[
@@ -431,23 +431,23 @@ def simulate(
     console = Console(as_json)
     loaded = load_plant(plant, network)
     roles = loaded.inputs, loaded.outputs, loaded.disturbances
-    (record,) = load_logs([log], *roles, columns=comma(columns), dt=dt)
-    repairs = _repaired(console, [record])[log_name(record)]
-    (record,), converted = match_logs(loaded, [record])
+    (log,) = load_logs([path], *roles, columns=comma(columns), dt=dt)
+    repairs = _repaired(console, [log])[log_name(log)]
+    (log,), converted = match_logs(loaded, [log])
     for line in converted:
-        console.warn(f"{log_name(record)}: {line}")
-    simulated = loaded.simulate(record, warmup=warmup)
+        console.warn(f"{log_name(log)}: {line}")
+    simulated = loaded.simulate(log, warmup=warmup)
     if bands:
         from thermogrip.sysid.validation.prediction_bands import free_run_band
 
-        for name, half in free_run_band(loaded, record, simulated).half.items():
+        for name, half in free_run_band(loaded, log, simulated).half.items():
             for end, sign in (("low", -1), ("high", 1)):
                 attrs = {"units": simulated[name].attrs["units"], "role": "other"}
                 simulated[f"{name}_{end}"] = ("time", column(simulated, name) + sign * half, attrs)
     write_log(simulated, out)
     console.say(f"wrote {out}: {', '.join(loaded.outputs)} at {simulated.sizes['time']} times")
     rows = simulated.sizes["time"]
-    console.answer({"log": record.attrs["name"], "rows": rows, "out": out, "repairs": repairs})
+    console.answer({"log": log.attrs["name"], "rows": rows, "out": out, "repairs": repairs})
     return 0
 
 

@@ -24,6 +24,7 @@ from thermogrip.sysid.plant.log_grid import (
     match_logs,
     misfit,
     quantum,
+    rows_of,
     signals,
     whole_readings,
 )
@@ -45,6 +46,11 @@ def lagged(tau: float, n: int, dt: float = 1.0, hold: int = 200, seed: int = 0) 
         y[k] = x
         x += (1 - np.exp(-dt / tau)) * (q[k] - x)
     return dt * np.arange(n), q, y
+
+
+def slowest_of(logs: list[Log], *outputs: str) -> float:
+    """Return the dominant time [s] of the outputs, ``t`` where none is named, driven by ``q``."""
+    return dominant_time([rows_of(log, ["q"], outputs or ["t"], ()) for log in logs])
 
 
 @pytest.mark.parametrize(("hole", "filled"), [(1, True), (5, True), (6, False)])
@@ -299,7 +305,7 @@ def test_the_dominant_time_is_that_of_the_lag(n: int, dt: float):
     """Where rows are averaged, means reach half a step ahead, into another input: it costs a third."""
     tau = 300.0
     t, q, y = lagged(tau, n, dt, hold=max(1, round(200 / dt)))
-    found = dominant_time([log_of(y, t, q)], inputs=["q"], outputs=["t"])
+    found = slowest_of([log_of(y, t, q)])
     assert found == pytest.approx(tau, rel=0.35 if n == 4000 else 0.01)
 
 
@@ -313,13 +319,13 @@ def test_a_time_constant_needs_twenty_rows_and_some_memory(tau: float, n: int, f
     t, q, y = lagged(tau, n, 20.0, hold=2)
     few = np.where(t < 60.0, y, np.nan)  # another sensor does not keep it from being found
     log = log_of(y, t, q, few=(few, "degC", "output"))
-    assert dominant_time([log], inputs=["q"], outputs=["few", "t"]) == pytest.approx(found, rel=1e-6)
+    assert slowest_of([log], "few", "t") == pytest.approx(found, rel=1e-6)
 
 
 def test_an_integrator_has_no_time_constant():
     t, q, _ = lagged(1.0, 130, 20.0, hold=4)
     whole = np.append(0.0, np.cumsum(q - 0.4)[:-1])
-    assert dominant_time([log_of(whole, t, q)], inputs=["q"], outputs=["t"]) == 129.0
+    assert slowest_of([log_of(whole, t, q)]) == 129.0
 
 
 def test_of_several_logs_the_dominant_time_is_the_median():
@@ -327,7 +333,7 @@ def test_of_several_logs_the_dominant_time_is_the_median():
     for tau in (100.0, 300.0, 320.0):
         t, q, y = lagged(tau, 130, 20.0, hold=10)
         logs.append(log_of(y, t, q))
-    assert dominant_time(logs, inputs=["q"], outputs=["t"]) == pytest.approx(300.0, rel=0.01)
+    assert slowest_of(logs) == pytest.approx(300.0, rel=0.01)
 
 
 def test_a_slow_drift_of_the_reading_does_not_pass_for_the_plants_own_time():
@@ -336,7 +342,7 @@ def test_a_slow_drift_of_the_reading_does_not_pass_for_the_plants_own_time():
     slow = np.zeros(t.size)
     for k in range(1, t.size):
         slow[k] = 0.998 * slow[k - 1] + rng.normal(0.0, 0.1 * np.sqrt(1 - 0.998**2))
-    found = dominant_time([log_of(y + slow, t, q)], inputs=["q"], outputs=["t"])
+    found = slowest_of([log_of(y + slow, t, q)])
     assert found == pytest.approx(60.0, rel=0.25)  # 500 s is the correlation time of the drift
 
 
@@ -344,14 +350,14 @@ def test_lost_readings_do_not_hide_the_dominant_time():
     t, q, y = lagged(300.0, 4000)
     y[np.random.default_rng(0).random(t.size) < 0.2] = np.nan
     y[1000:1400] = np.nan
-    found = dominant_time([log_of(y, t, q)], inputs=["q"], outputs=["t"])
-    whole = dominant_time([log_of(lagged(300.0, 4000)[2], t, q)], inputs=["q"], outputs=["t"])
+    found = slowest_of([log_of(y, t, q)])
+    whole = slowest_of([log_of(lagged(300.0, 4000)[2], t, q)])
     assert found == pytest.approx(whole, rel=0.03)
 
 
 def test_a_log_that_identifies_no_time_constant_counts_for_a_twentieth_of_its_length():
     still = log_of(np.random.default_rng(0).normal(size=200), q=np.full(200, 0.5))
-    assert dominant_time([still, log_of(T[:10], T[:10])], inputs=["q"], outputs=["t"]) == 199 / 20
+    assert slowest_of([still, log_of(T[:10], T[:10])]) == 199 / 20
 
 
 def coarse(y: np.ndarray, q: float) -> np.ndarray:
@@ -415,7 +421,7 @@ def test_a_step_is_held_at_a_tenth_of_the_time_constant():
 def test_a_fine_log_says_which_rule_set_its_step():
     t, u, y = lagged(400.0, 12_000)
     grid = make_grid([log_of(y, t, u)])
-    slowest = dominant_time([log_of(y, t, u)], inputs=["q"], outputs=["t"])
+    slowest = slowest_of([log_of(y, t, u)])
     assert grid.dt == round(slowest / 100)
     assert grid.why == f"a hundredth of the dominant time constant, {slowest:.3g} s"
     assert "held" not in grid.why

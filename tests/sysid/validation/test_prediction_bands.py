@@ -94,13 +94,13 @@ def test_another_run_adds_what_its_gain_changes(schedule):
     schedule = schedule.assign({name: 0.0 * schedule[name] for name in ("t1", "t2")})
     plant = first_order()
     run = plant.simulate(schedule)
-    added = between_runs(plant, schedule)
+    added = between_runs(plant, [schedule])
     for name in plant.outputs:  # linear from rest: 7 percent of the response
         np.testing.assert_allclose(added[name], 0.07 * run[name].values, atol=1e-9)
     half = free_run_band(plant, schedule, run).half["t1"]
     np.testing.assert_allclose(half, 1.6449 * np.hypot(0.1, added["t1"]), rtol=1e-3)
-    assert between_runs(first_order(logs=()), schedule) == {}
-    assert between_runs(first_order(logs=("a", "b", "c")), schedule) == {}
+    assert between_runs(first_order(logs=()), [schedule]) == {}
+    assert between_runs(first_order(logs=("a", "b", "c")), [schedule]) == {}
 
 
 def test_a_switch_has_no_gain_that_varies(schedule):
@@ -109,7 +109,7 @@ def test_a_switch_has_no_gain_that_varies(schedule):
         A=0.98 * np.eye(2), B=0.02 * np.eye(2), C=np.eye(2),
     )  # fmt: skip
     schedule["q2"].values[:] = schedule["q2"].values > 0
-    added = between_runs(Plant(model, {}, dt=2.0, logs=("a",)), schedule)
+    added = between_runs(Plant(model, {}, dt=2.0, logs=("a",)), [schedule])
     assert np.ptp(added["t1"]) > 1.0
     assert np.ptp(added["t2"]) == 0.0
 
