@@ -135,8 +135,8 @@ def _piece(
             for s in range(x.shape[2]):
                 inputs[t, r, hidden + s] = x[t, rows[r], s]
     _forward(matrix, curve, inputs, gates, cells, tanhs)
-    by_state[:] = 0
-    by_cell[:] = 0
+    by_state.fill(0)
+    by_cell.fill(0)
     heads, offsets = np.zeros_like(readout), np.zeros_like(offset)
     loss = _read_out(inputs[-1], target, rows, readout, offset, share, heads, offsets, by_state)
     return loss, _backward(recurrent, inputs, gates, cells, tanhs, by_state, by_cell), heads, offsets
@@ -176,7 +176,8 @@ def _forward(
                 g[r, j] = half + half * g[r, j]
             for j in range(n):
                 new[r, j] = g[r, n + j] * old[r, j] + g[r, j] * g[r, 2 * n + j]
-        tanh[:] = new
+            for j in range(n):
+                tanh[r, j] = new[r, j]
         _to_tanh(tanh, curve)
         for r in range(g.shape[0]):
             for j in range(n):
@@ -197,8 +198,11 @@ def _read_out(
             logits[k] = offset[k]
             for j in range(n):
                 logits[k] += readout[k, j] * states[r, j]
-        top = logits.max()
-        total = np.sum(np.exp(logits - top))
+        top, total = logits[0], offset.dtype.type(0)
+        for k in range(1, classes):
+            top = max(top, logits[k])
+        for k in range(classes):
+            total += np.exp(logits[k] - top)
         y = target[rows[r]]
         loss += np.log(total) - (logits[y] - top)
         for k in range(classes):
@@ -235,7 +239,9 @@ def _backward(
                 g[r, n + j] = c * old[r, j] * f * (one - f)
                 by_cell[r, j] = c * f
         np.dot(inputs[t].T, g, step)
-        total += step
+        for r in range(step.shape[0]):
+            for j in range(4 * n):
+                total[r, j] += step[r, j]
         if t > 0:
             np.dot(g, recurrent, by_state)
     return total

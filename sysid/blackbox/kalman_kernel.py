@@ -68,20 +68,23 @@ def _invert(m: Array, n: int) -> float:
 @numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _read(C: Array, R: Array, y: Array, x: Array, CP: Array, W: Array, e: Array, small: Array) -> float:
     """Set W and e of one row, zero where a channel is lost; return the row's share of J."""
-    n = C.shape[1]
-    read = np.flatnonzero(np.isfinite(y))
-    for a in range(len(read)):
+    n, count, read = C.shape[1], 0, np.empty(y.size, np.int64)
+    for i in range(y.size):
+        if np.isfinite(y[i]):
+            read[count] = i
+            count += 1
+    for a in range(count):
         i = read[a]
         e[i] = y[i]
         for j in range(n):
             e[i] -= C[i, j] * x[j]
-        for b in range(len(read)):
+        for b in range(count):
             small[a, b] = R[i, read[b]]
             for j in range(n):
                 small[a, b] += CP[i, j] * C[read[b], j]
-    cost = _invert(small, len(read)) + len(read) * _LOG_2PI
-    for a in range(len(read)):
-        for b in range(len(read)):
+    cost = _invert(small, count) + count * _LOG_2PI
+    for a in range(count):
+        for b in range(count):
             W[read[a], read[b]] = small[a, b]
             cost += e[read[a]] * small[a, b] * e[read[b]]
     return float(0.5 * cost)
@@ -102,14 +105,19 @@ def run_filter(
     G, W, e = np.zeros((rows, n, p)), np.zeros((rows, p, p)), np.zeros((rows, p))
     CP, small, M = np.empty((p, n)), np.empty((p, p)), np.empty((n, p))
     AP, APA = np.empty((n, n)), np.empty((n, n))
-    x[0], P[0] = x0, P0
     cost = 0.0
+    for i in range(n):
+        x[0, i] = x0[i]
+        for j in range(n):
+            P[0, i, j] = P0[i, j]
     for t in range(rows):
         Ft = A[at[t]]
         _ab(C, P[t], CP)
         cost += _read(C, R, y[t], x[t], CP, W[t], e[t], small)
         _ab(Ft, CP.T, M)
-        M += S
+        for i in range(n):
+            for k in range(p):
+                M[i, k] += S[i, k]
         _ab(M, W[t], G[t])
         _ab(Ft, P[t], AP)
         _ab(AP, Ft.T, APA)
@@ -140,9 +148,11 @@ def run_smoother(
     D, nn, pn, f = np.empty((n, n)), np.empty((n, n)), np.empty((p, n)), np.empty(p)
     for t in range(rows - 1, -1, -1):
         _ab(G[t], C, D)
-        D[:] = A[at[t]] - D
-        f[:] = 0.0
+        for i in range(n):
+            for j in range(n):
+                D[i, j] = A[at[t], i, j] - D[i, j]
         for i in range(p):
+            f[i] = 0.0
             for j in range(p):
                 f[i] += W[t, i, j] * e[t, j]
         after = np.zeros(n)
@@ -156,11 +166,11 @@ def run_smoother(
         _ab(D.T, nn, N)
         _ab(W[t], C, pn)
         _ab(C.T, pn, nn)
-        N += nn
         for i in range(n):
             mean[t, i] = x[t, i]
             for j in range(n):
                 mean[t, i] += P[t, i, j] * r[j]
+                N[i, j] += nn[i, j]
         _ab(N, P[t], nn)
         _ab(P[t], nn, D)
         for i in range(n):

@@ -366,9 +366,11 @@ def _shift_all(
     """Add b q to the modes of all curves, or take it off them."""
     for curve, wanted in ((VALUE, True), (BY_H, contact), (BY_BUILD_UP, contact), (BY_E, by_e), (BY_C, by_c)):
         if wanted:
-            x[curve, low:high] += steps[2, low:high] * (sign * now[0, curve])
-            if curve >= BY_E:
-                x[curve, low:N_MODE] += moved[curve - BY_E, 2, low:N_MODE] * (sign * now[0, VALUE])
+            q, q0 = sign * now[0, curve], sign * now[0, VALUE]
+            for j in range(low, high):
+                x[curve, j] += steps[2, j] * q
+            for j in range(low, N_MODE if curve >= BY_E else low):
+                x[curve, j] += moved[curve - BY_E, 2, j] * q0
 
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
@@ -377,7 +379,8 @@ def _start(
     parts: Array, sums: Array, now: Array,
 ) -> None:  # fmt: skip
     """Fill the slab's modes and the fluxes at first touch; resistances are left in ``sums``."""
-    now[:], sums[:] = 0.0, 0.0
+    now.fill(0.0)
+    sums.fill(0.0)
     own = slab(e, c, far, parts[0], parts[1])
     if by_e or by_c:
         d_e, d_c = slab_moves(e, c, far, parts[0], parts[2:6])
@@ -476,10 +479,14 @@ def step_contact(
     rise, slope, flux, grown, x, steps, moved, parts, now, sums = room
     _grow(repeat, dts, h, build_up, gripper.numbers, grown)
     _start(e, c, gripper.numbers[5], dts[0], by_e, by_c, gripper.numbers[0], grown[0, 0], parts, sums, now)
-    x[:], rise[:, 0], slope[:, 0], flux[0] = 0.0, 0.0, 0.0, now[0, VALUE]
-    steps[3, N_MODE:] = gripper.sensor
+    x.fill(0.0)
+    flux[0] = now[0, VALUE]
+    for curve in range(N_STEPPED):
+        rise[curve, 0] = slope[curve, 0] = 0.0
+    for j in range(gripper.sensor.size):
+        steps[3, N_MODE + j] = gripper.sensor[j]
     r, r3, r4 = sums[VALUE, 0], sums[BY_E, 0], sums[BY_C, 0]
-    k = low = 0
+    k = low = np.int64(0)  # for a literal the steps would be compiled once more
     for g in range(repeat.size):
         high = N_MODE + alive[g]
         while low < N_MODE and parts[0, low] * dts[g] > FADED:
@@ -524,7 +531,8 @@ def contacts(
             nodes[1], gripper, effusivity[p], capacity[p], h_c[p], build_up[p], asked[0], asked[1], asked[2],
             room,
         )  # fmt: skip
-        rise[p], slope[p], flux[p] = room.rise[VALUE], room.slope[VALUE], room.flux
+        for i in range(n_node):
+            rise[p, i], slope[p, i], flux[p, i] = room.rise[VALUE, i], room.slope[VALUE, i], room.flux[i]
     return rise, slope, flux
 
 

@@ -107,13 +107,13 @@ def _scratch(n_mode: int, n_node: int, n_sample: int, n_bin: int) -> _Scratch:
 
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
-def _whiten(whitener: Array, row: Array, out: Array) -> None:
-    """Fill W row; W (n, n) is lower triangular."""
+def _whiten(whitener: Array, row: Array, scale: float, out: Array) -> None:
+    """Fill W row, scaled; W (n, n) is lower triangular."""
     for i in range(row.size):
         total = 0.0
         for k in range(i + 1):
             total += whitener[i, k] * row[k]
-        out[i] = total
+        out[i] = total * scale
 
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
@@ -167,12 +167,11 @@ def _normal_equations(
     columns, left = scratch.columns, scratch.left
     for i in range(y.size):
         left[i] = y[i] - scratch.reading[i]
-    _whiten(whitener, left, columns[7])
+    _whiten(whitener, left, 1.0, columns[7])
     for a in range(7):
         gradient[a] = 0.0
         if sd[a] > 0.0:
-            _whiten(whitener, scratch.slopes[a], columns[a])
-            columns[a] *= sd[a]
+            _whiten(whitener, scratch.slopes[a], sd[a], columns[a])
             gradient[a] = _dot(columns[a], columns[7])
         for b in range(a + 1):
             matrix[a, b] = _dot(columns[a], columns[b]) if sd[a] > 0.0 and sd[b] > 0.0 else 0.0
@@ -238,20 +237,6 @@ def _solve(low: Array, rhs: Array, step: Array) -> None:
 
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
-def _evaluate(
-    nodes: Nodes, gripper: Gripper, u: Array, law: Array, vary: Mask, times: Array,
-    bins: NDArray[np.int64], count: Array, t: Array, y: Array, ramp: Array, room: float, whitener: Array,
-    scratch: _Scratch, at: _Expansion,
-) -> None:  # fmt: skip
-    """Fill what the objective and its expansion are at ``u``."""
-    _predict(nodes, gripper, u, vary, times, bins, count, t, ramp, room, scratch)
-    at.u[:] = u
-    square = _normal_equations(whitener, y, law[1], scratch, at.matrix, at.gradient)
-    at.cost[0] = square + penalty(u, law[0], law[1], law[2], at.slope, at.curvature, at.own)
-    at.cost[1] = square
-
-
-@numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def _propose(here: _Expansion, sd: Array, damping: float, work: _Work) -> Any:
     """Fill the step of the quadratic model, damped, in units of sd; return the predicted decrease."""
     for a in range(7):
@@ -304,13 +289,26 @@ def modes(
     covariance, objective = np.zeros((n, 7, 7)), np.empty(n)
     misfit, settled, trial = np.empty(n), np.zeros(n), np.empty(7)
     for p in range(n):
-        i, sd, damping = row[p], law[p, 1], 1e-3
+        i, sd, damping = row[p], law[p, 1], 1e-2
         vary = sd > 0.0
-        _evaluate(
-            nodes, gripper, u[p], law[p], vary, times[i], bins[i], count[i], t[i], y[i], ramp[i], room[i],
-            whitener[i], scratch, here,
-        )  # fmt: skip
-        for _ in range(max_steps):
+        for a in range(7):
+            trial[a] = u[p, a]
+        for step in range(max_steps + 1):  # one place for it all: each would be compiled by itself
+            _predict(
+                nodes, gripper, trial, vary, times[i], bins[i], count[i], t[i], ramp[i], room[i], scratch
+            )
+            square = _normal_equations(whitener[i], y[i], sd, scratch, there.matrix, there.gradient)
+            off = penalty(trial, law[p, 0], sd, law[p, 2], there.slope, there.curvature, there.own)
+            there.cost[0], there.cost[1] = square + off, square
+            for a in range(7):
+                there.u[a] = trial[a]
+            if step == 0 or there.cost[0] < here.cost[0]:
+                here, there = there, here
+                damping = max(damping * 0.1, 1e-9)
+            else:
+                damping *= 10.0
+            if damping > 1e9 or step == max_steps:
+                break
             decrease = _propose(here, sd, 0.0, work)
             if decrease < _LEAST_DECREASE:
                 for a in range(7):
@@ -322,18 +320,9 @@ def modes(
             part = _shorten(work.step, sd)
             for a in range(7):
                 trial[a] = here.u[a] + part * work.step[a] * sd[a]
-            _evaluate(
-                nodes, gripper, trial, law[p], vary, times[i], bins[i], count[i], t[i], y[i], ramp[i],
-                room[i], whitener[i], scratch, there,
-            )  # fmt: skip
-            if there.cost[0] < here.cost[0]:
-                here, there = there, here
-                damping = max(damping * 0.1, 1e-9)
-            else:
-                damping *= 10.0
-                if damping > 1e9:
-                    break
-        u[p], misfit[p] = here.u, here.cost[1]
+        for a in range(7):
+            u[p, a] = here.u[a]
+        misfit[p] = here.cost[1]
         objective[p] = here.cost[0] + _conclude(here, law[p], work, covariance[p])
     return covariance, objective, misfit, settled
 
@@ -372,14 +361,14 @@ def readings(
     Those are (n, n_bin, 7), zero where not ``vary`` (n, 7).
     """
     n, n_bin = count.shape
-    y, slopes = np.empty((n, n_bin)), np.zeros((n, n_bin, 7))
+    y, slopes = np.empty((n, n_bin)), np.empty((n, n_bin, 7))
     scratch = _scratch(gripper.sensor.size, nodes[2].size, times.shape[1], n_bin)
     for p in range(n):
         _predict(nodes, gripper, u[p], vary[p], times[p], bins[p], count[p], t[p], ramp[p], room[p], scratch)
-        y[p] = scratch.reading
-        for a in range(7):
-            if vary[p, a]:
-                slopes[p, :, a] = scratch.slopes[a]
+        for i in range(n_bin):
+            y[p, i] = scratch.reading[i]
+            for a in range(7):
+                slopes[p, i, a] = scratch.slopes[a, i] if vary[p, a] else 0.0
     return y, slopes
 
 
@@ -398,5 +387,6 @@ def gripper_readings(
     for p in range(n):
         one = gripper_of(nodes[0], lam[p], face[p], sensor[p], numbers[p])
         _predict(nodes, one, u, vary, times, bins, count, t, ramp, room, scratch)
-        out[p] = scratch.reading
+        for i in range(count.size):
+            out[p, i] = scratch.reading[i]
     return out

@@ -71,7 +71,7 @@ def _propagate(A: Array, p: Array, m: int, s: Array, S: Array, after: Array) -> 
     """Set ``after`` to (A + V diag(s) W) S, of m drives."""
     n, h = A.shape[0], s.shape[0]
     _, iV, iW, _, _ = _begins(n, m, h)
-    after[:] = 0.0
+    after.fill(0.0)
     for i in range(n):
         for j in range(n):
             gain = A[i, j]
@@ -106,13 +106,13 @@ def run_states(A: Array, theta: Array, h: int, x0: Array, w: Array, low: Array, 
     k, n, rows, n_y = theta.shape[0], x0.shape[1], w.shape[0], low.shape[0]
     x, t, after = np.empty((k, rows + 1, n)), np.empty(h), np.empty(n)
     for at in range(k):
-        x[at, 0] = x0[at]
+        for i in range(n):
+            x[at, 0, i] = x0[at, i]
         for row in range(rows):
             _units(theta[at], x[at, row], w[row], t)
             _advance(A[at], theta[at], x[at, row], w[row], t, after)
-            for i in range(n_y):
-                after[i] = min(max(after[i], low[i]), high[i])
-            x[at, row + 1] = after
+            for i in range(n):
+                x[at, row + 1, i] = min(max(after[i], low[i]), high[i]) if i < n_y else after[i]
     return x
 
 
@@ -128,7 +128,10 @@ def run_with_slopes(
     for i in range(n):
         S[i, n_p + i] = 1.0
     for row in range(rows):
-        y[row], slopes[row] = x[:n_y], S[:n_y]
+        for i in range(n_y):
+            y[row, i] = x[i]
+            for q in range(n_p + n):
+                slopes[row, i, q] = S[i, q]
         _units(p, x, w[row], t)
         for i in range(h):
             s[i] = 1.0 - t[i] * t[i]
@@ -138,9 +141,9 @@ def run_with_slopes(
         for i in range(n_y):
             if not low[i] < after[i] < high[i]:
                 after[i] = min(max(after[i], low[i]), high[i])
-                S_after[i, :] = 0.0
-        x[:] = after
+                S_after[i].fill(0.0)
         for i in range(n):
+            x[i] = after[i]
             for q in range(n_p + n):
                 # what has faded away would become numbers too small for fast arithmetic
                 S[i, q] = S_after[i, q] if abs(S_after[i, q]) > 1e-60 else 0.0

@@ -63,8 +63,8 @@ def test_triangular_systems_are_those_of_linear_algebra(matrix):
     kernel._solve.py_func(low, rhs, step)
     np.testing.assert_allclose(whole @ step, rhs)
     assert kernel._dot.py_func(step, rhs) == pytest.approx(step @ rhs)
-    kernel._whiten.py_func(low + np.triu(np.full((7, 7), 9.0), 1), rhs, white)
-    np.testing.assert_allclose(white, low @ rhs)
+    kernel._whiten.py_func(low + np.triu(np.full((7, 7), 9.0), 1), rhs, 3.0, white)
+    np.testing.assert_allclose(white, 3.0 * (low @ rhs))
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.3])
