@@ -28,7 +28,7 @@ from thermogrip.mpc.plant.prediction import PredictionModel
 
 NAN = float("nan")
 DT, SLEW = 2.0, 0.5  # s, and what the drive may change in a sample
-BEFORE, AFTER = 90, 150  # samples before and after the fault
+BEFORE = 60  # samples before the fault
 HOLD = 34.0  # degC
 LIMITS = {"t_tank": (8.0, 50.0)}
 
@@ -50,7 +50,8 @@ class Fault:
     meanwhile: str = ""  # what it is while it lasts
     broken: str = ""  # ``"solver"`` or ``"clock"`` fails while it lasts
     asleep: int = 0  # samples in which nobody calls the controller, from the beginning
-    back: float = 0.05  # how far the mean skin may be from its target at the end [degC]
+    back: float = 0.05  # how far the mean skin may be from its target at the end [degC] ...
+    after: int = 110  # ... so many samples after the fault
 
 
 def given(**change: Any) -> Callable[[int, Reading, Reading], Reading]:
@@ -102,7 +103,7 @@ FAULTS: Mapping[str, Fault] = {
     ),
     "the skin's sensor is stuck while it rests": Fault(["ok"], 60, frozen("t_surface"), back=0.05),
     "the tank's sensor is stuck while the target moves": Fault(
-        ["ok"], 60, frozen("t_tank"), target=42.0, advice="stuck"
+        ["ok"], 60, frozen("t_tank"), target=42.0, advice="stuck", after=150
     ),
     # time
     "the reading has no time": Fault(["ok"], 20, without("time_s")),
@@ -121,7 +122,7 @@ FAULTS: Mapping[str, Fault] = {
     "the target is NaN": Fault(["infeasible"], 10, target=NAN, advice="target"),
     "the target is absurd": Fault(["infeasible"], 10, target=900.0, advice="target"),
     "the target breaks the tank's limit": Fault(
-        ["ok", "infeasible"], 170, target=60.0, advice="no drive holds"
+        ["ok", "infeasible"], 170, target=60.0, advice="no drive holds", after=150
     ),
     "the drive is at its end for ever on a plant that loses five times the heat": Fault(
         ["ok", "infeasible"], 150, target=47.0, world="leaky", advice="no drive holds"
@@ -248,7 +249,7 @@ def run(driver: Driver, fault: Fault, worlds: dict[str, Any]) -> tuple[Record, s
     last = truth.reading()
     driver.reset(last)
     move, before = Move(0.0), 0.0
-    for k in range(BEFORE + fault.samples + AFTER):
+    for k in range(BEFORE + fault.samples + fault.after):
         since = k - BEFORE
         during = 0 <= since < fault.samples
         truth.model = broken if during else working

@@ -18,14 +18,18 @@ from thermogrip.datasets.schema import Grasps, make_grasps
 Maker = Callable[..., Grasps]
 
 
-# the first use of MiniRocket compiles for a minute
-@pytest.fixture(params=["svm-pca", pytest.param("rocket", marks=pytest.mark.slow)])
-def machine(request: pytest.FixtureRequest) -> GraspClassifier:
+def minirocket(monkeypatch: pytest.MonkeyPatch) -> GraspClassifier:
+    """Return MiniRocket as it was before its compilation, which takes a minute."""
+    aeon = pytest.importorskip("aeon.transformations.collection.convolution_based._minirocket")
+    for name in ("_fit_biases", "_static_transform_uni", "_static_transform_multi"):
+        monkeypatch.setattr(aeon, name, getattr(aeon, name).py_func)
+    return make_classifier("rocket", kernels=200)
+
+
+@pytest.fixture(params=["svm-pca", "rocket"])
+def machine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> GraspClassifier:
     """Both classifiers with margins, unfitted."""
-    if request.param == "rocket":
-        pytest.importorskip("aeon")
-        return make_classifier("rocket", kernels=500)
-    return make_classifier(request.param)
+    return minirocket(monkeypatch) if request.param == "rocket" else make_classifier(request.param)
 
 
 def test_the_scale_found_is_the_one_that_the_truth_was_drawn_with() -> None:
@@ -141,6 +145,17 @@ def test_both_sensors_are_seen(machine: GraspClassifier, three: Grasps) -> None:
 
 
 @pytest.mark.slow
+def test_compiled_features_are_those_of_the_same_lines_in_python(
+    monkeypatch: pytest.MonkeyPatch, three: Grasps
+) -> None:
+    with monkeypatch.context() as plain:
+        model = minirocket(plain).fit(three)
+        rows = model._rows(three)
+    compiled = make_classifier("rocket", kernels=200).fit(three)
+    np.testing.assert_allclose(compiled._rows(three), rows, atol=1e-9)
+    assert (compiled.predict(three) == model.predict(three)).all()
+
+
 def test_a_trace_too_short_for_the_kernels_is_the_users_error() -> None:
     pytest.importorskip("aeon")
     grasps = make_grasps(np.arange(6) * 0.1, np.zeros((4, 6)), list("abcd"), material=list("xxyy"))

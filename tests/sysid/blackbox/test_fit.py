@@ -111,8 +111,8 @@ def test_inputs_that_were_logged_behind_their_reading_are_found_out(kind, tmp_pa
         return make_log(np.arange(700.0), {"q": (q, "1", "input"), "t": (y, "degC", "output")})
 
     kept, behind = log_with(q), log_with(np.append(q[:1], q[:-1]))  # of each row the input of the row before
-    assert not fit_black_box(kind, [kept], average=1.0).plant.inputs_end_at_row
-    plant = fit_black_box(kind, [behind], average=1.0).plant
+    assert not fit_black_box(kind, [kept], average=1.0, order=1).plant.inputs_end_at_row
+    plant = fit_black_box(kind, [behind], average=1.0, order=1).plant
     assert plant.inputs_end_at_row
     loaded = Plant.load(plant.save(tmp_path / "plant.json"))
     assert loaded.inputs_end_at_row
