@@ -79,19 +79,19 @@ def read_grasps(path: str | Path) -> Grasps:
     >>> dict(grasps.sizes), str(grasps["material"].values[0]), float(grasps["t_object"][0])
     ({'grasp': 40, 'time': 121}, 'copper', 43.0)
     """
-    if file_format(path) == "netcdf":
-        return _read_netcdf(path)
-    if file_format(path) != "csv":
+    if file_format(path) not in ("csv", "netcdf"):
         raise UserError("grasps are CSV or NetCDF", file=path, hint="use one of the two")
-    stem = file_stem(path)
-    ids, time, channels, repairs = _read_samples(path)
-    order, index = _in_order(ids)
-    axis, gridded, more = _onto_one_axis(order, index, time, channels, str(path))
-    per_grasp = _read_meta(_meta_path(path), order, str(path))
-    grasps = make_grasps(axis, gridded["t_surface"], order, name=stem, t_surface_2=gridded.get("t_surface_2"),
-                         **_with_defaults(per_grasp, len(order), stem))  # fmt: skip
-    grasps.attrs["repairs"] = "\n".join(repairs + more)
-    return _check_contact(grasps, str(path))
+    grasps = _read_netcdf(path) if file_format(path) == "netcdf" else _read_csv(path)
+    time, seen = grasps["time"].values, np.isfinite(grasps["t_surface"].values)
+    for side, has, hint in (
+        ("before", seen[:, time < 0].any(axis=1), "time_s is 0 at the message; record from 2 s before"),
+        ("after", seen[:, time > 0].any(axis=1), "is this a grasp? remove it or record the contact"),
+    ):
+        if not has.all():
+            grasp = str(grasps["grasp"].values[int(np.argmin(has))])
+            problem = f"grasp {grasp!r} has no sample {side} the closed message at 0 s"
+            raise UserError(problem, file=path, hint=hint)
+    return grasps
 
 
 def check_grasp_file(path: str | Path) -> None:
@@ -158,7 +158,7 @@ def read_grasp_files(paths: Sequence[str | Path]) -> list[Grasps]:
     for path in map(Path, paths):
         files += _in_folder(path) if path.is_dir() else [path]
     records = [read_grasps(path) for path in files]
-    stems = [log_name(record) for record in records]
+    stems = [log_name(grasps) for grasps in records]
     for at, stem in enumerate(stems):
         if stem in stems[:at]:
             raise UserError("is given twice", file=files[at], hint="give each file once")
@@ -389,17 +389,15 @@ def _with_defaults(per_grasp: dict[str, Any], n: int, stem: str) -> dict[str, An
     return filled
 
 
-def _check_contact(grasps: Grasps, file: str) -> Grasps:
-    """Refuse a grasp that has no sample before or none after the closed message."""
-    time, seen = grasps["time"].values, np.isfinite(grasps["t_surface"].values)
-    for side, has, hint in (
-        ("before", seen[:, time < 0].any(axis=1), "time_s is 0 at the message; record from 2 s before"),
-        ("after", seen[:, time > 0].any(axis=1), "is this a grasp? remove it or record the contact"),
-    ):
-        if not has.all():
-            grasp = str(grasps["grasp"].values[int(np.argmin(has))])
-            problem = f"grasp {grasp!r} has no sample {side} the closed message at 0 s"
-            raise UserError(problem, file=file, hint=hint)
+def _read_csv(path: str | Path) -> Grasps:
+    stem = file_stem(path)
+    ids, time, channels, repairs = _read_samples(path)
+    order, index = _in_order(ids)
+    axis, gridded, more = _onto_one_axis(order, index, time, channels, str(path))
+    per_grasp = _read_meta(_meta_path(path), order, str(path))
+    grasps = make_grasps(axis, gridded["t_surface"], order, name=stem, t_surface_2=gridded.get("t_surface_2"),
+                         **_with_defaults(per_grasp, len(order), stem))  # fmt: skip
+    grasps.attrs["repairs"] = "\n".join(repairs + more)
     return grasps
 
 
@@ -428,7 +426,7 @@ def _read_netcdf(path: str | Path) -> Grasps:
     labels = {name: data[name].values.tolist() for name in ("material", "session", "block") if name in data}
     for name, values in _with_defaults(labels, data.sizes["grasp"], stem).items():
         data[name] = ("grasp", np.asarray(values, dtype=str))
-    return _check_contact(data, str(path))
+    return data
 
 
 def _meta_text(grasps: Grasps) -> str:

@@ -220,32 +220,32 @@ def make_grasps(
         "grasp": ("grasp", np.asarray([str(g) for g in grasp_id])),
         "time": ("time", np.asarray(time, dtype=float), {"units": "s"}),
     }
-    data = xr.Dataset(coords=coords)
+    grasps = xr.Dataset(coords=coords)
     for key, values in (("t_surface", t_surface), ("t_surface_2", t_surface_2)):
         if values is not None:
-            data[key] = (("grasp", "time"), np.asarray(values, dtype=float), {"units": "degC"})
+            grasps[key] = (("grasp", "time"), np.asarray(values, dtype=float), {"units": "degC"})
     for key, values in per_grasp.items():
         if key in GRASP_NUMBERS:
-            data[key] = ("grasp", np.asarray(values, dtype=float), {"units": GRASP_NUMBERS[key]})
+            grasps[key] = ("grasp", np.asarray(values, dtype=float), {"units": GRASP_NUMBERS[key]})
         elif key in GRASP_LABELS:
-            data[key] = ("grasp", np.asarray([str(v) for v in values]))
+            grasps[key] = ("grasp", np.asarray([str(v) for v in values]))
         else:
             problem = f"a grasp has no {key!r}"
             raise UserError(problem, hint=f"use {', '.join([*GRASP_NUMBERS, *GRASP_LABELS])}")
-    data.attrs.update(schema="thermogrip.grasps", version=1, name=name)
-    return check_grasps(data)
+    grasps.attrs.update(schema="thermogrip.grasps", version=1, name=name)
+    return check_grasps(grasps)
 
 
 def check_grasps(grasps: Grasps) -> Grasps:
     """Return the record as it is, or raise :class:`UserError` naming the grasp and the rule it breaks."""
-    for faults in (_axis_faults, _temperature_faults, _touch_faults):
-        for problem, hint in faults(grasps):
-            raise UserError(problem, file=log_name(grasps), hint=hint)
+    for problem, hint in _grasp_faults(grasps):
+        raise UserError(problem, file=log_name(grasps), hint=hint)
     return grasps
 
 
-def _axis_faults(grasps: Grasps) -> Iterator[tuple[str, str | None]]:
-    """Yield (problem, hint) of axes and labels; each check needs those before it."""
+def _grasp_faults(grasps: Grasps) -> Iterator[tuple[str, str | None]]:
+    """Yield (problem, hint) of axes and labels, of temperatures that no gripper and no object has [degC], and
+    of touches; each check needs those before it."""
     for need in ("grasp", "time"):
         if need not in grasps.coords:
             yield f"no {need} axis", "give the record dims 'grasp' and 'time'"
@@ -270,6 +270,32 @@ def _axis_faults(grasps: Grasps) -> Iterator[tuple[str, str | None]]:
         plain = label.strip().lower()
         if plain != label and plain in ("train", "test"):  # it would be left out of both without a word
             yield f"split {label!r} is neither train nor test", f"write {plain!r}"
+    for name in ("t_surface", "t_surface_2", "t_object", "t_gripper", "t_ambient"):
+        if name in grasps:
+            values = grasps.variables[name].values
+            values = values[:, None] if values.ndim == 1 else values
+            for i, k in np.argwhere(np.abs(values) > HOTTEST)[:1]:  # NaN compares false
+                problem = f"grasp {str(grasps['grasp'].values[i])!r} has a {name} of {values[i, k]:g} degC"
+                yield problem, "give degrees Celsius, or end the column's name in _K if it is kelvin"
+    rest = grasps.variables["rest"].values if "rest" in grasps else np.zeros(len(ids))
+    for k in np.flatnonzero(rest < 0):  # NaN compares false
+        hint = "give the seconds since the touch before, or leave it empty"
+        yield f"grasp {str(ids[k])!r} has a rest of {float(rest[k]):g} s", hint
+    if "touch" not in grasps or "touch_group" not in grasps:
+        return
+    group = label_values(grasps, "touch_group")
+    touch = np.asarray(grasps.variables["touch"].values, dtype=float)
+    for name in np.unique(group[group != ""]):
+        at = np.flatnonzero(group == name)
+        known = np.isfinite(touch[at])
+        numbers, counts = np.unique(touch[at][known], return_counts=True)
+        if known.any() and not known.all():
+            unnumbered = str(ids[at[~known][0]])
+            problem = f"grasp {unnumbered!r} of touch_group {str(name)!r} has no touch, others of it have"
+            yield problem, "number all touches of a block, or none"
+        if (counts > 1).any():
+            hint = "number its touches 1, 2, ..., and give a block that is touched anew another touch_group"
+            yield f"touch {numbers[counts > 1][0]:g} of touch_group {str(name)!r} occurs twice", hint
 
 
 def label_values(grasps: Grasps, name: str) -> NDArray[np.str_]:
@@ -288,38 +314,3 @@ def unit_names(grasps: Grasps) -> NDArray[np.str_]:
     """Return the unit that each grasp belongs to, shape (n_grasp,): its touch group, or itself."""
     groups = label_values(grasps, "touch_group")
     return np.where(groups == "", np.asarray(grasps["grasp"].values).astype(str), groups)
-
-
-def _touch_faults(grasps: Grasps) -> Iterator[tuple[str, str]]:
-    """Yield (problem, hint) where the order of a block's touches, or the time between them, is none."""
-    ids = grasps.variables["grasp"].values
-    rest = grasps.variables["rest"].values if "rest" in grasps else np.zeros(len(ids))
-    for k in np.flatnonzero(rest < 0):  # NaN compares false
-        hint = "give the seconds since the touch before, or leave it empty"
-        yield f"grasp {str(ids[k])!r} has a rest of {float(rest[k]):g} s", hint
-    if "touch" not in grasps or "touch_group" not in grasps:
-        return
-    group = label_values(grasps, "touch_group")
-    touch = np.asarray(grasps.variables["touch"].values, dtype=float)
-    for name in np.unique(group[group != ""]):
-        at = np.flatnonzero(group == name)
-        known = np.isfinite(touch[at])
-        numbers, counts = np.unique(touch[at][known], return_counts=True)
-        if known.any() and not known.all():
-            lost = str(ids[at[~known][0]])
-            problem = f"grasp {lost!r} of touch_group {str(name)!r} has no touch, others of it have"
-            yield problem, "number all touches of a block, or none"
-        if (counts > 1).any():
-            hint = "number its touches 1, 2, ..., and give a block that is touched anew another touch_group"
-            yield f"touch {numbers[counts > 1][0]:g} of touch_group {str(name)!r} occurs twice", hint
-
-
-def _temperature_faults(grasps: Grasps) -> Iterator[tuple[str, str]]:
-    """Yield (problem, hint) where a temperature is one that no gripper and no object has [degC]."""
-    for name in ("t_surface", "t_surface_2", "t_object", "t_gripper", "t_ambient"):
-        if name in grasps:
-            values = grasps.variables[name].values
-            values = values[:, None] if values.ndim == 1 else values
-            for i, k in np.argwhere(np.abs(values) > HOTTEST)[:1]:  # NaN compares false
-                problem = f"grasp {str(grasps['grasp'].values[i])!r} has a {name} of {values[i, k]:g} degC"
-                yield problem, "give degrees Celsius, or end the column's name in _K if it is kelvin"

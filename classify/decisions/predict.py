@@ -17,7 +17,7 @@ a contact that closed badly, or a trace that no such block gives.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -116,10 +116,10 @@ def _answers(
     whole = not classifier.leaves_samples_out
     quality = check_grasps(grasps, longest=classifier.longest_, whole_traces=whole)
     notes = [note or more for note, more in zip(quality.note, classifier.beyond_training(grasps))]
-    usable = quality.usable_grasps(quality.read(grasps))
+    usable, units = quality.usable_grasps(quality.read(grasps)), unit_names(grasps)
     found = [] if usable is None else _named(classifier, usable, names, rule)
-    units = unit_names(grasps)
     of_unit = {} if usable is None else dict(zip(unit_names(usable).tolist(), found))
+    last = _last_samples(grasps["time"].values, grasps["t_surface"].values, units)
     left = iter(found)
     rows: list[Row] = []
     for i, grasp_id in enumerate(grasps["grasp"].values):
@@ -129,7 +129,7 @@ def _answers(
         elif units[i] in of_unit:
             row, note = dict(of_unit[str(units[i])]), f"{note}: the answer of its block's other touches"
         else:
-            row = _no_name(names, quality.reason[i], _last_sample(grasps, i))
+            row = _no_name(names, quality.reason[i], float(last[i]))
         rows.append({"grasp_id": str(grasp_id)} | row | ({"note": note} if note else {}))
     return rows
 
@@ -137,9 +137,10 @@ def _answers(
 def _named(classifier: GraspClassifier, grasps: Grasps, names: list[str], rule: StopRule | None) -> list[Row]:
     """Return the answers of a classifier to grasps whose usable part is given, without their names."""
     if rule is None:
+        units = unit_names(grasps)
         log_p, unknown = classifier.open_set_log_proba(grasps, names)
-        log_p = joined_touches(classifier, log_p, grasps)
-        decided = np.array([_last_sample(grasps, i) for i in range(grasps.sizes["grasp"])])
+        log_p = joined_touches(classifier, log_p, units)
+        decided = _last_samples(grasps["time"].values, grasps["t_surface"].values, units)
     else:
         log_p, unknown, decided = _stopped(classifier, grasps, names, rule)
     rows: list[Row] = []
@@ -182,10 +183,9 @@ def _stopped(
     return seen.log_p[np.arange(at.size), at], unknown, found.time
 
 
-def joined_touches(classifier: GraspClassifier, log_p: Floats, grasps: Grasps) -> Floats:
-    """Return log probabilities in which all touches of one block have their common answer, same shape: the
+def joined_touches(classifier: GraspClassifier, log_p: Floats, units: NDArray[np.str_]) -> Floats:
+    """Return log probabilities in which all touches of one unit have their common answer, same shape: the
     classifier's own, or the normalised sum of theirs."""
-    units = unit_names(grasps)
     if classifier.joins_touches or np.unique(units).size == units.size:
         return log_p
     out = np.empty_like(log_p)
@@ -227,10 +227,10 @@ def _cell(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _last_sample(grasps: Grasps, i: int) -> float:
-    units = unit_names(grasps)
-    seen = np.isfinite(grasps["t_surface"].values[units == units[i]]).any(axis=0)
-    return float(grasps["time"].values[seen][-1])
+def _last_samples(time: Floats, skin: Floats, units: NDArray[np.str_]) -> Floats:
+    """Return the time of the last sample of each grasp's unit, (n_grasp,) [s]."""
+    seen = np.isfinite(skin)
+    return np.array([time[seen[units == unit].any(axis=0)][-1] for unit in units])
 
 
 _UNUSUAL = 2.5  # standard deviations: less is usual, one grasp in eighty
@@ -298,12 +298,13 @@ def unexplained_answers(
     ``stated`` is the range of unknown object temperatures [degC].
     """
 
-    def words(model: PosteriorClassifier, grasps: Grasps, named: list[str]) -> list[str]:
+    out = [""] * len(rows)
+    for model, at, grasps, named in _single_named(classifier, X, rows):
         hypotheses = _taken_for(model.device_, named, finish=model.finish)
         part = check_grasps(grasps, longest=model.longest_).read(grasps)
-        return unexplained(model.device_, part, hypotheses, stated)
-
-    return _explained(classifier, X, rows, words, lambda row: True)
+        for i, why in zip(at, unexplained(model.device_, part, hypotheses, stated)):
+            out[i] = why
+    return out
 
 
 def unexplained_effusivities(
@@ -364,35 +365,34 @@ def reasons(classifier: GraspClassifier, X: Records, rows: Sequence[Row]) -> lis
     "as wood it needs 0.34 times its block's effusivity (12.6 sd)"
     """
 
-    def words(model: PosteriorClassifier, grasps: Grasps, named: list[str]) -> list[str]:
-        found = deviations(model.device_, begun(grasps, model.longest_), named)
-        return [deviation_words(name, row) for name, row in zip(named, found)]
-
-    return _explained(classifier, X, rows, words, lambda row: (row["p_unknown"] or 0.0) > _STRANGE)
-
-
-def _explained(
-    classifier: GraspClassifier,
-    X: Records,
-    rows: Sequence[Row],
-    words: Callable[[PosteriorClassifier, Grasps, list[str]], list[str]],
-    wanted: Callable[[Row], bool],
-) -> list[str]:
-    """Return the words on each wanted row that is a named single touch of an exactly known gripper."""
     out = [""] * len(rows)
+    for model, at, grasps, named in _single_named(classifier, X, rows, least=_STRANGE):
+        found = deviations(model.device_, begun(grasps, model.longest_), named)
+        for i, name, row in zip(at, named, found):
+            out[i] = deviation_words(name, row)
+    return out
+
+
+def _single_named(
+    classifier: GraspClassifier, X: Records, rows: Sequence[Row], least: float = -1.0
+) -> Iterator[tuple[PosteriorClassifier, list[int], Grasps, list[str]]]:
+    """Yield of each record the classifier of an exactly known gripper, the rows that name single touches with
+    a ``p_unknown`` above ``least``, these grasps and their names."""
     # an uncertain gripper may be the reason itself
     if not isinstance(classifier, PosteriorClassifier) or classifier.device_.uncertain:
-        return out
+        return
     first = 0
     for grasps in record_list(X):
         group = label_values(grasps, "touch_group")
-        own = rows[first : first + group.size]
-        at = [i for i, row in enumerate(own) if group[i] == "" and row["material"] and wanted(row)]
+        at = [
+            first + i
+            for i, row in enumerate(rows[first : first + group.size])
+            if group[i] == "" and row["material"] and (row["p_unknown"] or 0.0) > least
+        ]
         if at:
-            for i, why in zip(at, words(classifier, pick(grasps, at), [str(own[i]["material"]) for i in at])):
-                out[first + i] = why
+            part = pick(grasps, [i - first for i in at])
+            yield classifier, at, part, [str(rows[i]["material"]) for i in at]
         first += group.size
-    return out
 
 
 def _taken_for(device: GripperModel, named: Sequence[str], **finish: str) -> Hypotheses:

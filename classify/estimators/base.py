@@ -202,16 +202,16 @@ class JoinedClassifier(GraspClassifier):
 
 def record_list(X: Records) -> list[Grasps]:
     """Return one record as a list of one, several as a list; checked, and their spikes lost samples."""
-    parts = list(X) if isinstance(X, Sequence) else [X]
-    if not parts:
+    records = list(X) if isinstance(X, Sequence) else [X]
+    if not records:
         raise UserError("no grasps were given", hint="give at least one record")
-    for part in parts:
-        if not isinstance(part, Grasps):
+    for grasps in records:
+        if not isinstance(grasps, Grasps):
             raise UserError(
-                f"expected Grasps, got {type(part).__name__}", hint="use make_grasps or read_grasps"
+                f"expected Grasps, got {type(grasps).__name__}", hint="use make_grasps or read_grasps"
             )
-        check_grasps(part)
-    return [without(part, check_quality(part).spiked) for part in parts]
+        check_grasps(grasps)
+    return [without(grasps, check_quality(grasps).spiked) for grasps in records]
 
 
 def grasp_labels(grasps: Grasps, y: ArrayLike | None = None) -> Labels:

@@ -142,26 +142,36 @@ class PosteriorClassifier(GraspClassifier):
 
     def _log_proba(self, grasps: Grasps) -> Floats:
         names = self.asked()
-        return np.asarray(self._evidence(grasps, names) + self.log_prior(names))
+        return np.asarray(self._evidence(grasps, names)[0] + self.log_prior(names))
 
-    def _evidence(self, grasps: Grasps, names: Sequence[str]) -> Floats:
-        """Return the log evidence of each candidate, (n_grasp, n_name), joint for touches of one block."""
-        evidence = np.empty((grasps.sizes["grasp"], len(names)))
-        alone, part = self._ungrouped(grasps)
-        if part is not None:
-            evidence[alone] = material_fit(self.device_, part, names, finish=self.finish).log_evidence
-        if has_touch_groups(grasps):
+    def _evidence(
+        self, grasps: Grasps, names: Sequence[str], *, unknown: bool = False
+    ) -> tuple[Floats, Floats]:
+        """Return the log evidence of each candidate, (n_grasp, n_name), joint for touches of one block, and,
+        where it is asked for, the posterior probability of a free effusivity beside them, at equal odds of
+        these."""
+        group = label_values(grasps, "touch_group")
+        single = group == ""
+        evidence, free, other = np.empty((group.size, len(names))), np.full(group.size, np.nan), None
+        if single.any():
+            part = begun(pick(grasps, single), self.longest_)
+            evidence[single] = material_fit(self.device_, part, names, finish=self.finish).log_evidence
+            if unknown:
+                free[single] = [fit.log_evidence for fit in grid_posteriors(self.device_, touches(part))]
+                if self.finish != "known":  # a free effusivity has the finish of the training's blocks
+                    other = material_fit(self.device_, part, names).log_evidence
+        if not single.all():
             fit = two_touch_fit(self.device_, grasps, names, coupling=self.coupling_, finish=self.finish)
             for at, row in zip(fit.rows, fit.log_evidence):
                 evidence[at] = row
-        return evidence
-
-    def _ungrouped(self, grasps: Grasps) -> tuple[NDArray[np.int64], Grasps | None]:
-        """Return the rows that are no part of a group of touches, and what is read of them."""
-        alone = np.flatnonzero(label_values(grasps, "touch_group") == "")
-        if not alone.size:
-            return alone, None
-        return alone, begun(pick(grasps, alone), self.longest_)
+            groups = free_touch_fit(self.device_, grasps, coupling=self.coupling_) if unknown else {}
+            for name, fits in groups.items():
+                free[group == name] = fits[0].log_evidence
+        known = evidence.copy()
+        if other is not None:
+            known[single] = other
+        odds = logsumexp(known, axis=1) - np.log(len(names)) - free
+        return evidence, np.asarray(expit(logit(self.prior_unknown) - odds))
 
     def log_prior(self, names: Sequence[str]) -> Floats:
         """Return the log prior odds of some materials, (n_name,)."""
@@ -171,39 +181,18 @@ class PosteriorClassifier(GraspClassifier):
         """Return log probabilities over a subset of ``classes_``: only their evidence is computed."""
         names = self.asked(candidates)
         prior = self.log_prior(names)
-        return np.vstack([normalised(self._evidence(part, names) + prior) for part in record_list(X)])
+        return np.vstack([normalised(self._evidence(part, names)[0] + prior) for part in record_list(X)])
 
     def open_set_log_proba(self, X: Records, candidates: Sequence[str]) -> tuple[Floats, Floats]:
         """Return :meth:`candidate_log_proba` and :meth:`p_unknown` from one evaluation of the evidence."""
         names = self.asked(candidates)
-        prior, log_p, unknown = self.log_prior(names), [], []
-        for part in record_list(X):
-            evidence = self._evidence(part, names)
-            log_p.append(normalised(evidence + prior))
-            unknown.append(self._none_of(part, names, evidence))
-        return np.vstack(log_p), np.concatenate(unknown)
+        found = [self._evidence(part, names, unknown=True) for part in record_list(X)]
+        log_p = [normalised(evidence + self.log_prior(names)) for evidence, _ in found]
+        return np.vstack(log_p), np.concatenate([unknown for _, unknown in found])
 
     def p_unknown(self, X: Records, candidates: Sequence[str] | None = None) -> Floats:
         names = self.asked() if candidates is None else [str(c) for c in candidates]
-        parts = record_list(X)
-        return np.concatenate([self._none_of(part, names, self._evidence(part, names)) for part in parts])
-
-    def _none_of(self, grasps: Grasps, names: Sequence[str], evidence: Floats) -> Floats:
-        """Return the posterior probability of a free effusivity beside the candidates, at equal odds of
-        these."""
-        free, known = np.empty(evidence.shape[0]), evidence
-        alone, part = self._ungrouped(grasps)
-        if part is not None:
-            free[alone] = [fit.log_evidence for fit in grid_posteriors(self.device_, touches(part))]
-            if self.finish != "known":  # a free effusivity has the finish of the training's blocks
-                known = evidence.copy()
-                known[alone] = material_fit(self.device_, part, names).log_evidence
-        if has_touch_groups(grasps):
-            group = label_values(grasps, "touch_group")
-            for name, fits in free_touch_fit(self.device_, grasps, coupling=self.coupling_).items():
-                free[group == name] = fits[0].log_evidence
-        odds = logsumexp(known, axis=1) - np.log(len(names)) - free
-        return np.asarray(expit(logit(self.prior_unknown) - odds))
+        return np.concatenate([self._evidence(part, names, unknown=True)[1] for part in record_list(X)])
 
     def beyond_training(self, grasps: Grasps) -> list[str]:
         """Return in words which blocks rested longer between touches than those of the training."""

@@ -262,9 +262,9 @@ def _tested(
         log_p, unknown = classifier.open_set_log_proba(test, candidates)
     else:
         log_p, unknown = classifier.candidate_log_proba(test, candidates), np.full(n, np.nan)
-    log_p = joined_touches(classifier, log_p, test)
-    predict_s = (perf_counter() - start) / n
     units = unit_names(test)
+    log_p = joined_touches(classifier, log_p, units)
+    predict_s = (perf_counter() - start) / n
     first = np.sort(np.unique(units, return_index=True)[1])  # one row a unit: its touches share an answer
     head = {"classifier": name, "repeat": fold.repeat, "condition": fold.condition, "apart": fold.apart}
     rows = _rows(pick(test, first), units[first], np.exp(log_p[first]), unknown[first], candidates)

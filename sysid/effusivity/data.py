@@ -87,7 +87,9 @@ def touches(grasps: Grasps, *, until: float | None = None) -> Touches:
     """Return the binned arrays of a Grasps record, samples after ``until`` [s] left out."""
     check_grasps(grasps)
     where = log_name(grasps)
-    _check_sd(grasps, where)
+    sd = number_values(grasps, "t_object_sd")
+    for i in np.flatnonzero(sd < 0):
+        raise UserError(f"grasp {str(grasps['grasp'].values[i])!r} has a negative t_object_sd", file=where)
     time = np.asarray(grasps["time"].values, dtype=float)
     keep = (time > _EDGES[0]) & (time < (_EDGES[-1] if until is None else until + 1e-9))
     time, data = time[keep], np.asarray(grasps["t_surface"].values, dtype=float)[:, keep]
@@ -122,7 +124,7 @@ def touches(grasps: Grasps, *, until: float | None = None) -> Touches:
         sample_bin=np.ascontiguousarray(np.where(good, bins, -1), dtype=np.int64),
         y=y, t=mean(np.broadcast_to(time, data.shape)),
         count=count, ramp=mean(np.broadcast_to(np.maximum(time - PUMP_OFF, 0.0), data.shape)), level=level,
-        t_object=number_values(grasps, "t_object"), t_object_sd=number_values(grasps, "t_object_sd"),
+        t_object=number_values(grasps, "t_object"), t_object_sd=sd,
         t_ambient=number_values(grasps, "t_ambient"), excursion=np.abs(away).max(axis=1),
     )  # fmt: skip
 
@@ -244,9 +246,3 @@ def whiten(data: Touches, noise: Noise) -> tuple[Array, Array]:
     w = np.ascontiguousarray(_inverse(chol) * there[:, None, :] * there[:, :, None])
     diagonal = np.diagonal(chol, axis1=1, axis2=2)
     return w, (2 * np.log(diagonal)).sum(axis=1) + there.sum(axis=1) * np.log(2 * np.pi)
-
-
-def _check_sd(grasps: Grasps, where: str) -> None:
-    sd = number_values(grasps, "t_object_sd")
-    for i in np.flatnonzero(sd < 0):
-        raise UserError(f"grasp {str(grasps['grasp'].values[i])!r} has a negative t_object_sd", file=where)

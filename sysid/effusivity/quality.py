@@ -204,10 +204,13 @@ def check_grasps(grasps: Grasps, *, longest: float = np.inf, whole_traces: bool 
     >>> quality.usable_grasps(quality.read(grasps)).sizes["grasp"]
     1
     """
-    trace = _Trace.of(grasps)
-    time, seen = trace.time, np.isfinite(trace.clean)
+    time = np.asarray(grasps.variables["time"].values, dtype=float)
+    raw = np.asarray(grasps.variables["t_surface"].values, dtype=float)
+    spiked, known = _spiked(raw), (number_values(grasps, name) for name in ("t_object", "t_object_sd"))
+    trace = _Trace(time, raw, np.where(spiked, np.nan, raw), spiked, *known)
+    seen = np.isfinite(trace.clean)
     clipped = _clipped(time, trace.clean)
-    masked = np.asarray(trace.spiked | clipped)
+    masked = np.asarray(spiked | clipped)
     read = seen & ~clipped
     out_of_range = clipped.any(axis=1) & ~(
         read[:, time < _BEFORE].any(axis=1) & read[:, time > _AFTER].any(axis=1)
@@ -215,9 +218,9 @@ def check_grasps(grasps: Grasps, *, longest: float = np.inf, whole_traces: bool 
     why = np.where(trace.contradicts(), CONTRARY, np.where(out_of_range, OUT_OF_RANGE, ""))
     reason = [str(words) for words in np.where(trace.stays(_NO_MOVE), NO_CONTACT, why)]
     at, row, ever = clipped.argmax(axis=1), np.arange(len(clipped)), np.asarray(clipped.any(axis=1))
-    since, reading = np.where(ever, time[at], np.nan), np.where(ever, trace.raw[row, at], np.nan)
+    since, reading = np.where(ever, time[at], np.nan), np.where(ever, raw[row, at], np.nan)
     single = not has_touch_groups(grasps)
-    shortened = np.asarray((_ends(time, np.isfinite(trace.raw)) > _READ_WHOLE * longest) & single)
+    shortened = np.asarray((_ends(time, np.isfinite(raw)) > _READ_WHOLE * longest) & single)
     note = list(reason)
     for i in range(len(note)):
         if not note[i] and ever[i]:
@@ -230,9 +233,7 @@ def check_grasps(grasps: Grasps, *, longest: float = np.inf, whole_traces: bool 
     start, stop = (
         np.where(used.any(axis=1), t, np.nan) for t in (time[used.argmax(axis=1)], _ends(time, used))
     )
-    return GraspQuality(
-        reason, note, masked, trace.spiked, reading, start, stop, shortened, float(longest), trace
-    )
+    return GraspQuality(reason, note, masked, spiked, reading, start, stop, shortened, float(longest), trace)
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,15 +246,6 @@ class _Trace:
     spiked: Flags
     t_object: Floats
     t_object_sd: Floats
-
-    @classmethod
-    def of(cls, grasps: Grasps) -> _Trace:
-        time = np.asarray(grasps.variables["time"].values, dtype=float)
-        raw = np.asarray(grasps.variables["t_surface"].values, dtype=float)
-        spiked = _spiked(raw)
-        clean = np.where(spiked, np.nan, raw)
-        known = number_values(grasps, "t_object"), number_values(grasps, "t_object_sd")
-        return cls(time, raw, clean, spiked, *known)
 
     @cached_property
     def level(self) -> Floats:

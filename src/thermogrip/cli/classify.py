@@ -259,7 +259,7 @@ def train(
 
 def classify(
     model_dir: Annotated[Path, argument("MODEL_DIR", "Folder that train wrote.", existing_model)],
-    grasps: GraspFiles,
+    paths: GraspFiles,
     out: Annotated[Path, option("--out", "FILE.csv", "Where the predictions go.")],
     candidates: Annotated[
         str | None, option("--materials", "A,B,C", "The candidates [default: all that the model knows].")
@@ -320,10 +320,10 @@ def classify(
         raise UserError(problem, hint="leave it out, or train on grasps of the new gripper")
     model = load_classifier(model_dir)
     rule = load_stop_rule(model_dir) if early else None
-    records = find_grasps(grasps)
+    records = find_grasps(paths)
     if other_gripper or known:
         model = _for_another_gripper(model, known or [])
-    ranged = [with_object_range(record, stated) for record in records]
+    ranged = [with_object_range(grasps, stated) for grasps in records]
     rows = classify_grasps(model, ranged, comma(candidates), rule=rule)
     if not early:
         for row, why in zip(rows, unexplained_answers(model, records, rows, stated)):
@@ -335,8 +335,8 @@ def classify(
         with console.progress("another touch") as progress:
             found = [
                 row
-                for record in ranged
-                for row in advise_touches(model, record, candidates=comma(candidates), progress=progress)
+                for grasps in ranged
+                for row in advise_touches(model, grasps, candidates=comma(candidates), progress=progress)
             ]
         for row, advice in zip(rows, found):
             row |= advice

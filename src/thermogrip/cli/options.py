@@ -323,20 +323,20 @@ def find_grasps(paths: Sequence[str]) -> list[Grasps]:
     return read_grasp_files(list(paths))
 
 
-def log_name(record: Log | Grasps) -> str:
+def log_name(log: Log | Grasps) -> str:
     """Return a record's name as tables have it."""
-    return str(record.attrs["name"])
+    return str(log.attrs["name"])
 
 
 def warn_of_contacts(console: Console, records: Sequence[Grasps]) -> None:
     """Warn of what was repaired in records while they were read, and of contacts that are missing or late."""
     from thermogrip.sysid.effusivity.quality import contact_faults, torn_groups
 
-    for record in records:
-        repairs = [line for line in str(record.attrs.get("repairs", "")).splitlines() if line]
+    for grasps in records:
+        repairs = [line for line in str(grasps.attrs.get("repairs", "")).splitlines() if line]
         more = [f"{len(repairs) - SHOWN_REPAIRS} more like these"] if len(repairs) > SHOWN_REPAIRS else []
-        for words in [*repairs[:SHOWN_REPAIRS], *more, *contact_faults(record)]:
-            console.warn(f"{log_name(record)}: {words}")
+        for words in [*repairs[:SHOWN_REPAIRS], *more, *contact_faults(grasps)]:
+            console.warn(f"{log_name(grasps)}: {words}")
     for words in torn_groups(records):
         console.warn(words)
 
