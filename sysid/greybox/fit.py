@@ -37,12 +37,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
+from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.parallel import Progress
 from thermogrip.datasets.schema import Log, columns, log_name
 from thermogrip.sysid.data.data_quality import reading_excess
@@ -227,8 +229,14 @@ def fit_network(
     report = progress or (lambda fraction, what: None)
     model = load_network(network) if isinstance(network, (str, Path)) else network
     logs, _ = match_logs(model, logs)
+    if not logs:
+        raise UserError("no log to fit", hint="give at least one")
     report(0.0, "preparing the model")
-    model = model.prepared(logs, free_runs=free_runs)
+    signals = (*model.inputs, *model.disturbances, *model.outputs)
+    rows = dict(zip(signals, np.concatenate([columns(log, signals) for log in logs]).T))
+    spread = {name: float(np.nanstd(rows[name])) for name in model.outputs}
+    runs = partial(free_runs, logs)
+    model = model.prepared(runs, spread)
     average = model.average if average is None else average
     problem = make_problem(model, logs, average=average, independent=model.independent)
     report(0.0, "fitting from the priors" if near is None else "fitting from an earlier fit")
@@ -241,7 +249,7 @@ def fit_network(
     if whiter.any():
         problem = problem.with_tau(np.where(whiter, tau, problem.tau))
         solution = _descend(problem, solution.z, report, (0.8, 0.95))
-    finer = model.prepared(logs, problem.parameters(solution.z[None])[0], free_runs=free_runs)
+    finer = model.prepared(runs, spread, problem.parameters(solution.z[None])[0])
     if finer is not model:  # its step was short enough at the prior, and is not where the fit ended
         problem = make_problem(finer, logs, average=average, independent=model.independent).with_tau(
             problem.tau
@@ -255,11 +263,9 @@ def fit_network(
         seconds=round(time.perf_counter() - began, 2),
         starts=wanted,
     )
-    signals = (*model.inputs, *model.disturbances, *model.outputs)
-    every = np.concatenate([columns(log, signals) for log in logs])
-    valid = zip(np.nanmin(every, axis=0).tolist(), np.nanmax(every, axis=0).tolist())
+    valid = {name: (float(np.nanmin(values)), float(np.nanmax(values))) for name, values in rows.items()}
     report(1.0, "fitted")
-    return replace(plant, valid=dict(zip(signals, valid)), fitted_to=fit_logs(logs), scores=scores)
+    return replace(plant, valid=valid, fitted_to=fit_logs(logs), scores=scores)
 
 
 def residual_tau(errors: Sequence[Sequence[Sequence[Array]]], least: Array) -> Array:
@@ -437,7 +443,7 @@ def _verdict(problem: Problem, solution: Solution, identifiability: Identifiabil
     return "; ".join(parts)
 
 
-def free_runs(model: GreyModel, logs: Sequence[Log], p: Array) -> list[tuple[str, Array]]:
+def free_runs(logs: Sequence[Log], model: GreyModel, p: Array) -> list[tuple[str, Array]]:
     """Return the free runs of a model over logs with parameters p, by log and stretch."""
     values, sensors = dict(zip(model.parameters, p.tolist())), dict(model.sensor_sd)
     plant = Plant(model, values, dt=model.dt, units=model.units, noise=sensors)

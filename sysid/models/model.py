@@ -17,7 +17,7 @@ either.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, runtime_checkable
 
@@ -30,7 +30,6 @@ from thermogrip.datasets.limits import STEP_RANGE, array_within, number_within
 from thermogrip.sysid.models.network_spec import Parameter
 
 if TYPE_CHECKING:
-    from thermogrip.datasets.schema import Log
     from thermogrip.sysid.models.jit_rollout import Equations
 
 SMOOTH = 20.0  # [s] mean of a measured ambient, for its sensor is slow and coarse
@@ -185,16 +184,16 @@ class GreyModel(Model, Protocol):
     warmup: float  # seconds of a log from which a fit may estimate how it starts
     search_step: float  # of a global search [s], which may be coarser
 
-    def prepared(self, logs: Sequence[Log], p: Array | None = None, *, free_runs: FreeRuns) -> GreyModel:
-        """Return the model made ready for these logs, its step short enough at p (at the prior where absent).
+    def prepared(self, free_runs: FreeRuns, spread: Mapping[str, float], p: Array | None = None) -> GreyModel:
+        """Return the model made ready for the logs of these runs, ``spread`` the sd of each of their outputs.
 
-        The model itself where it is ready as it is.
+        Its step is short enough at p (the prior where absent); the model itself where it is ready as it is.
         """
         ...
 
 
-# (model, logs, p (n_p,)) -> (log's name, simulated outputs (1, N + 1, n_y)) of each stretch without a gap
-FreeRuns = Callable[[GreyModel, Sequence["Log"], Array], list[tuple[str, Array]]]
+# (model, p (n_p,)) -> (log's name, simulated outputs (1, N + 1, n_y)) of each stretch without a gap
+FreeRuns = Callable[[GreyModel, Array], list[tuple[str, Array]]]
 
 
 class Described:

@@ -56,7 +56,7 @@ References
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -67,7 +67,6 @@ from numpy.typing import ArrayLike
 
 from thermogrip.datasets.arrays import Array, Run, Values
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Log
 from thermogrip.sysid.models.model import SMOOTH, Described, FreeRuns, roll_rows
 from thermogrip.sysid.models.network_spec import Network, Pipe, named_network, network_from_dict
 
@@ -512,7 +511,9 @@ class NetworkModel(Described):
         sd[: len(network.nodes)] = [node.start_sd for node in network.nodes.values()]
         self.spread = np.diag(sd**2)
 
-    def prepared(self, logs: Sequence[Log], p: Array | None = None, *, free_runs: FreeRuns) -> NetworkModel:
+    def prepared(
+        self, free_runs: FreeRuns, spread: Mapping[str, float], p: Array | None = None
+    ) -> NetworkModel:
         """Return the network itself: its implicit step is accurate whatever the logs."""
         return self
 

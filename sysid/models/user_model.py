@@ -70,7 +70,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from thermogrip.datasets.arrays import Array, Run, Values
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Log, columns
 from thermogrip.sysid.models.model import Described, FreeRuns, roll_rows
 from thermogrip.sysid.models.network_spec import Parameter
 
@@ -533,18 +532,18 @@ class OwnModel(Described):
             return roll_rows(OwnSteps(self.code), x0, u, d, p, dt / n, pieces=n)
         return kernel.rollout(x0, u, d, p, dt / n, pieces=n)
 
-    def prepared(self, logs: Sequence[Log], p: Array | None = None, *, free_runs: FreeRuns) -> OwnModel:
+    def prepared(self, free_runs: FreeRuns, spread: Mapping[str, float], p: Array | None = None) -> OwnModel:
         """Return the model with steps short enough for these logs, its sensors' sd known.
 
         The model itself where all that is so already.
         """
-        sd = {name: _SENSOR_SHARE * _spread_of(logs, name) for name in self.outputs}
+        sd = {name: _SENSOR_SHARE * (spread[name] or 1.0) for name in self.outputs}
         model = replace(self, sd=sd)
         at = self.prior if p is None else np.asarray(p, dtype=float)
-        runs, n = free_runs(model, logs, at), model.pieces
+        runs, n = free_runs(model, at), model.pieces
         while n <= _MOST_PIECES:
             finer = replace(model, pieces=2 * n)
-            again = free_runs(finer, logs, at)
+            again = free_runs(finer, at)
             if model._agree(runs, again):
                 return self if (self.pieces, self.sd) == (n, sd) else model
             model, runs, n = finer, again, 2 * n
@@ -700,9 +699,3 @@ def own_model(kind: Any) -> OwnModel:
         code.output(x, two)
         code.rest([1.0] * len(model.outputs), [1.0] * len(u), [1.0] * len(d), model.prior.tolist())
     return model
-
-
-def _spread_of(logs: Sequence[Log], name: str) -> float:
-    """Return the standard deviation of an output over the logs, 1 where it does not move."""
-    values = np.concatenate([columns(log, (name,))[:, 0] for log in logs])
-    return float(np.nanstd(values)) or 1.0

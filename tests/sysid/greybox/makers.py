@@ -92,7 +92,7 @@ class TwoGains:
     def __init__(self, nuisance: float = 0.0) -> None:
         self.nuisance = {"t": nuisance}
 
-    def prepared(self, logs: Sequence[Log], p: Array | None = None, **_: Any) -> TwoGains:
+    def prepared(self, free_runs: Any, spread: Any, p: Array | None = None) -> TwoGains:
         return self
 
     @property

@@ -187,7 +187,8 @@ def test_a_model_that_needs_finer_steps_where_the_fit_ended_is_fitted_with_them(
     class Coarse(TwoGains):
         lags = (30.0, 80.0)
 
-        def prepared(self, logs: Sequence[Log], p: Array | None = None, **_: Any) -> TwoGains:
+        def prepared(self, free_runs: Any, spread: Any, p: Array | None = None) -> TwoGains:
+            assert spread == {"t": np.nanstd(np.concatenate([log["t"].values for log in logs]))}
             return self if p is None else Fine()
 
     logs = [a_log(1), a_log(2)]
@@ -403,7 +404,7 @@ def test_a_random_search_begins_near_the_prior_and_counts_what_blew_up(monkeypat
 
 def test_free_runs_are_named_by_their_logs():
     logs, model = [a_log(1, seconds=100), a_log(2, seconds=120)], TwoGains()
-    found = greybox.free_runs(model, logs, np.array([3.0, 5.0]))
+    found = greybox.free_runs(logs, model, np.array([3.0, 5.0]))
     assert [name for name, _ in found] == ["log 1", "log 2"]
     for (_, run), log in zip(found, logs):
         y, _ = model.rollout(np.zeros((1, 2)), log["q"].values[None, :, None], np.zeros(0), [[3.0, 5.0]], 1.0)

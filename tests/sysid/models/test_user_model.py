@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import warnings
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -194,12 +195,13 @@ def test_steps_are_cut_until_they_are_accurate():
     t = np.arange(0.0, 60.0)
     q, air = (t % 20 < 10).astype(float), np.full(t.size, 21.0)
     signals = {"q": (q, "1", "input"), "air": (air, "degC", "disturbance"), "t": (air + q, "degC", "output")}
-    ready = own_model(Fast).prepared([make_log(t, signals)], free_runs=free_runs)
+    runs, spread = partial(free_runs, [make_log(t, signals)]), {"t": 0.5}
+    ready = own_model(Fast).prepared(runs, spread)
     assert ready.pieces >= 4
     exact = 21.0 + 20.0 * (1 - np.exp(-1.0 / 0.2))
     y, _ = ready.rollout([[21.0]], [[[1.0]]], [[[21.0]]], ready.prior[None], 1.0)
     assert abs(y[0, 1, 0] - exact) < 0.05
-    assert ready.prepared([make_log(t, signals)], free_runs=free_runs) is ready
+    assert ready.prepared(runs, spread) is ready
 
 
 def test_a_plant_at_rest_is_held_there_by_some_input():
@@ -342,7 +344,7 @@ def test_pieces_are_doubled_until_runs_agree(off: Any, pieces: int | None):
     """The second of two runs is off by so much; the class states no sd: it is 2 % of 5 K."""
     tried = []
 
-    def runs(model: OwnModel, logs: Any, p: np.ndarray) -> Any:
+    def runs(model: OwnModel, p: np.ndarray) -> Any:
         tried.append(model.pieces)
         return [
             ("first", np.zeros((1, 9, 1))),
@@ -350,15 +352,14 @@ def test_pieces_are_doubled_until_runs_agree(off: Any, pieces: int | None):
         ]
 
     model = own_model(varied(Block, outputs={"t": "degC"}, dt=0.5))
-    t = np.arange(0.0, 100.0)
-    signals = {"q": (t, "1", "input"), "air": (t, "degC", "disturbance")}
-    logs = [make_log(t, signals | {"t": (20 + 5 * (-1.0) ** t, "degC", "output")})]
+    still = model.prepared(lambda *_: [("still", np.zeros((1, 9, 1)))], {"t": 0.0})
+    assert still.sd == {"t": 0.02}  # of an output that does not move: 2 % of 1 K
     if pieces:
-        ready = model.prepared(logs, free_runs=runs)
+        ready = model.prepared(runs, {"t": 5.0})
         assert (ready.pieces, ready.sd) == (pieces, {"t": pytest.approx(0.1)})
         assert tried == [2**k for k in range(len(tried))]
         assert tried[-1] == 2 * pieces
-        assert ready.prepared(logs, free_runs=runs).pieces == pieces
+        assert ready.prepared(runs, {"t": 5.0}).pieces == pieces
     else:
         lost = not np.isfinite(off(1)).all()
         said = (
@@ -367,7 +368,7 @@ def test_pieces_are_doubled_until_runs_agree(off: Any, pieces: int | None):
             else r"too fast for 256 .* in dt = 0.5 s"
         )
         with pytest.raises(UserError, match=said):
-            model.prepared(logs, free_runs=runs)
+            model.prepared(runs, {"t": 5.0})
         assert tried[-1] == 512
 
 
