@@ -50,11 +50,18 @@ from thermogrip.sysid.blackbox.fit import (
 )
 from thermogrip.sysid.blackbox.order_selection import HARDLY_MORE, excess_within_noise, folds, held_out_runs
 from thermogrip.sysid.data.data_quality import DataCheck, Evidence, check_data, evidence
-from thermogrip.sysid.plant.fit_record import HELD_OUT_SHARE, RUN_GAIN_SD, SEVERAL, TAIL, HeldOut
+from thermogrip.sysid.plant.fit_record import (
+    HELD_OUT_SHARE,
+    RUN_GAIN_LARGE,
+    RUN_GAIN_SD,
+    SEVERAL,
+    TAIL,
+    HeldOut,
+)
 from thermogrip.sysid.plant.log_grid import make_grid, match_logs, misfit, roles_of, signals
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run, no_input_baseline
-from thermogrip.sysid.validation.prediction_bands import SHORT, between_runs, expected_coverage
+from thermogrip.sysid.validation.prediction_bands import SHORT, between_runs, expected_coverage, expected_error
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -184,7 +191,7 @@ def choose_black_box(fits: Sequence[BlackBoxFit], between: Mapping[str, float]) 
 
 
 def _preferred(fits: Sequence[BlackBoxFit]) -> BlackBoxFit:
-    between = 0.0 if len(fits[0].grid.logs) >= SEVERAL else RUN_GAIN_SD
+    between = 0.0 if len(fits[0].grid.logs) >= SEVERAL else RUN_GAIN_LARGE
     logs = [_fold_errors(fit, between) for fit in fits]
     best = min(logs, key=lambda errors: float(errors.mean()))
     near = [
@@ -255,7 +262,7 @@ def verdict_of(model: str, rows: Sequence[Row], checked: DataCheck, whole_logs: 
     where = "logs left out" if whole_logs else "parts of the logs, left out"
     units = dict.fromkeys((row.output, "" if row.unit == "1" else f" {row.unit}") for row in held)
     numbers = ", ".join(f"{name} {stated_error(held, name):.2g}{unit}" for name, unit in units)
-    head = f"{model}: free run on {where}: RMSE {numbers}"
+    head = f"{model}: expected RMSE of a free run {numbers} (from {where})"
     if good:
         return True, f"{head}; good for simulation and control inside what the logs cover"
     if share < USEFUL <= relative_error(own):
@@ -271,12 +278,9 @@ def verdict_of(model: str, rows: Sequence[Row], checked: DataCheck, whole_logs: 
 
 
 def stated_error(held: Sequence[Row], output: str) -> float:
-    """Return the rms error of an output over what was held out: of folds and last parts the larger one."""
-    groups = [
-        [row.rmse**2 for row in held if row.output == output and row.log.startswith(TAIL) == tail]
-        for tail in (True, False)
-    ]
-    return float(np.sqrt(max(np.mean(group) for group in groups if group)))
+    """Return the rms error of an output to expect of a part that was not held out, from those that were."""
+    rows = [row for row in held if row.output == output]
+    return expected_error([row.rmse for row in rows], sum(not row.log.startswith(TAIL) for row in rows))
 
 
 def relative_error(row: Row) -> float:
@@ -450,7 +454,7 @@ def identify(
     best = None
     if fits:
         least = min(fits, key=lambda fit: fit.choice.error)
-        best = choose_black_box(fits, _rms(between_runs(least.plant, logs)))
+        best = choose_black_box(fits, _rms(between_runs(least.plant, logs, RUN_GAIN_LARGE)))
     if leave_one_out:
         finalists = candidates
     else:

@@ -41,7 +41,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.models.lti import StartPrior, estimate_starts, evaluate_terms
 from thermogrip.sysid.models.model import Model as PlantModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.fit_record import RUN_GAIN_SD, SEVERAL
+from thermogrip.sysid.plant.fit_record import RUN_GAIN_LARGE, SEVERAL
 from thermogrip.sysid.plant.log_grid import Grid, Segment
 
 Array = NDArray[np.float64]
@@ -240,7 +240,7 @@ def _averages_of(scored: Mapping[Structure, _Errors]) -> list[Structure]:
 
 def _hardly_worse(errors: Array, least: Array) -> bool:
     """Return whether errors on the folds hardly exceed others on another run, where the gain differs too."""
-    excess = np.log(np.hypot(errors, RUN_GAIN_SD)) - np.log(np.hypot(least, RUN_GAIN_SD))
+    excess = np.log(np.hypot(errors, RUN_GAIN_LARGE)) - np.log(np.hypot(least, RUN_GAIN_LARGE))
     return bool(excess.mean() <= HARDLY_MORE)
 
 

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from thermogrip.datasets.schema import Log
 
 
-RUN_GAIN_SD = 0.07  # of the inputs' effect, from run to run, of a plant of too few logs to show it
+RUN_GAIN_SD = 0.05  # of the inputs' effect, from run to run, of a plant of too few logs to show it
+RUN_GAIN_LARGE = 0.07  # a large one, with which candidates are compared
 SEVERAL = 3  # logs of a fit from which on its held-out errors show what differs between runs
 HELD_OUT_SHARE = 0.3  # of each log, where whole logs are not left out
 TAIL = f"last {100 * HELD_OUT_SHARE:.0f} % of "  # how what is held out of a log is called

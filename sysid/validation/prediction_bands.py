@@ -23,6 +23,10 @@ so that on average the band is as wide as its held-out errors, and wider where i
 error and of that on the last parts of the logs; with n folds it is known as badly as a variance of n numbers,
 so s is multiplied by t_n / z, Student's quantile over the normal one (1.3 for four folds and 90 %).
 
+The error to expect of one part more is neither the larger one nor that of those seen: of n folds and the last
+parts, which lie in them, with the mean square e^2 it is e sqrt(1 + 2 / n) (:func:`expected_error`), as with
+an inverse gamma prior on it that weighs as two parts.
+
 **Where that is too narrow.** The average over parts does not apply to each: a tank that overflows in one
 stretch and not in the next errs there three times as much. With e_f the error on part f and h_f that on all
 the others, the expected coverage of part f by a band of the others is
@@ -41,7 +45,8 @@ to run by g = :data:`~thermogrip.sysid.plant.fit_record.RUN_GAIN_SD`, and
     (v(u) - v((1 - g) u))^2
 
 is added to the variance. Models of two heater boards, fitted on one day, have gains that are off by 4 to 8
-percent on another, and few other errors; boards of one kind differ by 5 to 20 percent.
+percent on another, and few other errors; of a third board and of a motor by 0 and 3 percent (rms of the four
+4 percent); boards of one kind differ by 5 to 20 percent.
 
 **Ensemble disagreement.** The members of a :class:`~thermogrip.sysid.models.neural.NeuralModel` were fitted
 to the same rows from different random weights, so they agree where the data constrain them. On other drives
@@ -155,9 +160,9 @@ def free_run_band(plant: Plant, log: Log, simulated: Log, *, level: float = 0.9,
     return Band(level, half, inside, taken, words)
 
 
-def between_runs(plant: Plant, logs: Sequence[Log]) -> dict[str, Array]:
-    """Return by output what a gain of the inputs that is off by ``RUN_GAIN_SD`` changes at each row of the
-    logs, one after the other.
+def between_runs(plant: Plant, logs: Sequence[Log], gain: float = RUN_GAIN_SD) -> dict[str, Array]:
+    """Return by output what a gain of the inputs that is off by so much changes at each row of the logs, one
+    after the other.
 
     Empty for a plant of no log, or of so many that their held-out errors show what differs between runs.
     """
@@ -168,7 +173,7 @@ def between_runs(plant: Plant, logs: Sequence[Log]) -> dict[str, Array]:
         change = columns(plant.simulate(log), plant.outputs)
         log = log.copy()
         for name in set(plant.inputs) - set(plant.model.switches):
-            log[name] = log[name].copy(data=(1 - RUN_GAIN_SD) * column(log, name))
+            log[name] = log[name].copy(data=(1 - gain) * column(log, name))
         changes.append(change - columns(plant.simulate(log), plant.outputs))
     return dict(zip(plant.outputs, np.concatenate(changes).T))
 
@@ -210,6 +215,11 @@ def _own_variance(plant: Plant, name: str, drawn: Array, level: float) -> float:
     tails = [each.rmse for each in plant.scores.held_out if each.output == name and each.log.startswith(TAIL)]
     error = max(held_out, float(np.sqrt(np.mean(np.square(tails)))) if tails else 0.0)
     return float(max(error**2 - drawn.mean(), 0.0)) * _few_parts(plant, name, level) ** 2
+
+
+def expected_error(errors: Sequence[float], parts: int) -> float:
+    """Return the rms error to expect of one part more, of errors over ``parts`` that do not overlap."""
+    return float(np.sqrt(np.mean(np.square(errors)) * (1 + 2 / (parts or len(errors)))))
 
 
 def _few_parts(plant: Plant, name: str, level: float) -> float:

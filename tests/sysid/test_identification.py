@@ -385,7 +385,7 @@ def test_a_model_is_good_where_its_error_is_below_half_of_that_without_input_on_
     found, words = identification.verdict_of("arx", rows, quality, True)
     assert found == good
     assert said in words
-    assert f"RMSE t {np.sqrt((0.2**2 + (2 * held) ** 2) / 2):.2g} K" in words
+    assert f"expected RMSE of a free run t {np.sqrt(0.2**2 + (2 * held) ** 2):.2g} K" in words
 
 
 def table(shares, held=True):
@@ -415,15 +415,18 @@ def test_errors_stated_and_kept_are_those_of_what_was_held_out():
     tail = "last 30 % of "
     rows = table({"arx": {f"{tail}a": 1.5, f"{tail}b": 0.5, "block 1": 1.0, "block 2": 1.0}})
     other = replace(rows[0], output="r", rmse=9.0, unit="1", fit_percent=np.nan)
-    assert stated_error([*rows, other], "t") == pytest.approx(np.sqrt(5))  # of 3 and 1; the blocks' is 2
-    assert stated_error(rows[1:], "t") == 2.0
+    # of 3, 1, 2, 2 the mean square is 4.5; two blocks are two parts, in which the last parts lie
+    assert stated_error([*rows, other], "t") == pytest.approx(np.sqrt(4.5 * 2))
+    assert stated_error(rows[:2], "t") == pytest.approx(np.sqrt(5 * 2))  # last parts alone
+    assert stated_error(rows[2:3], "t") == pytest.approx(2 * np.sqrt(3))
     more = [*table({"oe": {"a": 1.0}}), *table({"arx": {"a": 1.0}}, False)]
     assert identification.held_out_scores([other, *more], "arx") == [
         HeldOut(f"{tail}a", "r", 9.0, 0.0, "1", 100)
     ]
     quality: Any = SimpleNamespace(verdict="ok")
     words = identification.verdict_of("arx", [*rows, other], quality, False)[1]
-    assert words.startswith("arx: free run on parts of the logs, left out: RMSE t 2.2 K, r 9; not good")
+    beginning = "arx: expected RMSE of a free run t 3 K, r 16 (from parts of the logs, left out); not good"
+    assert words.startswith(beginning)
     assert identification.relative_error(replace(other, no_input_rmse=0.0)) == 9e12
 
 
