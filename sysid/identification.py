@@ -61,7 +61,12 @@ from thermogrip.sysid.plant.fit_record import (
 from thermogrip.sysid.plant.log_grid import make_grid, match_logs, misfit, roles_of, signals
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run, no_input_baseline
-from thermogrip.sysid.validation.prediction_bands import SHORT, between_runs, expected_coverage, expected_error
+from thermogrip.sysid.validation.prediction_bands import (
+    SHORT,
+    between_runs,
+    expected_coverage,
+    expected_error,
+)
 
 if TYPE_CHECKING:
     from pandas import DataFrame
