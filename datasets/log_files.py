@@ -179,8 +179,8 @@ def as_logs(logs: Log | DataFrame | Sequence[Log | DataFrame], *lists: Sequence[
 
     given = list(logs) if isinstance(logs, Sequence) else [logs]
     found: list[Log] = [log if isinstance(log, Dataset) else read_log(log, *lists) for log in given]
-    for at, (log, before) in enumerate(zip(found, given), start=1):
-        log.attrs["name"] += "" if log is before or len(given) == 1 else f" {at}"
+    for at, log in enumerate(found):
+        log.attrs["name"] += "" if log is given[at] or len(given) == 1 else f" {at + 1}"
     return found
 
 

@@ -158,19 +158,8 @@ def log_name(log: Log | Grasps) -> str:
     return str(log.attrs.get("name", "log"))
 
 
-def data_hash(log: Log) -> str:
-    """Return the SHA-256 of a log's data: of its file, before repairs and cuts, where it was read from one.
-
-    Names, order and units in the header do not count, so a copy under another name is the same data.
-    """
-    known = log.attrs.get("sha256")
-    if known:
-        return str(known)
-    return hash_columns({"time": log["time"].values} | {str(name): log[name].values for name in log})
-
-
 def hash_columns(data: Mapping[str, NDArray[np.float64]]) -> str:
-    """Return the SHA-256 of columns, in whatever order they stand; see :func:`data_hash`."""
+    """Return the SHA-256 of columns, in whatever order they stand."""
     # + 0.0: -0 and 0 are one number, of two byte patterns
     values = [np.asarray(v, dtype="<f8") + 0.0 for v in data.values()]
     each = sorted(hashlib.sha256(one.tobytes()).digest() for one in values)

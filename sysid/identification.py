@@ -124,7 +124,7 @@ def run_held_out(plant: Plant, held: Held, *, unseen: bool = False) -> FreeRun:
     Members of a neural model that disagree over what they have not seen have a mean that means nothing.
     """
     # a log may begin warm, and then its state needs more readings than one that begins at rest
-    warmup = max(5.0 if held.score_from == 0 else warm_up_of(held.log), plant.dt)
+    warmup = max(5.0 if held.score_from == 0 else warm_up_of(held.log["time"].values), plant.dt)
     if unseen and plant.model.kind == "neural":
         from thermogrip.sysid.validation.prediction_bands import check_ensemble
 
@@ -228,15 +228,15 @@ def fit_without_tail(fit: BlackBoxFit, train: Sequence[Log]) -> Plant:
     return replace(fit.plant, model=model)
 
 
-def warm_up_of(log: Log) -> float:
+def warm_up_of(time: Array) -> float:
     """Return the warm-up [s] of a log that may begin warm: fifty rows, a minute at most."""
-    return min(50.0 * float(np.median(np.diff(log["time"].values))), 60.0)
+    return min(50.0 * float(np.median(np.diff(time))), 60.0)
 
 
 def warm_up_of_fit(plant: Plant, log: Log) -> float:
     """Return the warm-up [s] that scored a black box of one or two logs; 0 for other plants."""
     black_box = bool(plant.scores.held_out_by_part)
-    return warm_up_of(log) if black_box and 0 < len(plant.logs) < SEVERAL else 0.0
+    return warm_up_of(log["time"].values) if black_box and 0 < len(plant.logs) < SEVERAL else 0.0
 
 
 def choose_model(rows: Sequence[Row], complete: int) -> str | None:
@@ -489,7 +489,9 @@ def identify(
     roles, unused = _signal_roles(logs, (u, d, y), lists, network)
     notes = (*converted, *refused, *unused, *lost, *_plant_notes(chosen, plant))
     # the same warm-up as on what was held out, or errors of the start would stand beside ones without
-    whole = [Held(log, log_name(log), 0.0 if leave_one_out else warm_up_of(log)) for log in logs]
+    whole = [
+        Held(log, log_name(log), 0.0 if leave_one_out else warm_up_of(log["time"].values)) for log in logs
+    ]
     runs = tuple(run_held_out(plant, held) for held in whole)
     for held, run in zip(whole, runs):
         rows += rows_of(chosen, plant, held.name, run, held_out=False)

@@ -1,7 +1,7 @@
 """What a plant keeps of its fit: numbers for tables, bands and later fits, and which data it was fitted to.
 
 A free run over a log of the fit says how well the plant is fitted, not how well it predicts.  A log's name
-may change, so a plant keeps the hash of each log's data (:func:`thermogrip.datasets.schema.data_hash`)
+may change, so a plant keeps the hash of each log's data (:func:`thermogrip.datasets.schema.hash_columns`)
 beside the seconds of it that were used.
 """
 
@@ -165,10 +165,21 @@ class FitLog:
 
 
 def fit_logs(logs: Sequence[Log]) -> tuple[FitLog, ...]:
-    """Return what a plant keeps of the logs of its fit."""
-    from thermogrip.datasets.schema import data_hash, log_name
+    """Return what a plant keeps of the logs of its fit.
 
-    return tuple(FitLog(log_name(log), data_hash(log), *_ends(log["time"].values)) for log in logs)
+    The hash is that of a log's file, before repairs and cuts, where it was read from one: names, order and
+    units in the header do not count, so a copy under another name is the same data.
+    """
+    from thermogrip.datasets.schema import hash_columns, log_name
+
+    found = []
+    for log in logs:
+        time = log["time"].values
+        known = log.attrs.get("sha256") or hash_columns(
+            {"time": time} | {str(name): log[name].values for name in log}
+        )
+        found.append(FitLog(log_name(log), str(known), float(time[0]), float(time[-1])))
+    return tuple(found)
 
 
 def said_of_fit(fitted_to: Sequence[FitLog], seen: FitLog) -> list[str]:
@@ -184,7 +195,3 @@ def said_of_fit(fitted_to: Sequence[FitLog], seen: FitLog) -> list[str]:
         meaning = "the scores say how well the plant is fitted, not how well it predicts"
         said.append(f"{what} in the fit{name}: {'' if whole else 'there '}{meaning}")
     return said
-
-
-def _ends(time: Any) -> tuple[float, float]:
-    return float(time[0]), float(time[-1])

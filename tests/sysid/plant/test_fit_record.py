@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from thermogrip.datasets.schema import data_hash, make_log
+from thermogrip.datasets.schema import hash_columns, make_log
 from thermogrip.sysid.plant.fit_record import TAIL, FitLog, Intervals, PlantScores, fit_logs, said_of_fit
 
 # as version 0.1.0 wrote them for a network and for a black box, shortened
@@ -64,7 +64,7 @@ def test_a_wrong_entry_is_named(content, where):
 
 def test_rows_of_a_log_are_in_the_fit_where_it_is_the_same_log_at_the_same_time():
     log = make_log([0.0, 1.0, 2.0, 3.0], {"q": ([0, 1, 0, 1], "percent", "input")}, name="a")
-    same = data_hash(log)
+    same = hash_columns({"time": log["time"].values, "x": log["q"].values})
     (seen,) = fit_logs([log])
     others = [FitLog("a", "0" * 64, 0.0, 3.0), FitLog("a", same, 3.0, 5.0), FitLog("a", same, -1.0, 0.0)]
     assert said_of_fit(others, seen) == []
@@ -77,6 +77,7 @@ def test_rows_of_a_log_are_in_the_fit_where_it_is_the_same_log_at_the_same_time(
         "0 to 1 s of 0 to 3 s are", "2 to 3 s of 0 to 3 s are"
     ]  # fmt: skip
     assert fit_logs([log, log]) == (FitLog("a", same, 0.0, 3.0),) * 2
+    assert fit_logs([log.assign_attrs(sha256="of the file")])[0].sha256 == "of the file"
     assert whole.endswith("the scores say how well the plant is fitted, not how well it predicts")
     assert TAIL == "last 30 % of "
 
