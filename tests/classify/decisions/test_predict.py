@@ -280,6 +280,8 @@ def test_reasons_stand_beside_strange_grasps_alone(device: GripperModel) -> None
     assert words[:3] == ["", "", ""]
     assert len(words) == 3 + cork.sizes["grasp"] > 3
     assert all(text.startswith("as wood it needs 0.3") and "effusivity" in text for text in words[3:])
+    usual = [row | {"p_unknown": p} for row, p in zip(rows[3:], (0.5, 0.51, None))]
+    assert [bool(text) for text in reasons(model, cork.isel(grasp=[0, 1, 2]), usual)] == [False, True, False]
     block = cork.assign(touch_group=("grasp", ["one"] * cork.sizes["grasp"]))
     assert set(reasons(model, block, rows[3:])) == {""}  # its touches have no nominal temperature
 

@@ -70,6 +70,17 @@ def test_candidates_come_in_the_order_asked_for(fitted: PosteriorClassifier, fre
         fitted.candidate_log_proba(fresh, ["gold"])
 
 
+def test_none_of_the_candidates_is_weighed_against_blocks_of_the_training(
+    fitted: PosteriorClassifier, fresh: Grasps
+) -> None:
+    other = clone(fitted).set_params(finish="unknown")
+    other.with_device(fitted.device_)
+    some = pick(fresh, [0, 3, 6])
+    of_other, of_same = (model.open_set_log_proba(some, ["copper", "wood"]) for model in (other, fitted))
+    np.testing.assert_allclose(of_other[1], of_same[1], rtol=1e-9)  # a free effusivity has their finish
+    assert not np.allclose(of_other[0], of_same[0], rtol=1e-3)
+
+
 def test_a_saved_one_predicts_the_same(fitted: PosteriorClassifier, fresh: Grasps, tmp_path: Path) -> None:
     again = load_classifier(save_classifier(fitted, tmp_path))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["classifier.json", "device.json"]

@@ -99,6 +99,9 @@ def test_another_run_adds_what_its_gain_changes(schedule):
         np.testing.assert_allclose(added[name], 0.05 * run[name].values, atol=1e-9)
     half = free_run_band(plant, schedule, run).half["t1"]
     np.testing.assert_allclose(half, 1.6449 * np.hypot(0.1, added["t1"]), rtol=1e-3)
+    both = between_runs(plant, [schedule, schedule.isel(time=slice(0, 20))])
+    for name in plant.outputs:  # one log after the other
+        np.testing.assert_allclose(both[name], [*added[name], *added[name][:20]], atol=1e-12)
     assert between_runs(first_order(logs=()), [schedule]) == {}
     assert between_runs(first_order(logs=("a", "b", "c")), [schedule]) == {}
 
