@@ -278,6 +278,8 @@ def unexplained(
     known = np.isfinite(touches(grasps).t_object)
     mode = fit_pairs(device, data, np.arange(ends.shape[0]), hypotheses)
     n = (data.count > 0).sum(axis=1)
+    if device.second is not None and data.second is not None:
+        n = n + (data.second.count > 0).sum(axis=1)
     words = []
     for i, (low, high) in enumerate(ends):
         if mode.misfit[i] > n[i] + _UNEXPLAINED * np.sqrt(2 * n[i]):

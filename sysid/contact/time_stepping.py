@@ -576,7 +576,7 @@ def fill_delayed(t: Array, count: Array, late: float, curve: Array, total: Array
 
 RATE = 5  # the row of the slope, after the stepped curves
 N_CURVE = 6
-_LATEST_ONSET = 0.8
+EARLIEST_ONSET, LATEST_ONSET = -1.5, 0.8  # s after the closed message
 _H, _BUILD_UP, _ONSET, _LEVEL, _T, _E, _C = range(7)
 
 
@@ -635,7 +635,7 @@ def fill_responses(
         nodes[1], gripper, np.exp(u[_E]), np.exp(u[_C]), np.exp(u[_H]), np.exp(u[_BUILD_UP]), contact, by_e,
         by_c, room,
     )  # fmt: skip
-    onset = min(max(u[_ONSET], -_LATEST_ONSET), _LATEST_ONSET)
+    onset = min(max(u[_ONSET], EARLIEST_ONSET), LATEST_ONSET)
     _places(nodes[2], onset, times, bins, place, share)
     t, rise, slope = nodes[2], room.rise, room.slope
     wanted = (True, contact, contact, by_e, by_c)
@@ -644,3 +644,5 @@ def fill_responses(
             _means(t, rise[curve], slope[curve], bins, count, place, share, False, out[curve])
     if vary[_ONSET]:
         _means(t, rise[VALUE], slope[VALUE], bins, count, place, share, True, out[RATE])
+        for i in range(out.shape[1]):  # past the range nothing moves
+            out[RATE, i] *= 1.0 if onset == u[_ONSET] else 0.0

@@ -53,6 +53,22 @@ class Noise:
     correlation_time: float = 4.0
     misfit: float = 0.0015
     growth: float = 1.0
+    smooth: bool = False  # whether slow noise and misfit have a slope (Matern 3/2), as in smoothed records
+
+    def correlation(self, distance: Array) -> Array:
+        """Return the correlation of slow noise and misfit at a distance in units of their scale."""
+        z = np.sqrt(3.0) * distance if self.smooth else distance
+        return np.asarray(np.exp(-z) * (1 + z) if self.smooth else np.exp(-z))
+
+
+KNOTS = np.array([-1.0, -0.6, -0.3, 0.0, 0.3, 0.6, 1.0, 1.5, 2.2, 3.2, 4.6, 6.6, 10.0, 16.0, 25.0, 40.0])
+
+
+def at_knots(t: Array) -> Array:
+    """Return the weights of the knots at times ``t`` [s], of shape t.shape + (n_knot,); 0 until -1.5 s."""
+    base = np.eye(KNOTS.size + 1)[1:]
+    x = np.concatenate([[-1.5], KNOTS])
+    return np.stack([np.interp(t, x, row) for row in base], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -72,10 +88,12 @@ class Touches:
     t_object_sd: Array  # (n,) [K]
     t_ambient: Array  # (n,), of the room [degC]
     excursion: Array  # (n,) [K]
+    second: Touches | None = None  # what a second sensor of the finger read of the same grasps
 
     def take(self, index: NDArray[np.int64]) -> Touches:
         """Return the touches at these rows."""
-        return Touches(*(getattr(self, f.name)[index] for f in fields(self)))
+        own = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "second"}
+        return Touches(**own, second=None if self.second is None else self.second.take(index))
 
     @property
     def end(self) -> float:
@@ -85,6 +103,10 @@ class Touches:
 
 def touches(grasps: Grasps, *, until: float | None = None) -> Touches:
     """Return the binned arrays of a Grasps record, samples after ``until`` [s] left out."""
+    second = None
+    if "t_surface_2" in grasps:
+        beside = grasps.drop_vars("t_surface_2").assign(t_surface=grasps["t_surface_2"])
+        second = touches(beside, until=until)
     check_grasps(grasps)
     where = log_name(grasps)
     sd = number_values(grasps, "t_object_sd")
@@ -125,7 +147,7 @@ def touches(grasps: Grasps, *, until: float | None = None) -> Touches:
         y=y, t=mean(np.broadcast_to(time, data.shape)),
         count=count, ramp=mean(np.broadcast_to(np.maximum(time - PUMP_OFF, 0.0), data.shape)), level=level,
         t_object=number_values(grasps, "t_object"), t_object_sd=sd,
-        t_ambient=number_values(grasps, "t_ambient"), excursion=np.abs(away).max(axis=1),
+        t_ambient=number_values(grasps, "t_ambient"), excursion=np.abs(away).max(axis=1), second=second,
     )  # fmt: skip
 
 
@@ -176,7 +198,9 @@ def stack_touches(parts: list[Touches]) -> Touches:
         padded = [np.pad(f, ((0, 0), (0, width - f.shape[1])), constant_values=fill) for f in columns]
         return np.concatenate(padded)
 
-    return Touches(*(joined(f.name) for f in fields(Touches)))
+    seconds = [p.second for p in parts if p.second is not None]
+    second = stack_touches(seconds) if len(seconds) == len(parts) else None
+    return Touches(**{f.name: joined(f.name) for f in fields(Touches) if f.name != "second"}, second=second)
 
 
 def noise_covariance(data: Touches, noise: Noise) -> Array:
@@ -199,12 +223,15 @@ def noise_fit(data: Touches, noise: Noise, extra: Array, left: Array) -> tuple[f
     a = np.einsum("nij,ni->nj", root, z)
     g = root.transpose(0, 2, 1) @ root - a[:, :, None] * a[:, None, :]
     by_slow, by_misfit = g * slow, (g * misfit).sum(axis=2)
-    apart = np.abs(data.t[:, :, None] - data.t[:, None, :])
+    x = np.abs(data.t[:, :, None] - data.t[:, None, :]) / noise.correlation_time
+    steep = (
+        3 * x**2 / (1 + np.sqrt(3.0) * x) if noise.smooth else x
+    )  # slope of -ln correlation by ln distance
     longer = np.log1p(np.maximum(data.t, 0.0) / 10)
     slopes = [
         (np.diagonal(g, axis1=1, axis2=2) * white * (data.count > 0)).sum(),
         by_slow.sum(),
-        0.5 * (by_slow * apart).sum() / noise.correlation_time,
+        0.5 * (by_slow * steep).sum(),
         by_misfit.sum(),
         (longer * by_misfit).sum(),
     ]
@@ -218,9 +245,10 @@ def _parts(data: Touches, noise: Noise) -> tuple[Array, Array, Array]:
     # grasps of one record share their time axis, and the exponentials cost most
     alike_all = bool((t == t[0]).all())
     axes, which = (t[:1], 0) if alike_all else np.unique(t, axis=0, return_inverse=True)
-    slow = noise.slow**2 * np.exp(-np.abs(axes[:, :, None] - axes[:, None, :]) / noise.correlation_time)
+    apart = np.abs(axes[:, :, None] - axes[:, None, :])
+    slow = noise.slow**2 * noise.correlation(apart / noise.correlation_time)
     u = np.log1p(np.maximum(axes, 0.0) / 0.3)
-    alike = np.exp(-np.abs(u[:, :, None] - u[:, None, :]))
+    alike = noise.correlation(np.abs(u[:, :, None] - u[:, None, :]))
     size = noise.misfit * data.excursion[:, None] * (1 + np.maximum(t, 0.0) / 10) ** noise.growth * (t > 0)
     misfit = alike[which] * (size * there)[:, :, None] * (size * there)[:, None, :]
     white = np.where(there, noise.white**2 / np.maximum(data.count, 1.0), 1.0)

@@ -38,7 +38,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import number_within
 from thermogrip.datasets.materials import load_materials
 from thermogrip.sysid.contact.simulation import Grip, Stack
-from thermogrip.sysid.effusivity.data import UNKNOWN_OBJECT_RANGE, Noise
+from thermogrip.sysid.effusivity.data import KNOTS, UNKNOWN_OBJECT_RANGE, Noise, at_knots
 
 # theta but for the blocks, in the order of the calibration
 SHARED_NAMES = (
@@ -194,8 +194,9 @@ def another_gripper(gripper: GripperModel, spread: GripperSpread | None = None) 
         known = ParameterCovariance(names, np.zeros((len(names), len(names))))
     extra = (spread or GripperSpread()).covariance(known.names)
     return replace(
-        gripper, uncertainty=ParameterCovariance(known.names, known.covariance + extra), uncertain=True
-    )
+        gripper, uncertainty=ParameterCovariance(known.names, known.covariance + extra), uncertain=True,
+        second=None if gripper.second is None else another_gripper(gripper.second, spread),
+    )  # fmt: skip
 
 
 def block_names(labels: Sequence[str]) -> tuple[str, ...]:
@@ -264,6 +265,30 @@ class Block:
     n_grasp: int
 
 
+@dataclass(frozen=True)
+class Discrepancy:
+    """What a gripper was found to read beyond the model at ``KNOTS``, linear between them.
+
+    ``always`` (n_knot,) [K] is common to all grasps (a heater that is cut at contact, a skin on its way);
+    ``share`` (n_block, n_knot) per degree between object and skin, by block in the gripper's order, and
+    by the effusivity of others (an approach before contact, a smoothed record).
+    """
+
+    always: Array = field(compare=False)
+    share: Array = field(compare=False)
+    onset: Array = field(compare=False)  # (n_block,) [s], of contact with each block about the mean
+    from_room: Array = field(compare=False)  # (n,) [K], objects less room in a training with unknown ones
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any], n_block: int) -> Discrepancy:
+        """Return what a file holds; ValueError where a shape or a number is wrong."""
+        parts = [np.asarray(content[f.name], dtype=float) for f in fields(cls)]
+        shapes = [(KNOTS.size,), (n_block, KNOTS.size), (n_block,), parts[3].shape]
+        if [p.shape for p in parts] != shapes or not all(np.isfinite(p).all() for p in parts):
+            raise ValueError("discrepancy is of another shape, or not finite")
+        return cls(*parts)
+
+
 @dataclass(frozen=True, kw_only=True)
 class GripperModel:
     """The calibrated gripper (frozen; a JSON file of schema ``thermogrip.device``).
@@ -290,6 +315,10 @@ class GripperModel:
         Of all these parameters.
     uncertain : bool, optional
         Whether answers integrate over the parameters, as ``uncertainty`` says; else they count as exact.
+    second : GripperModel, optional
+        What stands around a second sensor of the finger (``t_surface_2``), calibrated on the same grasps.
+    discrepancy : Discrepancy, optional
+        What the gripper reads beyond the model, where its calibration found something.
 
     Raises
     ------
@@ -311,6 +340,8 @@ class GripperModel:
     trained_on: tuple[str, ...] = ()
     uncertainty: ParameterCovariance | None = None
     uncertain: bool = False
+    second: GripperModel | None = None
+    discrepancy: Discrepancy | None = None
 
     def __post_init__(self) -> None:
         if self.uncertain and self.uncertainty is None:
@@ -320,6 +351,25 @@ class GripperModel:
     def materials(self) -> tuple[str, ...]:
         """Return the labels that it was calibrated with."""
         return tuple(self.blocks)
+
+    def discrepancy_of(self, ln_effusivity: Array) -> Discrepancy | None:
+        """Return the discrepancy by other blocks, of found effusivities (n,)."""
+        if (own := self.discrepancy) is None:
+            return None
+        blocks = np.array([block.ln_effusivity for block in self.blocks.values()])
+        order = np.argsort(blocks)
+        columns = np.column_stack([own.share, own.onset])[order].T
+        found = np.stack([np.interp(ln_effusivity, blocks[order], c) for c in columns], axis=1)
+        return replace(own, share=found[:, :-1], onset=found[:, -1])
+
+    def beyond(self, t: Array, ln_effusivity: Array) -> Array:
+        """Return the discrepancy of touches at times ``t`` (n or 1, n_bin) under found effusivities (n,),
+        (n, 2, n_bin): always [K], and per degree between object and skin."""
+        out = np.zeros((ln_effusivity.size, 2, t.shape[1]))
+        if (own := self.discrepancy_of(ln_effusivity)) is not None:
+            weight = at_knots(t)
+            out[:, 0], out[:, 1] = weight @ own.always, (weight * own.share[:, None, :]).sum(axis=2)
+        return out
 
     def expected_ln_h(self, ln_effusivity: Array) -> Array:
         """Return the expected ln h of a block of found effusivity ln e that was not calibrated."""
@@ -389,8 +439,12 @@ class GripperModel:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-able description."""
-        numbers = asdict(replace(self, uncertainty=None, uncertain=False)) | {"uncertain": self.uncertain}
-        del numbers["uncertainty"]
+        numbers = asdict(replace(self, uncertainty=None, uncertain=False, second=None, discrepancy=None))
+        numbers["uncertain"] = self.uncertain
+        del numbers["uncertainty"], numbers["second"], numbers["discrepancy"]
+        if self.discrepancy is not None:
+            numbers["discrepancy"] = {k: v.tolist() for k, v in vars(self.discrepancy).items()}
+        numbers |= {} if self.second is None else {"second": self.second.to_dict()}
         for part in ("stack", "noise", "spreads"):
             numbers[part] = {_FILE_KEYS.get(k, k): v for k, v in numbers[part].items()}
         numbers |= {"blocks": dict(numbers["blocks"]), "trained_on": [*self.trained_on]}
@@ -404,7 +458,9 @@ class GripperModel:
             return cls(
                 # files from before blocks had a far face have none
                 stack=Stack(**_numbers({"g_far": 0.0, **content["stack"]}, _OF_STACK)),
-                noise=Noise(**_numbers(content["noise"], _OF_NOISE)),
+                noise=Noise(
+                    **_numbers(content["noise"], _OF_NOISE), smooth=bool(content["noise"].get("smooth"))
+                ),
                 spreads=Spreads(**_numbers(content["spreads"], _OF_SPREADS)),
                 blocks={str(k): _block(v) for k, v in content["blocks"].items()},
                 trained_on=tuple(str(v) for v in content.get("trained_on", ())),
@@ -413,6 +469,10 @@ class GripperModel:
                 if "knowledge" in content
                 else None,
                 uncertain=bool(content.get("in_doubt", False)),
+                second=cls.from_dict(content["second"], file=file) if "second" in content else None,
+                discrepancy=Discrepancy.from_dict(content["discrepancy"], len(content["blocks"]))
+                if "discrepancy" in content
+                else None,
                 **_numbers(content, _OF_GRIPPER),
             )
         except (KeyError, TypeError, ValueError, AttributeError) as error:

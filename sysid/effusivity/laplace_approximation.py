@@ -89,7 +89,10 @@ from thermogrip.sysid.effusivity.gripper_model import (
 
 H, BUILD_UP, ONSET, LEVEL, T_OBJECT, EFFUSIVITY, CAPACITY = range(7)
 N_NUISANCE = 7
-_LATEST_ONSET = 0.8  # s, either side of the closed message
+_EARLIEST_ONSET = 1.5  # s before the closed message
+_SENSORS_APART = 0.3  # K: two thermistors of 1 %
+_DOF, _COUNTS, _GAIN_SD = 20.0, 2.0, 0.1
+_ALIKE_SD = 1.0  # K
 
 
 class Prior(NamedTuple):
@@ -116,29 +119,35 @@ class Mode(NamedTuple):
 
 def nodes_for(data: Touches) -> TimeNodes:
     """Return the time nodes that reach the last sample of an early contact."""
-    return time_nodes(data.end + _LATEST_ONSET)
+    return time_nodes(data.end + _EARLIEST_ONSET)
 
 
-def predict(stack: Stack, nodes: TimeNodes, data: Touches, u: Array) -> Array:
+def predict(stack: Stack, nodes: TimeNodes, data: Touches, u: Array, beyond: Array | None = None) -> Array:
     """Return the bin means that nuisances u (n_pair, 7) predict, (n_pair, n_bin) [degC]."""
-    return jacobian(stack, nodes, data, u, np.zeros(u.shape, dtype=bool))[0]
+    return jacobian(stack, nodes, data, u, np.zeros(u.shape, dtype=bool), beyond)[0]
 
 
-def jacobian(stack: Stack, nodes: TimeNodes, data: Touches, u: Array, vary: Mask) -> tuple[Array, Array]:
+def jacobian(
+    stack: Stack, nodes: TimeNodes, data: Touches, u: Array, vary: Mask, beyond: Array | None = None
+) -> tuple[Array, Array]:
     """Return the prediction (n_pair, n_bin) and its derivatives by u, (n_pair, n_bin, 7), zero where not
-    ``vary`` (n_pair, 7), the unknown nuisances."""
+    ``vary`` (n_pair, 7), the unknown nuisances; ``beyond`` (n_pair, 2, n_bin) the gripper's discrepancy."""
     from thermogrip.sysid.effusivity.mode_kernel import readings
 
     y, slopes = readings(
         *gripper_arguments(stack, nodes), data.sample_t, data.sample_bin, data.count, data.t, data.ramp,
-        data.t_ambient, np.ascontiguousarray(u), vary,
+        data.t_ambient, _beyond(beyond, u, data), np.ascontiguousarray(u), vary,
     )  # fmt: skip
     return y, slopes
 
 
+def _beyond(beyond: Array | None, u: Array, data: Touches) -> Array:
+    return np.zeros((len(u), 2, data.y.shape[1])) if beyond is None else beyond
+
+
 def find_modes(
     stack: Stack, data: Touches, row: NDArray[np.int64], whitener: tuple[Array, Array], prior: Prior, *,
-    start: Array | None = None, max_steps: int = 20,
+    start: Array | None = None, max_steps: int = 20, beyond: Array | None = None,
 ) -> Mode:  # fmt: skip
     """Return mode, covariance and log evidence of every pair by damped Gauss-Newton.
 
@@ -158,7 +167,8 @@ def find_modes(
     arguments = gripper_arguments(stack, nodes_for(data))
     covariance, objective, misfit, settled = modes(
         *arguments, row, data.sample_t, data.sample_bin, data.count, data.t, data.y,
-        data.ramp, data.t_ambient, w_matrix, np.stack([prior.mean, prior.sd, dof], axis=1), u, max_steps,
+        data.ramp, data.t_ambient, _beyond(beyond, u, data), w_matrix,
+        np.stack([prior.mean, prior.sd, dof], axis=1), u, max_steps,
     )  # fmt: skip
     evidence = -0.5 * (objective + log_det[row]) + peak_ratio(dof, vary)
     return Mode(u, covariance, evidence, settled > 0, misfit)
@@ -201,6 +211,7 @@ class _Pair(NamedTuple):
     centre: Array
     by_mean: Array  # (7, n_theta): how theta moves the prior's mean of u
     constant: float  # what neither guess nor gripper changes of the log evidence
+    beyond: Array  # (1, 2, n_bin)
 
 
 @dataclass(frozen=True)
@@ -239,7 +250,10 @@ def uncertain_gripper_modes(
     As :func:`find_modes`; ``block`` (n_pair,) is the place in ``gripper.materials`` of a hypothesis' block,
     -1 for others.  ``u`` and its covariance are for the gripper that each hypothesis found.
     """
-    first = find_modes(gripper.stack, data, row, whitener, prior, start=start, max_steps=max_steps)
+    beyond = gripper.beyond(data.take(row).t, prior.mean[:, EFFUSIVITY])
+    first = find_modes(
+        gripper.stack, data, row, whitener, prior, start=start, max_steps=max_steps, beyond=beyond
+    )
     pairs = _pairs(gripper, data, row, whitener, prior, block)
     found: list[Mode | None] = [None] * row.size
     for touch in np.unique(row):
@@ -272,7 +286,8 @@ def _pairs(
         own_prior = Prior(prior.mean[i : i + 1], sd[i : i + 1])
         one = data.take(np.array([r]))
         known = covariance[int(block[i])], centre, _mean_slopes(one), float(constant[i])
-        out.append(_Pair(one, nodes, whitener[0][r], noise[r], own_prior, dof[i], *known))
+        beyond = gripper.beyond(one.t, own_prior.mean[:, EFFUSIVITY])
+        out.append(_Pair(one, nodes, whitener[0][r], noise[r], own_prior, dof[i], *known, beyond))
     return out
 
 
@@ -347,8 +362,9 @@ def _point(pair: _Pair, v: Array, a: Array) -> _Point | None:
         return None
     u = v + pair.by_mean @ moved
     left = np.where(
-        pair.data.count[0] > 0, pair.data.y[0] - predict(stack, pair.nodes, pair.data, u[None])[0], 0.0
-    )
+        pair.data.count[0] > 0,
+        pair.data.y[0] - predict(stack, pair.nodes, pair.data, u[None], pair.beyond)[0], 0.0,
+    )  # fmt: skip
     cost = float(((pair.whitener @ left) ** 2).sum()) + _penalty(pair, v)[0] + float(a @ moved)
     return _Point(v, a, moved, u, stack, left, cost)
 
@@ -415,7 +431,7 @@ def _slopes(pair: _Pair, here: _Point) -> tuple[Array, Array]:
     from thermogrip.sysid.effusivity.mode_kernel import gripper_readings
 
     data, u, stack = pair.data, here.u, here.stack
-    _, by_u = jacobian(stack, pair.nodes, data, u[None], np.ones((1, u.size), dtype=bool))
+    _, by_u = jacobian(stack, pair.nodes, data, u[None], np.ones((1, u.size), dtype=bool), pair.beyond)
     k = by_u[0] @ pair.by_mean
     n = len(_LAYERS)
     layers = np.repeat([[getattr(stack, name) for name in LAYER_NAMES]], n, axis=0)
@@ -431,7 +447,7 @@ def _slopes(pair: _Pair, here: _Point) -> tuple[Array, Array]:
     )
     y = gripper_readings(
         tuple(pair.nodes), lam, face, sensor, contact, data.sample_t[0], data.sample_bin[0], data.count[0],
-        data.t[0], data.ramp[0], float(data.t_ambient[0]), u,
+        data.t[0], data.ramp[0], float(data.t_ambient[0]), pair.beyond[0], u,
     )  # fmt: skip
     k[:, _MOVED] = ((y[:-1] - y[-1]) / _DIFFERENCE).T
     if np.isfinite(data.t_ambient[0]):
@@ -499,6 +515,8 @@ def prior_of(gripper: GripperModel, data: Touches, hypotheses: Hypotheses) -> Pr
     mean[:, H], sd[:, H] = hypotheses.ln_h, hypotheses.ln_h_sd
     mean[:, BUILD_UP], sd[:, BUILD_UP] = np.log(gripper.stack.build_up), spreads.ln_build_up
     mean[:, ONSET], sd[:, ONSET] = gripper.onset, spreads.onset
+    if (own_blocks := gripper.discrepancy_of(hypotheses.ln_e)) is not None:
+        mean[:, ONSET] += own_blocks.onset
     mean[:, LEVEL], sd[:, LEVEL] = data.level, LEVEL_SD
     known = np.isfinite(data.t_object)
     lost = gripper.transit_loss * np.nan_to_num(data.t_ambient - data.t_object)
@@ -525,17 +543,129 @@ def fit_pairs(
 ) -> Mode:  # fmt: skip
     """Return the modes of pairs, hypothesis i against touch ``row[i]``.
 
-    The parameters of an uncertain gripper are integrated over.  ``noise`` and ``prior`` are what
-    :func:`~thermogrip.sysid.effusivity.data.whiten` and :func:`prior_of` give, where a caller has them.
+    The parameters of an uncertain gripper are integrated over, a second sensor is used.  ``noise`` and
+    ``prior`` are what :func:`~thermogrip.sysid.effusivity.data.whiten` and :func:`prior_of` give, where a
+    caller has them.
     """
     prior = prior_of(gripper, data.take(row), hypotheses) if prior is None else prior
+    mode = _own_modes(gripper, data, row, hypotheses, prior, start, max_steps, noise)
+    n, second = (data.count[row] > 0).sum(axis=1), gripper.second
+    if second is not None and data.second is not None:
+        others = hypotheses_of_second(gripper, second, hypotheses)
+        own = prior_of(second, data.second.take(row), others)
+        begin = own.mean.copy()
+        begin[:, LEVEL], begin[:, T_OBJECT] = data.second.level[row], mode.u[:, T_OBJECT]
+        beside = _own_modes(second, data.second, row, others, own, begin, 20, None)
+        mode = joined_modes(mode, prior, beside, own, second.bias - gripper.bias)
+        n = n + (data.second.count[row] > 0).sum(axis=1)
+    if gripper.discrepancy is not None:
+        mode = widened(mode, prior, n, gripper.bias)
+        if gripper.discrepancy.from_room.size:
+            unknown = ~np.isfinite(data.t_object[row])
+            mode = as_in_training(mode, prior, gripper.discrepancy.from_room, unknown)
+    return mode
+
+
+def _own_modes(
+    gripper: GripperModel, data: Touches, row: NDArray[np.int64], hypotheses: Hypotheses, prior: Prior,
+    start: Array | None, max_steps: int, noise: tuple[Array, Array] | None,
+) -> Mode:  # fmt: skip
+    """Return the modes of pairs by the first sensor alone."""
     noise = whiten(data, gripper.noise) if noise is None else noise
     if gripper.uncertain:
         block = hypotheses.block.astype(np.int64)
         return uncertain_gripper_modes(
             gripper, data, row, noise, prior, block, start=start, max_steps=max_steps
         )
-    return find_modes(gripper.stack, data, row, noise, prior, start=start, max_steps=max_steps)
+    beyond = gripper.beyond(data.t[row], prior.mean[:, EFFUSIVITY])
+    return find_modes(gripper.stack, data, row, noise, prior, start=start, max_steps=max_steps, beyond=beyond)
+
+
+def hypotheses_of_second(gripper: GripperModel, second: GripperModel, one: Hypotheses) -> Hypotheses:
+    """Return the hypotheses as they stand for the second sensor, on its own scale of effusivities."""
+    ln_e = second.found_effusivity(one.ln_e - gripper.effusivity_scale(one.ln_e)[0])
+    spread = np.full(ln_e.size, np.hypot(second.spreads.ln_h_of_blocks, second.spreads.ln_h))
+    other = [second.expected_ln_h(ln_e), spread, ln_e, *one[3:8], np.full(ln_e.size, -1.0)]
+    for i, block in enumerate(one.block.astype(int)):
+        name = gripper.materials[block] if block >= 0 else ""
+        if name in second.blocks:
+            known = "known" if np.isfinite(one.ln_h_dof[i]) else "unknown"
+            for column, value in zip(other, _trained(second, name, known)):
+                column[i] = value
+    return Hypotheses(*other)
+
+
+def joined_modes(first: Mode, prior: Prior, second: Mode, own: Prior, apart: float) -> Mode:
+    r"""Return the modes of one object that two sensors touched.
+
+    The object's temperature x, which a reading is linear in, is common to both.  What the second sensor saw
+    of it is the ratio of its posterior and its prior, a normal likelihood of precision
+    :math:`1/V_2 - 1/V_{02}`; its thermometer reads ``apart`` [K] more than the first one's, give or take
+    0.3 K.  All else is each sensor's own.
+    """
+    seen, width = _seen_temperature(second, own)
+    off = seen - apart - first.u[:, T_OBJECT]
+    variance = first.covariance[:, T_OBJECT, T_OBJECT] + width + _SENSORS_APART**2
+    evidence = first.log_evidence + second.log_evidence + _log_normal(off, variance)
+    evidence -= _log_normal(seen - own.mean[:, T_OBJECT], own.sd[:, T_OBJECT] ** 2 + width)
+    settled, misfit = first.converged & second.converged, first.misfit + second.misfit
+    column = first.covariance[:, :, T_OBJECT]
+    moved = first.covariance - column[:, :, None] * (column / variance[:, None])[:, None, :]
+    return Mode(first.u + (off / variance)[:, None] * column, moved, evidence, settled, misfit)
+
+
+def widened(mode: Mode, prior: Prior, n: NDArray[np.int64], bias: float) -> Mode:
+    r"""Return what a gripper with a discrepancy knows: less than its model says, least where that misfits.
+
+    A grasp's noise is larger or smaller than the others' as the discrepancy was: with a variance of inverse
+    gamma distribution, :math:`\nu = 20`, the misfit S of ``n`` readings counts
+    :math:`(\nu + n) \ln(1 + S / \nu)` in place of S.  All evidence counts half, since what differs from
+    grasp to grasp is not the noise that it is taken for.  The object's temperature is known to a tenth of its
+    distance from the skin at best, and to the thermometer's own ``bias`` [K], of which the discrepancy may
+    have taken a part.
+    """
+    evidence = mode.log_evidence + 0.5 * (mode.misfit - (_DOF + n) * np.log1p(mode.misfit / _DOF))
+    seen, width = _seen_temperature(mode, prior)
+    x0, v0 = prior.mean[:, T_OBJECT], prior.sd[:, T_OBJECT] ** 2
+    width *= np.maximum(_COUNTS * (_DOF + mode.misfit) / (_DOF + n), 1.0)
+    width += (_GAIN_SD * (mode.u[:, T_OBJECT] - mode.u[:, LEVEL])) ** 2 + bias**2
+    u, covariance = mode.u.copy(), mode.covariance.copy()
+    covariance[:, T_OBJECT, T_OBJECT] = v0 * width / (v0 + width)
+    u[:, T_OBJECT] = (x0 * width + seen * v0) / (v0 + width)
+    return mode._replace(u=u, covariance=covariance, log_evidence=evidence / _COUNTS)
+
+
+def as_in_training(mode: Mode, prior: Prior, from_room: Array, unknown: Mask) -> Mode:
+    """Return the modes under even odds that an object of unknown temperature is as far from its room as some
+    object of the training was, within 1 K, or anywhere in its range."""
+    seen, width = _seen_temperature(mode, prior)
+    room, v0 = prior.mean[:, T_OBJECT], prior.sd[:, T_OBJECT] ** 2
+    off, variance = room[:, None] + from_room - seen[:, None], (width + _ALIKE_SD**2)[:, None]
+    ratio = _log_normal(off, variance) - _log_normal(seen - room, v0 + width)[:, None]
+    each = np.exp(np.clip(ratio, -700.0, 300.0)) / (2 * from_room.size)
+    total = each.sum(axis=1) + 0.5
+    # where it lies: the range's own answer, or that of an object of the training
+    share = (width[:, None] / variance) * off
+    mean = (0.5 * mode.u[:, T_OBJECT] + (each * (seen[:, None] + share)).sum(axis=1)) / total
+    within = width * _ALIKE_SD**2 / (width + _ALIKE_SD**2)
+    spread = each * (within[:, None] + (seen[:, None] + share - mean[:, None]) ** 2)
+    own = mode.covariance[:, T_OBJECT, T_OBJECT] + (mode.u[:, T_OBJECT] - mean) ** 2
+    u, covariance = mode.u.copy(), mode.covariance.copy()
+    u[unknown, T_OBJECT] = mean[unknown]
+    covariance[unknown, T_OBJECT, T_OBJECT] = ((0.5 * own + spread.sum(axis=1)) / total)[unknown]
+    evidence = mode.log_evidence + np.where(unknown, np.log(total), 0.0)
+    return mode._replace(u=u, covariance=covariance, log_evidence=evidence)
+
+
+def _seen_temperature(mode: Mode, prior: Prior) -> tuple[Array, Array]:
+    """Return what the readings alone say of T_obj, the ratio of posterior and prior: mean and variance."""
+    x0, v = prior.mean[:, T_OBJECT], mode.covariance[:, T_OBJECT, T_OBJECT]
+    precision = np.maximum(1 / v - 1 / prior.sd[:, T_OBJECT] ** 2, 1e-9)
+    return x0 + (mode.u[:, T_OBJECT] - x0) / (v * precision), 1 / precision
+
+
+def _log_normal(x: Array, variance: Array) -> Array:
+    return np.asarray(-0.5 * (x**2 / variance + np.log(variance)))
 
 
 def fit_candidates(

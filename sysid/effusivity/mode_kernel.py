@@ -127,9 +127,12 @@ def _dot(a: Array, b: Array) -> Any:
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def _predict(
     nodes: Nodes, gripper: Gripper, u: Array, vary: Mask, times: Array, bins: NDArray[np.int64],
-    count: Array, t: Array, ramp: Array, room: float, scratch: _Scratch,
+    count: Array, t: Array, ramp: Array, room: float, beyond: Array, scratch: _Scratch,
 ) -> None:  # fmt: skip
-    """Fill the bin means that ``u`` predicts, their derivatives by level and T_obj, and those of ``vary``."""
+    """Fill the bin means that ``u`` predicts, their derivatives by level and T_obj, and those of ``vary``.
+
+    ``beyond`` (2, n_bin) is the gripper's discrepancy: always [K], and per degree between object and skin.
+    """
     curves, far, reading, slopes = scratch.curves, scratch.far, scratch.reading, scratch.slopes
     fill_responses(
         nodes, gripper, u, vary, times, bins, count, scratch.room, scratch.place, scratch.share, curves
@@ -142,8 +145,8 @@ def _predict(
     way = room - u[_T] if known else 0.0
     fill_delayed(t, count, late, curves[VALUE], far[0], far[1])
     for i in range(t.size):
-        f, lost = curves[VALUE, i], rate * far[0, i]
-        reading[i] = u[_LEVEL] + difference * f + way * lost + away * ramp[i]
+        f, lost = curves[VALUE, i] + beyond[1, i], rate * far[0, i]
+        reading[i] = u[_LEVEL] + difference * f + way * lost + away * ramp[i] + beyond[0, i]
         slopes[_T, i], slopes[_LEVEL, i] = f - lost, 1.0 - f - leak * ramp[i]
     for curve, at in ((BY_H, _H), (BY_BUILD_UP, _BUILD_UP), (RATE, _ONSET), (BY_E, _E), (BY_C, _C)):
         if not vary[at]:
@@ -274,8 +277,8 @@ def _conclude(here: _Expansion, law: Array, work: _Work, covariance: Array) -> A
 @numba.njit(**OUTER)  # type: ignore[untyped-decorator]
 def modes(
     nodes: Nodes, gripper: Gripper, row: NDArray[np.int64], times: Array, bins: NDArray[np.int64],
-    count: Array, t: Array, y: Array, ramp: Array, room: Array, whitener: Array, law: Array, u: Array,
-    max_steps: int,
+    count: Array, t: Array, y: Array, ramp: Array, room: Array, beyond: Array, whitener: Array, law: Array,
+    u: Array, max_steps: int,
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
     """Move ``u`` (n, 7) to the mode of each pair; return covariance (n, 7, 7), objective, misfit and state.
 
@@ -295,8 +298,9 @@ def modes(
             trial[a] = u[p, a]
         for step in range(max_steps + 1):  # one place for it all: each would be compiled by itself
             _predict(
-                nodes, gripper, trial, vary, times[i], bins[i], count[i], t[i], ramp[i], room[i], scratch
-            )
+                nodes, gripper, trial, vary, times[i], bins[i], count[i], t[i], ramp[i], room[i], beyond[p],
+                scratch,
+            )  # fmt: skip
             square = _normal_equations(whitener[i], y[i], sd, scratch, there.matrix, there.gradient)
             off = penalty(trial, law[p, 0], sd, law[p, 2], there.slope, there.curvature, there.own)
             there.cost[0], there.cost[1] = square + off, square
@@ -330,7 +334,7 @@ def modes(
 @numba.njit(**OUTER)  # type: ignore[untyped-decorator]
 def marginals(
     nodes: Nodes, gripper: Gripper, times: Array, bins: NDArray[np.int64], count: Array, t: Array, y: Array,
-    ramp: Array, room: float, whitener: Array, level_sd: float, t_sd: float, u: Array,
+    ramp: Array, room: float, beyond: Array, whitener: Array, level_sd: float, t_sd: float, u: Array,
 ) -> Array:  # fmt: skip
     """Return ln p(y | u) up to a constant for n points ``u`` (n, 7) of one grasp, level and T_obj integrated.
 
@@ -341,7 +345,7 @@ def marginals(
     matrix, gradient = np.zeros((7, 7)), np.zeros(7)
     sd[_LEVEL], sd[_T] = level_sd, t_sd
     for p in range(u.shape[0]):
-        _predict(nodes, gripper, u[p], vary, times, bins, count, t, ramp, room, scratch)
+        _predict(nodes, gripper, u[p], vary, times, bins, count, t, ramp, room, beyond[p], scratch)
         square = _normal_equations(whitener, y, sd, scratch, matrix, gradient)
         r1, r2 = gradient[_LEVEL], gradient[_T]
         v11, v12, v22 = 1.0 + matrix[_LEVEL, _LEVEL], matrix[_T, _LEVEL], 1.0 + matrix[_T, _T]
@@ -354,7 +358,7 @@ def marginals(
 @numba.njit(**OUTER)  # type: ignore[untyped-decorator]
 def readings(
     nodes: Nodes, gripper: Gripper, times: Array, bins: NDArray[np.int64], count: Array, t: Array,
-    ramp: Array, room: Array, u: Array, vary: Mask,
+    ramp: Array, room: Array, beyond: Array, u: Array, vary: Mask,
 ) -> tuple[Array, Array]:  # fmt: skip
     """Return the bin means (n, n_bin) that ``u`` (n, 7) predicts of n touches, and their derivatives.
 
@@ -364,7 +368,10 @@ def readings(
     y, slopes = np.empty((n, n_bin)), np.empty((n, n_bin, 7))
     scratch = _scratch(gripper.sensor.size, nodes[2].size, times.shape[1], n_bin)
     for p in range(n):
-        _predict(nodes, gripper, u[p], vary[p], times[p], bins[p], count[p], t[p], ramp[p], room[p], scratch)
+        _predict(
+            nodes, gripper, u[p], vary[p], times[p], bins[p], count[p], t[p], ramp[p], room[p], beyond[p],
+            scratch,
+        )  # fmt: skip
         for i in range(n_bin):
             y[p, i] = scratch.reading[i]
             for a in range(7):
@@ -375,7 +382,7 @@ def readings(
 @numba.njit(**OUTER)  # type: ignore[untyped-decorator]
 def gripper_readings(
     nodes: Nodes, lam: Array, face: Array, sensor: Array, numbers: Array, times: Array,
-    bins: NDArray[np.int64], count: Array, t: Array, ramp: Array, room: float, u: Array,
+    bins: NDArray[np.int64], count: Array, t: Array, ramp: Array, room: float, beyond: Array, u: Array,
 ) -> Array:  # fmt: skip
     """Return the bin means (n, n_bin) that ``u`` (7,) predicts of one touch by n grippers.
 
@@ -386,7 +393,7 @@ def gripper_readings(
     scratch = _scratch(lam.shape[1], nodes[2].size, times.size, count.size)
     for p in range(n):
         one = gripper_of(nodes[0], lam[p], face[p], sensor[p], numbers[p])
-        _predict(nodes, one, u, vary, times, bins, count, t, ramp, room, scratch)
+        _predict(nodes, one, u, vary, times, bins, count, t, ramp, room, beyond, scratch)
         for i in range(count.size):
             out[p, i] = scratch.reading[i]
     return out

@@ -507,7 +507,10 @@ def _factors(view: _View, groups: list[Rows], found: list[tuple[Array, Array]] |
     if found is not None:
         prior.mean[:, T_OBJECT] = np.concatenate([mean.ravel() for mean, _ in found])
         prior.sd[:, T_OBJECT] = np.concatenate([sd.ravel() for _, sd in found])
-    mode = find_modes(view.gripper.stack, view.data, row, view.whitener, Prior(prior.mean, prior.sd))
+    beyond = view.gripper.beyond(view.data.t[row], prior.mean[:, EFFUSIVITY])
+    mode = find_modes(
+        view.gripper.stack, view.data, row, view.whitener, Prior(prior.mean, prior.sd), beyond=beyond
+    )
     whole = factor_of(mode, prior)
     # away from a mode there is nothing to expand: such a hypothesis keeps its (hopeless) value everywhere
     lost = ~mode.converged

@@ -102,7 +102,7 @@ class MarginalPosterior:
             log_prior += _log_student(points[:, column], common.mean[0, k], common.sd[0, k], dof)
         likelihood = marginals(
             *self._arguments, data.sample_t[0], data.sample_bin[0], data.count[0], data.t[0], data.y[0],
-            data.ramp[0], float(data.t_ambient[0]), self.whitener,
+            data.ramp[0], float(data.t_ambient[0]), self.gripper.beyond(data.t, points[:, 0]), self.whitener,
             *common.sd[0, [LEVEL, T_OBJECT]].tolist(), u,
         )  # fmt: skip
         return np.asarray(log_prior + likelihood)
@@ -193,7 +193,7 @@ def _left_out(gripper: GripperModel, data: Touches, noise: tuple[Array, Array], 
     near = np.flatnonzero(settled & (value > value.max() - _REACH))
     near = near[np.argsort(x[near])]
     # for an uncertain gripper Laplace's method integrates over its parameters too, and is left alone
-    if near.size < _KNOTS or gripper.uncertain:
+    if near.size < _KNOTS or gripper.uncertain or (gripper.second is not None and data.second is not None):
         return np.zeros(x.size)
     wanted = np.linspace(x[near[0]], x[near[-1]], _KNOTS)
     at = near[np.unique(np.abs(x[near] - wanted[:, None]).argmin(axis=1))]

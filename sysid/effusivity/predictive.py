@@ -36,6 +36,7 @@ from thermogrip.sysid.effusivity.data import Touches, noise_covariance, touches
 from thermogrip.sysid.effusivity.gripper_model import GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import (
     BUILD_UP,
+    EFFUSIVITY,
     LEVEL,
     N_NUISANCE,
     ONSET,
@@ -79,7 +80,14 @@ def rest_of_contact(
     past, cross = noise[:, :n_past, :n_past], noise[:, n_past:, :n_past]
     gain = np.linalg.solve(past, cross.transpose(0, 2, 1)).transpose(0, 2, 1)
     left = noise[:, n_past:, n_past:] - gain @ cross.transpose(0, 2, 1)
-    y, slopes = jacobian(gripper.stack, nodes_for(whole), whole.take(row), mode.u, prior.sd > 0)
+    y, slopes = jacobian(
+        gripper.stack,
+        nodes_for(whole),
+        whole.take(row),
+        mode.u,
+        prior.sd > 0,
+        gripper.beyond(whole.t[row], prior.mean[:, EFFUSIVITY]),
+    )
     seen = np.where(data.count > 0, data.y, 0.0)[row] - np.where(data.count[row] > 0, y[:, :n_past], 0.0)
     mean = y[:, n_past:] + np.einsum("nfp,np->nf", gain[row], seen)
     moved = slopes[:, n_past:] - gain[row] @ slopes[:, :n_past]
@@ -109,7 +117,9 @@ def next_touch(
     u[:, SHARED] = np.tile(x_mean, (n, 1))
     spread[:, np.array(SHARED)[:, None], SHARED] = np.tile(x_cov, (n, 1, 1))
     vary = np.diagonal(spread, axis1=1, axis2=2) > 0
-    y, slopes = jacobian(gripper.stack, nodes_for(data), data, u, vary)
+    y, slopes = jacobian(
+        gripper.stack, nodes_for(data), data, u, vary, gripper.beyond(data.t, u[:, EFFUSIVITY])
+    )
     excursion = np.abs(y[:, 1:] - data.level[:, None]).max(axis=1)
     noise = noise_covariance(replace(data, excursion=excursion), gripper.noise)
     covariance = slopes @ spread @ slopes.transpose(0, 2, 1) + noise

@@ -19,7 +19,7 @@ from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.effusivity.gripper_model import GripperSpread, another_gripper, load_default_gripper
 from thermogrip.sysid.effusivity.multi_touch import two_touch_fit
-from thermogrip.sysid.effusivity.posterior import material_evidence, material_posterior
+from thermogrip.sysid.effusivity.posterior import effusivity_posterior, material_evidence, material_posterior
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +88,26 @@ def test_a_saved_one_predicts_the_same(fitted: PosteriorClassifier, fresh: Grasp
     (tmp_path / "device.json").unlink()
     with pytest.raises(UserError, match=r"device\.json: no such file"):
         load_classifier(tmp_path)
+
+
+def test_a_second_sensor_is_part_of_the_answer_where_there_is_one(fresh: Grasps, tmp_path: Path) -> None:
+    device = load_default_gripper()
+    one = PosteriorClassifier().with_device(device)
+    two = PosteriorClassifier().with_device(replace(device, second=device))
+    bare = fresh.assign(t_object=("grasp", np.full(fresh.sizes["grasp"], np.nan)))
+    both = bare.assign(t_surface_2=bare["t_surface"])
+    np.testing.assert_array_equal(two.predict_log_proba(bare), one.predict_log_proba(bare))
+    np.testing.assert_array_equal(one.predict_log_proba(both), one.predict_log_proba(bare))
+    alone, joint = (m.predict_proba(both).max(axis=1) for m in (one, two))
+    assert joint.mean() > alone.mean() + 0.04  # the same readings twice: the same answer, surer
+    assert np.array_equal(one.predict(both), two.predict(both))
+    again = load_classifier(save_classifier(two, tmp_path))
+    np.testing.assert_array_equal(again.predict_log_proba(both), two.predict_log_proba(both))
+    widths = [
+        [row.t_object_p95 - row.t_object_p05 for row in effusivity_posterior(m.device_, both)]
+        for m in (one, two)
+    ]
+    assert np.median(np.divide(widths[1], widths[0])) < 0.9
 
 
 def test_a_metal_is_unknown_to_one_who_knows_only_wood(fitted: PosteriorClassifier, fresh: Grasps) -> None:

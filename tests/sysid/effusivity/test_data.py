@@ -10,7 +10,9 @@ import pytest
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_grasps
 from thermogrip.sysid.effusivity.data import (
+    KNOTS,
     Noise,
+    at_knots,
     noise_covariance,
     noise_fit,
     object_range,
@@ -38,7 +40,8 @@ def test_whitener_inverts_the_covariance_and_leaves_lost_bins_out():
     assert (data.count[1] == 0).any()
 
 
-def test_slopes_of_the_noise_are_those_of_its_likelihood():
+@pytest.mark.parametrize("smooth", [False, True])
+def test_slopes_of_the_noise_are_those_of_its_likelihood(smooth):
     """The likelihood put together from the covariance, a sample lost, another uncertain parameter."""
     y = np.random.default_rng(3).normal(0.0, 0.05, (2, TIME.size)) + 3 * (TIME > 0)
     y[1, 30:40] = np.nan
@@ -50,7 +53,9 @@ def test_slopes_of_the_noise_are_those_of_its_likelihood():
 
     def cost(q):
         white, slow, memory, misfit = np.exp(q[:4])
-        noise = Noise(white=white, slow=slow, correlation_time=memory, misfit=misfit, growth=q[4])
+        noise = Noise(
+            white=white, slow=slow, correlation_time=memory, misfit=misfit, growth=q[4], smooth=smooth
+        )
         cov = noise_covariance(data, noise) + extra
         want = sum(r @ np.linalg.solve(c, r) + np.linalg.slogdet(c)[1] for r, c in zip(left, cov))
         return 0.5 * want, noise_fit(data, noise, extra, left)
@@ -164,3 +169,26 @@ def test_the_covariance_is_the_sum_of_its_three_parts():
     for (i, k), value in want.items():
         assert cov[i, k] == pytest.approx(value, rel=1e-9)
         assert cov[k, i] == pytest.approx(value, rel=1e-9)
+
+
+def test_a_smooth_noise_has_a_slope_and_its_scale():
+    near, far = Noise(smooth=True).correlation(np.array([1e-3, 1.0]))
+    assert 1 - near < 2e-6 < 1 - Noise().correlation(np.array(1e-3))  # of second order, of first
+    assert far == pytest.approx((1 + 3**0.5) * np.exp(-(3**0.5)))
+
+
+def test_a_second_sensor_is_binned_as_the_first_and_goes_along():
+    one = np.stack([20.0 + k + 3 * (TIME > 0) for k in range(3)])
+    both = make_grasps(TIME, one, ["a", "b", "c"], t_surface_2=one[::-1])
+    data = touches(both)
+    np.testing.assert_array_equal(data.second.y, data.y[::-1])
+    np.testing.assert_array_equal(data.take(np.array([2])).second.y, data.y[:1])
+    two = stack_touches([data, data])
+    np.testing.assert_array_equal(two.second.y, np.concatenate([data.y[::-1]] * 2))
+    assert stack_touches([data, touches(both.drop_vars("t_surface_2"))]).second is None
+
+
+def test_weights_of_the_knots_are_straight_lines_between_them():
+    t = np.array([-2.0, -1.5, -1.25, 0.0, 0.15, 41.0])
+    np.testing.assert_allclose(at_knots(t) @ KNOTS, [0.0, 0.0, -0.5, 0.0, 0.15, 40.0])
+    np.testing.assert_allclose(at_knots(t).sum(axis=1), [0.0, 0.0, 0.5, 1.0, 1.0, 1.0])

@@ -16,6 +16,7 @@ from thermogrip.sysid.effusivity.gripper_model import (
     NOTHING,
     SHARED_NAMES,
     Block,
+    Discrepancy,
     GripperModel,
     GripperSpread,
     ParameterCovariance,
@@ -33,6 +34,38 @@ def test_a_gripper_survives_its_file_and_those_of_before_are_read(device, tmp_pa
     content = device.to_dict()  # from before blocks had a far face, and before there was a covariance
     del content["stack"]["g_far"], content["in_doubt"]
     assert GripperModel.from_dict(content) == replace(device, stack=replace(device.stack, g_far=0.0))
+
+
+def test_discrepancy_and_second_sensor_survive_the_file(device, tmp_path):
+    rng = np.random.default_rng(0)
+    parts = rng.normal(size=16), rng.normal(size=(5, 16)), rng.normal(size=5), rng.normal(size=3)
+    second = replace(device, bias=1.5, noise=replace(device.noise, smooth=True))
+    whole = replace(device, second=second, discrepancy=Discrepancy(*parts))
+    back = GripperModel.load(whole.save(tmp_path / "device.json"))
+    assert back == whole
+    assert (back.second.bias, back.second.noise.smooth) == (1.5, True)
+    for ours, theirs in zip(vars(back.discrepancy).values(), parts):
+        np.testing.assert_array_equal(ours, theirs)
+    content = whole.to_dict()
+    content["discrepancy"]["always"] = [0.0]
+    with pytest.raises(UserError, match="discrepancy is of another shape"):
+        GripperModel.from_dict(content)
+    other = another_gripper(whole)
+    assert other.second.uncertain
+    assert other.discrepancy is whole.discrepancy
+
+
+def test_what_blocks_of_the_calibration_have_others_have_in_between(device):
+    share, names = np.zeros((5, 16)), list(device.blocks)
+    share[names.index("wood"), 6], share[names.index("copper"), 6] = 0.1, 0.3
+    onset = np.where(np.array(names) == "wood", -0.2, 0.0)
+    found = replace(device, discrepancy=Discrepancy(np.eye(16)[0], share, onset, np.zeros(0)))
+    ln_e = np.array([device.blocks["wood"].ln_effusivity, 3.0, device.blocks["copper"].ln_effusivity])
+    beyond = found.beyond(np.array([[-2.0, -1.0, 1.0]]), ln_e)
+    np.testing.assert_allclose(beyond[:, 0], [[0.0, 1.0, 0.0]] * 3)
+    np.testing.assert_allclose(beyond[:, 1], [[0.0, 0.0, 0.1], [0.0, 0.0, 0.1], [0.0, 0.0, 0.3]])
+    np.testing.assert_allclose(found.discrepancy_of(ln_e).onset, [-0.2, -0.2, 0.0])
+    assert not device.beyond(np.zeros((1, 3)), ln_e).any()
 
 
 @pytest.mark.parametrize(

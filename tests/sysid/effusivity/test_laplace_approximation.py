@@ -31,16 +31,21 @@ from thermogrip.sysid.effusivity.gripper_model import (
 from thermogrip.sysid.effusivity.laplace_approximation import (
     N_NUISANCE,
     ONSET,
+    T_OBJECT,
     Hypotheses,
+    Mode,
     Prior,
+    as_in_training,
     find_modes,
     fit_pairs,
     free_hypotheses,
     jacobian,
+    joined_modes,
     material_hypotheses,
     nodes_for,
     predict,
     prior_of,
+    widened,
 )
 from thermogrip.sysid.effusivity.multi_touch import two_touch_fit
 from thermogrip.sysid.effusivity.posterior import (
@@ -452,17 +457,118 @@ def test_what_a_nominal_temperature_says_of_the_object(device, t_object, sd, roo
     assert prior.dof[0].tolist() == [dof, dof, dof, np.inf, np.inf, insulators, np.inf]
 
 
-def test_a_contact_is_made_within_0_8_s_of_the_message(device, data, u):
+def test_a_contact_is_made_from_1_5_s_before_to_0_8_s_after_the_message(device, data, u):
     nodes, early, late = nodes_for(data), u.copy(), u.copy()
-    assert nodes.t[-1] >= data.end + 0.8
-    for at, onset in ((early, -0.8), (late, 0.8)):
+    assert nodes.t[-1] >= data.end + 1.5
+    for at, onset in ((early, -1.5), (late, 0.8)):
         at[:, ONSET] = onset
         beyond = at.copy()
         beyond[:, ONSET] = 1.5 * onset
         np.testing.assert_array_equal(*(predict(device.stack, nodes, data, v) for v in (at, beyond)))
+        vary = np.ones(u.shape, dtype=bool)
+        slopes = [jacobian(device.stack, nodes, data, v, vary)[1][:, :, ONSET] for v in (at, beyond)]
+        assert np.abs(slopes[0]).max() > 0.1
+        assert not slopes[1].any()
     assert (
         np.abs(predict(device.stack, nodes, data, early) - predict(device.stack, nodes, data, late)).max() > 1
     )
+
+
+def normal_mode(mean, variance, misfit=0.0, evidence=0.0):
+    """Return one pair whose T_obj has this posterior."""
+    u, covariance = np.zeros((1, 7)), np.eye(7)[None].copy()
+    u[0, T_OBJECT], covariance[0, T_OBJECT, T_OBJECT] = mean, variance
+    return Mode(u, covariance, np.array([evidence]), np.array([True]), np.array([misfit]))
+
+
+def normal_prior(mean, sd):
+    return Prior(np.full((1, 7), mean), np.full((1, 7), sd))
+
+
+def test_two_sensors_on_one_object_are_the_joint_normal():
+    """Readings r1 = x + noise, r2 = x + 0.4 + offset + noise of x ~ N(20, 9^2), seen under N(22, 11^2)."""
+    x0, v0, own0, own_v, noise, apart, r = 20.0, 81.0, 22.0, 121.0, (1.0, 2.25), 0.4, (14.0, 15.5)
+
+    def alone(reading, mean, variance, sigma2):
+        total = variance + sigma2
+        log_z = -0.5 * ((reading - mean) ** 2 / total + np.log(2 * np.pi * total))
+        return normal_mode(mean + variance / total * (reading - mean), variance * sigma2 / total, 1.0, log_z)
+
+    found = joined_modes(
+        alone(r[0], x0, v0, noise[0]), normal_prior(x0, v0**0.5), alone(r[1], own0, own_v, noise[1]),
+        normal_prior(own0, own_v**0.5), apart,
+    )  # fmt: skip
+    covariance = v0 + np.diag([noise[0], noise[1] + 0.3**2])
+    off = np.array([r[0] - x0, r[1] - x0 - apart])
+    want = -0.5 * (off @ np.linalg.solve(covariance, off) + np.linalg.slogdet(2 * np.pi * covariance)[1])
+    gain = np.linalg.solve(covariance, np.full(2, v0))
+    assert found.log_evidence[0] == pytest.approx(want, abs=1e-9)
+    assert found.u[0, T_OBJECT] == pytest.approx(x0 + gain @ off)
+    assert found.covariance[0, T_OBJECT, T_OBJECT] == pytest.approx(v0 - gain @ np.full(2, v0))
+    assert found.misfit[0] == 2.0
+
+
+def test_a_second_sensor_that_saw_nothing_changes_nothing():
+    first = normal_mode(14.0, 1.0, evidence=-3.0)
+    blank = normal_mode(22.0, 121.0, evidence=0.0)
+    found = joined_modes(first, normal_prior(20.0, 9.0), blank, normal_prior(22.0, 11.0), 0.0)
+    assert found.log_evidence[0] == pytest.approx(-3.0, abs=1e-6)
+    np.testing.assert_allclose(found.u, first.u, atol=1e-6)
+
+
+def test_the_more_a_grasp_misfits_the_less_it_says():
+    prior, n = normal_prior(20.0, 11.5), np.array([40])
+    pairs = [(0.0, 4.0), (40.0, 50.0), (200.0, 210.0)]  # misfits of two candidates
+    gaps = []
+    for misfits in pairs:
+        one, two = (widened(normal_mode(10.0, 0.2, m, -0.5 * m), prior, n, 0.3) for m in misfits)
+        gaps.append(float(one.log_evidence[0] - two.log_evidence[0]))
+    # half of what Student's t says with 20 degrees of freedom
+    np.testing.assert_allclose(gaps, [15 * np.log((20 + b) / (20 + a)) for a, b in pairs])
+    assert gaps[2] / 10 < 0.4 * gaps[1] / 10
+    small, large = (widened(normal_mode(10.0, 0.2, m), prior, n, 0.3) for m in (10.0, 400.0))
+    assert small.covariance[0, 4, 4] < large.covariance[0, 4, 4]
+    # a tenth of the distance from the skin, here of 0 degC, and the bias
+    assert small.covariance[0, 4, 4] == pytest.approx(1 / (1 / 1.2903 + 1 / 11.5**2), rel=1e-3)
+
+
+def test_objects_are_as_warm_as_those_of_the_training_or_anything():
+    """The evidence and the moments of a mixture, integrated on a grid."""
+    prior, from_room = normal_prior(20.0, 11.5), np.array([0.0, 0.5, -14.0])
+    mode, x = normal_mode(19.0, 2.0, evidence=1.0), np.linspace(-60, 100, 160_001)
+
+    def density(x, mean, variance):
+        return np.exp(-0.5 * (x - mean) ** 2 / variance) / np.sqrt(2 * np.pi * variance)
+
+    wide = density(x, 20.0, 11.5**2)
+    seen = density(x, 19.0, 2.0) / wide  # times the evidence
+    mixed = 0.5 * wide + 0.5 * np.mean([density(x, 20.0 + d, 1.0) for d in from_room], axis=0)
+    total = np.trapezoid(seen * mixed, x)
+    mean = np.trapezoid(x * seen * mixed, x) / total
+    variance = np.trapezoid((x - mean) ** 2 * seen * mixed, x) / total
+    found = as_in_training(mode, prior, from_room, np.array([True]))
+    assert found.log_evidence[0] == pytest.approx(1.0 + np.log(total), abs=1e-6)
+    assert found.u[0, 4] == pytest.approx(mean, abs=1e-6)
+    assert found.covariance[0, 4, 4] == pytest.approx(variance, abs=1e-6)
+    known = as_in_training(mode, prior, from_room, np.array([False]))
+    np.testing.assert_array_equal(known.u, mode.u)
+    assert known.log_evidence[0] == 1.0
+
+
+def test_the_second_sensor_is_asked_about_the_same_material(device):
+    second = replace(
+        device,
+        blocks={k: replace(b, ln_h=b.ln_h - 1.0) for k, b in device.blocks.items() if k != "zinc"},
+    )
+    first = material_hypotheses(device, ["copper", "zinc", "aluminium"])
+    other = laplace.hypotheses_of_second(device, second, first)
+    own = material_hypotheses(second, ["copper", "aluminium"])
+    for k, (theirs, ours) in enumerate(zip(own, other)):
+        if k < 4:
+            np.testing.assert_allclose(ours[[0, 2]], theirs, atol=0.02)
+    # no block of the second sensor's is of zinc: its conductance is unknown there
+    assert other.block.tolist() == [second.materials.index("copper"), -1, -1]
+    assert other.ln_h_sd[1] > 2 * other.ln_h_sd[0]
 
 
 def test_a_step_is_shortened_to_two_fifths_until_the_density_rises(monkeypatch):
