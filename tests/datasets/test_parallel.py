@@ -27,7 +27,6 @@ def test_one_worker_works_here_in_order_and_reports():
     assert seen == [(pytest.approx(1 / 3), "squares"), (pytest.approx(2 / 3), "squares"), (1.0, "squares")]
 
 
-@pytest.mark.slow
 def test_processes_give_the_same_in_the_same_order():
     fractions = []
     got = run_parallel(math.factorial, range(12), workers=2, progress=lambda f, _: fractions.append(f))
@@ -36,7 +35,6 @@ def test_processes_give_the_same_in_the_same_order():
     assert fractions[-1] == 1.0
 
 
-@pytest.mark.slow
 def test_a_fault_in_a_process_is_raised_here_as_it_was():
     with pytest.raises(ValueError, match="factorial"):
         run_parallel(math.factorial, [3, -1, 4], workers=2)
@@ -54,7 +52,6 @@ def test_processes_that_are_kept_do_the_work_of_every_call_and_then_end() -> Non
     assert not first & set(run_parallel(eval, OWN, workers=2))
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt" or (os.cpu_count() or 1) < 2, reason="needs POSIX and two processors")
 def test_a_killed_process_is_one_line():
     with pytest.raises(UserError, match="a worker process was killed"):
