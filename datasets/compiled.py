@@ -1,8 +1,8 @@
 """Numba, with compiled code that is kept while the sources of the kernels are the same.
 
 Numba keeps compiled code beside a module until the module's file is written again: each installation would
-compile all kernels anew, half a minute of work, and a kernel that calls a changed one of another module would go
-on with the old one.  Here a digest of the sources of all kernels decides.
+compile all kernels anew, half a minute of work, and a kernel that calls a changed one of another module would
+go on with the old one.  Here a digest of the sources of all kernels decides.
 """
 
 from __future__ import annotations
