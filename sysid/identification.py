@@ -58,7 +58,7 @@ from thermogrip.sysid.plant.fit_record import (
     TAIL,
     HeldOut,
 )
-from thermogrip.sysid.plant.log_grid import make_grid, match_logs, misfit, roles_of, signals
+from thermogrip.sysid.plant.log_grid import match_logs, misfit, roles_of, signals
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run, no_input_baseline
 from thermogrip.sysid.validation.prediction_bands import (
@@ -214,14 +214,7 @@ def _fold_errors(fit: BlackBoxFit, between: float) -> Array:
 
 def fit_without_tail(fit: BlackBoxFit, train: Sequence[Log]) -> Plant:
     """Return the plant of a black box with the same structure fitted to these parts of its logs."""
-    grid = make_grid(
-        train,
-        inputs=fit.grid.inputs,
-        outputs=fit.grid.outputs,
-        disturbances=fit.grid.disturbances,
-        average=fit.grid.dt,
-        ends=fit.grid.ends,
-    )
+    grid = fit.grid.of(train, ends=fit.grid.ends)
     model = FAMILIES[fit.kind](grid, only=fit.choice.structure).get(fit.choice.structure)
     if model is None:
         raise UserError(f"{fit.kind}: the chosen structure is unstable without the last part of the logs")

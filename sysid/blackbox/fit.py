@@ -50,7 +50,7 @@ from thermogrip.sysid.blackbox.sindy import sindy_family
 from thermogrip.sysid.blackbox.subspace import subspace_family
 from thermogrip.sysid.data.data_quality import reading_excess
 from thermogrip.sysid.plant.fit_record import PlantScores, fit_logs
-from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid, signals
+from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import READING_EVERY
 
@@ -148,12 +148,11 @@ def fit_black_box(
     if kind not in FAMILIES:
         raise UserError(f"no model of kind {kind!r}", hint=f"choose from {', '.join(BLACK_BOXES)}")
     family = _of_order(kind, order, delay)
-    u, y, d = signals(logs, inputs=inputs, outputs=outputs, disturbances=disturbances)
-    first = make_grid(logs, inputs=u, outputs=y, disturbances=d, average=average)
+    first = make_grid(logs, inputs=inputs, outputs=outputs, disturbances=disturbances, average=average)
     grids = [first]
     own_rows = sum(len(s.time) for s in first.segments) * first.dt / first.native
     if average is None and first.dt > 1.5 * first.native and own_rows <= _MAX_ROWS and kind not in _AVERAGED:
-        own = make_grid(logs, inputs=u, outputs=y, disturbances=d, average=first.native)
+        own = first.of(logs, average=first.native)
         grids.append(replace(own, why=f"the logs' own: held-out free runs err less than at {first.dt:.3g} s"))
     averages = kind == "subspace"  # structures of it differ in how they see the same states
     best: tuple[Grid, Choice] | None = None
@@ -201,15 +200,7 @@ def _with_convention(
     """
     if grid.dt > 1.5 * grid.native or family in (sindy_family, neural_family):
         return grid, choice
-    moved = make_grid(
-        logs,
-        inputs=grid.inputs,
-        outputs=grid.outputs,
-        disturbances=grid.disturbances,
-        average=grid.dt,
-        ends=True,
-    )
-    moved = replace(moved, why=grid.why)
+    moved = replace(grid.of(logs, ends=True), why=grid.why)
     for tried in (partial(family, only=choice.structure), family):  # the same structure first: one fit a fold
         try:
             other = choose(moved, tried, warmup=_warmup_rows(moved, warmup), average=average)

@@ -33,7 +33,7 @@ from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.repair import GAP_SECONDS, GAP_STEPS
 from thermogrip.datasets.resample import gaps
 from thermogrip.datasets.schema import Log, column, log_name
-from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid, quantum, signals
+from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid, quantum
 from thermogrip.sysid.plant.plant import Plant
 
 Verdict = Literal["ok", "warn", "fail"]
@@ -117,8 +117,8 @@ def check_data(
     >>> found.verdict, found.says
     ('fail', 'q never moves: nothing can be learnt about it')
     """
-    u, y, d = signals(logs, inputs=inputs, outputs=outputs, disturbances=disturbances)
-    grid = make_grid(logs, inputs=u, outputs=y, disturbances=d, average=average)
+    grid = make_grid(logs, inputs=inputs, outputs=outputs, disturbances=disturbances, average=average)
+    u, y = grid.inputs, grid.outputs
     found: list[Finding] = []
     for log in logs:
         channels = {

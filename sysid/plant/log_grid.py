@@ -138,6 +138,11 @@ class Grid:
         """Names of the logs, each once."""
         return tuple(dict.fromkeys(segment.log for segment in self.segments))
 
+    def of(self, logs: Sequence[Log], *, average: float | None = None, ends: bool = False) -> Grid:
+        """Return logs on a grid like this one, of its step or of ``average`` [s]."""
+        u, y, d = self.inputs, self.outputs, self.disturbances
+        return make_grid(logs, inputs=u, outputs=y, disturbances=d, average=average or self.dt, ends=ends)
+
     def having(self, segments: Sequence[Segment]) -> Grid:
         """Return the same grid with other segments."""
         return replace(self, segments=tuple(segments))
