@@ -16,6 +16,7 @@ from thermogrip.sysid.blackbox import fit as fitting
 from thermogrip.sysid.blackbox.fit import FAMILIES, BlackBoxFit, cut_into_blocks, fit_black_box, with_refits
 from thermogrip.sysid.blackbox.order_selection import Choice, Structure
 from thermogrip.sysid.models.lti import StartPrior
+from thermogrip.sysid.plant import log_grid
 from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid
 from thermogrip.sysid.validation.prediction_bands import free_run_band
 
@@ -264,8 +265,8 @@ def test_the_logs_own_rate_is_tried_beside_a_chosen_one(monkeypatch, kind, dt, r
             raise UserError(f"at {grid.dt:g} s")
         return SimpleNamespace(error=errors[grid.dt])
 
-    monkeypatch.setattr(fitting, "signals", lambda *logs, **names: ((), (), ()))
-    monkeypatch.setattr(fitting, "make_grid", lambda *a, average, **n: stub_grid((rows,), average or dt))
+    for module in (fitting, log_grid):
+        monkeypatch.setattr(module, "make_grid", lambda *a, average, **n: stub_grid((rows,), average or dt))
     monkeypatch.setattr(fitting, "choose", choose_by_step)
     monkeypatch.setattr(fitting, "_with_convention", lambda grid, choice, *more: (grid, choice))
     monkeypatch.setattr(fitting, "_plant", lambda *parts: None)
@@ -311,7 +312,8 @@ def test_inputs_up_to_their_rows_are_taken_where_that_errs_clearly_less(
         return choice_of(others[len(asked) - 1])
 
     asked, first = [], choice_of(0.2)
-    monkeypatch.setattr(fitting, "make_grid", lambda *a, average, ends, **n: stub_grid(dt=average, ends=ends))
+    made = "thermogrip.sysid.plant.log_grid.make_grid"
+    monkeypatch.setattr(made, lambda *a, average, ends, **n: stub_grid(dt=average, ends=ends))
     monkeypatch.setattr(fitting, "choose", choose_next)
     grid = stub_grid(dt=dt, why="so")
     found, choice = fitting._with_convention(grid, first, [], FAMILIES[family], 9.0, "as before")
