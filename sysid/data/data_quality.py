@@ -170,7 +170,7 @@ def _quantum(channel: _Channel, averaged: float | None) -> Finding:
     """Return the step of the converter; ``averaged`` is that of the fits [s], where it is longer."""
     q, name = quantum(channel.values), channel.name
     coarse = q > 0.05 * float(np.nanstd(channel.values))
-    says = f"{name} moves in steps of {q:.3g} {channel.unit}" if q else f"{name} shows no quantisation"
+    says = f"{name} moves in steps of {q:.3g}{_unit(channel.unit)}" if q else f"{name} shows no quantisation"
     if averaged is not None:
         says += f"; averaged over {averaged:g} s before the fits"
     if coarse:
@@ -196,7 +196,7 @@ def _noise(channel: _Channel) -> Finding:
     elif noise < _NO_NOISE * spread and jumps > 0.5 * values.size:
         says = f"{name} has no noise: is it computed or smoothed, no reading?"
     else:
-        return channel.found("noise", noise, unit, "ok", f"{name} has noise of {noise:.2g} {unit}")
+        return channel.found("noise", noise, unit, "ok", f"{name} has noise of {noise:.2g}{_unit(unit)}")
     return channel.found("noise", noise, unit, "warn", says + " Leave it out with --outputs")
 
 
@@ -328,7 +328,7 @@ def _shifts(grid: Grid) -> list[Finding]:
             half = len(part) // 2
             move = float(np.nanmean(part[half:]) - np.nanmean(part[:half])) if _some(part, half) else 0.0
             verdict: Verdict = "ok" if abs(move) < 0.5 * spread else "warn"
-            says = f"{name} drifts by {move:+.2g} {unit} between the halves{_of(segment, grid)} "
+            says = f"{name} drifts by {move:+.2g}{_unit(unit)} between the halves{_of(segment, grid)} "
             says += "beyond what a static fit says"
             out.append(Finding("drift", segment.log, name, move, unit, verdict, says))
         if len(grid.logs) > 1:
@@ -343,12 +343,17 @@ def _of(segment: Segment, grid: Grid) -> str:
     return f" of {segment.time[0]:.0f} to {segment.time[-1]:.0f} s"
 
 
+def _unit(unit: str) -> str:
+    """Return what follows a number."""
+    return "" if unit == "1" else f" {unit}"
+
+
 def _log_shift(grid: Grid, name: str, parts: list[Array], spread: float, unit: str) -> Finding:
     by_log = [np.concatenate([p for s, p in zip(grid.segments, parts) if s.log == log]) for log in grid.logs]
     levels = np.array([np.nanmean(part) if np.isfinite(part).any() else 0.0 for part in by_log])
     size = float(np.ptp(levels))
     shifted = size > 0.5 * spread
-    says = f"the level of {name} differs by {size:.2g} {unit} between logs beyond what a static fit says"
+    says = f"the level of {name} differs by {size:.2g}{_unit(unit)} between logs beyond what a static fit says"
     says += ": score on logs left out, not on the logs of the fit" if shifted else ""
     return Finding("shift between logs", "", name, size, unit, "warn" if shifted else "ok", says)
 

@@ -273,6 +273,16 @@ def test_a_drift_or_shift_beyond_half_the_spread_is_reported(size, verdict):
     ]
 
 
+def test_a_number_without_a_unit_stands_alone():
+    y = 20 + ODD + 2.0 * (K >= 100)
+    log = make_log(1.0 * K, {"q": (np.full(200, 0.3), "1", "input"), "t": (y, "1", "output")}, name="a")
+    checked = check_data([log], average=1.0)
+    assert [found.says for found in checked.of("drift")] == [
+        "t drifts by +2 between the halves beyond what a static fit says"
+    ]
+    assert [found.says for found in checked.of("noise")] == ["t has noise of 2.7"]
+
+
 def test_a_drift_is_of_the_later_half_of_an_odd_number_of_rows_and_none_where_a_half_is_lost():
     q, time = np.full(201, 0.3), np.arange(201.0)
     jump = 20 + 2.0 * (time >= 100)
