@@ -353,7 +353,8 @@ def _log_shift(grid: Grid, name: str, parts: list[Array], spread: float, unit: s
     levels = np.array([np.nanmean(part) if np.isfinite(part).any() else 0.0 for part in by_log])
     size = float(np.ptp(levels))
     shifted = size > 0.5 * spread
-    says = f"the level of {name} differs by {size:.2g}{_unit(unit)} between logs beyond what a static fit says"
+    says = f"the level of {name} differs by {size:.2g}{_unit(unit)} between logs "
+    says += "beyond what a static fit says"
     says += ": score on logs left out, not on the logs of the fit" if shifted else ""
     return Finding("shift between logs", "", name, size, unit, "warn" if shifted else "ok", says)
 
