@@ -166,28 +166,9 @@ class GripperSpread:
 
 
 def another_gripper(gripper: GripperModel, spread: GripperSpread | None = None) -> GripperModel:
-    """Return what one gripper's calibration leaves open about another one of the same kind.
-
-    Parameters
-    ----------
-    gripper : GripperModel
-        The calibrated one.  Where its file keeps no covariance, its own numbers count as exact.
-    spread : GripperSpread, optional
-        How far grippers lie apart; default what their making allows.
-
-    Returns
-    -------
-    gripper : GripperModel
-        The same numbers, less well known; answers integrate over them, and ``calibrate_gripper(...,
-        prior=...)`` on a few known grasps of the other gripper starts from them.
-
-    Examples
-    --------
-    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
-    >>> other = another_gripper(load_default_gripper())
-    >>> round(other.uncertainty.sd("ln_lag"), 2)
-    0.5
-    """
+    """Return what one gripper's calibration leaves open about another one of its kind: the same numbers, less
+    well known, over which answers integrate and from which a calibration on a few known grasps of the other
+    one starts.  Where its file keeps no covariance its own numbers count as exact."""
     known = gripper.uncertainty
     if known is None:
         names = (*SHARED_NAMES, *block_names(gripper.materials))
@@ -500,21 +481,23 @@ class GripperModel:
         """Return mean and sd of ln(found / true) at found values ln e, of the same shape.
 
         The anchors are the blocks, ln(found / library) with the library's uncertainty and 10 % for the block
-        itself.  Between them a Gaussian process interpolates (prior sd 0.3, correlation length 1.5 in ln
-        e), so a found value far from every known block is reported with that prior's uncertainty.
+        itself.  Between them a Gaussian process interpolates (prior sd 0.3, with a discrepancy 0.6,
+        correlation length 1.5 in ln e), so a found value far from every known block is reported with that
+        prior's uncertainty.
         """
         x = np.asarray(ln_effusivity, dtype=float)
         blocks = [*self.blocks.values()]
         at = np.array([b.ln_effusivity for b in blocks])
         seen = at - np.log([b.library_effusivity for b in blocks])
+        prior = 0.3**2 if self.discrepancy is None else 0.6**2
         variance = np.array([b.library_sd_ln**2 + b.ln_effusivity_sd**2 for b in blocks]) + 0.1**2
 
         def kernel(a: Array, b: Array) -> Array:
-            return np.asarray(0.3**2 * np.exp(-0.5 * ((a[:, None] - b[None, :]) / 1.5) ** 2))
+            return np.asarray(prior * np.exp(-0.5 * ((a[:, None] - b[None, :]) / 1.5) ** 2))
 
         cross = kernel(x.ravel(), at)
         gain = np.linalg.solve(kernel(at, at) + np.diag(variance), cross.T).T
-        mean, left = gain @ seen, 0.3**2 - (gain * cross).sum(axis=1)
+        mean, left = gain @ seen, prior - (gain * cross).sum(axis=1)
         return mean.reshape(x.shape), np.sqrt(np.maximum(left, 0.0)).reshape(x.shape)
 
 

@@ -643,16 +643,18 @@ def as_in_training(mode: Mode, prior: Prior, from_room: Array, unknown: Mask) ->
     off, variance = room[:, None] + from_room - seen[:, None], (width + _ALIKE_SD**2)[:, None]
     ratio = _log_normal(off, variance) - _log_normal(seen - room, v0 + width)[:, None]
     each = np.exp(np.clip(ratio, -700.0, 300.0)) / (2 * from_room.size)
-    total = each.sum(axis=1) + 0.5
     # where it lies: the range's own answer, or that of an object of the training
-    share = (width[:, None] / variance) * off
-    mean = (0.5 * mode.u[:, T_OBJECT] + (each * (seen[:, None] + share)).sum(axis=1)) / total
-    within = width * _ALIKE_SD**2 / (width + _ALIKE_SD**2)
-    spread = each * (within[:, None] + (seen[:, None] + share - mean[:, None]) ** 2)
-    own = mode.covariance[:, T_OBJECT, T_OBJECT] + (mode.u[:, T_OBJECT] - mean) ** 2
+    weight = np.column_stack([np.full(seen.size, 0.5), each])
+    means = seen[:, None] + (width[:, None] / variance) * off
+    means = np.column_stack([mode.u[:, T_OBJECT], means])
+    within = (width * _ALIKE_SD**2 / (width + _ALIKE_SD**2))[:, None] * np.ones(each.shape)
+    within = np.column_stack([mode.covariance[:, T_OBJECT, T_OBJECT], within])
+    total = weight.sum(axis=1)
+    mean = (weight * means).sum(axis=1) / total
+    spread = (weight * (within + (means - mean[:, None]) ** 2)).sum(axis=1) / total
     u, covariance = mode.u.copy(), mode.covariance.copy()
     u[unknown, T_OBJECT] = mean[unknown]
-    covariance[unknown, T_OBJECT, T_OBJECT] = ((0.5 * own + spread.sum(axis=1)) / total)[unknown]
+    covariance[unknown, T_OBJECT, T_OBJECT] = spread[unknown]
     evidence = mode.log_evidence + np.where(unknown, np.log(total), 0.0)
     return mode._replace(u=u, covariance=covariance, log_evidence=evidence)
 

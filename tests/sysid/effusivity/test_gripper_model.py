@@ -224,6 +224,11 @@ def test_the_scale_of_one_block_is_that_of_a_normal_process():
     mean, sd = GRIPPER.effusivity_scale(np.array([[8.2, 9.7]]))
     np.testing.assert_allclose(mean, [[0.2 * 0.09 / 0.1025, 0.2 * far / 0.1025]])
     np.testing.assert_allclose(sd, np.sqrt([[0.09 - 0.0081 / 0.1025, 0.09 - far**2 / 0.1025]]))
+    # of a gripper with a discrepancy less is expected: 0.36
+    nothing = Discrepancy(np.zeros(16), np.zeros((1, 16)), np.zeros(1), np.zeros(0))
+    mean, sd = replace(GRIPPER, discrepancy=nothing).effusivity_scale(np.array([8.2]))
+    assert mean[0] == pytest.approx(0.2 * 0.36 / 0.3725)
+    assert sd[0] == pytest.approx(np.sqrt(0.36 - 0.1296 / 0.3725))
     found = GRIPPER.found_effusivity(np.array([7.0, 8.0, 9.0]))
     np.testing.assert_allclose(found - GRIPPER.effusivity_scale(found)[0], [7.0, 8.0, 9.0], atol=1e-6)
     assert GRIPPER.expected_ln_h(np.array([9.0, 11.0])) == pytest.approx([6.6, 7.0])
