@@ -165,7 +165,7 @@ class _Steps:
 
     def __init__(self, model: ReferenceModel, h: float) -> None:
         self.model, self.h = model, h
-        self.sizes = model.n_x, 1, 2, 0
+        self.sizes = model.n_x, 1, len(model.disturbances), 0
 
     def prepare(self, p: Any) -> list[Any]:
         return []
