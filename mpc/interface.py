@@ -15,7 +15,7 @@ Readings: TypeAlias = Mapping[str, float]
 #: degC by output name; a single number is the target of every controlled output.
 Target: TypeAlias = float | Mapping[str, float]
 
-STATUSES = ("ok", "late", "infeasible", "fallback_plan", "fallback_pi", "off")
+STATUSES = ("ok", "late", "infeasible", "fallback_plan", "fallback_pi", "off", "mismatch")
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,8 @@ OUTPUTS = ("t_heatsink", "t_tank", "t_surface")
 SKIN = 2  # where the controlled output stands
 _NODES = 7  # heatsink, wall, water, finger, skin, second layer, what the skin's sensor shows
 _SEEBECK, _JOULE, _CONDUCT, _SINK, _WALL, _TANK, _FLOW, _FINGER, _SKIN, _TO_SKIN, _LOSS, _ROOM = range(12)
-_SENSOR, _LAYER, _TO_LAYER, _OUTSIDE, _FOUL, _DEAD, _FADE, _TUBE, _SINK_OUT, _WALL_OUT, _WALL_IN = range(12, 23)
+_SENSOR, _LAYER, _TO_LAYER, _OUTSIDE, _FOUL, _DEAD, _FADE, _TUBE = range(12, 20)
+_SINK_OUT, _WALL_OUT, _WALL_IN = range(20, 23)
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,9 @@ class Plant:
         return other
 
 
-def full_drive_time(plant: Plant, target: float, band: float, *, current: float, slew: float, now: float) -> float:
+def full_drive_time(
+    plant: Plant, target: float, band: float, *, current: float, slew: float, now: float
+) -> float:
     """Return how long full drive, reached at the slew limit from the current of now, needs to bring the skin
     into the band [s]; inf where it does not within 20 minutes."""
     plant, dt = plant.copy(), 0.1

@@ -15,7 +15,11 @@ A loop must never be left without an answer, so every failure has a next best on
   place of the reading, then without that output, and the drive that is there for it goes to rest;
 * ``fallback_pi``: the plan has run out; PI on the reading, taken over without a bump (and without
   feed-forward: the drive that is taken over has it);
-* ``off``: no reading to act on, or the pump is off; the drive goes to zero.
+* ``off``: no reading to act on, or the pump is off; the drive goes to zero;
+* ``mismatch``: the optimiser's move, as for a plant that is known to be slower than the model.
+
+Where readings stay far from what the filter expects (mean innovations beyond 3 standard deviations), the
+weight of moves is multiplied by their third, up to 30 times: a gain that is off by 30 % does not swing.
 
 Whatever the status, a drive is finite, inside its range, and within the slew limit of the one before.  What
 cannot be a reading is found by :mod:`thermogrip.mpc.estimator.reading_checks`.
@@ -56,6 +60,7 @@ if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
 _KEPT_DRAWS = 50  # of the posterior, in the controller's file for its review
+_CAUTION, _MOST_CAUTION = 3.0, 30.0  # of a mean innovation, from which on moves weigh more; how much more
 _WEAK = 0.05  # of its gain at rest, below which a drive's bias is not learnt
 
 
@@ -112,7 +117,7 @@ class Controller(SampledController):
         if compiled:
             self._compile()
         self.pi = PIController.of(plant, design, tuple(replace(p, feedforward=0.0) for p in design.loops))
-        self.monitor = ReadingMonitor(self.model.n_y)
+        self.monitor = ReadingMonitor(self.model.n_y, len(self.observer.lagged))
         self.reach = Reach(self.optimiser, self.observer)
         self.last_iterations = 0  # of the program, in the last step
         self._slew_s = self.dt  # for which the slew limit counts in this step
@@ -273,6 +278,7 @@ class Controller(SampledController):
     def _start(self, y: Array, d: Array) -> None:
         self._d = np.where(np.isfinite(d), d, self.design.ambient)
         self.observer.reset(y, self._d)
+        self.observer.expect_lags()
         self._forget()
         self._in_force = self._u
         self._side = np.zeros(len(self._rows))
@@ -406,7 +412,8 @@ class Controller(SampledController):
             lost = self._lost
             parked = [name for name, at in zip(self.model.drives, self.optimiser.pair) if lost[at]]
             return u, "fallback_plan", self._unseen(parked)
-        return u, "ok", follows(self.observer, self.controlled)
+        slower = self.monitor.slower(self.observer)
+        return (u, "mismatch", slower) if slower else (u, "ok", follows(self.observer, self.controlled))
 
     def _optimise(self, wanted: Array) -> Outcome:
         last = np.clip(self._u, self.optimiser.lowest, self.optimiser.highest)
@@ -416,9 +423,9 @@ class Controller(SampledController):
         if self.design.move_delay:  # the drive applied now stays for one more sample
             x = self.model.next_state(x, last + observer.drive_bias, d)
         guess, biases = self._guess(wanted, last), (observer.output_bias, observer.drive_bias)
-        return self.optimiser.solve(
-            Sample(x, last, guess, d, wanted, self._side, *biases, slew_s=self._slew_s, lost=self._lost)
-        )
+        caution = min(max(1.0, float(np.max(np.abs(observer.innovation))) / _CAUTION), _MOST_CAUTION)
+        about = {"slew_s": self._slew_s, "lost": self._lost, "caution": caution}
+        return self.optimiser.solve(Sample(x, last, guess, d, wanted, self._side, *biases, **about))
 
     def _guess(self, wanted: Array, last: Array) -> Array:
         """Return the plan to linearise along: the last one, shifted, by blocks; else the drive of now."""

@@ -102,6 +102,7 @@ def pair_loops(plant: Plant, controlled: tuple[str, ...]) -> tuple[PILoop, ...]:
 LONGEST_HORIZON, MOST_UNKNOWNS = 1000, 200
 
 _LONGEST_SAMPLE = 3600.0  # s
+_OUTPUT_DRIFT = 0.03  # degC per sqrt(sample), by which a bias of an output may wander in a default design
 _MOST_NOISE = 1e6  # of a state, a reading or a bias, in any unit
 _ROOMS = (-60.0, 150.0)  # degC: no room is beyond
 
@@ -281,7 +282,8 @@ class Design:
         """Return the filter of this design for a plant at its sample time."""
         count = None if self.offset_free else 0
         chosen = choose_disturbances(model, self.controlled, ambient=self.ambient, count=count)
-        return Observer(model, chosen, self.noise, ambient=self.ambient)
+        lagged = [model.outputs.index(name) for name in self.controlled]
+        return Observer(model, chosen, self.noise, ambient=self.ambient, lagged=lagged)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the design as plain JSON."""
@@ -387,6 +389,7 @@ def default_design(
         "drive_range": ranges,
         "slew_per_s": slews,
         "loops": pair_loops(plant, controlled),
+        "noise": ObserverNoise(output=_OUTPUT_DRIFT / dt**0.5),
         "deadline_s": 0.5 * dt,
         "patience_s": max(10.0, 5 * dt),
     }

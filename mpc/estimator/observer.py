@@ -37,10 +37,24 @@ u the mean of the drives since x and F the Jacobian of the sample.  A register b
 mean of its neighbours, and nothing is smeared from sample to sample, because x itself is never interpolated.
 The noise of the states grows with the seconds, by s Q in the share s of a sample.
 
+**A plant that is slower than the model.**  A sensor's pocket, a layer or a longer tube that the model lacks
+looks like a drive that is too weak, until it looks like one that is too strong, and the loop swings.  So each
+controlled output is read through a lag T of its own, 0 at the start and never below,
+
+    s+ = s + a (C x - s),     y = s + a (C x - s) + biases,     a = dt / (dt + T),
+
+with s, what was shown last, and T among the states of the filter.  What the model does not have it learns
+within a rise, from how the readings lag behind its x.  The plan still brings x to the target, not s:
+whether the skin is slow or its sensor, what follows x through a lag does not go beyond it.  A lag that is
+surely there is reported (:mod:`thermogrip.mpc.estimator.reading_checks`).  Where T would be negative (or
+beyond six samples) the estimate is the conditional mean at that end [2]_.
+
 References
 ----------
 .. [1] U. Maeder, F. Borrelli, M. Morari, "Linear offset-free model predictive control", Automatica 45(10),
    2009.
+.. [2] D. Simon, "Kalman filtering with state constraints: a survey of linear and nonlinear algorithms", IET
+   Control Theory and Applications 4(8), 2010.
 
 What state a plant at rest is in, when its sensors do not agree
 ---------------------------------------------------------------
@@ -64,6 +78,7 @@ For a nonlinear plant the update is repeated at its own answer (Gauss-Newton).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -135,6 +150,8 @@ def resting_state_in_room(model: PredictionModel, ambient: float, unit: tuple[fl
     return resting_state(model, x, v, ambient, d, unit=np.array(unit))
 
 
+#: Lag of an output beyond the model's, in samples: standard deviation at the start, most, and per sqrt(s).
+PRIOR_LAG, LONGEST_LAG, _LAG_DRIFT = 3.0, 6.0, 0.02
 _REPEATS, _SAME = 5, 1e-3  # of the start on a nonlinear plant, and when it is still [degC]
 _REMEMBER = 0.2  # share of the newest innovation in their mean
 #: Of a drive, in fractions of its range: no drive makes up for more.
@@ -261,7 +278,8 @@ class Observer:
     Where readings come at other times: ``advance`` by the seconds that passed, ``look``, then ``update``. x
     (n_x,) is the state at the last sample, w (n_w,) the disturbances, ``found_offset`` (n_y,) what each
     sensor was found to read too much at the start or after a jump that stayed [degC], ``innovation`` (n_y,)
-    the mean of the last innovations in their standard deviations.
+    the mean of the last innovations in their standard deviations.  Of the outputs ``lagged``, ``shown`` is
+    what they showed a sample before x [degC], ``lag`` by how much they lag behind the model [s].
     """
 
     def __init__(
@@ -271,8 +289,10 @@ class Observer:
         noise: ObserverNoise | None = None,
         *,
         ambient: float = ROOM,
+        lagged: Sequence[int] = (),
     ) -> None:
         self.model, self.disturbance, self.ambient = model, disturbance, ambient
+        self.lagged = list(lagged)
         self.noise = noise if noise is not None else ObserverNoise()
         plant = model.plant
         self.offset = np.array([float(plant.offsets.get(name, 0.0)) for name in model.outputs])
@@ -285,25 +305,35 @@ class Observer:
         self._unit = spread / max(float(seen), 1e-12)
         self.is_drive = disturbance.on_drive.any(axis=0)
         drift = np.where(self.is_drive, self.noise.drive, self.noise.output)
-        self.Q = np.concatenate([(self.noise.state * self._unit) ** 2, drift**2]) * model.dt
+        n_l, still = len(self.lagged), np.zeros(len(self.lagged))
+        lag = still + (_LAG_DRIFT * model.dt) ** 2
+        self.Q = np.concatenate([(self.noise.state * self._unit) ** 2, drift**2, still, lag]) * model.dt
         self.x = np.zeros(model.n_x)
         self.w = np.zeros(disturbance.n_w)
+        self.shown, self.lag = still.copy(), still.copy()
         self.found_offset = np.zeros(model.n_y)
         self.P0 = np.where(self.is_drive, 0.03, OFFSET) ** 2
         # a sensor without an offset among the disturbance states is read as loosely, once
         self.fixed: Mask = np.asarray(~disturbance.on_output.any(axis=1))
         self.R_start = self.R + np.where(self.fixed, OFFSET**2, 0.0)
-        self._P = np.zeros((model.n_x + disturbance.n_w,) * 2)
-        self._held = np.zeros(model.n_x + disturbance.n_w, dtype=bool)
+        self._n = model.n_x + disturbance.n_w
+        self._P = np.zeros((self._n + 2 * n_l,) * 2)
+        self._held = np.zeros(self._n + 2 * n_l, dtype=bool)
         self.innovation = np.zeros(model.n_y)
         self._on_sample()
+
+    def expect_lags(self) -> None:
+        """After a reset, allow for outputs that lag behind the model."""
+        n, P = len(self._P) - len(self.lagged), self._P.copy()
+        P[n:, n:] = (PRIOR_LAG * self.model.dt) ** 2 * np.eye(len(self.lagged))
+        self._P = P
 
     def hold_drives(self, weak: Mask) -> None:
         """Stop learning the bias of drives (n_u,) whose gain is weak or has turned over.
 
         There a bias explains nothing, or everything with the wrong sign; the other disturbances go on.
         """
-        self._held[self.model.n_x :] = (self.disturbance.on_drive * weak[:, None]).any(axis=0)
+        self._held[self.model.n_x : self._n] = (self.disturbance.on_drive * weak[:, None]).any(axis=0)
 
     def reset(self, y: Array, d: Array) -> None:
         """Start at rest at reading y (n_y,), NaN where a sensor is lost; see the module's theory."""
@@ -334,21 +364,29 @@ class Observer:
 
     def _begin(self, x: Array, P: Array, y: Array) -> None:
         """Start from a Gaussian state and a reading (n_y,)."""
-        n_x = self.model.n_x
-        self.x, self.w = x, np.zeros(self.disturbance.n_w)
+        n_x, n, n_l = self.model.n_x, self._n, len(self.lagged)
+        self.x, self.w, self.lag = x, np.zeros(self.disturbance.n_w), np.zeros(n_l)
+        self.shown = self.model.output(x)[self.lagged]
         self._held[:] = False
         self._on_sample()
         self.found_offset, self.innovation = np.zeros(self.model.n_y), np.zeros(self.model.n_y)
-        whole = np.zeros((n_x + self.disturbance.n_w,) * 2)
+        whole = np.zeros((n + 2 * n_l,) * 2)
         whole[:n_x, :n_x] = P
-        whole[n_x:, n_x:] = np.diag(self.P0)
+        whole[n_x:n, n_x:n] = np.diag(self.P0)
         self._P = whole
         self._correct(y, self.R_start)
+        # at rest every output shows what the model has
+        shows = np.eye(n + 2 * n_l)
+        shows[n : n + n_l, :n_x] = self.model.C[self.lagged]
+        self._P = shows @ self._P @ shows.T
+        self.shown = self.model.output(self.x)[self.lagged]
         self.set_offsets(y, np.asarray(self.fixed))
 
     def estimate(self) -> dict[str, Array]:
-        """Return what the filter knows: ``x``, ``w``, their covariance ``P``, and ``found_offset``."""
-        return {"x": self.x, "w": self.w, "P": self._P, "found_offset": self.found_offset}
+        """Return what the filter knows: ``x``, ``w``, ``shown``, ``lag``, their covariance ``P``, and
+        ``found_offset``."""
+        about = {"x": self.x, "w": self.w, "shown": self.shown, "lag": self.lag}
+        return about | {"P": self._P, "found_offset": self.found_offset}
 
     def set_offsets(self, y: Array, which: Mask) -> None:
         """Take what a reading (n_y,) differs by for offsets of the sensors ``which`` (n_y,)."""
@@ -361,7 +399,7 @@ class Observer:
         # of a sample: where readings are compared, and how much of Q is in P
         self._share, self._noised = 0.0, 0.0
         # the state there, and its derivative by (x, w)
-        self._ahead, self._way = self.x, np.zeros((0, 0))
+        self._ahead, self._shown_ahead, self._way = self.x, self.shown, np.zeros((0, 0))
 
     @property
     def now(self) -> Array:
@@ -385,12 +423,29 @@ class Observer:
 
     def reading(self) -> Array:
         """Return the reading (n_y,) that the filter expects now."""
-        return self.model.output(self.now) + self.output_bias
+        y, _ = self._shows(self.now, self._shown_now)
+        return y + self.output_bias
+
+    @property
+    def _shown_now(self) -> Array:
+        return self._shown_ahead if self._share else self.shown
+
+    def _shows(self, x: Array, shown: Array) -> tuple[Array, Array]:
+        """Return what the outputs (n_y,) show without biases, and its derivatives by the filter's states."""
+        model, n, n_l = self.model, self._n, len(self.lagged)
+        y, H = model.output(x), np.hstack([self._H, np.zeros((model.n_y, 2 * n_l))])
+        share = model.dt / (model.dt + self.lag)
+        far = y[self.lagged] - shown
+        y[self.lagged] = shown + share * far
+        H[self.lagged, : model.n_x] *= share[:, None]
+        H[self.lagged, n : n + n_l] = np.diag(1 - share)
+        H[self.lagged, n + n_l :] = np.diag(-far * share**2 / model.dt)
+        return y, H
 
     def settled_gain(self, step: Array) -> Array:
         """Return the gain (n_x + n_w, n_y) that the filter settles at with this Jacobian of a sample."""
         n = step.shape[0]
-        P = solve_discrete_are(step.T, self._H.T, np.diag(self.Q + 1e-12 * np.ones(n)), np.diag(self.R))
+        P = solve_discrete_are(step.T, self._H.T, np.diag(self.Q[:n] + 1e-12 * np.ones(n)), np.diag(self.R))
         innovation = self._H @ P @ self._H.T + np.diag(self.R)
         return np.asarray(np.linalg.solve(innovation, self._H @ P).T)
 
@@ -408,29 +463,45 @@ class Observer:
         innovation = y - self.reading()
         seen = np.flatnonzero(np.isfinite(y))
         if seen.size:
-            H = self._H[seen] @ self._way if self._share else self._H[seen]
+            H = self._shows(self.now, self._shown_now)[1][seen]
+            H = H @ self._way if self._share else H
             PH = self._P @ H.T
             S = H @ PH + np.diag(R[seen])
             gain = np.linalg.solve(S, PH.T).T
             mean = self.innovation.copy()
             mean[seen] += remember * (innovation[seen] / np.sqrt(np.diag(S)) - mean[seen])
             self.innovation = mean
-            gain[np.asarray(self._held, dtype=bool)] = 0.0  # C holds whole numbers
-            change = gain @ innovation[seen]
-            self.x = self.x + change[: self.model.n_x]
-            w = self.w + change[self.model.n_x :]
-            w = np.where(self.is_drive, np.clip(w, -LARGEST_BIAS, LARGEST_BIAS), w)
-            if self._share:
-                change[self.model.n_x :] = w - self.w
-                self._ahead = self._ahead + self._way[: self.model.n_x] @ change
-            self.w = w
+            held = np.asarray(self._held, dtype=bool)  # C holds whole numbers
+            gain[held] = 0.0
             left = np.eye(self._P.shape[0]) - gain @ H  # Joseph's form: right for any gain
             self._P = left @ self._P @ left.T + (gain * R[seen]) @ gain.T
+            self._change(self._inside(gain @ innovation[seen], held))
         return np.asarray(innovation)
+
+    def _inside(self, change: Array, held: Mask) -> Array:
+        """Return a change of the states that leaves each lag in its range: the mean, given that end."""
+        for at, lag in enumerate(self.lag, start=len(change) - len(self.lag)):
+            beyond = lag + change[at] - min(max(lag + change[at], 0.0), LONGEST_LAG * self.model.dt)
+            if beyond:
+                change = change - np.where(held, 0.0, self._P[:, at] * (beyond / self._P[at, at]))
+        return change
+
+    def _change(self, change: Array) -> None:
+        """Change the states."""
+        n_x, n, n_l = self.model.n_x, self._n, len(self.lagged)
+        w = self.w + change[n_x:n]
+        w = np.where(self.is_drive, np.clip(w, -LARGEST_BIAS, LARGEST_BIAS), w)
+        lag = np.clip(self.lag + change[n + n_l :], 0.0, LONGEST_LAG * self.model.dt)
+        if self._share:
+            change[n_x:n], change[n + n_l :] = w - self.w, lag - self.lag
+            ahead = self._way @ change
+            self._ahead, self._shown_ahead = self._ahead + ahead[:n_x], self._shown_ahead + ahead[n : n + n_l]
+        self.x, self.w = self.x + change[:n_x], w
+        self.shown, self.lag = self.shown + change[n : n + n_l], lag
 
     def predict(self, u: Array, d: Array) -> None:
         """Carry the estimate one sample on under drives u (n_u,) and disturbances d (n_d,)."""
-        self.x, step = self._sample(u, d)
+        self.x, self.shown, step = self._sample(u, d)
         self._P = step @ self._P @ step.T
         self._P[np.diag_indices_from(self._P)] += np.where(self._held, 0.0, (1 - self._noised) * self.Q)
         self._on_sample()
@@ -450,19 +521,23 @@ class Observer:
         share = self._into / self.model.dt
         if share <= SAME:
             return
-        after, step = self._sample(self._dose / self._into, d)
+        after, shown, step = self._sample(self._dose / self._into, d)
         P = self._P
         P[np.diag_indices_from(P)] += np.where(self._held, 0.0, (share - self._noised) * self.Q)
         self._P, self._share, self._noised = P, share, share
         self._ahead = (1 - share) * self.x + share * after
+        self._shown_ahead = (1 - share) * self.shown + share * shown
         self._way = (1 - share) * np.eye(len(P)) + share * step
 
-    def _sample(self, u: Array, d: Array) -> tuple[Array, Array]:
-        """Return the state a sample later, and the Jacobian of (x, w) there."""
-        model, n_x, n_w = self.model, self.model.n_x, self.disturbance.n_w
+    def _sample(self, u: Array, d: Array) -> tuple[Array, Array, Array]:
+        """Return the state a sample later, what is shown now, and the Jacobian of the filter's states."""
+        model, n_x, n, n_l = self.model, self.model.n_x, self._n, len(self.lagged)
         after, A, B, E = model.linearise(self.x, u + self.drive_bias, d + self.disturbance_bias)
-        step = np.eye(n_x + n_w)
+        step = np.eye(n + 2 * n_l)
         step[:n_x, :n_x] = A
         into = B @ (self.disturbance.on_drive * model.span[:, None]) + E @ self.disturbance.on_disturbance
-        step[:n_x, n_x:] = into
-        return after, step
+        step[:n_x, n_x:n] = into
+        y, H = self._shows(self.x, self.shown)
+        step[n : n + n_l] = H[self.lagged]
+        step[n : n + n_l, n_x:n] = 0.0  # without the biases
+        return after, y[self.lagged], step

@@ -15,6 +15,11 @@ that only what each sample adds is summed, not where the model would have gone b
 
 **A plant that does not follow.**  The bias that the observer had to assume for the drive is beyond 30 % of
 its range, or that of an output 2 degC: a pump that is off, a plug that has fallen off, another plant.
+
+**A plant that is slower.**  The observer has found an output to lag behind the model by more than half a
+sample and five standard deviations, in three samples in a row, from readings that show it to a quarter of a
+sample: a structure that the model lacks.  (Where a drive is far from the model, a lag explains too little to
+be believed.)  It is reported until the lag is below a quarter of a sample.
 """
 
 from __future__ import annotations
@@ -36,11 +41,16 @@ _STUCK = 2.0  # degC that the model expects of a reading that has not moved at a
 _FOLLOWS_DRIVE = 0.3  # of its range: a larger bias of a drive is not a small error of the model
 _FOLLOWS_OUTPUT = 2.0  # degC: a larger bias of an output is not a small error of the model
 
+# of a lag behind the model: least, least once reported, largest standard deviation [samples], least in those
+_SLOWER, _STILL_SLOWER, _SHOWN_TO, _SLOWER_SD = 0.5, 0.25, 0.25, 5.0
+_SLOW_FOR = 3  # samples in a row, until it is reported
+
 
 class ReadingMonitor:
     """What the last readings were, and what was expected of them."""
 
-    def __init__(self, n_y: int) -> None:
+    def __init__(self, n_y: int, n_l: int = 0) -> None:
+        self._slow_for = np.zeros(n_l, dtype=int)  # samples in a row that each was slower
         self._last = np.full(n_y, np.nan)
         self._moved = np.zeros(n_y)
         self._spikes = np.zeros(n_y, dtype=int)  # samples in a row that each reading was left out for
@@ -48,7 +58,21 @@ class ReadingMonitor:
     def forget(self, y: Array) -> None:
         """Start afresh from reading y (n_y,)."""
         self._last, self._moved = np.array(y, dtype=float), np.zeros(len(self._last))
-        self._spikes = np.zeros(len(self._last), dtype=int)
+        self._spikes, self._slow_for = np.zeros(len(self._last), dtype=int), 0 * self._slow_for
+
+    def slower(self, observer: Observer) -> str:
+        """Return which output is slower than the model, and by how much; empty where none surely is."""
+        lag = observer.lag / observer.model.dt
+        variance = np.diag(observer.estimate()["P"])
+        sd = np.sqrt(variance[variance.size - lag.size :]) / observer.model.dt
+        sure = ~too_weak(observer) & (lag > _SLOWER) & (lag > _SLOWER_SD * sd) & (sd < _SHOWN_TO)
+        sure |= (self._slow_for == _SLOW_FOR) & (lag > _STILL_SLOWER)
+        self._slow_for = np.where(sure, np.minimum(self._slow_for + 1, _SLOW_FOR), 0)
+        slow = np.where(self._slow_for == _SLOW_FOR, observer.lag, 0.0)
+        if not slow.any():
+            return ""
+        name = observer.model.outputs[observer.lagged[int(np.argmax(slow))]]
+        return f"{name} is slower than the model by about {slow.max():.2g} s: identify the plant anew"
 
     def expect(self, change: Array) -> None:
         """Note by how much the model moves the outputs (n_y,) in a sample [degC]."""
@@ -74,11 +98,15 @@ class ReadingMonitor:
         return np.where(jumped & ~stays, np.nan, y), stays
 
 
+def too_weak(observer: Observer) -> np.bool_:
+    """Return whether a drive does far less, or far more, than the model has."""
+    return np.any(np.abs(observer.disturbance.on_drive @ observer.w) >= _FOLLOWS_DRIVE)
+
+
 def follows(observer: Observer, controlled: tuple[str, ...]) -> str:
     """Return the report where the model no longer explains the plant; empty where it does."""
-    chosen, w = observer.disturbance, observer.w
     pump = "does the pump run" if observer.model.model.switches else ""
-    if np.any(np.abs(chosen.on_drive @ w) >= _FOLLOWS_DRIVE):
+    if too_weak(observer):
         return f"{', '.join(controlled)} does not follow the drive: {pump or 'is it another plant'}?"
     off = np.abs(observer.output_bias - observer.offset)
     if np.any(off >= _FOLLOWS_OUTPUT):

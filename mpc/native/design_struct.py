@@ -89,6 +89,7 @@ class Sizes:
     ND: int
     NY: int
     NW: int
+    NG: int  # outputs that may lag behind the model
     NB: int  # at most so many blocks, samples, controlled and limited outputs
     NH: int
     NC: int
@@ -104,7 +105,7 @@ class Sizes:
     @property
     def NZ(self) -> int:
         """States of the observer."""
-        return self.NX + self.NW
+        return self.NX + self.NW + 2 * self.NG
 
     def shape(self, name: str) -> tuple[int, ...]:
         """Return the shape of a field, as NumPy has it."""
@@ -121,6 +122,7 @@ def sizes_of(controller: ControllerParts, n_k: int, n_m: int, *, room: bool) -> 
         ND=model.n_d,
         NY=n_y,
         NW=controller.disturbance.n_w,
+        NG=len(controller.observer.lagged),
         NB=len(design.blocks),
         NH=-(-N // 32) * 32 if room else N,
         NC=n_y if room else len(design.controlled),
@@ -132,7 +134,7 @@ def sizes_of(controller: ControllerParts, n_k: int, n_m: int, *, room: bool) -> 
 
 def config_header(sizes: Sizes) -> str:
     """Return ``tg_config.h``: the sizes, and the struct of a design."""
-    names = ("NX", "NU", "ND", "NY", "NW", "NB", "NH", "NC", "NL", "NS", "NK", "NM")
+    names = ("NX", "NU", "ND", "NY", "NW", "NG", "NB", "NH", "NC", "NL", "NS", "NK", "NM")
     lines = ["/* Sizes and numbers of one controller. */", "#ifndef TG_CONFIG_H", "#define TG_CONFIG_H", ""]
     lines += [f"#define TG_{name} {getattr(sizes, name)}" for name in names]
     lines += ["", "typedef struct {"]
@@ -243,16 +245,16 @@ def _controller_parts(s: Sizes) -> list[tuple[Any, int]]:
     qp = type("tg_qp", (ctypes.Structure,), {"_fields_": _laid_out(_qp_parts(s))})
     return [
         (ctypes.c_void_p, 3),
-        *((number, count) for count in (s.NX, s.NW, z * z, s.NY, s.NY)),
+        *((number, count) for count in (s.NX, s.NW, s.NG, s.NG, z * z, s.NY, s.NY)),
         (whole, z),
-        *((number, count) for count in (3, s.NU, s.NX, 9)),
+        *((number, count) for count in (3, s.NU, s.NX, s.NG, 9)),
         (whole, 2),
         *((number, count) for count in (s.ND, s.NY, s.NU, s.NU, s.NC, s.NC, s.NH * s.NU, s.NC, 2)),
-        *((number, count) for count in (s.NY, s.NY, s.NX, s.NC)),
+        *((number, count) for count in (s.NY, s.NY, s.NX, s.NC, 1)),
         *((number, count) for count in (s.NX, s.NU, 1)),
         (whole, 3),
         (relaxation, s.NC),
-        (whole, 6 + s.NY + s.NC),
+        (whole, 6 + s.NY + s.NG + s.NC),
         *((number, count) for count in (n, s.NH * s.NY, n, 1)),
         (whole, 2),
         (qp, 1),

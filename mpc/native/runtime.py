@@ -140,6 +140,8 @@ def _library(path: Path) -> ctypes.CDLL:
     for name in (
         "tg_host_x",
         "tg_host_w",
+        "tg_host_shown",
+        "tg_host_lag",
         "tg_host_P",
         "tg_host_found_offset",
         "tg_host_innovation",
@@ -260,7 +262,7 @@ class CompiledOptimiser(Optimiser):
         self._lost = c.view("lost", (len(self.design.controlled),))
         n_c = len(self.design.controlled)
         # one block of memory for what goes in, so that a call costs next to nothing
-        lengths = (model.n_x, n_u, n, model.n_d, n_c, n_c, model.n_y, n_u, 1)
+        lengths = (model.n_x, n_u, n, model.n_d, n_c, n_c, model.n_y, n_u, 2)
         self._given = np.zeros(sum(lengths))
         ends = np.cumsum(lengths)
         self._parts = [self._given[end - length : end] for end, length in zip(ends, lengths)]
@@ -278,7 +280,7 @@ class CompiledOptimiser(Optimiser):
         *parts, slew = self._parts
         for part, values in zip(parts, sample[:8], strict=True):
             part[:] = values.ravel()
-        slew[:] = self.design.dt if sample.slew_s is None else sample.slew_s
+        slew[:] = self.design.dt if sample.slew_s is None else sample.slew_s, sample.caution
         self._lost[:] = 0 if sample.lost is None else sample.lost
         status = QP_STATUS[self._run(*self._arguments)]
         y, authority, iterations = self._y.copy(), self._authority_now[0].copy(), self._iterations.value
@@ -299,12 +301,14 @@ class CompiledObserver(Observer):
 
     def __init__(self, like: Observer, c: CompiledController) -> None:
         self._c = c
-        n_x, n_w = like.model.n_x, like.disturbance.n_w
+        n_x, n_w, n_z = like.model.n_x, like.disturbance.n_w, c.sizes.NZ
         self._views = {
             "x": c.view("x", (n_x,)),
             "w": c.view("w", (n_w,)),
-            "_P": c.view("P", (n_x + n_w, n_x + n_w)),
-            "_held": c.view("held", (n_x + n_w,)),
+            "shown": c.view("shown", (c.sizes.NG,)),
+            "lag": c.view("lag", (c.sizes.NG,)),
+            "_P": c.view("P", (n_z, n_z)),
+            "_held": c.view("held", (n_z,)),
             "found_offset": c.view("found_offset", (like.model.n_y,)),
             "innovation": c.view("innovation", (like.model.n_y,)),
         }
@@ -312,7 +316,7 @@ class CompiledObserver(Observer):
             setattr(self, name, value)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if name in ("x", "w", "_P", "_held", "found_offset", "innovation"):
+        if name in self.__dict__.get("_views", ()):
             self._views[name][...] = value
         else:
             object.__setattr__(self, name, value)
@@ -333,6 +337,12 @@ class CompiledObserver(Observer):
         n_u, n_x = self.model.n_u, self.model.n_x
         between = self._c.view("between", (3 + n_u + n_x,))
         return between[3 + n_u :].copy() if between[1] > 0 else self.x
+
+    @property
+    def _shown_now(self) -> Array:
+        start = 3 + self.model.n_u + self.model.n_x
+        between = self._c.view("between", (start + self._c.sizes.NG,))
+        return between[start:].copy() if between[1] > 0 else self.shown
 
     def update(self, y: Array) -> Array:
         """Correct the estimate with a reading (n_y,), NaN where lost; return the innovation (n_y,)."""

@@ -157,7 +157,8 @@ class Reach:
             held, J = self._held(observer, u, d + observer.disturbance_bias, target, side, seen)
         else:
             held, J = target, np.zeros((len(target), observer.w.size))
-        P = observer.estimate()["P"][self.model.n_x :, self.model.n_x :]
+        w_at = slice(self.model.n_x, self.model.n_x + observer.w.size)
+        P = observer.estimate()["P"][w_at, w_at]
         sd = np.maximum(np.sqrt(np.einsum("ij,jk,ik->i", J, P, J)), _LEAST_SD)
         miss = np.where(seen, np.abs(target - held), 0.0)
         scaled = (miss - _OUT) / (sd * max(1.0, observer.innovation_bias))

@@ -59,6 +59,7 @@ class Sample(NamedTuple):
     drive_bias: Array  # (n_u,) in the drives' units
     slew_s: float | None = None  # seconds that the slew limit of the first move counts; a sample where absent
     lost: Mask | None = None  # (n_controlled,) outputs that cost nothing, and whose drives go to rest
+    caution: float = 1.0  # how many times the design's move weight counts
 
 
 @dataclass(frozen=True)
@@ -103,7 +104,7 @@ class Optimiser:
         gaps = np.concatenate([[1.0], np.diff(middles)])
         self.reach = np.cumsum(gaps)
         self.slews = (gaps[:, None] * self.slew).ravel()
-        self._solves = 0
+        self._solves, self._move = 0, design.move
         self._seen_rows, self._parked = list(range(len(self._rows))), list[int]()
         self.neutral = np.clip(np.zeros(model.n_u), self.lowest, self.highest)
         self.at_rest = self._response_at_rest()
@@ -120,7 +121,8 @@ class Optimiser:
 
     def solve(self, sample: Sample) -> Outcome:
         """Improve a plan."""
-        x, last, guess, d, target, side, bias, drive_bias, slew_s, lost = sample
+        x, last, guess, d, target, side, bias, drive_bias, slew_s, lost, caution = sample
+        self._move = caution * self.design.move
         model, n_u = self.model, self.model.n_u
         # in samples, by how much more or less than in one the first move may go
         more = 0.0 if slew_s is None else slew_s / self.design.dt - 1.0
@@ -269,7 +271,7 @@ class Optimiser:
         """Return the cost (B,) of plans (B, n_b, n_u) whose outputs y (B, N, n_y) were simulated."""
         design, span = self.design, self.model.span
         before = np.concatenate([np.broadcast_to(last, (len(plans), 1, last.size)), plans], axis=1)
-        cost = design.move * np.sum((np.diff(before, axis=1) / span) ** 2, axis=(1, 2))
+        cost = self._move * np.sum((np.diff(before, axis=1) / span) ** 2, axis=(1, 2))
         cost += design.drive * np.sum((plans / span) ** 2 * np.array(self.blocks)[:, None], axis=(1, 2))
         over = []
         for at in self._seen_rows:
@@ -320,8 +322,8 @@ class Optimiser:
             f += 2 * part @ (free[:, row] - target[at])
         before = np.zeros(H.shape[0])
         before[: self.model.n_u] = last / self.model.span
-        f -= 2 * self.design.move * self.differences.T @ before
-        return H, f
+        f -= 2 * self._move * self.differences.T @ before
+        return H + 2 * (self._move - self.design.move) * self.differences.T @ self.differences, f
 
     def _constraints(
         self,

@@ -190,7 +190,9 @@ def test_a_target_out_of_reach_is_reported_within_two_samples_and_kept_reported(
     assert {move.status for move in moves} == {"ok"}
     moves, seen = run(controller, truth, {"t2": 60.0, "t5": 200.0}, 4000.0)
     assert {move.status for move in moves[1:]} == {"infeasible"}
-    found = re.search(r"no drive holds t5 at 200.0 degC: ([0-9.]+) degC can be held", moves[1].advice)
-    assert float(found[1]) == pytest.approx(seen[-50:, 4].mean(), abs=1.5)
+    pattern = r"no drive holds t5 at 200.0 degC: ([0-9.]+) degC can be held"
+    found = np.array([float(re.search(pattern, move.advice)[1]) for move in moves[1:40]])
+    assert np.median(found) == pytest.approx(seen[-50:, 4].mean(), abs=1.5)
+    np.testing.assert_allclose(found, seen[-50:, 4].mean(), atol=2.5)
     moves, seen = run(controller, truth, 60.0, 2000.0)  # the reachable temperature is not reported
     assert {move.status for move in moves} == {"ok"}

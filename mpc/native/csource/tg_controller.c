@@ -23,6 +23,13 @@
 #define STUCK 2.0      /* degC that the model expects of a reading that has not moved at all */
 #define FOLLOWS_DRIVE 0.3   /* of its range: a larger bias of a drive is not a small error of the model */
 #define FOLLOWS_OUTPUT 2.0  /* degC: a larger bias of an output is not a small error of the model */
+#define CAUTION 3.0      /* standard deviations of a mean innovation, from which on moves weigh more, */
+#define MOST_CAUTION 30.0 /* and at most so many times */
+#define SLOWER 0.5        /* samples that an output lags behind the model: a structure that the model lacks; */
+#define STILL_SLOWER 0.25 /* the same once that is reported, */
+#define SHOWN_TO 0.25     /* its largest standard deviation, */
+#define SLOWER_SD 5.0     /* the least lag in those, */
+#define SLOW_FOR 3        /* and for so many samples in a row */
 #define COLDEST (-60.0)
 #define HOTTEST 200.0
 #define TINY 1e-9
@@ -54,6 +61,7 @@ static void start(tg_controller *c, const double *y, const double *d)
     for (int i = 0; i < TG_ND; i++)
         c->d[i] = isfinite(d[i]) ? d[i] : s->ambient;
     tg_observer_reset(c, y, c->d);
+    tg_observer_expect_lags(c);
     for (int j = 0; j < TG_NU; j++)
         c->u[j] = c->in_force[j] = s->neutral[j];
     for (int r = 0; r < TG_NC; r++) {
@@ -62,6 +70,7 @@ static void start(tg_controller *c, const double *y, const double *d)
     }
     c->has_plan = c->solves = c->on_pi = 0;
     memset(c->spikes, 0, sizeof c->spikes);
+    memset(c->slow_for, 0, sizeof c->slow_for);
     c->age_s = c->silent_s = c->miss_sum = 0.0;
     memset(c->unread_s, 0, sizeof c->unread_s);
     memset(c->lost, 0, sizeof c->lost);
@@ -350,6 +359,9 @@ static int optimise(tg_controller *c)
         memcpy(x, next, sizeof x);
     }
     tg_guess(c, last, guess);
+    c->caution = 1.0;
+    for (int i = 0; i < TG_NY; i++)
+        c->caution = fmin(fmax(c->caution, fabs(c->innovation[i]) / CAUTION), MOST_CAUTION);
     return tg_optimise(c, x, last, guess, d, c->target, c->side, on_y, on_u);
 }
 
@@ -536,8 +548,8 @@ static double missed_by(tg_controller *c)
     return c->unreachable ? fmax(worst, TINY) : 0.0;
 }
 
-/* Whether the plant is the model no longer. */
-static int does_not_follow(const tg_controller *c)
+/* Whether a drive does far less, or far more, than the model has. */
+static int is_too_weak(const tg_controller *c)
 {
     const tg_design *s = c->design;
     for (int j = 0; j < TG_NU; j++) {
@@ -547,6 +559,15 @@ static int does_not_follow(const tg_controller *c)
         if (fabs(sum) >= FOLLOWS_DRIVE)
             return 1;
     }
+    return 0;
+}
+
+/* Whether the plant is the model no longer. */
+static int does_not_follow(const tg_controller *c)
+{
+    const tg_design *s = c->design;
+    if (is_too_weak(c))
+        return 1;
     for (int j = 0; j < TG_NY; j++) {
         double sum = c->found_offset[j];
         for (int i = 0; i < TG_NW; i++)
@@ -555,6 +576,21 @@ static int does_not_follow(const tg_controller *c)
             return 1;
     }
     return 0;
+}
+
+/* By how much an output is surely slower than the model, the most of all [s]; 0 where none is. */
+static double slower_by(tg_controller *c)
+{
+    double most = 0.0, dt = c->design->dt;
+    for (int r = 0; r < TG_NG; r++) {
+        double lag = c->lag[r] / dt, sd = sqrt(c->P[(TG_L + TG_NG + r) * (TG_Z + 1)]) / dt;
+        int sure = !is_too_weak(c) && lag > SLOWER && lag > SLOWER_SD * sd && sd < SHOWN_TO;
+        sure = sure || (c->slow_for[r] == SLOW_FOR && lag > STILL_SLOWER);
+        c->slow_for[r] = !sure ? 0 : c->slow_for[r] < SLOW_FOR ? c->slow_for[r] + 1 : SLOW_FOR;
+        if (c->slow_for[r] == SLOW_FOR)
+            most = fmax(most, c->lag[r]);
+    }
+    return most;
 }
 
 /* For how long no controlled output was read [s], and whether one of them is not. */
@@ -600,7 +636,7 @@ void tg_keep_plan(tg_controller *c)
 static void decide(tg_controller *c, tg_move *move)
 {
     const tg_design *s = c->design;
-    double missed;
+    double missed, slower;
     int outside = 0, unseen;
     double unread = unread_for(c, &unseen);
     move->status = TG_OK;
@@ -652,6 +688,10 @@ static void decide(tg_controller *c, tg_move *move)
     } else if (unseen) {
         move->status = TG_FALLBACK_PLAN;
         move->advice = TG_UNSEEN;
+    } else if (slower = slower_by(c), slower > 0.0) {
+        move->status = TG_MISMATCH;
+        move->advice = TG_SLOWER;
+        move->over = slower;
     } else if (does_not_follow(c))
         move->advice = s->switched ? TG_PUMP : TG_NOT_FOLLOWING;
 }
@@ -725,8 +765,8 @@ tg_move tg_step(tg_controller *c, double time_s, const double *y, const double *
 
 const char *tg_status_text(int status)
 {
-    static const char *const text[] = {"ok", "late", "infeasible", "fallback_plan", "fallback_pi", "off"};
-    return status >= TG_OK && status <= TG_OFF ? text[status] : "?";
+    static const char *const text[] = {"ok", "late", "infeasible", "fallback_plan", "fallback_pi", "off", "mismatch"};
+    return status >= TG_OK && status <= TG_MISMATCH ? text[status] : "?";
 }
 
 const char *tg_advice_text(int advice)
@@ -751,6 +791,7 @@ const char *tg_advice_text(int advice)
         "a jump of the readings stays: the estimate was started again",
         "the plant does not follow the model: does the pump run, is the sensor in place?",
         "a controlled output has no usable reading: the model replaces it, then its drive rests; the others go on",
+        "an output is slower than the model: identify the plant anew",
     };
-    return advice >= TG_ALL_WELL && advice <= TG_UNSEEN ? text[advice] : "?";
+    return advice >= TG_ALL_WELL && advice <= TG_SLOWER ? text[advice] : "?";
 }

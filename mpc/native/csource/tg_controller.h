@@ -20,12 +20,13 @@
 #include "tg_config.h"
 #include "tg_qp.h"
 
-#define TG_Z (TG_NX + TG_NW)               /* states of the observer */
+#define TG_L (TG_NX + TG_NW)               /* where what the lagging outputs show begins in them, */
+#define TG_Z (TG_L + 2 * TG_NG)            /* states of the observer; their lags are the last */
 #define TG_SEEDS (TG_NX + TG_NU + TG_ND)   /* directions of a sample's Jacobian */
 #define TG_WIDE (TG_SEEDS > TG_Q_N ? TG_SEEDS : TG_Q_N)
 #define TG_SOME(n) ((n) > 0 ? (n) : 1)
 
-enum tg_status { TG_OK = 0, TG_LATE, TG_INFEASIBLE, TG_FALLBACK_PLAN, TG_FALLBACK_PI, TG_OFF };
+enum tg_status { TG_OK = 0, TG_LATE, TG_INFEASIBLE, TG_FALLBACK_PLAN, TG_FALLBACK_PI, TG_OFF, TG_MISMATCH };
 
 enum tg_advice {
     TG_ALL_WELL = 0,
@@ -46,7 +47,8 @@ enum tg_advice {
     TG_SENSOR_OFFSET,
     TG_WORLD_CHANGED,
     TG_PUMP,
-    TG_UNSEEN
+    TG_UNSEEN,
+    TG_SLOWER
 };
 
 typedef struct {
@@ -55,7 +57,7 @@ typedef struct {
     int status;     /* enum tg_status */
     int advice;     /* enum tg_advice; tg_advice_text has its sentence */
     int iterations; /* of the quadratic program */
-    double over;    /* by how much a limit will be broken, or a target missed [degC], where the advice is that */
+    double over;    /* by how much a limit will be broken, a target missed [degC], an output late [s]: where advised */
 } tg_move;
 
 #define TG_BINS 12
@@ -71,10 +73,12 @@ typedef struct {
     int (*late)(void *about); /* whether time is up; NULL: never */
     void *about;
     /* observer */
-    double x[TG_NX], w[TG_SOME(TG_NW)], P[TG_Z * TG_Z], found_offset[TG_NY], innovation[TG_NY];
+    double x[TG_NX], w[TG_SOME(TG_NW)];
+    double shown[TG_NG], lag[TG_NG];   /* of each controlled output: what it showed a sample before x, its lag [s] */
+    double P[TG_Z * TG_Z], found_offset[TG_NY], innovation[TG_NY];
     int held[TG_Z];
     double into_s, share, noised;      /* seconds since x; of a sample: time of the estimate, and the noise in P */
-    double dose[TG_NU], ahead[TG_NX];  /* the drives summed over those seconds, and the state there */
+    double dose[TG_NU], ahead[TG_NX], shown_ahead[TG_NG]; /* the drives summed over those seconds, the state there */
     /* when it was called */
     double time_s, back_s, interval_s, passed_s, since_s, assumed_s, spent_s, waited_s, slew_s;
     int repeats, stale;
@@ -84,10 +88,12 @@ typedef struct {
     double last_y[TG_NY], moved[TG_NY]; /* the newest reading, and what was expected since it changed */
     double seen[TG_NX];                 /* the state after the newest reading */
     double integral[TG_NC];             /* of the PI controller */
+    double caution;                     /* how many times the weight of moves counts */
     double steady_x[TG_NX], steady_u[TG_NU], miss_sum; /* nearest to the targets, and evidence that they are missed */
     int has_steady, in, unreachable;                   /* samples in a row within reach again */
     tg_relaxation relaxation[TG_NC];
-    int has_plan, fresh, solves, on_pi, status, advice, spikes[TG_NY], lost[TG_NC]; /* lost: they cost nothing */
+    int has_plan, fresh, solves, on_pi, status, advice, spikes[TG_NY];
+    int slow_for[TG_NG], lost[TG_NC]; /* samples in a row that an output was slower; those that cost nothing */
     /* what the last optimisation gave */
     double best[TG_Q_N], y_best[TG_NH * TG_NY], authority[TG_Q_N], broken;
     int qp_status, iterations;
@@ -118,6 +124,7 @@ const char *tg_advice_text(int advice);
 
 /* The parts, for tests and for other loops. */
 void tg_observer_reset(tg_controller *c, const double *y, const double *d);
+void tg_observer_expect_lags(tg_controller *c); /* after a reset: outputs may lag behind the model */
 void tg_observer_update(tg_controller *c, const double *y);
 /* Take what a reading differs by for offsets of the sensors that are not 0 in which. */
 void tg_observer_set_offsets(tg_controller *c, const double *y, const int *which);

@@ -17,6 +17,8 @@ void tg_host_begin(tg_controller *c, const tg_design *design)
 
 double *tg_host_x(tg_controller *c) { return c->x; }
 double *tg_host_w(tg_controller *c) { return c->w; }
+double *tg_host_shown(tg_controller *c) { return c->shown; }
+double *tg_host_lag(tg_controller *c) { return c->lag; }
 double *tg_host_P(tg_controller *c) { return c->P; }
 double *tg_host_found_offset(tg_controller *c) { return c->found_offset; }
 double *tg_host_innovation(tg_controller *c) { return c->innovation; }
@@ -36,7 +38,8 @@ int tg_host_optimise(tg_controller *c, const double *x, const double *last, cons
                      double *over, int *iterations)
 {
     int status;
-    c->slew_s = *slew_s;
+    c->slew_s = slew_s[0];
+    c->caution = slew_s[1];
     status = tg_optimise(c, x, last, guess, d, target, side, bias, drive_bias);
     memcpy(plan, c->best, (size_t)c->qp.n * sizeof(double));
     memcpy(y, c->y_best, (size_t)c->design->N * TG_NY * sizeof(double));
@@ -55,6 +58,7 @@ int tg_host_replan(tg_controller *c, const double *x, const double *last, const 
     int status;
     tg_advance_plan(c);
     c->slew_s = 0.0;
+    c->caution = 1.0;
     tg_guess(c, last, guess);
     status = tg_optimise(c, x, last, guess, d, target, side, bias, drive_bias);
     if (status == TG_QP_SOLVED)
@@ -134,7 +138,8 @@ static void look(const tg_truth *plant, double *y)
 
 /* A closed loop of n samples against a plant that is not the model.
  *
- * observed: the estimate that the observer starts from: x, w, P and found_offset, one behind the other; per_sample: the plant's steps in a sample, of which the
+ * observed: the estimate that the observer starts from: x, w, shown, lag, P and
+ * found_offset, one behind the other; per_sample: the plant's steps in a sample, of which the
  * first `late` still run on the drive before; noise: n rows of TG_NY readings' errors; quanta: of each of the
  * TG_NY + TG_ND readings, 0 none; d_offset: what a sensor of a disturbance shows too much; target: n rows of n_c.
  * Into y: n per_sample + 1 rows of TG_NY, without noise and quantum; reading: n rows of TG_NY + TG_ND;
@@ -162,6 +167,8 @@ void tg_host_loop(tg_controller *c, const tg_design *design, tg_truth *plant, in
             tg_reset(c, design, shown, shown + TG_NY);
             memcpy(c->x, observed, sizeof c->x);
             memcpy(c->w, observed + TG_NX, TG_NW * sizeof(double));
+            memcpy(c->shown, observed + TG_L, sizeof c->shown);
+            memcpy(c->lag, observed + TG_L + TG_NG, sizeof c->lag);
             memcpy(c->P, observed + TG_Z, sizeof c->P);
             memcpy(c->found_offset, observed + TG_Z + TG_Z * TG_Z, sizeof c->found_offset);
         }

@@ -4,6 +4,8 @@
  *
  * x is kept on a grid of samples, because a delay of shift registers advances by whole samples only;
  * a reading the share s of a sample after it is one of (1 - s) x + s f(x, u, d), u the mean of the drives since.
+ *
+ * Controlled outputs are read through a lag T that is estimated too, s+ = s + a (C x - s), y = s+, a = dt / (dt + T).
  */
 #include "tg_controller.h"
 #include "tg_model.h"
@@ -13,6 +15,8 @@
 
 #define LARGEST_BIAS 1.0 /* of its range: no drive makes up for more */
 #define REMEMBER 0.2 /* share of the newest innovation in their mean */
+#define PRIOR_LAG 3.0   /* samples: standard deviation of a lag at the start */
+#define LONGEST_LAG 6.0 /* samples */
 #define SAME 1e-6 /* of a sample: what is nearer than this is the same time */
 #define WEAK 0.05 /* of its gain at rest, below which a drive's bias is not learnt */
 
@@ -40,17 +44,28 @@ void tg_biases(const tg_controller *c, double *on_u, double *on_d, double *on_y)
 
 const double *tg_now(const tg_controller *c) { return c->share > 0.0 ? c->ahead : c->x; }
 
+static const double *shown_now(const tg_controller *c) { return c->share > 0.0 ? c->shown_ahead : c->shown; }
+
+static double output(const tg_controller *c, int i, const double *x)
+{
+    double sum = c->design->y0[i];
+    for (int j = 0; j < TG_NX; j++)
+        sum += c->design->C[i * TG_NX + j] * x[j];
+    return sum;
+}
+
+static double lag_share(const tg_controller *c, int r) { return c->design->dt / (c->design->dt + c->lag[r]); }
+
 void tg_expected(const tg_controller *c, double *y)
 {
-    const tg_design *s = c->design;
-    const double *x = tg_now(c);
+    const double *x = tg_now(c), *shown = shown_now(c);
     double on_u[TG_NU], on_d[TG_SOME(TG_ND)];
     tg_biases(c, on_u, on_d, y);
-    for (int i = 0; i < TG_NY; i++) {
-        double sum = s->y0[i];
-        for (int j = 0; j < TG_NX; j++)
-            sum += s->C[i * TG_NX + j] * x[j];
-        y[i] += sum;
+    for (int i = 0; i < TG_NY; i++)
+        y[i] += output(c, i, x);
+    for (int r = 0; r < TG_NG; r++) {
+        int i = c->design->controlled[r];
+        y[i] -= (1.0 - lag_share(c, r)) * (output(c, i, x) - shown[r]);
     }
 }
 
@@ -60,14 +75,29 @@ static void stand_on_sample(tg_controller *c)
     memset(c->dose, 0, sizeof c->dose);
 }
 
-/* What reading i is of (x, w): [C, Wy], between two samples times the derivative of the state there. */
-static void sensitivity(const tg_controller *c, int i, double *h)
+/* What reading i is of the states, which are x and shown: [C, Wy], of a lagging one less, and by its lag. */
+static void plain_sensitivity(const tg_controller *c, int i, const double *x, const double *shown, double *h)
 {
     const tg_design *s = c->design;
-    double plain[TG_Z];
-    memcpy(plain, s->C + i * TG_NX, TG_NX * sizeof(double));
+    memset(h, 0, TG_Z * sizeof *h);
+    memcpy(h, s->C + i * TG_NX, TG_NX * sizeof *h);
     for (int j = 0; j < TG_NW; j++)
-        plain[TG_NX + j] = s->on_output[i * TG_NW + j];
+        h[TG_NX + j] = s->on_output[i * TG_NW + j];
+    for (int r = 0; r < TG_NG; r++)
+        if (s->controlled[r] == i) {
+            double share = lag_share(c, r);
+            for (int j = 0; j < TG_NX; j++)
+                h[j] *= share;
+            h[TG_L + r] = 1.0 - share;
+            h[TG_L + TG_NG + r] = (shown[r] - output(c, i, x)) * share * share / s->dt;
+        }
+}
+
+/* The same for a reading of now; between two samples times the derivative of the state there. */
+static void sensitivity(const tg_controller *c, int i, double *h)
+{
+    double plain[TG_Z];
+    plain_sensitivity(c, i, tg_now(c), shown_now(c), plain);
     if (!(c->share > 0.0)) {
         memcpy(h, plain, sizeof plain);
         return;
@@ -117,18 +147,52 @@ static void eliminate(double *S, double *B)
         }
 }
 
+/* Change the states; where a lag would leave its range, to the mean, given that it is at its end. */
+static void apply(tg_controller *c, double *change)
+{
+    const tg_design *s = c->design;
+    for (int r = 0; r < TG_NG; r++) {
+        int at = TG_L + TG_NG + r;
+        double lag = c->lag[r] + change[at];
+        double beyond = lag - fmin(fmax(lag, 0.0), LONGEST_LAG * s->dt), share;
+        if (beyond == 0.0)
+            continue;
+        share = beyond / c->P[at * (TG_Z + 1)];
+        for (int j = 0; j < TG_Z; j++)
+            change[j] -= c->held[j] ? 0.0 : c->P[j * TG_Z + at] * share;
+    }
+    for (int k = 0; k < TG_NW; k++) {
+        double w = c->w[k] + change[TG_NX + k];
+        for (int j = 0; j < TG_NU; j++)
+            if (s->on_drive[j * TG_NW + k] != 0.0)
+                w = fmin(fmax(w, -LARGEST_BIAS), LARGEST_BIAS);
+        change[TG_NX + k] = w - c->w[k];
+        c->w[k] = w;
+    }
+    for (int r = 0; r < TG_NG; r++) {
+        double lag = fmin(fmax(c->lag[r] + change[TG_L + TG_NG + r], 0.0), LONGEST_LAG * s->dt);
+        change[TG_L + TG_NG + r] = lag - c->lag[r];
+        c->lag[r] = lag;
+    }
+    for (int i = 0; c->share > 0.0 && i < TG_NX; i++)
+        c->ahead[i] += seen_by(c->jacobian + i * TG_Z, change);
+    for (int j = 0; j < TG_NX; j++)
+        c->x[j] += change[j];
+    for (int r = 0; r < TG_NG; r++) {
+        if (c->share > 0.0)
+            c->shown_ahead[r] += seen_by(c->jacobian + (TG_L + r) * TG_Z, change);
+        c->shown[r] += change[TG_L + r];
+    }
+}
+
 /* A lost reading is given no weight: its row of H P is 0. R: variances of the reading. */
 static void correct(tg_controller *c, const double *y, const double *R, double remember)
 {
-    const tg_design *s = c->design;
     double off[TG_NY], S[TG_NY * TG_NY], HP[TG_NY * TG_Z], gain[TG_NY * TG_Z], PH[TG_NY * TG_Z];
-    double H[TG_NY * TG_Z], change[TG_Z];
+    double H[TG_NY * TG_Z], change[TG_Z] = {0.0};
     tg_expected(c, off);
     for (int a = 0; a < TG_NY; a++)
         sensitivity(c, a, H + a * TG_Z);
-    memcpy(change, c->x, TG_NX * sizeof(double));
-    for (int j = 0; j < TG_NW; j++)
-        change[TG_NX + j] = c->w[j];
     for (int a = 0; a < TG_NY; a++) {
         int seen = isfinite(y[a]);
         off[a] = seen ? y[a] - off[a] : 0.0;
@@ -150,21 +214,8 @@ static void correct(tg_controller *c, const double *y, const double *R, double r
         for (int j = 0; j < TG_Z; j++) {
             if (c->held[j])
                 gain[a * TG_Z + j] = 0.0;
-            if (j < TG_NX)
-                c->x[j] += gain[a * TG_Z + j] * off[a];
-            else
-                c->w[j - TG_NX] += gain[a * TG_Z + j] * off[a];
+            change[j] += gain[a * TG_Z + j] * off[a];
         }
-    for (int k = 0; k < TG_NW; k++)
-        for (int j = 0; j < TG_NU; j++)
-            if (s->on_drive[j * TG_NW + k] != 0.0)
-                c->w[k] = fmin(fmax(c->w[k], -LARGEST_BIAS), LARGEST_BIAS);
-    for (int j = 0; j < TG_NX; j++)
-        change[j] = c->x[j] - change[j];
-    for (int j = 0; j < TG_NW; j++)
-        change[TG_NX + j] = c->w[j] - change[TG_NX + j];
-    for (int i = 0; c->share > 0.0 && i < TG_NX; i++)
-        c->ahead[i] += seen_by(c->jacobian + i * TG_Z, change);
     /* Joseph's form, right for any gain: P1 = P - K H P, P2 = P1 - P1 H'K' + K R K' */
     for (int a = 0; a < TG_NY; a++)
         for (int i = 0; i < TG_Z; i++)
@@ -177,6 +228,7 @@ static void correct(tg_controller *c, const double *y, const double *R, double r
         for (int i = 0; i < TG_Z; i++)
             for (int j = 0; j < TG_Z; j++)
                 c->P[i * TG_Z + j] += (gain[a * TG_Z + i] * R[a] - PH[a * TG_Z + i]) * gain[a * TG_Z + j];
+    apply(c, change);
 }
 
 void tg_observer_update(tg_controller *c, const double *y) { correct(c, y, c->design->R, REMEMBER); }
@@ -188,6 +240,12 @@ void tg_observer_set_offsets(tg_controller *c, const double *y, const int *which
     for (int i = 0; i < TG_NY; i++)
         if (which[i] && isfinite(y[i]))
             c->found_offset[i] += y[i] - mean[i];
+}
+
+void tg_observer_expect_lags(tg_controller *c)
+{
+    for (int r = 0; r < TG_NG; r++)
+        c->P[(TG_L + TG_NG + r) * (TG_Z + 1)] = PRIOR_LAG * PRIOR_LAG * c->design->dt * c->design->dt;
 }
 
 /* Start at rest: one update of a plant that may have been held by any drive, whose sensors may be off. */
@@ -216,8 +274,21 @@ void tg_observer_reset(tg_controller *c, const double *y, const double *d)
         memcpy(c->P + i * TG_Z, s->P_rest + i * TG_NX, TG_NX * sizeof(double));
     for (int k = 0; k < TG_NW; k++)
         c->P[(TG_NX + k) * (TG_Z + 1)] = s->P0[k];
+    memset(c->lag, 0, sizeof c->lag);
+    for (int r = 0; r < TG_NG; r++)
+        c->shown[r] = output(c, s->controlled[r], c->x);
     stand_on_sample(c);
     correct(c, y, s->R_start, 0.0);
+    for (int r = 0; r < TG_NG; r++) { /* at rest every output shows what the model has */
+        int at = TG_L + r, i = s->controlled[r];
+        double row[TG_Z], h[TG_Z] = {0.0};
+        memcpy(h, s->C + i * TG_NX, TG_NX * sizeof(double));
+        measure(c, h, row);
+        row[at] = seen_by(h, row);
+        for (int j = 0; j < TG_Z; j++)
+            c->P[at * TG_Z + j] = c->P[j * TG_Z + at] = row[j];
+        c->shown[r] = output(c, i, c->x);
+    }
     tg_observer_set_offsets(c, y, s->fixed);
 }
 
@@ -259,8 +330,14 @@ static const double *sample_jacobian(tg_controller *c, const double *u, const do
             c->jacobian[i * TG_Z + TG_NX + k] = sum;
         }
     }
-    for (int k = 0; k < TG_NW; k++)
-        c->jacobian[(TG_NX + k) * TG_Z + TG_NX + k] = 1.0;
+    for (int r = 0; r < TG_NG; r++) {
+        double *row = c->jacobian + (TG_L + r) * TG_Z;
+        plain_sensitivity(c, s->controlled[r], c->x, c->shown, row);
+        memset(row + TG_NX, 0, TG_NW * sizeof(double)); /* without the biases */
+    }
+    for (int k = TG_NX; k < TG_Z; k++)
+        if (k < TG_L || k >= TG_L + TG_NG)
+            c->jacobian[k * (TG_Z + 1)] = 1.0;
     return now;
 }
 
@@ -487,6 +564,8 @@ void tg_observer_predict(tg_controller *c, const double *u, const double *d)
     for (int j = 0; j < TG_ND; j++)
         on_d[j] += d[j];
     sample_jacobian(c, on_u, on_d, next);
+    for (int r = 0; r < TG_NG; r++)
+        c->shown[r] += lag_share(c, r) * (output(c, s->controlled[r], c->x) - c->shown[r]);
     memcpy(c->x, next, sizeof c->x);
     /* P = J P J' + Q; J is sparse in its last rows, and often in all */
     memset(c->spare, 0, sizeof c->spare);
@@ -541,6 +620,8 @@ void tg_observer_look(tg_controller *c, const double *d)
     sample_jacobian(c, on_u, on_d, next);
     for (int i = 0; i < TG_NX; i++)
         c->ahead[i] = (1.0 - share) * c->x[i] + share * next[i];
+    for (int r = 0; r < TG_NG; r++)
+        c->shown_ahead[r] = c->shown[r] + share * lag_share(c, r) * (output(c, s->controlled[r], c->x) - c->shown[r]);
     for (int i = 0; i < TG_Z; i++) {
         for (int j = 0; j < TG_Z; j++)
             c->jacobian[i * TG_Z + j] = share * c->jacobian[i * TG_Z + j] + (i == j ? 1.0 - share : 0.0);

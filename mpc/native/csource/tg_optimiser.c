@@ -141,7 +141,7 @@ static double merit(const tg_controller *c, const double *plan, const double *y,
         for (int j = 0; j < TG_NU; j++) {
             double value = plan[b * TG_NU + j];
             double step = (value - (b ? plan[(b - 1) * TG_NU + j] : last[j])) / s->span[j];
-            cost += s->move * step * step;
+            cost += c->caution * s->move * step * step;
             value /= s->span[j];
             cost += s->drive * value * value * s->blocks[b];
         }
@@ -211,6 +211,7 @@ static void set_cost(tg_controller *c, const double *target, const double *last)
 {
     const tg_design *s = c->design;
     tg_qp *q = &c->qp;
+    double weight_of_moves = c->caution * s->move;
     int n = q->n, k = 0;
     memset(q->f, 0, sizeof q->f);
     for (int i = 0; i < n; i++)
@@ -231,11 +232,11 @@ static void set_cost(tg_controller *c, const double *target, const double *last)
     for (int b = 0; b < s->n_b; b++)
         for (int j = 0; j < TG_NU; j++) {
             int i = b * TG_NU + j;
-            q->H[(size_t)i * (TG_Q_N + 1)] += 2.0 * (s->move * (b < s->n_b - 1 ? 2.0 : 1.0) + s->drive * s->blocks[b]);
+            q->H[(size_t)i * (TG_Q_N + 1)] += 2.0 * (weight_of_moves * (b < s->n_b - 1 ? 2.0 : 1.0) + s->drive * s->blocks[b]);
             if (b)
-                q->H[(size_t)i * TG_Q_N + (size_t)(i - TG_NU)] -= 2.0 * s->move;
+                q->H[(size_t)i * TG_Q_N + (size_t)(i - TG_NU)] -= 2.0 * weight_of_moves;
             else
-                q->f[i] -= 2.0 * s->move * last[j] / s->span[j];
+                q->f[i] -= 2.0 * weight_of_moves * last[j] / s->span[j];
         }
 }
 

@@ -360,3 +360,49 @@ def test_more_disturbances_than_outputs_cannot_be_distinguished():
 def test_an_unseen_mode_that_does_not_decay_is_not_detectable():
     A, C = np.diag([0.9, 1.0]), np.array([[1.0, 0.0]])
     assert detectability_margin(A, C, np.array([[0.1], [0.0]]), np.zeros((1, 1))) == 0
+
+
+def lag_observer() -> Observer:
+    quiet = ObserverNoise(state=1e-4, drive=1e-4, output=1e-4)
+    observer = Observer(MODEL, CHOSEN, quiet, lagged=[1])
+    observer.reset(LEVEL + OFFSET, np.array([25.0]))
+    observer.w, observer.found_offset = np.zeros(2), np.zeros(2)
+    observer._P = np.zeros_like(observer._P)  # all is known but the lag
+    observer.expect_lags()
+    return observer
+
+
+def test_what_a_lagging_output_shows_has_the_derivatives_of_a_first_order_lag() -> None:
+    observer, x = lag_observer(), np.array([31.0, 26.0])
+    observer.shown, observer.lag = np.array([24.0]), np.array([3.0])
+    y, H = observer._shows(x, observer.shown)
+    plain = MODEL.output(x)
+    np.testing.assert_allclose(y, [plain[0], 24.0 + 0.4 * (plain[1] - 24.0)])  # 2 s of 2 s and 3 s
+    for column, eps in ((0, [1e-6, 0]), (1, [0, 1e-6])):
+        np.testing.assert_allclose(
+            H[:, column], (observer._shows(x + eps, observer.shown)[0] - y) / 1e-6, atol=1e-6
+        )
+    np.testing.assert_allclose(H[:, -2], (observer._shows(x, observer.shown + 1e-6)[0] - y) / 1e-6, atol=1e-6)
+    observer.lag = observer.lag + 1e-6
+    np.testing.assert_allclose(H[:, -1], (observer._shows(x, observer.shown)[0] - y) / 1e-6, atol=1e-5)
+
+
+@pytest.mark.parametrize(("lag", "found"), [(0.0, 0.0), (5.0, 5.0), (30.0, 12.0)])
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_a_lag_is_learnt_from_a_rise_and_stays_between_none_and_six_samples(lag, found, share) -> None:
+    observer, d = lag_observer(), np.array([25.0])
+    x, shown = observer.x.copy(), float(MODEL.output(observer.x)[1])
+    for k in range(60):
+        u = np.array([SPAN * k / 60])
+        shown += DT / (DT + lag) * (MODEL.output(x)[1] - shown)
+        after = MODEL.next_state(x, u, d)
+        ahead = shown + DT / (DT + lag) * (MODEL.output(after)[1] - shown)
+        y = MODEL.output((1 - share) * x + share * after)
+        y[1] = (1 - share) * shown + share * ahead  # as the filter has it between samples
+        observer.advance(share * DT, u, d)
+        observer.look(d)
+        observer.update(y + OFFSET)
+        observer.advance((1 - share) * DT, u, d)
+        assert 0.0 <= observer.lag[0] <= 12.0
+        x = after
+    assert observer.lag[0] == pytest.approx(found, abs=0.3)

@@ -97,3 +97,35 @@ def test_what_the_model_does_not_explain_is_reported_of_the_drive_first(
 )
 def test_a_switch_is_off_below_a_half_and_only_where_it_is_read(reading: dict[str, float], off: bool):
     assert is_off(("a", "b"), reading) == off
+
+
+def lagging(lag: float, sd: float, drive: float = 0.0) -> SimpleNamespace:
+    """Return an observer of outputs a and b, of which b lags, whose drive is off by so much of its range."""
+    chosen = SimpleNamespace(on_drive=np.array([[1.0, 0.0]]))
+    model = SimpleNamespace(dt=2.0, outputs=("a", "b"))
+    P = np.diag([1.0, 1.0, 1.0, 9.0, sd**2])
+    return SimpleNamespace(
+        lag=np.array([lag]), lagged=[1], model=model, disturbance=chosen, w=np.array([drive, 9.0]),
+        estimate=lambda: {"P": P},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        ([(1.1, 0.2)] * 5, "00111"),  # more than half a sample of 2 s, and five standard deviations
+        ([(1.1, 0.2)] * 2 + [(0.9, 0.1)] + [(1.1, 0.2)] * 3, "000001"),  # in a row
+        ([(1.1, 0.25)] * 4 + [(4.0, 0.51)] * 4, "00000000"),  # or not surely
+        ([(4.0, 0.49)] * 3 + [(0.6, 3.0), (0.4, 0.01), (0.6, 0.01)], "001100"),  # it stays to a quarter
+        ([(1.1, 0.2, -0.3)] * 3 + [(1.1, 0.2, 0.29)] * 3, "000001"),  # a weak drive explains more
+    ],
+)
+def test_a_lag_is_reported_once_it_is_sure_and_until_it_is_small(rows: list[tuple[float, ...]], said: str):
+    monitor = ReadingMonitor(2, 1)
+    found = [monitor.slower(lagging(*row)) for row in rows]
+    assert "".join("01"[bool(text)] for text in found) == said
+    assert set(found) <= {""} | {
+        f"b is slower than the model by about {row[0]:.2g} s: identify the plant anew" for row in rows
+    }
+    monitor.forget(EXPECTED)
+    assert not monitor.slower(lagging(1.1, 0.2))

@@ -24,7 +24,8 @@ def test_a_search_has_room_for_its_variants_and_an_export_for_itself():
     assert N <= wide.NH < N + 32
     model = controller.model
     assert (model.n_x, 2, model.n_d, 2) == (tight.NX, tight.NU, tight.ND, tight.NY)
-    assert (5, 6, model.n_x + controller.disturbance.n_w) == (tight.NK, tight.NM, tight.NZ)
+    assert (tight.NG, wide.NG) == (1, 1)
+    assert (5, 6, model.n_x + controller.disturbance.n_w + 2) == (tight.NK, tight.NM, tight.NZ)
 
 
 def test_numbers_of_a_design_are_the_plants_offsets_and_its_rest_in_any_room():

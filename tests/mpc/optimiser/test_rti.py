@@ -307,3 +307,18 @@ def test_the_bias_of_a_drive_counts_where_the_range_is_looked_for(optimiser, mon
         wanted = (PLANS[0], [3.0, -5.0], np.ones((3, 2)), LAST, more)
         for value, want in zip(asked.pop(), wanted, strict=True):
             np.testing.assert_allclose(value, want, rtol=1e-9)
+
+
+@pytest.mark.parametrize("compiled", WAYS)
+def test_caution_counts_as_so_many_times_the_weight_of_moves(compiled):
+    plant = crossed()
+    design = replace(design_controller(plant, dt=2.0).design, move=0.5, price=0.0)
+    more = Controller(plant, replace(design, move=2.0), compiled=compiled).optimiser
+    own = Controller(plant, design, compiled=compiled).optimiser
+    sample = Sample(
+        np.array([24.0, 22.0]), np.array([20.0, 30.0]), np.full((own.n_b, 2), 25.0), np.array([20.0]),
+        np.array([30.0, 28.0]), np.ones(2), np.zeros(2), np.zeros(2), caution=4.0,
+    )  # fmt: skip
+    cautious, plain = own.solve(sample).plan, own.solve(sample._replace(caution=1.0)).plan
+    np.testing.assert_allclose(cautious, more.solve(sample._replace(caution=1.0)).plan, atol=1e-6)
+    assert np.abs(plain - cautious).max() > 1.0
