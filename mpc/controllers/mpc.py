@@ -424,8 +424,8 @@ class Controller(SampledController):
             x = self.model.next_state(x, last + observer.drive_bias, d)
         guess, biases = self._guess(wanted, last), (observer.output_bias, observer.drive_bias)
         caution = min(max(1.0, float(np.max(np.abs(observer.innovation))) / _CAUTION), _MOST_CAUTION)
-        about = {"slew_s": self._slew_s, "lost": self._lost, "caution": caution}
-        return self.optimiser.solve(Sample(x, last, guess, d, wanted, self._side, *biases, **about))
+        sample = Sample(x, last, guess, d, wanted, self._side, *biases, self._slew_s, self._lost, caution)
+        return self.optimiser.solve(sample)
 
     def _guess(self, wanted: Array, last: Array) -> Array:
         """Return the plan to linearise along: the last one, shifted, by blocks; else the drive of now."""
