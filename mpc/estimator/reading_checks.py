@@ -16,8 +16,8 @@ that only what each sample adds is summed, not where the model would have gone b
 **A plant that does not follow.**  The bias that the observer had to assume for the drive is beyond 30 % of
 its range, or that of an output 2 degC: a pump that is off, a plug that has fallen off, another plant.
 
-**A plant that is slower.**  The observer has found an output to lag behind the model by more than half a
-sample and five standard deviations, in three samples in a row, from readings that show it to a quarter of a
+**A plant that is slower.**  The observer has found an output to lag behind the model by more than 0.65
+of a sample and five standard deviations, in five in a row, from readings that show it to a quarter of a
 sample: a structure that the model lacks.  (Where a drive is far from the model, a lag explains too little to
 be believed.)  It is reported until the lag is below a quarter of a sample.
 """
@@ -42,8 +42,8 @@ _FOLLOWS_DRIVE = 0.3  # of its range: a larger bias of a drive is not a small er
 _FOLLOWS_OUTPUT = 2.0  # degC: a larger bias of an output is not a small error of the model
 
 # of a lag behind the model: least, least once reported, largest standard deviation [samples], least in those
-_SLOWER, _STILL_SLOWER, _SHOWN_TO, _SLOWER_SD = 0.5, 0.25, 0.25, 5.0
-_SLOW_FOR = 3  # samples in a row, until it is reported
+_SLOWER, _STILL_SLOWER, _SHOWN_TO, _SLOWER_SD = 0.65, 0.25, 0.25, 5.0
+_SLOW_FOR = 5  # samples in a row, until it is reported
 
 
 class ReadingMonitor:

@@ -25,11 +25,11 @@
 #define FOLLOWS_OUTPUT 2.0  /* degC: a larger bias of an output is not a small error of the model */
 #define CAUTION 3.0      /* standard deviations of a mean innovation, from which on moves weigh more, */
 #define MOST_CAUTION 30.0 /* and at most so many times */
-#define SLOWER 0.5        /* samples that an output lags behind the model: a structure that the model lacks; */
+#define SLOWER 0.65       /* samples that an output lags behind the model: a structure that the model lacks; */
 #define STILL_SLOWER 0.25 /* the same once that is reported, */
 #define SHOWN_TO 0.25     /* its largest standard deviation, */
 #define SLOWER_SD 5.0     /* the least lag in those, */
-#define SLOW_FOR 3        /* and for so many samples in a row */
+#define SLOW_FOR 5        /* and for so many samples in a row */
 #define COLDEST (-60.0)
 #define HOTTEST 200.0
 #define TINY 1e-9
