@@ -198,7 +198,12 @@ class PosteriorClassifier(GraspClassifier):
         """Return in words which blocks rested longer between touches than those of the training."""
         known = (self.coupling_ or Coupling()).longest_rest
         words = f"rested longer than the {known:g} s of the training: the answer may be too confident"
-        return [words if long else "" for long in rested_long(grasps, self.coupling_)]
+        notes = [words if long else "" for long in rested_long(grasps, self.coupling_)]
+        if self.device_.second is not None and "t_surface_2" in grasps:
+            joint = label_values(grasps, "touch_group") != ""
+            one = "of touches of one block the second sensor is not read"
+            notes = [word or (one if group else "") for word, group in zip(notes, joint)]
+        return notes
 
     def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """Return how long contacts of the training lasted; the device has a file of its own."""

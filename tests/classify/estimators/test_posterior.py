@@ -103,6 +103,9 @@ def test_a_second_sensor_is_part_of_the_answer_where_there_is_one(fresh: Grasps,
     assert np.array_equal(one.predict(both), two.predict(both))
     again = load_classifier(save_classifier(two, tmp_path))
     np.testing.assert_array_equal(again.predict_log_proba(both), two.predict_log_proba(both))
+    one_block = both.assign(touch_group=("grasp", ["a", "a", *[""] * 7]))
+    assert [bool(why) for why in two.beyond_training(one_block)] == [True, True, *[False] * 7]
+    assert not any(one.beyond_training(one_block))
     widths = [
         [row.t_object_p95 - row.t_object_p05 for row in effusivity_posterior(m.device_, both)]
         for m in (one, two)
