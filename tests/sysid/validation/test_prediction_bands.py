@@ -92,6 +92,8 @@ def first_order(gain=1.0, logs=("a",)):
 
 def test_another_run_adds_what_its_gain_changes(schedule):
     schedule = schedule.assign({name: 0.0 * schedule[name] for name in ("t1", "t2")})
+    for name in ("q1", "q2"):
+        schedule[name] = schedule[name].copy(data=schedule[name].values - schedule[name].values.min())
     plant = first_order()
     run = plant.simulate(schedule)
     added = between_runs(plant, [schedule])
@@ -104,6 +106,17 @@ def test_another_run_adds_what_its_gain_changes(schedule):
         np.testing.assert_allclose(both[name], [*added[name], *added[name][:20]], atol=1e-12)
     assert between_runs(first_order(logs=()), [schedule]) == {}
     assert between_runs(first_order(logs=("a", "b", "c")), [schedule]) == {}
+
+
+@pytest.mark.parametrize(("shift", "least"), [(0.0, 0.0), (3.0, 3.0), (-3.0, -2.0)])
+def test_an_input_that_never_was_0_varies_about_its_value_nearest_to_0(shift, least):
+    q = np.repeat([0.0, 1.0, 0.2, 0.7], 100) + shift  # 0 to 1, 3 to 4, -3 to -2
+    model = StateSpaceModel(("q",), (), ("t",), A=[[0.5]], B=[[2.0]], C=[[1.0]], dt=1.0)
+    time = np.arange(400.0)
+    log = make_log(time, {"q": (q, "1", "input"), "t": (0.0 * time, "degC", "output")})
+    added = between_runs(Plant(model, {}, dt=1.0, logs=("a",)), [log])["t"]
+    ends = [99, 199, 299, 399]  # at rest, with a gain of 4
+    np.testing.assert_allclose(added[ends], 0.05 * 4 * (q[ends] - least), atol=1e-6)
 
 
 def test_a_switch_has_no_gain_that_varies(schedule):
