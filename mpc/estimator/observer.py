@@ -43,11 +43,9 @@ controlled output is read through a lag T of its own, 0 at the start and never b
 
     s+ = s + a (C x - s),     y = s + a (C x - s) + biases,     a = dt / (dt + T),
 
-with s, what was shown last, and T among the states of the filter.  What the model does not have it learns
-within a rise, from how the readings lag behind its x.  The plan still brings x to the target, not s:
-whether the skin is slow or its sensor, what follows x through a lag does not go beyond it.  A lag that is
-surely there is reported (:mod:`thermogrip.mpc.estimator.reading_checks`).  Where T would be negative (or
-beyond six samples) the estimate is the conditional mean at that end [2]_.
+with s, what was shown last, and T among the states of the filter.  The plan still brings x to the target,
+not s: whether the skin is slow or its sensor, what follows x through a lag does not go beyond it.  Where T
+would be negative, or beyond six samples, the estimate is the conditional mean at that end [2]_.
 
 References
 ----------
