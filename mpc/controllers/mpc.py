@@ -18,8 +18,8 @@ A loop must never be left without an answer, so every failure has a next best on
 * ``off``: no reading to act on, or the pump is off; the drive goes to zero;
 * ``mismatch``: the optimiser's move, as for a plant that is known to be slower than the model.
 
-Where mean innovations are beyond 3 standard deviations, the weight of moves is multiplied by their third, up to
-30 times: a gain that is off by 30 % does not swing.
+Where mean innovations exceed 3 standard deviations, the weight of moves is multiplied by their third, up
+to 30 times: a gain that is off by 30 % does not swing.
 
 Whatever the status, a drive is finite, inside its range, and within the slew limit of the one before.  What
 cannot be a reading is found by :mod:`thermogrip.mpc.estimator.reading_checks`.
