@@ -68,11 +68,11 @@ def test_the_verbs_are_those_of_the_contract() -> None:
 #: Each verb's arguments and options as scripts use them: =default, >least, <most.
 OPTIONS = """
 demo: --out=thermogrip-demo --seed=0>0 --workers=2>1 --cluster --json=False
-identify: LOGS --out --network --inputs --outputs --disturbances --columns --dt>1e-09
+identify: LOG... --out --network --inputs --outputs --disturbances --columns --dt>1e-09
   --models=arx,oe,subspace,sindy,neural,network --average>0 --order>1<20 --delay>1<20
   --leave-one-out=False --grow=False --posterior/--no-posterior=False --report --seed=0>0 --workers=1>1
   --json=False
-validate: PLANT LOGS --warmup=5.0>0 --score-from=5.0>0 --average>0 --network --columns --dt>1e-09
+validate: PLANT LOG... --warmup=5.0>0 --score-from=5.0>0 --average>0 --network --columns --dt>1e-09
   --report --seed=0>0 --json=False
 simulate: PLANT LOG --out --warmup=5.0>0 --bands=False --network --columns --dt>1e-09 --seed=0>0
   --json=False
@@ -88,18 +88,18 @@ run: CONTROLLER --target --out --port --protocol --speed=1.0>0.01 --twin --draw=
 record: SCHEDULE --port --out --protocol --sample=1.0>0.05 --guard --speed=1.0>0.01 --seed=0>0 --json=False
 virtual: --protocol=thermogrip --plant --pty=False --socket>0<65535 --speed=1.0>0.01 --from --ambient=23.0
   --object --material --fault --seconds>0 --seed=0>0 --json=False
-batch: CONTROLLER PLAN --out --port --protocol --speed=1.0>0.01 --twin --draw=0>0 --grasp-time=10.0>0.5
+batch: CONTROLLER PLAN.csv --out --port --protocol --speed=1.0>0.01 --twin --draw=0>0 --grasp-time=10.0>0.5
   --stop-early --settle-timeout=900.0>1 --guard --learn --ask/--no-ask=True --network --seed=0>0 --json=False
-recover: FOLDER --out --bad --json=False
-effusivity: GRASPS --out --calibrate --object-range --seed=0>0 --json=False
-train: GRASPS --classifier --out --split --stop-error>0.001<0.5 --quick=False --seed=0>0 --json=False
-classify: MODEL_DIR GRASPS --out --materials --early=False --next-touch=False --or-unknown=False
+recover: DIR --out --bad --json=False
+effusivity: GRASPS... --out --calibrate --object-range --seed=0>0 --json=False
+train: GRASPS... --classifier --out --split --stop-error>0.001<0.5 --quick=False --seed=0>0 --json=False
+classify: MODEL_DIR GRASPS... --out --materials --early=False --next-touch=False --or-unknown=False
   --other-gripper=False --known --object-range --seed=0>0 --json=False
-compare: GRASPS --out --test --classifiers --repeats=20>0 --train-per-class=5>1 --by --curves=False
+compare: GRASPS... --out --test --classifiers --repeats=20>0 --train-per-class=5>1 --by --curves=False
   --quick=False --seed=0>0 --workers=1>1 --cluster --json=False
 paper: --out --quick=False --seed=0>0 --workers=1>1 --cluster --json=False
-materials: NAME --json=False
-init: WHAT --like --out --json=False
+materials: [NAME] --json=False
+init: spec|network|topics|guard|examples --like --out --json=False
 """
 
 
@@ -112,7 +112,7 @@ def options_of(command: Any) -> str:
         default = "" if parameter.default in (parameter.empty, None) else f"={parameter.default}"
         limits = [f"{sign}{end:g}" for sign, end in ((">", info.min), ("<", info.max)) if end is not None]
         names = [text for text in (info.default, *(info.param_decls or ())) if str(text).startswith("--")]
-        words.append("".join([names[0] if names else name.upper(), default, *limits]))
+        words.append("".join([names[0] if names else info.metavar, default, *limits]))
     return " ".join(words)
 
 
