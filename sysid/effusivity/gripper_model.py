@@ -511,11 +511,6 @@ def load_default_gripper() -> GripperModel:
         replace(calibrate(), uncertainty=None).save('sysid/data/gripper_device.json')"
 
     It keeps no covariance: its numbers count as exact.
-
-    Examples
-    --------
-    >>> load_default_gripper().materials
-    ('brass', 'copper', 'iron', 'wood', 'zinc')
     """
     path = resources.files("thermogrip.sysid.effusivity") / "data" / "gripper_device.json"
     with resources.as_file(path) as file:

@@ -69,26 +69,12 @@ def material_fit(
 ) -> MaterialFit:  # fmt: skip
     """Return the fit of each candidate to each grasp.
 
-    Parameters
-    ----------
-    gripper : GripperModel
-    grasps : Grasps
-        ``t_object`` and ``t_object_sd`` may be NaN: without a temperature the prior is wide, without its sd
-        it is the spread of the training grasps.
-    candidates : sequence of str or Material
-        Labels that the gripper was calibrated with, or names or rows of the library, whose contact
-        conductance is not known.
-    finish : {"known", "unknown"}, optional
-        Whether the blocks are those of the calibration, or others of the same materials.
-    until : float, optional
-        Leave out the samples after this time [s].
-    start : (n_grasp, n_candidate, 7) ndarray, optional
-        ``u`` of the fit to fewer readings: the answer is the same, and sooner there.
-
-    Raises
-    ------
-    UserError
-        If a candidate is nowhere known or named twice, or a grasp has too few samples.
+    Candidates are labels that the gripper was calibrated with, or names or rows of the library, whose contact
+    conductance is not known; one that is nowhere known or named twice raises a UserError.  ``finish`` says
+    whether the blocks are those of the calibration ("known") or others of the same materials ("unknown");
+    samples after ``until`` [s] are left out; ``start`` (n_grasp, n_candidate, 7) is ``u`` of a fit to fewer
+    readings, from which the same answer is found sooner.  Without a ``t_object`` its prior is wide, without
+    its sd that is the spread of the training grasps.
     """
     data = touches(grasps, until=until)
     mode, prior, _ = fit_candidates(gripper, data, candidates, finish, start=start)
@@ -106,19 +92,8 @@ def material_evidence(
     gripper: GripperModel, grasps: Grasps, candidates: Sequence[str | Material], *, finish: str = "known",
     until: float | None = None,
 ) -> Array:  # fmt: skip
-    """Return the log evidence of each candidate for each grasp, shape (n_grasp, n_candidate).
-
-    Parameters are those of :func:`material_fit`.
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
-    >>> grasps = load_example_grasps()["exp2_dT20"].isel(grasp=slice(5, 7))
-    >>> evidence = material_evidence(load_default_gripper(), grasps, ["copper", "iron", "wood"])
-    >>> evidence.shape, bool((evidence[:, 0] > evidence[:, 2] + 100).all())
-    ((2, 3), True)
-    """
+    """Return the log evidence of each candidate for each grasp, shape (n_grasp, n_candidate), with the
+    arguments of :func:`material_fit`."""
     return material_fit(gripper, grasps, candidates, finish=finish, until=until).log_evidence
 
 
@@ -126,20 +101,7 @@ def material_posterior(
     gripper: GripperModel, grasps: Grasps, candidates: Sequence[str | Material], *, finish: str = "known",
     until: float | None = None,
 ) -> Array:  # fmt: skip
-    """Return probabilities of the candidates, (n_grasp, n_candidate), at equal prior odds; rows sum to 1.
-
-    Parameters are those of :func:`material_fit`.
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
-    >>> grasps = load_example_grasps()["exp2_dT20"].isel(grasp=slice(5, 8))
-    >>> grasps["material"].values.tolist()
-    ['copper', 'copper', 'copper']
-    >>> material_posterior(load_default_gripper(), grasps, ["copper", "wood"]).round(3)[:, 0]
-    array([1., 1., 1.])
-    """
+    """Return probabilities of the candidates, (n_grasp, n_candidate), at equal prior odds; rows sum to 1."""
     evidence = material_evidence(gripper, grasps, candidates, finish=finish, until=until)
     return np.asarray(np.exp(evidence - logsumexp(evidence, axis=1, keepdims=True)))
 
@@ -150,26 +112,8 @@ def open_set(
 ) -> OpenSet:  # fmt: skip
     """Return log Bayes factors of "one of the candidates" against "something of any effusivity".
 
-    Parameters
-    ----------
-    gripper, grasps, candidates, until
-        As in :func:`material_fit`; the candidates have equal odds and known conductances.
-    prior_unknown : float, optional
-        Prior probability that the object is none of them, in (0, 1).
-
-    Returns
-    -------
-    OpenSet
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
-    >>> files = load_example_grasps()
-    >>> cork = files["exp6_other_materials_obj43_grip23"]
-    >>> cork = cork.isel(grasp=cork["material"].values == "cork")
-    >>> bool((open_set(load_default_gripper(), cork, ["copper", "iron", "wood"]).p_unknown > 0.99).all())
-    True
+    Arguments are those of :func:`material_fit`; the candidates have equal odds and known conductances, and
+    ``prior_unknown``, in (0, 1), is the probability that the object is none of them.
     """
     if not 0 < prior_unknown < 1:
         raise UserError(f"prior_unknown is {prior_unknown:g}", hint="give a probability between 0 and 1")
@@ -192,21 +136,8 @@ def effusivity_posterior(
     an insulator's own scatter from grasp to grasp.  Touches of one ``touch_group`` share the joint posterior
     of the effusivity; each row has the object's temperature at its own touch.
 
-    Parameters
-    ----------
-    gripper, grasps, until
-        As in :func:`material_fit`.
-    coupling : Coupling, optional
-        How blocks move between touches; default that of the example rig.
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
-    >>> grasps = load_example_grasps()["exp2_dT20"].isel(grasp=[5, 21])
-    >>> copper, wood = effusivity_posterior(load_default_gripper(), grasps)
-    >>> [row.effusivity_p05 < e < row.effusivity_p95 for row, e in ((copper, 3.64e4), (wood, 367.0))]
-    [True, True]
+    Arguments are those of :func:`material_fit`; ``coupling`` is how blocks move between touches, by default
+    those of the example rig.
     """
     rows = touch_groups(grasps) if has_touch_groups(grasps) else {}
     alone = np.setdiff1d(np.arange(grasps.sizes["grasp"]), np.concatenate([[], *rows.values()]).astype(int))
