@@ -406,3 +406,18 @@ def test_a_lag_is_learnt_from_a_rise_and_stays_between_none_and_six_samples(lag,
         assert 0.0 <= observer.lag[0] <= 12.0
         x = after
     assert observer.lag[0] == pytest.approx(found, abs=0.3)
+
+
+def test_where_a_lag_would_be_negative_the_estimate_is_that_without_one() -> None:
+    one, other = Observer(MODEL, CHOSEN, NOISE, lagged=[1]), Observer(MODEL, CHOSEN, NOISE)
+    for observer in (one, other):
+        observer.reset(LEVEL + OFFSET, np.array([25.0]))
+        observer.expect_lags()
+        for _ in range(2):
+            observer.predict(np.array([SPAN]), np.array([25.0]))
+    before = one.x
+    for observer in (one, other):
+        observer.update(observer.reading() + [0.2, 0.5])  # it rises faster than the model
+    assert one.lag[0] == pytest.approx(0.0, abs=1e-12)
+    assert np.abs(one.x - before).max() > 0.05
+    np.testing.assert_allclose([*one.x, *one.w], [*other.x, *other.w], atol=1e-9)

@@ -317,7 +317,7 @@ def test_caution_counts_as_so_many_times_the_weight_of_moves(compiled):
     own = Controller(plant, design, compiled=compiled).optimiser
     sample = Sample(
         np.array([24.0, 22.0]), np.array([20.0, 30.0]), np.full((own.n_b, 2), 25.0), np.array([20.0]),
-        np.array([30.0, 28.0]), np.ones(2), np.zeros(2), np.zeros(2), caution=4.0,
+        np.array([24.5, 24.5]), np.ones(2), np.zeros(2), np.zeros(2), caution=4.0,
     )  # fmt: skip
     cautious, plain = own.solve(sample).plan, own.solve(sample._replace(caution=1.0)).plan
     np.testing.assert_allclose(cautious, more.solve(sample._replace(caution=1.0)).plan, atol=1e-6)
