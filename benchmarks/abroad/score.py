@@ -3,9 +3,9 @@
     python benchmarks/abroad/score.py FOLDER [--sets luca,house] [--each]
 
 By set and output: the error stated (of two boards for another run, of the rest for the run itself), that on
-the other half, the share of its readings inside the 90 % band with the band's interval score; by set: the
-chosen model, whether it is called good, CPU seconds.  ``--each``: every black box beside it, fitted
-to the whole training half.
+the other half, the share of its readings inside the 90 % band with the band's interval score, of two boards
+by how much the gain is off on the other day; by set: the chosen model, whether it is called good, CPU
+seconds.  ``--each``: every black box beside it, fitted to the whole training half.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ import numpy as np
 from foreign_sets import SETS, ForeignSet, load
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import column
+from thermogrip.datasets.schema import Log, column
 from thermogrip.sysid import identify
 from thermogrip.sysid.blackbox.fit import BLACK_BOXES, fit_black_box
 from thermogrip.sysid.identification import stated_error
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run
-from thermogrip.sysid.validation.prediction_bands import free_run_band
+from thermogrip.sysid.validation.prediction_bands import between_runs, free_run_band
 
 
 def run_over(plant: Plant, some: ForeignSet) -> FreeRun:
@@ -34,6 +34,13 @@ def run_over(plant: Plant, some: ForeignSet) -> FreeRun:
 
 def mean_rmse(run: FreeRun) -> float:
     return float(np.mean([score.rmse for score in run.scores.values()]))
+
+
+def gain_off(plant: Plant, log: Log, output: str) -> float:
+    """Return by what share of the inputs' effect a run differs from the plant, by least squares."""
+    effect = between_runs(plant, [log], 1.0)[output]
+    miss = column(plant.simulate(log), output) - column(log, output)
+    return float(effect @ miss / (effect @ effect))
 
 
 def score_set(some: ForeignSet, each: bool) -> None:
@@ -62,7 +69,8 @@ def score_set(some: ForeignSet, each: bool) -> None:
         print(
             f"    {name}: stated {stated:.3g}, other half {score.rmse:.3g} "
             f"({score.rmse / stated:.2f} times), band holds {band.inside[name]:.2f}, "
-            f"interval score {interval:.3g}",
+            f"interval score {interval:.3g}"
+            + ("" if some.same_run else f", gain off by {gain_off(found.plant, some.test, name):+.3f}"),
             flush=True,
         )
     for row in dict.fromkeys((r.model, r.structure) for r in found.rows if r.held_out) if each else ():
