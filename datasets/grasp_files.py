@@ -81,7 +81,12 @@ def read_grasps(path: str | Path) -> Grasps:
     """
     if file_format(path) not in ("csv", "netcdf"):
         raise UserError("grasps are CSV or NetCDF", file=path, hint="use one of the two")
-    grasps = _read_netcdf(path) if file_format(path) == "netcdf" else _read_csv(path)
+    if file_format(path) == "netcdf":
+        grasps = _read_netcdf(path)
+    else:
+        samples, per_grasp, repairs = _read_csv(path)
+        grasps = make_grasps(*samples, **per_grasp)
+        grasps.attrs["repairs"] = "\n".join(repairs)
     time, seen = grasps["time"].values, np.isfinite(grasps["t_surface"].values)
     for side, has, hint in (
         ("before", seen[:, time < 0].any(axis=1), "time_s is 0 at the message; record from 2 s before"),
@@ -157,12 +162,13 @@ def read_grasp_files(paths: Sequence[str | Path]) -> list[Grasps]:
     files: list[Path] = []
     for path in map(Path, paths):
         files += _in_folder(path) if path.is_dir() else [path]
-    records = [read_grasps(path) for path in files]
-    stems = [log_name(grasps) for grasps in records]
-    for at, stem in enumerate(stems):
-        if stem in stems[:at]:
-            raise UserError("is given twice", file=files[at], hint="give each file once")
-    return records
+    records: dict[str, Grasps] = {}
+    for file in files:
+        grasps = read_grasps(file)
+        if log_name(grasps) in records:
+            raise UserError("is given twice", file=file, hint="give each file once")
+        records[log_name(grasps)] = grasps
+    return list(records.values())
 
 
 def shared_grasps(first: Sequence[Grasps], second: Sequence[Grasps]) -> list[str]:
@@ -389,16 +395,15 @@ def _with_defaults(per_grasp: dict[str, Any], n: int, stem: str) -> dict[str, An
     return filled
 
 
-def _read_csv(path: str | Path) -> Grasps:
+def _read_csv(path: str | Path) -> tuple[tuple[Floats, Floats, list[str]], dict[str, Any], list[str]]:
+    """Return time, samples and names of the grasps of a file, what is known of each, and repairs."""
     stem = file_stem(path)
     ids, time, channels, repairs = _read_samples(path)
     order, index = _in_order(ids)
     axis, gridded, more = _onto_one_axis(order, index, time, channels, str(path))
-    per_grasp = _read_meta(_meta_path(path), order, str(path))
-    grasps = make_grasps(axis, gridded["t_surface"], order, name=stem, t_surface_2=gridded.get("t_surface_2"),
-                         **_with_defaults(per_grasp, len(order), stem))  # fmt: skip
-    grasps.attrs["repairs"] = "\n".join(repairs + more)
-    return grasps
+    per_grasp = _with_defaults(_read_meta(_meta_path(path), order, str(path)), len(order), stem)
+    per_grasp |= {"name": stem, "t_surface_2": gridded.get("t_surface_2")}
+    return (axis, gridded["t_surface"], order), per_grasp, repairs + more
 
 
 def _read_netcdf(path: str | Path) -> Grasps:

@@ -90,11 +90,12 @@ def make_log(
     for key, (values, unit, role) in variables.items():
         log[key] = ("time", np.asarray(values, dtype=float), {"units": unit, "role": role})
     log.attrs.update(schema="thermogrip.log", version=1, name=name, repairs="\n".join(repairs))
-    return check_log(log)
+    check_log(log)
+    return log
 
 
-def check_log(log: Log) -> Log:
-    """Return the log as it is, or raise :class:`UserError` naming the variable and the rule it breaks."""
+def check_log(log: Log) -> None:
+    """Raise :class:`UserError` naming the variable of a log and the rule it breaks."""
     if "time" not in log.coords or log["time"].dims != ("time",):
         hint = "give the record a dimension 'time' in seconds"
         raise UserError("no time axis", file=log_name(log), hint=hint)
@@ -103,7 +104,6 @@ def check_log(log: Log) -> Log:
     for name, variable in log.data_vars.items():
         for problem, advice in _variable_faults(variable):
             raise UserError(problem, file=log_name(log), column=str(name), hint=advice)
-    return log
 
 
 def _time_faults(time: NDArray[np.float64]) -> Iterator[tuple[str, str]]:
@@ -222,14 +222,14 @@ def make_grasps(
             problem = f"a grasp has no {key!r}"
             raise UserError(problem, hint=f"use {', '.join([*GRASP_NUMBERS, *GRASP_LABELS])}")
     grasps.attrs.update(schema="thermogrip.grasps", version=1, name=name)
-    return check_grasps(grasps)
+    check_grasps(grasps)
+    return grasps
 
 
-def check_grasps(grasps: Grasps) -> Grasps:
-    """Return the record as it is, or raise :class:`UserError` naming the grasp and the rule it breaks."""
+def check_grasps(grasps: Grasps) -> None:
+    """Raise :class:`UserError` naming the grasp of a record and the rule it breaks."""
     for problem, hint in _grasp_faults(grasps):
         raise UserError(problem, file=log_name(grasps), hint=hint)
-    return grasps
 
 
 def _grasp_faults(grasps: Grasps) -> Iterator[tuple[str, str | None]]:

@@ -40,11 +40,12 @@ from thermogrip.classify.estimators.base import (
     record_list,
 )
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import csv_text
 from thermogrip.datasets.schema import Grasps, has_touch_groups, label_values, log_name, unit_names
-from thermogrip.sysid.effusivity.data import object_range, touches, with_object_range
+from thermogrip.sysid.effusivity.data import Touches, object_range, touches, with_object_range
 from thermogrip.sysid.effusivity.gripper_model import GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import (
     BUILD_UP,
@@ -59,7 +60,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     prior_of,
 )
 from thermogrip.sysid.effusivity.posterior import EffusivityRow
-from thermogrip.sysid.effusivity.quality import NO_CONTACT, begun, check_grasps
+from thermogrip.sysid.effusivity.quality import NO_CONTACT, check_grasps, number_values
 
 Row: TypeAlias = dict[str, Any]
 
@@ -116,7 +117,7 @@ def _answers(
     whole = not classifier.leaves_samples_out
     quality = check_grasps(grasps, longest=classifier.longest_, whole_traces=whole)
     notes = [note or more for note, more in zip(quality.note, classifier.beyond_training(grasps))]
-    usable, units = quality.usable_grasps(quality.read(grasps)), unit_names(grasps)
+    usable, units = quality.read(grasps), unit_names(grasps)
     found = [] if usable is None else _named(classifier, usable, names, rule)
     of_unit = {} if usable is None else dict(zip(unit_names(usable).tolist(), found))
     last = _last_samples(grasps["time"].values, grasps["t_surface"].values, units)
@@ -246,10 +247,10 @@ class Deviation(NamedTuple):
     words: str
 
 
-def deviations(device: GripperModel, grasps: Grasps, materials: Sequence[str]) -> list[list[Deviation]]:
-    """Return for each of n grasps how far its nuisances and its misfit are from the usual if it is of the
+def deviations(device: GripperModel, data: Touches, materials: Sequence[str]) -> list[list[Deviation]]:
+    """Return for each of n touches how far its nuisances and its misfit are from the usual if it is of the
     material named for it, the farthest first."""
-    data, hypotheses = touches(grasps), _taken_for(device, materials)
+    hypotheses = _taken_for(device, materials)
     prior = prior_of(device, data, hypotheses)
     mode = fit_pairs(device, data, np.arange(len(materials)), hypotheses)
     found = []
@@ -266,25 +267,20 @@ def deviations(device: GripperModel, grasps: Grasps, materials: Sequence[str]) -
     return found
 
 
-def unexplained(
-    device: GripperModel, grasps: Grasps, hypotheses: Hypotheses, stated: tuple[float, float] | None = None
-) -> list[str]:
-    """Return for each of n grasps, each under its own row of ``hypotheses``, why its trace is not explained;
-    empty where it is.
-
-    ``stated`` is the range of unknown object temperatures [degC]; by default 20 K about the room.
+def _unexplained(device: GripperModel, data: Touches, ends: Array, hypotheses: Hypotheses) -> list[str]:
+    """Return for each of n touches, each under its own row of ``hypotheses``, why its trace is not explained;
+    empty where it is.  ``ends`` (n, 2) [degC] are those of the range of its object, NaN where that is known.
     """
-    data, ends = touches(with_object_range(grasps, stated)), object_range(grasps, stated)
-    known = np.isfinite(touches(grasps).t_object)
     mode = fit_pairs(device, data, np.arange(ends.shape[0]), hypotheses)
     n = (data.count > 0).sum(axis=1)
     if device.second is not None and data.second is not None:
         n = n + (data.second.count > 0).sum(axis=1)
     words = []
     for i, (low, high) in enumerate(ends):
+        found = mode.u[i, T_OBJECT]
         if mode.misfit[i] > n[i] + _UNEXPLAINED * np.sqrt(2 * n[i]):
             words.append("the trace is not explained by the model: the answer is unreliable")
-        elif not known[i] and not low <= mode.u[i, T_OBJECT] <= high:
+        elif found < low or found > high:  # NaN compares false
             outside = f"explained only by an object outside of {low:.0f} to {high:.0f} degC"
             words.append(f"{outside}: the answer is unreliable")
         else:
@@ -299,12 +295,10 @@ def unexplained_answers(
 
     ``stated`` is the range of unknown object temperatures [degC].
     """
-
     out = [""] * len(rows)
-    for model, at, grasps, named in _single_named(classifier, X, rows):
+    for model, at, data, ends, named in _single_named(classifier, X, rows, stated):
         hypotheses = _taken_for(model.device_, named, finish=model.finish)
-        part = check_grasps(grasps, longest=model.longest_).read(grasps)
-        for i, why in zip(at, unexplained(model.device_, part, hypotheses, stated)):
+        for i, why in zip(at, _unexplained(model.device_, data, ends, hypotheses)):
             out[i] = why
     return out
 
@@ -326,10 +320,9 @@ def unexplained_effusivities(
         return {}
     hypotheses = free_hypotheses(device, device.found_effusivity(ln_e[at]))
     sd = np.log(10) * np.array([rows[i].log10_effusivity_sd for i in at])
-    part = pick(grasps, at)
-    found = unexplained(device, check_grasps(part).read(part), hypotheses._replace(ln_e_sd=sd), stated)
-    names = grasps["grasp"].values[at]
-    return {str(name): why for name, why in zip(names, found) if why}
+    data, ends = _asked(grasps, at, np.inf, stated)
+    found = _unexplained(device, data, ends, hypotheses._replace(ln_e_sd=sd))
+    return {str(name): why for name, why in zip(data.grasp_id, found) if why}
 
 
 def deviation_words(material: str, row: Sequence[Deviation]) -> str:
@@ -366,20 +359,22 @@ def reasons(classifier: GraspClassifier, X: Records, rows: Sequence[Row]) -> lis
     >>> why.split(" and ")[0]
     "as wood it needs 0.34 times its block's effusivity (12.6 sd)"
     """
-
     out = [""] * len(rows)
-    for model, at, grasps, named in _single_named(classifier, X, rows, least=_STRANGE):
-        found = deviations(model.device_, begun(grasps, model.longest_), named)
-        for i, name, row in zip(at, named, found):
+    for model, at, data, _, named in _single_named(classifier, X, rows, least=_STRANGE):
+        for i, name, row in zip(at, named, deviations(model.device_, data, named)):
             out[i] = deviation_words(name, row)
     return out
 
 
 def _single_named(
-    classifier: GraspClassifier, X: Records, rows: Sequence[Row], least: float = -1.0
-) -> Iterator[tuple[PosteriorClassifier, list[int], Grasps, list[str]]]:
+    classifier: GraspClassifier,
+    X: Records,
+    rows: Sequence[Row],
+    stated: tuple[float, float] | None = None,
+    least: float = -1.0,
+) -> Iterator[tuple[PosteriorClassifier, list[int], Touches, Array, list[str]]]:
     """Yield of each record the classifier of an exactly known gripper, the rows that name single touches with
-    a ``p_unknown`` above ``least``, these grasps and their names."""
+    a ``p_unknown`` above ``least``, these as :func:`_asked` returns them, and their names."""
     # an uncertain gripper may be the reason itself
     if not isinstance(classifier, PosteriorClassifier) or classifier.device_.uncertain:
         return
@@ -392,9 +387,19 @@ def _single_named(
             if group[i] == "" and row["material"] and (row["p_unknown"] or 0.0) > least
         ]
         if at:
-            part = pick(grasps, [i - first for i in at])
-            yield classifier, at, part, [str(rows[i]["material"]) for i in at]
+            data, ends = _asked(grasps, np.array(at) - first, classifier.longest_, stated)
+            yield classifier, at, data, ends, [str(rows[i]["material"]) for i in at]
         first += group.size
+
+
+def _asked(
+    grasps: Grasps, at: NDArray[np.int64], until: float, stated: tuple[float, float] | None
+) -> tuple[Touches, Array]:
+    """Return some touches until a time [s], and the ends of each one's range of temperatures (n, 2) [degC],
+    NaN where the object's is known; ``stated`` is that of unknown ones, by default 20 K about the room."""
+    unknown = np.isnan(number_values(grasps, "t_object"))[at, None]
+    ends = np.where(unknown, object_range(grasps, stated)[at], np.nan)
+    return touches(with_object_range(grasps, stated), until=until, at=at), ends
 
 
 def _taken_for(device: GripperModel, named: Sequence[str], **finish: str) -> Hypotheses:

@@ -36,7 +36,6 @@ from thermogrip.datasets.schema import (
     make_grasps,
 )
 from thermogrip.sysid.effusivity.quality import check_grasps as check_quality
-from thermogrip.sysid.effusivity.quality import without
 
 Floats: TypeAlias = NDArray[np.float64]
 Labels: TypeAlias = NDArray[np.str_]
@@ -205,13 +204,16 @@ def record_list(X: Records) -> list[Grasps]:
     records = list(X) if isinstance(X, Sequence) else [X]
     if not records:
         raise UserError("no grasps were given", hint="give at least one record")
-    for grasps in records:
+    for at, grasps in enumerate(records):
         if not isinstance(grasps, Grasps):
             raise UserError(
                 f"expected Grasps, got {type(grasps).__name__}", hint="use make_grasps or read_grasps"
             )
         check_grasps(grasps)
-    return [without(grasps, check_quality(grasps).spiked) for grasps in records]
+        spiked = check_quality(grasps).spiked
+        if spiked.any():
+            records[at] = grasps.assign(t_surface=grasps["t_surface"].where(~spiked))
+    return records
 
 
 def grasp_labels(grasps: Grasps, y: ArrayLike | None = None) -> Labels:
@@ -242,7 +244,9 @@ def record_labels(records: Sequence[Grasps], y: ArrayLike | None) -> list[Labels
 def pick(grasps: Grasps, index: ArrayLike) -> Grasps:
     """Return some grasps of a record, by position or mask, under the same name."""
     at = np.asarray(index)
-    return check_grasps(grasps.isel(grasp=np.flatnonzero(at) if at.dtype == bool else at.astype(int)))
+    part = grasps.isel(grasp=np.flatnonzero(at) if at.dtype == bool else at.astype(int))
+    check_grasps(part)
+    return part
 
 
 def common_times(records: Sequence[Grasps]) -> Floats:
@@ -266,7 +270,8 @@ def join_grasps(records: Sequence[Grasps], *, name: str | None = None) -> Grasps
     it.
     """
     if len(records) == 1:
-        return check_grasps(records[0])
+        check_grasps(records[0])
+        return records[0]
     times = common_times(records)
     cut = [part.sel(time=times, method="nearest") for part in records]
     fields: dict[str, Any] = {}

@@ -37,7 +37,6 @@ from thermogrip.classify.estimators.base import (
     GraspClassifier,
     Records,
     normalised,
-    pick,
     record_labels,
     record_list,
     two_or_more,
@@ -45,8 +44,9 @@ from thermogrip.classify.estimators.base import (
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, has_touch_groups, label_values
 from thermogrip.sysid.effusivity.calibration import calibrate_gripper
-from thermogrip.sysid.effusivity.data import touches
+from thermogrip.sysid.effusivity.data import Touches, touches
 from thermogrip.sysid.effusivity.gripper_model import GripperModel, GripperSpread, another_gripper
+from thermogrip.sysid.effusivity.laplace_approximation import fit_candidates
 from thermogrip.sysid.effusivity.multi_touch import (
     Coupling,
     free_touch_fit,
@@ -54,9 +54,8 @@ from thermogrip.sysid.effusivity.multi_touch import (
     rested_long,
     two_touch_fit,
 )
-from thermogrip.sysid.effusivity.posterior import material_fit
 from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors
-from thermogrip.sysid.effusivity.quality import begun, longest_contact
+from thermogrip.sysid.effusivity.quality import longest_contact
 
 GRIPPERS = ("same", "uncertain", "another")
 
@@ -154,12 +153,12 @@ class PosteriorClassifier(GraspClassifier):
         single = group == ""
         evidence, free, other = np.empty((group.size, len(names))), np.full(group.size, np.nan), None
         if single.any():
-            part = begun(pick(grasps, single), self.longest_)
-            evidence[single] = material_fit(self.device_, part, names, finish=self.finish).log_evidence
+            data = touches(grasps, until=self.longest_, at=np.flatnonzero(single))
+            evidence[single] = _of_candidates(self.device_, data, names, self.finish)
             if unknown:
-                free[single] = [fit.log_evidence for fit in grid_posteriors(self.device_, touches(part))]
+                free[single] = [fit.log_evidence for fit in grid_posteriors(self.device_, data)]
                 if self.finish != "known":  # a free effusivity has the finish of the training's blocks
-                    other = material_fit(self.device_, part, names).log_evidence
+                    other = _of_candidates(self.device_, data, names, "known")
         if not single.all():
             fit = two_touch_fit(self.device_, grasps, names, coupling=self.coupling_, finish=self.finish)
             for at, row in zip(fit.rows, fit.log_evidence):
@@ -226,6 +225,11 @@ class PosteriorClassifier(GraspClassifier):
         self.device_ = GripperModel.load(folder / "device.json")
         file = folder / "coupling.json"
         self.coupling_ = Coupling.load(file) if file.exists() else None
+
+
+def _of_candidates(device: GripperModel, data: Touches, names: Sequence[str], finish: str) -> Floats:
+    """Return the log evidence of each candidate for each touch, (n, n_name)."""
+    return fit_candidates(device, data, names, finish)[0].log_evidence.reshape(-1, len(names))
 
 
 def _uncertain_as(device: GripperModel, gripper: str) -> GripperModel:

@@ -415,7 +415,9 @@ def cut_at(grasps: Grasps, seconds: float) -> Grasps:
     kept = np.round(grasps["time"].values, 6) <= seconds + 1e-6
     if kept.sum() < 2 or seconds <= 0:
         raise UserError(f"{seconds:g} s of contact hold no sample", file=log_name(grasps))
-    return check_grasps(grasps.isel(time=kept))
+    cut = grasps.isel(time=kept)
+    check_grasps(cut)
+    return cut
 
 
 def _fewest(grasps: Grasps) -> int:

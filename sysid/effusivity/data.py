@@ -101,22 +101,27 @@ class Touches:
         return float(self.sample_t[self.sample_bin >= 0].max())
 
 
-def touches(grasps: Grasps, *, until: float | None = None) -> Touches:
-    """Return the binned arrays of a Grasps record, samples after ``until`` [s] left out."""
+def touches(
+    grasps: Grasps, *, until: float | None = None, at: NDArray[np.int64] | slice = slice(None)
+) -> Touches:
+    """Return the binned arrays of a Grasps record, or of those ``at`` some rows, samples after ``until`` [s]
+    left out."""
     second = None
     if "t_surface_2" in grasps:
         beside = grasps.drop_vars("t_surface_2").assign(t_surface=grasps["t_surface_2"])
-        second = touches(beside, until=until)
+        second = touches(beside, until=until, at=at)
     check_grasps(grasps)
     where = log_name(grasps)
-    sd = number_values(grasps, "t_object_sd")
+    ids = np.asarray(grasps["grasp"].values).astype(str)[at]
+    sd, t_object, t_ambient = (
+        number_values(grasps, name)[at] for name in ("t_object_sd", "t_object", "t_ambient")
+    )
     for i in np.flatnonzero(sd < 0):
-        raise UserError(f"grasp {str(grasps['grasp'].values[i])!r} has a negative t_object_sd", file=where)
+        raise UserError(f"grasp {str(ids[i])!r} has a negative t_object_sd", file=where)
     time = np.asarray(grasps["time"].values, dtype=float)
-    keep = (time > _EDGES[0]) & (time < (_EDGES[-1] if until is None else until + 1e-9))
-    time, data = time[keep], np.asarray(grasps["t_surface"].values, dtype=float)[:, keep]
-    ids = np.asarray(grasps["grasp"].values).astype(str)
-    good = np.isfinite(data) & ~check_quality(grasps).masked[:, keep]
+    keep = (time > _EDGES[0]) & (time < min(_EDGES[-1], np.inf if until is None else until + 1e-9))
+    time, data = time[keep], np.asarray(grasps["t_surface"].values, dtype=float)[at][:, keep]
+    good = np.isfinite(data) & ~check_quality(grasps).masked[at][:, keep]
     for i in np.flatnonzero((good & (time > 0.15)).sum(axis=1) < 1):
         raise UserError(f"grasp {str(ids[i])!r} has no sample after contact", file=where, hint="remove it")
     for i in np.flatnonzero((good & (time < -0.25)).sum(axis=1) < 1):
@@ -140,14 +145,14 @@ def touches(grasps: Grasps, *, until: float | None = None) -> Touches:
         (count > 0) & (np.arange(used.size) >= bins[np.searchsorted(time, 0.15)]), y - level[:, None], 0
     )
     return Touches(
-        grasp_id=ids, material=label_values(grasps, "material"),
+        grasp_id=ids, material=label_values(grasps, "material")[at],
         sample_t=np.broadcast_to(time, data.shape).copy(),
         # one memory layout whatever the record's: the compiled search is compiled anew for another
         sample_bin=np.ascontiguousarray(np.where(good, bins, -1), dtype=np.int64),
         y=y, t=mean(np.broadcast_to(time, data.shape)),
         count=count, ramp=mean(np.broadcast_to(np.maximum(time - PUMP_OFF, 0.0), data.shape)), level=level,
-        t_object=number_values(grasps, "t_object"), t_object_sd=sd,
-        t_ambient=number_values(grasps, "t_ambient"), excursion=np.abs(away).max(axis=1), second=second,
+        t_object=t_object, t_object_sd=sd, t_ambient=t_ambient, excursion=np.abs(away).max(axis=1),
+        second=second,
     )  # fmt: skip
 
 
@@ -164,8 +169,9 @@ def object_range(grasps: Grasps, stated: tuple[float, float] | None = None) -> A
             raise UserError(problem, hint="give the lower end first, within -60 to 200 degC")
         return np.tile([low, high], (n, 1)).astype(float)
     skin = grasps["t_surface"].values[:, grasps["time"].values < -0.25]
-    room = number_values(grasps, "t_ambient")
-    centre = np.where(np.isfinite(room), room, np.nanmedian(skin, axis=1))
+    centre = np.array(number_values(grasps, "t_ambient"))
+    unknown = ~np.isfinite(centre) & np.isfinite(skin).any(axis=1)
+    centre[unknown] = np.nanmedian(skin[unknown], axis=1)
     return np.stack([centre - UNKNOWN_OBJECT_RANGE, centre + UNKNOWN_OBJECT_RANGE], axis=1)
 
 

@@ -112,8 +112,8 @@ class GraspQuality:
     clipped_at: Floats  # (n,), the reading at which the sensor saturates [degC]; NaN if never
     start: Floats  # (n,), time of the first usable sample [s]; NaN where none is
     stop: Floats  # (n,), time of the last
-    shortened: Flags  # (n,), contacts that are read until ``longest`` only, and last much longer
-    longest: float  # readings of single touches later than this are not used [s]
+    shortened: Flags  # (n,), contacts that are read in part and last much longer
+    until: float  # later readings are not used [s]; inf where touches of one block are read whole
     _trace: _Trace = field(repr=False)
 
     @property
@@ -159,21 +159,11 @@ class GraspQuality:
             return kept
         return kept.assign(rest=("grasp", _rests(grasps, ~self.usable)[self.usable]))
 
-    def read(self, grasps: Grasps) -> Grasps:
-        """Return the record with masked samples lost (NaN), and cut."""
-        return begun(without(grasps, self.masked), self.longest)
-
-
-def begun(grasps: Grasps, longest: float) -> Grasps:
-    """Return the record up to ``longest`` [s], whole where it has touches of one block."""
-    if float(grasps["time"].values[-1]) <= longest or has_touch_groups(grasps):
-        return grasps
-    return grasps.sel(time=slice(None, longest + 1e-9))
-
-
-def without(grasps: Grasps, samples: Flags) -> Grasps:
-    """Return the record with these samples (n, n_time) lost (NaN); the record itself where there are none."""
-    return grasps.assign(t_surface=grasps["t_surface"].where(~samples)) if samples.any() else grasps
+    def read(self, grasps: Grasps) -> Grasps | None:
+        """Return the usable grasps as an answer reads them: masked samples lost (NaN), and cut."""
+        if self.masked.any():
+            grasps = grasps.assign(t_surface=grasps["t_surface"].where(~self.masked))
+        return self.usable_grasps(grasps.sel(time=slice(None, self.until + 1e-9)))
 
 
 def check_grasps(grasps: Grasps, *, longest: float = np.inf, whole_traces: bool = False) -> GraspQuality:
@@ -201,7 +191,7 @@ def check_grasps(grasps: Grasps, *, longest: float = np.inf, whole_traces: bool 
     >>> quality = check_grasps(grasps)
     >>> quality.reason, float(quality.stop[0]), int(quality.masked[0].sum())
     (['', 'no contact'], 10.0, 0)
-    >>> quality.usable_grasps(quality.read(grasps)).sizes["grasp"]
+    >>> quality.read(grasps).sizes["grasp"]
     1
     """
     time = np.asarray(grasps.variables["time"].values, dtype=float)
@@ -229,11 +219,12 @@ def check_grasps(grasps: Grasps, *, longest: float = np.inf, whole_traces: bool 
                 reason[i] = note[i] = f"{note[i]}, and this classifier needs whole traces"
         if not note[i] and shortened[i]:
             note[i] = f"read until {longest:g} s, as long as contacts of the training lasted"
-    used = np.asarray(read & (time <= (longest + 1e-9 if single else np.inf)))
+    until = float(longest) if single else np.inf
+    used = np.asarray(read & (time <= until + 1e-9))
     start, stop = (
         np.where(used.any(axis=1), t, np.nan) for t in (time[used.argmax(axis=1)], _ends(time, used))
     )
-    return GraspQuality(reason, note, masked, spiked, reading, start, stop, shortened, float(longest), trace)
+    return GraspQuality(reason, note, masked, spiked, reading, start, stop, shortened, until, trace)
 
 
 @dataclass(frozen=True, eq=False)

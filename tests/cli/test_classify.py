@@ -47,7 +47,7 @@ def gripper(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
 
     made = SimpleNamespace(bench=bench, why=[])
     made.records = [record_of(["a", "b"], "one"), record_of(["c"], "two")]
-    made.read = stand_in("thermogrip.cli.classify.find_grasps", lambda paths: made.records)
+    made.read = stand_in("thermogrip.datasets.grasp_files.read_grasp_files", lambda paths: made.records)
     made.warned = stand_in("thermogrip.cli.classify.warn_of_contacts")
     made.calibrated = stand_in("thermogrip.cli.classify.calibrated_device", ("device", "coupling", 9.0))
     stand_in("thermogrip.cli.classify._as_taught", lambda console, record, *_: record)
@@ -131,12 +131,14 @@ def test_a_record_says_which_contacts_lasted_longer_than_those_that_taught(
 ) -> None:
     record = record_of(["a", "b", "c"])
     rested = stand_in("thermogrip.sysid.effusivity.multi_touch.rested_long", np.array([False, True, False]))
-    longer = SimpleNamespace(shortened=np.array([True, False, True]))
+    until = record["time"].values[-2]
+    longer = SimpleNamespace(shortened=np.array([True, False, True]), until=until)
     checked = stand_in(f"{QUALITY}.check_grasps", longer)
-    begun = verb._as_taught(Console(), record, record["time"].values[-2], "coupling")
-    np.testing.assert_array_equal(begun["time"], record["time"].values[:-1])
+    cut = verb._as_taught(Console(), record, until, "coupling")
+    np.testing.assert_array_equal(cut["time"], record["time"].values[:-1])
     capsys.readouterr()
-    assert verb._as_taught(Console(), record, 9.5, "coupling") is record
+    longer.until = 9.5
+    assert verb._as_taught(Console(), record, 9.5, "coupling").equals(record)
     first, second = capsys.readouterr().err.splitlines()
     assert "mine: 2 of 3 contacts are read until 9.5 s" in first
     assert "mine: blocks that rested longer" in second
@@ -160,7 +162,7 @@ def test_a_gripper_is_the_bundled_one_or_calibrated_on_what_touched(
         return "mine"
 
     records = [record_of(["a"]), record_of(["b"], touch_group=["p"]), record_of(["c"], touch_group=["q"])]
-    read = stand_in("thermogrip.cli.classify.find_grasps", records)
+    read = stand_in("thermogrip.datasets.grasp_files.read_grasp_files", records)
     warned = stand_in("thermogrip.cli.classify.warn_of_contacts")
     touched = stand_in("thermogrip.cli.classify.touched_part", lambda console, given: given)
     asked = stand_in("thermogrip.sysid.effusivity.calibration.calibrate_gripper", calibrate)
@@ -228,7 +230,7 @@ def school(bench: Bench, stand_in: StandIn, monkeypatch: pytest.MonkeyPatch) -> 
     made = SimpleNamespace(bench=bench, model=model, fitted=[], saved=[])
     model.fit = made.fitted.append
     made.record = record_of(["a", "b", "c"], split=["train", "train", "test"])
-    made.read = stand_in("thermogrip.cli.classify.find_grasps", lambda paths: [made.record])
+    made.read = stand_in("thermogrip.datasets.grasp_files.read_grasp_files", lambda paths: [made.record])
     made.warned = stand_in("thermogrip.cli.classify.warn_of_contacts")
     stand_in("thermogrip.cli.classify.touched_part", lambda console, records: records)
     made.asked = stand_in("thermogrip.classify.estimators.registry.make_classifier", model)
@@ -295,7 +297,7 @@ def named(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
     """Return a bench whose classifier and its answers are stand-ins."""
     made = SimpleNamespace(bench=bench, record=record_of(["a", "b"]), model="a model")
     (bench.path / "m").mkdir()
-    stand_in("thermogrip.cli.classify.find_grasps", lambda paths: [made.record])
+    stand_in("thermogrip.datasets.grasp_files.read_grasp_files", lambda paths: [made.record])
     made.warned = stand_in("thermogrip.cli.classify.warn_of_contacts")
     made.ranged = stand_in("thermogrip.sysid.effusivity.data.with_object_range", lambda *_: "ranged")
     made.loaded = stand_in("thermogrip.classify.estimators.registry.load_classifier", lambda _: made.model)

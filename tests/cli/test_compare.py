@@ -58,7 +58,9 @@ def scored(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
         return made.of.get(split, Found(split))
 
     made = SimpleNamespace(bench=bench, read={"grasps.csv": MARKED, "more.csv": PLAIN}, of={}, missing=())
-    stand_in("thermogrip.cli.compare.find_grasps", lambda paths: [made.read[path] for path in paths])
+    stand_in(
+        "thermogrip.datasets.grasp_files.read_grasp_files", lambda paths: [made.read[path] for path in paths]
+    )
     made.warned = stand_in("thermogrip.cli.compare.warn_of_contacts")
     made.touched = stand_in("thermogrip.cli.compare.touched_part", lambda console, records: records)
     made.asked = stand_in(

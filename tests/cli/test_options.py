@@ -129,12 +129,9 @@ def test_a_plant_of_one_s_own_is_loaded_with_its_class(stand_in: StandIn) -> Non
 def test_logs_and_grasps_are_read_as_they_were_named(stand_in: StandIn) -> None:
     log = make_log([0.0, 1.0], {"u": ([0, 1], "1", "input")})
     logs = stand_in("thermogrip.datasets.log_files.read_log", log)
-    grasps = stand_in("thermogrip.datasets.grasp_files.read_grasp_files", ["g"])
     assert options.load_logs(["a", "b"], ["u"], ["y"], ["d"], known={"u": "output"}, dt=2.0) == [log] * 2
     assert (logs[1].args, logs[1].known) == (("b", ["u"], ["y"], ["d"]), {"u": "output"})
     assert (logs[0].columns, logs[0].dt) == (None, 2.0)
-    assert options.find_grasps(("a", "b")) == ["g"]
-    assert grasps[0].args == (["a", "b"],)
 
 
 def test_the_first_log_settles_the_roles_and_what_never_moves_is_no_signal(tmp_path: Path) -> None:

@@ -16,7 +16,6 @@ from thermogrip.cli.options import (
     comma,
     existing_grasps,
     existing_model,
-    find_grasps,
     flag,
     log_name,
     new_file,
@@ -45,6 +44,7 @@ def calibrated_device(
     With it: how blocks move between touches, where the grasps identify it, and how long the contacts of the
     training lasted [s].
     """
+    from thermogrip.datasets.grasp_files import read_grasp_files
     from thermogrip.datasets.schema import has_touch_groups
     from thermogrip.sysid.effusivity import calibrate_gripper, load_default_gripper
     from thermogrip.sysid.effusivity.multi_touch import learn_coupling
@@ -55,7 +55,7 @@ def calibrated_device(
             "the bundled gripper's calibration is used; give --calibrate with labelled grasps of yours"
         )
         return load_default_gripper(), None, _BUNDLED
-    labelled = find_grasps(calibrate)
+    labelled = read_grasp_files(calibrate)
     warn_of_contacts(console, labelled)
     labelled = touched_part(console, labelled)
     with console.progress("calibrate") as progress:
@@ -145,7 +145,9 @@ def effusivity(
     stated = _range(between)
     new_file(out, (".csv",))
     console = Console(as_json)
-    records = find_grasps(grasps)
+    from thermogrip.datasets.grasp_files import read_grasp_files
+
+    records = read_grasp_files(grasps)
     warn_of_contacts(console, records)
     from thermogrip.classify.decisions.predict import unexplained_effusivities
     from thermogrip.datasets.atomic_files import write_atomic
@@ -223,6 +225,7 @@ def train(
     """
     from thermogrip.classify.decisions.stopping_rule import RULE_FILE
     from thermogrip.classify.estimators.registry import can_be_saved, make_classifier, save_classifier
+    from thermogrip.datasets.grasp_files import read_grasp_files
 
     model = make_classifier(classifier, quick=quick, seed=seed)
     if not can_be_saved(model):
@@ -232,7 +235,7 @@ def train(
         )
     model.check_installed()
     console = Console(as_json)
-    records = training_part(console, find_grasps(grasps), split)
+    records = training_part(console, read_grasp_files(grasps), split)
     warn_of_contacts(console, records)
     records = touched_part(console, records)
     new_folder(out)
@@ -311,6 +314,7 @@ def classify(
     )
     from thermogrip.classify.decisions.stopping_rule import load_stop_rule
     from thermogrip.classify.estimators.registry import load_classifier
+    from thermogrip.datasets.grasp_files import read_grasp_files
     from thermogrip.sysid.effusivity.data import with_object_range
 
     if (other_gripper or known) and (early or next_touch):
@@ -320,7 +324,7 @@ def classify(
         raise UserError(problem, hint="leave it out, or train on grasps of the new gripper")
     model = load_classifier(model_dir)
     rule = load_stop_rule(model_dir) if early else None
-    records = find_grasps(paths)
+    records = read_grasp_files(paths)
     if other_gripper or known:
         model = _for_another_gripper(model, known or [])
     ranged = [with_object_range(grasps, stated) for grasps in records]
@@ -395,7 +399,7 @@ def materials(
 def _as_taught(console: Console, record: Grasps, longest: float, coupling: Coupling | None) -> Grasps:
     """Return a record without what its contacts did later than those that taught the gripper."""
     from thermogrip.sysid.effusivity.multi_touch import rested_long
-    from thermogrip.sysid.effusivity.quality import begun, check_grasps
+    from thermogrip.sysid.effusivity.quality import check_grasps
 
     quality = check_grasps(record, longest=longest)
     if (more := quality.shortened).any():
@@ -408,7 +412,7 @@ def _as_taught(console: Console, record: Grasps, longest: float, coupling: Coupl
             f"{log_name(record)}: blocks that rested longer than those that taught how they move between "
             "touches: intervals may be too narrow"
         )
-    return begun(record, longest)
+    return record.sel(time=slice(None, quality.until + 1e-9))
 
 
 def _effusivities(device: GripperModel, record: Grasps, coupling: Coupling | None) -> list[EffusivityRow]:
@@ -467,12 +471,13 @@ def _stop_rule(console: Console, model: GraspClassifier, records: Sequence[Grasp
 def _for_another_gripper(model: GraspClassifier, known: Sequence[str]) -> GraspClassifier:
     """Return the model for another gripper than that of its training."""
     from thermogrip.classify.estimators.posterior import PosteriorClassifier
+    from thermogrip.datasets.grasp_files import read_grasp_files
 
     if not isinstance(model, PosteriorClassifier):
         raise UserError(
             "this model knows no gripper that could be another one", hint="train a posterior classifier"
         )
-    return model.for_another_gripper(find_grasps(known) if known else None)
+    return model.for_another_gripper(read_grasp_files(known) if known else None)
 
 
 def _answer_or_unknown(rows: list[dict[str, Any]]) -> None:

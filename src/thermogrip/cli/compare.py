@@ -17,7 +17,6 @@ from thermogrip.cli.options import (
     Workers,
     comma,
     existing_grasps,
-    find_grasps,
     flag,
     new_folder,
     one_of,
@@ -93,6 +92,7 @@ def compare(
     """
     from thermogrip.classify.estimators.registry import trainable
     from thermogrip.classify.evaluation.harness import evaluate
+    from thermogrip.datasets.grasp_files import read_grasp_files
     from thermogrip.datasets.parallel import kept_processes
 
     pool, names = workers_of(workers, cluster), comma(classifiers)
@@ -101,8 +101,8 @@ def compare(
         raise missing[0]
     left_out = tuple(f"left out: {error}" for error in missing)
     fast, _ = trainable(models, quick=True, seed=seed)
-    records = find_grasps(grasps)
-    tests = find_grasps(test) if test else None
+    records = read_grasp_files(grasps)
+    tests = read_grasp_files(test) if test else None
     if tests is None and not repeats and not by and not _has_split(records):
         raise UserError("nothing to score", hint="give --test, a column split, or --repeats")
     new_folder(out)

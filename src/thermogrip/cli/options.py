@@ -316,13 +316,6 @@ def load_logs(
     return logs
 
 
-def find_grasps(paths: Sequence[str]) -> list[Grasps]:
-    """Read grasp files and folders, one record a file; no two files may be the same condition."""
-    from thermogrip.datasets.grasp_files import read_grasp_files
-
-    return read_grasp_files(list(paths))
-
-
 def log_name(log: Log | Grasps) -> str:
     """Return a record's name as tables have it."""
     return str(log.attrs["name"])

@@ -24,13 +24,11 @@ from thermogrip.sysid.effusivity.quality import (
     CONTRARY,
     NO_CONTACT,
     OUT_OF_RANGE,
-    begun,
     check_grasps,
     contact_faults,
     find_contact,
     longest_contact,
     torn_groups,
-    without,
 )
 
 from .makers import drawn_from_the_prior, simulated_blocks
@@ -195,7 +193,7 @@ def test_all_samples_at_a_rail_are_found(rail, mirrored):
     assert found.sum() < 1.02 * at_rail.sum()
     assert set(reading[hit].tolist()) == {80.0 - rail if mirrored else rail}
     assert np.isnan(reading[~hit]).all()
-    assert np.isnan(quality.read(cut)["t_surface"].values).sum() == found.sum()
+    assert np.isnan(quality.read(cut)["t_surface"].values).sum() == found[quality.usable].sum()
 
 
 def test_a_stuck_sensor_clips_its_own_grasp_alone():
@@ -364,7 +362,7 @@ def test_what_is_read_of_a_saturated_trace():
     np.testing.assert_array_equal(quality.stop, [0.9, 10.0, 10.0, 0.1, 10.0, 0.2, np.nan])
     assert quality.masked.sum(axis=1).tolist() == [91, 0, 18, 99, 17, 98, 121]
     assert not quality.spiked.any()
-    part = quality.usable_grasps(quality.read(record))
+    part = quality.read(record)
     assert part["grasp"].values.tolist() == ["g0", "g1", "g4", "g5"]
     whole = check_grasps(record, whole_traces=True)
     needed = f"{words.format('1.0')}, and this classifier needs whole traces"
@@ -373,7 +371,7 @@ def test_what_is_read_of_a_saturated_trace():
     assert short.note[:2] == [
         words.format("1.0"), "read until 5 s, as long as contacts of the training lasted"
     ]  # fmt: skip
-    assert (short.stop[0], short.stop[1], short.longest) == (0.9, 5.0, 5.0)
+    assert (short.stop[0], short.stop[1], short.until) == (0.9, 5.0, 5.0)
 
 
 @pytest.mark.parametrize(
@@ -386,10 +384,8 @@ def test_a_contact_is_shortened_from_1_2_times_the_longest_on(end, groups, short
     quality = check_grasps(record, longest=5.0)
     assert quality.shortened.tolist() == [shortened]
     assert quality.stop.tolist() == [last]
-    assert begun(record, 5.0)["time"].values[-1] == last
-    assert (begun(record, 5.0) is record) == (last == end)
+    assert quality.read(record)["time"].values[-1] == last
     assert quality.usable_grasps(record) is record
-    assert without(record, quality.spiked) is record
 
 
 def ramp(rate, rises=1.0, stays=9.0, step=0.1):
@@ -453,7 +449,7 @@ def test_which_readings_are_spikes(at, by, spiked):
     hit = {k % TIME.size for k in at} | ({0} if at == [1, 2] else set())  # what stands before them goes too
     assert set(np.flatnonzero(quality.spiked[0]).tolist()) == (hit if spiked else set())
     np.testing.assert_array_equal(quality.masked, quality.spiked)
-    assert np.isnan(without(made(skin), quality.spiked)["t_surface"].values).sum() == quality.spiked.sum()
+    assert np.isnan(quality.read(made(skin))["t_surface"].values).sum() == quality.spiked.sum()
 
 
 def test_seven_readings_are_needed_for_a_leap_and_a_coarse_sensor_may_flicker_by_two_steps():
@@ -616,7 +612,7 @@ def test_a_longer_contact_is_named_by_its_beginning_and_the_answer_reports_it(sh
     assert {row["decided_at_s"] for row in rows} == {10.0}
     np.testing.assert_allclose(
         short.predict_proba(long),
-        short.predict_proba(begun(long, 10.0)),
+        short.predict_proba(long.sel(time=slice(None, 10.0))),
         rtol=1e-6,
         atol=1e-9,
     )
@@ -648,8 +644,9 @@ def test_how_long_contacts_lasted_is_in_the_file_and_may_be_absent(short, tmp_pa
 def test_two_touches_are_read_whole():
     """What the first one took from the block depends on how long it lasted."""
     two = load_example_grasps()["exp5_two_touch_unknown_object"]
-    assert begun(two, 5.0) is two
-    assert not check_grasps(two, longest=5.0).shortened.any()
+    quality = check_grasps(two, longest=5.0)
+    assert quality.read(two).equals(two)
+    assert not quality.shortened.any()
 
 
 def test_a_trace_that_was_lost_early_is_no_longer_contact(long):
