@@ -12,6 +12,7 @@ that are there.  Averaging is what makes a coarse converter (the 0.4 degC of a h
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import TypeAlias
 
@@ -115,22 +116,14 @@ def average(log: Log, seconds: float) -> Log:
     >>> average(log, 1.0)["t"].values, average(log, 1.0)["pump"].values
     (array([20.1, 20.4]), array([0.5, 0.5]))
     """
-    time = log["time"].values
-    step = float(np.median(np.diff(time)))
-    if not seconds >= step * (1 - 1e-9):
-        problem = f"cannot average over {seconds:g} s: the rows are {step:g} s apart"
-        raise UserError(problem, file=log_name(log), hint="choose a longer block")
     held = names(log, "input") + names(log, "disturbance")
     wanted = tuple(str(key) for key in log.data_vars)
-    values, is_held = columns(log, wanted), np.array([name in held for name in wanted], dtype=bool)
-    starts = np.concatenate([[0], [at + 1 for at, _, _ in gaps(log)], [time.size]]).astype(np.int64)
-    parts = [
-        _blocks(time[a:b], values[a:b], is_held, seconds=seconds, step=step) for a, b in pairwise(starts)
-    ]
+    is_held = np.array([name in held for name in wanted], dtype=bool)
+    after = [at + 1 for at, _, _ in gaps(log)]
+    parts = block_means(
+        log["time"].values, columns(log, wanted), is_held, seconds=seconds, after=after, log=log_name(log)
+    )
     begins, means = np.concatenate([t for t, _ in parts]), np.concatenate([v for _, v in parts])
-    if begins.size < 2:
-        problem = f"{begins.size} block of {seconds:g} s is not a log"
-        raise UserError(problem, file=log_name(log), hint="choose a shorter block")
     variables = {
         name: (means[:, at], log[name].attrs["units"], log[name].attrs["role"])
         for at, name in enumerate(wanted)
@@ -142,6 +135,27 @@ def average(log: Log, seconds: float) -> Log:
     if len(parts) > 1:
         log.attrs[_AFTER_GAP] = " ".join(repr(float(t[0])) for t, _ in parts[1:])
     return log
+
+
+def block_means(
+    time: Floats, values: Floats, held: NDArray[np.bool_], *, seconds: float, after: Sequence[int], log: str
+) -> list[_Blocks]:
+    """Return starts (n_block,) and means (n_block, n) of blocks, as :func:`average` makes them, of each part.
+
+    ``held`` (n,) says which of the values (n_time, n) are held, ``after`` which rows begin anew after a gap.
+    """
+    step = float(np.median(np.diff(time)))
+    if not seconds >= step * (1 - 1e-9):
+        problem = f"cannot average over {seconds:g} s: the rows are {step:g} s apart"
+        raise UserError(problem, file=log, hint="choose a longer block")
+    parts = [
+        _blocks(time[a:b], values[a:b], held, seconds=seconds, step=step)
+        for a, b in pairwise([0, *after, time.size])
+    ]
+    if (n := sum(begins.size for begins, _ in parts)) < 2:
+        problem = f"{n} block of {seconds:g} s is not a log"
+        raise UserError(problem, file=log, hint="choose a shorter block")
+    return parts
 
 
 def _blocks(

@@ -59,6 +59,7 @@ from thermogrip.sysid.plant.fit_record import (
     HeldOut,
 )
 from thermogrip.sysid.plant.log_grid import match_logs, misfit, roles_of, signals
+from thermogrip.sysid.plant.log_grid import rows_of as log_rows
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run, no_input_baseline
 from thermogrip.sysid.validation.prediction_bands import (
@@ -111,11 +112,15 @@ def cases_of(logs: Sequence[Log], leave_one_out: bool) -> Iterator[tuple[list[Lo
         for held in logs:
             yield [log for log in logs if log is not held], Held(held, log_name(held), 0.0)
         return
-    times = [log["time"].values for log in logs]
-    rows = [int(np.searchsorted(t, t[0] + (1 - HELD_OUT_SHARE) * (t[-1] - t[0]))) for t in times]
-    train = [log.isel(time=slice(0, at)) for log, at in zip(logs, rows)]
-    for log, time, at in zip(logs, times, rows):  # run from the log's start: there its state is known
-        yield train, Held(log, f"{TAIL}{log_name(log)}", float(time[at] - time[0]))
+    train: list[Log] = []
+    tails: list[Held] = []
+    for log in logs:
+        time = log["time"].values
+        at = int(np.searchsorted(time, time[0] + (1 - HELD_OUT_SHARE) * (time[-1] - time[0])))
+        train.append(log.isel(time=slice(0, at)))
+        # run from the log's start: there its state is known
+        tails.append(Held(log, f"{TAIL}{log_name(log)}", float(time[at] - time[0])))
+    yield from ((train, tail) for tail in tails)
 
 
 def run_held_out(plant: Plant, held: Held, *, unseen: bool = False) -> FreeRun:
@@ -498,7 +503,7 @@ def identify(
         sizes = ", ".join(f"{name} {error:.2g}{units[name]}" for name, error in other.items())
         verdict += f"; on another run about {sizes}, its gain off by {100 * RUN_GAIN_SD:.0f} %"
         verdict += f" (assumed: it takes {SEVERAL} logs to show how runs differ)"
-    covered = evidence(plant, logs)
+    covered = evidence(plant, [log_rows(log, plant.inputs, plant.outputs, ()) for log in logs])
     verdict += "; " + covered.sentence(plant.units)
     scores = replace(plant.scores, held_out=held_out_scores(rows, chosen), new_run_rmse=other)
     plant = replace(plant, verdict=verdict, scores=scores)
@@ -671,11 +676,11 @@ def _with_draws(
     try:
         if isinstance(fitted, BlackBoxFit):
             return with_refits(fitted, draws, seed=seed, progress=report), []
-        from thermogrip.sysid.greybox.posterior import sample_posterior, with_draws
+        from thermogrip.sysid.greybox.posterior import fit_problem, sample_posterior, with_draws
 
         if posterior:
             return sample_posterior(plant, logs, seed=seed, progress=report)[0], []
-        return with_draws(plant, logs, draws, seed=seed, progress=report), []
+        return with_draws(plant, fit_problem(plant, logs), draws, seed=seed, progress=report), []
     except NO_DRAWS as error:
         return plant, [no_draws(model, what, error)]
 

@@ -50,7 +50,7 @@ from thermogrip.sysid.blackbox.sindy import sindy_family
 from thermogrip.sysid.blackbox.subspace import subspace_family
 from thermogrip.sysid.data.data_quality import reading_excess
 from thermogrip.sysid.plant.fit_record import PlantScores, fit_logs
-from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid
+from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid, rows_of
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import READING_EVERY
 
@@ -280,7 +280,9 @@ def _plant(grid: Grid, choice: Choice, logs: Sequence[Log]) -> Plant:
         structure=choice.structure.label,
         average_s=grid.dt,
         average_why=grid.why,
-        reading_excess=reading_excess(logs, grid.outputs, grid.dt),
+        reading_excess=reading_excess(
+            [rows_of(log, (), grid.outputs, ()) for log in logs], grid.outputs, grid.dt
+        ),
         folds=list(choice.folds),
         held_out_rmse={name: float(v) for name, v in zip(grid.outputs, rmse)},
         held_out_by_part={name: part.tolist() for name, part in zip(grid.outputs, choice.rmse.T)},

@@ -33,7 +33,7 @@ from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.repair import GAP_SECONDS, GAP_STEPS
 from thermogrip.datasets.resample import gaps
 from thermogrip.datasets.schema import Log, column, log_name
-from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid, quantum
+from thermogrip.sysid.plant.log_grid import Grid, Rows, Segment, make_grid, quantum
 from thermogrip.sysid.plant.plant import Plant
 
 Verdict = Literal["ok", "warn", "fail"]
@@ -370,16 +370,14 @@ def _slow(u: Array) -> Array:
     return np.asarray((area[width:] - area[:-width]) / width)
 
 
-def reading_excess(logs: Sequence[Log], outputs: Sequence[str], seconds: float) -> dict[str, float]:
+def reading_excess(logs: Sequence[Rows], outputs: Sequence[str], seconds: float) -> dict[str, float]:
     """Return by how much a reading lies off the mean of its bin by noise alone, by output, in its unit."""
-    steps = [np.diff(np.asarray(log["time"].values, dtype=float)) for log in logs]
-    within = [max(0.0, 1.0 - float(np.median(dt)) / seconds) for dt in steps]
+    within = [max(0.0, 1.0 - rows.step / seconds) for rows in logs]
     out = {}
-    for name in outputs:
-        squares = [
-            share * _second_differences(column(log, name), dt) for log, dt, share in zip(logs, steps, within)
-        ]
-        known = np.concatenate(squares)
+    for k, name in enumerate(outputs):
+        known = np.concatenate([
+            share * _second_differences(rows.y[:, k], np.diff(rows.time)) for rows, share in zip(logs, within)
+        ])  # fmt: skip
         out[name] = float(np.sqrt(known.mean() / 6)) if known.size else 0.0
     return out
 
@@ -421,22 +419,22 @@ class Evidence:
         return "; ".join(said)
 
 
-def evidence(plant: Plant, logs: Sequence[Log]) -> Evidence:
-    """Return what ``logs`` cover of a plant's inputs and outputs."""
-    spent = [_spent(np.diff(np.asarray(log["time"].values, dtype=float))) for log in logs]
+def evidence(plant: Plant, logs: Sequence[Rows]) -> Evidence:
+    """Return what ``logs``, in the plant's signals, cover of its inputs and outputs."""
+    spent = [_spent(np.diff(rows.time)) for rows in logs]
     total = float(sum(part.sum() for part in spent)) / 60
     minutes: dict[str, float] = {}
     thin = []
-    for name in plant.inputs:
-        values = [column(log, name) for log in logs]
+    for k, name in enumerate(plant.inputs):
+        values = [rows.u[:, k] for rows in logs]
         kinds = _kinds(name, values, on_off=name in plant.model.switches)
         for kind, chosen in kinds.items():
             minutes[kind] = float(sum(part[mask].sum() for part, mask in zip(spent, chosen))) / 60
             if minutes[kind] < min(THIN_MINUTES, THIN_SHARE * total):
                 thin.append(kind)
     ranges = {}
-    for name in plant.outputs:
-        low, high = np.nanpercentile(np.concatenate([column(log, name) for log in logs]), [1, 99])
+    for k, name in enumerate(plant.outputs):
+        low, high = np.nanpercentile(np.concatenate([rows.y[:, k] for rows in logs]), [1, 99])
         ranges[name] = (float(low), float(high))
     return Evidence(ranges, minutes, total, tuple(thin))
 

@@ -46,7 +46,7 @@ import numpy as np
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.parallel import Progress
-from thermogrip.datasets.schema import Log, columns, log_name
+from thermogrip.datasets.schema import Log, log_name
 from thermogrip.sysid.data.data_quality import reading_excess
 from thermogrip.sysid.greybox.identifiability import describe
 from thermogrip.sysid.greybox.problem import Problem, make_problem, start_seconds
@@ -61,7 +61,7 @@ from thermogrip.sysid.plant.fit_record import (
     PlantScores,
     fit_logs,
 )
-from thermogrip.sysid.plant.log_grid import cut_stretches, match_logs
+from thermogrip.sysid.plant.log_grid import cut_stretches, match_logs, rows_of
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import find_starts, predict
 
@@ -233,8 +233,9 @@ def fit_network(
         raise UserError("no log to fit", hint="give at least one")
     report(0.0, "preparing the model")
     signals = (*model.inputs, *model.disturbances, *model.outputs)
-    rows = dict(zip(signals, np.concatenate([columns(log, signals) for log in logs]).T))
-    spread = {name: float(np.nanstd(rows[name])) for name in model.outputs}
+    rows = [rows_of(log, model.inputs, model.outputs, model.disturbances) for log in logs]
+    seen = dict(zip(signals, np.concatenate([np.hstack([each.u, each.d, each.y]) for each in rows]).T))
+    spread = {name: float(np.nanstd(seen[name])) for name in model.outputs}
     runs = partial(free_runs, logs)
     model = model.prepared(runs, spread)
     average = model.average if average is None else average
@@ -259,11 +260,11 @@ def fit_network(
     plant = _as_plant(problem, solution, tau)
     scores = replace(
         plant.scores,
-        reading_excess=reading_excess(logs, model.outputs, problem.average),
+        reading_excess=reading_excess(rows, model.outputs, problem.average),
         seconds=round(time.perf_counter() - began, 2),
         starts=wanted,
     )
-    valid = {name: (float(np.nanmin(values)), float(np.nanmax(values))) for name, values in rows.items()}
+    valid = {name: (float(np.nanmin(values)), float(np.nanmax(values))) for name, values in seen.items()}
     report(1.0, "fitted")
     return replace(plant, valid=valid, fitted_to=fit_logs(logs), scores=scores)
 

@@ -483,7 +483,7 @@ def sample_posterior(
     """
     report = progress or (lambda fraction, what: None)
     report(0.0, "averaging the logs")
-    problem = _problem(plant, logs, average)
+    problem = fit_problem(plant, logs, average)
     z = problem.standard(plant.values)
     report(0.02, "learning the model error")
     uncertainty = score_covariance(problem, z)
@@ -519,18 +519,17 @@ def sample_posterior(
 
 def with_draws(
     plant: Plant,
-    logs: Sequence[Log],
+    problem: Problem,
     n: int = 24,
     *,
     seed: int = 0,
     progress: Callable[[float, str], None] | None = None,
 ) -> Plant:
-    """Return the plant with a few plants that agree with the logs as its samples.
+    """Return the plant with a few plants that agree with the logs of :func:`fit_problem` as its samples.
 
     They cost seconds where :func:`sample_posterior` costs minutes, and are for bands and closed loops: of the
     same density, but too few for its quantiles, and they may stop short along a valley that no run sees.
     """
-    problem = _problem(plant, logs, None)
     z = problem.standard(plant.values)
     intervals = plant.scores.intervals
     numbers = None
@@ -542,7 +541,7 @@ def with_draws(
     return replace(plant, samples=drawn)
 
 
-def _problem(plant: Plant, logs: Sequence[Log], average: float | None) -> Problem:
+def fit_problem(plant: Plant, logs: Sequence[Log], average: float | None = None) -> Problem:
     """Return the least-squares problem of the fit, with its weights."""
     if not plant.free:
         raise UserError("the plant has no free parameter", hint="fit a network first")

@@ -6,7 +6,7 @@ A :class:`Plant` is simulated, drawn from, saved, and handed to other libraries.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -19,7 +19,7 @@ from thermogrip.datasets.atomic_files import check_json, read_json, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, column, log_name, make_log
 from thermogrip.sysid.models.model import Model, load_model
-from thermogrip.sysid.plant.log_grid import at_rows, cut_stretches, match_logs
+from thermogrip.sysid.plant.log_grid import Stretch, at_rows, cut_stretches, match_logs
 from thermogrip.sysid.plant.plant_data import (
     SCHEMA,
     VERSION,
@@ -32,8 +32,9 @@ from thermogrip.sysid.plant.plant_data import (
     thin,
     write_samples,
 )
-from thermogrip.sysid.plant.simulation import AFTER_GAP, find_starts, predict
+from thermogrip.sysid.plant.simulation import AFTER_GAP, Start, find_starts, predict
 
+WARMUP = 5.0  # s of readings that set the state, where nothing else is asked for
 _INSIDE = 64  # so many samples stand in the plant's own file
 
 
@@ -95,7 +96,7 @@ class Plant(PlantData):
     """
 
     def simulate(
-        self, log: Log, warmup: float = 5.0, *, score_from: float | None = None, gaps: str = "mend"
+        self, log: Log, warmup: float = WARMUP, *, score_from: float | None = None, gaps: str = "mend"
     ) -> Log:
         """Return the free run over the log (:mod:`thermogrip.sysid.plant.simulation`).
 
@@ -136,18 +137,10 @@ class Plant(PlantData):
             raise UserError(f"a warm-up of {warmup:g} s says nothing", hint="give it a few seconds")
         (log,), notes = match_logs(self, [log])
         stretches = cut_stretches(self, log, gaps=gaps)
-        try:
-            with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges is infinite, an answer
-                starts = find_starts(self, self.p, stretches, warmup)
-                runs = predict(self.model, self.dt, self.p[None], stretches, starts)
-                at = [at_rows(stretch, run, self.dt)[0] for stretch, run in zip(stretches, runs)]
-        except np.linalg.LinAlgError as error:
-            hint = "identify the plant again"
-            raise UserError("the plant's run is not finite", file=log_name(log), hint=hint) from error
-        time, y = log["time"].values, np.empty((log.sizes["time"], len(self.outputs)))
+        y, starts = self.over(stretches, warmup)
+        time = log["time"].values
         scored = time - float(time[0]) >= (warmup if score_from is None else score_from)
-        for stretch, readings in zip(stretches, at):
-            y[stretch.rows] = readings
+        for stretch in stretches:
             if stretch.gap:
                 scored[stretch.rows] &= stretch.time >= AFTER_GAP
         variables = {n: (y[:, k], self.units.get(n, "degC"), "output") for k, n in enumerate(self.outputs)}
@@ -157,6 +150,18 @@ class Plant(PlantData):
         simulated = make_log(time, variables, name=log_name(log))
         simulated.attrs["notes"] = "\n".join([*notes, *(start.how for start in starts)])
         return simulated
+
+    def over(self, stretches: Sequence[Stretch], warmup: float) -> tuple[Array, list[Start]]:
+        """Return the free run at the rows of all stretches of a log, (n, n_y), and how each starts."""
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges is infinite, an answer
+                starts = find_starts(self, self.p, stretches, warmup)
+                runs = predict(self.model, self.dt, self.p[None], stretches, starts)
+                at = [at_rows(stretch, run, self.dt)[0] for stretch, run in zip(stretches, runs)]
+        except np.linalg.LinAlgError as error:
+            hint = "identify the plant again"
+            raise UserError("the plant's run is not finite", file=stretches[0].log, hint=hint) from error
+        return np.concatenate(at), starts
 
     def to_dict(self, *, draws: int | None = None) -> dict[str, Any]:
         """Return the whole plant as plain JSON, with so many posterior samples, evenly spread; with all where

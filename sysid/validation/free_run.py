@@ -28,13 +28,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from thermogrip.datasets.arrays import Array
+from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.resample import average as average_log
-from thermogrip.datasets.resample import gaps
-from thermogrip.datasets.schema import Log, column, log_name
+from thermogrip.datasets.resample import block_means, gaps
+from thermogrip.datasets.schema import Log, column, columns
 from thermogrip.sysid.plant.fit_record import fit_logs, said_of_fit
-from thermogrip.sysid.plant.log_grid import match_logs
+from thermogrip.sysid.plant.log_grid import Rows, cut_stretches, match_logs, rows_of
 from thermogrip.sysid.validation.residual_tests import (
     SQUARED,
     Correlation,
@@ -182,8 +181,10 @@ def free_run(
             hint=f"score from {warmup:g} s on",
         )
     simulated = plant.simulate(log, warmup=warmup, score_from=score_from) if known is None else known.log
+    rows = rows_of(log, plant.inputs, plant.outputs, plant.disturbances)
+    run, scored = columns(simulated, plant.outputs), column(simulated, "scored") > 0
     units = {name: str(log[name].attrs.get("units", "1")) for name in plant.outputs}
-    pairs = _beside(plant, log, simulated, average)
+    pairs = _beside(plant, rows, run, scored, average)
     both = pairs.outputs
     scores, found = _scores(both, units), gaps(log)
     held: dict[str, Score] = {}
@@ -191,7 +192,8 @@ def free_run(
         held = known.held
     elif found:
         through = plant.simulate(log, warmup=warmup, score_from=score_from, gaps="hold")
-        held = _scores(_beside(plant, log, through, average).outputs, units)
+        whole, kept = columns(through, plant.outputs), column(through, "scored") > 0
+        held = _scores(_beside(plant, rows, whole, kept, average).outputs, units)
     mean = {n: score(y, np.full(y.shape, np.nanmean(y)), units[n]) for n, (y, _) in both.items()}
     no_input = {n: score(y, no_input_baseline(pairs.time, y), units[n]) for n, (y, _) in both.items()}
     with np.errstate(invalid="ignore"):  # a run that went to infinity makes no step there
@@ -202,18 +204,18 @@ def free_run(
     whiteness = {name: autocorrelation(y - v) for name, (y, v) in both.items()}
     moved = {u: values for u, values in pairs.inputs.items() if np.ptp(values) > 0}
     left = {n: {u: cross_correlation(y - v, w) for u, w in moved.items()} for n, (y, v) in both.items()}
-    residual = (
-        residual_correlations(plant, log, simulated, warmup=warmup) if tests else ResidualCorrelations({}, {})
-    )
+    residual = ResidualCorrelations({}, {})
+    if tests:
+        residual = residual_correlations(plant, cut_stretches(plant, log), run, scored, warmup=warmup)
     # means over the fit's own blocks: an error as slow as the log correlates with no input, but shows here
-    blocks = _blocks_of_fit(plant, np.asarray(log["time"].values, dtype=float))
-    beyond = _beyond_fit(plant, residual, _beside(plant, log, simulated, blocks).outputs if blocks else {})
+    blocks = _blocks_of_fit(plant, rows.time)
+    beyond = _beyond_fit(plant, residual, _beside(plant, rows, run, scored, blocks).outputs if blocks else {})
     outside = _outside(plant, {name: column(log, name) for name in plant.valid if name in log})
     unseen = [name for name in outside if name not in plant.outputs]
     notes = (
         *said_of_fit(plant.fitted_to, *fit_logs([log])),
         *converted,
-        *_notes(float(log["time"].values[0]), found, held, no_better),
+        *_notes(float(rows.time[0]), found, held, no_better),
         *_residual_notes(whiteness, residual, units, warmup, unseen),
         *_excess_notes(plant, beyond, units),
         *_outside_notes(plant, outside),
@@ -275,21 +277,20 @@ class _Pairs(NamedTuple):
     inputs: dict[str, Array]
 
 
-def _beside(plant: Plant, log: Log, simulated: Log, average: float | None) -> _Pairs:
-    """Return what was measured beside the free run, in means over ``average`` [s] if that is given."""
-    scored = np.asarray(simulated["scored"].values) > 0
-    pair = log[[*plant.outputs, *plant.inputs]]
-    pair.attrs = dict(log.attrs)
-    for name in plant.outputs:
-        for key, values in ((name, column(log, name)), (f"{name} simulated", column(simulated, name))):
-            pair[key] = ("time", np.where(scored, values, np.nan), log[name].attrs)
-    pair = pair if average is None else average_log(pair, average)
-    time = np.asarray(pair["time"].values, dtype=float)
+def _beside(plant: Plant, rows: Rows, run: Array, scored: Mask, average: float | None) -> _Pairs:
+    """Return what was measured beside the free run (n, n_y), in means over ``average`` [s] if given."""
+    time, n_y = rows.time, len(plant.outputs)
+    values = np.hstack([np.where(scored[:, None], np.hstack([rows.y, run]), np.nan), rows.u])
+    if average is not None:
+        held = np.arange(values.shape[1]) >= 2 * n_y
+        parts = block_means(time, values, held, seconds=average, after=rows.after, log=rows.log)
+        time, values = (np.concatenate(part) for part in zip(*parts))
     if not scored.any():
         problem = f"nothing of its {np.ptp(time):g} s is left to score"
-        raise UserError(problem, file=log_name(log), hint="give a longer log, or score from an earlier time")
-    outputs = {name: (column(pair, name), column(pair, f"{name} simulated")) for name in plant.outputs}
-    return _Pairs(time, outputs, {name: column(pair, name) for name in plant.inputs})
+        raise UserError(problem, file=rows.log, hint="give a longer log, or score from an earlier time")
+    measured, simulated, drives = values.T[:n_y], values.T[n_y : 2 * n_y], values.T[2 * n_y :]
+    outputs = dict(zip(plant.outputs, zip(measured, simulated)))
+    return _Pairs(time, outputs, dict(zip(plant.inputs, drives)))
 
 
 def _one_step(y: Array, v: Array, unit: str) -> Score:

@@ -77,8 +77,8 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, column, columns, log_name
 from thermogrip.sysid.models.neural import NeuralModel
 from thermogrip.sysid.plant.fit_record import RUN_GAIN_SD, SEVERAL, TAIL
-from thermogrip.sysid.plant.log_grid import cut_stretches
-from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.plant.log_grid import cut_stretches, match_logs
+from thermogrip.sysid.plant.plant import WARMUP, Plant
 from thermogrip.sysid.plant.simulation import find_starts
 
 SHORT = 0.1  # of the level: a part on which the expected coverage falls short by more is reported
@@ -143,7 +143,8 @@ def free_run_band(plant: Plant, log: Log, simulated: Log, *, level: float = 0.9,
         raise ValueError(f"level must lie between 0 and 1, got {level:g}")
     wide = NormalDist().inv_cdf(0.5 + level / 2)
     taken = draws if plant.uncertain else 0
-    runs = [columns(plant.draw(k).simulate(log), plant.outputs) for k in range(1, taken + 1)]
+    stretches = cut_stretches(plant, match_logs(plant, [log])[0][0]) if taken else []
+    runs = [plant.draw(k).over(stretches, WARMUP)[0] for k in range(1, taken + 1)]
     scored = np.asarray(simulated["scored"].values) > 0
     half, inside, other_run = {}, {}, between_runs(plant, [log])
     for at, name in enumerate(plant.outputs):

@@ -67,9 +67,8 @@ from scipy.signal import lfilter
 from scipy.special import chdtrc
 
 from thermogrip.datasets.arrays import Array, Mask
-from thermogrip.datasets.schema import Log, columns
 from thermogrip.sysid.greybox.noise_model import Block, band_weights
-from thermogrip.sysid.plant.log_grid import Stretch, at_rows, cut_stretches
+from thermogrip.sysid.plant.log_grid import Stretch, at_rows
 from thermogrip.sysid.plant.simulation import Start, find_starts
 
 if TYPE_CHECKING:
@@ -241,20 +240,19 @@ class ResidualCorrelations:
 
 
 def residual_correlations(
-    plant: Plant, log: Log, simulated: Log, *, warmup: float = 5.0
+    plant: Plant, stretches: Sequence[Stretch], run: Array, scored: Mask, *, warmup: float
 ) -> ResidualCorrelations:
-    """Test the residual of the free run ``simulated`` of a plant over a log.
+    """Test the residual of the free ``run`` (n, n_y) of a plant over the stretches of a log, at all rows.
 
     Empty where the run diverged, has no residual, or has fewer than twenty blocks.
     """
-    run, scored = columns(simulated, plant.outputs), np.asarray(simulated["scored"].values) > 0
-    residual = _residual(columns(log, plant.outputs), run, scored)
+    residual = _residual(np.concatenate([stretch.y for stretch in stretches]), run, scored)
     rms = np.sqrt(np.nanmean(residual**2, axis=0)) if residual is not None else np.zeros(1)
     if residual is None or not rms.all():
         return ResidualCorrelations({}, {})
     draws = [plant.draw(k) for k in range(1, _DRAWS + 1)] if plant.uncertain else []
-    drawn = _of_draws([columns(draw.simulate(log, warmup=warmup), plant.outputs) for draw in draws], run, rms)
-    parts = _parts(plant, cut_stretches(plant, log), residual, drawn, rms, warmup)
+    drawn = _of_draws([draw.over(stretches, warmup)[0] for draw in draws], run, rms)
+    parts = _parts(plant, stretches, residual, drawn, rms, warmup)
     if not parts:
         return ResidualCorrelations({}, {})
     signals = list(parts[0].tested)

@@ -314,7 +314,8 @@ def test_a_plant_is_scored_log_by_log_beside_its_baselines(bench: Bench, stand_i
         return {"t_tank": Score(90.0, rmse, "degC", 12)}
 
     run = SimpleNamespace(
-        scores=score(0.1), one_step=score(0.2), naive={"no_input": score(0.3), "mean": score(0.4)},
+        log=SimpleNamespace(attrs={"name": "good@:100"}), scores=score(0.1), one_step=score(0.2),
+        naive={"no_input": score(0.3), "mean": score(0.4)},
         residual=SimpleNamespace(to_json=lambda: {"minutes": 1.0}), notes=("a note",),
         band=lambda: Band(0.9, {}, {"t_tank": 0.875, "t_lost": np.nan}, 12, "its errors"),
     )  # fmt: skip
@@ -329,8 +330,8 @@ def test_a_plant_is_scored_log_by_log_beside_its_baselines(bench: Bench, stand_i
     assert all(
         (call.args[0].inputs, call.args[1].attrs["name"][:4]) == (("drive", "pump"), "good") for call in runs
     )
-    assert sections[0].args[:2] == (runs[0].args[1], run)
-    assert sections[0].args[2].draws == 12
+    assert sections[0].args[0] is run
+    assert sections[0].args[1].draws == 12
     assert len(sections) == 2
     assert pages[0].args[:2] == (Path("v.html"), "Free runs of plant.json")
     assert pages[0].args[2].endswith("scored from 9 s on.")

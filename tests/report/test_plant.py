@@ -36,20 +36,20 @@ def run() -> tuple[Plant, Log, FreeRun]:
 
 
 def test_a_good_free_run_is_green(run: tuple[Plant, Log, FreeRun]) -> None:
-    _, log, found = run
-    section = free_run_section(log, found)
+    _, _, found = run
+    section = free_run_section(found)
     assert section.tone == "good"
     assert section.verdict.startswith("Free run (RMSE): t to 0.0")
     assert section.verdict.endswith(" degC.")
     bare = replace(found, scores={name: replace(s, unit="1") for name, s in found.scores.items()})
-    assert free_run_section(log, bare).verdict == section.verdict.replace(" degC", "")
+    assert free_run_section(bare).verdict == section.verdict.replace(" degC", "")
 
 
 def test_one_that_errs_more_than_its_fit_is_not_green_and_says_by_how_much(
     run: tuple[Plant, Log, FreeRun],
 ) -> None:
-    _, log, found = run
-    section = free_run_section(log, replace(found, exceeds_fit={"t": 3.14}))
+    _, _, found = run
+    section = free_run_section(replace(found, exceeds_fit={"t": 3.14}))
     assert section.tone == "warn"
     assert "Above the error of the fit: t 3.1 times." in section.verdict
 
@@ -64,11 +64,9 @@ def test_one_that_errs_more_than_its_fit_is_not_green_and_says_by_how_much(
 def test_one_whose_residual_follows_something_is_not_green_and_says_what(
     run: tuple[Plant, Log, FreeRun], signal: str, words: str
 ) -> None:
-    _, log, found = run
+    _, _, found = run
     follows = CorrelationTest(p=1e-6, size=0.02, significant=True)
-    section = free_run_section(
-        log, replace(found, residual=ResidualCorrelations({"t": {signal: follows}}, {}))
-    )
+    section = free_run_section(replace(found, residual=ResidualCorrelations({"t": {signal: follows}}, {})))
     assert section.tone == "warn"
     assert words in section.verdict
 
@@ -89,10 +87,10 @@ def test_the_prior_of_a_network_stands_beside_what_was_learnt_and_a_black_box_ha
 
 def test_a_free_run_s_page_has_its_scores_band_and_baselines(run: tuple[Plant, Log, FreeRun]) -> None:
     _, log, found = run
-    section = free_run_section(log, found)
+    section = free_run_section(found)
     assert section.title == f"Free run: {log.attrs['name']}"
-    assert free_run_section(log, found, seen=True).title.endswith(" (in the fit)")
-    assert free_run_section(log, found, seen=True, title="Mine").title == "Mine"
+    assert free_run_section(found, seen=True).title.endswith(" (in the fit)")
+    assert free_run_section(found, seen=True, title="Mine").title == "Mine"
     picture, table, residuals = section.parts[:3]
     assert isinstance(picture, Picture)
     assert f"Readings of the first {found.warmup:.3g} s set the state" in picture.caption
@@ -102,7 +100,7 @@ def test_a_free_run_s_page_has_its_scores_band_and_baselines(run: tuple[Plant, L
          naive["no_input"]["t"].rmse, naive["mean"]["t"].rmse, found.one_step["t"].rmse),
     )  # fmt: skip
     assert isinstance(residuals, Picture)
-    tied = free_run_section(log, replace(found, no_better=("t",), notes=("a note",)))
+    tied = free_run_section(replace(found, no_better=("t",), notes=("a note",)))
     assert (tied.tone, tied.parts[-1]) == ("warn", Text("a note."))
     assert "t: no better than a model without input." in tied.verdict
 
@@ -233,7 +231,7 @@ def test_growth_and_posterior_stand_where_there_are_any(monkeypatch: pytest.Monk
     board = plant_from_prior(load_network("tclab"))
     sections = plant.identification_sections(found, ["a log"], board, record, kept)
     assert asked == [(board, "a log", 9.0, 9.0, found.runs[0])]
-    assert sections[-1] == (("a log", "a run"), {"seen": True})
+    assert sections[-1] == (("a run",), {"seen": True})
     assert [section.title for section in sections[:3]] == [
         "Which plant is behind the logs?", "Which terms does the network need?",
         "How well are its parameters known?",

@@ -163,7 +163,8 @@ def waves(n: int, shift: float = 0.0) -> Any:
 
 def free_run_of(n: int) -> Figure:
     band = Band(0.9, {name: np.full(n, 0.5) for name in ("t1", "level")}, {"t1": 0.9, "level": 0.8}, 3)
-    return free_run_figure(waves(n), waves(n, 0.25), ("t1", "level"), band)
+    run = SimpleNamespace(measured=waves(n), log=waves(n, 0.25), scores=dict.fromkeys(("t1", "level")))
+    return free_run_figure(run, band)
 
 
 def residuals_of() -> Figure:

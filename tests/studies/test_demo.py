@@ -138,7 +138,7 @@ def test_every_stage_has_its_share_of_the_progress_and_its_section(
     asked: dict[str, tuple[Any, ...]] = {}
     session = SimpleNamespace(grasps="a grasp")
     results = {
-        "_identify": ("found", "plant", "record", ("log", "run")), "_tune": ("tuning", "checks"),
+        "_identify": ("found", "plant", "record", "run"), "_tune": ("tuning", "checks"),
         "_run": [("one", session), ("two", SimpleNamespace(grasps=None))],
         "_compare": ("comparison", "model"),
     }  # fmt: skip
@@ -173,7 +173,7 @@ def test_every_stage_has_its_share_of_the_progress_and_its_section(
         "_run": (tmp_path, "tuning", "plant", SEED), "_compare": (tmp_path, SEED, workers),
     }  # fmt: skip
     assert [section.title for section in done.sections] == [
-        "identification of found plant", "free_run of log run", "posterior of record",
+        "identification of found plant", "free_run of run", "posterior of record",
         "tuning of tuning", "review of checks",
         f"session of {results['_run']} the twin (posterior draw 3)", "touch of model ['a grasp']",
         "shipped comparison", "The same with your files",
@@ -217,8 +217,8 @@ def test_a_plant_is_fitted_to_three_logs_and_the_first_half_of_the_fourth(
     assert (len(names), options) == (
         4, {"network": "gripper", "models": ("arx", "oe", "sindy", "network"), "draws": 0, "seed": SEED},
     )  # fmt: skip
-    whole, (_, n, score_from) = found[3]
-    assert (whole.sizes["time"], score_from) == (n, 1350)
+    plant, n, score_from = found[3]
+    assert (plant is sampled, score_from) == (True, 1350)
     [cut] = [rows for name, rows in zip(names, rows) if name.startswith("pump_on_off")]
     assert 0.4 < cut / n < 0.6
     assert (calls["sample"], calls["saved"]) == (

@@ -269,6 +269,7 @@ def test_draws_that_cannot_be_made_are_a_note_and_the_fit_is_kept(monkeypatch, k
     block = StateSpaceModel(("q",), (), ("t",), A=[[0.95]], B=[[0.5]], C=[[1.0]], dt=1.0, y0=[25.0])
     plant = Plant(block, {}, dt=1.0, units={"q": "1", "t": "degC"})
     monkeypatch.setattr("thermogrip.sysid.greybox.fit.fit_network", lambda *_, **__: plant)
+    monkeypatch.setattr("thermogrip.sysid.greybox.posterior.fit_problem", lambda *_: None)
     for name in (
         "greybox.posterior.with_draws",
         "greybox.posterior.sample_posterior",

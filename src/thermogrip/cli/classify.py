@@ -17,7 +17,6 @@ from thermogrip.cli.options import (
     existing_grasps,
     existing_model,
     flag,
-    log_name,
     new_file,
     new_folder,
     one_of,
@@ -74,7 +73,7 @@ def touched_part(console: Console, records: Sequence[Grasps]) -> list[Grasps]:
     for record in records:
         quality = check_grasps(record)
         for words in dict.fromkeys(filter(None, quality.reason)):
-            console.warn(f"{log_name(record)}: {quality.reason.count(words)} left out: {words}")
+            console.warn(f"{record.attrs['name']}: {quality.reason.count(words)} left out: {words}")
         part = quality.usable_grasps(record)
         kept += [] if part is None else [part]
     if not kept:
@@ -89,7 +88,7 @@ def training_part(console: Console, records: Sequence[Grasps], split: str | None
         has_split = "split" in record and bool((record["split"].values != "").any())
         if split == "train" and not has_split:
             raise UserError(
-                "has no split", file=log_name(record), hint="fill the column split, or use --split all"
+                "has no split", file=record.attrs["name"], hint="fill the column split, or use --split all"
             )
         if split == "all" or not has_split:
             kept.append(record)
@@ -98,7 +97,7 @@ def training_part(console: Console, records: Sequence[Grasps], split: str | None
         if marked.any():
             kept.append(record.isel(grasp=marked))
         else:
-            console.warn(f"{log_name(record)}: no grasp is marked train, it is left out")
+            console.warn(f"{record.attrs['name']}: no grasp is marked train, it is left out")
     if not kept:
         raise UserError("no grasp is marked train", hint="use --split all")
     return kept
@@ -160,7 +159,7 @@ def effusivity(
     with console.progress("effusivity") as progress:
         rows = []
         for k, record in enumerate(records):
-            progress(k / len(records), log_name(record))
+            progress(k / len(records), record.attrs["name"])
             found = _effusivities(device, with_object_range(record, stated), coupling)
             unexplained |= unexplained_effusivities(device, record, found, stated)
             rows += [asdict(row) for row in found]
@@ -404,12 +403,12 @@ def _as_taught(console: Console, record: Grasps, longest: float, coupling: Coupl
     quality = check_grasps(record, longest=longest)
     if (more := quality.shortened).any():
         console.warn(
-            f"{log_name(record)}: {int(more.sum())} of {more.size} contacts are read until {longest:g} s, as "
-            "long as those lasted that taught the gripper"
+            f"{record.attrs['name']}: {int(more.sum())} of {more.size} contacts are read until "
+            f"{longest:g} s, as long as those lasted that taught the gripper"
         )
     if rested_long(record, coupling).any():
         console.warn(
-            f"{log_name(record)}: blocks that rested longer than those that taught how they move between "
+            f"{record.attrs['name']}: blocks that rested longer than those that taught how they move between "
             "touches: intervals may be too narrow"
         )
     return record.sel(time=slice(None, quality.until + 1e-9))

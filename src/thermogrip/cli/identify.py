@@ -25,7 +25,6 @@ from thermogrip.cli.options import (
     flag,
     load_logs,
     load_plant,
-    log_name,
     new_file,
     option,
 )
@@ -181,7 +180,7 @@ def identify(
     plant.save(out)
     dynamics, nothing = _dynamics(plant)
     if report is not None:
-        lead = f"From {', '.join(log_name(log) for log in logs)}."
+        lead = f"From {', '.join(log.attrs['name'] for log in logs)}."
         sections = identification_sections(found, logs, plant, record, growth, dynamics)
         write_report(report, "Identification", lead, sections)
     _show_identified(console, found, plant, growth, dynamics)
@@ -222,9 +221,9 @@ def _repaired(console: Console, logs: Sequence[Log]) -> dict[str, list[str]]:
     """Return what was repaired while the logs were read, by the log's name, and warn of it."""
     found = {}
     for log in logs:
-        found[log_name(log)] = [line for line in str(log.attrs.get("repairs", "")).splitlines() if line]
-        for line in found[log_name(log)]:
-            console.warn(f"{log_name(log)}: {line}")
+        found[log.attrs["name"]] = [line for line in str(log.attrs.get("repairs", "")).splitlines() if line]
+        for line in found[log.attrs["name"]]:
+            console.warn(f"{log.attrs['name']}: {line}")
     return found
 
 
@@ -364,7 +363,7 @@ def validate(
 
     repairs = _repaired(console, logs)
     for log in logs:
-        needed, name = warm_up_of_fit(loaded, log), log_name(log)
+        needed, name = warm_up_of_fit(loaded, log), log.attrs["name"]
         if warmup < needed:
             console.warn(
                 f"{name}: {warmup:g} s of readings set the state, the fit was scored with {needed:g} s; "
@@ -373,19 +372,19 @@ def validate(
     runs = []
     with console.progress("validate") as progress:
         for k, log in enumerate(logs):
-            progress(k / len(logs), log_name(log))
+            progress(k / len(logs), log.attrs["name"])
             runs.append(free_run(loaded, log, warmup=warmup, score_from=score_from, average=average))
     bands = [run.band() for run in runs]
     if report is not None:
-        sections = [free_run_section(*each) for each in zip(logs, runs, bands)]
+        sections = [free_run_section(*each) for each in zip(runs, bands)]
         lead = f"Inputs in, outputs out, nothing fed back; scored from {score_from:g} s on."
         write_report(report, f"Free runs of {plant.name}", lead, sections)
-    console.table(f"Free run of {plant.name}", *run_table(list(zip(logs, runs))))
+    console.table(f"Free run of {plant.name}", *run_table(runs))
     for log, run, band in zip(logs, runs, bands):
-        console.say(f"{log_name(log)}: {band_words(band)}")
+        console.say(f"{log.attrs['name']}: {band_words(band)}")
         for note in run.notes:
-            console.say(f"{log_name(log)}: {note}")
-    answers = [run_answer(log_name(log), run, band) for log, run, band in zip(logs, runs, bands)]
+            console.say(f"{log.attrs['name']}: {note}")
+    answers = [run_answer(log.attrs["name"], run, band) for log, run, band in zip(logs, runs, bands)]
     console.answer({"logs": answers, "repairs": repairs})
     return 0
 
@@ -432,10 +431,10 @@ def simulate(
     loaded = load_plant(plant, network)
     roles = loaded.inputs, loaded.outputs, loaded.disturbances
     (log,) = load_logs([path], *roles, columns=comma(columns), dt=dt)
-    repairs = _repaired(console, [log])[log_name(log)]
+    repairs = _repaired(console, [log])[log.attrs["name"]]
     (log,), converted = match_logs(loaded, [log])
     for line in converted:
-        console.warn(f"{log_name(log)}: {line}")
+        console.warn(f"{log.attrs['name']}: {line}")
     simulated = loaded.simulate(log, warmup=warmup)
     if bands:
         from thermogrip.sysid.validation.prediction_bands import free_run_band

@@ -316,11 +316,6 @@ def load_logs(
     return logs
 
 
-def log_name(log: Log | Grasps) -> str:
-    """Return a record's name as tables have it."""
-    return str(log.attrs["name"])
-
-
 def warn_of_contacts(console: Console, records: Sequence[Grasps]) -> None:
     """Warn of what was repaired in records while they were read, and of contacts that are missing or late."""
     from thermogrip.sysid.effusivity.quality import contact_faults, torn_groups
@@ -329,7 +324,7 @@ def warn_of_contacts(console: Console, records: Sequence[Grasps]) -> None:
         repairs = [line for line in str(grasps.attrs.get("repairs", "")).splitlines() if line]
         more = [f"{len(repairs) - SHOWN_REPAIRS} more like these"] if len(repairs) > SHOWN_REPAIRS else []
         for words in [*repairs[:SHOWN_REPAIRS], *more, *contact_faults(grasps)]:
-            console.warn(f"{log_name(grasps)}: {words}")
+            console.warn(f"{grasps.attrs['name']}: {words}")
     for words in torn_groups(records):
         console.warn(words)
 

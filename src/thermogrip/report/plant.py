@@ -42,15 +42,15 @@ _TIME_CONSTANTS = 6  # the slowest, in a sentence
 _STRUCTURES = 5  # of each kind, in the table of those searched
 
 
-def run_table(runs: Sequence[tuple[Log, FreeRun]]) -> Cells:
-    """Return the scores of free runs of logs beside their baselines (RMSE), a row a log and output."""
+def run_table(runs: Sequence[FreeRun]) -> Cells:
+    """Return the scores of free runs beside their baselines (RMSE), a row a log and output."""
     head = ("log", "output", "RMSE", "unit", "fit [%]", "n", "no input", "mean", "one step")
     rows = []
-    for log, run in runs:
+    for run in runs:
         for output, score in run.scores.items():
             naive = (run.naive[kind][output].rmse for kind in ("no_input", "mean"))
             scores = (score.rmse, score.unit, score.fit_percent, score.n, *naive, run.one_step[output].rmse)
-            rows.append((log_name(log), output, *scores))
+            rows.append((log_name(run.log), output, *scores))
     return head, tuple(rows)
 
 
@@ -171,7 +171,7 @@ def identification_sections(
         sections.append(posterior_section(record))
     for log, known in zip(logs, found.runs):
         run = free_run(plant, log, known.warmup, known.warmup, known=known)
-        sections.append(free_run_section(log, run, seen=True))
+        sections.append(free_run_section(run, seen=True))
     return sections
 
 
@@ -309,15 +309,15 @@ def _prior_intervals(plant: Plant) -> dict[str, tuple[float, float]]:
 
 
 def free_run_section(
-    log: Log, run: FreeRun, band: Band | None = None, *, seen: bool = False, title: str = ""
+    run: FreeRun, band: Band | None = None, *, seen: bool = False, title: str = ""
 ) -> Section:
-    """Return the section of one log: free run beside the measurement, scores, residual tests, notes.
+    """Return the section of a log: free run beside the measurement, scores, residual tests, notes.
 
     ``band`` is that of the run, where it is known already; ``seen`` says that the log was in the fit;
     ``title`` takes the place of the usual one.
     """
     band = run.band() if band is None else band
-    name = log_name(log)
+    name = log_name(run.log)
     units = {output: "" if score.unit == "1" else f" {score.unit}" for output, score in run.scores.items()}
     words = (f"{output} to {score.rmse:.2g}{units[output]}" for output, score in run.scores.items())
     verdict = f"Free run (RMSE): {', '.join(words)}."
@@ -331,12 +331,12 @@ def free_run_section(
         verdict += f" Residual correlation: {'; '.join(follows)}."
     parts: list[Any] = [
         Picture(
-            free_run_figure(log, run.log, tuple(run.scores), band),
+            free_run_figure(run, band),
             f"{name}: measured, simulated from the inputs alone, and their difference. Readings of the first "
             f"{run.warmup:.3g} s set the state; nothing is fed back after that. Shaded: {band_words(band)}. "
             "On grey: not scored.",
         ),
-        Table(*run_table([(log, run)]), _BASELINES),
+        Table(*run_table([run]), _BASELINES),
         Picture(
             residual_figure(run),
             "Correlation of the residuals with themselves and with the inputs before them; shaded: 95 % of "

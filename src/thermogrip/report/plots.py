@@ -40,9 +40,10 @@ MARKERS = ("o", "s", "D", "^", "v", "P", "X", "*")
 MAX_POINTS = 1500
 
 
-def free_run_figure(log: Log, simulated: Log, outputs: Sequence[str], band: Band | None = None) -> Figure:
+def free_run_figure(run: FreeRun, band: Band | None = None) -> Figure:
     """Draw outputs measured and in free run, their difference and the inputs, a column an output; rows whose
     ``scored`` is 0 stand on grey, and where a band is given readings are expected in the shade."""
+    log, simulated, outputs = run.measured, run.log, tuple(run.scores)
     figure, axes = panels(
         3, len(outputs), heights=(3, 1.2, 1.0), size=(5.2 * len(outputs), 4.4), sharex="col"
     )

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from thermogrip.classify.estimators.base import GraspClassifier
     from thermogrip.classify.evaluation.comparison import Comparison
     from thermogrip.datasets.parallel import Progress, Workers
-    from thermogrip.datasets.schema import Grasps, Log
+    from thermogrip.datasets.schema import Grasps
     from thermogrip.mpc.tuning.design_review import Check
     from thermogrip.mpc.tuning.tune import Tuning
     from thermogrip.rig.session.session import Session
@@ -78,7 +78,7 @@ def run_demo(
     touched = [session.grasps for _, session in sessions if session.grasps is not None]
     sections = [
         identification_section(found, plant),
-        free_run_section(*held_out, title="Does it predict the half of a log that was held out?"),
+        free_run_section(held_out, title="Does it predict the half of a log that was held out?"),
         posterior_section(record),
         tuning_section(tuning),
         review_section(checks),
@@ -108,7 +108,7 @@ def compared_models(seed: int) -> tuple[dict[str, GraspClassifier], tuple[str, .
 
 def _identify(
     out: Path, seed: int, progress: Progress | None
-) -> tuple[Identification, Plant, Posterior, tuple[Log, FreeRun]]:
+) -> tuple[Identification, Plant, Posterior, FreeRun]:
     """Fit three logs and half of the fourth, sample the posterior, and run freely over the held-out half."""
     from thermogrip.datasets.examples import EXAMPLE_LOGS, example_path
     from thermogrip.datasets.log_files import read_log
@@ -124,7 +124,7 @@ def _identify(
     plant, record = sample_posterior(found.plant, logs, seed=seed, progress=share)
     plant.save(out / "plant.json")
     whole = read_log(example_path("pump_on_off"))
-    return found, plant, record, (whole, free_run(plant, whole, score_from=SPLIT_S))
+    return found, plant, record, free_run(plant, whole, score_from=SPLIT_S)
 
 
 def _tune(

@@ -221,6 +221,7 @@ def test_a_refit_errs_by_its_worst_output(monkeypatch, rows, warmup):
 @pytest.mark.parametrize(("dt", "share"), [(2.0, 0.24), (20.0, 1.0)])  # (1 + 19 dt / 10) of 20 readings
 def test_a_plant_keeps_what_the_choice_found(monkeypatch, dt, share):
     monkeypatch.setattr(fitting, "reading_excess", lambda logs, names, dt: {names[0]: dt})
+    monkeypatch.setattr(fitting, "rows_of", lambda *_: None)
     grid, rmse = stub_grid((100, 60), dt, why="so", ends=True), np.array([[3.0, 1.0], [4.0, 7.0]])
     model = fit_of("oe", lagged_log(0, 100), poles=1, zeros=1, delays=1).plant.model
     model = replace(model, outputs=("s", "t"), C=np.ones((2, model.n_x)), y0=np.zeros(2))

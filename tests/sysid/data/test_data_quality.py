@@ -11,6 +11,7 @@ from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.data.data_quality import check_data, evidence, reading_excess
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.plant.log_grid import rows_of
 
 
 def plant_log(n=2000, *, seed=0, noise=0.02, level=25.0, name="a", drift=0.0, q=None, time=None):
@@ -19,6 +20,10 @@ def plant_log(n=2000, *, seed=0, noise=0.02, level=25.0, name="a", drift=0.0, q=
     y = level + drift * np.arange(n) / n + lfilter([0, 0.5], [1, -0.95], u) + noise * rng.standard_normal(n)
     t = np.arange(float(n)) if time is None else time
     return make_log(t, {"q": (u, "1", "input"), "t": (y, "degC", "output")}, name=name)
+
+
+def covered(plant, logs):
+    return evidence(plant, [rows_of(log, plant.inputs, plant.outputs, ()) for log in logs])
 
 
 def one(logs, check, **how):
@@ -376,10 +381,12 @@ def test_a_log_without_48_rows_before_one_is_not_tested_for_feedback():
 def test_the_noise_of_a_reading_off_its_bins_mean(steps, y, seconds, excess):
     time = np.append(0.0, np.cumsum(np.broadcast_to(steps, 199)))
     log = make_log(time, {"q": (ODD, "1", "input"), "t": (y, "degC", "output")})
-    assert reading_excess([log], ["t"], seconds) == {"t": pytest.approx(excess)}
+    rows = rows_of(log, ("q",), ("t",), ())
+    assert reading_excess([rows], ["t"], seconds) == {"t": pytest.approx(excess)}
     slow = make_log(4.0 * K, {"q": (ODD, "1", "input"), "t": (K, "degC", "output")})
     if np.isfinite(y).all():  # rows of 4 s are means of themselves
-        assert reading_excess([log, slow], ["t"], seconds)["t"] < max(0.8 * excess, 1e-9)
+        both = [rows, rows_of(slow, (), ("t",), ())]
+        assert reading_excess(both, ["t"], seconds)["t"] < max(0.8 * excess, 1e-9)
 
 
 # ---- what a plant rests on ----
@@ -403,7 +410,7 @@ def test_the_minutes_of_a_drive_to_either_side_are_counted(drive, pump, minutes,
     signals = {"drive": (value, plant.units["drive"], "input"), "pump": (0 * value + pump, "1", "input")}
     signals |= dict.fromkeys(plant.disturbances, (20 + 0 * value, "degC", "disturbance"))
     signals |= {name: (np.sin(np.arange(value.size)), "degC", "output") for name in plant.outputs}
-    seen = evidence(plant, [make_log(6.0 * np.arange(value.size), signals)])
+    seen = covered(plant, [make_log(6.0 * np.arange(value.size), signals)])
     got = [seen.minutes[kind] for kind in ("drive > 0", "drive < 0", "pump on")]
     assert got == pytest.approx(minutes)
     assert seen.total == pytest.approx(value.size / 10) == pytest.approx(seen.minutes["pump off"] + got[2])
@@ -422,7 +429,7 @@ def test_a_row_stands_for_ten_seconds_or_five_rows_at_most_and_the_last_for_the_
         n = len(times)
         signals = {name: (np.linspace(0, 9, n), "percent", "input") for name in plant.inputs}
         signals |= {name: (np.linspace(0, 9, n), "degC", "output") for name in plant.outputs}
-        assert evidence(plant, [make_log(np.array(times), signals)]).total == pytest.approx(minutes)
+        assert covered(plant, [make_log(np.array(times), signals)]).total == pytest.approx(minutes)
 
 
 @pytest.fixture
@@ -432,7 +439,7 @@ def gripper():
 
 def test_minutes_of_heating_and_cooling_are_those_of_the_columns(gripper):
     log = load_example_logs()["step_up_down"]
-    seen = evidence(gripper, [log])
+    seen = covered(gripper, [log])
     drive, time = log["drive"].values, log["time"].values
     cooling = np.sum(np.diff(time)[drive[:-1] < -0.05 * np.abs(drive).max()]) / 60
     assert seen.minutes["drive < 0"] == pytest.approx(cooling, abs=0.05)
@@ -440,10 +447,10 @@ def test_minutes_of_heating_and_cooling_are_those_of_the_columns(gripper):
 
 
 def test_a_pump_that_never_stops_is_reported(gripper):
-    seen = evidence(gripper, [load_example_logs()["step_up_down"]])
+    seen = covered(gripper, [load_example_logs()["step_up_down"]])
     assert "pump off" in seen.thin
     assert "pump off never occurs" in seen.sentence(gripper.units)
-    both = evidence(gripper, list(load_example_logs().values()))
+    both = covered(gripper, list(load_example_logs().values()))
     assert both.minutes["pump off"] > 5
 
 
@@ -451,16 +458,16 @@ def test_a_gap_does_not_count_as_minutes(gripper):
     time = np.append(np.arange(0.0, 600.0), np.arange(3600.0, 4200.0))
     log = load_example_logs()["step_up_down"].isel(time=slice(0, time.size))
     signals = {name: (log[name].values, log[name].attrs["units"], log[name].attrs["role"]) for name in log}
-    assert evidence(gripper, [make_log(time, signals)]).total == pytest.approx(20.0, abs=0.3)
+    assert covered(gripper, [make_log(time, signals)]).total == pytest.approx(20.0, abs=0.3)
 
 
 def test_rows_of_an_hour_are_no_gaps(gripper):
     log = load_example_logs()["step_up_down"].isel(time=slice(0, 200))
     signals = {name: (log[name].values, log[name].attrs["units"], log[name].attrs["role"]) for name in log}
     time = 3600.0 * np.arange(200)
-    assert evidence(gripper, [make_log(time, signals)]).total == pytest.approx(200 * 60)
+    assert covered(gripper, [make_log(time, signals)]).total == pytest.approx(200 * 60)
     time[100:] += 6 * 3600.0  # a step of seven hours counts as five
-    assert evidence(gripper, [make_log(time, signals)]).total == pytest.approx(204 * 60)
+    assert covered(gripper, [make_log(time, signals)]).total == pytest.approx(204 * 60)
 
 
 def test_an_input_of_one_sign_is_described_by_its_halves():
@@ -472,7 +479,7 @@ def test_an_input_of_one_sign_is_described_by_its_halves():
         "t1": (t / 100, "degC", "output"),
         "t2": (t / 100, "degC", "output"),
     }
-    seen = evidence(plant, [make_log(t, signals)])
+    seen = covered(plant, [make_log(t, signals)])
     assert seen.thin == ("q1 above 50",)
     assert seen.ranges["t1"] == pytest.approx((0.36, 35.63), abs=0.01)
     assert "the logs cover t1 between 0.36 and 35.6 degC, t2" in seen.sentence({"t1": "degC", "t2": "1"})

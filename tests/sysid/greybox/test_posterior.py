@@ -25,6 +25,7 @@ from thermogrip.sysid.greybox.posterior import (
     Chain,
     Posterior,
     RandomizedMap,
+    fit_problem,
     problem_hash,
     run_chain,
     sample_posterior,
@@ -135,11 +136,11 @@ def test_what_is_integrated_out_is_followed_far_from_the_fit() -> None:
 def test_draws_take_the_error_that_the_fit_has_learnt(monkeypatch: pytest.MonkeyPatch) -> None:
     plant, logs = a_fit(1, 2, 3)
     forgetful = replace(plant, scores=replace(plant.scores, intervals=None))
-    anew = with_draws(forgetful, logs, 5)
+    anew = with_draws(forgetful, fit_problem(forgetful, logs), 5)
     assert anew.intervals() == plant.intervals()
     assert anew.draw(4).values != plant.values
     monkeypatch.setattr("thermogrip.sysid.greybox.sandwich.learn_error_model", None)
-    again = with_draws(plant, logs, 5)
+    again = with_draws(plant, fit_problem(plant, logs), 5)
     assert anew.samples is not None
     assert again.samples is not None
     np.testing.assert_allclose(again.samples, anew.samples, rtol=1e-6)
@@ -150,9 +151,8 @@ def test_intervals_cover_the_truth_as_often_as_stated() -> None:
     inside = np.zeros(2)
     for seed in range(25):
         plant, logs = a_fit(100 + 2 * seed, 101 + 2 * seed)
-        quantiles = np.quantile(
-            np.asarray(with_draws(plant, logs, 60, seed=seed).samples), [0.05, 0.95], axis=0
-        )
+        drawn = with_draws(plant, fit_problem(plant, logs), 60, seed=seed).samples
+        quantiles = np.quantile(np.asarray(drawn), [0.05, 0.95], axis=0)
         inside += (quantiles[0] <= list(TRUE.values())) & (quantiles[1] >= list(TRUE.values()))
     # 99 % bounds of a binomial of 25 at 0.9, per parameter; the prior's sd of 4 adds nothing
     low, high = binom.ppf([0.003, 0.999], 25, 0.9)
@@ -496,13 +496,13 @@ def test_walkers_start_where_the_density_is_not_nought():
 def test_the_density_has_the_bins_and_weights_of_the_fit(fitted: tuple[Plant, list[Log]]):
     plant, logs = fitted
     plant = replace(plant, scores=replace(plant.scores, weight_s={"t": 24.0}, average_s=8.0))
-    problem = posterior._problem(plant, logs, None)
+    problem = posterior.fit_problem(plant, logs, None)
     assert (problem.average, problem.tau.tolist()) == (8.0, [3.0])
-    problem = posterior._problem(plant, logs, 6.0)
+    problem = posterior.fit_problem(plant, logs, 6.0)
     assert (problem.average, problem.tau.tolist()) == (6.0, [4.0])
-    assert posterior._problem(plant, logs, 30.0).tau.tolist() == [1.0]  # a bin is a reading at most
+    assert posterior.fit_problem(plant, logs, 30.0).tau.tolist() == [1.0]  # a bin is a reading at most
     free = replace(plant, scores=PlantScores())
-    assert posterior._problem(free, logs, None).tau.tolist() == [15.0]
+    assert posterior.fit_problem(free, logs, None).tau.tolist() == [15.0]
 
 
 def test_the_error_that_was_learnt_is_taken_for_the_fits_own_logs_alone(
@@ -517,9 +517,9 @@ def test_the_error_that_was_learnt_is_taken_for_the_fits_own_logs_alone(
         return whole(problem, z, numbers=numbers)
 
     monkeypatch.setattr(posterior, "score_covariance", watched)
-    with_draws(plant, logs, 2)
-    with_draws(plant, [logs[0], a_log(7)], 2)
-    with_draws(plant, logs[:1], 2)
+    with_draws(plant, fit_problem(plant, logs), 2)
+    with_draws(plant, fit_problem(plant, [logs[0], a_log(7)]), 2)
+    with_draws(plant, fit_problem(plant, logs[:1]), 2)
     assert [numbers is not None for numbers in given] == [True, False, False]
 
 
@@ -528,7 +528,7 @@ def test_a_seed_decides(fitted: tuple[Plant, list[Log]], what: str):
     make: Any = {
         "moves from one start": lambda s: run_chain(normal, start(), max_steps=20, seed=s).steps,
         "starts": lambda s: sample_posterior(*fitted, max_steps=1, n_samples=2, seed=s)[1].chain.steps[0],
-        "draws": lambda s: with_draws(*fitted, 3, seed=s).samples,
+        "draws": lambda s: with_draws(fitted[0], fit_problem(*fitted), 3, seed=s).samples,
     }[what]
     one, again, other = (make(seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one, again)
@@ -609,10 +609,10 @@ def test_draws_tell_how_far_they_are(
     def progress(share: float, what: str) -> None:
         told.append((share, what))
 
-    drawn = with_draws(*fitted, 2, progress=progress)
+    drawn = with_draws(fitted[0], fit_problem(*fitted), 2, progress=progress)
     assert told == [(k / 8, "plants that agree with the logs") for k in range(8)]
     assert np.asarray(drawn.samples).shape == (2, 2)
-    assert np.asarray(with_draws(*fitted).samples).shape == (24, 2)
+    assert np.asarray(with_draws(fitted[0], fit_problem(*fitted)).samples).shape == (24, 2)
     told.clear()
     monkeypatch.setattr(posterior, "_CHECK_EVERY", 2)
     sample_posterior(*fitted, max_steps=4, n_samples=3, progress=progress)

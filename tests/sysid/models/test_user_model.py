@@ -18,7 +18,7 @@ from scipy.integrate import solve_ivp
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.sysid.greybox.fit import fit_network, free_runs
-from thermogrip.sysid.greybox.posterior import with_draws
+from thermogrip.sysid.greybox.posterior import fit_problem, with_draws
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.user_model import OwnModel, _settle, load_object, own_model
 from thermogrip.sysid.plant.plant import Plant
@@ -123,7 +123,7 @@ def test_one_step_leaves_no_parameter_less_known_than_its_prior_and_can_be_drawn
     assert (np.sqrt(np.diag(plant.covariance)) <= prior * (1 + 1e-9)).all()
     for name, (low, high) in plant.intervals(0.9).items():  # 90 % of the prior: exp(2 * 1.645 sd)
         assert np.log(high / low) <= 2 * 1.6449 * model.specs[name].sd_log
-    drawn = with_draws(plant, [log], 60).samples
+    drawn = with_draws(plant, fit_problem(plant, [log]), 60).samples
     assert drawn is not None
     assert np.isfinite(drawn).all()
     scale = np.log(drawn).std(axis=0)  # of 60 draws a standard deviation is known to 9 %

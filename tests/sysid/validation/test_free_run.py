@@ -13,9 +13,10 @@ from scipy.stats import binom
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_log, write_log
 from thermogrip.datasets.resample import average
-from thermogrip.datasets.schema import make_log
+from thermogrip.datasets.schema import columns, make_log
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import PlantScores, fit_logs
+from thermogrip.sysid.plant.log_grid import rows_of
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation import free_run as module
 from thermogrip.sysid.validation.free_run import Score, free_run, no_input_baseline, score
@@ -55,6 +56,12 @@ def test_the_rmse_of_the_true_plant_is_the_noise():
     assert run.scores["t"].rmse == pytest.approx(0.1, abs=4 * 0.1 / np.sqrt(2 * 3995) + 0.002)
     assert run.whiteness["t"].independent
     assert run.no_better == ()
+
+
+def beside(plant, log, simulated, average):
+    rows = rows_of(log, plant.inputs, plant.outputs, plant.disturbances)
+    run, scored = columns(simulated, plant.outputs), simulated["scored"].values > 0
+    return module._beside(plant, rows, run, scored, average)
 
 
 def test_a_run_to_infinity_scores_infinity_in_one_step_too_and_warns_of_nothing():
@@ -101,7 +108,7 @@ def test_means_of_the_residual_are_correlated_with_means_of_the_input():
     log, fast = lag_log(2000, noise=0.3, seed=2), np.resize([0.0, 1.0, 1.0, 0.0, 1.0], 2000)
     log["q"] = ("time", log["q"].values + fast, log["q"].attrs)
     run = free_run(lag_plant(), log, average=10.0, tests=False)
-    pairs = module._beside(lag_plant(), log, run.log, 10.0)
+    pairs = beside(lag_plant(), log, run.log, 10.0)
     means, (y, v) = average(log, 10.0), pairs.outputs["t"]
     np.testing.assert_array_equal(pairs.time, means["time"].values)
     wanted = cross_correlation(y - v, means["q"].values)
@@ -280,7 +287,7 @@ def test_an_error_of_more_than_twice_that_of_the_fit_is_stated(here, noise, seco
     residual = ResidualCorrelations({}, {"t": start})
     log, seen = offset_run(here)
     blocks = module._blocks_of_fit(plant, log["time"].values)
-    pairs = module._beside(plant, log, seen, blocks).outputs if blocks else {}
+    pairs = beside(plant, log, seen, blocks).outputs if blocks else {}
     beyond = module._beyond_fit(plant, residual, pairs)
     assert beyond == ({"t": (pytest.approx(here), noise)} if found else {})
     black_box = replace(plant, scores=PlantScores(average_s=5.0))

@@ -10,11 +10,11 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.signal import lfilter
 from scipy.stats import binom
 
-from thermogrip.datasets.schema import Log, make_log
+from thermogrip.datasets.schema import Log, columns, make_log
 from thermogrip.sysid.greybox.noise_model import Block, band_weights
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import PlantScores
-from thermogrip.sysid.plant.log_grid import Stretch
+from thermogrip.sysid.plant.log_grid import Stretch, cut_stretches
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import Start
 from thermogrip.sysid.validation import residual_tests as tests
@@ -22,6 +22,7 @@ from thermogrip.sysid.validation.free_run import FreeRun, free_run
 from thermogrip.sysid.validation.residual_tests import (
     Correlation,
     CorrelationTest,
+    ResidualCorrelations,
     SlowNoise,
     _significant,
     autocorrelation,
@@ -62,8 +63,14 @@ def heated(q: np.ndarray, plant: Plant, start: float = 0.0) -> np.ndarray:
     return np.asarray(y[0, :-1, 0])
 
 
+def correlations(plant: Plant, log: Log, warmup: float = 5.0) -> ResidualCorrelations:
+    run, stretches = plant.simulate(log, warmup), cut_stretches(plant, log)
+    scored = run["scored"].values > 0
+    return residual_correlations(plant, stretches, columns(run, plant.outputs), scored, warmup=warmup)
+
+
 def signals_of(plant: Plant, log: Log, warmup: float = 20.0) -> dict[str, CorrelationTest]:
-    return residual_correlations(plant, log, plant.simulate(log, warmup), warmup=warmup).tests["t"]
+    return correlations(plant, log, warmup).tests["t"]
 
 
 def suspected(run: FreeRun) -> bool:
@@ -167,9 +174,9 @@ def test_what_cannot_be_tested_is_left_alone():
     own = log_of(q, heated(q, plant))
     assert free_run(plant, own).residual.start.keys() <= {"t"}  # its own simulation: nothing is left
     short = log_of(q, heated(q, plant) + 0.1).isel(time=slice(0, 15))
-    assert residual_correlations(plant, short, plant.simulate(short)).tests == {}
+    assert correlations(plant, short).tests == {}
     slow_rows = log_of(q, heated(q, plant) + 0.1 * q).isel(time=slice(0, 160, 4))  # 40, slower than the plant
-    found = residual_correlations(plant, slow_rows, plant.simulate(slow_rows)).tests["t"]
+    found = correlations(plant, slow_rows).tests["t"]
     assert found.keys() == {"q", "t squared"}
     wild = heater(1.5)  # it diverges
     assert free_run(wild, own).residual.tests == {}
