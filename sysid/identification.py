@@ -166,15 +166,10 @@ def fold_rows(fit: BlackBoxFit) -> list[Row]:
 
 def searched_rows(fit: BlackBoxFit) -> list[Searched]:
     """Return the structures of a kind that are usable on every fold, the best first, at most ``SHOWN``."""
+    chosen, error_of = fit.choice.structure, fit.choice.error_of
     rows = [
-        Searched(
-            fit.kind,
-            structure.label,
-            fit.choice.error_of(structure),
-            tuple(errors.tolist()),
-            structure == fit.choice.structure,
-        )
-        for structure, errors in fit.choice.errors.items()
+        Searched(fit.kind, each.label, error_of(each), tuple(errors.tolist()), each == chosen)
+        for each, errors in fit.choice.errors.items()
         if np.isfinite(errors).all()
     ]
     rows.sort(key=lambda row: row.error)
@@ -326,7 +321,7 @@ class Searched:
     structure: str
     error: float  # geometric mean over the folds of RMSE over the outputs' spread
     folds: tuple[float, ...]  # the same by fold
-    kept: bool  # whether it stands for its kind
+    kept: bool  # whether it represents its kind
 
 
 @dataclass(frozen=True, eq=False)
@@ -443,16 +438,9 @@ def identify(
     cases = list(cases_of(logs, leave_one_out))
     boxes = [] if leave_one_out else [model for model in candidates if model != "network"]
     parts = _Parts(progress, len(boxes) + len(cases) * (len(candidates) if leave_one_out else 2) + 2)
-
     settings: dict[str, Any] = {
-        "inputs": u,
-        "outputs": y,
-        "disturbances": d,
-        "average": average,
-        "order": order,
-        "delay": delay,
-    }
-
+        "inputs": u, "outputs": y, "disturbances": d, "average": average, "order": order, "delay": delay,
+    }  # fmt: skip
     fits, rows, refused = _fit_all(boxes, logs, settings, parts, workers)
     best = None
     if fits:

@@ -157,7 +157,7 @@ class PosteriorClassifier(GraspClassifier):
             evidence[single] = _of_candidates(self.device_, data, names, self.finish)
             if unknown:
                 free[single] = [fit.log_evidence for fit in grid_posteriors(self.device_, data)]
-                if self.finish != "known":  # a free effusivity has the finish of the training's blocks
+                if self.finish != "known":  # a free effusivity has the conductance of the training's blocks
                     other = _of_candidates(self.device_, data, names, "known")
         if not single.all():
             fit = two_touch_fit(self.device_, grasps, names, coupling=self.coupling_, finish=self.finish)

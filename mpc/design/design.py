@@ -102,7 +102,7 @@ def pair_loops(plant: Plant, controlled: tuple[str, ...]) -> tuple[PILoop, ...]:
 LONGEST_HORIZON, MOST_UNKNOWNS = 1000, 200
 
 _LONGEST_SAMPLE = 3600.0  # s
-_OUTPUT_DRIFT = 0.03  # degC per sqrt(sample), by which a bias of an output may wander in a default design
+_OUTPUT_DRIFT = 0.03  # degC per sqrt(sample), by which a bias of an output may drift in a default design
 _MOST_NOISE = 1e6  # of a state, a reading or a bias, in any unit
 _ROOMS = (-60.0, 150.0)  # degC: no room is beyond
 

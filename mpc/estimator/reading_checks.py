@@ -19,7 +19,7 @@ its range, or that of an output 2 degC: a pump that is off, a plug that has fall
 **A plant that is slower.**  The observer has found an output to lag behind the model by more than 0.65
 of a sample and five standard deviations, in five in a row, from readings that show it to a quarter of a
 sample: a structure that the model lacks.  (Where a drive is far from the model, a lag explains too little to
-be believed.)  It is reported until the lag is below a quarter of a sample.
+be accepted.)  It is reported until the lag is below a quarter of a sample.
 """
 
 from __future__ import annotations

@@ -297,7 +297,7 @@ class GripperModel:
     uncertain : bool, optional
         Whether answers integrate over the parameters, as ``uncertainty`` says; else they count as exact.
     second : GripperModel, optional
-        What stands around a second sensor of the finger (``t_surface_2``), calibrated on the same grasps.
+        What surrounds a second sensor of the finger (``t_surface_2``), calibrated on the same grasps.
     discrepancy : Discrepancy, optional
         What the gripper reads beyond the model, where its calibration found something.
 

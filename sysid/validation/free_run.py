@@ -223,21 +223,9 @@ def free_run(
     exceeds_fit = {name: here / there for name, (here, there) in beyond.items()}
     naive = {"mean": mean, "no_input": no_input}
     return FreeRun(
-        simulated,
-        scores,
-        one,
-        naive,
-        held,
-        whiteness,
-        left,
-        residual,
-        exceeds_fit,
-        no_better,
-        notes,
-        warmup,
-        plant,
-        log,
-    )
+        simulated, scores, one, naive, held, whiteness, left, residual, exceeds_fit, no_better, notes, warmup,
+        plant, log,
+    )  # fmt: skip
 
 
 def score(measured: Array, simulated: Array, unit: str = "degC") -> Score:

@@ -169,7 +169,7 @@ def option(
     min: float | None = None,
     max: float | None = None,
 ) -> Any:
-    """Return the Typer option of a name, what stands for its value, its help, a ``callback=``, its bounds."""
+    """Return the Typer option of a name, what its value is called, its help, a ``callback=``, its bounds."""
     return typer.Option(name, metavar=metavar, help=words, callback=check, min=min, max=max)
 
 
