@@ -5,7 +5,7 @@ line, its sensors have noise, and each knows one unmeasured change that comes la
 degC, levels cm or percent, time s.
 
 * rig: the skin behind two tubes of water of ``simulator.py``; then the skin loses more heat.
-* tclab: two heaters with their sensors, and the board between them that no model of the kit has; then a draught.
+* tclab: two heaters with their sensors, and a board between them that no model has; then a draught.
 * tanks: four tanks, two pumps that each feed two of them; then more water flows into the first.
 * furnace: three windings, six thermocouples along the tube; then the end stands open.
 * delay: a heated tube whose outlet is read a minute later; then the inflow is colder.
@@ -14,7 +14,7 @@ degC, levels cm or percent, time s.
   the thermometer; then the feed is warmer.
 * room: a day's weather, walls, clouds before the sun; then the sun comes in.
 * hotend: 12 g of aluminium that radiate; then a fan blows at it.
-* peltier: a cold plate whose element warms more than it cools beyond two thirds of its current; then 0.4 W of load.
+* peltier: a cold plate, coldest at two thirds of the current; then 0.4 W of load.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Case:
     levels: tuple[tuple[float, float], ...]  # of each input, between which a log moves it
     rest: tuple[float, ...]  # inputs at which a log, and a run, begins
     spec: Mapping[str, object]
-    targets: tuple[float, ...]  # of all controlled outputs, one after the other; at the last comes the disturbance
+    targets: tuple[float, ...]  # of all controlled outputs; at the last comes the disturbance
     seconds: float  # of each
     band: float
     range: float  # of targets, of which overshoot may be half a percent
@@ -230,7 +230,7 @@ def integrator() -> Plant:
     """A level in percent, 4 s behind its valve."""
 
     def rates(x: list[float], u: Sequence[float], _: Sequence[float], c: Changes) -> list[float]:
-        level, valve = x
+        _level, valve = x
         return [0.006 * (valve - 45.0 - (6.0 if c.disturbed else 0.0)), (u[0] - valve) / 4.0]
 
     return Plant(rates, [50.0, 45.0], [0], step=0.5)
@@ -339,7 +339,8 @@ CASES = (
         _sensors(0.03, "h1", "h2", unit="cm"), tanks,
         2.0, 3000.0, (60.0, 300.0), ((2.3, 3.7), (2.3, 3.7)), (3.0, 3.0),
         {"output": ["h1", "h2"], "steps": [(12.0, 14.0), (14.0, 11.0)], "band_degC": 0.1, "noise_degC": 0.03,
-         "overshoot_degC": 0.1, "sensor_offset_degC": 0.0, "settle_within_s": 400.0},
+         "overshoot_degC": 0.1, "sensor_offset_degC": 0.0, "settle_within_s": 400.0,
+         "drive_limits": {"v1": (0.0, 10.0), "v2": (0.0, 10.0)}},
         (14.0, 11.0), 600.0, 0.1, 20.0, (("v1", "h1"), ("v2", "h2")),
     ),
     Case(

@@ -17,18 +17,10 @@ from thermogrip.mpc.estimator.call_times import SAME, CallTimes
 from thermogrip.mpc.interface import Move, Readings, Target, number
 from thermogrip.mpc.plant.prediction import PredictionModel
 
-#: Readings outside are a broken wire, not a temperature [degC].
-PLAUSIBLE = (-60.0, 200.0)
 #: What a controller reports of a call that comes before its move is due.
 TOO_EARLY = "called before its sample time: the move is held"
 #: And of a reading that it has seen already.
 STALE = "reading is stale: its time has not moved on"
-
-
-def clean(reading: Readings, name: str) -> float:
-    """Return a plausible temperature [degC] from a reading, NaN where it is missing, no number, or absurd."""
-    value = number(reading, name)
-    return value if PLAUSIBLE[0] <= value <= PLAUSIBLE[1] else float("nan")
 
 
 class SampledController:
@@ -68,10 +60,15 @@ class SampledController:
         """Which controlled outputs have not been read for longer than patience."""
         return np.asarray(self._unread_s > self._patience_s)
 
+    def _clean(self, reading: Readings, name: str) -> float:
+        """Return a plausible value from a reading, NaN where it is missing, no number, or absurd."""
+        value = number(reading, name)
+        return value if self.model.coldest <= value <= self.model.hottest else float("nan")
+
     def _read(self, reading: Readings) -> tuple[Array, Array]:
         """Return the outputs (n_y,) and disturbances (n_d,) of a reading [degC], NaN where they cannot be."""
-        y = np.array([clean(reading, name) for name in self.model.outputs])
-        return y, np.array([clean(reading, name) for name in self.model.disturbances])
+        y = np.array([self._clean(reading, name) for name in self.model.outputs])
+        return y, np.array([self._clean(reading, name) for name in self.model.disturbances])
 
     def _given(self, reading: Readings, target: Target) -> tuple[Array, Array, Array, str]:
         """Return outputs, disturbances and targets in force [degC], and what is wrong; a stale reading is
@@ -91,11 +88,11 @@ class SampledController:
         """
         controlled = self.controlled
         if isinstance(target, Mapping):
-            wanted = np.array([clean(target, name) for name in controlled])
+            wanted = np.array([self._clean(target, name) for name in controlled])
             unknown = [name for name in target if name not in controlled]
             wrong = f"target names {unknown[0]}, controlled is {', '.join(controlled)}" if unknown else ""
         else:
-            wanted, wrong = np.full(len(controlled), clean({"": target}, "")), ""
+            wanted, wrong = np.full(len(controlled), self._clean({"": target}, "")), ""
         lost = ~np.isfinite(wanted)
         if lost.any():
             name = controlled[int(np.argmax(lost))]

@@ -117,7 +117,7 @@ class Controller(SampledController):
         if compiled:
             self._compile()
         self.pi = PIController.of(plant, design, tuple(replace(p, feedforward=0.0) for p in design.loops))
-        self.monitor = ReadingMonitor(self.model.n_y, len(self.observer.lagged))
+        self.monitor = ReadingMonitor(self.model.n_y, len(self.observer.lagged), spike=self.model.spike)
         self.reach = Reach(self.optimiser, self.observer)
         self.last_iterations = 0  # of the program, in the last step
         self._slew_s = self.dt  # for which the slew limit counts in this step

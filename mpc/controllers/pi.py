@@ -114,8 +114,12 @@ class PIController(SampledController):
         """Forget the past; the plant is at rest at this reading."""
         self._forget()
         self._I = np.zeros(len(self.loops))
-        self._target = self._read(reading)[0][self._rows]
+        y, room = self._read(reading)
+        self._target = y[self._rows]
         self._room = np.full(self.model.n_d, np.nan)
+        if np.isfinite(self._target).all():  # what the feed-forward leaves of the drive that holds this
+            held = self._held(self._target, np.where(np.isfinite(room), room, ROOM))
+            self._I = np.array([(1 - p.feedforward) * held[j] for p, (j, _) in zip(self.loops, self._ends)])
         self.times.reset()
 
     def step(self, reading: Readings, target: Target) -> Move:
@@ -178,9 +182,13 @@ class PIController(SampledController):
             self._I[at] = self._u[j] - loop.feedforward * ahead[j] - loop.Kc * error[i]
 
     def _feedforward(self, target: Array, d: Array) -> Array:
-        """Return the drives that hold the target; worked out once for a target and half a degree of room."""
+        """Return the drives that hold the target, where a loop uses them."""
         if not any(loop.feedforward for loop in self.loops):
             return np.zeros(self.model.n_u)
+        return self._held(target, d)
+
+    def _held(self, target: Array, d: Array) -> Array:
+        """Return the drives that hold the target; worked out once for a target and half a degree of room."""
         wanted, room = tuple(np.round(target, 2).tolist()), tuple((np.round(2 * d) / 2).tolist())
         return np.asarray(
             np.clip(held_drive(self.model, self.controlled, wanted, room), self.lowest, self.highest)

@@ -102,6 +102,8 @@ def pair_loops(plant: Plant, controlled: tuple[str, ...]) -> tuple[PILoop, ...]:
 LONGEST_HORIZON, MOST_UNKNOWNS = 1000, 200
 
 _LONGEST_SAMPLE = 3600.0  # s
+_COARSE = 1.0  # range of an output below which the filter's numbers, made for degC, are too coarse
+_MOST_DELAY = 10.0  # delays in a lag, from which on the bias of a drive is learnt more slowly
 _OUTPUT_DRIFT = 0.03  # degC per sqrt(sample), by which a bias of an output may drift in a default design
 _MOST_NOISE = 1e6  # of a state, a reading or a bias, in any unit
 _ROOMS = (-60.0, 150.0)  # degC: no room is beyond
@@ -364,23 +366,29 @@ def default_design(
     for name in controlled:
         if name not in plant.outputs:
             raise UserError(f"the plant has no output {name}", hint=f"it has {', '.join(plant.outputs)}")
-        unit = plant.units.get(name, "degC")
-        if unit != "degC":
+        low, high = plant.valid.get(name, (-np.inf, np.inf))
+        if high - low < _COARSE:
+            seen = f"{name} moves by {high - low:.2g} {plant.units.get(name, 'degC')} in the logs"
             raise UserError(
-                f"{name} is in {unit}, and controllers here regulate temperatures",
-                hint="name an output in degC in the spec: output = ...",
+                f"{seen}, and a controller counts tenths of a unit",
+                hint="log it in a smaller unit: cm instead of m",
             )
     dt = max(1, round((sample_time(plant) if dt is None else dt) / plant.dt)) * plant.dt
     drives = drive_names(plant)
     ranges = {name: drive_range(plant, name) for name in drives}
     slews = {name: 0.125 * (high - low) for name, (low, high) in ranges.items()}
-    lengths = []
+    lengths, ratios = [], []
     for output in controlled:
         answers = [step_response(plant, drive, output) for drive in drives]
         best = max(answers, key=lambda answer: abs(answer.gain))
         if not np.isfinite(best.gain) or best.gain == 0:
-            raise _unmoved(plant, output, finite=bool(np.isfinite(best.gain)))
+            how = "moves" if np.isfinite(best.gain) else "has a finite effect on"
+            raise UserError(
+                f"no drive {how} {output}",
+                hint="identify it with logs that move the drive, or take another model",
+            )
         lengths.append(min(8 * best.delay, best.delay + 3 * best.lag))
+        ratios.append(best.lag / max(best.delay, 1e-3 * best.lag))
     horizon = int(np.clip(np.ceil(max(lengths) / dt), 20, 80))
     values: dict[str, Any] = {
         "dt": dt,
@@ -389,21 +397,12 @@ def default_design(
         "drive_range": ranges,
         "slew_per_s": slews,
         "loops": pair_loops(plant, controlled),
-        "noise": ObserverNoise(output=_OUTPUT_DRIFT / dt**0.5),
+        "noise": ObserverNoise(
+            # what is learnt sooner than a delay shows it is noise
+            drive=ObserverNoise.drive * min(1.0, min(ratios) / _MOST_DELAY) ** 2,
+            output=_OUTPUT_DRIFT / dt**0.5,
+        ),
         "deadline_s": 0.5 * dt,
         "patience_s": max(10.0, 5 * dt),
     }
     return check_design(replace(Design(**values), **changes), plant)
-
-
-def _unmoved(plant: Plant, output: str, *, finite: bool) -> UserError:
-    """Return the error about an output that no drive moves, or none to a finite value."""
-    how = "moves" if finite else "has a finite effect on"
-    low, high = plant.valid.get(output, (-np.inf, np.inf))
-    # a black box knows nothing beyond its logs
-    beyond = not low - 5 <= 25.0 <= high + 5
-    where = f" at rest at 25 degC, where no log was ({low:.0f} to {high:.0f} degC)" if beyond else ""
-    hint = (
-        "identify it with logs that begin at rest" if beyond else "identify it with logs that move the drive"
-    )
-    return UserError(f"no drive {how} {output}{where}", hint=f"{hint}, or take another model")

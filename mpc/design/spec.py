@@ -17,6 +17,7 @@ from thermogrip.datasets.atomic_files import read_toml
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import LARGEST
 from thermogrip.mpc.design.design import Design, default_design
+from thermogrip.mpc.plant.prediction import drive_names, drive_range
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
@@ -80,7 +81,7 @@ class Spec(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    steps: Annotated[list[tuple[Temperature, Temperature]], Field(min_length=1, max_length=20)] = [
+    steps: Annotated[list[tuple[Finite, Finite]], Field(min_length=1, max_length=20)] = [
         (28.0, 38.0),
         (28.0, 18.0),
         (18.0, 43.0),
@@ -123,6 +124,16 @@ class Spec(BaseModel):
             seen = f"longer than each step is simulated (hold_s, {self.hold_s:g} s)"
             raise ValueError(f"settle_within_s: {self.settle_within_s:g} s is {seen}")
         return self
+
+    def widened(self, plant: Plant) -> Plant:
+        """Return the plant with drives as wide as the spec has them, where only the logs showed how wide."""
+        ranges = dict(plant.valid)
+        for name, (low, high) in _by_drive("drive_limits", self.drive_limits, drive_names(plant)).items():
+            (least, most), unit = drive_range(plant, name), plant.units.get(name, "1")
+            of_unit = unit in ("percent", "0_255") or (unit == "1" and -1.0 <= least < most <= 1.0)
+            if not of_unit:
+                ranges[name] = (min(low, least), max(high, most))
+        return replace(plant, valid=ranges)
 
     def design(self, plant: Plant, **changes: Any) -> Design:
         """Return the plant's default design under this spec; a key that does not fit it is a UserError."""

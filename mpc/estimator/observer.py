@@ -77,7 +77,7 @@ For a nonlinear plant the update is repeated at its own answer (Gauss-Newton).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -143,9 +143,13 @@ def resting_state(
 
 @lru_cache(maxsize=16)
 def resting_state_in_room(model: PredictionModel, ambient: float, unit: tuple[float, ...]) -> RestingState:
-    """Return :func:`resting_state` linearised where all rests in a room of ``ambient`` [degC]."""
+    """Return :func:`resting_state` linearised where all rests in a room of ``ambient`` [degC], or amid what
+    the logs showed.
+    """
     x, v, d = model.at_rest(ambient)
-    return resting_state(model, x, v, ambient, d, unit=np.array(unit))
+    level = float(np.mean(model.usual(ambient)))
+    rest = resting_state(model, x, v, level, d, unit=np.array(unit))
+    return replace(rest, x=rest.x + (ambient - level) * rest.by_level)
 
 
 #: Lag of an output beyond the model's, in samples: standard deviation at the start, most, and per sqrt(s).
@@ -294,8 +298,11 @@ class Observer:
         self.noise = noise if noise is not None else ObserverNoise()
         plant = model.plant
         self.offset = np.array([float(plant.offsets.get(name, 0.0)) for name in model.outputs])
-        sd = [max(plant.noise.get(name, self.noise.reading), 0.02) for name in model.outputs]
-        self.R = np.array(sd) ** 2
+        sd = [plant.noise.get(name, self.noise.reading) for name in model.outputs]
+        # a black box has the noise that shares a first error with the state best: at most sensor and model
+        known, errs = plant.scores.reading_sd, plant.scores.held_out_rmse
+        own = [np.hypot(known.get(n, np.inf), errs.get(n, np.inf)) for n in model.outputs]
+        self.R = np.maximum(np.minimum(sd, own), 0.02) ** 2
         self._H = np.hstack([model.C, disturbance.on_output])
         # a state's own unit: its spread, seen against the spread of the outputs
         spread = np.sqrt(np.maximum(np.diag(np.atleast_2d(plant.model.spread)), 1e-12))

@@ -1,8 +1,9 @@
 r"""Readings that cannot be, and plants that do not follow: found by what the model expects.
 
-**A jump.**  A reading more than 6 degC off the prediction is a loose plug: it is left out, for three samples.
-If it is still there at the fourth it counts: where most sensors have stayed with the model, it is taken for
-an offset of the sensor that jumped; else the world has changed, and the estimate starts again.
+**A jump.**  A reading more than 6 degC (of a wide range: a tenth of it) off the prediction is a loose plug:
+it is left out, for three samples.  If it is still there at the fourth it counts: where most sensors have
+stayed with the model, it is taken for an offset of the sensor that jumped; else the world has changed, and
+the estimate starts again.
 
 **A sensor that is stuck.**  A frozen reading is as finite and as near as any other, and a controller that
 accepts it heats for ever.  The model reveals it: while the reading stays the very same number,
@@ -31,11 +32,11 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.mpc.interface import number
+from thermogrip.mpc.plant.prediction import SPIKE
 
 if TYPE_CHECKING:
     from thermogrip.mpc.estimator.observer import Observer
 
-_SPIKE = 6.0  # degC off the prediction in one sample: a loose plug, unless it stays
 _LEFT_OUT = 3  # samples in a row, at most, that a jump is left out for
 _STUCK = 2.0  # degC that the model expects of a reading that has not moved at all
 _FOLLOWS_DRIVE = 0.3  # of its range: a larger bias of a drive is not a small error of the model
@@ -49,7 +50,8 @@ _SLOW_FOR = 5  # samples in a row, until it is reported
 class ReadingMonitor:
     """What the last readings were, and what was expected of them."""
 
-    def __init__(self, n_y: int, n_l: int = 0) -> None:
+    def __init__(self, n_y: int, n_l: int = 0, *, spike: Array | float = SPIKE) -> None:
+        self._spike = spike
         self._slow_for = np.zeros(n_l, dtype=int)  # samples in a row that each was slower
         self._last = np.full(n_y, np.nan)
         self._moved = np.zeros(n_y)
@@ -91,7 +93,7 @@ class ReadingMonitor:
         self._last = np.where(np.isfinite(y), y, self._last)
         self._moved = np.where(fresh, 0.0, self._moved)
         y = np.where(self.stuck, np.nan, y)
-        jumped = np.abs(np.nan_to_num(y - expected)) > _SPIKE
+        jumped = np.abs(np.nan_to_num(y - expected)) > self._spike
         self._spikes = np.where(jumped, self._spikes + 1, np.where(np.isfinite(y), 0, self._spikes))
         stays = self._spikes > _LEFT_OUT
         self._spikes[stays] = 0

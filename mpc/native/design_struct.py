@@ -49,6 +49,9 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "overshoot": (False, (), "band beyond the target [degC]"),
     "patience_s": (False, (), "how long a plan is followed without a solve [s]"),
     "ambient": (False, (), "room where none is measured [degC]"),
+    "spike": (False, ("NY",), "off its prediction a reading is a loose plug, unless it stays [degC]"),
+    "coldest": (False, (), "what a reading may be [degC]"),
+    "hottest": (False, (), ""),
     "reach": (False, ("NB",), "samples of slew from now to the middle of a block"),
     "lowest": (False, ("NU",), "range of the drives"),
     "highest": (False, ("NU",), ""),
@@ -186,7 +189,7 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
     rest = observer.rest_in_room()
     limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2)
     same_names = (
-        (model, "sub dt span C"),
+        (model, "sub dt span C spike coldest hottest"),
         (design, "move_delay blocks track terminal move drive price overshoot patience_s ambient"),
         (optimiser, "pair strongest seen reach lowest highest slew neutral at_rest"),
         (observer, "fixed offset R Q P0 R_start"),

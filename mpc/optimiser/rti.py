@@ -206,8 +206,8 @@ class Optimiser:
     def _response_at_rest(self) -> Array:
         """Set which output each drive moves most; return the response at rest (n_b, n_u) of that one."""
         model = self.model
-        x, _, room = model.at_rest(self.design.ambient)
-        plan = np.repeat(self.neutral[None, :], self.n_b, axis=0)
+        x, u, room = model.at_rest(self.design.ambient)
+        plan = np.repeat(u[None, :], self.n_b, axis=0)
         _, G = model.trajectory(x, plan, room, self.blocks)
         self.strongest = np.argmax(np.abs(G[:, self._rows].sum(axis=(0, 2))), axis=0)
         return self._response(G * model.span)

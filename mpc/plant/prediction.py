@@ -74,14 +74,20 @@ def drive_range(plant: Plant, name: str) -> tuple[float, float]:
 _STEP_ERROR = 0.01  # degC, of the prediction by a coarser step
 #: The room's temperature where nothing is known of it [degC].
 ROOM = 25.0
+#: Readings outside, and beyond twice what the logs showed, are a broken wire [degC].
+PLAUSIBLE = (-60.0, 200.0)
+#: A reading so far from the prediction is a loose plug, unless it stays [degC]; of a wide range, a tenth.
+SPIKE = 6.0
+_NEAR = 5.0  # degC from what the logs showed, where a black box still knows what it does
 
 
 class PredictionModel:
     """A plant seen at the controller's sample time, its on/off inputs at 1.
 
     ``drives``, ``outputs`` and ``disturbances`` name u, y and d; ``dt`` is the sample time [s], ``sub`` the
-    model's steps in it. A drive is between ``lowest`` and ``highest``, ``span`` wide, the unit in which
-    drives are scaled, and ``neutral`` is no drive or what is nearest to none, all (n_u,).
+    model's steps in it.  A drive is between ``lowest`` and ``highest``, ``span`` wide, the unit in which
+    drives are scaled, and ``neutral`` is no drive or what is nearest to none, all (n_u,).  A reading is
+    between ``coldest`` and ``hottest``, and within ``spike`` (n_y,) of its prediction.
     """
 
     def __init__(self, plant: Plant, *, dt: float | None = None) -> None:
@@ -100,6 +106,12 @@ class PredictionModel:
         self.lowest, self.highest = ranges[:, 0], ranges[:, 1]
         self.span = self.highest - self.lowest
         self.neutral = np.clip(np.zeros(self.n_u), self.lowest, self.highest)
+        seen = np.array([plant.valid.get(name, (-np.inf, np.inf)) for name in self.outputs], dtype=float)
+        self._seen, spread = seen, np.nan_to_num(seen[:, 1] - seen[:, 0], posinf=0.0)
+        away = np.nan_to_num(seen + spread[:, None] * [-1.0, 1.0], posinf=0.0, neginf=0.0)
+        self.spike = np.maximum(SPIKE, 0.1 * spread)
+        self.coldest = min(PLAUSIBLE[0], float(away[:, 0].min()))
+        self.hottest = max(PLAUSIBLE[1], float(away[:, 1].max()))
         wanted = sample_time(plant) if dt is None else float(dt)
         self.sub = max(1, round(wanted / plant.dt))
         self.dt = self.sub * plant.dt
@@ -113,7 +125,7 @@ class PredictionModel:
         """
         own = self.sub
         d = np.full(self.n_d, ROOM)
-        x = self.rest(np.full(self.n_y, ROOM), d)[None, :]
+        x = self.rest(self.usual(ROOM), d)[None, :]
         plan = np.repeat(np.stack([self.highest, self.lowest]), 30, axis=0)[None]
         exact, _ = self.run(x, plan, d)
         for steps in range(1, own):
@@ -137,9 +149,23 @@ class PredictionModel:
         return np.asarray(x, dtype=np.float64)
 
     def at_rest(self, ambient: float) -> tuple[Array, Array, Array]:
-        """Return state, drives and disturbances where all is at rest in a room of this temperature [degC]."""
-        d = np.full(self.n_d, ambient)
-        return self.rest(np.full(self.n_y, ambient), d), self.neutral, d
+        """Return state, drives and disturbances where all is at rest in a room of this temperature [degC];
+        where no log was there, amid what the logs showed.
+        """
+        d, y, v = np.full(self.n_d, ambient), self.usual(ambient), self.neutral
+        if np.any(y != ambient):
+            logs = [self.plant.valid.get(name, (rest, rest)) for name, rest in zip(self.drives, v)]
+            v = np.clip(np.mean(np.array(logs, dtype=float), axis=1), self.lowest, self.highest)
+        x = self.model.rest(y, self.inputs(v), d, self.p)
+        return np.asarray(x, dtype=np.float64), v, d
+
+    def usual(self, ambient: float) -> Array:
+        """Return outputs (n_y,) that are as warm as the room [degC], or the middle of what the logs showed
+        of those that never were.
+        """
+        low, high = self._seen.T
+        away = (ambient < low - _NEAR) | (ambient > high + _NEAR)
+        return np.mean(np.where(away, self._seen.T, ambient), axis=0, dtype=np.float64)
 
     def output(self, x: ArrayLike) -> Array:
         """Return the outputs (n_y,) at state x (n_x,)."""
@@ -259,7 +285,7 @@ class PredictionModel:
     def steady_state(self, u: ArrayLike, d: ArrayLike) -> Array:
         """Return the state (n_x,) in which the plant stays under drives u (Newton); NaN: there is none."""
         u, d = np.asarray(u, float).reshape(self.n_u), np.asarray(d, float)
-        x = self.rest(np.full(self.n_y, self.room(d)), d)
+        x = self.rest(self.usual(self.room(d)), d)
         for _ in range(30):
             after, A, _, _ = self.linearise(x, u, d)
             try:
@@ -436,14 +462,19 @@ def sample_time(plant: Plant) -> float:
     """Return a sample time [s] for control, on a 1-2-5 grid: a quarter of the longest apparent delay of an
     output behind the drive that moves it most.
 
-    Where there is next to no delay, a 400th of the lag, 10 s at most; never below the plant's own step.
+    Where there is next to no delay, a 400th of the lag, 10 s at most; of an output that adds up what it gets,
+    a 40th of the time in which a full drive leads through all that the logs showed.  Never below the plant's
+    own step.
     """
     found = []
     for output in plant.model.outputs:
         answers = [step_response(plant, drive, output) for drive in drive_names(plant)]
         best = max(answers, key=lambda answer: abs(answer.gain))
         if best.gain:
-            found.append(max(best.delay / 4, min(best.lag, 4000.0) / 400))
+            low, high = plant.valid.get(output, (-np.inf, np.inf))
+            through = best.lag * (high - low) / abs(best.gain)
+            short = through / 40 if through < best.lag / 20 else min(best.lag, 4000.0) / 400
+            found.append(max(best.delay / 4, short))
     wanted = max(found) if found else plant.dt
     grid = np.array([m * 10.0**e for e in range(-3, 3) for m in (1, 2, 5)])
     nice = float(grid[int(np.argmin(np.abs(np.log(grid / wanted))))])

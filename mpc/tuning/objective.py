@@ -178,14 +178,14 @@ MPC_PARAMETERS = (
     ("move", 0.02, 500.0),
     ("terminal", 0.3, 300.0),
     ("overshoot_share", 0.05, 0.9),
-    ("drive_walk", 1e-4, 2e-2),
+    ("drive_walk", 1e-5, 2e-2),
     ("output_walk", 2e-4, 2e-2),
 )
 PI_PARAMETERS = (("Kc", 0.1, 10.0), ("Ti", 0.2, 10.0), ("Tt", 0.05, 5.0), ("feedforward", 0.05, 1.0))
 LQR_PARAMETERS = (
     ("move", 0.02, 500.0),
     ("drive", 1e-4, 100.0),
-    ("drive_walk", 1e-4, 2e-2),
+    ("drive_walk", 1e-5, 2e-2),
     ("output_walk", 2e-4, 2e-2),
 )
 
@@ -229,10 +229,9 @@ class Search:
         self.bounds = bounds_of(plant, baseline, spec, sorted({*self.draws, *self.unseen}))
         check_steps(self.bounds)
         slowest = [max(self.bounds[(*step, draw)] for draw in self.draws) for step in spec.steps]
-        # long enough to see it settle and stay, short enough to try many; a PI takes longer, and costs less
+        # long enough to see it settle and stay, short enough to try many
         least = min(120.0, spec.hold_s)
         self.lengths = [float(np.clip(1.35 * bound + 40.0, least, spec.hold_s)) for bound in slowest]
-        self.pi_lengths = [float(np.clip(2.5 * bound + 100.0, least, spec.hold_s)) for bound in slowest]
 
     def __getstate__(self) -> dict[str, Any]:
         own = getattr(self.plant.model, "code", None)
@@ -284,7 +283,8 @@ class Search:
         else:
             controller = self.made(name, self.design(parameters))
         if lengths is None:
-            lengths = self.pi_lengths if name == "PI" else self.lengths
+            # a PI is tried for as long as a step is held, to see what its integrator has still to do
+            lengths = [self.spec.hold_s] * len(self.spec.steps) if name == "PI" else self.lengths
         results = run_trials(controller, self.plant, self.spec, self.draws, lengths=lengths, seed=self.seed)
         return Trial(
             controller=name,
@@ -351,12 +351,15 @@ def parameters_of(design: Design, spec: Spec) -> dict[str, float]:
 
 
 def scaled_loops(loops: tuple[PILoop, ...], factors: dict[str, float]) -> tuple[PILoop, ...]:
-    """Return PI loops with each number times its factor; the feed-forward is the number itself."""
+    """Return PI loops with each number times its factor; the feed-forward is the number itself.
+
+    A step of the load leaves an integrated error of Ti / Kc: at most half more than that of the loops given.
+    """
     return tuple(
         replace(
             loop,
             Kc=factors["Kc"] * loop.Kc,
-            Ti=factors["Ti"] * loop.Ti,
+            Ti=min(factors["Ti"], 1.5 * factors["Kc"]) * loop.Ti,
             Tt=factors["Tt"] * loop.Tt,
             feedforward=factors["feedforward"],
         )

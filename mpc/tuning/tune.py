@@ -273,6 +273,7 @@ def tune(
     ('actuator-limited', ['baseline', 'tuned', 'PI', 'LQR'])
     """
     spec = Spec() if spec is None else spec
+    plant = spec.widened(plant)
     baseline = spec.design(plant)
     search = Search(plant, spec, baseline, seed)
     start = parameters_of(baseline, spec)
@@ -355,12 +356,12 @@ def _search_all(
 ) -> dict[str, list[Trial]]:
     """Return the trials of MPC, PI and LQR, after as many evaluations each."""
     n = search.spec.evaluations
-    pi = {"Kc": 1.0, "Ti": 1.0, "Tt": 0.5, "feedforward": 0.99}  # SIMC
+    pi = {"Kc": 1.0, "Ti": 1.0, "Tt": 0.5, "feedforward": 0.99}  # SIMC, with the drive that holds the target
     lqr = {**parameters_of(search.baseline, search.spec), "drive": 1e-2}
     items = [
-        (search, "MPC", _best(looked).parameters, max(0, n - len(looked)), None),
-        (search, "PI", pi, n, None),
-        (search, "LQR", lqr, n, None),
+        (search, "MPC", [_best(looked).parameters], max(0, n - len(looked)), None),
+        (search, "PI", [pi, pi | {"feedforward": 0.05}], n, None),  # and without
+        (search, "LQR", [lqr], n, None),
     ]
     if workers == 1:
         shares = ((0.0, 0.5), (0.5, 0.65), (0.65, 1.0))
@@ -372,9 +373,11 @@ def _search_all(
     return {**found, "MPC": [*looked, *found["MPC"]]}
 
 
-def _optimise(item: tuple[Search, str, dict[str, float], int, Progress | None]) -> list[Trial]:
-    """Minimise a controller's score over its parameters' logarithms; return every trial."""
-    search, name, start, evaluations, progress = item
+def _optimise(item: tuple[Search, str, list[dict[str, float]], int, Progress | None]) -> list[Trial]:
+    """Minimise a controller's score over its parameters' logarithms from the best of its starts on; return
+    every trial.
+    """
+    search, name, starts, evaluations, progress = item
     if evaluations < 1:
         return []
     import nlopt
@@ -384,7 +387,8 @@ def _optimise(item: tuple[Search, str, dict[str, float], int, Progress | None]) 
     names = [parameter for parameter, _, _ in parameters]
     low = np.log([small for _, small, _ in parameters])
     high = np.log([large for _, _, large in parameters])
-    tried = [] if name == "MPC" else [evaluate(start)]
+    tried = [] if name == "MPC" else [evaluate(start) for start in starts[:evaluations]]
+    start = _best(tried).parameters if tried else starts[0]
 
     def cost(z: Array, gradient: Array) -> float:
         tried.append(evaluate({**start, **dict(zip(names, np.exp(z).tolist(), strict=True))}))

@@ -276,13 +276,13 @@ def _plant(grid: Grid, choice: Choice, logs: Sequence[Log]) -> Plant:
     independent = min(1 + rows * grid.dt / READING_EVERY, rows + 1) / (rows + 1)
     noise, nuisance = prior.noise * scale * np.sqrt(independent), prior.nuisance * scale
     rmse = np.sqrt(np.mean(choice.rmse**2, axis=0))
+    own = [rows_of(log, (), grid.outputs, ()) for log in logs]
     scores = PlantScores(
         structure=choice.structure.label,
         average_s=grid.dt,
         average_why=grid.why,
-        reading_excess=reading_excess(
-            [rows_of(log, (), grid.outputs, ()) for log in logs], grid.outputs, grid.dt
-        ),
+        reading_excess=reading_excess(own, grid.outputs, grid.dt),
+        reading_sd=reading_excess(own, grid.outputs, np.inf),
         folds=list(choice.folds),
         held_out_rmse={name: float(v) for name, v in zip(grid.outputs, rmse)},
         held_out_by_part={name: part.tolist() for name, part in zip(grid.outputs, choice.rmse.T)},

@@ -6,7 +6,6 @@
 #include <string.h>
 
 #define RESTART_S 30.0 /* a longer silence than this and the past is unknown */
-#define SPIKE 6.0      /* degC off the prediction in one sample: a loose plug, unless it stays */
 #define LEFT_OUT 3     /* samples in a row, at most, that a jump is rejected */
 #define CANNOT 0.1     /* degC from the target: out of reach */
 #define CAN 0.05       /* degC from the target: within reach */
@@ -30,14 +29,15 @@
 #define SHOWN_TO 0.25     /* its largest standard deviation, */
 #define SLOWER_SD 5.0     /* the least lag in those, */
 #define SLOW_FOR 5        /* and for so many samples in a row */
-#define COLDEST (-60.0)
-#define HOTTEST 200.0
 #define TINY 1e-9
 #define SAME 1e-6 /* of a sample: what is nearer than this is the same time */
 
 /* ---- the loop ---- */
 
-static double clean(double value) { return value >= COLDEST && value <= HOTTEST ? value : NAN; }
+static double clean(const tg_design *s, double value)
+{
+    return value >= s->coldest && value <= s->hottest ? value : NAN;
+}
 
 static int all_finite(const double *a, int n)
 {
@@ -90,9 +90,9 @@ void tg_reset(tg_controller *c, const tg_design *design, const double *y, const 
     memset(c, 0, sizeof *c);
     c->design = design;
     for (int i = 0; i < TG_NY; i++)
-        clean_y[i] = clean(y[i]);
+        clean_y[i] = clean(design, y[i]);
     for (int i = 0; i < TG_ND; i++)
-        clean_d[i] = clean(d[i]);
+        clean_d[i] = clean(design, d[i]);
     start(c, clean_y, clean_d);
     forget_calls(c);
 }
@@ -196,7 +196,7 @@ static int screen(tg_controller *c, double *y)
     int stays[TG_NY], count = 0, seen = 0;
     tg_expected(c, mean);
     for (int i = 0; i < TG_NY; i++) {
-        int jumped = fabs(y[i] - mean[i]) > SPIKE;
+        int jumped = fabs(y[i] - mean[i]) > c->design->spike[i];
         if (jumped)
             c->spikes[i]++;
         else if (isfinite(y[i]))
@@ -273,7 +273,7 @@ static int set_target(tg_controller *c, const double *target)
     double mean[TG_NY], wanted;
     int wrong = 0, moved = 0;
     for (int r = 0; r < s->n_c; r++) {
-        wanted = clean(target[r]);
+        wanted = clean(s, target[r]);
         wrong = wrong || !isfinite(wanted);
         if (isfinite(wanted) && wanted != c->target[r])
             moved = 1;
@@ -282,7 +282,7 @@ static int set_target(tg_controller *c, const double *target)
     }
     tg_expected(c, mean);
     for (int r = 0; r < s->n_c; r++) {
-        wanted = isfinite(clean(target[r])) ? target[r] : c->target[r];
+        wanted = isfinite(clean(s, target[r])) ? target[r] : c->target[r];
         if (moved) {
             double far = wanted - mean[s->controlled[r]];
             c->side[r] = far > 0.0 ? 1.0 : far < 0.0 ? -1.0 : 0.0;
@@ -725,9 +725,9 @@ tg_move tg_step(tg_controller *c, double time_s, const double *y, const double *
     int said, wrong;
     memset(&move, 0, sizeof move);
     for (int i = 0; i < TG_NY; i++)
-        clean_y[i] = c->stale ? NAN : clean(y[i]);
+        clean_y[i] = c->stale ? NAN : clean(c->design, y[i]);
     for (int i = 0; i < TG_ND; i++)
-        clean_d[i] = clean(d[i]);
+        clean_d[i] = clean(c->design, d[i]);
     for (int j = 0; j < TG_NU; j++)
         did[j] = applied && isfinite(applied[j]) ? applied[j] : c->in_force[j];
     pass(c, did);

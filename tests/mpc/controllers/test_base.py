@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.mpc.makers import crossed
-from thermogrip.mpc.controllers.base import SampledController, as_drive, clean
+from thermogrip.mpc.controllers.base import SampledController, as_drive
 from thermogrip.mpc.plant.prediction import PredictionModel
 
 NAN = float("nan")
@@ -24,10 +24,10 @@ def controller() -> SampledController:
     [(25.5, 25.5), ("25.5", 25.5), (-60.0, -60.0), (200.0, 200.0), (-60.1, NAN), (200.1, NAN), (NAN, NAN),
      (None, NAN), ("warm", NAN), ([], NAN)],
 )  # fmt: skip
-def test_a_reading_is_a_plausible_temperature_or_none(value: object, read: float):
-    np.testing.assert_equal(clean({"t": value}, "t"), read)  # type: ignore[dict-item]
-    assert np.isnan(clean({"other": 25.0}, "t"))
-    assert np.isnan(clean(None, "t"))  # type: ignore[arg-type]
+def test_a_reading_is_a_plausible_temperature_or_none(controller, value: object, read: float):
+    np.testing.assert_equal(controller._clean({"t": value}, "t"), read)
+    assert np.isnan(controller._clean({"other": 25.0}, "t"))
+    assert np.isnan(controller._clean(None, "t"))
 
 
 @pytest.mark.parametrize(

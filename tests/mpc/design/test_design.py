@@ -16,7 +16,6 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import (
     Design,
-    _unmoved,
     check_design,
     default_controlled,
     default_design,
@@ -125,27 +124,26 @@ def test_a_drive_may_move_an_eighth_of_its_range_a_second(unit: str, ends: tuple
     assert design.slew_per_s == {"q": ends[1] / 8}
 
 
-def test_what_is_no_temperature_and_what_nothing_moves_is_no_target():
-    with pytest.raises(UserError, match="t is in V, and controllers here regulate temperatures"):
-        default_design(block(10, 50.0, output="V"))
+def test_an_output_in_any_unit_is_a_target_where_it_moves_by_more_than_a_unit():
+    assert default_design(block(10, 50.0, output="V")) == default_design(block(10, 50.0))
+    small = replace(block(10, 50.0, output="m"), valid={"q": (0.0, 1.0), "t": (2.0, 2.9)})
+    with pytest.raises(UserError, match=r"t moves by 0\.9 m in the logs.*cm instead of m"):
+        default_design(small)
+    default_design(replace(small, valid={"t": (2.0, 3.0)}))
+
+
+def test_what_nothing_moves_is_no_target():
     with pytest.raises(UserError, match="the plant has no output u; it has t"):
         default_design(block(10, 50.0), controlled=["u"])
     with pytest.raises(UserError, match="no drive moves t"):
         default_design(block(10, 50.0, gain=0.0), dt=1.0)
 
 
-@pytest.mark.parametrize(
-    ("valid", "beyond"),
-    [((30.0, 90.0), False), ((30.1, 90.0), True), ((0.0, 20.0), False), ((0.0, 19.9), True)],
-)
-def test_logs_that_never_were_near_25_degc_are_named_where_no_drive_moves_an_output(valid, beyond):
-    plant = replace(block(10, 50.0), valid={"t": valid})
-    text, begin = str(_unmoved(plant, "t", finite=True)), "identify it with logs that begin at rest, or take"
-    seen = f"no drive moves t at rest at 25 degC, where no log was ({valid[0]:.0f} to {valid[1]:.0f} degC)"
-    assert (seen in text, begin in text) == (beyond, beyond)
-    assert ("logs that move the drive, or take another model" in text) == (not beyond)
-    assert "no drive has a finite effect on t" in str(_unmoved(plant, "t", finite=False))
-    assert "where no log was" not in str(_unmoved(replace(plant, valid={}), "t", finite=True))
+def test_a_bias_is_learnt_more_slowly_where_there_are_less_than_ten_delays_in_a_lag():
+    drifts = [
+        default_design(block(delay, lag), dt=2.0).noise.drive for delay, lag in ((5, 100.0), (40, 100.0))
+    ]
+    assert drifts == pytest.approx([0.002, 0.002 * (0.1 * 101 / 39.995) ** 2], rel=1e-2)
 
 
 LOOP = {"drive": "drive", "output": "t_surface", "Kc": 0.1, "Ti": 50.0, "Tt": 50.0, "feedforward": 0.0}

@@ -11,6 +11,7 @@ import pytest
 from tests.mpc.makers import heater
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.design.spec import SPEC_TEMPLATE, Spec, _ranges, read_spec, spec_from_dict
+from thermogrip.mpc.plant.prediction import drive_range
 
 
 def test_the_template_says_the_defaults():
@@ -35,7 +36,7 @@ def test_every_line_of_the_template_that_is_commented_out_is_valid_too():
         ("steps = []", "steps"),
         ("steps = [[28, 38, 40]]", "steps"),
         ("steps = [[28, 28.1]]", "steps"),
-        ("steps = [[28, 4000]]", "steps"),
+        ("steps = [[28, 4e12]]", "steps"),
         ("setle_within_s = 3", "setle_within_s"),
         ("drive_limits = [1, -1]", "drive_limits"),
         ("evaluations = 0", "evaluations"),
@@ -50,8 +51,8 @@ def test_every_line_of_the_template_that_is_commented_out_is_valid_too():
         ("slew_per_s = { drive = -1 }", "slew_per_s.drive: input should be greater than 0"),
         ("limits = { t_tank = [-inf, 60] }", "limits.t_tank.0 is -inf, not a finite number"),
         ("steps = [[28, 28.25]]", "steps: 28 -> 28.25 stays inside the band"),
-        ("steps = [[28, -21]]", "steps.0.1: input should be greater than or equal to -20"),
-        ("steps = [[151, 28]]", "steps.0.0: input should be less than or equal to 150"),
+        ("steps = [[28, -1.1e12]]", "steps.0.1: input should be greater than or equal to -1000000000000"),
+        ("steps = [[1.1e12, 28]]", "steps.0.0: input should be less than or equal to 1000000000000"),
         (f"steps = {[[28, 38]] * 21}", "steps: list should have at most 20"),
         ("hold_s = 9.9", "hold_s: input should be greater than or equal to 10"),
         ("hold_s = 36001", "hold_s: input should be less than or equal to 36000"),
@@ -79,7 +80,7 @@ def test_a_mistake_in_the_spec_is_one_line_that_names_file_and_key(tmp_path, tex
 
 
 def test_what_is_just_allowed_is_taken_and_a_spec_stays_as_it_is():
-    ends = {"steps": [(28.0, 28.26)] * 19 + [(-20.0, 150.0)], "hold_s": 36000, "settle_within_s": 36000}
+    ends = {"steps": [(28.0, 28.26)] * 19 + [(-20.0, 1500.0)], "hold_s": 36000, "settle_within_s": 36000}
     ends |= {"noise_degC": 50, "sensor_offset_degC": -50, "search_draws": 50, "check_draws": 200}
     ends |= {"evaluations": 10000, "energy_weight": 0, "patience_s": 0, "output": ["a", "b"]}
     assert spec_from_dict(ends).model_dump(exclude_unset=True) == ends
@@ -169,3 +170,15 @@ def test_a_sample_time_is_held_against_the_step_of_its_plant():
     assert Spec(sample_time_s=15).design(plant).dt == 15.0
     with pytest.raises(UserError, match="18 s is no multiple of the plant's step of 5 s; write 20, or"):
         Spec(sample_time_s=18).design(plant)
+
+
+def test_a_drive_whose_range_only_its_logs_showed_is_as_wide_as_the_spec_has_it(tank):
+    volts = replace(tank, units=tank.units | {"drive": "V"}, valid=tank.valid | {"drive": (2.0, 4.0)})
+    spec = Spec(drive_limits={"drive": (0.0, 3.0)})
+    wide = spec.widened(volts)
+    assert drive_range(wide, "drive") == (0.0, 4.0)
+    assert spec.design(wide).drive_range == {"drive": (0.0, 3.0)}
+    with pytest.raises(UserError, match="drive_limits: 0 to 3 of drive leaves its range"):
+        spec.design(volts)
+    with pytest.raises(UserError, match="leaves its range"):  # of a drive whose unit has a range
+        (beyond := Spec(drive_limits=(-2.0, 2.0))).design(beyond.widened(tank))

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.mpc.makers import network_plant
+from tests.mpc.makers import make_tank, network_plant
 from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.estimator.observer import (
     DisturbanceModel,
     Observer,
@@ -19,6 +22,7 @@ from thermogrip.mpc.estimator.observer import (
 )
 from thermogrip.mpc.plant.prediction import PredictionModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.fit_record import PlantScores
 from thermogrip.sysid.plant.plant import Plant
 
 A = np.array([[0.95, 0.02], [0.06, 0.9]])
@@ -421,3 +425,13 @@ def test_where_a_lag_would_be_negative_the_estimate_is_that_without_one() -> Non
     assert one.lag[0] == pytest.approx(0.0, abs=1e-12)
     assert np.abs(one.x - before).max() > 0.05
     np.testing.assert_allclose([*one.x, *one.w], [*other.x, *other.w], atol=1e-9)
+
+
+def test_readings_of_a_black_box_count_by_no_more_than_their_own_noise_and_the_models_error():
+    old = replace(make_tank(), noise={"t_tank": 9.0, "t_surface": 0.1})
+    errs = {"t_tank": 0.4, "t_surface": 0.2}
+    scores = PlantScores(reading_sd={"t_tank": 0.3, "t_surface": 0.01}, held_out_rmse=errs)
+    plants = old, replace(old, scores=scores)
+    old, new = ([*default_design(p).observer(PredictionModel(p, dt=2.0)).R] for p in plants)
+    assert old == pytest.approx([81.0, 0.01])
+    assert new == pytest.approx([0.25, 0.01])

@@ -195,6 +195,36 @@ def test_the_sample_time_is_a_round_part_of_the_delay_or_of_the_lag(tank, grippe
     ]
     assert [sample_time(plant) for plant in plants] == [2.0, 5.0, 10.0, 10.0, 1.0]
     assert sample_time(block(3, 800.0, gain=0.0)) == 1.0
+    # what adds up: half of the range leads through the 80 of the logs in 160 s, of which 4 are a 40th
+    level = StateSpaceModel(("q",), (), ("t",), A=np.eye(1), B=np.full((1, 1), 0.01), C=np.eye(1), dt=1.0)
+    seen = {"q": (0.0, 100.0), "t": (10.0, 90.0)}
+    assert sample_time(Plant(level, {}, dt=1.0, units={"q": "percent"}, valid=seen)) == 2.0
+
+
+def test_a_plant_whose_logs_were_never_in_the_room_rests_amid_them():
+    plant = block(10, 50.0)
+    warm = PredictionModel(replace(plant, valid={"q": (40.0, 60.0), "t": (30.1, 90.0)}))
+    x, v, d = warm.at_rest(25.0)
+    assert (warm.output(x), v.tolist(), d.tolist()) == (pytest.approx(60.05), [50.0], [25.0])
+    near = PredictionModel(replace(plant, valid={"q": (40.0, 60.0), "t": (30.0, 90.0)}))
+    x, v, d = near.at_rest(25.0)
+    assert (near.output(x), v.tolist()) == (pytest.approx(25.0), [0.0])
+    assert PredictionModel(replace(plant, valid={"t": (0.0, 19.9)})).usual(25.0) == pytest.approx(9.95)
+    assert PredictionModel(replace(plant, valid={})).usual(25.0).tolist() == [25.0]
+
+
+@pytest.mark.parametrize(
+    ("valid", "ends", "spike"),
+    [
+        ({"t": (20.0, 45.0)}, (-60.0, 200.0), 6.0),
+        ({}, (-60.0, 200.0), 6.0),
+        ({"t": (25.0, 285.0)}, (-235.0, 545.0), 26.0),
+    ],
+)
+def test_a_reading_may_be_as_far_from_the_logs_as_they_are_wide(valid, ends, spike):
+    model = PredictionModel(replace(block(10, 50.0), valid={"q": (0.0, 100.0)} | valid))
+    assert (model.coldest, model.hottest) == ends
+    assert model.spike.tolist() == [spike]
 
 
 def test_each_operation_of_a_compiled_step_does_what_casadi_does():

@@ -29,18 +29,17 @@ def search_of(bounds: Any, *, uncertain: bool = True, spec: Spec = SPEC, **chang
         return Search(plant, spec, spec.design(make_tank(), **changes), 3)  # type: ignore[arg-type]
 
 
-def test_trials_last_for_what_the_slowest_draw_needs_and_those_of_a_pi_for_longer():
+def test_trials_last_for_what_the_slowest_draw_needs():
     search = search_of(lambda start, target, draw: (70.0 if target > 30 else 20.0) + draw)
     assert (search.draws, search.unseen, search.certain) == ([1, 2], [101, 102, 103], False)
     assert (search.seed, search.check_seed) == (3, 3)
     assert set(search.bounds) == {(*step, draw) for step in STEPS for draw in (1, 2, 101, 102, 103)}
     assert search.bounds[28.0, 20.0, 102] == 122.0
     assert search.lengths == pytest.approx([1.35 * 72 + 40, 120.0])  # two minutes at least
-    assert search.pi_lengths == pytest.approx([2.5 * 72 + 100, 2.5 * 22 + 100])
     long = search_of(lambda *at: 250.0)
-    assert (long.lengths, long.pi_lengths) == ([300.0, 300.0], [300.0, 300.0])
+    assert long.lengths == [300.0, 300.0]
     short = search_of(lambda *at: 1.0, spec=SPEC.model_copy(update={"hold_s": 90.0}))
-    assert (short.lengths, short.pi_lengths) == ([90.0, 90.0], [90.0, 90.0])
+    assert short.lengths == [90.0, 90.0]
     sure = search_of(lambda *at: 50.0, uncertain=False)
     assert (sure.draws, sure.unseen, sure.certain, sure.seed, sure.check_seed) == ([0], [0], True, 3, 4)
 
@@ -71,7 +70,7 @@ def test_each_controller_is_tried_for_its_own_length(monkeypatch: pytest.MonkeyP
     pi = {"Kc": 2.0, "Ti": 1.0, "Tt": 1.0, "feedforward": 0.5}
     tried = [search.evaluate({"move": 7.0}), search.evaluate(pi, "PI"), search.evaluate({"move": 4.0}, "LQR")]
     search.evaluate_at_length(("PI", pi))
-    lengths = [search.lengths, search.pi_lengths, search.lengths, [300.0, 300.0]]
+    lengths = [search.lengths, [300.0, 300.0], search.lengths, [300.0, 300.0]]
     names = [("MPC", 7.0), ("PI", 2.0), ("LQR", 4.0), ("PI", 2.0)]
     assert seen == [(name, [1, 2], length, 3) for name, length in zip(names, lengths, strict=True)]
     cost = (80 + 100) / 120 + 0.5 * (100 - 90) / 60  # the mean, and half of what the worst is above it
@@ -142,6 +141,9 @@ def test_a_pis_numbers_are_scaled_and_its_feedforward_is_given():
     loop = PILoop("q", "t", 2.0, 30.0, 40.0, 0.9)
     (made,) = scaled_loops((loop,), {"Kc": 3.0, "Ti": 0.5, "Tt": 0.1, "feedforward": 0.7})
     assert made == PILoop("q", "t", 6.0, 15.0, 4.0, 0.7)
+    # a step of the load leaves at most half more than with the loop's own Ti / Kc
+    (slow,) = scaled_loops((loop,), {"Kc": 0.5, "Ti": 8.0, "Tt": 0.1, "feedforward": 0.7})
+    assert slow.Ti / slow.Kc == pytest.approx(1.5 * loop.Ti / loop.Kc)
 
 
 def test_a_score_is_the_mean_and_half_of_what_the_worst_is_above_it():

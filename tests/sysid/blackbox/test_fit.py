@@ -236,7 +236,7 @@ def test_a_plant_keeps_what_the_choice_found(monkeypatch, dt, share):
     assert (scores.structure, scores.average_s, scores.average_why) == ("lag", dt, "so")
     assert scores.held_out_rmse == pytest.approx({"s": 12.5**0.5, "t": 5.0})
     assert scores.held_out_by_part == {"s": [3.0, 4.0], "t": [1.0, 7.0]}
-    assert (scores.folds, scores.reading_excess) == (["a", "b"], {"s": dt})
+    assert (scores.folds, scores.reading_excess, scores.reading_sd) == (["a", "b"], {"s": dt}, {"s": np.inf})
 
 
 @pytest.mark.parametrize(
