@@ -165,7 +165,7 @@ class PredictionModel:
         """
         low, high = self._seen.T
         away = (ambient < low - _NEAR) | (ambient > high + _NEAR)
-        return np.mean(np.where(away, self._seen.T, ambient), axis=0, dtype=np.float64)
+        return np.asarray(np.mean(np.where(away, self._seen.T, ambient), axis=0), dtype=np.float64)
 
     def output(self, x: ArrayLike) -> Array:
         """Return the outputs (n_y,) at state x (n_x,)."""
