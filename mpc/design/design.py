@@ -399,7 +399,7 @@ def default_design(
         "loops": pair_loops(plant, controlled),
         "noise": ObserverNoise(
             # what is learnt sooner than a delay shows it is noise
-            drive=ObserverNoise.drive * min(1.0, min(ratios) / _MOST_DELAY) ** 2,
+            drive=ObserverNoise.drive * min(1.0, min(ratios) / _MOST_DELAY) ** 1.5,
             output=_OUTPUT_DRIFT / dt**0.5,
         ),
         "deadline_s": 0.5 * dt,

@@ -360,7 +360,8 @@ def _search_all(
     lqr = {**parameters_of(search.baseline, search.spec), "drive": 1e-2}
     items = [
         (search, "MPC", [_best(looked).parameters], max(0, n - len(looked)), None),
-        (search, "PI", [pi, pi | {"feedforward": 0.05}], n, None),  # and without
+        # and without; a plant that has no draws does not know how wrong that drive is
+        (search, "PI", [pi, pi | {"feedforward": 0.05}][search.certain :], n, None),
         (search, "LQR", [lqr], n, None),
     ]
     if workers == 1:
@@ -382,7 +383,8 @@ def _optimise(item: tuple[Search, str, list[dict[str, float]], int, Progress | N
         return []
     import nlopt
 
-    parameters = {"MPC": MPC_PARAMETERS, "PI": PI_PARAMETERS, "LQR": LQR_PARAMETERS}[name]
+    own = PI_PARAMETERS[:3] if search.certain else PI_PARAMETERS
+    parameters = {"MPC": MPC_PARAMETERS, "PI": own, "LQR": LQR_PARAMETERS}[name]
     evaluate = partial(search.evaluate, name=name)
     names = [parameter for parameter, _, _ in parameters]
     low = np.log([small for _, small, _ in parameters])

@@ -351,8 +351,10 @@ def test_a_spec_faster_than_full_drive_is_called_actuator_limited(tank: Any):
 
 
 def test_a_plant_without_uncertainty_is_compared_under_fresh_noise(tank: Any):
-    found = tuned(tank, draws=(0,), unseen=(0,), certain=True).tuning
-    assert "under fresh noise (the plant has no uncertainty)" in found.finding
+    done = tuned(tank, draws=(0,), unseen=(0,), certain=True)
+    assert "under fresh noise (the plant has no uncertainty)" in done.tuning.finding
+    # its PI does without the drive that the plant has for a target
+    assert {trial.parameters["feedforward"] for trial in done.tried("PI")} == {0.05}
 
 
 def test_the_file_holds_what_was_found(done: Done):
