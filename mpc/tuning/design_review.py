@@ -35,6 +35,7 @@ from thermogrip.mpc.native.design_struct import ITERATION_LIMIT
 from thermogrip.mpc.optimiser.rti import Optimiser
 from thermogrip.mpc.plant.prediction import PredictionModel, holding_drive, steady_curve, step_response
 from thermogrip.mpc.tuning.objective import draws_of
+from thermogrip.sysid.models.model import BlackBox
 
 _RANK = {"pass": 0, "warn": 1, "fail": 2}
 _KELVIN = 273.15
@@ -74,7 +75,7 @@ def review(
     controller: Controller,
     *,
     wanted: tuple[float, float] | None = None,
-    rooms: Sequence[float] = (18.0, 30.0),
+    rooms: Sequence[float] | None = None,
     draws: int = 5,
 ) -> list[Check]:
     """Return the findings about a controller's design.
@@ -85,7 +86,8 @@ def review(
     wanted : (float, float), optional
         The range of targets [degC]; by default that of its spec's steps, else what the logs showed.
     rooms : sequence of float, optional
-        Room temperatures in which the range must be reachable [degC].
+        Room temperatures in which the range must be reachable [degC]; by default 7 degC below and 5 above
+        the design's.
     draws : int, optional
         Posterior draws on which the closed loop is checked.
 
@@ -103,10 +105,10 @@ def review(
     starts, targets = _steps(controller)
     span = (min(targets), max(targets)) if wanted is None else wanted
     swing = (min(starts + targets), max(starts + targets)) if wanted is None else wanted
-    loops = loops_of(controller, draws)
+    loops, usual = loops_of(controller, draws), controller.design.ambient
     return [
         horizon(controller),
-        reachable(controller, span, rooms),
+        reachable(controller, span, (usual - 7.0, usual + 5.0) if rooms is None else rooms),
         gain_sign(controller),
         peltier_optimum(controller, span, draws),
         detectable(controller),
@@ -255,6 +257,14 @@ def reachable(controller: Controller, span: tuple[float, float], rooms: Sequence
     )
 
 
+def _known(model: PredictionModel) -> tuple[Array, Array]:
+    """Return the least and the most of each drive (n_u,) that is known: to a black box, of its logs."""
+    if not isinstance(model.model, BlackBox):
+        return model.lowest, model.highest
+    low, high = np.array([model.plant.valid.get(name, (-np.inf, np.inf)) for name in model.drives]).T
+    return np.maximum(model.lowest, low), np.minimum(model.highest, high)
+
+
 def gain_sign(controller: Controller) -> Check:
     """A Peltier element cools less beyond its optimum current: dT/du changes sign there."""
     design, model = controller.design, controller.model
@@ -267,7 +277,8 @@ def gain_sign(controller: Controller) -> Check:
             return Check(
                 name, "warn", finding, "evaluate by the closed loops of tune: there is no steady state"
             )
-        inside = [turn for turn in curve.turns if low < turn < high]
+        least, most = (float(ends[model.drives.index(drive)]) for ends in _known(model))
+        inside = [turn for turn in curve.turns if max(low, least) < turn < min(high, most)]
         seen.append(f"{drive}: {np.nanmin(curve.y):.1f} to {np.nanmax(curve.y):.1f} degC in steady state")
         if inside:
             bad.append(
@@ -402,9 +413,9 @@ def detectable(controller: Controller) -> Check:
     chosen = choose_disturbances(model, controller.controlled, ambient=controller.design.ambient)
     d = np.full(model.n_d, controller.design.ambient)
     scale = np.array([0.01 if label.startswith("input") else 1.0 for label in chosen.names])
-    margins = []
+    margins, (low, high) = [], _known(model)
     for share in (0.1, 0.3, 0.5, 0.7, 0.9):
-        u = model.lowest + share * model.span
+        u = low + share * (high - low)
         _, A, B, E = model.linearise(model.steady_state(u, d), u, d)
         into = B @ (chosen.on_drive * model.span[:, None]) + E @ chosen.on_disturbance
         margins.append(

@@ -13,6 +13,7 @@ from tests.mpc.makers import crossed, network_plant
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
 from thermogrip.mpc.design.design import PILoop, default_design
 from thermogrip.mpc.estimator.observer import ObserverNoise
+from thermogrip.mpc.plant.prediction import PredictionModel
 from thermogrip.mpc.tuning import design_review as checks
 from thermogrip.mpc.tuning.design_review import review, worst
 from thermogrip.sysid.models.state_space import StateSpaceModel
@@ -216,6 +217,7 @@ def stub(**design) -> Any:
     usual = {"controlled": ("t",), "dt": 2.0, "horizon_s": 40.0, "blocks": (1, 3), "slew_per_s": {"q": 0.1}}
     usual |= {"drive_range": {"q": (-1.0, 3.0)}, "limits": {}, "ambient": 22.0}
     model = SimpleNamespace(drives=("p", "q"), n_u=2, n_d=1, outputs=("t",), span=np.array([1.0, 4.0]))
+    vars(model).update(model=None, lowest=np.array([0.0, -1.0]), highest=np.array([1.0, 3.0]))
     return SimpleNamespace(design=SimpleNamespace(**usual | design), model=model, plant=None, dt=2.0)
 
 
@@ -378,6 +380,14 @@ def test_a_turn_of_the_gain_counts_inside_the_range(monkeypatch, y, turns, verdi
     check = checks.gain_sign(stub())
     assert (check.verdict, check.finding) == (verdict, finding)
     assert [(drive, output, d.tolist()) for drive, output, d in asked] == [("q", "t", [22.0])]
+
+
+def test_of_a_black_box_gains_are_looked_at_where_its_logs_were():
+    boxed = replace(crossed(), valid={"q1": (20.0, 60.0), "a": (20.0, 40.0), "b": (20.0, 40.0)})
+    low, high = checks._known(PredictionModel(boxed, dt=2.0))
+    assert (low.tolist(), high.tolist()) == ([20.0, 0.0], [60.0, 100.0])
+    network = network_plant("tclab", q1=(20.0, 60.0))
+    assert [ends.tolist() for ends in checks._known(PredictionModel(network))] == [[0.0, 0.0], [100.0, 100.0]]
 
 
 @pytest.fixture(scope="module")
