@@ -114,7 +114,7 @@ def test_a_class_of_ones_own_with_two_outputs_is_tuned_and_run(lab: Bench):
         (["tune", "lab.json", "--out", "c.json"], "hand the class in with --network lab.py:Lab"),
         (["tune", "lab.json", "--network", "lab.py:Lap", "--out", "c.json"], "Lab"),
         (["tune", "plant.json", "--cluster", "localhost", "--out", "c.json"], "write tcp://HOST:PORT"),
-        (["tune", "volt.json", "--out", "c.json"], "level is in V, and controllers here regulate"),
+        (["tune", "volt.json", "--out", "c.json"], "level moves by 0.5 V in the logs"),
         (["tune", "still.json", "--out", "c.json"], "no drive moves t_surface"),
     ],
 )
@@ -122,7 +122,7 @@ def test_what_cannot_be_controlled_is_one_line(lab: Bench, words: list[str], say
     plant = small_plant()
     model = StateSpaceModel(("pump",), (), ("level",), A=[[0.9]], B=[[1.0]], C=[[1.0]], dt=1.0)
     units = {"pump": "1", "level": "V"}
-    Plant(model, {}, dt=1.0, units=units, valid={"pump": (0.0, 1.0)}).save(lab.path / "volt.json")
+    Plant(model, {}, dt=1.0, units=units, valid={"pump": (0.0, 1.0), "level": (2.0, 2.5)}).save(lab.path / "volt.json")
     still = replace(plant.model, B=np.zeros((2, 2)))
     replace(plant, model=still).save(lab.path / "still.json")
     done = lab.run(*words)
