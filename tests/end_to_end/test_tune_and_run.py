@@ -122,7 +122,8 @@ def test_what_cannot_be_controlled_is_one_line(lab: Bench, words: list[str], say
     plant = small_plant()
     model = StateSpaceModel(("pump",), (), ("level",), A=[[0.9]], B=[[1.0]], C=[[1.0]], dt=1.0)
     units = {"pump": "1", "level": "V"}
-    Plant(model, {}, dt=1.0, units=units, valid={"pump": (0.0, 1.0), "level": (2.0, 2.5)}).save(lab.path / "volt.json")
+    valid = {"pump": (0.0, 1.0), "level": (2.0, 2.5)}
+    Plant(model, {}, dt=1.0, units=units, valid=valid).save(lab.path / "volt.json")
     still = replace(plant.model, B=np.zeros((2, 2)))
     replace(plant, model=still).save(lab.path / "still.json")
     done = lab.run(*words)

@@ -383,7 +383,7 @@ def test_a_turn_of_the_gain_counts_inside_the_range(monkeypatch, y, turns, verdi
 
 
 def test_of_a_black_box_gains_are_looked_at_where_its_logs_were():
-    boxed = replace(crossed(), valid={"q1": (20.0, 60.0), "a": (20.0, 40.0), "b": (20.0, 40.0)})
+    boxed = replace(crossed(), valid={"q1": (20.0, 60.0), "q2": (0.0, 120.0)})
     low, high = checks._known(PredictionModel(boxed, dt=2.0))
     assert (low.tolist(), high.tolist()) == ([20.0, 0.0], [60.0, 100.0])
     network = network_plant("tclab", q1=(20.0, 60.0))
@@ -392,7 +392,7 @@ def test_of_a_black_box_gains_are_looked_at_where_its_logs_were():
 
 @pytest.fixture(scope="module")
 def two() -> Controller:
-    plant = crossed("0_255")
+    plant = replace(crossed("0_255"), valid={"q1": (0.0, 100.0), "q2": (0.0, 255.0)})
     return Controller(plant, default_design(plant, controlled=("b", "a"), ambient=21.0))
 
 
