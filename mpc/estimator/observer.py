@@ -41,11 +41,14 @@ The noise of the states grows with the seconds, by s Q in the share s of a sampl
 looks like a drive that is too weak, until it looks like one that is too strong, and the loop swings.  So each
 controlled output is read through a lag T of its own, 0 at the start and never below,
 
-    s+ = s + a (C x - s),     y = s + a (C x - s) + biases,     a = dt / (dt + T),
+    s+ = s + a (z - s),    y = s + a (z - s) + biases,    a = dt / (dt + T),    z = C x + k (C x - C x_0),
 
-with s, what was shown last, and T among the states of the filter.  The plan still brings x to the target,
-not s: whether the skin is slow or its sensor, what follows x through a lag does not go beyond it.  Where T
-would be negative, or beyond six samples, the estimate is the conditional mean at that end [2]_.
+with s, what was shown last, T and k among the states of the filter.  k is by what share the output moves more
+than the model's since the start: on a ramp a loss or a coupling that is off by a few percent looks like a lag
+that grows with the way gone, and would be taken for one.  It is 0 at the start and becomes uncertain by and
+by, for the first samples of a rise show a lag.  The plan still brings x to the target, not s: whether the
+skin is slow or its sensor, what follows x through a lag does not go beyond it.  Where T would be negative, or
+beyond six samples, the estimate is the conditional mean at that end [2]_.
 
 References
 ----------
@@ -154,6 +157,8 @@ def resting_state_in_room(model: PredictionModel, ambient: float, unit: tuple[fl
 
 #: Lag of an output beyond the model's, in samples: standard deviation at the start, most, and per sqrt(s).
 PRIOR_LAG, LONGEST_LAG, _LAG_DRIFT = 3.0, 6.0, 0.02
+#: Per sqrt(sample), of the share by which an output moves more than the model's.
+_SCALE_DRIFT = 0.001
 _REPEATS, _SAME = 5, 1e-3  # of the start on a nonlinear plant, and when it is still [degC]
 _REMEMBER = 0.2  # share of the newest innovation in their mean
 #: Of a drive, in fractions of its range: no drive makes up for more.
@@ -281,7 +286,8 @@ class Observer:
     (n_x,) is the state at the last sample, w (n_w,) the disturbances, ``found_offset`` (n_y,) what each
     sensor was found to read too much at the start or after a jump that stayed [degC], ``innovation`` (n_y,)
     the mean of the last innovations in their standard deviations.  Of the outputs ``lagged``, ``shown`` is
-    what they showed a sample before x [degC], ``lag`` by how much they lag behind the model [s].
+    what they showed a sample before x [degC], ``lag`` by how much they lag behind the model [s], ``scale`` by
+    what share they move more than it does since they stood at ``start`` [degC].
     """
 
     def __init__(
@@ -312,25 +318,28 @@ class Observer:
         drift = np.where(self.is_drive, self.noise.drive, self.noise.output)
         n_l, still = len(self.lagged), np.zeros(len(self.lagged))
         lag = still + (_LAG_DRIFT * model.dt) ** 2
-        self.Q = np.concatenate([(self.noise.state * self._unit) ** 2, drift**2, still, lag]) * model.dt
+        scale = still + _SCALE_DRIFT**2 / model.dt
+        own = [(self.noise.state * self._unit) ** 2, drift**2, still, lag, scale]
+        self.Q = np.concatenate(own) * model.dt
         self.x = np.zeros(model.n_x)
         self.w = np.zeros(disturbance.n_w)
-        self.shown, self.lag = still.copy(), still.copy()
+        self.shown, self.lag, self.scale, self.start = (still.copy() for _ in range(4))
         self.found_offset = np.zeros(model.n_y)
         self.P0 = np.where(self.is_drive, 0.03, OFFSET) ** 2
         # a sensor without an offset among the disturbance states is read as loosely, once
         self.fixed: Mask = np.asarray(~disturbance.on_output.any(axis=1))
         self.R_start = self.R + np.where(self.fixed, OFFSET**2, 0.0)
         self._n = model.n_x + disturbance.n_w
-        self._P = np.zeros((self._n + 2 * n_l,) * 2)
-        self._held = np.zeros(self._n + 2 * n_l, dtype=bool)
+        self._P = np.zeros((self._n + 3 * n_l,) * 2)
+        self._held = np.zeros(self._n + 3 * n_l, dtype=bool)
         self.innovation = np.zeros(model.n_y)
         self._on_sample()
 
     def expect_lags(self) -> None:
         """After a reset, allow for outputs that lag behind the model."""
-        n, P = len(self._P) - len(self.lagged), self._P.copy()
-        P[n:, n:] = (PRIOR_LAG * self.model.dt) ** 2 * np.eye(len(self.lagged))
+        n_l, P = len(self.lagged), self._P.copy()
+        at = np.arange(self._n + n_l, self._n + 2 * n_l)
+        P[at, at] = (PRIOR_LAG * self.model.dt) ** 2
         self._P = P
 
     def hold_drives(self, weak: Mask) -> None:
@@ -370,28 +379,35 @@ class Observer:
     def _begin(self, x: Array, P: Array, y: Array) -> None:
         """Start from a Gaussian state and a reading (n_y,)."""
         n_x, n, n_l = self.model.n_x, self._n, len(self.lagged)
-        self.x, self.w, self.lag = x, np.zeros(self.disturbance.n_w), np.zeros(n_l)
+        self.x, self.w = x, np.zeros(self.disturbance.n_w)
+        self.lag, self.scale = np.zeros(n_l), np.zeros(n_l)
         self.shown = self.model.output(x)[self.lagged]
         self._held[:] = False
         self._on_sample()
         self.found_offset, self.innovation = np.zeros(self.model.n_y), np.zeros(self.model.n_y)
-        whole = np.zeros((n + 2 * n_l,) * 2)
+        whole = np.zeros((n + 3 * n_l,) * 2)
         whole[:n_x, :n_x] = P
         whole[n_x:n, n_x:n] = np.diag(self.P0)
         self._P = whole
         self._correct(y, self.R_start)
         # at rest every output shows what the model has
-        shows = np.eye(n + 2 * n_l)
+        shows = np.eye(n + 3 * n_l)
         shows[n : n + n_l, :n_x] = self.model.C[self.lagged]
         self._P = shows @ self._P @ shows.T
-        self.shown = self.model.output(self.x)[self.lagged]
+        self.shown = self.start = self.model.output(self.x)[self.lagged]
         self.set_offsets(y, np.asarray(self.fixed))
 
     def estimate(self) -> dict[str, Array]:
-        """Return what the filter knows: ``x``, ``w``, ``shown``, ``lag``, their covariance ``P``, and
-        ``found_offset``."""
-        about = {"x": self.x, "w": self.w, "shown": self.shown, "lag": self.lag}
-        return about | {"P": self._P, "found_offset": self.found_offset}
+        """Return what the filter knows: ``x``, ``w``, ``shown``, ``lag``, ``scale``, their covariance ``P``,
+        ``found_offset`` and ``start``."""
+        about = {"x": self.x, "w": self.w, "shown": self.shown, "lag": self.lag, "scale": self.scale}
+        return about | {"P": self._P, "found_offset": self.found_offset, "start": self.start}
+
+    @property
+    def lag_sd(self) -> Array:
+        """Standard deviations of the lags [s]."""
+        at, n_l = self._n + len(self.lagged), len(self.lagged)
+        return np.asarray(np.sqrt(np.diag(self._P)[at : at + n_l]))
 
     def set_offsets(self, y: Array, which: Mask) -> None:
         """Take what a reading (n_y,) differs by for offsets of the sensors ``which`` (n_y,)."""
@@ -423,13 +439,19 @@ class Observer:
 
     @property
     def output_bias(self) -> Array:
-        """What to add to the model's outputs to get readings (n_y,)."""
+        """What to add to the model's outputs to get readings (n_y,), once none lags."""
+        bias = self._sensor_bias
+        bias[self.lagged] += self.scale * (self.model.output(self.now)[self.lagged] - self.start)
+        return bias
+
+    @property
+    def _sensor_bias(self) -> Array:
         return np.asarray(self.offset + self.found_offset + self.disturbance.on_output @ self.w)
 
     def reading(self) -> Array:
         """Return the reading (n_y,) that the filter expects now."""
         y, _ = self._shows(self.now, self._shown_now)
-        return y + self.output_bias
+        return y + self._sensor_bias
 
     @property
     def _shown_now(self) -> Array:
@@ -438,13 +460,14 @@ class Observer:
     def _shows(self, x: Array, shown: Array) -> tuple[Array, Array]:
         """Return what the outputs (n_y,) show without biases, and its derivatives by the filter's states."""
         model, n, n_l = self.model, self._n, len(self.lagged)
-        y, H = model.output(x), np.hstack([self._H, np.zeros((model.n_y, 2 * n_l))])
+        y, H = model.output(x), np.hstack([self._H, np.zeros((model.n_y, 3 * n_l))])
         share = model.dt / (model.dt + self.lag)
-        far = y[self.lagged] - shown
+        risen = y[self.lagged] - self.start
+        far = y[self.lagged] + self.scale * risen - shown
         y[self.lagged] = shown + share * far
-        H[self.lagged, : model.n_x] *= share[:, None]
-        H[self.lagged, n : n + n_l] = np.diag(1 - share)
-        H[self.lagged, n + n_l :] = np.diag(-far * share**2 / model.dt)
+        H[self.lagged, : model.n_x] *= (share * (1 + self.scale))[:, None]
+        by_own = np.concatenate([1 - share, -far * share**2 / model.dt, share * risen])
+        H[3 * self.lagged, np.arange(n, n + 3 * n_l)] = by_own
         return y, H
 
     def settled_gain(self, step: Array) -> Array:
@@ -485,7 +508,7 @@ class Observer:
 
     def _inside(self, change: Array, held: Mask) -> Array:
         """Return a change of the states that leaves each lag in its range: the mean, given that end."""
-        for at, lag in enumerate(self.lag, start=len(change) - len(self.lag)):
+        for at, lag in enumerate(self.lag, start=self._n + len(self.lag)):
             beyond = lag + change[at] - min(max(lag + change[at], 0.0), LONGEST_LAG * self.model.dt)
             if beyond:
                 change = change - np.where(held, 0.0, self._P[:, at] * (beyond / self._P[at, at]))
@@ -496,13 +519,15 @@ class Observer:
         n_x, n, n_l = self.model.n_x, self._n, len(self.lagged)
         w = self.w + change[n_x:n]
         w = np.where(self.is_drive, np.clip(w, -LARGEST_BIAS, LARGEST_BIAS), w)
-        lag = np.clip(self.lag + change[n + n_l :], 0.0, LONGEST_LAG * self.model.dt)
+        lags = slice(n + n_l, n + 2 * n_l)
+        lag = np.clip(self.lag + change[lags], 0.0, LONGEST_LAG * self.model.dt)
         if self._share:
-            change[n_x:n], change[n + n_l :] = w - self.w, lag - self.lag
+            change[n_x:n], change[lags] = w - self.w, lag - self.lag
             ahead = self._way @ change
             self._ahead, self._shown_ahead = self._ahead + ahead[:n_x], self._shown_ahead + ahead[n : n + n_l]
         self.x, self.w = self.x + change[:n_x], w
         self.shown, self.lag = self.shown + change[n : n + n_l], lag
+        self.scale = self.scale + change[n + 2 * n_l :]
 
     def predict(self, u: Array, d: Array) -> None:
         """Carry the estimate one sample on under drives u (n_u,) and disturbances d (n_d,)."""
@@ -538,7 +563,7 @@ class Observer:
         """Return the state a sample later, what is shown now, and the Jacobian of the filter's states."""
         model, n_x, n, n_l = self.model, self.model.n_x, self._n, len(self.lagged)
         after, A, B, E = model.linearise(self.x, u + self.drive_bias, d + self.disturbance_bias)
-        step = np.eye(n + 2 * n_l)
+        step = np.eye(n + 3 * n_l)
         step[:n_x, :n_x] = A
         into = B @ (self.disturbance.on_drive * model.span[:, None]) + E @ self.disturbance.on_disturbance
         step[:n_x, n_x:n] = into

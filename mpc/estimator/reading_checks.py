@@ -64,9 +64,7 @@ class ReadingMonitor:
 
     def slower(self, observer: Observer) -> str:
         """Return which output is slower than the model, and by how much; empty where none surely is."""
-        lag = observer.lag / observer.model.dt
-        variance = np.diag(observer.estimate()["P"])
-        sd = np.sqrt(variance[variance.size - lag.size :]) / observer.model.dt
+        lag, sd = observer.lag / observer.model.dt, observer.lag_sd / observer.model.dt
         sure = ~too_weak(observer) & (lag > _SLOWER) & (lag > _SLOWER_SD * sd) & (sd < _SHOWN_TO)
         sure |= (self._slow_for == _SLOW_FOR) & (lag > _STILL_SLOWER)
         self._slow_for = np.where(sure, np.minimum(self._slow_for + 1, _SLOW_FOR), 0)

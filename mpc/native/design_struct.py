@@ -108,7 +108,7 @@ class Sizes:
     @property
     def NZ(self) -> int:
         """States of the observer."""
-        return self.NX + self.NW + 2 * self.NG
+        return self.NX + self.NW + 3 * self.NG
 
     def shape(self, name: str) -> tuple[int, ...]:
         """Return the shape of a field, as NumPy has it."""
@@ -248,7 +248,7 @@ def _controller_parts(s: Sizes) -> list[tuple[Any, int]]:
     qp = type("tg_qp", (ctypes.Structure,), {"_fields_": _laid_out(_qp_parts(s))})
     return [
         (ctypes.c_void_p, 3),
-        *((number, count) for count in (s.NX, s.NW, s.NG, s.NG, z * z, s.NY, s.NY)),
+        *((number, count) for count in (s.NX, s.NW, s.NG, s.NG, s.NG, s.NG, z * z, s.NY, s.NY)),
         (whole, z),
         *((number, count) for count in (3, s.NU, s.NX, s.NG, 9)),
         (whole, 2),

@@ -46,10 +46,11 @@ int main(void)
             !read_numbers(c->target, TG_NC) || !read_numbers(c->side, TG_NC) || !read_numbers(y, TG_NY) ||
             !read_numbers(d, TG_ND) || !read_numbers(target, TG_NC) || !read_numbers(&late, 1))
             return 1;
-        for (int r = 0; r < TG_NG; r++) { /* it shows what the state has */
+        for (int r = 0; r < TG_NG; r++) { /* it shows what the state has, and began there */
             c->shown[r] = tg_the_design.y0[tg_the_design.controlled[r]];
             for (int j = 0; j < TG_NX; j++)
                 c->shown[r] += tg_the_design.C[tg_the_design.controlled[r] * TG_NX + j] * c->x[j];
+            c->start[r] = c->shown[r];
         }
         c->late = time_is_up;
         c->about = &late;

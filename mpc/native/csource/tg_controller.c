@@ -566,15 +566,13 @@ static int is_too_weak(const tg_controller *c)
 static int does_not_follow(const tg_controller *c)
 {
     const tg_design *s = c->design;
+    double on_u[TG_NU], on_d[TG_SOME(TG_ND)], on_y[TG_NY];
     if (is_too_weak(c))
         return 1;
-    for (int j = 0; j < TG_NY; j++) {
-        double sum = c->found_offset[j];
-        for (int i = 0; i < TG_NW; i++)
-            sum += s->on_output[j * TG_NW + i] * c->w[i];
-        if (fabs(sum) >= FOLLOWS_OUTPUT)
+    tg_biases(c, on_u, on_d, on_y);
+    for (int j = 0; j < TG_NY; j++)
+        if (fabs(on_y[j] - s->offset[j]) >= FOLLOWS_OUTPUT)
             return 1;
-    }
     return 0;
 }
 

@@ -21,7 +21,7 @@
 #include "tg_qp.h"
 
 #define TG_L (TG_NX + TG_NW)               /* where what the lagging outputs show begins in them, */
-#define TG_Z (TG_L + 2 * TG_NG)            /* states of the observer; their lags are the last */
+#define TG_Z (TG_L + 3 * TG_NG)            /* states of the observer; their lags and scales are the last */
 #define TG_SEEDS (TG_NX + TG_NU + TG_ND)   /* directions of a sample's Jacobian */
 #define TG_WIDE (TG_SEEDS > TG_Q_N ? TG_SEEDS : TG_Q_N)
 #define TG_SOME(n) ((n) > 0 ? (n) : 1)
@@ -74,7 +74,8 @@ typedef struct {
     void *about;
     /* observer */
     double x[TG_NX], w[TG_SOME(TG_NW)];
-    double shown[TG_NG], lag[TG_NG];   /* of each controlled output: what it showed a sample before x, its lag [s] */
+    double shown[TG_NG], lag[TG_NG];   /* of each controlled output: what it showed a sample before x, its lag [s], */
+    double scale[TG_NG], start[TG_NG]; /* by what share it moves more than the model since the start, the model there */
     double P[TG_Z * TG_Z], found_offset[TG_NY], innovation[TG_NY];
     int held[TG_Z];
     double into_s, share, noised;      /* seconds since x; of a sample: time of the estimate, and the noise in P */
@@ -124,7 +125,7 @@ const char *tg_advice_text(int advice);
 
 /* The parts, for tests and for other loops. */
 void tg_observer_reset(tg_controller *c, const double *y, const double *d);
-void tg_observer_expect_lags(tg_controller *c); /* after a reset: outputs may lag behind the model */
+void tg_observer_expect_lags(tg_controller *c); /* after a reset: outputs may lag behind the model, or move more */
 void tg_observer_update(tg_controller *c, const double *y);
 /* Take what a reading differs by for offsets of the sensors that are not 0 in which. */
 void tg_observer_set_offsets(tg_controller *c, const double *y, const int *which);

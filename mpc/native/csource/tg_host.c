@@ -19,6 +19,8 @@ double *tg_host_x(tg_controller *c) { return c->x; }
 double *tg_host_w(tg_controller *c) { return c->w; }
 double *tg_host_shown(tg_controller *c) { return c->shown; }
 double *tg_host_lag(tg_controller *c) { return c->lag; }
+double *tg_host_scale(tg_controller *c) { return c->scale; }
+double *tg_host_start(tg_controller *c) { return c->start; }
 double *tg_host_P(tg_controller *c) { return c->P; }
 double *tg_host_found_offset(tg_controller *c) { return c->found_offset; }
 double *tg_host_innovation(tg_controller *c) { return c->innovation; }
@@ -138,8 +140,8 @@ static void look(const tg_truth *plant, double *y)
 
 /* A closed loop of n samples against a plant that is not the model.
  *
- * observed: the estimate that the observer starts from: x, w, shown, lag, P and
- * found_offset, one behind the other; per_sample: the plant's steps in a sample, of which the
+ * observed: the estimate that the observer starts from: x, w, shown, lag, scale, P,
+ * found_offset and start, one behind the other; per_sample: the plant's steps in a sample, of which the
  * first `late` still run on the drive before; noise: n rows of TG_NY readings' errors; quanta: of each of the
  * TG_NY + TG_ND readings, 0 none; d_offset: what a sensor of a disturbance shows too much; target: n rows of n_c.
  * Into y: n per_sample + 1 rows of TG_NY, without noise and quantum; reading: n rows of TG_NY + TG_ND;
@@ -169,8 +171,10 @@ void tg_host_loop(tg_controller *c, const tg_design *design, tg_truth *plant, in
             memcpy(c->w, observed + TG_NX, TG_NW * sizeof(double));
             memcpy(c->shown, observed + TG_L, sizeof c->shown);
             memcpy(c->lag, observed + TG_L + TG_NG, sizeof c->lag);
+            memcpy(c->scale, observed + TG_L + 2 * TG_NG, sizeof c->scale);
             memcpy(c->P, observed + TG_Z, sizeof c->P);
             memcpy(c->found_offset, observed + TG_Z + TG_Z * TG_Z, sizeof c->found_offset);
+            memcpy(c->start, observed + TG_Z + TG_Z * TG_Z + TG_NY, sizeof c->start);
         }
         move = tg_step(c, NAN, shown, shown + TG_NY, NULL, target + t * design->n_c);
         memcpy(drive + t * TG_NU, move.drive, sizeof move.drive);

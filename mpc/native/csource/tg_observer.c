@@ -5,7 +5,8 @@
  * x is kept on a grid of samples, because a delay of shift registers advances by whole samples only;
  * a reading the share s of a sample after it is one of (1 - s) x + s f(x, u, d), u the mean of the drives since.
  *
- * Controlled outputs are read through a lag T that is estimated too, s+ = s + a (C x - s), y = s+, a = dt / (dt + T).
+ * Controlled outputs are read through a lag T that is estimated too, and move by the share k more than the model,
+ * s+ = s + a (z - s), y = s+, a = dt / (dt + T), z = C x + k (C x - C x_0).
  */
 #include "tg_controller.h"
 #include "tg_model.h"
@@ -20,7 +21,22 @@
 #define SAME 1e-6 /* of a sample: what is nearer than this is the same time */
 #define WEAK 0.05 /* of its gain at rest, below which a drive's bias is not learnt */
 
-/* What the disturbance states add to drives, measured disturbances and outputs. */
+static double output(const tg_controller *c, int i, const double *x)
+{
+    double sum = c->design->y0[i];
+    for (int j = 0; j < TG_NX; j++)
+        sum += c->design->C[i * TG_NX + j] * x[j];
+    return sum;
+}
+
+/* What controlled output r is at x, by its scale. */
+static double scaled(const tg_controller *c, int r, const double *x)
+{
+    double y = output(c, c->design->controlled[r], x);
+    return y + c->scale[r] * (y - c->start[r]);
+}
+
+/* What the disturbance states add to drives, measured disturbances and outputs; to these, the scales too. */
 void tg_biases(const tg_controller *c, double *on_u, double *on_d, double *on_y)
 {
     const tg_design *s = c->design;
@@ -40,19 +56,13 @@ void tg_biases(const tg_controller *c, double *on_u, double *on_d, double *on_y)
         for (int i = 0; i < TG_NW; i++)
             on_y[j] += s->on_output[j * TG_NW + i] * c->w[i];
     }
+    for (int r = 0; r < TG_NG; r++)
+        on_y[s->controlled[r]] += scaled(c, r, tg_now(c)) - output(c, s->controlled[r], tg_now(c));
 }
 
 const double *tg_now(const tg_controller *c) { return c->share > 0.0 ? c->ahead : c->x; }
 
 static const double *shown_now(const tg_controller *c) { return c->share > 0.0 ? c->shown_ahead : c->shown; }
-
-static double output(const tg_controller *c, int i, const double *x)
-{
-    double sum = c->design->y0[i];
-    for (int j = 0; j < TG_NX; j++)
-        sum += c->design->C[i * TG_NX + j] * x[j];
-    return sum;
-}
 
 static double lag_share(const tg_controller *c, int r) { return c->design->dt / (c->design->dt + c->lag[r]); }
 
@@ -63,10 +73,8 @@ void tg_expected(const tg_controller *c, double *y)
     tg_biases(c, on_u, on_d, y);
     for (int i = 0; i < TG_NY; i++)
         y[i] += output(c, i, x);
-    for (int r = 0; r < TG_NG; r++) {
-        int i = c->design->controlled[r];
-        y[i] -= (1.0 - lag_share(c, r)) * (output(c, i, x) - shown[r]);
-    }
+    for (int r = 0; r < TG_NG; r++)
+        y[c->design->controlled[r]] -= (1.0 - lag_share(c, r)) * (scaled(c, r, x) - shown[r]);
 }
 
 static void stand_on_sample(tg_controller *c)
@@ -75,7 +83,7 @@ static void stand_on_sample(tg_controller *c)
     memset(c->dose, 0, sizeof c->dose);
 }
 
-/* What reading i is of the states, which are x and shown: [C, Wy], of a lagging one less, and by its lag. */
+/* What reading i is of the states, which are x and shown: [C, Wy], of a lagging one less, by its lag and scale. */
 static void plain_sensitivity(const tg_controller *c, int i, const double *x, const double *shown, double *h)
 {
     const tg_design *s = c->design;
@@ -87,9 +95,10 @@ static void plain_sensitivity(const tg_controller *c, int i, const double *x, co
         if (s->controlled[r] == i) {
             double share = lag_share(c, r);
             for (int j = 0; j < TG_NX; j++)
-                h[j] *= share;
+                h[j] *= share * (1.0 + c->scale[r]);
             h[TG_L + r] = 1.0 - share;
-            h[TG_L + TG_NG + r] = (shown[r] - output(c, i, x)) * share * share / s->dt;
+            h[TG_L + TG_NG + r] = (shown[r] - scaled(c, r, x)) * share * share / s->dt;
+            h[TG_L + 2 * TG_NG + r] = share * (output(c, i, x) - c->start[r]);
         }
 }
 
@@ -182,6 +191,7 @@ static void apply(tg_controller *c, double *change)
         if (c->share > 0.0)
             c->shown_ahead[r] += seen_by(c->jacobian + (TG_L + r) * TG_Z, change);
         c->shown[r] += change[TG_L + r];
+        c->scale[r] += change[TG_L + 2 * TG_NG + r];
     }
 }
 
@@ -275,6 +285,7 @@ void tg_observer_reset(tg_controller *c, const double *y, const double *d)
     for (int k = 0; k < TG_NW; k++)
         c->P[(TG_NX + k) * (TG_Z + 1)] = s->P0[k];
     memset(c->lag, 0, sizeof c->lag);
+    memset(c->scale, 0, sizeof c->scale);
     for (int r = 0; r < TG_NG; r++)
         c->shown[r] = output(c, s->controlled[r], c->x);
     stand_on_sample(c);
@@ -287,7 +298,7 @@ void tg_observer_reset(tg_controller *c, const double *y, const double *d)
         row[at] = seen_by(h, row);
         for (int j = 0; j < TG_Z; j++)
             c->P[at * TG_Z + j] = c->P[j * TG_Z + at] = row[j];
-        c->shown[r] = output(c, i, c->x);
+        c->shown[r] = c->start[r] = output(c, i, c->x);
     }
     tg_observer_set_offsets(c, y, s->fixed);
 }
@@ -565,7 +576,7 @@ void tg_observer_predict(tg_controller *c, const double *u, const double *d)
         on_d[j] += d[j];
     sample_jacobian(c, on_u, on_d, next);
     for (int r = 0; r < TG_NG; r++)
-        c->shown[r] += lag_share(c, r) * (output(c, s->controlled[r], c->x) - c->shown[r]);
+        c->shown[r] += lag_share(c, r) * (scaled(c, r, c->x) - c->shown[r]);
     memcpy(c->x, next, sizeof c->x);
     /* P = J P J' + Q; J is sparse in its last rows, and often in all */
     memset(c->spare, 0, sizeof c->spare);
@@ -621,7 +632,7 @@ void tg_observer_look(tg_controller *c, const double *d)
     for (int i = 0; i < TG_NX; i++)
         c->ahead[i] = (1.0 - share) * c->x[i] + share * next[i];
     for (int r = 0; r < TG_NG; r++)
-        c->shown_ahead[r] = c->shown[r] + share * lag_share(c, r) * (output(c, s->controlled[r], c->x) - c->shown[r]);
+        c->shown_ahead[r] = c->shown[r] + share * lag_share(c, r) * (scaled(c, r, c->x) - c->shown[r]);
     for (int i = 0; i < TG_Z; i++) {
         for (int j = 0; j < TG_Z; j++)
             c->jacobian[i * TG_Z + j] = share * c->jacobian[i * TG_Z + j] + (i == j ? 1.0 - share : 0.0);

@@ -366,28 +366,32 @@ def test_an_unseen_mode_that_does_not_decay_is_not_detectable():
     assert detectability_margin(A, C, np.array([[0.1], [0.0]]), np.zeros((1, 1))) == 0
 
 
-def lag_observer() -> Observer:
+def lag_observer(scale: float | None = None) -> Observer:
     quiet = ObserverNoise(state=1e-4, drive=1e-4, output=1e-4)
     observer = Observer(MODEL, CHOSEN, quiet, lagged=[1])
     observer.reset(LEVEL + OFFSET, np.array([25.0]))
     observer.w, observer.found_offset = np.zeros(2), np.zeros(2)
     observer._P = np.zeros_like(observer._P)  # all is known but the lag
     observer.expect_lags()
+    observer.Q[-1] = 0.0 if scale is None else scale**2
     return observer
 
 
 def test_what_a_lagging_output_shows_has_the_derivatives_of_a_first_order_lag() -> None:
     observer, x = lag_observer(), np.array([31.0, 26.0])
-    observer.shown, observer.lag = np.array([24.0]), np.array([3.0])
+    observer.shown, observer.lag, observer.scale = np.array([24.0]), np.array([3.0]), np.array([-0.1])
     y, H = observer._shows(x, observer.shown)
     plain = MODEL.output(x)
-    np.testing.assert_allclose(y, [plain[0], 24.0 + 0.4 * (plain[1] - 24.0)])  # 2 s of 2 s and 3 s
+    less = plain[1] - 0.1 * (plain[1] - observer.start[0])
+    np.testing.assert_allclose(y, [plain[0], 24.0 + 0.4 * (less - 24.0)])  # 2 s of 2 s and 3 s
     for column, eps in ((0, [1e-6, 0]), (1, [0, 1e-6])):
         np.testing.assert_allclose(
             H[:, column], (observer._shows(x + eps, observer.shown)[0] - y) / 1e-6, atol=1e-6
         )
-    np.testing.assert_allclose(H[:, -2], (observer._shows(x, observer.shown + 1e-6)[0] - y) / 1e-6, atol=1e-6)
+    np.testing.assert_allclose(H[:, -3], (observer._shows(x, observer.shown + 1e-6)[0] - y) / 1e-6, atol=1e-6)
     observer.lag = observer.lag + 1e-6
+    np.testing.assert_allclose(H[:, -2], (observer._shows(x, observer.shown)[0] - y) / 1e-6, atol=1e-5)
+    observer.lag, observer.scale = observer.lag - 1e-6, observer.scale + 1e-6
     np.testing.assert_allclose(H[:, -1], (observer._shows(x, observer.shown)[0] - y) / 1e-6, atol=1e-5)
 
 
@@ -412,6 +416,21 @@ def test_a_lag_is_learnt_from_a_rise_and_stays_between_none_and_six_samples(lag,
     assert observer.lag[0] == pytest.approx(found, abs=0.3)
 
 
+def test_an_output_that_moves_less_than_the_model_is_not_taken_for_one_that_lags() -> None:
+    observer, d = lag_observer(1.4e-3), np.array([25.0])
+    x, start = observer.x.copy(), MODEL.output(observer.x)[1]
+    for k in range(60):
+        u = np.array([SPAN * min(k / 20, 1.0)])
+        x = MODEL.next_state(x, u, d)
+        y = MODEL.output(x)
+        y[1] = start + 0.97 * (y[1] - start)
+        observer.predict(u, d)
+        observer.update(y + OFFSET)
+    assert observer.lag[0] < 0.8  # more than 6 without the scale
+    assert observer.scale[0] == pytest.approx(-0.03, abs=0.003)
+    np.testing.assert_allclose(MODEL.output(observer.x) + observer.output_bias, y + OFFSET, atol=0.1)
+
+
 def test_where_a_lag_would_be_negative_the_estimate_is_that_without_one() -> None:
     one, other = Observer(MODEL, CHOSEN, NOISE, lagged=[1]), Observer(MODEL, CHOSEN, NOISE)
     for observer in (one, other):
@@ -419,7 +438,7 @@ def test_where_a_lag_would_be_negative_the_estimate_is_that_without_one() -> Non
         observer.expect_lags()
         for _ in range(2):
             observer.predict(np.array([SPAN]), np.array([25.0]))
-    before = one.x
+    before, one._P[-1], one._P[:, -1] = one.x, 0.0, 0.0
     for observer in (one, other):
         observer.update(observer.reading() + [0.2, 0.5])  # it rises faster than the model
     assert one.lag[0] == pytest.approx(0.0, abs=1e-12)

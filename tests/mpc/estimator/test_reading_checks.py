@@ -103,10 +103,9 @@ def lagging(lag: float, sd: float, drive: float = 0.0) -> SimpleNamespace:
     """Return an observer of outputs a and b, of which b lags, whose drive is off by so much of its range."""
     chosen = SimpleNamespace(on_drive=np.array([[1.0, 0.0]]))
     model = SimpleNamespace(dt=2.0, outputs=("a", "b"))
-    P = np.diag([1.0, 1.0, 1.0, 9.0, sd**2])
     return SimpleNamespace(
-        lag=np.array([lag]), lagged=[1], model=model, disturbance=chosen, w=np.array([drive, 9.0]),
-        estimate=lambda: {"P": P},
+        lag=np.array([lag]), lag_sd=np.array([sd]), lagged=[1], model=model, disturbance=chosen,
+        w=np.array([drive, 9.0]),
     )  # fmt: skip
 
 

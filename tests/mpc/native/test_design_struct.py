@@ -25,7 +25,7 @@ def test_a_search_has_room_for_its_variants_and_an_export_for_itself():
     model = controller.model
     assert (model.n_x, 2, model.n_d, 2) == (tight.NX, tight.NU, tight.ND, tight.NY)
     assert (tight.NG, wide.NG) == (1, 1)
-    assert (5, 6, model.n_x + controller.disturbance.n_w + 2) == (tight.NK, tight.NM, tight.NZ)
+    assert (5, 6, model.n_x + controller.disturbance.n_w + 3) == (tight.NK, tight.NM, tight.NZ)
 
 
 def test_numbers_of_a_design_are_the_plants_offsets_and_its_rest_in_any_room():

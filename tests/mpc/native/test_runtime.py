@@ -68,6 +68,7 @@ def test_the_filter_is_the_same_in_c(pair):
     rng, d = np.random.default_rng(2), np.array([24.0])
     for part in (python.observer, c.observer):
         part.reset(np.array([25.0, 26.0]), d)
+        part.expect_lags()
     for _ in range(40):
         u, y = rng.uniform(-1, 1, 1), 25 + rng.normal(size=2)
         y[rng.random(2) < 0.2] = np.nan
@@ -78,6 +79,10 @@ def test_the_filter_is_the_same_in_c(pair):
             part.update(y)
         np.testing.assert_allclose(c.observer.x, python.observer.x, atol=1e-11)
         np.testing.assert_allclose(c.observer.w, python.observer.w, atol=1e-12)
+        for name in ("shown", "lag", "lag_sd", "scale", "output_bias"):
+            one, two = getattr(python.observer, name), getattr(c.observer, name)
+            np.testing.assert_allclose(two, one, atol=1e-11, err_msg=name)
+    assert abs(c.observer.scale[0]) > 1e-4
 
 
 def test_a_loop_is_the_same_in_python_with_c_parts_and_wholly_in_c(pair, tank_maker):
