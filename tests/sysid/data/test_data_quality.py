@@ -383,6 +383,8 @@ def test_the_noise_of_a_reading_off_its_bins_mean(steps, y, seconds, excess):
     log = make_log(time, {"q": (ODD, "1", "input"), "t": (y, "degC", "output")})
     rows = rows_of(log, ("q",), ("t",), ())
     assert reading_excess([rows], ["t"], seconds) == {"t": pytest.approx(excess)}
+    two = rows_of(log.assign(t2=2 * log["t"]), (), ("t", "t2"), ())
+    assert reading_excess([two], ["t", "t2"], seconds)["t2"] == pytest.approx(2 * excess)
     slow = make_log(4.0 * K, {"q": (ODD, "1", "input"), "t": (K, "degC", "output")})
     if np.isfinite(y).all():  # rows of 4 s are means of themselves
         both = [rows, rows_of(slow, (), ("t",), ())]
@@ -479,9 +481,10 @@ def test_an_input_of_one_sign_is_described_by_its_halves():
         "t1": (t / 100, "degC", "output"),
         "t2": (t / 100, "degC", "output"),
     }
-    seen = covered(plant, [make_log(t, signals)])
+    seen = covered(plant, [make_log(t, signals | {"t2": (t / 50, "degC", "output")})])
     assert seen.thin == ("q1 above 50",)
+    assert seen.ranges["t2"] == pytest.approx((0.72, 71.26), abs=0.01)
     assert seen.ranges["t1"] == pytest.approx((0.36, 35.63), abs=0.01)
     assert "the logs cover t1 between 0.36 and 35.6 degC, t2" in seen.sentence({"t1": "degC", "t2": "1"})
     # no unit, no "1"
-    assert seen.sentence({"t1": "degC", "t2": "1"}).split(";")[0].endswith("35.6 (98 % of the readings)")
+    assert seen.sentence({"t1": "degC", "t2": "1"}).split(";")[0].endswith("71.3 (98 % of the readings)")

@@ -115,6 +115,13 @@ def test_means_of_the_residual_are_correlated_with_means_of_the_input():
     np.testing.assert_array_equal(run.input_correlation["t"]["q"].values, wanted.values)
 
 
+def test_blocks_begin_anew_after_a_gap():
+    log = lag_log(1000).isel(time=np.r_[0:405, 443:1000])
+    pairs = beside(lag_plant(), log, lag_plant().simulate(log), 10.0)
+    np.testing.assert_array_equal(pairs.time, average(log, 10.0)["time"].values)
+    assert 443.0 in pairs.time
+
+
 def test_inputs_outside_of_the_fit_are_noted():
     log = lag_log()
     log["q"].values[500:] += 5.0

@@ -84,6 +84,14 @@ def test_what_the_draws_do_not_explain_of_the_held_out_errors_is_in_the_band(sch
     assert np.mean(band["t2"] ** 2) > (1.6449 * 0.001) ** 2  # draws that run further apart than it erred
 
 
+def test_draws_run_over_a_log_in_other_units(heater, schedule):
+    shares = schedule.assign(q1=(schedule["q1"] / 100).assign_attrs(schedule["q1"].attrs | {"units": "1"}))
+    half, other = (
+        free_run_band(heater, log, heater.simulate(log), draws=3).half for log in (schedule, shares)
+    )
+    np.testing.assert_allclose(other["t1"], half["t1"], rtol=1e-9)
+
+
 def first_order(gain=1.0, logs=("a",)):
     A, B = 0.98 * np.eye(2), 0.02 * gain * np.eye(2)
     block = StateSpaceModel(("q1", "q2"), (), ("t1", "t2"), A=A, B=B, C=np.eye(2), dt=2.0)
