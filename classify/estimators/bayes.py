@@ -36,18 +36,30 @@ difference of 1 K. The two shrinkages, :math:`\nu_0` of the covariance and :math
 
 in which a grasp counts for :math:`\Delta T^2 / (\Delta T^2 + 4\,\mathrm{K}^2)`. A feature that a grasp does
 not have (a response at 40 s in one of 10 s) is marginalised, in training and after.
+
+**A second sensor** has features of its own, divided by its own difference from the object; the covariance
+has what both feel of one contact, and the error of the object's temperature moves both.  Where that is
+**unknown** the density is the mean of those at temperatures 2 K apart, up to 20 K from the room's; where its
+stated sd is more than 2 K, the mean over that normal distribution.  The mean of a **material that was not
+trained** is drawn as those of the k trained ones were, from :math:`N(\bar\mu, B)` with
+
+.. math:: B = \frac{k + 1}{k (k - 1)} \sum_m (\mu_m - \bar\mu)(\mu_m - \bar\mu)^T,
+
+so that its grasps are Student-t distributed with k - 1 degrees of freedom and scale :math:`\Delta T^2 (B +
+\Sigma) + N`; beside it the mean density of the candidates gives the probability that it is none of them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, ClassVar, Self
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import gammaln, multigammaln
+from scipy.special import expit, gammaln, logit, logsumexp, multigammaln
 
 from thermogrip.classify.estimators.base import (
     HELD_AT_AN_END,
@@ -56,7 +68,10 @@ from thermogrip.classify.estimators.base import (
     Labels,
     Records,
     check_shapes,
+    level,
     named_arrays,
+    normalised,
+    pick,
     record_labels,
     record_list,
     set_arrays,
@@ -66,14 +81,17 @@ from thermogrip.classify.estimators.features import (
     FIT_END,
     LEAST_DIFFERENCE,
     MATERIAL_FEATURES,
+    RESPONSE_TIMES,
     can_normalise,
     extract_features,
     feature_noise,
+    linear_features,
     object_difference,
 )
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import number_within
 from thermogrip.datasets.schema import Grasps, log_name
+from thermogrip.sysid.effusivity.data import object_range
 
 _COVARIANCE_GRID = np.geomspace(0.5, 200.0, 25)  # nu_0 - d - 1, grasps
 _MEAN_GRID = np.geomspace(0.001, 30.0, 16)  # kappa_0, grasps
@@ -84,9 +102,11 @@ _T_OBJECT_SD = 0.5  # K, of a nominal object temperature
 _SD_WEIGHT = 4.0  # grasps that this prior counts for
 _STEPS, _STILL = 100, 1e-5  # of the expectation maximisation, and when it ends
 _DROWNED = 1e9  # in units of the scatter within a class
-_ORDER = ("initial_slope", "response_", "fitted_rise", "log_time_constant", "late_slope")
-_DENSITY_FEATURES = ("response_", "late_slope")
-"""Features that are linear in the samples, with Gaussian noise at any difference."""
+_ORDER = ("initial_slope", "response_", "change_", "fitted_rise", "log_time_constant", "late_slope")
+_SECOND = "second_"  # prefix of the features of a second sensor
+_NEAR = 1.4  # the end of a contact is a time of its own where it is so many times as late as the one before
+_WIDE = 2.0  # K; an object's temperature that is less certain is integrated over
+_NODES, _REACH = 21, 2.5  # temperatures of that integral, up to so many sd from the stated one
 
 
 @dataclass(frozen=True)
@@ -95,7 +115,8 @@ class Readings:
 
     ``y`` (n, d), NaN where a grasp lacks a feature; ``gain`` (n, d), the difference of temperature [K], 1 for
     a time constant and everywhere in kelvin; ``noise`` (n, d, d); ``t_object_sd`` (n,) [K], NaN where no file
-    has it; ``difference`` (n,) [K], NaN where it is unknown.
+    has it; ``difference`` (n,) [K] of the first sensor; the last and ``gain`` are NaN where the object's
+    temperature is unknown.
     """
 
     y: Floats
@@ -130,24 +151,31 @@ class FeatureReader:
 
     @classmethod
     def learn(
-        cls, records: Sequence[Grasps], labels: Labels, *, prefixes: tuple[str, ...] = MATERIAL_FEATURES
+        cls,
+        records: Sequence[Grasps],
+        labels: Labels,
+        *,
+        linear: bool = False,
+        both: bool = False,
     ) -> tuple[FeatureReader, Readings, NDArray[np.bool_], list[str]]:
         """Return a reader of the features that most grasps of any record have, and what it reads.
 
         The mask is of grasps that can be learnt from, the list has the others in words: where features
         are normalised, grasps of unknown temperature, and materials that were only touched at the skin's own.
+        ``linear``: features that are sums of samples; ``both``: those of a second sensor, too.
         """
+        end = min(float(np.median(np.concatenate([_last(part) for part in records]))), FIT_END)
         names, tables = [], []
         for part in records:
-            table = extract_features(part, normalise=False)
+            table = _table(part, _times(part, end if linear else 0.0), linear=linear, both=both)
             known = np.isfinite(table.values).mean(axis=0) > 0.5
-            names += [str(f) for f in table["feature"].values[known] if str(f).startswith(prefixes)]
+            found = [str(f) for f in table["feature"].values[known]]
+            names += [f for f in found if linear or f.startswith(MATERIAL_FEATURES)]
             tables.append(table)
         names = sorted(set(names), key=_order)
         if not names:
             where = "+".join(map(log_name, records))
             raise UserError("no feature is known for every grasp", file=where, hint="record longer")
-        end = min(float(np.median(np.concatenate([_last(part) for part in records]))), FIT_END)
         difference = np.concatenate([object_difference(part) for part in records])
         usable, notes = _usable(difference, labels)
         reader = cls(names, any(map(can_normalise, records)) and bool(usable.any()), end)
@@ -167,7 +195,7 @@ class FeatureReader:
 
     def read(self, grasps: Grasps) -> Readings:
         """Return the features of other grasps; one that is more than half a second shorter than those of the
-        training, or whose object temperature is unknown where theirs were not, is a :class:`UserError`."""
+        training is a :class:`UserError`."""
         last = _last(grasps)
         if (last < self.end - HELD_AT_AN_END).any():
             i = int(last.argmin())
@@ -177,32 +205,31 @@ class FeatureReader:
                 file=log_name(grasps),
                 hint="leave it out, or train on contacts of that length",
             )
-        if self.normalise:
-            self._check_temperatures(grasps)
-        times = [float(f[len("response_") : -1]) for f in self.names if f.startswith("response_")]
-        table = extract_features(grasps, normalise=False, times=times)
-        return self._readings(grasps, table.sel(feature=self.names))
+        times = sorted({_time(f) for f in self.names if f.endswith("s")})
+        linear = any("change_" in f for f in self.names)
+        both = any(f.startswith(_SECOND) for f in self.names)
+        return self._readings(grasps, _table(grasps, times, linear=linear, both=both).sel(feature=self.names))
 
     def _readings(self, grasps: Grasps, table: xr.DataArray) -> Readings:
         y = np.asarray(table.values, dtype=float)
-        n, difference = y.shape[0], object_difference(grasps)
+        n = y.shape[0]
         if not self.normalise:
             noise, unknown = np.zeros((*y.shape, y.shape[1])), np.full(n, np.nan)
             return Readings(y, np.ones_like(y), noise, unknown, unknown)
-        linear = np.array([name != "log_time_constant" for name in self.names])
+        gain, noise = np.ones_like(y), np.zeros((*y.shape, y.shape[1]))
+        for prefix, part in _sensors(grasps):
+            own = [k for k, f in enumerate(self.names) if f.startswith(_SECOND) == bool(prefix)]
+            names = [self.names[k].removeprefix(_SECOND) for k in own]
+            linear = [k for k, f in zip(own, names) if f != "log_time_constant"]
+            gain[:, linear] = object_difference(part)[:, None]
+            if own:  # a feature that nobody has is without noise
+                noise[np.ix_(range(n), own, own)] = np.nan_to_num(feature_noise(part, names))
         sd = grasps["t_object_sd"].values if "t_object_sd" in grasps else np.full(n, np.nan)
-        return Readings(
-            y,
-            np.where(linear, difference[:, None], 1.0),
-            np.nan_to_num(feature_noise(grasps, self.names)),  # of features that nobody has
-            np.asarray(sd, dtype=float),
-            difference,
-        )
+        return Readings(y, gain, noise, np.asarray(sd, dtype=float), object_difference(grasps))
 
-    @staticmethod
-    def _check_temperatures(grasps: Grasps) -> None:
+    def check_temperatures(self, grasps: Grasps) -> None:
         """Raise UserError where a response cannot be compared for want of the difference behind it."""
-        unknown = np.isnan(object_difference(grasps))
+        unknown = np.isnan(object_difference(grasps)) & self.normalise
         if unknown.any():
             raise UserError(
                 f"grasp {str(grasps['grasp'].values[unknown][0])!r} has no object temperature, and the "
@@ -221,9 +248,12 @@ class BayesClassifier(GraspClassifier):
     object temperatures were off their nominal ones [K].
     """
 
+    learns_from_all_conditions: ClassVar[bool] = True
     fits_in_a_blink: ClassVar[bool] = True
+    reads_both_sensors: ClassVar[bool] = True
 
     shrinkage: float | None = None  # nu_0 - d - 1 [grasps]; by default the most evident of a grid
+    prior_unknown: float = 0.1  # probability of a material that is not among the candidates
 
     def fit(self, X: Records, y: ArrayLike | None = None) -> Self:
         """Learn from one record or several; ``y`` (n_grasp,) are their materials, record after record, by
@@ -235,21 +265,20 @@ class BayesClassifier(GraspClassifier):
         two_or_more(labels, "+".join(map(log_name, records)))
         self.sensors_ = 2 if all("t_surface_2" in part for part in records) else 1
         self.reader_, all_read, usable, self.notes_ = FeatureReader.learn(
-            records, labels, prefixes=_DENSITY_FEATURES
+            records, labels, linear=True, both=self.sensors_ == 2
         )
         self.feature_names_ = self.reader_.names
         self.classes_ = np.unique(labels[usable])
-        read = Readings(**{key: value[usable] for key, value in vars(all_read).items()})
-        self._fit_density(read, np.searchsorted(self.classes_, labels[usable]))
+        self._fit_density(_rows(all_read, usable), np.searchsorted(self.classes_, labels[usable]))
         return self
 
     def _fit_density(self, read: Readings, at: NDArray[np.intp]) -> None:
         """Find means, covariance and the error of object temperatures; ``at`` is the class of each grasp."""
         k, (n, d) = self.classes_.size, read.y.shape
         seen = np.isfinite(read.y)
-        square = read.difference**2
-        clear = np.where(self.reader_.normalise, square / (square + _HALF_WEIGHT), 1.0)
-        weight = np.where(seen & (read.gain != 0), clear[:, None], 0.0)
+        square = np.where(read.gain == 1, read.difference[:, None], read.gain) ** 2
+        clear = square / (square + _HALF_WEIGHT) if self.reader_.normalise else np.ones_like(square)
+        weight = np.where(seen & (read.gain != 0), clear, 0.0)
         x = np.divide(read.y, read.gain, out=np.zeros_like(read.y), where=weight > 0)
         self.center_ = _weighted_mean(x, weight)
         means = np.array([_weighted_mean(x[at == m], weight[at == m], self.center_) for m in range(k)])
@@ -314,20 +343,65 @@ class BayesClassifier(GraspClassifier):
         return y, read.noise / np.outer(self.scale_, self.scale_)
 
     def _log_proba(self, grasps: Grasps) -> Floats:
+        return self._log_density(grasps)[:, :-1]
+
+    def open_set_log_proba(self, X: Records, candidates: Sequence[str]) -> tuple[Floats, Floats]:
+        """Return :meth:`candidate_log_proba` and :meth:`p_unknown` from the same densities."""
+        at = [self.asked().index(name) for name in self.asked(candidates)]
+        log_p = np.vstack([self._log_density(self._as_trained(part)) for part in record_list(X)])
+        odds = logsumexp(log_p[:, at], axis=1) - np.log(len(at)) - log_p[:, -1]
+        return normalised(log_p[:, at]), np.asarray(expit(logit(self.prior_unknown) - odds))
+
+    def p_unknown(self, X: Records, candidates: Sequence[str] | None = None) -> Floats:
+        return self.open_set_log_proba(X, self.asked(candidates))[1]
+
+    def _log_density(self, grasps: Grasps) -> Floats:
+        """Return the log density of each grasp under each class, and last under a material that is none of
+        them, (n_grasp, n_class + 1)."""
         read = self.reader_.read(grasps)
+        unknown = np.isnan(read.difference)
+        wide = (unknown | (read.t_object_sd > _WIDE)) & self.reader_.normalise
+        out = np.empty((wide.size, self.classes_.size + 1))
+        out[~wide] = self._log_t_of(_rows(read, ~wide))
+        if not wide.any():
+            return out
+        part, unknown, some = pick(grasps, wide), unknown[wide], _rows(read, wide)
+        low, high = object_range(part).T
+        levels = np.stack([level(sensor) for _, sensor in _sensors(part)], axis=1)
+        beside = levels[:, [int(f.startswith(_SECOND)) for f in self.feature_names_]]
+        centre = np.where(unknown, (low + high) / 2, levels[:, 0] + np.where(unknown, 0.0, some.difference))
+        half = np.where(unknown, (high - low) / 2, _REACH * np.where(unknown, 0.0, some.t_object_sd))
+        z = np.linspace(-1.0, 1.0, _NODES)
+        log_w = np.where(unknown[:, None], 0.0, -0.5 * (_REACH * z) ** 2)
+        log_w -= logsumexp(log_w, axis=1, keepdims=True)
+        each = np.empty((_NODES, *out[wide].shape))
+        for k, (at, weight) in enumerate(zip(z, log_w.T)):
+            gain = np.where(some.gain == 1, 1.0, (centre + at * half)[:, None] - beside)
+            sd = 0.6 * half * (z[1] - z[0])  # bells that wide, so far apart, add up to a smooth density
+            each[k] = weight[:, None] + self._log_t_of(replace(some, gain=gain, t_object_sd=sd))
+        out[wide] = logsumexp(each, axis=0)
+        return out
+
+    def _log_t_of(self, read: Readings) -> Floats:
+        """Return :meth:`_log_density` of grasps whose objects' temperatures are known."""
         y, noise = self._scaled(read)
         sd = np.where(np.isfinite(read.t_object_sd), read.t_object_sd, self.t_object_sd_)
-        out = np.zeros((y.shape[0], self.classes_.size))
+        k, zero = self.classes_.size, self.center_ / self.scale_
+        middle = self.means_.mean(axis=0)
+        off = self.means_ - middle
+        strange = (k + 1) / (k * (k - 1)) * off.T @ off
+        kinds = [(mean, own, self.dof_) for mean, own in zip(self.means_, self.mean_covariance_)]
+        out = np.zeros((y.shape[0], k + 1))
         for has in np.unique(np.isfinite(y), axis=0):
             rows = (np.isfinite(y) == has).all(axis=1)
             gain, y_has = read.gain[np.ix_(rows, has)], y[np.ix_(rows, has)]
             known = noise[rows][:, has][:, :, has]
-            for m, mean in enumerate(self.means_[:, has]):
-                ray = (mean + (self.center_ / self.scale_)[has]) * (gain != 1)
-                block = (self.covariance_ + self.mean_covariance_[m])[np.ix_(has, has)]
+            for m, (mean, own, dof) in enumerate([*kinds, (middle, strange, k - 1.0)]):
+                ray = (mean + zero)[has] * (gain != 1)
+                block = (self.covariance_ + own)[np.ix_(has, has)]
                 scale = gain[:, :, None] * block * gain[:, None, :] + known
                 scale += sd[rows, None, None] ** 2 * _outer(ray)
-                out[rows, m] = _log_t(y_has - gain * mean, scale, self.dof_)
+                out[rows, m] = _log_t(y_has - gain * mean[has], scale, dof)
         return out
 
     def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
@@ -373,14 +447,49 @@ def _usable(difference: Floats, labels: Labels) -> tuple[NDArray[np.bool_], list
     return usable, notes
 
 
+def _rows(read: Readings, at: NDArray[np.bool_]) -> Readings:
+    return Readings(**{key: value[at] for key, value in vars(read).items()})
+
+
 def _joined(parts: Sequence[Readings]) -> Readings:
     return Readings(**{key: np.concatenate([getattr(p, key) for p in parts]) for key in vars(parts[0])})
 
 
-def _order(name: str) -> tuple[int, float]:
-    """Return the place of a feature: in the order of the table, responses by time."""
-    kind = next(i for i, prefix in enumerate(_ORDER) if name.startswith(prefix))
-    return kind, float(name[len("response_") : -1]) if name.startswith("response_") else 0.0
+def _sensors(grasps: Grasps) -> list[tuple[str, Grasps]]:
+    """Return the prefix of each sensor's features and the record that has its readings as ``t_surface``."""
+    if "t_surface_2" not in grasps:
+        return [("", grasps)]
+    beside = grasps.drop_vars("t_surface_2").assign(t_surface=grasps["t_surface_2"])
+    return [("", grasps), (_SECOND, beside)]
+
+
+def _table(grasps: Grasps, times: Sequence[float], *, linear: bool, both: bool) -> xr.DataArray:
+    """Return the features in kelvin (n, d), those of a second sensor behind those of the first."""
+    tables = []
+    for prefix, part in _sensors(grasps)[: 2 if both else 1]:
+        read = linear_features if linear else partial(extract_features, normalise=False)
+        table = read(part, times=times)
+        tables.append(table.assign_coords(feature=[f"{prefix}{f}" for f in table["feature"].values]))
+    return tables[0] if len(tables) == 1 else xr.concat(tables, "feature")
+
+
+def _times(grasps: Grasps, end: float) -> list[float]:
+    """Return when a response is read of the contacts of a record [s], an ``end`` that is late among these."""
+    times = [t for t in RESPONSE_TIMES if t <= float(grasps["time"].values[-1]) + 0.05]
+    before = max([t for t in times if t <= end + 0.05], default=0.0)
+    return sorted([*times, round(end, 2)]) if end > _NEAR * before else times
+
+
+def _order(name: str) -> tuple[bool, int, float]:
+    """Return the place of a feature: by sensor, in the order of the table, responses by time."""
+    own = name.removeprefix(_SECOND)
+    kind = next(i for i, prefix in enumerate(_ORDER) if own.startswith(prefix))
+    return own != name, kind, _time(name) if name.endswith("s") else 0.0
+
+
+def _time(name: str) -> float:
+    """Return when a response is read after the onset [s]."""
+    return float(name.rpartition("_")[2][:-1])
 
 
 def _last(grasps: Grasps) -> Floats:

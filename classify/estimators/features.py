@@ -20,6 +20,9 @@ by solving the linear part for each :math:`(t_0, \tau)` of a grid and averaging 
 :math:`\exp(-\mathrm{SSE} / 2 \sigma^2 - t_0^2 / 2 \sigma_0^2)`, :math:`\sigma_0` = 0.15 s.  An average has no
 local minima, and at equal temperatures, where no onset is visible, it falls back to the message.  Responses
 are read at fixed times after :math:`t_0`: the fitted curve plus the mean residual within 0.3 s.
+
+:func:`linear_features` need no onset: a **change** is the rise at a fixed time t after the message, on the
+line through the samples within 0.3 s, or t / 5, of it.  How late a contact was is a part of their scatter.
 """
 
 from __future__ import annotations
@@ -38,6 +41,8 @@ RESPONSE_TIMES = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0)
 MATERIAL_FEATURES = ("initial_slope", "fitted_rise", "log_time_constant", "late_slope", "response_")
 """Prefixes of the features that speak of the object; ``level``, ``level_drift`` and ``onset`` do not."""
 
+_LINEAR = ("change_", "late_slope")
+_NEAR, _SHARE = 0.3, 0.2  # s, and of the time
 _SLOW = 6.0  # s, about the time in which a 2 cm metal block and the skin come to terms
 _ONSETS = np.arange(-0.40, 0.401, 0.04)
 _RATES = np.geomspace(0.15, 3.0, 14)
@@ -122,6 +127,42 @@ def extract_features(
     )
 
 
+def linear_features(grasps: Grasps, times: Sequence[float]) -> xr.DataArray:
+    """Return the changes at some times after the message [s], ``change_<t>s`` [K], and ``late_slope`` [K/s]
+    of each grasp, (n_grasp, n): sums of samples less the level before contact; NaN where a trace ends
+    before."""
+    time = np.asarray(grasps["time"].values, dtype=float)
+    rise, seen = _filled(time, grasps["t_surface"].values - level(grasps)[:, None])
+    last = np.max(np.where(seen > 0, time, -np.inf), axis=1)
+    names = [*(f"change_{t:g}s" for t in times), "late_slope"]
+    values = np.full((last.size, len(names)), np.nan)
+    for end in np.unique(last):
+        own = last == end
+        values[own] = rise[own] @ _linear_weights(tuple(time.tolist()), tuple(names), float(end))
+    return xr.DataArray(
+        values, dims=("grasp", "feature"), coords={"grasp": grasps["grasp"].values, "feature": names}
+    )
+
+
+@lru_cache(maxsize=64)
+def _linear_weights(time: tuple[float, ...], names: tuple[str, ...], last: float) -> Floats:
+    """Return the weight of each sample of a trace that ends at ``last`` [s] in linear features, (n_time, n);
+    NaN in the column of a feature that it does not have."""
+    t, weights = np.asarray(time), np.full((len(time), len(names)), np.nan)
+    for k, name in enumerate(names):
+        slope = name == "late_slope"
+        asked = FIT_END if slope else float(name[len("change_") : -1])
+        at = min(asked, last)
+        used = (t >= 5.0) if slope else np.abs(t - at) <= max(_NEAR, _SHARE * at) + 1e-6
+        used &= t <= (at + 1e-6 if slope else last)
+        if used.sum() < (3 if slope else 1) or last < asked - (1.0 if slope else 0.6):
+            continue
+        off = np.where(used, t - t[used].mean(), 0.0)
+        lever = off / max(float(off @ off), 1e-12)
+        weights[:, k] = lever if slope else used / used.sum() + (at - t[used].mean()) * lever
+    return weights
+
+
 def feature_noise(grasps: Grasps, names: Sequence[str]) -> Floats:
     """Return the covariance that the noise of the sensor gives features in kelvin, (n_grasp, n, n).
 
@@ -153,11 +194,14 @@ def _sample_noise(grasps: Grasps) -> Floats:
 def _noise_shape(time: tuple[float, ...], names: tuple[str, ...]) -> Floats:
     """Return the covariance of features for samples of sd 1 when responses are small, (n, n)."""
     t = np.asarray(time)
-    small = 1e-3  # K: the weights of the average over the grid stay those of its prior
-    one_each = make_grasps(t, small * np.eye(t.size), [str(i) for i in range(t.size)])
-    at = [float(name[len("response_") : -1]) for name in names if name.startswith("response_")]
-    table = extract_features(one_each, normalise=False, times=at).sel(feature=list(names))
-    gain = np.where(np.array(names) == "log_time_constant", 0.0, table.values).T / small
+    if all(name.startswith(_LINEAR) for name in names):
+        gain = _linear_weights(time, names, time[-1]).T
+    else:
+        small = 1e-3  # K: the weights of the average over the grid stay those of its prior
+        one_each = make_grasps(t, small * np.eye(t.size), [str(i) for i in range(t.size)])
+        at = [float(name[len("response_") : -1]) for name in names if name.startswith("response_")]
+        table = extract_features(one_each, normalise=False, times=at).sel(feature=list(names))
+        gain = np.where(np.array(names) == "log_time_constant", 0.0, table.values).T / small
     after = t > -0.5
     shift = gain[:, after].sum(axis=1)  # of an error of the level, which the median hides above
     before = max(int(np.sum(t <= -0.5)), 3)

@@ -113,6 +113,7 @@ class FeaturesLda(_Lda):
         return self.reader_.read(grasps).normalised()[0]
 
     def _log_proba(self, grasps: Grasps) -> Floats:
+        self.reader_.check_temperatures(grasps)
         x, noise = self.reader_.read(grasps).normalised()
         by_feature = _centred(self.coef_.T / self.scale_[:, None])  # (d, K)
         noise = np.einsum("dk,gde,ek->g", by_feature, np.nan_to_num(noise), by_feature)

@@ -242,8 +242,8 @@ def _read_weights(file: Path) -> dict[str, NDArray[Any]]:
 
 @dataclass(eq=False, repr=False)
 class VoteClassifier(GraspClassifier):
-    """The mean of the probabilities of ``members``, at least two unfitted classifiers, none of which learns
-    from the grasps of other conditions than its own."""
+    """The mean of the probabilities of ``members``, at least two unfitted classifiers that answer for each
+    touch alone; all learn from the grasps that the vote is given."""
 
     members: Sequence[GraspClassifier] = ()
 
@@ -267,8 +267,8 @@ def check_members(members: Sequence[GraspClassifier]) -> None:
     if len(members) < 2:
         raise UserError("a vote has fewer than two members", hint="name them like rocket+features-lda")
     for member in members:
-        if member.learns_from_all_conditions:
+        if member.joins_touches:
             raise UserError(
-                f"{type(member).__name__} learns from all conditions and can be no member of a vote",
+                f"{type(member).__name__} joins the touches of a block and can be no member of a vote",
                 hint="compare it beside the vote",
             )

@@ -6,7 +6,8 @@ Rules that it keeps:
   training grasps, augmentation included, happens inside ``fit``;
 - each record is one condition, and its candidates are the materials of its training grasps;
 - what describes the gripper, and is the same in all conditions, may be learnt from the training grasps of all
-  of them (``learns_from_all_conditions``); never from a test grasp;
+  of them (``learns_from_all_conditions``); never from a test grasp; a classifier that does not join touches
+  learns a condition that is scored apart, or has a material that only other temperatures could show, alone;
 - what cannot be scored is noted, not dropped in silence.
 
 **Leak probe.**  Everything after -0.5 s is replaced by the trace's own level before contact, with noise of
@@ -35,6 +36,7 @@ from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from thermogrip.classify.decisions.predict import Row, joined_touches
 from thermogrip.classify.estimators.base import Floats, GraspClassifier, grasp_labels, level, pick
+from thermogrip.classify.estimators.features import LEAST_DIFFERENCE, object_difference
 from thermogrip.classify.estimators.lda import ArrayClassifier
 from thermogrip.classify.estimators.registry import classifier_name, make_classifier
 from thermogrip.classify.evaluation import metrics as s
@@ -220,13 +222,18 @@ def _jobs(named: Mapping[str, GraspClassifier], plan: Plan, probe: bool) -> list
     numbered = list(enumerate(plan.folds))
     jobs = []
     for name, classifier in named.items():
-        if classifier.learns_from_all_conditions:
-            for repeat, training in enumerate(plan.training):
-                folds = tuple((i, f) for i, f in numbered if f.repeat == repeat)
-                also = "also" if probe and repeat == 0 else "no"
+        together = [
+            classifier.learns_from_all_conditions and _together(classifier, fold, plan.training[fold.repeat])
+            for fold in plan.folds
+        ]
+        for repeat, training in enumerate(plan.training):
+            folds = tuple((i, f) for i, f in numbered if f.repeat == repeat and together[i])
+            also = "also" if probe and repeat == 0 else "no"
+            if folds:
                 jobs.append(_Job(name, classifier, training, folds, also))
-            continue
         for i, fold in numbered:
+            if together[i]:
+                continue
             jobs.append(_Job(name, classifier, (fold.train,), ((i, fold),), "no"))
             if probe and fold.repeat == 0:
                 jobs.append(_Job(name, probe_clone(classifier), (fold.train,), ((i, fold),), "only"))
@@ -237,12 +244,20 @@ def _jobs(named: Mapping[str, GraspClassifier], plan: Plan, probe: bool) -> list
     return jobs
 
 
+def _together(classifier: GraspClassifier, fold: Fold, training: Sequence[Grasps]) -> bool:
+    """Return whether the training grasps of all conditions serve one of them."""
+    if classifier.joins_touches:
+        return True
+    far = [grasp_labels(part)[np.abs(object_difference(part)) >= LEAST_DIFFERENCE] for part in training]
+    return not fold.apart and set(fold.candidates) <= set(np.concatenate(far))
+
+
 def _run(job: _Job) -> list[_Result]:
     classifier: GraspClassifier = clone(job.classifier)
     only = job.probe == "only"
     training = [untouched(g, seed=1) for g in job.training] if only else list(job.training)
     start = perf_counter()
-    classifier.fit(training if classifier.learns_from_all_conditions else training[0])
+    classifier.fit(training if len(training) > 1 else training[0])
     fit_s = perf_counter() - start
     results = []
     for order, fold in job.folds:

@@ -105,7 +105,7 @@ def test_which_features_are_learnt_and_how_long_a_contact_must_be(make_touches: 
         reader.read(warm.assign(t_surface=warm["t_surface"].where((warm.time <= 3) | NOT_THE_SECOND)))
     empty = pick(warm, [0, 1]).assign(t_surface=pick(warm, [0, 1])["t_surface"].where(warm.time < 0))
     with pytest.raises(UserError, match="no feature is known"):
-        FeatureReader.learn([empty], empty["material"].values, prefixes=("late_slope",))
+        FeatureReader.learn([empty], empty["material"].values, linear=True)
 
 
 def conditioned(model: BayesClassifier, read: Readings, at: np.ndarray, g: int) -> tuple[np.ndarray, ...]:
@@ -209,6 +209,78 @@ def test_the_spread_within_classes_falls_back_on_that_of_all_and_on_one() -> Non
     np.testing.assert_allclose(_within_class_sd(x, weight, classes, center), [6.5**0.5, 0.75**0.5, 1.0])
 
 
+def with_second(first: Grasps, second: Grasps) -> Grasps:
+    """The readings of another record as those of a second sensor."""
+    return first.assign(t_surface_2=(("grasp", "time"), second["t_surface"].values))
+
+
+def test_a_second_sensor_is_read_and_divided_by_its_own_difference(make_touches: Maker) -> None:
+    """Under the first, half as warm, copper and zinc are alike; the second alone tells them apart."""
+    same, other = (
+        make_touches(("iron",), each=16),
+        make_touches(("copper", "zinc"), each=8, noise=0.01, seed=3),
+    )
+    kind = other["material"].values
+    cooler = other.assign(t_surface=0.5 * (other["t_surface"] - 43.0) + 43.0)
+    both = with_second(same, cooler).assign(material=("grasp", kind))
+    model = make_classifier("bayes").fit(both)
+    assert model.feature_names_[6:] == [f"second_{name}" for name in model.feature_names_[:6]]
+    assert right(model, both) > right(make_classifier("bayes").fit(both.drop_vars("t_surface_2")), both) + 0.2
+    read = model.reader_.read(both)
+    np.testing.assert_allclose(read.gain[:, 6:].mean(), 10.0, atol=0.3)  # 43 less 33 degC
+    np.testing.assert_allclose(read.gain[:, :6].mean(), 20.0, atol=0.3)
+    assert (read.noise[:, :6, 6:] == 0).all()
+    with pytest.raises(UserError, match="has no t_surface_2"):
+        model.predict(same)
+
+
+def test_an_unknown_temperature_is_integrated_over_what_it_may_be(make_touches: Maker) -> None:
+    model = make_classifier("bayes").fit(make_touches(MATERIALS))
+    asked = pick(make_touches(MATERIALS, t_object=33.0, seed=4), [1, 9, 20]).assign(
+        t_ambient=("grasp", [25.0, 25.0, 25.0])
+    )
+    unknown = asked.assign(t_object=("grasp", [np.nan, 33.0, np.nan]))
+    found = model._log_density(unknown)
+    np.testing.assert_allclose(found[1], model._log_density(asked)[1])
+    fine = np.arange(4.0, 47.0, 0.25)  # 5 to 45 degC, each end as blurred as the rest
+    each = []
+    for t in fine:
+        at = asked.assign(t_object=("grasp", np.full(3, t)), t_object_sd=("grasp", np.full(3, 1.2)))
+        each.append(model._log_density(at))
+    inside = (fine >= 5) & (fine <= 45)
+    expected = np.logaddexp.reduce(np.array(each)[inside], axis=0) - np.log(inside.sum())
+    np.testing.assert_allclose(found[[0, 2]], expected[[0, 2]], rtol=0.01)
+    p = model.predict_proba(unknown)
+    assert p[0].max() < model.predict_proba(asked)[0].max()
+    stated = asked.assign(t_object_sd=("grasp", np.full(3, 8.0)))
+    bells = np.exp(-0.5 * ((fine - 33.0) / 8.0) ** 2)
+    expected = np.logaddexp.reduce(np.array(each) + np.log(bells / bells.sum())[:, None, None], axis=0)
+    np.testing.assert_allclose(model._log_density(stated), expected, rtol=0.015)
+
+
+def test_a_material_that_was_not_trained_is_drawn_like_the_trained_ones(make_touches: Maker) -> None:
+    model = make_classifier("bayes").fit(make_touches(MATERIALS))
+    asked = pick(make_touches(MATERIALS, t_object=33.0, seed=4), [1, 9, 20])
+    read, middle = model.reader_.read(asked), model.means_.mean(axis=0)
+    between = 4 / 3 * np.cov(model.means_.T)
+    zero = model.center_ / model.scale_
+    for g in range(3):
+        y = read.y[g] / model.scale_ - read.difference[g] * zero
+        noise = read.noise[g] / np.outer(model.scale_, model.scale_)
+        scale = read.difference[g] ** 2 * (between + model.covariance_) + noise
+        scale = scale + model.t_object_sd_**2 * np.outer(middle + zero, middle + zero)
+        expected = multivariate_t.logpdf(y, read.difference[g] * middle, scale, df=2)
+        assert model._log_density(asked)[g, -1] == pytest.approx(expected)
+    log_p, unknown = model.open_set_log_proba(asked, ["iron", "wood"])
+    np.testing.assert_allclose(log_p, model.candidate_log_proba(asked, ["iron", "wood"]), atol=1e-12)
+    density = model._log_density(asked)
+    known = np.logaddexp(density[:, 1], density[:, 2]) - np.log(2)
+    odds = np.exp(density[:, 3] - known) * 0.1 / 0.9
+    np.testing.assert_allclose(unknown, odds / (1 + odds))
+    np.testing.assert_array_equal(model.p_unknown(asked, ["iron", "wood"]), unknown)
+    assert unknown[0] > 0.5 > unknown[1:].max()  # copper, which is no candidate
+
+
 def test_nothing_seen_leaves_every_class_alike() -> None:
     assert _log_t(np.zeros((3, 0)), np.zeros((3, 0, 0)), 5.0).tolist() == [0.0] * 3
 
@@ -271,7 +343,7 @@ def test_bayes_learns_from_all_conditions_of_the_rig_together() -> None:
     assert np.concatenate(list(hits.values())).mean() > 0.8  # 0.29 to 0.58 by condition
     far = [hit for name, hit in hits.items() if name in ("exp2_dT15", "exp2_dT20", "exp3A_obj", "exp3B_obj")]
     assert np.concatenate(far).mean() > 0.9
-    assert "response_40s" in model.feature_names_  # of one condition alone, and of use there
+    assert "change_40s" in model.feature_names_  # of one condition alone, and of use there
 
 
 @pytest.mark.parametrize("name", LEARNERS)
@@ -309,7 +381,7 @@ def test_bayes_files_of_0_1_0_still_load(three: Grasps, tmp_path: Path) -> None:
 def test_conditions_of_other_rates_and_lengths_are_learnt_from_together(make_touches: Maker) -> None:
     records = [make_touches(MATERIALS), make_touches(MATERIALS, end=40.0, step=0.25, seed=2, name="long")]
     model = make_classifier("bayes").fit(records)
-    assert {"response_10s", "response_40s"} <= set(model.feature_names_)
+    assert {"change_10s", "change_40s"} <= set(model.feature_names_)
     assert min(right(model, g) for g in records) > 0.9
     assert model.shrinkage_ > 0
     with pytest.raises(UserError, match="labels for"):

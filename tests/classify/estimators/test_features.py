@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from thermogrip.classify import extract_features
-from thermogrip.classify.estimators.features import _slope, can_normalise, feature_noise
+from thermogrip.classify.estimators.features import (
+    _slope,
+    can_normalise,
+    feature_noise,
+    linear_features,
+)
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_grasps
 
@@ -253,3 +258,40 @@ def test_a_trace_without_a_start_is_refused() -> None:
     late[T < 1] = np.nan
     with pytest.raises(UserError, match="'g' has no sample before contact"):
         extract_features(make_grasps(T, [late], ["g"]))
+
+
+@pytest.mark.parametrize("end", [10.0, 9.6])
+def test_linear_features_of_a_parabola_are_its_local_lines(end: float) -> None:
+    """A line through the samples about a time is off a parabola by its curvature only."""
+    time = np.arange(-2.0, 10.01, 0.1)
+    after = np.maximum(time, 0)
+    rise = np.where(time <= end + 1e-9, 3 * after - 0.1 * after**2, np.nan)
+    grasps = make_grasps(time, [20 + rise, 20 + 2 * rise], ["a", "b"])
+    found = linear_features(grasps, [0.5, 2.0, 5.0, 10.0, 20.0])
+    assert found["feature"].values.tolist() == [
+        *("change_0.5s", "change_2s", "change_5s", "change_10s", "change_20s", "late_slope")
+    ]
+    x = found.values
+    np.testing.assert_allclose(x[1, [0, 1, 2, 3, 5]], 2 * x[0, [0, 1, 2, 3, 5]])
+    assert np.isnan(x[:, 4]).all()
+    for k, (t, half) in enumerate([(0.5, 0.3), (2.0, 0.4), (5.0, 1.0)]):
+        near = time[np.abs(time - t) < half + 0.01]
+        assert x[0, k] == pytest.approx(3 * t - 0.1 * t**2 - 0.1 * np.mean((near - t) ** 2), abs=1e-9)
+    last = time[(time > end - 0.2 * end - 0.01) & (time < end + 0.01)]
+    line = np.polyfit(last, 3 * last - 0.1 * last**2, 1)
+    assert x[0, 3] == pytest.approx(np.polyval(line, end), abs=1e-9)  # a trace that ends before is read there
+    late = time[(time > 4.99) & (time < end + 0.01)]
+    assert x[0, 5] == pytest.approx(3 - 0.2 * late.mean(), abs=1e-9)
+
+
+def test_the_noise_of_linear_features_is_that_of_their_sums() -> None:
+    rng = np.random.default_rng(1)
+    time = np.arange(-2.0, 10.01, 0.1)
+    grasps = make_grasps(
+        time, 20 + 0.05 * rng.standard_normal((3000, time.size)), [str(k) for k in range(3000)]
+    )
+    names = ["change_0.5s", "change_2s", "change_10s", "late_slope"]
+    found = linear_features(grasps, [0.5, 2.0, 10.0]).values
+    expected = feature_noise(grasps, names).mean(axis=0)
+    sd = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(np.cov(found.T) / np.outer(sd, sd), expected / np.outer(sd, sd), atol=0.06)

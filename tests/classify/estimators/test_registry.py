@@ -189,7 +189,7 @@ def test_its_name_is_its_members_and_it_gives_each_the_seed() -> None:
 @pytest.mark.parametrize(
     ("name", "params", "said"),
     [
-        ("bayes+posterior", {}, "learns from all conditions"),
+        ("bayes+posterior", {}, "joins the touches of a block"),
         ("bayes+", {}, "no classifier is called"),
         ("bayes+nothing", {}, "nothing"),
         ("bayes+pca-lda", {"n": 3}, "no parameters"),

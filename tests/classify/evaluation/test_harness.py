@@ -14,6 +14,7 @@ import pytest
 
 from thermogrip.classify import evaluate, make_classifier
 from thermogrip.classify.estimators.base import JoinedClassifier, pick
+from thermogrip.classify.estimators.bayes import BayesClassifier
 from thermogrip.classify.evaluation import harness
 from thermogrip.classify.evaluation.comparison import Comparison
 from thermogrip.classify.evaluation.harness import (
@@ -505,3 +506,23 @@ def test_what_is_scored_apart_is_no_point_of_a_curve_of_differences(make_touches
         scores=lambda: [row | {"apart": apart} for apart in (False, True)], classifiers=["x"]
     )
     assert [r["apart"] for r in difference_curve(found, [grasps])] == [False]
+
+
+def test_bayes_learns_all_conditions_together_but_those_scored_apart(make_touches: Maker) -> None:
+    """One of unknown temperature, and one whose material no other temperature shows, are learnt alone."""
+    warm, mild = make_touches(name="warm"), make_touches(t_object=33.0, seed=1, name="mild")
+    unknown = make_touches(seed=2, name="unknown").drop_vars("t_object")
+    level = make_touches(("zinc", "iron"), t_object=23.0, seed=3, name="level")
+    learnt: list[list[str]] = []
+
+    class Watched(BayesClassifier):
+        def fit(self, X, y=None):  # type: ignore[no-untyped-def]
+            records = X if isinstance(X, list) else [X]
+            learnt.append([str(part.attrs["name"]) for part in records])
+            return super().fit(X, y)
+
+    evaluate({"b": Watched()}, [warm, mild, unknown, level], probe=False)
+    assert learnt == [["warm", "mild", "unknown", "level"], ["unknown"], ["level"]]
+    learnt.clear()
+    evaluate({"b": Watched()}, [warm, mild], probe=False)
+    assert learnt == [["warm", "mild"]]
