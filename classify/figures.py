@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from thermogrip.classify.estimators.bayes import BayesClassifier, Readings
     from thermogrip.classify.evaluation.decision_time import Decisions
     from thermogrip.sysid.effusivity.posterior import EffusivityRow
 
@@ -136,6 +137,46 @@ def effusivity_figure(
     axis.set_yticks(range(len(rows)), [row.grasp_id for row in rows], fontsize=6)
     axis.set_ylim(len(rows) - 0.3, -0.7)
     axis.set_xlabel("effusivity [W s$^{0.5}$ m$^{-2}$ K$^{-1}$], median and 90 % interval")
+    return figure
+
+
+def feature_figure(model: BayesClassifier, read: Readings, labels: NDArray[np.str_]) -> Figure:
+    """Draw each feature's density under every class of ``bayes``, below it the grasps that ``read`` has, with
+    the sd of their noise; ``labels`` (n_grasp,) are their materials."""
+    x, noise = read.normalised() if model.reader_.normalise else (read.y, read.noise)
+    sd = np.sqrt(np.diagonal(noise, axis1=1, axis2=2))
+    means, scales = model.marginals()
+    count = len(model.feature_names_)
+    down = -(-count // 4)
+    figure, axes = panels(down, min(count, 4), size=(8.6, 0.4 + 2.1 * down), ticks=6)
+    for axis in axes.ravel()[count:]:
+        axis.set_axis_off()
+    for j, (axis, name) in enumerate(zip(axes.ravel(), model.feature_names_)):
+        seen = np.concatenate([x[np.isfinite(x[:, j]), j], means[:, j]])
+        ends = np.quantile(seen, [0.01, 0.99]) + np.array([-3, 3]) * np.median(scales[:, j])
+        grid = np.linspace(ends[0], ends[1], 400)
+        for m, material in enumerate(model.classes_):
+            z = (grid - means[m, j]) / scales[m, j]
+            density = (1 + z**2 / model.dof_) ** (-0.5 * (model.dof_ + 1)) / scales[m, j]
+            top = density * float(np.min(scales[:, j]))
+            axis.plot(grid, top, color=PALETTE[m % 8], lw=1.2, label=str(material) if j == 0 else None)
+            own = labels == material
+            at = np.full(int(own.sum()), -0.08 - 0.09 * m)
+            axis.errorbar(
+                x[own, j],
+                at,
+                xerr=sd[own, j],
+                fmt=MARKERS[m % 8],
+                ms=2,
+                lw=0.4,
+                color=PALETTE[m % 8],
+                alpha=0.6,
+            )
+        unit = "" if model.reader_.normalise else " [K/s]" if "slope" in name else " [K]"
+        words = name.replace("change_", "change at ").replace("_", " ")
+        axis.set(xlim=ends, ylim=(-0.1 - 0.09 * len(model.classes_), 1.05), yticks=())
+        axis.set_xlabel((words[:-1] + " s" if "change" in name else words) + unit, fontsize=7)
+    figure.legend(loc="outside upper center", ncols=min(8, model.classes_.size), frameon=False, fontsize=8)
     return figure
 
 

@@ -140,9 +140,10 @@ class Readings:
 class FeatureReader:
     """Which features a classifier was trained on, and how to read them again.
 
-    Features come from a rise that is fitted to the whole of a contact, up to 10 s: of a shorter contact they
-    are other numbers, and a classifier was right in 0.2 to 0.5 of 300 such simulated grasps at stated
-    probabilities of 0.7 to 1.0.  So a contact that is shorter than those of the training is refused.
+    A shorter contact has fewer linear features, and those that it has are the same numbers.  The others come
+    from a rise that is fitted to the whole of a contact, up to 10 s: of a shorter one they are other numbers,
+    and a classifier was right in 0.2 to 0.5 of 300 such simulated grasps at stated probabilities of 0.7 to
+    1.0.  So with these a contact that is shorter than those of the training is refused.
     """
 
     names: list[str]
@@ -194,10 +195,11 @@ class FeatureReader:
         return cls(list(content["features"]), bool(content["normalise"]), float(content["end"]))
 
     def read(self, grasps: Grasps) -> Readings:
-        """Return the features of other grasps; one that is more than half a second shorter than those of the
-        training is a :class:`UserError`."""
+        """Return the features of other grasps; unless they are linear, one that is more than half a second
+        shorter than those of the training is a :class:`UserError`."""
         last = _last(grasps)
-        if (last < self.end - HELD_AT_AN_END).any():
+        linear = any("change_" in f for f in self.names)
+        if not linear and (last < self.end - HELD_AT_AN_END).any():
             i = int(last.argmin())
             raise UserError(
                 f"grasp {str(grasps['grasp'].values[i])!r} ends at {last[i]:g} s, "
@@ -206,7 +208,6 @@ class FeatureReader:
                 hint="leave it out, or train on contacts of that length",
             )
         times = sorted({_time(f) for f in self.names if f.endswith("s")})
-        linear = any("change_" in f for f in self.names)
         both = any(f.startswith(_SECOND) for f in self.names)
         return self._readings(grasps, _table(grasps, times, linear=linear, both=both).sel(feature=self.names))
 
@@ -403,6 +404,26 @@ class BayesClassifier(GraspClassifier):
                 scale += sd[rows, None, None] ** 2 * _outer(ray)
                 out[rows, m] = _log_t(y_has - gain * mean[has], scale, dof)
         return out
+
+    def marginals(self) -> tuple[Floats, Floats]:
+        """Return mean and scale of each class's t distribution by feature, (n_class, d) each; normalised
+        features have no unit."""
+        scale = np.sqrt(np.diagonal(self.covariance_ + self.mean_covariance_, axis1=1, axis2=2))
+        return self.means_ * self.scale_ + self.center_, scale * self.scale_
+
+    def separation(self, noise: Floats, difference: float) -> Floats:
+        """Return how many standard deviations each two classes are apart, (n_class, n_class), in grasps of
+        this difference [K] and noise [K], (d, d); where features are in kelvin neither counts."""
+        k, off = self.classes_.size, np.zeros((self.classes_.size,) * 2)
+        within = self.covariance_
+        if self.reader_.normalise:
+            within = within + noise / np.outer(self.scale_, self.scale_) / difference**2
+        for i, j in zip(*np.triu_indices(k, 1)):
+            ray = (self.means_[i] + self.means_[j]) / 2 + self.center_ / self.scale_
+            both = within + (self.t_object_sd_ / difference) ** 2 * np.outer(ray, ray)
+            step = self.means_[i] - self.means_[j]
+            off[i, j] = off[j, i] = np.sqrt(step @ np.linalg.solve(both, step))
+        return off
 
     def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         numbers = self.reader_.to_dict() | {

@@ -155,7 +155,7 @@ def _linear_weights(time: tuple[float, ...], names: tuple[str, ...], last: float
         at = min(asked, last)
         used = (t >= 5.0) if slope else np.abs(t - at) <= max(_NEAR, _SHARE * at) + 1e-6
         used &= t <= (at + 1e-6 if slope else last)
-        if used.sum() < (3 if slope else 1) or last < asked - (1.0 if slope else 0.6):
+        if used.sum() < (3 if slope else 1) or last < asked - max(0.06, 0.02 * asked):
             continue
         off = np.where(used, t - t[used].mean(), 0.0)
         lever = off / max(float(off @ off), 1e-12)

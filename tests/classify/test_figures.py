@@ -15,15 +15,18 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator
 
 from tests.report.conftest import described
+from thermogrip.classify.estimators.bayes import BayesClassifier
 from thermogrip.classify.figures import (
     accuracy_figure,
     confusion_figure,
     curve_figure,
     decision_figure,
     effusivity_figure,
+    feature_figure,
     reliability_figure,
 )
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Grasps
 
 DRAWN = Path(__file__).with_name("figures.txt")
 NINE = tuple("abcdefghi")  # one more than there are colours and markers
@@ -186,3 +189,31 @@ def untested() -> Any:
 def test_nothing_is_not_drawn(draw: Callable[[], Figure], message: str) -> None:
     with pytest.raises(UserError, match=message):
         draw()
+
+
+def test_each_feature_has_the_density_of_every_class_above_its_grasps(three: Grasps) -> None:
+    model = BayesClassifier().fit(three)
+    read = model.reader_.read(three)
+    figure = feature_figure(model, read, three["material"].values.astype(str))
+    means, scales = model.marginals()
+    x, noise = read.normalised()
+    for j, name in enumerate(model.feature_names_):
+        axis = figure.axes[j]
+        assert axis.get_xlabel().replace("change at ", "change_").replace(" s", "s") == name.replace(
+            "late_slope", "lateslope"
+        )
+        curves = [line for line in axis.get_lines() if len(line.get_xdata()) == 400]
+        for m, curve in enumerate(curves):
+            at, height = curve.get_xdata(), np.asarray(curve.get_ydata())
+            assert at[height.argmax()] == pytest.approx(means[m, j], abs=0.02 * np.ptp(at))
+            z = (at - means[m, j]) / scales[m, j]
+            t = (1 + z**2 / model.dof_) ** (-(model.dof_ + 1) / 2)
+            np.testing.assert_allclose(height, t * scales[:, j].min() / scales[m, j])
+        points = [line for line in axis.get_lines() if len(line.get_xdata()) == 8]
+        np.testing.assert_allclose(np.concatenate([p.get_xdata() for p in points]), x[:, j])
+        bars = np.concatenate([np.array(c.get_segments())[:, :, 0] for c in axis.collections])
+        np.testing.assert_allclose(np.ptp(bars, axis=1), 2 * np.sqrt(noise[:, j, j]))
+    kelvin = three.drop_vars("t_object")
+    model = BayesClassifier().fit(kelvin)
+    figure = feature_figure(model, model.reader_.read(kelvin), three["material"].values.astype(str))
+    assert [a.get_xlabel() for a in figure.axes[:6:5]] == ["change at 0.5 s [K]", "late slope [K/s]"]

@@ -12,9 +12,12 @@ import numpy as np
 import pytest
 
 from tests.cli.conftest import Bench, StandIn, shares, words_of
+from thermogrip.classify import make_classifier
 from thermogrip.classify.evaluation.comparison import POOLED
 from thermogrip.cli import compare as verb
+from thermogrip.cli.compare import _features
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps, make_grasps
 from thermogrip.report.console import Console
 from thermogrip.report.html import Section
@@ -285,3 +288,15 @@ def test_contacts_are_followed_where_a_classifier_can_and_temperatures_are_known
         assert (times[0].split, times[0].seed, times[0].progress) == (split, 4, None)
         found.rows = ()
         assert verb._decisions(models, [record], 4, None) is None
+
+
+def test_the_features_of_bayes_are_those_of_the_training_grasps() -> None:
+    record = load_example_grasps()["exp2_dT20"]
+    [section] = _features({"bayes": make_classifier("bayes")}, [record])
+    half = record.isel(grasp=record["split"].values == "train")
+    model = make_classifier("bayes").fit(half)
+    expected = float(np.max(model.separation(model.reader_.read(half).noise.mean(axis=0), 20.0)))
+    assert section.parts[1].rows[-1][-1] == pytest.approx(expected, abs=0.05)
+    assert _features({"pca-lda": make_classifier("pca-lda")}, [record]) == []
+    untrained = record.assign(split=("grasp", ["test"] * record.sizes["grasp"]))
+    assert len(_features({"bayes": make_classifier("bayes")}, [untrained])) == 1

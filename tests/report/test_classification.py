@@ -13,14 +13,19 @@ from thermogrip.classify import evaluate, make_classifier
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import make_log
 from thermogrip.report import classification
-from thermogrip.report.classification import comparison_sections, curves_section, touch_section
+from thermogrip.report.classification import (
+    comparison_sections,
+    curves_section,
+    feature_section,
+    touch_section,
+)
 from thermogrip.report.html import Picture, Section, Table, Text
 
 
 @pytest.fixture(autouse=True)
 def _no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures have tests of their own."""
-    for name in ("accuracy", "confusion", "curve", "decision", "effusivity", "reliability"):
+    for name in ("accuracy", "confusion", "curve", "decision", "effusivity", "feature", "reliability"):
         monkeypatch.setattr(f"thermogrip.classify.figures.{name}_figure", lambda *_, **__: Figure())
     monkeypatch.setattr(classification, "loop_figure", lambda *_, **__: Figure())
 
@@ -219,3 +224,17 @@ def test_each_score_stands_under_its_name_with_its_own_interval() -> None:
         "log loss": "0.510 (.11\N{EN DASH}.91)", "by chance": "1.10", "Brier": "0.520 (.12\N{EN DASH}.92)",
         "ECE": "0.530 (.13\N{EN DASH}.93)", "if calibrated": "0.032", "fit [s]": "1.23",
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_the_page_of_bayes_names_the_pair_that_is_hardest_to_tell_apart(known: bool) -> None:
+    grasps = load_example_grasps()["exp1A_obj43_grip23"]
+    grasps = grasps if known else grasps.drop_vars("t_object")
+    model = make_classifier("bayes").fit(grasps)
+    section = feature_section(model, [grasps])
+    assert " and ".join(section.parts[1].rows[0][0].split(", ")) in section.verdict
+    columns = list(zip(*section.parts[1].rows))
+    assert len(columns) == (4 if known else 2)
+    assert list(columns[-1]) == sorted(columns[-1])
+    assert section.parts[1].rows[0][0] in ("brass, copper", "brass, zinc")
+    assert ("at 20 K" in section.verdict) == known

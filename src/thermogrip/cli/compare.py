@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -141,10 +141,25 @@ def compare(
         found = {name: comparison for name, comparison in found.items() if _scored(console, name, comparison)}
         if not found:
             raise UserError("nothing to score", hint="test on grasps of the materials that were trained")
-        more = _curves(console, fast, records, found, seed, pool, shares["curves"], out) if curves else []
+        more = _features(models, records)
+        if curves:
+            more += _curves(console, fast, records, found, seed, pool, shares["curves"], out)
     found = {name: replace(each, notes=(*left_out, *each.notes)) for name, each in found.items()}
     _write_comparisons(console, found, out, more)
     return 0
+
+
+def _features(models: Mapping[str, GraspClassifier], records: Sequence[Grasps]) -> list[Section]:
+    """Return the section of the features of ``bayes``, where it is among the classifiers."""
+    from sklearn.base import clone
+
+    from thermogrip.classify.estimators.bayes import BayesClassifier
+    from thermogrip.report.classification import feature_section
+
+    if not isinstance(models.get("bayes"), BayesClassifier):
+        return []
+    training = training_part(Console(True), records, None if _has_split(records) else "all")
+    return [feature_section(clone(models["bayes"]).fit(training), training)]
 
 
 def _unsplittable(records: Sequence[Grasps], repeats: int, train_per_class: int, seed: int) -> str:

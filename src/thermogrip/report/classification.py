@@ -16,6 +16,7 @@ from thermogrip.report.plots import grasp_figure, loop_figure
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from thermogrip.classify.estimators.bayes import BayesClassifier
     from thermogrip.classify.evaluation.comparison import Comparison
     from thermogrip.classify.evaluation.decision_time import Decisions
     from thermogrip.datasets.schema import Grasps
@@ -295,6 +296,39 @@ def strips_section(rows: Sequence[Any], materials: Sequence[str]) -> Section:
         f"their 90 % interval; the library's own rows are uncertain by {spread[0]:.0f} to {spread[-1]:.0f} %."
     )
     return Section("What effusivity?", (Picture(figure, "Posterior strips of the test grasps."),), verdict)
+
+
+def feature_section(model: BayesClassifier, records: Sequence[Grasps]) -> Section:
+    """Return the section of what ``bayes`` looks at: the features of the grasps that it was fitted to, their
+    densities, and which materials are hard to tell apart at which difference."""
+    import numpy as np
+
+    from thermogrip.classify.figures import feature_figure
+
+    parts = [model.reader_.read(record) for record in records]
+    read = type(parts[0])(**{k: np.concatenate([getattr(p, k) for p in parts]) for k in vars(parts[0])})
+    labels = np.concatenate([record["material"].values.astype(str) for record in records])
+    names, noise = [str(c) for c in model.classes_], read.noise.mean(axis=0)
+    gaps = (5.0, 10.0, 20.0) if model.reader_.normalise else (1.0,)
+    apart = [model.separation(noise, gap) for gap in gaps]
+    pairs = [(i, k) for i in range(len(names)) for k in range(i)]
+    order = sorted(pairs, key=lambda pair: float(apart[-1][pair]))
+    head = ("materials", *((f"at {g:g} K" for g in gaps) if model.reader_.normalise else ("apart",)))
+    rows = tuple(
+        (f"{names[k]}, {names[i]}", *(round(float(a[i, k]), 1) for a in apart)) for i, k in order[:8]
+    )
+    i, k = order[0]
+    verdict = (
+        f"{names[k]} and {names[i]} are the hardest to tell apart: {apart[-1][i, k]:.1f} standard deviations"
+        + (f" at {gaps[-1]:g} K, {apart[0][i, k]:.1f} at {gaps[0]:g} K." if len(gaps) > 1 else ".")
+    )
+    caption = (
+        "Changes after contact, over the difference of object and skin where it is known, and the slope from "
+        "5 s to 10 s. Above, the density under each material; below, the grasps with the sd of their noise."
+    )
+    table = Table(head, rows, "Standard deviations between two materials, by difference of temperature")
+    figure = feature_figure(model, read, labels)
+    return Section("What does bayes look at?", (Picture(figure, caption), table), verdict, "plain")
 
 
 def _who_wins(comparison: Comparison, condition: str) -> str:

@@ -422,3 +422,19 @@ def test_materials_that_do_not_differ_get_equal_probabilities(make_touches: Make
     y = np.array(["a", "b", "c"])[np.arange(30) % 3]
     p = make_classifier("bayes").fit(one, y).predict_proba(make_touches(("copper",), seed=8))
     assert p.max() < 0.75
+
+
+def test_classes_are_as_far_apart_as_scatter_noise_and_temperature_leave_them(make_touches: Maker) -> None:
+    """The distance that linear discriminants of simulated features have."""
+    model = make_classifier("bayes").fit(make_touches(MATERIALS))
+    noise = model.reader_.read(make_touches(MATERIALS)).noise.mean(axis=0)
+    rng, n = np.random.default_rng(0), 40000
+    for gap in (3.0, 20.0):
+        middle = (model.means_[0] + model.means_[1]) / 2 * model.scale_ + model.center_
+        scatter = np.outer(model.scale_, model.scale_) * model.covariance_
+        x = rng.multivariate_normal(np.zeros(middle.size), gap**2 * scatter + noise, n)
+        x += model.t_object_sd_ * rng.standard_normal(n)[:, None] * middle
+        step = gap * (model.means_[0] - model.means_[1]) * model.scale_
+        expected = np.sqrt(step @ np.linalg.solve(np.cov(x.T), step))
+        assert model.separation(noise, gap)[0, 1] == pytest.approx(expected, rel=0.02)
+    assert (np.diag(model.separation(noise, 5.0)) == 0).all()
