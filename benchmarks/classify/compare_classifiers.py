@@ -35,7 +35,6 @@ def main() -> None:
     parser.add_argument("--classifiers", default=LADDER)
     parser.add_argument("--splits", type=int, default=20)
     parser.add_argument("--epochs", type=int, default=QUICK_EPOCHS, help="of the LSTMs")
-    parser.add_argument("--together", action="store_true", help="learn from all conditions at once")
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     records = [g for name, g in load_example_grasps().items() if name[:4] in ("exp1", "exp2", "exp3", "exp4")]
@@ -46,8 +45,6 @@ def main() -> None:
             clock = time.perf_counter()
             epochs = {"epochs": given.epochs} if name.startswith("lstm") else {}
             model = {name: make_classifier(name, seed=0, **epochs)}
-            if given.together:
-                type(model[name]).learns_from_all_conditions = True
             found = evaluate(model, records, split="random", repeats=given.splits, probe=False)
             file.write_text(json.dumps(asdict(found)), encoding="utf-8")
             print(f"{name}: {time.perf_counter() - clock:.0f} s", file=sys.stderr, flush=True)
