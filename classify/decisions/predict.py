@@ -258,44 +258,45 @@ def deviations(device: GripperModel, data: Touches, materials: Sequence[str]) ->
         rows = _nuisances(mode.u[i] - prior.mean[i], prior.sd[i], bool(np.isfinite(data.t_object[i])))
         n = float((data.count[i] > 0).sum())
         times = float(np.sqrt(mode.misfit[i] / n))
-        rows.append(
-            Deviation(
-                float((mode.misfit[i] - n) / np.sqrt(2 * n)), f"a trace {times:.1f} times its noise away"
-            )
-        )
+        rows.append(Deviation(_misfit_sd(mode.misfit[i], n), f"a trace {times:.1f} times its noise away"))
         found.append(sorted(rows, key=lambda row: -row.sd))
     return found
 
 
-def _unexplained(device: GripperModel, data: Touches, ends: Array, hypotheses: Hypotheses) -> list[str]:
-    """Return for each of n touches, each under its own row of ``hypotheses``, why its trace is not explained;
-    empty where it is.  ``ends`` (n, 2) [degC] are those of the range of its object, NaN where that is known.
-    """
+def _misfit_sd(square: float, n: float) -> float:
+    """Return how unusual the squared whitened residuals of n readings are, in standard deviations."""
+    return float((square - n) / np.sqrt(2 * n))
+
+
+def _unexplained(device: GripperModel, data: Touches, ends: Array, hypotheses: Hypotheses) -> list[Deviation]:
+    """Return for each of n touches, each under its own row of ``hypotheses``, its misfit, and in words why
+    its trace is not explained, if it is not.  ``ends`` (n, 2) [degC] are those of the range of its object,
+    NaN where that is known."""
     mode = fit_pairs(device, data, np.arange(ends.shape[0]), hypotheses)
     n = (data.count > 0).sum(axis=1)
     if device.second is not None and data.second is not None:
         n = n + (data.second.count > 0).sum(axis=1)
-    words = []
+    out = []
     for i, (low, high) in enumerate(ends):
-        found = mode.u[i, T_OBJECT]
-        if mode.misfit[i] > n[i] + _UNEXPLAINED * np.sqrt(2 * n[i]):
-            words.append("the trace is not explained by the model: the answer is unreliable")
+        sd, found, words = _misfit_sd(mode.misfit[i], n[i]), mode.u[i, T_OBJECT], ""
+        if sd > _UNEXPLAINED:
+            words = "the trace is not explained by the model: the answer is unreliable"
         elif found < low or found > high:  # NaN compares false
             outside = f"explained only by an object outside of {low:.0f} to {high:.0f} degC"
-            words.append(f"{outside}: the answer is unreliable")
-        else:
-            words.append("")
-    return words
+            words = f"{outside}: the answer is unreliable"
+        out.append(Deviation(sd, words))
+    return out
 
 
 def unexplained_answers(
     classifier: GraspClassifier, X: Records, rows: Sequence[Row], stated: tuple[float, float] | None = None
-) -> list[str]:
-    """Return for each row of predictions what its material does not explain, empty as for :func:`reasons`.
+) -> list[Deviation]:
+    """Return for each row of predictions the misfit under its material, and in words what that does not
+    explain; NaN and empty as for :func:`reasons`.
 
     ``stated`` is the range of unknown object temperatures [degC].
     """
-    out = [""] * len(rows)
+    out = [Deviation(np.nan, "")] * len(rows)
     for model, at, data, ends, named in _single_named(classifier, X, rows, stated):
         hypotheses = _taken_for(model.device_, named, finish=model.finish)
         for i, why in zip(at, _unexplained(model.device_, data, ends, hypotheses)):
@@ -308,8 +309,9 @@ def unexplained_effusivities(
     grasps: Grasps,
     rows: Sequence[EffusivityRow],
     stated: tuple[float, float] | None = None,
-) -> dict[str, str]:
-    """Return the single touches that their effusivity does not explain, and why.
+) -> dict[str, Deviation]:
+    """Return the misfit of single touches under their effusivity, and in words why that does not explain
+    them, if it does not.
 
     ``stated`` is the range of unknown object temperatures [degC].
     """
@@ -322,7 +324,7 @@ def unexplained_effusivities(
     sd = np.log(10) * np.array([rows[i].log10_effusivity_sd for i in at])
     data, ends = _asked(grasps, at, np.inf, stated)
     found = _unexplained(device, data, ends, hypotheses._replace(ln_e_sd=sd))
-    return {str(name): why for name, why in zip(data.grasp_id, found) if why}
+    return {str(name): why for name, why in zip(data.grasp_id, found)}
 
 
 def deviation_words(material: str, row: Sequence[Deviation]) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from tests.cli.conftest import Bench, StandIn, shares, words_of
+from thermogrip.classify.decisions.predict import Deviation
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.cli import classify as verb
 from thermogrip.cli.classify import SHOWN, touched_part, training_part
@@ -57,7 +58,10 @@ def gripper(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
         "thermogrip.sysid.effusivity.posterior.effusivity_posterior",
         lambda device, record, coupling: [effusivity_row(str(n), 1e3) for n in record["grasp"].values],
     )
-    made.explained = stand_in("thermogrip.classify.decisions.predict.unexplained_effusivities", {"a": "odd"})
+    made.explained = stand_in(
+        "thermogrip.classify.decisions.predict.unexplained_effusivities",
+        {"a": Deviation(4.5, "odd"), "b": Deviation(-0.25, "")},
+    )
     return made
 
 
@@ -80,9 +84,10 @@ def test_effusivities_are_printed_written_and_answered(gripper: SimpleNamespace)
         rows = list(csv.DictReader(file))
     assert [row["grasp_id"] for row in rows] == ["a", "b", "c"]
     assert (rows[0]["effusivity"], rows[0]["effusivity_p95"], rows[0]["h_c"]) == ("1000", "2000", "500")
+    assert [row["misfit_sd"] for row in rows] == ["4.5", "-0.25", "nan"]
     answer = json.loads(gripper.bench.run(*words, "--json").out)
     assert gripper.calibrated[1].args[1] == []
-    assert answer["grasps"][2] == asdict(effusivity_row("c", 1e3))
+    assert answer["grasps"][2] == asdict(effusivity_row("c", 1e3)) | {"misfit_sd": None}
     assert (answer["without_contact"], answer["unexplained"], answer["out"]) == ([], {"a": "odd"}, "e.csv")
 
 
@@ -93,7 +98,7 @@ def test_a_grasp_without_a_contact_has_no_effusivity(gripper: SimpleNamespace) -
     answer = json.loads(gripper.bench.run("effusivity", "grasps.csv", "--out", "e.csv", "--json").out)
     assert answer["without_contact"] == ["a", "c"]
     first = answer["grasps"][0]
-    assert set(first) - {"grasp_id"} == {key for key, value in first.items() if value is None}
+    assert set(first) - {"grasp_id", "misfit_sd"} == {key for key, value in first.items() if value is None}
     assert answer["grasps"][1]["effusivity"] == 1000.0
     assert len(gripper.posteriors) == 2  # of the first record alone, twice
 
@@ -305,7 +310,10 @@ def named(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
     made.asked = stand_in(
         "thermogrip.classify.decisions.predict.classify_grasps", lambda *_, **__: [dict(row) for row in ROWS]
     )
-    made.unexplained = stand_in("thermogrip.classify.decisions.predict.unexplained_answers", ["odd", "odder"])
+    made.unexplained = stand_in(
+        "thermogrip.classify.decisions.predict.unexplained_answers",
+        [Deviation(4.5, "odd"), Deviation(float("nan"), "odder")],
+    )
     made.reasons = stand_in("thermogrip.classify.decisions.predict.reasons", ["too cold for iron", ""])
     return made
 
@@ -330,7 +338,8 @@ def test_answers_are_printed_written_and_answered(named: SimpleNamespace) -> Non
     answer = json.loads(named.bench.run(*words, "--json").out)
     first, second = ROWS
     assert answer == {
-        "grasps": [first | {"note": "odd"}, second], "strange": {"a": "too cold for iron"}, "out": "p.csv",
+        "grasps": [first | {"misfit_sd": 4.5, "note": "odd"}, second],
+        "strange": {"a": "too cold for iron"}, "out": "p.csv",
     }  # fmt: skip
 
 

@@ -27,6 +27,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
 
 if TYPE_CHECKING:
+    from thermogrip.classify.decisions.predict import Deviation
     from thermogrip.classify.decisions.stopping_rule import StopRule
     from thermogrip.classify.estimators.base import GraspClassifier
     from thermogrip.datasets.schema import Grasps
@@ -155,14 +156,17 @@ def effusivity(
 
     device, coupling, longest = calibrated_device(console, calibrate or [], seed)
     records = [_as_taught(console, record, longest, coupling) for record in records]
-    unexplained: dict[str, str] = {}
+    misfits: dict[str, Deviation] = {}
     with console.progress("effusivity") as progress:
         rows = []
         for k, record in enumerate(records):
             progress(k / len(records), record.attrs["name"])
             found = _effusivities(device, with_object_range(record, stated), coupling)
-            unexplained |= unexplained_effusivities(device, record, found, stated)
+            misfits |= unexplained_effusivities(device, record, found, stated)
             rows += [asdict(row) for row in found]
+    for row in rows:
+        row["misfit_sd"] = misfits[row["grasp_id"]].sd if row["grasp_id"] in misfits else float("nan")
+    unexplained = {name: found.words for name, found in misfits.items() if found.words}
     cells = [[f"{cell:.6g}" if isinstance(cell, float) else cell for cell in row.values()] for row in rows]
     write_atomic(out, csv_text([list(rows[0]), *cells]))
     shown = [
@@ -329,7 +333,9 @@ def classify(
     ranged = [with_object_range(grasps, stated) for grasps in records]
     rows = classify_grasps(model, ranged, comma(candidates), rule=rule)
     if not early:
-        for row, why in zip(rows, unexplained_answers(model, records, rows, stated)):
+        for row, (misfit, why) in zip(rows, unexplained_answers(model, records, rows, stated)):
+            if misfit == misfit:
+                row["misfit_sd"] = misfit
             if why and not row.get("note"):
                 row["note"] = why
     console = Console(as_json)

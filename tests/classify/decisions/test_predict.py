@@ -340,9 +340,10 @@ def test_a_stated_range_is_for_objects_of_unknown_temperature(cold: Grasps) -> N
 
 def test_what_the_model_does_not_explain_is_reported(known: PosteriorClassifier, cold: Grasps) -> None:
     def said(grasps: Grasps, stated: tuple[float, float] | None = None) -> list[str]:
-        return unexplained_answers(
-            known, grasps, classify_grasps(known, with_object_range(grasps, stated)), stated
-        )
+        rows = classify_grasps(known, with_object_range(grasps, stated))
+        found = unexplained_answers(known, grasps, rows, stated)
+        assert [row.sd > 4 for row in found] == ["is not explained by" in row.words for row in found]
+        return [row.words for row in found]
 
     assert said(load_example_grasps()["exp3C_obj18_grip38"]) == [""] * 24
     assert said(cold) == said(cold, (10.0, 26.0)) == [""] * 3
@@ -359,7 +360,11 @@ def test_a_grasp_that_cannot_be_read_leaves_the_others_explained(known: Posterio
     lost = cold.assign(t_surface=cold["t_surface"].where(~after | (cold["grasp"] != cold["grasp"][0]), 30.0))
     rows = classify_grasps(known, lost)
     assert [bool(row["material"]) for row in rows] == [False, True, True]
-    assert unexplained_answers(known, lost, rows) == reasons(known, lost, rows) == [""] * 3
+    found = unexplained_answers(known, lost, rows)
+    assert [row.words for row in found] == reasons(known, lost, rows) == [""] * 3
+    assert [bool(np.isfinite(row.sd)) for row in found] == [False, True, True]
+    [whitened] = deviations(known.device_, touches(pick(lost, [1])), [rows[1]["material"]])
+    assert found[1].sd == pytest.approx(next(d.sd for d in whitened if "times its noise" in d.words))
 
 
 def test_a_stated_range_narrows_effusivities_and_one_that_is_wrong_is_reported(
@@ -369,7 +374,10 @@ def test_a_stated_range_narrows_effusivities_and_one_that_is_wrong_is_reported(
     for stated, odd in ((None, 0), ((15.0, 21.0), 0), ((28.0, 34.0), 2)):
         rows = effusivity_posterior(device, with_object_range(cold, stated))
         width.append(rows[0].t_object_p95 - rows[0].t_object_p05)
-        words = unexplained_effusivities(device, cold, rows, stated)
+        found = unexplained_effusivities(device, cold, rows, stated)
+        assert list(found) == [row.grasp_id for row in rows]
+        assert max(row.sd for row in found.values()) < 4
+        words = {name: row.words for name, row in found.items() if row.words}
         assert all("the answer is unreliable" in why for why in words.values())
         assert len(words) >= odd if odd else not words
     assert width[1] < width[0]
@@ -393,11 +401,12 @@ def test_no_contact_of_another_rig_is_put_out_of_the_range_without_a_word() -> N
     device = load_default_gripper()
     for stated in (None, (1.0, 25.0)):
         rows = effusivity_posterior(device, with_object_range(grasps, stated))
-        reported = unexplained_effusivities(device, grasps, rows, stated)
+        found = unexplained_effusivities(device, grasps, rows, stated)
+        reported = {name for name, row in found.items() if row.words}
         ends = object_range(grasps, stated)
         outside = [
             row.grasp_id
             for row, (low, high) in zip(rows, ends)
             if not low - 2 <= row.t_object <= high + 2  # at the median effusivity it may be just inside
         ]
-        assert set(outside) <= set(reported)
+        assert set(outside) <= reported
