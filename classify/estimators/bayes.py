@@ -182,6 +182,11 @@ class FeatureReader:
         reader = cls(names, any(map(can_normalise, records)) and bool(usable.any()), end)
         if not reader.normalise:
             usable = np.ones(labels.size, dtype=bool)
+        elif both:
+            beside = np.concatenate([object_difference(_sensors(part)[1][1]) for part in records])
+            if set(labels[usable]) - set(_seen(beside, labels)):
+                names = reader.names = [f for f in names if not f.startswith(_SECOND)]
+                notes.append("the second sensor is not read: its temperature was within 1 K of an object's")
         parts = [reader._readings(part, table.reindex(feature=names)) for part, table in zip(records, tables)]
         return reader, _joined(parts), usable, notes
 
@@ -452,9 +457,7 @@ class BayesClassifier(GraspClassifier):
 
 def _usable(difference: Floats, labels: Labels) -> tuple[NDArray[np.bool_], list[str]]:
     """Return which grasps have normalised features of at least two materials, and in words which have not."""
-    clear = np.abs(difference) >= LEAST_DIFFERENCE
-    weight = np.where(clear, difference**2 / (difference**2 + _HALF_WEIGHT), 0.0)
-    known = [m for m in np.unique(labels) if weight[labels == m].sum() >= _LEAST_WEIGHT]
+    known = _seen(difference, labels)
     if len(known) < 2:
         return np.zeros(labels.size, dtype=bool), [
             "features stay in kelvin: object temperatures are unknown, or within 1 K of the skin's"
@@ -466,6 +469,13 @@ def _usable(difference: Floats, labels: Labels) -> tuple[NDArray[np.bool_], list
     if unknown:
         notes.append(f"{unknown} grasps left out: their object temperature is unknown")
     return usable, notes
+
+
+def _seen(difference: Floats, labels: Labels) -> list[str]:
+    """Return the materials whose normalised features grasps at these differences [K] show."""
+    clear = np.abs(difference) >= LEAST_DIFFERENCE
+    weight = np.where(clear, difference**2 / (difference**2 + _HALF_WEIGHT), 0.0)
+    return [str(m) for m in np.unique(labels) if weight[labels == m].sum() >= _LEAST_WEIGHT]
 
 
 def _rows(read: Readings, at: NDArray[np.bool_]) -> Readings:

@@ -234,6 +234,19 @@ def test_a_second_sensor_is_read_and_divided_by_its_own_difference(make_touches:
         model.predict(same)
 
 
+def test_a_second_sensor_as_warm_as_an_object_is_not_read(make_touches: Maker) -> None:
+    """Of a passive sensor at the objects' temperature nothing can be divided; the fit was singular."""
+    first = make_touches(("copper", "zinc"))
+    still = make_touches(("copper", "zinc"), t_object=23.0, seed=2, noise=0.01)
+    passive = still.assign(t_surface=still["t_surface"] + 20.0)
+    model = make_classifier("bayes").fit(with_second(first, passive))
+    assert model.notes_ == ["the second sensor is not read: its temperature was within 1 K of an object's"]
+    alone = make_classifier("bayes").fit(first)
+    np.testing.assert_allclose(
+        model.predict_proba(with_second(first, passive)), alone.predict_proba(first), atol=1e-9
+    )
+
+
 def test_an_unknown_temperature_is_integrated_over_what_it_may_be(make_touches: Maker) -> None:
     model = make_classifier("bayes").fit(make_touches(MATERIALS))
     asked = pick(make_touches(MATERIALS, t_object=33.0, seed=4), [1, 9, 20]).assign(
