@@ -37,7 +37,8 @@ loss at first, and no short record distinguishes them: there the report is early
 once: those are known.
 
 A target that cannot be reached can be again after five samples in a row in which neither answer says
-otherwise, or when it moves.
+otherwise, or when it moves.  Where no steady state is found after the model's answer was that it cannot (near
+an optimum Newton's method may not converge), that answer is kept until the plan ends at the target.
 """
 
 from __future__ import annotations
@@ -152,9 +153,10 @@ class Reach:
         if not np.array_equal(target, self._target):
             self._target, self._sum, self._in, self._unreachable = target.copy(), 0.0, 0, False
         self._record(y, u, observer.w)
-        limit = _IN if self._unreachable else _OUT
+        limit, lost = _IN if self._unreachable else _OUT, False
         if np.any(np.abs(target - ahead)[seen] > limit):
             held, J = self._held(observer, u, d + observer.disturbance_bias, target, side, seen)
+            lost = held is target and self._sum >= _ALARM  # none was found
         else:
             held, J = target, np.zeros((len(target), observer.w.size))
         w_at = slice(self.model.n_x, self.model.n_x + observer.w.size)
@@ -162,13 +164,15 @@ class Reach:
         sd = np.maximum(np.sqrt(np.einsum("ij,jk,ik->i", J, P, J)), _LEAST_SD)
         miss = np.where(seen, np.abs(target - held), 0.0)
         scaled = (miss - _OUT) / (sd * max(1.0, observer.innovation_bias))
-        self._sum = min(max(0.0, self._sum + float(np.clip(scaled.max(), -1, _CLIP)) - _ALLOWANCE), _ALARM)
+        if not lost:
+            step = float(np.clip(scaled.max(), -1, _CLIP)) - _ALLOWANCE
+            self._sum = min(max(0.0, self._sum + step), _ALARM)
         short, ends = self._readings_say(observer.w, J, sd, miss, target, seen)
         allowed = np.clip(target, *self._own)
         barred = seen & (np.abs(target - allowed) > _OUT)
         out = (miss > limit) | short | barred
         if self._unreachable:
-            self._in = 0 if out.any() else self._in + 1
+            self._in = 0 if out.any() or lost else self._in + 1
             self._unreachable = self._in < _TAKE_BACK
         else:
             self._in, self._unreachable = 0, self._sum >= _ALARM or bool((short | barred).any())

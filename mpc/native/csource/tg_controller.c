@@ -502,7 +502,7 @@ static double missed_by(tg_controller *c)
     const tg_design *s = c->design;
     double limit = c->unreachable ? CAN : CANNOT, held[TG_NC] = {0.0}, by_w[TG_NC * TG_SOME(TG_NW)] = {0.0};
     double d[TG_SOME(TG_ND)] = {0.0}, on_u[TG_NU], on_y[TG_NY], scaled = -1.0, worst = 0.0, inflation = 1.0;
-    int away = 0, out = 0, alarm = 0;
+    int away = 0, out = 0, alarm = 0, lost = 0;
     record_relaxation(c);
     for (int r = 0; r < s->n_c; r++)
         away = away || (!(c->unread_s[r] > 0.0) &&
@@ -512,6 +512,7 @@ static double missed_by(tg_controller *c)
         for (int i = 0; i < TG_ND; i++)
             d[i] += c->d[i];
         away = tg_find_steady(c, d, on_u, on_y, held, by_w);
+        lost = !away && c->miss_sum >= MISS_ALARM; /* the last answer is kept */
     }
     if (!away)
         memset(by_w, 0, sizeof by_w);
@@ -542,8 +543,9 @@ static double missed_by(tg_controller *c)
         worst = fmax(worst, miss > limit ? miss : is_short ? fabs(c->target[r] - end) : 0.0);
         worst = fmax(worst, is_barred ? beyond : 0.0);
     }
-    c->miss_sum = fmin(fmax(0.0, c->miss_sum + fmin(scaled, MISS_CLIP) - MISS_ALLOWANCE), MISS_ALARM);
-    c->in = c->unreachable && !out ? c->in + 1 : 0;
+    if (!lost)
+        c->miss_sum = fmin(fmax(0.0, c->miss_sum + fmin(scaled, MISS_CLIP) - MISS_ALLOWANCE), MISS_ALARM);
+    c->in = c->unreachable && !out && !lost ? c->in + 1 : 0;
     c->unreachable = c->unreachable ? c->in < TAKE_BACK : c->miss_sum >= MISS_ALARM || alarm;
     return c->unreachable ? fmax(worst, TINY) : 0.0;
 }

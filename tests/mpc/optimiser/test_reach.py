@@ -48,6 +48,26 @@ ROWS = {
 }
 
 
+def test_where_the_steady_state_is_no_longer_found_the_report_is_kept(tank_maker, monkeypatch):
+    plant = tank_maker(**OPTIMUM)
+    controller = Controller(plant, default_design(plant, dt=2.0, deadline_s=1e9))
+    reading = {"t_tank": 25.0, "t_surface": 25.0, "t_ambient": 25.0}
+    controller.reset(reading)
+    before = [controller.step(reading, -20.0) for _ in range(4)][-1]
+    assert before.status == "infeasible"
+    solve = np.linalg.solve
+
+    def fails(A, b):  # as where Newton's method does not converge
+        if b.ndim == 2 and b.shape[1] > 1 and A.shape[0] == controller.model.n_x:
+            raise np.linalg.LinAlgError
+        return solve(A, b)
+
+    monkeypatch.setattr("thermogrip.mpc.optimiser.reach.np.linalg.solve", fails)
+    after = [controller.step(reading, -20.0) for _ in range(8)]
+    assert {(move.status, move.advice) for move in after} == {(before.status, before.advice)}
+    assert controller.reach._x is None
+
+
 @pytest.mark.parametrize("row", ROWS)
 def test_a_target_out_of_reach_is_reported_soon_and_kept_and_no_other_is(row, tank_maker):
     truth, model, limits, schedule, latest, value = ROWS[row]
