@@ -290,7 +290,7 @@ def test_contacts_are_followed_where_a_classifier_can_and_temperatures_are_known
         assert verb._decisions(models, [record], 4, None) is None
 
 
-def test_the_features_of_bayes_are_those_of_the_training_grasps() -> None:
+def test_the_features_of_bayes_are_those_of_the_training_grasps(capsys: pytest.CaptureFixture[str]) -> None:
     record = load_example_grasps()["exp2_dT20"]
     [section] = _features({"bayes": make_classifier("bayes")}, [record])
     half = record.isel(grasp=record["split"].values == "train")
@@ -300,3 +300,5 @@ def test_the_features_of_bayes_are_those_of_the_training_grasps() -> None:
     assert _features({"pca-lda": make_classifier("pca-lda")}, [record]) == []
     untrained = record.assign(split=("grasp", ["test"] * record.sizes["grasp"]))
     assert len(_features({"bayes": make_classifier("bayes")}, [untrained])) == 1
+    [same] = _features({"bayes": make_classifier("bayes")}, [record, untrained.assign_attrs(name="other")])
+    assert (same.parts[1], capsys.readouterr().err) == (section.parts[1], "")

@@ -158,7 +158,10 @@ def _features(models: Mapping[str, GraspClassifier], records: Sequence[Grasps]) 
 
     if not isinstance(models.get("bayes"), BayesClassifier):
         return []
-    training = training_part(Console(True), records, None if _has_split(records) else "all")
+    training = list(records)
+    if _has_split(records):
+        training = [r.isel(grasp=r["split"].values == "train") if "split" in r else r for r in records]
+    training = [part for part in training if part.sizes["grasp"]]
     return [feature_section(clone(models["bayes"]).fit(training), training)]
 
 
