@@ -32,6 +32,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -49,10 +50,10 @@ Array = NDArray[np.float64]
 HARDLY_MORE = float(np.log(1.05))  # of log errors
 _AVERAGED = (10, 5, 3)  # structures
 _MOST_ON_ALL = 2.0  # times the worst fold's error: a fit to all data that errs more on them is refused
+_BLOCKS = 4  # of one or two logs
 FEWEST = 20  # rows of a block that is held out
 
-# How a first error is shared between state and sensor; the free run over held-out rows chooses one.
-PRIORS = tuple(StartPrior(noise=r, nuisance=q) for q in (0.0, 0.1, 0.3, 1.0) for r in (0.03, 0.1, 0.3))
+_SHORT = 0.25  # of a held-out part: the memory of an offset that fades
 
 
 class Model(PlantModel, Protocol):
@@ -102,7 +103,7 @@ class Choice:
         return float(np.exp(np.mean(np.log(np.maximum(self.errors[structure], 1e-12)))))
 
 
-def folds(grid: Grid, *, blocks: int = 4) -> Iterator[tuple[str, Grid, tuple[Segment, ...]]]:
+def folds(grid: Grid, *, blocks: int = _BLOCKS) -> Iterator[tuple[str, Grid, tuple[Segment, ...]]]:
     """Yield (what is held out, the training grid, the held-out segments)."""
     if len(grid.logs) >= 3:
         candidates = [name for name in grid.logs if _may_be_held_out(grid, name)]
@@ -127,6 +128,18 @@ def held_out_runs(grid: Grid, held: Sequence[Segment]) -> list[Segment]:
     return [*held, *(s.part(len(s.time) // 2, len(s.time)) for s in held if len(grid.logs) < 3)]
 
 
+def priors_of(grid: Grid) -> tuple[StartPrior, ...]:
+    """Return how a first error may be shared between state and sensor, and how long an offset lasts.
+
+    Offsets that fade do in a quarter of a held-out part: a longer memory cannot be told from one that lasts.
+    """
+    seconds = grid.dt * sum(len(segment.time) for segment in grid.segments)
+    fading = _SHORT * seconds / (len(grid.logs) if len(grid.logs) >= 3 else _BLOCKS)
+    none = [StartPrior(noise=r) for r in (0.03, 0.1, 0.3)]
+    kinds = [(0.0, np.inf), *product((0.1, 0.3, 1.0), (np.inf, fading))]
+    return tuple(replace(some, nuisance=q, memory=memory) for q, memory in kinds for some in none)
+
+
 def free_run_errors(
     model: Model,
     segments: Sequence[Segment],
@@ -141,12 +154,18 @@ def free_run_errors(
     if not model.stable:
         return refused
     total, count = np.zeros((len(priors), len(scale))), np.zeros(len(scale))
+    memory = np.array([prior.memory for prior in priors])[:, None]
+    # the memory has no part in the start
+    shares = list(dict.fromkeys(replace(prior, memory=np.inf) for prior in priors))
+    at = [shares.index(replace(prior, memory=np.inf)) for prior in priors]
     for segment in segments:
         head = (segment.y[:warmup], segment.u[:warmup], segment.d[:warmup])
-        x0, offset = estimate_starts(model, *head, dt=dt, scale=scale, priors=priors)
+        x0, offset = estimate_starts(model, *head, dt=dt, scale=scale, priors=shares)
         seen, _ = model.rollout(x0, segment.u[None], segment.d[None], (), dt)
         known = np.isfinite(segment.y[warmup:])
-        miss = (seen[:, :-1] + offset[:, None] - segment.y)[:, warmup:]
+        rows = np.arange(len(segment.y) - warmup) + warmup / 2  # after the middle of the warm-up
+        lasts = np.exp(-rows * dt / memory)[:, :, None]
+        miss = (seen[:, :-1] - segment.y)[at, warmup:] + offset[at, None] * lasts
         if not np.isfinite(miss[:, known]).all():
             return refused
         total += np.sum(np.where(known, miss, 0.0) ** 2, axis=1)
@@ -203,8 +222,8 @@ def _score(
     progress: Callable[[float, str], None] | None = None,
 ) -> dict[Structure, _Errors]:
     """Return the errors of each structure that ``fit`` makes of the rest of the folds."""
-    scale = np.maximum(grid.output_spread(), 1e-9)
-    refused = np.full((len(PRIORS), len(scale)), np.inf)
+    scale, priors = np.maximum(grid.output_spread(), 1e-9), priors_of(grid)
+    refused = np.full((len(priors), len(scale)), np.inf)
     errors: dict[Structure, list[Array]] = {}
     for at, (label, train, held) in enumerate(cases):
         if progress is not None:
@@ -213,7 +232,7 @@ def _score(
         for structure, model in fit(train).items():
             column = errors.setdefault(structure, [refused] * at)
             column.append(
-                free_run_errors(model, starts, dt=grid.dt, scale=scale, warmup=warmup, priors=PRIORS)
+                free_run_errors(model, starts, dt=grid.dt, scale=scale, warmup=warmup, priors=priors)
             )
         for column in errors.values():  # a structure that could not be fitted on this fold is refused
             column.extend([refused] * (at + 1 - len(column)))
@@ -223,7 +242,7 @@ def _score(
         by_prior = np.mean(by_output / scale, axis=2)
         with np.errstate(divide="ignore"):
             at = int(np.argmin(np.log(by_prior).mean(axis=0)))
-        out[structure] = _Errors(PRIORS[at], by_prior[:, at], by_output[:, at])
+        out[structure] = _Errors(priors[at], by_prior[:, at], by_output[:, at])
     return out
 
 

@@ -158,6 +158,7 @@ class StartPrior:
 
     noise: float = 0.1  # r, per row of the warm-up
     nuisance: float = 0.0  # q; 0 means that sensors have no offset of their own
+    memory: float = np.inf  # [s] in which an offset falls to 1/e
 
 
 def estimate_starts(

@@ -85,6 +85,8 @@ class Plant(PlantData):
         has none.
     inputs_end_at_row : bool, optional
         Whether an input of the logs was applied up to the row that holds it; where False, from it on.
+    offset_memory : float, optional
+        Seconds in which a log's own offset falls to 1/e after the warm-up; infinite where it lasts.
 
     Examples
     --------

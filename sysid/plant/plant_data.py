@@ -61,6 +61,7 @@ class PlantData:
     verdict: str = ""
     fitted_to: tuple[FitLog, ...] = ()
     inputs_end_at_row: bool = False
+    offset_memory: float = np.inf
 
     def __post_init__(self) -> None:
         missing = [name for name in self.model.parameters if name not in self.values]
@@ -203,6 +204,8 @@ def plain_content(plant: PlantData) -> dict[str, Any]:
     content["samples"] = None
     if plant.inputs_end_at_row:  # absent otherwise: files of version 0.1.0 have no such key
         content["inputs_end_at_row"] = True
+    if np.isfinite(plant.offset_memory):
+        content["offset_memory"] = plant.offset_memory
     if plant.refits:
         content["refits"] = [model.to_dict() for model in plant.refits]
     return content
@@ -229,6 +232,9 @@ def fields_of(content: Mapping[str, Any]) -> dict[str, Any]:
             "scores": PlantScores.from_json(content["scores"]),
             "verdict": str(content["verdict"]),
             "inputs_end_at_row": bool(content.get("inputs_end_at_row", False)),
+            "offset_memory": number_within(content, "offset_memory", 1e-6, LARGEST)
+            if "offset_memory" in content
+            else np.inf,
         }
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise not_whole(error) from error

@@ -12,6 +12,8 @@ later:
 * Any other start is x0 = x_rest + s with s ~ N(0, P) and sensor offsets o ~ N(pooled, q^2).  The readings
   of the warm-up are linear in (s, o) to first order, so their estimate is a ridge regression, done twice.
   The warm-up counts as one independent reading every 10 s, for the model's error is not white.
+  Where the fit found that a log's own offset fades, it falls from the middle of the warm-up
+  on as exp(-t / plant.offset_memory) to the pooled one.
 
 **Gaps.**  Over a gap of more than 10 s the input is unknown.  It is taken to have changed once, from the row
 before to the row after, at a time chosen by the warm-up after the gap; the state propagated to there is
@@ -51,11 +53,19 @@ class Start:
     # (n_x,) x0 minus the state at rest of the readings without their offsets, or minus the state propagated
     # through the gap
     shift: Array
-    y_offset: Array  # (n_y,) reading minus model
+    y_offset: Array  # (n_y,) reading minus model, as the warm-up says
     d_offset: Array  # (n_d,)
     level: float | None  # the uniform temperature of a log that starts at rest
     change: float  # seconds after the row before the gap at which the input changed
     how: str  # one clause for notes
+    fading: Array | float = 0.0  # (n_y,) share of y_offset that fades
+    memory: float = np.inf  # [s] in which it falls to 1/e
+    warm: float = 0.0  # middle of the warm-up, after which it fades, in seconds of this stretch
+
+    def offset(self, time: Array) -> Array:
+        """Return the offset (n, n_y) at seconds ``time`` of the stretch."""
+        lost = -np.expm1(-np.maximum(time - self.warm, 0.0) / self.memory)
+        return np.asarray(self.y_offset - self.fading * lost[:, None])
 
 
 def find_starts(plant: PlantData, p: Array, stretches: Sequence[Stretch], warmup: float) -> list[Start]:
@@ -84,7 +94,7 @@ def predict(
             u_gap, d_gap, dt_gap = _through_gap(stretches[at - 1], stretch, start, [start.change], dt)
             x0 = model.rollout(x_end, u_gap, d_gap, p, dt_gap)[1] + start.shift
         y, x_end = model.rollout(x0, stretch.u[None], d[None], p, dt)
-        out.append(y + start.y_offset)
+        out.append(y + start.offset(dt * np.arange(y.shape[1], dtype=np.float64)))
     return out
 
 
@@ -124,7 +134,8 @@ def _first_start(plant: PlantData, p: Array, stretch: Stretch, warmup: float) ->
         x0 = plant.model.rest(*_about_start(stretch, start), p)
         start = _corrected(plant, p, stretch, replace(start, x0=x0), warmup, offsets=True)
         # the state at rest for other parameters is that of readings without the offsets that were found
-        return replace(start, shift=start.x0 - plant.model.rest(*_about_start(stretch, start), p))
+        start = replace(start, shift=start.x0 - plant.model.rest(*_about_start(stretch, start), p))
+        return replace(start, fading=start.y_offset - y_offset, memory=plant.offset_memory, warm=warmup / 2)
     T0, y_mean, d_mean = level
     y_own = np.array([plant.nuisance.get(name, 0.0) > 0 for name in plant.outputs], dtype=bool)
     d_own = np.array([plant.nuisance.get(name, 0.0) > 0 for name in plant.disturbances], dtype=bool)
@@ -191,7 +202,8 @@ def _after_gap(
     times = [0.0] if same else np.linspace(0.0, stretch.gap, count).tolist()
     u, d, dt = _through_gap(before, stretch, start, times, plant.dt)
     propagated = plant.model.rollout(np.repeat(runs[1], len(times), axis=0), u, d, p[None], dt)[1]
-    here = replace(start, level=None, shift=np.zeros(plant.model.n_x))
+    zero, warm = np.zeros(plant.model.n_x), start.warm - before.time[-1] - stretch.gap
+    here = replace(start, level=None, shift=zero, warm=warm)
     residual, response = _warm(plant, p, stretch, here, propagated, warmup)
     known = np.isfinite(residual[0])
     spread = response[known] @ plant.model.spread @ response[known].T + np.eye(int(known.sum()))
@@ -224,7 +236,7 @@ def _warm(
 ) -> tuple[Array, Array]:
     """Return residuals (B, n_r) of the warm-up for each x0 and its response (n_r, n_x) to the first [sd]."""
     n = min(len(stretch.u), max(1, int(np.ceil(warmup / plant.dt - 1e-9))))
-    y = _binned(stretch, plant.dt, n, warmup) - start.y_offset
+    y = _binned(stretch, plant.dt, n, warmup) - start.offset(plant.dt * np.arange(n + 1, dtype=np.float64))
     size = 1e-3 * np.sqrt(np.diag(plant.model.spread))
     around = np.vstack([x0, x0[0] + np.diag(size)])
     u, d = stretch.u[None, :n], stretch.d[None, :n] - start.d_offset

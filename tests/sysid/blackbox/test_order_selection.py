@@ -29,9 +29,16 @@ def rows(n, log="a"):
     return segment(np.arange(n)[:, None], log=log)
 
 
-def test_each_noise_is_tried_with_each_offset():
-    want = [(r, q) for q in (0.0, 0.1, 0.3, 1.0) for r in (0.03, 0.1, 0.3)]
-    assert [(some.noise, some.nuisance) for some in selection.PRIORS] == want
+@pytest.mark.parametrize(
+    ("lengths", "memory"),  # rows of 2 s; a quarter of a held-out part, of four blocks or a log of three
+    [((80,), 10.0), ((50, 40), 11.25), ((30, 60, 30), 20.0)],
+)
+def test_each_noise_is_tried_with_each_offset_that_lasts_or_fades(lengths, memory):
+    want = [(r, 0.0, np.inf) for r in (0.03, 0.1, 0.3)]
+    for q in (0.1, 0.3, 1.0):
+        want += [(r, q, lasts) for lasts in (np.inf, memory) for r in (0.03, 0.1, 0.3)]
+    found = selection.priors_of(grid_of(*(rows(n, log) for n, log in zip(lengths, "abc"))))
+    assert [(some.noise, some.nuisance, some.memory) for some in found] == want
 
 
 def spans(segments):
@@ -113,6 +120,11 @@ def test_errors_of_a_free_run_are_those_of_the_rows_after_the_warm_up_for_each_p
     # misses of 3.5, 5.5, 2 and 1, 2, -3; half of (0, 2, 4) times 3/(3 + 1) taken as offset: 1.5 less
     want = [[np.sqrt(46.5 / 3), np.sqrt(14 / 3)], [np.sqrt((4 + 16 + 4) / 3), np.sqrt(14 / 3)]]
     np.testing.assert_allclose(found, want)
+    fading = [StartPrior(noise=1.0, nuisance=1.0, memory=5.0)]  # by exp(-2 s/5 s) a row
+    (found,) = selection.free_run_errors(Stands(), [long, short], **how | {"priors": fading})
+    left = 1.5 * np.exp(-0.4 * (np.arange(3) + 1.5))
+    misses = [3.5 - left[0], 5.5 - left[2], 2.0]  # nothing of the short one's is offset
+    np.testing.assert_allclose(found[0], np.sqrt(np.mean(np.square(misses))))
     lost = selection.free_run_errors(
         Stands(lost=[(4, 0)]), [long.part(0, 5)], **how
     )  # where nothing was read
@@ -148,11 +160,11 @@ def test_the_choice_has_the_errors_of_its_structure_and_of_its_best_prior(monkey
     def errors_of(model, segments, *, dt, scale, warmup, priors):
         assert (dt, scale.tolist(), warmup) == (2.0, [2.0, 10.0], 6)
         if len(priors) == 1:
-            assert priors[0] == selection.PRIORS[4]
+            assert priors[0] == selection.priors_of(grid)[4]
             error, shape = on_all if model == SMALL else 0.1, np.ones((1, 1))
         else:
             (log,) = {s.log for s in segments}
-            error, shape = by_fold[model][log], np.full((12, 1), 3.0)
+            error, shape = by_fold[model][log], np.full((21, 1), 3.0)
             shape[4], shape[7] = 1.0, {"a": 1.2, "b": 1.2, "c": 0.8}[log]
         return error * shape * scale * [1.5, 0.5]  # their mean is 1
 
@@ -160,7 +172,7 @@ def test_the_choice_has_the_errors_of_its_structure_and_of_its_best_prior(monkey
     choice = selection.choose(grid, family, warmup=6, progress=lambda *what: said.append(what))
     errors = list(by_fold[choice.structure].values())
     assert (choice.structure.label, choice.model) == (chosen, choice.structure)
-    assert (choice.prior, choice.folds, choice.warmup) == (selection.PRIORS[4], ("a", "b", "c"), 6)
+    assert (choice.prior, choice.folds, choice.warmup) == (selection.priors_of(grid)[4], ("a", "b", "c"), 6)
     np.testing.assert_allclose(choice.errors[choice.structure], errors)
     np.testing.assert_allclose(choice.rmse, np.outer(errors, [2 * 1.5, 10 * 0.5]))
     assert choice.error == pytest.approx(np.prod(errors) ** (1 / 3))

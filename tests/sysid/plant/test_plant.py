@@ -83,6 +83,7 @@ def test_units_and_covariance_stand_in_the_text_by_name():
         ({"covariance": [1.0, 2.0]}, "covariance"),
         ({"free": ["zz"], "covariance": None}, "the model has no parameter zz"),
         ({"fitted_to": [{"name": "a"}]}, "start_s"),
+        ({"offset_memory": 0.0}, "offset_memory is 0"),
     ],
 )
 def test_what_is_not_a_plant_is_refused_in_one_line(change, says):
@@ -99,12 +100,16 @@ def test_the_ends_of_what_a_plant_may_hold_are_held(tmp_path: Path):
     assert (back.noise, back.offsets, back.nuisance) == ({"t": 1e6}, {"t": -1e6}, {"t": 0.0})
     assert back.valid == {"t": (3.0, 3.0), "q": (-1e9, np.inf)}
     assert "inputs_end_at_row" not in bare.to_dict()
+    assert "offset_memory" not in bare.to_dict()
     assert "refits" not in bare.to_dict()
     log = FitLog("a", "0" * 64, -3.0, 7.5)
-    more = replace(bare, refits=(bare.model, bare.model), inputs_end_at_row=True, fitted_to=(log,))
+    more = replace(
+        bare, refits=(bare.model, bare.model), inputs_end_at_row=True, fitted_to=(log,), offset_memory=7.5
+    )
     again = Plant.load(more.save(tmp_path / "plant.json"))
     assert (len(again.refits), again.inputs_end_at_row, again.fitted_to) == (2, True, (log,))
-    assert not Plant.from_dict(bare.to_dict()).inputs_end_at_row
+    bare = Plant.from_dict(bare.to_dict())
+    assert (again.offset_memory, bare.offset_memory, bare.inputs_end_at_row) == (7.5, np.inf, False)
     with pytest.raises(ValueError, match=f"no value for {_plants()[0].model.parameters[0]}"):
         replace(_plants()[0], values={})
 

@@ -418,6 +418,32 @@ def test_offsets_are_those_of_the_log_also_behind_a_gap():
     assert second.y_offset.tolist() == first.y_offset.tolist()
 
 
+def test_an_offset_that_fades_does_from_the_middle_of_the_warm_up_on_and_through_gaps():
+    t = 2.0 * np.arange(200)
+    y = truth(np.full(t.size - 1, 0.5)) + [0.05, 0.2]
+    y[t > 170.0, 1] = y[t > 170.0, 1] - 0.3 + 0.3 * np.exp(-(t[t > 170.0] - 15.0) / 100.0)
+    log = log_of(t, y, room=25.4).isel(time=kept(t, (121.0, 179.0)))
+    lasts, fades = plant(), plant(offset_memory=100.0)
+    stretches = cut_stretches(fades, log)
+    first, second = find_starts(fades, P, stretches, 30.0)
+    steady = find_starts(lasts, P, stretches, 30.0)[0]
+    np.testing.assert_allclose(first.y_offset, steady.y_offset)  # it is what the warm-up says in both
+    own = first.y_offset[1] + 0.1  # beside the pooled -0.1, which stays
+    for start, begins in ((first, 0.0), (second, 180.0)):
+        seconds = np.array([0.0, 30.0, 90.0])
+        left = np.exp(-np.maximum(begins + seconds - 15.0, 0.0) / 100.0)
+        np.testing.assert_allclose(
+            start.offset(seconds), np.column_stack([0.05 + 0 * left, own * left - 0.1])
+        )
+    runs = predict(fades.model, 2.0, P[None], stretches, [first, second])
+    plain = predict(lasts.model, 2.0, P[None], stretches[:1], [steady])[0]
+    lost = own * (np.exp(-np.maximum(2.0 * np.arange(plain.shape[1]) - 15.0, 0.0) / 100.0) - 1.0)
+    np.testing.assert_allclose(runs[0][0, :, 1] - plain[0, :, 1], lost, atol=1e-9)
+    # behind the gap the readings were those of the faded offset: the state needs next to no shift
+    again = find_starts(lasts, P, stretches, 30.0)[1]
+    assert abs(second.shift[1]) < abs(again.shift[1])
+
+
 def test_a_grid_that_ends_beyond_the_last_row_takes_that_from_the_gap():
     fine = np.arange(300.0)  # rows each second, steps of two: the last step before the gap is half a row long
     q = np.full(fine.size, 0.5)
