@@ -1,6 +1,6 @@
 """Black-box fits: choose a structure, fit it to all logs, resample it to see how certain it is.
 
-``arx``, ``oe``, ``subspace``, ``sindy`` and ``neural`` differ in the family of models
+``arx``, ``oe``, ``bj``, ``subspace``, ``sindy`` and ``neural`` differ in the family of models
 (:class:`thermogrip.sysid.blackbox.order_selection.Family`); averaging, the choice by held-out free run and
 what the plant keeps are the same for all.  Where the averaging is not prescribed, both the averaged rate and
 the logs' own are tried: a coarse converter calls for the former, a delay for the latter.
@@ -36,6 +36,7 @@ import numpy as np
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log
 from thermogrip.sysid.blackbox.arx import arx_family
+from thermogrip.sysid.blackbox.box_jenkins import bj_family
 from thermogrip.sysid.blackbox.neural import neural_family
 from thermogrip.sysid.blackbox.order_selection import (
     Choice,
@@ -57,18 +58,21 @@ from thermogrip.sysid.plant.simulation import READING_EVERY
 FAMILIES: dict[str, Family] = {
     "arx": arx_family,
     "oe": oe_family,
+    "bj": bj_family,
     "subspace": subspace_family,
     "sindy": sindy_family,
     "neural": neural_family,
 }
 BLACK_BOXES = tuple(FAMILIES)
-RESAMPLED = ("arx", "oe", "subspace", "sindy")  # a refit of a neural model takes as long as its fit
+RESAMPLED = ("arx", "oe", "bj", "subspace", "sindy")  # a refit of a neural model takes as long as its fit
 
 _FIXED = {  # what a kind calls its order or delay
     ("arx", "order"): "poles",
     ("arx", "delay"): "delays",
     ("oe", "order"): "poles",
     ("oe", "delay"): "delays",
+    ("bj", "order"): "poles",
+    ("bj", "delay"): "delays",
     ("subspace", "order"): "orders",
 }
 _MOST_FIXED = 20  # more poles, or steps of delay, than any record determines
@@ -107,16 +111,16 @@ def fit_black_box(
 
     Parameters
     ----------
-    kind : {"arx", "oe", "subspace", "sindy", "neural"}
+    kind : {"arx", "oe", "bj", "subspace", "sindy", "neural"}
     logs : sequence of Log
     inputs, outputs, disturbances : sequence of str, optional
         Names of the signals; by role where absent.
     average : float, optional
         Step [s]; both the chosen and the logs' own are tried where absent.
     order : int, optional
-        Poles of each output of ``arx`` and ``oe``, states of ``subspace``; searched where absent.
+        Poles of each output of ``arx``, ``oe`` and ``bj``, states of ``subspace``; searched where absent.
     delay : int, optional
-        Steps of the model from an input to its effect, of ``arx`` and ``oe``; searched where absent.
+        Steps of the model from an input to its effect, of ``arx``, ``oe`` and ``bj``; searched where absent.
     warmup : float, optional
         Seconds whose readings set the state of a held-out stretch; 5 s for whole logs (they begin at rest),
         50 samples for stretches cut out of a log, where absent.
@@ -299,4 +303,5 @@ def _plant(grid: Grid, choice: Choice, logs: Sequence[Log]) -> Plant:
         scores=scores,
         fitted_to=fit_logs(logs),
         inputs_end_at_row=grid.ends,
+        offset_memory=prior.memory,
     )

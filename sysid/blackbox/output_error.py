@@ -80,6 +80,11 @@ class Records:
         """Number of drives."""
         return int(self.w[0].shape[1])
 
+    def filtered(self, D: Array) -> Records:
+        """Return readings and drives filtered by the polynomial D(q), without the rows that lack a past."""
+        w = [lfilter(D, [1.0], drive, axis=0)[len(D) - 1 :] for drive in self.w]
+        return Records([lfilter(D, [1.0], y)[len(D) - 1 :] for y in self.y], w)
+
 
 @dataclass(frozen=True, eq=False)
 class Solution:
@@ -198,6 +203,29 @@ def arx_start(records: Records, na: int, nb: int, delay: int) -> Array | None:
     return a if _stable(a) else None
 
 
+def fit_rest(found: Filter, records: Records) -> tuple[Filter, list[Array]]:
+    """Return the filter with constant and initial conditions fitted again, and the errors left."""
+    a, (n_drive, nb) = found.a, found.b.shape
+    na, end = len(a), n_drive * nb
+    tests = np.zeros((2, records.longest))
+    tests[0, 0], tests[1] = 1.0, 1.0
+    impulse, step = lfilter([1.0], np.append(1.0, a), tests, axis=1)
+    columns, right = [], []
+    for at, known in enumerate(records.known):
+        X = _columns(a, records, at, nb, found.delay, impulse, step)
+        own = np.zeros((1 + na * len(records.y), len(known)))
+        own[0], own[1 + at * na : 1 + (at + 1) * na] = X[end], X[end + 1 :]
+        columns.append(own)
+        right.append(np.where(known, records.y[at], 0.0) - found.b.reshape(-1) @ X[:end])
+    size = np.maximum(np.sqrt(sum(np.sum(own**2, axis=1) for own in columns)), 1e-12)
+    gram = sum(own @ own.T for own in columns) / size / size[:, None]
+    slope = sum(own @ part for own, part in zip(columns, right)) / size
+    rest = np.linalg.lstsq(gram, slope, rcond=1e-13)[0] / size
+    first = rest[1:].reshape(len(records.y), na)
+    misses = [part - rest @ own for own, part in zip(columns, right)]
+    return Filter(a, found.b, float(rest[0]), found.delay, first), misses
+
+
 def real_pole_starts(records: Records, na: int) -> list[Array]:
     """Return denominators of real poles with time constants tau, tau / 4, ... for several tau [rows]."""
     return [_real_poles(tau, na) for tau in np.geomspace(3.0, max(records.longest / 3, 4.0), 6)]
@@ -258,7 +286,7 @@ def oe_family(
 ) -> Mapping[Structure, StateSpaceModel]:
     """Return an output-error model for each structure that has a stable one."""
     out = {}
-    searches = [_Search() for _ in grid.outputs]
+    searches = [Search() for _ in grid.outputs]
     # magnitudes and signed squares, never products with a switch that moves in one log alone
     for some in default_terms(grid, switched=False) if terms is None else terms:
         w = drives(grid, some)
@@ -315,7 +343,7 @@ def _first_states(filters: Sequence[Filter], held: Array, segment: int) -> Array
     return np.concatenate(out)
 
 
-class _Search:
+class Search:
     """Fits one output, structure by structure, and remembers the denominators that it found."""
 
     def __init__(self) -> None:

@@ -46,8 +46,8 @@ if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation import Band, FreeRun
 
-MODELS = ("arx", "oe", "subspace", "sindy", "neural", "network")
-ALL_MODELS = ",".join(MODELS)
+MODELS = ("arx", "oe", "bj", "subspace", "sindy", "neural", "network")
+USUAL_MODELS = ",".join(model for model in MODELS if model != "bj")
 DEFAULT_NETWORK = "gripper"  # of --grow
 NO_POSTERIOR = "no posterior: the model that was kept is a black box, only networks have parameters to sample"
 
@@ -90,14 +90,15 @@ def identify(
     columns: Columns = None,
     dt: Step = None,
     models: Annotated[
-        str, option("--models", "LIST", "Which candidate models to fit.", _known_models)
-    ] = ALL_MODELS,
+        str, option("--models", "LIST", "Which candidate models to fit, of these and bj.", _known_models)
+    ] = USUAL_MODELS,
     average: Average = None,
     order: Annotated[
-        int | None, option("--order", "N", "Poles of ARX and OE, states of subspace models.", min=1, max=20)
+        int | None,
+        option("--order", "N", "Poles of ARX, OE and BJ, states of subspace models.", min=1, max=20),
     ] = None,
     delay: Annotated[
-        int | None, option("--delay", "N", "Delay of ARX and OE, in steps of the model.", min=1, max=20)
+        int | None, option("--delay", "N", "Delay of ARX, OE and BJ, in steps of the model.", min=1, max=20)
     ] = None,
     leave_one_out: Annotated[bool, flag("--leave-one-out", "Score each log by a fit to the others.")] = False,
     grow: Annotated[

@@ -1,0 +1,108 @@
+"""Box-Jenkins models: output-error models whose noise is autoregressive.
+
+    y = G(q) w + v,    D(q) v = e,    D(q) = 1 + d_1 q^-1 + ... + d_p q^-p,
+
+with the filter G of :mod:`thermogrip.sysid.blackbox.output_error` and white e.  Least squares of the free run
+count every row as a reading of its own; where a disturbance lasts for many rows they are not, and the slow
+part of the response is fitted to the disturbance.  The likeliest G minimises the sum of e^2 instead, which is
+the output-error fit of D y to D w.  D follows from the residuals of such a fit by the Yule-Walker equations,
+its order by the Bayesian information criterion, so both are fitted in turn (generalised least squares,
+[1]_ chapter 7).  One D an output serves all structures: it is that of the largest one.
+
+The plant keeps G alone: noise is not simulated.  So c and the initial conditions, which D nearly removes
+where the noise is slow, are fitted to the readings themselves.
+
+References
+----------
+.. [1] T. Soederstroem and P. Stoica, System Identification (Prentice Hall, 1989).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_toeplitz
+
+from thermogrip.datasets.arrays import Array
+from thermogrip.sysid.blackbox.order_selection import Structure, default_terms, drives
+from thermogrip.sysid.blackbox.output_error import (
+    Filter,
+    Records,
+    Search,
+    assemble,
+    fit_rest,
+    refine,
+    solve,
+)
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.log_grid import Grid
+
+MOST_LAGS = 3  # of D
+ROUNDS = 2
+
+
+def bj_family(
+    grid: Grid,
+    *,
+    poles: Sequence[int] = (1, 2, 3),
+    zeros: Sequence[int] = (1, 2),
+    delays: Sequence[int] = (1, 2, 3),
+    terms: Sequence[tuple[str, ...]] | None = None,
+    only: Structure | None = None,
+) -> Mapping[Structure, StateSpaceModel]:
+    """Return a Box-Jenkins model for each structure that has a stable one."""
+    out = {}
+    searches = [Search() for _ in grid.outputs]
+    for some in default_terms(grid, switched=False) if terms is None else terms:
+        w = drives(grid, some)
+        records = [Records([s.y[:, i] for s in grid.segments], w) for i in range(len(grid.outputs))]
+        for na, nb, nk in product(poles, zeros, delays):
+            label = f"na {na}, nb {nb}, delay {nk}" + (f", with {', '.join(some)}" if some else "")
+            structure = Structure(label, (na + w[0].shape[1] * nb + 2) * len(grid.outputs))
+            if only not in (None, structure):
+                continue
+            found = [search(part, na, nb, nk) for search, part in zip(searches, records)]
+            filters = [with_noise(each, part) for each, part in zip(found, records) if each is not None]
+            if len(filters) == len(found):
+                out[structure] = assemble(grid, filters, some, origin="bj")
+    return out
+
+
+def with_noise(found: Filter, records: Records) -> Filter:
+    """Return the filter fitted again with autoregressive noise; as it is where its errors are white."""
+    nb, rows = found.b.shape[1], sum(int(known.sum()) for known in records.known)
+    found, misses = fit_rest(found, records)
+    for _ in range(ROUNDS):
+        D = autoregression(misses, records.known)
+        if len(D) == 1 or min(map(len, records.y)) < 2 * len(D):
+            break
+        white = records.filtered(D)
+        whole = sum(int(known.sum()) for known in white.known)
+        start = solve(found.a, white, nb, found.delay) if whole > rows / 2 else None  # few were lost
+        if start is None:
+            break
+        better = refine(start, white, nb, found.delay).filter(white, nb, found.delay)
+        found, misses = fit_rest(better, records)
+    return found
+
+
+def autoregression(errors: Sequence[Array], known: Sequence[NDArray[np.bool_]]) -> Array:
+    """Return 1, d_1 ... d_p of errors, segment by segment; those that are not known are 0."""
+    lags = range(MOST_LAGS + 1)
+    pairs = [sum(int(np.sum(k[: len(k) - lag] & k[lag:])) for k in known) for lag in lags]
+    sums = [sum(float(e[: len(e) - lag] @ e[lag:]) for e in errors) for lag in lags]
+    r, n = np.array(sums) / np.maximum(pairs, 1), pairs[0]
+    best, D = 0.0, np.ones(1)
+    for p in lags[1:] if r[0] > 0 else ():
+        # a trace more variance: errors that are all alike have a singular matrix
+        d = solve_toeplitz(np.append((1 + 1e-9) * r[0], r[1:p]), r[1 : p + 1])
+        left = 1.0 - float(d @ r[1 : p + 1]) / r[0]
+        if left <= 0.0:  # covariances of a record with gaps need not be those of any process
+            break
+        criterion = np.log(left) + p * np.log(n) / n
+        if criterion < best:
+            best, D = criterion, np.append(1.0, -d)
+    return D
