@@ -451,3 +451,17 @@ def test_classes_are_as_far_apart_as_scatter_noise_and_temperature_leave_them(ma
         expected = np.sqrt(step @ np.linalg.solve(np.cov(x.T), step))
         assert model.separation(noise, gap)[0, 1] == pytest.approx(expected, rel=0.02)
     assert (np.diag(model.separation(noise, 5.0)) == 0).all()
+
+
+def test_a_grasp_counts_for_a_sensor_by_its_own_difference() -> None:
+    """The second is 20 K from half of the objects and 0.05 K from the others, where noise is all it reads."""
+    rng, at = np.random.default_rng(0), np.repeat([0, 1], 20)
+    gain = np.column_stack([np.full(40, 20.0), np.tile([20.0, 0.05], 20)])
+    y = gain * np.array([[0.6, 0.3], [0.2, 0.1]])[at] + 0.05 * rng.standard_normal((40, 2))
+    noise = np.tile(0.05**2 * np.eye(2), (40, 1, 1))
+    model = BayesClassifier(shrinkage=3.0)
+    model.reader_ = FeatureReader(["change_2s", "second_change_2s"], True, 10.0)
+    model.classes_ = np.array(["x", "y"])
+    model._fit_density(Readings(y, gain, noise, np.full(40, 0.01), gain[:, 0]), at)
+    np.testing.assert_allclose(model.marginals()[0], [[0.6, 0.3], [0.2, 0.1]], atol=0.01)
+    assert model.scale_.max() < 0.05  # noise over 0.05 K has an sd of 1
