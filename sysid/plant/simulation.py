@@ -63,7 +63,9 @@ class Start:
     warm: float = 0.0  # middle of the warm-up, after which it fades, in seconds of this stretch
 
     def offset(self, time: Array) -> Array:
-        """Return the offset (n, n_y) at seconds ``time`` of the stretch."""
+        """Return the offset (n, n_y) at seconds ``time`` of the stretch; (n_y,) of one that lasts."""
+        if np.isinf(self.memory):
+            return self.y_offset
         lost = -np.expm1(-np.maximum(time - self.warm, 0.0) / self.memory)
         return np.asarray(self.y_offset - self.fading * lost[:, None])
 
