@@ -362,8 +362,8 @@ class BayesClassifier(GraspClassifier):
         return self.open_set_log_proba(X, self.asked(candidates))[1]
 
     def _log_density(self, grasps: Grasps) -> Floats:
-        """Return the log density of each grasp under each class, and last under a material that is none of
-        them, (n_grasp, n_class + 1)."""
+        """Return the log density of each grasp under each class, and last under an unknown material,
+        (n_grasp, n_class + 1)."""
         read = self.reader_.read(grasps)
         unknown = np.isnan(read.difference)
         wide = (unknown | (read.t_object_sd > _WIDE)) & self.reader_.normalise

@@ -19,56 +19,18 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from itertools import product
+from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_toeplitz
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.sysid.blackbox.order_selection import Structure, default_terms, drives
-from thermogrip.sysid.blackbox.output_error import (
-    Filter,
-    Records,
-    Search,
-    assemble,
-    fit_rest,
-    refine,
-    solve,
-)
-from thermogrip.sysid.models.state_space import StateSpaceModel
-from thermogrip.sysid.plant.log_grid import Grid
+from thermogrip.sysid.blackbox.output_error import Filter, Records, fit_rest, oe_family, refine, solve
 
 MOST_LAGS = 3  # of D
 ROUNDS = 2
-
-
-def bj_family(
-    grid: Grid,
-    *,
-    poles: Sequence[int] = (1, 2, 3),
-    zeros: Sequence[int] = (1, 2),
-    delays: Sequence[int] = (1, 2, 3),
-    terms: Sequence[tuple[str, ...]] | None = None,
-    only: Structure | None = None,
-) -> Mapping[Structure, StateSpaceModel]:
-    """Return a Box-Jenkins model for each structure that has a stable one."""
-    out = {}
-    searches = [Search() for _ in grid.outputs]
-    for some in default_terms(grid, switched=False) if terms is None else terms:
-        w = drives(grid, some)
-        records = [Records([s.y[:, i] for s in grid.segments], w) for i in range(len(grid.outputs))]
-        for na, nb, nk in product(poles, zeros, delays):
-            label = f"na {na}, nb {nb}, delay {nk}" + (f", with {', '.join(some)}" if some else "")
-            structure = Structure(label, (na + w[0].shape[1] * nb + 2) * len(grid.outputs))
-            if only not in (None, structure):
-                continue
-            found = [search(part, na, nb, nk) for search, part in zip(searches, records)]
-            filters = [with_noise(each, part) for each, part in zip(found, records) if each is not None]
-            if len(filters) == len(found):
-                out[structure] = assemble(grid, filters, some, origin="bj")
-    return out
 
 
 def with_noise(found: Filter, records: Records) -> Filter:
@@ -106,3 +68,6 @@ def autoregression(errors: Sequence[Array], known: Sequence[NDArray[np.bool_]]) 
         if criterion < best:
             best, D = criterion, np.append(1.0, -d)
     return D
+
+
+bj_family = partial(oe_family, with_noise=with_noise)

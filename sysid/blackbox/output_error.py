@@ -30,7 +30,7 @@ and the best of them is refined: a denominator that suits one delay is a few ste
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -283,9 +283,13 @@ def oe_family(
     delays: Sequence[int] = (1, 2, 3),
     terms: Sequence[tuple[str, ...]] | None = None,
     only: Structure | None = None,
+    with_noise: Callable[[Filter, Records], Filter] | None = None,
 ) -> Mapping[Structure, StateSpaceModel]:
-    """Return an output-error model for each structure that has a stable one."""
-    out = {}
+    """Return an output-error model for each structure that has a stable one.
+
+    ``with_noise`` fits a filter again with a model of its noise.
+    """
+    out, numbers = {}, 2 if with_noise else 1  # beside poles and zeros: the constant, the noise
     searches = [Search() for _ in grid.outputs]
     # magnitudes and signed squares, never products with a switch that moves in one log alone
     for some in default_terms(grid, switched=False) if terms is None else terms:
@@ -293,13 +297,14 @@ def oe_family(
         records = [Records([s.y[:, i] for s in grid.segments], w) for i in range(len(grid.outputs))]
         for na, nb, nk in product(poles, zeros, delays):
             label = f"na {na}, nb {nb}, delay {nk}" + (f", with {', '.join(some)}" if some else "")
-            structure = Structure(label, (na + w[0].shape[1] * nb + 1) * len(grid.outputs))
+            structure = Structure(label, (na + w[0].shape[1] * nb + numbers) * len(grid.outputs))
             if only not in (None, structure):
                 continue
             found = [search(part, na, nb, nk) for search, part in zip(searches, records)]
-            filters = [each for each in found if each is not None]
-            if len(filters) == len(found):
-                out[structure] = assemble(grid, filters, some, origin="oe")
+            fits = [(each, part) for each, part in zip(found, records) if each is not None]
+            if len(fits) == len(found):
+                filters = [with_noise(*fit) if with_noise else fit[0] for fit in fits]
+                out[structure] = assemble(grid, filters, some, origin="bj" if with_noise else "oe")
     return out
 
 
