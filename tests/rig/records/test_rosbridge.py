@@ -146,7 +146,7 @@ def test_a_server_that_starts_again_is_found_again_and_gets_what_it_missed(
     monkeypatch.setattr(Bridge, "_connect", lambda bridge: (tried.append(clock()), connect(bridge))[1])
     with Bridge(server.url, clock=lambda: 0.0, behind=kept, monotonic=clock) as bridge:
         bridge.sample({"time_s": 0.0, "drive": 0.5})
-        assert wait_for(lambda: server.heard)
+        assert wait_for(lambda: server.reported("drive"))
         server.close()
         assert wait_for(lambda: bridge.reports)
         for k in range(1500):
