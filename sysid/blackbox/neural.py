@@ -49,6 +49,7 @@ STANDS = 8  # rows in a row at the end of the range make a saturation level
 MANY = 2500  # readings: beyond it fewer starts
 BEYOND = 1.25  # of the drives' reach in the data: further out they are clipped
 SLOWEST = 0.9995  # largest pole of the linear part
+ALIKE = 1e6  # condition of C: beyond it outputs are combinations of others, and cannot be states
 ITERATIONS = 30
 KEPT = 0.75  # of the members that fit best, and of those that agree best
 TOGETHER = 4  # times as many members of all sizes in the last fit as in the folds
@@ -188,7 +189,8 @@ def _linear_starts(grid: Grid, data: _Data, orders: Sequence[int]) -> dict[int, 
     """Return for each order the stable subspace model with the least free-run error on its own data."""
     best: dict[int, tuple[float, StateSpaceModel]] = {}
     for model in subspace_family(grid, orders=orders, terms=((),)).values():
-        if np.abs(model.poles()).max() > SLOWEST:
+        alike = np.linalg.cond(model.C / data.y_size[:, None]) > ALIKE
+        if alike or np.abs(model.poles()).max() > SLOWEST:
             continue
         total = 0.0
         for segment in grid.segments:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -210,6 +211,15 @@ def test_linear_starts_run_as_the_best_subspace_model_in_scaled_units(coupled):
                 x = linear.A @ x + linear.B @ row + linear.c
             np.testing.assert_allclose(seen, (run - data.y_middle) / data.y_size, atol=1e-6)
     assert list(starts) == [2, 3]
+
+
+def test_outputs_that_are_sums_of_others_are_no_states_to_start_from(coupled):
+    grid = make_grid([coupled.log(300, seed=1, reading=0.05)], average=1.0)
+    part = grid.segments[0]
+    three = np.column_stack([part.y, part.y @ [1.0, -1.0]])  # a PID log's error beside what it was taken of
+    twice = replace(grid, outputs=(*grid.outputs, "error"), segments=(replace(part, y=three),))
+    assert list(neural._linear_starts(grid, neural._scaled(grid), [2, 3, 4])) == [2, 3, 4]
+    assert not neural._linear_starts(twice, neural._scaled(twice), [3, 4, 5])
 
 
 def test_members_of_two_sizes_are_one_model_in_the_units_of_the_readings():
