@@ -20,9 +20,11 @@ column j is the gain in the Bayesian information criterion,
 RSS_j of j on its own past, RSS_ij with that of i beside it (Granger 1969); beyond 10, with 2 lags and with 6
 (of a smooth input few leave what its output contains of it), it counts.
 
-A column that is computed from others is neither: a copy in another unit, or what is left between a set point
-and a reading.  A unit alone is a weak sign of an input: where some inputs are held, a column of volts that
-moves in every row is a reading.
+A column that is computed from others is neither: a copy in another unit or on another scale (counts of a
+converter), or what is left between a set point and a reading.  Where some inputs are held, a column that
+moves in every row is none of them: not by a unit alone, and not because nothing predicts it.  Such a column
+is an output where its values lie as those of one (a second sensor), else a disturbance.  Beside a set point
+``input`` and ``output`` are a controller's, the reading and the drive.
 """
 
 from __future__ import annotations
@@ -71,7 +73,8 @@ _SETPOINT = re.compile(
 _SET_DRIVE = re.compile(r"^set(_.*|\d*)$|_set$|^(goal|desired)")  # set_percent is what a drive is set to
 _OF_DRIVES = ("percent", "V", "A", "W", "0_255")
 _AMBIENT = re.compile(
-    r"ambient|(^|_)(amb|room|outside|outdoors?|sol|weather|wind)(_|$)|solar|irradia|^(to|te|text|toa|ghi)$"
+    r"ambient|(^|_)(amb|room|outside|outdoors?|sol|weather|wind|cloud|rain|dew)(_|$)|solar|irradia"
+    r"|^(to|te|text|toa|oat|ghi)$"
 )
 _INPUT = re.compile(
     r"^(drive|pump|pwm|duty|heater|heating|cooler|cooling|peltier|tec|valve|fan|flow|cmd|command|power|input"
@@ -91,6 +94,9 @@ _HELD_SHARE, _HELD_SIZE = 0.5, 0.05  # of rows with a move; of the range that it
 _FEW = 20  # rows: too few to distinguish chance from rule
 _COUNTS = 0.9  # of the rows have the same step
 _SHOWS = 5  # moves of two columns, by which they may be copies
+_TURNS = 20  # of a column's course, without which two that rise together look like copies
+_COARSE = 0.03  # of a column's standard deviation: coarser steps hide what a second sensor reads
+_SHARED = 1 / 3  # of the wider one of two ranges: two sensors of one plant
 _EXACT, _ROUNDED = 1e-6, 0.05  # of a column's range; of its standard deviation, that rounding takes at most
 _LAGS, _STRONG, _MOST_ROWS = (2, 6), 10.0, 20_000
 
@@ -243,11 +249,20 @@ def roles_of_data(
         help_ = gain[:, names.index(name)]
         if help_.max() > _STRONG:
             out[name] = "output", f"its course follows {names[int(help_.argmax())]}"
-        else:
-            why = "no other column predicts its course"
-            out[name] = ("disturbance" if units[name] == "degC" else "input"), why
     roles |= {name: role for name, (role, _) in out.items()}
-    if open_ and "input" not in roles.values():
+    held = next((n for n in columns if roles.get(n) == "input" and _is_held(columns[n])), None)
+    read = [n for n in columns if roles.get(n) == "output"]
+    for name in [n for n in open_ if n not in roles]:
+        why = "no other column predicts its course"
+        out[name] = ("disturbance" if held or units[name] == "degC" else "input"), why
+        like = next((n for n in read if held and _overlap(columns[name], columns[n]) >= _SHARED), None)
+        if like is not None:
+            out[name] = "output", f"its values lie as those of {like}"
+    roles |= {name: role for name, (role, _) in out.items()}
+    clear = {role for name, role in roles.items() if name not in open_}
+    if len(open_) == 1 and "disturbance" in clear and "output" not in clear:
+        roles[open_[0]], out[open_[0]] = "output", ("output", "there is nothing else to predict")
+    elif open_ and "input" not in roles.values():
         lead = dict(zip(names, gain.sum(axis=1)))
         for name in [n for n in open_ if net[n] > 0] or [max(open_, key=lambda n: lead[n])]:
             more = "it predicts the others more than they predict it"
@@ -269,6 +284,12 @@ def _is_held(values: NDArray[np.float64]) -> bool:
     moves = np.abs(np.diff(known))
     held = 0 < np.count_nonzero(moves) <= _HELD_SHARE * known.size
     return bool(held and np.median(moves[moves > 0]) >= _HELD_SIZE * np.ptp(known))
+
+
+def _overlap(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    """Return the share of the wider range of two columns that both have."""
+    low, high = np.nanmin([one, other], axis=1), np.nanmax([one, other], axis=1)
+    return float((high.min() - low.max()) / (high - low).max())
 
 
 def _unlike_inputs(
@@ -304,7 +325,8 @@ def _computed(
         if name not in guessed:
             continue
         kept = [n for n in order[:at] if n not in out]
-        of = next((n for n in kept if _explains(shown[name], shown[n])), None)
+        own = shown[name]
+        of = next((n for n in kept if _explains(own, shown[n]) or _rescaled(own, shown[n])), None)
         if of is not None:
             out[name] = "other", f"it is {of} in another unit"
             continue
@@ -329,6 +351,19 @@ def _explains(y: NDArray[np.float64], *some: NDArray[np.float64]) -> bool:
         if np.abs(left).max() > least or left.std() > _ROUNDED * y.std():
             return False
     return True
+
+
+def _rescaled(*pair: NDArray[np.float64]) -> bool:
+    """Tell whether two columns that often turn rise or fall with each other, but for fine rounding."""
+    exact, fine = [], []
+    for y, x in (pair, pair[::-1]):
+        moves = np.diff(y)[np.diff(y) != 0]
+        if np.count_nonzero(np.diff(np.sign(moves))) < _TURNS:
+            return False
+        in_order, least = y[np.argsort(x, kind="stable")], (1 + _EXACT) * np.abs(moves).min()
+        exact.append(min((np.maximum.accumulate(s) - s).max() for s in (in_order, -in_order)) <= least)
+        fine.append(exact[-1] and least <= _COARSE * y.std())
+    return all(exact) or any(fine)
 
 
 def _predictive_gain(columns: Sequence[NDArray[np.float64]], lags: int) -> NDArray[np.float64]:
@@ -385,6 +420,11 @@ def assign_roles(
     if columns is not None and all(len(values) >= _FEW for values in columns.values()):
         guesses |= _computed(columns, {n: why != NO_CLUE for n, (_, why) in guesses.items()})
         guesses |= _unlike_inputs(columns, guesses, [n for n, role in stated.items() if role == "input"])
+    by_name = {name.lower(): name for name in guesses}
+    if {"input", "output"} <= by_name.keys() and any(_SETPOINT.search(name.lower()) for name in units):
+        why = "beside a set point it is the controller's:"
+        guesses[by_name["input"]] = "output", f"{why} what it reads"
+        guesses[by_name["output"]] = "input", f"{why} what it drives"
     fixed = {name: role for name, (role, why) in guesses.items() if why != NO_CLUE} | stated
     if columns is not None and not {"input", "output"} <= {*fixed.values()}:
         guesses |= roles_of_data(columns, units, fixed)

@@ -289,15 +289,41 @@ def test_a_controller_s_output_is_an_input_though_its_reading_predicts_it(gain, 
 
 
 def test_names_go_first_and_data_are_asked_where_these_show_no_input_or_no_output():
-    columns = {"a": HELD, "t_x": plant_of(HELD), "b": NOISY}
+    columns = {"a": HELD, "t_x": plant_of(HELD), "b": 50 + NOISY}
     units = {"a": "1", "t_x": "degC", "b": "1"}
     roles, reasons = assign_roles(units, columns=columns)
-    assert roles == {"a": "input", "t_x": "output", "b": "input"}
+    assert roles == {"a": "input", "t_x": "output", "b": "disturbance"}  # a is held, b moves in every row
     assert reasons["a"].startswith("it is held between ")
     assert reasons["t_x"] == "its name is that of a reading"
     assert assign_roles(units, columns=columns, inputs=["b"])[0]["a"] == "other"
     named = {"q1": HELD, "t_x": plant_of(HELD), "b": NOISY}
     assert assign_roles({"q1": "1", "t_x": "degC", "b": "1"}, columns=named)[0]["b"] == "other"
+
+
+def test_beside_held_inputs_a_second_sensor_is_read_and_the_rest_is_a_disturbance():
+    slow = 20 + 30 * plant_of(HELD)
+    walk, room = np.cumsum(np.random.default_rng(8).standard_normal((2, 600)), axis=1)
+    columns = {"c2": HELD, "c4": slow, "c5": 25 + 80 * walk / np.ptp(walk), "c6": 22 + room / np.ptp(room)}
+    roles, reasons = assign_roles(dict.fromkeys(columns, "1"), columns=columns)
+    assert roles == {"c2": "input", "c4": "output", "c5": "output", "c6": "disturbance"}
+    assert reasons["c5"] == "its values lie as those of c4"
+
+
+def test_beside_a_set_point_input_and_output_are_the_controllers():
+    goal, pwm = np.repeat([30.0, 60.0], 300), 100 + 10 * NOISY
+    columns = {"set": goal, "input": 20 + 5 * plant_of(HELD), "output": pwm}
+    units = dict.fromkeys(columns, "1")
+    roles = assign_roles(units, columns=columns)[0]
+    assert roles == {"set": "other", "input": "output", "output": "input"}
+    assert assign_roles(units, columns=columns, inputs=["input"])[0]["input"] == "input"
+    del units["set"], columns["set"]
+    assert assign_roles(units, columns=columns)[0]["input"] == "input"
+
+
+def test_one_column_beside_the_weather_is_the_output():
+    columns = {"oat": ROOM, "meter": 2 * NOISY}
+    roles = assign_roles({"oat": "1", "meter": "W"}, columns=columns)[0]
+    assert roles == {"oat": "disturbance", "meter": "output"}
 
 
 READING = np.round(4 * (20 + 5 * plant_of(HELD, noise=0.02))) / 4  # degC, a converter of 0.25
@@ -314,6 +340,10 @@ GOAL = np.repeat([30.0, 60.0], 300)
           "dev": ("1", np.trunc(GOAL - READING))},
          "input output other other", "it is computed from setpoint and t_a"),
         ({"u": ("1", HELD), "t_a": ("degC", READING), "raw": ("1", 100 - 2.5 * READING)},
+         "input output other", "it is t_a in another unit"),
+        ({"u": ("1", HELD), "t_a": ("degC", READING), "adc": ("1", np.rint(9e3 * np.exp(0.01 * READING)))},
+         "input output other", "it is t_a in another unit"),
+        ({"u": ("1", HELD), "t_a": ("degC", np.round(READING + NOISY, 2)), "r": ("1", 9 / (READING + NOISY))},
          "input output other", "it is t_a in another unit"),
         ({"u": ("1", HELD), "t_a": ("degC", READING), "t_f": ("degC", 1.8 * READING + 32)},
          "input output other", "it is t_a in another unit"),
