@@ -250,8 +250,8 @@ def roles_of_data(
         if help_.max() > _STRONG:
             out[name] = "output", f"its course follows {names[int(help_.argmax())]}"
     roles |= {name: role for name, (role, _) in out.items()}
-    held = next((n for n in columns if roles.get(n) == "input" and _is_held(columns[n])), None)
-    read = [n for n in columns if roles.get(n) == "output"]
+    held = next((n for n in names if roles.get(n) == "input" and _is_held(columns[n])), None)
+    read = [n for n in names if roles.get(n) == "output"]
     for name in [n for n in open_ if n not in roles]:
         why = "no other column predicts its course"
         out[name] = ("disturbance" if held or units[name] == "degC" else "input"), why
@@ -316,9 +316,7 @@ def _computed(
     ``guessed``: name -> whether a clue says what the column is, for those whose role is no user's; of two
     copies the one with a clue, else the first, stays.
     """
-    # what is beyond all use is no reading, and its squares are none either
-    useful = {n: v for n, v in columns.items() if (np.abs(v) <= MOST_NUMBER).all()}
-    shown = {n: v[:_MOST_ROWS] for n, v in useful.items() if np.ptp(v) > 0}
+    shown = {n: v[:_MOST_ROWS] for n, v in columns.items() if np.ptp(v) > 0}  # of lost values none
     out: dict[str, tuple[str, str]] = {}
     order = sorted(shown, key=lambda n: (n in guessed) + (not guessed.get(n, True)))
     for at, name in enumerate(order):
@@ -417,6 +415,8 @@ def assign_roles(
             chosen[name] = role
     stated = (given or {}) | chosen
     guesses = {n: explain_role(n, unit) for n, unit in units.items() if n not in stated}
+    if columns is not None:  # what is beyond all use is no reading, and its squares are none either
+        columns = {n: np.where(np.abs(v) <= MOST_NUMBER, v, np.nan) for n, v in columns.items()}
     if columns is not None and all(len(values) >= _FEW for values in columns.values()):
         guesses |= _computed(columns, {n: why != NO_CLUE for n, (_, why) in guesses.items()})
         guesses |= _unlike_inputs(columns, guesses, [n for n, role in stated.items() if role == "input"])

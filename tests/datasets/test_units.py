@@ -326,6 +326,12 @@ def test_one_column_beside_the_weather_is_the_output():
     assert roles == {"oat": "disturbance", "meter": "output"}
 
 
+def test_columns_beyond_all_use_have_no_role_and_overflow_nothing():
+    columns = {"u": HELD, "a": 8.988e307 * np.sign(NOISY), "b": plant_of(HELD)}
+    roles = assign_roles(dict.fromkeys("uab", "1"), columns=columns)[0]
+    assert roles == {"u": "input", "a": "other", "b": "output"}
+
+
 READING = np.round(4 * (20 + 5 * plant_of(HELD, noise=0.02))) / 4  # degC, a converter of 0.25
 GOAL = np.repeat([30.0, 60.0], 300)
 
