@@ -17,10 +17,16 @@ never colder) is in no refit.  The structure is not chosen again: held-out free 
 A refit whose blocks lack what one direction needs does not agree with the logs: refits whose free run over
 all logs errs more than 1.5 times as much as that of the fit are rejected.
 
+A plant much slower than a block cannot be refitted to blocks, nor one whose logs have few.  Then the readings
+are drawn, not the blocks: the free run of the fit plus its error times a random course w (dependent wild
+bootstrap [2]_) of mean 0, variance 1 and the correlation exp(-(t - s)^2 / l^2), l half a block.  That keeps
+inputs, lengths and starts, and the errors' size and correlation where they were.
+
 References
 ----------
 .. [1] H. R. Kuensch, "The jackknife and the bootstrap for general stationary observations", Annals of
    Statistics 17 (1989).
+.. [2] X. Shao, "The dependent wild bootstrap", Journal of the American Statistical Association 105 (2010).
 """
 
 from __future__ import annotations
@@ -33,6 +39,7 @@ from typing import Any
 
 import numpy as np
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log
 from thermogrip.sysid.blackbox.arx import arx_family
@@ -45,6 +52,7 @@ from thermogrip.sysid.blackbox.order_selection import (
     choose,
     excess_within_noise,
     free_run_errors,
+    free_run_misses,
 )
 from thermogrip.sysid.blackbox.output_error import oe_family
 from thermogrip.sysid.blackbox.sindy import sindy_family
@@ -80,7 +88,7 @@ _AVERAGED = ("sindy", "neural")  # fitted at the averaged rate alone
 _MAX_ROWS = 8000  # beyond it the logs' own rate is not tried beside the averaged one
 _BLOCKS, _BLOCK_ROWS = 16, 40  # blocks of the bootstrap in all, each of so many rows at least
 _FEWEST = 8  # blocks
-_TRIES = 3  # fits per draw
+_TRIES, _HOPELESS = 3, 8  # fits per draw; fits of which none agrees
 _AGREES = 1.5  # times the error of the fit
 
 
@@ -219,32 +227,53 @@ def _with_convention(
 def with_refits(
     fit: BlackBoxFit, n: int = 24, *, seed: int = 0, progress: Callable[[float, str], None] | None = None
 ) -> Plant:
-    """Return the plant with ``n`` refits to resampled blocks, for :meth:`Plant.draw`.
+    """Return the plant with ``n`` refits to resampled blocks or errors, for :meth:`Plant.draw`.
 
     Raises a UserError where the logs are too short, or too few of the refits agree with them.
     """
     if fit.kind not in RESAMPLED:
         raise ValueError(f"{fit.kind} is not refitted; choose from {', '.join(RESAMPLED)}")
-    blocks, family = cut_into_blocks(fit.grid.segments), FAMILIES[fit.kind]
-    if len(blocks) < _FEWEST:
-        problem = f"the logs are too short to be resampled: {len(blocks)} blocks of {_BLOCK_ROWS} rows"
-        raise UserError(problem, hint=f"give logs of {_FEWEST} such blocks")
+    family, blocks = FAMILIES[fit.kind], cut_into_blocks(fit.grid.segments)
     rng, most = np.random.default_rng(seed), _AGREES * _error(fit, fit.choice.model)
-    refits: list[Model] = []
-    tried = 0
-    while len(refits) < n and tried < _TRIES * n:
-        if progress is not None:
-            progress(len(refits) / n, f"{fit.kind}, refits to resampled blocks")
-        drawn = fit.grid.having([blocks[k] for k in rng.integers(len(blocks), size=len(blocks))])
-        model, tried = family(drawn, only=fit.choice.structure).get(fit.choice.structure), tried + 1
-        if model is not None and _error(fit, model) <= most:
-            refits.append(model)
-    if len(refits) < n:
-        raise UserError(
-            f"{fit.kind}: of {tried} refits to resampled blocks only {len(refits)} agree with the logs",
-            hint="a smaller structure, or longer logs",
-        )
-    return replace(fit.plant, refits=tuple(refits))
+    said = []
+    for what, draw, fewest in (("blocks", _drawn_blocks, _FEWEST), ("errors", _drawn_errors, _FEWEST // 2)):
+        if len(blocks) < fewest:
+            short = f"{len(blocks)} blocks of {_BLOCK_ROWS} rows"
+            said.append(f"the logs are too short to resample {what}: {short}")
+            continue
+        refits: list[Model] = []
+        tried = 0
+        while len(refits) < n and tried < _TRIES * n and (refits or tried < _HOPELESS):
+            if progress is not None:
+                progress(len(refits) / n, f"{fit.kind}, refits to resampled {what}")
+            drawn = fit.grid.having(draw(fit, blocks, rng))
+            model, tried = family(drawn, only=fit.choice.structure).get(fit.choice.structure), tried + 1
+            if model is not None and _error(fit, model) <= most:
+                refits.append(model)
+        if len(refits) == n:
+            return replace(fit.plant, refits=tuple(refits))
+        said.append(f"of {tried} refits to resampled {what} only {len(refits)} agree with the logs")
+    raise UserError(f"{fit.kind}: {'; '.join(said)}", hint="a smaller structure, or longer logs")
+
+
+def _drawn_blocks(fit: BlackBoxFit, blocks: Sequence[Segment], rng: np.random.Generator) -> list[Segment]:
+    return [blocks[k] for k in rng.integers(len(blocks), size=len(blocks))]
+
+
+def _drawn_errors(fit: BlackBoxFit, blocks: Sequence[Segment], rng: np.random.Generator) -> list[Segment]:
+    """Return the segments with the readings of the module's theory, of one course w for all outputs."""
+    from scipy.ndimage import gaussian_filter1d  # half a second
+
+    grid, sigma = fit.grid, max(len(block.time) for block in blocks) / 4
+    # of unit white noise: its sd after the filter, which has the square root of w's correlation
+    size = (2 * sigma * np.sqrt(np.pi)) ** -0.5
+    out = []
+    for segment, miss in zip(grid.segments, _misses(fit)):
+        pad = int(4 * sigma)
+        noise = rng.standard_normal(len(segment.time) + 2 * pad)
+        w = gaussian_filter1d(noise, sigma)[pad : pad + len(segment.time)] / size
+        out.append(replace(segment, y=segment.y + miss - miss * w[:, None]))
+    return out
 
 
 def cut_into_blocks(segments: tuple[Segment, ...]) -> list[Segment]:
@@ -260,11 +289,18 @@ def cut_into_blocks(segments: tuple[Segment, ...]) -> list[Segment]:
 
 def _error(fit: BlackBoxFit, model: Model) -> float:
     """Return the free-run error over all logs, the worst output's, in units of its spread."""
+    return float(np.max(free_run_errors(model, fit.grid.segments, **_run_settings(fit))))
+
+
+def _misses(fit: BlackBoxFit) -> list[Array]:
+    settings = _run_settings(fit)
+    return [free_run_misses(fit.choice.model, segment, **settings)[0] for segment in fit.grid.segments]
+
+
+def _run_settings(fit: BlackBoxFit) -> dict[str, Any]:
     grid, warmup = fit.grid, max(2, min(50, min(len(s.time) for s in fit.grid.segments) // 4))
     scale = np.maximum(grid.output_spread(), 1e-9)
-    prior = [fit.choice.prior]
-    errors = free_run_errors(model, grid.segments, dt=grid.dt, scale=scale, warmup=warmup, priors=prior)
-    return float(np.max(errors))
+    return {"dt": grid.dt, "scale": scale, "warmup": warmup, "priors": [fit.choice.prior]}
 
 
 def _warmup_rows(grid: Grid, warmup: float | None) -> int:

@@ -154,23 +154,30 @@ def free_run_errors(
     if not model.stable:
         return refused
     total, count = np.zeros((len(priors), len(scale))), np.zeros(len(scale))
-    memory = np.array([prior.memory for prior in priors])[:, None]
-    # the memory has no part in the start
-    shares = list(dict.fromkeys(replace(prior, memory=np.inf) for prior in priors))
-    at = [shares.index(replace(prior, memory=np.inf)) for prior in priors]
     for segment in segments:
-        head = (segment.y[:warmup], segment.u[:warmup], segment.d[:warmup])
-        x0, offset = estimate_starts(model, *head, dt=dt, scale=scale, priors=shares)
-        seen, _ = model.rollout(x0, segment.u[None], segment.d[None], (), dt)
         known = np.isfinite(segment.y[warmup:])
-        rows = np.arange(len(segment.y) - warmup) + warmup / 2  # after the middle of the warm-up
-        lasts = np.exp(-rows * dt / memory)[:, :, None]
-        miss = (seen[:, :-1] - segment.y)[at, warmup:] + offset[at, None] * lasts
+        miss = free_run_misses(model, segment, dt=dt, scale=scale, warmup=warmup, priors=priors)[:, warmup:]
         if not np.isfinite(miss[:, known]).all():
             return refused
         total += np.sum(np.where(known, miss, 0.0) ** 2, axis=1)
         count += known.sum(axis=0)
     return np.sqrt(total / count) if count.all() else refused
+
+
+def free_run_misses(
+    model: Model, segment: Segment, *, dt: float, scale: Array, warmup: int, priors: Sequence[StartPrior]
+) -> Array:
+    """Return the free run less the readings, from the start that each prior makes of the warm-up."""
+    memory = np.array([prior.memory for prior in priors])[:, None]
+    # the memory has no part in the start
+    shares = list(dict.fromkeys(replace(prior, memory=np.inf) for prior in priors))
+    at = [shares.index(replace(prior, memory=np.inf)) for prior in priors]
+    head = (segment.y[:warmup], segment.u[:warmup], segment.d[:warmup])
+    x0, offset = estimate_starts(model, *head, dt=dt, scale=scale, priors=shares)
+    seen, _ = model.rollout(x0, segment.u[None], segment.d[None], (), dt)
+    rows = np.maximum(np.arange(len(segment.y)) - warmup / 2, 0.0)  # after the middle of the warm-up
+    lasts = np.exp(-rows * dt / memory)[:, :, None]
+    return np.asarray((seen[:, :-1] - segment.y)[at] + offset[at, None] * lasts)
 
 
 def choose(

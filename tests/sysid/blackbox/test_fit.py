@@ -38,14 +38,16 @@ def fit_of(kind, log, **orders):
     return BlackBoxFit(kind, Plant(model, {}, dt=1.0), choice, grid)
 
 
+@pytest.mark.parametrize(("what", "rows"), [("_drawn_blocks", 1200), ("_drawn_errors", 600)])
 @pytest.mark.parametrize(
     ("kind", "orders"),
     [("oe", {"poles": 2, "zeros": 1, "delays": 2}), ("subspace", {"orders": 2, "rows": 15})],
 )
-def test_refits_spread_as_fits_to_new_logs_do(kind, orders):
+def test_refits_spread_as_fits_to_new_logs_do(monkeypatch, kind, orders, what, rows):
+    monkeypatch.setattr(fitting, "_drawn_blocks", getattr(fitting, what))
     fitted, spread = [], []
     for seed in range(16):
-        fit = fit_of(kind, lagged_log(seed), **orders)
+        fit = fit_of(kind, lagged_log(seed, rows), **orders)
         drawn = [plant.model for plant in map(with_refits(fit, 12, seed=seed).draw, range(1, 13))]
         fitted.append([fit.choice.model.gain()[0, 0], fit.choice.model.time_constants()[0]])
         spread.append([[m.gain()[0, 0] for m in drawn], [m.time_constants()[0] for m in drawn]])
@@ -168,12 +170,25 @@ def test_blocks_hold_every_row_once():
 
 
 def test_short_logs_are_not_resampled_and_that_is_reported():
-    log = lagged_log(0, 300, noise=0.02)
-    with pytest.raises(UserError, match="too short to be resampled: 7 blocks"):
+    log = lagged_log(0, 140, noise=0.02)
+    short = "too short to resample blocks: 3 .*; .*too short to resample errors: 3 "
+    with pytest.raises(UserError, match=short):
         with_refits(fit_black_box("arx", [log], average=1.0))
     found = identify(log, models=["arx"], average=1.0)
     assert not found.plant.uncertain
     assert any("no draws" in note for note in found.notes)
+
+
+def test_a_plant_slower_than_its_blocks_is_refitted_to_its_errors():
+    rng = np.random.default_rng(2)
+    q, e = np.repeat(rng.random(16), 50), lfilter([0.6], [1, -0.8], rng.standard_normal(800))
+    y = lfilter([0, 0.01], [1, -1.96, 0.9604], q) + 0.02 * e  # two lags of 25 s, blocks of 50 rows
+    log = make_log(np.arange(800.0), {"q": (q, "1", "input"), "t": (25 + y, "degC", "output")})
+    fit, said = fit_of("oe", log, poles=2, zeros=1, delays=1), []
+    refits = with_refits(fit, 6, progress=lambda _, what: said.append(what)).refits
+    assert len(refits) == 6
+    assert {what.rpartition(" ")[2] for what in said} == {"blocks", "errors"}
+    assert abs(np.mean([m.gain()[0, 0] for m in refits]) - 25.0) < 0.5
 
 
 def test_kinds_whose_fit_takes_long_are_refused():
@@ -322,7 +337,7 @@ def test_inputs_up_to_their_rows_are_taken_where_that_errs_clearly_less(
     assert asked == [(True, {"only": "s"}, 9 / dt), (True, None, 9 / dt)][: len(others)]
 
 
-@pytest.mark.parametrize(("agree", "n"), [(6, 6), (1, 2)])  # of the tries after the first
+@pytest.mark.parametrize(("agree", "n"), [(6, 6), (1, 2), (0, 6)])  # of the tries after the first
 def test_refits_that_err_more_than_half_as_much_again_are_left_out(monkeypatch, agree, n):
     made = []
 
@@ -333,14 +348,16 @@ def test_refits_that_err_more_than_half_as_much_again_are_left_out(monkeypatch, 
     errors = {0: 0.2, **{k: 0.3 if k <= agree + 1 else 0.301 for k in range(1, 99)}}
     monkeypatch.setitem(fitting.FAMILIES, "oe", family)
     monkeypatch.setattr(fitting, "_error", lambda fit, model: errors[model])
+    monkeypatch.setattr(fitting, "_drawn_errors", fitting._drawn_blocks)
     plant = fit_of("arx", lagged_log(0, 320), poles=1, zeros=1, delays=1, terms=()).plant
     choice = SimpleNamespace(structure="s", model=0)
     fit, said = BlackBoxFit("oe", plant, choice, stub_grid((320,))), []
     if agree < n:
-        with pytest.raises(UserError, match="oe: of 6 refits to resampled blocks only 1 agree"):
+        tried = {1: 6, 0: 8}[agree]  # as many as three a draw, or eight of which none agrees
+        with pytest.raises(UserError, match=f"oe: of {tried} refits to resampled blocks only {agree} agree"):
             with_refits(fit, n)
     else:
         found = with_refits(fit, n, progress=lambda *what: said.append(what))
         assert found.refits == tuple(range(2, n + 2))
         assert said == [(k / n, "oe, refits to resampled blocks") for k in (0, *range(n))]
-    assert (set(made), len(made)) == ({("s", 8)}, 7 if agree == n else 6)
+    assert (set(made), len(made)) == ({("s", 8)}, 7 if agree == n else 2 * tried)
