@@ -9,10 +9,13 @@ from thermogrip import lazy_exports
 
 # doors of 0.1.0, which are found and not listed
 _ALSO = {
-    "advise_touches": "decisions.next_touch",
-    "can_be_saved": "estimators.registry",
-    "join_grasps": "estimators.base",
-    "session_stop": "decisions.stopping_rule",
+    "decisions.next_touch": ("advise_touches",),
+    "decisions.predict": ("write_predictions",),
+    "decisions.stopping_rule": ("StopRule", "learn_stop_rule", "session_stop"),
+    "estimators.base": ("join_grasps",),
+    "estimators.features": ("extract_features",),
+    "estimators.lda": ("ArrayClassifier",),
+    "estimators.registry": ("can_be_saved",),
 }
 
 __all__, __getattr__, __dir__ = lazy_exports(__name__, _ALSO)

@@ -3,16 +3,11 @@ from thermogrip.classify.decisions.next_touch import choose_next_touch as choose
 from thermogrip.classify.decisions.next_touch import name_or_unknown as name_or_unknown
 from thermogrip.classify.decisions.predict import classify_grasps as classify_grasps
 from thermogrip.classify.decisions.predict import reasons as reasons
-from thermogrip.classify.decisions.predict import write_predictions as write_predictions
-from thermogrip.classify.decisions.stopping_rule import StopRule as StopRule
 from thermogrip.classify.decisions.stopping_rule import Stream as Stream
-from thermogrip.classify.decisions.stopping_rule import learn_stop_rule as learn_stop_rule
 from thermogrip.classify.decisions.stopping_rule import load_stop_rule as load_stop_rule
 from thermogrip.classify.estimators import CLASSIFIERS as CLASSIFIERS
 from thermogrip.classify.estimators.base import GraspClassifier as GraspClassifier
 from thermogrip.classify.estimators.base import as_array as as_array
-from thermogrip.classify.estimators.features import extract_features as extract_features
-from thermogrip.classify.estimators.lda import ArrayClassifier as ArrayClassifier
 from thermogrip.classify.estimators.registry import load_classifier as load_classifier
 from thermogrip.classify.estimators.registry import make_classifier as make_classifier
 from thermogrip.classify.estimators.registry import save_classifier as save_classifier

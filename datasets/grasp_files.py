@@ -141,24 +141,8 @@ def write_grasps(grasps: Grasps, path: str | Path) -> Path:
 
 
 def read_grasp_files(paths: Sequence[str | Path]) -> list[Grasps]:
-    """Return the records of several files.
-
-    Parameters
-    ----------
-    paths : sequence of str or Path
-        Files as for :func:`read_grasps`; a folder is all its grasp files, in order of name.
-
-    Raises
-    ------
-    UserError
-        If a folder holds none, or two files have one name.
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.examples import example_path
-    >>> [record.attrs["name"] for record in read_grasp_files([example_path("exp2_dT20")])]
-    ['exp2_dT20']
-    """
+    """Return the records of several files as of :func:`read_grasps`; a folder is all its grasp files, in
+    order of name, and no two files may have one name."""
     files: list[Path] = []
     for path in map(Path, paths):
         files += _in_folder(path) if path.is_dir() else [path]

@@ -42,36 +42,17 @@ KINDS: dict[str, tuple[tuple[float, float], tuple[float, float], tuple[float, fl
 
 @dataclass(frozen=True)
 class Material:
-    """One row of the table.
-
-    Attributes
-    ----------
-    name : str
-    k : float
-        Conductivity [W m^-1 K^-1].
-    rho : float
-        Density [kg m^-3].
-    c_p : float
-        Heat capacity [J kg^-1 K^-1].
-    effusivity : float
-        sqrt(k rho c_p) [W s^0.5 m^-2 K^-1].
-    effusivity_sd_ln : float
-        Its relative standard deviation [1].
-    source, kind : str
-        Where the numbers are from, and one of :data:`KINDS`.
-    aliases : tuple of str
-        Other names.
-    """
+    """One row of the table."""
 
     name: str
-    k: float
-    rho: float
-    c_p: float
-    effusivity: float
-    effusivity_sd_ln: float
-    source: str
-    kind: str
-    aliases: tuple[str, ...] = ()
+    k: float  # conductivity [W m^-1 K^-1]
+    rho: float  # density [kg m^-3]
+    c_p: float  # heat capacity [J kg^-1 K^-1]
+    effusivity: float  # sqrt(k rho c_p) [W s^0.5 m^-2 K^-1]
+    effusivity_sd_ln: float  # its relative standard deviation [1]
+    source: str  # where the numbers are from
+    kind: str  # one of :data:`KINDS`
+    aliases: tuple[str, ...] = ()  # other names
 
     @property
     def diffusivity(self) -> float:
@@ -86,14 +67,7 @@ def _bundled() -> tuple[Material, ...]:
 
 
 def load_materials() -> dict[str, Material]:
-    """Return the table by name, in file order: the paper's five first.
-
-    Examples
-    --------
-    >>> table = load_materials()
-    >>> list(table)[:5], round(table["copper"].effusivity, -1)
-    (['copper', 'zinc', 'brass', 'iron', 'wood'], 36390.0)
-    """
+    """Return the table by name, in file order: the paper's five first."""
     return {material.name: material for material in _bundled()}
 
 

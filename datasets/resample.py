@@ -60,21 +60,8 @@ def cut(log: Log, start: float = -np.inf, stop: float = np.inf) -> Log:
 
 
 def gaps(log: Log, longer_than: float = 10.0) -> list[tuple[int, float, float]]:
-    """Return (row before, time before [s], time after [s]) of each gap.
-
-    In an averaged log the blocks end where the gaps of the log itself were.
-
-    Parameters
-    ----------
-    log : Log
-    longer_than : float, optional
-        A gap is longer than this [s], and than five median steps.
-
-    Examples
-    --------
-    >>> gaps(make_log([0.0, 1.0, 2.0, 40.0, 41.0], {"pump": ([1] * 5, "1", "input")}))
-    [(2, 2.0, 40.0)]
-    """
+    """Return (row before, time before [s], time after [s]) of each gap, longer than this [s] and than five
+    median steps; in an averaged log the blocks end where the gaps of the log itself were."""
     time = log["time"].values
     begins = [float(t) for t in str(log.attrs.get(_AFTER_GAP, "")).split()]
     found = np.union1d(gap_rows(time, longer_than), np.flatnonzero(np.isin(time[1:], begins)))

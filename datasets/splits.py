@@ -25,31 +25,7 @@ Split: TypeAlias = tuple[NDArray[np.int64], NDArray[np.int64]]
 def by_grasp(
     grasps: Grasps, *, train_per_class: int = 5, repeats: int = 20, seed: int = 0
 ) -> Iterator[Split]:
-    """Return random splits with so many training units of each material; the others are the test.
-
-    Parameters
-    ----------
-    grasps : Grasps
-        With ``material``; grasps without one are in neither part.
-    train_per_class : int, optional
-        Training grasps (or touch groups) of each material.
-    repeats : int, optional
-        Number of splits.
-    seed : int, optional
-        Same seed, same splits.
-
-    Raises
-    ------
-    UserError
-        If a material has no unit left for the test.
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> train, test = next(by_grasp(load_example_grasps()["exp2_dT20"]))
-    >>> train.size, test.size, set(train) & set(test)
-    (15, 9, set())
-    """
+    """Return random splits with so many training units of each material; the others are the test."""
     material, unit = label_values(grasps, "material"), unit_names(grasps)
     _whole(grasps, material, "material")
     classes = {m: np.unique(unit[material == m]) for m in dict.fromkeys(material.tolist()) if m}
@@ -72,26 +48,7 @@ def by_grasp(
 
 
 def by_session(grasps: Grasps) -> Iterator[Split]:
-    """Return one split a session: that session is the test, all others the training.
-
-    Parameters
-    ----------
-    grasps : Grasps
-        With ``material`` and ``session``.
-
-    Raises
-    ------
-    UserError
-        If there is only one session, or a touch group spans two.
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.schema import make_grasps
-    >>> days = {"material": ["iron", "wood"] * 2, "session": ["monday", "monday", "friday", "friday"]}
-    >>> made = make_grasps([-0.1, 0.1], [[23.0, 24.0]] * 4, ["a", "b", "c", "d"], **days)
-    >>> [(train.tolist(), test.tolist()) for train, test in by_session(made)]
-    [([2, 3], [0, 1]), ([0, 1], [2, 3])]
-    """
+    """Return one split a session: that session is the test, all others the training."""
     session, known = label_values(grasps, "session"), label_values(grasps, "material") != ""
     _whole(grasps, session, "session")
     sessions = list(dict.fromkeys(session[known].tolist()))
@@ -103,31 +60,7 @@ def by_session(grasps: Grasps) -> Iterator[Split]:
 
 
 def by_block(grasps: Grasps, *, seed: int = 0) -> Iterator[Split]:
-    """Return splits in which no block of the test was touched in training: one block of each material is
-    held out.
-
-    There are as many splits as the material with the fewest blocks has.
-
-    Parameters
-    ----------
-    grasps : Grasps
-        With ``material`` and ``block``.
-    seed : int, optional
-        Of the order in which blocks are held out.
-
-    Raises
-    ------
-    UserError
-        If a material has only one block, or a touch group spans two.
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.schema import make_grasps
-    >>> blocks = {"material": ["iron", "iron", "wood", "wood"], "block": ["1", "2", "1", "2"]}
-    >>> made = make_grasps([-0.1, 0.1], [[23.0, 24.0]] * 4, ["a", "b", "c", "d"], **blocks)
-    >>> [(train.tolist(), test.tolist()) for train, test in by_block(made)]
-    [([1, 3], [0, 2]), ([0, 2], [1, 3])]
-    """
+    """Return splits with one block of each material as the test, as many as the one with the fewest has."""
     material, block = label_values(grasps, "material"), label_values(grasps, "block")
     _whole(grasps, block, "block")
     rng = np.random.default_rng(seed)
@@ -147,25 +80,7 @@ def by_block(grasps: Grasps, *, seed: int = 0) -> Iterator[Split]:
 
 
 def shipped(grasps: Grasps) -> Split:
-    """Return the split that the record itself holds.
-
-    Parameters
-    ----------
-    grasps : Grasps
-        With ``split``: train or test; other words are in neither.
-
-    Raises
-    ------
-    UserError
-        If there is no such column, a part is empty, or a touch group is in both.
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> train, test = shipped(load_example_grasps()["exp1A_obj43_grip23"])
-    >>> train.size, test.size
-    (25, 15)
-    """
+    """Return the split in the record's own ``split``, train or test; other words there are in neither."""
     split = label_values(grasps, "split")
     _whole(grasps, split, "split")
     train, test = np.flatnonzero(split == "train"), np.flatnonzero(split == "test")

@@ -2,4 +2,15 @@
 
 from thermogrip import lazy_exports
 
-__all__, __getattr__, __dir__ = lazy_exports(__name__)
+# doors of 0.1.0, which are found and not listed
+_ALSO = {
+    "drivers.tclab": ("TCLabRig",),
+    "drivers.thermogrip": ("DeviceRig",),
+    "guard.trip": ("Trip",),
+    "records.batch": ("Trial",),
+    "records.run_folder": ("RunFolder", "export_run", "recover"),
+    "serial.port": ("Port",),
+    "session.session": ("Session",),
+}
+
+__all__, __getattr__, __dir__ = lazy_exports(__name__, _ALSO)

@@ -134,6 +134,14 @@ def test_what_a_stub_names_is_loaded_and_listed_and_nothing_else() -> None:
             package.nothing  # noqa: B018
 
 
+@pytest.mark.parametrize("room", ROOMS)
+def test_a_door_of_an_older_version_is_found_and_not_listed(room: str) -> None:
+    package = importlib.import_module(f"thermogrip.{room}")
+    for name in (name for names in package._ALSO.values() for name in names):
+        assert getattr(package, name) is not None
+        assert name not in package.__all__
+
+
 @pytest.mark.parametrize("name", doors())
 def test_a_door_is_documented_in_full(name: str) -> None:
     assert lacks(_door(name)) == set()

@@ -196,22 +196,7 @@ def joined_touches(classifier: GraspClassifier, log_p: Floats, units: NDArray[np
 
 
 def write_predictions(rows: Sequence[Row], path: str | Path) -> Path:
-    """Write ``predictions.csv`` whole or not at all and return its path.
-
-    Parameters
-    ----------
-    rows : sequence of dict
-        Of :func:`classify_grasps`; probabilities get six digits, unknown ones are empty.
-    path : str or Path
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     path = write_predictions([{"grasp_id": "g0", "p_iron": 1 / 3}], Path(folder) / "out.csv")
-    ...     print(path.read_text().split())
-    ['grasp_id,p_iron', 'g0,0.333333']
-    """
+    """Write ``predictions.csv`` whole or not at all and return its path; probabilities get six digits."""
     return write_atomic(path, table_csv(rows))
 
 

@@ -67,30 +67,15 @@ _SURE = np.concatenate([np.arange(0.5, 0.95, 0.05), 1 - np.geomspace(0.05, 1e-4,
 
 @dataclass(frozen=True, kw_only=True)
 class StopRule:
-    """When to end a contact.
+    """When to end a contact."""
 
-    Parameters
-    ----------
-    sure : float
-        Stop where the likeliest candidate has this probability.
-    gain : float
-        Stop where the rest of the contact is expected to win less than this share of right answers; 0 never.
-    times : tuple of float
-        When it is evaluated [s after the closed message].
-    end : float
-        When contact ends anyway [s].
-    error : float
-        Stated share of wrong answers among contacts that it ended as confident.
-    n_grasp : int
-        Training grasps that it was learnt from.
-    """
-
-    sure: float
+    sure: float  # stop where the likeliest candidate has this probability
+    # stop where the rest of the contact is expected to win less than this share of right answers; 0 never
     gain: float = 0.0
-    times: tuple[float, ...] = TIMES
-    end: float = 10.0
-    error: float = 0.05
-    n_grasp: int = 0
+    times: tuple[float, ...] = TIMES  # when it is evaluated [s after the closed message]
+    end: float = 10.0  # when contact ends anyway [s]
+    error: float = 0.05  # stated share of wrong answers among contacts that it ended as confident
+    n_grasp: int = 0  # training grasps that it was learnt from
 
     def __post_init__(self) -> None:
         ahead = all(t > 0 for t in self.times) and self.end > 0
@@ -257,37 +242,9 @@ def learn_stop_rule(
 ) -> StopRule:
     """Return the rule under which training grasps stop earliest at the stated error.
 
-    Parameters
-    ----------
-    classifier : PosteriorClassifier
-        A fitted one.
-    X : Grasps or list of Grasps
-        Training grasps with their materials; the candidates of each record are its own materials.
-    error : float, optional
-        Share of wrong answers among the contacts that stop because the answer is confident.
-    loss : float, optional
-        Share of right answers that may be given away by stopping where the rest is not expected to help; 0
-        never stops for that.
-    times, end : optional
-        When the rule is evaluated, and when contact ends anyway [s].
-    progress : callable, optional
-        Called with the fraction done and what is being done.
-
-    Raises
-    ------
-    UserError
-        If so few grasps cannot show so small an error, or a share is none.
-
-    Examples
-    --------
-    >>> from thermogrip.classify.estimators.posterior import PosteriorClassifier
-    >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
-    >>> known = PosteriorClassifier().with_device(load_default_gripper())
-    >>> six = load_example_grasps()["exp2_dT20"].isel(grasp=[5, 6, 13, 14, 21, 22])
-    >>> rule = learn_stop_rule(known, six, error=0.2, times=(0.5, 1.0, 2.0))
-    >>> rule.n_grasp, round(rule.sure, 2)
-    (6, 0.8)
+    ``error`` is the share of wrong answers among the contacts that stop because the answer is confident,
+    ``loss`` the share of right answers that may be given away by stopping where the rest is not expected to
+    help (0 never stops for that); UserError where so few grasps cannot show so small an error.
     """
     if not (0 < error < 1 and 0 <= loss < 1):
         raise UserError(f"error {error:g} or loss {loss:g} is no share", hint="give numbers between 0 and 1")

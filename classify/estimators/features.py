@@ -69,32 +69,12 @@ def can_normalise(grasps: Grasps) -> bool:
 def extract_features(
     grasps: Grasps, *, normalise: bool | None = None, times: Sequence[float] | None = None
 ) -> xr.DataArray:
-    """Return a table of physics features, one row a grasp.
+    """Return a table of physics features, one row a grasp: dims (grasp, feature), with the coordinate
+    ``unit``.
 
-    Parameters
-    ----------
-    grasps : Grasps
-    normalise : bool, optional
-        Divide the responses of each grasp by its ``T_obj - T_skin`` (unit 1) or leave them in kelvin; by
-        default where :func:`can_normalise`.  A grasp that cannot be divided has NaN there.
-    times : sequence of float, optional
-        Times after onset [s] at which the response is read; by default 0.5, 1, 2, 5, 10, 20, 40 s as far as
-        the record reaches.
-
-    Returns
-    -------
-    features : DataArray, dims (grasp, feature)
-        With the coordinate ``unit``.  NaN where a trace does not reach far enough.
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.schema import make_grasps
-    >>> t = np.arange(-2, 10.05, 0.1)
-    >>> rise = 20 * 0.5 * (1 - np.exp(-np.maximum(t - 0.1, 0) / 1.0))
-    >>> g = make_grasps(t, [23 + rise], ["g0"], t_object=[43.0])
-    >>> f = extract_features(g)
-    >>> f.sel(feature=["level", "response_2s", "fitted_rise"]).values.round(2).tolist()
-    [[23.0, 0.43, 0.5]]
+    Responses at ``times`` after onset [s], by default 0.5 to 40 s as far as the record reaches, are divided
+    by the grasp's ``T_obj - T_skin`` (unit 1) or in kelvin, by default as :func:`can_normalise` says; NaN
+    where a grasp cannot be divided or its trace does not reach far enough.
     """
     check_grasps(grasps)
     divide = can_normalise(grasps) if normalise is None else normalise

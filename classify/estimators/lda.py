@@ -168,40 +168,19 @@ class PcaLda(_Lda):
 class ArrayClassifier(JoinedClassifier):
     """Any scikit-learn classifier on the traces as a matrix.
 
-    Parameters
-    ----------
-    estimator : estimator or str, optional
-        The classifier, or its import path (``module:Class``), which is imported: give only what you trust.
-    params : dict, optional
-        Its parameters, where a path was given.
-    start : float, optional
-        First time [s] that is used.
-    subtract_level : bool, optional
-        Subtract each trace's level before contact.
-    standardise : bool, optional
-        Bring each sample time to mean 0 and spread 1 over the training grasps.
-    random_state : int, optional
-        Passed on where the estimator takes one.
-
-    Notes
-    -----
-    An estimator without ``predict_proba`` answers with the class that it predicts at probability (n + 1) / (n
-    + K) for n training grasps of K classes.  It is not saved to a file: loading one would run code.
-
-    Examples
-    --------
-    >>> ArrayClassifier("sklearn.svm:SVC", params={"C": 3.0}).get_params()["estimator"]
-    'sklearn.svm:SVC'
+    Without ``predict_proba`` it answers with the class that it predicts at probability (n + 1) / (n + K) for
+    n training grasps of K classes. It is not saved to a file: loading one would run code.
     """
 
     reads_both_sensors: ClassVar[bool] = True
 
+    # a classifier, or its import path (``module:Class``), which is imported: give only what you trust
     estimator: BaseEstimator | str = "sklearn.linear_model.LogisticRegression"
-    params: dict[str, Any] | None = None
-    start: float = 0.0
-    subtract_level: bool = True
-    standardise: bool = True
-    random_state: int | None = None
+    params: dict[str, Any] | None = None  # its parameters, where a path was given
+    start: float = 0.0  # first time that is used [s]
+    subtract_level: bool = True  # subtract each trace's level before contact
+    standardise: bool = True  # bring each sample time to mean 0 and spread 1 over the training grasps
+    random_state: int | None = None  # passed on where the estimator takes one
 
     def _fit(self, grasps: Grasps, labels: Labels) -> None:
         self.times_ = times_from(grasps, self.start)

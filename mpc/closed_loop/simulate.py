@@ -87,44 +87,18 @@ class Segment:
 
 @dataclass(frozen=True)
 class ClosedLoop:
-    """The record of one run.
+    """The record of one run: n of the plant's own steps, k calls of the controller."""
 
-    Attributes
-    ----------
-    time : (n,) ndarray
-        The plant's own steps [s].
-    outputs : dict of str to (n,) ndarray
-        What the sensors would read without noise and quantum [degC].
-    sample_time : (k,) ndarray
-        When the controller was called [s].
-    readings : dict of str to (k,) ndarray
-        What it was given [degC].
-    drive : dict of str to (k,) ndarray
-        What it answered.
-    target : dict of str to (k,) ndarray
-        [degC].
-    status : tuple of str
-        Its k statuses.
-    advice : tuple of str
-        Its k advices.
-    seconds : (k,) ndarray
-        Time of each step [s].
-    band : float
-        For settling [degC].
-    drive_range : dict of str to (float, float)
-    segments : tuple of Segment
-    """
-
-    time: Array
-    outputs: dict[str, Array]
-    sample_time: Array
-    readings: dict[str, Array]
-    drive: dict[str, Array]
-    target: dict[str, Array]
-    status: tuple[str, ...]
-    advice: tuple[str, ...]
-    seconds: Array
-    band: float
+    time: Array  # (n,), the plant's own steps [s]
+    outputs: dict[str, Array]  # (n,), what the sensors would read without noise and quantum [degC]
+    sample_time: Array  # (k,), when the controller was called [s]
+    readings: dict[str, Array]  # (k,), what it was given [degC]
+    drive: dict[str, Array]  # (k,), what it answered
+    target: dict[str, Array]  # (k,) [degC]
+    status: tuple[str, ...]  # its k statuses
+    advice: tuple[str, ...]  # its k advices
+    seconds: Array  # (k,), time of each step [s]
+    band: float  # for settling [degC]
     drive_range: dict[str, tuple[float, float]]
     segments: tuple[Segment, ...]
 

@@ -214,65 +214,32 @@ SCHEMA, VERSION = "thermogrip.controller", 1
 
 @dataclass(frozen=True)
 class Design:
-    """Everything that a controller is, but the plant.
+    """Everything that a controller is, but the plant."""
 
-    Attributes
-    ----------
-    dt : float
-        Sample time [s].
-    controlled : tuple of str
-        Outputs with a target.
-    blocks : tuple of int
-        Samples in each block of the plan; their sum is the horizon.
-    drive_range : dict of str to (float, float)
-        What may be commanded, in the drive's units; hard.
-    slew_per_s : dict of str to float
-        Largest change of a drive [units per s]; hard.
-    loops : tuple of PILoop
-        The PI controller that takes over when the optimiser fails.
-    track, terminal : float
-        Weight of the squared error of each sample, and of the last one besides [degC^-2].
-    move, drive : float
-        Weight of the squared change of a drive a block, and of a squared drive a sample, in shares of its
-        range.
-    overshoot : float
-        Band beyond the target that the prediction keeps out of, on the far side [degC]; soft.
-    limits : dict of str to (float, float)
-        Ranges of outputs, e.g. the tank's [degC]; soft.
-    price : float
-        Weight of what exceeds a soft limit [1/degC], and of its square [degC^-2].
-    noise : ObserverNoise
-    offset_free : bool
-        Whether disturbance states are estimated; without them the loop ends off its target.
-    move_delay : int
-        Samples between a reading and the moment its move is applied: 0, or 1 where the computer is slow.
-    ambient : float
-        Room temperature where none is measured [degC].
-    deadline_s : float
-        Time allowed to a step [s].
-    patience_s : float
-        How long the plan is followed without a reading, or with a failing solver, before the next fallback
-        [s]; of several controlled outputs, how long the model replaces one that is lost.
-    """
-
-    dt: float
-    controlled: tuple[str, ...]
-    blocks: tuple[int, ...]
-    drive_range: dict[str, tuple[float, float]]
-    slew_per_s: dict[str, float]
-    loops: tuple[PILoop, ...] = ()
-    track: float = 1.0
-    terminal: float = 10.0
-    move: float = 1.0
-    drive: float = 0.0
+    dt: float  # sample time [s]
+    controlled: tuple[str, ...]  # outputs with a target
+    blocks: tuple[int, ...]  # samples in each block of the plan; their sum is the horizon
+    drive_range: dict[str, tuple[float, float]]  # what may be commanded, in the drive's units; hard
+    slew_per_s: dict[str, float]  # largest change of a drive [units per s]; hard
+    loops: tuple[PILoop, ...] = ()  # the PI controller that takes over when the optimiser fails
+    track: float = 1.0  # weight of the squared error of each sample [degC^-2]
+    terminal: float = 10.0  # weight of that of the last one besides [degC^-2]
+    move: float = 1.0  # weight of the squared change of a drive a block, in shares of its range
+    drive: float = 0.0  # weight of a squared drive a sample, in shares of its range
+    # band beyond the target that the prediction keeps out of, on the far side [degC]; soft
     overshoot: float = 0.15
+    # ranges of outputs, e.g. the tank's [degC]; soft
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
-    price: float = 50.0
+    price: float = 50.0  # weight of what exceeds a soft limit [1/degC], and of its square [degC^-2]
     noise: ObserverNoise = field(default_factory=ObserverNoise)
+    # whether disturbance states are estimated; without them the loop ends off its target
     offset_free: bool = True
+    # samples between a reading and the moment its move is applied: 0, or 1 where the computer is slow
     move_delay: int = 0
-    ambient: float = 25.0
-    deadline_s: float = 1.0
+    ambient: float = 25.0  # room temperature where none is measured [degC]
+    deadline_s: float = 1.0  # time allowed to a step [s]
+    # how long the plan is followed without a reading, or with a failing solver, before the next fallback [s];
+    # of several controlled outputs, how long the model replaces one that is lost
     patience_s: float = 10.0
 
     @property

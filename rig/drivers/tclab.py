@@ -46,41 +46,9 @@ _STOP = re.compile(rb"Stop\r\n")
 class TCLabRig(NoticeBook):
     """A TCLab behind the rig's interface; inputs ``q1``, ``q2`` in percent, outputs ``t1``, ``t2``.
 
-    Parameters
-    ----------
-    port : Port
-        Not open yet, or open.
-    highest : float, optional
-        Temperature above which it trips [degC].
-    jump : float, optional
-        Change between two scans that is asked again [K].
-    timeout : float, optional
-        How long an answer may take, in real seconds; three are waited for.
-    greeting : float, optional
-        How long the board may take to start after its port was opened, in real seconds.
-    clock, sleep : callable, optional
-        The rig's clock and how it waits [s].
-
-    Raises
-    ------
-    PortError
-        If the port cannot be opened, or no TCLab answers.
-
-    Examples
-    --------
-    >>> from thermogrip.rig.clock import SteppedClock
-    >>> from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
-    >>> clock = SteppedClock()
-    >>> device = VirtualDevice(protocol="tclab", link="none", clock=clock, t_start=23.0)
-    >>> lab = TCLabRig(DirectPort(device), clock=clock, sleep=clock.sleep)
-    >>> lab.version
-    'TCLab Firmware 2.0.1 Arduino Leonardo/Micro'
-    >>> lab.apply({"q1": 80.0, "q2": 0.0}, pump=1)
-    >>> lab.wait(120.0)
-    >>> reading = lab.read()
-    >>> reading.drive, reading.values["t1"] > 35.0
-    ({'q1': 80.0, 'q2': 0.0}, True)
-    >>> lab.close()
+    It trips above ``highest`` [degC], and a change of ``jump`` [K] between two scans is asked again;
+    ``timeout`` of an answer, of which three are waited for, and ``greeting`` of a board that starts are real
+    seconds.
     """
 
     def __init__(

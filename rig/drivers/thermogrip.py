@@ -90,39 +90,9 @@ class Gathering:
 class DeviceRig(NoticeBook):
     """A device with our firmware, behind the rig's interface.
 
-    Parameters
-    ----------
-    port : Port
-        Not open yet, or open.
-    timeout : float, optional
-        How long an answer may take, in real seconds.
-    tries : int, optional
-        So often a question is met with silence before the device counts as lost.
-    greeting : float, optional
-        How long the device may take to say hello after the port opened, in real seconds: an Arduino starts
-        anew when its port is opened.
-    clock, sleep : callable, optional
-        The rig's clock and how it waits [s].
-
-    Raises
-    ------
-    PortError
-        If the port cannot be opened, or nothing behind it speaks our protocol.
-
-    Examples
-    --------
-    >>> from thermogrip.rig.clock import SteppedClock
-    >>> from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
-    >>> clock = SteppedClock()
-    >>> device = VirtualDevice(link="none", clock=clock, t_start=25.0)
-    >>> rig = DeviceRig(DirectPort(device), clock=clock, sleep=clock.sleep)
-    >>> rig.units
-    {'drive': '1'}
-    >>> rig.apply({"drive": 0.8}, pump=1)
-    >>> rig.wait(60.0)
-    >>> rig.read().values["t_tank"] > 25.5
-    True
-    >>> rig.close()
+    ``timeout`` and ``greeting`` are real seconds: how long an answer may take, and an Arduino that starts
+    anew when its port is opened; after ``tries`` questions that are met with silence the device counts as
+    lost.
     """
 
     def __init__(

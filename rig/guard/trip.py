@@ -25,41 +25,16 @@ ENDLESS: dict[str, str] = {kind: row["endless"] for kind, row in _WORDS.items() 
 
 @dataclass(frozen=True)
 class Trip:
-    """Why the guard ended a session.
+    """Why the guard ended a session."""
 
-    Attributes
-    ----------
-    kind : str
-        One of :data:`KINDS`.
-    time_s : float
-        When [s, the rig's clock].
-    subject : str
-        The sensor, input or part that it is about.
-    expected, measured : str
-        With their units.
-    check, clear : str
-        What to look at, and what makes a new start possible; the kind's own where not given.
-    figures : mapping of str to float
-        The numbers behind the words, for a program.
-
-    Examples
-    --------
-    >>> line = Trip("jump", 52.0, "t_surface", "near 30 degC", "39 degC, 3 readings in a row").line()
-    >>> for part in line.split("; "):
-    ...     print(part)
-    jump: t_surface: expected near 30 degC, measured 39 degC, 3 readings in a row
-    check the sensor's plug and wire for a loose contact
-    to clear: repair it, then start again
-    """
-
-    kind: str
-    time_s: float
-    subject: str
-    expected: str
-    measured: str
-    check: str = ""
-    clear: str = ""
-    figures: Mapping[str, float] = field(default_factory=dict)
+    kind: str  # one of :data:`KINDS`
+    time_s: float  # when [s, the rig's clock]
+    subject: str  # the sensor, input or part that it is about
+    expected: str  # with its unit
+    measured: str  # with its unit
+    check: str = ""  # what to look at; the kind's own where not given
+    clear: str = ""  # what makes a new start possible; the kind's own where not given
+    figures: Mapping[str, float] = field(default_factory=dict)  # the numbers behind the words, for a program
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:

@@ -48,26 +48,13 @@ _KNOWN = {"material", "t_object_degC", "t_object_sd_degC", "target_degC", *_LABE
 
 @dataclass(frozen=True)
 class Trial:
-    """One row of a plan.
+    """One row of a plan."""
 
-    Attributes
-    ----------
-    material : str
-        Empty where it is not known.
-    target : float
-        Of the skin [degC].
-    t_object : float, str or None
-        [degC]; the name of a sensor; None where it is not known.
-    t_object_sd : float or None
-        [K].
-    labels : dict
-        ``block``, ``repeat``, ``session``, ``experiment``, ``split``, ``touch_group``, ``touch``, ``rest``.
-    """
-
-    material: str
-    target: float
-    t_object: float | str | None = None
-    t_object_sd: float | None = None
+    material: str  # empty where it is not known
+    target: float  # of the skin [degC]
+    t_object: float | str | None = None  # [degC]; the name of a sensor; None where it is not known
+    t_object_sd: float | None = None  # [K]
+    # ``block``, ``repeat``, ``session``, ``experiment``, ``split``, ``touch_group``, ``touch``, ``rest``
     labels: dict[str, Any] = field(default_factory=dict)
 
 

@@ -65,31 +65,9 @@ _PACKAGES = ("thermogrip", "numpy", "scipy", "xarray", "casadi", "daqp", "pyseri
 class RunFolder:
     """Write a session as it happens; a context manager.
 
-    Parameters
-    ----------
-    path : str or Path
-        The folder; made if absent, refused if it is a symbolic link, or holds one, a run, or a file of a
-        run's names.
-    about : dict, optional
-        What is run: controller, plant, target, seed (JSON-able).
-    files : mapping of str to Path, optional
-        Files that the run depends on (controller, plant); their hashes go into ``run.json``.
-    clock : callable, optional
-        Tells when a second is over and the files are forced to disk [s].
-
-    Raises
-    ------
-    UserError
-        If the folder holds a run or a link, or cannot be made.
-
-    Examples
-    --------
-    >>> from tempfile import mkdtemp
-    >>> with RunFolder(Path(mkdtemp()) / "run") as run:
-    ...     run.sample({"time_s": 0.0, "t_surface_degC": 25.0625})
-    >>> print((run.path / "samples.csv").read_text(), end="")
-    time_s,t_surface_degC
-    0,25.0625
+    The folder is made if absent, refused if it is a symbolic link, or holds one, a run, or a file of a run's
+    names. ``about`` is what is run (JSON-able), ``files`` what it depends on, whose hashes go into
+    ``run.json``.
     """
 
     def __init__(
@@ -404,26 +382,7 @@ def read_run(folder: str | Path) -> Run:
 
 
 def recover(folder: str | Path) -> Recovery:
-    """Return what was done to bring the folder of a run that was cut off into the state of a clean end.
-
-    Parameters
-    ----------
-    folder : str or Path
-        As of :func:`read_run`.
-
-    Raises
-    ------
-    UserError
-        If it is no run folder, holds a link, or a file was changed after the run ended.
-
-    Examples
-    --------
-    >>> from tempfile import mkdtemp
-    >>> with RunFolder(Path(mkdtemp()) / "run") as run:
-    ...     run.sample({"time_s": 0.0, "t_surface_degC": 25.0})
-    >>> recover(run.path).findings
-    ('every file is as the run left it',)
-    """
+    """Return what was done to bring the folder of a run that was cut off into the state of a clean end."""
     path = Path(folder)
     changed = sums_agree(path)
     if changed == []:
@@ -469,29 +428,7 @@ def mark_bad(folder: str | Path, why: str) -> None:
 
 
 def export_run(folder: str | Path, out: str | Path) -> Path:
-    """Write the log of a run folder and return the path.
-
-    Parameters
-    ----------
-    folder : str or Path
-        Of the run.
-    out : str or Path
-        ``.nc``, ``.parquet``, ``.csv`` or ``.mcap``.
-
-    Raises
-    ------
-    UserError
-        If the run has no log, the ending is unknown, or MCAP is asked for without the package.
-
-    Examples
-    --------
-    >>> from tempfile import mkdtemp
-    >>> with RunFolder(Path(mkdtemp()) / "run") as run:
-    ...     for k in range(2):
-    ...         run.sample({"time_s": k, "t_surface_degC": 25.5})
-    >>> export_run(run.path, run.path.parent / "log.csv").read_text().split()
-    ['time_s,t_surface_degC', '0.0,25.5', '1.0,25.5']
-    """
+    """Write the log of a run folder as ``.nc``, ``.parquet``, ``.csv`` or ``.mcap`` and return the path."""
     run, path = read_run(folder), Path(out)
     if run.log is None:
         raise UserError("has fewer than two rows", file=folder, hint="give a run that recorded something")

@@ -78,30 +78,8 @@ class PortLock:
 class Port:
     """A serial port, pty or socket that is opened, lost and found again.
 
-    Parameters
-    ----------
-    url : str
-        ``/dev/ttyACM0``, ``COM3``, ``socket://127.0.0.1:5000``.
-    baudrate : int, optional
-    clock : callable, optional
-        Where the times of the back-off come from [s].
-    lock_folder : str or Path, optional
-        As of :class:`PortLock`.
-
-    Attributes
-    ----------
-    opened : int
-        How often it was opened; a change shows that the connection is a new one.
-
-    Examples
-    --------
-    >>> from thermogrip.rig.simulation.cable import SocketLink
-    >>> board = SocketLink()
-    >>> board.plug()
-    >>> with Port(board.url) as port:
-    ...     port.is_open, port.opened
-    (True, 1)
-    >>> board.close()
+    ``url`` is ``/dev/ttyACM0``, ``COM3`` or ``socket://127.0.0.1:5000``; a change of ``opened``, which
+    counts, shows that the connection is a new one.
     """
 
     def __init__(

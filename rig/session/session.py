@@ -164,39 +164,21 @@ class Object:
 
 @dataclass(frozen=True)
 class Session:
-    """What a session returns.
+    """What a session returns."""
 
-    Attributes
-    ----------
-    log : Log
-        Every sample: drive by input, ``pump``, ambient, outputs, ``target_<output>``, ``phase`` (index into
-        :data:`PHASES`).
-    grasps : Grasps or None
-        The one grasp, time 0 at the "closed" message.
-    events : tuple of Event
-        Phases, changes of the controller's status, lost readings, the verdict.
-    verdict : str
-        ``settled``, ``not settled`` or ``tripped``.
-    advice : str
-        What to do about it; empty when settled.
-    settle_time, overshoot, bias : float
-        [s], [K], [K], as in :class:`StepFigures`; of the worst output where there are several.
-    contact : float
-        When the skin made contact [s after the "closed" message]; NaN where there was no contact.
-    trip : Trip or None
-        What ended it, where the guard did.
-    """
-
+    # every sample: drives, ``pump``, ambient, outputs, ``target_<output>``, ``phase`` (index into
+    # :data:`PHASES`)
     log: Log
-    grasps: Grasps | None
-    events: tuple[Event, ...]
-    verdict: str
-    advice: str
-    settle_time: float
-    overshoot: float
-    bias: float
+    grasps: Grasps | None  # the one grasp, time 0 at the "closed" message
+    events: tuple[Event, ...]  # phases, changes of the controller's status, lost readings, the verdict
+    verdict: str  # ``settled``, ``not settled`` or ``tripped``
+    advice: str  # what to do about it; empty when settled
+    settle_time: float  # [s], as in :class:`StepFigures`; of the worst output where there are several
+    overshoot: float  # [K], likewise
+    bias: float  # [K], likewise
+    # when the skin made contact [s after the "closed" message]; NaN where there was no contact
     contact: float = np.nan
-    trip: Trip | None = None
+    trip: Trip | None = None  # what ended it, where the guard did
 
 
 def run_session(

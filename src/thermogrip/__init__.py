@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ast
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -17,17 +17,17 @@ __version__ = "0.1.0"
 
 
 def lazy_exports(
-    package: str, also: Mapping[str, str] | None = None
+    package: str, also: Mapping[str, Sequence[str]] | None = None
 ) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
     """Return ``__all__``, ``__getattr__`` and ``__dir__`` of a package that loads its exports at first use
     (PEP 562): what the ``__init__.pyi`` beside its ``__init__.py`` imports, for type checkers as well.
 
-    ``also`` has the modules, relative to the package, of names that are found and not listed.
+    ``also`` has names that are found and not listed, by module relative to the package.
     """
     stub = Path(str(sys.modules[package].__file__)).with_suffix(".pyi").read_text(encoding="utf-8")
     imports = [node for node in ast.parse(stub).body if isinstance(node, ast.ImportFrom)]
     listed = {alias.name: str(node.module) for node in imports for alias in node.names}
-    home = listed | {name: f"{package}.{module}" for name, module in (also or {}).items()}
+    home = listed | {n: f"{package}.{module}" for module, names in (also or {}).items() for n in names}
 
     def load(name: str) -> Any:
         if name not in home:

@@ -169,30 +169,10 @@ class GraspQuality:
 def check_grasps(grasps: Grasps, *, longest: float = np.inf, whole_traces: bool = False) -> GraspQuality:
     """Return which grasps of a record, and which of their samples, are usable.
 
-    Parameters
-    ----------
-    grasps : Grasps
-        Of unknown object temperature, or shorter than 3 s, none shows that it has no contact, nor does one
-        that is not 10 K away if its object's temperature is off by two of its ``t_object_sd``.
-    longest : float, optional
-        How long the contacts of the calibration lasted [s]: of single touches no more is used.
-    whole_traces : bool, optional
-        Whether a grasp with clipped samples is unusable.
-
-    Returns
-    -------
-    quality : GraspQuality
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> grasps = load_example_grasps()["exp2_dT20"].isel(grasp=[0, 1])
-    >>> grasps["t_surface"][1] = 48.0
-    >>> quality = check_grasps(grasps)
-    >>> quality.reason, float(quality.stop[0]), int(quality.masked[0].sum())
-    (['', 'no contact'], 10.0, 0)
-    >>> quality.read(grasps).sizes["grasp"]
-    1
+    Of unknown object temperature, or shorter than 3 s, none shows that it has no contact, nor does one that
+    is not 10 K away if its object's temperature is off by two of its ``t_object_sd``. Of single touches no
+    more is used than ``longest`` [s], as the contacts of the calibration lasted; with ``whole_traces`` a
+    grasp with clipped samples is unusable.
     """
     time = np.asarray(grasps.variables["time"].values, dtype=float)
     raw = np.asarray(grasps.variables["t_surface"].values, dtype=float)

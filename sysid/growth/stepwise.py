@@ -118,33 +118,9 @@ def grow(
 ) -> Growth:
     """Try candidates on held-out logs, keep those that earn it, and return the network with the whole record.
 
-    Parameters
-    ----------
-    network : NetworkModel or str
-        To start from.
-    logs : sequence of Log
-    candidates : sequence of Candidate, optional
-        Where absent, what the residual's terms propose and then those of
-        :func:`thermogrip.sysid.growth.candidates.suggested`.
-    folds : sequence of Fold, optional
-        Those of :func:`folds_of` where absent.
-    outputs : sequence of str, optional
-        Outputs that count; all where absent.
-    rounds : int, optional
-        How often the best candidate may become the base of the next round.
-    warmup : float, optional
-        Seconds of a held-out log whose readings may set its start.
-    progress : callable, optional
-        Called with (fraction done, what).
-
-    Returns
-    -------
-    Growth
-
-    Raises
-    ------
-    UserError
-        If there is too little data to hold some out, or no such output.
+    Where absent, ``candidates`` are what the residual's terms propose and then those of
+    :func:`thermogrip.sysid.growth.candidates.suggested`; all ``outputs`` count. The best candidate may become
+    the base of the next round so many ``rounds``; ``warmup`` [s] of a held-out log may set its start.
     """
     model = network if isinstance(network, NetworkModel) else load_network(network)
     report = progress or (lambda fraction, what: None)

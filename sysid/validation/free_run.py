@@ -65,55 +65,25 @@ class Score:
 
 @dataclass(frozen=True, eq=False)
 class FreeRun:
-    """What :func:`free_run` found.
+    """What :func:`free_run` found, by output."""
 
-    Parameters
-    ----------
-    log : Log
-        Simulated outputs, inputs, disturbances and ``scored`` (1 or 0) at the measured times.
-    scores : dict of output -> Score
-        The free run.
-    one_step : dict of output -> Score
-        The last reading plus the model's move.
-    naive : dict of baseline -> dict of output -> Score
-        ``"mean"`` and ``"no_input"``.
-    held : dict of output -> Score
-        The free run with the last row held through the gaps; empty without a gap.
-    whiteness : dict of output -> Correlation
-        Autocorrelation of the residual.
-    input_correlation : dict of output -> dict of input -> Correlation
-        Correlation of the residual with the inputs before it, of those that move in this log; what a figure
-        shows.
-    residual : ResidualCorrelations
-        Tests of the residual for correlation with signals; empty without ``tests``.
-    exceeds_fit : dict of output -> float
-        How many times as far off as its fit an output is, where that is more than twice.
-    no_better : tuple of str
-        Outputs whose free run does not clearly beat the no-input baseline.
-    notes : tuple of str
-        What limits these numbers.
-    warmup : float
-        Seconds whose readings set the state.
-    plant : Plant
-        What was run.
-    measured : Log
-        Over what, in the plant's units.
-    """
-
-    log: Log
-    scores: dict[str, Score]
-    one_step: dict[str, Score]
-    naive: dict[str, dict[str, Score]]
-    held: dict[str, Score]
-    whiteness: dict[str, Correlation]
+    log: Log  # simulated outputs, inputs, disturbances and ``scored`` (1 or 0) at the measured times
+    scores: dict[str, Score]  # of the free run
+    one_step: dict[str, Score]  # of the last reading plus the model's move
+    naive: dict[str, dict[str, Score]]  # of the baselines ``"mean"`` and ``"no_input"``
+    held: dict[str, Score]  # with the last row held through the gaps; empty without a gap
+    whiteness: dict[str, Correlation]  # autocorrelation of the residual
+    # of the residual with the inputs before it, of those that move in this log; what a figure shows
     input_correlation: dict[str, dict[str, Correlation]]
+    # tests of the residual for correlation with signals; empty without ``tests``
     residual: ResidualCorrelations
+    # how many times as far off as its fit an output is, where that is more than twice
     exceeds_fit: dict[str, float]
-    no_better: tuple[str, ...]
-    notes: tuple[str, ...]
-    warmup: float
-    plant: Plant
-    measured: Log
+    no_better: tuple[str, ...]  # outputs whose free run does not clearly beat the no-input baseline
+    notes: tuple[str, ...]  # what limits these numbers
+    warmup: float  # seconds whose readings set the state
+    plant: Plant  # what was run
+    measured: Log  # over what, in the plant's units
 
     def band(self, level: float = 0.9) -> Band:
         """Return the band about the run that a new run's readings should lie in, and how many of these do;

@@ -86,59 +86,18 @@ SHORT = 0.1  # of the level: a part on which the expected coverage falls short b
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """A band about a free run.
+    """A band about a free run."""
 
-    Parameters
-    ----------
-    level : float
-        Probability that it should cover a reading.
-    half : dict of output -> (n,) ndarray
-        Half-width at each row of the log, in the output's unit.
-    inside : dict of output -> float
-        Share of the scored readings that it covers.
-    draws : int
-        Draws of the parameters; 0: the plant has none, the band is the plant's own error alone.
-    own_error : str
-        How the plant's own error was estimated, in words.
-    """
-
-    level: float
-    half: dict[str, Array]
-    inside: dict[str, float]
-    draws: int
-    own_error: str = "the error of the fit"
+    level: float  # probability that it should cover a reading
+    half: dict[str, Array]  # (n,), half-width at each row of the log, in the output's unit
+    inside: dict[str, float]  # share of the scored readings that it covers
+    draws: int  # of the parameters; 0: the plant has none, the band is the plant's own error alone
+    own_error: str = "the error of the fit"  # how the plant's own error was estimated, in words
 
 
 def free_run_band(plant: Plant, log: Log, simulated: Log, *, level: float = 0.9, draws: int = 30) -> Band:
-    """Return the band about a free run of the plant.
-
-    Parameters
-    ----------
-    plant : Plant
-    log : Log
-        What was measured.
-    simulated : Log
-        Its free run, as :meth:`thermogrip.sysid.plant.plant.Plant.simulate` returns it.
-    level : float, optional
-    draws : int, optional
-        Draws of the parameters, seeds 1 to ``draws``.
-
-    Returns
-    -------
-    Band
-
-    Examples
-    --------
-    >>> from thermogrip.datasets.schema import make_log
-    >>> from thermogrip.sysid.models.state_space import StateSpaceModel
-    >>> block = StateSpaceModel(("q",), (), ("t",), A=[[0.9]], B=[[1.0]], C=[[1.0]], dt=1.0)
-    >>> plant = Plant(block, {}, dt=1.0, noise={"t": 0.2})
-    >>> still = {"q": (np.zeros(60), "1", "input"), "t": (np.zeros(60), "degC", "output")}
-    >>> log = make_log(np.arange(60.0), still)
-    >>> band = free_run_band(plant, log, plant.simulate(log))
-    >>> round(float(band.half["t"][-1]), 3), band.inside["t"], band.draws
-    (0.329, 1.0, 0)
-    """
+    """Return the band about the ``simulated`` free run of a plant over a log, of so many draws of its
+    parameters (seeds 1 to ``draws``)."""
     if not 0 < level < 1:
         raise ValueError(f"level must lie between 0 and 1, got {level:g}")
     wide = NormalDist().inv_cdf(0.5 + level / 2)
