@@ -16,6 +16,7 @@ _ALSO = {
     "estimators.features": ("extract_features",),
     "estimators.lda": ("ArrayClassifier",),
     "estimators.registry": ("can_be_saved",),
+    "evaluation.comparison": ("Comparison",),
 }
 
 __all__, __getattr__, __dir__ = lazy_exports(__name__, _ALSO)

@@ -11,5 +11,4 @@ from thermogrip.classify.estimators.base import as_array as as_array
 from thermogrip.classify.estimators.registry import load_classifier as load_classifier
 from thermogrip.classify.estimators.registry import make_classifier as make_classifier
 from thermogrip.classify.estimators.registry import save_classifier as save_classifier
-from thermogrip.classify.evaluation.comparison import Comparison as Comparison
 from thermogrip.classify.evaluation.harness import evaluate as evaluate

@@ -6,11 +6,12 @@ from thermogrip import lazy_exports
 _ALSO = {
     "drivers.tclab": ("TCLabRig",),
     "drivers.thermogrip": ("DeviceRig",),
+    "guard.guard": ("GuardSettings",),
     "guard.trip": ("Trip",),
     "records.batch": ("Trial",),
     "records.run_folder": ("RunFolder", "export_run", "recover"),
     "serial.port": ("Port",),
-    "session.session": ("Session",),
+    "session.session": ("Object", "Session"),
 }
 
 __all__, __getattr__, __dir__ = lazy_exports(__name__, _ALSO)

@@ -1,6 +1,5 @@
 from thermogrip.rig.drivers.connect import open_rig as open_rig
 from thermogrip.rig.guard.guard import Guard as Guard
-from thermogrip.rig.guard.guard import GuardSettings as GuardSettings
 from thermogrip.rig.guard.settings import read_guard as read_guard
 from thermogrip.rig.interface import Reading as Reading
 from thermogrip.rig.interface import Rig as Rig
@@ -8,7 +7,6 @@ from thermogrip.rig.records.batch import read_plan as read_plan
 from thermogrip.rig.records.batch import run_batch as run_batch
 from thermogrip.rig.records.rosbridge import Bridge as Bridge
 from thermogrip.rig.records.run_folder import read_run as read_run
-from thermogrip.rig.session.session import Object as Object
 from thermogrip.rig.session.session import run_session as run_session
 from thermogrip.rig.simulation.twin import Twin as Twin
 from thermogrip.rig.simulation.virtual_device import VirtualDevice as VirtualDevice

@@ -29,38 +29,21 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Comparison:
-    """The result of :func:`~thermogrip.classify.evaluation.harness.evaluate`.
+    """The result of :func:`~thermogrip.classify.evaluation.harness.evaluate`."""
 
-    Attributes
-    ----------
-    split : str
-        ``shipped``, ``random``, ``session``, ``block`` or ``files``.
-    repeats : int
-        Random splits; 1 otherwise.
-    seed : int
-    predictions : tuple of dict
-        A row for each classifier, repeat, condition and test grasp (or touched block): ``classifier, repeat,
-        condition, grasp_id, material, predicted, known, correct, confidence, log_loss, brier, p_unknown,
-        apart`` and ``p_<candidate>``.  ``known`` is False where the material was no candidate: such grasps
-        are not in the accuracy, and are what ``open_set`` is about.
-    leaks : tuple of dict
-        The leak probe: ``classifier, condition, n, accuracy, chance, p_value, leak``.
-    times : tuple of dict
-        ``classifier, repeat, condition, fit_s, predict_s_per_grasp``.
-    notes : tuple of str
-        What was left out, and why.
-    level : float
-        Confidence of the intervals.
-    """
-
-    split: str
-    repeats: int
+    split: str  # ``shipped``, ``random``, ``session``, ``block`` or ``files``
+    repeats: int  # random splits; 1 otherwise
     seed: int
+    # a row for each classifier, repeat, condition and test grasp (or touched block): ``classifier, repeat,
+    # condition, grasp_id, material, predicted, known, correct, confidence, log_loss, brier, p_unknown,
+    # apart`` and ``p_<candidate>``; ``known`` is False where the material was no candidate: such grasps are
+    # not in the accuracy, and are what ``open_set`` is about
     predictions: tuple[Row, ...]
+    # the leak probe: ``classifier, condition, n, accuracy, chance, p_value, leak``
     leaks: tuple[Row, ...] = ()
-    times: tuple[Row, ...] = ()
-    notes: tuple[str, ...] = ()
-    level: float = field(default=0.95)
+    times: tuple[Row, ...] = ()  # ``classifier, repeat, condition, fit_s, predict_s_per_grasp``
+    notes: tuple[str, ...] = ()  # what was left out, and why
+    level: float = field(default=0.95)  # confidence of the intervals
 
     @property
     def classifiers(self) -> tuple[str, ...]:

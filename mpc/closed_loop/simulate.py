@@ -37,30 +37,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What the controller does not know.
+    """What the controller does not know."""
 
-    Attributes
-    ----------
-    ambient : float
-        Of the room [degC].
-    noise : float
-        Standard deviation of a reading [degC].
-    quantum : float
-        Step of a reading [degC]; 0 is none.
-    quanta : dict of str to float
-        The same of sensors that have another, by name, ambient included [degC].
-    offset : dict of str to float
-        What a sensor reads too much, by name, ambient included [degC].
-    move_delay_s : float
-        Time between a reading and the moment its move is applied [s].
-    """
-
-    ambient: float = 25.0
-    noise: float = 0.04
-    quantum: float = 0.0625
+    ambient: float = 25.0  # of the room [degC]
+    noise: float = 0.04  # standard deviation of a reading [degC]
+    quantum: float = 0.0625  # step of a reading [degC]; 0 is none
+    # the same of sensors that have another, by name, ambient included [degC]
     quanta: dict[str, float] = field(default_factory=dict)
+    # what a sensor reads too much, by name, ambient included [degC]
     offset: dict[str, float] = field(default_factory=dict)
-    move_delay_s: float = 0.0
+    move_delay_s: float = 0.0  # time between a reading and the moment its move is applied [s]
 
     def steps_of(self, names: tuple[str, ...]) -> Array:
         """Return the step of a reading of each of these sensors (n,) [degC]."""

@@ -37,73 +37,35 @@ Range = tuple[Finite, Finite]
 
 
 class Spec(BaseModel):
-    """What is wanted of a controller; the defaults are those of :data:`SPEC_TEMPLATE`.
-
-    Attributes
-    ----------
-    steps : list of (float, float)
-        Start and target of each step that is simulated [degC].
-    settle_within_s, hold_s : float
-        How soon a step must have settled, and how long it is simulated [s].
-    band_degC, overshoot_degC, bias_degC : float
-        Half width of the settling band, and the largest overshoot and mean error at the end [degC].
-    energy_weight : float
-        Seconds of settling that are worth one second at full drive.
-    sample_time_s : float, optional
-        Time between moves [s]; read off the plant where absent, like the next ones.
-    slew_per_s : float or dict of str to float, optional
-        Largest change of a drive [its units per s].
-    drive_limits : (float, float) or dict of str to (float, float), optional
-        Narrower range of a drive, in its units.
-    patience_s : float, optional
-        How long the model replaces a lost reading [s].
-    output : str or list of str, optional
-        What is regulated.
-    ambient_degC, noise_degC, sensor_offset_degC : float
-        Of the simulations: the room, noise of a reading, and by how much sensors are off [degC].
-    search_draws, check_draws : int
-        Draws of the plant in the search and in the final comparison.
-    evaluations : int
-        Designs that the search may try.
-    limits : dict of str to (float, float), optional
-        Soft limits of outputs [degC].
-
-    Examples
-    --------
-    >>> Spec(settle_within_s=200).steps[0]
-    (28.0, 38.0)
-    >>> try:
-    ...     spec_from_dict({"band_degC": -1})
-    ... except UserError as error:
-    ...     print(error.problem)
-    band_degC: input should be greater than 0
-    """
+    """What is wanted of a controller; the defaults are those of :data:`SPEC_TEMPLATE`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    # start and target of each step that is simulated [degC]
     steps: Annotated[list[tuple[Finite, Finite]], Field(min_length=1, max_length=20)] = [
         (28.0, 38.0),
         (28.0, 18.0),
         (18.0, 43.0),
     ]
-    settle_within_s: Positive = 450.0
-    band_degC: Positive = 0.25
-    overshoot_degC: Positive = 0.3
-    bias_degC: Positive = 0.05
-    hold_s: Annotated[float, Field(ge=10, le=36000)] = 600.0
-    energy_weight: NotNegative = 0.0
+    settle_within_s: Positive = 450.0  # how soon a step must have settled
+    band_degC: Positive = 0.25  # half width of the settling band
+    overshoot_degC: Positive = 0.3  # largest
+    bias_degC: Positive = 0.05  # largest mean error at the end
+    hold_s: Annotated[float, Field(ge=10, le=36000)] = 600.0  # how long a step is simulated
+    energy_weight: NotNegative = 0.0  # seconds of settling that are worth one second at full drive
+    # between moves; read off the plant where absent, like the next ones
     sample_time_s: Positive | None = None
-    slew_per_s: Positive | dict[str, Positive] | None = None
-    drive_limits: Range | dict[str, Range] | None = None
-    patience_s: NotNegative | None = None
-    output: str | Annotated[list[str], Field(min_length=1)] | None = None
-    ambient_degC: Temperature = 25.0
-    noise_degC: Annotated[Deviation, Field(ge=0)] = 0.04
-    sensor_offset_degC: Deviation = 0.2
-    search_draws: Annotated[int, Field(ge=1, le=50)] = 2
-    check_draws: Annotated[int, Field(ge=1, le=200)] = 5
-    evaluations: Annotated[int, Field(ge=1, le=10000)] = 20
-    limits: dict[str, Range] | None = None
+    slew_per_s: Positive | dict[str, Positive] | None = None  # largest change of a drive [its units per s]
+    drive_limits: Range | dict[str, Range] | None = None  # narrower range of a drive, in its units
+    patience_s: NotNegative | None = None  # how long the model replaces a lost reading
+    output: str | Annotated[list[str], Field(min_length=1)] | None = None  # what is regulated
+    ambient_degC: Temperature = 25.0  # of the simulations' room
+    noise_degC: Annotated[Deviation, Field(ge=0)] = 0.04  # of a reading there
+    sensor_offset_degC: Deviation = 0.2  # by how much sensors are off there
+    search_draws: Annotated[int, Field(ge=1, le=50)] = 2  # of the plant, in the search
+    check_draws: Annotated[int, Field(ge=1, le=200)] = 5  # of the plant, in the final comparison
+    evaluations: Annotated[int, Field(ge=1, le=10000)] = 20  # designs that the search may try
+    limits: dict[str, Range] | None = None  # soft limits of outputs [degC]
 
     @model_validator(mode="after")
     def _agree(self) -> Spec:

@@ -156,47 +156,29 @@ class RuleMonitor:
 
 @dataclass(frozen=True)
 class GuardSettings:
-    """What the guard allows.
+    """What the guard allows."""
 
-    Attributes
-    ----------
-    limits : mapping of str to (float, float)
-        Of single sensors by name [degC].
-    skin_limits : (float, float)
-        Of the skin's sensors, where ``limits`` does not name them [degC].
-    other_limits : (float, float)
-        Of every other one [degC]: water that neither freezes nor scalds.
-    expiry_s : float
-        The device's own time to live of a drive [s]: a longer silence of ours and it is off.
-    stale_s : float
-        Longest time without a new reading [s].
-    clock_slack_s : float
-        By how much the rig's clock may differ from ours between two readings [s].
-    drive_slack : float
-        By how much the applied drive may differ from what was asked, a fraction of half its range.
-    forget_s : float
-        After a touch the skin is what the object made of it for so long [s].
-    rooms : tuple of str or None
-        Sensors that read the room, of those that the plant does not know; None goes by their names.
-    sensors, model, rules
-        Of the checks.
-    file : str
-        Where it was read from, for messages.
-    """
-
+    # of single sensors by name [degC]
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    # of the skin's sensors, where ``limits`` does not name them [degC]
     skin_limits: tuple[float, float] = keyed((3.0, 55.0), "skin_degC", -50, 150)
+    # of every other one [degC]: water that neither freezes nor scalds
     other_limits: tuple[float, float] = keyed((-1.0, 70.0), "others_degC", -50, 150)
+    # the device's own time to live of a drive [s]: a longer silence of ours and it is off
     expiry_s: float = keyed(2.0, "expiry_s", 0.5, 2)
-    stale_s: float = keyed(2.0, "stale_s", 0.5, 60)
+    stale_s: float = keyed(2.0, "stale_s", 0.5, 60)  # longest time without a new reading [s]
+    # by how much the rig's clock may differ from ours between two readings [s]
     clock_slack_s: float = keyed(1.0, "clock_slack_s", 0.1, 60)
+    # by how much the applied drive may differ from what was asked, a fraction of half its range
     drive_slack: float = keyed(0.05, "drive_slack", 0.005, 0.5)
+    # after a touch the skin is what the object made of it for so long [s]
     forget_s: float = keyed(60.0, "forget_s", 0, 3600)
     sensors: SensorSettings = field(default_factory=SensorSettings)
+    # sensors that read the room, of those that the plant does not know; None goes by their names
     rooms: tuple[str, ...] | None = None
     model: ModelSettings = field(default_factory=ModelSettings)
     rules: RuleSettings = field(default_factory=RuleSettings)
-    file: str = field(default="", compare=False)
+    file: str = field(default="", compare=False)  # where it was read from, for messages
 
     def check_sensors(self, have: Collection[str], rooms: Collection[str]) -> None:
         """Raise UserError where a limit or a pair names a sensor that the rig has not, or the room's."""

@@ -140,24 +140,13 @@ LEAD_S = 1.0  # of fast samples before, and after, the pump stops
 
 @dataclass(frozen=True)
 class Object:
-    """What is grasped, and how the grasp is labelled.
+    """What is grasped, and how the grasp is labelled."""
 
-    Attributes
-    ----------
-    material : str
-        Empty where it is not known.
-    t_object : float or str
-        Temperature [degC], or the sensor that measures it; NaN where it is not known.
-    t_object_sd : float
-        Its uncertainty, standard deviation [K]; NaN where not known.
-    labels : mapping of str to str or float
-        ``block``, ``session``, ``experiment``, ``split``, ``touch_group``, ``repeat``, ``touch``, ``rest``.
-    grasp_id : str
-    """
-
-    material: str
+    material: str  # empty where it is not known
+    # temperature [degC], or the sensor that measures it; NaN where it is not known
     t_object: float | str = np.nan
-    t_object_sd: float = np.nan
+    t_object_sd: float = np.nan  # its uncertainty, standard deviation [K]; NaN where not known
+    # ``block``, ``session``, ``experiment``, ``split``, ``touch_group``, ``repeat``, ``touch``, ``rest``
     labels: Mapping[str, Any] = field(default_factory=dict)
     grasp_id: str = "g0000"
 

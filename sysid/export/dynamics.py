@@ -48,27 +48,16 @@ class Estimate(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Dynamics:
-    """How a plant responds to small changes about an operating point.
+    """How a plant responds to small changes about an operating point."""
 
-    Attributes
-    ----------
-    near : LinearPlant
-        The discrete linear plant, with its operating point and the names of its signals.
-    draws : tuple of LinearPlant
-        The same of other plants that agree with the logs; empty where the plant has no uncertainty.
-    gain_sd : (n_w,) ndarray
-        Standard deviation of the gain of each input between runs [1, of the gain], 0 where the logs show it.
-    units : dict of str to str
-        Of inputs, disturbances and outputs.
-    level : float
-        Probability inside of the intervals.
-    """
-
-    near: LinearPlant
+    near: LinearPlant  # the discrete linear plant, with its operating point and the names of its signals
+    # the same of other plants that agree with the logs; empty where the plant has no uncertainty
     draws: tuple[LinearPlant, ...]
+    # (n_w,), standard deviation of the gain of each input between runs [1, of the gain], 0 where the logs
+    # show it
     gain_sd: Array
-    units: dict[str, str]
-    level: float = 0.9
+    units: dict[str, str]  # of inputs, disturbances and outputs
+    level: float = 0.9  # probability inside of the intervals
 
     @property
     def dt(self) -> float:

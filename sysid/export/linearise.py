@@ -49,31 +49,19 @@ _DELAY = 1e-8  # modulus of a discrete pole that represents a delay
 
 @dataclass(frozen=True, eq=False)
 class LinearPlant:
-    """Matrices with names, and the point that they are about.
+    """Matrices with names, in the units of the plant's states, inputs and outputs, and the point that they
+    are about."""
 
-    Attributes
-    ----------
-    A, B, C : (n_x, n_x), (n_x, n_w), (n_y, n_x) ndarray
-        In the units of the plant's states, inputs and outputs.
-    states, inputs, outputs : tuple of str
-        ``inputs`` are the plant's inputs that are no switches, then its disturbances.
-    x, w, y : (n_x,), (n_w,), (n_y,) ndarray
-        The operating point, in the same units.
-    dt : float or None
-        Step [s]; None is continuous time.
-    name : str
-    """
-
-    A: Array
-    B: Array
-    C: Array
+    A: Array  # (n_x, n_x)
+    B: Array  # (n_x, n_w)
+    C: Array  # (n_y, n_x)
     states: tuple[str, ...]
-    inputs: tuple[str, ...]
+    inputs: tuple[str, ...]  # the plant's inputs that are no switches, then its disturbances
     outputs: tuple[str, ...]
-    x: Array
-    w: Array
-    y: Array
-    dt: float | None
+    x: Array  # (n_x,), of the operating point
+    w: Array  # (n_w,), of it
+    y: Array  # (n_y,), of it
+    dt: float | None  # step [s]; None is continuous time
     name: str = "plant"
 
     def simulate(self, w: ArrayLike) -> Array:

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from thermogrip.datasets.parallel import Progress
     from thermogrip.datasets.schema import Log
-    from thermogrip.sysid.export import Dynamics
+    from thermogrip.sysid.export.dynamics import Dynamics
     from thermogrip.sysid.greybox import Posterior
     from thermogrip.sysid.growth import Growth
     from thermogrip.sysid.identification import Identification

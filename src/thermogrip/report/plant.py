@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from thermogrip.datasets.schema import Log
-    from thermogrip.sysid.export import Dynamics
+    from thermogrip.sysid.export.dynamics import Dynamics
     from thermogrip.sysid.greybox import Posterior
     from thermogrip.sysid.growth import Growth
     from thermogrip.sysid.identification import Identification, Row, Searched

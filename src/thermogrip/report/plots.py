@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from thermogrip.mpc.closed_loop.simulate import ClosedLoop
-    from thermogrip.sysid.export import Dynamics
+    from thermogrip.sysid.export.dynamics import Dynamics
     from thermogrip.sysid.greybox import Posterior
     from thermogrip.sysid.identification import Row
     from thermogrip.sysid.validation import Band, FreeRun
