@@ -4,6 +4,7 @@ from thermogrip import lazy_exports
 
 # doors of 0.1.0, which are found and not listed
 _ALSO = {
+    ".sysid.contact.simulation": ("Grip",),
     "drivers.tclab": ("TCLabRig",),
     "drivers.thermogrip": ("DeviceRig",),
     "guard.guard": ("GuardSettings",),

@@ -10,5 +10,4 @@ from thermogrip.rig.records.run_folder import read_run as read_run
 from thermogrip.rig.session.session import run_session as run_session
 from thermogrip.rig.simulation.twin import Twin as Twin
 from thermogrip.rig.simulation.virtual_device import VirtualDevice as VirtualDevice
-from thermogrip.sysid.contact.simulation import Grip as Grip
 from thermogrip.sysid.contact.simulation import simulate_grasps as simulate_grasps

@@ -27,11 +27,11 @@ def lazy_exports(
     stub = Path(str(sys.modules[package].__file__)).with_suffix(".pyi").read_text(encoding="utf-8")
     imports = [node for node in ast.parse(stub).body if isinstance(node, ast.ImportFrom)]
     listed = {alias.name: str(node.module) for node in imports for alias in node.names}
-    home = listed | {n: f"{package}.{module}" for module, names in (also or {}).items() for n in names}
+    home = listed | {name: f".{module}" for module, names in (also or {}).items() for name in names}
 
     def load(name: str) -> Any:
         if name not in home:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(import_module(home[name]), name)
+        return getattr(import_module(home[name], package), name)
 
     return sorted(listed), load, lambda: sorted(listed)

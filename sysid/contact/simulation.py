@@ -261,54 +261,23 @@ class ContactModel(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Grip:
-    """A gripper and the spreads of its grasps.
+    """A gripper and the spreads of its grasps; those with ``_ln`` are standard deviations of logarithms."""
 
-    Attributes
-    ----------
-    stack : Stack
-        The finger, from skin to water.
-    h_c : float
-        Settled contact conductance of a block that ``h_c_of`` does not name [W m^-2 K^-1].
-    h_c_of : mapping of str to float
-        By material [W m^-2 K^-1].
-    h_c_sd_ln, build_up_sd_ln : float
-        Spreads from grasp to grasp of conductance and build-up time, standard deviations of ln [1].
-    onset, onset_sd : float
-        Moment of contact after the "closed" message, mean and standard deviation [s].
-    bias, t_object_sd : float
-        True less nominal temperature of the object, mean and standard deviation [K].
-    transit_loss : float
-        Fraction of the way to the room that an object goes before contact.
-    effusivity_of : mapping of str to float
-        By material, on the gripper's scale [W s^0.5 m^-2 K^-1]; else the library's.
-    effusivity_sd_ln : mapping of str to float
-        By material, standard deviation of ln [1].
-    length : float
-        Of the block [m].
-    until : float
-        A touch is computed for so long [s].
-
-    Examples
-    --------
-    >>> touch = Grip().draw("copper", 43.0, np.random.default_rng(0), ambient=28.0)
-    >>> bool(abs(touch.t_object - 43) < 2), touch.response([-2.0]).tolist()
-    (True, [0.0])
-    """
-
-    stack: Stack = SOFT_FINGER
-    h_c: float = 1600.0
-    h_c_of: Mapping[str, float] = field(default_factory=lambda: {"wood": 910.0})
-    h_c_sd_ln: float = 0.09
-    build_up_sd_ln: float = 0.03
-    onset: float = 0.02
-    onset_sd: float = 0.09
-    bias: float = 0.0
-    t_object_sd: float = 0.40
-    transit_loss: float = 0.02
+    stack: Stack = SOFT_FINGER  # the finger, from skin to water
+    h_c: float = 1600.0  # settled contact conductance of a block that ``h_c_of`` does not name [W m^-2 K^-1]
+    h_c_of: Mapping[str, float] = field(default_factory=lambda: {"wood": 910.0})  # by material [W m^-2 K^-1]
+    h_c_sd_ln: float = 0.09  # of conductance from grasp to grasp
+    build_up_sd_ln: float = 0.03  # of build-up time from grasp to grasp
+    onset: float = 0.02  # mean moment of contact after the "closed" message [s]
+    onset_sd: float = 0.09  # [s]
+    bias: float = 0.0  # mean of true less nominal temperature of the object [K]
+    t_object_sd: float = 0.40  # of true less nominal [K]
+    transit_loss: float = 0.02  # fraction of the way to the room that an object goes before contact
+    # by material, on the gripper's scale [W s^0.5 m^-2 K^-1]; else the library's
     effusivity_of: Mapping[str, float] = field(default_factory=dict)
-    effusivity_sd_ln: Mapping[str, float] = field(default_factory=lambda: {"wood": 0.08})
-    length: float = 0.02
-    until: float = 60.0
+    effusivity_sd_ln: Mapping[str, float] = field(default_factory=lambda: {"wood": 0.08})  # by material
+    length: float = 0.02  # of the block [m]
+    until: float = 60.0  # a touch is computed for so long [s]
 
     def draw(self, material: str, t_object: float, rng: np.random.Generator, *, ambient: float) -> Touch:
         """Return one grasp of this material at this nominal temperature [degC]."""
