@@ -46,10 +46,8 @@ _NO_LINK = getattr(os, "O_NOFOLLOW", 0)  # Windows has none
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path in the folder of ``path``; on success it is synced and renamed to ``path``.
-
-    On any exception, Ctrl-C included, the temporary file is removed and ``path`` is left as it was.
-    """
+    """Yield a temporary path beside ``path``, synced and renamed to it on success and removed on any
+    exception, Ctrl-C included."""
     target = Path(path)
     if os.path.isdir(target):  # Path.is_dir raises on a name that is too long
         raise UserError("is a folder", file=target, hint="name a file")

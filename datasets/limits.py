@@ -103,10 +103,8 @@ def unpack_within(stream: BinaryIO, source: BinaryIO, *, file: str | Path, most:
 
 
 class Unpacker:
-    """Unpack the chunks of one bag, which count together, and not a byte further than the file may hold.
-
-    Their readers unpack a chunk whole: lz4 grows 255 times, zstd and bz2 many thousand times.
-    """
+    """Unpack the chunks of one bag, which count together, to what the file may hold and not a byte further;
+    readers would unpack chunks whole, which grow 255 times (lz4) or many thousand times (zstd, bz2)."""
 
     def __init__(self, file: str | Path) -> None:
         self._file, self._packed, self._found = file, Path(file).stat().st_size, 0

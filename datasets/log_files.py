@@ -412,10 +412,8 @@ def _counts(header: str, table: Table) -> bool:
 
 
 def read_clock(cells: Sequence[str]) -> tuple[Floats, str] | None:
-    """Return the seconds that dates and times of day mean, and how they were taken; None if they are none.
-
-    Without a date they count from midnight on, across further ones; UTC where no offset is written.
-    """
+    """Return the seconds that dates and times of day mean (without a date from midnight on, UTC without an
+    offset) and how they were taken; None if they are none."""
     import pandas as pd
 
     parts = pd.Series(list(cells), dtype=object).str.strip().str.extract(_STAMP)

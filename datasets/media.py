@@ -73,10 +73,8 @@ def panels(
     sharey: Any = False,
     ticks: float = 8,
 ) -> tuple[Figure, NDArray[Any]]:
-    """Return a figure and its (down, across) axes in thermogrip's style.
-
-    It is made without ``pyplot``: no window system is asked for, and nothing global is left behind.
-    """
+    """Return a figure and its (down, across) axes in thermogrip's style, without ``pyplot``, which asks for a
+    window system and leaves global state behind."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=size, layout="constrained")

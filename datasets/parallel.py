@@ -63,10 +63,8 @@ def run_parallel(
 
 @contextmanager
 def kept_processes(workers: Workers) -> Iterator[None]:
-    """Let every :func:`run_parallel` of the block that shares its work out use the same local processes.
-
-    A process takes seconds to import what it needs and to load compiled code; here it does so once.
-    """
+    """Let every :func:`run_parallel` of the block that shares its work out use the same local processes, for
+    each takes seconds to import and to load compiled code."""
     n = 1 if isinstance(workers, str) else min(workers, os.cpu_count() or 1)
     if n == 1 or _kept:
         yield

@@ -408,10 +408,8 @@ def text_numbers(table: Table, header: str) -> NDArray[np.float64]:
 
 
 def read_matlab_table(path: str | Path, columns: Sequence[str] | None = None) -> Table:
-    """Return the columns of a MATLAB file (up to version 7): vectors and columns of matrices of one length.
-
-    A matrix alone has columns without names; a scalar ``Ts``, ``dt`` or ``fs`` is the step (``meta["dt"]``).
-    """
+    """Return the columns of a MATLAB file (up to version 7): vectors and columns of matrices of one length (a
+    matrix alone without names); a scalar ``Ts``, ``dt`` or ``fs`` is the step (``meta["dt"]``)."""
     raw = read_bytes(path)
     if raw[:10] == b"MATLAB 7.3":
         raise UserError("is MATLAB 7.3", file=path, hint="save('x.mat', ..., '-v7') in MATLAB, or export CSV")

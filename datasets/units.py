@@ -295,10 +295,8 @@ def _overlap(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
 def _unlike_inputs(
     columns: Mapping[str, NDArray[np.float64]], guesses: Mapping[str, tuple[str, str]], stated: Sequence[str]
 ) -> dict[str, tuple[str, str]]:
-    """Return the columns that are inputs by their unit alone and move in most rows, where another is held.
-
-    ``stated``: inputs that need no guess. Where none is held a controller moves them, in every row.
-    """
+    """Return the columns that are inputs by unit alone and move in most rows while one of them or of the
+    ``stated`` is held; where none is, a controller moves them."""
     by_unit = [n for n, (role, why) in guesses.items() if role == "input" and why.startswith("its unit")]
     likely = [n for n, (role, why) in guesses.items() if role == "input" or why == NO_CLUE]
     held = next((name for name in (*stated, *likely) if _is_held(columns[name])), None)

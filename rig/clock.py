@@ -14,10 +14,8 @@ _LATE_S = 0.5  # work that took longer than this starts a new grid
 
 
 class SteppedClock:
-    """A clock that moves only when somebody sleeps on it, at once.
-
-    Host and virtual device on one stepped clock run a day in minutes, the same way each time.
-    """
+    """A clock that moves only when somebody sleeps on it, at once. Host and virtual device on one stepped
+    clock run a day in minutes, the same way each time."""
 
     def __init__(self, start: float = 0.0) -> None:
         self._now, self._lock = start, threading.Lock()

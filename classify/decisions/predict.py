@@ -296,10 +296,7 @@ def unexplained_effusivities(
     stated: tuple[float, float] | None = None,
 ) -> dict[str, Deviation]:
     """Return the misfit of single touches under their effusivity, and in words why that does not explain
-    them, if it does not.
-
-    ``stated`` is the range of unknown object temperatures [degC].
-    """
+    them, with unknown object temperatures in the range ``stated`` [degC]."""
     alone = label_values(grasps, "touch_group") == ""
     ln_e = np.log([row.effusivity for row in rows])
     at = np.flatnonzero(alone & np.isfinite(ln_e))

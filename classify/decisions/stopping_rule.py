@@ -183,10 +183,8 @@ def _window(
     u: Floats | None,
     weigh: bool,
 ) -> tuple[Floats, Floats, Floats | None]:
-    """Return log probabilities (n, m) at a time, the gain of reading on (n,) if weighed, and the next start.
-
-    A contact without a reading yet has the prior ones; without any in the end it is a :class:`UserError`.
-    """
+    """Return log probabilities (n, m) at a time (the prior's before a first reading, a :class:`UserError`
+    where none comes), the gain of reading on (n,) if weighed, and the next start."""
     odds = model.log_prior(names)
     read = _read_by(grasps, t) | (t >= end)
     log_p, gain = normalised(np.tile(odds, (read.size, 1))), np.full(read.size, np.inf)

@@ -28,10 +28,8 @@ def check_name(name: str) -> None:
 
 
 def classifier_names(value: str | None) -> str | None:
-    """Return a list of classifiers (commas between them, or None) if each may be one; a check of options.
-
-    Whether an import path names a classifier is seen when it is imported.
-    """
+    """Return a list of classifiers (commas between them, or None) if each may be one; import paths are tried
+    later."""
     for name in (value or "").replace("+", ",").split(","):
         if name.strip() and not set(":.") & set(name):
             check_name(name.strip())

@@ -73,10 +73,8 @@ RULES = ("stack", "nested")
 
 @dataclass(eq=False, repr=False)
 class ExpansionClassifier(JoinedClassifier):
-    """Pool of classifiers on value, slope and curvature of the last seconds (``"expansions"``).
-
-    ``weights_`` has the share of each machine by name.
-    """
+    """Pool of classifiers on value, slope and curvature of the last seconds (``"expansions"``), the share of
+    each machine by name in ``weights_``."""
 
     reads_both_sensors: ClassVar[bool] = True
 

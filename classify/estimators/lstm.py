@@ -91,10 +91,8 @@ _MOST_THREADS = 2  # a batch of 100 is two pieces
 
 @dataclass(eq=False, repr=False)
 class LstmClassifier(JoinedClassifier):
-    """The paper's LSTM, fed with what differs between grasps (``"lstm"``).
-
-    ``loss_curve_`` (epochs,) is the mean training cross entropy of each epoch.
-    """
+    """The paper's LSTM, fed with what differs between grasps (``"lstm"``); ``loss_curve_`` has each epoch's
+    mean training cross entropy."""
 
     reads_both_sensors: ClassVar[bool] = True
     needs: ClassVar[tuple[str, str] | None] = ("torch", "lstm")

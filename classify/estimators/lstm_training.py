@@ -123,10 +123,8 @@ def _compiled(function: Callable[..., Any]) -> Any:
 def _piece(
     x: Reals, target: Rows, rows: Rows, given: tuple[Any, ...], work: tuple[Reals, ...], share: Any
 ) -> Any:
-    """Return the sum of the losses of some series, and the slopes of ``share`` times it by W and readout.
-
-    Rows of the work beyond those of the piece have no slope, so they add nothing.
-    """
+    """Return the sum of the losses of some series, and the slopes of ``share`` times it by W and readout, to
+    which rows of the work beyond the piece's add nothing."""
     matrix, recurrent, readout, offset, curve = given
     inputs, gates, cells, tanhs, by_state, by_cell = work
     hidden = recurrent.shape[1]

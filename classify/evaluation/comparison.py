@@ -137,10 +137,8 @@ class Comparison:
         return float(np.mean(found)) if found else None
 
     def confusion(self, classifier: str, condition: str = POOLED) -> tuple[list[str], Floats]:
-        """Return materials and the confusion matrix: rows true, columns predicted, in test grasps a split.
-
-        Columns hold every material that was predicted; a sum over columns is the mean number tested.
-        """
+        """Return the materials tested or predicted, and the confusion matrix: rows true, columns predicted,
+        in test grasps a split."""
         rows = self._rows(classifier, condition)
         names = sorted({r["material"] for r in rows} | {r["predicted"] for r in rows})
         counts = np.zeros((len(names), len(names)))
@@ -149,10 +147,8 @@ class Comparison:
         return names, counts / self.repeats
 
     def calibration(self, classifier: str, condition: str = POOLED) -> list[Row]:
-        """Return confidence beside accuracy in bins of 0.1, each accuracy with its interval.
-
-        The interval of a bin counts distinct grasps.
-        """
+        """Return confidence beside accuracy in bins of 0.1, each accuracy with its interval over distinct
+        grasps."""
         rows, table = self._rows(classifier, condition), []
         confidence = np.array([r["confidence"] for r in rows])
         for b in s.calibration_bins(confidence, [r["correct"] for r in rows]):

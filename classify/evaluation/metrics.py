@@ -76,10 +76,8 @@ class McNemar(NamedTuple):
 
 
 def clopper_pearson(k: float, n: int, *, level: float = 0.95) -> tuple[float, float]:
-    """Return the exact binomial interval of k right of n.
-
-    ``k`` may be fractional: a mean over repeated tests of n distinct grasps.
-    """
+    """Return the exact binomial interval of k right of n; a mean over repeated tests of n distinct grasps is
+    a fractional k."""
     if n < 1 or not -1e-9 <= k <= n + 1e-9:
         raise ValueError(f"need 0 <= k <= n and n >= 1, got {k=}, {n=}")
     k = min(max(k, 0.0), float(n))

@@ -261,8 +261,7 @@ def segment_of(
     name: str, time: Array, y: Array, goal: float, drive: Array, full: Mask, band: float
 ) -> Segment:
     """Return one target of a run: outputs y (n,) [degC] at times (n,) [s], drives (k, n_u) by sample in
-    fractions of full drive, ``full`` (k,) where one is at its limit.
-    """
+    fractions of full drive, ``full`` (k,) where one is at its limit."""
     error = y - goal
     outside = np.flatnonzero(np.abs(error) > band)
     last = outside[-1] + 1 if outside.size else 0
@@ -288,9 +287,8 @@ def segment_of(
 
 
 class RecordedController:
-    """A controller that keeps its ``moves``, each with the time of its reading [s], counted in sample
-    times where the reading has none.
-    """
+    """A controller that keeps its ``moves``, each with the time of its reading [s], counted in sample times
+    where the reading has none."""
 
     def __init__(self, controller: Controller) -> None:
         self.controller = controller

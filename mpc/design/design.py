@@ -62,8 +62,7 @@ class PILoop:
 
 def simc(plant: Plant, drive: str, output: str, *, tau_c: float | None = None) -> PILoop:
     """Return SIMC settings of one loop for a closed-loop time constant tau_c [s], by default the apparent
-    delay; a drive that does not move the output is a ValueError.
-    """
+    delay; a drive that does not move the output is a ValueError."""
     model = PredictionModel(plant, dt=plant.dt)
     answer = step_response(plant, drive, output)
     if answer.gain == 0:

@@ -70,9 +70,8 @@ def c_source(name: str) -> str:
 
 
 def build_library(files: dict[str, str]) -> Path:
-    """Return a shared library of these C files, from the cache where it was built before; a RuntimeError
-    has the first words of a compiler that refuses.
-    """
+    """Return a shared library of these C files, from the cache where it was built before; a RuntimeError has
+    the first words of a compiler that refuses."""
     gcc = compiler()
     if gcc is None:
         raise RuntimeError("no gcc")

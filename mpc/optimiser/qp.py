@@ -97,9 +97,8 @@ class CondensedQP:
         self._model = None
 
     def solve(self, H: Array, f: Array, A: Array, lower: Array, upper: Array) -> QPAnswer:
-        """Return the minimiser for H (n, n), positive definite, f (n,) and rows A (m, n) between bounds
-        that are infinite where there is none.
-        """
+        """Return the minimiser for H (n, n), positive definite, f (n,) and rows A (m, n) between bounds that
+        are infinite where there is none."""
         if A.shape != (self.soft.size, f.size):
             raise ValueError(f"A is {A.shape}, not {(self.soft.size, f.size)}")
         finite = np.isfinite(H).all() and np.isfinite(f).all() and np.isfinite(A).all()

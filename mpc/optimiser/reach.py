@@ -214,10 +214,8 @@ class Reach:
     def _held(
         self, observer: Observer, u: Array, d: Array, target: Array, side: Array, seen: Mask
     ) -> tuple[Array, Array]:
-        """Return the controlled outputs nearest to the targets, and their derivatives by the biases w.
-
-        The targets and zeros where no steady state is found.
-        """
+        """Return the controlled outputs nearest to the targets, and their derivatives by the biases w; the
+        targets and zeros where no steady state is found."""
         model, rows, optimiser = self.model, self._rows, self._optimiser
         bias, drive_bias, found = observer.output_bias, observer.drive_bias, observer.disturbance
         lowest, highest = optimiser.lowest, optimiser.highest

@@ -213,10 +213,8 @@ class Optimiser:
         return self._response(G * model.span)
 
     def _settled_gain(self) -> Array | None:
-        """Return the steady gain (n_u,) of the output that each drive moves most, at rest [degC a range].
-
-        None where the plant does not settle, or a drive moves nothing.
-        """
+        """Return the steady gain (n_u,) of the output that each drive moves most, at rest [degC a range];
+        None where a drive moves nothing or the plant does not settle."""
         model, (x, u, d) = self.model, self.model.at_rest(self.design.ambient)
         _, A, B, _ = model.linearise(x, u, d)
         try:

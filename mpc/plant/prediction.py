@@ -56,8 +56,7 @@ def drive_names(plant: Plant) -> tuple[str, ...]:
 
 def drive_range(plant: Plant, name: str) -> tuple[float, float]:
     """Return a drive's range: by its unit (-1...1, 0...100 percent, 0...255), else what the logs showed; a
-    UserError where they held it constant.
-    """
+    UserError where they held it constant."""
     unit = plant.units.get(name, "1")
     low, high = plant.valid.get(name, (-1.0, 1.0))
     if unit == "percent":
@@ -150,8 +149,7 @@ class PredictionModel:
 
     def at_rest(self, ambient: float) -> tuple[Array, Array, Array]:
         """Return state, drives and disturbances where all is at rest in a room of this temperature [degC];
-        where no log was there, amid what the logs showed.
-        """
+        where no log was there, amid what the logs showed."""
         d, y, v = np.full(self.n_d, ambient), self.usual(ambient), self.neutral
         if np.any(y != ambient):
             logs = [self.plant.valid.get(name, (rest, rest)) for name, rest in zip(self.drives, v)]
@@ -160,9 +158,8 @@ class PredictionModel:
         return np.asarray(x, dtype=np.float64), v, d
 
     def usual(self, ambient: float) -> Array:
-        """Return outputs (n_y,) that are as warm as the room [degC], or the middle of what the logs showed
-        of those that never were.
-        """
+        """Return outputs (n_y,) that are as warm as the room [degC], or the middle of what the logs showed of
+        those that never were."""
         low, high = self._seen.T
         away = (ambient < low - _NEAR) | (ambient > high + _NEAR)
         return np.asarray(np.mean(np.where(away, self._seen.T, ambient), axis=0), dtype=np.float64)
@@ -174,8 +171,7 @@ class PredictionModel:
 
     def run(self, x: Array, u: Array, d: Array) -> tuple[Array, Array]:
         """Simulate plans u (B, N, n_u) from states x (B, n_x) under d (n_d,) or (B, n_d); return outputs
-        (B, N + 1, n_y) from the start on, and last states (B, n_x).
-        """
+        (B, N + 1, n_y) from the start on, and last states (B, n_x)."""
         fine = np.repeat(self.inputs(u), self.sub, axis=1)
         d = np.atleast_2d(d)
         held = np.ascontiguousarray(np.broadcast_to(d[:, None, :], (d.shape[0], fine.shape[1], d.shape[1])))
@@ -211,10 +207,8 @@ class PredictionModel:
         return Kernel(steps) if steps.are_arithmetic else None
 
     def _tangents(self, x: Array, u: Array, d: Array, sx: Array, su: Array, sd: Array) -> tuple[Array, Array]:
-        """Run samples u (N, n_u) with directions sx (B, n_x), su (B, N, n_u), sd (B, n_d).
-
-        Returns outputs (B, N + 1, 2 n_y) and the last state (B, 2 n_x), values first, then directions.
-        """
+        """Run samples u (N, n_u) with directions sx (B, n_x), su (B, N, n_u), sd (B, n_d) to outputs (B, N +
+        1, 2 n_y) and the last state (B, 2 n_x), values first, then directions."""
         if self._kernel is None:
             raise RuntimeError("no compiled step")
         count, n = len(su), len(u)
@@ -235,10 +229,8 @@ class PredictionModel:
         return np.stack(columns, axis=1)
 
     def trajectory(self, x: Array, plan: Array, d: Array, blocks: Sequence[int]) -> tuple[Array, Array]:
-        """Predict along a plan (n_b, n_u) of blocks of so many samples, from state x under disturbances d.
-
-        Returns the outputs (N, n_y) after 1...N samples and their derivatives (N, n_y, n_b, n_u).
-        """
+        """Return the outputs (N, n_y) after 1...N samples of a plan (n_b, n_u) of blocks, from state x under
+        disturbances d, and their derivatives (N, n_y, n_b, n_u)."""
         if self._kernel is None:
             return self._trajectory_by_casadi(x, plan, d, blocks)
         n_b, n_u = plan.shape
@@ -328,10 +320,8 @@ def _step(model: PredictionModel, symbols: list[Any]) -> list[Any]:
 
 
 class _TangentSteps:
-    """A step and its derivative in one direction, as CasADi takes it, for a compiled kernel.
-
-    State, inputs and disturbances are the model's, then their directions; of the inputs, the drives alone.
-    """
+    """A step and its derivative in one direction, as CasADi takes it, for a compiled kernel: state, inputs
+    and disturbances, each followed by its directions (of inputs, the drives' alone)."""
 
     def __init__(self, model: PredictionModel) -> None:
         import casadi as ca
@@ -429,9 +419,8 @@ class StepResponse:
 def step_response(
     plant: Plant, drive: str, output: str, *, ambient: float = ROOM, longest: float = 14400.0
 ) -> StepResponse:
-    """Simulate a step of a twentieth of a drive's range from rest at ``ambient`` [degC], for ``longest`` s
-    at most, and read gain, delay and lag off it.
-    """
+    """Simulate a step of a twentieth of a drive's range from rest at ``ambient`` [degC], for ``longest`` s at
+    most, and read gain, delay and lag off it."""
     model = PredictionModel(plant, dt=plant.dt)
     j, i = model.drives.index(drive), model.outputs.index(output)
     rest, start, d = model.at_rest(ambient)
@@ -539,10 +528,8 @@ def holding_drive(
 
 
 def _balance(model: PredictionModel, rows: list[int], wanted: Array, d: Array) -> tuple[Array, Array]:
-    """Return drives and outputs of a state that stays and has these outputs, by Newton's method.
-
-    Outputs are NaN where there is none.
-    """
+    """Return drives and outputs of a state that stays and has these outputs, by Newton's method; outputs are
+    NaN where there is none."""
     x, u = model.rest(np.full(model.n_y, wanted.mean()), d), model.neutral
     for _ in range(_NEWTON_STEPS):
         after, A, B, _ = model.linearise(x, u, d)
@@ -559,9 +546,8 @@ def _balance(model: PredictionModel, rows: list[int], wanted: Array, d: Array) -
 def steady_curve(
     model: PredictionModel, drive: str, output: str, d: ArrayLike, *, n: int = 41
 ) -> SteadyCurve:
-    """Return the steady output over n points of a drive's range, the other drives at rest, under
-    disturbances d (n_d,).
-    """
+    """Return the steady output over n points of a drive's range, the other drives at rest, under disturbances
+    d (n_d,)."""
     j, i = model.drives.index(drive), model.outputs.index(output)
     grid = np.linspace(model.lowest[j], model.highest[j], n)
     neutral = model.neutral

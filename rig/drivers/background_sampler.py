@@ -69,10 +69,8 @@ class Sampler:
         return taken
 
     def ask(self, call: Callable[[], T]) -> T:
-        """Ask the rig for something between two samples, e.g. ``lambda: rig.apply(...)``.
-
-        The sampler does not renew a drive: on our firmware it lives 2 s, so it is to be applied more often.
-        """
+        """Ask the rig for something between two samples, e.g. ``lambda: rig.apply(...)``, often enough: no
+        sample renews a drive, which on our firmware lives 2 s."""
         with self._lock:
             return call()
 

@@ -57,10 +57,8 @@ class InputSteps:
     _d: deque[Array] = field(default_factory=deque)
 
     def add(self, until: float, u: Array, d: Array, keep: int) -> int:
-        """Hold u (n_u,) and d (n_d,) until a time [s]; return how many steps that completed.
-
-        Of all that are complete the newest ``keep`` are kept, and in any case those of this call.
-        """
+        """Hold u (n_u,) and d (n_d,) until a time [s], keep the newest ``keep`` complete steps (but all of
+        this call), and return how many it completed."""
         before = self.done
         while (grid := self.start + (self.done + 1) * self.dt) <= until + 1e-9:
             self._accumulate(grid - self.time, u)
@@ -169,10 +167,8 @@ class RigModel:
         return out
 
     def rollout(self, x: Array, u: Array, d: Array, p: Array | None = None) -> tuple[Array, Array]:
-        """Return outputs (B, N + 1, n_y) without offsets and last states (B, n_x) of runs from x (B, n_x).
-
-        Inputs u (B, N, n_u), disturbances d (B, N, n_d), parameters p (B, n_p) or its own.
-        """
+        """Return outputs (B, N + 1, n_y) without offsets and last states (B, n_x) of runs from x (B, n_x)
+        under u (B, N, n_u), d (B, N, n_d) and parameters p (B, n_p), or the model's own."""
         return self.plant.model.rollout(x, u, d, self.p[None] if p is None else p, self.plant.dt)
 
     def run(self, x: Array, u: Array, d: Array) -> Array:

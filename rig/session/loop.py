@@ -275,10 +275,8 @@ class Loop:
             self.note("opened", f"the gripper could not be opened ({error})")
 
     def power_off(self) -> None:
-        """Switch drive and pump off; if even that fails, let the rig go, which switches off too.
-
-        No signal interrupts it.  A rig that cannot be reached is noted, and whether it ends by itself.
-        """
+        """Switch drive and pump off, whatever signals come; if even that fails, let the rig go, which
+        switches off too, and note whether one out of reach ends by itself."""
         with hold_signals():
             try:
                 self.rig.apply(self.no_drive(), 0)

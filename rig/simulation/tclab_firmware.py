@@ -36,8 +36,7 @@ _LONGEST = 64
 
 class TCLabCore:
     """A TCLab's firmware since its last reset; called as
-    :class:`~thermogrip.rig.firmware.reference.DeviceCore` is.
-    """
+    :class:`~thermogrip.rig.firmware.reference.DeviceCore` is."""
 
     expires_ms: int | None = None
     mode = "armed"  # nothing ever ends

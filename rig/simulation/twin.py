@@ -42,16 +42,14 @@ from thermogrip.sysid.plant.plant import Plant
 
 @dataclass
 class _Contact:
-    """A closed gripper: the touch, when it closed, the skin's own temperature then, and when it opened.
-
-    ``times`` and ``alone`` follow the skin as it would be without the object, native step by native step.
-    """
+    """A closed gripper."""
 
     touch: Touch
-    closed: float
-    skin: float
-    opened: float = np.inf
+    closed: float  # time [s]
+    skin: float  # the skin's own temperature when it closed [degC]
+    opened: float = np.inf  # time [s]
     left: float = 0.0  # addition at release [K]
+    # the skin as it would be without the object, native step by native step
     times: list[float] = field(default_factory=list)
     alone: list[float] = field(default_factory=list)
 

@@ -197,10 +197,8 @@ def step_response(
 def far_response(
     stack: Stack, nodes: TimeNodes, rise: Array, *, effusivity: ArrayLike, capacity: ArrayLike
 ) -> Array:
-    """Return what the far face of blocks does to the sensor, per degree from block to room, (n, n_node).
-
-    ``rise`` (n, n_node) as :func:`step_response` gives it for the same blocks.
-    """
+    """Return what the far face of blocks, whose :func:`step_response` is ``rise`` (n, n_node), does to the
+    sensor, per degree from block to room, (n, n_node)."""
     e, c = (np.broadcast_to(np.asarray(v, dtype=float), rise.shape[:1]) for v in (effusivity, capacity))
     since = np.maximum(nodes.t - (c**2 / (6 * e**2))[:, None], 0.0)
     total = [make_interp_spline(nodes.t, f, k=1).antiderivative()(s) for f, s in zip(rise, since)]

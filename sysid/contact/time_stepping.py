@@ -87,10 +87,8 @@ def _eigenvalue(y: float, biot: float) -> float:
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def slab(e: float, c: float, far: float, lam: Array, weight: Array) -> float:
-    """Fill decay rates and weights (N_MODE,) of a slab, fast ones first; return its series resistance.
-
-    ``far`` [W m^-2 K^-1] is lost per degree by the far face.
-    """
+    """Fill decay rates and weights (N_MODE,) of a slab that loses ``far`` [W m^-2 K^-1] by its far face, fast
+    ones first; return its series resistance."""
     unit, biot = (e / c) ** 2, far * c / e**2
     start = _N_EXACT - 0.5
     top = max(np.sqrt(_FASTEST / unit) / np.pi, 3 * start)
@@ -123,10 +121,8 @@ def slabs(effusivity: Array, capacity: Array, far: float) -> tuple[Array, Array,
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def slab_moves(e: float, c: float, far: float, lam: Array, moves: Array) -> tuple[float, float]:
-    """Fill derivatives (4, N_MODE) of ln rate and ln weight by ln e, then by ln C.
-
-    ``lam`` (N_MODE,) are the rates. Return the derivatives of the logarithm of the series resistance.
-    """
+    """Fill derivatives (4, N_MODE) of ln rate (of the rates ``lam``) and ln weight by ln e, then by ln C;
+    return those of the logarithm of the series resistance."""
     ratio = np.sqrt(_FASTEST) * c / (np.pi * e * (_N_EXACT - 0.5))
     free, biot = ratio > 3.0, far * c / e**2
     for i in range(N_MODE):
@@ -544,10 +540,8 @@ def delay(ln_e: float, ln_c: float) -> float:
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def fill_delayed(t: Array, count: Array, late: float, curve: Array, total: Array, value: Array) -> None:
-    """Fill the integral of a curve up to t - late, and the curve there; by straight lines, zero before.
-
-    ``t``, ``count``, ``curve`` (n,) rise in time where ``count`` is not 0; other points are skipped.
-    """
+    """Fill the integral of a ``curve`` (n,) up to t - late, and the curve there, by straight lines, zero
+    before, over the points with a ``count``, along which ``t`` rises."""
     before = after = -1  # the points on either side of t - late
     summed = 0.0  # integral up to ``before``
     for i in range(t.size):
@@ -625,10 +619,8 @@ def fill_responses(
     nodes: Nodes, gripper: Gripper, u: Array, vary: Mask, times: Array,
     bins: NDArray[np.int64], count: Array, room: Room, place: NDArray[np.int64], share: Array, out: Array,
 ) -> None:  # fmt: skip
-    """Fill bin means of F, of its derivatives by ln h, ln tau_b, ln e, ln C, and of its slope, (6, n_bin).
-
-    Derivatives that ``vary`` (7,) does not ask for are left as they are.
-    """
+    """Fill bin means (6, n_bin) of F, of its derivatives by those of ln h, ln tau_b, ln e, ln C that ``vary``
+    (7,) asks for, and of its slope."""
     by_e, by_c = vary[_E], vary[_C]
     contact = vary[_H] or vary[_BUILD_UP] or by_e or by_c
     step_contact(

@@ -342,8 +342,7 @@ def _slow(u: Array) -> Array:
 
 def reading_excess(logs: Sequence[Rows], outputs: Sequence[str], seconds: float) -> dict[str, float]:
     """Return by how much a reading lies off the mean of its bin by noise alone, by output, in its unit; in
-    bins of infinite length that is its white noise.
-    """
+    bins of infinite length that is its white noise."""
     within = [max(0.0, 1.0 - rows.step / seconds) for rows in logs]
     out = {}
     for k, name in enumerate(outputs):

@@ -117,15 +117,12 @@ class Anchor(NamedTuple):
 
 @dataclass(frozen=True)
 class ThetaPrior:
-    """``mean`` (n_theta,) and ``precision`` (n_theta, n_theta) of theta; ``spread`` from grasp to grasp.
+    """What is believed of theta before the fit."""
 
-    ``guesses`` is the number of grasps that ``spread`` counts for.
-    """
-
-    mean: Array
-    precision: Array
-    spread: Mapping[str, float]
-    guesses: float = _GUESSES
+    mean: Array  # (n_theta,)
+    precision: Array  # (n_theta, n_theta)
+    spread: Mapping[str, float]  # from grasp to grasp
+    guesses: float = _GUESSES  # number of grasps that the spread counts for
 
     def penalty(self, theta: Array) -> float:
         """Return the squared distance of theta from the mean, in standard deviations."""
@@ -548,10 +545,8 @@ def _calibrated(
 def _discrepant(
     problem: Problem, last: Step, w: Array, spread: Spread, noise: Noise, progress: Progress
 ) -> tuple[Problem, Step, Array, Spread, Noise]:
-    """Return the fit with a discrepancy in a smooth noise where its evidence is greater, else as it was.
-
-    A first look at twice three steps decides whether it is worth a search.
-    """
+    """Return the fit with a discrepancy in a smooth noise where its evidence is greater, else as it was; a
+    first look at twice three steps decides whether a search is worth it."""
     bare = problem, last, w, spread, noise
     least = _log_evidence(problem, last, noise)
     problem, theta = _with_discrepancy(problem, last.theta)

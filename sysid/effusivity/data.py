@@ -157,10 +157,8 @@ def touches(
 
 
 def object_range(grasps: Grasps, stated: tuple[float, float] | None = None) -> Array:
-    """Return between what an object of unknown temperature may be, (n_grasp, 2) [degC].
-
-    As ``stated``, or 20 K about the room, or about the skin where no room is known.
-    """
+    """Return between what an object of unknown temperature may be, (n_grasp, 2) [degC]: as ``stated``,
+    or 20 K about the room, or about the skin where no room is known."""
     n = grasps.sizes["grasp"]
     if stated is not None:
         low, high = stated
@@ -176,10 +174,8 @@ def object_range(grasps: Grasps, stated: tuple[float, float] | None = None) -> A
 
 
 def with_object_range(grasps: Grasps, stated: tuple[float, float] | None) -> Grasps:
-    """Return a record whose unknown object temperatures have the mean and the sd of a stated range.
-
-    Every temperature of the range is as likely as another: the sd is its width over the root of twelve.
-    """
+    """Return a record whose unknown object temperatures have the mean and the sd (width over the root of
+    twelve) of a stated range in which all are equally likely."""
     if stated is None:
         return grasps
     ends = object_range(grasps, stated)

@@ -74,13 +74,10 @@ def stack_of(theta: Array) -> Stack:
 
 @dataclass(frozen=True)
 class ParameterCovariance:
-    """``covariance`` (n, n) of the estimates called ``names`` (n,).
+    """Covariance of the estimates of a calibration."""
 
-    Names are those of :data:`SHARED_NAMES`, then ``ln_h LABEL`` and ``ln_e LABEL`` of each block.
-    """
-
-    names: tuple[str, ...]
-    covariance: Array = field(compare=False)
+    names: tuple[str, ...]  # of SHARED_NAMES, then "ln_h LABEL" and "ln_e LABEL" of each block
+    covariance: Array = field(compare=False)  # (n, n)
 
     def __post_init__(self) -> None:
         shape = (len(self.names),) * 2

@@ -674,10 +674,8 @@ def fit_candidates(
     gripper: GripperModel, data: Touches, candidates: Sequence[str | Material], finish: str = "known", *,
     start: Array | None = None,
 ) -> tuple[Mode, Prior, NDArray[np.int64]]:  # fmt: skip
-    """Return modes of every touch under every candidate, (n m,) rows; the prior and the touch of each.
-
-    ``start`` (n, m, 7) are nuisances to start from.
-    """
+    """Return modes of every touch under every candidate, (n m,) rows, from nuisances ``start`` (n, m, 7), and
+    the prior and the touch of each."""
     one = material_hypotheses(gripper, candidates, finish)
     n, m = data.level.size, len(candidates)
     row = np.repeat(np.arange(n), m)

@@ -129,10 +129,8 @@ def _predict(
     nodes: Nodes, gripper: Gripper, u: Array, vary: Mask, times: Array, bins: NDArray[np.int64],
     count: Array, t: Array, ramp: Array, room: float, beyond: Array, scratch: _Scratch,
 ) -> None:  # fmt: skip
-    """Fill the bin means that ``u`` predicts, their derivatives by level and T_obj, and those of ``vary``.
-
-    ``beyond`` (2, n_bin) is the gripper's discrepancy: always [K], and per degree between object and skin.
-    """
+    """Fill the bin means that ``u`` predicts, their derivatives by level and T_obj, and those of ``vary``;
+    the gripper's discrepancy ``beyond`` (2, n_bin) is always [K], and per degree between object and skin."""
     curves, far, reading, slopes = scratch.curves, scratch.far, scratch.reading, scratch.slopes
     fill_responses(
         nodes, gripper, u, vary, times, bins, count, scratch.room, scratch.place, scratch.share, curves
@@ -336,10 +334,8 @@ def marginals(
     nodes: Nodes, gripper: Gripper, times: Array, bins: NDArray[np.int64], count: Array, t: Array, y: Array,
     ramp: Array, room: float, beyond: Array, whitener: Array, level_sd: float, t_sd: float, u: Array,
 ) -> Array:  # fmt: skip
-    """Return ln p(y | u) up to a constant for n points ``u`` (n, 7) of one grasp, level and T_obj integrated.
-
-    Their prior means stand in ``u``, their sds are ``level_sd`` and ``t_sd``.
-    """
+    """Return ln p(y | u) up to a constant for n points ``u`` (n, 7) of one grasp, integrated over level and
+    T_obj (prior means in ``u``, sds ``level_sd`` and ``t_sd``)."""
     scratch = _scratch(gripper.sensor.size, nodes[2].size, times.size, y.size)
     vary, sd, result = np.zeros(7, dtype=np.bool_), np.zeros(7), np.empty(u.shape[0])
     matrix, gradient = np.zeros((7, 7)), np.zeros(7)
@@ -360,10 +356,8 @@ def readings(
     nodes: Nodes, gripper: Gripper, times: Array, bins: NDArray[np.int64], count: Array, t: Array,
     ramp: Array, room: Array, beyond: Array, u: Array, vary: Mask,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Return the bin means (n, n_bin) that ``u`` (n, 7) predicts of n touches, and their derivatives.
-
-    Those are (n, n_bin, 7), zero where not ``vary`` (n, 7).
-    """
+    """Return the bin means (n, n_bin) that ``u`` (n, 7) predicts of n touches, and their derivatives (n,
+    n_bin, 7), zero where not ``vary`` (n, 7)."""
     n, n_bin = count.shape
     y, slopes = np.empty((n, n_bin)), np.empty((n, n_bin, 7))
     scratch = _scratch(gripper.sensor.size, nodes[2].size, times.shape[1], n_bin)
@@ -384,10 +378,8 @@ def gripper_readings(
     nodes: Nodes, lam: Array, face: Array, sensor: Array, numbers: Array, times: Array,
     bins: NDArray[np.int64], count: Array, t: Array, ramp: Array, room: float, beyond: Array, u: Array,
 ) -> Array:  # fmt: skip
-    """Return the bin means (n, n_bin) that ``u`` (7,) predicts of one touch by n grippers.
-
-    ``lam``, ``face``, ``sensor`` (n, n_mode) are their modes, ``numbers`` (n, 7) those of their contacts.
-    """
+    """Return the bin means (n, n_bin) that ``u`` (7,) predicts of one touch by n grippers with modes ``lam``,
+    ``face``, ``sensor`` (n, n_mode) and contact ``numbers`` (n, 7)."""
     n, vary = lam.shape[0], np.zeros(7, dtype=np.bool_)
     out = np.empty((n, count.size))
     scratch = _scratch(lam.shape[1], nodes[2].size, times.size, count.size)

@@ -429,10 +429,8 @@ def next_touch_prior(
     gripper: GripperModel, grasps: Grasps, candidates: Sequence[str | Material], *,
     coupling: Coupling | None = None, rest: float = 60.0, finish: str = "known",
 ) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Return the log evidence (m,) from the touches of one block, and the prior of another touch of it.
-
-    That is mean (m, 4) and covariance (m, 4, 4) of its x = (T_obj, ln h, ln e, ln C) after a ``rest`` [s].
-    """
+    """Return the log evidence (m,) from the touches of one block, and the prior mean (m, 4) and covariance
+    (m, 4, 4) of another touch's x = (T_obj, ln h, ln e, ln C) after a ``rest`` [s]."""
     at = _one_block(grasps)
     hypotheses = material_hypotheses(gripper, candidates, finish)
     view = _view(gripper, grasps, hypotheses, coupling or Coupling())
@@ -520,10 +518,8 @@ def _factors(view: _View, groups: list[Rows], found: list[tuple[Array, Array]] |
 
 
 def _prior(view: _View, at: Rows, coupling: Coupling, factor: Factor) -> tuple[Array, Array]:
-    """Return the joint prior of the x of a group's touches.
-
-    How far the block went between them is taken from a first answer, in which none of the way is uncertain.
-    """
+    """Return the joint prior of the x of a group's touches, how far the block went between them as in a first
+    answer, in which none of the way is uncertain."""
     one = view.hypotheses
     m = one.ln_h.size
     touched = prior_of(view.gripper, view.data.take(np.repeat(at[:1], m)), one)

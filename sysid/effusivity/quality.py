@@ -146,10 +146,8 @@ class GraspQuality:
         return np.asarray(chance < _CHANCE)
 
     def usable_grasps(self, grasps: Grasps) -> Grasps | None:
-        """Return the usable grasps with all their samples, None where there are none.
-
-        The ``rest`` before a touch of a block grows by touches that are left out before it.
-        """
+        """Return the usable grasps with all their samples (None where there are none), a block's ``rest``
+        before a touch longer by the touches left out before it."""
         if not self.usable.any():
             return None
         if self.usable.all():

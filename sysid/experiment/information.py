@@ -244,10 +244,8 @@ class ExperimentForecast:
         return _bits(self._gain(u, self._run(u, *self._moved)))
 
     def covariance(self, u: Array, discrepancy: Discrepancy = "rescaled") -> Array:
-        """Return the covariance (n_free, n_free) of theta expected after an experiment u (N, n_u).
-
-        ``discrepancy`` is how large the model discrepancy is in it; see the module.
-        """
+        """Return the covariance (n_free, n_free) of theta expected after an experiment u (N, n_u) in which
+        the model ``discrepancy`` is so large (see the module)."""
         after = self._root @ np.linalg.solve(
             self._gain(u, self._run(u, *self._moved), discrepancy), self._root.T
         )
@@ -269,10 +267,8 @@ class ExperimentForecast:
         return _bits(self._gain(u, y[: len(rows)]))
 
     def _gain(self, u: Array, y: Array, discrepancy: Discrepancy = "rescaled") -> Array:
-        """Return the inverse (n_free, n_free) of the covariance after an experiment, where it is 1 now.
-
-        ``y`` are the outputs of the plant and of what was moved.
-        """
+        """Return the inverse (n_free, n_free) of the covariance after an experiment, where it is 1 now, from
+        the outputs ``y`` of the plant and of what was moved."""
         n = len(self.plant.free)
         change = np.nan_to_num(y[1:, 1:] - y[0, 1:])
         slopes = change[:n] / self._steps[:, None, None]

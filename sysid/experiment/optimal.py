@@ -68,10 +68,8 @@ class Expectation:
 
 
 def expect(plant: Plant, schedules: Mapping[str, Log], *, room: float = ROOM) -> Expectation:
-    """Return what each schedule is expected to leave of a plant's uncertainty, from rest at ``room`` degC.
-
-    A UserError where the plant has no covariance, or a schedule, on the plant's step, lacks an input.
-    """
+    """Return what each schedule is expected to leave of a plant's uncertainty, from rest at ``room`` degC; a
+    UserError where the plant has no covariance, or a schedule, on the plant's step, lacks an input."""
     forecast = ExperimentForecast(plant, room=room, draws=0)
     inputs = {name: inputs_of(plant, log) for name, log in schedules.items()}
     bits = {"now": 0.0} | {name: forecast.bits(u) for name, u in inputs.items()}

@@ -103,10 +103,8 @@ def excite(
 
 
 def prbs(n: int, *, hold: int, seed: int = 0) -> Array:
-    """Return n samples of a maximum-length sequence of +-1, each bit held for ``hold`` samples.
-
-    The register has as many bits as one full period within n samples allows (3 to 10).
-    """
+    """Return n samples of a maximum-length sequence of +-1, each bit held for ``hold`` samples, from as many
+    register bits (3 to 10) as let one full period fit."""
     from scipy.signal import max_len_seq  # slow to import, and the other schedules do without
 
     bits = max(3, min(10, int(np.floor(np.log2(max(n / hold, 7) + 1)))))

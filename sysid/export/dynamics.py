@@ -105,19 +105,15 @@ class Dynamics:
         return np.where(there.any(axis=0), there.argmax(axis=0) * steps * self.dt, np.nan)
 
     def step_response(self, n: int = 300) -> tuple[Array, Estimate]:
-        """Return times (n + 1,) [s] and the response (n + 1, n_y, n_w) to a unit step of each input at 0 s.
-
-        The last time is five of the slowest time constants.
-        """
+        """Return times (n + 1,) [s], to five of the slowest time constants, and the response (n + 1, n_y,
+        n_w) to a unit step of each input at 0 s."""
         steps = self._steps(n)
         time = np.asarray(steps * self.dt * np.arange(n + 1), dtype=float)
         return time, self._estimate(lambda near: _rise(near, steps, n))
 
     def frequency_response(self, n: int = 100) -> tuple[Array, Estimate, Estimate]:
-        """Return frequencies (n,) [rad/s], magnitude and phase [deg] (n, n_y, n_w) from inputs to outputs.
-
-        From a tenth of the slowest pole to the Nyquist frequency of the step.
-        """
+        """Return frequencies (n,) [rad/s], from a tenth of the slowest pole to the step's Nyquist frequency,
+        and magnitude and phase [deg] (n, n_y, n_w) from inputs to outputs."""
         omega = np.geomspace(min(0.1 / self._slowest, 0.1 / self.dt), np.pi / self.dt, n)
 
         def response(near: LinearPlant) -> NDArray[np.complex128]:

@@ -322,10 +322,8 @@ def _proposals(mean: Array, covariance: Array) -> Callable[..., tuple[Array, Arr
 
 
 def _autocorrelation(steps: Array) -> Array:
-    """Return the integrated autocorrelation times, never below one step.
-
-    That of a dimension in which a walker has not moved yet is not known: it counts as the whole chain.
-    """
+    """Return the integrated autocorrelation times, never below one step, and the whole chain for a dimension
+    in which a walker has not moved yet."""
     from emcee.autocorr import integrated_time
 
     with np.errstate(invalid="ignore"):

@@ -51,10 +51,8 @@ _WARM_ROWS = 30  # of a log, from whose readings its start is estimated at least
 
 
 def innovations(errors: Array, *, sd: float, time: float, variance: float, bin_s: float) -> Array:
-    """Return the innovations (k, m) of errors (k, m) in bins of ``bin_s`` [s], in units of their sd.
-
-    ``sd`` and ``time`` [s] are those of the drift, ``variance`` is that of the rest of a bin.
-    """
+    """Return the innovations (k, m) of errors (k, m) in bins of ``bin_s`` [s], in units of their sd, from the
+    drift's ``sd`` and ``time`` [s] and the ``variance`` of the rest of a bin."""
     rho = float(np.exp(-bin_s / time))
     push = (1 - rho**2) * sd**2
     # P^2 + P (r (1 - rho^2) - push) - push r = 0
@@ -179,10 +177,8 @@ class Problem:
         return residual, np.vstack([*(J for _, J in parts), np.eye(len(z))])
 
     def by_log(self, z: Array, *, central: bool = False) -> list[tuple[Array, Array]]:
-        """Return residual (m,) and Jacobian (m, n) of each log, without the prior.
-
-        Central differences cost twice as much and are needed where a null direction is looked for.
-        """
+        """Return residual (m,) and Jacobian (m, n) of each log, without the prior, by ``central`` differences
+        (twice the cost) where a null direction is looked for."""
         sign = np.where(z + _STEP > self.box[1], -1.0, 1.0)  # a step outside the box may not be simulated
         ahead = _STEP * np.diag(sign)
         around = np.vstack([z, z + ahead, z - ahead] if central else [z, z + ahead])

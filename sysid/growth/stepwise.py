@@ -154,8 +154,7 @@ def grow(
 
 def folds_of(model: NetworkModel, logs: Sequence[Log]) -> list[Fold]:
     """Return the folds of some logs: whole logs left out, halves of a log that is alone in something, or
-    blocks.
-    """
+    blocks."""
     if len(logs) < 3:
         return [fold for log in logs for fold in _block_folds(log, [o for o in logs if o is not log])]
     out = []

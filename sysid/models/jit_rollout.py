@@ -288,10 +288,8 @@ def spread(builder: ir.IRBuilder, number: Any) -> Vector:
 
 
 def assemble(module: ir.Module) -> Callable[[str], int]:
-    """Return a function from the names in a module to the addresses of their machine code.
-
-    The code lives as long as what is returned here.
-    """
+    """Return a function from the names in a module to the addresses of their machine code, which lives as
+    long as that function."""
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
     features = binding.get_host_cpu_features().flatten()

@@ -88,10 +88,8 @@ class Model(Protocol):
         ...
 
     def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
-        """Simulate a batch: x0 (B, n_x), u (B|1, N, n_u), d (B|1, N, n_d), p (B|1, n_p).
-
-        Returns y (B, N + 1, n_y), row 0 at x0, and the last state (B, n_x).
-        """
+        """Simulate a batch: x0 (B, n_x), u (B|1, N, n_u), d (B|1, N, n_d), p (B|1, n_p); return y
+        (B, N + 1, n_y), row 0 at x0, and the last state (B, n_x)."""
         ...
 
     def to_dict(self) -> dict[str, Any]:
@@ -197,10 +195,8 @@ FreeRuns = Callable[[GreyModel, Array], list[tuple[str, Array]]]
 
 
 class Described:
-    """The part of a :class:`GreyModel` that its tables answer.
-
-    ``tables`` has ``inputs``, ``disturbances``, ``outputs`` and ``parameters`` by name, ``name`` and ``dt``.
-    """
+    """The part of a :class:`GreyModel` that its tables answer: ``inputs``, ``disturbances``, ``outputs`` and
+    ``parameters`` by name, ``name`` and ``dt``."""
 
     def __init__(self, tables: Any) -> None:
         self.tables = tables

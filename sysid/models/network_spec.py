@@ -135,16 +135,13 @@ class Boundary(_Table):
 
 
 class Link(_Table):
-    """A conductance between two nodes; with the switch off, ``off`` of it is left.
-
-    ``bend`` is the share by which it grows per 10 K of difference, as natural convection does.
-    """
+    """A conductance between two nodes."""
 
     between: Two
     conductance: Name
     switch: Name | None = None
-    off: Name | None = None
-    bend: Name | None = None
+    off: Name | None = None  # the share of it that is left with the switch off
+    bend: Name | None = None  # by which share it grows per 10 K of difference, as natural convection does
 
 
 class Pipe(_Table):

@@ -88,11 +88,8 @@ class SindyModel(BlackBox):
         return np.tile(np.where(np.isfinite(y), y, (self.low + self.high) / 2), self.memory)
 
     def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
-        """Simulate a batch.
-
-        A state that leaves :data:`BOUND` times the range of the data has diverged and is infinite from
-        there on.
-        """
+        """Simulate a batch; a state beyond :data:`BOUND` times the range of the data has diverged and is
+        infinite from there on."""
         x = np.array(x0, dtype=float)
         w = join_columns(np.asarray(u, dtype=float), np.asarray(d, dtype=float))
         n_y, rows, n_x = len(self.outputs), w.shape[1], self.n_x

@@ -533,10 +533,8 @@ class OwnModel(Described):
         return kernel.rollout(x0, u, d, p, dt / n, pieces=n)
 
     def prepared(self, free_runs: FreeRuns, spread: Mapping[str, float], p: Array | None = None) -> OwnModel:
-        """Return the model with steps short enough for these logs, its sensors' sd known.
-
-        The model itself where all that is so already.
-        """
+        """Return the model with steps short enough for these logs and its sensors' sd known, itself where all
+        that is so already."""
         sd = {name: _SENSOR_SHARE * (spread[name] or 1.0) for name in self.outputs}
         model = replace(self, sd=sd)
         at = self.prior if p is None else np.asarray(p, dtype=float)

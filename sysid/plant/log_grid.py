@@ -265,10 +265,8 @@ def bridge(y: Array) -> Array:
 
 
 def whole_readings(segments: Sequence[Segment], deep: int) -> list[Array]:
-    """Return each segment's readings, bridged where less than half of the windows of ``deep`` rows are whole.
-
-    Where enough windows are whole the rest is left out, for a bridge is a guess.
-    """
+    """Return each segment's readings, bridged only where less than half of the windows of ``deep`` rows are
+    whole, for a bridge is a guess; elsewhere the rest is left out."""
     whole = total = 0
     for segment in segments:
         lost = np.cumsum(np.append(0, ~np.isfinite(segment.y).all(axis=1)))
@@ -481,10 +479,8 @@ def misfit(model: Signals, log: Log) -> UserError | None:
 def match_logs(
     model: Signals, logs: Sequence[Log], *, keep_others: bool = False
 ) -> tuple[list[Log], list[str]]:
-    """Return logs in the model's roles and units, and what was converted, a line a column.
-
-    A log that fits as it is is returned itself.
-    """
+    """Return logs in the model's roles and units (one that fits is returned itself), and what was converted,
+    a line a column."""
     known, matched, said = roles_of(model), list(logs), dict[str, None]()
     largest = {name: _largest([column(log, name) for log in logs]) for name in known}
     for at, log in enumerate(logs):
@@ -506,10 +502,8 @@ def match_logs(
 
 
 def _converted(model: Signals, name: str, unit: str, largest: float, log: str) -> tuple[float, str] | None:
-    """Return a signal's factor to the model's unit and a note, None where it is in it; refuse another unit.
-
-    ``largest`` is the greatest size of its values in all logs.
-    """
+    """Return a signal's factor to the model's unit and a note (None where it is in it), given the ``largest``
+    size of its values in all logs; refuse another unit."""
     want = model.units.get(name)
     if want is None or unit == want:
         return None

@@ -145,10 +145,8 @@ def between_runs(plant: Plant, logs: Sequence[Log], gain: float = RUN_GAIN_SD) -
 
 
 def expected_coverage(plant: Plant, level: float = 0.9) -> dict[str, Array]:
-    """Return by output the coverage of each held-out part expected of a band of the other parts.
-
-    Empty for a plant that is no black box.
-    """
+    """Return by output the coverage of each held-out part expected of a band of the other parts, of a black
+    box only."""
     wide = NormalDist().inv_cdf(0.5 + level / 2)
     out = {}
     for name, errors in plant.scores.held_out_by_part.items():

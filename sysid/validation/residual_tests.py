@@ -242,10 +242,8 @@ class ResidualCorrelations:
 def residual_correlations(
     plant: Plant, stretches: Sequence[Stretch], run: Array, scored: Mask, *, warmup: float
 ) -> ResidualCorrelations:
-    """Test the residual of the free ``run`` (n, n_y) of a plant over the stretches of a log, at all rows.
-
-    Empty where the run diverged, has no residual, or has fewer than twenty blocks.
-    """
+    """Test the residual of the free ``run`` (n, n_y) of a plant over the stretches of a log, at all rows;
+    empty where it diverged, has no residual, or has fewer than twenty blocks."""
     residual = _residual(np.concatenate([stretch.y for stretch in stretches]), run, scored)
     rms = np.sqrt(np.nanmean(residual**2, axis=0)) if residual is not None else np.zeros(1)
     if residual is None or not rms.all():
@@ -266,15 +264,11 @@ def residual_correlations(
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """One stretch in blocks, in rms of the residual of each output.
+    """One stretch in blocks, in rms of the residual of each output."""
 
-    ``fixed`` (n, n_y, m) are columns of N that all stretches share, ``starts`` (n, n_y, k) its own;
-    ``tested`` holds x (n, 4) by signal.
-    """
-
-    fixed: Array
-    starts: Array
-    tested: dict[str, Array]
+    fixed: Array  # (n, n_y, m), columns of N that all stretches share
+    starts: Array  # (n, n_y, k), its own columns of N
+    tested: dict[str, Array]  # x (n, 4) by signal
     residual: Array
 
 

@@ -201,10 +201,8 @@ def identify(
 def _sampled(
     plant: Plant, logs: Sequence[Log], out: Path, seed: int, progress: Progress | None
 ) -> tuple[Plant, Posterior | None, str]:
-    """Return the plant with samples of its parameters, their record, and in words why there is none.
-
-    The chain lies beside the plant until it has converged.
-    """
+    """Return the plant with samples of its parameters (beside it until the chain has converged), their
+    record, and in words why there is none."""
     from thermogrip.sysid.greybox.posterior import sample_posterior
     from thermogrip.sysid.identification import NO_DRAWS, no_draws
 

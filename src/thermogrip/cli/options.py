@@ -30,10 +30,8 @@ _CHECKS, _LATER = "thermogrip.checks", "thermogrip.later_checks"
 
 
 class Verb(TyperCommand):
-    """A command whose files are looked for once its words are right, before the verb imports any room.
-
-    First every file is looked for, then plants are looked through.
-    """
+    """A command that looks for every file, then looks plants through, once its words are right and before the
+    verb imports any room."""
 
     def invoke(self, ctx: Any) -> Any:
         """Check the paths that were given, then run the verb."""

@@ -76,10 +76,8 @@ class Console:
 
     @contextmanager
     def progress(self, title: str) -> Iterator[Progress]:
-        """Show a bar on stderr while the block runs; without a terminal, a line whenever the work changes.
-
-        The bar never goes back: where work turns out to be longer than was thought, it waits.
-        """
+        """Show a bar on stderr while the block runs, which waits but never goes back where work turns out
+        longer; without a terminal, a line whenever the work changes."""
         if not sys.stderr.isatty():
             yield _onward(_lines(title))
             return

@@ -251,10 +251,8 @@ def session_sections(
 
 
 def _figures_of(session: Session, controlled: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Return the session's own figures, which the command line prints, where there is one output.
-
-    Of several they are those of the worst.  What never settled has no bias.
-    """
+    """Return the session's own figures, which the command line prints, of its worst output; what never
+    settled has no bias."""
     if len(controlled) != 1:
         return {}
     figures = {"settle_s": session.settle_time, "overshoot": session.overshoot}

@@ -49,15 +49,12 @@ class Commands:
 
 @dataclass(frozen=True)
 class Table:
-    """A table; numbers are shortened to four digits and stand to the right.
-
-    ``dense`` ones have small type and unbroken cells: many columns of numbers with their intervals.
-    """
+    """A table; numbers are shortened to four digits and stand to the right."""
 
     head: tuple[str, ...]
     rows: tuple[tuple[Any, ...], ...]
     caption: str = ""
-    dense: bool = False
+    dense: bool = False  # small type and unbroken cells: many columns of numbers with their intervals
     kind: str = "table"
 
     @property

@@ -43,17 +43,14 @@ LEARNT = 0.9  # share of further copies below which training itself fell short
 
 @dataclass(frozen=True)
 class Case:
-    """One row of the paper's tables.
-
-    ``right`` of ``of`` is what the published accuracy is a fraction of; None where the paper gives no number.
-    """
+    """One row of the paper's tables."""
 
     name: str
     record: str
     t_object: float
     t_gripper: float
     materials: tuple[str, ...]
-    right: int | None
+    right: int | None  # the published accuracy is this of ``of``; None where the paper gives no number
     seconds: float = 10.0
 
     @property
