@@ -1,32 +1,15 @@
 """Clocks of ports, devices and sessions.
 
 Nothing in the rig reads the computer's clock of its own accord; it is given ``clock()`` and
-``sleep(seconds)``.  Hardware gets :func:`time.monotonic` and :func:`time.sleep`; a test gets one of these.
+``sleep(seconds)``.  Hardware gets :func:`time.monotonic` and :func:`time.sleep`.
 """
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable
 
 _LATE_S = 0.5  # work that took longer than this starts a new grid
-
-
-class SteppedClock:
-    """A clock that moves only when somebody sleeps on it, at once. Host and virtual device on one stepped
-    clock run a day in minutes, the same way each time."""
-
-    def __init__(self, start: float = 0.0) -> None:
-        self._now, self._lock = start, threading.Lock()
-
-    def __call__(self) -> float:
-        return self._now
-
-    def sleep(self, seconds: float) -> None:
-        """Let so many seconds pass; rounded to a nanosecond, so that sums of tenths stay tenths."""
-        with self._lock:
-            self._now = round(self._now + max(0.0, seconds), 9)
 
 
 class ScaledClock:

@@ -39,18 +39,18 @@ import numpy as np
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.interface import Controller
-from thermogrip.rig.clock import SteppedClock
 from thermogrip.rig.drivers.thermogrip import DeviceRefusedError, DeviceRig
 from thermogrip.rig.guard.guard import LIMIT_MARGIN, Guard
 from thermogrip.rig.guard.plant_mismatch import PlantDrift
 from thermogrip.rig.records.batch import Trial, good_run, next_folder
 from thermogrip.rig.records.run_folder import RunFolder, read_run
 from thermogrip.rig.session.session import Object, Session, run_session
-from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
+from thermogrip.rig.simulation.virtual_device import VirtualDevice
 from thermogrip.sysid.plant.plant import Plant
 
 sys.path.insert(0, str(Path(__file__).parents[2]))  # the drills are tests
 from tests.rig.fault_injection.drills import drill_plants
+from tests.rig.makers import DirectPort, SteppedClock
 
 MATERIALS = ("copper", "iron", "wood", "aluminium", "glass")
 SENSORS = ("t_surface", "t_tank")

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermogrip.datasets.arrays import Array, Mask
-from thermogrip.datasets.schema import Log, column, make_log, names
+from thermogrip.datasets.schema import Log, column, names
 from thermogrip.mpc.interface import Controller, Move, Readings, Regulator, Target
 from thermogrip.mpc.plant.prediction import PredictionModel
 
@@ -92,17 +92,6 @@ class ClosedLoop:
     def settled(self) -> bool:
         """Whether every segment settled."""
         return all(np.isfinite(segment.settle_s) for segment in self.segments)
-
-    def to_log(self, name: str = "closed loop") -> Log:
-        """Return the run at the controller's samples as a Log, with the readings as outputs."""
-        variables: dict[str, tuple[Array, str, str]] = {}
-        for key, values in self.drive.items():
-            variables[key] = (values, "1", "input")
-        for key, values in self.readings.items():
-            variables[key] = (values, "degC", "output" if key in self.outputs else "disturbance")
-        for key, values in self.target.items():
-            variables[f"target_{key}"] = (values, "degC", "other")
-        return make_log(self.sample_time, variables, name=name)
 
 
 def simulate_closed_loop(

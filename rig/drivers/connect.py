@@ -59,13 +59,12 @@ def open_rig(
 
     Examples
     --------
-    >>> from thermogrip.rig.clock import SteppedClock
-    >>> from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
-    >>> device = VirtualDevice(protocol="tclab", link="none", clock=SteppedClock())
-    >>> rig = open_rig(DirectPort(device))
-    >>> rig.units
+    >>> from thermogrip.rig.simulation.virtual_device import VirtualDevice
+    >>> with VirtualDevice(protocol="tclab", link="socket") as device:
+    ...     rig = open_rig(device.port)
+    ...     rig.units
+    ...     rig.close()
     {'q1': 'percent', 'q2': 'percent'}
-    >>> rig.close()
     """
     port: Port = Port(url, clock=clock) if isinstance(url, str) else url
     port.open()

@@ -1,9 +1,8 @@
 """A device without hardware: either protocol on a pty or a socket, a simulated plant, faults on demand.
 
 The device lives in a thread of its own and moves its plant and its firmware ten times a second of its own
-clock: the computer's, many times that, or one that the host steps (:mod:`~thermogrip.rig.clock`).  What it
-does on a stepped clock depends on no scheduler.  :class:`DirectPort` leaves out thread and cable: the
-quickest.
+clock: the computer's, many times that, or one that the host steps.  What it does on a stepped clock depends
+on no scheduler.  :meth:`VirtualDevice.exchange` leaves out thread and cable: the quickest.
 
 ``trace`` keeps the truth of the last hour (or as many samples as asked), so that a test knows when the
 drive went to zero and how warm it got, whatever the sensors showed.
@@ -25,7 +24,6 @@ from typing import Any
 from thermogrip.rig.clock import ScaledClock
 from thermogrip.rig.firmware.reference import Board, DeviceCore, Outputs, Sensor, Value
 from thermogrip.rig.guard.sensor_checks import room_disturbances
-from thermogrip.rig.serial.port import Port, PortError
 from thermogrip.rig.serial.protocol import Channel
 from thermogrip.rig.simulation.cable import PtyLink, SocketLink, spoil
 from thermogrip.rig.simulation.tclab_firmware import TCLabCore
@@ -216,7 +214,7 @@ class VirtualDevice:
         What it drives; :func:`example_plant` of the protocol where absent.
     protocol : {"thermogrip", "tclab"}, optional
     link : {"pty", "socket", "none"}, optional
-        Where the host finds it; ``none`` is for :class:`DirectPort`.
+        Where the host finds it; ``none`` leaves it to :meth:`exchange`.
     socket_port : int, optional
         TCP port on the loopback address; 0 takes a free one.
     clock : callable, optional
@@ -243,13 +241,11 @@ class VirtualDevice:
 
     Examples
     --------
-    >>> from thermogrip.rig.clock import SteppedClock
-    >>> clock = SteppedClock()
-    >>> device = VirtualDevice(protocol="tclab", link="none", clock=clock, t_start=23.0)
-    >>> port = DirectPort(device)
-    >>> port.write(b"Q1 100\\r\\n"); port.read(0.0)
+    >>> now = [0.0]
+    >>> device = VirtualDevice(protocol="tclab", link="none", clock=lambda: now[0], t_start=23.0)
+    >>> device.exchange(b"Q1 100\\r\\n")
     b'100.000\\r\\n'
-    >>> clock.sleep(60.0)
+    >>> now[0] = 60.0
     >>> device.true_temperatures["t1"] > 30.0
     True
     >>> device.fault("sensor_open", sensor="t1")
@@ -297,7 +293,7 @@ class VirtualDevice:
     def port(self) -> str:
         """What a host opens: the name of the pty or ``socket://127.0.0.1:PORT``."""
         if self._link is None:
-            raise ValueError("this device has no cable; use DirectPort")
+            raise ValueError("this device has no cable: exchange bytes with it")
         return self._link.url
 
     @property
@@ -363,7 +359,7 @@ class VirtualDevice:
     def start(self) -> VirtualDevice:
         """Plug the cable in and serve in a thread."""
         if self._link is None:
-            raise ValueError("this device has no cable; use DirectPort")
+            raise ValueError("this device has no cable: exchange bytes with it")
         self._link.plug()
         self._thread = threading.Thread(target=self._serve, name="virtual device", daemon=True)
         self._thread.start()
@@ -499,48 +495,6 @@ class VirtualDevice:
         return b"".join(
             spoil(line, self._rng) if self._rng.random() < self._garbage else line for line in lines
         )
-
-
-class DirectPort(Port):
-    """A port with no cable, to a device with ``link="none"``."""
-
-    def __init__(self, device: VirtualDevice) -> None:
-        super().__init__("direct")
-        self.device, self._answer = device, b""
-        self._serial, self.opened = device, 1
-
-    def open(self) -> None:
-        """Open it."""
-        if self.device.is_pulled:
-            raise PortError("absent", "is not there", file=self.url, hint="plug the cable in")
-        self.opened += not self.is_open
-        self._serial = self.device
-
-    def close(self) -> None:
-        """Close it."""
-        self._serial, self._answer = None, b""
-
-    def try_open(self) -> bool:
-        """Open it if the cable is in; say whether it is open."""
-        if not self.device.is_pulled:
-            self.open()
-        return self.is_open
-
-    def write(self, data: bytes) -> None:
-        """Let the device hear the bytes."""
-        self._check()
-        self._answer += self.device.exchange(data)
-
-    def read(self, seconds: float) -> bytes:
-        """Return the device's answers; there is nothing to wait for."""
-        self._check()
-        answer, self._answer = self._answer or self.device.exchange(b""), b""
-        return answer
-
-    def _check(self) -> None:
-        if not self.is_open or self.device.is_pulled:
-            self.close()
-            raise PortError("lost", "was lost", file=self.url, hint="check cable and power")
 
 
 def example_plant(protocol: str = "thermogrip", *, room: float | None = None) -> Plant:

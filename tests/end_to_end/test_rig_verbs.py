@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.rig.makers import SteppedClock
 from thermogrip.cli.main import main
 from thermogrip.datasets.log_files import read_log
 from thermogrip.mpc import Controller
-from thermogrip.rig.clock import SteppedClock
 from thermogrip.rig.drivers.connect import open_rig
 from thermogrip.rig.drivers.tclab import TCLabRig
 from thermogrip.rig.simulation.virtual_device import VirtualDevice

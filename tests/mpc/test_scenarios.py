@@ -147,11 +147,6 @@ def test_two_runs_of_one_seed_are_the_same_and_another_seed_is_not(controller, o
     assert np.any(first.readings["t_surface"] != other.readings["t_surface"])
 
 
-def test_the_run_is_a_log(controller, tank):
-    log = run(controller, tank, 28.0, 30.0, 40.0)[0].to_log()
-    assert {"drive", "t_tank", "t_surface", "t_ambient", "target_t_surface"} <= set(log.data_vars)
-
-
 @pytest.mark.parametrize("in_c", [False, True] if compiler() else [False])
 def test_a_skin_whose_sensor_lags_by_10_s_is_found_slower_and_does_not_swing(tank, in_c):
     tank, lag = replace(tank, noise=dict.fromkeys(tank.outputs, 0.02)), 10.0

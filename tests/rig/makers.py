@@ -2,23 +2,81 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from thermogrip.mpc.interface import Move, Readings, Target
-from thermogrip.rig.clock import SteppedClock
 from thermogrip.rig.drivers.tclab import TCLabRig
 from thermogrip.rig.drivers.thermogrip import DeviceRig
 from thermogrip.rig.guard.model_checks import ModelMonitor, Residual
-from thermogrip.rig.serial.port import Port
-from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
+from thermogrip.rig.serial.port import Port, PortError
+from thermogrip.rig.simulation.virtual_device import VirtualDevice
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 
 PATIENCE_S = 60.0  # of a loaded machine; nothing waits so long that goes as it should
 STILL = {"noise": 0.0, "slow_noise": 0.0, "quantum": 0.0}
+
+
+class SteppedClock:
+    """A clock that moves only when somebody sleeps on it, at once. Host and virtual device on one stepped
+    clock run a day in minutes, the same way each time."""
+
+    def __init__(self, start: float = 0.0) -> None:
+        self._now, self._lock = start, threading.Lock()
+
+    def __call__(self) -> float:
+        return self._now
+
+    def sleep(self, seconds: float) -> None:
+        """Let so many seconds pass; rounded to a nanosecond, so that sums of tenths stay tenths."""
+        with self._lock:
+            self._now = round(self._now + max(0.0, seconds), 9)
+
+
+class DirectPort(Port):
+    """A port with no cable, to a device with ``link="none"``."""
+
+    def __init__(self, device: VirtualDevice) -> None:
+        super().__init__("direct")
+        self.device, self._answer = device, b""
+        self._serial, self.opened = device, 1
+
+    def open(self) -> None:
+        """Open it."""
+        if self.device.is_pulled:
+            raise PortError("absent", "is not there", file=self.url, hint="plug the cable in")
+        self.opened += not self.is_open
+        self._serial = self.device
+
+    def close(self) -> None:
+        """Close it."""
+        self._serial, self._answer = None, b""
+
+    def try_open(self) -> bool:
+        """Open it if the cable is in; say whether it is open."""
+        if not self.device.is_pulled:
+            self.open()
+        return self.is_open
+
+    def write(self, data: bytes) -> None:
+        """Let the device hear the bytes."""
+        self._check()
+        self._answer += self.device.exchange(data)
+
+    def read(self, seconds: float) -> bytes:
+        """Return the device's answers; there is nothing to wait for."""
+        self._check()
+        answer, self._answer = self._answer or self.device.exchange(b""), b""
+        return answer
+
+    def _check(self) -> None:
+        if not self.is_open or self.device.is_pulled:
+            self.close()
+            raise PortError("lost", "was lost", file=self.url, hint="check cable and power")
 
 
 def make_lab() -> Plant:

@@ -6,7 +6,8 @@ import time
 
 import pytest
 
-from thermogrip.rig.clock import BackOff, Metronome, ScaledClock, SteppedClock
+from tests.rig.makers import SteppedClock
+from thermogrip.rig.clock import BackOff, Metronome, ScaledClock
 
 
 def test_sums_of_tenths_stay_tenths_a_nanosecond_is_time_and_no_sleep_turns_the_clock_back() -> None:

@@ -9,11 +9,11 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-from thermogrip.rig.clock import SteppedClock
+from tests.rig.makers import DirectPort, SteppedClock
 from thermogrip.rig.drivers.connect import open_rig
 from thermogrip.rig.interface import Rig
 from thermogrip.rig.simulation.twin import Twin
-from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
+from thermogrip.rig.simulation.virtual_device import VirtualDevice
 from thermogrip.sysid.plant.plant import Plant
 
 from .makers import make_lab

@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.rig.makers import make_lab
+from tests.rig.makers import SteppedClock, make_lab
 from tests.rig.session.test_session import steps
 from thermogrip.datasets.log_files import read_log
 from thermogrip.mpc import Controller
-from thermogrip.rig.clock import SteppedClock
 from thermogrip.rig.drivers.connect import open_rig
 from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.records.run_folder import RunFolder

@@ -46,8 +46,8 @@ print("imported", main(["virtual", "--pty", "--seconds", "0"]))
 
 SOCKET = """
 import json
+from tests.rig.makers import SteppedClock
 from thermogrip.datasets.errors import UserError
-from thermogrip.rig.clock import SteppedClock
 from thermogrip.rig.drivers.connect import open_rig
 from thermogrip.rig.session.session import play
 from thermogrip.rig.records.run_folder import RunFolder
@@ -74,16 +74,17 @@ run = read_run(sys.argv[2])
 print(ended or "played", run.log.sizes["time"] == log.sizes["time"], run.lost)
 """
 
+ROOT = Path(__file__).parents[2]
 NO_PTY = "this system has no pseudo-terminals; serve a socket: --socket PORT, or link='socket'"
 
 
 def run(script: str, *words: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-c", LACKING + script, *words]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
 
 
 def test_every_module_imports_without_posix_terminals_and_locks_and_the_verb_refuses_a_pty() -> None:
-    done = run(IMPORTS, str(Path(__file__).parents[2]))
+    done = run(IMPORTS, str(ROOT))
     assert done.returncode == 0, done.stderr
     assert done.stdout == "imported 2\n"
     assert done.stderr == f"thermogrip: {NO_PTY}\n"

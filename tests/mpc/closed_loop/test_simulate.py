@@ -238,15 +238,6 @@ def test_a_schedule_is_recorded_segment_by_segment() -> None:
     assert first.overshoot == pytest.approx(top - 30.0)
     assert run.drive["q"].tolist() == [1.0] * 5 + [0.0] * 10
     assert run.drive_range == {"q": (-1.0, 1.0)}
-    log = run.to_log("by hand")
-    kinds = {str(name): (part.units, part.role) for name, part in log.data_vars.items()}
-    assert kinds == {
-        "q": ("1", "input"), "a": ("degC", "output"), "b": ("degC", "output"),
-        "t_ambient": ("degC", "disturbance"), "target_a": ("degC", "other"),
-    }  # fmt: skip
-    assert log["a"].values.tolist() == run.readings["a"].tolist()
-    assert log["time"].values.tolist() == run.sample_time.tolist()
-    assert log.attrs["name"] == "by hand"
 
 
 # ---- a session ----

@@ -8,17 +8,16 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from tests.rig.makers import Bench, Constant, make_lab
+from tests.rig.makers import Bench, Constant, DirectPort, SteppedClock, make_lab
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.interface import Move, Readings, Target
-from thermogrip.rig.clock import SteppedClock
 from thermogrip.rig.drivers.connect import open_rig
 from thermogrip.rig.drivers.tclab import TCLabRig
 from thermogrip.rig.interface import DeviceRefusedError
 from thermogrip.rig.serial.port import PortError
 from thermogrip.rig.session.session import run_session
 from thermogrip.rig.simulation.tclab_firmware import LSB, TCLAB_VERSION, TCLabCore
-from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
+from thermogrip.rig.simulation.virtual_device import VirtualDevice
 
 OFF = {"q1": 0.0, "q2": 0.0}
 HALF = {"q1": 50.0, "q2": 0.0}

@@ -16,9 +16,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.rig.makers import PATIENCE_S, Bench, Constant, make_lab
+from tests.rig.makers import PATIENCE_S, Bench, Constant, DirectPort, SteppedClock, make_lab
 from thermogrip.datasets.errors import UserError
-from thermogrip.rig.clock import SteppedClock
 from thermogrip.rig.drivers.background_sampler import Sampler
 from thermogrip.rig.drivers.connect import open_rig, recognise
 from thermogrip.rig.drivers.thermogrip import TTL_S, DeviceClock, DeviceRig, Gathering
@@ -26,7 +25,7 @@ from thermogrip.rig.interface import DeviceRefusedError, Reading
 from thermogrip.rig.serial.port import PortError
 from thermogrip.rig.serial.protocol import Kept, Request, Taken, parse_request
 from thermogrip.rig.session.session import run_session
-from thermogrip.rig.simulation.virtual_device import DirectPort, VirtualDevice
+from thermogrip.rig.simulation.virtual_device import VirtualDevice
 from thermogrip.sysid.plant.plant import Plant
 
 DT = 0.01

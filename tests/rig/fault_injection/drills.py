@@ -29,8 +29,8 @@ from typing import Any
 
 import numpy as np
 
+from tests.rig.makers import SteppedClock
 from thermogrip.mpc.interface import Controller
-from thermogrip.rig.clock import SteppedClock
 from thermogrip.rig.drivers.thermogrip import DeviceRig
 from thermogrip.rig.guard.guard import Guard, GuardSettings
 from thermogrip.rig.guard.plant_mismatch import PlantDrift

@@ -14,9 +14,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.rig.makers import PATIENCE_S
+from tests.rig.makers import PATIENCE_S, SteppedClock
 from thermogrip.datasets.errors import UserError
-from thermogrip.rig.clock import SteppedClock
 from thermogrip.rig.interface import Event
 from thermogrip.rig.records.rosbridge import Bridge, Messages
 from thermogrip.rig.session.session import run_session

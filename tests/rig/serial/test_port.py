@@ -14,9 +14,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from tests.rig.makers import PATIENCE_S, make_lab
+from tests.rig.makers import PATIENCE_S, SteppedClock, make_lab
 from thermogrip.datasets.errors import UserError
-from thermogrip.rig.clock import SteppedClock
 from thermogrip.rig.serial.port import FIRST_WAIT_S, LONGEST_WAIT_S, Port, PortError, PortLock, port_error
 from thermogrip.rig.simulation.cable import PtyLink, SocketLink
 from thermogrip.rig.simulation.virtual_device import VirtualDevice

@@ -6,13 +6,13 @@ import time
 
 import pytest
 
-from tests.rig.makers import PATIENCE_S, STILL, Bench, make_lab
-from thermogrip.rig.clock import ScaledClock, SteppedClock
+from tests.rig.makers import PATIENCE_S, STILL, Bench, DirectPort, SteppedClock, make_lab
+from thermogrip.rig.clock import ScaledClock
 from thermogrip.rig.drivers.thermogrip import DeviceRig
 from thermogrip.rig.firmware.reference import Board, Sensor
 from thermogrip.rig.serial.port import Port, PortError
 from thermogrip.rig.serial.protocol import Channel
-from thermogrip.rig.simulation.virtual_device import FAULTS, DirectPort, VirtualDevice, example_plant
+from thermogrip.rig.simulation.virtual_device import FAULTS, VirtualDevice, example_plant
 from thermogrip.sysid.plant.plant import Plant
 
 
