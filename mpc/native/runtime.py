@@ -41,16 +41,8 @@ SOURCES = ("tg_qp.h", "tg_qp.c", "tg_controller.h", "tg_controller.c", "tg_obser
 
 # sums may be done in any order and pairs of operations at once; NaN keeps its meaning
 _FLAGS = (
-    "-std=c99",
-    "-O3",
-    "-march=native",
-    "-fno-math-errno",
-    "-fno-trapping-math",
-    "-fno-signed-zeros",
-    "-fassociative-math",
-    "-ffp-contract=fast",
-    "-fPIC",
-    "-shared",
+    *("-std=c99", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros"),
+    *("-fassociative-math", "-ffp-contract=fast", "-fPIC", "-shared"),
 )
 
 
@@ -136,21 +128,10 @@ class _ByStructure:
 @cache
 def _library(path: Path) -> ctypes.CDLL:
     library = ctypes.CDLL(str(path))
-    for name in (
-        "tg_host_x",
-        "tg_host_w",
-        "tg_host_shown",
-        "tg_host_lag",
-        "tg_host_scale",
-        "tg_host_start",
-        "tg_host_P",
-        "tg_host_found_offset",
-        "tg_host_innovation",
-        "tg_host_between",
-    ):
-        getattr(library, name).restype = ctypes.POINTER(ctypes.c_double)
-    for name in ("tg_host_held", "tg_host_lost"):
-        getattr(library, name).restype = ctypes.POINTER(ctypes.c_int)
+    doubles, integers = "x w shown lag scale start P found_offset innovation between", "held lost"
+    for names, kind in ((doubles, ctypes.c_double), (integers, ctypes.c_int)):
+        for name in names.split():
+            getattr(library, f"tg_host_{name}").restype = ctypes.POINTER(kind)
     library.tg_advice_text.restype = ctypes.c_char_p
     library.tg_host_size.restype = library.tg_host_design_size.restype = ctypes.c_long
     return library
