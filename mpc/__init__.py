@@ -2,11 +2,4 @@
 
 from thermogrip import lazy_exports
 
-# doors of 0.1.0, which are found and not listed
-_ALSO = {
-    "closed_loop.simulate": ("ClosedLoop", "Surroundings"),
-    "design.design": ("Design",),
-    "design.spec": ("Spec",),
-}
-
-__all__, __getattr__, __dir__ = lazy_exports(__name__, _ALSO)
+__all__, __getattr__, __dir__ = lazy_exports(__name__)

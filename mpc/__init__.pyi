@@ -1,3 +1,5 @@
+import typing
+
 from thermogrip.mpc.closed_loop.simulate import simulate_closed_loop as simulate_closed_loop
 from thermogrip.mpc.controllers.mpc import Controller as Controller
 from thermogrip.mpc.controllers.mpc import design_controller as design_controller
@@ -11,3 +13,9 @@ from thermogrip.mpc.tuning.design_review import review as review
 from thermogrip.mpc.tuning.figures import closed_loop_figure as closed_loop_figure
 from thermogrip.mpc.tuning.tune import Tuning as Tuning
 from thermogrip.mpc.tuning.tune import tune as tune
+
+if typing.TYPE_CHECKING:  # doors of 0.1.0, which are found and not listed
+    from thermogrip.mpc.closed_loop.simulate import ClosedLoop as ClosedLoop
+    from thermogrip.mpc.closed_loop.simulate import Surroundings as Surroundings
+    from thermogrip.mpc.design.design import Design as Design
+    from thermogrip.mpc.design.spec import Spec as Spec

@@ -7,7 +7,4 @@
 
 from thermogrip import lazy_exports
 
-# doors of 0.1.0, which are found and not listed
-_ALSO = {"data.data_quality": ("check_data",), "effusivity.gripper_model": ("GripperModel",)}
-
-__all__, __getattr__, __dir__ = lazy_exports(__name__, _ALSO)
+__all__, __getattr__, __dir__ = lazy_exports(__name__)

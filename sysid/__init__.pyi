@@ -1,5 +1,7 @@
 from thermogrip.datasets.log_files import read_log as read_log
+from thermogrip.sysid.data.data_quality import check_data as check_data
 from thermogrip.sysid.effusivity.calibration import calibrate_gripper as calibrate_gripper
+from thermogrip.sysid.effusivity.gripper_model import GripperModel as GripperModel
 from thermogrip.sysid.experiment.schedules import excite as excite
 from thermogrip.sysid.export.dynamics import plant_dynamics as plant_dynamics
 from thermogrip.sysid.export.linearise import linearise_plant as linearise_plant

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ast
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -16,22 +16,20 @@ from typing import Any
 __version__ = "0.1.0"
 
 
-def lazy_exports(
-    package: str, also: Mapping[str, Sequence[str]] | None = None
-) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
+def lazy_exports(package: str) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
     """Return ``__all__``, ``__getattr__`` and ``__dir__`` of a package that loads its exports at first use
     (PEP 562): what the ``__init__.pyi`` beside its ``__init__.py`` imports, for type checkers as well.
 
-    ``also`` has names that are found and not listed, by module relative to the package.
+    What the stub imports under ``if typing.TYPE_CHECKING`` is found and not listed.
     """
-    stub = Path(str(sys.modules[package].__file__)).with_suffix(".pyi").read_text(encoding="utf-8")
-    imports = [node for node in ast.parse(stub).body if isinstance(node, ast.ImportFrom)]
-    listed = {alias.name: str(node.module) for node in imports for alias in node.names}
-    home = listed | {name: f".{module}" for module, names in (also or {}).items() for name in names}
+    stub = ast.parse(Path(str(sys.modules[package].__file__)).with_suffix(".pyi").read_text(encoding="utf-8"))
+    imports = [node for node in ast.walk(stub) if isinstance(node, ast.ImportFrom)]
+    home = {alias.name: str(node.module) for node in imports for alias in node.names}
+    listed = sorted(alias.name for node in imports if node in stub.body for alias in node.names)
 
     def load(name: str) -> Any:
         if name not in home:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         return getattr(import_module(home[name], package), name)
 
-    return sorted(listed), load, lambda: sorted(listed)
+    return listed, load, lambda: listed.copy()

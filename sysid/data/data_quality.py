@@ -85,8 +85,38 @@ def check_data(
     disturbances: Sequence[str] | None = None,
     average: float | None = None,
 ) -> DataCheck:
-    """Check logs before a fit, on the grid that it would have; UserError where a signal is missing or too
-    short."""
+    """Check logs before a fit.
+
+    Parameters
+    ----------
+    logs : sequence of Log
+    inputs, outputs, disturbances : sequence of str, optional
+        Names of the signals; by role where absent.
+    average : float, optional
+        Step [s] of the grid for the dynamic checks; chosen from quantum and time constant where absent.
+
+    Returns
+    -------
+    DataCheck
+        Its ``findings``, the worst ``verdict``, and ``of(check)`` for those of one check.
+
+    Raises
+    ------
+    UserError
+        If a signal is missing or every stretch is too short.
+
+    Examples
+    --------
+    An input that never moves cannot be identified from:
+
+    >>> from thermogrip.datasets.schema import make_log
+    >>> t = np.arange(200.0)
+    >>> y = 25 + np.sin(t / 30)
+    >>> log = make_log(t, {"q": (np.full(200, 0.5), "1", "input"), "t": (y, "degC", "output")})
+    >>> found = check_data([log], average=1.0).of("excitation")[0]
+    >>> found.verdict, found.says
+    ('fail', 'q never moves: nothing can be learnt about it')
+    """
     grid = make_grid(logs, inputs=inputs, outputs=outputs, disturbances=disturbances, average=average)
     u, y = grid.inputs, grid.outputs
     found: list[Finding] = []

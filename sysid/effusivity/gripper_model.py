@@ -269,27 +269,56 @@ class Discrepancy:
 
 @dataclass(frozen=True, kw_only=True)
 class GripperModel:
-    """The calibrated gripper (frozen; a JSON file of schema ``thermogrip.device``)."""
+    """The calibrated gripper (frozen; a JSON file of schema ``thermogrip.device``).
+
+    Parameters
+    ----------
+    stack : Stack
+    noise : Noise
+    spreads : Spreads
+    onset : float
+        Mean time of contact after the closed message [s].
+    transit_loss : float
+        Share of the way to room temperature that a block relaxes before contact.
+    bias : float
+        Object temperatures on the sensor's scale minus the nominal ones [K].
+    depth_share, block_length : float
+        A block of this length [m] stores rho c_p block_length depth_share per contact face and degree.
+    ln_h_level, ln_h_slope : float
+        ln h [ln(W m^-2 K^-1)] of a block that was not calibrated is ln_h_level + ln_h_slope (ln e - 9).
+    blocks : mapping of str to Block
+    trained_on : tuple of str
+        Names of the records it was calibrated on.
+    uncertainty : ParameterCovariance, optional
+        Of all these parameters.
+    uncertain : bool, optional
+        Whether answers integrate over the parameters, as ``uncertainty`` says; else they count as exact.
+    second : GripperModel, optional
+        What surrounds a second sensor of the finger (``t_surface_2``), calibrated on the same grasps.
+    discrepancy : Discrepancy, optional
+        What the gripper reads beyond the model, where its calibration found something.
+
+    Raises
+    ------
+    ValueError
+        If the gripper is uncertain and there is no ``uncertainty``.
+    """
 
     stack: Stack
     noise: Noise
     spreads: Spreads
-    onset: float  # mean time of contact after the closed message [s]
-    transit_loss: float  # share of the way to room temperature that a block relaxes before contact
-    bias: float  # object temperatures on the sensor's scale minus the nominal ones [K]
-    depth_share: float  # a block stores rho c_p block_length depth_share per contact face and degree
-    block_length: float  # [m]
-    # ln h [ln(W m^-2 K^-1)] of a block that was not calibrated is ln_h_level + ln_h_slope (ln e - 9)
+    onset: float
+    transit_loss: float
+    bias: float
+    depth_share: float
+    block_length: float
     ln_h_level: float
     ln_h_slope: float
     blocks: Mapping[str, Block]
-    trained_on: tuple[str, ...] = ()  # names of the records it was calibrated on
-    uncertainty: ParameterCovariance | None = None  # of all these parameters
-    # whether answers integrate over the parameters, as ``uncertainty`` says; else they count as exact
+    trained_on: tuple[str, ...] = ()
+    uncertainty: ParameterCovariance | None = None
     uncertain: bool = False
-    # what surrounds a second sensor of the finger (``t_surface_2``), calibrated on the same grasps
     second: GripperModel | None = None
-    # what the gripper reads beyond the model, where its calibration found something
     discrepancy: Discrepancy | None = None
 
     def __post_init__(self) -> None:
