@@ -389,7 +389,7 @@ FLOATS = st.floats(allow_nan=False, allow_infinity=False, width=64)
 @st.composite
 def logs(draw):
     """Logs with any inputs; outputs that no spike rule would touch, with lost samples."""
-    n = draw(st.integers(2, 30))
+    n = draw(st.integers(2, 19))  # of twenty rows and more, a column that is another's copy has no role
     steps = draw(arrays(float, n, elements=st.floats(1e-3, 5.0)))
     base = draw(st.floats(-50, 100))
     t_a = base + draw(arrays(float, n, elements=st.floats(-0.25, 0.25)))
