@@ -363,7 +363,9 @@ def _time_of(
 ) -> tuple[Floats, set[str], list[str]]:
     """Return the time of each row [s], the headers it was read from, and what was taken for it."""
     like = [h for h, (n, unit, _) in read.items() if unit in _TIME_UNITS and _TIME.fullmatch(n)]
-    like.sort(key=lambda header: read[header][0] != "time")
+    # a clock that starts again with each cycle comes after one that does not
+    back = {h for h in like if h in table.numbers and (np.diff(table.numbers[h]) < 0).any()}
+    like.sort(key=lambda header: (header in back, read[header][0] != "time"))
     unnamed = [h for h in [*table.text, *[*table.numbers][:1]] if h not in like and _counts(h, table)]
     if dt is not None:
         instead = f" in place of {', '.join([*like, *unnamed])}" if like or unnamed else ""

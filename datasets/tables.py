@@ -20,6 +20,7 @@ import lzma
 import os
 import re
 import shlex
+import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
@@ -414,15 +415,18 @@ def read_matlab_table(path: str | Path, columns: Sequence[str] | None = None) ->
     if raw[:10] == b"MATLAB 7.3":
         raise UserError("is MATLAB 7.3", file=path, hint="save('x.mat', ..., '-v7') in MATLAB, or export CSV")
     from scipy.io import loadmat
+    from scipy.io.matlab import MatReadWarning
 
     # scipy raises whatever a damaged file makes it stumble over
     with as_user_error(Exception, "is no MATLAB file, or is damaged", file=path, hint="save it again"):
         source: Any = io.BytesIO(_unpacked_matlab(raw, path))  # the stubs know names only
-        found = loadmat(source, simplify_cells=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MatReadWarning)  # of objects without names
+            found = loadmat(source, simplify_cells=True)
     arrays = dict(_matlab_arrays({k: v for k, v in found.items() if not k.startswith("__")}))
     lengths = [values.shape[0] for values in arrays.values() for _ in range(values.shape[1])]
     if not lengths:
-        hint = "save the signals as vectors or a matrix"
+        hint = "save the signals as vectors or a matrix (timeseries and tables are objects of MATLAB's own)"
         raise UserError("has no columns of numbers", file=path, hint=hint)
     n = max(set(lengths), key=lambda length: (length * lengths.count(length), length))
     parts = {name: values for name, values in arrays.items() if values.shape[0] == n}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import lzma
 import pickle
+import re
 import sys
 import zipfile
 
@@ -378,6 +379,14 @@ def test_a_clock_of_seconds_since_1970_starts_at_the_first_row_and_a_late_start_
     millis = read_log(write(HEAD.replace("time_s", "time_ms") + late.replace(".5,0.5", "500,0.5")))
     assert millis["time"].values.tolist() == [0.0, 1.0, 2.0, 3.0]
     assert read_log(write(HEAD + "1e6,0.5,25\n1000001,0.5,26\n"))["time"].values[0] == 1e6
+
+
+def test_of_two_times_the_one_that_starts_again_with_each_cycle_is_not_taken(write):
+    rows = "".join(f"{k % 5},{1683363163 + k}000000000,{k % 3},{25 + k / 10}\n" for k in range(30))
+    log = read_log(write("Time,Time(ns),Q1,T1\n" + rows))
+    assert log["time"].values.tolist() == list(range(30))
+    with pytest.raises(UserError, match="time runs back from 4 s to 0 s"):
+        read_log(write("Time,Q1,T1\n" + re.sub(r",\d+000000000", "", rows)))
 
 
 ENDINGS = [".csv", ".csv.gz", ".csv.xz", ".nc", ".parquet"]
