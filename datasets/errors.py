@@ -7,8 +7,9 @@ prints its one line and exits with code 2.  Any other exception is our bug and e
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +78,18 @@ def as_user_error(
         raise
     except kinds as error:
         raise UserError(problem.replace("{error}", str(error)[:200]), **where) from error
+
+
+def known_names(name: object, known: Iterable[str], words: str = "use {}") -> str:
+    """Return a hint with the known names in place of the braces, and at its end the one most like ``name``.
+
+    >>> known_names("Drvie", ["drive", "pump"], "it has {}")
+    "it has drive, pump; did you mean 'drive'?"
+    """
+    by_lower = {each.lower(): each for each in known}
+    near = get_close_matches(str(name).lower(), by_lower, 1, 0.65)
+    meant = f"did you mean {by_lower[near[0]]!r}?" if near else ""
+    return "; ".join(filter(None, (words.format(", ".join(by_lower.values())), meant)))
 
 
 def os_fault(error: OSError, path: str | Path) -> UserError:

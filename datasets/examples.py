@@ -13,7 +13,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from thermogrip.datasets.atomic_files import write_atomic
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.grasp_files import read_grasps
 from thermogrip.datasets.log_files import read_log
 from thermogrip.datasets.schema import Grasps, Log
@@ -47,8 +47,8 @@ def example_path(name: str) -> Path:
     """
     path = _folder() / f"{name}.csv.xz"
     if not path.is_file():
-        have = ", ".join([*EXAMPLE_LOGS, *example_grasps()])
-        raise UserError(f"no example {name!r}", hint=f"there are {have}")
+        known = [*EXAMPLE_LOGS, *example_grasps()]
+        raise UserError(f"no example {name!r}", hint=known_names(name, known, "there are {}"))
     return path
 
 

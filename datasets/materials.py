@@ -25,7 +25,7 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
-from thermogrip.datasets.errors import UserError, as_user_error
+from thermogrip.datasets.errors import UserError, as_user_error, known_names
 
 # kind -> (k [W/mK], rho [kg/m3], c_p [J/kgK]), each (least, greatest) near room temperature
 KINDS: dict[str, tuple[tuple[float, float], tuple[float, float], tuple[float, float]]] = {
@@ -134,8 +134,7 @@ def _material(row: dict[str, str], at: dict[str, Any]) -> Material:
         raise UserError(problem, **at, column="effusivity", hint="check the four numbers of the row")
     kind = row.get("kind") or ""
     if kind not in KINDS:
-        hint = f"use one of {', '.join(KINDS)}"
-        raise UserError(f"kind {kind!r} is unknown", **at, column="kind", hint=hint)
+        raise UserError(f"kind {kind!r} is unknown", **at, column="kind", hint=known_names(kind, KINDS))
     for name, (least, greatest) in zip(("k", "rho", "c_p"), KINDS[kind], strict=True):
         if not least <= numbers[name] <= greatest:
             problem = f"{numbers[name]:g} is outside {least:g} to {greatest:g}, where a {kind} can be"

@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.atomic_files import read_bytes, read_toml
-from thermogrip.datasets.errors import UserError, as_user_error, os_fault
+from thermogrip.datasets.errors import UserError, as_user_error, known_names, os_fault
 from thermogrip.datasets.limits import Unpacker, check_size, check_source
 from thermogrip.datasets.schema import ROLES
 from thermogrip.datasets.tables import Table, file_stem
@@ -90,7 +90,7 @@ def read_topic_map(path: str | Path) -> TopicMap:
     columns = {name: _column(name, entry, path) for name, entry in content["columns"].items()}
     clock, stamp = str(content.get("clock", "")), str(content.get("stamp", "log"))
     if clock and clock not in columns:
-        raise UserError(f"clock {clock!r} is no column", file=path, hint=f"use one of {', '.join(columns)}")
+        raise UserError(f"clock {clock!r} is no column", file=path, hint=known_names(clock, columns))
     if stamp not in ("log", "header"):
         raise UserError(f"stamp {stamp!r} is unknown", file=path, hint="use log or header")
     return TopicMap(columns, clock, stamp)
@@ -104,7 +104,7 @@ def _column(name: str, entry: Any, path: str | Path) -> Column:
         problem = f"unit {unit!r} is unknown"
         raise UserError(problem, file=path, column=name, hint=f"use {' '.join(UNITS)} or 1")
     if role not in (*ROLES, ""):
-        raise UserError(f"role {role!r} is unknown", file=path, column=name, hint=f"use {', '.join(ROLES)}")
+        raise UserError(f"role {role!r} is unknown", file=path, column=name, hint=known_names(role, ROLES))
     return Column(str(entry["topic"]), str(entry.get("field", "data")), unit, role)
 
 

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, known_names
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -141,8 +141,8 @@ def names(log: Log, role: str) -> tuple[str, ...]:
 def column(log: Log, name: str) -> NDArray[np.float64]:
     """Return one variable of the log as a float array of shape (n_time,)."""
     if name not in log:
-        have = ", ".join(str(key) for key in log.data_vars)
-        raise UserError("no such column", file=log_name(log), column=name, hint=f"it has {have}")
+        hint = known_names(name, map(str, log.data_vars), "it has {}")
+        raise UserError("no such column", file=log_name(log), column=name, hint=hint)
     return np.asarray(log[name].values, dtype=float)
 
 
@@ -220,7 +220,7 @@ def make_grasps(
             grasps[key] = ("grasp", np.asarray([str(v) for v in values]))
         else:
             problem = f"a grasp has no {key!r}"
-            raise UserError(problem, hint=f"use {', '.join([*GRASP_NUMBERS, *GRASP_LABELS])}")
+            raise UserError(problem, hint=known_names(key, [*GRASP_NUMBERS, *GRASP_LABELS]))
     grasps.attrs.update(schema="thermogrip.grasps", version=1, name=name)
     check_grasps(grasps)
     return grasps

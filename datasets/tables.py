@@ -47,7 +47,7 @@ from thermogrip.datasets.limits import (
 from thermogrip.datasets.media import from_csv
 from thermogrip.datasets.netcdf import check_netcdf
 from thermogrip.datasets.repair import name_rows
-from thermogrip.datasets.units import read_header
+from thermogrip.datasets.units import find_column, read_header
 
 FORMATS = {
     ".csv": "csv", ".csv.gz": "csv", ".csv.xz": "csv",
@@ -165,6 +165,15 @@ def parse_text(data: bytes, file: str, columns: Sequence[str] | None = None) -> 
     table = _parse_table(data, replace(layout, names=names, notes=notes), file)
     kept = {name: values for name, values in table.numbers.items() if not name.startswith(_LEFT_OUT)}
     return replace(table, numbers=kept)
+
+
+def check_columns(path: Path, names: Sequence[str] | None) -> None:
+    """Refuse names that are no columns of a text table, from its beginning; others pass."""
+    if names and path.is_file() and file_format(path) in ("csv", "text"):
+        headers = find_layout(_any_coding(_text_of(path, _BEGINNING))[0], str(path)).names
+        known = dict.fromkeys((read_header(header, headers)[0] for header in headers), "")
+        for name in names:
+            find_column(name, known, str(path))
 
 
 def find_layout(data: bytes, file: str) -> Layout:

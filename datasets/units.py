@@ -35,7 +35,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.limits import MOST_NUMBER
 
 UNITS = ("degC", "K", "degF", "percent", "V", "A", "W", "s", "ms", "min", "0_255")
@@ -444,4 +444,4 @@ def find_column(entry: str, units: Mapping[str, str], file: str | None = None) -
     for found in (likely & {*units}, {n for n in units if n.lower() in {word.lower() for word in likely}}):
         if len(found) == 1:
             return found.pop()
-    raise UserError("no such column", file=file, column=entry, hint=f"it has {', '.join(units)}")
+    raise UserError("no such column", file=file, column=entry, hint=known_names(entry, units, "it has {}"))

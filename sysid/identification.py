@@ -36,7 +36,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.log_files import as_logs
 from thermogrip.datasets.parallel import Workers, run_parallel
 from thermogrip.datasets.schema import Log, column, log_name, names
@@ -724,7 +724,7 @@ class _Parts:
 def _candidates(models: Sequence[str], network: GreyModel | None) -> list[str]:
     unknown = [name for name in models if name not in MODELS]
     if unknown:
-        raise UserError(f"no model of kind {unknown[0]!r}", hint=f"choose from {', '.join(MODELS)}")
+        raise UserError(f"no model of kind {unknown[0]!r}", hint=known_names(unknown[0], MODELS))
     candidates = [name for name in models if name != "network" or network is not None]
     if not candidates:
         raise UserError("no model is left to fit", hint="name a network, or another model")

@@ -35,7 +35,7 @@ from scipy.special import logsumexp
 
 from thermogrip.classify.estimators.base import Floats, GraspClassifier, Labels, normalised, pick
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.schema import Grasps, Log, make_log, unit_names
 from thermogrip.sysid.effusivity.predictive import PosteriorPredictive, next_touch
 from thermogrip.sysid.effusivity.quality import check_grasps
@@ -330,7 +330,7 @@ def by_plant(
     """
     for name, there in ((output, plant.outputs), ("drive", plant.inputs)):
         if name not in there:
-            raise UserError(f"the plant has no {name!r}", hint=f"it has {', '.join(there)}")
+            raise UserError(f"the plant has no {name!r}", hint=known_names(name, there, "it has {}"))
     low, high = plant.valid.get("drive", (-1.0, 1.0))
 
     def passed(drive: float) -> tuple[Floats, Floats]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, known_names
 
 CLASSIFIERS = {
     "posterior": ("estimators.posterior", "PosteriorClassifier"),
@@ -23,7 +23,7 @@ def check_name(name: str) -> None:
     if name not in CLASSIFIERS:
         raise UserError(
             f"no classifier is called {name!r}",
-            hint=f"use {', '.join(CLASSIFIERS)}, or module:Class of a scikit-learn classifier",
+            hint=known_names(name, CLASSIFIERS, "use {}, or module:Class of a scikit-learn classifier"),
         )
 
 

@@ -26,7 +26,7 @@ from scipy.special import logsumexp
 from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.exceptions import NotFittedError
 
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.schema import (
     GRASP_LABELS,
     GRASP_NUMBERS,
@@ -139,9 +139,8 @@ class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc
         names = known if candidates is None else [str(c) for c in candidates]
         for name in names:
             if name not in known:
-                raise UserError(
-                    f"{name!r} is no class of this classifier", hint=f"it knows {', '.join(known)}"
-                )
+                hint = known_names(name, known, "it knows {}")
+                raise UserError(f"{name!r} is no class of this classifier", hint=hint)
         if not names:
             raise UserError("no candidate is given", hint=f"name some of {', '.join(known)}")
         return names

@@ -32,7 +32,7 @@ from sklearn.base import clone
 from thermogrip.classify.estimators import CLASSIFIERS, check_name
 from thermogrip.classify.estimators.base import Floats, GraspClassifier, Records
 from thermogrip.datasets.atomic_files import make_folder, read_bytes, read_json, write_atomic, write_json
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.schema import Grasps
 
 _SAVED = "posterior, bayes, features-lda, pca-lda, lstm, lstm-paper"
@@ -86,8 +86,8 @@ def make_classifier(
     known = inspect.signature(kind.__init__).parameters
     for key in params:
         if key not in known:
-            have = ", ".join(k for k in known if k != "self")
-            raise UserError(f"{name} has no parameter {key!r}", hint=f"it has {have}")
+            hint = known_names(key, [k for k in known if k != "self"], "it has {}")
+            raise UserError(f"{name} has no parameter {key!r}", hint=hint)
     if quick and "epochs" in known:
         from thermogrip.classify.estimators.lstm import QUICK_EPOCHS
 

@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.limits import LARGEST
 from thermogrip.mpc.estimator.observer import Observer, ObserverNoise, choose_disturbances
 from thermogrip.mpc.plant.prediction import (
@@ -331,7 +331,9 @@ def default_design(
     controlled = default_controlled(plant) if controlled is None else tuple(controlled)
     for name in controlled:
         if name not in plant.outputs:
-            raise UserError(f"the plant has no output {name}", hint=f"it has {', '.join(plant.outputs)}")
+            raise UserError(
+                f"the plant has no output {name}", hint=known_names(name, plant.outputs, "it has {}")
+            )
         low, high = plant.valid.get(name, (-np.inf, np.inf))
         if high - low < _COARSE:
             seen = f"{name} moves by {high - low:.2g} {plant.units.get(name, 'degC')} in the logs"

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from thermogrip.datasets.atomic_files import read_toml
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.limits import LARGEST
 from thermogrip.mpc.design.design import Design, default_design
 from thermogrip.mpc.plant.prediction import drive_names, drive_range
@@ -102,9 +102,8 @@ class Spec(BaseModel):
         wanted = [self.output] if isinstance(self.output, str) else self.output
         for name in wanted or ():
             if name not in plant.outputs:
-                raise UserError(
-                    f"output: the plant has no output {name}", hint=f"it has {', '.join(plant.outputs)}"
-                )
+                hint = known_names(name, plant.outputs, "it has {}")
+                raise UserError(f"output: the plant has no output {name}", hint=hint)
         _check_sample(self, plant)
         design = default_design(
             plant,
@@ -166,9 +165,8 @@ def _limits(spec: Spec, plant: Plant, design: Design) -> dict[str, Range]:
         return {"t_tank": _WATER} if free else {}
     for name, (low, high) in spec.limits.items():
         if name not in plant.outputs:
-            raise UserError(
-                f"limits: the plant has no output {name}", hint=f"it has {', '.join(plant.outputs)}"
-            )
+            hint = known_names(name, plant.outputs, "it has {}")
+            raise UserError(f"limits: the plant has no output {name}", hint=hint)
         beyond = [target for _, target in spec.steps if not low <= target <= high]
         if name in design.controlled and beyond:
             wrong = f"{name} is to stay in {low:g} to {high:g} degC, and a step goes to {beyond[0]:g}"
@@ -213,7 +211,8 @@ def spec_from_dict(content: Mapping[str, Any], *, file: str | Path | None = None
         if first["type"] == "extra_forbidden":
             text = "no such key"
         problem = f"{key}: {text[0].lower()}{text[1:]}" if key else text
-        raise UserError(problem, file=file, hint="the template of 'init spec' shows every key") from error
+        hint = known_names(key, Spec.model_fields, "the template of 'init spec' shows every key")
+        raise UserError(problem, file=file, hint=hint) from error
 
 
 def _by_drive(key: str, value: Any, drives: tuple[str, ...]) -> dict[str, Any]:
@@ -223,5 +222,6 @@ def _by_drive(key: str, value: Any, drives: tuple[str, ...]) -> dict[str, Any]:
         return dict.fromkeys(drives, value)
     for name in value:
         if name not in drives:
-            raise UserError(f"{key}: the plant has no drive {name}", hint=f"it has {', '.join(drives)}")
+            hint = known_names(name, drives, "it has {}")
+            raise UserError(f"{key}: the plant has no drive {name}", hint=hint)
     return dict(value)

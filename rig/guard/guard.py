@@ -46,7 +46,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from math import isfinite
 
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.limits import keyed
 from thermogrip.rig.guard.model_checks import ModelMonitor, ModelSettings, Residual, by_danger
 from thermogrip.rig.guard.plant_mismatch import PlantDrift
@@ -185,7 +185,7 @@ class GuardSettings:
         guarded = [name for name in have if name not in rooms]  # the room's is no reason to stop
         for name in (*self.limits, *(name for pair in self.sensors.pairs for name in pair)):
             if name not in guarded:
-                hint = f"name one of {', '.join(guarded)}"
+                hint = known_names(name, guarded, "name one of {}")
                 raise UserError(f"the rig has no sensor {name!r} to guard", file=self.file or None, hint=hint)
         for name in self.rooms or ():
             if name not in rooms:

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from thermogrip.datasets.atomic_files import read_json, write_json
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.grasp_files import read_grasps, write_grasps
 from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, Grasps, make_grasps
@@ -94,7 +94,7 @@ def read_plan(path: str | Path) -> list[Trial]:
     unknown = sorted(set(table.text) - _KNOWN)
     if unknown or "target_degC" not in table.text or "material" not in table.text:
         problem = f"has the unknown column {unknown[0]!r}" if unknown else "lacks material or target_degC"
-        raise UserError(problem, file=path, row=1, hint=f"use {', '.join(sorted(_KNOWN))}")
+        raise UserError(problem, file=path, row=1, hint=known_names("".join(unknown[:1]), sorted(_KNOWN)))
     trials = []
     for at, line in enumerate(table.lines.tolist()):
         cells = {name: values[at] for name, values in table.text.items() if values[at]}

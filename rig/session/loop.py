@@ -18,7 +18,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.datasets.units import join_header, split_header
 from thermogrip.mpc.interface import Controller, Move, Target
@@ -85,8 +85,8 @@ class Loop:
         self.guard.settings.check_sensors(self.reading.values, self.rooms)
         for name, value in target.items():
             if name not in self.reading.values:
-                have = ", ".join(self.reading.values)
-                raise UserError(f"the rig has no sensor {name!r}", hint=f"set a target for one of {have}")
+                hint = known_names(name, self.reading.values, "set a target for one of {}")
+                raise UserError(f"the rig has no sensor {name!r}", hint=hint)
             lo, hi = self.guard.limits_of(name)
             if not lo <= value <= hi:
                 problem, hint = f"target {value:g} degC is unsafe", f"choose one from {lo:g} to {hi:g} degC"

@@ -56,7 +56,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, Grasps, Log, make_grasps
 from thermogrip.mpc.interface import Controller, Move, Readings, Target
 from thermogrip.rig.guard.guard import Guard
@@ -278,8 +278,8 @@ def _learn(run: Loop) -> None:
 def _check_object(thing: Object | None, run: Loop) -> None:
     """Raise UserError where the object's temperature is to come from a sensor that the rig has not."""
     if thing is not None and isinstance(thing.t_object, str) and thing.t_object not in run.reading.values:
-        have = ", ".join(run.reading.values)
-        raise UserError(f"the rig has no sensor {thing.t_object!r}", hint=f"use one of {have}, or a number")
+        hint = known_names(thing.t_object, run.reading.values, "use one of {}, or a number")
+        raise UserError(f"the rig has no sensor {thing.t_object!r}", hint=hint)
 
 
 def _settle(run: Loop, timeout: float, band: float) -> bool:

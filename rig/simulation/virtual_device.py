@@ -26,20 +26,11 @@ from thermogrip.rig.firmware.reference import Board, DeviceCore, Outputs, Sensor
 from thermogrip.rig.guard.sensor_checks import room_disturbances
 from thermogrip.rig.serial.protocol import Channel
 from thermogrip.rig.simulation.cable import PtyLink, SocketLink, spoil
+from thermogrip.rig.simulation.faults import FAULTS, SENSOR_FAULTS
 from thermogrip.rig.simulation.tclab_firmware import TCLabCore
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.plant.plant import Plant
 
-#: Faults of one sensor, and the option that each takes.
-SENSOR_FAULTS = {
-    "sensor_open": "the wire is broken",
-    "sensor_short": "the wires touch",
-    "sensor_stuck": "it repeats its last value",
-    "sensor_drift": "it leaves the truth by `rate` K/s",
-    "sensor_lag": "it shows what was `seconds` ago",
-    "sensor_offset": "it is off by `kelvin` at once",
-    "sensor_nan": "the device itself reports nonsense (-273.15 degC)",
-}
 _LIMITS = {"t_tank": (2_000, 60_000), "t_surface": (3_000, 55_000)}
 _ABSOLUTE_ZERO = -273_150
 
@@ -188,16 +179,6 @@ def board_of(twin: Twin) -> Board:
 
 
 PROTOCOLS = ("thermogrip", "tclab")
-#: What :meth:`VirtualDevice.fault` knows.
-FAULTS = SENSOR_FAULTS | {
-    "garbage": "each line, either way, is spoilt with probability `rate`",
-    "silence": "its answers are lost",
-    "deaf": "the host's lines are lost",
-    "reset": "it starts anew, for the reason `cause`; happens once",
-    "pump_stall": "the pump has stopped, whatever is commanded",
-    "driver_stuck": "every driver gives `share` (-1 to 1) of its full range while it has a supply",
-    "cable_pulled": "the port vanishes; its drive runs on until it expires",
-}
 _BOARD = {
     "G_amb": 0.013, "G_between": 0.006, "power_1": 0.86, "power_2": 0.61, "lag_1": 16.0, "lag_2": 19.0,
 }  # fmt: skip

@@ -40,7 +40,7 @@ from typing import Any
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.schema import Log
 from thermogrip.sysid.blackbox.arx import arx_family
 from thermogrip.sysid.blackbox.box_jenkins import bj_family
@@ -158,7 +158,7 @@ def fit_black_box(
     ('na 1, nb 1, delay 1', [20.0])
     """
     if kind not in FAMILIES:
-        raise UserError(f"no model of kind {kind!r}", hint=f"choose from {', '.join(BLACK_BOXES)}")
+        raise UserError(f"no model of kind {kind!r}", hint=known_names(kind, BLACK_BOXES))
     family = _of_order(kind, order, delay)
     first = make_grid(logs, inputs=inputs, outputs=outputs, disturbances=disturbances, average=average)
     grids = [first]

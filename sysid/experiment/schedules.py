@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.schema import Log, make_log
 
 KINDS = ("prbs", "multisine", "staircase")
@@ -75,7 +75,7 @@ def excite(
     ([-1.0, 0.0, 1.0], 2400)
     """
     if kind not in KINDS:
-        raise UserError(f"no schedule of kind {kind!r}", hint=f"choose from {', '.join(KINDS)}")
+        raise UserError(f"no schedule of kind {kind!r}", hint=known_names(kind, KINDS))
     if not high > low:
         raise UserError(f"limits {low:g} to {high:g} are empty", hint="give low below high")
     if not (0 < tau_fast < tau_slow and dt > 0 and slew > 0):

@@ -33,7 +33,7 @@ from scipy.linalg import logm
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import atomic_path, write_atomic
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.media import csv_text
 from thermogrip.sysid.models.model import GreyModel
 
@@ -178,8 +178,8 @@ def operating_point(
     given_u, given_d = dict(inputs or {}), dict(disturbances or {})
     for name in (*given_u, *given_d):
         if name not in (plant.inputs if name in given_u else plant.disturbances):
-            known = ", ".join((*plant.inputs, *plant.disturbances))
-            raise UserError(f"the plant has no {name} there", hint=f"its inputs and disturbances are {known}")
+            hint = known_names(name, plant.inputs + plant.disturbances, "its inputs and disturbances are {}")
+            raise UserError(f"the plant has no {name} there", hint=hint)
     u = [given_u.get(name, 1.0 if name in plant.model.switches else 0.0) for name in plant.inputs]
     d = [given_d.get(name, _usual(plant, name)) for name in plant.disturbances]
     return np.array(u, dtype=float), np.array(d, dtype=float)

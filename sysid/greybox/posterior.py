@@ -72,7 +72,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import atomic_path
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.schema import Log, columns, log_name
 from thermogrip.sysid.greybox.noise_model import ErrorModel
 from thermogrip.sysid.greybox.problem import Problem, make_problem
@@ -560,7 +560,7 @@ def _choose(plant: Plant, free: Sequence[str] | None, n: int, spread: Array) -> 
         return sorted(np.argsort(np.diag(spread))[:n].tolist())
     for name in free:
         if name not in plant.free:
-            raise UserError(f"{name!r} is not a free parameter", hint=f"choose from {', '.join(plant.free)}")
+            raise UserError(f"{name!r} is not a free parameter", hint=known_names(name, plant.free))
     if not free:
         raise UserError("no parameter to sample", hint=f"choose from {', '.join(plant.free)}")
     return [plant.free.index(name) for name in dict.fromkeys(free)]

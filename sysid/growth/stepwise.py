@@ -34,7 +34,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.parallel import Progress
 from thermogrip.datasets.resample import cut
 from thermogrip.datasets.schema import Log, column, log_name
@@ -220,7 +220,7 @@ def _moves(log: Log, name: str) -> bool:
 def _wanted(model: NetworkModel, outputs: Sequence[str] | None) -> tuple[str, ...]:
     for name in outputs or ():
         if name not in model.outputs:
-            raise UserError(f"no output {name!r}", hint=f"there are {', '.join(model.outputs)}")
+            raise UserError(f"no output {name!r}", hint=known_names(name, model.outputs, "there are {}"))
     return tuple(outputs or model.outputs)
 
 

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from thermogrip.datasets.arrays import Array, Mask, Run, Values
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.limits import STEP_RANGE, array_within, number_within
 from thermogrip.sysid.models.network_spec import Parameter
 
@@ -152,7 +152,7 @@ def load_model(content: Mapping[str, Any], *, code: Model | None = None) -> Mode
     """Return the model that ``Model.to_dict`` wrote, by its ``kind``."""
     kind = content.get("kind") if isinstance(content, Mapping) else None
     if not isinstance(kind, str) or kind not in _KINDS:
-        raise UserError(f"model of kind {kind!r} is unknown", hint=f"it is one of {', '.join(_KINDS)}")
+        raise UserError(f"model of kind {kind!r} is unknown", hint=known_names(kind, _KINDS))
     if code is not None:
         restored = getattr(code, "restored", None)
         if restored is None or kind != code.kind:

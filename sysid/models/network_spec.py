@@ -9,8 +9,7 @@ say about each other.  Each refusal names the table and the key.
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from importlib import resources
 from math import exp
 from pathlib import Path
@@ -19,7 +18,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from thermogrip.datasets.atomic_files import read_toml
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.limits import LARGEST, STEP_RANGE
 
 _SHARES = {"1": 1.0, "percent": 100.0, "0_255": 255.0}  # full scale of what is a share of it already
@@ -298,8 +297,8 @@ def named_network(name_or_path: str | Path) -> Network:
         with resources.as_file(resources.files("thermogrip.sysid") / "networks" / f"{text}.toml") as path:
             return read_network(path)
     if not text.endswith(".toml") and not Path(text).is_file():
-        known = ", ".join(builtin_networks())
-        raise UserError(f"no network {text!r}", hint=f"name one of {known}, or a TOML file")
+        hint = known_names(text, builtin_networks(), "name one of {}, or a TOML file")
+        raise UserError(f"no network {text!r}", hint=hint)
     return read_network(text)
 
 
@@ -392,7 +391,7 @@ def _reference_faults(network: Network) -> Iterator[tuple[str, str]]:
         for name in names:
             if name not in known[kind]:
                 what = "node" if kind == "place" else kind
-                yield f"{where}: no {what} {name!r}", _near(name, known[kind])
+                yield f"{where}: no {what} {name!r}", known_names(name, known[kind], "there are {}")
         if len(names) == 2 and (names[0] == names[1] or set(names) <= set(outside)):
             yield f"{where}: joins {names[0]} and {names[1]}", "join two places, one of them a node"
 
@@ -402,7 +401,10 @@ def _parameter_faults(network: Network) -> Iterator[tuple[str, str]]:
     for table, key, name in roles(network):
         used.add(name)
         if name not in network.parameters:
-            yield f"{table}.{key}: no parameter {name!r}", _near(name, network.parameters)
+            yield (
+                f"{table}.{key}: no parameter {name!r}",
+                known_names(name, network.parameters, "there are {}"),
+            )
             continue
         parameter = network.parameters[name]
         if parameter.unit != _UNITS[key]:
@@ -417,9 +419,3 @@ def _parameter_faults(network: Network) -> Iterator[tuple[str, str]]:
     for name in network.parameters:
         if name not in used:
             yield f"parameters.{name}: no element names it", "use it or leave it out"
-
-
-def _near(name: str, known: Iterable[str]) -> str:
-    options = list(known)
-    close = difflib.get_close_matches(name, options, n=1)
-    return f"did you mean {close[0]!r}?" if close else f"there are {', '.join(options) or 'none'}"

@@ -69,7 +69,7 @@ from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from thermogrip.datasets.arrays import Array, Run, Values
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.sysid.models.model import Described, FreeRuns, roll_rows
 from thermogrip.sysid.models.network_spec import Parameter
 
@@ -249,7 +249,7 @@ class OwnCode:
         out = {}
         for name, ends in dict(getattr(self.made, "limits", {})).items():
             if name not in self.states:
-                raise self.fault(f"limits {name!r}, which is no state", hint=f"use {', '.join(self.states)}")
+                raise self.fault(f"limits {name!r}, which is no state", hint=known_names(name, self.states))
             try:
                 low, high = ends
                 low = -float("inf") if low is None else float(low)
@@ -305,7 +305,7 @@ def load_object(file: str | Path, name: str) -> Any:
         raise UserError(problem, file=where, hint="correct the file") from error
     if not hasattr(module, name):
         classes = [n for n, item in vars(module).items() if inspect.isclass(item) and hasattr(item, "rhs")]
-        hint = f"it has {', '.join(classes)}" if classes else "name a class that is in it"
+        hint = known_names(name, classes, "it has {}") if classes else "name a class that is in it"
         raise UserError(f"has no {name!r}", file=path, hint=hint)
     return getattr(module, name)
 

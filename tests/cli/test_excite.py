@@ -54,7 +54,7 @@ def test_a_plain_schedule_fits_what_is_known_of_the_plant(
     assert found == {"kind": "prbs", "rows": 3, "out": "s.csv", **answer}
 
 
-@pytest.mark.parametrize(("slew", "hold"), [(None, ()), ("2.5", ("q1", "q2"))])
+@pytest.mark.parametrize(("slew", "hold"), [(None, ()), ("2.5", ("drive", "pump"))])
 def test_the_optimal_schedule_is_reported_beside_the_plain_ones(
     slew: str | None, hold: tuple[str, ...], bench: Bench, stand_in: StandIn
 ) -> None:

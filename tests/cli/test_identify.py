@@ -66,6 +66,8 @@ def room(bench: Bench, stand_in: StandIn, monkeypatch: pytest.MonkeyPatch) -> Si
     idle = ([0.0, 0.0], "1", "other")
     signals = {"t1": ([20.0, 20.0], "degC", "output"), "q1": idle, "q2": idle, "room": idle}
     log = make_log([0.0, 1.0], signals, name="log a")
+    for name in ("good.csv", "two.csv"):
+        bench.write(name, "time_s,q1,q2,t1_degC,room\n0,1,1,20,20\n1,1,1,20,20\n")
     log.attrs["repairs"] = "one row dropped\n\ntwo rows swapped"
 
     def fit(*_: Any, progress: Any, **__: Any) -> SimpleNamespace:
@@ -120,13 +122,13 @@ def test_the_network_is_the_one_asked_for_or_a_shipped_one_whose_columns_the_log
 
 
 def test_words_reach_the_fit_by_their_meaning(room: SimpleNamespace) -> None:
-    words = "good.csv more.csv --network tclab --inputs q1,q2 --outputs T1_degC --disturbances room"
+    words = "good.csv two.csv --network tclab --inputs q1,q2 --outputs T1_degC --disturbances room"
     words += " --models arx,network --average 2.5 --order 2 --delay 3 --leave-one-out"
     words += " --seed 7 --report r.html --workers 3"
     done = room.bench.run("identify", *words.split(), "--out", "p.json")
     assert done.code == 0, done
     words, roles = (("q1", "q2"), ("T1_degC",), ("room",)), (("q1", "q2"), ("t1",), ("room",))
-    assert [call.args for call in room.read] == [("good.csv", *words), ("more.csv", *words)]
+    assert [call.args for call in room.read] == [("good.csv", *words), ("two.csv", *words)]
     assert room.read[0].known == {"q1": "input", "q2": "input", "t1": "output", "t2": "output"}
     [fit] = room.fits
     assert (len(fit.args[0]), fit.args[2:]) == (2, roles)
@@ -447,7 +449,7 @@ def test_names_in_a_table_of_matrices_are_cells_and_no_formulas(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        ("--at q9=3", "the plant has no q9"),
+        ("--at q9=3", "--at 'q9' is unknown; use q1, q2"),
         ("--at q1", "--at 'q1' is no NAME=NUMBER"),
         ("--at q1=hot", "--at 'q1=hot' is no NAME=NUMBER"),
         ("--dt 0.3 --out l.json", "no whole multiple"),

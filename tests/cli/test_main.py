@@ -123,7 +123,7 @@ def test_the_options_of_every_verb_are_those_that_scripts_use() -> None:
 
 def test_no_words_show_the_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 0
-    assert "Commands:" in capsys.readouterr().out
+    assert "On the rig:" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

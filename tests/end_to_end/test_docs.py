@@ -23,8 +23,9 @@ from thermogrip.cli.main import app, main
 ROOT = Path(__file__).parents[2]
 INTRO = """# The command line
 
-What `thermogrip VERB --help` prints. Every verb takes `--json` (one JSON object on stdout and nothing
-else there), all but `recover`, `materials` and `init` take `--seed`. Progress and warnings go to stderr.
+What `thermogrip VERB --help` prints, but for what all verbs share: `-h`, `--json` (one JSON object on stdout
+and nothing else there) and, in all but `recover`, `materials` and `init`, `--seed N`. Progress, warnings and
+what to type next go to stderr. `thermogrip --install-completion` lets the shell complete verbs and options.
 
 | exit code | meaning |
 |---|---|
@@ -40,7 +41,8 @@ def reference() -> str:
     """Return the reference page."""
     parts = [INTRO]
     for command in app.registered_commands:
-        parts.append(f"## {command.name}\n\n```\n{help_of(str(command.name))}\n```\n")
+        text = re.sub(r"\n  (?:--seed N|--json|-h, --help) .*(?:\n {20,}.*)*", "", help_of(str(command.name)))
+        parts.append(f"## {command.name}\n\n```\n{text}\n```\n")
     return "\n".join(parts)
 
 

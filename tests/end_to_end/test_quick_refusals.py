@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from tests.end_to_end.mistakes import MISTAKES, mistaken_folder
+
 HEAVY = ("torch", "sklearn", "numba", "casadi", "xarray", "scipy", "matplotlib")
 ASK = f"""
 import contextlib, io, json, sys
@@ -27,7 +29,7 @@ FILES = {
     "b/batch.json": "{}",
     "deep.json": "[" * 50_000,
     "short.json": '{"schema": "thermogrip.plant", "version": 1}',
-    "c.json": json.dumps(CONTROLLER | {"plant": PLANT}),
+    "c.json": json.dumps(CONTROLLER | {"plant": PLANT, "design": {"dt": 1.0}}),
     "large.json": json.dumps(CONTROLLER | {"plant": PLANT, "design": {"dt": 1e200}}),
     "slow.json": json.dumps(CONTROLLER | {"plant": PLANT, "design": {"dt": 1e9}}),
     "fast.json": json.dumps(CONTROLLER | {"plant": PLANT | {"dt": 1e-9}}),
@@ -38,7 +40,7 @@ FILES = {
 }
 # What is typed there -> what the line says.
 REFUSED = {
-    "classify nomodel x.csv --out p.csv": "nomodel: is not a folder",
+    "classify nomodel x.csv --out p.csv": "nomodel: no such file or folder",
     "classify m nofile.csv --out p.csv": "nofile.csv: no such file or folder",
     "classify m x.csv --known nofile.csv --out p.csv": "nofile.csv: no such file or folder",
     "compare x.csv --by sesion --out o": "--by 'sesion' is unknown; use session, block",
@@ -81,7 +83,7 @@ REFUSED = {
     "identify empty.csv --out p.json": "empty.csv: is empty",
     "identify binary.csv@10:20 --out p.json": "binary.csv: is not text",
     "identify n.toml --out p.json": "n.toml: ending '.toml' is unknown",
-    "simulate c.json n.nc --out s.csv": "c.json: schema is 'thermogrip.controller'",
+    "simulate c.json n.nc --out s.csv": "c.json: is a controller, not a plant",
     "train x.csv --classifier bayes --out o": "x.csv: its meta file is missing",
     "classify m n.nc --out p.csv": "n.nc: is not NetCDF",
     "compare m --out o": "m: holds no grasp files",
@@ -112,22 +114,33 @@ REFUSED = {
 }
 
 
+def told(words: list[str], folder: Path) -> dict[str, str]:
+    """Return the line on stderr of each mistake: one line, code 2, and nothing heavy was imported for it."""
+    ask = [sys.executable, "-c", ASK]
+    done = subprocess.run(
+        ask, input=json.dumps(words), cwd=folder, capture_output=True, text=True, check=True
+    )
+    lines = {}
+    for typed, code, said, loaded in map(json.loads, done.stdout.splitlines()):
+        assert (code, loaded, said.count("\n")) == (2, [], 1), (typed, said)
+        lines[typed] = said
+    assert list(lines) == words
+    return lines
+
+
 def test_a_mistake_in_the_words_costs_no_import_of_a_room(tmp_path: Path) -> None:
     for folder in ("m", "r", "b"):
         (tmp_path / folder).mkdir()
     for name, content in FILES.items():
         (tmp_path / name).write_text(content)
-    done = subprocess.run(
-        [sys.executable, "-c", ASK],
-        input=json.dumps(list(REFUSED)),
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    for line in done.stdout.splitlines():
-        words, code, said, loaded = json.loads(line)
-        assert (code, loaded) == (2, []), words
+    for words, said in told(list(REFUSED), tmp_path).items():
         assert REFUSED[words] in said
-    assert len(done.stdout.splitlines()) == len(REFUSED)
     assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")} == {"m", "r", "b", *FILES}
+
+
+def test_what_people_mistype_is_mended_in_its_line(tmp_path: Path) -> None:
+    mistaken_folder(tmp_path)
+    before = {*tmp_path.rglob("*")}
+    for words, said in told(list(MISTAKES), tmp_path).items():
+        assert MISTAKES[words] in said, words
+    assert {path for path in tmp_path.rglob("*") if path.name != "__pycache__"} == before

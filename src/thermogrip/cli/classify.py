@@ -13,9 +13,8 @@ from thermogrip.cli.options import (
     GraspFiles,
     Seed,
     argument,
+    choices,
     comma,
-    existing_grasps,
-    existing_model,
     flag,
     new_file,
     new_folder,
@@ -127,7 +126,6 @@ def effusivity(
             "--calibrate",
             "GRASPS",
             "Labelled grasps that describe your gripper; may be repeated.",
-            existing_grasps,
         ),
     ] = None,
     between: ObjectRange = None,
@@ -264,7 +262,7 @@ def train(
 
 
 def classify(
-    model_dir: Annotated[Path, argument("MODEL_DIR", "Folder that train wrote.", existing_model)],
+    model_dir: Annotated[Path, argument("MODEL_DIR", "Folder that train wrote.")],
     paths: GraspFiles,
     out: Annotated[Path, option("--out", "FILE.csv", "Where the predictions go.")],
     candidates: Annotated[
@@ -289,7 +287,6 @@ def classify(
             "--known",
             "GRASPS",
             "Labelled grasps of that other gripper, one or more; may be repeated.",
-            existing_grasps,
         ),
     ] = None,
     between: ObjectRange = None,
@@ -308,6 +305,7 @@ def classify(
     """
     stated = _range(between)
     new_file(out, (".csv",))
+    choices("--materials", comma(candidates) or (), model_dir / "classifier.json", "classes")
     from thermogrip.classify.decisions.next_touch import advise_touches
     from thermogrip.classify.decisions.predict import (
         classify_grasps,

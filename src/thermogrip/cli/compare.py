@@ -16,7 +16,6 @@ from thermogrip.cli.options import (
     Seed,
     Workers,
     comma,
-    existing_grasps,
     flag,
     new_folder,
     one_of,
@@ -45,7 +44,7 @@ def compare(
     out: Annotated[Path, option("--out", "DIR", "Where tables and report go.")],
     test: Annotated[
         list[str] | None,
-        option("--test", "GRASPS", "Test on these grasps, not on a split; may be repeated.", existing_grasps),
+        option("--test", "GRASPS", "Test on these grasps, not on a split; may be repeated."),
     ] = None,
     classifiers: Annotated[
         str | None,

@@ -18,9 +18,6 @@ from thermogrip.cli.options import (
     Seed,
     Workers,
     argument,
-    existing,
-    existing_controller,
-    existing_spec,
     find_network,
     flag,
     load_plant,
@@ -35,10 +32,7 @@ from thermogrip.report.console import Console
 if TYPE_CHECKING:
     from thermogrip.mpc.controllers.mpc import Controller
 
-_HELP = "controller.json of tune."
-#: Of verbs that have words to check first; the others look through the file at once.
-ControllerFile = Annotated[Path, argument("CONTROLLER", _HELP, existing)]
-CheckedController = Annotated[Path, argument("CONTROLLER", _HELP, existing_controller)]
+ControllerFile = Annotated[Path, argument("CONTROLLER", "controller.json of tune.")]
 
 
 def tune(
@@ -46,9 +40,7 @@ def tune(
     out: Annotated[Path, option("--out", "FILE.json", "Where the controller goes.")],
     spec: Annotated[
         Path | None,
-        option(
-            "--spec", "SPEC.toml", "What is wanted; `thermogrip init spec` writes one to edit.", existing_spec
-        ),
+        option("--spec", "SPEC.toml", "What is wanted; `thermogrip init spec` writes one to edit."),
     ] = None,
     report: Report = None,
     network: OwnNetwork = None,
@@ -110,7 +102,7 @@ def _naming(spec: Path | None, keys: tuple[str, ...]) -> Iterator[None]:
 
 
 def review(
-    controller: CheckedController,
+    controller: ControllerFile,
     report: Report = None,
     network: OwnNetwork = None,
     seed: Seed = 0,
@@ -140,7 +132,7 @@ def review(
 
 
 def export(
-    controller: CheckedController,
+    controller: ControllerFile,
     out: Annotated[Path, option("--out", "DIR", "Folder of the C files.")],
     check: Annotated[
         bool, flag("--check", "Build it (gcc) and compare it with Python on random states.")

@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 from thermogrip.cli.options import (
     AsJson,
     Seed,
+    choices,
     comma,
-    existing_network,
-    existing_plant,
     find_network,
     load_plant,
     new_file,
@@ -49,7 +48,7 @@ def excite(
     out: Annotated[Path, option("--out", "SCHEDULE.csv", "Where it goes.")],
     plant: Annotated[
         Path | None,
-        option("--plant", "PLANT", "Fit time constants and amplitude to this plant.", existing_plant),
+        option("--plant", "PLANT", "Fit time constants and amplitude to this plant."),
     ] = None,
     network: Annotated[
         str | None,
@@ -57,7 +56,6 @@ def excite(
             "--network",
             "NAME|FILE",
             "Before any log: a network at its priors; with a plant of your own, its FILE.py:CLASS.",
-            existing_network,
         ),
     ] = None,
     lowest: Annotated[float, option("--lowest", "DEGC", "With a plant: no output below this.")] = 5.0,
@@ -72,6 +70,8 @@ def excite(
     """Write an input schedule to identify a plant by.
 
     ``optimal`` shrinks the intervals of the plant's parameters most and says by how much, beforehand."""
+    if plant is not None:
+        choices("--hold", comma(hold) or (), plant, "inputs")
     from thermogrip.datasets.log_files import write_log
     from thermogrip.sysid.experiment.schedules import excite as plain_schedule
 

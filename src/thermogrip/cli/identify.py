@@ -18,9 +18,8 @@ from thermogrip.cli.options import (
     Workers,
     argument,
     choice,
+    choices,
     comma,
-    existing_logs,
-    existing_network,
     find_network,
     flag,
     load_logs,
@@ -79,7 +78,6 @@ def identify(
             "NAME|FILE",
             "A shipped one (init network --like), none, FILE.toml, FILE.py:CLASS (which runs the file); "
             "where absent, the shipped one whose columns the logs have.",
-            existing_network,
         ),
     ] = None,
     inputs: Annotated[str | None, option("--inputs", "A,B", "Columns that are moved.")] = None,
@@ -126,12 +124,18 @@ def identify(
 
         out = Path(f"{file_stem(split_cut(paths[0])[0])}_plant.json")
     new_file(out, (".json",))
+    roles = comma(inputs), comma(outputs), comma(disturbances)
+    if columns is None:
+        from thermogrip.datasets.log_files import split_cut
+        from thermogrip.datasets.tables import check_columns
+
+        for path in paths:
+            check_columns(split_cut(path)[0], [name for names in roles for name in names or ()])
     a_network = "network" in wanted and network != "none"
     named = a_network and bool(network or grow)
     wanted_network = find_network(network or DEFAULT_NETWORK) if named else None
     to_grow = _growable(wanted_network) if grow else None
     console = Console(as_json)
-    roles = comma(inputs), comma(outputs), comma(disturbances)
     from thermogrip.datasets.units import find_column
     from thermogrip.sysid.plant.log_grid import roles_of
 
@@ -408,7 +412,7 @@ def run_answer(name: str, run: FreeRun, band: Band) -> dict[str, Any]:
 
 def simulate(
     plant: PlantFile,
-    path: Annotated[str, argument("LOG", "Inputs and warm-up come from here.", existing_logs)],
+    path: Annotated[str, argument("LOG", "Inputs and warm-up come from here.")],
     out: Annotated[Path, option("--out", "SIM.csv", "Where the log goes.")],
     warmup: Warmup = 5.0,
     bands: Annotated[
@@ -475,13 +479,14 @@ def linearise(
     Gains have 90 % intervals where the plant has draws."""
     if out is not None:
         new_file(out, (".json", ".csv", ".mat"))
+    named = _numbers("--at", at)
+    choices("--at", named, plant, "inputs", "disturbances")
     loaded, console = load_plant(plant, network), Console(as_json)
     from thermogrip.report.html import write_report
     from thermogrip.report.plant import dynamics_section, gain_table, time_constant_words
     from thermogrip.sysid.export.dynamics import plant_dynamics, usual_point
     from thermogrip.sysid.export.linearise import linearise_plant, save_linear
 
-    named = _numbers("--at", at)
     u, d = usual_point(
         loaded,
         {name: value for name, value in named.items() if name not in loaded.disturbances},

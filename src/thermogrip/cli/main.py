@@ -20,19 +20,19 @@ import typer
 
 from thermogrip import __version__
 from thermogrip.cli import classify, compare, control, excite, identify, project, rig
-from thermogrip.cli.options import Verb
-from thermogrip.datasets.errors import UserError, os_fault
+from thermogrip.cli.verbs import Verb, Verbs
+from thermogrip.datasets.errors import UserError, known_names, os_fault
 from thermogrip.datasets.media import printable
 
 OK, BUG, USER, INTERRUPTED = 0, 1, 2, 130
 
 app = typer.Typer(
     name="thermogrip",
-    add_completion=False,
+    cls=Verbs,
     no_args_is_help=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+    context_settings={"help_option_names": ["-h", "--help"]},
     epilog="Exit codes: 0 done; 1 a bug of ours; 2 your input is at fault; 3 done, but the answer is no; "
     "130 Ctrl-C. --debug anywhere shows the traceback of a bug.",
 )
@@ -56,30 +56,13 @@ def _root(
     """
 
 
-for _name, _verb in (
-    ("demo", project.demo),
-    ("identify", identify.identify),
-    ("validate", identify.validate),
-    ("simulate", identify.simulate),
-    ("linearise", identify.linearise),
-    ("excite", excite.excite),
-    ("tune", control.tune),
-    ("review", control.review),
-    ("export", control.export),
-    ("run", rig.run),
-    ("record", rig.record),
-    ("virtual", rig.virtual),
-    ("batch", rig.batch),
-    ("recover", rig.recover),
-    ("effusivity", classify.effusivity),
-    ("train", classify.train),
-    ("classify", classify.classify),
-    ("compare", compare.compare),
-    ("paper", project.paper),
-    ("materials", classify.materials),
-    ("init", project.init),
-):
-    app.command(_name, cls=Verb)(_verb)
+for _verb in (
+    project.demo, identify.identify, identify.validate, identify.simulate, identify.linearise, excite.excite,
+    control.tune, control.review, control.export, rig.run, rig.record, rig.virtual, rig.batch, rig.recover,
+    classify.effusivity, classify.train, classify.classify, compare.compare, project.paper,
+    classify.materials, project.init,
+):  # fmt: skip
+    app.command(_verb.__name__, cls=Verb)(_verb)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -90,7 +73,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"] or ["--help"]
     try:
-        code = app(args=words, prog_name="thermogrip", standalone_mode=False)
+        width = 10_000 if sys.stdout.isatty() else 100  # of help, at most
+        code = app(args=words, prog_name="thermogrip", standalone_mode=False, max_content_width=width)
         sys.stdout.flush()
     except (KeyboardInterrupt, typer.Abort):
         return _fail("stopped by Ctrl-C", INTERRUPTED)
@@ -130,4 +114,7 @@ def _option_line(error: typer.TyperException) -> str:
     """Return what is wrong with an option and where its help is."""
     context = getattr(error, "ctx", None)
     path = context.command_path if context is not None else "thermogrip"
-    return f"{error.format_message().rstrip('.')}; see {path} --help"
+    words, about = error.format_message().rstrip("."), vars(error)
+    if about.get("possibilities"):
+        words = f"{about['message']}; {known_names(about['option_name'], about['possibilities'], '')}"
+    return f"{words}; see {path} --help"

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperCommand
 
-from thermogrip.datasets.errors import UserError
+from thermogrip.cli.kinds import check_exists, check_keys
+from thermogrip.datasets.errors import UserError, known_names
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps, Log
@@ -25,45 +26,14 @@ PROTOCOLS = ("thermogrip", "tclab")
 #: Repairs of one file that are printed.
 SHOWN_REPAIRS = 5
 
-Paths: TypeAlias = "str | Path | list[str] | None"
-_CHECKS, _LATER = "thermogrip.checks", "thermogrip.later_checks"
 
-
-class Verb(TyperCommand):
-    """A command that looks for every file, then looks plants through, once its words are right and before the
-    verb imports any room."""
-
-    def invoke(self, ctx: Any) -> Any:
-        """Check the paths that were given, then run the verb."""
-        for check in (*ctx.meta.get(_CHECKS, ()), *ctx.meta.get(_LATER, ())):
-            check()
-        return super().invoke(ctx)
-
-
-def _asked(check: Callable[[Any], None], when: str = _CHECKS) -> Callable[[typer.Context, Any], Any]:
-    """Return a ``callback=`` that keeps a check of its option's value for :class:`Verb`."""
-
-    def callback(ctx: typer.Context, value: Any) -> Any:
-        ctx.meta.setdefault(when, []).append(lambda: check(value))
-        return value
-
-    return callback
-
-
-def _all_exist(value: Paths) -> None:
-    for path in _each(value):
-        text = str(path)
-        if not (os.path.exists(text) or os.path.exists(text.rpartition("@")[0])):  # LOG@120:1800
-            raise UserError("no such file or folder", file=text, hint="check the path")
-
-
-def _is_plant(path: str | Path) -> None:
+def _is_plant(path: str) -> None:
     from thermogrip.sysid.plant.plant_data import check_plant_file
 
     check_plant_file(path)
 
 
-def _is_controller(path: Path) -> None:
+def _is_controller(path: str) -> None:
     from thermogrip.datasets.limits import STEP_RANGE, number_within
     from thermogrip.sysid.plant.plant_data import check_plant_file
 
@@ -75,48 +45,37 @@ def _is_controller(path: Path) -> None:
         raise UserError(problem, file=path, hint="tune the controller again") from error
 
 
-def _is_spec(path: str | Path) -> None:
-    from thermogrip.datasets.atomic_files import read_toml
+def _is_settings(kind: str) -> Callable[[str], None]:
+    def check(path: str) -> None:
+        from thermogrip.datasets.atomic_files import read_toml
 
-    read_toml(path, hint="'init spec' writes one to edit")
+        check_keys(read_toml(path, hint=f"'init {kind}' writes one to edit"), kind, path)
+
+    return check
 
 
-def _is_log(path: str | Path) -> None:
+def _is_log(path: str) -> None:
     from thermogrip.datasets.log_files import check_log_file
 
     check_log_file(path)
 
 
-def _is_grasps(path: str | Path) -> None:
+def _is_grasps(path: str) -> None:
     from thermogrip.datasets.grasp_files import check_grasp_file
 
     check_grasp_file(path)
 
 
-def _each(value: Paths) -> Sequence[str | Path]:
-    return [value] if isinstance(value, str | Path) else value or ()
-
-
-def _existing_and(check: Callable[[Any], None]) -> Callable[[typer.Context, Any], Any]:
-    """Return a ``callback=`` that asks that files exist and, later, that each passes this check."""
-
-    def each(value: Paths) -> None:
-        for path in _each(value):
-            check(path)
-
-    return lambda ctx, value: existing(ctx, _asked(each, _LATER)(ctx, value))
-
-
-def _is_network(text: str | None) -> None:
-    if text is None or text == "none":
+def _is_network(text: str) -> None:
+    if text == "none":
         return
     file, name = _split_class(text)
+    if name or Path(text).suffix:
+        check_exists(file)
     if not name:
         from thermogrip.sysid.models.network_spec import named_network
 
         named_network(text)
-    elif not Path(file).is_file():
-        raise UserError("no such file", file=file, hint="check the path")
 
 
 def _split_class(text: str) -> tuple[str, str]:
@@ -128,25 +87,21 @@ def _split_class(text: str) -> tuple[str, str]:
     return (file, name) if file.endswith(".py") else (text, "")
 
 
-def _is_new_page(value: Path | None) -> None:
-    if value is not None:
-        new_file(value, (".html",))
+def _is_new_page(value: str) -> None:
+    new_file(Path(value), (".html",))
 
 
-def _is_folder(value: Path | None) -> None:
-    if value is not None and not value.is_dir():
+def _is_folder(value: str) -> None:
+    if not os.path.isdir(value):
         raise UserError("is not a folder", file=value, hint="give the folder that train --out made")
 
 
-existing = _asked(_all_exist)
-existing_network = _asked(_is_network)
-existing_model = _asked(_is_folder)
-existing_plant = _existing_and(_is_plant)
-existing_controller = _existing_and(_is_controller)
-existing_spec = _existing_and(_is_spec)
-existing_logs = _existing_and(_is_log)
-existing_grasps = _existing_and(_is_grasps)
-new_report = _asked(_is_new_page, _LATER)
+#: What is looked at in a file of each kind before a room is imported.
+LOOKS: dict[str, Callable[[str], None]] = {
+    "plant": _is_plant, "controller": _is_controller, "log": _is_log, "grasps": _is_grasps,
+    "network": _is_network, "page": _is_new_page, "classifier": _is_folder,
+    "spec": _is_settings("spec"), "guard": _is_settings("guard"),
+}  # fmt: skip
 
 
 def one_of(option: str, allowed: Sequence[str]) -> Callable[[str | None], str | None]:
@@ -168,7 +123,7 @@ def option(
     max: float | None = None,
 ) -> Any:
     """Return the Typer option of a name, what its value is called, its help, a ``callback=``, its bounds."""
-    return typer.Option(name, metavar=metavar, help=words, callback=check, min=min, max=max)
+    return typer.Option(name, metavar=metavar or "N", help=words, callback=check, min=min, max=max)
 
 
 def flag(name: str, words: str) -> Any:
@@ -188,17 +143,14 @@ Cluster = Annotated[
     str | None,
     option("--cluster", "tcp://HOST:PORT", "Dask cluster that does this work in place of local processes."),
 ]
-Report = Annotated[
-    Path | None, option("--report", "FILE.html", "Also write a one-page report with figures.", new_report)
-]
-PlantFile = Annotated[Path, argument("PLANT", "plant.json of identify.", existing_plant)]
+Report = Annotated[Path | None, option("--report", "FILE.html", "Also write a one-page report with figures.")]
+PlantFile = Annotated[Path, argument("PLANT", "plant.json of identify.")]
 LogFiles = Annotated[
     list[str],
     argument(
         "LOG...",
         "Text, .mat, .xlsx, NetCDF, Parquet; LOG@120:1800 takes seconds 120 to 1800 (either end may be "
         "empty).",
-        existing_logs,
     ),
 ]
 Columns = Annotated[
@@ -211,12 +163,11 @@ OwnNetwork = Annotated[
         "--network",
         "FILE.py:CLASS",
         "The class that the plant was fitted with, where it is your own (which runs the file).",
-        existing_network,
     ),
 ]
 GraspFiles = Annotated[
     list[str],
-    argument("GRASPS...", "Grasp files (CSV with its _meta.csv, or NetCDF) or folders.", existing_grasps),
+    argument("GRASPS...", "Grasp files (CSV with its _meta.csv, or NetCDF) or folders."),
 ]
 
 
@@ -240,8 +191,21 @@ def workers_of(workers: int, cluster: str | None) -> int | str:
 def choice(option: str, value: str, allowed: Sequence[str]) -> str:
     """Return the value if it is one of the allowed, else raise the error that lists them."""
     if value not in allowed:
-        raise UserError(f"{option} {value!r} is unknown", hint=f"use {', '.join(allowed)}")
+        raise UserError(f"{option} {value!r} is unknown", hint=known_names(value, allowed))
     return value
+
+
+def choices(option: str, names: Iterable[str], path: Path, *keys: str) -> None:
+    """Refuse names that a JSON file of ours does not list under these keys, before its reader."""
+    try:
+        content = json.loads(path.read_bytes())
+        for part in ("plant", "model", "network"):
+            content = content.get(part, content)
+        known = [name for key in keys for name in content[key]]
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):  # which the reader explains
+        return
+    for name in names:
+        choice(option, name, known)
 
 
 def new_file(path: Path, suffixes: Sequence[str] = ()) -> Path:

@@ -6,6 +6,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated
 
+from thermogrip.cli.kinds import TEMPLATES, template_text
 from thermogrip.cli.options import (
     AsJson,
     Cluster,
@@ -21,13 +22,6 @@ from thermogrip.cli.options import (
 )
 from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
-
-TEMPLATES = {  # the package and the file of each
-    "spec": ("thermogrip.mpc.design", "spec.toml"),
-    "network": ("thermogrip", "templates/network.toml"),
-    "topics": ("thermogrip.datasets", "data/topics.toml"),
-    "guard": ("thermogrip.rig.guard", "guard.toml"),
-}
 
 
 def demo(
@@ -158,9 +152,9 @@ def _examples(console: Console, folder: Path) -> int:
 
 def _template(what: str, like: str | None) -> str:
     """Return the text of a template, or of a shipped network that one is to start from."""
-    package, name = TEMPLATES[what]
-    if like is not None:
-        from thermogrip.sysid.models.network_spec import builtin_networks
+    if like is None:
+        return template_text(what)
+    from thermogrip.sysid.models.network_spec import builtin_networks
 
-        package, name = "thermogrip.sysid", f"networks/{choice('--like', like, builtin_networks())}.toml"
-    return resources.files(package).joinpath(name).read_text(encoding="utf-8")
+    name = choice("--like", like, builtin_networks())
+    return (resources.files("thermogrip.sysid") / f"networks/{name}.toml").read_text(encoding="utf-8")

@@ -20,9 +20,7 @@ from thermogrip.cli.options import (
     Seed,
     argument,
     choice,
-    existing,
-    existing_model,
-    existing_plant,
+    choices,
     flag,
     load_plant,
     new_file,
@@ -33,6 +31,7 @@ from thermogrip.cli.options import (
 from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
 from thermogrip.rig.session.signals import check_stopped, stop_signals
+from thermogrip.rig.simulation.faults import FAULTS
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
@@ -49,10 +48,16 @@ if TYPE_CHECKING:
 
 LOWEST_TARGET, HIGHEST_TARGET = 10.0, 50.0  # degC, of the skin
 
+
+def _known_material(value: str | None) -> str | None:
+    """Return the name of a material in our table (``callback=``)."""
+    from thermogrip.datasets.materials import find_material
+
+    return None if value is None else find_material(value).name
+
+
 OutOption = Annotated[Path, option("--out", "DIR", "Folder of the run.")]
-TwinOption = Annotated[
-    Path | None, option("--twin", "PLANT", "Simulate this plant; no hardware is opened.", existing_plant)
-]
+TwinOption = Annotated[Path | None, option("--twin", "PLANT", "Simulate this plant; no hardware is opened.")]
 PortOption = Annotated[
     str | None, option("--port", "DEV", "The rig: /dev/ttyACM0, COM3, socket://HOST:PORT.")
 ]
@@ -68,7 +73,9 @@ StartOption = Annotated[
     float | None, option("--from", "DEGC", "Temperature at the start [default: the room's].")
 ]
 ObjOption = Annotated[float | None, option("--object", "DEGC", "Temperature of the object.")]
-MaterialOption = Annotated[str | None, option("--material", "NAME", "Material of the object.")]
+MaterialOption = Annotated[
+    str | None, option("--material", "NAME", "Material of the object.", _known_material)
+]
 GraspTimeOption = Annotated[float, option("--grasp-time", "S", "Recorded time of contact.", min=0.5)]
 StopEarlyOption = Annotated[
     Path | None,
@@ -76,7 +83,6 @@ StopEarlyOption = Annotated[
         "--stop-early",
         "MODEL_DIR",
         "End the contact once this classifier (train --stop-error) has seen enough.",
-        existing_model,
     ),
 ]
 SettleTimeoutOption = Annotated[
@@ -135,6 +141,7 @@ def run(
     """
     wanted, grasp = _targets(target), _what_to_grasp(obj, material)
     one_rig(port, twin)
+    choices("--target", wanted if isinstance(wanted, dict) else (), controller, "outputs")
     from thermogrip.classify.decisions.stopping_rule import session_stop
     from thermogrip.mpc.closed_loop.simulate import RecordedController
     from thermogrip.mpc.tuning.design_review import beyond_logs
@@ -200,7 +207,6 @@ def batch(
         argument(
             "PLAN.csv",
             "A row a grasp: material,t_object_degC,target_degC[,block,repeat,touch_group,...].",
-            existing,
         ),
     ],
     out: Annotated[Path, option("--out", "DIR", "Folder of the batch.")],
@@ -269,7 +275,7 @@ def batch(
 
 @stop_signals()
 def record(
-    schedule: Annotated[str, argument("SCHEDULE", "schedule.csv of excite.", existing)],
+    schedule: Annotated[str, argument("SCHEDULE", "schedule.csv of excite.")],
     port: Annotated[str, option("--port", "DEV", "/dev/ttyACM0, COM3, socket://HOST:PORT.")],
     out: OutOption,
     protocol: ProtocolOption = None,
@@ -314,7 +320,7 @@ def record(
 
 
 def recover(
-    folder: Annotated[Path, argument("DIR", "Folder of a run, or of a batch of runs.", existing)],
+    folder: Annotated[Path, argument("DIR", "Folder of a run, or of a batch of runs.")],
     out: Annotated[
         Path | None,
         option("--out", "FILE", "Also write the run's log: .nc, .parquet, .csv, or .mcap (with ros)."),
@@ -361,7 +367,7 @@ def virtual(
     ] = "thermogrip",
     plant: Annotated[
         Path | None,
-        option("--plant", "PLANT", "plant.json of identify [default: a bundled network].", existing_plant),
+        option("--plant", "PLANT", "plant.json of identify [default: a bundled network]."),
     ] = None,
     pty: Annotated[bool, flag("--pty", "On a pseudo-terminal, as a serial port.")] = False,
     socket: Annotated[
@@ -373,7 +379,8 @@ def virtual(
     obj: ObjOption = None,
     material: MaterialOption = None,
     fault: Annotated[
-        list[str] | None, option("--fault", "S:NAME", "After S seconds let NAME fail; may be repeated.")
+        list[str] | None,
+        option("--fault", "S:NAME", f"After S seconds let one of {', '.join(FAULTS)} fail; may be repeated."),
     ] = None,
     seconds: Annotated[float | None, option("--seconds", "S", "End after this long.", min=0)] = None,
     seed: Seed = 0,
@@ -381,16 +388,15 @@ def virtual(
 ) -> int:
     """Be a device: our firmware or a TCLab, with a simulated plant behind it.
 
-    Prints the name of the port and serves until Ctrl-C. Faults: sensor_open, sensor_short, sensor_stuck,
-    sensor_drift, sensor_lag, garbage, silence, reset, pump_stall, driver_stuck, cable_pulled, ...
+    Prints the name of the port and serves until Ctrl-C.
     """
+    if pty and socket is not None:
+        raise UserError("--pty and --socket are both given", hint="give one")
+    due = sorted(_fault(text) for text in fault or [])
     from thermogrip.rig.clock import ScaledClock
     from thermogrip.rig.simulation.virtual_device import VirtualDevice
     from thermogrip.sysid.plant.plant import Plant
 
-    if pty and socket is not None:
-        raise UserError("--pty and --socket are both given", hint="give one")
-    due = sorted(_fault(text) for text in fault or [])
     device = VirtualDevice(
         None if plant is None else Plant.load(plant),
         protocol=protocol,
@@ -531,15 +537,13 @@ def _said(target: float | dict[str, float]) -> str:
 
 def _what_to_grasp(obj: float | None, material: str | None) -> tuple[str, float] | None:
     """Return material and object temperature, checked, None where nothing is grasped."""
-    from thermogrip.datasets.materials import find_material
-
     if (obj is None) != (material is None):
         raise UserError(
             "one of --object and --material is missing", hint="give both, or none to regulate only"
         )
     if obj is None or material is None:
         return None
-    return find_material(material).name, obj
+    return material, obj
 
 
 def _ready(n: int) -> Callable[[int, Trial], bool]:
@@ -591,8 +595,6 @@ def _run_folders(folder: Path) -> list[Path]:
 
 def _fault(text: str) -> tuple[float, str]:
     """Return when and what, of ``60:sensor_open``."""
-    from thermogrip.rig.simulation.virtual_device import FAULTS
-
     when, _, name = text.partition(":")
     try:
         at = float(when)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.media import panels
 from thermogrip.datasets.schema import Grasps, Log, column, log_name, names
 
@@ -337,7 +337,7 @@ def corner_figure(posterior: Posterior, names: Sequence[str] | None = None) -> F
     names = posterior.sampled if names is None else tuple(names)
     for name in names:
         if name not in posterior.free:
-            raise UserError(f"{name!r} was not sampled", hint=f"choose from {', '.join(posterior.free)}")
+            raise UserError(f"{name!r} was not sampled", hint=known_names(name, posterior.free))
     columns = posterior.samples[:, [posterior.free.index(name) for name in names]]
     n = len(names)
     figure = Figure(figsize=(1.7 * n + 0.6, 1.7 * n + 0.6), layout="constrained")

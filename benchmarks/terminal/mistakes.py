@@ -1,0 +1,54 @@
+"""What each mistake of a command line costs until it is told: seconds of CPU of a process, and its line.
+
+    python benchmarks/terminal/mistakes.py
+
+Each is to be told in less than 0.5 s, with code 2 and the mend of ``tests/end_to_end/mistakes.py``.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from tests.end_to_end.mistakes import MISTAKES, mistaken_folder
+
+SECONDS = 0.5
+
+
+def told(words: str, folder: str) -> tuple[float, int, str]:
+    """Return seconds of CPU, exit code and the line on stderr."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    command = [sys.executable, "-m", "thermogrip", *words.split()]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return spent, done.returncode, done.stderr.strip()
+
+
+def main() -> int:
+    """Print a row a mistake; return how many were not told as they should be."""
+    os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    bad, most = 0, 0.0
+    with tempfile.TemporaryDirectory() as folder:
+        mistaken_folder(Path(folder))
+        told("--help", folder)
+        print("| typed | CPU [s] | told |\n|---|---|---|")
+        for words, mend in MISTAKES.items():
+            spent, code, line = told(words, folder)
+            good = code == 2 and mend in line and "\n" not in line and spent < SECONDS
+            bad, most = bad + (not good), max(most, spent)
+            print(
+                f"| `{words}` | {spent:.2f} | {'' if good else '**'}{line.removeprefix('thermogrip: ')} |",
+                flush=True,
+            )
+    print(f"\n{len(MISTAKES)} mistakes, {bad} not told as they should be, at most {most:.2f} s of CPU")
+    return bad
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,157 @@
+"""What a file is, by its name and its beginning: one of the wrong kind is refused with the verbs it is for.
+
+What a verb takes in a place of its command line is known by what that place is called in its help.  Nothing
+heavy is loaded, and a file that nothing is known of is left to its reader.
+"""
+
+from __future__ import annotations
+
+import gzip
+import lzma
+import os
+import re
+import tomllib
+from collections.abc import Iterator
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from thermogrip.datasets.errors import UserError, known_names
+
+KINDS: dict[str, dict[str, Any]] = tomllib.loads(
+    (resources.files("thermogrip.cli") / "kinds.toml").read_text(encoding="utf-8")
+)
+#: What ``init`` writes.
+TEMPLATES = [kind for kind, about in KINDS.items() if "template" in about]
+_TAKES = {place: kind for kind, about in KINDS.items() for place in about.get("places", ())}
+_INSIDE = {"classifier.json": "classifier", "batch.json": "batch", "run.json": "run", "samples.csv": "run"}
+_PARTS = {"log": "samples.csv", "grasps": "grasps.csv"}  # of a run
+_BOTH = ({"run", "batch"}, {"batch", "grasps"})  # one may be given for the other
+_HEAD = 1 << 16  # bytes that show what a file is
+
+
+def kind_of(path: str | Path) -> str:
+    """Return what a file or folder is, "" where that cannot be told."""
+    if os.path.isdir(path):
+        return next((kind for name, kind in _INSIDE.items() if os.path.isfile(Path(path, name))), "")
+    name = str(path).lower()
+    openers: dict[str, Any] = {".gz": gzip.open, ".xz": lzma.open}
+    try:
+        if not os.path.isfile(path):  # a pipe is read once
+            return ""
+        with openers.get(name[-3:], open)(path, "rb") as stream:
+            head = stream.read(_HEAD)
+    except (OSError, EOFError, lzma.LZMAError):
+        return ""
+    if name.endswith((".csv", ".csv.gz", ".csv.xz")):
+        return _kind_of_table(head)
+    mark = rb"" if name.endswith(".nc") else rb"schema\W+"
+    if schema := re.search(
+        mark + rb"thermogrip\.(plant|controller|classifier|grasps|log|network|topics)\b", head
+    ):
+        return schema[1].decode()
+    return _kind_of_toml(head) if name.endswith(".toml") else ""
+
+
+def _kind_of_table(head: bytes) -> str:
+    """Return what the header of a table says that it is."""
+    lines = (line for line in head.decode("utf-8", "replace").splitlines() if line[:1] not in "#")
+    names = [name.strip(' "').lower() for name in re.split(r"[,;\t]", next(lines, ""))]
+    timed = any(re.match(r"time|stamp|seconds|t$|t_m?s$", name) for name in names)
+    if "grasp_id" in names:
+        return "grasps" if timed else "meta"
+    if {"material", "target_degc"} <= {*names}:
+        return "plan"
+    return "log" if timed and len(names) > 1 else ""
+
+
+def _kind_of_toml(head: bytes) -> str:
+    """Return which template a TOML file has most keys of."""
+    try:
+        keys = {*_keys(tomllib.loads(head.decode()))}
+    except (ValueError, RecursionError):
+        return ""
+    shared = {kind: len(keys & template_keys(kind)) for kind in ("spec", "guard")}
+    kind = max(shared, key=lambda each: shared[each])
+    return kind if shared[kind] > len(keys) / 2 else ""
+
+
+def template_text(kind: str) -> str:
+    """Return the template of a kind of file."""
+    package, name = KINDS[kind]["template"]
+    return resources.files(package).joinpath(name).read_text(encoding="utf-8")
+
+
+def template_keys(kind: str) -> set[str]:
+    """Return the keys and tables that a template shows, those that are commented out among them."""
+    found = re.findall(r"(?m)^(?:# )?(?:\[+(\w+)[\].]|(\w+) += )", template_text(kind))
+    return {table or key for table, key in found}
+
+
+def _keys(content: dict[str, Any]) -> Iterator[str]:
+    """Yield the keys of a TOML file and of its tables."""
+    for key, value in content.items():
+        yield key
+        if key in ("sensors", "model", "no_model") and isinstance(value, dict):
+            yield from value
+
+
+def check_keys(content: dict[str, Any], kind: str, path: str | Path) -> None:
+    """Refuse a key that the template of this kind has not."""
+    known = template_keys(kind)
+    for key in _keys(content):
+        if key not in known:
+            hint = known_names(key, sorted(known), f"'thermogrip init {kind}' shows every key")
+            raise UserError(f"{key}: no such key", file=path, hint=hint)
+
+
+def check_exists(text: str) -> None:
+    """Refuse a file that is not there, with the name of one that is called nearly so."""
+    if os.path.exists(text) or os.path.exists(text.rpartition("@")[0]):  # LOG@120:1800
+        return
+    path = Path(re.sub(r"@[^@/]*:[^@/]*$", "", text))
+    while not path.parent.is_dir():
+        path = path.parent
+    names = os.listdir(path.parent) if os.access(path.parent, os.R_OK) else []
+    same = [name for name in names if name.split(".")[0] == path.name.split(".")[0]]  # but for its ending
+    hint = known_names(path.name, same or names, "check the path")
+    raise UserError("no such file or folder", file=text, hint=hint)
+
+
+def check_kind(ctx: Any, path: str, wanted: str) -> None:
+    """Refuse what is known to be another kind of file, with what to type instead."""
+    found, verb = kind_of(path if os.path.exists(path) else path.rpartition("@")[0]), ctx.command.name
+    if found in ("", wanted) or {found, wanted} in _BOTH:
+        return
+    fits = {name: _places(each, found) for name, each in ctx.parent.command.commands.items()}
+    verbs = [name for name, (_, takes) in fits.items() if takes]
+    hint = KINDS[found].get("hint", f"it is for {', '.join(verbs)}")
+    if wanted in _PARTS and os.path.isfile(part := Path(path, _PARTS[wanted])):
+        hint = f"give {part}"
+    elif verb in verbs:
+        hint = f"write {' '.join([verb, *fits[verb][0]])}"
+    raise UserError(f"is {KINDS[found]['words']}, not {KINDS[wanted]['words']}", file=path, hint=hint)
+
+
+def _places(command: Any, kind: str) -> tuple[list[str], bool]:
+    """Return a verb's arguments with its options for this kind of file, and whether it takes any."""
+    takes = [p for p in command.params if p.name != "out" and _TAKES.get(p.metavar) == kind]
+    first = [p.metavar for p in command.params if p.param_type_name == "argument"]
+    named = [f"{p.opts[0]} {p.metavar}" for p in takes if p.metavar not in first]
+    return first + named, bool(takes)
+
+
+def check_files(ctx: Any) -> list[tuple[str, str]]:
+    """Refuse what is not there or of another kind among what a verb was given; return paths and kinds."""
+    given = []
+    for param in ctx.command.params:
+        kind, value = _TAKES.get(param.metavar, ""), ctx.params.get(param.name)
+        if kind and value and param.name != "out":
+            given += [(str(path), kind) for path in (value if isinstance(value, list | tuple) else [value])]
+    given.sort(key=lambda each: each[1] != "network")  # a misspelt name is refused before files are read
+    there = [(path, kind) for path, kind in given if kind not in ("network", "page") or os.path.isfile(path)]
+    for path, _ in there:
+        check_exists(path)
+    for path, kind in there:
+        check_kind(ctx, path, kind)
+    return given

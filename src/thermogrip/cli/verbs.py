@@ -1,0 +1,75 @@
+"""How a verb looks and ends: its help with examples, its files checked first, and what to type next at last.
+
+``verbs.toml`` has the examples of each verb by job, and the line that comes next.
+"""
+
+from __future__ import annotations
+
+import shlex
+import sys
+import tomllib
+from functools import cache
+from importlib import resources
+from typing import Any
+
+from typer.core import TyperCommand, TyperGroup
+
+from thermogrip.cli.kinds import check_files
+from thermogrip.cli.options import LOOKS
+from thermogrip.datasets.media import printable
+
+
+@cache
+def jobs() -> dict[str, dict[str, list[Any]]]:
+    """Return job -> verb -> two examples and what comes next."""
+    return tomllib.loads((resources.files("thermogrip.cli") / "verbs.toml").read_text(encoding="utf-8"))
+
+
+class Verb(TyperCommand):
+    """A command whose files are looked at once its words are right, before the verb imports any room."""
+
+    def __init__(self, name: str | None, **attrs: Any) -> None:
+        super().__init__(name, **attrs)
+        (*self.examples, self.then) = next(verbs[str(name)] for verbs in jobs().values() if name in verbs)
+        for param in self.params:  # its type stands after an argument, and its metavar says enough
+            if param.param_type_name == "argument":
+                vars(param)["display_type_rich"] = lambda ctx: None
+
+    def invoke(self, ctx: Any) -> Any:
+        """Check what was given, run the verb, and where that went well say on stderr what to type next."""
+        for path, kind in check_files(ctx):
+            if kind in LOOKS:
+                LOOKS[kind](path)
+        code = super().invoke(ctx)
+        if not code and not ctx.params.get("as_json"):
+            sys.stdout.flush()
+            sys.stderr.write(f"next: thermogrip {self.next({k: v for k, v in ctx.params.items() if v})}\n")
+        return code
+
+    def next(self, given: dict[str, Any]) -> str:
+        """Return the command that comes next, with what was given in place of its names."""
+        words = {str(param.name): param.metavar for param in self.params}
+        then = self.then if isinstance(self.then, str) else self.then[given.get("what", "network")]
+        return str(then).format(**words | {k: printable(shlex.quote(str(v))) for k, v in given.items()})
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        """Return the options and each argument once."""
+        return ["[OPTIONS]", *(str(p.metavar) for p in self.params if p.param_type_name == "argument")]
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        """Write two examples and the verb that comes next; a command is one line."""
+        with formatter.section("Examples"):
+            for line in self.examples:
+                formatter.write(f"  thermogrip {line}\n")
+        with formatter.section("Next"):
+            formatter.write(f"  thermogrip {self.next({})}\n")
+
+
+class Verbs(TyperGroup):
+    """The verbs, by job."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write a section a job, each verb with the whole first sentence of its help."""
+        for job, verbs in jobs().items():
+            with formatter.section(job):
+                formatter.write_dl([(name, self.commands[name].get_short_help_str(200)) for name in verbs])
