@@ -15,7 +15,8 @@ import os
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,9 +43,14 @@ from thermogrip.datasets.tables import (
 from thermogrip.datasets.units import rename_hint, split_header, to_record_unit
 
 if TYPE_CHECKING:
+    from pandas import DataFrame
+
     from thermogrip.datasets.schema import Grasps
 
 Floats = NDArray[np.float64]
+#: What is taken for grasps: themselves, long DataFrames, paths of files; one or several.
+Records: TypeAlias = "Grasps | DataFrame | str | Path | Sequence[Grasps | DataFrame | str | Path]"
+_OF_SAMPLES = ("grasp_id", "time", "t_surface", "pump")  # how the columns begin that change in a grasp
 
 # name in the meta file (without unit) -> name in the record
 _FROM_META = {"t_object_nominal": "t_object", "t_gripper_set": "t_gripper"}
@@ -97,6 +103,27 @@ def read_grasps(path: str | Path) -> Grasps:
             problem = f"grasp {grasp!r} has no sample {side} the closed message at 0 s"
             raise UserError(problem, file=path, hint=hint)
     return grasps
+
+
+def as_grasps(grasps: Records) -> list[Grasps]:
+    """Return records as they are, those of files and DataFrames as they are read."""
+    from pandas import DataFrame
+
+    given = list(grasps) if isinstance(grasps, Sequence) and not isinstance(grasps, str) else [grasps]
+    files = [read_grasps(each) if isinstance(each, str | Path) else each for each in given]
+    return [from_frame(each) if isinstance(each, DataFrame) else each for each in files]
+
+
+def from_frame(frame: DataFrame) -> Grasps:
+    """Return the grasps of a table with a row a sample, in which each row repeats what is known of its grasp;
+    columns as in the two files of :func:`read_grasps`."""
+    samples = [name for name in map(str, frame.columns) if name.startswith(_OF_SAMPLES)]
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "DataFrame.csv")
+        frame[samples].to_csv(path, index=False)
+        rest = frame.drop(columns=[name for name in samples if name != "grasp_id"])
+        rest.drop_duplicates("grasp_id").to_csv(Path(folder, "DataFrame_meta.csv"), index=False)
+        return read_grasps(path)
 
 
 def check_grasp_file(path: str | Path) -> None:

@@ -20,7 +20,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +62,8 @@ if TYPE_CHECKING:
     from thermogrip.datasets.schema import Log
 
 Floats = NDArray[np.float64]
+#: What is taken for logs: themselves, DataFrames, paths of files; one or several.
+Logs: TypeAlias = "Log | DataFrame | str | Path | Sequence[Log | DataFrame | str | Path]"
 
 _TIME_UNITS = ("1", "s", "ms", "min")
 _TIME = re.compile(
@@ -173,14 +175,14 @@ def read_log(
     return _cut(log, start, stop, file) if (start, stop) != (-np.inf, np.inf) else log
 
 
-def as_logs(logs: Log | DataFrame | Sequence[Log | DataFrame], *lists: Sequence[str] | None) -> list[Log]:
-    """Return logs as they are and DataFrames as :func:`read_log` reads them; ``lists`` are its roles."""
+def as_logs(logs: Logs, *lists: Sequence[str] | None, known: Mapping[str, str] | None = None) -> list[Log]:
+    """Return logs as they are, DataFrames and files as :func:`read_log` reads them in these roles."""
     from xarray import Dataset
 
-    given = list(logs) if isinstance(logs, Sequence) else [logs]
-    found: list[Log] = [log if isinstance(log, Dataset) else read_log(log, *lists) for log in given]
+    given = list(logs) if isinstance(logs, Sequence) and not isinstance(logs, str) else [logs]
+    found = [log if isinstance(log, Dataset) else read_log(log, *lists, known=known) for log in given]
     for at, log in enumerate(found):
-        log.attrs["name"] += "" if log is given[at] or len(given) == 1 else f" {at + 1}"
+        log.attrs["name"] += f" {at + 1}" if log.attrs["name"] == "DataFrame" and len(given) > 1 else ""
     return found
 
 

@@ -37,9 +37,10 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError, known_names
-from thermogrip.datasets.log_files import as_logs
+from thermogrip.datasets.log_files import Logs, as_logs
 from thermogrip.datasets.parallel import Workers, run_parallel
 from thermogrip.datasets.schema import Log, column, log_name, names
+from thermogrip.datasets.shown import Shown
 from thermogrip.sysid.blackbox.fit import (
     BLACK_BOXES,
     FAMILIES,
@@ -70,8 +71,6 @@ from thermogrip.sysid.validation.prediction_bands import (
 )
 
 if TYPE_CHECKING:
-    from pandas import DataFrame
-
     from thermogrip.sysid.models.model import GreyModel
 
 WITHIN_NOISE = 1.1  # of the best error: then the network is preferred, and a linear kind on another run
@@ -326,8 +325,8 @@ class Searched:
     kept: bool  # whether it represents its kind
 
 
-@dataclass(frozen=True, eq=False)
-class Identification:
+@dataclass(frozen=True, eq=False, repr=False)
+class Identification(Shown):
     """What :func:`identify` found."""
 
     plant: Plant  # the chosen model, fitted on everything
@@ -342,6 +341,11 @@ class Identification:
     runs: tuple[FreeRun, ...] = ()  # of ``plant`` over each log, its residual not tested
     searched: tuple[Searched, ...] = ()  # structures of the black boxes, by kind, the best first
 
+    def _facts(self) -> dict[str, object]:
+        """Return the verdict, the chosen model, and the held-out error of each candidate."""
+        errors = {f"error of {m}": f"{e:.3g} of that without an input" for m, e in self.errors().items()}
+        return {"verdict": self.verdict, "model": self.model, **errors, "notes": "; ".join(self.notes)}
+
     def errors(self) -> dict[str, float]:
         """Return the mean held-out error of each candidate, relative to the no-input baseline."""
         out: dict[str, list[float]] = {}
@@ -352,7 +356,7 @@ class Identification:
 
 
 def identify(
-    logs: Sequence[Log | DataFrame] | Log | DataFrame,
+    logs: Logs,
     network: GreyModel | str | Path | None = None,
     inputs: Sequence[str] | None = None,
     outputs: Sequence[str] | None = None,
@@ -373,8 +377,8 @@ def identify(
 
     Parameters
     ----------
-    logs : Log, DataFrame, or sequence of them
-        DataFrames as :func:`~thermogrip.datasets.log_files.read_log` reads them.
+    logs : Log, DataFrame, str, Path, or sequence of them
+        DataFrames and files as :func:`~thermogrip.datasets.log_files.read_log` reads them.
     network : GreyModel, str or Path, optional
         A thermal network, or the name or file of one; without it the candidate ``network`` is left out.
     inputs, outputs, disturbances : sequence of str, optional

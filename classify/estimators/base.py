@@ -27,6 +27,8 @@ from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.exceptions import NotFittedError
 
 from thermogrip.datasets.errors import UserError, known_names
+from thermogrip.datasets.grasp_files import Records as Records
+from thermogrip.datasets.grasp_files import as_grasps
 from thermogrip.datasets.schema import (
     GRASP_LABELS,
     GRASP_NUMBERS,
@@ -39,7 +41,6 @@ from thermogrip.sysid.effusivity.quality import check_grasps as check_quality
 
 Floats: TypeAlias = NDArray[np.float64]
 Labels: TypeAlias = NDArray[np.str_]
-Records: TypeAlias = Grasps | Sequence[Grasps]
 
 HELD_AT_AN_END = 0.5  # s; a trace that is shorter than its grid by more is refused, not continued
 
@@ -200,7 +201,7 @@ class JoinedClassifier(GraspClassifier):
 
 def record_list(X: Records) -> list[Grasps]:
     """Return one record as a list of one, several as a list; checked, and their spikes lost samples."""
-    records = list(X) if isinstance(X, Sequence) else [X]
+    records = as_grasps(X)
     if not records:
         raise UserError("no grasps were given", hint="give at least one record")
     for at, grasps in enumerate(records):

@@ -21,14 +21,15 @@ from thermogrip.classify.decisions.predict import Row, table_csv
 from thermogrip.classify.evaluation import metrics as s
 from thermogrip.classify.evaluation.metrics import calibration_interval, mean_intervals
 from thermogrip.datasets.atomic_files import make_folder, write_atomic, write_json
+from thermogrip.datasets.shown import Shown
 
 POOLED = "pooled"
 
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Comparison:
+@dataclass(frozen=True, repr=False)
+class Comparison(Shown):
     """The result of :func:`~thermogrip.classify.evaluation.harness.evaluate`."""
 
     split: str  # ``shipped``, ``random``, ``session``, ``block`` or ``files``
@@ -44,6 +45,14 @@ class Comparison:
     times: tuple[Row, ...] = ()  # ``classifier, repeat, condition, fit_s, predict_s_per_grasp``
     notes: tuple[str, ...] = ()  # what was left out, and why
     level: float = field(default=0.95)  # confidence of the intervals
+
+    def _facts(self) -> dict[str, object]:
+        """Return the split and the accuracy of each classifier with its interval, pooled where it can be."""
+        facts: dict[str, object] = {"split": self.split, "conditions": ", ".join(self.conditions)}
+        for row in reversed(self.scores()):  # the first of a classifier stays
+            interval = f"({100 * self.level:.0f} %: {row['low']:.3f} to {row['high']:.3f})"
+            facts[row["classifier"]] = f"accuracy {row['accuracy']:.3f} {interval} of {row['n']} grasps"
+        return facts
 
     @property
     def classifiers(self) -> tuple[str, ...]:

@@ -43,6 +43,7 @@ from thermogrip.classify.evaluation import metrics as s
 from thermogrip.classify.evaluation.comparison import POOLED, Comparison
 from thermogrip.classify.evaluation.splits import Fold, Plan, plan_folds
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.grasp_files import Records
 from thermogrip.datasets.parallel import Progress, Workers, run_parallel, sub_progress
 from thermogrip.datasets.schema import Grasps, check_grasps, log_name, unit_names
 
@@ -94,12 +95,12 @@ _PROBE_NAME = "untouched traces"
 
 def evaluate(
     classifiers: Sequence[str | GraspClassifier] | Mapping[str, GraspClassifier],
-    conditions: Sequence[Grasps],
+    conditions: Records,
     *,
     split: str = "shipped",
     repeats: int = 20,
     train_per_class: int = 5,
-    test: Sequence[Grasps] | None = None,
+    test: Records | None = None,
     seed: int = 0,
     workers: Workers = 1,
     probe: bool = True,
@@ -111,14 +112,14 @@ def evaluate(
     ----------
     classifiers : sequence of str or estimator, or dict of name to estimator
         Names as for :func:`~thermogrip.classify.estimators.registry.make_classifier`, or unfitted estimators.
-    conditions : sequence of Grasps
+    conditions : Grasps, DataFrame, str, Path, or sequence of them
         One record a condition, each under its own name.
     split : {"shipped", "random", "session", "block"}, optional
         By the records' ``split`` column, ``repeats`` random splits by grasp, or one session, one block of
         each material held out after the other.
     repeats, train_per_class : int, optional
         Of the random splits.
-    test : sequence of Grasps, optional
+    test : as ``conditions``, optional
         Test records; the conditions then only train (their grasps marked ``train``, or all).
     seed : int, optional
         Of splits, and of classifiers that are given by name.
@@ -157,8 +158,8 @@ def evaluate(
     results = sorted((r for part in done for r in part), key=lambda r: (order.get(r.classifier, -1), r.order))
     real = [r for r in results if not r.probe]
     return Comparison(
-        split="files" if test else split,
-        repeats=repeats if split == "random" and not test else 1,
+        split="files" if test is not None else split,
+        repeats=repeats if split == "random" and test is None else 1,
         seed=seed,
         predictions=tuple(row for r in real for row in r.rows),
         leaks=tuple(_leaks([r for r in results if r.probe])),

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from thermogrip.classify.estimators.base import grasp_labels, pick, record_list
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.grasp_files import Records
 from thermogrip.datasets.schema import Grasps, has_touch_groups, log_name, unit_names
 from thermogrip.datasets.splits import by_grasp, shipped
 
@@ -55,19 +56,19 @@ class Plan:
 
 
 def plan_folds(
-    conditions: Sequence[Grasps],
+    conditions: Records,
     *,
     split: str = "shipped",
     repeats: int = 20,
     train_per_class: int = 5,
-    test: Sequence[Grasps] | None = None,
+    test: Records | None = None,
     seed: int = 0,
 ) -> Plan:
     """Return who trains and who is tested; the arguments are those of ``evaluate``."""
-    records = record_list(list(conditions))
+    records = record_list(conditions)
     _refuse_repeated(records)
-    if test:
-        plan = _from_files(records, record_list(list(test)))
+    if test is not None:
+        plan = _from_files(records, record_list(test))
     elif split == "shipped":
         plan = _shipped(records)
     elif split == "random":

@@ -43,6 +43,7 @@ import numpy as np
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.shown import Shown
 from thermogrip.mpc.controllers.base import STALE, SampledController
 from thermogrip.mpc.controllers.linear_equivalent import to_control
 from thermogrip.mpc.controllers.pi import PIController
@@ -64,7 +65,7 @@ _CAUTION, _MOST_CAUTION = 3.0, 30.0  # of a mean innovation, from which on moves
 _WEAK = 0.05  # of its gain at rest, below which a drive's bias is not learnt
 
 
-class Controller(SampledController):
+class Controller(Shown, SampledController):
     """Model-predictive controller of a plant.
 
     Parameters
@@ -136,6 +137,16 @@ class Controller(SampledController):
     def plan(self) -> Array | None:
         """The plan that is still ahead, (N, n_u)."""
         return None if self._plan is None else shifted(self._plan, self._age_s / self.dt)
+
+    def _facts(self) -> dict[str, object]:
+        """Return what is regulated by what, how often, and of which plant."""
+        ranges = (f"{name} {low:g} to {high:g}" for name, (low, high) in self.design.drive_range.items())
+        facts: dict[str, object] = {
+            "regulates": ", ".join(self.controlled),
+            "by": ", ".join(ranges),
+            "every": f"{self.dt:g} s",
+        }
+        return facts | {"model": self.plant.model.kind, "logs": ", ".join(self.plant.logs) or "none"}
 
     def save(self, path: str | Path) -> Path:
         """Write the controller with its plant as JSON and return the path."""

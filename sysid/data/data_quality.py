@@ -30,9 +30,10 @@ import numpy as np
 from scipy.stats import f as f_distribution
 
 from thermogrip.datasets.arrays import Array, Mask
+from thermogrip.datasets.log_files import Logs, as_logs
 from thermogrip.datasets.repair import GAP_SECONDS, GAP_STEPS
 from thermogrip.datasets.resample import gaps
-from thermogrip.datasets.schema import Log, column, log_name
+from thermogrip.datasets.schema import column, log_name
 from thermogrip.sysid.plant.log_grid import Grid, Rows, Segment, make_grid, quantum
 from thermogrip.sysid.plant.plant import Plant
 
@@ -78,7 +79,7 @@ class DataCheck:
 
 
 def check_data(
-    logs: Sequence[Log],
+    logs: Logs,
     *,
     inputs: Sequence[str] | None = None,
     outputs: Sequence[str] | None = None,
@@ -89,7 +90,7 @@ def check_data(
 
     Parameters
     ----------
-    logs : sequence of Log
+    logs : Log, DataFrame, str, Path, or sequence of them
     inputs, outputs, disturbances : sequence of str, optional
         Names of the signals; by role where absent.
     average : float, optional
@@ -117,6 +118,7 @@ def check_data(
     >>> found.verdict, found.says
     ('fail', 'q never moves: nothing can be learnt about it')
     """
+    logs = as_logs(logs, inputs, outputs, disturbances)
     grid = make_grid(logs, inputs=inputs, outputs=outputs, disturbances=disturbances, average=average)
     u, y = grid.inputs, grid.outputs
     found: list[Finding] = []

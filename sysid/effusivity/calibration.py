@@ -34,6 +34,7 @@ from scipy.optimize import minimize
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.grasp_files import Records, as_grasps
 from thermogrip.datasets.materials import Material, find_material
 from thermogrip.datasets.parallel import Progress
 from thermogrip.datasets.schema import Grasps, log_name
@@ -436,7 +437,7 @@ _NOISE_SEARCH, _NOISE_SLOPE = 300, 0.01  # steps at most, and nat per such step 
 
 
 def calibrate_gripper(
-    grasps: Sequence[Grasps], *, materials: Mapping[str, Material] | None = None,
+    grasps: Records, *, materials: Mapping[str, Material] | None = None,
     start: GripperModel | None = None, prior: GripperModel | None = None, block_length: float | None = None,
     seed: int = 0, progress: Progress | None = None,
 ) -> GripperModel:  # fmt: skip
@@ -444,7 +445,7 @@ def calibrate_gripper(
 
     Parameters
     ----------
-    grasps : sequence of Grasps
+    grasps : Grasps, DataFrame, str, Path, or sequence of them
         Training grasps of all conditions, every one with a ``material``.
     materials : mapping of label to Material, optional
         Library rows of the labels; default the project's table.
@@ -484,6 +485,7 @@ def calibrate_gripper(
     """
     if start is not None and prior is not None:
         raise UserError("both start and prior are given", hint="a prior is a start too: give it alone")
+    grasps = as_grasps(grasps)
     data = _labelled(grasps, materials or {}, least=2 if prior is None else 1)
     names = (*(() if prior is None else prior.trained_on), *(log_name(g) for g in grasps))
     length = block_length or (0.02 if prior is None else prior.block_length)

@@ -17,6 +17,7 @@ from scipy.special import expit, logit, logsumexp
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.grasp_files import Records, as_grasps
 from thermogrip.datasets.materials import Material
 from thermogrip.datasets.schema import Grasps, has_touch_groups
 from thermogrip.sysid.effusivity.data import touches
@@ -125,7 +126,7 @@ def open_set(
 
 
 def effusivity_posterior(
-    gripper: GripperModel, grasps: Grasps, *, until: float | None = None, coupling: Coupling | None = None
+    gripper: GripperModel, grasps: Records, *, until: float | None = None, coupling: Coupling | None = None
 ) -> list[EffusivityRow]:
     """Return one row a grasp: effusivity, object temperature and contact conductance, no material assumed.
 
@@ -139,6 +140,7 @@ def effusivity_posterior(
     Arguments are those of :func:`material_fit`; ``coupling`` is how blocks move between touches, by default
     those of the example rig.
     """
+    (grasps,) = as_grasps(grasps)
     rows = touch_groups(grasps) if has_touch_groups(grasps) else {}
     alone = np.setdiff1d(np.arange(grasps.sizes["grasp"]), np.concatenate([[], *rows.values()]).astype(int))
     found: dict[int, GridPosterior] = {}

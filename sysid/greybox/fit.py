@@ -45,6 +45,7 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.log_files import Logs
 from thermogrip.datasets.parallel import Progress
 from thermogrip.datasets.schema import Log, log_name
 from thermogrip.sysid.data.data_quality import reading_excess
@@ -167,7 +168,7 @@ _COARSE = 6  # times the usual bins, for the global search
 
 def fit_network(
     network: GreyModel | str | Path,
-    logs: Sequence[Log],
+    logs: Logs,
     *,
     average: float | None = None,
     seed: int = 0,
@@ -181,7 +182,7 @@ def fit_network(
     ----------
     network : GreyModel, str or Path
         A network or a model of the user's own, or the name or path of a network.
-    logs : sequence of Log
+    logs : Log, DataFrame, str, Path, or sequence of them
         All are fitted together.
     average : float, optional
         Length of the bins that are compared [s]; the model's own where absent: for a network 5 s, or five

@@ -73,13 +73,14 @@ from scipy.linalg import cho_factor, cho_solve
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import atomic_path
 from thermogrip.datasets.errors import UserError, known_names
+from thermogrip.datasets.log_files import Logs, as_logs
 from thermogrip.datasets.schema import Log, columns, log_name
 from thermogrip.sysid.greybox.noise_model import ErrorModel
 from thermogrip.sysid.greybox.problem import Problem, make_problem
 from thermogrip.sysid.greybox.sandwich import ScoreCovariance, score_covariance
 from thermogrip.sysid.models.model import GreyModel
 from thermogrip.sysid.plant.fit_record import Sampling
-from thermogrip.sysid.plant.log_grid import match_logs
+from thermogrip.sysid.plant.log_grid import match_logs, roles_of
 from thermogrip.sysid.plant.plant import Plant
 
 _STEP = 1e-4  # of z, for differences
@@ -422,7 +423,7 @@ class Posterior:
 
 def sample_posterior(
     plant: Plant,
-    logs: Sequence[Log],
+    logs: Logs,
     *,
     free: Sequence[str] | None = None,
     n_sampled: int = 6,
@@ -440,7 +441,7 @@ def sample_posterior(
     ----------
     plant : Plant
         A fitted network, or model of the user's own with priors.
-    logs : sequence of Log
+    logs : Log, DataFrame, str, Path, or sequence of them
         The logs of the fit.
     free : sequence of str, optional
         Parameters that emcee samples; default the ``n_sampled`` that the data know best relative to the
@@ -481,6 +482,7 @@ def sample_posterior(
     """
     report = progress or (lambda fraction, what: None)
     report(0.0, "averaging the logs")
+    logs = as_logs(logs, known=roles_of(plant))
     problem = fit_problem(plant, logs, average)
     z = problem.standard(plant.values)
     report(0.02, "learning the model error")

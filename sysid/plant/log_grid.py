@@ -44,6 +44,7 @@ import numpy as np
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import most_bytes
+from thermogrip.datasets.log_files import Logs, as_logs
 from thermogrip.datasets.resample import gaps as gaps_of
 from thermogrip.datasets.resample import held_means
 from thermogrip.datasets.schema import Log, column, columns, log_name
@@ -476,12 +477,12 @@ def misfit(model: Signals, log: Log) -> UserError | None:
     return None
 
 
-def match_logs(
-    model: Signals, logs: Sequence[Log], *, keep_others: bool = False
-) -> tuple[list[Log], list[str]]:
+def match_logs(model: Signals, logs: Logs, *, keep_others: bool = False) -> tuple[list[Log], list[str]]:
     """Return logs in the model's roles and units (one that fits is returned itself), and what was converted,
     a line a column."""
-    known, matched, said = roles_of(model), list(logs), dict[str, None]()
+    known, said = roles_of(model), dict[str, None]()
+    logs = as_logs(logs, known=known)
+    matched = list(logs)
     largest = {name: _largest([column(log, name) for log in logs]) for name in known}
     for at, log in enumerate(logs):
         changed = {}

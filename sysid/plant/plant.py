@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import check_json, read_json, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, column, log_name, make_log
+from thermogrip.datasets.shown import Shown
 from thermogrip.sysid.models.model import Model, load_model
 from thermogrip.sysid.plant.log_grid import Stretch, at_rows, cut_stretches, match_logs
 from thermogrip.sysid.plant.plant_data import (
@@ -34,12 +35,16 @@ from thermogrip.sysid.plant.plant_data import (
 )
 from thermogrip.sysid.plant.simulation import AFTER_GAP, Start, find_starts, predict
 
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
 WARMUP = 5.0  # s of readings that set the state, where nothing else is asked for
+_SHOWN = 10  # free parameters where a plant shows itself
 _INSIDE = 64  # so many samples stand in the plant's own file
 
 
-@dataclass(frozen=True, eq=False)
-class Plant(PlantData):
+@dataclass(frozen=True, eq=False, repr=False)
+class Plant(Shown, PlantData):
     """A model with its numbers.
 
     Parameters
@@ -97,14 +102,31 @@ class Plant(PlantData):
     (('t',), (0,), {})
     """
 
+    def _facts(self) -> dict[str, object]:
+        """Return equations, signals, the free parameters with their 90 % intervals, and the verdict."""
+        facts: dict[str, object] = {"model": f"{self.model.kind}, a step of {self.dt:g} s"}
+        for role in ("inputs", "disturbances", "outputs"):
+            facts[role] = ", ".join(f"{n} [{self.units.get(n, '1')}]" for n in getattr(self, role)) or "none"
+        ranges = self.intervals() if self.uncertain else {}
+        for name in self.free[:_SHOWN]:
+            between = " (90 %: {:.4g} to {:.4g})".format(*ranges[name]) if name in ranges else ""
+            facts[name] = f"{self.values[name]:.4g} {self.units.get(name, '')}{between}"
+        facts |= {"...": f"{len(self.free) - _SHOWN} more parameters"} if len(self.free) > _SHOWN else {}
+        return facts | {"logs": ", ".join(self.logs) or "none", "verdict": self.verdict or "none"}
+
     def simulate(
-        self, log: Log, warmup: float = WARMUP, *, score_from: float | None = None, gaps: str = "mend"
+        self,
+        log: Log | DataFrame | str | Path,
+        warmup: float = WARMUP,
+        *,
+        score_from: float | None = None,
+        gaps: str = "mend",
     ) -> Log:
         """Return the free run over the log (:mod:`thermogrip.sysid.plant.simulation`).
 
         Parameters
         ----------
-        log : Log
+        log : Log, DataFrame, str or Path
             Inputs and disturbances of the whole log are used, measured outputs of the warm-up only.
         warmup : float, optional
             Seconds at the start (and after each gap) whose outputs set the state and the sensor offsets.

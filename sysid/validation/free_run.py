@@ -45,6 +45,10 @@ from thermogrip.sysid.validation.residual_tests import (
 )
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pandas import DataFrame
+
     from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation.prediction_bands import Band
 
@@ -95,7 +99,7 @@ class FreeRun:
 
 def free_run(
     plant: Plant,
-    log: Log,
+    log: Log | DataFrame | str | Path,
     warmup: float = 5.0,
     score_from: float = 5.0,
     average: float | None = None,
@@ -108,7 +112,7 @@ def free_run(
     Parameters
     ----------
     plant : Plant
-    log : Log
+    log : Log, DataFrame, str or Path
     warmup : float, optional
         Seconds at the start whose measured outputs may set the state.
     score_from : float, optional

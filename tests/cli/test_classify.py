@@ -49,7 +49,7 @@ def gripper(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
     made = SimpleNamespace(bench=bench, why=[])
     made.records = [record_of(["a", "b"], "one"), record_of(["c"], "two")]
     made.read = stand_in("thermogrip.datasets.grasp_files.read_grasp_files", lambda paths: made.records)
-    made.warned = stand_in("thermogrip.cli.classify.warn_of_contacts")
+    made.warned = stand_in("thermogrip.cli.options.warn_of_contacts")
     made.calibrated = stand_in("thermogrip.cli.classify.calibrated_device", ("device", "coupling", 9.0))
     stand_in("thermogrip.cli.classify._as_taught", lambda console, record, *_: record)
     made.ranged = stand_in("thermogrip.sysid.effusivity.data.with_object_range", lambda record, _: record)
@@ -168,7 +168,7 @@ def test_a_gripper_is_the_bundled_one_or_calibrated_on_what_touched(
 
     records = [record_of(["a"]), record_of(["b"], touch_group=["p"]), record_of(["c"], touch_group=["q"])]
     read = stand_in("thermogrip.datasets.grasp_files.read_grasp_files", records)
-    warned = stand_in("thermogrip.cli.classify.warn_of_contacts")
+    warned = stand_in("thermogrip.cli.options.warn_of_contacts")
     touched = stand_in("thermogrip.cli.classify.touched_part", lambda console, given: given)
     asked = stand_in("thermogrip.sysid.effusivity.calibration.calibrate_gripper", calibrate)
     learnt = stand_in(
@@ -236,7 +236,7 @@ def school(bench: Bench, stand_in: StandIn, monkeypatch: pytest.MonkeyPatch) -> 
     model.fit = made.fitted.append
     made.record = record_of(["a", "b", "c"], split=["train", "train", "test"])
     made.read = stand_in("thermogrip.datasets.grasp_files.read_grasp_files", lambda paths: [made.record])
-    made.warned = stand_in("thermogrip.cli.classify.warn_of_contacts")
+    made.warned = stand_in("thermogrip.cli.options.warn_of_contacts")
     stand_in("thermogrip.cli.classify.touched_part", lambda console, records: records)
     made.asked = stand_in("thermogrip.classify.estimators.registry.make_classifier", model)
     made.can = stand_in("thermogrip.classify.estimators.registry.can_be_saved", lambda _: made.savable)
@@ -303,7 +303,7 @@ def named(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
     made = SimpleNamespace(bench=bench, record=record_of(["a", "b"]), model="a model")
     (bench.path / "m").mkdir()
     stand_in("thermogrip.datasets.grasp_files.read_grasp_files", lambda paths: [made.record])
-    made.warned = stand_in("thermogrip.cli.classify.warn_of_contacts")
+    made.warned = stand_in("thermogrip.cli.options.warn_of_contacts")
     made.ranged = stand_in("thermogrip.sysid.effusivity.data.with_object_range", lambda *_: "ranged")
     made.loaded = stand_in("thermogrip.classify.estimators.registry.load_classifier", lambda _: made.model)
     made.rules = stand_in("thermogrip.classify.decisions.stopping_rule.load_stop_rule", "a rule")

@@ -64,7 +64,7 @@ def scored(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
     stand_in(
         "thermogrip.datasets.grasp_files.read_grasp_files", lambda paths: [made.read[path] for path in paths]
     )
-    made.warned = stand_in("thermogrip.cli.compare.warn_of_contacts")
+    made.warned = stand_in("thermogrip.cli.options.warn_of_contacts")
     made.touched = stand_in("thermogrip.cli.compare.touched_part", lambda console, records: records)
     made.asked = stand_in(
         "thermogrip.classify.estimators.registry.trainable",

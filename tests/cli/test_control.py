@@ -161,7 +161,7 @@ def test_a_review_is_an_answer_of_no_where_a_check_fails(
 
 def test_the_class_of_a_plant_of_one_s_own_is_handed_in(controller: Bench, stand_in: StandIn) -> None:
     controller.write("own.py", "")
-    stand_in("thermogrip.cli.control.find_network", lambda text: f"model of {text}")
+    stand_in("thermogrip.cli.options.find_network", lambda text: f"model of {text}")
     loaded = stand_in("thermogrip.mpc.controllers.mpc.Controller.load", "a controller")
     stand_in("thermogrip.mpc.tuning.design_review.review", [])
     for network in ((), ("--network", "own.py:Own")):

@@ -36,8 +36,8 @@ INFORMATION = "thermogrip.sysid.experiment.information"
 def test_a_plain_schedule_fits_what_is_known_of_the_plant(
     words: str, asked: tuple[Any, ...], answer: dict[str, float], said: str, bench: Bench, stand_in: StandIn
 ) -> None:
-    plants = stand_in("thermogrip.cli.excite.load_plant", "a plant")
-    stand_in("thermogrip.cli.excite.find_network", lambda name: name)
+    plants = stand_in("thermogrip.cli.options.load_plant", "a plant")
+    stand_in("thermogrip.cli.options.find_network", lambda name: name)
     stand_in(f"{INFORMATION}.plant_from_prior", "a prior")
     plain = stand_in("thermogrip.sysid.experiment.schedules.excite", LOG)
     fitted = stand_in("thermogrip.cli.excite.schedule_for", (LOG, 0.625))
@@ -61,7 +61,7 @@ def test_the_optimal_schedule_is_reported_beside_the_plain_ones(
     widths = {"now": {"U": 4.0}, "prbs": {"U": 2.0}, "optimal": {"U": 0.5}}
     expected = Expectation({"now": 0.0, "prbs": 1.04, "optimal": 3.04}, widths, {})
     plant = SimpleNamespace(free=("U",), units={}, values={"U": 5.0})
-    stand_in("thermogrip.cli.excite.load_plant", plant)
+    stand_in("thermogrip.cli.options.load_plant", plant)
     asked = stand_in("thermogrip.cli.excite.optimal_for", (LOG, expected, ["no staircase"]))
     words = ["excite", "--kind", "optimal", "--minutes", "7", "--plant", "plant.json", "--out", "s.csv"]
     words += ["--seed", "4", *(["--slew", slew, "--hold", ",".join(hold)] if slew else [])]

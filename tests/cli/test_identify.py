@@ -78,7 +78,7 @@ def room(bench: Bench, stand_in: StandIn, monkeypatch: pytest.MonkeyPatch) -> Si
     made = SimpleNamespace(bench=bench, like="gripper", found=found_of(), record=None, dynamics=DYNAMICS)
     made.asked = stand_in("thermogrip.sysid.export.dynamics.plant_dynamics", lambda *_, **__: made.dynamics)
     made.read = stand_in("thermogrip.datasets.log_files.read_log", log)
-    made.networks = stand_in("thermogrip.cli.identify.find_network", load_network)
+    made.networks = stand_in("thermogrip.cli.options.find_network", load_network)
     made.fits = stand_in(f"{IDENTIFICATION}.identify", fit)
     made.misfits = stand_in(
         "thermogrip.sysid.plant.log_grid.misfit",

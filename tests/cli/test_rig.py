@@ -41,8 +41,8 @@ def test_targets_are_one_temperature_or_one_for_each_output(text: str, value: ob
     ("text", "words"),
     [
         ("warm", "is no temperature"),
-        ("t1=40,35", "is no temperature"),
-        ("t1=40,t1=35", "names an output twice"),
+        ("t1=40,35", "'35' is no NAME=NUMBER"),
+        ("t1=40,t1=35", "names t1 twice"),
         ("9.9", "--target 9.9 degC is outside the rig's range; choose one from 10 to 50 degC"),
         ("50.1", "outside"),
         ("nan", "outside"),
@@ -119,7 +119,7 @@ def test_a_twin_is_a_draw_of_its_plant_within_the_controller_s_ranges(own: bool,
     units = {"a": "percent", "b": "0_255", "c": "1", "e": "W"}
     plant = SimpleNamespace(draw=lambda k: ("draw", k), units=units)
     loaded = stand_in("thermogrip.sysid.plant.plant.Plant.load", UserError("own") if own else plant)
-    again = stand_in("thermogrip.cli.rig.load_plant", plant)
+    again = stand_in("thermogrip.cli.options.load_plant", plant)
     twins = stand_in("thermogrip.rig.simulation.twin.Twin", "a twin")
     ranges = dict.fromkeys("abcde", (0.0, 100.0)) | {"d": (0.0, 5.0)}  # d has no unit: 1
     controller = SimpleNamespace(design=SimpleNamespace(drive_range=ranges))

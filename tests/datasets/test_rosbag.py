@@ -263,7 +263,7 @@ def test_a_damaged_chunk_is_never_read_as_numbers(tmp_path: Path) -> None:
         (('unit = "K"', 'unit = "Kelvin"'), "unit 'Kelvin' is unknown"),
         (("thermogrip.topics", "thermogrip.topic"), "is no topic map"),
         (('role = "input"', 'role = "in"'), "role 'in' is unknown"),
-        (("version = 1", 'version = 1\nclock = "t3"'), "clock 't3' is no column; use one of t_tank"),
+        (("version = 1", 'version = 1\nclock = "t3"'), "clock 't3' is no column; use t_tank"),
         (("version = 1", 'version = 1\nclocks = "t3"'), "has the unknown key 'clocks'; write a fresh one"),
         (("version = 1", 'version = 1\nstamp = "now"'), "stamp 'now' is unknown; use log or header"),
         (('topic = "/cmd"', ""), "column drive: needs topic, field, unit, role; name its topic"),

@@ -56,19 +56,38 @@ def test_what_json_cannot_hold_is_text_and_collections_are_lists(value: object, 
     assert plain(value) == held
 
 
-def test_a_table_is_wide_enough_for_a_file_and_its_numbers_stand_to_the_right(
+def test_a_table_is_as_wide_as_its_terminal_or_100_columns_and_breaks_no_word(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("COLUMNS", "40")
-    Console().table("title", ["name", "value", "a" * 60], [["x", 1.5, "b"], ["long name", None, "c"]])
-    shown = [line.rstrip() for line in capsys.readouterr().out.splitlines() if line.strip()]
-    title, head, _, first, second = shown
-    assert title == "title"
-    assert len(head) > 75
-    assert head.index("value") + 5 == first.index("1.5") + 3 == second.index("-") + 1
-    assert first.index("x") == head.index("name")
-    Console().table("title", ["name"], [["x" * 300]])
-    assert {len(line) for line in capsys.readouterr().out.splitlines() if line.strip()} == {140}
+    prose = "held-out readings of the whole day in one sentence that is longer than its column can be wide"
+    rows = [["features-lda", 1.5, prose], ["long name", None, "c"]]
+    for terminal, width in ((False, 100), (True, 60)):
+        monkeypatch.setenv("COLUMNS", "60")
+        monkeypatch.setattr("sys.stdout.isatty", lambda terminal=terminal: terminal)
+        Console().table("title", ["name", "value", "what it says"], rows)
+        title, head, _, first, *more, last = filter(None, capsys.readouterr().out.splitlines())
+        assert title == "title"
+        assert max(map(len, (head, first, *more, last))) <= width
+        assert " ".join([first, *more]).split() == ["features-lda", "1.5", *prose.split()]
+        assert head.index("value") + 5 == first.index("1.5") + 3 == last.index("-") + 1
+    Console().table("title", ["name", "value"], [["x" * 59, 2.0]])
+    assert capsys.readouterr().out.split("\n\n")[1].splitlines() == [f"name: {'x' * 59}", "value: 2"]
+
+
+def test_on_a_terminal_progress_is_one_line_with_the_time_left(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "70")
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    clock = iter((0.0, 5.0, 30.0))
+    monkeypatch.setattr("time.monotonic", lambda: next(clock))
+    with Console().progress("tune") as progress:
+        progress(0.25, "a")
+        progress(0.5, "b" * 80)
+    *shown, last = capsys.readouterr().err.split("\r\x1b[K")[1:]
+    assert shown[0] == "[#####...............] tune  25 %    5 s, 15 s left a"
+    assert shown[1].startswith("[##########..........] tune  50 %   30 s, 30 s left bbb")
+    assert (len(shown[1]), last) == (69, "")
 
 
 def test_progress_says_each_change_of_work_and_each_twentieth(capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,20 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from thermogrip.classify.estimators import classifier_names
-from thermogrip.cli.options import (
-    AsJson,
-    GraspFiles,
-    Seed,
-    argument,
-    choices,
-    comma,
-    flag,
-    new_file,
-    new_folder,
-    one_of,
-    option,
-    warn_of_contacts,
-)
+from thermogrip.cli import options as cli
 from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
 
@@ -55,7 +42,7 @@ def calibrated_device(
         )
         return load_default_gripper(), None, _BUNDLED
     labelled = read_grasp_files(calibrate)
-    warn_of_contacts(console, labelled)
+    cli.warn_of_contacts(console, labelled)
     labelled = touched_part(console, labelled)
     with console.progress("calibrate") as progress:
         device = calibrate_gripper(labelled, seed=seed, progress=progress)
@@ -108,29 +95,25 @@ _HEADS = {"answer": "answer", "next_touch_degC": "touch at [degC]", "next_touch_
 
 ObjectRange = Annotated[
     str | None,
-    option(
+    cli.option(
         "--object-range",
         "A,B",
         "Objects of unknown temperature are between A and B degC [default: 20 K about the room].",
     ),
 ]
-Quick = Annotated[bool, flag("--quick", "200 epochs in place of 2000 for the LSTM.")]
+Quick = Annotated[bool, cli.flag("--quick", "200 epochs in place of 2000 for the LSTM.")]
 
 
 def effusivity(
-    grasps: GraspFiles,
-    out: Annotated[Path, option("--out", "FILE.csv", "Where the table goes.")],
+    grasps: cli.GraspFiles,
+    out: Annotated[Path, cli.option("--out", "FILE.csv", "Where the table goes.")],
     calibrate: Annotated[
         list[str] | None,
-        option(
-            "--calibrate",
-            "GRASPS",
-            "Labelled grasps that describe your gripper; may be repeated.",
-        ),
+        cli.option("--calibrate", "GRASPS", "Labelled grasps that describe your gripper; may be repeated."),
     ] = None,
     between: ObjectRange = None,
-    seed: Seed = 0,
-    as_json: AsJson = False,
+    seed: cli.Seed = 0,
+    as_json: cli.AsJson = False,
 ) -> int:
     """Find the effusivity of what was touched, grasp by grasp.
 
@@ -141,12 +124,12 @@ def effusivity(
     single touch that the model does not explain is named.
     """
     stated = _range(between)
-    new_file(out, (".csv",))
+    cli.new_file(out, (".csv",))
     console = Console(as_json)
     from thermogrip.datasets.grasp_files import read_grasp_files
 
     records = read_grasp_files(grasps)
-    warn_of_contacts(console, records)
+    cli.warn_of_contacts(console, records)
     from thermogrip.classify.decisions.predict import unexplained_effusivities
     from thermogrip.datasets.atomic_files import write_atomic
     from thermogrip.datasets.media import csv_text
@@ -186,29 +169,29 @@ def effusivity(
 
 
 def train(
-    grasps: GraspFiles,
+    grasps: cli.GraspFiles,
     classifier: Annotated[
         str,
-        option(
+        cli.option(
             "--classifier",
             "NAME",
             "posterior, bayes, features-lda, pca-lda, lstm, lstm-paper.",
             classifier_names,
         ),
     ],
-    out: Annotated[Path, option("--out", "MODEL_DIR", "Where the model goes.")],
+    out: Annotated[Path, cli.option("--out", "MODEL_DIR", "Where the model goes.")],
     split: Annotated[
         str | None,
-        option(
+        cli.option(
             "--split",
             "train|all",
             "Which grasps to learn from [default: train where the column exists].",
-            one_of("--split", ("train", "all")),
+            cli.one_of("--split", ("train", "all")),
         ),
     ] = None,
     stop_error: Annotated[
         float | None,
-        option(
+        cli.option(
             "--stop-error",
             "SHARE",
             "Also learn when a contact may end, at this share of wrong answers [posterior].",
@@ -217,8 +200,8 @@ def train(
         ),
     ] = None,
     quick: Quick = False,
-    seed: Seed = 0,
-    as_json: AsJson = False,
+    seed: cli.Seed = 0,
+    as_json: cli.AsJson = False,
 ) -> int:
     """Train one classifier on labelled grasps and save it.
 
@@ -237,9 +220,9 @@ def train(
     model.check_installed()
     console = Console(as_json)
     records = training_part(console, read_grasp_files(grasps), split)
-    warn_of_contacts(console, records)
+    cli.warn_of_contacts(console, records)
     records = touched_part(console, records)
-    new_folder(out)
+    cli.new_folder(out)
     with console.progress("train") as progress:
         progress(0.0, classifier)
         model.fit(records)
@@ -262,36 +245,36 @@ def train(
 
 
 def classify(
-    model_dir: Annotated[Path, argument("MODEL_DIR", "Folder that train wrote.")],
-    paths: GraspFiles,
-    out: Annotated[Path, option("--out", "FILE.csv", "Where the predictions go.")],
+    model_dir: Annotated[Path, cli.argument("MODEL_DIR", "Folder that train wrote.")],
+    paths: cli.GraspFiles,
+    out: Annotated[Path, cli.option("--out", "FILE.csv", "Where the predictions go.")],
     candidates: Annotated[
-        str | None, option("--materials", "A,B,C", "The candidates [default: all that the model knows].")
+        str | None, cli.option("--materials", "A,B,C", "The candidates [default: all that the model knows].")
     ] = None,
     early: Annotated[
-        bool, flag("--early", "Use of each contact what was read until the stop rule ended it.")
+        bool, cli.flag("--early", "Use of each contact what was read until the stop rule ended it.")
     ] = False,
     next_touch: Annotated[
         bool,
-        flag("--next-touch", "Also say at which temperature another touch is worth its time [posterior]."),
+        cli.flag(
+            "--next-touch", "Also say at which temperature another touch is worth its time [posterior]."
+        ),
     ] = False,
     or_unknown: Annotated[
-        bool, flag("--or-unknown", "Also give the answer that may be 'unknown' [posterior].")
+        bool, cli.flag("--or-unknown", "Also give the answer that may be 'unknown' [posterior].")
     ] = False,
     other_gripper: Annotated[
-        bool, flag("--other-gripper", "Another gripper of the same kind took these grasps [posterior].")
+        bool, cli.flag("--other-gripper", "Another gripper of the same kind took these grasps [posterior].")
     ] = False,
     known: Annotated[
         list[str] | None,
-        option(
-            "--known",
-            "GRASPS",
-            "Labelled grasps of that other gripper, one or more; may be repeated.",
+        cli.option(
+            "--known", "GRASPS", "Labelled grasps of that other gripper, one or more; may be repeated."
         ),
     ] = None,
     between: ObjectRange = None,
-    seed: Seed = 0,
-    as_json: AsJson = False,
+    seed: cli.Seed = 0,
+    as_json: cli.AsJson = False,
 ) -> int:
     """Name the material of each grasp, with probabilities.
 
@@ -304,8 +287,8 @@ def classify(
     the other one reads of blocks it knows.
     """
     stated = _range(between)
-    new_file(out, (".csv",))
-    choices("--materials", comma(candidates) or (), model_dir / "classifier.json", "classes")
+    cli.new_file(out, (".csv",))
+    cli.choices("--materials", cli.comma(candidates) or (), model_dir / "classifier.json", "classes")
     from thermogrip.classify.decisions.next_touch import advise_touches
     from thermogrip.classify.decisions.predict import (
         classify_grasps,
@@ -329,7 +312,7 @@ def classify(
     if other_gripper or known:
         model = _for_another_gripper(model, known or [])
     ranged = [with_object_range(grasps, stated) for grasps in records]
-    rows = classify_grasps(model, ranged, comma(candidates), rule=rule)
+    rows = classify_grasps(model, ranged, cli.comma(candidates), rule=rule)
     if not early:
         for row, (misfit, why) in zip(rows, unexplained_answers(model, records, rows, stated)):
             if misfit == misfit:
@@ -337,13 +320,13 @@ def classify(
             if why and not row.get("note"):
                 row["note"] = why
     console = Console(as_json)
-    warn_of_contacts(console, records)
+    cli.warn_of_contacts(console, records)
     if next_touch:  # at which temperature another touch of its block would be worth most
         with console.progress("another touch") as progress:
             found = [
                 row
                 for grasps in ranged
-                for row in advise_touches(model, grasps, candidates=comma(candidates), progress=progress)
+                for row in advise_touches(model, grasps, candidates=cli.comma(candidates), progress=progress)
             ]
         for row, advice in zip(rows, found):
             row |= advice
@@ -377,8 +360,7 @@ def classify(
 
 
 def materials(
-    name: Annotated[str | None, argument("[NAME]", "One material.")] = None,
-    as_json: AsJson = False,
+    name: Annotated[str | None, cli.argument("[NAME]", "One material.")] = None, as_json: cli.AsJson = False
 ) -> int:
     """List the materials table, or show one row of it."""
     from thermogrip.datasets.materials import find_material, load_materials

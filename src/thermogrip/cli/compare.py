@@ -8,21 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from thermogrip.classify.estimators import classifier_names
+from thermogrip.cli import options as cli
 from thermogrip.cli.classify import Quick, touched_part, training_part
-from thermogrip.cli.options import (
-    AsJson,
-    Cluster,
-    GraspFiles,
-    Seed,
-    Workers,
-    comma,
-    flag,
-    new_folder,
-    one_of,
-    option,
-    warn_of_contacts,
-    workers_of,
-)
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.parallel import sub_progress
 from thermogrip.report.console import Console
@@ -40,15 +27,15 @@ MOST_CONDITIONS = 4  # that are printed one by one
 
 
 def compare(
-    grasps: GraspFiles,
-    out: Annotated[Path, option("--out", "DIR", "Where tables and report go.")],
+    grasps: cli.GraspFiles,
+    out: Annotated[Path, cli.option("--out", "DIR", "Where tables and report go.")],
     test: Annotated[
         list[str] | None,
-        option("--test", "GRASPS", "Test on these grasps, not on a split; may be repeated."),
+        cli.option("--test", "GRASPS", "Test on these grasps, not on a split; may be repeated."),
     ] = None,
     classifiers: Annotated[
         str | None,
-        option(
+        cli.option(
             "--classifiers",
             "LIST",
             "Those of train, svm-pca, rocket, expansions, A+B (their mean), or module:Class of scikit-learn "
@@ -57,31 +44,31 @@ def compare(
         ),
     ] = None,
     repeats: Annotated[
-        int, option("--repeats", None, "Random splits by grasp, beside the shipped split.", min=0)
+        int, cli.option("--repeats", None, "Random splits by grasp, beside the shipped split.", min=0)
     ] = 20,
     train_per_class: Annotated[
-        int, option("--train-per-class", None, "Training grasps a material in a random split.", min=1)
+        int, cli.option("--train-per-class", None, "Training grasps a material in a random split.", min=1)
     ] = 5,
     by: Annotated[
         str | None,
-        option(
+        cli.option(
             "--by",
             "session|block",
             "Also hold out whole sessions or blocks in turn.",
-            one_of("--by", ("session", "block")),
+            cli.one_of("--by", ("session", "block")),
         ),
     ] = None,
     curves: Annotated[
         bool,
-        flag(
+        cli.flag(
             "--curves", "Also learning curve, contact time, time to decision, difference, effusivity strips."
         ),
     ] = False,
     quick: Quick = False,
-    seed: Seed = 0,
-    workers: Workers = 1,
-    cluster: Cluster = None,
-    as_json: AsJson = False,
+    seed: cli.Seed = 0,
+    workers: cli.Workers = 1,
+    cluster: cli.Cluster = None,
+    as_json: cli.AsJson = False,
 ) -> int:
     """Score classifiers on the same splits of the same grasps.
 
@@ -94,7 +81,7 @@ def compare(
     from thermogrip.datasets.grasp_files import read_grasp_files
     from thermogrip.datasets.parallel import kept_processes
 
-    pool, names = workers_of(workers, cluster), comma(classifiers)
+    pool, names = cli.workers_of(workers, cluster), cli.comma(classifiers)
     models, missing = trainable(names or BY_DEFAULT, quick=quick, seed=seed)
     if names is not None and missing:
         raise missing[0]
@@ -104,11 +91,11 @@ def compare(
     tests = read_grasp_files(test) if test else None
     if tests is None and not repeats and not by and not _has_split(records):
         raise UserError("nothing to score", hint="give --test, a column split, or --repeats")
-    new_folder(out)
+    cli.new_folder(out)
     console = Console(as_json)
     for line in left_out:
         console.warn(line)
-    warn_of_contacts(console, [*records, *(tests or ())])
+    cli.warn_of_contacts(console, [*records, *(tests or ())])
     records = touched_part(console, records)
     tests = None if tests is None else touched_part(console, tests)
     found = {}

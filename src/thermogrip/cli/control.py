@@ -8,46 +8,29 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from thermogrip.cli.options import (
-    ANSWER_IS_NO,
-    AsJson,
-    Cluster,
-    OwnNetwork,
-    PlantFile,
-    Report,
-    Seed,
-    Workers,
-    argument,
-    find_network,
-    flag,
-    load_plant,
-    new_file,
-    new_folder,
-    option,
-    workers_of,
-)
+from thermogrip.cli import options as cli
 from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
 
 if TYPE_CHECKING:
     from thermogrip.mpc.controllers.mpc import Controller
 
-ControllerFile = Annotated[Path, argument("CONTROLLER", "controller.json of tune.")]
+ControllerFile = Annotated[Path, cli.argument("CONTROLLER", "controller.json of tune.")]
 
 
 def tune(
-    plant: PlantFile,
-    out: Annotated[Path, option("--out", "FILE.json", "Where the controller goes.")],
+    plant: cli.PlantFile,
+    out: Annotated[Path, cli.option("--out", "FILE.json", "Where the controller goes.")],
     spec: Annotated[
         Path | None,
-        option("--spec", "SPEC.toml", "What is wanted; `thermogrip init spec` writes one to edit."),
+        cli.option("--spec", "SPEC.toml", "What is wanted; `thermogrip init spec` writes one to edit."),
     ] = None,
-    report: Report = None,
-    network: OwnNetwork = None,
-    seed: Seed = 0,
-    workers: Workers = 1,
-    cluster: Cluster = None,
-    as_json: AsJson = False,
+    report: cli.Report = None,
+    network: cli.OwnNetwork = None,
+    seed: cli.Seed = 0,
+    workers: cli.Workers = 1,
+    cluster: cli.Cluster = None,
+    as_json: cli.AsJson = False,
 ) -> int:
     """Find the MPC's weights for what you want.
 
@@ -61,16 +44,12 @@ def tune(
     from thermogrip.report.control import tuning_sections, tuning_table
     from thermogrip.report.html import write_report
 
-    pool = workers_of(workers, cluster)
-    loaded = load_plant(plant, network)
+    pool = cli.workers_of(workers, cluster)
+    loaded = cli.load_plant(plant, network)
     wanted = Spec() if spec is None else read_spec(spec)
-    new_file(out, (".json",))
+    cli.new_file(out, (".json",))
     console = Console(as_json)
-    with (
-        kept_processes(pool),
-        console.progress("tune") as progress,
-        _naming(spec, tuple(Spec.model_fields)),
-    ):
+    with kept_processes(pool), console.progress("tune") as progress, _naming(spec, tuple(Spec.model_fields)):
         found = search(loaded, wanted, progress=progress, workers=pool, seed=seed)
     found.save(out)
     if report is not None:
@@ -87,7 +66,7 @@ def tune(
     result = {key: getattr(found, key) for key in keys}
     result |= {"in_words": words, "pareto": found.pareto.rows(), "out": out, "report": report}
     console.answer(result)
-    return 0 if found.meets_spec else ANSWER_IS_NO
+    return 0 if found.meets_spec else cli.ANSWER_IS_NO
 
 
 @contextmanager
@@ -103,10 +82,10 @@ def _naming(spec: Path | None, keys: tuple[str, ...]) -> Iterator[None]:
 
 def review(
     controller: ControllerFile,
-    report: Report = None,
-    network: OwnNetwork = None,
-    seed: Seed = 0,
-    as_json: AsJson = False,
+    report: cli.Report = None,
+    network: cli.OwnNetwork = None,
+    seed: cli.Seed = 0,
+    as_json: cli.AsJson = False,
 ) -> int:
     """Check a controller's design.
 
@@ -128,19 +107,19 @@ def review(
         console.say(f"wrote {report}")
     failed = any(c.verdict == "fail" for c in checks)
     console.answer({"passed": not failed, "checks": checks, "report": report})
-    return ANSWER_IS_NO if failed else 0
+    return cli.ANSWER_IS_NO if failed else 0
 
 
 def export(
     controller: ControllerFile,
-    out: Annotated[Path, option("--out", "DIR", "Folder of the C files.")],
+    out: Annotated[Path, cli.option("--out", "DIR", "Folder of the C files.")],
     check: Annotated[
-        bool, flag("--check", "Build it (gcc) and compare it with Python on random states.")
+        bool, cli.flag("--check", "Build it (gcc) and compare it with Python on random states.")
     ] = False,
-    states: Annotated[int, option("--states", None, "Random states of --check.", min=1)] = 3_000,
-    network: OwnNetwork = None,
-    seed: Seed = 0,
-    as_json: AsJson = False,
+    states: Annotated[int, cli.option("--states", None, "Random states of --check.", min=1)] = 3_000,
+    network: cli.OwnNetwork = None,
+    seed: cli.Seed = 0,
+    as_json: cli.AsJson = False,
 ) -> int:
     """Write a controller as C99 without malloc.
 
@@ -150,7 +129,7 @@ def export(
 
     console = Console(as_json)
     loaded = load_controller(controller, network)
-    written = export_controller(loaded, new_folder(out))
+    written = export_controller(loaded, cli.new_folder(out))
     console.say(
         f"Wrote {len(written.files)} files to {out}: {written.ram} bytes of RAM a controller, "
         f"{written.constants} of constants."
@@ -169,11 +148,11 @@ def export(
     )
     console.say("C and Python do the same." if found.passed else "C and Python differ.")
     console.answer({**result, **asdict(found), "passed": found.passed})
-    return 0 if found.passed else ANSWER_IS_NO
+    return 0 if found.passed else cli.ANSWER_IS_NO
 
 
 def load_controller(path: Path, network: str | None) -> Controller:
     """Return a controller; ``network`` is the class of its plant, where that is the user's own."""
     from thermogrip.mpc.controllers.mpc import Controller
 
-    return Controller.load(path, model=None if network is None else find_network(network))
+    return Controller.load(path, model=None if network is None else cli.find_network(network))

@@ -12,17 +12,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from thermogrip.cli.options import (
-    AsJson,
-    Seed,
-    choices,
-    comma,
-    find_network,
-    load_plant,
-    new_file,
-    one_of,
-    option,
-)
+from thermogrip.cli import options as cli
 from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
 
@@ -42,40 +32,39 @@ HALVINGS = 12  # of the bisection
 
 def excite(
     kind: Annotated[
-        str, option("--kind", "|".join(KINDS), "Shape of the excitation.", one_of("--kind", KINDS))
+        str, cli.option("--kind", "|".join(KINDS), "Shape of the excitation.", cli.one_of("--kind", KINDS))
     ],
-    minutes: Annotated[float, option("--minutes", "M", "Length of the experiment.", min=0.1)],
-    out: Annotated[Path, option("--out", "SCHEDULE.csv", "Where it goes.")],
+    minutes: Annotated[float, cli.option("--minutes", "M", "Length of the experiment.", min=0.1)],
+    out: Annotated[Path, cli.option("--out", "SCHEDULE.csv", "Where it goes.")],
     plant: Annotated[
-        Path | None,
-        option("--plant", "PLANT", "Fit time constants and amplitude to this plant."),
+        Path | None, cli.option("--plant", "PLANT", "Fit time constants and amplitude to this plant.")
     ] = None,
     network: Annotated[
         str | None,
-        option(
+        cli.option(
             "--network",
             "NAME|FILE",
             "Before any log: a network at its priors; with a plant of your own, its FILE.py:CLASS.",
         ),
     ] = None,
-    lowest: Annotated[float, option("--lowest", "DEGC", "With a plant: no output below this.")] = 5.0,
-    highest: Annotated[float, option("--highest", "DEGC", "With a plant: no output above this.")] = 60.0,
-    hold: Annotated[str | None, option("--hold", "A,B", "With optimal: inputs that do not move.")] = None,
+    lowest: Annotated[float, cli.option("--lowest", "DEGC", "With a plant: no output below this.")] = 5.0,
+    highest: Annotated[float, cli.option("--highest", "DEGC", "With a plant: no output above this.")] = 60.0,
+    hold: Annotated[str | None, cli.option("--hold", "A,B", "With optimal: inputs that do not move.")] = None,
     slew: Annotated[
-        float | None, option("--slew", "PER_S", "With optimal: a drive changes no faster.", min=1e-9)
+        float | None, cli.option("--slew", "PER_S", "With optimal: a drive changes no faster.", min=1e-9)
     ] = None,
-    seed: Seed = 0,
-    as_json: AsJson = False,
+    seed: cli.Seed = 0,
+    as_json: cli.AsJson = False,
 ) -> int:
     """Write an input schedule to identify a plant by.
 
     ``optimal`` shrinks the intervals of the plant's parameters most and says by how much, beforehand."""
     if plant is not None:
-        choices("--hold", comma(hold) or (), plant, "inputs")
+        cli.choices("--hold", cli.comma(hold) or (), plant, "inputs")
     from thermogrip.datasets.log_files import write_log
     from thermogrip.sysid.experiment.schedules import excite as plain_schedule
 
-    new_file(out)
+    cli.new_file(out)
     console = Console(as_json)
     subject = _subject(plant, network)
     answer: dict[str, Any] = {"kind": kind}
@@ -85,7 +74,7 @@ def excite(
                 "--kind optimal needs to know what it is optimal for", hint="give --plant or --network"
             )
         limits = {"lowest": lowest, "highest": highest, "slew": float("inf") if slew is None else slew}
-        log, answer["expected"] = _optimal(console, subject, minutes, limits, comma(hold) or (), seed)
+        log, answer["expected"] = _optimal(console, subject, minutes, limits, cli.comma(hold) or (), seed)
     elif subject is None:
         log, answer["share"] = plain_schedule(kind, minutes, seed=seed), 1.0
     else:
@@ -105,21 +94,16 @@ def _subject(plant: Path | None, network: str | None) -> Plant | None:
     if plant is not None and network is not None and ".py:" not in network:
         raise UserError("--plant and --network exclude each other", hint="give one of them")
     if plant is not None:
-        return load_plant(plant, network)
+        return cli.load_plant(plant, network)
     if network is None:
         return None
     from thermogrip.sysid.experiment.information import plant_from_prior
 
-    return plant_from_prior(find_network(network))
+    return plant_from_prior(cli.find_network(network))
 
 
 def _optimal(
-    console: Console,
-    plant: Plant,
-    minutes: float,
-    limits: dict[str, float],
-    hold: tuple[str, ...],
-    seed: int,
+    console: Console, plant: Plant, minutes: float, limits: dict[str, float], hold: tuple[str, ...], seed: int
 ) -> tuple[Log, dict[str, Any]]:
     """Return the most informative schedule and what is expected of it, and show that."""
     with console.progress("excite") as progress:

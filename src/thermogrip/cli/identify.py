@@ -5,28 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from thermogrip.cli.options import (
-    ANSWER_IS_NO,
-    AsJson,
-    Columns,
-    LogFiles,
-    OwnNetwork,
-    PlantFile,
-    Report,
-    Seed,
-    Step,
-    Workers,
-    argument,
-    choice,
-    choices,
-    comma,
-    find_network,
-    flag,
-    load_logs,
-    load_plant,
-    new_file,
-    option,
-)
+from thermogrip.cli import options as cli
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.parallel import sub_progress
 from thermogrip.report.console import Console
@@ -53,78 +32,82 @@ NO_POSTERIOR = "no posterior: the model that was kept is a black box, only netwo
 
 def _known_models(value: str) -> str:
     """Ask that every model of a list is known (``callback=``)."""
-    for name in comma(value) or ():
-        choice("--models", name, MODELS)
+    for name in cli.comma(value) or ():
+        cli.choice("--models", name, MODELS)
     return value
 
 
 Warmup = Annotated[
-    float, option("--warmup", "S", "Measured outputs of these first seconds may set the state.", min=0)
+    float, cli.option("--warmup", "S", "Measured outputs of these first seconds may set the state.", min=0)
 ]
 Average = Annotated[
-    float | None, option("--average", "S", "Average over S seconds first (coarse sensors need it).", min=0)
+    float | None,
+    cli.option("--average", "S", "Average over S seconds first (coarse sensors need it).", min=0),
 ]
 
 
 def identify(
-    paths: LogFiles,
+    paths: cli.LogFiles,
     out: Annotated[
-        Path | None, option("--out", "FILE.json", "Where the plant goes; where absent, LOG_plant.json.")
+        Path | None, cli.option("--out", "FILE.json", "Where the plant goes; where absent, LOG_plant.json.")
     ] = None,
     network: Annotated[
         str | None,
-        option(
+        cli.option(
             "--network",
             "NAME|FILE",
             "A shipped one (init network --like), none, FILE.toml, FILE.py:CLASS (which runs the file); "
             "where absent, the shipped one whose columns the logs have.",
         ),
     ] = None,
-    inputs: Annotated[str | None, option("--inputs", "A,B", "Columns that are moved.")] = None,
-    outputs: Annotated[str | None, option("--outputs", "C,D", "Columns to predict.")] = None,
+    inputs: Annotated[str | None, cli.option("--inputs", "A,B", "Columns that are moved.")] = None,
+    outputs: Annotated[str | None, cli.option("--outputs", "C,D", "Columns to predict.")] = None,
     disturbances: Annotated[
-        str | None, option("--disturbances", "E", "Columns that are measured and not moved.")
+        str | None, cli.option("--disturbances", "E", "Columns that are measured and not moved.")
     ] = None,
-    columns: Columns = None,
-    dt: Step = None,
+    columns: cli.Columns = None,
+    dt: cli.Step = None,
     models: Annotated[
-        str, option("--models", "LIST", "Which candidate models to fit, of these and bj.", _known_models)
+        str, cli.option("--models", "LIST", "Which candidate models to fit, of these and bj.", _known_models)
     ] = USUAL_MODELS,
     average: Average = None,
     order: Annotated[
         int | None,
-        option("--order", "N", "Poles of ARX, OE and BJ, states of subspace models.", min=1, max=20),
+        cli.option("--order", "N", "Poles of ARX, OE and BJ, states of subspace models.", min=1, max=20),
     ] = None,
     delay: Annotated[
-        int | None, option("--delay", "N", "Delay of ARX, OE and BJ, in steps of the model.", min=1, max=20)
+        int | None,
+        cli.option("--delay", "N", "Delay of ARX, OE and BJ, in steps of the model.", min=1, max=20),
     ] = None,
-    leave_one_out: Annotated[bool, flag("--leave-one-out", "Score each log by a fit to the others.")] = False,
+    leave_one_out: Annotated[
+        bool, cli.flag("--leave-one-out", "Score each log by a fit to the others.")
+    ] = False,
     grow: Annotated[
         bool,
-        flag(
+        cli.flag(
             "--grow", "Try terms that the network lacks, and its own, on held-out logs; print what was kept."
         ),
     ] = False,
     posterior: Annotated[
-        bool, flag("--posterior/--no-posterior", "Sample the parameters' posterior until it converges.")
+        bool, cli.flag("--posterior/--no-posterior", "Sample the parameters' posterior until it converges.")
     ] = False,
-    report: Report = None,
-    seed: Seed = 0,
-    workers: Workers = 1,
-    as_json: AsJson = False,
+    report: cli.Report = None,
+    seed: cli.Seed = 0,
+    workers: cli.Workers = 1,
+    as_json: cli.AsJson = False,
 ) -> int:
     """Find the plant behind one or several logs.
 
     Checks the data, fits candidate models, scores each by free run on held-out data, keeps the best one.
     """
-    wanted = comma(models) or ()
+    wanted = cli.comma(models) or ()
     if out is None:
         from thermogrip.datasets.log_files import split_cut
         from thermogrip.datasets.tables import file_stem
 
         out = Path(f"{file_stem(split_cut(paths[0])[0])}_plant.json")
-    new_file(out, (".json",))
-    roles = comma(inputs), comma(outputs), comma(disturbances)
+    cli.new_file(out, (".json",))
+    roles = cli.comma(inputs), cli.comma(outputs), cli.comma(disturbances)
     if columns is None:
         from thermogrip.datasets.log_files import split_cut
         from thermogrip.datasets.tables import check_columns
@@ -133,18 +116,18 @@ def identify(
             check_columns(split_cut(path)[0], [name for names in roles for name in names or ()])
     a_network = "network" in wanted and network != "none"
     named = a_network and bool(network or grow)
-    wanted_network = find_network(network or DEFAULT_NETWORK) if named else None
+    wanted_network = cli.find_network(network or DEFAULT_NETWORK) if named else None
     to_grow = _growable(wanted_network) if grow else None
     console = Console(as_json)
     from thermogrip.datasets.units import find_column
     from thermogrip.sysid.plant.log_grid import roles_of
 
-    table: dict[str, Any] = {"columns": comma(columns), "dt": dt}
+    table: dict[str, Any] = {"columns": cli.comma(columns), "dt": dt}
     if wanted_network is None:
-        logs = load_logs(paths, *roles, **table)
+        logs = cli.load_logs(paths, *roles, **table)
         wanted_network = _shipped_network(logs) if a_network else None
     if wanted_network is not None:  # what a network calls its own has the role that it has there
-        logs = load_logs(paths, *roles, known=roles_of(wanted_network), **table)
+        logs = cli.load_logs(paths, *roles, known=roles_of(wanted_network), **table)
     repairs = _repaired(console, logs)
     have = dict.fromkeys(map(str, logs[0].data_vars), "")  # what a word means may be written otherwise
     known = [None if words is None else tuple(find_column(w, have) for w in words) for words in roles]
@@ -199,7 +182,7 @@ def identify(
         console.warn(f"{plant.model.kind} model not compiled, tens of times slower: {slow}")
     more = {"dynamics": None if dynamics is None else dynamics.to_dict(), "repairs": repairs}
     console.answer(_identified(found, plant, record, growth, out) | more)
-    return ANSWER_IS_NO if posterior and (record is None or not record.converged) else 0
+    return cli.ANSWER_IS_NO if posterior and (record is None or not record.converged) else 0
 
 
 def _sampled(
@@ -236,7 +219,7 @@ def _shipped_network(logs: Sequence[Log]) -> GreyModel | None:
     from thermogrip.sysid.plant.log_grid import misfit
 
     for name in builtin_networks():
-        network = find_network(name)
+        network = cli.find_network(name)
         if all(misfit(network, log) is None for log in logs):
             return network
     return None
@@ -338,27 +321,27 @@ def _identified(
 
 
 def validate(
-    plant: PlantFile,
-    paths: LogFiles,
+    plant: cli.PlantFile,
+    paths: cli.LogFiles,
     warmup: Warmup = 5.0,
     score_from: Annotated[
-        float, option("--score-from", "S", "Samples before this are not scored.", min=0)
+        float, cli.option("--score-from", "S", "Samples before this are not scored.", min=0)
     ] = 5.0,
     average: Average = None,
-    network: OwnNetwork = None,
-    columns: Columns = None,
-    dt: Step = None,
-    report: Report = None,
-    seed: Seed = 0,
-    as_json: AsJson = False,
+    network: cli.OwnNetwork = None,
+    columns: cli.Columns = None,
+    dt: cli.Step = None,
+    report: cli.Report = None,
+    seed: cli.Seed = 0,
+    as_json: cli.AsJson = False,
 ) -> int:
     """Score a plant by free run.
 
     It sees the inputs and disturbances of the whole log, and measured outputs of the warm-up only."""
-    loaded = load_plant(plant, network)
+    loaded = cli.load_plant(plant, network)
     console = Console(as_json)
     roles = loaded.inputs, loaded.outputs, loaded.disturbances
-    logs = load_logs(paths, *roles, columns=comma(columns), dt=dt)
+    logs = cli.load_logs(paths, *roles, columns=cli.comma(columns), dt=dt)
     from thermogrip.report.html import write_report
     from thermogrip.report.plant import band_words, free_run_section, run_table
     from thermogrip.sysid.identification import warm_up_of_fit
@@ -411,29 +394,29 @@ def run_answer(name: str, run: FreeRun, band: Band) -> dict[str, Any]:
 
 
 def simulate(
-    plant: PlantFile,
-    path: Annotated[str, argument("LOG", "Inputs and warm-up come from here.")],
-    out: Annotated[Path, option("--out", "SIM.csv", "Where the log goes.")],
+    plant: cli.PlantFile,
+    path: Annotated[str, cli.argument("LOG", "Inputs and warm-up come from here.")],
+    out: Annotated[Path, cli.option("--out", "SIM.csv", "Where the log goes.")],
     warmup: Warmup = 5.0,
     bands: Annotated[
-        bool, flag("--bands", "Add the ends of each output's 90 % band, OUTPUT_low and OUTPUT_high.")
+        bool, cli.flag("--bands", "Add the ends of each output's 90 % band, OUTPUT_low and OUTPUT_high.")
     ] = False,
-    network: OwnNetwork = None,
-    columns: Columns = None,
-    dt: Step = None,
-    seed: Seed = 0,
-    as_json: AsJson = False,
+    network: cli.OwnNetwork = None,
+    columns: cli.Columns = None,
+    dt: cli.Step = None,
+    seed: cli.Seed = 0,
+    as_json: cli.AsJson = False,
 ) -> int:
     """Simulate a plant over the inputs of a log."""
     from thermogrip.datasets.log_files import write_log
     from thermogrip.datasets.schema import column
     from thermogrip.sysid.plant.log_grid import match_logs
 
-    new_file(out)
+    cli.new_file(out)
     console = Console(as_json)
-    loaded = load_plant(plant, network)
+    loaded = cli.load_plant(plant, network)
     roles = loaded.inputs, loaded.outputs, loaded.disturbances
-    (log,) = load_logs([path], *roles, columns=comma(columns), dt=dt)
+    (log,) = cli.load_logs([path], *roles, columns=cli.comma(columns), dt=dt)
     repairs = _repaired(console, [log])[log.attrs["name"]]
     (log,), converted = match_logs(loaded, [log])
     for line in converted:
@@ -454,34 +437,34 @@ def simulate(
 
 
 def linearise(
-    plant: PlantFile,
+    plant: cli.PlantFile,
     at: Annotated[
         str | None,
-        option(
+        cli.option(
             "--at",
             "NAME=X,...",
             "Inputs and disturbances of the operating point; the others are in the middle of the logs.",
         ),
     ] = None,
     dt: Annotated[
-        float | None, option("--dt", "S", "Step of the matrices; none: continuous.", min=1e-9)
+        float | None, cli.option("--dt", "S", "Step of the matrices; none: continuous.", min=1e-9)
     ] = None,
     out: Annotated[
-        Path | None, option("--out", "FILE", "Matrices as .json, .csv (a row an entry) or .mat.")
+        Path | None, cli.option("--out", "FILE", "Matrices as .json, .csv (a row an entry) or .mat.")
     ] = None,
-    report: Report = None,
-    network: OwnNetwork = None,
-    seed: Seed = 0,
-    as_json: AsJson = False,
+    report: cli.Report = None,
+    network: cli.OwnNetwork = None,
+    seed: cli.Seed = 0,
+    as_json: cli.AsJson = False,
 ) -> int:
     """Show a plant about an operating point: gains, time constants, dead times, matrices.
 
     Gains have 90 % intervals where the plant has draws."""
     if out is not None:
-        new_file(out, (".json", ".csv", ".mat"))
-    named = _numbers("--at", at)
-    choices("--at", named, plant, "inputs", "disturbances")
-    loaded, console = load_plant(plant, network), Console(as_json)
+        cli.new_file(out, (".json", ".csv", ".mat"))
+    named = cli.numbers("--at", at)
+    cli.choices("--at", named, plant, "inputs", "disturbances")
+    loaded, console = cli.load_plant(plant, network), Console(as_json)
     from thermogrip.report.html import write_report
     from thermogrip.report.plant import dynamics_section, gain_table, time_constant_words
     from thermogrip.sysid.export.dynamics import plant_dynamics, usual_point
@@ -509,15 +492,3 @@ def linearise(
         answer["out"] = out
     console.answer(answer)
     return 0
-
-
-def _numbers(option: str, text: str | None) -> dict[str, float]:
-    """Return the numbers of ``NAME=X,...`` by name."""
-    out = {}
-    for word in comma(text) or ():
-        name, _, number = word.partition("=")
-        try:
-            out[name.strip()] = float(number)
-        except ValueError:
-            raise UserError(f"{option} {word!r} is no NAME=NUMBER", hint="write q1=30,t_ambient=22") from None
-    return out

@@ -12,10 +12,12 @@ import os
 import re
 import tomllib
 from collections.abc import Iterator
-from importlib import resources
+from functools import partial
+from importlib import import_module, resources
 from pathlib import Path
 from typing import Any
 
+from thermogrip.datasets.atomic_files import read_toml
 from thermogrip.datasets.errors import UserError, known_names
 
 KINDS: dict[str, dict[str, Any]] = tomllib.loads(
@@ -96,13 +98,15 @@ def _keys(content: dict[str, Any]) -> Iterator[str]:
             yield from value
 
 
-def check_keys(content: dict[str, Any], kind: str, path: str | Path) -> None:
+def check_keys(path: str, kind: str) -> None:
     """Refuse a key that the template of this kind has not."""
-    known = template_keys(kind)
-    for key in _keys(content):
+    known, shows = template_keys(kind), f"'thermogrip init {kind}' shows every key"
+    for key in _keys(read_toml(path, hint=shows)):
         if key not in known:
-            hint = known_names(key, sorted(known), f"'thermogrip init {kind}' shows every key")
-            raise UserError(f"{key}: no such key", file=path, hint=hint)
+            raise UserError(f"{key}: no such key", file=path, hint=known_names(key, sorted(known), shows))
+
+
+check_spec, check_guard = partial(check_keys, kind="spec"), partial(check_keys, kind="guard")
 
 
 def check_exists(text: str) -> None:
@@ -141,8 +145,8 @@ def _places(command: Any, kind: str) -> tuple[list[str], bool]:
     return first + named, bool(takes)
 
 
-def check_files(ctx: Any) -> list[tuple[str, str]]:
-    """Refuse what is not there or of another kind among what a verb was given; return paths and kinds."""
+def check_files(ctx: Any) -> None:
+    """Refuse what is not there, of another kind, or not whole among what a verb was given."""
     given = []
     for param in ctx.command.params:
         kind, value = _TAKES.get(param.metavar, ""), ctx.params.get(param.name)
@@ -154,4 +158,7 @@ def check_files(ctx: Any) -> list[tuple[str, str]]:
         check_exists(path)
     for path, kind in there:
         check_kind(ctx, path, kind)
-    return given
+    for path, kind in given:
+        if where := KINDS[kind].get("check"):
+            module, name = where.split(":")
+            getattr(import_module(module), name)(path)

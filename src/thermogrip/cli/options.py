@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from thermogrip.cli.kinds import check_exists, check_keys
-from thermogrip.datasets.errors import UserError, known_names
+from thermogrip.cli.kinds import check_exists
+from thermogrip.datasets.errors import UserError, as_user_error, known_names
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps, Log
@@ -27,13 +27,8 @@ PROTOCOLS = ("thermogrip", "tclab")
 SHOWN_REPAIRS = 5
 
 
-def _is_plant(path: str) -> None:
-    from thermogrip.sysid.plant.plant_data import check_plant_file
-
-    check_plant_file(path)
-
-
-def _is_controller(path: str) -> None:
+def check_controller(path: str) -> None:
+    """Look through a controller before what its model needs is loaded."""
     from thermogrip.datasets.limits import STEP_RANGE, number_within
     from thermogrip.sysid.plant.plant_data import check_plant_file
 
@@ -45,28 +40,8 @@ def _is_controller(path: str) -> None:
         raise UserError(problem, file=path, hint="tune the controller again") from error
 
 
-def _is_settings(kind: str) -> Callable[[str], None]:
-    def check(path: str) -> None:
-        from thermogrip.datasets.atomic_files import read_toml
-
-        check_keys(read_toml(path, hint=f"'init {kind}' writes one to edit"), kind, path)
-
-    return check
-
-
-def _is_log(path: str) -> None:
-    from thermogrip.datasets.log_files import check_log_file
-
-    check_log_file(path)
-
-
-def _is_grasps(path: str) -> None:
-    from thermogrip.datasets.grasp_files import check_grasp_file
-
-    check_grasp_file(path)
-
-
-def _is_network(text: str) -> None:
+def check_network(text: str) -> None:
+    """Refuse what is no network, or no file of one."""
     if text == "none":
         return
     file, name = _split_class(text)
@@ -87,21 +62,15 @@ def _split_class(text: str) -> tuple[str, str]:
     return (file, name) if file.endswith(".py") else (text, "")
 
 
-def _is_new_page(value: str) -> None:
+def check_new_page(value: str) -> None:
+    """Refuse a page that cannot be written there."""
     new_file(Path(value), (".html",))
 
 
-def _is_folder(value: str) -> None:
+def check_folder(value: str) -> None:
+    """Refuse what is no folder."""
     if not os.path.isdir(value):
         raise UserError("is not a folder", file=value, hint="give the folder that train --out made")
-
-
-#: What is looked at in a file of each kind before a room is imported.
-LOOKS: dict[str, Callable[[str], None]] = {
-    "plant": _is_plant, "controller": _is_controller, "log": _is_log, "grasps": _is_grasps,
-    "network": _is_network, "page": _is_new_page, "classifier": _is_folder,
-    "spec": _is_settings("spec"), "guard": _is_settings("guard"),
-}  # fmt: skip
 
 
 def one_of(option: str, allowed: Sequence[str]) -> Callable[[str | None], str | None]:
@@ -166,8 +135,7 @@ OwnNetwork = Annotated[
     ),
 ]
 GraspFiles = Annotated[
-    list[str],
-    argument("GRASPS...", "Grasp files (CSV with its _meta.csv, or NetCDF) or folders."),
+    list[str], argument("GRASPS...", "Grasp files (CSV with its _meta.csv, or NetCDF) or folders.")
 ]
 
 
@@ -179,6 +147,20 @@ def comma(text: str | None) -> tuple[str, ...] | None:
     if not words:
         raise UserError(f"{text!r} names nothing", hint="write names with commas between them")
     return words
+
+
+def numbers(option: str, text: str | None) -> dict[str, float]:
+    """Return the numbers of ``NAME=X,...`` by name."""
+    out = {}
+    for word in comma(text) or ():
+        name, _, number = word.partition("=")
+        if name.strip() in out:
+            raise UserError(f"{option} {text!r} names {name.strip()} twice", hint="name each once")
+        with as_user_error(
+            ValueError, f"{option} {word!r} is no NAME=NUMBER", hint="write q1=30,t_ambient=22"
+        ):
+            out[name.strip()] = float(number)
+    return out
 
 
 def workers_of(workers: int, cluster: str | None) -> int | str:

@@ -6,38 +6,26 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated
 
+from thermogrip.cli import options as cli
 from thermogrip.cli.kinds import TEMPLATES, template_text
-from thermogrip.cli.options import (
-    AsJson,
-    Cluster,
-    Seed,
-    Workers,
-    argument,
-    choice,
-    flag,
-    new_file,
-    new_folder,
-    option,
-    workers_of,
-)
 from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
 
 
 def demo(
-    out: Annotated[Path, option("--out", "DIR", "Where everything goes.")] = Path("thermogrip-demo"),
-    seed: Seed = 0,
-    workers: Workers = 2,
-    cluster: Cluster = None,
-    as_json: AsJson = False,
+    out: Annotated[Path, cli.option("--out", "DIR", "Where everything goes.")] = Path("thermogrip-demo"),
+    seed: cli.Seed = 0,
+    workers: cli.Workers = 2,
+    cluster: cli.Cluster = None,
+    as_json: cli.AsJson = False,
 ) -> int:
     """Do all of the below once on the example data.
 
     Identify, validate, tune, run on the simulated rig, grasp, compare; under 2 minutes on 2 cores, with a
     report. Without PyTorch the comparison has no LSTM.
     """
-    new_folder(out)
-    pool = workers_of(workers, cluster)
+    cli.new_folder(out)
+    pool = cli.workers_of(workers, cluster)
     from thermogrip.studies.demo import compared_models, run_demo
 
     console = Console(as_json)
@@ -55,19 +43,19 @@ def demo(
 
 
 def paper(
-    out: Annotated[Path, option("--out", "DIR", "Where everything goes.")],
-    quick: Annotated[bool, flag("--quick", "LSTM of 200 epochs instead of 2000.")] = False,
-    seed: Seed = 0,
-    workers: Workers = 1,
-    cluster: Cluster = None,
-    as_json: AsJson = False,
+    out: Annotated[Path, cli.option("--out", "DIR", "Where everything goes.")],
+    quick: Annotated[bool, cli.flag("--quick", "LSTM of 200 epochs instead of 2000.")] = False,
+    seed: cli.Seed = 0,
+    workers: cli.Workers = 1,
+    cluster: cli.Cluster = None,
+    as_json: cli.AsJson = False,
 ) -> int:
     """Repeat the paper's experiments, table beside table.
 
     They train its LSTM, which needs PyTorch: pip install "thermogrip[lstm]".
     """
-    new_folder(out)
-    pool = workers_of(workers, cluster)
+    cli.new_folder(out)
+    pool = cli.workers_of(workers, cluster)
     from thermogrip.datasets.parallel import kept_processes
     from thermogrip.report.html import write_report
     from thermogrip.studies.paper import repeat_paper
@@ -96,10 +84,10 @@ def paper(
 
 
 def init(
-    what: Annotated[str, argument("spec|network|topics|guard|examples", "What to start from.")],
+    what: Annotated[str, cli.argument("spec|network|topics|guard|examples", "What to start from.")],
     like: Annotated[
         str | None,
-        option(
+        cli.option(
             "--like",
             "NAME",
             "Of a network: start from gripper, tclab, peltier_chamber, room, hotend, furnace, tank "
@@ -108,16 +96,18 @@ def init(
     ] = None,
     out: Annotated[
         Path | None,
-        option("--out", "FILE.toml|DIR", "Where it goes [default: stdout; of the examples: this folder]."),
+        cli.option(
+            "--out", "FILE.toml|DIR", "Where it goes [default: stdout; of the examples: this folder]."
+        ),
     ] = None,
-    as_json: AsJson = False,
+    as_json: cli.AsJson = False,
 ) -> int:
     """Write a commented template, or the example files, to start from.
 
     spec: what tune aims at; network: a thermal network for identify --network; topics: which
     topic of a ROS bag or MCAP file is which column of a log; guard: what run and batch allow;
     examples: logs and grasps of a simulated rig, to try every verb on."""
-    choice("template", what, (*TEMPLATES, "examples"))
+    cli.choice("template", what, (*TEMPLATES, "examples"))
     console = Console(as_json)
     if like is not None and what != "network":
         raise UserError(f"--like {like} is of a network, not of {what}", hint="write init network --like")
@@ -129,7 +119,7 @@ def init(
     else:
         from thermogrip.datasets.atomic_files import write_atomic
 
-        new_file(out, (".toml",))
+        cli.new_file(out, (".toml",))
         if out.exists():
             raise UserError("exists already", file=out, hint="remove it or choose another name")
         write_atomic(out, text)
@@ -142,7 +132,7 @@ def _examples(console: Console, folder: Path) -> int:
     """Copy the example files and say what they are."""
     from thermogrip.datasets.examples import EXAMPLE_LOGS, copy_examples, example_grasps
 
-    paths = copy_examples(new_folder(folder))
+    paths = copy_examples(cli.new_folder(folder))
     logs, grasps = len(EXAMPLE_LOGS), len(example_grasps())
     console.say(f"{logs} logs in {folder}, {grasps} sets of grasps in {folder / 'grasps'}")
     console.say(f"simulated, not measured; described in {folder / 'EXAMPLES.md'}")
@@ -156,5 +146,5 @@ def _template(what: str, like: str | None) -> str:
         return template_text(what)
     from thermogrip.sysid.models.network_spec import builtin_networks
 
-    name = choice("--like", like, builtin_networks())
+    name = cli.choice("--like", like, builtin_networks())
     return (resources.files("thermogrip.sysid") / f"networks/{name}.toml").read_text(encoding="utf-8")

@@ -10,25 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from thermogrip.cli import options as cli
 from thermogrip.cli.control import ControllerFile, load_controller
-from thermogrip.cli.options import (
-    ANSWER_IS_NO,
-    PROTOCOLS,
-    AsJson,
-    OwnNetwork,
-    Report,
-    Seed,
-    argument,
-    choice,
-    choices,
-    flag,
-    load_plant,
-    new_file,
-    new_folder,
-    one_of,
-    option,
-)
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, as_user_error
+from thermogrip.datasets.materials import find_material
 from thermogrip.report.console import Console
 from thermogrip.rig.session.signals import check_stopped, stop_signals
 from thermogrip.rig.simulation.faults import FAULTS
@@ -48,53 +33,55 @@ if TYPE_CHECKING:
 
 LOWEST_TARGET, HIGHEST_TARGET = 10.0, 50.0  # degC, of the skin
 
-
-def _known_material(value: str | None) -> str | None:
-    """Return the name of a material in our table (``callback=``)."""
-    from thermogrip.datasets.materials import find_material
-
-    return None if value is None else find_material(value).name
-
-
-OutOption = Annotated[Path, option("--out", "DIR", "Folder of the run.")]
-TwinOption = Annotated[Path | None, option("--twin", "PLANT", "Simulate this plant; no hardware is opened.")]
+OutOption = Annotated[Path, cli.option("--out", "DIR", "Folder of the run.")]
+TwinOption = Annotated[
+    Path | None, cli.option("--twin", "PLANT", "Simulate this plant; no hardware is opened.")
+]
 PortOption = Annotated[
-    str | None, option("--port", "DEV", "The rig: /dev/ttyACM0, COM3, socket://HOST:PORT.")
+    str | None, cli.option("--port", "DEV", "The rig: /dev/ttyACM0, COM3, socket://HOST:PORT.")
 ]
 ProtocolOption = Annotated[
     str | None,
-    option(
-        "--protocol", "NAME", "thermogrip or tclab [default: found out].", one_of("--protocol", PROTOCOLS)
+    cli.option(
+        "--protocol",
+        "NAME",
+        "thermogrip or tclab [default: found out].",
+        cli.one_of("--protocol", cli.PROTOCOLS),
     ),
 ]
-SpeedOption = Annotated[float, option("--speed", "X", "With --port: that of a virtual device.", min=0.01)]
-DrawOption = Annotated[int, option("--draw", None, "Posterior draw of the twin's plant (0: the fit).", min=0)]
+SpeedOption = Annotated[float, cli.option("--speed", "X", "With --port: that of a virtual device.", min=0.01)]
+DrawOption = Annotated[
+    int, cli.option("--draw", None, "Posterior draw of the twin's plant (0: the fit).", min=0)
+]
 StartOption = Annotated[
-    float | None, option("--from", "DEGC", "Temperature at the start [default: the room's].")
+    float | None, cli.option("--from", "DEGC", "Temperature at the start [default: the room's].")
 ]
-ObjOption = Annotated[float | None, option("--object", "DEGC", "Temperature of the object.")]
+ObjOption = Annotated[float | None, cli.option("--object", "DEGC", "Temperature of the object.")]
 MaterialOption = Annotated[
-    str | None, option("--material", "NAME", "Material of the object.", _known_material)
+    str | None,
+    cli.option(
+        "--material", "NAME", "Material of the object.", lambda name: name and find_material(name).name
+    ),
 ]
-GraspTimeOption = Annotated[float, option("--grasp-time", "S", "Recorded time of contact.", min=0.5)]
+GraspTimeOption = Annotated[float, cli.option("--grasp-time", "S", "Recorded time of contact.", min=0.5)]
 StopEarlyOption = Annotated[
     Path | None,
-    option(
+    cli.option(
         "--stop-early",
         "MODEL_DIR",
         "End the contact once this classifier (train --stop-error) has seen enough.",
     ),
 ]
 SettleTimeoutOption = Annotated[
-    float, option("--settle-timeout", "S", "Give up settling after this long.", min=1)
+    float, cli.option("--settle-timeout", "S", "Give up settling after this long.", min=1)
 ]
 GuardOption = Annotated[
     Path | None,
-    option("--guard", "GUARD.toml", "What the guard allows; `thermogrip init guard` writes one to edit."),
+    cli.option("--guard", "GUARD.toml", "What the guard allows; `thermogrip init guard` writes one to edit."),
 ]
 LearnOption = Annotated[
     Path | None,
-    option(
+    cli.option(
         "--learn",
         "RIG.json",
         "Let the guard learn from this rig's first healthy sessions how far it is from the plant.",
@@ -107,7 +94,7 @@ def run(
     controller: ControllerFile,
     target: Annotated[
         str,
-        option(
+        cli.option(
             "--target",
             "DEGC",
             "Skin temperature at contact, 10 to 50; of several outputs t1=40,t2=35.",
@@ -121,7 +108,7 @@ def run(
     twin: TwinOption = None,
     draw: DrawOption = 0,
     start: StartOption = None,
-    hold: Annotated[float, option("--hold", "S", "Regulate this long after settling.", min=0)] = 0.0,
+    hold: Annotated[float, cli.option("--hold", "S", "Regulate this long after settling.", min=0)] = 0.0,
     obj: ObjOption = None,
     material: MaterialOption = None,
     grasp_time: GraspTimeOption = 10.0,
@@ -129,10 +116,10 @@ def run(
     settle_timeout: SettleTimeoutOption = 900.0,
     guard: GuardOption = None,
     learn: LearnOption = None,
-    report: Report = None,
-    network: OwnNetwork = None,
-    seed: Seed = 0,
-    as_json: AsJson = False,
+    report: cli.Report = None,
+    network: cli.OwnNetwork = None,
+    seed: cli.Seed = 0,
+    as_json: cli.AsJson = False,
 ) -> int:
     """Bring the skin to a temperature, stop the pump, grasp, record.
 
@@ -141,7 +128,7 @@ def run(
     """
     wanted, grasp = _targets(target), _what_to_grasp(obj, material)
     one_rig(port, twin)
-    choices("--target", wanted if isinstance(wanted, dict) else (), controller, "outputs")
+    cli.choices("--target", wanted if isinstance(wanted, dict) else (), controller, "outputs")
     from thermogrip.classify.decisions.stopping_rule import session_stop
     from thermogrip.mpc.closed_loop.simulate import RecordedController
     from thermogrip.mpc.tuning.design_review import beyond_logs
@@ -196,7 +183,7 @@ def run(
         console.say(session.advice)
     console.say(f"wrote {out}")
     console.answer({"verdict": session.verdict, "advice": session.advice, **figures, "out": out})
-    return 0 if session.verdict == "settled" else ANSWER_IS_NO
+    return 0 if session.verdict == "settled" else cli.ANSWER_IS_NO
 
 
 @stop_signals()
@@ -204,12 +191,11 @@ def batch(
     controller: ControllerFile,
     plan: Annotated[
         Path,
-        argument(
-            "PLAN.csv",
-            "A row a grasp: material,t_object_degC,target_degC[,block,repeat,touch_group,...].",
+        cli.argument(
+            "PLAN.csv", "A row a grasp: material,t_object_degC,target_degC[,block,repeat,touch_group,...]."
         ),
     ],
-    out: Annotated[Path, option("--out", "DIR", "Folder of the batch.")],
+    out: Annotated[Path, cli.option("--out", "DIR", "Folder of the batch.")],
     port: PortOption = None,
     protocol: ProtocolOption = None,
     speed: SpeedOption = 1.0,
@@ -220,10 +206,10 @@ def batch(
     settle_timeout: SettleTimeoutOption = 900.0,
     guard: GuardOption = None,
     learn: LearnOption = None,
-    ask: Annotated[bool, flag("--ask/--no-ask", "With --port: ask before and after each grasp.")] = True,
-    network: OwnNetwork = None,
-    seed: Seed = 0,
-    as_json: AsJson = False,
+    ask: Annotated[bool, cli.flag("--ask/--no-ask", "With --port: ask before and after each grasp.")] = True,
+    network: cli.OwnNetwork = None,
+    seed: cli.Seed = 0,
+    as_json: cli.AsJson = False,
 ) -> int:
     """Grasp one object after another by a plan, and record.
 
@@ -250,7 +236,7 @@ def batch(
             opened,
             loaded,
             trials,
-            new_folder(out),
+            cli.new_folder(out),
             ready=_ready(len(trials)) if asks else None,
             judge=_verdict(console) if asks else None,
             stop=None if stop_early is None else session_stop(stop_early),
@@ -270,20 +256,20 @@ def batch(
     console.answer(
         {"verdict": done.verdict, "advice": done.advice, "good": len(done.done), "left": done.left}
     )
-    return 0 if done.left == 0 else ANSWER_IS_NO
+    return 0 if done.left == 0 else cli.ANSWER_IS_NO
 
 
 @stop_signals()
 def record(
-    schedule: Annotated[str, argument("SCHEDULE", "schedule.csv of excite.")],
-    port: Annotated[str, option("--port", "DEV", "/dev/ttyACM0, COM3, socket://HOST:PORT.")],
+    schedule: Annotated[str, cli.argument("SCHEDULE", "schedule.csv of excite.")],
+    port: Annotated[str, cli.option("--port", "DEV", "/dev/ttyACM0, COM3, socket://HOST:PORT.")],
     out: OutOption,
     protocol: ProtocolOption = None,
-    dt: Annotated[float, option("--sample", "S", "Seconds a row.", min=0.05)] = 1.0,
+    dt: Annotated[float, cli.option("--sample", "S", "Seconds a row.", min=0.05)] = 1.0,
     guard: GuardOption = None,
     speed: SpeedOption = 1.0,
-    seed: Seed = 0,
-    as_json: AsJson = False,
+    seed: cli.Seed = 0,
+    as_json: cli.AsJson = False,
 ) -> int:
     """Play a schedule on a rig and record the log.
 
@@ -316,17 +302,19 @@ def record(
         console.say(ended)
     console.say(f"wrote {log.sizes['time']} rows to {out / 'samples.csv'}")
     console.answer({"rows": log.sizes["time"], "ended": ended, "out": out})
-    return ANSWER_IS_NO if ended else 0
+    return cli.ANSWER_IS_NO if ended else 0
 
 
 def recover(
-    folder: Annotated[Path, argument("DIR", "Folder of a run, or of a batch of runs.")],
+    folder: Annotated[Path, cli.argument("DIR", "Folder of a run, or of a batch of runs.")],
     out: Annotated[
         Path | None,
-        option("--out", "FILE", "Also write the run's log: .nc, .parquet, .csv, or .mcap (with ros)."),
+        cli.option("--out", "FILE", "Also write the run's log: .nc, .parquet, .csv, or .mcap (with ros)."),
     ] = None,
-    bad: Annotated[str | None, option("--bad", "WHY", "Mark the trial as bad; nothing is removed.")] = None,
-    as_json: AsJson = False,
+    bad: Annotated[
+        str | None, cli.option("--bad", "WHY", "Mark the trial as bad; nothing is removed.")
+    ] = None,
+    as_json: cli.AsJson = False,
 ) -> int:
     """Repair a run that was killed or lost its power.
 
@@ -337,7 +325,7 @@ def recover(
     if len(folders) > 1 and (out is not None or bad is not None):
         raise UserError("holds several runs", file=folder, hint="give the folder of one of them")
     if out is not None:
-        new_file(out, (".nc", ".parquet", ".csv", ".mcap"))
+        cli.new_file(out, (".nc", ".parquet", ".csv", ".mcap"))
     from thermogrip.rig.records.run_folder import export_run, mark_bad, recover
 
     console = Console(as_json)
@@ -358,33 +346,34 @@ def recover(
         export_run(folders[0], out)
         console.say(f"wrote {out}")
     console.answer({"runs": results})
-    return 0 if all(result["rows"] for result in results) else ANSWER_IS_NO
+    return 0 if all(result["rows"] for result in results) else cli.ANSWER_IS_NO
 
 
 def virtual(
     protocol: Annotated[
-        str, option("--protocol", "NAME", "thermogrip or tclab.", one_of("--protocol", PROTOCOLS))
+        str, cli.option("--protocol", "NAME", "thermogrip or tclab.", cli.one_of("--protocol", cli.PROTOCOLS))
     ] = "thermogrip",
     plant: Annotated[
-        Path | None,
-        option("--plant", "PLANT", "plant.json of identify [default: a bundled network]."),
+        Path | None, cli.option("--plant", "PLANT", "plant.json of identify [default: a bundled network].")
     ] = None,
-    pty: Annotated[bool, flag("--pty", "On a pseudo-terminal, as a serial port.")] = False,
+    pty: Annotated[bool, cli.flag("--pty", "On a pseudo-terminal, as a serial port.")] = False,
     socket: Annotated[
-        int | None, option("--socket", "PORT", "On a TCP port of this computer.", min=0, max=65535)
+        int | None, cli.option("--socket", "PORT", "On a TCP port of this computer.", min=0, max=65535)
     ] = None,
-    speed: Annotated[float, option("--speed", "X", "Its time runs X times as fast.", min=0.01)] = 1.0,
+    speed: Annotated[float, cli.option("--speed", "X", "Its time runs X times as fast.", min=0.01)] = 1.0,
     start: StartOption = None,
-    ambient: Annotated[float, option("--ambient", "DEGC", "Temperature of the room.")] = 23.0,
+    ambient: Annotated[float, cli.option("--ambient", "DEGC", "Temperature of the room.")] = 23.0,
     obj: ObjOption = None,
     material: MaterialOption = None,
     fault: Annotated[
         list[str] | None,
-        option("--fault", "S:NAME", f"After S seconds let one of {', '.join(FAULTS)} fail; may be repeated."),
+        cli.option(
+            "--fault", "S:NAME", f"After S seconds let one of {', '.join(FAULTS)} fail; may be repeated."
+        ),
     ] = None,
-    seconds: Annotated[float | None, option("--seconds", "S", "End after this long.", min=0)] = None,
-    seed: Seed = 0,
-    as_json: AsJson = False,
+    seconds: Annotated[float | None, cli.option("--seconds", "S", "End after this long.", min=0)] = None,
+    seed: cli.Seed = 0,
+    as_json: cli.AsJson = False,
 ) -> int:
     """Be a device: our firmware or a TCLab, with a simulated plant behind it.
 
@@ -467,7 +456,7 @@ def _twin(
     except UserError:
         if network is None:
             raise
-        plant = load_plant(path, network)
+        plant = cli.load_plant(path, network)
     known = ("1", "percent", "0_255")
     ranges = controller.design.drive_range
     limits = {name: ends for name, ends in ranges.items() if plant.units.get(name, "1") not in known}
@@ -488,7 +477,7 @@ def _drift_of(path: Path, plant: Plant, stated: float) -> PlantDrift:
     """Return what a file knows of the rig, nothing yet where it is to be made."""
     from thermogrip.rig.guard.plant_mismatch import USUAL_DRIFT, PlantDrift
 
-    new_file(path, (".json",))
+    cli.new_file(path, (".json",))
     if not path.exists():
         return PlantDrift.unknown(plant, stated or USUAL_DRIFT, file=path)
     found = PlantDrift.load(path, plant)
@@ -500,17 +489,9 @@ def _drift_of(path: Path, plant: Plant, stated: float) -> PlantDrift:
 
 def _targets(target: str) -> float | dict[str, float]:
     """Return one target or targets by output ("38", "t1=40,t2=35"), inside what a skin may be brought to."""
-    try:
-        if "=" in target:
-            pairs = [part.split("=") for part in target.split(",")]
-            values: float | dict[str, float] = {name.strip(): float(value) for name, value in pairs}
-        else:
-            values = float(target)
-    except ValueError:
-        problem = f"'--target' {target!r} is no temperature"
-        raise UserError(problem, hint="write one [degC], or t1=40,t2=35 for several outputs") from None
-    if isinstance(values, dict) and len(values) <= target.count(","):
-        raise UserError(f"'--target' {target!r} names an output twice", hint="give each one target")
+    hint = "write one [degC], or t1=40,t2=35 for several outputs"
+    with as_user_error(ValueError, f"'--target' {target!r} is no temperature", hint=hint):
+        values = cli.numbers("--target", target) if "=" in target else float(target)
     for value in values.values() if isinstance(values, dict) else (values,):
         if not LOWEST_TARGET <= value <= HIGHEST_TARGET:
             hint = f"choose one from {LOWEST_TARGET:g} to {HIGHEST_TARGET:g} degC"
@@ -602,4 +583,4 @@ def _fault(text: str) -> tuple[float, str]:
         at = float("nan")
     if not 0 <= at < float("inf"):
         raise UserError(f"--fault {text!r} has no time", hint="write 60:sensor_open")
-    return at, choice("--fault", name, tuple(FAULTS))
+    return at, cli.choice("--fault", name, tuple(FAULTS))

@@ -15,7 +15,6 @@ from typing import Any
 from typer.core import TyperCommand, TyperGroup
 
 from thermogrip.cli.kinds import check_files
-from thermogrip.cli.options import LOOKS
 from thermogrip.datasets.media import printable
 
 
@@ -37,9 +36,7 @@ class Verb(TyperCommand):
 
     def invoke(self, ctx: Any) -> Any:
         """Check what was given, run the verb, and where that went well say on stderr what to type next."""
-        for path, kind in check_files(ctx):
-            if kind in LOOKS:
-                LOOKS[kind](path)
+        check_files(ctx)
         code = super().invoke(ctx)
         if not code and not ctx.params.get("as_json"):
             sys.stdout.flush()

@@ -15,12 +15,16 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
+from itertools import zip_longest
 from pathlib import Path
+from shutil import get_terminal_size
+from textwrap import wrap
 from typing import Any, TypeAlias
 
 from thermogrip.datasets.media import printable
 from thermogrip.datasets.parallel import Progress
 
+_WIDTH = 100  # columns of what is written to no terminal
 #: Head and rows of a table.
 Cells: TypeAlias = tuple[tuple[str, ...], tuple[tuple[Any, ...], ...]]
 #: The columns of a table: their names, and what each shows of an item.
@@ -40,34 +44,33 @@ class Console:
 
     def warn(self, text: str) -> None:
         """Print one warning on stderr, with ``--json`` too."""
-        sys.stderr.write(f"thermogrip: warning: {printable(text)}\n")
+        sys.stderr.write(f"{_anew()}thermogrip: warning: {printable(text)}\n")
 
     def table(self, title: str, head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-        """Print a table for people; numbers stand to the right."""
+        """Print a table for people, as wide as the terminal (100 columns of what is none); numbers stand to
+        the right, no word is broken, and where the columns are too many each row is a block of lines."""
         if self.as_json:
             return
-        from rich import box
-        from rich.console import Console as RichConsole
-        from rich.table import Table
-
-        table = Table(
-            title=printable(title),
-            title_justify="left",
-            title_style="bold",
-            box=box.SIMPLE_HEAD,
-            pad_edge=False,
-        )
-        for k, name in enumerate(head):
-            numeric = all(isinstance(row[k], int | float) or row[k] is None for row in rows)
-            table.add_column(printable(name), justify="right" if numeric else "left", overflow="fold")
-        for row in rows:
-            table.add_row(*(printable(short(cell)) for cell in row))
-        console = RichConsole(file=sys.stdout, highlight=False, markup=False, emoji=False)
-        if not console.is_terminal:
-            console.width = max(console.width, 140)
-        with console.capture() as shown:  # it would make a closed pipe exit code 1
-            console.print(table)
-        sys.stdout.write(shown.get())
+        cells = [[printable(name) for name in head], *([printable(short(c)) for c in row] for row in rows)]
+        columns = range(len(head))
+        numeric = [all(isinstance(row[k], int | float) or row[k] is None for row in rows) for k in columns]
+        least = [max(len(word) for row in cells for word in row[k].split() or [""]) for k in columns]
+        wide = [max(len(row[k]) for row in cells) for k in columns]
+        room = (get_terminal_size().columns if sys.stdout.isatty() else _WIDTH) - 2 * (len(head) - 1)
+        while sum(wide) > room and (open_ := [k for k in columns if wide[k] > least[k]]):
+            wide[max(open_, key=lambda k: wide[k])] -= 1
+        lines = [printable(title), ""]
+        for at, row in enumerate(cells):
+            if sum(wide) > room:
+                lines += [f"{name}: {cell}" for name, cell in zip(cells[0], row)] + [""] if at else []
+                continue
+            for parts in zip_longest(
+                *(wrap(row[k], wide[k], break_on_hyphens=False) or [""] for k in columns), fillvalue=""
+            ):
+                aligned = (part.rjust(w) if n else part.ljust(w) for part, w, n in zip(parts, wide, numeric))
+                lines.append("  ".join(aligned).rstrip())
+            lines += ["  ".join("-" * w for w in wide)] if at == 0 else []
+        sys.stdout.write("\n".join([*lines, "", ""]))
 
     def answer(self, result: Mapping[str, Any]) -> None:
         """Print the JSON answer where ``--json`` asked for it."""
@@ -76,29 +79,15 @@ class Console:
 
     @contextmanager
     def progress(self, title: str) -> Iterator[Progress]:
-        """Show a bar on stderr while the block runs, which waits but never goes back where work turns out
-        longer; without a terminal, a line whenever the work changes."""
-        if not sys.stderr.isatty():
-            yield _onward(_lines(title))
-            return
-        from rich.console import Console as RichConsole
-        from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
-        from rich.progress import Progress as RichProgress
+        """Show on stderr how far the work is while the block runs: on a terminal a line that is written anew,
+        else a line whenever the work changes, at most one for each twentieth of it.
 
-        columns = (
-            TextColumn(printable(title), markup=False),
-            BarColumn(),
-            TaskProgressColumn(),
-            TimeElapsedColumn(),
-            TextColumn("{task.description}", markup=False),
-        )
-        with RichProgress(*columns, console=RichConsole(stderr=True), transient=True) as bars:
-            task = bars.add_task("", total=1.0)
-
-            def show(fraction: float, what: str) -> None:
-                bars.update(task, completed=fraction, description=printable(what))
-
-            yield _onward(show)
+        It never goes back: where work turns out to be longer than was thought, it waits.
+        """
+        try:
+            yield _lines(printable(title))
+        finally:
+            sys.stderr.write(_anew())
 
 
 def cells(columns: Columns, items: Iterable[Any]) -> Cells:
@@ -141,29 +130,27 @@ def short(cell: Any) -> str:
     return str(cell)
 
 
-def _onward(show: Progress) -> Progress:
-    """Return a callback that passes on the largest fraction so far, inside 0 to 1."""
-    most = 0.0
-
-    def forward(fraction: float, what: str) -> None:
-        nonlocal most
-        most = min(max(most, fraction), 1.0)
-        show(most, what)
-
-    return forward
+def _anew() -> str:
+    """Return what clears the last line of a terminal; nothing where stderr is none."""
+    return "\r\x1b[K" if sys.stderr.isatty() else ""
 
 
 def _lines(title: str) -> Progress:
-    """Return a callback that writes a line a change, at most one for each twentieth of the work."""
-    last: list[Any] = [-1, ""]
+    """Return a callback that writes how far the work is, with the time left where it is over 10 s."""
+    last: list[Any] = [-1, "", 0.0]
     begin = time.monotonic()
 
     def show(fraction: float, what: str) -> None:
-        stage, step = what.split(":")[0], int(20 * fraction)
-        if stage != last[1] or step != last[0]:
-            done = f"{100 * fraction:3.0f} % {time.monotonic() - begin:4.0f} s"
-            sys.stderr.write(f"{printable(title)} {done} {printable(what)}\n")
-            sys.stderr.flush()
-        last[:] = [step, stage]
+        fraction = min(max(fraction, last[2]), 1.0)
+        stage, step, spent, clear = what.split(":")[0], int(20 * fraction), time.monotonic() - begin, _anew()
+        whole = spent / max(fraction, 1e-3)
+        left = f", {whole - spent:.0f} s left" if whole > 10 and spent > 1 else ""
+        line = f"{title} {100 * fraction:3.0f} % {spent:4.0f} s{left} {printable(what)}"
+        if clear:
+            sys.stderr.write(clear + f"[{'#' * step:.<20}] {line}"[: get_terminal_size().columns - 1])
+        elif stage != last[1] or step != last[0]:
+            sys.stderr.write(line + "\n")
+        sys.stderr.flush()
+        last[:] = [step, stage, fraction]
 
     return show

@@ -531,7 +531,11 @@ def test_rest_is_the_minimum_that_its_theory_names(name: str, y: list[float], u:
 @pytest.mark.parametrize(
     ("where", "change", "said"),
     [
-        ("nodes.tank", {"capacity": "C_tnak"}, r"no parameter 'C_tnak'; did you mean 'C_tank'\?"),
+        (
+            "nodes.tank",
+            {"capacity": "C_tnak"},
+            r"no parameter 'C_tnak'; there are C_tank.*; did you mean 'C_tank'\?",
+        ),
         ("nodes", {"lone": {"capacity": "C_tank"}}, "nodes.lone: no element touches it"),
         ("nodes", {"air": {"capacity": "C_tank"}}, "nodes.air: the name is in disturbances"),
         ("links.loss", {"speed": "F"}, "links.loss.speed"),

@@ -1,0 +1,79 @@
+"""Whatever takes a Log or Grasps from Python takes the path of a file and a DataFrame as well."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.end_to_end.conftest import HEADER, small_grasps, small_log_rows, small_plant
+from thermogrip.classify import classify_grasps, evaluate, make_classifier
+from thermogrip.datasets import read_grasps
+from thermogrip.sysid import Plant, calibrate_gripper, check_data, free_run, identify, read_log
+from thermogrip.sysid.effusivity import effusivity_posterior, load_default_gripper
+
+
+@pytest.fixture
+def log_file(tmp_path: Path) -> Path:
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join([HEADER, *small_log_rows()]) + "\n")
+    return path
+
+
+@pytest.fixture
+def grasps_file(tmp_path: Path) -> Path:
+    for name, text in zip(("grasps.csv", "grasps_meta.csv"), small_grasps()):
+        (tmp_path / name).write_text(text)
+    return tmp_path / "grasps.csv"
+
+
+LOGS: list[Callable[[Plant, Any], Any]] = [
+    lambda plant, log: plant.simulate(log)["t_tank"].values,
+    lambda plant, log: [free_run(plant, log).scores["t_tank"].rmse, plant.free_run(log).band().level],
+    lambda plant, log: [len(check_data(log, outputs=["t_tank"]).findings)],
+    lambda plant, log: identify(
+        log, models=["arx"], outputs=["t_tank"], draws=2, order=1
+    ).plant.model.A.ravel(),
+]
+
+
+@pytest.mark.parametrize("use", LOGS)
+def test_a_log_is_a_record_a_path_or_a_frame(use: Callable[[Plant, Any], Any], log_file: Path) -> None:
+    plant = small_plant()
+    ours = use(plant, read_log(log_file))
+    for other in (log_file, str(log_file), pd.read_csv(log_file)):
+        np.testing.assert_allclose(use(plant, other), ours, rtol=1e-12, strict=True)
+
+
+GRASPS: list[Callable[[Any], Any]] = [
+    lambda grasps: [
+        row["p_copper"] for row in classify_grasps(make_classifier("features-lda").fit(grasps), grasps)
+    ],
+    lambda grasps: [evaluate(["features-lda"], grasps, probe=False).scores()[0]["log_loss"]],
+    lambda grasps: [row.effusivity for row in effusivity_posterior(load_default_gripper(), grasps)],
+]
+
+
+@pytest.mark.parametrize("use", GRASPS)
+def test_grasps_are_a_record_a_path_or_a_frame(use: Callable[[Any], Any], grasps_file: Path) -> None:
+    meta = pd.read_csv(grasps_file.with_name("grasps_meta.csv"))
+    ours = use(read_grasps(grasps_file))
+    for other in (grasps_file, str(grasps_file), pd.read_csv(grasps_file).merge(meta, on="grasp_id")):
+        np.testing.assert_allclose(use(other), ours, rtol=1e-9, strict=True)
+
+
+@pytest.mark.slow
+def test_a_gripper_is_calibrated_from_a_file(grasps_file: Path) -> None:
+    assert calibrate_gripper(grasps_file).materials == ("copper", "wood")
+
+
+def test_a_comparison_shows_the_accuracy_of_each_classifier(grasps_file: Path) -> None:
+    found = evaluate(["features-lda", "pca-lda"], grasps_file, probe=False)
+    for row in found.scores():
+        assert f"{row['classifier']:16}  accuracy {row['accuracy']:.3f} (95 %: {row['low']:.3f} to" in repr(
+            found
+        )
