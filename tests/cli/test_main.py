@@ -5,9 +5,11 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import subprocess
 import sys
 from inspect import signature
+from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 import pytest
@@ -119,6 +121,64 @@ def options_of(command: Any) -> str:
 def test_the_options_of_every_verb_are_those_that_scripts_use() -> None:
     wanted = [" ".join(lines.split()) for lines in OPTIONS.strip().replace("\n  ", " ").splitlines()]
     assert [options_of(command) for command in app.registered_commands] == wanted
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_has_two_examples_that_its_own_options_understand_and_a_next_one(
+    verb: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([verb, "--help"]) == 0
+    shown = capsys.readouterr().out
+    options, rest = shown.split("\nExamples:\n")
+    examples, following = rest.split("\nNext:\n")
+    lines = [line.split() for line in examples.splitlines()]
+    assert [line[:2] for line in lines] == [["thermogrip", verb]] * 2
+    for word in (word for line in lines for word in line if word.startswith("--")):
+        assert f"{word} " in options or f"{word}\n" in options, word
+    (program, after, *_), *more = [line.split() for line in following.splitlines()]
+    assert (program, after in VERBS, more) == ("thermogrip", True, [])
+    assert not re.search(r"<[a-z]", options)  # no <list[str]>
+
+
+def test_the_help_says_of_each_verb_a_whole_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["--help"])
+    shown = capsys.readouterr().out.split("To begin:")[1]
+    assert set(re.findall(r"(?m)^  ([a-z]+) ", shown.split("Exit codes")[0])) == {*VERBS}
+    assert "..." not in shown
+
+
+def test_what_is_next_is_said_on_stderr_with_what_was_given(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "a spec.toml"
+    assert main(["init", "spec", "--out", str(out)]) == 0
+    assert capsys.readouterr().err == f"next: thermogrip tune PLANT --spec '{out}' --out controller.json\n"
+    assert main(["materials", "copper", "--json"]) == 0
+    assert main(["materials", "gold leaf"]) == 2
+    assert "next:" not in capsys.readouterr().err
+
+
+def test_help_is_as_wide_as_the_terminal_and_at_most_100_columns_of_a_pipe(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for terminal, columns, least, most in ((False, 300, 90, 100), (True, 140, 101, 140), (True, 60, 50, 60)):
+        monkeypatch.setenv("COLUMNS", str(columns))
+        monkeypatch.setattr("sys.stdout.isatty", lambda terminal=terminal: terminal)
+        main(["identify", "--help"])
+        shown = capsys.readouterr().out
+        assert least < max(map(len, shown.split("Examples:")[0].splitlines())) <= most
+        assert "\x1b" not in shown
+
+
+def test_a_shell_completes_verbs_and_options() -> None:
+    for typed, found in (("thermogrip val", "validate"), ("thermogrip identify --net", "--network")):
+        asked = {"_THERMOGRIP_COMPLETE": "complete_bash", "COMP_WORDS": typed}
+        done = subprocess.run(
+            [sys.executable, "-c", "from thermogrip.__main__ import main; main()"],
+            env=os.environ | asked | {"COMP_CWORD": str(typed.count(" "))},
+            capture_output=True, text=True, timeout=120, check=False,
+        )  # fmt: skip
+        assert (done.returncode, done.stdout.split()) == (0, [found]), done.stderr
 
 
 def test_no_words_show_the_help(capsys: pytest.CaptureFixture[str]) -> None:

@@ -95,7 +95,7 @@ _HEADS = {"answer": "answer", "next_touch_degC": "touch at [degC]", "next_touch_
 
 ObjectRange = Annotated[
     str | None,
-    cli.option(
+    cli.opt(
         "--object-range",
         "A,B",
         "Objects of unknown temperature are between A and B degC [default: 20 K about the room].",
@@ -106,10 +106,10 @@ Quick = Annotated[bool, cli.flag("--quick", "200 epochs in place of 2000 for the
 
 def effusivity(
     grasps: cli.GraspFiles,
-    out: Annotated[Path, cli.option("--out", "FILE.csv", "Where the table goes.")],
+    out: Annotated[Path, cli.opt("--out", "FILE.csv", "Where the table goes.")],
     calibrate: Annotated[
         list[str] | None,
-        cli.option("--calibrate", "GRASPS", "Labelled grasps that describe your gripper; may be repeated."),
+        cli.opt("--calibrate", "GRASPS", "Labelled grasps that describe your gripper; may be repeated."),
     ] = None,
     between: ObjectRange = None,
     seed: cli.Seed = 0,
@@ -172,17 +172,17 @@ def train(
     grasps: cli.GraspFiles,
     classifier: Annotated[
         str,
-        cli.option(
+        cli.opt(
             "--classifier",
             "NAME",
             "posterior, bayes, features-lda, pca-lda, lstm, lstm-paper.",
             classifier_names,
         ),
     ],
-    out: Annotated[Path, cli.option("--out", "MODEL_DIR", "Where the model goes.")],
+    out: Annotated[Path, cli.opt("--out", "MODEL_DIR", "Where the model goes.")],
     split: Annotated[
         str | None,
-        cli.option(
+        cli.opt(
             "--split",
             "train|all",
             "Which grasps to learn from [default: train where the column exists].",
@@ -191,7 +191,7 @@ def train(
     ] = None,
     stop_error: Annotated[
         float | None,
-        cli.option(
+        cli.opt(
             "--stop-error",
             "SHARE",
             "Also learn when a contact may end, at this share of wrong answers [posterior].",
@@ -245,11 +245,11 @@ def train(
 
 
 def classify(
-    model_dir: Annotated[Path, cli.argument("MODEL_DIR", "Folder that train wrote.")],
+    model_dir: Annotated[Path, cli.arg("MODEL_DIR", "Folder that train wrote.")],
     paths: cli.GraspFiles,
-    out: Annotated[Path, cli.option("--out", "FILE.csv", "Where the predictions go.")],
+    out: Annotated[Path, cli.opt("--out", "FILE.csv", "Where the predictions go.")],
     candidates: Annotated[
-        str | None, cli.option("--materials", "A,B,C", "The candidates [default: all that the model knows].")
+        str | None, cli.opt("--materials", "A,B,C", "The candidates [default: all that the model knows].")
     ] = None,
     early: Annotated[
         bool, cli.flag("--early", "Use of each contact what was read until the stop rule ended it.")
@@ -268,9 +268,7 @@ def classify(
     ] = False,
     known: Annotated[
         list[str] | None,
-        cli.option(
-            "--known", "GRASPS", "Labelled grasps of that other gripper, one or more; may be repeated."
-        ),
+        cli.opt("--known", "GRASPS", "Labelled grasps of that other gripper, one or more; may be repeated."),
     ] = None,
     between: ObjectRange = None,
     seed: cli.Seed = 0,
@@ -360,7 +358,7 @@ def classify(
 
 
 def materials(
-    name: Annotated[str | None, cli.argument("[NAME]", "One material.")] = None, as_json: cli.AsJson = False
+    name: Annotated[str | None, cli.arg("[NAME]", "One material.")] = None, as_json: cli.AsJson = False
 ) -> int:
     """List the materials table, or show one row of it."""
     from thermogrip.datasets.materials import find_material, load_materials

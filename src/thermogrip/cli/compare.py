@@ -28,14 +28,14 @@ MOST_CONDITIONS = 4  # that are printed one by one
 
 def compare(
     grasps: cli.GraspFiles,
-    out: Annotated[Path, cli.option("--out", "DIR", "Where tables and report go.")],
+    out: Annotated[Path, cli.opt("--out", "DIR", "Where tables and report go.")],
     test: Annotated[
         list[str] | None,
-        cli.option("--test", "GRASPS", "Test on these grasps, not on a split; may be repeated."),
+        cli.opt("--test", "GRASPS", "Test on these grasps, not on a split; may be repeated."),
     ] = None,
     classifiers: Annotated[
         str | None,
-        cli.option(
+        cli.opt(
             "--classifiers",
             "LIST",
             "Those of train, svm-pca, rocket, expansions, A+B (their mean), or module:Class of scikit-learn "
@@ -44,14 +44,14 @@ def compare(
         ),
     ] = None,
     repeats: Annotated[
-        int, cli.option("--repeats", None, "Random splits by grasp, beside the shipped split.", min=0)
+        int, cli.opt("--repeats", None, "Random splits by grasp, beside the shipped split.", min=0)
     ] = 20,
     train_per_class: Annotated[
-        int, cli.option("--train-per-class", None, "Training grasps a material in a random split.", min=1)
+        int, cli.opt("--train-per-class", None, "Training grasps a material in a random split.", min=1)
     ] = 5,
     by: Annotated[
         str | None,
-        cli.option(
+        cli.opt(
             "--by",
             "session|block",
             "Also hold out whole sessions or blocks in turn.",

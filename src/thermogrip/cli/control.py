@@ -15,15 +15,15 @@ from thermogrip.report.console import Console
 if TYPE_CHECKING:
     from thermogrip.mpc.controllers.mpc import Controller
 
-ControllerFile = Annotated[Path, cli.argument("CONTROLLER", "controller.json of tune.")]
+ControllerFile = Annotated[Path, cli.arg("CONTROLLER", "controller.json of tune.")]
 
 
 def tune(
     plant: cli.PlantFile,
-    out: Annotated[Path, cli.option("--out", "FILE.json", "Where the controller goes.")],
+    out: Annotated[Path, cli.opt("--out", "FILE.json", "Where the controller goes.")],
     spec: Annotated[
         Path | None,
-        cli.option("--spec", "SPEC.toml", "What is wanted; `thermogrip init spec` writes one to edit."),
+        cli.opt("--spec", "SPEC.toml", "What is wanted; `thermogrip init spec` writes one to edit."),
     ] = None,
     report: cli.Report = None,
     network: cli.OwnNetwork = None,
@@ -112,11 +112,11 @@ def review(
 
 def export(
     controller: ControllerFile,
-    out: Annotated[Path, cli.option("--out", "DIR", "Folder of the C files.")],
+    out: Annotated[Path, cli.opt("--out", "DIR", "Folder of the C files.")],
     check: Annotated[
         bool, cli.flag("--check", "Build it (gcc) and compare it with Python on random states.")
     ] = False,
-    states: Annotated[int, cli.option("--states", None, "Random states of --check.", min=1)] = 3_000,
+    states: Annotated[int, cli.opt("--states", None, "Random states of --check.", min=1)] = 3_000,
     network: cli.OwnNetwork = None,
     seed: cli.Seed = 0,
     as_json: cli.AsJson = False,

@@ -32,26 +32,26 @@ HALVINGS = 12  # of the bisection
 
 def excite(
     kind: Annotated[
-        str, cli.option("--kind", "|".join(KINDS), "Shape of the excitation.", cli.one_of("--kind", KINDS))
+        str, cli.opt("--kind", "|".join(KINDS), "Shape of the excitation.", cli.one_of("--kind", KINDS))
     ],
-    minutes: Annotated[float, cli.option("--minutes", "M", "Length of the experiment.", min=0.1)],
-    out: Annotated[Path, cli.option("--out", "SCHEDULE.csv", "Where it goes.")],
+    minutes: Annotated[float, cli.opt("--minutes", "M", "Length of the experiment.", min=0.1)],
+    out: Annotated[Path, cli.opt("--out", "SCHEDULE.csv", "Where it goes.")],
     plant: Annotated[
-        Path | None, cli.option("--plant", "PLANT", "Fit time constants and amplitude to this plant.")
+        Path | None, cli.opt("--plant", "PLANT", "Fit time constants and amplitude to this plant.")
     ] = None,
     network: Annotated[
         str | None,
-        cli.option(
+        cli.opt(
             "--network",
             "NAME|FILE",
             "Before any log: a network at its priors; with a plant of your own, its FILE.py:CLASS.",
         ),
     ] = None,
-    lowest: Annotated[float, cli.option("--lowest", "DEGC", "With a plant: no output below this.")] = 5.0,
-    highest: Annotated[float, cli.option("--highest", "DEGC", "With a plant: no output above this.")] = 60.0,
-    hold: Annotated[str | None, cli.option("--hold", "A,B", "With optimal: inputs that do not move.")] = None,
+    lowest: Annotated[float, cli.opt("--lowest", "DEGC", "With a plant: no output below this.")] = 5.0,
+    highest: Annotated[float, cli.opt("--highest", "DEGC", "With a plant: no output above this.")] = 60.0,
+    hold: Annotated[str | None, cli.opt("--hold", "A,B", "With optimal: inputs that do not move.")] = None,
     slew: Annotated[
-        float | None, cli.option("--slew", "PER_S", "With optimal: a drive changes no faster.", min=1e-9)
+        float | None, cli.opt("--slew", "PER_S", "With optimal: a drive changes no faster.", min=1e-9)
     ] = None,
     seed: cli.Seed = 0,
     as_json: cli.AsJson = False,

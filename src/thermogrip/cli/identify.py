@@ -38,46 +38,44 @@ def _known_models(value: str) -> str:
 
 
 Warmup = Annotated[
-    float, cli.option("--warmup", "S", "Measured outputs of these first seconds may set the state.", min=0)
+    float, cli.opt("--warmup", "S", "Measured outputs of these first seconds may set the state.", min=0)
 ]
 Average = Annotated[
-    float | None,
-    cli.option("--average", "S", "Average over S seconds first (coarse sensors need it).", min=0),
+    float | None, cli.opt("--average", "S", "Average over S seconds first (coarse sensors need it).", min=0)
 ]
 
 
 def identify(
     paths: cli.LogFiles,
     out: Annotated[
-        Path | None, cli.option("--out", "FILE.json", "Where the plant goes; where absent, LOG_plant.json.")
+        Path | None, cli.opt("--out", "FILE.json", "Where the plant goes; where absent, LOG_plant.json.")
     ] = None,
     network: Annotated[
         str | None,
-        cli.option(
+        cli.opt(
             "--network",
             "NAME|FILE",
             "A shipped one (init network --like), none, FILE.toml, FILE.py:CLASS (which runs the file); "
             "where absent, the shipped one whose columns the logs have.",
         ),
     ] = None,
-    inputs: Annotated[str | None, cli.option("--inputs", "A,B", "Columns that are moved.")] = None,
-    outputs: Annotated[str | None, cli.option("--outputs", "C,D", "Columns to predict.")] = None,
+    inputs: Annotated[str | None, cli.opt("--inputs", "A,B", "Columns that are moved.")] = None,
+    outputs: Annotated[str | None, cli.opt("--outputs", "C,D", "Columns to predict.")] = None,
     disturbances: Annotated[
-        str | None, cli.option("--disturbances", "E", "Columns that are measured and not moved.")
+        str | None, cli.opt("--disturbances", "E", "Columns that are measured and not moved.")
     ] = None,
     columns: cli.Columns = None,
     dt: cli.Step = None,
     models: Annotated[
-        str, cli.option("--models", "LIST", "Which candidate models to fit, of these and bj.", _known_models)
+        str, cli.opt("--models", "LIST", "Which candidate models to fit, of these and bj.", _known_models)
     ] = USUAL_MODELS,
     average: Average = None,
     order: Annotated[
         int | None,
-        cli.option("--order", "N", "Poles of ARX, OE and BJ, states of subspace models.", min=1, max=20),
+        cli.opt("--order", "N", "Poles of ARX, OE and BJ, states of subspace models.", min=1, max=20),
     ] = None,
     delay: Annotated[
-        int | None,
-        cli.option("--delay", "N", "Delay of ARX, OE and BJ, in steps of the model.", min=1, max=20),
+        int | None, cli.opt("--delay", "N", "Delay of ARX, OE and BJ, in steps of the model.", min=1, max=20)
     ] = None,
     leave_one_out: Annotated[
         bool, cli.flag("--leave-one-out", "Score each log by a fit to the others.")
@@ -325,7 +323,7 @@ def validate(
     paths: cli.LogFiles,
     warmup: Warmup = 5.0,
     score_from: Annotated[
-        float, cli.option("--score-from", "S", "Samples before this are not scored.", min=0)
+        float, cli.opt("--score-from", "S", "Samples before this are not scored.", min=0)
     ] = 5.0,
     average: Average = None,
     network: cli.OwnNetwork = None,
@@ -395,8 +393,8 @@ def run_answer(name: str, run: FreeRun, band: Band) -> dict[str, Any]:
 
 def simulate(
     plant: cli.PlantFile,
-    path: Annotated[str, cli.argument("LOG", "Inputs and warm-up come from here.")],
-    out: Annotated[Path, cli.option("--out", "SIM.csv", "Where the log goes.")],
+    path: Annotated[str, cli.arg("LOG", "Inputs and warm-up come from here.")],
+    out: Annotated[Path, cli.opt("--out", "SIM.csv", "Where the log goes.")],
     warmup: Warmup = 5.0,
     bands: Annotated[
         bool, cli.flag("--bands", "Add the ends of each output's 90 % band, OUTPUT_low and OUTPUT_high.")
@@ -440,17 +438,17 @@ def linearise(
     plant: cli.PlantFile,
     at: Annotated[
         str | None,
-        cli.option(
+        cli.opt(
             "--at",
             "NAME=X,...",
             "Inputs and disturbances of the operating point; the others are in the middle of the logs.",
         ),
     ] = None,
     dt: Annotated[
-        float | None, cli.option("--dt", "S", "Step of the matrices; none: continuous.", min=1e-9)
+        float | None, cli.opt("--dt", "S", "Step of the matrices; none: continuous.", min=1e-9)
     ] = None,
     out: Annotated[
-        Path | None, cli.option("--out", "FILE", "Matrices as .json, .csv (a row an entry) or .mat.")
+        Path | None, cli.opt("--out", "FILE", "Matrices as .json, .csv (a row an entry) or .mat.")
     ] = None,
     report: cli.Report = None,
     network: cli.OwnNetwork = None,

@@ -82,7 +82,7 @@ def one_of(option: str, allowed: Sequence[str]) -> Callable[[str | None], str | 
     return check
 
 
-def option(
+def opt(
     name: str,
     metavar: str | None,
     words: str,
@@ -100,42 +100,40 @@ def flag(name: str, words: str) -> Any:
     return typer.Option(name, help=words)
 
 
-def argument(metavar: str, words: str, check: Callable[..., Any] | None = None) -> Any:
+def arg(metavar: str, words: str, check: Callable[..., Any] | None = None) -> Any:
     """Return the Typer argument of a place on the command line."""
     return typer.Argument(metavar=metavar, help=words, callback=check)
 
 
 AsJson = Annotated[bool, flag("--json", "Print one JSON object on stdout and nothing else there.")]
-Seed = Annotated[int, option("--seed", None, "Seed of everything random.", min=0)]
-Workers = Annotated[int, option("--workers", None, "Local processes for work that can be shared out.", min=1)]
+Seed = Annotated[int, opt("--seed", None, "Seed of everything random.", min=0)]
+Workers = Annotated[int, opt("--workers", None, "Local processes for work that can be shared out.", min=1)]
 Cluster = Annotated[
     str | None,
-    option("--cluster", "tcp://HOST:PORT", "Dask cluster that does this work in place of local processes."),
+    opt("--cluster", "tcp://HOST:PORT", "Dask cluster that does this work in place of local processes."),
 ]
-Report = Annotated[Path | None, option("--report", "FILE.html", "Also write a one-page report with figures.")]
-PlantFile = Annotated[Path, argument("PLANT", "plant.json of identify.")]
+Report = Annotated[Path | None, opt("--report", "FILE.html", "Also write a one-page report with figures.")]
+PlantFile = Annotated[Path, arg("PLANT", "plant.json of identify.")]
 LogFiles = Annotated[
     list[str],
-    argument(
+    arg(
         "LOG...",
         "Text, .mat, .xlsx, NetCDF, Parquet; LOG@120:1800 takes seconds 120 to 1800 (either end may be "
         "empty).",
     ),
 ]
-Columns = Annotated[
-    str | None, option("--columns", "A,B", "Headers in place of the log's; - leaves one out.")
-]
-Step = Annotated[float | None, option("--dt", "S", "Seconds between rows.", min=1e-9)]
+Columns = Annotated[str | None, opt("--columns", "A,B", "Headers in place of the log's; - leaves one out.")]
+Step = Annotated[float | None, opt("--dt", "S", "Seconds between rows.", min=1e-9)]
 OwnNetwork = Annotated[
     str | None,
-    option(
+    opt(
         "--network",
         "FILE.py:CLASS",
         "The class that the plant was fitted with, where it is your own (which runs the file).",
     ),
 ]
 GraspFiles = Annotated[
-    list[str], argument("GRASPS...", "Grasp files (CSV with its _meta.csv, or NetCDF) or folders.")
+    list[str], arg("GRASPS...", "Grasp files (CSV with its _meta.csv, or NetCDF) or folders.")
 ]
 
 

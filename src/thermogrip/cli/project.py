@@ -13,7 +13,7 @@ from thermogrip.report.console import Console
 
 
 def demo(
-    out: Annotated[Path, cli.option("--out", "DIR", "Where everything goes.")] = Path("thermogrip-demo"),
+    out: Annotated[Path, cli.opt("--out", "DIR", "Where everything goes.")] = Path("thermogrip-demo"),
     seed: cli.Seed = 0,
     workers: cli.Workers = 2,
     cluster: cli.Cluster = None,
@@ -43,7 +43,7 @@ def demo(
 
 
 def paper(
-    out: Annotated[Path, cli.option("--out", "DIR", "Where everything goes.")],
+    out: Annotated[Path, cli.opt("--out", "DIR", "Where everything goes.")],
     quick: Annotated[bool, cli.flag("--quick", "LSTM of 200 epochs instead of 2000.")] = False,
     seed: cli.Seed = 0,
     workers: cli.Workers = 1,
@@ -84,10 +84,10 @@ def paper(
 
 
 def init(
-    what: Annotated[str, cli.argument("spec|network|topics|guard|examples", "What to start from.")],
+    what: Annotated[str, cli.arg("spec|network|topics|guard|examples", "What to start from.")],
     like: Annotated[
         str | None,
-        cli.option(
+        cli.opt(
             "--like",
             "NAME",
             "Of a network: start from gripper, tclab, peltier_chamber, room, hotend, furnace, tank "
@@ -96,9 +96,7 @@ def init(
     ] = None,
     out: Annotated[
         Path | None,
-        cli.option(
-            "--out", "FILE.toml|DIR", "Where it goes [default: stdout; of the examples: this folder]."
-        ),
+        cli.opt("--out", "FILE.toml|DIR", "Where it goes [default: stdout; of the examples: this folder]."),
     ] = None,
     as_json: cli.AsJson = False,
 ) -> int:

@@ -33,55 +33,51 @@ if TYPE_CHECKING:
 
 LOWEST_TARGET, HIGHEST_TARGET = 10.0, 50.0  # degC, of the skin
 
-OutOption = Annotated[Path, cli.option("--out", "DIR", "Folder of the run.")]
-TwinOption = Annotated[
-    Path | None, cli.option("--twin", "PLANT", "Simulate this plant; no hardware is opened.")
-]
+OutOption = Annotated[Path, cli.opt("--out", "DIR", "Folder of the run.")]
+TwinOption = Annotated[Path | None, cli.opt("--twin", "PLANT", "Simulate this plant; no hardware is opened.")]
 PortOption = Annotated[
-    str | None, cli.option("--port", "DEV", "The rig: /dev/ttyACM0, COM3, socket://HOST:PORT.")
+    str | None, cli.opt("--port", "DEV", "The rig: /dev/ttyACM0, COM3, socket://HOST:PORT.")
 ]
 ProtocolOption = Annotated[
     str | None,
-    cli.option(
+    cli.opt(
         "--protocol",
         "NAME",
         "thermogrip or tclab [default: found out].",
         cli.one_of("--protocol", cli.PROTOCOLS),
     ),
 ]
-SpeedOption = Annotated[float, cli.option("--speed", "X", "With --port: that of a virtual device.", min=0.01)]
+SpeedOption = Annotated[float, cli.opt("--speed", "X", "With --port: that of a virtual device.", min=0.01)]
 DrawOption = Annotated[
-    int, cli.option("--draw", None, "Posterior draw of the twin's plant (0: the fit).", min=0)
+    int, cli.opt("--draw", None, "Posterior draw of the twin's plant (0: the fit).", min=0)
 ]
 StartOption = Annotated[
-    float | None, cli.option("--from", "DEGC", "Temperature at the start [default: the room's].")
+    float | None, cli.opt("--from", "DEGC", "Temperature at the start [default: the room's].")
 ]
-ObjOption = Annotated[float | None, cli.option("--object", "DEGC", "Temperature of the object.")]
+ObjOption = Annotated[float | None, cli.opt("--object", "DEGC", "Temperature of the object.")]
 MaterialOption = Annotated[
     str | None,
-    cli.option(
-        "--material", "NAME", "Material of the object.", lambda name: name and find_material(name).name
-    ),
+    cli.opt("--material", "NAME", "Material of the object.", lambda name: name and find_material(name).name),
 ]
-GraspTimeOption = Annotated[float, cli.option("--grasp-time", "S", "Recorded time of contact.", min=0.5)]
+GraspTimeOption = Annotated[float, cli.opt("--grasp-time", "S", "Recorded time of contact.", min=0.5)]
 StopEarlyOption = Annotated[
     Path | None,
-    cli.option(
+    cli.opt(
         "--stop-early",
         "MODEL_DIR",
         "End the contact once this classifier (train --stop-error) has seen enough.",
     ),
 ]
 SettleTimeoutOption = Annotated[
-    float, cli.option("--settle-timeout", "S", "Give up settling after this long.", min=1)
+    float, cli.opt("--settle-timeout", "S", "Give up settling after this long.", min=1)
 ]
 GuardOption = Annotated[
     Path | None,
-    cli.option("--guard", "GUARD.toml", "What the guard allows; `thermogrip init guard` writes one to edit."),
+    cli.opt("--guard", "GUARD.toml", "What the guard allows; `thermogrip init guard` writes one to edit."),
 ]
 LearnOption = Annotated[
     Path | None,
-    cli.option(
+    cli.opt(
         "--learn",
         "RIG.json",
         "Let the guard learn from this rig's first healthy sessions how far it is from the plant.",
@@ -94,7 +90,7 @@ def run(
     controller: ControllerFile,
     target: Annotated[
         str,
-        cli.option(
+        cli.opt(
             "--target",
             "DEGC",
             "Skin temperature at contact, 10 to 50; of several outputs t1=40,t2=35.",
@@ -108,7 +104,7 @@ def run(
     twin: TwinOption = None,
     draw: DrawOption = 0,
     start: StartOption = None,
-    hold: Annotated[float, cli.option("--hold", "S", "Regulate this long after settling.", min=0)] = 0.0,
+    hold: Annotated[float, cli.opt("--hold", "S", "Regulate this long after settling.", min=0)] = 0.0,
     obj: ObjOption = None,
     material: MaterialOption = None,
     grasp_time: GraspTimeOption = 10.0,
@@ -191,11 +187,11 @@ def batch(
     controller: ControllerFile,
     plan: Annotated[
         Path,
-        cli.argument(
+        cli.arg(
             "PLAN.csv", "A row a grasp: material,t_object_degC,target_degC[,block,repeat,touch_group,...]."
         ),
     ],
-    out: Annotated[Path, cli.option("--out", "DIR", "Folder of the batch.")],
+    out: Annotated[Path, cli.opt("--out", "DIR", "Folder of the batch.")],
     port: PortOption = None,
     protocol: ProtocolOption = None,
     speed: SpeedOption = 1.0,
@@ -261,11 +257,11 @@ def batch(
 
 @stop_signals()
 def record(
-    schedule: Annotated[str, cli.argument("SCHEDULE", "schedule.csv of excite.")],
-    port: Annotated[str, cli.option("--port", "DEV", "/dev/ttyACM0, COM3, socket://HOST:PORT.")],
+    schedule: Annotated[str, cli.arg("SCHEDULE", "schedule.csv of excite.")],
+    port: Annotated[str, cli.opt("--port", "DEV", "/dev/ttyACM0, COM3, socket://HOST:PORT.")],
     out: OutOption,
     protocol: ProtocolOption = None,
-    dt: Annotated[float, cli.option("--sample", "S", "Seconds a row.", min=0.05)] = 1.0,
+    dt: Annotated[float, cli.opt("--sample", "S", "Seconds a row.", min=0.05)] = 1.0,
     guard: GuardOption = None,
     speed: SpeedOption = 1.0,
     seed: cli.Seed = 0,
@@ -306,14 +302,12 @@ def record(
 
 
 def recover(
-    folder: Annotated[Path, cli.argument("DIR", "Folder of a run, or of a batch of runs.")],
+    folder: Annotated[Path, cli.arg("DIR", "Folder of a run, or of a batch of runs.")],
     out: Annotated[
         Path | None,
-        cli.option("--out", "FILE", "Also write the run's log: .nc, .parquet, .csv, or .mcap (with ros)."),
+        cli.opt("--out", "FILE", "Also write the run's log: .nc, .parquet, .csv, or .mcap (with ros)."),
     ] = None,
-    bad: Annotated[
-        str | None, cli.option("--bad", "WHY", "Mark the trial as bad; nothing is removed.")
-    ] = None,
+    bad: Annotated[str | None, cli.opt("--bad", "WHY", "Mark the trial as bad; nothing is removed.")] = None,
     as_json: cli.AsJson = False,
 ) -> int:
     """Repair a run that was killed or lost its power.
@@ -351,27 +345,27 @@ def recover(
 
 def virtual(
     protocol: Annotated[
-        str, cli.option("--protocol", "NAME", "thermogrip or tclab.", cli.one_of("--protocol", cli.PROTOCOLS))
+        str, cli.opt("--protocol", "NAME", "thermogrip or tclab.", cli.one_of("--protocol", cli.PROTOCOLS))
     ] = "thermogrip",
     plant: Annotated[
-        Path | None, cli.option("--plant", "PLANT", "plant.json of identify [default: a bundled network].")
+        Path | None, cli.opt("--plant", "PLANT", "plant.json of identify [default: a bundled network].")
     ] = None,
     pty: Annotated[bool, cli.flag("--pty", "On a pseudo-terminal, as a serial port.")] = False,
     socket: Annotated[
-        int | None, cli.option("--socket", "PORT", "On a TCP port of this computer.", min=0, max=65535)
+        int | None, cli.opt("--socket", "PORT", "On a TCP port of this computer.", min=0, max=65535)
     ] = None,
-    speed: Annotated[float, cli.option("--speed", "X", "Its time runs X times as fast.", min=0.01)] = 1.0,
+    speed: Annotated[float, cli.opt("--speed", "X", "Its time runs X times as fast.", min=0.01)] = 1.0,
     start: StartOption = None,
-    ambient: Annotated[float, cli.option("--ambient", "DEGC", "Temperature of the room.")] = 23.0,
+    ambient: Annotated[float, cli.opt("--ambient", "DEGC", "Temperature of the room.")] = 23.0,
     obj: ObjOption = None,
     material: MaterialOption = None,
     fault: Annotated[
         list[str] | None,
-        cli.option(
+        cli.opt(
             "--fault", "S:NAME", f"After S seconds let one of {', '.join(FAULTS)} fail; may be repeated."
         ),
     ] = None,
-    seconds: Annotated[float | None, cli.option("--seconds", "S", "End after this long.", min=0)] = None,
+    seconds: Annotated[float | None, cli.opt("--seconds", "S", "End after this long.", min=0)] = None,
     seed: cli.Seed = 0,
     as_json: cli.AsJson = False,
 ) -> int:

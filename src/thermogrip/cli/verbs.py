@@ -49,6 +49,10 @@ class Verb(TyperCommand):
         then = self.then if isinstance(self.then, str) else self.then[given.get("what", "network")]
         return str(then).format(**words | {k: printable(shlex.quote(str(v))) for k, v in given.items()})
 
+    def get_short_help_str(self, limit: int = 200) -> str:
+        """Return the first sentence of the help, whole."""
+        return super().get_short_help_str(limit)
+
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """Return the options and each argument once."""
         return ["[OPTIONS]", *(str(p.metavar) for p in self.params if p.param_type_name == "argument")]
@@ -69,4 +73,4 @@ class Verbs(TyperGroup):
         """Write a section a job, each verb with the whole first sentence of its help."""
         for job, verbs in jobs().items():
             with formatter.section(job):
-                formatter.write_dl([(name, self.commands[name].get_short_help_str(200)) for name in verbs])
+                formatter.write_dl([(name, self.commands[name].get_short_help_str()) for name in verbs])
