@@ -268,5 +268,5 @@ def test_each_figure_shows_what_it_should_in_the_colours_widths_and_units_of_the
 
 def test_a_parameter_that_was_not_sampled_has_no_corner() -> None:
     posterior = SimpleNamespace(free=("a", "b"))
-    with pytest.raises(UserError, match="'c' was not sampled; choose from a, b"):
+    with pytest.raises(UserError, match="'c' was not sampled; use a, b"):
         corner_figure(posterior, ("a", "c"))
