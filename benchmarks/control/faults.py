@@ -19,15 +19,13 @@ how much the reported value is off.
 
 from __future__ import annotations
 
-import argparse
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
-from pathlib import Path
 
 import numpy as np
-from mismatch import CASES, CURRENT, NOISE, model_of
+from mismatch import CASES, CURRENT, NOISE, asked, model_of
 from simulator import OUTPUTS, SKIN, Plant, Truth
 
 from thermogrip.mpc.controllers.mpc import Controller
@@ -162,15 +160,9 @@ def reach_line(controller: Controller, name: str, truth: Truth, beyond: float, s
 
 def main() -> None:
     """Run, print, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seeds", default="0", help="of the noise, by commas")
-    parser.add_argument("--only", default="", help="rows whose name has this in it")
-    parser.add_argument("--markdown", type=Path, help="also write the tables here")
-    given = parser.parse_args()
-    seeds, model = [int(seed) for seed in given.seeds.split(",")], model_of()
-    controller = Controller(model, default_design(model), compiled=wanted())
+    given, model = asked(__doc__, "0"), model_of()
+    seeds = [int(seed) for seed in given.seeds.split(",")]
+    controller = Controller(model, default_design(model), compiled=wanted() and not given.python)
     heads = "| plant, sensors | overshoot [degC] | offset [degC] | settled after [s] | status |"
     lines = [heads, "|---|---|---|---|---|"]
     print(*lines, sep="\n")

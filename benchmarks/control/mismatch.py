@@ -174,17 +174,19 @@ def line(case: Case, runs: list[Run]) -> str:
     return f"| {case.name} | {shown} | {over:.2f} | {offset:.3f} | {said} | {marks} |"
 
 
-def main() -> None:
-    """Run, print, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seeds", default="0,1", help="of the noise, by commas")
+def asked(doc: str | None, seeds: str) -> argparse.Namespace:
+    """Return the options of a table of closed loops."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", default=seeds, help="of the noise, by commas")
     parser.add_argument("--only", default="", help="rows whose name has this in it")
     parser.add_argument("--python", action="store_true", help="without compiled parts")
     parser.add_argument("--markdown", type=Path, help="also write the table here")
-    given = parser.parse_args()
-    model = model_of()
+    return parser.parse_args()
+
+
+def main() -> None:
+    """Run, print, write."""
+    given, model = asked(__doc__, "0,1"), model_of()
     controller = Controller(model, default_design(model), compiled=wanted() and not given.python)
     lines = [
         "| plant | settling / full drive: mean, worst | overshoot [degC] | offset [degC] "

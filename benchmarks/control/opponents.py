@@ -10,10 +10,11 @@ sample, limits of range and slew; states and disturbances come from the package'
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -21,6 +22,9 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 from truths import Case
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "mpc"))
+from dompc_values import hold_over_horizon
 
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import Design
@@ -172,15 +176,7 @@ class DoMPC:
             c.set_nl_cons(f"up{j}", u[j] - before[j], ub=slew)
             c.set_nl_cons(f"down{j}", before[j] - u[j], ub=slew)
         self.values = dict.fromkeys(self.keys, 0.0)
-        template = c.get_tvp_template()
-
-        def time_varying(_: Any) -> Any:
-            for k in range(N + 1):
-                for key, value in self.values.items():
-                    template["_tvp", k, key] = value
-            return template
-
-        c.set_tvp_fun(time_varying)
+        hold_over_horizon(c, N, lambda: self.values)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             c.setup()

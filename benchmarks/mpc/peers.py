@@ -14,6 +14,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from dompc_values import hold_over_horizon
 from numpy.typing import NDArray
 from ours import Ours
 from problem import DRIVE, DT, HORIZON, LAST, MODEL, MOVE, PRICE, SLEW, TANK, TRACK, ReferenceModel
@@ -59,15 +60,7 @@ class DoMPC:
         c.set_nl_cons("above", x[4] - given["high"], ub=0, **soft)
         c.set_nl_cons("below", given["low"] - x[4], ub=0, **soft)
         self.values: dict[str, float] = dict.fromkeys(given, 0.0)
-        template = c.get_tvp_template()
-
-        def time_varying(_: Any) -> Any:
-            for k in range(HORIZON + 1):
-                for name, value in self.values.items():
-                    template["_tvp", k, name] = value
-            return template
-
-        c.set_tvp_fun(time_varying)
+        hold_over_horizon(c, HORIZON, lambda: self.values)
         c.setup()
         self.c, self.first = c, True
 

@@ -47,6 +47,8 @@ class Surroundings:
     # what a sensor reads too much, by name, ambient included [degC]
     offset: dict[str, float] = field(default_factory=dict)
     move_delay_s: float = 0.0  # time between a reading and the moment its move is applied [s]
+    sensor_lag_s: float = 0.0  # by how much every sensor is slower than the plant's outputs [s]
+    drive_share: float = 1.0  # share of a drive, counted from the one that holds the start, that acts
 
     def steps_of(self, names: tuple[str, ...]) -> Array:
         """Return the step of a reading of each of these sensors (n,) [degC]."""
@@ -167,11 +169,20 @@ class Truth:
         self.d = np.full(native.n_d, around.ambient)
         warmth = around.ambient if start is None else start
         self.x = native.rest(np.full(native.n_y, warmth), self.d)
-        self.u = native.neutral
+        self.moves: list[Array] = []
+        self.before = native.neutral
         given = [plant.offsets.get(name, 0.0) + around.offset.get(name, 0.0) for name in native.outputs]
         self.offset = np.array(given, dtype=float)
         self.rng = np.random.default_rng(seed)
         self.late = round(around.move_delay_s / native.dt)
+        self.sees = native.dt / (native.dt + around.sensor_lag_s)  # share of a change that is shown at once
+        if self.late or around.drive_share != 1:  # what was applied before counts: what holds the start
+            pushed = native.neutral + np.diag(0.01 * native.span)
+            plans = np.vstack([native.neutral[None], pushed])[:, None]
+            _, after = native.run(np.repeat(self.x[None], len(plans), axis=0), plans, self.d)
+            by_drive = (after[1:] - after[0]).T / (0.01 * native.span)
+            held = native.neutral + np.linalg.lstsq(by_drive, self.x - after[0], rcond=None)[0]
+            self.before = np.clip(held, native.lowest, native.highest)
         self.y = [native.output(self.x) + self.offset]
         self.time = 0.0
 
@@ -188,12 +199,14 @@ class Truth:
 
     def apply(self, move: Move) -> None:
         """Let one sample pass under this move."""
-        new = np.array(move.drives(self.model.drives), dtype=float)
-        u = np.repeat(new[None, None, :], self.sub, axis=1)
-        u[:, : min(self.late, self.sub)] = self.u
-        y, x = self.model.run(self.x[None, :], u, self.d)
-        self.x, self.u = x[0], new
-        self.y.extend(y[0, 1:] + self.offset)
+        first, rest = len(self.moves) * self.sub - self.late, self.before
+        self.moves.append(np.array(move.drives(self.model.drives), dtype=float))
+        at = np.arange(first, first + self.sub) // self.sub
+        u = np.stack([self.moves[k] if k >= 0 else rest for k in at])
+        y, x = self.model.run(self.x[None, :], (rest + self.around.drive_share * (u - rest))[None], self.d)
+        self.x = x[0]
+        for row in y[0, 1:] + self.offset:
+            self.y.append(row if self.sees == 1 else self.y[-1] + self.sees * (row - self.y[-1]))
         self.time += self.dt
 
 

@@ -82,8 +82,10 @@ def _loop_in_c(
         ctypes.byref(plant_in_c),
         n,
         truth.sub,
-        min(truth.late, truth.sub),
-        *(address(values) for values in (observed, truth.d, noise)),
+        truth.late,
+        ctypes.c_double(truth.sees),
+        ctypes.c_double(around.drive_share),
+        *(address(values) for values in (truth.before, observed, truth.d, noise)),
         *(address(values) for values in (quanta, d_offset, target, y, reading, drive, status)),
     )
     del held  # it had to live until here

@@ -2,12 +2,13 @@
 
 One loop for each controlled output, on the drive that moves it most:
 
-    v = u_ff(r, d) + Kc (r - y) + I,      u = v inside range and slew,
+    v = u_ff(r, d) + Kc (b r + (1 - b) r_0 - y) + I,      u = v inside range and slew,
     I+ = I + dt ( Kc/Ti (r - y) + (u - v)/Tt ).
 
 The last term (back-calculation) bleeds the integrator while the drive is limited, which is most of the
 time after a step of the target.  ``u_ff`` is the drive that holds the target in steady state, from the
-plant, weighted.  Where readings have a time, dt is what really passed, for the integrator and for the slew
+plant, weighted; r_0 is where the loop began, and b below 1 answers a new target less than a reading, against
+overshoot.  Where readings have a time, dt is what really passed, for the integrator and for the slew
 alike, and a call before a move is due (:mod:`thermogrip.mpc.estimator.call_times`) holds the last one.
 
 Its loops are tuned by :mod:`thermogrip.mpc.design.design`.
@@ -94,7 +95,7 @@ class PIController(SampledController):
         self.loops = pair_loops(plant, self.controlled) if loops is None else loops
         # of each loop its drive and its output, counted from 0
         self._ends = [(model.drives.index(p.drive), self.controlled.index(p.output)) for p in self.loops]
-        self._I = np.zeros(len(self.loops))
+        self._I, self._begun = np.zeros(len(self.loops)), np.full(len(self.controlled), np.nan)
         self._room = np.full(model.n_d, np.nan)
 
     @classmethod
@@ -115,7 +116,7 @@ class PIController(SampledController):
         self._forget()
         self._I = np.zeros(len(self.loops))
         y, room = self._read(reading)
-        self._target = y[self._rows]
+        self._target = self._begun = y[self._rows]
         self._room = np.full(self.model.n_d, np.nan)
         if np.isfinite(self._target).all():  # what the feed-forward leaves of the drive that holds this
             held = self._held(self._target, np.where(np.isfinite(room), room, ROOM))
@@ -155,10 +156,12 @@ class PIController(SampledController):
         """
         seconds = self.dt if seconds is None else seconds
         ahead, error = self._feedforward(target, d), target - y
+        self._begun = np.where(np.isfinite(self._begun), self._begun, y)
         v = ahead.copy()
         for at, (loop, (j, i)) in enumerate(zip(self.loops, self._ends)):
             if np.isfinite(error[i]):
-                v[j] = loop.feedforward * ahead[j] + loop.Kc * error[i] + self._I[at]
+                kept = (1 - loop.setpoint) * (target[i] - self._begun[i])
+                v[j] = loop.feedforward * ahead[j] + loop.Kc * (error[i] - kept) + self._I[at]
             else:
                 v[j] = self._neutral[j] if self._lost[i] else self._u[j]
         u = self._within(v, seconds)
@@ -176,7 +179,7 @@ class PIController(SampledController):
 
         The other arguments are those of :meth:`propose`.
         """
-        self._u = np.asarray(u, dtype=float)
+        self._u, self._begun = np.asarray(u, dtype=float), target
         ahead, error = self._feedforward(target, d), target - y
         for at, (loop, (j, i)) in enumerate(zip(self.loops, self._ends)):
             self._I[at] = self._u[j] - loop.feedforward * ahead[j] - loop.Kc * error[i]

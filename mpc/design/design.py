@@ -58,6 +58,7 @@ class PILoop:
     Ti: float  # integral and anti-windup times [s]
     Tt: float
     feedforward: float = 1.0  # share of the holding drive that is fed forward, 0 to 1
+    setpoint: float = 1.0  # share of a change of the target that Kc answers to, 0 to 1
 
 
 def simc(plant: Plant, drive: str, output: str, *, tau_c: float | None = None) -> PILoop:
@@ -142,7 +143,7 @@ def _numbers_of(design: Design) -> Iterator[tuple[str, Sequence[Any]]]:
     for name, value in design.slew_per_s.items():
         yield f"slew_per_s of {name}", (value,)
     for loop in design.loops:
-        yield f"the PI of {loop.output}", (loop.Kc, loop.Ti, loop.Tt, loop.feedforward)
+        yield f"the PI of {loop.output}", (loop.Kc, loop.Ti, loop.Tt, loop.feedforward, loop.setpoint)
     for name, value in vars(design.noise).items():
         yield f"noise: {name}", (value,)
 
@@ -197,6 +198,8 @@ def _check_loops(design: Design, drives: Sequence[str]) -> None:
         wrong = any(loop.drive == other.drive or loop.output == other.output for other in design.loops[:at])
         _refuse(wrong, f"loops: {loop.output} by {loop.drive} is there twice")
         _refuse(loop.Ti <= 0 or loop.Tt <= 0, f"loops: Ti and Tt of {loop.output} must be > 0")
+        wrong = not 0 <= loop.setpoint <= 1
+        _refuse(wrong, f"loops: setpoint of {loop.output} must be 0 to 1")
 
 
 def _check_weights(design: Design) -> None:

@@ -53,6 +53,7 @@ class Spec(BaseModel):
     bias_degC: Positive = 0.05  # largest mean error at the end
     hold_s: Annotated[float, Field(ge=10, le=36000)] = 600.0  # how long a step is simulated
     energy_weight: NotNegative = 0.0  # seconds of settling that are worth one second at full drive
+    moves_weight: NotNegative = 0.01  # share of the minimum time that is worth one move by a full drive less
     # between moves; read off the plant where absent, like the next ones
     sample_time_s: Positive | None = None
     slew_per_s: Positive | dict[str, Positive] | None = None  # largest change of a drive [its units per s]
@@ -65,6 +66,11 @@ class Spec(BaseModel):
     search_draws: Annotated[int, Field(ge=1, le=50)] = 2  # of the plant, in the search
     check_draws: Annotated[int, Field(ge=1, le=200)] = 5  # of the plant, in the final comparison
     evaluations: Annotated[int, Field(ge=1, le=10000)] = 20  # designs that the search may try
+    # what the plant may have that the model lacks: a lag of every sensor and a delay of the drives, in apparent
+    # delays of the plant, and a share of the drives that does nothing; 0 is not tried
+    extra_lag: Annotated[NotNegative, Field(le=10)] = 0.5
+    extra_delay: Annotated[NotNegative, Field(le=10)] = 0.5
+    lost_gain: Annotated[NotNegative, Field(lt=1)] = 0.15
     limits: dict[str, Range] | None = None  # soft limits of outputs [degC]
 
     @model_validator(mode="after")

@@ -126,6 +126,11 @@ class _ByStructure:
 
 
 @cache
+def _truth_library(model: _ByStructure, drives: tuple[int, ...], h: float) -> ctypes.CDLL:
+    return ctypes.CDLL(str(build_library(_written(model, drives, h).files)))
+
+
+@cache
 def _library(path: Path) -> ctypes.CDLL:
     library = ctypes.CDLL(str(path))
     doubles, integers = "x w shown lag scale start P found_offset innovation between", "held lost"
@@ -218,7 +223,9 @@ class CompiledTruth:
 
     def __init__(self, model: PredictionModel) -> None:
         code = _code_of(model)
-        self._library = ctypes.CDLL(str(build_library(code.files)))
+        self._library = _truth_library(
+            _ByStructure(model.model), tuple(model.drive_index), model.dt / model.sub
+        )
         self._k = np.zeros(max(1, code.n_k))
         self._library.tg_model_prepare(address(np.ascontiguousarray(model.p)), address(self._k))
         self._C = np.ascontiguousarray(model.C)

@@ -29,12 +29,13 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.closed_loop.simulate import simulate_closed_loop
 from thermogrip.mpc.controllers.linear_equivalent import LinearLaw, linear_law, linear_move
 from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.design.spec import Spec, spec_from_dict
 from thermogrip.mpc.estimator.observer import choose_disturbances, detectability_margin
 from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.mpc.native.design_struct import ITERATION_LIMIT
 from thermogrip.mpc.optimiser.rti import Optimiser
 from thermogrip.mpc.plant.prediction import PredictionModel, holding_drive, steady_curve, step_response
-from thermogrip.mpc.tuning.objective import draws_of
+from thermogrip.mpc.tuning.objective import STRUCTURE, draws_of, lacking, run_trials
 from thermogrip.sysid.models.model import BlackBox
 
 _RANK = {"pass": 0, "warn": 1, "fail": 2}
@@ -120,6 +121,7 @@ def review(
         weights(controller),
         room_to_move(controller),
         limits(controller, span),
+        lacks_structure(controller, swing),
         *_effort(controller, swing),
         _stand_in(controller),
         valid_range(controller, span),
@@ -138,6 +140,33 @@ def _steps(controller: Controller) -> tuple[list[float], list[float]]:
         return starts, targets
     low, high = controller.plant.valid.get(controller.controlled[0], (20.0, 40.0))
     return [], [float(low), float(high)]
+
+
+def lacks_structure(controller: Controller, swing: tuple[float, float]) -> Check:
+    """A plant may have what its model lacks: the spec's first step, with each of that in turn."""
+    name, plant = "settles where the model lacks structure", controller.plant
+    noted = controller.notes.get("spec")
+    spec = (
+        spec_from_dict(noted)
+        if isinstance(noted, Mapping)
+        else Spec(steps=[(swing[0], max(swing[0] + 1.0, swing[1]))])
+    )
+    spec = spec.model_copy(update={"steps": spec.steps[:1]})
+    tried = lacking(plant, spec, controller.controlled)
+    numbers = [STRUCTURE * at + draws_of(plant, 1)[0] for at in range(1, len(tried) + 1)]
+    found = run_trials(Controller(plant, controller.design), plant, spec, numbers)
+    times = [f"{r.settle_s:.0f} s" if np.isfinite(r.settle_s) else "never" for r in found]
+    seen = [
+        f"{words}: {time}, overshoot {r.overshoot:.2f}"
+        for (words, _), time, r in zip(tried, times, found, strict=True)
+    ]
+    if "never" in times:
+        move = controller.design.move
+        fix = (
+            f"raise the move weight (now {move:.3g}), or identify on a log of the closed loop and tune again"
+        )
+        return Check(name, "warn", "; ".join(seen), fix)
+    return Check(name, "pass", "; ".join(seen) or "nothing is tried")
 
 
 class _Counted(Controller):

@@ -6,10 +6,14 @@ name travel, and the file is run where it arrives), so that other processes can 
 **Score.**  A step's settling time counts in units of the bound, so that short and long steps weigh alike;
 what the spec forbids is charged on top, steeply:
 
-    score = (settle + energy_weight E) / bound + 10 (overshoot - 0.9 allowed)+ + 10 (|bias| - 0.9 allowed)+
+    score = (settle + energy_weight E) / bound + moves_weight M
+            + 10 (overshoot - 0.9 allowed)+ + 10 (|bias| - 0.9 allowed)+
 
-A step that never settles is charged its whole length and twice its last error.  Over the runs, the score
-is the mean plus half of what the worst is above it: the draws stand for what the plant may be.
+M is by how many full drives the drives move in all: of two designs that settle alike, the one that answers
+less to noise wins.  A step that never settles is charged its whole length and twice its last error.  Over the
+runs, the score is the mean plus half of what the worst is above it: the draws stand for what the plant may
+be.  All of them have the model's structure.  What that may lack (sensors that are slower, a longer delay, a
+weaker drive) is tried one by one on the first draw; the mean of those runs counts a little.
 
 **Bound.**  Before :func:`thermogrip.mpc.tuning.minimum_time.full_drive_bound` no drive inside its limits
 brings the skin into the band.  Staying there takes longer still, since the drive must be taken back in time,
@@ -21,6 +25,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,14 +40,26 @@ from thermogrip.mpc.design.design import Design, PILoop, make_blocks
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.interface import Regulator
 from thermogrip.mpc.native.runtime import wanted
+from thermogrip.mpc.plant.prediction import drive_names, step_response
 from thermogrip.mpc.tuning.minimum_time import full_drive_bound
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
 
+class Record:
+    """What is written into a controller's notes."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain JSON, None for what is not finite."""
+        return {
+            key: None if isinstance(value, float) and not np.isfinite(value) else value
+            for key, value in vars(self).items()
+        }
+
+
 @dataclass(frozen=True)
-class StepResult:
+class StepResult(Record):
     """One step on one draw; of the worst output where several are controlled."""
 
     start: float  # [degC]
@@ -61,6 +78,33 @@ class StepResult:
 def draws_of(plant: Plant, count: int) -> list[int]:
     """Return which draws to try: 1 to count, or the plant itself alone where it has no uncertainty."""
     return list(range(1, count + 1)) if plant.uncertain else [0]
+
+
+#: From this number on a draw lacks structure: 2001 is draw 1 with the second of :func:`lacking`.
+STRUCTURE = 1000
+#: How much runs on such draws count in the score beside the others, and the most that one is charged.
+LACKING, MOST_LACKING = 0.05, 5.0
+
+
+@lru_cache(maxsize=16)
+def apparent_delay(plant: Plant, controlled: tuple[str, ...]) -> float:
+    """Return the longest apparent delay [s] of a controlled output behind the drive that moves it most."""
+    drives = drive_names(plant)
+    answers = [[step_response(plant, drive, output) for drive in drives] for output in controlled]
+    delays = [max(of, key=lambda answer: abs(answer.gain)).delay for of in answers]
+    return max(*delays, plant.dt)
+
+
+def lacking(plant: Plant, spec: Spec, controlled: Sequence[str]) -> list[tuple[str, dict[str, float]]]:
+    """Return what a plant may have that its model lacks: in words, and as changes of the surroundings."""
+    delay = apparent_delay(plant, tuple(controlled))
+    lag, late, lost = spec.extra_lag * delay, spec.extra_delay * delay, spec.lost_gain
+    tried = [
+        (lag, f"sensors slower by {lag:.2g} s", {"sensor_lag_s": lag}),
+        (late, f"delay longer by {late:.2g} s", {"move_delay_s": late}),
+        (lost, f"drive weaker by {100 * lost:.2g} %", {"drive_share": 1.0 - lost}),
+    ]
+    return [(words, changes) for value, words, changes in tried if value > 0]
 
 
 def surroundings_of(spec: Spec, controlled: Sequence[str], disturbances: Sequence[str]) -> Surroundings:
@@ -85,12 +129,16 @@ def trial(
     loop: Callable[..., ClosedLoop] = simulate_closed_loop
     if isinstance(controller, Controller) and controller.c is not None:
         from thermogrip.mpc.closed_loop.simulate_native import compiled_loop as loop
+    structure, draw = divmod(draw, STRUCTURE)
+    around = surroundings_of(spec, controller.controlled, plant.disturbances)
+    if structure:
+        around = replace(around, **lacking(plant, spec, controller.controlled)[structure - 1][1])
     return loop(
         controller,
         plant.draw(draw),
         [(step[1], length_s)],
         start=step[0],
-        surroundings=surroundings_of(spec, controller.controlled, plant.disturbances),
+        surroundings=around,
         band=spec.band_degC,
         seed=1000 * seed + draw,
     )
@@ -121,16 +169,18 @@ def score(results: Sequence[StepResult], spec: Spec, bounds: Bounds) -> float:
     """Return the score of a set of trials, see the module's text; lower is better; ``bounds`` are shortest
     times [s].
     """
-    costs = []
+    costs: tuple[list[float], list[float]] = [], []
     for result in results:
-        bound = bounds[(result.start, result.target, result.draw)]
+        bound = bounds[(result.start, result.target, result.draw % STRUCTURE)]
         unit = max(bound if np.isfinite(bound) else result.length_s, 1.0)
         settled = np.isfinite(result.settle_s)
         cost = result.settle_s / unit if settled else result.length_s / unit + 2 * abs(result.last_error)
         cost += 10 * max(0.0, result.overshoot - 0.9 * spec.overshoot_degC)
         cost += 10 * max(0.0, abs(result.bias) - 0.9 * spec.bias_degC) if settled else 0.0
-        costs.append(cost + spec.energy_weight * result.energy_s / unit)
-    return float(np.mean(costs) + 0.5 * (np.max(costs) - np.mean(costs)))
+        cost += spec.energy_weight * result.energy_s / unit + spec.moves_weight * result.travel
+        costs[result.draw >= STRUCTURE].append(cost)
+    own, others = costs[0], np.minimum(costs[1], MOST_LACKING)
+    return float(0.5 * (np.mean(own) + np.max(own)) + LACKING * np.sum(others) / max(1, len(others)))
 
 
 def bounds_of(plant: Plant, design: Design, spec: Spec, draws: Sequence[int]) -> Bounds:
@@ -175,32 +225,28 @@ def _result(run: ClosedLoop, step: tuple[float, float], draw: int) -> StepResult
 
 #: What the search varies: name, smallest, largest; all on a logarithmic scale.
 MPC_PARAMETERS = (
-    ("move", 0.02, 500.0),
+    ("move", 0.02, 5000.0),
     ("terminal", 0.3, 300.0),
     ("overshoot_share", 0.05, 0.9),
     ("drive_walk", 1e-5, 2e-2),
     ("output_walk", 2e-4, 2e-2),
+    ("state_walk", 5e-4, 5e-3),
 )
-PI_PARAMETERS = (("Kc", 0.1, 10.0), ("Ti", 0.2, 10.0), ("Tt", 0.05, 5.0), ("feedforward", 0.05, 1.0))
+PI_PARAMETERS = (
+    ("Kc", 0.2, 5.0),
+    ("Ti", 0.2, 5.0),
+    ("setpoint", 0.1, 1.0),
+    ("feedforward", 0.05, 1.0),
+)
 LQR_PARAMETERS = (
     ("move", 0.02, 500.0),
     ("drive", 1e-4, 100.0),
+    ("state_walk", 5e-4, 5e-3),
     ("drive_walk", 1e-5, 2e-2),
     ("output_walk", 2e-4, 2e-2),
 )
 
 _CHECK_FROM = 100  # draws of the comparison, apart from those of the search
-
-
-class Record:
-    """What is written into a controller's notes."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain JSON, None for what is not finite."""
-        return {
-            key: None if isinstance(value, float) and not np.isfinite(value) else value
-            for key, value in vars(self).items()
-        }
 
 
 @dataclass(frozen=True)
@@ -227,6 +273,8 @@ class Search:
         # the comparison takes draws that the search has not seen
         self.unseen = [draw + _CHECK_FROM if draw else 0 for draw in draws_of(plant, spec.check_draws)]
         self.bounds = bounds_of(plant, baseline, spec, sorted({*self.draws, *self.unseen}))
+        count = len(lacking(plant, spec, baseline.controlled))
+        self.lacking = [STRUCTURE * (k + 1) + self.draws[0] for k in range(count)]
         check_steps(self.bounds)
         slowest = [max(self.bounds[(*step, draw)] for draw in self.draws) for step in spec.steps]
         # long enough to see it settle and stay, short enough to try many
@@ -255,6 +303,7 @@ class Search:
         base = self.baseline
         noise = replace(
             base.noise,
+            state=parameters.get("state_walk", base.noise.state),
             drive=parameters.get("drive_walk", base.noise.drive),
             output=parameters.get("output_walk", base.noise.output),
         )
@@ -285,11 +334,13 @@ class Search:
         if lengths is None:
             # a PI is tried for as long as a step is held, to see what its integrator has still to do
             lengths = [self.spec.hold_s] * len(self.spec.steps) if name == "PI" else self.lengths
-        results = run_trials(controller, self.plant, self.spec, self.draws, lengths=lengths, seed=self.seed)
+        draws = [*self.draws, *self.lacking]
+        found = run_trials(controller, self.plant, self.spec, draws, lengths=lengths, seed=self.seed)
+        results = [result for result in found if result.draw < STRUCTURE]
         return Trial(
             controller=name,
             parameters=dict(parameters),
-            score=score(results, self.spec, self.bounds),
+            score=score(found, self.spec, self.bounds),
             settle_s=float(np.mean([result.settle_s for result in results])),
             overshoot=max(result.overshoot for result in results),
             energy_s=float(np.mean([result.energy_s for result in results])),
@@ -343,6 +394,7 @@ def parameters_of(design: Design, spec: Spec) -> dict[str, float]:
         "move": design.move,
         "terminal": design.terminal,
         "overshoot_share": design.overshoot / spec.overshoot_degC,
+        "state_walk": design.noise.state,
         "drive_walk": design.noise.drive,
         "output_walk": design.noise.output,
         "horizon": float(sum(design.blocks)),
@@ -351,17 +403,20 @@ def parameters_of(design: Design, spec: Spec) -> dict[str, float]:
 
 
 def scaled_loops(loops: tuple[PILoop, ...], factors: dict[str, float]) -> tuple[PILoop, ...]:
-    """Return PI loops with each number times its factor; the feed-forward is the number itself.
+    """Return PI loops with each number times its factor; feed-forward and setpoint weight as they are given.
 
-    A step of the load leaves an integrated error of Ti / Kc: at most half more than that of the loops given.
+    Tt is given as a share of Ti.  A step of the load leaves an integrated error of Ti / Kc: at most half more
+    than that of the loops given.
     """
+    Ti = min(factors["Ti"], 1.5 * factors["Kc"])
     return tuple(
         replace(
             loop,
             Kc=factors["Kc"] * loop.Kc,
-            Ti=min(factors["Ti"], 1.5 * factors["Kc"]) * loop.Ti,
-            Tt=factors["Tt"] * loop.Tt,
+            Ti=Ti * loop.Ti,
+            Tt=factors["Tt"] * Ti * loop.Ti,
             feedforward=factors["feedforward"],
+            setpoint=factors["setpoint"],
         )
         for loop in loops
     )

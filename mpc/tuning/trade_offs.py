@@ -106,6 +106,7 @@ PARAMETER_WORDS = {
     "move": "the move weight",
     "terminal": "the terminal weight",
     "overshoot_share": "the band's share of the overshoot",
+    "state_walk": "the process noise of the states",
     "drive_walk": "the process noise of the drive's bias",
     "output_walk": "the process noise of the output's bias",
     "horizon": "the horizon",

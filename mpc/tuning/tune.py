@@ -2,11 +2,12 @@ r"""Find the weights for what is wanted, and say whether weights were the limit.
 
 The search varies what a user would have to guess: move suppression, the terminal weight, the overshoot band
 kept free, how fast the observer moves its bias (all as logarithms, by NLopt's subplex, which needs no
-derivative and takes the small jumps of a settling time), and before that the horizon. Subplex takes the
-parameters a few at a time, those named first before the others: 20 trials change the move weight and the
-terminal weight and hardly the rest, 40 reach all of them. Each design is evaluated in closed loop on draws
-of the plant's posterior, never on the model itself. A PI controller and a linear-quadratic regulator are
-tuned with the same number of trials, and stand beside it.
+derivative and takes the small jumps of a settling time), and before that moves that are dearer by powers of
+ten, a filter that trusts readings less, and the horizon. Subplex takes the parameters a few at a time, those
+named first before the others: 20 trials change the first two and hardly the rest. Each design
+is evaluated in closed loop on draws of the plant's posterior, never on the model itself, and on draws that
+lack structure (:mod:`thermogrip.mpc.tuning.objective`). A linear-quadratic regulator is tuned with the same
+number of trials and a PI controller with twice as many, SIMC's settings first; they stand beside it.
 
 Trade-offs that remain are reported: designs of which none is better in all of settling, overshoot and energy,
 what each weight does (:mod:`thermogrip.mpc.tuning.trade_offs`), and whether weights were the limit at all:
@@ -41,11 +42,13 @@ from thermogrip.mpc.tuning.objective import (
     LQR_PARAMETERS,
     MPC_PARAMETERS,
     PI_PARAMETERS,
+    STRUCTURE,
     Bounds,
     Record,
     Search,
     StepResult,
     Trial,
+    lacking,
     parameters_of,
     scaled_loops,
     score,
@@ -181,6 +184,26 @@ def _simpler(scores: Mapping[str, float]) -> str:
     return f"{name}, tuned with as many trials, scores {how} on this spec{missing}."
 
 
+def _moved(kept: Sequence[Row], rows: Sequence[Row]) -> str:
+    """Return how far a step moves the drives, beside the default design."""
+    own = np.mean([row.travel_mean for row in kept])
+    default = np.mean([row.travel_mean for row in rows if row.controller == "baseline"])
+    return f"A step moves the drives by {own:.1f} times full drive, {default:.1f} with the default design."
+
+
+def _lacking(plant: Plant, design: Design, spec: Spec, results: Sequence[StepResult]) -> str:
+    """Return what becomes of a plant that has what its model lacks."""
+    said = []
+    for at, (what, _) in enumerate(lacking(plant, spec, design.controlled), start=1):
+        part = [result for result in results if result.draw // STRUCTURE == at]
+        settled = all(np.isfinite(result.settle_s) for result in part)
+        takes = f"settles in {max(r.settle_s for r in part):.0f} s" if settled else "does not settle"
+        said.append(f"with {what} it {takes}, overshoot {max(r.overshoot for r in part):.2f} K")
+    return f"Where the model lacks structure: {'; '.join(said)}." if said else ""
+
+
+# to begin with: dearer moves than in the default design, a filter that trusts readings less, other horizons
+_LOOK = (("move", (10.0, 100.0, 1000.0)), ("state_walk", (0.3, 0.1)), ("horizon", (0.7, 1.5)))
 _WORTH = 0.01  # by which a traded design must be better on the spec's own score to be taken
 
 
@@ -277,9 +300,14 @@ def tune(
     baseline = spec.design(plant)
     search = Search(plant, spec, baseline, seed)
     start = parameters_of(baseline, spec)
-    look = [{**start, "horizon": float(round(h * start["horizon"]))} for h in (0.7, 1.0, 1.5)]
-    looked = run_parallel(search.evaluate, look, workers, sub_progress(progress, 0.0, 0.05), what="horizon")
-    found = _search_all(search, looked, workers, sub_progress(progress, 0.05, 0.6))
+    looked = run_parallel(search.evaluate, [start], workers, what="default design")
+    for at, (parameter, factors) in enumerate(_LOOK):
+        first = _best(looked).parameters
+        values = [factor * first[parameter] for factor in factors]
+        look = [{**first, parameter: float(round(v)) if parameter == "horizon" else v} for v in values]
+        share = sub_progress(progress, 0.02 * at, 0.02 * (at + 1))
+        looked += run_parallel(search.evaluate, look, workers, share, what=PARAMETER_WORDS[parameter])
+    found = _search_all(search, looked, workers, sub_progress(progress, 0.06, 0.6))
     pareto, best = _trade(search, found, workers, sub_progress(progress, 0.6, 0.7))
     tuned = search.design(best.parameters)
     candidates = {
@@ -292,15 +320,20 @@ def tune(
     scores = {name: score(part, spec, search.bounds) for name, part in results.items()}
     kept = "tuned" if scores["tuned"] < scores["baseline"] else "baseline"
     about = best if kept == "tuned" else search.evaluate(start)
+    own = {name: [result for result in part if result.draw < STRUCTURE] for name, part in results.items()}
     items = [(search, parameter, about.parameters, about) for parameter in PARAMETER_WORDS]
     share = sub_progress(progress, 0.85, 1.0)
     sensitivity = run_parallel(sensitivity_of, items, workers, share, what="sensitivities")
     history = tuple(tried for part in found.values() for tried in part)
-    rows = tuple(row for name, part in results.items() for row in rows_of(name, part, spec, search.bounds))
+    rows = tuple(row for name, part in own.items() for row in rows_of(name, part, spec, search.bounds))
     unseen = "under fresh noise (the plant has no uncertainty)" if search.certain else "on unseen draws"
     kept_rows = [row for row in rows if row.controller == kept]
-    verdict, finding = verdict_of(spec, scores, kept_rows, unseen=unseen)
-    meets = all(meets_spec(result, spec) for result in results[kept])
+    still = spec.model_copy(update={"moves_weight": 0.0})
+    settling = {name: score(part, still, search.bounds) for name, part in own.items()}
+    verdict, finding = verdict_of(spec, settling, kept_rows, unseen=unseen)
+    missing = [result for result in results[kept] if result.draw >= STRUCTURE]
+    finding = f"{finding} {_moved(kept_rows, rows)} {_lacking(plant, baseline, spec, missing)}".strip()
+    meets = all(meets_spec(result, spec) for result in own[kept])
     notes = {
         "verdict": verdict,
         "finding": finding,
@@ -312,6 +345,7 @@ def tune(
         "spec": spec.model_dump(mode="json"),
         "seed": seed,
         "rows": [row.to_dict() for row in rows],
+        "lacking": [result.to_dict() for result in missing],
     }
     # the PI found here also takes over when the optimiser fails
     controller = Controller(plant, replace(candidates[kept], loops=candidates["PI"].loops), notes=notes)
@@ -356,12 +390,15 @@ def _search_all(
 ) -> dict[str, list[Trial]]:
     """Return the trials of MPC, PI and LQR, after as many evaluations each."""
     n = search.spec.evaluations
-    pi = {"Kc": 1.0, "Ti": 1.0, "Tt": 0.5, "feedforward": 0.99}  # SIMC, with the drive that holds the target
+    # SIMC, with the drive that holds the target; and without: a plant that has no draws does not know how
+    # wrong that drive is
+    pi = {"Kc": 1.0, "Ti": 1.0, "Tt": 0.25, "setpoint": 1.0, "feedforward": 0.99}
+    plain = pi | {"feedforward": 0.05}
+    others = [plain | dict(zip(_SPREAD, values.tolist())) for values in _spread(search.certain)]
     lqr = {**parameters_of(search.baseline, search.spec), "drive": 1e-2}
     items = [
         (search, "MPC", [_best(looked).parameters], max(0, n - len(looked)), None),
-        # and without; a plant that has no draws does not know how wrong that drive is
-        (search, "PI", [pi, pi | {"feedforward": 0.05}][search.certain :], n, None),
+        (search, "PI", [pi, plain, *others][search.certain :], 2 * n, None),
         (search, "LQR", [lqr], n, None),
     ]
     if workers == 1:
@@ -374,6 +411,18 @@ def _search_all(
     return {**found, "MPC": [*looked, *found["MPC"]]}
 
 
+_SPREAD = {"Kc": (0.4, 2.5), "Ti": (0.4, 2.5), "setpoint": (0.2, 1.0), "feedforward": (0.05, 1.0)}
+
+
+def _spread(certain: bool) -> Array:
+    """Return 16 sets of a PI's parameters, evenly spread over their logarithms."""
+    from scipy.stats.qmc import Halton
+
+    ends = np.log(list(_SPREAD.values())[: 3 if certain else 4])
+    low, high = ends.T
+    return np.asarray(np.exp(low + Halton(len(ends), scramble=False).random(17)[1:] * (high - low)))
+
+
 def _optimise(item: tuple[Search, str, list[dict[str, float]], int, Progress | None]) -> list[Trial]:
     """Minimise a controller's score over its parameters' logarithms from the best of its starts on; return
     every trial.
@@ -383,7 +432,7 @@ def _optimise(item: tuple[Search, str, list[dict[str, float]], int, Progress | N
         return []
     import nlopt
 
-    own = PI_PARAMETERS[:3] if search.certain else PI_PARAMETERS
+    own = PI_PARAMETERS[:-1] if search.certain else PI_PARAMETERS
     parameters = {"MPC": MPC_PARAMETERS, "PI": own, "LQR": LQR_PARAMETERS}[name]
     evaluate = partial(search.evaluate, name=name)
     names = [parameter for parameter, _, _ in parameters]
@@ -402,7 +451,7 @@ def _optimise(item: tuple[Search, str, list[dict[str, float]], int, Progress | N
     optimiser.set_min_objective(cost)
     optimiser.set_lower_bounds(low)
     optimiser.set_upper_bounds(high)
-    optimiser.set_initial_step(np.full(len(names), 0.7))
+    optimiser.set_initial_step(np.full(len(names), 0.3 if name == "PI" else 0.7))
     optimiser.set_maxeval(evaluations - len(tried) or 1)
     optimiser.set_xtol_rel(1e-3)
     optimiser.optimize(np.clip(np.log([start[parameter] for parameter in names]), low + 1e-9, high - 1e-9))
@@ -413,7 +462,8 @@ def _compare(
     search: Search, candidates: dict[str, Design], workers: Workers, progress: Progress | None
 ) -> dict[str, list[StepResult]]:
     """Run all candidates on draws that the search has not seen, at full length."""
-    items = [(name, design, draw) for name, design in candidates.items() for draw in search.unseen]
+    draws = [*search.unseen, *(draw - search.draws[0] + search.unseen[0] for draw in search.lacking)]
+    items = [(name, design, draw) for name, design in candidates.items() for draw in draws]
     done = run_parallel(search.check, items, workers, progress, what="comparison")
     results: dict[str, list[StepResult]] = {name: [] for name in candidates}
     for (name, _, _), part in zip(items, done, strict=True):

@@ -373,23 +373,25 @@ static int is_young(const tg_controller *c)
 
 static int time_is_up(const tg_controller *c) { return c->late && c->late(c->about); }
 
-static double error_of(const tg_controller *c, int loop)
+/* A share of a loop's target, less the reading. */
+static double error_of(const tg_controller *c, int loop, double share)
 {
     const tg_design *s = c->design;
     int r = s->loop_output[loop];
-    return c->target[r] - c->y[s->controlled[r]];
+    return share * c->target[r] - c->y[s->controlled[r]];
 }
 
-/* One step of the PI controller, taken over without a bump: u = Kc e + I, I+ = I + dt (Kc/Ti e + (u - v)/Tt). */
+/* One step of the PI controller, taken over without a bump: u = Kc (b r - y) + I,
+ * I+ = I + dt (Kc/Ti (r - y) + (u - v)/Tt). */
 static void go_on_pi(tg_controller *c, double *drive)
 {
     const tg_design *s = c->design;
     double wanted[TG_NU] = {0.0};
     for (int l = 0; l < s->n_loops && !c->on_pi; l++)
-        c->integral[l] = c->u[s->loop_drive[l]] - s->Kc[l] * error_of(c, l);
+        c->integral[l] = c->u[s->loop_drive[l]] - s->Kc[l] * error_of(c, l, s->setpoint[l]);
     c->on_pi = 1;
     for (int l = 0; l < s->n_loops; l++)
-        wanted[s->loop_drive[l]] = s->Kc[l] * error_of(c, l) + c->integral[l];
+        wanted[s->loop_drive[l]] = s->Kc[l] * error_of(c, l, s->setpoint[l]) + c->integral[l];
     for (int j = 0; j < TG_NU; j++) {
         double before = fmin(fmax(c->u[j], s->lowest[j]), s->highest[j]);
         double slew = s->slew[j] * (c->slew_s / s->dt);
@@ -398,7 +400,7 @@ static void go_on_pi(tg_controller *c, double *drive)
     }
     for (int l = 0; l < s->n_loops; l++) {
         int j = s->loop_drive[l];
-        c->integral[l] += c->slew_s * (s->Kc[l] / s->Ti[l] * error_of(c, l) + (drive[j] - wanted[j]) / s->Tt[l]);
+        c->integral[l] += c->slew_s * (s->Kc[l] / s->Ti[l] * error_of(c, l, 1.0) + (drive[j] - wanted[j]) / s->Tt[l]);
     }
 }
 

@@ -141,20 +141,19 @@ static void look(const tg_truth *plant, double *y)
 /* A closed loop of n samples against a plant that is not the model.
  *
  * observed: the estimate that the observer starts from: x, w, shown, lag, scale, P,
- * found_offset and start, one behind the other; per_sample: the plant's steps in a sample, of which the
- * first `late` still run on the drive before; noise: n rows of TG_NY readings' errors; quanta: of each of the
- * TG_NY + TG_ND readings, 0 none; d_offset: what a sensor of a disturbance shows too much; target: n rows of n_c.
+ * found_offset and start, one behind the other; per_sample: the plant's steps in a sample; late: steps after
+ * which a drive acts, acts: the share of it that does, both counted from the drives `before`; sees: share of a
+ * change that sensors show at once; noise: n rows of TG_NY readings' errors; quanta: of each of the TG_NY + TG_ND readings, 0 none; d_offset: what
+ * a sensor of a disturbance shows too much; target: n rows of n_c.
  * Into y: n per_sample + 1 rows of TG_NY, without noise and quantum; reading: n rows of TG_NY + TG_ND;
  * drive: n rows of TG_NU; status: n.
  */
 void tg_host_loop(tg_controller *c, const tg_design *design, tg_truth *plant, int n, int per_sample, int late,
-                  const double *observed, const double *d, const double *noise, const double *quanta,
-                  const double *d_offset, const double *target, double *y, double *reading, double *drive,
-                  int *status)
+                  double sees, double acts, const double *before, const double *observed, const double *d,
+                  const double *noise, const double *quanta, const double *d_offset, const double *target,
+                  double *y, double *reading, double *drive, int *status)
 {
-    double u[TG_NU];
     look(plant, y);
-    memcpy(u, design->neutral, sizeof u);
     for (int t = 0; t < n; t++) {
         double *shown = reading + t * (TG_NY + TG_ND), *row = y + (size_t)t * (size_t)per_sample * TG_NY;
         tg_move move;
@@ -180,13 +179,18 @@ void tg_host_loop(tg_controller *c, const tg_design *design, tg_truth *plant, in
         memcpy(drive + t * TG_NU, move.drive, sizeof move.drive);
         status[t] = move.status;
         for (int part = 0; part < per_sample; part++) {
-            double *swap = plant->x;
-            plant->next(plant->x, part < late ? u : move.drive, d, plant->k, plant->after);
+            double *swap = plant->x, u[TG_NU];
+            const int since = t * per_sample + part - late;
+            const double *given = since < 0 ? before : drive + since / per_sample * TG_NU;
+            for (int j = 0; j < TG_NU; j++)
+                u[j] = acts == 1.0 ? given[j] : before[j] + acts * (given[j] - before[j]);
+            plant->next(plant->x, u, d, plant->k, plant->after);
             plant->x = plant->after;
             plant->after = swap;
             row += TG_NY;
             look(plant, row);
+            for (int i = 0; sees < 1.0 && i < TG_NY; i++)
+                row[i] = row[i - TG_NY] + sees * (row[i] - row[i - TG_NY]);
         }
-        memcpy(u, move.drive, sizeof u);
     }
 }

@@ -127,13 +127,13 @@ def test_one_drive_at_its_limit_is_enough() -> None:
 
 
 def test_surroundings_are_those_of_a_thermocouple_amplifier_where_nothing_is_given() -> None:
-    assert Surroundings() == Surroundings(25.0, 0.04, 1 / 16, {}, {}, 0.0)
+    assert Surroundings() == Surroundings(25.0, 0.04, 1 / 16, {}, {}, 0.0, 0.0, 1.0)
     assert all(kind.__dataclass_params__.frozen for kind in (Surroundings, Segment, ClosedLoop))
 
 
 def test_two_drives_of_a_plant_of_half_a_second() -> None:
     model = StateSpaceModel(
-        ("p", "q"), ("room",), ("t",), A=[[0.9]], B=[[1.0, 0.1]], E=[[0.2]], C=[[1.0]], dt=0.5, y0=[25.0],
+        ("p", "q"), ("room",), ("t",), A=[[0.9]], B=[[1.0, 0.1]], E=[[0.2]], C=[[1.0]], dt=0.5, y0=[20.0],
         c=[-0.2 * 20.0],
     )  # fmt: skip
     plant = Plant(model, {}, dt=0.5, units={"p": "1", "q": "percent"}, valid={"p": (-1.0, 1.0)})
@@ -143,30 +143,42 @@ def test_two_drives_of_a_plant_of_half_a_second() -> None:
     first = float(np.random.default_rng(3).standard_normal(1)[0])
     assert truth.reading() == pytest.approx({"time_s": 0.0, "t": 20.0 + 0.3 * first, "room": 20.0})
     truth.apply(Move({"q": 50.0, "p": -0.5}))
-    x, want = -5.0, [20.0]
+    x, want = 0.0, [20.0]
     for push in (0.0, 0.0, 4.5, 4.5):
         x = 0.9 * x + push
-        want.append(25.0 + x)
+        want.append(20.0 + x)
     np.testing.assert_allclose(np.ravel(truth.y), want, atol=1e-12)
     assert truth.reading()["time_s"] == 2.0
 
 
 def test_a_move_is_applied_after_its_delay_and_held() -> None:
     for delay in (0.0, 1.0, 3.0):
-        truth = Truth(lag(), 2.0, Surroundings(move_delay_s=delay), 25.0, 0)
+        truth = Truth(lag(), 2.0, Surroundings(move_delay_s=delay, drive_share=0.5), 25.0, 0)
         x, want = 0.0, [25.0]
-        applied = [0.0] * 6
         moves = (0.5, -0.2, 1.0)
-        for k, move in enumerate(moves):
+        for move in moves:
             truth.apply(Move(move, 1, "ok", "", 0.0))
-            late = min(round(delay), 2)
-            applied[2 * k : 2 * k + late] = [moves[k - 1] if k else 0.0] * late
-            applied[2 * k + late : 2 * k + 2] = [move] * (2 - late)
-        for u in applied:
-            x = 0.95 * x + u
+        for u in [*[0.0] * round(delay), *np.repeat(moves, 2)][:6]:
+            x = 0.95 * x + 0.5 * u
             want.append(25.0 + x)
         np.testing.assert_allclose([row[0] for row in truth.y], want, atol=1e-12)
         assert truth.time == 6.0
+
+
+def test_a_slower_sensor_is_a_first_order_lag_and_a_longer_delay_begins_with_the_drive_that_holds() -> None:
+    slow = Truth(lag(), 2.0, Surroundings(sensor_lag_s=3.0), 25.0, 0)
+    slow.apply(Move(1.0))
+    x, shown, want = 0.0, 25.0, [25.0]
+    for _ in range(2):
+        x = 0.95 * x + 1.0
+        shown += 0.25 * (25.0 + x - shown)
+        want.append(shown)
+    np.testing.assert_allclose([row[0] for row in slow.y], want, atol=1e-12)
+    # at 37 degC a drive of 0.6 holds it; of what is asked beyond, half acts
+    held = Truth(lag(), 2.0, Surroundings(move_delay_s=2.0, drive_share=0.5), 35.0, 0)
+    for _ in range(2):
+        held.apply(Move(0.7))
+    np.testing.assert_allclose([row[0] for row in held.y], [37.0, 37.0, 37.0, 37.05, 37.0975], atol=1e-9)
 
 
 def test_readings_have_offsets_noise_and_the_quantum_of_their_converter() -> None:

@@ -114,6 +114,29 @@ def test_a_take_over_starts_from_the_drives_that_are_applied():
     np.testing.assert_allclose(controller._I, [29 + 2 * 0.6, -2 + 2 * 0.125], atol=1e-4)
 
 
+def test_a_setpoint_weight_answers_a_new_target_less_and_a_reading_as_before():
+    half = tuple(replace(loop, setpoint=0.5) for loop in LOOPS)
+    wide = {"slew_per_s": {"q1": 100.0, "q2": 100.0}}
+    whole, weighted = pi(**wide), pi(loops=half, **wide)
+    first = {"a": 22.0, "b": 22.0, "room": 22.0}
+    one, two = whole.step(first, TARGET).drive, weighted.step(first, TARGET).drive
+    # of the steps of 8 and 7.5 degC half is left to the integrator
+    assert one["q2"] - two["q2"] == pytest.approx(3.0 * 4.0, abs=1e-4)
+    assert one["q1"] - two["q1"] == pytest.approx(2.0 * 3.75, abs=1e-4)
+    assert pytest.approx(weighted._I) == whole._I
+    warmer = {"a": 23.0, "b": 22.5, "room": 22.0}
+    one, two = whole.step(warmer, TARGET).drive, weighted.step(warmer, TARGET).drive
+    assert (one["q2"] - two["q2"], one["q1"] - two["q1"]) == pytest.approx((12.0, 7.5), abs=1e-4)
+    # a loop whose reading was lost at the start begins where it is first read
+    weighted.reset({"a": NAN, "b": 22.0, "room": 22.0})
+    again = weighted.step(first, TARGET).drive
+    assert again["q2"] == pytest.approx(20.0 + 3.0 * 4.0, abs=1e-4)
+    # taken over it starts from the drive, and answers half of a new target
+    y, target, d = np.array([27.0, 26.0]), np.array([29.5, 30.0]), np.array([22.0])
+    weighted.follow(np.array([33.0, 61.0]), y, target, d)
+    np.testing.assert_allclose(weighted.propose(y, target, d), [33.0, 61.0])
+
+
 def test_where_nothing_holds_a_target_nothing_is_fed_forward():
     model = StateSpaceModel(("q",), (), ("t",), A=[[1.0]], B=[[0.0]], C=[[1.0]], dt=1.0)
     plant = Plant(model, {}, dt=1.0, units={"q": "1", "t": "degC"}, valid={"q": (0.0, 1.0)})

@@ -203,6 +203,7 @@ def design(tank) -> dict:
         ({"loops": [{**LOOP, "output": "t_tank"}]}, "loops"),
         ({"loops": [LOOP, LOOP]}, "twice"),
         ({"loops": [{**LOOP, "Ti": 0.0}]}, "Ti"),
+        ({"loops": [{**LOOP, "setpoint": 1.1}]}, "setpoint of t_surface must be 0 to 1"),
         ({"loops": [{**LOOP, "Kc": "much"}]}, "PI of t_surface"),
         ({"noise": {"state": -1.0}}, "noise"),
         ({"limits": {"t_tank": [40.0, 20.0]}}, "limits of t_tank"),

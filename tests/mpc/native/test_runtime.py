@@ -85,10 +85,13 @@ def test_the_filter_is_the_same_in_c(pair):
     assert abs(c.observer.scale[0]) > 1e-5
 
 
-def test_a_loop_is_the_same_in_python_with_c_parts_and_wholly_in_c(pair, tank_maker):
+@pytest.mark.parametrize(
+    "lacks", [{"move_delay_s": 1.0}, {"move_delay_s": 7.0, "sensor_lag_s": 3.0, "drive_share": 0.8}]
+)
+def test_a_loop_is_the_same_in_python_with_c_parts_and_wholly_in_c(pair, tank_maker, lacks):
     python, c = pair
     truth = tank_maker(heat=0.1, joule=0.055, loss=1 / 600, delay=9)
-    around = Surroundings(ambient=23.0, offset={"t_surface": 0.3, "t_ambient": -0.4}, move_delay_s=1.0)
+    around = Surroundings(ambient=23.0, offset={"t_surface": 0.3, "t_ambient": -0.4}, **lacks)
     around = replace(around, quanta={"t_ambient": 0.1})
     schedule = [(35.0, 120.0), (22.0, 120.0)]
     runs = [

@@ -16,6 +16,7 @@ from thermogrip.mpc.estimator.observer import ObserverNoise
 from thermogrip.mpc.plant.prediction import PredictionModel
 from thermogrip.mpc.tuning import design_review as checks
 from thermogrip.mpc.tuning.design_review import review, worst
+from thermogrip.mpc.tuning.objective import apparent_delay
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 
@@ -28,7 +29,7 @@ def verdicts(controller, **options) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def sound(tank):
-    return review(design_controller(tank, dt=2.0), wanted=(18.0, 43.0))
+    return review(design_controller(tank, dt=2.0, move=1000.0), wanted=(18.0, 43.0))
 
 
 def test_a_sound_design_passes_every_check(sound):
@@ -476,3 +477,16 @@ def test_a_target_is_held_well_inside_the_drives(monkeypatch, u, y, miss, verdic
     assert [(target.tolist(), d.tolist()) for _, target, d in asked] == [
         ([target], [room]) for room in (18.0, 30.5) for target in (24.0, 40.0)
     ]
+
+
+@pytest.mark.parametrize(("move", "verdict"), [(1000.0, "pass"), (30.0, "warn")])
+def test_a_plant_that_has_what_its_model_lacks_settles_or_is_warned_of(tank: Any, move: float, verdict: str):
+    notes = {"spec": {"steps": [[18.0, 43.0]], "lost_gain": 0.1}}
+    controller = Controller(tank, default_design(tank, dt=4.0, move=move), notes=notes)
+    found = checks.lacks_structure(controller, (20.0, 30.0))
+    assert found.verdict == verdict
+    words = [part.split(":")[0] for part in found.finding.split("; ")]
+    delay = apparent_delay(tank, ("t_surface",))
+    late = [f"sensors slower by {0.5 * delay:.2g} s", f"delay longer by {0.5 * delay:.2g} s"]
+    assert words == [*late, "drive weaker by 10 %"]
+    assert ("never" in found.finding) == (verdict == "warn")

@@ -26,13 +26,14 @@ def search_of(bounds: Any, *, uncertain: bool = True, spec: Spec = SPEC, **chang
     plant = SimpleNamespace(uncertain=uncertain, draw=lambda k: k)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(objective, "full_drive_bound", lambda drawn, design, step, spec: bounds(*step, drawn))
+        patch.setattr(objective, "apparent_delay", lambda plant, controlled: 8.0)
         return Search(plant, spec, spec.design(make_tank(), **changes), 3)  # type: ignore[arg-type]
 
 
 def test_trials_last_for_what_the_slowest_draw_needs():
     search = search_of(lambda start, target, draw: (70.0 if target > 30 else 20.0) + draw)
     assert (search.draws, search.unseen, search.certain) == ([1, 2], [101, 102, 103], False)
-    assert (search.seed, search.check_seed) == (3, 3)
+    assert (search.seed, search.check_seed, search.lacking) == (3, 3, [1001, 2001, 3001])
     assert set(search.bounds) == {(*step, draw) for step in STEPS for draw in (1, 2, 101, 102, 103)}
     assert search.bounds[28.0, 20.0, 102] == 122.0
     assert search.lengths == pytest.approx([1.35 * 72 + 40, 120.0])  # two minutes at least
@@ -61,19 +62,22 @@ def test_each_controller_is_tried_for_its_own_length(monkeypatch: pytest.MonkeyP
         return [
             StepResult(28.0, 36.0, 1, 80.0, 0.1, 0.0, 0.0, 20.0, 1.0, 0.5, 100.0),
             StepResult(28.0, 20.0, 2, 100.0, 0.2, 0.0, 0.0, 40.0, 1.0, 0.5, 100.0),
+            StepResult(28.0, 36.0, 2001, 90.0, 0.3, 0.0, 0.0, 99.0, 0.0, 0.5, 100.0),
         ]
 
     monkeypatch.setattr(objective, "run_trials", run)
     monkeypatch.setattr(search, "made", lambda name, design: (name, design.move))
     scale = search.baseline.loops[0].Kc
     monkeypatch.setattr(objective.PIController, "of", lambda plant, base, loops: ("PI", loops[0].Kc / scale))
-    pi = {"Kc": 2.0, "Ti": 1.0, "Tt": 1.0, "feedforward": 0.5}
+    pi = {"Kc": 2.0, "Ti": 1.0, "Tt": 1.0, "setpoint": 1.0, "feedforward": 0.5}
     tried = [search.evaluate({"move": 7.0}), search.evaluate(pi, "PI"), search.evaluate({"move": 4.0}, "LQR")]
     search.evaluate_at_length(("PI", pi))
     lengths = [search.lengths, [300.0, 300.0], search.lengths, [300.0, 300.0]]
     names = [("MPC", 7.0), ("PI", 2.0), ("LQR", 4.0), ("PI", 2.0)]
-    assert seen == [(name, [1, 2], length, 3) for name, length in zip(names, lengths, strict=True)]
-    cost = (80 + 100) / 120 + 0.5 * (100 - 90) / 60  # the mean, and half of what the worst is above it
+    draws = [1, 2, 1001, 2001, 3001]
+    assert seen == [(name, draws, length, 3) for name, length in zip(names, lengths, strict=True)]
+    # the mean, and half of what the worst is above it; a move; what lacks structure
+    cost = (80 + 100) / 120 + 0.5 * (100 - 90) / 60 + 0.01 + 0.05 * (90 / 60 + 10 * 0.03)
     assert tried[0] == Trial("MPC", {"move": 7.0}, pytest.approx(cost), 90.0, 0.2, 30.0)
     assert [trial.controller for trial in tried] == ["MPC", "PI", "LQR"]
 
@@ -92,6 +96,7 @@ def test_a_trial_has_a_sensor_that_is_off_and_a_seed_of_its_draw(monkeypatch: py
         return SimpleNamespace(segments=parts, outputs=y)
 
     monkeypatch.setattr(objective, "simulate_closed_loop", loop)
+    monkeypatch.setattr(objective, "apparent_delay", lambda plant, controlled: 8.0)
     plant: Any = SimpleNamespace(disturbances=("room",), draw=lambda k: {"draw": k})
     controller: Any = SimpleNamespace(controlled=("a", "b"))
     found = objective.run_trials(controller, plant, SPEC, [1, 2], lengths=[50.0, 60.0], seed=4)
@@ -107,6 +112,17 @@ def test_a_trial_has_a_sensor_that_is_off_and_a_seed_of_its_draw(monkeypatch: py
     objective.run_trials(controller, plant, SPEC, [1])
     assert [given[1][0][1] for given in seen[4:]] == [300.0, 300.0]
     assert seen[4][2]["seed"] == 1
+    # draws that lack structure: the third without what is not tried
+    found = objective.run_trials(controller, plant, SPEC, [1002, 2002, 3002])
+    assert [result.draw for result in found[:3]] == [1002, 2002, 3002]
+    assert [(of, given["seed"]) for of, _, given in seen[6:9]] == [({"draw": 2}, 2)] * 3
+    changed = [{"sensor_lag_s": 4.0}, {"move_delay_s": 4.0}, {"drive_share": 0.85}]
+    assert [given["surroundings"] for _, _, given in seen[6:9]] == [replace(around, **it) for it in changed]
+    assert [words for words, _ in objective.lacking(plant, SPEC, ("a",))] == [
+        "sensors slower by 4 s", "delay longer by 4 s", "drive weaker by 15 %",
+    ]  # fmt: skip
+    fewer = SPEC.model_copy(update={"extra_lag": 0.0, "lost_gain": 0.0})
+    assert len(objective.lacking(plant, fewer, ("a",))) == 1
 
 
 def test_parameters_make_a_design_and_are_read_off_it():
@@ -114,12 +130,13 @@ def test_parameters_make_a_design_and_are_read_off_it():
     base, spec = search.baseline, search.spec
     assert search.design({}) == base
     made = {"move": 3.0, "terminal": 4.0, "overshoot_share": 0.4, "drive_walk": 5e-3, "output_walk": 6e-3}
-    made |= {"horizon": 31.0, "blocks": 6.0}
+    made |= {"state_walk": 7e-3, "horizon": 31.0, "blocks": 6.0}
     design = search.design(made | {"drive": 0.7, "drive_share": 0.5})
     assert parameters_of(design, spec) == pytest.approx(made)
     assert (design.drive, design.overshoot, design.blocks) == (0.7, pytest.approx(0.12), make_blocks(31, 6))
     assert design.drive_range == {"drive": (-0.5, 0.5)}
-    assert replace(design.noise, drive=base.noise.drive, output=base.noise.output) == base.noise
+    own_noise = {name: getattr(base.noise, name) for name in ("state", "drive", "output")}
+    assert replace(design.noise, **own_noise) == base.noise
     least = search.design({"horizon": 3.0, "blocks": 1.0})
     assert least.blocks == make_blocks(10, 2)
     own = sum(base.blocks), len(base.blocks)
@@ -139,10 +156,11 @@ def test_a_share_of_a_drive_is_about_none(ends, capped):
 
 def test_a_pis_numbers_are_scaled_and_its_feedforward_is_given():
     loop = PILoop("q", "t", 2.0, 30.0, 40.0, 0.9)
-    (made,) = scaled_loops((loop,), {"Kc": 3.0, "Ti": 0.5, "Tt": 0.1, "feedforward": 0.7})
-    assert made == PILoop("q", "t", 6.0, 15.0, 4.0, 0.7)
+    given = {"setpoint": 0.4, "feedforward": 0.7}
+    (made,) = scaled_loops((loop,), {"Kc": 3.0, "Ti": 0.5, "Tt": 0.1, **given})
+    assert made == PILoop("q", "t", 6.0, 15.0, 1.5, 0.7, 0.4)
     # a step of the load leaves at most half more than with the loop's own Ti / Kc
-    (slow,) = scaled_loops((loop,), {"Kc": 0.5, "Ti": 8.0, "Tt": 0.1, "feedforward": 0.7})
+    (slow,) = scaled_loops((loop,), {"Kc": 0.5, "Ti": 8.0, "Tt": 0.1, **given})
     assert slow.Ti / slow.Kc == pytest.approx(1.5 * loop.Ti / loop.Kc)
 
 
@@ -156,6 +174,9 @@ def test_a_score_is_the_mean_and_half_of_what_the_worst_is_above_it():
     assert score([replace(one, draw=4)], SPEC, bounds) == pytest.approx(150.0)
     never = replace(one, settle_s=np.nan, last_error=-1.5, bias=5.0)  # its bias is not charged besides
     assert score([never], SPEC, bounds) == pytest.approx(300 / 50 + 3.0)
+    # without structure a run counts a twentieth, and is charged 5 at most
+    slow = [replace(one, draw=1001, settle_s=200.0), replace(never, draw=2001)]
+    assert score([one, two, *slow], SPEC, bounds) == pytest.approx(2.5 + 0.05 * (4.0 + 5.0) / 2)
 
 
 def test_a_note_has_none_for_what_is_no_number():
