@@ -37,7 +37,7 @@ def tuning_of(**changes: Any) -> Any:
     spec = SimpleNamespace(
         steps=STEPS, settle_within_s=180.0, band_degC=0.25, overshoot_degC=0.5, bias_degC=0.1, hold_s=200.0,
         energy_weight=2.0, ambient_degC=25.0, noise_degC=0.04, sensor_offset_degC=0.3, search_draws=2,
-        check_draws=5, evaluations=30,
+        check_draws=5, evaluations=30, moves_weight=0.03, extra_lag=0.4, extra_delay=0.6, lost_gain=0.1,
     )  # fmt: skip
     design = SimpleNamespace(
         controlled=("t1", "t2"), dt=2.0, horizon_s=60.0, blocks=(1, 2, 4), drive_range={"q": (0.0, 100.0)},
@@ -88,10 +88,8 @@ def test_a_tuned_controller_stands_with_its_scores_and_what_it_did_not_know(
     assert about.text.startswith("Band 0.25 degC. ")
     assert unseen in about.text
     assert "offset of 0.3 degC" in about.text
-    assert (
-        "lower is better: tuned 1.235, PI 2.000. MPC, PI and LQR were tuned with 30 trials each"
-        in scores.text
-    )
+    words = "MPC and LQR were tuned with 30 trials each, PI with twice as many"
+    assert f"lower is better: tuned 1.235, PI 2.000. {words}" in scores.text
     tuning.controller.plant = SimpleNamespace(samples=np.eye(1), covariance=None)
     assert control._uncertain(tuning)
 
@@ -138,7 +136,8 @@ def test_what_was_asked_stands_beside_the_design() -> None:
         ("asked", "value"), "The spec", ("found", "value"), "The design",
     )  # fmt: skip
     assert [value for _, value in asked.rows] == [
-        "28 to 38, 28 to 18", "180", "0.25", "0.5", "0.1", "200", "2", "25", "0.04", "0.3", "2", "5", "30",
+        "28 to 38, 28 to 18", "180", "0.25", "0.5", "0.1", "200", "2", "0.03", "25", "0.04", "0.3", "2", "5",
+        "30", "0.4", "0.6", "0.1",
     ]  # fmt: skip
     assert asked.rows[1] == ("settle within [s]", "180")
     assert dict(found.rows) == {

@@ -44,12 +44,16 @@ _SPEC_WORDS = {
     "bias_degC": "bias at the end, at most [degC]",
     "hold_s": "each step is simulated for [s]",
     "energy_weight": "seconds of settling given for one at full drive",
+    "moves_weight": "share of the minimum time given for one move of full drive less",
     "ambient_degC": "room of the simulations [degC]",
     "noise_degC": "noise of one reading [degC]",
     "sensor_offset_degC": "sensors are off by [degC]",
     "search_draws": "draws of the plant in the search",
     "check_draws": "draws in the comparison",
     "evaluations": "designs that each search may try",
+    "extra_lag": "sensors slower than the model, tried [apparent delays]",
+    "extra_delay": "delay longer than the model's, tried [apparent delays]",
+    "lost_gain": "share of the drives that does nothing, tried",
 }
 
 
@@ -103,8 +107,9 @@ def tuning_section(tuning: Tuning) -> Section:
             "band, whatever the controller."
         ),
         Text(
-            f"Scores on these draws, lower is better: {scores}. MPC, PI and LQR were tuned with "
-            f"{tuning.spec.evaluations} trials each; a settling time counts in units of the last column."
+            f"Scores on these draws, lower is better: {scores}. MPC and LQR were tuned with "
+            f"{tuning.spec.evaluations} trials each, PI with twice as many; a settling time counts in units "
+            "of the last column."
         ),
     ]
     tone = "good" if tuning.meets_spec else "warn"
