@@ -95,7 +95,7 @@ def apparent_delay(plant: Plant, controlled: tuple[str, ...]) -> float:
     return max(*delays, plant.dt)
 
 
-def lacking(plant: Plant, spec: Spec, controlled: Sequence[str]) -> list[tuple[str, dict[str, float]]]:
+def lacking(plant: Plant, spec: Spec, controlled: Sequence[str]) -> list[tuple[str, dict[str, Any]]]:
     """Return what a plant may have that its model lacks: in words, and as changes of the surroundings."""
     delay = apparent_delay(plant, tuple(controlled))
     lag, late, lost = spec.extra_lag * delay, spec.extra_delay * delay, spec.lost_gain
