@@ -5,12 +5,13 @@ from __future__ import annotations
 import ctypes
 import os
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.mpc.makers import InC, network_plant
+from tests.mpc.makers import InC, ask_late, network_plant
 from thermogrip.mpc.closed_loop.simulate import Surroundings, Truth, simulate_closed_loop
 from thermogrip.mpc.closed_loop.simulate_native import compiled_loop
 from thermogrip.mpc.controllers.mpc import Controller
@@ -139,6 +140,26 @@ def test_over_a_run_c_that_is_given_what_was_applied_stays_with_python(tclab):
         assert c.step(reading | applied, 60.0).drive == pytest.approx(move.drive, abs=1e-7)  # of 100 percent
         applied = move.drive
         truth.apply(move)
+
+
+def test_a_pi_that_has_taken_over_answers_a_new_target_alike_in_c(plant):
+    design, drives = default_design(plant), {}
+    for share in (0.4, 1.0):
+        own = replace(design, loops=tuple(replace(loop, setpoint=share) for loop in design.loops))
+        python = Controller(plant, own, clock=count(0, 60).__next__)  # the deadline has always passed
+        c, truth = InC(plant, own), Truth(plant, own.dt, Surroundings(), 25.0, 3)
+        for controller in (python, c):
+            controller.reset(truth.reading())
+        ask_late(c.c, True)
+        for k in range(12):
+            reading, target = truth.reading(), 25.5 if k < 6 else 26.0
+            move = python.step(reading, target)
+            assert c.step(reading, target).drive == pytest.approx(move.drive, abs=1e-9)
+            assert move.status == "late"
+            drives[share, k] = move.drive
+            truth.apply(move)
+    assert drives[0.4, 5] == pytest.approx(drives[1.0, 5], abs=1e-12)
+    assert abs(drives[0.4, 6] - drives[1.0, 6]) > 1e-3
 
 
 def test_without_a_target_c_is_off_as_python_is(plant):
