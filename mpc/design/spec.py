@@ -66,8 +66,8 @@ class Spec(BaseModel):
     search_draws: Annotated[int, Field(ge=1, le=50)] = 2  # of the plant, in the search
     check_draws: Annotated[int, Field(ge=1, le=200)] = 5  # of the plant, in the final comparison
     evaluations: Annotated[int, Field(ge=1, le=10000)] = 20  # designs that the search may try
-    # what the plant may have that the model lacks: a lag of every sensor and a delay of the drives, in apparent
-    # delays of the plant, and a share of the drives that does nothing; 0 is not tried
+    # what the plant may have that the model lacks: a lag of every sensor and a delay of the drives, in its
+    # apparent delays, and a share of the drives that does nothing; 0 is not tried
     extra_lag: Annotated[NotNegative, Field(le=10)] = 0.5
     extra_delay: Annotated[NotNegative, Field(le=10)] = 0.5
     lost_gain: Annotated[NotNegative, Field(lt=1)] = 0.15
