@@ -181,7 +181,7 @@ def _simpler(scores: Mapping[str, float]) -> str:
     share = 100 * (1 - near[name] / kept)
     how = "as well" if abs(share) < 0.5 else f"{abs(share):.1f} % {'better' if share > 0 else 'worse'}"
     missing = ", and knows neither limits of outputs nor where a gain turns over" if name == "LQR" else ""
-    return f"{name}, tuned with as many trials, scores {how} on this spec{missing}."
+    return f"{name}, tuned with no fewer trials, scores {how} on this spec{missing}."
 
 
 def _moved(kept: Sequence[Row], rows: Sequence[Row]) -> str:
@@ -388,7 +388,7 @@ def _trade(
 def _search_all(
     search: Search, looked: list[Trial], workers: Workers, progress: Progress | None
 ) -> dict[str, list[Trial]]:
-    """Return the trials of MPC, PI and LQR, after as many evaluations each."""
+    """Return the trials of MPC, PI and LQR, after as many evaluations each, the PI after twice as many."""
     n = search.spec.evaluations
     # SIMC, with the drive that holds the target; and without: a plant that has no draws does not know how
     # wrong that drive is

@@ -407,7 +407,7 @@ def rows(bound: float, *results: StepResult) -> list[Row]:
         ({"baseline": 100.0, "tuned": 97.5}, 80.0, 50.0, "flat", "Weights win 2.5 %"),
         ({"baseline": 100.0, "tuned": 96.5}, 80.0, 50.0, "improved", "Score 4 % below"),
         ({"baseline": 100.0, "tuned": 110.0}, 80.0, 50.0, "flat", "Weights win 0.0 %"),
-        (BETTER | {"PI": 60.0, "LQR": 90.0}, 80.0, 50.0, "improved", "PI, tuned with as many trials, scores"),
+        (BETTER | {"PI": 60.0, "LQR": 90.0}, 80.0, 50.0, "improved", "PI, tuned with no fewer trials"),
         (BETTER | {"PI": 60.42}, 80.0, 50.0, "improved", "scores 0.7 % worse on this spec."),
         (BETTER | {"PI": 61.2}, 80.0, 50.0, "improved", "scores 2.0 % worse on this spec."),
         (BETTER | {"PI": 61.2, "LQR": 54.0}, 80.0, 50.0, "improved", "trials, scores 10.0 % better"),
@@ -464,5 +464,5 @@ def test_a_row_is_the_mean_and_the_worst_of_its_draws() -> None:
 )
 def test_a_simpler_controller_that_is_as_good_is_named_with_what_it_does_not_know(scores, name, how):
     missing = ", and knows neither limits of outputs nor where a gain turns over" if name == "LQR" else ""
-    said = f"{name}, tuned with as many trials, scores {how} on this spec{missing}."
+    said = f"{name}, tuned with no fewer trials, scores {how} on this spec{missing}."
     assert _simpler(scores) == (said if name else "")
