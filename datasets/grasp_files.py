@@ -31,6 +31,7 @@ from thermogrip.datasets.schema import (
     check_grasps,
     log_name,
     make_grasps,
+    with_lead_in,
 )
 from thermogrip.datasets.tables import (
     Table,
@@ -93,9 +94,10 @@ def read_grasps(path: str | Path) -> Grasps:
         samples, per_grasp, repairs = _read_csv(path)
         grasps = make_grasps(*samples, **per_grasp)
         grasps.attrs["repairs"] = "\n".join(repairs)
+    grasps = with_lead_in(grasps)
     time, seen = grasps["time"].values, np.isfinite(grasps["t_surface"].values)
     for side, has, hint in (
-        ("before", seen[:, time < 0].any(axis=1), "time_s is 0 at the message; record from 2 s before"),
+        ("before", seen[:, time < 0].any(axis=1), "record from 2 s before, or give t_gripper_set_degC"),
         ("after", seen[:, time > 0].any(axis=1), "is this a grasp? remove it or record the contact"),
     ):
         if not has.all():

@@ -226,6 +226,30 @@ def make_grasps(
     return grasps
 
 
+def with_lead_in(grasps: Grasps) -> Grasps:
+    """Return a record that begins at contact with its stated level before it.
+
+    Where no sample is before 0 s and ``t_gripper`` is known of every grasp, that level stands as readings
+    from 3 to 2 s before the message (so that contact may have been before it), which ``attrs["repairs"]``
+    notes; any other record is returned as it is.
+    """
+    time = grasps["time"].values
+    if time[0] < 0 or "t_gripper" not in grasps or bool(grasps["t_gripper"].isnull().any()):
+        return grasps
+    step = float(np.median(np.diff(time)))  # on the grid of the others
+    lead = time[0] - step * np.unique(np.round(np.linspace(3.0, 2.0, 5) / step))[::-1]
+    level = np.repeat(grasps["t_gripper"].values[:, None], lead.size, axis=1)
+    out = grasps.drop_dims("time").assign_coords(time=("time", np.concatenate([lead, time]), {"units": "s"}))
+    for key, before in (("t_surface", level), ("t_surface_2", np.full(level.shape, np.nan))):
+        if key in grasps:
+            values = np.hstack([before, grasps[key].values])
+            out[key] = (("grasp", "time"), values, grasps[key].attrs)
+    note = "begins at contact: the level before it is t_gripper"
+    out.attrs["repairs"] = "\n".join(filter(None, [grasps.attrs.get("repairs", ""), note]))
+    check_grasps(out)
+    return out
+
+
 def check_grasps(grasps: Grasps) -> None:
     """Raise :class:`UserError` naming the grasp of a record and the rule it breaks."""
     for problem, hint in _grasp_faults(grasps):

@@ -3,11 +3,10 @@
     python benchmarks/classify/ambiguous.py FOLDER [--train 1-20] [--test 21-30] [--within] \
         [--cases heated,both] [--classifiers A,B] [--out F.json]
 
-The contacts of ``two_sensors.py`` with all 30 sets: FOLDER holds the same two files with the published sets
-21 to 30 too (``robot_study/test/R_SET``: every tenth row, columns 0, 2, 1, 4).  The question is the material;
-cooled wood is wood.  Training: the room was 22.7 degC, where aluminium and wood lay; of cooled wood no
-temperature is given.  Test: nothing but the room is known.  ``--within``: five folds of whole sets within the
-test sets, in place of the training sets.
+The contacts of ``two_sensors.py`` with all 30 sets: FOLDER is ``robot_study/test`` as published.  The
+question is the material; cooled wood is wood.  Training: the room was 22.7 degC, where aluminium and wood
+lay; of cooled wood no temperature is given.  Test: nothing but the room is known.
+``--within``: five folds of whole sets within the test sets, in place of the training sets.
 
 Effusivities of 24050 and 367 count as true (the table's aluminium and wood), and 13.7 degC for cooled wood,
 which nobody measured.  What was chosen for the posterior (the widths of a discrepancy, how much evidence
@@ -24,6 +23,7 @@ import numpy as np
 from two_sensors import read
 
 from thermogrip.classify import make_classifier
+from thermogrip.classify.estimators.lda import ArrayClassifier
 from thermogrip.classify.evaluation.metrics import calibration_bins, log_loss
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.effusivity import effusivity_posterior
@@ -47,32 +47,17 @@ def contacts(folder: Path, sets: set[int], *, both: bool, known: bool) -> tuple[
     return own if both else own.drop_vars("t_surface_2"), which
 
 
-def make(name: str):  # type: ignore[no-untyped-def]
-    """Return a classifier by name."""
-    if name != "logistic-pca":
-        return make_classifier(name, seed=0)
-    from sklearn.decomposition import PCA
-    from sklearn.linear_model import LogisticRegression
-    from sklearn.pipeline import make_pipeline
-    from sklearn.preprocessing import StandardScaler
+class Traces(ArrayClassifier):
+    """Logistic regression on ten principal components of the traces (``"logistic-pca"``)."""
 
-    class Traces:
-        """Logistic regression on ten principal components of the traces."""
+    def __init__(self) -> None:
+        from sklearn.decomposition import PCA
+        from sklearn.linear_model import LogisticRegression
+        from sklearn.pipeline import make_pipeline
+        from sklearn.preprocessing import StandardScaler
 
-        def fit(self, grasps: Grasps) -> Traces:
-            self.model = make_pipeline(PCA(10), StandardScaler(), LogisticRegression(max_iter=5000))
-            self.model.fit(self.rows(grasps), grasps["material"].values)
-            self.classes_ = self.model.classes_
-            return self
-
-        def predict_proba(self, grasps: Grasps) -> np.ndarray:
-            return np.asarray(self.model.predict_proba(self.rows(grasps)))
-
-        def rows(self, grasps: Grasps) -> np.ndarray:
-            names = [name for name in ("t_surface", "t_surface_2") if name in grasps]
-            return np.concatenate([grasps[name].values for name in names], axis=1)
-
-    return Traces()
+        model = make_pipeline(PCA(10), StandardScaler(), LogisticRegression(max_iter=5000))
+        super().__init__(model, start=-np.inf, subtract_level=False, standardise=False)
 
 
 def numbers(text: str) -> list[int]:
@@ -123,7 +108,7 @@ def score(folder: Path, name: str, both: bool, folds: list[tuple[set[int], set[i
     for train, test in folds:
         learnt, _ = contacts(folder, train, both=both, known=True)
         asked, which = contacts(folder, test, both=both, known=False)
-        model = make(name).fit(learnt)
+        model = (Traces() if name == "logistic-pca" else make_classifier(name, seed=0)).fit(learnt)
         assert list(model.classes_) == ["aluminium", "wood"]
         answers.append(model.predict_proba(asked))
         kinds.append(which)

@@ -31,13 +31,16 @@ from thermogrip.classify import GraspClassifier, evaluate, make_classifier
 from thermogrip.classify.estimators.local_polynomials import ExpansionClassifier
 from thermogrip.classify.estimators.registry import VoteClassifier
 from thermogrip.classify.evaluation.harness import cut_at
+from thermogrip.datasets.public_sets import read_toh
 from thermogrip.datasets.schema import Grasps, make_grasps
 
 CASES = (("both", 1.0), ("both", 2.0), ("both", 4.0), ("heated", 4.0))
 
 
 def read(folder: Path) -> Grasps:
-    """Return all contacts as one record, a set as a session."""
+    """Return all contacts as one record, a set as a session, of the two files or the published folder."""
+    if (folder / "R_1").is_dir():
+        return read_toh(folder)
     with open(folder / "two_sensor_contacts_meta.csv", newline="", encoding="utf-8") as file:
         about = {row["grasp"]: row for row in csv.DictReader(file)}
     traces: dict[str, list[tuple[float, float, float]]] = defaultdict(list)

@@ -116,6 +116,9 @@ class Anchor(NamedTuple):
     heat_capacity: float
 
 
+_ANY = Anchor(800.0, 2.0, 2e6)  # of a label that the table has not: from foam to metal, all of solids
+
+
 @dataclass(frozen=True)
 class ThetaPrior:
     """What is believed of theta before the fit."""
@@ -134,16 +137,17 @@ class ThetaPrior:
 def anchors(
     labels: Sequence[str], library: Mapping[str, Material], gripper: GripperModel | None
 ) -> tuple[Anchor, ...]:
-    """Return what is written of each label, in the library or else in an earlier calibration."""
+    """Return what is written of each label, in the library or else in an earlier calibration, or nothing."""
     out = []
     for label in labels:
         if label in library:
             row = library[label]
             out.append(Anchor(row.effusivity, row.effusivity_sd_ln, row.rho * row.c_p))
-        else:
-            assert gripper is not None
+        elif gripper is not None and label in gripper.blocks:
             block = gripper.blocks[label]
             out.append(Anchor(block.library_effusivity, block.library_sd_ln, block.heat_capacity))
+        else:
+            out.append(_ANY)
     return tuple(out)
 
 
@@ -448,7 +452,8 @@ def calibrate_gripper(
     grasps : Grasps, DataFrame, str, Path, or sequence of them
         Training grasps of all conditions, every one with a ``material``.
     materials : mapping of label to Material, optional
-        Library rows of the labels; default the project's table.
+        Library rows of the labels; default the project's table.  A label without a row is learnt from its
+        grasps alone, beside one that has a row.
     start : GripperModel, optional
         An earlier calibration of this gripper.  A refit from it is quick and keeps its noise; it must not
         have seen the grasps that the refit is tested on where that matters.
@@ -471,7 +476,7 @@ def calibrate_gripper(
     Raises
     ------
     UserError
-        If there is no grasp, a grasp has no label, a material is not in the library, both ``start`` and
+        If there is no grasp, a grasp has no label, no material is in the library, both ``start`` and
         ``prior`` are given, all grasps are of one material and there is no ``prior``, or no grasp has a known
         ``t_object``.
 
@@ -600,7 +605,7 @@ def _problem(
     data: Touches, materials: Mapping[str, Material], prior: GripperModel | None, block_length: float
 ) -> Problem:
     touched = sorted(set(data.material.tolist()))
-    library = {label: materials.get(label) or find_material(label) for label in touched}
+    library = {label: row for label in touched if (row := _row(label, materials)) is not None}
     labels = touched if prior is None else sorted({*touched, *prior.materials})
     known = dict(zip(labels, anchors(labels, library, prior)))
     theta = wide_prior([*known.values()])
@@ -624,7 +629,6 @@ def _labelled(grasps: Sequence[Grasps], materials: Mapping[str, Material], least
             raise UserError(
                 f"grasp {lost!r} has no material", file=log_name(record), hint="label or remove it"
             )
-        _check_labels(part, materials, log_name(record))
         parts.append(part)
     data = stack_touches(parts)
     if np.unique(data.material).size < least:
@@ -633,6 +637,12 @@ def _labelled(grasps: Sequence[Grasps], materials: Mapping[str, Material], least
             file=log_name(grasps[0]),
             hint="give grasps of at least two materials, or a prior",
         )
+    labels = dict.fromkeys(data.material.tolist())
+    if least > 1 and not any(_row(label, materials) for label in labels):
+        first = f"grasp {str(data.grasp_id[0])!r} is of {str(data.material[0])!r}"
+        problem = f"{first}, and the materials table has none of the labels"
+        hint = "name one of them at least as 'thermogrip materials' does: it holds the scale"
+        raise UserError(problem, file=log_name(grasps[0]), column="material", hint=hint)
     if not np.isfinite(data.t_object).any():
         raise UserError(
             "no training grasp has a known object temperature, so nothing shows how much of it the skin sees",
@@ -642,16 +652,12 @@ def _labelled(grasps: Sequence[Grasps], materials: Mapping[str, Material], least
     return data
 
 
-def _check_labels(part: Touches, materials: Mapping[str, Material], file: str) -> None:
-    """Raise UserError, with file and grasp, at the first label that has no row to hold its scale to."""
-    for label in dict.fromkeys(part.material.tolist()):
-        try:
-            materials.get(label) or find_material(label)
-        except UserError as error:
-            first = str(part.grasp_id[part.material == label][0])
-            problem = f"grasp {first!r} is of {label!r}, which the materials table has not"
-            hint = f"{error.hint} (every classifier but posterior takes any name)"
-            raise UserError(problem, file=file, column="material", hint=hint) from error
+def _row(label: str, materials: Mapping[str, Material]) -> Material | None:
+    """Return the library's row of a label, None where it has none."""
+    try:
+        return materials.get(label) or find_material(label)
+    except UserError:
+        return None
 
 
 def _fit(

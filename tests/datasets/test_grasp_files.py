@@ -50,6 +50,18 @@ def refused(path):
     return str(fault.value)
 
 
+def test_a_record_that_begins_at_contact_has_its_stated_level_before_it(pair):
+    long = samples("a", "b", start=0)
+    g = read_grasps(pair(long, META + "a,iron,43,23.5\nb,wood,43,24\n"))
+    early = g["time"].values < 0
+    assert early.sum() == 5
+    assert -3.05 <= g["time"].values[0] < g["time"].values[early][-1] <= -1.95
+    np.testing.assert_array_equal(g["t_surface"].values[:, early], np.repeat([[23.5], [24.0]], 5, axis=1))
+    np.testing.assert_allclose(g["t_surface"].values[0, ~early], 23 + np.arange(11) / 16)
+    assert "begins at contact" in g.attrs["repairs"]
+    assert "before the closed message" in refused(pair(long, META + "a,iron,43,23.5\nb,wood,43,\n"))
+
+
 def test_the_rigs_grasps_have_their_facts():
     g = read_grasps(example_path("exp4_cooled5_obj18_grip38_40s"))
     assert dict(g.sizes) == {"grasp": 40, "time": 421}
@@ -180,7 +192,7 @@ ONE = META + "a,copper,43,23\n"
         (samples("a"), ONE.replace("nominal_degC", "nominal_V"), ["unit 'V' does not fit"]),
         (samples("a"), "material\ncopper\n", ["g_meta.csv", "no column grasp_id"]),
         (samples("a", stop=0), ONE, ["grasp 'a' has no sample after"]),
-        (samples("a", start=0), ONE, ["grasp 'a' has no sample before"]),
+        (samples("a", start=0), META + "a,copper,43,\n", ["grasp 'a' has no sample before"]),
         (samples("a").replace("grasp_id", "id"), ONE, ["no column grasp_id", "a grasp file has grasp_id"]),
         (samples("a").replace("time_s", "time"), ONE, ["column time: is not a time", "time_s"]),
         (samples("a").replace("time_s", "when_s"), ONE, ["no column time_s", "rename 'when_s' to time_s"]),
