@@ -28,6 +28,7 @@ from thermogrip.datasets.netcdf import open_netcdf, record_unit, write_netcdf
 from thermogrip.datasets.schema import (
     GRASP_LABELS,
     GRASP_NUMBERS,
+    as_record,
     check_grasps,
     log_name,
     make_grasps,
@@ -444,7 +445,7 @@ def _read_netcdf(path: str | Path) -> Grasps:
     labels = {name: data[name].values.tolist() for name in ("material", "session", "block") if name in data}
     for name, values in _with_defaults(labels, data.sizes["grasp"], stem).items():
         data[name] = ("grasp", np.asarray(values, dtype=str))
-    return data
+    return as_record(data)
 
 
 def _meta_text(grasps: Grasps) -> str:

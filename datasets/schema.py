@@ -1,6 +1,6 @@
 """The two records that every stage exchanges: ``Log`` and ``Grasps``.
 
-Both are plain :class:`xarray.Dataset` objects that passed the check in this module, so every tool that
+Both are :class:`xarray.Dataset` objects that passed the check in this module, so every tool that
 reads a dataset reads them.  Temperatures are degC, time is s; the unit of a variable is in its
 ``units`` attribute (``"1"`` for a dimensionless one).
 
@@ -28,8 +28,9 @@ from thermogrip.datasets.errors import UserError, known_names
 if TYPE_CHECKING:
     import xarray as xr
 
+    from thermogrip.datasets.grasp_record import Grasps as Grasps
+
     Log: TypeAlias = xr.Dataset
-    Grasps: TypeAlias = xr.Dataset
 
 ROLES = ("input", "disturbance", "output", "other")
 
@@ -47,6 +48,10 @@ GRASP_LABELS = ("material", "experiment", "split", "touch_group", "session", "bl
 def __getattr__(name: str) -> Any:  # PEP 562: a file that is no log is refused before xarray is loaded
     if name not in ("Log", "Grasps"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name == "Grasps":
+        from thermogrip.datasets.grasp_record import Grasps
+
+        return Grasps
     from xarray import Dataset
 
     return Dataset
@@ -153,7 +158,7 @@ def columns(log: Log, wanted: Sequence[str]) -> NDArray[np.float64]:
     return np.stack([column(log, name) for name in wanted], axis=1)
 
 
-def log_name(log: Log | Grasps) -> str:
+def log_name(log: xr.Dataset) -> str:
     """Return the record's name in tables and messages."""
     return str(log.attrs.get("name", "log"))
 
@@ -203,13 +208,13 @@ def make_grasps(
     >>> g.sizes["grasp"], str(g["material"].values[0]), float(g["t_object"][0])
     (1, 'copper', 43.0)
     """
-    import xarray as xr
+    from thermogrip.datasets.grasp_record import Grasps
 
     coords = {
         "grasp": ("grasp", np.asarray([str(g) for g in grasp_id])),
         "time": ("time", np.asarray(time, dtype=float), {"units": "s"}),
     }
-    grasps = xr.Dataset(coords=coords)
+    grasps = Grasps(coords=coords)
     for key, values in (("t_surface", t_surface), ("t_surface_2", t_surface_2)):
         if values is not None:
             grasps[key] = (("grasp", "time"), np.asarray(values, dtype=float), {"units": "degC"})
@@ -224,6 +229,13 @@ def make_grasps(
     grasps.attrs.update(schema="thermogrip.grasps", version=1, name=name)
     check_grasps(grasps)
     return grasps
+
+
+def as_record(data: xr.Dataset) -> Grasps:
+    """Return a dataset as the record that counts grasps (:mod:`thermogrip.datasets.grasp_record`)."""
+    from thermogrip.datasets.grasp_record import Grasps
+
+    return data if isinstance(data, Grasps) else Grasps(data.data_vars, coords=data.coords, attrs=data.attrs)
 
 
 def with_lead_in(grasps: Grasps) -> Grasps:
@@ -250,13 +262,13 @@ def with_lead_in(grasps: Grasps) -> Grasps:
     return out
 
 
-def check_grasps(grasps: Grasps) -> None:
+def check_grasps(grasps: xr.Dataset) -> None:
     """Raise :class:`UserError` naming the grasp of a record and the rule it breaks."""
     for problem, hint in _grasp_faults(grasps):
         raise UserError(problem, file=log_name(grasps), hint=hint)
 
 
-def _grasp_faults(grasps: Grasps) -> Iterator[tuple[str, str | None]]:
+def _grasp_faults(grasps: xr.Dataset) -> Iterator[tuple[str, str | None]]:
     """Yield (problem, hint) of axes and labels, of temperatures that no gripper and no object has [degC], and
     of touches; each check needs those before it."""
     for need in ("grasp", "time"):
@@ -311,7 +323,7 @@ def _grasp_faults(grasps: Grasps) -> Iterator[tuple[str, str | None]]:
             yield f"touch {numbers[counts > 1][0]:g} of touch_group {str(name)!r} occurs twice", hint
 
 
-def label_values(grasps: Grasps, name: str) -> NDArray[np.str_]:
+def label_values(grasps: xr.Dataset, name: str) -> NDArray[np.str_]:
     """Return a label of :data:`GRASP_LABELS` for each grasp, shape (n_grasp,), "" where it is absent."""
     if name not in grasps:
         return np.full(grasps.sizes["grasp"], "", dtype="<U1")

@@ -1,10 +1,11 @@
 r"""What all grasp classifiers share: records in, classes and probabilities out.
 
-A classifier is a scikit-learn estimator whose ``X`` is a Grasps record (or several, which are joined) and
-whose ``y`` defaults to the record's ``material``.  A subclass writes two methods,
+A classifier is a scikit-learn estimator whose ``X`` is a Grasps record (or several, which are joined), or an
+array or data frame (:mod:`~thermogrip.classify.estimators.arrays`), and whose ``y`` defaults to the record's
+``material``.  A subclass writes two methods,
 
-- ``fit(X, y)``, or ``_fit(grasps, labels)`` of a :class:`JoinedClassifier`: learn, set attributes that end in
-  ``_``, ``classes_`` among them;
+- ``_learn(records, labels)``, or ``_fit(grasps, labels)`` of a :class:`JoinedClassifier`: learn, set
+  attributes that end in ``_``, ``classes_`` among them;
 - ``_log_proba(grasps)``: log probabilities over ``classes_``, shape (n_grasp, n_class),
 
 and this module adds the checks and the rest.  Candidates are a question put to a fitted classifier: with the
@@ -15,7 +16,8 @@ that a set of improbable candidates still has an answer.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeAlias
@@ -25,7 +27,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import logsumexp
 from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.exceptions import NotFittedError
+from xarray import Dataset
 
+from thermogrip.classify.estimators.arrays import coded, grasps_of
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.grasp_files import Records as Records
 from thermogrip.datasets.grasp_files import as_grasps
@@ -33,6 +37,7 @@ from thermogrip.datasets.schema import (
     GRASP_LABELS,
     GRASP_NUMBERS,
     Grasps,
+    as_record,
     check_grasps,
     log_name,
     make_grasps,
@@ -45,8 +50,18 @@ Labels: TypeAlias = NDArray[np.str_]
 HELD_AT_AN_END = 0.5  # s; a trace that is shorter than its grid by more is refused, not continued
 
 
-class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc]  # scikit-learn has no types
+@dataclass(eq=False, repr=False, kw_only=True)
+class _Sampled:
+    times: Sequence[float] | None = None  # of an array's samples [s], 0 at contact; None: 0, 0.1, 0.2 ...
+
+
+class GraspClassifier(ClassifierMixin, _Sampled, BaseEstimator, ABC):  # type: ignore[misc]  # scikit-learn has no types
     """Base of the classifiers: checks what comes in, derives what scikit-learn expects.
+
+    Parameters
+    ----------
+    times : sequence of float, optional
+        When the samples of an array were taken [s], 0 at contact; by default 0, 0.1, 0.2 ...
 
     Examples
     --------
@@ -86,9 +101,37 @@ class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc
     longest_: float = np.inf
     """How much of a single touch is read [s], where that is not all."""
 
-    @abstractmethod
     def fit(self, X: Records, y: ArrayLike | None = None) -> Self:
-        """Learn from labelled grasps; see :meth:`JoinedClassifier.fit` for the arguments."""
+        """Learn from labelled grasps: one record, several, or an array (n, n_time) or (n, n_time, n_channel);
+        ``y`` (n_grasp,) are their materials, record after record, by default each record's own."""
+        return self._taught(X, y, self._learn)
+
+    def _taught(self, X: Any, y: Any, learn: Callable[[list[Grasps], list[Labels]], None]) -> Self:
+        self.check_installed()
+        if _are_records(X):
+            records = record_list(X)
+            learn(records, record_labels(records, y))
+            return self
+        words, values = (None, None) if y is None else coded(y)
+        record = grasps_of(self, X, reset=True, y=words)
+        learn(record_list(record), [grasp_labels(record, words)])
+        if values is not None:
+            self.classes_ = values[self.classes_.astype(int)]
+        return self
+
+    @abstractmethod
+    def _learn(self, records: list[Grasps], labels: list[Labels]) -> None:
+        """Learn from records and the materials of each; set attributes that end in ``_``."""
+
+    def _records(self, X: Any) -> list[Grasps]:
+        """Return what is to be classified as records."""
+        self._check_fitted()
+        return record_list(X if _are_records(X) else grasps_of(self, X, reset=False))
+
+    def __sklearn_tags__(self) -> Any:
+        tags = super().__sklearn_tags__()
+        tags.input_tags.allow_nan = tags.input_tags.three_d_array = True
+        return tags
 
     def check_installed(self) -> None:
         """Raise :class:`UserError` where training needs a package that is not installed."""
@@ -101,8 +144,7 @@ class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc
 
     def predict_log_proba(self, X: Records) -> Floats:
         """Return log class probabilities, shape (n_grasp, n_class), in the order of ``classes_``."""
-        self._check_fitted()
-        return np.vstack([normalised(self._log_proba(self._as_trained(part))) for part in record_list(X)])
+        return np.vstack([normalised(self._log_proba(self._as_trained(part))) for part in self._records(X)])
 
     def predict_proba(self, X: Records) -> Floats:
         """Return class probabilities, shape (n_grasp, n_class); each row sums to 1."""
@@ -118,7 +160,7 @@ class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc
 
         NaN where the classifier has no model of other materials, as here.
         """
-        return np.full(sum(part.sizes["grasp"] for part in record_list(X)), np.nan)
+        return np.full(sum(map(len, self._records(X))), np.nan)
 
     def candidate_log_proba(self, X: Records, candidates: Sequence[str]) -> Floats:
         """Return log probabilities over a subset of ``classes_``, shape (n_grasp, n_candidate)."""
@@ -183,33 +225,36 @@ class GraspClassifier(ClassifierMixin, BaseEstimator, ABC):  # type: ignore[misc
 class JoinedClassifier(GraspClassifier):
     """Base of the classifiers that learn from all grasps as one record, on the samples that they share."""
 
-    def fit(self, X: Records, y: ArrayLike | None = None) -> Self:
-        """Learn from one record or several, joined on the samples that they share; ``y`` (n_grasp,) are their
-        materials, by default each record's own."""
-        self.check_installed()
-        grasps = join_grasps(record_list(X))
-        labels = grasp_labels(grasps, y)
-        self.classes_ = two_or_more(labels, log_name(grasps))
+    def _learn(self, records: list[Grasps], labels: list[Labels]) -> None:
+        grasps, joined = join_grasps(records), np.concatenate(labels)
+        self.classes_ = two_or_more(joined, log_name(grasps))
         self.sensors_ = 2 if "t_surface_2" in grasps else 1
-        self._fit(grasps, labels)
-        return self
+        self._fit(grasps, joined)
 
     @abstractmethod
     def _fit(self, grasps: Grasps, labels: Labels) -> None:
         """Learn from labelled grasps; set attributes that end in ``_``."""
 
 
-def record_list(X: Records) -> list[Grasps]:
+def _are_records(X: Any) -> bool:
+    """Return whether something is records, or nothing at all, and no array."""
+    if isinstance(X, str | Path | Dataset) or "grasp_id" in getattr(X, "columns", ()):
+        return True
+    return isinstance(X, Sequence) and all(map(_are_records, X))
+
+
+def record_list(X: Any) -> list[Grasps]:
     """Return one record as a list of one, several as a list; checked, and their spikes lost samples."""
     records = as_grasps(X)
     if not records:
         raise UserError("no grasps were given", hint="give at least one record")
     for at, grasps in enumerate(records):
-        if not isinstance(grasps, Grasps):
+        if not isinstance(grasps, Dataset):
             raise UserError(
                 f"expected Grasps, got {type(grasps).__name__}", hint="use make_grasps or read_grasps"
             )
         check_grasps(grasps)
+        records[at] = grasps = as_record(grasps)
         spiked = check_quality(grasps).spiked
         if spiked.any():
             records[at] = grasps.assign(t_surface=grasps["t_surface"].where(~spiked))
@@ -332,9 +377,12 @@ def as_array(
 
 
 def times_from(grasps: Grasps, start: float) -> Floats:
-    """Return the record's sample times from ``start`` on [s], to 1 us: -1e-16 s is 0 s."""
+    """Return the record's sample times from ``start`` on [s], to 1 us (-1e-16 s is 0 s), up to half a second
+    after its shortest contact ends."""
     time = np.round(np.asarray(grasps["time"].values, dtype=float), 6) + 0.0  # no negative zero
-    return np.asarray(time[time >= start])
+    seen = np.isfinite(grasps["t_surface"].values)
+    end = time[time.size - 1 - seen[:, ::-1].argmax(axis=1)].min()
+    return np.asarray(time[(time >= start) & (time <= end + HELD_AT_AN_END)])
 
 
 def level(grasps: Grasps, key: str = "t_surface") -> Floats:
@@ -396,7 +444,7 @@ def two_or_more(labels: Labels, where: str) -> Labels:
         raise UserError(
             f"all grasps are of {str(classes[0])!r}",
             file=where,
-            hint="give at least two materials",
+            hint="give at least two classes",
         )
     return np.asarray(classes)
 

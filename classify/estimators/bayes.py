@@ -54,11 +54,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.special import expit, gammaln, logit, logsumexp, multigammaln
 
 from thermogrip.classify.estimators.base import (
@@ -72,8 +72,6 @@ from thermogrip.classify.estimators.base import (
     named_arrays,
     normalised,
     pick,
-    record_labels,
-    record_list,
     set_arrays,
     two_or_more,
 )
@@ -261,13 +259,10 @@ class BayesClassifier(GraspClassifier):
     shrinkage: float | None = None  # nu_0 - d - 1 [grasps]; by default the most evident of a grid
     prior_unknown: float = 0.1  # probability of a material that is not among the candidates
 
-    def fit(self, X: Records, y: ArrayLike | None = None) -> Self:
-        """Learn from one record or several; ``y`` (n_grasp,) are their materials, record after record, by
-        default each record's own."""
+    def _learn(self, records: list[Grasps], labels_of: list[Labels]) -> None:
         if self.shrinkage is not None and not self.shrinkage > 0:
             raise UserError(f"shrinkage must be > 0 grasps, got {self.shrinkage}")
-        records = record_list(X)
-        labels = np.concatenate(record_labels(records, y))
+        labels = np.concatenate(labels_of)
         two_or_more(labels, "+".join(map(log_name, records)))
         self.sensors_ = 2 if all("t_surface_2" in part for part in records) else 1
         self.reader_, all_read, usable, self.notes_ = FeatureReader.learn(
@@ -276,7 +271,6 @@ class BayesClassifier(GraspClassifier):
         self.feature_names_ = self.reader_.names
         self.classes_ = np.unique(labels[usable])
         self._fit_density(_rows(all_read, usable), np.searchsorted(self.classes_, labels[usable]))
-        return self
 
     def _fit_density(self, read: Readings, at: NDArray[np.intp]) -> None:
         """Find means, covariance and the error of object temperatures; ``at`` is the class of each grasp."""
@@ -354,7 +348,7 @@ class BayesClassifier(GraspClassifier):
     def open_set_log_proba(self, X: Records, candidates: Sequence[str]) -> tuple[Floats, Floats]:
         """Return :meth:`candidate_log_proba` and :meth:`p_unknown` from the same densities."""
         at = [self.asked().index(name) for name in self.asked(candidates)]
-        log_p = np.vstack([self._log_density(self._as_trained(part)) for part in record_list(X)])
+        log_p = np.vstack([self._log_density(self._as_trained(part)) for part in self._records(X)])
         odds = logsumexp(log_p[:, at], axis=1) - np.log(len(at)) - log_p[:, -1]
         return normalised(log_p[:, at]), np.asarray(expit(logit(self.prior_unknown) - odds))
 

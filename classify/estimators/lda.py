@@ -206,7 +206,7 @@ class ArrayClassifier(JoinedClassifier):
             if hasattr(self.model_, "predict_proba"):
                 p = np.asarray(self.model_.predict_proba(rows), dtype=float)
             else:
-                hit = np.asarray(self.model_.predict(rows))[:, None] == self.classes_
+                hit = np.asarray(self.model_.predict(rows))[:, None] == self.model_.classes_
                 p = (1.0 + hit * self.n_trained_) / (self.n_trained_ + self.classes_.size)
         return np.asarray(np.log(np.maximum(p, 1e-12)))  # a vote of zero trees is no certainty
 

@@ -89,8 +89,6 @@ class ExpansionClassifier(JoinedClassifier):
             raise UserError(f"no pool {self.pool!r} or rule {self.rule!r}", hint=have)
         pool = POOLS[self.pool]
         self.times_ = times_from(grasps, self.start)
-        if self.times_.size <= max(pool.degrees):
-            raise UserError(f"{self.times_.size} samples cannot be expanded", hint="record longer")
         rows, machines = self._rows(grasps), _machines(pool, self.times_, self._sensors(grasps))
         if labels.size == self.classes_.size:  # one grasp a material has no spread within
             machines = {name: m for name, m in machines.items() if name.startswith("logistic")}

@@ -245,9 +245,10 @@ def _named(network: Any, readout: Any) -> Weights:
 
 def _logits(weights: Mapping[str, NDArray[Any]], series: NDArray[np.float32]) -> Floats:
     """Return the readout of the last state of each series, (n_series, K)."""
-    inputs, recurrent = weights["lstm.weight_ih_l0"].T, weights["lstm.weight_hh_l0"].T
-    bias = weights["lstm.bias_ih_l0"] + weights["lstm.bias_hh_l0"]
-    state = cell = np.zeros((series.shape[0], recurrent.shape[0]), dtype=np.float32)
+    # in doubles a series' answer is the same in any batch, to 1e-12
+    inputs, recurrent = (weights[f"lstm.weight_{kind}_l0"].T.astype(float) for kind in ("ih", "hh"))
+    bias = weights["lstm.bias_ih_l0"].astype(float) + weights["lstm.bias_hh_l0"]
+    state = cell = np.zeros((series.shape[0], recurrent.shape[0]))
     for t in range(series.shape[1]):
         i, f, g, o = np.split(series[:, t] @ inputs + state @ recurrent + bias, 4, axis=1)
         cell = expit(f) * cell + expit(i) * np.tanh(g)

@@ -42,7 +42,7 @@ from sklearn.svm import SVC
 
 from thermogrip.classify.estimators.base import Floats, JoinedClassifier, Labels, as_array, times_from
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Grasps, log_name, unit_names
+from thermogrip.datasets.schema import Grasps, unit_names
 
 _SCALES = (1e-3, 1e3)
 
@@ -185,9 +185,6 @@ class RocketClassifier(MarginClassifier):
         from aeon.transformations.collection.convolution_based import MiniRocket
 
         self.times_ = times_from(grasps, self.start)
-        if self.times_.size < _LEAST_SAMPLES:
-            problem = f"{self.times_.size} samples from {self.start:g} s, MiniRocket needs {_LEAST_SAMPLES}"
-            raise UserError(problem, file=log_name(grasps), hint="record longer")
         self.reader_ = make_pipeline(
             MiniRocket(n_kernels=self.kernels, random_state=self.random_state),
             FunctionTransformer(np.asarray, kw_args={"dtype": float}),
@@ -198,7 +195,9 @@ class RocketClassifier(MarginClassifier):
 
     def _series(self, grasps: Grasps) -> NDArray[np.float32]:
         x = as_array(grasps, times=self.times_)
-        return x.reshape(x.shape[0], -1, self.times_.size).astype(np.float32)
+        cube = x.reshape(x.shape[0], -1, self.times_.size)
+        missing = max(0, _LEAST_SAMPLES - self.times_.size)  # a short contact stays where it ended
+        return np.pad(cube, ((0, 0), (0, 0), (0, missing)), mode="edge").astype(np.float32)
 
     def _rows(self, grasps: Grasps) -> Floats:
         return np.asarray(self.reader_.transform(self._series(grasps)))

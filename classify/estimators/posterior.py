@@ -25,6 +25,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -35,9 +36,9 @@ from scipy.special import expit, logit, logsumexp
 from thermogrip.classify.estimators.base import (
     Floats,
     GraspClassifier,
+    Labels,
     Records,
     normalised,
-    record_labels,
     record_list,
     two_or_more,
 )
@@ -88,9 +89,15 @@ class PosteriorClassifier(GraspClassifier):
         """Calibrate the gripper on labelled grasps of one or several conditions, which need not share a
         time axis; ``y`` (n_grasp,) are their materials, record after record, by default each record's
         own."""
+        return self._taught(X, y, partial(self._learn, progress=progress))
+
+    def _learn(
+        self,
+        records: list[Grasps],
+        labels: list[Labels],
+        progress: Callable[[float, str], None] | None = None,
+    ) -> None:
         self._check_params()
-        records = record_list(X)
-        labels = record_labels(records, y)
         where = "+".join(str(part.attrs.get("name")) for part in records)
         self.classes_ = two_or_more(np.concatenate(labels), where)
         records = [part.assign(material=("grasp", own)) for part, own in zip(records, labels)]
@@ -103,7 +110,6 @@ class PosteriorClassifier(GraspClassifier):
             if has_touch_groups(part):
                 self.coupling_ = learn_coupling(device, part, start=self.coupling_)
         self.device_ = _uncertain_as(device, self.gripper)
-        return self
 
     def with_device(self, device: GripperModel, coupling: Coupling | None = None) -> Self:
         """Take up a calibration in place of fitting one; the classes are its materials."""
@@ -182,18 +188,18 @@ class PosteriorClassifier(GraspClassifier):
         """Return log probabilities over a subset of ``classes_``: only their evidence is computed."""
         names = self.asked(candidates)
         prior = self.log_prior(names)
-        return np.vstack([normalised(self._evidence(part, names)[0] + prior) for part in record_list(X)])
+        return np.vstack([normalised(self._evidence(part, names)[0] + prior) for part in self._records(X)])
 
     def open_set_log_proba(self, X: Records, candidates: Sequence[str]) -> tuple[Floats, Floats]:
         """Return :meth:`candidate_log_proba` and :meth:`p_unknown` from one evaluation of the evidence."""
         names = self.asked(candidates)
-        found = [self._evidence(part, names, unknown=True) for part in record_list(X)]
+        found = [self._evidence(part, names, unknown=True) for part in self._records(X)]
         log_p = [normalised(evidence + self.log_prior(names)) for evidence, _ in found]
         return np.vstack(log_p), np.concatenate([unknown for _, unknown in found])
 
     def p_unknown(self, X: Records, candidates: Sequence[str] | None = None) -> Floats:
         names = self.asked() if candidates is None else [str(c) for c in candidates]
-        return np.concatenate([self._evidence(part, names, unknown=True)[1] for part in record_list(X)])
+        return np.concatenate([self._evidence(part, names, unknown=True)[1] for part in self._records(X)])
 
     def beyond_training(self, grasps: Grasps) -> list[str]:
         """Return in words which blocks rested longer between touches than those of the training."""

@@ -22,15 +22,15 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.special import logsumexp
 from sklearn.base import clone
 
 from thermogrip.classify.estimators import CLASSIFIERS, check_name
-from thermogrip.classify.estimators.base import Floats, GraspClassifier, Records
+from thermogrip.classify.estimators.base import Floats, GraspClassifier, Labels
 from thermogrip.datasets.atomic_files import make_folder, read_bytes, read_json, write_atomic, write_json
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.schema import Grasps
@@ -247,11 +247,12 @@ class VoteClassifier(GraspClassifier):
 
     members: Sequence[GraspClassifier] = ()
 
-    def fit(self, X: Records, y: ArrayLike | None = None) -> Self:
+    def _learn(self, records: list[Grasps], labels: list[Labels]) -> None:
         check_members(self.members)
-        self.members_ = [clone(member).fit(X, y) for member in self.members]
+        self.members_ = [clone(member) for member in self.members]
+        for member in self.members_:
+            member._learn(records, labels)
         self.classes_ = self.members_[0].classes_
-        return self
 
     def check_installed(self) -> None:
         for member in self.members:

@@ -36,9 +36,9 @@ class Comparison(Shown):
     repeats: int  # random splits; 1 otherwise
     seed: int
     # a row for each classifier, repeat, condition and test grasp (or touched block): ``classifier, repeat,
-    # condition, grasp_id, material, predicted, known, correct, confidence, log_loss, brier, p_unknown,
-    # apart`` and ``p_<candidate>``; ``known`` is False where the material was no candidate: such grasps are
-    # not in the accuracy, and are what ``open_set`` is about
+    # condition, grasp_id, material, predicted, known, correct, confidence, log_loss, log_loss_base, brier,
+    # p_unknown, apart`` and ``p_<candidate>``; ``known`` is False where the material was no candidate: such
+    # grasps are not in the accuracy, and are what ``open_set`` is about
     predictions: tuple[Row, ...]
     # the leak probe: ``classifier, condition, n, accuracy, chance, p_value, leak``
     leaks: tuple[Row, ...] = ()
@@ -90,7 +90,8 @@ class Comparison(Shown):
         ``log_loss``, ``brier`` and ``ece`` with ``<score>_low`` and ``<score>_high`` over grasps
         (:mod:`~thermogrip.classify.evaluation.metrics`); ``ece_calibrated``, what a calibrated forecaster
         of these confidences would show, and ``ece_p``, how often one would show more; ``confidence``;
-        ``log_loss_chance`` (equal probabilities); ``fit_s``, ``predict_s_per_grasp``.
+        ``log_loss_chance`` (equal probabilities) and ``log_loss_base`` (always stating the shares of the
+        training grasps); ``fit_s``, ``predict_s_per_grasp``.
         """
         return [dict(row) for row in self._scores]
 
@@ -132,6 +133,7 @@ class Comparison(Shown):
             "sd_over_splits": _sd_over_splits(rows) if self.repeats > 1 else None,
             **_spread("log_loss", loss),
             "log_loss_chance": float(np.mean([np.log(r["candidates"]) for r in rows])),
+            "log_loss_base": float(np.mean([r["log_loss_base"] for r in rows])),
             **_spread("brier", brier),
             "confidence": float(confidence.mean()),
             **_spread("ece", ece),

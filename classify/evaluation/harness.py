@@ -8,7 +8,8 @@ Rules that it keeps:
 - what describes the gripper, and is the same in all conditions, may be learnt from the training grasps of all
   of them (``learns_from_all_conditions``); never from a test grasp; a classifier that does not join touches
   learns a condition that is scored apart, or has a material that only other temperatures could show, alone;
-- what cannot be scored is noted, not dropped in silence.
+- what cannot be scored is noted, not dropped in silence: a classifier that cannot learn from the training
+  grasps of a condition, or answer there, is left out of it, and the others are scored.
 
 **Leak probe.**  Everything after -0.5 s is replaced by the trace's own level before contact, with noise of
 the size seen there.  Such a record contains no touch, so a classifier trained and tested on it must be at
@@ -25,7 +26,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any
 
@@ -137,7 +138,8 @@ def evaluate(
     Raises
     ------
     UserError
-        If a name is unknown, a grasp is in training and test, or nothing can be scored.
+        If a name is unknown, a grasp is in training and test, or nothing can be scored.  Of classifiers that
+        cannot all be scored ``notes`` has the reason.
 
     Examples
     --------
@@ -156,15 +158,21 @@ def evaluate(
     done = run_parallel(_run, jobs, workers, progress, what="train and test")
     order = {name: i for i, name in enumerate(named)}
     results = sorted((r for part in done for r in part), key=lambda r: (order.get(r.classifier, -1), r.order))
-    real = [r for r in results if not r.probe]
+    faults = [r for r in results if r.fault is not None]
+    real = [r for r in results if not r.probe and r.fault is None]
+    if faults and not real:
+        raise faults[0].fault  # type: ignore[misc]
+    unable = dict.fromkeys(
+        f"{r.classifier} left out of {plan.folds[r.order].condition}: {r.fault}" for r in faults
+    )
     return Comparison(
         split="files" if test is not None else split,
         repeats=repeats if split == "random" and test is None else 1,
         seed=seed,
         predictions=tuple(row for r in real for row in r.rows),
-        leaks=tuple(_leaks([r for r in results if r.probe])),
+        leaks=tuple(_leaks([r for r in results if r.probe and r.fault is None])),
         times=tuple(r.time for r in real),
-        notes=(*plan.notes, *late),
+        notes=(*plan.notes, *late, *unable),
     )
 
 
@@ -184,8 +192,9 @@ class _Result:
     classifier: str
     order: int
     probe: bool
-    rows: tuple[Row, ...]
-    time: Row
+    rows: tuple[Row, ...] = ()
+    time: Row = field(default_factory=dict)
+    fault: UserError | None = None
 
 
 def _named(
@@ -258,13 +267,18 @@ def _run(job: _Job) -> list[_Result]:
     only = job.probe == "only"
     training = [untouched(g, seed=1) for g in job.training] if only else list(job.training)
     start = perf_counter()
-    classifier.fit(training if len(training) > 1 else training[0])
+    try:
+        classifier.fit(training if len(training) > 1 else training[0])
+    except UserError as fault:
+        return [_Result(job.name, order, only, fault=fault) for order, _ in job.folds]
     fit_s = perf_counter() - start
     results = []
     for order, fold in job.folds:
-        results.append(_tested(job.name, classifier, fold, order, fit_s, touch=not only))
-        if job.probe == "also":
-            results.append(_tested(job.name, classifier, fold, order, fit_s, touch=False))
+        for touch in (not only, *((False,) if job.probe == "also" else ())):
+            try:
+                results.append(_tested(job.name, classifier, fold, order, fit_s, touch=touch))
+            except UserError as fault:
+                results.append(_Result(job.name, order, not touch, fault=fault))
     return results
 
 
@@ -284,6 +298,9 @@ def _tested(
     first = np.sort(np.unique(units, return_index=True)[1])  # one row a unit: its touches share an answer
     head = {"classifier": name, "repeat": fold.repeat, "condition": fold.condition, "apart": fold.apart}
     rows = _rows(pick(test, first), units[first], np.exp(log_p[first]), unknown[first], candidates)
+    trained = Counter(map(str, grasp_labels(fold.train)))
+    for row in rows:
+        row["log_loss_base"] = -np.log(trained[row["material"]] / trained.total()) if row["known"] else None
     time = head | {"fit_s": fit_s, "predict_s_per_grasp": predict_s}
     return _Result(name, order, not touch, tuple(head | row for row in rows), time)
 

@@ -68,7 +68,9 @@ def scored(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
     made.touched = stand_in("thermogrip.cli.compare.touched_part", lambda console, records: records)
     made.asked = stand_in(
         "thermogrip.classify.estimators.registry.trainable",
-        lambda names, quick, seed: (dict.fromkeys(names, quick), made.missing),
+        lambda names, quick, seed: (
+            {name: quick for name in names if not (made.missing and name == "lstm")}, made.missing
+        ),
     )
     made.planned = stand_in("thermogrip.classify.evaluation.splits.plan_folds")
     made.scored = stand_in("thermogrip.classify.evaluation.harness.evaluate", evaluate)
@@ -143,6 +145,9 @@ def test_the_answer_holds_scores_notes_and_intervals_of_each_split(scored: Simpl
     assert [call.quick for call in scored.asked] == [True, True]
     assert scored.asked[0].args == (("lstm", "posterior", "bayes", "features-lda", "pca-lda"),)
     assert (scored.scored[0].workers, scored.scored[0].seed) == (1, 0)
+    both = scored.bench.run("compare", "grasps.csv", "--classifiers", "lstm,bayes", "--out", "d")
+    assert (both.code, both.err.count("warning: left out: lstm needs torch")) == (0, 1)
+    assert list(scored.scored[-1].args[0]) == ["bayes"]
     refused = scored.bench.run("compare", "grasps.csv", "--classifiers", "lstm", "--out", "c")
     assert (refused.code, refused.said) == (2, ["thermogrip: lstm needs torch"])
 

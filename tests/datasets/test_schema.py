@@ -53,9 +53,21 @@ def test_a_log_that_breaks_a_rule_is_refused(time, variables, words):
 
 
 def test_the_types_of_records_are_loaded_when_they_are_asked_for():
-    assert schema.Log is schema.Grasps is xr.Dataset
+    assert schema.Log is xr.Dataset
+    assert issubclass(schema.Grasps, xr.Dataset)
     with pytest.raises(AttributeError, match=r"'thermogrip.datasets.schema' has no attribute 'Logs'"):
         _ = schema.Logs
+
+
+def test_a_plain_dataset_becomes_a_record_that_counts_grasps():
+    made = make_grasps([0.0, 1.0], [[1.0, 2.0], [3.0, 4.0]], ["a", "b"], material=["tin", "zinc"])
+    plain = xr.Dataset(made.data_vars, coords=made.coords, attrs=made.attrs)
+    assert len(plain) == 2  # of its variables
+    again = schema.as_record(plain)
+    assert len(again.isel(time=[0])) == len(again.drop_vars("material")) == len(again.copy(deep=True)) == 2
+    xr.testing.assert_identical(again, made)
+    assert schema.as_record(made) is made
+    assert list(again) == ["t_surface", "material"]
 
 
 def test_a_record_has_its_marks_and_a_variable_only_its_time():

@@ -214,6 +214,7 @@ def test_conditions_below_the_line_are_reported_where_there_are_others_above_it(
 
 def test_each_score_stands_under_its_name_with_its_own_interval() -> None:
     row: dict[str, Any] = {"classifier": "a", "condition": "b", "n": 7, "log_loss_chance": 1.099}
+    row["log_loss_base"] = 0.871
     for at, key in enumerate(("accuracy", "log_loss", "brier", "ece")):
         low, high = ("low", "high") if key == "accuracy" else (f"{key}_low", f"{key}_high")
         row |= {key: 0.5 + at / 100, low: 0.1 + at / 100, high: 0.9 + at / 100}
@@ -221,7 +222,8 @@ def test_each_score_stands_under_its_name_with_its_own_interval() -> None:
     head, [cells] = classification.score_table(SimpleNamespace(scores=lambda: [row]))
     assert dict(zip(head, cells, strict=True)) == {
         "classifier": "a", "condition": "b", "n": 7, "accuracy": "0.500 (.10\N{EN DASH}.90)",
-        "log loss": "0.510 (.11\N{EN DASH}.91)", "by chance": "1.10", "Brier": "0.520 (.12\N{EN DASH}.92)",
+        "log loss": "0.510 (.11\N{EN DASH}.91)", "by chance": "1.10", "by base rates": "0.87",
+        "Brier": "0.520 (.12\N{EN DASH}.92)",
         "ECE": "0.530 (.13\N{EN DASH}.93)", "if calibrated": "0.032", "fit [s]": "1.23",
     }  # fmt: skip
 

@@ -83,7 +83,7 @@ def compare(
 
     pool, names = cli.workers_of(workers, cluster), cli.comma(classifiers)
     models, missing = trainable(names or BY_DEFAULT, quick=quick, seed=seed)
-    if names is not None and missing:
+    if not models:
         raise missing[0]
     left_out = tuple(f"left out: {error}" for error in missing)
     fast, _ = trainable(models, quick=True, seed=seed)

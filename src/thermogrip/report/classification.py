@@ -30,6 +30,7 @@ _SCORES: Columns = (
     ("accuracy", lambda row: _between(row["accuracy"], row["low"], row["high"])),
     ("log loss", lambda row: _between(row["log_loss"], row["log_loss_low"], row["log_loss_high"])),
     ("by chance", lambda row: f"{row['log_loss_chance']:.2f}"),
+    ("by base rates", lambda row: f"{row['log_loss_base']:.2f}"),
     ("Brier", lambda row: _between(row["brier"], row["brier_low"], row["brier_high"])),
     ("ECE", lambda row: _between(row["ece"], row["ece_low"], row["ece_high"])),
     ("if calibrated", lambda row: f"{row['ece_calibrated']:.3f}"),

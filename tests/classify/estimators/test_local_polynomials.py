@@ -149,7 +149,9 @@ def test_one_grasp_a_material_is_enough_to_answer(three: Grasps) -> None:
     assert make_classifier("expansions").fit(pick(three, [0, 1, 8, 9, 16])).predict(three).size == 24
 
 
-def test_a_trace_too_short_to_bend_is_refused() -> None:
-    grasps = make_grasps(np.arange(5) * 0.1, np.zeros((4, 5)), list("abcd"), material=list("xxyy"))
-    with pytest.raises(UserError, match="5 samples cannot be expanded"):
-        make_classifier("expansions").fit(grasps)
+def test_a_trace_too_short_to_bend_is_read_by_components_alone() -> None:
+    traces = np.outer([1.0, 1.1, 3.0, 3.1, 0.9, 2.9], [0.0, 0.5, 0.8])
+    grasps = make_grasps(np.arange(3) * 0.1, traces, list("abcdef"), material=list("xxyyxy"))
+    model = make_classifier("expansions").fit(grasps)
+    assert all(name.endswith("components") for name in model.weights_)
+    assert model.predict(grasps).tolist() == list("xxyyxy")

@@ -12,7 +12,6 @@ from sklearn.model_selection import cross_val_predict
 from thermogrip.classify import make_classifier
 from thermogrip.classify.estimators.base import GraspClassifier, pick
 from thermogrip.classify.estimators.margins import SvmPca, calibrated_scale, inner_folds
-from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, make_grasps
 
 Maker = Callable[..., Grasps]
@@ -156,8 +155,11 @@ def test_compiled_features_are_those_of_the_same_lines_in_python(
     assert (compiled.predict(three) == model.predict(three)).all()
 
 
-def test_a_trace_too_short_for_the_kernels_is_the_users_error() -> None:
+def test_a_trace_too_short_for_the_kernels_stays_where_it_ended() -> None:
     pytest.importorskip("aeon")
-    grasps = make_grasps(np.arange(6) * 0.1, np.zeros((4, 6)), list("abcd"), material=list("xxyy"))
-    with pytest.raises(UserError, match="6 samples from 0 s, MiniRocket needs 9"):
-        make_classifier("rocket").fit(grasps)
+    traces = np.outer([1.0, 1.1, 3.0, 3.1], [0.0, 0.5, 0.8, 0.9, 0.95, 1.0])
+    short = make_grasps(np.arange(6) * 0.1, traces, list("abcd"), material=list("xxyy"))
+    longer = np.pad(traces, ((0, 0), (0, 3)), mode="edge")
+    whole = make_grasps(np.arange(9) * 0.1, longer, list("abcd"), material=list("xxyy"))
+    found, same = (make_classifier("rocket", kernels=200).fit(g).predict_proba(g) for g in (short, whole))
+    np.testing.assert_allclose(found, same)

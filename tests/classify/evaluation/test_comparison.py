@@ -34,6 +34,7 @@ def said(
         "confidence": confidence,
         "known": True,
         "log_loss": float(-np.log(confidence if right else 1 - confidence)),
+        "log_loss_base": 0.5 if right else 0.8,
         "candidates": 2,
         "apart": False,
         "brier": 2 * (1 - confidence if right else confidence) ** 2,
@@ -87,6 +88,7 @@ def test_scores_are_means_over_tests_and_their_intervals_count_grasps() -> None:
     assert got == pytest.approx(list(ece))
     assert row["confidence"] == pytest.approx(0.8)
     assert row["log_loss_chance"] == pytest.approx((4 * np.log(2) + 2 * np.log(3)) / 6)
+    assert row["log_loss_base"] == pytest.approx((4 * 0.5 + 2 * 0.8) / 6)
     # first split 2 of 3, second 2 of 3; of the wet grasps 1 of 2 and 2 of 2
     assert (row["sd_over_splits"], rows["a", "wet"]["sd_over_splits"]) == (0.0, 0.25)
     assert (row["fit_s"], row["predict_s_per_grasp"]) == pytest.approx((3.0, 0.3))

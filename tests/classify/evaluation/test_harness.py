@@ -58,6 +58,7 @@ def test_the_scores_are_those_of_the_classifier_alone(three: Grasps) -> None:
     assert row["log_loss"] == pytest.approx(-np.log(p[np.arange(9), true]).mean())
     assert row["brier"] == pytest.approx(((p - np.eye(3)[true]) ** 2).sum(axis=1).mean())
     assert row["log_loss_chance"] == pytest.approx(np.log(3))
+    assert row["log_loss_base"] == pytest.approx(np.log(3))  # five grasps of each train
 
 
 def test_every_classifier_is_tested_on_the_same_grasps(found: Comparison) -> None:
@@ -174,6 +175,26 @@ def test_leaks_share_their_level_and_count_grasps() -> None:
     assert [row["leak"] for row in harness._leaks([seven, none])] == [False, False]
     assert strange == [alone[0] | {"leak": False}]
     assert harness._leaks([none])[0]["p_value"] == pytest.approx(42 / 64)
+
+
+def test_who_cannot_answer_is_left_out_with_the_reason_and_the_others_are_scored(three: Grasps) -> None:
+    strange = three.assign(material=("grasp", np.char.add("un", three["material"].values.astype(str))))
+    found = evaluate(["posterior", "pca-lda"], [strange])
+    assert found.classifiers == ("pca-lda",)
+    assert {row["classifier"] for row in found.leaks} == {"pca-lda", "untouched traces"}
+    head = f"posterior left out of {three.attrs['name']}: "
+    [note] = [note for note in found.notes if note.startswith(head)]
+    assert "the materials table has none of the labels" in note
+    with pytest.raises(UserError, match="the materials table has none of the labels"):
+        evaluate(["posterior"], [strange])
+
+
+def test_base_rates_are_those_of_the_training(three: Grasps) -> None:
+    few = pick(three, np.r_[0:5, 8:12, 16:24])
+    marks = [*["train"] * 4, "test", *["train"] * 3, "test", *["train"] * 7, "test"]
+    kept = few.assign(split=("grasp", marks))
+    [row] = evaluate(["pca-lda"], [kept], probe=False).scores()
+    assert row["log_loss_base"] == pytest.approx(-np.log([4 / 14, 3 / 14, 7 / 14]).mean())
 
 
 def test_a_row_is_what_was_said_of_one_grasp(three: Grasps) -> None:
