@@ -32,7 +32,7 @@ from thermogrip.sysid.effusivity.calibration import calibrate_example_gripper
 from thermogrip.sysid.effusivity.data import touches
 from thermogrip.sysid.effusivity.gripper_model import GripperModel, load_default_gripper
 from thermogrip.sysid.effusivity.laplace_approximation import (
-    BUILD,
+    BUILD_UP,
     CAPACITY,
     ONSET,
     H,
@@ -47,7 +47,7 @@ from tests.oracles.emcee_posterior import emcee_posterior
 
 LEVELS = (0.05, 0.5, 0.95)
 FIVE = ["brass", "copper", "iron", "wood", "zinc"]
-REST = [H, BUILD, ONSET, CAPACITY]
+REST = [H, BUILD_UP, ONSET, CAPACITY]
 CHAINS, EFFECTIVE = 4, 6000
 AT_ENDS, AT_MEDIAN = 2.1, 1.25  # standard error of a quantile of a normal sample times sqrt(n)
 

@@ -19,7 +19,7 @@ from thermogrip.sysid.contact.simulation import stack_modes
 from thermogrip.sysid.effusivity.data import Touches, whiten
 from thermogrip.sysid.effusivity.gripper_model import GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import (
-    BUILD,
+    BUILD_UP,
     LEVEL,
     ONSET,
     T_OBJECT,
@@ -156,6 +156,6 @@ def log_density(device: GripperModel, data: Touches) -> Callable[[Any], Any]:
         c_sd = 0.4 - 0.2 * metal
         value -= 0.5 * ((ln_h - device.ln_h_level - device.ln_h_slope * (x - 9.0)) / h_sd) ** 2
         value -= 0.5 * ((ln_c - c_mean) / c_sd) ** 2 + jnp.log(c_sd) + np.log(h_sd)
-        return value + student(ln_build, BUILD) + student(onset, ONSET)
+        return value + student(ln_build, BUILD_UP) + student(onset, ONSET)
 
     return density

@@ -36,7 +36,7 @@ from thermogrip.sysid.effusivity.calibration import calibrate_gripper
 from thermogrip.sysid.effusivity.data import noise_covariance, touches, whiten
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.effusivity.laplace_approximation import (
-    BUILD,
+    BUILD_UP,
     CAPACITY,
     EFFUSIVITY,
     LEVEL,
@@ -62,7 +62,7 @@ CONDITIONS = (
     (18, 38, FIVE, 40),
 )  # fmt: skip
 MUST = 0.54
-REST = [H, BUILD, ONSET, EFFUSIVITY, CAPACITY]
+REST = [H, BUILD_UP, ONSET, EFFUSIVITY, CAPACITY]
 
 
 def main() -> None:
@@ -190,7 +190,7 @@ def shared(device):
         for i, material in enumerate(train["material"].values.tolist()):
             sums = news.setdefault((name, material), np.zeros((2, score.shape[1])))
             sums += score[i], information[i]
-    for what, k in (("ln h", H), ("ln tau_b", BUILD), ("onset", ONSET), ("T_obj", T_OBJECT)):
+    for what, k in (("ln h", H), ("ln tau_b", BUILD_UP), ("onset", ONSET), ("T_obj", T_OBJECT)):
         for group, size in (("file", 1), ("material in a file", 2)):
             for materials, left_out in (("all", ""), ("metals", "wood")):
                 groups = {}
@@ -214,7 +214,7 @@ def tails(device):
     at = np.concatenate([mode.u for mode, _ in found]) - mean
     variance = np.concatenate([np.einsum("nii->ni", mode.covariance) for mode, _ in found])
     x = np.linspace(-8, 8, 4001)
-    for what, k in (("ln h", H), ("ln tau_b", BUILD), ("onset", ONSET), ("T_obj", T_OBJECT)):
+    for what, k in (("ln h", H), ("ln tau_b", BUILD_UP), ("onset", ONSET), ("T_obj", T_OBJECT)):
         left = np.clip(variance[:, k] / sd[:, k] ** 2, 1e-4, 0.999)  # posterior over prior
         precision = 1 / left - 1  # of the readings alone
         z = at[:, k] / sd[:, k] / left / precision

@@ -37,9 +37,10 @@ from thermogrip.classify.decisions.stopping_rule import (
 from thermogrip.classify.estimators.base import pick
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.classify.evaluation.splits import plan_folds
-from thermogrip.classify.figures import PALETTE, make_grid
+from thermogrip.classify.figures import PALETTE
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.materials import find_material
+from thermogrip.datasets.media import panels as grid_of
 from thermogrip.datasets.schema import make_grasps
 from thermogrip.sysid.effusivity.calibration import calibrate_gripper
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
@@ -360,7 +361,7 @@ def contact_time_figure(conditions):
 def stop_time_figure(rule, conditions):
     """Draw the share of contacts that a rule has ended by each time, and where it named the wrong
     material."""
-    figure, [[axis]] = make_grid(1, 1, size=(6.4, 3.4))
+    figure, [[axis]] = grid_of(1, 1, size=(6.4, 3.4), ticks=7)
     for k, (name, (seen, true)) in enumerate(conditions.items()):
         found = stops(rule, seen)
         order = np.argsort(found.time, kind="stable")
@@ -401,7 +402,7 @@ def over_time(axis):
 
 def panels(count):
     """Return a figure and its axes in a row."""
-    figure, axes = make_grid(1, count, size=(3.2 * count, 3.0))
+    figure, axes = grid_of(1, count, size=(3.2 * count, 3.0), ticks=7)
     return figure, axes[0]
 
 

@@ -19,7 +19,6 @@ from thermogrip.classify.decisions import stopping_rule
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.materials import find_material
 from thermogrip.sysid.effusivity.posterior import effusivity_posterior
-from thermogrip.sysid.effusivity.quality import begun
 
 FIVE = ("brass", "copper", "iron", "wood", "zinc")
 WARM = ((43.0, 23.0),)
@@ -51,7 +50,7 @@ def longer(sets: int) -> None:
             known.longest_ = read
             p = np.exp(known.candidate_log_proba(test, names))
             right = np.mean(np.array(names)[p.argmax(axis=1)] == label)
-            found = effusivity_posterior(known.device_, begun(test, read))
+            found = effusivity_posterior(known.device_, test, until=read)
             inside = np.mean([row.effusivity_p05 <= x <= row.effusivity_p95 for row, x in zip(found, e)])
             stated = p.max(axis=1).mean()
             print(f"| {seconds:g} | {read:g} | {right:.2f} | {stated:.2f} | {inside:.2f} |", flush=True)
