@@ -185,3 +185,16 @@ def test_an_error_that_is_not_documented_is_found() -> None:
         raise ValueError(t)
 
     assert lacks(add) == {"Raises"}
+
+
+BENCHMARKS = sorted((Path(__file__).parents[1] / "benchmarks").glob("*/*.py"))
+
+
+@pytest.mark.parametrize("file", BENCHMARKS, ids=lambda file: f"{file.parent.name}/{file.stem}")
+def test_what_a_benchmark_imports_of_us_exists(file: Path) -> None:
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("thermogrip"):
+            module = importlib.import_module(str(node.module))
+            for alias in node.names:
+                if not hasattr(module, alias.name):
+                    importlib.import_module(f"{node.module}.{alias.name}")
