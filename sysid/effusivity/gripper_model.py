@@ -53,6 +53,7 @@ _FILE_KEYS = {
     "ln_h_of_blocks": "finish", "ln_h_level": "finish_level", "ln_h_slope": "finish_slope",
     "uncertain": "in_doubt",
 }  # fmt: skip
+_WIDER = 1.5  # GripperSpread's numbers are guesses themselves: so wide, answers are right as often as stated
 NOTHING = 1e-3  # in place of a conductance of nothing, which has no logarithm
 _STACK_NAMES = SHARED_NAMES[: SHARED_NAMES.index("onset")]  # these make a Stack
 _ROUNDING = 1e-6  # a correlation matrix may have an eigenvalue so far below zero by rounding alone
@@ -170,7 +171,7 @@ def another_gripper(gripper: GripperModel, spread: GripperSpread | None = None) 
     if known is None:
         names = (*SHARED_NAMES, *block_names(gripper.materials))
         known = ParameterCovariance(names, np.zeros((len(names), len(names))))
-    extra = (spread or GripperSpread()).covariance(known.names)
+    extra = (spread or GripperSpread()).covariance(known.names) * (_WIDER**2 if spread is None else 1.0)
     return replace(
         gripper, uncertainty=ParameterCovariance(known.names, known.covariance + extra), uncertain=True,
         second=None if gripper.second is None else another_gripper(gripper.second, spread),
