@@ -56,6 +56,7 @@ Array = NDArray[np.float64]
 Fitted = tuple[StateSpaceModel, Sequence[Array]]  # with the initial state of each segment
 
 _WEIGHTINGS = ("moesp", "cva")
+DEPENDENT = 1e-8  # of the largest singular value: what is less is none
 _NEAR = 0.1  # of the error: how far an average's run may be from the mean of its members'
 _MOST_STATES = 14  # of an average, or those of its smallest member
 
@@ -274,9 +275,21 @@ def _factorise(
     stacked = np.concatenate(parts) if parts else np.empty((0, 0))
     if stacked.shape[0] < 1.5 * stacked.shape[1] or not stacked.size:
         return None
-    lower = np.asarray(np.linalg.qr(stacked, mode="r")).T
-    future, past = f * n_w + 1, f * (n_w + n_y)
-    return lower[future + past :, future : future + past], lower[future + past :, future + past :]
+    # a triangle with the same inner products: what an input that stands adds is dependent, and of such columns
+    # the directions of an LQ factorisation are rounding
+    triangle = np.linalg.qr(stacked, mode="r")
+    future, past, ahead = np.split(triangle, np.cumsum([f * n_w + 1, f * (n_w + n_y)]), axis=1)
+    known = _span(future)
+    past, ahead = past - known @ (known.T @ past), ahead - known @ (known.T @ ahead)
+    state = _span(past)
+    seen = state.T @ ahead
+    return seen.T, (ahead - state @ seen).T
+
+
+def _span(columns: Array) -> Array:
+    """Return an orthonormal basis of the columns, without what only rounding spans."""
+    left, size, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(left[:, size > DEPENDENT * size.max(initial=0.0)])
 
 
 def _windows(z: Array, n_w: int, f: int) -> Array:
