@@ -19,13 +19,15 @@ output v
     dv/da_i = - q^-i v / A(q)
 
 is a shift of one filtered row as well. So an iteration costs one ``scipy.signal.lfilter`` of few rows and
-one set of normal equations, however many lags there are.
+one QR of them, however many lags there are.  Shifts are nearly alike where poles are slow: normal equations
+would leave costs that depend on rounding, and with them where the steps end.
 
 **Many structures, few searches.** The first structure of each denominator order starts from the ARX fit
 and, because that is biased towards fast poles, from real poles at several time constants between the step
-and the length of the data and from the order below with one fast pole more; the best two are refined. Every
-other structure of that order starts from its own ARX fit and from the refined denominators found so far,
-and the best of them is refined: a denominator that suits one delay is a few steps from that of another.
+and the length of the data and from the order below with one fast pole more; all go a few steps, and the best
+two to the end. Every other structure of that order starts from its own ARX fit and from the refined
+denominators found so far, and the best of them is refined: a denominator that suits one delay is a few steps
+from that of another.
 """
 
 from __future__ import annotations
@@ -35,7 +37,8 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from scipy.linalg import block_diag, cho_factor, cho_solve
+from scipy.linalg import block_diag
+from scipy.linalg.lapack import dgeqrf
 from scipy.signal import lfilter
 
 from thermogrip.datasets.arrays import Array
@@ -49,9 +52,9 @@ from thermogrip.sysid.blackbox.order_selection import (
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import Grid, bridge
 
-RIDGE = 1e-10  # of unit columns: two that are alike share their effect
-ENOUGH = 1e-5  # of the cost: a step that gains less is the last one
-ITERATIONS = 30
+DEPENDENT = 1e-11  # of unit columns: two that are alike share their effect
+ENOUGH = 1e-7  # of the cost: a step that gains less is the last one
+ITERATIONS, FEW = 100, 4  # of the best starts, and of each
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,85 +95,64 @@ class Solution:
 
     a: Array  # (na,)
     cost: float  # sum of squared residuals
-    linear: Array  # (n_drive nb + 1 + na n_segment,), numerators, the constant, initial conditions
+    shared: Array  # (n_drive nb + 1,), numerators and the constant
+    first: Array  # (n_segment, na), initial conditions
     outputs: list[Array]  # model output, segment by segment
     misses: list[Array]  # readings minus model output, 0 where lost
     columns: list[Array]
-    root: tuple[Array, bool]
-    size: Array
 
-    def normal(self, records: Records) -> tuple[Array, Array]:
-        """Return J'J and J'(y - v) of dv/da, the linear columns projected out."""
-        na, n_shared = len(self.a), len(self.linear) - len(self.a) * len(records.y)
-        gram, slope = np.zeros((na, na)), np.zeros(na)
-        cross = np.zeros((len(self.linear), na))
-        for at, (v, miss, X, known) in enumerate(zip(self.outputs, self.misses, self.columns, records.known)):
+    def slopes(self, records: Records) -> tuple[Array, Array]:
+        """Return T and t of |T da - t|^2, the cost with the linear columns projected out of dv/da."""
+        na, parts = len(self.a), []
+        for v, miss, X, known in zip(self.outputs, self.misses, self.columns, records.known):
             filtered = lfilter([1.0], np.append(1.0, self.a), v)
             J = np.zeros((na, len(v)))
             for i in range(1, na + 1):
                 J[i - 1, i:] = -filtered[:-i]
-            J *= known
-            gram, slope, both = gram + J @ J.T, slope + J @ miss, X @ J.T
-            cross[:n_shared] += both[:n_shared]
-            cross[n_shared + at * na : n_shared + (at + 1) * na] = both[n_shared:]
-        cross /= self.size[:, None]
-        return gram - cross.T @ cho_solve(self.root, cross, check_finite=False), slope
+            parts.append(np.vstack([X[len(self.shared) :], X[: len(self.shared)], J * known, miss]))
+        whole, _ = _triangles(parts, na)
+        at = len(self.shared)
+        return whole[at : at + na, at : at + na], whole[at : at + na, -1]
 
     def filter(self, records: Records, nb: int, delay: int) -> Filter:
         """Return the filter of these numbers."""
-        end = records.n_drive * nb
-        b = self.linear[:end].reshape(-1, nb)
-        first = self.linear[end + 1 :].reshape(len(records.y), -1)
-        return Filter(self.a, b, float(self.linear[end]), delay, first)
+        b = self.shared[:-1].reshape(-1, nb)
+        return Filter(self.a, b, float(self.shared[-1]), delay, self.first)
 
 
 def solve(a: Array, records: Records, nb: int, delay: int) -> Solution | None:
     """Solve for b, c and the initial conditions at this denominator; None where it is unstable."""
     if not _stable(a):
         return None
-    na, n_shared = len(a), records.n_drive * nb + 1
-    n_all = n_shared + na * len(records.y)
-    tests = np.zeros((2, records.longest))
-    tests[0, 0], tests[1] = 1.0, 1.0
-    impulse, step = lfilter([1.0], np.append(1.0, a), tests, axis=1)
-    gram, right, columns = np.zeros((n_all, n_all)), np.zeros(n_all), []
-    for at, known in enumerate(records.known):
-        X = _columns(a, records, at, nb, delay, impulse, step)
-        columns.append(X)
-        y, own = np.where(known, records.y[at], 0.0), slice(n_shared + at * na, n_shared + (at + 1) * na)
-        square, product = X @ X.T, X @ y
-        gram[:n_shared, :n_shared] += square[:n_shared, :n_shared]
-        gram[:n_shared, own] = square[:n_shared, n_shared:]
-        gram[own, :n_shared] = square[n_shared:, :n_shared]
-        gram[own, own] = square[n_shared:, n_shared:]
-        right[:n_shared] += product[:n_shared]
-        right[own] = product[n_shared:]
-    size = np.maximum(np.sqrt(np.diag(gram)), 1e-12)
-    gram = gram / size / size[:, None]
-    gram[np.diag_indices_from(gram)] += RIDGE
-    root = cho_factor(gram, lower=True, check_finite=False)
-    linear = cho_solve(root, right / size, check_finite=False) / size
+    n_shared = records.n_drive * nb + 1
+    impulse, step = _responses(a, records)
+    segments = range(len(records.y))
+    columns = [_columns(a, records, at, nb, delay, impulse, step) for at in segments]
+    right = [np.where(known, y, 0.0) for known, y in zip(records.known, records.y)]
+    shared, first = _least([X[n_shared:] for X in columns], [X[:n_shared] for X in columns], right)
     outputs, misses = [], []
-    for at, (X, known) in enumerate(zip(columns, records.known)):
-        own = slice(n_shared + at * na, n_shared + (at + 1) * na)
-        part = np.concatenate([linear[:n_shared], linear[own]])
+    for at, known in enumerate(records.known):
         # where a reading is lost the columns are empty, yet the model runs on
-        whole = X if known.all() else _columns(a, records, at, nb, delay, impulse, step, lost=True)
-        outputs.append(part @ whole)
+        whole = columns[at]
+        if not known.all():
+            whole = _columns(a, records, at, nb, delay, impulse, step, lost=True)
+        outputs.append(shared @ whole[:n_shared] + first[at] @ whole[n_shared:])
         misses.append(np.where(known, records.y[at] - outputs[-1], 0.0))
     cost = float(sum(miss @ miss for miss in misses))
-    return Solution(a, cost, linear, outputs, misses, columns, root, size)
+    return Solution(a, cost, shared, first, outputs, misses, columns)
 
 
-def refine(start: Solution, records: Records, nb: int, delay: int) -> Solution:
+def refine(start: Solution, records: Records, nb: int, delay: int, most: int = ITERATIONS) -> Solution:
     """Return where Levenberg-Marquardt steps over the denominator no longer lower the cost."""
     best, damping = start, 1e-3
-    for _ in range(ITERATIONS):
+    for _ in range(most):
         before = best.cost
-        gram, slope = best.normal(records)
-        weight = np.diag(np.maximum(np.diag(gram), 0.0) + 1e-12)
+        T, t = best.slopes(records)
+        weight = np.diag(np.linalg.norm(T, axis=0) + 1e-12)
         for _ in range(8):
-            trial = solve(best.a + np.linalg.solve(gram + damping * weight, slope), records, nb, delay)
+            rows, right = np.vstack([T, np.sqrt(damping) * weight]), np.append(t, np.zeros(len(t)))
+            move = np.linalg.lstsq(rows, right, rcond=None)[0]
+            trial = solve(best.a + move, records, nb, delay)
             if trial is not None and trial.cost < before:
                 best, damping = trial, damping / 5
                 break
@@ -178,6 +160,50 @@ def refine(start: Solution, records: Records, nb: int, delay: int) -> Solution:
         if before - best.cost < ENOUGH * before:
             break
     return best
+
+
+def _cost(found: Solution) -> float:
+    return found.cost
+
+
+def _triangles(parts: Sequence[Array], na: int) -> tuple[Array, list[Array]]:
+    """Return R of the QR of all rows [own | rest], the own columns of each part projected out, and R by part.
+
+    The parts are transposed, (na + n_rest, n).  Normal equations would square the condition, and columns
+    that are shifts of one another are nearly dependent.
+    """
+    own = [_triangle(part.T) for part in parts]
+    rest = [R[na:, na:] for R in own]
+    return (rest[0] if len(rest) == 1 else _triangle(np.concatenate(rest))), own
+
+
+def _triangle(rows: Array) -> Array:
+    """Return the square R of a QR."""
+    n = rows.shape[1]
+    if len(rows) < n:
+        rows = np.pad(rows, ((0, n - len(rows)), (0, 0)))
+    return np.asarray(np.triu(dgeqrf(rows)[0][:n]))
+
+
+def _least(own: Sequence[Array], shared: Sequence[Array], right: Sequence[Array]) -> tuple[Array, Array]:
+    """Return the least-squares weights of the shared columns, and those of each part's own ones."""
+    na, n_own = len(own[0]), len(own) * len(own[0])
+    whole, by_part = _triangles([np.vstack(trio) for trio in zip(own, shared, right)], na)
+    R = np.zeros((n_own + len(whole) - 1, n_own + len(whole)))
+    for at, part in enumerate(by_part):
+        rows = slice(at * na, (at + 1) * na)
+        R[rows, rows], R[rows, n_own:] = part[:na, :na], part[:na, na:]
+    R[n_own:, n_own:] = whole[:-1]
+    size = np.maximum(np.sqrt((R[:, :-1] ** 2).sum(axis=0)), 1e-12)
+    weights = np.linalg.lstsq(R[:, :-1] / size, R[:, -1], rcond=DEPENDENT)[0] / size
+    return weights[n_own:], weights[:n_own].reshape(-1, na)
+
+
+def _responses(a: Array, records: Records) -> Array:
+    """Return the responses of 1/A to an impulse and to a step."""
+    tests = np.zeros((2, records.longest))
+    tests[0, 0], tests[1] = 1.0, 1.0
+    return np.asarray(lfilter([1.0], np.append(1.0, a), tests, axis=1))
 
 
 def arx_start(records: Records, na: int, nb: int, delay: int) -> Array | None:
@@ -206,24 +232,16 @@ def arx_start(records: Records, na: int, nb: int, delay: int) -> Array | None:
 def fit_rest(found: Filter, records: Records) -> tuple[Filter, list[Array]]:
     """Return the filter with constant and initial conditions fitted again, and the errors left."""
     a, (n_drive, nb) = found.a, found.b.shape
-    na, end = len(a), n_drive * nb
-    tests = np.zeros((2, records.longest))
-    tests[0, 0], tests[1] = 1.0, 1.0
-    impulse, step = lfilter([1.0], np.append(1.0, a), tests, axis=1)
+    end = n_drive * nb
+    impulse, step = _responses(a, records)
     columns, right = [], []
     for at, known in enumerate(records.known):
         X = _columns(a, records, at, nb, found.delay, impulse, step)
-        own = np.zeros((1 + na * len(records.y), len(known)))
-        own[0], own[1 + at * na : 1 + (at + 1) * na] = X[end], X[end + 1 :]
-        columns.append(own)
+        columns.append(X[end:])
         right.append(np.where(known, records.y[at], 0.0) - found.b.reshape(-1) @ X[:end])
-    size = np.maximum(np.sqrt(sum(np.sum(own**2, axis=1) for own in columns)), 1e-12)
-    gram = sum(own @ own.T for own in columns) / size / size[:, None]
-    slope = sum(own @ part for own, part in zip(columns, right)) / size
-    rest = np.linalg.lstsq(gram, slope, rcond=1e-13)[0] / size
-    first = rest[1:].reshape(len(records.y), na)
-    misses = [part - rest @ own for own, part in zip(columns, right)]
-    return Filter(a, found.b, float(rest[0]), found.delay, first), misses
+    shared, first = _least([X[1:] for X in columns], [X[:1] for X in columns], right)
+    misses = [y - shared @ X[:1] - own @ X[1:] for y, X, own in zip(right, columns, first)]
+    return Filter(a, found.b, float(shared[0]), found.delay, first), misses
 
 
 def real_pole_starts(records: Records, na: int) -> list[Array]:
@@ -272,7 +290,14 @@ def _real_poles(tau: float, na: int) -> Array:
 
 
 def _stable(a: Array) -> bool:
-    return bool(np.abs(np.roots(np.append(1.0, a))).max(initial=0.0) < 1 - 1e-7)
+    """Return whether all roots lie inside of the unit circle (Schur-Cohn: every reflection is below one)."""
+    left = [value / (1 - 1e-7) ** i for i, value in enumerate(a.tolist(), start=1)]
+    while left:
+        last = left.pop()
+        if not abs(last) < 1:
+            return False
+        left = [(x - last * y) / (1 - last * last) for x, y in zip(left, left[::-1])]
+    return True
 
 
 def oe_family(
@@ -364,8 +389,9 @@ class Search:
         solved = [some for some in (solve(a, records, nb, delay) for a in starts) if some is not None]
         if not solved:
             return None
-        solved.sort(key=lambda some: some.cost)
-        refined = [refine(some, records, nb, delay) for some in solved[: 1 if known else 2]]
-        best = min(refined, key=lambda some: some.cost)
+        if not known:  # the start of the least cost need not lead to it
+            solved = [refine(some, records, nb, delay, FEW) for some in solved]
+        solved.sort(key=_cost)
+        best = min((refine(some, records, nb, delay) for some in solved[: 1 if known else 2]), key=_cost)
         self._found[na] = [best.a, *known][:2]
         return best.filter(records, nb, delay)

@@ -11,11 +11,11 @@ with Gamma = [C; CA; ...; CA^(f-1)].  The LQ factorisation of [W_f; Z_p; Y_f] ta
     [Z_p] = [L21 L22      ] Q',        L32 = Gamma X projected,
     [Y_f]   [L31 L32 L33  ]
 
-and the left singular vectors of S L32 span Gamma: S = I is PO-MOESP (Verhaegen), and
-S = (L32 L32' + L33 L33')^(-1/2) is CVA (Larimore).  A follows from the shift of Gamma, C is its first block
-row; poles that it puts outside of the unit circle are moved inside (:func:`stabilised`).  B, E, the constant
-and one initial state per segment enter the *simulated* output linearly, so they are a least-squares fit of
-the free run, not of one step.
+(of rows that depend on others, as with an input that moves once, what is new) and the left singular vectors
+of S L32 span Gamma: S = I is PO-MOESP (Verhaegen), and S = (L32 L32' + L33 L33')^(-1/2) is CVA (Larimore).  A
+follows from the shift of Gamma, C is its first block row; poles that it puts outside of the unit circle are
+moved inside (:func:`stabilised`).  B, E, the constant and one initial state per segment enter the *simulated*
+output linearly, so they are a least-squares fit of the free run, not of one step.
 
 The average of several such models is one of low order, by balanced truncation (:func:`average`).
 
@@ -211,7 +211,8 @@ def average(grid: Grid, members: Sequence[Fitted]) -> StateSpaceModel:
     starts = [np.concatenate(x0) - np.concatenate(rest) for x0 in zip(*(x for _, x in members))]
     mean = [np.mean(runs, axis=0) for runs in zip(*(_runs(grid, *member) for member in members))]
     miss = _rms([(segment.y - y) / scale for segment, y in zip(grid.segments, mean)])
-    left, right = balanced(A, B * w.std(axis=0), C / scale[:, None])
+    reached = B * w.std(axis=0) if w.std(axis=0).any() else np.stack(starts, axis=1)
+    left, right = balanced(A, reached, C / scale[:, None])
     least = min(model.n_x for model in models)
     for n in range(least, max(least, min(_MOST_STATES, len(A))) + 1):
         a, c = left[:n] @ A @ right[:, :n], C @ right[:, :n]
@@ -275,8 +276,8 @@ def _factorise(
     stacked = np.concatenate(parts) if parts else np.empty((0, 0))
     if stacked.shape[0] < 1.5 * stacked.shape[1] or not stacked.size:
         return None
-    # a triangle with the same inner products: what an input that stands adds is dependent, and of such columns
-    # the directions of an LQ factorisation are rounding
+    # a triangle with the same inner products; of an input that hardly moves columns are dependent, and the
+    # directions that a QR gives those are rounding
     triangle = np.linalg.qr(stacked, mode="r")
     future, past, ahead = np.split(triangle, np.cumsum([f * n_w + 1, f * (n_w + n_y)]), axis=1)
     known = _span(future)

@@ -361,3 +361,20 @@ def test_refits_that_err_more_than_half_as_much_again_are_left_out(monkeypatch, 
         assert found.refits == tuple(range(2, n + 2))
         assert said == [(k / n, "oe, refits to resampled blocks") for k in (0, *range(n))]
     assert (set(made), len(made)) == ({("s", 8)}, 7 if agree == n else 2 * tried)
+
+
+@pytest.mark.parametrize("kind", ["arx", "oe", "subspace"])
+def test_rounding_of_the_readings_changes_no_choice(kind):
+    rng = np.random.default_rng(2)
+    q, noise = np.repeat([2.0, 3.0], [2, 598]), 0.3 * lfilter([1.0], [1, -0.8], rng.standard_normal(600))
+    y = 25 + lfilter([0, 0.8], [1, -0.98], q) + lfilter([0, 0.3], [1, -0.9], q) + noise
+    found = []
+    for size in (0.0, 1e-12):
+        off = 1 + size * rng.standard_normal((2, 600))
+        signals = {"q": (q * off[0], "1", "input"), "t": (y * off[1], "degC", "output")}
+        log = make_log(np.arange(600.0), signals)
+        found.append(fit_black_box(kind, [log], average=1.0).choice)
+    assert found[0].structure == found[1].structure
+    assert found[0].prior == found[1].prior
+    for structure, errors in found[0].errors.items():
+        np.testing.assert_allclose(found[1].errors[structure], errors, rtol=0.03)

@@ -10,7 +10,14 @@ from scipy.signal import lfilter
 
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.blackbox.order_selection import choose, drives
-from thermogrip.sysid.blackbox.output_error import Records, oe_family, real_pole_starts, solve, with_pole
+from thermogrip.sysid.blackbox.output_error import (
+    Records,
+    Search,
+    oe_family,
+    real_pole_starts,
+    solve,
+    with_pole,
+)
 from thermogrip.sysid.plant.log_grid import make_grid
 
 
@@ -72,11 +79,32 @@ def test_the_gradient_is_that_of_finite_differences(lost, first_order):
     grid = make_grid([log], average=1.0)
     records = Records([grid.segments[0].y[:, 0]], drives(grid, ()))
     a = np.array([-1.5, 0.56])
-    _, slope = solve(a, records, 1, 1).normal(records)
+    T, t = solve(a, records, 1, 1).slopes(records)
+    slope = T.T @ t
     for i in range(2):
         step = 1e-6 * np.eye(2)[i]
         numeric = (solve(a + step, records, 1, 1).cost - solve(a - step, records, 1, 1).cost) / 2e-6
         assert -2 * slope[i] == pytest.approx(numeric, rel=1e-3)  # Kaufman's Jacobian has the exact gradient
+
+
+@pytest.mark.parametrize("cut", [(), (900,), (300, 500)])
+def test_rounding_leaves_the_cost_and_the_fit_of_slow_poles_as_they_are(cut):
+    rng = np.random.default_rng(4)
+    poles = (0.995, 0.985, 0.97)  # the normal equations of their columns have a condition of 1e14
+    w = np.repeat(rng.random((40, 2)), 40, axis=0)
+    y = 25 + 1e-4 * w @ (1.0, 0.5)
+    y = lfilter([1.0], np.poly(poles), y - 25) + 25 + 0.1 * rng.standard_normal(1600)
+
+    def found(size):
+        part = np.split(y * (1 + size * rng.standard_normal(1600)), cut), np.split(w, cut)
+        records = Records(*part)
+        best = Search()(records, 3, 2, 1)
+        return np.append(best.a, solve(best.a, records, 2, 1).cost), best.b.sum(axis=1) / (1 + best.a.sum())
+
+    (once, gains), (again, same) = found(0.0), found(1e-12)
+    np.testing.assert_allclose(again, once, rtol=2e-5)
+    np.testing.assert_allclose(same, gains, rtol=1e-4)
+    assert once[-1] < 1.02 * 0.01 * 1600
 
 
 def test_shifted_columns_are_the_filtered_lags():

@@ -63,6 +63,23 @@ def test_a_window_with_a_lost_reading_is_left_out_and_the_rest_suffices(coupled,
     np.testing.assert_allclose(np.sort(np.abs(model.poles())), poles, atol=1e-5)
 
 
+def test_rounding_changes_no_model_of_an_input_that_moves_once():
+    rng = np.random.default_rng(8)
+    q, k = np.repeat([0.0, 1.0], [2, 298]), np.arange(300)
+    y = 60 - 35 * 0.98**k + 3 * 0.9**k + 0.2 * rng.standard_normal(300)
+    found = []
+    for size in (0.0, 1e-12):
+        off = 1 + size * rng.standard_normal((2, 300))
+        signals = {"q": (q * off[0], "1", "input"), "t": (y * off[1], "degC", "output")}
+        log = make_log(k.astype(float), signals)
+        found.append(subspace_family(make_grid([log], average=1.0), orders=(1, 2, 3), rows=(3, 8)))
+    assert len(found[0]) == 2 * (2 + 3)
+    for structure, model in found[0].items():
+        other = found[1][structure]
+        want = markov(model.A, model.spread, model.C, 9) @ model.C.T
+        np.testing.assert_allclose(markov(other.A, other.spread, other.C, 9) @ other.C.T, want, rtol=1e-6)
+
+
 def test_a_structure_with_a_term_has_one_number_more_for_each_state():
     log = make_log(
         np.arange(400.0),
