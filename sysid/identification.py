@@ -74,7 +74,7 @@ if TYPE_CHECKING:
     from thermogrip.sysid.models.model import GreyModel
 
 WITHIN_NOISE = 1.1  # of the best error: then the network is preferred, and a linear kind on another run
-LINEAR = ("arx", "oe", "bj", "subspace")  # kept where another kind errs hardly less
+LINEAR = ("arx", "oe", "armax", "bj", "subspace", "parsim")  # kept where another kind errs hardly less
 SHOWN = 12  # structures of a kind
 USEFUL = 0.5  # of the no-input error: below it a model is called good
 
@@ -296,8 +296,9 @@ def held_out_scores(rows: Sequence[Row], model: str) -> list[HeldOut]:
 
 
 MODELS = (*BLACK_BOXES, "network")
-# a Box-Jenkins model errs least on held-out parts of some logs, and more than others on another day
-USUAL_MODELS = tuple(model for model in MODELS if model != "bj")
+# these err least on held-out parts of some logs, and more than others on another day
+ON_REQUEST = ("armax", "bj", "parsim")
+USUAL_MODELS = tuple(model for model in MODELS if model not in ON_REQUEST)
 NO_DRAWS = (UserError, np.linalg.LinAlgError)  # what draws of a fit may fail with; the fit itself is sound
 
 Progress = Callable[[float, str], None]
@@ -384,7 +385,7 @@ def identify(
     inputs, outputs, disturbances : sequence of str, optional
         Names of the signals; by role where absent.
     models : sequence of str, optional
-        Candidates, of :data:`MODELS`; Box-Jenkins (``bj``) where it is asked for.
+        Candidates, of :data:`MODELS`; those of :data:`ON_REQUEST` where they are asked for.
     average : float, optional
         Averaging step of the black boxes [s]; chosen where absent.
     order, delay : int, optional

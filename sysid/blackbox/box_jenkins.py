@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_toeplitz
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.sysid.blackbox.output_error import Filter, Records, fit_rest, oe_family, refine, solve
+from thermogrip.sysid.blackbox.output_error import Filter, Records, Search, fit_rest, oe_family, refine, solve
 
 MOST_LAGS = 3  # of D
 ROUNDS = 2
@@ -46,7 +46,8 @@ def with_noise(found: Filter, records: Records) -> Filter:
         start = solve(found.a, white, nb, found.delay) if whole > rows / 2 else None  # few were lost
         if start is None:
             break
-        better = refine(start, white, nb, found.delay).filter(white, nb, found.delay)
+        at = partial(solve, records=white, nb=nb, delay=found.delay)
+        better = refine(start, white, at).filter(white, nb, found.delay)
         found, misses = fit_rest(better, records)
     return found
 
@@ -70,4 +71,20 @@ def autoregression(errors: Sequence[Array], known: Sequence[NDArray[np.bool_]]) 
     return D
 
 
-bj_family = partial(oe_family, with_noise=with_noise)
+class NoiseSearch(Search):
+    """The same, with the filter fitted again with a model of its noise."""
+
+    origin = "bj"
+
+    @staticmethod
+    def numbers(na: int) -> int:
+        """Return how many numbers an output has beside poles and zeros: the constant, the noise."""
+        return 2
+
+    def __call__(self, records: Records, na: int, nb: int, delay: int) -> Filter | None:
+        """Return the best stable filter of this structure."""
+        found = super().__call__(records, na, nb, delay)
+        return None if found is None else with_noise(found, records)
+
+
+bj_family = partial(oe_family, search=NoiseSearch)

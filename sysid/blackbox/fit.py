@@ -1,6 +1,6 @@
 """Black-box fits: choose a structure, fit it to all logs, resample it to see how certain it is.
 
-``arx``, ``oe``, ``bj``, ``subspace``, ``sindy`` and ``neural`` differ in the family of models
+The kinds (:data:`FAMILIES`) differ in the family of models
 (:class:`thermogrip.sysid.blackbox.order_selection.Family`); averaging, the choice by held-out free run and
 what the plant keeps are the same for all.  Where the averaging is not prescribed, both the averaged rate and
 the logs' own are tried: a coarse converter calls for the former, a delay for the latter.
@@ -42,6 +42,7 @@ import numpy as np
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.schema import Log
+from thermogrip.sysid.blackbox.armax import armax_family
 from thermogrip.sysid.blackbox.arx import arx_family
 from thermogrip.sysid.blackbox.box_jenkins import bj_family
 from thermogrip.sysid.blackbox.neural import neural_family
@@ -56,7 +57,7 @@ from thermogrip.sysid.blackbox.order_selection import (
 )
 from thermogrip.sysid.blackbox.output_error import oe_family
 from thermogrip.sysid.blackbox.sindy import sindy_family
-from thermogrip.sysid.blackbox.subspace import subspace_family
+from thermogrip.sysid.blackbox.subspace import parsim_family, subspace_family
 from thermogrip.sysid.data.data_quality import reading_excess
 from thermogrip.sysid.plant.fit_record import PlantScores, fit_logs
 from thermogrip.sysid.plant.log_grid import Grid, Segment, make_grid, rows_of
@@ -66,23 +67,21 @@ from thermogrip.sysid.plant.simulation import READING_EVERY
 FAMILIES: dict[str, Family] = {
     "arx": arx_family,
     "oe": oe_family,
+    "armax": armax_family,
     "bj": bj_family,
     "subspace": subspace_family,
+    "parsim": parsim_family,
     "sindy": sindy_family,
     "neural": neural_family,
 }
 BLACK_BOXES = tuple(FAMILIES)
-RESAMPLED = ("arx", "oe", "bj", "subspace", "sindy")  # a refit of a neural model takes as long as its fit
+# a refit of a neural model takes as long as its fit
+RESAMPLED = ("arx", "oe", "armax", "bj", "subspace", "parsim", "sindy")
 
-_FIXED = {  # what a kind calls its order or delay
-    ("arx", "order"): "poles",
-    ("arx", "delay"): "delays",
-    ("oe", "order"): "poles",
-    ("oe", "delay"): "delays",
-    ("bj", "order"): "poles",
-    ("bj", "delay"): "delays",
-    ("subspace", "order"): "orders",
-}
+# what a kind calls its order or delay
+_FIXED = {(kind, "order"): "poles" for kind in ("arx", "oe", "armax", "bj")}
+_FIXED |= {(kind, "delay"): "delays" for kind, _ in _FIXED}
+_FIXED |= {(kind, "order"): "orders" for kind in ("subspace", "parsim")}
 _MOST_FIXED = 20  # more poles, or steps of delay, than any record determines
 _AVERAGED = ("sindy", "neural")  # fitted at the averaged rate alone
 _MAX_ROWS = 8000  # beyond it the logs' own rate is not tried beside the averaged one
@@ -119,16 +118,17 @@ def fit_black_box(
 
     Parameters
     ----------
-    kind : {"arx", "oe", "bj", "subspace", "sindy", "neural"}
+    kind : {"arx", "oe", "armax", "bj", "subspace", "parsim", "sindy", "neural"}
     logs : sequence of Log
     inputs, outputs, disturbances : sequence of str, optional
         Names of the signals; by role where absent.
     average : float, optional
         Step [s]; both the chosen and the logs' own are tried where absent.
     order : int, optional
-        Poles of each output of ``arx``, ``oe`` and ``bj``, states of ``subspace``; searched where absent.
+        Poles of each output (states, of ``subspace`` and ``parsim``); searched where absent.
     delay : int, optional
-        Steps of the model from an input to its effect, of ``arx``, ``oe`` and ``bj``; searched where absent.
+        Steps of the model from an input to its effect, of ``arx``, ``oe``, ``armax`` and ``bj``; searched
+        where absent.
     warmup : float, optional
         Seconds whose readings set the state of a held-out stretch; 5 s for whole logs (they begin at rest),
         50 samples for stretches cut out of a log, where absent.
@@ -166,7 +166,7 @@ def fit_black_box(
     if average is None and first.dt > 1.5 * first.native and own_rows <= _MAX_ROWS and kind not in _AVERAGED:
         own = first.of(logs, average=first.native)
         grids.append(replace(own, why=f"the logs' own: held-out free runs err less than at {first.dt:.3g} s"))
-    averages = kind == "subspace"  # structures of it differ in how they see the same states
+    averages = kind in ("subspace", "parsim")  # structures of it differ in how they see the same states
     best: tuple[Grid, Choice] | None = None
     refused: UserError | None = None
     for at, grid in enumerate(grids):

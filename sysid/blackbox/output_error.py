@@ -122,27 +122,29 @@ class Solution:
 
 def solve(a: Array, records: Records, nb: int, delay: int) -> Solution | None:
     """Solve for b, c and the initial conditions at this denominator; None where it is unstable."""
-    if not _stable(a):
+    if not is_stable(a):
         return None
     n_shared = records.n_drive * nb + 1
-    impulse, step = _responses(a, records)
+    impulse, step = responses(a, records)
     segments = range(len(records.y))
-    columns = [_columns(a, records, at, nb, delay, impulse, step) for at in segments]
+    columns = [columns_of(a, records, at, nb, delay, impulse, step) for at in segments]
     right = [np.where(known, y, 0.0) for known, y in zip(records.known, records.y)]
-    shared, first = _least([X[n_shared:] for X in columns], [X[:n_shared] for X in columns], right)
+    shared, first = least_squares([X[n_shared:] for X in columns], [X[:n_shared] for X in columns], right)
     outputs, misses = [], []
     for at, known in enumerate(records.known):
         # where a reading is lost the columns are empty, yet the model runs on
         whole = columns[at]
         if not known.all():
-            whole = _columns(a, records, at, nb, delay, impulse, step, lost=True)
+            whole = columns_of(a, records, at, nb, delay, impulse, step, lost=True)
         outputs.append(shared @ whole[:n_shared] + first[at] @ whole[n_shared:])
         misses.append(np.where(known, records.y[at] - outputs[-1], 0.0))
     cost = float(sum(miss @ miss for miss in misses))
     return Solution(a, cost, shared, first, outputs, misses, columns)
 
 
-def refine(start: Solution, records: Records, nb: int, delay: int, most: int = ITERATIONS) -> Solution:
+def refine(
+    start: Solution, records: Records, at: Callable[[Array], Solution | None], most: int = ITERATIONS
+) -> Solution:
     """Return where Levenberg-Marquardt steps over the denominator no longer lower the cost."""
     best, damping = start, 1e-3
     for _ in range(most):
@@ -152,7 +154,7 @@ def refine(start: Solution, records: Records, nb: int, delay: int, most: int = I
         for _ in range(8):
             rows, right = np.vstack([T, np.sqrt(damping) * weight]), np.append(t, np.zeros(len(t)))
             move = np.linalg.lstsq(rows, right, rcond=None)[0]
-            trial = solve(best.a + move, records, nb, delay)
+            trial = at(best.a + move)
             if trial is not None and trial.cost < before:
                 best, damping = trial, damping / 5
                 break
@@ -185,7 +187,9 @@ def _triangle(rows: Array) -> Array:
     return np.asarray(np.triu(dgeqrf(rows)[0][:n]))
 
 
-def _least(own: Sequence[Array], shared: Sequence[Array], right: Sequence[Array]) -> tuple[Array, Array]:
+def least_squares(
+    own: Sequence[Array], shared: Sequence[Array], right: Sequence[Array]
+) -> tuple[Array, Array]:
     """Return the least-squares weights of the shared columns, and those of each part's own ones."""
     na, n_own = len(own[0]), len(own) * len(own[0])
     whole, by_part = _triangles([np.vstack(trio) for trio in zip(own, shared, right)], na)
@@ -199,7 +203,7 @@ def _least(own: Sequence[Array], shared: Sequence[Array], right: Sequence[Array]
     return weights[n_own:], weights[:n_own].reshape(-1, na)
 
 
-def _responses(a: Array, records: Records) -> Array:
+def responses(a: Array, records: Records) -> Array:
     """Return the responses of 1/A to an impulse and to a step."""
     tests = np.zeros((2, records.longest))
     tests[0, 0], tests[1] = 1.0, 1.0
@@ -226,20 +230,20 @@ def arx_start(records: Records, na: int, nb: int, delay: int) -> Array | None:
         return None
     size = np.maximum(np.sqrt(np.diag(gram)), 1e-12)
     a = np.asarray((np.linalg.lstsq(gram / size / size[:, None], right / size, rcond=1e-13)[0] / size)[:na])
-    return a if _stable(a) else None
+    return a if is_stable(a) else None
 
 
 def fit_rest(found: Filter, records: Records) -> tuple[Filter, list[Array]]:
     """Return the filter with constant and initial conditions fitted again, and the errors left."""
     a, (n_drive, nb) = found.a, found.b.shape
     end = n_drive * nb
-    impulse, step = _responses(a, records)
+    impulse, step = responses(a, records)
     columns, right = [], []
     for at, known in enumerate(records.known):
-        X = _columns(a, records, at, nb, found.delay, impulse, step)
+        X = columns_of(a, records, at, nb, found.delay, impulse, step)
         columns.append(X[end:])
         right.append(np.where(known, records.y[at], 0.0) - found.b.reshape(-1) @ X[:end])
-    shared, first = _least([X[1:] for X in columns], [X[:1] for X in columns], right)
+    shared, first = least_squares([X[1:] for X in columns], [X[:1] for X in columns], right)
     misses = [y - shared @ X[:1] - own @ X[1:] for y, X, own in zip(right, columns, first)]
     return Filter(a, found.b, float(shared[0]), found.delay, first), misses
 
@@ -255,7 +259,7 @@ def with_pole(a: Array) -> Array:
     return np.asarray(np.convolve(np.append(1.0, a), [1.0, -(fastest**4)])[1:])
 
 
-def _columns(
+def columns_of(
     a: Array,
     records: Records,
     at: int,
@@ -289,7 +293,7 @@ def _real_poles(tau: float, na: int) -> Array:
     return np.asarray(np.poly(roots)[1:])
 
 
-def _stable(a: Array) -> bool:
+def is_stable(a: Array) -> bool:
     """Return whether all roots lie inside of the unit circle (Schur-Cohn: every reflection is below one)."""
     left = [value / (1 - 1e-7) ** i for i, value in enumerate(a.tolist(), start=1)]
     while left:
@@ -308,28 +312,24 @@ def oe_family(
     delays: Sequence[int] = (1, 2, 3),
     terms: Sequence[tuple[str, ...]] | None = None,
     only: Structure | None = None,
-    with_noise: Callable[[Filter, Records], Filter] | None = None,
+    search: type[Search] | None = None,
 ) -> Mapping[Structure, StateSpaceModel]:
-    """Return an output-error model for each structure that has a stable one.
-
-    ``with_noise`` fits a filter again with a model of its noise.
-    """
-    out, numbers = {}, 2 if with_noise else 1  # beside poles and zeros: the constant, the noise
-    searches = [Search() for _ in grid.outputs]
+    """Return a model for each structure that has a stable one, by ``search`` of output error where absent."""
+    out, kind = {}, search or Search
+    searches = [kind() for _ in grid.outputs]
     # magnitudes and signed squares, never products with a switch that moves in one log alone
     for some in default_terms(grid, switched=False) if terms is None else terms:
         w = drives(grid, some)
         records = [Records([s.y[:, i] for s in grid.segments], w) for i in range(len(grid.outputs))]
         for na, nb, nk in product(poles, zeros, delays):
             label = f"na {na}, nb {nb}, delay {nk}" + (f", with {', '.join(some)}" if some else "")
-            structure = Structure(label, (na + w[0].shape[1] * nb + numbers) * len(grid.outputs))
+            structure = Structure(label, (na + w[0].shape[1] * nb + kind.numbers(na)) * len(grid.outputs))
             if only not in (None, structure):
                 continue
-            found = [search(part, na, nb, nk) for search, part in zip(searches, records)]
-            fits = [(each, part) for each, part in zip(found, records) if each is not None]
-            if len(fits) == len(found):
-                filters = [with_noise(*fit) if with_noise else fit[0] for fit in fits]
-                out[structure] = assemble(grid, filters, some, origin="bj" if with_noise else "oe")
+            found = [each(part, na, nb, nk) for each, part in zip(searches, records)]
+            filters = [each for each in found if each is not None]
+            if len(filters) == len(found):
+                out[structure] = assemble(grid, filters, some, origin=kind.origin)
     return out
 
 
@@ -376,22 +376,39 @@ def _first_states(filters: Sequence[Filter], held: Array, segment: int) -> Array
 class Search:
     """Fits one output, structure by structure, and remembers the denominators that it found."""
 
+    origin = "oe"
+
     def __init__(self) -> None:
         self._found: dict[int, list[Array]] = {}
 
+    @staticmethod
+    def numbers(na: int) -> int:
+        """Return how many numbers an output has beside poles and zeros."""
+        return 1
+
     def __call__(self, records: Records, na: int, nb: int, delay: int) -> Filter | None:
         """Return the best stable filter of this structure, None where no start leads to one."""
+        best = self._search(records, na, nb, delay, lambda a: solve(a, records, nb, delay))
+        return None if best is None else best.filter(records, nb, delay)
+
+    def starts(self, records: Records, na: int) -> list[Array]:
+        """Return denominators where the search begins, beside that of ARX."""
+        return [*real_pole_starts(records, na), *map(with_pole, self._found.get(na - 1, [])[:1])]
+
+    def _search(
+        self, records: Records, na: int, nb: int, delay: int, at: Callable[[Array], Solution | None]
+    ) -> Solution | None:
         known = self._found.get(na, [])
-        starts = known or [*real_pole_starts(records, na), *map(with_pole, self._found.get(na - 1, [])[:1])]
+        starts = known or self.starts(records, na)
         regressed = arx_start(records, na, nb, delay)
         if regressed is not None:
             starts = [regressed, *starts]
-        solved = [some for some in (solve(a, records, nb, delay) for a in starts) if some is not None]
+        solved = [some for some in map(at, starts) if some is not None]
         if not solved:
             return None
         if not known:  # the start of the least cost need not lead to it
-            solved = [refine(some, records, nb, delay, FEW) for some in solved]
+            solved = [refine(some, records, at, FEW) for some in solved]
         solved.sort(key=_cost)
-        best = min((refine(some, records, nb, delay) for some in solved[: 1 if known else 2]), key=_cost)
+        best = min((refine(some, records, at) for some in solved[: 1 if known else 2]), key=_cost)
         self._found[na] = [best.a, *known][:2]
-        return best.filter(records, nb, delay)
+        return best

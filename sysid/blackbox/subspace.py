@@ -17,6 +17,17 @@ follows from the shift of Gamma, C is its first block row; poles that it puts ou
 moved inside (:func:`stabilised`).  B, E, the constant and one initial state per segment enter the *simulated*
 output linearly, so they are a least-squares fit of the free run, not of one step.
 
+**PARSIM-K** (Pannocchia and Calosi).  With the innovation e = y - C x and A_K = A - K C,  x+ = A_K x + B w
++ K y, so a reading i rows ahead is linear in the past and in the drives and *readings* between,
+
+    Y_f = Gamma_K L Z_p + H_K W_f + G_K Y_f + E,        Gamma L = (I - G_K)^-1 Gamma_K L,
+
+H_K and G_K strictly lower triangular.  The e of a row depends on none of what it is regressed on, even where
+w was fed back from y, so every row is a regression of its own; PO-MOESP and CVA take the future drives for
+independent of the noise, and are biased by feedback.  (The paper goes on with A_K and K, which asks the past
+to be longer than any memory; solved for Gamma, a short one does.)  A drive that acts on its own row's reading
+is one that ends at its row (``Grid.ends``), which the folds choose.
+
 The average of several such models is one of low order, by balanced truncation (:func:`average`).
 
 Several logs are side by side in the Hankel matrices; a window that touches a gap or a lost reading is left
@@ -33,6 +44,7 @@ next reading and a free run ask for different models of low order.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -55,7 +67,6 @@ Array = NDArray[np.float64]
 
 Fitted = tuple[StateSpaceModel, Sequence[Array]]  # with the initial state of each segment
 
-_WEIGHTINGS = ("moesp", "cva")
 DEPENDENT = 1e-8  # of the largest singular value: what is less is none
 _NEAR = 0.1  # of the error: how far an average's run may be from the mean of its members'
 _MOST_STATES = 14  # of an average, or those of its smallest member
@@ -68,6 +79,7 @@ def subspace_family(
     rows: Sequence[int] | None = None,
     terms: Sequence[tuple[str, ...]] | None = None,
     only: Structure | None = None,
+    weightings: Sequence[str] = ("moesp", "cva"),
 ) -> Mapping[Structure, StateSpaceModel]:
     """Return a model for each order, number of block rows f and weighting that the data allow.
 
@@ -83,7 +95,7 @@ def subspace_family(
     for some in sets:
         names = {
             (f, w, n): _structure(n, f, w, some, n_drive, n_y)
-            for f, w, n in product(sizes, _WEIGHTINGS, orders)
+            for f, w, n in product(sizes, weightings, orders)
             if n < f
         }
         wanted = {of: name for of, name in names.items() if asked is None or name in asked}
@@ -105,11 +117,15 @@ def _realised(
     out: dict[tuple[int, str, int], Fitted] = {}
     readings = _readings(grid, terms) if wanted else []
     for f in dict.fromkeys(f for f, _, _ in wanted):
-        factor = _factorise(grid, readings, f, terms)
-        if factor is None:
+        triangle = _triangle(grid, readings, f, terms)
+        if triangle is None:
             continue
+        n_y = len(grid.outputs)
         for weighting in dict.fromkeys(w for size, w, _ in wanted if size == f):
-            gamma, _ = extended_observability(*factor, n_y=len(grid.outputs), weighting=weighting)
+            if weighting == "parsim":
+                gamma = predictor_observability(triangle, f, n_y)
+            else:
+                gamma, _ = extended_observability(*_factorise(triangle, f, n_y), n_y=n_y, weighting=weighting)
             for n in (n for size, w, n in wanted if (size, w) == (f, weighting) and n < gamma.shape[1]):
                 out[f, weighting, n] = _realise(grid, gamma[:, :n], terms)
     return out
@@ -263,28 +279,51 @@ def stabilised(A: Array, rows: int) -> Array:
     return np.asarray(np.real(vectors * poles @ np.linalg.pinv(vectors)))
 
 
-def _factorise(
-    grid: Grid, readings: Sequence[Array], f: int, terms: tuple[str, ...]
-) -> tuple[Array, Array] | None:
-    """Return L32 and L33 of the LQ factorisation, signals at unit spread; None with too few windows."""
+def _triangle(grid: Grid, readings: Sequence[Array], f: int, terms: tuple[str, ...]) -> Array | None:
+    """Return R of the QR of all windows, signals at unit spread; None with too few windows."""
     signals = [np.hstack(pair) for pair in zip(drives(grid, terms), readings)]
     whole = np.concatenate(signals)
     mean, size = np.nanmean(whole, axis=0), np.nanstd(whole, axis=0)
-    n_y = len(grid.outputs)
-    n_w = whole.shape[1] - n_y
+    n_w = whole.shape[1] - len(grid.outputs)
     parts = [_windows((z - mean) / np.where(size > 0, size, 1.0), n_w, f) for z in signals if len(z) > 2 * f]
     stacked = np.concatenate(parts) if parts else np.empty((0, 0))
     if stacked.shape[0] < 1.5 * stacked.shape[1] or not stacked.size:
         return None
-    # a triangle with the same inner products; of an input that hardly moves columns are dependent, and the
+    return np.asarray(np.linalg.qr(stacked, mode="r"))
+
+
+def _factorise(triangle: Array, f: int, n_y: int) -> tuple[Array, Array]:
+    """Return L32 and L33 of the LQ factorisation."""
+    # the triangle has the same inner products; of an input that hardly moves columns are dependent, and the
     # directions that a QR gives those are rounding
-    triangle = np.linalg.qr(stacked, mode="r")
-    future, past, ahead = np.split(triangle, np.cumsum([f * n_w + 1, f * (n_w + n_y)]), axis=1)
+    future, past, ahead = _parts(triangle, f, n_y)
     known = _span(future)
     past, ahead = past - known @ (known.T @ past), ahead - known @ (known.T @ ahead)
     state = _span(past)
     seen = state.T @ ahead
     return seen.T, (ahead - state @ seen).T
+
+
+def _parts(triangle: Array, f: int, n_y: int) -> tuple[Array, Array, Array]:
+    """Return the columns [W_f, 1], [W_p, Y_p] and Y_f of windows."""
+    future, past, ahead = np.split(triangle, [-f * n_y - (triangle.shape[1] - 1) // 2, -f * n_y], axis=1)
+    return future, past, ahead
+
+
+def predictor_observability(triangle: Array, f: int, n_y: int) -> Array:
+    """Return the columns that span Gamma, from one-step predictors of every future row."""
+    future, past, ahead = _parts(triangle, f, n_y)
+    n_w, n_z = (future.shape[1] - 1) // f, past.shape[1]
+    by_past, by_readings = np.zeros((f * n_y, n_z)), np.eye(f * n_y)
+    for row in range(f):
+        known = np.hstack([past, ahead[:, : row * n_y], future[:, : row * n_w], future[:, -1:]])
+        at = slice(row * n_y, (row + 1) * n_y)
+        weights = np.linalg.lstsq(known, ahead[:, at], rcond=DEPENDENT)[0].T
+        by_past[at], by_readings[at, : row * n_y] = weights[:, :n_z], -weights[:, n_z : n_z + row * n_y]
+    constant = future[:, -1:]
+    apart = past - constant @ (constant.T @ past) / (constant.T @ constant)
+    left, values, _ = np.linalg.svd(np.linalg.solve(by_readings, by_past) @ apart.T, full_matrices=False)
+    return np.asarray(left * np.sqrt(values))
 
 
 def _span(columns: Array) -> Array:
@@ -308,3 +347,6 @@ def _windows(z: Array, n_w: int, f: int) -> Array:
     ]
     rows = np.hstack(parts)
     return np.asarray(rows[np.isfinite(rows).all(axis=1)])
+
+
+parsim_family = partial(subspace_family, weightings=("parsim",))

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation import Band, FreeRun
 
-MODELS = ("arx", "oe", "bj", "subspace", "sindy", "neural", "network")
-USUAL_MODELS = ",".join(model for model in MODELS if model != "bj")
+MODELS = ("arx", "oe", "armax", "bj", "subspace", "parsim", "sindy", "neural", "network")
+USUAL_MODELS = ",".join(model for model in MODELS if model not in ("armax", "bj", "parsim"))
 DEFAULT_NETWORK = "gripper"  # of --grow
 NO_POSTERIOR = "no posterior: the model that was kept is a black box, only networks have parameters to sample"
 
@@ -67,15 +67,22 @@ def identify(
     columns: cli.Columns = None,
     dt: cli.Step = None,
     models: Annotated[
-        str, cli.opt("--models", "LIST", "Which candidate models to fit, of these and bj.", _known_models)
+        str,
+        cli.opt(
+            "--models",
+            "LIST",
+            "Which candidate models to fit, of these, armax, bj and parsim.",
+            _known_models,
+        ),
     ] = USUAL_MODELS,
     average: Average = None,
     order: Annotated[
         int | None,
-        cli.opt("--order", "N", "Poles of ARX, OE and BJ, states of subspace models.", min=1, max=20),
+        cli.opt("--order", "N", "Poles of ARX, OE, ARMAX and BJ, states of subspace models.", min=1, max=20),
     ] = None,
     delay: Annotated[
-        int | None, cli.opt("--delay", "N", "Delay of ARX, OE and BJ, in steps of the model.", min=1, max=20)
+        int | None,
+        cli.opt("--delay", "N", "Delay of ARX, OE, ARMAX and BJ, in steps of the model.", min=1, max=20),
     ] = None,
     leave_one_out: Annotated[
         bool, cli.flag("--leave-one-out", "Score each log by a fit to the others.")

@@ -15,6 +15,7 @@ from thermogrip.sysid.blackbox.subspace import (
     average,
     balanced,
     extended_observability,
+    parsim_family,
     stabilised,
     subspace_family,
 )
@@ -238,3 +239,29 @@ def test_an_average_is_fitted_where_each_member_can_be(coupled):
     np.testing.assert_allclose(model.gain(), np.mean(gains, axis=0), rtol=1e-6)
     long = tuple(subspace_family(grid, orders=(2,), rows=(5, 30)))
     assert not subspace_family(make_grid([coupled.log(150)], average=1.0), only=Structure("x", 7, long))
+
+
+def test_parsim_is_consistent_under_feedback_and_moesp_is_not():
+    pole, K, errors = 0.9, 0.6, {"moesp": [], "parsim": []}
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        r, e = 0.5 * rng.standard_normal((2, 4000))
+        x, y, q = np.zeros(2), np.zeros(4000), np.zeros(4000)
+        for k in range(4000):
+            y[k] = x[0] + e[k]
+            q[k] = r[k] - 0.5 * y[k]  # a proportional controller
+            x = np.array([pole * x[0] + x[1] + K * e[k], 0.5 * x[1] + 0.4 * q[k]])
+        signals = {"q": (q, "1", "input"), "t": (y, "degC", "output")}
+        grid = make_grid([make_log(np.arange(4000.0), signals)], average=1.0)
+        for weighting, off in errors.items():
+            found = subspace_family(grid, orders=(2,), rows=(8,), terms=((),), weightings=(weighting,))
+            off.append(np.abs(next(iter(found.values())).poles()).max() - pole)
+    assert np.abs(errors["parsim"]).max() < 0.04
+    assert np.max(errors["moesp"]) < -0.1
+
+
+def test_parsim_finds_the_markov_parameters_of_the_plant_without_feedback(coupled):
+    grid = make_grid([coupled.log(3000, reading=1e-3)], average=1.0)
+    (model,) = parsim_family(grid, orders=(2,), rows=(15,), terms=((),)).values()
+    wanted = markov(coupled.A, coupled.B, coupled.C, 20)
+    np.testing.assert_allclose(markov(model.A, model.B, model.C, 20), wanted, atol=2e-3)

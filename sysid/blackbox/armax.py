@@ -1,0 +1,89 @@
+"""ARMAX models: the equation error of ARX is a moving average, with one more polynomial.
+
+    A(q) y[k] = sum_j B_j(q) w_j[k - n_k] + c + C(q) e[k],     C(q) = 1 + c_1 q^-1 + ... + c_na q^-na,
+
+for each output, e white: what one innovation of the state-space form leaves in one reading.  C = 1 is ARX,
+C = A output error.  Given C, the one-step errors e = (A y - B w - c) / C are linear in a, b and c, so only
+C is iterated (variable projection, as in :mod:`thermogrip.sysid.blackbox.output_error`), with
+
+    de/dc_i = - q^-i e / C(q).
+
+Rows before the record enter A y in its first na rows alone, where an impulse each takes them up.  A line
+replaces a lost reading, and rows that need one carry no weight.  The plant keeps B/A, with constant and
+initial conditions fitted to its free run; noise is not simulated.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+from scipy.signal import lfilter
+
+from thermogrip.datasets.arrays import Array
+from thermogrip.sysid.blackbox.output_error import (
+    Filter,
+    Records,
+    Search,
+    Solution,
+    columns_of,
+    fit_rest,
+    is_stable,
+    least_squares,
+    oe_family,
+    responses,
+)
+
+
+def solve_armax(c: Array, records: Records, nb: int, delay: int) -> Solution | None:
+    """Solve for a, b, the constant and what begins a segment at this C; None where 1/C is unstable.
+
+    ``shared`` of the solution are a, b and the constant, its ``outputs`` -e, whose slopes by C are those of
+    an output-error model by A.
+    """
+    if not is_stable(c):
+        return None
+    na, n_shared = len(c), len(c) + records.n_drive * nb + 1
+    impulse, step = responses(c, records)
+    columns, right = [], []
+    for at, (y, known) in enumerate(zip(records.y, records.known)):
+        rows = np.arange(len(y))
+        whole = np.interp(rows, rows[known], y[known]) if known.any() else np.zeros(len(y))
+        late = np.zeros((na, len(y)))
+        filtered, used = lfilter([1.0], np.append(1.0, c), whole), known.copy()
+        for i in range(1, na + 1):
+            late[i - 1, i:] = -filtered[:-i]
+            used[i:] &= known[:-i]
+        X = np.vstack([late, columns_of(c, records, at, nb, delay, impulse, step, lost=True)])
+        columns.append(X * used)
+        right.append(filtered * used)
+    shared, first = least_squares([X[n_shared:] for X in columns], [X[:n_shared] for X in columns], right)
+    misses = [y - shared @ X[:n_shared] - own @ X[n_shared:] for y, X, own in zip(right, columns, first)]
+    cost = float(sum(miss @ miss for miss in misses))
+    return Solution(c, cost, shared, first, [-miss for miss in misses], misses, columns)
+
+
+class ArmaxSearch(Search):
+    """Fits one output, structure by structure, and remembers each C that it found."""
+
+    origin = "armax"
+
+    @staticmethod
+    def numbers(na: int) -> int:
+        """Return how many numbers an output has beside poles and zeros: the constant, C."""
+        return 1 + na
+
+    def starts(self, records: Records, na: int) -> list[Array]:
+        """Return where the search for C begins: at that of ARX, and where that for A would."""
+        return [np.zeros(na), *super().starts(records, na)]
+
+    def __call__(self, records: Records, na: int, nb: int, delay: int) -> Filter | None:
+        """Return the best stable filter of this structure, None where no start leads to one."""
+        best = self._search(records, na, nb, delay, partial(solve_armax, records=records, nb=nb, delay=delay))
+        if best is None or not is_stable(best.shared[:na]):
+            return None
+        b = best.shared[na:-1].reshape(-1, nb)
+        return fit_rest(Filter(best.shared[:na], b, 0.0, delay, np.zeros((len(records.y), na))), records)[0]
+
+
+armax_family = partial(oe_family, search=ArmaxSearch)
