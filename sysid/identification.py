@@ -20,10 +20,11 @@ geometric mean over the folds; where the paired excess is within one standard er
 of structures, else the smallest one, and a linear one before others.  One or two logs do not show what
 differs between runs: of the error on another run, whose gain differs
 (:mod:`thermogrip.sysid.validation.prediction_bands`), 5 percent count as no difference among linear kinds,
-and 10 percent beside others.  On whole logs, and beside a network, that of the least held-out error over that
-of a model without input; the network also when it is within 10 percent of the
-best, for its parameters mean something.  A model that no output shows to beat a model without input (see
-:mod:`thermogrip.sysid.validation.free_run`) is never called good.
+and 10 percent beside others; where even no error at all would be within them neural models are not fitted.
+On whole logs, and beside a network, that of the least held-out error over that of a model without input; the
+network also when it is within 10 percent of the best, for its parameters mean something.  A model that no
+output shows to beat a model without input (see :mod:`thermogrip.sysid.validation.free_run`) is never called
+good.
 """
 
 from __future__ import annotations
@@ -184,14 +185,35 @@ def choose_black_box(fits: Sequence[BlackBoxFit], between: Mapping[str, float]) 
     others = [fit for fit in fits if fit.kind not in LINEAR]
     if not (linear and others):
         return _preferred(fits)
-    grid = fits[0].grid
+    run, other = _run_error(fits[0], between), _preferred(others)
+    excess = _least(linear, run) - _fold_errors(other, run)
+    hardly = excess.mean() <= np.log(WITHIN_NOISE) if run else excess_within_noise(excess)
+    return _preferred(linear) if hardly else other
+
+
+def beyond_reach(fits: Sequence[BlackBoxFit], between: Mapping[str, float]) -> bool:
+    """Return whether even another kind without any error on the folds would not replace the linear fits."""
+    linear = [fit for fit in fits if fit.kind in LINEAR]
+    run = _run_error(linear[0], between) if linear else 0.0
+    return run > 0 and float(_least(linear, run).mean() - np.log(run)) <= np.log(WITHIN_NOISE)
+
+
+def _run_error(fit: BlackBoxFit, between: Mapping[str, float]) -> float:
+    """Return what differences between runs add, in units of the outputs' spread."""
+    grid = fit.grid
     added = [between.get(name, 0.0) / spread for name, spread in zip(grid.outputs, grid.output_spread())]
-    simple, other = _preferred(linear), _preferred(others)
-    run = float(np.sqrt(np.mean(np.square(added))))
-    least = min((_fold_errors(fit, run) for fit in linear), key=np.mean)
-    excess = least - _fold_errors(other, run)
-    hardly = excess.mean() <= np.log(WITHIN_NOISE) if any(added) else excess_within_noise(excess)
-    return simple if hardly else other
+    return float(np.sqrt(np.mean(np.square(added))))
+
+
+def _least(fits: Sequence[BlackBoxFit], run: float) -> Array:
+    return min((_fold_errors(fit, run) for fit in fits), key=np.mean)
+
+
+def _between(fits: Sequence[BlackBoxFit], logs: Sequence[Log]) -> dict[str, float]:
+    """Return what a large difference of gain adds to each output, by the best linear fit (else any)."""
+    linear = [fit for fit in fits if fit.kind in LINEAR] or fits
+    least = min(linear, key=lambda fit: fit.choice.error)
+    return _rms(between_runs(least.plant, logs, RUN_GAIN_LARGE))
 
 
 def _preferred(fits: Sequence[BlackBoxFit]) -> BlackBoxFit:
@@ -451,8 +473,7 @@ def identify(
     fits, rows, refused = _fit_all(boxes, logs, settings, parts, workers)
     best = None
     if fits:
-        least = min(fits, key=lambda fit: fit.choice.error)
-        best = choose_black_box(fits, _rms(between_runs(least.plant, logs, RUN_GAIN_LARGE)))
+        best = choose_black_box(fits, _between(fits, logs))
     if leave_one_out:
         finalists = candidates
     else:
@@ -601,23 +622,47 @@ def _for_network(
 def _fit_all(
     boxes: Sequence[str], logs: Sequence[Log], settings: dict[str, Any], parts: _Parts, workers: Workers
 ) -> tuple[list[BlackBoxFit], list[Row], list[str]]:
-    """Return each black box fitted to all logs, the rows of its folds, and why others could not be fitted."""
+    """Return each black box fitted to all logs, the rows of its folds, and why others could not be fitted.
+
+    Neural models take longest, so one by one they come last, and not at all where they are beyond reach.
+    """
+    found: dict[str, BlackBoxFit | str] = {}
+
+    def pointless() -> bool:
+        fits = [some for kind, some in found.items() if kind != "neural" and isinstance(some, BlackBoxFit)]
+        return bool(fits) and beyond_reach(fits, _between(fits, logs))
+
     if workers == 1:
-        found = []
-        for kind in boxes:
-            found.append(_fit_or_refusal((kind, logs, settings | {"progress": parts.part(kind)})))
+        for kind in sorted(boxes, key=lambda kind: kind == "neural"):
+            if kind != "neural" or not pointless():
+                report = parts.part(kind)
+                found[kind] = _fit_or_refusal((kind, logs, settings | {"progress": report}))
+                if report is not None:
+                    report(1.0, _in_short(found[kind]))
             parts.next()
     else:
         report = parts.part("black boxes", of=len(boxes))
-        # the neural one takes longest, so it begins first
         order = sorted(boxes, key=lambda kind: kind != "neural")
         items = [(kind, logs, settings) for kind in order]
-        done = dict(zip(order, run_parallel(_fit_or_refusal, items, workers, report, what="fitting")))
-        found = [done[kind] for kind in boxes]
+        done = run_parallel(_fit_or_refusal, items, workers, report, what="fitting")
+        found = dict(zip(order, done))
         parts.next(len(boxes))
-    fits = [each for each in found if isinstance(each, BlackBoxFit)]
+    if "neural" in boxes and pointless():
+        found["neural"] = (
+            "neural: left out, for even without any error on held-out parts it would not be kept: another "
+            "run differs by more than the linear models err (--models neural fits it)"
+        )
+    every = [found[kind] for kind in boxes]
+    fits = [each for each in every if isinstance(each, BlackBoxFit)]
     rows = [row for each in fits for row in fold_rows(each)]
-    return fits, rows, [each for each in found if isinstance(each, str)]
+    return fits, rows, [each for each in every if isinstance(each, str)]
+
+
+def _in_short(found: BlackBoxFit | str) -> str:
+    if isinstance(found, str):
+        return "refused"
+    choice = found.choice
+    return f"{choice.structure.label}, errs {100 * choice.error:.1f} % of the spread on held-out parts"
 
 
 def _fit_or_refusal(item: tuple[str, Sequence[Log], dict[str, Any]]) -> BlackBoxFit | str:

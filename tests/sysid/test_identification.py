@@ -18,7 +18,14 @@ from thermogrip.datasets.schema import make_log
 from thermogrip.sysid import Plant, identification, identify
 from thermogrip.sysid.blackbox.fit import fit_black_box
 from thermogrip.sysid.blackbox.order_selection import Structure, folds, held_out_runs
-from thermogrip.sysid.identification import SHOWN, Held, choose_black_box, stated_error, warm_up_of_fit
+from thermogrip.sysid.identification import (
+    SHOWN,
+    Held,
+    beyond_reach,
+    choose_black_box,
+    stated_error,
+    warm_up_of_fit,
+)
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import HeldOut, PlantScores, fit_logs
 from thermogrip.sysid.validation.free_run import free_run
@@ -128,6 +135,33 @@ def test_another_kind_is_compared_with_the_linear_one_that_errs_least(neural, ch
     average = fit_of("subspace", [0.048] * 4, logs=("a",), members=(Structure("s", 3),))
     fits = [fit_of("neural", [neural] * 4, logs=("a",)), fit_of("oe", [0.044] * 4, logs=("a",)), average]
     assert choose_black_box(fits, {"t": 0.14}).kind == chosen
+
+
+@pytest.mark.parametrize(
+    ("oe", "run", "out"),  # sqrt(1.1^2 - 1) = 0.458 of what differs between runs
+    [(0.0318, 0.14, True), (0.0324, 0.14, False), (0.001, 0.0, False)],
+)
+def test_a_kind_is_beyond_reach_where_even_no_error_would_not_replace_the_linear_one(oe, run, out):
+    fits = [fit_of("oe", [oe] * 4, logs=("a",)), fit_of("arx", [0.3] * 4, logs=("a",))]
+    assert beyond_reach(fits, {"t": run}) == out
+    perfect = [*fits, fit_of("neural", [1e-9] * 4, logs=("a",))]
+    assert (choose_black_box(perfect, {"t": run}).kind == "oe") == out
+    assert not beyond_reach([fit_of("sindy", [0.0] * 4)], {"t": run})
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_neural_models_that_could_not_be_kept_are_left_out_with_the_reason(workers):
+    said = []
+    found = identify(
+        plant_log(500), models=["neural", "oe"], average=2.0, draws=0, workers=workers,
+        progress=lambda _, what: said.append(what),
+    )  # fmt: skip
+    assert found.model == "oe"
+    assert {row.model for row in found.rows} == {"oe"}
+    assert any(note.startswith("neural: left out, for even without any error") for note in found.notes)
+    if workers == 1:
+        assert any(what.startswith("oe: na ") and "of the spread on held-out parts" in what for what in said)
+        assert not any(what.startswith("neural") for what in said)
 
 
 def test_what_was_searched_is_listed_with_its_errors_and_a_fixed_order_leaves_others_out():
