@@ -321,13 +321,10 @@ _REST = 10.0  # s at the present temperature, of which the plant takes its state
 def by_plant(
     plant: Plant, now: float, *, t_ambient: float, output: str = "t_surface", longest: float = 900.0
 ) -> Callable[[float], float]:
-    """Return the time [s] from temperature ``now`` [degC] to another, for ``choose_next_touch(seconds=...)``;
-    infinite beyond ``longest`` [s].
-
-    It is when the plant's free run at full ``drive``, pump on, from rest first passes the other one; a
-    controller that settles there takes a little longer.  A plant without that output or an input ``drive`` is
-    a :class:`UserError`.
-    """
+    """Return the time [s] from temperature ``now`` [degC] to another, for ``choose_next_touch(seconds=...)``:
+    when the plant's free run at full ``drive``, pump on, from rest first passes it (a controller that settles
+    there takes a little longer), infinite beyond ``longest`` [s]; a plant without that output or input is a
+    :class:`UserError`."""
     for name, there in ((output, plant.outputs), ("drive", plant.inputs)):
         if name not in there:
             raise UserError(f"the plant has no {name!r}", hint=known_names(name, there, "it has {}"))

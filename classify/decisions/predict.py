@@ -277,10 +277,8 @@ def unexplained_answers(
     classifier: GraspClassifier, X: Records, rows: Sequence[Row], stated: tuple[float, float] | None = None
 ) -> list[Deviation]:
     """Return for each row of predictions the misfit under its material, and in words what that does not
-    explain; NaN and empty as for :func:`reasons`.
-
-    ``stated`` is the range of unknown object temperatures [degC].
-    """
+    explain, with unknown object temperatures in the range ``stated`` [degC]; NaN and empty as for
+    :func:`reasons`."""
     out = [Deviation(np.nan, "")] * len(rows)
     for model, at, data, ends, named in _single_named(classifier, X, rows, stated):
         hypotheses = _taken_for(model.device_, named, finish=model.finish)

@@ -483,12 +483,9 @@ class Stream:
 def stop_callback(
     classifier: GraspClassifier, rule: StopRule, *, candidates: Sequence[str] | None = None
 ) -> Callable[[Grasps], bool]:
-    """Return a function of the one grasp so far that returns whether the rule ends the contact.
-
-    A session calls it after each sample (``stop`` of :func:`thermogrip.rig.session.session.run_session`) and
-    knows nothing else of classifiers.  It uses the record's ``t_object`` and ``t_ambient``, never its
-    ``material``.
-    """
+    """Return a function of the one grasp so far, its ``t_object`` and ``t_ambient`` and never its
+    ``material``, that returns whether the rule ends the contact; a session calls it after each sample
+    (``stop`` of :func:`thermogrip.rig.session.session.run_session`) and knows nothing else of classifiers."""
     stream: Stream | None = None
 
     def stop(grasp: Grasps) -> bool:

@@ -144,11 +144,9 @@ def _linear_weights(time: tuple[float, ...], names: tuple[str, ...], last: float
 
 
 def feature_noise(grasps: Grasps, names: Sequence[str]) -> Floats:
-    """Return the covariance that the noise of the sensor gives features in kelvin, (n_grasp, n, n).
-
-    The noise of a grasp is read from the second differences of its trace.  Of a time constant, which is a
-    ratio of responses, it is the relative noise of the fitted rise.
-    """
+    """Return the covariance that the noise of the sensor, read from a trace's second differences, gives
+    features in kelvin, (n_grasp, n, n); of a time constant, a ratio of responses, it is that of the fitted
+    rise."""
     time = tuple(np.asarray(grasps["time"].values, dtype=float).tolist())
     shape = _noise_shape(time, tuple(names))
     noise = _sample_noise(grasps)[:, None, None] ** 2 * shape

@@ -58,8 +58,8 @@ def train_network(
     threads: int = 1,
 ) -> tuple[dict[str, Reals], NDArray[np.float64]]:
     """Return the trained weights, named, shaped and as precise as PyTorch's ``weights``, and the mean cross
-    entropy of each epoch, from series ``x`` (n_series, n_time, S), their classes and the rows of each batch.
-    """
+    entropy of each epoch, from series ``x`` (n_series, n_time, S), their classes and the rows of each
+    batch."""
     sizes = np.cumsum([value.size for value in weights.values()])
     flat = np.concatenate([value.ravel() for value in weights.values()])
     real = flat.dtype.type

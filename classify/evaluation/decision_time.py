@@ -103,10 +103,8 @@ def decision_times(
     progress: Progress | None = None,
 ) -> Decisions:
     """Return when each classifier would have ended the contacts at a stated ``error``, evaluated at ``times``
-    [s], and whether it was right then; the other arguments are those of ``evaluate``.
-
-    Conditions with two touches, or with objects of unknown temperature, are left out.
-    """
+    [s], and whether it was right then, without conditions that have two touches or objects of unknown
+    temperature; the other arguments are those of ``evaluate``."""
     followed = {name: c for name, c in classifiers.items() if c.reads_beginnings or c.fits_in_a_blink}
     notes = [
         f"{n}: training it for each window takes long, left out" for n in classifiers if n not in followed

@@ -28,17 +28,13 @@ _TELLING_VALUES = 10
 
 @dataclass(frozen=True)
 class Fold:
-    """One condition in one repeat.
-
-    ``train`` are its training grasps, ``test`` its test grasps; ``apart`` is whether it is not pooled with
-    others, because its blocks were touched twice or their temperature is unknown.
-    """
+    """One condition in one repeat."""
 
     condition: str
     repeat: int
     train: Grasps
     test: Grasps
-    apart: bool
+    apart: bool  # not pooled with others: its blocks were touched twice or their temperature is unknown
 
     @property
     def candidates(self) -> tuple[str, ...]:

@@ -219,11 +219,8 @@ def record_loop(
     stops: list[int],
     band: float,
 ) -> ClosedLoop:
-    """Return the record of a run: targets and readings [degC] and moves by sample, a segment for each stop
-    and controlled output.
-
-    ``stops`` are the samples at which the segments end, ``band`` is that of settling [degC].
-    """
+    """Return the record of a run: targets and readings [degC] and moves by sample, a segment, which ends at
+    one of the samples ``stops``, for each stop and controlled output; ``band`` is that of settling [degC]."""
     model = truth.model
     y = np.stack(truth.y)
     fine = np.asarray(model.dt * np.arange(y.shape[0]), dtype=np.float64)

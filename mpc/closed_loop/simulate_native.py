@@ -34,12 +34,9 @@ def compiled_loop(
     band: float = 0.25,
     seed: int = 0,
 ) -> ClosedLoop:
-    """Run a compiled controller against a plant as :func:`simulate_closed_loop` does, with the same
-    arguments.
-
-    The plant has the same signals; its equations and its step may be others. The record has no advices and no
-    step times. A controller that is not compiled is a ValueError.
-    """
+    """Run a compiled controller (else a ValueError) as :func:`simulate_closed_loop` does, with the same
+    arguments, against a plant of the same signals whose equations and step may be others; the record has no
+    advices and no step times."""
     if controller.c is None:
         raise ValueError("the controller is not compiled")
     around = Surroundings() if surroundings is None else surroundings
@@ -62,12 +59,9 @@ def compiled_loop(
 def _loop_in_c(
     c: CompiledController, observed: Array, truth: Truth, target: Array
 ) -> tuple[Array, Array, NDArray[np.int32]]:
-    """Run the loop from an observer's flat estimate to targets (n, n_controlled) [degC]; what the plant did
-    is left in ``truth.y``.
-
-    Returns readings (n, n_y + n_d), outputs first, drives (n, n_u), and places (n,) in
-    :data:`thermogrip.mpc.interface.STATUSES`.
-    """
+    """Run the loop from an observer's flat estimate to targets (n, n_controlled) [degC]; return readings (n,
+    n_y + n_d), outputs first, drives (n, n_u), and places (n,) in :data:`thermogrip.mpc.interface.STATUSES`,
+    and leave in ``truth.y`` what the plant did."""
     model, around, n = truth.model, truth.around, len(target)
     noise = around.noise * truth.rng.standard_normal((n, model.n_y))
     d_offset = np.array([around.offset.get(name, 0.0) for name in model.disturbances])

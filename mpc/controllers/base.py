@@ -72,8 +72,7 @@ class SampledController:
 
     def _given(self, reading: Readings, target: Target) -> tuple[Array, Array, Array, str]:
         """Return outputs, disturbances and targets in force [degC], and what is wrong; a stale reading is
-        none.
-        """
+        none."""
         wanted, wrong = self._wanted(target)
         self._target = wanted
         y, d = self._read(reading)
@@ -82,10 +81,8 @@ class SampledController:
         return y, d, wanted, wrong
 
     def _wanted(self, target: Target) -> tuple[Array, str]:
-        """Return targets (n_controlled,) [degC] and what was wrong with them; the last good one stays.
-
-        A single number is the target of every controlled output.
-        """
+        """Return targets (n_controlled,) [degC], the last good one staying and a single number being that of
+        every controlled output, and what was wrong with them."""
         controlled = self.controlled
         if isinstance(target, Mapping):
             wanted = np.array([self._clean(target, name) for name in controlled])
@@ -101,8 +98,7 @@ class SampledController:
 
     def _within(self, u: Array, seconds: float) -> Array:
         """Return drives (n_u,) that are finite, in range, and within the slew limit of so many seconds; range
-        wins over slew.
-        """
+        wins over slew."""
         before = np.clip(self._u, self.lowest, self.highest)
         slew = self.slew * (seconds / self.dt)
         slewed = np.clip(np.where(np.isfinite(u), u, self._neutral), before - slew, before + slew)

@@ -116,9 +116,8 @@ def check_export(
     sanitize: bool = True,
     progress: Progress | None = None,
 ) -> Agreement:
-    """Build an export (with sanitizers too), step it from so many random states, and compare with Python;
-    a UserError where there is no gcc, or it refuses the code.
-    """
+    """Build an export (with sanitizers too), step it from so many random states, and compare with Python; a
+    UserError where there is no gcc, or it refuses the code."""
     if compiler() is None:
         raise UserError("no gcc here to build the export with", hint="install gcc, or leave --check out")
     _make(export.folder, "all", *(("sanitized",) if sanitize else ()))
@@ -186,10 +185,8 @@ class _Twin(Controller):
     _rests: tuple[tuple[Array, Array, Array], ...] = ()
 
     def random_rest(self, rng: np.random.Generator) -> tuple[Array, Array, Array]:
-        """Return readings, measured disturbances and state at rest somewhere in the valid range.
-
-        A rest is a program to solve, which takes longer than a step: there are a few hundred of them.
-        """
+        """Return readings, measured disturbances and state at rest somewhere in the valid range, one of a few
+        hundred: each is a program to solve, which takes longer than a step."""
         if len(self._rests) < _RESTS:
             low, high = _range_of(self)
             y = rng.uniform(low, high) + 0.02 * (high - low) * rng.normal(size=self.model.n_y)

@@ -44,12 +44,9 @@ class LinearLaw:
 def linear_move(
     controller: ControllerParts, optimiser: Optimiser | None = None
 ) -> tuple[Array, Array, Array]:
-    """Return H of the QP, and the plan's gains on the free response and on the drive before.
-
-    They are those of :meth:`thermogrip.mpc.optimiser.rti.Optimiser.linear_gains`, linearised where the plant
-    settles without drive, or where it rests if it settles nowhere; by default the optimiser is the
-    controller's own.
-    """
+    """Return H of the QP and the plan's gains on the free response and on the drive before, as
+    :meth:`thermogrip.mpc.optimiser.rti.Optimiser.linear_gains`, by default of the controller's own optimiser,
+    linearised where the plant settles without drive, or where it rests if it settles nowhere."""
     model, design = controller.model, controller.design
     optimiser = controller.optimiser if optimiser is None else optimiser
     rest, u, d = model.at_rest(design.ambient)

@@ -66,10 +66,8 @@ _LEAST_WEIGHT = 1e-6  # of a drive: without one, two drives on one output would 
 
 def regulator_gain(A: Array, B: Array, C: Array, *, track: float, move: Array, drive: Array) -> Array:
     """Return the gain K (n_u, n_x + n_u) of du = -K (x - x_s, u_before - u_s) for weights of the outputs'
-    errors, of moves (n_u,), and of drives (n_u,).
-
-    A LinAlgError is raised where the Riccati equation has no stabilising solution.
-    """
+    errors, of moves (n_u,), and of drives (n_u,); LinAlgError: the Riccati equation has no stabilising
+    solution."""
     n_x, n_u = B.shape
     whole = np.block([[A, B], [np.zeros((n_u, n_x)), np.eye(n_u)]])
     into = np.vstack([B, np.eye(n_u)])
@@ -167,9 +165,8 @@ class LQRController(SampledController):
         return self._answer(status, said, started)
 
     def propose(self, target: Array, samples: float = 1.0) -> Array:
-        """Return the drives (n_u,) before their limits for targets (n_controlled,) [degC]: their mean over
-        so many samples, at least one.
-        """
+        """Return the drives (n_u,) before their limits for targets (n_controlled,) [degC]: their mean over so
+        many samples, at least one."""
         law, observer, n_x = self._law(target), self.observer, self.model.n_x
         proposed = self._neutral.copy()
         if law is None:

@@ -124,10 +124,8 @@ class PIController(SampledController):
         self.times.reset()
 
     def step(self, reading: Readings, target: Target) -> Move:
-        """Return the move for this sample.
-
-        A lost reading holds the drive of its loop for ``patience_s``, then it goes to rest; the others go on.
-        """
+        """Return the move for this sample; a lost reading holds the drive of its loop for ``patience_s``,
+        then it goes to rest, and the others go on."""
         started = self.clock()
         self.times.call(reading)
         if not self.times.due:
@@ -151,9 +149,8 @@ class PIController(SampledController):
         return self._answer(status, advice, started)
 
     def propose(self, y: Array, target: Array, d: Array, *, seconds: float | None = None) -> Array:
-        """Return the limited drives (n_u,) after so many seconds, and integrate; readings y
-        (n_controlled,) are NaN where lost, d (n_d,) feeds the holding drive [degC].
-        """
+        """Return the limited drives (n_u,) after so many seconds, and integrate; readings y (n_controlled,)
+        are NaN where lost, d (n_d,) feeds the holding drive [degC]."""
         seconds = self.dt if seconds is None else seconds
         ahead, error = self._feedforward(target, d), target - y
         self._begun = np.where(np.isfinite(self._begun), self._begun, y)
@@ -175,10 +172,8 @@ class PIController(SampledController):
         self._u = np.asarray(u, dtype=float)
 
     def follow(self, u: Array, y: Array, target: Array, d: Array) -> None:
-        """Set the integrators so that the next proposal starts from drives u (n_u,): a bumpless take-over.
-
-        The other arguments are those of :meth:`propose`.
-        """
+        """Set the integrators so that the next proposal, with the arguments of :meth:`propose`, starts from
+        drives u (n_u,): a bumpless take-over."""
         self._u, self._begun = np.asarray(u, dtype=float), target
         ahead, error = self._feedforward(target, d), target - y
         for at, (loop, (j, i)) in enumerate(zip(self.loops, self._ends)):

@@ -28,8 +28,7 @@ SAME = 1e-6
 
 class CallTimes:
     """The times of the calls of a controller of sample time ``dt`` [s]: ``seconds`` since the last call (0
-    where the reading is ``stale``), ``since`` the last move that a fresh reading led to.
-    """
+    where the reading is ``stale``), ``since`` the last move that a fresh reading led to."""
 
     def __init__(self, dt: float) -> None:
         self.dt = dt
@@ -93,10 +92,8 @@ class CallTimes:
 
 
 def shifted(plan: Array, samples: float) -> Array:
-    """Return what is ahead of a plan (N, n_u) after so many samples; its last row stays.
-
-    Between two samples a row of it is the mean of the drives that were planned for those seconds.
-    """
+    """Return what is ahead of a plan (N, n_u) after so many samples, its last row staying; between two
+    samples a row is the mean of the drives that were planned for those seconds."""
     last = len(plan) - 1
     samples = min(samples, float(last))
     whole = math.floor(samples + SAME)
@@ -108,11 +105,8 @@ def shifted(plan: Array, samples: float) -> Array:
 
 
 def opening(plan: Array, samples: float) -> Array:
-    """Return the mean drives (n_u,) of a plan (N, n_u) over its first so many samples, at least one.
-
-    A controller that is called late will be called late again, and its move is held until then: held at
-    their mean, drives do to a slow plant what they would have done one after the other.
-    """
+    """Return the mean drives (n_u,) of a plan (N, n_u) over its first so many samples, at least one: held
+    until the next late call, they do to a slow plant what the plan would have done one after the other."""
     samples = min(samples, float(len(plan)))
     whole = math.floor(samples + SAME)
     if whole < 1 or (whole == 1 and samples - whole <= SAME):

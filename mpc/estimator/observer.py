@@ -119,8 +119,7 @@ def resting_state(
     model: PredictionModel, x: Array, v: Array, level: float, d: Array, *, unit: Array
 ) -> RestingState:
     """Return where a plant at rest may be, linearised at state x (n_x,) and drive v (n_u,), for a mean
-    reading ``level`` [degC]; ``unit`` (n_x,) is what counts as 1 degC of each state.
-    """
+    reading ``level`` [degC]; ``unit`` (n_x,) is what counts as 1 degC of each state."""
     after, A, B, E = model.linearise(x, v, d)
     away = np.eye(model.n_x) - A
     push = after - A @ x + B @ (model.neutral - v)
@@ -147,8 +146,7 @@ def resting_state(
 @lru_cache(maxsize=16)
 def resting_state_in_room(model: PredictionModel, ambient: float, unit: tuple[float, ...]) -> RestingState:
     """Return :func:`resting_state` linearised where all rests in a room of ``ambient`` [degC], or amid what
-    the logs showed.
-    """
+    the logs showed."""
     x, v, d = model.at_rest(ambient)
     level = float(np.mean(model.usual(ambient)))
     rest = resting_state(model, x, v, level, d, unit=np.array(unit))
@@ -343,10 +341,8 @@ class Observer:
         self._P = P
 
     def hold_drives(self, weak: Mask) -> None:
-        """Stop learning the bias of drives (n_u,) whose gain is weak or has turned over.
-
-        There a bias explains nothing, or everything with the wrong sign; the other disturbances go on.
-        """
+        """Stop learning the bias of drives (n_u,) whose gain is weak or has turned over, where a bias
+        explains nothing or everything with the wrong sign; the other disturbances go on."""
         self._held[self.model.n_x : self._n] = (self.disturbance.on_drive * weak[:, None]).any(axis=0)
 
     def reset(self, y: Array, d: Array) -> None:

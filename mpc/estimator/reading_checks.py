@@ -85,8 +85,7 @@ class ReadingMonitor:
 
     def screen(self, y: Array, expected: Array) -> tuple[Array, Mask]:
         """Return a reading y (n_y,) [degC], NaN where it cannot be, and which of its sensors (n_y,) have
-        jumped and stay there; ``expected`` (n_y,) is the prediction.
-        """
+        jumped and stay there; ``expected`` (n_y,) is the prediction."""
         fresh = np.isfinite(y) & (y != self._last)
         self._last = np.where(np.isfinite(y), y, self._last)
         self._moved = np.where(fresh, 0.0, self._moved)

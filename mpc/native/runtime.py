@@ -183,12 +183,9 @@ class CompiledController:
         time_s: float = np.nan,
         applied: Array | None = None,
     ) -> tuple[Array, int, int]:
-        """Do one step of the whole controller in C; return drives (n_u,), pump, and the place in
-        :data:`thermogrip.mpc.interface.STATUSES`.
-
-        Readings, disturbances and targets are in degC, NaN where lost; without a time one sample has passed,
-        without ``applied`` (n_u,) the last answer was.
-        """
+        """Do one step of the whole controller in C and return drives (n_u,), pump, and the place in
+        :data:`thermogrip.mpc.interface.STATUSES`, for readings, disturbances and targets in degC, NaN where
+        lost; without a time one sample has passed, without ``applied`` (n_u,) the last answer was."""
         given = [np.ascontiguousarray(values, float) for values in (y, d, target)]
         did = None if applied is None else np.ascontiguousarray(applied, float)
         drive, over, what = np.zeros(self.sizes.NU), ctypes.c_double(), np.zeros(4, dtype=np.int32)

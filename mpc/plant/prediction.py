@@ -117,11 +117,9 @@ class PredictionModel:
         self.sub = self._fewest_steps()
 
     def _fewest_steps(self) -> int:
-        """Return into how few steps a sample may be cut with a full swing of the drives within 0.01 degC.
-
-        A plant's own step is chosen for identification; an implicit network is as good for control at four
-        times that, and a controller's time goes into these steps.
-        """
+        """Return into how few steps a sample may be cut with a full swing of the drives within 0.01 degC: an
+        implicit network is as good for control at four times its own step, and a controller's time goes into
+        these."""
         own = self.sub
         d = np.full(self.n_d, ROOM)
         x = self.rest(self.usual(ROOM), d)[None, :]
@@ -498,12 +496,8 @@ def holding_drive(
     model: PredictionModel, controlled: tuple[str, ...], target: ArrayLike, d: ArrayLike
 ) -> Holding:
     """Return the drives inside their range that hold the controlled outputs nearest to target (n_controlled,)
-    [degC].
-
-    Nearest in the least-squares sense, started from the best of a coarse grid: beyond an optimum there are
-    two drives for one temperature, and the smaller one wins. For an integrator, which rests at any
-    temperature or at none, the drives that balance it there; they may lie outside their range.
-    """
+    [degC] in the least-squares sense, the smaller of two beyond an optimum; of an integrator, which rests at
+    any temperature or at none, those that balance it there, which may lie outside their range."""
     wanted = np.asarray(target, dtype=float).reshape(len(controlled))
     d = np.asarray(d, dtype=float)
     rows = [model.outputs.index(name) for name in controlled]

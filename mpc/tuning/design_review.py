@@ -416,8 +416,7 @@ def beyond_logs(
     controller: Controller, target: float | Mapping[str, float], *, grasps: bool = False
 ) -> list[str]:
     """Return a sentence for each thing that a session will do and the plant's logs have not done: targets
-    [degC] outside them, a pump that stops for ``grasps``.
-    """
+    [degC] outside them, a pump that stops for ``grasps``."""
     wanted = target if isinstance(target, Mapping) else dict.fromkeys(controller.controlled, float(target))
     said = []
     for output, value in wanted.items():
@@ -527,10 +526,8 @@ def loops_of(controller: Controller, draws: int) -> list[LinearLoop]:
 
 
 def eigenvalues(loops: Sequence[LinearLoop]) -> Check:
-    """Largest eigenvalue of plant, observer and unconstrained move, around the middle of the range.
-
-    A slow part of the plant that the loop leaves as it is, a heatsink say, is no fault of the loop.
-    """
+    """Largest eigenvalue of plant, observer and unconstrained move, around the middle of the range; a slow
+    part of the plant that the loop leaves as it is, a heatsink say, is no fault of the loop."""
     name = "closed loop is stable"
     sizes = [largest_eigenvalue(loop.matrix) for loop in loops]
     nominal, worst = sizes[0], max(sizes)

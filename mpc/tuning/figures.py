@@ -86,9 +86,8 @@ def closed_loop_figure(
 
 
 def step_time_figure(seconds: Mapping[str, ArrayLike], deadline_s: float, dt: float) -> Figure:
-    """Draw how long the steps took (given in s, drawn in ms, logarithmic), beside the deadline and the
-    sample time.
-    """
+    """Draw how long the steps took (given in s, drawn in ms, logarithmic), beside the deadline and the sample
+    time."""
     figure, [[axis]] = panels(1, 1, size=(8.6, 2.2))
     shown = {name: 1e3 * np.asarray(values, float) for name, values in seconds.items()}
     everything = np.concatenate([values[values > 0] for values in shown.values()] or [np.ones(1)])

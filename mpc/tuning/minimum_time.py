@@ -40,8 +40,7 @@ _CLIMBS = 12
 
 def full_drive_bound(plant: Plant, design: Design, step: tuple[float, float], spec: Spec) -> float:
     """Return the shortest time [s] in which a step (start, target) [degC] can settle, whatever the
-    controller; NaN where it cannot within ``hold_s``.
-    """
+    controller; NaN where it cannot within ``hold_s``."""
     return max(_Race(plant, design, step, spec, name).shortest_time() for name in design.controlled)
 
 

@@ -123,9 +123,8 @@ def trial(
     length_s: float,
     seed: int,
 ) -> ClosedLoop:
-    """Run a step (start, target) [degC] of the spec on one draw of the plant for so many seconds, wholly
-    in C where the controller is in C.
-    """
+    """Run a step (start, target) [degC] of the spec on one draw of the plant for so many seconds, wholly in C
+    where the controller is in C."""
     loop: Callable[..., ClosedLoop] = simulate_closed_loop
     if isinstance(controller, Controller) and controller.c is not None:
         from thermogrip.mpc.closed_loop.simulate_native import compiled_loop as loop
@@ -167,8 +166,7 @@ Bounds = dict[tuple[float, float, int], float]
 
 def score(results: Sequence[StepResult], spec: Spec, bounds: Bounds) -> float:
     """Return the score of a set of trials, see the module's text; lower is better; ``bounds`` are shortest
-    times [s].
-    """
+    times [s]."""
     costs: tuple[list[float], list[float]] = [], []
     for result in results:
         bound = bounds[(result.start, result.target, result.draw % STRUCTURE)]
@@ -358,10 +356,8 @@ class Search:
         return run_trials(self.made(name, design), self.plant, self.spec, [draw], seed=self.check_seed)
 
     def made(self, name: str, design: Design) -> Regulator:
-        """Return the controller of a design: ``"PI"`` and ``"LQR"`` are such, any other name is an MPC.
-
-        Filter and optimiser are in C where there is a compiler.
-        """
+        """Return the controller of a design, ``"PI"``, ``"LQR"`` or by any other name an MPC, with filter and
+        optimiser in C where there is a compiler."""
         if name == "PI":
             return PIController.of(self.plant, self.baseline, design.loops)
         controller = self._controller(design)
@@ -404,11 +400,9 @@ def parameters_of(design: Design, spec: Spec) -> dict[str, float]:
 
 
 def scaled_loops(loops: tuple[PILoop, ...], factors: dict[str, float]) -> tuple[PILoop, ...]:
-    """Return PI loops with each number times its factor; feed-forward and setpoint weight as they are given.
-
-    Tt is given as a share of Ti.  A step of the load leaves an integrated error of Ti / Kc: at most half more
-    than that of the loops given.
-    """
+    """Return PI loops with each number times its factor, feed-forward and setpoint weight as given and Tt as
+    a share of Ti; a step of the load leaves an integrated error of Ti / Kc, at most half more than that of
+    the loops given."""
     Ti = min(factors["Ti"], 1.5 * factors["Kc"])
     return tuple(
         replace(

@@ -425,8 +425,7 @@ def _spread(certain: bool) -> Array:
 
 def _optimise(item: tuple[Search, str, list[dict[str, float]], int, Progress | None]) -> list[Trial]:
     """Minimise a controller's score over its parameters' logarithms from the best of its starts on; return
-    every trial.
-    """
+    every trial."""
     search, name, starts, evaluations, progress = item
     if evaluations < 1:
         return []

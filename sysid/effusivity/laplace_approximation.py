@@ -96,11 +96,8 @@ _ALIKE_SD = 1.0  # K
 
 
 class Prior(NamedTuple):
-    """Mean and standard deviation of u, (n_pair, 7) each.
-
-    Where ``dof`` (n_pair, 7) is given and finite, the prior is Student's t with so many degrees of freedom
-    and ``sd`` as its scale: a spread estimated from few grasps is itself uncertain.
-    """
+    """Mean and sd of u, (n_pair, 7) each; where ``dof`` (n_pair, 7) is given and finite, Student's t with so
+    many degrees of freedom and scale ``sd``: a spread estimated from few grasps is itself uncertain."""
 
     mean: Array
     sd: Array
@@ -541,12 +538,9 @@ def fit_pairs(
     start: Array | None = None, max_steps: int = 20, noise: tuple[Array, Array] | None = None,
     prior: Prior | None = None,
 ) -> Mode:  # fmt: skip
-    """Return the modes of pairs, hypothesis i against touch ``row[i]``.
-
-    The parameters of an uncertain gripper are integrated over, a second sensor is used.  ``noise`` and
-    ``prior`` are what :func:`~thermogrip.sysid.effusivity.data.whiten` and :func:`prior_of` give, where a
-    caller has them.
-    """
+    """Return the modes of pairs, hypothesis i against touch ``row[i]``, integrated over an uncertain
+    gripper's parameters, a second sensor used; ``noise`` and ``prior`` are
+    :func:`~thermogrip.sysid.effusivity.data.whiten` and :func:`prior_of` where a caller has them."""
     prior = prior_of(gripper, data.take(row), hypotheses) if prior is None else prior
     mode = _own_modes(gripper, data, row, hypotheses, prior, start, max_steps, noise)
     n, second = (data.count[row] > 0).sum(axis=1), gripper.second
@@ -596,13 +590,10 @@ def hypotheses_of_second(gripper: GripperModel, second: GripperModel, one: Hypot
 
 
 def joined_modes(first: Mode, prior: Prior, second: Mode, own: Prior, apart: float) -> Mode:
-    r"""Return the modes of one object that two sensors touched.
-
-    The object's temperature x, which a reading is linear in, is common to both.  What the second sensor saw
-    of it is the ratio of its posterior and its prior, a normal likelihood of precision
-    :math:`1/V_2 - 1/V_{02}`; its thermometer reads ``apart`` [K] more than the first one's, give or take
-    0.3 K.  All else is each sensor's own.
-    """
+    r"""Return the modes of one object that two sensors touched, with its temperature x common to both: what
+    the second saw of x is its posterior over its prior, a normal likelihood of precision :math:`1/V_2 -
+    1/V_{02}`, its thermometer ``apart`` [K] above the first one's, give or take 0.3 K; all else is each
+    sensor's own."""
     seen, width = _seen_temperature(second, own)
     off = seen - apart - first.u[:, T_OBJECT]
     variance = first.covariance[:, T_OBJECT, T_OBJECT] + width + _SENSORS_APART**2

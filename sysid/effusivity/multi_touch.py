@@ -115,11 +115,9 @@ class Coupling:
 
     @property
     def touch_sd(self) -> float:
-        """Return the error of a temperature that a touch finds, beyond its noise [K].
-
-        Two touches show the sum of the block's own AR(1) drift, of variance s^2 / 2 here, and of their two
-        errors, s^2 / 4 each; which is which is not identifiable.
-        """
+        """Return the error of a temperature that a touch finds, beyond its noise [K]: two touches show the
+        sum of the block's own AR(1) drift, of variance s^2 / 2 here, and of their errors, s^2 / 4 each, which
+        are not identifiable apart."""
         return 0.5 * self.sd
 
     def to_dict(self) -> dict[str, float]:
@@ -319,11 +317,8 @@ def touch_groups(grasps: Grasps) -> dict[str, Rows]:
 
 
 def rested_long(grasps: Grasps, coupling: Coupling | None = None) -> Mask:
-    """Return which grasps are of blocks that rested much longer than the coupling was learnt from, (n,).
-
-    From rests of one length it learns what becomes of a block in that time, and not the law: wood's face is
-    at the room's temperature long before its middle.
-    """
+    """Return which grasps, (n,), are of blocks that rested much longer than the coupling was learnt from,
+    which says nothing of the law: wood's face is at the room's temperature long before its middle."""
     label = label_values(grasps, "touch_group")
     if (label == "").all():
         return np.zeros(grasps.sizes["grasp"], dtype=bool)
@@ -342,11 +337,8 @@ def two_touch_fit(
     gripper: GripperModel, grasps: Grasps, candidates: Sequence[str | Material], *,
     coupling: Coupling | None = None, finish: str = "known", until: float | None = None,
 ) -> TouchGroups:  # fmt: skip
-    """Return the evidence of each candidate from all touches of each ``touch_group``.
-
-    Their number is free; the nominal temperature of the first alone counts, for the later ones it is what the
-    touches before left.
-    """
+    """Return the evidence of each candidate from all touches, any number, of each ``touch_group``; the
+    nominal temperature of the first alone counts, for the later ones it is what the touches before left."""
     rows = touch_groups(grasps)
     hypotheses = material_hypotheses(gripper, candidates, finish)
     view = _view(gripper, grasps, hypotheses, coupling or Coupling(), until)
@@ -363,11 +355,9 @@ def two_touch_fit(
 def free_touch_fit(
     gripper: GripperModel, grasps: Grasps, *, coupling: Coupling | None = None, until: float | None = None
 ) -> dict[str, list[GridPosterior]]:
-    """Return the posterior of a free effusivity from all touches of each group, one entry a touch.
-
-    The entries of a group share ln e and differ in the temperature and contact conductance of their touch.
-    Prior and grid are those of :func:`~thermogrip.sysid.effusivity.posterior_grid.grid_posteriors`.
-    """
+    """Return the posterior of a free effusivity from all touches of each group, one entry a touch, which
+    share ln e and differ in temperature and contact conductance; prior and grid are those of
+    :func:`~thermogrip.sysid.effusivity.posterior_grid.grid_posteriors`."""
     gripper.require_known("a question of several touches of one block")
     rows = touch_groups(grasps)
     used = coupling or Coupling()
@@ -531,11 +521,9 @@ def _prior(view: _View, at: Rows, coupling: Coupling, factor: Factor) -> tuple[A
 
 
 def _cavities(view: _View, groups: list[Rows], factors: list[Factor]) -> list[tuple[Array, Array]]:
-    """Return mean and sd (m, n) of each touch's block temperature by the other touches alone.
-
-    Where that contradicts the touch itself, the hypothesis is hopeless, and an expansion around the others'
-    temperature would reach too far: there it stays the prior.
-    """
+    """Return mean and sd (m, n) of each touch's block temperature by the other touches alone, or the prior's
+    where that contradicts the touch itself: such a hypothesis is hopeless, and an expansion there would reach
+    too far."""
     found = []
     for at, factor in zip(groups, factors):
         prior = _prior(view, at, view.coupling, factor)

@@ -111,11 +111,9 @@ def open_set(
     gripper: GripperModel, grasps: Grasps, candidates: Sequence[str | Material], *,
     prior_unknown: float = 0.1, until: float | None = None,
 ) -> OpenSet:  # fmt: skip
-    """Return log Bayes factors of "one of the candidates" against "something of any effusivity".
-
-    Arguments are those of :func:`material_fit`; the candidates have equal odds and known conductances, and
-    ``prior_unknown``, in (0, 1), is the probability that the object is none of them.
-    """
+    """Return log Bayes factors of "one of the candidates" at equal odds and known conductances against
+    "something of any effusivity", of probability ``prior_unknown`` in (0, 1); other arguments as for
+    :func:`material_fit`."""
     if not 0 < prior_unknown < 1:
         raise UserError(f"prior_unknown is {prior_unknown:g}", hint="give a probability between 0 and 1")
     evidence = material_evidence(gripper, grasps, candidates, until=until)

@@ -123,11 +123,9 @@ class GraspQuality:
 
     @property
     def undecided(self) -> Flags:
-        """Return which contacts are too short to be evaluated at their last reading, (n,).
-
-        A skin that has not moved is an insulator's, or will touch in a moment; one that has just stood still
-        in full motion may have met the end of its sensor's range; and one may have no reading yet.
-        """
+        """Return which contacts are too short to be evaluated at their last reading, (n,): of a skin that has
+        not moved (an insulator's, or about to touch), one that has just stood still in full motion (perhaps
+        at the end of its sensor's range), and one without a reading yet."""
         trace = self._trace
         unread = ~np.isfinite(trace.clean[:, trace.time > _CONTACT]).any(axis=1)
         return np.asarray(unread | trace.unmoved() | trace.begins_to_saturate())

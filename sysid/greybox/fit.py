@@ -271,11 +271,9 @@ def fit_network(
 
 
 def residual_tau(errors: Sequence[Sequence[Sequence[Array]]], least: Array) -> Array:
-    """Return bins per independent bin of each output, from the errors' autocorrelation.
-
-    tau = 1 + 2 sum rho_k, summed while rho_k > 0.05, over all stretches together; at most a twentieth of the
-    bins, so that a log never counts as fewer than twenty readings.
-    """
+    """Return bins per independent bin of each output, tau = 1 + 2 sum rho_k of the errors' autocorrelation
+    while rho_k > 0.05, over all stretches, at most a twentieth of the bins: a log never counts as fewer than
+    twenty readings."""
     out = np.array(least, dtype=float)
     for k in range(len(out)):
         series = [stretch[k] for log in errors for stretch in log if stretch[k].size > 20]

@@ -525,11 +525,9 @@ def with_draws(
     seed: int = 0,
     progress: Callable[[float, str], None] | None = None,
 ) -> Plant:
-    """Return the plant with a few plants that agree with the logs of :func:`fit_problem` as its samples.
-
-    They cost seconds where :func:`sample_posterior` costs minutes, and are for bands and closed loops: of the
-    same density, but too few for its quantiles, and they may stop short along a valley that no run sees.
-    """
+    """Return the plant with a few plants that agree with the logs of :func:`fit_problem` as its samples, for
+    bands and closed loops: in seconds where :func:`sample_posterior` takes minutes, of the same density, but
+    too few for its quantiles, and they may stop short along a valley that no run sees."""
     z = problem.standard(plant.values)
     intervals = plant.scores.intervals
     numbers = None

@@ -227,11 +227,9 @@ def second_zone(network: Network, node: str, *, tau: float | None = None) -> Can
 
 
 def lagging_air(network: Network, disturbance: str, *, tau: float = _AIR_LAG) -> Candidate:
-    """Return air about the rig that follows the measured ambient with the time constant ``tau`` [s].
-
-    It is a node of so large a capacity that the rig does not warm it.  The other way round, a sensor that
-    lags the air, would need the reading's slope, which a network does not know.
-    """
+    """Return air about the rig that follows the measured ambient with the time constant ``tau`` [s]: a node
+    of so large a capacity that the rig does not warm it, for a sensor that lags the air would need the
+    reading's slope, which a network does not know."""
     air, C, G = f"{disturbance}_near", f"C_{disturbance}_near", f"G_{disturbance}_near"
     size = _MUCH * max(network.parameters[node.capacity].value for node in network.nodes.values())
 
