@@ -66,6 +66,16 @@ class Check:
     fix: str = ""
 
 
+def _graded(
+    name: str, finding: str, *, fail: tuple[bool, str] = (False, ""), warn: tuple[bool, str] = (False, "")
+) -> Check:
+    """Return the check of a finding that fails, else warns, where the condition holds, with its fix."""
+    for verdict, (holds, fix) in (("fail", fail), ("warn", warn)):
+        if holds:
+            return Check(name, verdict, finding, fix)
+    return Check(name, "pass", finding)
+
+
 def worst(checks: Sequence[Check]) -> str:
     """Return the worst verdict of a review."""
     rank: Callable[[str], int] = _RANK.__getitem__
@@ -160,13 +170,9 @@ def lacks_structure(controller: Controller, swing: tuple[float, float]) -> Check
         f"{words}: {time}, overshoot {r.overshoot:.2f}"
         for (words, _), time, r in zip(tried, times, found, strict=True)
     ]
-    if "never" in times:
-        move = controller.design.move
-        fix = (
-            f"raise the move weight (now {move:.3g}), or identify on a log of the closed loop and tune again"
-        )
-        return Check(name, "warn", "; ".join(seen), fix)
-    return Check(name, "pass", "; ".join(seen) or "nothing is tried")
+    move = controller.design.move
+    fix = f"raise the move weight (now {move:.3g}), or identify on a log of the closed loop and tune again"
+    return _graded(name, "; ".join(seen) or "nothing is tried", warn=("never" in times, fix))
 
 
 class _Counted(Controller):
@@ -192,14 +198,12 @@ def _effort(controller: Controller, span: tuple[float, float]) -> list[Check]:
         f"{len(ms)} steps on swings across the range: median {float(np.median(ms)):.1f} ms, "
         f"p99 {p99:.1f} ms, slowest {slowest:.1f} ms; deadline {1e3 * deadline:.0f} ms, sample {dt:g} s"
     )
-    name = "step time fits the sample time"
-    fix = "shorten the horizon, take fewer blocks or sample more slowly"
-    if slowest > 1e3 * deadline:
-        time = Check(name, "fail", finding, fix)
-    elif p99 > 250 * dt:
-        time = Check(name, "warn", finding, "leave more time: another process may take the processor")
-    else:
-        time = Check(name, "pass", finding)
+    time = _graded(
+        "step time fits the sample time",
+        finding,
+        fail=(slowest > 1e3 * deadline, "shorten the horizon, take fewer blocks or sample more slowly"),
+        warn=(p99 > 250 * dt, "leave more time: another process may take the processor"),
+    )
     return [time, _iterations(controller, fresh.iterations)]
 
 
@@ -208,13 +212,13 @@ def _iterations(controller: Controller, counted: Sequence[int]) -> Check:
     rows = 2 * controller.optimiser.n_b * controller.model.n_u
     soft = len(controller.optimiser.qp.soft) - rows
     finding = f"{rows} hard and {soft} soft rows; at most {max(counted)} iterations of {limit} allowed"
-    if max(counted) >= limit:
-        return Check(name, "fail", finding, "take fewer blocks, a shorter horizon, or fewer limits")
-    if max(counted) > limit // 4:
-        return Check(
-            name, "warn", finding, "take fewer blocks or fewer limits: the worst case may not end in time"
-        )
-    return Check(name, "pass", finding)
+    late = "take fewer blocks or fewer limits: the worst case may not end in time"
+    return _graded(
+        name,
+        finding,
+        fail=(max(counted) >= limit, "take fewer blocks, a shorter horizon, or fewer limits"),
+        warn=(max(counted) > limit // 4, late),
+    )
 
 
 def _stand_in(controller: Controller) -> Check:
@@ -223,21 +227,19 @@ def _stand_in(controller: Controller) -> Check:
     alone = [output for output in controller.controlled if output not in {loop.output for loop in loops}]
     said = "; ".join(f"{p.drive} by {p.output}: Kc {p.Kc:.3g}, Ti {p.Ti:.0f} s" for p in loops)
     if alone:
-        return Check(
-            name, "warn", f"{len(alone)} outputs without", "tune again: a failing solver ends in off"
-        )
+        fix = "tune again: a failing solver ends in off"
+        return Check(name, "warn", f"{len(alone)} outputs without", fix)
     # by the step response, which an output that only adds up has too
     gains = [step_response(controller.plant, loop.drive, loop.output).gain for loop in loops]
     wrong = [loop.output for loop, gain in zip(loops, gains, strict=True) if gain * loop.Kc < 0]
-    if wrong:
-        return Check(name, "fail", said, f"tune again: the PI of {', '.join(wrong)} pushes the wrong way")
-    return Check(name, "pass", said)
+    fix = f"tune again: the PI of {', '.join(wrong)} pushes the wrong way"
+    return _graded(name, said, fail=(bool(wrong), fix))
 
 
 def horizon(controller: Controller) -> Check:
     """The drive must be taken back while what it did has not arrived: the horizon has to see that far."""
     design = controller.design
-    verdict, finding = "pass", []
+    short, near, finding = False, False, []
     for output in design.controlled:
         answers = [step_response(controller.plant, drive, output) for drive in controller.model.drives]
         best = max(answers, key=lambda answer: abs(answer.gain))
@@ -247,12 +249,9 @@ def horizon(controller: Controller) -> Check:
             f"{output}: horizon {design.horizon_s:.0f} s, wanted {good:.0f} s: {needed} "
             f"(delay {best.delay:.0f} s, lag {best.lag:.0f} s)"
         )
-        if design.horizon_s < need:
-            verdict = "fail"
-        elif design.horizon_s < good and verdict == "pass":
-            verdict = "warn"
-    fix = "" if verdict == "pass" else "lengthen the horizon to four delays (blocks), or sample more slowly"
-    return Check("horizon covers delay and lag", verdict, "; ".join(finding), fix)
+        short, near = short or design.horizon_s < need, near or design.horizon_s < good
+    fix = "lengthen the horizon to four delays (blocks), or sample more slowly"
+    return _graded("horizon covers delay and lag", "; ".join(finding), fail=(short, fix), warn=(near, fix))
 
 
 def reachable(controller: Controller, span: tuple[float, float], rooms: Sequence[float]) -> Check:
@@ -303,9 +302,8 @@ def gain_sign(controller: Controller) -> Check:
         curve = steady_curve(model, drive, design.controlled[0], d)
         if not np.isfinite(curve.y).any():
             finding = f"{drive}: {design.controlled[0]} comes to rest at no drive (it only adds up)"
-            return Check(
-                name, "warn", finding, "evaluate by the closed loops of tune: there is no steady state"
-            )
+            fix = "evaluate by the closed loops of tune: there is no steady state"
+            return Check(name, "warn", finding, fix)
         least, most = (float(ends[model.drives.index(drive)]) for ends in _known(model))
         inside = [turn for turn in curve.turns if max(low, least) < turn < min(high, most)]
         seen.append(f"{drive}: {np.nanmin(curve.y):.1f} to {np.nanmax(curve.y):.1f} degC in steady state")
@@ -314,19 +312,14 @@ def gain_sign(controller: Controller) -> Check:
                 f"{drive} turns over at {', '.join(f'{turn:.2f}' for turn in inside)} of {low:g} to {high:g}"
             )
             seen.append(f"rising from {curve.rising[0]:.2f} to {curve.rising[1]:.2f}")
-    if bad:
-        fix = "set drive_limits to the rising part, or accept it: the prediction sees the turn, a PI does not"
-        return Check(name, "warn", "; ".join(bad + seen), fix)
-    return Check(name, "pass", "; ".join(seen))
+    fix = "set drive_limits to the rising part, or accept it: the prediction sees the turn, a PI does not"
+    return _graded(name, "; ".join(bad + seen), warn=(bool(bad), fix))
 
 
 def peltier_optimum(controller: Controller, span: tuple[float, float], draws: int) -> Check:
     """Beyond I* = S T_c / R a Peltier element cools less; the drive's range must end before."""
-    name, network = (
-        "current stays below the Peltier optimum",
-        getattr(controller.plant.model, "network", None),
-    )
-    elements = getattr(network, "peltiers", {})
+    name = "current stays below the Peltier optimum"
+    elements = getattr(getattr(controller.plant.model, "network", None), "peltiers", {})
     if not elements:
         return Check(name, "pass", "no Peltier element: 0 to check")
     picked = [controller.plant, *(controller.plant.draw(k) for k in draws_of(controller.plant, draws) if k)]
@@ -348,32 +341,26 @@ def peltier_optimum(controller: Controller, span: tuple[float, float], draws: in
             beyond.append(f"{element.input} = [{-0.8 * least:.2f}, ...]")
         elif -low > 0.9 * least:
             near.append(element.input)
+    fix = "the last tenth of the current hardly cools: leave it out"
     if beyond:
-        return Check(name, "warn", "; ".join(seen), f"set drive_limits: {', '.join(beyond)}")
-    if near:
-        return Check(
-            name, "warn", "; ".join(seen), "the last tenth of the current hardly cools: leave it out"
-        )
-    return Check(name, "pass", "; ".join(seen))
+        fix = f"set drive_limits: {', '.join(beyond)}"
+    return _graded(name, "; ".join(seen), warn=(bool(beyond or near), fix))
 
 
 def room_to_move(controller: Controller) -> Check:
     """Range and slew must neither exclude each other nor make every move a jump across the range."""
     design = controller.design
-    verdict, seen = "pass", []
+    excluded, slow, seen = False, False, []
     for name, (low, high) in design.drive_range.items():
         share = design.slew_per_s[name] * design.dt / (high - low)
         seen.append(f"{name}: {low:g} to {high:g}, {100 * share:.1f} % of it a sample")
-        if not low <= 0 <= high:
-            verdict = "fail"
-        elif share < 0.002 and verdict == "pass":
-            verdict = "warn"
-    fix = {
-        "pass": "",
-        "warn": "raise slew_per_s: crossing the range takes over 500 samples",
-        "fail": "let the drive range contain 0: that is where a failing loop goes",
-    }[verdict]
-    return Check("hard limits leave room", verdict, "; ".join(seen), fix)
+        excluded, slow = excluded or not low <= 0 <= high, slow or share < 0.002
+    return _graded(
+        "hard limits leave room",
+        "; ".join(seen),
+        fail=(excluded, "let the drive range contain 0: that is where a failing loop goes"),
+        warn=(slow, "raise slew_per_s: crossing the range takes over 500 samples"),
+    )
 
 
 def limits(controller: Controller, span: tuple[float, float]) -> Check:
@@ -455,11 +442,12 @@ def detectable(controller: Controller) -> Check:
         f"{', '.join(chosen.names)}; 1 % of the drive or 1 degC shows as {min(margins):.2f} "
         f"to {max(margins):.2f} degC"
     )
-    if min(margins) <= 1e-6:
-        return Check(name, "fail", finding, "narrow drive_limits to where the gain keeps its sign")
-    if min(margins) < 0.02:
-        return Check(name, "warn", finding, "expect slow removal of offsets where the gain is small")
-    return Check(name, "pass", finding)
+    return _graded(
+        name,
+        finding,
+        fail=(min(margins) <= 1e-6, "narrow drive_limits to where the gain keeps its sign"),
+        warn=(min(margins) < 0.02, "expect slow removal of offsets where the gain is small"),
+    )
 
 
 def hessian(controller: Controller) -> Check:
@@ -468,11 +456,12 @@ def hessian(controller: Controller) -> Check:
     values = np.linalg.eigvalsh(H)
     condition = float(values[-1] / values[0]) if values[0] > 0 else float("inf")
     name, finding = "QP is well conditioned", f"{H.shape[0]} unknowns, condition {condition:.1e}"
-    if values[0] <= 0 or condition > _LOST:
-        return Check(name, "fail", finding, "raise the move weight")
-    if condition > _ILL:
-        return Check(name, "warn", finding, "raise the move weight or take fewer blocks")
-    return Check(name, "pass", finding)
+    return _graded(
+        name,
+        finding,
+        fail=(values[0] <= 0 or condition > _LOST, "raise the move weight"),
+        warn=(condition > _ILL, "raise the move weight or take fewer blocks"),
+    )
 
 
 def scaling(controller: Controller) -> Check:
@@ -483,13 +472,17 @@ def scaling(controller: Controller) -> Check:
     moved = response / sum(controller.design.blocks)
     gains = ", ".join(f"{drive} {gain:.3g} degC" for drive, gain in zip(model.drives, moved))
     finding = f"a whole range of a drive moves its output over the horizon by {gains}"
-    if np.min(moved) < 1e-4 * max(1.0, float(np.max(moved))):
-        return Check(
-            name, "fail", finding, "leave out the drive that moves nothing, or widen its drive_limits"
-        )
-    if np.max(moved) > 300 * np.min(moved) or np.max(moved) > 3000 or np.min(moved) < 0.05:
-        return Check(name, "warn", finding, "look at the units of the drives, and at drive_limits")
-    return Check(name, "pass", finding)
+    least, most = float(np.min(moved)), float(np.max(moved))
+    nothing = "leave out the drive that moves nothing, or widen its drive_limits"
+    return _graded(
+        name,
+        finding,
+        fail=(least < 1e-4 * max(1.0, most), nothing),
+        warn=(
+            most > 300 * least or most > 3000 or least < 0.05,
+            "look at the units of the drives, and at drive_limits",
+        ),
+    )
 
 
 def weights(controller: Controller) -> Check:
@@ -510,11 +503,12 @@ def weights(controller: Controller) -> Check:
         if share < _IDLE:
             idle.append(key)
     finding = f"doubled, they change the move by: {', '.join(seen)}"
-    if len(idle) == len(seen):
-        return Check(name, "fail", finding, "the move no longer depends on any weight: take them nearer to 1")
-    if idle:
-        return Check(name, "warn", finding, f"leave {', '.join(idle)} alone: tuning it changes nothing")
-    return Check(name, "pass", finding)
+    return _graded(
+        name,
+        finding,
+        fail=(len(idle) == len(seen), "the move no longer depends on any weight: take them nearer to 1"),
+        warn=(bool(idle), f"leave {', '.join(idle)} alone: tuning it changes nothing"),
+    )
 
 
 def loops_of(controller: Controller, draws: int) -> list[LinearLoop]:
@@ -546,15 +540,12 @@ def observer_stable(controller: Controller, loop: LinearLoop) -> Check:
     size = largest_eigenvalue(loop.law.forgets)
     slow = -controller.dt / np.log(size) if 0 < size < 1 else float("inf")
     finding = f"largest eigenvalue {size:.4f}: an error falls to a third in {slow:.0f} s"
-    if size >= 1 - 1e-9:
-        return Check(
-            name, "fail", finding, "measure another output, or give the observer's drive noise a value"
-        )
-    if slow > 3600:
-        return Check(
-            name, "warn", finding, "raise the observer's drive and output noise: it learns too slowly"
-        )
-    return Check(name, "pass", finding)
+    return _graded(
+        name,
+        finding,
+        fail=(size >= 1 - 1e-9, "measure another output, or give the observer's drive noise a value"),
+        warn=(slow > 3600, "raise the observer's drive and output noise: it learns too slowly"),
+    )
 
 
 def offset_free(loops: Sequence[LinearLoop]) -> Check:
@@ -562,11 +553,8 @@ def offset_free(loops: Sequence[LinearLoop]) -> Check:
     name = "no offset is left in steady state"
     left = max(loop.left_of_offset() for loop in loops)
     finding = f"of an offset of 1 degC {left:.4f} degC is left, plant and {len(loops) - 1} draws"
-    if not left < 0.05:
-        return Check(
-            name, "fail", finding, "set offset_free; let an output that a drive can move be controlled"
-        )
-    return Check(name, "pass", finding)
+    fix = "set offset_free; let an output that a drive can move be controlled"
+    return _graded(name, finding, fail=(not left < 0.05, fix))
 
 
 def largest_eigenvalue(matrix: Array) -> float:
