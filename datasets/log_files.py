@@ -25,22 +25,12 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.datasets import repair
 from thermogrip.datasets.atomic_files import atomic_path, write_atomic
 from thermogrip.datasets.errors import UserError, as_user_error
 from thermogrip.datasets.limits import check_size, check_source
 from thermogrip.datasets.media import csv_cell
 from thermogrip.datasets.netcdf import convention_unit, open_netcdf, write_netcdf
-from thermogrip.datasets.repair import (
-    SPIKE_FLOOR_K,
-    check_plausible,
-    describe_gaps,
-    describe_steps,
-    fill_disturbance,
-    fill_input,
-    from_first_row,
-    order_rows,
-    reject_spikes,
-)
 from thermogrip.datasets.rosbag import bag_parts, read_rosbag_table
 from thermogrip.datasets.schema import check_log, hash_columns, make_log
 from thermogrip.datasets.tables import (
@@ -459,17 +449,17 @@ def _repair(
     time: Floats, columns: dict[str, Floats], units: dict[str, str], roles: dict[str, str], table: Table
 ) -> tuple[Floats, dict[str, Floats], list[str]]:
     """Return the repaired time and columns, and a line a finding."""
-    time, rows, repairs = order_rows(time, table.lines, table.file)
+    time, rows, repairs = repair.order_rows(time, table.lines, table.file)
     columns = {name: values[rows] for name, values in columns.items()}
     if time.size < 2:
         raise UserError(f"{time.size} row(s) are not a log", file=table.file, hint="give at least two rows")
-    time, found = from_first_row(time)
-    repairs += found + describe_steps(time)
+    time, found = repair.from_first_row(time)
+    repairs += found + repair.describe_steps(time)
     for name, values in columns.items():
         columns[name], found = _repair_column(name, values, time, units[name], roles[name], table.file)
         repairs += found
     time, columns, found = _drop_unknown_start(time, columns, roles, table.file)
-    repairs += found + describe_gaps(time, {n: v for n, v in columns.items() if roles[n] == "input"})
+    repairs += found + repair.describe_gaps(time, {n: v for n, v in columns.items() if roles[n] == "input"})
     return time, columns, repairs
 
 
@@ -478,16 +468,18 @@ def _repair_column(
 ) -> tuple[Floats, list[str]]:
     values = np.where(np.isinf(values), np.nan, values)
     if role == "input":
-        return fill_input(name, values)
+        return repair.fill_input(name, values)
     if role == "disturbance":
-        filled, repairs = fill_disturbance(name, values, time)
-        return filled, repairs + (check_plausible(name, filled, file) if unit == "degC" else [])
+        filled, repairs = repair.fill_disturbance(name, values, time)
+        return filled, repairs + (repair.check_plausible(name, filled, file) if unit == "degC" else [])
     if role != "output":
         return values, []
     lost = int(np.isnan(values).sum())
     repairs = [f"{name}: {lost} lost sample{'' if lost == 1 else 's'} left empty"] if lost else []
-    values, found = reject_spikes(name, values, time, floor=SPIKE_FLOOR_K if unit == "degC" else None)
-    return values, repairs + found + (check_plausible(name, values, file) if unit == "degC" else [])
+    values, found = repair.reject_spikes(
+        name, values, time, floor=repair.SPIKE_FLOOR_K if unit == "degC" else None
+    )
+    return values, repairs + found + (repair.check_plausible(name, values, file) if unit == "degC" else [])
 
 
 def _drop_unknown_start(

@@ -33,17 +33,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from thermogrip.datasets import limits
 from thermogrip.datasets.atomic_files import read_bytes
 from thermogrip.datasets.errors import UserError, as_user_error, os_faults
-from thermogrip.datasets.limits import (
-    check_size,
-    check_source,
-    check_unpacked,
-    most_bytes,
-    most_unpacked,
-    read_within,
-    unpack_within,
-)
 from thermogrip.datasets.media import from_csv
 from thermogrip.datasets.netcdf import check_netcdf
 from thermogrip.datasets.repair import name_rows
@@ -482,9 +474,9 @@ def _unpacked_matlab(raw: bytes, path: str | Path) -> bytes:
         part, at = raw[at : at + 8 + size], at + 8 + size
         if kind == 15:  # miCOMPRESSED
             unpacker = zlib.decompressobj()
-            part = unpacker.decompress(part[8:], most_unpacked(len(raw)) - total + 1)
+            part = unpacker.decompress(part[8:], limits.most_unpacked(len(raw)) - total + 1)
             total += len(part)
-            check_unpacked(len(raw), total, file=path)
+            limits.check_unpacked(len(raw), total, file=path)
         if at > len(raw):
             raise ValueError("it was cut off")
         out.append(part)
@@ -498,7 +490,7 @@ def read_excel_table(path: str | Path, columns: Sequence[str] | None = None) -> 
     # openpyxl raises whatever a damaged file makes it stumble over
     with as_user_error(Exception, "is no Excel workbook, or is damaged", file=path, hint="export CSV"):
         with zipfile.ZipFile(io.BytesIO(raw)) as packed:
-            check_unpacked(len(raw), sum(entry.file_size for entry in packed.infolist()), file=path)
+            limits.check_unpacked(len(raw), sum(entry.file_size for entry in packed.infolist()), file=path)
         import pandas as pd
 
         with as_user_error(ImportError, absent, file=path, hint=hint):
@@ -531,7 +523,7 @@ def _open_parquet(path: str | Path, source: Any, packed: int) -> Any:
     """Return the open file, its columns and sizes checked."""
     import pyarrow.parquet as parquet
 
-    check_size(packed, file=path)
+    limits.check_size(packed, file=path)
     with _sound_parquet(path):
         opened = parquet.ParquetFile(source, page_checksum_verification=True)
         _check_parquet(opened, packed, path)
@@ -560,7 +552,7 @@ def _check_parquet(opened: Any, packed: int, path: str | Path) -> None:
     groups = [about.row_group(at) for at in range(about.num_row_groups)]
     rows = max(about.num_rows, sum(group.num_rows for group in groups))
     pages = sum(group.column(at).total_uncompressed_size for group in groups for at in range(columns))
-    check_unpacked(packed, max(8 * rows * columns, pages), file=path, what="declares")
+    limits.check_unpacked(packed, max(8 * rows * columns, pages), file=path, what="declares")
 
 
 def _decode(metadata: dict[bytes, bytes] | None) -> dict[str, str]:
@@ -579,7 +571,7 @@ def check_table(path: str | Path, *, log: bool = False) -> None:
     it is not looked at here.
     """
     kind = file_format(path)
-    if os.path.exists(path) and not check_source(path) and not os.path.isfile(path):
+    if os.path.exists(path) and not limits.check_source(path) and not os.path.isfile(path):
         return
     if kind == "text" or (kind == "csv" and log):
         _text_of(path, _BEGINNING)
@@ -588,7 +580,7 @@ def check_table(path: str | Path, *, log: bool = False) -> None:
         if len(text) < _BEGINNING // 2 or not text.startswith(b"#"):
             _header(text, str(path))
     elif kind == "parquet":
-        _open_parquet(path, str(path), check_source(path)).close()
+        _open_parquet(path, str(path), limits.check_source(path)).close()
     elif kind == "netcdf":
         check_netcdf(path)
 
@@ -596,7 +588,7 @@ def check_table(path: str | Path, *, log: bool = False) -> None:
 def _text_of(path: str | Path, most: int | None = None) -> bytes:
     """Return the text of a file, unpacked, within the limits of :mod:`thermogrip.datasets.limits`, or as much
     of its beginning as ``most`` [bytes]."""
-    check_size(check_source(path), file=path)
+    limits.check_size(limits.check_source(path), file=path)
     openers: dict[str, Any] = {".gz": gzip.open, ".xz": lzma.open}
     opener = openers.get(Path(path).suffix.lower())
     damage = (gzip.BadGzipFile, lzma.LZMAError, zlib.error, EOFError)
@@ -604,14 +596,14 @@ def _text_of(path: str | Path, most: int | None = None) -> bytes:
     spoilt = as_user_error(damage, problem, file=path, hint="copy it again")
     with os_faults(path), spoilt, open(path, "rb") as file:
         if opener is None:
-            data = read_within(file, most_bytes() if most is None else most)
+            data = limits.read_within(file, limits.most_bytes() if most is None else most)
         else:
             with opener(file, "rb") as stream:
                 _check_text(stream.read(4096), path)
                 stream.seek(0)
-                data = unpack_within(stream, file, file=path, most=most)
+                data = limits.unpack_within(stream, file, file=path, most=most)
     if most is None:
-        check_size(len(data), file=path)  # a pipe says no size, and a file may grow
+        limits.check_size(len(data), file=path)  # a pipe says no size, and a file may grow
     data = _as_utf8(data, path, whole=most is None).removeprefix(b"\xef\xbb\xbf")
     if b"\n" not in data:
         data = data.replace(b"\r", b"\n")

@@ -61,6 +61,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import expit, gammaln, logit, logsumexp, multigammaln
 
+from thermogrip.classify.estimators import features
 from thermogrip.classify.estimators.base import (
     HELD_AT_AN_END,
     Floats,
@@ -74,17 +75,6 @@ from thermogrip.classify.estimators.base import (
     pick,
     set_arrays,
     two_or_more,
-)
-from thermogrip.classify.estimators.features import (
-    FIT_END,
-    LEAST_DIFFERENCE,
-    MATERIAL_FEATURES,
-    RESPONSE_TIMES,
-    can_normalise,
-    extract_features,
-    feature_noise,
-    linear_features,
-    object_difference,
 )
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import number_within
@@ -130,7 +120,7 @@ class Readings:
             sd = np.where(np.isfinite(self.t_object_sd), self.t_object_sd, _T_OBJECT_SD)[:, None]
             off = np.where(self.gain == 1, 0.0, sd / self.gain) * x
             noise = self.noise / (self.gain[:, :, None] * self.gain[:, None, :]) + _outer(off)
-        small = np.abs(self.difference) < LEAST_DIFFERENCE
+        small = np.abs(self.difference) < features.LEAST_DIFFERENCE
         return np.where(small[:, None], np.nan, x), np.where(small[:, None, None], np.nan, noise)
 
 
@@ -163,25 +153,25 @@ class FeatureReader:
         are normalised, grasps of unknown temperature, and materials that were only touched at the skin's own.
         ``linear``: features that are sums of samples; ``both``: those of a second sensor, too.
         """
-        end = min(float(np.median(np.concatenate([_last(part) for part in records]))), FIT_END)
+        end = min(float(np.median(np.concatenate([_last(part) for part in records]))), features.FIT_END)
         names, tables = [], []
         for part in records:
             table = _table(part, _times(part, end if linear else 0.0), linear=linear, both=both)
             known = np.isfinite(table.values).mean(axis=0) > 0.5
             found = [str(f) for f in table["feature"].values[known]]
-            names += [f for f in found if linear or f.startswith(MATERIAL_FEATURES)]
+            names += [f for f in found if linear or f.startswith(features.MATERIAL_FEATURES)]
             tables.append(table)
         names = sorted(set(names), key=_order)
         if not names:
             where = "+".join(map(log_name, records))
             raise UserError("no feature is known for every grasp", file=where, hint="record longer")
-        difference = np.concatenate([object_difference(part) for part in records])
+        difference = np.concatenate([features.object_difference(part) for part in records])
         usable, notes = _usable(difference, labels)
-        reader = cls(names, any(map(can_normalise, records)) and bool(usable.any()), end)
+        reader = cls(names, any(map(features.can_normalise, records)) and bool(usable.any()), end)
         if not reader.normalise:
             usable = np.ones(labels.size, dtype=bool)
         elif both:
-            beside = np.concatenate([object_difference(_sensors(part)[1][1]) for part in records])
+            beside = np.concatenate([features.object_difference(_sensors(part)[1][1]) for part in records])
             if set(labels[usable]) - set(_seen(beside, labels)):
                 names = reader.names = [f for f in names if not f.startswith(_SECOND)]
                 notes.append("the second sensor is not read: its temperature was within 1 K of an object's")
@@ -225,15 +215,15 @@ class FeatureReader:
             own = [k for k, f in enumerate(self.names) if f.startswith(_SECOND) == bool(prefix)]
             names = [self.names[k].removeprefix(_SECOND) for k in own]
             linear = [k for k, f in zip(own, names) if f != "log_time_constant"]
-            gain[:, linear] = object_difference(part)[:, None]
+            gain[:, linear] = features.object_difference(part)[:, None]
             if own:  # a feature that nobody has is without noise
-                noise[np.ix_(range(n), own, own)] = np.nan_to_num(feature_noise(part, names))
+                noise[np.ix_(range(n), own, own)] = np.nan_to_num(features.feature_noise(part, names))
         sd = grasps["t_object_sd"].values if "t_object_sd" in grasps else np.full(n, np.nan)
-        return Readings(y, gain, noise, np.asarray(sd, dtype=float), object_difference(grasps))
+        return Readings(y, gain, noise, np.asarray(sd, dtype=float), features.object_difference(grasps))
 
     def check_temperatures(self, grasps: Grasps) -> None:
         """Raise UserError where a response cannot be compared for want of the difference behind it."""
-        unknown = np.isnan(object_difference(grasps)) & self.normalise
+        unknown = np.isnan(features.object_difference(grasps)) & self.normalise
         if unknown.any():
             raise UserError(
                 f"grasp {str(grasps['grasp'].values[unknown][0])!r} has no object temperature, and the "
@@ -467,7 +457,7 @@ def _usable(difference: Floats, labels: Labels) -> tuple[NDArray[np.bool_], list
 
 def _seen(difference: Floats, labels: Labels) -> list[str]:
     """Return the materials whose normalised features grasps at these differences [K] show."""
-    clear = np.abs(difference) >= LEAST_DIFFERENCE
+    clear = np.abs(difference) >= features.LEAST_DIFFERENCE
     weight = np.where(clear, difference**2 / (difference**2 + _HALF_WEIGHT), 0.0)
     return [str(m) for m in np.unique(labels) if weight[labels == m].sum() >= _LEAST_WEIGHT]
 
@@ -492,7 +482,7 @@ def _table(grasps: Grasps, times: Sequence[float], *, linear: bool, both: bool) 
     """Return the features in kelvin (n, d), those of a second sensor behind those of the first."""
     tables = []
     for prefix, part in _sensors(grasps)[: 2 if both else 1]:
-        read = linear_features if linear else partial(extract_features, normalise=False)
+        read = features.linear_features if linear else partial(features.extract_features, normalise=False)
         table = read(part, times=times)
         tables.append(table.assign_coords(feature=[f"{prefix}{f}" for f in table["feature"].values]))
     return tables[0] if len(tables) == 1 else xr.concat(tables, "feature")
@@ -500,7 +490,7 @@ def _table(grasps: Grasps, times: Sequence[float], *, linear: bool, both: bool) 
 
 def _times(grasps: Grasps, end: float) -> list[float]:
     """Return when a response is read of the contacts of a record [s], an ``end`` that is late among these."""
-    times = [t for t in RESPONSE_TIMES if t <= float(grasps["time"].values[-1]) + 0.05]
+    times = [t for t in features.RESPONSE_TIMES if t <= float(grasps["time"].values[-1]) + 0.05]
     before = max([t for t in times if t <= end + 0.05], default=0.0)
     return sorted([*times, round(end, 2)]) if end > _NEAR * before else times
 

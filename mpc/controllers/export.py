@@ -31,16 +31,8 @@ from thermogrip.datasets.media import markdown
 from thermogrip.datasets.parallel import Progress
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.interface import STATUSES
+from thermogrip.mpc.native import design_struct
 from thermogrip.mpc.native.codegen import write_model
-from thermogrip.mpc.native.design_struct import (
-    ITERATION_LIMIT,
-    Sizes,
-    bytes_of,
-    config_header,
-    initialiser,
-    numbers_of,
-    sizes_of,
-)
 from thermogrip.mpc.native.runtime import SOURCES, c_source, compiler
 from thermogrip.mpc.optimiser.active_set import ActiveSetQP
 
@@ -91,16 +83,16 @@ def export_controller(controller: Controller, folder: str | Path) -> Export:
     folder.mkdir(parents=True, exist_ok=True)
     model = controller.model
     code = write_model(model.model, model.drive_index, model.dt / model.sub)
-    sizes = sizes_of(controller, code.n_k, code.n_m, room=False)
-    numbers = numbers_of(controller, np.array(code.constants(model.p.tolist())))
+    sizes = design_struct.sizes_of(controller, code.n_k, code.n_m, room=False)
+    numbers = design_struct.numbers_of(controller, np.array(code.constants(model.p.tolist())))
     files = {name: c_source(name) for name in _COPIED} | code.files
     files |= {
-        "tg_config.h": config_header(sizes),
+        "tg_config.h": design_struct.config_header(sizes),
         "tg_design.c": '#include "tg_design.h"\n\nconst tg_design tg_the_design = {\n'
-        + initialiser(sizes, numbers)
+        + design_struct.initialiser(sizes, numbers)
         + "\n};\n",
     }
-    ram, constants = bytes_of(sizes)
+    ram, constants = design_struct.bytes_of(sizes)
     files["README.md"] = _readme(controller, sizes, ram, constants)
     for name, content in files.items():
         write_atomic(folder / name, content)
@@ -338,7 +330,7 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(markdown(name) for name in names)
 
 
-def _readme(controller: Controller, sizes: Sizes, ram: int, constants: int) -> str:
+def _readme(controller: Controller, sizes: design_struct.Sizes, ram: int, constants: int) -> str:
     model, design = controller.model, controller.design
     low, high = _range_of(controller)
     ranges = "; ".join(f"{markdown(name)} in [{a:g}, {b:g}]" for name, (a, b) in design.drive_range.items())
@@ -361,7 +353,7 @@ def _readme(controller: Controller, sizes: Sizes, ram: int, constants: int) -> s
         c_example=", ".join(["35.0"] * len(controlled)),
         n_u_last=model.n_u - 1,
         drives_ranges=ranges,
-        iterations=ITERATION_LIMIT,
+        iterations=design_struct.ITERATION_LIMIT,
         rest_error=_rest_error(controller, low, high),
         low=low,
         high=high,

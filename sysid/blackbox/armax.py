@@ -21,30 +21,19 @@ import numpy as np
 from scipy.signal import lfilter
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.sysid.blackbox.output_error import (
-    Filter,
-    Records,
-    Search,
-    Solution,
-    columns_of,
-    fit_rest,
-    is_stable,
-    least_squares,
-    oe_family,
-    responses,
-)
+from thermogrip.sysid.blackbox import output_error
 
 
-def solve_armax(c: Array, records: Records, nb: int, delay: int) -> Solution | None:
+def solve_armax(c: Array, records: output_error.Records, nb: int, delay: int) -> output_error.Solution | None:
     """Solve for a, b, the constant and what begins a segment at this C; None where 1/C is unstable.
 
     ``shared`` of the solution are a, b and the constant, its ``outputs`` -e, whose slopes by C are those of
     an output-error model by A.
     """
-    if not is_stable(c):
+    if not output_error.is_stable(c):
         return None
     na, n_shared = len(c), len(c) + records.n_drive * nb + 1
-    impulse, step = responses(c, records)
+    impulse, step = output_error.responses(c, records)
     columns, right = [], []
     for at, (y, known) in enumerate(zip(records.y, records.known)):
         rows = np.arange(len(y))
@@ -54,16 +43,18 @@ def solve_armax(c: Array, records: Records, nb: int, delay: int) -> Solution | N
         for i in range(1, na + 1):
             late[i - 1, i:] = -filtered[:-i]
             used[i:] &= known[:-i]
-        X = np.vstack([late, columns_of(c, records, at, nb, delay, impulse, step, lost=True)])
+        X = np.vstack([late, output_error.columns_of(c, records, at, nb, delay, impulse, step, lost=True)])
         columns.append(X * used)
         right.append(filtered * used)
-    shared, first = least_squares([X[n_shared:] for X in columns], [X[:n_shared] for X in columns], right)
+    shared, first = output_error.least_squares(
+        [X[n_shared:] for X in columns], [X[:n_shared] for X in columns], right
+    )
     misses = [y - shared @ X[:n_shared] - own @ X[n_shared:] for y, X, own in zip(right, columns, first)]
     cost = float(sum(miss @ miss for miss in misses))
-    return Solution(c, cost, shared, first, [-miss for miss in misses], misses, columns)
+    return output_error.Solution(c, cost, shared, first, [-miss for miss in misses], misses, columns)
 
 
-class ArmaxSearch(Search):
+class ArmaxSearch(output_error.Search):
     """Fits one output, structure by structure, and remembers each C that it found."""
 
     origin = "armax"
@@ -73,17 +64,21 @@ class ArmaxSearch(Search):
         """Return how many numbers an output has beside poles and zeros: the constant, C."""
         return 1 + na
 
-    def starts(self, records: Records, na: int) -> list[Array]:
+    def starts(self, records: output_error.Records, na: int) -> list[Array]:
         """Return where the search for C begins: at that of ARX, and where that for A would."""
         return [np.zeros(na), *super().starts(records, na)]
 
-    def __call__(self, records: Records, na: int, nb: int, delay: int) -> Filter | None:
+    def __call__(
+        self, records: output_error.Records, na: int, nb: int, delay: int
+    ) -> output_error.Filter | None:
         """Return the best stable filter of this structure, None where no start leads to one."""
         best = self._search(records, na, nb, delay, partial(solve_armax, records=records, nb=nb, delay=delay))
-        if best is None or not is_stable(best.shared[:na]):
+        if best is None or not output_error.is_stable(best.shared[:na]):
             return None
         b = best.shared[na:-1].reshape(-1, nb)
-        return fit_rest(Filter(best.shared[:na], b, 0.0, delay, np.zeros((len(records.y), na))), records)[0]
+        return output_error.fit_rest(
+            output_error.Filter(best.shared[:na], b, 0.0, delay, np.zeros((len(records.y), na))), records
+        )[0]
 
 
-armax_family = partial(oe_family, search=ArmaxSearch)
+armax_family = partial(output_error.oe_family, search=ArmaxSearch)

@@ -114,39 +114,15 @@ def fit_black_box(
     warmup: float | None = None,
     progress: Callable[[float, str], None] | None = None,
 ) -> BlackBoxFit:
-    """Fit one kind of black box to one or several logs.
+    """Fit one kind of :data:`BLACK_BOXES` to one or several logs.
 
-    Parameters
-    ----------
-    kind : {"arx", "oe", "armax", "bj", "subspace", "parsim", "sindy", "neural"}
-    logs : sequence of Log
-    inputs, outputs, disturbances : sequence of str, optional
-        Names of the signals; by role where absent.
-    average : float, optional
-        Step [s]; both the chosen and the logs' own are tried where absent.
-    order : int, optional
-        Poles of each output (states, of ``subspace`` and ``parsim``); searched where absent.
-    delay : int, optional
-        Steps of the model from an input to its effect, of ``arx``, ``oe``, ``armax`` and ``bj``; searched
-        where absent.
-    warmup : float, optional
-        Seconds whose readings set the state of a held-out stretch; 5 s for whole logs (they begin at rest),
-        50 samples for stretches cut out of a log, where absent.
-    progress : callable, optional
-        Called with (fraction done, what).
+    Where absent, signals are known by role, both the chosen step ``average`` [s] and the logs' own are tried,
+    ``order`` (poles of each output; states, of ``subspace`` and ``parsim``) and ``delay`` (steps from an
+    input to its effect, of ``arx``, ``oe``, ``armax`` and ``bj``) are searched, and the readings of 5 s for
+    whole logs (they begin at rest), 50 samples for stretches cut out of a log, set the state of what is held
+    out in place of ``warmup`` [s]. A UserError where there is no such kind, order or delay, the data are too
+    short, or no structure survives the held-out free run.
 
-    Returns
-    -------
-    BlackBoxFit
-
-    Raises
-    ------
-    UserError
-        If there is no such kind, or it has no such order or delay, the data are too short, or no structure
-        survives the held-out free run.
-
-    Examples
-    --------
     >>> from scipy.signal import lfilter
     >>> from thermogrip.datasets.schema import make_log
     >>> rng = np.random.default_rng(0)

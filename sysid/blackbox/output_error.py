@@ -42,13 +42,7 @@ from scipy.linalg.lapack import dgeqrf
 from scipy.signal import lfilter
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.sysid.blackbox.order_selection import (
-    Structure,
-    as_state_space,
-    default_terms,
-    drives,
-    with_spread,
-)
+from thermogrip.sysid.blackbox import order_selection
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.log_grid import Grid, bridge
 
@@ -311,19 +305,21 @@ def oe_family(
     zeros: Sequence[int] = (1, 2),
     delays: Sequence[int] = (1, 2, 3),
     terms: Sequence[tuple[str, ...]] | None = None,
-    only: Structure | None = None,
+    only: order_selection.Structure | None = None,
     search: type[Search] | None = None,
-) -> Mapping[Structure, StateSpaceModel]:
+) -> Mapping[order_selection.Structure, StateSpaceModel]:
     """Return a model for each structure that has a stable one, by ``search`` of output error where absent."""
     out, kind = {}, search or Search
     searches = [kind() for _ in grid.outputs]
     # magnitudes and signed squares, never products with a switch that moves in one log alone
-    for some in default_terms(grid, switched=False) if terms is None else terms:
-        w = drives(grid, some)
+    for some in order_selection.default_terms(grid, switched=False) if terms is None else terms:
+        w = order_selection.drives(grid, some)
         records = [Records([s.y[:, i] for s in grid.segments], w) for i in range(len(grid.outputs))]
         for na, nb, nk in product(poles, zeros, delays):
             label = f"na {na}, nb {nb}, delay {nk}" + (f", with {', '.join(some)}" if some else "")
-            structure = Structure(label, (na + w[0].shape[1] * nb + kind.numbers(na)) * len(grid.outputs))
+            structure = order_selection.Structure(
+                label, (na + w[0].shape[1] * nb + kind.numbers(na)) * len(grid.outputs)
+            )
             if only not in (None, structure):
                 continue
             found = [each(part, na, nb, nk) for each, part in zip(searches, records)]
@@ -354,9 +350,9 @@ def assemble(
         c.append(np.concatenate([[each.constant], np.zeros(n - 1)]))
         C.append(np.eye(1, n))
     parts = block_diag(*A), np.vstack(W), block_diag(*C), np.concatenate(c)
-    model = as_state_space(grid, *parts, terms=terms, origin=origin)
-    starts = [_first_states(filters, w[0], at) for at, w in enumerate(drives(grid, terms))]
-    return with_spread(model, grid, starts)
+    model = order_selection.as_state_space(grid, *parts, terms=terms, origin=origin)
+    starts = [_first_states(filters, w[0], at) for at, w in enumerate(order_selection.drives(grid, terms))]
+    return order_selection.with_spread(model, grid, starts)
 
 
 def _first_states(filters: Sequence[Filter], held: Array, segment: int) -> Array:

@@ -85,8 +85,6 @@ def contact_temperature(*, T_dev0: float, T_obj0: float, gamma: float) -> float:
 
     ``gamma`` is e_dev / e_obj; with T_dev0 = T_obj0 + dT0 it reads T_dev0 - dT0 / (1 + gamma), eq. (10).
 
-    Examples
-    --------
     >>> round(contact_temperature(T_dev0=23.0, T_obj0=43.0, gamma=1.6e3 / 3.64e4), 2)
     42.16
     """
@@ -136,8 +134,6 @@ def object_surface_temperature(
 ) -> Array:
     """Return the object's surface temperature [degC]; parameters are those of :func:`skin_temperature`.
 
-    Examples
-    --------
     >>> warm_block = dict(T_dev0=23.0, T_obj0=43.0, e_dev=1.6e3)
     >>> object_surface_temperature([10.0], e_obj=3.64e4, h_c=500.0, **warm_block).round(2)
     array([42.51])
@@ -149,25 +145,10 @@ def device_temperature(
     t: ArrayLike, depth: ArrayLike, *, T_dev0: float, T_obj0: float, e_dev: float, e_obj: float,
     alpha_dev: float, h_c: float = np.inf,
 ) -> Array:  # fmt: skip
-    """Return the temperature inside the gripper.
+    """Return the temperature [degC] inside the gripper at a ``depth`` from the contact [m], of the shape that
+    it has with ``t``; ``alpha_dev`` is the gripper's diffusivity [m^2/s], all else as in
+    :func:`skin_temperature`.
 
-    Parameters
-    ----------
-    t : array_like
-        Time since contact [s], non-negative.
-    depth : array_like
-        Distance from the contact [m], non-negative; broadcast against ``t``.
-    T_dev0, T_obj0, e_dev, e_obj, h_c
-        As in :func:`skin_temperature`.
-    alpha_dev : float
-        Thermal diffusivity of the gripper [m^2/s], positive.
-
-    Returns
-    -------
-    T : ndarray of the broadcast shape [degC]
-
-    Examples
-    --------
     >>> device_temperature(10.0, [0.0, 1e-3, 5e-3], T_dev0=23.0, T_obj0=43.0, e_dev=1.6e3, e_obj=3.64e4,
     ...                    alpha_dev=1.4e-7, h_c=500.0).round(2)
     array([34.13, 28.26, 23.02])
@@ -194,12 +175,9 @@ def object_temperature(
     t: ArrayLike, depth: ArrayLike, *, T_dev0: float, T_obj0: float, e_dev: float, e_obj: float,
     alpha_obj: float, h_c: float = np.inf,
 ) -> Array:  # fmt: skip
-    """Return the temperature inside the object [degC]; parameters as in :func:`device_temperature`.
+    """Return the temperature inside the object [degC], at a ``depth`` from the contact into it [m]; all else
+    as in :func:`device_temperature`.
 
-    ``depth`` is the distance from the contact into the object [m].
-
-    Examples
-    --------
     >>> object_temperature([1.0, 10.0], 0.01, T_dev0=23.0, T_obj0=43.0, e_dev=1.6e3, e_obj=3.64e4,
     ...                    alpha_obj=1.125e-4).round(2)
     array([42.57, 42.3 ])
@@ -216,8 +194,6 @@ def contact_flux(
 
     At perfect contact it is the paper's eq. (12) per unit area, infinite at t = 0.
 
-    Examples
-    --------
     >>> contact_flux([0.0, 10.0], T_dev0=23.0, T_obj0=43.0, e_dev=1.6e3, e_obj=3.64e4, h_c=500.0).round(0)
     array([10000.,  4191.])
     """
@@ -236,8 +212,6 @@ def contact_heat(
 
     The integral of the flux, h_c (T_obj0 - T_dev0) / H^2 (erfcx(y) - 1 + 2 y / sqrt(pi)).
 
-    Examples
-    --------
     >>> contact_heat([1.0, 10.0], T_dev0=23.0, T_obj0=43.0, e_dev=1.6e3, e_obj=3.64e4, h_c=500.0).round(0)
     array([ 7990., 54795.])
     """
@@ -251,17 +225,9 @@ def contact_heat(
 def sensor_temperature(
     t: ArrayLike, *, T_dev0: float, T_obj0: float, e_dev: float, e_obj: float, lag: float, h_c: float = np.inf
 ) -> Array:
-    """Return what a sensor on the skin reads that follows with a first-order lag.
+    """Return what a sensor on the skin reads [degC] that follows with a first-order ``lag`` [s]; all else as
+    in :func:`skin_temperature`.
 
-    Parameters
-    ----------
-    t, T_dev0, T_obj0, e_dev, e_obj, h_c
-        As in :func:`skin_temperature`.
-    lag : float
-        Time constant of the sensor [s], positive.
-
-    Examples
-    --------
     >>> sensor_temperature([0.1, 10.0], T_dev0=23.0, T_obj0=43.0, e_dev=1.6e3, e_obj=3.64e4, lag=0.8,
     ...                    h_c=800.0).round(2)
     array([23.25, 36.24])
@@ -295,8 +261,6 @@ def invert_laplace(transform: Callable[[Complex], Complex], t: ArrayLike, *, n: 
 def half_space(effusivity: float) -> Impedance:
     """Return the impedance of a half-space, s -> 1 / (e sqrt(s)) [m^2 K W^-1].
 
-    Examples
-    --------
     >>> complex(half_space(1600.0)(np.array(4.0 + 0j)))
     (0.0003125+0j)
     """
@@ -307,8 +271,6 @@ def half_space(effusivity: float) -> Impedance:
 def slab(effusivity: float, capacity: float) -> Impedance:
     """Return the impedance of a slab with an insulated back; ``capacity`` is C = rho c_p L [J m^-2 K^-1].
 
-    Examples
-    --------
     >>> complex(slab(3.64e4, 68600.0)(np.array(1e-6 + 0j))).real.__round__(2)  # 1/(C s) when slow
     14.58
     """
@@ -325,8 +287,6 @@ def slab(effusivity: float, capacity: float) -> Impedance:
 def layer_on(effusivity: float, capacity: float, base: Impedance) -> Impedance:
     """Return the impedance of a layer of capacity C = rho c_p L [J m^-2 K^-1] in perfect contact with a base.
 
-    Examples
-    --------
     >>> same = layer_on(900.0, 100.0, half_space(900.0))  # a layer of the base's own stuff changes nothing
     >>> bool(np.isclose(same(np.array(2.0 + 1j)), half_space(900.0)(np.array(2.0 + 1j)), rtol=1e-14))
     True
@@ -349,8 +309,6 @@ def two_body_flux(
 ) -> Array:
     """Return the heat flux into the gripper [W/m^2] at times t > 0 [s] for any two impedances.
 
-    Examples
-    --------
     >>> two_body_flux([10.0], dev=half_space(1.6e3), obj=half_space(3.64e4), T_dev0=23.0, T_obj0=43.0,
     ...               h_c=500.0).round(0)
     array([4191.])
@@ -364,8 +322,6 @@ def two_body_temperatures(
 ) -> tuple[Array, Array]:
     """Return the surface temperatures of gripper and object [degC] at times t > 0 [s] for any two impedances.
 
-    Examples
-    --------
     >>> bodies = dict(dev=half_space(1.6e3), obj=slab(3.64e4, 68600.0))
     >>> skin, block = two_body_temperatures([10.0], T_dev0=23.0, T_obj0=43.0, h_c=500.0, **bodies)
     >>> skin.round(2), block.round(2)
@@ -388,8 +344,6 @@ def block_contact_flux(
 
     Times t > 0 [s]; effusivities [W s^0.5 m^-2 K^-1]; capacity [J m^-2 K^-1]; h_c [W m^-2 K^-1].
 
-    Examples
-    --------
     >>> block_contact_flux([10.0], T_dev0=23.0, T_obj0=43.0, e_dev=1.6e3, e_obj=3.64e4, capacity=68600.0,
     ...                    h_c=500.0).round(0)
     array([4082.])
@@ -405,8 +359,6 @@ def block_skin_temperature(
 ) -> Array:  # fmt: skip
     """Return the skin temperature of a half-space gripper on a block [degC]; as :func:`block_contact_flux`.
 
-    Examples
-    --------
     >>> block_skin_temperature([10.0], T_dev0=23.0, T_obj0=43.0, e_dev=1.6e3, e_obj=3.64e4, capacity=68600.0,
     ...                        h_c=500.0).round(2)
     array([33.97])
@@ -418,24 +370,10 @@ def block_skin_temperature(
 def slab_temperature(
     t: ArrayLike, depth: ArrayLike, *, T0: float, T_surf: float, thickness: float, alpha: float
 ) -> Array:
-    """Return the temperature in a slab whose face is held at ``T_surf`` from t = 0 and whose back is
-    insulated.
+    """Return the temperature [degC], first T0, at times t [s] and a ``depth`` from the face [m] in a slab of
+    this ``thickness`` [m] and diffusivity ``alpha`` [m^2/s], whose face is held at ``T_surf`` from t = 0 and
+    whose back is insulated.
 
-    Parameters
-    ----------
-    t : array_like
-        Time [s], non-negative.
-    depth : array_like
-        Distance from the face [m], 0 to ``thickness``; broadcast against ``t``.
-    T0, T_surf : float
-        Initial and face temperature [degC].
-    thickness : float
-        [m], positive.
-    alpha : float
-        Thermal diffusivity [m^2/s], positive.
-
-    Examples
-    --------
     >>> slab_temperature([1.0, 100.0], 0.02, T0=43.0, T_surf=23.0, thickness=0.02, alpha=1.0e-5).round(3)
     array([43.   , 23.053])
     """
@@ -444,12 +382,9 @@ def slab_temperature(
 
 
 def slab_heat(t: ArrayLike, *, T0: float, T_surf: float, capacity: float, effusivity: float) -> Array:
-    """Return the heat that the slab of :func:`slab_temperature` has taken up [J/m^2], t >= 0 [s].
+    """Return the heat that the slab of :func:`slab_temperature` has taken up [J/m^2], t >= 0 [s], where
+    ``capacity`` is rho c_p L [J m^-2 K^-1].
 
-    ``capacity`` is rho c_p L [J m^-2 K^-1]; the Fourier number is t (e / C)^2.
-
-    Examples
-    --------
     >>> slab_heat([1.0, 1e6], T0=23.0, T_surf=43.0, capacity=68600.0, effusivity=1.6e4).round(0)
     array([ 361081., 1372000.])
     """
@@ -470,21 +405,10 @@ def slab_temperature_convective(
     t: ArrayLike, depth: ArrayLike, *, T0: float, T_fluid: float, h: float, k: float, thickness: float,
     alpha: float,
 ) -> Array:  # fmt: skip
-    """Return the temperature in a slab whose face meets a fluid through a film conductance, back insulated.
+    """Return the temperature [degC] in the slab of :func:`slab_temperature`, of conductivity ``k``
+    [W m^-1 K^-1], where its face meets a fluid of ``T_fluid`` through a film conductance ``h``
+    [W m^-2 K^-1].
 
-    Parameters
-    ----------
-    t, depth, T0, thickness, alpha
-        As in :func:`slab_temperature`.
-    T_fluid : float
-        [degC].
-    h : float
-        Film conductance [W m^-2 K^-1], positive.
-    k : float
-        Conductivity of the slab [W m^-1 K^-1], positive.
-
-    Examples
-    --------
     >>> slab_temperature_convective([1.0, 100.0], 0.0, T0=43.0, T_fluid=23.0, h=500.0, k=73.0, thickness=0.02,
     ...                             alpha=2.05e-5).round(2)
     array([42.32, 32.77])
@@ -498,25 +422,10 @@ def layered_temperature(
     t: ArrayLike, depth: ArrayLike, *, T0: float, T_surf: float, thickness: float, e_layer: float,
     alpha_layer: float, e_base: float, alpha_base: float,
 ) -> Array:  # fmt: skip
-    """Return the temperature in a layer on a half-space whose face is held at ``T_surf`` from t = 0.
+    """Return the temperature [degC], first T0, at times t > 0 [s] and a ``depth`` from the face [m] in a
+    layer of this ``thickness`` [m] or the half-space below it, of these effusivities [W s^0.5 m^-2 K^-1] and
+    diffusivities [m^2/s], whose face is held at ``T_surf`` from t = 0.
 
-    Heat is reflected by r = (e_layer - e_base) / (e_layer + e_base) at the joint, by -1 at the face.
-
-    Parameters
-    ----------
-    t : array_like
-        Time [s], positive.
-    depth : array_like
-        Distance from the face [m], in the layer or below it; broadcast against ``t``.
-    T0, T_surf : float
-        Initial and face temperature [degC].
-    thickness : float
-        Of the layer [m].
-    e_layer, e_base, alpha_layer, alpha_base : float
-        Effusivities [W s^0.5 m^-2 K^-1] and diffusivities [m^2/s].
-
-    Examples
-    --------
     >>> layered_temperature(5.0, [1e-3, 5e-3], T0=23.0, T_surf=43.0, thickness=1e-3, e_layer=600.0,
     ...                     alpha_layer=1e-7, e_base=1600.0, alpha_base=1.4e-7).round(2)
     array([26.47, 23.  ])
@@ -531,7 +440,7 @@ def layered_temperature(
     inside = np.minimum(x, thickness)[..., None] / np.sqrt(alpha_layer)
     below = np.maximum(x - thickness, 0.0)[..., None] / np.sqrt(alpha_base)
 
-    def transform(s: Complex) -> Complex:
+    def transform(s: Complex) -> Complex:  # reflected by r at the joint, by -1 at the face
         q = np.sqrt(s)
         rise = (np.exp(-q * inside) + r * np.exp(-q * (2 * z - inside))) * np.exp(-q * below)
         return np.asarray(rise / (s * (1 + r * np.exp(-2 * q * z))))

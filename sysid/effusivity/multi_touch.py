@@ -63,6 +63,7 @@ from thermogrip.datasets.limits import number_within
 from thermogrip.datasets.materials import Material
 from thermogrip.datasets.schema import Grasps, label_values, log_name
 from thermogrip.sysid.contact.simulation import step_response, time_nodes
+from thermogrip.sysid.effusivity import posterior_grid
 from thermogrip.sysid.effusivity.data import Touches, touches, whiten
 from thermogrip.sysid.effusivity.gripper_model import UNKNOWN_OBJECT_SD, GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import (
@@ -77,14 +78,6 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     free_hypotheses,
     material_hypotheses,
     prior_of,
-)
-from thermogrip.sysid.effusivity.posterior_grid import (
-    LN_E_RANGE,
-    N_COARSE,
-    WIDEN,
-    GridPosterior,
-    posterior_of,
-    refined,
 )
 from thermogrip.sysid.effusivity.quality import number_values
 
@@ -354,7 +347,7 @@ def two_touch_fit(
 
 def free_touch_fit(
     gripper: GripperModel, grasps: Grasps, *, coupling: Coupling | None = None, until: float | None = None
-) -> dict[str, list[GridPosterior]]:
+) -> dict[str, list[posterior_grid.GridPosterior]]:
     """Return the posterior of a free effusivity from all touches of each group, one entry a touch, which
     share ln e and differ in temperature and contact conductance; prior and grid are those of
     :func:`~thermogrip.sysid.effusivity.posterior_grid.grid_posteriors`."""
@@ -372,17 +365,19 @@ def free_touch_fit(
     return {name: _free(at, joint, used.touch_sd) for name, at in rows.items()}
 
 
-def _free(at: Rows, joint: Callable[[Rows, Array], Joint], touch_sd: float) -> list[GridPosterior]:
-    x = np.linspace(*LN_E_RANGE, N_COARSE)
+def _free(
+    at: Rows, joint: Callable[[Rows, Array], Joint], touch_sd: float
+) -> list[posterior_grid.GridPosterior]:
+    x = np.linspace(*posterior_grid.LN_E_RANGE, posterior_grid.N_COARSE)
     fit = joint(at, x)
-    for widen in WIDEN:
-        more = refined(x, fit.log_evidence, widen)
+    for widen in posterior_grid.WIDEN:
+        more = posterior_grid.refined(x, fit.log_evidence, widen)
         extra = joint(at, more)
         x = np.concatenate([x, more])
         fit = Joint(*(np.concatenate(pair) for pair in zip(fit, extra)))
     sd = np.hypot(np.sqrt(np.diagonal(fit.covariance, axis1=1, axis2=2)), touch_sd)
     return [
-        posterior_of(x, fit.log_evidence, fit.mean[:, k], sd[:, k], fit.mean[:, k + 1])
+        posterior_grid.posterior_of(x, fit.log_evidence, fit.mean[:, k], sd[:, k], fit.mean[:, k + 1])
         for k in range(0, fit.mean.shape[1], N_SHARED)
     ]
 

@@ -54,14 +54,7 @@ from thermogrip.sysid.greybox.problem import Problem, make_problem, start_second
 from thermogrip.sysid.greybox.sandwich import ScoreCovariance, score_covariance
 from thermogrip.sysid.models.model import GreyModel
 from thermogrip.sysid.models.network import load_network
-from thermogrip.sysid.plant.fit_record import (
-    DiscrepancyTerm,
-    ErrorNumbers,
-    Identifiability,
-    Intervals,
-    PlantScores,
-    fit_logs,
-)
+from thermogrip.sysid.plant import fit_record
 from thermogrip.sysid.plant.log_grid import cut_stretches, match_logs, rows_of
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import find_starts, predict
@@ -267,7 +260,7 @@ def fit_network(
     )
     valid = {name: (float(np.nanmin(values)), float(np.nanmax(values))) for name, values in seen.items()}
     report(1.0, "fitted")
-    return replace(plant, valid=valid, fitted_to=fit_logs(logs), scores=scores)
+    return replace(plant, valid=valid, fitted_to=fit_record.fit_logs(logs), scores=scores)
 
 
 def residual_tau(errors: Sequence[Sequence[Sequence[Array]]], least: Array) -> Array:
@@ -376,7 +369,7 @@ def _as_plant(problem: Problem, solution: Solution, tau: Array) -> Plant:
     first = [begin[0] for begin in starts]
     offsets = dict(zip(model.outputs, np.mean([s.y_offset for s in first], axis=0).tolist()))
     offsets |= dict(zip(model.disturbances, np.mean([s.d_offset for s in first], axis=0).tolist()))
-    scores = PlantScores(
+    scores = fit_record.PlantScores(
         in_sample_rmse={
             log: {name: round(_rms([s[k] for s in parts]), 4) for k, name in enumerate(model.outputs)}
             for log, parts in zip(problem.names, errors)
@@ -404,17 +397,17 @@ def _as_plant(problem: Problem, solution: Solution, tau: Array) -> Plant:
     )
 
 
-def _of_intervals(problem: Problem, spread: ScoreCovariance) -> Intervals:
+def _of_intervals(problem: Problem, spread: ScoreCovariance) -> fit_record.Intervals:
     """Return what the intervals rest on."""
     outputs = problem.model.outputs
     names = [problem.plant.units.get(name, "degC") for name in outputs]
     unit = (problem.sd * np.sqrt(problem.tau)).tolist()
     units = list(zip(unit, names))
     learnt, merge = spread.numbers, round(spread.bin_s / problem.average)
-    return Intervals(
-        numbers=ErrorNumbers(**vars(learnt), unit=tuple(unit), bin_s=spread.bin_s, merge=merge),
+    return fit_record.Intervals(
+        numbers=fit_record.ErrorNumbers(**vars(learnt), unit=tuple(unit), bin_s=spread.bin_s, merge=merge),
         hessian=(spread.hessian / np.outer(problem.width, problem.width)).tolist(),
-        terms=[DiscrepancyTerm(t.signal, t.lag, t.size.tolist(), t.rms) for t in spread.terms],
+        terms=[fit_record.DiscrepancyTerm(t.signal, t.lag, t.size.tolist(), t.rms) for t in spread.terms],
         stretches=sum(len(stretches) for stretches, _ in problem.logs),
         pull=(spread.pull / problem.width[:, None]).tolist(),
         error=learnt.describe(outputs, spread.bin_s, units),
@@ -423,7 +416,7 @@ def _of_intervals(problem: Problem, spread: ScoreCovariance) -> Intervals:
     )
 
 
-def _verdict(problem: Problem, solution: Solution, identifiability: Identifiability) -> str:
+def _verdict(problem: Problem, solution: Solution, identifiability: fit_record.Identifiability) -> str:
     rms = _rms_in_sd(problem, solution)
     errors = ", ".join(
         f"{name} {r * sd:.2f} {problem.plant.units.get(name, 'degC')}"

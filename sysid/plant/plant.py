@@ -20,19 +20,8 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, column, log_name, make_log
 from thermogrip.datasets.shown import Shown
 from thermogrip.sysid.models.model import Model, load_model
+from thermogrip.sysid.plant import plant_data
 from thermogrip.sysid.plant.log_grid import Stretch, at_rows, cut_stretches, match_logs
-from thermogrip.sysid.plant.plant_data import (
-    SCHEMA,
-    VERSION,
-    PlantData,
-    draws_of,
-    fields_of,
-    not_whole,
-    plain_content,
-    read_samples,
-    thin,
-    write_samples,
-)
 from thermogrip.sysid.plant.simulation import AFTER_GAP, Start, find_starts, predict
 
 if TYPE_CHECKING:
@@ -44,7 +33,7 @@ _INSIDE = 64  # so many samples stand in the plant's own file
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Plant(Shown, PlantData):
+class Plant(Shown, plant_data.PlantData):
     """A model with its numbers.
 
     Parameters
@@ -190,9 +179,12 @@ class Plant(Shown, PlantData):
     def to_dict(self, *, draws: int | None = None) -> dict[str, Any]:
         """Return the whole plant as plain JSON, with so many posterior samples, evenly spread; with all where
         ``draws`` is absent, for only then is the k-th :meth:`draw` the same on both sides."""
-        content: dict[str, Any] = {"schema": SCHEMA, "version": VERSION} | plain_content(self)
+        content: dict[str, Any] = {
+            "schema": plant_data.SCHEMA,
+            "version": plant_data.VERSION,
+        } | plant_data.plain_content(self)
         if self.samples is not None:
-            content["draws"] = thin(self.samples, draws).tolist()
+            content["draws"] = plant_data.thin(self.samples, draws).tolist()
         kept: dict[str, Any] = json.loads(json.dumps(content, allow_nan=False))  # tuples become lists
         return kept
 
@@ -200,20 +192,20 @@ class Plant(Shown, PlantData):
     def from_dict(cls, content: Mapping[str, Any], *, model: Model | None = None) -> Plant:
         """Return the plant that :meth:`to_dict` wrote; ``model`` and errors as for :meth:`load`."""
         body = {key: value for key, value in content.items() if key != "draws"}
-        check_json(body, SCHEMA, VERSION)
+        check_json(body, plant_data.SCHEMA, plant_data.VERSION)
         draws = content.get("draws")
-        return cls._of(body, model, None if draws is None else draws_of(draws))
+        return cls._of(body, model, None if draws is None else plant_data.draws_of(draws))
 
     def save(self, path: str | Path) -> Path:
         """Write the plant as JSON, with more than a few samples beside it as ``.nc``, and return the path."""
-        target, content = Path(path), plain_content(self)
+        target, content = Path(path), plant_data.plain_content(self)
         if self.samples is not None and len(self.samples) <= _INSIDE:
             content["draws"] = np.asarray(self.samples).tolist()
         elif self.samples is not None:
             beside = target.with_suffix(".nc")
             content["samples"] = beside.name
-            write_samples(beside, self.free, self.samples, self.units)
-        return write_json(target, content, schema=SCHEMA, version=VERSION)
+            plant_data.write_samples(beside, self.free, self.samples, self.units)
+        return write_json(target, content, schema=plant_data.SCHEMA, version=plant_data.VERSION)
 
     @classmethod
     def load(cls, path: str | Path, *, model: Model | None = None) -> Plant:
@@ -236,17 +228,17 @@ class Plant(Shown, PlantData):
         --------
         >>> Plant.load("plant.json").simulate(log)  # doctest: +SKIP
         """
-        content = read_json(path, SCHEMA, VERSION)
+        content = read_json(path, plant_data.SCHEMA, plant_data.VERSION)
         try:
-            samples = read_samples(Path(path), content.get("samples"), content.get("free", ()))
+            samples = plant_data.read_samples(Path(path), content.get("samples"), content.get("free", ()))
             draws = content.pop("draws", None)
-            return cls._of(content, model, samples if draws is None else draws_of(draws))
+            return cls._of(content, model, samples if draws is None else plant_data.draws_of(draws))
         except UserError as error:
             raise UserError(error.problem, file=path, hint=error.hint) from error
 
     @classmethod
     def _of(cls, content: Mapping[str, Any], model: Model | None, samples: Array | None) -> Plant:
-        fields = fields_of(content)
+        fields = plant_data.fields_of(content)
         try:
             equations = load_model(content["model"], code=model)
             refits = tuple(load_model(one) for one in content.get("refits") or ())
@@ -254,7 +246,7 @@ class Plant(Shown, PlantData):
         except UserError:
             raise
         except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise not_whole(error) from error
+            raise plant_data.not_whole(error) from error
 
     def free_run(self, log: Log, **how: Any) -> Any:
         """Return the plant's free run over a log, with its scores and ``band()``; see

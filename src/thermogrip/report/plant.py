@@ -11,17 +11,9 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from thermogrip.datasets.schema import log_name
+from thermogrip.report import plots
 from thermogrip.report.console import Cells
 from thermogrip.report.html import Picture, Section, Table, Text
-from thermogrip.report.plots import (
-    bode_figure,
-    difference_unit,
-    free_run_figure,
-    models_figure,
-    posterior_figure,
-    residual_figure,
-    step_response_figure,
-)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -107,7 +99,8 @@ def identification_section(found: Identification, plant: Plant) -> Section:
     ]
     parts: list[Any] = [
         Picture(
-            models_figure(found.rows), "Free-run error of every model on rows that it was not fitted to."
+            plots.models_figure(found.rows),
+            "Free-run error of every model on rows that it was not fitted to.",
         ),
         model_table(found),
         Table(*signal_table(found), "Columns of the logs"),
@@ -207,10 +200,10 @@ def dynamics_section(found: Dynamics) -> Section:
     parts = (
         Table(*gain_table(found), "Gains at rest, with intervals"),
         Picture(
-            step_response_figure(found),
+            plots.step_response_figure(found),
             "Response of each output to a step of one unit of each input; shaded: the interval.",
         ),
-        Picture(bode_figure(found), "Frequency response from each input; shaded: the interval."),
+        Picture(plots.bode_figure(found), "Frequency response from each input; shaded: the interval."),
     )
     words = time_constant_words(found)
     return Section("How does the plant respond?", parts, _sentence(words[0].upper() + words[1:]))
@@ -247,7 +240,7 @@ def posterior_section(record: Posterior) -> Section:
     """Return the section of the parameters' posterior: marginals, corner plot, how it was sampled."""
     from thermogrip.report.plots import corner_figure
 
-    figure = posterior_figure(record.samples, record.free, record.units, record.fitted)
+    figure = plots.posterior_figure(record.samples, record.free, record.units, record.fitted)
     slowest = max(record.tau.values())
     parts: list[Any] = [
         Picture(figure, f"Marginals of {len(record.samples)} samples: 90 % shaded, the fit as a line."),
@@ -294,7 +287,7 @@ def _unit_of_effect(plant: Plant, effect: str) -> str:
     name = effect.split(" of ")[-1]
     unit = plant.units.get(name, "1")
     if name != effect:
-        return difference_unit(unit)
+        return plots.difference_unit(unit)
     return "1" if plant.scales.get(name) == "log" else unit
 
 
@@ -331,14 +324,14 @@ def free_run_section(
         verdict += f" Residual correlation: {'; '.join(follows)}."
     parts: list[Any] = [
         Picture(
-            free_run_figure(run, band),
+            plots.free_run_figure(run, band),
             f"{name}: measured, simulated from the inputs alone, and their difference. Readings of the first "
             f"{run.warmup:.3g} s set the state; nothing is fed back after that. Shaded: {band_words(band)}. "
             "On grey: not scored.",
         ),
         Table(*run_table([run]), _BASELINES),
         Picture(
-            residual_figure(run),
+            plots.residual_figure(run),
             "Correlation of the residuals with themselves and with the inputs before them; shaded: 95 % of "
             "the lags of white residuals. Lags of a slow input leave the shade together, by chance too; "
             "a line below reports the inputs with which they correlate.",
