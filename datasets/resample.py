@@ -127,10 +127,9 @@ def average(log: Log, seconds: float) -> Log:
 def block_means(
     time: Floats, values: Floats, held: NDArray[np.bool_], *, seconds: float, after: Sequence[int], log: str
 ) -> list[_Blocks]:
-    """Return starts (n_block,) and means (n_block, n) of blocks, as :func:`average` makes them, of each part.
-
-    ``held`` (n,) says which of the values (n_time, n) are held, ``after`` which rows begin anew after a gap.
-    """
+    """Return starts (n_block,) and means (n_block, n) of blocks, as :func:`average` makes them, of each part;
+    ``held`` (n,) says which of the values (n_time, n) are held, ``after`` which rows begin anew after a
+    gap."""
     step = float(np.median(np.diff(time)))
     if not seconds >= step * (1 - 1e-9):
         problem = f"cannot average over {seconds:g} s: the rows are {step:g} s apart"

@@ -177,10 +177,8 @@ def searched_rows(fit: BlackBoxFit) -> list[Searched]:
 
 
 def choose_black_box(fits: Sequence[BlackBoxFit], between: Mapping[str, float]) -> BlackBoxFit:
-    """Return the linear fit of the least error over its folds, or another kind that errs clearly less.
-
-    ``between``: by output the error that differences between runs add to that of any of them.
-    """
+    """Return the linear fit of the least error over its folds, or another kind that errs clearly less;
+    ``between``: by output the error that differences between runs add to that of any of them."""
     linear = [fit for fit in fits if fit.kind in LINEAR]
     others = [fit for fit in fits if fit.kind not in LINEAR]
     if not (linear and others):

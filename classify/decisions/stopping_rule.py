@@ -131,24 +131,21 @@ def load_stop_rule(folder: str | Path) -> StopRule:
 
 
 class Windows(NamedTuple):
-    """``n`` grasps at n_t times and at the end: ``times`` (n_t + 1,) [s], ``log_p`` (n, n_t + 1, m), and the
-    expected ``gain`` (n, n_t + 1) of reading on, zero at the end."""
+    """``n`` grasps at n_t times and at the end."""
 
-    times: Floats
-    log_p: Floats
-    gain: Floats
+    times: Floats  # (n_t + 1,) [s]
+    log_p: Floats  # (n, n_t + 1, m)
+    gain: Floats  # (n, n_t + 1), expected of reading on, zero at the end
 
 
 class Stops(NamedTuple):
-    """``time`` (n,) [s], ``answer`` (n,) place of the likeliest candidate then, ``confident`` (n,) and
-    ``early`` (n,) are the reason and whether it is before the end, ``p_wrong`` (n,) is the probability that
-    the answer is wrong."""
+    """Where a rule ends n contacts."""
 
-    time: Floats
-    answer: NDArray[np.int64]
-    confident: NDArray[np.bool_]
-    early: NDArray[np.bool_]
-    p_wrong: Floats
+    time: Floats  # (n,) [s]
+    answer: NDArray[np.int64]  # (n,) place of the likeliest candidate then
+    confident: NDArray[np.bool_]  # (n,) whether that is the reason
+    early: NDArray[np.bool_]  # (n,) whether it is before the end
+    p_wrong: Floats  # (n,) probability that the answer is wrong
 
 
 def growing_windows(

@@ -29,10 +29,8 @@ _CHANNELS = 2
 
 
 def grasps_of(estimator: Any, X: Any, *, reset: bool, **y: Any) -> Grasps:
-    """Return the record of an array or a data frame; ``reset`` in training, where its width is remembered.
-
-    ``y`` are labels that scikit-learn checks beside, in training.
-    """
+    """Return the record of an array or a data frame; ``reset`` in training, where its width is remembered;
+    ``y`` are labels that scikit-learn checks beside, in training."""
     times, per_grasp = estimator.times, {}
     if hasattr(X, "columns") and (stated := _stated_times(X.columns)):
         columns = sorted(stated, key=stated.__getitem__)

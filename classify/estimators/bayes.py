@@ -99,19 +99,15 @@ _NODES, _REACH = 21, 2.5  # temperatures of that integral, up to so many sd from
 
 @dataclass(frozen=True)
 class Readings:
-    """Features in kelvin of n grasps, what multiplies the normalised ones in them, and their noise.
+    """Features in kelvin of n grasps, what multiplies the normalised ones in them, and their noise."""
 
-    ``y`` (n, d), NaN where a grasp lacks a feature; ``gain`` (n, d), the difference of temperature [K], 1 for
-    a time constant and everywhere in kelvin; ``noise`` (n, d, d); ``t_object_sd`` (n,) [K], NaN where no file
-    has it; ``difference`` (n,) [K] of the first sensor; the last and ``gain`` are NaN where the object's
-    temperature is unknown.
-    """
-
-    y: Floats
+    y: Floats  # (n, d), NaN where a grasp lacks a feature
+    # (n, d), the difference of temperature [K], NaN where the object's is unknown, 1 for a time constant and
+    # everywhere in kelvin
     gain: Floats
-    noise: Floats
-    t_object_sd: Floats
-    difference: Floats
+    noise: Floats  # (n, d, d)
+    t_object_sd: Floats  # (n,) [K], NaN where no file has it
+    difference: Floats  # (n,) [K] of the first sensor, NaN where the object's temperature is unknown
 
     def normalised(self) -> tuple[Floats, Floats]:
         """Return the features over their gain, (n, d), and their noise, (n, d, d); NaN within 1 K."""

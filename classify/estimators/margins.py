@@ -117,9 +117,8 @@ class SvmPca(MarginClassifier):
 def inner_folds(
     grasps: Grasps, labels: Labels, *, count: int = 5, seed: int = 0
 ) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Return (fitted, held out) rows of training grasps, whole sessions or whole grasps apart.
-
-    There are none where a class is in one group only."""
+    """Return (fitted, held out) rows of training grasps, whole sessions or whole grasps apart; there are none
+    where a class is in one group only."""
     groups = unit_names(grasps)
     session = grasps["session"].values.astype(str) if "session" in grasps else groups
     for tried in (session, groups):

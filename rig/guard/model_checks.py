@@ -375,11 +375,9 @@ class ModelMonitor:
         return _window_slopes(self._model, self._past, self.settings.smooth, window, steps)
 
     def _with_drift(self, one: Residual) -> Residual:
-        """Return a residual with the uncertainty of the plant's parameters.
-
-        A drive's bias that was such a parameter is wrong once the rig does something else: the path without
-        it counts where that is nearer, and no further away than the parameters explain.
-        """
+        """Return a residual with the uncertainty of the plant's parameters; a drive's bias that was such a
+        parameter is wrong once the rig does something else: the path without it counts where that is nearer,
+        and no further away than the parameters explain."""
         found = self._slopes(one.window)
         if found is None or self.drift is None:
             return one

@@ -79,11 +79,9 @@ def room_sensors(
     stated: Collection[str] | None = None,
     outputs: Collection[str] = (),
 ) -> frozenset[str]:
-    """Return those of a rig's sensors that read the room; an output never does, whatever its name.
-
-    Sensors that the plant does not know are the room's where they are ``stated`` or, without a statement,
-    called so.
-    """
+    """Return those of a rig's sensors that read the room; an output never does, whatever its name; sensors
+    that the plant does not know are the room's where they are ``stated`` or, without a statement, called
+    so."""
     known: set[str] = set(outputs)
     rooms: set[str] = set()
     if plant is not None:

@@ -63,10 +63,8 @@ def arx_family(
     terms: Sequence[tuple[str, ...]] | None = None,
     only: Structure | None = None,
 ) -> Mapping[Structure, StateSpaceModel]:
-    """Return an ARX model for each structure that gives a stable one.
-
-    Orders na, nb and delays n_k are in rows; with products of inputs only the first two of each are tried.
-    """
+    """Return an ARX model for each structure that gives a stable one; orders na, nb and delays n_k are in
+    rows; with products of inputs only the first two of each are tried."""
     out = {}
     moving = any(
         np.ptp(np.concatenate([s.u[:, grid.inputs.index(n)] for s in grid.segments])) for n in grid.switches

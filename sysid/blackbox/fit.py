@@ -182,10 +182,8 @@ def _of_order(kind: str, order: int | None, delay: int | None) -> Family:
 def _with_convention(
     grid: Grid, choice: Choice, logs: Sequence[Log], family: Family, warmup: float | None, average: bool
 ) -> tuple[Grid, Choice]:
-    """Return grid and choice with inputs that were applied up to their rows where that errs clearly less.
-
-    Within a step that was averaged over several rows one row makes no difference.
-    """
+    """Return grid and choice with inputs that were applied up to their rows where that errs clearly less;
+    within a step that was averaged over several rows one row makes no difference."""
     if grid.dt > 1.5 * grid.native or family in (sindy_family, neural_family):
         return grid, choice
     moved = replace(grid.of(logs, ends=True), why=grid.why)

@@ -108,11 +108,9 @@ def neural_family(
     members: int | None = None,
     only: Structure | None = None,
 ) -> Mapping[Structure, NeuralModel]:
-    """Return a model for each number of states and units, and one of the members of all of them.
-
-    Each starts from ``members`` random weights: 6 where absent, 3 with more than :data:`MANY` readings, 2.7
-    times as many for one structure alone, and four times as many for all together.
-    """
+    """Return a model for each number of states and units, and one of the members of all of them; each starts
+    from ``members`` random weights: 6 where absent, 3 with more than :data:`MANY` readings, 2.7 times as many
+    for one structure alone, and four times as many for all together."""
     data = _scaled(grid)
     n_y = len(grid.outputs)
     orders = range(n_y + 1, max(5, n_y + 2)) if states is None else states
@@ -278,10 +276,8 @@ def _train(data: _Data, linear: _Linear, h: int, *, seed: int) -> _Member:
 def _descend(
     linearise: Callable[[Array], tuple[Array, Array]], residuals: Callable[[Array], Array], z: Array
 ) -> Array:
-    """Return where Levenberg-Marquardt steps, three dampings tried at a time, no longer lower the cost.
-
-    The residuals are cheap and the normal equations expensive here, the other way round than for a network.
-    """
+    """Return where Levenberg-Marquardt steps, three dampings tried at a time, no longer lower the cost; the
+    residuals are cheap and the normal equations expensive here, the other way round than for a network."""
     damping = 1.0
     for _ in range(ITERATIONS):
         residual, jacobian = linearise(z)

@@ -129,10 +129,8 @@ def held_out_runs(grid: Grid, held: Sequence[Segment]) -> list[Segment]:
 
 
 def priors_of(grid: Grid) -> tuple[StartPrior, ...]:
-    """Return how a first error may be shared between state and sensor, and how long an offset lasts.
-
-    Offsets that fade do in a quarter of a held-out part: a longer memory cannot be told from one that lasts.
-    """
+    """Return how a first error may be shared between state and sensor, and how long an offset lasts; offsets
+    that fade do in a quarter of a held-out part: a longer memory cannot be told from one that lasts."""
     seconds = grid.dt * sum(len(segment.time) for segment in grid.segments)
     fading = _SHORT * seconds / (len(grid.logs) if len(grid.logs) >= 3 else _BLOCKS)
     none = [StartPrior(noise=r) for r in (0.03, 0.1, 0.3)]
@@ -188,10 +186,8 @@ def choose(
     average: bool = False,
     progress: Callable[[float, str], None] | None = None,
 ) -> Choice:
-    """Fit every structure of the family on every fold and choose by the one-standard-error rule.
-
-    ``average``: of one or two logs the average of the best ones is taken where it errs hardly more.
-    """
+    """Fit every structure of the family on every fold and choose by the one-standard-error rule; ``average``:
+    of one or two logs the average of the best ones is taken where it errs hardly more."""
     cases = list(folds(grid))
     scored = _score(grid, family, cases, warmup, progress)
     left = {structure: errors.mean for structure, errors in scored.items()}
@@ -290,11 +286,9 @@ def _error_on_all(model: Model, grid: Grid, prior: StartPrior, warmup: int) -> f
 
 
 def drives(grid: Grid, terms: Sequence[str]) -> list[Array]:
-    """Return the columns w = [u, d, phi(u, d)] of each segment, shape (n, n_drive).
-
-    A column that never moves cannot be distinguished from a constant; it is zero here, so that its effect is
-    fitted as none and not as an arbitrary share of the constant.
-    """
+    """Return the columns w = [u, d, phi(u, d)] of each segment, shape (n, n_drive); a column that never moves
+    cannot be distinguished from a constant; it is zero here, so that its effect is fitted as none and not as
+    an arbitrary share of the constant."""
     names = grid.inputs + grid.disturbances
     rows = [np.hstack([segment.u, segment.d]) for segment in grid.segments]
     w = [np.hstack([some, evaluate_terms(terms, names, some)]) for some in rows]

@@ -81,11 +81,9 @@ def subspace_family(
     only: Structure | None = None,
     weightings: Sequence[str] = ("moesp", "cva"),
 ) -> Mapping[Structure, StateSpaceModel]:
-    """Return a model for each order, number of block rows f and weighting that the data allow.
-
-    Where absent, ``rows`` are 3, 5, 8, 15 and 30 as far as the data allow, and ``terms`` none and the
-    magnitudes of signed inputs.
-    """
+    """Return a model for each order, number of block rows f and weighting that the data allow; where absent,
+    ``rows`` are 3, 5, 8, 15 and 30 as far as the data allow, and ``terms`` none and the magnitudes of signed
+    inputs."""
     found: dict[Structure, Fitted] = {}
     asked = None if only is None else only.members or (only,)
     longest = max(len(segment.time) for segment in grid.segments)
@@ -153,11 +151,9 @@ def extended_observability(L32: Array, L33: Array, *, n_y: int, weighting: str) 
 
 
 def fit_inputs(grid: Grid, A: Array, C: Array, terms: tuple[str, ...] = ()) -> Fitted:
-    """Return the model with the B, E, constant of the least free-run error, given A and C, and the starts.
-
-    The simulated output is linear in all of them; the columns of the regression are simulations of unit
-    entries.
-    """
+    """Return the model with the B, E, constant of the least free-run error, given A and C, and the starts;
+    the simulated output is linear in all of them; the columns of the regression are simulations of unit
+    entries."""
     n = A.shape[0]
     y0 = np.nanmean(np.concatenate([segment.y for segment in grid.segments]), axis=0)
     scale = np.maximum(grid.output_spread(), 1e-9)
@@ -266,10 +262,8 @@ def _rms(parts: Sequence[Array]) -> float:
 
 
 def stabilised(A: Array, rows: int) -> Array:
-    """Return A with poles beyond exp(-1 / rows) moved onto that circle, along their direction.
-
-    A record of so many rows cannot distinguish a slower pole, or a growing one, from one of its own length.
-    """
+    """Return A with poles beyond exp(-1 / rows) moved onto that circle, along their direction; a record of so
+    many rows cannot distinguish a slower pole, or a growing one, from one of its own length."""
     poles, vectors = np.linalg.eig(A)
     beyond = np.abs(poles) > np.exp(-1 / rows)
     if not beyond.any():

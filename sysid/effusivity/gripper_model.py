@@ -246,14 +246,12 @@ class Block:
 
 @dataclass(frozen=True)
 class Discrepancy:
-    """What a gripper was found to read beyond the model at ``KNOTS``, linear between them.
+    """What a gripper was found to read beyond the model at ``KNOTS``, linear between them."""
 
-    ``always`` (n_knot,) [K] is common to all grasps (a heater that is cut at contact, a skin on its way);
-    ``share`` (n_block, n_knot) per degree between object and skin, by block in the gripper's order, and
-    by the effusivity of others (an approach before contact, a smoothed record).
-    """
-
+    # (n_knot,) [K], common to all grasps: a heater that is cut at contact, a skin on its way
     always: Array = field(compare=False)
+    # (n_block, n_knot), per degree between object and skin, by block in the gripper's order, and by the
+    # effusivity of others: an approach before contact, a smoothed record
     share: Array = field(compare=False)
     onset: Array = field(compare=False)  # (n_block,) [s], of contact with each block about the mean
     from_room: Array = field(compare=False)  # (n,) [K], objects less room in a training with unknown ones

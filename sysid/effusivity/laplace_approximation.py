@@ -225,17 +225,14 @@ class _Point:
 
 
 class _Expansion(NamedTuple):
-    """The solution around a guess: step of v, new a, predicted decrease, evidence, and factors at its end.
-
-    ``curved`` (7, 7) is the Cholesky factor of the curvature in units of the prior's sd, ``chol`` that of S.
-    """
+    """The solution around a guess: step of v, new a, predicted decrease, evidence, and factors at its end."""
 
     dv: Array
     a: Array
     decrease: float
     log_evidence: float
-    curved: Array
-    chol: Array
+    curved: Array  # (7, 7), Cholesky factor of the curvature in units of the prior's sd
+    chol: Array  # that of S
 
 
 def uncertain_gripper_modes(

@@ -42,39 +42,29 @@ _H, _BUILD_UP, _ONSET, _LEVEL, _T, _E, _C = range(7)
 
 
 class _Scratch(NamedTuple):
-    """What one search works in.
+    """What one search works in."""
 
-    ``room`` of the time stepping; ``place`` and ``share`` (n_sample,) of the samples; ``curves`` (6, n_bin)
-    the responses; ``far`` (4, n_bin) of the far face: delayed integral and value of F, then those of a
-    derivative; ``reading`` (n_bin,) that is predicted and ``slopes`` (7, n_bin) its derivatives by u;
-    ``left`` (n_bin,) what was read beyond it; ``columns`` (8, n_bin) the slopes and, last, that, whitened.
-    """
-
-    room: Room
-    place: NDArray[np.int64]
+    room: Room  # of the time stepping
+    place: NDArray[np.int64]  # (n_sample,) of the samples, as ``share``
     share: Array
-    curves: Array
-    far: Array
-    reading: Array
-    slopes: Array
-    left: Array
-    columns: Array
+    curves: Array  # (6, n_bin) the responses
+    far: Array  # (4, n_bin) of the far face: delayed integral and value of F, then those of a derivative
+    reading: Array  # (n_bin,) that is predicted
+    slopes: Array  # (7, n_bin) its derivatives by u
+    left: Array  # (n_bin,) what was read beyond it
+    columns: Array  # (8, n_bin) the slopes and, last, what is left, whitened
 
 
 class _Expansion(NamedTuple):
-    """The objective's expansion at a point ``u`` (7,).
+    """The objective's expansion at a point."""
 
-    ``matrix`` (7, 7) J' J, ``gradient`` (7,) J' r, ``slope``, bound of the ``curvature`` and its ``own`` (7,)
-    of the prior; ``cost`` (2,): the objective and |r|^2.
-    """
-
-    u: Array
-    matrix: Array
-    gradient: Array
-    slope: Array
-    curvature: Array
-    own: Array
-    cost: Array
+    u: Array  # (7,)
+    matrix: Array  # (7, 7) J' J
+    gradient: Array  # (7,) J' r
+    slope: Array  # (7,) of the prior, as the next two
+    curvature: Array  # its bound
+    own: Array  # the curvature itself
+    cost: Array  # (2,), the objective and |r|^2
 
 
 class _Work(NamedTuple):

@@ -233,12 +233,11 @@ class Factor(NamedTuple):
 
 
 class Joint(NamedTuple):
-    """``log_evidence`` (...,), and the posterior ``mean`` (..., k) and ``covariance`` (..., k, k) of all
-    x."""
+    """Evidence and posterior of all x."""
 
-    log_evidence: Array
-    mean: Array
-    covariance: Array
+    log_evidence: Array  # (...,)
+    mean: Array  # (..., k)
+    covariance: Array  # (..., k, k)
 
 
 def factor_of(mode: Mode, prior: Prior) -> Factor:

@@ -81,11 +81,9 @@ def find_starts(plant: PlantData, p: Array, stretches: Sequence[Stretch], warmup
 def predict(
     model: Model, dt: float, p: Array, stretches: Sequence[Stretch], starts: Sequence[Start]
 ) -> list[Array]:
-    """Simulate the stretches of one log for a batch of parameters.
-
-    The starts' shifts, offsets and changes are held; what they are relative to (the state at rest, the state
-    propagated through a gap) follows the parameters.
-    """
+    """Simulate the stretches of one log for a batch of parameters; the starts' shifts, offsets and changes
+    are held; what they are relative to (the state at rest, the state propagated through a gap) follows the
+    parameters."""
     out: list[Array] = []
     x_end = np.empty((len(p), model.n_x))
     for at, (stretch, start) in enumerate(zip(stretches, starts)):

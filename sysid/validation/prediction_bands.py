@@ -124,10 +124,8 @@ def free_run_band(plant: Plant, log: Log, simulated: Log, *, level: float = 0.9,
 
 def between_runs(plant: Plant, logs: Sequence[Log], gain: float = RUN_GAIN_SD) -> dict[str, Array]:
     """Return by output what a gain of the inputs that is off by so much changes at each row of the logs, one
-    after the other.
-
-    Empty for a plant of no log, or of so many that their held-out errors show what differs between runs.
-    """
+    after the other; empty for a plant of no log, or of so many that their held-out errors show what differs
+    between runs."""
     if not 0 < len(plant.logs) < SEVERAL:
         return {}
     moving = set(plant.inputs) - set(plant.model.switches)
