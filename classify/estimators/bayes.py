@@ -529,15 +529,12 @@ def _outer(rows: Floats) -> Floats:
     return np.asarray(rows[:, :, None] * rows[:, None, :])
 
 
-def _scatter(within: Floats, means: Floats, counts: Floats, kappa: float) -> Floats:
-    return np.asarray(within + np.einsum("m,mi,mj->ij", kappa * counts / (kappa + counts), means, means))
-
-
 def _log_evidence(within: Floats, means: Floats, counts: Floats, extra: float, kappa: float) -> float:
     """Return ln p(features) but for a constant; ``extra`` is nu_0 - d - 1."""
     d, n = within.shape[0], float(counts.sum())
     prior = d + 1 + extra
-    total = np.linalg.slogdet(extra * np.eye(d) + _scatter(within, means, counts, kappa))[1]
+    scatter = within + np.einsum("m,mi,mj->ij", kappa * counts / (kappa + counts), means, means)
+    total = np.linalg.slogdet(extra * np.eye(d) + scatter)[1]
     return float(
         0.5 * prior * d * np.log(extra)
         - 0.5 * (prior + n) * total

@@ -80,8 +80,10 @@ def extract_features(
     divide = can_normalise(grasps) if normalise is None else normalise
     time = np.asarray(grasps["time"].values, dtype=float)
     reach = [t for t in RESPONSE_TIMES if t <= time[-1] + 0.05] if times is None else list(times)
-    base = level(grasps)
-    scale = _scale(grasps) if divide else np.ones(base.size)
+    base, scale = level(grasps), np.ones(grasps.sizes["grasp"])
+    if divide:
+        scale = object_difference(grasps)
+        scale = np.where(np.abs(scale) >= LEAST_DIFFERENCE, scale, np.nan)
     rise, seen = _filled(time, grasps["t_surface"].values - base[:, None])
     fit = _RiseFit(time, rise, seen)
     unit = "1" if divide else "K"
@@ -227,11 +229,6 @@ class _RiseFit:
 def _shapes(time: Floats, onset: Floats, tau: Floats) -> Floats:
     s = np.maximum(time - onset, 0.0)
     return np.stack([-np.expm1(-s / tau), -np.expm1(-s / _SLOW)])
-
-
-def _scale(grasps: Grasps) -> Floats:
-    difference = object_difference(grasps)
-    return np.where(np.abs(difference) >= LEAST_DIFFERENCE, difference, np.nan)
 
 
 def _filled(time: Floats, rise: Floats) -> tuple[Floats, Floats]:

@@ -178,7 +178,10 @@ class Comparison(Shown):
         """
         table = []
         for first, second in combinations(self.classifiers, 2):
-            a, b = (_by_key(self._rows(name, condition)) for name in (first, second))
+            a, b = (
+                {(r["repeat"], r["condition"], r["grasp_id"]): r for r in self._rows(name, condition)}
+                for name in (first, second)
+            )
             if shared := [(a[k], b[k]) for k in a if k in b]:
                 head = {"first": first, "second": second, "condition": condition}
                 table.append(head | self._difference(shared))
@@ -276,10 +279,6 @@ class Comparison(Shown):
             and r["known"]
             and (r["condition"] == condition or (condition == POOLED and not r["apart"]))
         ]
-
-
-def _by_key(rows: Sequence[Row]) -> dict[Any, Row]:
-    return {(r["repeat"], r["condition"], r["grasp_id"]): r for r in rows}
 
 
 def grasp_numbers(rows: Sequence[Row]) -> NDArray[np.int64]:

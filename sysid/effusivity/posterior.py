@@ -13,10 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import expit, logit, logsumexp
+from scipy.special import logsumexp
 
 from thermogrip.datasets.arrays import Array, Mask
-from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.grasp_files import Records, as_grasps
 from thermogrip.datasets.materials import Material
 from thermogrip.datasets.schema import Grasps, has_touch_groups
@@ -40,14 +39,6 @@ class EffusivityRow:
     t_object_p95: float
     h_c: float  # posterior mean of ln h as a conductance [W m^-2 K^-1]
     log10_effusivity_sd: float
-
-
-@dataclass(frozen=True)
-class OpenSet:
-    """``log_bayes_factor`` (n_grasp,) of the known candidates against a free one, and ``p_unknown``."""
-
-    log_bayes_factor: Array
-    p_unknown: Array
 
 
 @dataclass(frozen=True)
@@ -105,22 +96,6 @@ def material_posterior(
     """Return probabilities of the candidates, (n_grasp, n_candidate), at equal prior odds; rows sum to 1."""
     evidence = material_evidence(gripper, grasps, candidates, finish=finish, until=until)
     return np.asarray(np.exp(evidence - logsumexp(evidence, axis=1, keepdims=True)))
-
-
-def open_set(
-    gripper: GripperModel, grasps: Grasps, candidates: Sequence[str | Material], *,
-    prior_unknown: float = 0.1, until: float | None = None,
-) -> OpenSet:  # fmt: skip
-    """Return log Bayes factors of "one of the candidates" at equal odds and known conductances against
-    "something of any effusivity", of probability ``prior_unknown`` in (0, 1); other arguments as for
-    :func:`material_fit`."""
-    if not 0 < prior_unknown < 1:
-        raise UserError(f"prior_unknown is {prior_unknown:g}", hint="give a probability between 0 and 1")
-    evidence = material_evidence(gripper, grasps, candidates, until=until)
-    known = logsumexp(evidence, axis=1) - np.log(len(candidates))
-    free = np.array([p.log_evidence for p in grid_posteriors(gripper, touches(grasps, until=until))])
-    odds = known - free
-    return OpenSet(log_bayes_factor=odds, p_unknown=expit(logit(prior_unknown) - odds))
 
 
 def effusivity_posterior(

@@ -384,12 +384,8 @@ class ExperimentForecast:
     def _rest(self, p: Array) -> Array:
         model = self.plant.model
         still = np.array([1.0 if name in model.switches else self._still(name) for name in model.inputs])
-        y = np.array(
-            [
-                self.room if _is_celsius(self.plant, name) else _lowest(self.plant, name)
-                for name in model.outputs
-            ]
-        )
+        lowest = {name: self.plant.valid.get(name, (0.0, 0.0))[0] for name in model.outputs}
+        y = np.array([self.room if _is_celsius(self.plant, n) else low for n, low in lowest.items()])
         return np.asarray(model.rest(y, still, self._d, p), dtype=float)
 
     def _still(self, name: str) -> float:
@@ -448,7 +444,3 @@ def _is_celsius(plant: Plant, name: str) -> bool:
 def _middle(plant: Plant, name: str) -> float:
     low, high = plant.valid.get(name, (0.0, 0.0))
     return 0.5 * (low + high)
-
-
-def _lowest(plant: Plant, name: str) -> float:
-    return plant.valid.get(name, (0.0, 0.0))[0]

@@ -318,11 +318,15 @@ def _of_nodes(network: Network) -> Iterator[Candidate]:
                 "parameters": {own: {"unit": "1", "value": 0.1, "sd": 0.1, "low": 0.0}},
             }
             yield Candidate(f"{name}: convection", patch, about="loss that grows faster than the difference")
-    for node, conductance in _to_air(network):
+    for link in network.links.values():
+        inside = [end for end in link.between if end in network.nodes]
+        if len(inside) != 1 or not set(link.between) & set(network.disturbances):
+            continue
+        [node] = inside
         place, T, G = f"{node}_bench", f"t_{node}_bench", f"G_{node}_bench"
         if place in network.boundaries:
             continue
-        value = 0.5 * network.parameters[conductance].value
+        value = 0.5 * network.parameters[link.conductance].value
         patch = {
             "boundaries": {place: {"temperature": T}},
             "links": {place: {"between": [node, place], "conductance": G}},
@@ -352,14 +356,6 @@ def _of_pipes(network: Network) -> Iterator[Candidate]:
         own = f"{link.conductance}_off"
         patch = {"links": {name: {"switch": pump, "off": own}}, "parameters": {own: _LEFT}}
         yield Candidate(f"{name}: film follows the flow", patch, about="slower while the pump rests")
-
-
-def _to_air(network: Network) -> Iterator[tuple[str, str]]:
-    """Yield the nodes that a link joins with a measured ambient, and its conductance."""
-    for link in network.links.values():
-        inside = [end for end in link.between if end in network.nodes]
-        if len(inside) == 1 and set(link.between) & set(network.disturbances):
-            yield inside[0], link.conductance
 
 
 def _removals(model: NetworkModel) -> Iterator[Candidate]:

@@ -64,10 +64,8 @@ def touch_section(touched: Sequence[Grasps], rows: Sequence[dict[str, Any]], tra
     right = sum(row["material"] == row["true"] for row in rows)
     named = [key for key in rows[0] if key.startswith("p_")]
     head = ("true", "answer", *(key.removeprefix("p_") for key in named), "decided at [s]")
-    table = tuple(
-        (row["true"], row["material"], *(_probability(row[key]) for key in named), row["decided_at_s"])
-        for row in rows
-    )
+    shares = [[None if row[key] is None else round(row[key], 4) for key in named] for row in rows]
+    table = tuple((r["true"], r["material"], *of, r["decided_at_s"]) for r, of in zip(rows, shares))
     verdict = f"{right} of {len(rows)} grasps of the twin were named right."
     for row in rows:
         if (row["p_unknown"] or 0.0) > 0.5:
@@ -86,10 +84,6 @@ def touch_section(touched: Sequence[Grasps], rows: Sequence[dict[str, Any]], tra
     strange = any((row["p_unknown"] or 0.0) > 0.5 for row in rows)
     tone = "good" if right == len(rows) and not strange else "warn"
     return Section("What did it touch?", parts, verdict, tone)
-
-
-def _probability(p: float | None) -> float | None:
-    return None if p is None else round(p, 4)
 
 
 def review_section(checks: Sequence[Check]) -> Section:

@@ -97,8 +97,9 @@ def tuning_section(tuning: Tuning) -> Section:
         else "It does not meet the spec on every draw."
     )
     scores = ", ".join(f"{name} {value:.3f}" for name, value in tuning.scores.items())
+    checked = f"{tuning.spec.check_draws} draws of the plant" if _uncertain(tuning) else "the plant"
     parts: list[Any] = [
-        Table(*tuning_table(tuning), f"Closed loops on {_checked(tuning)}"),
+        Table(*tuning_table(tuning), f"Closed loops on {checked}"),
         Picture(steps_figure(tuning.runs), _STEPS_CAPTION),
         Text(
             f"Band {tuning.spec.band_degC:g} degC. {_unseen(tuning)}; "
@@ -296,10 +297,6 @@ def _trade(rows: list[dict[str, Any]]) -> str:
 def _uncertain(tuning: Tuning) -> bool:
     plant = tuning.controller.plant
     return plant.samples is not None or plant.covariance is not None
-
-
-def _checked(tuning: Tuning) -> str:
-    return f"{tuning.spec.check_draws} draws of the plant" if _uncertain(tuning) else "the plant"
 
 
 def _unseen(tuning: Tuning) -> str:

@@ -17,9 +17,11 @@ from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
+from thermogrip.sysid.effusivity.data import touches
 from thermogrip.sysid.effusivity.gripper_model import GripperSpread, another_gripper, load_default_gripper
 from thermogrip.sysid.effusivity.multi_touch import two_touch_fit
 from thermogrip.sysid.effusivity.posterior import effusivity_posterior, material_evidence, material_posterior
+from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors
 
 
 @pytest.fixture(scope="module")
@@ -111,6 +113,30 @@ def test_a_second_sensor_is_part_of_the_answer_where_there_is_one(fresh: Grasps,
         for m in (one, two)
     ]
     assert np.median(np.divide(widths[1], widths[0])) < 0.9
+
+
+FIVE = ["copper", "zinc", "brass", "iron", "wood"]
+
+
+def test_what_is_none_of_them_is_called_unknown() -> None:
+    files, model = load_example_grasps(), PosteriorClassifier().with_device(load_default_gripper())
+    others, home = files["exp6_other_materials_obj43_grip23"], files["exp1A_obj43_grip23"]
+    far = np.isin(others["material"].values, ["glass", "acrylic", "rubber", "cork", "stainless"])
+    assert np.all(model.p_unknown(pick(others, far), FIVE) > 0.9)
+    assert np.median(model.p_unknown(pick(home, home["split"].values == "test"), FIVE)) < 0.1
+
+
+def test_odds_of_an_unknown_are_prior_odds_times_the_bayes_factor() -> None:
+    device, record = (
+        load_default_gripper(),
+        load_example_grasps()["exp1A_obj43_grip23"].isel(grasp=[0, 9, 18]),
+    )
+    known = material_evidence(device, record, FIVE)
+    free = [fit.log_evidence for fit in grid_posteriors(device, touches(record))]
+    factor = np.exp(known).mean(axis=1) / np.exp(free)
+    for prior, odds in ((0.25, 3.0), (0.1, 9.0)):
+        model = PosteriorClassifier(prior_unknown=prior).with_device(device)
+        np.testing.assert_allclose(model.p_unknown(record, FIVE), 1 / (1 + odds * factor))
 
 
 def test_a_metal_is_unknown_to_one_who_knows_only_wood(fitted: PosteriorClassifier, fresh: Grasps) -> None:

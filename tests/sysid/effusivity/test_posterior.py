@@ -31,7 +31,6 @@ from thermogrip.sysid.effusivity.posterior import (
     material_evidence,
     material_fit,
     material_posterior,
-    open_set,
 )
 from thermogrip.sysid.effusivity.posterior_grid import LN_E_RANGE, GridPosterior, grid_posteriors
 
@@ -181,16 +180,6 @@ def test_a_library_row_is_a_candidate_without_training(device, files):
     assert np.all(p[:, 5] > 0.9)
 
 
-def test_what_is_none_of_them_is_called_unknown(device, files):
-    grasps = files["exp6_other_materials_obj43_grip23"]
-    far = np.isin(grasps["material"].values, ["glass", "acrylic", "rubber", "cork", "stainless"])
-    strange = open_set(device, grasps.isel(grasp=np.flatnonzero(far)), FIVE)
-    home = open_set(device, split_of(files["exp1A_obj43_grip23"], "test"), FIVE)
-    assert strange.log_bayes_factor.max() < home.log_bayes_factor.min()
-    assert np.all(strange.p_unknown > 0.9)
-    assert np.median(home.p_unknown) < 0.1
-
-
 def test_lost_samples_and_order_of_grasps_do_not_matter(device, files):
     record = split_of(files["exp2_dT20"], "test").isel(grasp=[0, 3, 8])
     names = ["copper", "iron", "wood"]
@@ -211,7 +200,6 @@ def test_lost_samples_and_order_of_grasps_do_not_matter(device, files):
         (lambda d, g: material_evidence(d, g, ["copper", "copper"]), "twice"),
         (lambda d, g: material_evidence(d, g, []), "no candidate"),
         (lambda d, g: material_evidence(d, g, ["copper"], finish="polished"), "finish"),
-        (lambda d, g: open_set(d, g, ["copper"], prior_unknown=1.5), "prior_unknown"),
         (lambda d, g: effusivity_posterior(d, g, until=0.0), "after contact"),
         (lambda d, g: effusivity_posterior(d, g.assign(t_surface=g["t_surface"] + 273.15)), "give deg"),
         (
@@ -247,19 +235,6 @@ def test_a_row_is_made_of_two_mixtures(device):
         ]
         np.testing.assert_allclose(below, [0.05, 0.5, 0.95], atol=1e-7)
         assert (row.grasp_id, row.h_c) == ("g", pytest.approx(np.exp(7.15)))
-
-
-def test_odds_of_an_unknown_are_prior_odds_times_the_bayes_factor(device, files):
-    record = split_of(files["exp1A_obj43_grip23"], "test").isel(grasp=[0, 4, 9])
-    known = material_evidence(device, record, FIVE)
-    free = [p.log_evidence for p in grid_posteriors(device, touches(record))]
-    found, usual = (open_set(device, record, FIVE, **prior) for prior in ({"prior_unknown": 0.25}, {}))
-    np.testing.assert_allclose(found.log_bayes_factor, np.log(np.exp(known).mean(axis=1)) - free)
-    np.testing.assert_allclose(found.p_unknown, 1 / (1 + 3 * np.exp(found.log_bayes_factor)))
-    np.testing.assert_allclose(usual.p_unknown, 1 / (1 + 9 * np.exp(found.log_bayes_factor)))
-    for p in (0.0, 1.0):
-        with pytest.raises(UserError, match=f"prior_unknown is {p:g}; give a probability between 0 and 1"):
-            open_set(device, record, FIVE, prior_unknown=p)
 
 
 def test_grasps_with_and_without_a_group_share_a_record(device, files):
