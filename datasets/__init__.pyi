@@ -26,7 +26,5 @@ if typing.TYPE_CHECKING:  # doors of 0.1.0, which are found and not listed
     from thermogrip.datasets.materials import load_materials as load_materials
     from thermogrip.datasets.resample import gaps as gaps
     from thermogrip.datasets.resample import hold_average as hold_average
-    from thermogrip.datasets.splits import by_block as by_block
     from thermogrip.datasets.splits import by_grasp as by_grasp
-    from thermogrip.datasets.splits import by_session as by_session
     from thermogrip.datasets.splits import shipped as shipped

@@ -2,8 +2,8 @@
 
 The samples of one grasp are not independent, nor are the two touches of one ``touch_group``: a split by
 sample measures memory.  The unit here is the touch group, or the grasp where there is none, and every
-split keeps a unit whole.  Splits by session and by block keep those whole as well, and answer harder
-questions: does it work tomorrow, does it work on another block of the same material.
+split keeps a unit whole.  Splits by session and by block (:mod:`thermogrip.classify.evaluation.splits`)
+answer harder questions: does it work tomorrow, does it work on another block of the same material.
 
 A split is two index arrays into the record's ``grasp`` dimension, (train, test), sorted and disjoint.
 """
@@ -45,38 +45,6 @@ def by_grasp(
         chosen = np.concatenate([rng.permutation(units)[:train_per_class] for units in classes.values()])
         in_train = np.isin(unit, chosen)
         yield np.flatnonzero(known & in_train), np.flatnonzero(known & ~in_train)
-
-
-def by_session(grasps: Grasps) -> Iterator[Split]:
-    """Return one split a session: that session is the test, all others the training."""
-    session, known = label_values(grasps, "session"), label_values(grasps, "material") != ""
-    _whole(grasps, session, "session")
-    sessions = list(dict.fromkeys(session[known].tolist()))
-    if len(sessions) < 2:
-        problem = f"{len(sessions)} session(s) cannot be split"
-        raise UserError(problem, file=log_name(grasps), hint="give the column session, or split by grasp")
-    for name in sessions:
-        yield np.flatnonzero(known & (session != name)), np.flatnonzero(known & (session == name))
-
-
-def by_block(grasps: Grasps, *, seed: int = 0) -> Iterator[Split]:
-    """Return splits with one block of each material as the test, as many as the one with the fewest has."""
-    material, block = label_values(grasps, "material"), label_values(grasps, "block")
-    _whole(grasps, block, "block")
-    rng = np.random.default_rng(seed)
-    blocks: dict[str, NDArray[np.str_]] = {}
-    for name in dict.fromkeys(material[material != ""].tolist()):
-        blocks[name] = rng.permutation(np.unique(block[material == name]))
-        if blocks[name].size < 2:
-            problem = f"there is one block of {name}"
-            raise UserError(problem, file=log_name(grasps), hint="give the column block, or split by grasp")
-    if not blocks:
-        raise UserError("no grasp has a material", file=log_name(grasps), hint="give the column material")
-    for fold in range(min(b.size for b in blocks.values())):
-        held = np.zeros(material.size, dtype=bool)
-        for name, order in blocks.items():
-            held |= (material == name) & (block == order[fold])
-        yield np.flatnonzero((material != "") & ~held), np.flatnonzero(held)
 
 
 def shipped(grasps: Grasps) -> Split:

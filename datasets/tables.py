@@ -72,19 +72,15 @@ _NUMBER = re.compile(
 
 @dataclass(frozen=True)
 class Table:
-    """Columns of one file: numbers as float, text as str, and the file's line of each row.
-
-    ``attrs`` holds the format's entries for each column (``units``, ``role``), ``meta`` those for the whole
-    file, ``notes`` what the reader repaired.
-    """
+    """Columns of one file: numbers as float, text as str, and the file's line of each row."""
 
     file: str
     numbers: dict[str, NDArray[np.float64]]
     text: dict[str, list[str]]
     lines: NDArray[np.int64]
-    attrs: dict[str, dict[str, str]] = field(default_factory=dict)
-    meta: dict[str, str] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    attrs: dict[str, dict[str, str]] = field(default_factory=dict)  # by column: ``units``, ``role``
+    meta: dict[str, str] = field(default_factory=dict)  # the format's entries for the whole file
+    notes: tuple[str, ...] = ()  # what the reader repaired
     separator: str = ","
 
 

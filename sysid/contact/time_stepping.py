@@ -191,45 +191,33 @@ N_STEPPED = 5
 
 
 class Gripper(NamedTuple):
-    """A gripper on one set of time steps.
+    """A gripper on one set of time steps."""
 
-    ``dt`` (n_group,); ``steps`` (3, n_group, n_mode): E, E b + a and b; ``alive`` (n_group,) modes that keep
-    a state; ``sums`` (n_group, 2): of b, and of a past the alive ones; ``sensed`` (n_group, 6): the same as
-    the sensor sees them, E, a and b of its lag, and its rate; ``sensor`` (n_mode,) weights; ``numbers`` (7,):
-    resistance, lag, first, creep, settle, what the block's far face loses per degree, and the skin's leak.
-    """
-
-    dt: Array
-    steps: Array
-    alive: NDArray[np.int64]
-    sums: Array
-    sensed: Array
-    sensor: Array
+    dt: Array  # (n_group,)
+    steps: Array  # (3, n_group, n_mode): E, E b + a and b
+    alive: NDArray[np.int64]  # (n_group,) modes that keep a state
+    sums: Array  # (n_group, 2): of b, and of a past the alive ones
+    sensed: Array  # (n_group, 6): the same as the sensor sees them, E, a and b of its lag, and its rate
+    sensor: Array  # (n_mode,) weights
+    # (7,): resistance, lag, first, creep, settle, what the block's far face loses per degree, the skin's leak
     numbers: Array
 
 
 class Room(NamedTuple):
-    """Room to work in.
+    """Room to work in."""
 
-    ``rise``, ``slope`` (5, n_node) and ``flux`` (n_node,): the result, a row a curve.  ``grown`` (2,
-    n_node): h(t) and its derivative by ln tau_b.  The modes lie side by side, the slab's from fast to slow
-    and the gripper's from slow to fast, so that those that keep a state are neighbours: ``x`` (5, n_mode)
-    their states, ``steps`` (4, n_mode) E, E b + a, b and the sensor's weights, ``moved`` (2, 3, n_mode)
-    derivatives of the first three by ln e and by ln C.  ``slab`` (7, N_MODE): rate, weight, their moves and
-    1 - E.  ``now`` (3, 5): flux, sensor's node and reading of each curve.  ``sums`` (5, 2): Z and the sum of
-    a past the alive modes, of the value and of curves 3 and 4.
-    """
-
-    rise: Array
-    slope: Array
-    flux: Array
-    grown: Array
-    x: Array
-    steps: Array
-    moved: Array
-    slab: Array
-    now: Array
-    sums: Array
+    rise: Array  # (5, n_node): with slope and flux the result, a row a curve
+    slope: Array  # (5, n_node)
+    flux: Array  # (n_node,)
+    grown: Array  # (2, n_node): h(t) and its derivative by ln tau_b
+    # the modes lie side by side, the slab's from fast to slow and the gripper's from slow to fast, so that
+    # those that keep a state are neighbours
+    x: Array  # (5, n_mode), their states
+    steps: Array  # (4, n_mode): E, E b + a, b and the sensor's weights
+    moved: Array  # (2, 3, n_mode), derivatives of the first three by ln e and by ln C
+    slab: Array  # (7, N_MODE): rate, weight, their moves and 1 - E
+    now: Array  # (3, 5): flux, sensor's node and reading of each curve
+    sums: Array  # (5, 2): Z and the sum of a past the alive modes, of the value and of curves 3 and 4
 
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]

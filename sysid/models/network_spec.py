@@ -98,20 +98,16 @@ class Disturbance(_Table):
 
 
 class Output(_Table):
-    """A sensor on a node; ``sd`` of a mean over the fit's bins about the model, ``log_sd`` of its offset.
-
-    Where the error drifts over hours (AR(1)), ``wander`` is its sd and ``wander_time`` [s] its correlation
-    time; ``sd`` is then what is left beside it.
-    """
+    """A sensor on a node."""
 
     node: Name
     unit: Literal["degC"] = "degC"
     lag: Name | None = None
-    sd: Positive = 0.1
-    log_sd: NotNegative = 0.0
+    sd: Positive = 0.1  # of a mean over the fit's bins about the model, beside a drift
+    log_sd: NotNegative = 0.0  # of its offset
     reference: bool = False
-    wander: Positive | None = None
-    wander_time: Positive | None = None
+    wander: Positive | None = None  # sd of an error that drifts over hours (AR(1))
+    wander_time: Positive | None = None  # its correlation time [s]
 
     @model_validator(mode="after")
     def _whole(self) -> Output:
@@ -144,24 +140,19 @@ class Link(_Table):
 
 
 class Pipe(_Table):
-    """Water that moves from one node to another: cells in a row, each with a piece of wall.
-
-    ``flow`` is the mass flow times the heat capacity of water; ``delay`` the time at full flow; the sums
-    over all cells are ``wall_capacity``, ``film`` (water to wall) and ``loss`` (wall, or else water, to
-    ``surroundings``).
-    """
+    """Water that moves from one node to another: cells in a row, each with a piece of wall."""
 
     source: Name = Field(alias="from")
     target: Name = Field(alias="to")
-    flow: Name
-    delay: Name
+    flow: Name  # mass flow times the heat capacity of water
+    delay: Name  # the time at full flow
     cells: Annotated[int, Field(ge=1, le=60)]
     switch: Name | None = None
     off: Name | None = None
-    wall_capacity: Name | None = None
-    film: Name | None = None
+    wall_capacity: Name | None = None  # as film and loss a sum over all cells
+    film: Name | None = None  # water to wall
     film_off: Name | None = None
-    loss: Name | None = None
+    loss: Name | None = None  # wall, or else water, to the surroundings
     surroundings: Name | None = None
 
     @model_validator(mode="after")

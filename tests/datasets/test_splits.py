@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import make_grasps
-from thermogrip.datasets.splits import by_block, by_grasp, by_session, shipped
+from thermogrip.datasets.splits import by_grasp, shipped
 
 
 def record(material, **labels):
@@ -29,20 +29,16 @@ def record(material, **labels):
 def records(draw):
     """Records with unequal classes, unlabelled grasps and touch groups within a material."""
     counts = draw(st.lists(st.integers(4, 9), min_size=1, max_size=4))
-    material, group, session, block = [], [], [], []
+    material, group = [], []
     for kind, count in enumerate(counts):
         for unit in range(count):
             touches = draw(st.integers(1, 3))
             material += [f"m{kind}"] * touches
             group += [f"p{kind}-{unit}" if touches > 1 else ""] * touches
-            session += [f"s{unit % 2}"] * touches
-            block += [f"b{unit % 3}"] * touches
     blank = draw(st.integers(0, 3))
     material, group = material + [""] * blank, group + [""] * blank
-    session, block = session + ["s0"] * blank, block + ["b0"] * blank
     order = draw(st.permutations(range(len(material))))
-    pick = [[column[i] for i in order] for column in (material, group, session, block)]
-    return record(pick[0], touch_group=pick[1], session=pick[2], block=pick[3])
+    return record([material[i] for i in order], touch_group=[group[i] for i in order])
 
 
 def check_apart(grasps, train, test):
@@ -71,25 +67,6 @@ def test_random_splits_never_overlap_and_use_every_labelled_grasp(grasps, train_
             assert len(units) == train_per_class
 
 
-@settings(max_examples=40, deadline=None)
-@given(records(), st.integers(0, 5))
-def test_sessions_and_blocks_are_kept_whole(grasps, seed):
-    folds = list(by_session(grasps))
-    for train, test in folds:
-        check_apart(grasps, train, test)
-        assert set(grasps["session"].values[train]).isdisjoint(grasps["session"].values[test])
-    tested = np.concatenate([test for _, test in folds])
-    assert np.array_equal(np.sort(tested), np.flatnonzero(grasps["material"].values != ""))
-    whole = [f"{m}/{b}" for m, b in zip(grasps["material"].values, grasps["block"].values)]
-    folds = list(by_block(grasps, seed=seed))
-    assert len(folds) == 3
-    for train, test in folds:
-        check_apart(grasps, train, test)
-        assert {whole[i] for i in train}.isdisjoint(whole[i] for i in test)
-        assert set(grasps["material"].values[test]) <= set(grasps["material"].values[train])
-        assert len({whole[i] for i in test}) == len(set(grasps["material"].values[test]))  # a block of each
-
-
 def test_the_same_seed_gives_the_same_splits_and_another_does_not():
     grasps = load_example_grasps()["exp1A_obj43_grip23"]
     first, again = list(by_grasp(grasps, seed=1)), list(by_grasp(grasps, seed=1))
@@ -104,10 +81,6 @@ def test_twenty_splits_of_five_a_material_from_seed_0_are_the_default():
     asked = by_grasp(grasps, train_per_class=5, repeats=20, seed=0)
     assert (len(found), len(found[0])) == (20, 25)  # of five materials
     assert found == [train.tolist() for train, _ in asked]
-    blocks = record(list("aaaaaaaa"), block=list("12345678"))
-    seeds = {}, {"seed": 0}, {"seed": 1}
-    folds = [[test.tolist() for _, test in by_block(blocks, **seed)] for seed in seeds]
-    assert folds[0] == folds[1] != folds[2]
 
 
 def test_every_grasp_gets_its_turn_in_training():
@@ -137,13 +110,6 @@ def test_the_shipped_split_is_that_of_the_column():
         (lambda: by_grasp(record(["a"] * 3), train_per_class=3), "3 grasp(s) of a cannot give 3 to train"),
         (lambda: by_grasp(record(["a"] * 3), train_per_class=0), "0 training grasps a material; give"),
         (lambda: by_grasp(record(["", ""]), train_per_class=1), "no grasp has a material"),
-        (lambda: by_block(record(["", ""])), "no grasp has a material"),
-        (lambda: by_session(record(["a", "b"], session=["s", "s"])), "1 session"),
-        (lambda: by_block(record(["a", "b"], block=["a", "b"])), "one block of a"),
-        (
-            lambda: by_session(record(["a", "a"], session=["s", "t"], touch_group=["p", "p"])),
-            "touch group 'p' is in session 's' and 't'",
-        ),
         (lambda: by_grasp(record(["a", "b"], touch_group=["p", "p"])), "is in material 'a' and 'b'"),
     ],
 )
