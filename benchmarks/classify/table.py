@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.special import expit, logit, logsumexp
 
 from thermogrip.classify.evaluation.metrics import auroc
 from thermogrip.classify.evaluation.splits import plan_folds
@@ -30,17 +31,20 @@ from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.effusivity.calibration import calibrate_gripper
+from thermogrip.sysid.effusivity.data import touches
 from thermogrip.sysid.effusivity.gripper_model import GripperModel
 from thermogrip.sysid.effusivity.posterior import (
     effusivity_posterior,
+    material_evidence,
     material_posterior,
-    open_set,
 )
+from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors
 
 Row = dict[str, Any]
 
 FIVE = ["brass", "copper", "iron", "wood", "zinc"]
 METALS, INSULATORS = ("copper", "brass", "zinc", "iron"), ("glass", "acrylic", "rubber", "cork")
+PRIOR_UNKNOWN = 0.1  # probability of a material that is not among the five
 OTHERS = "exp6_other_materials_obj43_grip23"
 LONG = "exp4_cooled5_obj18_grip38_40s"
 # name: (condition, seconds of contact), what must be reached, what hundreds of grasps teach a classifier
@@ -131,15 +135,17 @@ def answers(
 
 def open_answers(device: GripperModel, grasps: Grasps, known: bool, repeat: int) -> list[Row]:
     """Return a row a grasp: the log Bayes factor of the five against any other material."""
-    found = open_set(device, grasps, FIVE)
+    known_to_it = logsumexp(material_evidence(device, grasps, FIVE), axis=1) - np.log(len(FIVE))
+    odds = known_to_it - [fit.log_evidence for fit in grid_posteriors(device, touches(grasps))]
+    p_unknown = expit(logit(PRIOR_UNKNOWN) - odds)
     return [
         {
             "repeat": repeat,
             "grasp": str(grasps["grasp"].values[i]),
             "material": str(grasps["material"].values[i]),
             "known": known,
-            "log_bayes_factor": float(found.log_bayes_factor[i]),
-            "p_unknown": float(found.p_unknown[i]),
+            "log_bayes_factor": float(odds[i]),
+            "p_unknown": float(p_unknown[i]),
         }
         for i in range(grasps.sizes["grasp"])
     ]
