@@ -102,8 +102,7 @@ class PosteriorClassifier(GraspClassifier):
         self.classes_ = two_or_more(np.concatenate(labels), where)
         records = [part.assign(material=("grasp", own)) for part, own in zip(records, labels)]
         device = calibrate_gripper(records, start=self.device, seed=self.random_state, progress=progress)
-        untabled = [name for name, block in device.blocks.items() if block.library_sd_ln > 1]
-        self.notes_ = [f"{name}: not in the materials table, learnt from its grasps" for name in untabled]
+        self.notes_ = [f"{m}: not in the materials table, learnt from its grasps" for m in device.unlisted]
         self.longest_ = longest_contact(records)
         self.coupling_: Coupling | None = None
         for part in records:

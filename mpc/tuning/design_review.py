@@ -157,7 +157,7 @@ def lacks_structure(controller: Controller, swing: tuple[float, float]) -> Check
     name, plant = "settles where the model lacks structure", controller.plant
     noted = controller.notes.get("spec")
     spec = (
-        spec_from_dict(noted)
+        spec_from_dict({key: value for key, value in noted.items() if key != "settle_within_s"})
         if isinstance(noted, Mapping)
         else Spec(steps=[(swing[0], max(swing[0] + 1.0, swing[1]))])
     )

@@ -25,6 +25,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from typing import NamedTuple
 
 import numpy as np
@@ -35,7 +36,7 @@ from scipy.optimize import minimize
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.grasp_files import Records, as_grasps
-from thermogrip.datasets.materials import Material, find_material
+from thermogrip.datasets.materials import Material, find_material, load_materials
 from thermogrip.datasets.parallel import Progress
 from thermogrip.datasets.schema import Grasps, log_name
 from thermogrip.sysid.contact.simulation import TimeNodes
@@ -629,6 +630,7 @@ def _labelled(grasps: Sequence[Grasps], materials: Mapping[str, Material], least
             raise UserError(
                 f"grasp {lost!r} has no material", file=log_name(record), hint="label or remove it"
             )
+        _check_labels(part, materials, log_name(record))
         parts.append(part)
     data = stack_touches(parts)
     if np.unique(data.material).size < least:
@@ -650,6 +652,19 @@ def _labelled(grasps: Sequence[Grasps], materials: Mapping[str, Material], least
             hint="fill in t_object_nominal_degC, if only of some",
         )
     return data
+
+
+def _check_labels(part: Touches, materials: Mapping[str, Material], file: str) -> None:
+    """Raise UserError, with file and grasp, at a label that is hardly another word than the table's."""
+    for label in dict.fromkeys(part.material.tolist()):
+        near = get_close_matches(label.lower(), load_materials(), 1, 0.8)
+        if near and _row(label, materials) is None:
+            first = str(part.grasp_id[part.material == label][0])
+            problem = f"grasp {first!r} is of {label!r}, which the materials table has not"
+            hint = (
+                f"did you mean {near[0]}? (a material that the table lacks needs a name less like its names)"
+            )
+            raise UserError(problem, file=file, column="material", hint=hint)
 
 
 def _row(label: str, materials: Mapping[str, Material]) -> Material | None:

@@ -325,6 +325,11 @@ class GripperModel:
             raise ValueError("an uncertain gripper needs the covariance of its parameters")
 
     @property
+    def unlisted(self) -> list[str]:
+        """The materials that the table lacks, which were learnt from their grasps alone."""
+        return [name for name, block in self.blocks.items() if block.library_sd_ln > 1]
+
+    @property
     def materials(self) -> tuple[str, ...]:
         """Return the labels that it was calibrated with."""
         return tuple(self.blocks)

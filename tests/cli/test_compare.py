@@ -69,7 +69,8 @@ def scored(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
     made.asked = stand_in(
         "thermogrip.classify.estimators.registry.trainable",
         lambda names, quick, seed: (
-            {name: quick for name in names if not (made.missing and name == "lstm")}, made.missing
+            {name: quick for name in names if not (made.missing and name == "lstm")},
+            made.missing,
         ),
     )
     made.planned = stand_in("thermogrip.classify.evaluation.splits.plan_folds")

@@ -143,4 +143,4 @@ def test_what_people_mistype_is_mended_in_its_line(tmp_path: Path) -> None:
     before = {*tmp_path.rglob("*")}
     for words, said in told(list(MISTAKES), tmp_path).items():
         assert MISTAKES[words] in said, words
-    assert {path for path in tmp_path.rglob("*") if path.name != "__pycache__"} == before
+    assert {path for path in tmp_path.rglob("*") if "__pycache__" not in path.parts} == before

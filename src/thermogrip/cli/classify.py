@@ -46,6 +46,8 @@ def calibrated_device(
     labelled = touched_part(console, labelled)
     with console.progress("calibrate") as progress:
         device = calibrate_gripper(labelled, seed=seed, progress=progress)
+    for name in device.unlisted:
+        console.warn(f"{name}: not in the materials table, learnt from its grasps")
     coupling = None
     for record in filter(has_touch_groups, labelled):
         coupling = learn_coupling(device, record, start=coupling)
