@@ -162,9 +162,11 @@ def test_a_gripper_is_the_bundled_one_or_calibrated_on_what_touched(
     assert verb.calibrated_device(Console(), [], 4) == ("bundled", None, 40.0)
     assert "warning: the bundled gripper's calibration is used; give --calibrate" in capsys.readouterr().err
 
-    def calibrate(*_: Any, progress: Any, **__: Any) -> str:
+    mine = SimpleNamespace(unlisted=["soap"])
+
+    def calibrate(*_: Any, progress: Any, **__: Any) -> SimpleNamespace:
         progress(0.5, "fit")
-        return "mine"
+        return mine
 
     records = [record_of(["a"]), record_of(["b"], touch_group=["p"]), record_of(["c"], touch_group=["q"])]
     read = stand_in("thermogrip.datasets.grasp_files.read_grasp_files", records)
@@ -175,14 +177,16 @@ def test_a_gripper_is_the_bundled_one_or_calibrated_on_what_touched(
         "thermogrip.sysid.effusivity.multi_touch.learn_coupling", lambda *_, start: (start or 0) + 1
     )
     longest = stand_in(f"{QUALITY}.longest_contact", 12.0)
-    assert verb.calibrated_device(Console(), ["x.csv"], 4) == ("mine", 2, 12.0)
+    assert verb.calibrated_device(Console(), ["x.csv"], 4) == (mine, 2, 12.0)
     assert (read[0].args, warned[0].args[1], touched[0].args[1]) == ((["x.csv"],), records, records)
     assert (asked[0].args, asked[0].seed, longest[0].args) == ((records,), 4, (records,))
     assert [(call.args, call.start) for call in learnt] == [
-        (("mine", records[1]), None),
-        (("mine", records[2]), 1),
+        ((mine, records[1]), None),
+        ((mine, records[2]), 1),
     ]
-    assert shares(capsys.readouterr().err, "calibrate") == [50]
+    said = capsys.readouterr().err
+    assert shares(said, "calibrate") == [50]
+    assert "warning: soap: not in the materials table, learnt from its grasps" in said
 
 
 @pytest.mark.parametrize(

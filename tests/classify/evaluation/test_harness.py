@@ -178,7 +178,9 @@ def test_leaks_share_their_level_and_count_grasps() -> None:
 
 
 def test_who_cannot_answer_is_left_out_with_the_reason_and_the_others_are_scored(three: Grasps) -> None:
-    strange = three.assign(material=("grasp", np.char.add("un", three["material"].values.astype(str))))
+    strange = three.assign(
+        material=("grasp", np.char.add("a kind of ", three["material"].values.astype(str)))
+    )
     found = evaluate(["posterior", "pca-lda"], [strange])
     assert found.classifiers == ("pca-lda",)
     assert {row["classifier"] for row in found.leaks} == {"pca-lda", "untouched traces"}
