@@ -8,6 +8,7 @@ import inspect
 import re
 import textwrap
 from dataclasses import is_dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -196,5 +197,5 @@ def test_what_a_benchmark_imports_of_us_exists(file: Path) -> None:
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("thermogrip"):
             module = importlib.import_module(str(node.module))
             for alias in node.names:
-                if not hasattr(module, alias.name):
-                    importlib.import_module(f"{node.module}.{alias.name}")
+                folder = getattr(module, "__path__", None) and f"{node.module}.{alias.name}"
+                assert hasattr(module, alias.name) or (folder and find_spec(folder)), alias.name

@@ -35,6 +35,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
+from operator import attrgetter
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -156,10 +157,6 @@ def refine(
         if before - best.cost < ENOUGH * before:
             break
     return best
-
-
-def _cost(found: Solution) -> float:
-    return found.cost
 
 
 def _triangles(parts: Sequence[Array], na: int) -> tuple[Array, list[Array]]:
@@ -404,7 +401,8 @@ class Search:
             return None
         if not known:  # the start of the least cost need not lead to it
             solved = [refine(some, records, at, FEW) for some in solved]
-        solved.sort(key=_cost)
-        best = min((refine(some, records, at) for some in solved[: 1 if known else 2]), key=_cost)
+        cost = attrgetter("cost")
+        solved.sort(key=cost)
+        best = min((refine(some, records, at) for some in solved[: 1 if known else 2]), key=cost)
         self._found[na] = [best.a, *known][:2]
         return best
