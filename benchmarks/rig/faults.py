@@ -1,6 +1,7 @@
 """Write docs/reference/faults.md: every fault that is drilled, and what it costs.
 
-    python benchmarks/rig/faults.py --out docs/reference/faults.md --nominal nominal*.json --day day.txt
+    python benchmarks/rig/faults.py --out docs/reference/faults.md --record docs/records/faults.md \
+        --nominal nominal*.json --day day.txt
 
 ``--nominal``: what benchmarks/rig/nominal.py wrote, of one seed or several, and with ``--off``; ``--day``: what
 benchmarks/rig/day.py printed.  From them come the false alarms that the detection times stand beside.
@@ -47,8 +48,8 @@ HEAD = """\
 # What happens when something fails
 
 Every line is a test (`tests/rig/fault_injection/test_drills.py`) on a virtual device behind a real pseudo-terminal; this
-page is written by `python benchmarks/rig/faults.py --out docs/reference/faults.md --nominal nominal.json --day
-day.txt`. The device's plant is a few percent off the model that guard and controller know; the room is 25 degC, the
+page is written by `python benchmarks/rig/faults.py --out docs/reference/faults.md --record docs/records/faults.md
+--nominal nominal.json --day day.txt`. The device's plant is a few percent off the model that guard and controller know; the room is 25 degC, the
 skin is on its way from 25 to 36 degC or, where marked *held*, was there.
 
 - **found**: from the fault to the trip, by the device's clock. A sample is 1 s, and the fault comes between two.
@@ -73,21 +74,29 @@ SLOW = """
 Sooner is lower floors, or fewer repeats, at the cost of false alarms. {cost}
 
 Floors are what a window against the model may be off by where the model predicts no change: {floors}; a quarter of
-the change comes on top. With lower ones the same faults are found so much sooner, and healthy sessions are ended:
+the change comes on top. [What lower floors cost](../records/faults.md), how long faults take at any moment of a session,
+and what a drift of the plant costs, are in the records.
+
+A session that does not begin at rest (after a trip, say) compares nothing with the model in its first 60 s, for what
+cannot be read, a hot heatsink, is not known yet; nor is a skin compared for 60 s after a touch. What fails then is found
+at the end of that and a window; sensors that are lost or jump, limits, pump and cable are seen at once all the same.
+
+What is found late did no harm meanwhile: with none of these drills the water or the skin left its range by more than
+{worst:.1f} K, and no grasp is taken before the skin has been compared with the model for a whole window.
+"""
+
+RECORD = """\
+# What finding faults sooner would cost
+
+Written with [the page of faults](../reference/faults.md), by `python benchmarks/rig/faults.py`. With lower floors the
+same faults are found so much sooner, and healthy sessions are ended:
 
 | found after [s] with floors | {heads} | why not sooner |
 |---|{rules}---|
 {rows}
 
 Repeats of a sensor are another matter: {repeats}
-
-A session that does not begin at rest (after a trip, say) compares nothing with the model in its first 60 s, for what
-cannot be read, a hot heatsink, is not known yet; nor is a skin compared for 60 s after a touch. What fails then is found
-at the end of that and a window; sensors that are lost or jump, limits, pump and cable are seen at once all the same.
-{day}
-What is found late did no harm meanwhile: with none of these drills the water or the skin left its range by more than
-{worst:.1f} K, and no grasp is taken before the skin has been compared with the model for a whole window.
-"""
+{day}"""
 
 SAID = """
 ## Messages
@@ -113,7 +122,7 @@ DRIFTED = """
 """
 
 LEARNT = """
-What it costs: the same faults are found so much later with a drift of 5 % of which nothing is known yet, and after {healthy} healthy sessions on the very device:
+What a stated drift costs: the same faults are found so much later with a drift of 5 % of which nothing is known yet, and after {healthy} healthy sessions on the very device:
 
 | found after [s] | plant as identified | drift 5 % | learnt |
 |---|---|---|---|
@@ -132,6 +141,7 @@ def main() -> None:
     """Run every drill and write the page."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--record", type=Path, required=True)
     parser.add_argument("--nominal", type=Path, nargs="+", required=True)
     parser.add_argument("--day", type=Path)
     options = parser.parse_args()
@@ -155,7 +165,7 @@ def main() -> None:
     lines = [_row(one) for one in outcomes] + [_host_row(one) for one in hosts]
     nominal = [json.loads(path.read_text(encoding="utf-8")) for path in options.nominal]
     healthy = [run for run in nominal if not run["off"] and not run.get("drift")]
-    slow = _slow(outcomes, sooner, _merged(healthy), options.day)
+    slow, record = _slow(outcomes, sooner, _merged(healthy), options.day)
     wrong = [run for run in nominal if run["off"]]
     stated = [run for run in wrong if run.get("drift")]
     slow += "".join(
@@ -166,13 +176,14 @@ def main() -> None:
         slow += DRIFTED.format(
             share=share, percent=100 * share, n=n, sessions=run["sessions"], hours=run["hours"]
         )
-    slow += drift_section(controller, outcomes) if stated else ""
+    record += drift_section(controller, outcomes) if stated else ""
     said = [f"    {o.message}" for o in outcomes if o.drill.name in ("pump stops", "driver gives nothing")]
     kinds = [f"| `{kind}` | {check} | {clear} |" for kind, (check, clear) in KINDS.items()]
     text = HEAD + "\n".join(lines) + "\n" + slow + SAID + "\n\n".join(said) + "\n"
     ends = [f"- `{kind}`: {clear}" for kind, clear in ENDLESS.items()]
     text += TAIL + "\n".join(kinds) + "\n" + ALONE + "\n".join(ends) + "\n"
     out.write_text(_tidy(text), encoding="utf-8")
+    options.record.write_text(_tidy(record), encoding="utf-8")
 
 
 def drift_section(controller: PIController, outcomes: Sequence[Outcome]) -> str:
@@ -247,8 +258,8 @@ def _slow(
     sooner: dict[float, dict[str, float]],
     nominal: dict[str, Any],
     day: Path | None,
-) -> str:
-    """Return the section on what takes its time, and what less would cost."""
+) -> tuple[str, str]:
+    """Return the section on what takes its time, and the record of what less would cost."""
     most = 24 * float(chi2.ppf(0.95, 2 * (nominal["trips"] + 1))) / (2 * nominal["hours"])
     cost = (
         f"In {nominal['hours']:.0f} h of sessions without a fault on {nominal['rigs']} rigs (posterior draws of a plant, "
@@ -282,16 +293,15 @@ def _slow(
     )
     usual = ModelSettings()
     floors = ", ".join(f"{f:g} K in {w:g} s" for f, w in zip(usual.floors, usual.windows))
-    return SLOW.format(
-        cost=cost,
-        floors=floors,
+    section = SLOW.format(cost=cost, floors=floors, worst=max(o.excursion for o in outcomes if o.drill.why))
+    record = RECORD.format(
         heads=" | ".join(f"x {share:g}" for share in (1.0, *SHARES)),
         rules="---|" * (1 + len(SHARES)),
         rows="\n".join(rows),
         repeats=repeats,
         day=table,
-        worst=max(o.excursion for o in outcomes if o.drill.why),
     )
+    return section, record
 
 
 def _of_the_day(said: dict[str, Any]) -> str:

@@ -27,7 +27,7 @@ and the mean is cut off at -1 and 1.
 *What cannot be learnt away.*  Only sessions that settled without a trip are learnt from, only the first
 :data:`LEARN_FROM` of them, and in all no parameter is moved by more than s: a driver that weakens from
 session to session is followed to s and trips later than it would, but it trips (measured in
-docs/reference/faults.md).  After that the file stays, and the windows are nearly as sharp as for a plant that
+docs/records/faults.md).  After that the file stays, and the windows are nearly as sharp as for a plant that
 is known.
 """
 

@@ -1,7 +1,7 @@
 """Posterior of a grey-box fit: whole parameter vectors from emcee, or a few draws for bands.
 
 What the samples are for, and why they lie closer than the intervals of the fit, is in
-``docs/explanation/likelihood.md``.
+``docs/explanation/uncertainty.md``.
 
 **Sampling.** The few parameters that the data determine best relative to the prior are sampled with emcee;
 all others are integrated out and drawn afterwards, each as a fit of its own, so every sample is a whole

@@ -1,7 +1,4 @@
-"""The documents say what the program does: the reference is its help, the README's commands are understood.
-
-To write the reference anew: ``python tests/end_to_end/test_docs.py > docs/reference/cli.md``.
-"""
+"""The documents say what the program does: their commands are understood, their links lead somewhere."""
 
 from __future__ import annotations
 
@@ -9,41 +6,20 @@ import ast
 import contextlib
 import importlib.util
 import io
-import os
 import re
 import shlex
-import sys
+import tomllib
 from functools import cache
 from pathlib import Path
 
 import pytest
 
+from thermogrip import __version__
 from thermogrip.cli.main import app, main
+from thermogrip.sysid.models.user_model import load_object
 
 ROOT = Path(__file__).parents[2]
-INTRO = """# The command line
-
-What `thermogrip VERB --help` prints, but for what all verbs share: `-h`, `--json` (one JSON object on stdout
-and nothing else there) and, in all but `recover`, `materials` and `init`, `--seed N`. Progress, warnings and
-what to type next go to stderr. `thermogrip --install-completion` lets the shell complete verbs and options.
-
-| exit code | meaning |
-|---|---|
-| 0 | done |
-| 1 | a bug of ours; `--debug` anywhere on the line shows its traceback |
-| 2 | your input is at fault: one line on stderr names file, row, column and what to do |
-| 3 | done, but the answer is no: not converged, spec not met, review failed, rig tripped, did not settle |
-| 130 | Ctrl-C; no half-written file is left |
-"""
-
-
-def reference() -> str:
-    """Return the reference page."""
-    parts = [INTRO]
-    for command in app.registered_commands:
-        text = re.sub(r"\n  (?:--seed N|--json|-h, --help) .*(?:\n {20,}.*)*", "", help_of(str(command.name)))
-        parts.append(f"## {command.name}\n\n```\n{text}\n```\n")
-    return "\n".join(parts)
+SITE = ROOT / ".ci" / "site.py"
 
 
 @cache
@@ -70,7 +46,7 @@ def commands_in(path: Path) -> list[str]:
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 #: records name files, modules and options as they were at the time
 PRESENT = [page for page in PAGES if page.parent.name != "records"]
-WRITTEN = [(page, line) for page in PRESENT if page.name != "cli.md" for line in commands_in(page)]
+WRITTEN = [(page, line) for page in PRESENT for line in commands_in(page)]
 
 
 @pytest.fixture(autouse=True)
@@ -78,8 +54,26 @@ def _a_wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "100")
 
 
-def test_the_reference_is_what_help_prints() -> None:
-    assert (ROOT / "docs/reference/cli.md").read_text(encoding="utf-8") == reference()
+def test_the_site_has_the_help_of_every_verb_and_documents_every_door() -> None:
+    reference, doors = load_object(SITE, "help_of_verbs")(), load_object(SITE, "doors")
+    for command in app.registered_commands:
+        assert f"## {command.name}\n\n```text\nUsage: thermogrip {command.name} [OPTIONS]" in reference
+    assert "--network FILE.py:CLASS" in reference
+    assert "--json" not in reference  # every verb's; the page says so once
+    for room in ("datasets", "sysid", "mpc", "rig", "classify"):
+        page = (ROOT / "docs" / "reference" / "python" / f"{room}.md").read_text(encoding="utf-8")
+        assert f"<!-- doors of thermogrip.{room} -->" in page
+        names = importlib.import_module(f"thermogrip.{room}").__all__
+        documented = doors(room)
+        assert all(re.search(rf"(:: .*\.|`){name}\b", documented) for name in names)
+
+
+def test_the_menu_of_the_site_has_every_page() -> None:
+    menu = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:\n")[2]
+    pages = {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")}
+    notebooks = {f"notebooks/{path.stem}.md" for path in (ROOT / "notebooks").glob("*.py")}
+    elsewhere = set(load_object(SITE, "PAGES").values())
+    assert set(re.findall(r"[\w/.-]+\.md", menu)) == pages | notebooks | elsewhere
 
 
 @pytest.mark.parametrize(("page", "line"), WRITTEN, ids=[f"{p.name}: {line[:60]}" for p, line in WRITTEN])
@@ -141,6 +135,16 @@ def test_files_and_modules_that_the_documents_name_are_there(page: Path) -> None
         assert spec or hasattr(importlib.import_module(module), last), f"{page.name} names thermogrip{name}"
 
 
+def test_one_version_stands_everywhere() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert project["version"] == __version__
+    assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    latest = re.search(r"^## \[(.*?)\]", changes, flags=re.MULTILINE)
+    assert latest
+    assert latest[1] == __version__
+
+
 def test_the_tests_that_are_repeated_with_another_processors_kernels_are_there() -> None:
     for name in (ROOT / ".ci" / "numeric_tests").read_text(encoding="utf-8").split():
         assert (ROOT / name).is_file(), name
@@ -148,8 +152,3 @@ def test_the_tests_that_are_repeated_with_another_processors_kernels_are_there()
 
 def _is_package(module: str) -> bool:
     return hasattr(importlib.import_module(module), "__path__")
-
-
-if __name__ == "__main__":
-    os.environ["COLUMNS"] = "100"
-    sys.stdout.write(reference())

@@ -25,10 +25,10 @@ KINDS: dict[str, dict[str, Any]] = tomllib.loads(
 )
 #: What ``init`` writes.
 TEMPLATES = [kind for kind, about in KINDS.items() if "template" in about]
-_TAKES = {place: kind for kind, about in KINDS.items() for place in about.get("places", ())}
+TAKES = {place: kind for kind, about in KINDS.items() for place in about.get("places", ())}
 _INSIDE = {"classifier.json": "classifier", "batch.json": "batch", "run.json": "run", "samples.csv": "run"}
 _PARTS = {"log": "samples.csv", "grasps": "grasps.csv"}  # of a run
-_BOTH = ({"run", "batch"}, {"batch", "grasps"})  # one may be given for the other
+BOTH = ({"run", "batch"}, {"batch", "grasps"})  # one may be given for the other
 _HEAD = 1 << 16  # bytes that show what a file is
 
 
@@ -125,7 +125,7 @@ def check_exists(text: str) -> None:
 def check_kind(ctx: Any, path: str, wanted: str) -> None:
     """Refuse what is known to be another kind of file, with what to type instead."""
     found, verb = kind_of(path if os.path.exists(path) else path.rpartition("@")[0]), ctx.command.name
-    if found in ("", wanted) or {found, wanted} in _BOTH:
+    if found in ("", wanted) or {found, wanted} in BOTH:
         return
     fits = {name: _places(each, found) for name, each in ctx.parent.command.commands.items()}
     verbs = [name for name, (_, takes) in fits.items() if takes]
@@ -139,7 +139,7 @@ def check_kind(ctx: Any, path: str, wanted: str) -> None:
 
 def _places(command: Any, kind: str) -> tuple[list[str], bool]:
     """Return a verb's arguments with its options for this kind of file, and whether it takes any."""
-    takes = [p for p in command.params if p.name != "out" and _TAKES.get(p.metavar) == kind]
+    takes = [p for p in command.params if p.name != "out" and TAKES.get(p.metavar) == kind]
     first = [p.metavar for p in command.params if p.param_type_name == "argument"]
     named = [f"{p.opts[0]} {p.metavar}" for p in takes if p.metavar not in first]
     return first + named, bool(takes)
@@ -149,7 +149,7 @@ def check_files(ctx: Any) -> None:
     """Refuse what is not there, of another kind, or not whole among what a verb was given."""
     given = []
     for param in ctx.command.params:
-        kind, value = _TAKES.get(param.metavar, ""), ctx.params.get(param.name)
+        kind, value = TAKES.get(param.metavar, ""), ctx.params.get(param.name)
         if kind and value and param.name != "out":
             given += [(str(path), kind) for path in (value if isinstance(value, list | tuple) else [value])]
     given.sort(key=lambda each: each[1] != "network")  # a misspelt name is refused before files are read

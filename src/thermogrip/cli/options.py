@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from thermogrip.cli.completion import completer
 from thermogrip.cli.kinds import check_exists
 from thermogrip.datasets.errors import UserError, as_user_error, known_names
 
@@ -92,7 +93,15 @@ def opt(
     max: float | None = None,
 ) -> Any:
     """Return the Typer option of a name, what its value is called, its help, a ``callback=``, its bounds."""
-    return typer.Option(name, metavar=metavar or "N", help=words, callback=check, min=min, max=max)
+    return typer.Option(
+        name,
+        metavar=metavar or "N",
+        help=words,
+        callback=check,
+        min=min,
+        max=max,
+        autocompletion=completer(name, metavar or "N"),
+    )
 
 
 def flag(name: str, words: str) -> Any:
@@ -102,7 +111,7 @@ def flag(name: str, words: str) -> Any:
 
 def arg(metavar: str, words: str, check: Callable[..., Any] | None = None) -> Any:
     """Return the Typer argument of a place on the command line."""
-    return typer.Argument(metavar=metavar, help=words, callback=check)
+    return typer.Argument(metavar=metavar, help=words, callback=check, autocompletion=completer("", metavar))
 
 
 AsJson = Annotated[bool, flag("--json", "Print one JSON object on stdout and nothing else there.")]
