@@ -30,6 +30,10 @@ def main() -> None:
         notebook = jupytext.read(source)
         with tempfile.TemporaryDirectory() as folder:
             NotebookClient(notebook, timeout=300, resources={"metadata": {"path": folder}}).execute()
+        for cell in notebook.cells:
+            for output in cell.get("outputs", []):  # xarray brings 20 kB of styles; its text says the same
+                if "xr-wrap" in output.get("data", {}).get("text/html", ""):
+                    del output["data"]["text/html"]
         text, resources = MarkdownExporter().from_notebook_node(
             notebook, resources={"output_files_dir": "", "unique_key": source.stem}
         )

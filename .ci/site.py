@@ -30,6 +30,7 @@ PAGES = {
     "VISION.md": "vision.md",
     "SECURITY.md": "security.md",
     "examples/README.md": "examples.md",
+    "CITATION.cff": "CITATION.cff",
 }
 NOTEBOOKS = ROOT / "build" / "notebooks"
 

@@ -17,6 +17,7 @@
 
 # %%
 import matplotlib.pyplot as plt
+import pandas as pd
 
 from thermogrip.classify import Stream, classify_grasps, evaluate, make_classifier
 from thermogrip.datasets import load_example_grasps
@@ -47,12 +48,8 @@ comparison = evaluate(["posterior", "bayes", "pca-lda"], grasps)
 comparison
 
 # %%
-for score in comparison.scores():
-    low, high = score["low"], score["high"]
-    print(
-        f"{score['classifier']:10} {score['accuracy']:.2f} ({low:.2f} to {high:.2f}), n = {score['n']}, "
-        f"log loss {score['log_loss']:.2f}"
-    )
+shown = ["classifier", "accuracy", "low", "high", "n", "log_loss"]
+pd.DataFrame(comparison.scores())[shown].round(2)
 
 # %% [markdown]
 # ## Train one and ask it

@@ -18,6 +18,7 @@
 # %%
 import matplotlib.pyplot as plt
 import numpy as np
+import pandas as pd
 
 from thermogrip.datasets import load_example_logs
 from thermogrip.sysid import free_run, identify, plant_dynamics
@@ -74,11 +75,10 @@ plt.show()
 # %%
 near = plant_dynamics(plant, inputs={"drive": 0.3}, disturbances={"t_ambient": 22.0})
 print("time constants [s]:", np.round(near.time_constants[:4], 1))
-for row in near.rows()[:3]:
-    print(row)
+pd.DataFrame(near.rows())
 
 # %%
-plant.save("plant.json")
+print("wrote", plant.save("plant.json"))
 
 # %% [markdown]
 # Next: [tune a controller](tune.md) for it. Of logs of your own: [use your own

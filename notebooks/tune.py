@@ -15,10 +15,14 @@
 # weights are found on draws of the plant's uncertainty.
 
 # %%
+import pandas as pd
+from matplotlib_inline.backend_inline import set_matplotlib_formats
+
 from thermogrip.datasets import load_example_logs
 from thermogrip.mpc import Spec, closed_loop_figure, review, simulate_closed_loop, tune
 from thermogrip.sysid import identify
 
+set_matplotlib_formats("png")  # figures are shown under their cells
 logs = load_example_logs()
 fitted = [logs[name] for name in ("prbs_heating_cooling", "step_up_down", "pump_on_off")]
 plant = identify(fitted, network="gripper", models=("network",), draws=8).plant
@@ -40,11 +44,11 @@ spec = Spec(
 )
 found = tune(plant, spec)
 print(found.verdict)
-for row in found.rows:
-    print(row)
+shown = ["controller", "settle_mean_s", "settle_worst_s", "overshoot_worst", "bias_worst", "bound_s"]
+pd.DataFrame(found.rows)[shown].round(3)
 
 # %% [markdown]
-# `baseline` is the default design; PI and LQR got as many trials and look at the same draws. Where the
+# `baseline` is the default design; PI and LQR got no fewer trials on the same draws. Where the
 # drive is the limit, the verdict says so: then no weight improves the loop.
 
 # %%
@@ -68,7 +72,7 @@ for check in review(controller, wanted=(28.0, 40.0), draws=1):
     print(f"{check.verdict:5} {check.name}")
 
 # %%
-controller.save("controller.json")
+print("wrote", controller.save("controller.json"))
 
 # %% [markdown]
 # In a loop of your own: `controller.reset(reading)` once, then `controller.step(reading, target)` a
