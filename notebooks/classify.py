@@ -11,9 +11,9 @@
 # %% [markdown]
 # # Name a material
 #
-# A warm finger touches a block; what its skin then reads says what the block is made of. The grasps are
-# the simulated examples that come with the package; `read_grasps("mine.csv")` reads yours, and DataFrames
-# go in too.
+# A finger touches a block of another temperature; what its skin then reads says what the block is made
+# of. The grasps are the simulated examples that come with the package; `read_grasps("mine.csv")` reads
+# yours, and DataFrames go in too.
 
 # %%
 import matplotlib.pyplot as plt
