@@ -24,8 +24,8 @@ from thermogrip.sysid import identify
 
 set_matplotlib_formats("png")  # figures are shown under their cells
 logs = load_example_logs()
-fitted = [logs[name] for name in ("prbs_heating_cooling", "step_up_down", "pump_on_off")]
-plant = identify(fitted, network="gripper", models=("network",), draws=8).plant
+fitted = [logs[name] for name in ("prbs_heating_cooling", "pump_on_off")]
+plant = identify(fitted, network="gripper", models=("network",), draws=5).plant
 
 # %% [markdown]
 # ## Say what is wanted
@@ -38,9 +38,9 @@ spec = Spec(
     steps=[(28.0, 38.0)],
     settle_within_s=150.0,
     overshoot_degC=0.3,
-    evaluations=4,
+    evaluations=2,
     search_draws=1,
-    check_draws=2,
+    check_draws=1,
 )
 found = tune(plant, spec)
 print(found.verdict)
@@ -59,7 +59,7 @@ controller
 # ## A closed loop on a plant that is not the model
 
 # %%
-loop = simulate_closed_loop(controller, plant.draw(3), [(38.0, 300.0), (30.0, 300.0)], start=28.0)
+loop = simulate_closed_loop(controller, plant.draw(2), [(38.0, 300.0), (30.0, 300.0)], start=28.0)
 figure = closed_loop_figure(loop, "28 to 38 to 30 degC, on a draw of the plant")
 figure.set_size_inches(8, 5)
 figure
