@@ -5,8 +5,9 @@ atomic on POSIX and Windows, so a reader sees the old file or the new one, never
 full disk or ``kill -9`` leave the old one in place.  Nothing is written through a symbolic link: one that has
 the target's name is replaced, where it leads to is left alone.
 
-Every JSON file of the toolkit is an object with the keys ``schema`` (what it is) and ``version`` (an
-integer). Reading one runs no code, whatever the file holds.
+Every JSON file of the toolkit is an object with the keys ``schema`` (what it is), ``version`` (an
+integer) and ``provenance`` (:mod:`thermogrip.datasets.provenance`). Reading one runs no code, whatever the
+file holds.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from typing import Any
 
 from thermogrip.datasets.errors import UserError, as_user_error, os_fault, os_faults
 from thermogrip.datasets.limits import check_content, check_size, check_source, most_bytes, read_within
+from thermogrip.datasets.provenance import KEY, note_written, provenance
 
 #: A document's part of what a file of records may have (:mod:`thermogrip.datasets.limits`): 8 MiB, 1 MiB.
 JSON_SHARE, _TOML_SHARE = 256, 2048
@@ -62,6 +64,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         yield temporary
         _sync_file(temporary, _mode_of(target))
         os.replace(temporary, target)
+        note_written(target)
         _sync_folder(target.parent)
         temporary = None
     except OSError as error:
@@ -83,7 +86,9 @@ def write_atomic(path: str | Path, content: bytes | str) -> Path:
 
 def open_new(path: str | Path) -> int:
     """Return the descriptor of a new file for writing; OSError if its name is there, if only as a link."""
-    return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _NO_LINK | _AS_WRITTEN, 0o666)
+    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _NO_LINK | _AS_WRITTEN, 0o666)
+    note_written(path)
+    return handle
 
 
 def read_bytes(path: str | Path, *, share: int = 1) -> bytes:
@@ -105,8 +110,8 @@ def file_hash(path: str | Path) -> str:
 
 
 def write_json(path: str | Path, content: Mapping[str, Any], *, schema: str, version: int) -> Path:
-    """Write a JSON object of finite numbers with ``schema`` and ``version``, return the path."""
-    whole = {"schema": schema, "version": version} | dict(content)
+    """Write a JSON object of finite numbers with ``schema``, ``version`` and provenance, return the path."""
+    whole = {"schema": schema, "version": version} | dict(content) | {KEY: provenance()}
     return write_atomic(path, json.dumps(whole, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
 
 

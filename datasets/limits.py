@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from thermogrip.datasets.errors import UserError, os_faults
+from thermogrip.datasets.provenance import note_read
 
 if TYPE_CHECKING:
     import numpy as np
@@ -59,6 +60,7 @@ def check_source(path: str | Path) -> int:
     handed = str(path).startswith(("/dev/fd/", "/proc/self/fd/")) or str(path) == "/dev/stdin"
     if not stat.S_ISREG(found.st_mode) and not (handed and stat.S_ISFIFO(found.st_mode)):
         raise UserError("is no file but a device, a pipe or a socket", file=path, hint="name a file")
+    note_read(path)
     return found.st_size if stat.S_ISREG(found.st_mode) else 0
 
 

@@ -30,7 +30,7 @@ good.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -361,6 +361,8 @@ class Identification(Shown):
     signals: tuple[SignalRole, ...] = ()  # what each column of the logs was taken for
     runs: tuple[FreeRun, ...] = ()  # of ``plant`` over each log, its residual not tested
     searched: tuple[Searched, ...] = ()  # structures of the black boxes, by kind, the best first
+    # of the chosen model fitted without them, over each log, or last part of one, that was held out, by name
+    held_out_runs: Mapping[str, FreeRun] = field(default_factory=dict)
 
     def _facts(self) -> dict[str, object]:
         """Return the verdict, the chosen model, and the held-out error of each candidate."""
@@ -487,7 +489,7 @@ def identify(
         assert network is not None
         return fit_network(network, train, seed=seed, progress=report)
 
-    scored, more = _compare(fit, finalists, cases, parts)
+    scored, more, tried = _compare(fit, finalists, cases, parts)
     rows, refused = rows + scored, refused + more
     chosen = choose_model(scored, len(cases)) or (best.kind if best else None)
     if chosen is None:
@@ -523,8 +525,9 @@ def identify(
     plant = replace(plant, verdict=verdict, scores=scores)
     searched = tuple(row for some in fits for row in searched_rows(some))
     return Identification(
-        plant, chosen, tuple(rows), checked, covered, good, verdict, notes, roles, runs, searched
-    )
+        plant, chosen, tuple(rows), checked, covered, good, verdict, notes, roles, runs, searched,
+        tried.get(chosen, {}),
+    )  # fmt: skip
 
 
 def _without_still(logs: list[Log]) -> list[Log]:
@@ -677,9 +680,11 @@ def _compare(
     candidates: Sequence[str],
     cases: Sequence[tuple[list[Log], Held]],
     parts: _Parts,
-) -> tuple[list[Row], list[str]]:
-    """Return the rows of every candidate on what is held out, and which could not be fitted, and why."""
+) -> tuple[list[Row], list[str], dict[str, dict[str, FreeRun]]]:
+    """Return the rows of every candidate on what is held out, which could not be fitted, and why, and by
+    candidate and what was held out its free runs."""
     rows: list[Row] = []
+    runs: dict[str, dict[str, FreeRun]] = {}
     refused: list[str] = []
     plants: dict[tuple[str, int], Plant] = {}  # without leave_one_out all cases share one training set
     for train, held in cases:
@@ -692,10 +697,11 @@ def _compare(
                 plant = plants[model, id(train)]
                 run = run_held_out(plant, held, unseen=True)
                 rows += rows_of(model, plant, held.name, run, held_out=True)
+                runs.setdefault(model, {})[held.name] = run
             except UserError as error:
                 refused.append(f"{what}: {error}")
             parts.next()
-    return rows, refused
+    return rows, refused, runs
 
 
 def _with_draws(

@@ -5,12 +5,14 @@ And what a tuning leaves to be chosen: designs over settling and energy, and how
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from thermogrip.datasets.arrays import Array
+from thermogrip.datasets.charts import INK, PALETTE, SOFT, Chart, Curve, Panel, draw_chart, time_axis
 from thermogrip.datasets.media import panels
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop
 from thermogrip.mpc.tuning.trade_offs import PARAMETER_WORDS, Sensitivity
@@ -21,12 +23,7 @@ if TYPE_CHECKING:
 
     from thermogrip.mpc.tuning.trade_offs import Pareto
 
-# after Okabe and Ito: distinct in every kind of colour vision
-_COLOURS = ("#1f5fa8", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
-_INK, _LINE = "#1d2733", "#9aa7b5"
 _MARKS = {"MPC": "o", "LQR": "s", "PI": "^"}
-#: More points than this do not show.
-MOST_POINTS = 1500
 
 
 def closed_loop_figure(
@@ -64,25 +61,54 @@ def closed_loop_figure(
     >>> [axis.get_ylabel() for axis in closed_loop_figure(run).axes]
     ['regulated [degC]', 'drive']
     """
-    others = [name for name in run.outputs if name not in run.target]
-    heights = [2.4, *([1.3] if others else []), 1.0, *([0.8] if slew_per_s else [])]
-    figure, grid = panels(
-        len(heights), 1, size=(8.6, 1.1 + 1.05 * sum(heights)), heights=heights, sharex=True
+    return draw_chart(closed_loop_chart(run, title, limits=limits, slew_per_s=slew_per_s))
+
+
+def closed_loop_chart(
+    run: ClosedLoop,
+    title: str = "",
+    *,
+    limits: Mapping[str, tuple[float, float]] | None = None,
+    slew_per_s: Mapping[str, float] | None = None,
+) -> Chart:
+    """Return what :func:`closed_loop_figure` draws as a chart."""
+    per, x_label = time_axis(float(run.time[-1] - run.time[0]))
+    t, called = run.time / per, run.sample_time / per
+    ends = called[[0, -1]]
+    regulated, driven = [], []
+    for k, (name, goal) in enumerate(run.target.items()):
+        band = {"low": goal - run.band, "high": goal + run.band}
+        label = f"target, \N{PLUS-MINUS SIGN}{run.band:g} degC"
+        regulated.append(Curve(label, called, goal, INK, 1.0, "--", step=True, **band))
+        regulated.append(Curve(name, t, run.outputs[name], PALETTE[k % 5], 1.6))
+    settled = tuple(
+        (segment.begin_s + segment.settle_s) / per
+        for segment in run.segments
+        if np.isfinite(segment.settle_s)
     )
-    axes = grid[:, 0]
-    _regulated(axes[0], run)
+    rows = [Panel("regulated [degC]", tuple(regulated), title, 2.4, marks=settled)]
+    others = [name for name in run.outputs if name not in run.target]
     if others:
-        _watched(axes[1], run, others, limits or {})
-    at = 2 if others else 1
-    _driven(axes[at], run)
+        curves = []
+        for k, name in enumerate(others):
+            colour = PALETTE[(2 + k) % 5]
+            curves.append(Curve(name, t, run.outputs[name], colour, 1.2))
+            curves += [
+                Curve(f"limits of {name}", ends, np.full(2, end), colour, 1.0, "-.")
+                for end in (limits or {}).get(name, ())
+            ]
+        rows.append(Panel("others [degC]", tuple(curves), height=1.3))
+    for k, (name, values) in enumerate(run.drive.items()):
+        driven.append(Curve(name, called, values, PALETTE[(1 + k) % 5], 1.2, step=True))
+        driven += [Curve("range", ends, np.full(2, end), SOFT, 0.9) for end in run.drive_range[name]]
+    odd = np.array([status != "ok" for status in run.status])
+    if odd.any():
+        first = next(iter(run.drive.values()))
+        driven.append(Curve("status not ok", called[odd], first[odd], "#a3262a", dash=""))
+    rows.append(Panel("drive", tuple(driven)))
     if slew_per_s:
-        _slewed(axes[at + 1], run, slew_per_s)
-    axes[-1].set_xlabel("time [s]")
-    if title:
-        axes[0].set_title(title, fontsize=10)
-    for axis in axes:
-        _legend(axis)
-    return figure
+        rows.append(Panel("slew [1/s]", tuple(_slewed(run, called, slew_per_s)), height=0.9))
+    return Chart((tuple(rows),), x_label, wide=8.6)
 
 
 def step_time_figure(seconds: Mapping[str, ArrayLike], deadline_s: float, dt: float) -> Figure:
@@ -95,9 +121,9 @@ def step_time_figure(seconds: Mapping[str, ArrayLike], deadline_s: float, dt: fl
     bins = np.geomspace(0.7 * low, 1.4 * max(high, float(np.max(everything, initial=0.0))), 60)
     for k, (name, values) in enumerate(shown.items()):
         label = f"{name}:\nmedian {np.median(values):.2g} ms\nslowest {np.max(values):.2g} ms"
-        axis.hist(values, bins=bins.tolist(), color=_COLOURS[k % 5], alpha=0.7, label=label)
+        axis.hist(values, bins=bins.tolist(), color=PALETTE[k % 5], alpha=0.7, label=label)
     axis.axvline(1e3 * deadline_s, color="#a3262a", lw=1.2, label=f"deadline {1e3 * deadline_s:g} ms")
-    axis.axvline(1e3 * dt, color=_INK, lw=0.9, ls="--", label=f"sample time {1e3 * dt:g} ms")
+    axis.axvline(1e3 * dt, color=INK, lw=0.9, ls="--", label=f"sample time {1e3 * dt:g} ms")
     axis.set_xscale("log")
     axis.set_xlabel("time of a step [ms]")
     axis.set_ylabel("steps")
@@ -115,7 +141,7 @@ def pareto_figure(pareto: Pareto) -> Figure:
     colour = Normalize(0.0, max([0.05, *(row["overshoot_degC"] for row in rows)]))
     front = sorted((row for row in rows if row["best"]), key=lambda row: row["settle_s"])
     axis.plot(
-        [r["settle_s"] for r in front], [r["energy_s"] for r in front], color=_LINE, lw=0.9, ls=":", zorder=1
+        [r["settle_s"] for r in front], [r["energy_s"] for r in front], color=SOFT, lw=0.9, ls=":", zorder=1
     )
     for name, mark in _MARKS.items():
         mine = [row for row in rows if row["controller"] == name]
@@ -151,7 +177,7 @@ def sensitivity_figure(found: Sequence[Sensitivity]) -> Figure:
         if low < high:
             axis.barh(k, high - low, left=low, height=0.5, color="#c9d6e6")
         label = f"  costs {100 * item.elasticity * np.log(1.3):+.1f} % at 30 % more"
-        axis.plot(1.0, k, "o", ms=5, color=_COLOURS[0] if low < 1 < high else "#a3262a")
+        axis.plot(1.0, k, "o", ms=5, color=PALETTE[0] if low < 1 < high else "#a3262a")
         axis.annotate(label, (max(high, 1.0), k), fontsize=7, va="center", color="#5b6776")
     axis.set_yticks(range(len(found)), [f"{PARAMETER_WORDS[item.knob]}, {item.value:.3g}" for item in found])
     axis.set_ylim(len(found) - 0.5, -0.5)
@@ -163,57 +189,15 @@ def sensitivity_figure(found: Sequence[Sensitivity]) -> Figure:
     return figure
 
 
-def _regulated(axis: Axes, run: ClosedLoop) -> None:
-    keep = slice(None, None, max(1, run.time.size // MOST_POINTS))
-    for k, (name, goal) in enumerate(run.target.items()):
-        axis.plot(run.time[keep], run.outputs[name][keep], color=_COLOURS[k % 5], lw=1.4, label=name)
-        label = f"target, +-{run.band:g} degC" if k == 0 else None
-        axis.step(run.sample_time, goal, where="post", color=_INK, lw=0.9, ls="--", label=label)
-        low, high = goal - run.band, goal + run.band
-        axis.fill_between(run.sample_time, low, high, step="post", color=_INK, alpha=0.12, lw=0)
-    settled = [s for s in run.segments if np.isfinite(s.settle_s)]
-    for k, segment in enumerate(settled):
-        at = segment.begin_s + segment.settle_s
-        label = f"settled after {segment.settle_s:.0f} s" if len(settled) == 1 else "settled"
-        axis.axvline(at, color="#5b6776", lw=0.9, ls=":", label=label if k == 0 else None)
-    axis.set_ylabel("regulated [degC]")
-
-
-def _watched(axis: Axes, run: ClosedLoop, names: Sequence[str], limits: Mapping[str, Any]) -> None:
-    keep = slice(None, None, max(1, run.time.size // MOST_POINTS))
-    for k, name in enumerate(names):
-        colour = _COLOURS[(2 + k) % 5]
-        axis.plot(run.time[keep], run.outputs[name][keep], color=colour, lw=1.0, label=name)
-        ends = limits.get(name, ())
-        for end in ends:
-            label = f"limits {ends[0]:g}, {ends[1]:g}" if end == ends[0] else None
-            axis.axhline(end, color=colour, lw=0.9, ls="-.", label=label)
-    axis.set_ylabel("others [degC]")
-
-
-def _driven(axis: Axes, run: ClosedLoop) -> None:
+def _slewed(run: ClosedLoop, called: Array, slew_per_s: Mapping[str, float]) -> Iterator[Curve]:
+    """Yield what each drive changed by a second, and what it may change by."""
+    dt = float(np.median(np.diff(run.sample_time))) if run.sample_time.size > 1 else 1.0
     for k, (name, values) in enumerate(run.drive.items()):
-        axis.step(run.sample_time, values, where="post", color=_COLOURS[(1 + k) % 5], lw=1.0, label=name)
-        for end in run.drive_range[name]:
-            axis.axhline(end, color=_LINE, lw=0.7)
-    odd = np.array([status != "ok" for status in run.status])
-    if odd.any():
-        first = next(iter(run.drive.values()))
-        axis.plot(run.sample_time[odd], first[odd], "x", color="#a3262a", ms=4, label="status not ok")
-    axis.set_ylabel("drive")
-
-
-def _slewed(axis: Axes, run: ClosedLoop, slew_per_s: Mapping[str, float]) -> None:
-    dt = np.median(np.diff(run.sample_time)) if run.sample_time.size > 1 else 1.0
-    for k, (name, values) in enumerate(run.drive.items()):
-        change = (
-            np.diff(values, prepend=min(max(0.0, run.drive_range[name][0]), run.drive_range[name][1])) / dt
-        )
-        axis.step(run.sample_time, change, where="post", color=_COLOURS[(1 + k) % 5], lw=0.8)
+        first = min(max(0.0, run.drive_range[name][0]), run.drive_range[name][1])
+        change = np.diff(values, prepend=first) / dt
+        yield Curve(f"slew of {name}", called, change, PALETTE[(1 + k) % 5], 1.0, step=True)
         for end in (-slew_per_s[name], slew_per_s[name]):
-            label = f"limit {slew_per_s[name]:g} per s" if k == 0 and end > 0 else None
-            axis.axhline(end, color=_LINE, lw=0.7, label=label)
-    axis.set_ylabel("slew [1/s]")
+            yield Curve("limit of slew", called[[0, -1]], np.full(2, end), SOFT, 0.9)
 
 
 def _note_all(axis: Axes, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -23,7 +23,6 @@ import json
 import os
 import platform
 import re
-import sys
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
@@ -81,7 +80,7 @@ class RunFolder:
         self.path, self.about = Path(path), dict(about or {})
         if self.path.is_symlink():
             raise UserError("is a link", file=self.path, hint="name the folder that it leads to")
-        self._made = provenance(files or {})
+        self._made = made_with(files or {})
         # a run that cannot begin leaves no file behind
         with ExitStack() as undo, os_faults(self.path):
             self.path.mkdir(parents=True, exist_ok=True)
@@ -175,8 +174,8 @@ class RunFolder:
         write_json(self.path / "run.json", content, schema=SCHEMA, version=VERSION)
 
 
-def provenance(files: Mapping[str, Path]) -> dict[str, Any]:
-    """Return the provenance of a run: versions, git commit, hashes of its files, command, when it began."""
+def made_with(files: Mapping[str, Path]) -> dict[str, Any]:
+    """Return when a run began, the versions of what it runs on, and the hashes of its files by their role."""
     found = {}
     for name in _PACKAGES:
         with suppress(PackageNotFoundError):
@@ -184,8 +183,6 @@ def provenance(files: Mapping[str, Path]) -> dict[str, Any]:
     return {
         "began": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "versions": {"python": platform.python_version(), **found},
-        "git": _commit(Path(__file__).resolve().parent),
-        "command": sys.argv[:],
         "files": {name: {"path": str(path), "sha256": file_hash(path)} for name, path in files.items()},
     }
 
@@ -285,23 +282,6 @@ class _Reserve:
 def _write(file: int, data: memoryview) -> int:
     """Write to a file descriptor: the one place where a test can fill the disk."""
     return os.write(file, data)
-
-
-def _commit(folder: Path) -> str:
-    """Return the commit that is checked out, "" where this is no checkout; no program is started for it."""
-    for parent in folder.parents:
-        head = parent / ".git" / "HEAD"
-        if head.is_file():
-            text = head.read_text(encoding="utf-8").strip()
-            if not text.startswith("ref: "):
-                return text
-            name = text.removeprefix("ref: ")
-            if (parent / ".git" / name).is_file():
-                return (parent / ".git" / name).read_text(encoding="utf-8").strip()
-            packed = parent / ".git" / "packed-refs"
-            lines = packed.read_text(encoding="utf-8").splitlines() if packed.is_file() else []
-            return next((line.split()[0] for line in lines if line.endswith(f" {name}")), "")
-    return ""
 
 
 def _number(value: float) -> str:

@@ -68,10 +68,7 @@ class Dynamics:
     @property
     def poles(self) -> NDArray[np.complex128]:
         """Continuous equivalents [1/s] of the poles that are no delay, the slowest first."""
-        A = self.near.A  # rounding of a difference in a delay of n steps makes a pole of its n-th root
-        z = np.linalg.eigvals(np.where(np.abs(A) > _ROUNDING * np.abs(A).max(), A, 0.0)).astype(complex)
-        s = np.log(z[np.abs(z) > _DELAY]) / self.dt
-        return np.asarray(s[np.argsort(-s.real, kind="stable")])
+        return poles_of(self.near)
 
     @property
     def time_constants(self) -> Array:
@@ -184,6 +181,15 @@ class Dynamics:
         sd = np.sqrt(variance + ((self.gain_sd if gain_sd is None else gain_sd) * value) ** 2)
         half = NormalDist().inv_cdf(0.5 + self.level / 2) * sd
         return Estimate(value, value - half, value + half)
+
+
+def poles_of(near: LinearPlant) -> NDArray[np.complex128]:
+    """Return the continuous equivalents [1/s] of the poles that are no delay, the slowest first."""
+    A = near.A  # rounding of a difference in a delay of n steps makes a pole of its n-th root
+    z = np.linalg.eigvals(np.where(np.abs(A) > _ROUNDING * np.abs(A).max(), A, 0.0)).astype(complex)
+    assert near.dt is not None
+    s = np.log(z[np.abs(z) > _DELAY]) / near.dt
+    return np.asarray(s[np.argsort(-s.real, kind="stable")])
 
 
 def _rise(near: LinearPlant, steps: int, n: int) -> Array:

@@ -35,6 +35,7 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import atomic_path, write_atomic
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.media import csv_text
+from thermogrip.datasets.provenance import KEY, provenance
 from thermogrip.sysid.models.model import GreyModel
 
 if TYPE_CHECKING:
@@ -158,8 +159,8 @@ def save_linear(near: LinearPlant, path: str | Path) -> Path:
         return file
     if file.suffix == ".json":
         numbers = {name: value.tolist() for name, value in (matrices | point).items()}
-        text = json.dumps(numbers | {name: list(words) for name, words in labels.items()} | {"dt": near.dt})
-        return write_atomic(file, text + "\n")
+        lists = {name: list(words) for name, words in labels.items()}
+        return write_atomic(file, json.dumps(numbers | lists | {"dt": near.dt, KEY: provenance()}) + "\n")
     axes = {"A": ("states", "states"), "B": ("states", "inputs"), "C": ("outputs", "states")}
     axes["D"] = ("outputs", "inputs")
     rows: list[tuple[object, ...]] = [("matrix", "row", "column", "value")]

@@ -54,6 +54,7 @@ References
 .. [2] J. W. Miller, D. B. Dunson, "Robust Bayesian inference via coarsening", JASA 114 (2019).
 .. [3] J. M. Bardsley, A. Solonen, H. Haario, M. Laine, "Randomize-then-optimize", SIAM J. Sci. Comput. 36
    (2014).
+.. [4] A. Gelman et al., "Bayesian Data Analysis", 3rd ed. (2013), section 11.4.
 """
 
 from __future__ import annotations
@@ -250,11 +251,15 @@ class Chain:
     converged: bool  # whether the chain is longer than 50 tau in every dimension
     acceptance: float  # share of moves that were accepted
 
+    @property
+    def settled(self) -> Array:
+        """The steps (n, n_walker, n_dim) behind the burn-in."""
+        return self.steps[min(int(np.ceil(3 * np.max(self.tau))), len(self.steps) // 2) :]
+
     def kept(self, n: int) -> Array:
         """Return about ``n`` rows (n, n_dim), spread evenly over walkers and steps behind the burn-in."""
-        burn = min(int(np.ceil(3 * np.max(self.tau))), len(self.steps) // 2)
         # walker by walker: a stride over all walkers of a step may meet the same few at every step
-        flat = self.steps[burn:].swapaxes(0, 1).reshape(-1, self.steps.shape[-1])
+        flat = self.settled.swapaxes(0, 1).reshape(-1, self.steps.shape[-1])
         return np.asarray(flat[np.linspace(0, len(flat) - 1, min(n, len(flat))).astype(int)])
 
 
@@ -399,6 +404,8 @@ class Posterior:
     likelihood: str  # what was assumed about the residuals, in words
     off_centre: float  # of the medians from the fitted values, in standard deviations, at most
     verdict: str  # one sentence
+    ess: dict[str, float]  # effective number of samples of each sampled parameter, by its autocorrelation
+    r_hat: dict[str, float]  # split R-hat over the walkers; an ensemble's walkers are not independent chains
 
     def inference_data(self) -> Any:
         """Return the chain and, as ``posterior_whole``, the whole samples: arviz ``InferenceData``."""
@@ -622,7 +629,23 @@ def _record(
         likelihood=about,
         off_centre=float(np.max(np.abs(np.median(whole, axis=0) - z) / whole.std(axis=0))),
         verdict=verdict,
+        ess={
+            name: chain.settled[..., 0].size / float(tau) for name, tau in zip(names, chain.tau, strict=True)
+        },
+        r_hat={name: split_r_hat(chain.settled[..., i]) for i, name in enumerate(names)},
     )
+
+
+def split_r_hat(steps: Array) -> float:
+    """Return the R-hat [4]_ of one dimension (n_step, n_walker), each walker cut in two.
+
+    >>> split_r_hat(np.random.default_rng(0).standard_normal((1000, 8))) < 1.01
+    True
+    """
+    half = len(steps) // 2
+    parts = np.concatenate([steps[:half], steps[half : 2 * half]], axis=1)
+    within, between = parts.var(axis=0, ddof=1).mean(), parts.mean(axis=0).var(ddof=1)
+    return float(np.sqrt((half - 1) / half + between / within)) if within > 0 else float("nan")
 
 
 def _arviz() -> Any:

@@ -10,6 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from thermogrip.classify import evaluate, make_classifier
+from thermogrip.datasets.charts import Chart
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import make_log
 from thermogrip.report import classification
@@ -27,7 +28,7 @@ def _no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures have tests of their own."""
     for name in ("accuracy", "confusion", "curve", "decision", "effusivity", "feature", "reliability"):
         monkeypatch.setattr(f"thermogrip.classify.figures.{name}_figure", lambda *_, **__: Figure())
-    monkeypatch.setattr(classification, "loop_figure", lambda *_, **__: Figure())
+    monkeypatch.setattr(classification, "loops_chart", lambda *_, **__: Chart(()))
 
 
 def captions(sections: list[Section]) -> Iterator[str]:

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from thermogrip.datasets.charts import Chart
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Segment
 from thermogrip.report import control
-from thermogrip.report.html import Picture, Table, Text
+from thermogrip.report.html import Plot, Table, Text
 
 NAN, INF = float("nan"), float("inf")
 
@@ -22,14 +23,15 @@ STEPS = [(28.0, 38.0), (28.0, 18.0)]
 def drawn(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """Return what each figure was drawn from; figures have tests of their own."""
     seen: dict[str, Any] = {}
-    names = ["closed_loop", "pareto", "sensitivity", "step_time", "steps", "grasp"]
-    for name in names:
+    made = dict.fromkeys(("pareto_figure", "sensitivity_figure", "step_time_figure"), Figure)
+    made |= dict.fromkeys(("closed_loop_chart", "steps_chart", "grasps_chart"), lambda: Chart(()))
+    for name, make in made.items():
 
-        def draw(*args: Any, name: str = name, **options: Any) -> Figure:
-            seen.setdefault(name, []).append((args, options))
-            return Figure()
+        def draw(*args: Any, name: str = name, make: Any = make, **options: Any) -> Any:
+            seen.setdefault(name.rpartition("_")[0], []).append((args, options))
+            return make()
 
-        monkeypatch.setattr(control, f"{name}_figure", draw)
+        monkeypatch.setattr(control, name, draw)
     return seen
 
 
@@ -83,7 +85,7 @@ def test_a_tuned_controller_stands_with_its_scores_and_what_it_did_not_know(
     assert (section.verdict, section.tone) == (f"Tuned. {says} Faster.", tone)
     table, picture, about, scores = section.parts
     assert (table.head, table.caption) == (control.tuning_table(tuning)[0], f"Closed loops on {of}")
-    assert isinstance(picture, Picture)
+    assert isinstance(picture, Plot)
     unseen = "were not used in the search" if known else "no uncertainty, so the table is of the plant itself"
     assert about.text.startswith("Band 0.25 degC. ")
     assert unseen in about.text

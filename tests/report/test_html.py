@@ -1,16 +1,33 @@
-"""The report page: one file, no scripts, nothing from elsewhere, everything escaped."""
+"""The report page: one file, nothing from elsewhere, scripts by their hash alone, everything escaped."""
 
 from __future__ import annotations
 
 import base64
+import json
 import re
+from hashlib import sha256
+from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from thermogrip.report.html import Commands, Picture, Section, Table, Text, html_page, write_report
+from thermogrip.datasets.charts import Chart, Curve, Panel
+from thermogrip.datasets.provenance import work
+from thermogrip.report.html import (
+    MOST_NUMBERS,
+    Commands,
+    Picture,
+    Plot,
+    Section,
+    Table,
+    Text,
+    html_page,
+    write_report,
+)
 
 
 def picture(points: int = 3) -> Picture:
@@ -19,19 +36,140 @@ def picture(points: int = 3) -> Picture:
     return Picture(figure, "a line")
 
 
-def test_a_page_needs_nothing_from_elsewhere(tmp_path: Path) -> None:
+def plot(points: int = 500, curves: int = 1, name: str = "skin") -> Plot:
+    x = np.arange(float(points))
+    y = np.where(x == 7, np.nan, np.sin(x / 10))
+    own = tuple(Curve(name, x, y + k, low=y + k - 1, high=y + k + 1) for k in range(curves))
+    return Plot(Chart(((Panel("T [degC]", own, name),),)), "a curve")
+
+
+class Tree(HTMLParser):
+    """The elements of a page, each closed where it must be."""
+
+    VOID = frozenset({"meta", "img", "br"})
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+        self.texts: dict[str, list[str]] = {}
+        self.feed(page)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: Any) -> None:
+        self.found.append((tag, dict(attrs)))
+        if tag not in self.VOID:
+            self.open.append(tag)
+            self.texts.setdefault(tag, []).append("")
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open:
+            self.texts[self.open[-1]][-1] += data
+
+
+def whole_page(tmp_path: Path, *more: Any) -> Tree:
     path = tmp_path / "report.html"
     parts = (Text("words"), Commands(("thermogrip demo",)), Table(("n", "who"), ((1.0, "a"),)), picture())
-    write_report(path, "title", "lead", [Section("one", parts, "fine", "good"), Section("two", ())])
-    page = path.read_text()
-    assert "<script" not in page
-    assert not re.findall(r'(?:src|href)="(?!data:|#)', page)
-    assert "data:image/svg+xml;base64," in page
+    with work(["thermogrip", "demo", "--out", "x y"]):
+        write_report(
+            path, "title", "lead", [Section("one", (*parts, *more), "fine", "good"), Section("two", ())]
+        )
+    return Tree(path.read_text(encoding="utf-8"))
+
+
+def test_a_page_is_well_formed_and_needs_nothing_from_elsewhere(tmp_path: Path) -> None:
+    page = whole_page(tmp_path, plot())
+    assert page.open == []
+    addresses = [a[key] for _, a in page.found for key in ("src", "href") if key in a]
+    assert addresses
+    assert all(str(address).startswith(("data:image/", "#")) for address in addresses)
+    code = "".join(page.texts["script"] + page.texts["style"])
+    assert not re.findall(r"@import|url\(|fetch\(|XMLHttpRequest|WebSocket|importScripts|\.src\b", code)
+    assert not any(key.startswith("on") or key == "style" for _, a in page.found for key in a)
+
+
+@pytest.mark.parametrize("more", [(), (plot(),)], ids=["figures at rest", "charts"])
+def test_the_policy_opens_scripts_and_styles_by_the_hashes_of_those_on_the_page(
+    tmp_path: Path, more: tuple[Plot, ...]
+) -> None:
+    page = whole_page(tmp_path, *more)
+    (policy,) = [a["content"] for tag, a in page.found if a.get("http-equiv") == "Content-Security-Policy"]
+    rules = dict(rule.strip().split(" ", 1) for rule in str(policy).split(";"))
+    assert rules["default-src"] == "'none'"
+    for tag, rule in (("script", "script-src"), ("style", "style-src")):
+        kinds = [a.get("type") for each, a in page.found if each == tag]
+        texts = [text for text, kind in zip(page.texts[tag], kinds) if kind != "application/json"]
+        hashes = [base64.b64encode(sha256(text.encode()).digest()).decode() for text in texts]
+        assert rules[rule] == " ".join(f"'sha256-{digest}'" for digest in hashes)
+    assert ("Leon Sorokin" in page.texts["script"][-1]) == bool(more)  # the licence goes where uPlot goes
+
+
+def test_a_page_begins_with_its_contents_and_ends_with_where_it_comes_from(tmp_path: Path) -> None:
+    page = whole_page(tmp_path)
+    ids = {a["id"] for _, a in page.found if "id" in a}
+    links = [str(a["href"])[1:] for tag, a in page.found if tag == "a"]
+    assert links == ["s1", "s2", "provenance"]
+    assert set(links) <= ids
+    assert page.texts["pre"][-1] == "thermogrip demo --out 'x y'"
+    assert {"thermogrip", "written"} <= set(page.texts["dt"])
+
+
+def test_a_verdict_has_a_sign_and_a_word_and_so_have_cells_of_verdicts() -> None:
+    table = Table(("check", "verdict"), (("fail", "fail"), ("b", "pass"), ("c", "odd")))
+    sections = [Section(tone, (table,), "so", tone) for tone in ("plain", "good", "warn", "bad")]
+    page = Tree(html_page("t", "l", sections))
+    words = [text.strip() for text in page.texts["span"]]
+    for said in ("i Result", "\u2713 Good", "! Caution", "\u2715 Bad"):
+        assert words.count(said) == 2
+    assert words.count("\u2715 fail") == words.count("\u2713 pass") == 4
+
+
+def numbers(text: str) -> list[float]:
+    return np.frombuffer(base64.b64decode(text), dtype="<f4").tolist()
+
+
+def test_the_numbers_of_a_chart_are_those_of_its_curves_and_a_gap_is_no_number() -> None:
+    drawn = plot(20)
+    content = json.loads(drawn.data(100))
+    (curve,) = content["columns"][0][0]["curves"]
+    x, y, low = (numbers(content["arrays"][curve[name]]) for name in ("x", "y", "low"))
+    own = drawn.chart.columns[0][0].curves[0]
+    np.testing.assert_allclose(x, own.x, rtol=1e-6)
+    np.testing.assert_allclose(y, own.y, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(low, own.low, rtol=1e-6, atol=1e-6)
+    assert np.isnan(y[7])
+    assert content["columns"][0][0]["unit"] == " s"
+
+
+def test_arrays_that_curves_share_are_there_once() -> None:
+    x = np.arange(9.0)
+    chart = Chart(((Panel("a", (Curve("a", x, x), Curve("b", x, x), Curve("c", x, x + 1))),),))
+    assert len(json.loads(Plot(chart, "").data(100))["arrays"]) == 2
+
+
+def test_names_in_a_chart_end_no_script_and_hold_no_control_character() -> None:
+    page = html_page("t", "l", [Section("s", (plot(name="</script><script>alert(1)//\x1b<!--"),), "v")])
+    assert "alert(1)//\\\\x1b" in page
+    assert "</script><script>alert" not in page
+    assert "\x1b" not in page
+
+
+def test_a_page_of_many_long_curves_stays_small() -> None:
+    parts = tuple(plot(20_000, 6) for _ in range(8))
+    page = html_page("t", "l", [Section("s", parts, "v")])
+    data = re.findall(r'<script type="application/json">(.*?)</script>', page, re.S)
+    assert len(data) == 8
+    assert sum(map(len, data)) < 1.1 * MOST_NUMBERS * 16 / 3  # base64 of four bytes
+    assert len(page) < 3_000_000
 
 
 def test_a_large_figure_goes_in_as_png() -> None:
     small, large = picture(3).data_uri, picture(9_000).data_uri
     assert small.startswith("data:image/svg+xml")
+    assert len(large) < 40_000
     assert large.startswith("data:image/png")
 
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.report import plant
-from thermogrip.report.html import Picture, Table, Text
+from thermogrip.report.html import Picture, Plot, Table, Text
 from thermogrip.report.plant import _prior_intervals, free_run_section, parameter_table
 from thermogrip.sysid.experiment.information import plant_from_prior
 from thermogrip.sysid.identification import Searched, SignalRole
@@ -92,7 +92,8 @@ def test_a_free_run_s_page_has_its_scores_band_and_baselines(run: tuple[Plant, L
     assert free_run_section(found, seen=True).title.endswith(" (in the fit)")
     assert free_run_section(found, seen=True, title="Mine").title == "Mine"
     picture, table, residuals = section.parts[:3]
-    assert isinstance(picture, Picture)
+    assert isinstance(picture, Plot)
+    assert [panel.label for panel in picture.chart.columns[0]] == ["t [degC]", "error [K]", "inputs"]
     assert f"Readings of the first {found.warmup:.3g} s set the state" in picture.caption
     score, naive = found.scores["t"], found.naive
     assert table.rows == (
@@ -147,7 +148,7 @@ def identified(good: bool = True) -> SimpleNamespace:
     checked = SimpleNamespace(findings=findings)
     return SimpleNamespace(
         rows=rows, data_check=checked, good=good, verdict="oe is best", notes=("arx failed",),
-        model="oe", signals=(), runs=(),
+        model="oe", signals=(), runs=(), held_out_runs={},
         searched=(
             *(Searched("arx", f"na {k}", 0.25, (0.2, 0.3125), k == 7) for k in range(1, 9)),
             Searched("subspace", "order 1", 0.5, (0.5, 0.5), True),
@@ -158,15 +159,14 @@ def identified(good: bool = True) -> SimpleNamespace:
 @pytest.mark.usefixtures("no_figures")
 @pytest.mark.parametrize(("good", "tone"), [(True, "good"), (False, "warn")])
 def test_an_identification_has_its_tables_and_verdict(good: bool, tone: str) -> None:
-    board = plant_from_prior(load_network("tclab"))
-    section = plant.identification_section(identified(good), board)
+    section = plant.identification_section(identified(good))
     assert (section.verdict, section.tone) == ("oe is best.", tone)
     tables = [part for part in section.parts if isinstance(part, Table)]
-    assert [table.caption for table in tables][:4] == [
+    assert [table.caption for table in tables][:3] == [
         "Free-run RMSE on rows that were not fitted (blocks: of means over a step of the model)",
         "Columns of the logs",
-        "oe, fitted on everything, on its own logs", "Free parameters",
-    ]  # fmt: skip
+        "oe, fitted on everything, on its own logs",
+    ]
     assert tables[2].rows == (("b", "t", 0.5, "degC", 90.0, 50),)
     assert tables[-2].rows == (("warn", "gaps", "a", "t", "a gap"),)
     assert tables[-1].head == ("model", "structure", "mean", "fold 1", "fold 2", "")
@@ -174,13 +174,10 @@ def test_an_identification_has_its_tables_and_verdict(good: bool, tone: str) -> 
     assert [row[1] for row in tables[-1].rows] == ["na 1", "na 2", "na 3", "na 4", "na 5", "na 7", "order 1"]
     assert tables[-1].rows[5] == ("arx", "na 7", 0.25, 0.2, 0.3125, "kept")
     texts = [part for part in section.parts if isinstance(part, Text)]
-    assert texts == [Text("U is known."), Text("arx failed.")]
+    assert texts == [Text("arx failed.")]
     clean = identified()
     clean.data_check.findings = clean.data_check.findings[:1]
-    black = SimpleNamespace(free=(), model=None)
-    captions = [
-        part.caption for part in plant.identification_section(clean, black).parts if isinstance(part, Table)
-    ]
+    captions = [part.caption for part in plant.identification_section(clean).parts if isinstance(part, Table)]
     assert captions == [table.caption for table in (*tables[:3], tables[-1])]
 
 
@@ -204,22 +201,6 @@ def test_growth_and_posterior_stand_where_there_are_any(monkeypatch: pytest.Monk
     assert "of t depends on q (25 % of its variance)." in section.parts[2].text
     none = plant.growth_section(growth_of(("base", "kept", "base")))
     assert (none.verdict, len(none.parts)) == ("No change earned its place.", 2)
-    record = SimpleNamespace(
-        samples=np.zeros((200, 2)), free=(), units={}, fitted={}, tau={"a": 10.0, "b": 25.0},
-        sampled=("a", "b"), likelihood="normal", n_steps=500, acceptance=0.3, off_centre=0.123,
-        converged=True, verdict="sampled",
-    )  # fmt: skip
-    section = plant.posterior_section(record)
-    assert (section.verdict, section.tone) == ("sampled.", "good")
-    assert section.parts[0].caption.startswith("Marginals of 200 samples")
-    assert section.parts[2] == Text("normal.")
-    assert section.parts[3].text == (
-        "emcee moved a, b; the others were integrated out and fitted to each sample. 500 steps, longest "
-        "autocorrelation time 25 steps (20 of them), 30 % accepted. Medians lie within 0.12 standard "
-        "deviations of the fitted values."
-    )
-    record.converged = False
-    assert plant.posterior_section(record).tone == "warn"
     monkeypatch.setattr(plant, "free_run_section", lambda *args, **options: (args, options))
     asked: list[tuple[object, ...]] = []
     monkeypatch.setattr(
@@ -229,14 +210,65 @@ def test_growth_and_posterior_stand_where_there_are_any(monkeypatch: pytest.Monk
     found = identified()
     found.runs = (SimpleNamespace(warmup=9.0),)
     board = plant_from_prior(load_network("tclab"))
-    sections = plant.identification_sections(found, ["a log"], board, record, kept)
+    sections = plant.identification_sections(found, ["a log"], board, None, kept)
     assert asked == [(board, "a log", 9.0, 9.0, found.runs[0])]
     assert sections[-1] == (("a run",), {"seen": True})
     assert [section.title for section in sections[:3]] == [
-        "Which plant is behind the logs?", "Which terms does the network need?",
-        "How well are its parameters known?",
+        "Which plant is behind the logs?", "How well are its parameters known?",
+        "Which terms does the network need?",
     ]  # fmt: skip
-    assert len(plant.identification_sections(found, ["a log"], board, None)) == 2
+    black = SimpleNamespace(free=())
+    assert len(plant.identification_sections(found, ["a log"], black, None)) == 2
+
+
+def test_what_was_held_out_is_drawn_and_its_error_is_the_answer(run: tuple[Plant, Log, FreeRun]) -> None:
+    _, log, found = run
+    kept = identified()
+    kept.held_out_runs = {"last 30 % of one": found}
+    section = plant.held_out_section(kept)
+    assert section.verdict == f"RMSE of last 30 % of one: t {found.scores['t'].rmse:.2g} degC."
+    (drawn,) = section.parts
+    assert isinstance(drawn, Plot)
+    measured, simulated = drawn.chart.columns[0][0].curves
+    np.testing.assert_array_equal(measured.y, log["t"].values)
+    np.testing.assert_array_equal(simulated.y, found.log["t"].values)
+    assert (measured.dash, simulated.dash) == ("-", "--")
+    assert measured.colour != simulated.colour
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_parameters_answer_for_themselves_and_the_sampler_only_where_it_failed() -> None:
+    board = plant_from_prior(load_network("tclab"))
+    section = plant.parameters_section(board)
+    _, rows = parameter_table(board)
+    off = {row[0]: (row[4] - row[3]) / 2 / row[1] for row in rows}
+    least = max(off, key=lambda name: off[name])
+    near = sum(width <= 0.1 for width in off.values())
+    assert section.verdict.startswith(f"{near} of {len(rows)} parameters known within \u00b110 %")
+    assert f"least known: {least} (" in section.verdict
+    assert section.parts[-1] == Text("U is known.")
+    names = board.free
+    samples = np.random.default_rng(0).normal(3.0, 0.5, (400, len(names)))
+    record = SimpleNamespace(
+        samples=samples, free=names, units={}, fitted={}, tau={names[0]: 10.0}, sampled=names[:1],
+        likelihood="normal", n_steps=500, acceptance=0.3, off_centre=0.123, converged=True,
+        verdict="converged: 50 autocorrelation times", ess={names[0]: 812.4}, r_hat={names[0]: 1.003},
+    )  # fmt: skip
+    known = plant.parameters_section(board, record)
+    assert (known.verdict, known.tone) == (section.verdict, "plain")
+    table = known.parts[0]
+    assert table.head == (
+        "parameter", "value", "unit", "mean", "sd", "5 %", "95 %", "ESS", "R-hat", "prior 5 %", "prior 95 %"
+    )  # fmt: skip
+    assert table.rows[0][3:5] == (pytest.approx(3.0, abs=0.1), pytest.approx(0.5, abs=0.1))
+    assert table.rows[0][7:9] == (812, 1.003)
+    assert table.rows[1][7:9] == (None, None)
+    assert "500 steps, converged: 50 autocorrelation times, 30 % accepted" in known.parts[4].text
+    record.converged = False
+    record.verdict = "not converged: 9 autocorrelation times"
+    unsure = plant.parameters_section(board, record)
+    assert unsure.tone == "warn"
+    assert unsure.verdict.endswith("The sampler has not converged: 9 autocorrelation times.")
 
 
 def test_the_table_of_models_has_a_column_a_log_of_what_was_held_out() -> None:

@@ -15,25 +15,24 @@ from numpy.typing import NDArray
 
 from tests.report.conftest import described
 from thermogrip.classify import figures as of_classifiers
+from thermogrip.datasets.charts import PALETTE, draw_chart
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_grasps, make_log
 from thermogrip.mpc.interface import Move
-from thermogrip.mpc.tuning import figures as of_loops
 from thermogrip.report.control import session_sections
 from thermogrip.report.plant import _per_log
 from thermogrip.report.plots import (
-    PALETTE,
     _log_scale,
     corner_figure,
     exchange_figure,
-    free_run_figure,
-    grasp_figure,
-    loop_figure,
+    free_run_chart,
+    grasps_chart,
+    loops_chart,
     models_figure,
+    pole_figure,
     posterior_figure,
     residual_figure,
-    responses_figure,
-    steps_figure,
+    steps_chart,
 )
 from thermogrip.rig import Session
 from thermogrip.sysid.identification import Row
@@ -70,7 +69,7 @@ def lab_of(colour: str, eye: str) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("eye", EYES)
-@pytest.mark.parametrize("colours", [PALETTE, of_loops._COLOURS, of_classifiers.PALETTE])
+@pytest.mark.parametrize("colours", [PALETTE, of_classifiers.PALETTE])
 def test_no_eye_takes_two_colours_of_a_figure_for_one(colours, eye):
     seen = {colour: lab_of(colour, eye) for colour in colours}
     near = {(a, b): np.linalg.norm(seen[a] - seen[b]) for a, b in combinations(colours, 2)}
@@ -164,7 +163,7 @@ def waves(n: int, shift: float = 0.0) -> Any:
 def free_run_of(n: int) -> Figure:
     band = Band(0.9, {name: np.full(n, 0.5) for name in ("t1", "level")}, {"t1": 0.9, "level": 0.8}, 3)
     run = SimpleNamespace(measured=waves(n), log=waves(n, 0.25), scores=dict.fromkeys(("t1", "level")))
-    return free_run_figure(run, band)
+    return draw_chart(free_run_chart(run, ("t1", "level"), band))
 
 
 def residuals_of() -> Figure:
@@ -173,7 +172,8 @@ def residuals_of() -> Figure:
 
     whiteness = {name: correlation(scale) for name, scale in (("t1", 1.0), ("level", 0.5), ("t2", 0.25))}
     left = {name: {"q1": correlation(0.2), "drive": correlation(-0.2)} for name in whiteness}
-    return residual_figure(SimpleNamespace(whiteness=whiteness, input_correlation=left))
+    run = {"whiteness": whiteness, "input_correlation": left, "measured": waves(12)}
+    return residual_figure(SimpleNamespace(**run))
 
 
 def models_of() -> Figure:
@@ -208,9 +208,8 @@ def corner_of() -> Figure:
 
 
 def loops_of() -> Figure:
-    return loop_figure(
-        {"first": waves(6), "second": waves(7, 1.0)}, {"first": 30.0, "second": 35.0}, output="t1"
-    )
+    runs, targets = {"first": waves(6), "second": waves(7, 1.0)}, {"first": 30.0, "second": 35.0}
+    return draw_chart(loops_chart(runs, targets, output="t1"))
 
 
 def steps_of() -> Figure:
@@ -223,9 +222,14 @@ def steps_of() -> Figure:
             time=time, sample_time=time[:4], outputs=out, drive={"u": drive["u"][:4]}, target=target
         )
 
-    return steps_figure(
-        {"28 to 38, MPC": loop(37.0), "28 to 38, PI": loop(36.0), "28 to 18, LQR": loop(18.0)}
-    )
+    runs = {"28 to 38, MPC": loop(37.0), "28 to 38, PI": loop(36.0), "28 to 18, LQR": loop(18.0)}
+    return draw_chart(steps_chart(runs))
+
+
+def poles_of_two() -> Figure:
+    near = SimpleNamespace(A=np.diag([0.9, 0.5]), dt=2.0)
+    draws = [SimpleNamespace(A=np.diag([0.9 + k / 100, 0.5]), dt=2.0) for k in (-1, 1)]
+    return pole_figure(SimpleNamespace(poles=np.array([-0.05, -0.3 + 0.4j]), near=near, draws=draws))
 
 
 def grasps_of(*labels: str) -> Any:
@@ -244,10 +248,14 @@ FIGURES = {
     "corner": corner_of,
     "loops": loops_of,
     "steps": steps_of,
-    "grasps": lambda: grasp_figure([grasps_of("copper", "wood"), grasps_of()], "two touches"),
-    "responses": lambda: responses_figure(
-        {f"case {k}": grasps_of("wood", "copper") for k in range(5)} | {"last": grasps_of("cork", "wood")},
-        ("copper", "wood"),
+    "poles": poles_of_two,
+    "grasps": lambda: draw_chart(grasps_chart({"two": [grasps_of("copper", "wood"), grasps_of()]})),
+    "responses": lambda: draw_chart(
+        grasps_chart(
+            {f"case {k}": [grasps_of("wood", "copper")] for k in range(5)}
+            | {"last": [grasps_of("cork", "wood")]},
+            ("copper", "wood"),
+        )
     ),
     "exchange": lambda: exchange_figure(
         {"copper": 36e3, "wood": 350.0}, e_dev=1500.0, seconds=4.0, area=2e-4

@@ -23,6 +23,7 @@ from thermogrip.cli import classify, compare, control, excite, identify, project
 from thermogrip.cli.verbs import Verb, Verbs
 from thermogrip.datasets.errors import UserError, known_names, os_fault
 from thermogrip.datasets.media import printable
+from thermogrip.datasets.provenance import work
 
 OK, BUG, USER, INTERRUPTED = 0, 1, 2, 130
 
@@ -74,7 +75,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = [word for word in words if word != "--debug"] or ["--help"]
     try:
         width = 10_000 if sys.stdout.isatty() else 100  # of help, at most
-        code = app(args=words, prog_name="thermogrip", standalone_mode=False, max_content_width=width)
+        with work(["thermogrip", *words]):
+            code = app(args=words, prog_name="thermogrip", standalone_mode=False, max_content_width=width)
         sys.stdout.flush()
     except (KeyboardInterrupt, typer.Abort):
         return _fail("stopped by Ctrl-C", INTERRUPTED)

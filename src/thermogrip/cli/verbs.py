@@ -16,6 +16,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from thermogrip.cli.kinds import check_files
 from thermogrip.datasets.media import printable
+from thermogrip.datasets.provenance import note_seed
 
 
 @cache
@@ -36,6 +37,7 @@ class Verb(TyperCommand):
 
     def invoke(self, ctx: Any) -> Any:
         """Check what was given, run the verb, and where that went well say on stderr what to type next."""
+        note_seed(ctx.params.get("seed"))
         check_files(ctx)
         code = super().invoke(ctx)
         if not code and not ctx.params.get("as_json"):

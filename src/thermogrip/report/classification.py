@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from thermogrip.report.console import Cells, Columns, cells
-from thermogrip.report.html import Picture, Section, Table, Text
-from thermogrip.report.plots import grasp_figure, loop_figure
+from thermogrip.report.html import Picture, Plot, Section, Table, Text
+from thermogrip.report.plots import grasps_chart, loops_chart
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -49,10 +49,10 @@ def session_section(sessions: Sequence[tuple[str, Session]], rig: str) -> Sectio
     rows = tuple((title, s.verdict, s.settle_time, s.overshoot, s.bias) for title, s in sessions)
     head = ("session", "verdict", "settled after [s]", "overshoot [K]", "bias [K]")
     targets = {title: float(s.log["target_t_surface"].values[0]) for title, s in sessions}
-    figure = loop_figure({title: s.log for title, s in sessions}, targets)
+    chart = loops_chart({title: s.log for title, s in sessions}, targets)
     failed = [title for title, s in sessions if s.verdict != "settled"]
     verdict = f"{len(sessions) - len(failed)} of {len(sessions)} sessions settled on {rig}."
-    parts: list[Any] = [Table(head, rows), Picture(figure, "Sessions: settle, stop the pump, grasp.")]
+    parts: list[Any] = [Table(head, rows), Plot(chart, "Sessions: settle, stop the pump, grasp.")]
     parts += [Text(f"{title}: {s.advice}") for title, s in sessions if s.advice]
     return Section("Does it settle and grasp?", tuple(parts), verdict, "warn" if failed else "good")
 
@@ -72,7 +72,7 @@ def touch_section(touched: Sequence[Grasps], rows: Sequence[dict[str, Any]], tra
             why = f": {row['why']}" if row.get("why") else ""
             verdict += f" That of {row['true']} is marked as unlike any block of the training{why}."
     parts = (
-        Picture(grasp_figure(touched), "The grasps as recorded."),
+        Plot(grasps_chart({"": touched}), "The grasps as recorded; dotted: the gripper's message."),
         Table(head, table, f"Posterior classifier, trained on {trained_on}"),
         Text(
             "Unknown is the probability that the block is none of the candidates; it is beside "

@@ -11,15 +11,15 @@ import numpy as np
 
 from thermogrip.mpc.closed_loop.simulate import session_loop
 from thermogrip.mpc.tuning.figures import (
-    closed_loop_figure,
+    closed_loop_chart,
     pareto_figure,
     sensitivity_figure,
     step_time_figure,
 )
 from thermogrip.mpc.tuning.trade_offs import sensitivity_words
 from thermogrip.report.console import Cells, Columns, cells, short
-from thermogrip.report.html import Picture, Section, Table, Text
-from thermogrip.report.plots import grasp_figure, steps_figure
+from thermogrip.report.html import Picture, Plot, Section, Table, Text
+from thermogrip.report.plots import grasps_chart, steps_chart
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from thermogrip.rig.session.session import Session
 
 _STEPS_CAPTION = (
-    "Closed loops on one draw of the plant; dashed: the target. MPC is drawn broad and LQR thin, so that "
-    "both show where they do the same."
+    "Closed loops on one draw of the plant; dash and dot: the target. MPC is drawn broad, LQR dotted and PI "
+    "dashed, so that all show where they do the same."
 )
 
 _SPEC_WORDS = {
@@ -100,7 +100,7 @@ def tuning_section(tuning: Tuning) -> Section:
     checked = f"{tuning.spec.check_draws} draws of the plant" if _uncertain(tuning) else "the plant"
     parts: list[Any] = [
         Table(*tuning_table(tuning), f"Closed loops on {checked}"),
-        Picture(steps_figure(tuning.runs), _STEPS_CAPTION),
+        Plot(steps_chart(tuning.runs), _STEPS_CAPTION),
         Text(
             f"Band {tuning.spec.band_degC:g} degC. {_unseen(tuning)}; "
             f"noise, quantum and a sensor offset of {tuning.spec.sensor_offset_degC:g} degC are unknown to "
@@ -175,12 +175,12 @@ def loop_section(run: ClosedLoop, design: Design, title: str, *, tone: str = "")
     )
     statuses = {status: run.status.count(status) for status in dict.fromkeys(run.status)}
     counts = ", ".join(f"{count} {status}" for status, count in statuses.items())
-    figure = closed_loop_figure(run, limits=design.limits, slew_per_s=design.slew_per_s)
+    chart = closed_loop_chart(run, limits=design.limits, slew_per_s=design.slew_per_s)
     caption = (
-        f"Shaded: the band of \N{PLUS-MINUS SIGN}{run.band:g} degC. Grey: limits of drive and slew. "
-        f"By status: {counts}."
+        f"Shaded: the band of \N{PLUS-MINUS SIGN}{run.band:g} degC; dotted across: settled. Grey: limits of "
+        f"drive and slew. By status: {counts}."
     )
-    parts: list[Any] = [Picture(figure, caption)]
+    parts: list[Any] = [Plot(chart, caption)]
     advices = [text for text in dict.fromkeys(run.advice) if text]
     parts += [Text(f"Advice of the controller: {'; '.join(advices[:5])}.")] if advices else []
     whole = all(np.isfinite(segment.settle_s) for segment in run.segments)
@@ -274,7 +274,7 @@ def _contact_section(grasps: Grasps, contact: float) -> Section:
         else "The skin felt no object: no contact, or one as warm as the skin."
     )
     caption = "The grasp as recorded; dotted: the message."
-    parts = (Picture(grasp_figure([grasps]), caption),)
+    parts = (Plot(grasps_chart({"": [grasps]}), caption),)
     return Section("What did the skin feel?", parts, felt, "good" if np.isfinite(contact) else "warn")
 
 

@@ -1,34 +1,58 @@
 """Reports: one self-contained HTML page made of sections, tables and figures.
 
 A report is a list of :class:`Section`; each says its verdict in words first and shows the evidence under it.
-Figures go in as inline SVG (as PNG where the SVG would be large), so that the page is one file which opens
-without a network and without scripts.  Every text is escaped by the template.
+The page is one file which opens without a network: styles, figures and the script are in it, and its content
+security policy names the hashes of that script and style alone.  A :class:`Plot` can be zoomed and read point
+by point; on paper and without scripts it is the same figure at rest, as all others are: inline SVG, or PNG
+where the SVG would be large.  Every text is escaped by the template.
+
+The script draws with uPlot [1]_, whose licence stands in ``templates/uPlot.LICENSE`` and in every page.
+
+References
+----------
+.. [1] https://github.com/leeoniya/uPlot, version 1.6.32.
 """
 
 from __future__ import annotations
 
 import base64
+import hashlib
 import io
+import json
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from thermogrip import __version__
+import numpy as np
+
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import write_atomic
+from thermogrip.datasets.charts import Chart, Curve, draw_chart, thinned
 from thermogrip.datasets.media import printable
+from thermogrip.datasets.provenance import provenance
 from thermogrip.report.console import short
 
 if TYPE_CHECKING:
+    from markupsafe import Markup
     from matplotlib.figure import Figure
 
-TONES = ("plain", "good", "warn", "bad")
+#: A sign and a word, so that a verdict does not depend on its colour.
+ICONS = {"plain": "i Result", "good": "\u2713 Good", "warn": "! Caution", "bad": "\u2715 Bad"}
+TONES = tuple(ICONS)
+#: Cells of tables that are verdicts.
+VERDICTS = {"pass": "good", "ok": "good", "warn": "warn", "fail": "bad"}
+#: Numbers in all charts of a page, and points in one of their curves, at most.
+MOST_NUMBERS, MOST_POINTS = 200_000, 2400
 _SUPERSCRIPT = re.compile(r"(\$\^\{-?[0-9.]+\}\$)")
 _DOLLAR = re.compile(r"(?<!\\)\$")
 #: An SVG larger than this goes in as PNG [bytes].
-SVG_LIMIT = 250_000
+SVG_LIMIT = 130_000
+_COLOURS = 128  # of a PNG
 
 
 @dataclass(frozen=True)
@@ -90,7 +114,64 @@ class Picture:
         return _data_uri(self.figure)
 
 
-Part: TypeAlias = Text | Commands | Table | Picture
+@dataclass(frozen=True)
+class Plot:
+    """A chart that can be zoomed, with the sentence that says what it shows."""
+
+    chart: Chart
+    caption: str
+    kind: str = "plot"
+
+    @property
+    def data_uri(self) -> str:
+        """Return the chart at rest as a ``data:`` address."""
+        return _data_uri(draw_chart(self.chart))
+
+    @property
+    def size(self) -> Iterator[tuple[int, int]]:
+        """Yield the points and the numbers a point of every curve."""
+        for curve in self._curves():
+            yield len(curve.x), 2 + 2 * (curve.low is not None)
+
+    def data(self, most: int) -> Markup:
+        """Return the chart as JSON that may stand in a script element, at most so many points a curve."""
+        from markupsafe import Markup
+
+        arrays: dict[str, int] = {}
+
+        def place(values: Array | None) -> int | None:
+            return None if values is None else arrays.setdefault(_packed(values), len(arrays))
+
+        def plain_curve(curve: Curve) -> dict[str, Any]:
+            few = thinned(curve, most)
+            look = {"label": printable(few.label), "colour": few.colour, "width": few.width, "dash": few.dash}
+            numbers = {name: place(getattr(few, name)) for name in ("x", "y", "low", "high")}
+            return look | numbers | {"step": few.step}
+
+        unit = re.search(r"\[(.+)\]", self.chart.x_label)
+        columns = [
+            [
+                {
+                    "label": printable(panel.label), "title": printable(panel.title), "height": panel.height,
+                    "log": panel.log, "shaded": panel.shaded, "marks": panel.marks,
+                    "last": panel is column[-1], "unit": f" {unit[1]}" if unit else "",
+                    "curves": [plain_curve(curve) for curve in panel.curves],
+                }
+                for panel in column
+            ]
+            for column in self.chart.columns
+        ]  # fmt: skip
+        head = {"x_label": self.chart.x_label, "log": self.chart.log}
+        text = json.dumps(head | {"columns": columns, "arrays": list(arrays)}, allow_nan=False)
+        return Markup(text.replace("<", "\\u003c"))
+
+    def _curves(self) -> Iterator[Curve]:
+        for column in self.chart.columns:
+            for panel in column:
+                yield from panel.curves
+
+
+Part: TypeAlias = Text | Commands | Table | Picture | Plot
 
 
 @dataclass(frozen=True)
@@ -110,6 +191,7 @@ class Section:
 def html_page(title: str, lead: str, sections: Sequence[Section]) -> str:
     """Return the page as text; ``lead`` says in a sentence or two what was done."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
+    from markupsafe import Markup
 
     loader = PackageLoader("thermogrip", "templates")
     env = Environment(
@@ -121,12 +203,49 @@ def html_page(title: str, lead: str, sections: Sequence[Section]) -> str:
         lstrip_blocks=True,
     )
     template = env.get_template("report.html.j2")
-    return template.render(title=title, lead=lead, sections=sections, version=__version__)
+    plots = [part for section in sections for part in section.parts if isinstance(part, Plot)]
+    script, style = _script(drawing=bool(plots)), _asset("uPlot.min.css") + _asset("report.css")
+    return template.render(
+        title=title, lead=lead, sections=sections, points=_points(plots), provenance=provenance(),
+        icons=ICONS, marks={tone: icon.split()[0] for tone, icon in ICONS.items()}, verdicts=VERDICTS,
+        style=Markup(style), style_hash=_source(style), script=Markup(script), script_hash=_source(script),
+    )  # fmt: skip
 
 
 def write_report(path: Path, title: str, lead: str, sections: Sequence[Section]) -> None:
     """Write the page to ``path``, whole or not at all."""
     write_atomic(path, html_page(title, lead, sections))
+
+
+def _points(plots: Sequence[Plot]) -> int:
+    """Return how many points a curve may have, so that the page stays small."""
+    sizes = [size for plot in plots for size in plot.size]
+    most = MOST_POINTS
+    while most > 200 and sum(per * min(n, most) for n, per in sizes) > MOST_NUMBERS:
+        most = int(0.9 * most)
+    return most
+
+
+@cache
+def _asset(name: str) -> str:
+    return (resources.files("thermogrip") / "templates" / name).read_text(encoding="utf-8")
+
+
+def _script(*, drawing: bool) -> str:
+    """Return the script of a page, with what draws charts where there are any."""
+    drawn = f"/*! {_asset('uPlot.LICENSE')} */\n{_asset('uPlot.iife.min.js')}\n" if drawing else ""
+    return drawn + _asset("report.js")
+
+
+def _source(text: str) -> str:
+    """Return the hash of an inline script or style as a content security policy has it."""
+    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+
+
+def _packed(values: Array) -> str:
+    """Return numbers as base64 of little-endian float32, gaps and what is no number as NaN."""
+    known = np.where(np.isfinite(values), values, np.nan)
+    return base64.b64encode(np.asarray(known, dtype="<f4").tobytes()).decode()
 
 
 def _number(cell: Any) -> bool:
@@ -167,14 +286,23 @@ def _literal(text: str) -> str:
 
 
 def _data_uri(figure: Figure) -> str:
+    from matplotlib import rc_context
+
     literal(figure)
     svg = io.BytesIO()
-    with warnings.catch_warnings():
+    look: dict[str, Any] = {"facecolor": "none"}  # the page's own paper shows, in the dark too
+    for axes in figure.axes:
+        axes.set_facecolor("none")
+    with warnings.catch_warnings(), rc_context({"svg.hashsalt": "thermogrip"}):  # its ids are no random ones
         # a label in letters that the font has not: the tables have the word
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
-        figure.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
+        figure.savefig(svg, format="svg", metadata={"Date": None, "Creator": None}, **look)
     if svg.tell() <= SVG_LIMIT:
         return "data:image/svg+xml;base64," + base64.b64encode(svg.getvalue()).decode()
-    png = io.BytesIO()
-    figure.savefig(png, format="png", dpi=130)
+    from PIL import Image
+
+    whole, png = io.BytesIO(), io.BytesIO()
+    figure.savefig(whole, format="png", dpi=130, **look)
+    few = Image.open(whole).quantize(_COLOURS, method=Image.Quantize.FASTOCTREE)  # keeps what is transparent
+    few.save(png, format="png", optimize=True)
     return "data:image/png;base64," + base64.b64encode(png.getvalue()).decode()

@@ -13,7 +13,7 @@ import numpy as np
 from thermogrip.datasets.schema import log_name
 from thermogrip.report import plots
 from thermogrip.report.console import Cells
-from thermogrip.report.html import Picture, Section, Table, Text
+from thermogrip.report.html import Picture, Plot, Section, Table, Text
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -29,6 +29,10 @@ if TYPE_CHECKING:
 _BASELINES = (
     "Beside the free run: the best decay without input, the log's mean, and one step from each last "
     "reading (RMSE)"
+)
+_POLES = (
+    "Poles of the plant, and of the draws of its parameters: their scatter shows how well the time constants "
+    "are known. Below the line a plant does not settle."
 )
 _TIME_CONSTANTS = 6  # the slowest, in a sentence
 _STRUCTURES = 5  # of each kind, in the table of those searched
@@ -90,10 +94,8 @@ def model_table(found: Identification) -> Table:
     )
 
 
-def identification_section(found: Identification, plant: Plant) -> Section:
+def identification_section(found: Identification) -> Section:
     """Return the section of the model comparison: verdict, every model's free run, data check."""
-    from thermogrip.sysid.greybox.identifiability import identifiability_report
-
     checks = [
         (f.verdict, f.check, f.log, f.channel, f.says) for f in found.data_check.findings if f.verdict != "ok"
     ]
@@ -112,10 +114,6 @@ def identification_section(found: Identification, plant: Plant) -> Section:
             f"{found.model}, fitted on everything, on its own logs",
         ),
     ]
-    if plant.free:
-        parts.append(Table(*parameter_table(plant), "Free parameters"))
-        parts += _per_log(plant)
-        parts += [Text(_sentence(said)) for said in identifiability_report(plant)]
     if checks:
         parts.append(Table(("verdict", "check", "log", "channel", "finding"), tuple(checks), "Data check"))
     parts += [Text(_sentence(note)) for note in found.notes]
@@ -148,24 +146,46 @@ def identification_sections(
     growth: Growth | None = None,
     dynamics: Dynamics | None = None,
 ) -> list[Section]:
-    """Return the report of an identification: the model comparison, responses, growth, posterior, every log.
+    """Return the report of an identification: the model comparison, what was held out, parameters, responses,
+    growth, every log.
 
     ``plant`` is the chosen one, with samples where ``record`` says how they were drawn.  Its free runs
     are those of the comparison, now with residual tests.
     """
     from thermogrip.sysid.validation.free_run import free_run
 
-    sections = [identification_section(found, plant)]
+    sections = [identification_section(found)]
+    if found.held_out_runs:
+        sections.append(held_out_section(found))
+    if plant.free:
+        sections.append(parameters_section(plant, record))
     if dynamics is not None:
         sections.append(dynamics_section(dynamics))
     if growth is not None:
         sections.append(growth_section(growth))
-    if record is not None:
-        sections.append(posterior_section(record))
     for log, known in zip(logs, found.runs):
         run = free_run(plant, log, known.warmup, known.warmup, known=known)
         sections.append(free_run_section(run, seen=True))
     return sections
+
+
+def held_out_section(found: Identification) -> Section:
+    """Return the section of the kept model over what it was fitted without: measured beside free run."""
+    runs = found.held_out_runs
+    words = (
+        ", ".join(f"{o} {s.rmse:.2g}{_spaced(s.unit)}" for o, s in r.scores.items()) for r in runs.values()
+    )
+    errors = "; ".join(f"{name}: {each}" for name, each in zip(runs, words))
+    parts = tuple(
+        Plot(
+            plots.free_run_chart(run, tuple(run.scores)[k : k + 2]),
+            f"{name}: {found.model} fitted without it, simulated from the inputs alone (dashed), over what "
+            f"was measured. Readings of the first {run.warmup:.3g} s set the state. On grey: not scored.",
+        )
+        for name, run in runs.items()
+        for k in range(0, len(run.scores), 2)
+    )
+    return Section("Does it predict what it has not seen?", parts, f"RMSE of {errors}.", "plain")
 
 
 def gain_table(found: Dynamics) -> Cells:
@@ -199,11 +219,12 @@ def dynamics_section(found: Dynamics) -> Section:
     """Return the section of gains, step and frequency responses."""
     parts = (
         Table(*gain_table(found), "Gains at rest, with intervals"),
-        Picture(
-            plots.step_response_figure(found),
+        Plot(
+            plots.step_response_chart(found),
             "Response of each output to a step of one unit of each input; shaded: the interval.",
         ),
-        Picture(plots.bode_figure(found), "Frequency response from each input; shaded: the interval."),
+        Plot(plots.bode_chart(found), "Frequency response from each input; shaded: the interval."),
+        Picture(plots.pole_figure(found), _POLES),
     )
     words = time_constant_words(found)
     return Section("How does the plant respond?", parts, _sentence(words[0].upper() + words[1:]))
@@ -236,36 +257,77 @@ def growth_section(growth: Growth) -> Section:
     return Section("Which terms does the network need?", tuple(parts), verdict)
 
 
-def posterior_section(record: Posterior) -> Section:
-    """Return the section of the parameters' posterior: marginals, corner plot, how it was sampled."""
+def parameters_section(plant: Plant, record: Posterior | None = None) -> Section:
+    """Return the section of the free parameters: how well each is known, and the posterior of ``record``."""
     from thermogrip.report.plots import corner_figure
+    from thermogrip.sysid.greybox.identifiability import identifiability_report
 
-    figure = plots.posterior_figure(record.samples, record.free, record.units, record.fitted)
-    slowest = max(record.tau.values())
-    parts: list[Any] = [
-        Picture(figure, f"Marginals of {len(record.samples)} samples: 90 % shaded, the fit as a line."),
-        Picture(
-            corner_figure(record), "The parameters that emcee sampled, pair by pair; grey lines: the fit."
-        ),
-        Text(_sentence(record.likelihood)),
-        Text(
-            f"emcee moved {', '.join(record.sampled)}; the others were integrated out and fitted to each "
-            "sample. "
-            f"{record.n_steps} steps, longest autocorrelation time {slowest:.0f} steps "
-            f"({record.n_steps / slowest:.0f} of them), {100 * record.acceptance:.0f} % accepted. "
-            f"Medians lie within {record.off_centre:.2f} standard deviations of the fitted values."
-        ),
-    ]
-    tone = "good" if record.converged else "warn"
-    return Section("How well are its parameters known?", tuple(parts), _sentence(record.verdict), tone)
+    parts: list[Any] = [Table(*parameter_table(plant, record), "Free parameters", dense=True)]
+    verdict, tone = known_words(plant), "plain"
+    if record is not None:
+        marginals = plots.posterior_figure(record.samples, record.free, record.units, record.fitted)
+        tone = "plain" if record.converged else "warn"
+        verdict += "" if record.converged else f" The sampler has {record.verdict}."
+        caption = "The parameters that emcee sampled, pair by pair; grey lines: the fit."
+        parts += [
+            Picture(
+                marginals, f"Marginals of {len(record.samples)} samples: 90 % shaded, the fit as a line."
+            ),
+            Picture(corner_figure(record), caption),
+            Text(_sentence(record.likelihood)),
+            Text(
+                f"emcee moved {', '.join(record.sampled)}, which have an effective number of samples (ESS) "
+                "and R-hat; the others were integrated out and fitted to each sample. "
+                f"{record.n_steps} steps, {record.verdict}, {100 * record.acceptance:.0f} % accepted. "
+                f"Medians lie within {record.off_centre:.2f} standard deviations of the fitted values."
+            ),
+        ]
+    parts += _per_log(plant)
+    parts += [Text(_sentence(said)) for said in identifiability_report(plant)]
+    return Section("How well are its parameters known?", tuple(parts), verdict, tone)
 
 
-def parameter_table(plant: Plant) -> Cells:
-    """Return the free parameters with their 90 % intervals, and those of the prior."""
+def known_words(plant: Plant) -> str:
+    """Return how many free parameters are known how well, and which least, by their 90 % intervals."""
+    intervals = plant.intervals(0.9)
+    if not intervals:
+        return f"{len(plant.free)} free parameters, without intervals."
+    off = {
+        name: (high - low) / 2 / max(abs(plant.values[name]), 1e-300)
+        for name, (low, high) in intervals.items()
+    }
+    near, half = (sum(width <= share for width in off.values()) for share in (0.1, 0.5))
+    least = sorted(off, key=lambda name: -off[name])[:3]
+    ends = ", ".join(
+        f"{name} ({intervals[name][0]:.3g} to {intervals[name][1]:.3g}{_spaced(plant.units.get(name, '1'))})"
+        for name in least
+    )
+    return (
+        f"{near} of {len(off)} parameters known within \N{PLUS-MINUS SIGN}10 %, {half} within "
+        f"\N{PLUS-MINUS SIGN}50 % (90 % intervals); least known: {ends}."
+    )
+
+
+def parameter_table(plant: Plant, record: Posterior | None = None) -> Cells:
+    """Return the free parameters with their 90 % intervals, and those of the prior; with ``record`` mean, sd,
+    effective number of samples and R-hat too."""
     intervals, before, nothing = plant.intervals(0.9), _prior_intervals(plant), (None, None)
-    ends = {name: (*intervals.get(name, nothing), *before.get(name, nothing)) for name in plant.free}
-    rows = ((name, plant.values[name], plant.units.get(name, "1"), *ends[name]) for name in plant.free)
-    return ("parameter", "value", "unit", "5 %", "95 %", "prior 5 %", "prior 95 %"), tuple(rows)
+    head = ["parameter", "value", "unit", "5 %", "95 %", "prior 5 %", "prior 95 %"]
+    rows: list[list[Any]] = [
+        [
+            name, plant.values[name], plant.units.get(name, "1"), *intervals.get(name, nothing),
+            *before.get(name, nothing),
+        ]
+        for name in plant.free
+    ]  # fmt: skip
+    if record is not None:
+        head[3:3], head[7:7] = ["mean", "sd"], ["ESS", "R-hat"]
+        for k, row in enumerate(rows):
+            own = record.samples[:, k]
+            row[3:3] = [float(own.mean()), float(own.std(ddof=1))]
+            ess = record.ess.get(row[0])
+            row[7:7] = [None if ess is None else round(ess), record.r_hat.get(row[0])]
+    return tuple(head), tuple(map(tuple, rows))
 
 
 def _per_log(plant: Plant) -> list[Table]:
@@ -319,15 +381,18 @@ def free_run_section(
     if run.exceeds_fit:
         times = ", ".join(f"{output} {ratio:.1f} times" for output, ratio in run.exceeds_fit.items())
         verdict += f" Above the error of the fit: {times}."
-    follows = _followed(run)
+    follows, outputs = _followed(run), tuple(run.scores)
     if follows:
         verdict += f" Residual correlation: {'; '.join(follows)}."
     parts: list[Any] = [
-        Picture(
-            plots.free_run_figure(run, band),
-            f"{name}: measured, simulated from the inputs alone, and their difference. Readings of the first "
-            f"{run.warmup:.3g} s set the state; nothing is fed back after that. Shaded: {band_words(band)}. "
-            "On grey: not scored.",
+        *(
+            Plot(
+                plots.free_run_chart(run, outputs[k : k + 2], band),
+                f"{name}: measured, simulated from the inputs alone (dashed), and their difference. Readings "
+                f"of the first {run.warmup:.3g} s set the state; nothing is fed back after that. Shaded: "
+                f"{band_words(band)}. On grey: not scored.",
+            )
+            for k in range(0, len(outputs), 2)
         ),
         Table(*run_table([run]), _BASELINES),
         Picture(

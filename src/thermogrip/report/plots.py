@@ -1,7 +1,8 @@
-"""Figures of a plant and of a session: free runs, posterior, closed loops, one grasp.
+"""Charts and figures of a plant and of a session: free runs, posterior, closed loops, grasps.
 
-They take records and numbers, and return matplotlib figures made without ``pyplot``, so that no window system
-is asked for and nothing global is left behind.  Figures of a classifier's results are in
+They take records and numbers.  What a reader wants to zoom into is a chart
+(:class:`~thermogrip.datasets.charts.Chart`), the rest are matplotlib figures made without ``pyplot``, so that
+no window system is asked for and nothing global is left behind.  Figures of a classifier's results are in
 :mod:`thermogrip.classify.figures`.
 
 The corner figure of a posterior: each pair of parameters, marginals on the diagonal
@@ -14,11 +15,13 @@ is.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
+from thermogrip.datasets.charts import DASHES, INK, PALETTE, SOFT, Chart, Curve, Panel, stretches, time_axis
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.media import panels
 from thermogrip.datasets.schema import Grasps, Log, column, log_name, names
@@ -28,72 +31,70 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from thermogrip.mpc.closed_loop.simulate import ClosedLoop
-    from thermogrip.sysid.export.dynamics import Dynamics
+    from thermogrip.sysid.export.dynamics import Dynamics, Estimate
     from thermogrip.sysid.greybox import Posterior
     from thermogrip.sysid.identification import Row
     from thermogrip.sysid.validation import Band, FreeRun
 
-MEASURED, MODEL, TARGET = "#9aa7b5", "#1f5fa8", "#1d2733"
-# after Okabe and Ito: eight colours that are distinct under every kind of colour-vision deficiency
-PALETTE = ("#1f5fa8", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8a5a00")
+MODEL, TARGET = PALETTE[0], INK
+MEASURED, PREDICTED = "#b3bfcb", PALETTE[1]  # a broad line, and a thin one of dashes over it
 MARKERS = ("o", "s", "D", "^", "v", "P", "X", "*")
-MAX_POINTS = 1500
 
 
-def free_run_figure(run: FreeRun, band: Band | None = None) -> Figure:
-    """Draw outputs measured and in free run, their difference and the inputs, a column an output; rows whose
-    ``scored`` is 0 stand on grey, and where a band is given readings are expected in the shade."""
-    log, simulated, outputs = run.measured, run.log, tuple(run.scores)
-    figure, axes = panels(
-        3, len(outputs), heights=(3, 1.2, 1.0), size=(5.2 * len(outputs), 4.4), sharex="col"
-    )
+def free_run_chart(run: FreeRun, outputs: Sequence[str], band: Band | None = None) -> Chart:
+    """Return outputs measured and in free run, their difference and the inputs, a column an output; rows
+    whose ``scored`` is 0 stand on grey, and where a band is given readings are expected in the shade."""
+    log, simulated = run.measured, run.log
     t = np.asarray(log["time"].values, dtype=float)
-    keep = _thin(t.size)
-    unscored = column(simulated, "scored") == 0 if "scored" in simulated else np.zeros(t.shape, dtype=bool)
-    for k, name in enumerate(outputs):
-        measured, model = column(log, name), column(simulated, name)
-        top, middle, bottom = axes[:, k]
-        high = middle.get_xaxis_transform()  # from the bottom of the panel, 0, to its top, 1
-        middle.fill_between(t, 0, 1, where=unscored, transform=high, color="#e6eaef", lw=0)
-        top.plot(t[keep], measured[keep], color=MEASURED, lw=2.2, label="measured")
-        top.plot(t[keep], model[keep], color=MODEL, lw=1.0, label="free run")
-        top.set_ylabel(f"{name} [{log[name].attrs['units']}]")
+    per, x_label = time_axis(float(t[-1] - t[0]))
+    t = t / per
+    shaded = stretches(t, column(simulated, "scored") == 0) if "scored" in simulated else ()
+    inputs = tuple(
+        Curve(_with_unit(u, log[u].attrs["units"]), t, column(log, u), PALETTE[(2 + k) % 8], step=True)
+        for k, u in enumerate(names(log, "input"))
+    )
+    columns = []
+    for name in outputs:
+        measured, model, unit = column(log, name), column(simulated, name), log[name].attrs["units"]
+        read = Curve("measured", t, measured, MEASURED, width=5.0)
+        freely = Curve("free run", t, model, PREDICTED, width=1.6, dash="--")
+        error = Curve("measured - free run", t, measured - model, MODEL, width=0.9)
+        above: tuple[Curve, ...] = (read, freely)
+        below: tuple[Curve, ...] = (error,)
         if band is not None:
-            half = band.half[name][keep]
-            top.fill_between(t[keep], model[keep] - half, model[keep] + half, color=MODEL, alpha=0.18, lw=0)
-            middle.fill_between(t[keep], -half, half, color=MODEL, alpha=0.18, lw=0)
-        middle.plot(t[keep], (measured - model)[keep], color=PALETTE[1], lw=0.8)
-        middle.axhline(0, color=TARGET, lw=0.6)
-        middle.set_ylabel(f"error [{difference_unit(log[name].attrs['units'])}]")
-        for j, u in enumerate(names(log, "input")):
-            label, colour = _with_unit(u, log[u].attrs["units"]), PALETTE[(2 + j) % 8]
-            bottom.step(t[keep], column(log, u)[keep], where="post", lw=0.8, color=colour, label=label)
-        bottom.set_xlabel("time [s]")
-        bottom.set_ylabel("inputs")
-    lines = axes[0, 0].get_lines() + axes[2, 0].get_lines()
-    figure.legend(handles=lines, loc="outside upper center", ncols=6, frameon=False, fontsize=8)
-    return figure
+            half = band.half[name]
+            above = (read, replace(freely, low=model - half, high=model + half))
+            below = (Curve("expected", t, 0 * half, PREDICTED, 1.0, "--", low=-half, high=half), error)
+        columns.append(
+            (
+                Panel(_with_unit(name, unit), above, name, 2.4, shaded=shaded),
+                Panel(f"error [{difference_unit(unit)}]", below, height=1.3, shaded=shaded),
+                Panel("inputs", inputs),
+            )
+        )
+    return Chart(tuple(columns), x_label)
 
 
 def residual_figure(run: FreeRun) -> Figure:
     """Draw the correlation of residuals with themselves and with the inputs before them, a row an output; the
     shaded bands cover 95 % of the lags of white residuals."""
     outputs = tuple(run.whiteness)
+    row_s = float(np.median(np.diff(run.measured["time"].values)))
     inputs = tuple(run.input_correlation[outputs[0]])
-    size = (2.6 * (1 + len(inputs)), 1.7 * len(outputs))
+    size = (max(6.4, 2.6 * (1 + len(inputs))), 1.7 * len(outputs))
     figure, axes = panels(len(outputs), 1 + len(inputs), size=size, sharex="col")
     for row, name in zip(axes, outputs):
         shown = {f"{name}, own": run.whiteness[name]}
         shown |= {f"{name} after {u}": found for u, found in run.input_correlation[name].items()}
         for axis, (title, found) in zip(row, shown.items()):
             axis.axhspan(-found.band, found.band, color=MODEL, alpha=0.15, lw=0)
-            axis.vlines(found.lags, 0.0, found.values, color=PALETTE[1], lw=1.2)
+            axis.vlines(found.lags * row_s, 0.0, found.values, color=PALETTE[1], lw=1.2)
             axis.axhline(0, color=TARGET, lw=0.6)
             axis.set_ylim(-1.05, 1.05)
             axis.set_title(title, fontsize=8)
         row[0].set_ylabel("correlation")
     for axis in axes[-1]:
-        axis.set_xlabel("lag [rows]")
+        axis.set_xlabel("lag [s]")
     return figure
 
 
@@ -118,48 +119,72 @@ def models_figure(rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def step_response_figure(found: Dynamics) -> Figure:
-    """Draw the response of each output, a row each, to a unit step of each input, a column each."""
+def step_response_chart(found: Dynamics) -> Chart:
+    """Return the response of each output, a panel each, to a unit step of each input, a column each."""
     outputs, inputs = found.near.outputs, found.near.inputs
     time, step = found.step_response()
-    size = (max(4.6, 2.6 * len(inputs)), 0.6 + 1.5 * len(outputs))
-    figure, axes = panels(len(outputs), len(inputs), size=size, sharex="col")
-    for i, name in enumerate(outputs):
-        unit = difference_unit(found.units.get(name, "1"))
-        axes[i, 0].set_ylabel(name if unit == "1" else f"{name} [{unit}]")
-        for j, axis in enumerate(axes[i]):
-            axis.axhline(0, color=TARGET, lw=0.6)
-            axis.fill_between(time, step.low[:, i, j], step.high[:, i, j], color=MODEL, alpha=0.18, lw=0)
-            axis.plot(time, step.value[:, i, j], color=MODEL, lw=1.2)
-    for j, name in enumerate(inputs):
-        by = found.units.get(name, "1")
-        axes[0, j].set_title(f"{name} + 1{'' if by == '1' else ' ' + difference_unit(by)}", fontsize=8)
-        axes[-1, j].set_xlabel("time [s]")
-    return figure
+    per, x_label = time_axis(float(time[-1]))
+    units = {name: found.units.get(name, "1") for name in (*outputs, *inputs)}
+
+    def panel(i: int, j: int) -> Panel:
+        value, low, high = (np.asarray(part)[:, i, j] for part in step)
+        ends = (low, high) if np.isfinite(low).all() else (None, None)
+        curve = Curve(outputs[i], time / per, value, PALETTE[i % 8], low=ends[0], high=ends[1])
+        by = units[inputs[j]]
+        title = f"{inputs[j]} + 1{'' if by == '1' else ' ' + difference_unit(by)}"
+        label = _with_unit(outputs[i], difference_unit(units[outputs[i]]))
+        return Panel(label, (curve,), title if i == 0 else "", 1.3)
+
+    rows = range(len(outputs))
+    columns = tuple(tuple(panel(i, j) for i in rows) for j in range(len(inputs)))
+    return Chart(columns, x_label, wide=max(3.2, 6.4 / len(inputs)))
 
 
-def bode_figure(found: Dynamics) -> Figure:
-    """Draw magnitude and phase from each input, a column each, to every output, a line each."""
+def bode_chart(found: Dynamics) -> Chart:
+    """Return magnitude and phase from each input, a column each, to every output, a line each."""
     outputs, inputs = found.near.outputs, found.near.inputs
-    omega, *parts = found.frequency_response()
-    figure, axes = panels(2, len(inputs), size=(max(4.6, 2.6 * len(inputs)), 3.6), sharex="col")
-    for j, (name, column_of) in enumerate(zip(inputs, axes.T)):
-        for axis, part in zip(column_of, parts):
-            axis.set_xscale("log")
-            for i in range(len(outputs)):
-                colour, low = PALETTE[i % 8], part.low[:, i, j]
-                if axis is column_of[0]:
-                    low = np.maximum(low, 1e-3 * part.value[:, i, j])  # the scale has no zero
-                axis.fill_between(omega, low, part.high[:, i, j], color=colour, alpha=0.15, lw=0)
-                axis.plot(omega, part.value[:, i, j], color=colour, lw=1.2, label=outputs[i])
-        column_of[0].set_yscale("log")
-        column_of[0].set_ylim(bottom=1e-4 * parts[0].value[:, :, j].max() or None)
-        column_of[0].set_title(name, fontsize=8)
-        column_of[1].set_xlabel("frequency [rad/s]")
-    axes[0, 0].set_ylabel("magnitude")
-    axes[1, 0].set_ylabel("phase [deg]")
-    lines = axes[0, 0].get_lines()
-    figure.legend(handles=lines, loc="outside upper center", ncols=6, frameon=False, fontsize=8)
+    omega, magnitude, phase = found.frequency_response()
+    least = 1e-4 * magnitude.value.max(axis=(0, 1))  # of each input: the scale has no zero
+
+    def curve(part: Estimate, i: int, j: int, floor: float) -> Curve:
+        value, low, high = (each[:, i, j] for each in part)
+        line = Curve(
+            outputs[i], omega, np.where(value < floor, np.nan, value), PALETTE[i % 8], dash=DASHES[i % 4]
+        )
+        if not np.isfinite(high).all():
+            return line
+        seen = high >= floor
+        low, high = np.where(seen, np.maximum(low, floor), np.nan), np.where(seen, high, np.nan)
+        return replace(line, low=low, high=high)
+
+    rows = range(len(outputs))
+    columns = []
+    for j, name in enumerate(inputs):
+        sizes = tuple(curve(magnitude, i, j, float(least[j])) for i in rows)
+        turns = tuple(curve(phase, i, j, -np.inf) for i in rows)
+        above = Panel("magnitude", sizes, name, 1.5, log=True)
+        columns.append((above, Panel("phase [deg]", turns, height=1.3)))
+    return Chart(tuple(columns), "frequency [rad/s]", log=True, wide=max(3.2, 6.4 / len(inputs)))
+
+
+def pole_figure(found: Dynamics) -> Figure:
+    """Draw the poles s of the plant, crosses, over those of the draws, dots: 1 / abs(s) [s], of a real pole
+    the time constant, and the damping ratio -Re(s) / abs(s)."""
+    from thermogrip.sysid.export.dynamics import poles_of
+
+    figure, [[axis]] = panels(1, 1, size=(7.2, 2.8))
+    drawn = np.concatenate([np.empty(0, complex), *(poles_of(other) for other in found.draws)])
+    for label, poles, mark, size, colour in (
+        (f"{len(found.draws)} draws", drawn, ".", 4, PREDICTED),
+        ("plant", found.poles, "x", 7, MODEL),
+    ):
+        s = poles[np.abs(poles) > 0]  # an integrator has no time
+        axis.plot(1 / np.abs(s), -s.real / np.abs(s), mark, ms=size, color=colour, label=label)
+    axis.axhline(0, color=TARGET, lw=0.8)
+    axis.set(xscale="log", ylim=(min(-0.1, axis.get_ylim()[0]), 1.1))
+    axis.set_xlabel("1 / |pole| [s]; of a real pole, on top, the time constant")
+    axis.set_ylabel("damping ratio")
+    axis.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
 
@@ -186,96 +211,73 @@ def posterior_figure(
     return figure
 
 
-def loop_figure(runs: Mapping[str, Log], targets: Mapping[str, float], output: str = "t_surface") -> Figure:
-    """Draw closed loops side by side by title: the regulated temperature and its target [degC] above, the
+def loops_chart(runs: Mapping[str, Log], targets: Mapping[str, float], output: str = "t_surface") -> Chart:
+    """Return closed loops side by side by title: the regulated temperature and its target [degC] above, the
     drive below."""
-    figure, axes = panels(2, len(runs), heights=(2.4, 1), size=(3.6 * len(runs), 3.6), sharex="col")
-    for k, (title, log) in enumerate(runs.items()):
+    spans = [float(log["time"].values[-1] - log["time"].values[0]) for log in runs.values()]
+    per, x_label = time_axis(*spans)
+    columns = []
+    for title, log in runs.items():
         t = np.asarray(log["time"].values, dtype=float)
-        t, keep = t - t[0], _thin(t.size)
-        top, bottom = axes[:, k]
-        for j, name in enumerate(n for n in names(log, "output") if n != output):
-            top.plot(
-                t[keep], column(log, name)[keep], color=PALETTE[(5 + j) % 8], lw=0.8, alpha=0.8, label=name
-            )
-        top.plot(t[keep], column(log, output)[keep], color=MODEL, lw=1.3, label=output)
-        top.axhline(targets[title], color=TARGET, lw=0.8, ls="--", label="target")
-        top.set_title(title, fontsize=9)
-        for j, u in enumerate(names(log, "input")):
-            label, colour = _with_unit(u, log[u].attrs["units"]), PALETTE[(1 + j) % 8]
-            bottom.step(t[keep], column(log, u)[keep], where="post", lw=0.9, color=colour, label=label)
-        bottom.set_xlabel("time [s]")
-    axes[0, 0].set_ylabel("temperature [degC]")
-    axes[1, 0].set_ylabel("inputs")
-    lines = axes[0, 0].get_lines() + axes[1, 0].get_lines()
-    figure.legend(handles=lines, loc="outside upper center", ncols=6, frameon=False, fontsize=8)
-    return figure
+        t = (t - t[0]) / per
+        goal = Curve("target", t[[0, -1]], np.full(2, targets[title]), TARGET, 1.0, "--")
+        others = tuple(
+            Curve(n, t, column(log, n), PALETTE[(5 + j) % 8], 0.9)
+            for j, n in enumerate(name for name in names(log, "output") if name != output)
+        )
+        drives = tuple(
+            Curve(_with_unit(u, log[u].attrs["units"]), t, column(log, u), PALETTE[(1 + j) % 8], step=True)
+            for j, u in enumerate(names(log, "input"))
+        )
+        own = Curve(output, t, column(log, output), MODEL, 1.6)
+        top = Panel("temperature [degC]", (*others, goal, own), title, 2.2)
+        columns.append((top, Panel("inputs", drives)))
+    return Chart(tuple(columns), x_label, wide=3.6)
 
 
-def steps_figure(runs: Mapping[str, ClosedLoop]) -> Figure:
-    """Draw simulated closed loops by "<step>, <controller>", a column a step, controllers over each other."""
+def steps_chart(runs: Mapping[str, ClosedLoop]) -> Chart:
+    """Return simulated closed loops by "<step>, <controller>": a column a step, controllers over each
+    other."""
     steps = list(dict.fromkeys(key.rsplit(", ", 1)[0] for key in runs))
-    figure, axes = panels(2, len(steps), heights=(2.4, 1), size=(3.6 * len(steps), 3.6), sharex="col")
+    per, x_label = time_axis(*(float(run.time[-1]) for run in runs.values()))
+    above: dict[str, list[Curve]] = {step: [] for step in steps}
+    below: dict[str, list[Curve]] = {step: [] for step in steps}
     for title, run in runs.items():
         step, controller = title.rsplit(", ", 1)
-        top, bottom = axes[:, steps.index(step)]
         # the one under another is broader, so that it shows where both do the same
-        colour, width = {"MPC": (PALETTE[5], 3.0), "LQR": (TARGET, 0.9)}.get(controller, (PALETTE[1], 1.3))
-        keep, rows = _thin(run.time.size), _thin(run.sample_time.size)
+        looks = {"MPC": (PALETTE[5], 3.2, "-"), "LQR": (TARGET, 1.1, ":")}
+        colour, width, dash = looks.get(controller, (PALETTE[1], 1.4, "--"))
         for name, target in run.target.items():
-            top.plot(run.time[keep], run.outputs[name][keep], color=colour, lw=width, label=controller)
-            top.plot(run.sample_time, target, color=MEASURED, lw=0.8, ls="--", zorder=1)
-        for drive in run.drive.values():
-            bottom.step(run.sample_time[rows], drive[rows], where="post", lw=0.8 * width, color=colour)
-        top.set_title(f"{step} degC", fontsize=9)
-        bottom.set_xlabel("time [s]")
-    axes[0, 0].set_ylabel("temperature [degC]")
-    axes[1, 0].set_ylabel("drive")
-    axes[0, 0].legend(frameon=False, fontsize=8)
-    return figure
+            if not any(curve.label == "target" for curve in above[step]):
+                above[step].append(Curve("target", run.sample_time / per, target, SOFT, 1.0, "-.", step=True))
+            above[step].append(Curve(controller, run.time / per, run.outputs[name], colour, width, dash))
+        below[step] += [
+            Curve(controller, run.sample_time / per, drive, colour, 0.8 * width, dash, step=True)
+            for drive in run.drive.values()
+        ]
+    columns = tuple(
+        (Panel("temperature [degC]", tuple(above[s]), f"{s} degC", 2.2), Panel("drive", tuple(below[s])))
+        for s in steps
+    )
+    return Chart(columns, x_label, wide=3.6)
 
 
-def grasp_figure(records: Sequence[Grasps], title: str = "") -> Figure:
-    """Draw the traces of grasps, a colour for each material."""
-    figure, [[axis]] = panels(1, 1, size=(6.4, 3.0))
-    colours: dict[str, str] = {}
-    for grasps in records:
-        time = np.asarray(grasps["time"].values, dtype=float)
-        labels = grasps["material"].values.astype(str) if "material" in grasps else [log_name(grasps)]
-        for row, name in zip(grasps["t_surface"].values, np.resize(labels, grasps.sizes["grasp"])):
-            label = None if name in colours else str(name)
-            colours.setdefault(str(name), PALETTE[len(colours) % 8])
-            axis.plot(time, row, lw=1.0, color=colours[str(name)], label=label)
-    axis.axvline(0, color=TARGET, lw=1.0, ls=":")
-    axis.set_xlabel('time since the "closed" message [s]')
-    axis.set_ylabel("t_surface [degC]")
-    axis.set_title(title, fontsize=9)
-    axis.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    return figure
-
-
-def responses_figure(records: Mapping[str, Grasps], materials: Sequence[str] = ()) -> Figure:
-    """Draw the traces of several conditions side by side, a colour for each material; those of ``materials``
-    get the first colours, the same as in another figure."""
-    across = min(4, len(records))
-    down = -(-len(records) // across)
-    figure, axes = panels(down, across, size=(2.9 * across, 2.2 * down))
-    colours = {name: PALETTE[k % 8] for k, name in enumerate(materials)}
-    for axis, (title, grasps) in zip(axes.ravel(), records.items()):
-        for row, name in zip(grasps["t_surface"].values, grasps["material"].values.astype(str)):
-            colours.setdefault(name, PALETTE[len(colours) % 8])
-            axis.plot(grasps["time"].values, row, lw=0.7, alpha=0.8, color=colours[name])
-        axis.axvline(0, color=TARGET, lw=0.6, ls=":")
-        axis.set_title(title, fontsize=8)
-    for axis in axes.ravel()[len(records) :]:
-        axis.set_axis_off()
-    for axis in axes[:, 0]:
-        axis.set_ylabel("t_surface [degC]")
-    for axis in axes.ravel()[max(0, len(records) - across) : len(records)]:
-        axis.set_xlabel("time since contact [s]")
-    lines = [axes[0, 0].plot([], [], color=colour, label=name)[0] for name, colour in colours.items()]
-    figure.legend(handles=lines, loc="outside upper center", ncols=len(lines), frameon=False, fontsize=8)
-    return figure
+def grasps_chart(records: Mapping[str, Sequence[Grasps]], materials: Sequence[str] = ()) -> Chart:
+    """Return the traces of grasps by title, a panel each, a colour and dash for each material; those of
+    ``materials`` get the first ones, the same as in another chart."""
+    styles = {name: k for k, name in enumerate(materials)}
+    columns = []
+    for title, group in records.items():
+        curves = []
+        for grasps in group:
+            time = np.asarray(grasps["time"].values, dtype=float)
+            labels = grasps["material"].values.astype(str) if "material" in grasps else [log_name(grasps)]
+            for row, name in zip(grasps["t_surface"].values, np.resize(labels, grasps.sizes["grasp"])):
+                k = styles.setdefault(str(name), len(styles))
+                curves.append(Curve(str(name), time, row, PALETTE[k % 8], 1.1, DASHES[k % 4]))
+        columns.append((Panel("t_surface [degC]", tuple(curves), title, 2.2, marks=(0.0,)),))
+    label = 'time since the "closed" message [s]'
+    return Chart(tuple(columns), label, wide=6.4 if len(columns) == 1 else 2.9, across=4)
 
 
 def exchange_figure(
@@ -322,11 +324,6 @@ def _with_unit(name: str, unit: str) -> str:
 def difference_unit(unit: str) -> str:
     """Return the unit of a difference: kelvin of temperatures."""
     return "K" if unit == "degC" else unit
-
-
-def _thin(n: int) -> slice:
-    """Return a slice that keeps at most :data:`MAX_POINTS` of n points."""
-    return slice(None, None, max(1, -(-n // MAX_POINTS)))
 
 
 def corner_figure(posterior: Posterior, names: Sequence[str] | None = None) -> Figure:

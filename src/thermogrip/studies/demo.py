@@ -8,6 +8,7 @@ small, so that two cores need less than two minutes; the report says what that c
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,7 +23,7 @@ from thermogrip.report.classification import (
 )
 from thermogrip.report.control import tuning_section
 from thermogrip.report.html import Commands, Section, write_report
-from thermogrip.report.plant import free_run_section, identification_section, posterior_section
+from thermogrip.report.plant import free_run_section, identification_section, parameters_section
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -67,7 +68,7 @@ def run_demo(
     """
     with ThreadPoolExecutor(1) as beside, kept_processes(workers):
         compare = partial(_compare, out, seed, workers)
-        compared = None if workers == 1 else beside.submit(compare, None)
+        compared = None if workers == 1 else beside.submit(copy_context().run, compare, None)
         found, plant, record, held_out = _identify(out, seed, sub_progress(progress, 0.0, 0.6, "identify"))
         tuning, checks = _tune(out, plant, seed, workers, sub_progress(progress, 0.6, 0.73, "tune"))
         sessions = _run(out, tuning, plant, seed, sub_progress(progress, 0.73, 0.76, "run"))
@@ -77,9 +78,9 @@ def run_demo(
         comparison, classifier = compare(share) if compared is None else compared.result()
     touched = [session.grasps for _, session in sessions if session.grasps is not None]
     sections = [
-        identification_section(found, plant),
+        identification_section(found),
         free_run_section(held_out, title="Does it predict the half of a log that was held out?"),
-        posterior_section(record),
+        parameters_section(plant, record),
         tuning_section(tuning),
         review_section(checks),
         session_section(sessions, f"the twin (posterior draw {DRAW})"),

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from thermogrip.report.classification import comparison_sections
-from thermogrip.report.html import Picture, Section, Table, Text
+from thermogrip.report.html import Picture, Plot, Section, Table, Text
 
 if TYPE_CHECKING:
     from thermogrip.classify.evaluation.comparison import Comparison
@@ -228,18 +228,18 @@ class PaperResult:
         from thermogrip.classify.figures import confusion_figure
         from thermogrip.datasets.examples import load_example_grasps
         from thermogrip.datasets.materials import find_material
-        from thermogrip.report.plots import exchange_figure, responses_figure
+        from thermogrip.report.plots import exchange_figure, grasps_chart
 
         examples = load_example_grasps()
         known = {name: find_material(name).effusivity for name in FIVE}
-        traces = {case.name: examples[case.record] for case in CASES}
+        traces = {case.name: [examples[case.record]] for case in CASES}
         parts: list[Any] = [
             Picture(
                 exchange_figure(known, e_dev=E_DEV),
                 f"Heat exchanged in 10 s by half-spaces in perfect contact, over difference and area; "
                 f"skin of {E_DEV:g} {E_UNIT}, like water (the paper gives none).",
             ),
-            Picture(responses_figure(traces, FIVE), "Responses of the bundled grasps, case by case."),
+            Plot(grasps_chart(traces, FIVE), "Responses of the bundled grasps, case by case."),
         ]
         for case in CASES[:2]:
             title = f"Case {case.name}, bundled grasps: rows true, columns predicted."

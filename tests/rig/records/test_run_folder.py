@@ -319,24 +319,6 @@ def test_a_verdict_has_its_figures_and_nothing_that_is_no_json(tmp_path: Path, t
     assert about.get("trip") == (None if trip is None else trip.as_dict())
 
 
-@POSIX
-@pytest.mark.parametrize(
-    ("head", "files", "commit"),
-    [("abc123\n", {}, "abc123"), ("ref: refs/heads/main\n", {"refs/heads/main": "d4\n"}, "d4"),
-     ("ref: refs/heads/main", {"packed-refs": "# pack\ne0 refs/heads/x-main\ne5 refs/heads/main\n"}, "e5"),
-     ("ref: refs/heads/main", {"packed-refs": "e5 refs/heads/other\n"}, ""),
-     ("ref: refs/heads/main", {}, ""), (None, {}, "")],
-)  # fmt: skip
-def test_the_commit_that_is_checked_out_is_read_without_git(
-    tmp_path: Path, head: str | None, files: dict[str, str], commit: str
-) -> None:
-    for name, text in {**({} if head is None else {"HEAD": head}), **files}.items():
-        path = tmp_path / ".git" / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-    assert run_folder._commit(tmp_path / "a" / "b") == commit
-
-
 WRITER = """
 import sys
 from thermogrip.rig.records.run_folder import RunFolder

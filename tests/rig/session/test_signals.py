@@ -139,7 +139,7 @@ def test_wherever_a_second_ctrl_c_comes_the_run_is_closed_as_with_one(
 ) -> None:
     came: list[int] = []
     monkeypatch.setattr(recorder, "RESERVE", 64)
-    monkeypatch.setattr(recorder, "provenance", lambda files: {})  # this and the disk take the time here
+    monkeypatch.setattr(recorder, "made_with", lambda files: {})  # this and the disk take the time here
     monkeypatch.setattr(os, "fsync", lambda file: None)
 
     def interrupted(path: Path, n: int) -> None:

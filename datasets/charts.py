@@ -1,0 +1,190 @@
+"""Charts: curves over a shared axis in panels, as data, so that a page can zoom in them and paper show them.
+
+A :class:`Chart` is what a page draws anew at every zoom (:mod:`thermogrip.report.html`) and what
+:func:`draw_chart` sets as a matplotlib figure for print and for readers without scripts.  Both show the same
+curves in the same colours and dashes.
+
+**Thinning.**  A log has more rows than a screen has columns of pixels, and every n-th row would miss the
+peaks.  :func:`thin` cuts the rows into bins and keeps of each the last row and those of the least and the
+largest value of every column, and one of its gaps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.arrays import Array
+from thermogrip.datasets.media import panels
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# after Okabe and Ito: eight colours that are distinct under every kind of colour-vision deficiency
+PALETTE = ("#1f5fa8", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8a5a00")
+DASHES = ("-", "--", ":", "-.")
+INK, SOFT, SHADE = "#1d2733", "#8795a3", "#e6eaef"  # of targets, of limits, of what is not scored
+_STILL = 400  # points of a curve on paper
+_MINUTES, _HOURS = 3600.0, 6 * 3600.0  # from which on an axis is in minutes, in hours
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """One line of a panel, or marks, or a band."""
+
+    label: str  # curves of one label share an entry of the legend; "": none
+    x: Array  # (n,), of the chart's axis
+    y: Array  # (n,), NaN where there is a gap
+    colour: str = PALETTE[0]
+    width: float = 1.3
+    dash: str = "-"  # as matplotlib has it: "-", "--", ":", "-.", and "" for marks alone
+    step: bool = False  # a value holds until the next
+    low: Array | None = None  # (n,), the ends of a band
+    high: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """Curves over one axis."""
+
+    label: str  # what is drawn, with its unit
+    curves: tuple[Curve, ...]
+    title: str = ""
+    height: float = 1.0
+    log: bool = False
+    shaded: tuple[tuple[float, float], ...] = ()  # stretches of x on grey
+    marks: tuple[float, ...] = ()  # dotted across, at these x
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """Panels in columns; those of a column share their axis."""
+
+    columns: tuple[tuple[Panel, ...], ...]
+    x_label: str = "time [s]"
+    log: bool = False  # the axis
+    wide: float = 5.2  # of a column on paper [inch]
+    across: int = 99  # columns beside each other on paper, at most
+
+
+def thin(columns: Sequence[Array], most: int) -> NDArray[np.intp]:
+    """Return at most ``most`` rows that show what all do: of each bin its last, of every column the extremes
+    and a gap.
+
+    >>> thin([np.array([0.0, 0, 0, 9, 0, 0, 0, 0, -5, 0, 0, 0])], 7).tolist()
+    [0, 3, 5, 6, 8, 11]
+    """
+    n = len(columns[0])
+    if n <= most:
+        return np.arange(n)
+    kept = {0}
+    rows = 1 + sum(2 + (not np.isfinite(values).all()) for values in columns)  # that a bin may keep
+    for part in np.array_split(np.arange(n), max(1, (most - 1) // rows)):
+        kept.add(int(part[-1]))
+        for values in columns:
+            known = np.isfinite(values[part])
+            if known.any():
+                seen = part[known]
+                kept |= {int(seen[values[seen].argmin()]), int(seen[values[seen].argmax()])}
+            if not known.all():
+                kept.add(int(part[~known][0]))
+    return np.array(sorted(kept))
+
+
+def thinned(curve: Curve, most: int) -> Curve:
+    """Return a curve of at most so many points."""
+    own = [part for part in (curve.y, curve.low, curve.high) if part is not None]
+    if len(curve.x) <= most:
+        return curve
+    keep = thin(own, most)
+    x, y, *ends = (np.asarray(part)[keep] for part in (curve.x, *own))
+    low, high = ends or (None, None)
+    return replace(curve, x=x, y=y, low=low, high=high)
+
+
+def time_axis(*seconds: float) -> tuple[float, str]:
+    """Return what times [s] up to these are divided by, and the axis' label: in s, min or h.
+
+    >>> time_axis(1800.0), time_axis(9000.0), time_axis(1e5)
+    ((1.0, 'time [s]'), (60.0, 'time [min]'), (3600.0, 'time [h]'))
+    """
+    span = max(seconds, default=0.0)
+    if span <= _MINUTES:
+        return 1.0, "time [s]"
+    return (60.0, "time [min]") if span <= _HOURS else (3600.0, "time [h]")
+
+
+def stretches(x: Array, inside: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
+    """Return the (first, last) x of each run of rows that are ``inside``."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(int)))
+    last = len(x) - 1
+    return tuple((float(x[a]), float(x[min(b, last)])) for a, b in zip(edges[::2], edges[1::2]))
+
+
+def draw_chart(chart: Chart) -> Figure:
+    """Return a chart as a figure for paper."""
+    heights, across = [panel.height for panel in chart.columns[0]], min(chart.across, len(chart.columns))
+    down = -(-len(chart.columns) // across)
+    size = (chart.wide * across, 0.5 + down * (0.3 + 1.25 * sum(heights)))
+    figure, axes = panels(down * len(heights), across, size=size, heights=heights * down)
+    for axis in axes.ravel():
+        axis.set_axis_off()
+    for k, column in enumerate(chart.columns):
+        at = k // across * len(heights)
+        own = axes[at : at + len(heights), k % across]
+        for panel, axis in zip(column, own):
+            axis.set_axis_on()
+            if axis is not own[0]:
+                axis.sharex(own[0])
+            axis.tick_params(labelbottom=panel is column[-1])
+            _draw(axis, panel)
+            if chart.log:
+                axis.set_xscale("log")
+        own[len(column) - 1].set_xlabel(chart.x_label)
+    entries: dict[str, Artist] = {}
+    for axis in axes.T.ravel():
+        for handle, label in zip(*axis.get_legend_handles_labels()):
+            entries.setdefault(label, handle)
+    if entries:
+        look: dict[str, Any] = {"ncols": 6, "frameon": False, "fontsize": 8}
+        figure.legend(list(entries.values()), list(entries), loc="outside upper center", **look)
+    return figure
+
+
+def _draw(axis: Axes, panel: Panel) -> None:
+    """Draw one panel."""
+    if panel.log:
+        axis.set_yscale("log")
+    for begin, end in panel.shaded:
+        axis.axvspan(begin, end, color=SHADE, lw=0, zorder=0)
+    for at in panel.marks:
+        axis.axvline(at, color=INK, lw=0.9, ls=":")
+    for label, curve in _once((curve.label, thinned(curve, _STILL)) for curve in panel.curves):
+        own: dict[str, Any] = {"color": curve.colour, "label": label}
+        if curve.low is not None and curve.high is not None:
+            axis.fill_between(
+                curve.x, curve.low, curve.high, color=curve.colour, alpha=0.18, lw=0,
+                step="post" if curve.step else None,
+            )  # fmt: skip
+        if curve.dash:
+            steps = "steps-post" if curve.step else "default"
+            axis.plot(curve.x, curve.y, lw=curve.width, ls=curve.dash, drawstyle=steps, **own)
+        else:
+            axis.plot(curve.x, curve.y, "x", ms=4, **own)
+    axis.set_ylabel(panel.label)
+    if panel.title:
+        axis.set_title(panel.title, fontsize=9)
+
+
+def _once(curves: Iterable[tuple[str, Curve]]) -> Iterable[tuple[str | None, Curve]]:
+    """Yield each curve with its label, the first time only."""
+    seen = {""}
+    for label, curve in curves:
+        yield None if label in seen else label, curve
+        seen.add(label)

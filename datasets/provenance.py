@@ -1,0 +1,136 @@
+"""Where a result comes from: version, date, command, repository, seed, and the SHA-256 of what was read.
+
+Every JSON file has it under the key ``provenance``, every page in its foot.  It is gathered here and nowhere
+else: the command line opens a :func:`work` with its words, readers and writers of files report to it, and a
+writer asks :func:`provenance`.  Two runs of one command with one seed differ in this alone; with
+``SOURCE_DATE_EPOCH`` the date is that one [1]_.
+
+References
+----------
+.. [1] https://reproducible-builds.org/specs/source-date-epoch/
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+KEY = "provenance"
+_ROOMS = tuple(
+    str(Path(__file__).resolve().parent.parent / room) + os.sep
+    for room in ("datasets", "sysid", "mpc", "rig", "classify")
+)  # what they bring belongs to the version
+_PATIENCE_S = 2.0  # for git, in a large repository
+
+
+@dataclass
+class _Work:
+    """One command while it runs."""
+
+    words: Sequence[str]
+    seed: int | None = None
+    read: dict[str, str] = field(default_factory=dict)  # path -> SHA-256, "" until it is asked for
+    written: set[str] = field(default_factory=set)
+
+
+_WORK: ContextVar[_Work | None] = ContextVar("work", default=None)
+
+
+@contextmanager
+def work(words: Sequence[str]) -> Iterator[None]:
+    """Gather what one command, the words as typed, reads and writes."""
+    token = _WORK.set(_Work(words))
+    try:
+        yield
+    finally:
+        _WORK.reset(token)
+
+
+def note_seed(seed: int | None) -> None:
+    """Report the seed of the command."""
+    if now := _WORK.get():
+        now.seed = seed
+
+
+def note_read(path: str | Path) -> None:
+    """Report a file that is read; those of the package itself and those that the command wrote do not
+    count."""
+    now, name = _WORK.get(), os.path.abspath(path)
+    if now and name not in now.written and not os.path.realpath(name).startswith(_ROOMS):
+        now.read.setdefault(name, "")
+
+
+def note_written(path: str | Path) -> None:
+    """Report a file that was written."""
+    if now := _WORK.get():
+        now.written.add(os.path.abspath(path))
+
+
+def provenance() -> dict[str, Any]:
+    """Return the provenance of what is being written, as plain JSON."""
+    from thermogrip import __version__
+
+    now = _WORK.get() or _Work([Path(sys.argv[0]).name, *sys.argv[1:]])
+    for name in now.read:
+        now.read[name] = now.read[name] or _hash(name)
+    return {
+        "thermogrip": __version__,
+        "written": _date(),
+        "command": shlex.join(now.words),
+        "git": _describe(os.getcwd()),
+        "seed": now.seed,
+        "inputs": {os.path.relpath(name) if _below(name) else name: now.read[name] for name in now.read},
+    }
+
+
+def _below(name: str) -> bool:
+    """Tell whether a file lies in the working folder or below it."""
+    return name.startswith(os.getcwd().rstrip(os.sep) + os.sep)
+
+
+def _date() -> str:
+    """Return the time in UTC, of the environment where that sets one."""
+    epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
+    at = time.gmtime(int(epoch) if epoch.isdecimal() and len(epoch) < 12 else None)
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", at)
+
+
+def _hash(name: str) -> str:
+    """Return the SHA-256 of a file, "" where it is gone or no file."""
+    try:
+        if not os.path.isfile(name):
+            return ""
+        with open(name, "rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError:
+        return ""
+
+
+@cache
+def _describe(folder: str) -> str | None:
+    """Return what ``git describe`` says of the repository about a folder, None where there is none."""
+    command = ["git", "-C", folder, "describe", "--always", "--dirty", "--tags"]
+    try:
+        done = subprocess.run(
+            command,
+            capture_output=True,
+            text=True,
+            timeout=_PATIENCE_S,
+            stdin=subprocess.DEVNULL,
+            env=os.environ | {"GIT_OPTIONAL_LOCKS": "0"},
+            check=False,
+        )
+    except (OSError, subprocess.SubprocessError, UnicodeDecodeError):
+        return None
+    return done.stdout.strip() or None
