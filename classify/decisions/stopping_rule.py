@@ -494,7 +494,9 @@ def stop_callback(
     def stop(grasp: Grasps) -> bool:
         nonlocal stream
         time, reading = grasp["time"].values, grasp["t_surface"].values[0]
-        if stream is None or not np.array_equal(reading[: len(stream._time)], stream._reading, equal_nan=True):
+        if stream is None or not np.array_equal(
+            reading[: len(stream._time)], stream._reading, equal_nan=True
+        ):
             known = {
                 name: float(grasp[name].values[0]) for name in ("t_object", "t_object_sd", "t_ambient")
                 if name in grasp

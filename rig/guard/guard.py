@@ -309,7 +309,7 @@ class Guard:
 
     @property
     def model_share(self) -> float:
-        """The largest deviation from the plant, as a share of what is allowed; NaN where there is no plant."""
+        """The largest deviation from the plant, as a share of what is allowed; NaN without a plant."""
         return float("nan") if self.model is None else self.model.share
 
     @property
@@ -337,7 +337,8 @@ class Guard:
         stop_asked: str = "",
     ) -> Findings:
         """Return the accepted values of a reading, and whether to go on; ``now`` is the host's time [s],
-        ``planned`` how long the loop meant to wait since the last check [s], ``stop_asked`` who asks to stop."""
+        ``planned`` how long the loop meant to wait since the last check [s], ``stop_asked`` who asks for an
+        end."""
         trip = self._clocks(reading, now, planned)
         if trip is None and stop_asked:
             trip = Trip("operator", reading.time_s, "the operator", "to go on", f"a stop from {stop_asked}")

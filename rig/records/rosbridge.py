@@ -52,9 +52,7 @@ class Messages:
     """The protocol: rows and events to JSON texts, JSON texts to targets inside ``limits`` [degC], or to none
     where ``limits`` is None: then nothing is asked for."""
 
-    def __init__(
-        self, prefix: str = PREFIX, limits: tuple[float, float] | None = (10.0, 50.0)
-    ) -> None:
+    def __init__(self, prefix: str = PREFIX, limits: tuple[float, float] | None = (10.0, 50.0)) -> None:
         self.prefix, self.limits = prefix, limits
         self._advertised: set[str] = set()
 
