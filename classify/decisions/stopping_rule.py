@@ -487,8 +487,10 @@ def stop_callback(
     """Return a function of the one grasp so far, its ``t_object`` and ``t_ambient`` and never its
     ``material``, that returns whether the rule ends the contact; a session calls it after each sample
     (``stop`` of :func:`thermogrip.rig.session.session.run_session`) and knows nothing else of classifiers.
+    What has to be compiled is compiled before it is returned.
     A grasp that does not begin as the last one did is another one.  ``tell`` hears the probabilities at each
     time [s]."""
+    Stream(classifier, candidates=candidates)  # no contact may wait for it
     stream: Stream | None = None
 
     def stop(grasp: Grasps) -> bool:

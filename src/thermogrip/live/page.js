@@ -54,14 +54,14 @@ function show() {
   }
   ask(m.question);
   const dead = !here || m.lost || Boolean(m.ended);
-  for (const control of document.querySelectorAll("#actions button, #question button")) control.disabled = dead;
+  for (const control of document.querySelectorAll("#stop, #actions button, #question button")) control.disabled = dead;
   if (!now.phase) { text("phase", "no reading yet"); return; }
   countdown(now, dead);
   tiles(now);
   $("events").replaceChildren(...[...now.events].reverse().map((event) => {
     const item = document.createElement("li"), at = document.createElement("b");
     at.textContent = event.time_s.toFixed(1) + " s";
-    item.append(at, event.kind + ": " + event.text);
+    item.append(at, event.kind === "tripped" ? "tripped, see above" : event.kind + ": " + event.text);
     return item;
   }));
   if (!drawn) drawn = requestAnimationFrame(draw);
@@ -80,7 +80,7 @@ function countdown(now, dead) {
   longest = Math.max(longest, left, 1e-9);
   const over = dead || now.verdict;
   text("phase", now.verdict || now.phase.replace("_", " "));
-  text("left", over || now.left_s === null ? "" : (now.phase === "contact" ? left.toFixed(1) : left.toFixed(0)) + " s left");
+  text("left", over || now.left_s === null ? "" : (now.phase === "contact" ? left.toFixed(1) + " s left" : left.toFixed(0) + " s left at most"));
   text("what", m.what || "");
   $("bar").value = over ? 1 : 1 - left / longest;
 }
@@ -164,12 +164,12 @@ function materials() {
     return cells;
   }));
   const lines = best.map(([name], k) => ({ name, color: "--s" + k, points: posterior.map(([t, p]) => [t, p[name] === null ? null : 100 * p[name]]) }));
-  chart("posterior", lines, "%", posterior[0][0], Math.max(posterior[posterior.length - 1][0], 1), 0, 100);
+  chart("posterior", lines, "%", 0, Math.max(posterior[posterior.length - 1][0], 1), 0, 100);
 }
 
 function ticks(low, high, n) {
   const rough = (high - low) / n, power = 10 ** Math.floor(Math.log10(rough));
-  const step = power * [1, 2, 5, 10].find((k) => k * power >= rough), found = [];
+  const step = power * [1, 2, 5, 10].find((k) => k * power >= 0.999 * rough), found = [];
   for (let v = Math.ceil(low / step) * step; v <= high + 1e-9 * step; v += step) found.push(Math.round(v / step) * step);
   return [found, Math.max(0, -Math.floor(Math.log10(step) + 1e-9))];
 }
@@ -205,13 +205,13 @@ function chart(id, lines, unitOf, from, to, ...must) {
   g.setTransform(scale, 0, 0, scale, 0, 0);
   g.clearRect(0, 0, box.width, box.height);
   g.font = "12px system-ui, sans-serif"; g.lineWidth = 1; g.strokeStyle = color("--line"); g.fillStyle = color("--soft");
-  const [ys, yd] = ticks(low, high, box.height < 160 ? 3 : 5), [xs, xd] = ticks(from, to, Math.max(2, box.width / 120));
+  const [ys, yd] = ticks(low, high, box.height < 160 ? 4 : 5), [xs, xd] = ticks(from, to, Math.max(2, box.width / 120));
   g.textAlign = "right"; g.textBaseline = "middle";
   for (const v of ys) { g.beginPath(); g.moveTo(left, Y(v)); g.lineTo(box.width - right, Y(v)); g.stroke(); g.fillText(v.toFixed(yd), left - 5, Y(v)); }
   g.textAlign = "center"; g.textBaseline = "top";
   for (const t of xs) if (X(t) < box.width - 26) g.fillText(t.toFixed(xd) + " s", X(t), box.height - bottom + 5);
   let at = left; g.textAlign = "left"; g.textBaseline = "alphabetic";
-  g.fillText("[" + unitOf + "]", 4, 11);
+  g.fillText(unitOf && "[" + unitOf + "]", 4, 11);
   for (const l of lines) {
     g.fillStyle = g.strokeStyle = color(l.color); g.lineWidth = 2; g.setLineDash(l.dash || []);
     g.beginPath(); g.moveTo(at, 8); g.lineTo(at + 18, 8); g.stroke(); g.setLineDash([]);
@@ -221,11 +221,12 @@ function chart(id, lines, unitOf, from, to, ...must) {
   for (const l of lines) {
     const points = thin(l.points, box.width);
     if (l.band) {
+      const there = points.filter((p) => p[1] !== null);
       g.fillStyle = color("--band");
-      for (let k = 0; k + 1 < points.length; k++) if (points[k][1] !== null) {
-        const x = X(points[k][0]), wide = X(points[k + 1][0]) - x;
-        g.fillRect(x, Y(points[k][1] + l.band), wide + 0.5, Y(points[k][1] - l.band) - Y(points[k][1] + l.band));
-      }
+      g.beginPath();
+      for (const [t, v] of there) g.lineTo(X(t), Y(v + l.band));
+      for (const [t, v] of there.reverse()) g.lineTo(X(t), Y(v - l.band));
+      g.fill();
     }
     g.strokeStyle = color(l.color); g.lineWidth = 1.8; g.setLineDash(l.dash || []);
     g.beginPath();
@@ -247,7 +248,7 @@ function chart(id, lines, unitOf, from, to, ...must) {
     const near = (points) => points.reduce((a, b) => (Math.abs(b[0] - t) < Math.abs(a[0] - t) ? b : a));
     const first = near(lines[0].points);
     g.strokeStyle = color("--soft"); g.lineWidth = 1; g.beginPath(); g.moveTo(X(first[0]), top); g.lineTo(X(first[0]), box.height - bottom); g.stroke();
-    words = first[0].toFixed(1) + " s: " + lines.map((l) => l.name + " " + fixed(near(l.points)[1], 2)).join(", ") + " " + unitOf;
+    words = first[0].toFixed(1) + " s: " + lines.map((l) => l.name + " " + fixed(near(l.points)[1], 2)).join(", ") + (unitOf && " " + unitOf);
   }
   text("r-" + id, words);
 }

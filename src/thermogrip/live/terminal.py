@@ -46,8 +46,8 @@ def numbers(now: Snapshot) -> list[tuple[str, str]]:
 def line(now: Snapshot) -> str:
     """Return the numbers in one line."""
     shown = ", ".join(f"{name} {value}" for name, value in numbers(now))
-    last = f"; {now.events[-1].kind}: {now.events[-1].text}" if now.events else ""
-    return printable(f"{now.time_s:.1f} s: {shown}{now.trip.line() if now.trip else last}")
+    last = f"{now.events[-1].kind}: {now.events[-1].text}" if now.events else ""
+    return printable(f"{now.time_s:.1f} s: {shown}; {now.trip.line() if now.trip else last}")
 
 
 def sparkline(values: Sequence[float], width: int, bars: str = _BARS) -> str:
