@@ -189,9 +189,9 @@ def run(
             console.warn(line)
         with (
             _bridge(bridge) as through,
+            watch,
             RunFolder(out, about, files=files) as folder,
             through(folder) as recorder,
-            watch,
         ):
             session = run_session(
                 rig,
@@ -351,9 +351,9 @@ def record(
         files = {} if guard is None else {"guard": guard}
         with (
             _bridge(bridge) as through,
+            watch,
             RunFolder(out, about, files=files) as folder,
             through(folder) as recorder,
-            watch,
         ):
             shown: dict[str, Any] = {"progress": watch.progress, "listener": watch.listen}
             log, ended = play(

@@ -155,15 +155,15 @@ function draw() {
 }
 
 function materials() {
-  const newest = posterior[posterior.length - 1][1];
+  const newest = posterior[posterior.length - 1][1], known = Object.keys(newest), color = (name) => "--s" + (known.indexOf(name) % 6);
   const best = Object.entries(newest).sort((a, b) => (b[1] ?? 0) - (a[1] ?? 0)).slice(0, 5);
-  $("materials").replaceChildren(...best.flatMap(([name, p], k) => {
+  $("materials").replaceChildren(...best.flatMap(([name, p]) => {
     const cells = ["span", "span", "i"].map((tag) => document.createElement(tag));
     cells[0].textContent = name; cells[1].textContent = p === null ? "–" : (100 * p).toFixed(0) + " %";
-    cells[2].style.width = 100 * (p ?? 0) + "%"; cells[2].style.background = "var(--s" + k + ")";
+    cells[2].style.width = 100 * (p ?? 0) + "%"; cells[2].style.background = "var(" + color(name) + ")";
     return cells;
   }));
-  const lines = best.map(([name], k) => ({ name, color: "--s" + k, points: posterior.map(([t, p]) => [t, p[name] === null ? null : 100 * p[name]]) }));
+  const lines = best.map(([name]) => ({ name, color: color(name), points: posterior.map(([t, p]) => [t, p[name] === null ? null : 100 * p[name]]) }));
   chart("posterior", lines, "%", 0, Math.max(posterior[posterior.length - 1][0], 1), 0, 100);
 }
 

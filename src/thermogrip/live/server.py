@@ -278,7 +278,7 @@ def main() -> None:
             _answer({"port": listener.getsockname()[1]})
         asyncio.run(_serve(settings, lines, listener))
     except (OSError, RuntimeError) as error:
-        _answer({"error": str(error)})
+        _answer({"error": os.strerror(error.errno) if getattr(error, "errno", None) else str(error)})
 
 
 if __name__ == "__main__":

@@ -124,7 +124,7 @@ def panel(
     if len(known) > 1:
         bars = sparkline(means, max(10, width - 36), _PLAIN_BARS if plain else _BARS)
         ends = f" {min(known):.1f} to {max(known):.1f} degC, last {MINUTES} min"
-        lines.append(Text(bars, style="cyan", end="").append(ends, style="dim"))
+        lines.append(Text(bars, style="cyan").append(ends, style="dim"))
     if note:
         lines.append(Text(printable(note)))
     if now.events and now.trip is None:

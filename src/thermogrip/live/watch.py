@@ -76,7 +76,8 @@ class Question:
 class Watch:
     """Show a session; a context manager, whose methods are called from the session's thread.
 
-    ``operator`` is handed to the session, as are :meth:`listen` and :meth:`progress`.
+    ``operator`` is handed to the session, as are :meth:`listen` and :meth:`progress`; ``address`` is that of
+    the page, with its token.
     """
 
     def __init__(self, title: str, console: Console, show: Show | None = None) -> None:
@@ -94,7 +95,9 @@ class Watch:
         self._answers: queue.Queue[tuple[int, str]] = queue.Queue()
         self._typing: threading.Thread | None = None
         self._over = threading.Event()
+        self.address = ""
         self._page: subprocess.Popen[bytes] | None = None
+        self._reached = False  # whether the page's process takes what is written
         self._view = _Lines(title) if not sys.stderr.isatty() else _Panel(title)
 
     def listen(self, snapshot: Snapshot) -> None:
@@ -120,7 +123,7 @@ class Watch:
         """Return what is answered, on the terminal or on the page."""
         self._view.pause()
         try:
-            if self._page is None:
+            if not self._reached:
                 return str(typer.prompt(text, default="", show_default=False)).strip()
             return self._ask_both(text, choices, own_words)
         finally:
@@ -142,7 +145,7 @@ class Watch:
                 check_stopped()
                 if self.operator.stop_asked:
                     return "q"
-                if self._page is None and not self._typing.is_alive():
+                if not self._reached and not self._typing.is_alive():
                     raise UserError("nobody can answer any more", hint="run the same command again to go on")
                 with suppress(queue.Empty):
                     number, said = self._answers.get(timeout=0.2)
@@ -205,7 +208,7 @@ class Watch:
     def _send(self, taken: list[Snapshot], over: bool) -> None:
         """Write what is new to the page's process; one that is gone is let go."""
         page, now = self._page, self._now
-        if page is None or page.stdin is None:
+        if page is None or page.stdin is None or not self._reached:
             return
         question = self._question
         names = [] if now is None else [*now.values, *now.drive]
@@ -228,7 +231,7 @@ class Watch:
             page.stdin.write(json.dumps(plain(message), allow_nan=False).encode() + b"\n")
             page.stdin.flush()
         except OSError:
-            self._page = None
+            self._reached = False
             self._console.warn("the page's process is gone; the session goes on without it")
 
     def _open_page(self) -> None:
@@ -245,20 +248,23 @@ class Watch:
         settings |= {"layout": None if layout is None else str(layout)}
         page.stdin.write(json.dumps(settings).encode() + b"\n")
         page.stdin.flush()
-        begin, said = time.monotonic(), {}
+        begin = time.monotonic()
+        said: dict[str, Any] = {}
         for text in page.stdout:
             said |= json.loads(text)
             if said.keys() & {"ready", "error"} or time.monotonic() - begin > _PATIENCE_S:
                 break
-        if "ready" not in said:
+        self._reader = threading.Thread(target=self._read_page, args=(page,), daemon=True)
+        self._reader.start()
+        self._reached = "ready" in said
+        if not self._reached:
             page.kill()
-            page.wait()
-            self._page = None
+            self._close_page()
             why = said.get("error", "its process did not start")
             raise UserError(f"the live page cannot be served ({why})", hint="choose another port")
-        threading.Thread(target=self._read_page, args=(page,), daemon=True).start()
         if show.live is not None:
-            sys.stderr.write(f"live: http://127.0.0.1:{said['port']}/?token={token}\n")
+            self.address = f"http://127.0.0.1:{said['port']}/?token={token}"
+            sys.stderr.write(f"live: {self.address}\n")
         if show.foxglove is not None:
             sys.stderr.write(f"foxglove: ws://127.0.0.1:{show.foxglove}, layout {printable(str(layout))}\n")
         sys.stderr.flush()
@@ -276,8 +282,8 @@ class Watch:
                 self._answers.put((int(asked["question"]), asked.get("text", "")))
 
     def _close_page(self) -> None:
-        page, self._page = self._page, None
-        if page is None or page.stdin is None:
+        page, self._page, self._reached = self._page, None, False
+        if page is None or page.stdin is None or page.stdout is None:
             return
         with suppress(OSError):
             page.stdin.close()
@@ -286,18 +292,20 @@ class Watch:
         except subprocess.TimeoutExpired:
             page.kill()
             page.wait()
+        self._reader.join()
+        page.stdout.close()
 
 
 class _Lines:
     """What is no terminal: one line a second at most."""
 
     def __init__(self, title: str) -> None:
-        self._title, self._now, self._said = title, None, -float("inf")
+        self._title, self._said, self._last = title, -float("inf"), ""
+        self._now: Snapshot | None = None
         self.progress: tuple[float, str] = 0.0, ""
-        self._last = ""
 
     def add(self, snapshot: Snapshot) -> None:
-        self._now: Snapshot | None = snapshot
+        self._now = snapshot
 
     def show(self, *, last: bool) -> None:
         fraction, what = self.progress
@@ -321,13 +329,14 @@ class _Panel:
     def __init__(self, title: str) -> None:
         from rich.console import Console as RichConsole
 
-        self._title, self._now, self._history = title, None, History()
+        self._title, self._history = title, History()
+        self._now: Snapshot | None = None
         self.progress: tuple[float, str] = 0.0, ""
         self._console, self._lock = RichConsole(stderr=True, highlight=False), threading.Lock()
         self._live: Any = None
 
     def add(self, snapshot: Snapshot) -> None:
-        self._now: Snapshot | None = snapshot
+        self._now = snapshot
         self._history.add(snapshot.time_s, snapshot.values.get(snapshot.skin, float("nan")))
 
     def show(self, *, last: bool) -> None:
