@@ -12,7 +12,19 @@ from pathlib import Path
 
 import thermogrip
 
-EXTRAS = ("aeon", "control", "distributed", "mcap", "pythonfmu", "rosbags", "torch", "websockets")
+EXTRAS = (
+    "aeon",
+    "control",
+    "distributed",
+    "foxglove",
+    "mcap",
+    "pythonfmu",
+    "rosbags",
+    "starlette",
+    "torch",
+    "uvicorn",
+    "websockets",
+)
 GRASPS = "grasps/exp3C_obj18_grip38.csv.xz"
 VERBS = (
     "init examples",

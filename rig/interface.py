@@ -131,6 +131,14 @@ class Rig(Protocol):
 
 
 @runtime_checkable
+class LatchingRig(Rig, Protocol):
+    """A rig whose device latches its faults."""
+
+    def clear(self) -> None:
+        """Clear the latch; DeviceRefusedError where the cause is still there."""
+
+
+@runtime_checkable
 class SamplingRig(Rig, Protocol):
     """A rig that may take readings by its own clock and keep them until they are taken."""
 

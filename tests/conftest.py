@@ -29,6 +29,7 @@ ALLOWED_SKIPS = {
     r"not installed: ": "a compiler and a simulator of Arduino's chips, of the distribution",
     r"(no mkfs|no mount on|nothing may be mounted)": "a small disk to fill needs an administrator's rights",
     r"needs POSIX and two processors": "one core shares no work",
+    r"no browser: ": "the distribution's chromium, which `.ci/run` installs where it may",
 }
 
 

@@ -478,29 +478,46 @@ class Stream:
 
 
 def stop_callback(
-    classifier: GraspClassifier, rule: StopRule, *, candidates: Sequence[str] | None = None
+    classifier: GraspClassifier,
+    rule: StopRule,
+    *,
+    candidates: Sequence[str] | None = None,
+    tell: Callable[[float, Mapping[str, float]], None] | None = None,
 ) -> Callable[[Grasps], bool]:
     """Return a function of the one grasp so far, its ``t_object`` and ``t_ambient`` and never its
     ``material``, that returns whether the rule ends the contact; a session calls it after each sample
-    (``stop`` of :func:`thermogrip.rig.session.session.run_session`) and knows nothing else of classifiers."""
+    (``stop`` of :func:`thermogrip.rig.session.session.run_session`) and knows nothing else of classifiers.
+    What has to be compiled is compiled before it is returned.
+    A grasp that does not begin as the last one did is another one.  ``tell`` hears the probabilities at each
+    time [s]."""
+    Stream(classifier, candidates=candidates)  # no contact may wait for it
     stream: Stream | None = None
 
     def stop(grasp: Grasps) -> bool:
         nonlocal stream
         time, reading = grasp["time"].values, grasp["t_surface"].values[0]
-        if stream is None:
+        if stream is None or not np.array_equal(
+            reading[: len(stream._time)], stream._reading, equal_nan=True
+        ):
             known = {
                 name: float(grasp[name].values[0]) for name in ("t_object", "t_object_sd", "t_ambient")
                 if name in grasp
             }  # fmt: skip
             stream = Stream(classifier, candidates=candidates, rule=rule, **known)
         for at in range(len(stream._time), time.size):
-            stream.update(float(time[at]), float(reading[at]))
+            found = stream.update(float(time[at]), float(reading[at]))
+            if tell is not None:
+                tell(float(time[at]), found)
         return stream.decided_at is not None
 
     return stop
 
 
-def session_stop(folder: str | Path, *, candidates: Sequence[str] | None = None) -> Callable[[Grasps], bool]:
+def session_stop(
+    folder: str | Path,
+    *,
+    candidates: Sequence[str] | None = None,
+    tell: Callable[[float, Mapping[str, float]], None] | None = None,
+) -> Callable[[Grasps], bool]:
     """Return :func:`stop_callback` of the classifier and the stop rule in a folder of ``train``."""
-    return stop_callback(load_classifier(folder), load_stop_rule(folder), candidates=candidates)
+    return stop_callback(load_classifier(folder), load_stop_rule(folder), candidates=candidates, tell=tell)

@@ -10,6 +10,7 @@ It asks, in this order:
     model     does the rig follow its identified model?  (model, pump, driver, reversed, drift;
               :mod:`~thermogrip.rig.guard.model_checks`), or, without a model, the rules below
     optimum   does more cooling drive still cool?  (optimum)
+    operator  has somebody asked to stop?  (operator)
 
 and of a move, before it goes out: is it finite, and does it pump heat into standing water?  (drive,
 interlock)
@@ -223,6 +224,8 @@ class Guard:
         What is regulated to which temperature [degC].
     trips : list of Trip
         Of this session.
+    margin, nearest : float, str
+        How far the sensor that is nearest to its limit is from it [K], and which one that is.
 
     Examples
     --------
@@ -252,6 +255,7 @@ class Guard:
         self.target: dict[str, float] = {}
         self.trips: list[Trip] = []
         self._time, self._released, self._touched = float("-inf"), float("-inf"), False
+        self.margin, self.nearest = float("inf"), ""
 
     def start(self, reading: Reading, now: float, units: Mapping[str, str]) -> None:
         """Begin a session at a reading, the host's time [s] and the drives' units, nothing driven yet and
@@ -304,6 +308,11 @@ class Guard:
         return None
 
     @property
+    def model_share(self) -> float:
+        """The largest deviation from the plant, as a share of what is allowed; NaN without a plant."""
+        return float("nan") if self.model is None else self.model.share
+
+    @property
     def _has_pump(self) -> bool:
         return self.model is None or "pump" in self.model.plant.inputs
 
@@ -319,11 +328,20 @@ class Guard:
         return not self._touched and time >= since + self.settings.model.windows[0]
 
     def check(
-        self, reading: Reading, now: float, *, planned: float = 0.0, touching: bool = False
+        self,
+        reading: Reading,
+        now: float,
+        *,
+        planned: float = 0.0,
+        touching: bool = False,
+        stop_asked: str = "",
     ) -> Findings:
         """Return the accepted values of a reading, and whether to go on; ``now`` is the host's time [s],
-        ``planned`` how long the loop meant to wait since the last check [s]."""
+        ``planned`` how long the loop meant to wait since the last check [s], ``stop_asked`` who asks for an
+        end."""
         trip = self._clocks(reading, now, planned)
+        if trip is None and stop_asked:
+            trip = Trip("operator", reading.time_s, "the operator", "to go on", f"a stop from {stop_asked}")
         seen, late = self._seen == reading.time_s, now > self._now
         self._now = now
         if trip is None and seen and not late:
@@ -394,8 +412,11 @@ class Guard:
 
     def _limits(self, time: float, outputs: Mapping[str, float]) -> Trip | None:
         driven = any(self._drive.values())
+        self.margin, self.nearest = float("inf"), ""
         for name, value in outputs.items():
             low, high = self.limits_of(name)
+            if (margin := min(value - low, high - value)) < self.margin:
+                self.margin, self.nearest = margin, name
             beyond = not low <= value <= high
             self._beyond[name] = self._beyond.get(name, 0) + 1 if beyond else 0
             if self._beyond[name] >= 2 and (driven or not self._touched):

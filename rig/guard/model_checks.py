@@ -273,7 +273,7 @@ class ModelMonitor:
         self._past.add(self._filter.moment(time, y))
         self._masked: frozenset[str] = frozenset()
         self._since = np.full(len(self.plant.outputs), self.compared_from)
-        self._time, self._compared, self.compared_now = time, 0, False
+        self._time, self._compared, self.compared_now, self.share = time, 0, False, 0.0
         self._weighed = float("-inf")
 
     def predict(
@@ -306,6 +306,7 @@ class ModelMonitor:
             return []
         self._compared = done
         compared = self.compare()
+        self.share = max((one.excess for one in compared), default=0.0)
         self._weigh(time, compared)
         found = [self._with_drift(one) for one in compared if one.off > one.allowed]
         return [one for one in found if one.off > one.allowed] + self._biases(time, compared)

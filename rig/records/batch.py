@@ -8,7 +8,8 @@ skips every trial that has a good grasp on disk.  The plan is kept in ``batch.js
 folder is refused.
 
 After a trip the batch stops, unless its kind is one of ``again``: a cable that was out and is in, a device
-that was reset.  Then the trial is done once more, at most ``tries`` times.
+that was reset; or unless somebody who is asked has cleared its cause.  Then the trial is done once more, at
+most ``tries`` times.
 
 The grasps of all good trials are :func:`collect` -ed into one record, labelled for ``classify``.
 """
@@ -17,7 +18,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+from contextlib import AbstractContextManager, closing, nullcontext, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -32,8 +33,10 @@ from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, Grasps, make
 from thermogrip.datasets.tables import read_csv_table
 from thermogrip.mpc.interface import Controller
 from thermogrip.rig.guard.guard import Guard
-from thermogrip.rig.interface import Rig
+from thermogrip.rig.guard.trip import Trip
+from thermogrip.rig.interface import DeviceRefusedError, LatchingRig, Rig
 from thermogrip.rig.records.run_folder import RunFolder, mark_bad, read_run
+from thermogrip.rig.session.loop import Recorder
 from thermogrip.rig.session.session import Object, Session, run_session
 
 SCHEMA, VERSION = "thermogrip.batch", 1
@@ -146,6 +149,8 @@ def run_batch(
     *,
     ready: Callable[[int, Trial], bool] | None = None,
     judge: Callable[[int, Trial, Session], str] | None = None,
+    cleared: Callable[[int, Trial, Trip], bool] | None = None,
+    through: Callable[[Recorder], AbstractContextManager[Recorder]] = nullcontext,
     stop: Callable[[Grasps], bool] | None = None,
     guard: Guard | None = None,
     about: Mapping[str, Any] | None = None,
@@ -171,7 +176,14 @@ def run_batch(
         Asked before each trial (number from 0, trial), while the rig is off: the operator lays the object
         ready. False stops the batch.
     judge : callable, optional
-        Asked after each good grasp: why the operator calls it bad, "" to keep it.
+        Asked after each good grasp that is not marked bad already: why the operator calls it bad, "" to keep
+        it.
+    cleared : callable, optional
+        Asked after a trip of another kind than those of ``again``, but for a stop that was asked for: whether
+        its cause is cleared.  Then the device's latch is cleared and the trial done again.
+    through : callable, optional
+        Handed each run folder, and returns for that run what records in its place, e.g.
+        :meth:`~thermogrip.rig.records.rosbridge.Bridge.before`.
     stop : callable, optional
         As of :func:`~thermogrip.rig.session.session.run_session`: ends a contact early.
     guard : Guard, optional
@@ -222,19 +234,25 @@ def run_batch(
                 run = next_folder(path, k)
                 known = _with_temperature(trial, k, plan, path, first_touch)
                 described = {**(about or {}), "trial": k + 1, **asdict(known)}
-                with RunFolder(run, described, files=files) as recorder:
+                with RunFolder(run, described, files=files) as kept_in, through(kept_in) as recorder:
                     kept: dict[str, Any] = {"stop": stop, "guard": guard, "recorder": recorder, **options}
                     thing = _object(known, k)
                     session = run_session(source.rig, controller, known.target, grasp=thing, **kept)
-                    recorder.finish(session)
+                    kept_in.finish(session)
                 sessions += 1
                 verdict, advice = _judged(session, k, trial, run, judge)
                 if verdict == "done":
                     break
-                may = session.trip is None or session.trip.kind in again
-                if session.trip is not None and may:
+                trip = session.trip
+                may = trip is None or trip.kind in again
+                if trip is not None and may:
                     source.open_again()
-                if not may or (session.trip is None and attempt + 1 >= tries):
+                elif trip is not None and trip.kind != "operator" and cleared is not None:
+                    may = cleared(k, trial, trip)
+                    if may:
+                        source.open_again()
+                        source.clear()
+                if not may or (trip is None and attempt + 1 >= tries):
                     return _batch(path, plan, verdict, advice, sessions)
             else:
                 return _batch(path, plan, verdict, advice, sessions)
@@ -252,6 +270,12 @@ class _Source:
         if self._open is not None:
             self.rig.close()
             self.rig = self._open()
+
+    def clear(self) -> None:
+        """Clear the device's latch; one whose cause is still there trips again."""
+        if isinstance(self.rig, LatchingRig):
+            with suppress(DeviceRefusedError):
+                self.rig.clear()
 
     def close(self) -> None:
         if self._open is not None:
@@ -341,9 +365,12 @@ def _judged(
     """Return verdict and advice of a trial, the operator's included."""
     if session.verdict != "settled":
         return session.verdict, session.advice
-    why = "" if judge is None else judge(k, trial, session)
+    why = marked = next((event.text for event in session.events if event.kind == "bad"), "")
+    if not why and judge is not None:
+        why = judge(k, trial, session)
     if why:
-        mark_bad(run, why)
+        if not marked:
+            mark_bad(run, why)
         return "stopped", f"trial {k + 1} is bad: {why}"
     return "done", ""
 

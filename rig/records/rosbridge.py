@@ -28,8 +28,8 @@ import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from math import inf, isfinite, nan
 from typing import Any
@@ -49,15 +49,18 @@ _LOOK_S = 0.02  # how often a thread without a connection asks whether the next 
 
 
 class Messages:
-    """The protocol: rows and events to JSON texts, JSON texts to targets inside ``limits`` [degC]."""
+    """The protocol: rows and events to JSON texts, JSON texts to targets inside ``limits`` [degC], or to none
+    where ``limits`` is None: then nothing is asked for."""
 
-    def __init__(self, prefix: str = PREFIX, limits: tuple[float, float] = (10.0, 50.0)) -> None:
+    def __init__(self, prefix: str = PREFIX, limits: tuple[float, float] | None = (10.0, 50.0)) -> None:
         self.prefix, self.limits = prefix, limits
         self._advertised: set[str] = set()
 
     def hello(self) -> list[str]:
         """Return the first messages of a new connection; earlier advertisements are forgotten."""
         self._advertised.clear()
+        if self.limits is None:
+            return []
         return [_text(op="subscribe", topic=f"{self.prefix}/target", type="std_msgs/Float64")]
 
     def row(self, row: Mapping[str, float], *, stamp: float) -> list[str]:
@@ -85,6 +88,8 @@ class Messages:
 
     def hear(self, text: str | bytes) -> tuple[float | None, str]:
         """Return the target that a message is, or None and why not ("" where it is not for us)."""
+        if self.limits is None:
+            return None, ""
         if len(text) > MAX_BYTES:
             return None, "a message was too long"
         try:
@@ -202,6 +207,17 @@ class Bridge:
         if self.behind is not None:
             self.behind.event(event)
         self._put(partial(self.messages.event, event))
+
+    @contextmanager
+    def before(self, recorder: Recorder) -> Iterator[Bridge]:
+        """Publish what this recorder gets, while the block runs; the connection outlasts it."""
+        self.behind, self._time = recorder, 0.0
+        try:
+            yield self
+        finally:
+            with suppress(OSError):  # a full disk, which the run itself records
+                self._record()
+            self.behind = None
 
     def close(self) -> None:
         """Send what waits, for at most the time-out, and close; may be called twice."""

@@ -27,10 +27,12 @@ from thermogrip.rig.guard.trip import ENDLESS, Trip, TripError
 from thermogrip.rig.interface import DeviceRefusedError, Event, Reading, Rig, SamplingRig
 from thermogrip.rig.serial.port import PortError
 from thermogrip.rig.session.signals import check_stopped, hold_signals
+from thermogrip.rig.session.snapshot import Listener, Operator, Snapshot
 
 #: The phases of a session; a log holds their index.
 PHASES = ("settle", "hold", "lead_in", "pump_off", "contact", "release")
 
+_SHOWN_EVENTS = 5
 Array = NDArray[np.float64]
 
 
@@ -54,6 +56,9 @@ class Loop:
     progress: Callable[[float, str], None] | None
     guard: Guard
     clock: Callable[[], float] | None = None
+    listener: Listener | None = None
+    operator: Operator = field(default_factory=Operator)
+    band: float = np.nan
     rows: list[dict[str, float]] = field(default_factory=list)
     events: list[Event] = field(default_factory=list)
     target: dict[str, float] = field(default_factory=dict)
@@ -64,6 +69,8 @@ class Loop:
     status: str = "ok"
     move: Move = field(default_factory=lambda: Move(drive=0.0))
     phase: str = ""
+    ends: float = np.inf
+    dt: float = np.nan
 
     def __post_init__(self) -> None:
         self.rig.notices()  # what happened before is not of this session
@@ -110,6 +117,7 @@ class Loop:
     def regulate(self, phase: str, seconds: float) -> Iterator[float]:
         """Run the controller for so long; yield the time passed in this phase at each move."""
         begin = self.reading.time_s
+        self.ends, self.dt = begin + seconds, self.controller.dt
         while True:
             fresh = self.check()  # before the clock is asked how long it has been: it may have jumped
             passed = self.reading.time_s - begin
@@ -128,6 +136,7 @@ class Loop:
 
     def sample(self, phase: str, n: int, dt: float) -> None:
         """Record n fast samples under the present move."""
+        self.dt = dt
         for _ in range(n):
             self.check()
             self.record(phase)
@@ -156,7 +165,15 @@ class Loop:
 
     def check(self) -> bool:
         """Have the guard check the newest reading; say whether the controller may be asked."""
-        found = self.guard.check(self.reading, self.now(), planned=self.planned, touching=self.touching)
+        for why in self.operator.take_bad():
+            self.note("bad", why)
+        found = self.guard.check(
+            self.reading,
+            self.now(),
+            planned=self.planned,
+            touching=self.touching,
+            stop_asked=self.operator.stop_asked,
+        )
         self.planned = 0.0
         self.accepted = found.values
         for name, why in found.suspect.items():
@@ -191,6 +208,38 @@ class Loop:
         row |= {f"target_{name}_degC": value for name, value in self.target.items()}
         self.rows.append(row | {"phase": float(PHASES.index(phase))})
         self._write(self.rows[-1])
+        self.show(drive)
+
+    def show(self, drive: Mapping[str, float], *, verdict: str = "", trip: Trip | None = None) -> None:
+        """Hand a snapshot to the listener; one that fails gets nothing more, which is noted."""
+        if self.listener is None:
+            return
+        guard, reading = self.guard, self.reading
+        snapshot = Snapshot(
+            reading.time_s,
+            self.phase,
+            self.ends - reading.time_s,
+            self.dt,
+            next(iter(self.target), guard.skin),
+            reading.values,
+            self.target,
+            self.band,
+            drive,
+            self.rig.units,
+            self.move.pump,
+            guard.margin,
+            guard.nearest,
+            guard.model_share,
+            self.rig.expires_s,
+            tuple(self.events[-_SHOWN_EVENTS:]),
+            trip,
+            verdict,
+        )
+        try:
+            self.listener(snapshot)
+        except Exception as error:  # a view may be anybody's, and ends no session
+            self.listener = None
+            self.note("view", f"what shows the session failed and gets no more of it ({error})")
 
     def record_last(self) -> None:
         """Record the reading that ended it, with the drive that is applied from then on: none."""

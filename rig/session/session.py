@@ -64,6 +64,7 @@ from thermogrip.rig.guard.trip import Trip, TripError
 from thermogrip.rig.interface import UNIT_RANGES, Event, Rig
 from thermogrip.rig.session.loop import PHASES, Loop, Recorder
 from thermogrip.rig.session.signals import stop_signals
+from thermogrip.rig.session.snapshot import Listener, Operator
 from thermogrip.sysid.effusivity.quality import find_contact
 
 
@@ -187,6 +188,8 @@ def run_session(
     stop: Callable[[Grasps], bool] | None = None,
     recorder: Recorder | None = None,
     progress: Callable[[float, str], None] | None = None,
+    listener: Listener | None = None,
+    operator: Operator | None = None,
 ) -> Session:
     """Bring the skin to a temperature, stop the pump, grasp, record; return what came of it.
 
@@ -220,6 +223,11 @@ def run_session(
         Takes every sample and event as it happens: :class:`~thermogrip.rig.records.run_folder.RunFolder`.
     progress : callable, optional
         Called with (fraction done, what is being done).
+    listener : callable, optional
+        Called with a :class:`~thermogrip.rig.session.snapshot.Snapshot` at each sample, and with a last one
+        that has the verdict; the loop waits for it.
+    operator : Operator, optional
+        Whose requests, made in other threads, are looked at each sample.
 
     Raises
     ------
@@ -236,7 +244,8 @@ def run_session(
     >>> session.verdict, abs(session.bias) < 0.25
     ('settled', True)
     """
-    run = Loop(rig, controller, recorder, progress, Guard(skin=output) if guard is None else guard, clock)
+    watch, asked = Guard(skin=output) if guard is None else guard, operator or Operator()
+    run = Loop(rig, controller, recorder, progress, watch, clock, listener, asked, band)
     thing = Object(*grasp) if isinstance(grasp, tuple) else grasp
     _check_object(thing, run)
     verdict, touched, trip = "tripped", None, None
@@ -259,6 +268,7 @@ def run_session(
     if verdict == "settled":
         _learn(run)
     run.note("verdict", verdict)
+    run.show(run.no_drive(), verdict=verdict, trip=trip)
     return _result(run, verdict, touched, band, trip)
 
 
@@ -308,10 +318,13 @@ def _touch(
     first, n_lead = len(run.rows), max(1, round(LEAD_S / dt))
     run.report(0.9, "grasping")
     run.let_device_sample(dt)
+    run.ends = run.reading.time_s + n_lead * dt
     run.sample("lead_in", n_lead, dt)
     run.move = Move(drive=run.no_drive(), pump=0)
+    run.ends = run.reading.time_s + n_lead * dt
     run.sample("pump_off", n_lead, dt)
     closed, known = run.reading.time_s, thing.t_object
+    run.ends = closed + seconds
     t_object = float(run.accepted[known] if isinstance(known, str) else known)
     t_gripper = run.target.get(output, np.nan)
     about = {
@@ -457,6 +470,8 @@ def play(
     clock: Callable[[], float] | None = None,
     recorder: Recorder | None = None,
     progress: Callable[[float, str], None] | None = None,
+    listener: Listener | None = None,
+    operator: Operator | None = None,
 ) -> tuple[Log, str]:
     """Play a schedule, sampled every ``dt`` [s]; return the log, and the line of the trip that ended it.
 
@@ -464,20 +479,23 @@ def play(
     down but not closed at the end; UserError where a trip comes before there are two rows.
     """
     player = Playback(schedule, rig.units, dt)
-    run = Loop(rig, player, recorder, progress, Guard() if guard is None else guard, clock)
-    ended = ""
+    watch = Guard() if guard is None else guard
+    run = Loop(rig, player, recorder, progress, watch, clock, listener, operator or Operator())
+    ended, trip = "", None
     with stop_signals():
         try:
             run.start({})
             for passed in run.regulate("hold", player.seconds):
                 run.report(passed / player.seconds, "playing the schedule")
         except TripError as tripped:
-            ended = tripped.trip.line()
+            trip = tripped.trip
+            ended = trip.line()
         finally:
             run.power_off()
     if ended:
         run.record_last()
         run.note("tripped", ended)
+    run.show(run.no_drive(), verdict="tripped" if ended else "played", trip=trip)
     if len(run.rows) < 2:
         raise UserError("the rig ended at its first reading", hint=ended)
     return run.log(), ended

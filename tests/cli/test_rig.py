@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,10 +15,12 @@ from tests.end_to_end.conftest import small_plant
 from thermogrip.cli import rig as verbs
 from thermogrip.cli.main import main
 from thermogrip.datasets.errors import UserError
+from thermogrip.live.watch import Watch
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.report.console import Console
 from thermogrip.rig import Session
 from thermogrip.rig.guard.plant_mismatch import USUAL_DRIFT
+from thermogrip.rig.guard.trip import Trip
 from thermogrip.rig.records.batch import Batch, Trial
 from thermogrip.sysid.experiment.information import plant_from_prior
 from thermogrip.sysid.models.network import load_network
@@ -332,9 +335,10 @@ def test_a_batch_that_is_done_has_no_advice(bench: Bench, stand_in: StandIn) -> 
 def test_a_batch_stops_at_q_alone_and_keeps_what_nobody_calls_bad(
     said: str, goes_on: bool, bad: str, stand_in: StandIn
 ) -> None:
-    stand_in("thermogrip.cli.rig.typer.prompt", said)
-    assert verbs._ready(2)(0, Trial("copper", 30.0, 18.0)) is goes_on
-    assert verbs._verdict(Console())(0, Trial("copper", 30.0), SimpleNamespace(contact=0.1)) == bad
+    stand_in("typer.prompt", said)
+    assert verbs._ready(2, Watch("batch", Console()))(0, Trial("copper", 30.0, 18.0)) is goes_on
+    verdict = verbs._verdict(Console(), Watch("batch", Console()))
+    assert verdict(0, Trial("copper", 30.0), SimpleNamespace(contact=0.1)) == bad
 
 
 @pytest.mark.parametrize(
@@ -345,8 +349,8 @@ def test_a_batch_stops_at_q_alone_and_keeps_what_nobody_calls_bad(
     ],
 )
 def test_the_operator_is_asked_for_the_next_object(trial: Trial, words: str, stand_in: StandIn) -> None:
-    asked = stand_in("thermogrip.cli.rig.typer.prompt", "")
-    verbs._ready(5)(1, trial)
+    asked = stand_in("typer.prompt", "")
+    verbs._ready(5, Watch("batch", Console()))(1, trial)
     assert asked[0].args == (f"{words}Enter when it is ready, q to stop",)
     assert (asked[0].default, asked[0].show_default) == ("", False)
 
@@ -355,9 +359,40 @@ def test_the_operator_is_asked_for_the_next_object(trial: Trial, words: str, sta
 def test_no_contact_is_reported_to_the_operator(
     contact: float, warned: bool, stand_in: StandIn, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    stand_in("thermogrip.cli.rig.typer.prompt", "")
-    verbs._verdict(Console())(0, Trial("copper", 30.0), SimpleNamespace(contact=contact))
+    stand_in("typer.prompt", "")
+    verdict = verbs._verdict(Console(), Watch("batch", Console()))
+    verdict(0, Trial("copper", 30.0), SimpleNamespace(contact=contact))
     assert ("the skin felt nothing" in capsys.readouterr().err) == warned
+
+
+@pytest.mark.parametrize(("said", "again"), [("c", True), ("Cleared", True), ("", False), ("no", False)])
+def test_after_a_trip_the_operator_is_asked_whether_it_is_cleared(
+    said: str, again: bool, stand_in: StandIn
+) -> None:
+    asked = stand_in("typer.prompt", said)
+    trip = Trip("limit", 1.0, "t_surface", "3 to 55 degC", "61 degC")
+    assert verbs._cleared(Watch("batch", Console()))(0, Trial("copper", 30.0), trip) is again
+    assert asked[0].args == (f"{trip.line()}; c when it is cleared, Enter to end the batch",)
+
+
+@pytest.mark.parametrize(("words", "shown"), [([], "0"), (["8642"], "8642"), (["--seed", "3"], "0")])
+def test_live_may_stand_alone(words: list[str], shown: str, ran: SimpleNamespace, stand_in: StandIn) -> None:
+    made = stand_in("thermogrip.cli.rig._watch", UserError("seen"))
+    given = ["run", "c.json", "--target", "40", "--twin", "plant.json", "--out", "r", "--on-trip", "mail me"]
+    assert ran.bench.run(*given, "--live", *words).code == 2
+    assert made[0].args[0::2] == ("run", Path("r"), None)
+    assert (str(made[0].args[3]), made[0].args[5]) == (shown, "mail me")
+    ran.bench.run(*given, "--foxglove")
+    assert made[1].args[3:5] == (None, 8765)
+
+
+def test_what_is_published_takes_no_targets(stand_in: StandIn) -> None:
+    made = stand_in("thermogrip.rig.records.rosbridge.Bridge", nullcontext(SimpleNamespace(before="before")))
+    with verbs._bridge(None) as through, through("a folder") as recorder:
+        assert recorder == "a folder"
+    with verbs._bridge("ws://robot:9090") as through:
+        assert through == "before"
+    assert (made[0].args, made[0].messages.limits) == (("ws://robot:9090",), None)
 
 
 def test_a_first_touch_reports_median_and_sd_of_its_90_percent_interval(stand_in: StandIn) -> None:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
 
 from thermogrip.cli import options as cli
 from thermogrip.cli.control import ControllerFile, load_controller
@@ -20,12 +19,15 @@ from thermogrip.rig.simulation.faults import FAULTS
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
+    from thermogrip.live.watch import Watch
     from thermogrip.mpc.controllers.mpc import Controller
     from thermogrip.rig.clock import ScaledClock
     from thermogrip.rig.guard.guard import Guard
     from thermogrip.rig.guard.plant_mismatch import PlantDrift
+    from thermogrip.rig.guard.trip import Trip
     from thermogrip.rig.interface import Rig
     from thermogrip.rig.records.batch import Trial
+    from thermogrip.rig.session.loop import Recorder
     from thermogrip.rig.session.session import Session
     from thermogrip.rig.simulation.twin import Twin
     from thermogrip.sysid.plant.plant import Plant
@@ -75,6 +77,35 @@ GuardOption = Annotated[
     Path | None,
     cli.opt("--guard", "GUARD.toml", "What the guard allows; `thermogrip init guard` writes one to edit."),
 ]
+LiveOption = Annotated[
+    int | None,
+    cli.opt(
+        "--live",
+        "[PORT]",
+        "Serve a live page to this computer, on any free port or on this one.",
+        min=0,
+        max=65535,
+    ),
+]
+FoxgloveOption = Annotated[
+    int | None,
+    cli.opt(
+        "--foxglove",
+        "[PORT]",
+        "Serve Foxglove on this computer, on port 8765 or on this one.",
+        min=1,
+        max=65535,
+    ),
+]
+BridgeOption = Annotated[
+    str | None, cli.opt("--bridge", "ws://HOST:PORT", "Publish rows and events to a rosbridge server.")
+]
+OnTripOption = Annotated[
+    str | None,
+    cli.opt(
+        "--on-trip", "CMD", "Run this command, without a shell, on a trip, which it gets as JSON on stdin."
+    ),
+]
 LearnOption = Annotated[
     Path | None,
     cli.opt(
@@ -112,6 +143,10 @@ def run(
     settle_timeout: SettleTimeoutOption = 900.0,
     guard: GuardOption = None,
     learn: LearnOption = None,
+    live: LiveOption = None,
+    foxglove: FoxgloveOption = None,
+    bridge: BridgeOption = None,
+    on_trip: OnTripOption = None,
     report: cli.Report = None,
     network: cli.OwnNetwork = None,
     seed: cli.Seed = 0,
@@ -136,11 +171,13 @@ def run(
 
     if stop_early is not None and grasp is None:
         raise UserError("--stop-early without a grasp", hint="give --object and --material too")
-    stop = None if stop_early is None else session_stop(stop_early)
+    console = Console(as_json)
+    watch = _watch("run", console, out, live, foxglove, on_trip)
+    stop = None if stop_early is None else session_stop(stop_early, tell=watch.posterior)
     loaded = load_controller(controller, network)
     regulator, wanted = RecordedController(loaded), _for_outputs(wanted, loaded.controlled)
-    watch = guard_of(guard, loaded.plant, learn)
-    clock, console = ScaledClock(speed), Console(as_json)
+    checks = guard_of(guard, loaded.plant, learn)
+    clock = ScaledClock(speed)
     name = f"{twin.name}, draw {draw}" if twin is not None else str(port)
     about: dict[str, Any] = {"controller": controller.name, "target_degC": wanted}
     about |= {"port": port} if twin is None else {"twin": twin.name, "draw": draw}
@@ -150,7 +187,12 @@ def run(
     try:
         for line in beyond_logs(loaded, wanted, grasps=grasp is not None):
             console.warn(line)
-        with RunFolder(out, about, files=files) as folder, console.progress("run") as progress:
+        with (
+            _bridge(bridge) as through,
+            watch,
+            RunFolder(out, about, files=files) as folder,
+            through(folder) as recorder,
+        ):
             session = run_session(
                 rig,
                 regulator,
@@ -161,12 +203,15 @@ def run(
                 grasp_time=grasp_time,
                 stop=stop,
                 settle_timeout=settle_timeout,
-                guard=watch,
+                guard=checks,
                 clock=None if port is None else clock,
-                recorder=folder,
-                progress=progress,
+                recorder=recorder,
+                progress=watch.progress,
+                listener=watch.listen,
+                operator=watch.operator,
             )
             folder.finish(session)
+            watch.ended(session.verdict)
     finally:
         rig.close()
     if report is not None:
@@ -203,6 +248,10 @@ def batch(
     guard: GuardOption = None,
     learn: LearnOption = None,
     ask: Annotated[bool, cli.flag("--ask/--no-ask", "With --port: ask before and after each grasp.")] = True,
+    live: LiveOption = None,
+    foxglove: FoxgloveOption = None,
+    bridge: BridgeOption = None,
+    on_trip: OnTripOption = None,
     network: cli.OwnNetwork = None,
     seed: cli.Seed = 0,
     as_json: cli.AsJson = False,
@@ -219,24 +268,27 @@ def batch(
     from thermogrip.rig.records.batch import read_plan, run_batch
 
     trials, loaded = read_plan(plan), load_controller(controller, network)
-    watch = guard_of(guard, loaded.plant, learn)
+    checks = guard_of(guard, loaded.plant, learn)
     clock, console = ScaledClock(speed), Console(as_json)
+    watch = _watch("batch", console, out, live, foxglove, on_trip)
     asks = ask and port is not None and not as_json
 
     def opened() -> Rig:
         return rig_of(port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=None)
 
     files = files_of(learn, controller=controller, plan=plan, plant=twin, guard=guard)
-    with console.progress("batch") as progress:
+    with _bridge(bridge) as through, watch:
         done = run_batch(
             opened,
             loaded,
             trials,
             cli.new_folder(out),
-            ready=_ready(len(trials)) if asks else None,
-            judge=_verdict(console) if asks else None,
-            stop=None if stop_early is None else session_stop(stop_early),
-            guard=watch,
+            ready=_ready(len(trials), watch) if asks else None,
+            judge=_verdict(console, watch) if asks else None,
+            cleared=_cleared(watch) if asks else None,
+            through=through,
+            stop=None if stop_early is None else session_stop(stop_early, tell=watch.posterior),
+            guard=checks,
             first_touch=_first_touch,
             about={"port": port} if twin is None else {"twin": twin.name, "draw": draw, "seed": seed},
             files=files,
@@ -244,8 +296,11 @@ def batch(
             grasp_time=grasp_time,
             settle_timeout=settle_timeout,
             clock=None if port is None else clock,
-            progress=progress,
+            progress=watch.progress,
+            listener=watch.listen,
+            operator=watch.operator,
         )
+        watch.ended(done.verdict)
     console.say(f"{len(done.done)} of {len(trials)} grasps are good: {done.verdict}")
     if done.advice:
         console.say(done.advice)
@@ -264,6 +319,10 @@ def record(
     dt: Annotated[float, cli.opt("--sample", "S", "Seconds a row.", min=0.05)] = 1.0,
     guard: GuardOption = None,
     speed: SpeedOption = 1.0,
+    live: LiveOption = None,
+    foxglove: FoxgloveOption = None,
+    bridge: BridgeOption = None,
+    on_trip: OnTripOption = None,
     seed: cli.Seed = 0,
     as_json: cli.AsJson = False,
 ) -> int:
@@ -278,8 +337,9 @@ def record(
     from thermogrip.rig.session.session import Playback, play
 
     plan = read_log(schedule)
-    watch = guard_of(guard, None)
+    checks = guard_of(guard, None)
     console = Console(as_json)
+    watch = _watch("record", console, out, live, foxglove, on_trip)
     clock = ScaledClock(speed)
     rig = open_rig(port, protocol, clock=clock, sleep=clock.sleep)
     try:
@@ -289,9 +349,25 @@ def record(
             raise UserError(error.problem, file=schedule, hint=error.hint) from error
         about = {"schedule": schedule, "port": port, "sample_s": dt, "seed": seed}
         files = {} if guard is None else {"guard": guard}
-        with RunFolder(out, about, files=files) as folder, console.progress("record") as progress:
-            log, ended = play(rig, plan, dt=dt, guard=watch, clock=clock, recorder=folder, progress=progress)
+        with (
+            _bridge(bridge) as through,
+            watch,
+            RunFolder(out, about, files=files) as folder,
+            through(folder) as recorder,
+        ):
+            shown: dict[str, Any] = {"progress": watch.progress, "listener": watch.listen}
+            log, ended = play(
+                rig,
+                plan,
+                dt=dt,
+                guard=checks,
+                clock=clock,
+                recorder=recorder,
+                operator=watch.operator,
+                **shown,
+            )
             folder.played(ended)
+            watch.ended("tripped" if ended else "played")
     finally:
         rig.close()
     if ended:
@@ -521,32 +597,62 @@ def _what_to_grasp(obj: float | None, material: str | None) -> tuple[str, float]
     return material, obj
 
 
-def _ready(n: int) -> Callable[[int, Trial], bool]:
+def _watch(
+    title: str, console: Console, out: Path, live: int | None, foxglove: int | None, on_trip: str | None
+) -> Watch:
+    """Return what shows a session."""
+    from thermogrip.live.watch import Show, Watch
+
+    layout = out / "foxglove_layout.json"
+    return Watch(title, console, Show(live=live, foxglove=foxglove, on_trip=on_trip, layout=layout))
+
+
+@contextmanager
+def _bridge(url: str | None) -> Iterator[Callable[[Recorder], AbstractContextManager[Recorder]]]:
+    """Yield what publishes whatever a recorder gets while a run lasts; it takes no target."""
+    if url is None:
+        yield nullcontext
+        return
+    from thermogrip.rig.records.rosbridge import Bridge, Messages
+
+    with Bridge(url, clock=time.time, messages=Messages(limits=None)) as bridge:
+        yield bridge.before
+
+
+def _ready(n: int, watch: Watch) -> Callable[[int, Trial], bool]:
     """Return what asks for the next object."""
 
     def ready(k: int, trial: Trial) -> bool:
         at = "unknown temperature" if trial.t_object is None else f"{trial.t_object} degC"
         what = f"trial {k + 1} of {n}: {trial.material or 'unknown'}, {at}, skin to {trial.target:g} degC"
-        return _asked(f"{what}; Enter when it is ready, q to stop").lower() not in ("q", "quit", "n", "no")
+        choices = (("", "It is ready"), ("q", "Stop the batch"))
+        said = watch.ask(f"{what}; Enter when it is ready, q to stop", choices)
+        return said.lower() not in ("q", "quit", "n", "no")
 
     return ready
 
 
-def _verdict(console: Console) -> Callable[[int, Trial, Session], str]:
+def _verdict(console: Console, watch: Watch) -> Callable[[int, Trial, Session], str]:
     """Return what asks whether a grasp was good."""
 
     def verdict(k: int, trial: Trial, session: Session) -> str:
         if session.contact != session.contact:
             console.warn("the skin felt nothing: no object, or one as warm as the skin")
-        said = _asked("Enter to keep it, or what was bad")
+        said = watch.ask("Enter to keep it, or what was bad", (("", "Keep it"),), "what was bad")
         return "" if said.lower() in ("y", "yes", "ok") else said
 
     return verdict
 
 
-def _asked(question: str) -> str:
-    """Return what the operator answers, "" for Enter alone."""
-    return str(typer.prompt(question, default="", show_default=False)).strip()
+def _cleared(watch: Watch) -> Callable[[int, Trial, Trip], bool]:
+    """Return what asks after a trip whether its cause is cleared."""
+
+    def cleared(k: int, trial: Trial, trip: Trip) -> bool:
+        text = f"{trip.line()}; c when it is cleared, Enter to end the batch"
+        choices = (("c", "It is cleared: do this trial again"), ("", "End the batch"))
+        return watch.ask(text, choices).lower() in ("c", "cleared")
+
+    return cleared
 
 
 def _first_touch(grasps: Grasps) -> tuple[float, float]:

@@ -18,6 +18,9 @@ from thermogrip.cli.kinds import check_files
 from thermogrip.datasets.media import printable
 from thermogrip.datasets.provenance import note_seed
 
+#: Options that may stand alone, and what they mean then: any free port, and the one that Foxglove asks for.
+ALONE = {"--live": "0", "--foxglove": "8765"}
+
 
 @cache
 def jobs() -> dict[str, dict[str, list[Any]]]:
@@ -34,6 +37,13 @@ class Verb(TyperCommand):
         for param in self.params:  # its type stands after an argument, and its metavar says enough
             if param.param_type_name == "argument":
                 vars(param)["display_type_rich"] = lambda ctx: None
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Give an option its usual value where it stands alone."""
+        words: list[str] = []
+        for word, after in zip(args, [*args[1:], ""]):
+            words += [word, ALONE[word]] if word in ALONE and not after.isdigit() else [word]
+        return super().parse_args(ctx, words)
 
     def invoke(self, ctx: Any) -> Any:
         """Check what was given, run the verb, and where that went well say on stderr what to type next."""

@@ -332,6 +332,23 @@ def test_a_session_goes_by_samples_and_hides_the_label(known: PosteriorClassifie
     assert np.array_equal(ended, time[time >= ended[0]])  # once decided it stays so
 
 
+def test_one_callback_serves_grasp_after_grasp_and_tells_what_it_finds(
+    known: PosteriorClassifier, fresh: Grasps
+) -> None:
+    """A batch has one for all its trials: what ended the first contact says nothing of the second."""
+    told: list[tuple[float, dict[str, float]]] = []
+    stop = stop_callback(known, StopRule(sure=0.95), candidates=THREE, tell=lambda *found: told.append(found))
+    time = fresh["time"].values
+    for k in (0, 8):
+        told.clear()
+        one = pick(fresh, [k])
+        ended = [t for t in time[(time > 0.2) & (time < 3.0)] if stop(one.sel(time=slice(None, t)))]
+        alone = stop_callback(known, StopRule(sure=0.95), candidates=THREE)
+        assert ended == [t for t in time[(time > 0.2) & (time < 3.0)] if alone(one.sel(time=slice(None, t)))]
+        assert max(told[-1][1], key=told[-1][1].__getitem__) == one["material"].values[0]
+        assert [at for at, _ in told] == time[time < 3.0].tolist()
+
+
 @pytest.mark.parametrize("late", [0.0, 0.6])
 def test_a_record_ends_when_its_stream_did_also_where_the_contact_is_late(
     late: float, known: PosteriorClassifier, fresh: Grasps

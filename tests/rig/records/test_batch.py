@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -14,10 +17,12 @@ from thermogrip.datasets.grasp_files import read_grasps
 from thermogrip.datasets.schema import Grasps, make_grasps
 from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.guard.trip import Trip
+from thermogrip.rig.interface import DeviceRefusedError
 from thermogrip.rig.records import batch
 from thermogrip.rig.records.batch import Batch, Trial, collect, good_run, next_folder, read_plan, run_batch
 from thermogrip.rig.records.run_folder import read_run
 from thermogrip.rig.session.session import Object, Session
+from thermogrip.rig.session.snapshot import Operator
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.contact.simulation import Grip
 from thermogrip.sysid.plant.plant import Plant
@@ -214,6 +219,64 @@ def test_a_trial_is_done_again_after_what_is_over_at_most_three_times(
     assert (found.verdict, found.sessions, found.left) == (verdict, sessions, left)
     assert found.advice == ("" if verdict == "done" else f"after {words[-1]}")
     assert (source.opened, source.closed) == (opened, opened)
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "answers", "verdict", "sessions", "opened"),
+    [("limit settled settled", [True], "done", 3, 2), ("limit", [False], "tripped", 1, 1),
+     ("limit limit limit", [True] * 3, "tripped", 3, 4), ("operator", [], "tripped", 1, 1),
+     ("cable settled settled", [], "done", 3, 2)],
+)  # fmt: skip
+def test_somebody_may_clear_a_trip_but_is_not_asked_after_a_stop(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, outcomes: str, answers: list[bool], verdict: str,
+    sessions: int, opened: int,
+) -> None:  # fmt: skip
+    source, asked = scripted(monkeypatch, outcomes.split()), []
+
+    def cleared(k: int, trial: Trial, trip: Trip) -> bool:
+        asked.append((k, trial, trip.kind))
+        return answers[len(asked) - 1]
+
+    found = run_batch(source, None, BOTH, tmp_path, cleared=cleared)
+    assert (found.verdict, found.sessions, source.opened) == (verdict, sessions, opened)
+    assert asked == [(0, BOTH[0], "limit")] * len(answers)
+
+
+def test_a_cleared_trip_clears_the_latch_of_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = Mock()
+    source = batch._Source(lambda: rig)
+    source.clear()
+    rig.clear.side_effect = DeviceRefusedError("active", "the cause is still there")
+    source.clear()  # the next session says so
+    assert rig.clear.call_count == 2
+
+
+def test_a_trial_that_was_marked_while_it_ran_is_done_again_and_nobody_is_asked(
+    plant: Plant, controller: Any, tmp_path: Path
+) -> None:
+    operator, asked = Operator(), []
+    operator.mark_bad("it slipped")
+    found = run_batch(
+        twin(plant), controller, PLAN[:1], tmp_path, grasp_time=1.0, operator=operator,
+        judge=lambda k, trial, session: asked.append(k) or "",
+    )  # fmt: skip
+    assert (found.verdict, found.sessions, found.left) == ("done", 2, 0)
+    assert read_run(tmp_path / "0001").bad == "it slipped"
+    assert [event.kind for event in read_run(tmp_path / "0001").events].count("bad") == 1
+    assert asked == [0]  # for the second one
+    assert found.done == (tmp_path / "0001-2",)
+
+
+def test_what_records_may_stand_before_each_run_folder(plant: Plant, controller: Any, tmp_path: Path) -> None:
+    stood: list[Path] = []
+
+    @contextmanager
+    def through(folder: Any) -> Iterator[Any]:
+        stood.append(folder.path)
+        yield folder
+
+    run_batch(twin(plant), controller, PLAN[:2], tmp_path, grasp_time=1.0, through=through)
+    assert stood == [tmp_path / "0001", tmp_path / "0002"]
 
 
 def test_a_trial_that_does_not_settle_is_tried_three_times_and_a_bad_one_too(

@@ -50,6 +50,10 @@ class Server:
         topic = f"/thermogrip/{name}"
         return [m["msg"]["data"] for m in self.heard if m["op"] == "publish" and m["topic"] == topic]
 
+    def reported_numbers(self, name: str) -> list[float]:
+        """Return what was published as a number on a topic."""
+        return [float(value) for value in self.reported(name)]
+
     def publish(self, topic: str, content: Any) -> None:
         self.sockets[-1].send(json.dumps({"op": "publish", "topic": topic, "msg": content}))
 
@@ -130,8 +134,10 @@ class Kept:
 
     def __init__(self) -> None:
         self.events: list[Event] = []
+        self.rows: list[Mapping[str, float]] = []
 
-    def sample(self, row: Mapping[str, float]) -> None: ...
+    def sample(self, row: Mapping[str, float]) -> None:
+        self.rows.append(row)
 
     def event(self, event: Event) -> None:
         self.events.append(event)
@@ -248,3 +254,18 @@ def test_a_row_is_a_message_a_column_with_its_date_and_a_lost_reading_is_not_sen
     stamp = {"sec": 1700000000, "nanosec": 500000000}
     skin = {"header": {"stamp": stamp, "frame_id": "thermogrip"}, "temperature": 30.0, "variance": 0.0}
     assert [m["msg"] for m in sent if m["op"] == "publish"] == [{"data": 0.25}, skin]
+
+
+def test_one_connection_serves_run_after_run_and_takes_no_target(server: Server) -> None:
+    first, second = Kept(), Kept()
+    with Bridge(server.url, clock=lambda: 0.0, messages=Messages(limits=None)) as bridge:
+        for k, folder in enumerate((first, second)):
+            with bridge.before(folder) as recorder:
+                recorder.sample({"time_s": float(k), "drive": 0.25})
+            assert bridge.behind is None
+        assert wait_for(lambda: len(server.reported_numbers("drive")) == 2)
+        server.publish("/thermogrip/target", {"data": 38.5})
+    assert bridge.target is None
+    assert [row["time_s"] for row in first.rows + second.rows] == [0.0, 1.0]
+    assert len(server.sockets) == 1
+    assert not [m for m in server.heard if m["op"] == "subscribe"]

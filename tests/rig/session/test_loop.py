@@ -16,6 +16,7 @@ from thermogrip.rig.guard.trip import ENDLESS, KINDS, TripError
 from thermogrip.rig.interface import DeviceRefusedError, Event, Reading
 from thermogrip.rig.serial.port import PortError
 from thermogrip.rig.session.loop import Loop, log_of_rows, trip_of_device
+from thermogrip.rig.session.snapshot import Snapshot
 
 NONE = call({"q": 0.0}, 0)
 LOST = PortError("lost", "did not answer", file="COM3", hint="check cable")
@@ -320,3 +321,59 @@ def test_a_log_has_a_role_for_each_column_and_none_for_what_was_never_read() -> 
     assert log["phase"].attrs["flag_meanings"].split()[4] == "contact"
     assert (log.attrs["name"], log.attrs["repairs"]) == ("one", "cut")
     np.testing.assert_array_equal(log["time"].values, [0.0, 1.0, 2.0])
+
+
+def shown(run: Loop, *, fails: bool = False) -> list[Snapshot]:
+    """Let a loop show itself; return what it shows."""
+    seen: list[Snapshot] = []
+
+    def listener(snapshot: Snapshot) -> None:
+        seen.append(snapshot)
+        if fails:
+            raise RuntimeError("the view is gone")
+
+    run.listener = listener
+    return seen
+
+
+def test_each_sample_shows_the_session_as_it_is() -> None:
+    run = started(Move(drive=40.0))
+    run.band, seen = 0.25, shown(run)
+    for _ in run.regulate("hold", 1.0):
+        pass
+    run.sample("lead_in", 1, 0.1)
+    first, last = seen[0], seen[-1]
+    assert [one.time_s for one in seen] == [10.0, 10.5, 11.0]
+    assert (first.phase, first.left_s, first.dt, first.pump) == ("hold", 1.0, 0.5, 1)
+    assert (last.phase, last.dt, last.verdict, last.trip) == ("lead_in", 0.1, "", None)
+    assert (first.skin, first.target, first.band) == ("t_surface", {"t_surface": 30.0}, 0.25)
+    assert first.values == {"t_tank": 25.0, "t_surface": 25.5, "t_ambient": 20.0}
+    assert (first.drive, first.units, first.expires_s) == ({"q": 40.0}, {"q": "percent"}, 2.0)
+    assert (first.margin, first.nearest) == (22.5, "t_surface")  # to 3 degC
+    assert first.model_share != first.model_share
+    assert last.events[-1].text == "lead_in"
+    assert first.events[-1].text == "hold"
+
+
+def test_a_view_that_fails_ends_no_session_and_gets_no_more() -> None:
+    run = started(Move(drive=40.0))
+    seen = shown(run, fails=True)
+    for _ in run.regulate("hold", 2.0):
+        pass
+    assert len(seen) == 1
+    assert len(run.rows) == 4
+    assert told(run, "view") == [
+        (10.0, "what shows the session failed and gets no more of it (the view is gone)")
+    ]
+
+
+def test_an_operator_marks_a_trial_bad_and_stops_it_through_the_guard() -> None:
+    run = started(Move(drive=40.0))
+    run.operator.mark_bad("it slipped")
+    for _ in run.regulate("hold", 1.0):
+        pass
+    assert told(run, "bad") == [(10.0, "it slipped")]
+    run.operator.stop("the page")
+    trip = trip_of(lambda: next(run.regulate("hold", 1.0)))
+    assert (trip.kind, trip.measured) == ("operator", "a stop from the page")
+    assert run.guard.trips == [trip]

@@ -1,0 +1,285 @@
+"""The page's own process: what the session sends goes to every viewer, what a viewer asks goes back.
+
+    session --- a line of JSON, 10 a second ---> this process --- server-sent events ---> viewers
+            <-- a line of JSON a request ------               <-- POST -----------------
+
+Neither end needs the other.  Without this process the session goes on.  Without the session the line ends
+here, the page says so, and says what then holds for the drive.
+
+Only this computer is served (a loopback address), and who has the token: it is in the address that the
+terminal shows, and in a cookie from then on.  A name that is not the loopback's (a rebound DNS name) and a
+request from another site's page are refused, whatever they know; so is an action that is no POST.  The page
+loads nothing from elsewhere, and runs no script but its own, which the browser knows by its hash.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import hashlib
+import json
+import os
+import secrets
+import socket
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import suppress
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from starlette.requests import Request
+    from starlette.responses import Response
+    from starlette.types import ASGIApp, Receive, Scope, Send
+    from uvicorn import Server
+
+HOST = "127.0.0.1"
+EVERY_S = 0.1  # between two events to a viewer
+ALIVE_S = 1.0  # at most
+LINGER_S = 600.0  # that a page whose session was killed may still be opened
+MOST_ROWS = 4000  # that are kept; older ones are thinned
+MOST_BYTES = 4096  # of a request
+MOST_TEXT = 200  # characters, of what a viewer says
+
+
+class State:
+    """What a viewer sees: the rows so far and the newest message."""
+
+    def __init__(self) -> None:
+        self.columns: list[str] = []
+        self.history: list[list[Any]] = []
+        self.recent: deque[list[Any]] = deque(maxlen=MOST_ROWS)
+        self.posterior: list[list[Any]] = []
+        self.now: dict[str, Any] = {}
+        self.count = self.messages = 0
+        self.lost = False  # the session is gone without a verdict
+        self.over = False
+
+    def take(self, message: dict[str, Any]) -> None:
+        """Take one message of the session."""
+        rows, probabilities = message.pop("rows"), message.pop("posterior")
+        if message["columns"] != self.columns or (rows and self.recent and rows[0][0] < self.recent[-1][0]):
+            self.columns = message["columns"]
+            self.history.clear()
+        for row in probabilities:
+            if self.posterior and row[0] <= self.posterior[-1][0]:
+                self.posterior = []  # of another contact
+            self.posterior.append(row)
+        self.history += rows
+        self.recent.extend(rows)
+        self.count += len(rows)
+        if len(self.history) > MOST_ROWS:
+            half = MOST_ROWS // 2
+            self.history[:half] = self.history[:half:2]
+        self.now, self.over = message, bool(message["ended"])
+        self.messages += 1
+
+    def lose(self) -> None:
+        """Note that the session's process is gone; one that said goodbye has ended."""
+        self.lost = not self.over
+        self.messages += 1
+
+    def whole(self) -> dict[str, Any]:
+        """Return everything, for a new viewer."""
+        return {"all": True, "rows": self.history, "posterior": self.posterior, **self._present()}
+
+    def since(self, count: int) -> dict[str, Any]:
+        """Return what is new after so many rows."""
+        new = min(self.count - count, len(self.recent))
+        rows = list(self.recent)[len(self.recent) - new :]
+        return {"rows": rows, "posterior": self.posterior, **self._present()}
+
+    def _present(self) -> dict[str, Any]:
+        return {"lost": self.lost, **self.now}
+
+
+class Gate:
+    """Lets in who calls this computer by its own name, comes from its own page, and has the token."""
+
+    def __init__(self, app: ASGIApp, *, port: int, token: str) -> None:
+        self.app, self._token, self.cookie = app, token, f"thermogrip_{port}"
+        self._hosts = tuple(f"{name}:{port}" for name in (HOST, "localhost"))
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Refuse, or pass on."""
+        from starlette.requests import Request
+        from starlette.responses import PlainTextResponse
+
+        why = self.refused(Request(scope)) if scope["type"] == "http" else "only HTTP is served"
+        if why:
+            await PlainTextResponse(why + "\n", 403)(scope, receive, send)
+        else:
+            await self.app(scope, receive, send)
+
+    def refused(self, request: Request) -> str:
+        """Return why a request is refused, "" where it is not."""
+        host, origin = request.headers.get("host", ""), request.headers.get("origin")
+        if host not in self._hosts:
+            return "refused: this address is not the page's own"
+        if origin != f"http://{host}" and (origin is not None or request.method == "POST"):
+            return "refused: this comes from another page"
+        given = request.cookies.get(self.cookie, "")
+        if request.url.path == "/":
+            given = request.query_params.get("token", given)
+        if not secrets.compare_digest(given.encode(), self._token.encode()):
+            return "refused: open the address that the terminal shows, with its token"
+        return ""
+
+
+def page_text() -> tuple[str, str]:
+    """Return the page and the policy under which a browser shows it."""
+    parts = {
+        name: (files(__package__) / f"page.{name}").read_text(encoding="utf-8")
+        for name in ("html", "css", "js")
+    }
+    hashes = {
+        name: base64.b64encode(hashlib.sha256(parts[name].encode()).digest()).decode()
+        for name in ("css", "js")
+    }
+    policy = (
+        f"default-src 'none'; script-src 'sha256-{hashes['js']}'; style-src 'sha256-{hashes['css']}'; "
+        "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    )
+    return parts["html"].replace("{{css}}", parts["css"]).replace("{{js}}", parts["js"]), policy
+
+
+def application(state: State, ask: Callable[[dict[str, Any]], None], *, port: int, token: str) -> ASGIApp:
+    """Return the page; ``ask`` hears what viewers want."""
+    from starlette.applications import Starlette
+    from starlette.responses import HTMLResponse, JSONResponse, StreamingResponse
+    from starlette.routing import Route
+
+    text, policy = page_text()
+    safe = {
+        "Cache-Control": "no-store", "Content-Security-Policy": policy, "Referrer-Policy": "no-referrer",
+        "X-Content-Type-Options": "nosniff", "Cross-Origin-Resource-Policy": "same-origin",
+    }  # fmt: skip
+
+    async def page(request: Request) -> Response:
+        response = HTMLResponse(text, headers=safe)
+        response.set_cookie(f"thermogrip_{port}", token, httponly=True, samesite="strict")
+        return response
+
+    async def events(request: Request) -> Response:
+        return StreamingResponse(_events(state), media_type="text/event-stream", headers=safe)
+
+    async def act(request: Request) -> Response:
+        if int(request.headers.get("content-length") or MOST_BYTES) >= MOST_BYTES:
+            return JSONResponse({"refused": "too long"}, 413)
+        try:
+            said = json.loads(await request.body())
+            words = {key: str(said[key])[:MOST_TEXT] for key in ("text", "question") if key in said}
+        except (ValueError, TypeError):
+            return JSONResponse({"refused": "no JSON object"}, 400)
+        if state.lost or state.over:
+            return JSONResponse({"refused": "the session is not there any more"}, 409)
+        ask({"do": request.url.path.lstrip("/"), **words})
+        return JSONResponse({"done": True})
+
+    actions = [Route(f"/{name}", act, methods=["POST"]) for name in ("stop", "bad", "answer")]
+    app = Starlette(routes=[Route("/", page), Route("/events", events), *actions])
+    return Gate(app, port=port, token=token)
+
+
+async def _events(state: State) -> AsyncIterator[str]:
+    """Yield what a viewer is sent, until the session is over."""
+    count, messages, content, said = state.count, state.messages, state.whole(), 0.0
+    while True:
+        if content:
+            said = time.monotonic()
+            yield f"data: {json.dumps(content)}\n\n"
+        if state.over:
+            return
+        await asyncio.sleep(EVERY_S)
+        content = {}
+        if messages != state.messages:
+            content = state.since(count)
+            count, messages = state.count, state.messages
+        elif time.monotonic() - said > ALIVE_S:
+            content = {"rows": [], "posterior": state.posterior, **state._present()}
+
+
+async def _serve(settings: dict[str, Any], lines: Iterator[bytes], listener: socket.socket | None) -> None:
+    """Serve until the session is over."""
+    state, loop, ended = State(), asyncio.get_running_loop(), asyncio.Event()
+    mirror: Callable[[dict[str, Any]], None] | None = None
+    if settings["foxglove"] is not None:
+        from thermogrip.live.foxglove import Mirror
+
+        mirror = Mirror(settings["foxglove"], settings["title"], settings["layout"]).take
+    server = None if listener is None else _server(state, settings["token"], listener)
+    _answer({"ready": True})
+
+    def take(line: bytes) -> None:
+        message = json.loads(line)
+        if mirror is not None:
+            mirror(message)
+        state.take(message)
+        if state.over:
+            ended.set()
+
+    def lose() -> None:
+        state.lose()
+        if state.over or server is None:
+            ended.set()
+        loop.call_later(LINGER_S, ended.set)
+
+    def hear() -> None:
+        for line in lines:
+            loop.call_soon_threadsafe(take, line)
+        loop.call_soon_threadsafe(lose)
+
+    threading.Thread(target=hear, daemon=True).start()
+    running = None if server is None else asyncio.create_task(server.serve(sockets=[listener]))  # type: ignore[list-item]
+    await ended.wait()
+    await asyncio.sleep(2 * EVERY_S)  # every viewer is sent the end
+    if server is not None and running is not None:
+        server.should_exit = True
+        await running
+
+
+def _server(state: State, token: str, listener: socket.socket) -> Server:
+    from uvicorn import Config, Server
+
+    app = application(state, _answer, port=listener.getsockname()[1], token=token)
+    config = Config(
+        app, loop="asyncio", http="h11", ws="none", lifespan="off", log_level="error", access_log=False,
+        server_header=False, proxy_headers=False, timeout_graceful_shutdown=1,
+    )  # fmt: skip
+    return Server(config)
+
+
+def _answer(content: dict[str, Any]) -> None:
+    """Say something to the session; one that is gone hears nothing."""
+    with suppress(OSError):
+        sys.stdout.write(json.dumps(content) + "\n")
+        sys.stdout.flush()
+
+
+def _lines() -> Iterator[bytes]:
+    """Yield the lines of standard input; unbuffered, for a thread that waits in a buffer holds up the end."""
+    rest = b""
+    while data := os.read(0, 1 << 16):
+        *whole, rest = (rest + data).split(b"\n")
+        yield from whole
+
+
+def main() -> None:
+    """Serve what comes on standard input; its first line has the settings."""
+    lines = _lines()
+    settings = json.loads(next(lines))
+    listener = None
+    try:
+        if settings["port"] is not None:
+            listener = socket.create_server((HOST, settings["port"]))
+            _answer({"port": listener.getsockname()[1]})
+        asyncio.run(_serve(settings, lines, listener))
+    except (OSError, RuntimeError) as error:
+        _answer({"error": os.strerror(error.errno) if getattr(error, "errno", None) else str(error)})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,392 @@
+"""What shows a session while it runs, and takes what an operator asks; the loop waits for none of it.
+
+The loop appends a snapshot to a queue (:meth:`Watch.listen`).  A thread takes them out ten times a second for
+the terminal and for the page's process (:mod:`~thermogrip.live.server`), which it writes lines to; another
+one reads what comes back.  A queue that is full drops its oldest.  Where the page's process is gone, that is
+said once, and the session goes on.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import secrets
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from shutil import get_terminal_size
+from types import TracebackType
+from typing import Any
+
+import typer
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.media import printable
+from thermogrip.live.terminal import History, line, panel
+from thermogrip.live.trip_command import TripCommand
+from thermogrip.report.console import Console, plain
+from thermogrip.rig.session.loop import PHASES
+from thermogrip.rig.session.signals import check_stopped
+from thermogrip.rig.session.snapshot import Operator, Snapshot
+
+EVERY_S = 0.1  # between two looks at the queue
+REFRESH_S = 0.5  # of the terminal
+_KEEP = 4096  # snapshots that wait
+_SWITCH_S = 5e-4  # after which a thread that shows passes Python's lock on (5 ms elsewhere)
+_PATIENCE_S = 10.0  # for the page's process to start
+_GOODBYE_S = 4.0  # for it to end
+
+
+@dataclass(frozen=True)
+class Show:
+    """What of a session is shown where."""
+
+    live: int | None = None  # port of the page, 0 for any; None for no page
+    foxglove: int | None = None  # port
+    on_trip: str | None = None  # command line
+    layout: Path | None = None  # where Foxglove's layout goes
+
+    def check(self) -> None:
+        """Raise UserError where a package is missing."""
+        needs = {"live": ("starlette", "uvicorn"), "foxglove": ("foxglove",)}
+        for extra, packages in needs.items():
+            if getattr(self, extra) is not None and not all(map(find_spec, packages)):
+                hint = f'pip install "thermogrip[{extra}]"'
+                raise UserError(f"--{extra} needs {' and '.join(packages)}", hint=hint)
+
+
+@dataclass(frozen=True)
+class Question:
+    """What an operator is asked: answers to choose from (what is sent, what is shown), or own words."""
+
+    number: int
+    text: str
+    choices: tuple[tuple[str, str], ...]
+    own_words: str = ""  # what they are for; empty where there is none
+
+
+class Watch:
+    """Show a session; a context manager, whose methods are called from the session's thread.
+
+    ``operator`` is handed to the session, as are :meth:`listen` and :meth:`progress`; ``address`` is that of
+    the page, with its token.
+    """
+
+    def __init__(self, title: str, console: Console, show: Show | None = None) -> None:
+        self.title, self._console, self._show = title, console, show or Show()
+        self.operator = Operator()
+        self._show.check()
+        self._command = None if self._show.on_trip is None else TripCommand(self._show.on_trip, console.warn)
+        self._queue: deque[Snapshot] = deque(maxlen=_KEEP)
+        self._posterior: deque[list[Any]] = deque(maxlen=_KEEP)
+        self._now: Snapshot | None = None
+        self._heard = time.monotonic()
+        self._fraction, self._what, self._verdict = 0.0, "", ""
+        self._question: Question | None = None
+        self._asked = 0
+        self._answers: queue.Queue[tuple[int, str]] = queue.Queue()
+        self._typing: threading.Thread | None = None
+        self._over = threading.Event()
+        self.address = ""
+        self._page: subprocess.Popen[bytes] | None = None
+        self._reached = False  # whether the page's process takes what is written
+        self._view = _Lines(title) if not sys.stderr.isatty() else _Panel(title)
+
+    def listen(self, snapshot: Snapshot) -> None:
+        """Take a snapshot; returns at once."""
+        self._queue.append(snapshot)
+        if snapshot.trip is not None and self._command is not None:
+            self._command.start(snapshot.trip)
+
+    def progress(self, fraction: float, what: str) -> None:
+        """Take how far the work is."""
+        self._fraction, self._what = max(self._fraction, fraction), what
+        self._view.progress = self._fraction, what
+
+    def posterior(self, time_s: float, probabilities: Mapping[str, float]) -> None:
+        """Take the probabilities of the materials at this time of the contact [s]."""
+        self._posterior.append([time_s, dict(probabilities)])
+
+    def ended(self, verdict: str) -> None:
+        """Say how the work ended."""
+        self._verdict = verdict
+
+    def ask(self, text: str, choices: tuple[tuple[str, str], ...] = (), own_words: str = "") -> str:
+        """Return what is answered, on the terminal or on the page."""
+        self._view.pause()
+        try:
+            if not self._reached:
+                return str(typer.prompt(text, default="", show_default=False)).strip()
+            return self._ask_both(text, choices, own_words)
+        finally:
+            self._view.resume()
+
+    def _ask_both(self, text: str, choices: tuple[tuple[str, str], ...], own_words: str) -> str:
+        self._asked += 1
+        with suppress(queue.Empty):
+            while True:
+                self._answers.get_nowait()  # typed before there was a question
+        self._question = Question(self._asked, text, choices, own_words)
+        sys.stderr.write(f"{printable(text)} (here or on the page): ")
+        sys.stderr.flush()
+        if self._typing is None:
+            self._typing = threading.Thread(target=self._read_typed, daemon=True)
+            self._typing.start()
+        try:
+            while True:
+                check_stopped()
+                if self.operator.stop_asked:
+                    return "q"
+                if not self._reached and not self._typing.is_alive():
+                    raise UserError("nobody can answer any more", hint="run the same command again to go on")
+                with suppress(queue.Empty):
+                    number, said = self._answers.get(timeout=0.2)
+                    if number in (0, self._asked):
+                        return said.strip()
+        finally:
+            self._question = None
+            sys.stderr.write("\n")
+
+    def _read_typed(self) -> None:
+        """Read lines from the terminal; not through Python's buffer, which a waiting thread would hold."""
+        rest = b""
+        with suppress(OSError, ValueError):
+            while data := os.read(sys.stdin.fileno(), 4096):
+                *whole, rest = (rest + data).split(b"\n")
+                for typed in whole:
+                    self._answers.put((0, typed.decode("utf-8", "replace")))
+
+    def __enter__(self) -> Watch:
+        if self._show.live is not None or self._show.foxglove is not None:
+            self._open_page()
+        self._switch = sys.getswitchinterval()
+        sys.setswitchinterval(_SWITCH_S)
+        self._view.resume()
+        self._thread = threading.Thread(target=self._work, name="watch", daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is not None:
+            stopped = issubclass(kind, KeyboardInterrupt)
+            self._verdict = "stopped by Ctrl-C" if stopped else f"failed: {error}"
+        self._over.set()
+        self._thread.join(_GOODBYE_S)
+        self._view.pause()
+        self._close_page()
+        if self._command is not None:
+            self._command.join()
+        sys.setswitchinterval(self._switch)
+
+    def _work(self) -> None:
+        """Show what is new until the end, and that too."""
+        shown = 0.0
+        while True:
+            over = self._over.wait(EVERY_S)
+            taken = _drain(self._queue)
+            if taken:
+                self._now, self._heard = taken[-1], time.monotonic()
+            for snapshot in taken:
+                self._view.add(snapshot)
+            if over or time.monotonic() - shown > REFRESH_S:
+                shown = time.monotonic()
+                self._view.show(last=over)
+            self._send(taken, over)
+            if over:
+                return
+
+    def _send(self, taken: list[Snapshot], over: bool) -> None:
+        """Write what is new to the page's process; one that is gone is let go."""
+        page, now = self._page, self._now
+        if page is None or page.stdin is None or not self._reached:
+            return
+        question = self._question
+        names = [] if now is None else [*now.values, *now.drive]
+        units = [] if now is None else [*["degC"] * len(now.values), *(now.units[k] for k in now.drive)]
+        message = {
+            "title": self.title, "what": self._what, "fraction": self._fraction,
+            "columns": ["time_s", "phase", "pump", "target", *names],
+            "units": ["s", "1", "1", "degC", *units],
+            "rows": [_row(snapshot) for snapshot in taken],
+            "now": {} if now is None else _present(now),
+            "posterior": _drain(self._posterior),
+            "age": time.monotonic() - self._heard,
+            "question": None if question is None else asdict(question),
+            "stopping": bool(self.operator.stop_asked),
+            "ended": (self._verdict or "ended") if over else "",
+        }  # fmt: skip
+        if now is None:
+            message |= {"columns": [], "units": []}
+        try:
+            page.stdin.write(json.dumps(plain(message), allow_nan=False).encode() + b"\n")
+            page.stdin.flush()
+        except OSError:
+            self._reached = False
+            self._console.warn("the page's process is gone; the session goes on without it")
+
+    def _open_page(self) -> None:
+        """Start the page's process and say where the page is."""
+        token = secrets.token_urlsafe(24)
+        words = [sys.executable, "-P", "-m", "thermogrip.live.server"]
+        self._page = page = subprocess.Popen(
+            words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
+        )
+        assert page.stdin is not None
+        assert page.stdout is not None
+        show, layout = self._show, self._show.layout
+        settings = {"token": token, "port": show.live, "foxglove": show.foxglove, "title": self.title}
+        settings |= {"layout": None if layout is None else str(layout)}
+        page.stdin.write(json.dumps(settings).encode() + b"\n")
+        page.stdin.flush()
+        begin = time.monotonic()
+        said: dict[str, Any] = {}
+        for text in page.stdout:
+            said |= json.loads(text)
+            if said.keys() & {"ready", "error"} or time.monotonic() - begin > _PATIENCE_S:
+                break
+        self._reader = threading.Thread(target=self._read_page, args=(page,), daemon=True)
+        self._reader.start()
+        self._reached = "ready" in said
+        if not self._reached:
+            page.kill()
+            self._close_page()
+            why = said.get("error", "its process did not start")
+            raise UserError(f"the live page cannot be served ({why})", hint="choose another port")
+        if show.live is not None:
+            self.address = f"http://127.0.0.1:{said['port']}/?token={token}"
+            sys.stderr.write(f"live: {self.address}\n")
+        if show.foxglove is not None:
+            sys.stderr.write(f"foxglove: ws://127.0.0.1:{show.foxglove}, layout {printable(str(layout))}\n")
+        sys.stderr.flush()
+
+    def _read_page(self, page: subprocess.Popen[bytes]) -> None:
+        """Take what viewers ask."""
+        assert page.stdout is not None
+        for text in page.stdout:
+            asked = json.loads(text)
+            if asked["do"] == "stop":
+                self.operator.stop("the page")
+            elif asked["do"] == "bad":
+                self.operator.mark_bad(asked.get("text") or "marked on the page")
+            elif asked["do"] == "answer" and asked.get("question", "").isdigit():
+                self._answers.put((int(asked["question"]), asked.get("text", "")))
+
+    def _close_page(self) -> None:
+        page, self._page, self._reached = self._page, None, False
+        if page is None or page.stdin is None or page.stdout is None:
+            return
+        with suppress(OSError):
+            page.stdin.close()
+        try:
+            page.wait(_GOODBYE_S)
+        except subprocess.TimeoutExpired:
+            page.kill()
+            page.wait()
+        self._reader.join()
+        page.stdout.close()
+
+
+class _Lines:
+    """What is no terminal: one line a second at most."""
+
+    def __init__(self, title: str) -> None:
+        self._title, self._said, self._last = title, -float("inf"), ""
+        self._now: Snapshot | None = None
+        self.progress: tuple[float, str] = 0.0, ""
+
+    def add(self, snapshot: Snapshot) -> None:
+        self._now = snapshot
+
+    def show(self, *, last: bool) -> None:
+        fraction, what = self.progress
+        begin = f"{printable(self._title)} {100 * fraction:3.0f} % {printable(what)}"
+        text = begin if self._now is None else f"{begin}; {line(self._now)}"
+        if (last or time.monotonic() - self._said >= 1.0) and text != self._last and (what or self._now):
+            self._said, self._last = time.monotonic(), text
+            sys.stderr.write(text + "\n")
+            sys.stderr.flush()
+
+    def pause(self) -> None:
+        pass
+
+    def resume(self) -> None:
+        pass
+
+
+class _Panel:
+    """A terminal: a panel that is drawn anew in its place, by the thread that shows."""
+
+    def __init__(self, title: str) -> None:
+        from rich.console import Console as RichConsole
+
+        self._title, self._history = title, History()
+        self._now: Snapshot | None = None
+        self.progress: tuple[float, str] = 0.0, ""
+        self._console, self._lock = RichConsole(stderr=True, highlight=False), threading.Lock()
+        self._live: Any = None
+
+    def add(self, snapshot: Snapshot) -> None:
+        self._now = snapshot
+        self._history.add(snapshot.time_s, snapshot.values.get(snapshot.skin, float("nan")))
+
+    def show(self, *, last: bool) -> None:
+        with self._lock:
+            if self._live is not None:
+                self._live.update(self._drawn(), refresh=True)
+
+    def pause(self) -> None:
+        with self._lock:
+            if self._live is not None:
+                self._live.stop()
+                self._live = None
+
+    def resume(self) -> None:
+        from rich.live import Live
+
+        with self._lock:
+            self._live = Live(self._drawn(), console=self._console, auto_refresh=False)
+            self._live.start()
+
+    def _drawn(self) -> Any:
+        fraction, what = self.progress
+        note = f"{100 * fraction:3.0f} %  {what}" if what else ""
+        plain_text = not (self._console.encoding or "").lower().startswith("utf")
+        width = get_terminal_size().columns
+        return panel(self._title, self._now, self._history, note=note, width=width, plain=plain_text)
+
+
+def _drain(waiting: deque[Any]) -> list[Any]:
+    """Return what waits, oldest first, and take it out."""
+    taken: list[Any] = []
+    with suppress(IndexError):
+        while True:
+            taken.append(waiting.popleft())
+    return taken
+
+
+def _row(now: Snapshot) -> list[float | None]:
+    """Return a snapshot as a row of the page's columns."""
+    phase = float(PHASES.index(now.phase)) if now.phase else None
+    head = [now.time_s, phase, float(now.pump), now.target.get(now.skin)]
+    return [*head, *now.values.values(), *now.drive.values()]
+
+
+def _present(now: Snapshot) -> dict[str, Any]:
+    """Return a snapshot as the page shows it."""
+    expires = now.expires_s if now.expires_s < float("inf") else None
+    return {
+        **{name: getattr(now, name) for name in now.__dataclass_fields__ if name not in ("events", "trip")},
+        "events": [{"time_s": e.time_s, "kind": e.kind, "text": e.text} for e in now.events],
+        "trip": None if now.trip is None else now.trip.as_dict(),
+        "expires_s": expires,
+    }

@@ -1,0 +1,98 @@
+"""What shows a session: the loop waits for none of it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from dataclasses import replace
+from importlib import util
+from typing import Any
+
+import pytest
+
+from tests.live.conftest import Running, paced_twin
+from tests.live.test_terminal import NOW, TRIP
+from thermogrip.datasets.errors import UserError
+from thermogrip.live import watch as module
+from thermogrip.live.watch import Show, Watch
+from thermogrip.report.console import Console
+
+
+def test_a_page_that_hangs_holds_up_nothing(watch: Watch) -> None:
+    assert watch._page is not None
+    os.kill(watch._page.pid, signal.SIGSTOP)
+    wide = replace(NOW, values={f"t_{k}": float(k) for k in range(200)})
+    begin, slowest = time.monotonic(), 0.0
+    while time.monotonic() - begin < 1.5:  # more than a pipe holds
+        before = time.monotonic()
+        for _ in range(200):
+            watch.listen(wide)
+        slowest = max(slowest, time.monotonic() - before)
+        time.sleep(0.001)
+    assert slowest < 0.5
+    assert len(watch._queue) == module._KEEP  # the oldest are dropped
+    os.kill(watch._page.pid, signal.SIGCONT)
+
+
+def test_without_a_terminal_there_is_a_line_a_second_at_most(capsys: pytest.CaptureFixture[str]) -> None:
+    begin = time.monotonic()
+    with Watch("record", Console()) as watch:
+        for k in range(120):
+            watch.listen(replace(NOW, time_s=float(k)))
+            time.sleep(0.01)
+        watch.listen(replace(NOW, time_s=999.0, trip=TRIP, verdict="tripped"))
+    lines = capsys.readouterr().err.splitlines()
+    assert 2 <= len(lines) <= 2 + (time.monotonic() - begin)
+    assert lines[-1].endswith(TRIP.line())
+    assert all(line.startswith("record   0 % ; ") and "t_surface 37.90 degC" in line for line in lines)
+
+
+def test_work_that_shows_no_session_shows_its_progress(capsys: pytest.CaptureFixture[str]) -> None:
+    with Watch("batch", Console()) as watch:
+        watch.progress(0.5, "trial 2 of 4: copper")
+    assert capsys.readouterr().err == "batch  50 % trial 2 of 4: copper\n"
+
+
+def test_a_trip_runs_the_command_while_the_session_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    ran: list[Any] = []
+    monkeypatch.setattr("thermogrip.live.trip_command.TripCommand.start", lambda self, trip: ran.append(trip))
+    with Watch("run", Console(), Show(on_trip="true")) as watch:
+        rig = paced_twin()
+        running = Running(watch, rig, hold=10_000.0)
+        time.sleep(0.3)
+        watch.operator.stop("a test")
+        session = running.result()
+    assert session.trip is not None
+    assert ran == [session.trip]
+
+
+@pytest.mark.parametrize("extra", ["live", "foxglove"])
+def test_a_missing_package_is_one_line(extra: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "find_spec", lambda name: None)
+    assert util.find_spec("starlette")
+    with pytest.raises(UserError, match=rf'--{extra} needs .*; pip install "thermogrip\[{extra}\]"'):
+        Watch("run", Console(), Show(**{extra: 0}))
+
+
+def test_without_a_page_questions_are_asked_on_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+    monkeypatch.setattr("typer.prompt", lambda text, **_: (asked.append(text), " q ")[1])
+    with Watch("batch", Console()) as watch:
+        assert watch.ask("ready?") == "q"
+    assert asked == ["ready?"]
+
+
+def test_a_question_on_the_page_may_be_answered_on_the_terminal(
+    watch: Watch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ends = os.pipe()
+    with os.fdopen(ends[0]) as terminal:
+        monkeypatch.setattr("sys.stdin", terminal)
+        threading.Timer(0.3, os.write, (ends[1], b"slipped\n")).start()
+        assert watch.ask("was it good?", own_words="what was bad") == "slipped"
+        threading.Timer(0.3, watch.operator.stop, ("the page",)).start()
+        assert watch.ask("ready?") == "q"  # a stop that was asked for is an answer
+        os.close(ends[1])
+        watch._typing.join()
