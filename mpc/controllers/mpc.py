@@ -16,7 +16,8 @@ A loop must never be left without an answer, so every failure has a next best on
 * ``fallback_pi``: the plan has run out; PI on the reading, taken over without a bump (and without
   feed-forward: the drive that is taken over has it);
 * ``off``: no reading to act on, or the pump is off; the drive goes to zero;
-* ``mismatch``: the optimiser's move, as for a plant that is known to be slower than the model.
+* ``mismatch``: the optimiser's move, as for a plant that is known not to be the model
+  (:mod:`thermogrip.mpc.estimator.structure_monitor`; in Python alone), or to be slower.
 
 Where mean innovations exceed 3 standard deviations, the weight of moves is multiplied by their third, up
 to 30 times: a gain that is off by 30 % does not swing.
@@ -50,6 +51,7 @@ from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import SCHEMA, VERSION, Design, check_design, default_design
 from thermogrip.mpc.estimator.call_times import RESTART_S, opening, shifted
 from thermogrip.mpc.estimator.reading_checks import ReadingMonitor, follows, is_off
+from thermogrip.mpc.estimator.structure_monitor import StructureMonitor
 from thermogrip.mpc.interface import Move, Readings, Target, number
 from thermogrip.mpc.optimiser.reach import Reach
 from thermogrip.mpc.optimiser.rti import Optimiser, Outcome, Sample
@@ -62,6 +64,7 @@ if TYPE_CHECKING:
 
 _KEPT_DRAWS = 50  # of the posterior, in the controller's file for its review
 _CAUTION, _MOST_CAUTION = 3.0, 30.0  # of a mean innovation, from which on moves weigh more; how much more
+_EVEN = 0.1  # of a sample time, by which calls may differ from it in a window of the structure's monitor
 _WEAK = 0.05  # of its gain at rest, below which a drive's bias is not learnt
 
 
@@ -119,6 +122,7 @@ class Controller(Shown, SampledController):
             self._compile()
         self.pi = PIController.of(plant, design, tuple(replace(p, feedforward=0.0) for p in design.loops))
         self.monitor = ReadingMonitor(self.model.n_y, len(self.observer.lagged), spike=self.model.spike)
+        self.structure = StructureMonitor(plant, self.model, self.controlled)
         self.reach = Reach(self.optimiser, self.observer)
         self.last_iterations = 0  # of the program, in the last step
         self._slew_s = self.dt  # for which the slew limit counts in this step
@@ -302,6 +306,7 @@ class Controller(Shown, SampledController):
         self._fresh = True
         self._on_pi = False
         self.monitor.forget(y)
+        self.structure.forget()
         self.reach.forget()
         self.optimiser.forget()
 
@@ -334,10 +339,14 @@ class Controller(Shown, SampledController):
         self._fresh = False
         if not self.design.move_delay:
             self._u = applied  # the slew limit counts from what was really applied
+        before = self._d
         self._d = np.where(np.isfinite(d), d, self._d)
         y, stays = self.monitor.screen(y, self.observer.reading())
         jumped = self._accept_jump(y, stays) if stays.any() else ""
         self.observer.update(y)
+        if stays.any() or abs(elapsed - self.dt) > _EVEN * self.dt:
+            self.structure.restart()
+        self.structure.note(self.observer, y, applied, before)
         self._y, self._seen = y, self.observer.now
         lost = [name for name, value in zip(self.model.outputs, y) if not np.isfinite(value)]
         lost += [name for name, value in zip(self.model.disturbances, d) if not np.isfinite(value)]
@@ -423,8 +432,9 @@ class Controller(Shown, SampledController):
             lost = self._lost
             parked = [name for name, at in zip(self.model.drives, self.optimiser.pair) if lost[at]]
             return u, "fallback_plan", self._unseen(parked)
-        slower = self.monitor.slower(self.observer)
-        return (u, "mismatch", slower) if slower else (u, "ok", follows(self.observer, self.controlled))
+        lags = self.monitor.slower(self.observer)
+        doubt = self.structure.said or ("" if self.structure.denies else lags)
+        return (u, "mismatch", doubt) if doubt else (u, "ok", follows(self.observer, self.controlled))
 
     def _optimise(self, wanted: Array) -> Outcome:
         last = np.clip(self._u, self.optimiser.lowest, self.optimiser.highest)

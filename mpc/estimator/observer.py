@@ -311,13 +311,13 @@ class Observer:
         # a state's own unit: its spread, seen against the spread of the outputs
         spread = np.sqrt(np.maximum(np.diag(np.atleast_2d(plant.model.spread)), 1e-12))
         seen = np.sqrt(np.einsum("ij,j,ij->i", model.C, spread**2, model.C)).max()
-        self._unit = spread / max(float(seen), 1e-12)
+        self.unit = spread / max(float(seen), 1e-12)
         self.is_drive = disturbance.on_drive.any(axis=0)
         drift = np.where(self.is_drive, self.noise.drive, self.noise.output)
         n_l, still = len(self.lagged), np.zeros(len(self.lagged))
         lag = still + (_LAG_DRIFT * model.dt) ** 2
         scale = still + _SCALE_DRIFT**2 / model.dt
-        own = [(self.noise.state * self._unit) ** 2, drift**2, still, lag, scale]
+        own = [(self.noise.state * self.unit) ** 2, drift**2, still, lag, scale]
         self.Q = np.concatenate(own) * model.dt
         self.x = np.zeros(model.n_x)
         self.w = np.zeros(disturbance.n_w)
@@ -350,9 +350,9 @@ class Observer:
         model, level = self.model, self._level(y, d)
         x, v = model.rest(np.full(model.n_y, level), d), model.neutral
         for _ in range(_REPEATS):
-            rest = resting_state(model, x, v, level, d, unit=self._unit)
+            rest = resting_state(model, x, v, level, d, unit=self.unit)
             self._begin(rest.x, rest.P, y)
-            moved = np.max(np.abs(self.x - x) / self._unit)
+            moved = np.max(np.abs(self.x - x) / self.unit)
             x = self.x
             v = np.clip(rest.past_drive(x), model.lowest, model.highest)
             if not moved > _SAME:
@@ -370,7 +370,7 @@ class Observer:
 
     def rest_in_room(self) -> RestingState:
         """Return where the plant may rest, linearised where all is as warm as the room."""
-        return resting_state_in_room(self.model, self.ambient, tuple(self._unit.tolist()))
+        return resting_state_in_room(self.model, self.ambient, tuple(self.unit.tolist()))
 
     def _begin(self, x: Array, P: Array, y: Array) -> None:
         """Start from a Gaussian state and a reading (n_y,)."""

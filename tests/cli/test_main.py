@@ -63,7 +63,7 @@ def test_python_dash_m_is_the_command() -> None:
 
 def test_the_verbs_are_those_of_the_contract() -> None:
     verbs = "demo identify validate simulate excite tune review export run effusivity train classify compare"
-    more = "linearise paper materials init record recover virtual batch"
+    more = "retune linearise paper materials init record recover virtual batch"
     assert set(VERBS) == {*verbs.split(), *more.split()}
 
 
@@ -82,6 +82,8 @@ linearise: PLANT --at --dt>1e-09 --out --report --network --seed=0>0 --json=Fals
 excite: --kind --minutes>0.1 --out --plant --network --lowest=5.0 --highest=60.0 --hold --slew>1e-09
   --seed=0>0 --json=False
 tune: PLANT --out --spec --report --network --seed=0>0 --workers=1>1 --cluster --json=False
+retune: DIR LOG... --out=retuned.json --controller --spec --report --network --seed=0>0 --workers=1>1
+  --json=False
 review: CONTROLLER --report --network --seed=0>0 --json=False
 export: CONTROLLER --out --check=False --states=3000>1 --network --seed=0>0 --json=False
 run: CONTROLLER --target --out --port --protocol --speed=1.0>0.01 --twin --draw=0>0 --from --hold=0.0>0

@@ -59,7 +59,8 @@ def _root(
 
 for _verb in (
     project.demo, identify.identify, identify.validate, identify.simulate, identify.linearise, excite.excite,
-    control.tune, control.review, control.export, rig.run, rig.record, rig.virtual, rig.batch, rig.recover,
+    control.tune, control.retune, control.review, control.export, rig.run, rig.record, rig.virtual,
+    rig.batch, rig.recover,
     classify.effusivity, classify.train, classify.classify, compare.compare, project.paper,
     classify.materials, project.init,
 ):  # fmt: skip

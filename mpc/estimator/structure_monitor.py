@@ -1,0 +1,276 @@
+r"""Whether the last minute of closed loop is the model's: a bank of one-parameter alternatives.
+
+Over a window of 7.5 apparent delays (a minute on the gripper) the model is run on the drives that were really
+applied.  Its state z at the start, the biases w, the plant's free parameters theta and each drive's gain are
+unknown, with the spread that an honest plant has,
+
+    z ~ N(z_s, 1 degC in its unit),    w ~ N(w_s, P_0 + w_s^2),
+    theta ~ N(theta, posterior),       gain ~ N(1, 0.2^2),
+
+z_s and w_s being the filter's.  Two Gauss-Newton steps find the most likely of them.  Linearised there, the
+readings are y ~ N(y_0, V) with V = R + J J', J in these standard deviations, and what the model lacks adds a
+column a of its own to J, with a parameter that is nothing but for what nobody would call another structure
+(``_Alternative.tolerated``).  Freed one at a time it is
+
+    s = a' V^-1 r / a' V^-1 a  +-  (a' V^-1 a)^-1/2,      z = s / sqrt(sd^2 + tolerated^2),
+
+whose square is twice the logarithm of the generalised likelihood ratio [1]_, and N(0, 1) where the plant is a
+draw of its posterior.  The alternatives, with D the apparent delay of an output and y(t) what the model has,
+
+* y(t - s): a delay that is longer, or shorter; y through a lag: a slower sensor;
+* a share s of y through a lag of 6 D: a second mass, which takes up its heat later;
+* u(t - s), a drive that acts later, or sooner; one that does nothing within s of none: a dead zone.
+
+The plant is reported not to be the model at z >= 5, or where r' V^-1 r exceeds 4 a reading, whatever the
+alternative: 1 is what an honest plant has, 4 allows for readings twice as noisy as the model says.  A report
+stays until a window that would have shown it as well (its sd at most twice that of then) has z < 2.
+
+It needs a posterior: a plant without one does not say which numbers it may honestly have.  A window is of
+calls at the sample time, with drive biases below 30 % of the range; another sample starts a new one.
+
+References
+----------
+.. [1] A. S. Willsky, H. L. Jones, "A generalized likelihood ratio approach to the detection and estimation of
+   jumps in linear systems", IEEE Transactions on Automatic Control 21(1), 1976.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.signal import lfilter
+
+from thermogrip.datasets.arrays import Array
+from thermogrip.mpc.estimator.reading_checks import too_weak
+from thermogrip.mpc.plant.prediction import PredictionModel, step_response
+
+if TYPE_CHECKING:
+    from thermogrip.mpc.estimator.observer import Observer
+    from thermogrip.sysid.plant.plant import Plant
+
+REPORTED, TAKEN_BACK, MISFIT = 5.0, 2.0, 4.0
+_DELAYS, _FEWEST, _MOST = 7.5, 20, 200  # of a window, in apparent delays; samples
+_STATE, _GAIN = 1.0, 0.2  # degC of each state where a window starts; of a drive
+_LAG, _SLOW, _ZONE = 0.5, 6.0, 0.02  # apparent delays, apparent delays, of a drive's range
+_TRIED = 0.3  # standard deviations, of a difference quotient
+
+
+class _Alternative(NamedTuple):
+    """What a model may lack: ``unit`` times its parameter is reported, as more than ``most`` beyond that."""
+
+    words: str
+    unit: float
+    most: float
+    tolerated: float
+    two_sided: bool = False
+    granted: bool = False  # whether an honest plant may have as much as is tolerated
+
+    def reported(self, size: float) -> str:
+        """Return it in words."""
+        amount = abs(size) * self.unit
+        about = f"about {amount:.2g}" if amount < self.most else f"more than {self.most:.2g}"
+        return self.words.format(about, "faster" if size < 0 else "slower")
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """What a window says: of each alternative its parameter, the standard deviation of that, and z."""
+
+    size: Array
+    sd: Array
+    z: Array
+    chi: float  # r' V^-1 r, of a reading
+
+
+class _Row(NamedTuple):
+    x: Array
+    w: Array
+    shown: Array  # (n_y,) expected
+    y: Array
+    u: Array  # applied until here
+    d: Array
+
+
+class StructureMonitor:
+    """Watches one closed loop; ``said`` is what is known of it, empty while the plant may be the model, and
+    ``denies`` whether the last window was the model's."""
+
+    def __init__(self, plant: Plant, model: PredictionModel, controlled: Sequence[str]) -> None:
+        self.model, self.plant, self.said, self.denies = model, plant, "", False
+        self.spread = _posterior(plant)
+        self._rows = [model.outputs.index(name) for name in controlled]
+        if self.spread is None:
+            return
+        answers = [[step_response(plant, name, of) for name in model.drives] for of in controlled]
+        best = (max(answer, key=lambda one: abs(one.gain)) for answer in answers)
+        self._delays = [float(np.clip(one.delay, model.dt, _MOST / _DELAYS * model.dt)) for one in best]
+        longest = max(self._delays) / model.dt
+        self.window = int(np.clip(round(_DELAYS * longest), _FEWEST, _MOST))
+        self.bank = [each for name, D in zip(controlled, self._delays) for each in _of_output(name, D)]
+        self._share_late = min(1.0, max(self._delays) / 8 / model.dt)
+        for name in model.drives:
+            words = f"{name} acts {{1}} than in the model by {{0}} s"
+            self.bank.append(
+                _Alternative(words, self._share_late * model.dt, max(self._delays), 0.15, True, True)
+            )
+        for name, span in zip(model.drives, model.span):
+            words = f"{name} has a dead zone of {{0}} {plant.units.get(name, '')}".strip()
+            self.bank.append(_Alternative(words, _ZONE * float(span), 0.2 * float(span), 0.25))
+        self.forget()
+
+    def forget(self) -> None:
+        """Start afresh."""
+        self.said, self._at, self._sd, self.denies = "", 0, 0.0, False
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin a new window; what is known stays."""
+        if self.spread is not None:
+            self._history: deque[_Row] = deque(maxlen=2 * self.window + 1)
+            self._count = 0
+
+    def note(self, observer: Observer, y: Array, u: Array, d: Array) -> None:
+        """Note a sample: the filter after reading y (n_y,), and what was applied before it, drives u (n_u,)
+        and measured disturbances d (n_d,)."""
+        if self.spread is None:
+            return
+        if too_weak(observer):
+            self.restart()
+            return
+        x, w = observer.now.copy(), observer.w.copy()
+        self._history.append(_Row(x, w, observer.reading(), y, u, d))
+        self._count += 1
+        if self._count >= _FEWEST and self._count % max(1, self.window // 6) == 0:
+            found = self.misfit(observer)
+            if found is not None:
+                self._report(found)
+
+    def _report(self, found: Misfit) -> None:
+        side = np.where([one.two_sided for one in self.bank], np.sign(found.size), 1.0)
+        z, own = side * found.z, 3 * len(self._rows)
+        # what an output shows is named before what drives do, and a drive only with what it may do
+        named = [at < own or abs(found.size[at]) * one.unit < one.most for at, one in enumerate(self.bank)]
+        named = named[:own] if np.max(z[:own]) >= REPORTED else named
+        at = int(np.argmax(np.where(named, (side * found.size / found.sd)[: len(named)], -np.inf)))
+        if np.max(z) >= REPORTED or found.chi >= MISFIT:
+            self.said = f"{self.bank[at].reported(float(found.size[at]))}: identify the plant anew"
+            self._at, self._sd = at, float(found.sd[at])
+        elif self.said and found.sd[self._at] <= 2 * self._sd and z[self._at] < TAKEN_BACK:
+            self.said = ""
+        self.denies = not self.said
+
+    def misfit(self, observer: Observer) -> Misfit | None:
+        """Return what the last window says; None where the model's run over it is not finite."""
+        model, spread = self.model, self.spread
+        rows = list(self._history)
+        before, rows = rows[: -self.window], rows[-self.window :]
+        if spread is None or len(rows) < _FEWEST:
+            return None
+        first, rows = rows[0], rows[1:]
+        u, d, y = (np.array([getattr(row, name) for row in rows]) for name in ("u", "d", "y"))
+        n_x, n_w, n_t = model.n_x, len(first.w), spread.shape[1]
+        scale = np.concatenate([_STATE * observer.unit, np.sqrt(observer.P0 + first.w**2)])
+        offset, found = observer.offset + observer.found_offset, observer.disturbance
+
+        def run(z: Array, drives: Array) -> Array:
+            """Return the outputs (B, N sub + 1, n_y) of unknowns z (B, m) under drives (B|1, N, n_u)."""
+            xw = np.concatenate([first.x, first.w]) + z[:, : n_x + n_w] * scale
+            x, w, rest = xw[:, :n_x], xw[:, n_x:], z[:, n_x + n_w :]
+            pushed = drives * (1 + _GAIN * rest[:, None, n_t:])
+            fine = np.repeat(
+                model.inputs(pushed + (w @ found.on_drive.T * model.span)[:, None]), model.sub, axis=1
+            )
+            held = np.repeat(d + (w @ found.on_disturbance.T)[:, None], model.sub, axis=1)
+            numbers = _numbers(self.plant, rest[:, :n_t] @ spread.T)
+            shown, _ = model.model.rollout(x, fine, held, numbers, model.dt / model.sub)
+            return np.asarray(shown) + (w @ found.on_output.T)[:, None] + offset
+
+        m = n_x + n_w + n_t + model.n_u
+        z, weight = np.zeros(m), np.where(np.isfinite(y), 1 / np.sqrt(observer.R), 0.0)
+        seen, tried = np.nan_to_num(y), np.vstack([np.zeros(m), _TRIED * np.eye(m)])
+        with np.errstate(all="ignore"):  # a run that diverges is found below
+            for _ in range(2):
+                shown = run(z + tried, u[None])
+                at_rows = shown[:, model.sub :: model.sub]
+                J = ((at_rows[1:] - at_rows[0]) * weight / _TRIED).reshape(m, -1)
+                r = ((seen - at_rows[0]) * weight).ravel() + z @ J
+                if not (np.isfinite(J).all() and np.isfinite(r).all()):
+                    return None
+                last, z = z, np.linalg.solve(J @ J.T + np.eye(m), J @ r)
+            each = np.eye(model.n_u)[:, None]
+            late = u + each * self._share_late * (np.vstack([first.u, u[:-1]]) - u)
+            cut = np.sign(u) * np.maximum(np.abs(u) - each * _ZONE * model.span, 0.0)
+            other = run(np.repeat(last[None], 2 * model.n_u, axis=0), np.concatenate([late, cut]))
+        of_drives = other[:, model.sub :: model.sub] - at_rows[0]
+        a = np.concatenate([self._signatures(before, first, shown[0]), of_drives])
+        return self._tested(J, (a * weight).reshape(len(a), -1), r)
+
+    def _signatures(self, before: Sequence[_Row], first: _Row, shown: Array) -> Array:
+        """Return what each alternative of an output adds to the readings (n, N, n_y), by its unit."""
+        model, sub = self.model, self.model.sub
+        step, made = model.dt / sub, []
+        past = np.array([row.shown for row in (*before, first)])
+        lead = sub * (len(past) - 1)
+        t = step * (np.arange(lead + len(shown)) - lead)
+        for i, D in zip(self._rows, self._delays):
+            ahead = np.interp(t[:lead], t[: lead + 1 : sub], past[:, i])
+            line = np.concatenate([ahead, shown[:, i]])
+
+            def through(lag: float, line: Array = line) -> Array:
+                keep = np.exp(-step / lag)
+                return np.asarray(lfilter([1 - keep], [1, -keep], line, zi=[keep * line[0]])[0])
+
+            late, lagged = np.interp(t - D / 8, t, line), line + (through(_LAG * D) - line) / (8 * _LAG)
+            for changed in (late, lagged, through(_SLOW * D)):
+                column = np.zeros(((len(shown) - 1) // sub, model.n_y))
+                column[:, i] = (changed - line)[lead + sub :: sub]
+                made.append(column)
+        return np.array(made)
+
+    def _tested(self, J: Array, a: Array, r: Array) -> Misfit:
+        """Return what residuals r (n,) say of alternatives a (k, n), all in standard deviations of readings;
+        J (m, n) are the unknowns'."""
+        tolerated = np.array([one.tolerated for one in self.bank])
+        granted = np.array([one.granted for one in self.bank])
+        known = np.vstack([J, (tolerated[:, None] * a)[granted]])
+        K = np.linalg.inv(known @ known.T + np.eye(len(known)))
+        by_r, by_a = (v - v @ known.T @ K @ known for v in (r, a))  # times V^-1
+        q = np.maximum(np.sum(a * by_a, axis=1), 1e-12)
+        size = a @ by_r / q
+        z = size / np.sqrt(1 / q + np.where(granted, 0.0, tolerated**2))
+        return Misfit(size, 1 / np.sqrt(q), z, float(r @ by_r) / max(1, np.count_nonzero(r)))
+
+
+def _of_output(name: str, D: float) -> list[_Alternative]:
+    """Return what may be off about an output of apparent delay D [s]."""
+    by = f"{name} is {{1}} than the model by {{0}} s"
+    return [
+        _Alternative(by, D / 8, 2 * D, 0.1, two_sided=True),
+        _Alternative(by, D / 8, 2 * D, 0.1),
+        _Alternative(f"{name} has a second mass, for {{0}} % of its heat", 100.0, 50.0, 0.015),
+    ]
+
+
+def _posterior(plant: Plant) -> Array | None:
+    """Return L (n_free, n) with L L' the covariance of theta; None where nothing states it."""
+    if plant.covariance is not None:
+        covariance = np.asarray(plant.covariance)
+    elif plant.samples is not None and len(plant.samples) > 1:
+        drawn = np.asarray(plant.samples, dtype=float)
+        logs = plant.log_scaled
+        covariance = np.cov(np.where(logs, np.log(np.where(logs, drawn, 1.0)), drawn), rowvar=False)
+    else:
+        return None
+    size, axes = np.linalg.eigh(np.atleast_2d(covariance))
+    return np.asarray(axes * np.sqrt(np.maximum(size, 0.0)))
+
+
+def _numbers(plant: Plant, change: Array) -> Array:
+    """Return the parameters (B, n_p) of changes (B, n_free) of theta."""
+    p = np.repeat(plant.p[None], len(change), axis=0)
+    p[:, [plant.model.parameters.index(name) for name in plant.free]] = plant.natural(plant.theta + change)
+    return p
