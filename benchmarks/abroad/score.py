@@ -1,4 +1,4 @@
-"""What ``identify`` says of ten public sets, beside what is true on the half that it has not seen.
+"""What ``identify`` says of public sets, beside what is true on the half that it has not seen.
 
     python benchmarks/abroad/score.py FOLDER [--sets luca,house] [--each]
 
@@ -12,10 +12,11 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from foreign_sets import SETS, ForeignSet, load
+from foreign_sets import ForeignSet, load, present
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, column
@@ -36,6 +37,12 @@ def mean_rmse(run: FreeRun) -> float:
     return float(np.mean([score.rmse for score in run.scores.values()]))
 
 
+def mean_share(errors: Sequence[float], some: ForeignSet, outputs: Sequence[str]) -> float:
+    """Return the mean over outputs of errors over the spread of what is scored, for units that differ."""
+    rows = some.test["time"].values - some.test["time"].values[0] >= some.warmup
+    return float(np.mean([e / np.nanstd(column(some.test, y)[rows]) for e, y in zip(errors, outputs)]))
+
+
 def gain_off(plant: Plant, log: Log, output: str) -> float:
     """Return by what share of the inputs' effect a run differs from the plant, by least squares."""
     effect = between_runs(plant, [log], 1.0)[output]
@@ -52,9 +59,10 @@ def score_set(some: ForeignSet, each: bool) -> None:
         return
     cpu = time.process_time() - began
     run = run_over(found.plant, some)
+    share = mean_share([score.rmse for score in run.scores.values()], some, list(run.scores))
     print(
-        f"{some.name:10s} {found.model:9s} RMSE {mean_rmse(run):.3f} {'good' if found.good else '-':4s} "
-        f"{cpu:4.0f} s CPU  {found.plant.scores.structure} dt {found.plant.dt:g}",
+        f"{some.name:10s} {found.model:9s} RMSE {mean_rmse(run):.3f} ({share:.3f} of the spread) "
+        f"{'good' if found.good else '-':4s} {cpu:4.0f} s CPU  {found.plant.scores.structure} dt {found.plant.dt:g}",
         flush=True,
     )
     band = free_run_band(found.plant, some.test, run.log, level=0.9)
@@ -89,10 +97,10 @@ def score_set(some: ForeignSet, each: bool) -> None:
 def main() -> None:
     words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     words.add_argument("folder", type=Path)
-    words.add_argument("--sets", default=",".join(SETS))
+    words.add_argument("--sets", help="separated by commas; where absent, all whose files are there")
     words.add_argument("--each", action="store_true")
     given = words.parse_args()
-    for name in given.sets.split(","):
+    for name in given.sets.split(",") if given.sets else present(given.folder):
         score_set(load(given.folder, name), given.each)
 
 
