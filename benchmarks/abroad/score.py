@@ -62,7 +62,8 @@ def score_set(some: ForeignSet, each: bool) -> None:
     share = mean_share([score.rmse for score in run.scores.values()], some, list(run.scores))
     print(
         f"{some.name:10s} {found.model:9s} RMSE {mean_rmse(run):.3f} ({share:.3f} of the spread) "
-        f"{'good' if found.good else '-':4s} {cpu:4.0f} s CPU  {found.plant.scores.structure} dt {found.plant.dt:g}",
+        f"{'good' if found.good else '-':4s} {cpu:4.0f} s CPU  "
+        f"{found.plant.scores.structure} dt {found.plant.dt:g}",
         flush=True,
     )
     band = free_run_band(found.plant, some.test, run.log, level=0.9)
