@@ -149,6 +149,7 @@ def test_words_reach_the_fit_by_their_meaning(room: SimpleNamespace) -> None:
 def test_how_a_table_is_read_is_passed_on_and_the_plant_is_named_after_the_log(room: SimpleNamespace) -> None:
     done = room.bench.run("identify", "good.csv@:3", "--columns", "time_s,-,t1", "--dt", "2")
     assert (done.code, "wrote good_plant.json" in done.out) == (0, True)
+    assert done.err.endswith("next: thermogrip validate good_plant.json LOG\n")
     assert [(call.columns, call.dt) for call in room.read] == [(("time_s", "-", "t1"), 2.0)] * len(room.read)
 
 

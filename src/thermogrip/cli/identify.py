@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
+
 from thermogrip.cli import options as cli
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.parallel import sub_progress
@@ -37,6 +39,16 @@ def _known_models(value: str) -> str:
     return value
 
 
+def _beside_log(ctx: typer.Context, value: Path | None) -> Path:
+    """Return where the plant goes: LOG_plant.json where nothing names it (``callback=``)."""
+    if value is not None:
+        return value
+    from thermogrip.datasets.log_files import split_cut
+    from thermogrip.datasets.tables import file_stem
+
+    return Path(f"{file_stem(split_cut(ctx.params['paths'][0])[0])}_plant.json")
+
+
 Warmup = Annotated[
     float, cli.opt("--warmup", "S", "Measured outputs of these first seconds may set the state.", min=0)
 ]
@@ -48,7 +60,8 @@ Average = Annotated[
 def identify(
     paths: cli.LogFiles,
     out: Annotated[
-        Path | None, cli.opt("--out", "FILE.json", "Where the plant goes; where absent, LOG_plant.json.")
+        Path | None,
+        cli.opt("--out", "FILE.json", "Where the plant goes; where absent, LOG_plant.json.", _beside_log),
     ] = None,
     network: Annotated[
         str | None,
@@ -106,11 +119,7 @@ def identify(
     Checks the data, fits candidate models, scores each by free run on held-out data, keeps the best one.
     """
     wanted = cli.comma(models) or ()
-    if out is None:
-        from thermogrip.datasets.log_files import split_cut
-        from thermogrip.datasets.tables import file_stem
-
-        out = Path(f"{file_stem(split_cut(paths[0])[0])}_plant.json")
+    assert out is not None  # its callback names one
     cli.new_file(out, (".json",))
     roles = cli.comma(inputs), cli.comma(outputs), cli.comma(disturbances)
     if columns is None:
