@@ -25,7 +25,7 @@ from thermogrip.sysid.blackbox.fit import BLACK_BOXES, fit_black_box
 from thermogrip.sysid.identification import stated_error
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run
-from thermogrip.sysid.validation.prediction_bands import between_runs, free_run_band
+from thermogrip.sysid.validation.prediction_bands import between_runs
 
 
 def run_over(plant: Plant, some: ForeignSet) -> FreeRun:
@@ -66,7 +66,7 @@ def score_set(some: ForeignSet, each: bool) -> None:
         f"{found.plant.scores.structure} dt {found.plant.dt:g}",
         flush=True,
     )
-    band = free_run_band(found.plant, some.test, run.log, level=0.9)
+    band = run.band(0.9)
     scored = np.asarray(run.log["scored"].values) > 0
     for name, score in run.scores.items():
         rows = [row for row in found.rows if row.held_out and row.model == found.model and row.output == name]
@@ -75,11 +75,11 @@ def score_set(some: ForeignSet, each: bool) -> None:
         miss = np.abs(column(some.test, name) - column(run.log, name))[scored]
         half = band.half[name][scored]
         interval = float(np.mean(2 * half + 20 * np.maximum(miss - half, 0.0)))
+        day = "" if some.same_run else f", gain off by {gain_off(found.plant, some.test, name):+.3f}"
         print(
-            f"    {name}: stated {stated:.3g}, other half {score.rmse:.3g} "
-            f"({score.rmse / stated:.2f} times), band holds {band.inside[name]:.2f}, "
-            f"interval score {interval:.3g}"
-            + ("" if some.same_run else f", gain off by {gain_off(found.plant, some.test, name):+.3f}"),
+            f"    {name}: stated {stated:.3g}, other half {score.rmse:.3g} ({score.rmse / stated:.2f} times, "
+            f"{score.rmse / band.expected[name]:.2f} by the band), band holds {band.inside[name]:.2f}, "
+            f"interval score {interval:.3g}{day}",
             flush=True,
         )
     for row in dict.fromkeys((r.model, r.structure) for r in found.rows if r.held_out) if each else ():

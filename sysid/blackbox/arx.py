@@ -71,11 +71,11 @@ def arx_family(
     )
     couplings = (False, True) if len(grid.outputs) > 1 else (True,)
     for some in default_terms(grid) if terms is None else terms:
-        regression = _regress(grid, some, max(poles), max(zeros) + max(delays) - 1)
+        regression, orders = _deepest(grid, some, [poles, zeros, delays])
         if regression is None:
             continue
         # with products of inputs only the smaller half, for their number multiplies the structures
-        orders = [part[:2] if some else part for part in (poles, zeros, delays)]
+        orders = [part[:2] if some else part for part in orders]
         for (na, nb, nk), coupled in product(product(*orders), couplings):
             for switched in (False, True) if moving and coupled else (False,):
                 tried = _Orders(na, nb, nk, coupled, switched)
@@ -94,6 +94,20 @@ def _structure(grid: Grid, terms: tuple[str, ...], orders: _Orders) -> Structure
     label += ", coupled" if orders.coupled and n_y > 1 else ""
     label += f", switched by {' and '.join(grid.switches)}" if orders.switched else ""
     return Structure(label + (f", with {', '.join(terms)}" if terms else ""), size)
+
+
+def _deepest(
+    grid: Grid, terms: tuple[str, ...], orders: list[Sequence[int]]
+) -> tuple[_Regression | None, list[Sequence[int]]]:
+    """Return the regression of as many lags as the rows allow, and the orders, delays last, that it has: of
+    short logs with many signals the longest delays are left out, then the highest orders."""
+    while True:
+        poles, zeros, delays = orders
+        regression = _regress(grid, terms, max(poles), max(zeros) + max(delays) - 1)
+        if regression is not None or max(map(len, orders)) == 1:
+            return regression, orders
+        which = slice(2, 3) if len(delays) > 1 else slice(0, 2)
+        orders[which] = [part[:-1] or part for part in orders[which]]
 
 
 def _regress(grid: Grid, terms: tuple[str, ...], deep_y: int, deep_w: int) -> _Regression | None:

@@ -320,7 +320,7 @@ def test_a_plant_is_scored_log_by_log_beside_its_baselines(bench: Bench, stand_i
         log=SimpleNamespace(attrs={"name": "good@:100"}), scores=score(0.1), one_step=score(0.2),
         naive={"no_input": score(0.3), "mean": score(0.4)},
         residual=SimpleNamespace(to_json=lambda: {"minutes": 1.0}), notes=("a note",),
-        band=lambda: Band(0.9, {}, {"t_tank": 0.875, "t_lost": np.nan}, 12, "its errors"),
+        band=lambda: Band(0.9, {}, {"t_tank": 0.875, "t_lost": np.nan}, 12, "its errors", {"t_tank": 0.3}),
     )  # fmt: skip
     runs = stand_in("thermogrip.sysid.validation.free_run.free_run", run)
     sections = stand_in("thermogrip.report.plant.free_run_section", "a section")
@@ -353,7 +353,7 @@ def test_a_plant_is_scored_log_by_log_beside_its_baselines(bench: Bench, stand_i
     one = {"log": "good@:100", "outputs": table(0.1), "one_step": table(0.2), "left": {"minutes": 1.0},
            "naive": {"no_input": table(0.3), "mean": table(0.4)}, "notes": ["a note"],
            "band": {"level": 0.9, "coverage": {"t_tank": 0.875, "t_lost": None}, "own_error": "its errors",
-                    "draws": 12}}  # fmt: skip
+                    "expected_rmse": {"t_tank": 0.3}, "draws": 12}}  # fmt: skip
     repairs = {"good@:100": ["taken from the start to 100 s"], "good@100:200": ["taken from 100 s to 200 s"]}
     logs = [one, one | {"log": "good@100:200"}]
     assert json.loads(bench.run(*words, "--json").out) == {"logs": logs, "repairs": repairs}

@@ -200,9 +200,15 @@ def test_one_log_states_what_another_run_may_add_and_three_do_not():
     expected = np.hypot(stated_error(held, "t"), np.sqrt(np.mean(varied**2)))
     assert one.plant.scores.new_run_rmse["t"] == pytest.approx(expected)
     assert f"on another run about t {expected:.2g} degC" in one.verdict
+    effect = float(np.sqrt(np.mean(between_runs(one.plant, [plant_log()], 1.0)["t"] ** 2)))
+    assert one.plant.scores.input_effect["t"] == pytest.approx(effect)
+    unlike = np.hypot(stated_error(held, "t"), 0.18 * effect)
+    assert one.plant.scores.other_kind_rmse["t"] == pytest.approx(unlike)
+    assert f"about t {unlike:.2g} degC, its gain off by 18 %" in one.verdict
+    assert "good for simulation and control on runs like these" in one.verdict
     logs = [plant_log(500, seed=s, name=name) for s, name in enumerate("abc")]
     three = identify(logs, models=["oe"], average=2.0, draws=0)
-    assert three.plant.scores.new_run_rmse == {}
+    assert three.plant.scores.new_run_rmse == three.plant.scores.other_kind_rmse == {}
     assert "another run" not in three.verdict
 
 

@@ -400,6 +400,7 @@ def run_answer(name: str, run: FreeRun, band: Band) -> dict[str, Any]:
         "band": {
             "level": band.level,
             "coverage": {output: share if share == share else None for output, share in band.inside.items()},
+            "expected_rmse": band.expected,
             "own_error": band.own_error,
             "draws": band.draws,
         },
@@ -439,7 +440,7 @@ def simulate(
     if bands:
         from thermogrip.sysid.validation.prediction_bands import free_run_band
 
-        for name, half in free_run_band(loaded, log, simulated).half.items():
+        for name, half in free_run_band(loaded, log, simulated, warmup=warmup).half.items():
             for end, sign in (("low", -1), ("high", 1)):
                 attrs = {"units": simulated[name].attrs["units"], "role": "other"}
                 simulated[f"{name}_{end}"] = ("time", column(simulated, name) + sign * half, attrs)
