@@ -27,6 +27,7 @@ from thermogrip.sysid.blackbox.missing_data import MANY, expected_moments
 from thermogrip.sysid.blackbox.order_selection import (
     Structure,
     as_state_space,
+    column_sizes,
     default_terms,
     drives,
     with_spread,
@@ -131,7 +132,7 @@ def _regress(grid: Grid, terms: tuple[str, ...], deep_y: int, deep_w: int) -> _R
     if not blocks or sum(map(len, blocks)) < 2 * blocks[0].shape[1]:
         return None
     X, Y = np.concatenate(blocks), np.concatenate(targets)
-    size = np.maximum(np.linalg.norm(X, axis=0), 1e-12)
+    size = column_sizes(np.linalg.norm(X, axis=0))
     return _Regression((X / size).T @ (X / size), (X / size).T @ Y, size, deep)
 
 
@@ -145,7 +146,7 @@ def _expect(grid: Grid, terms: tuple[str, ...], deep_y: int, deep_w: int) -> _Re
     found = expected_moments(grid.segments, drives(grid, terms), on, past_y=deep_y, past_w=deep_w)
     if found.read < 2 * len(grid.outputs) * len(found.gram):
         return None
-    size = np.maximum(np.sqrt(np.diag(found.gram)), 1e-12)
+    size = column_sizes(np.sqrt(np.diag(found.gram)))
     return _Regression(found.gram / size / size[:, None], found.cross / size[:, None], size, deep)
 
 

@@ -297,6 +297,12 @@ def drives(grid: Grid, terms: Sequence[str]) -> list[Array]:
     return [column * moves for column in w]
 
 
+def column_sizes(norms: Array) -> Array:
+    """Return what the columns of a regression are divided by: their norms, and 1 for one that is zero, whose
+    weight would otherwise be rounding, scaled up."""
+    return np.where(norms > 1e-12, norms, 1.0)
+
+
 def default_terms(grid: Grid, *, switched: bool = True) -> tuple[tuple[str, ...], ...]:
     """Return sets of products worth trying: none, magnitudes of signed inputs, those with a moving switch."""
     u = np.concatenate([segment.u for segment in grid.segments])

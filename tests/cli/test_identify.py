@@ -80,9 +80,9 @@ def room(bench: Bench, stand_in: StandIn, monkeypatch: pytest.MonkeyPatch) -> Si
     made.read = stand_in("thermogrip.datasets.log_files.read_log", log)
     made.networks = stand_in("thermogrip.cli.options.find_network", load_network)
     made.fits = stand_in(f"{IDENTIFICATION}.identify", fit)
-    made.misfits = stand_in(
-        "thermogrip.sysid.plant.log_grid.misfit",
-        lambda network, _: None if network.name == made.like else UserError("lacks a column"),
+    made.shipped = stand_in(
+        "thermogrip.sysid.data.shipped_networks.shipped_network",
+        lambda _: load_network(made.like) if made.like in builtin_networks() else None,
     )
     stand_in("thermogrip.sysid.greybox.identifiability.identifiability_report", ["U is identifiable"])
     made.sections = stand_in("thermogrip.report.plant.identification_sections", ["a section"])
@@ -115,9 +115,8 @@ def test_the_network_is_the_one_asked_for_or_a_shipped_one_whose_columns_the_log
     roles = None if network is None else roles_of(load_network(network))
     chosen = network is not None and "--network" not in words
     assert [call.known for call in room.read] == [None] * chosen + [roles]
-    tried = [] if "--network" in words or words == "--models arx,oe" else builtin_networks()
-    tried = tried[: tried.index(like) + 1] if like in tried else tried
-    assert [call.args[0].name for call in room.misfits] == [*tried]
+    looked = "--network" not in words and words != "--models arx,oe"
+    assert [[log.attrs["name"] for log in call.args[0]] for call in room.shipped] == [["log a"]] * looked
     assert not fit.leave_one_out
 
 

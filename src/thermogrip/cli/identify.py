@@ -139,7 +139,10 @@ def identify(
     table: dict[str, Any] = {"columns": cli.comma(columns), "dt": dt}
     if wanted_network is None:
         logs = cli.load_logs(paths, *roles, **table)
-        wanted_network = _shipped_network(logs) if a_network else None
+        if a_network:
+            from thermogrip.sysid.data.shipped_networks import shipped_network
+
+            wanted_network = shipped_network(logs)
     if wanted_network is not None:  # what a network calls its own has the role that it has there
         logs = cli.load_logs(paths, *roles, known=roles_of(wanted_network), **table)
     repairs = _repaired(console, logs)
@@ -225,18 +228,6 @@ def _repaired(console: Console, logs: Sequence[Log]) -> dict[str, list[str]]:
         for line in found[log.attrs["name"]]:
             console.warn(f"{log.attrs['name']}: {line}")
     return found
-
-
-def _shipped_network(logs: Sequence[Log]) -> GreyModel | None:
-    """Return the network of the package whose signals all logs have, if there is one."""
-    from thermogrip.sysid.models.network_spec import builtin_networks
-    from thermogrip.sysid.plant.log_grid import misfit
-
-    for name in builtin_networks():
-        network = cli.find_network(name)
-        if all(misfit(network, log) is None for log in logs):
-            return network
-    return None
 
 
 def _growable(network: GreyModel | None) -> NetworkModel:
