@@ -395,6 +395,7 @@ def identify(
     seed: int = 0,
     workers: Workers = 1,
     progress: Progress | None = None,
+    early: Callable[[Sequence[Row]], None] | None = None,
 ) -> Identification:
     """Find the plant behind one or several logs.
 
@@ -426,6 +427,9 @@ def identify(
         same.
     progress : callable, optional
         Called with (fraction done, what).
+    early : callable, optional
+        Called once with the rows of the other black boxes before neural models, which take longest, are
+        fitted; with one worker only.
 
     Returns
     -------
@@ -470,7 +474,7 @@ def identify(
     settings: dict[str, Any] = {
         "inputs": u, "outputs": y, "disturbances": d, "average": average, "order": order, "delay": delay,
     }  # fmt: skip
-    fits, rows, refused = _fit_all(boxes, logs, settings, parts, workers)
+    fits, rows, refused = _fit_all(boxes, logs, settings, parts, workers, early)
     best = None
     if fits:
         best = choose_black_box(fits, _between(fits, logs))
@@ -635,7 +639,12 @@ def _for_network(
 
 
 def _fit_all(
-    boxes: Sequence[str], logs: Sequence[Log], settings: dict[str, Any], parts: _Parts, workers: Workers
+    boxes: Sequence[str],
+    logs: Sequence[Log],
+    settings: dict[str, Any],
+    parts: _Parts,
+    workers: Workers,
+    early: Callable[[Sequence[Row]], None] | None = None,
 ) -> tuple[list[BlackBoxFit], list[Row], list[str]]:
     """Return each black box fitted to all logs, the rows of its folds, and why others could not be fitted.
 
@@ -643,13 +652,18 @@ def _fit_all(
     """
     found: dict[str, BlackBoxFit | str] = {}
 
+    def others() -> list[BlackBoxFit]:
+        return [some for kind, some in found.items() if kind != "neural" and isinstance(some, BlackBoxFit)]
+
     def pointless() -> bool:
-        fits = [some for kind, some in found.items() if kind != "neural" and isinstance(some, BlackBoxFit)]
+        fits = others()
         return bool(fits) and beyond_reach(fits, _between(fits, logs))
 
     if workers == 1:
         for kind in sorted(boxes, key=lambda kind: kind == "neural"):
             if kind != "neural" or not pointless():
+                if kind == "neural" and early is not None and (fits := others()):
+                    early([row for each in fits for row in fold_rows(each)])
                 report = parts.part(kind)
                 found[kind] = _fit_or_refusal((kind, logs, settings | {"progress": report}))
                 if report is not None:

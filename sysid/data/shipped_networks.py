@@ -88,7 +88,7 @@ def _by_name(network: Network, log: Log) -> dict[str, str] | None:
 
 def _by_role(network: Network, logs: Sequence[Log]) -> dict[str, str] | None:
     """Return the column of each signal by role, unit and order; None where they are not as many."""
-    log, found = logs[0], {}
+    log, found = logs[0], dict[str, str]()
     for role, table in zip(("input", "disturbance", "output"), _tables(network)):
         columns = [name for name in names(log, role) if _moves(logs, name)]
         wanted = [name for name, item in table.items() if not getattr(item, "switch", False)]

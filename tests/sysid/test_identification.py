@@ -242,6 +242,28 @@ def test_progress_goes_from_zero_to_one():
     assert all("arx" in what for _, what in calls)
 
 
+def test_other_models_are_shown_before_neural_ones_are_fitted(monkeypatch):
+    shown, fitted = [], []
+    fit = identification.fit_black_box
+
+    def followed(kind, *given, **more):
+        fitted.append(kind)
+        return fit(kind if kind != "neural" else "arx", *given, **more)
+
+    monkeypatch.setattr(identification, "fit_black_box", followed)
+    monkeypatch.setattr(identification, "beyond_reach", lambda *_: False)
+
+    def early(rows):
+        shown.append(([*fitted], {(row.model, row.log) for row in rows}))
+
+    identify(plant_log(), models=["neural", "oe", "arx"], average=2.0, draws=0, early=early)
+    assert shown == [
+        (["oe", "arx"], {(kind, f"block {k} of 4") for kind in ("oe", "arx") for k in range(1, 5)})
+    ]
+    identify(plant_log(), models=["arx"], average=2.0, draws=0, early=early)
+    assert len(shown) == 1
+
+
 def test_a_record_of_ninety_slow_rows_is_fitted():
     # a heated room logged each half hour: 90 rows were refused as too short to hold a part out
     rng, t = np.random.default_rng(3), 1800.0 * np.arange(90)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from thermogrip.sysid.export.dynamics import Dynamics
     from thermogrip.sysid.greybox import Posterior
     from thermogrip.sysid.growth import Growth
-    from thermogrip.sysid.identification import Identification
+    from thermogrip.sysid.identification import Identification, Row
     from thermogrip.sysid.models.model import GreyModel
     from thermogrip.sysid.models.network import NetworkModel
     from thermogrip.sysid.plant.plant import Plant
@@ -173,6 +173,7 @@ def identify(
             seed=seed,
             workers=workers,
             progress=sub_progress(progress, 0.4 if grow else 0.0, 0.6 if posterior else 1.0),
+            early=lambda rows: console.early(*_so_far(rows)),
         )
         plant = found.plant
         if network and wanted_network is not None and all(row.model != "network" for row in found.rows):
@@ -218,6 +219,19 @@ def _sampled(
     if record.converged:
         chain.unlink(missing_ok=True)
     return plant, record, ""
+
+
+def _so_far(rows: Sequence[Row]) -> tuple[Any, ...]:
+    """Return in a line, and as a table, how the models that are fitted before neural ones err."""
+    from thermogrip.report.plant import held_out_table
+    from thermogrip.sysid.identification import relative_error
+
+    errors: dict[str, list[float]] = {}
+    for row in rows:
+        errors.setdefault(row.model, []).append(relative_error(row))
+    means = ", ".join(f"{model} {sum(each) / len(each):.2g}" for model, each in errors.items())
+    line = f"so far {means} of the error without input; neural models are fitted next"
+    return line, "So far (RMSE of free runs); neural models are fitted next", *held_out_table(rows)
 
 
 def _repaired(console: Console, logs: Sequence[Log]) -> dict[str, list[str]]:
@@ -274,7 +288,7 @@ def _show_identified(
             share = f"{100 * term.share:.0f} % of the residual's variance, {term.tau:.3g} s"
             console.say(f"before growth, the residual of {term.output} correlated with {term.term} ({share})")
     console.table("Columns of the logs", *signal_table(found))
-    console.table("Free runs (RMSE)", *held_out_table(found))
+    console.table("Free runs (RMSE)", *held_out_table(found.rows))
     if plant.free:
         console.table("Free parameters of the plant", *parameter_table(plant))
     if dynamics is not None:
