@@ -54,6 +54,7 @@ from thermogrip.sysid.blackbox.order_selection import HARDLY_MORE, excess_within
 from thermogrip.sysid.data.data_quality import DataCheck, Evidence, check_data, evidence
 from thermogrip.sysid.plant.fit_record import (
     HELD_OUT_SHARE,
+    OTHER_KIND_GAIN_SD,
     RUN_GAIN_LARGE,
     RUN_GAIN_SD,
     SEVERAL,
@@ -67,6 +68,7 @@ from thermogrip.sysid.validation.free_run import FreeRun, free_run, no_input_bas
 from thermogrip.sysid.validation.prediction_bands import (
     SHORT,
     between_runs,
+    beyond_range,
     expected_coverage,
     expected_error,
 )
@@ -281,7 +283,7 @@ def verdict_of(model: str, rows: Sequence[Row], checked: DataCheck, whole_logs: 
     numbers = ", ".join(f"{name} {stated_error(held, name):.2g}{unit}" for name, unit in units)
     head = f"{model}: expected RMSE of a free run {numbers} (from {where})"
     if good:
-        return True, f"{head}; good for simulation and control inside what the logs cover"
+        return True, f"{head}; good for simulation and control on runs like these"
     if share < USEFUL <= relative_error(own):
         percent = f"{100 * relative_error(own):.0f} %"
         part = f"on {own.log}, which it is fitted to, its error for {own.output} is {percent}"
@@ -395,6 +397,7 @@ def identify(
     seed: int = 0,
     workers: Workers = 1,
     progress: Progress | None = None,
+    early: Callable[[Sequence[Row]], None] | None = None,
 ) -> Identification:
     """Find the plant behind one or several logs.
 
@@ -426,6 +429,9 @@ def identify(
         same.
     progress : callable, optional
         Called with (fraction done, what).
+    early : callable, optional
+        Called once with the rows of the other black boxes before neural models, which take longest, are
+        fitted; with one worker only.
 
     Returns
     -------
@@ -470,7 +476,7 @@ def identify(
     settings: dict[str, Any] = {
         "inputs": u, "outputs": y, "disturbances": d, "average": average, "order": order, "delay": delay,
     }  # fmt: skip
-    fits, rows, refused = _fit_all(boxes, logs, settings, parts, workers)
+    fits, rows, refused = _fit_all(boxes, logs, settings, parts, workers, early)
     best = None
     if fits:
         best = choose_black_box(fits, _between(fits, logs))
@@ -514,14 +520,29 @@ def identify(
     # what was held out, and a gain that varies; empty where the logs show what differs between runs
     varied = _rms(between_runs(plant, logs))
     other = {name: float(np.hypot(stated_error(mine, name), varied[name])) for name in varied}
+    effect = {} if chosen == "network" else _rms(between_runs(plant, logs, 1.0))
+    beyond = beyond_range(plant, logs) if effect else {}
+    added = {name: np.hypot(OTHER_KIND_GAIN_SD * size, beyond[name]) for name, size in effect.items()}
+    unlike = {name: float(np.hypot(stated_error(mine, name), size)) for name, size in added.items()}
+    units = {row.output: "" if row.unit == "1" else f" {row.unit}" for row in rows}
+    for what, errors, gain in (
+        ("another run", other, RUN_GAIN_SD),
+        ("one unlike them (longer holds, other ranges)", unlike, OTHER_KIND_GAIN_SD),
+    ):
+        if errors:
+            sizes = ", ".join(f"{name} {error:.2g}{units[name]}" for name, error in errors.items())
+            verdict += f"; on {what} about {sizes}, its gain off by {100 * gain:.0f} %"
     if other:
-        units = {row.output: "" if row.unit == "1" else f" {row.unit}" for row in rows}
-        sizes = ", ".join(f"{name} {error:.2g}{units[name]}" for name, error in other.items())
-        verdict += f"; on another run about {sizes}, its gain off by {100 * RUN_GAIN_SD:.0f} %"
         verdict += f" (assumed: it takes {SEVERAL} logs to show how runs differ)"
     covered = evidence(plant, [log_rows(log, plant.inputs, plant.outputs, ()) for log in logs])
     verdict += "; " + covered.sentence(plant.units)
-    scores = replace(plant.scores, held_out=held_out_scores(rows, chosen), new_run_rmse=other)
+    scores = replace(
+        plant.scores,
+        held_out=held_out_scores(rows, chosen),
+        new_run_rmse=other,
+        other_kind_rmse=unlike,
+        input_effect=effect,
+    )
     plant = replace(plant, verdict=verdict, scores=scores)
     searched = tuple(row for some in fits for row in searched_rows(some))
     return Identification(
@@ -621,7 +642,12 @@ def _for_network(
 
 
 def _fit_all(
-    boxes: Sequence[str], logs: Sequence[Log], settings: dict[str, Any], parts: _Parts, workers: Workers
+    boxes: Sequence[str],
+    logs: Sequence[Log],
+    settings: dict[str, Any],
+    parts: _Parts,
+    workers: Workers,
+    early: Callable[[Sequence[Row]], None] | None = None,
 ) -> tuple[list[BlackBoxFit], list[Row], list[str]]:
     """Return each black box fitted to all logs, the rows of its folds, and why others could not be fitted.
 
@@ -629,13 +655,18 @@ def _fit_all(
     """
     found: dict[str, BlackBoxFit | str] = {}
 
+    def others() -> list[BlackBoxFit]:
+        return [some for kind, some in found.items() if kind != "neural" and isinstance(some, BlackBoxFit)]
+
     def pointless() -> bool:
-        fits = [some for kind, some in found.items() if kind != "neural" and isinstance(some, BlackBoxFit)]
+        fits = others()
         return bool(fits) and beyond_reach(fits, _between(fits, logs))
 
     if workers == 1:
         for kind in sorted(boxes, key=lambda kind: kind == "neural"):
             if kind != "neural" or not pointless():
+                if kind == "neural" and early is not None and (fits := others()):
+                    early([row for each in fits for row in fold_rows(each)])
                 report = parts.part(kind)
                 found[kind] = _fit_or_refusal((kind, logs, settings | {"progress": report}))
                 if report is not None:

@@ -1,4 +1,4 @@
-"""What ``identify`` says of ten public sets, beside what is true on the half that it has not seen.
+"""What ``identify`` says of public sets, beside what is true on the half that it has not seen.
 
     python benchmarks/abroad/score.py FOLDER [--sets luca,house] [--each]
 
@@ -12,10 +12,11 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from foreign_sets import SETS, ForeignSet, load
+from foreign_sets import ForeignSet, load, present
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, column
@@ -24,7 +25,7 @@ from thermogrip.sysid.blackbox.fit import BLACK_BOXES, fit_black_box
 from thermogrip.sysid.identification import stated_error
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run
-from thermogrip.sysid.validation.prediction_bands import between_runs, free_run_band
+from thermogrip.sysid.validation.prediction_bands import between_runs
 
 
 def run_over(plant: Plant, some: ForeignSet) -> FreeRun:
@@ -34,6 +35,12 @@ def run_over(plant: Plant, some: ForeignSet) -> FreeRun:
 
 def mean_rmse(run: FreeRun) -> float:
     return float(np.mean([score.rmse for score in run.scores.values()]))
+
+
+def mean_share(errors: Sequence[float], some: ForeignSet, outputs: Sequence[str]) -> float:
+    """Return the mean over outputs of errors over the spread of what is scored, for units that differ."""
+    rows = some.test["time"].values - some.test["time"].values[0] >= some.warmup
+    return float(np.mean([e / np.nanstd(column(some.test, y)[rows]) for e, y in zip(errors, outputs)]))
 
 
 def gain_off(plant: Plant, log: Log, output: str) -> float:
@@ -52,12 +59,14 @@ def score_set(some: ForeignSet, each: bool) -> None:
         return
     cpu = time.process_time() - began
     run = run_over(found.plant, some)
+    share = mean_share([score.rmse for score in run.scores.values()], some, list(run.scores))
     print(
-        f"{some.name:10s} {found.model:9s} RMSE {mean_rmse(run):.3f} {'good' if found.good else '-':4s} "
-        f"{cpu:4.0f} s CPU  {found.plant.scores.structure} dt {found.plant.dt:g}",
+        f"{some.name:10s} {found.model:9s} RMSE {mean_rmse(run):.3f} ({share:.3f} of the spread) "
+        f"{'good' if found.good else '-':4s} {cpu:4.0f} s CPU  "
+        f"{found.plant.scores.structure} dt {found.plant.dt:g}",
         flush=True,
     )
-    band = free_run_band(found.plant, some.test, run.log, level=0.9)
+    band = run.band(0.9)
     scored = np.asarray(run.log["scored"].values) > 0
     for name, score in run.scores.items():
         rows = [row for row in found.rows if row.held_out and row.model == found.model and row.output == name]
@@ -66,11 +75,11 @@ def score_set(some: ForeignSet, each: bool) -> None:
         miss = np.abs(column(some.test, name) - column(run.log, name))[scored]
         half = band.half[name][scored]
         interval = float(np.mean(2 * half + 20 * np.maximum(miss - half, 0.0)))
+        day = "" if some.same_run else f", gain off by {gain_off(found.plant, some.test, name):+.3f}"
         print(
-            f"    {name}: stated {stated:.3g}, other half {score.rmse:.3g} "
-            f"({score.rmse / stated:.2f} times), band holds {band.inside[name]:.2f}, "
-            f"interval score {interval:.3g}"
-            + ("" if some.same_run else f", gain off by {gain_off(found.plant, some.test, name):+.3f}"),
+            f"    {name}: stated {stated:.3g}, other half {score.rmse:.3g} ({score.rmse / stated:.2f} times, "
+            f"{score.rmse / band.expected[name]:.2f} by the band), band holds {band.inside[name]:.2f}, "
+            f"interval score {interval:.3g}{day}",
             flush=True,
         )
     for row in dict.fromkeys((r.model, r.structure) for r in found.rows if r.held_out) if each else ():
@@ -89,10 +98,10 @@ def score_set(some: ForeignSet, each: bool) -> None:
 def main() -> None:
     words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     words.add_argument("folder", type=Path)
-    words.add_argument("--sets", default=",".join(SETS))
+    words.add_argument("--sets", help="separated by commas; where absent, all whose files are there")
     words.add_argument("--each", action="store_true")
     given = words.parse_args()
-    for name in given.sets.split(","):
+    for name in given.sets.split(",") if given.sets else present(given.folder):
         score_set(load(given.folder, name), given.each)
 
 

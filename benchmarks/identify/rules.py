@@ -90,8 +90,8 @@ def problems(folder: Path, wanted: Sequence[str] = ()) -> Iterator[Problem]:
             unit,
             inputs,
             outputs,
-            _record(train, inputs, outputs),
-            _record(test, inputs, outputs),
+            record(train, inputs, outputs),
+            record(test, inputs, outputs),
             (train, test),
         )
 
@@ -123,7 +123,8 @@ def _error(peer: Peer, first: Record, structure: object, last: Record) -> float:
     return float(np.mean(found / np.std(last.y, axis=0))) if np.isfinite(found).all() else np.inf
 
 
-def _record(log: Log, inputs: Sequence[str], outputs: Sequence[str]) -> Record:
+def record(log: Log, inputs: Sequence[str], outputs: Sequence[str]) -> Record:
+    """Return inputs and outputs of a log as rows."""
     time = log["time"].values
 
     def stack(names: Sequence[str]) -> Array:

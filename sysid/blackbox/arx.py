@@ -27,6 +27,7 @@ from thermogrip.sysid.blackbox.missing_data import MANY, expected_moments
 from thermogrip.sysid.blackbox.order_selection import (
     Structure,
     as_state_space,
+    column_sizes,
     default_terms,
     drives,
     with_spread,
@@ -71,11 +72,11 @@ def arx_family(
     )
     couplings = (False, True) if len(grid.outputs) > 1 else (True,)
     for some in default_terms(grid) if terms is None else terms:
-        regression = _regress(grid, some, max(poles), max(zeros) + max(delays) - 1)
+        regression, orders = _deepest(grid, some, [poles, zeros, delays])
         if regression is None:
             continue
         # with products of inputs only the smaller half, for their number multiplies the structures
-        orders = [part[:2] if some else part for part in (poles, zeros, delays)]
+        orders = [part[:2] if some else part for part in orders]
         for (na, nb, nk), coupled in product(product(*orders), couplings):
             for switched in (False, True) if moving and coupled else (False,):
                 tried = _Orders(na, nb, nk, coupled, switched)
@@ -94,6 +95,20 @@ def _structure(grid: Grid, terms: tuple[str, ...], orders: _Orders) -> Structure
     label += ", coupled" if orders.coupled and n_y > 1 else ""
     label += f", switched by {' and '.join(grid.switches)}" if orders.switched else ""
     return Structure(label + (f", with {', '.join(terms)}" if terms else ""), size)
+
+
+def _deepest(
+    grid: Grid, terms: tuple[str, ...], orders: list[Sequence[int]]
+) -> tuple[_Regression | None, list[Sequence[int]]]:
+    """Return the regression of as many lags as the rows allow, and the orders, delays last, that it has: of
+    short logs with many signals the longest delays are left out, then the highest orders."""
+    while True:
+        poles, zeros, delays = orders
+        regression = _regress(grid, terms, max(poles), max(zeros) + max(delays) - 1)
+        if regression is not None or max(map(len, orders)) == 1:
+            return regression, orders
+        which = slice(2, 3) if len(delays) > 1 else slice(0, 2)
+        orders[which] = [part[:-1] or part for part in orders[which]]
 
 
 def _regress(grid: Grid, terms: tuple[str, ...], deep_y: int, deep_w: int) -> _Regression | None:
@@ -117,7 +132,7 @@ def _regress(grid: Grid, terms: tuple[str, ...], deep_y: int, deep_w: int) -> _R
     if not blocks or sum(map(len, blocks)) < 2 * blocks[0].shape[1]:
         return None
     X, Y = np.concatenate(blocks), np.concatenate(targets)
-    size = np.maximum(np.linalg.norm(X, axis=0), 1e-12)
+    size = column_sizes(np.linalg.norm(X, axis=0))
     return _Regression((X / size).T @ (X / size), (X / size).T @ Y, size, deep)
 
 
@@ -131,7 +146,7 @@ def _expect(grid: Grid, terms: tuple[str, ...], deep_y: int, deep_w: int) -> _Re
     found = expected_moments(grid.segments, drives(grid, terms), on, past_y=deep_y, past_w=deep_w)
     if found.read < 2 * len(grid.outputs) * len(found.gram):
         return None
-    size = np.maximum(np.sqrt(np.diag(found.gram)), 1e-12)
+    size = column_sizes(np.sqrt(np.diag(found.gram)))
     return _Regression(found.gram / size / size[:, None], found.cross / size[:, None], size, deep)
 
 

@@ -24,6 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
+from thermogrip.sysid.blackbox.order_selection import column_sizes
 from thermogrip.sysid.plant.log_grid import Segment
 
 MANY = 0.005  # of the rows lack a reading: below it they are left out, for little is lost with them
@@ -131,7 +132,7 @@ class _Em:
 
     def solved(self, gram: Array, cross: Array, square: Array) -> tuple[Array, Array]:
         """Return the regression (n_column, n_y) and the covariance of its innovations."""
-        size = np.maximum(np.sqrt(np.diag(gram)), 1e-12)
+        size = column_sizes(np.sqrt(np.diag(gram)))
         beta = np.linalg.lstsq(gram / size / size[:, None], cross / size[:, None], rcond=1e-12)[0]
         beta = beta / size[:, None]
         rows = sum(len(y) - self.depth for y in self.y)

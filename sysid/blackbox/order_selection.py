@@ -48,6 +48,7 @@ from thermogrip.sysid.plant.log_grid import Grid, Segment
 Array = NDArray[np.float64]
 
 HARDLY_MORE = float(np.log(1.05))  # of log errors
+MORE_BY_LOGS = float(np.log(1.25))  # the same over whole logs
 _AVERAGED = (10, 5, 3)  # structures
 _MOST_ON_ALL = 2.0  # times the worst fold's error: a fit to all data that errs more on them is refused
 _BLOCKS = 4  # of one or two logs
@@ -193,7 +194,7 @@ def choose(
     left = {structure: errors.mean for structure, errors in scored.items()}
     fitted = None
     while fitted is None:
-        structure = _one_standard_error(left)
+        structure = _one_standard_error(left, HARDLY_MORE if len(grid.logs) < SEVERAL else MORE_BY_LOGS)
         fitted = _fit_to_all(grid, family, structure, scored[structure], warmup)
         del left[structure]
     best = scored[structure].mean
@@ -297,6 +298,12 @@ def drives(grid: Grid, terms: Sequence[str]) -> list[Array]:
     return [column * moves for column in w]
 
 
+def column_sizes(norms: Array) -> Array:
+    """Return what the columns of a regression are divided by: their norms, and 1 for one that is zero, whose
+    weight would otherwise be rounding, scaled up."""
+    return np.where(norms > 1e-12, norms, 1.0)
+
+
 def default_terms(grid: Grid, *, switched: bool = True) -> tuple[tuple[str, ...], ...]:
     """Return sets of products worth trying: none, magnitudes of signed inputs, those with a moving switch."""
     u = np.concatenate([segment.u for segment in grid.segments])
@@ -336,12 +343,13 @@ def with_spread(model: StateSpaceModel, grid: Grid, starts: Sequence[Array]) -> 
     return replace(model, spread=spread + 1e-8 * max(np.trace(spread), 1e-12) * np.eye(model.n_x))
 
 
-def excess_within_noise(excess: Array) -> bool:
-    """Return whether paired differences of log errors are zero to within one standard error and 5 percent."""
-    return bool(excess.mean() <= min(excess.std(ddof=1) / np.sqrt(excess.size), HARDLY_MORE))
+def excess_within_noise(excess: Array, most: float = HARDLY_MORE) -> bool:
+    """Return whether paired differences of log errors are zero to within one standard error and 5 percent, or
+    ``most``."""
+    return bool(excess.mean() <= min(excess.std(ddof=1) / np.sqrt(excess.size), most))
 
 
-def _one_standard_error(table: Mapping[Structure, Array]) -> Structure:
+def _one_standard_error(table: Mapping[Structure, Array], most: float = HARDLY_MORE) -> Structure:
     usable = {structure: error for structure, error in table.items() if np.isfinite(error).all()}
     if not usable:
         raise UserError(
@@ -352,7 +360,7 @@ def _one_standard_error(table: Mapping[Structure, Array]) -> Structure:
     best = min(logs, key=lambda s: float(logs[s].mean()))
     good = [best]
     for structure, error in logs.items():
-        if excess_within_noise(error - logs[best]):
+        if excess_within_noise(error - logs[best], most):
             good.append(structure)
     return min(good, key=lambda s: (s.size, float(logs[s].mean())))
 

@@ -189,7 +189,7 @@ def least_squares(
         rows = slice(at * na, (at + 1) * na)
         R[rows, rows], R[rows, n_own:] = part[:na, :na], part[:na, na:]
     R[n_own:, n_own:] = whole[:-1]
-    size = np.maximum(np.sqrt((R[:, :-1] ** 2).sum(axis=0)), 1e-12)
+    size = order_selection.column_sizes(np.sqrt((R[:, :-1] ** 2).sum(axis=0)))
     weights = np.linalg.lstsq(R[:, :-1] / size, R[:, -1], rcond=DEPENDENT)[0] / size
     return weights[n_own:], weights[:n_own].reshape(-1, na)
 
@@ -219,7 +219,7 @@ def arx_start(records: Records, na: int, nb: int, delay: int) -> Array | None:
         gram, right, count = gram + X.T @ X, right + X.T @ y, count + len(y)
     if count < 2 * n:
         return None
-    size = np.maximum(np.sqrt(np.diag(gram)), 1e-12)
+    size = order_selection.column_sizes(np.sqrt(np.diag(gram)))
     a = np.asarray((np.linalg.lstsq(gram / size / size[:, None], right / size, rcond=1e-13)[0] / size)[:na])
     return a if is_stable(a) else None
 

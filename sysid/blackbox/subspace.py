@@ -82,25 +82,32 @@ def subspace_family(
     weightings: Sequence[str] = ("moesp", "cva"),
 ) -> Mapping[Structure, StateSpaceModel]:
     """Return a model for each order, number of block rows f and weighting that the data allow; where absent,
-    ``rows`` are 3, 5, 8, 15 and 30 as far as the data allow, and ``terms`` none and the magnitudes of signed
-    inputs."""
+    ``rows`` are 3, 5, 8, 15 and 30 as far as the data allow (2 where they allow none), and ``terms`` none and
+    the magnitudes of signed inputs."""
     found: dict[Structure, Fitted] = {}
     asked = None if only is None else only.members or (only,)
     longest = max(len(segment.time) for segment in grid.segments)
     sets = default_terms(grid)[:2] if terms is None else terms
     n_drive, n_y = len(grid.inputs) + len(grid.disturbances), len(grid.outputs)
-    sizes = rows or [f for f in (3, 5, 8, 15, 30) if only is not None or 6 * f < longest]
+    few = 1.5 * _columns(3, n_drive, n_y) > sum(max(len(s.time) - 5, 0) for s in grid.segments)
+    sizes = rows or (2, 3, 5, 8, 15, 30)
+    if rows is None and only is None:
+        sizes = [f for f in sizes if 6 * f < longest and (few or f > 2)]
     for some in sets:
         names = {
             (f, w, n): _structure(n, f, w, some, n_drive, n_y)
             for f, w, n in product(sizes, weightings, orders)
-            if n < f
+            if n < f or (f == 2 and n <= n_y)
         }
         wanted = {of: name for of, name in names.items() if asked is None or name in asked}
         found |= {wanted[of]: pair for of, pair in _realised(grid, wanted, some).items()}
     if only is not None and only.members:
         return {only: average(grid, [*found.values()])} if len(found) == len(only.members) else {}
     return {structure: model for structure, (model, _) in found.items()}
+
+
+def _columns(f: int, n_drive: int, n_y: int) -> int:
+    return 2 * f * (n_drive + n_y) + 1
 
 
 def _structure(n: int, f: int, weighting: str, some: Sequence[str], n_drive: int, n_y: int) -> Structure:

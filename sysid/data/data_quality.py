@@ -400,7 +400,7 @@ THIN_MINUTES, THIN_SHARE = 15.0, 0.15  # below either, a side of the drive is th
 class Evidence:
     """What the logs of a fit cover."""
 
-    ranges: dict[str, tuple[float, float]]  # seen in the logs (1st and 99th percentile), in the output's unit
+    ranges: dict[str, tuple[float, float]]  # of inputs and outputs in the logs (1st and 99th percentile)
     minutes: dict[str, float]  # minutes of each kind of drive, such as ``"drive < 0"`` or ``"pump off"``
     total: float  # minutes of all logs together
     thin: tuple[str, ...]  # the kinds that rest on little
@@ -436,9 +436,11 @@ def evidence(plant: Plant, logs: Sequence[Rows]) -> Evidence:
             if minutes[kind] < min(THIN_MINUTES, THIN_SHARE * total):
                 thin.append(kind)
     ranges = {}
-    for k, name in enumerate(plant.outputs):
-        low, high = np.nanpercentile(np.concatenate([rows.y[:, k] for rows in logs]), [1, 99])
-        ranges[name] = (float(low), float(high))
+    u, y = (np.concatenate([getattr(rows, group) for rows in logs]) for group in ("u", "y"))
+    for name, values in (*zip(plant.inputs, u.T), *zip(plant.outputs, y.T)):
+        if name not in plant.model.switches:
+            low, high = np.nanpercentile(values, [1, 99])
+            ranges[name] = (float(low), float(high))
     return Evidence(ranges, minutes, total, tuple(thin))
 
 

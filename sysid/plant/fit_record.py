@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 RUN_GAIN_SD = 0.05  # of the inputs' effect, from run to run, of a plant of too few logs to show it
 RUN_GAIN_LARGE = 0.07  # a large one, with which candidates are compared
+OTHER_KIND_GAIN_SD = 0.18  # from one kind of run to another (pulses, long steps), of a black box
 SEVERAL = 3  # logs of a fit from which on its held-out errors show what differs between runs
 HELD_OUT_SHARE = 0.3  # of each log, where whole logs are not left out
 TAIL = f"last {100 * HELD_OUT_SHARE:.0f} % of "  # how what is held out of a log is called
@@ -126,6 +127,10 @@ class PlantScores:
     posterior: Sampling | None = None
     held_out: list[HeldOut] = field(default_factory=list)  # free runs over what the fit had not seen
     new_run_rmse: dict[str, float] = field(default_factory=dict)  # by output, of a plant of one or two logs
+    other_kind_rmse: dict[str, float] = field(default_factory=dict)  # the same of a run unlike those
+    input_effect: dict[str, float] = field(
+        default_factory=dict
+    )  # of the inputs, rms over the logs of the fit
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of key ``scores`` of ``plant.json``; a default is left out."""

@@ -94,7 +94,7 @@ class FreeRun:
         see :func:`thermogrip.sysid.validation.prediction_bands.free_run_band`."""
         from thermogrip.sysid.validation.prediction_bands import free_run_band  # scipy.special
 
-        return free_run_band(self.plant, self.measured, self.log, level=level)
+        return free_run_band(self.plant, self.measured, self.log, level=level, warmup=self.warmup)
 
 
 def free_run(

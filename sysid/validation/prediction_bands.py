@@ -50,6 +50,17 @@ heater boards, fitted on one day, have gains that are off by 4 to 8 percent on a
 of a third board and of a motor by 0 and 3 percent (rms of the four 4 percent); boards of one kind differ by 5
 to 20 percent.
 
+**A run unlike the fit.** A black box knows nothing of where it has not been. Three things are added to its
+variance, all 0 on a run like those of the fit: the part of v that lies beyond the range of the readings of
+the fit (it may be wrong altogether: losses curve, supplies saturate); by how much the readings of the warm-up
+lie beyond it (another room, to which the model does not know the way); and a gain that is off by
+
+    k min(|ln r|, 1),        r = rms effect of the inputs on this run over that in the fit,
+
+for where losses grow with temperature the gain of a linear model is that of the excursions that it was
+fitted to. Of four heater boards, from one kind of run to another (pulses, long steps), gains are off by .11
+to .27 where |ln r| is .27 to .46 and by .02 to .14 where it is .5 to .6: k = :data:`GAIN_OF_SIZE`.
+
 **Ensemble disagreement.** The members of a :class:`~thermogrip.sysid.models.neural.NeuralModel` were fitted
 to the same rows from different random weights, so they agree where the data constrain them. On other drives
 and temperatures one member settles in a state of its own and another does not. The standard deviation s of
@@ -66,7 +77,7 @@ without input errs by about S, and one that errs by half of that is not called g
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from statistics import NormalDist
 
 import numpy as np
@@ -82,6 +93,10 @@ from thermogrip.sysid.plant.plant import WARMUP, Plant
 from thermogrip.sysid.plant.simulation import find_starts
 
 SHORT = 0.1  # of the level: a part on which the expected coverage falls short by more is reported
+GAIN_OF_SIZE = (
+    0.4  # sd of a black box's gain on a run whose inputs have e times the effect they had in the fit
+)
+_UNLIKE = 0.1  # of the run's error: what a run unlike the fit adds, from which it is reported
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,25 +108,40 @@ class Band:
     inside: dict[str, float]  # share of the scored readings that it covers
     draws: int  # of the parameters; 0: the plant has none, the band is the plant's own error alone
     own_error: str = "the error of the fit"  # how the plant's own error was estimated, in words
+    expected: dict[str, float] = field(default_factory=dict)  # rms error of the run that it stands for
 
 
-def free_run_band(plant: Plant, log: Log, simulated: Log, *, level: float = 0.9, draws: int = 30) -> Band:
+def free_run_band(
+    plant: Plant,
+    log: Log,
+    simulated: Log,
+    *,
+    level: float = 0.9,
+    draws: int = 30,
+    warmup: float = WARMUP,
+) -> Band:
     """Return the band about the ``simulated`` free run of a plant over a log, of so many draws of its
-    parameters (seeds 1 to ``draws``)."""
+    parameters (seeds 1 to ``draws``), whose state readings of ``warmup`` [s] have set."""
     if not 0 < level < 1:
         raise ValueError(f"level must lie between 0 and 1, got {level:g}")
     wide = NormalDist().inv_cdf(0.5 + level / 2)
     taken = draws if plant.uncertain else 0
     stretches = cut_stretches(plant, match_logs(plant, [log])[0][0]) if taken else []
-    runs = [plant.draw(k).over(stretches, WARMUP)[0] for k in range(1, taken + 1)]
+    runs = [plant.draw(k).over(stretches, warmup)[0] for k in range(1, taken + 1)]
     scored = np.asarray(simulated["scored"].values) > 0
-    half, inside, other_run = {}, {}, between_runs(plant, [log])
+    half, inside, expected = {}, {}, {}
+    other_run, unlike = between_runs(plant, [log]), unlike_fit(plant, log, simulated, warmup)
+    far = False
     for at, name in enumerate(plant.outputs):
         nominal = column(simulated, name)
         spread = np.array([run[:, at] - nominal for run in runs]).reshape(taken, len(nominal))
         variance = np.mean(spread**2, axis=0) if taken else np.zeros(len(nominal))
         own = _own_variance(plant, name, variance, level) + plant.scores.reading_excess.get(name, 0.0) ** 2
-        half[name] = wide * np.sqrt(variance + own + other_run.get(name, 0.0) ** 2)
+        seen = variance + own + other_run.get(name, 0.0) ** 2
+        added = unlike.get(name, 0.0) ** 2
+        half[name] = wide * np.sqrt(seen + added)
+        expected[name] = float(np.sqrt(np.mean((seen + added)[scored]))) if scored.any() else float("nan")
+        far = far or bool(np.mean(added) > _UNLIKE * np.mean(seen))
         miss = np.abs(column(log, name) - nominal)
         known = scored & np.isfinite(miss)
         inside[name] = float(np.mean(miss[known] <= half[name][known])) if known.any() else float("nan")
@@ -119,7 +149,30 @@ def free_run_band(plant: Plant, log: Log, simulated: Log, *, level: float = 0.9,
     if other_run:
         words += f" and a gain that varies by {100 * RUN_GAIN_SD:.0f} % from run to run (assumed: "
         words += f"{'one log' if len(plant.logs) == 1 else 'two logs'} cannot show it)"
-    return Band(level, half, inside, taken, words)
+    if far:
+        words += ", wider because this run is unlike the fit (range of the readings, size of the moves)"
+    return Band(level, half, inside, taken, words, expected)
+
+
+def unlike_fit(plant: Plant, log: Log, simulated: Log, warmup: float) -> dict[str, Array]:
+    """Return by output the standard deviation that a black box gets at each row for what is unlike its fit;
+    empty for other plants."""
+    if not plant.scores.held_out_by_part:
+        return {}
+    effects, time = between_runs(plant, [log], 1.0), log["time"].values
+    begin, out = time - time[0] < max(warmup, plant.dt), {}
+    for name in plant.outputs:
+        run, (low, high) = column(simulated, name), plant.valid.get(name, (-np.inf, np.inf))
+        first = column(log, name)[begin]
+        first = first[np.isfinite(first)]
+        start = float(np.mean(first - np.clip(first, low, high))) if first.size else 0.0
+        added = np.hypot(run - np.clip(run, low, high), start)
+        effect, before = effects.get(name), plant.scores.input_effect.get(name, 0.0)
+        size = 0.0 if effect is None else float(np.sqrt(np.mean(effect**2)))
+        if effect is not None and min(size, before) > 0:
+            added = np.hypot(added, GAIN_OF_SIZE * min(abs(np.log(size / before)), 1.0) * effect)
+        out[name] = np.asarray(added)
+    return out
 
 
 def between_runs(plant: Plant, logs: Sequence[Log], gain: float = RUN_GAIN_SD) -> dict[str, Array]:
@@ -140,6 +193,27 @@ def between_runs(plant: Plant, logs: Sequence[Log], gain: float = RUN_GAIN_SD) -
             log[name] = log[name].copy(data=u - gain * (u - nearest[name]))
         changes.append(change - columns(plant.simulate(log), plant.outputs))
     return dict(zip(plant.outputs, np.concatenate(changes).T))
+
+
+def beyond_range(plant: Plant, logs: Sequence[Log]) -> dict[str, float]:
+    """Return by output how far (rms) runs go beyond the readings of the fit if each input in percent, which
+    the logs moved over a part of its range, is moved alike over 0 to 100."""
+    parts = {name: plant.valid[name] for name in plant.inputs if plant.units.get(name) == "percent"}
+    parts = {name: (low, high) for name, (low, high) in parts.items() if 0 <= low < high <= 100}
+    out = dict.fromkeys(plant.outputs, 0.0)
+    if all(ends == (0, 100) for ends in parts.values()):
+        return out
+    moved = []
+    for log in logs:
+        log = log.copy()
+        for name, (low, high) in parts.items():
+            u = column(log, name)
+            log[name] = log[name].copy(data=100 * (u - low) / (high - low))
+        moved.append(plant.simulate(log))
+    for name in plant.outputs:
+        run = np.concatenate([column(one, name) for one in moved])
+        out[name] = float(np.sqrt(np.mean((run - np.clip(run, *plant.valid[name])) ** 2)))
+    return out
 
 
 def expected_coverage(plant: Plant, level: float = 0.9) -> dict[str, Array]:

@@ -80,9 +80,9 @@ def room(bench: Bench, stand_in: StandIn, monkeypatch: pytest.MonkeyPatch) -> Si
     made.read = stand_in("thermogrip.datasets.log_files.read_log", log)
     made.networks = stand_in("thermogrip.cli.options.find_network", load_network)
     made.fits = stand_in(f"{IDENTIFICATION}.identify", fit)
-    made.misfits = stand_in(
-        "thermogrip.sysid.plant.log_grid.misfit",
-        lambda network, _: None if network.name == made.like else UserError("lacks a column"),
+    made.shipped = stand_in(
+        "thermogrip.sysid.data.shipped_networks.shipped_network",
+        lambda _: load_network(made.like) if made.like in builtin_networks() else None,
     )
     stand_in("thermogrip.sysid.greybox.identifiability.identifiability_report", ["U is identifiable"])
     made.sections = stand_in("thermogrip.report.plant.identification_sections", ["a section"])
@@ -115,9 +115,8 @@ def test_the_network_is_the_one_asked_for_or_a_shipped_one_whose_columns_the_log
     roles = None if network is None else roles_of(load_network(network))
     chosen = network is not None and "--network" not in words
     assert [call.known for call in room.read] == [None] * chosen + [roles]
-    tried = [] if "--network" in words or words == "--models arx,oe" else builtin_networks()
-    tried = tried[: tried.index(like) + 1] if like in tried else tried
-    assert [call.args[0].name for call in room.misfits] == [*tried]
+    looked = "--network" not in words and words != "--models arx,oe"
+    assert [[log.attrs["name"] for log in call.args[0]] for call in room.shipped] == [["log a"]] * looked
     assert not fit.leave_one_out
 
 
@@ -149,6 +148,7 @@ def test_words_reach_the_fit_by_their_meaning(room: SimpleNamespace) -> None:
 def test_how_a_table_is_read_is_passed_on_and_the_plant_is_named_after_the_log(room: SimpleNamespace) -> None:
     done = room.bench.run("identify", "good.csv@:3", "--columns", "time_s,-,t1", "--dt", "2")
     assert (done.code, "wrote good_plant.json" in done.out) == (0, True)
+    assert done.err.endswith("next: thermogrip validate good_plant.json LOG\n")
     assert [(call.columns, call.dt) for call in room.read] == [(("time_s", "-", "t1"), 2.0)] * len(room.read)
 
 
@@ -319,7 +319,7 @@ def test_a_plant_is_scored_log_by_log_beside_its_baselines(bench: Bench, stand_i
         log=SimpleNamespace(attrs={"name": "good@:100"}), scores=score(0.1), one_step=score(0.2),
         naive={"no_input": score(0.3), "mean": score(0.4)},
         residual=SimpleNamespace(to_json=lambda: {"minutes": 1.0}), notes=("a note",),
-        band=lambda: Band(0.9, {}, {"t_tank": 0.875, "t_lost": np.nan}, 12, "its errors"),
+        band=lambda: Band(0.9, {}, {"t_tank": 0.875, "t_lost": np.nan}, 12, "its errors", {"t_tank": 0.3}),
     )  # fmt: skip
     runs = stand_in("thermogrip.sysid.validation.free_run.free_run", run)
     sections = stand_in("thermogrip.report.plant.free_run_section", "a section")
@@ -352,7 +352,7 @@ def test_a_plant_is_scored_log_by_log_beside_its_baselines(bench: Bench, stand_i
     one = {"log": "good@:100", "outputs": table(0.1), "one_step": table(0.2), "left": {"minutes": 1.0},
            "naive": {"no_input": table(0.3), "mean": table(0.4)}, "notes": ["a note"],
            "band": {"level": 0.9, "coverage": {"t_tank": 0.875, "t_lost": None}, "own_error": "its errors",
-                    "draws": 12}}  # fmt: skip
+                    "expected_rmse": {"t_tank": 0.3}, "draws": 12}}  # fmt: skip
     repairs = {"good@:100": ["taken from the start to 100 s"], "good@100:200": ["taken from 100 s to 200 s"]}
     logs = [one, one | {"log": "good@100:200"}]
     assert json.loads(bench.run(*words, "--json").out) == {"logs": logs, "repairs": repairs}

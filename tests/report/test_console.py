@@ -74,6 +74,18 @@ def test_a_table_is_as_wide_as_its_terminal_or_100_columns_and_breaks_no_word(
     assert capsys.readouterr().out.split("\n\n")[1].splitlines() == [f"name: {'x' * 59}", "value: 2"]
 
 
+def test_what_is_known_so_far_is_a_table_on_a_terminal_and_a_line_elsewhere(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for as_json in (False, True):
+        Console(as_json).early("a 1", "title", ["name", "value"], [["a", 1.0]])
+        assert capsys.readouterr() == ("", "a 1\n")
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    Console().early("a 1", "title", ["name", "value"], [["a", 1.0]])
+    out, err = capsys.readouterr()
+    assert (out, err.startswith("\r\x1b[Ktitle\n"), err.split()[-2:]) == ("", True, ["a", "1"])
+
+
 def test_on_a_terminal_progress_is_one_line_with_the_time_left(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -289,7 +289,7 @@ def test_the_table_of_models_has_a_column_a_log_of_what_was_held_out() -> None:
         ("oe", "t", None, 0.2, "degC"),
         ("no\N{NO-BREAK SPACE}input", "t", 2.1, 2.2, "degC"),
     )
-    assert [row[-1] for row in plant.held_out_table(found)[1]] == ["held out", "held out", "in the fit"]
+    assert [row[-1] for row in plant.held_out_table(found.rows)[1]] == ["held out", "held out", "in the fit"]
 
 
 def test_blocks_of_a_log_share_a_row_that_shows_each() -> None:
@@ -304,7 +304,7 @@ def test_blocks_of_a_log_share_a_row_that_shows_each() -> None:
             ("block wood", 7.0, 50.0, 7, 8.0),
         )
     ]
-    head, (both, tail, *logs) = plant.held_out_table(SimpleNamespace(rows=rows))
+    head, (both, tail, *logs) = plant.held_out_table(rows)
     assert head == ("model", "log", "output", "RMSE", "unit", "fit [%]", "n", "no input", "")
     assert [row[1] for row in logs] == ["block copper", "block wood"]
     assert both[:3] == ("oe", "2 blocks: 3, 4", "t")

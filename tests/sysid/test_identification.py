@@ -200,9 +200,15 @@ def test_one_log_states_what_another_run_may_add_and_three_do_not():
     expected = np.hypot(stated_error(held, "t"), np.sqrt(np.mean(varied**2)))
     assert one.plant.scores.new_run_rmse["t"] == pytest.approx(expected)
     assert f"on another run about t {expected:.2g} degC" in one.verdict
+    effect = float(np.sqrt(np.mean(between_runs(one.plant, [plant_log()], 1.0)["t"] ** 2)))
+    assert one.plant.scores.input_effect["t"] == pytest.approx(effect)
+    unlike = np.hypot(stated_error(held, "t"), 0.18 * effect)
+    assert one.plant.scores.other_kind_rmse["t"] == pytest.approx(unlike)
+    assert f"about t {unlike:.2g} degC, its gain off by 18 %" in one.verdict
+    assert "good for simulation and control on runs like these" in one.verdict
     logs = [plant_log(500, seed=s, name=name) for s, name in enumerate("abc")]
     three = identify(logs, models=["oe"], average=2.0, draws=0)
-    assert three.plant.scores.new_run_rmse == {}
+    assert three.plant.scores.new_run_rmse == three.plant.scores.other_kind_rmse == {}
     assert "another run" not in three.verdict
 
 
@@ -234,6 +240,28 @@ def test_progress_goes_from_zero_to_one():
     assert fractions == sorted(fractions)
     assert 0 <= fractions[0] <= fractions[-1] <= 1
     assert all("arx" in what for _, what in calls)
+
+
+def test_other_models_are_shown_before_neural_ones_are_fitted(monkeypatch):
+    shown, fitted = [], []
+    fit = identification.fit_black_box
+
+    def followed(kind, *given, **more):
+        fitted.append(kind)
+        return fit(kind if kind != "neural" else "arx", *given, **more)
+
+    monkeypatch.setattr(identification, "fit_black_box", followed)
+    monkeypatch.setattr(identification, "beyond_reach", lambda *_: False)
+
+    def early(rows):
+        shown.append(([*fitted], {(row.model, row.log) for row in rows}))
+
+    identify(plant_log(), models=["neural", "oe", "arx"], average=2.0, draws=0, early=early)
+    assert shown == [
+        (["oe", "arx"], {(kind, f"block {k} of 4") for kind in ("oe", "arx") for k in range(1, 5)})
+    ]
+    identify(plant_log(), models=["arx"], average=2.0, draws=0, early=early)
+    assert len(shown) == 1
 
 
 def test_a_record_of_ninety_slow_rows_is_fitted():

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
+
 from thermogrip.cli import options as cli
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.parallel import sub_progress
@@ -18,7 +20,7 @@ if TYPE_CHECKING:
     from thermogrip.sysid.export.dynamics import Dynamics
     from thermogrip.sysid.greybox import Posterior
     from thermogrip.sysid.growth import Growth
-    from thermogrip.sysid.identification import Identification
+    from thermogrip.sysid.identification import Identification, Row
     from thermogrip.sysid.models.model import GreyModel
     from thermogrip.sysid.models.network import NetworkModel
     from thermogrip.sysid.plant.plant import Plant
@@ -37,6 +39,16 @@ def _known_models(value: str) -> str:
     return value
 
 
+def _beside_log(ctx: typer.Context, value: Path | None) -> Path:
+    """Return where the plant goes: LOG_plant.json where nothing names it (``callback=``)."""
+    if value is not None:
+        return value
+    from thermogrip.datasets.log_files import split_cut
+    from thermogrip.datasets.tables import file_stem
+
+    return Path(f"{file_stem(split_cut(ctx.params['paths'][0])[0])}_plant.json")
+
+
 Warmup = Annotated[
     float, cli.opt("--warmup", "S", "Measured outputs of these first seconds may set the state.", min=0)
 ]
@@ -48,7 +60,8 @@ Average = Annotated[
 def identify(
     paths: cli.LogFiles,
     out: Annotated[
-        Path | None, cli.opt("--out", "FILE.json", "Where the plant goes; where absent, LOG_plant.json.")
+        Path | None,
+        cli.opt("--out", "FILE.json", "Where the plant goes; where absent, LOG_plant.json.", _beside_log),
     ] = None,
     network: Annotated[
         str | None,
@@ -106,11 +119,7 @@ def identify(
     Checks the data, fits candidate models, scores each by free run on held-out data, keeps the best one.
     """
     wanted = cli.comma(models) or ()
-    if out is None:
-        from thermogrip.datasets.log_files import split_cut
-        from thermogrip.datasets.tables import file_stem
-
-        out = Path(f"{file_stem(split_cut(paths[0])[0])}_plant.json")
+    assert out is not None  # its callback names one
     cli.new_file(out, (".json",))
     roles = cli.comma(inputs), cli.comma(outputs), cli.comma(disturbances)
     if columns is None:
@@ -130,7 +139,10 @@ def identify(
     table: dict[str, Any] = {"columns": cli.comma(columns), "dt": dt}
     if wanted_network is None:
         logs = cli.load_logs(paths, *roles, **table)
-        wanted_network = _shipped_network(logs) if a_network else None
+        if a_network:
+            from thermogrip.sysid.data.shipped_networks import shipped_network
+
+            wanted_network = shipped_network(logs)
     if wanted_network is not None:  # what a network calls its own has the role that it has there
         logs = cli.load_logs(paths, *roles, known=roles_of(wanted_network), **table)
     repairs = _repaired(console, logs)
@@ -161,6 +173,7 @@ def identify(
             seed=seed,
             workers=workers,
             progress=sub_progress(progress, 0.4 if grow else 0.0, 0.6 if posterior else 1.0),
+            early=lambda rows: console.early(*_so_far(rows)),
         )
         plant = found.plant
         if network and wanted_network is not None and all(row.model != "network" for row in found.rows):
@@ -208,6 +221,19 @@ def _sampled(
     return plant, record, ""
 
 
+def _so_far(rows: Sequence[Row]) -> tuple[Any, ...]:
+    """Return in a line, and as a table, how the models that are fitted before neural ones err."""
+    from thermogrip.report.plant import held_out_table
+    from thermogrip.sysid.identification import relative_error
+
+    errors: dict[str, list[float]] = {}
+    for row in rows:
+        errors.setdefault(row.model, []).append(relative_error(row))
+    means = ", ".join(f"{model} {sum(each) / len(each):.2g}" for model, each in errors.items())
+    line = f"so far {means} of the error without input; neural models are fitted next"
+    return line, "So far (RMSE of free runs); neural models are fitted next", *held_out_table(rows)
+
+
 def _repaired(console: Console, logs: Sequence[Log]) -> dict[str, list[str]]:
     """Return what was repaired while the logs were read, by the log's name, and warn of it."""
     found = {}
@@ -216,18 +242,6 @@ def _repaired(console: Console, logs: Sequence[Log]) -> dict[str, list[str]]:
         for line in found[log.attrs["name"]]:
             console.warn(f"{log.attrs['name']}: {line}")
     return found
-
-
-def _shipped_network(logs: Sequence[Log]) -> GreyModel | None:
-    """Return the network of the package whose signals all logs have, if there is one."""
-    from thermogrip.sysid.models.network_spec import builtin_networks
-    from thermogrip.sysid.plant.log_grid import misfit
-
-    for name in builtin_networks():
-        network = cli.find_network(name)
-        if all(misfit(network, log) is None for log in logs):
-            return network
-    return None
 
 
 def _growable(network: GreyModel | None) -> NetworkModel:
@@ -274,7 +288,7 @@ def _show_identified(
             share = f"{100 * term.share:.0f} % of the residual's variance, {term.tau:.3g} s"
             console.say(f"before growth, the residual of {term.output} correlated with {term.term} ({share})")
     console.table("Columns of the logs", *signal_table(found))
-    console.table("Free runs (RMSE)", *held_out_table(found))
+    console.table("Free runs (RMSE)", *held_out_table(found.rows))
     if plant.free:
         console.table("Free parameters of the plant", *parameter_table(plant))
     if dynamics is not None:
@@ -391,6 +405,7 @@ def run_answer(name: str, run: FreeRun, band: Band) -> dict[str, Any]:
         "band": {
             "level": band.level,
             "coverage": {output: share if share == share else None for output, share in band.inside.items()},
+            "expected_rmse": band.expected,
             "own_error": band.own_error,
             "draws": band.draws,
         },
@@ -430,7 +445,7 @@ def simulate(
     if bands:
         from thermogrip.sysid.validation.prediction_bands import free_run_band
 
-        for name, half in free_run_band(loaded, log, simulated).half.items():
+        for name, half in free_run_band(loaded, log, simulated, warmup=warmup).half.items():
             for end, sign in (("low", -1), ("high", 1)):
                 attrs = {"units": simulated[name].attrs["units"], "role": "other"}
                 simulated[f"{name}_{end}"] = ("time", column(simulated, name) + sign * half, attrs)

@@ -49,28 +49,16 @@ class Console:
     def table(self, title: str, head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
         """Print a table for people, as wide as the terminal (100 columns of what is none); numbers stand to
         the right, no word is broken, and where the columns are too many each row is a block of lines."""
-        if self.as_json:
-            return
-        cells = [[printable(name) for name in head], *([printable(short(c)) for c in row] for row in rows)]
-        columns = range(len(head))
-        numeric = [all(isinstance(row[k], int | float) or row[k] is None for row in rows) for k in columns]
-        least = [max(len(word) for row in cells for word in row[k].split() or [""]) for k in columns]
-        wide = [max(len(row[k]) for row in cells) for k in columns]
-        room = (get_terminal_size().columns if sys.stdout.isatty() else _WIDTH) - 2 * (len(head) - 1)
-        while sum(wide) > room and (open_ := [k for k in columns if wide[k] > least[k]]):
-            wide[max(open_, key=lambda k: wide[k])] -= 1
-        lines = [printable(title), ""]
-        for at, row in enumerate(cells):
-            if sum(wide) > room:
-                lines += [f"{name}: {cell}" for name, cell in zip(cells[0], row)] + [""] if at else []
-                continue
-            for parts in zip_longest(
-                *(wrap(row[k], wide[k], break_on_hyphens=False) or [""] for k in columns), fillvalue=""
-            ):
-                aligned = (part.rjust(w) if n else part.ljust(w) for part, w, n in zip(parts, wide, numeric))
-                lines.append("  ".join(aligned).rstrip())
-            lines += ["  ".join("-" * w for w in wide)] if at == 0 else []
-        sys.stdout.write("\n".join([*lines, "", ""]))
+        if not self.as_json:
+            room = get_terminal_size().columns if sys.stdout.isatty() else _WIDTH
+            sys.stdout.write(_table(title, head, rows, room))
+
+    def early(self, line: str, title: str, head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+        """Show on stderr, while work goes on, what is known so far: on a terminal a table, else one line."""
+        terminal = sys.stderr.isatty()
+        table = _anew() + _table(title, head, rows, get_terminal_size().columns) if terminal else ""
+        sys.stderr.write(table or printable(line) + "\n")
+        sys.stderr.flush()
 
     def answer(self, result: Mapping[str, Any]) -> None:
         """Print the JSON answer where ``--json`` asked for it."""
@@ -128,6 +116,30 @@ def short(cell: Any) -> str:
     if isinstance(cell, float):
         return f"{cell:.4g}" if math.isfinite(cell) else "-"
     return str(cell)
+
+
+def _table(title: str, head: Sequence[str], rows: Sequence[Sequence[Any]], width: int) -> str:
+    """Return the text of a table that is so many columns wide."""
+    cells = [[printable(name) for name in head], *([printable(short(c)) for c in row] for row in rows)]
+    columns = range(len(head))
+    numeric = [all(isinstance(row[k], int | float) or row[k] is None for row in rows) for k in columns]
+    least = [max(len(word) for row in cells for word in row[k].split() or [""]) for k in columns]
+    wide = [max(len(row[k]) for row in cells) for k in columns]
+    room = width - 2 * (len(head) - 1)
+    while sum(wide) > room and (open_ := [k for k in columns if wide[k] > least[k]]):
+        wide[max(open_, key=lambda k: wide[k])] -= 1
+    lines = [printable(title), ""]
+    for at, row in enumerate(cells):
+        if sum(wide) > room:
+            lines += [f"{name}: {cell}" for name, cell in zip(cells[0], row)] + [""] if at else []
+            continue
+        for parts in zip_longest(
+            *(wrap(row[k], wide[k], break_on_hyphens=False) or [""] for k in columns), fillvalue=""
+        ):
+            aligned = (part.rjust(w) if n else part.ljust(w) for part, w, n in zip(parts, wide, numeric))
+            lines.append("  ".join(aligned).rstrip())
+        lines += ["  ".join("-" * w for w in wide)] if at == 0 else []
+    return "\n".join([*lines, "", ""])
 
 
 def _anew() -> str:

@@ -56,10 +56,10 @@ def signal_table(found: Identification) -> Cells:
     return ("column", "unit", "role", "why"), tuple(rows)
 
 
-def held_out_table(found: Identification) -> Cells:
+def held_out_table(errors: Sequence[Row]) -> Cells:
     """Return the errors of candidate models: a row a model, log and output; blocks of a log share one row."""
     groups: dict[tuple[str, str, str, bool], list[Row]] = {}
-    for row in found.rows:
+    for row in errors:
         log = "blocks" if re.fullmatch(r"block \d+ of \d+", row.log) else row.log
         groups.setdefault((row.model, log, row.output, row.held_out), []).append(row)
     out = []

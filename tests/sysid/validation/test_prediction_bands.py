@@ -20,12 +20,15 @@ from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import HeldOut, PlantScores
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.prediction_bands import (
+    GAIN_OF_SIZE,
     MOST_DISAGREEMENT,
     between_runs,
+    beyond_range,
     check_ensemble,
     ensemble_disagreement,
     expected_coverage,
     free_run_band,
+    unlike_fit,
 )
 
 
@@ -136,6 +139,73 @@ def test_a_switch_has_no_gain_that_varies(schedule):
     added = between_runs(Plant(model, {}, dt=2.0, logs=("a",)), [schedule])
     assert np.ptp(added["t1"]) > 1.0
     assert np.ptp(added["t2"]) == 0.0
+
+
+@pytest.fixture
+def shown():
+    """A black box whose fit had an input of 0 to 50 percent and readings of 0 to 50, and a log like that."""
+    model = StateSpaceModel(("q",), (), ("t",), A=[[0.5]], B=[[0.5]], C=[[1.0]], dt=1.0)
+    q = np.repeat([0.0, 50.0, 20.0, 40.0], 100)
+    plant = Plant(model, {}, dt=1.0, logs=("a",), units={"q": "percent"}, valid={"q": (0, 50), "t": (0, 50)})
+    log = make_log(np.arange(400.0), {"q": (q, "percent", "input"), "t": (0.0 * q, "degC", "output")})
+    log["t"] = log["t"].copy(data=plant.simulate(log)["t"].values)
+    scores = PlantScores(
+        held_out_rmse={"t": 0.1},
+        held_out_by_part={"t": [0.1, 0.1]},
+        input_effect={"t": float(np.sqrt(np.mean(between_runs(plant, [log], 1.0)["t"] ** 2)))},
+    )
+    return replace(plant, scores=scores), log
+
+
+def times(log, factor):
+    return log.assign({n: log[n].copy(data=factor * log[n].values) for n in ("q", "t")})
+
+
+def test_a_run_like_the_fit_adds_nothing_to_its_band(shown):
+    plant, log = shown
+    assert np.max(unlike_fit(plant, log, plant.simulate(log), 5.0)["t"]) < 1e-6
+    assert "unlike the fit" not in plant.free_run(log).band().own_error
+    assert unlike_fit(replace(plant, scores=PlantScores()), log, plant.simulate(log), 5.0) == {}
+
+
+def test_what_lies_beyond_the_readings_of_the_fit_is_in_doubt(shown):
+    plant, log = shown
+    steps = replace(plant, scores=replace(plant.scores, input_effect={}))
+    far = times(log, 1.4)
+    added = unlike_fit(steps, far, steps.simulate(far), 5.0)["t"]
+    np.testing.assert_allclose(added[[99, 199, 299, 399]], [0.0, 20.0, 0.0, 6.0], atol=1e-3)
+    band = plant.free_run(far).band()
+    assert "unlike the fit" in band.own_error
+    assert band.half["t"][199] > 1.64 * 20.0
+    assert band.expected["t"] == pytest.approx(np.sqrt(np.mean((band.half["t"][5:] / 1.6449) ** 2)), rel=1e-3)
+
+
+def test_a_warm_up_outside_of_the_readings_of_the_fit_is_in_doubt(shown):
+    plant, log = shown
+    cold = log.assign(t=log["t"].copy(data=np.full(400, -7.0)))
+    assert unlike_fit(plant, cold, plant.simulate(cold), 5.0)["t"][-1] == pytest.approx(7.0, abs=0.01)
+
+
+@pytest.mark.parametrize(("factor", "share"), [(0.5, np.log(2)), (0.25, 1.0), (0.9, -np.log(0.9))])
+def test_the_gain_of_smaller_or_larger_moves_is_in_doubt(shown, factor, share):
+    plant, log = shown
+    other = times(log, factor)
+    run = plant.simulate(other)
+    np.testing.assert_allclose(
+        unlike_fit(plant, other, run, 5.0)["t"], GAIN_OF_SIZE * share * run["t"].values, rtol=1e-3, atol=1e-4
+    )
+
+
+@pytest.mark.parametrize(
+    ("unit", "valid", "last"), [("percent", (0, 50), 50.0), ("percent", (0, 100), 0.0), ("V", (0, 50), 0.0)]
+)
+def test_an_input_in_percent_can_go_to_0_and_100(shown, unit, valid, last):
+    plant, log = shown
+    plant = replace(plant, units={"q": unit}, valid=plant.valid | {"q": valid})
+    log["q"].attrs["units"] = unit
+    run = np.maximum(2 * log["t"].values - 50.0, 0.0)  # 0, 50, 0 and 30 at rest
+    expected = np.sqrt(np.mean(run**2)) if last else 0.0
+    assert beyond_range(plant, [log])["t"] == pytest.approx(expected, rel=1e-3)
 
 
 def test_one_part_alone_has_no_expected_coverage():

@@ -1,0 +1,123 @@
+"""Which of the networks that come with the package the columns of logs can be.
+
+A network fits logs that have a column for each of its signals: of the same name, in whatever case, or, where
+no network's names are there, as many columns of each role in units that convert (a switch reads 0 or 1), in
+the order in which they stand. The latter only where one network alone fits, and where an output is a
+temperature by its unit or its name. The network then has the columns' names. One whose inputs the logs do not
+move is none: nothing could be learnt about it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.schema import Log, column, names
+from thermogrip.sysid.models.network import NetworkModel
+from thermogrip.sysid.models.network_spec import (
+    Network,
+    builtin_networks,
+    named_network,
+    network_from_dict,
+)
+from thermogrip.sysid.plant.log_grid import SHARES, misfit
+
+# keys of elements that name signals or places
+_NAMING = ("between", "from", "to", "surroundings", "node", "face", "sink", "switch", "input")
+_TEMPERATURE = re.compile(r"(t|tc|temp|temperature)[ _]?[a-z0-9]{0,2}", re.IGNORECASE)
+
+
+def shipped_network(logs: Sequence[Log]) -> NetworkModel | None:
+    """Return the network of the package whose signals all logs have, under the columns' names, if there is
+    one."""
+    networks = [named_network(name) for name in builtin_networks()]
+    for network in networks:
+        if (found := _fitting(network, _by_name(network, logs[0]), logs)) is not None:
+            return found
+    likely = [_fitting(network, _by_role(network, logs), logs) for network in networks]
+    alone = [network for network in likely if network is not None]
+    return alone[0] if len(alone) == 1 else None
+
+
+def _fitting(network: Network, columns: Mapping[str, str] | None, logs: Sequence[Log]) -> NetworkModel | None:
+    """Return the network with these columns as its signals; None where it does not fit the logs."""
+    if columns is None:
+        return None
+    try:
+        model = NetworkModel(renamed(network, columns))
+    except UserError:  # a column is called like one of its parts
+        return None
+    moved = [name for name in model.inputs if name not in model.switches]
+    fits = all(misfit(model, log) is None for log in logs) and all(_moves(logs, name) for name in moved)
+    return model if fits else None
+
+
+def renamed(network: Network, columns: Mapping[str, str]) -> Network:
+    """Return the network with these names of its inputs, disturbances and outputs."""
+    if all(old == new for old, new in columns.items()):
+        return network
+
+    def element(item: dict[str, Any]) -> dict[str, Any]:
+        return {key: over(value) if key in _NAMING else value for key, value in item.items()}
+
+    def over(value: Any) -> Any:
+        return [columns.get(v, v) for v in value] if isinstance(value, list) else columns.get(value, value)
+
+    content = network.model_dump(by_alias=True, exclude_none=True, mode="json")
+    for group, table in content.items():
+        if group in ("inputs", "disturbances", "outputs"):
+            content[group] = {columns.get(name, name): element(item) for name, item in table.items()}
+        elif isinstance(table, dict) and group != "parameters":
+            content[group] = {name: element(item) for name, item in table.items()}
+    return network_from_dict(content)
+
+
+def _by_name(network: Network, log: Log) -> dict[str, str] | None:
+    """Return the column of each signal that is called like it, in whatever case; None where one is absent."""
+    written: dict[str, list[str]] = {}
+    for name in log.data_vars:
+        written.setdefault(str(name).lower(), []).append(str(name))
+    found = {name: written.get(name.lower(), []) for group in _tables(network) for name in group}
+    found |= {name: [name] for name in found if name in log}
+    return {name: same[0] for name, same in found.items()} if all(map(len, found.values())) else None
+
+
+def _by_role(network: Network, logs: Sequence[Log]) -> dict[str, str] | None:
+    """Return the column of each signal by role, unit and order; None where they are not as many."""
+    log, found = logs[0], dict[str, str]()
+    for role, table in zip(("input", "disturbance", "output"), _tables(network)):
+        columns = [name for name in names(log, role) if _moves(logs, name)]
+        wanted = [name for name, item in table.items() if not getattr(item, "switch", False)]
+        switches = [name for name in table if name not in wanted]
+        on_off = [name for name in columns if switches and set(column(log, name)) <= {0.0, 1.0}]
+        rest = [name for name in columns if name not in on_off]
+        if (len(on_off), len(rest)) != (len(switches), len(wanted)):
+            return None
+        if not all(_suits(log, name, table[of]) for name, of in zip(rest, wanted)):
+            return None
+        found |= dict(zip([*wanted, *switches], [*rest, *on_off]))
+    return found
+
+
+def _suits(log: Log, name: str, item: Any) -> bool:
+    """Tell whether a column may be a signal: it has its unit, or one that converts; a temperature without a
+    unit is told by its name, a drive of both signs by its readings."""
+    has = str(log[name].attrs.get("units", "1"))
+    if item.unit == "degC":
+        return has == item.unit or (has == "1" and _TEMPERATURE.fullmatch(name) is not None)
+    signed = bool(getattr(item, "range", (0, 0))[0] < 0)
+    known = has == item.unit or (has in SHARES and item.unit in SHARES)
+    return known and signed == bool(np.nanmin(column(log, name)) < 0)
+
+
+def _tables(network: Network) -> tuple[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]]:
+    return network.inputs, network.disturbances, network.outputs
+
+
+def _moves(logs: Sequence[Log], name: str) -> bool:
+    values = np.concatenate([column(log, name) for log in logs if name in log])
+    return bool(np.nanmax(values, initial=-np.inf) > np.nanmin(values, initial=np.inf))

@@ -1,0 +1,109 @@
+"""The network of the package that the columns of a log can be, by names and by roles."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermogrip.datasets.schema import make_log
+from thermogrip.sysid.data.shipped_networks import renamed, shipped_network
+from thermogrip.sysid.models.network_spec import builtin_networks, named_network
+
+TIME = np.arange(200.0)
+DRIVE = np.where(TIME % 50 < 20, 60.0, 10.0)
+SWITCH = np.where(TIME % 70 < 30, 1.0, 0.0)
+WARM = 23 + 0.05 * TIME
+
+
+def board(**signals):
+    return make_log(
+        TIME, {"q_1": (DRIVE, "percent", "input"), "Q2": (SWITCH * 40, "percent", "input"), **signals}
+    )
+
+
+TEMPERATURES = {"TC1": (WARM, "1", "output"), "TC2": (WARM, "degC", "output")}
+
+
+@pytest.mark.parametrize("name", builtin_networks())
+def test_each_network_is_found_by_its_names_in_whatever_case(name):
+    network = named_network(name)
+    signals = {
+        of.upper(): (SWITCH if item.switch else DRIVE / 100 * item.range[1], item.unit, "input")
+        for of, item in network.inputs.items()
+    }
+    signals |= {of: (WARM, item.unit, "disturbance") for of, item in network.disturbances.items()}
+    signals |= {of.title(): (WARM, item.unit, "output") for of, item in network.outputs.items()}
+    found = shipped_network([make_log(TIME, signals)])
+    assert found.name == name
+    assert {*found.inputs, *found.disturbances, *found.outputs} == {*signals}
+
+
+def test_two_heaters_and_two_temperatures_are_a_tclab_in_the_order_of_the_columns():
+    found = shipped_network([board(**TEMPERATURES)])
+    assert (found.name, found.inputs, found.outputs) == ("tclab", ("q_1", "Q2"), ("TC1", "TC2"))
+    parts = found.network
+    assert [heater.input for heater in parts.heaters.values()] == ["q_1", "Q2"]
+    assert parts.parameters == named_network("tclab").parameters
+
+
+@pytest.mark.parametrize(
+    "signals",
+    [
+        {"TC1": TEMPERATURES["TC1"]},  # one temperature
+        TEMPERATURES | {"room": (WARM, "degC", "disturbance")},
+        {"p1": (WARM, "1", "output"), "p2": (WARM, "1", "output")},  # no temperatures
+        {"v": (WARM, "V", "output"), "TC2": TEMPERATURES["TC2"]},
+        TEMPERATURES | {"q_1": (DRIVE, "V", "input")},
+        TEMPERATURES | {"Q2": (0 * DRIVE, "percent", "input")},  # never moves
+    ],
+)
+def test_columns_of_another_plant_are_no_network(signals):
+    assert shipped_network([board(**signals)]) is None
+
+
+def test_a_network_whose_input_never_moves_is_none():
+    log = make_log(
+        TIME,
+        {
+            "q1": (DRIVE, "percent", "input"),
+            "q2": (0 * DRIVE, "percent", "input"),
+            "t1": (WARM, "degC", "output"),
+            "t2": (WARM, "degC", "output"),
+        },
+    )
+    assert shipped_network([log]) is None
+    assert shipped_network([log, log.assign(q2=log["q1"])]).name == "tclab"
+
+
+def test_where_two_networks_fit_by_role_none_is_chosen():
+    # a furnace and a hot end have a heater and a temperature each
+    log = make_log(TIME, {"duty": (DRIVE, "percent", "input"), "temp": (WARM, "degC", "output")})
+    assert shipped_network([log]) is None
+
+
+def test_a_switch_is_a_column_of_0_and_1():
+    signals = {
+        "fan": (SWITCH, "1", "input"),
+        "element": (DRIVE, "percent", "input"),
+        "outside": (WARM, "degC", "disturbance"),
+        "inside": (WARM, "degC", "output"),
+        "part": (WARM, "degC", "output"),
+    }
+    found = shipped_network([make_log(TIME, signals)])
+    assert (found.name, found.inputs, found.switches) == ("thermal_chamber", ("element", "fan"), ("fan",))
+    assert found.disturbances == ("outside",)
+    both_ways = signals | {"element": (DRIVE - 30, "percent", "input")}
+    assert shipped_network([make_log(TIME, both_ways)]).name == "gripper"
+    taken = signals | {"air": signals.pop("inside")}  # as a part of the network is called
+    assert shipped_network([make_log(TIME, taken)]) is None
+
+
+def test_only_names_of_signals_change():
+    network = named_network("tank")
+    other = renamed(network, {"heater": "leak", "valve": "tap", "t_inlet": "cold", "t_tank": "hot"})
+    assert (*other.inputs, *other.disturbances) == ("leak", "tap", "cold", "t_ambient")
+    assert other.parameters == network.parameters
+    used = {pipe.source for pipe in other.pipes.values()} | {link.switch for link in other.links.values()}
+    assert "valve" not in used
+    assert [heater.power for heater in other.heaters.values()] == [h.power for h in network.heaters.values()]
+    assert renamed(network, {"heater": "heater"}) is network
