@@ -8,8 +8,9 @@ is the other gripper of transfer.py; the rest are drawn, wider than the spread t
 in other terms: thicknesses, conductivities and heat capacities of all three layers, lag, build-up time,
 contact conductance of all blocks and of each, and the heat that blocks lose.  It is asked
 
-- as it is, its numbers taken as exact;
-- as ``for_another_gripper()`` from no known grasp, and from 1, 3, 5, 10 known ones of the other gripper,
+- as it is: each record decides whether another gripper or other blocks explain it better;
+- as that of the training for certain (``gripper="same"``), its numbers taken as exact;
+- as ``for_another_gripper()`` from no known grasp, and from 1, 3, 5, 10, 25 known ones of the other gripper,
   copper and wood in turn at 20 K;
 - beside a calibration of the other gripper from those 10 alone, cold, and from a hundred grasps of all five.
 
@@ -40,7 +41,7 @@ from thermogrip.sysid.effusivity.calibration import calibrate_gripper
 from thermogrip.sysid.effusivity.posterior import material_posterior
 
 Array = NDArray[np.float64]
-KNOWN = (1, 3, 5, 10)
+KNOWN = (1, 3, 5, 10, 25)
 
 
 def main() -> None:
@@ -98,8 +99,8 @@ def asked(
     """Return (how, probabilities, truth, CPU seconds a grasp) of each way to ask about one gripper."""
     fresh = labelled(FIVE, repeats=test, seed=seed, rig=rig)
     truth = [str(m) for record in fresh for m in record["material"].values]
-    pool = labelled(("copper", "wood"), repeats=5, seed=seed + 50, rig=rig)[1]
-    order = [i for pair in zip(range(5), range(5, 10)) for i in pair]
+    pool = labelled(("copper", "wood"), repeats=13, seed=seed + 50, rig=rig)[1]
+    order = [i for pair in zip(range(13), range(13, 26)) for i in pair]
     known: dict[int, Grasps | None] = {0: None} | {n: pool.isel(grasp=order[:n]) for n in KNOWN}
 
     def answer(model: PosteriorClassifier) -> tuple[Array, float]:
@@ -108,10 +109,11 @@ def asked(
         return p, (time.process_time() - clock) / len(truth)
 
     yield "as it is", *_with(truth, answer(ours))
+    yield "the same for certain", *_with(truth, answer(ours.certain()))
     for n, few in known.items():
         model = ours.for_another_gripper(few)
         yield f"another, {n} known", *_with(truth, answer(model))
-    cold = calibrate_gripper([pool])
+    cold = calibrate_gripper([pool.isel(grasp=order[:10])])
     p = np.concatenate([material_posterior(cold, record, FIVE) for record in fresh])
     yield "cold, 10 known", p, truth, 0.0
     whole = PosteriorClassifier().fit(labelled(FIVE, repeats=5, seed=seed + 100, rig=rig))

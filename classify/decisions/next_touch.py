@@ -244,7 +244,7 @@ def choose_next_touch(
     names = model.asked(candidates)
     forecast = next_touch(
         model.device_, grasps, names, levels,
-        coupling=model.coupling_, rest=rest, end=end, finish=model.finish,
+        coupling=model.coupling_, rest=rest, end=end, finish=model.as_taught,
     )  # fmt: skip
     forecast = forecast._replace(log_p=normalised(forecast.log_p + model.log_prior(names)))
     found = expected_information(forecast, draws=draws, seed=seed)

@@ -116,8 +116,10 @@ def _answers(
     """Return the rows of one record: those that can be answered for, and what the others get."""
     whole = not classifier.leaves_samples_out
     quality = check_grasps(grasps, longest=classifier.longest_, whole_traces=whole)
-    notes = [note or more for note, more in zip(quality.note, classifier.beyond_training(grasps))]
-    usable, units = quality.read(grasps), unit_names(grasps)
+    notes, usable, units = [*quality.note], quality.read(grasps), unit_names(grasps)
+    if usable is not None:
+        for i, more in zip(np.flatnonzero(quality.usable), classifier.beyond_training(usable)):
+            notes[i] = notes[i] or more
     found = [] if usable is None else _named(classifier, usable, names, rule)
     of_unit = {} if usable is None else dict(zip(unit_names(usable).tolist(), found))
     last = _last_samples(grasps["time"].values, grasps["t_surface"].values, units)
@@ -281,7 +283,7 @@ def unexplained_answers(
     :func:`reasons`."""
     out = [Deviation(np.nan, "")] * len(rows)
     for model, at, data, ends, named in _single_named(classifier, X, rows, stated):
-        hypotheses = _taken_for(model.device_, named, finish=model.finish)
+        hypotheses = _taken_for(model.device_, named, finish=model.as_taught)
         for i, why in zip(at, _unexplained(model.device_, data, ends, hypotheses)):
             out[i] = why
     return out

@@ -111,6 +111,8 @@ class GraspClassifier(ClassifierMixin, _Sampled, BaseEstimator, ABC):  # type: i
         if _are_records(X):
             records = record_list(X)
             learn(records, record_labels(records, y))
+            if not self.reads_both_sensors and any("t_surface_2" in part for part in records):
+                self.notes_ = [*self.notes_, "the second sensor is not read"]
             return self
         words, values = (None, None) if y is None else coded(y)
         record = grasps_of(self, X, reset=True, y=words)
@@ -176,17 +178,21 @@ class GraspClassifier(ClassifierMixin, _Sampled, BaseEstimator, ABC):  # type: i
         return [""] * grasps.sizes["grasp"]
 
     def asked(self, candidates: Sequence[str] | None = None) -> list[str]:
-        """Return the candidates, each of them one of ``classes_``; by default all of these."""
+        """Return the candidates, each of which it :meth:`can_name`; by default all of ``classes_``."""
         self._check_fitted()
         known = [str(c) for c in self.classes_]
         names = known if candidates is None else [str(c) for c in candidates]
         for name in names:
-            if name not in known:
+            if not self.can_name(name):
                 hint = known_names(name, known, "it knows {}")
                 raise UserError(f"{name!r} is no class of this classifier", hint=hint)
         if not names:
             raise UserError("no candidate is given", hint=f"name some of {', '.join(known)}")
         return names
+
+    def can_name(self, name: str) -> bool:
+        """Return whether a material can be a candidate: one of ``classes_``."""
+        return name in self.classes_
 
     def _check_fitted(self) -> None:
         if not hasattr(self, "classes_"):

@@ -14,10 +14,21 @@ Touches of one block (``touch_group``) are one question: their evidence is joint
 temperature (:mod:`thermogrip.sysid.effusivity.multi_touch`), and each of their rows has the common
 answer.
 
-A calibration is of one gripper.  For another one of the same kind its numbers are a guess, and an answer
-that takes them as exact is far too confident: ``gripper="another"`` integrates over what such a gripper may
-be (:mod:`thermogrip.sysid.effusivity.gripper_model`), and :meth:`PosteriorClassifier.for_another_gripper`
-learns it from a few of its grasps of known blocks.
+A calibration is of one gripper and its blocks.  For another one of the same kind its numbers are a guess, and
+an answer that takes them as exact is far too confident: ``gripper="another"`` integrates over what such a
+gripper may be (:mod:`thermogrip.sysid.effusivity.gripper_model`), and
+:meth:`PosteriorClassifier.for_another_gripper` learns it from a few of its grasps of known blocks.
+
+Nobody need say which: by default a record decides between the training's gripper and blocks, other blocks of
+the same materials, and another gripper, with prior odds :math:`\pi_L` of 0.72, 0.18 and 0.10.  Its grasps j
+have one gripper and one set of blocks, so
+
+.. math:: p(m | i) \propto \sum_L \pi_L Z_{i m L} \prod_{j \ne i} Z_{j L}, \qquad
+          Z_{j L} = (1 - u) \frac{1}{M} \sum_m Z_{j m L} + u Z_{j, free},
+
+u being the probability of a material that is no candidate, which shall not pass for another gripper.  Where
+the training's own numbers explain a record, the answers are theirs.  Touches of one block are taken for the
+training's, and so is any gripper where the calibration has a discrepancy, which is that one device's.
 """
 
 from __future__ import annotations
@@ -27,7 +38,7 @@ from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -43,6 +54,7 @@ from thermogrip.classify.estimators.base import (
     two_or_more,
 )
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.materials import load_materials
 from thermogrip.datasets.schema import Grasps, has_touch_groups, label_values
 from thermogrip.sysid.effusivity.calibration import calibrate_gripper
 from thermogrip.sysid.effusivity.data import Touches, touches
@@ -58,7 +70,30 @@ from thermogrip.sysid.effusivity.multi_touch import (
 from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors
 from thermogrip.sysid.effusivity.quality import longest_contact
 
-GRIPPERS = ("same", "uncertain", "another")
+FINISHES = ("auto", "known", "unknown")
+GRIPPERS = ("auto", "same", "uncertain", "another")
+_OTHER_GRIPPER, _OTHER_BLOCKS = 0.1, 0.2  # prior probabilities, the latter given the training's gripper
+_SURE = 0.99  # of the training's gripper and blocks, from which on no free effusivity is asked against others
+_NEEDED = 0.05  # of the odds of another gripper, below which its free effusivity is not asked for
+_LIKELY = 0.9  # that a grasp is of another gripper or block, from which on its row says so
+
+
+class _Level(NamedTuple):
+    """One of the explanations that a record decides between."""
+
+    prior: float
+    device: GripperModel
+    finish: str
+    words: str  # for the row of a grasp that needs it
+
+
+class _Decided(NamedTuple):
+    """Log evidence of the candidates (n, m), log odds of all of them to a free effusivity (n,), and in words
+    which grasps another gripper or block explains."""
+
+    log_evidence: Floats
+    odds: Floats
+    words: list[str]
 
 
 @dataclass(eq=False, repr=False)
@@ -67,21 +102,23 @@ class PosteriorClassifier(GraspClassifier):
 
     ``gripper`` is which one took the grasps: the ``same`` that was calibrated, its parameters taken as the
     file has them (as exact, unless that marks them uncertain); the same, but ``uncertain``: integrated over;
-    or ``another`` one of its kind.  ``device_`` is the calibrated one, ``coupling_`` (or None) how blocks
-    move between touches, where groups of touches taught it.
+    ``another`` one of its kind; or ``auto``: the same or another, as each record decides.  ``device_`` is the
+    calibrated one, ``coupling_`` (or None) how blocks move between touches, where groups of those taught it.
     """
 
     learns_from_all_conditions: ClassVar[bool] = True
     reads_beginnings: ClassVar[bool] = True
     joins_touches: ClassVar[bool] = True
     leaves_samples_out: ClassVar[bool] = True
+    reads_both_sensors: ClassVar[bool] = True
 
-    finish: str = "known"  # the test blocks are those of the training; "unknown": others of their materials
+    # the test blocks are those of the training; "unknown": others of their materials; "auto": either
+    finish: str = "auto"
     priors: dict[str, float] | None = None  # odds of the materials; equal by default
     prior_unknown: float = 0.1  # probability of a material that is not among the candidates
     device: GripperModel | None = None  # a calibration to start from: fitting is quicker
     random_state: int = 0  # of the calibration
-    gripper: str = "same"
+    gripper: str = "auto"
 
     def fit(
         self, X: Records, y: ArrayLike | None = None, *, progress: Callable[[float, str], None] | None = None
@@ -134,9 +171,19 @@ class PosteriorClassifier(GraspClassifier):
         other.device_ = device
         return other
 
+    def can_name(self, name: str) -> bool:
+        """Return whether a material can be a candidate: also those of the table, on blocks never touched."""
+        return super().can_name(name) or name in load_materials()
+
+    def certain(self) -> PosteriorClassifier:
+        """Return this classifier for the training's own gripper and blocks: no record decides otherwise."""
+        own = copy(self)
+        own.gripper, own.finish = "same", self.as_taught
+        return own
+
     def _check_params(self) -> None:
-        if self.finish not in ("known", "unknown"):
-            raise UserError(f"finish is {self.finish!r}", hint="use 'known' or 'unknown'")
+        if self.finish not in FINISHES:
+            raise UserError(f"finish is {self.finish!r}", hint=f"use one of {', '.join(FINISHES)}")
         if self.gripper not in GRIPPERS:
             raise UserError(f"gripper is {self.gripper!r}", hint=f"use one of {', '.join(GRIPPERS)}")
         if not 0 < self.prior_unknown < 1:
@@ -158,26 +205,68 @@ class PosteriorClassifier(GraspClassifier):
         these."""
         group = label_values(grasps, "touch_group")
         single = group == ""
-        evidence, free, other = np.empty((group.size, len(names))), np.full(group.size, np.nan), None
+        evidence, odds = np.empty((group.size, len(names))), np.full(group.size, np.nan)
         if single.any():
             data = touches(grasps, until=self.longest_, at=np.flatnonzero(single))
-            evidence[single] = _of_candidates(self.device_, data, names, self.finish)
-            if unknown:
-                free[single] = [fit.log_evidence for fit in grid_posteriors(self.device_, data)]
-                if self.finish != "known":  # a free effusivity has the conductance of the training's blocks
-                    other = _of_candidates(self.device_, data, names, "known")
+            found = self._decided(data, names, unknown)
+            evidence[single], odds[single] = found.log_evidence, found.odds if unknown else np.nan
         if not single.all():
-            fit = two_touch_fit(self.device_, grasps, names, coupling=self.coupling_, finish=self.finish)
+            fit = two_touch_fit(self.device_, grasps, names, coupling=self.coupling_, finish=self.as_taught)
             for at, row in zip(fit.rows, fit.log_evidence):
                 evidence[at] = row
             groups = free_touch_fit(self.device_, grasps, coupling=self.coupling_) if unknown else {}
             for name, fits in groups.items():
-                free[group == name] = fits[0].log_evidence
-        known = evidence.copy()
-        if other is not None:
-            known[single] = other
-        odds = logsumexp(known, axis=1) - np.log(len(names)) - free
+                at = group == name
+                odds[at] = logsumexp(evidence[at], axis=1) - np.log(len(names)) - fits[0].log_evidence
         return evidence, np.asarray(expit(logit(self.prior_unknown) - odds))
+
+    @property
+    def as_taught(self) -> str:
+        """``finish`` where only the training's gripper is asked about."""
+        return "known" if self.finish == "auto" else self.finish
+
+    def _levels(self) -> list[_Level]:
+        """Return what a record decides between, the training's own gripper and blocks first."""
+        if self.device_.uncertain:
+            return [_Level(1.0, self.device_, self.as_taught, "")]
+        # what another gripper reads beyond the model, nobody knows
+        other = _OTHER_GRIPPER if self.gripper == "auto" and self.device_.discrepancy is None else 0.0
+        blocks = (1 - other) * _OTHER_BLOCKS if self.finish == "auto" else 0.0
+        out = [_Level(1 - other - blocks, self.device_, self.as_taught, "")]
+        if blocks:
+            words = "read as another block of its material than those of the training"
+            out.append(_Level(blocks, self.device_, "unknown", words))
+        if other:
+            words = "read as by another gripper than the training's: a labelled grasp of it helps (--known)"
+            out.append(_Level(other, another_gripper(self.device_), self.as_taught, words))
+        return out
+
+    def _decided(self, data: Touches, names: Sequence[str], unknown: bool = False) -> _Decided:
+        """Return what single touches of one record decide; the odds where a free effusivity is asked for."""
+        levels, u = self._levels(), np.log(self.prior_unknown)
+        each = np.stack([_of_candidates(level.device, data, names, level.finish) for level in levels])
+        prior = np.log([level.prior for level in levels])[:, None]
+        known, free = logsumexp(each, axis=2) - np.log(len(names)), np.full(each.shape[:2], -np.inf)
+        sure = normalised((prior + known.sum(axis=1, keepdims=True)).T)[0, 0] > np.log(_SURE)
+        own = np.array([level.device is self.device_ for level in levels])
+        if unknown or not sure:
+            free[own] = _free(self.device_, data)
+        explained = known if sure else np.logaddexp(np.log(1 - self.prior_unknown) + known, u + free)
+        others = explained.sum(axis=1, keepdims=True) - explained
+        weight = normalised((prior + others).T).T
+        strange = logsumexp(weight + free, axis=0)
+        share = np.exp(normalised(np.column_stack([(weight + known).T, u + strange])))
+        words = [*(level.words for level in levels), ""]
+        found = [words[int(row.argmax())] if row.max() > _LIKELY else "" for row in share]
+        if unknown and not own.all() and (at := np.flatnonzero(share[:, -2] > _NEEDED)).size:
+            free[-1, at] = _free(levels[-1].device, data.take(at))
+            strange = logsumexp(weight + free, axis=0)
+        # a stranger is none of the training's blocks, whatever another block of a known material may be
+        blocks = known[0] if self.finish != "unknown" else _mean_evidence(self.device_, data, names)
+        weighed = np.where(own[:, None], blocks, known) + weight
+        return _Decided(
+            logsumexp(each + weight[:, :, None], axis=0), logsumexp(weighed, axis=0) - strange, found
+        )
 
     def log_prior(self, names: Sequence[str]) -> Floats:
         """Return the log prior odds of some materials, (n_name,)."""
@@ -201,14 +290,20 @@ class PosteriorClassifier(GraspClassifier):
         return np.concatenate([self._evidence(part, names, unknown=True)[1] for part in self._records(X)])
 
     def beyond_training(self, grasps: Grasps) -> list[str]:
-        """Return in words which blocks rested longer between touches than those of the training."""
+        """Return in words which grasps another gripper or other blocks explain, which blocks rested longer
+        between touches than those of the training, and which sensor of two has no part in the answer."""
         known = (self.coupling_ or Coupling()).longest_rest
         words = f"rested longer than the {known:g} s of the training: the answer may be too confident"
-        notes = [words if long else "" for long in rested_long(grasps, self.coupling_)]
-        if self.device_.second is not None and "t_surface_2" in grasps:
-            joint = label_values(grasps, "touch_group") != ""
-            one = "of touches of one block the second sensor is not read"
-            notes = [word or (one if group else "") for word, group in zip(notes, joint)]
+        trained, has = self.device_.second is not None, "t_surface_2" in grasps
+        other = "" if trained == has else "the second sensor is not read: the training had one"
+        if trained and not has:
+            other = "answered by the first sensor alone: the record has no second one"
+        notes = [words if long else other for long in rested_long(grasps, self.coupling_)]
+        single = np.flatnonzero(label_values(grasps, "touch_group") == "")
+        if single.size and len(self._levels()) > 1:
+            decided = self._decided(touches(grasps, until=self.longest_, at=single), self.asked())
+            for i, why in zip(single, decided.words):
+                notes[i] = why or notes[i]
         return notes
 
     def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
@@ -237,6 +332,16 @@ class PosteriorClassifier(GraspClassifier):
 def _of_candidates(device: GripperModel, data: Touches, names: Sequence[str], finish: str) -> Floats:
     """Return the log evidence of each candidate for each touch, (n, n_name)."""
     return fit_candidates(device, data, names, finish)[0].log_evidence.reshape(-1, len(names))
+
+
+def _mean_evidence(device: GripperModel, data: Touches, names: Sequence[str]) -> Floats:
+    """Return the log evidence of the training's own blocks, the mean over candidates, (n,)."""
+    return np.asarray(logsumexp(_of_candidates(device, data, names, "known"), axis=1) - np.log(len(names)))
+
+
+def _free(device: GripperModel, data: Touches) -> Floats:
+    """Return the log evidence of a free effusivity for each touch, (n,)."""
+    return np.array([fit.log_evidence for fit in grid_posteriors(device, data)])
 
 
 def _uncertain_as(device: GripperModel, gripper: str) -> GripperModel:

@@ -20,6 +20,9 @@ What a hypothesis expects before the data
 
 - A **material with training grasps**: its block's ln h and ln e as calibrated, with the spread from grasp to
   grasp.
+- **Another block** of such a material (``finish="unknown"``): ln h is 0.4 off, as much as ground faces of one
+  metal whose roughness is a factor of 1.5 apart (between 0.25 and 2.5 um conductance changes fivefold), ln e
+  by the table's uncertainty of the material and 5 % of composition.
 - A **material of the library**: its effusivity on the gripper's scale, with the row's uncertainty, on a block
   of unknown contact conductance.
 - A **free effusivity**: a point of ln e, unknown contact conductance, rho c_p of solids in general (3.2
@@ -93,6 +96,7 @@ _EARLIEST_ONSET = 1.5  # s before the closed message
 _SENSORS_APART = 0.3  # K: two thermistors of 1 %
 _DOF, _COUNTS, _GAIN_SD = 20.0, 2.0, 0.1
 _ALIKE_SD = 1.0  # K
+_FINISH_SD, _GRADE_SD = 0.4, 0.05  # between blocks of one material: of ln h, and of ln e beside the table's
 
 
 class Prior(NamedTuple):
@@ -540,14 +544,9 @@ def fit_pairs(
     :func:`~thermogrip.sysid.effusivity.data.whiten` and :func:`prior_of` where a caller has them."""
     prior = prior_of(gripper, data.take(row), hypotheses) if prior is None else prior
     mode = _own_modes(gripper, data, row, hypotheses, prior, start, max_steps, noise)
-    n, second = (data.count[row] > 0).sum(axis=1), gripper.second
-    if second is not None and data.second is not None:
-        others = hypotheses_of_second(gripper, second, hypotheses)
-        own = prior_of(second, data.second.take(row), others)
-        begin = own.mean.copy()
-        begin[:, LEVEL], begin[:, T_OBJECT] = data.second.level[row], mode.u[:, T_OBJECT]
-        beside = _own_modes(second, data.second, row, others, own, begin, 20, None)
-        mode = joined_modes(mode, prior, beside, own, second.bias - gripper.bias)
+    mode = with_second(gripper, data, row, hypotheses, prior, mode)
+    n = (data.count[row] > 0).sum(axis=1)
+    if gripper.second is not None and data.second is not None:
         n = n + (data.second.count[row] > 0).sum(axis=1)
     if gripper.discrepancy is not None:
         mode = widened(mode, prior, n, gripper.bias)
@@ -555,6 +554,22 @@ def fit_pairs(
             unknown = ~np.isfinite(data.t_object[row])
             mode = as_in_training(mode, prior, gripper.discrepancy.from_room, unknown)
     return mode
+
+
+def with_second(
+    gripper: GripperModel, data: Touches, row: NDArray[np.int64], hypotheses: Hypotheses, prior: Prior,
+    mode: Mode,
+) -> Mode:  # fmt: skip
+    """Return the modes of pairs by the first sensor with what the second one saw, if there is one."""
+    second = gripper.second
+    if second is None or data.second is None:
+        return mode
+    others = hypotheses_of_second(gripper, second, hypotheses)
+    own = prior_of(second, data.second.take(row), others)
+    begin = own.mean.copy()
+    begin[:, LEVEL], begin[:, T_OBJECT] = data.second.level[row], mode.u[:, T_OBJECT]
+    beside = _own_modes(second, data.second, row, others, own, begin, 20, None)
+    return joined_modes(mode, prior, beside, own, second.bias - gripper.bias)
 
 
 def _own_modes(
@@ -675,17 +690,19 @@ def fit_candidates(
 
 def _trained(gripper: GripperModel, name: str, finish: str) -> tuple[float, ...]:
     block, spreads, own = gripper.blocks[name], gripper.spreads, finish == "known"
-    spread = spreads.ln_h if own else float(np.hypot(spreads.ln_h_of_blocks, spreads.ln_h))
+    between = max(_FINISH_SD, spreads.ln_h_of_blocks)
+    spread = spreads.ln_h if own else float(np.hypot(between, spreads.ln_h))
     scatter = spreads.ln_effusivity if block.library_effusivity < INSULATOR else 0.0
+    composition = 0.0 if own else float(np.hypot(_GRADE_SD, min(block.library_sd_ln, 0.3)))
     return (
         block.ln_h,
         float(np.hypot(spread, block.ln_h_sd)),
         block.ln_effusivity,
-        scatter,
+        float(np.hypot(scatter, composition)),
         float(np.log(block.heat_capacity)),
         0.0,
         spreads.dof if own else np.inf,
-        spreads.insulator_dof if scatter else np.inf,
+        spreads.insulator_dof if scatter and own else np.inf,
         float(gripper.materials.index(name)),
     )
 

@@ -3,10 +3,10 @@
 Two touches at different gripper temperatures must agree on the block: on its effusivity, its heat capacity,
 what its contact conductance has in common, and its temperature, which moves from one touch to the next
 (aluminium's by several degrees in one touch).  Under a candidate each touch is a Gaussian factor of what it
-shares with the others.  The factors are expanded twice, the second time around what the other touches say of
-the block's temperature: a wide prior leaves wood's open by many degrees, too far for one expansion.  With a
-free effusivity in place of a candidate, on a grid, the same algebra gives the joint posterior of ln e and of
-the block's temperature.
+shares with the others, by both sensors where there are two.  The factors are expanded twice, the second time
+around what the other touches say of the block's temperature: a wide prior leaves wood's open by many degrees,
+too far for one expansion.  With a free effusivity in place of a candidate, on a grid, the same algebra gives
+the joint posterior of ln e and of the block's temperature.
 
 A touch as a Gaussian factor
 ----------------------------
@@ -78,6 +78,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     free_hypotheses,
     material_hypotheses,
     prior_of,
+    with_second,
 )
 from thermogrip.sysid.effusivity.quality import number_values
 
@@ -485,7 +486,8 @@ def _factors(view: _View, groups: list[Rows], found: list[tuple[Array, Array]] |
     # group after group, hypothesis after hypothesis, touch after touch
     row = np.concatenate([np.tile(at, m) for at in groups])
     which = np.concatenate([np.repeat(np.arange(m), at.size) for at in groups])
-    prior = prior_of(view.gripper, view.data.take(row), Hypotheses(*(h[which] for h in view.hypotheses)))
+    hypotheses = Hypotheses(*(h[which] for h in view.hypotheses))
+    prior = prior_of(view.gripper, view.data.take(row), hypotheses)
     if found is not None:
         prior.mean[:, T_OBJECT] = np.concatenate([mean.ravel() for mean, _ in found])
         prior.sd[:, T_OBJECT] = np.concatenate([sd.ravel() for _, sd in found])
@@ -493,7 +495,7 @@ def _factors(view: _View, groups: list[Rows], found: list[tuple[Array, Array]] |
     mode = find_modes(
         view.gripper.stack, view.data, row, view.whitener, Prior(prior.mean, prior.sd), beyond=beyond
     )
-    whole = factor_of(mode, prior)
+    whole = factor_of(with_second(view.gripper, view.data, row, hypotheses, prior, mode), prior)
     # away from a mode there is nothing to expand: such a hypothesis keeps its (hopeless) value everywhere
     lost = ~mode.converged
     whole.log_size[lost], whole.eta[lost], whole.precision[lost] = mode.log_evidence[lost], 0.0, 0.0

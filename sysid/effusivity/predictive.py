@@ -15,7 +15,8 @@ gripper's spreads, and
 
 Each candidate's prediction and the probabilities of the candidates now are a :class:`PosteriorPredictive`;
 the expected information of readings is a sum over it (:mod:`thermogrip.classify.decisions.next_touch`).
-Nothing is simulated sample by sample: it costs a few evaluations of the response per candidate.
+Nothing is simulated sample by sample: it costs a few evaluations of the response per candidate.  Of a second
+sensor what it has read counts; what it will read is left out, so a touch may gain more than is expected.
 """
 
 from __future__ import annotations

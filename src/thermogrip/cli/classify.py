@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from thermogrip.classify.decisions.predict import Deviation
     from thermogrip.classify.decisions.stopping_rule import StopRule
     from thermogrip.classify.estimators.base import GraspClassifier
+    from thermogrip.classify.estimators.posterior import PosteriorClassifier
     from thermogrip.datasets.schema import Grasps
     from thermogrip.sysid.effusivity import Coupling, EffusivityRow, GripperModel
 
@@ -251,7 +252,13 @@ def classify(
     paths: cli.GraspFiles,
     out: Annotated[Path, cli.opt("--out", "FILE.csv", "Where the predictions go.")],
     candidates: Annotated[
-        str | None, cli.opt("--materials", "A,B,C", "The candidates [default: all that the model knows].")
+        str | None,
+        cli.opt(
+            "--materials",
+            "A,B,C",
+            "The candidates, for posterior also others of `thermogrip materials` [default: those that the "
+            "model knows].",
+        ),
     ] = None,
     early: Annotated[
         bool, cli.flag("--early", "Use of each contact what was read until the stop rule ended it.")
@@ -268,6 +275,10 @@ def classify(
     other_gripper: Annotated[
         bool, cli.flag("--other-gripper", "Another gripper of the same kind took these grasps [posterior].")
     ] = False,
+    same_gripper: Annotated[
+        bool,
+        cli.flag("--same-gripper", "The gripper and the blocks of the training for certain [posterior]."),
+    ] = False,
     known: Annotated[
         list[str] | None,
         cli.opt("--known", "GRASPS", "Labelled grasps of that other gripper, one or more; may be repeated."),
@@ -283,12 +294,12 @@ def classify(
     left out: see the column note. With --early the stop rule that train --stop-error learnt says when
     each contact could have ended. --next-touch adds next_touch_degC, empty where no touch gains 0.001 of
     accuracy a second, and the accuracy expected after it; --or-unknown adds answer. A model is trained on
-    one gripper: with --other-gripper its answers are as unsure as grippers differ, unless --known says what
-    the other one reads of blocks it knows.
+    one gripper and its blocks; each file decides whether another gripper or other blocks explain it better,
+    and is then answered as unsurely as these differ. --same-gripper and --other-gripper say which it is,
+    --known what the other one reads of blocks it knows.
     """
     stated = _range(between)
     cli.new_file(out, (".csv",))
-    cli.choices("--materials", cli.comma(candidates) or (), model_dir / "classifier.json", "classes")
     from thermogrip.classify.decisions.next_touch import advise_touches
     from thermogrip.classify.decisions.predict import (
         classify_grasps,
@@ -301,6 +312,8 @@ def classify(
     from thermogrip.datasets.grasp_files import read_grasp_files
     from thermogrip.sysid.effusivity.data import with_object_range
 
+    if same_gripper and (other_gripper or known):
+        raise UserError("--same-gripper contradicts --other-gripper and --known", hint="give one of them")
     if (other_gripper or known) and (early or next_touch):
         problem = (
             f"{'--early' if early else '--next-touch'} needs a known gripper, and another one is uncertain"
@@ -310,7 +323,9 @@ def classify(
     rule = load_stop_rule(model_dir) if early else None
     records = read_grasp_files(paths)
     if other_gripper or known:
-        model = _for_another_gripper(model, known or [])
+        model = _with_gripper(model).for_another_gripper(read_grasp_files(known) if known else None)
+    if same_gripper:
+        model = _with_gripper(model).certain()
     ranged = [with_object_range(grasps, stated) for grasps in records]
     rows = classify_grasps(model, ranged, cli.comma(candidates), rule=rule)
     if not early:
@@ -453,16 +468,15 @@ def _stop_rule(console: Console, model: GraspClassifier, records: Sequence[Grasp
     return rule
 
 
-def _for_another_gripper(model: GraspClassifier, known: Sequence[str]) -> GraspClassifier:
-    """Return the model for another gripper than that of its training."""
+def _with_gripper(model: GraspClassifier) -> PosteriorClassifier:
+    """Return the model if it has a gripper, which may be another one than took the grasps."""
     from thermogrip.classify.estimators.posterior import PosteriorClassifier
-    from thermogrip.datasets.grasp_files import read_grasp_files
 
     if not isinstance(model, PosteriorClassifier):
         raise UserError(
             "this model knows no gripper that could be another one", hint="train a posterior classifier"
         )
-    return model.for_another_gripper(read_grasp_files(known) if known else None)
+    return model
 
 
 def _answer_or_unknown(rows: list[dict[str, Any]]) -> None:

@@ -193,7 +193,7 @@ def made_up(monkeypatch: pytest.MonkeyPatch, gain: list[float], information: lis
     """Let a touch gain so much at each temperature; return the probabilities that it was weighed with."""
     weighed: list[Any] = []
     model = SimpleNamespace(
-        device_=None, coupling_=None, finish=None,
+        device_=None, coupling_=None, as_taught="known",
         log_prior=lambda names: np.log([0.8, 0.2]), asked=lambda names: ["a", "b"],
     )  # fmt: skip
     said = np.array(gain)
@@ -316,8 +316,8 @@ def test_what_has_no_model_is_refused(plant: Plant, known: PosteriorClassifier, 
     for wrong in ({"t_gripper": [np.nan]}, {"t_gripper": []}, {"price": -1e-9}, {"price": np.inf}):
         with pytest.raises(UserError, match="is no number"):
             choose_next_touch(known, touched, **wrong)  # type: ignore[arg-type]
-    with pytest.raises(UserError, match="'gold' is no class"):
-        choose_next_touch(known, touched, candidates=["gold", "iron"])
+    with pytest.raises(UserError, match="'goldd' is no class"):
+        choose_next_touch(known, touched, candidates=["goldd", "iron"])
 
 
 def test_switches_are_on() -> None:

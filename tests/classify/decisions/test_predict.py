@@ -128,7 +128,7 @@ def numbers(row: dict[str, Any]) -> dict[str, float]:
 
 def fitted(name: str) -> GraspClassifier:
     if name == "posterior":
-        return PosteriorClassifier().with_device(load_default_gripper())
+        return PosteriorClassifier(gripper="same", finish="known").with_device(load_default_gripper())
     return make_classifier(name).fit(load_example_grasps()["exp2_dT20"])
 
 

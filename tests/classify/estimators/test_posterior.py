@@ -17,6 +17,7 @@ from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
+from thermogrip.sysid.contact.simulation import simulate_grasps
 from thermogrip.sysid.effusivity.data import touches
 from thermogrip.sysid.effusivity.gripper_model import GripperSpread, another_gripper, load_default_gripper
 from thermogrip.sysid.effusivity.multi_touch import two_touch_fit
@@ -55,7 +56,7 @@ def test_fifteen_grasps_teach_it_to_identify_the_other_nine(
 
 def test_probabilities_are_the_evidence_times_the_prior(fitted: PosteriorClassifier, fresh: Grasps) -> None:
     evidence = material_evidence(fitted.device_, fresh, ["copper", "iron", "wood"])
-    biased = clone(fitted).set_params(priors={"iron": 20.0})
+    biased = clone(fitted).set_params(priors={"iron": 20.0}, gripper="same", finish="known")
     biased.device_, biased.classes_ = fitted.device_, fitted.classes_
     expected = evidence + np.log([1.0, 20.0, 1.0])
     expected -= logsumexp(expected, axis=1, keepdims=True)
@@ -68,17 +69,30 @@ def test_candidates_come_in_the_order_asked_for(fitted: PosteriorClassifier, fre
     two = p[:, [2, 0]]
     seen = two.sum(axis=1) > 1e-6
     np.testing.assert_allclose(q[seen], two[seen] / two[seen].sum(axis=1, keepdims=True), atol=1e-6)
-    with pytest.raises(UserError, match="'gold' is no class"):
-        fitted.candidate_log_proba(fresh, ["gold"])
+    with pytest.raises(UserError, match="'goldd' is no class"):
+        fitted.candidate_log_proba(fresh, ["goldd"])
+
+
+def test_a_material_of_the_table_may_be_asked_for_untrained() -> None:
+    others = load_example_grasps()["exp6_other_materials_obj43_grip23"]
+    glass = pick(others, others["material"].values == "glass")
+    model = PosteriorClassifier().with_device(load_default_gripper())
+    p = np.exp(model.candidate_log_proba(glass, ["copper", "glass", "wood"]))
+    assert p[:, 1].min() > 0.9
+    assert model.p_unknown(glass, ["copper", "glass", "wood"]).max() < 0.5
+    assert model.p_unknown(glass, ["copper", "wood"]).min() > 0.9
 
 
 def test_none_of_the_candidates_is_weighed_against_blocks_of_the_training(
     fitted: PosteriorClassifier, fresh: Grasps
 ) -> None:
-    other = clone(fitted).set_params(finish="unknown")
-    other.with_device(fitted.device_)
     some = pick(fresh, [0, 3, 6])
-    of_other, of_same = (model.open_set_log_proba(some, ["copper", "wood"]) for model in (other, fitted))
+    of_other, of_same = (
+        PosteriorClassifier(finish=finish, gripper="same")
+        .with_device(fitted.device_)
+        .open_set_log_proba(some, ["copper", "wood"])
+        for finish in ("unknown", "known")
+    )
     np.testing.assert_allclose(of_other[1], of_same[1], rtol=1e-9)  # a free effusivity has their finish
     assert not np.allclose(of_other[0], of_same[0], rtol=1e-3)
 
@@ -105,9 +119,11 @@ def test_a_second_sensor_is_part_of_the_answer_where_there_is_one(fresh: Grasps,
     assert np.array_equal(one.predict(both), two.predict(both))
     again = load_classifier(save_classifier(two, tmp_path))
     np.testing.assert_array_equal(again.predict_log_proba(both), two.predict_log_proba(both))
-    one_block = both.assign(touch_group=("grasp", ["a", "a", *[""] * 7]))
-    assert [bool(why) for why in two.beyond_training(one_block)] == [True, True, *[False] * 7]
-    assert not any(one.beyond_training(one_block))
+    assert not any([*two.beyond_training(both), *one.beyond_training(bare)])
+    assert set(two.beyond_training(bare)) == {
+        "answered by the first sensor alone: the record has no second one"
+    }
+    assert set(one.beyond_training(both)) == {"the second sensor is not read: the training had one"}
     widths = [
         [row.t_object_p95 - row.t_object_p05 for row in effusivity_posterior(m.device_, both)]
         for m in (one, two)
@@ -135,7 +151,7 @@ def test_odds_of_an_unknown_are_prior_odds_times_the_bayes_factor() -> None:
     free = [fit.log_evidence for fit in grid_posteriors(device, touches(record))]
     factor = np.exp(known).mean(axis=1) / np.exp(free)
     for prior, odds in ((0.25, 3.0), (0.1, 9.0)):
-        model = PosteriorClassifier(prior_unknown=prior).with_device(device)
+        model = PosteriorClassifier(prior_unknown=prior, gripper="same", finish="known").with_device(device)
         np.testing.assert_allclose(model.p_unknown(record, FIVE), 1 / (1 + odds * factor))
 
 
@@ -152,7 +168,7 @@ def test_a_metal_is_unknown_to_one_who_knows_only_wood(fitted: PosteriorClassifi
 @pytest.mark.parametrize(
     ("params", "message"),
     [
-        ({"finish": "shiny"}, "finish is 'shiny'; use 'known' or 'unknown'"),
+        ({"finish": "shiny"}, "finish is 'shiny'; use one of auto, known, unknown"),
         ({"prior_unknown": 0.0}, "prior_unknown is 0"),
         ({"priors": {"wood": 0.0}}, "a prior is not positive"),
     ],
@@ -215,6 +231,72 @@ def test_answers_include_the_uncertainty_of_the_gripper(known: PosteriorClassifi
     ):
         np.testing.assert_allclose(model.predict_proba(metals), expected, rtol=1e-9)
     assert not known.device_.uncertain  # the one that was asked stays as it was
+
+
+@pytest.fixture(scope="module")
+def strange() -> Grasps:
+    """Grasps by a gripper of a slower sensor under a thicker sheet, pressed less."""
+    device = load_default_gripper()
+    stack = replace(device.stack, lag=2.5 * device.stack.lag, z_outer=1.3 * device.stack.z_outer)
+    blocks = {name: replace(block, ln_h=block.ln_h - 0.3) for name, block in device.blocks.items()}
+    other = replace(device, stack=stack, blocks=blocks)
+    return simulate_grasps(other.grip(), FIVE * 2, t_gripper=23.0, t_object=43.0, seed=3, **other.readings())
+
+
+def test_a_record_decides_which_gripper_took_it(known: PosteriorClassifier, strange: Grasps) -> None:
+    same = known.certain()
+    other = known.for_another_gripper()
+    decided = known.predict_proba(strange)
+    np.testing.assert_allclose(decided, other.predict_proba(strange), atol=0.01)
+    right = same.predict(strange) == strange["material"].values
+    assert same.predict_proba(strange).max(axis=1).mean() > right.mean() + 0.2  # far too sure
+    rows = classify_grasps(known, strange)
+    assert all("another gripper" in row["note"] for row in rows)
+    assert max(row["p_unknown"] for row in rows) < 0.5
+    # at home each answer stays as it was, whatever grasps are with it
+    home = load_example_grasps()["exp1A_obj43_grip23"]
+    np.testing.assert_allclose(known.predict_proba(home), same.predict_proba(home), atol=1e-4)
+    assert not any("note" in row for row in classify_grasps(known, home))
+
+
+def test_what_a_record_decides_is_the_mixture_of_its_explanations(
+    known: PosteriorClassifier, metals: Grasps
+) -> None:
+    """Each grasp of two by Bayes' rule, the other one and its materials summed over."""
+    pair, names = pick(metals, [0, 1]), ["brass", "copper"]
+    levels = [
+        (0.72, known.device_, "known"),
+        (0.18, known.device_, "unknown"),
+        (0.10, another_gripper(known.device_), "known"),
+    ]
+    z = [material_evidence(device, pair, names, finish=finish) for _, device, finish in levels]
+    free = [fit.log_evidence for fit in grid_posteriors(known.device_, touches(pair))]
+    top, odds = np.max(z), np.zeros((2, 2))
+    sure = np.array([p * np.exp(e - top).mean(axis=1).prod() for (p, *_), e in zip(levels, z)])
+    assert sure[0] / sum(sure) < 0.99  # so that a free effusivity is asked
+    for (prior, device, _), e in zip(levels, z):
+        own = np.exp(np.array(free) - top) * (device is known.device_)
+        each = 0.9 * np.exp(e - top).mean(axis=1) + 0.1 * own
+        odds += prior * each[::-1, None] * np.exp(e - top)
+    want = odds / odds.sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(np.exp(known.candidate_log_proba(pair, names)), want, rtol=1e-6)
+
+
+def test_other_blocks_are_answered_less_surely(known: PosteriorClassifier) -> None:
+    device = known.device_
+    off = dict(zip(FIVE, (0.5, -0.5, 0.45, -0.4, 0.5)))
+    blocks = {name: replace(block, ln_h=block.ln_h + off[name]) for name, block in device.blocks.items()}
+    other = replace(device, blocks=blocks)
+    grasps = simulate_grasps(
+        other.grip(), FIVE * 4, t_gripper=23.0, t_object=43.0, seed=5, **other.readings()
+    )
+    same = known.certain()
+    loss = [
+        -m.predict_log_proba(grasps)[np.arange(20), np.searchsorted(m.classes_, FIVE * 4)].mean()
+        for m in (known, same)
+    ]
+    assert loss[0] < loss[1] - 0.3
+    assert any("another block" in row.get("note", "") for row in classify_grasps(known, grasps))
 
 
 def test_the_closer_grippers_lie_together_the_surer(known: PosteriorClassifier, metals: Grasps) -> None:

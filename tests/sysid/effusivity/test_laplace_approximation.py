@@ -421,8 +421,11 @@ def test_what_each_kind_of_hypothesis_expects(device):
     assert rows.ln_h_dof.tolist() == [spreads.dof, spreads.dof, np.inf]
     assert rows.ln_e_dof.tolist() == [np.inf, spreads.insulator_dof, np.inf]
     assert rows.block.tolist() == [device.materials.index("copper"), device.materials.index("wood"), -1]
-    assert other.ln_h_sd[0] == pytest.approx(np.hypot(anew, block.ln_h_sd))
-    assert (other.ln_h_dof[0], other.ln_e_dof[0]) == (np.inf, spreads.insulator_dof)
+    other_sd = np.sqrt(0.4**2 + spreads.ln_h**2 + block.ln_h_sd**2)
+    assert other.ln_h_sd[0] == pytest.approx(other_sd)
+    grade = np.sqrt(0.05**2 + 0.25**2 + spreads.ln_effusivity**2)  # of wood the table is 25 % unsure
+    assert other.ln_e_sd[0] == pytest.approx(grade, rel=1e-3)
+    assert (other.ln_h_dof[0], other.ln_e_dof[0]) == (np.inf, np.inf)
     # half way from insulators to metals at 4500
     free = free_hypotheses(device, np.log([4500.0, 10.0, 1e6]))
     np.testing.assert_allclose(np.exp(free.ln_rho_c), [np.sqrt(1.7e6 * 3.2e6), 1.7e6, 3.2e6], rtol=1e-4)

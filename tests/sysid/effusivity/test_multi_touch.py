@@ -68,9 +68,13 @@ def test_two_touches_name_blocks_that_one_cannot(device, record, fit):
     assert own.max() < 0.6
 
 
-def test_one_touch_alone_is_the_single_fit(device, record):
+@pytest.mark.parametrize("sensors", [1, 2])
+def test_one_touch_alone_is_the_single_fit(device, record, sensors):
     """With the scatter of single grasps, known well, a group of one says what the engine says of a grasp."""
     device = replace(device, spreads=replace(device.spreads, dof=1e9, insulator_dof=1e9))
+    if sensors == 2:
+        device = replace(device, second=replace(device, bias=device.bias + 0.5))
+        record = record.assign(t_surface_2=record["t_surface"] + 0.5)
     coupling = replace(Coupling(), ln_h_sd=device.spreads.ln_h)
     alone = record.isel(grasp=[0, 4])
     fit = two_touch_fit(device, alone, FIVE, coupling=coupling)
