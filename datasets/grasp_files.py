@@ -12,6 +12,7 @@ left NaN where the nearest samples are more than 1.5 steps apart.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -358,15 +359,16 @@ def _meta_path(path: str | Path) -> Path:
     return found
 
 
-def _read_meta(path: Path, order: list[str], file: str) -> dict[str, Any]:
-    """Return the per-grasp columns in the order of the sample file."""
+def _read_meta(path: Path, order: list[str], file: str) -> tuple[dict[str, Any], list[str]]:
+    """Return the per-grasp columns in the order of the sample file, and a line on those that are left out."""
     table = read_csv_table(path, text=None)
     if "grasp_id" not in table.text:
         raise UserError("no column grasp_id", file=path, hint="give each grasp's name as in the sample file")
     rows = _matched(table, order, path, file)
     found: dict[str, Any] = {}
+    strange = []
     for header, cells in table.text.items():
-        name, unit = split_header(header, file=str(path))
+        name, unit = split_header(header) if re.fullmatch(r"\S+", header) else ("", "")
         name = _FROM_META.get(name, name)
         if name in found:
             raise UserError(f"gives {name} a second time", file=path, column=header, hint="keep one")
@@ -378,7 +380,11 @@ def _read_meta(path: Path, order: list[str], file: str) -> dict[str, Any]:
             found[name] = numbers[rows]
         elif name in GRASP_LABELS:
             found[name] = [cells[at] for at in rows]
-    return found
+        elif name != "grasp_id":
+            strange.append(header)
+    known = [*(f"{_TO_META.get(name, name)}_{unit}" for name, unit in GRASP_NUMBERS.items()), *GRASP_LABELS]
+    line = f"{path.name}: not used: {', '.join(strange)}; known are {', '.join(known)}"
+    return found, [line] if strange else []
 
 
 def _matched(table: Table, order: list[str], path: Path, file: str) -> list[int]:
@@ -415,9 +421,10 @@ def _read_csv(path: str | Path) -> tuple[tuple[Floats, Floats, list[str]], dict[
     ids, time, channels, repairs = _read_samples(path)
     order, index = _in_order(ids)
     axis, gridded, more = _onto_one_axis(order, index, time, channels, str(path))
-    per_grasp = _with_defaults(_read_meta(_meta_path(path), order, str(path)), len(order), stem)
+    meta, left_out = _read_meta(_meta_path(path), order, str(path))
+    per_grasp = _with_defaults(meta, len(order), stem)
     per_grasp |= {"name": stem, "t_surface_2": gridded.get("t_surface_2")}
-    return (axis, gridded["t_surface"], order), per_grasp, repairs + more
+    return (axis, gridded["t_surface"], order), per_grasp, repairs + more + left_out
 
 
 def _read_netcdf(path: str | Path) -> Grasps:

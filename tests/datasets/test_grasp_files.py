@@ -278,6 +278,17 @@ def test_columns_that_nobody_asked_for_are_left_out_and_reported(pair):
     np.testing.assert_array_equal(g["t_surface"], read_grasps(pair(plain, ONE))["t_surface"])
 
 
+def test_columns_of_the_meta_file_that_mean_nothing_are_left_out_and_reported(pair):
+    meta = "grasp_id,material,object temp,t_room_degC\na,copper,28,25\nb,wood,28,25\n"
+    file = pair(samples("a", "b"), meta)
+    grasps = read_grasps(file)
+    assert grasps["material"].values.tolist() == ["copper", "wood"]
+    line = grasps.attrs["repairs"].splitlines()[-1]
+    assert line.startswith("g_meta.csv: not used: object temp, t_room_degC; known are ")
+    assert "t_ambient_degC" in line
+    assert "t_object_nominal_degC" in line
+
+
 def test_what_is_no_table_is_found_in_a_folder_a_file_and_the_facts_beside_it(tmp_path, small_grasps):
     path = write_grasps(small_grasps, tmp_path / "a.csv")
     facts = tmp_path / "a_meta.csv"

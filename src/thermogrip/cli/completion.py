@@ -11,6 +11,11 @@ from collections.abc import Callable, Iterable
 
 from thermogrip.cli.kinds import BOTH, TAKES, kind_of
 
+#: Candidate models of identify.
+MODELS = ("arx", "oe", "armax", "bj", "subspace", "parsim", "sindy", "neural", "network")
+#: What a rig on a port may speak.
+PROTOCOLS = ("thermogrip", "tclab")
+
 
 def completer(option: str, metavar: str) -> Callable[[str], list[str]]:
     """Return what completes the value of an option, or of an argument (whose option is "")."""
@@ -42,12 +47,6 @@ def _networks() -> Iterable[str]:
     return builtin_networks()
 
 
-def _models() -> Iterable[str]:
-    from thermogrip.cli.identify import MODELS
-
-    return MODELS
-
-
 def _classifiers() -> Iterable[str]:
     from thermogrip.classify.estimators import CLASSIFIERS
 
@@ -63,11 +62,11 @@ def _materials() -> Iterable[str]:
 _NAMES: dict[str, Callable[[], Iterable[str]]] = {
     "--network": lambda: (*_networks(), "none"),
     "--like": _networks,
-    "--models": _models,
+    "--models": lambda: MODELS,
     "--classifier": _classifiers,
     "--classifiers": _classifiers,
     "--material": _materials,
     "--materials": _materials,
     "[NAME]": _materials,
-    "--protocol": lambda: ("thermogrip", "tclab"),
+    "--protocol": lambda: PROTOCOLS,
 }

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from thermogrip.cli import options as cli
+from thermogrip.cli.completion import MODELS
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.parallel import sub_progress
 from thermogrip.report.console import Console
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation import Band, FreeRun
 
-MODELS = ("arx", "oe", "armax", "bj", "subspace", "parsim", "sindy", "neural", "network")
 USUAL_MODELS = ",".join(model for model in MODELS if model not in ("armax", "bj", "parsim"))
 DEFAULT_NETWORK = "gripper"  # of --grow
 NO_POSTERIOR = "no posterior: the model that was kept is a black box, only networks have parameters to sample"

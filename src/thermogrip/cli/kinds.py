@@ -134,6 +134,8 @@ def check_kind(ctx: Any, path: str, wanted: str) -> None:
         hint = f"give {part}"
     elif verb in verbs:
         hint = f"write {' '.join([verb, *fits[verb][0]])}"
+    if needs := KINDS[wanted].get("needs"):
+        hint = f"{hint}; {KINDS[wanted]['words']} has {needs}"
     raise UserError(f"is {KINDS[found]['words']}, not {KINDS[wanted]['words']}", file=path, hint=hint)
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from thermogrip.cli.completion import PROTOCOLS as PROTOCOLS
 from thermogrip.cli.completion import completer
 from thermogrip.cli.kinds import check_exists
 from thermogrip.datasets.errors import UserError, as_user_error, known_names
@@ -22,8 +23,6 @@ if TYPE_CHECKING:
 
 #: Exit code of work that was done and whose answer is no.
 ANSWER_IS_NO = 3
-#: What a rig on a port may speak.
-PROTOCOLS = ("thermogrip", "tclab")
 #: Repairs of one file that are printed.
 SHOWN_REPAIRS = 5
 
