@@ -637,12 +637,14 @@ def _record(
 
 
 def split_r_hat(steps: Array) -> float:
-    """Return the R-hat [4]_ of one dimension (n_step, n_walker), each walker cut in two.
+    """Return the R-hat [4]_ of one dimension (n_step, n_walker), each walker cut in two; NaN of too few steps.
 
     >>> split_r_hat(np.random.default_rng(0).standard_normal((1000, 8))) < 1.01
     True
     """
     half = len(steps) // 2
+    if half < 2:
+        return float("nan")
     parts = np.concatenate([steps[:half], steps[half : 2 * half]], axis=1)
     within, between = parts.var(axis=0, ddof=1).mean(), parts.mean(axis=0).var(ddof=1)
     return float(np.sqrt((half - 1) / half + between / within)) if within > 0 else float("nan")
