@@ -117,6 +117,12 @@ def test_a_page_begins_with_its_contents_and_ends_with_where_it_comes_from(tmp_p
     assert {"thermogrip", "written"} <= set(page.texts["dt"])
 
 
+def test_two_equal_pages_are_the_same_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+    first, second = (html_page("t", "l", [Section("s", (picture(), plot()), "v")]) for _ in range(2))
+    assert first == second
+
+
 def test_a_verdict_has_a_sign_and_a_word_and_so_have_cells_of_verdicts() -> None:
     table = Table(("check", "verdict"), (("fail", "fail"), ("b", "pass"), ("c", "odd")))
     sections = [Section(tone, (table,), "so", tone) for tone in ("plain", "good", "warn", "bad")]
