@@ -46,7 +46,7 @@ def plot(points: int = 500, curves: int = 1, name: str = "skin") -> Plot:
 class Tree(HTMLParser):
     """The elements of a page, each closed where it must be."""
 
-    VOID = frozenset({"meta", "img", "br"})
+    VOID = frozenset({"meta", "img", "br", "wbr"})
 
     def __init__(self, page: str) -> None:
         super().__init__()
