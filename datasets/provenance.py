@@ -82,21 +82,21 @@ def provenance() -> dict[str, Any]:
     from thermogrip import __version__
 
     now = _WORK.get() or _Work([Path(sys.argv[0]).name, *sys.argv[1:]])
+    try:
+        here = os.getcwd()
+    except OSError:  # it was removed, which must not cost what is being written
+        here = ""
+    below = here.rstrip(os.sep) + os.sep
     for name in now.read:
         now.read[name] = now.read[name] or _hash(name)
     return {
         "thermogrip": __version__,
         "written": _date(),
         "command": shlex.join(now.words),
-        "git": _describe(os.getcwd()),
+        "git": _describe(here) if here else None,
         "seed": now.seed,
-        "inputs": {os.path.relpath(name) if _below(name) else name: now.read[name] for name in now.read},
+        "inputs": {name.removeprefix(below): digest for name, digest in now.read.items()},
     }
-
-
-def _below(name: str) -> bool:
-    """Tell whether a file lies in the working folder or below it."""
-    return name.startswith(os.getcwd().rstrip(os.sep) + os.sep)
 
 
 def _date() -> str:

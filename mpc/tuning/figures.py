@@ -176,7 +176,7 @@ def sensitivity_figure(found: Sequence[Sensitivity]) -> Figure:
         low, high = item.free_low / item.value, item.free_high / item.value
         if low < high:
             axis.barh(k, high - low, left=low, height=0.5, color="#c9d6e6")
-        label = f"  costs {100 * item.elasticity * np.log(1.3):+.1f} % at 30 % more"
+        label = f"  costs {100 * item.elasticity * np.log(1.3):+z.1f} % at 30 % more"
         axis.plot(1.0, k, "o", ms=5, color=PALETTE[0] if low < 1 < high else "#a3262a")
         axis.annotate(label, (max(high, 1.0), k), fontsize=7, va="center", color="#5b6776")
     axis.set_yticks(range(len(found)), [f"{PARAMETER_WORDS[item.knob]}, {item.value:.3g}" for item in found])

@@ -32,6 +32,7 @@ import numpy as np
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import atomic_path
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.provenance import KEY, provenance
 from thermogrip.sysid.export.linearise import needed, operating_point
 from thermogrip.sysid.plant.plant import Plant
 
@@ -193,7 +194,8 @@ def to_fmu(plant: Plant, path: str | Path) -> Path:
         # names in it begin with an underscore, so that no name of a plant can hide one of them
         text = (resources.files("thermogrip.sysid.export") / "slave.py.in").read_text(encoding="utf-8")
         script.write_text(text.format(name=name), encoding="utf-8")
-        beside.write_text(json.dumps(replace(plant, samples=None).to_dict()), encoding="utf-8")
+        content = replace(plant, samples=None).to_dict() | {KEY: provenance()}
+        beside.write_text(json.dumps(content), encoding="utf-8")
         path_before = list(sys.path)
         sys.modules.pop(module, None)  # the builder imports the script by its name
         try:

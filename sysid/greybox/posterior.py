@@ -599,6 +599,7 @@ def _record(
     full = np.tile(z, (*chain.steps.shape[:2], 1))
     full[..., list(sampled)] = chain.steps
     steps = problem.parameters(full.reshape(-1, z.size))[:, [at[i] for i in sampled]]
+    drawn = replace(chain, steps=steps.reshape(chain.steps.shape))
     samples = problem.parameters(whole)[:, at]
     low, mid, high = np.quantile(samples, [0.05, 0.5, 0.95], axis=0)
     length = len(chain.steps) / float(np.max(chain.tau))
@@ -620,7 +621,7 @@ def _record(
         samples=samples,
         units={name: plant.units.get(name, "1") for name in plant.free},
         fitted={name: plant.values[name] for name in plant.free},
-        chain=replace(chain, steps=steps.reshape(chain.steps.shape)),
+        chain=drawn,
         tau=dict(zip(names, chain.tau.tolist())),
         n_steps=len(chain.steps),
         converged=chain.converged,
@@ -629,20 +630,20 @@ def _record(
         likelihood=about,
         off_centre=float(np.max(np.abs(np.median(whole, axis=0) - z) / whole.std(axis=0))),
         verdict=verdict,
-        ess={
-            name: chain.settled[..., 0].size / float(tau) for name, tau in zip(names, chain.tau, strict=True)
-        },
-        r_hat={name: split_r_hat(chain.settled[..., i]) for i, name in enumerate(names)},
+        ess={name: drawn.settled[..., 0].size / tau for name, tau in zip(names, chain.tau.tolist())},
+        r_hat={name: split_r_hat(drawn.settled[..., i]) for i, name in enumerate(names)},
     )
 
 
 def split_r_hat(steps: Array) -> float:
-    """Return the R-hat [4]_ of one dimension (n_step, n_walker), each walker cut in two.
+    """Return the R-hat [4]_ of one dimension (n_step, n_walker), each walker cut in two; NaN of few steps.
 
     >>> split_r_hat(np.random.default_rng(0).standard_normal((1000, 8))) < 1.01
     True
     """
     half = len(steps) // 2
+    if half < 2:
+        return float("nan")
     parts = np.concatenate([steps[:half], steps[half : 2 * half]], axis=1)
     within, between = parts.var(axis=0, ddof=1).mean(), parts.mean(axis=0).var(ddof=1)
     return float(np.sqrt((half - 1) / half + between / within)) if within > 0 else float("nan")

@@ -407,7 +407,8 @@ def test_a_simulation_has_the_ends_of_its_bands(bench: Bench, stand_in: StandIn)
 
 def test_a_plant_is_linearised_where_it_is_asked_for(bench: Bench) -> None:
     (bench.path / "board.json").write_text(json.dumps(replace(BOARD, samples=None).to_dict()))
-    done = bench.run("linearise", "board.json", "--at", "q1=30, q2=20", "--dt", "4", "--out", "l.json")
+    words = ("linearise", "board.json", "--at", "q1=30, q2=20", "--dt", "4", "--out", "l.json", "--seed", 3)
+    done = bench.run(*words, "--report", "l.html")
     assert done.code == 0, done
     near = linearise_plant(BOARD, inputs={"q1": 30.0, "q2": 20.0}, dt=4.0)
     said = words_of(done.out)
@@ -415,6 +416,14 @@ def test_a_plant_is_linearised_where_it_is_asked_for(bench: Bench) -> None:
     assert "about q1 30 percent, q2 20 percent: time constants 124 s" in said
     assert said.endswith("wrote l.json")
     written = json.loads((bench.path / "l.json").read_text())
+    made = written["provenance"]
+    assert (made["command"], made["seed"], list(made["inputs"])) == (
+        "thermogrip linearise board.json --at 'q1=30, q2=20' --dt 4 --out l.json --seed 3 --report l.html", 3,
+        ["board.json"],
+    )  # fmt: skip
+    page = (bench.path / "l.html").read_text(encoding="utf-8")
+    assert made["inputs"]["board.json"] in page
+    assert page.count('type="application/json"') == 2
     assert {key: written[key] for key in ("states", "inputs", "outputs", "dt")} == {
         "states": list(near.states), "inputs": ["q1", "q2"], "outputs": ["t1", "t2"], "dt": 4.0,
     }  # fmt: skip

@@ -101,6 +101,19 @@ def test_without_git_there_is_no_description(monkeypatch: pytest.MonkeyPatch) ->
     assert provenance()["git"] is None
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX: a folder in use cannot be removed")
+def test_a_working_folder_that_was_removed_costs_nothing_that_is_written(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gone = here / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    with work(["thermogrip", "run"]):
+        write_json(here / "run.json", {"a": 1}, schema="thing", version=1)
+    assert json.loads((here / "run.json").read_text())[KEY]["command"] == "thermogrip run"
+
+
 def test_a_file_that_is_gone_has_no_sum(here: Path) -> None:
     (here / "a.json").write_text(json.dumps({"schema": "thing", "version": 1}))
     with work(["thermogrip"]):

@@ -109,6 +109,7 @@ def test_a_chart_shows_the_numbers_under_the_pointer_and_zooms_all_its_panels(op
     assert len(whole) == 6
     at = box["x"] + 0.25 * box["width"]
     page.mouse.move(at, box["y"] + 20)
+    assert plots.first.bounding_box() == box  # what is shown moves nothing
     legend = room.locator(".legend").first
     seconds = float(legend.locator(".at").inner_text().removesuffix(" s"))
     low, high = whole[0]

@@ -151,7 +151,7 @@ def test_every_stage_has_its_share_of_the_progress_and_its_section(
             return result
 
         monkeypatch.setattr(demo, name, stage)
-    for name in ("identification", "free_run", "posterior", "tuning", "review", "session"):
+    for name in ("identification", "free_run", "parameters", "tuning", "review", "session"):
         monkeypatch.setattr(
             demo, f"{name}_section",
             lambda *args, name=name, **_: Section(f"{name} of {' '.join(map(str, args))}", ()),
@@ -173,13 +173,13 @@ def test_every_stage_has_its_share_of_the_progress_and_its_section(
         "_run": (tmp_path, "tuning", "plant", SEED), "_compare": (tmp_path, SEED, workers),
     }  # fmt: skip
     assert [section.title for section in done.sections] == [
-        "identification of found plant", "free_run of run", "posterior of record",
+        "identification of found", "free_run of run", "parameters of plant record",
         "tuning of tuning", "review of checks",
         f"session of {results['_run']} the twin (posterior draw 3)", "touch of model ['a grasp']",
         "shipped comparison", "The same with your files",
     ]  # fmt: skip
     assert done.report == tmp_path / "report.html"
-    assert "identification of found plant" in done.report.read_text()
+    assert "identification of found" in done.report.read_text()
 
 
 def test_a_plant_is_fitted_to_three_logs_and_the_first_half_of_the_fourth(

@@ -14,7 +14,7 @@ from scipy.signal import lfilter
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_log
-from thermogrip.datasets.schema import make_log
+from thermogrip.datasets.schema import log_name, make_log
 from thermogrip.sysid import Plant, identification, identify
 from thermogrip.sysid.blackbox.fit import fit_black_box
 from thermogrip.sysid.blackbox.order_selection import Structure, folds, held_out_runs
@@ -57,6 +57,11 @@ def test_leaving_one_log_out_gives_a_row_for_every_model_and_log():
     assert (found.plant.scores.average_s, found.plant.scores.average_why) == (2.0, "asked for")
     assert f"{found.model}: steps of 2 s (asked for)" in found.notes
     assert found.errors()[found.model] == min(found.errors().values())
+    assert list(found.held_out_runs) == list("abc")
+    for row in (row for row in found.rows if row.held_out and row.model == found.model):
+        run = found.held_out_runs[row.log]
+        assert (run.scores[row.output].rmse, log_name(run.measured)) == (row.rmse, row.log)
+        assert row.log not in run.plant.logs
 
 
 def test_a_log_is_scored_in_the_fit_with_the_warmup_that_its_held_out_part_had():
@@ -76,6 +81,7 @@ def test_every_fold_of_every_candidate_is_in_the_table_and_the_tail_of_the_one_t
     for model in ("arx", "oe", "subspace"):
         tail = {"last 30 % of a"} if model == found.model else set()
         assert {row.log for row in held if row.model == model} == blocks | tail
+    assert list(found.held_out_runs) == ["last 30 % of a"]
     fit = fit_black_box("oe", [plant_log()], average=2.0)
     rows = [row for row in held if row.model == "oe" and row.log in blocks]
     assert [row.rmse for row in rows] == fit.choice.rmse[:, 0].tolist()

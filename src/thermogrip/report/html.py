@@ -191,7 +191,7 @@ class Section:
 def html_page(title: str, lead: str, sections: Sequence[Section]) -> str:
     """Return the page as text; ``lead`` says in a sentence or two what was done."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
-    from markupsafe import Markup
+    from markupsafe import Markup, escape
 
     loader = PackageLoader("thermogrip", "templates")
     env = Environment(
@@ -202,6 +202,7 @@ def html_page(title: str, lead: str, sections: Sequence[Section]) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    env.filters["breakable"] = lambda name: escape(printable(name)).replace("_", Markup("_<wbr>"))
     template = env.get_template("report.html.j2")
     plots = [part for section in sections for part in section.parts if isinstance(part, Plot)]
     script, style = _script(drawing=bool(plots)), _asset("uPlot.min.css") + _asset("report.css")

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from thermogrip.sysid.validation import Band, FreeRun
 
 MODEL, TARGET = PALETTE[0], INK
-MEASURED, PREDICTED = "#b3bfcb", PALETTE[1]  # a broad line, and a thin one of dashes over it
+MEASURED, PREDICTED = "#9dabb9", PALETTE[1]  # a broad line, and a thin one of dashes over it
 MARKERS = ("o", "s", "D", "^", "v", "P", "X", "*")
 
 

@@ -30,7 +30,10 @@
   const ticks = (self, splits) => splits.map(value => value == null ? "" : String(Number(value.toPrecision(6))));
   const dashes = {"-": [], "--": [7, 4], ":": [2, 3], "-.": [7, 3, 2, 3]};
 
-  function legend(panel, plot, places, box) {
+  const told = (value, low, high) => shown(value) + (low == null ? "" : ` (${shown(low)} to ${shown(high)})`);
+  const longest = words => words.reduce((a, b) => b.length > a.length ? b : a, "");
+
+  function legend(chart, panel, plot, places, box) {
     const line = document.createElement("div"), entries = new Map();
     line.className = "legend";
     const at = line.appendChild(document.createElement("span"));
@@ -62,6 +65,18 @@
       entries.get(curve.label).curves.push(k);
     });
     box.append(line);
+    // room for the numbers is there before they are, so that no plot moves under the pointer
+    const some = at => chart.arrays[at].filter((_, k, all) => k % Math.ceil(all.length / 200) === 0);
+    for (const {value, curves: [k]} of entries.values()) {
+      const [y, low, high] = ["y", "low", "high"].map(name => panel.curves[k][name] == null ? null : some(panel.curves[k][name]));
+      value.textContent = longest(y.map((_, j) => told(y[j], low?.[j], high?.[j])));
+      value.style.minWidth = `${value.offsetWidth}px`;
+    }
+    at.textContent = longest(some(panel.curves[0].x).map(shown)) + panel.unit;
+    at.style.minWidth = `${at.offsetWidth}px`;
+    line.style.minHeight = `${line.offsetHeight}px`;
+    for (const {value} of entries.values()) value.textContent = "";
+    at.textContent = "";
     return self => {
       const {idx, idxs, top} = self.cursor;
       at.textContent = idx == null ? "" : `${shown(self.data[0][idx])}${panel.unit}`;
@@ -71,8 +86,9 @@
           .filter(own => own[0] != null)
           .sort((a, b) => Math.abs(self.valToPos(a[0], "y") - top) - Math.abs(self.valToPos(b[0], "y") - top));
         const [value, low, high] = near[0] ?? [];
-        entry.value.textContent = shown(value) + (low == null ? "" : ` (${shown(low)} to ${shown(high)})`);
+        entry.value.textContent = told(value, low, high);
       }
+      line.style.minHeight = `${line.offsetHeight}px`;  // what has grown once stays, and the plot under it too
     };
   }
 
@@ -136,7 +152,7 @@
       },
     };
     if (panel.title) box.appendChild(document.createElement("h3")).textContent = panel.title;
-    tell = legend(panel, () => plot, places, box);
+    tell = legend(chart, panel, () => plot, places, box);
     plot = new uPlot(options, data.length > 1 ? uPlot.join(data) : data[0], box);
     fingers(plot, figure);
     return plot;

@@ -25,10 +25,12 @@ from thermogrip.sysid.greybox.posterior import (
     Chain,
     Posterior,
     RandomizedMap,
+    _arviz,
     fit_problem,
     problem_hash,
     run_chain,
     sample_posterior,
+    split_r_hat,
     with_draws,
 )
 from thermogrip.sysid.greybox.problem import make_problem, prior_plant
@@ -229,6 +231,26 @@ def test_the_saved_posterior_reads_back_with_arviz(tmp_path: Path) -> None:
     np.testing.assert_allclose(data.sample_stats["lp"].values, record.chain.log_posterior.T)
     np.testing.assert_allclose(data.posterior_whole["b"].values[0], record.samples[:, 1])
     assert [p.name for p in tmp_path.iterdir()] == ["posterior.nc"]
+
+
+@pytest.mark.parametrize("apart", [0.0, 3.0])
+def test_r_hat_is_that_of_arviz_and_finds_walkers_that_have_not_met(apart: float) -> None:
+    steps = np.random.default_rng(0).standard_normal((101, 6)) + apart * (np.arange(6) > 2)
+    found = split_r_hat(steps)
+    assert found == pytest.approx(float(_arviz().rhat(steps[:100].T, method="split")), rel=1e-9)
+    assert (found > 1.5) == (apart > 0)
+    assert np.isnan(split_r_hat(steps[:3]))
+
+
+def test_the_effective_number_of_samples_is_that_behind_the_burn_in_over_tau(
+    sampled: tuple[Plant, Posterior],
+) -> None:
+    record = sampled[1]
+    kept = record.chain.settled
+    assert list(record.ess) == list(record.r_hat) == list(record.sampled)
+    for k, name in enumerate(record.sampled):
+        assert record.ess[name] == pytest.approx(kept[..., 0].size / record.tau[name])
+        assert record.r_hat[name] == split_r_hat(kept[..., k])
 
 
 def test_a_corner_of_what_was_not_sampled_is_refused(sampled: tuple[Plant, Posterior]) -> None:
