@@ -82,7 +82,7 @@ LiveOption = Annotated[
     cli.opt(
         "--live",
         "[PORT]",
-        "Serve a live page to this computer, on any free port or on this one.",
+        "Live page on this computer, any free port or this one.",
         min=0,
         max=65535,
     ),
@@ -92,19 +92,15 @@ FoxgloveOption = Annotated[
     cli.opt(
         "--foxglove",
         "[PORT]",
-        "Serve Foxglove on this computer, on port 8765 or on this one.",
+        "Foxglove on this computer, port 8765 or this one.",
         min=1,
         max=65535,
     ),
 ]
-BridgeOption = Annotated[
-    str | None, cli.opt("--bridge", "ws://HOST:PORT", "Publish rows and events to a rosbridge server.")
-]
+BridgeOption = Annotated[str | None, cli.opt("--bridge", "ws://HOST:PORT", "Publish to a rosbridge server.")]
 OnTripOption = Annotated[
     str | None,
-    cli.opt(
-        "--on-trip", "CMD", "Run this command, without a shell, on a trip, which it gets as JSON on stdin."
-    ),
+    cli.opt("--on-trip", "CMD", "Run this on a trip, which it gets as JSON on stdin."),
 ]
 LearnOption = Annotated[
     Path | None,

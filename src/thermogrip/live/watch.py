@@ -362,7 +362,9 @@ class _Panel:
         note = f"{100 * fraction:3.0f} %  {what}" if what else ""
         plain_text = not (self._console.encoding or "").lower().startswith("utf")
         width = get_terminal_size().columns
-        return panel(self._title, self._now, self._history, note=note, width=width, plain=plain_text)
+        return panel(
+            f"thermogrip {self._title}", self._now, self._history, note=note, width=width, plain=plain_text
+        )
 
 
 def _drain(waiting: deque[Any]) -> list[Any]:
