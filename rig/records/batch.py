@@ -38,6 +38,7 @@ from thermogrip.rig.interface import DeviceRefusedError, LatchingRig, Rig
 from thermogrip.rig.records.run_folder import RunFolder, mark_bad, read_run
 from thermogrip.rig.session.loop import Recorder
 from thermogrip.rig.session.session import Object, Session, run_session
+from thermogrip.rig.session.snapshot import Operator
 
 SCHEMA, VERSION = "thermogrip.batch", 1
 #: Trips after which a trial may simply be done again: what they say is over once the rig answers.
@@ -159,6 +160,7 @@ def run_batch(
     tries: int = 3,
     first_touch: Callable[[Grasps], tuple[float, float]] | None = None,
     progress: Callable[[float, str], None] | None = None,
+    operator: Operator | None = None,
     **options: Any,
 ) -> Batch:
     """Do every trial of the plan that has no good grasp in the folder yet; return how that went.
@@ -199,6 +201,8 @@ def run_batch(
         trial without a temperature whose ``touch_group`` has a good grasp already.
     progress : callable, optional
         Called with (fraction of the plan, what is being done).
+    operator : Operator, optional
+        Whose stop ends the batch; handed to each session.
     **options
         Handed to :func:`~thermogrip.rig.session.session.run_session`.
 
@@ -229,13 +233,15 @@ def run_batch(
             if progress is not None:
                 progress(k / len(plan), f"trial {k + 1} of {len(plan)}: {trial.material or 'unknown'}")
             for attempt in range(tries):
-                if ready is not None and not ready(k, trial):
+                stopped = operator is not None and operator.stop_asked
+                if stopped or (ready is not None and not ready(k, trial)):
                     return _batch(path, plan, "stopped", "run the same command again to go on", sessions)
                 run = next_folder(path, k)
                 known = _with_temperature(trial, k, plan, path, first_touch)
                 described = {**(about or {}), "trial": k + 1, **asdict(known)}
                 with RunFolder(run, described, files=files) as kept_in, through(kept_in) as recorder:
-                    kept: dict[str, Any] = {"stop": stop, "guard": guard, "recorder": recorder, **options}
+                    kept: dict[str, Any] = {"stop": stop, "guard": guard, "recorder": recorder}
+                    kept |= {"operator": operator, **options}
                     thing = _object(known, k)
                     session = run_session(source.rig, controller, known.target, grasp=thing, **kept)
                     kept_in.finish(session)

@@ -104,6 +104,7 @@ class Loop:
             if name not in self.rooms and not self.guard.sensors.plausible(value):
                 problem = f"the rig's {name} reads {value:g} degC"
                 raise UserError(problem, hint="check the sensor before starting")
+        self.operator.take_bad()  # of what was before
         self.open_gripper()  # a session that lost its rig in contact has left it closed on the object
         self.guard.start(self.reading, self.now(), self.rig.units)
         if self.guard.model is not None and (drift := self.guard.model.drift) is not None:

@@ -68,6 +68,8 @@ def test_two_viewers_see_a_session_from_its_start_over_the_grasp_to_its_end(
             page.evaluate("rows.length") == len(session.log["time"]) + 1
         )  # and the last one, with the verdict
         assert page.evaluate("$('c-skin').getContext('2d').getImageData(0, 0, 300, 150).data.some((x) => x)")
+        page.hover("#c-skin")
+        until(page, "#r-skin", r"^\d+\.\d s: target 28\.00, t_surface \d\d\.\d\d °C$")
     assert session.verdict == "settled"
     own = watch.address.split("?")[0]
     assert all(url.startswith(own) for url in asked)
@@ -124,10 +126,8 @@ def test_a_question_is_answered_on_the_page(watch: Watch, viewer: Viewer, monkey
     answers: list[str] = []
 
     def work() -> None:
-        answers.append(
-            watch.ask("trial 1 of 2: <b>copper</b>", (("", "It is ready"), ("q", "Stop the batch")))
-        )
-        answers.append(watch.ask("was it good?", (("", "Keep it"),), "what was bad"))
+        answers.append(watch.ask("trial 1 of 2: <b>copper</b>", "", (("", "It is ready"), ("q", "Stop"))))
+        answers.append(watch.ask("was it good?", "", (("", "Keep it"),), "what was bad"))
 
     asking = threading.Thread(target=work)
     asking.start()

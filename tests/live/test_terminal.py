@@ -27,12 +27,12 @@ def test_the_numbers_of_a_session() -> None:
     assert dict(numbers(NOW)) == {
         "t_surface": "37.90 degC", "target of t_surface": "38 +- 0.25 degC", "t_tank": "31.40 degC",
         "t_ambient": "nan degC", "drive": "+0.42", "pump": "on", "phase": "lead in, 3 s left",
-        "guard": "17.1 K to the limit of t_surface; 40 % of what the plant allows",
+        "guard margin": "17.1 K to the limit of t_surface", "off the plant": "40 % of what is allowed",
     }  # fmt: skip
     bare = replace(NOW, target={}, band=nan, left_s=inf, margin=inf, units={"drive": "percent"}, pump=0)
     shown = dict(numbers(bare))
     assert (shown["phase"], shown["drive"], shown["pump"]) == ("lead in", "+0.42 %", "off")
-    assert not shown.keys() & {"guard", "target of t_surface"}
+    assert not shown.keys() & {"guard margin", "target of t_surface"}
 
 
 def test_one_line_has_the_same_numbers_and_what_happened_last() -> None:
@@ -44,7 +44,7 @@ def test_one_line_has_the_same_numbers_and_what_happened_last() -> None:
 
 def test_a_sparkline_has_its_lowest_and_highest_at_the_ends_and_gaps_where_nothing_was_read() -> None:
     assert sparkline([0.0, 1.0, nan, 2.0], 10) == "▁▅ █"
-    assert sparkline([0.0, 5.0, 6.0], 2) == "▁█"
+    assert sparkline([0.0, 2.0, nan, nan, 3.0], 3) == "▁ █"  # means of two
     assert sparkline([3.0, 3.0], 5) == "▁▁"
     assert sparkline([], 5) == ""
     assert sparkline([0.0, 1.0], 5, "_#") == "_#"

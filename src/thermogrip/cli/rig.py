@@ -82,7 +82,7 @@ LiveOption = Annotated[
     cli.opt(
         "--live",
         "[PORT]",
-        "Serve a live page to this computer, on any free port or on this one.",
+        "Live page on this computer, any free port or this one.",
         min=0,
         max=65535,
     ),
@@ -92,19 +92,15 @@ FoxgloveOption = Annotated[
     cli.opt(
         "--foxglove",
         "[PORT]",
-        "Serve Foxglove on this computer, on port 8765 or on this one.",
+        "Foxglove on this computer, port 8765 or this one.",
         min=1,
         max=65535,
     ),
 ]
-BridgeOption = Annotated[
-    str | None, cli.opt("--bridge", "ws://HOST:PORT", "Publish rows and events to a rosbridge server.")
-]
+BridgeOption = Annotated[str | None, cli.opt("--bridge", "ws://HOST:PORT", "Publish to a rosbridge server.")]
 OnTripOption = Annotated[
     str | None,
-    cli.opt(
-        "--on-trip", "CMD", "Run this command, without a shell, on a trip, which it gets as JSON on stdin."
-    ),
+    cli.opt("--on-trip", "CMD", "Run this on a trip, which it gets as JSON on stdin."),
 ]
 LearnOption = Annotated[
     Path | None,
@@ -626,7 +622,7 @@ def _ready(n: int, watch: Watch) -> Callable[[int, Trial], bool]:
         at = "unknown temperature" if trial.t_object is None else f"{trial.t_object} degC"
         what = f"trial {k + 1} of {n}: {trial.material or 'unknown'}, {at}, skin to {trial.target:g} degC"
         choices = (("", "It is ready"), ("q", "Stop the batch"))
-        said = watch.ask(f"{what}; Enter when it is ready, q to stop", choices)
+        said = watch.ask(what, "Enter when it is ready, q to stop", choices)
         return said.lower() not in ("q", "quit", "n", "no")
 
     return ready
@@ -638,7 +634,9 @@ def _verdict(console: Console, watch: Watch) -> Callable[[int, Trial, Session], 
     def verdict(k: int, trial: Trial, session: Session) -> str:
         if session.contact != session.contact:
             console.warn("the skin felt nothing: no object, or one as warm as the skin")
-        said = watch.ask("Enter to keep it, or what was bad", (("", "Keep it"),), "what was bad")
+        said = watch.ask(
+            "was it good", "Enter to keep it, or what was bad", (("", "Keep it"),), "what was bad"
+        )
         return "" if said.lower() in ("y", "yes", "ok") else said
 
     return verdict
@@ -648,9 +646,11 @@ def _cleared(watch: Watch) -> Callable[[int, Trial, Trip], bool]:
     """Return what asks after a trip whether its cause is cleared."""
 
     def cleared(k: int, trial: Trial, trip: Trip) -> bool:
-        text = f"{trip.line()}; c when it is cleared, Enter to end the batch"
         choices = (("c", "It is cleared: do this trial again"), ("", "End the batch"))
-        return watch.ask(text, choices).lower() in ("c", "cleared")
+        said = watch.ask(trip.line(), "c when it is cleared, Enter to end the batch", choices)
+        if done := said.lower() in ("c", "cleared"):
+            watch.cleared()
+        return done
 
     return cleared
 

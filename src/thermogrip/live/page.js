@@ -23,8 +23,8 @@ source.onerror = () => { if (!m.ended) { here = false; show(); } };
 function status(now) {
   if (!here) return ["✖", m.lost ? "session lost, and this page's server too" : "this page's server is gone", "bad"];
   if (m.lost) return ["✖", "session lost", "bad"];
-  if (now.trip) return ["⚠", "tripped", "bad"];
-  if (m.ended) return [["settled", "played", "done"].includes(m.ended) ? "✓" : "■", "ended: " + m.ended, "good"];
+  if (now.trip) return ["⚠", m.question ? "tripped, waiting for you" : "tripped", "bad"];
+  if (m.ended) return ["settled", "played", "done"].includes(m.ended) ? ["✓", "ended: " + m.ended, "good"] : ["■", "ended: " + m.ended, "warn"];
   if (m.question) return ["❚❚", "waiting for you", "warn"];
   if (m.stopping) return ["■", "stopping", "warn"];
   if (!now.phase) return ["…", "starting", ""];
@@ -34,7 +34,7 @@ function status(now) {
 }
 
 function text(id, words) { if ($(id).textContent !== words) $(id).textContent = words; }
-function fixed(value, n) { return value === null || value === undefined ? "lost" : value.toFixed(n); }
+function fixed(value, n, more = "") { return value === null || value === undefined ? "lost" : value.toFixed(n) + more; }
 function unit(name) { return { "1": "", percent: " %", "0_255": " / 255" }[m.now.units[name]] ?? " " + m.now.units[name]; }
 
 function show() {
@@ -54,8 +54,10 @@ function show() {
   }
   ask(m.question);
   const dead = !here || m.lost || Boolean(m.ended);
-  for (const control of document.querySelectorAll("#stop, #actions button, #question button")) control.disabled = dead;
-  if (!now.phase) { text("phase", "no reading yet"); return; }
+  for (const control of document.querySelectorAll("#stop, #question button")) control.disabled = dead;
+  document.querySelector("#bad button").disabled = dead || !now.phase || Boolean(now.verdict);
+  $("charts").hidden = $("happened").hidden = $("phase-box").hidden = !now.phase;
+  if (!now.phase) return;
   countdown(now, dead);
   tiles(now);
   $("events").replaceChildren(...[...now.events].reverse().map((event) => {
@@ -81,19 +83,20 @@ function countdown(now, dead) {
   const over = dead || now.verdict;
   text("phase", now.verdict || now.phase.replace("_", " "));
   text("left", over || now.left_s === null ? "" : (now.phase === "contact" ? left.toFixed(1) + " s left" : left.toFixed(0) + " s left at most"));
-  text("what", m.what || "");
-  $("bar").value = over ? 1 : 1 - left / longest;
+  text("what", over && !m.question ? "" : m.what || "");
+  $("bar").hidden = Boolean(over);
+  $("bar").value = 1 - left / longest;
 }
 
 function tiles(now) {
   const gone = m.lost && now.expires_s !== null, kept = m.lost && now.expires_s === null;
-  const found = [[now.skin, fixed(now.values[now.skin], 2) + " °C"]];
+  const found = [[now.skin, fixed(now.values[now.skin], 2, " °C")]];
   for (const [name, value] of Object.entries(now.target)) found.push(["target of " + name, value.toFixed(1) + " °C", now.band === null ? "" : "± " + now.band]);
-  for (const [name, value] of Object.entries(now.values)) if (name !== now.skin) found.push([name, fixed(value, 2) + " °C"]);
+  for (const [name, value] of Object.entries(now.values)) if (name !== now.skin) found.push([name, fixed(value, 2, " °C")]);
   for (const [name, value] of Object.entries(now.drive)) found.push([name, gone ? "0" : kept ? "not known" : value.toFixed(2) + unit(name), gone ? "expired" : ""]);
   found.push(["pump", gone ? "off" : kept ? "not known" : now.pump ? "on" : "off"]);
   if (now.margin !== null) found.push(["guard margin", now.margin.toFixed(1) + " K", "to the limit of " + now.nearest]);
-  if (now.model_share !== null) found.push(["against the plant", (100 * now.model_share).toFixed(0) + " %", "of what is allowed"]);
+  if (now.model_share !== null) found.push(["off the plant", (100 * now.model_share).toFixed(0) + " %", "of what is allowed"]);
   $("tiles").replaceChildren(...found.map(([name, value, more]) => {
     const box = document.createElement("div"), dt = document.createElement("dt"), dd = document.createElement("dd");
     dt.textContent = name; dd.textContent = value;
@@ -109,7 +112,7 @@ function ask(question) {
   if (key === asked) return;
   asked = key;
   if (!question) return;
-  text("question-text", question.text);
+  text("question-text", m.now.trip ? "Is it cleared?" : question.text);
   $("choices").replaceChildren(...question.choices.map(([said, shown]) => {
     const button = document.createElement("button");
     button.textContent = shown;
@@ -150,8 +153,9 @@ function draw() {
   chart("skin", skin, "°C", from, last);
   chart("other", names.map((name, k) => line(name, k + 2)), "°C", from, last);
   chart("drive", drives.map((name, k) => line(name, k, { steps: true })), drives.length ? unit(drives[0]).trim() : "", from, last, 0);
-  $("posterior").hidden = !posterior.length;
-  if (posterior.length) materials();
+  const earlier = !now.verdict && ["settle", "hold"].includes(now.phase);  // of the trial before
+  $("posterior").hidden = earlier || !posterior.length;
+  if (!$("posterior").hidden) materials();
 }
 
 function materials() {
@@ -205,7 +209,7 @@ function chart(id, lines, unitOf, from, to, ...must) {
   g.setTransform(scale, 0, 0, scale, 0, 0);
   g.clearRect(0, 0, box.width, box.height);
   g.font = "12px system-ui, sans-serif"; g.lineWidth = 1; g.strokeStyle = color("--line"); g.fillStyle = color("--soft");
-  const [ys, yd] = ticks(low, high, box.height < 160 ? 4 : 5), [xs, xd] = ticks(from, to, Math.max(2, box.width / 120));
+  const [ys, yd] = ticks(low, high, box.height < 160 ? 4 : 5), [xs, xd] = ticks(from, to, Math.max(4, box.width / 120));
   g.textAlign = "right"; g.textBaseline = "middle";
   for (const v of ys) { g.beginPath(); g.moveTo(left, Y(v)); g.lineTo(box.width - right, Y(v)); g.stroke(); g.fillText(v.toFixed(yd), left - 5, Y(v)); }
   g.textAlign = "center"; g.textBaseline = "top";

@@ -269,6 +269,8 @@ def _lines() -> Iterator[bytes]:
 
 def main() -> None:
     """Serve what comes on standard input; its first line has the settings."""
+    if hasattr(os, "nice"):
+        os.nice(5)  # the session comes first
     lines = _lines()
     settings = json.loads(next(lines))
     listener = None
@@ -277,8 +279,10 @@ def main() -> None:
             listener = socket.create_server((HOST, settings["port"]))
             _answer({"port": listener.getsockname()[1]})
         asyncio.run(_serve(settings, lines, listener))
-    except (OSError, RuntimeError) as error:
-        _answer({"error": os.strerror(error.errno) if getattr(error, "errno", None) else str(error)})
+    except OSError as error:
+        _answer({"error": os.strerror(error.errno) if error.errno else str(error)})
+    except RuntimeError as error:  # of Foxglove's server
+        _answer({"error": str(error)})
 
 
 if __name__ == "__main__":

@@ -36,10 +36,9 @@ def numbers(now: Snapshot) -> list[tuple[str, str]]:
     left = f", {max(now.left_s, 0.0):.0f} s left" if isfinite(now.left_s) and not now.verdict else ""
     rows.append(("phase", (now.verdict or now.phase.replace("_", " ")) + left))
     if isfinite(now.margin):
-        model = (
-            f"; {100 * now.model_share:.0f} % of what the plant allows" if isfinite(now.model_share) else ""
-        )
-        rows.append(("guard", f"{now.margin:.1f} K to the limit of {now.nearest}{model}"))
+        rows.append(("guard margin", f"{now.margin:.1f} K to the limit of {now.nearest}"))
+    if isfinite(now.model_share):
+        rows.append(("off the plant", f"{100 * now.model_share:.0f} % of what is allowed"))
     return rows
 
 
@@ -51,8 +50,10 @@ def line(now: Snapshot) -> str:
 
 
 def sparkline(values: Sequence[float], width: int, bars: str = _BARS) -> str:
-    """Return values as bars between the lowest and the highest, newest at the right; gaps are spaces."""
-    kept = list(values)[-width:]
+    """Return values as bars between the lowest and the highest, newest at the right; gaps are spaces; where
+    there are more than the width, each bar is the mean of several."""
+    size = max(1, -(-len(values) // width))
+    kept = [_mean(values[at : at + size]) for at in range(0, len(values), size)]
     known = [value for value in kept if isfinite(value)]
     low, high = min(known, default=0.0), max(known, default=1.0)
     span = max(high - low, 1e-9)
@@ -60,6 +61,11 @@ def sparkline(values: Sequence[float], width: int, bars: str = _BARS) -> str:
         bars[min(int((value - low) / span * len(bars)), len(bars) - 1)] if isfinite(value) else " "
         for value in kept
     )
+
+
+def _mean(values: Sequence[float]) -> float:
+    known = [value for value in values if isfinite(value)]
+    return sum(known) / len(known) if known else float("nan")
 
 
 class History:
@@ -124,7 +130,7 @@ def panel(
     if len(known) > 1:
         bars = sparkline(means, max(10, width - 36), _PLAIN_BARS if plain else _BARS)
         ends = f" {min(known):.1f} to {max(known):.1f} degC, last {MINUTES} min"
-        lines.append(Text(bars, style="cyan").append(ends, style="dim"))
+        lines.append(Text.assemble((bars, "cyan"), ends))
     if note:
         lines.append(Text(printable(note)))
     if now.events and now.trip is None:

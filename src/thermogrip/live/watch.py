@@ -19,7 +19,7 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from shutil import get_terminal_size
@@ -119,23 +119,31 @@ class Watch:
         """Say how the work ended."""
         self._verdict = verdict
 
-    def ask(self, text: str, choices: tuple[tuple[str, str], ...] = (), own_words: str = "") -> str:
-        """Return what is answered, on the terminal or on the page."""
+    def cleared(self) -> None:
+        """Show the trip no more."""
+        if self._now is not None:
+            self._queue.append(replace(self._now, trip=None, verdict="cleared"))
+
+    def ask(
+        self, text: str, keys: str = "", choices: tuple[tuple[str, str], ...] = (), own_words: str = ""
+    ) -> str:
+        """Return what is answered, on the terminal, which says what the ``keys`` mean, or on the page."""
         self._view.pause()
+        typed = f"{text}; {keys}" if keys else text
         try:
             if not self._reached:
-                return str(typer.prompt(text, default="", show_default=False)).strip()
-            return self._ask_both(text, choices, own_words)
+                return str(typer.prompt(typed, default="", show_default=False)).strip()
+            return self._ask_both(text, typed, choices, own_words)
         finally:
             self._view.resume()
 
-    def _ask_both(self, text: str, choices: tuple[tuple[str, str], ...], own_words: str) -> str:
+    def _ask_both(self, text: str, typed: str, choices: tuple[tuple[str, str], ...], own_words: str) -> str:
         self._asked += 1
         with suppress(queue.Empty):
             while True:
                 self._answers.get_nowait()  # typed before there was a question
         self._question = Question(self._asked, text, choices, own_words)
-        sys.stderr.write(f"{printable(text)} (here or on the page): ")
+        sys.stderr.write(f"{printable(typed)} (here or on the page): ")
         sys.stderr.flush()
         if self._typing is None:
             self._typing = threading.Thread(target=self._read_typed, daemon=True)
@@ -182,6 +190,9 @@ class Watch:
             self._verdict = "stopped by Ctrl-C" if stopped else f"failed: {error}"
         self._over.set()
         self._thread.join(_GOODBYE_S)
+        if self._thread.is_alive() and self._page is not None:  # it writes to a process that hangs
+            self._page.kill()
+            self._thread.join()
         self._view.pause()
         self._close_page()
         if self._command is not None:
@@ -302,6 +313,7 @@ class _Lines:
     def __init__(self, title: str) -> None:
         self._title, self._said, self._last = title, -float("inf"), ""
         self._now: Snapshot | None = None
+        self._paused = False
         self.progress: tuple[float, str] = 0.0, ""
 
     def add(self, snapshot: Snapshot) -> None:
@@ -311,16 +323,18 @@ class _Lines:
         fraction, what = self.progress
         begin = f"{printable(self._title)} {100 * fraction:3.0f} % {printable(what)}"
         text = begin if self._now is None else f"{begin}; {line(self._now)}"
+        if self._paused:
+            return
         if (last or time.monotonic() - self._said >= 1.0) and text != self._last and (what or self._now):
             self._said, self._last = time.monotonic(), text
             sys.stderr.write(text + "\n")
             sys.stderr.flush()
 
     def pause(self) -> None:
-        pass
+        self._paused = True
 
     def resume(self) -> None:
-        pass
+        self._paused = False
 
 
 class _Panel:
@@ -362,7 +376,9 @@ class _Panel:
         note = f"{100 * fraction:3.0f} %  {what}" if what else ""
         plain_text = not (self._console.encoding or "").lower().startswith("utf")
         width = get_terminal_size().columns
-        return panel(self._title, self._now, self._history, note=note, width=width, plain=plain_text)
+        return panel(
+            f"thermogrip {self._title}", self._now, self._history, note=note, width=width, plain=plain_text
+        )
 
 
 def _drain(waiting: deque[Any]) -> list[Any]:

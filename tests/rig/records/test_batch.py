@@ -22,7 +22,7 @@ from thermogrip.rig.records import batch
 from thermogrip.rig.records.batch import Batch, Trial, collect, good_run, next_folder, read_plan, run_batch
 from thermogrip.rig.records.run_folder import read_run
 from thermogrip.rig.session.session import Object, Session
-from thermogrip.rig.session.snapshot import Operator
+from thermogrip.rig.session.snapshot import Operator, Snapshot
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.contact.simulation import Grip
 from thermogrip.sysid.plant.plant import Plant
@@ -254,10 +254,16 @@ def test_a_cleared_trip_clears_the_latch_of_the_device(monkeypatch: pytest.Monke
 def test_a_trial_that_was_marked_while_it_ran_is_done_again_and_nobody_is_asked(
     plant: Plant, controller: Any, tmp_path: Path
 ) -> None:
-    operator, asked = Operator(), []
-    operator.mark_bad("it slipped")
+    operator, asked, seen = Operator(), [], []
+    operator.mark_bad("too early")  # nothing runs yet
+
+    def listener(snapshot: Snapshot) -> None:
+        if len(seen) == 3:
+            operator.mark_bad("it slipped")
+        seen.append(snapshot)
+
     found = run_batch(
-        twin(plant), controller, PLAN[:1], tmp_path, grasp_time=1.0, operator=operator,
+        twin(plant), controller, PLAN[:1], tmp_path, grasp_time=1.0, operator=operator, listener=listener,
         judge=lambda k, trial, session: asked.append(k) or "",
     )  # fmt: skip
     assert (found.verdict, found.sessions, found.left) == ("done", 2, 0)
@@ -265,6 +271,20 @@ def test_a_trial_that_was_marked_while_it_ran_is_done_again_and_nobody_is_asked(
     assert [event.kind for event in read_run(tmp_path / "0001").events].count("bad") == 1
     assert asked == [0]  # for the second one
     assert found.done == (tmp_path / "0001-2",)
+
+
+def test_a_stop_that_is_asked_for_between_trials_ends_the_batch(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    operator = Operator()
+    source = scripted(monkeypatch, ["settled"])
+
+    def judge(k: int, trial: Trial, session: Session) -> str:
+        operator.stop("the page")
+        return ""
+
+    found = run_batch(source, None, BOTH, tmp_path, operator=operator, judge=judge)
+    assert (found.verdict, found.sessions, found.left) == ("stopped", 1, 1)
 
 
 def test_what_records_may_stand_before_each_run_folder(plant: Plant, controller: Any, tmp_path: Path) -> None:
@@ -305,7 +325,7 @@ def test_a_session_is_given_its_trial_and_the_record_describes_it(
     assert told == [(0.0, "trial 1 of 2: copper"), (0.5, "trial 2 of 2: unknown")]
     first, second = source.asked
     assert first[:2] == (32.0, Object("copper", 18.0, 0.4, {"block": "c1"}, "0001"))
-    assert first[2] == {"guard": "G", "stop": "S", "band": 0.5}
+    assert first[2] == {"guard": "G", "stop": "S", "band": 0.5, "operator": None}
     assert (second[0], second[1].material, second[1].grasp_id, second[1].labels) == (30.0, "", "0002", {})
     assert np.isnan([second[1].t_object, second[1].t_object_sd]).all()
     about = read_run(tmp_path / "0001").about["about"]
