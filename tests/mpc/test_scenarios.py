@@ -147,6 +147,38 @@ def test_two_runs_of_one_seed_are_the_same_and_another_seed_is_not(controller, o
     assert np.any(first.readings["t_surface"] != other.readings["t_surface"])
 
 
+def follow(controller: Controller, plant, line: np.ndarray, ahead: int) -> tuple[np.ndarray, set[str]]:
+    """Return by how much the skin is off a trajectory of which so many samples are told."""
+    world, off, statuses = Truth(plant, 2.0, Surroundings(noise=0.02, quantum=0.0), 28.0, 1), [], set()
+    controller.reset(world.reading())
+    for k in range(250):
+        reading = world.reading()
+        off.append(reading["t_surface"] - line[k])
+        told = line[k : k + ahead + 1].tolist() if ahead else float(line[k])
+        move = controller.step(reading, {"t_surface": told})
+        statuses.add(move.status)
+        world.apply(move)
+    return np.array(off[20:]), statuses
+
+
+def test_a_trajectory_that_is_told_ahead_is_followed_without_lag(tank, other_tank):
+    line = np.interp(2.0 * np.arange(400), [0, 60, 260, 400, 600], [28, 28, 38, 38, 30])
+    controller = design_controller(tank, dt=2.0)
+    late, _ = follow(controller, other_tank, line, 0)
+    told, statuses = follow(controller, other_tank, line, 80)
+    assert np.sqrt(np.mean(told**2)) < 0.12  # 0.09, and 0.77 where only the target now is known
+    assert np.sqrt(np.mean(late**2)) > 0.5
+    assert np.max(np.abs(told)) < 0.25
+    assert statuses == {"ok"}
+    controller.reset({"t_tank": 28.0, "t_surface": 28.0})
+    move = controller.step({"t_tank": 28.0, "t_surface": 28.0}, {"t_surface": [float("nan"), 30.0]})
+    assert (move.status, move.advice[:19]) == ("off", "target of t_surface")
+    slow = Controller(tank, replace(controller.design, move_delay=1))
+    slow.reset({"t_tank": 28.0, "t_surface": 28.0})
+    slow.step({"t_tank": 28.0, "t_surface": 28.0}, {"t_surface": [28.0, 29.0, 30.0, float("nan"), 31.0]})
+    np.testing.assert_array_equal(slow._ahead[:4, 0], [30.0, 28.0, 31.0, 31.0])
+
+
 @pytest.mark.parametrize("in_c", [False, True] if compiler() else [False])
 def test_a_skin_whose_sensor_lags_by_10_s_is_found_slower_and_does_not_swing(tank, in_c):
     tank, lag = replace(tank, noise=dict.fromkeys(tank.outputs, 0.02)), 10.0
