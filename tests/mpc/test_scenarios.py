@@ -12,6 +12,7 @@ from thermogrip.mpc.closed_loop.simulate import Surroundings, Truth, simulate_cl
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.native.runtime import compiler
+from thermogrip.mpc.optimiser.rti import Sample
 
 OFF = Surroundings(offset={"t_surface": 0.2, "t_ambient": 0.3})
 
@@ -173,6 +174,15 @@ def test_a_trajectory_that_is_told_ahead_is_followed_without_lag(tank, other_tan
     controller.reset({"t_tank": 28.0, "t_surface": 28.0})
     move = controller.step({"t_tank": 28.0, "t_surface": 28.0}, {"t_surface": [float("nan"), 30.0]})
     assert (move.status, move.advice[:19]) == ("off", "target of t_surface")
+    x, u, d = controller.model.at_rest(25.0)
+    plans = []
+    for side in (0.0, 1.0):  # from where it is approached: nothing is beyond a target that moves
+        controller.optimiser.forget()
+        ahead = np.linspace(40.0, 30.0, controller.optimiser.N)[:, None]
+        guess, none = np.zeros((controller.optimiser.n_b, 1)), np.zeros(2)
+        about = Sample(x, u, guess, d, np.array([40.0]), np.array([side]), none, np.zeros(1), ahead=ahead)
+        plans.append(controller.optimiser.solve(about).plan)
+    np.testing.assert_array_equal(plans[0], plans[1])
     slow = Controller(tank, replace(controller.design, move_delay=1))
     slow.reset({"t_tank": 28.0, "t_surface": 28.0})
     slow.step({"t_tank": 28.0, "t_surface": 28.0}, {"t_surface": [28.0, 29.0, 30.0, float("nan"), 31.0]})
