@@ -68,9 +68,9 @@ def test_drives_that_acted_a_sample_later_than_the_model_was_told_are_slower_by_
     controller = design_controller(kit(), dt=DT)
     controller.structure.note = lambda *_: None  # type: ignore[method-assign]
     seen = StructureMonitor(kit(), controller.model, ("t1", "t2"))
-    rows, world, move = [], Truth(kit(), DT, Surroundings(noise=0.01, quantum=0.0), None, 2), None
+    rows, world = [], Truth(kit(), DT, Surroundings(noise=0.01, quantum=0.0), None, 2)
     controller.reset(world.reading())
-    for k in range(30):
+    for _ in range(30):
         reading = world.reading()
         move = controller.step(reading, TARGETS[0])
         y = np.array([reading["t1"], reading["t2"]])
