@@ -12,8 +12,9 @@ from typing import Protocol, TypeAlias
 #: One sample: ``{"time_s": .., "t_tank": .., "t_surface": .., "t_ambient": ..}``, degC.  Without ``time_s``
 #: a call is one sample time.
 Readings: TypeAlias = Mapping[str, float]
-#: degC by output name; a single number is the target of every controlled output.
-Target: TypeAlias = float | Mapping[str, float]
+#: degC by output name; a single number is the target of every controlled output.  A sequence is a trajectory:
+#: the target now, and those of the samples ahead, of which the last stays.
+Target: TypeAlias = float | Mapping[str, float | Sequence[float]]
 
 STATUSES = ("ok", "late", "infeasible", "fallback_plan", "fallback_pi", "off", "mismatch")
 
@@ -75,6 +76,13 @@ class Regulator(Controller, Protocol):
     def controlled(self) -> tuple[str, ...]:
         """Outputs with a target."""
         ...
+
+
+def target_now(target: Target) -> float | Mapping[str, float]:
+    """Return a target without what is ahead."""
+    if not isinstance(target, Mapping):
+        return target
+    return {name: value[0] if isinstance(value, Sequence) else value for name, value in target.items()}
 
 
 def number(reading: Mapping[str, float], name: str) -> float:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.mpc.estimator.call_times import SAME, CallTimes
-from thermogrip.mpc.interface import Move, Readings, Target, number
+from thermogrip.mpc.interface import Move, Readings, Target, number, target_now
 from thermogrip.mpc.plant.prediction import PredictionModel
 
 #: What a controller reports of a call that comes before its move is due.
@@ -83,7 +83,7 @@ class SampledController:
     def _wanted(self, target: Target) -> tuple[Array, str]:
         """Return targets (n_controlled,) [degC], the last good one staying and a single number being that of
         every controlled output, and what was wrong with them."""
-        controlled = self.controlled
+        controlled, target = self.controlled, target_now(target)
         if isinstance(target, Mapping):
             wanted = np.array([self._clean(target, name) for name in controlled])
             unknown = [name for name in target if name not in controlled]

@@ -64,15 +64,15 @@ _LONGEST = 1000.0  # samples that a mean is taken over
 _LEAST_WEIGHT = 1e-6  # of a drive: without one, two drives on one output would drift against each other
 
 
-def regulator_gain(A: Array, B: Array, C: Array, *, track: float, move: Array, drive: Array) -> Array:
+def regulator_gain(A: Array, B: Array, C: Array, *, track: Array | float, move: Array, drive: Array) -> Array:
     """Return the gain K (n_u, n_x + n_u) of du = -K (x - x_s, u_before - u_s) for weights of the outputs'
-    errors, of moves (n_u,), and of drives (n_u,); LinAlgError: the Riccati equation has no stabilising
+    errors (n_y,), of moves (n_u,), and of drives (n_u,); LinAlgError: the Riccati equation has no stabilising
     solution."""
     n_x, n_u = B.shape
     whole = np.block([[A, B], [np.zeros((n_u, n_x)), np.eye(n_u)]])
     into = np.vstack([B, np.eye(n_u)])
     Q = np.zeros((n_x + n_u, n_x + n_u))
-    Q[:n_x, :n_x], Q[n_x:, n_x:] = track * C.T @ C, np.diag(drive)
+    Q[:n_x, :n_x], Q[n_x:, n_x:] = C.T @ (np.atleast_1d(track)[:, None] * C), np.diag(drive)
     P = solve_discrete_are(whole, into, Q, np.diag(move))
     return np.asarray(np.linalg.solve(np.diag(move) + into.T @ P @ into, into.T @ P @ whole))
 
@@ -235,7 +235,9 @@ class LQRController(SampledController):
             raise ValueError("no drive is left")
         span2, (n_x, n_u) = self.model.span[live] ** 2, B.shape
         move, drive = self.design.move / span2, max(self.design.drive, _LEAST_WEIGHT) / span2
-        K = regulator_gain(A, B, C, track=self.design.track, move=move, drive=drive)
+        weights = [self.design.weights.get(self.controlled[at], 1.0) for at in seen]
+        track = self.design.track * np.array(weights)
+        K = regulator_gain(A, B, C, track=track, move=move, drive=drive)
         whole = np.block([[A - np.eye(n_x), B], [C, np.zeros((len(C), n_u))]])
         return _Law(point, K, np.linalg.pinv(whole), seen, live)
 

@@ -34,7 +34,7 @@ the mean of the plan over the time until it is likely to be called again.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -128,6 +128,7 @@ class Controller(Shown, SampledController):
         self._slew_s = self.dt  # for which the slew limit counts in this step
         self._in_force: Array
         self._plan: Array | None  # (N, n_u), as it was made ``_age_s`` ago
+        self._ahead: Array | None = None  # targets of the samples that are predicted, where they change
         self._start(np.full(self.model.n_y, np.nan), np.full(self.model.n_d, design.ambient))
 
     def _compile(self) -> None:
@@ -245,7 +246,8 @@ class Controller(Shown, SampledController):
             own name may stand there too: then that is what was applied, whatever was asked.  So may that of a
             switch (``"pump": 0``): then no water moves the heat, and the drive goes to zero until it runs.
         target : float or mapping of str to float
-            [degC] by output name; a single number is the target of every controlled output.
+            [degC] by output name; a single number is the target of every controlled output. A sequence is a
+            trajectory: the target now, and those of the samples ahead.
 
         Examples
         --------
@@ -278,6 +280,7 @@ class Controller(Shown, SampledController):
         if not np.array_equal(wanted, self._target):
             self._side = self._sides(wanted)
         self._target = wanted
+        self._ahead = self._trajectory(target)
         u, status, advice = self._decide(wanted, started)
         if status == "ok":  # what happened in this sample, before what has been so for long
             advice = said or advice
@@ -445,8 +448,18 @@ class Controller(Shown, SampledController):
             x = self.model.next_state(x, last + observer.drive_bias, d)
         guess, biases = self._guess(wanted, last), (observer.output_bias, observer.drive_bias)
         caution = min(max(1.0, float(np.max(np.abs(observer.innovation))) / _CAUTION), _MOST_CAUTION)
-        sample = Sample(x, last, guess, d, wanted, self._side, *biases, self._slew_s, self._lost, caution)
-        return self.optimiser.solve(sample)
+        how = self._slew_s, self._lost, caution, self._ahead
+        return self.optimiser.solve(Sample(x, last, guess, d, wanted, self._side, *biases, *how))
+
+    def _trajectory(self, target: Target) -> Array | None:
+        """Return the targets (N, n_controlled) of the samples that are predicted; None where they stay."""
+        if not isinstance(target, Mapping) or not any(isinstance(v, Sequence) for v in target.values()):
+            return None
+        at = self.design.move_delay + np.arange(1, self.optimiser.N + 1)
+        lines = [np.atleast_1d(target.get(name, now)) for name, now in zip(self.controlled, self._target)]
+        ahead = np.column_stack([line[np.minimum(at, len(line) - 1)] for line in lines]).astype(float)
+        low, high = self.model.coldest, self.model.hottest
+        return np.where((ahead >= low) & (ahead <= high), ahead, self._target)  # NaN is neither
 
     def _guess(self, wanted: Array, last: Array) -> Array:
         """Return the plan to linearise along: the last one, shifted, by blocks; else the drive of now."""

@@ -140,6 +140,8 @@ def _numbers_of(design: Design) -> Iterator[tuple[str, Sequence[Any]]]:
         yield f"drive_range of {name}", ends
     for name, ends in design.limits.items():
         yield f"limits of {name}", ends
+    for name, value in design.weights.items():
+        yield f"weights of {name}", (value,)
     for name, value in design.slew_per_s.items():
         yield f"slew_per_s of {name}", (value,)
     for loop in design.loops:
@@ -169,6 +171,9 @@ def _check_outputs(design: Design, plant: Plant) -> None:
     for name in design.controlled:
         _refuse(name not in plant.outputs, f"controlled: the plant has no output {name}")
         _refuse(design.controlled.count(name) > 1, f"controlled names {name} twice")
+    for name, weight in design.weights.items():
+        _refuse(name not in design.controlled, f"weights: {name} is not regulated")
+        _refuse(not weight > 0, f"weights of {name} must be > 0")
     for name, (low, high) in design.limits.items():
         _refuse(name not in plant.outputs, f"limits: the plant has no output {name}")
         _refuse(not low < high, f"limits of {name} are {low:g} to {high:g}, which is empty")
@@ -226,6 +231,8 @@ class Design:
     loops: tuple[PILoop, ...] = ()  # the PI controller that takes over when the optimiser fails
     track: float = 1.0  # weight of the squared error of each sample [degC^-2]
     terminal: float = 10.0  # weight of that of the last one besides [degC^-2]
+    # how many times the errors of an output count; 1 where absent
+    weights: dict[str, float] = field(default_factory=dict)
     move: float = 1.0  # weight of the squared change of a drive a block, in shares of its range
     drive: float = 0.0  # weight of a squared drive a sample, in shares of its range
     # band beyond the target that the prediction keeps out of, on the far side [degC]; soft

@@ -11,7 +11,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from thermogrip.datasets.atomic_files import read_toml
 from thermogrip.datasets.errors import UserError, known_names
@@ -34,6 +34,18 @@ Finite = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
 Deviation = Annotated[float, Field(ge=-50, le=50, allow_inf_nan=False)]
 Temperature = Annotated[float, Field(ge=-20, le=150, allow_inf_nan=False)]
 Range = tuple[Finite, Finite]
+
+
+def _ends(value: Any) -> Any:
+    """Return both ends of a limit that may have one: ``{ max = 60 }``."""
+    if not isinstance(value, dict):
+        return value
+    if not value or set(value) - {"min", "max"}:
+        raise ValueError("write [low, high], { min = low } or { max = high }")
+    return value.get("min", -LARGEST), value.get("max", LARGEST)
+
+
+Ends = Annotated[Range, BeforeValidator(_ends)]
 
 
 class Spec(BaseModel):
@@ -71,7 +83,8 @@ class Spec(BaseModel):
     extra_lag: Annotated[NotNegative, Field(le=10)] = 0.5
     extra_delay: Annotated[NotNegative, Field(le=10)] = 0.5
     lost_gain: Annotated[NotNegative, Field(lt=1)] = 0.15
-    limits: dict[str, Range] | None = None  # soft limits of outputs [degC]
+    limits: dict[str, Ends] | None = None  # soft limits of outputs [degC]
+    weights: dict[str, Positive] | None = None  # how many times the errors of an output count
 
     @model_validator(mode="after")
     def _agree(self) -> Spec:
@@ -123,6 +136,11 @@ class Spec(BaseModel):
         if self.patience_s is not None:
             values["patience_s"] = self.patience_s
         values |= {"limits": _limits(self, plant, design), "overshoot": 0.5 * self.overshoot_degC}
+        for name in self.weights or ():
+            if name not in design.controlled:
+                hint = known_names(name, design.controlled, "these are: {}")
+                raise UserError(f"weights: {name} is not regulated", hint=hint)
+        values["weights"] = dict(self.weights or {})
         return replace(design, **values, **changes)
 
 

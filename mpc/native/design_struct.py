@@ -43,6 +43,7 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "dt": (False, (), "sample time [s]"),
     "track": (False, (), "weights of the cost"),
     "terminal": (False, (), ""),
+    "weight": (False, ("NC",), "how many times the error of each controlled output counts"),
     "move": (False, (), ""),
     "drive": (False, (), ""),
     "price": (False, (), "of a broken soft row"),
@@ -192,7 +193,7 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
     same_names = (
         (model, "sub dt span C spike coldest hottest"),
         (design, "move_delay blocks track terminal move drive price overshoot patience_s ambient"),
-        (optimiser, "pair strongest seen reach lowest highest slew neutral at_rest"),
+        (optimiser, "weight pair strongest seen reach lowest highest slew neutral at_rest"),
         (observer, "fixed offset R Q P0 R_start"),
         (disturbance, "on_drive on_disturbance on_output"),
     )
@@ -248,7 +249,7 @@ def _controller_parts(s: Sizes) -> list[tuple[Any, int]]:
     relaxation = type("tg_relaxation", (ctypes.Structure,), {"_fields_": _laid_out(still)})
     qp = type("tg_qp", (ctypes.Structure,), {"_fields_": _laid_out(_qp_parts(s))})
     return [
-        (ctypes.c_void_p, 3),
+        (ctypes.c_void_p, 4),
         *((number, count) for count in (s.NX, s.NW, s.NG, s.NG, s.NG, s.NG, z * z, s.NY, s.NY)),
         (whole, z),
         *((number, count) for count in (3, s.NU, s.NX, s.NG, 9)),

@@ -268,7 +268,13 @@ class CompiledOptimiser(Optimiser):
             part[:] = values.ravel()
         slew[:] = self.design.dt if sample.slew_s is None else sample.slew_s, sample.caution
         self._lost[:] = 0 if sample.lost is None else sample.lost
-        status = QP_STATUS[self._run(*self._arguments)]
+        if sample.ahead is None:
+            status = QP_STATUS[self._run(*self._arguments)]
+        else:
+            ahead = np.ascontiguousarray(sample.ahead, float)
+            self._c.library.tg_host_goals(self._c.state, address(ahead))
+            status = QP_STATUS[self._run(*self._arguments)]
+            self._c.library.tg_host_goals(self._c.state, None)
         y, authority, iterations = self._y.copy(), self._authority_now[0].copy(), self._iterations.value
         if status != "solved":
             plan = np.full(self._plan.shape, np.nan)

@@ -60,6 +60,7 @@ class Sample(NamedTuple):
     slew_s: float | None = None  # seconds that the slew limit of the first move counts; a sample where absent
     lost: Mask | None = None  # (n_controlled,) outputs that cost nothing, and whose drives go to rest
     caution: float = 1.0  # how many times the design's move weight counts
+    ahead: Array | None = None  # (N, n_controlled) targets of each sample, where they change
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,9 @@ class Optimiser:
         n = self.n_b * model.n_u
         self.differences = np.kron(np.eye(self.n_b) - np.eye(self.n_b, k=-1), np.eye(model.n_u))
         self._hard = np.vstack([np.eye(n), self.differences])
-        self._weight = np.full(self.N, design.track)
+        self.weight = np.array([design.weights.get(name, 1.0) for name in design.controlled])
+        self._of_row = dict(zip(self._rows, self.weight))
+        self._weight = np.full(self.N, design.track)  # of each sample
         self._weight[-1] += design.terminal
         lengths = np.repeat(np.array(self.blocks, dtype=float), model.n_u)
         self._fixed = 2 * (
@@ -121,15 +124,16 @@ class Optimiser:
 
     def solve(self, sample: Sample) -> Outcome:
         """Improve a plan."""
-        x, last, guess, d, target, side, bias, drive_bias, slew_s, lost, caution = sample
+        x, last, guess, d, now, side, bias, drive_bias, slew_s, lost, caution, ahead = sample
         self._move = caution * self.design.move
         model, n_u = self.model, self.model.n_u
         # in samples, by how much more or less than in one the first move may go
         more = 0.0 if slew_s is None else slew_s / self.design.dt - 1.0
         self._seen_rows = [at for at in range(len(self._rows)) if lost is None or not lost[at]]
         self._parked = [j for j in range(n_u) if lost is not None and lost[self.pair[j]]]
-        if lost is not None:
-            side = np.where(lost, 0.0, side)
+        target = np.broadcast_to(now, (self.N, len(now))) if ahead is None else ahead
+        if lost is not None or ahead is not None:  # nothing is beyond a target that moves
+            side = np.where(lost, 0.0, side) if ahead is None else np.zeros(len(now))
         guess = self._park(guess, last, more)
         y0, G = model.trajectory(x, guess + drive_bias, d, self.blocks)
         G = G.reshape(self.N, model.n_y, self.n_b * n_u) * np.tile(model.span, self.n_b)
@@ -273,8 +277,8 @@ class Optimiser:
         cost += design.drive * np.sum((plans / span) ** 2 * np.array(self.blocks)[:, None], axis=(1, 2))
         over = []
         for at in self._seen_rows:
-            error = y[:, :, self._rows[at]] - target[at]
-            cost += error**2 @ self._weight
+            error = y[:, :, self._rows[at]] - target[:, at]
+            cost += self.weight[at] * (error**2 @ self._weight)
             if side[at]:
                 over.append(np.maximum(0.0, side[at] * error - design.overshoot))
         for at, row in enumerate(self._limited):
@@ -307,7 +311,8 @@ class Optimiser:
 
     def _hessian(self, G: Array, rows: Sequence[int]) -> tuple[Array, list[Array]]:
         """Return H, and by output the response (n, N) of each sample times its weight."""
-        H, weighted = self._fixed.copy(), [G[:, row, :].T * self._weight for row in rows]
+        H = self._fixed.copy()
+        weighted = [G[:, row, :].T * (self._of_row[row] * self._weight) for row in rows]
         for row, part in zip(rows, weighted):
             H += 2 * part @ G[:, row, :]
         return H, weighted
@@ -317,7 +322,7 @@ class Optimiser:
         H, weighted = self._hessian(G, rows)
         f = np.zeros(H.shape[0])
         for at, row, part in zip(self._seen_rows, rows, weighted):
-            f += 2 * part @ (free[:, row] - target[at])
+            f += 2 * part @ (free[:, row] - target[:, at])
         before = np.zeros(H.shape[0])
         before[: self.model.n_u] = last / self.model.span
         f -= 2 * self._move * self.differences.T @ before
@@ -344,8 +349,8 @@ class Optimiser:
         for at, row in enumerate(self._rows):
             rows.append(G[:, row, :])
             far = self.design.overshoot
-            lower.append((target[at] - far if side[at] < 0 else -np.inf) - free[:, row])
-            upper.append((target[at] + far if side[at] > 0 else np.inf) - free[:, row])
+            lower.append((target[:, at] - far if side[at] < 0 else -np.inf) - free[:, row])
+            upper.append((target[:, at] + far if side[at] > 0 else np.inf) - free[:, row])
         for at, row in enumerate(self._limited):
             rows.append(G[:, row, :])
             lower.append(self._limits[at, 0] - free[:, row])

@@ -12,6 +12,7 @@ from thermogrip.mpc.closed_loop.simulate import Surroundings, Truth, simulate_cl
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.native.runtime import compiler
+from thermogrip.mpc.optimiser.rti import Sample
 
 OFF = Surroundings(offset={"t_surface": 0.2, "t_ambient": 0.3})
 
@@ -145,6 +146,47 @@ def test_two_runs_of_one_seed_are_the_same_and_another_seed_is_not(controller, o
     first, again, other = (run(controller, other_tank, 28.0, 31.0, 60.0, seed=s)[0] for s in (1, 1, 2))
     np.testing.assert_array_equal(first.drive["drive"], again.drive["drive"])
     assert np.any(first.readings["t_surface"] != other.readings["t_surface"])
+
+
+def follow(controller: Controller, plant, line: np.ndarray, ahead: int) -> tuple[np.ndarray, set[str]]:
+    """Return by how much the skin is off a trajectory of which so many samples are told."""
+    world, off, statuses = Truth(plant, 2.0, Surroundings(noise=0.02, quantum=0.0), 28.0, 1), [], set()
+    controller.reset(world.reading())
+    for k in range(250):
+        reading = world.reading()
+        off.append(reading["t_surface"] - line[k])
+        told = line[k : k + ahead + 1].tolist() if ahead else float(line[k])
+        move = controller.step(reading, {"t_surface": told})
+        statuses.add(move.status)
+        world.apply(move)
+    return np.array(off[20:]), statuses
+
+
+def test_a_trajectory_that_is_told_ahead_is_followed_without_lag(tank, other_tank):
+    line = np.interp(2.0 * np.arange(400), [0, 60, 260, 400, 600], [28, 28, 38, 38, 30])
+    controller = design_controller(tank, dt=2.0)
+    late, _ = follow(controller, other_tank, line, 0)
+    told, statuses = follow(controller, other_tank, line, 80)
+    assert np.sqrt(np.mean(told**2)) < 0.12  # 0.09, and 0.77 where only the target now is known
+    assert np.sqrt(np.mean(late**2)) > 0.5
+    assert np.max(np.abs(told)) < 0.25
+    assert statuses == {"ok"}
+    controller.reset({"t_tank": 28.0, "t_surface": 28.0})
+    move = controller.step({"t_tank": 28.0, "t_surface": 28.0}, {"t_surface": [float("nan"), 30.0]})
+    assert (move.status, move.advice[:19]) == ("off", "target of t_surface")
+    x, u, d = controller.model.at_rest(25.0)
+    plans = []
+    for side in (0.0, 1.0):  # from where it is approached: nothing is beyond a target that moves
+        controller.optimiser.forget()
+        ahead = np.linspace(40.0, 30.0, controller.optimiser.N)[:, None]
+        guess, none = np.zeros((controller.optimiser.n_b, 1)), np.zeros(2)
+        about = Sample(x, u, guess, d, np.array([40.0]), np.array([side]), none, np.zeros(1), ahead=ahead)
+        plans.append(controller.optimiser.solve(about).plan)
+    np.testing.assert_array_equal(plans[0], plans[1])
+    slow = Controller(tank, replace(controller.design, move_delay=1))
+    slow.reset({"t_tank": 28.0, "t_surface": 28.0})
+    slow.step({"t_tank": 28.0, "t_surface": 28.0}, {"t_surface": [28.0, 29.0, 30.0, float("nan"), 31.0]})
+    np.testing.assert_array_equal(slow._ahead[:4, 0], [30.0, 28.0, 31.0, 31.0])
 
 
 @pytest.mark.parametrize("in_c", [False, True] if compiler() else [False])

@@ -7,7 +7,8 @@ import re
 import numpy as np
 import pytest
 
-from tests.mpc.makers import InC
+from tests.mpc.makers import InC, network_plant
+from thermogrip.mpc.closed_loop.simulate import simulate_closed_loop
 from thermogrip.mpc.controllers.lqr import LQRController
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
@@ -42,6 +43,17 @@ def test_a_single_number_is_the_target_of_every_controlled_output(furnace_plant)
             moves.append(controller.step(reading, target))
         assert [(move.status, move.advice) for move in moves] == [("ok", "")] * 2
         assert moves[0].drive == moves[1].drive
+
+
+def test_of_two_targets_that_exclude_each_other_the_one_that_weighs_more_is_nearer():
+    plant = network_plant("tclab", t1=(20.0, 60.0), t2=(20.0, 60.0))
+    off, ends = {}, {"q1": (0.0, 60.0), "q2": (0.0, 0.001)}
+    for name, weights in (("alike", {}), ("t2", {"t2": 100.0})):
+        controller = Controller(plant, default_design(plant, dt=5.0, weights=weights, drive_range=ends))
+        loop = simulate_closed_loop(controller, plant, [({"t1": 60.0, "t2": 27.0}, 1500.0)], start=25.0)
+        off[name] = [abs(part.bias) for part in loop.segments]
+    assert off["t2"][1] < 0.5 * off["alike"][1]
+    assert off["t2"][0] > off["alike"][0]
 
 
 def run(controller, truth, target, seconds):

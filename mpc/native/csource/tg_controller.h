@@ -70,6 +70,7 @@ typedef struct {
 
 typedef struct {
     const tg_design *design;
+    const double *goals;      /* targets of each of the N samples ahead, n_c each; NULL: they stay */
     int (*late)(void *about); /* whether time is up; NULL: never */
     void *about;
     /* observer */

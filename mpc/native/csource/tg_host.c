@@ -70,6 +70,9 @@ int tg_host_replan(tg_controller *c, const double *x, const double *last, const 
     return status;
 }
 
+/* What is asked of each sample ahead. */
+void tg_host_goals(tg_controller *c, const double *goals) { c->goals = goals; }
+
 /* Who is asked whether time is up. */
 void tg_host_late(tg_controller *c, int (*late)(void *about)) { c->late = late; }
 

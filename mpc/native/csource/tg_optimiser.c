@@ -131,6 +131,12 @@ static void find_authority(tg_controller *c)
         }
 }
 
+/* The target of controlled output r in sample k of the prediction. */
+static double goal(const tg_controller *c, const double *target, int k, int r)
+{
+    return c->goals ? c->goals[k * c->design->n_c + r] : target[r];
+}
+
 /* The cost of a plan whose outputs y were simulated. */
 static double merit(const tg_controller *c, const double *plan, const double *y, const double *target,
                     const double *side, const double *last)
@@ -149,11 +155,11 @@ static double merit(const tg_controller *c, const double *plan, const double *y,
         const double *row = y + k * TG_NY;
         double weight = s->track + (k == s->N - 1 ? s->terminal : 0.0);
         for (int r = 0; r < s->n_c; r++) {
-            double error = row[s->controlled[r]] - target[r];
+            double error = row[s->controlled[r]] - goal(c, target, k, r);
             double slack = side[r] != 0.0 ? side[r] * error - s->overshoot : 0.0;
             if (c->lost[r])
                 continue;
-            cost += weight * error * error;
+            cost += s->weight[r] * weight * error * error;
             if (slack > 0.0)
                 over += slack + slack * slack;
         }
@@ -220,8 +226,8 @@ static void set_cost(tg_controller *c, const double *target, const double *last)
         for (int at = 0; at < s->blocks[b]; at++, k++)
             for (int r = 0; r < s->n_c; r++) {
                 const double *g = c->G + ((size_t)k * TG_NS + (size_t)r) * TG_Q_N;
-                double weight = 2.0 * (s->track + (k == s->N - 1 ? s->terminal : 0.0));
-                double error = weight * (c->free[k * TG_NS + r] - target[r]);
+                double weight = 2.0 * s->weight[r] * (s->track + (k == s->N - 1 ? s->terminal : 0.0));
+                double error = weight * (c->free[k * TG_NS + r] - goal(c, target, k, r));
                 for (int i = 0; !c->lost[r] && i < (b + 1) * TG_NU; i++) {
                     double share = weight * g[i], *row = q->H + (size_t)i * TG_Q_N;
                     q->f[i] += error * g[i];
@@ -253,9 +259,9 @@ static void set_soft_rows(tg_controller *c, const double *target, const double *
                     low = s->limit_low[r - s->n_c];
                     high = s->limit_high[r - s->n_c];
                 } else if (side[r] < 0.0)
-                    low = target[r] - s->overshoot;
+                    low = goal(c, target, k, r) - s->overshoot;
                 else if (side[r] > 0.0)
-                    high = target[r] + s->overshoot;
+                    high = goal(c, target, k, r) + s->overshoot;
                 lower[i] = low - c->free[k * TG_NS + r];
                 upper[i] = high - c->free[k * TG_NS + r];
                 q->filled[i] = (b + 1) * TG_NU;
@@ -348,7 +354,7 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
     memcpy(guess, start, (size_t)q->n * sizeof(double));
     park(c, last, guess);
     for (int r = 0; r < s->n_c; r++)
-        side[r] = c->lost[r] ? 0.0 : from[r];
+        side[r] = c->lost[r] || c->goals ? 0.0 : from[r]; /* nothing is beyond a target that moves */
     linearise(c, x, guess, drive_bias, d, bias);
     find_authority(c);
     find_free(c, guess);

@@ -36,6 +36,9 @@ def test_the_gain_is_that_of_a_very_long_horizon_by_dynamic_programming(pole, ot
         K = np.linalg.solve(move + into.T @ P @ into, into.T @ P @ whole)
         P = Q + whole.T @ P @ (whole - into @ K)
     np.testing.assert_allclose(got, K, rtol=1e-6, atol=1e-9)
+    how = {"move": np.array([move]), "drive": np.array([drive])}
+    weighed = regulator_gain(A, B, np.eye(2), track=np.array([1.0, 4.0]), **how)
+    np.testing.assert_allclose(weighed, regulator_gain(A, B, np.diag([1.0, 2.0]), track=1.0, **how))
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ import pytest
 
 from tests.mpc.makers import heater
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.limits import LARGEST
 from thermogrip.mpc.design.spec import SPEC_TEMPLATE, Spec, _ranges, read_spec, spec_from_dict
 from thermogrip.mpc.plant.prediction import drive_range
 
@@ -49,6 +50,10 @@ def test_every_line_of_the_template_that_is_commented_out_is_valid_too():
         ('output = ["t", "t"]', "output: names one twice"),
         ("slew_per_s = 0", "slew_per_s: input should be greater than 0"),
         ("slew_per_s = { drive = -1 }", "slew_per_s.drive: input should be greater than 0"),
+        ("limits = { t_tank = { most = 60 } }", "limits.t_tank: write [low, high], { min = low } or { max"),
+        ("limits = { t_tank = {} }", "limits.t_tank: write [low, high]"),
+        ("limits = { t_tank = { max = 'hot' } }", "limits.t_tank.1"),
+        ("weights = { t1 = 0 }", "weights.t1: input should be greater than 0"),
         ("limits = { t_tank = [-inf, 60] }", "limits.t_tank.0 is -inf, not a finite number"),
         ("steps = [[28, 28.25]]", "steps: 28 -> 28.25 stays inside the band"),
         ("steps = [[28, -1.1e12]]", "steps.0.1: input should be greater than or equal to -1000000000000"),
@@ -128,6 +133,7 @@ def test_limits_of_a_drive_are_inside_its_range_about_0(own, limits, problem):
         ({"output": "t_nose"}, "t_nose"),
         ({"limits": {"t_nose": (10, 20)}}, "limits"),
         ({"drive_limits": {"fan": (0, 1)}}, "fan"),
+        ({"weights": {"t_tank": 2.0}}, "weights: t_tank is not regulated"),
         ({"drive_limits": (-3, 3)}, "drive_limits"),
         ({"slew_per_s": {"fan": 1}}, "fan"),
         ({"sample_time_s": 0.1}, "sample_time_s: 0.1 s is no multiple of the plant's step of 1 s; write 1"),
@@ -162,6 +168,9 @@ def test_the_spec_reaches_the_design(tank):
     assert Spec(output="t_tank").design(tank).limits == {}  # what is regulated has its targets
     ends = {"t_surface": (18.0, 43.0), "t_tank": (30.0, 31.0)}  # targets 18 to 43; of the tank there is none
     assert Spec(limits=ends).design(tank, track=3.0).limits == ends
+    one = Spec(limits={"t_tank": {"max": 60.0}, "t_surface": {"min": 5.0}}).design(tank).limits
+    assert one == {"t_tank": (-LARGEST, 60.0), "t_surface": (5.0, LARGEST)}
+    assert Spec(weights={"t_surface": 4.0}).design(tank).weights == {"t_surface": 4.0}
     assert Spec(limits=ends).design(tank, track=3.0).track == 3.0
     assert Spec(limits={}, output=["t_tank", "t_surface"]).design(tank).controlled == ("t_tank", "t_surface")
     assert Spec(hold_s=20, sample_time_s=4).design(tank).dt == 4.0  # five samples are enough

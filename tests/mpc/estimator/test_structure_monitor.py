@@ -15,7 +15,7 @@ from tests.mpc.makers import network_plant
 from thermogrip.mpc.closed_loop.simulate import Surroundings, Truth
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
 from thermogrip.mpc.design.design import default_design
-from thermogrip.mpc.estimator.structure_monitor import Misfit, StructureMonitor
+from thermogrip.mpc.estimator.structure_monitor import Misfit, StructureMonitor, _Row
 from thermogrip.mpc.interface import Move
 from thermogrip.mpc.native.runtime import wanted
 from thermogrip.sysid.plant.plant import Plant
@@ -55,6 +55,43 @@ def test_a_draw_of_the_posterior_is_not_reported(draw: int):
     controller = design_controller(kit(), dt=DT)
     assert not told(loop(controller, kit().draw(draw), seed=draw))
     assert controller.structure.denies
+
+
+def test_a_drive_that_is_a_fifth_weaker_than_the_posterior_has_it_is_not_reported():
+    numbers = replace(kit(), covariance=kit().covariance / 100)
+    controller = design_controller(numbers, dt=DT)
+    assert not told(loop(controller, numbers, Surroundings(drive_share=0.8)))
+    assert controller.structure.denies
+
+
+def test_drives_that_acted_a_sample_later_than_the_model_was_told_are_slower_by_a_sample():
+    controller = design_controller(kit(), dt=DT)
+    controller.structure.note = lambda *_: None  # type: ignore[method-assign]
+    seen = StructureMonitor(kit(), controller.model, ("t1", "t2"))
+    rows, world = [], Truth(kit(), DT, Surroundings(noise=0.01, quantum=0.0), None, 2)
+    controller.reset(world.reading())
+    for _ in range(30):
+        reading = world.reading()
+        move = controller.step(reading, TARGETS[0])
+        y = np.array([reading["t1"], reading["t2"]])
+        rows.append(
+            (
+                controller.observer.now.copy(),
+                controller.observer.w.copy(),
+                y,
+                np.array([*move.drive.values()]),
+            )
+        )
+        world.apply(move)
+    start, w = rows[8][:2]
+    for at, early in ((1, 0.0), (2, 1.0)):
+        seen.restart()
+        for k in range(8, 29):
+            u = rows[k - 2 + at][3]  # what was applied before the reading, or a sample after it was
+            seen._history.append(_Row(start, w, rows[k][2], rows[k][2], u, np.zeros(0)))
+        found = seen.misfit(controller.observer)
+        late = [size * one.unit for size, one in zip(found.size, seen.bank) if "acts" in one.words]
+        np.testing.assert_allclose(late, early * DT, atol=1.5)
 
 
 @pytest.mark.slow

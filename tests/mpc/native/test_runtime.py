@@ -64,6 +64,27 @@ def test_a_plan_is_the_same_in_c(pair):
         assert one.broken.keys() == two.broken.keys()
 
 
+def test_a_trajectory_and_weights_of_outputs_are_the_same_in_c(tclab):
+    design = default_design(tclab, dt=5.0, weights={"t2": 9.0})
+    python, c = Controller(tclab, design), Controller(tclab, design, compiled=True)
+    plain = Controller(tclab, replace(design, weights={}))
+    rng, reading = np.random.default_rng(4), {"t1": 25.0, "t2": 25.0}
+    moves = []
+    for _ in range(20):
+        lines = {name: (25 + rng.random(30)).tolist() for name in reading}
+        for controller in (python, c, plain):
+            controller.reset(reading)
+        moves.append([list(one.step(reading, lines).drive.values()) for one in (python, c, plain)])
+        now = {name: line[0] for name, line in lines.items()}
+        c.reset(reading)
+        python.reset(reading)
+        one, two = (list(each.step(reading, now).drive.values()) for each in (c, python))
+        np.testing.assert_allclose(one, two, atol=1e-6)
+    moves = np.array(moves)
+    np.testing.assert_allclose(moves[:, 1], moves[:, 0], atol=1e-6)
+    assert np.max(np.abs(moves[:, 2] - moves[:, 0])) > 0.1
+
+
 def test_the_filter_is_the_same_in_c(pair):
     python, c = pair
     rng, d = np.random.default_rng(2), np.array([24.0])
