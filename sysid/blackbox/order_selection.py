@@ -10,7 +10,7 @@ input.
 **The one-standard-error rule.** With e_sf the error of structure s on fold f and b the best structure, the
 smallest structure is taken for which
 
-    mean_f ln(e_sf / e_bf) <= min(se_f ln(e_sf / e_bf), ln 1.05),
+    mean_f ln(e_sf / e_bf) <= min(se_f ln(e_sf / e_bf), ln 1.05),        ln 1.2 over whole logs,
 
 with the standard error of the paired differences. Logarithms, because a fold whose input lies outside of
 what the rest has seen is bad for every structure alike and must not outweigh the others. Models that are
@@ -48,7 +48,7 @@ from thermogrip.sysid.plant.log_grid import Grid, Segment
 Array = NDArray[np.float64]
 
 HARDLY_MORE = float(np.log(1.05))  # of log errors
-MORE_BY_LOGS = float(np.log(1.25))  # the same over whole logs
+MORE_BY_LOGS = float(np.log(1.2))  # the same over whole logs, of which there are few
 _AVERAGED = (10, 5, 3)  # structures
 _MOST_ON_ALL = 2.0  # times the worst fold's error: a fit to all data that errs more on them is refused
 _BLOCKS = 4  # of one or two logs
@@ -299,9 +299,9 @@ def drives(grid: Grid, terms: Sequence[str]) -> list[Array]:
 
 
 def column_sizes(norms: Array) -> Array:
-    """Return what the columns of a regression are divided by: their norms, and 1 for one that is zero, whose
-    weight would otherwise be rounding, scaled up."""
-    return np.where(norms > 1e-12, norms, 1.0)
+    """Return what the columns of a regression and then its weights are divided by: norms, and infinity for a
+    column that is zero, whose weight would otherwise be rounding, scaled up."""
+    return np.where(norms > 1e-12, norms, np.inf)
 
 
 def default_terms(grid: Grid, *, switched: bool = True) -> tuple[tuple[str, ...], ...]:

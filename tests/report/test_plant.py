@@ -111,7 +111,10 @@ def test_a_free_run_s_page_has_its_scores_band_and_baselines(run: tuple[Plant, L
 )
 def test_a_band_says_what_it_is_made_of_and_covers(draws: int, words: str) -> None:
     band = Band(0.9, {}, {"t": 0.876, "s": 0.95}, draws, "the noise")
-    assert plant.band_words(band) == f"90 % band from {words}; it covers 88 % of t, 95 % of s"
+    said = f"90 % band from {words}; it covers 88 % of t, 95 % of s"
+    assert plant.band_words(band) == said
+    band = replace(band, expected={"t": 0.123, "s": 4.0})
+    assert plant.band_words(band) == f"{said} and stands for an RMSE of 0.12 of t, 4 of s"
 
 
 def test_signals_are_shown_with_their_roles_and_guesses_are_marked() -> None:

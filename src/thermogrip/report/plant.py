@@ -425,7 +425,9 @@ def band_words(band: Band) -> str:
     """Return what the shaded band is, and how many readings it covers."""
     inside = ", ".join(f"{100 * share:.0f} % of {name}" for name, share in band.inside.items())
     draws = f"{band.draws} draws of the parameters and " if band.draws else ""
-    return f"{100 * band.level:.0f} % band from {draws}{band.own_error}; it covers {inside}"
+    said = f"{100 * band.level:.0f} % band from {draws}{band.own_error}; it covers {inside}"
+    errors = ", ".join(f"{error:.2g} of {name}" for name, error in band.expected.items())
+    return said + (f" and stands for an RMSE of {errors}" if errors else "")
 
 
 def _sentence(text: str) -> str:

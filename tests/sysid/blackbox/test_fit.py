@@ -378,3 +378,24 @@ def test_rounding_of_the_readings_changes_no_choice(kind):
     assert found[0].prior == found[1].prior
     for structure, errors in found[0].errors.items():
         np.testing.assert_allclose(found[1].errors[structure], errors, rtol=0.03)
+
+
+def board_log(seed, name, n=1500):
+    """Two readings of a heated block in a room that hardly changes; the pump never stops."""
+    rng = np.random.default_rng(seed)
+    q, room = np.repeat(2 * rng.random(n // 20) - 1, 20), 26 + 0.3 * np.sin(np.arange(n) / 300 + seed)
+    t, s = (
+        room + lfilter([0, 0.4], [1, -0.98], q + 0.5 * np.abs(q)) + 0.05 * rng.standard_normal(n)
+        for _ in range(2)
+    )
+    signals = {"q": (q, "1", "input"), "pump": (np.ones(n), "1", "input"), "t": (t, "degC", "output")}
+    signals |= {"room": (room, "degC", "disturbance"), "s": (s, "degC", "output")}
+    return make_log(np.arange(float(n)), signals, name=name)
+
+
+@pytest.mark.parametrize("kind", ["arx", "oe"])
+def test_rounding_gives_an_input_that_never_moves_no_gain_in_any_structure(kind):
+    models = FAMILIES[kind](make_grid([board_log(0, "a"), board_log(1, "b")], average=2.0))
+    still = [model.inputs.index("pump") for model in models.values()]
+    gains = [m.C @ np.linalg.solve(np.eye(m.n_x) - m.A, m.B)[:, at] for m, at in zip(models.values(), still)]
+    assert max(np.abs(gain).max() for gain in gains) == 0.0

@@ -274,6 +274,16 @@ def test_the_error_of_a_choice_is_a_geometric_mean(errors, mean):
     assert choice.error == pytest.approx(mean)
 
 
+@pytest.mark.parametrize(("logs", "chosen"), [("a", LARGE), ("abc", SMALL)])
+def test_over_whole_logs_a_fifth_more_is_within_noise(monkeypatch, logs, chosen):
+    errors = {SMALL: [0.1, 0.15, 0.16], LARGE: [0.15, 0.1, 0.12]}  # 10 percent apart
+    scored = {s: selection._Errors(StartPrior(), np.array(e), np.ones((3, 1))) for s, e in errors.items()}
+    monkeypatch.setattr(selection, "_score", lambda *_: scored)
+    monkeypatch.setattr(selection, "_fit_to_all", lambda grid, family, structure, *_: structure)
+    grid = grid_of(*(rows(80, log) for log in logs))
+    assert selection.choose(grid, lambda *_, **__: {}, warmup=2).structure == chosen
+
+
 def test_drives_are_inputs_disturbances_and_products_of_which_still_ones_are_none():
     u = np.array([[-2.0, 5.0, 0.0], [3.0, 5.0 + 4e-9, 7.0], [1.0, 5.0, 7.0]])
     d = np.array([[20.0], [20.0 + 3e-8], [20.0]])  # a billionth of it is 2e-8
