@@ -12,9 +12,10 @@ from typing import Protocol, TypeAlias
 #: One sample: ``{"time_s": .., "t_tank": .., "t_surface": .., "t_ambient": ..}``, degC.  Without ``time_s``
 #: a call is one sample time.
 Readings: TypeAlias = Mapping[str, float]
-#: degC by output name; a single number is the target of every controlled output.  A sequence is a trajectory:
-#: the target now, and those of the samples ahead, of which the last stays.
-Target: TypeAlias = float | Mapping[str, float | Sequence[float]]
+#: degC by output name; a single number is the target of every controlled output.
+Target: TypeAlias = float | Mapping[str, float]
+#: The same, or by name the target now and those of the samples ahead, of which the last stays.
+Trajectory: TypeAlias = float | Mapping[str, float | Sequence[float]]
 
 STATUSES = ("ok", "late", "infeasible", "fallback_plan", "fallback_pi", "off", "mismatch")
 
@@ -78,7 +79,7 @@ class Regulator(Controller, Protocol):
         ...
 
 
-def target_now(target: Target) -> float | Mapping[str, float]:
+def target_now(target: Trajectory) -> Target:
     """Return a target without what is ahead."""
     if not isinstance(target, Mapping):
         return target

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.mpc.estimator.call_times import SAME, CallTimes
-from thermogrip.mpc.interface import Move, Readings, Target, number, target_now
+from thermogrip.mpc.interface import Move, Readings, Trajectory, number, target_now
 from thermogrip.mpc.plant.prediction import PredictionModel
 
 #: What a controller reports of a call that comes before its move is due.
@@ -70,7 +70,7 @@ class SampledController:
         y = np.array([self._clean(reading, name) for name in self.model.outputs])
         return y, np.array([self._clean(reading, name) for name in self.model.disturbances])
 
-    def _given(self, reading: Readings, target: Target) -> tuple[Array, Array, Array, str]:
+    def _given(self, reading: Readings, target: Trajectory) -> tuple[Array, Array, Array, str]:
         """Return outputs, disturbances and targets in force [degC], and what is wrong; a stale reading is
         none."""
         wanted, wrong = self._wanted(target)
@@ -80,16 +80,16 @@ class SampledController:
             return np.full(len(y), np.nan), d, wanted, wrong or STALE
         return y, d, wanted, wrong
 
-    def _wanted(self, target: Target) -> tuple[Array, str]:
+    def _wanted(self, target: Trajectory) -> tuple[Array, str]:
         """Return targets (n_controlled,) [degC], the last good one staying and a single number being that of
         every controlled output, and what was wrong with them."""
-        controlled, target = self.controlled, target_now(target)
-        if isinstance(target, Mapping):
-            wanted = np.array([self._clean(target, name) for name in controlled])
-            unknown = [name for name in target if name not in controlled]
+        controlled, now = self.controlled, target_now(target)
+        if isinstance(now, Mapping):
+            wanted = np.array([self._clean(now, name) for name in controlled])
+            unknown = [name for name in now if name not in controlled]
             wrong = f"target names {unknown[0]}, controlled is {', '.join(controlled)}" if unknown else ""
         else:
-            wanted, wrong = np.full(len(controlled), self._clean({"": target}, "")), ""
+            wanted, wrong = np.full(len(controlled), self._clean({"": now}, "")), ""
         lost = ~np.isfinite(wanted)
         if lost.any():
             name = controlled[int(np.argmax(lost))]

@@ -54,7 +54,7 @@ from thermogrip.mpc.controllers.pi import held_drive
 from thermogrip.mpc.design.design import Design
 from thermogrip.mpc.estimator.call_times import RESTART_S, opening
 from thermogrip.mpc.estimator.observer import Observer
-from thermogrip.mpc.interface import Move, Readings, Target
+from thermogrip.mpc.interface import Move, Readings, Trajectory
 from thermogrip.mpc.plant.prediction import PredictionModel, prediction_model
 
 if TYPE_CHECKING:
@@ -135,7 +135,7 @@ class LQRController(SampledController):
         self._fresh = True
         self.times.reset()
 
-    def step(self, reading: Readings, target: Target) -> Move:
+    def step(self, reading: Readings, target: Trajectory) -> Move:
         """Return the move for this sample; a lost reading is predicted for ``patience_s``."""
         started = self.clock()
         self.times.call(reading)

@@ -52,7 +52,7 @@ from thermogrip.mpc.design.design import SCHEMA, VERSION, Design, check_design, 
 from thermogrip.mpc.estimator.call_times import RESTART_S, opening, shifted
 from thermogrip.mpc.estimator.reading_checks import ReadingMonitor, follows, is_off
 from thermogrip.mpc.estimator.structure_monitor import StructureMonitor
-from thermogrip.mpc.interface import Move, Readings, Target, number
+from thermogrip.mpc.interface import Move, Readings, Trajectory, number
 from thermogrip.mpc.optimiser.reach import Reach
 from thermogrip.mpc.optimiser.rti import Optimiser, Outcome, Sample
 from thermogrip.mpc.plant.prediction import prediction_model
@@ -235,7 +235,7 @@ class Controller(Shown, SampledController):
         self.pi.reset(reading)
         self.times.reset()
 
-    def step(self, reading: Readings, target: Target) -> Move:
+    def step(self, reading: Readings, target: Trajectory) -> Move:
         """Return the move for this sample.
 
         Parameters
@@ -370,7 +370,7 @@ class Controller(Shown, SampledController):
         """Return from where the targets are approached: +1 from below, -1 from above, 0 neither."""
         return np.where(np.isfinite(wanted), np.sign(wanted - self.observer.reading()[self._rows]), 0.0)
 
-    def _pause(self, y: Array, d: Array, target: Target, started: float) -> Move:
+    def _pause(self, y: Array, d: Array, target: Trajectory, started: float) -> Move:
         """Take the drive back while no water moves its heat; the estimate starts again afterwards."""
         u = self._within(self._neutral, self._slew_s)
         wanted, _ = self._wanted(target)
@@ -448,10 +448,10 @@ class Controller(Shown, SampledController):
             x = self.model.next_state(x, last + observer.drive_bias, d)
         guess, biases = self._guess(wanted, last), (observer.output_bias, observer.drive_bias)
         caution = min(max(1.0, float(np.max(np.abs(observer.innovation))) / _CAUTION), _MOST_CAUTION)
-        how = self._slew_s, self._lost, caution, self._ahead
-        return self.optimiser.solve(Sample(x, last, guess, d, wanted, self._side, *biases, *how))
+        sample = Sample(x, last, guess, d, wanted, self._side, *biases, self._slew_s, self._lost, caution)
+        return self.optimiser.solve(sample._replace(ahead=self._ahead))
 
-    def _trajectory(self, target: Target) -> Array | None:
+    def _trajectory(self, target: Trajectory) -> Array | None:
         """Return the targets (N, n_controlled) of the samples that are predicted; None where they stay."""
         if not isinstance(target, Mapping) or not any(isinstance(v, Sequence) for v in target.values()):
             return None

@@ -26,7 +26,7 @@ import numpy as np
 from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.controllers.base import SampledController
 from thermogrip.mpc.design.design import Design, PILoop, default_controlled, pair_loops
-from thermogrip.mpc.interface import Move, Readings, Target
+from thermogrip.mpc.interface import Move, Readings, Trajectory
 from thermogrip.mpc.plant.prediction import ROOM, PredictionModel, holding_drive, prediction_model
 
 if TYPE_CHECKING:
@@ -123,7 +123,7 @@ class PIController(SampledController):
             self._I = np.array([(1 - p.feedforward) * held[j] for p, (j, _) in zip(self.loops, self._ends)])
         self.times.reset()
 
-    def step(self, reading: Readings, target: Target) -> Move:
+    def step(self, reading: Readings, target: Trajectory) -> Move:
         """Return the move for this sample; a lost reading holds the drive of its loop for ``patience_s``,
         then it goes to rest, and the others go on."""
         started = self.clock()

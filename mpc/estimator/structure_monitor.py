@@ -7,10 +7,10 @@ unknown, with the spread that an honest plant has,
     z ~ N(z_s, 1 degC in its unit),    w ~ N(w_s, P_0 + w_s^2),
     theta ~ N(theta, posterior),       gain ~ N(1, 0.2^2),
 
-z_s and w_s being the filter's.  Two Gauss-Newton steps find the most likely of them.  Linearised there, the
-readings are y ~ N(y_0, V) with V = R + J J', J in these standard deviations, and what the model lacks adds a
-column a of its own to J, with a parameter that is nothing but for what nobody would call another structure
-(``_Alternative.tolerated``).  Freed one at a time it is
+z_s and w_s being the filter's; a sensor may drift by 0.1 degC in a window.  Two Gauss-Newton steps find the
+most likely of them.  Linearised there, the readings are y ~ N(y_0, V) with V = R + J J', J in these standard
+deviations, and what the model lacks adds a column a of its own to J, with a parameter that is nothing but for
+what nobody would call another structure (``_Alternative.tolerated``).  Freed one at a time it is
 
     s = a' V^-1 r / a' V^-1 a  +-  (a' V^-1 a)^-1/2,      z = s / sqrt(sd^2 + tolerated^2),
 
@@ -54,7 +54,8 @@ if TYPE_CHECKING:
 
 REPORTED, TAKEN_BACK, MISFIT = 5.0, 2.0, 4.0
 _DELAYS, _FEWEST, _MOST = 7.5, 20, 200  # of a window, in apparent delays; samples
-_STATE, _GAIN = 1.0, 0.2  # degC of each state where a window starts; of a drive
+_STATE, _GAIN, _DRIFT = 1.0, 0.2, 0.1  # degC of each state at the start; of a drive; degC of a sensor
+_ENOUGH = 0.7  # of a window, from which on it is looked at
 _LAG, _SLOW, _ZONE = 0.5, 6.0, 0.02  # apparent delays, apparent delays, of a drive's range
 _TRIED = 0.3  # standard deviations, of a difference quotient
 
@@ -144,7 +145,8 @@ class StructureMonitor:
         x, w = observer.now.copy(), observer.w.copy()
         self._history.append(_Row(x, w, observer.reading(), y, u, d))
         self._count += 1
-        if self._count >= _FEWEST and self._count % max(1, self.window // 6) == 0:
+        enough = max(_FEWEST, _ENOUGH * self.window)
+        if self._count >= enough and self._count % max(1, self.window // 6) == 0:
             found = self.misfit(observer)
             if found is not None:
                 self._report(found)
@@ -187,7 +189,7 @@ class StructureMonitor:
             held = np.repeat(d + (w @ found.on_disturbance.T)[:, None], model.sub, axis=1)
             numbers = _numbers(self.plant, rest[:, :n_t] @ spread.T)
             shown, _ = model.model.rollout(x, fine, held, numbers, model.dt / model.sub)
-            return np.asarray(shown) + (w @ found.on_output.T)[:, None] + offset
+            return np.asarray(np.asarray(shown) + (w @ found.on_output.T)[:, None] + offset)
 
         m = n_x + n_w + n_t + model.n_u
         z, weight = np.zeros(m), np.where(np.isfinite(y), 1 / np.sqrt(observer.R), 0.0)
@@ -207,7 +209,9 @@ class StructureMonitor:
             other = run(np.repeat(last[None], 2 * model.n_u, axis=0), np.concatenate([late, cut]))
         of_drives = other[:, model.sub :: model.sub] - at_rows[0]
         a = np.concatenate([self._signatures(before, first, shown[0]), of_drives])
-        return self._tested(J, (a * weight).reshape(len(a), -1), r)
+        drift = _DRIFT * np.linspace(0.0, 1.0, len(y))[:, None] * np.eye(model.n_y)[:, None]
+        known = np.vstack([J, (drift * weight).reshape(model.n_y, -1)])
+        return self._tested(known, (a * weight).reshape(len(a), -1), r)
 
     def _signatures(self, before: Sequence[_Row], first: _Row, shown: Array) -> Array:
         """Return what each alternative of an output adds to the readings (n, N, n_y), by its unit."""
@@ -239,10 +243,10 @@ class StructureMonitor:
         known = np.vstack([J, (tolerated[:, None] * a)[granted]])
         K = np.linalg.inv(known @ known.T + np.eye(len(known)))
         by_r, by_a = (v - v @ known.T @ K @ known for v in (r, a))  # times V^-1
-        q = np.maximum(np.sum(a * by_a, axis=1), 1e-12)
+        q: Array = np.maximum(np.sum(a * by_a, axis=1), 1e-12)
         size = a @ by_r / q
         z = size / np.sqrt(1 / q + np.where(granted, 0.0, tolerated**2))
-        return Misfit(size, 1 / np.sqrt(q), z, float(r @ by_r) / max(1, np.count_nonzero(r)))
+        return Misfit(size, 1 / np.sqrt(q), z, float(r @ by_r) / max(1, int(np.count_nonzero(r))))
 
 
 def _of_output(name: str, D: float) -> list[_Alternative]:

@@ -132,8 +132,10 @@ class Optimiser:
         self._seen_rows = [at for at in range(len(self._rows)) if lost is None or not lost[at]]
         self._parked = [j for j in range(n_u) if lost is not None and lost[self.pair[j]]]
         target = np.broadcast_to(now, (self.N, len(now))) if ahead is None else ahead
-        if lost is not None or ahead is not None:  # nothing is beyond a target that moves
-            side = np.where(lost, 0.0, side) if ahead is None else np.zeros(len(now))
+        if lost is not None:
+            side = np.where(lost, 0.0, side)
+        if ahead is not None:  # nothing is beyond a target that moves
+            side = np.zeros(len(now))
         guess = self._park(guess, last, more)
         y0, G = model.trajectory(x, guess + drive_bias, d, self.blocks)
         G = G.reshape(self.N, model.n_y, self.n_b * n_u) * np.tile(model.span, self.n_b)

@@ -17,7 +17,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -32,6 +33,7 @@ from thermogrip.sysid.identification import Identification, cases_of, identify, 
 from thermogrip.sysid.models.model import BlackBox
 
 if TYPE_CHECKING:
+    from thermogrip.sysid.models.model import GreyModel
     from thermogrip.sysid.plant.plant import Plant
 
 _BETTER = 0.9  # of the old plant's error, below which the new one is taken
@@ -120,11 +122,10 @@ def _identified(
     plant: Plant, logs: Sequence[Log], progress: Progress | None, workers: Workers, seed: int
 ) -> Identification:
     """Return what is found of a plant of the same kind."""
-    how = {"seed": seed, "workers": workers, "progress": progress}
+    again = partial(identify, logs, seed=seed, workers=workers, progress=progress)
     if isinstance(plant.model, BlackBox):
-        names = {"inputs": plant.inputs, "outputs": plant.outputs, "disturbances": plant.disturbances}
-        return identify(logs, **names, **how)
-    return identify(logs, plant.model, models=("network",), **how)
+        return again(inputs=plant.inputs, outputs=plant.outputs, disturbances=plant.disturbances)
+    return again(network=cast("GreyModel", plant.model), models=("network",))
 
 
 def _errors(old: Plant, found: Identification, loop: Log) -> tuple[RunError, ...]:

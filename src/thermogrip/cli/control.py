@@ -114,7 +114,7 @@ def retune(
     noted = old.notes.get("spec")
     was = spec_from_dict(noted) if isinstance(noted, dict) else Spec()
     wanted = was if spec is None else read_spec(spec)
-    more = cli.load_logs(logs, known=roles_of(old.plant.model)) if logs else []
+    more = cli.load_logs(logs, known=roles_of(old.plant)) if logs else []
     phases = str(done.log["phase"].attrs["flag_meanings"]).split()
     loop = done.log.isel(time=done.log["phase"].values < phases.index("contact"))
     console = Console(as_json)
