@@ -83,6 +83,7 @@ DESIGN = Design(
 SPAN, ROOM = np.array([100.0, 255.0]), 22.0
 START, LAST = np.array([25.0, 21.0]), np.array([40.0, 30.0])  # a and b; q1 and q2
 TARGET, BIAS = np.array([27.0, 26.5]), np.array([0.4, -0.3])  # of b and a; of a and b
+EACH = np.broadcast_to(TARGET, (6, 2))  # of each sample
 PLANS = np.array([
     [[45.0, 40.0], [30.0, 70.0], [-20.0, 10.0]],
     [[60.0, 5.0], [90.0, 0.0], [100.0, 80.0]],
@@ -127,10 +128,10 @@ def condensed(optimiser: Optimiser) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("side", [(0.0, 0.0), (1.0, -1.0), (-1.0, 1.0)])
 def test_the_merit_of_a_plan_is_its_cost(optimiser, side):
     y = np.stack([outputs(plan) for plan in PLANS])
-    found = optimiser._merit(PLANS, y, TARGET, np.array(side), LAST)
+    found = optimiser._merit(PLANS, y, EACH, np.array(side), LAST)
     np.testing.assert_allclose(found, [cost(plan, side) for plan in PLANS])
     optimiser._seen_rows = [1]  # b is lost: it costs nothing
-    rest = optimiser._merit(PLANS, y, TARGET, np.array(side), LAST)
+    rest = optimiser._merit(PLANS, y, EACH, np.array(side), LAST)
     weights = np.array([1.5] * 5 + [6.5])
     off = (y[:, :, 1] - 27.0) * (side[0] or 1.0)
     over = np.maximum(0.0, off - 0.2) * bool(side[0])
@@ -139,7 +140,7 @@ def test_the_merit_of_a_plan_is_its_cost(optimiser, side):
 
 def test_the_program_costs_what_the_plan_costs_and_its_minimum_is_the_linear_law(optimiser):
     G, free = condensed(optimiser)
-    H, f = optimiser._cost(G, free, TARGET, LAST)
+    H, f = optimiser._cost(G, free, EACH, LAST)
     one, two = ((plan / SPAN).ravel() for plan in PLANS)
     found = 0.5 * (two @ H @ two - one @ H @ one) + f @ (two - one)
     assert found == pytest.approx(cost(PLANS[1], limits=False) - cost(PLANS[0], limits=False))
@@ -148,7 +149,7 @@ def test_the_program_costs_what_the_plan_costs_and_its_minimum_is_the_linear_law
     best = on_free @ (free[:, [1, 0]] - TARGET).ravel() + on_last @ LAST
     np.testing.assert_allclose(best, -np.tile(SPAN, 3) * np.linalg.solve(H, f))
     optimiser._seen_rows = [1]
-    H, f = optimiser._cost(G, free, TARGET, LAST)
+    H, f = optimiser._cost(G, free, EACH, LAST)
     lost = 0.5 * (two @ H @ two - one @ H @ one) + f @ (two - one)
     weights = np.array([1.5] * 5 + [6.5])
     of_b = [weights @ (outputs(plan)[:, 1] - 27.0) ** 2 for plan in PLANS]
@@ -159,7 +160,7 @@ def test_the_program_costs_what_the_plan_costs_and_its_minimum_is_the_linear_law
 def test_the_rows_of_the_program_are_what_a_plan_has_left_to_its_limits(optimiser, side, more):
     G, free = condensed(optimiser)
     ends = np.full((3, 2), [-50.0, 0.0]), np.full((3, 2), [100.0, 80.0])
-    A, lower, upper = optimiser._constraints(G, free, TARGET, np.array(side), LAST, ends, more)
+    A, lower, upper = optimiser._constraints(G, free, EACH, np.array(side), LAST, ends, more)
     slew = np.array([1 + more, 1.5, 2.5])[:, None] * [8.0, 20.0]  # between the middles of the blocks
     for plan in PLANS:
         y, change = outputs(plan), np.diff(plan, axis=0, prepend=LAST[None])
