@@ -245,10 +245,15 @@ def asked(doc: str | None, seeds: str, **counts: str) -> argparse.Namespace:
 def honest(controller: Controller, count: int) -> str:
     """Return how often plants of the posterior are reported."""
     runs = [close_loop(controller, case.truth, 1000 + k, TARGETS[:2]) for k, case in enumerate(draws(count))]
-    words = [(k, *word) for k, word in enumerate(run.first_word() for run in runs) if word is not None]
-    shown = "".join(f"\ndraw {k}, {at:.0f} s: {move.status}, {move.advice}" for k, at, move in words)
+    words = [
+        (k, float(time_s), move.advice)
+        for k, run in enumerate(runs)
+        for time_s, move in zip(run.time_s, run.moves, strict=True)
+        if move.status == "mismatch"
+    ]
+    shown = "".join(f"\ndraw {k}, {at:.0f} s: {advice}" for k, at, advice in words)
     hours = sum(float(run.time_s[-1]) for run in runs) / 3600
-    return f"{len(words)} of {count} plants in {hours:.1f} h{shown}"
+    return f"{len({k for k, *_ in words})} of {count} plants in {hours:.1f} h{shown}"
 
 
 def main() -> None:
