@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.charts import INK, PALETTE, SOFT, Chart, Curve, Panel, draw_chart, time_axis
+from thermogrip.datasets.limits import LARGEST
 from thermogrip.datasets.media import panels
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop
 from thermogrip.mpc.tuning.trade_offs import PARAMETER_WORDS, Sensitivity
@@ -96,6 +97,7 @@ def closed_loop_chart(
             curves += [
                 Curve(f"limits of {name}", ends, np.full(2, end), colour, 1.0, "-.")
                 for end in (limits or {}).get(name, ())
+                if abs(end) < LARGEST  # an open end
             ]
         rows.append(Panel("others [degC]", tuple(curves), height=1.3))
     for k, (name, values) in enumerate(run.drive.items()):

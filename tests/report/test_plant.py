@@ -17,6 +17,7 @@ from thermogrip.sysid.experiment.information import plant_from_prior
 from thermogrip.sysid.identification import Searched, SignalRole
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.fit_record import Identifiability
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run
 from thermogrip.sysid.validation.prediction_bands import Band
@@ -272,6 +273,12 @@ def test_parameters_answer_for_themselves_and_the_sampler_only_where_it_failed()
     unsure = plant.parameters_section(board, record)
     assert unsure.tone == "warn"
     assert unsure.verdict.endswith("The sampler has not converged: 9 autocorrelation times.")
+    flat = Identifiability(1e6, [1.0, 1e-6], "a up", ["a up, b up"], True, [], {}, {})
+    loose = plant.parameters_section(replace(board, scores=replace(board.scores, identifiability=flat)))
+    assert (loose.tone, loose.verdict) == (
+        "warn",
+        f"{section.verdict} Hardly identifiable together: a up, b up.",
+    )
 
 
 def test_the_table_of_models_has_a_column_a_log_of_what_was_held_out() -> None:

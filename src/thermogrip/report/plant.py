@@ -264,9 +264,12 @@ def parameters_section(plant: Plant, record: Posterior | None = None) -> Section
 
     parts: list[Any] = [Table(*parameter_table(plant, record), "Free parameters", dense=True)]
     verdict, tone = known_words(plant), "plain"
+    found = plant.scores.identifiability
+    if found is not None and found.flat:
+        verdict, tone = f"{verdict} Hardly identifiable together: {'; '.join(found.flat)}.", "warn"
     if record is not None:
         marginals = plots.posterior_figure(record.samples, record.free, record.units, record.fitted)
-        tone = "plain" if record.converged else "warn"
+        tone = tone if record.converged else "warn"
         verdict += "" if record.converged else f" The sampler has {record.verdict}."
         caption = "The parameters that emcee sampled, pair by pair; grey lines: the fit."
         parts += [

@@ -11,7 +11,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from tests.report.conftest import described
+from thermogrip.datasets.limits import LARGEST
 from thermogrip.mpc.tuning.figures import (
+    closed_loop_chart,
     closed_loop_figure,
     pareto_figure,
     sensitivity_figure,
@@ -64,3 +66,9 @@ def test_each_figure_shows_what_it_should_in_the_colours_widths_and_units_of_the
     if os.environ.get("THERMOGRIP_FIGURES") == "write":
         DRAWN.write_text("\n".join(found) + "\n", encoding="utf-8")
     assert found == DRAWN.read_text(encoding="utf-8").splitlines()
+
+
+def test_an_open_end_of_a_limit_is_not_drawn() -> None:
+    chart = closed_loop_chart(run(), limits={"tank": (-LARGEST, 45.0)})
+    (ends,) = [curve.y for curve in chart.columns[0][1].curves if curve.label == "limits of tank"]
+    assert ends.tolist() == [45.0, 45.0]
