@@ -38,12 +38,12 @@ may be touched at another face).  Meanwhile the block relaxes towards the room w
 
     T_2 = T_room + exp(-U rest / C) (T_1 - a rho (T_1 - T_grip) - T_room) + N(0, s^2 + (law way)^2).
 
-One time constant is not the law of a slab, least where it has not become even since: of the way that the block
-went towards the room law = 0.15 + 0.25 exp(-lam_1 rest) is uncertain, a sixth in metals, two fifths in wood.
-And a block's temperature is known to 3 % of its distance from the skin beyond 15 K, as far as blocks lay from
-the skin where s was learnt.  Contact conductance scatters from touch to touch about the block's own by ``ln_h_sd``, which may
-be wider than between grasps of a series.  All of it is learnt from groups of known material by maximum
-likelihood (:func:`learn_coupling`); the defaults are those of the example rig.
+One time constant is not the law of a slab, least of one that has not become even since: of the way that the
+block went towards the room law = 0.15 + 0.25 exp(-lam_1 rest) is uncertain, a sixth in metals, two fifths in
+wood.  And a block's temperature is known to 3 % of its distance from the skin beyond 15 K, as far as blocks lay
+from the skin where s was learnt.  Contact conductance scatters from touch to touch about the block's own by
+``ln_h_sd``, which may be wider than between grasps of a series.  All of it is learnt from groups of known
+material by maximum likelihood (:func:`learn_coupling`); the defaults are those of the example rig.
 """
 
 from __future__ import annotations
@@ -210,8 +210,8 @@ def joint_prior(
 def _move(
     coupling: Coupling, traces: Traces, before: int, after: int, about: Array | None
 ) -> tuple[Array, Array, Array]:
-    """Return gain and offset (m,) of the block's temperature from one touch to the next, and what is uncertain
-    of how far the room takes one that is found at ``about`` (m,) [K]."""
+    """Return gain and offset (m,) of the block's temperature from one touch to the next, and what is
+    uncertain of how far the room takes one that is found at ``about`` (m,) [K]."""
     rest = float(traces.rest[after])
     taken = coupling.found * traces.drop(rest)
     room = traces.room[before]

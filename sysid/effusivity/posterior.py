@@ -113,8 +113,8 @@ def effusivity_posterior(
     of the effusivity; each row has the object's temperature at its own touch.
 
     Arguments are those of :func:`material_fit`; ``coupling`` is how blocks move between touches, by default
-    those of the example rig; ``other_gripper`` the probability, before the grasps are seen, that another gripper
-    of its kind took them: single touches then are answered by both, as likely as these explain all of them.
+    those of the example rig; ``other_gripper`` the probability, before the grasps are seen, that another
+    gripper of its kind took them: single touches are answered by both, as likely as each explains them all.
     """
     (grasps,) = as_grasps(grasps)
     rows = touch_groups(grasps) if has_touch_groups(grasps) else {}

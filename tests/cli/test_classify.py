@@ -115,7 +115,8 @@ def test_a_grasp_without_a_contact_has_no_effusivity(gripper: SimpleNamespace) -
     answer = json.loads(gripper.bench.run("effusivity", "grasps.csv", "--out", "e.csv", "--json").out)
     assert answer["without_contact"] == ["a", "c"]
     first = answer["grasps"][0]
-    assert set(first) - {"grasp_id", "misfit_sd", "other_gripper"} == {key for key, value in first.items() if value is None}
+    unknown = {key for key, value in first.items() if value is None}
+    assert set(first) - {"grasp_id", "misfit_sd", "other_gripper"} == unknown
     assert answer["grasps"][1]["effusivity"] == 1000.0
     assert len(gripper.posteriors) == 2  # of the first record alone, twice
 

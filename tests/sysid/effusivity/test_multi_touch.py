@@ -234,7 +234,8 @@ def test_the_way_begins_where_the_touches_found_the_block(record):
     left = first - taken * (first - skin)
     stay = np.exp(-100.0 * rest / view.traces.capacity)
     uneven = np.exp(-rest * np.where(view.traces.decay > 0, view.traces.decay, np.inf).min(axis=1))
-    assert (uneven[FIVE.index("copper")] < 0.01) and (uneven[FIVE.index("wood")] > 0.5)
+    assert uneven[FIVE.index("copper")] < 0.01
+    assert uneven[FIVE.index("wood")] > 0.5
     variance = 0.36**2 + ((0.15 + 0.25 * uneven) * (1 - stay) * (room - left)) ** 2
     np.testing.assert_allclose(p[:, 4, 4], (stay * (1 - taken)) ** 2 * p[:, 0, 0] + variance, rtol=0.05)
     assert variance.max() > 1.2 * 0.36**2
