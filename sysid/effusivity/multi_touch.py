@@ -40,7 +40,7 @@ may be touched at another face).  Meanwhile the block relaxes towards the room w
 
 One time constant is not the law of a slab, least of one that has not become even since: of the way that the
 block went towards the room law = 0.15 + 0.25 exp(-lam_1 rest) is uncertain, a sixth in metals, two fifths in
-wood.  And a block's temperature is known to 3 % of its distance from the skin beyond 15 K, as far as blocks lay
+wood.  And a block's temperature is known to 3 % of its distance from the skin beyond 15 K, as far as they lay
 from the skin where s was learnt.  Contact conductance scatters from touch to touch about the block's own by
 ``ln_h_sd``, which may be wider than between grasps of a series.  All of it is learnt from groups of known
 material by maximum likelihood (:func:`learn_coupling`); the defaults are those of the example rig.

@@ -68,6 +68,25 @@ def test_two_touches_name_blocks_that_one_cannot(device, record, fit):
     assert own.max() < 0.8
 
 
+def test_a_temperature_far_from_the_skin_is_known_less_well(device, record, monkeypatch):
+    """By 3 % of what is beyond 15 K, in quadrature, under candidates as under a free effusivity."""
+    at = touch_groups(record)["p000"]
+    block, names = record.isel(grasp=at), ["copper", "iron"]
+    skin = touches(block).level
+    near, near_free = two_touch_fit(device, block, names), free_touch_fit(device, block)["p000"]
+    far = np.abs(near.t_object[0] - skin[0])
+    monkeypatch.setattr(multi_touch, "_FAR", 2.0)
+    wide, wide_free = two_touch_fit(device, block, names), free_touch_fit(device, block)["p000"]
+    assert far.min() > 2.0
+    grown = 0.03**2 * (far**2 - 4.0 - np.maximum(far**2 - 225.0, 0.0))
+    np.testing.assert_allclose(wide.t_object_sd[0] ** 2 - near.t_object_sd[0] ** 2, grown)
+    for k, (a, b) in enumerate(zip(near_free, wide_free)):
+        far = np.abs(a.t_object - skin[k])
+        grown = 0.03**2 * (np.maximum(far**2 - 4.0, 0.0) - np.maximum(far**2 - 225.0, 0.0))
+        np.testing.assert_allclose(b.t_object_sd**2 - a.t_object_sd**2, grown, atol=1e-9)
+    assert near.log_evidence.tolist() == wide.log_evidence.tolist()
+
+
 @pytest.mark.parametrize("sensors", [1, 2])
 def test_one_touch_alone_is_the_single_fit(device, record, sensors):
     """With the scatter of single grasps, known well, a group of one says what the engine says of a grasp."""
