@@ -36,12 +36,14 @@ heat capacity, since its temperature is even after seconds; in wood more than th
 near the face.  A share a of it is left to find (a block stores heat beside the part that a touch sees, and
 may be touched at another face).  Meanwhile the block relaxes towards the room with time constant C / U, so
 
-    T_2 = T_room + exp(-U rest / C) (T_1 - a rho (T_1 - T_grip) - T_room) + N(0, s^2 + (0.15 way)^2).
+    T_2 = T_room + exp(-U rest / C) (T_1 - a rho (T_1 - T_grip) - T_room) + N(0, s^2 + (law way)^2).
 
-One time constant is not the law of a slab, so of the way that the block went towards the room 15 % are
-uncertain.  Contact conductance scatters from touch to touch about the block's own by ``ln_h_sd``, which may
-be wider than between grasps of a series.  All of it is learnt from groups of known material by maximum
-likelihood (:func:`learn_coupling`); the defaults are those of the example rig.
+One time constant is not the law of a slab, least of one that has not become even since: of the way that the
+block went towards the room law = 0.15 + 0.25 exp(-lam_1 rest) is uncertain, a sixth in metals, two fifths in
+wood.  And a block's temperature is known to 3 % of its distance from the skin beyond 15 K, as far as they lay
+from the skin where s was learnt.  Contact conductance scatters from touch to touch about the block's own by
+``ln_h_sd``, which may be wider than between grasps of a series.  All of it is learnt from groups of known
+material by maximum likelihood (:func:`learn_coupling`); the defaults are those of the example rig.
 """
 
 from __future__ import annotations
@@ -89,7 +91,8 @@ _RANGES = {  # of the numbers of a file
 }  # fmt: skip
 #: Time between two touches, where the record does not say [s].
 REST = 60.0
-_LAW = 0.15  # of the way to the room, uncertain
+_LAW, _UNEVEN = 0.15, 0.25  # of the way to the room, uncertain in an even block, and more in an uneven one
+_FAR_SD, _FAR = 0.03, 15.0  # of a temperature's distance from the skin, in quadrature beyond so many K
 _INTO = 2.0  # s into the next touch: where its reading knows most of the block
 
 
@@ -107,12 +110,12 @@ class Coupling:
         if not (0 <= self.found <= 2 and self.loss >= 0 and self.sd > 0 and self.ln_h_sd > 0):
             raise ValueError(f"need 0 <= found <= 2, loss >= 0, sd > 0, ln_h_sd > 0, got {self}")
 
-    @property
-    def touch_sd(self) -> float:
-        """Return the error of a temperature that a touch finds, beyond its noise [K]: two touches show the
-        sum of the block's own AR(1) drift, of variance s^2 / 2 here, and of their errors, s^2 / 4 each, which
-        are not identifiable apart."""
-        return 0.5 * self.sd
+    def touch_sd(self, distance: Array) -> Array:
+        """Return the error of a temperature that a touch finds at a distance from the skin, beyond its noise
+        [K]: two touches show the sum of the block's own AR(1) drift, of variance s^2 / 2 here, and of their
+        errors, s^2 / 4 each, which are not identifiable apart."""
+        far = _FAR_SD * np.sqrt(np.maximum(np.square(distance) - _FAR**2, 0.0))
+        return np.hypot(0.5 * self.sd, far)
 
     def to_dict(self) -> dict[str, float]:
         """Return the numbers by name, without a longest rest that is not known."""
@@ -149,6 +152,11 @@ class Traces:
     skin: Array  # (n,), the gripper's temperature in the touch [degC]
     room: Array  # (n,), the room's, NaN where unknown [degC]
     rest: Array  # (n,), time since the touch before [s]
+
+    def law(self, rest: float) -> Array:
+        """Return which share of the way to the room is uncertain under each hypothesis, (m,)."""
+        slowest = np.where(self.decay > 0, self.decay, np.inf).min(axis=1)
+        return np.asarray(_LAW + _UNEVEN * np.exp(-slowest * rest))
 
     def drop(self, rest: float) -> Array:
         """Return rho of each hypothesis after a rest [s], (m,)."""
@@ -195,15 +203,15 @@ def joint_prior(
         mu[:, k, 0] = gain * mu[:, k - 1, 0] + offset
         for j in range(k):
             p[:, j, 0, k, 0] = p[:, k, 0, j, 0] = gain * p[:, j, 0, k - 1, 0]
-        p[:, k, 0, k, 0] = gain**2 * p[:, k - 1, 0, k - 1, 0] + coupling.sd**2 + (_LAW * way) ** 2
+        p[:, k, 0, k, 0] = gain**2 * p[:, k - 1, 0, k - 1, 0] + coupling.sd**2 + way**2
     return mu.reshape(m, 4 * n), p.reshape(m, 4 * n, 4 * n)
 
 
 def _move(
     coupling: Coupling, traces: Traces, before: int, after: int, about: Array | None
 ) -> tuple[Array, Array, Array]:
-    """Return gain and offset (m,) of the block's temperature from one touch to the next, and how far the room
-    takes one that is found at ``about`` (m,) [K]."""
+    """Return gain and offset (m,) of the block's temperature from one touch to the next, and what is
+    uncertain of how far the room takes one that is found at ``about`` (m,) [K]."""
     rest = float(traces.rest[after])
     taken = coupling.found * traces.drop(rest)
     room = traces.room[before]
@@ -213,7 +221,7 @@ def _move(
     if about is None:
         return gain, np.asarray(offset), np.zeros(gain.shape)
     way = gain * about + offset - (about - taken * (about - traces.skin[before]))
-    return gain, np.asarray(offset), np.asarray(way)
+    return gain, np.asarray(offset), np.asarray(traces.law(rest) * way)
 
 
 SHARED = (T_OBJECT, H, EFFUSIVITY, CAPACITY)
@@ -336,12 +344,15 @@ def two_touch_fit(
     hypotheses = material_hypotheses(gripper, candidates, finish)
     view = _view(gripper, grasps, hypotheses, coupling or Coupling(), until)
     fits = _fits(view, list(rows.values()))
+    found = np.array([f.mean[:, 0] for f in fits])
+    skin = view.data.level[[at[0] for at in rows.values()]]
+    own = view.coupling.touch_sd(found - skin[:, None])
     return TouchGroups(
         tuple(rows),
         tuple(rows.values()),
         np.array([f.log_evidence for f in fits]),
-        np.array([f.mean[:, 0] for f in fits]),
-        np.hypot(np.sqrt([f.covariance[:, 0, 0] for f in fits]), view.coupling.touch_sd),
+        found,
+        np.hypot(np.sqrt([f.covariance[:, 0, 0] for f in fits]), own),
     )
 
 
@@ -362,11 +373,11 @@ def free_touch_fit(
         view = _View(gripper, data, whitener, hypotheses, traces_of(gripper, data, rest, hypotheses), used)
         return _fits(view, [at])[0]
 
-    return {name: _free(at, joint, used.touch_sd) for name, at in rows.items()}
+    return {name: _free(at, joint, used, data.level[at]) for name, at in rows.items()}
 
 
 def _free(
-    at: Rows, joint: Callable[[Rows, Array], Joint], touch_sd: float
+    at: Rows, joint: Callable[[Rows, Array], Joint], coupling: Coupling, skin: Array
 ) -> list[posterior_grid.GridPosterior]:
     x = np.linspace(*posterior_grid.LN_E_RANGE, posterior_grid.N_COARSE)
     fit = joint(at, x)
@@ -375,10 +386,12 @@ def _free(
         extra = joint(at, more)
         x = np.concatenate([x, more])
         fit = Joint(*(np.concatenate(pair) for pair in zip(fit, extra)))
-    sd = np.hypot(np.sqrt(np.diagonal(fit.covariance, axis1=1, axis2=2)), touch_sd)
+    own = np.diagonal(fit.covariance, axis1=1, axis2=2)[:, ::N_SHARED]
+    found, ln_h = fit.mean[:, ::N_SHARED], fit.mean[:, 1::N_SHARED]
+    sd = np.hypot(np.sqrt(own), coupling.touch_sd(found - skin))
     return [
-        posterior_grid.posterior_of(x, fit.log_evidence, fit.mean[:, k], sd[:, k], fit.mean[:, k + 1])
-        for k in range(0, fit.mean.shape[1], N_SHARED)
+        posterior_grid.posterior_of(x, fit.log_evidence, found[:, k], sd[:, k], ln_h[:, k])
+        for k in range(skin.size)
     ]
 
 

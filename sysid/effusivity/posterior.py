@@ -13,14 +13,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import logsumexp
+from scipy.special import expit, logit, logsumexp
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.grasp_files import Records, as_grasps
 from thermogrip.datasets.materials import Material
 from thermogrip.datasets.schema import Grasps, has_touch_groups
-from thermogrip.sysid.effusivity.data import touches
-from thermogrip.sysid.effusivity.gripper_model import INSULATOR, GripperModel
+from thermogrip.sysid.effusivity.data import Touches, touches
+from thermogrip.sysid.effusivity.gripper_model import INSULATOR, GripperModel, another_gripper
 from thermogrip.sysid.effusivity.laplace_approximation import T_OBJECT, H, fit_candidates
 from thermogrip.sysid.effusivity.multi_touch import Coupling, free_touch_fit, touch_groups
 from thermogrip.sysid.effusivity.posterior_grid import GridPosterior, grid_posteriors, mixture_quantiles
@@ -39,6 +39,7 @@ class EffusivityRow:
     t_object_p95: float
     h_c: float  # posterior mean of ln h as a conductance [W m^-2 K^-1]
     log10_effusivity_sd: float
+    other_gripper: float = 0.0  # probability that another gripper than the calibrated one took it
 
 
 @dataclass(frozen=True)
@@ -99,8 +100,9 @@ def material_posterior(
 
 
 def effusivity_posterior(
-    gripper: GripperModel, grasps: Records, *, until: float | None = None, coupling: Coupling | None = None
-) -> list[EffusivityRow]:
+    gripper: GripperModel, grasps: Records, *, until: float | None = None, coupling: Coupling | None = None,
+    other_gripper: float = 0.0,
+) -> list[EffusivityRow]:  # fmt: skip
     """Return one row a grasp: effusivity, object temperature and contact conductance, no material assumed.
 
     The prior of the effusivity is log-uniform between 17 and 110 000 on the gripper's scale, from plastic
@@ -111,22 +113,67 @@ def effusivity_posterior(
     of the effusivity; each row has the object's temperature at its own touch.
 
     Arguments are those of :func:`material_fit`; ``coupling`` is how blocks move between touches, by default
-    those of the example rig.
+    those of the example rig; ``other_gripper`` the probability, before the grasps are seen, that another
+    gripper of its kind took them: single touches are answered by both, as likely as each explains them all.
     """
     (grasps,) = as_grasps(grasps)
     rows = touch_groups(grasps) if has_touch_groups(grasps) else {}
     alone = np.setdiff1d(np.arange(grasps.sizes["grasp"]), np.concatenate([[], *rows.values()]).astype(int))
     found: dict[int, GridPosterior] = {}
+    share = 0.0
     if alone.size:
-        single = grid_posteriors(gripper, touches(grasps.isel(grasp=alone) if rows else grasps, until=until))
+        data = touches(grasps.isel(grasp=alone) if rows else grasps, until=until)
+        single = grid_posteriors(gripper, data)
+        if other_gripper > 0:
+            single, share = _by_either(gripper, data, single, other_gripper)
         found |= dict(zip(alone.tolist(), single))
     if rows:
         for name, fits in free_touch_fit(gripper, grasps, coupling=coupling, until=until).items():
             found |= dict(zip(rows[name].tolist(), fits))
-    return [_row(gripper, str(name), found[i]) for i, name in enumerate(grasps["grasp"].values)]
+    names = [str(name) for name in grasps["grasp"].values]
+    return [_row(gripper, name, found[i], share if i in alone else 0.0) for i, name in enumerate(names)]
 
 
-def _row(gripper: GripperModel, name: str, posterior: GridPosterior) -> EffusivityRow:
+_ASKED, _UNLIKELY = 5, 0.01  # grasps that another gripper is asked about first, and when no more are
+
+
+def _by_either(
+    gripper: GripperModel, data: Touches, own: list[GridPosterior], prior: float
+) -> tuple[list[GridPosterior], float]:
+    """Return the posteriors of touches that one gripper took, the calibrated one or another, and how likely
+    it was another."""
+    other, n = another_gripper(gripper), len(own)
+    order = np.unique(np.linspace(0, n - 1, min(n, _ASKED)).astype(int))
+    order = np.concatenate([order, np.setdiff1d(np.arange(n), order)])
+    theirs: dict[int, GridPosterior] = {}
+    odds = float(logit(prior))
+    for some in (order[:_ASKED], order[_ASKED:]):
+        if some.size and (not theirs or expit(odds) > _UNLIKELY):
+            fits = grid_posteriors(other, data.take(some))
+            odds += sum(fit.log_evidence - own[i].log_evidence for i, fit in zip(some, fits))
+            theirs |= dict(zip(some.tolist(), fits))
+    share = float(expit(odds))
+    if len(theirs) < n or share < _UNLIKELY:
+        return own, share
+    return [_mixed(one, theirs[i], share) for i, one in enumerate(own)], share
+
+
+def _mixed(one: GridPosterior, other: GridPosterior, share: float) -> GridPosterior:
+    """Return the mixture of two posteriors of a touch, a ``share`` of the other."""
+
+    def joined(a: Array, b: Array) -> Array:
+        return np.concatenate([(1 - share) * a, share * b])
+
+    return GridPosterior(
+        np.concatenate([one.x, other.x]), joined(one.mass, other.mass),
+        float(np.logaddexp(np.log1p(-share) + one.log_evidence, np.log(share) + other.log_evidence))
+        if share < 1 else other.log_evidence,
+        joined(one.weight, other.weight),
+        *(np.concatenate(pair) for pair in zip(one[4:], other[4:])),
+    )  # fmt: skip
+
+
+def _row(gripper: GripperModel, name: str, posterior: GridPosterior, share: float = 0.0) -> EffusivityRow:
     scale, scale_sd = gripper.effusivity_scale(posterior.x)
     scatter = np.where(np.exp(posterior.x) < INSULATOR, gripper.spreads.ln_effusivity, 0.0)
     x, sd = posterior.x - scale, np.hypot(np.hypot(scale_sd, scatter), 1e-4)
@@ -138,5 +185,5 @@ def _row(gripper: GripperModel, name: str, posterior: GridPosterior) -> Effusivi
         grasp_id=name, effusivity=float(middle), effusivity_p05=float(low), effusivity_p95=float(high),
         t_object=float(t[1]), t_object_p05=float(t[0]), t_object_p95=float(t[2]),
         h_c=float(np.exp((posterior.weight * posterior.ln_h).sum())),
-        log10_effusivity_sd=float(np.sqrt(variance) / np.log(10)),
+        log10_effusivity_sd=float(np.sqrt(variance) / np.log(10)), other_gripper=share,
     )  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -56,7 +56,9 @@ def gripper(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
     stand_in(f"{QUALITY}.check_grasps", quality)
     made.posteriors = stand_in(
         "thermogrip.sysid.effusivity.posterior.effusivity_posterior",
-        lambda device, record, coupling: [effusivity_row(str(n), 1e3) for n in record["grasp"].values],
+        lambda device, record, coupling, other_gripper: [
+            effusivity_row(str(n), 1e3) for n in record["grasp"].values
+        ],
     )
     made.explained = stand_in(
         "thermogrip.classify.decisions.predict.unexplained_effusivities",
@@ -91,6 +93,21 @@ def test_effusivities_are_printed_written_and_answered(gripper: SimpleNamespace)
     assert (answer["without_contact"], answer["unexplained"], answer["out"]) == ([], {"a": "odd"}, "e.csv")
 
 
+def test_the_bundled_gripper_may_be_another_one(gripper: SimpleNamespace, stand_in: StandIn) -> None:
+    posteriors = stand_in(
+        "thermogrip.sysid.effusivity.posterior.effusivity_posterior",
+        lambda device, record, coupling, other_gripper: [
+            replace(effusivity_row(str(n), 1e3), other_gripper=0.9 * (other_gripper == 0.5))
+            for n in record["grasp"].values
+        ],
+    )
+    done = gripper.bench.run("effusivity", "grasps.csv", "--out", "e.csv")
+    assert "read as by another gripper than the bundled one" in done.err
+    done = gripper.bench.run("effusivity", "grasps.csv", "--calibrate", "more.csv", "--out", "e.csv")
+    assert "another gripper" not in done.err
+    assert len(posteriors) == 4  # both records, twice
+
+
 def test_a_grasp_without_a_contact_has_no_effusivity(gripper: SimpleNamespace) -> None:
     gripper.why = ["no contact", ""]
     done = gripper.bench.run("effusivity", "grasps.csv", "--out", "e.csv")
@@ -98,7 +115,8 @@ def test_a_grasp_without_a_contact_has_no_effusivity(gripper: SimpleNamespace) -
     answer = json.loads(gripper.bench.run("effusivity", "grasps.csv", "--out", "e.csv", "--json").out)
     assert answer["without_contact"] == ["a", "c"]
     first = answer["grasps"][0]
-    assert set(first) - {"grasp_id", "misfit_sd"} == {key for key, value in first.items() if value is None}
+    unknown = {key for key, value in first.items() if value is None}
+    assert set(first) - {"grasp_id", "misfit_sd", "other_gripper"} == unknown
     assert answer["grasps"][1]["effusivity"] == 1000.0
     assert len(gripper.posteriors) == 2  # of the first record alone, twice
 
@@ -388,6 +406,12 @@ def test_another_gripper_is_known_by_its_grasps_or_not_at_all(
         assert named.bench.run(*words, *other).code == 0
     assert asked == [None, [named.record]]
     assert [call.args[0] for call in named.asked] == ["another", "another", named.model]
+    assert named.bench.run(*words, "--same-gripper").code == 0
+    certain = named.asked[-1].args[0]
+    assert (certain.gripper, certain.finish) == ("same", "known")
+    assert (named.model.gripper, named.model.finish) == ("auto", "auto")
+    refused = named.bench.run(*words, "--same-gripper", "--known", "more.csv")
+    assert (refused.code, "--same-gripper contradicts" in refused.said[0]) == (2, True)
     named.model = "a model"
     refused = named.bench.run(*words, "--other-gripper")
     assert (refused.code, "train a posterior classifier" in refused.said[0]) == (2, True)

@@ -120,7 +120,8 @@ def effusivity(
 ) -> int:
     """Find the effusivity of what was touched, grasp by grasp.
 
-    Without --calibrate the calibration of the bundled example gripper is used, with a warning. Touches of one
+    Without --calibrate the calibration of the bundled example gripper is used, with a warning, and where
+    another gripper explains a file better, as wide as such grippers differ. Touches of one
     block (touch_group) share one posterior of the effusivity, which needs no object temperature. A grasp that
     shows no contact, or moves away from its t_object, has none: its numbers are nan. Readings at the end of
     the sensor's range are left out, and of single touches what is later than the calibration's contacts. A
@@ -145,7 +146,14 @@ def effusivity(
         rows = []
         for k, record in enumerate(records):
             progress(k / len(records), record.attrs["name"])
-            found = _effusivities(device, with_object_range(record, stated), coupling)
+            # the bundled gripper, which may have taken these grasps or not
+            other = 0.0 if calibrate else 0.5
+            found = _effusivities(device, with_object_range(record, stated), coupling, other)
+            if max(row.other_gripper for row in found) > 0.5:
+                console.warn(
+                    f"{record.attrs['name']}: read as by another gripper than the bundled one: intervals are "
+                    "as wide as grippers differ"
+                )
             misfits |= unexplained_effusivities(device, record, found, stated)
             rows += [asdict(row) for row in found]
     for row in rows:
@@ -300,6 +308,11 @@ def classify(
     """
     stated = _range(between)
     cli.new_file(out, (".csv",))
+    from thermogrip.datasets.materials import load_materials
+
+    listed = load_materials()
+    asked = [name for name in cli.comma(candidates) or () if name not in listed]
+    cli.choices("--materials", asked, model_dir / "classifier.json", "classes")
     from thermogrip.classify.decisions.next_touch import advise_touches
     from thermogrip.classify.decisions.predict import (
         classify_grasps,
@@ -415,13 +428,19 @@ def _as_taught(console: Console, record: Grasps, longest: float, coupling: Coupl
     return record.sel(time=slice(None, quality.until + 1e-9))
 
 
-def _effusivities(device: GripperModel, record: Grasps, coupling: Coupling | None) -> list[EffusivityRow]:
+def _effusivities(
+    device: GripperModel, record: Grasps, coupling: Coupling | None, other: float
+) -> list[EffusivityRow]:
     """Return a row a grasp; one without contact has no numbers, and no part in its block."""
     from thermogrip.sysid.effusivity import EffusivityRow, check_grasps, effusivity_posterior
 
     quality = check_grasps(record)
     touched = quality.usable_grasps(record)
-    found = [] if touched is None else effusivity_posterior(device, touched, coupling=coupling)
+    found = (
+        []
+        if touched is None
+        else effusivity_posterior(device, touched, coupling=coupling, other_gripper=other)
+    )
     left = iter(found)
     nothing = [float("nan")] * 8
     names = [str(name) for name in record["grasp"].values]

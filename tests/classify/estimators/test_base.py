@@ -321,6 +321,8 @@ def test_a_second_sensor_not_trained_with_is_not_read(name: str, rig: Grasps, tw
 
 def test_features_of_the_first_sensor_need_no_second(rig: Grasps, two_sensors: Grasps) -> None:
     model = make_classifier("features-lda").fit(two_sensors)
+    assert model.notes_ == ["the second sensor is not read"]
+    assert make_classifier("features-lda").fit(rig).notes_ == []
     assert (model.predict(rig) == rig["material"].values).mean() > 0.9
 
 

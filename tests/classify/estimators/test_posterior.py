@@ -18,8 +18,13 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.contact.simulation import simulate_grasps
-from thermogrip.sysid.effusivity.data import touches
-from thermogrip.sysid.effusivity.gripper_model import GripperSpread, another_gripper, load_default_gripper
+from thermogrip.sysid.effusivity.data import KNOTS, touches
+from thermogrip.sysid.effusivity.gripper_model import (
+    Discrepancy,
+    GripperSpread,
+    another_gripper,
+    load_default_gripper,
+)
 from thermogrip.sysid.effusivity.multi_touch import two_touch_fit
 from thermogrip.sysid.effusivity.posterior import effusivity_posterior, material_evidence, material_posterior
 from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors
@@ -280,6 +285,18 @@ def test_what_a_record_decides_is_the_mixture_of_its_explanations(
         odds += prior * each[::-1, None] * np.exp(e - top)
     want = odds / odds.sum(axis=1, keepdims=True)
     np.testing.assert_allclose(np.exp(known.candidate_log_proba(pair, names)), want, rtol=1e-6)
+
+
+def test_a_gripper_with_a_discrepancy_is_taken_for_no_other(known: PosteriorClassifier) -> None:
+    device, n = known.device_, len(known.device_.blocks)
+    odd = Discrepancy(np.zeros(KNOTS.size), np.zeros((n, KNOTS.size)), np.zeros(n), np.zeros(0))
+    levels = [
+        PosteriorClassifier().with_device(d)._levels() for d in (device, replace(device, discrepancy=odd))
+    ]
+    assert [[level.prior for level in some] for some in levels] == [
+        pytest.approx([0.72, 0.18, 0.1]), pytest.approx([0.8, 0.2])
+    ]  # fmt: skip
+    assert not any(level.device.uncertain for level in levels[1])
 
 
 def test_other_blocks_are_answered_less_surely(known: PosteriorClassifier) -> None:

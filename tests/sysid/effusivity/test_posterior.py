@@ -18,6 +18,7 @@ from scipy.stats import t as student_t
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.materials import find_material, load_materials
 from thermogrip.sysid.effusivity.data import touches, whiten
+from thermogrip.sysid.effusivity.gripper_model import another_gripper
 from thermogrip.sysid.effusivity.laplace_approximation import (
     find_modes,
     material_hypotheses,
@@ -36,6 +37,39 @@ from thermogrip.sysid.effusivity.posterior_grid import LN_E_RANGE, GridPosterior
 
 from ...oracles.emcee_posterior import emcee_posterior
 from .makers import FIVE, drawn_from_the_prior, simulated, split_of
+
+
+def test_grasps_decide_whether_another_gripper_took_them(device):
+    home = simulated(device, FIVE, t_gripper=23.0, t_object=43.0, seed=1)
+    own = effusivity_posterior(device, home)
+    either = effusivity_posterior(device, home, other_gripper=0.5)
+    assert 0 < either[0].other_gripper < 0.01
+    assert [replace(row, other_gripper=0.0) for row in either] == own
+    stack = replace(device.stack, lag=2.5 * device.stack.lag, z_outer=1.3 * device.stack.z_outer)
+    strange = simulated(
+        replace(device, stack=stack), ["copper", "iron", "wood"], t_gripper=23.0, t_object=43.0, seed=2
+    )
+    e = np.array([find_material(name).effusivity for name in strange["material"].values])
+    found = [effusivity_posterior(device, strange, other_gripper=p) for p in (0.0, 0.5)]
+    assert min(row.other_gripper for row in found[1]) > 0.99
+    holds = [[row.effusivity_p05 <= x <= row.effusivity_p95 for row, x in zip(rows, e)] for rows in found]
+    assert sum(holds[1]) == 3 > sum(holds[0])
+
+
+def test_either_gripper_s_answer_is_the_mixture_of_both(device):
+    one = simulated(device, ["iron"], t_gripper=23.0, t_object=43.0, seed=4)
+    data = touches(one)
+    (own,), (other,) = (grid_posteriors(g, data) for g in (device, another_gripper(device)))
+    odds = 4.0 * np.exp(other.log_evidence - own.log_evidence)  # of a prior of 0.8
+    share = odds / (1 + odds)
+    (row,) = effusivity_posterior(device, one, other_gripper=0.8)
+    assert row.other_gripper == pytest.approx(share, rel=1e-9)
+    assert 0.05 < share < 0.95
+    means = [(fit.mass * (fit.x - device.effusivity_scale(fit.x)[0])).sum() for fit in (own, other)]
+    alone = [_row(device, "", fit, 0.0).log10_effusivity_sd * np.log(10) for fit in (own, other)]
+    mean = (1 - share) * means[0] + share * means[1]
+    variance = sum(w * (s**2 + (m - mean) ** 2) for w, s, m in zip((1 - share, share), alone, means))
+    assert row.log10_effusivity_sd * np.log(10) == pytest.approx(np.sqrt(variance), rel=1e-6)
 
 
 def test_every_solid_lies_in_the_prior_s_range_with_room_for_the_scale(device):
