@@ -19,7 +19,7 @@ from thermogrip.cli.main import app, main
 from thermogrip.sysid.models.user_model import load_object
 
 ROOT = Path(__file__).parents[2]
-SITE = ROOT / ".ci" / "site.py"
+SITE = ROOT / ".ci" / "docs_site.py"
 
 
 @cache
