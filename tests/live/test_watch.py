@@ -68,7 +68,8 @@ def test_a_trip_runs_the_command_while_the_session_ends(monkeypatch: pytest.Monk
     with Watch("run", Console(), Show(on_trip="true")) as watch:
         rig = paced_twin()
         running = Running(watch, rig, hold=10_000.0)
-        time.sleep(0.3)
+        while watch._now is None or watch._now.time_s < 5.0:
+            time.sleep(0.01)
         watch.operator.stop("a test")
         session = running.result()
     assert session.trip is not None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -67,6 +69,27 @@ def test_a_batch_goes_on_where_it_was_stopped(plant: Plant, controller: Any, tmp
     second = run_batch(rig, controller, PLAN, tmp_path, grasp_time=2.0)
     assert (second.verdict, second.sessions) == ("done", 1)
     assert (tmp_path / "0001" / "samples.csv").read_bytes() == kept
+
+
+def test_a_batch_goes_on_after_its_computer_lost_power_in_a_trial(
+    plant: Plant, controller: Any, tmp_path: Path
+) -> None:
+    """What is left then: the plan, a good trial, one with a torn last line and the verdict "running"."""
+    first = run_batch(twin(plant), controller, PLAN, tmp_path, grasp_time=1.0)
+    assert first.left == 0
+    cut = tmp_path / "0002"
+    about = json.loads((cut / "run.json").read_text())
+    (cut / "run.json").write_text(json.dumps(about | {"verdict": "running"}))
+    (cut / "samples.csv").write_bytes((cut / "samples.csv").read_bytes()[:-7] + bytes(7))
+    for lost in ("grasps.csv", "grasps_meta.csv", "SHA256SUMS"):
+        (cut / lost).unlink()
+    (tmp_path / "grasps.csv").unlink()
+    shutil.rmtree(tmp_path / "0003")
+    again = run_batch(twin(plant), controller, PLAN, tmp_path, grasp_time=1.0)
+    assert (again.verdict, again.left, again.sessions) == ("done", 0, 2)
+    assert [run.name for run in again.done] == ["0001", "0002-2", "0003"]
+    assert read_grasps(tmp_path / "grasps.csv")["material"].values.tolist() == ["copper", "wood", "iron"]
+    assert (cut / "samples.csv").read_bytes().endswith(bytes(7))  # what was cut off is left as it is
 
 
 def test_another_plan_in_the_same_folder_is_refused(plant: Plant, controller: Any, tmp_path: Path) -> None:
