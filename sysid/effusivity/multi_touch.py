@@ -115,7 +115,7 @@ class Coupling:
         [K]: two touches show the sum of the block's own AR(1) drift, of variance s^2 / 2 here, and of their
         errors, s^2 / 4 each, which are not identifiable apart."""
         far = _FAR_SD * np.sqrt(np.maximum(np.square(distance) - _FAR**2, 0.0))
-        return np.hypot(0.5 * self.sd, far)
+        return np.asarray(np.hypot(0.5 * self.sd, far))
 
     def to_dict(self) -> dict[str, float]:
         """Return the numbers by name, without a longest rest that is not known."""
