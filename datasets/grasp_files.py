@@ -174,16 +174,26 @@ def write_grasps(grasps: Grasps, path: str | Path) -> Path:
 def read_grasp_files(paths: Sequence[str | Path]) -> list[Grasps]:
     """Return the records of several files as of :func:`read_grasps`; a folder is all its grasp files, in
     order of name, and no two files may have one name."""
-    files: list[Path] = []
-    for path in map(Path, paths):
-        files += _in_folder(path) if path.is_dir() else [path]
     records: dict[str, Grasps] = {}
-    for file in files:
+    for file in list_grasp_files(paths):
         grasps = read_grasps(file)
         if log_name(grasps) in records:
             raise UserError("is given twice", file=file, hint="give each file once")
         records[log_name(grasps)] = grasps
     return list(records.values())
+
+
+def list_grasp_files(paths: Sequence[str | Path]) -> list[Path]:
+    """Return the grasp files in paths and folders, as of :func:`read_grasp_files`, unread."""
+    files: list[Path] = []
+    for path in map(Path, paths):
+        files += _in_folder(path) if path.is_dir() else [path]
+    return files
+
+
+def grasp_file_parts(path: Path) -> list[Path]:
+    """Return the files that hold the grasps of one: itself, and of a CSV its meta file."""
+    return [path, _meta_path(path)] if file_format(path) == "csv" else [path]
 
 
 def shared_grasps(first: Sequence[Grasps], second: Sequence[Grasps]) -> list[str]:
