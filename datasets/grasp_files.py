@@ -57,7 +57,8 @@ _OF_SAMPLES = ("grasp_id", "time", "t_surface", "pump")  # how the columns begin
 
 # name in the meta file (without unit) -> name in the record
 _FROM_META = {"t_object_nominal": "t_object", "t_gripper_set": "t_gripper"}
-_TO_META = {ours: theirs for theirs, ours in _FROM_META.items()}
+#: Names in the meta file of what a record calls otherwise.
+META_NAMES = {ours: theirs for theirs, ours in _FROM_META.items()}
 _ENDINGS = (".csv", ".csv.gz", ".csv.xz")
 _NEEDED = ("time", "t_surface")  # how the columns begin that are read as numbers
 
@@ -475,7 +476,7 @@ def _meta_text(grasps: Grasps) -> str:
             columns.append([str(v) for v in variable.values])
         elif key in GRASP_NUMBERS:
             unit = "" if GRASP_NUMBERS[key] == "1" else f"_{GRASP_NUMBERS[key]}"
-            headers.append(_TO_META.get(key, key) + unit)
+            headers.append(META_NAMES.get(key, key) + unit)
             columns.append(["" if np.isnan(v) else repr(float(v)) for v in variable.values])
     return csv_text([headers, *zip(*columns, strict=True)])
 

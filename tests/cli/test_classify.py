@@ -376,6 +376,33 @@ def test_early_answers_are_those_of_the_stop_rule(named: SimpleNamespace) -> Non
     assert json.loads(done.out)["strange"] == {}
 
 
+@pytest.mark.parametrize(
+    "words", [[], ["grasps.csv"], ["--out", "p.csv"], ["grasps.csv", "--out", "p.csv", "--serve"],
+              ["--serve", "--out", "p.csv"], ["grasps.csv", "--out", "p.csv", "--port", "0"]]
+)  # fmt: skip
+def test_grasps_come_from_files_or_from_requests(words: list[str], named: SimpleNamespace) -> None:
+    refused = named.bench.run("classify", "m", *words)
+    assert (refused.code, "give GRASPS and --out, or --serve alone" in refused.said[0]) == (2, True)
+
+
+def test_requests_are_answered_by_lines_or_over_http(named: SimpleNamespace, stand_in: StandIn) -> None:
+    lines = stand_in("thermogrip.classify.decisions.serve.serve_lines")
+    ran: list[Any] = []
+    served = stand_in(
+        "thermogrip.classify.decisions.serve.server", SimpleNamespace(run=lambda sockets: ran.extend(sockets))
+    )
+    assert named.bench.run("classify", "m", "--serve", "--materials", "iron,wood").code == 0
+    assert lines[0].args[0](named.record)["rows"][0]["material"] == "iron"
+    assert named.asked[0].args[2] == ("iron", "wood")
+    done = named.bench.run("classify", "m", "--serve", "--port", "0")
+    assert (done.code, ran == [served[0].args[1]]) == (0, True), done
+    assert f"answers at http://127.0.0.1:{ran[0].getsockname()[1]}/\n" in done.err
+    ran[0].close()
+    stand_in("thermogrip.cli.classify.find_spec")
+    refused = named.bench.run("classify", "m", "--serve", "--port", "0")
+    assert (refused.code, "thermogrip[live]" in refused.said[0]) == (2, True)
+
+
 @pytest.mark.parametrize("option", ["--early", "--next-touch"])
 @pytest.mark.parametrize("other", [["--other-gripper"], ["--known", "more.csv"]])
 def test_of_another_gripper_nothing_is_foreseen(

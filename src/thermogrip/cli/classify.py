@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, astuple, dataclass
 from functools import partial
+from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -264,8 +266,11 @@ def train(
 
 def classify(
     model_dir: Annotated[Path, cli.arg("MODEL_DIR", "Folder that train wrote.")],
-    paths: cli.GraspFiles,
-    out: Annotated[Path, cli.opt("--out", "FILE.csv", "Where the predictions go.")],
+    paths: Annotated[
+        list[str] | None,
+        cli.arg("GRASPS...", "Grasp files (CSV with its _meta.csv, or NetCDF) or folders."),
+    ] = None,
+    out: Annotated[Path | None, cli.opt("--out", "FILE.csv", "Where the predictions go.")] = None,
     candidates: Annotated[
         str | None,
         cli.opt(
@@ -299,6 +304,13 @@ def classify(
         cli.opt("--known", "GRASPS", "Labelled grasps of that other gripper, one or more; may be repeated."),
     ] = None,
     between: ObjectRange = None,
+    serve: Annotated[
+        bool, cli.flag("--serve", "Answer grasps that come as lines of JSON, until they end.")
+    ] = False,
+    port: Annotated[
+        int | None,
+        cli.opt("--port", "N", "With --serve: answer over HTTP on 127.0.0.1 instead.", min=0, max=65535),
+    ] = None,
     seed: cli.Seed = 0,
     as_json: cli.AsJson = False,
 ) -> int:
@@ -312,9 +324,13 @@ def classify(
     one gripper and its blocks; each file decides whether another gripper or other blocks explain it better,
     and is then answered as unsurely as these differ. --same-gripper and --other-gripper say which it is,
     --known what the other one reads of blocks it knows.
+
+    A run that was ended goes on where it stopped when it is given again. --serve takes one object a line,
+    {"time_s": [...], "t_surface_degC": [...], "t_object_nominal_degC": 28}, and writes its answer.
     """
     stated = _range(between)
-    cli.new_file(out, (".csv",))
+    if serve == bool(paths) or serve == (out is not None) or (port is not None and not serve):
+        raise UserError("give GRASPS and --out, or --serve alone", hint="--port belongs to --serve")
     from thermogrip.classify.decisions.predict import cell_text
     from thermogrip.datasets.partitions import Answers, sources, stamps
 
@@ -330,7 +346,11 @@ def classify(
         model_dir, cli.comma(candidates), stated, early=early, next_touch=next_touch, or_unknown=or_unknown,
         other_gripper=other_gripper, same_gripper=same_gripper, known=tuple(known or ()),
     )  # fmt: skip
-    given = sources(paths)
+    if serve:
+        return _serve(console, ask.answerer(), port)
+    assert out is not None
+    cli.new_file(out, (".csv",))
+    given = sources(paths or [])
     asked = [*astuple(ask), stamps([model_dir, *ask.known])]
     answer = ask.answerer()
     found = Answers(out, ["classify", *asked])
@@ -366,6 +386,23 @@ def classify(
             "strange": {name: why for part in parts for name, why in part["strange"].items()}, "out": out,
         })  # fmt: skip
     found.remove()
+    return 0
+
+
+def _serve(console: Console, answer: Callable[[Grasps], dict[str, Any]], port: int | None) -> int:
+    """Answer single grasps: from stdin, or over HTTP at a port."""
+    from thermogrip.classify.decisions.serve import HOST, listen, serve_lines, server
+
+    if port is None:
+        serve_lines(answer, sys.stdin.buffer, sys.stdout.buffer)
+        return 0
+    if find_spec("uvicorn") is None or find_spec("starlette") is None:
+        raise UserError(
+            "--port needs the packages starlette and uvicorn", hint='pip install "thermogrip[live]"'
+        )
+    listening = listen(port)
+    sys.stderr.write(f"answers at http://{HOST}:{listening.getsockname()[1]}/\n")
+    server(answer, listening).run(sockets=[listening])
     return 0
 
 
