@@ -129,6 +129,7 @@ def listen(port: int) -> socket.socket:
     try:
         found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         found.bind((HOST, port))
+        found.listen()  # who reads the address may call at once
     except OSError as error:
         found.close()
         raise UserError(f"port {port} cannot be used ({error.strerror})", hint="choose another") from error

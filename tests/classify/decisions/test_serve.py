@@ -150,7 +150,7 @@ def test_a_request_by_another_name_or_of_a_web_page_is_refused(port: int, header
 
 def test_only_the_loopback_listens_and_a_taken_port_is_one_line() -> None:
     first = listen(0)
-    first.listen()
+    socket.create_connection(first.getsockname()).close()
     assert first.getsockname()[0] == "127.0.0.1"
     with pytest.raises(UserError, match="cannot be used"):
         listen(first.getsockname()[1])
