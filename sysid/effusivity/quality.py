@@ -382,10 +382,10 @@ def touched_groups(record: Grasps) -> list[str]:
     return list(dict.fromkeys(filter(None, label_values(record, "touch_group").tolist())))
 
 
-def torn_names(files: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
+def torn_names(touched: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
     """Return what :func:`torn_groups` does, of the name of each file and its groups."""
     found: dict[str, list[str]] = {}
-    for file, groups in files:
+    for file, groups in touched:
         for name in groups:
             found.setdefault(name, []).append(file)
     torn = {name: files for name, files in found.items() if len(files) > 1}

@@ -112,6 +112,37 @@ def test_a_grasp_without_a_contact_has_no_effusivity(gripper: SimpleNamespace) -
     assert len(gripper.posteriors) == 2  # of the first record alone, twice
 
 
+def test_a_block_in_two_files_is_warned_of_and_what_was_answered_before_an_end_is_kept(
+    gripper: SimpleNamespace, stand_in: StandIn
+) -> None:
+    gripper.records = [
+        record_of(["a", "b"], "one", touch_group=["x", "x"], touch=[1.0, 2.0]),
+        record_of(["c"], "two", touch_group=["x"], touch=[1.0]),
+    ]
+    words = ["effusivity", "grasps.csv", "--out", "e.csv"]
+    assert "touch_group 'x' is in one and in two" in gripper.bench.run(*words).err
+    (gripper.bench.path / "e.csv").unlink()
+    usual = verb._effusivities
+
+    def ended(device: Any, record: Grasps, coupling: Any) -> list[EffusivityRow]:
+        if "c" in record["grasp"].values:
+            raise KeyboardInterrupt
+        return usual(device, record, coupling)
+
+    stand_in("thermogrip.cli.classify._effusivities", ended)
+    done = gripper.bench.run(*words)
+    assert (done.code, "2 answers are kept in e.csv.partial; the same command goes on" in done.err) == (
+        130,
+        True,
+    )
+    assert not (gripper.bench.path / "e.csv").exists()
+    stand_in("thermogrip.cli.classify._effusivities", usual)
+    asked = len(gripper.posteriors)
+    assert gripper.bench.run(*words).code == 0
+    assert len(gripper.posteriors) == asked + 1
+    assert sorted(path.name for path in gripper.bench.path.iterdir()) == ["e.csv"]
+
+
 @pytest.mark.parametrize(("n", "more"), [(SHOWN, ""), (SHOWN + 2, "... and 2 more in the file\n")])
 def test_a_long_table_is_cut_with_a_note(n: int, more: str, gripper: SimpleNamespace) -> None:
     gripper.records = [record_of([f"g{k:03d}" for k in range(n)])]

@@ -178,12 +178,13 @@ def effusivity(
     unexplained.say(console)
     console.say(f"wrote {out}")
     if as_json:
-        rows, without, strange = [], [], {}
-        for part in found:
-            rows += part["rows"]
-            without += part["missed"]
-            strange |= part["unexplained"]
-        console.answer({"grasps": rows, "without_contact": without, "unexplained": strange, "out": out})
+        parts = list(found)
+        console.answer({
+            "grasps": [row for part in parts for row in part["rows"]],
+            "without_contact": [name for part in parts for name in part["missed"]],
+            "unexplained": {name: why for part in parts for name, why in part["unexplained"].items()},
+            "out": out,
+        })  # fmt: skip
     found.remove()
     return 0
 
