@@ -393,7 +393,7 @@ def _read_meta(path: Path, order: list[str], file: str) -> tuple[dict[str, Any],
             found[name] = [cells[at] for at in rows]
         elif name != "grasp_id":
             strange.append(header)
-    known = [*(f"{_TO_META.get(name, name)}_{unit}" for name, unit in GRASP_NUMBERS.items()), *GRASP_LABELS]
+    known = [*(f"{META_NAMES.get(name, name)}_{unit}" for name, unit in GRASP_NUMBERS.items()), *GRASP_LABELS]
     line = f"{path.name}: not used: {', '.join(strange)}; known are {', '.join(known)}"
     return found, [line] if strange else []
 
