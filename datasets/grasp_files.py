@@ -57,7 +57,8 @@ _OF_SAMPLES = ("grasp_id", "time", "t_surface", "pump")  # how the columns begin
 
 # name in the meta file (without unit) -> name in the record
 _FROM_META = {"t_object_nominal": "t_object", "t_gripper_set": "t_gripper"}
-_TO_META = {ours: theirs for theirs, ours in _FROM_META.items()}
+#: Names in the meta file of what a record calls otherwise.
+META_NAMES = {ours: theirs for theirs, ours in _FROM_META.items()}
 _ENDINGS = (".csv", ".csv.gz", ".csv.xz")
 _NEEDED = ("time", "t_surface")  # how the columns begin that are read as numbers
 
@@ -174,16 +175,26 @@ def write_grasps(grasps: Grasps, path: str | Path) -> Path:
 def read_grasp_files(paths: Sequence[str | Path]) -> list[Grasps]:
     """Return the records of several files as of :func:`read_grasps`; a folder is all its grasp files, in
     order of name, and no two files may have one name."""
-    files: list[Path] = []
-    for path in map(Path, paths):
-        files += _in_folder(path) if path.is_dir() else [path]
     records: dict[str, Grasps] = {}
-    for file in files:
+    for file in list_grasp_files(paths):
         grasps = read_grasps(file)
         if log_name(grasps) in records:
             raise UserError("is given twice", file=file, hint="give each file once")
         records[log_name(grasps)] = grasps
     return list(records.values())
+
+
+def list_grasp_files(paths: Sequence[str | Path]) -> list[Path]:
+    """Return the grasp files in paths and folders, as of :func:`read_grasp_files`, unread."""
+    files: list[Path] = []
+    for path in map(Path, paths):
+        files += _in_folder(path) if path.is_dir() else [path]
+    return files
+
+
+def grasp_file_parts(path: Path) -> list[Path]:
+    """Return the files that hold the grasps of one: itself, and of a CSV its meta file."""
+    return [path, _meta_path(path)] if file_format(path) == "csv" else [path]
 
 
 def shared_grasps(first: Sequence[Grasps], second: Sequence[Grasps]) -> list[str]:
@@ -382,7 +393,7 @@ def _read_meta(path: Path, order: list[str], file: str) -> tuple[dict[str, Any],
             found[name] = [cells[at] for at in rows]
         elif name != "grasp_id":
             strange.append(header)
-    known = [*(f"{_TO_META.get(name, name)}_{unit}" for name, unit in GRASP_NUMBERS.items()), *GRASP_LABELS]
+    known = [*(f"{META_NAMES.get(name, name)}_{unit}" for name, unit in GRASP_NUMBERS.items()), *GRASP_LABELS]
     line = f"{path.name}: not used: {', '.join(strange)}; known are {', '.join(known)}"
     return found, [line] if strange else []
 
@@ -465,7 +476,7 @@ def _meta_text(grasps: Grasps) -> str:
             columns.append([str(v) for v in variable.values])
         elif key in GRASP_NUMBERS:
             unit = "" if GRASP_NUMBERS[key] == "1" else f"_{GRASP_NUMBERS[key]}"
-            headers.append(_TO_META.get(key, key) + unit)
+            headers.append(META_NAMES.get(key, key) + unit)
             columns.append(["" if np.isnan(v) else repr(float(v)) for v in variable.values])
     return csv_text([headers, *zip(*columns, strict=True)])
 

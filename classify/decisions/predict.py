@@ -206,10 +206,11 @@ def table_csv(rows: Sequence[Mapping[str, Any]]) -> str:
     """Return a table as CSV text: a header from all rows' keys, floats with six digits, None and NaN
     empty."""
     names = list(dict.fromkeys(key for row in rows for key in row))
-    return csv_text([names, *([_cell(row.get(name)) for name in names] for row in rows)])
+    return csv_text([names, *([cell_text(row.get(name)) for name in names] for row in rows)])
 
 
-def _cell(value: Any) -> str:
+def cell_text(value: Any) -> str:
+    """Return a cell of such a table."""
     if value is None or (isinstance(value, float) and np.isnan(value)):
         return ""
     return f"{value:.6g}" if isinstance(value, float) else str(value)

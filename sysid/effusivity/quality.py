@@ -56,7 +56,7 @@ each leaves in the block what it took as long as it lasted.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -374,10 +374,20 @@ def contact_faults(grasps: Grasps) -> list[str]:
 
 def torn_groups(records: Sequence[Grasps]) -> list[str]:
     """Return in words which blocks have touches in several records: no answer joins those."""
+    return torn_names((str(record.attrs["name"]), touched_groups(record)) for record in records)
+
+
+def touched_groups(record: Grasps) -> list[str]:
+    """Return the names of the touch groups of a record."""
+    return list(dict.fromkeys(filter(None, label_values(record, "touch_group").tolist())))
+
+
+def torn_names(touched: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
+    """Return what :func:`torn_groups` does, of the name of each file and its groups."""
     found: dict[str, list[str]] = {}
-    for record in records:
-        for name in dict.fromkeys(filter(None, label_values(record, "touch_group").tolist())):
-            found.setdefault(name, []).append(str(record.attrs["name"]))
+    for file, groups in touched:
+        for name in groups:
+            found.setdefault(name, []).append(file)
     torn = {name: files for name, files in found.items() if len(files) > 1}
     if not torn:
         return []

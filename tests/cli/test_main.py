@@ -98,7 +98,8 @@ recover: DIR --out --bad --json=False
 effusivity: GRASPS... --out --calibrate --object-range --seed=0>0 --json=False
 train: GRASPS... --classifier --out --split --stop-error>0.001<0.5 --quick=False --seed=0>0 --json=False
 classify: MODEL_DIR GRASPS... --out --materials --early=False --next-touch=False --or-unknown=False
-  --other-gripper=False --known --object-range --seed=0>0 --json=False
+  --other-gripper=False --same-gripper=False --known --object-range --serve=False --port>0<65535
+  --seed=0>0 --json=False
 compare: GRASPS... --out --test --classifiers --repeats=20>0 --train-per-class=5>1 --by --curves=False
   --quick=False --seed=0>0 --workers=1>1 --cluster --json=False
 paper: --out --quick=False --seed=0>0 --workers=1>1 --cluster --json=False

@@ -86,6 +86,17 @@ def test_what_is_known_so_far_is_a_table_on_a_terminal_and_a_line_elsewhere(
     assert (out, err.startswith("\r\x1b[Ktitle\n"), err.split()[-2:]) == ("", True, ["a", "1"])
 
 
+def test_work_that_goes_on_counts_the_time_left_from_where_it_began(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = iter((0.0, 0.1, 20.0))
+    monkeypatch.setattr("time.monotonic", lambda: next(clock))
+    with Console().progress("grasps") as progress:
+        progress(0.4, "a")
+        progress(0.5, "b")
+    assert capsys.readouterr().err.endswith("grasps  50 %   20 s, 100 s left b\n")
+
+
 def test_on_a_terminal_progress_is_one_line_with_the_time_left(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

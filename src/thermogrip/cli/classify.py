@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, astuple, dataclass
+from functools import partial
+from importlib.util import find_spec
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,10 +19,10 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
 
 if TYPE_CHECKING:
-    from thermogrip.classify.decisions.predict import Deviation
     from thermogrip.classify.decisions.stopping_rule import StopRule
     from thermogrip.classify.estimators.base import GraspClassifier
     from thermogrip.classify.estimators.posterior import PosteriorClassifier
+    from thermogrip.datasets.partitions import Answers
     from thermogrip.datasets.schema import Grasps
     from thermogrip.sysid.effusivity import Coupling, EffusivityRow, GripperModel
 
@@ -130,52 +136,63 @@ def effusivity(
     stated = _range(between)
     cli.new_file(out, (".csv",))
     console = Console(as_json)
-    from thermogrip.datasets.grasp_files import read_grasp_files
-
-    records = read_grasp_files(grasps)
-    cli.warn_of_contacts(console, records)
     from thermogrip.classify.decisions.predict import unexplained_effusivities
-    from thermogrip.datasets.atomic_files import write_atomic
-    from thermogrip.datasets.media import csv_text
+    from thermogrip.datasets.partitions import Answers, sources, stamps
     from thermogrip.sysid.effusivity.data import with_object_range
 
+    given = sources(grasps)
     device, coupling, longest = calibrated_device(console, calibrate or [], seed)
-    records = [_as_taught(console, record, longest, coupling) for record in records]
-    misfits: dict[str, Deviation] = {}
-    with console.progress("effusivity") as progress:
-        rows = []
-        for k, record in enumerate(records):
-            progress(k / len(records), record.attrs["name"])
-            # the bundled gripper, which may have taken these grasps or not
-            other = 0.0 if calibrate else 0.5
-            found = _effusivities(device, with_object_range(record, stated), coupling, other)
-            if max(row.other_gripper for row in found) > 0.5:
-                console.warn(
-                    f"{record.attrs['name']}: read as by another gripper than the bundled one: intervals are "
-                    "as wide as grippers differ"
-                )
-            misfits |= unexplained_effusivities(device, record, found, stated)
-            rows += [asdict(row) for row in found]
-    for row in rows:
-        row["misfit_sd"] = misfits[row["grasp_id"]].sd if row["grasp_id"] in misfits else float("nan")
-    unexplained = {name: found.words for name, found in misfits.items() if found.words}
-    cells = [[f"{cell:.6g}" if isinstance(cell, float) else cell for cell in row.values()] for row in rows]
-    write_atomic(out, csv_text([list(rows[0]), *cells]))
+
+    def prepare(record: Grasps) -> Grasps:
+        return _as_taught(console, _warned(console, record), longest, coupling)
+
+    def answer(record: Grasps) -> dict[str, Any]:
+        # the bundled gripper may have taken these grasps or not
+        found = _effusivities(device, with_object_range(record, stated), coupling, 0.0 if calibrate else 0.5)
+        if max(row.other_gripper for row in found) > 0.5:
+            console.warn(
+                f"{record.attrs['name']}: read as by another gripper than the bundled one: intervals are as wide "
+                "as grippers differ"
+            )
+        misfits = unexplained_effusivities(device, record, found, stated)
+        rows = [asdict(row) for row in found]
+        for row in rows:
+            row["misfit_sd"] = misfits[row["grasp_id"]].sd if row["grasp_id"] in misfits else float("nan")
+        unexplained = {name: found.words for name, found in misfits.items() if found.words}
+        return {"rows": rows, "unexplained": unexplained, "missed": _missed(record, rows)} | _of_part(record)
+
+    found = Answers(out, ["effusivity", stated, seed, stamps(calibrate or [])])
+    with _resumable(console, found), console.progress("effusivity") as progress:
+        found.find(given, prepare, answer, progress)
+    _warn_of_torn(console, found)
+    found.write(out, lambda cell: f"{cell:.6g}" if isinstance(cell, float) else cell)
     shown = [
         (r["grasp_id"], r["effusivity"], r["effusivity_p05"], r["effusivity_p95"], r["t_object"])
-        for r in rows
+        for r in islice((row for part in found for row in part["rows"]), SHOWN)
     ]
     head = ("grasp", "effusivity", "5 %", "95 %", "object [degC]")
-    console.table("Effusivity [W s^0.5 m^-2 K^-1], median and quantiles", head, shown[:SHOWN])
-    _say_more(console, len(shown))
-    missed = [row["grasp_id"] for row in rows if row["effusivity"] != row["effusivity"]]
-    if missed:
-        for why, names in _unusable(records).items():
-            console.say(f"{why}, so no effusivity: {', '.join(names[:SHOWN])}")
-            _say_more(console, len(names))
-    _say_notes(console, [{"grasp_id": key, "note": why, "material": "?"} for key, why in unexplained.items()])
+    console.table("Effusivity [W s^0.5 m^-2 K^-1], median and quantiles", head, shown)
+    _say_more(console, found.grasps)
+    missed, unexplained = _Named(), _Named()
+    for part in found:
+        for name, why in part["missed"].items():
+            missed.add(why, name)
+        for name, why in part["unexplained"].items():
+            unexplained.add(why, name)
+    for why, names in missed.first.items():
+        console.say(f"{why}, so no effusivity: {', '.join(names)}")
+        _say_more(console, missed.count[why])
+    unexplained.say(console)
     console.say(f"wrote {out}")
-    console.answer({"grasps": rows, "without_contact": missed, "unexplained": unexplained, "out": out})
+    if as_json:
+        parts = list(found)
+        console.answer({
+            "grasps": [row for part in parts for row in part["rows"]],
+            "without_contact": [name for part in parts for name in part["missed"]],
+            "unexplained": {name: why for part in parts for name, why in part["unexplained"].items()},
+            "out": out,
+        })  # fmt: skip
+    found.remove()
     return 0
 
 
@@ -257,8 +274,11 @@ def train(
 
 def classify(
     model_dir: Annotated[Path, cli.arg("MODEL_DIR", "Folder that train wrote.")],
-    paths: cli.GraspFiles,
-    out: Annotated[Path, cli.opt("--out", "FILE.csv", "Where the predictions go.")],
+    paths: Annotated[
+        list[str] | None,
+        cli.arg("GRASPS...", "Grasp files (CSV with its _meta.csv, or NetCDF) or folders."),
+    ] = None,
+    out: Annotated[Path | None, cli.opt("--out", "FILE.csv", "Where the predictions go.")] = None,
     candidates: Annotated[
         str | None,
         cli.opt(
@@ -292,6 +312,13 @@ def classify(
         cli.opt("--known", "GRASPS", "Labelled grasps of that other gripper, one or more; may be repeated."),
     ] = None,
     between: ObjectRange = None,
+    serve: Annotated[
+        bool, cli.flag("--serve", "Answer grasps that come as lines of JSON, until they end.")
+    ] = False,
+    port: Annotated[
+        int | None,
+        cli.opt("--port", "N", "With --serve: answer over HTTP on 127.0.0.1 instead.", min=0, max=65535),
+    ] = None,
     seed: cli.Seed = 0,
     as_json: cli.AsJson = False,
 ) -> int:
@@ -305,26 +332,19 @@ def classify(
     one gripper and its blocks; each file decides whether another gripper or other blocks explain it better,
     and is then answered as unsurely as these differ. --same-gripper and --other-gripper say which it is,
     --known what the other one reads of blocks it knows.
+
+    A run that was ended goes on where it stopped when it is given again. --serve takes one object a line,
+    {"time_s": [...], "t_surface_degC": [...], "t_object_nominal_degC": 28}, and writes its answer.
     """
     stated = _range(between)
-    cli.new_file(out, (".csv",))
+    if serve == bool(paths) or serve == (out is not None) or (port is not None and not serve):
+        raise UserError("give GRASPS and --out, or --serve alone", hint="--port belongs to --serve")
+    from thermogrip.classify.decisions.predict import cell_text
     from thermogrip.datasets.materials import load_materials
+    from thermogrip.datasets.partitions import Answers, sources, stamps
 
-    listed = load_materials()
-    asked = [name for name in cli.comma(candidates) or () if name not in listed]
-    cli.choices("--materials", asked, model_dir / "classifier.json", "classes")
-    from thermogrip.classify.decisions.next_touch import advise_touches
-    from thermogrip.classify.decisions.predict import (
-        classify_grasps,
-        reasons,
-        unexplained_answers,
-        write_predictions,
-    )
-    from thermogrip.classify.decisions.stopping_rule import load_stop_rule
-    from thermogrip.classify.estimators.registry import load_classifier
-    from thermogrip.datasets.grasp_files import read_grasp_files
-    from thermogrip.sysid.effusivity.data import with_object_range
-
+    own = [name for name in cli.comma(candidates) or () if name not in load_materials()]
+    cli.choices("--materials", own, model_dir / "classifier.json", "classes")
     if same_gripper and (other_gripper or known):
         raise UserError("--same-gripper contradicts --other-gripper and --known", hint="give one of them")
     if (other_gripper or known) and (early or next_touch):
@@ -332,35 +352,24 @@ def classify(
             f"{'--early' if early else '--next-touch'} needs a known gripper, and another one is uncertain"
         )
         raise UserError(problem, hint="leave it out, or train on grasps of the new gripper")
-    model = load_classifier(model_dir)
-    rule = load_stop_rule(model_dir) if early else None
-    records = read_grasp_files(paths)
-    if other_gripper or known:
-        model = _with_gripper(model).for_another_gripper(read_grasp_files(known) if known else None)
-    if same_gripper:
-        model = _with_gripper(model).certain()
-    ranged = [with_object_range(grasps, stated) for grasps in records]
-    rows = classify_grasps(model, ranged, cli.comma(candidates), rule=rule)
-    if not early:
-        for row, (misfit, why) in zip(rows, unexplained_answers(model, records, rows, stated)):
-            if misfit == misfit:
-                row["misfit_sd"] = misfit
-            if why and not row.get("note"):
-                row["note"] = why
     console = Console(as_json)
-    cli.warn_of_contacts(console, records)
-    if next_touch:  # at which temperature another touch of its block would be worth most
-        with console.progress("another touch") as progress:
-            found = [
-                row
-                for grasps in ranged
-                for row in advise_touches(model, grasps, candidates=cli.comma(candidates), progress=progress)
-            ]
-        for row, advice in zip(rows, found):
-            row |= advice
-    if or_unknown:
-        _answer_or_unknown(rows)
-    write_predictions(rows, out)
+    ask = _Question(
+        model_dir, cli.comma(candidates), stated, early=early, next_touch=next_touch, or_unknown=or_unknown,
+        other_gripper=other_gripper, same_gripper=same_gripper, known=tuple(known or ()),
+    )  # fmt: skip
+    if serve:
+        return _serve(console, ask.answerer(), port)
+    assert out is not None
+    cli.new_file(out, (".csv",))
+    given = sources(paths or [])
+    asked = [*astuple(ask), stamps([model_dir, *ask.known])]
+    answer = ask.answerer()
+    found = Answers(out, ["classify", *asked])
+    with _resumable(console, found), console.progress("classify") as progress:
+        found.find(given, partial(_warned, console), answer, progress)
+    _warn_of_torn(console, found)
+    found.write(out, cell_text)
+    rows = list(islice((row for part in found for row in part["rows"]), SHOWN))
     more = [key for key in ("answer", "next_touch_degC", "next_touch_accuracy") if key in rows[0]]
     shown = [
         (
@@ -374,17 +383,92 @@ def classify(
         for row in rows
     ]
     head = ("grasp", "material", "probability", "p unknown", "decided at [s]", *(_HEADS[key] for key in more))
-    console.table("Materials", head, shown[:SHOWN])
-    _say_more(console, len(shown))
-    _say_notes(console, rows)
-    strange = {}
-    if not early:
-        strange = {row["grasp_id"]: why for row, why in zip(rows, reasons(model, ranged, rows)) if why}
-    for name, why in list(strange.items())[:SHOWN]:
+    console.table("Materials", head, shown)
+    _say_more(console, found.grasps)
+    _notes(row for part in found for row in part["rows"]).say(console)
+    strange = ((name, why) for part in found for name, why in part["strange"].items())
+    for name, why in islice(strange, SHOWN):
         console.say(f"{name} is out of distribution: {why}")
     console.say(f"wrote {out}")
-    console.answer({"grasps": rows, "strange": strange, "out": out})
+    if as_json:
+        parts = list(found)
+        console.answer({
+            "grasps": [row for part in parts for row in part["rows"]],
+            "strange": {name: why for part in parts for name, why in part["strange"].items()}, "out": out,
+        })  # fmt: skip
+    found.remove()
     return 0
+
+
+def _serve(console: Console, answer: Callable[[Grasps], dict[str, Any]], port: int | None) -> int:
+    """Answer single grasps: from stdin, or over HTTP at a port."""
+    from thermogrip.classify.decisions.serve import HOST, listen, serve_lines, server
+
+    if port is None:
+        serve_lines(answer, sys.stdin.buffer, sys.stdout.buffer)
+        return 0
+    if find_spec("uvicorn") is None or find_spec("starlette") is None:
+        raise UserError(
+            "--port needs the packages starlette and uvicorn", hint='pip install "thermogrip[live]"'
+        )
+    listening = listen(port)
+    sys.stderr.write(f"answers at http://{HOST}:{listening.getsockname()[1]}/\n")
+    server(answer, listening).run(sockets=[listening])
+    return 0
+
+
+@dataclass(frozen=True)
+class _Question:
+    """What is asked of a classifier about each grasp."""
+
+    model_dir: Path
+    candidates: tuple[str, ...] | None = None
+    stated: tuple[float, float] | None = None
+    early: bool = False
+    next_touch: bool = False
+    or_unknown: bool = False
+    other_gripper: bool = False
+    same_gripper: bool = False
+    known: tuple[str, ...] = ()
+
+    def answerer(self) -> Callable[[Grasps], dict[str, Any]]:
+        """Return what answers a record with its rows and why some are out of distribution."""
+        from thermogrip.classify.decisions.predict import classify_grasps, reasons, unexplained_answers
+        from thermogrip.classify.decisions.stopping_rule import load_stop_rule
+        from thermogrip.classify.estimators.registry import load_classifier
+        from thermogrip.datasets.grasp_files import read_grasp_files
+        from thermogrip.sysid.effusivity.data import with_object_range
+
+        model = load_classifier(self.model_dir)
+        rule = load_stop_rule(self.model_dir) if self.early else None
+        if self.other_gripper or self.known:
+            known = read_grasp_files(self.known) if self.known else None
+            model = _with_gripper(model).for_another_gripper(known)
+        if self.same_gripper:
+            model = _with_gripper(model).certain()
+
+        def answer(record: Grasps) -> dict[str, Any]:
+            ranged = [with_object_range(record, self.stated)]
+            rows = classify_grasps(model, ranged, self.candidates, rule=rule)
+            why_strange = [""] * len(rows)
+            if not self.early:
+                for row, (misfit, why) in zip(rows, unexplained_answers(model, [record], rows, self.stated)):
+                    if misfit == misfit:
+                        row["misfit_sd"] = misfit
+                    if why and not row.get("note"):
+                        row["note"] = why
+                why_strange = reasons(model, ranged, rows)
+            if self.next_touch:  # at which temperature another touch of its block would be worth most
+                from thermogrip.classify.decisions.next_touch import advise_touches
+
+                for row, advice in zip(rows, advise_touches(model, ranged[0], candidates=self.candidates)):
+                    row |= advice
+            if self.or_unknown:
+                _answer_or_unknown(rows)
+            strange = {row["grasp_id"]: why for row, why in zip(rows, why_strange) if why}
+            return {"rows": rows, "strange": strange} | _of_part(record)
+
+        return answer
 
 
 def materials(
@@ -462,16 +546,46 @@ def _range(text: str | None) -> tuple[float, float] | None:
     return low, high
 
 
-def _unusable(records: Sequence[Grasps]) -> dict[str, list[str]]:
-    """Return the unusable grasps, by reason."""
+def _missed(record: Grasps, rows: Sequence[dict[str, Any]]) -> dict[str, str]:
+    """Return why the grasps without an effusivity have none."""
     from thermogrip.sysid.effusivity.quality import check_grasps
 
-    found: dict[str, list[str]] = {}
-    for record in records:
-        for why, name in zip(check_grasps(record).reason, record["grasp"].values):
-            if why:
-                found.setdefault(why, []).append(str(name))
-    return found
+    if all(row["effusivity"] == row["effusivity"] for row in rows):
+        return {}
+    why = zip(record["grasp"].values, check_grasps(record).reason)
+    return {str(name): words for name, words in why if words}
+
+
+def _warned(console: Console, record: Grasps) -> Grasps:
+    """Return a record after the warnings of it."""
+    cli.warn_of_contacts(console, [record])
+    return record
+
+
+def _of_part(record: Grasps) -> dict[str, Any]:
+    """Return what is kept of a part beside its answers: the blocks that were touched."""
+    from thermogrip.sysid.effusivity.quality import touched_groups
+
+    return {"name": str(record.attrs["name"]), "groups": touched_groups(record)}
+
+
+def _warn_of_torn(console: Console, found: Answers) -> None:
+    """Warn of blocks whose touches are in several files."""
+    from thermogrip.sysid.effusivity.quality import torn_names
+
+    for words in torn_names((part["name"], part["groups"]) for part in found):
+        console.warn(words)
+
+
+@contextmanager
+def _resumable(console: Console, found: Answers) -> Iterator[None]:
+    """Say of work that ends early what is kept."""
+    try:
+        yield
+    except (KeyboardInterrupt, UserError):
+        if found.grasps:
+            console.warn(f"{found.grasps} answers are kept in {found.path}; the same command goes on")
+        raise
 
 
 def _stop_rule(console: Console, model: GraspClassifier, records: Sequence[Grasps], error: float) -> StopRule:
@@ -510,16 +624,33 @@ def _answer_or_unknown(rows: list[dict[str, Any]]) -> None:
         row["answer"] = str(answer)
 
 
-def _say_notes(console: Console, rows: Sequence[dict[str, Any]]) -> None:
-    """Print the notes on grasps, a line a note."""
-    alike: dict[str, list[str]] = {}
+class _Named:
+    """Names by what is said of them: how many, and the first of them."""
+
+    def __init__(self) -> None:
+        self.first: dict[str, list[str]] = {}
+        self.count: Counter[str] = Counter()
+
+    def add(self, words: str, name: str) -> None:
+        """Say something of one more name."""
+        self.count[words] += 1
+        if len(names := self.first.setdefault(words, [])) < SHOWN:
+            names.append(name)
+
+    def say(self, console: Console) -> None:
+        """Print a line for each thing that is said."""
+        for words, names in self.first.items():
+            more = self.count[words] - len(names)
+            console.say(f"{words}: {', '.join(names)}{f' and {more} more' if more else ''}")
+
+
+def _notes(rows: Iterable[dict[str, Any]]) -> _Named:
+    """Return the grasps with a note, by note."""
+    found = _Named()
     for row in rows:
         if row.get("note"):
-            name = "" if row["material"] else ", so no name"
-            alike.setdefault(f"{row['note']}{name}", []).append(row["grasp_id"])
-    for note, names in alike.items():
-        more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-        console.say(f"{note}: {', '.join(names[:SHOWN])}{more}")
+            found.add(f"{row['note']}{'' if row['material'] else ', so no name'}", row["grasp_id"])
+    return found
 
 
 def _is_candidate(key: str) -> bool:

@@ -24,6 +24,7 @@ from typing import Any, TypeAlias
 from thermogrip.datasets.media import printable
 from thermogrip.datasets.parallel import Progress
 
+_AT_ONCE = 0.5  # s
 _WIDTH = 100  # columns of what is written to no terminal
 #: Head and rows of a table.
 Cells: TypeAlias = tuple[tuple[str, ...], tuple[tuple[Any, ...], ...]]
@@ -150,13 +151,14 @@ def _anew() -> str:
 def _lines(title: str) -> Progress:
     """Return a callback that writes how far the work is, with the time left where it is over 10 s."""
     last: list[Any] = [-1, "", 0.0]
-    begin = time.monotonic()
+    begin, first = time.monotonic(), list[float]()  # work that was begun before goes on at its share
 
     def show(fraction: float, what: str) -> None:
         fraction = min(max(fraction, last[2]), 1.0)
         stage, step, spent, clear = what.split(":")[0], int(20 * fraction), time.monotonic() - begin, _anew()
-        whole = spent / max(fraction, 1e-3)
-        left = f", {whole - spent:.0f} s left" if whole > 10 and spent > 1 else ""
+        first[:] = first or [fraction if spent < _AT_ONCE else 0.0]
+        left_s = spent * (1 - fraction) / max(fraction - first[0], 1e-3)
+        left = f", {left_s:.0f} s left" if spent + left_s > 10 and spent > 1 else ""
         line = f"{title} {100 * fraction:3.0f} % {spent:4.0f} s{left} {printable(what)}"
         if clear:
             sys.stderr.write(clear + f"[{'#' * step:.<20}] {line}"[: get_terminal_size().columns - 1])

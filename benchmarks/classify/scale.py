@@ -1,0 +1,91 @@
+"""Wall time, CPU time, peak memory and grasps per core-second of ``effusivity`` and ``classify`` by the
+number of grasps, and whether a run that ``kill -9`` ended at 40 % goes on to the same bytes.
+
+    python benchmarks/classify/scale.py FOLDER [--files 2 20] [--classify MODEL_DIR] [--kill]
+
+Files of 500 grasps each are made in FOLDER: traces of the example condition ``exp1A_obj43_grip23``, drawn at
+random, with new white noise of 0.02 K.  The rate leaves out the start, by the difference of two numbers of
+files.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from thermogrip.datasets.examples import load_example_grasps
+from thermogrip.datasets.grasp_files import write_grasps
+
+PER_FILE = 500
+
+
+def make(folder: Path, n_files: int) -> Path:
+    """Return a folder of so many files, made where they are absent."""
+    grasps, folder = load_example_grasps()["exp1A_obj43_grip23"], folder / f"{n_files}"
+    folder.mkdir(parents=True, exist_ok=True)
+    for k in range(n_files):
+        rng = np.random.default_rng(k)
+        if (path := folder / f"part{k:04d}.csv").exists():
+            continue
+        part = grasps.isel(grasp=rng.integers(0, grasps.sizes["grasp"], PER_FILE))
+        part = part.assign_coords(grasp=[f"{k}-{i}" for i in range(PER_FILE)])
+        noise = rng.normal(0, 0.02, part["t_surface"].shape)
+        part = part.assign(t_surface=(("grasp", "time"), part["t_surface"].values + noise, {"units": "degC"}))
+        part.attrs["name"] = path.stem
+        write_grasps(part, path)
+    return folder
+
+
+def ran(words: list[str]) -> tuple[float, float, float]:
+    """Return wall and CPU time [s] and the peak memory [MB] of one run of the program."""
+    begin = time.perf_counter()
+    process = subprocess.Popen([sys.executable, "-m", "thermogrip", *words], stdout=subprocess.DEVNULL)
+    _, status, used = os.wait4(process.pid, 0)
+    if status:
+        raise SystemExit(f"failed: {words}")
+    return time.perf_counter() - begin, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024
+
+
+def killed(words: list[str], out: Path, lines: int) -> None:
+    """Run the program, and end it by kill -9 once so many parts are answered."""
+    partial = out.with_name(f"{out.name}.partial")
+    process = subprocess.Popen([sys.executable, "-m", "thermogrip", *words], stdout=subprocess.DEVNULL)
+    while not partial.exists() or partial.read_bytes().count(b"\n") <= lines:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--files", type=int, nargs="+", default=[2, 20])
+    parser.add_argument("--classify", metavar="MODEL_DIR")
+    parser.add_argument("--kill", action="store_true")
+    given = parser.parse_args()
+    verb = ["classify", given.classify] if given.classify else ["effusivity"]
+    print("grasps   wall [s]  CPU [s]  memory [MB]  grasps a core-second")
+    before: tuple[int, float] | None = None
+    for n_files in given.files:
+        folder, out = make(given.folder, n_files), given.folder / f"{n_files}.csv"
+        wall, cpu, memory = ran([*verb, str(folder), "--out", str(out)])
+        n = n_files * PER_FILE
+        rate = "" if before is None else f"{(n - before[0]) / (cpu - before[1]):.0f}"
+        print(f"{n:6d} {wall:10.0f} {cpu:8.1f} {memory:12.0f}  {rate}", flush=True)
+        before = n, cpu
+    if given.kill:
+        again = given.folder / "killed.csv"
+        killed([*verb, str(folder), "--out", str(again)], again, int(0.4 * n_files))
+        ran([*verb, str(folder), "--out", str(again)])
+        print("the same bytes:", again.read_bytes() == out.read_bytes())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,188 @@
+"""One grasp in, one answer out: requests in JSON, over pipes or over HTTP on this computer.
+
+A request is an object with ``time_s`` and ``t_surface_degC`` (null is a lost sample), and what else is known
+of the grasp under the names of a meta file (``t_object_nominal_degC``, ...); ``id``, a number or text, comes
+back.
+The answer is the row that ``classify`` writes, or ``error``, one line.  Over pipes both are lines of JSON.
+Over HTTP a request is the body of a POST; the server has a loopback address, takes only requests that call it
+by one, and none of a web page: a page elsewhere, opened in a browser here, must not learn what is touched.
+Requests wait for one thread, in the order of their arrival: an answer is all arithmetic.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import socket
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+from thermogrip.datasets.errors import UserError, known_names
+from thermogrip.datasets.grasp_files import META_NAMES
+from thermogrip.datasets.schema import GRASP_NUMBERS, Grasps, make_grasps, with_lead_in
+
+if TYPE_CHECKING:
+    from starlette.requests import Request
+    from starlette.responses import Response
+    from starlette.types import ASGIApp
+    from uvicorn import Server
+
+MOST_BYTES = 1 << 18  # of a request
+HOST = "127.0.0.1"
+#: What returns the ``rows`` of a record, and by grasp why some are ``strange``.
+Answer = Callable[[Grasps], Mapping[str, Any]]
+
+_TRACES = {"time_s": "time", "t_surface_degC": "t_surface", "t_surface_2_degC": "t_surface_2"}
+_NUMBERS = {META_NAMES.get(name, name) + ("" if unit == "1" else f"_{unit}"): name
+            for name, unit in GRASP_NUMBERS.items()}  # fmt: skip
+
+
+def reply(answer: Answer, request: bytes) -> dict[str, Any]:
+    """Return the answer to one request, or what is wrong with it."""
+    given: Any = {}
+    try:
+        given = _content(request)
+        said = answer(grasp_of(given))
+        found = {key: _plain(value) for key, value in said["rows"][0].items() if key != "grasp_id"}
+        for why in said["strange"].values():
+            found["strange"] = why
+    except UserError as error:
+        found = {"error": str(error)}
+    return ({"id": given["id"]} if "id" in given else {}) | found
+
+
+def grasp_of(given: Mapping[str, Any]) -> Grasps:
+    """Return the record of one grasp that a request describes."""
+    known = {"id", *_TRACES, *_NUMBERS}
+    for name in given:
+        if name not in known:
+            raise UserError(f"{name!r} is unknown", hint=known_names(name, sorted(known)))
+    traces = {ours: _numbers(given, name) for name, ours in _TRACES.items() if name in given}
+    for name in ("time_s", "t_surface_degC"):
+        if _TRACES[name] not in traces:
+            raise UserError(f"no {name}", hint="give time_s and t_surface_degC, lists of one length")
+    if len({len(values) for values in traces.values()}) > 1:
+        raise UserError("lists of several lengths", hint="null is a lost sample")
+    about = {ours: [_number(name, given[name])] for name, ours in _NUMBERS.items() if name in given}
+    second = [traces["t_surface_2"]] if "t_surface_2" in traces else None
+    record = make_grasps(
+        traces["time"], [traces["t_surface"]], ["grasp"], name="request", t_surface_2=second, **about
+    )
+    record = with_lead_in(record)
+    time, seen = record["time"].values, ~record["t_surface"].isnull().values[0]
+    if not (seen & (time < 0)).any() or not (seen & (time > 0)).any():
+        raise UserError("no sample before 0 s or none after", hint="0 s is the closed message")
+    return record
+
+
+def serve_lines(answer: Answer, requests: BinaryIO, answers: BinaryIO) -> int:
+    """Answer lines of JSON until they end; return how many there were."""
+    n = 0
+    while line := requests.readline(MOST_BYTES + 2):
+        if not line.endswith(b"\n") and len(line) > MOST_BYTES:
+            found = _too_long()
+            while line and not line.endswith(b"\n"):
+                line = requests.readline(MOST_BYTES)
+        elif line.strip():
+            found = reply(answer, line)
+        else:
+            continue
+        answers.write(json.dumps(found, allow_nan=False).encode() + b"\n")
+        answers.flush()
+        n += 1
+    return n
+
+
+def application(answer: Answer, port: int) -> ASGIApp:
+    """Return the server of answers for uvicorn; it is called by the loopback's names and this port."""
+    import asyncio
+    from concurrent.futures import ThreadPoolExecutor
+
+    from starlette.applications import Starlette
+    from starlette.responses import JSONResponse
+    from starlette.routing import Route
+
+    one_by_one = ThreadPoolExecutor(1)
+    hosts = {f"{name}:{port}" for name in (HOST, "localhost")}
+
+    async def ask(request: Request) -> Response:
+        why = "" if request.headers.get("host") in hosts else "refused: this address is not the server's own"
+        if "origin" in request.headers:
+            why = "refused: this comes from a web page"
+        if why:
+            return JSONResponse({"error": why}, 403)
+        body = bytearray()
+        async for piece in request.stream():
+            body += piece
+            if len(body) > MOST_BYTES:
+                return JSONResponse(_too_long(), 413, {"connection": "close"})
+        loop = asyncio.get_running_loop()
+        found = await loop.run_in_executor(one_by_one, reply, answer, bytes(body))
+        return JSONResponse(found, 400 if "error" in found else 200)
+
+    return Starlette(routes=[Route("/", ask, methods=["POST"])])
+
+
+def listen(port: int) -> socket.socket:
+    """Return a socket on the loopback; UserError where the port (0: any) is taken."""
+    found = socket.socket()
+    try:
+        found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        found.bind((HOST, port))
+        found.listen()  # who reads the address may call at once
+    except OSError as error:
+        found.close()
+        raise UserError(f"port {port} cannot be used ({error.strerror})", hint="choose another") from error
+    return found
+
+
+def server(answer: Answer, listening: socket.socket) -> Server:
+    """Return what answers over HTTP once its ``run(sockets=[listening])`` is called."""
+    import uvicorn
+
+    app = application(answer, listening.getsockname()[1])
+    config = uvicorn.Config(app, log_level="warning", access_log=False, lifespan="off")
+    return uvicorn.Server(config)
+
+
+def _content(request: bytes) -> dict[str, Any]:
+    try:
+        given = json.loads(request)
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"is no JSON ({error})", hint="write an object on one line") from error
+    if not isinstance(given, dict):
+        raise UserError("is no JSON object", hint="write an object on one line")
+    if not isinstance(given.get("id", 0), str | int):
+        del given["id"]
+        raise UserError("id is no text and no whole number", hint="leave it out, or number the requests")
+    return given
+
+
+def _numbers(given: Mapping[str, Any], name: str) -> list[float]:
+    if not isinstance(given[name], list):
+        raise UserError(f"{name} is no list", hint="write a list of numbers")
+    return [_number(name, value) for value in given[name]]
+
+
+def _number(name: str, value: Any) -> float:
+    """Return a number of a request; null is NaN."""
+    if value is None:
+        return math.nan
+    try:
+        number = float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise UserError(
+            f"{name} has {str(value)[:20]!r}, which is no finite number", hint="write one or null"
+        )
+    return number
+
+
+def _plain(value: Any) -> Any:
+    """Return a cell of an answer as JSON has it."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _too_long() -> dict[str, Any]:
+    return {"error": f"request of more than {MOST_BYTES} bytes"}

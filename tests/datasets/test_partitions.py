@@ -1,0 +1,186 @@
+"""Parts of files: an ended run goes on where it stopped, to the same bytes."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from thermogrip.datasets import partitions
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.grasp_files import write_grasps
+from thermogrip.datasets.partitions import Answers, parts_of, sources
+from thermogrip.datasets.schema import Grasps, make_grasps
+
+Answer = Callable[[Grasps], dict[str, Any]]
+N_FILES, N = 3, 5  # with parts of two grasps: three parts a file
+
+
+def record_of(name: str, n: int = N, **columns: Any) -> Grasps:
+    skin = 23.0 + np.arange(3 * n).reshape(n, 3) / 8
+    return make_grasps([-1.0, 0.0, 1.0], skin, [f"{name}{k}" for k in range(n)], name=name, **columns)
+
+
+@pytest.fixture(autouse=True)
+def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(partitions, "PART", 2)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Return a folder of grasp files."""
+    made = tmp_path / "grasps"
+    made.mkdir()
+    for k in range(N_FILES):
+        write_grasps(record_of("abc"[k]), made / f"{'abc'[k]}.csv")
+    return made
+
+
+class Work:
+    """Answers that count their parts and fail when they are told to."""
+
+    def __init__(self, fails_at: int | None = None, fault: BaseException | None = None) -> None:
+        self.asked: list[list[str]] = []
+        self.read: list[str] = []
+        self.shares: list[float] = []
+        self.fails_at, self.fault = fails_at, fault or KeyboardInterrupt()
+
+    def prepare(self, record: Grasps) -> Grasps:
+        self.read.append(record.attrs["name"])
+        return record
+
+    def answer(self, part: Grasps) -> dict[str, Any]:
+        if len(self.asked) == self.fails_at:
+            raise self.fault
+        self.asked.append([str(name) for name in part["grasp"].values])
+        rows = [{"grasp_id": n, "last": v} for n, v in zip(self.asked[-1], part["t_surface"].values[:, -1])]
+        if "b2" in self.asked[-1]:
+            rows[0]["note"] = "a column of its own"
+        return {"rows": rows}
+
+    def run(self, folder: Path, out: Path, question: str = "?") -> Answers:
+        found = Answers(out, [question])
+        found.find(sources([folder]), self.prepare, self.answer, lambda share, _: self.shares.append(share))
+        found.write(out, lambda cell: "" if cell is None else cell)
+        return found
+
+
+@pytest.fixture
+def whole(folder: Path, tmp_path: Path) -> bytes:
+    Work().run(folder, tmp_path / "whole.csv").remove()
+    return (tmp_path / "whole.csv").read_bytes()
+
+
+def test_all_parts_are_answered_in_order_under_the_columns_of_all(folder: Path, tmp_path: Path) -> None:
+    work = Work()
+    found = work.run(folder, tmp_path / "o.csv")
+    assert [len(part) for part in work.asked] == [2, 2, 1] * N_FILES
+    assert found.grasps == N_FILES * N
+    lines = (tmp_path / "o.csv").read_text().splitlines()
+    assert lines[:2] == ["grasp_id,last,note", "a0,23.25,"]
+    assert [line.split(",")[0] for line in lines[1:]] == [*chain(*work.asked)]
+    assert lines[1 + N + 2] == "b2,24.0,a column of its own"
+    assert work.shares[1:] == pytest.approx(np.arange(9) / 9, abs=0.02)
+    found.remove()
+    assert sorted(os.listdir(tmp_path)) == ["grasps", "o.csv"]
+
+
+@pytest.mark.parametrize("done", range(1, 9))
+def test_the_same_command_goes_on_to_the_same_bytes(
+    done: int, folder: Path, tmp_path: Path, whole: bytes
+) -> None:
+    out = tmp_path / "o.csv"
+    with pytest.raises(KeyboardInterrupt):
+        Work(done).run(folder, out)
+    assert not out.exists()
+    again = Work()
+    again.run(folder, out)
+    assert (len(again.asked), out.read_bytes() == whole) == (9 - done, True)
+    assert again.read == ["a", "b", "c"][done // 3 :]  # what is answered is not read
+    assert again.shares[1] == pytest.approx(done / 9, abs=0.02)
+
+
+@pytest.mark.parametrize("cut", [1, 40, 200])
+def test_a_torn_line_is_cut_off(cut: int, folder: Path, tmp_path: Path, whole: bytes) -> None:
+    out, partial = tmp_path / "o.csv", tmp_path / "o.csv.partial"
+    with pytest.raises(KeyboardInterrupt):
+        Work(4).run(folder, out)
+    partial.write_bytes(partial.read_bytes()[:-cut])
+    again = Work()
+    again.run(folder, out)
+    assert (len(again.asked) > 5, out.read_bytes() == whole) == (True, True)
+
+
+def test_what_was_done_of_other_files_or_asked_otherwise_is_done_anew(
+    folder: Path, tmp_path: Path, whole: bytes
+) -> None:
+    out = tmp_path / "o.csv"
+    with pytest.raises(KeyboardInterrupt):
+        Work(7).run(folder, out)
+    os.utime(folder / "b_meta.csv", (1, 1))
+    with pytest.raises(KeyboardInterrupt):
+        Work(0).run(folder, out)  # keeps what is of file a
+    changed = Work()
+    changed.run(folder, out)
+    assert (changed.asked[0], out.read_bytes() == whole) == (["b0", "b1"], True)
+    other = Work()
+    other.run(folder, out, "another question")
+    assert (len(other.asked), out.read_bytes() == whole) == (9, True)
+
+
+def test_a_run_that_answered_nothing_leaves_nothing(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="no such"):
+        Work(0, UserError("no such material")).run(folder, tmp_path / "o.csv")
+    assert os.listdir(tmp_path) == ["grasps"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit on the size of files")
+def test_a_full_disk_is_one_line_and_keeps_whole_lines(folder: Path, tmp_path: Path, whole: bytes) -> None:
+    import resource
+
+    out, first = tmp_path / "o.csv", Work()
+    usual = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1200, usual[1]))  # stands for the end of the disk
+    try:
+        with pytest.raises(UserError, match=r"o.csv.partial: File too large"):
+            first.run(folder, out)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, usual)
+    again = Work()
+    again.run(folder, out)
+    assert (0 < len(again.asked) < 9, out.read_bytes() == whole) == (True, True)
+
+
+def test_two_runs_do_not_write_one_file(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "o.csv"
+
+    class Second(Work):
+        def answer(self, part: Grasps) -> dict[str, Any]:
+            with pytest.raises(UserError, match="written by another run"):
+                Work().run(folder, out)
+            return super().answer(part)
+
+    Second().run(folder, out)
+    assert out.exists()
+
+
+def test_two_files_of_one_name_are_refused(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "more").mkdir()
+    write_grasps(record_of("a"), tmp_path / "more" / "a.csv")
+    with pytest.raises(UserError, match="given twice"):
+        Answers(tmp_path / "o.csv", []).find(
+            sources([folder, tmp_path / "more"]), Work().prepare, Work().answer, lambda *_: None
+        )
+
+
+@pytest.mark.parametrize(("groups", "parts"), [(["", "", "", "", ""], 3), (["", "x", "x", "", ""], 1)])
+def test_touches_of_a_record_stay_together(groups: list[str], parts: int) -> None:
+    found = parts_of(record_of("a", touch_group=groups, touch=[1.0, 1.0, 2.0, 1.0, 1.0]))
+    assert len(found) == parts
+    assert [str(name) for part in found for name in part["grasp"].values] == [f"a{k}" for k in range(N)]
