@@ -151,8 +151,8 @@ def effusivity(
         found = _effusivities(device, with_object_range(record, stated), coupling, 0.0 if calibrate else 0.5)
         if max(row.other_gripper for row in found) > 0.5:
             console.warn(
-                f"{record.attrs['name']}: read as by another gripper than the bundled one: intervals are as wide "
-                "as grippers differ"
+                f"{record.attrs['name']}: read as by another gripper than the bundled one: intervals are as "
+                "wide as grippers differ"
             )
         misfits = unexplained_effusivities(device, record, found, stated)
         rows = [asdict(row) for row in found]
