@@ -142,10 +142,10 @@ def test_a_block_in_two_files_is_warned_of_and_what_was_answered_before_an_end_i
     (gripper.bench.path / "e.csv").unlink()
     usual = verb._effusivities
 
-    def ended(device: Any, record: Grasps, coupling: Any) -> list[EffusivityRow]:
+    def ended(device: Any, record: Grasps, *more: Any) -> list[EffusivityRow]:
         if "c" in record["grasp"].values:
             raise KeyboardInterrupt
-        return usual(device, record, coupling)
+        return usual(device, record, *more)
 
     stand_in("thermogrip.cli.classify._effusivities", ended)
     done = gripper.bench.run(*words)

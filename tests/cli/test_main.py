@@ -87,13 +87,15 @@ retune: DIR LOG... --out=retuned.json --controller --spec --report --network --s
 review: CONTROLLER --report --network --seed=0>0 --json=False
 export: CONTROLLER --out --check=False --states=3000>1 --network --seed=0>0 --json=False
 run: CONTROLLER --target --out --port --protocol --speed=1.0>0.01 --twin --draw=0>0 --from --hold=0.0>0
-  --object --material --grasp-time=10.0>0.5 --stop-early --settle-timeout=900.0>1 --guard --learn --report
-  --network --seed=0>0 --json=False
-record: SCHEDULE --port --out --protocol --sample=1.0>0.05 --guard --speed=1.0>0.01 --seed=0>0 --json=False
+  --object --material --grasp-time=10.0>0.5 --stop-early --settle-timeout=900.0>1 --guard --learn
+  --live>0<65535 --foxglove>1<65535 --bridge --on-trip --report --network --seed=0>0 --json=False
+record: SCHEDULE --port --out --protocol --sample=1.0>0.05 --guard --speed=1.0>0.01 --live>0<65535
+  --foxglove>1<65535 --bridge --on-trip --seed=0>0 --json=False
 virtual: --protocol=thermogrip --plant --pty=False --socket>0<65535 --speed=1.0>0.01 --from --ambient=23.0
   --object --material --fault --seconds>0 --seed=0>0 --json=False
 batch: CONTROLLER PLAN.csv --out --port --protocol --speed=1.0>0.01 --twin --draw=0>0 --grasp-time=10.0>0.5
-  --stop-early --settle-timeout=900.0>1 --guard --learn --ask/--no-ask=True --network --seed=0>0 --json=False
+  --stop-early --settle-timeout=900.0>1 --guard --learn --ask/--no-ask=True --live>0<65535
+  --foxglove>1<65535 --bridge --on-trip --network --seed=0>0 --json=False
 recover: DIR --out --bad --json=False
 effusivity: GRASPS... --out --calibrate --object-range --seed=0>0 --json=False
 train: GRASPS... --classifier --out --split --stop-error>0.001<0.5 --quick=False --seed=0>0 --json=False

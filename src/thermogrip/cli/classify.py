@@ -339,12 +339,13 @@ def classify(
     stated = _range(between)
     if serve == bool(paths) or serve == (out is not None) or (port is not None and not serve):
         raise UserError("give GRASPS and --out, or --serve alone", hint="--port belongs to --serve")
-    from thermogrip.classify.decisions.predict import cell_text
     from thermogrip.datasets.materials import load_materials
-    from thermogrip.datasets.partitions import Answers, sources, stamps
 
     own = [name for name in cli.comma(candidates) or () if name not in load_materials()]
     cli.choices("--materials", own, model_dir / "classifier.json", "classes")
+    from thermogrip.classify.decisions.predict import cell_text
+    from thermogrip.datasets.partitions import Answers, sources, stamps
+
     if same_gripper and (other_gripper or known):
         raise UserError("--same-gripper contradicts --other-gripper and --known", hint="give one of them")
     if (other_gripper or known) and (early or next_touch):
