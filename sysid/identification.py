@@ -516,24 +516,8 @@ def identify(
     for held, run in zip(whole, runs):
         rows += rows_of(chosen, plant, held.name, run, held_out=False)
     good, verdict = verdict_of(chosen, rows, checked, leave_one_out)
-    mine = [row for row in rows if row.held_out and row.model == chosen]
-    # what was held out, and a gain that varies; empty where the logs show what differs between runs
-    varied = _rms(between_runs(plant, logs))
-    other = {name: float(np.hypot(stated_error(mine, name), varied[name])) for name in varied}
-    effect = {} if chosen == "network" else _rms(between_runs(plant, logs, 1.0))
-    beyond = beyond_range(plant, logs) if effect else {}
-    added = {name: np.hypot(OTHER_KIND_GAIN_SD * size, beyond[name]) for name, size in effect.items()}
-    unlike = {name: float(np.hypot(stated_error(mine, name), size)) for name, size in added.items()}
-    units = {row.output: "" if row.unit == "1" else f" {row.unit}" for row in rows}
-    for what, errors, gain in (
-        ("another run", other, RUN_GAIN_SD),
-        ("one unlike them (longer holds, other ranges)", unlike, OTHER_KIND_GAIN_SD),
-    ):
-        if errors:
-            sizes = ", ".join(f"{name} {error:.2g}{units[name]}" for name, error in errors.items())
-            verdict += f"; on {what} about {sizes}, its gain off by {100 * gain:.0f} %"
-    if other:
-        verdict += f" (assumed: it takes {SEVERAL} logs to show how runs differ)"
+    other, unlike, effect = _errors_of_other_runs(plant, logs, chosen, rows)
+    verdict += _other_runs_said(other, unlike, rows)
     covered = evidence(plant, [log_rows(log, plant.inputs, plant.outputs, ()) for log in logs])
     verdict += "; " + covered.sentence(plant.units)
     scores = replace(
@@ -549,6 +533,34 @@ def identify(
         plant, chosen, tuple(rows), checked, covered, good, verdict, notes, roles, runs, searched,
         tried.get(chosen, {}),
     )  # fmt: skip
+
+
+def _errors_of_other_runs(
+    plant: Plant, logs: Sequence[Log], chosen: str, rows: Sequence[Row]
+) -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
+    """Return by output the error of another run (empty where the logs show how runs differ), that of one unlike
+    them and the effect of the inputs (both empty for a network): what was held out, and a varying gain."""
+    mine = [row for row in rows if row.held_out and row.model == chosen]
+    varied = _rms(between_runs(plant, logs))
+    other = {name: float(np.hypot(stated_error(mine, name), varied[name])) for name in varied}
+    effect = {} if chosen == "network" else _rms(between_runs(plant, logs, 1.0))
+    beyond = beyond_range(plant, logs) if effect else {}
+    added = {name: np.hypot(OTHER_KIND_GAIN_SD * size, beyond[name]) for name, size in effect.items()}
+    unlike = {name: float(np.hypot(stated_error(mine, name), size)) for name, size in added.items()}
+    return other, unlike, effect
+
+
+def _other_runs_said(other: Mapping[str, float], unlike: Mapping[str, float], rows: Sequence[Row]) -> str:
+    """Return the errors of other runs in words, as the verdict has them."""
+    units, said = {row.output: "" if row.unit == "1" else f" {row.unit}" for row in rows}, ""
+    for what, errors, gain in (
+        ("another run", other, RUN_GAIN_SD),
+        ("one unlike them (longer holds, other ranges)", unlike, OTHER_KIND_GAIN_SD),
+    ):
+        if errors:
+            sizes = ", ".join(f"{name} {error:.2g}{units[name]}" for name, error in errors.items())
+            said += f"; on {what} about {sizes}, its gain off by {100 * gain:.0f} %"
+    return said + (f" (assumed: it takes {SEVERAL} logs to show how runs differ)" if other else "")
 
 
 def _without_still(logs: list[Log]) -> list[Log]:

@@ -125,15 +125,10 @@ def application(answer: Answer, port: int) -> ASGIApp:
 
 def listen(port: int) -> socket.socket:
     """Return a socket on the loopback; UserError where the port (0: any) is taken."""
-    found = socket.socket()
     try:
-        found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        found.bind((HOST, port))
-        found.listen()  # who reads the address may call at once
+        return socket.create_server((HOST, port))  # listens: who reads the address may call at once
     except OSError as error:
-        found.close()
         raise UserError(f"port {port} cannot be used ({error.strerror})", hint="choose another") from error
-    return found
 
 
 def server(answer: Answer, listening: socket.socket) -> Server:

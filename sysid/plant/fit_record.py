@@ -128,9 +128,7 @@ class PlantScores:
     held_out: list[HeldOut] = field(default_factory=list)  # free runs over what the fit had not seen
     new_run_rmse: dict[str, float] = field(default_factory=dict)  # by output, of a plant of one or two logs
     other_kind_rmse: dict[str, float] = field(default_factory=dict)  # the same of a run unlike those
-    input_effect: dict[str, float] = field(
-        default_factory=dict
-    )  # of the inputs, rms over the logs of the fit
+    input_effect: dict[str, float] = field(default_factory=dict)  # of the inputs, rms over the logs
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of key ``scores`` of ``plant.json``; a default is left out."""

@@ -93,9 +93,8 @@ from thermogrip.sysid.plant.plant import WARMUP, Plant
 from thermogrip.sysid.plant.simulation import find_starts
 
 SHORT = 0.1  # of the level: a part on which the expected coverage falls short by more is reported
-GAIN_OF_SIZE = (
-    0.4  # sd of a black box's gain on a run whose inputs have e times the effect they had in the fit
-)
+#: Standard deviation of a black box's gain on a run whose inputs have e times the effect they had in the fit.
+GAIN_OF_SIZE = 0.4
 _UNLIKE = 0.1  # of the run's error: what a run unlike the fit adds, from which it is reported
 
 
