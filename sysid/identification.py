@@ -538,8 +538,9 @@ def identify(
 def _errors_of_other_runs(
     plant: Plant, logs: Sequence[Log], chosen: str, rows: Sequence[Row]
 ) -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
-    """Return by output the error of another run (empty where the logs show how runs differ), that of one unlike
-    them and the effect of the inputs (both empty for a network): what was held out, and a varying gain."""
+    """Return by output the error of another run (empty where the logs show how runs differ), that of one
+    unlike them and the effect of the inputs (both empty for a network): what was held out, and a varying
+    gain."""
     mine = [row for row in rows if row.held_out and row.model == chosen]
     varied = _rms(between_runs(plant, logs))
     other = {name: float(np.hypot(stated_error(mine, name), varied[name])) for name in varied}
