@@ -442,7 +442,7 @@ def read_matlab_table(path: str | Path, columns: Sequence[str] | None = None) ->
         if len(columns) != len(numbers):
             raise _other_count(path, len(numbers), len(columns))
         numbers = {name: v for name, v in zip(columns, numbers.values()) if name != "-"}
-    scalars = {key.lower(): v for key, v in found.items() if isinstance(v, int | float) and v > 0}
+    scalars = dict(_matlab_scalars(found))
     step = scalars.get("ts") or scalars.get("dt") or 1 / scalars.get("fs", 1.0)
     meta = {"dt": repr(float(step))}
     return Table(str(path), numbers, {}, np.arange(1, n + 1), meta=meta, notes=tuple(notes))
@@ -457,6 +457,14 @@ def _matlab_arrays(found: Mapping[str, Any], depth: int = 0) -> Iterator[tuple[s
             rows = value[:, None] if value.ndim == 1 else value if len(value) >= value.shape[1] else value.T
             if len(rows) > 1 and rows.shape[1]:
                 yield name, np.asarray(rows, dtype=float)
+
+
+def _matlab_scalars(found: Mapping[str, Any], depth: int = 0) -> Iterator[tuple[str, float]]:
+    """Yield name, in small letters, and value of each number above zero, those of structures first."""
+    for value in found.values():
+        if isinstance(value, dict) and depth < 4:
+            yield from _matlab_scalars(value, depth + 1)
+    yield from ((k.lower(), v) for k, v in found.items() if isinstance(v, int | float) and v > 0)
 
 
 def _unpacked_matlab(raw: bytes, path: str | Path) -> bytes:

@@ -664,39 +664,37 @@ def _fit_all(
 ) -> tuple[list[BlackBoxFit], list[Row], list[str]]:
     """Return each black box fitted to all logs, the rows of its folds, and why others could not be fitted.
 
-    Neural models take longest, so one by one they come last, and not at all where they are beyond reach.
+    Neural models take longest, so they come last, and not at all where they are beyond reach.
     """
     found: dict[str, BlackBoxFit | str] = {}
 
-    def others() -> list[BlackBoxFit]:
-        return [some for kind, some in found.items() if kind != "neural" and isinstance(some, BlackBoxFit)]
-
-    def pointless() -> bool:
-        fits = others()
-        return bool(fits) and beyond_reach(fits, _between(fits, logs))
-
-    if workers == 1:
-        for kind in sorted(boxes, key=lambda kind: kind == "neural"):
-            if kind != "neural" or not pointless():
-                if kind == "neural" and early is not None and (fits := others()):
-                    early([row for each in fits for row in fold_rows(each)])
-                report = parts.part(kind)
-                found[kind] = _fit_or_refusal((kind, logs, settings | {"progress": report}))
-                if report is not None:
-                    report(1.0, _in_short(found[kind]))
+    def fit(kinds: Sequence[str]) -> None:
+        if workers != 1 and len(kinds) > 1:
+            items = [(kind, logs, settings) for kind in kinds]
+            report = parts.part("black boxes", of=len(kinds))
+            found.update(zip(kinds, run_parallel(_fit_or_refusal, items, workers, report, what="fitting")))
+            parts.next(len(kinds))
+            return
+        for kind in kinds:
+            report = parts.part(kind)
+            found[kind] = _fit_or_refusal((kind, logs, settings | {"progress": report}))
+            if report is not None:
+                report(1.0, _in_short(found[kind]))
             parts.next()
-    else:
-        report = parts.part("black boxes", of=len(boxes))
-        order = sorted(boxes, key=lambda kind: kind != "neural")
-        items = [(kind, logs, settings) for kind in order]
-        done = run_parallel(_fit_or_refusal, items, workers, report, what="fitting")
-        found = dict(zip(order, done))
-        parts.next(len(boxes))
-    if "neural" in boxes and pointless():
-        found["neural"] = (
-            "neural: left out, for even without any error on held-out parts it would not be kept: another "
-            "run differs by more than the linear models err (--models neural fits it)"
-        )
+
+    fit([kind for kind in boxes if kind != "neural"])
+    if "neural" in boxes:
+        others = [some for some in found.values() if isinstance(some, BlackBoxFit)]
+        if others and beyond_reach(others, _between(others, logs)):
+            found["neural"] = (
+                "neural: left out, for even without any error on held-out parts it would not be kept: "
+                "another run differs by more than the linear models err (--models neural fits it)"
+            )
+            parts.next()
+        else:
+            if others and early is not None:
+                early([row for each in others for row in fold_rows(each)])
+            fit(["neural"])
     every = [found[kind] for kind in boxes]
     fits = [each for each in every if isinstance(each, BlackBoxFit)]
     rows = [row for each in fits for row in fold_rows(each)]

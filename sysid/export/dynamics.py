@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import product
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -35,6 +36,7 @@ _ROUNDING = 1e-9  # of the largest entry of A
 _NOTHING = 1e-6  # of the largest coefficient of an impulse response: before it is dead time
 _LONG = 5.0  # slowest time constants that a step response shows
 _FEWEST = 8  # draws of an interval
+_SHOWN = 60  # points of a response in JSON
 _RISEN = 1 - np.exp(-1)
 
 
@@ -150,8 +152,10 @@ class Dynamics:
         return out
 
     def to_dict(self) -> dict[str, Any]:
-        """Return poles, gains and the operating point as plain JSON."""
+        """Return poles, gains, responses and the operating point as plain JSON."""
         near = self.near
+        time, step = self.step_response(_SHOWN)
+        omega, magnitude, phase = self.frequency_response(_SHOWN)
         return {
             "level": self.level,
             "draws": len(self.draws),
@@ -161,7 +165,24 @@ class Dynamics:
             "poles": [{"re": float(s.real), "im": float(s.imag)} for s in self.poles],
             "time_constants_s": [float(tau) if np.isfinite(tau) else None for tau in self.time_constants],
             "gains": self.rows(),
+            "step_responses": {"time_s": time.tolist(), "pairs": self._pairs({"": step})},
+            "frequency_responses": {
+                "rad_per_s": omega.tolist(),
+                "pairs": self._pairs({"magnitude": magnitude, "phase_deg": phase}),
+            },
         }
+
+    def _pairs(self, parts: Mapping[str, Estimate]) -> list[dict[str, Any]]:
+        """Return a record for each pair of an input and an output: courses with their intervals, if any."""
+        out = []
+        for (j, name), (i, output) in product(enumerate(self.near.inputs), enumerate(self.near.outputs)):
+            pair: dict[str, Any] = {"input": name, "output": output}
+            for what, estimate in parts.items():
+                for end, course in estimate._asdict().items():
+                    key = what if what and end == "value" else f"{what}_{end}".strip("_")
+                    pair[key] = course[:, i, j].tolist() if np.isfinite(course).all() else None
+            out.append(pair)
+        return out
 
     @property
     def _slowest(self) -> float:

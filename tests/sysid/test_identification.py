@@ -165,9 +165,8 @@ def test_neural_models_that_could_not_be_kept_are_left_out_with_the_reason(worke
     assert found.model == "oe"
     assert {row.model for row in found.rows} == {"oe"}
     assert any(note.startswith("neural: left out, for even without any error") for note in found.notes)
-    if workers == 1:
-        assert any(what.startswith("oe: na ") and "of the spread on held-out parts" in what for what in said)
-        assert not any(what.startswith("neural") for what in said)
+    assert any(what.startswith("oe: na ") and "of the spread on held-out parts" in what for what in said)
+    assert not any(what.startswith("neural") for what in said)
 
 
 def test_what_was_searched_is_listed_with_its_errors_and_a_fixed_order_leaves_others_out():
@@ -384,7 +383,7 @@ def test_kinds_fitted_side_by_side_give_the_same_plant(monkeypatch):
     assert (0.167, "black boxes: fitting") in seen  # half of two of six parts
 
 
-def test_the_kind_that_takes_longest_is_begun_first_and_reported_in_its_place(monkeypatch):
+def test_the_kind_that_takes_longest_comes_after_the_others_and_is_reported_in_its_place(monkeypatch):
     asked = []
 
     def refused(_function, items, workers, _progress, *, what):
@@ -392,11 +391,11 @@ def test_the_kind_that_takes_longest_is_begun_first_and_reported_in_its_place(mo
         return [f"{kind}: {what}" for kind, _, _ in items]
 
     monkeypatch.setattr(identification, "run_parallel", refused)
+    monkeypatch.setattr(identification, "_fit_or_refusal", lambda item: f"{item[0]}: after {len(asked)}")
     parts = identification._Parts(None, 5)
-    kinds = ["arx", "neural", "oe"]
-    found = identification._fit_all(kinds, [], {}, parts, "tcp://a:1")
-    assert found == ([], [], [f"{kind}: fitting" for kind in kinds])
-    assert asked == [("tcp://a:1", ["neural", "arx", "oe"])]
+    found = identification._fit_all(["arx", "neural", "oe"], [], {}, parts, "tcp://a:1")
+    assert found == ([], [], ["arx: fitting", "neural: after 1", "oe: fitting"])
+    assert asked == [("tcp://a:1", ["arx", "oe"])]
     assert parts._done == 3
 
 

@@ -49,6 +49,26 @@ def test_gains_times_and_poles_are_those_of_the_lags():
     assert found.rows()[1]["rise_time_s"] is None
 
 
+def test_responses_in_json_are_those_of_each_pair_and_have_no_ends_without_draws():
+    found, answer = plant_dynamics(PLANT), plant_dynamics(PLANT).to_dict()
+    time, step = found.step_response(60)
+    omega, size, phase = found.frequency_response(60)
+    steps, waves = answer["step_responses"], answer["frequency_responses"]
+    assert (steps["time_s"], waves["rad_per_s"]) == (time.tolist(), omega.tolist())
+    names = [("u", "hot"), ("u", "level"), ("v", "hot"), ("v", "level")]
+    assert [(pair["input"], pair["output"]) for pair in steps["pairs"]] == names
+    assert [(pair["input"], pair["output"]) for pair in waves["pairs"]] == names
+    late, wave = steps["pairs"][3], waves["pairs"][3]
+    assert late["value"][-1] == pytest.approx(-3.0, rel=1e-6)
+    assert (late["low"], late["high"]) == (step.low[:, 1, 1].tolist(), step.high[:, 1, 1].tolist())
+    assert wave["magnitude"] == size.value[:, 1, 1].tolist()
+    assert wave["magnitude_high"] == size.high[:, 1, 1].tolist()
+    assert wave["phase_deg"] == phase.value[:, 1, 1].tolist()
+    assert wave["phase_deg_low"] == phase.low[:, 1, 1].tolist()
+    alone = plant_dynamics(replace(PLANT, refits=())).to_dict()["step_responses"]["pairs"][3]
+    assert (alone["value"], alone["low"], alone["high"]) == (late["value"], None, None)
+
+
 def test_a_pair_of_complex_poles_is_one_oscillation():
     poles = np.exp(2.0 * (-0.05 + 0.3j)), np.exp(2.0 * (-0.05 - 0.3j))
     A = np.array([[2 * poles[0].real, -(abs(poles[0]) ** 2)], [1.0, 0.0]])
