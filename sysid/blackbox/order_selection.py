@@ -54,6 +54,8 @@ _MOST_ON_ALL = 2.0  # times the worst fold's error: a fit to all data that errs 
 _BLOCKS = 4  # of one or two logs
 FEWEST = 20  # rows of a block that is held out
 
+_ALIKE = 0.98  # correlation of an input with its square: a line leaves a fifth of the square's spread
+
 _SHORT = 0.25  # of a held-out part: the memory of an offset that fades
 
 
@@ -305,18 +307,27 @@ def column_sizes(norms: Array) -> Array:
 
 
 def default_terms(grid: Grid, *, switched: bool = True) -> tuple[tuple[str, ...], ...]:
-    """Return sets of products worth trying: none, magnitudes of signed inputs, those with a moving switch."""
+    """Return sets of products worth trying: none, magnitudes of signed inputs, squares of others that show
+    their curvature (Joule heat), those with a moving switch."""
     u = np.concatenate([segment.u for segment in grid.segments])
     signed = [n for i, n in enumerate(grid.inputs) if u[:, i].min() < 0 < u[:, i].max()]
     moving = [n for n in grid.switches if np.ptp(u[:, grid.inputs.index(n)])]
+    curved = [n for n, each in zip(grid.inputs, u.T) if n not in signed and _shows_curvature(each)]
     sets: list[tuple[str, ...]] = [()]
     if signed:
         sets.append(tuple(f"|{n}|" for n in signed))
         sets.append(tuple(t for n in signed for t in (f"|{n}|", f"{n}*|{n}|")))
+    if curved:
+        sets.append(tuple(f"{n}*{n}" for n in curved))
     if moving and switched:
         others = [n for n in (*grid.inputs, *grid.disturbances) if n not in moving]
         sets += [(*some, *(f"{s}*{n}" for s in moving for n in others)) for some in list(sets)]
     return tuple(sets)
+
+
+def _shows_curvature(u: Array) -> bool:
+    """Return whether the square of an input is no line in it; of two levels, or of few moves, it is."""
+    return bool(np.ptp(u) > 0 and abs(np.corrcoef(u, u**2)[0, 1]) < _ALIKE)
 
 
 def as_state_space(

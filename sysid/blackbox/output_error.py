@@ -308,7 +308,7 @@ def oe_family(
     """Return a model for each structure that has a stable one, by ``search`` of output error where absent."""
     out, kind = {}, search or Search
     searches = [kind() for _ in grid.outputs]
-    # magnitudes and signed squares, never products with a switch that moves in one log alone
+    # magnitudes and squares, never products with a switch that moves in one log alone
     for some in order_selection.default_terms(grid, switched=False) if terms is None else terms:
         w = order_selection.drives(grid, some)
         records = [Records([s.y[:, i] for s in grid.segments], w) for i in range(len(grid.outputs))]

@@ -83,7 +83,7 @@ def subspace_family(
 ) -> Mapping[Structure, StateSpaceModel]:
     """Return a model for each order, number of block rows f and weighting that the data allow; where absent,
     ``rows`` are 3, 5, 8, 15 and 30 as far as the data allow (2 where they allow none), and ``terms`` none and
-    the magnitudes of signed inputs."""
+    the magnitudes of signed inputs, or else the squares of others."""
     found: dict[Structure, Fitted] = {}
     asked = None if only is None else only.members or (only,)
     longest = max(len(segment.time) for segment in grid.segments)

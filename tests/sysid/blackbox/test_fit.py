@@ -399,3 +399,21 @@ def test_rounding_gives_an_input_that_never_moves_no_gain_in_any_structure(kind)
     still = [model.inputs.index("pump") for model in models.values()]
     gains = [m.C @ np.linalg.solve(np.eye(m.n_x) - m.A, m.B)[:, at] for m, at in zip(models.values(), still)]
     assert max(np.abs(gain).max() for gain in gains) == 0.0
+
+
+@pytest.mark.parametrize(("joule", "kept"), [(0.6, True), (0.0, False)])
+@pytest.mark.parametrize("kind", ["oe", "subspace", "arx"])
+def test_the_square_of_a_heater_s_drive_is_kept_where_the_folds_show_it(kind, joule, kept):
+    rng = np.random.default_rng(1)
+    u = np.repeat(rng.random(60), 20)
+    y = 25 + lfilter([0, 0.5], [1, -0.9], joule * u**2 + (1 - joule) * u)
+    signals = {"q": (u, "1", "input"), "t": (y + 0.02 * rng.standard_normal(len(u)), "degC", "output")}
+    found = fit_black_box(kind, [make_log(np.arange(float(len(u))), signals)], average=1.0)
+    errors = {s: found.choice.error_of(s) for s, e in found.choice.errors.items() if np.isfinite(e).all()}
+    plain = min(error for s, error in errors.items() if not s.members and "with q*q" not in s.label)
+    if kept:
+        assert found.plant.model.terms == ("q*q",)
+        assert found.choice.error < 0.5 * plain
+    else:
+        assert found.choice.error < 1.05 * plain
+        assert found.plant.model.terms == () or found.choice.structure.members

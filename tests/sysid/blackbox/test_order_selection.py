@@ -306,7 +306,7 @@ def test_magnitudes_of_signed_inputs_and_products_with_moving_switches_are_tried
     grid = grid_of(
         segment(np.zeros((2, 1)), u), inputs=("q", "pump"), disturbances=("room",), switches=("pump",)
     )
-    sets = [(), ("|q|",), ("|q|", "q*|q|")][: 3 if lowest * highest else 1]
+    sets = [(), ("|q|",), ("|q|", "q*|q|")][: 3 if lowest * highest else 1]  # two levels show no square
     products = [(*some, "pump*q", "pump*room") for some in sets]
     want = sets + (products if pump and switched else [])
     assert list(selection.default_terms(grid, switched=switched)) == want
@@ -339,3 +339,22 @@ def test_products_have_columns_of_their_own_after_inputs_and_disturbances():
     model = selection.as_state_space(grid, np.eye(1) / 2, W, np.eye(1), np.ones(1), **how, y0=np.array([7.0]))
     assert [part.tolist() for part in (model.B, model.E, model.F)] == [[[1.0, 2.0]], [[3.0]], [[4.0]]]
     assert (model.y0.tolist(), model.c.tolist(), model.terms) == ([7.0], [1.0], ("|q|",))
+
+
+@pytest.mark.parametrize(
+    ("levels", "terms"),
+    [
+        (np.linspace(0, 1, 50), [("q*q",)]),
+        (np.linspace(-1, 0, 50), [("q*q",)]),
+        (np.linspace(3, 4, 50), []),  # so far from 0 a square is nearly a line
+        (np.linspace(-1, 1, 50), [("|q|",), ("|q|", "q*|q|")]),
+        (np.repeat([0.0, 9.0], 25), []),  # two levels have a line through them
+        (np.r_[np.repeat([0.0, 9.0], 25), 8.0], []),
+        (np.full(50, 7.0), []),
+    ],
+)
+def test_squares_of_inputs_of_one_sign_are_tried_where_a_line_would_show(levels, terms):
+    u = np.column_stack([levels, np.repeat([0.0, 1.0], [9, len(levels) - 9])])
+    rows = segment(np.zeros((len(u), 1)), u)
+    grid = grid_of(rows, inputs=("q", "pump"), switches=("pump",))
+    assert list(selection.default_terms(grid, switched=False)) == [(), *terms]
