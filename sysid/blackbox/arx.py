@@ -3,7 +3,8 @@
     y[k] = sum_i A_i y[k - i] + sum_l B_l w[k - n_k - l] + c + e[k],     i = 1..na,  l = 0..nb-1,  n_k >= 1,
 
 w are inputs, disturbances and products of inputs (``|drive|``, ``drive*|drive|``: a Peltier element heats
-and cools unequally; ``drive*drive``: Joule heat), and with ``switched`` each A_i differs between a pump that runs and one that does not.
+and cools unequally; ``drive*drive``: Joule heat), and with ``switched`` each A_i differs between a pump that
+runs and one that does not.
 It is one linear regression: the normal equations of the largest structure hold those of all smaller ones, and
 several logs only add rows.  Rows that would reach across a gap or use a lost reading are left out; where more
 than a few readings were lost, the normal equations are their expectation given all that was read
