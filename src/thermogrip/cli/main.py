@@ -19,7 +19,7 @@ from typing import Annotated
 import typer
 
 from thermogrip import __version__
-from thermogrip.cli import classify, compare, control, excite, identify, project, rig
+from thermogrip.cli import classify, compare, control, excite, fleet, identify, project, rig
 from thermogrip.cli.verbs import Verb, Verbs
 from thermogrip.datasets.errors import UserError, known_names, os_fault
 from thermogrip.datasets.media import printable
@@ -58,7 +58,7 @@ def _root(
 
 
 for _verb in (
-    project.demo, identify.identify, identify.validate, identify.simulate, identify.linearise, excite.excite,
+    project.demo, identify.identify, fleet.fleet, identify.validate, identify.simulate, identify.linearise, excite.excite,
     control.tune, control.retune, control.review, control.export, rig.run, rig.record, rig.virtual,
     rig.batch, rig.recover,
     classify.effusivity, classify.train, classify.classify, compare.compare, project.paper,
