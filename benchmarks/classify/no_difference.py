@@ -51,8 +51,8 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     nodes_for,
     prior_of,
 )
-from thermogrip.sysid.effusivity.posterior_grid import marginals
 from thermogrip.sysid.effusivity.posterior import material_evidence, material_fit
+from thermogrip.sysid.effusivity.posterior_grid import marginals
 
 THREE, FIVE = ["copper", "iron", "wood"], ["brass", "copper", "iron", "wood", "zinc"]
 # object, gripper [degC], materials, contact time [s]: exp1 to exp4
@@ -284,7 +284,8 @@ def summed_evidence(device, data, mode, prior, k, r, n=3000):
     u = np.repeat(prior.mean[k][None], n, axis=0)
     u[:, vary] = points
     whitener, log_det = whiten(one, device.noise)
-    arguments, beyond = gripper_arguments(device.stack, nodes_for(one)), device.beyond(one.t, u[:, EFFUSIVITY])
+    arguments = gripper_arguments(device.stack, nodes_for(one))
+    beyond = device.beyond(one.t, u[:, EFFUSIVITY])
     likelihood = marginals(arguments, one, whitener, beyond, prior.sd[k], u)
     return logsumexp(likelihood + log_prior - proposed) - np.log(n) - 0.5 * log_det[0]
 

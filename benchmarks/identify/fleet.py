@@ -1,4 +1,4 @@
-"""Rigs of one kind alone and pooled: errors of parameters and free runs, coverage of the population, ill rigs.
+"""Rigs of one kind alone and pooled: errors of parameters and free runs, the population's coverage, ill rigs.
 
     python benchmarks/identify/fleet.py [--rigs 30] [--seeds 4] [--workers 2]
 
@@ -58,7 +58,7 @@ def fleet(rng, n, n_logs, *, ill=False):
     values = [dict(zip(NAMES, np.exp(row).tolist())) | {"t_room": 23.0 + rng.normal()} for row in theta]
     truths = [replace(board, values=board.values | each) for each in values]
     logs = [[log_of(truth, rng, 5) for _ in range(n_logs)] for truth in truths]
-    return prior + OFF, theta, logs, [log_of(truth, rng, 20, noise=False) for truth in truths]
+    return theta, logs, [log_of(truth, rng, 20, noise=False) for truth in truths]
 
 
 def fitted(given):
@@ -86,12 +86,14 @@ def main() -> None:
     given = parser.parse_args()
     run = partial(run_parallel, fitted, workers=given.workers)
     model, n = load_network("tclab"), given.rigs
-    print("logs  alone ln p, K   pooled ln p, K   refit ln p, K   covered  spread found  alarms  ill found  s")
+    print(
+        "logs  alone ln p, K   pooled ln p, K   refit ln p, K   covered  spread found  alarms  ill found  s"
+    )
     for n_logs in (3, 1):
         rows, found, alarms, covered, spreads, seconds = [], 0, 0, [], [], []
         for seed in range(given.seeds):
             rng = np.random.default_rng([seed, n_logs])
-            mean, theta, logs, checks = fleet(rng, n, n_logs)
+            theta, logs, checks = fleet(rng, n, n_logs)
             begin = time.perf_counter()
             alone = run([(model, each) for each in logs])
             population, rigs = pool_rigs({f"r{k}": plant for k, plant in enumerate(alone)})
@@ -108,15 +110,16 @@ def main() -> None:
                 for r, row in zip(rigs, np.exp(theta)) for p, v in zip(NAMES, row)
             ]  # fmt: skip
             covered += inside
-            _, _, logs, _ = fleet(rng, n, n_logs, ill=True)
+            _, logs, _ = fleet(rng, n, n_logs, ill=True)
             plants = run([(model, each) for each in logs])
             with_ill = pool_rigs({f"r{k}": plant for k, plant in enumerate(plants)})[1]
             found += with_ill[0].ill
             alarms += sum(rig.ill for rig in with_ill[1:])
+        healthy = (2 * n - 1) * given.seeds
         a, b, c = np.sqrt(np.mean(np.square(rows), axis=0))
         print(
             f"{n_logs:4d}  {a[0]:6.3f} {a[1]:6.2f}   {b[0]:6.3f} {b[1]:6.2f}   {c[0]:6.3f} {c[1]:6.2f}"
-            f"   {np.mean(covered):6.3f}  {np.mean(spreads, axis=0).round(2)}  {alarms}/{2 * n * given.seeds - given.seeds}"
+            f"   {np.mean(covered):6.3f}  {np.mean(spreads, axis=0).round(2)}  {alarms}/{healthy}"
             f"  {found}/{given.seeds}  {np.mean(seconds):.0f}",
             flush=True,
         )

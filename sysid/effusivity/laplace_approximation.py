@@ -136,8 +136,8 @@ def jacobian(
     from thermogrip.sysid.effusivity.mode_kernel import readings
 
     y, slopes = readings(
-        *gripper_arguments(stack, nodes), (np.empty((0, 0)),) * 4, data.sample_t, data.sample_bin, data.count, data.t, data.ramp,
-        data.t_ambient, _beyond(beyond, u, data), np.ascontiguousarray(u), vary,
+        *gripper_arguments(stack, nodes), (np.empty((0, 0)),) * 4, data.sample_t, data.sample_bin, data.count,
+        data.t, data.ramp, data.t_ambient, _beyond(beyond, u, data), np.ascontiguousarray(u), vary,
     )  # fmt: skip
     return y, slopes
 

@@ -3,7 +3,7 @@ r"""Rigs of one kind: how far each parameter differs from rig to rig, and what t
 Each rig is fitted by itself.  In units of the network's prior, z = (theta - theta_prior) / sd_prior, the fit
 leaves z_i with covariance S_i, the prior N(0, 1) included.  Its logs alone are a likelihood of precision
 :math:`\Lambda_i = S_i^{-1} - 1` and information :math:`\eta_i = S_i^{-1} z_i`, in the directions in which
-S_i is narrower than the prior; others say nothing.  Nothing is inverted that a short log leaves open.
+S_i is narrower than the prior; others say nothing.
 
 The population is normal, z ~ N(mu, T) with T diagonal, and mu has the network's prior.  Given T,
 
@@ -20,15 +20,15 @@ N - 1 in place of N is a gamma(2) prior on the standard deviation, which keeps a
 found of one piece [1]_.
 
 **A new rig** is N(mu, T + C), with Student's t of N - 1 degrees of freedom for its intervals: with three rigs
-those are half as wide again.  That is the prior for the next rig (`identify --prior`), and b_i, V_i is what all
-rigs together say of one (partial pooling).
+those are half as wide again.  That is the prior for the next rig (`identify --prior`), and b_i, V_i is what
+all rigs together say of one (partial pooling).
 
-**A rig that is ill** is far from what the others predict.  With the eigenvectors of its :math:`\Lambda_i = U l
-U'`, its information :math:`w = l^{-1/2} U' \eta_i` is N(F' mu, 1 + F' (T + C) F), F = U l^{1/2}, of the population
-of the others; the squared distance over its r dimensions is compared with an F distribution of r and N - 2
-degrees of freedom, and its farthest parameter with Student's t of N - 2, times the number of parameters: one that
-is far off may be lost among others that are not.  Twice the smaller of both, times the number of rigs, is the
-chance of such a rig in a healthy fleet.
+**A rig that is ill** is far from what the others predict.  With the eigenvectors of its
+:math:`\Lambda_i = U l U'`, its information :math:`w = l^{-1/2} U' \eta_i` is N(F' mu, 1 + F' (T + C) F),
+F = U l^{1/2}, of the population of the others.  The squared distance over its r dimensions is compared with
+an F distribution of r and N - 2 degrees of freedom, and its farthest parameter with Student's t of N - 2,
+times the number of parameters: one that is far off may be lost among others that are not.  Twice the smaller
+of both, times the number of rigs, is the chance of such a rig in a healthy fleet.
 
 References
 ----------
@@ -134,7 +134,9 @@ class Population:
         free = {name for name, spec in specs.items() if not spec.fixed}
         if free != set(known):
             odd = ", ".join(sorted(free ^ set(known)))
-            problem = f"the population is of network {self.network!r}, {model.network.name!r} differs in {odd}"
+            problem = (
+                f"the population is of network {self.network!r}, {model.network.name!r} differs in {odd}"
+            )
             raise UserError(problem, hint=f"--network {self.network}")
         # the variance of Student's t, which three rigs have not: twice its scale then
         dof = len(self.rigs) - 1
@@ -221,11 +223,13 @@ def pool_rigs(plants: Mapping[str, Plant]) -> tuple[Population, tuple[Rig, ...]]
     whole = _pool(told)
 
     def population(found: _Pooled, rigs: Sequence[str]) -> Population:
-        numbers = (centre + width * found.mean, width * np.sqrt(found.variance))
+        mean, spread = centre + width * found.mean, width * np.sqrt(found.variance)
         sure = width * np.sqrt(np.diagonal(found.unsure))
-        each = (tuple(map(float, part)) for part in (*numbers, sure))
         scales = tuple(spec.scale for spec in specs)
-        return Population(str(model.network.name), first.free, scales, *each, tuple(rigs))
+        return Population(
+            str(model.network.name), first.free, scales, tuple(mean.tolist()), tuple(spread.tolist()),
+            tuple(sure.tolist()), tuple(rigs),
+        )  # fmt: skip
 
     rigs = []
     for i, name in enumerate(names):
@@ -279,7 +283,7 @@ def _given(told: _Told, T: Array) -> _Pooled:
     weight = len(V) * np.diag(1 / T) - V.sum(axis=0) / np.outer(T, T)
     C = np.linalg.inv(np.eye(T.size) + weight)
     mean = C @ (own.sum(axis=0) / T)
-    return _Pooled(mean, T, C, own + V @ (mean / T), V)
+    return _Pooled(mean, T, C, np.asarray(own + V @ (mean / T)), np.asarray(V))
 
 
 def _distance(precision: Array, information: Array, others: _Pooled, dof: int) -> tuple[float, float]:
@@ -299,6 +303,7 @@ def pooled_plant(plant: Plant, rig: Rig) -> Plant:
     """Return a rig's plant with the parameters and the covariance that all rigs together give it."""
     values = dict(zip(plant.free, plant.natural(rig.pooled).tolist()))
     inside = {
-        name: float(np.clip(value, *plant.bounds.get(name, (-np.inf, np.inf)))) for name, value in values.items()
+        name: float(np.clip(value, *plant.bounds.get(name, (-np.inf, np.inf))))
+        for name, value in values.items()
     }
     return replace(plant, values=plant.values | inside, covariance=rig.covariance, samples=None)

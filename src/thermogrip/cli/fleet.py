@@ -30,8 +30,8 @@ def fleet(
 ) -> int:
     """Identify rigs of one kind together.
 
-    Fits the thermal network to the logs of each rig, finds how far each parameter differs from rig to rig, and
-    from that what all rigs say of each of them. Says which rig is unlike the others (exit code 3 if one is).
+    Fits the network to the logs of each rig, finds how far each parameter differs from rig to rig, and what
+    all rigs together say of each. Reports which rig is unlike the others (exit code 3 if one is).
     """
     cli.new_folder(out)
     pool = cli.workers_of(workers, cluster)
@@ -45,7 +45,9 @@ def fleet(
     from thermogrip.sysid.models.network import NetworkModel
     from thermogrip.sysid.plant.log_grid import roles_of
 
-    model = cli.find_network(network) if network else shipped_network(cli.load_logs(next(iter(paths.values()))))
+    model = (
+        cli.find_network(network) if network else shipped_network(cli.load_logs(next(iter(paths.values()))))
+    )
     if not isinstance(model, NetworkModel):
         raise UserError("these logs are of no thermal network", file=folder, hint="name one with --network")
     logs = [cli.load_logs(files, known=roles_of(model)) for files in paths.values()]

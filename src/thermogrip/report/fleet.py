@@ -8,13 +8,16 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from thermogrip.datasets.charts import PALETTE, panels
+from thermogrip.datasets.charts import PALETTE
+from thermogrip.datasets.media import panels
 from thermogrip.report.html import Picture, Section, Table
 from thermogrip.sysid.greybox.population import Population, Rig
 from thermogrip.sysid.plant.plant import Plant
 
 
-def population_table(population: Population, plant: Plant) -> tuple[tuple[str, ...], list[tuple[object, ...]]]:
+def population_table(
+    population: Population, plant: Plant
+) -> tuple[tuple[str, ...], list[tuple[object, ...]]]:
     """Return head and rows of what a new rig may have, a row a parameter; ``plant`` has the units."""
     middle, ranges = population.natural(np.array(population.mean)), population.intervals(0.9)
     head = ("parameter", "unit", "population", "90 % of new rigs from", "to", "spread from rig to rig")
@@ -26,7 +29,9 @@ def population_table(population: Population, plant: Plant) -> tuple[tuple[str, .
     return head, rows
 
 
-def rig_table(rigs: Sequence[Rig], population: Population) -> tuple[tuple[str, ...], list[tuple[object, ...]]]:
+def rig_table(
+    rigs: Sequence[Rig], population: Population
+) -> tuple[tuple[str, ...], list[tuple[object, ...]]]:
     """Return head and rows of each rig against the others, the farthest first."""
     head = ("rig", "", "squared distance", "chance in a healthy fleet", "farthest parameter", "off by [sd]")
     rows: list[tuple[object, ...]] = []
@@ -38,9 +43,7 @@ def rig_table(rigs: Sequence[Rig], population: Population) -> tuple[tuple[str, .
     return head, rows
 
 
-def fleet_figure(
-    plants: Mapping[str, Plant], population: Population, rigs: Sequence[Rig]
-) -> Figure:
+def fleet_figure(plants: Mapping[str, Plant], population: Population, rigs: Sequence[Rig]) -> Figure:
     """Draw every parameter of every rig, by its own logs and pooled, on the population's 90 % interval."""
     n, columns = len(population.parameters), 3
     rows = -(-n // columns)
@@ -75,9 +78,7 @@ def fleet_figure(
     return figure
 
 
-def fleet_sections(
-    plants: Mapping[str, Plant], population: Population, rigs: Sequence[Rig]
-) -> list[Section]:
+def fleet_sections(plants: Mapping[str, Plant], population: Population, rigs: Sequence[Rig]) -> list[Section]:
     """Return the page's sections."""
     ill = [rig.name for rig in rigs if rig.ill]
     words = f"{', '.join(ill)} far from the others" if ill else "No rig is far from the others"

@@ -132,7 +132,13 @@ def test_the_file_and_the_prior_are_the_population(tmp_path):
 
 @pytest.mark.parametrize(
     "broken",
-    [{"mean": [1.0]}, {"spread": [-1.0] * N_FREE}, {"rigs": ["a"]}, {"scales": ["x"] * N_FREE}, {"mean": None}],
+    [
+        {"mean": [1.0]},
+        {"spread": [-1.0] * N_FREE},
+        {"rigs": ["a"]},
+        {"scales": ["x"] * N_FREE},
+        {"mean": None},
+    ],
 )
 def test_a_broken_file_is_refused(tmp_path, broken):
     path = pool_rigs(fits(6, np.random.default_rng(8))[1])[0].save(tmp_path / "population.json")
