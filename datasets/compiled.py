@@ -34,15 +34,26 @@ def sources_digest() -> str:
     return hashlib.sha256(b"\0".join(path.read_bytes() for path in KERNELS)).hexdigest()
 
 
-class _BySources(caching.InTreeCacheLocator):  # type: ignore[misc]
-    """Where the compiled code of a kernel lies, and until when it may be used."""
+class _BySources:
+    """Until when the compiled code of a kernel may be used."""
 
     @classmethod
     def from_function(cls, py_func: Any, py_file: str) -> Any:
-        return super().from_function(py_func, py_file) if Path(py_file) in KERNELS else None
+        if Path(py_file) not in KERNELS:
+            return None
+        return super().from_function(py_func, py_file)  # type: ignore[misc]
 
     def get_source_stamp(self) -> str:
         return sources_digest()
 
 
-caching.CacheImpl._locator_classes.insert(1, _BySources)  # after the folder of NUMBA_CACHE_DIR
+class _BesideModule(_BySources, caching.InTreeCacheLocator):  # type: ignore[misc]
+    """Beside the kernel's module."""
+
+
+class _OfUser(_BySources, caching.UserWideCacheLocator):  # type: ignore[misc]
+    """In the user's cache folder, where that of the module cannot be written."""
+
+
+# after the folder of NUMBA_CACHE_DIR
+caching.CacheImpl._locator_classes[1:1] = [_BesideModule, _OfUser]

@@ -51,8 +51,8 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     nodes_for,
     prior_of,
 )
-from thermogrip.sysid.effusivity.mode_kernel import marginals
 from thermogrip.sysid.effusivity.posterior import material_evidence, material_fit
+from thermogrip.sysid.effusivity.posterior_grid import marginals
 
 THREE, FIVE = ["copper", "iron", "wood"], ["brass", "copper", "iron", "wood", "zinc"]
 # object, gripper [degC], materials, contact time [s]: exp1 to exp4
@@ -284,11 +284,9 @@ def summed_evidence(device, data, mode, prior, k, r, n=3000):
     u = np.repeat(prior.mean[k][None], n, axis=0)
     u[:, vary] = points
     whitener, log_det = whiten(one, device.noise)
-    likelihood = marginals(
-        *gripper_arguments(device.stack, nodes_for(one)), one.sample_t[0], one.sample_bin[0], one.count[0],
-        one.t[0], one.y[0], one.ramp[0], float(one.t_ambient[0]), whitener[0],
-        *prior.sd[k, [LEVEL, T_OBJECT]].tolist(), u,
-    )  # fmt: skip
+    arguments = gripper_arguments(device.stack, nodes_for(one))
+    beyond = device.beyond(one.t, u[:, EFFUSIVITY])
+    likelihood = marginals(arguments, one, whitener, beyond, prior.sd[k], u)
     return logsumexp(likelihood + log_prior - proposed) - np.log(n) - 0.5 * log_det[0]
 
 

@@ -136,8 +136,8 @@ def jacobian(
     from thermogrip.sysid.effusivity.mode_kernel import readings
 
     y, slopes = readings(
-        *gripper_arguments(stack, nodes), data.sample_t, data.sample_bin, data.count, data.t, data.ramp,
-        data.t_ambient, _beyond(beyond, u, data), np.ascontiguousarray(u), vary,
+        *gripper_arguments(stack, nodes), (np.empty((0, 0)),) * 4, data.sample_t, data.sample_bin, data.count,
+        data.t, data.ramp, data.t_ambient, _beyond(beyond, u, data), np.ascontiguousarray(u), vary,
     )  # fmt: skip
     return y, slopes
 
@@ -426,7 +426,7 @@ def _whole_covariance(pair: _Pair, ahead: _Expansion, k: Array, j: Array) -> Arr
 
 def _slopes(pair: _Pair, here: _Point) -> tuple[Array, Array]:
     """Return the derivatives of the bin means by theta, (n_bin, n_theta), and by u, (n_bin, 7)."""
-    from thermogrip.sysid.effusivity.mode_kernel import gripper_readings
+    from thermogrip.sysid.effusivity.mode_kernel import readings
 
     data, u, stack = pair.data, here.u, here.stack
     _, by_u = jacobian(stack, pair.nodes, data, u[None], np.ones((1, u.size), dtype=bool), pair.beyond)
@@ -443,9 +443,10 @@ def _slopes(pair: _Pair, here: _Point) -> tuple[Array, Array]:
         np.concatenate([moved, np.repeat(here_[None], len(_CONTACT) + 1, axis=0)])
         for moved, here_ in zip(near[:3], base[:3])
     )
-    y = gripper_readings(
-        tuple(pair.nodes), lam, face, sensor, contact, data.sample_t[0], data.sample_bin[0], data.count[0],
-        data.t[0], data.ramp[0], float(data.t_ambient[0]), pair.beyond[0], u,
+    us, vary = np.repeat(u[None], len(contact), axis=0), np.zeros((len(contact), u.size), dtype=bool)
+    y, _ = readings(
+        *gripper_arguments(stack, pair.nodes), (lam, face, sensor, contact), data.sample_t, data.sample_bin,
+        data.count, data.t, data.ramp, data.t_ambient, pair.beyond, us, vary,
     )  # fmt: skip
     k[:, _MOVED] = ((y[:-1] - y[-1]) / _DIFFERENCE).T
     if np.isfinite(data.t_ambient[0]):

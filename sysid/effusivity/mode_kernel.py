@@ -272,7 +272,8 @@ def modes(
 
     Pair p is touch ``row[p]`` under the prior ``law`` (n, 3, 7): mean, sd, degrees of freedom.  The objective
     is -2 ln (likelihood x prior density relative to its peak) + ln det of its curvature in units of sd; the
-    state is 1 where the search settled.
+    state is 1 where the search settled.  With ``max_steps`` 0 the one step is taken that is exact where only
+    level and T_obj vary: the objective is then -2 ln of their integral.
     """
     n = u.shape[0]
     scratch = _scratch(gripper.sensor.size, nodes[2].size, times.shape[1], y.shape[1])
@@ -299,10 +300,10 @@ def modes(
                 damping = max(damping * 0.1, 1e-9)
             else:
                 damping *= 10.0
-            if damping > 1e9 or step == max_steps:
+            if damping > 1e9 or (step == max_steps and max_steps > 0):
                 break
             decrease = _propose(here, sd, 0.0, work)
-            if decrease < _LEAST_DECREASE:
+            if decrease < _LEAST_DECREASE or max_steps == 0:
                 for a in range(7):
                     here.u[a] += work.step[a] * sd[a]
                 here.cost[0] -= decrease
@@ -320,62 +321,31 @@ def modes(
 
 
 @numba.njit(**OUTER)  # type: ignore[untyped-decorator]
-def marginals(
-    nodes: Nodes, gripper: Gripper, times: Array, bins: NDArray[np.int64], count: Array, t: Array, y: Array,
-    ramp: Array, room: float, beyond: Array, whitener: Array, level_sd: float, t_sd: float, u: Array,
-) -> Array:  # fmt: skip
-    """Return ln p(y | u) up to a constant for n points ``u`` (n, 7) of one grasp, integrated over level and
-    T_obj (prior means in ``u``, sds ``level_sd`` and ``t_sd``)."""
-    scratch = _scratch(gripper.sensor.size, nodes[2].size, times.size, y.size)
-    vary, sd, result = np.zeros(7, dtype=np.bool_), np.zeros(7), np.empty(u.shape[0])
-    matrix, gradient = np.zeros((7, 7)), np.zeros(7)
-    sd[_LEVEL], sd[_T] = level_sd, t_sd
-    for p in range(u.shape[0]):
-        _predict(nodes, gripper, u[p], vary, times, bins, count, t, ramp, room, beyond[p], scratch)
-        square = _normal_equations(whitener, y, sd, scratch, matrix, gradient)
-        r1, r2 = gradient[_LEVEL], gradient[_T]
-        v11, v12, v22 = 1.0 + matrix[_LEVEL, _LEVEL], matrix[_T, _LEVEL], 1.0 + matrix[_T, _T]
-        det = v11 * v22 - v12 * v12
-        gain = (v22 * r1 * r1 - 2.0 * v12 * r1 * r2 + v11 * r2 * r2) / det
-        result[p] = -0.5 * (square - gain) - 0.5 * np.log(det)
-    return result
-
-
-@numba.njit(**OUTER)  # type: ignore[untyped-decorator]
 def readings(
-    nodes: Nodes, gripper: Gripper, times: Array, bins: NDArray[np.int64], count: Array, t: Array,
-    ramp: Array, room: Array, beyond: Array, u: Array, vary: Mask,
+    nodes: Nodes, gripper: Gripper, others: tuple[Array, Array, Array, Array], times: Array,
+    bins: NDArray[np.int64], count: Array, t: Array, ramp: Array, room: Array, beyond: Array, u: Array,
+    vary: Mask,
 ) -> tuple[Array, Array]:  # fmt: skip
     """Return the bin means (n, n_bin) that ``u`` (n, 7) predicts of n touches, and their derivatives (n,
-    n_bin, 7), zero where not ``vary`` (n, 7)."""
-    n, n_bin = count.shape
+    n_bin, 7), zero where not ``vary`` (n, 7).
+
+    ``others`` are decay rates, weights at face and sensor (n, n_mode) and contact numbers (n, 7) of a gripper
+    for each, in place of ``gripper``, where they have rows.  What of a touch has one row is that of all n.
+    """
+    n, n_bin = u.shape[0], count.shape[1]
     y, slopes = np.empty((n, n_bin)), np.empty((n, n_bin, 7))
     scratch = _scratch(gripper.sensor.size, nodes[2].size, times.shape[1], n_bin)
+    one = gripper
     for p in range(n):
+        i = p if count.shape[0] == n else 0
+        if others[0].shape[0] > 0:
+            one = gripper_of(nodes[0], others[0][p], others[1][p], others[2][p], others[3][p])
         _predict(
-            nodes, gripper, u[p], vary[p], times[p], bins[p], count[p], t[p], ramp[p], room[p], beyond[p],
+            nodes, one, u[p], vary[p], times[i], bins[i], count[i], t[i], ramp[i], room[i], beyond[i],
             scratch,
         )  # fmt: skip
-        for i in range(n_bin):
-            y[p, i] = scratch.reading[i]
+        for m in range(n_bin):
+            y[p, m] = scratch.reading[m]
             for a in range(7):
-                slopes[p, i, a] = scratch.slopes[a, i] if vary[p, a] else 0.0
+                slopes[p, m, a] = scratch.slopes[a, m] if vary[p, a] else 0.0
     return y, slopes
-
-
-@numba.njit(**OUTER)  # type: ignore[untyped-decorator]
-def gripper_readings(
-    nodes: Nodes, lam: Array, face: Array, sensor: Array, numbers: Array, times: Array,
-    bins: NDArray[np.int64], count: Array, t: Array, ramp: Array, room: float, beyond: Array, u: Array,
-) -> Array:  # fmt: skip
-    """Return the bin means (n, n_bin) that ``u`` (7,) predicts of one touch by n grippers with modes ``lam``,
-    ``face``, ``sensor`` (n, n_mode) and contact ``numbers`` (n, 7)."""
-    n, vary = lam.shape[0], np.zeros(7, dtype=np.bool_)
-    out = np.empty((n, count.size))
-    scratch = _scratch(lam.shape[1], nodes[2].size, times.size, count.size)
-    for p in range(n):
-        one = gripper_of(nodes[0], lam[p], face[p], sensor[p], numbers[p])
-        _predict(nodes, one, u, vary, times, bins, count, t, ramp, room, beyond, scratch)
-        for i in range(count.size):
-            out[p, i] = scratch.reading[i]
-    return out

@@ -24,7 +24,7 @@ the unit vectors, w_k = 1/6, the rule that is exact for all cubics of three norm
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -63,6 +63,22 @@ _Z = np.column_stack([np.repeat(_FIRST, 6), np.tile(_OTHERS, (_FIRST.size, 1))])
 _LOG_WEIGHT = 1.5 - np.log(6.0) - 0.5 * np.log(2 * np.pi) + np.log(_STEP)
 
 
+def marginals(arguments: Any, data: Touches, whitener: Array, beyond: Array, sd: Array, u: Array) -> Array:
+    """Return ln p(y | u) up to a constant for n points ``u`` (n, 7) of one grasp, integrated over level and
+    T_obj (prior means in ``u``, sds in ``sd`` (7,)); ``arguments`` are of
+    :func:`~thermogrip.sysid.effusivity.laplace_approximation.gripper_arguments`."""
+    from thermogrip.sysid.effusivity.mode_kernel import modes
+
+    law = np.zeros((len(u), 3, u.shape[1]))
+    law[:, 0], law[:, 2] = u, np.inf
+    law[:, 1, [LEVEL, T_OBJECT]] = sd[[LEVEL, T_OBJECT]]
+    _, objective, _, _ = modes(
+        *arguments, np.zeros(len(u), dtype=np.int64), data.sample_t, data.sample_bin, data.count, data.t,
+        data.y, data.ramp, data.t_ambient, beyond, whitener, law, u.copy(), 0,
+    )  # fmt: skip
+    return np.asarray(-0.5 * objective)
+
+
 class MarginalPosterior:
     """Log posterior of (ln e, ln h, ln tau_b, t0, ln C), up to a constant, of many points at once."""
 
@@ -74,7 +90,7 @@ class MarginalPosterior:
         gripper.require_known("an integral over one grasp's nuisances")
         self.gripper, self.data = gripper, data
         whitener, log_det = whiten(data, gripper.noise) if noise is None else noise
-        self.whitener, self.log_det = whitener[0], float(log_det[0])
+        self.whitener, self.log_det = whitener, float(log_det[0])
         self._arguments = gripper_arguments(gripper.stack, nodes_for(data))
         # of the prior only what depends on ln e is computed again
         self._prior = prior_of(gripper, data, free_hypotheses(gripper, [9.0]))
@@ -89,8 +105,6 @@ class MarginalPosterior:
         return value
 
     def _log_posterior(self, points: Array) -> Array:
-        from thermogrip.sysid.effusivity.mode_kernel import marginals
-
         free, common, data = free_hypotheses(self.gripper, points[:, 0]), self._prior, self.data
         u = np.repeat(common.mean, points.shape[0], axis=0)
         u[:, SAMPLED] = points
@@ -100,11 +114,8 @@ class MarginalPosterior:
         for column, k in ((2, BUILD_UP), (3, ONSET)):
             dof = np.inf if common.dof is None else common.dof[0, k]
             log_prior += _log_student(points[:, column], common.mean[0, k], common.sd[0, k], dof)
-        likelihood = marginals(
-            *self._arguments, data.sample_t[0], data.sample_bin[0], data.count[0], data.t[0], data.y[0],
-            data.ramp[0], float(data.t_ambient[0]), self.gripper.beyond(data.t, points[:, 0]), self.whitener,
-            *common.sd[0, [LEVEL, T_OBJECT]].tolist(), u,
-        )  # fmt: skip
+        beyond = self.gripper.beyond(data.t, points[:, 0])
+        likelihood = marginals(self._arguments, data, self.whitener, beyond, common.sd[0], u)
         return np.asarray(log_prior + likelihood)
 
 

@@ -63,17 +63,18 @@ def test_python_dash_m_is_the_command() -> None:
 
 def test_the_verbs_are_those_of_the_contract() -> None:
     verbs = "demo identify validate simulate excite tune review export run effusivity train classify compare"
-    more = "retune linearise paper materials init record recover virtual batch"
+    more = "warm-up fleet retune linearise paper materials init record recover virtual batch"
     assert set(VERBS) == {*verbs.split(), *more.split()}
 
 
 #: Each verb's arguments and options as scripts use them: =default, >least, <most.
 OPTIONS = """
 demo: --out=thermogrip-demo --seed=0>0 --workers=2>1 --cluster --json=False
-identify: LOG... --out --network --inputs --outputs --disturbances --columns --dt>1e-09
+identify: LOG... --out --network --prior --inputs --outputs --disturbances --columns --dt>1e-09
   --models=arx,oe,subspace,sindy,neural,network --average>0 --order>1<20 --delay>1<20
   --leave-one-out=False --grow=False --posterior/--no-posterior=False --report --seed=0>0 --workers=1>1
   --json=False
+fleet: LOGS_BY_RIG --out --network --report --seed=0>0 --workers=1>1 --cluster --json=False
 validate: PLANT LOG... --warmup=5.0>0 --score-from=5.0>0 --average>0 --network --columns --dt>1e-09
   --report --seed=0>0 --json=False
 simulate: PLANT LOG --out --warmup=5.0>0 --bands=False --network --columns --dt>1e-09 --seed=0>0
@@ -107,6 +108,7 @@ compare: GRASPS... --out --test --classifiers --repeats=20>0 --train-per-class=5
 paper: --out --quick=False --seed=0>0 --workers=1>1 --cluster --json=False
 materials: [NAME] --json=False
 init: spec|network|topics|guard|examples --like --out --json=False
+warm-up: --json=False
 """
 
 
@@ -148,7 +150,7 @@ def test_every_verb_has_two_examples_that_its_own_options_understand_and_a_next_
 def test_the_help_says_of_each_verb_a_whole_sentence(capsys: pytest.CaptureFixture[str]) -> None:
     main(["--help"])
     shown = capsys.readouterr().out.split("To begin:")[1]
-    assert set(re.findall(r"(?m)^  ([a-z]+) ", shown.split("Exit codes")[0])) == {*VERBS}
+    assert set(re.findall(r"(?m)^  ([a-z-]+) ", shown.split("Exit codes")[0])) == {*VERBS}
     assert "..." not in shown
 
 

@@ -127,3 +127,14 @@ def test_the_examples_come_out_ready_to_use(bench: Bench) -> None:
     assert Path("here/EXAMPLES.md").is_file()
     assert bench.run("init", "examples").code == 0
     assert Path("EXAMPLES.md").is_file()
+
+
+def test_warm_up_says_where_the_compiled_code_is_kept(bench: Bench) -> None:
+    from thermogrip.sysid.effusivity.mode_kernel import modes
+
+    done = bench.run("warm-up", "--json")
+    answer = json.loads(done.out)
+    assert done.code == 0
+    assert answer["kept_in"] == modes.stats.cache_path
+    assert list(Path(answer["kept_in"]).glob("mode_kernel.modes-*.nbc"))
+    assert "kept in" in bench.run("warm-up").out

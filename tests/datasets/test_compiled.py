@@ -86,3 +86,13 @@ def test_code_of_others_is_numbas_own_affair(module):
     assert len(stamp) == 2  # time and size of its file
     assert module(2)._cache._impl.locator.get_source_stamp() == sources_digest()
     assert numba.__name__ == "numba"
+
+
+def test_code_is_kept_for_the_user_where_the_package_cannot_be_written(module, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    (tmp_path / "__pycache__").write_text("in the way")  # as of another user
+    first = module(2)
+    assert (tmp_path / "home") in Path(first.stats.cache_path).parents
+    again = module(2)
+    assert (sum(again.stats.cache_misses.values()), sum(again.stats.cache_hits.values())) == (0, 1)
+    assert again._cache._impl.locator.get_source_stamp() == sources_digest()

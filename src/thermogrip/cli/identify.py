@@ -72,6 +72,9 @@ def identify(
             "where absent, the shipped one whose columns the logs have.",
         ),
     ] = None,
+    prior: Annotated[
+        Path | None, cli.opt("--prior", "POPULATION", "population.json of fleet, as prior of its network.")
+    ] = None,
     inputs: Annotated[str | None, cli.opt("--inputs", "A,B", "Columns that are moved.")] = None,
     outputs: Annotated[str | None, cli.opt("--outputs", "C,D", "Columns to predict.")] = None,
     disturbances: Annotated[
@@ -131,6 +134,8 @@ def identify(
     a_network = "network" in wanted and network != "none"
     named = a_network and bool(network or grow)
     wanted_network = cli.find_network(network or DEFAULT_NETWORK) if named else None
+    if prior is not None:
+        wanted_network = _with_prior(prior, wanted_network, a_network)
     to_grow = _growable(wanted_network) if grow else None
     console = Console(as_json)
     from thermogrip.datasets.units import find_column
@@ -201,6 +206,20 @@ def identify(
     more = {"dynamics": None if dynamics is None else dynamics.to_dict(), "repairs": repairs}
     console.answer(_identified(found, plant, record, growth, out) | more)
     return cli.ANSWER_IS_NO if posterior and (record is None or not record.converged) else 0
+
+
+def _with_prior(path: Path, network: GreyModel | None, wanted: bool) -> NetworkModel:
+    """Return the network, by default that of the population, with the population as its prior."""
+    from thermogrip.sysid.greybox.population import Population
+    from thermogrip.sysid.models.network import NetworkModel
+
+    population = Population.load(path)
+    if not wanted:
+        raise UserError("--prior without a network to fit", hint="leave out --network none, or --prior")
+    model = cli.find_network(population.network) if network is None else network
+    if not isinstance(model, NetworkModel):
+        raise UserError("--prior is of a thermal network", hint="name one with --network")
+    return population.prior_of(model)
 
 
 def _sampled(

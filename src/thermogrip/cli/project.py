@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from importlib import resources
 from pathlib import Path
 from typing import Annotated
@@ -123,6 +124,31 @@ def init(
         write_atomic(out, text)
         console.say(f"wrote {out}")
     console.answer({"template": what, "text": text, "out": out})
+    return 0
+
+
+def warm_up(as_json: cli.AsJson = False) -> int:
+    """Compile now what grasps need, which their first verb would do.
+
+    For images and new installations. The code is kept beside the package, in the user's cache folder where
+    that cannot be written, or in NUMBA_CACHE_DIR.
+    """
+    from thermogrip.classify.decisions.predict import classify_grasps
+    from thermogrip.classify.estimators.posterior import PosteriorClassifier
+    from thermogrip.datasets.examples import load_example_grasps
+    from thermogrip.sysid.contact.simulation import step_response, time_nodes
+    from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
+    from thermogrip.sysid.effusivity.mode_kernel import modes
+    from thermogrip.sysid.effusivity.posterior import effusivity_posterior
+
+    console, began = Console(as_json), time.process_time()
+    gripper, grasps = load_default_gripper(), load_example_grasps()["exp2_dT20"].isel(grasp=[0])
+    classify_grasps(PosteriorClassifier().with_device(gripper), grasps, ["copper", "wood"])
+    effusivity_posterior(gripper, grasps)
+    step_response(gripper.stack, time_nodes(1.0), effusivity=[1e3], capacity=[1e4], h_c=[500.0])
+    seconds, place = time.process_time() - began, modes.stats.cache_path
+    console.say(f"compiled in {seconds:.1f} s of CPU, kept in {place}")
+    console.answer({"cpu_s": seconds, "kept_in": place})
     return 0
 
 

@@ -1,0 +1,129 @@
+"""Rigs of one kind alone and pooled: errors of parameters and free runs, the population's coverage, ill rigs.
+
+    python benchmarks/identify/fleet.py [--rigs 30] [--seeds 4] [--workers 2]
+
+Each fleet has TCLab boards whose parameters are drawn about a mean that is off the network's own prior: with
+sd 0.15 in the logarithm, of the lags 0.3.  Each board has three logs of 5 min, or one, with random steps,
+white noise of 0.2 K, an AR(1) drift of 0.2 K and 100 s, steps of 0.1 K in the reading, and one room.
+Each is scored by a free run of a log of 20 min that no fit saw, noise left out.  "refit" is a fit with the
+population of the other rigs as prior, which takes the fit's whole curvature; "pooled" the update of its end.
+In a second fleet the first board's G_amb is twice its own (a fan that blows on it).  Simulation and fit share
+the equations: the network is right, and only the number of readings is short.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from scipy.signal import lfilter
+
+from thermogrip.datasets.parallel import run_parallel
+from thermogrip.datasets.schema import make_log
+from thermogrip.sysid.greybox.fit import fit_network
+from thermogrip.sysid.greybox.population import pool_rigs, pooled_plant
+from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.models.network import load_network
+
+NAMES = ("G_amb", "G_between", "power_1", "power_2", "lag_1", "lag_2")
+SPREAD = np.array([0.15, 0.15, 0.15, 0.15, 0.3, 0.3])
+OFF = np.array([0.3, -0.3, 0.2, 0.2, -0.3, -0.3])  # of the mean from the network's prior, in ln
+
+
+def log_of(truth, rng, minutes, *, noise=True):
+    """Return a log of a board."""
+    t, room = np.arange(0.0, 60 * minutes, 2.0), truth.values["t_room"]
+    drives = [np.repeat(rng.uniform(0, 80, t.size // 50 + 1), 50)[: t.size] for _ in range(2)]
+    signals = {f"q{k + 1}": (u, "percent", "input") for k, u in enumerate(drives)}
+    signals |= {name: (np.full(t.size, room), "degC", "output") for name in ("t1", "t2")}
+    run = truth.simulate(make_log(t, signals))
+    for name in ("t1", "t2") if noise else ():
+        push = 0.2 * np.sqrt(1 - np.exp(-2 * 2.0 / 100)) * rng.normal(size=t.size)
+        drift = lfilter([1.0], [1.0, -np.exp(-2.0 / 100)], push)
+        value = run[name].values + drift + 0.2 * rng.normal(size=t.size)
+        run[name] = ("time", 0.1 * np.round(value / 0.1), run[name].attrs)
+    return run.assign_attrs(name=f"log{rng.integers(1e9)}")
+
+
+def fleet(rng, n, n_logs, *, ill=False):
+    """Return the truth of each board (n, 6) as logarithms, its logs, and the one that scores it."""
+    board = prior_plant(load_network("tclab"))
+    prior = np.log([board.values[name] for name in NAMES])
+    theta = prior + OFF + SPREAD * rng.normal(size=(n, len(NAMES)))
+    if ill:
+        theta[0, 0] += np.log(2.0)
+    values = [dict(zip(NAMES, np.exp(row).tolist())) | {"t_room": 23.0 + rng.normal()} for row in theta]
+    truths = [replace(board, values=board.values | each) for each in values]
+    logs = [[log_of(truth, rng, 5) for _ in range(n_logs)] for truth in truths]
+    return theta, logs, [log_of(truth, rng, 20, noise=False) for truth in truths]
+
+
+def fitted(given):
+    """Return the fit of one board."""
+    model, logs = given
+    return fit_network(model, logs)
+
+
+def errors(plants, theta, checks):
+    """Return the rms error of the parameters' logarithms, and of free runs [K]."""
+    found = np.log([[plant.values[name] for name in NAMES] for plant in plants])
+    squares = []
+    for plant, log in zip(plants, checks):
+        run = replace(plant, offsets={}).simulate(log)
+        squares += [float(((run[name] - log[name]) ** 2).mean()) for name in ("t1", "t2")]
+    return np.sqrt(((found - theta) ** 2).mean()), np.sqrt(np.mean(squares))
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--rigs", type=int, default=30)
+    parser.add_argument("--seeds", type=int, default=4)
+    parser.add_argument("--workers", type=int, default=2)
+    given = parser.parse_args()
+    run = partial(run_parallel, fitted, workers=given.workers)
+    model, n = load_network("tclab"), given.rigs
+    print(
+        "logs  alone ln p, K   pooled ln p, K   refit ln p, K   covered  spread found  alarms  ill found  s"
+    )
+    for n_logs in (3, 1):
+        rows, found, alarms, covered, spreads, seconds = [], 0, 0, [], [], []
+        for seed in range(given.seeds):
+            rng = np.random.default_rng([seed, n_logs])
+            theta, logs, checks = fleet(rng, n, n_logs)
+            begin = time.perf_counter()
+            alone = run([(model, each) for each in logs])
+            population, rigs = pool_rigs({f"r{k}": plant for k, plant in enumerate(alone)})
+            seconds.append(time.perf_counter() - begin)
+            pooled = [pooled_plant(plant, rig) for plant, rig in zip(alone, rigs)]
+            refit = run([(rig.others.prior_of(model), each) for rig, each in zip(rigs, logs)])
+            rows.append([errors(plants, theta, checks) for plants in (alone, pooled, refit)])
+            alarms += sum(rig.ill for rig in rigs)
+            at = [population.parameters.index(name) for name in NAMES]
+            spreads.append(np.array(population.spread)[at] / SPREAD)
+            # a rig against the interval that the others give, and new boards against that of all
+            inside = [
+                [r.others.intervals(0.9)[p][0] < v < r.others.intervals(0.9)[p][1]]
+                for r, row in zip(rigs, np.exp(theta)) for p, v in zip(NAMES, row)
+            ]  # fmt: skip
+            covered += inside
+            _, logs, _ = fleet(rng, n, n_logs, ill=True)
+            plants = run([(model, each) for each in logs])
+            with_ill = pool_rigs({f"r{k}": plant for k, plant in enumerate(plants)})[1]
+            found += with_ill[0].ill
+            alarms += sum(rig.ill for rig in with_ill[1:])
+        healthy = (2 * n - 1) * given.seeds
+        a, b, c = np.sqrt(np.mean(np.square(rows), axis=0))
+        print(
+            f"{n_logs:4d}  {a[0]:6.3f} {a[1]:6.2f}   {b[0]:6.3f} {b[1]:6.2f}   {c[0]:6.3f} {c[1]:6.2f}"
+            f"   {np.mean(covered):6.3f}  {np.mean(spreads, axis=0).round(2)}  {alarms}/{healthy}"
+            f"  {found}/{given.seeds}  {np.mean(seconds):.0f}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

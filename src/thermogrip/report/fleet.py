@@ -1,0 +1,94 @@
+"""The page of a fleet: every rig against the population of the others, and what a new rig may have."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from thermogrip.datasets.charts import PALETTE
+from thermogrip.datasets.media import panels
+from thermogrip.report.html import Picture, Section, Table
+from thermogrip.sysid.greybox.population import Population, Rig
+from thermogrip.sysid.plant.plant import Plant
+
+
+def population_table(
+    population: Population, plant: Plant
+) -> tuple[tuple[str, ...], list[tuple[object, ...]]]:
+    """Return head and rows of what a new rig may have, a row a parameter; ``plant`` has the units."""
+    middle, ranges = population.natural(np.array(population.mean)), population.intervals(0.9)
+    head = ("parameter", "unit", "population", "90 % of new rigs from", "to", "spread from rig to rig")
+    rows: list[tuple[object, ...]] = []
+    for k, name in enumerate(population.parameters):
+        unit, spread = plant.units.get(name, "1"), population.spread[k]
+        told = f"{100 * spread:.2g} %" if population.scales[k] == "log" else f"{spread:.2g} {unit}"
+        rows.append((name, unit, float(middle[k]), *ranges[name], told))
+    return head, rows
+
+
+def rig_table(
+    rigs: Sequence[Rig], population: Population
+) -> tuple[tuple[str, ...], list[tuple[object, ...]]]:
+    """Return head and rows of each rig against the others, the farthest first."""
+    head = ("rig", "", "squared distance", "chance in a healthy fleet", "farthest parameter", "off by [sd]")
+    rows: list[tuple[object, ...]] = []
+    for rig in sorted(rigs, key=lambda each: (each.chance, -each.distance)):
+        k = int(np.abs(rig.deviation).argmax())
+        word = "ill" if rig.ill else "ok"
+        far = population.parameters[k]
+        rows.append((rig.name, word, rig.distance, rig.chance, far, float(rig.deviation[k])))
+    return head, rows
+
+
+def fleet_figure(plants: Mapping[str, Plant], population: Population, rigs: Sequence[Rig]) -> Figure:
+    """Draw every parameter of every rig, by its own logs and pooled, on the population's 90 % interval."""
+    n, columns = len(population.parameters), 3
+    rows = -(-n // columns)
+    figure, axes = panels(rows, columns, size=(10.0, rows * (0.9 + 0.17 * len(rigs))))
+    ranges = population.intervals(0.9)
+    y = np.arange(len(rigs))
+    for k, axis in enumerate(axes.ravel()):
+        if k >= n:
+            axis.set_visible(False)
+            continue
+        name = population.parameters[k]
+        axis.axvspan(*ranges[name], color=PALETTE[0], alpha=0.15, lw=0, label="90 % of new rigs")
+        for place, rig in zip(y, rigs):
+            own = plants[rig.name]
+            low, high = own.intervals(0.9)[name]
+            colour = PALETTE[3] if rig.ill else "0.6"
+            axis.plot([low, high], [place - 0.15] * 2, "-", color=colour, lw=1)
+            axis.plot(own.values[name], place - 0.15, "o", color=colour, ms=3, label="by its own logs")
+            pooled = population.natural(rig.pooled)[k]
+            axis.plot(pooled, place + 0.15, "D", color=PALETTE[0], ms=3, label="pooled")
+        low, high = ranges[name]
+        values = [low, high, *(plants[rig.name].values[name] for rig in rigs)]
+        margin = 0.15 * (max(values) - min(values))
+        axis.set_xlim(min(values) - margin, max(values) + margin)  # a short log's interval may be far wider
+        axis.xaxis.set_major_locator(MaxNLocator(4))
+        axis.set_yticks(y, [rig.name for rig in rigs] if k % columns == 0 else [], fontsize=7)
+        axis.set_ylim(len(rigs) - 0.5, -0.5)
+        axis.set_xlabel(f"{name} [{next(iter(plants.values())).units.get(name, '1')}]")
+    handles, labels = axes.flat[0].get_legend_handles_labels()
+    found = dict(zip(labels, handles))
+    figure.legend(list(found.values()), list(found), loc="outside upper center", fontsize=7, ncols=3)
+    return figure
+
+
+def fleet_sections(plants: Mapping[str, Plant], population: Population, rigs: Sequence[Rig]) -> list[Section]:
+    """Return the page's sections."""
+    ill = [rig.name for rig in rigs if rig.ill]
+    words = f"{', '.join(ill)} far from the others" if ill else "No rig is far from the others"
+    head, rows = rig_table(rigs, population)
+    caption = "Distance from the population of the others, 1 on average; less than 0.01 of chance is ill."
+    first = next(iter(plants.values()))
+    names, numbers = population_table(population, first)
+    drawn = "Grey, or red of an ill rig: its own logs, with 90 %. Blue: what all rigs together say of it."
+    return [
+        Section("Which rig is ill?", (Table(head, tuple(rows), caption),), words, "bad" if ill else "good"),
+        Section("What may a new rig have?", (Table(names, tuple(numbers)),)),
+        Section("Each rig", (Picture(fleet_figure(plants, population, rigs), drawn),)),
+    ]

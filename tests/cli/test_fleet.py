@@ -1,0 +1,72 @@
+"""fleet: from folders of logs to a population, to pooled plants and to a prior."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.cli.conftest import Bench
+from thermogrip.datasets.log_files import write_log
+from thermogrip.datasets.schema import make_log
+from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.models.network import load_network
+from thermogrip.sysid.plant.plant import Plant
+
+
+@pytest.fixture
+def rigs(tmp_path: Path) -> Path:
+    """Three boards that lose heat 0.9, 1.0 and 1.1 times as fast as 1.3 times the prior, a log of each."""
+    board, rng = prior_plant(load_network("tclab")), np.random.default_rng(0)
+    t = np.arange(0.0, 400.0, 4.0)
+    signals = {"q1": (60.0 * (t < 200), "percent", "input"), "q2": (40.0 * (t > 100), "percent", "input")}
+    signals |= {name: (np.full(t.size, 23.0), "degC", "output") for name in ("t1", "t2")}
+    for k, factor in enumerate((0.9, 1.0, 1.1)):
+        truth = replace(board, values=board.values | {"G_amb": 0.013 * factor})
+        log = truth.simulate(make_log(t, signals))
+        for name in ("t1", "t2"):
+            log[name] = ("time", log[name].values + 0.1 * rng.normal(size=t.size), log[name].attrs)
+        (tmp_path / f"rigs/b{k}").mkdir(parents=True)
+        write_log(log, tmp_path / f"rigs/b{k}/log.csv")
+    return tmp_path / "rigs"
+
+
+def test_a_fleet_gives_population_plants_page_and_prior(bench: Bench, rigs: Path) -> None:
+    words = ("fleet", str(rigs), "--network", "tclab", "--report", "f.html", "--out", "f", "--json")
+    done = bench.run(*words)
+    answer = json.loads(done.out)
+    assert (done.code, answer["ill"]) == (0, [])
+    low, high = answer["population"]["intervals_90"]["G_amb"]
+    assert low < 0.013 < high
+    assert [rig["rig"] for rig in answer["rigs"]] == ["b0", "b1", "b2"]
+    lost = [Plant.load(bench.path / f"f/b{k}_plant.json").values["G_amb"] for k in range(3)]
+    assert lost == sorted(lost)
+    assert "b2" in (bench.path / "f.html").read_text()
+    log, prior = str(rigs / "b0/log.csv"), str(bench.path / "f/population.json")
+    done = bench.run("identify", log, "--models", "network", "--prior", prior, "--out", "p.json", "--json")
+    assert json.loads(done.out)["model"] == "network"
+    model = Plant.load(bench.path / "p.json").model
+    assert model.specs["G_amb"].value == pytest.approx(np.exp(answer["population"]["mean"][0]))
+
+
+def test_folders_that_are_no_fleet_are_refused(bench: Bench, rigs: Path) -> None:
+    (rigs / "empty").mkdir()
+    done = bench.run("fleet", str(rigs), "--network", "tclab", "--out", "f")
+    assert (done.code, "has no log" in done.err) == (2, True)
+    (rigs / "empty").rmdir()
+    (rigs / "b2/log.csv").unlink()
+    (rigs / "b2").rmdir()
+    done = bench.run("fleet", str(rigs), "--network", "tclab", "--out", "f")
+    assert (done.code, "2 folders" in done.err) == (2, True)
+    done = bench.run("fleet", str(rigs / "b0/log.csv"), "--out", "f")
+    assert (done.code, "is no folder" in done.err) == (2, True)
+
+
+def test_a_prior_needs_its_network(bench: Bench, rigs: Path) -> None:
+    log = str(rigs / "b0/log.csv")
+    done = bench.run("identify", log, "--prior", log, "--out", "p.json")
+    assert done.code == 2
+    assert not (bench.path / "p.json").exists()
