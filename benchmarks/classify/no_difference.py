@@ -41,6 +41,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     EFFUSIVITY,
     LEVEL,
     ONSET,
+    SLIPS,
     T_OBJECT,
     H,
     Hypotheses,
@@ -50,6 +51,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     material_hypotheses,
     nodes_for,
     prior_of,
+    slip_of,
 )
 from thermogrip.sysid.effusivity.mode_kernel import marginals
 from thermogrip.sysid.effusivity.posterior import material_evidence, material_fit
@@ -286,8 +288,9 @@ def summed_evidence(device, data, mode, prior, k, r, n=3000):
     whitener, log_det = whiten(one, device.noise)
     likelihood = marginals(
         *gripper_arguments(device.stack, nodes_for(one)), one.sample_t[0], one.sample_bin[0], one.count[0],
-        one.t[0], one.y[0], one.ramp[0], float(one.t_ambient[0]), whitener[0],
-        *prior.sd[k, [LEVEL, T_OBJECT]].tolist(), u,
+        one.t[0], one.y[0], one.ramp[0], float(one.t_ambient[0]), device.beyond(one.t, u[:, EFFUSIVITY]),
+        whitener[0], *prior.sd[k, [LEVEL, T_OBJECT]].tolist(), SLIPS,
+        float(slip_of(prior.sd[k, T_OBJECT])), u,
     )  # fmt: skip
     return logsumexp(likelihood + log_prior - proposed) - np.log(n) - 0.5 * log_det[0]
 

@@ -72,7 +72,7 @@ from thermogrip.sysid.effusivity.quality import longest_contact
 
 FINISHES = ("auto", "known", "unknown")
 GRIPPERS = ("auto", "same", "uncertain", "another")
-_OTHER_GRIPPER, _OTHER_BLOCKS = 0.1, 0.2  # prior probabilities, the latter given the training's gripper
+_OTHER_GRIPPER, _OTHER_BLOCKS = 0.02, 0.2  # prior probabilities, the latter given the training's gripper
 _SURE = 0.99  # of the training's gripper and blocks, from which on no free effusivity is asked against others
 _ASKED = 5  # grasps of a record about which another gripper is asked first
 _NEEDED = 0.05  # of the odds of another gripper, below which its free effusivity is not asked for

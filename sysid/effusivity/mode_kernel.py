@@ -319,13 +319,23 @@ def modes(
     return covariance, objective, misfit, settled
 
 
+@numba.njit(**INNER)  # type: ignore[untyped-decorator]
+def _integral(r1: float, r2: float, m11: float, m12: float, m22: float) -> float:
+    """Return the log of what integrating over two linear unknowns adds to the density at their means."""
+    v11, v22 = 1.0 + m11, 1.0 + m22
+    det = v11 * v22 - m12 * m12
+    return 0.5 * (v22 * r1 * r1 - 2.0 * m12 * r1 * r2 + v11 * r2 * r2) / det - 0.5 * np.log(det)
+
+
 @numba.njit(**OUTER)  # type: ignore[untyped-decorator]
 def marginals(
     nodes: Nodes, gripper: Gripper, times: Array, bins: NDArray[np.int64], count: Array, t: Array, y: Array,
-    ramp: Array, room: float, beyond: Array, whitener: Array, level_sd: float, t_sd: float, u: Array,
+    ramp: Array, room: float, beyond: Array, whitener: Array, level_sd: float, t_sd: float, slips: float,
+    slip: float, u: Array,
 ) -> Array:  # fmt: skip
     """Return ln p(y | u) up to a constant for n points ``u`` (n, 7) of one grasp, integrated over level and
-    T_obj (prior means in ``u``, sds ``level_sd`` and ``t_sd``)."""
+    T_obj (prior means in ``u``, sds ``level_sd`` and ``t_sd``, the latter ``slip`` times that with the
+    probability ``slips``)."""
     scratch = _scratch(gripper.sensor.size, nodes[2].size, times.size, y.size)
     vary, sd, result = np.zeros(7, dtype=np.bool_), np.zeros(7), np.empty(u.shape[0])
     matrix, gradient = np.zeros((7, 7)), np.zeros(7)
@@ -334,10 +344,12 @@ def marginals(
         _predict(nodes, gripper, u[p], vary, times, bins, count, t, ramp, room, beyond[p], scratch)
         square = _normal_equations(whitener, y, sd, scratch, matrix, gradient)
         r1, r2 = gradient[_LEVEL], gradient[_T]
-        v11, v12, v22 = 1.0 + matrix[_LEVEL, _LEVEL], matrix[_T, _LEVEL], 1.0 + matrix[_T, _T]
-        det = v11 * v22 - v12 * v12
-        gain = (v22 * r1 * r1 - 2.0 * v12 * r1 * r2 + v11 * r2 * r2) / det
-        result[p] = -0.5 * (square - gain) - 0.5 * np.log(det)
+        m11, m12, m22 = matrix[_LEVEL, _LEVEL], matrix[_T, _LEVEL], matrix[_T, _T]
+        gain = np.log(1.0 - slips) + _integral(r1, r2, m11, m12, m22)
+        if slips > 0.0:
+            wide = np.log(slips) + _integral(r1, slip * r2, m11, slip * m12, slip**2 * m22)
+            gain = np.logaddexp(gain, wide)
+        result[p] = gain - 0.5 * square
     return result
 
 

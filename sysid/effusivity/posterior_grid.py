@@ -39,13 +39,16 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     EFFUSIVITY,
     LEVEL,
     ONSET,
+    SLIPS,
     T_OBJECT,
     H,
+    doubted,
     fit_pairs,
     free_hypotheses,
     gripper_arguments,
     nodes_for,
     prior_of,
+    slip_of,
 )
 
 # On the gripper's scale.  Of solids at room temperature plastic foams have least (expanded polystyrene, 32),
@@ -100,10 +103,12 @@ class MarginalPosterior:
         for column, k in ((2, BUILD_UP), (3, ONSET)):
             dof = np.inf if common.dof is None else common.dof[0, k]
             log_prior += _log_student(points[:, column], common.mean[0, k], common.sd[0, k], dof)
+        # a stated temperature of the object may be a slip
+        slips = SLIPS if np.isfinite(data.t_object[0]) else 0.0
         likelihood = marginals(
             *self._arguments, data.sample_t[0], data.sample_bin[0], data.count[0], data.t[0], data.y[0],
             data.ramp[0], float(data.t_ambient[0]), self.gripper.beyond(data.t, points[:, 0]), self.whitener,
-            *common.sd[0, [LEVEL, T_OBJECT]].tolist(), u,
+            *common.sd[0, [LEVEL, T_OBJECT]].tolist(), slips, float(slip_of(common.sd[0, T_OBJECT])), u,
         )  # fmt: skip
         return np.asarray(log_prior + likelihood)
 
@@ -234,9 +239,10 @@ def _evaluate(
     n, m = grid.shape
     row = np.broadcast_to(np.arange(n)[:, None], (n, m))[wanted]
     begin = None if start is None else start[wanted]
-    mode = fit_pairs(
-        gripper, data, row, free_hypotheses(gripper, grid[wanted]), start=begin, max_steps=steps, noise=noise
-    )
+    hypotheses = free_hypotheses(gripper, grid[wanted])
+    prior = prior_of(gripper, data.take(row), hypotheses)
+    mode = fit_pairs(gripper, data, row, hypotheses, start=begin, max_steps=steps, noise=noise, prior=prior)
+    mode = doubted(gripper, data.take(row), prior, mode)
     out = _Fitted(
         grid, np.zeros((n, m)), np.zeros((n, m, 7)), np.zeros((n, m, 7, 7)), np.zeros((n, m), dtype=bool)
     )
