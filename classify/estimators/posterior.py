@@ -20,7 +20,7 @@ gripper may be (:mod:`thermogrip.sysid.effusivity.gripper_model`), and
 :meth:`PosteriorClassifier.for_another_gripper` learns it from a few of its grasps of known blocks.
 
 Nobody need say which: by default a record decides between the training's gripper and blocks, other blocks of
-the same materials, and another gripper, with prior odds :math:`\pi_L` of 0.72, 0.18 and 0.10.  Its grasps j
+the same materials, and another gripper, with prior odds :math:`\pi_L` of 0.784, 0.196 and 0.02.  Its grasps j
 have one gripper and one set of blocks, so
 
 .. math:: p(m | i) \propto \sum_L \pi_L Z_{i m L} \prod_{j \ne i} Z_{j L}, \qquad

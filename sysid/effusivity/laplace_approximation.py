@@ -31,6 +31,11 @@ What a hypothesis expects before the data
 What comes from the gripper and the nominal temperature (build-up time, onset, object temperature) is common
 to all of them.
 
+Somebody stated the nominal temperature, and blocks are mistaken, or not at rest: one in twenty is three times
+as far off as the training's were (Tukey's contaminated normal).  T_obj enters linearly, so the readings' own
+say, the ratio of its posterior and prior, gives mode and evidence under the wider prior too, and the answer is
+the mixture (:func:`doubted`).
+
 Uncertain grippers
 ------------------
 
