@@ -42,7 +42,7 @@ def test_a_controller_of_0_1_0_moves_the_same() -> None:
 # stated temperature of an object may be a slip, and that of this grasp is 1.3 K off
 @pytest.mark.parametrize(
     ("name", "tolerance"),
-    [("bayes", 0.02), ("features-lda", 1e-6), ("pca-lda", 1e-6), ("posterior", 0.06), ("lstm", 1e-4)],
+    [("bayes", 0.02), ("features-lda", 1e-6), ("pca-lda", 1e-6), ("posterior", 0.08), ("lstm", 1e-4)],
 )
 def test_a_classifier_of_0_1_0_answers_the_same(name: str, tolerance: float) -> None:
     row = classify_grasps(load_classifier(OLD / name), read_grasps(OLD / "run" / "grasps.csv"))[0]
