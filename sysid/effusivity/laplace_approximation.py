@@ -721,9 +721,10 @@ def fit_candidates(
     row = np.repeat(np.arange(n), m)
     hypotheses = Hypotheses(*(np.tile(h, n) for h in one))
     begin = None if start is None else start.reshape(n * m, -1)
-    prior = prior_of(gripper, data.take(row), hypotheses)
+    each = data.take(row)
+    prior = prior_of(gripper, each, hypotheses)
     mode = fit_pairs(gripper, data, row, hypotheses, start=begin, prior=prior)
-    return doubted(gripper, data.take(row), prior, mode), prior, row
+    return doubted(gripper, each, prior, mode), prior, row
 
 
 def _trained(gripper: GripperModel, name: str, finish: str) -> tuple[float, ...]:

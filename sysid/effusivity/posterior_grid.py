@@ -240,9 +240,10 @@ def _evaluate(
     row = np.broadcast_to(np.arange(n)[:, None], (n, m))[wanted]
     begin = None if start is None else start[wanted]
     hypotheses = free_hypotheses(gripper, grid[wanted])
-    prior = prior_of(gripper, data.take(row), hypotheses)
+    each = data.take(row)
+    prior = prior_of(gripper, each, hypotheses)
     mode = fit_pairs(gripper, data, row, hypotheses, start=begin, max_steps=steps, noise=noise, prior=prior)
-    mode = doubted(gripper, data.take(row), prior, mode)
+    mode = doubted(gripper, each, prior, mode)
     out = _Fitted(
         grid, np.zeros((n, m)), np.zeros((n, m, 7)), np.zeros((n, m, 7, 7)), np.zeros((n, m), dtype=bool)
     )
