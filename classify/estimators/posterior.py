@@ -20,7 +20,7 @@ gripper may be (:mod:`thermogrip.sysid.effusivity.gripper_model`), and
 :meth:`PosteriorClassifier.for_another_gripper` learns it from a few of its grasps of known blocks.
 
 Nobody need say which: by default a record decides between the training's gripper and blocks, other blocks of
-the same materials, and another gripper, with prior odds :math:`\pi_L` of 0.72, 0.18 and 0.10.  Its grasps j
+the same materials, and another gripper, with prior odds :math:`\pi_L` of 0.784, 0.196 and 0.02.  Its grasps j
 have one gripper and one set of blocks, so
 
 .. math:: p(m | i) \propto \sum_L \pi_L Z_{i m L} \prod_{j \ne i} Z_{j L}, \qquad
@@ -72,7 +72,7 @@ from thermogrip.sysid.effusivity.quality import longest_contact
 
 FINISHES = ("auto", "known", "unknown")
 GRIPPERS = ("auto", "same", "uncertain", "another")
-_OTHER_GRIPPER, _OTHER_BLOCKS = 0.1, 0.2  # prior probabilities, the latter given the training's gripper
+_OTHER_GRIPPER, _OTHER_BLOCKS = 0.02, 0.2  # prior probabilities, the latter given the training's gripper
 _SURE = 0.99  # of the training's gripper and blocks, from which on no free effusivity is asked against others
 _ASKED = 5  # grasps of a record about which another gripper is asked first
 _NEEDED = 0.05  # of the odds of another gripper, below which its free effusivity is not asked for

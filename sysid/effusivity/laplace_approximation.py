@@ -31,6 +31,11 @@ What a hypothesis expects before the data
 What comes from the gripper and the nominal temperature (build-up time, onset, object temperature) is common
 to all of them.
 
+Somebody stated the nominal temperature, and blocks are mistaken, or not at rest: one in twenty is three times
+as far off as the training's were (Tukey's contaminated normal).  T_obj enters linearly, so the readings' own
+say, the ratio of its posterior and prior, gives mode and evidence under the wider prior too, and the answer
+is the mixture (:func:`doubted`).
+
 Uncertain grippers
 ------------------
 
@@ -96,6 +101,9 @@ _EARLIEST_ONSET = 1.5  # s before the closed message
 _SENSORS_APART = 0.3  # K: two thermistors of 1 %
 _DOF, _COUNTS, _GAIN_SD = 20.0, 2.0, 0.1
 _ALIKE_SD = 1.0  # K
+# Tukey's contaminated normal: one stated temperature of an object in twenty is three times as far off
+SLIPS, _SLIP = 0.05, 3.0
+_TELLING = 0.99  # of the prior variance of the temperature that readings leave, if they say anything of it
 _FINISH_SD, _GRADE_SD = 0.4, 0.05  # between blocks of one material: of ln h, and of ln e beside the table's
 
 
@@ -663,6 +671,35 @@ def as_in_training(mode: Mode, prior: Prior, from_room: Array, unknown: Mask) ->
     return mode._replace(u=u, covariance=covariance, log_evidence=evidence)
 
 
+def slip_of(sd: ArrayLike) -> Array:
+    """Return how many times as far off as its ``sd`` [K] a stated temperature that is a slip may be: three,
+    no farther than one that nobody stated."""
+    return np.clip(UNKNOWN_OBJECT_SD / np.asarray(sd), 1.0, _SLIP)
+
+
+def doubted(gripper: GripperModel, data: Touches, prior: Prior, mode: Mode) -> Mode:
+    """Return the modes of pairs, a row of data each, where the stated temperature of an object may be off by
+    more than the training's were: with a probability of 0.05 the sd about it is three times its own."""
+    off = gripper.nominal_sd(data.t_ambient - data.t_object) if gripper.uncertain else 0.0
+    v0 = prior.sd[:, T_OBJECT] ** 2 + np.square(off)
+    x0, v = prior.mean[:, T_OBJECT], mode.covariance[:, T_OBJECT, T_OBJECT]
+    # readings that say nothing of it cannot contradict it
+    seen_at_all = np.isfinite(data.t_object) & (v < _TELLING * v0)
+    precision = np.where(seen_at_all, 1 / v - 1 / v0, 1.0)
+    seen, width = x0 + (mode.u[:, T_OBJECT] - x0) / (v * precision), 1 / precision
+    wide = slip_of(np.sqrt(v0)) ** 2 * v0
+    ratio = _log_normal(seen - x0, wide + width) - _log_normal(seen - x0, v0 + width)
+    slip = np.where(seen_at_all, SLIPS * np.exp(np.clip(ratio, -700.0, 300.0)), 0.0)
+    total = np.where(seen_at_all, 1 - SLIPS, 1.0) + slip
+    share, apart = slip / total, (wide * seen + width * x0) / (wide + width) - mode.u[:, T_OBJECT]
+    within = share * (wide * width / (wide + width) - v) + share * (1 - share) * apart**2
+    # the rest of what is unknown goes along with the temperature
+    column = mode.covariance[:, :, T_OBJECT] / v[:, None]
+    u = mode.u + column * (share * apart)[:, None]
+    covariance = mode.covariance + within[:, None, None] * column[:, :, None] * column[:, None, :]
+    return mode._replace(u=u, covariance=covariance, log_evidence=mode.log_evidence + np.log(total))
+
+
 def _seen_temperature(mode: Mode, prior: Prior) -> tuple[Array, Array]:
     """Return what the readings alone say of T_obj, the ratio of posterior and prior: mean and variance."""
     x0, v = prior.mean[:, T_OBJECT], mode.covariance[:, T_OBJECT, T_OBJECT]
@@ -685,8 +722,10 @@ def fit_candidates(
     row = np.repeat(np.arange(n), m)
     hypotheses = Hypotheses(*(np.tile(h, n) for h in one))
     begin = None if start is None else start.reshape(n * m, -1)
-    prior = prior_of(gripper, data.take(row), hypotheses)
-    return fit_pairs(gripper, data, row, hypotheses, start=begin, prior=prior), prior, row
+    each = data.take(row)
+    prior = prior_of(gripper, each, hypotheses)
+    mode = fit_pairs(gripper, data, row, hypotheses, start=begin, prior=prior)
+    return doubted(gripper, each, prior, mode), prior, row
 
 
 def _trained(gripper: GripperModel, name: str, finish: str) -> tuple[float, ...]:

@@ -39,13 +39,16 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     EFFUSIVITY,
     LEVEL,
     ONSET,
+    SLIPS,
     T_OBJECT,
     H,
+    doubted,
     fit_pairs,
     free_hypotheses,
     gripper_arguments,
     nodes_for,
     prior_of,
+    slip_of,
 )
 
 # On the gripper's scale.  Of solids at room temperature plastic foams have least (expanded polystyrene, 32),
@@ -65,18 +68,27 @@ _LOG_WEIGHT = 1.5 - np.log(6.0) - 0.5 * np.log(2 * np.pi) + np.log(_STEP)
 
 def marginals(arguments: Any, data: Touches, whitener: Array, beyond: Array, sd: Array, u: Array) -> Array:
     """Return ln p(y | u) up to a constant for n points ``u`` (n, 7) of one grasp, integrated over level and
-    T_obj (prior means in ``u``, sds in ``sd`` (7,)); ``arguments`` are of
+    T_obj (prior means in ``u``, sds in ``sd`` (7,)), the latter a slip with a probability of ``SLIPS`` where
+    it is stated; ``arguments`` are of
     :func:`~thermogrip.sysid.effusivity.laplace_approximation.gripper_arguments`."""
     from thermogrip.sysid.effusivity.mode_kernel import modes
 
     law = np.zeros((len(u), 3, u.shape[1]))
     law[:, 0], law[:, 2] = u, np.inf
-    law[:, 1, [LEVEL, T_OBJECT]] = sd[[LEVEL, T_OBJECT]]
-    _, objective, _, _ = modes(
-        *arguments, np.zeros(len(u), dtype=np.int64), data.sample_t, data.sample_bin, data.count, data.t,
-        data.y, data.ramp, data.t_ambient, beyond, whitener, law, u.copy(), 0,
-    )  # fmt: skip
-    return np.asarray(-0.5 * objective)
+
+    def integrated(t_sd: float) -> Array:
+        law[:, 1, LEVEL], law[:, 1, T_OBJECT] = sd[LEVEL], t_sd
+        _, objective, _, _ = modes(
+            *arguments, np.zeros(len(u), dtype=np.int64), data.sample_t, data.sample_bin, data.count, data.t,
+            data.y, data.ramp, data.t_ambient, beyond, whitener, law, u.copy(), 0,
+        )  # fmt: skip
+        return np.asarray(-0.5 * objective)
+
+    stated = integrated(sd[T_OBJECT])
+    if not np.isfinite(data.t_object[0]):
+        return stated
+    slip = integrated(sd[T_OBJECT] * float(slip_of(sd[T_OBJECT])))
+    return np.logaddexp(np.log1p(-SLIPS) + stated, np.log(SLIPS) + slip)
 
 
 class MarginalPosterior:
@@ -245,9 +257,11 @@ def _evaluate(
     n, m = grid.shape
     row = np.broadcast_to(np.arange(n)[:, None], (n, m))[wanted]
     begin = None if start is None else start[wanted]
-    mode = fit_pairs(
-        gripper, data, row, free_hypotheses(gripper, grid[wanted]), start=begin, max_steps=steps, noise=noise
-    )
+    hypotheses = free_hypotheses(gripper, grid[wanted])
+    each = data.take(row)
+    prior = prior_of(gripper, each, hypotheses)
+    mode = fit_pairs(gripper, data, row, hypotheses, start=begin, max_steps=steps, noise=noise, prior=prior)
+    mode = doubted(gripper, each, prior, mode)
     out = _Fitted(
         grid, np.zeros((n, m)), np.zeros((n, m, 7)), np.zeros((n, m, 7, 7)), np.zeros((n, m), dtype=bool)
     )

@@ -143,7 +143,7 @@ def test_what_is_none_of_them_is_called_unknown() -> None:
     files, model = load_example_grasps(), PosteriorClassifier().with_device(load_default_gripper())
     others, home = files["exp6_other_materials_obj43_grip23"], files["exp1A_obj43_grip23"]
     far = np.isin(others["material"].values, ["glass", "acrylic", "rubber", "cork", "stainless"])
-    assert np.all(model.p_unknown(pick(others, far), FIVE) > 0.9)
+    assert np.all(model.p_unknown(pick(others, far), FIVE) > 0.85)
     assert np.median(model.p_unknown(pick(home, home["split"].values == "test"), FIVE)) < 0.1
 
 
@@ -270,9 +270,9 @@ def test_what_a_record_decides_is_the_mixture_of_its_explanations(
     """Each grasp of two by Bayes' rule, the other one and its materials summed over."""
     pair, names = pick(metals, [0, 1]), ["brass", "copper"]
     levels = [
-        (0.72, known.device_, "known"),
-        (0.18, known.device_, "unknown"),
-        (0.10, another_gripper(known.device_), "known"),
+        (0.784, known.device_, "known"),
+        (0.196, known.device_, "unknown"),
+        (0.02, another_gripper(known.device_), "known"),
     ]
     z = [material_evidence(device, pair, names, finish=finish) for _, device, finish in levels]
     free = [fit.log_evidence for fit in grid_posteriors(known.device_, touches(pair))]
@@ -287,6 +287,20 @@ def test_what_a_record_decides_is_the_mixture_of_its_explanations(
     np.testing.assert_allclose(np.exp(known.candidate_log_proba(pair, names)), want, rtol=1e-6)
 
 
+def test_one_block_far_from_its_stated_temperature_makes_no_other_gripper(known: PosteriorClassifier) -> None:
+    """Copper at 16.3 degC, stated as 18 +- 0.36, touched 0.17 s before the message."""
+    device = known.device_
+    grip = replace(device.grip(), onset=-0.17, onset_sd=0.0, bias=0.0, t_object_sd=0.0)
+    one = simulate_grasps(
+        grip, ["copper"], t_gripper=38.0, t_object=16.3, seed=2, ambient=25.0, **device.readings()
+    )
+    one = one.assign(t_object=("grasp", [18.0]))
+    (row,) = classify_grasps(known, one)
+    assert (row["material"], "note" in row) == ("copper", False)
+    assert row["p_copper"] > 0.8
+    assert row["p_unknown"] < 0.1
+
+
 def test_a_gripper_with_a_discrepancy_is_taken_for_no_other(known: PosteriorClassifier) -> None:
     device, n = known.device_, len(known.device_.blocks)
     odd = Discrepancy(np.zeros(KNOTS.size), np.zeros((n, KNOTS.size)), np.zeros(n), np.zeros(0))
@@ -294,7 +308,7 @@ def test_a_gripper_with_a_discrepancy_is_taken_for_no_other(known: PosteriorClas
         PosteriorClassifier().with_device(d)._levels() for d in (device, replace(device, discrepancy=odd))
     ]
     assert [[level.prior for level in some] for some in levels] == [
-        pytest.approx([0.72, 0.18, 0.1]), pytest.approx([0.8, 0.2])
+        pytest.approx([0.784, 0.196, 0.02]), pytest.approx([0.8, 0.2])
     ]  # fmt: skip
     assert not any(level.device.uncertain for level in levels[1])
 

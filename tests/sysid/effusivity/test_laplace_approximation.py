@@ -621,3 +621,38 @@ def test_a_search_starts_from_the_likeliest_hypothesis_gripper_where_that_is_bet
     assert laplace._start(None, np.zeros(7), np.ones(3)).a.any() == taken
     assert not laplace._start(None, np.zeros(7), np.zeros(3)).a.any()
     assert asked == [False, True, False]
+
+
+@pytest.mark.parametrize("off", [0.0, 0.7, 2.5])
+def test_a_stated_temperature_may_be_a_slip(device, off):
+    """One in twenty is three times as far off: the mixture of the answers under each, put together again."""
+    grasp = load_example_grasps()["exp2_dT20"].isel(grasp=[2])
+    grasp = grasp.assign(t_object=grasp["t_object"] + off, t_object_sd=("grasp", [0.4]))
+    names = ["copper", "iron"]
+    data, one, row = touches(grasp), material_hypotheses(device, names), np.zeros(2, dtype=np.int64)
+    usual = prior_of(device, data.take(row), one)
+    wide = usual._replace(sd=usual.sd * np.where(np.arange(7) == laplace.T_OBJECT, 3.0, 1.0))
+    parts = [laplace.fit_pairs(device, data, row, one, prior=prior) for prior in (usual, wide)]
+    weighed = np.array([np.log(0.95), np.log(0.05)])[:, None] + [p.log_evidence for p in parts]
+    got = laplace.fit_candidates(device, data, names)[0]
+    # the others of a contact are nearly normal given its temperature
+    np.testing.assert_allclose(got.log_evidence, logsumexp(weighed, axis=0), atol=0.15)
+    share = np.exp(weighed - logsumexp(weighed, axis=0))
+    means = np.array([p.u[:, laplace.T_OBJECT] for p in parts])
+    mean = (share * means).sum(axis=0)
+    variance = (share * [p.covariance[:, laplace.T_OBJECT, laplace.T_OBJECT] for p in parts]).sum(axis=0)
+    variance += (share * (means - mean) ** 2).sum(axis=0)
+    np.testing.assert_allclose(got.u[:, laplace.T_OBJECT], mean, atol=0.05)
+    found = got.covariance[:, laplace.T_OBJECT, laplace.T_OBJECT]
+    np.testing.assert_allclose(found, variance, rtol=0.15)
+    assert share[1, 0] > 0.9 if off == 2.5 else share[1, 0] < 0.2
+
+
+def test_a_temperature_that_nobody_stated_is_no_slip(device):
+    grasp = load_example_grasps()["exp2_dT20"].isel(grasp=[2])
+    data = touches(grasp.assign(t_object=("grasp", [np.nan])))
+    one = material_hypotheses(device, ["copper"])
+    plain = laplace.fit_pairs(device, data, np.zeros(1, dtype=np.int64), one)
+    got = laplace.fit_candidates(device, data, ["copper"])[0]
+    for a, b in zip(got, plain):
+        np.testing.assert_array_equal(a, b)

@@ -304,4 +304,5 @@ def test_fits_are_laid_out_by_grasp_and_candidate_and_may_start_from_another(dev
     assert alone.h_c == pytest.approx(np.exp(alone.u[:, :, 0]))
     assert alone.t_object == pytest.approx(alone.u[:, :, 4])
     again = material_fit(device, record, names, start=whole.u)
-    np.testing.assert_allclose(again.log_evidence, whole.log_evidence, atol=0.5)
+    near = whole.log_evidence > whole.log_evidence.max(axis=1, keepdims=True) - 100
+    np.testing.assert_allclose(again.log_evidence[near], whole.log_evidence[near], atol=0.5)
