@@ -15,6 +15,15 @@ from typing import Any, Protocol, runtime_checkable
 UNIT_RANGES = {"1": (-1.0, 1.0), "percent": (0.0, 100.0), "0_255": (0.0, 255.0)}
 
 
+def range_of(unit: str, seen: tuple[float, float] | None) -> tuple[float, float] | None:
+    """Return what a drive may be: by its unit, else what the logs showed; a column without a unit may have
+    been in percent."""
+    usual = UNIT_RANGES.get(unit)
+    if usual is not None and (unit != "1" or seen is None or -1.05 <= seen[0] <= seen[1] <= 1.05):
+        return usual
+    return seen
+
+
 class DeviceRefusedError(Exception):
     """The device refuses a request: a code of the protocol's refusals, and the latched faults."""
 

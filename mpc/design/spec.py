@@ -5,19 +5,23 @@ The template in :data:`SPEC_TEMPLATE` is the documentation: ``thermogrip init sp
 
 from __future__ import annotations
 
+import json
+import math
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from thermogrip.datasets.atomic_files import read_toml
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.limits import LARGEST
-from thermogrip.mpc.design.design import Design, default_design
-from thermogrip.mpc.plant.prediction import drive_names, drive_range
+from thermogrip.mpc.design.design import Design, default_controlled, default_design
+from thermogrip.mpc.plant.prediction import drive_names, drive_range, step_response
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
@@ -26,6 +30,7 @@ SPEC_TEMPLATE = (files(__package__) / "spec.toml").read_text(encoding="utf-8")
 
 _WATER = (2.0, 65.0)  # degC: neither ice nor scald in a tank of water
 _SAMPLES = 5  # of a step, at least
+_LEAST_SEEN = 1.0  # range of the logs [degC] within which steps would be lost in the noise
 _TAGS = ("tuple[", "dict[", "list[", "constrained-", "str")  # pydantic's names for one of several forms
 
 Positive = Annotated[float, Field(gt=0, le=LARGEST, allow_inf_nan=False)]
@@ -106,6 +111,45 @@ class Spec(BaseModel):
             raise ValueError(f"settle_within_s: {self.settle_within_s:g} s is {seen}")
         return self
 
+    @classmethod
+    def of(cls, plant: Plant) -> Spec:
+        """Return what is wanted where nobody said: of a skin the defaults; of another plant the output that
+        each drive moves most, a step up and one down inside what the logs showed, and the time that the plant
+        takes by itself."""
+        usual = default_controlled(plant)
+        if usual == ("t_surface",):
+            return cls()
+        times = _own_times(plant)
+        while times:
+            seen = [plant.valid.get(name, (0.0, 0.0)) for name in times]
+            low, high = max(ends[0] for ends in seen), min(ends[1] for ends in seen)
+            if high - low > _LEAST_SEEN:
+                break
+            times.popitem()
+        else:
+            return cls()
+        below, above = _rounded(low + 0.3 * (high - low), low + 0.7 * (high - low))
+        wanted: dict[str, Any] = {"steps": [(below, above), (above, below)]}
+        if {*times} != {*usual}:
+            wanted["output"] = list(times)
+        for key, share in (("band_degC", 0.025), ("overshoot_degC", 0.05), ("bias_degC", 0.01)):
+            least = cls.model_fields[key].default
+            wanted[key] = float(f"{max(least, share * (above - below)):.2g}")
+        wanted["settle_within_s"] = float(f"{np.clip(3 * max(times.values()), 7.5, 27000):.2g}")
+        wanted["hold_s"] = float(f"{wanted['settle_within_s'] / 0.75:.2g}")
+        if plant.disturbances and plant.disturbances[0] in plant.valid:
+            room = float(np.mean(plant.valid[plant.disturbances[0]]))
+            wanted["ambient_degC"] = round(min(max(room, -20.0), 150.0), 1)
+        return cls(**wanted)
+
+    def in_toml(self) -> str:
+        """Return the template with these values."""
+        text = SPEC_TEMPLATE.replace("are the defaults", "are what tune takes for the plant")
+        for key in sorted(self.model_fields_set):
+            line = f"{key} = {json.dumps(getattr(self, key))} ".ljust(27)
+            text = re.sub(rf"(?m)^(?:# )?{key} = [^#\n]*", line, text)
+        return re.sub(r"(?m) +$", "", text)
+
     def widened(self, plant: Plant) -> Plant:
         """Return the plant with drives as wide as the spec has them, where only the logs showed how wide."""
         ranges = dict(plant.valid)
@@ -142,6 +186,23 @@ class Spec(BaseModel):
                 raise UserError(f"weights: {name} is not regulated", hint=hint)
         values["weights"] = dict(self.weights or {})
         return replace(design, **values, **changes)
+
+
+def _own_times(plant: Plant) -> dict[str, float]:
+    """Return the output that each drive moves most, of those that are left, with its delay and lag [s]."""
+    times: dict[str, float] = {}
+    for drive in drive_names(plant):
+        answers = {name: step_response(plant, drive, name) for name in plant.outputs if name not in times}
+        name = max(answers, key=lambda each: abs(answers[each].gain), default="")
+        if name and answers[name].gain:
+            times[name] = answers[name].delay + answers[name].lag
+    return times
+
+
+def _rounded(low: float, high: float) -> tuple[float, float]:
+    """Return both to the digits that a hundredth of their difference has."""
+    digits = 1 - math.floor(math.log10(high - low))
+    return round(low, digits), round(high, digits)
 
 
 def _check_sample(spec: Spec, plant: Plant) -> None:

@@ -270,7 +270,7 @@ def tune(
     plant : Plant
         With its uncertainty where it has any: draws of it close the loop.
     spec : Spec, optional
-        What is wanted; the defaults where absent.
+        What is wanted; where absent, :meth:`Spec.of` the plant.
     progress : callable, optional
         Called with (fraction done, what is being done).
     workers : int or str, optional
@@ -295,7 +295,7 @@ def tune(
     >>> found.verdict, [row.controller for row in found.rows]
     ('actuator-limited', ['baseline', 'tuned', 'PI', 'LQR'])
     """
-    spec = Spec() if spec is None else spec
+    spec = Spec.of(plant) if spec is None else spec
     plant = spec.widened(plant)
     baseline = spec.design(plant)
     search = Search(plant, spec, baseline, seed)

@@ -53,7 +53,7 @@ from thermogrip.rig.guard.model_checks import ModelMonitor, ModelSettings, Resid
 from thermogrip.rig.guard.plant_mismatch import PlantDrift
 from thermogrip.rig.guard.sensor_checks import SensorMonitor, SensorSettings, room_disturbances, room_sensors
 from thermogrip.rig.guard.trip import KINDS, Trip
-from thermogrip.rig.interface import UNIT_RANGES, Reading
+from thermogrip.rig.interface import Reading, range_of
 from thermogrip.sysid.plant.plant import Plant
 
 #: A limit is not exceeded by more than this before power is off [K].
@@ -248,7 +248,7 @@ class Guard:
         drift: PlantDrift | None = None,
     ) -> None:
         self.settings = GuardSettings() if settings is None else settings
-        self.skin = skin
+        self.skin, self._ranges = skin, {} if plant is None else plant.valid
         self.model = None if plant is None else ModelMonitor(plant, self.settings.model, drift)
         self.sensors = SensorMonitor(self.settings.sensors)
         self.rules = RuleMonitor(self.settings.rules)
@@ -262,7 +262,7 @@ class Guard:
         what the model knows of the rig from a session that ended well a few minutes ago."""
         age = reading.time_s - self._time
         known = not self.trips and 0 <= age <= _KEPT_S
-        self._span = {name: UNIT_RANGES.get(unit, (-1.0, 1.0)) for name, unit in units.items()}
+        self._span = {name: range_of(unit, self._ranges.get(name)) or (-1.0, 1.0) for name, unit in units.items()}
         self._time, self._now, self._fresh_at = reading.time_s, now, now
         self._seen = float("nan")
         self._drive, self._pump = dict.fromkeys(units, 0.0), reading.pump

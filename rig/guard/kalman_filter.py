@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.limits import keyed
 from thermogrip.rig.guard.sensor_checks import room_disturbances
-from thermogrip.rig.interface import UNIT_RANGES
+from thermogrip.rig.interface import range_of
 from thermogrip.sysid.plant.plant import Plant
 
 
@@ -157,8 +157,7 @@ class RigModel:
         self.p = plant.p  # or better ones
 
     def _range(self, name: str) -> tuple[float, float]:
-        unit = self.plant.units.get(name, "1")
-        return UNIT_RANGES.get(unit) or self.plant.valid.get(name) or (-1.0, 1.0)
+        return range_of(self.plant.units.get(name, "1"), self.plant.valid.get(name)) or (-1.0, 1.0)
 
     def biased(self, u: Array, w: Array) -> Array:
         """Return inputs (..., n_u) as the rig gets them where its drives have biases w (n_w,)."""

@@ -34,7 +34,7 @@ import numpy as np
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.rig.guard.sensor_checks import room_disturbances
-from thermogrip.rig.interface import UNIT_RANGES, Event, Reading, check_order
+from thermogrip.rig.interface import Event, Reading, check_order, range_of
 from thermogrip.sysid.contact.simulation import ContactModel, Touch
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 from thermogrip.sysid.plant.plant import Plant
@@ -339,7 +339,8 @@ class Twin:
 
 def _input_range(plant: Plant, name: str) -> tuple[float, float]:
     unit = plant.units.get(name, "1")
-    if unit not in UNIT_RANGES:
+    known = range_of(unit, plant.valid.get(name) if unit == "1" else None)
+    if known is None:
         problem = f"the range of {name} [{unit}] is unknown"
         raise UserError(problem, hint=f"give it: limits={{{name!r}: (lo, hi)}}")
-    return UNIT_RANGES[unit]
+    return known

@@ -121,6 +121,8 @@ def test_a_grasp_without_a_contact_has_no_effusivity(gripper: SimpleNamespace) -
     gripper.why = ["no contact", ""]
     done = gripper.bench.run("effusivity", "grasps.csv", "--out", "e.csv")
     assert "no contact, so no effusivity: a, c\n" in done.out
+    page = gripper.bench.run("effusivity", "grasps.csv", "--out", "e.csv", "--report", "e.html")
+    assert "1 of 3 grasps have an effusivity." in (gripper.bench.path / "e.html").read_text(), page
     answer = json.loads(gripper.bench.run("effusivity", "grasps.csv", "--out", "e.csv", "--json").out)
     assert answer["without_contact"] == ["a", "c"]
     first = answer["grasps"][0]

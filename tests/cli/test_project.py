@@ -10,6 +10,8 @@ from typing import Any
 import pytest
 
 from tests.cli.conftest import Bench, StandIn, shares
+from tests.mpc.makers import network_plant
+from thermogrip.mpc.design.spec import Spec, read_spec
 from thermogrip.report.html import Section
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.network_spec import builtin_networks
@@ -102,10 +104,20 @@ def test_a_network_starts_from_a_shipped_one(name: str, bench: Bench) -> None:
     assert name in " ".join(bench.run("init", "--help").out.split())
 
 
+def test_a_spec_like_a_plant_is_what_tune_takes_for_it(bench: Bench) -> None:
+    plant = network_plant("tclab", t1=(24.0, 64.0), t2=(26.0, 70.0))
+    plant.save("plant.json")
+    done = bench.run("init", "spec", "--like", "plant.json", "--out", "spec.toml")
+    then = "next: thermogrip tune plant.json --spec spec.toml --out controller.json\n"
+    assert (done.code, done.err) == (0, then)
+    assert read_spec("spec.toml") == Spec.of(plant) != Spec()
+
+
 def test_what_is_like_no_network_is_refused(bench: Bench) -> None:
     for words, says in (
         ("network --like oven", "--like 'oven' is unknown; use furnace"),
-        ("spec --like tank", "not of spec"),
+        ("guard --like tank", "not of guard"),
+        ("spec --like plnt.json", "no such file"),
     ):
         done = bench.run("init", *words.split())
         assert (done.code, len(done.said)) == (2, 1)

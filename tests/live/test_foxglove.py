@@ -47,4 +47,9 @@ def test_a_viewer_gets_the_channels_of_the_run_and_the_layout_names_them(tmp_pat
         running.result()
     named = set(re.findall(r'"(/[a-z_]+)(?:\.value)?"', layout.read_text()))
     assert named == set(topics)
-    assert json.loads(layout.read_text())["content"]["direction"] == "column"
+    content = json.loads(layout.read_text())  # as the application exports it
+    assert {"configById", "globalVariables", "userNodes", "playbackConfig", "layout"} == set(content)
+    split, panels = content["layout"], [content["layout"]["first"]]
+    panels += [split["second"]["first"], split["second"]["second"]]
+    assert panels == list(content["configById"])
+    assert [panel.partition("!")[0] for panel in panels] == ["Plot", "Plot", "RawMessages"]

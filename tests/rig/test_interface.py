@@ -11,7 +11,7 @@ import pytest
 
 from tests.rig.makers import DirectPort, SteppedClock
 from thermogrip.rig.drivers.connect import open_rig
-from thermogrip.rig.interface import Rig
+from thermogrip.rig.interface import Rig, range_of
 from thermogrip.rig.simulation.twin import Twin
 from thermogrip.rig.simulation.virtual_device import VirtualDevice
 from thermogrip.sysid.plant.plant import Plant
@@ -125,3 +125,18 @@ def test_what_is_handed_on_cannot_be_changed(module: str) -> None:
     assert made
     for one in made:
         assert one.__dataclass_params__.frozen == (one.__name__ not in CHANGING), one
+
+
+@pytest.mark.parametrize(
+    ("unit", "seen", "known"),
+    [
+        ("percent", (5.0, 40.0), (0.0, 100.0)),
+        ("1", (0.1, 0.6), (-1.0, 1.0)),
+        ("1", None, (-1.0, 1.0)),
+        ("1", (0.0, 100.0), (0.0, 100.0)),  # percent, in a column that does not say so
+        ("W", (0.0, 12.0), (0.0, 12.0)),
+        ("W", None, None),
+    ],
+)
+def test_the_range_of_a_drive_is_its_units_unless_the_logs_left_it(unit, seen, known):
+    assert range_of(unit, seen) == known

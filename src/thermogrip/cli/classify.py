@@ -99,7 +99,7 @@ def training_part(console: Console, records: Sequence[Grasps], split: str | None
     return kept
 
 
-SHOWN = 40  # rows of a long table
+SHOWN, ON_A_PAGE = 40, 200  # rows of a long table: printed, and in a report
 _HEADS = {"answer": "answer", "next_touch_degC": "touch at [degC]", "next_touch_accuracy": "then right"}
 
 ObjectRange = Annotated[
@@ -121,6 +121,7 @@ def effusivity(
         cli.opt("--calibrate", "GRASPS", "Labelled grasps that describe your gripper; may be repeated."),
     ] = None,
     between: ObjectRange = None,
+    report: cli.Report = None,
     seed: cli.Seed = 0,
     as_json: cli.AsJson = False,
 ) -> int:
@@ -184,6 +185,14 @@ def effusivity(
         _say_more(console, missed.count[why])
     unexplained.say(console)
     console.say(f"wrote {out}")
+    if report is not None:
+        from thermogrip.report.classification import effusivity_section
+        from thermogrip.report.html import write_report
+
+        pairs = islice(((row, part["unexplained"]) for part in found for row in part["rows"]), ON_A_PAGE)
+        noted = [(row, why.get(row["grasp_id"], "")) for row, why in pairs]
+        lead = "How fast the touched objects take up heat, grasp by grasp."
+        write_report(report, "Effusivity", lead, [effusivity_section(noted, found.grasps)])
     if as_json:
         parts = list(found)
         console.answer({
@@ -191,6 +200,7 @@ def effusivity(
             "without_contact": [name for part in parts for name in part["missed"]],
             "unexplained": {name: why for part in parts for name, why in part["unexplained"].items()},
             "out": out,
+            "report": report,
         })  # fmt: skip
     found.remove()
     return 0

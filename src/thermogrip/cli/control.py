@@ -24,7 +24,11 @@ def tune(
     out: Annotated[Path, cli.opt("--out", "FILE.json", "Where the controller goes.")],
     spec: Annotated[
         Path | None,
-        cli.opt("--spec", "SPEC.toml", "What is wanted; `thermogrip init spec` writes one to edit."),
+        cli.opt(
+            "--spec",
+            "SPEC.toml",
+            "What is wanted; `init spec --like PLANT` writes one to edit [default: that one].",
+        ),
     ] = None,
     report: cli.Report = None,
     network: cli.OwnNetwork = None,
@@ -44,9 +48,15 @@ def tune(
 
     pool = cli.workers_of(workers, cluster)
     loaded = cli.load_plant(plant, network)
-    wanted = Spec() if spec is None else read_spec(spec)
+    wanted = Spec.of(loaded) if spec is None else read_spec(spec)
     cli.new_file(out, (".json",))
     console = Console(as_json)
+    if spec is None:
+        steps = ", ".join(f"{start:g} to {target:g}" for start, target in wanted.steps)
+        console.say(
+            f"No --spec: steps {steps}, each within {wanted.band_degC:g} after {wanted.settle_within_s:g} s; "
+            f"'thermogrip init spec --like {plant} --out spec.toml' writes what was taken, to edit"
+        )
     with kept_processes(pool), console.progress("tune") as progress, _naming(spec, tuple(Spec.model_fields)):
         found = search(loaded, wanted, progress=progress, workers=pool, seed=seed)
     result = _written(console, found, f"A controller for {plant.name}", out, report)

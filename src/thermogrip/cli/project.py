@@ -90,9 +90,9 @@ def init(
         str | None,
         cli.opt(
             "--like",
-            "NAME",
+            "PLANT|NAME",
             "Of a network: start from gripper, tclab, peltier_chamber, room, hotend, furnace, tank "
-            "or thermal_chamber.",
+            "or thermal_chamber; of a spec: what tune takes for this plant.",
         ),
     ] = None,
     out: Annotated[
@@ -108,8 +108,8 @@ def init(
     examples: logs and grasps of a simulated rig, to try every verb on."""
     cli.choice("template", what, (*TEMPLATES, "examples"))
     console = Console(as_json)
-    if like is not None and what != "network":
-        raise UserError(f"--like {like} is of a network, not of {what}", hint="write init network --like")
+    if like is not None and what not in ("network", "spec"):
+        raise UserError(f"--like {like} is of a network or a spec, not of {what}", hint="leave it out")
     if what == "examples":
         return _examples(console, out or Path())
     text = _template(what, like)
@@ -168,6 +168,10 @@ def _template(what: str, like: str | None) -> str:
     """Return the text of a template, or of a shipped network that one is to start from."""
     if like is None:
         return template_text(what)
+    if what == "spec":
+        from thermogrip.mpc.design.spec import Spec
+
+        return Spec.of(cli.load_plant(Path(like))).in_toml()
     from thermogrip.sysid.models.network_spec import builtin_networks
 
     name = cli.choice("--like", like, builtin_networks())

@@ -513,7 +513,8 @@ def rig_of(
 def _twin(
     path: Path, network: str | None, draw: int, controller: Controller, *, seed: int, t_start: float | None
 ) -> Twin:
-    """Return the simulated rig; a drive whose unit says no range has the controller's."""
+    """Return the simulated rig; a drive whose unit does not say its range has the controller's."""
+    from thermogrip.rig.interface import UNIT_RANGES
     from thermogrip.rig.simulation.twin import Twin
     from thermogrip.sysid.plant.plant import Plant
 
@@ -523,9 +524,8 @@ def _twin(
         if network is None:
             raise
         plant = cli.load_plant(path, network)
-    known = ("1", "percent", "0_255")
     ranges = controller.design.drive_range
-    limits = {name: ends for name, ends in ranges.items() if plant.units.get(name, "1") not in known}
+    limits = {name: ends for name, ends in ranges.items() if plant.units.get(name, "1") not in UNIT_RANGES}
     return Twin(plant.draw(draw), seed=seed, t_start=t_start, limits=limits)
 
 

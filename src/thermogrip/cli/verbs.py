@@ -57,7 +57,7 @@ class Verb(TyperCommand):
 
     def next(self, given: dict[str, Any]) -> str:
         """Return the command that comes next, with what was given in place of its names."""
-        words = {str(param.name): param.metavar for param in self.params}
+        words = {str(param.name): str(param.metavar).split("|")[0] for param in self.params}
         then = self.then if isinstance(self.then, str) else self.then[given.get("what", "network")]
         return str(then).format(**words | {k: printable(shlex.quote(str(v))) for k, v in given.items()})
 

@@ -8,6 +8,7 @@ It is a view: nothing that Foxglove sends is taken.
 
 from __future__ import annotations
 
+import json
 import time
 from typing import Any
 
@@ -47,20 +48,33 @@ class Mirror:
         self._shown = events
 
     def layout(self, columns: list[str], units: list[str]) -> str:
-        """Return the layout file of these columns: temperatures with the target, drives, what happened."""
-        from foxglove import layouts as fl
+        """Return the layout file of these columns: temperatures with the target, drives, what happened.
 
-        def plot(title: str, names: list[str]) -> Any:
-            series = [fl.PlotSeries(value=f"/{name}.value", label=name) for name in names]
-            return fl.PlotPanel(title=title, config=fl.PlotConfig(paths=series))
+        It is what the application exports and imports; what ``foxglove.layouts`` builds is for notebooks alone.
+        """
+
+        def plot(title: str, names: list[str]) -> dict[str, Any]:
+            shown = {"enabled": True, "timestampMethod": "receiveTime"}
+            paths = [{"value": f"/{name}.value", "label": name, **shown} for name in names]
+            return {"foxglovePanelTitle": title, "paths": paths, "xAxisVal": "timestamp", "showLegend": True}
 
         warm = [name for name, unit in zip(columns, units) if unit == "degC"]
         moved = [name for name, unit in zip(columns, units) if unit != "degC"][1:]
-        rows = [plot("Temperatures [degC]", warm), plot("Drive and pump", moved)]
-        rows.append(fl.RawMessagesPanel(config=fl.RawMessagesConfig(topic_path="/events")))
-        items = [fl.SplitItem(proportion=share, content=row) for share, row in zip((3, 2, 1), rows)]
-        content = fl.SplitContainer(direction="column", items=items)
-        return str(fl.Layout(content=content).to_json())
+        panels = {
+            "Plot!temperatures": plot("Temperatures [degC]", warm),
+            "Plot!drives": plot("Drive and pump", moved),
+            "RawMessages!events": {"topicPath": "/events"},
+        }
+        top, middle, bottom = panels
+        below = {"direction": "column", "first": middle, "second": bottom, "splitPercentage": 67}
+        content = {
+            "configById": panels,
+            "globalVariables": {},
+            "userNodes": {},
+            "playbackConfig": {"speed": 1},
+            "layout": {"direction": "column", "first": top, "second": below, "splitPercentage": 50},
+        }
+        return json.dumps(content, indent=1)
 
     def _stamp(self, time_s: float) -> int:
         """Return the date of a session's time [ns since 1970]: that of its first sample, and what passed."""

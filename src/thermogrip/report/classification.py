@@ -37,6 +37,9 @@ _SCORES: Columns = (
     ("fit [s]", lambda row: f"{row['fit_s']:.2f}"),
 )
 
+#: Materials whose effusivity a reader may compare with, from low to high.
+_WELL_KNOWN = ("aerated concrete", "wood", "silicone", "glass", "granite", "titanium", "iron", "copper")
+
 ECE_TEXT = (
     "ECE is the mean gap between confidence and accuracy over bins of 0.1. Few grasps raise it: a perfectly "
     "calibrated classifier of the same confidences would show what is under 'if calibrated'. "
@@ -291,6 +294,38 @@ def strips_section(rows: Sequence[Any], materials: Sequence[str]) -> Section:
         f"their 90 % interval; the library's own rows are uncertain by {spread[0]:.0f} to {spread[-1]:.0f} %."
     )
     return Section("What effusivity?", (Picture(figure, "Posterior strips of the test grasps."),), verdict)
+
+
+def effusivity_section(rows: Sequence[tuple[Mapping[str, Any], str]], of: int) -> Section:
+    """Return the section of what ``effusivity`` found: each grasp's numbers with what was not explained of it,
+    strips of those that have an answer; ``of`` counts all grasps."""
+    import math
+
+    from thermogrip.classify.figures import effusivity_figure
+    from thermogrip.datasets.materials import find_material
+    from thermogrip.sysid.effusivity import EffusivityRow
+
+    head = ("grasp", "effusivity", "5 %", "95 %", "object [degC]", "5 %", "95 %", "h_c [W m^-2 K^-1]", "note")
+    keys = ("grasp_id", "effusivity", "effusivity_p05", "effusivity_p95")
+    keys += ("t_object", "t_object_p05", "t_object_p95", "h_c")
+    answered = [row for row, _ in rows if math.isfinite(row["effusivity"])]
+    cells = []
+    for row, why in rows:
+        note = why or ("" if math.isfinite(row["effusivity"]) else "no contact, or no answer")
+        cells.append((*(None if row[key] != row[key] else row[key] for key in keys), note))
+    strange = sum(bool(why) for _, why in rows)
+    verdict = f"{len(answered)} of {len(rows)} grasps have an effusivity."
+    verdict += f" The model does not explain {strange} of them." if strange else ""
+    verdict += f" The first {len(rows)} of {of} are shown." if of > len(rows) else ""
+    parts: list[Any] = []
+    if answered:
+        strips = [EffusivityRow(**{k: v for k, v in row.items() if k != "misfit_sd"}) for row in answered]
+        library = {name: find_material(name).effusivity for name in _WELL_KNOWN}
+        caption = "Posterior of each grasp, median and 90 % interval; lines: a few of `thermogrip materials`."
+        parts.append(Picture(effusivity_figure(strips, library), caption))
+    parts.append(Table(head, tuple(cells), "Effusivity in W s^0.5 m^-2 K^-1, with 90 % intervals", dense=True))
+    good = len(answered) == len(rows) and not strange
+    return Section("What effusivity?", tuple(parts), verdict, "good" if good else "warn")
 
 
 def feature_section(model: BayesClassifier, records: Sequence[Grasps]) -> Section:

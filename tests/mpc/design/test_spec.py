@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 
-from tests.mpc.makers import heater
+from tests.mpc.makers import crossed, heater, make_tank, network_plant
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import LARGEST
 from thermogrip.mpc.design.spec import SPEC_TEMPLATE, Spec, _ranges, read_spec, spec_from_dict
@@ -194,3 +195,29 @@ def test_a_drive_whose_range_only_its_logs_showed_is_as_wide_as_the_spec_has_it(
         spec.design(volts)
     with pytest.raises(UserError, match="leaves its range"):  # of a drive whose unit has a range
         (beyond := Spec(drive_limits=(-2.0, 2.0))).design(beyond.widened(tank))
+
+
+def test_a_plant_without_a_skin_gets_steps_inside_its_logs():
+    board = network_plant("tclab", t1=(20.0, 60.0), t2=(30.0, 70.0))
+    spec = Spec.of(board)
+    assert spec.steps == [(39.0, 51.0), (51.0, 39.0)]  # 0.3 and 0.7 of what both covered, 30 to 60
+    assert (spec.band_degC, spec.overshoot_degC, spec.bias_degC, spec.output) == (0.3, 0.6, 0.12, None)
+    spec.design(board)  # fits
+    assert spec_from_dict(tomllib.loads(spec.in_toml())) == spec
+
+
+def test_a_spec_of_a_plant_asks_for_three_times_what_its_slowest_output_takes_by_itself():
+    seen = {"a": (20.0, 60.0), "b": (20.0, 60.0), "room": (16.0, 19.0)}
+    spec = Spec.of(replace(crossed(), valid={**crossed().valid, **seen}))
+    assert spec.settle_within_s == pytest.approx(3 * 2 / -math.log(0.9), rel=0.12)  # the pole of 0.9, 2 s
+    assert (spec.hold_s > spec.settle_within_s, spec.ambient_degC) == (True, 17.5)
+
+
+def test_outputs_that_share_no_range_are_not_both_regulated():
+    apart = replace(crossed(), valid={**crossed().valid, "a": (20.0, 60.0), "b": (70.0, 90.0)})
+    assert Spec.of(apart).output == ["b"]  # which the first drive moves
+    assert Spec.of(replace(apart, valid={**apart.valid, "b": (70.0, 70.5)})) == Spec()
+
+
+def test_a_skin_gets_the_defaults():
+    assert Spec.of(make_tank()) == Spec()

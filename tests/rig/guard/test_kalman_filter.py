@@ -234,7 +234,7 @@ def heater() -> RigFilter:
     ("unit", "valid", "span", "half"),
     [("W", None, (-1.0, 1.0), 1.0), ("W", (2.0, 8.0), (2.0, 8.0), 3.0),
      ("percent", (2.0, 8.0), (0.0, 100.0), 50.0), ("0_255", None, (0.0, 255.0), 127.5),
-     (None, (2.0, 8.0), (-1.0, 1.0), 1.0)],
+     (None, (-0.2, 0.8), (-1.0, 1.0), 1.0), (None, (0.0, 100.0), (0.0, 100.0), 50.0)],
 )  # fmt: skip
 def test_a_drive_has_the_range_of_its_unit_else_of_its_logs(
     unit: str | None, valid: tuple[float, float] | None, span: tuple[float, float], half: float
