@@ -86,9 +86,8 @@ def main() -> None:
     given = parser.parse_args()
     run = partial(run_parallel, fitted, workers=given.workers)
     model, n = load_network("tclab"), given.rigs
-    print(
-        "logs  alone ln p, K   pooled ln p, K   refit ln p, K   covered  spread found  alarms  ill found (chance)  s"
-    )
+    print("logs  alone ln p, K   pooled ln p, K   refit ln p, K   covered  spread found / true")
+    print("      alarms among healthy boards  ill found (chance of each)  seconds of fits and pooling")
     for n_logs in (3, 1):
         rows, found, alarms, covered, spreads, seconds, chances = [], 0, 0, [], [], [], []
         for seed in range(given.seeds):

@@ -249,7 +249,8 @@ def _shorten(step: Array, sd: Array) -> Any:
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def _conclude(here: _Expansion, law: Array, work: _Work, covariance: Array) -> Any:
-    """Fill the covariance at the mode, its first columns where there are fewer; return the log determinant of the curvature in units of sd."""
+    """Fill the covariance at the mode, its first columns where it has fewer; return the log determinant of
+    the curvature in units of sd."""
     sd = law[1]
     penalty(here.u, law[0], sd, law[2], work.rhs, work.step, work.diagonal)
     log_det = _cholesky(here.matrix, work.diagonal, work.low)
