@@ -86,11 +86,10 @@ def main() -> None:
     given = parser.parse_args()
     run = partial(run_parallel, fitted, workers=given.workers)
     model, n = load_network("tclab"), given.rigs
-    print(
-        "logs  alone ln p, K   pooled ln p, K   refit ln p, K   covered  spread found  alarms  ill found  s"
-    )
+    print("logs  alone ln p, K   pooled ln p, K   refit ln p, K   covered  spread found / true")
+    print("      alarms among healthy boards  ill found (chance of each)  seconds of fits and pooling")
     for n_logs in (3, 1):
-        rows, found, alarms, covered, spreads, seconds = [], 0, 0, [], [], []
+        rows, found, alarms, covered, spreads, seconds, chances = [], 0, 0, [], [], [], []
         for seed in range(given.seeds):
             rng = np.random.default_rng([seed, n_logs])
             theta, logs, checks = fleet(rng, n, n_logs)
@@ -104,7 +103,7 @@ def main() -> None:
             alarms += sum(rig.ill for rig in rigs)
             at = [population.parameters.index(name) for name in NAMES]
             spreads.append(np.array(population.spread)[at] / SPREAD)
-            # a rig against the interval that the others give, and new boards against that of all
+            # a rig against the interval that the others give
             inside = [
                 [r.others.intervals(0.9)[p][0] < v < r.others.intervals(0.9)[p][1]]
                 for r, row in zip(rigs, np.exp(theta)) for p, v in zip(NAMES, row)
@@ -114,13 +113,14 @@ def main() -> None:
             plants = run([(model, each) for each in logs])
             with_ill = pool_rigs({f"r{k}": plant for k, plant in enumerate(plants)})[1]
             found += with_ill[0].ill
+            chances.append(round(with_ill[0].chance, 4))
             alarms += sum(rig.ill for rig in with_ill[1:])
         healthy = (2 * n - 1) * given.seeds
         a, b, c = np.sqrt(np.mean(np.square(rows), axis=0))
         print(
             f"{n_logs:4d}  {a[0]:6.3f} {a[1]:6.2f}   {b[0]:6.3f} {b[1]:6.2f}   {c[0]:6.3f} {c[1]:6.2f}"
             f"   {np.mean(covered):6.3f}  {np.mean(spreads, axis=0).round(2)}  {alarms}/{healthy}"
-            f"  {found}/{given.seeds}  {np.mean(seconds):.0f}",
+            f"  {found}/{given.seeds} {chances}  {np.mean(seconds):.0f}",
             flush=True,
         )
 

@@ -249,11 +249,12 @@ def _shorten(step: Array, sd: Array) -> Any:
 
 @numba.njit(**INNER)  # type: ignore[untyped-decorator]
 def _conclude(here: _Expansion, law: Array, work: _Work, covariance: Array) -> Any:
-    """Fill the covariance at the mode; return the log determinant of the curvature in units of sd."""
+    """Fill the covariance at the mode, its first columns where it has fewer; return the log determinant of
+    the curvature in units of sd."""
     sd = law[1]
     penalty(here.u, law[0], sd, law[2], work.rhs, work.step, work.diagonal)
     log_det = _cholesky(here.matrix, work.diagonal, work.low)
-    for b in range(7):
+    for b in range(covariance.shape[1]):
         for a in range(7):
             work.rhs[a] = 1.0 if a == b else 0.0
         _solve(work.low, work.rhs, work.step)
@@ -278,7 +279,8 @@ def modes(
     n = u.shape[0]
     scratch = _scratch(gripper.sensor.size, nodes[2].size, times.shape[1], y.shape[1])
     here, there, work = _expansion(), _expansion(), _work()
-    covariance, objective = np.zeros((n, 7, 7)), np.empty(n)
+    # an integral needs none
+    covariance, objective = np.zeros((n, 7, 7 if max_steps > 0 else 0)), np.empty(n)
     misfit, settled, trial = np.empty(n), np.zeros(n), np.empty(7)
     for p in range(n):
         i, sd, damping = row[p], law[p, 1], 1e-2

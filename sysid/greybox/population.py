@@ -59,7 +59,7 @@ LEAST_RIGS = 3
 _SEEN = 1e-3  # of the prior's precision: what logs say less about is not counted as told
 _ROUNDS, _STILL = 500, 1e-4
 _FIRST = 0.25  # of the prior's variance, where EM begins
-_ILL = 0.01  # chance of such a distance among all healthy rigs
+_ILL = 0.05  # chance that one of a healthy fleet is as far off
 
 
 class _Told(NamedTuple):
@@ -189,7 +189,7 @@ class Rig(NamedTuple):
 
     @property
     def ill(self) -> bool:
-        """Whether a healthy fleet has such a rig in fewer than one case of a hundred."""
+        """Whether fewer than one healthy fleet of twenty has such a rig."""
         return self.chance < _ILL
 
 

@@ -83,7 +83,7 @@ def fleet_sections(plants: Mapping[str, Plant], population: Population, rigs: Se
     ill = [rig.name for rig in rigs if rig.ill]
     words = f"{', '.join(ill)} far from the others" if ill else "No rig is far from the others"
     head, rows = rig_table(rigs, population)
-    caption = "Distance from the population of the others, 1 on average; less than 0.01 of chance is ill."
+    caption = "Distance from the population of the others, 1 on average; less than 0.05 of chance is ill."
     first = next(iter(plants.values()))
     names, numbers = population_table(population, first)
     drawn = "Grey, or red of an ill rig: its own logs, with 90 %. Blue: what all rigs together say of it."
