@@ -324,7 +324,8 @@ def _integral(r1: float, r2: float, m11: float, m12: float, m22: float) -> float
     """Return the log of what integrating over two linear unknowns adds to the density at their means."""
     v11, v22 = 1.0 + m11, 1.0 + m22
     det = v11 * v22 - m12 * m12
-    return 0.5 * (v22 * r1 * r1 - 2.0 * m12 * r1 * r2 + v11 * r2 * r2) / det - 0.5 * np.log(det)
+    found = 0.5 * (v22 * r1 * r1 - 2.0 * m12 * r1 * r2 + v11 * r2 * r2) / det - 0.5 * np.log(det)
+    return float(found)
 
 
 @numba.njit(**OUTER)  # type: ignore[untyped-decorator]
