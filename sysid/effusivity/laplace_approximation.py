@@ -103,7 +103,7 @@ _DOF, _COUNTS, _GAIN_SD = 20.0, 2.0, 0.1
 _ALIKE_SD = 1.0  # K
 # Tukey's contaminated normal: one stated temperature of an object in twenty is three times as far off
 SLIPS, _SLIP = 0.05, 3.0
-_TELLING = 0.99  # of the prior variance of the temperature that readings leave, if they say anything of it
+_TELLING = 0.5  # of the prior variance of the temperature: readings that leave more do not tell a slip
 _FINISH_SD, _GRADE_SD = 0.4, 0.05  # between blocks of one material: of ln h, and of ln e beside the table's
 
 
@@ -683,14 +683,14 @@ def doubted(gripper: GripperModel, data: Touches, prior: Prior, mode: Mode) -> M
     off = gripper.nominal_sd(data.t_ambient - data.t_object) if gripper.uncertain else 0.0
     v0 = prior.sd[:, T_OBJECT] ** 2 + np.square(off)
     x0, v = prior.mean[:, T_OBJECT], mode.covariance[:, T_OBJECT, T_OBJECT]
-    # readings that say nothing of it cannot contradict it
-    seen_at_all = np.isfinite(data.t_object) & (v < _TELLING * v0)
-    precision = np.where(seen_at_all, 1 / v - 1 / v0, 1.0)
+    # beyond what readings know of it the normal distribution around the mode is no guide
+    telling = np.isfinite(data.t_object) & (v < _TELLING * v0) & mode.converged
+    precision = np.where(telling, 1 / v - 1 / v0, 1.0)
     seen, width = x0 + (mode.u[:, T_OBJECT] - x0) / (v * precision), 1 / precision
     wide = slip_of(np.sqrt(v0)) ** 2 * v0
     ratio = _log_normal(seen - x0, wide + width) - _log_normal(seen - x0, v0 + width)
-    slip = np.where(seen_at_all, SLIPS * np.exp(np.clip(ratio, -700.0, 300.0)), 0.0)
-    total = np.where(seen_at_all, 1 - SLIPS, 1.0) + slip
+    slip = np.where(telling, SLIPS * np.exp(np.clip(ratio, -700.0, 300.0)), 0.0)
+    total = np.where(telling, 1 - SLIPS, 1.0) + slip
     share, apart = slip / total, (wide * seen + width * x0) / (wide + width) - mode.u[:, T_OBJECT]
     within = share * (wide * width / (wide + width) - v) + share * (1 - share) * apart**2
     # the rest of what is unknown goes along with the temperature

@@ -181,6 +181,8 @@ def _row(gripper: GripperModel, name: str, posterior: GridPosterior, share: floa
     mean = float((posterior.mass * x).sum())
     variance = float((posterior.mass * ((x - mean) ** 2 + sd**2)).sum())
     t = mixture_quantiles(posterior.weight, posterior.t_object, posterior.t_object_sd, (0.05, 0.5, 0.95))
+    if gripper.discrepancy is not None:  # it has no scale of its own: that of the temperatures it was told
+        t = t - gripper.bias
     return EffusivityRow(
         grasp_id=name, effusivity=float(middle), effusivity_p05=float(low), effusivity_p95=float(high),
         t_object=float(t[1]), t_object_p05=float(t[0]), t_object_p95=float(t[2]),

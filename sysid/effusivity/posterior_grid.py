@@ -215,8 +215,10 @@ def _left_out(gripper: GripperModel, data: Touches, noise: tuple[Array, Array], 
     x, value, u, covariance, settled = found
     near = np.flatnonzero(settled & (value > value.max() - _REACH))
     near = near[np.argsort(x[near])]
-    # for an uncertain gripper Laplace's method integrates over its parameters too, and is left alone
-    if near.size < _KNOTS or gripper.uncertain or (gripper.second is not None and data.second is not None):
+    # for an uncertain gripper Laplace's method integrates over its parameters too, with a discrepancy the
+    # evidence counts less than the integral says
+    other = gripper.uncertain or gripper.discrepancy is not None
+    if near.size < _KNOTS or other or (gripper.second is not None and data.second is not None):
         return np.zeros(x.size)
     wanted = np.linspace(x[near[0]], x[near[-1]], _KNOTS)
     at = near[np.unique(np.abs(x[near] - wanted[:, None]).argmin(axis=1))]

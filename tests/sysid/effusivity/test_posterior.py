@@ -17,10 +17,12 @@ from scipy.stats import t as student_t
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.materials import find_material, load_materials
-from thermogrip.sysid.effusivity.data import touches, whiten
-from thermogrip.sysid.effusivity.gripper_model import another_gripper
+from thermogrip.sysid.effusivity.data import KNOTS, touches, whiten
+from thermogrip.sysid.effusivity.gripper_model import Discrepancy, another_gripper
 from thermogrip.sysid.effusivity.laplace_approximation import (
     find_modes,
+    fit_pairs,
+    free_hypotheses,
     material_hypotheses,
     nodes_for,
     predict,
@@ -33,7 +35,12 @@ from thermogrip.sysid.effusivity.posterior import (
     material_fit,
     material_posterior,
 )
-from thermogrip.sysid.effusivity.posterior_grid import LN_E_RANGE, GridPosterior, grid_posteriors
+from thermogrip.sysid.effusivity.posterior_grid import (
+    LN_E_RANGE,
+    GridPosterior,
+    grid_posteriors,
+    mixture_quantiles,
+)
 
 from ...oracles.emcee_posterior import emcee_posterior
 from .makers import FIVE, drawn_from_the_prior, simulated, split_of
@@ -306,3 +313,21 @@ def test_fits_are_laid_out_by_grasp_and_candidate_and_may_start_from_another(dev
     again = material_fit(device, record, names, start=whole.u)
     near = whole.log_evidence > whole.log_evidence.max(axis=1, keepdims=True) - 100
     np.testing.assert_allclose(again.log_evidence[near], whole.log_evidence[near], atol=0.5)
+
+
+def test_a_gripper_with_a_discrepancy_answers_as_unsurely_as_its_evidence(device, files):
+    """Its fits count half and its temperatures are those that it was told: no integral makes them sharper."""
+    n = len(device.blocks)
+    nothing = Discrepancy(np.zeros(KNOTS.size), np.zeros((n, KNOTS.size)), np.zeros(n), np.zeros(0))
+    odd, grasp = replace(device, discrepancy=nothing, bias=0.8), files["exp2_dT20"].isel(grasp=[13])
+    grasp = grasp.assign(t_object=("grasp", [np.nan]))
+    (found,) = grid_posteriors(odd, touches(grasp))
+    x = found.x[::25]
+    value = fit_pairs(
+        odd, touches(grasp), np.zeros(x.size, dtype=np.int64), free_hypotheses(odd, x)
+    ).log_evidence
+    near = value > value.max() - 5
+    np.testing.assert_allclose(np.diff(np.log(found.mass[::25])[near]), np.diff(value[near]), atol=0.05)
+    (row,) = effusivity_posterior(odd, grasp)
+    on_its_own = mixture_quantiles(found.weight, found.t_object, found.t_object_sd, (0.05, 0.5, 0.95))
+    assert [row.t_object_p05, row.t_object, row.t_object_p95] == pytest.approx(on_its_own - 0.8)
