@@ -262,7 +262,8 @@ class Guard:
         what the model knows of the rig from a session that ended well a few minutes ago."""
         age = reading.time_s - self._time
         known = not self.trips and 0 <= age <= _KEPT_S
-        self._span = {name: range_of(unit, self._ranges.get(name)) or (-1.0, 1.0) for name, unit in units.items()}
+        seen = self._ranges
+        self._span = {name: range_of(unit, seen.get(name)) or (-1.0, 1.0) for name, unit in units.items()}
         self._time, self._now, self._fresh_at = reading.time_s, now, now
         self._seen = float("nan")
         self._drive, self._pump = dict.fromkeys(units, 0.0), reading.pump

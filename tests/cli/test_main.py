@@ -98,7 +98,7 @@ batch: CONTROLLER PLAN.csv --out --port --protocol --speed=1.0>0.01 --twin --dra
   --stop-early --settle-timeout=900.0>1 --guard --learn --ask/--no-ask=True --live>0<65535
   --foxglove>1<65535 --bridge --on-trip --network --seed=0>0 --json=False
 recover: DIR --out --bad --json=False
-effusivity: GRASPS... --out --calibrate --object-range --seed=0>0 --json=False
+effusivity: GRASPS... --out --calibrate --object-range --report --seed=0>0 --json=False
 train: GRASPS... --classifier --out --split --stop-error>0.001<0.5 --quick=False --seed=0>0 --json=False
 classify: MODEL_DIR GRASPS... --out --materials --early=False --next-touch=False --or-unknown=False
   --other-gripper=False --same-gripper=False --known --object-range --serve=False --port>0<65535

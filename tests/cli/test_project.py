@@ -114,10 +114,12 @@ def test_a_spec_like_a_plant_is_what_tune_takes_for_it(bench: Bench) -> None:
 
 
 def test_what_is_like_no_network_is_refused(bench: Bench) -> None:
+    bench.run("init", "network", "--out", "mine.toml")
     for words, says in (
         ("network --like oven", "--like 'oven' is unknown; use furnace"),
         ("guard --like tank", "not of guard"),
         ("spec --like plnt.json", "no such file"),
+        ("spec --like mine.toml", "is a thermal network, not a plant; give plant.json of identify"),
     ):
         done = bench.run("init", *words.split())
         assert (done.code, len(done.said)) == (2, 1)

@@ -637,3 +637,9 @@ def test_a_device_that_cannot_be_is_one_line(
 ) -> None:
     assert main(["virtual", *options]) == 2
     assert said in capsys.readouterr().err
+
+
+def test_an_address_without_its_scheme_is_refused_before_the_rig_is_opened(bench: Bench) -> None:
+    done = bench.run("record", "s.csv", "--port", "x", "--out", "d", "--bridge", "localhost:9090")
+    said = "thermogrip: --bridge 'localhost:9090' is no address; write ws://localhost:9090"
+    assert (done.code, done.said) == (2, [said])

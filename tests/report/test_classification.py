@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import asdict
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,6 +24,7 @@ from thermogrip.report.classification import (
     touch_section,
 )
 from thermogrip.report.html import Picture, Section, Table, Text
+from thermogrip.sysid.effusivity import EffusivityRow
 
 
 @pytest.fixture(autouse=True)
@@ -246,13 +248,14 @@ def test_the_page_of_bayes_names_the_pair_that_is_hardest_to_tell_apart(known: b
 
 
 def test_a_page_of_effusivities_has_every_grasp_and_says_what_is_missing() -> None:
-    known = dict(grasp_id="a", effusivity=1.5e4, effusivity_p05=1.1e4, effusivity_p95=2e4, t_object=23.0)
-    known |= dict(t_object_p05=22.5, t_object_p95=23.5, h_c=900.0, log10_effusivity_sd=0.1, misfit_sd=0.0)
+    row = EffusivityRow("a", 1.5e4, 1.1e4, 2e4, 23.0, 22.5, 23.5, 900.0, 0.1)
+    known = asdict(row) | {"misfit_sd": 0.0}
     lost = {key: value if key == "grasp_id" else math.nan for key, value in known.items()} | {"grasp_id": "b"}
     section = effusivity_section([(known, ""), (known | {"grasp_id": "c"}, "too slow"), (lost, "")], 500)
     picture, table = section.parts
     assert section.verdict == (
-        "2 of 3 grasps have an effusivity. The model does not explain 1 of them. The first 3 of 500 are shown."
+        "2 of 3 grasps have an effusivity. The model does not explain 1 of them. "
+        "The first 3 of 500 are shown."
     )
     assert (section.tone, picture.kind) == ("warn", "picture")
     assert [(row[0], row[1], row[-1]) for row in table.rows] == [

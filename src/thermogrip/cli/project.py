@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated
 
 from thermogrip.cli import options as cli
-from thermogrip.cli.kinds import TEMPLATES, template_text
+from thermogrip.cli.kinds import KINDS, TEMPLATES, check_exists, kind_of, template_text
 from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
 
@@ -169,6 +169,10 @@ def _template(what: str, like: str | None) -> str:
     if like is None:
         return template_text(what)
     if what == "spec":
+        check_exists(like)
+        if (kind := kind_of(like)) != "plant":
+            problem = f"is {KINDS[kind]['words'] if kind else 'no file of ours'}, not a plant"
+            raise UserError(problem, file=like, hint="give plant.json of identify")
         from thermogrip.mpc.design.spec import Spec
 
         return Spec.of(cli.load_plant(Path(like))).in_toml()

@@ -97,7 +97,18 @@ FoxgloveOption = Annotated[
         max=65535,
     ),
 ]
-BridgeOption = Annotated[str | None, cli.opt("--bridge", "ws://HOST:PORT", "Publish to a rosbridge server.")]
+
+
+def _check_bridge(url: str | None) -> str | None:
+    """Refuse what is no address of a websocket."""
+    if url is not None and not url.startswith(("ws://", "wss://")):
+        raise UserError(f"--bridge {url!r} is no address", hint=f"write ws://{url.rpartition('/')[2]}")
+    return url
+
+
+BridgeOption = Annotated[
+    str | None, cli.opt("--bridge", "ws://HOST:PORT", "Publish to a rosbridge server.", _check_bridge)
+]
 OnTripOption = Annotated[
     str | None,
     cli.opt("--on-trip", "CMD", "Run this on a trip, which it gets as JSON on stdin."),

@@ -50,7 +50,7 @@ class Mirror:
     def layout(self, columns: list[str], units: list[str]) -> str:
         """Return the layout file of these columns: temperatures with the target, drives, what happened.
 
-        It is what the application exports and imports; what ``foxglove.layouts`` builds is for notebooks alone.
+        It is what the application imports; what ``foxglove.layouts`` builds is for notebooks alone.
         """
 
         def plot(title: str, names: list[str]) -> dict[str, Any]:

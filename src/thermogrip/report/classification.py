@@ -297,8 +297,8 @@ def strips_section(rows: Sequence[Any], materials: Sequence[str]) -> Section:
 
 
 def effusivity_section(rows: Sequence[tuple[Mapping[str, Any], str]], of: int) -> Section:
-    """Return the section of what ``effusivity`` found: each grasp's numbers with what was not explained of it,
-    strips of those that have an answer; ``of`` counts all grasps."""
+    """Return the section of what ``effusivity`` found: each grasp's numbers with what was not explained
+    of it, strips of those that have an answer; ``of`` counts all grasps."""
     import math
 
     from thermogrip.classify.figures import effusivity_figure
@@ -306,8 +306,8 @@ def effusivity_section(rows: Sequence[tuple[Mapping[str, Any], str]], of: int) -
     from thermogrip.sysid.effusivity import EffusivityRow
 
     head = ("grasp", "effusivity", "5 %", "95 %", "object [degC]", "5 %", "95 %", "h_c [W m^-2 K^-1]", "note")
-    keys = ("grasp_id", "effusivity", "effusivity_p05", "effusivity_p95")
-    keys += ("t_object", "t_object_p05", "t_object_p95", "h_c")
+    keys = ["grasp_id", "effusivity", "effusivity_p05", "effusivity_p95"]
+    keys += ["t_object", "t_object_p05", "t_object_p95", "h_c"]
     answered = [row for row, _ in rows if math.isfinite(row["effusivity"])]
     cells = []
     for row, why in rows:
@@ -323,7 +323,8 @@ def effusivity_section(rows: Sequence[tuple[Mapping[str, Any], str]], of: int) -
         library = {name: find_material(name).effusivity for name in _WELL_KNOWN}
         caption = "Posterior of each grasp, median and 90 % interval; lines: a few of `thermogrip materials`."
         parts.append(Picture(effusivity_figure(strips, library), caption))
-    parts.append(Table(head, tuple(cells), "Effusivity in W s^0.5 m^-2 K^-1, with 90 % intervals", dense=True))
+    caption = "Effusivity in W s^0.5 m^-2 K^-1, with 90 % intervals"
+    parts.append(Table(head, tuple(cells), caption, dense=True))
     good = len(answered) == len(rows) and not strange
     return Section("What effusivity?", tuple(parts), verdict, "good" if good else "warn")
 
