@@ -59,7 +59,7 @@ class Ours:
     """A controller of the package; inputs that stay are put beside its drives."""
 
     def __init__(self, case: Case, loop: Loop) -> None:
-        self.case, self.loop, self.dt = case, loop, loop.dt
+        self.case, self.loop, self.dt = case, loop, case.log_dt
 
     def reset(self, reading: Mapping[str, float]) -> None:
         self.loop.reset(reading)

@@ -271,6 +271,8 @@ class Controller(Shown, SampledController):
         applied = self._applied(reading)
         self._pass(self.times.seconds, applied)
         if not self.times.due:
+            if not self.times.stale:
+                self._refine(y)
             return self._held_move(started)
         if self.times.stale:
             y = np.full(self.model.n_y, np.nan)
@@ -356,6 +358,15 @@ class Controller(Shown, SampledController):
         self._unread_s = np.where(np.isfinite(y[self._rows]), 0.0, self._unread_s + elapsed)
         stuck = ", stuck: it should have moved" if self.monitor.stuck.any() else ""
         return jumped or (f"{', '.join(lost)}: no usable reading{stuck}" if lost else "")
+
+    def _refine(self, y: Array) -> None:
+        """Correct the estimate with a reading that comes before a move is due."""
+        if self._fresh or not np.isfinite(y).any():
+            return
+        self.observer.look(self._d)
+        self.monitor.expect(self.model.C @ (self.observer.now - self._seen))
+        self.observer.refine(self.monitor.screen_between(y, self.observer.reading()))
+        self._seen = self.observer.now
 
     def _accept_jump(self, y: Array, stays: Mask) -> str:
         """Take a jump that stays for an offset of its sensor, or for another world; return what it was."""

@@ -35,7 +35,9 @@ drives that were applied in it, and a reading that comes the share s of a sample
 
 u the mean of the drives since x and F the Jacobian of the sample.  A register between two samples holds the
 mean of its neighbours, and nothing is smeared from sample to sample, because x itself is never interpolated.
-The noise of the states grows with the seconds, by s Q in the share s of a sample.
+The noise of the states grows with the seconds, by s Q in the share s of a sample.  Every reading counts, also
+one that comes before a move is due; but where the output moves, a straight line between two samples is not
+its path, and the standard deviation of such a reading is larger by 4 s (1 - s) times its move.
 
 **A plant that is slower than the model.**  A sensor's pocket, a layer or a longer tube that the model lacks
 looks like a drive that is too weak, until it looks like one that is too strong, and the loop swings.  So each
@@ -415,8 +417,9 @@ class Observer:
         self._into, self._dose = 0.0, np.zeros(self.model.n_u)
         # of a sample: where readings are compared, and how much of Q is in P
         self._share, self._noised = 0.0, 0.0
-        # the state there, and its derivative by (x, w)
+        # the state there, its derivative by (x, w), and how far an output may be from a straight line [degC]
         self._ahead, self._shown_ahead, self._way = self.x, self.shown, np.zeros((0, 0))
+        self._bent = np.zeros(self.model.n_y)
 
     @property
     def now(self) -> Array:
@@ -475,7 +478,12 @@ class Observer:
 
     def update(self, y: Array) -> Array:
         """Correct the estimate with a reading (n_y,), NaN where lost; return the innovation (n_y,)."""
-        return self._correct(y, self.R, remember=_REMEMBER)
+        return self._correct(y, self.R + self._bent**2, remember=_REMEMBER)
+
+    def refine(self, y: Array) -> None:
+        """Correct the estimate with a reading (n_y,) between two moves; the mean innovation is that of
+        moves."""
+        self._correct(y, self.R + self._bent**2)
 
     @property
     def innovation_bias(self) -> float:
@@ -554,6 +562,7 @@ class Observer:
         self._ahead = (1 - share) * self.x + share * after
         self._shown_ahead = (1 - share) * self.shown + share * shown
         self._way = (1 - share) * np.eye(len(P)) + share * step
+        self._bent = 4 * share * (1 - share) * (self.model.C @ (after - self.x))
 
     def _sample(self, u: Array, d: Array) -> tuple[Array, Array, Array]:
         """Return the state a sample later, what is shown now, and the Jacobian of the filter's states."""

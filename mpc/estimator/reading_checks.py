@@ -86,15 +86,24 @@ class ReadingMonitor:
     def screen(self, y: Array, expected: Array) -> tuple[Array, Mask]:
         """Return a reading y (n_y,) [degC], NaN where it cannot be, and which of its sensors (n_y,) have
         jumped and stay there; ``expected`` (n_y,) is the prediction."""
-        fresh = np.isfinite(y) & (y != self._last)
-        self._last = np.where(np.isfinite(y), y, self._last)
-        self._moved = np.where(fresh, 0.0, self._moved)
-        y = np.where(self.stuck, np.nan, y)
-        jumped = np.abs(np.nan_to_num(y - expected)) > self._spike
+        y, jumped = self._found(y, expected)
         self._spikes = np.where(jumped, self._spikes + 1, np.where(np.isfinite(y), 0, self._spikes))
         stays = self._spikes > _LEFT_OUT
         self._spikes[stays] = 0
         return np.where(jumped & ~stays, np.nan, y), stays
+
+    def screen_between(self, y: Array, expected: Array) -> Array:
+        """Return a reading y (n_y,) [degC] between two moves, NaN where it cannot be; no jump counts."""
+        y, jumped = self._found(y, expected)
+        return np.where(jumped, np.nan, y)
+
+    def _found(self, y: Array, expected: Array) -> tuple[Array, Mask]:
+        """Return a reading (n_y,) without those that are stuck, and which of it have jumped (n_y,)."""
+        fresh = np.isfinite(y) & (y != self._last)
+        self._last = np.where(np.isfinite(y), y, self._last)
+        self._moved = np.where(fresh, 0.0, self._moved)
+        y = np.where(self.stuck, np.nan, y)
+        return y, np.asarray(np.abs(np.nan_to_num(y - expected)) > self._spike)
 
 
 def too_weak(observer: Observer) -> np.bool_:

@@ -252,7 +252,7 @@ def _controller_parts(s: Sizes) -> list[tuple[Any, int]]:
         (ctypes.c_void_p, 4),
         *((number, count) for count in (s.NX, s.NW, s.NG, s.NG, s.NG, s.NG, z * z, s.NY, s.NY)),
         (whole, z),
-        *((number, count) for count in (3, s.NU, s.NX, s.NG, 9)),
+        *((number, count) for count in (3, s.NU, s.NX, s.NG, s.NY, 9)),
         (whole, 2),
         *((number, count) for count in (s.ND, s.NY, s.NU, s.NU, s.NC, s.NC, s.NH * s.NU, s.NC, 2)),
         *((number, count) for count in (s.NY, s.NY, s.NX, s.NC, 1)),

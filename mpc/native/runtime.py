@@ -344,6 +344,10 @@ class CompiledObserver(Observer):
         self._c.library.tg_observer_update(self._c.state, address(np.ascontiguousarray(y, float)))
         return np.asarray(innovation)
 
+    def refine(self, y: Array) -> None:
+        """Correct the estimate with a reading (n_y,) between two moves."""
+        self._c.library.tg_observer_refine(self._c.state, address(np.ascontiguousarray(y, float)))
+
     def predict(self, u: Array, d: Array) -> None:
         """Carry the estimate one sample on under drives u (n_u,) and disturbances d (n_d,)."""
         drives, held = np.ascontiguousarray(u, float), np.ascontiguousarray(d, float)

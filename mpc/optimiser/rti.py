@@ -20,7 +20,8 @@ where the optimum is, and how far a block may go, as a share of the way there,
 counted where the gain is evaluated, not in the share: it is a heat flow, and heat moves no optimum.  Where
 the QP's plan costs more than the guess in the nonlinear simulation, it is taken only part of the way.  And
 since the far side is a trap (there, heating seems to ask for still more cooling current), plain ramps that
-take the drive back, to none and to the other end, are looked at every fifth sample.
+take the drive back, to none and to the other end, are looked at every fifth sample; so a drive does not stay
+at an end of its range either, where a black box answers nothing at all.
 """
 
 from __future__ import annotations
@@ -265,9 +266,11 @@ class Optimiser:
         return y[:, 1:]
 
     def _ramps(self, last: Array, more: float) -> Array:
-        """Return plans (2, n_b, n_u) that take the drives back: to none, and to the other end."""
-        neutral = self.neutral
-        ends = np.stack([neutral, np.where(last > neutral, self.lowest, self.highest)])[:, None, :]
+        """Return plans (2, n_b, n_u) that take the drives back: to none, and to the other end; where that is
+        none, to the far one."""
+        neutral, up = self.neutral, self.lowest == self.neutral
+        up |= (last <= neutral) & (self.highest > neutral)
+        ends = np.stack([neutral, np.where(up, self.highest, self.lowest)])[:, None, :]
         reach = ((self.reach[:, None] + more) * self.slew)[None]
         return np.asarray(np.clip(ends, last - reach, last + reach))
 

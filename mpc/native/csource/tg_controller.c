@@ -219,6 +219,26 @@ static int screen(tg_controller *c, double *y)
     return TG_WORLD_CHANGED;
 }
 
+/* Correct the estimate with a reading that comes before a move is due; no jump of it counts. */
+static void refine(tg_controller *c, double *y)
+{
+    double mean[TG_NY];
+    int any = 0;
+    for (int i = 0; i < TG_NY; i++)
+        any = any || isfinite(y[i]);
+    if (c->fresh || !any)
+        return;
+    tg_observer_look(c, c->d);
+    expect(c);
+    drop_stuck(c, y);
+    tg_expected(c, mean);
+    for (int i = 0; i < TG_NY; i++)
+        if (fabs(y[i] - mean[i]) > c->design->spike[i])
+            y[i] = NAN;
+    tg_observer_refine(c, y);
+    memcpy(c->seen, tg_now(c), sizeof c->seen);
+}
+
 /* Correct the estimate with this reading; return what the operator should know. */
 static int absorb(tg_controller *c, double *y, const double *d, const double *applied)
 {
@@ -734,6 +754,8 @@ tg_move tg_step(tg_controller *c, double time_s, const double *y, const double *
         did[j] = applied && isfinite(applied[j]) ? applied[j] : c->in_force[j];
     pass(c, did);
     if (!due) { /* its advice stays */
+        if (!c->stale)
+            refine(c, clean_y);
         memcpy(move.drive, c->u, sizeof move.drive);
         move.status = c->status;
         move.advice = c->advice == TG_ALL_WELL ? TG_TOO_EARLY : c->advice;

@@ -81,6 +81,7 @@ typedef struct {
     int held[TG_Z];
     double into_s, share, noised;      /* seconds since x; of a sample: time of the estimate, and the noise in P */
     double dose[TG_NU], ahead[TG_NX], shown_ahead[TG_NG]; /* the drives summed over those seconds, the state there */
+    double bent[TG_NY];                /* how far an output may be from the straight line between two samples */
     /* when it was called */
     double time_s, back_s, interval_s, passed_s, since_s, assumed_s, spent_s, waited_s, slew_s;
     int repeats, stale;
@@ -128,6 +129,7 @@ const char *tg_advice_text(int advice);
 void tg_observer_reset(tg_controller *c, const double *y, const double *d);
 void tg_observer_expect_lags(tg_controller *c); /* after a reset: outputs may lag behind the model, or move more */
 void tg_observer_update(tg_controller *c, const double *y);
+void tg_observer_refine(tg_controller *c, const double *y); /* with a reading between two moves */
 /* Take what a reading differs by for offsets of the sensors that are not 0 in which. */
 void tg_observer_set_offsets(tg_controller *c, const double *y, const int *which);
 void tg_observer_predict(tg_controller *c, const double *u, const double *d);

@@ -81,6 +81,7 @@ static void stand_on_sample(tg_controller *c)
 {
     c->into_s = c->share = c->noised = 0.0;
     memset(c->dose, 0, sizeof c->dose);
+    memset(c->bent, 0, sizeof c->bent);
 }
 
 /* What reading i is of the states, which are x and shown: [C, Wy], of a lagging one less, by its lag and scale. */
@@ -241,7 +242,17 @@ static void correct(tg_controller *c, const double *y, const double *R, double r
     apply(c, change);
 }
 
-void tg_observer_update(tg_controller *c, const double *y) { correct(c, y, c->design->R, REMEMBER); }
+static void correct_now(tg_controller *c, const double *y, double remember)
+{
+    double R[TG_NY];
+    for (int i = 0; i < TG_NY; i++)
+        R[i] = c->design->R[i] + c->bent[i] * c->bent[i];
+    correct(c, y, R, remember);
+}
+
+void tg_observer_update(tg_controller *c, const double *y) { correct_now(c, y, REMEMBER); }
+
+void tg_observer_refine(tg_controller *c, const double *y) { correct_now(c, y, 0.0); }
 
 void tg_observer_set_offsets(tg_controller *c, const double *y, const int *which)
 {
@@ -638,6 +649,8 @@ void tg_observer_look(tg_controller *c, const double *d)
             c->jacobian[i * TG_Z + j] = share * c->jacobian[i * TG_Z + j] + (i == j ? 1.0 - share : 0.0);
         c->P[i * TG_Z + i] += c->held[i] ? 0.0 : (share - c->noised) * s->Q[i];
     }
+    for (int i = 0; i < TG_NY; i++)
+        c->bent[i] = 4.0 * share * (1.0 - share) * (output(c, i, next) - output(c, i, c->x));
     c->share = c->noised = share;
 }
 

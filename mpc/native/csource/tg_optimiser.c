@@ -313,10 +313,11 @@ static void try_others(tg_controller *c, const double *x, const double *guess, c
             plan[i] = guess[i] + shares[at] * (full[i] - guess[i]);
         consider(c, x, plan, d, target, side, bias, drive_bias, last, &least);
     }
-    for (int way = 0; way < 2; way++) { /* ramps: to none, and to the other end */
+    for (int way = 0; way < 2; way++) { /* ramps: to none, and to the other end, which is not none */
         for (int b = 0; b < s->n_b; b++)
             for (int j = 0; j < TG_NU; j++) {
-                double far = last[j] > s->neutral[j] ? s->lowest[j] : s->highest[j];
+                int up = s->lowest[j] == s->neutral[j] || (last[j] <= s->neutral[j] && s->highest[j] > s->neutral[j]);
+                double far = up ? s->highest[j] : s->lowest[j];
                 double end = way ? far : s->neutral[j], room = (s->reach[b] + more_slew(c)) * s->slew[j];
                 plan[b * TG_NU + j] = fmin(fmax(end, last[j] - room), last[j] + room);
             }

@@ -123,6 +123,28 @@ def test_at_random_times_c_answers_what_python_answers(tank):
         )
 
 
+@pytest.mark.parametrize("name", ["mpc", "c"])
+def test_readings_between_moves_make_the_estimate_less_noisy(tank, name):
+    """Eight readings of 0.3 degC a sample in place of one, of a tank that rests at 25 degC; one is a plug."""
+    if name == "c" and compiler() is None:
+        pytest.skip("no gcc here")
+    design, spread = default_design(tank, dt=DT, deadline_s=1e9), {}
+    for parts in (1, 8):
+        controller, rng = Controller(tank, design, compiled=name == "c"), np.random.default_rng(4)
+        for k in range(150 * parts):
+            y = 25.0 + 0.3 * rng.standard_normal(2)
+            y[1] += 60.0 * (k == 803)
+            reading = {"time_s": k * DT / parts, "t_tank": y[0], "t_surface": y[1], "t_ambient": 25.0}
+            reading[controller.model.drives[0]] = 0.0
+            if not k:
+                controller.reset(reading)
+                estimates = []
+            controller.step(reading, 25.0)
+            estimates.append(controller.observer.reading())
+        spread[parts] = float(np.sqrt(np.mean((np.array(estimates)[60 * parts :] - 25.0) ** 2)))
+    assert spread[8] < 0.6 * spread[1], spread
+
+
 GAPS = st.one_of(st.floats(0.01, 20.0), st.sampled_from([*PERIODS, 2.0, 0.0, NAN]))
 TIMES = st.lists(GAPS, min_size=1, max_size=40)
 

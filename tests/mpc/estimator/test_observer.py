@@ -298,7 +298,8 @@ def test_between_samples_the_filter_is_that_of_the_state_there(held: bool) -> No
     P, between = P + 0.6 * Q, 0.4 * np.eye(4) + 0.6 * F
     np.testing.assert_allclose(observer.now, (0.4 * z + 0.6 * after(z, 30.0))[:2], atol=1e-9)
     y = np.array([26.0, 25.5])
-    Hs, R = H @ between, np.diag([0.2**2, 0.02**2])
+    bent = 4 * 0.6 * 0.4 * C @ (after(z, 30.0) - z)[:2]  # between samples an output is not on a straight line
+    Hs, R = H @ between, np.diag(np.array([0.2, 0.02]) ** 2 + bent**2)
     K = P @ Hs.T @ np.linalg.inv(Hs @ P @ Hs.T + R)
     K[2] = 0.0 if held else K[2]
     miss = y - levels - H @ (0.4 * z + 0.6 * after(z, 30.0))

@@ -62,6 +62,25 @@ def test_far_below_what_can_be_held_the_drive_stays_where_it_may(tank_maker, com
 
 
 @pytest.mark.parametrize("compiled", WAYS)
+def test_a_drive_leaves_an_end_of_its_range_where_the_model_answers_nothing(compiled):
+    """Cooled by the square of a drive of 0 to 100, from 80 degC at 5 less a bias of 5: its gain is 0."""
+    a = float(np.exp(-1 / 60))
+    F = np.full((1, 1), -60.0 / 100**2 * (1 - a))
+    model = StateSpaceModel(
+        ("q",), (), ("t",), A=np.full((1, 1), a), B=np.zeros((1, 1)), C=np.eye(1), dt=1.0, y0=[80.0],
+        terms=("q*q",), F=F,
+    )  # fmt: skip
+    plant = Plant(model, {}, dt=1.0, units={"q": "percent"}, valid={"q": (0.0, 100.0), "t": (20.0, 80.0)})
+    controller = Controller(plant, design_controller(plant).design, compiled=compiled)
+    at, n_b = np.array([5.0]), controller.optimiser.n_b
+    asked = np.array([[40.0], [-1.0], [0.0]])
+    now = Sample(np.zeros(1), at, np.full((n_b, 1), 5.0), np.zeros(0), *asked, -at)
+    plan = controller.optimiser.solve(now).plan
+    assert plan[0, 0] > 5.0
+    assert plan.max() > 50.0
+
+
+@pytest.mark.parametrize("compiled", WAYS)
 def test_a_tank_that_cools_better_than_its_model_arrives_as_soon_as_its_drive_allows(tank_maker, compiled):
     plant, truth = tank_maker(heat=0.11, joule=0.055), tank_maker(heat=0.13, joule=0.045)
     controller = Controller(plant, design_controller(plant, dt=2.0).design, compiled=compiled)
