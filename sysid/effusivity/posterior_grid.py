@@ -88,7 +88,7 @@ def marginals(arguments: Any, data: Touches, whitener: Array, beyond: Array, sd:
     if not np.isfinite(data.t_object[0]):
         return stated
     slip = integrated(sd[T_OBJECT] * float(slip_of(sd[T_OBJECT])))
-    return np.logaddexp(np.log1p(-SLIPS) + stated, np.log(SLIPS) + slip)
+    return np.asarray(np.logaddexp(np.log1p(-SLIPS) + stated, np.log(SLIPS) + slip))
 
 
 class MarginalPosterior:
