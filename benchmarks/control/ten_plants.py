@@ -280,8 +280,9 @@ def players(case: Case, without: Sequence[str], keep: Path | None) -> list[tuple
         if "mpc" not in without:
             found.append(("mpc", Ours(case, controller)))
         if "pi" not in without:
-            design = controller.design
-            found.append(("pi", Ours(case, PIController.of(plant, design, design.loops))))
+            # under the limits of the spec, as it was tuned: the MPC may have been given less of a drive
+            wide = spec.design(controller.plant)
+            found.append(("pi", Ours(case, PIController.of(plant, wide, controller.design.loops))))
         if "do-mpc" not in without and importlib.util.find_spec("do_mpc") is not None:
             found.append(("do-mpc", DoMPC(controller.plant, spec.design(controller.plant))))
     except UserError as error:

@@ -29,7 +29,7 @@ import numpy as np
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.schema import Log, column, names
 from thermogrip.mpc.interface import Controller, Move, Readings, Regulator, Target
-from thermogrip.mpc.plant.prediction import PredictionModel
+from thermogrip.mpc.plant.prediction import held_state, prediction_model
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
@@ -49,6 +49,7 @@ class Surroundings:
     move_delay_s: float = 0.0  # time between a reading and the moment its move is applied [s]
     sensor_lag_s: float = 0.0  # by how much every sensor is slower than the plant's outputs [s]
     drive_share: float = 1.0  # share of a drive, counted from the one that holds the start, that acts
+    held: tuple[str, ...] = ()  # outputs that drives have held at the start for long; else all is as warm
 
     def steps_of(self, names: tuple[str, ...]) -> Array:
         """Return the step of a reading of each of these sensors (n,) [degC]."""
@@ -160,7 +161,7 @@ class Truth:
     """The plant that closes the loop, with its sensors."""
 
     def __init__(self, plant: Plant, dt: float, around: Surroundings, start: float | None, seed: int) -> None:
-        native = PredictionModel(plant, dt=plant.dt)
+        native = prediction_model(plant, plant.dt)
         self.model, self.around = native, around
         self.sub = max(1, round(dt / native.dt))
         self.dt = self.sub * native.dt
@@ -169,6 +170,8 @@ class Truth:
         self.d = np.full(native.n_d, around.ambient)
         warmth = around.ambient if start is None else start
         self.x = native.rest(np.full(native.n_y, warmth), self.d)
+        if around.held:
+            self.x = held_state(native, around.held, warmth, tuple(self.d.tolist()))
         self.moves: list[Array] = []
         self.before = native.neutral
         given = [plant.offsets.get(name, 0.0) + around.offset.get(name, 0.0) for name in native.outputs]

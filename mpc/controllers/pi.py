@@ -3,13 +3,14 @@
 One loop for each controlled output, on the drive that moves it most:
 
     v = u_ff(r, d) + Kc (b r + (1 - b) r_0 - y) + I,      u = v inside range and slew,
-    I+ = I + dt ( Kc/Ti (r - y) + (u - v)/Tt ).
+    I+ = I + dt Kc/Ti (r - y),  but I where u is limited and this would take v further out.
 
-The last term (back-calculation) bleeds the integrator while the drive is limited, which is most of the
-time after a step of the target.  ``u_ff`` is the drive that holds the target in steady state, from the
-plant, weighted; r_0 is where the loop began, and b below 1 answers a new target less than a reading, against
-overshoot.  Where readings have a time, dt is what really passed, for the integrator and for the slew
-alike, and a call before a move is due (:mod:`thermogrip.mpc.estimator.call_times`) holds the last one.
+So the integrator stands while the drive is limited, which is most of the time after a step of the target
+(taken to the limit by back-calculation, it overshoots).  ``u_ff`` is the drive that holds the target in
+steady state, from the plant, weighted; r_0 is where the loop began, and b below 1 answers a new target less
+than a reading, against overshoot.  Where readings have a time, dt is what really passed, for the integrator
+and for the slew alike, and a call before a move is due (:mod:`thermogrip.mpc.estimator.call_times`) holds the
+last one.
 
 Its loops are tuned by :mod:`thermogrip.mpc.design.design`.
 """
@@ -31,6 +32,9 @@ from thermogrip.mpc.plant.prediction import ROOM, PredictionModel, holding_drive
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
+
+
+_UNCUT = 1e-9  # of a range: a drive that is cut by less is not limited
 
 
 class PIController(SampledController):
@@ -164,7 +168,9 @@ class PIController(SampledController):
         u = self._within(v, seconds)
         for at, (loop, (j, i)) in enumerate(zip(self.loops, self._ends)):
             if np.isfinite(error[i]):
-                self._I[at] += seconds * (loop.Kc / loop.Ti * error[i] + (u[j] - v[j]) / loop.Tt)
+                inward = (u[j] - v[j]) * loop.Kc * error[i] > 0
+                if inward or abs(u[j] - v[j]) <= _UNCUT * self.model.span[j]:
+                    self._I[at] += seconds * loop.Kc / loop.Ti * error[i]
         return u
 
     def hold(self, u: Array) -> None:

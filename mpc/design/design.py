@@ -55,8 +55,7 @@ class PILoop:
     drive: str  # what it moves and what it controls
     output: str
     Kc: float  # gain [drive units per degC]
-    Ti: float  # integral and anti-windup times [s]
-    Tt: float
+    Ti: float  # integral time [s]
     feedforward: float = 1.0  # share of the holding drive that is fed forward, 0 to 1
     setpoint: float = 1.0  # share of a change of the target that Kc answers to, 0 to 1
 
@@ -73,7 +72,7 @@ def simc(plant: Plant, drive: str, output: str, *, tau_c: float | None = None) -
     span = float(model.span[model.drives.index(drive)])
     Kc = span * answer.lag / (answer.gain * (closed + delay))
     Ti = min(answer.lag, 4 * (closed + delay))
-    return PILoop(drive, output, Kc, Ti, Tt=Ti)
+    return PILoop(drive, output, Kc, Ti)
 
 
 def default_controlled(plant: Plant) -> tuple[str, ...]:
@@ -145,7 +144,7 @@ def _numbers_of(design: Design) -> Iterator[tuple[str, Sequence[Any]]]:
     for name, value in design.slew_per_s.items():
         yield f"slew_per_s of {name}", (value,)
     for loop in design.loops:
-        yield f"the PI of {loop.output}", (loop.Kc, loop.Ti, loop.Tt, loop.feedforward, loop.setpoint)
+        yield f"the PI of {loop.output}", (loop.Kc, loop.Ti, loop.feedforward, loop.setpoint)
     for name, value in vars(design.noise).items():
         yield f"noise: {name}", (value,)
 
@@ -202,7 +201,7 @@ def _check_loops(design: Design, drives: Sequence[str]) -> None:
         _refuse(wrong, f"loops: {loop.output} by {loop.drive} is no pair of a regulated output and a drive")
         wrong = any(loop.drive == other.drive or loop.output == other.output for other in design.loops[:at])
         _refuse(wrong, f"loops: {loop.output} by {loop.drive} is there twice")
-        _refuse(loop.Ti <= 0 or loop.Tt <= 0, f"loops: Ti and Tt of {loop.output} must be > 0")
+        _refuse(loop.Ti <= 0, f"loops: Ti of {loop.output} must be > 0")
         wrong = not 0 <= loop.setpoint <= 1
         _refuse(wrong, f"loops: setpoint of {loop.output} must be 0 to 1")
 
@@ -278,7 +277,9 @@ class Design:
             values = dict(content)
             values["controlled"] = tuple(str(name) for name in content["controlled"])
             values["blocks"] = tuple(int(length) for length in content["blocks"])
-            values["loops"] = tuple(PILoop(**loop) for loop in content["loops"])
+            # an older file has an anti-windup time beside
+            loops = [{key: of[key] for key in of if key != "Tt"} for of in content["loops"]]
+            values["loops"] = tuple(PILoop(**loop) for loop in loops)
             values["noise"] = ObserverNoise(**content["noise"])
             for key in ("drive_range", "limits"):
                 values[key] = {str(k): (float(v[0]), float(v[1])) for k, v in content[key].items()}

@@ -32,7 +32,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -397,7 +397,7 @@ _ARITHMETIC: dict[str, Callable[..., Any]] = {
 }
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=64)
 def prediction_model(plant: Plant, dt: float) -> PredictionModel:
     """Return :class:`PredictionModel`, the same one for the same plant: a search asks again and again."""
     return PredictionModel(plant, dt=dt)
@@ -516,25 +516,46 @@ def holding_drive(
     u = found.x * model.span
     y = model.steady_output(u, d)
     if not np.isfinite(y).all():
-        u, y = _balance(model, rows, wanted, d)
+        x, u = _balance(model, rows, wanted, d)
+        y = model.output(x)
         return Holding(u, y, float(np.max(np.abs(np.where(np.isfinite(y[rows]), y[rows] - wanted, 1e3)))))
     return Holding(u, y, float(np.max(np.abs(miss(found.x)))))
 
 
+_HELD = 0.25  # degC: a start that drives miss by less is held
+
+
+@lru_cache(maxsize=256)
+def held_state(
+    model: PredictionModel, controlled: tuple[str, ...], start: float, d: tuple[float, ...]
+) -> Array:
+    """Return the state (n_x,) in which drives inside their range hold the controlled outputs at ``start``
+    [degC] for good; where none do, that of a plant which is as warm all over, without a drive."""
+    wanted = np.full(len(controlled), start)
+    held = holding_drive(model, controlled, wanted, d)
+    x = model.steady_state(held.u, d)
+    if not np.isfinite(x).all():  # an integrator
+        x, u = _balance(model, [model.outputs.index(name) for name in controlled], wanted, np.array(d))
+        held = replace(held, miss=held.miss if np.all((model.lowest <= u) & (u <= model.highest)) else np.inf)
+    if held.miss < _HELD and np.isfinite(x).all():
+        return np.asarray(x)
+    return model.rest(np.full(model.n_y, start), d)
+
+
 def _balance(model: PredictionModel, rows: list[int], wanted: Array, d: Array) -> tuple[Array, Array]:
-    """Return drives and outputs of a state that stays and has these outputs, by Newton's method; outputs are
-    NaN where there is none."""
+    """Return a state that stays and has these outputs, and its drives, by Newton's method; the state is NaN
+    where there is none."""
     x, u = model.rest(np.full(model.n_y, wanted.mean()), d), model.neutral
     for _ in range(_NEWTON_STEPS):
         after, A, B, _ = model.linearise(x, u, d)
         off = np.concatenate([after - x, model.output(x)[rows] - wanted])
         if np.max(np.abs(off)) < _BALANCED:
-            return u, model.output(x)
+            return x, u
         outputs = np.hstack([model.C[rows], np.zeros((len(rows), model.n_u))])
         by = np.vstack([np.hstack([A - np.eye(model.n_x), B * model.span]), outputs])
         move = np.linalg.lstsq(by, -off, rcond=None)[0]
         x, u = x + move[: model.n_x], u + move[model.n_x :] * model.span
-    return u, np.full(model.n_y, np.nan)
+    return np.full(model.n_x, np.nan), u
 
 
 def steady_curve(

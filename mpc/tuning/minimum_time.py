@@ -29,7 +29,7 @@ from scipy.sparse import diags_array, kron, vstack
 from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.design.design import Design
 from thermogrip.mpc.design.spec import Spec
-from thermogrip.mpc.plant.prediction import PredictionModel, prediction_model
+from thermogrip.mpc.plant.prediction import PredictionModel, held_state, prediction_model
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
@@ -58,7 +58,7 @@ class _Race:
         offset = plant.offsets.get(output, 0.0) + spec.sensor_offset_degC
         self.goal = self.side * (step[1] - offset) - spec.band_degC
         self.d = np.full(model.n_d, spec.ambient_degC)
-        self.x = model.rest(np.full(model.n_y, step[0]), self.d)
+        self.x = held_state(model, tuple(design.controlled), step[0], tuple(self.d.tolist()))
         self.low, self.high = np.array([design.drive_range[name] for name in model.drives]).T
         self.slew = np.array([design.slew_per_s[name] for name in model.drives]) * design.dt
         self.neutral = np.clip(np.zeros(model.n_u), self.low, self.high)

@@ -107,11 +107,18 @@ def lacking(plant: Plant, spec: Spec, controlled: Sequence[str]) -> list[tuple[s
     return [(words, changes) for value, words, changes in tried if value > 0]
 
 
+@lru_cache(maxsize=64)
+def drawn(plant: Plant, draw: int) -> Plant:
+    """Return a draw, the same one each time: its models and held states are worked out once."""
+    return plant.draw(draw)
+
+
 def surroundings_of(spec: Spec, controlled: Sequence[str], disturbances: Sequence[str]) -> Surroundings:
     """Return the room and the sensors of the trials: the controlled ones are off, and the room's are."""
     offset = dict.fromkeys(controlled, spec.sensor_offset_degC)
     offset |= dict.fromkeys(disturbances, 1.5 * spec.sensor_offset_degC)
-    return Surroundings(ambient=spec.ambient_degC, noise=spec.noise_degC, offset=offset)
+    room = spec.ambient_degC
+    return Surroundings(ambient=room, noise=spec.noise_degC, offset=offset, held=tuple(controlled))
 
 
 def trial(
@@ -134,7 +141,7 @@ def trial(
         around = replace(around, **lacking(plant, spec, controller.controlled)[structure - 1][1])
     return loop(
         controller,
-        plant.draw(draw),
+        drawn(plant, draw),
         [(step[1], length_s)],
         start=step[0],
         surroundings=around,
@@ -185,9 +192,8 @@ def bounds_of(plant: Plant, design: Design, spec: Spec, draws: Sequence[int]) ->
     """Return :func:`full_drive_bound` of every step of the spec on these draws."""
     found: Bounds = {}
     for draw in draws:
-        drawn = plant.draw(draw)
         for step in spec.steps:
-            found[(*step, draw)] = full_drive_bound(drawn, design, step, spec)
+            found[(*step, draw)] = full_drive_bound(drawn(plant, draw), design, step, spec)
     return found
 
 
@@ -236,6 +242,8 @@ PI_PARAMETERS = (
     ("setpoint", 0.1, 1.0),
     ("feedforward", 0.05, 1.0),
 )
+#: Of a PI whose delay is no longer than the plant's step: no log shows it, SIMC's gain is the highest tried.
+PI_OF_UNSEEN_DELAY = (("Kc", 0.2, 1.0), ("Ti", 0.6, 5.0), *PI_PARAMETERS[2:])
 LQR_PARAMETERS = (
     ("move", 0.02, 500.0),
     ("drive", 1e-4, 100.0),
@@ -274,6 +282,9 @@ class Search:
         count = len(lacking(plant, spec, baseline.controlled))
         self.lacking = [STRUCTURE * (k + 1) + self.draws[0] for k in range(count)]
         check_steps(self.bounds)
+        unseen = apparent_delay(plant, baseline.controlled) <= plant.dt
+        own = PI_OF_UNSEEN_DELAY if unseen else PI_PARAMETERS
+        self.pi = own[:-1] if self.certain else own
         slowest = [max(self.bounds[(*step, draw)] for draw in self.draws) for step in spec.steps]
         # long enough to see it settle and stay, short enough to try many
         least = min(120.0, spec.hold_s)
@@ -400,16 +411,14 @@ def parameters_of(design: Design, spec: Spec) -> dict[str, float]:
 
 
 def scaled_loops(loops: tuple[PILoop, ...], factors: dict[str, float]) -> tuple[PILoop, ...]:
-    """Return PI loops with each number times its factor, feed-forward and setpoint weight as given and Tt as
-    a share of Ti; a step of the load leaves an integrated error of Ti / Kc, at most half more than that of
-    the loops given."""
+    """Return PI loops with each number times its factor, feed-forward and setpoint weight as given; a step of
+    the load leaves an integrated error of Ti / Kc, at most half more than that of the loops given."""
     Ti = min(factors["Ti"], 1.5 * factors["Kc"])
     return tuple(
         replace(
             loop,
             Kc=factors["Kc"] * loop.Kc,
             Ti=Ti * loop.Ti,
-            Tt=factors["Tt"] * Ti * loop.Ti,
             feedforward=factors["feedforward"],
             setpoint=factors["setpoint"],
         )

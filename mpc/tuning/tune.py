@@ -41,7 +41,6 @@ from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.tuning.objective import (
     LQR_PARAMETERS,
     MPC_PARAMETERS,
-    PI_PARAMETERS,
     STRUCTURE,
     Bounds,
     Record,
@@ -392,9 +391,9 @@ def _search_all(
     n = search.spec.evaluations
     # SIMC, with the drive that holds the target; and without: a plant that has no draws does not know how
     # wrong that drive is
-    pi = {"Kc": 1.0, "Ti": 1.0, "Tt": 0.25, "setpoint": 1.0, "feedforward": 0.99}
+    pi = {"Kc": 1.0, "Ti": 1.0, "setpoint": 1.0, "feedforward": 0.99}
     plain = pi | {"feedforward": 0.05}
-    others = [plain | dict(zip(_SPREAD, values.tolist())) for values in _spread(search.certain)]
+    others = [plain | dict(zip(_SPREAD, values.tolist())) for values in _spread(search.pi)]
     lqr = {**parameters_of(search.baseline, search.spec), "drive": 1e-2}
     items = [
         (search, "MPC", [_best(looked).parameters], max(0, n - len(looked)), None),
@@ -414,12 +413,12 @@ def _search_all(
 _SPREAD = {"Kc": (0.4, 2.5), "Ti": (0.4, 2.5), "setpoint": (0.2, 1.0), "feedforward": (0.05, 1.0)}
 
 
-def _spread(certain: bool) -> Array:
-    """Return 16 sets of a PI's parameters, evenly spread over their logarithms."""
+def _spread(bounds: Sequence[tuple[str, float, float]]) -> Array:
+    """Return 16 sets of a PI's parameters inside these bounds, evenly spread over their logarithms."""
     from scipy.stats.qmc import Halton
 
-    ends = np.log(list(_SPREAD.values())[: 3 if certain else 4])
-    low, high = ends.T
+    ends = [(max(low, _SPREAD[name][0]), min(high, _SPREAD[name][1])) for name, low, high in bounds]
+    low, high = np.log(ends).T
     return np.asarray(np.exp(low + Halton(len(ends), scramble=False).random(17)[1:] * (high - low)))
 
 
@@ -431,8 +430,7 @@ def _optimise(item: tuple[Search, str, list[dict[str, float]], int, Progress | N
         return []
     import nlopt
 
-    own = PI_PARAMETERS[:-1] if search.certain else PI_PARAMETERS
-    parameters = {"MPC": MPC_PARAMETERS, "PI": own, "LQR": LQR_PARAMETERS}[name]
+    parameters = {"MPC": MPC_PARAMETERS, "PI": search.pi, "LQR": LQR_PARAMETERS}[name]
     evaluate = partial(search.evaluate, name=name)
     names = [parameter for parameter, _, _ in parameters]
     low = np.log([small for _, small, _ in parameters])

@@ -30,6 +30,7 @@
 #define SLOWER_SD 5.0     /* the least lag in those, */
 #define SLOW_FOR 5        /* and for so many samples in a row */
 #define TINY 1e-9
+#define UNCUT 1e-9 /* of its range: a drive of the PI that is cut by less is not limited */
 #define SAME 1e-6 /* of a sample: what is nearer than this is the same time */
 
 /* ---- the loop ---- */
@@ -402,7 +403,7 @@ static double error_of(const tg_controller *c, int loop, double share)
 }
 
 /* One step of the PI controller, taken over without a bump: u = Kc (b r - y) + I,
- * I+ = I + dt (Kc/Ti (r - y) + (u - v)/Tt). */
+ * I+ = I + dt Kc/Ti (r - y), but I where u is limited and this would take v further out. */
 static void go_on_pi(tg_controller *c, double *drive)
 {
     const tg_design *s = c->design;
@@ -420,7 +421,9 @@ static void go_on_pi(tg_controller *c, double *drive)
     }
     for (int l = 0; l < s->n_loops; l++) {
         int j = s->loop_drive[l];
-        c->integral[l] += c->slew_s * (s->Kc[l] / s->Ti[l] * error_of(c, l, 1.0) + (drive[j] - wanted[j]) / s->Tt[l]);
+        double change = s->Kc[l] * error_of(c, l, 1.0), cut = drive[j] - wanted[j];
+        if (cut * change > 0.0 || fabs(cut) <= UNCUT * (s->highest[j] - s->lowest[j]))
+            c->integral[l] += c->slew_s / s->Ti[l] * change;
     }
 }
 

@@ -17,8 +17,8 @@ from thermogrip.sysid.plant.plant import Plant
 
 PLANT, NAN = crossed(), float("nan")
 LOOPS = (
-    PILoop("q2", "a", Kc=3.0, Ti=20.0, Tt=10.0, feedforward=0.5),
-    PILoop("q1", "b", Kc=2.0, Ti=40.0, Tt=5.0),
+    PILoop("q2", "a", Kc=3.0, Ti=20.0, feedforward=0.5),
+    PILoop("q1", "b", Kc=2.0, Ti=40.0),
 )
 TARGET = {"a": 30.0, "b": 29.5}  # held by 40 % of q2 and 30 % of q1 in a room of 22 degC
 
@@ -33,10 +33,11 @@ def pi(**changes) -> PIController:
 def test_its_moves_and_its_integrators_are_those_of_the_equations():
     controller = pi()
     for now, a, b, q1, q2, of_a, of_b in (
-        # q2: 20 + 3 * 8 = 44, of which 12.5 a second; q1: 30 + 2 * 7.5 = 45, of which 4
-        (0.0, 22.0, 22.0, 8.0, 25.0, 2 * (1.2 - 1.9), 2 * (0.375 - 7.4)),
-        (2.0, 24.0, 25.0, 16.0, 36.6, -1.4 + 2 * 0.9, -14.05 + 2 * (0.225 - 1.79)),
-        (5.0, 26.0, 27.0, 17.82, 32.4, 0.4 + 3 * 0.6, -17.18 + 3 * 0.125),
+        # q2: 20 + 3 * 8 = 44, of which 12.5 a second; q1: 30 + 2 * 7.5 = 45, of which 4: both stand
+        (0.0, 22.0, 22.0, 8.0, 25.0, 0.0, 0.0),
+        # 20 + 3 * 6 is within; 30 - 2 * 0.4 is limited, and its integrator brings it back
+        (2.0, 24.0, 29.9, 16.0, 38.0, 2 * 0.9, 2 * -0.02),
+        (5.0, 26.0, 31.0, 26.96, 33.8, 1.8 + 3 * 0.6, -0.04 - 3 * 0.075),
     ):
         move = controller.step({"a": a, "b": b, "room": 22.0, "time_s": now}, TARGET)
         assert (move.status, move.advice, move.pump, move.seconds) == ("ok", "", 1, 1)
@@ -50,9 +51,9 @@ def test_its_moves_and_its_integrators_are_those_of_the_equations():
     said = {(each.status, each.advice) for each in lost}
     assert said == {("fallback_plan", "b: no usable reading, the others go on")}
     drives = [each.drive["q1"] for each in lost]
-    assert drives == pytest.approx([17.82, 9.82, 1.82, 0.0], abs=1e-4)  # held for 3 s, then to rest
-    assert controller._I[1] == pytest.approx(-16.805, abs=1e-4)
-    assert lost[0].drive["q2"] == pytest.approx(20.0 + 2.2, abs=2e-4)
+    assert drives == pytest.approx([26.96, 18.96, 10.96, 2.96], abs=1e-4)  # held for 3 s, then to rest
+    assert controller._I[1] == pytest.approx(-0.265, abs=1e-4)
+    assert lost[0].drive["q2"] == pytest.approx(20.0 + 3.6, abs=2e-4)
     controller.reset({"a": 23.0, "b": 24.0})
     assert controller._I.tolist() == pytest.approx(controller._unread_s.tolist()) == [0.0, 0.0]
     assert controller._target.tolist() == [24.0, 23.0]
@@ -89,7 +90,7 @@ def test_patience_is_ten_seconds_or_five_samples():
     ("share", "narrow", "q1"), [(0.5, 100.0, 30.0), (0.0, 100.0, 0.0), (0.5, 20.0, 20.0)]
 )
 def test_a_drive_without_a_loop_gets_what_is_fed_forward(share: float, narrow: float, q1: float):
-    loop = PILoop("q2", "a", Kc=3.0, Ti=20.0, Tt=10.0, feedforward=share)
+    loop = PILoop("q2", "a", Kc=3.0, Ti=20.0, feedforward=share)
     controller = pi(loops=(loop,), drive_range={"q1": (0.0, narrow)}, slew_per_s=None)
     for _ in range(3):
         u = controller.propose(np.array([22.0, 29.0]), np.array([29.504, 30.0]), np.array([22.2]))

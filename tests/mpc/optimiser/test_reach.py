@@ -334,5 +334,5 @@ def test_a_relaxation_begins_anew_when_its_own_drive_moves_or_its_reading_is_los
         made._record(np.array(y), np.array(u), np.array([at, 0.2]))
         assert [len(relaxation.bins) for relaxation in made._relaxations] == kept
         assert [relaxation.w.tolist() for relaxation in made._relaxations] == [[k, 0.2] for k in since]
-    alone = PILoop("q1", "a", Kc=1.0, Ti=1.0, Tt=1.0)
+    alone = PILoop("q1", "a", Kc=1.0, Ti=1.0)
     assert [each.tolist() for each in reach(loops=(alone,))._movers] == [[0, 1], [0, 1]]

@@ -260,7 +260,7 @@ def test_gains_at_rest_and_what_is_left_of_them(optimiser):
     np.testing.assert_allclose(optimiser._authority(0.6 * G), np.full((3, 2), 0.6))
     optimiser.seen[1, 0] = False
     assert optimiser._authority(0.6 * G)[:2, 0].tolist() == [pytest.approx(0.6), 1.0]
-    loops = (PILoop("q2", "b", Kc=1.0, Ti=1.0, Tt=1.0), PILoop("q1", "a", Kc=1.0, Ti=1.0, Tt=1.0))
+    loops = (PILoop("q2", "b", Kc=1.0, Ti=1.0), PILoop("q1", "a", Kc=1.0, Ti=1.0))
     assert Optimiser(optimiser.model, replace(DESIGN, loops=loops)).pair.tolist() == [1, 0]
 
 

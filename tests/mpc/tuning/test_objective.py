@@ -21,9 +21,17 @@ STEPS = [(28.0, 36.0), (28.0, 20.0)]
 SPEC = Spec(steps=STEPS, hold_s=300.0, search_draws=2, check_draws=3, sensor_offset_degC=0.4, band_degC=0.3)
 
 
-def search_of(bounds: Any, *, uncertain: bool = True, spec: Spec = SPEC, **changes: Any) -> Search:
+class _Plant(SimpleNamespace):
+    """A plant of which draws are kept."""
+
+    __hash__ = object.__hash__
+
+
+def search_of(
+    bounds: Any, *, uncertain: bool = True, spec: Spec = SPEC, dt: float = 1.0, **changes: Any
+) -> Search:
     """Return the search of a tank whose shortest times are a function of (start, target, draw)."""
-    plant = SimpleNamespace(uncertain=uncertain, draw=lambda k: k)
+    plant = _Plant(uncertain=uncertain, draw=lambda k: k, dt=dt)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(objective, "full_drive_bound", lambda drawn, design, step, spec: bounds(*step, drawn))
         patch.setattr(objective, "apparent_delay", lambda plant, controlled: 8.0)
@@ -69,7 +77,7 @@ def test_each_controller_is_tried_for_its_own_length(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(search, "made", lambda name, design: (name, design.move))
     scale = search.baseline.loops[0].Kc
     monkeypatch.setattr(objective.PIController, "of", lambda plant, base, loops: ("PI", loops[0].Kc / scale))
-    pi = {"Kc": 2.0, "Ti": 1.0, "Tt": 1.0, "setpoint": 1.0, "feedforward": 0.5}
+    pi = {"Kc": 2.0, "Ti": 1.0, "setpoint": 1.0, "feedforward": 0.5}
     tried = [search.evaluate({"move": 7.0}), search.evaluate(pi, "PI"), search.evaluate({"move": 4.0}, "LQR")]
     search.evaluate_at_length(("PI", pi))
     lengths = [search.lengths, [300.0, 300.0], search.lengths, [300.0, 300.0]]
@@ -97,11 +105,11 @@ def test_a_trial_has_a_sensor_that_is_off_and_a_seed_of_its_draw(monkeypatch: py
 
     monkeypatch.setattr(objective, "simulate_closed_loop", loop)
     monkeypatch.setattr(objective, "apparent_delay", lambda plant, controlled: 8.0)
-    plant: Any = SimpleNamespace(disturbances=("room",), draw=lambda k: {"draw": k})
+    plant: Any = _Plant(disturbances=("room",), draw=lambda k: {"draw": k})
     controller: Any = SimpleNamespace(controlled=("a", "b"))
     found = objective.run_trials(controller, plant, SPEC, [1, 2], lengths=[50.0, 60.0], seed=4)
     offset = {"a": 0.4, "b": 0.4, "room": pytest.approx(0.6)}
-    around = Surroundings(ambient=25.0, noise=0.04, offset=offset)
+    around = Surroundings(ambient=25.0, noise=0.04, offset=offset, held=("a", "b"))
     assert seen == [
         ({"draw": draw}, [(target, length)],
          {"start": 28.0, "surroundings": around, "band": 0.3, "seed": 4000 + draw})
@@ -154,13 +162,19 @@ def test_a_share_of_a_drive_is_about_none(ends, capped):
     assert objective._capped({"q": ends}, 0.25) == {"q": pytest.approx(capped)}
 
 
+def test_a_pi_goes_beyond_its_rules_gain_only_where_the_delay_was_seen():
+    seen, unseen = search_of(lambda *at: 60.0), search_of(lambda *at: 60.0, dt=8.0)
+    assert [{name: most for name, _, most in of.pi}["Kc"] for of in (seen, unseen)] == [5.0, 1.0]
+    assert [name for name, *_ in search_of(lambda *at: 60.0, uncertain=False).pi] == ["Kc", "Ti", "setpoint"]
+
+
 def test_a_pis_numbers_are_scaled_and_its_feedforward_is_given():
-    loop = PILoop("q", "t", 2.0, 30.0, 40.0, 0.9)
+    loop = PILoop("q", "t", 2.0, 30.0, 0.9)
     given = {"setpoint": 0.4, "feedforward": 0.7}
-    (made,) = scaled_loops((loop,), {"Kc": 3.0, "Ti": 0.5, "Tt": 0.1, **given})
-    assert made == PILoop("q", "t", 6.0, 15.0, 1.5, 0.7, 0.4)
+    (made,) = scaled_loops((loop,), {"Kc": 3.0, "Ti": 0.5, **given})
+    assert made == PILoop("q", "t", 6.0, 15.0, 0.7, 0.4)
     # a step of the load leaves at most half more than with the loop's own Ti / Kc
-    (slow,) = scaled_loops((loop,), {"Kc": 0.5, "Ti": 8.0, "Tt": 0.1, **given})
+    (slow,) = scaled_loops((loop,), {"Kc": 0.5, "Ti": 8.0, **given})
     assert slow.Ti / slow.Kc == pytest.approx(1.5 * loop.Ti / loop.Kc)
 
 
