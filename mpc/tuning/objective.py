@@ -242,7 +242,7 @@ PI_PARAMETERS = (
     ("setpoint", 0.1, 1.0),
     ("feedforward", 0.05, 1.0),
 )
-#: Of a PI whose delay is no longer than the plant's step: no log shows it, SIMC's gain is the highest tried.
+#: Of a PI whose delay is below two steps of the plant: no log shows it, SIMC's gain is the highest tried.
 PI_OF_UNSEEN_DELAY = (("Kc", 0.2, 1.0), ("Ti", 0.6, 5.0), *PI_PARAMETERS[2:])
 LQR_PARAMETERS = (
     ("move", 0.02, 500.0),
@@ -282,7 +282,7 @@ class Search:
         count = len(lacking(plant, spec, baseline.controlled))
         self.lacking = [STRUCTURE * (k + 1) + self.draws[0] for k in range(count)]
         check_steps(self.bounds)
-        unseen = apparent_delay(plant, baseline.controlled) <= plant.dt
+        unseen = apparent_delay(plant, baseline.controlled) < 2 * plant.dt
         own = PI_OF_UNSEEN_DELAY if unseen else PI_PARAMETERS
         self.pi = own[:-1] if self.certain else own
         slowest = [max(self.bounds[(*step, draw)] for draw in self.draws) for step in spec.steps]
