@@ -356,7 +356,9 @@ def test_a_spec_faster_than_full_drive_is_called_actuator_limited(tank: Any):
 
 
 def test_a_plant_without_uncertainty_is_compared_under_fresh_noise(tank: Any):
-    done = tuned(tank, draws=(0,), unseen=(0,), lacking=(1000, 2000, 3000), certain=True)
+    done = tuned(
+        tank, draws=(0,), unseen=(0,), lacking=(1000, 2000, 3000), certain=True, pi=PI_PARAMETERS[:-1]
+    )
     assert "under fresh noise (the plant has no uncertainty)" in done.tuning.finding
     # its PI does without the drive that the plant has for a target
     assert {trial.parameters["feedforward"] for trial in done.tried("PI")} == {0.05}
