@@ -183,6 +183,22 @@ def test_a_pi_that_has_taken_over_answers_a_new_target_alike_in_c(plant):
     assert abs(drives[0.4, 6] - drives[1.0, 6]) > 1e-3
 
 
+def test_a_pi_that_was_limited_comes_back_alike_in_c(plant):
+    design = default_design(plant)
+    python = Controller(plant, design, clock=count(0, 60).__next__)
+    c, truth = InC(plant, design), Truth(plant, design.dt, Surroundings(), 25.0, 3)
+    for controller in (python, c):
+        controller.reset(truth.reading())
+    ask_late(c.c, True)
+    for k in range(60):
+        reading, target = truth.reading(), 60.0 if 6 <= k < 30 else 26.0
+        move = python.step(reading, target)
+        assert c.step(reading, target).drive == pytest.approx(move.drive, abs=1e-7)
+        truth.apply(move)
+        if k == 29:
+            assert move.drive == pytest.approx(1.0)  # its limit, since the new target
+
+
 def test_without_a_target_c_is_off_as_python_is(plant):
     c, reading = InC(plant, default_design(plant)), dict.fromkeys((*plant.outputs, "t_ambient"), 25.0)
     c.reset(reading)
