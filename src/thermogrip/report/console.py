@@ -115,8 +115,18 @@ def short(cell: Any) -> str:
     if hasattr(cell, "item"):
         cell = cell.item()
     if isinstance(cell, float):
-        return f"{cell:.4g}" if math.isfinite(cell) else "-"
+        return significant(cell, 4) if math.isfinite(cell) else "-"
     return str(cell)
+
+
+def significant(value: float, digits: int) -> str:
+    """Return a number with so many digits, without an exponent below a million.
+
+    >>> significant(63970.4, 4), significant(1580.2, 3), significant(0.0712, 3), significant(2.5e7, 3)
+    ('63970', '1580', '0.0712', '2.5e+07')
+    """
+    text = f"{value:.{digits}g}"
+    return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e6 else text
 
 
 def _table(title: str, head: Sequence[str], rows: Sequence[Sequence[Any]], width: int) -> str:
