@@ -26,8 +26,8 @@ def test_the_page_names_the_ill_rig_and_draws_all(ill):
     assert [row[0] for row in numbers.parts[0].rows] == list(population.parameters)
     axes = [axis for axis in each.parts[0].figure.axes if axis.get_visible()]
     assert len(axes) == N_FREE
-    drawn = [line for line in axes[0].lines if line.get_marker() in ("o", "X")]
-    assert [line.get_marker() == "X" for line in drawn] == [rig.ill for rig in rigs]  # not by colour alone
+    drawn = [line for line in axes[0].lines if line.get_marker() in ("o", "x")]
+    assert [line.get_marker() == "x" for line in drawn] == [rig.ill for rig in rigs]  # not by colour alone
     assert [tick.get_text() for tick in axes[0].get_yticklabels() if "(ill)" in tick.get_text()] == (
         ["odd (ill)"] if ill else []
     )

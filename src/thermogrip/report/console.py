@@ -18,7 +18,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from itertools import zip_longest
 from pathlib import Path
 from shutil import get_terminal_size
-from textwrap import wrap
+from textwrap import TextWrapper, wrap
 from typing import Any, TypeAlias
 
 from thermogrip.datasets.media import printable
@@ -39,8 +39,13 @@ class Console:
     as_json: bool = False
 
     def say(self, text: str) -> None:
-        """Print one line for people."""
+        """Print a sentence for people, as wide as the terminal (100 columns of what is none); lines that end
+        stay as they are."""
         if not self.as_json:
+            if "\n" not in text:
+                indent = " " * (len(text) - len(text.lstrip()))
+                whole = {"break_long_words": False, "break_on_hyphens": False}
+                text = TextWrapper(_room(), subsequent_indent=indent, **whole).fill(text)
             sys.stdout.write(printable(text) + "\n")
 
     def warn(self, text: str) -> None:
@@ -51,8 +56,7 @@ class Console:
         """Print a table for people, as wide as the terminal (100 columns of what is none); numbers stand to
         the right, no word is broken, and where the columns are too many each row is a block of lines."""
         if not self.as_json:
-            room = get_terminal_size().columns if sys.stdout.isatty() else _WIDTH
-            sys.stdout.write(_table(title, head, rows, room))
+            sys.stdout.write(_table(title, head, rows, _room()))
 
     def early(self, line: str, title: str, head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
         """Show on stderr, while work goes on, what is known so far: on a terminal a table, else one line."""
@@ -77,6 +81,11 @@ class Console:
             yield _lines(printable(title))
         finally:
             sys.stderr.write(_anew())
+
+
+def _room() -> int:
+    """Return the columns of stdout."""
+    return get_terminal_size().columns if sys.stdout.isatty() else _WIDTH
 
 
 def cells(columns: Columns, items: Iterable[Any]) -> Cells:

@@ -62,13 +62,15 @@ def fleet_figure(plants: Mapping[str, Plant], population: Population, rigs: Sequ
         for place, rig in zip(y, rigs):
             own = plants[rig.name]
             low, high = own.intervals(0.9)[name]
-            look, label = (("X", PALETTE[1]), "ill, by its own logs") if rig.ill else (("o", "0.6"), _OWN)
+            look, label = (("x", PALETTE[1]), "ill, by its own logs") if rig.ill else (("o", "0.6"), _OWN)
             axis.plot([low, high], [place - 0.15] * 2, "-", color=look[1], lw=1)
-            axis.plot(own.values[name], place - 0.15, look[0], color=look[1], ms=3 + 2 * rig.ill, label=label)
+            size = 6 if rig.ill else 3
+            axis.plot(own.values[name], place - 0.15, look[0], color=look[1], ms=size, mew=1.5, label=label)
             pooled = population.natural(rig.pooled)[k]
             axis.plot(pooled, place + 0.15, "D", color=PALETTE[0], ms=3, label="pooled")
         low, high = ranges[name]
-        values = [low, high, *(plants[rig.name].values[name] for rig in rigs)]
+        own_values = (plants[rig.name].values[name] for rig in rigs)
+        values = [low, high, *own_values, *(population.natural(rig.pooled)[k] for rig in rigs)]
         margin = 0.15 * (max(values) - min(values))
         axis.set_xlim(min(values) - margin, max(values) + margin)  # a short log's interval may be far wider
         axis.xaxis.set_major_locator(MaxNLocator(4))

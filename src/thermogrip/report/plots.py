@@ -142,6 +142,7 @@ def bode_chart(found: Dynamics) -> Chart:
     outputs, inputs = found.near.outputs, found.near.inputs
     omega, magnitude, phase = found.frequency_response()
     least = 1e-4 * magnitude.value.max(axis=(0, 1))  # of each input: the scale has no zero
+    turned = type(phase)(*(np.where(magnitude.value < least, np.nan, part) for part in phase))
 
     def curve(part: Estimate, i: int, j: int, floor: float) -> Curve:
         value, low, high = (each[:, i, j] for each in part)
@@ -158,7 +159,7 @@ def bode_chart(found: Dynamics) -> Chart:
     columns = []
     for j, name in enumerate(inputs):
         sizes = tuple(curve(magnitude, i, j, float(least[j])) for i in rows)
-        turns = tuple(curve(phase, i, j, -np.inf) for i in rows)
+        turns = tuple(curve(turned, i, j, -np.inf) for i in rows)
         above = Panel("magnitude", sizes, name, 1.5, log=True)
         columns.append((above, Panel("phase [deg]", turns, height=1.3)))
     return Chart(tuple(columns), "frequency [rad/s]", log=True, wide=max(3.2, 6.4 / len(inputs)))
