@@ -149,7 +149,7 @@ def bode_chart(found: Dynamics) -> Chart:
         line = Curve(
             outputs[i], omega, np.where(value < floor, np.nan, value), PALETTE[i % 8], dash=DASHES[i % 4]
         )
-        if not np.isfinite(high).all():
+        if not np.isfinite(high).any():
             return line
         seen = high >= floor
         low, high = np.where(seen, np.maximum(low, floor), np.nan), np.where(seen, high, np.nan)
