@@ -44,8 +44,9 @@ class Console:
         if not self.as_json:
             if "\n" not in text:
                 indent = " " * (len(text) - len(text.lstrip()))
-                whole = {"break_long_words": False, "break_on_hyphens": False}
-                text = TextWrapper(_room(), subsequent_indent=indent, **whole).fill(text)
+                lines = TextWrapper(_room(), subsequent_indent=indent)
+                lines.break_long_words = lines.break_on_hyphens = False
+                text = lines.fill(text)
             sys.stdout.write(printable(text) + "\n")
 
     def warn(self, text: str) -> None:
