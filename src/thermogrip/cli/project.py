@@ -36,7 +36,8 @@ def demo(
         done = run_demo(out, seed=seed, workers=pool, progress=progress)
     for section in done.sections:
         if section.verdict:
-            console.say(f"{section.title}\n    {section.verdict}")
+            console.say(section.title)
+            console.say(f"    {section.verdict}")
     console.say(f"report: {done.report}")
     verdicts = {section.title: section.verdict for section in done.sections if section.verdict}
     console.answer({"report": done.report, "verdicts": verdicts})
