@@ -165,12 +165,12 @@ def _modes(lam: Array, vectors: Array, root: Array, half: Array) -> StackModes:
 
 
 @lru_cache(maxsize=64)
-def compiled_gripper(stack: Stack, steps: tuple[float, ...]) -> Any:
-    """Return what is common to all contacts of a gripper at these steps: it costs more than one contact."""
-    from thermogrip.sysid.contact.time_stepping import gripper_of
+def gripper_modes(stack: Stack) -> Any:
+    """Return the gripper as the time stepping takes it."""
+    from thermogrip.sysid.contact.time_stepping import grippers
 
     found = stack_modes(stack)
-    return gripper_of(np.array(steps), found.lam, found.face, found.sensor, contact_numbers(stack, found))
+    return grippers(found.lam[None], found.face[None], found.sensor[None], contact_numbers(stack, found)[None])
 
 
 def step_response(
@@ -182,16 +182,17 @@ def step_response(
     ``effusivity``, ``capacity``, settled ``h_c`` and ``build_up`` (default the stack's) are (n,);
     one that is not positive and finite raises a ValueError.
     """
-    from thermogrip.sysid.contact.time_stepping import contacts
+    from thermogrip.sysid.contact.time_stepping import N_STEPPED, VALUE, contacts
 
     given = (effusivity, capacity, h_c, stack.build_up if build_up is None else build_up)
     e, c, h, tau = np.broadcast_arrays(*(np.atleast_1d(np.asarray(v, dtype=float)) for v in given))
     for name, value in (("effusivity", e), ("capacity", c), ("h_c", h)):
         if not (np.all(np.isfinite(value)) and np.all(value > 0)):
             raise ValueError(f"{name} must be positive and finite, got {value[~(value > 0)][:3]}")
-    gripper = compiled_gripper(stack, tuple(nodes.dt.tolist()))
-    rise, slope, flux = contacts(tuple(nodes), gripper, *(np.ascontiguousarray(v) for v in (e, c, h, tau)))
-    return rise, slope, flux
+    wanted = np.zeros((e.size, N_STEPPED), dtype=bool)
+    wanted[:, VALUE] = True
+    rise, slope, flux = contacts(tuple(nodes), gripper_modes(stack), np.stack([e, c, h, tau], axis=1), wanted)
+    return rise[:, VALUE], slope[:, VALUE], flux
 
 
 def far_response(

@@ -78,8 +78,8 @@ from thermogrip.sysid.contact.simulation import (
     LAYER_NAMES,
     Stack,
     TimeNodes,
-    compiled_gripper,
     contact_numbers,
+    gripper_modes,
     nearby_modes,
     stack_modes,
     time_nodes,
@@ -143,15 +143,18 @@ def jacobian(
     ``vary`` (n_pair, 7), the unknown nuisances; ``beyond`` (n_pair, 2, n_bin) the gripper's discrepancy."""
     from thermogrip.sysid.effusivity.mode_kernel import readings
 
-    y, slopes = readings(
-        *gripper_arguments(stack, nodes), (np.empty((0, 0)),) * 4, data.sample_t, data.sample_bin, data.count,
-        data.t, data.ramp, data.t_ambient, _beyond(beyond, u, data), np.ascontiguousarray(u), vary,
-    )  # fmt: skip
-    return y, slopes
+    y, slopes = readings(pairs_asked(stack, nodes, data, np.arange(len(u)), beyond), u, vary)
+    return y, slopes[:, :N_NUISANCE].transpose(0, 2, 1)
 
 
-def _beyond(beyond: Array | None, u: Array, data: Touches) -> Array:
-    return np.zeros((len(u), 2, data.y.shape[1])) if beyond is None else beyond
+def pairs_asked(
+    stack: Stack, nodes: TimeNodes, data: Touches, row: NDArray[np.int64], beyond: Array | None
+) -> Any:
+    """Return the pairs of some rows and a gripper as the search takes them."""
+    from thermogrip.sysid.effusivity.mode_kernel import Asked
+
+    nothing = np.zeros((row.size, 2, data.y.shape[1])) if beyond is None else beyond
+    return Asked(tuple(nodes), gripper_modes(stack), data, row, nothing)
 
 
 def find_modes(
@@ -173,14 +176,10 @@ def find_modes(
         u[:, LEVEL] = np.where(vary[:, LEVEL], data.level[row], u[:, LEVEL])
     dof = np.full(u.shape, np.inf) if prior.dof is None else prior.dof
     w_matrix, log_det = whitener
-    arguments = gripper_arguments(stack, nodes_for(data))
-    covariance, objective, misfit, settled = modes(
-        *arguments, row, data.sample_t, data.sample_bin, data.count, data.t, data.y,
-        data.ramp, data.t_ambient, _beyond(beyond, u, data), w_matrix,
-        np.stack([prior.mean, prior.sd, dof], axis=1), u, max_steps,
-    )  # fmt: skip
+    asked, law = pairs_asked(stack, nodes_for(data), data, row, beyond), np.stack([prior.mean, prior.sd, dof], axis=1)
+    covariance, objective, misfit, settled = modes(asked, w_matrix, law, u, max_steps)
     evidence = -0.5 * (objective + log_det[row]) + peak_ratio(dof, vary)
-    return Mode(u, covariance, evidence, settled > 0, misfit)
+    return Mode(u, covariance, evidence, settled, misfit)
 
 
 def peak_ratio(dof: Array, vary: Mask) -> Array:
@@ -189,11 +188,6 @@ def peak_ratio(dof: Array, vary: Mask) -> Array:
     nu = np.where(heavy, dof, 1.0)
     ratio = gammaln(0.5 * (nu + 1)) - gammaln(0.5 * nu) - 0.5 * np.log(0.5 * nu)
     return np.asarray(np.where(heavy, ratio, 0.0).sum(axis=1))
-
-
-def gripper_arguments(stack: Stack, nodes: TimeNodes) -> tuple[Any, ...]:
-    """Return the first arguments of the compiled functions, kept from call to call for each gripper."""
-    return tuple(nodes), compiled_gripper(stack, tuple(nodes.dt.tolist()))
 
 
 _AT = {name: i for i, name in enumerate((*SHARED_NAMES, "ln_h", "ln_e"))}
@@ -379,8 +373,8 @@ def _penalty(pair: _Pair, v: Array) -> tuple[float, Array, Array, Array]:
     """Return the prior's -2 ln density, its slopes, bounds of the curvatures and these, (7,) each."""
     from thermogrip.sysid.effusivity.mode_kernel import penalty
 
-    parts = np.empty((3, N_NUISANCE))
-    return float(penalty(v, pair.prior.mean[0], pair.prior.sd[0], pair.dof, *parts)), *parts
+    value, *parts = penalty(v[None], pair.prior.mean, pair.prior.sd, pair.dof[None])
+    return float(value[0]), parts[0][0], parts[1][0], parts[2][0]
 
 
 def _expand(pair: _Pair, here: _Point, k: Array, j: Array) -> _Expansion:
@@ -434,6 +428,7 @@ def _whole_covariance(pair: _Pair, ahead: _Expansion, k: Array, j: Array) -> Arr
 
 def _slopes(pair: _Pair, here: _Point) -> tuple[Array, Array]:
     """Return the derivatives of the bin means by theta, (n_bin, n_theta), and by u, (n_bin, 7)."""
+    from thermogrip.sysid.contact.time_stepping import grippers
     from thermogrip.sysid.effusivity.mode_kernel import readings
 
     data, u, stack = pair.data, here.u, here.stack
@@ -451,11 +446,10 @@ def _slopes(pair: _Pair, here: _Point) -> tuple[Array, Array]:
         np.concatenate([moved, np.repeat(here_[None], len(_CONTACT) + 1, axis=0)])
         for moved, here_ in zip(near[:3], base[:3])
     )
-    us, vary = np.repeat(u[None], len(contact), axis=0), np.zeros((len(contact), u.size), dtype=bool)
-    y, _ = readings(
-        *gripper_arguments(stack, pair.nodes), (lam, face, sensor, contact), data.sample_t, data.sample_bin,
-        data.count, data.t, data.ramp, data.t_ambient, pair.beyond, us, vary,
-    )  # fmt: skip
+    asked = pairs_asked(stack, pair.nodes, data, np.zeros(len(contact), dtype=np.int64), pair.beyond)
+    asked = asked._replace(gripper=grippers(lam, face, sensor, contact))
+    us = np.repeat(u[None], len(contact), axis=0)
+    y, _ = readings(asked, us, np.zeros(us.shape, dtype=bool))
     k[:, _MOVED] = ((y[:-1] - y[-1]) / _DIFFERENCE).T
     if np.isfinite(data.t_ambient[0]):
         k[:, _AT["leak"]] = (data.t_ambient[0] - u[LEVEL]) * data.ramp[0]

@@ -45,8 +45,8 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     doubted,
     fit_pairs,
     free_hypotheses,
-    gripper_arguments,
     nodes_for,
+    pairs_asked,
     prior_of,
     slip_of,
 )
@@ -66,29 +66,19 @@ _Z = np.column_stack([np.repeat(_FIRST, 6), np.tile(_OTHERS, (_FIRST.size, 1))])
 _LOG_WEIGHT = 1.5 - np.log(6.0) - 0.5 * np.log(2 * np.pi) + np.log(_STEP)
 
 
-def marginals(arguments: Any, data: Touches, whitener: Array, beyond: Array, sd: Array, u: Array) -> Array:
+def slipped(
+    gripper: GripperModel, data: Touches, whitener: Array, beyond: Array, sd: Array, u: Array
+) -> Array:
     """Return ln p(y | u) up to a constant for n points ``u`` (n, 7) of one grasp, integrated over level and
     T_obj (prior means in ``u``, sds in ``sd`` (7,)), the latter a slip with a probability of ``SLIPS`` where
-    it is stated; ``arguments`` are of
-    :func:`~thermogrip.sysid.effusivity.laplace_approximation.gripper_arguments`."""
-    from thermogrip.sysid.effusivity.mode_kernel import modes
+    it is stated."""
+    from thermogrip.sysid.effusivity.mode_kernel import marginals
 
-    law = np.zeros((len(u), 3, u.shape[1]))
-    law[:, 0], law[:, 2] = u, np.inf
-
-    def integrated(t_sd: float) -> Array:
-        law[:, 1, LEVEL], law[:, 1, T_OBJECT] = sd[LEVEL], t_sd
-        _, objective, _, _ = modes(
-            *arguments, np.zeros(len(u), dtype=np.int64), data.sample_t, data.sample_bin, data.count, data.t,
-            data.y, data.ramp, data.t_ambient, beyond, whitener, law, u.copy(), 0,
-        )  # fmt: skip
-        return np.asarray(-0.5 * objective)
-
-    stated = integrated(sd[T_OBJECT])
-    if not np.isfinite(data.t_object[0]):
-        return stated
-    slip = integrated(sd[T_OBJECT] * float(slip_of(sd[T_OBJECT])))
-    return np.asarray(np.logaddexp(np.log1p(-SLIPS) + stated, np.log(SLIPS) + slip))
+    asked = pairs_asked(gripper.stack, nodes_for(data), data, np.zeros(len(u), dtype=np.int64), beyond)
+    stated, t_sd = np.isfinite(data.t_object[0]), sd[T_OBJECT]
+    sds = [[sd[LEVEL], t_sd], [sd[LEVEL], t_sd * float(slip_of(t_sd))]]
+    found = marginals(asked, whitener, u, np.array(sds[: 1 + stated]))
+    return np.asarray(np.logaddexp(np.log1p(-SLIPS) + found[0], np.log(SLIPS) + found[1]) if stated else found[0])
 
 
 class MarginalPosterior:
@@ -103,7 +93,6 @@ class MarginalPosterior:
         self.gripper, self.data = gripper, data
         whitener, log_det = whiten(data, gripper.noise) if noise is None else noise
         self.whitener, self.log_det = whitener, float(log_det[0])
-        self._arguments = gripper_arguments(gripper.stack, nodes_for(data))
         # of the prior only what depends on ln e is computed again
         self._prior = prior_of(gripper, data, free_hypotheses(gripper, [9.0]))
 
@@ -127,7 +116,7 @@ class MarginalPosterior:
             dof = np.inf if common.dof is None else common.dof[0, k]
             log_prior += _log_student(points[:, column], common.mean[0, k], common.sd[0, k], dof)
         beyond = self.gripper.beyond(data.t, points[:, 0])
-        likelihood = marginals(self._arguments, data, self.whitener, beyond, common.sd[0], u)
+        likelihood = slipped(self.gripper, data, self.whitener, beyond, common.sd[0], u)
         return np.asarray(log_prior + likelihood)
 
 
