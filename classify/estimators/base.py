@@ -173,6 +173,10 @@ class GraspClassifier(ClassifierMixin, _Sampled, BaseEstimator, ABC):  # type: i
         """Return :meth:`candidate_log_proba` and :meth:`p_unknown`."""
         return self.candidate_log_proba(X, candidates), self.p_unknown(X, candidates)
 
+    def open_set_answer(self, grasps: Grasps, candidates: Sequence[str]) -> tuple[Floats, Floats, list[str]]:
+        """Return :meth:`open_set_log_proba` and :meth:`beyond_training` of one record."""
+        return *self.open_set_log_proba(grasps, candidates), self.beyond_training(grasps)
+
     def beyond_training(self, grasps: Grasps) -> list[str]:
         """Return in words what makes the answer of each grasp overconfident; empty where nothing does."""
         return [""] * grasps.sizes["grasp"]

@@ -153,20 +153,20 @@ def pairs_asked(
     """Return the pairs of some rows and a gripper as the search takes them."""
     from thermogrip.sysid.effusivity.mode_kernel import Asked
 
-    nothing = np.zeros((row.size, 2, data.y.shape[1])) if beyond is None else beyond
+    nothing = np.broadcast_to(0.0, (row.size, 2, data.y.shape[1])) if beyond is None else beyond
     return Asked(tuple(nodes), gripper_modes(stack), data, row, nothing)
 
 
 def find_modes(
     stack: Stack, data: Touches, row: NDArray[np.int64], whitener: tuple[Array, Array], prior: Prior, *,
-    start: Array | None = None, max_steps: int = 20, beyond: Array | None = None,
+    start: Array | None = None, max_steps: int = 20, beyond: Array | None = None, rivals: bool = False,
 ) -> Mode:  # fmt: skip
     """Return mode, covariance and log evidence of every pair by damped Gauss-Newton.
 
     Pair p is touch ``row[p]`` under row p of ``prior``; ``whitener`` is what
     :func:`~thermogrip.sysid.effusivity.data.whiten` returns for ``data``.  It starts at the prior's mean with
     the level as measured, or at ``start`` (n_pair, 7); a pair that has not settled within ``max_steps`` is
-    hopeless in practice.
+    hopeless in practice, and where pairs of one touch are ``rivals`` one far behind the best is left early.
     """
     from thermogrip.sysid.effusivity.mode_kernel import modes
 
@@ -177,7 +177,7 @@ def find_modes(
     dof = np.full(u.shape, np.inf) if prior.dof is None else prior.dof
     w_matrix, log_det = whitener
     asked, law = pairs_asked(stack, nodes_for(data), data, row, beyond), np.stack([prior.mean, prior.sd, dof], axis=1)
-    covariance, objective, misfit, settled = modes(asked, w_matrix, law, u, max_steps)
+    covariance, objective, misfit, settled = modes(asked, w_matrix, law, u, max_steps, rivals=rivals)
     evidence = -0.5 * (objective + log_det[row]) + peak_ratio(dof, vary)
     return Mode(u, covariance, evidence, settled, misfit)
 
@@ -540,13 +540,15 @@ def prior_of(gripper: GripperModel, data: Touches, hypotheses: Hypotheses) -> Pr
 def fit_pairs(
     gripper: GripperModel, data: Touches, row: NDArray[np.int64], hypotheses: Hypotheses, *,
     start: Array | None = None, max_steps: int = 20, noise: tuple[Array, Array] | None = None,
-    prior: Prior | None = None,
+    prior: Prior | None = None, rivals: bool = False,
 ) -> Mode:  # fmt: skip
     """Return the modes of pairs, hypothesis i against touch ``row[i]``, integrated over an uncertain
     gripper's parameters, a second sensor used; ``noise`` and ``prior`` are
     :func:`~thermogrip.sysid.effusivity.data.whiten` and :func:`prior_of` where a caller has them."""
-    prior = prior_of(gripper, data.take(row), hypotheses) if prior is None else prior
-    mode = _own_modes(gripper, data, row, hypotheses, prior, start, max_steps, noise)
+    prior = prior_of(gripper, data.known(row), hypotheses) if prior is None else prior
+    # what else counts may bring another one up
+    rivals = rivals and gripper.discrepancy is None and (gripper.second is None or data.second is None)
+    mode = _own_modes(gripper, data, row, hypotheses, prior, start, max_steps, noise, rivals)
     mode = with_second(gripper, data, row, hypotheses, prior, mode)
     n = (data.count[row] > 0).sum(axis=1)
     if gripper.second is not None and data.second is not None:
@@ -568,16 +570,16 @@ def with_second(
     if second is None or data.second is None:
         return mode
     others = hypotheses_of_second(gripper, second, hypotheses)
-    own = prior_of(second, data.second.take(row), others)
+    own = prior_of(second, data.second.known(row), others)
     begin = own.mean.copy()
     begin[:, LEVEL], begin[:, T_OBJECT] = data.second.level[row], mode.u[:, T_OBJECT]
-    beside = _own_modes(second, data.second, row, others, own, begin, 20, None)
+    beside = _own_modes(second, data.second, row, others, own, begin, 20, None, False)
     return joined_modes(mode, prior, beside, own, second.bias - gripper.bias)
 
 
 def _own_modes(
     gripper: GripperModel, data: Touches, row: NDArray[np.int64], hypotheses: Hypotheses, prior: Prior,
-    start: Array | None, max_steps: int, noise: tuple[Array, Array] | None,
+    start: Array | None, max_steps: int, noise: tuple[Array, Array] | None, rivals: bool,
 ) -> Mode:  # fmt: skip
     """Return the modes of pairs by the first sensor alone."""
     noise = whiten(data, gripper.noise) if noise is None else noise
@@ -586,8 +588,10 @@ def _own_modes(
         return uncertain_gripper_modes(
             gripper, data, row, noise, prior, block, start=start, max_steps=max_steps
         )
-    beyond = gripper.beyond(data.t[row], prior.mean[:, EFFUSIVITY])
-    return find_modes(gripper.stack, data, row, noise, prior, start=start, max_steps=max_steps, beyond=beyond)
+    beyond = None if gripper.discrepancy is None else gripper.beyond(data.t[row], prior.mean[:, EFFUSIVITY])
+    return find_modes(
+        gripper.stack, data, row, noise, prior, start=start, max_steps=max_steps, beyond=beyond, rivals=rivals
+    )
 
 
 def hypotheses_of_second(gripper: GripperModel, second: GripperModel, one: Hypotheses) -> Hypotheses:
@@ -716,9 +720,9 @@ def fit_candidates(
     row = np.repeat(np.arange(n), m)
     hypotheses = Hypotheses(*(np.tile(h, n) for h in one))
     begin = None if start is None else start.reshape(n * m, -1)
-    each = data.take(row)
+    each = data.known(row)
     prior = prior_of(gripper, each, hypotheses)
-    mode = fit_pairs(gripper, data, row, hypotheses, start=begin, prior=prior)
+    mode = fit_pairs(gripper, data, row, hypotheses, start=begin, prior=prior, rivals=True)
     return doubted(gripper, each, prior, mode), prior, row
 
 

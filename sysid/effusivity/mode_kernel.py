@@ -21,6 +21,8 @@ from thermogrip.sysid.effusivity.data import Touches
 
 _AT_ONCE = 256  # pairs
 _LONGEST = 1.5
+# after so many steps, -2 ln posterior behind the best by the quadratic model, which is a poor guide far away
+_HOPELESS = {3: 1000.0, 4: 1000.0, 5: 1000.0} | dict.fromkeys(range(6, 99), 120.0)
 _LEAST_DECREASE = 0.01  # of -2 ln posterior: smaller predicted decreases end the search
 _H, _BUILD_UP, _ONSET, _LEVEL, _T, _E, _C = range(7)
 _LEFT = 7  # the column of what is left, after those of the derivatives
@@ -224,31 +226,35 @@ def penalty(u: Array, mean: Array, sd: Array, dof: Array) -> Penalty:
 
 
 def modes(
-    asked: Asked, whitener: Array, law: Array, u: Array, max_steps: int
-) -> tuple[Array, Array, Array, Mask]:  # fmt: skip
+    asked: Asked, whitener: Array, law: Array, u: Array, max_steps: int, *, rivals: bool = False
+) -> tuple[Array, Array, Array, Mask]:
     """Move ``u`` (n, 7) to the mode of each pair; return covariance (n, 7, 7), objective, misfit and where the
     search settled.
 
     The prior of each is its ``law`` (n, 3, 7): mean, sd, degrees of freedom.  The objective is -2 ln
-    (likelihood x prior density relative to its peak) + ln det of its curvature in units of sd.
+    (likelihood x prior density relative to its peak) + ln det of its curvature in units of sd.  Where pairs
+    of one row are ``rivals``, one that is hopeless beside the best of them is left there, unsettled.
     """
     n = len(u)
     covariance, objective, misfit = np.zeros((n, 7, 7)), np.empty(n), np.empty(n)
-    settled = np.zeros(n, dtype=bool)
-    for begin in range(0, n, _AT_ONCE):
-        part = slice(begin, min(begin + _AT_ONCE, n))
-        found = _settle(asked.take(part), whitener, law[part], u[part], max_steps)
+    settled, begin = np.zeros(n, dtype=bool), 0
+    ends = np.append(np.flatnonzero(np.diff(asked.row)) + 1, n) if rivals else np.arange(1, n + 1)
+    while begin < n:  # rivals at once
+        end = int(ends[max(np.searchsorted(ends, begin + _AT_ONCE, "right") - 1, np.searchsorted(ends, begin, "right"))])
+        part, begin = slice(begin, end), end
+        found = _settle(asked.take(part), whitener, law[part], u[part], max_steps, rivals)
         covariance[part], objective[part], misfit[part], settled[part] = found
     return covariance, objective, misfit, settled
 
 
 def _settle(
-    asked: Asked, whitener: Array, law: Array, u: Array, max_steps: int
+    asked: Asked, whitener: Array, law: Array, u: Array, max_steps: int, rivals: bool
 ) -> tuple[Array, Array, Array, Mask]:
     n, (mean, sd, dof) = len(u), law.transpose(1, 0, 2)
     trial, damping = u.copy(), np.full(n, 1e-2)
     at, settled, diagonal = np.arange(n), np.zeros(n, dtype=bool), np.arange(_LEFT)
     cost, matrix, slope, bound = np.full(n, np.inf), np.zeros((n, 8, 8)), np.zeros((n, 7)), np.ones((n, 7))
+    best = np.empty(asked.data.level.size)
     for step in range(max_steps + 1):
         there = products(asked.take(at), whitener, trial[at], sd[at], alike=step == 0)
         off = penalty(trial[at], mean[at], sd[at], dof[at])
@@ -269,7 +275,12 @@ def _settle(
         u[at[near]] += last[near] * sd[at[near]]
         cost[at[near]] -= decrease[near]
         settled[at[near]] = True
-        at, curved, rhs = at[~near], curved[~near], rhs[~near]
+        left = ~near
+        if rivals and step in _HOPELESS:
+            best.fill(np.inf)
+            np.minimum.at(best, asked.row, cost)
+            left &= cost[at] - decrease < best[asked.row[at]] + _HOPELESS[step]
+        at, curved, rhs = at[left], curved[left], rhs[left]
         if not at.size:
             break
         curved[:, diagonal, diagonal] *= 1.0 + damping[at, None]

@@ -3,7 +3,7 @@ r"""The posterior of ln e on a grid that finds its own place.
 Given ln e every other unknown is close to Gaussian, so Laplace's method serves there; ln e itself is not
 (copper's posterior runs into the prior's edge, wood's is narrower than any fixed grid), so it gets a grid:
 coarse over the prior, then twice refined where the mass is.  Between points the log density is interpolated
-by a monotone cubic.
+by Akima's cubics.
 
 **What Laplace's method leaves out** changes slowly with ln e, so it is integrated (:func:`log_integrals`) at
 seven of the points, and the rest interpolated.  Its mean over the posterior is left to Laplace's method: the
@@ -27,7 +27,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
+from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 from scipy.special import gammaln, logsumexp, ndtr
 
 from thermogrip.datasets.arrays import Array, Mask
@@ -142,10 +142,8 @@ def _log_student(x: Array, mean: Array | float, sd: Array | float, dof: float = 
     return np.asarray(norm - 0.5 * (dof + 1) * np.log1p(w**2 / dof) - np.log(sd))
 
 
-N_COARSE, _FINE = 26, 18
-_FIRST_STEPS, _STEPS = 3, 20
-_NEAR = 500.0  # nats below the best point within which a search that has not settled goes on
-WIDEN = (12.0, 7.0)  # nats below the best point that a refinement still covers
+N_COARSE = 26
+REFINEMENTS = ((12.0, 12), (7.0, 14))  # nats below the best point that each covers, and its points
 _KNOTS, _REACH = 7, 8.0  # points to integrate at, and how far below the best they go [nat]
 
 
@@ -173,20 +171,29 @@ class _Fitted(NamedTuple):
 
 def grid_posteriors(gripper: GripperModel, data: Touches) -> list[GridPosterior]:
     """Return the posteriors of ln e: log-uniform prior over :data:`LN_E_RANGE`, h_c unknown."""
-    n, noise = data.level.size, whiten(data, gripper.noise)
-    coarse = np.tile(np.linspace(*LN_E_RANGE, N_COARSE), (n, 1))
-    found = _evaluate(gripper, data, noise, coarse, np.ones(coarse.shape, dtype=bool), None, _FIRST_STEPS)
-    near = ~found.settled & (found.value > found.value.max(axis=1, keepdims=True) - _NEAR)
-    if near.any():
-        again = _evaluate(gripper, data, noise, coarse, near, found.u, _STEPS)
-        for old, new in zip(found, again):
-            old[near] = new[near]
-    for widen in WIDEN:
-        grid = np.stack([refined(found.x[i], found.value[i], widen) for i in range(n)])
-        start = np.stack([_between(grid[i], found.x[i], found.u[i]) for i in range(n)])
-        more = _evaluate(gripper, data, noise, grid, np.ones(grid.shape, dtype=bool), start, _STEPS)
+    noise = whiten(data, gripper.noise)
+    found = _fitted(gripper, data, noise)
+    return [_finished(gripper, data, noise, found, i) for i in range(data.level.size)]
+
+
+def free_evidence(gripper: GripperModel, data: Touches) -> Array:
+    """Return the log evidence of a free effusivity for each touch, (n,), as :func:`grid_posteriors` do."""
+    found = _fitted(gripper, data, whiten(data, gripper.noise))
+    return log_total(found.x, found.value) - np.log(LN_E_RANGE[1] - LN_E_RANGE[0])
+
+
+def _fitted(gripper: GripperModel, data: Touches, noise: tuple[Array, Array]) -> _Fitted:
+    """Return the fits at the coarse points and at those of the refinements, along which ln e rises."""
+    coarse = np.tile(np.linspace(*LN_E_RANGE, N_COARSE), (data.level.size, 1))
+    found = _evaluate(gripper, data, noise, coarse, None)
+    for widen, n_point in REFINEMENTS:
+        grid = np.stack([refined(x, value, widen, n_point) for x, value in zip(found.x, found.value)])
+        more = _evaluate(gripper, data, noise, grid, _between(grid, found.x, found.u))
         found = _Fitted(*(np.concatenate(pair, axis=1) for pair in zip(found, more)))
-    return [_finished(gripper, data, noise, found, i) for i in range(n)]
+        order = np.argsort(found.x, axis=1)
+        row = np.arange(len(order))[:, None]
+        found = _Fitted(*(part[row, order] for part in found))
+    return found
 
 
 def _finished(
@@ -203,7 +210,6 @@ def _left_out(gripper: GripperModel, data: Touches, noise: tuple[Array, Array], 
     """Return what Laplace's method left out of one grasp's points, (m,), less its mean over the posterior."""
     x, value, u, covariance, settled = found
     near = np.flatnonzero(settled & (value > value.max() - _REACH))
-    near = near[np.argsort(x[near])]
     # for an uncertain gripper Laplace's method integrates over its parameters too, with a discrepancy the
     # evidence counts less than the integral says
     other = gripper.uncertain or gripper.discrepancy is not None
@@ -213,9 +219,8 @@ def _left_out(gripper: GripperModel, data: Touches, noise: tuple[Array, Array], 
     at = near[np.unique(np.abs(x[near] - wanted[:, None]).argmin(axis=1))]
     missing = log_integrals(gripper, data, x[at], u[at], covariance[at], noise=noise) - value[at]
     everywhere = PchipInterpolator(x[at], missing)(np.clip(x, x[at[0]], x[at[-1]]))
-    order = np.argsort(x)
-    weight = np.exp(value[order] - value.max()) * np.gradient(x[order])
-    return np.asarray(everywhere - (weight * everywhere[order]).sum() / weight.sum())
+    weight = np.exp(value - value.max()) * np.gradient(x)
+    return np.asarray(everywhere - (weight * everywhere).sum() / weight.sum())
 
 
 def mixture_quantiles(weight: Array, mean: Array, sd: Array, levels: tuple[float, ...]) -> Array:
@@ -241,50 +246,84 @@ def mixture_quantiles(weight: Array, mean: Array, sd: Array, levels: tuple[float
 
 
 def _evaluate(
-    gripper: GripperModel, data: Touches, noise: tuple[Array, Array], grid: Array, wanted: Mask,
-    start: Array | None, steps: int,
-) -> _Fitted:  # fmt: skip
-    """Return the fits at the ``wanted`` points of a grid (n, m), zeros elsewhere."""
+    gripper: GripperModel, data: Touches, noise: tuple[Array, Array], grid: Array, start: Array | None
+) -> _Fitted:
+    """Return the fits at the points of a grid (n, m)."""
     n, m = grid.shape
-    row = np.broadcast_to(np.arange(n)[:, None], (n, m))[wanted]
-    begin = None if start is None else start[wanted]
-    hypotheses = free_hypotheses(gripper, grid[wanted])
-    each = data.take(row)
+    row = np.repeat(np.arange(n), m)
+    hypotheses = free_hypotheses(gripper, grid)
+    each = data.known(row)
     prior = prior_of(gripper, each, hypotheses)
-    mode = fit_pairs(gripper, data, row, hypotheses, start=begin, max_steps=steps, noise=noise, prior=prior)
+    begin = None if start is None else start.reshape(n * m, -1)
+    mode = fit_pairs(gripper, data, row, hypotheses, start=begin, noise=noise, prior=prior, rivals=True)
     mode = doubted(gripper, each, prior, mode)
-    out = _Fitted(
-        grid, np.zeros((n, m)), np.zeros((n, m, 7)), np.zeros((n, m, 7, 7)), np.zeros((n, m), dtype=bool)
-    )
-    values = (mode.log_evidence, mode.u, mode.covariance, mode.converged)
-    for part, value in zip(out[1:], values):
-        part[wanted] = value
-    return out
+    found = (mode.log_evidence, mode.u, mode.covariance, mode.converged)
+    return _Fitted(grid, *(part.reshape(n, m, *part.shape[1:]) for part in found))
 
 
 def _between(x: Array, knots: Array, values: Array) -> Array:
-    """Return values (n_knot, 7) at knots in any order, linear between them, at x (n,)."""
-    order = np.argsort(knots)
-    return np.stack([np.interp(x, knots[order], column) for column in values[order].T], axis=1)
+    """Return ``values`` (n, n_knot, 7) at ``knots`` (n, n_knot), along which these rise, at ``x`` (n, m): by
+    the cubic of the four around."""
+    row = np.arange(len(x))[:, None]
+    first = (knots[:, None, :] <= x[:, :, None]).sum(axis=2) - 2
+    at = np.clip(first, 0, knots.shape[1] - 4)[:, :, None] + np.arange(4)
+    near = knots[row[:, :, None], at]
+    total = np.zeros((*x.shape, values.shape[2]))
+    for j in range(4):
+        others = [k for k in range(4) if k != j]
+        weight = np.prod((x[:, :, None] - near[:, :, others]) / (near[:, :, [j]] - near[:, :, others]), axis=2)
+        total += weight[:, :, None] * values[row, at[:, :, j]]
+    return total
 
 
-def refined(x: Array, value: Array, widen: float) -> Array:
-    """Return new points where log densities ``value`` at ``x`` are within ``widen`` of their best."""
-    order = np.argsort(x)
-    x, value = x[order], value[order]
+def refined(x: Array, value: Array, widen: float, n_point: int) -> Array:
+    """Return new points where log densities ``value`` at ``x``, which rises, are within ``widen`` of their
+    best."""
     inside = np.flatnonzero(value > value.max() - widen)
     low = x[max(inside[0] - 1, 0)]
     high = x[min(inside[-1] + 1, x.size - 1)]
-    # midpoints of cells, so that a refinement never repeats a point of the one before
-    return np.asarray(low + (high - low) * (np.arange(_FINE) + 0.5) / _FINE)
+    # of each cell the middle, or beside it: farthest from the points there are
+    cell = (high - low) / n_point
+    new = low + cell * (np.arange(n_point) + _PLACES[:, None])
+    return np.asarray(new[np.abs(new[:, :, None] - x).min(axis=(1, 2)).argmax()])
+
+
+_FAR = 30.0  # nats below the best, where nothing counts, and a cubic beside would swing
+_PLACES = np.array([0.5, 0.46, 0.54, 0.42, 0.58, 0.38, 0.62])
+
+
+def slopes(x: Array, value: Array) -> Array:
+    """Return Akima's slopes of curves ``value`` (n, m) at ``x`` (n, m): where a curve bends sharply they are
+    those of its smooth side, so that no wave is added."""
+    secant = np.diff(value) / np.diff(x)
+    before, after = 2 * secant[:, :1] - secant[:, 1:2], 2 * secant[:, -1:] - secant[:, -2:-1]
+    m = np.concatenate([2 * before - secant[:, :1], before, secant, after, 2 * after - secant[:, -1:]], axis=1)
+    turn = np.abs(np.diff(m))
+    left, right = turn[:, 2:], turn[:, :-2]
+    even = left + right <= 1e-9 * turn.max(axis=1, keepdims=True)
+    weight = np.where(even, 0.5, left / np.where(even, 1.0, left + right))
+    return np.asarray(weight * m[:, 1:-2] + (1 - weight) * m[:, 2:-1])
+
+
+_GAUSS, _SHARE = (0.5 * v for v in np.polynomial.legendre.leggauss(8))
+
+
+def log_total(x: Array, value: Array) -> Array:
+    """Return the logarithms of the integrals of densities whose logarithms are ``value`` (n, m) at ``x``
+    (n, m), cubics between them, (n,)."""
+    value = np.maximum(value, value.max(axis=1, keepdims=True) - _FAR)
+    s, width, d = _GAUSS + 0.5, np.diff(x)[:, :, None], slopes(x, value)
+    y0, y1 = value[:, :-1, None], value[:, 1:, None]
+    bent = s * (1 - s) * ((1 - s) * (d[:, :-1, None] * width) - s * (d[:, 1:, None] * width))
+    bulge = s * (1 - s) * (1 - 2 * s) * (y0 - y1)
+    log_density = y0 + s * (y1 - y0) + bent + bulge
+    return np.asarray(logsumexp(log_density + np.log(_SHARE * width), axis=(1, 2)))
 
 
 def posterior_of(x: Array, value: Array, t_object: Array, sd: Array, ln_h: Array) -> GridPosterior:
-    """Return the posterior of log densities ``value`` at points ``x``, in any order; all arguments (m,)."""
-    order = np.argsort(x)
-    order = order[np.concatenate([[True], np.diff(x[order]) > 1e-9])]
-    x, value, t_object, sd, ln_h = (v[order] for v in (x, value, t_object, sd, ln_h))
-    curve = PchipInterpolator(x, value)
+    """Return the posterior of log densities ``value`` at points ``x``, along which these rise; all arguments (m,)."""
+    bounded = np.maximum(value, value.max() - _FAR)
+    curve = CubicHermiteSpline(x, bounded, slopes(x[None], bounded[None])[0])
     inside = np.flatnonzero(value > value.max() - 20)
     low, high = x[max(inside[0] - 1, 0)], x[min(inside[-1] + 1, x.size - 1)]
     fine = np.linspace(low, high, 500)
