@@ -432,8 +432,6 @@ def _slopes(pair: _Pair, here: _Point) -> tuple[Array, Array]:
     from thermogrip.sysid.effusivity.mode_kernel import readings
 
     data, u, stack = pair.data, here.u, here.stack
-    _, by_u = jacobian(stack, pair.nodes, data, u[None], np.ones((1, u.size), dtype=bool), pair.beyond)
-    k = by_u[0] @ pair.by_mean
     n = len(_LAYERS)
     layers = np.repeat([[getattr(stack, name) for name in LAYER_NAMES]], n, axis=0)
     layers[np.arange(n), np.arange(n)] *= np.exp(_DIFFERENCE)
@@ -449,12 +447,16 @@ def _slopes(pair: _Pair, here: _Point) -> tuple[Array, Array]:
     asked = pairs_asked(stack, pair.nodes, data, np.zeros(len(contact), dtype=np.int64), pair.beyond)
     asked = asked._replace(gripper=grippers(lam, face, sensor, contact))
     us = np.repeat(u[None], len(contact), axis=0)
-    y, _ = readings(asked, us, np.zeros(us.shape, dtype=bool))
+    vary = np.zeros(us.shape, dtype=bool)
+    vary[-1] = True
+    y, slopes = readings(asked, us, vary)
+    by_u = slopes[-1, :N_NUISANCE].T
+    k = by_u @ pair.by_mean
     k[:, _MOVED] = ((y[:-1] - y[-1]) / _DIFFERENCE).T
     if np.isfinite(data.t_ambient[0]):
         k[:, _AT["leak"]] = (data.t_ambient[0] - u[LEVEL]) * data.ramp[0]
     there = (data.count[0] > 0)[:, None]
-    return k * there, by_u[0] * there
+    return k * there, by_u * there
 
 
 class Hypotheses(NamedTuple):
