@@ -56,7 +56,6 @@ from thermogrip.classify.estimators.base import (
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.materials import load_materials
 from thermogrip.datasets.schema import Grasps, has_touch_groups, label_values
-from thermogrip.sysid.effusivity.calibration import calibrate_gripper
 from thermogrip.sysid.effusivity.data import Touches, touches
 from thermogrip.sysid.effusivity.gripper_model import GripperModel, GripperSpread, another_gripper
 from thermogrip.sysid.effusivity.laplace_approximation import fit_candidates
@@ -135,6 +134,8 @@ class PosteriorClassifier(GraspClassifier):
         labels: list[Labels],
         progress: Callable[[float, str], None] | None = None,
     ) -> None:
+        from thermogrip.sysid.effusivity.calibration import calibrate_gripper
+
         self._check_params()
         where = "+".join(str(part.attrs.get("name")) for part in records)
         self.classes_ = two_or_more(np.concatenate(labels), where)
@@ -167,6 +168,8 @@ class PosteriorClassifier(GraspClassifier):
         self._check_fitted()
         device = another_gripper(self.device_, spread)
         if known is not None:
+            from thermogrip.sysid.effusivity.calibration import calibrate_gripper
+
             device = calibrate_gripper(record_list(known), prior=device, seed=self.random_state)
         other = copy(self)
         other.device_ = device

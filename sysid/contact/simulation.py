@@ -37,7 +37,6 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import make_interp_spline
 from scipy.linalg import eigh
 
 from thermogrip.datasets.arrays import Array
@@ -200,6 +199,8 @@ def far_response(
 ) -> Array:
     """Return what the far face of blocks, whose :func:`step_response` is ``rise`` (n, n_node), does to the
     sensor, per degree from block to room, (n, n_node)."""
+    from scipy.interpolate import make_interp_spline
+
     e, c = (np.broadcast_to(np.asarray(v, dtype=float), rise.shape[:1]) for v in (effusivity, capacity))
     since = np.maximum(nodes.t - (c**2 / (6 * e**2))[:, None], 0.0)
     total = [make_interp_spline(nodes.t, f, k=1).antiderivative()(s) for f, s in zip(rise, since)]

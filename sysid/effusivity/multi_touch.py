@@ -56,7 +56,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.atomic_files import read_json, write_json
@@ -398,6 +397,8 @@ def _free(
 
 def learn_coupling(gripper: GripperModel, grasps: Grasps, *, start: Coupling | None = None) -> Coupling:
     """Return the coupling that makes labelled groups likeliest."""
+    from scipy.optimize import minimize
+
     centre = start or Coupling()
     groups = [
         (factor, view, at)

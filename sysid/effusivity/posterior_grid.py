@@ -27,7 +27,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
+from numpy.typing import NDArray
 from scipy.special import gammaln, logsumexp, ndtr
 
 from thermogrip.datasets.arrays import Array, Mask
@@ -208,6 +208,8 @@ def _finished(
 
 def _left_out(gripper: GripperModel, data: Touches, noise: tuple[Array, Array], found: _Fitted) -> Array:
     """Return what Laplace's method left out of one grasp's points, (m,), less its mean over the posterior."""
+    from scipy.interpolate import PchipInterpolator
+
     x, value, u, covariance, settled = found
     near = np.flatnonzero(settled & (value > value.max() - _REACH))
     # for an uncertain gripper Laplace's method integrates over its parameters too, with a discrepancy the
@@ -311,23 +313,32 @@ _GAUSS, _SHARE = (0.5 * v for v in np.polynomial.legendre.leggauss(8))
 def log_total(x: Array, value: Array) -> Array:
     """Return the logarithms of the integrals of densities whose logarithms are ``value`` (n, m) at ``x``
     (n, m), cubics between them, (n,)."""
+    n, m = x.shape
+    place = np.broadcast_to((_GAUSS + 0.5)[None, None], (n, m - 1, _GAUSS.size)).reshape(n, -1)
+    at = np.repeat(np.arange(m - 1), _GAUSS.size)
+    share = _SHARE * np.diff(x)[:, :, None]
+    return np.asarray(logsumexp(_cubic(x, value, at, place) + np.log(share).reshape(n, -1), axis=1))
+
+
+def _cubic(x: Array, value: Array, at: NDArray[np.int64], share: Array) -> Array:
+    """Return curves (n, m) through ``value`` at ``x``, between points ``at`` (k,) and the next, a ``share``
+    (n, k) of the way."""
     value = np.maximum(value, value.max(axis=1, keepdims=True) - _FAR)
-    s, width, d = _GAUSS + 0.5, np.diff(x)[:, :, None], slopes(x, value)
-    y0, y1 = value[:, :-1, None], value[:, 1:, None]
-    bent = s * (1 - s) * ((1 - s) * (d[:, :-1, None] * width) - s * (d[:, 1:, None] * width))
-    bulge = s * (1 - s) * (1 - 2 * s) * (y0 - y1)
-    log_density = y0 + s * (y1 - y0) + bent + bulge
-    return np.asarray(logsumexp(log_density + np.log(_SHARE * width), axis=(1, 2)))
+    d, width, s = slopes(x, value), np.diff(x)[:, at], share
+    y0, y1 = value[:, at], value[:, at + 1]
+    bent = (1 - s) * d[:, at] * width - s * d[:, at + 1] * width + (1 - 2 * s) * (y0 - y1)
+    return np.asarray(y0 + s * (y1 - y0) + s * (1 - s) * bent)
 
 
 def posterior_of(x: Array, value: Array, t_object: Array, sd: Array, ln_h: Array) -> GridPosterior:
-    """Return the posterior of log densities ``value`` at points ``x``, along which these rise; all arguments (m,)."""
-    bounded = np.maximum(value, value.max() - _FAR)
-    curve = CubicHermiteSpline(x, bounded, slopes(x[None], bounded[None])[0])
+    """Return the posterior of log densities ``value`` at points ``x``, along which these rise; arguments are
+    (m,)."""
     inside = np.flatnonzero(value > value.max() - 20)
     low, high = x[max(inside[0] - 1, 0)], x[min(inside[-1] + 1, x.size - 1)]
     fine = np.linspace(low, high, 500)
-    log_density = np.asarray(curve(fine))
+    at = np.clip(np.searchsorted(x, fine, "right") - 1, 0, x.size - 2)
+    share = (fine - x[at]) / (x[at + 1] - x[at])
+    log_density = _cubic(x[None], value[None], at, share[None])[0]
     log_total = float(logsumexp(log_density)) + np.log(fine[1] - fine[0])
     mass = np.exp(log_density - logsumexp(log_density))
     weight = np.exp(value - value.max()) * np.gradient(x)
