@@ -169,7 +169,9 @@ def gripper_modes(stack: Stack) -> Any:
     from thermogrip.sysid.contact.time_stepping import grippers
 
     found = stack_modes(stack)
-    return grippers(found.lam[None], found.face[None], found.sensor[None], contact_numbers(stack, found)[None])
+    return grippers(
+        found.lam[None], found.face[None], found.sensor[None], contact_numbers(stack, found)[None]
+    )
 
 
 def step_response(

@@ -116,7 +116,9 @@ def _eigenvalues(y: Array, biot: Array) -> Array:
         b, at = beta[:, columns], np.broadcast_to(lost, y.shape)[:, columns]
         square = b**2 + biot**2
         angle = np.arctan(np.divide(biot, b, out=np.zeros(b.shape), where=at))
-        b -= np.divide((b - y[:, columns] * np.pi - angle) * square, square + biot, out=np.zeros(b.shape), where=at)
+        b -= np.divide(
+            (b - y[:, columns] * np.pi - angle) * square, square + biot, out=np.zeros(b.shape), where=at
+        )
     return beta
 
 
@@ -139,7 +141,9 @@ def slab_moves(effusivity: Array, capacity: Array, far: float | Array, rate: Arr
         square = beta**2 + biot**2
         some = np.where(square > 0.0, square, 1.0)  # a mode that nothing damps does not move
         angle = np.arctan(biot / np.where(beta > 0.0, beta, 1.0))
-        place = (beta - angle) / np.where(beta > 0.0, beta, 1.0) * square / (some + biot)  # d ln beta / d ln y
+        place = (
+            (beta - angle) / np.where(beta > 0.0, beta, 1.0) * square / (some + biot)
+        )  # d ln beta / d ln y
         by_biot = biot / (some + biot)  # d ln beta / d ln Bi
         for at, sign, power in ((0, -1.0, -2.0), (2, 1.0, 1.0)):
             d = sign * along * place + power * by_biot
@@ -152,7 +156,7 @@ class Gripper(NamedTuple):
     """One gripper for all contacts, or one for each (k of them)."""
 
     modes: Array  # (k, 3, n + 1): decay rates, weights at face and sensor, the sensor's lag last
-    # (k, 7): resistance, lag, first, creep, settle, what the block's far face loses per degree, the skin's leak
+    # (k, 7): resistance, lag, first, creep, settle, what the block's far face loses per degree, skin's leak
     numbers: Array
 
 
@@ -165,8 +169,8 @@ def grippers(lam: Array, face: Array, sensor: Array, numbers: Array) -> Gripper:
 
 
 def conductance(t: Array, h: Array, build_up: Array, numbers: Array) -> Array:
-    """Return h(t) of n contacts on time nodes, and its derivative by ln tau_b, (n, 2, n_node); ``numbers`` are
-    those of :class:`Gripper`."""
+    """Return h(t) of n contacts on time nodes, and its derivative by ln tau_b, (n, 2, n_node); ``numbers``
+    are those of :class:`Gripper`."""
     first, creep, settle = numbers[:, 2, None], numbers[:, 3, None], numbers[:, 4, None]
     late = np.exp(-t / build_up[:, None])
     settled = h[:, None] * (1.0 - creep * np.expm1(-t / settle))
@@ -198,7 +202,11 @@ def contacts(
     modes[:, 0, :N_MODE], modes[:, 1, :N_MODE], modes[:, :3, N_MODE:] = block.rate, block.weight, own
     modes[:, 3, :N_MODE] = -np.expm1(-block.rate * dt[0])
     modes[:, 3, N_MODE:] = -np.expm1(-own[:, 0] * dt[0])
-    rise, slope, flux = np.empty((n, N_STEPPED, t.size)), np.empty((n, N_STEPPED, t.size)), np.empty((n, t.size))
+    rise, slope, flux = (
+        np.empty((n, N_STEPPED, t.size)),
+        np.empty((n, N_STEPPED, t.size)),
+        np.empty((n, t.size)),
+    )
     grown = conductance(t, h, build_up, gripper.numbers)
     room = np.zeros((17, modes.shape[2]))
     step_contacts(repeat, dt, modes, moves, series, grown, wanted, room, rise, slope, flux)
@@ -207,14 +215,14 @@ def contacts(
 
 @numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
 def step_contacts(
-    repeat: NDArray[np.int64], dt: Array, modes: Array, moves: Array, series: Array, grown: Array, wanted: Mask,
-    room: Array, rise: Array, slope: Array, flux: Array,
+    repeat: NDArray[np.int64], dt: Array, modes: Array, moves: Array, series: Array, grown: Array,
+    wanted: Mask, room: Array, rise: Array, slope: Array, flux: Array,
 ) -> None:  # fmt: skip
     """Fill ``rise``, ``slope`` and ``flux`` of :func:`contacts`, curve by curve.
 
     ``modes`` (n, 4, n_mode + 1) are rate, weight at face and sensor and 1 - E of the first step: the slab's
-    from fast to slow, the gripper's from slow to fast, so that those that keep a state are neighbours, and the
-    sensor's lag; ``moves`` are those of :func:`slab_moves`; ``series`` (n, 3) is the resistance, and its
+    from fast to slow, the gripper's from slow to fast, so that those that keep a state are neighbours, and
+    the sensor's lag; ``moves`` are those of :func:`slab_moves`; ``series`` (n, 3) is the resistance, and its
     derivatives by ln e and ln C.
     """
     last = modes.shape[2] - 1
@@ -290,7 +298,12 @@ def step_contacts(
                         if c > 2:
                             at, q0 = 3 * (c - 3), q[0]
                             for j in range(low, N_MODE):
-                                v = keep[j] * x[c, j] + gain[j] * qc + moved[at, j] * x[0, j] + moved[at + 1, j] * q0
+                                v = (
+                                    keep[j] * x[c, j]
+                                    + gain[j] * qc
+                                    + moved[at, j] * x[0, j]
+                                    + moved[at + 1, j] * q0
+                                )
                                 x[c, j] = v
                                 total += v
                         else:
@@ -313,7 +326,9 @@ def step_contacts(
                         new = h * gap
                         if c > 0:
                             driven = h * gap if c == 1 else (grown[p, 1, i] * gap if c == 2 else 0.0)
-                            new = (driven - h * (w[c] + late[0] * q[c] + late[c] * q0 + z[c] * h * gap)) * invert
+                            new = (
+                                driven - h * (w[c] + late[0] * q[c] + late[c] * q0 + z[c] * h * gap)
+                            ) * invert
                         v = s[c] + seen * new + seen_late * q[c]
                         read[c] = keep[last] * read[c] + a[last] * node[c] + b[last] * v
                         q[c], node[c] = new, v

@@ -176,7 +176,10 @@ def find_modes(
         u[:, LEVEL] = np.where(vary[:, LEVEL], data.level[row], u[:, LEVEL])
     dof = np.full(u.shape, np.inf) if prior.dof is None else prior.dof
     w_matrix, log_det = whitener
-    asked, law = pairs_asked(stack, nodes_for(data), data, row, beyond), np.stack([prior.mean, prior.sd, dof], axis=1)
+    asked, law = (
+        pairs_asked(stack, nodes_for(data), data, row, beyond),
+        np.stack([prior.mean, prior.sd, dof], axis=1),
+    )
     covariance, objective, misfit, settled = modes(asked, w_matrix, law, u, max_steps, rivals=rivals)
     evidence = -0.5 * (objective + log_det[row]) + peak_ratio(dof, vary)
     return Mode(u, covariance, evidence, settled, misfit)

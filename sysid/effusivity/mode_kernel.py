@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.compiled import numba
 from thermogrip.sysid.contact.time_stepping import COMPILED, N_STEPPED, VALUE, Gripper, contacts
-from thermogrip.sysid.effusivity.data import Touches
 
 _AT_ONCE = 1024  # pairs
 _LONGEST = 1.5
-# after so many steps, -2 ln posterior behind the best by the quadratic model: of 943 points of a free effusivity
-# that ended within 25 nats of the best, none was farther than 1734 after one, 356 after two and 378 after three
+# after so many steps, -2 ln posterior behind the best by the quadratic model: of 943 points of a free
+# effusivity that ended within 25 nats of the best, none was farther than 1734 after one, 356 after two and
+# 378 after three
 _HOPELESS = {1: 6000.0, 2: 2000.0, 3: 1000.0, 4: 1000.0, 5: 1000.0} | dict.fromkeys(range(6, 99), 120.0)
 _LEAST_DECREASE = 0.01  # of -2 ln posterior: smaller predicted decreases end the search
 _H, _BUILD_UP, _ONSET, _LEVEL, _T, _E, _C = range(7)
@@ -39,9 +39,11 @@ class Asked(NamedTuple):
 
     nodes: Nodes
     gripper: Gripper
-    data: Touches
+    data: Any  # Touches; kernels import nothing that is not in the digest of their sources
     row: NDArray[np.int64]  # (n,)
-    beyond: Array  # (n, 2, n_bin), the gripper's discrepancy: always [K], and per degree between object and skin
+    beyond: (
+        Array  # (n, 2, n_bin), the gripper's discrepancy: always [K], and per degree between object and skin
+    )
 
     def take(self, index: Any) -> Asked:
         """Return some of the pairs, of one gripper."""
@@ -81,7 +83,13 @@ def readings(asked: Asked, u: Array, vary: Mask, *, alike: bool = False) -> tupl
     ramp, slopes = data.ramp[row], np.zeros((row.size, _LEFT + 1, data.y.shape[1]))
     f, lost = means[:, VALUE] + beyond[:, 1], rate[:, None] * delayed[:, VALUE]
     away = np.where(known, leak * (room - u[:, _LEVEL]), 0.0)
-    y = u[:, _LEVEL, None] + difference[:, None] * f + way[:, None] * lost + away[:, None] * ramp + beyond[:, 0]
+    y = (
+        u[:, _LEVEL, None]
+        + difference[:, None] * f
+        + way[:, None] * lost
+        + away[:, None] * ramp
+        + beyond[:, 0]
+    )
     slopes[:, _T], slopes[:, _LEVEL] = f - lost, 1.0 - f - leak[:, None] * ramp
     scale = (rate * way)[:, None]
     for curve, at in enumerate(_CURVES, 1):
@@ -110,7 +118,9 @@ def bin_means(
     last, n_curve, n_bin = nodes.size - 1, wanted.shape[1], t.shape[1]
     for p in range(row.size):
         i, k = row[p], 0
-        for j in range(times.shape[1]):  # the node before each sample, -1 before contact, and the way to the next
+        for j in range(
+            times.shape[1]
+        ):  # the node before each sample, -1 before contact, and the way to the next
             since = times[i, j] - onset[p]
             room[0, j] = -1.0
             if bins[i, j] >= 0 and since > 0.0:
@@ -170,8 +180,8 @@ def bin_means(
 def normal_equations(
     row: NDArray[np.int64], whitener: Array, columns: Array, scale: Array, white: Array, matrix: Array
 ) -> None:
-    """Fill products (n, 8, 8) of the ``columns`` (n, 8, n_bin), scaled by ``scale`` (n, 8) and whitened by the
-    lower triangles ``whitener`` (n_row, n_bin, n_bin); what has no scale is left out."""
+    """Fill products (n, 8, 8) of the ``columns`` (n, 8, n_bin), scaled by ``scale`` (n, 8) and whitened by
+    the lower triangles ``whitener`` (n_row, n_bin, n_bin); what has no scale is left out."""
     n_bin = columns.shape[2]
     for p in range(row.size):
         for a in range(columns.shape[1]):
@@ -190,8 +200,8 @@ def normal_equations(
 
 
 def products(asked: Asked, whitener: Array, u: Array, sd: Array, *, alike: bool = False) -> Array:
-    """Return J' J, and J' r and r' r in the last row and column, (n, 8, 8): J in units of ``sd`` (n, 7), r the
-    readings less those that ``u`` predicts, both whitened."""
+    """Return J' J, and J' r and r' r in the last row and column, (n, 8, 8): J in units of ``sd`` (n, 7), r
+    the readings less those that ``u`` predicts, both whitened."""
     y, columns = readings(asked, u, sd > 0.0, alike=alike)
     np.subtract(asked.data.y[asked.row], y, out=columns[:, _LEFT])
     matrix = np.zeros((len(u), _LEFT + 1, _LEFT + 1))
@@ -229,8 +239,8 @@ def penalty(u: Array, mean: Array, sd: Array, dof: Array) -> Penalty:
 def modes(
     asked: Asked, whitener: Array, law: Array, u: Array, max_steps: int, *, rivals: bool = False
 ) -> tuple[Array, Array, Array, Mask]:
-    """Move ``u`` (n, 7) to the mode of each pair; return covariance (n, 7, 7), objective, misfit and where the
-    search settled.
+    """Move ``u`` (n, 7) to the mode of each pair; return covariance (n, 7, 7), objective, misfit and where
+    the search settled.
 
     The prior of each is its ``law`` (n, 3, 7): mean, sd, degrees of freedom.  The objective is -2 ln
     (likelihood x prior density relative to its peak) + ln det of its curvature in units of sd.  Where pairs
@@ -241,7 +251,14 @@ def modes(
     settled, begin = np.zeros(n, dtype=bool), 0
     ends = np.append(np.flatnonzero(np.diff(asked.row)) + 1, n) if rivals else np.arange(1, n + 1)
     while begin < n:  # rivals at once
-        end = int(ends[max(np.searchsorted(ends, begin + _AT_ONCE, "right") - 1, np.searchsorted(ends, begin, "right"))])
+        end = int(
+            ends[
+                max(
+                    np.searchsorted(ends, begin + _AT_ONCE, "right") - 1,
+                    np.searchsorted(ends, begin, "right"),
+                )
+            ]
+        )
         part, begin = slice(begin, end), end
         found = _settle(asked.take(part), whitener, law[part], u[part], max_steps, rivals)
         covariance[part], objective[part], misfit[part], settled[part] = found
@@ -296,8 +313,8 @@ def _settle(
 
 
 def marginals(asked: Asked, whitener: Array, u: Array, sd: Array) -> Array:
-    """Return ln p(y | u) up to a constant for points ``u`` (n, 7), integrated over level and T_obj, whose prior
-    means are in ``u``; ``sd`` (m, 2) are their sds, each pair of which has a row of the answer (m, n)."""
+    """Return ln p(y | u) up to a constant for points ``u`` (n, 7), integrated over level and T_obj, whose
+    prior means are in ``u``; ``sd`` (m, 2) are their sds, each pair with a row of the answer (m, n)."""
     at, out = [_LEVEL, _T], np.empty((len(sd), len(u)))
     for begin in range(0, len(u), _AT_ONCE):
         part = slice(begin, begin + _AT_ONCE)

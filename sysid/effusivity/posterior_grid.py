@@ -24,7 +24,7 @@ the unit vectors, w_k = 1/6, the rule that is exact for all cubics of three norm
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,7 +78,9 @@ def slipped(
     stated, t_sd = np.isfinite(data.t_object[0]), sd[T_OBJECT]
     sds = [[sd[LEVEL], t_sd], [sd[LEVEL], t_sd * float(slip_of(t_sd))]]
     found = marginals(asked, whitener, u, np.array(sds[: 1 + stated]))
-    return np.asarray(np.logaddexp(np.log1p(-SLIPS) + found[0], np.log(SLIPS) + found[1]) if stated else found[0])
+    return np.asarray(
+        np.logaddexp(np.log1p(-SLIPS) + found[0], np.log(SLIPS) + found[1]) if stated else found[0]
+    )
 
 
 class MarginalPosterior:
@@ -273,7 +275,9 @@ def _between(x: Array, knots: Array, values: Array) -> Array:
     total = np.zeros((*x.shape, values.shape[2]))
     for j in range(4):
         others = [k for k in range(4) if k != j]
-        weight = np.prod((x[:, :, None] - near[:, :, others]) / (near[:, :, [j]] - near[:, :, others]), axis=2)
+        weight = np.prod(
+            (x[:, :, None] - near[:, :, others]) / (near[:, :, [j]] - near[:, :, others]), axis=2
+        )
         total += weight[:, :, None] * values[row, at[:, :, j]]
     return total
 
@@ -299,7 +303,9 @@ def slopes(x: Array, value: Array) -> Array:
     those of its smooth side, so that no wave is added."""
     secant = np.diff(value) / np.diff(x)
     before, after = 2 * secant[:, :1] - secant[:, 1:2], 2 * secant[:, -1:] - secant[:, -2:-1]
-    m = np.concatenate([2 * before - secant[:, :1], before, secant, after, 2 * after - secant[:, -1:]], axis=1)
+    m = np.concatenate(
+        [2 * before - secant[:, :1], before, secant, after, 2 * after - secant[:, -1:]], axis=1
+    )
     turn = np.abs(np.diff(m))
     left, right = turn[:, 2:], turn[:, :-2]
     even = left + right <= 1e-9 * turn.max(axis=1, keepdims=True)

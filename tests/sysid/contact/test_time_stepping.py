@@ -90,7 +90,9 @@ def test_the_slopes_of_a_contact_are_its_differences(block):
     for curve, k in ((1, 2), (2, 3), (3, 0), (4, 1)):
         np.testing.assert_allclose(rise[0, curve], (ups[k, 0] - ups[k + 4, 0]) / (2 * h), atol=1e-8)
         np.testing.assert_allclose(slope[0, curve], (slopes[k, 0] - slopes[k + 4, 0]) / (2 * h), atol=1e-7)
-    again = kernel.contacts(nodes, gripper, np.exp(at)[None], wanted & np.array([True, False, False, True, False]))
+    again = kernel.contacts(
+        nodes, gripper, np.exp(at)[None], wanted & np.array([True, False, False, True, False])
+    )
     for curve in (0, 3):
         np.testing.assert_array_equal(again[0][0, curve], rise[0, curve])
     np.testing.assert_array_equal(again[2], flux)

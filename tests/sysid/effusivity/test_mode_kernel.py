@@ -55,7 +55,7 @@ def test_products_are_those_of_whitened_columns():
 
 
 def means_of(nodes, rise, slope, times, bins, *, onset=0.0, late=-1.0):
-    """Return bin means, of the value and of its slope, and what is delayed, of one grasp with a sample a bin."""
+    """Return bin means, of the value and of its slope, and what is delayed, of one sample a bin."""
     times, bins = np.array([times]), np.array([bins])
     n = times.shape[1]
     count = np.zeros((1, n))
@@ -72,7 +72,7 @@ def means_of(nodes, rise, slope, times, bins, *, onset=0.0, late=-1.0):
 
 
 def test_samples_find_their_nodes_whichever_way_they_come():
-    """A straight line is its own interpolation; what is lost or before contact is nothing, the end the end."""
+    """A straight line is its own interpolation; what is lost or before contact is nothing."""
     nodes, times = [0.0, 1.0, 2.0, 4.0], [0.5, 3.5, 9.0, 1.5, 2.5, 3.0, 1.6]
     found, rate, _, _ = means_of(nodes, nodes, np.ones(4), times, [0, 1, 2, 3, -1, 5, 6], onset=0.5)
     np.testing.assert_allclose(found, [0.0, 3.0, 4.0, 1.0, 0.0, 2.5, 1.1])
@@ -102,7 +102,8 @@ def test_a_candidate_far_behind_is_left_and_changes_no_other():
     data = touches(record.isel(grasp=np.flatnonzero(record["material"].values == "copper")[:3]))
     names = ["copper", "iron", "wood"]
     raced, _, row = fit_candidates(gripper, data, names)
-    alone = fit_pairs(gripper, data, row, type(h := material_hypotheses(gripper, names))(*(np.tile(c, 3) for c in h)))
+    one = material_hypotheses(gripper, names)
+    alone = fit_pairs(gripper, data, row, type(one)(*(np.tile(column, 3) for column in one)))
     found = raced.log_evidence.reshape(3, 3)
     settled = raced.converged.reshape(3, 3)
     assert settled[:, :2].all()
