@@ -192,7 +192,7 @@ def step_response(
             raise ValueError(f"{name} must be positive and finite, got {value[~(value > 0)][:3]}")
     wanted = np.zeros((e.size, N_STEPPED), dtype=bool)
     wanted[:, VALUE] = True
-    rise, slope, flux = contacts(tuple(nodes), gripper_modes(stack), np.stack([e, c, h, tau], axis=1), wanted)
+    rise, slope, flux = contacts(nodes, gripper_modes(stack), np.stack([e, c, h, tau], axis=1), wanted)
     return rise[:, VALUE], slope[:, VALUE], flux
 
 

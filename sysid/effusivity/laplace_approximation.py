@@ -154,7 +154,7 @@ def pairs_asked(
     from thermogrip.sysid.effusivity.mode_kernel import Asked
 
     nothing = np.broadcast_to(0.0, (row.size, 2, data.y.shape[1])) if beyond is None else beyond
-    return Asked(tuple(nodes), gripper_modes(stack), data, row, nothing)
+    return Asked(nodes, gripper_modes(stack), data, row, nothing)
 
 
 def find_modes(

@@ -24,7 +24,7 @@ the unit vectors, w_k = 1/6, the rule that is exact for all cubics of three norm
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -181,7 +181,7 @@ def grid_posteriors(gripper: GripperModel, data: Touches) -> list[GridPosterior]
 def free_evidence(gripper: GripperModel, data: Touches) -> Array:
     """Return the log evidence of a free effusivity for each touch, (n,), as :func:`grid_posteriors` do."""
     found = _fitted(gripper, data, whiten(data, gripper.noise))
-    return log_total(found.x, found.value) - np.log(LN_E_RANGE[1] - LN_E_RANGE[0])
+    return np.asarray(log_total(found.x, found.value) - np.log(LN_E_RANGE[1] - LN_E_RANGE[0]))
 
 
 def _fitted(gripper: GripperModel, data: Touches, noise: tuple[Array, Array]) -> _Fitted:
@@ -261,7 +261,7 @@ def _evaluate(
     begin = None if start is None else start.reshape(n * m, -1)
     mode = fit_pairs(gripper, data, row, hypotheses, start=begin, noise=noise, prior=prior, rivals=True)
     mode = doubted(gripper, each, prior, mode)
-    found = (mode.log_evidence, mode.u, mode.covariance, mode.converged)
+    found: list[Any] = [mode.log_evidence, mode.u, mode.covariance, mode.converged]
     return _Fitted(grid, *(part.reshape(n, m, *part.shape[1:]) for part in found))
 
 
