@@ -128,6 +128,7 @@ def effusivity_figure(
         axis.plot([row.effusivity_p05, row.effusivity_p95], [i, i], color=colour, lw=4, alpha=0.45)
         axis.plot(row.effusivity, i, MARKERS[kinds.index(name) % 8], ms=4.5, color=colour)
     axis.set_xscale("log")
+    axis.tick_params(axis="x", which="minor", labelsize=7)
     for k, name in enumerate(kinds):
         if name:
             axis.plot([], [], MARKERS[k % 8], color=PALETTE[k % 8], ms=4.5, label=name)

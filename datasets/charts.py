@@ -31,7 +31,6 @@ PALETTE = ("#1f5fa8", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 DASHES = ("-", "--", ":", "-.")
 INK, SOFT, SHADE = "#1d2733", "#8795a3", "#e6eaef"  # of targets, of limits, of what is not scored
 _STILL = 400  # points of a curve on paper
-_MINUTES, _HOURS = 3600.0, 6 * 3600.0  # from which on an axis is in minutes, in hours
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +66,7 @@ class Chart:
     """Panels in columns; those of a column share their axis."""
 
     columns: tuple[tuple[Panel, ...], ...]
-    x_label: str = "time [s]"
+    x_label: str = "time [s]"  # however long: a stretch of it is LOG@START:STOP
     log: bool = False  # the axis
     wide: float = 5.2  # of a column on paper [inch]
     across: int = 99  # columns beside each other on paper, at most
@@ -106,18 +105,6 @@ def thinned(curve: Curve, most: int) -> Curve:
     x, y, *ends = (np.asarray(part)[keep] for part in (curve.x, *own))
     low, high = ends or (None, None)
     return replace(curve, x=x, y=y, low=low, high=high)
-
-
-def time_axis(*seconds: float) -> tuple[float, str]:
-    """Return what times [s] up to these are divided by, and the axis' label: in s, min or h.
-
-    >>> time_axis(1800.0), time_axis(9000.0), time_axis(1e5)
-    ((1.0, 'time [s]'), (60.0, 'time [min]'), (3600.0, 'time [h]'))
-    """
-    span = max(seconds, default=0.0)
-    if span <= _MINUTES:
-        return 1.0, "time [s]"
-    return (60.0, "time [min]") if span <= _HOURS else (3600.0, "time [h]")
 
 
 def stretches(x: Array, inside: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:

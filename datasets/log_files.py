@@ -35,6 +35,7 @@ from thermogrip.datasets.rosbag import bag_parts, read_rosbag_table
 from thermogrip.datasets.schema import check_log, hash_columns, make_log
 from thermogrip.datasets.tables import (
     Table,
+    check_header,
     check_table,
     file_format,
     file_stem,
@@ -132,6 +133,8 @@ def read_log(
     else:
         file, start, stop = split_cut(path)
         table = _read_table(file, columns)
+    named = [*(inputs or ()), *(outputs or ()), *(disturbances or ())]
+    check_header([*table.numbers, *table.text], named, str(file))
     if table.meta.get("schema") not in (None, "thermogrip.log"):
         raise UserError(f"holds a {table.meta['schema']}, not a log", file=file, hint="give a log")
     data, units, names_of, repairs = _convert(table, dt)
@@ -211,17 +214,19 @@ def write_log(log: Log, path: str | Path) -> Path:
     0.5,1.0,0.30000000000000004 True
     """
     check_log(log)
-    kind = file_format(path)
-    if kind in ("text", "matlab", "excel"):
-        problem = f"logs are not written with the ending {Path(path).suffix}"
-        raise UserError(problem, file=path, hint="write .csv, .nc or .parquet")
+    kind = check_written(path)
     if kind == "csv":
         return write_atomic(path, _pack(_to_csv(log), path))
-    if kind == "netcdf":
-        return write_netcdf(log, path)
-    if kind == "rosbag":
-        raise UserError("logs are not written as bags", file=path, hint="write .csv, .nc or .parquet")
-    return _write_parquet(log, path)
+    return write_netcdf(log, path) if kind == "netcdf" else _write_parquet(log, path)
+
+
+def check_written(path: str | Path) -> str:
+    """Return the format that a log is written in, by the path's ending; UserError where it is only read."""
+    kind = file_format(path)
+    if kind not in ("csv", "netcdf", "parquet"):
+        problem = f"logs are not written with the ending {Path(path).suffix}"
+        raise UserError(problem, file=path, hint="write .csv, .nc or .parquet")
+    return kind
 
 
 def split_cut(path: str | Path) -> tuple[Path, float, float]:

@@ -159,9 +159,22 @@ def check_columns(path: Path, names: Sequence[str] | None) -> None:
     """Refuse names that are no columns of a text table, from its beginning; others pass."""
     if names and path.is_file() and file_format(path) in ("csv", "text"):
         headers = find_layout(_any_coding(_text_of(path, _BEGINNING))[0], str(path)).names
+        check_header(headers, names, str(path))
         known = dict.fromkeys((read_header(header, headers)[0] for header in headers), "")
         for name in names:
             find_column(name, known, str(path))
+
+
+def check_header(headers: Sequence[str], names: Sequence[str], file: str) -> None:
+    """Refuse names where a table has no header, with the ``--columns`` that would give them to it."""
+    known = {header.lower() for header in headers}
+    spare = len(headers) - len(names)
+    if not names or spare < 0 or known != {f"c{at + 1}" for at in range(len(headers))}:
+        return
+    if not known & {name.strip().lower() for name in names}:
+        words = [*["time_s"][:spare], *names, *["-"] * (spare - 1)]
+        hint = f"name its columns in their order, such as --columns {','.join(words)} (-: left out)"
+        raise UserError("has no header", file=file, hint=hint)
 
 
 def find_layout(data: bytes, file: str) -> Layout:

@@ -31,16 +31,16 @@ def main(out: str) -> None:
 
     test = cut(logs["multisine"], stop=1200.0)
     for log, style in ((test, MEASURED), (plant.simulate(test), PREDICTED)):
-        left.plot(log["time"][::20] / 60, log["t_surface"][::20], **style)
-    left.set(title="Identify: free run on an unseen log", xlabel="time [min]", ylabel="skin [degC]")
+        left.plot(log["time"][::20], log["t_surface"][::20], **style)
+    left.set(title="Identify: free run on an unseen log", xlabel="time [s]", ylabel="skin [degC]")
     left.legend(frameon=False)
 
     loop = simulate_closed_loop(
         design_controller(plant), plant.draw(1), [(28.0, 60.0), (38.0, 240.0), (30.0, 300.0)], start=28.0
     )
-    middle.step(loop.sample_time / 60, loop.target["t_surface"], color="0.65", linewidth=2.5, label="target")
-    middle.plot(loop.time / 60, loop.outputs["t_surface"], color="C0", linewidth=1, label="skin")
-    middle.set(title="Control: MPC, plant off its model", xlabel="time [min]")
+    middle.step(loop.sample_time, loop.target["t_surface"], color="0.65", linewidth=2.5, label="target")
+    middle.plot(loop.time, loop.outputs["t_surface"], color="C0", linewidth=1, label="skin")
+    middle.set(title="Control: MPC, plant off its model", xlabel="time [s]")
     middle.legend(frameon=False)
 
     grasps = load_example_grasps()["exp2_dT20"]

@@ -58,15 +58,15 @@ print(f"free run of t_surface: RMSE {score.rmse:.3f} degC over {score.n} samples
 
 # %%
 simulated = plant.simulate(test)
-minutes = test["time"].values / 60
+time = test["time"]
 rows = {"sharex": True, "height_ratios": (3, 1), "layout": "constrained"}
 figure, (above, below) = plt.subplots(2, 1, figsize=(8, 5), **rows)
-above.plot(minutes, test["t_surface"], color="0.6", label="measured")
-above.plot(minutes, simulated["t_surface"], "--", color="C1", label="predicted from the inputs alone")
+above.plot(time, test["t_surface"], color="0.6", label="measured")
+above.plot(time, simulated["t_surface"], "--", color="C1", label="predicted from the inputs alone")
 above.set_ylabel("skin [degC]")
 above.legend()
-below.plot(minutes, test["t_surface"].values - simulated["t_surface"].values, color="0.4")
-below.set(xlabel="time [min]", ylabel="residual [K]", ylim=(-0.5, 0.5))
+below.plot(time, test["t_surface"].values - simulated["t_surface"].values, color="0.4")
+below.set(xlabel="time [s]", ylabel="residual [K]", ylim=(-0.5, 0.5))
 plt.show()
 
 # %% [markdown]

@@ -45,14 +45,13 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     H,
     Hypotheses,
     fit_pairs,
-    gripper_arguments,
     jacobian,
     material_hypotheses,
     nodes_for,
     prior_of,
 )
 from thermogrip.sysid.effusivity.posterior import material_evidence, material_fit
-from thermogrip.sysid.effusivity.posterior_grid import marginals
+from thermogrip.sysid.effusivity.posterior_grid import slipped
 
 THREE, FIVE = ["copper", "iron", "wood"], ["brass", "copper", "iron", "wood", "zinc"]
 # object, gripper [degC], materials, contact time [s]: exp1 to exp4
@@ -284,9 +283,8 @@ def summed_evidence(device, data, mode, prior, k, r, n=3000):
     u = np.repeat(prior.mean[k][None], n, axis=0)
     u[:, vary] = points
     whitener, log_det = whiten(one, device.noise)
-    arguments = gripper_arguments(device.stack, nodes_for(one))
     beyond = device.beyond(one.t, u[:, EFFUSIVITY])
-    likelihood = marginals(arguments, one, whitener, beyond, prior.sd[k], u)
+    likelihood = slipped(device, one, whitener, beyond, prior.sd[k], u)
     return logsumexp(likelihood + log_prior - proposed) - np.log(n) - 0.5 * log_det[0]
 
 

@@ -110,7 +110,8 @@ class Density:
                 total += student.logpdf(x, dof, prior.mean[:, k], prior.sd[:, k])
             u = prior.mean.copy()
             u[:, OWN] = own
-            y, slopes = jacobian(device.stack, nodes_for(data), row, u, np.ones(u.shape, dtype=bool))
+            linear = np.isin(np.arange(u.shape[1]), [LEVEL, T_OBJECT]) * np.ones(u.shape, dtype=bool)
+            y, slopes = jacobian(device.stack, nodes_for(data), row, u, linear)
             left.append((data.y - y) @ self.white[j].T)
             by.append(np.einsum("ab,nbk->nak", self.white[j], slopes[:, :, [LEVEL, T_OBJECT]]))
             if j == 0:

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -39,7 +39,9 @@ from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.schema import Grasps, Log, make_log, unit_names
 from thermogrip.sysid.effusivity.predictive import PosteriorPredictive, next_touch
 from thermogrip.sysid.effusivity.quality import check_grasps
-from thermogrip.sysid.plant.plant import Plant
+
+if TYPE_CHECKING:
+    from thermogrip.sysid.plant.plant import Plant
 
 _NEGLIGIBLE = 1e-4  # of probability: such a candidate's futures are not drawn
 

@@ -117,10 +117,9 @@ def _answers(
     whole = not classifier.leaves_samples_out
     quality = check_grasps(grasps, longest=classifier.longest_, whole_traces=whole)
     notes, usable, units = [*quality.note], quality.read(grasps), unit_names(grasps)
-    if usable is not None:
-        for i, more in zip(np.flatnonzero(quality.usable), classifier.beyond_training(usable)):
-            notes[i] = notes[i] or more
-    found = [] if usable is None else _named(classifier, usable, names, rule)
+    found, beyond = ([], []) if usable is None else _named(classifier, usable, names, rule)
+    for i, more in zip(np.flatnonzero(quality.usable), beyond):
+        notes[i] = notes[i] or more
     of_unit = {} if usable is None else dict(zip(unit_names(usable).tolist(), found))
     last = _last_samples(grasps["time"].values, grasps["t_surface"].values, units)
     left = iter(found)
@@ -137,22 +136,26 @@ def _answers(
     return rows
 
 
-def _named(classifier: GraspClassifier, grasps: Grasps, names: list[str], rule: StopRule | None) -> list[Row]:
-    """Return the answers of a classifier to grasps whose usable part is given, without their names."""
+def _named(
+    classifier: GraspClassifier, grasps: Grasps, names: list[str], rule: StopRule | None
+) -> tuple[list[Row], list[str]]:
+    """Return the answers of a classifier to grasps whose usable part is given, without their names, and what
+    makes each overconfident."""
     if rule is None:
         units = unit_names(grasps)
-        log_p, unknown = classifier.open_set_log_proba(grasps, names)
+        log_p, unknown, beyond = classifier.open_set_answer(grasps, names)
         log_p = joined_touches(classifier, log_p, units)
         decided = _last_samples(grasps["time"].values, grasps["t_surface"].values, units)
     else:
         log_p, unknown, decided = _stopped(classifier, grasps, names, rule)
+        beyond = classifier.beyond_training(grasps)
     rows: list[Row] = []
     for i, row in enumerate(log_p):
         answer: Row = {"material": names[int(row.argmax())]}
         answer |= {f"p_{name}": float(p) for name, p in zip(names, np.exp(row))}
         answer["p_unknown"] = float(unknown[i]) if np.isfinite(unknown[i]) else None
         rows.append(answer | {"decided_at_s": float(decided[i])})
-    return rows
+    return rows, beyond
 
 
 def _no_name(names: list[str], why: str, last: float) -> Row:

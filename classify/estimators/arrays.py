@@ -17,9 +17,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.utils import assert_all_finite
-from sklearn.utils.multiclass import check_classification_targets
-from sklearn.utils.validation import check_array, check_consistent_length, column_or_1d, validate_data
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, Grasps, make_grasps, with_lead_in
@@ -31,6 +28,8 @@ _CHANNELS = 2
 def grasps_of(estimator: Any, X: Any, *, reset: bool, **y: Any) -> Grasps:
     """Return the record of an array or a data frame; ``reset`` in training, where its width is remembered;
     ``y`` are labels that scikit-learn checks beside, in training."""
+    from sklearn.utils.validation import check_array, check_consistent_length, validate_data
+
     times, per_grasp = estimator.times, {}
     if hasattr(X, "columns") and (stated := _stated_times(X.columns)):
         columns = sorted(stated, key=stated.__getitem__)
@@ -69,6 +68,9 @@ def grasps_of(estimator: Any, X: Any, *, reset: bool, **y: Any) -> Grasps:
 
 def coded(y: Any) -> tuple[NDArray[np.str_], NDArray[Any] | None]:
     """Return labels as words and, where they are none, what the words stand for, in the order of both."""
+    from sklearn.utils import assert_all_finite, column_or_1d
+    from sklearn.utils.multiclass import check_classification_targets
+
     y = column_or_1d(y, warn=True)
     if y.dtype.kind == "f":
         assert_all_finite(y, input_name="y")

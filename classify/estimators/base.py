@@ -19,14 +19,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
+from inspect import signature
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import logsumexp
-from sklearn.base import BaseEstimator, ClassifierMixin
-from sklearn.exceptions import NotFittedError
 from xarray import Dataset
 
 from thermogrip.classify.estimators.arrays import coded, grasps_of
@@ -55,7 +54,55 @@ class _Sampled:
     times: Sequence[float] | None = None  # of an array's samples [s], 0 at contact; None: 0, 0.1, 0.2 ...
 
 
-class GraspClassifier(ClassifierMixin, _Sampled, BaseEstimator, ABC):  # type: ignore[misc]  # scikit-learn has no types
+class _Estimator:
+    """What makes an estimator of a classifier, by scikit-learn's own functions: these are imported when it
+    asks, since that takes a quarter of the time until a first answer."""
+
+    _estimator_type = "classifier"
+
+    @classmethod
+    def _get_param_names(cls) -> list[str]:
+        from sklearn.base import BaseEstimator
+
+        return list(BaseEstimator._get_param_names.__func__(cls))
+
+    def get_params(self, deep: bool = True) -> dict[str, Any]:
+        """Return the parameters by name, with ``deep`` also those of parameters that are estimators."""
+        from sklearn.base import BaseEstimator
+
+        return dict(BaseEstimator.get_params(self, deep))
+
+    def set_params(self, **params: Any) -> Self:
+        """Set parameters by name and return the estimator."""
+        from sklearn.base import BaseEstimator
+
+        BaseEstimator.set_params(self, **params)
+        return self
+
+    def score(self, X: Any, y: ArrayLike, sample_weight: ArrayLike | None = None) -> float:
+        """Return the share of right answers."""
+        from sklearn.base import ClassifierMixin
+
+        return float(ClassifierMixin.score(self, X, y, sample_weight))
+
+    def __repr__(self) -> str:
+        usual = {name: each.default for name, each in signature(type(self)).parameters.items()}
+        own = self.get_params(deep=False).items()
+        changed = [f"{name}={value!r}" for name, value in own if repr(value) != repr(usual[name])]
+        return f"{type(self).__name__}({', '.join(changed)})"
+
+    def __sklearn_tags__(self) -> Any:
+        from sklearn.utils import ClassifierTags, InputTags, Tags, TargetTags
+
+        return Tags(
+            estimator_type="classifier",
+            target_tags=TargetTags(required=True),
+            classifier_tags=ClassifierTags(),
+            input_tags=InputTags(allow_nan=True, three_d_array=True),
+        )
+
+
+class GraspClassifier(_Sampled, _Estimator, ABC):
     """Base of the classifiers: checks what comes in, derives what scikit-learn expects.
 
     Parameters
@@ -130,11 +177,6 @@ class GraspClassifier(ClassifierMixin, _Sampled, BaseEstimator, ABC):  # type: i
         self._check_fitted()
         return record_list(X if _are_records(X) else grasps_of(self, X, reset=False))
 
-    def __sklearn_tags__(self) -> Any:
-        tags = super().__sklearn_tags__()
-        tags.input_tags.allow_nan = tags.input_tags.three_d_array = True
-        return tags
-
     def check_installed(self) -> None:
         """Raise :class:`UserError` where training needs a package that is not installed."""
         if self.needs is not None and find_spec(self.needs[0]) is None:
@@ -173,6 +215,10 @@ class GraspClassifier(ClassifierMixin, _Sampled, BaseEstimator, ABC):  # type: i
         """Return :meth:`candidate_log_proba` and :meth:`p_unknown`."""
         return self.candidate_log_proba(X, candidates), self.p_unknown(X, candidates)
 
+    def open_set_answer(self, grasps: Grasps, candidates: Sequence[str]) -> tuple[Floats, Floats, list[str]]:
+        """Return :meth:`open_set_log_proba` and :meth:`beyond_training` of one record."""
+        return *self.open_set_log_proba(grasps, candidates), self.beyond_training(grasps)
+
     def beyond_training(self, grasps: Grasps) -> list[str]:
         """Return in words what makes the answer of each grasp overconfident; empty where nothing does."""
         return [""] * grasps.sizes["grasp"]
@@ -196,6 +242,8 @@ class GraspClassifier(ClassifierMixin, _Sampled, BaseEstimator, ABC):  # type: i
 
     def _check_fitted(self) -> None:
         if not hasattr(self, "classes_"):
+            from sklearn.exceptions import NotFittedError
+
             raise NotFittedError(f"this {type(self).__name__} is not fitted yet: call fit(grasps)")
 
     def _as_trained(self, grasps: Grasps) -> Grasps:

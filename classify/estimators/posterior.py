@@ -56,7 +56,6 @@ from thermogrip.classify.estimators.base import (
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.materials import load_materials
 from thermogrip.datasets.schema import Grasps, has_touch_groups, label_values
-from thermogrip.sysid.effusivity.calibration import calibrate_gripper
 from thermogrip.sysid.effusivity.data import Touches, touches
 from thermogrip.sysid.effusivity.gripper_model import GripperModel, GripperSpread, another_gripper
 from thermogrip.sysid.effusivity.laplace_approximation import fit_candidates
@@ -67,7 +66,7 @@ from thermogrip.sysid.effusivity.multi_touch import (
     rested_long,
     two_touch_fit,
 )
-from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors
+from thermogrip.sysid.effusivity.posterior_grid import free_evidence
 from thermogrip.sysid.effusivity.quality import longest_contact
 
 FINISHES = ("auto", "known", "unknown")
@@ -135,6 +134,8 @@ class PosteriorClassifier(GraspClassifier):
         labels: list[Labels],
         progress: Callable[[float, str], None] | None = None,
     ) -> None:
+        from thermogrip.sysid.effusivity.calibration import calibrate_gripper
+
         self._check_params()
         where = "+".join(str(part.attrs.get("name")) for part in records)
         self.classes_ = two_or_more(np.concatenate(labels), where)
@@ -167,6 +168,8 @@ class PosteriorClassifier(GraspClassifier):
         self._check_fitted()
         device = another_gripper(self.device_, spread)
         if known is not None:
+            from thermogrip.sysid.effusivity.calibration import calibrate_gripper
+
             device = calibrate_gripper(record_list(known), prior=device, seed=self.random_state)
         other = copy(self)
         other.device_ = device
@@ -200,17 +203,19 @@ class PosteriorClassifier(GraspClassifier):
 
     def _evidence(
         self, grasps: Grasps, names: Sequence[str], *, unknown: bool = False
-    ) -> tuple[Floats, Floats]:
+    ) -> tuple[Floats, Floats, list[str]]:
         """Return the log evidence of each candidate, (n_grasp, n_name), joint for touches of one block, and,
         where it is asked for, the posterior probability of a free effusivity beside them, at equal odds of
-        these."""
+        these; and in words which single touches another gripper or block explains."""
         group = label_values(grasps, "touch_group")
         single = group == ""
         evidence, odds = np.empty((group.size, len(names))), np.full(group.size, np.nan)
+        words = np.full(group.size, "", dtype=object)
         if single.any():
             data = touches(grasps, until=self.longest_, at=np.flatnonzero(single))
             found = self._decided(data, names, unknown)
             evidence[single], odds[single] = found.log_evidence, found.odds if unknown else np.nan
+            words[single] = found.words
         if not single.all():
             fit = two_touch_fit(self.device_, grasps, names, coupling=self.coupling_, finish=self.as_taught)
             for at, row in zip(fit.rows, fit.log_evidence):
@@ -219,7 +224,7 @@ class PosteriorClassifier(GraspClassifier):
             for name, fits in groups.items():
                 at = group == name
                 odds[at] = logsumexp(evidence[at], axis=1) - np.log(len(names)) - fits[0].log_evidence
-        return evidence, np.asarray(expit(logit(self.prior_unknown) - odds))
+        return evidence, np.asarray(expit(logit(self.prior_unknown) - odds)), words.tolist()
 
     @property
     def as_taught(self) -> str:
@@ -255,7 +260,7 @@ class PosteriorClassifier(GraspClassifier):
         sure = _share(levels, each)[0] > _SURE
         own = np.array([level.device is self.device_ for level in levels])
         if unknown or not sure:
-            free[own] = _free(self.device_, data)
+            free[own] = free_evidence(self.device_, data)
         explained = known if sure else np.logaddexp(np.log(1 - self.prior_unknown) + known, u + free)
         others = explained.sum(axis=1, keepdims=True) - explained
         weight = normalised((prior + others).T).T
@@ -264,7 +269,7 @@ class PosteriorClassifier(GraspClassifier):
         words = [*(level.words for level in levels), ""]
         found = [words[int(row.argmax())] if row.max() > _LIKELY else "" for row in share]
         if unknown and not own.all() and (at := np.flatnonzero(share[:, -2] > _NEEDED)).size:
-            free[-1, at] = _free(levels[-1].device, data.take(at))
+            free[-1, at] = free_evidence(levels[-1].device, data.take(at))
             strange = logsumexp(weight + free, axis=0)
         # a stranger is none of the training's blocks, whatever another block of a known material may be
         blocks = known[0] if self.finish != "unknown" else _mean_evidence(self.device_, data, names)
@@ -287,8 +292,18 @@ class PosteriorClassifier(GraspClassifier):
         """Return :meth:`candidate_log_proba` and :meth:`p_unknown` from one evaluation of the evidence."""
         names = self.asked(candidates)
         found = [self._evidence(part, names, unknown=True) for part in self._records(X)]
-        log_p = [normalised(evidence + self.log_prior(names)) for evidence, _ in found]
-        return np.vstack(log_p), np.concatenate([unknown for _, unknown in found])
+        log_p = [normalised(evidence + self.log_prior(names)) for evidence, _, _ in found]
+        return np.vstack(log_p), np.concatenate([unknown for _, unknown, _ in found])
+
+    def open_set_answer(self, grasps: Grasps, candidates: Sequence[str]) -> tuple[Floats, Floats, list[str]]:
+        """Return :meth:`open_set_log_proba` and :meth:`beyond_training` of one record, from one evaluation of
+        the evidence where all materials of the training are asked about."""
+        names = self.asked(candidates)
+        (part,) = self._records(grasps)
+        if set(names) != set(self.asked()):
+            return super().open_set_answer(part, names)
+        evidence, unknown, words = self._evidence(part, names, unknown=True)
+        return normalised(evidence + self.log_prior(names)), unknown, self._beyond(part, words)
 
     def p_unknown(self, X: Records, candidates: Sequence[str] | None = None) -> Floats:
         names = self.asked() if candidates is None else [str(c) for c in candidates]
@@ -297,19 +312,24 @@ class PosteriorClassifier(GraspClassifier):
     def beyond_training(self, grasps: Grasps) -> list[str]:
         """Return in words which grasps another gripper or other blocks explain, which blocks rested longer
         between touches than those of the training, and which sensor of two has no part in the answer."""
+        found, single = [""] * grasps.sizes["grasp"], label_values(grasps, "touch_group") == ""
+        if single.any() and len(self._levels()) > 1:
+            at = np.flatnonzero(single)
+            decided = self._decided(touches(grasps, until=self.longest_, at=at), self.asked())
+            for i, why in zip(at, decided.words):
+                found[i] = why
+        return self._beyond(grasps, found)
+
+    def _beyond(self, grasps: Grasps, words: Sequence[str]) -> list[str]:
+        """Return what makes the answers overconfident: these ``words``, or what else there is to say."""
         known = (self.coupling_ or Coupling()).longest_rest
-        words = f"rested longer than the {known:g} s of the training: the answer may be too confident"
+        rested = f"rested longer than the {known:g} s of the training: the answer may be too confident"
         trained, has = self.device_.second is not None, "t_surface_2" in grasps
         other = "" if trained == has else "the second sensor is not read: the training had one"
         if trained and not has:
             other = "answered by the first sensor alone: the record has no second one"
-        notes = [words if long else other for long in rested_long(grasps, self.coupling_)]
-        single = np.flatnonzero(label_values(grasps, "touch_group") == "")
-        if single.size and len(self._levels()) > 1:
-            decided = self._decided(touches(grasps, until=self.longest_, at=single), self.asked())
-            for i, why in zip(single, decided.words):
-                notes[i] = why or notes[i]
-        return notes
+        notes = [rested if long else other for long in rested_long(grasps, self.coupling_)]
+        return [why or note for why, note in zip(words, notes)]
 
     def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """Return how long contacts of the training lasted; the device has a file of its own."""
@@ -334,14 +354,10 @@ class PosteriorClassifier(GraspClassifier):
         self.coupling_ = Coupling.load(file) if file.exists() else None
 
 
-def _of_candidates(device: GripperModel, data: Touches, names: Sequence[str], finish: str) -> Floats:
-    """Return the log evidence of each candidate for each touch, (n, n_name)."""
-    return fit_candidates(device, data, names, finish)[0].log_evidence.reshape(-1, len(names))
-
-
 def _of_levels(levels: Sequence[_Level], data: Touches, names: Sequence[str]) -> Floats:
     """Return the log evidence of each candidate for each touch on each level, (n_level, n, n_name)."""
-    return np.stack([_of_candidates(level.device, data, names, level.finish) for level in levels])
+    found = [fit_candidates(level.device, data, names, level.finish)[0] for level in levels]
+    return np.stack([mode.log_evidence.reshape(-1, len(names)) for mode in found])
 
 
 def _share(levels: Sequence[_Level], each: Floats) -> Floats:
@@ -352,12 +368,8 @@ def _share(levels: Sequence[_Level], each: Floats) -> Floats:
 
 def _mean_evidence(device: GripperModel, data: Touches, names: Sequence[str]) -> Floats:
     """Return the log evidence of the training's own blocks, the mean over candidates, (n,)."""
-    return np.asarray(logsumexp(_of_candidates(device, data, names, "known"), axis=1) - np.log(len(names)))
-
-
-def _free(device: GripperModel, data: Touches) -> Floats:
-    """Return the log evidence of a free effusivity for each touch, (n,)."""
-    return np.array([fit.log_evidence for fit in grid_posteriors(device, data)])
+    evidence = fit_candidates(device, data, names, "known")[0].log_evidence
+    return np.asarray(logsumexp(evidence.reshape(-1, len(names)), axis=1) - np.log(len(names)))
 
 
 def _uncertain_as(device: GripperModel, gripper: str) -> GripperModel:

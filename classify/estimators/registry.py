@@ -27,7 +27,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
-from sklearn.base import clone
 
 from thermogrip.classify.estimators import CLASSIFIERS, check_name
 from thermogrip.classify.estimators.base import Floats, GraspClassifier, Labels
@@ -248,6 +247,8 @@ class VoteClassifier(GraspClassifier):
     members: Sequence[GraspClassifier] = ()
 
     def _learn(self, records: list[Grasps], labels: list[Labels]) -> None:
+        from sklearn.base import clone
+
         check_members(self.members)
         self.members_ = [clone(member) for member in self.members]
         for member in self.members_:

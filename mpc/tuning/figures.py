@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.charts import INK, PALETTE, SOFT, Chart, Curve, Panel, draw_chart, time_axis
+from thermogrip.datasets.charts import INK, PALETTE, SOFT, Chart, Curve, Panel, draw_chart
 from thermogrip.datasets.limits import LARGEST
 from thermogrip.datasets.media import panels
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop
@@ -73,8 +73,7 @@ def closed_loop_chart(
     slew_per_s: Mapping[str, float] | None = None,
 ) -> Chart:
     """Return what :func:`closed_loop_figure` draws as a chart."""
-    per, x_label = time_axis(float(run.time[-1] - run.time[0]))
-    t, called = run.time / per, run.sample_time / per
+    t, called = run.time, run.sample_time
     ends = called[[0, -1]]
     regulated, driven = [], []
     for k, (name, goal) in enumerate(run.target.items()):
@@ -83,7 +82,7 @@ def closed_loop_chart(
         regulated.append(Curve(label, called, goal, INK, 1.0, "--", step=True, **band))
         regulated.append(Curve(name, t, run.outputs[name], PALETTE[k % 5], 1.6))
     settled = tuple(
-        (segment.begin_s + segment.settle_s) / per
+        segment.begin_s + segment.settle_s
         for segment in run.segments
         if np.isfinite(segment.settle_s)
     )
@@ -110,7 +109,7 @@ def closed_loop_chart(
     rows.append(Panel("drive", tuple(driven)))
     if slew_per_s:
         rows.append(Panel("slew [1/s]", tuple(_slewed(run, called, slew_per_s)), height=0.9))
-    return Chart((tuple(rows),), x_label, wide=8.6)
+    return Chart((tuple(rows),), wide=8.6)
 
 
 def step_time_figure(seconds: Mapping[str, ArrayLike], deadline_s: float, dt: float) -> Figure:

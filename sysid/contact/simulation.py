@@ -37,7 +37,6 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import make_interp_spline
 from scipy.linalg import eigh
 
 from thermogrip.datasets.arrays import Array
@@ -165,12 +164,14 @@ def _modes(lam: Array, vectors: Array, root: Array, half: Array) -> StackModes:
 
 
 @lru_cache(maxsize=64)
-def compiled_gripper(stack: Stack, steps: tuple[float, ...]) -> Any:
-    """Return what is common to all contacts of a gripper at these steps: it costs more than one contact."""
-    from thermogrip.sysid.contact.time_stepping import gripper_of
+def gripper_modes(stack: Stack) -> Any:
+    """Return the gripper as the time stepping takes it."""
+    from thermogrip.sysid.contact.time_stepping import grippers
 
     found = stack_modes(stack)
-    return gripper_of(np.array(steps), found.lam, found.face, found.sensor, contact_numbers(stack, found))
+    return grippers(
+        found.lam[None], found.face[None], found.sensor[None], contact_numbers(stack, found)[None]
+    )
 
 
 def step_response(
@@ -182,16 +183,17 @@ def step_response(
     ``effusivity``, ``capacity``, settled ``h_c`` and ``build_up`` (default the stack's) are (n,);
     one that is not positive and finite raises a ValueError.
     """
-    from thermogrip.sysid.contact.time_stepping import contacts
+    from thermogrip.sysid.contact.time_stepping import N_STEPPED, VALUE, contacts
 
     given = (effusivity, capacity, h_c, stack.build_up if build_up is None else build_up)
     e, c, h, tau = np.broadcast_arrays(*(np.atleast_1d(np.asarray(v, dtype=float)) for v in given))
     for name, value in (("effusivity", e), ("capacity", c), ("h_c", h)):
         if not (np.all(np.isfinite(value)) and np.all(value > 0)):
             raise ValueError(f"{name} must be positive and finite, got {value[~(value > 0)][:3]}")
-    gripper = compiled_gripper(stack, tuple(nodes.dt.tolist()))
-    rise, slope, flux = contacts(tuple(nodes), gripper, *(np.ascontiguousarray(v) for v in (e, c, h, tau)))
-    return rise, slope, flux
+    wanted = np.zeros((e.size, N_STEPPED), dtype=bool)
+    wanted[:, VALUE] = True
+    rise, slope, flux = contacts(nodes, gripper_modes(stack), np.stack([e, c, h, tau], axis=1), wanted)
+    return rise[:, VALUE], slope[:, VALUE], flux
 
 
 def far_response(
@@ -199,6 +201,8 @@ def far_response(
 ) -> Array:
     """Return what the far face of blocks, whose :func:`step_response` is ``rise`` (n, n_node), does to the
     sensor, per degree from block to room, (n, n_node)."""
+    from scipy.interpolate import make_interp_spline
+
     e, c = (np.broadcast_to(np.asarray(v, dtype=float), rise.shape[:1]) for v in (effusivity, capacity))
     since = np.maximum(nodes.t - (c**2 / (6 * e**2))[:, None], 0.0)
     total = [make_interp_spline(nodes.t, f, k=1).antiderivative()(s) for f, s in zip(rise, since)]

@@ -95,6 +95,13 @@ class Touches:
         own = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "second"}
         return Touches(**own, second=None if self.second is None else self.second.take(index))
 
+    def known(self, index: NDArray[np.int64]) -> Touches:
+        """Return what was known of the touches at these rows, with no readings."""
+        own = ("level", "t_object", "t_object_sd", "t_ambient", "excursion")
+        numbers = {f.name: getattr(self, f.name)[index if f.name in own else slice(0)]
+                   for f in fields(self) if f.name != "second"}  # fmt: skip
+        return Touches(**numbers)
+
     @property
     def end(self) -> float:
         """Return the last sample's time [s]."""

@@ -78,8 +78,8 @@ from thermogrip.sysid.contact.simulation import (
     LAYER_NAMES,
     Stack,
     TimeNodes,
-    compiled_gripper,
     contact_numbers,
+    gripper_modes,
     nearby_modes,
     stack_modes,
     time_nodes,
@@ -143,27 +143,30 @@ def jacobian(
     ``vary`` (n_pair, 7), the unknown nuisances; ``beyond`` (n_pair, 2, n_bin) the gripper's discrepancy."""
     from thermogrip.sysid.effusivity.mode_kernel import readings
 
-    y, slopes = readings(
-        *gripper_arguments(stack, nodes), (np.empty((0, 0)),) * 4, data.sample_t, data.sample_bin, data.count,
-        data.t, data.ramp, data.t_ambient, _beyond(beyond, u, data), np.ascontiguousarray(u), vary,
-    )  # fmt: skip
-    return y, slopes
+    y, slopes = readings(pairs_asked(stack, nodes, data, np.arange(len(u)), beyond), u, vary)
+    return y, slopes[:, :N_NUISANCE].transpose(0, 2, 1)
 
 
-def _beyond(beyond: Array | None, u: Array, data: Touches) -> Array:
-    return np.zeros((len(u), 2, data.y.shape[1])) if beyond is None else beyond
+def pairs_asked(
+    stack: Stack, nodes: TimeNodes, data: Touches, row: NDArray[np.int64], beyond: Array | None
+) -> Any:
+    """Return the pairs of some rows and a gripper as the search takes them."""
+    from thermogrip.sysid.effusivity.mode_kernel import Asked
+
+    nothing = np.broadcast_to(0.0, (row.size, 2, data.y.shape[1])) if beyond is None else beyond
+    return Asked(nodes, gripper_modes(stack), data, row, nothing)
 
 
 def find_modes(
     stack: Stack, data: Touches, row: NDArray[np.int64], whitener: tuple[Array, Array], prior: Prior, *,
-    start: Array | None = None, max_steps: int = 20, beyond: Array | None = None,
+    start: Array | None = None, max_steps: int = 20, beyond: Array | None = None, rivals: bool = False,
 ) -> Mode:  # fmt: skip
     """Return mode, covariance and log evidence of every pair by damped Gauss-Newton.
 
     Pair p is touch ``row[p]`` under row p of ``prior``; ``whitener`` is what
     :func:`~thermogrip.sysid.effusivity.data.whiten` returns for ``data``.  It starts at the prior's mean with
     the level as measured, or at ``start`` (n_pair, 7); a pair that has not settled within ``max_steps`` is
-    hopeless in practice.
+    hopeless in practice, and where pairs of one touch are ``rivals`` one far behind the best is left early.
     """
     from thermogrip.sysid.effusivity.mode_kernel import modes
 
@@ -173,14 +176,13 @@ def find_modes(
         u[:, LEVEL] = np.where(vary[:, LEVEL], data.level[row], u[:, LEVEL])
     dof = np.full(u.shape, np.inf) if prior.dof is None else prior.dof
     w_matrix, log_det = whitener
-    arguments = gripper_arguments(stack, nodes_for(data))
-    covariance, objective, misfit, settled = modes(
-        *arguments, row, data.sample_t, data.sample_bin, data.count, data.t, data.y,
-        data.ramp, data.t_ambient, _beyond(beyond, u, data), w_matrix,
-        np.stack([prior.mean, prior.sd, dof], axis=1), u, max_steps,
-    )  # fmt: skip
+    asked, law = (
+        pairs_asked(stack, nodes_for(data), data, row, beyond),
+        np.stack([prior.mean, prior.sd, dof], axis=1),
+    )
+    covariance, objective, misfit, settled = modes(asked, w_matrix, law, u, max_steps, rivals=rivals)
     evidence = -0.5 * (objective + log_det[row]) + peak_ratio(dof, vary)
-    return Mode(u, covariance, evidence, settled > 0, misfit)
+    return Mode(u, covariance, evidence, settled, misfit)
 
 
 def peak_ratio(dof: Array, vary: Mask) -> Array:
@@ -189,11 +191,6 @@ def peak_ratio(dof: Array, vary: Mask) -> Array:
     nu = np.where(heavy, dof, 1.0)
     ratio = gammaln(0.5 * (nu + 1)) - gammaln(0.5 * nu) - 0.5 * np.log(0.5 * nu)
     return np.asarray(np.where(heavy, ratio, 0.0).sum(axis=1))
-
-
-def gripper_arguments(stack: Stack, nodes: TimeNodes) -> tuple[Any, ...]:
-    """Return the first arguments of the compiled functions, kept from call to call for each gripper."""
-    return tuple(nodes), compiled_gripper(stack, tuple(nodes.dt.tolist()))
 
 
 _AT = {name: i for i, name in enumerate((*SHARED_NAMES, "ln_h", "ln_e"))}
@@ -379,8 +376,8 @@ def _penalty(pair: _Pair, v: Array) -> tuple[float, Array, Array, Array]:
     """Return the prior's -2 ln density, its slopes, bounds of the curvatures and these, (7,) each."""
     from thermogrip.sysid.effusivity.mode_kernel import penalty
 
-    parts = np.empty((3, N_NUISANCE))
-    return float(penalty(v, pair.prior.mean[0], pair.prior.sd[0], pair.dof, *parts)), *parts
+    value, *parts = penalty(v[None], pair.prior.mean, pair.prior.sd, pair.dof[None])
+    return float(value[0]), parts[0][0], parts[1][0], parts[2][0]
 
 
 def _expand(pair: _Pair, here: _Point, k: Array, j: Array) -> _Expansion:
@@ -434,11 +431,10 @@ def _whole_covariance(pair: _Pair, ahead: _Expansion, k: Array, j: Array) -> Arr
 
 def _slopes(pair: _Pair, here: _Point) -> tuple[Array, Array]:
     """Return the derivatives of the bin means by theta, (n_bin, n_theta), and by u, (n_bin, 7)."""
+    from thermogrip.sysid.contact.time_stepping import grippers
     from thermogrip.sysid.effusivity.mode_kernel import readings
 
     data, u, stack = pair.data, here.u, here.stack
-    _, by_u = jacobian(stack, pair.nodes, data, u[None], np.ones((1, u.size), dtype=bool), pair.beyond)
-    k = by_u[0] @ pair.by_mean
     n = len(_LAYERS)
     layers = np.repeat([[getattr(stack, name) for name in LAYER_NAMES]], n, axis=0)
     layers[np.arange(n), np.arange(n)] *= np.exp(_DIFFERENCE)
@@ -451,16 +447,19 @@ def _slopes(pair: _Pair, here: _Point) -> tuple[Array, Array]:
         np.concatenate([moved, np.repeat(here_[None], len(_CONTACT) + 1, axis=0)])
         for moved, here_ in zip(near[:3], base[:3])
     )
-    us, vary = np.repeat(u[None], len(contact), axis=0), np.zeros((len(contact), u.size), dtype=bool)
-    y, _ = readings(
-        *gripper_arguments(stack, pair.nodes), (lam, face, sensor, contact), data.sample_t, data.sample_bin,
-        data.count, data.t, data.ramp, data.t_ambient, pair.beyond, us, vary,
-    )  # fmt: skip
+    asked = pairs_asked(stack, pair.nodes, data, np.zeros(len(contact), dtype=np.int64), pair.beyond)
+    asked = asked._replace(gripper=grippers(lam, face, sensor, contact))
+    us = np.repeat(u[None], len(contact), axis=0)
+    vary = np.zeros(us.shape, dtype=bool)
+    vary[-1] = True
+    y, slopes = readings(asked, us, vary)
+    by_u = slopes[-1, :N_NUISANCE].T
+    k = by_u @ pair.by_mean
     k[:, _MOVED] = ((y[:-1] - y[-1]) / _DIFFERENCE).T
     if np.isfinite(data.t_ambient[0]):
         k[:, _AT["leak"]] = (data.t_ambient[0] - u[LEVEL]) * data.ramp[0]
     there = (data.count[0] > 0)[:, None]
-    return k * there, by_u[0] * there
+    return k * there, by_u * there
 
 
 class Hypotheses(NamedTuple):
@@ -546,13 +545,15 @@ def prior_of(gripper: GripperModel, data: Touches, hypotheses: Hypotheses) -> Pr
 def fit_pairs(
     gripper: GripperModel, data: Touches, row: NDArray[np.int64], hypotheses: Hypotheses, *,
     start: Array | None = None, max_steps: int = 20, noise: tuple[Array, Array] | None = None,
-    prior: Prior | None = None,
+    prior: Prior | None = None, rivals: bool = False,
 ) -> Mode:  # fmt: skip
     """Return the modes of pairs, hypothesis i against touch ``row[i]``, integrated over an uncertain
     gripper's parameters, a second sensor used; ``noise`` and ``prior`` are
     :func:`~thermogrip.sysid.effusivity.data.whiten` and :func:`prior_of` where a caller has them."""
-    prior = prior_of(gripper, data.take(row), hypotheses) if prior is None else prior
-    mode = _own_modes(gripper, data, row, hypotheses, prior, start, max_steps, noise)
+    prior = prior_of(gripper, data.known(row), hypotheses) if prior is None else prior
+    # what else counts may bring another one up
+    rivals = rivals and gripper.discrepancy is None and (gripper.second is None or data.second is None)
+    mode = _own_modes(gripper, data, row, hypotheses, prior, start, max_steps, noise, rivals)
     mode = with_second(gripper, data, row, hypotheses, prior, mode)
     n = (data.count[row] > 0).sum(axis=1)
     if gripper.second is not None and data.second is not None:
@@ -574,16 +575,16 @@ def with_second(
     if second is None or data.second is None:
         return mode
     others = hypotheses_of_second(gripper, second, hypotheses)
-    own = prior_of(second, data.second.take(row), others)
+    own = prior_of(second, data.second.known(row), others)
     begin = own.mean.copy()
     begin[:, LEVEL], begin[:, T_OBJECT] = data.second.level[row], mode.u[:, T_OBJECT]
-    beside = _own_modes(second, data.second, row, others, own, begin, 20, None)
+    beside = _own_modes(second, data.second, row, others, own, begin, 20, None, False)
     return joined_modes(mode, prior, beside, own, second.bias - gripper.bias)
 
 
 def _own_modes(
     gripper: GripperModel, data: Touches, row: NDArray[np.int64], hypotheses: Hypotheses, prior: Prior,
-    start: Array | None, max_steps: int, noise: tuple[Array, Array] | None,
+    start: Array | None, max_steps: int, noise: tuple[Array, Array] | None, rivals: bool,
 ) -> Mode:  # fmt: skip
     """Return the modes of pairs by the first sensor alone."""
     noise = whiten(data, gripper.noise) if noise is None else noise
@@ -592,8 +593,10 @@ def _own_modes(
         return uncertain_gripper_modes(
             gripper, data, row, noise, prior, block, start=start, max_steps=max_steps
         )
-    beyond = gripper.beyond(data.t[row], prior.mean[:, EFFUSIVITY])
-    return find_modes(gripper.stack, data, row, noise, prior, start=start, max_steps=max_steps, beyond=beyond)
+    beyond = None if gripper.discrepancy is None else gripper.beyond(data.t[row], prior.mean[:, EFFUSIVITY])
+    return find_modes(
+        gripper.stack, data, row, noise, prior, start=start, max_steps=max_steps, beyond=beyond, rivals=rivals
+    )
 
 
 def hypotheses_of_second(gripper: GripperModel, second: GripperModel, one: Hypotheses) -> Hypotheses:
@@ -722,9 +725,9 @@ def fit_candidates(
     row = np.repeat(np.arange(n), m)
     hypotheses = Hypotheses(*(np.tile(h, n) for h in one))
     begin = None if start is None else start.reshape(n * m, -1)
-    each = data.take(row)
+    each = data.known(row)
     prior = prior_of(gripper, each, hypotheses)
-    mode = fit_pairs(gripper, data, row, hypotheses, start=begin, prior=prior)
+    mode = fit_pairs(gripper, data, row, hypotheses, start=begin, prior=prior, rivals=True)
     return doubted(gripper, each, prior, mode), prior, row
 
 

@@ -56,7 +56,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.atomic_files import read_json, write_json
@@ -381,11 +380,12 @@ def _free(
 ) -> list[posterior_grid.GridPosterior]:
     x = np.linspace(*posterior_grid.LN_E_RANGE, posterior_grid.N_COARSE)
     fit = joint(at, x)
-    for widen in posterior_grid.WIDEN:
-        more = posterior_grid.refined(x, fit.log_evidence, widen)
+    for widen, n_point in posterior_grid.REFINEMENTS:
+        more = posterior_grid.refined(x, fit.log_evidence, widen, n_point)
         extra = joint(at, more)
-        x = np.concatenate([x, more])
-        fit = Joint(*(np.concatenate(pair) for pair in zip(fit, extra)))
+        order = np.argsort(np.concatenate([x, more]))
+        x = np.concatenate([x, more])[order]
+        fit = Joint(*(np.concatenate(pair)[order] for pair in zip(fit, extra)))
     own = np.diagonal(fit.covariance, axis1=1, axis2=2)[:, ::N_SHARED]
     found, ln_h = fit.mean[:, ::N_SHARED], fit.mean[:, 1::N_SHARED]
     sd = np.hypot(np.sqrt(own), coupling.touch_sd(found - skin))
@@ -397,6 +397,8 @@ def _free(
 
 def learn_coupling(gripper: GripperModel, grasps: Grasps, *, start: Coupling | None = None) -> Coupling:
     """Return the coupling that makes labelled groups likeliest."""
+    from scipy.optimize import minimize
+
     centre = start or Coupling()
     groups = [
         (factor, view, at)

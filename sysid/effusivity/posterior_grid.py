@@ -3,7 +3,7 @@ r"""The posterior of ln e on a grid that finds its own place.
 Given ln e every other unknown is close to Gaussian, so Laplace's method serves there; ln e itself is not
 (copper's posterior runs into the prior's edge, wood's is narrower than any fixed grid), so it gets a grid:
 coarse over the prior, then twice refined where the mass is.  Between points the log density is interpolated
-by a monotone cubic.
+by Akima's cubics.
 
 **What Laplace's method leaves out** changes slowly with ln e, so it is integrated (:func:`log_integrals`) at
 seven of the points, and the rest interpolated.  Its mean over the posterior is left to Laplace's method: the
@@ -27,7 +27,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
+from numpy.typing import NDArray
 from scipy.special import gammaln, logsumexp, ndtr
 
 from thermogrip.datasets.arrays import Array, Mask
@@ -45,8 +45,8 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     doubted,
     fit_pairs,
     free_hypotheses,
-    gripper_arguments,
     nodes_for,
+    pairs_asked,
     prior_of,
     slip_of,
 )
@@ -66,29 +66,21 @@ _Z = np.column_stack([np.repeat(_FIRST, 6), np.tile(_OTHERS, (_FIRST.size, 1))])
 _LOG_WEIGHT = 1.5 - np.log(6.0) - 0.5 * np.log(2 * np.pi) + np.log(_STEP)
 
 
-def marginals(arguments: Any, data: Touches, whitener: Array, beyond: Array, sd: Array, u: Array) -> Array:
+def slipped(
+    gripper: GripperModel, data: Touches, whitener: Array, beyond: Array, sd: Array, u: Array
+) -> Array:
     """Return ln p(y | u) up to a constant for n points ``u`` (n, 7) of one grasp, integrated over level and
     T_obj (prior means in ``u``, sds in ``sd`` (7,)), the latter a slip with a probability of ``SLIPS`` where
-    it is stated; ``arguments`` are of
-    :func:`~thermogrip.sysid.effusivity.laplace_approximation.gripper_arguments`."""
-    from thermogrip.sysid.effusivity.mode_kernel import modes
+    it is stated."""
+    from thermogrip.sysid.effusivity.mode_kernel import marginals
 
-    law = np.zeros((len(u), 3, u.shape[1]))
-    law[:, 0], law[:, 2] = u, np.inf
-
-    def integrated(t_sd: float) -> Array:
-        law[:, 1, LEVEL], law[:, 1, T_OBJECT] = sd[LEVEL], t_sd
-        _, objective, _, _ = modes(
-            *arguments, np.zeros(len(u), dtype=np.int64), data.sample_t, data.sample_bin, data.count, data.t,
-            data.y, data.ramp, data.t_ambient, beyond, whitener, law, u.copy(), 0,
-        )  # fmt: skip
-        return np.asarray(-0.5 * objective)
-
-    stated = integrated(sd[T_OBJECT])
-    if not np.isfinite(data.t_object[0]):
-        return stated
-    slip = integrated(sd[T_OBJECT] * float(slip_of(sd[T_OBJECT])))
-    return np.asarray(np.logaddexp(np.log1p(-SLIPS) + stated, np.log(SLIPS) + slip))
+    asked = pairs_asked(gripper.stack, nodes_for(data), data, np.zeros(len(u), dtype=np.int64), beyond)
+    stated, t_sd = np.isfinite(data.t_object[0]), sd[T_OBJECT]
+    sds = [[sd[LEVEL], t_sd], [sd[LEVEL], t_sd * float(slip_of(t_sd))]]
+    found = marginals(asked, whitener, u, np.array(sds[: 1 + stated]))
+    return np.asarray(
+        np.logaddexp(np.log1p(-SLIPS) + found[0], np.log(SLIPS) + found[1]) if stated else found[0]
+    )
 
 
 class MarginalPosterior:
@@ -103,7 +95,6 @@ class MarginalPosterior:
         self.gripper, self.data = gripper, data
         whitener, log_det = whiten(data, gripper.noise) if noise is None else noise
         self.whitener, self.log_det = whitener, float(log_det[0])
-        self._arguments = gripper_arguments(gripper.stack, nodes_for(data))
         # of the prior only what depends on ln e is computed again
         self._prior = prior_of(gripper, data, free_hypotheses(gripper, [9.0]))
 
@@ -127,7 +118,7 @@ class MarginalPosterior:
             dof = np.inf if common.dof is None else common.dof[0, k]
             log_prior += _log_student(points[:, column], common.mean[0, k], common.sd[0, k], dof)
         beyond = self.gripper.beyond(data.t, points[:, 0])
-        likelihood = marginals(self._arguments, data, self.whitener, beyond, common.sd[0], u)
+        likelihood = slipped(self.gripper, data, self.whitener, beyond, common.sd[0], u)
         return np.asarray(log_prior + likelihood)
 
 
@@ -153,10 +144,8 @@ def _log_student(x: Array, mean: Array | float, sd: Array | float, dof: float = 
     return np.asarray(norm - 0.5 * (dof + 1) * np.log1p(w**2 / dof) - np.log(sd))
 
 
-N_COARSE, _FINE = 26, 18
-_FIRST_STEPS, _STEPS = 3, 20
-_NEAR = 500.0  # nats below the best point within which a search that has not settled goes on
-WIDEN = (12.0, 7.0)  # nats below the best point that a refinement still covers
+N_COARSE = 26
+REFINEMENTS = ((12.0, 12), (7.0, 14))  # nats below the best point that each covers, and its points
 _KNOTS, _REACH = 7, 8.0  # points to integrate at, and how far below the best they go [nat]
 
 
@@ -184,20 +173,29 @@ class _Fitted(NamedTuple):
 
 def grid_posteriors(gripper: GripperModel, data: Touches) -> list[GridPosterior]:
     """Return the posteriors of ln e: log-uniform prior over :data:`LN_E_RANGE`, h_c unknown."""
-    n, noise = data.level.size, whiten(data, gripper.noise)
-    coarse = np.tile(np.linspace(*LN_E_RANGE, N_COARSE), (n, 1))
-    found = _evaluate(gripper, data, noise, coarse, np.ones(coarse.shape, dtype=bool), None, _FIRST_STEPS)
-    near = ~found.settled & (found.value > found.value.max(axis=1, keepdims=True) - _NEAR)
-    if near.any():
-        again = _evaluate(gripper, data, noise, coarse, near, found.u, _STEPS)
-        for old, new in zip(found, again):
-            old[near] = new[near]
-    for widen in WIDEN:
-        grid = np.stack([refined(found.x[i], found.value[i], widen) for i in range(n)])
-        start = np.stack([_between(grid[i], found.x[i], found.u[i]) for i in range(n)])
-        more = _evaluate(gripper, data, noise, grid, np.ones(grid.shape, dtype=bool), start, _STEPS)
+    noise = whiten(data, gripper.noise)
+    found = _fitted(gripper, data, noise)
+    return [_finished(gripper, data, noise, found, i) for i in range(data.level.size)]
+
+
+def free_evidence(gripper: GripperModel, data: Touches) -> Array:
+    """Return the log evidence of a free effusivity for each touch, (n,), as :func:`grid_posteriors` do."""
+    found = _fitted(gripper, data, whiten(data, gripper.noise))
+    return np.asarray(log_total(found.x, found.value) - np.log(LN_E_RANGE[1] - LN_E_RANGE[0]))
+
+
+def _fitted(gripper: GripperModel, data: Touches, noise: tuple[Array, Array]) -> _Fitted:
+    """Return the fits at the coarse points and at those of the refinements, along which ln e rises."""
+    coarse = np.tile(np.linspace(*LN_E_RANGE, N_COARSE), (data.level.size, 1))
+    found = _evaluate(gripper, data, noise, coarse, None)
+    for widen, n_point in REFINEMENTS:
+        grid = np.stack([refined(x, value, widen, n_point) for x, value in zip(found.x, found.value)])
+        more = _evaluate(gripper, data, noise, grid, _between(grid, found.x, found.u))
         found = _Fitted(*(np.concatenate(pair, axis=1) for pair in zip(found, more)))
-    return [_finished(gripper, data, noise, found, i) for i in range(n)]
+        order = np.argsort(found.x, axis=1)
+        row = np.arange(len(order))[:, None]
+        found = _Fitted(*(part[row, order] for part in found))
+    return found
 
 
 def _finished(
@@ -212,9 +210,10 @@ def _finished(
 
 def _left_out(gripper: GripperModel, data: Touches, noise: tuple[Array, Array], found: _Fitted) -> Array:
     """Return what Laplace's method left out of one grasp's points, (m,), less its mean over the posterior."""
+    from scipy.interpolate import PchipInterpolator
+
     x, value, u, covariance, settled = found
     near = np.flatnonzero(settled & (value > value.max() - _REACH))
-    near = near[np.argsort(x[near])]
     # for an uncertain gripper Laplace's method integrates over its parameters too, with a discrepancy the
     # evidence counts less than the integral says
     other = gripper.uncertain or gripper.discrepancy is not None
@@ -224,9 +223,8 @@ def _left_out(gripper: GripperModel, data: Touches, noise: tuple[Array, Array], 
     at = near[np.unique(np.abs(x[near] - wanted[:, None]).argmin(axis=1))]
     missing = log_integrals(gripper, data, x[at], u[at], covariance[at], noise=noise) - value[at]
     everywhere = PchipInterpolator(x[at], missing)(np.clip(x, x[at[0]], x[at[-1]]))
-    order = np.argsort(x)
-    weight = np.exp(value[order] - value.max()) * np.gradient(x[order])
-    return np.asarray(everywhere - (weight * everywhere[order]).sum() / weight.sum())
+    weight = np.exp(value - value.max()) * np.gradient(x)
+    return np.asarray(everywhere - (weight * everywhere).sum() / weight.sum())
 
 
 def mixture_quantiles(weight: Array, mean: Array, sd: Array, levels: tuple[float, ...]) -> Array:
@@ -252,54 +250,101 @@ def mixture_quantiles(weight: Array, mean: Array, sd: Array, levels: tuple[float
 
 
 def _evaluate(
-    gripper: GripperModel, data: Touches, noise: tuple[Array, Array], grid: Array, wanted: Mask,
-    start: Array | None, steps: int,
-) -> _Fitted:  # fmt: skip
-    """Return the fits at the ``wanted`` points of a grid (n, m), zeros elsewhere."""
+    gripper: GripperModel, data: Touches, noise: tuple[Array, Array], grid: Array, start: Array | None
+) -> _Fitted:
+    """Return the fits at the points of a grid (n, m)."""
     n, m = grid.shape
-    row = np.broadcast_to(np.arange(n)[:, None], (n, m))[wanted]
-    begin = None if start is None else start[wanted]
-    hypotheses = free_hypotheses(gripper, grid[wanted])
-    each = data.take(row)
+    row = np.repeat(np.arange(n), m)
+    hypotheses = free_hypotheses(gripper, grid)
+    each = data.known(row)
     prior = prior_of(gripper, each, hypotheses)
-    mode = fit_pairs(gripper, data, row, hypotheses, start=begin, max_steps=steps, noise=noise, prior=prior)
+    begin = None if start is None else start.reshape(n * m, -1)
+    mode = fit_pairs(gripper, data, row, hypotheses, start=begin, noise=noise, prior=prior, rivals=True)
     mode = doubted(gripper, each, prior, mode)
-    out = _Fitted(
-        grid, np.zeros((n, m)), np.zeros((n, m, 7)), np.zeros((n, m, 7, 7)), np.zeros((n, m), dtype=bool)
-    )
-    values = (mode.log_evidence, mode.u, mode.covariance, mode.converged)
-    for part, value in zip(out[1:], values):
-        part[wanted] = value
-    return out
+    found: list[Any] = [mode.log_evidence, mode.u, mode.covariance, mode.converged]
+    return _Fitted(grid, *(part.reshape(n, m, *part.shape[1:]) for part in found))
 
 
 def _between(x: Array, knots: Array, values: Array) -> Array:
-    """Return values (n_knot, 7) at knots in any order, linear between them, at x (n,)."""
-    order = np.argsort(knots)
-    return np.stack([np.interp(x, knots[order], column) for column in values[order].T], axis=1)
+    """Return ``values`` (n, n_knot, 7) at ``knots`` (n, n_knot), along which these rise, at ``x`` (n, m): by
+    the cubic of the four around."""
+    row = np.arange(len(x))[:, None]
+    first = (knots[:, None, :] <= x[:, :, None]).sum(axis=2) - 2
+    at = np.clip(first, 0, knots.shape[1] - 4)[:, :, None] + np.arange(4)
+    near = knots[row[:, :, None], at]
+    total = np.zeros((*x.shape, values.shape[2]))
+    for j in range(4):
+        others = [k for k in range(4) if k != j]
+        weight = np.prod(
+            (x[:, :, None] - near[:, :, others]) / (near[:, :, [j]] - near[:, :, others]), axis=2
+        )
+        total += weight[:, :, None] * values[row, at[:, :, j]]
+    return total
 
 
-def refined(x: Array, value: Array, widen: float) -> Array:
-    """Return new points where log densities ``value`` at ``x`` are within ``widen`` of their best."""
-    order = np.argsort(x)
-    x, value = x[order], value[order]
+def refined(x: Array, value: Array, widen: float, n_point: int) -> Array:
+    """Return new points where log densities ``value`` at ``x``, which rises, are within ``widen`` of their
+    best."""
     inside = np.flatnonzero(value > value.max() - widen)
     low = x[max(inside[0] - 1, 0)]
     high = x[min(inside[-1] + 1, x.size - 1)]
-    # midpoints of cells, so that a refinement never repeats a point of the one before
-    return np.asarray(low + (high - low) * (np.arange(_FINE) + 0.5) / _FINE)
+    # of each cell the middle, or beside it: farthest from the points there are
+    cell = (high - low) / n_point
+    new = low + cell * (np.arange(n_point) + _PLACES[:, None])
+    return np.asarray(new[np.abs(new[:, :, None] - x).min(axis=(1, 2)).argmax()])
+
+
+_FAR = 30.0  # nats below the best, where nothing counts, and a cubic beside would swing
+_PLACES = np.array([0.5, 0.46, 0.54, 0.42, 0.58, 0.38, 0.62])
+
+
+def slopes(x: Array, value: Array) -> Array:
+    """Return Akima's slopes of curves ``value`` (n, m) at ``x`` (n, m): where a curve bends sharply they are
+    those of its smooth side, so that no wave is added."""
+    secant = np.diff(value) / np.diff(x)
+    before, after = 2 * secant[:, :1] - secant[:, 1:2], 2 * secant[:, -1:] - secant[:, -2:-1]
+    m = np.concatenate(
+        [2 * before - secant[:, :1], before, secant, after, 2 * after - secant[:, -1:]], axis=1
+    )
+    turn = np.abs(np.diff(m))
+    left, right = turn[:, 2:], turn[:, :-2]
+    even = left + right <= 1e-9 * turn.max(axis=1, keepdims=True)
+    weight = np.where(even, 0.5, left / np.where(even, 1.0, left + right))
+    return np.asarray(weight * m[:, 1:-2] + (1 - weight) * m[:, 2:-1])
+
+
+_GAUSS, _SHARE = (0.5 * v for v in np.polynomial.legendre.leggauss(8))
+
+
+def log_total(x: Array, value: Array) -> Array:
+    """Return the logarithms of the integrals of densities whose logarithms are ``value`` (n, m) at ``x``
+    (n, m), cubics between them, (n,)."""
+    n, m = x.shape
+    place = np.broadcast_to((_GAUSS + 0.5)[None, None], (n, m - 1, _GAUSS.size)).reshape(n, -1)
+    at = np.repeat(np.arange(m - 1), _GAUSS.size)
+    share = _SHARE * np.diff(x)[:, :, None]
+    return np.asarray(logsumexp(_cubic(x, value, at, place) + np.log(share).reshape(n, -1), axis=1))
+
+
+def _cubic(x: Array, value: Array, at: NDArray[np.int64], share: Array) -> Array:
+    """Return curves (n, m) through ``value`` at ``x``, between points ``at`` (k,) and the next, a ``share``
+    (n, k) of the way."""
+    value = np.maximum(value, value.max(axis=1, keepdims=True) - _FAR)
+    d, width, s = slopes(x, value), np.diff(x)[:, at], share
+    y0, y1 = value[:, at], value[:, at + 1]
+    bent = (1 - s) * d[:, at] * width - s * d[:, at + 1] * width + (1 - 2 * s) * (y0 - y1)
+    return np.asarray(y0 + s * (y1 - y0) + s * (1 - s) * bent)
 
 
 def posterior_of(x: Array, value: Array, t_object: Array, sd: Array, ln_h: Array) -> GridPosterior:
-    """Return the posterior of log densities ``value`` at points ``x``, in any order; all arguments (m,)."""
-    order = np.argsort(x)
-    order = order[np.concatenate([[True], np.diff(x[order]) > 1e-9])]
-    x, value, t_object, sd, ln_h = (v[order] for v in (x, value, t_object, sd, ln_h))
-    curve = PchipInterpolator(x, value)
+    """Return the posterior of log densities ``value`` at points ``x``, along which these rise; arguments are
+    (m,)."""
     inside = np.flatnonzero(value > value.max() - 20)
     low, high = x[max(inside[0] - 1, 0)], x[min(inside[-1] + 1, x.size - 1)]
     fine = np.linspace(low, high, 500)
-    log_density = np.asarray(curve(fine))
+    at = np.clip(np.searchsorted(x, fine, "right") - 1, 0, x.size - 2)
+    share = (fine - x[at]) / (x[at + 1] - x[at])
+    log_density = _cubic(x[None], value[None], at, share[None])[0]
     log_total = float(logsumexp(log_density)) + np.log(fine[1] - fine[0])
     mass = np.exp(log_density - logsumexp(log_density))
     weight = np.exp(value - value.max()) * np.gradient(x)

@@ -139,8 +139,8 @@ def _width(sd: float, log: bool) -> str:
     """Return a 90 per cent half-width in words."""
     half = NormalDist().inv_cdf(0.95) * sd
     if not log:
-        return f"+-{half:.2g}"
-    return f"+-{100 * np.expm1(half):.2g} %" if half < np.log(2.0) else f"a factor of {np.exp(half):.2g}"
+        return f"±{half:.2g}"
+    return f"±{100 * np.expm1(half):.2g} %" if half < np.log(2.0) else f"a factor of {np.exp(half):.2g}"
 
 
 def describe(

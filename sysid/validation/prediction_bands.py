@@ -24,8 +24,9 @@ error and of that on the last parts of the logs; with n folds it is known as bad
 so s is multiplied by t_n / z, Student's quantile over the normal one (1.3 for four folds and 90 %).
 
 The error to expect of one part more is neither the larger one nor that of those seen: of n folds and the last
-parts, which lie in them, with the mean square e^2 it is e sqrt(1 + 2 / n) (:func:`expected_error`), as with
-an inverse gamma prior on it that weighs as two parts.
+parts, which lie in them, with the mean square e^2 it is e sqrt(1 + 1 / n) (:func:`expected_error`), as the
+variance of one value more about the mean of n; over 33 outputs of public sets its median ratio to the true
+error is 1.00 (docs/records/black-boxes.md).
 
 **Where that is too narrow.** The average over parts does not apply to each: a tank that overflows in one
 stretch and not in the next errs there three times as much. With e_f the error on part f and h_f that on all
@@ -254,7 +255,7 @@ def _own_variance(plant: Plant, name: str, drawn: Array, level: float) -> float:
 
 def expected_error(errors: Sequence[float], parts: int) -> float:
     """Return the rms error to expect of one part more, of errors over ``parts`` that do not overlap."""
-    return float(np.sqrt(np.mean(np.square(errors)) * (1 + 2 / (parts or len(errors)))))
+    return float(np.sqrt(np.mean(np.square(errors)) * (1 + 1 / (parts or len(errors)))))
 
 
 def _few_parts(plant: Plant, name: str, level: float) -> float:

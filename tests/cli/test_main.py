@@ -177,6 +177,19 @@ def test_help_is_as_wide_as_the_terminal_and_at_most_100_columns_of_a_pipe(
         assert "\x1b" not in shown
 
 
+def test_help_ends_no_line_within_a_word(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    for verb in VERBS:
+        shown = {}
+        for columns in (60, 300):
+            monkeypatch.setenv("COLUMNS", str(columns))
+            main([str(verb), "--help"])
+            shown[columns] = {part for part in re.split(r"\s+|(?<=,)", capsys.readouterr().out) if part}
+        assert shown[60] <= shown[300], verb
+
+
 def test_a_shell_completes_verbs_and_options() -> None:
     for typed, found in (("thermogrip val", "validate"), ("thermogrip identify --net", "--network")):
         asked = {"_THERMOGRIP_COMPLETE": "complete_bash", "COMP_WORDS": typed}

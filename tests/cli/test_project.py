@@ -144,11 +144,11 @@ def test_the_examples_come_out_ready_to_use(bench: Bench) -> None:
 
 
 def test_warm_up_says_where_the_compiled_code_is_kept(bench: Bench) -> None:
-    from thermogrip.sysid.effusivity.mode_kernel import modes
+    from thermogrip.sysid.contact.time_stepping import step_contacts
 
     done = bench.run("warm-up", "--json")
     answer = json.loads(done.out)
     assert done.code == 0
-    assert answer["kept_in"] == modes.stats.cache_path
-    assert list(Path(answer["kept_in"]).glob("mode_kernel.modes-*.nbc"))
+    assert answer["kept_in"] == step_contacts.stats.cache_path
+    assert list(Path(answer["kept_in"]).glob("time_stepping.step_contacts-*.nbc"))
     assert "kept in" in bench.run("warm-up").out

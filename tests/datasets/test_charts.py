@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from thermogrip.datasets.charts import Chart, Curve, Panel, draw_chart, stretches, thin, thinned, time_axis
+from thermogrip.datasets.charts import Chart, Curve, Panel, draw_chart, stretches, thin, thinned
 
 ROWS = st.integers(1, 400).flatmap(
     lambda n: st.lists(
@@ -44,14 +44,6 @@ def test_what_is_short_enough_stays_as_it_is():
     curve = Curve("", np.arange(9.0), np.arange(9.0))
     assert thinned(curve, 9) is curve
     assert thin([curve.y], 9).tolist() == list(range(9))
-
-
-@pytest.mark.parametrize(
-    ("seconds", "per", "label"),
-    [((), 1.0, "s"), ((10.0, 3600.0), 1.0, "s"), ((3601.0,), 60.0, "min"), ((10.0, 21_601.0), 3600.0, "h")],
-)
-def test_a_long_axis_is_in_minutes_or_hours_and_says_so(seconds, per, label):
-    assert time_axis(*seconds) == (per, f"time [{label}]")
 
 
 def test_stretches_are_the_runs_of_rows_and_end_where_the_next_begins():

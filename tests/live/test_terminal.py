@@ -26,7 +26,7 @@ TRIP = Trip("limit", 12.5, "t_surface", "3 to 55 degC", "61.00 degC")
 def test_the_numbers_of_a_session() -> None:
     assert dict(numbers(NOW)) == {
         "t_surface": "37.90 degC", "target of t_surface": "38 +- 0.25 degC", "t_tank": "31.40 degC",
-        "t_ambient": "nan degC", "drive": "+0.42", "pump": "on", "phase": "lead in, 3 s left",
+        "t_ambient": "lost", "drive": "+0.42", "pump": "on", "phase": "lead in, 3 s left",
         "guard margin": "17.1 K to the limit of t_surface", "off the plant": "40 % of what is allowed",
     }  # fmt: skip
     bare = replace(NOW, target={}, band=nan, left_s=inf, margin=inf, units={"drive": "percent"}, pump=0)

@@ -26,6 +26,19 @@ def test_with_json_tables_and_words_are_silent(capsys: pytest.CaptureFixture[str
     assert json.loads(capsys.readouterr().out) == {"a": 1}
 
 
+def test_a_sentence_is_as_wide_as_100_columns_of_a_pipe_and_breaks_no_word(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    words = ["    one", *["pca-lda"] * 30, "x" * 120]
+    Console().say(" ".join(words))
+    lines = capsys.readouterr().out.splitlines()
+    assert " ".join(lines).split() == " ".join(words).split()
+    assert all(line.startswith("    ") for line in lines)
+    assert 92 < len(lines[0]) <= 100
+    Console().say("a = 1\n" + "b" * 120)  # a file that is shown stays as it is
+    assert capsys.readouterr().out == "a = 1\n" + "b" * 120 + "\n"
+
+
 def test_progress_never_goes_back(capsys: pytest.CaptureFixture[str]) -> None:
     with Console().progress("demo") as progress:
         for k, fraction in enumerate((0.1, 0.6, 0.4, 0.7, 1.3)):
@@ -39,6 +52,7 @@ def test_progress_never_goes_back(capsys: pytest.CaptureFixture[str]) -> None:
     [
         (0.123456, "0.1235"), (None, "-"), (1234567.0, "1.235e+06"), ("wood", "wood"), (float("nan"), "-"),
         (True, "yes"), (False, "no"), (np.float64(0.5), "0.5"), (np.int64(7), "7"), (12345, "12345"),
+        (63970.4, "63970"), (-12346.0, "-12350"),
     ],
 )  # fmt: skip
 def test_a_cell_has_four_digits_and_a_dash_for_what_is_absent(cell: object, text: str) -> None:

@@ -23,6 +23,7 @@ from thermogrip.report.control import session_sections
 from thermogrip.report.plant import _per_log
 from thermogrip.report.plots import (
     _log_scale,
+    bode_chart,
     corner_figure,
     exchange_figure,
     free_run_chart,
@@ -35,6 +36,7 @@ from thermogrip.report.plots import (
     steps_chart,
 )
 from thermogrip.rig import Session
+from thermogrip.sysid.export.dynamics import Estimate
 from thermogrip.sysid.identification import Row
 from thermogrip.sysid.plant.fit_record import PlantScores
 from thermogrip.sysid.validation.prediction_bands import Band
@@ -272,6 +274,26 @@ def test_each_figure_shows_what_it_should_in_the_colours_widths_and_units_of_the
     if os.environ.get("THERMOGRIP_FIGURES") == "write":
         DRAWN.write_text(found, encoding="utf-8")
     assert found.splitlines() == DRAWN.read_text(encoding="utf-8").splitlines()
+
+
+def test_a_phase_is_drawn_with_its_band_where_its_magnitude_is_on_the_axis() -> None:
+    size = np.array([1.0, 1e-3, 1e-6])[:, None, None]
+    found = SimpleNamespace(
+        near=SimpleNamespace(outputs=("y",), inputs=("u",)),
+        frequency_response=lambda: (
+            np.array([0.1, 1.0, 10.0]),
+            Estimate(size, 0.9 * size, 1.1 * size),
+            Estimate(*(np.full((3, 1, 1), turn) for turn in (-90.0, -95.0, -85.0))),
+        ),
+    )
+    ((above, below),) = bode_chart(found).columns  # type: ignore[arg-type]
+    for curve, ends in ((above.curves[0], (0.9, 1.1)), (below.curves[0], (-95.0, -85.0))):
+        assert np.isfinite(curve.y).tolist() == [True, True, False]
+        assert curve.low is not None
+        assert curve.high is not None
+        assert (curve.low[0], curve.high[0]) == ends
+        assert np.isnan(curve.low[2])
+        assert np.isnan(curve.high[2])
 
 
 def test_a_parameter_that_was_not_sampled_has_no_corner() -> None:

@@ -453,7 +453,7 @@ def test_a_model_is_good_where_its_error_is_below_half_of_that_without_input_on_
     found, words = identification.verdict_of("arx", rows, quality, True)
     assert found == good
     assert said in words
-    assert f"expected RMSE of a free run t {np.sqrt(0.2**2 + (2 * held) ** 2):.2g} K" in words
+    assert f"expected RMSE of a free run t {np.sqrt(0.75 * (0.2**2 + (2 * held) ** 2)):.2g} K" in words
 
 
 def table(shares, held=True):
@@ -484,16 +484,16 @@ def test_errors_stated_and_kept_are_those_of_what_was_held_out():
     rows = table({"arx": {f"{tail}a": 1.5, f"{tail}b": 0.5, "block 1": 1.0, "block 2": 1.0}})
     other = replace(rows[0], output="r", rmse=9.0, unit="1", fit_percent=np.nan)
     # of 3, 1, 2, 2 the mean square is 4.5; two blocks are two parts, in which the last parts lie
-    assert stated_error([*rows, other], "t") == pytest.approx(np.sqrt(4.5 * 2))
-    assert stated_error(rows[:2], "t") == pytest.approx(np.sqrt(5 * 2))  # last parts alone
-    assert stated_error(rows[2:3], "t") == pytest.approx(2 * np.sqrt(3))
+    assert stated_error([*rows, other], "t") == pytest.approx(np.sqrt(4.5 * 1.5))
+    assert stated_error(rows[:2], "t") == pytest.approx(np.sqrt(5 * 1.5))  # last parts alone
+    assert stated_error(rows[2:3], "t") == pytest.approx(2 * np.sqrt(2))
     more = [*table({"oe": {"a": 1.0}}), *table({"arx": {"a": 1.0}}, False)]
     assert identification.held_out_scores([other, *more], "arx") == [
         HeldOut(f"{tail}a", "r", 9.0, 0.0, "1", 100)
     ]
     quality: Any = SimpleNamespace(verdict="ok")
     words = identification.verdict_of("arx", [*rows, other], quality, False)[1]
-    beginning = "arx: expected RMSE of a free run t 3 K, r 16 (from parts of the logs, left out); not good"
+    beginning = "arx: expected RMSE of a free run t 2.6 K, r 13 (from parts of the logs, left out); not good"
     assert words.startswith(beginning)
     assert identification.relative_error(replace(other, no_input_rmse=0.0)) == 9e12
 

@@ -349,13 +349,6 @@ def classify(
     stated = _range(between)
     if serve == bool(paths) or serve == (out is not None) or (port is not None and not serve):
         raise UserError("give GRASPS and --out, or --serve alone", hint="--port belongs to --serve")
-    from thermogrip.datasets.materials import load_materials
-
-    own = [name for name in cli.comma(candidates) or () if name not in load_materials()]
-    cli.choices("--materials", own, model_dir / "classifier.json", "classes")
-    from thermogrip.classify.decisions.predict import cell_text
-    from thermogrip.datasets.partitions import Answers, sources, stamps
-
     if same_gripper and (other_gripper or known):
         raise UserError("--same-gripper contradicts --other-gripper and --known", hint="give one of them")
     if (other_gripper or known) and (early or next_touch):
@@ -363,6 +356,15 @@ def classify(
             f"{'--early' if early else '--next-touch'} needs a known gripper, and another one is uncertain"
         )
         raise UserError(problem, hint="leave it out, or train on grasps of the new gripper")
+    if out is not None:
+        cli.new_file(out, (".csv",))
+    from thermogrip.datasets.materials import load_materials
+
+    own = [name for name in cli.comma(candidates) or () if name not in load_materials()]
+    cli.choices("--materials", own, model_dir / "classifier.json", "classes")
+    from thermogrip.classify.decisions.predict import cell_text
+    from thermogrip.datasets.partitions import Answers, sources, stamps
+
     console = Console(as_json)
     ask = _Question(
         model_dir, cli.comma(candidates), stated, early=early, next_touch=next_touch, or_unknown=or_unknown,
@@ -371,7 +373,6 @@ def classify(
     if serve:
         return _serve(console, ask.answerer(), port)
     assert out is not None
-    cli.new_file(out, (".csv",))
     given = sources(paths or [])
     asked = [*astuple(ask), stamps([model_dir, *ask.known])]
     answer = ask.answerer()

@@ -42,6 +42,7 @@ def tune(
     You say settling time, overshoot, energy. Runs closed loops on posterior draws of the plant; shows
     baseline, tuned, PI and LQR side by side, what can be traded, and which weights matter.
     """
+    cli.new_file(out, (".json",))
     from thermogrip.datasets.parallel import kept_processes
     from thermogrip.mpc.design.spec import Spec, read_spec
     from thermogrip.mpc.tuning.tune import tune as search
@@ -49,7 +50,6 @@ def tune(
     pool = cli.workers_of(workers, cluster)
     loaded = cli.load_plant(plant, network)
     wanted = Spec.of(loaded) if spec is None else read_spec(spec)
-    cli.new_file(out, (".json",))
     console = Console(as_json)
     if spec is None:
         steps = ", ".join(f"{start:g} to {target:g}" for start, target in wanted.steps)
@@ -109,13 +109,13 @@ def retune(
     Says how far the old and the new plant are from the end of the run, and what the old and the new
     controller do on draws of the new plant.
     """
+    cli.new_file(out, (".json",))
     from thermogrip.datasets.parallel import kept_processes
     from thermogrip.mpc.design.spec import Spec, read_spec, spec_from_dict
     from thermogrip.mpc.tuning.retune import retune as search
     from thermogrip.rig.records.run_folder import read_run
     from thermogrip.sysid.plant.log_grid import roles_of
 
-    cli.new_file(out, (".json",))
     done = read_run(run)
     if done.log is None:
         raise UserError("holds no samples", file=run, hint="give the folder of a run that began")

@@ -61,10 +61,11 @@ def excite(
     ``optimal`` shrinks the intervals of the plant's parameters most and says by how much, beforehand."""
     if plant is not None:
         cli.choices("--hold", cli.comma(hold) or (), plant, "inputs")
-    from thermogrip.datasets.log_files import write_log
+    from thermogrip.datasets.log_files import check_written, write_log
+
+    check_written(cli.new_file(out))
     from thermogrip.sysid.experiment.schedules import excite as plain_schedule
 
-    cli.new_file(out)
     console = Console(as_json)
     subject = _subject(plant, network)
     answer: dict[str, Any] = {"kind": kind}

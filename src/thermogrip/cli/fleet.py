@@ -33,9 +33,9 @@ def fleet(
     Fits the network to the logs of each rig, finds how far each parameter differs from rig to rig, and what
     all rigs together say of each. Reports which rig is unlike the others (exit code 3 if one is).
     """
-    cli.new_folder(out)
     pool = cli.workers_of(workers, cluster)
     paths = _rigs(folder)
+    cli.new_folder(out)
     console = Console(as_json)
     from thermogrip.datasets.parallel import run_parallel
     from thermogrip.report.fleet import fleet_sections, population_table, rig_table

@@ -126,11 +126,7 @@ def identify(
     cli.new_file(out, (".json",))
     roles = cli.comma(inputs), cli.comma(outputs), cli.comma(disturbances)
     if columns is None:
-        from thermogrip.datasets.log_files import split_cut
-        from thermogrip.datasets.tables import check_columns
-
-        for path in paths:
-            check_columns(split_cut(path)[0], [name for names in roles for name in names or ()])
+        cli.check_columns(paths, [name for names in roles for name in names or ()])
     a_network = "network" in wanted and network != "none"
     named = a_network and bool(network or grow)
     wanted_network = cli.find_network(network or DEFAULT_NETWORK) if named else None
@@ -376,6 +372,8 @@ def validate(
     """Score a plant by free run.
 
     It sees the inputs and disturbances of the whole log, and measured outputs of the warm-up only."""
+    if columns is None:
+        cli.check_columns(paths, cli.listed(plant, "inputs", "outputs", "disturbances"))
     loaded = cli.load_plant(plant, network)
     console = Console(as_json)
     roles = loaded.inputs, loaded.outputs, loaded.disturbances
@@ -447,11 +445,14 @@ def simulate(
     as_json: cli.AsJson = False,
 ) -> int:
     """Simulate a plant over the inputs of a log."""
-    from thermogrip.datasets.log_files import write_log
+    from thermogrip.datasets.log_files import check_written, write_log
+
+    check_written(cli.new_file(out))
+    if columns is None:
+        cli.check_columns([path], cli.listed(plant, "inputs", "outputs", "disturbances"))
     from thermogrip.datasets.schema import column
     from thermogrip.sysid.plant.log_grid import match_logs
 
-    cli.new_file(out)
     console = Console(as_json)
     loaded = cli.load_plant(plant, network)
     roles = loaded.inputs, loaded.outputs, loaded.disturbances

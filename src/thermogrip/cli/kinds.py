@@ -111,9 +111,12 @@ check_spec, check_guard = partial(check_keys, kind="spec"), partial(check_keys, 
 
 def check_exists(text: str) -> None:
     """Refuse a file that is not there, with the name of one that is called nearly so."""
-    if os.path.exists(text) or os.path.exists(text.rpartition("@")[0]):  # LOG@120:1800
+    path = Path(re.sub(r"@[^@/]*:[^@/]*$", "", text))  # LOG@120:1800
+    if os.path.exists(text) or os.path.exists(path):
         return
-    path = Path(re.sub(r"@[^@/]*:[^@/]*$", "", text))
+    if os.path.exists(whole := text.rpartition("@")[0]):
+        hint = f"a part of a log is {whole}@START:STOP, in seconds"
+        raise UserError("no such file, and no part of one", file=text, hint=hint)
     while not path.parent.is_dir():
         path = path.parent
     names = os.listdir(path.parent) if os.access(path.parent, os.R_OK) else []
@@ -132,6 +135,8 @@ def check_kind(ctx: Any, path: str, wanted: str) -> None:
     hint = KINDS[found].get("hint", f"it is for {', '.join(verbs)}")
     if wanted in _PARTS and os.path.isfile(part := Path(path, _PARTS[wanted])):
         hint = f"give {part}"
+    elif kind_of(folder := Path(path).parent) == wanted:
+        hint = f"give {folder}"
     elif verb in verbs:
         hint = f"write {' '.join([verb, *fits[verb][0]])}"
     if needs := KINDS[wanted].get("needs"):

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import sys
 import traceback
 from collections.abc import Sequence
@@ -121,4 +122,7 @@ def _option_line(error: typer.TyperException) -> str:
     words, about = error.format_message().rstrip("."), vars(error)
     if about.get("possibilities"):
         words = f"{about['message']}; {known_names(about['option_name'], about['possibilities'], '')}"
+    elif re.fullmatch("-[a-z]", letter := str(about.get("option_name", ""))) and context is not None:
+        long = [name for param in context.command.params for name in param.opts if name[1:3] == letter]
+        words = f"{words}; options are whole words: {', '.join(long)}" if long else words
     return f"{words}; see {path} --help"

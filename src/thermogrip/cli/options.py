@@ -183,17 +183,32 @@ def choice(option: str, value: str, allowed: Sequence[str]) -> str:
     return value
 
 
-def choices(option: str, names: Iterable[str], path: Path, *keys: str) -> None:
-    """Refuse names that a JSON file of ours does not list under these keys, before its reader."""
+def listed(path: Path, *keys: str) -> list[str]:
+    """Return the names that a JSON file of ours lists under these keys, before its reader; none where it is
+    at fault, which the reader explains."""
     try:
         content = json.loads(path.read_bytes())
         for part in ("plant", "model", "network"):
             content = content.get(part, content)
-        known = [name for key in keys for name in content[key]]
-    except (OSError, ValueError, LookupError, TypeError, AttributeError):  # which the reader explains
-        return
-    for name in names:
-        choice(option, name, known)
+        return [str(name) for key in keys for name in content[key]]
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        return []
+
+
+def choices(option: str, names: Iterable[str], path: Path, *keys: str) -> None:
+    """Refuse names that a JSON file of ours does not list under these keys."""
+    if known := listed(path, *keys):
+        for name in names:
+            choice(option, name, known)
+
+
+def check_columns(paths: Sequence[str], names: Sequence[str]) -> None:
+    """Refuse names that are no columns of these logs, before what reads them is loaded."""
+    from thermogrip.datasets.log_files import split_cut
+    from thermogrip.datasets.tables import check_columns
+
+    for path in paths:
+        check_columns(split_cut(path)[0], names)
 
 
 def new_file(path: Path, suffixes: Sequence[str] = ()) -> Path:

@@ -36,7 +36,8 @@ def demo(
         done = run_demo(out, seed=seed, workers=pool, progress=progress)
     for section in done.sections:
         if section.verdict:
-            console.say(f"{section.title}\n    {section.verdict}")
+            console.say(section.title)
+            console.say(f"    {section.verdict}")
     console.say(f"report: {done.report}")
     verdicts = {section.title: section.verdict for section in done.sections if section.verdict}
     console.answer({"report": done.report, "verdicts": verdicts})
@@ -136,17 +137,15 @@ def warm_up(as_json: cli.AsJson = False) -> int:
     from thermogrip.classify.decisions.predict import classify_grasps
     from thermogrip.classify.estimators.posterior import PosteriorClassifier
     from thermogrip.datasets.examples import load_example_grasps
-    from thermogrip.sysid.contact.simulation import step_response, time_nodes
+    from thermogrip.sysid.contact.time_stepping import step_contacts
     from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
-    from thermogrip.sysid.effusivity.mode_kernel import modes
     from thermogrip.sysid.effusivity.posterior import effusivity_posterior
 
     console, began = Console(as_json), time.process_time()
     gripper, grasps = load_default_gripper(), load_example_grasps()["exp2_dT20"].isel(grasp=[0])
     classify_grasps(PosteriorClassifier().with_device(gripper), grasps, ["copper", "wood"])
     effusivity_posterior(gripper, grasps)
-    step_response(gripper.stack, time_nodes(1.0), effusivity=[1e3], capacity=[1e4], h_c=[500.0])
-    seconds, place = time.process_time() - began, modes.stats.cache_path
+    seconds, place = time.process_time() - began, step_contacts.stats.cache_path
     console.say(f"compiled in {seconds:.1f} s of CPU, kept in {place}")
     console.answer({"cpu_s": seconds, "kept_in": place})
     return 0

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import sys
 import tomllib
@@ -26,6 +27,19 @@ ALONE = {"--live": "0", "--foxglove": "8765"}
 def jobs() -> dict[str, dict[str, list[Any]]]:
     """Return job -> verb -> two examples and what comes next."""
     return tomllib.loads((resources.files("thermogrip.cli") / "verbs.toml").read_text(encoding="utf-8"))
+
+
+def _whole_words(formatter: Any) -> Any:
+    """Return a help formatter that ends no line within a word: at no hyphen, and in a list behind a comma."""
+    write, write_text, write_dl = formatter.write, formatter.write_text, formatter.write_dl
+
+    def marked(text: str) -> str:
+        return re.sub(r"(?<=\w)-(?=\w)", "\u2011", re.sub(r",(?=\S)", ",\ue000 ", text))
+
+    formatter.write = lambda text: write(re.sub("\ue000 ?", "", text).replace("\u2011", "-"))
+    formatter.write_text = lambda text: write_text(marked(text))
+    formatter.write_dl = lambda rows: write_dl([(name, marked(about)) for name, about in rows])
+    return formatter
 
 
 class Verb(TyperCommand):
@@ -65,6 +79,10 @@ class Verb(TyperCommand):
         """Return the first sentence of the help, whole."""
         return super().get_short_help_str(limit)
 
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the help, no word of it broken."""
+        super().format_help(ctx, _whole_words(formatter))
+
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """Return the options and each argument once."""
         return ["[OPTIONS]", *(str(p.metavar) for p in self.params if p.param_type_name == "argument")]
@@ -80,6 +98,10 @@ class Verb(TyperCommand):
 
 class Verbs(TyperGroup):
     """The verbs, by job."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the help, no word of it broken."""
+        super().format_help(ctx, _whole_words(formatter))
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write a section a job, each verb with the whole first sentence of its help."""

@@ -27,9 +27,9 @@ def numbers(now: Snapshot) -> list[tuple[str, str]]:
     others = {name: value for name, value in now.values.items() if name != now.skin}
     skin = now.values.get(now.skin, float("nan"))
     band = f" +- {now.band:g}" if isfinite(now.band) else ""
-    rows = [(now.skin, f"{skin:.2f} degC")]
+    rows = [(now.skin, _reading(skin))]
     rows += [(f"target of {name}", f"{value:g}{band} degC") for name, value in now.target.items()]
-    rows += [(name, f"{value:.2f} degC") for name, value in others.items()]
+    rows += [(name, _reading(value)) for name, value in others.items()]
     units = {"1": "", "percent": " %", "0_255": " of 255"}
     rows += [(name, f"{value:+.3g}{units.get(now.units[name], '')}") for name, value in now.drive.items()]
     rows.append(("pump", "on" if now.pump else "off"))
@@ -40,6 +40,10 @@ def numbers(now: Snapshot) -> list[tuple[str, str]]:
     if isfinite(now.model_share):
         rows.append(("off the plant", f"{100 * now.model_share:.0f} % of what is allowed"))
     return rows
+
+
+def _reading(value: float) -> str:
+    return f"{value:.2f} degC" if isfinite(value) else "lost"
 
 
 def line(now: Snapshot) -> str:

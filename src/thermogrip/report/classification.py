@@ -192,7 +192,7 @@ def curves_section(curves: Mapping[str, Sequence[dict[str, Any]]]) -> Section:
     parts = tuple(
         Picture(curve_figure(rows, over), captions[over] + _off_the_page(rows))
         for over, rows in curves.items()
-        if rows
+        if len({row[over] for row in rows}) > 1  # one point is no curve
     )
     gains = [_gain(over, rows) for over, rows in curves.items() if over != "difference_K" and rows]
     return Section("What would help?", parts, " ".join(gains), "plain")

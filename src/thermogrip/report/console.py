@@ -18,7 +18,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from itertools import zip_longest
 from pathlib import Path
 from shutil import get_terminal_size
-from textwrap import wrap
+from textwrap import TextWrapper, wrap
 from typing import Any, TypeAlias
 
 from thermogrip.datasets.media import printable
@@ -39,8 +39,14 @@ class Console:
     as_json: bool = False
 
     def say(self, text: str) -> None:
-        """Print one line for people."""
+        """Print a sentence for people, as wide as the terminal (100 columns of what is none); lines that end
+        stay as they are."""
         if not self.as_json:
+            if "\n" not in text:
+                indent = " " * (len(text) - len(text.lstrip()))
+                lines = TextWrapper(_room(), subsequent_indent=indent)
+                lines.break_long_words = lines.break_on_hyphens = False
+                text = lines.fill(text)
             sys.stdout.write(printable(text) + "\n")
 
     def warn(self, text: str) -> None:
@@ -51,8 +57,7 @@ class Console:
         """Print a table for people, as wide as the terminal (100 columns of what is none); numbers stand to
         the right, no word is broken, and where the columns are too many each row is a block of lines."""
         if not self.as_json:
-            room = get_terminal_size().columns if sys.stdout.isatty() else _WIDTH
-            sys.stdout.write(_table(title, head, rows, room))
+            sys.stdout.write(_table(title, head, rows, _room()))
 
     def early(self, line: str, title: str, head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
         """Show on stderr, while work goes on, what is known so far: on a terminal a table, else one line."""
@@ -77,6 +82,11 @@ class Console:
             yield _lines(printable(title))
         finally:
             sys.stderr.write(_anew())
+
+
+def _room() -> int:
+    """Return the columns of stdout."""
+    return get_terminal_size().columns if sys.stdout.isatty() else _WIDTH
 
 
 def cells(columns: Columns, items: Iterable[Any]) -> Cells:
@@ -115,8 +125,18 @@ def short(cell: Any) -> str:
     if hasattr(cell, "item"):
         cell = cell.item()
     if isinstance(cell, float):
-        return f"{cell:.4g}" if math.isfinite(cell) else "-"
+        return significant(cell, 4) if math.isfinite(cell) else "-"
     return str(cell)
+
+
+def significant(value: float, digits: int) -> str:
+    """Return a number with so many digits, without an exponent below a million.
+
+    >>> significant(63970.4, 4), significant(1580.2, 3), significant(0.0712, 3), significant(2.5e7, 3)
+    ('63970', '1580', '0.0712', '2.5e+07')
+    """
+    text = f"{value:.{digits}g}"
+    return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e6 else text
 
 
 def _table(title: str, head: Sequence[str], rows: Sequence[Sequence[Any]], width: int) -> str:

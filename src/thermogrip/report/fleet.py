@@ -14,6 +14,8 @@ from thermogrip.report.html import Picture, Section, Table
 from thermogrip.sysid.greybox.population import Population, Rig
 from thermogrip.sysid.plant.plant import Plant
 
+_OWN = "by its own logs"
+
 
 def population_table(
     population: Population, plant: Plant
@@ -33,7 +35,8 @@ def rig_table(
     rigs: Sequence[Rig], population: Population
 ) -> tuple[tuple[str, ...], list[tuple[object, ...]]]:
     """Return head and rows of each rig against the others, the farthest first."""
-    head = ("rig", "", "squared distance", "chance in a healthy fleet", "farthest parameter", "off by [sd]")
+    chance = "chance in a healthy fleet"
+    head = ("rig", "verdict", "squared distance", chance, "farthest parameter", "off by [sd]")
     rows: list[tuple[object, ...]] = []
     for rig in sorted(rigs, key=lambda each: (each.chance, -each.distance)):
         k = int(np.abs(rig.deviation).argmax())
@@ -49,7 +52,7 @@ def fleet_figure(plants: Mapping[str, Plant], population: Population, rigs: Sequ
     rows = -(-n // columns)
     figure, axes = panels(rows, columns, size=(10.0, rows * (0.9 + 0.17 * len(rigs))))
     ranges = population.intervals(0.9)
-    y = np.arange(len(rigs))
+    y, called = np.arange(len(rigs)), [f"{rig.name} (ill)" if rig.ill else rig.name for rig in rigs]
     for k, axis in enumerate(axes.ravel()):
         if k >= n:
             axis.set_visible(False)
@@ -59,17 +62,19 @@ def fleet_figure(plants: Mapping[str, Plant], population: Population, rigs: Sequ
         for place, rig in zip(y, rigs):
             own = plants[rig.name]
             low, high = own.intervals(0.9)[name]
-            colour = PALETTE[3] if rig.ill else "0.6"
-            axis.plot([low, high], [place - 0.15] * 2, "-", color=colour, lw=1)
-            axis.plot(own.values[name], place - 0.15, "o", color=colour, ms=3, label="by its own logs")
+            look, label = (("x", PALETTE[1]), "ill, by its own logs") if rig.ill else (("o", "0.6"), _OWN)
+            axis.plot([low, high], [place - 0.15] * 2, "-", color=look[1], lw=1)
+            size = 6 if rig.ill else 3
+            axis.plot(own.values[name], place - 0.15, look[0], color=look[1], ms=size, mew=1.5, label=label)
             pooled = population.natural(rig.pooled)[k]
             axis.plot(pooled, place + 0.15, "D", color=PALETTE[0], ms=3, label="pooled")
         low, high = ranges[name]
-        values = [low, high, *(plants[rig.name].values[name] for rig in rigs)]
+        own_values = (plants[rig.name].values[name] for rig in rigs)
+        values = [low, high, *own_values, *(population.natural(rig.pooled)[k] for rig in rigs)]
         margin = 0.15 * (max(values) - min(values))
         axis.set_xlim(min(values) - margin, max(values) + margin)  # a short log's interval may be far wider
         axis.xaxis.set_major_locator(MaxNLocator(4))
-        axis.set_yticks(y, [rig.name for rig in rigs] if k % columns == 0 else [], fontsize=7)
+        axis.set_yticks(y, called if k % columns == 0 else [], fontsize=7)
         axis.set_ylim(len(rigs) - 0.5, -0.5)
         axis.set_xlabel(f"{name} [{next(iter(plants.values())).units.get(name, '1')}]")
     handles, labels = axes.flat[0].get_legend_handles_labels()
@@ -81,12 +86,12 @@ def fleet_figure(plants: Mapping[str, Plant], population: Population, rigs: Sequ
 def fleet_sections(plants: Mapping[str, Plant], population: Population, rigs: Sequence[Rig]) -> list[Section]:
     """Return the page's sections."""
     ill = [rig.name for rig in rigs if rig.ill]
-    words = f"{', '.join(ill)} far from the others" if ill else "No rig is far from the others"
+    words = f"{', '.join(ill)} far from the others." if ill else "No rig is far from the others."
     head, rows = rig_table(rigs, population)
     caption = "Distance from the population of the others, 1 on average; less than 0.05 of chance is ill."
     first = next(iter(plants.values()))
     names, numbers = population_table(population, first)
-    drawn = "Grey, or red of an ill rig: its own logs, with 90 %. Blue: what all rigs together say of it."
+    drawn = "Dots, or crosses of an ill rig: by its own logs, with 90 %. Diamonds: by all rigs together."
     return [
         Section("Which rig is ill?", (Table(head, tuple(rows), caption),), words, "bad" if ill else "good"),
         Section("What may a new rig have?", (Table(names, tuple(numbers)),)),

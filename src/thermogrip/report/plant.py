@@ -12,7 +12,7 @@ import numpy as np
 
 from thermogrip.datasets.schema import log_name
 from thermogrip.report import plots
-from thermogrip.report.console import Cells
+from thermogrip.report.console import Cells, significant
 from thermogrip.report.html import Picture, Plot, Section, Table, Text
 
 if TYPE_CHECKING:
@@ -202,7 +202,8 @@ def time_constant_words(found: Dynamics) -> str:
     )
     slow = [(tau, s) for tau, s in zip(found.time_constants, found.poles) if s.imag >= 0]
     taus = ", ".join(
-        f"{tau:.3g} s" + (f" (period {2 * np.pi / s.imag:.3g} s)" if s.imag > 1e-9 * abs(s) else "")
+        f"{significant(tau, 3)} s"
+        + (f" (period {significant(2 * np.pi / s.imag, 3)} s)" if s.imag > 1e-9 * abs(s) else "")
         for tau, s in slow[:_TIME_CONSTANTS]
     )
     taus += f" and {len(slow) - _TIME_CONSTANTS} faster" if len(slow) > _TIME_CONSTANTS else ""

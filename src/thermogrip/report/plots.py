@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.charts import DASHES, INK, PALETTE, SOFT, Chart, Curve, Panel, stretches, time_axis
+from thermogrip.datasets.charts import DASHES, INK, PALETTE, SOFT, Chart, Curve, Panel, stretches
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.media import panels
 from thermogrip.datasets.schema import Grasps, Log, column, log_name, names
@@ -46,8 +46,6 @@ def free_run_chart(run: FreeRun, outputs: Sequence[str], band: Band | None = Non
     whose ``scored`` is 0 stand on grey, and where a band is given readings are expected in the shade."""
     log, simulated = run.measured, run.log
     t = np.asarray(log["time"].values, dtype=float)
-    per, x_label = time_axis(float(t[-1] - t[0]))
-    t = t / per
     shaded = stretches(t, column(simulated, "scored") == 0) if "scored" in simulated else ()
     inputs = tuple(
         Curve(_with_unit(u, log[u].attrs["units"]), t, column(log, u), PALETTE[(2 + k) % 8], step=True)
@@ -72,7 +70,7 @@ def free_run_chart(run: FreeRun, outputs: Sequence[str], band: Band | None = Non
                 Panel("inputs", inputs),
             )
         )
-    return Chart(tuple(columns), x_label)
+    return Chart(tuple(columns))
 
 
 def residual_figure(run: FreeRun) -> Figure:
@@ -123,13 +121,12 @@ def step_response_chart(found: Dynamics) -> Chart:
     """Return the response of each output, a panel each, to a unit step of each input, a column each."""
     outputs, inputs = found.near.outputs, found.near.inputs
     time, step = found.step_response()
-    per, x_label = time_axis(float(time[-1]))
     units = {name: found.units.get(name, "1") for name in (*outputs, *inputs)}
 
     def panel(i: int, j: int) -> Panel:
         value, low, high = (np.asarray(part)[:, i, j] for part in step)
         ends = (low, high) if np.isfinite(low).all() else (None, None)
-        curve = Curve(outputs[i], time / per, value, PALETTE[i % 8], low=ends[0], high=ends[1])
+        curve = Curve(outputs[i], time, value, PALETTE[i % 8], low=ends[0], high=ends[1])
         by = units[inputs[j]]
         title = f"{inputs[j]} + 1{'' if by == '1' else ' ' + difference_unit(by)}"
         label = _with_unit(outputs[i], difference_unit(units[outputs[i]]))
@@ -137,7 +134,7 @@ def step_response_chart(found: Dynamics) -> Chart:
 
     rows = range(len(outputs))
     columns = tuple(tuple(panel(i, j) for i in rows) for j in range(len(inputs)))
-    return Chart(columns, x_label, wide=max(3.2, 6.4 / len(inputs)))
+    return Chart(columns, wide=max(3.2, 6.4 / len(inputs)))
 
 
 def bode_chart(found: Dynamics) -> Chart:
@@ -145,13 +142,14 @@ def bode_chart(found: Dynamics) -> Chart:
     outputs, inputs = found.near.outputs, found.near.inputs
     omega, magnitude, phase = found.frequency_response()
     least = 1e-4 * magnitude.value.max(axis=(0, 1))  # of each input: the scale has no zero
+    turned = type(phase)(*(np.where(magnitude.value < least, np.nan, part) for part in phase))
 
     def curve(part: Estimate, i: int, j: int, floor: float) -> Curve:
         value, low, high = (each[:, i, j] for each in part)
         line = Curve(
             outputs[i], omega, np.where(value < floor, np.nan, value), PALETTE[i % 8], dash=DASHES[i % 4]
         )
-        if not np.isfinite(high).all():
+        if not np.isfinite(high).any():
             return line
         seen = high >= floor
         low, high = np.where(seen, np.maximum(low, floor), np.nan), np.where(seen, high, np.nan)
@@ -161,7 +159,7 @@ def bode_chart(found: Dynamics) -> Chart:
     columns = []
     for j, name in enumerate(inputs):
         sizes = tuple(curve(magnitude, i, j, float(least[j])) for i in rows)
-        turns = tuple(curve(phase, i, j, -np.inf) for i in rows)
+        turns = tuple(curve(turned, i, j, -np.inf) for i in rows)
         above = Panel("magnitude", sizes, name, 1.5, log=True)
         columns.append((above, Panel("phase [deg]", turns, height=1.3)))
     return Chart(tuple(columns), "frequency [rad/s]", log=True, wide=max(3.2, 6.4 / len(inputs)))
@@ -214,12 +212,10 @@ def posterior_figure(
 def loops_chart(runs: Mapping[str, Log], targets: Mapping[str, float], output: str = "t_surface") -> Chart:
     """Return closed loops side by side by title: the regulated temperature and its target [degC] above, the
     drive below."""
-    spans = [float(log["time"].values[-1] - log["time"].values[0]) for log in runs.values()]
-    per, x_label = time_axis(*spans)
     columns = []
     for title, log in runs.items():
         t = np.asarray(log["time"].values, dtype=float)
-        t = (t - t[0]) / per
+        t = t - t[0]
         goal = Curve("target", t[[0, -1]], np.full(2, targets[title]), TARGET, 1.0, "--")
         others = tuple(
             Curve(n, t, column(log, n), PALETTE[(5 + j) % 8], 0.9)
@@ -232,14 +228,13 @@ def loops_chart(runs: Mapping[str, Log], targets: Mapping[str, float], output: s
         own = Curve(output, t, column(log, output), MODEL, 1.6)
         top = Panel("temperature [degC]", (*others, goal, own), title, 2.2)
         columns.append((top, Panel("inputs", drives)))
-    return Chart(tuple(columns), x_label, wide=3.6)
+    return Chart(tuple(columns), wide=3.6)
 
 
 def steps_chart(runs: Mapping[str, ClosedLoop]) -> Chart:
     """Return simulated closed loops by "<step>, <controller>": a column a step, controllers over each
     other."""
     steps = list(dict.fromkeys(key.rsplit(", ", 1)[0] for key in runs))
-    per, x_label = time_axis(*(float(run.time[-1]) for run in runs.values()))
     above: dict[str, list[Curve]] = {step: [] for step in steps}
     below: dict[str, list[Curve]] = {step: [] for step in steps}
     for title, run in runs.items():
@@ -249,17 +244,17 @@ def steps_chart(runs: Mapping[str, ClosedLoop]) -> Chart:
         colour, width, dash = looks.get(controller, (PALETTE[1], 1.4, "--"))
         for name, target in run.target.items():
             if not any(curve.label == "target" for curve in above[step]):
-                above[step].append(Curve("target", run.sample_time / per, target, SOFT, 1.0, "-.", step=True))
-            above[step].append(Curve(controller, run.time / per, run.outputs[name], colour, width, dash))
+                above[step].append(Curve("target", run.sample_time, target, SOFT, 1.0, "-.", step=True))
+            above[step].append(Curve(controller, run.time, run.outputs[name], colour, width, dash))
         below[step] += [
-            Curve(controller, run.sample_time / per, drive, colour, 0.8 * width, dash, step=True)
+            Curve(controller, run.sample_time, drive, colour, 0.8 * width, dash, step=True)
             for drive in run.drive.values()
         ]
     columns = tuple(
         (Panel("temperature [degC]", tuple(above[s]), f"{s} degC", 2.2), Panel("drive", tuple(below[s])))
         for s in steps
     )
-    return Chart(columns, x_label, wide=3.6)
+    return Chart(columns, wide=3.6)
 
 
 def grasps_chart(records: Mapping[str, Sequence[Grasps]], materials: Sequence[str] = ()) -> Chart:
@@ -353,6 +348,7 @@ def _corner_panel(
         ax.set_axis_off()
         return
     ax.tick_params(labelsize=6)
+    ax.locator_params(axis="x", nbins=3)
     ax.axvline(posterior.fitted[names[j]], color="0.6", lw=0.8)
     if i == j:
         ax.hist(columns[:, i], bins=25, color="tab:blue", alpha=0.6)

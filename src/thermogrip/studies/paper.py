@@ -312,12 +312,12 @@ def _known(case: Case, grasps: Grasps) -> dict[str, Any]:
     """Return how the posterior that knows the simulated gripper names its test grasps."""
     import numpy as np
 
-    from thermogrip.classify.estimators.registry import make_classifier
+    from thermogrip.classify.estimators.posterior import PosteriorClassifier
     from thermogrip.classify.evaluation.metrics import clopper_pearson
     from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 
     test = grasps.isel(grasp=grasps["split"].values == "test")
-    best = make_classifier("posterior")
+    best = PosteriorClassifier()
     best.classes_ = np.asarray(sorted(case.materials))
     best.device_ = load_default_gripper()
     log_p = best.predict_log_proba(test)

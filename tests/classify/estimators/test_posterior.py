@@ -27,7 +27,7 @@ from thermogrip.sysid.effusivity.gripper_model import (
 )
 from thermogrip.sysid.effusivity.multi_touch import two_touch_fit
 from thermogrip.sysid.effusivity.posterior import effusivity_posterior, material_evidence, material_posterior
-from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors
+from thermogrip.sysid.effusivity.posterior_grid import free_evidence
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +153,7 @@ def test_odds_of_an_unknown_are_prior_odds_times_the_bayes_factor() -> None:
         load_example_grasps()["exp1A_obj43_grip23"].isel(grasp=[0, 9, 18]),
     )
     known = material_evidence(device, record, FIVE)
-    free = [fit.log_evidence for fit in grid_posteriors(device, touches(record))]
+    free = free_evidence(device, touches(record))
     factor = np.exp(known).mean(axis=1) / np.exp(free)
     for prior, odds in ((0.25, 3.0), (0.1, 9.0)):
         model = PosteriorClassifier(prior_unknown=prior, gripper="same", finish="known").with_device(device)
@@ -275,7 +275,7 @@ def test_what_a_record_decides_is_the_mixture_of_its_explanations(
         (0.02, another_gripper(known.device_), "known"),
     ]
     z = [material_evidence(device, pair, names, finish=finish) for _, device, finish in levels]
-    free = [fit.log_evidence for fit in grid_posteriors(known.device_, touches(pair))]
+    free = free_evidence(known.device_, touches(pair))
     top, odds = np.max(z), np.zeros((2, 2))
     sure = np.array([p * np.exp(e - top).mean(axis=1).prod() for (p, *_), e in zip(levels, z)])
     assert sure[0] / sum(sure) < 0.99  # so that a free effusivity is asked

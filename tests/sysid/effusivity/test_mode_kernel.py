@@ -1,4 +1,4 @@
-"""The small parts of the compiled search, run as plain Python, against linear algebra and densities."""
+"""The parts of the search for modes, against linear algebra, densities and sums by hand."""
 
 from __future__ import annotations
 
@@ -7,30 +7,18 @@ import pytest
 from scipy.stats import norm
 from scipy.stats import t as student_t
 
+from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.sysid.effusivity import mode_kernel as kernel
+from thermogrip.sysid.effusivity.data import touches
+from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
+from thermogrip.sysid.effusivity.laplace_approximation import fit_candidates, fit_pairs, material_hypotheses
 
 SD = np.array([0.3, 0.5, 0.1, 3.0, 0.4, 0.0, 0.2])
 DOF = np.array([np.inf, 6.0, 4.0, np.inf, np.inf, 5.0, np.inf])
 
 
-@pytest.fixture(scope="module")
-def matrix():
-    """A positive definite matrix of 7 unknowns, the sixth of which is known."""
-    root = np.random.default_rng(2).normal(size=(9, 7)) * (SD > 0)
-    return root.T @ root
-
-
-@pytest.fixture
-def plain(monkeypatch):
-    for name in ("_cholesky", "_solve", "_dot", "_whiten"):
-        monkeypatch.setattr(kernel, name, getattr(kernel, name).py_func)
-    return kernel
-
-
 def law(u, mean):
-    slope, bound, own = np.empty((3, 7))
-    value = kernel.penalty.py_func(u, mean, SD, DOF, slope, bound, own)
-    return value, slope, bound, own
+    return kernel.Penalty(*(part[0] for part in kernel.penalty(u[None], mean[None], SD[None], DOF[None])))
 
 
 def test_the_penalty_is_the_priors_density_beside_its_peak():
@@ -39,75 +27,87 @@ def test_the_penalty_is_the_priors_density_beside_its_peak():
     u = mean + rng.normal(size=7)
     w = np.where(SD > 0, (u - mean) / np.where(SD > 0, SD, 1.0), 0.0)
     laws = [norm() if np.isinf(v) else student_t(v) for v in DOF]
-    value, slope, curvature, own = law(u, mean)
+    here = law(u, mean)
     want = sum(2 * (one.logpdf(0) - one.logpdf(x)) for one, x in zip(laws, w))
-    assert value == pytest.approx(want)
+    assert here.value == pytest.approx(want)
     for a in range(7):
         h = 1e-6 * SD[a] * (np.arange(7) == a)
-        rise = (law(u + h, mean)[0] - law(u - h, mean)[0]) / 4e-6 if SD[a] > 0 else 0.0
-        assert slope[a] == pytest.approx(rise, rel=1e-5, abs=1e-8)
-        bend = (law(u + h, mean)[1][a] - law(u - h, mean)[1][a]) / 2e-6 if SD[a] > 0 else 1.0
-        assert own[a] == pytest.approx(max(bend, 1e-3), rel=1e-5)
+        up, down = law(u + h, mean), law(u - h, mean)
+        rise = (up.value - down.value) / 4e-6 if SD[a] > 0 else 0.0
+        assert here.slope[a] == pytest.approx(rise, rel=1e-5, abs=1e-8)
+        bend = (up.slope[a] - down.slope[a]) / 2e-6 if SD[a] > 0 else 1.0
+        assert here.own[a] == pytest.approx(max(bend, 1e-3), rel=1e-5)
         # what makes of the slope a step to the mean; 1 of a normal law, and of what is known
-        assert curvature[a] == pytest.approx(slope[a] / w[a] if w[a] else 1.0)
+        assert here.bound[a] == pytest.approx(here.slope[a] / w[a] if w[a] else 1.0)
 
 
-def test_triangular_systems_are_those_of_linear_algebra(matrix):
-    diagonal, rhs = np.linspace(0.5, 2.0, 7), np.arange(7.0) - 2.5
-    low, step, white = np.zeros((7, 7)), np.zeros(7), np.zeros(7)
-    lower_alone = np.where(np.tri(7, dtype=bool), matrix, np.nan)
-    log_det = kernel._cholesky.py_func(lower_alone, diagonal, low)
-    whole = matrix + np.diag(diagonal)
-    np.testing.assert_allclose(low, np.linalg.cholesky(whole), atol=1e-12)
-    assert log_det == pytest.approx(np.linalg.slogdet(whole)[1])
-    kernel._solve.py_func(low, rhs, step)
-    np.testing.assert_allclose(whole @ step, rhs)
-    assert kernel._dot.py_func(step, rhs) == pytest.approx(step @ rhs)
-    kernel._whiten.py_func(low + np.triu(np.full((7, 7), 9.0), 1), rhs, 3.0, white)
-    np.testing.assert_allclose(white, 3.0 * (low @ rhs))
+def test_products_are_those_of_whitened_columns():
+    rng = np.random.default_rng(1)
+    whitener, columns = np.tril(rng.normal(size=(2, 5, 5))), rng.normal(size=(3, 8, 5))
+    scale, row, matrix = rng.uniform(0.5, 2.0, (3, 8)), np.array([1, 0, 1]), np.zeros((3, 8, 8))
+    scale[1, 2] = 0.0  # known: no part of the sums
+    above = np.triu(np.full((5, 5), 9.0), 1)
+    kernel.normal_equations.py_func(row, whitener + above, columns, scale, np.empty((8, 5)), matrix)
+    for p in range(3):
+        white = whitener[row[p]] @ (columns[p] * scale[p, :, None]).T
+        np.testing.assert_allclose(matrix[p], white.T @ white, atol=1e-12)
+    assert not matrix[1, 2].any()
 
 
-@pytest.mark.parametrize("damping", [0.0, 0.3])
-def test_a_step_is_that_of_the_quadratic_model(plain, matrix, damping):
-    here = kernel._Expansion(*(np.zeros(0),) * 7)._replace(
-        matrix=matrix, gradient=np.arange(7.0), slope=np.linspace(1, 2, 7), curvature=np.linspace(0.5, 1.1, 7)
-    )
-    work = kernel._Work(np.zeros((7, 7)), *(np.zeros(7) for _ in range(3)))
-    decrease = kernel._propose.py_func(here, SD, damping, work)
-    whole = matrix + np.diag(here.curvature)
-    want = np.linalg.solve(whole + damping * np.diag(np.diag(whole)), here.gradient - here.slope)
-    np.testing.assert_allclose(work.step, want)
-    assert decrease == pytest.approx(want @ (here.gradient - here.slope))
+def means_of(nodes, rise, slope, times, bins, *, onset=0.0, late=-1.0):
+    """Return bin means, of the value and of its slope, and what is delayed, of one sample a bin."""
+    times, bins = np.array([times]), np.array([bins])
+    n = times.shape[1]
+    count = np.zeros((1, n))
+    count[0, bins[bins >= 0]] = 1.0
+    curves = np.zeros((1, 6, len(nodes)))
+    bent, out = curves.copy(), np.zeros((3, 1, 6, n))
+    curves[0, 0], bent[0, 0] = rise, slope
+    wanted = np.array([[True, False, False, False, False, True]])
+    kernel.bin_means.py_func(
+        np.array(nodes, dtype=float), curves, bent, wanted, np.array([0]), np.array([onset]), np.array([0]),
+        times, bins, count, times, np.array([late]), np.empty((2, n)), *out,
+    )  # fmt: skip
+    return out[0, 0, 0], out[0, 0, 5], out[1, 0, 0], out[2, 0, 0]
 
 
-@pytest.mark.parametrize(
-    ("at", "step", "part"),
-    [
-        (0, 5.0, 1.0),
-        (0, 10.0, 0.5),
-        (1, -6.0, 0.5),
-        (6, 15.0, 0.5),
-        (2, 1e3, 1.0),
-        (3, 1e3, 1.0),
-        (4, 1e3, 1.0),
-    ],
-)
-def test_a_step_moves_no_logarithm_by_more_than_one_and_a_half(at, step, part):
-    assert kernel._shorten.py_func(step * (np.arange(7) == at), SD) == pytest.approx(part)
-    assert kernel._shorten.py_func(np.where(np.arange(7) == 5, 3.0, 0.0), np.ones(7)) == pytest.approx(0.5)
+def test_samples_find_their_nodes_whichever_way_they_come():
+    """A straight line is its own interpolation; what is lost or before contact is nothing."""
+    nodes, times = [0.0, 1.0, 2.0, 4.0], [0.5, 3.5, 9.0, 1.5, 2.5, 3.0, 1.6]
+    found, rate, _, _ = means_of(nodes, nodes, np.ones(4), times, [0, 1, 2, 3, -1, 5, 6], onset=0.5)
+    np.testing.assert_allclose(found, [0.0, 3.0, 4.0, 1.0, 0.0, 2.5, 1.1])
+    np.testing.assert_allclose(rate, [0.0, 1.0, 1.0, 1.0, 0.0, 1.0, 1.0])
 
 
-def test_the_covariance_has_the_densitys_own_curvature(plain, matrix):
-    """Of Student's t (nu + 1) (nu - w^2) / (nu + w^2)^2, a thousandth at least: it is negative far out."""
-    w = np.array([0.5, 0.8, 5.0, 0.1, 0.2, 0.0, 0.3])
-    mean = np.arange(7.0)
-    here = kernel._Expansion(mean + w * SD, matrix, *(np.zeros(7),) * 4, np.zeros(2))
-    work = kernel._Work(np.zeros((7, 7)), *(np.zeros(7) for _ in range(3)))
-    covariance = np.zeros((7, 7))
-    log_det = kernel._conclude.py_func(here, np.stack([mean, SD, DOF]), work, covariance)
-    own = np.ones(7)
-    own[1] = 7 * (6 - 0.64) / (6 + 0.64) ** 2
-    own[2] = 1e-3
-    whole = matrix + np.diag(own)
-    assert log_det == pytest.approx(np.linalg.slogdet(whole)[1])
-    np.testing.assert_allclose(covariance, np.linalg.inv(whole) * np.outer(SD, SD), atol=1e-12)
+def test_between_nodes_a_cubic_is_met_with_its_slope():
+    nodes, times = np.array([0.0, 1.0, 3.0]), [0.25, 1.5, 2.9]
+    found, rate, _, _ = means_of(nodes, nodes**3 - nodes, 3 * nodes**2 - 1, times, [0, 1, 2])
+    np.testing.assert_allclose(found, np.power(times, 3) - times)
+    np.testing.assert_allclose(rate, 3 * np.square(times) - 1)
+
+
+def test_a_delayed_integral_goes_by_straight_lines_between_the_points_that_count():
+    """Readings 0, 2, 4 at 1, 2, 4 s, one lost between: integrals 0, 1, 7; looked at half a second late."""
+    nodes, times, bins = [0.0, 1.0, 2.0, 4.0, 4.5], [1.0, 2.0, 3.0, 4.0, 4.5], [0, 1, -1, 3, 4]
+    given = nodes, [0.0, 0.0, 2.0, 4.0, 4.0], np.zeros(5), times, bins
+    _, _, total, value = means_of(*given, late=0.5)
+    np.testing.assert_allclose(value, [0.0, 1.0, 0.0, 3.5, 4.0])
+    np.testing.assert_allclose(total, [0.0, 0.25, 0.0, 1 + 1.5 * 2.75, 7.0])
+    np.testing.assert_allclose(means_of(*given, late=0.0)[2], [0.0, 1.0, 0.0, 7.0, 9.0])
+    assert not means_of(*given)[2].any()
+
+
+def test_a_candidate_far_behind_is_left_and_changes_no_other():
+    gripper, record = load_default_gripper(), load_example_grasps()["exp1A_obj43_grip23"]
+    data = touches(record.isel(grasp=np.flatnonzero(record["material"].values == "copper")[:3]))
+    names = ["copper", "iron", "wood"]
+    raced, _, row = fit_candidates(gripper, data, names)
+    one = material_hypotheses(gripper, names)
+    alone = fit_pairs(gripper, data, row, type(one)(*(np.tile(column, 3) for column in one)))
+    found = raced.log_evidence.reshape(3, 3)
+    settled = raced.converged.reshape(3, 3)
+    assert settled[:, :2].all()
+    assert not settled[:, 2].any()
+    assert (found[:, 2] < found[:, 0] - 60).all()
+    np.testing.assert_allclose(raced.u[row < 3][settled.ravel()], alone.u[settled.ravel()], atol=0.05)
+    assert (alone.log_evidence.reshape(3, 3)[:, 2] < found[:, 0] - 25).all()

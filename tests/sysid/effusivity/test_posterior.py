@@ -293,9 +293,9 @@ def test_grasps_with_and_without_a_group_share_a_record(device, files):
 
 def test_fits_are_laid_out_by_grasp_and_candidate_and_may_start_from_another(device, files):
     record = split_of(files["exp2_dT20"], "test").isel(grasp=[0, 3, 8])
-    names = ["copper", "wood"]
+    names = ["copper", "iron"]
     whole = material_fit(device, record, names)
-    alone = material_fit(device, record.isel(grasp=[1]), ["wood"])
+    alone = material_fit(device, record.isel(grasp=[1]), ["iron"])
     assert whole.u.shape == (3, 2, 7)
     np.testing.assert_allclose(whole.u[1, 1], alone.u[0, 0], atol=1e-9)
     for part in (

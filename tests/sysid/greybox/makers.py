@@ -1,4 +1,4 @@
-"""Models and logs of the grey-box tests: a heated block, and two gains whose fit is linear."""
+"""Models and logs of the grey-box tests: a heated block, two gains whose fit is linear, rigs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.sysid.greybox.fit import fit_network
 from thermogrip.sysid.greybox.problem import prior_plant
-from thermogrip.sysid.models.network import NetworkModel
+from thermogrip.sysid.models.network import NetworkModel, load_network
 from thermogrip.sysid.models.network_spec import Parameter, network_from_dict
 from thermogrip.sysid.plant.plant import Plant
 
@@ -147,3 +147,25 @@ def a_log(seed: int, *, seconds: int = 600, memory: float = CORRELATION_TIME) ->
     error = lfilter([1.0], [1.0, -keep], drive)[500:]
     seen = y[0, :-1, 0] + error + rng.normal(0.0, NOISE, seconds)
     return make_log(t, {"q": (q, "1", "input"), "t": (seen, "degC", "output")}, name=f"log {seed}")
+
+
+BOARD = prior_plant(load_network("tclab"))
+N_FREE = len(BOARD.free)
+WIDTH = np.array([BOARD.model.specs[n].sd_log or BOARD.model.specs[n].sd for n in BOARD.free])
+OFF, SPREAD = np.full(N_FREE, 0.4), np.array([0.1, 0.3, 0.1, 0.2, 0.4, 0.2, 0.3])  # in sd of the prior
+
+
+def fits(n, rng, rows=10, size=8.0):
+    """Return truths (n, k) in units of the prior, and the plants that linear logs of each leave."""
+    z = OFF + SPREAD * rng.normal(size=(n, N_FREE))
+    plants = {}
+    for i, true in enumerate(z):
+        J = size * rng.normal(size=(rows, N_FREE))
+        S = np.linalg.inv(J.T @ J + np.eye(N_FREE))
+        plants[f"r{i}"] = plant_at(S @ J.T @ (J @ true + rng.normal(size=rows)), S)
+    return z, plants
+
+
+def plant_at(z, S):
+    values = dict(zip(BOARD.free, BOARD.natural(BOARD.theta + WIDTH * z).tolist()))
+    return replace(BOARD, values=BOARD.values | values, covariance=S * np.outer(WIDTH, WIDTH))

@@ -29,17 +29,17 @@ def test_a_ratio_that_is_known_is_named_with_its_width():
     stated = [line for line in identifiability_report(a_plant(0.99)) if "trade off" in line]
     # sd of the difference sqrt(2 * 0.04 * 0.01) = 0.028: 1.645 of it is 4.8 %, of 0.2 it is 39 %
     assert len(stated) == 1
-    assert "G_amb and power_1 trade off (correlation 0.99): their ratio is known to +-4.8 %" in stated[0]
-    assert "each by itself to +-39 % at best" in stated[0]
+    assert "G_amb and power_1 trade off (correlation 0.99): their ratio is known to ±4.8 %" in stated[0]
+    assert "each by itself to ±39 % at best" in stated[0]
 
 
 @pytest.mark.parametrize(
     ("scales", "correlation", "what"),
     [
-        (("log", "log"), -0.99, "their product is known to +-4.8 %, each by itself to +-39 % at best"),
-        (("linear", "linear"), 0.99, "their difference is known to +-0.047, each by itself to +-0.33"),
-        (("linear", "linear"), -0.99, "their sum is known to +-0.047, each by itself to +-0.33 at best"),
-        (("log", "linear"), 0.99, "their combination is known to +-0.047"),
+        (("log", "log"), -0.99, "their product is known to ±4.8 %, each by itself to ±39 % at best"),
+        (("linear", "linear"), 0.99, "their difference is known to ±0.047, each by itself to ±0.33"),
+        (("linear", "linear"), -0.99, "their sum is known to ±0.047, each by itself to ±0.33 at best"),
+        (("log", "linear"), 0.99, "their combination is known to ±0.047"),
     ],
 )
 def test_what_is_known_goes_by_scale_and_sign(scales, correlation: float, what: str):

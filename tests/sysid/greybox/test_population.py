@@ -8,32 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.sysid.greybox.makers import BOARD, N_FREE, OFF, SPREAD, WIDTH, fits, plant_at
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.greybox import population as kernel
 from thermogrip.sysid.greybox.population import Population, check_population, pool_rigs, pooled_plant
-from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.network import load_network
-
-BOARD = prior_plant(load_network("tclab"))
-N_FREE = len(BOARD.free)
-WIDTH = np.array([BOARD.model.specs[n].sd_log or BOARD.model.specs[n].sd for n in BOARD.free])
-OFF, SPREAD = np.full(N_FREE, 0.4), np.array([0.1, 0.3, 0.1, 0.2, 0.4, 0.2, 0.3])  # in sd of the prior
-
-
-def fits(n, rng, rows=10, size=8.0):
-    """Return truths (n, k) in units of the prior, and the plants that linear logs of each leave."""
-    z = OFF + SPREAD * rng.normal(size=(n, N_FREE))
-    plants = {}
-    for i, true in enumerate(z):
-        J = size * rng.normal(size=(rows, N_FREE))
-        S = np.linalg.inv(J.T @ J + np.eye(N_FREE))
-        plants[f"r{i}"] = plant_at(S @ J.T @ (J @ true + rng.normal(size=rows)), S)
-    return z, plants
-
-
-def plant_at(z, S):
-    values = dict(zip(BOARD.free, BOARD.natural(BOARD.theta + WIDTH * z).tolist()))
-    return replace(BOARD, values=BOARD.values | values, covariance=S * np.outer(WIDTH, WIDTH))
 
 
 def standard(theta):
