@@ -423,7 +423,7 @@ def test_a_truncated_ros1_bag_says_reindex(tmp_path: Path) -> None:
 
 def test_logs_are_not_written_as_bags(tmp_path: Path) -> None:
     log = read_log(write_bag(tmp_path, "bag"))
-    with pytest.raises(UserError, match="not written as bags"):
+    with pytest.raises(UserError, match=r"not written with the ending \.bag; write .csv, .nc or .parquet"):
         write_log(log, tmp_path / "out.bag")
 
 
