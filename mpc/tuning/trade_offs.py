@@ -6,7 +6,8 @@ wanted.  Differences that nobody could see (a second, a quantum of the sensor, h
 not count: the objectives are rounded to them before they are compared.
 
 What a user can trade on a saturated plant is mostly the drive itself, so the scan beside the search's own
-trials caps it (to 90, 75, 60 and 50 % of its range), and makes moves cheaper and dearer.
+trials caps it (to 90, 75, 60 and 50 % of its range), and makes moves cheaper and dearer. A filter that trusts
+readings less spares moves too, but its bias takes longer to go than the search's trials last: it is tried here.
 
 **Which weights matter.**  Of the cost J of a parameter k (a weight, the horizon, the number of blocks) the
 elasticity is taken by a central difference over a third up and down,
@@ -35,6 +36,7 @@ RESOLUTION = (1.0, 0.05, 0.005)
 
 _CAPS = (0.9, 0.75, 0.6, 0.5)
 _MOVES = (0.1, 10.0, 100.0)
+_TRUST = (0.3, 0.1)
 _KEPT = 6  # of the search's own trials
 
 
@@ -73,7 +75,8 @@ def non_dominated(points: ArrayLike) -> Mask:
 
 
 def scan_of(best: dict[str, float], history: Sequence[Trial]) -> list[tuple[str, dict[str, float]]]:
-    """Return what to run at full length: the search's trials that stand out, then caps and dearer moves."""
+    """Return what to run at full length: the search's trials that stand out, then caps, dearer moves and
+    filters that trust readings less."""
     points = [(trial.settle_s, trial.overshoot, trial.score) for trial in history]
     shown = [
         trial for trial, kept in zip(history, non_dominated(points)) if kept and trial.parameters != best
@@ -84,6 +87,9 @@ def scan_of(best: dict[str, float], history: Sequence[Trial]) -> list[tuple[str,
     found += [(f"{100 * cap:.0f} % of the drive", {**best, "drive_share": cap}) for cap in _CAPS if cap < own]
     for factor in _MOVES:
         found.append((f"moves {factor:g} times as dear", {**best, "move": factor * best["move"]}))
+    for factor in _TRUST if "state_walk" in best else ():
+        trusted = {**best, "state_walk": factor * best["state_walk"]}
+        found.append((f"states {factor:g} times as noisy to the filter", trusted))
     return found
 
 

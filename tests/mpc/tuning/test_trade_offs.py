@@ -87,7 +87,7 @@ def test_a_second_a_quantum_and_half_a_per_cent_of_the_largest_energy_count(one,
     }  # fmt: skip
 
 
-def test_the_scan_has_six_of_the_search_by_score_smaller_drives_and_other_move_weights():
+def test_the_scan_has_six_of_the_search_by_score_smaller_drives_other_move_weights_and_filters():
     best = {"move": 2.0, "drive_share": 0.75}
     scores = [4.0, 1.0, 7.0, 3.0, 8.0, 2.0, 6.0, 5.0]
     history = [Trial("MPC", {"move": float(k)}, s, 100.0 - k, 0.1 + k, 1.0) for k, s in enumerate(scores, 10)]
@@ -102,6 +102,11 @@ def test_the_scan_has_six_of_the_search_by_score_smaller_drives_and_other_move_w
         ("moves 0.1 times as dear", best | {"move": 0.2}), ("moves 10 times as dear", best | {"move": 20.0}),
         ("moves 100 times as dear", best | {"move": 200.0}),
     ]  # fmt: skip
+    trusting = {"move": 2.0, "state_walk": 0.01}
+    assert scan_of(trusting, history[:1])[-2:] == [
+        ("states 0.3 times as noisy to the filter", trusting | {"state_walk": 0.003}),
+        ("states 0.1 times as noisy to the filter", trusting | {"state_walk": 0.001}),
+    ]
     whole = [name for name, _ in scan_of({"move": 2.0}, history[:1])]
     assert whole[:6] == [
         "tuned",
