@@ -107,6 +107,17 @@ def lacking(plant: Plant, spec: Spec, controlled: Sequence[str]) -> list[tuple[s
     return [(words, changes) for value, words, changes in tried if value > 0]
 
 
+def cold_steps(plant: Plant, spec: Spec, controlled: Sequence[str]) -> list[tuple[float, float]]:
+    """Return the step from rest in the room to the first target, where a log was as cold and it is further
+    than any step of the spec, else none: a run begins there, its integrator has all of the drive to find."""
+    cold, target = spec.ambient_degC, spec.steps[0][1]
+    seen = [plant.valid.get(name, (np.inf, -np.inf)) for name in controlled]
+    begun = all(low - spec.band_degC <= cold <= high for low, high in seen)
+    warm = all(plant.units.get(name, "degC") == "degC" for name in controlled)
+    further = abs(target - cold) > max(abs(end - start) for start, end in spec.steps)
+    return [(cold, target)] if begun and warm and further else []
+
+
 @lru_cache(maxsize=64)
 def drawn(plant: Plant, draw: int) -> Plant:
     """Return a draw, the same one each time: its models and held states are worked out once."""
@@ -279,6 +290,11 @@ class Search:
         # the comparison takes draws that the search has not seen
         self.unseen = [draw + _CHECK_FROM if draw else 0 for draw in draws_of(plant, spec.check_draws)]
         self.bounds = bounds_of(plant, baseline, spec, sorted({*self.draws, *self.unseen}))
+        cold = cold_steps(plant, spec, baseline.controlled)
+        self.pi_spec = spec.model_copy(update={"steps": [*spec.steps, *cold]})  # of the PI's trials
+        if cold:
+            begun = spec.model_copy(update={"steps": cold})
+            self.bounds |= bounds_of(plant, baseline, begun, self.draws)
         count = len(lacking(plant, spec, baseline.controlled))
         self.lacking = [STRUCTURE * (k + 1) + self.draws[0] for k in range(count)]
         check_steps(self.bounds)
@@ -335,17 +351,17 @@ class Search:
         self, parameters: dict[str, float], name: str = "MPC", lengths: Sequence[float] | None = None
     ) -> Trial:
         """Return the trial of an ``"MPC"``, ``"PI"`` or ``"LQR"``; ``lengths`` are seconds by step."""
+        spec, lengths = self.spec, self.lengths if lengths is None else lengths
         if name == "PI":
             loops = scaled_loops(self.baseline.loops, parameters)
             controller: Regulator = PIController.of(self.plant, self.baseline, loops)
+            # for as long as a step is held, to see what its integrator has still to do
+            spec, lengths = self.pi_spec, [spec.hold_s] * len(self.pi_spec.steps)
         else:
             controller = self.made(name, self.design(parameters))
-        if lengths is None:
-            # a PI is tried for as long as a step is held, to see what its integrator has still to do
-            lengths = [self.spec.hold_s] * len(self.spec.steps) if name == "PI" else self.lengths
         # trials of the LQR, which is there for comparison, take ten times as long
         draws = self.draws if name == "LQR" else [*self.draws, *self.lacking]
-        found = run_trials(controller, self.plant, self.spec, draws, lengths=lengths, seed=self.seed)
+        found = run_trials(controller, self.plant, spec, draws, lengths=lengths, seed=self.seed)
         results = [result for result in found if result.draw < STRUCTURE]
         return Trial(
             controller=name,

@@ -7,7 +7,7 @@ not count: the objectives are rounded to them before they are compared.
 
 What a user can trade on a saturated plant is mostly the drive itself, so the scan beside the search's own
 trials caps it (to 90, 75, 60 and 50 % of its range), and makes moves cheaper and dearer. A filter that trusts
-readings less spares moves too, but its bias takes longer to go than the search's trials last: it is tried here.
+readings less spares moves too; its bias takes longer to go than trials of the search last, so try it here.
 
 **Which weights matter.**  Of the cost J of a parameter k (a weight, the horizon, the number of blocks) the
 elasticity is taken by a central difference over a third up and down,

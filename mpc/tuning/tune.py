@@ -25,6 +25,7 @@ Whatever the verdict, it reports where a simpler controller, tuned with the same
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -41,6 +42,7 @@ from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.tuning.objective import (
     LQR_PARAMETERS,
     MPC_PARAMETERS,
+    PI_PARAMETERS,
     STRUCTURE,
     Bounds,
     Record,
@@ -452,6 +454,12 @@ def _optimise(item: tuple[Search, str, list[dict[str, float]], int, Progress | N
     optimiser.set_maxeval(evaluations - len(tried) or 1)
     optimiser.set_xtol_rel(1e-3)
     optimiser.optimize(np.clip(np.log([start[parameter] for parameter in names]), low + 1e-9, high - 1e-9))
+    if name == "PI" and search.pi[0] != PI_PARAMETERS[0] and not np.isfinite(_best(tried).settle_s):
+        # within the limits of a delay that no log shows it does not settle
+        wide = copy(search)
+        wide.pi = PI_PARAMETERS[: len(search.pi)]
+        others = [start | dict(zip(_SPREAD, values.tolist())) for values in _spread(wide.pi)]
+        return [*tried, *_optimise((wide, name, others, evaluations, progress))]
     return tried
 
 

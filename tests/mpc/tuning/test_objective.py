@@ -28,10 +28,18 @@ class _Plant(SimpleNamespace):
 
 
 def search_of(
-    bounds: Any, *, uncertain: bool = True, spec: Spec = SPEC, dt: float = 1.0, **changes: Any
+    bounds: Any,
+    *,
+    uncertain: bool = True,
+    spec: Spec = SPEC,
+    dt: float = 1.0,
+    coldest: float = 27.0,
+    **changes: Any,
 ) -> Search:
-    """Return the search of a tank whose shortest times are a function of (start, target, draw)."""
-    plant = _Plant(uncertain=uncertain, draw=lambda k: k, dt=dt)
+    """Return the search of a tank whose shortest times are a function of (start, target, draw), its skin in
+    the logs as cold as that."""
+    logs = {"t_surface": (coldest, 40.0)}
+    plant = _Plant(uncertain=uncertain, draw=lambda k: k, dt=dt, valid=logs, units={})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(objective, "full_drive_bound", lambda drawn, design, step, spec: bounds(*step, drawn))
         patch.setattr(objective, "apparent_delay", lambda plant, controlled: 8.0)
@@ -88,6 +96,44 @@ def test_each_controller_is_tried_for_its_own_length(monkeypatch: pytest.MonkeyP
     cost = (80 + 100) / 120 + 0.5 * (100 - 90) / 60 + 0.01 + 0.05 * (90 / 60 + 10 * 0.03)
     assert tried[0] == Trial("MPC", {"move": 7.0}, pytest.approx(cost), 90.0, 0.2, 30.0)
     assert [trial.controller for trial in tried] == ["MPC", "PI", "LQR"]
+
+
+FAR = SPEC.model_copy(update={"ambient_degC": 20.0})  # 16 degC below the first target, steps are of 8
+
+
+@pytest.mark.parametrize(
+    ("spec", "logs", "unit", "steps"),
+    [
+        (FAR, (20.2, 40.0), "degC", [(20.0, 36.0)]),  # in the band of the coldest
+        (FAR, (20.4, 40.0), "degC", []),
+        (FAR, (10.0, 19.0), "degC", []),
+        (FAR, (20.0, 40.0), "percent", []),  # a room's temperature says nothing about a level
+        (SPEC.model_copy(update={"ambient_degC": 28.0}), (20.0, 40.0), "degC", []),  # no further than a step
+    ],
+)
+def test_a_pi_is_also_tried_from_a_cold_start_where_logs_show_one_and_it_is_further_than_any_step(
+    spec, logs, unit, steps
+):
+    plant: Any = _Plant(valid={"t": logs}, units={"t": unit})
+    assert objective.cold_steps(plant, spec, ("t",)) == steps
+
+
+def test_the_trial_from_a_cold_start_is_of_the_pi_alone(monkeypatch: pytest.MonkeyPatch):
+    search = search_of(lambda *at: 60.0, spec=FAR, coldest=20.0)
+    assert {key for key in search.bounds if key[0] == 20.0} == {(20.0, 36.0, 1), (20.0, 36.0, 2)}
+    seen: list[Any] = []
+
+    def run(controller: Any, plant: Any, spec: Spec, draws: Any, *, lengths: Any, seed: int) -> Any:
+        seen.append((list(spec.steps), lengths))
+        return [StepResult(*spec.steps[-1], 1, 80.0, 0.1, 0.0, 0.0, 20.0, 1.0, 0.5, 100.0)]
+
+    monkeypatch.setattr(objective, "run_trials", run)
+    monkeypatch.setattr(search, "made", lambda name, design: name)
+    monkeypatch.setattr(objective.PIController, "of", lambda plant, base, loops: "PI")
+    for name in ("MPC", "PI", "LQR"):
+        search.evaluate({"Kc": 1.0, "Ti": 1.0, "setpoint": 1.0, "feedforward": 0.5}, name)
+    cold = ([*STEPS, (20.0, 36.0)], [300.0] * 3)
+    assert seen == [(STEPS, search.lengths), cold, (STEPS, search.lengths)]
 
 
 def test_a_trial_has_a_sensor_that_is_off_and_a_seed_of_its_draw(monkeypatch: pytest.MonkeyPatch):

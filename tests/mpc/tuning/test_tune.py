@@ -20,6 +20,7 @@ from thermogrip.mpc.tuning.figures import closed_loop_figure
 from thermogrip.mpc.tuning.objective import (
     LQR_PARAMETERS,
     MPC_PARAMETERS,
+    PI_OF_UNSEEN_DELAY,
     PI_PARAMETERS,
     Search,
     StepResult,
@@ -115,6 +116,7 @@ class Paper:
     pi: tuple[tuple[str, float, float], ...] = PI_PARAMETERS
     capped: float = 1.0  # score at full length of 75 % of the drive, over that of all of it
     pi_at_length: float = 5.0
+    creeps: float = 0.0  # up to this gain a PI does not settle
     evaluate_check: Callable[[str, int], StepResult] | None = None
     checked: list[tuple[str, Design, int]] = field(default_factory=list)
 
@@ -141,6 +143,8 @@ class Paper:
         )
 
     def trial(self, name: str, parameters: dict[str, float], value: float) -> Trial:
+        if parameters.get("Kc", np.inf) <= self.creeps:
+            return Trial(name, dict(parameters), value + 5.0, np.nan, 0.1, 50.0)
         return Trial(name, dict(parameters), value, 100.0 * value, 0.1, 50.0)
 
     def check(self, item: tuple[str, Design, int]) -> list[StepResult]:
@@ -362,6 +366,15 @@ def test_a_plant_without_uncertainty_is_compared_under_fresh_noise(tank: Any):
     assert "under fresh noise (the plant has no uncertainty)" in done.tuning.finding
     # its PI does without the drive that the plant has for a target
     assert {trial.parameters["feedforward"] for trial in done.tried("PI")} == {0.05}
+
+
+@pytest.mark.parametrize(("creeps", "wider"), [(0.5, False), (1.0, True)])
+def test_a_pi_of_an_unseen_delay_goes_beyond_its_limits_only_where_it_does_not_settle_inside(
+    tank: Any, creeps: float, wider: bool
+):
+    done = tuned(tank, pi=PI_OF_UNSEEN_DELAY, creeps=creeps)
+    assert (done.best("PI").parameters["Kc"] > 1.0) == wider
+    assert max(trial.parameters["Kc"] for trial in done.tried("PI")) <= (5.0 if wider else 1.0)
 
 
 def test_the_file_holds_what_was_found(done: Done):
