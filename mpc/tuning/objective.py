@@ -300,7 +300,7 @@ class Search:
         check_steps(self.bounds)
         unseen = apparent_delay(plant, baseline.controlled) < 2 * plant.dt
         own = PI_OF_UNSEEN_DELAY if unseen else PI_PARAMETERS
-        self.pi = own[:-1] if self.certain else own
+        self.pi: Sequence[tuple[str, float, float]] = own[:-1] if self.certain else own
         slowest = [max(self.bounds[(*step, draw)] for draw in self.draws) for step in spec.steps]
         # long enough to see it settle and stay, short enough to try many
         least = min(120.0, spec.hold_s)
