@@ -276,6 +276,7 @@ class Trial:
     settle_s: float  # means over steps and draws; NaN where one did not settle
     overshoot: float  # the worst [degC]
     energy_s: float  # means over steps and draws; NaN where one did not settle
+    travel: float = 0.0  # mean of how many full drives the drives move
 
 
 class Search:
@@ -370,6 +371,7 @@ class Search:
             settle_s=float(np.mean([result.settle_s for result in results])),
             overshoot=max(result.overshoot for result in results),
             energy_s=float(np.mean([result.energy_s for result in results])),
+            travel=float(np.mean([result.travel for result in results])),
         )
 
     def evaluate_at_length(self, item: tuple[str, dict[str, float]]) -> Trial:

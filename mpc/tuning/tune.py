@@ -206,6 +206,7 @@ def _lacking(plant: Plant, design: Design, spec: Spec, results: Sequence[StepRes
 # to begin with: dearer moves than in the default design, a filter that trusts readings less, other horizons
 _LOOK = (("move", (10.0, 100.0, 1000.0)), ("state_walk", (0.3, 0.1)), ("horizon", (0.7, 1.5)))
 _WORTH = 0.01  # by which a traded design must be better on the spec's own score to be taken
+_ALIKE = 0.02  # of designs with as much of the drive that differ by less in score the one that moves least
 
 
 @dataclass(frozen=True)
@@ -319,9 +320,11 @@ def tune(
     }
     results = _compare(search, candidates, workers, sub_progress(progress, 0.7, 0.85))
     scores = {name: score(part, spec, search.bounds) for name, part in results.items()}
-    kept = "tuned" if scores["tuned"] < scores["baseline"] else "baseline"
-    about = best if kept == "tuned" else search.evaluate(start)
     own = {name: [result for result in part if result.draw < STRUCTURE] for name, part in results.items()}
+    moved = {name: np.mean([result.travel for result in part]) for name, part in own.items()}
+    alike = 1 + _ALIKE if moved["tuned"] < moved["baseline"] else 1.0
+    kept = "tuned" if scores["tuned"] < alike * scores["baseline"] else "baseline"
+    about = best if kept == "tuned" else search.evaluate(start)
     items = [(search, parameter, about.parameters, about) for parameter in PARAMETER_WORDS]
     share = sub_progress(progress, 0.85, 1.0)
     sensitivity = run_parallel(sensitivity_of, items, workers, share, what="sensitivities")
@@ -380,10 +383,15 @@ def _trade(
     names, items = zip(*scanned, strict=True)
     tried = run_parallel(search.evaluate_at_length, items, workers, progress, what="trade-offs")
     pareto = front_of(tried, names)
-    first, traded = pareto.trials[0], _best([trial for trial in tried if trial.controller == "MPC"])
-    if traded.score < (1 - _WORTH) * first.score:  # the spec weights energy, and a cap on the drive pays
-        best = search.evaluate(traded.parameters)
-    return pareto, best
+    own = [trial for trial in tried if trial.controller == "MPC"]
+    taken = _best(own)
+    if taken.score >= (1 - _WORTH) * own[0].score:  # else a cap pays: energy is weighted
+        taken = own[0]
+    share = taken.parameters.get("drive_share", 1.0)
+    near = [trial for trial in own if trial.score <= (1 + _ALIKE) * taken.score]
+    same = [trial for trial in near if trial.parameters.get("drive_share", 1.0) == share]
+    still = min([taken, *same], key=lambda trial: trial.travel)
+    return pareto, best if still is own[0] else search.evaluate(still.parameters)
 
 
 def _search_all(

@@ -324,6 +324,34 @@ def test_less_drive_is_taken_where_the_specs_own_score_gains_by_more_than_a_hund
     assert done.tuning.sensitivity[0].settle_s == pytest.approx(100 * best.score)
 
 
+@pytest.mark.parametrize(("dearer", "taken"), [(1.015, 10.0), (1.025, 1.0)])
+def test_of_designs_that_score_alike_the_one_that_moves_least_is_taken_with_as_much_of_the_drive(
+    dearer: float, taken: float
+):
+    scores = {0.1: 1.0, 1.0: 1.0, 10.0: dearer, 100.0: 1.5}
+
+    def at_length(item: tuple[str, dict[str, float]]) -> Trial:
+        name, parameters = item
+        travel = 0.01 if "drive_share" in parameters or name != "MPC" else 1 / parameters["move"]
+        return Trial(name, parameters, scores[parameters["move"]], 100.0, 0.1, 50.0, travel)
+
+    search: Any = SimpleNamespace(
+        evaluate_at_length=at_length, evaluate=lambda parameters: at_length(("MPC", parameters))
+    )
+    found = {name: [at_length((name, {"move": 1.0}))] for name in ("MPC", "PI", "LQR")}
+    _, best = tuner._trade(search, found, 1, None)
+    assert best.parameters == {"move": taken}
+
+
+def test_a_default_that_scores_alike_and_moves_more_is_not_kept(tank: Any):
+    def evaluate(name: str, draw: int) -> StepResult:
+        late, travel = {"tuned": (181.0, 1.0)}.get(name, (180.0, 2.0))
+        return step_result(name, draw, settle_s=late, travel=travel)
+
+    done = tuned(tank, evaluate_check=evaluate)
+    assert done.tuning.controller.design.move == done.best("MPC").parameters["move"]
+
+
 def test_a_pi_that_is_better_at_length_is_shown_and_not_taken_for_an_mpc(tank: Any):
     done = tuned(tank, pi_at_length=0.5)
     assert done.tuning.controller.design.move == done.best("MPC").parameters["move"]
