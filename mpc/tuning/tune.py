@@ -7,7 +7,7 @@ ten, a filter that trusts readings less, and the horizon. Subplex takes the para
 named first before the others: 20 trials change the first two and hardly the rest. Each design
 is evaluated in closed loop on draws of the plant's posterior, never on the model itself, and on draws that
 lack structure (:mod:`thermogrip.mpc.tuning.objective`). A linear-quadratic regulator is tuned with the same
-number of trials and a PI controller with twice as many, SIMC's settings first; they stand beside it.
+number of trials and a PI controller with three times as many, SIMC's first; they stand beside it.
 
 Trade-offs that remain are reported: designs of which none is better in all of settling, overshoot and energy,
 what each weight does (:mod:`thermogrip.mpc.tuning.trade_offs`), and whether weights were the limit at all:
@@ -397,7 +397,7 @@ def _trade(
 def _search_all(
     search: Search, looked: list[Trial], workers: Workers, progress: Progress | None
 ) -> dict[str, list[Trial]]:
-    """Return the trials of MPC, PI and LQR, after as many evaluations each, the PI after twice as many."""
+    """Return the trials of MPC, PI and LQR, after as many evaluations each, the PI after three times as many."""
     n = search.spec.evaluations
     # SIMC, with the drive that holds the target; and without: a plant that has no draws does not know how
     # wrong that drive is
@@ -407,7 +407,7 @@ def _search_all(
     lqr = {**parameters_of(search.baseline, search.spec), "drive": 1e-2}
     items = [
         (search, "MPC", [_best(looked).parameters], max(0, n - len(looked)), None),
-        (search, "PI", [pi, plain, *others][search.certain :], 2 * n, None),
+        (search, "PI", [pi, plain, *others][search.certain :], 3 * n, None),
         (search, "LQR", [lqr], n, None),
     ]
     if workers == 1:
@@ -424,12 +424,12 @@ _SPREAD = {"Kc": (0.4, 2.5), "Ti": (0.4, 2.5), "setpoint": (0.2, 1.0), "feedforw
 
 
 def _spread(bounds: Sequence[tuple[str, float, float]]) -> Array:
-    """Return 16 sets of a PI's parameters inside these bounds, evenly spread over their logarithms."""
+    """Return 32 sets of a PI's parameters inside these bounds, evenly spread over their logarithms."""
     from scipy.stats.qmc import Halton
 
     ends = [(max(low, _SPREAD[name][0]), min(high, _SPREAD[name][1])) for name, low, high in bounds]
     low, high = np.log(ends).T
-    return np.asarray(np.exp(low + Halton(len(ends), scramble=False).random(17)[1:] * (high - low)))
+    return np.asarray(np.exp(low + Halton(len(ends), scramble=False).random(33)[1:] * (high - low)))
 
 
 def _optimise(item: tuple[Search, str, list[dict[str, float]], int, Progress | None]) -> list[Trial]:

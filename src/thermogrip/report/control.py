@@ -109,7 +109,7 @@ def tuning_section(tuning: Tuning) -> Section:
         ),
         Text(
             f"Scores on these draws, lower is better: {scores}. MPC and LQR were tuned with "
-            f"{tuning.spec.evaluations} trials each, PI with twice as many; a settling time counts in units "
+            f"{tuning.spec.evaluations} trials each, PI with three times as many; a settling time counts in units "
             "of the last column."
         ),
     ]

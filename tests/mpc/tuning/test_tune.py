@@ -221,7 +221,7 @@ def test_moves_filters_and_horizons_are_looked_at_and_the_best_is_searched_from(
 def test_every_controller_has_as_many_trials_and_keeps_to_its_ranges(done: Done):
     for name, parameters in {"MPC": MPC_PARAMETERS, "PI": PI_PARAMETERS, "LQR": LQR_PARAMETERS}.items():
         tried = done.tried(name)
-        assert len(tried) == (2 if name == "PI" else 1) * SPEC.evaluations
+        assert len(tried) == (3 if name == "PI" else 1) * SPEC.evaluations
         for parameter, low, high in parameters:
             values = np.array([trial.parameters[parameter] for trial in tried])
             assert np.all((values >= low) & (values <= high)), parameter
