@@ -397,7 +397,7 @@ def _trade(
 def _search_all(
     search: Search, looked: list[Trial], workers: Workers, progress: Progress | None
 ) -> dict[str, list[Trial]]:
-    """Return the trials of MPC, PI and LQR, after as many evaluations each, the PI after three times as many."""
+    """Return the trials of MPC, PI and LQR, after as many evaluations each, the PI after thrice as many."""
     n = search.spec.evaluations
     # SIMC, with the drive that holds the target; and without: a plant that has no draws does not know how
     # wrong that drive is

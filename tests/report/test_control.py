@@ -90,7 +90,7 @@ def test_a_tuned_controller_stands_with_its_scores_and_what_it_did_not_know(
     assert about.text.startswith("Band 0.25 degC. ")
     assert unseen in about.text
     assert "offset of 0.3 degC" in about.text
-    words = "MPC and LQR were tuned with 30 trials each, PI with twice as many"
+    words = "MPC and LQR were tuned with 30 trials each, PI with three times as many"
     assert f"lower is better: tuned 1.235, PI 2.000. {words}" in scores.text
     tuning.controller.plant = SimpleNamespace(samples=np.eye(1), covariance=None)
     assert control._uncertain(tuning)

@@ -109,8 +109,8 @@ def tuning_section(tuning: Tuning) -> Section:
         ),
         Text(
             f"Scores on these draws, lower is better: {scores}. MPC and LQR were tuned with "
-            f"{tuning.spec.evaluations} trials each, PI with three times as many; a settling time counts in units "
-            "of the last column."
+            f"{tuning.spec.evaluations} trials each, PI with three times as many; a settling time counts in "
+            "units of the last column."
         ),
     ]
     tone = "good" if tuning.meets_spec else "warn"
