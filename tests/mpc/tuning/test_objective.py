@@ -94,7 +94,7 @@ def test_each_controller_is_tried_for_its_own_length(monkeypatch: pytest.MonkeyP
     assert seen == [(*given, 3) for given in zip(names, draws, lengths, strict=True)]
     # the mean, and half of what the worst is above it; a move; what lacks structure
     cost = (80 + 100) / 120 + 0.5 * (100 - 90) / 60 + 0.01 + 0.05 * (90 / 60 + 10 * 0.03)
-    assert tried[0] == Trial("MPC", {"move": 7.0}, pytest.approx(cost), 90.0, 0.2, 30.0)
+    assert tried[0] == Trial("MPC", {"move": 7.0}, pytest.approx(cost), 90.0, 0.2, 30.0, 1.0)
     assert [trial.controller for trial in tried] == ["MPC", "PI", "LQR"]
 
 
