@@ -62,7 +62,9 @@ _LEFT_OUT = "\x1f"  # how the name of a column begins that is not kept
 _NAMELESS = "no header: columns named c1 to c{} by position; --columns a,b,... names them"
 _HEAD_LINES = 200  # of a file, that show how it is a table
 _DATE = re.compile(r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}|\d{1,2}:\d{2}")  # how a date or a time of day begins
-_MANY = 0.9  # share of a column's cells that decide what the others should be
+# name, number and end of a cell that begins with its column's name; bounded, so that no line takes long
+_LABELLED = re.compile(rb"([A-Za-z_][^:=,;\t\n]{0,63}?) ?[:=] ?([-+.\deE]{1,30}|nan|NaN)([,;\t ]|$)")
+_MANY = 0.9  # share of a column's cells, or of a table's lines, that decide what the others should be
 _MOST_BROKEN = 0.05  # share of rows with too few or too many cells that are left out
 _SWITCH = {"on": 1.0, "off": 0.0, "true": 1.0, "false": 0.0, "yes": 1.0, "no": 0.0}
 _NUMBER = re.compile(
@@ -137,8 +139,9 @@ def read_text_table(path: str | Path, columns: Sequence[str] | None = None) -> T
 def parse_text(data: bytes, file: str, columns: Sequence[str] | None = None) -> Table:
     """Return the table in the text of a file; see :func:`read_text_table`."""
     data, coded = _any_coding(data)
+    data, labelled = _without_labels(data)
     layout = find_layout(data, file)
-    names, notes = layout.names, (*coded, *layout.notes)
+    names, notes = layout.names, (*coded, *labelled, *layout.notes)
     if columns is not None:
         have = len([name for name in names if not name.startswith(_LEFT_OUT)])
         if len(columns) != have:
@@ -186,13 +189,18 @@ def find_layout(data: bytes, file: str) -> Layout:
     best: tuple[float, int, str, list[list[str]]] | None = None  # share of rows that fit, the first of them
     for separator in "\t;|, ":
         rows = [_split(line, separator) for _, line in head]
-        first = next((k for k in range(len(rows)) if _is_row(rows, k, separator)), None)
-        if first is None:
+        starts = [k for k in range(len(rows)) if _is_row(rows, k, separator)]
+        if not starts:
             continue
-        n, rows = len(rows[first]), rows[first:]
-        fit = float(np.mean([len(r) == n and _values(r, separator) for r in rows])) if n > 1 else 0.0
+        # a preamble may have a line like a row, of another length than the rows of the table
+        others = (k for k in starts if len(rows[k]) not in (1, len(rows[starts[0]])))
+        first = starts[0]
+        if _like_first(rows[first:], separator) < _MANY:
+            first = next((k for k in others if _like_first(rows[k:], separator) >= _MANY), first)
+        n, below = len(rows[first]), rows[first:]
+        fit = float(np.mean([len(r) == n and _values(r, separator) for r in below])) if n > 1 else 0.0
         if best is None or fit > best[0] + 1e-9:
-            best = fit, first, separator, rows
+            best = fit, first, separator, below
     if best is None:
         return Layout(*_header(data, file), ())
     _, first, separator, rows = best
@@ -241,6 +249,12 @@ def _values(row: Sequence[str], separator: str) -> float:
     return sum(_is_value(cell, separator) for cell in row) / max(len(row), 1)
 
 
+def _like_first(rows: Sequence[Sequence[str]], separator: str) -> float:
+    """Return the share of lines that are as long as the first one, and of which at least half are numbers."""
+    n = len(rows[0])
+    return float(np.mean([len(row) == n and _values(row, separator) >= 0.5 for row in rows]))
+
+
 def _is_row(rows: Sequence[Sequence[str]], k: int, separator: str) -> bool:
     """Tell whether line k is one of numbers, as long as the next or the one before."""
     row, cells = rows[k], [cell for cell in rows[k] if cell]
@@ -284,6 +298,25 @@ def _any_coding(data: bytes) -> tuple[bytes, tuple[str, ...]]:
     except UnicodeDecodeError:
         return data.decode("cp1252", "replace").encode(), ("text is not UTF-8: read as Windows-1252",)
     return data, ()
+
+
+def _without_labels(data: bytes) -> tuple[bytes, tuple[str, ...]]:
+    """Return a table whose every cell begins with the name of its column, as a serial plotter takes them
+    (``T1:23.5,T2:24.0``), with the names in a header."""
+    lines = [line for line in islice(_lines(data[: 1 << 20]), _HEAD_LINES) if line.strip()]
+    rows = [_LABELLED.findall(line) for line in lines]
+    names = max((tuple(name for name, _, _ in row) for row in rows), key=len, default=())
+    as_named = [row for row in rows if len(names) > 0 and tuple(name for name, _, _ in row) == names]
+    if len(as_named) < max(2, _MANY * len(rows)) or len({*names}) < len(names):
+        return data, ()
+    by = b"," if all(b"," in end for row in as_named for *_, end in row[:-1]) else b"\t"
+    out = [by.join(names)]
+    for line in _lines(data):
+        cells = _LABELLED.findall(line)
+        if cells:
+            out.append(by.join(value for _, value, _ in cells))
+    shown = ", ".join(name.decode("utf-8", "replace") for name in names)
+    return b"\n".join(out) + b"\n", (f"cells begin with the names of their columns: {shown}",)
 
 
 def _parse_table(

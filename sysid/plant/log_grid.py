@@ -122,10 +122,10 @@ class Segment:
 class Grid:
     """Segments of several logs on one grid."""
 
-    inputs: tuple[str, ...]  # names of the columns; switches are inputs that are only ever 0 or 1
+    inputs: tuple[str, ...]  # names of the columns
     disturbances: tuple[str, ...]
     outputs: tuple[str, ...]
-    switches: tuple[str, ...]
+    switches: tuple[str, ...]  # inputs, beside others, that are only ever 0 or 1
     dt: float  # step [s]
     segments: tuple[Segment, ...]
     native: float  # sample time of the logs before averaging [s]
@@ -196,6 +196,7 @@ def make_grid(
     lost = float(np.mean(np.concatenate([~np.isfinite(part.y).all(axis=1) for part in segments])))
     moves = np.concatenate([each.u for each in rows]).T
     switches = tuple(n for n, on in zip(u, moves) if units[n] == "1" and np.isin(on, (0.0, 1.0)).all())
+    switches = () if len(switches) == len(u) else switches  # a heater that is only on or off is what drives
     return Grid(u, d, y, switches, step, tuple(segments), native, units, why, lost, ends)
 
 

@@ -97,6 +97,8 @@ def test_the_ending_is_the_format_and_the_rest_is_the_name(name, kind, stem):
         ("12\n1,2\n3,4\n", "12|c2", 1, ",", "without a name: c2"),
         ("a,b,c\n1,x,\n2,,5\n", "a|b|c", 1, ",", ""),  # half of the cells
         ("a;b,c\n", "a;b|c", 1, ",", ""),
+        ("Log\nversion\t2\nby\tme\n\nTime\tU\tT (C)\n" + "0\t1\t2\n" * 40, "Time|U|T (C)", 5, "\t",
+         "3 line(s) before the table passed over"),
         ("a,b\n1,2\n", "a|b", 1, ",", ""),  # a row alone stands beside the header
         *((("x\n" * (198 + more) + "a,b\n0,1\n0,2\n"), *found, ",", note) for more, found, note in [
             (0, ("a|b", 199), "198 line(s) before the table passed over"), (1, ("x", 1), "")]),
@@ -206,6 +208,26 @@ def test_cells_are_numbers_switches_times_or_words(text, cells, lines, notes):
     table = parse_text(text if isinstance(text, bytes) else text.encode(), "a.txt")
     assert shown(table) == (cells, lines)
     assert list(table.notes) == notes
+
+
+@pytest.mark.parametrize(
+    ("text", "cells"),
+    [
+        ("PWM:1,T1:20.5,T2:-3e1\n" * 3, {"PWM": "1 1 1", "T1": "20.5 20.5 20.5", "T2": "-30 -30 -30"}),
+        ("t = 0, T hot = nan\r\nt = 1, T hot = 5\r\n", {"t": "0 1", "T hot": "- 5"}),
+        ("a:1\tb:2\na:3\tb:4\n", {"a": "1 3", "b": "2 4"}),
+        ("a:1 b:2\n\na:3 b:4\n", {"a": "1 3", "b": "2 4"}),
+    ],
+)
+def test_cells_that_begin_with_the_names_of_their_columns(text, cells):
+    table = parse_text(text.encode(), "a.txt")
+    assert shown(table)[0] == cells
+    assert table.notes == (f"cells begin with the names of their columns: {', '.join(cells)}",)
+
+
+def test_labels_must_be_alike_in_the_rows_and_differ_in_a_row():
+    for text in ("a:1,b:2\nb:2,a:1\n", "a:1,a:2\n" * 3, "12:30,5\n12:31,6\n"):
+        assert not any("begin with" in note for note in parse_text(text.encode(), "a.txt").notes)
 
 
 def test_columns_are_named_anew_and_those_of_a_dash_left_out():

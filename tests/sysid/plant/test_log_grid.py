@@ -276,8 +276,10 @@ def test_switches_are_shares_that_are_nought_or_one():
     more = {"half": (0.5 * on, "1"), "s": (on, "1"), "c": (on, "0_255"), "a": (on, "A")}
     log = log_of(T, q=on, **{name: (*item, "input") for name, item in more.items()})
     assert make_grid([log], average=1.0).switches == ("s",)
-    off = log_of(T, s=(0 * on, "1", "input"))
-    assert make_grid([off], inputs=["s"], average=1.0).switches == ("s",)  # off throughout
+    off = log_of(T, q=on, s=(0 * on, "1", "input"))
+    assert make_grid([off], inputs=["q", "s"], average=1.0).switches == ("s",)  # off throughout
+    alone = log_of(T, heater=(on, "1", "input"))
+    assert make_grid([alone], inputs=["heater"], average=1.0).switches == ()  # a drive that is on or off
 
 
 # ---- the step ----
