@@ -66,6 +66,7 @@ _STEP = re.compile(r"(?i)ts|dt|delta_?t|sampl(e|ing)_?(time|period|interval)")
 _COUNTER = re.compile(r"(?i)c1|x|n|k|i|no|nr|id|index|idx|samples?|rows?|steps?|count(er)?|unnamed.*")
 _TIME_WORDS = {"ms": 1e-3, "milli": 1e-3, "us": 1e-6, "minute": 60.0, "hour": 3600.0}  # that begin a name
 _EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))  # from how much on a number since 1970 is in ns, us, ms
+MOST_SIGNALS = 40  # of a table with a reading of one of them in a row
 _MONOTONE = 0.9  # share of a time's steps that do not run backward
 _MONTH_NAMES = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 _MONTHS = {m: str(at) for at, m in enumerate(_MONTH_NAMES, 1)}
@@ -350,9 +351,25 @@ def _convert(
         if units[name] != unit:
             repairs.append(f"{name}: converted from {unit} to {units[name]}")
     words = [header for header in table.text if header not in used]
+    _check_wide(table, words, [*names_of])
     repairs += [f"read {', '.join(renamed)}"] if renamed else []
     repairs += [f"left out, no numbers: {', '.join(words)}"] if words else []
     return columns, units, names_of, repairs
+
+
+def _check_wide(table: Table, words: Sequence[str], numbers: Sequence[str]) -> None:
+    """Refuse a table of one reading a row, which a column of words says the signal of."""
+    *times, last = numbers or [""]
+    for header in words if len(times) == 1 else ():
+        signals = {*table.text[header]}
+        if 2 <= len(signals) <= MOST_SIGNALS and len(table.lines) >= 5 * len(signals):
+            pivot = f"pivot_table(index={times[0]!r}, columns={header!r}, values={last!r}).ffill()"
+            raise UserError(
+                f"has a reading of one signal in a row, of {', '.join(sorted(signals)[:3])}",
+                file=table.file,
+                column=header,
+                hint=f"give each signal a column: pandas.read_csv({table.file!r}).{pivot}.to_csv('wide.csv')",
+            )
 
 
 def _time_of(

@@ -857,3 +857,16 @@ def test_empty_lines_are_counted_beside_the_short_rows_too(tmp_path, monkeypatch
     (tmp_path / "a.csv").write_text(text + 41 * "\n")
     with pytest.raises(UserError, match="empty lines"):
         read_log(tmp_path / "a.csv")
+
+
+def test_a_reading_of_one_signal_a_row_is_refused_with_what_makes_columns_of_it(tmp_path):
+    path = tmp_path / "long.csv"
+    rows = [f"{name},{k},{60 * k}\n" for k in range(10) for name in ("heater", "oven")]
+    path.write_text("".join(["sensor,state,time_s\n", *rows]))
+    with pytest.raises(UserError) as caught:
+        read_log(path)
+    line = str(caught.value)
+    assert "column sensor: has a reading of one signal in a row, of heater, oven; give each signal" in line
+    assert "pivot_table(index='time_s', columns='sensor', values='state')" in line
+    path.write_text("".join(["note,state,time_s\n", *(f"n{k},{k},{k}\n" for k in range(10))]))  # all differ
+    assert list(read_log(path).data_vars) == ["state"]
