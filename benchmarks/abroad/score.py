@@ -1,11 +1,13 @@
 """What ``identify`` says of public sets, beside what is true on the half that it has not seen.
 
-    python benchmarks/abroad/score.py FOLDER [--sets luca,house] [--each]
+    python benchmarks/abroad/score.py FOLDER [--sets luca,house] [--each [--swapped]]
 
 By set and output: the error stated (of two boards for another run, of the rest for the run itself), that on
 the other half, the share of its readings inside the 90 % band with the band's interval score, of two boards
 by how much the gain is off on the other day; by set: the chosen model, whether it is called good, CPU
-seconds.  ``--each``: every black box beside it, fitted to the whole training half.
+seconds.  ``--each``: every black box beside it, fitted to the whole training half.  ``--swapped``: only the
+black boxes, fitted to the other half and scored on the training half: what errors on unseen data of the same
+plant say of which kind is best.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +25,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, column
 from thermogrip.sysid import identify
 from thermogrip.sysid.blackbox.fit import BLACK_BOXES, fit_black_box
-from thermogrip.sysid.identification import stated_error
+from thermogrip.sysid.identification import USUAL_MODELS, stated_error
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run
 from thermogrip.sysid.validation.prediction_bands import between_runs
@@ -84,7 +87,13 @@ def score_set(some: ForeignSet, each: bool) -> None:
         )
     for row in dict.fromkeys((r.model, r.structure) for r in found.rows if r.held_out) if each else ():
         print(f"    held: {row[0]:9s} {found.errors()[row[0]]:.3f} {row[1]}", flush=True)
-    for kind in BLACK_BOXES if each else ():
+    if each:
+        score_kinds(some, BLACK_BOXES)
+
+
+def score_kinds(some: ForeignSet, kinds: Sequence[str]) -> None:
+    """Print the error of each kind of black box, fitted to the training half."""
+    for kind in kinds:
         began = time.process_time()
         try:
             fit = fit_black_box(kind, [some.train])
@@ -92,7 +101,7 @@ def score_set(some: ForeignSet, each: bool) -> None:
             label = f"{fit.choice.structure.label} dt {fit.plant.dt:g} folds {fit.choice.error:.3f}"
         except UserError as refused:
             error, label = np.nan, str(refused)
-        print(f"    all:  {kind:9s} {error:.3f} {time.process_time() - began:4.0f} s  {label}", flush=True)
+        print(f"    all:  {kind:9s} {error:.4g} {time.process_time() - began:4.0f} s  {label}", flush=True)
 
 
 def main() -> None:
@@ -100,9 +109,17 @@ def main() -> None:
     words.add_argument("folder", type=Path)
     words.add_argument("--sets", help="separated by commas; where absent, all whose files are there")
     words.add_argument("--each", action="store_true")
+    words.add_argument("--swapped", action="store_true")
     given = words.parse_args()
     for name in given.sets.split(",") if given.sets else present(given.folder):
-        score_set(load(given.folder, name), given.each)
+        some = load(given.folder, name)
+        if given.swapped:
+            print(f"{name:10s} swapped", flush=True)
+            score_kinds(
+                replace(some, train=some.test, test=some.train), [k for k in USUAL_MODELS if k != "network"]
+            )
+        else:
+            score_set(some, given.each)
 
 
 if __name__ == "__main__":
