@@ -43,7 +43,7 @@ anew) is in the errors of whole logs that were held out, so in those of a plant 
 two logs cannot show it, and parts of one log share it. Then the gain of the inputs is taken to vary from run
 to run by g = :data:`~thermogrip.sysid.plant.fit_record.RUN_GAIN_SD`, and
 
-    (v(u) - v(u - g (u - u_0)))^2,        u_0 the value nearest to 0 in the logs,
+    (v(u) - v(u - g (u - u_0)))^2,        u_0 the value nearest to 0 in the logs of the fit,
 
 is added to the variance: an input that was 0 at times has its whole effect scaled, and one that never was
 only the effect of its changes, for what it does from 0 on is part of the operating point. Models of two
@@ -178,12 +178,12 @@ def unlike_fit(plant: Plant, log: Log, simulated: Log, warmup: float) -> dict[st
 def between_runs(plant: Plant, logs: Sequence[Log], gain: float = RUN_GAIN_SD) -> dict[str, Array]:
     """Return by output what a gain of the inputs that is off by so much changes at each row of the logs, one
     after the other; empty for a plant of no log, or of so many that their held-out errors show what differs
-    between runs."""
+    between runs. The effect of an input begins at the value nearest to 0 in the fit: a run that holds it has
+    none of its own."""
     if not 0 < len(plant.logs) < SEVERAL:
         return {}
     moving = set(plant.inputs) - set(plant.model.switches)
-    seen = {name: np.concatenate([column(log, name) for log in logs]) for name in moving}
-    nearest = {name: np.clip(0.0, np.nanmin(u), np.nanmax(u)) for name, u in seen.items()}
+    nearest = {name: np.clip(0.0, *plant.valid.get(name, (0.0, 0.0))) for name in moving}
     changes = []
     for log in logs:
         change = columns(plant.simulate(log), plant.outputs)

@@ -125,9 +125,12 @@ def test_an_input_that_never_was_0_varies_about_its_value_nearest_to_0(shift, le
     model = StateSpaceModel(("q",), (), ("t",), A=[[0.5]], B=[[2.0]], C=[[1.0]], dt=1.0)
     time = np.arange(400.0)
     log = make_log(time, {"q": (q, "1", "input"), "t": (0.0 * time, "degC", "output")})
-    added = between_runs(Plant(model, {}, dt=1.0, logs=("a",)), [log])["t"]
+    plant = Plant(model, {}, dt=1.0, logs=("a",), valid={"q": (q.min(), q.max())})
+    added = between_runs(plant, [log])["t"]
     ends = [99, 199, 299, 399]  # at rest, with a gain of 4
     np.testing.assert_allclose(added[ends], 0.05 * 4 * (q[ends] - least), atol=1e-6)
+    held = log.assign(q=log["q"].copy(data=np.full(400, q[99] + 1.0)))  # about the same value as in the fit
+    assert between_runs(plant, [held])["t"][-1] == pytest.approx(0.05 * 4 * (q[99] + 1.0 - least))
 
 
 def test_a_switch_has_no_gain_that_varies(schedule):
