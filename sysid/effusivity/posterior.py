@@ -23,7 +23,12 @@ from thermogrip.sysid.effusivity.data import Touches, touches
 from thermogrip.sysid.effusivity.gripper_model import INSULATOR, GripperModel, another_gripper
 from thermogrip.sysid.effusivity.laplace_approximation import T_OBJECT, H, fit_candidates
 from thermogrip.sysid.effusivity.multi_touch import Coupling, free_touch_fit, touch_groups
-from thermogrip.sysid.effusivity.posterior_grid import GridPosterior, grid_posteriors, mixture_quantiles
+from thermogrip.sysid.effusivity.posterior_grid import (
+    GridPosterior,
+    grid_posteriors,
+    mixed,
+    mixture_quantiles,
+)
 
 
 @dataclass(frozen=True)
@@ -155,22 +160,8 @@ def _by_either(
     share = float(expit(odds))
     if len(theirs) < n or share < _UNLIKELY:
         return own, share
-    return [_mixed(one, theirs[i], share) for i, one in enumerate(own)], share
-
-
-def _mixed(one: GridPosterior, other: GridPosterior, share: float) -> GridPosterior:
-    """Return the mixture of two posteriors of a touch, a ``share`` of the other."""
-
-    def joined(a: Array, b: Array) -> Array:
-        return np.concatenate([(1 - share) * a, share * b])
-
-    return GridPosterior(
-        np.concatenate([one.x, other.x]), joined(one.mass, other.mass),
-        float(np.logaddexp(np.log1p(-share) + one.log_evidence, np.log(share) + other.log_evidence))
-        if share < 1 else other.log_evidence,
-        joined(one.weight, other.weight),
-        *(np.concatenate(pair) for pair in zip(one[4:], other[4:])),
-    )  # fmt: skip
+    odds_of = np.log([max(1 - share, 1e-300), share])
+    return [mixed([one, theirs[i]], odds_of) for i, one in enumerate(own)], share
 
 
 def _row(gripper: GripperModel, name: str, posterior: GridPosterior, share: float = 0.0) -> EffusivityRow:
