@@ -178,7 +178,7 @@ class Traces:
     def law(self, rest: float) -> Array:
         """Return which share of the way to the room is uncertain under each hypothesis, (m,)."""
         slowest = np.where(self.decay > 0, self.decay, np.inf).min(axis=1)
-        return np.hypot(_LAW + _UNEVEN * np.exp(-slowest * rest), self.unlike)
+        return np.asarray(np.hypot(_LAW + _UNEVEN * np.exp(-slowest * rest), self.unlike))
 
     def drop(self, rest: float) -> Array:
         """Return rho of each hypothesis after a rest [s], (m,)."""
@@ -561,10 +561,9 @@ def _moved_on(view: _View, at: Rows, rest: float) -> tuple[Array, Array, Array]:
     m, new = view.hypotheses.ln_h.size, int(view.traces.rest.size)
     silent = Factor(*(np.concatenate([f, np.zeros((m, 1, *f.shape[2:]))], axis=1) for f in factor))
     silent.centre[:, -1] = factor.centre[:, -1]
-    traces = replace(view.traces, **{
-        name: np.append(getattr(view.traces, name), value)
-        for name, value in (("skin", np.nan), ("room", np.nan), ("rest", rest))
-    })  # fmt: skip
+    before = view.traces
+    skin, room = np.append(before.skin, np.nan), np.append(before.room, np.nan)
+    traces = replace(before, skin=skin, room=room, rest=np.append(before.rest, rest))
     prior = _prior(view._replace(traces=traces), np.append(at, new), view.coupling, silent)
     joint = combine(silent, *prior)
     last = slice(-N_SHARED, None)

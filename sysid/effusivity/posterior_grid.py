@@ -160,6 +160,7 @@ class GridPosterior(NamedTuple):
     t_object: Array  # (m,), mean of T_obj there [degC]
     t_object_sd: Array  # (m,) [K]
     ln_h: Array  # (m,)
+    x_sd: Array  # (n,), of the scale of ln e, beside what the gripper's blocks leave open
 
 
 class _Fitted(NamedTuple):
@@ -368,5 +369,5 @@ def posterior_of(x: Array, value: Array, t_object: Array, sd: Array, ln_h: Array
     use = weight > 1e-9 * weight.max()
     return GridPosterior(
         fine, mass, log_total - np.log(LN_E_RANGE[1] - LN_E_RANGE[0]), weight[use] / weight[use].sum(),
-        t_object[use], sd[use], ln_h[use],
+        t_object[use], sd[use], ln_h[use], np.zeros(fine.size),
     )  # fmt: skip
