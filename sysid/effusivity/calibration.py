@@ -439,7 +439,6 @@ _ALWAYS_SD, _SHARE_SD, _ONSET_SD = 0.5, 0.02, 0.2  # of a discrepancy: K, share 
 _NOISE_STEPS = np.array([0.01, 0.1, 0.3, 0.1, 0.2])
 _NOISE_RANGE = np.array([(-8.0, 0.0), (-8.0, 0.0), (-1.0, 4.0), (-9.0, -3.0), (0.0, 2.0)])
 _NOISE_SEARCH, _NOISE_SLOPE = 300, 0.01  # steps at most, and nat per such step that end it
-_NOISE_STARTS = 3  # searches, each from where the last one ended unsettled
 
 
 def calibrate_gripper(
@@ -728,16 +727,12 @@ def _least(cost: Callable[[Array], tuple[float, Array]], first: Array, n_grasp: 
         value, slopes = cost(z * _NOISE_STEPS)
         return value, slopes * _NOISE_STEPS
 
-    z = first / _NOISE_STEPS
-    for _ in range(_NOISE_STARTS):
-        # ftol 0: the slopes alone say when it is over
-        best = minimize(
-            scaled, z, jac=True, method="L-BFGS-B", bounds=_NOISE_RANGE / _NOISE_STEPS[:, None],
-            options={"maxiter": _NOISE_SEARCH, "ftol": 0.0, "gtol": _NOISE_SLOPE},
-        )  # fmt: skip
-        if best.success:
-            break
-        z = best.x  # rounding has spoilt what it learnt of the curvature
+    # ftol 0: the slopes alone say when it is over
+    best = minimize(
+        scaled, first / _NOISE_STEPS, jac=True, method="L-BFGS-B",
+        bounds=_NOISE_RANGE / _NOISE_STEPS[:, None],
+        options={"maxiter": _NOISE_SEARCH, "ftol": 0.0, "gtol": _NOISE_SLOPE},
+    )  # fmt: skip
     if not best.success:
         warnings.warn(
             f"the search for the noise of {n_grasp} grasps ended after {best.nit} steps before it settled "
