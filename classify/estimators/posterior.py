@@ -206,7 +206,7 @@ class PosteriorClassifier(GraspClassifier):
     ) -> tuple[Floats, Floats, list[str]]:
         """Return the log evidence of each candidate, (n_grasp, n_name), joint for touches of one block, and,
         where it is asked for, the posterior probability of a free effusivity beside them, at equal odds of
-        these; and in words which single touches another gripper or block explains."""
+        these; and in words which grasps another gripper, block or loss to the room explains."""
         group = label_values(grasps, "touch_group")
         single = group == ""
         evidence, odds = np.empty((group.size, len(names))), np.full(group.size, np.nan)
@@ -218,8 +218,12 @@ class PosteriorClassifier(GraspClassifier):
             words[single] = found.words
         if not single.all():
             fit = two_touch_fit(self.device_, grasps, names, coupling=self.coupling_, finish=self.as_taught)
-            for at, row in zip(fit.rows, fit.log_evidence):
+            for at, row, loss, as_taught in zip(fit.rows, fit.log_evidence, fit.loss, fit.as_taught):
                 evidence[at] = row
+                if as_taught < 1 - _LIKELY:
+                    words[at] = (
+                        f"read as of a block that loses {loss:.2g} times as much as those of the training"
+                    )
             groups = free_touch_fit(self.device_, grasps, coupling=self.coupling_) if unknown else {}
             for name, fits in groups.items():
                 at = group == name
@@ -311,14 +315,8 @@ class PosteriorClassifier(GraspClassifier):
 
     def beyond_training(self, grasps: Grasps) -> list[str]:
         """Return in words which grasps another gripper or other blocks explain, which blocks rested longer
-        between touches than those of the training, and which sensor of two has no part in the answer."""
-        found, single = [""] * grasps.sizes["grasp"], label_values(grasps, "touch_group") == ""
-        if single.any() and len(self._levels()) > 1:
-            at = np.flatnonzero(single)
-            decided = self._decided(touches(grasps, until=self.longest_, at=at), self.asked())
-            for i, why in zip(at, decided.words):
-                found[i] = why
-        return self._beyond(grasps, found)
+        between touches or lose more than those of the training, and which sensor of two has no part."""
+        return self._beyond(grasps, self._evidence(grasps, self.asked())[2])
 
     def _beyond(self, grasps: Grasps, words: Sequence[str]) -> list[str]:
         """Return what makes the answers overconfident: these ``words``, or what else there is to say."""
@@ -329,7 +327,7 @@ class PosteriorClassifier(GraspClassifier):
         if trained and not has:
             other = "answered by the first sensor alone: the record has no second one"
         notes = [rested if long else other for long in rested_long(grasps, self.coupling_)]
-        return [why or note for why, note in zip(words, notes)]
+        return ["; ".join(filter(None, pair)) for pair in zip(words, notes)]
 
     def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """Return how long contacts of the training lasted; the device has a file of its own."""

@@ -54,6 +54,9 @@ _FILE_KEYS = {
     "uncertain": "in_doubt",
 }  # fmt: skip
 _WIDER = 1.5  # GripperSpread's numbers are guesses themselves: so wide, answers are right as often as stated
+# of ln e on another gripper's scale, which no block of its own anchors: skins go from plain silicone (570) to
+# silicone filled for conduction (1800 W s^0.5 m^-2 K^-1), a factor of three
+ANOTHER_SCALE_SD = 0.6
 NOTHING = 1e-3  # in place of a conductance of nothing, which has no logarithm
 _STACK_NAMES = SHARED_NAMES[: SHARED_NAMES.index("onset")]  # these make a Stack
 _ROUNDING = 1e-6  # a correlation matrix may have an eigenvalue so far below zero by rounding alone

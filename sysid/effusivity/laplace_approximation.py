@@ -98,7 +98,7 @@ from thermogrip.sysid.effusivity.gripper_model import (
 H, BUILD_UP, ONSET, LEVEL, T_OBJECT, EFFUSIVITY, CAPACITY = range(7)
 N_NUISANCE = 7
 _EARLIEST_ONSET = 1.5  # s before the closed message
-_SENSORS_APART = 0.3  # K: two thermistors of 1 %
+SENSORS_APART = 0.3  # K: two thermistors of 1 %
 _DOF, _COUNTS, _GAIN_SD = 20.0, 2.0, 0.1
 _ALIKE_SD = 1.0  # K
 # Tukey's contaminated normal: one stated temperature of an object in twenty is three times as far off
@@ -620,7 +620,7 @@ def joined_modes(first: Mode, prior: Prior, second: Mode, own: Prior, apart: flo
     sensor's own."""
     seen, width = _seen_temperature(second, own)
     off = seen - apart - first.u[:, T_OBJECT]
-    variance = first.covariance[:, T_OBJECT, T_OBJECT] + width + _SENSORS_APART**2
+    variance = first.covariance[:, T_OBJECT, T_OBJECT] + width + SENSORS_APART**2
     evidence = first.log_evidence + second.log_evidence + _log_normal(off, variance)
     evidence -= _log_normal(seen - own.mean[:, T_OBJECT], own.sd[:, T_OBJECT] ** 2 + width)
     settled, misfit = first.converged & second.converged, first.misfit + second.misfit

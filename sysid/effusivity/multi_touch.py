@@ -44,6 +44,18 @@ wood.  And a block's temperature is known to 3 % of its distance from the skin b
 from the skin where s was learnt.  Contact conductance scatters from touch to touch about the block's own by
 ``ln_h_sd``, which may be wider than between grasps of a series.  All of it is learnt from groups of known
 material by maximum likelihood (:func:`learn_coupling`); the defaults are those of the example rig.
+
+Blocks that lose more or less
+-----------------------------
+
+U is that of the training's blocks where they lay.  Free convection alone goes from 2 to 25 W/m2K, so blocks
+of another shape or in another place lose k times as much, ln k of sd 0.64.  A record decides: with a
+probability of 0.8 k is 1, else one of five, and then each block's way to the room is a fifth uncertain more.
+The groups j of a record lie in one place, so group i is answered by the mixture with
+
+    p(k | others) ~ p_k prod_{j != i} [0.9 Z_jk + 0.1 max_l Z_jl],
+
+of which each group decides no more than a factor of ten: it may be of no candidate.
 """
 
 from __future__ import annotations
@@ -52,10 +64,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.atomic_files import read_json, write_json
@@ -92,6 +105,15 @@ _RANGES = {  # of the numbers of a file
 REST = 60.0
 _LAW, _UNEVEN = 0.15, 0.25  # of the way to the room, uncertain in an even block, and more in an uneven one
 _FAR_SD, _FAR = 0.03, 15.0  # of a temperature's distance from the skin, in quadrature beyond so many K
+# k, what blocks lose in units of the training's, and the prior probability of each
+_OTHER_LOSS, _LN_LOSS_SD = 0.2, 0.64
+_LN_K = np.array([0.0, -1.1, -0.55, 0.55, 1.1, 1.65])
+_LOSSES = tuple(np.exp(_LN_K).tolist())
+_OF_OTHERS = np.exp(-0.5 * (_LN_K[1:] / _LN_LOSS_SD) ** 2)
+_LOSS_PRIOR = np.concatenate([[1 - _OTHER_LOSS], _OTHER_LOSS * _OF_OTHERS / _OF_OTHERS.sum()])
+_ELSEWHERE = 0.2  # of the way to the room, uncertain from block to block where k is not 1
+_KNOWN, _STRANGE = np.log([0.9, 0.1])  # that a group is of a candidate, or of none
+_ASKED, _HOPELESS = 5, np.log(1e-3)  # groups that are asked at a time, and when a loss is asked no more
 _INTO = 2.0  # s into the next touch: where its reading knows most of the block
 
 
@@ -151,11 +173,12 @@ class Traces:
     skin: Array  # (n,), the gripper's temperature in the touch [degC]
     room: Array  # (n,), the room's, NaN where unknown [degC]
     rest: Array  # (n,), time since the touch before [s]
+    unlike: float = 0.0  # share of the way that is uncertain besides, from block to block
 
     def law(self, rest: float) -> Array:
         """Return which share of the way to the room is uncertain under each hypothesis, (m,)."""
         slowest = np.where(self.decay > 0, self.decay, np.inf).min(axis=1)
-        return np.asarray(_LAW + _UNEVEN * np.exp(-slowest * rest))
+        return np.asarray(np.hypot(_LAW + _UNEVEN * np.exp(-slowest * rest), self.unlike))
 
     def drop(self, rest: float) -> Array:
         """Return rho of each hypothesis after a rest [s], (m,)."""
@@ -301,6 +324,8 @@ class TouchGroups:
     log_evidence: Array  # (n, m)
     t_object: Array  # (n, m), the block's temperature at the first touch under each candidate [degC]
     t_object_sd: Array  # (n, m) [K]
+    loss: Array  # (n,), what the block loses to the room, in units of what those of the training do
+    as_taught: Array  # (n,), probability that it is as much as those
 
 
 def touch_groups(grasps: Grasps) -> dict[str, Rows]:
@@ -340,19 +365,33 @@ def two_touch_fit(
     """Return the evidence of each candidate from all touches, any number, of each ``touch_group``; the
     nominal temperature of the first alone counts, for the later ones it is what the touches before left."""
     rows = touch_groups(grasps)
+    groups = list(rows.values())
     hypotheses = material_hypotheses(gripper, candidates, finish)
     view = _view(gripper, grasps, hypotheses, coupling or Coupling(), until)
-    fits = _fits(view, list(rows.values()))
-    found = np.array([f.mean[:, 0] for f in fits])
-    skin = view.data.level[[at[0] for at in rows.values()]]
-    own = view.coupling.touch_sd(found - skin[:, None])
-    return TouchGroups(
-        tuple(rows),
-        tuple(rows.values()),
-        np.array([f.log_evidence for f in fits]),
-        found,
-        np.hypot(np.sqrt([f.covariance[:, 0, 0] for f in fits]), own),
-    )
+    skin, m = view.data.level, hypotheses.ln_h.size
+
+    def ask(loss: float, which: list[int]) -> list[Joint]:
+        return _fits(_losing(view, loss), [groups[i] for i in which])
+
+    found = _by_loss(view, groups, ask, lambda fit: float(logsumexp(fit.log_evidence) - np.log(m)))
+    each = [
+        _mixed([fit[i] for fit in found.answers], found.log_prior[:, i], view.coupling, float(skin[at[0]]))
+        for i, at in enumerate(groups)
+    ]
+    evidence, t_object, sd = (np.array(part) for part in zip(*each))
+    return TouchGroups(tuple(rows), tuple(groups), evidence, t_object, sd, found.loss, found.as_taught)
+
+
+def _mixed(
+    fits: Sequence[Joint], log_prior: Array, coupling: Coupling, skin: float
+) -> tuple[Array, Array, Array]:
+    """Return evidence, temperature and its sd at the first touch, (m,) each, of a mixture over losses."""
+    log_z = log_prior[:, None] + np.array([fit.log_evidence for fit in fits])
+    total = logsumexp(log_z, axis=0)
+    share, t = np.exp(log_z - total), np.array([fit.mean[:, 0] for fit in fits])
+    own = np.array([fit.covariance[:, 0, 0] for fit in fits]) + coupling.touch_sd(t - skin) ** 2
+    mean = (share * t).sum(axis=0)
+    return total, mean, np.sqrt((share * (own + (t - mean) ** 2)).sum(axis=0))
 
 
 def free_touch_fit(
@@ -367,12 +406,79 @@ def free_touch_fit(
     data = touches(grasps, until=until)
     whitener, rest = whiten(data, gripper.noise), number_values(grasps, "rest")
 
-    def joint(at: Rows, x: Array) -> Joint:
+    def view(x: Array) -> _View:
         hypotheses = free_hypotheses(gripper, x)
-        view = _View(gripper, data, whitener, hypotheses, traces_of(gripper, data, rest, hypotheses), used)
-        return _fits(view, [at])[0]
+        return _View(gripper, data, whitener, hypotheses, traces_of(gripper, data, rest, hypotheses), used)
 
-    return {name: _free(at, joint, used, data.level[at]) for name, at in rows.items()}
+    groups = list(rows.values())
+
+    def ask(loss: float, which: list[int]) -> list[list[posterior_grid.GridPosterior]]:
+        def joint(at: Rows, x: Array) -> Joint:
+            return _fits(_losing(view(x), loss), [at])[0]
+
+        return [_free(groups[i], joint, used, data.level[groups[i]]) for i in which]
+
+    found = _by_loss(view(np.array([9.0])), groups, ask, lambda fits: fits[0].log_evidence)
+    out = {}
+    for i, name in enumerate(rows):
+        log_z = found.log_prior[:, i] + [fits[i][0].log_evidence for fits in found.answers]
+        touched = zip(*(fits[i] for fits in found.answers))
+        out[name] = [posterior_grid.mixed(parts, log_z) for parts in touched]
+    return out
+
+
+_Answer = TypeVar("_Answer")
+
+
+class _ByLoss(NamedTuple, Generic[_Answer]):
+    """What each group of a record answers if blocks lose k times as much as those of the training."""
+
+    answers: list[list[_Answer]]  # of each k, of each group
+    log_prior: Array  # (n_k, n), of each k by the record's other groups
+    loss: Array  # (n,), k in the mean of its logarithm
+    as_taught: Array  # (n,), probability of k = 1
+
+
+def _by_loss(
+    view: _View, groups: list[Rows], ask: Callable[[float, list[int]], list[_Answer]],
+    evidence: Callable[[_Answer], float],
+) -> _ByLoss[_Answer]:  # fmt: skip
+    """Return what groups answer at each loss that the record leaves open; ``ask`` answers some of them."""
+    several = any(at.size > 1 and np.isfinite(view.traces.room[at]).any() for at in groups)
+    left = np.arange(len(_LOSSES) if several else 1)
+    answers: list[list[_Answer]] = [[] for _ in left]
+    total = np.log(_LOSS_PRIOR[left])
+    # a few at a time, from all over the record: a loss that these rule out is asked about no more
+    order = np.argsort(np.arange(len(groups)) % -(-len(groups) // _ASKED), kind="stable")
+    for first in range(0, len(groups), _ASKED):
+        likely = np.flatnonzero(total > total.max() + _HOPELESS)
+        which, left = order[first : first + _ASKED].tolist(), left[likely]
+        answers = [[*answers[i], *ask(_LOSSES[k], which)] for i, k in zip(likely, left)]
+        log_z = np.array([[evidence(answer) for answer in one] for one in answers])
+        says = np.logaddexp(_KNOWN + log_z, _STRANGE + log_z.max(axis=0))
+        total = np.log(_LOSS_PRIOR[left]) + says.sum(axis=1)
+    log_prior = total[:, None] - says
+    log_prior = log_prior - logsumexp(log_prior, axis=0)
+    share = np.exp(log_prior + log_z - logsumexp(log_prior + log_z, axis=0))
+    back = np.argsort(order)
+    loss, as_taught = np.exp(_LN_K[left] @ share), share[left == 0].sum(axis=0)
+    answers = [[one[i] for i in back] for one in answers]
+    return _ByLoss(answers, log_prior[:, back], loss[back], as_taught[back])
+
+
+def _losing(view: _View, loss: float) -> _View:
+    """Return the view of blocks that lose ``loss`` times as much to the room as those of the training."""
+    if loss == 1.0:
+        return view
+    coupling = replace(view.coupling, loss=loss * view.coupling.loss)
+    gripper, traces = _losing_by(view.gripper, loss), replace(view.traces, unlike=_ELSEWHERE)
+    return view._replace(gripper=gripper, coupling=coupling, traces=traces)
+
+
+def _losing_by(gripper: GripperModel, loss: float) -> GripperModel:
+    second = None if gripper.second is None else _losing_by(gripper.second, loss)
+    stack = replace(gripper.stack, g_far=loss * gripper.stack.g_far)
+    return replace(gripper, stack=stack, second=second)
 
 
 def _free(
@@ -434,18 +540,30 @@ def next_touch_prior(
     at = _one_block(grasps)
     hypotheses = material_hypotheses(gripper, candidates, finish)
     view = _view(gripper, grasps, hypotheses, coupling or Coupling())
+    k = len(_LOSSES) if np.isfinite(view.traces.room[at]).any() else 1
+    each = [_moved_on(_losing(view, loss), at, rest) for loss in _LOSSES[:k]]
+    log_z = np.array([one[0] for one in each]) + np.log(_LOSS_PRIOR[:k, None] / _LOSS_PRIOR[:k].sum())
+    log_evidence = logsumexp(log_z, axis=0)
+    share, means = np.exp(log_z - log_evidence), np.array([one[1] for one in each])
+    mean = (share[:, :, None] * means).sum(axis=0)
+    off = means - mean
+    within = np.array([one[2] for one in each]) + off[:, :, :, None] * off[:, :, None, :]
+    return log_evidence, mean, (share[:, :, None, None] * within).sum(axis=0)
+
+
+def _moved_on(view: _View, at: Rows, rest: float) -> tuple[Array, Array, Array]:
+    """Return log evidence, mean and covariance of the x of another touch at one loss."""
     factor = _factors(view, [at])[0]
     if at.size > 1:
         factor = _factors(view, [at], _cavities(view, [at], [factor]))[0]
     log_evidence = combine(factor, *_prior(view, at, view.coupling, factor)).log_evidence
     # the touch to come: a flat factor, in a row of its own
-    m, new = hypotheses.ln_h.size, int(view.traces.rest.size)
+    m, new = view.hypotheses.ln_h.size, int(view.traces.rest.size)
     silent = Factor(*(np.concatenate([f, np.zeros((m, 1, *f.shape[2:]))], axis=1) for f in factor))
     silent.centre[:, -1] = factor.centre[:, -1]
-    traces = replace(view.traces, **{
-        name: np.append(getattr(view.traces, name), value)
-        for name, value in (("skin", np.nan), ("room", np.nan), ("rest", rest))
-    })  # fmt: skip
+    before = view.traces
+    skin, room = np.append(before.skin, np.nan), np.append(before.room, np.nan)
+    traces = replace(before, skin=skin, room=room, rest=np.append(before.rest, rest))
     prior = _prior(view._replace(traces=traces), np.append(at, new), view.coupling, silent)
     joint = combine(silent, *prior)
     last = slice(-N_SHARED, None)

@@ -20,10 +20,20 @@ from thermogrip.datasets.grasp_files import Records, as_grasps
 from thermogrip.datasets.materials import Material
 from thermogrip.datasets.schema import Grasps, has_touch_groups
 from thermogrip.sysid.effusivity.data import Touches, touches
-from thermogrip.sysid.effusivity.gripper_model import INSULATOR, GripperModel, another_gripper
+from thermogrip.sysid.effusivity.gripper_model import (
+    ANOTHER_SCALE_SD,
+    INSULATOR,
+    GripperModel,
+    another_gripper,
+)
 from thermogrip.sysid.effusivity.laplace_approximation import T_OBJECT, H, fit_candidates
 from thermogrip.sysid.effusivity.multi_touch import Coupling, free_touch_fit, touch_groups
-from thermogrip.sysid.effusivity.posterior_grid import GridPosterior, grid_posteriors, mixture_quantiles
+from thermogrip.sysid.effusivity.posterior_grid import (
+    GridPosterior,
+    grid_posteriors,
+    mixed,
+    mixture_quantiles,
+)
 
 
 @dataclass(frozen=True)
@@ -114,7 +124,8 @@ def effusivity_posterior(
 
     Arguments are those of :func:`material_fit`; ``coupling`` is how blocks move between touches, by default
     those of the example rig; ``other_gripper`` the probability, before the grasps are seen, that another
-    gripper of its kind took them: single touches are answered by both, as likely as each explains them all.
+    gripper of its kind took them: single touches are answered by both, as likely as each explains them all,
+    and another one's scale of effusivities, which no block anchors, is known to 0.6 in the logarithm.
     """
     (grasps,) = as_grasps(grasps)
     rows = touch_groups(grasps) if has_touch_groups(grasps) else {}
@@ -150,33 +161,20 @@ def _by_either(
     for some in (order[:_ASKED], order[_ASKED:]):
         if some.size and (not theirs or expit(odds) > _UNLIKELY):
             fits = grid_posteriors(other, data.take(some))
+            fits = [fit._replace(x_sd=np.full(fit.x.size, ANOTHER_SCALE_SD)) for fit in fits]
             odds += sum(fit.log_evidence - own[i].log_evidence for i, fit in zip(some, fits))
             theirs |= dict(zip(some.tolist(), fits))
     share = float(expit(odds))
     if len(theirs) < n or share < _UNLIKELY:
         return own, share
-    return [_mixed(one, theirs[i], share) for i, one in enumerate(own)], share
-
-
-def _mixed(one: GridPosterior, other: GridPosterior, share: float) -> GridPosterior:
-    """Return the mixture of two posteriors of a touch, a ``share`` of the other."""
-
-    def joined(a: Array, b: Array) -> Array:
-        return np.concatenate([(1 - share) * a, share * b])
-
-    return GridPosterior(
-        np.concatenate([one.x, other.x]), joined(one.mass, other.mass),
-        float(np.logaddexp(np.log1p(-share) + one.log_evidence, np.log(share) + other.log_evidence))
-        if share < 1 else other.log_evidence,
-        joined(one.weight, other.weight),
-        *(np.concatenate(pair) for pair in zip(one[4:], other[4:])),
-    )  # fmt: skip
+    odds_of = np.log([max(1 - share, 1e-300), share])
+    return [mixed([one, theirs[i]], odds_of) for i, one in enumerate(own)], share
 
 
 def _row(gripper: GripperModel, name: str, posterior: GridPosterior, share: float = 0.0) -> EffusivityRow:
     scale, scale_sd = gripper.effusivity_scale(posterior.x)
     scatter = np.where(np.exp(posterior.x) < INSULATOR, gripper.spreads.ln_effusivity, 0.0)
-    x, sd = posterior.x - scale, np.hypot(np.hypot(scale_sd, scatter), 1e-4)
+    x, sd = posterior.x - scale, np.sqrt(scale_sd**2 + scatter**2 + posterior.x_sd**2 + 1e-8)
     low, middle, high = np.exp(mixture_quantiles(posterior.mass, x, sd, (0.05, 0.5, 0.95)))
     mean = float((posterior.mass * x).sum())
     variance = float((posterior.mass * ((x - mean) ** 2 + sd**2)).sum())

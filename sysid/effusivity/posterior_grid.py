@@ -24,6 +24,7 @@ the unit vectors, w_k = 1/6, the rule that is exact for all cubics of three norm
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -159,6 +160,7 @@ class GridPosterior(NamedTuple):
     t_object: Array  # (m,), mean of T_obj there [degC]
     t_object_sd: Array  # (m,) [K]
     ln_h: Array  # (m,)
+    x_sd: Array  # (n,), of the scale of ln e, beside what the gripper's blocks leave open
 
 
 class _Fitted(NamedTuple):
@@ -225,6 +227,21 @@ def _left_out(gripper: GripperModel, data: Touches, noise: tuple[Array, Array], 
     everywhere = PchipInterpolator(x[at], missing)(np.clip(x, x[at[0]], x[at[-1]]))
     weight = np.exp(value - value.max()) * np.gradient(x)
     return np.asarray(everywhere - (weight * everywhere).sum() / weight.sum())
+
+
+def mixed(parts: Sequence[GridPosterior], log_weight: Array) -> GridPosterior:
+    """Return the mixture of posteriors of one grasp whose prior odds times evidence are ``log_weight``
+    (n_part,)."""
+    total = float(logsumexp(log_weight))
+    share = np.exp(log_weight - total)
+
+    def joined(arrays: Iterable[Array]) -> Array:
+        return np.concatenate([s * array for s, array in zip(share, arrays)])
+
+    return GridPosterior(
+        np.concatenate([p.x for p in parts]), joined(p.mass for p in parts), total,
+        joined(p.weight for p in parts), *(np.concatenate(rest) for rest in zip(*(p[4:] for p in parts))),
+    )  # fmt: skip
 
 
 def mixture_quantiles(weight: Array, mean: Array, sd: Array, levels: tuple[float, ...]) -> Array:
@@ -352,5 +369,5 @@ def posterior_of(x: Array, value: Array, t_object: Array, sd: Array, ln_h: Array
     use = weight > 1e-9 * weight.max()
     return GridPosterior(
         fine, mass, log_total - np.log(LN_E_RANGE[1] - LN_E_RANGE[0]), weight[use] / weight[use].sum(),
-        t_object[use], sd[use], ln_h[use],
+        t_object[use], sd[use], ln_h[use], np.zeros(fine.size),
     )  # fmt: skip

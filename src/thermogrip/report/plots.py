@@ -276,23 +276,33 @@ def grasps_chart(records: Mapping[str, Sequence[Grasps]], materials: Sequence[st
 
 
 def exchange_figure(
-    effusivity: Mapping[str, float], *, e_dev: float, seconds: float = 10.0, area: float = 4e-4
-) -> Figure:
-    """Draw the heat that two half-spaces in perfect contact exchange, over the difference and over the area.
+    effusivity: Mapping[str, float], *, e_dev: float, seconds: float = 10.0, area: float = 4e-4,
+    scatter: float = 0.5,
+) -> Figure:  # fmt: skip
+    """Draw what two half-spaces in perfect contact exchange: heat, over the difference and over the area, and
+    how far the skin's surface moves, over the difference.
 
-    The flux e_dev (T_s - T_dev) / sqrt(pi t), T_s - T_dev = dT / (1 + e_dev / e_obj), has the integral
-    2 e_dev dT sqrt(t / pi) / (1 + e_dev / e_obj).
+    T_s - T_dev = dT / (1 + e_dev / e_obj); the flux e_dev (T_s - T_dev) / sqrt(pi t) has the integral
+    2 e_dev (T_s - T_dev) sqrt(t / pi).
     """
-    figure, axes = panels(1, 2, size=(7.6, 3.0))
+    figure, axes = panels(1, 3, size=(9.6, 3.0))
     difference, areas = np.linspace(0, 20, 41), np.linspace(0, 6e-4, 41)
     for k, (name, e_obj) in enumerate(effusivity.items()):
-        share = 2 * e_dev * np.sqrt(seconds / np.pi) / (1 + e_dev / e_obj)
+        moved = 1 / (1 + e_dev / e_obj)
+        share = 2 * e_dev * np.sqrt(seconds / np.pi) * moved
         axes[0, 0].plot(difference, share * area * difference, color=PALETTE[k % 8], label=name)
         for dT, style in ((5.0, ":"), (20.0, "-")):
             axes[0, 1].plot(1e4 * areas, share * areas * dT, color=PALETTE[k % 8], ls=style)
+        axes[0, 2].plot(difference, moved * difference, color=PALETTE[k % 8])
+        axes[0, 2].fill_between(
+            difference, moved * difference - scatter, moved * difference + scatter, color=PALETTE[k % 8],
+            alpha=0.15, lw=0,
+        )  # fmt: skip
     axes[0, 0].set_xlabel(f"temperature difference [K], {1e4 * area:g} cm\u00b2")
     axes[0, 1].set_xlabel("contact area [cm\u00b2], 20 K (lines) and 5 K (dots)")
+    axes[0, 2].set_xlabel("temperature difference [K]")
     axes[0, 0].set_ylabel(f"heat in {seconds:g} s [J]")
+    axes[0, 2].set_ylabel(f"surface moves by [K], \u00b1 {scatter:g} K")
     axes[0, 0].legend(frameon=False, fontsize=8)
     return figure
 

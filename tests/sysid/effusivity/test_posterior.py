@@ -74,6 +74,7 @@ def test_either_gripper_s_answer_is_the_mixture_of_both(device):
     assert 0.05 < share < 0.95
     means = [(fit.mass * (fit.x - device.effusivity_scale(fit.x)[0])).sum() for fit in (own, other)]
     alone = [_row(device, "", fit, 0.0).log10_effusivity_sd * np.log(10) for fit in (own, other)]
+    alone[1] = np.hypot(alone[1], 0.6)  # no block anchors the other one's scale
     mean = (1 - share) * means[0] + share * means[1]
     variance = sum(w * (s**2 + (m - mean) ** 2) for w, s, m in zip((1 - share, share), alone, means))
     assert row.log10_effusivity_sd * np.log(10) == pytest.approx(np.sqrt(variance), rel=1e-6)
@@ -258,10 +259,11 @@ def test_a_row_is_made_of_two_mixtures(device):
     """Over two effusivities and two temperatures; the scale's error and an insulator's scatter on top."""
     x, mass, weight = np.array([7.0, 7.2]), np.array([0.3, 0.7]), np.array([0.25, 0.75])
     for shift in (0.0, 2.0):  # an insulator, a metal
-        made = GridPosterior(x + shift, mass, 0.0, weight, np.array([20.0, 24.0]), np.array([0.1, 0.2]), x)
+        t, t_sd, x_sd = np.array([20.0, 24.0]), np.array([0.1, 0.2]), shift * np.array([0.0, 0.3])
+        made = GridPosterior(x + shift, mass, 0.0, weight, t, t_sd, x, x_sd)
         row = _row(device, "g", made)
         scale, sd = device.effusivity_scale(made.x)
-        sd = np.sqrt(sd**2 + (device.spreads.ln_effusivity**2 if shift == 0 else 0.0) + 1e-8)
+        sd = np.sqrt(sd**2 + x_sd**2 + (device.spreads.ln_effusivity**2 if shift == 0 else 0.0) + 1e-8)
         below = [
             (mass * norm.cdf((np.log(e) - made.x + scale) / sd)).sum()
             for e in (row.effusivity_p05, row.effusivity, row.effusivity_p95)
