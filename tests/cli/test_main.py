@@ -212,7 +212,7 @@ def test_no_words_show_the_help(capsys: pytest.CaptureFixture[str]) -> None:
         (["nope"], "No such command 'nope'"),
         (["identfy", "a.csv"], "Did you mean 'identify'"),
         (["--nope"], "No such option"),
-        (["identify"], "Missing argument 'LOG...'; see thermogrip identify --help"),
+        (["identify"], "Missing argument 'LOG...'; for example thermogrip identify log.csv --out plant.json"),
         (["tune", "a.json"], "Missing option '--out'"),
         (["demo", "--seed", "many"], "'--seed'"),
         (["run", "c.json", "--target", "warm", "--out", "x"], "'--target'"),
@@ -229,6 +229,12 @@ def test_a_bad_option_is_one_line_and_code_2(
     assert err.count("\n") == 1
     assert err.startswith("thermogrip: ")
     assert says in err
+
+
+def test_help_of_a_verb_is_its_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["help", "materials"]) == main(["materials", "--help"]) == 0
+    asked, usual = capsys.readouterr().out.split("Usage: thermogrip materials")[1:]
+    assert asked == usual
 
 
 def test_ctrl_c_while_the_program_is_imported_is_one_quiet_line() -> None:

@@ -566,7 +566,8 @@ def _drift_of(path: Path, plant: Plant, stated: float) -> PlantDrift:
 
 def _targets(target: str) -> float | dict[str, float]:
     """Return one target or targets by output ("38", "t1=40,t2=35"), inside what a skin may be brought to."""
-    hint = "write one [degC], or t1=40,t2=35 for several outputs"
+    bare = target.rstrip("degC° ") or "one"
+    hint = f"write {bare} [degC], or t1=40,t2=35 for several outputs"
     with as_user_error(ValueError, f"'--target' {target!r} is no temperature", hint=hint):
         values = cli.numbers("--target", target) if "=" in target else float(target)
     for value in values.values() if isinstance(values, dict) else (values,):

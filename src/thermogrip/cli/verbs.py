@@ -15,7 +15,7 @@ from typing import Any
 
 from typer.core import TyperCommand, TyperGroup
 
-from thermogrip.cli.kinds import check_files
+from thermogrip.cli.kinds import TYPED, check_files
 from thermogrip.datasets.media import printable
 from thermogrip.datasets.provenance import note_seed
 
@@ -54,6 +54,7 @@ class Verb(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Give an option its usual value where it stands alone."""
+        ctx.meta[TYPED] = args
         words: list[str] = []
         for word, after in zip(args, [*args[1:], ""]):
             words += [word, ALONE[word]] if word in ALONE and not after.isdigit() else [word]
