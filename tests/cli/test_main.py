@@ -155,11 +155,18 @@ def test_the_help_says_of_each_verb_a_whole_sentence(capsys: pytest.CaptureFixtu
 
 
 def test_what_is_next_is_said_on_stderr_with_what_was_given(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "a spec.toml"
     assert main(["init", "spec", "--out", str(out)]) == 0
     assert capsys.readouterr().err == f"next: thermogrip tune PLANT --spec '{out}' --out controller.json\n"
+    assert main(["init", "guard"]) == 0  # on stdout: once more, into a file
+    assert capsys.readouterr().err == "next: thermogrip init guard --out guard.toml\n"
+    monkeypatch.chdir(tmp_path)
+    assert main(["init", "examples"]) == 0
+    [then] = capsys.readouterr().err.splitlines()
+    assert then == "next: thermogrip identify ./multisine.csv.xz --out plant.json"
+    assert Path("./multisine.csv.xz").is_file()
     assert main(["materials", "copper", "--json"]) == 0
     assert main(["materials", "gold leaf"]) == 2
     assert "next:" not in capsys.readouterr().err

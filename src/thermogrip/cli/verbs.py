@@ -9,6 +9,7 @@ import re
 import shlex
 import sys
 import tomllib
+from collections.abc import Sequence
 from functools import cache
 from importlib import resources
 from typing import Any
@@ -67,13 +68,21 @@ class Verb(TyperCommand):
         code = super().invoke(ctx)
         if not code and not ctx.params.get("as_json"):
             sys.stdout.flush()
-            sys.stderr.write(f"next: thermogrip {self.next({k: v for k, v in ctx.params.items() if v})}\n")
+            given = {name: value for name, value in ctx.params.items() if value}
+            sys.stderr.write(f"next: thermogrip {self.next(given, ctx.meta[TYPED])}\n")
         return code
 
-    def next(self, given: dict[str, Any]) -> str:
-        """Return the command that comes next, with what was given in place of its names."""
+    def next(self, given: dict[str, Any], typed: Sequence[str] = ()) -> str:
+        """Return the command that comes next, with what was given in place of its names: what was typed once
+        more where that wrote no file for it."""
         words = {str(param.name): str(param.metavar).split("|")[0] for param in self.params}
-        then = self.then if isinstance(self.then, str) else self.then[given.get("what", "network")]
+        what = given.get("what", "")
+        then = self.then if isinstance(self.then, str) else self.then[what or "network"]
+        if what == "examples":
+            words["out"] = "."
+        elif typed and "{out}" in then and "out" not in given:
+            file = f"{what}.toml" if what else self.examples[0].rpartition("--out ")[2]
+            return printable(shlex.join([str(self.name), *typed, "--out", file]))
         return str(then).format(**words | {k: printable(shlex.quote(str(v))) for k, v in given.items()})
 
     def get_short_help_str(self, limit: int = 200) -> str:
