@@ -182,6 +182,10 @@ def test_help_is_as_wide_as_the_terminal_and_at_most_100_columns_of_a_pipe(
         shown = capsys.readouterr().out
         assert least < max(map(len, shown.split("Examples:")[0].splitlines())) <= most
         assert "\x1b" not in shown
+    monkeypatch.setattr("sys.stdout.isatty", lambda: False)
+    for verb in VERBS:
+        main([str(verb), "--help"])
+        assert max(map(len, capsys.readouterr().out.splitlines())) <= 100, verb
 
 
 def test_help_ends_no_line_within_a_word(
