@@ -75,7 +75,7 @@ class Verb(TyperCommand):
     def next(self, given: dict[str, Any], typed: Sequence[str] = ()) -> str:
         """Return the command that comes next, with what was given in place of its names: what was typed once
         more where that wrote no file for it."""
-        words = {str(param.name): str(param.metavar).split("|")[0] for param in self.params}
+        words = {str(param.name): str(param.metavar).split("|")[0].rstrip(".") for param in self.params}
         what = given.get("what", "")
         then = self.then if isinstance(self.then, str) else self.then[what or "network"]
         if what == "examples":
@@ -83,7 +83,9 @@ class Verb(TyperCommand):
         elif typed and "{out}" in then and "out" not in given:
             file = f"{what}.toml" if what else self.examples[0].rpartition("--out ")[2]
             return printable(shlex.join([str(self.name), *typed, "--out", file]))
-        return str(then).format(**words | {k: printable(shlex.quote(str(v))) for k, v in given.items()})
+        for name, value in given.items():
+            words[name] = printable(shlex.join(map(str, value if isinstance(value, list) else [value])))
+        return str(then).format(**words)
 
     def get_short_help_str(self, limit: int = 200) -> str:
         """Return the first sentence of the help, whole."""
