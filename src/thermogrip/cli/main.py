@@ -136,5 +136,5 @@ def _option_line(error: typer.TyperException) -> str:
 
 def _given(error: Exception) -> str:
     """Return what an option was given that its type cannot take, "" where that is not known."""
-    found = getattr(error.__cause__, "errors", list)()
+    found: list[dict[str, object]] = getattr(error.__cause__, "errors", list)()
     return str(found[0]["input"]) if found else ""
