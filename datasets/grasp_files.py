@@ -380,7 +380,7 @@ def _read_meta(path: Path, order: list[str], file: str) -> tuple[dict[str, Any],
     strange = []
     for header, cells in table.text.items():
         name, unit = split_header(header) if re.fullmatch(r"\S+", header) else ("", "")
-        name = _FROM_META.get(name, name)
+        name = name.lower() if name.lower() in GRASP_LABELS else _FROM_META.get(name, name)  # "Material"
         if name in found:
             raise UserError(f"gives {name} a second time", file=path, column=header, hint="keep one")
         if name in GRASP_NUMBERS:

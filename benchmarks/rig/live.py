@@ -1,6 +1,6 @@
 """What a live page costs the control loop, and what holds where one end is killed or a request is forged.
 
-    python benchmarks/rig/live.py --seconds 240
+    chrt -f 1 python benchmarks/rig/live.py --seconds 120 --block 5     other work of the computer is kept out
 
 **Cost.**  One loop, as a session runs it (guard, controller, snapshot), regulates a twin that waits on the
 computer's clock, at 100 Hz, and keeps when each sample began.  Blocks of ``--block`` seconds alternate:

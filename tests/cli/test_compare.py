@@ -149,6 +149,7 @@ def test_the_answer_holds_scores_notes_and_intervals_of_each_split(scored: Simpl
     both = scored.bench.run("compare", "grasps.csv", "--classifiers", "lstm,bayes", "--out", "d")
     assert (both.code, both.err.count("warning: left out: lstm needs torch")) == (0, 1)
     assert list(scored.scored[-1].args[0]) == ["bayes"]
+    assert both.err.endswith("next: thermogrip train grasps.csv --classifier posterior --out MODEL_DIR\n")
     refused = scored.bench.run("compare", "grasps.csv", "--classifiers", "lstm", "--out", "c")
     assert (refused.code, refused.said) == (2, ["thermogrip: lstm needs torch"])
 

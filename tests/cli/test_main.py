@@ -155,11 +155,18 @@ def test_the_help_says_of_each_verb_a_whole_sentence(capsys: pytest.CaptureFixtu
 
 
 def test_what_is_next_is_said_on_stderr_with_what_was_given(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "a spec.toml"
     assert main(["init", "spec", "--out", str(out)]) == 0
     assert capsys.readouterr().err == f"next: thermogrip tune PLANT --spec '{out}' --out controller.json\n"
+    assert main(["init", "guard"]) == 0  # on stdout: once more, into a file
+    assert capsys.readouterr().err == "next: thermogrip init guard --out guard.toml\n"
+    monkeypatch.chdir(tmp_path)
+    assert main(["init", "examples"]) == 0
+    [then] = capsys.readouterr().err.splitlines()
+    assert then == "next: thermogrip identify ./multisine.csv.xz --out plant.json"
+    assert Path("./multisine.csv.xz").is_file()
     assert main(["materials", "copper", "--json"]) == 0
     assert main(["materials", "gold leaf"]) == 2
     assert "next:" not in capsys.readouterr().err
@@ -175,6 +182,10 @@ def test_help_is_as_wide_as_the_terminal_and_at_most_100_columns_of_a_pipe(
         shown = capsys.readouterr().out
         assert least < max(map(len, shown.split("Examples:")[0].splitlines())) <= most
         assert "\x1b" not in shown
+    monkeypatch.setattr("sys.stdout.isatty", lambda: False)
+    for verb in VERBS:
+        main([str(verb), "--help"])
+        assert max(map(len, capsys.readouterr().out.splitlines())) <= 100, verb
 
 
 def test_help_ends_no_line_within_a_word(
@@ -212,7 +223,7 @@ def test_no_words_show_the_help(capsys: pytest.CaptureFixture[str]) -> None:
         (["nope"], "No such command 'nope'"),
         (["identfy", "a.csv"], "Did you mean 'identify'"),
         (["--nope"], "No such option"),
-        (["identify"], "Missing argument 'LOG...'; see thermogrip identify --help"),
+        (["identify"], "Missing argument 'LOG...'; for example thermogrip identify log.csv --out plant.json"),
         (["tune", "a.json"], "Missing option '--out'"),
         (["demo", "--seed", "many"], "'--seed'"),
         (["run", "c.json", "--target", "warm", "--out", "x"], "'--target'"),
@@ -229,6 +240,12 @@ def test_a_bad_option_is_one_line_and_code_2(
     assert err.count("\n") == 1
     assert err.startswith("thermogrip: ")
     assert says in err
+
+
+def test_help_of_a_verb_is_its_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["help", "materials"]) == main(["materials", "--help"]) == 0
+    asked, usual = capsys.readouterr().out.split("Usage: thermogrip materials")[1:]
+    assert asked == usual
 
 
 def test_ctrl_c_while_the_program_is_imported_is_one_quiet_line() -> None:

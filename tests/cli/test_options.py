@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -164,3 +165,21 @@ def test_what_was_repaired_in_grasps_is_reported_five_times_and_then_counted(
     said += ["clean: no contact?", "a block in two files"]
     assert capsys.readouterr().err.splitlines() == [f"thermogrip: warning: {words}" for words in said]
     assert torn[0].args == ([record, clean],)
+
+
+def test_a_port_that_is_not_there_is_refused_with_those_that_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.platform", "linux")
+    options.check_port(str(tmp_path))
+    options.check_port("socket://10.0.0.7:5000")
+    there = {"ttyACM*": [Path("/dev/ttyACM1"), Path("/dev/ttyACM0")]}
+    monkeypatch.setattr(Path, "glob", lambda self, pattern: there.get(pattern, []))
+    meant = "use /dev/ttyACM0, /dev/ttyACM1; check name, cable and power; did you mean '/dev/ttyACM0'?"
+    with pytest.raises(UserError, match=re.escape(f"ttyACM0: no such port; {meant}")):
+        options.check_port("ttyACM0")
+    there.clear()
+    with pytest.raises(UserError, match="no such port; none is here; check name, cable and power"):
+        options.check_port("/dev/ttyACM0.gone")
+    monkeypatch.setattr("sys.platform", "win32")
+    options.check_port("COM3")  # no file

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,6 +20,7 @@ from thermogrip.live.watch import Watch
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.report.console import Console
 from thermogrip.rig import Session
+from thermogrip.rig.guard.guard import GuardSettings
 from thermogrip.rig.guard.plant_mismatch import USUAL_DRIFT
 from thermogrip.rig.guard.trip import Trip
 from thermogrip.rig.records.batch import Batch, Trial
@@ -219,19 +221,20 @@ def test_words_reach_the_session_on_a_twin(ran: SimpleNamespace, stand_in: Stand
 
 def test_words_reach_the_session_on_a_port(ran: SimpleNamespace) -> None:
     ran.session = Session(None, None, (), "not settled", "wait longer", float("nan"), 0.125, float("nan"))
-    words = ["run", "c.json", "--target", "t_surface=40", "--port", "COM3", "--speed", "5", "--out", "r"]
+    words = ["run", "c.json", "--target", "t_surface=40", "--port", "socket://rig", "--out", "r"]
+    words += ["--speed", "5"]
     done = ran.bench.run(*words, "--protocol", "tclab")
     assert (done.code, ran.closed, ran.pages) == (3, [True], [])
     [rig], [session], [folder] = ran.rigs, ran.sessions, ran.folders
-    assert (rig.args[:2], rig.args[3:6], rig.t_start) == (("COM3", "tclab"), (None, None, 0), None)
+    assert (rig.args[:2], rig.args[3:6], rig.t_start) == (("socket://rig", "tclab"), (None, None, 0), None)
     assert (session.clock is rig.args[2], rig.args[2].speed) == (True, 5.0)
     assert (session.args[2], session.grasp, session.stop) == ({"t_surface": 40.0}, None, None)
     assert (session.hold, session.grasp_time, session.settle_timeout) == (0.0, 10.0, 900.0)
-    assert folder.args[1]["port"] == "COM3"
+    assert folder.args[1]["port"] == "socket://rig"
     assert "twin" not in folder.args[1]
     assert not ran.beyond[0].grasps
     said = words_of(done.out)
-    assert said.startswith("COM3, to t_surface 40 degC verdict")
+    assert said.startswith("socket://rig, to t_surface 40 degC verdict")
     assert said.endswith("not settled - 0.125 - wait longer wrote r")
     assert json.loads(ran.bench.run(*words, "--json").out) == {
         "verdict": "not settled", "advice": "wait longer", "settle_time": None, "overshoot": 0.125,
@@ -249,14 +252,14 @@ def test_a_contact_ends_early_only_where_there_is_one(ran: SimpleNamespace) -> N
     assert not ran.rigs
 
 
-PORT = ["--port", "COM7", "--speed", "3", "--protocol", "tclab"]
+PORT = ["--port", "socket://rig", "--speed", "3", "--protocol", "tclab"]
 
 
 @pytest.mark.parametrize(
     ("where", "about", "asks", "on_rig"),
     [
-        (PORT, {"port": "COM7"}, True, True),
-        ([*PORT, "--no-ask"], {"port": "COM7"}, False, True),
+        (PORT, {"port": "socket://rig"}, True, True),
+        ([*PORT, "--no-ask"], {"port": "socket://rig"}, False, True),
         (["--twin", "plant.json", "--draw", "3", "--seed", "5"], {"twin": "plant.json", "draw": 3, "seed": 5},
          False, False),
     ],
@@ -290,13 +293,14 @@ def test_a_batch_keeps_on_what_it_ran_and_fails_while_a_trial_is_left(
     assert (type(call.args[1]), len(call.args[2]), call.args[3]) == (Controller, 2, Path("out"))
     assert call.first_touch is verbs._first_touch
     assert guards[0].args == (Path("g.toml"), call.args[1].plant, Path("rig.json"))
+    assert guards[0].speed == (3.0 if on_rig else 1.0)
     files = {"controller": "c.json", "plan": "plan.csv", "guard": "g.toml"} | (
         {} if on_rig else {"plant": "plant.json"}
     )
     assert call.files == {name: Path(file) for name, file in files.items()}
     [rig] = opened
     twin = None if on_rig else Path("plant.json")
-    assert rig.args[:2] == (("COM7", "tclab") if on_rig else (None, None))
+    assert rig.args[:2] == (("socket://rig", "tclab") if on_rig else (None, None))
     assert rig.args[3:] == (twin, None, 0 if on_rig else 3, call.args[1])
     assert (rig.args[2].speed, rig.seed, rig.t_start) == (3.0 if on_rig else 1.0, 0 if on_rig else 5, None)
     assert done.out.splitlines() == [f"{2 - left} of 2 grasps are good: stopped", "go on"]
@@ -471,17 +475,17 @@ def test_a_schedule_is_played_and_its_rows_are_counted(
     guards = stand_in("thermogrip.cli.rig.guard_of", "a guard")
     monkeypatch.setattr("thermogrip.rig.records.run_folder.RunFolder", Folder)
     bench.write("g.toml", "")
-    words = ["record", "good.csv", "--port", "COM3", "--out", "r"]
+    words = ["record", "good.csv", "--port", "socket://rig", "--out", "r"]
     done = bench.run(*words, "--sample", "0.5", "--guard", "g.toml", "--speed", "4", "--protocol", "tclab",
                      "--seed", "3")  # fmt: skip
     assert (done.code, closed) == (code, [True]), done
     [opens], [call] = opened, plays
-    assert (opens.args, opens.clock.speed) == (("COM3", "tclab"), 4.0)
+    assert (opens.args, opens.clock.speed) == (("socket://rig", "tclab"), 4.0)
     assert (tried[0].args[0].attrs["name"], tried[0].args[1:]) == ("good", ({"drive": "1"}, 0.5))
-    assert guards[0].args == (Path("g.toml"), None)
+    assert (guards[0].args, guards[0].speed) == ((Path("g.toml"), None), 4.0)
     assert (call.args[0], call.args[1].attrs["name"], call.dt) == (made, "good", 0.5)
     assert (call.guard, call.clock is opens.clock) == ("a guard", True)
-    about = {"schedule": "good.csv", "port": "COM3", "sample_s": 0.5, "seed": 3}
+    about = {"schedule": "good.csv", "port": "socket://rig", "sample_s": 0.5, "seed": 3}
     assert folders == [((Path("r"), about), {"files": {"guard": Path("g.toml")}}), ended]
     assert shares(done.err, "record") == [50]
     assert done.out == (f"{ended}\n" if ended else "") + "wrote 77 rows to r/samples.csv\n"
@@ -496,7 +500,7 @@ def test_a_schedule_that_cannot_be_played_is_refused_by_its_name_and_the_port_is
     made = SimpleNamespace(units={}, close=lambda: closed.append(True))
     stand_in("thermogrip.rig.drivers.connect.open_rig", made)
     stand_in("thermogrip.rig.session.session.Playback", UserError("too high", hint="lower"))
-    done = bench.run("record", "good.csv", "--port", "COM3", "--out", "r")
+    done = bench.run("record", "good.csv", "--port", "socket://rig", "--out", "r")
     assert (done.code, done.said, closed) == (2, ["thermogrip: good.csv: too high; lower"], [True])
     assert not (bench.path / "r").exists()
 
@@ -509,7 +513,7 @@ def test_a_guard_file_that_is_wrong_is_refused_before_a_port_is_opened(
     bench.write("plan.csv", "material,target_degC\ncopper,30\n")
     bench.write("g.toml", "stale_ms = 500\n")
     opened = stand_in("thermogrip.rig.drivers.connect.open_rig", SimpleNamespace(units={"drive": "1"}))
-    done = bench.run(*words.split(), "--port", "COM3", "--guard", "g.toml", "--out", "r")
+    done = bench.run(*words.split(), "--port", "socket://rig", "--guard", "g.toml", "--out", "r")
     assert (done.code, len(done.said), opened) == (2, 1, [])
     assert done.said[0].startswith("thermogrip: g.toml: stale_ms: no such key")
     assert not (bench.path / "r").exists()
@@ -534,6 +538,13 @@ def test_a_guard_has_its_file_or_the_defaults_and_learns_only_of_a_plant(
     assert [call.drift for call in guards] == [None, None, None, "a drift"]
     assert [call.args for call in read] == [(Path("g.toml"),)]
     assert drifts[0].args == (tmp_path, "a plant", 0.125)
+
+
+def test_clocks_of_a_faster_virtual_device_are_as_far_apart_in_seconds_of_the_computer() -> None:
+    usual = GuardSettings()
+    for speed, times in ((1.0, 1.0), (0.5, 1.0), (4.0, 4.0)):
+        wider = replace(usual, clock_slack_s=times * usual.clock_slack_s)
+        assert verbs.guard_of(None, None, speed=speed).settings == wider
 
 
 def test_a_rig_that_nobody_knows_drifts_as_is_usual_or_as_the_guard_file_says(tmp_path: Path) -> None:

@@ -283,6 +283,9 @@ def test_columns_of_the_meta_file_that_mean_nothing_are_left_out_and_reported(pa
     file = pair(samples("a", "b"), meta)
     grasps = read_grasps(file)
     assert grasps["material"].values.tolist() == ["copper", "wood"]
+    named = read_grasps(pair(samples("a", "b"), "grasp_id,Material,SPLIT\na,copper,train\nb,wood,test\n"))
+    assert named["material"].values.tolist() == ["copper", "wood"]
+    assert named["split"].values.tolist() == ["train", "test"]
     line = grasps.attrs["repairs"].splitlines()[-1]
     assert line.startswith("g_meta.csv: not used: object temp, t_room_degC; known are ")
     assert "t_ambient_degC" in line

@@ -120,6 +120,20 @@ MISTAKES = {
     "tune plant.json --spec guard.toml --out c.json": "is a guard's settings, not a spec of tune",
     "identify log.csv --network spec.toml": "is a spec of tune, not a thermal network; it is for tune",
     "identify net.toml": "write identify LOG... --network NAME|FILE",
+    # what is missing, and values
+    "run controller.json --target 38 --out r": "give --port DEV, or --twin PLANT",
+    "batch controller.json plan.csv --out b": "give --port DEV, or --twin PLANT",
+    "run controller.json --target 38C --twin plant.json --out r": "write 38 [degC]",
+    "identify log.csv --inputs drive pump": "joined by commas: --inputs drive,pump",
+    "identify log.csv --average 10s": "write --average 10;",
+    "excite --kind prbs --minutes 0 --out s.csv": "greater than or equal to 0.1",
+    "validate log.csv": "for example thermogrip validate plant.json log.csv@1350:",
+    "train grasps.csv --out m": "for example thermogrip train grasps.csv --classifier posterior --out model",
+    "excite prbs --minutes 5 --out s.csv": "for example thermogrip excite --kind prbs",
+    "classify grasps.csv --out p.csv": "write classify MODEL_DIR GRASPS...",
+    "effusivity grasps.csv --calibrate log.csv --out e.csv": "is a log, not a file of grasps",
+    "compare grasps.csv --test grasps.csv --out c": "give others to --test, or leave it out",
+    "record schedule.csv --port ttyACM9 --out r": "check name, cable and power",
 }  # fmt: skip
 
 

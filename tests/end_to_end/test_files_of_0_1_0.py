@@ -14,8 +14,14 @@ from thermogrip.classify import classify_grasps, load_classifier
 from thermogrip.cli.main import main
 from thermogrip.datasets import read_grasps
 from thermogrip.datasets.examples import load_example_logs
+from thermogrip.datasets.log_files import read_log
+from thermogrip.datasets.rosbag import read_topic_map
 from thermogrip.mpc import Controller
+from thermogrip.mpc.design.spec import read_spec
+from thermogrip.rig.guard.plant_mismatch import PlantDrift
+from thermogrip.rig.guard.settings import read_guard
 from thermogrip.sysid import Plant
+from thermogrip.sysid.models.network import load_network
 
 OLD = Path(__file__).parents[1] / "files_of_0_1_0"
 EXPECTED = json.loads((OLD / "expected.json").read_text())
@@ -74,3 +80,42 @@ def test_the_code_in_an_fmu_of_0_1_0_finds_its_runtime(
     assert slave.do_step(0.0, 1.0)
     assert slave.core.get("t_surface") == pytest.approx(slave.core.get("t_tank"), abs=5.0)
     del sys.modules["thermogrip_slave_plant"]
+
+
+def test_tables_of_0_1_0_have_the_same_columns_and_numbers() -> None:
+    log, grasps = read_log(OLD / "log.nc"), read_grasps(OLD / "grasps.nc")
+    kept = {name: [each.attrs["role"], each.attrs["units"]] for name, each in log.data_vars.items()}
+    assert kept == EXPECTED["log"]["columns"]
+    assert [float(log[name][-1]) for name in kept] == EXPECTED["log"]["last"]
+    assert grasps["material"].values.tolist() == EXPECTED["grasps"]["material"]
+    assert grasps["t_object"].values.tolist() == EXPECTED["grasps"]["t_object"]
+    assert grasps["t_surface"].values[:, -1].tolist() == EXPECTED["grasps"]["last"]
+
+
+def test_samples_and_what_was_learnt_of_a_rig_by_0_1_0_belong_to_their_plant() -> None:
+    plant = Plant.load(OLD / "plant_samples.json")
+    assert plant.samples is not None
+    mean = dict(zip(plant.free, plant.samples.mean(axis=0)))
+    assert (len(plant.samples), mean) == (100, pytest.approx(EXPECTED["samples"], rel=1e-12))
+    assert PlantDrift.load(OLD / "rig.json", plant).drift == 0.1
+
+
+def test_what_init_of_0_1_0_wrote_is_read() -> None:
+    assert sorted(load_network(OLD / "network.toml").parameters) == EXPECTED["network"]
+    spec, guard = read_spec(OLD / "spec.toml"), read_guard(OLD / "guard.toml")
+    assert {name: getattr(spec, name) for name in EXPECTED["spec"]} == EXPECTED["spec"]
+    assert guard.stale_s == EXPECTED["guard"]["stale_s"]
+    assert [*guard.skin_limits] == EXPECTED["guard"]["skin_limits"]
+    assert read_topic_map(OLD / "topics.toml").columns
+
+
+def test_a_batch_of_0_1_0_is_done_and_stays_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(OLD / "night", tmp_path / "night")
+    monkeypatch.chdir(tmp_path / "night")
+    before = sorted(Path("batch").rglob("*"))
+    words = "batch controller.json plan.csv --twin plant.json --grasp-time 2 --out batch"
+    assert main(words.split()) == 0
+    assert "1 of 1 grasps are good: done" in capsys.readouterr().out
+    assert sorted(Path("batch").rglob("*")) == before

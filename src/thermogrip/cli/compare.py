@@ -76,6 +76,10 @@ def compare(
     shipped split (column split) is used where it exists, and then --repeats random splits by grasp, on
     which the LSTM trains for 200 epochs. Grasps that show no contact are left out.
     """
+    if both := {*grasps} & {*(test or ())}:
+        hint = "give others to --test, or leave it out: a part of each material is then held back"
+        raise UserError("is to be trained and tested on", file=min(both), hint=hint)
+
     from thermogrip.classify.estimators.registry import trainable
     from thermogrip.classify.evaluation.harness import evaluate
     from thermogrip.datasets.grasp_files import read_grasp_files

@@ -29,6 +29,7 @@ TAKES = {place: kind for kind, about in KINDS.items() for place in about.get("pl
 _INSIDE = {"classifier.json": "classifier", "batch.json": "batch", "run.json": "run", "samples.csv": "run"}
 _PARTS = {"log": "samples.csv", "grasps": "grasps.csv"}  # of a run
 BOTH = ({"run", "batch"}, {"batch", "grasps"})  # one may be given for the other
+TYPED = "thermogrip.typed"  # key of the words of a verb in what its check is handed
 _HEAD = 1 << 16  # bytes that show what a file is
 
 
@@ -109,8 +110,8 @@ def check_keys(path: str, kind: str) -> None:
 check_spec, check_guard = partial(check_keys, kind="spec"), partial(check_keys, kind="guard")
 
 
-def check_exists(text: str) -> None:
-    """Refuse a file that is not there, with the name of one that is called nearly so."""
+def check_exists(text: str, meant: str = "") -> None:
+    """Refuse a file that is not there, with what was ``meant`` or one that is called nearly so."""
     path = Path(re.sub(r"@[^@/]*:[^@/]*$", "", text))  # LOG@120:1800
     if os.path.exists(text) or os.path.exists(path):
         return
@@ -121,7 +122,7 @@ def check_exists(text: str) -> None:
         path = path.parent
     names = os.listdir(path.parent) if os.access(path.parent, os.R_OK) else []
     same = [name for name in names if name.split(".")[0] == path.name.split(".")[0]]  # but for its ending
-    hint = known_names(path.name, same or names, "check the path")
+    hint = meant or known_names(path.name, same or names, "check the path")
     raise UserError("no such file or folder", file=text, hint=hint)
 
 
@@ -152,6 +153,15 @@ def _places(command: Any, kind: str) -> tuple[list[str], bool]:
     return first + named, bool(takes)
 
 
+def _joined(ctx: Any, word: str) -> str:
+    """Return the hint for a word that stands behind the value of an option that takes names with commas."""
+    lists = {opt for p in ctx.command.params if "," in str(p.metavar) for opt in p.opts}
+    for option, first, then in zip(*(ctx.meta[TYPED][k:] for k in range(3))):
+        if option in lists and then == word:
+            return f"names of one option are joined by commas: {option} {first},{word}"
+    return ""
+
+
 def check_files(ctx: Any) -> None:
     """Refuse what is not there, of another kind, or not whole among what a verb was given."""
     given = []
@@ -160,9 +170,10 @@ def check_files(ctx: Any) -> None:
         if kind and value and param.name != "out":
             given += [(str(path), kind) for path in (value if isinstance(value, list | tuple) else [value])]
     given.sort(key=lambda each: each[1] != "network")  # a misspelt name is refused before files are read
-    there = [(path, kind) for path, kind in given if kind not in ("network", "page") or os.path.isfile(path)]
+    named = ("network", "page", "port")  # which need no file
+    there = [(path, kind) for path, kind in given if kind not in named or os.path.isfile(path)]
     for path, _ in there:
-        check_exists(path)
+        check_exists(path, _joined(ctx, path))
     for path, kind in there:
         check_kind(ctx, path, kind)
     for path, kind in given:

@@ -76,6 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"] or ["--help"]
+    words = [*words[1:], "--help"] if words[0] == "help" else words
     try:
         width = 10_000 if sys.stdout.isatty() else 100  # of help, at most
         with work(["thermogrip", *words]):
@@ -125,4 +126,15 @@ def _option_line(error: typer.TyperException) -> str:
     elif re.fullmatch("-[a-z]", letter := str(about.get("option_name", ""))) and context is not None:
         long = [name for param in context.command.params for name in param.opts if name[1:3] == letter]
         words = f"{words}; options are whole words: {', '.join(long)}" if long else words
+    elif "param_type" in about and isinstance(command := getattr(context, "command", None), Verb):
+        words = f"{words}; for example thermogrip {command.examples[0]}"
+    elif number := re.match(r"[-+]?\d+(\.\d+)?(?=[^\d.])", given := _given(error)):
+        option, begin = about["param"].opts[0], words.partition(": ")[0]
+        words = f"{begin}: {given!r} is no number; write {option} {number[0]}"
     return f"{words}; see {path} --help"
+
+
+def _given(error: Exception) -> str:
+    """Return what an option was given that its type cannot take, "" where that is not known."""
+    found: list[dict[str, object]] = getattr(error.__cause__, "errors", list)()
+    return str(found[0]["input"]) if found else ""

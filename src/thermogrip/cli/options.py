@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -65,6 +66,16 @@ def _split_class(text: str) -> tuple[str, str]:
 def check_new_page(value: str) -> None:
     """Refuse a page that cannot be written there."""
     new_file(Path(value), (".html",))
+
+
+def check_port(value: str) -> None:
+    """Refuse a device that is not there, with those that are."""
+    if "://" not in value and sys.platform != "win32" and not os.path.exists(value):
+        patterns = ("ttyACM*", "ttyUSB*", "cu.*")
+        there = sorted(str(path) for pattern in patterns for path in Path("/dev").glob(pattern))
+        words = "use {}" if there else "none is here"
+        hint = known_names(value, there, f"{words}; check name, cable and power")
+        raise UserError("no such port", file=value, hint=hint)
 
 
 def check_folder(value: str) -> None:

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -183,7 +184,7 @@ def run(
     stop = None if stop_early is None else session_stop(stop_early, tell=watch.posterior)
     loaded = load_controller(controller, network)
     regulator, wanted = RecordedController(loaded), _for_outputs(wanted, loaded.controlled)
-    checks = guard_of(guard, loaded.plant, learn)
+    checks = guard_of(guard, loaded.plant, learn, speed=speed)
     clock = ScaledClock(speed)
     name = f"{twin.name}, draw {draw}" if twin is not None else str(port)
     about: dict[str, Any] = {"controller": controller.name, "target_degC": wanted}
@@ -275,7 +276,7 @@ def batch(
     from thermogrip.rig.records.batch import read_plan, run_batch
 
     trials, loaded = read_plan(plan), load_controller(controller, network)
-    checks = guard_of(guard, loaded.plant, learn)
+    checks = guard_of(guard, loaded.plant, learn, speed=speed)
     clock, console = ScaledClock(speed), Console(as_json)
     watch = _watch("batch", console, out, live, foxglove, on_trip)
     asks = ask and port is not None and not as_json
@@ -344,7 +345,7 @@ def record(
     from thermogrip.rig.session.session import Playback, play
 
     plan = read_log(schedule)
-    checks = guard_of(guard, None)
+    checks = guard_of(guard, None, speed=speed)
     console = Console(as_json)
     watch = _watch("record", console, out, live, foxglove, on_trip)
     clock = ScaledClock(speed)
@@ -540,12 +541,17 @@ def _twin(
     return Twin(plant.draw(draw), seed=seed, t_start=t_start, limits=limits)
 
 
-def guard_of(path: Path | None, plant: Plant | None, learn: Path | None = None) -> Guard:
-    """Return the guard of a rig; what no file says is as by default."""
+def guard_of(
+    path: Path | None, plant: Plant | None, learn: Path | None = None, *, speed: float = 1.0
+) -> Guard:
+    """Return the guard of a rig; what no file says is as by default.  Clocks of a virtual device that runs
+    ``speed`` times as fast may be as far apart as those of others, in seconds of the computer."""
     from thermogrip.rig.guard.guard import Guard, GuardSettings
     from thermogrip.rig.guard.settings import read_guard
 
     settings = GuardSettings() if path is None else read_guard(path)
+    if speed > 1.0:
+        settings = replace(settings, clock_slack_s=speed * settings.clock_slack_s)
     drift = None if learn is None or plant is None else _drift_of(learn, plant, settings.model.drift)
     return Guard(plant, settings, drift=drift)
 
@@ -566,7 +572,8 @@ def _drift_of(path: Path, plant: Plant, stated: float) -> PlantDrift:
 
 def _targets(target: str) -> float | dict[str, float]:
     """Return one target or targets by output ("38", "t1=40,t2=35"), inside what a skin may be brought to."""
-    hint = "write one [degC], or t1=40,t2=35 for several outputs"
+    bare = target.rstrip("degC° ") or "one"
+    hint = f"write {bare} [degC], or t1=40,t2=35 for several outputs"
     with as_user_error(ValueError, f"'--target' {target!r} is no temperature", hint=hint):
         values = cli.numbers("--target", target) if "=" in target else float(target)
     for value in values.values() if isinstance(values, dict) else (values,):

@@ -9,13 +9,14 @@ import re
 import shlex
 import sys
 import tomllib
+from collections.abc import Sequence
 from functools import cache
 from importlib import resources
 from typing import Any
 
 from typer.core import TyperCommand, TyperGroup
 
-from thermogrip.cli.kinds import check_files
+from thermogrip.cli.kinds import TYPED, check_files
 from thermogrip.datasets.media import printable
 from thermogrip.datasets.provenance import note_seed
 
@@ -54,6 +55,7 @@ class Verb(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Give an option its usual value where it stands alone."""
+        ctx.meta[TYPED] = args
         words: list[str] = []
         for word, after in zip(args, [*args[1:], ""]):
             words += [word, ALONE[word]] if word in ALONE and not after.isdigit() else [word]
@@ -66,14 +68,24 @@ class Verb(TyperCommand):
         code = super().invoke(ctx)
         if not code and not ctx.params.get("as_json"):
             sys.stdout.flush()
-            sys.stderr.write(f"next: thermogrip {self.next({k: v for k, v in ctx.params.items() if v})}\n")
+            given = {name: value for name, value in ctx.params.items() if value}
+            sys.stderr.write(f"next: thermogrip {self.next(given, ctx.meta[TYPED])}\n")
         return code
 
-    def next(self, given: dict[str, Any]) -> str:
-        """Return the command that comes next, with what was given in place of its names."""
-        words = {str(param.name): str(param.metavar).split("|")[0] for param in self.params}
-        then = self.then if isinstance(self.then, str) else self.then[given.get("what", "network")]
-        return str(then).format(**words | {k: printable(shlex.quote(str(v))) for k, v in given.items()})
+    def next(self, given: dict[str, Any], typed: Sequence[str] = ()) -> str:
+        """Return the command that comes next, with what was given in place of its names: what was typed once
+        more where that wrote no file for it."""
+        words = {str(param.name): str(param.metavar).split("|")[0].rstrip(".") for param in self.params}
+        what = given.get("what", "")
+        then = self.then if isinstance(self.then, str) else self.then[what or "network"]
+        if what == "examples":
+            words["out"] = "."
+        elif typed and "{out}" in then and "out" not in given:
+            file = f"{what}.toml" if what else self.examples[0].rpartition("--out ")[2]
+            return printable(shlex.join([str(self.name), *typed, "--out", file]))
+        for name, value in given.items():
+            words[name] = printable(shlex.join(map(str, value if isinstance(value, list) else [value])))
+        return str(then).format(**words)
 
     def get_short_help_str(self, limit: int = 200) -> str:
         """Return the first sentence of the help, whole."""

@@ -239,7 +239,7 @@ class Watch:
         if now is None:
             message |= {"columns": [], "units": []}
         try:
-            page.stdin.write(json.dumps(plain(message), allow_nan=False).encode() + b"\n")
+            page.stdin.write(json.dumps(message, default=plain).encode() + b"\n")  # NaN is left to the page
             page.stdin.flush()
         except OSError:
             self._reached = False
