@@ -59,7 +59,8 @@ class ResponseTable:
         self._whole = np.zeros(shape, dtype=bool)  # where all nodes about a cell are there
         self._rows, self._n = np.empty((1024, N_BASIS), dtype=np.float32), 0
         drawn = self._stepped(np.random.default_rng(0).uniform(low, high, (_DRAWN, 4)))
-        self._basis = np.ascontiguousarray(np.linalg.svd(drawn, full_matrices=False)[2][:N_BASIS])
+        self._basis = np.linalg.svd(drawn, full_matrices=False)[2][:N_BASIS]
+        self._rise, self._slope = map(np.ascontiguousarray, np.split(self._basis, 2, axis=1))
 
     def curves(self, contact: Array, wanted: Mask) -> tuple[Array, Array]:
         """Return the sensor's rise and its slope (n, 5, n_node) of ``contact`` (n, 4) and the ``wanted``
@@ -68,14 +69,15 @@ class ResponseTable:
         z = np.log(contact)
         z[:, 1] = np.minimum(z[:, 1] - z[:, 0], self._high[1])
         inside = ((z >= self._low) & (z <= self._high)).all(axis=1)
-        n_node, n_curve = self._nodes.t.size, N_STEPPED if wanted[:, 1:].any() else 1
+        n_curve = N_STEPPED if wanted[:, 1:].any() else 1
         if inside.all():
-            both = self._blended(z, wanted)[:, :n_curve] @ self._basis
-            return both[:, :, :n_node], both[:, :, n_node:]
-        out, both = ~inside, np.empty((len(z), n_curve, 2 * n_node))
-        rise, slope = both[:, :, :n_node], both[:, :, n_node:]
+            own = self._blended(z, wanted)[:, :n_curve]
+            return own @ self._rise, own @ self._slope
+        out, shape = ~inside, (len(z), n_curve, self._nodes.t.size)
+        rise, slope = np.empty(shape), np.empty(shape)
         if inside.any():
-            both[inside] = self._blended(z[inside], wanted[inside])[:, :n_curve] @ self._basis
+            own = self._blended(z[inside], wanted[inside])[:, :n_curve]
+            rise[inside], slope[inside] = own @ self._rise, own @ self._slope
         stepped = contacts(self._nodes, self._gripper, contact[out], wanted[out])
         rise[out], slope[out] = (part[:, :n_curve] for part in stepped[:2])
         return rise, slope
