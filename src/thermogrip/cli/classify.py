@@ -273,7 +273,7 @@ def classify(
     model_dir: Annotated[Path, cli.arg("MODEL_DIR", "Folder that train wrote.")],
     paths: Annotated[
         list[str] | None,
-        cli.arg("GRASPS...", "Grasp files (CSV with its _meta.csv, or NetCDF) or folders."),
+        cli.arg("GRASPS...", "Grasp files (CSV with its _meta.csv, NetCDF, Parquet), folders or patterns."),
     ] = None,
     out: Annotated[Path | None, cli.opt("--out", "FILE.csv", "Where the predictions go.")] = None,
     candidates: Annotated[

@@ -140,7 +140,7 @@ OwnNetwork = Annotated[
     ),
 ]
 GraspFiles = Annotated[
-    list[str], arg("GRASPS...", "Grasp files (CSV with its _meta.csv, or NetCDF) or folders.")
+    list[str], arg("GRASPS...", "Grasp files (CSV with its _meta.csv, NetCDF, Parquet), folders or patterns.")
 ]
 
 
