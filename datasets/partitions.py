@@ -16,6 +16,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from functools import partial
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
@@ -36,11 +37,12 @@ PART = 500
 
 
 class Source(NamedTuple):
-    """A file of grasps: its path, size [byte] and what shows that it is as it was."""
+    """A file of grasps: its name, size [byte] and what shows that it is as it was, and how it is read."""
 
-    path: Path
+    name: str
     size: int
     stamp: list[Any]
+    read: Callable[[], Grasps]
 
 
 def sources(paths: Sequence[str | Path]) -> list[Source]:
@@ -49,7 +51,7 @@ def sources(paths: Sequence[str | Path]) -> list[Source]:
     for path in list_grasp_files(paths):
         marks = stamps(grasp_file_parts(path))
         size = sum(mark[1] for mark in marks)
-        found.append(Source(path.absolute(), size, marks))
+        found.append(Source(path.name, size, marks, partial(read_grasps, path.absolute())))
     return found
 
 
@@ -84,7 +86,7 @@ class Task(NamedTuple):
 
     def lines(self) -> Iterator[dict[str, Any]]:
         """Yield the answers of its parts."""
-        parts = parts_of(self.prepare(read_grasps(self.source.path)))
+        parts = parts_of(self.prepare(self.source.read()))
         for k, grasps in islice(enumerate(parts), self.first, None):
             own = {"of": self.source.stamp, "part": k, "parts": len(parts), "grasps": grasps.sizes["grasp"]}
             yield own | {"name": log_name(grasps)} | self.answer(grasps)
@@ -154,14 +156,14 @@ class Answers:
         for task, lines in zip(tasks, answered):
             for line in lines:
                 if line["part"] == task.first and line["name"] in names:
-                    raise UserError("is given twice", file=task.source.path, hint="give each file once")
+                    raise UserError("is given twice", file=task.source.name, hint="give each file once")
                 names.add(line["name"])
                 for words in line.pop("warnings", ()):
                     warn(words)
                 self._append(file, line)
                 self.grasps += line["grasps"]
                 rate = (self.grasps - before) / max(time.monotonic() - begin, 1e-3)
-                words = f"grasps: {self.grasps}, {rate:.3g}/s, {task.source.path.name}"
+                words = f"grasps: {self.grasps}, {rate:.3g}/s, {task.source.name}"
                 progress((done + task.source.size * (line["part"] + 1) / line["parts"]) / whole, words)
             done += task.source.size
 

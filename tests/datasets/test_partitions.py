@@ -208,7 +208,7 @@ def test_answers_as_parquet_have_the_rows_of_the_table(folder: Path, tmp_path: P
 
 
 def test_a_pattern_that_a_shell_left_is_filled_in(folder: Path) -> None:
-    assert [each.path.name for each in sources([str(folder / "[ac]*.csv")])] == ["a.csv", "c.csv"]
+    assert [each.name for each in sources([str(folder / "[ac]*.csv")])] == ["a.csv", "c.csv"]
 
 
 def test_two_files_of_one_name_are_refused(folder: Path, tmp_path: Path) -> None:

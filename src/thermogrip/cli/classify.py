@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, astuple, dataclass
-from functools import cache
+from functools import lru_cache
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
@@ -357,17 +357,18 @@ def classify(
     from thermogrip.datasets.partitions import Answers, sources, stamps
 
     console = Console(as_json)
+    anywhere = Path.absolute if cluster else Path  # its workers run in other folders
     ask = _Question(
-        model_dir.absolute(), cli.comma(candidates), stated, early=early, next_touch=next_touch,
+        anywhere(model_dir), cli.comma(candidates), stated, early=early, next_touch=next_touch,
         or_unknown=or_unknown, other_gripper=other_gripper, same_gripper=same_gripper,
-        known=tuple(known or ()),
+        known=tuple(str(anywhere(Path(path))) for path in known or ()),
     )  # fmt: skip
     if serve:
-        return _serve(console, _answerer(ask), port)
+        return _serve(console, ask.answerer(), port)
     assert out is not None
     given = sources(paths or [])
     asked = [*astuple(ask), stamps([model_dir, *ask.known])]
-    _answerer(ask)
+    ask.answerer()
     found = Answers(out, ["classify", *asked])
     with _resumable(console, found), console.progress("classify") as progress:
         found.find(given, ask.prepare, ask.answer, progress, workers=pool, warn=console.warn)
@@ -443,9 +444,15 @@ class _Question:
         """Return the rows of a part, and warnings of it."""
         said = _Said()
         cli.warn_of_contacts(said, [part])
-        return _answerer(self)(part) | {"warnings": said.words}
+        return self.answerer()(part) | {"warnings": said.words}
 
     def answerer(self) -> Callable[[Grasps], dict[str, Any]]:
+        """Return what answers a record, once a process while the model's files are the same."""
+        from thermogrip.datasets.partitions import stamps
+
+        return _answerer(self, str(Path.cwd()), str(stamps([self.model_dir, *self.known])))
+
+    def load(self) -> Callable[[Grasps], dict[str, Any]]:
         """Return what answers a record with its rows and why some are out of distribution."""
         from thermogrip.classify.decisions.predict import classify_grasps, reasons, unexplained_answers
         from thermogrip.classify.decisions.stopping_rule import load_stop_rule
@@ -485,10 +492,9 @@ class _Question:
         return answer
 
 
-@cache
-def _answerer(ask: _Question) -> Callable[[Grasps], dict[str, Any]]:
-    """Return what answers a question, once a process."""
-    return ask.answerer()
+@lru_cache(maxsize=1)
+def _answerer(ask: _Question, _folder: str, _files: str) -> Callable[[Grasps], dict[str, Any]]:
+    return ask.load()
 
 
 class _Said:
