@@ -143,7 +143,7 @@ def from_frame(frame: DataFrame, name: str = "DataFrame") -> Grasps:
 def check_grasp_file(path: str | Path) -> None:
     """Refuse what is no file or folder of grasps by names, beginnings and what is declared."""
     for file in _in_folder(Path(path)) if os.path.isdir(path) else [Path(path)]:
-        check_table(file, text=True)
+        check_table(file, labels=True)
         if file_format(file) == "csv":
             check_table(_meta_path(file))
 

@@ -597,11 +597,11 @@ def _to_float(chunked: Any) -> NDArray[np.float64]:
     return values.copy()
 
 
-def check_table(path: str | Path, *, log: bool = False, text: bool = False) -> None:
+def check_table(path: str | Path, *, log: bool = False, labels: bool = False) -> None:
     """Refuse a file that is no table of numbers by its name, its beginning and what it declares.
 
-    A log may have any header, Parquet ``text``.  Neither pandas nor xarray is loaded.  What a shell passes on
-    is read once, so it is not looked at here.
+    A log may have any header, Parquet ``labels``.  Neither pandas nor xarray is loaded.  What a shell passes
+    on is read once, so it is not looked at here.
     """
     kind = file_format(path)
     if os.path.exists(path) and not limits.check_source(path) and not os.path.isfile(path):
@@ -613,7 +613,7 @@ def check_table(path: str | Path, *, log: bool = False, text: bool = False) -> N
         if len(text) < _BEGINNING // 2 or not text.startswith(b"#"):
             _header(text, str(path))
     elif kind == "parquet":
-        _open_parquet(path, str(path), limits.check_source(path), text=text).close()
+        _open_parquet(path, str(path), limits.check_source(path), text=labels).close()
     elif kind == "netcdf":
         check_netcdf(path)
 

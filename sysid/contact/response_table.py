@@ -121,7 +121,8 @@ class ResponseTable:
         missing = np.flatnonzero(needed & (self._index.ravel() < 0))
         for part in (missing[i : i + 512] for i in range(0, missing.size, 512)):
             node = np.stack(np.unravel_index(part, self._index.shape), axis=1)
-            rows = self._stepped(self._origin + _STEP * node) @ self._basis.T
+            # sums in one order however many there are, so that it does not matter what was asked before
+            rows = np.einsum("nt,kt->nk", self._stepped(self._origin + _STEP * node), self._basis)
             while self._n + part.size > len(self._rows):
                 self._rows = np.concatenate([self._rows, np.empty_like(self._rows)])
             self._rows[self._n : self._n + part.size] = rows

@@ -64,9 +64,10 @@ def test_what_lies_outside_is_stepped(table):
 def test_answers_do_not_depend_on_what_was_asked_before(table):
     contact, every = places(20, 4), np.ones((20, 5), dtype=bool)
     fresh = ResponseTable(SOFT_FINGER, END)
-    backwards = fresh.curves(contact[::-1].copy(), every)
-    for one, other in zip(table.curves(contact, every), backwards):
-        np.testing.assert_allclose(one, other[::-1], rtol=0, atol=1e-13)
+    for at in (slice(7, 8), slice(3, 15)):
+        fresh.curves(contact[at], every[at])
+    for one, other in zip(table.curves(contact, every), fresh.curves(contact, every)):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_a_long_block_has_no_far_face(table):
