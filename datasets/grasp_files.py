@@ -14,6 +14,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Sequence
+from glob import glob
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -41,6 +42,7 @@ from thermogrip.datasets.tables import (
     file_format,
     file_stem,
     read_csv_table,
+    read_parquet_frame,
     text_numbers,
 )
 from thermogrip.datasets.units import rename_hint, split_header, to_record_unit
@@ -69,7 +71,8 @@ def read_grasps(path: str | Path) -> Grasps:
     Parameters
     ----------
     path : str or Path
-        A CSV file with its meta file beside it, or NetCDF.
+        A CSV file with its meta file beside it, NetCDF, or Parquet with a row a sample, in which each row
+        repeats what is known of its grasp.
 
     Returns
     -------
@@ -89,8 +92,14 @@ def read_grasps(path: str | Path) -> Grasps:
     >>> dict(grasps.sizes), str(grasps["material"].values[0]), float(grasps["t_object"][0])
     ({'grasp': 40, 'time': 121}, 'copper', 43.0)
     """
-    if file_format(path) not in ("csv", "netcdf"):
-        raise UserError("grasps are CSV or NetCDF", file=path, hint="use one of the two")
+    if file_format(path) not in ("csv", "netcdf", "parquet"):
+        raise UserError("grasps are CSV, NetCDF or Parquet", file=path, hint="use one of them")
+    if file_format(path) == "parquet":
+        frame = read_parquet_frame(path)
+        if "grasp_id" not in frame:
+            problem = "no column grasp_id"
+            raise UserError(problem, file=path, hint="a grasp file has grasp_id,time_s,t_surface_degC")
+        return from_frame(frame, file_stem(path))
     if file_format(path) == "netcdf":
         grasps = _read_netcdf(path)
     else:
@@ -119,22 +128,22 @@ def as_grasps(grasps: Records) -> list[Grasps]:
     return [from_frame(each) if isinstance(each, DataFrame) else each for each in files]
 
 
-def from_frame(frame: DataFrame) -> Grasps:
+def from_frame(frame: DataFrame, name: str = "DataFrame") -> Grasps:
     """Return the grasps of a table with a row a sample, in which each row repeats what is known of its grasp;
     columns as in the two files of :func:`read_grasps`."""
     samples = [name for name in map(str, frame.columns) if name.startswith(_OF_SAMPLES)]
     with TemporaryDirectory() as folder:
-        path = Path(folder, "DataFrame.csv")
+        path = Path(folder, f"{name}.csv")
         frame[samples].to_csv(path, index=False)
         rest = frame.drop(columns=[name for name in samples if name != "grasp_id"])
-        rest.drop_duplicates("grasp_id").to_csv(Path(folder, "DataFrame_meta.csv"), index=False)
+        rest.drop_duplicates("grasp_id").to_csv(Path(folder, f"{name}_meta.csv"), index=False)
         return read_grasps(path)
 
 
 def check_grasp_file(path: str | Path) -> None:
     """Refuse what is no file or folder of grasps by names, beginnings and what is declared."""
     for file in _in_folder(Path(path)) if os.path.isdir(path) else [Path(path)]:
-        check_table(file)
+        check_table(file, labels=True)
         if file_format(file) == "csv":
             check_table(_meta_path(file))
 
@@ -187,9 +196,15 @@ def read_grasp_files(paths: Sequence[str | Path]) -> list[Grasps]:
 def list_grasp_files(paths: Sequence[str | Path]) -> list[Path]:
     """Return the grasp files in paths and folders, as of :func:`read_grasp_files`, unread."""
     files: list[Path] = []
-    for path in map(Path, paths):
+    for path in (Path(name) for given in paths for name in _matching(given)):
         files += _in_folder(path) if path.is_dir() else [path]
     return files
+
+
+def _matching(path: str | Path) -> list[str]:
+    """Return what a pattern with *, ? or [] that a shell left names, in order; else the path itself."""
+    found = [] if os.path.exists(path) else sorted(glob(str(path), recursive=True))
+    return [name for name in found if not file_stem(name).endswith("_meta")] or [str(path)]
 
 
 def grasp_file_parts(path: Path) -> list[Path]:
@@ -219,10 +234,11 @@ def _print_of(samples: Floats) -> bytes:
 
 def _in_folder(folder: Path) -> list[Path]:
     with os_faults(folder):
-        files = sorted(p for p in folder.iterdir() if p.name.lower().endswith((*_ENDINGS, ".nc")))
+        files = sorted(p for p in folder.iterdir() if p.name.lower().endswith((*_ENDINGS, ".nc", ".parquet")))
     files = [p for p in files if not file_stem(p).endswith("_meta") and not p.name.startswith(".")]
     if not files:
-        raise UserError("holds no grasp files", file=folder, hint="give a folder with .csv or .nc files")
+        hint = "give a folder with .csv, .nc or .parquet files"
+        raise UserError("holds no grasp files", file=folder, hint=hint)
     return files
 
 

@@ -3,22 +3,27 @@
 Local processes are spawned, not forked: a fork copies locks that numerical libraries hold, and hangs.  So
 the function must be importable (defined at the top of a module) and its items must pickle; only the user's
 own processes read them, those that this one started or those of the cluster that was named.  Results come
-back in the order of the items, whatever the order of finishing.
+back in the order of the items, whatever the order of finishing.  What a killed process had in hand is done
+again, by another one.
 
 A cluster (``tcp://HOST:PORT`` of its scheduler, extra ``cluster``) runs the same functions on the same items,
-so it gives the same bits where its machines' arithmetic does; every worker needs this version of thermogrip.
+so it gives the same bits where its machines' arithmetic does; every worker needs the versions of thermogrip,
+Python and the numerical packages that are here.  Workers may join at any time, and leave.
 """
 
 from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Callable, Iterable, Iterator
+import sys
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from importlib.metadata import version
 from importlib.util import find_spec
 from typing import Any, TypeAlias, TypeVar
+from warnings import catch_warnings, simplefilter
 
 from thermogrip import __version__
 from thermogrip.datasets.errors import UserError, as_user_error
@@ -28,6 +33,7 @@ Progress: TypeAlias = Callable[[float, str], None]
 Workers: TypeAlias = int | str
 
 _CONNECT_S = 10
+_DEATHS = 3  # of processes, without a result between them
 
 #: The processes that :func:`kept_processes` holds, if any.
 _kept: list[ProcessPoolExecutor] = []
@@ -48,17 +54,32 @@ def run_parallel(
 
     ``function`` must be importable; the first exception that it raises stops the rest and is raised here.
     With one worker it runs in this process; more are never started than there are items or processors.
-    ``progress`` is called with the fraction done and ``what``. UserError if a process was killed, or the
-    cluster cannot be reached, has no workers, or has another version of thermogrip.
+    ``progress`` is called with the fraction done and ``what``. UserError if processes are killed again and
+    again, or the cluster cannot be reached, has no workers, or has other versions.
     """
     todo = list(items)
-    check_workers(workers)
-    if isinstance(workers, str):
-        return _on_cluster(function, todo, workers, progress, what) if todo else []
-    n = min(workers, len(todo), os.cpu_count() or 1)
-    if n <= 1:
-        return _counted(map(function, todo), len(todo), progress, what)
-    return _on_processes(function, todo, n, progress, what)
+    found: dict[int, _Result] = {}
+    with closing(_done(function, todo, workers)) as done:
+        for i, result in done:
+            found[i] = result
+            if progress is not None:
+                progress(len(found) / len(todo), what)
+    return [found[i] for i in range(len(todo))]
+
+
+def in_order(
+    function: Callable[[_Item], _Result], items: Iterable[_Item], workers: Workers = 1
+) -> Iterator[_Result]:
+    """Yield the results of :func:`run_parallel` in the order of the items, each once it and those before it
+    are there."""
+    waiting: dict[int, _Result] = {}
+    at = 0
+    with closing(_done(function, list(items), workers)) as done:
+        for i, result in done:
+            waiting[i] = result
+            while at in waiting:
+                yield waiting.pop(at)
+                at += 1
 
 
 @contextmanager
@@ -102,23 +123,50 @@ def sub_progress(progress: Progress | None, start: float, stop: float, name: str
     return show
 
 
+def _done(
+    function: Callable[[_Item], _Result], todo: list[_Item], workers: Workers
+) -> Generator[tuple[int, _Result], None, None]:
+    """Yield the place of each item and its result, in the order of finishing."""
+    check_workers(workers)
+    if isinstance(workers, str):
+        if todo:
+            yield from _on_cluster(function, todo, workers)
+        return
+    n = min(workers, len(todo), os.cpu_count() or 1)
+    if n <= 1:
+        yield from enumerate(map(function, todo))
+    else:
+        yield from _on_processes(function, todo, n)
+
+
 def _on_processes(
-    function: Callable[[_Item], _Result], todo: list[_Item], n: int, progress: Progress | None, what: str
-) -> list[_Result]:
-    kept = bool(_kept)
-    pool = _kept[0] if kept else _processes(n)
-    futures: list[Future[_Result]] = []
-    try:
-        futures += [pool.submit(function, item) for item in todo]
-        _counted((future.result() for future in as_completed(futures)), len(todo), progress, what)
-        return [future.result() for future in futures]
-    except BrokenProcessPool as error:
-        raise UserError("a worker process was killed", hint="lower --workers; memory may be short") from error
-    finally:
-        for future in futures:
-            future.cancel()  # what has not begun
-        if not kept:
-            pool.shutdown(wait=True)
+    function: Callable[[_Item], _Result], todo: list[_Item], n: int
+) -> Generator[tuple[int, _Result], None, None]:
+    left, deaths = dict(enumerate(todo)), 0
+    while left:
+        pool = _kept[0] if _kept else _processes(n)
+        futures: dict[Future[_Result], int] = {}
+        try:
+            futures |= {pool.submit(function, item): i for i, item in left.items()}
+            for future in as_completed(futures):
+                result = future.result()
+                del left[futures[future]]
+                deaths = 0
+                yield futures[future], result
+        except BrokenProcessPool as error:  # all of the pool is lost
+            deaths += 1
+            if deaths > _DEATHS:
+                raise UserError(
+                    "worker processes are killed again and again", hint="lower --workers; memory may be short"
+                ) from error
+            if _kept:
+                _kept[0].shutdown(wait=True)
+                _kept[0] = _processes(n)
+        finally:
+            for future in futures:
+                future.cancel()  # what has not begun
+            if not _kept:
+                pool.shutdown(wait=True)
 
 
 def _processes(n: int) -> ProcessPoolExecutor:
@@ -126,27 +174,27 @@ def _processes(n: int) -> ProcessPoolExecutor:
 
 
 def _on_cluster(
-    function: Callable[[_Item], _Result],
-    todo: list[_Item],
-    address: str,
-    progress: Progress | None,
-    what: str,
-) -> list[_Result]:
+    function: Callable[[_Item], _Result], todo: list[_Item], address: str
+) -> Generator[tuple[int, _Result], None, None]:
     import distributed
 
     dask: Any = distributed  # its functions have no types
 
     hint = "start one with 'dask scheduler', or check the address"
-    with as_user_error((OSError, ValueError), f"no scheduler answers at {address}", hint=hint):
+    # its own words about versions are a table; _check_cluster says it in one line
+    lost = as_user_error((OSError, ValueError), f"no scheduler answers at {address}", hint=hint)
+    with catch_warnings(), lost:
+        simplefilter("ignore", dask.versions.VersionMismatchWarning)
         client = dask.Client(address, timeout=_CONNECT_S, set_as_default=False)
     try:
         _check_cluster(client, address)
-        futures = client.map(function, todo, pure=False)
-        done = dask.as_completed(futures, loop=client.loop)
-        _counted((future.result() for future in done), len(todo), progress, what)  # the first fault ends it
-        return list(client.gather(futures))
+        futures = {future: i for i, future in enumerate(client.map(function, todo, pure=False))}
+        for future in dask.as_completed(futures, loop=client.loop):
+            result = future.result()  # the first fault ends it
+            yield futures.pop(future), result
     except dask.KilledWorker as error:
-        raise UserError(f"a worker of {address} was killed", hint="give its workers more memory") from error
+        problem = f"workers of {address} are killed again and again"
+        raise UserError(problem, hint="give them more memory") from error
     finally:
         client.close()  # which lets go of what is not done
 
@@ -155,23 +203,18 @@ def _check_cluster(client: Any, address: str) -> None:
     """Refuse a cluster without workers, or one that would run other code."""
     if not client.scheduler_info()["workers"]:
         raise UserError(f"the cluster at {address} has no workers", hint=f"run 'dask worker {address}'")
+    own = _versions()
     hint = f"install thermogrip {__version__} on all of them"
     with as_user_error(ModuleNotFoundError, f"a worker of {address} has no thermogrip", hint=hint):
-        versions = set(client.run(_version).values())
-    if versions != {__version__}:
-        found = ", ".join(sorted(versions - {__version__}))
-        raise UserError(f"a worker of {address} has thermogrip {found}", hint=hint)
+        theirs = client.run(_versions).values()
+    differ = {name: {there[name] for there in theirs} - {own[name]} for name in own}
+    if any(differ.values()):
+        words = [f"{name} {', '.join(sorted(differ[name]))} for {own[name]}" for name in own if differ[name]]
+        problem = f"a worker of {address} has {'; '.join(words)}"
+        raise UserError(problem, hint="install the same versions on all of them")
 
 
-def _version() -> str:
-    return __version__
-
-
-def _counted(results: Iterable[_Result], n: int, progress: Progress | None, what: str) -> list[_Result]:
-    """Return the n results, and report the progress with each."""
-    found: list[_Result] = []
-    for result in results:
-        found.append(result)
-        if progress is not None:
-            progress(len(found) / n, what)
-    return found
+def _versions() -> dict[str, str]:
+    """Return the versions on which the last bits of answers depend."""
+    found = {name: version(name) for name in ("numba", "numpy", "scipy")}
+    return {"thermogrip": __version__, "Python": f"{sys.version_info[0]}.{sys.version_info[1]}"} | found

@@ -2,10 +2,11 @@
 
 Files are read one at a time, and one of many single touches is answered in parts of :data:`PART` grasps, each
 as a file of its own.  What was answered is kept beside the output in ``NAME.partial``, a line of JSON a part,
-forced to disk before the next part begins.  Ctrl-C, ``kill -9`` and a full disk leave whole lines and at most
-the beginning of one.  The same command takes those of its lines that are of the same files (name, size, time
-of writing) in the same order, cuts off the rest, and goes on: as a part's answer depends on nothing but the
-part, the end is the same bytes.  Memory holds one file and one part, whatever the number of files.
+forced to disk before the next part begins (with several workers, before that of a later file).  Ctrl-C,
+``kill -9`` and a full disk leave whole lines and at most the beginning of one.  The same command takes those
+of its lines that are of the same files (name, size, time of writing) in the same order, cuts off the rest,
+and goes on: as a part's answer depends on nothing but the part, the end is the same bytes.  Memory holds one
+file and one part, whatever the number of files.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from functools import partial
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
@@ -27,7 +29,7 @@ from thermogrip.datasets.atomic_files import atomic_path, open_append
 from thermogrip.datasets.errors import UserError, as_user_error, os_faults
 from thermogrip.datasets.grasp_files import grasp_file_parts, list_grasp_files, read_grasps
 from thermogrip.datasets.media import csv_text
-from thermogrip.datasets.parallel import Progress
+from thermogrip.datasets.parallel import Progress, Workers, in_order
 from thermogrip.datasets.schema import Grasps, label_values, log_name
 
 #: Single touches of one file that are answered at once.
@@ -49,7 +51,7 @@ def sources(paths: Sequence[str | Path]) -> list[Source]:
     for path in list_grasp_files(paths):
         marks = stamps(grasp_file_parts(path))
         size = sum(mark[1] for mark in marks)
-        found.append(Source(path.name, size, marks, lambda path=path: read_grasps(path)))  # type: ignore[misc]
+        found.append(Source(path.name, size, marks, partial(read_grasps, path.absolute())))
     return found
 
 
@@ -74,12 +76,33 @@ def parts_of(record: Grasps) -> list[Grasps]:
     return [record.isel(grasp=at) for at in np.array_split(np.arange(n), -(-n // PART))]
 
 
+class Task(NamedTuple):
+    """A file that is answered from one of its parts on, by itself and wherever it can be read."""
+
+    source: Source
+    first: int
+    prepare: Callable[[Grasps], Grasps]
+    answer: Callable[[Grasps], dict[str, Any]]
+
+    def lines(self) -> Iterator[dict[str, Any]]:
+        """Yield the answers of its parts."""
+        parts = parts_of(self.prepare(self.source.read()))
+        for k, grasps in islice(enumerate(parts), self.first, None):
+            own = {"of": self.source.stamp, "part": k, "parts": len(parts), "grasps": grasps.sizes["grasp"]}
+            yield own | {"name": log_name(grasps)} | self.answer(grasps)
+
+
+def _whole(task: Task) -> list[dict[str, Any]]:
+    return list(task.lines())
+
+
 class Answers:
     """The answers of the parts, in order, as often as they are iterated over; on disk until removed.
 
-    ``answer`` returns of a part what JSON holds; ``prepare`` is called once a file that is read, and what it
-    returns is divided into parts.  ``question`` is all else that the answers depend on: those to another one
-    are not gone on with.
+    ``answer`` returns of a part what JSON holds, with ``warnings`` that are given to ``warn`` and not kept;
+    ``prepare`` is called once a file that is read, and what it returns is divided into parts.  With several
+    ``workers`` each answers a file at a time, which it reads itself.  ``question`` is all else that the
+    answers depend on: those to another one are not gone on with.
     """
 
     def __init__(self, out: Path, question: Sequence[Any]) -> None:
@@ -87,6 +110,7 @@ class Answers:
         head = {"partial": 1, "thermogrip": __version__, "question": list(question)}
         self._head: dict[str, Any] = json.loads(json.dumps(head, default=str))
         self.grasps, self._own = 0, False
+        self._answered = 0.0  # share of the file to go on with
 
     def find(
         self,
@@ -94,6 +118,9 @@ class Answers:
         prepare: Callable[[Grasps], Grasps],
         answer: Callable[[Grasps], dict[str, Any]],
         progress: Progress,
+        *,
+        workers: Workers = 1,
+        warn: Callable[[str], None] = lambda _: None,
     ) -> Answers:
         """Answer every part that has no answer yet; return the answers of all."""
         with os_faults(self.path):
@@ -101,7 +128,13 @@ class Answers:
         try:
             _lock(file, self.path)
             self._own = True
-            self._find(file, given, prepare, answer, progress)
+            at, part, end = self._known(given)
+            os.ftruncate(file, end)
+            if not end:
+                self._append(file, self._head)
+            tasks = [Task(each, 0, prepare, answer) for each in given[at:]]
+            tasks[:1] = [task._replace(first=part) for task in tasks[:1]]
+            self._find(file, tasks, given, progress, workers, warn)
         except BaseException:
             if self._own and not self.grasps:
                 self.remove()
@@ -111,30 +144,28 @@ class Answers:
         return self
 
     def _find(
-        self, file: int, given: Sequence[Source], prepare: Any, answer: Any, progress: Progress
-    ) -> None:
-        at, part, end = self._known(given)
-        os.ftruncate(file, end)
-        if not end:
-            self._append(file, self._head)
+        self, file: int, tasks: list[Task], given: Sequence[Source], progress: Progress, workers: Workers,
+        warn: Callable[[str], None],
+    ) -> None:  # fmt: skip
         whole, begin, before = max(sum(each.size for each in given), 1), time.monotonic(), self.grasps
-        done, names = sum(each.size for each in given[:at]), set[str]()
-        progress(done / whole, "grasps")  # which shows with what share this run begins
-        for source in given[at:]:
-            record = source.read()
-            if log_name(record) in names:
-                raise UserError("is given twice", file=source.name, hint="give each file once")
-            names.add(log_name(record))
-            parts = parts_of(prepare(record))
-            for k, grasps in islice(enumerate(parts), part, None):
-                rate = (self.grasps - before) / max(time.monotonic() - begin, 1e-3)
-                words = f"grasps: {self.grasps}, {rate:.3g}/s, {source.name}"
-                progress((done + source.size * k / len(parts)) / whole, words)
-                n = grasps.sizes["grasp"]
-                line = {"of": source.stamp, "part": k, "parts": len(parts), "grasps": n} | answer(grasps)
+        done, names = whole - sum(task.source.size for task in tasks), set[str]()
+        ahead = tasks[0].source.size * self._answered if tasks else 0.0
+        progress((done + ahead) / whole, "grasps")  # with which share this run begins
+        alone = workers == 1 or len(tasks) == 1
+        answered = (task.lines() for task in tasks) if alone else in_order(_whole, tasks, workers)
+        for task, lines in zip(tasks, answered):
+            for line in lines:
+                if line["part"] == task.first and line["name"] in names:
+                    raise UserError("is given twice", file=task.source.name, hint="give each file once")
+                names.add(line["name"])
+                for words in line.pop("warnings", ()):
+                    warn(words)
                 self._append(file, line)
-                self.grasps += n
-            done, part = done + source.size, 0
+                self.grasps += line["grasps"]
+                rate = (self.grasps - before) / max(time.monotonic() - begin, 1e-3)
+                words = f"grasps: {self.grasps}, {rate:.3g}/s, {task.source.name}"
+                progress((done + task.source.size * (line["part"] + 1) / line["parts"]) / whole, words)
+            done += task.source.size
 
     def _known(self, given: Sequence[Source]) -> tuple[int, int, int]:
         """Return the file and the part to go on with, and where in the file of answers."""
@@ -148,6 +179,7 @@ class Answers:
             else:
                 self.grasps += line["grasps"]
                 at, part = (at + 1, 0) if part + 1 == line["parts"] else (at, part + 1)
+                self._answered = part / line["parts"]
             end = last
         return at, part, end
 
@@ -177,13 +209,31 @@ class Answers:
             os.fsync(file)
 
     def write(self, out: Path, cell: Callable[[Any], Any]) -> None:
-        """Write the ``rows`` of all parts as CSV, whole or not at all; the columns are those of all
-        rows in order of appearance, and ``cell`` returns what is written for a value."""
+        """Write the ``rows`` of all parts as CSV or, by the ending of ``out``, Parquet, whole or not at all.
+
+        Columns are those of all rows in order of appearance, and ``cell`` returns what CSV has for a value.
+        """
         names = list(dict.fromkeys(name for part in self for row in part["rows"] for name in row))
-        with atomic_path(out) as path, open(path, "w", encoding="utf-8", newline="") as file:
-            file.write(csv_text([names]))
+        with atomic_path(out) as path:
+            if out.suffix == ".parquet":
+                self._write_parquet(path, names)
+                return
+            with open(path, "w", encoding="utf-8", newline="") as file:
+                file.write(csv_text([names]))
+                for part in self:
+                    file.write(csv_text([cell(row.get(name)) for name in names] for row in part["rows"]))
+
+    def _write_parquet(self, path: Path, names: list[str]) -> None:
+        """Write a row group a part; a column with a text in any row is text."""
+        import pyarrow as pa
+        from pyarrow.parquet import ParquetWriter
+
+        texts = {name for part in self for row in part["rows"] for name in row if isinstance(row[name], str)}
+        schema = pa.schema([(name, pa.string() if name in texts else pa.float64()) for name in names])
+        with ParquetWriter(path, schema) as file:
             for part in self:
-                file.write(csv_text([cell(row.get(name)) for name in names] for row in part["rows"]))
+                columns = [pa.array([row.get(f.name) for row in part["rows"]], f.type) for f in schema]
+                file.write_table(pa.table(columns, schema=schema))
 
     def remove(self) -> None:
         """Remove what is kept on disk."""

@@ -28,7 +28,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from itertools import chain, count, islice
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,9 @@ from thermogrip.datasets.media import from_csv
 from thermogrip.datasets.netcdf import check_netcdf
 from thermogrip.datasets.repair import name_rows
 from thermogrip.datasets.units import find_column, read_header
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 FORMATS = {
     ".csv": "csv", ".csv.gz": "csv", ".csv.xz": "csv",
@@ -569,14 +572,25 @@ def read_parquet_table(path: str | Path) -> Table:
     return Table(str(path), numbers, {}, np.arange(1, table.num_rows + 1), attrs, meta)
 
 
-def _open_parquet(path: str | Path, source: Any, packed: int) -> Any:
-    """Return the open file, its columns and sizes checked."""
+def read_parquet_frame(path: str | Path) -> DataFrame:
+    """Return a Parquet file with columns of numbers and text."""
+    raw = read_bytes(path)
+    with (
+        _sound_parquet(path),
+        _open_parquet(path, io.BytesIO(raw), len(raw), text=True) as opened,
+    ):
+        frame: DataFrame = opened.read().to_pandas()
+        return frame
+
+
+def _open_parquet(path: str | Path, source: Any, packed: int, *, text: bool = False) -> Any:
+    """Return the open file, its columns and sizes checked; ``text`` may be in some."""
     import pyarrow.parquet as parquet
 
     limits.check_size(packed, file=path)
     with _sound_parquet(path):
         opened = parquet.ParquetFile(source, page_checksum_verification=True)
-        _check_parquet(opened, packed, path)
+        _check_parquet(opened, packed, path, text)
     return opened
 
 
@@ -587,13 +601,15 @@ def _sound_parquet(path: str | Path) -> AbstractContextManager[None]:
     return as_user_error(wrong, "is not Parquet, or is damaged", file=path, hint="write or copy it again")
 
 
-def _check_parquet(opened: Any, packed: int, path: str | Path) -> None:
-    """Refuse columns that are no numbers, and a table that would be too large, before any of it is read."""
+def _check_parquet(opened: Any, packed: int, path: str | Path, text: bool) -> None:
+    """Refuse columns that are no numbers, nor ``text`` where it may be, and a table that would be too large,
+    before any of it is read."""
     import pyarrow.types as kinds
 
-    numbers = (kinds.is_floating, kinds.is_integer, kinds.is_boolean)
+    known: list[Any] = [kinds.is_floating, kinds.is_integer, kinds.is_boolean]
+    known += [kinds.is_string, kinds.is_large_string, kinds.is_dictionary, kinds.is_null] if text else []
     for entry in opened.schema_arrow:
-        if not any(is_one(entry.type) for is_one in numbers):
+        if not any(is_one(entry.type) for is_one in known):
             problem = f"holds {entry.type}, not numbers"
             raise UserError(problem, file=path, column=entry.name, hint="leave it out")
     about, columns = opened.metadata, len(opened.schema_arrow)
@@ -614,11 +630,11 @@ def _to_float(chunked: Any) -> NDArray[np.float64]:
     return values.copy()
 
 
-def check_table(path: str | Path, *, log: bool = False) -> None:
+def check_table(path: str | Path, *, log: bool = False, labels: bool = False) -> None:
     """Refuse a file that is no table of numbers by its name, its beginning and what it declares.
 
-    A log may have any header.  Neither pandas nor xarray is loaded.  What a shell passes on is read once, so
-    it is not looked at here.
+    A log may have any header, Parquet ``labels``.  Neither pandas nor xarray is loaded.  What a shell passes
+    on is read once, so it is not looked at here.
     """
     kind = file_format(path)
     if os.path.exists(path) and not limits.check_source(path) and not os.path.isfile(path):
@@ -630,7 +646,7 @@ def check_table(path: str | Path, *, log: bool = False) -> None:
         if len(text) < _BEGINNING // 2 or not text.startswith(b"#"):
             _header(text, str(path))
     elif kind == "parquet":
-        _open_parquet(path, str(path), limits.check_source(path)).close()
+        _open_parquet(path, str(path), limits.check_source(path), text=labels).close()
     elif kind == "netcdf":
         check_netcdf(path)
 

@@ -32,7 +32,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -425,8 +425,8 @@ def identify(
         to resampled logs.
     seed : int, optional
     workers : int or str, optional
-        Local processes, or the address of a Dask scheduler, for the kinds of black boxes. The result is the
-        same.
+        Local processes, or the address of a Dask scheduler, for the kinds of black boxes and for the logs
+        that are left out. The result is the same.
     progress : callable, optional
         Called with (fraction done, what).
     early : callable, optional
@@ -488,14 +488,21 @@ def identify(
     def fit(model: str, train: Sequence[Log], report: Progress | None) -> Plant | BlackBoxFit:
         if best is not None and model == best.kind:
             return best if train is logs else fit_without_tail(best, train)
-        if model != "network":
-            return fit_black_box(model, train, **settings, progress=report)
-        from thermogrip.sysid.greybox.fit import fit_network  # pulls in llvmlite and nlopt at the first fit
+        return _fit((network, settings, seed), model, train, report)
 
-        assert network is not None
-        return fit_network(network, train, seed=seed, progress=report)
+    folds_done: dict[tuple[str, int], Plant | str] = {}
+    if leave_one_out and workers != 1:
+        from thermogrip.sysid.models.network import NetworkModel
 
-    scored, more, tried = _compare(fit, finalists, cases, parts)
+        # a class of the user's own is known in this process alone
+        shared = network if isinstance(network, NetworkModel) else None
+        some = [model for model in finalists if model != "network" or shared is not None]
+        pairs = [(model, train) for train, _ in cases for model in some]
+        items = [((shared, settings, seed), *pair) for pair in pairs]
+        report = parts.part("left out", of=len(items))
+        found = run_parallel(_fitted_or_why, items, workers, report, what="fitting")
+        folds_done = {(model, id(train)): plant for (model, train), plant in zip(pairs, found)}
+    scored, more, tried = _compare(fit, finalists, cases, parts, folds_done)
     rows, refused = rows + scored, refused + more
     chosen = choose_model(scored, len(cases)) or (best.kind if best else None)
     if chosen is None:
@@ -717,18 +724,42 @@ def _fit_or_refusal(item: tuple[str, Sequence[Log], dict[str, Any]]) -> BlackBox
         return f"{kind}: {error}"
 
 
+_Asked: TypeAlias = "tuple[GreyModel | None, dict[str, Any], int]"  # network, settings of black boxes, seed
+
+
+def _fit(asked: _Asked, model: str, train: Sequence[Log], report: Progress | None) -> Plant | BlackBoxFit:
+    """Return a candidate fitted to some logs."""
+    network, settings, seed = asked
+    if model != "network":
+        return fit_black_box(model, train, **settings, progress=report)
+    from thermogrip.sysid.greybox.fit import fit_network  # pulls in llvmlite and nlopt at the first fit
+
+    assert network is not None
+    return fit_network(network, train, seed=seed, progress=report)
+
+
+def _fitted_or_why(item: tuple[_Asked, str, Sequence[Log]]) -> Plant | str:
+    """Return the plant of a candidate fitted to some logs, or why it could not be."""
+    try:
+        fitted = _fit(*item, None)
+    except UserError as error:
+        return str(error)
+    return fitted if isinstance(fitted, Plant) else fitted.plant
+
+
 def _compare(
     fit: Callable[[str, Sequence[Log], Progress | None], Plant | BlackBoxFit],
     candidates: Sequence[str],
     cases: Sequence[tuple[list[Log], Held]],
     parts: _Parts,
+    plants: dict[tuple[str, int], Plant | str],
 ) -> tuple[list[Row], list[str], dict[str, dict[str, FreeRun]]]:
     """Return the rows of every candidate on what is held out, which could not be fitted, and why, and by
-    candidate and what was held out its free runs."""
+    candidate and what was held out its free runs; ``plants`` are those fitted already, or why not."""
     rows: list[Row] = []
     runs: dict[str, dict[str, FreeRun]] = {}
     refused: list[str] = []
-    plants: dict[tuple[str, int], Plant] = {}  # without leave_one_out all cases share one training set
+    # without leave_one_out all cases share one training set
     for train, held in cases:
         for model in candidates:
             what = f"{model} without {held.name}"
@@ -737,6 +768,10 @@ def _compare(
                     fitted = fit(model, train, parts.part(what))
                     plants[model, id(train)] = fitted if isinstance(fitted, Plant) else fitted.plant
                 plant = plants[model, id(train)]
+                if isinstance(plant, str):
+                    refused.append(f"{what}: {plant}")
+                    parts.next()
+                    continue
                 run = run_held_out(plant, held, unseen=True)
                 rows += rows_of(model, plant, held.name, run, held_out=True)
                 runs.setdefault(model, {})[held.name] = run

@@ -1,7 +1,7 @@
 """Wall time, CPU time, peak memory and grasps per core-second of ``effusivity`` and ``classify`` by the
 number of grasps, and whether a run that ``kill -9`` ended at 40 % goes on to the same bytes.
 
-    python benchmarks/classify/scale.py FOLDER [--files 2 20] [--classify MODEL_DIR] [--kill]
+    python benchmarks/classify/scale.py FOLDER [--files 2 20] [--classify MODEL_DIR] [--kill] [--workers N]
 
 Files of 500 grasps each are made in FOLDER: traces of the example condition ``exp1A_obj43_grip23``, drawn at
 random, with new white noise of 0.02 K.  The rate leaves out the start, by the difference of two numbers of
@@ -69,8 +69,10 @@ def main() -> None:
     parser.add_argument("--files", type=int, nargs="+", default=[2, 20])
     parser.add_argument("--classify", metavar="MODEL_DIR")
     parser.add_argument("--kill", action="store_true")
+    parser.add_argument("--workers", type=int, default=1)
     given = parser.parse_args()
     verb = ["classify", given.classify] if given.classify else ["effusivity"]
+    verb += ["--workers", str(given.workers)]
     print("grasps   wall [s]  CPU [s]  memory [MB]  grasps a core-second")
     before: tuple[int, float] | None = None
     for n_files in given.files:

@@ -45,7 +45,13 @@ from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import csv_text
 from thermogrip.datasets.schema import Grasps, has_touch_groups, label_values, log_name, unit_names
-from thermogrip.sysid.effusivity.data import Touches, object_range, touches, with_object_range
+from thermogrip.sysid.effusivity.data import (
+    Touches,
+    object_range,
+    touches,
+    with_object_range,
+    with_tables,
+)
 from thermogrip.sysid.effusivity.gripper_model import GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import (
     BUILD_UP,
@@ -387,7 +393,7 @@ def _asked(
     NaN where the object's is known; ``stated`` is that of unknown ones, by default 20 K about the room."""
     unknown = np.isnan(number_values(grasps, "t_object"))[at, None]
     ends = np.where(unknown, object_range(grasps, stated)[at], np.nan)
-    return touches(with_object_range(grasps, stated), until=until, at=at), ends
+    return with_tables(touches(with_object_range(grasps, stated), until=until, at=at)), ends
 
 
 def _taken_for(device: GripperModel, named: Sequence[str], **finish: str) -> Hypotheses:

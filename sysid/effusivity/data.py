@@ -17,7 +17,7 @@ with contact time, so that a longer record does not raise confidence faster than
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -71,6 +71,11 @@ def at_knots(t: Array) -> Array:
     return np.stack([np.interp(t, x, row) for row in base], axis=-1)
 
 
+_WHOLE = ("second", "tabled")  # not an array of each touch
+#: Touches from which on a table of their responses pays.
+MANY = 100
+
+
 @dataclass(frozen=True)
 class Touches:
     """``n`` grasps, padded to the longest."""
@@ -89,18 +94,20 @@ class Touches:
     t_ambient: Array  # (n,), of the room [degC]
     excursion: Array  # (n,) [K]
     second: Touches | None = None  # what a second sensor of the finger read of the same grasps
+    tabled: float = 0.0  # s: responses are of tables that reach so far; 0 where each is stepped
 
     def take(self, index: NDArray[np.int64]) -> Touches:
         """Return the touches at these rows."""
-        own = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "second"}
-        return Touches(**own, second=None if self.second is None else self.second.take(index))
+        own = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name not in _WHOLE}
+        second = None if self.second is None else self.second.take(index)
+        return Touches(**own, second=second, tabled=self.tabled)
 
     def known(self, index: NDArray[np.int64]) -> Touches:
         """Return what was known of the touches at these rows, with no readings."""
         own = ("level", "t_object", "t_object_sd", "t_ambient", "excursion")
         numbers = {f.name: getattr(self, f.name)[index if f.name in own else slice(0)]
-                   for f in fields(self) if f.name != "second"}  # fmt: skip
-        return Touches(**numbers)
+                   for f in fields(self) if f.name not in _WHOLE}  # fmt: skip
+        return Touches(**numbers, tabled=self.tabled)
 
     @property
     def end(self) -> float:
@@ -163,6 +170,15 @@ def touches(
     )  # fmt: skip
 
 
+def with_tables(data: Touches) -> Touches:
+    """Return touches whose responses are interpolated where they are many enough."""
+    if data.level.size < MANY:
+        return data
+    second = None if data.second is None else with_tables(data.second)
+    # contact may begin 1.5 s early; whole seconds, so that records share tables
+    return replace(data, second=second, tabled=float(np.ceil(data.end + 1.5)))
+
+
 def object_range(grasps: Grasps, stated: tuple[float, float] | None = None) -> Array:
     """Return between what an object of unknown temperature may be, (n_grasp, 2) [degC]: as ``stated``,
     or 20 K about the room, or about the skin where no room is known."""
@@ -209,7 +225,7 @@ def stack_touches(parts: list[Touches]) -> Touches:
 
     seconds = [p.second for p in parts if p.second is not None]
     second = stack_touches(seconds) if len(seconds) == len(parts) else None
-    return Touches(**{f.name: joined(f.name) for f in fields(Touches) if f.name != "second"}, second=second)
+    return Touches(**{f.name: joined(f.name) for f in fields(Touches) if f.name not in _WHOLE}, second=second)
 
 
 def noise_covariance(data: Touches, noise: Noise) -> Array:

@@ -128,7 +128,7 @@ class Mode(NamedTuple):
 
 def nodes_for(data: Touches) -> TimeNodes:
     """Return the time nodes that reach the last sample of an early contact."""
-    return time_nodes(data.end + _EARLIEST_ONSET)
+    return time_nodes(data.tabled or data.end + _EARLIEST_ONSET)
 
 
 def predict(stack: Stack, nodes: TimeNodes, data: Touches, u: Array, beyond: Array | None = None) -> Array:
@@ -148,13 +148,18 @@ def jacobian(
 
 
 def pairs_asked(
-    stack: Stack, nodes: TimeNodes, data: Touches, row: NDArray[np.int64], beyond: Array | None
-) -> Any:
-    """Return the pairs of some rows and a gripper as the search takes them."""
+    stack: Stack, nodes: TimeNodes, data: Touches, row: NDArray[np.int64], beyond: Array | None, *,
+    tabled: bool = False,
+) -> Any:  # fmt: skip
+    """Return the pairs of some rows and a gripper as the search takes them, their responses ``tabled``
+    (:mod:`thermogrip.sysid.contact.response_table`) or stepped."""
+    from thermogrip.sysid.contact.response_table import response_table
     from thermogrip.sysid.effusivity.mode_kernel import Asked
 
-    nothing = np.broadcast_to(0.0, (row.size, 2, data.y.shape[1])) if beyond is None else beyond
-    return Asked(nodes, gripper_modes(stack), data, row, nothing)
+    shape = (row.size, 2, data.y.shape[1])
+    nothing = np.zeros(shape) if beyond is None else np.ascontiguousarray(np.broadcast_to(beyond, shape))
+    table = response_table(stack, data.tabled) if tabled and data.tabled else None
+    return Asked(nodes, gripper_modes(stack), data, row, nothing, table)
 
 
 def find_modes(
@@ -177,7 +182,7 @@ def find_modes(
     dof = np.full(u.shape, np.inf) if prior.dof is None else prior.dof
     w_matrix, log_det = whitener
     asked, law = (
-        pairs_asked(stack, nodes_for(data), data, row, beyond),
+        pairs_asked(stack, nodes_for(data), data, row, beyond, tabled=True),
         np.stack([prior.mean, prior.sd, dof], axis=1),
     )
     covariance, objective, misfit, settled = modes(asked, w_matrix, law, u, max_steps, rivals=rivals)

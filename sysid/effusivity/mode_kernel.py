@@ -44,6 +44,7 @@ class Asked(NamedTuple):
     beyond: (
         Array  # (n, 2, n_bin), the gripper's discrepancy: always [K], and per degree between object and skin
     )
+    table: Any = None  # ResponseTable of the gripper, where its responses are interpolated
 
     def take(self, index: Any) -> Asked:
         """Return some of the pairs, of one gripper."""
@@ -54,7 +55,7 @@ def readings(asked: Asked, u: Array, vary: Mask, *, alike: bool = False) -> tupl
     """Return the bin means (n, n_bin) that ``u`` (n, 7) predicts, and their derivatives (n, 8, n_bin), zero
     where not ``vary`` (n, 7), with a last row for the caller's use; ``alike`` says that many contacts are the
     same but for onset and temperatures."""
-    nodes, gripper, data, row, beyond = asked
+    nodes, gripper, data, row, beyond, table = asked
     wanted = np.ones((row.size, RATE + 1), dtype=bool)
     wanted[:, 1:] = vary[:, _CURVES]
     contact, which = np.ascontiguousarray(np.exp(u[:, (_E, _C, _H, _BUILD_UP)])), np.arange(row.size)
@@ -65,100 +66,91 @@ def readings(asked: Asked, u: Array, vary: Mask, *, alike: bool = False) -> tupl
         contact, every = contact[first], np.zeros((first.size, N_STEPPED), dtype=bool)
         np.logical_or.at(every, which, stepped)
         stepped = every
-    rise, slope, _ = contacts(nodes, gripper, contact, np.ascontiguousarray(stepped))
+    if table is None:
+        rise, slope, _ = contacts(nodes, gripper, contact, np.ascontiguousarray(stepped))
+    else:
+        rise, slope = table.curves(contact, stepped)
     room = data.t_ambient[row]
-    known, difference = np.isfinite(room), u[:, _T] - u[:, _LEVEL]
+    known = np.isfinite(room)
     late = np.exp(2.0 * (u[:, _C] - u[:, _E])) / 6.0
     # the block goes to the room by its far face at ``rate`` [1/s], ``way`` [K]
     far, leak = gripper.numbers[:, 5], np.where(known, gripper.numbers[:, 6], 0.0)
     rate, way = np.where(known, far * np.exp(-u[:, _C]), 0.0), np.where(known, room - u[:, _T], 0.0)
-    means, delayed, shifted = np.zeros((3, row.size, RATE + 1, data.y.shape[1]))
     onset = np.clip(u[:, _ONSET], EARLIEST_ONSET, LATEST_ONSET)
     wanted[:, RATE] &= onset == u[:, _ONSET]  # past the range nothing moves
-    room_for = np.empty((2, data.sample_t.shape[1]))
+    n_bin, away = data.y.shape[1], np.where(known, leak * (room - u[:, _LEVEL]), 0.0)
+    y, slopes = np.empty((row.size, n_bin)), np.zeros((row.size, _LEFT + 1, n_bin))
+    late, leak = np.where(rate > 0.0, late, -1.0), np.broadcast_to(leak, row.size)
+    loss = np.stack([late, rate, way, away, leak], axis=1)
     bin_means(
         nodes[2], rise, slope, wanted, which, onset, row, data.sample_t, data.sample_bin, data.count, data.t,
-        np.where(rate > 0.0, late, -1.0), room_for, means, delayed, shifted,
+        data.ramp, beyond, u, vary, loss, np.empty((7, data.sample_t.shape[1])),
+        np.empty((3, RATE + 1, n_bin)), y, slopes,
     )  # fmt: skip
-    ramp, slopes = data.ramp[row], np.zeros((row.size, _LEFT + 1, data.y.shape[1]))
-    f, lost = means[:, VALUE] + beyond[:, 1], rate[:, None] * delayed[:, VALUE]
-    away = np.where(known, leak * (room - u[:, _LEVEL]), 0.0)
-    y = (
-        u[:, _LEVEL, None]
-        + difference[:, None] * f
-        + way[:, None] * lost
-        + away[:, None] * ramp
-        + beyond[:, 0]
-    )
-    slopes[:, _T], slopes[:, _LEVEL] = f - lost, 1.0 - f - leak[:, None] * ramp
-    scale = (rate * way)[:, None]
-    for curve, at in enumerate(_CURVES, 1):
-        if not vary[:, at].any():
-            continue
-        extra = delayed[:, curve]
-        if at == _E:  # a denser or less conducting block passes the loss on later
-            extra = extra + 2.0 * late[:, None] * shifted[:, VALUE]
-        elif at == _C:
-            extra = extra - 2.0 * late[:, None] * shifted[:, VALUE] - delayed[:, VALUE]
-        sign = np.where(vary[:, at], -1.0 if at == _ONSET else 1.0, 0.0)[:, None]
-        slopes[:, at] = sign * (difference[:, None] * means[:, curve] + scale * extra)
-    slopes[:, :_LEFT][~vary] = 0.0
     return y, slopes
 
 
 @numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
 def bin_means(
     nodes: Array, rise: Array, slope: Array, wanted: Mask, which: NDArray[np.int64], onset: Array,
-    row: NDArray[np.int64], times: Array, bins: NDArray[np.int64], count: Array, t: Array, late: Array,
-    room: Array, means: Array, delayed: Array, shifted: Array,
+    row: NDArray[np.int64], times: Array, bins: NDArray[np.int64], count: Array, t: Array, ramp: Array,
+    beyond: Array, u: Array, vary: Mask, loss: Array, room: Array, parts: Array, y: Array, slopes: Array,
 ) -> None:  # fmt: skip
-    """Fill bin means (n, 6, n_bin) of the ``wanted`` curves ``which`` belong to n pairs, the last of them the
-    slope of the first; and where ``late`` is not negative the integrals of the means up to ``late`` before,
-    and the means there, by straight lines between the bins with a ``count``, zero before them."""
+    """Fill ``y`` (n, n_bin) and ``slopes`` (n, 8, n_bin) of :func:`readings`.
+
+    Bin means (6, n_bin) of the ``wanted`` curves ``which`` belong to n pairs, the last of them the slope of
+    the first; and where ``late``, first of ``loss`` (n, 5), is not negative the integrals of the means up to
+    ``late`` before, and the means there, by straight lines between the bins with a ``count``, zero before
+    them.  The others of ``loss`` are rate, way, drift of the level and leak."""
+    means, delayed, shifted = parts[0], parts[1], parts[2]
     last, n_curve, n_bin = nodes.size - 1, wanted.shape[1], t.shape[1]
     for p in range(row.size):
-        i, k = row[p], 0
-        for j in range(
-            times.shape[1]
-        ):  # the node before each sample, -1 before contact, and the way to the next
+        i, k, begin, late = row[p], 0, times.shape[1], loss[p, 0]
+        parts[:] = 0.0
+        # the node before each sample, -1 before contact, and the weights of values and slopes there and at
+        # the next one, by cubic Hermite interpolation
+        for j in range(times.shape[1]):
             since = times[i, j] - onset[p]
             room[0, j] = -1.0
             if bins[i, j] >= 0 and since > 0.0:
+                begin = min(begin, j)
                 while k < last - 1 and nodes[k + 1] < since:
                     k += 1
                 while k > 0 and nodes[k] > since:
                     k -= 1
-                room[0, j], room[1, j] = k, min((since - nodes[k]) / (nodes[k + 1] - nodes[k]), 1.0)
+                dt = nodes[k + 1] - nodes[k]
+                s = min((since - nodes[k]) / dt, 1.0)
+                room[0, j], room[1, j] = k, s * s * (3.0 - 2.0 * s)
+                room[2, j], room[3, j] = s * (1.0 - s) * (1.0 - s) * dt, -s * s * (1.0 - s) * dt
+                room[4, j], room[5, j] = 6.0 * s * (1.0 - s) / dt, (1.0 - s) * (1.0 - 3.0 * s)
+                room[6, j] = s * (3.0 * s - 2.0)
         for c in range(n_curve):
             if not wanted[p, c]:
                 continue
-            # by cubic Hermite interpolation
             rates, values = c == n_curve - 1, 0 if c == n_curve - 1 else c
             r, v = rise[which[p], values], slope[which[p], values]
-            for j in range(times.shape[1]):
+            for j in range(begin, times.shape[1]):
                 if room[0, j] >= 0.0:
-                    k, s = int(room[0, j]), room[1, j]
-                    dt, high = nodes[k + 1] - nodes[k], r[k + 1] - r[k]
+                    k = int(room[0, j])
+                    high = r[k + 1] - r[k]
                     if rates:
-                        one = 6.0 * s * (1.0 - s) * high / dt
-                        one += (1.0 - s) * (1.0 - 3.0 * s) * v[k] + s * (3.0 * s - 2.0) * v[k + 1]
+                        one = room[4, j] * high + room[5, j] * v[k] + room[6, j] * v[k + 1]
                     else:
-                        one = r[k] + s * s * (3.0 - 2.0 * s) * high
-                        one += s * (1.0 - s) * dt * ((1.0 - s) * v[k] - s * v[k + 1])
-                    means[p, c, bins[i, j]] += one
+                        one = r[k] + room[1, j] * high + room[2, j] * v[k] + room[3, j] * v[k + 1]
+                    means[c, bins[i, j]] += one
             for m in range(n_bin):
                 if count[i, m] > 0.0:
-                    means[p, c, m] /= count[i, m]
-            if late[p] < 0.0:
+                    means[c, m] /= count[i, m]
+            if late < 0.0:
                 continue
-            curve, summed = means[p, c], 0.0  # the integral up to ``before``
+            curve, summed = means[c], 0.0  # the integral up to ``before``
             before = after = -1  # the bins on either side
             for m in range(n_bin):
                 if count[i, m] <= 0.0:
                     continue
                 if after < 0:
                     after = m
-                x = t[i, m] - late[p]
+                x = t[i, m] - late
                 while t[i, after] <= x:
                     if before >= 0:
                         summed += 0.5 * (t[i, after] - t[i, before]) * (curve[after] + curve[before])
@@ -172,8 +164,30 @@ def bin_means(
                     ahead, bend = x - t[i, before], 0.0
                     if after != before:
                         bend = (curve[after] - curve[before]) / (t[i, after] - t[i, before])
-                    delayed[p, c, m] = summed + ahead * (curve[before] + 0.5 * bend * ahead)
-                    shifted[p, c, m] = curve[before] + bend * ahead
+                    delayed[c, m] = summed + ahead * (curve[before] + 0.5 * bend * ahead)
+                    shifted[c, m] = curve[before] + bend * ahead
+        rate, way, difference = loss[p, 1], loss[p, 2], u[p, _T] - u[p, _LEVEL]
+        for m in range(n_bin):
+            f, lost = means[VALUE, m] + beyond[p, 1, m], rate * delayed[VALUE, m]
+            y[p, m] = u[p, _LEVEL] + difference * f + way * lost + loss[p, 3] * ramp[i, m] + beyond[p, 0, m]
+            if vary[p, _T]:
+                slopes[p, _T, m] = f - lost
+            if vary[p, _LEVEL]:
+                slopes[p, _LEVEL, m] = 1.0 - f - loss[p, 4] * ramp[i, m]
+        for c in range(1, n_curve):
+            at = _CURVES[c - 1]
+            if vary[p, at]:
+                by_late = 0.0
+                if at == _E:  # a denser or less conducting block passes the loss on later
+                    by_late = 2.0 * late
+                elif at == _C:
+                    by_late = -2.0 * late
+                sign = -1.0 if at == _ONSET else 1.0
+                for m in range(n_bin):
+                    extra = delayed[c, m] + by_late * shifted[VALUE, m]
+                    if at == _C:
+                        extra -= delayed[VALUE, m]
+                    slopes[p, at, m] = sign * (difference * means[c, m] + rate * way * extra)
 
 
 @numba.njit(**COMPILED)  # type: ignore[untyped-decorator]

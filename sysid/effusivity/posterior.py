@@ -19,7 +19,7 @@ from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.grasp_files import Records, as_grasps
 from thermogrip.datasets.materials import Material
 from thermogrip.datasets.schema import Grasps, has_touch_groups
-from thermogrip.sysid.effusivity.data import Touches, touches
+from thermogrip.sysid.effusivity.data import Touches, touches, with_tables
 from thermogrip.sysid.effusivity.gripper_model import (
     ANOTHER_SCALE_SD,
     INSULATOR,
@@ -133,7 +133,7 @@ def effusivity_posterior(
     found: dict[int, GridPosterior] = {}
     share = 0.0
     if alone.size:
-        data = touches(grasps.isel(grasp=alone) if rows else grasps, until=until)
+        data = with_tables(touches(grasps.isel(grasp=alone) if rows else grasps, until=until))
         single = grid_posteriors(gripper, data)
         if other_gripper > 0:
             single, share = _by_either(gripper, data, single, other_gripper)
@@ -145,7 +145,8 @@ def effusivity_posterior(
     return [_row(gripper, name, found[i], share if i in alone else 0.0) for i, name in enumerate(names)]
 
 
-_ASKED, _UNLIKELY = 5, 0.01  # grasps that another gripper is asked about first, and when no more are
+# grasps about which another gripper is asked one by one, until it is so unlikely, and when no more are asked
+_ASKED, _HARDLY, _UNLIKELY = 5, 0.001, 0.01
 
 
 def _by_either(
@@ -158,8 +159,8 @@ def _by_either(
     order = np.concatenate([order, np.setdiff1d(np.arange(n), order)])
     theirs: dict[int, GridPosterior] = {}
     odds = float(logit(prior))
-    for some in (order[:_ASKED], order[_ASKED:]):
-        if some.size and (not theirs or expit(odds) > _UNLIKELY):
+    for some in (*order[:_ASKED, None], order[_ASKED:]):
+        if some.size and expit(odds) > (_HARDLY if len(theirs) < _ASKED else _UNLIKELY):
             fits = grid_posteriors(other, data.take(some))
             fits = [fit._replace(x_sd=np.full(fit.x.size, ANOTHER_SCALE_SD)) for fit in fits]
             odds += sum(fit.log_evidence - own[i].log_evidence for i, fit in zip(some, fits))

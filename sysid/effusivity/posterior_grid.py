@@ -75,7 +75,8 @@ def slipped(
     it is stated."""
     from thermogrip.sysid.effusivity.mode_kernel import marginals
 
-    asked = pairs_asked(gripper.stack, nodes_for(data), data, np.zeros(len(u), dtype=np.int64), beyond)
+    row = np.zeros(len(u), dtype=np.int64)
+    asked = pairs_asked(gripper.stack, nodes_for(data), data, row, beyond, tabled=True)
     stated, t_sd = np.isfinite(data.t_object[0]), sd[T_OBJECT]
     sds = [[sd[LEVEL], t_sd], [sd[LEVEL], t_sd * float(slip_of(t_sd))]]
     found = marginals(asked, whitener, u, np.array(sds[: 1 + stated]))

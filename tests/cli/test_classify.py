@@ -90,7 +90,7 @@ def test_effusivities_are_printed_written_and_answered(gripper: SimpleNamespace)
     assert "a 1000 500 2000 28" in said
     assert said.endswith("odd: a wrote e.csv")
     assert "so no effusivity" not in said
-    assert shares(done.err, "effusivity") == [0, 50]
+    assert shares(done.err, "effusivity") == [0, 50, 100]
     with (gripper.bench.path / "e.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["grasp_id"] for row in rows] == ["a", "b", "c"]

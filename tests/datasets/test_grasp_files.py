@@ -244,7 +244,7 @@ def test_a_log_is_no_grasps(tmp_path, small_log):
     from thermogrip.datasets.log_files import write_log
 
     assert "not grasps" in refused(write_log(small_log, tmp_path / "x.nc"))
-    assert "CSV or NetCDF" in refused(write_log(small_log, tmp_path / "x.parquet"))
+    assert "no column grasp_id" in refused(write_log(small_log, tmp_path / "x.parquet"))
 
 
 def test_a_folder_is_its_grasp_files(tmp_path, small_grasps):
@@ -335,3 +335,21 @@ def test_the_first_and_the_last_sample_of_a_jittering_grasp_are_held_for_half_a_
     assert "interpolated onto a step of 0.1 s" in grasps.attrs["repairs"]
     ends = grasps["t_surface"].values[:, [0, -1]]
     np.testing.assert_allclose(ends, [[10.0, 30.0], [10.04, 29.96], [np.nan, np.nan]], atol=1e-9)
+
+
+def test_parquet_with_a_row_a_sample_is_the_csv(tmp_path):
+    import pandas as pd
+
+    made = make_grasps(
+        [-0.1, 0.1],
+        [[23.0, 24.5], [22.0, 25.0]],
+        ["g0", "g1"],
+        material=["iron", "wood"],
+        t_object=[43.0, np.nan],
+    )
+    csv = read_grasps(write_grasps(made, tmp_path / "warm.csv"))
+    samples, meta = pd.read_csv(tmp_path / "warm.csv"), pd.read_csv(tmp_path / "warm_meta.csv")
+    (tmp_path / "parquet").mkdir()
+    samples.merge(meta, on="grasp_id").to_parquet(tmp_path / "parquet" / "warm.parquet")
+    [found] = read_grasp_files([tmp_path / "parquet"])
+    assert found.identical(csv)

@@ -6,6 +6,8 @@ import math
 import os
 import re
 import signal
+import sys
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -15,7 +17,7 @@ import pytest
 from thermogrip import __version__
 from thermogrip.datasets import parallel
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.parallel import kept_processes, run_parallel, sub_progress
+from thermogrip.datasets.parallel import in_order, kept_processes, run_parallel, sub_progress
 
 OWN = ["__import__('os').getpid()"] * 4  # a process may not find this module, the builtin eval it does
 
@@ -53,8 +55,8 @@ def test_processes_that_are_kept_do_the_work_of_every_call_and_then_end() -> Non
 
 
 @pytest.mark.skipif(os.name == "nt" or (os.cpu_count() or 1) < 2, reason="needs POSIX and two processors")
-def test_a_killed_process_is_one_line():
-    with pytest.raises(UserError, match="a worker process was killed"):
+def test_processes_that_are_killed_again_and_again_are_one_line():
+    with pytest.raises(UserError, match="worker processes are killed again and again"):
         run_parallel(signal.raise_signal, [signal.SIGKILL] * 3, workers=2)
 
 
@@ -91,8 +93,8 @@ def test_a_fault_stops_what_has_not_begun_and_a_killed_process_is_one_line(pools
             raise BrokenProcessPool
         return n
 
-    with pytest.raises(UserError, match="a worker process was killed; lower --workers; memory may be short"):
-        run_parallel(work, range(200), workers=2)
+    with pytest.raises(UserError, match=r"killed again and again; lower --workers; memory may be short"):
+        run_parallel(work, [1] * 200, workers=2)
     assert len(done) < 100
 
 
@@ -120,7 +122,7 @@ class Cluster:
     def run(self, _function):
         if self._versions is None:
             raise ModuleNotFoundError
-        return self._versions
+        return {str(k): parallel._versions() | {"thermogrip": v} for k, v in enumerate(self._versions)}
 
 
 @pytest.mark.parametrize(
@@ -128,8 +130,8 @@ class Cluster:
     [
         ({}, {}, "the cluster at tcp://a:1 has no workers; run 'dask worker tcp://a:1'"),
         ({"w": 1}, None, f"a worker of tcp://a:1 has no thermogrip; install thermogrip {__version__} on all"),
-        ({"w": 1}, {"w": "0.3", "v": __version__, "u": "0.2"}, "tcp://a:1 has thermogrip 0.2, 0.3; install"),
-        ({"w": 1}, {"w": __version__}, ""),
+        ({"w": 1}, ["0.3", __version__, "0.2"], f"has thermogrip 0.2, 0.3 for {__version__}; install"),
+        ({"w": 1}, [__version__], ""),
     ],
 )
 def test_a_cluster_has_workers_of_this_version(workers, versions, words):
@@ -208,6 +210,39 @@ def test_a_cluster_that_does_not_answer_is_one_line(monkeypatch):
 
 
 def test_a_cluster_of_another_version_is_refused(cluster, monkeypatch):
-    monkeypatch.setattr("thermogrip.datasets.parallel._version", lambda: "0.0.1")
-    with pytest.raises(UserError, match=r"has thermogrip 0\.0\.1"):
+    own = parallel._versions()
+    monkeypatch.setattr(parallel, "_versions", lambda: own | {"thermogrip": "0.0.1", "numpy": "1.0"})
+    monkeypatch.setattr(distributed_client(), "run", lambda *_: {"w": own})
+    words = rf"has thermogrip {__version__} for 0\.0\.1; numpy .* for 1\.0; install"
+    with pytest.raises(UserError, match=words):
         run_parallel(abs, [1], cluster)
+
+
+def distributed_client():
+    return pytest.importorskip("distributed").Client
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
+def test_what_a_killed_process_had_in_hand_is_done_again(tmp_path):
+    mark, seen = tmp_path / "killed", []
+    kill = f"{{n}} if __import__('os').path.exists({str(mark)!r}) else " + (
+        f"(open({str(mark)!r}, 'w').close(), __import__('os').kill(__import__('os').getpid(), 9))"
+    )
+    items = [kill.format(n=n) if n == 3 else str(n) for n in range(8)]
+    got = run_parallel(eval, items, 2, lambda share, _: seen.append(share))
+    assert got == list(range(8))
+    assert mark.exists()
+    assert seen == [pytest.approx(n / 8) for n in range(1, 9)]
+
+
+def test_results_come_in_order_as_soon_as_they_can(pools):
+    turn = threading.Event()
+
+    def work(n):
+        if n == 0:
+            turn.wait(10)
+        turn.set()
+        return n
+
+    assert list(in_order(work, range(9), 3)) == list(range(9))
+    assert list(in_order(abs, [-2, -1])) == [2, 1]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from thermogrip.datasets import partitions
+from thermogrip.datasets import parallel, partitions
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.grasp_files import write_grasps
 from thermogrip.datasets.partitions import Answers, parts_of, sources
@@ -86,7 +87,7 @@ def test_all_parts_are_answered_in_order_under_the_columns_of_all(folder: Path, 
     assert lines[:2] == ["grasp_id,last,note", "a0,23.25,"]
     assert [line.split(",")[0] for line in lines[1:]] == [*chain(*work.asked)]
     assert lines[1 + N + 2] == "b2,24.0,a column of its own"
-    assert work.shares[1:] == pytest.approx(np.arange(9) / 9, abs=0.02)
+    assert work.shares == pytest.approx(np.arange(10) / 9, abs=0.02)
     found.remove()
     assert sorted(os.listdir(tmp_path)) == ["grasps", "o.csv"]
 
@@ -103,7 +104,7 @@ def test_the_same_command_goes_on_to_the_same_bytes(
     again.run(folder, out)
     assert (len(again.asked), out.read_bytes() == whole) == (9 - done, True)
     assert again.read == ["a", "b", "c"][done // 3 :]  # what is answered is not read
-    assert again.shares[1] == pytest.approx(done / 9, abs=0.02)
+    assert again.shares[:2] == pytest.approx([done / 9, (done + 1) / 9], abs=0.02)
 
 
 @pytest.mark.parametrize("cut", [1, 40, 200])
@@ -168,6 +169,46 @@ def test_two_runs_do_not_write_one_file(folder: Path, tmp_path: Path) -> None:
 
     Second().run(folder, out)
     assert out.exists()
+
+
+def rows_of(record: Grasps) -> dict[str, Any]:
+    """Return answers that processes can find."""
+    names = record["grasp"].values.tolist()
+    return {"rows": [{"grasp_id": name} for name in names], "warnings": [record.attrs["name"]]}
+
+
+def test_workers_share_out_files_and_give_the_same_bytes(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(parallel, "_processes", ThreadPoolExecutor)
+    monkeypatch.setattr(parallel.os, "cpu_count", lambda: 3)
+    found: list[bytes] = []
+    for workers in (1, 3):
+        said: list[str] = []
+        answers, out = Answers(tmp_path / "o.csv", []), tmp_path / f"{workers}.csv"
+        answers.find(
+            sources([folder]), lambda r: r, rows_of, lambda *_: None, workers=workers, warn=said.append
+        )
+        answers.write(out, str)
+        assert said == ["a", "a", "a", "b", "b", "b", "c", "c", "c"]
+        found.append(answers.path.read_bytes() + out.read_bytes())
+        answers.remove()
+    assert found[0] == found[1]
+    assert b"warnings" not in found[0]
+
+
+def test_answers_as_parquet_have_the_rows_of_the_table(folder: Path, tmp_path: Path, whole: bytes) -> None:
+    import pandas as pd
+
+    work = Work()
+    work.run(folder, tmp_path / "o.parquet").remove()
+    frame = pd.read_parquet(tmp_path / "o.parquet")
+    table = pd.read_csv(tmp_path / "whole.csv")
+    pd.testing.assert_frame_equal(frame, table, check_dtype=False)
+
+
+def test_a_pattern_that_a_shell_left_is_filled_in(folder: Path) -> None:
+    assert [each.name for each in sources([str(folder / "[ac]*.csv")])] == ["a.csv", "c.csv"]
 
 
 def test_two_files_of_one_name_are_refused(folder: Path, tmp_path: Path) -> None:

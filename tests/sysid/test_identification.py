@@ -45,6 +45,30 @@ def plant_log(n=900, *, seed=0, name="a", gain=0.5, noise=0.02):
     return make_log(np.arange(float(n)), {"q": (q, "1", "input"), "t": (t, "degC", "output")}, name=name)
 
 
+def test_logs_left_out_on_other_processes_give_the_same(monkeypatch):
+    logs = [plant_log(300, seed=s, name=name) for s, name in enumerate("ab")]
+    own = identification._fit
+
+    def fit(asked, model, train, report):
+        if model == "subspace" and train[0].attrs["name"] == "a":
+            raise UserError("no")
+        return own(asked, model, train, report)
+
+    monkeypatch.setattr(identification, "_fit", fit)
+    how = {"models": ["arx", "subspace"], "leave_one_out": True, "average": 2.0, "draws": 0}
+    alone, asked = identify(logs, **how), []
+
+    def parallel(function, items, workers, *_, **__):
+        asked.append((workers, len(items)))
+        return [function(item) for item in items]
+
+    monkeypatch.setattr(identification, "run_parallel", parallel)
+    shared = identify(logs, **how, workers=2)
+    assert asked == [(2, 4)]
+    assert (shared.rows, shared.notes, shared.model) == (alone.rows, alone.notes, alone.model)
+    assert "subspace without b: no" in shared.notes
+
+
 def test_leaving_one_log_out_gives_a_row_for_every_model_and_log():
     logs = [plant_log(500, seed=s, name=name) for s, name in enumerate("abc")]
     found = identify(logs, models=["arx", "subspace"], leave_one_out=True, average=2.0, draws=0)

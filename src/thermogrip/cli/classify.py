@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, astuple, dataclass
-from functools import partial
+from functools import lru_cache
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
@@ -123,6 +123,8 @@ def effusivity(
     between: ObjectRange = None,
     report: cli.Report = None,
     seed: cli.Seed = 0,
+    workers: cli.Workers = 1,
+    cluster: cli.Cluster = None,
     as_json: cli.AsJson = False,
 ) -> int:
     """Find the effusivity of what was touched, grasp by grasp.
@@ -133,38 +135,23 @@ def effusivity(
     shows no contact, or moves away from its t_object, has none: its numbers are nan. Readings at the end of
     the sensor's range are left out, and of single touches what is later than the calibration's contacts. A
     single touch that the model does not explain is named.
+
+    A run that was ended goes on where it stopped when it is given again. Workers share out files, which
+    they read themselves.
     """
     stated = _range(between)
-    cli.new_file(out, (".csv",))
+    cli.new_file(out, (".csv", ".parquet"))
+    pool = cli.workers_of(workers, cluster)
     console = Console(as_json)
-    from thermogrip.classify.decisions.predict import unexplained_effusivities
     from thermogrip.datasets.partitions import Answers, sources, stamps
-    from thermogrip.sysid.effusivity.data import with_object_range
 
     given = sources(grasps)
     device, coupling, longest = calibrated_device(console, calibrate or [], seed)
-
-    def prepare(record: Grasps) -> Grasps:
-        return _as_taught(console, _warned(console, record), longest, coupling)
-
-    def answer(record: Grasps) -> dict[str, Any]:
-        # the bundled gripper may have taken these grasps or not
-        found = _effusivities(device, with_object_range(record, stated), coupling, 0.0 if calibrate else 0.5)
-        if max(row.other_gripper for row in found) > 0.5:
-            console.warn(
-                f"{record.attrs['name']}: read as by another gripper than the bundled one: intervals are as "
-                "wide as grippers differ"
-            )
-        misfits = unexplained_effusivities(device, record, found, stated)
-        rows = [asdict(row) for row in found]
-        for row in rows:
-            row["misfit_sd"] = misfits[row["grasp_id"]].sd if row["grasp_id"] in misfits else float("nan")
-        unexplained = {name: found.words for name, found in misfits.items() if found.words}
-        return {"rows": rows, "unexplained": unexplained, "missed": _missed(record, rows)} | _of_part(record)
-
+    # the bundled gripper may have taken these grasps or not
+    ask = _Effusivity(device, coupling, longest, stated, 0.0 if calibrate else 0.5)
     found = Answers(out, ["effusivity", stated, seed, stamps(calibrate or [])])
     with _resumable(console, found), console.progress("effusivity") as progress:
-        found.find(given, prepare, answer, progress)
+        found.find(given, ask.prepare, ask.answer, progress, workers=pool, warn=console.warn)
     _warn_of_torn(console, found)
     found.write(out, lambda cell: f"{cell:.6g}" if isinstance(cell, float) else cell)
     shown = [
@@ -286,7 +273,7 @@ def classify(
     model_dir: Annotated[Path, cli.arg("MODEL_DIR", "Folder that train wrote.")],
     paths: Annotated[
         list[str] | None,
-        cli.arg("GRASPS...", "Grasp files (CSV with its _meta.csv, or NetCDF) or folders."),
+        cli.arg("GRASPS...", "Grasp files (CSV with its _meta.csv, NetCDF, Parquet), folders or patterns."),
     ] = None,
     out: Annotated[Path | None, cli.opt("--out", "FILE.csv", "Where the predictions go.")] = None,
     candidates: Annotated[
@@ -330,6 +317,8 @@ def classify(
         cli.opt("--port", "N", "With --serve: answer over HTTP on 127.0.0.1 instead.", min=0, max=65535),
     ] = None,
     seed: cli.Seed = 0,
+    workers: cli.Workers = 1,
+    cluster: cli.Cluster = None,
     as_json: cli.AsJson = False,
 ) -> int:
     """Name the material of each grasp, with probabilities.
@@ -343,7 +332,8 @@ def classify(
     and is then answered as unsurely as these differ. --same-gripper and --other-gripper say which it is,
     --known what the other one reads of blocks it knows.
 
-    A run that was ended goes on where it stopped when it is given again. --serve takes one object a line,
+    A run that was ended goes on where it stopped when it is given again. Workers share out files, which
+    they read themselves. --serve takes one object a line,
     {"time_s": [...], "t_surface_degC": [...], "t_object_nominal_degC": 28}, and writes its answer.
     """
     stated = _range(between)
@@ -357,7 +347,8 @@ def classify(
         )
         raise UserError(problem, hint="leave it out, or train on grasps of the new gripper")
     if out is not None:
-        cli.new_file(out, (".csv",))
+        cli.new_file(out, (".csv", ".parquet"))
+    pool = cli.workers_of(workers, cluster)
     from thermogrip.datasets.materials import load_materials
 
     own = [name for name in cli.comma(candidates) or () if name not in load_materials()]
@@ -366,19 +357,21 @@ def classify(
     from thermogrip.datasets.partitions import Answers, sources, stamps
 
     console = Console(as_json)
+    anywhere = Path.absolute if cluster else Path  # its workers run in other folders
     ask = _Question(
-        model_dir, cli.comma(candidates), stated, early=early, next_touch=next_touch, or_unknown=or_unknown,
-        other_gripper=other_gripper, same_gripper=same_gripper, known=tuple(known or ()),
+        anywhere(model_dir), cli.comma(candidates), stated, early=early, next_touch=next_touch,
+        or_unknown=or_unknown, other_gripper=other_gripper, same_gripper=same_gripper,
+        known=tuple(str(anywhere(Path(path))) for path in known or ()),
     )  # fmt: skip
     if serve:
         return _serve(console, ask.answerer(), port)
     assert out is not None
     given = sources(paths or [])
     asked = [*astuple(ask), stamps([model_dir, *ask.known])]
-    answer = ask.answerer()
+    ask.answerer()
     found = Answers(out, ["classify", *asked])
     with _resumable(console, found), console.progress("classify") as progress:
-        found.find(given, partial(_warned, console), answer, progress)
+        found.find(given, ask.prepare, ask.answer, progress, workers=pool, warn=console.warn)
     _warn_of_torn(console, found)
     found.write(out, cell_text)
     rows = list(islice((row for part in found for row in part["rows"]), SHOWN))
@@ -443,7 +436,23 @@ class _Question:
     same_gripper: bool = False
     known: tuple[str, ...] = ()
 
+    def prepare(self, record: Grasps) -> Grasps:
+        """Return a record of a file as it is."""
+        return record
+
+    def answer(self, part: Grasps) -> dict[str, Any]:
+        """Return the rows of a part, and warnings of it."""
+        said = _Said()
+        cli.warn_of_contacts(said, [part])
+        return self.answerer()(part) | {"warnings": said.words}
+
     def answerer(self) -> Callable[[Grasps], dict[str, Any]]:
+        """Return what answers a record, once a process while the model's files are the same."""
+        from thermogrip.datasets.partitions import stamps
+
+        return _answerer(self, str(Path.cwd()), str(stamps([self.model_dir, *self.known])))
+
+    def load(self) -> Callable[[Grasps], dict[str, Any]]:
         """Return what answers a record with its rows and why some are out of distribution."""
         from thermogrip.classify.decisions.predict import classify_grasps, reasons, unexplained_answers
         from thermogrip.classify.decisions.stopping_rule import load_stop_rule
@@ -483,6 +492,60 @@ class _Question:
         return answer
 
 
+@lru_cache(maxsize=1)
+def _answerer(ask: _Question, _folder: str, _files: str) -> Callable[[Grasps], dict[str, Any]]:
+    return ask.load()
+
+
+class _Said:
+    """Warnings, kept."""
+
+    def __init__(self) -> None:
+        self.words: list[str] = []
+
+    def warn(self, text: str) -> None:
+        """Keep one warning."""
+        self.words.append(text)
+
+
+@dataclass(frozen=True)
+class _Effusivity:
+    """What is asked about the effusivity of each grasp; ``other`` is the probability of another gripper."""
+
+    device: GripperModel
+    coupling: Coupling | None
+    longest: float
+    stated: tuple[float, float] | None
+    other: float
+
+    def prepare(self, record: Grasps) -> Grasps:
+        """Return a record of a file as it is."""
+        return record
+
+    def answer(self, part: Grasps) -> dict[str, Any]:
+        """Return the rows of a part, what is not explained or missing, and warnings of it."""
+        from thermogrip.classify.decisions.predict import unexplained_effusivities
+        from thermogrip.sysid.effusivity.data import with_object_range
+
+        said = _Said()
+        cli.warn_of_contacts(said, [part])
+        record = _as_taught(said, part, self.longest, self.coupling)
+        ranged = with_object_range(record, self.stated)
+        found = _effusivities(self.device, ranged, self.coupling, self.other)
+        if max(row.other_gripper for row in found) > 0.5:
+            said.warn(
+                f"{record.attrs['name']}: read as by another gripper than the bundled one: intervals are as "
+                "wide as grippers differ"
+            )
+        misfits = unexplained_effusivities(self.device, record, found, self.stated)
+        rows = [asdict(row) for row in found]
+        for row in rows:
+            row["misfit_sd"] = misfits[row["grasp_id"]].sd if row["grasp_id"] in misfits else float("nan")
+        unexplained = {name: found.words for name, found in misfits.items() if found.words}
+        own = {"rows": rows, "unexplained": unexplained, "missed": _missed(record, rows)}
+        return own | _of_part(record) | {"warnings": said.words}
+
+
 def materials(
     name: Annotated[str | None, cli.arg("[NAME]", "One material.")] = None, as_json: cli.AsJson = False
 ) -> int:
@@ -505,7 +568,7 @@ def materials(
     return 0
 
 
-def _as_taught(console: Console, record: Grasps, longest: float, coupling: Coupling | None) -> Grasps:
+def _as_taught(console: cli.Warner, record: Grasps, longest: float, coupling: Coupling | None) -> Grasps:
     """Return a record without what its contacts did later than those that taught the gripper."""
     from thermogrip.sysid.effusivity.multi_touch import rested_long
     from thermogrip.sysid.effusivity.quality import check_grasps
@@ -566,12 +629,6 @@ def _missed(record: Grasps, rows: Sequence[dict[str, Any]]) -> dict[str, str]:
         return {}
     why = zip(record["grasp"].values, check_grasps(record).reason)
     return {str(name): words for name, words in why if words}
-
-
-def _warned(console: Console, record: Grasps) -> Grasps:
-    """Return a record after the warnings of it."""
-    cli.warn_of_contacts(console, [record])
-    return record
 
 
 def _of_part(record: Grasps) -> dict[str, Any]:

@@ -115,13 +115,14 @@ def identify(
     report: cli.Report = None,
     seed: cli.Seed = 0,
     workers: cli.Workers = 1,
+    cluster: cli.Cluster = None,
     as_json: cli.AsJson = False,
 ) -> int:
     """Find the plant behind one or several logs.
 
     Checks the data, fits candidate models, scores each by free run on held-out data, keeps the best one.
     """
-    wanted = cli.comma(models) or ()
+    wanted, pool = cli.comma(models) or (), cli.workers_of(workers, cluster)
     assert out is not None  # its callback names one
     cli.new_file(out, (".json",))
     roles = cli.comma(inputs), cli.comma(outputs), cli.comma(disturbances)
@@ -172,7 +173,7 @@ def identify(
             leave_one_out=leave_one_out,
             draws=0 if posterior else 24,
             seed=seed,
-            workers=workers,
+            workers=pool,
             progress=sub_progress(progress, 0.4 if grow else 0.0, 0.6 if posterior else 1.0),
             early=lambda rows: console.early(*_so_far(rows)),
         )

@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
 
@@ -18,7 +18,6 @@ from thermogrip.datasets.errors import UserError, as_user_error, known_names
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps, Log
-    from thermogrip.report.console import Console
     from thermogrip.sysid.models.model import GreyModel
     from thermogrip.sysid.plant.plant import Plant
 
@@ -152,7 +151,7 @@ OwnNetwork = Annotated[
     ),
 ]
 GraspFiles = Annotated[
-    list[str], arg("GRASPS...", "Grasp files (CSV with its _meta.csv, or NetCDF) or folders.")
+    list[str], arg("GRASPS...", "Grasp files (CSV with its _meta.csv, NetCDF, Parquet), folders or patterns.")
 ]
 
 
@@ -292,7 +291,14 @@ def load_logs(
     return logs
 
 
-def warn_of_contacts(console: Console, records: Sequence[Grasps]) -> None:
+class Warner(Protocol):
+    """What takes warnings."""
+
+    def warn(self, text: str) -> None:
+        """Take one warning."""
+
+
+def warn_of_contacts(console: Warner, records: Sequence[Grasps]) -> None:
     """Warn of what was repaired in records while they were read, and of contacts that are missing or late."""
     from thermogrip.sysid.effusivity.quality import contact_faults, torn_groups
 

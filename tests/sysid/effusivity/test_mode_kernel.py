@@ -61,14 +61,15 @@ def means_of(nodes, rise, slope, times, bins, *, onset=0.0, late=-1.0):
     count = np.zeros((1, n))
     count[0, bins[bins >= 0]] = 1.0
     curves = np.zeros((1, 6, len(nodes)))
-    bent, out = curves.copy(), np.zeros((3, 1, 6, n))
+    bent, out, loss = curves.copy(), np.empty((3, 6, n)), np.array([[late, 0.0, 0.0, 0.0, 0.0]])
     curves[0, 0], bent[0, 0] = rise, slope
     wanted = np.array([[True, False, False, False, False, True]])
     kernel.bin_means.py_func(
         np.array(nodes, dtype=float), curves, bent, wanted, np.array([0]), np.array([onset]), np.array([0]),
-        times, bins, count, times, np.array([late]), np.empty((2, n)), *out,
+        times, bins, count, times, times, np.zeros((1, 2, n)), np.zeros((1, 7)), np.zeros((1, 7), dtype=bool),
+        loss, np.empty((7, n)), out, np.empty((1, n)), np.empty((1, 8, n)),
     )  # fmt: skip
-    return out[0, 0, 0], out[0, 0, 5], out[1, 0, 0], out[2, 0, 0]
+    return out[0, 0], out[0, 5], out[1, 0], out[2, 0]
 
 
 def test_samples_find_their_nodes_whichever_way_they_come():
