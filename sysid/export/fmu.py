@@ -187,7 +187,7 @@ def to_fmu(plant: Plant, path: str | Path) -> Path:
 
 
 def fmu_path(path: str | Path, plant: Plant) -> Path:
-    """Return where an FMU of a plant, or of its controller, goes; a UserError where its stem cannot be a model's
+    """Return where an FMU of a plant, or of its controller, goes; a UserError where its stem cannot be an
     identifier, or the plant is in no file."""
     target = Path(path)
     plain = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", target.stem) and not keyword.iskeyword(target.stem)
@@ -203,8 +203,8 @@ def fmu_path(path: str | Path, plant: Plant) -> Path:
 
 
 def write_fmu(target: Path, content: dict[str, Any], core: str, what: str) -> Path:
-    """Write an FMU with this JSON in it and return its path; ``core_of`` of the module ``core`` makes of it what
-    is stepped, ``what`` describes it."""
+    """Write an FMU with this JSON in it and return its path; ``core_of`` of the module ``core`` makes of it
+    what is stepped, ``what`` describes it."""
     name = target.stem
     builder = needed("pythonfmu.builder", "fmu")
     with tempfile.TemporaryDirectory() as folder, atomic_path(target) as temporary:
