@@ -49,7 +49,7 @@ class Core:
 
     def get(self, name: str) -> float:
         """Return a variable's value."""
-        return (self._inputs() | self._answer)[name]
+        return float((self._inputs() | self._answer)[name])
 
     def set(self, name: str, value: float) -> None:
         """Set a reading or a target."""

@@ -535,7 +535,8 @@ class Controller(Shown, SampledController):
             return None
         seconds = (self.times.now + self.dt * np.arange(self.optimiser.N)) % DAY
         starts, factors = np.array(tariff).T
-        return factors[np.searchsorted(starts, seconds, side="right") - 1]  # -1: of the day before
+        at = np.searchsorted(starts, seconds, side="right") - 1  # -1: of the day before
+        return np.asarray(factors[at], dtype=np.float64)
 
     def _forecast(self, coming: Mapping[str, Sequence[float]]) -> Array | None:
         """Return what is told of the measured disturbances (N, n_d), NaN where nothing is."""

@@ -288,8 +288,10 @@ class PredictionModel:
 
     def _response(self, blocks: tuple[int, ...]) -> Response:
         """Return how a linear plant's outputs answer, made once for these blocks."""
-        if blocks in self._responses or self.affine is None:
+        if blocks in self._responses:
             return self._responses[blocks]
+        if self.affine is None:
+            raise RuntimeError("the plant is not linear")
         A, B, _, _ = self.affine
         rows, sums = self.C, np.zeros_like(self.C)
         by_x, by_rest, impulse = [], [], []
@@ -315,7 +317,7 @@ class PredictionModel:
         """Return what :meth:`trajectory` returns, from CasADi forward sensitivities."""
         n_b, n_u = plan.shape
         sensitivity: Array = np.zeros((self.n_x, n_b, n_u))
-        outputs, gains = [], []
+        outputs, gains = list[Array](), list[Array]()
         for block, length in enumerate(blocks):
             for _ in range(length):
                 now = d if d.ndim == 1 else d[len(outputs)]
