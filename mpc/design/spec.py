@@ -111,11 +111,6 @@ class Spec(BaseModel):
             for low, high in group.values():
                 if not low < high:
                     raise ValueError(f"{key}: {low:g} to {high:g} is empty")
-        for name, half in (self.zones or {}).items():
-            for key in ("band_degC", "overshoot_degC", "bias_degC"):
-                if half > getattr(self, key):
-                    narrow = f"{half:g} about {name} is wider than {key}, {getattr(self, key):g}"
-                    raise ValueError(f"zones: {narrow}, by which steps are judged: widen that too")
         if isinstance(self.output, list) and len(set(self.output)) < len(self.output):
             raise ValueError("output: names one twice")
         if "settle_within_s" in self.model_fields_set and self.settle_within_s > self.hold_s:
@@ -196,6 +191,11 @@ class Spec(BaseModel):
             if name not in design.controlled:
                 hint = known_names(name, design.controlled, "these are: {}")
                 raise UserError(f"weights: {name} is not regulated", hint=hint)
+        for name, half in (self.zones or {}).items():
+            for key in ("band_degC", "overshoot_degC", "bias_degC"):
+                if half > getattr(self, key):
+                    narrow = f"{half:g} about {name} is wider than {key}, {getattr(self, key):g}"
+                    raise UserError(f"zones: {narrow}", hint="steps are judged by it: widen it too")
         values["weights"] = dict(self.weights or {})
         values |= {"zones": dict(self.zones or {}), "hard": tuple(self.hard or ())}
         values |= {"tariff": tuple(self.tariff or ()), "iterations": self.iterations}

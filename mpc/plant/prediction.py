@@ -326,7 +326,7 @@ class PredictionModel:
                 sensitivity[:, block, :] += B
                 x = x_next.ravel()
                 outputs.append(self.output(x))
-                gains.append(np.tensordot(self.C, sensitivity, axes=1))
+                gains.append(np.asarray(np.tensordot(self.C, sensitivity, axes=1), dtype=np.float64))
         return np.stack(outputs), np.stack(gains)
 
     def _casadi_sample(self, x: Array, u: Array, d: Array) -> list[Array]:
