@@ -181,9 +181,8 @@ class PredictionModel:
         """Simulate plans u (B, N, n_u) from states x (B, n_x) under d (n_d,), (B, n_d) or (1, N, n_d); return
         outputs (B, N + 1, n_y) from the start on, and last states (B, n_x)."""
         fine = np.repeat(self.inputs(u), self.sub, axis=1)
-        d = d if d.ndim == 3 else np.atleast_2d(d)[:, None, :]
-        each = np.broadcast_to(d, (d.shape[0], u.shape[1], d.shape[2]))
-        held = np.ascontiguousarray(np.repeat(each, self.sub, axis=1))
+        d = np.repeat(d, self.sub, axis=1) if d.ndim == 3 else np.atleast_2d(d)[:, None, :]
+        held = np.ascontiguousarray(np.broadcast_to(d, (d.shape[0], fine.shape[1], d.shape[2])))
         y, x_end = self.model.rollout(
             np.ascontiguousarray(x), fine, held, self.p[None, :], self.dt / self.sub
         )
@@ -243,11 +242,15 @@ class PredictionModel:
         count, n = len(su), len(u)
         states = np.concatenate([np.broadcast_to(x, (count, self.n_x)), sx], axis=1)
         drives = np.concatenate([np.broadcast_to(u, (count, n, self.n_u)), su], axis=2)
-        room = np.broadcast_to(d, (n, self.n_d))
-        held = np.concatenate(
-            [np.broadcast_to(room, (count, *room.shape)), np.repeat(sd[:, None], n, axis=1)], axis=2
-        )
-        fine, held = (np.ascontiguousarray(np.repeat(values, self.sub, axis=1)) for values in (drives, held))
+        told = np.atleast_2d(d)  # one row holds for all samples
+        rows = [
+            np.broadcast_to(told, (count, *told.shape)),
+            np.broadcast_to(sd[:, None], (count, *told.shape)),
+        ]
+        held = np.concatenate(rows, axis=2)
+        fine = np.repeat(drives, self.sub, axis=1)
+        held = held if len(told) == 1 else np.repeat(held, self.sub, axis=1)
+        held = np.ascontiguousarray(np.broadcast_to(held, (count, fine.shape[1], 2 * self.n_d)))
         renew = np.zeros(fine.shape[1], dtype=bool)
         y, x_end = self._kernel.rollout(states, fine, held, np.zeros((1, 0)), self.dt / self.sub, renew)
         return y[:, :: self.sub], x_end
