@@ -34,6 +34,7 @@ class SampledController:
         slew: Array,
         patience_s: float,
         clock: Callable[[], float],
+        safe_drive: Mapping[str, float] | None = None,
     ) -> None:
         self.model, self.controlled, self.slew, self.clock = model, controlled, slew, clock
         self.lowest, self.highest = np.array([drive_range[name] for name in model.drives], dtype=float).T
@@ -41,6 +42,9 @@ class SampledController:
         self._rows = [model.outputs.index(name) for name in controlled]
         self._patience_s = patience_s * (1 + SAME)
         self._neutral = np.clip(np.zeros(model.n_u), self.lowest, self.highest)
+        # where the drives of a failing loop go
+        safe = [(safe_drive or {}).get(name, rest) for name, rest in zip(model.drives, self._neutral)]
+        self._safe = np.array(safe, dtype=float)
         self._forget()
         self._move = Move(as_drive(model.drives, self._u))
 
@@ -101,7 +105,7 @@ class SampledController:
         wins over slew."""
         before = np.clip(self._u, self.lowest, self.highest)
         slew = self.slew * (seconds / self.dt)
-        slewed = np.clip(np.where(np.isfinite(u), u, self._neutral), before - slew, before + slew)
+        slewed = np.clip(np.where(np.isfinite(u), u, self._safe), before - slew, before + slew)
         return np.asarray(np.clip(slewed, self.lowest, self.highest))
 
     def _answer(

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermogrip import __version__
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError
@@ -77,8 +78,15 @@ class Agreement:
         return exact and self.difference <= _TOLERANCE
 
 
-def export_controller(controller: Controller, folder: str | Path) -> Export:
-    """Write a controller as C99 into a folder, made where absent; files of the same names are replaced."""
+def export_controller(controller: Controller, folder: str | Path, *, arduino: bool = False) -> Export:
+    """Write a controller as C99 into a folder, made where absent; files of the same names are replaced.
+
+    What the C has not (zones, prices, ramps, hard limits) is a UserError. With ``arduino`` the folder is a
+    library of the Arduino IDE, its example a loop to fill in.
+    """
+    if alone := controller.design.in_python_alone:
+        hint = "run it from Python, or tune without"
+        raise UserError(f"the exported C has no {', no '.join(alone)}", hint=hint)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     model = controller.model
@@ -94,9 +102,40 @@ def export_controller(controller: Controller, folder: str | Path) -> Export:
     }
     ram, constants = design_struct.bytes_of(sizes)
     files["README.md"] = _readme(controller, sizes, ram, constants)
+    if arduino:
+        files = _as_library(controller, files)
     for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
         write_atomic(folder / name, content)
     return Export(folder, tuple(sorted(files)), ram, constants)
+
+
+def _as_library(controller: Controller, files: dict[str, str]) -> dict[str, str]:
+    """Return these files as the Arduino IDE wants them; it refuses boards of four-byte doubles."""
+    ends = ", ".join(controller.controlled)
+    lines = {
+        "name": "thermogrip_controller",
+        "version": __version__,
+        "author": "thermogrip",
+        "maintainer": "thermogrip",
+        "sentence": f"Model-predictive controller of {_one_line(ends)}.",
+        "paragraph": f"Written for one plant; a step each {controller.dt:g} s.",
+        "category": "Device Control",
+        "url": "https://arxiv.org/abs/2111.15344",
+        "architectures": "esp32,rp2040,mbed,samd,stm32,renesas_uno,teensy",
+        "includes": "tg_design.h",
+    }
+    wide = '#if __SIZEOF_DOUBLE__ < 8\n#error "this board\'s double has 4 bytes"\n#endif\n'
+    library = {"library.properties": "".join(f"{key}={value}\n" for key, value in lines.items())}
+    library |= {"README.md": files["README.md"], "examples/loop/loop.ino": c_source("loop.ino")}
+    parts = {name: files[name] for name in files if name.startswith("tg_")}
+    parts["tg_config.h"] = parts["tg_config.h"].replace("typedef", wide + "\ntypedef", 1)
+    return library | {f"src/{name}": content for name, content in parts.items()}
+
+
+def _one_line(text: str) -> str:
+    """Return a text whose characters may stand in a properties file."""
+    return "".join(letter if letter.isprintable() else " " for letter in text)
 
 
 def check_export(

@@ -9,7 +9,8 @@ disturbances and u^- the move of the sample before,
     z^+ = F z + B u + E d,
 
 so in (z^, u^-) the controller is one state space from (y, r, d) to u: what loop shaping and margins are made
-of.  The overshoot band and the limits of outputs are rows of the QP, and not in it.
+of.  The overshoot band and the limits of outputs are rows of the QP, and not in it; nor are zones and prices:
+what is reviewed tracks the middle of a zone.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
+from thermogrip.datasets.errors import UserError
 
 if TYPE_CHECKING:
     from thermogrip.mpc.optimiser.rti import ControllerParts, Optimiser
@@ -115,5 +117,8 @@ def to_control(controller: ControllerParts) -> Any:
     """Return the law as a python-control ``StateSpace``; see :meth:`Controller.to_control`."""
     from thermogrip.sysid.export.linearise import control_system
 
+    if controller.design.zones:
+        problem = "zones: a controller that may rest anywhere in them is no linear system"
+        raise UserError(problem, hint="tune without them")
     law = linear_law(controller)
     return control_system(law, (law.A, law.B, law.C, law.D, law.dt), "controller")

@@ -112,7 +112,9 @@ class LQRController(SampledController):
     ) -> None:
         model = prediction_model(plant, design.dt)
         slew = design.dt * np.array([design.slew_per_s[name] for name in model.drives])
-        super().__init__(model, design.controlled, design.drive_range, slew, design.patience_s, clock)
+        super().__init__(
+            model, design.controlled, design.drive_range, slew, design.patience_s, clock, design.safe_drive
+        )
         self.design = design
         if observer is None:
             observer = design.observer(model)
@@ -155,7 +157,7 @@ class LQRController(SampledController):
         self._unread_s = np.where(seen, 0.0, self._unread_s + self.times.waited_s)
         lost = self._lost
         if lost.all() or not np.isfinite(wanted).all():
-            u, status, said = self._neutral, "off", said or "reading lost: drive to zero"
+            u, status, said = self._safe, "off", said or "reading lost: drive to zero"
         else:
             u, status = self.propose(wanted, passed / self.dt), "ok" if seen.all() else "fallback_plan"
             if seen.any() and not seen.all():
@@ -168,7 +170,7 @@ class LQRController(SampledController):
         """Return the drives (n_u,) before their limits for targets (n_controlled,) [degC]: their mean over so
         many samples, at least one."""
         law, observer, n_x = self._law(target), self.observer, self.model.n_x
-        proposed = self._neutral.copy()
+        proposed = self._safe.copy()
         if law is None:
             return proposed  # no drive that is left moves what is still seen
         point, live = law.point, law.live
@@ -195,7 +197,7 @@ class LQRController(SampledController):
     def _law(self, target: Array) -> _Law | None:
         """Return the law about a target, worked out once for it, half a degree of room and what is lost."""
         lost = self._lost
-        parked = tuple((drive, float(self._neutral[drive])) for drive in self._parked(lost))
+        parked = tuple((drive, float(self._safe[drive])) for drive in self._parked(lost))
         wanted, room = tuple(np.round(target, 2).tolist()), tuple((np.round(2 * self._d) / 2).tolist())
         key = wanted + room + tuple(lost.tolist())
         if key not in self._laws:

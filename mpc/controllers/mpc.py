@@ -48,7 +48,7 @@ from thermogrip.datasets.shown import Shown
 from thermogrip.mpc.controllers.base import STALE, SampledController
 from thermogrip.mpc.controllers.linear_equivalent import to_control
 from thermogrip.mpc.controllers.pi import PIController
-from thermogrip.mpc.design.design import SCHEMA, VERSION, Design, check_design, default_design
+from thermogrip.mpc.design.design import DAY, SCHEMA, VERSION, Design, check_design, default_design
 from thermogrip.mpc.estimator.call_times import RESTART_S, opening, shifted
 from thermogrip.mpc.estimator.reading_checks import ReadingMonitor, follows, is_off
 from thermogrip.mpc.estimator.structure_monitor import StructureMonitor
@@ -65,6 +65,7 @@ if TYPE_CHECKING:
 _KEPT_DRAWS = 50  # of the posterior, in the controller's file for its review
 _CAUTION, _MOST_CAUTION = 3.0, 30.0  # of a mean innovation, from which on moves weigh more; how much more
 _EVEN = 0.1  # of a sample time, by which calls may differ from it in a window of the structure's monitor
+_STAYS = 1e-5  # of its range: a plan that moves by less has converged
 _WEAK = 0.05  # of its gain at rest, below which a drive's bias is not learnt
 
 
@@ -112,13 +113,15 @@ class Controller(Shown, SampledController):
         design = default_design(plant) if design is None else check_design(design, plant)
         model = prediction_model(plant, design.dt)
         slew = design.dt * np.array([design.slew_per_s[name] for name in model.drives])
-        super().__init__(model, design.controlled, design.drive_range, slew, design.patience_s, clock)
+        super().__init__(
+            model, design.controlled, design.drive_range, slew, design.patience_s, clock, design.safe_drive
+        )
         self.plant, self.design, self.notes = plant, design, dict(notes or {})
         self.observer = design.observer(self.model)
         self.disturbance = self.observer.disturbance
         self.optimiser = Optimiser(self.model, design)
         self.c: CompiledController | None = None
-        if compiled:
+        if compiled and not design.in_python_alone:
             self._compile()
         self.pi = PIController.of(plant, design, tuple(replace(p, feedforward=0.0) for p in design.loops))
         self.monitor = ReadingMonitor(self.model.n_y, len(self.observer.lagged), spike=self.model.spike)
@@ -129,6 +132,8 @@ class Controller(Shown, SampledController):
         self._in_force: Array
         self._plan: Array | None  # (N, n_u), as it was made ``_age_s`` ago
         self._ahead: Array | None = None  # targets of the samples that are predicted, where they change
+        self._coming: Array | None = None  # (N, n_d) measured disturbances of those, NaN where not told
+        self._ramped = np.full(len(design.controlled), np.nan)  # where targets are that may only ramp
         self._start(np.full(self.model.n_y, np.nan), np.full(self.model.n_d, design.ambient))
 
     def _compile(self) -> None:
@@ -155,12 +160,45 @@ class Controller(Shown, SampledController):
 
     def save(self, path: str | Path) -> Path:
         """Write the controller with its plant as JSON and return the path."""
-        content = {
+        return write_json(path, self.to_dict(), schema=SCHEMA, version=VERSION)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what the file has, as plain JSON."""
+        return {
+            "schema": SCHEMA,
+            "version": VERSION,
             "design": self.design.to_dict(),
             "notes": self.notes,
             "plant": self.plant.to_dict(draws=_KEPT_DRAWS),
         }
-        return write_json(path, content, schema=SCHEMA, version=VERSION)
+
+    def to_fmu(self, path: str | Path) -> Path:
+        """Write the controller as an FMU (FMI 2.0, co-simulation) and return the path.
+
+        Parameters
+        ----------
+        path : str or Path
+            Ends in ``.fmu``; its stem becomes the model's identifier.
+
+        Raises
+        ------
+        UserError
+            If pythonfmu is not installed, the name cannot be an identifier, or the plant is a class of the
+            user's own.
+
+        Examples
+        --------
+        >>> from tempfile import TemporaryDirectory
+        >>> from thermogrip.sysid.greybox.problem import prior_plant
+        >>> from thermogrip.sysid.models.network import load_network
+        >>> controller = design_controller(prior_plant(load_network("tclab")), dt=5.0)
+        >>> with TemporaryDirectory() as folder:
+        ...     controller.to_fmu(f"{folder}/loop.fmu").name
+        'loop.fmu'
+        """
+        from thermogrip.mpc.controllers.fmu import to_fmu
+
+        return to_fmu(self, path)
 
     @classmethod
     def load(cls, path: str | Path, *, model: Model | None = None) -> Controller:
@@ -235,7 +273,13 @@ class Controller(Shown, SampledController):
         self.pi.reset(reading)
         self.times.reset()
 
-    def step(self, reading: Readings, target: Trajectory) -> Move:
+    def step(
+        self,
+        reading: Readings,
+        target: Trajectory,
+        *,
+        coming: Mapping[str, Sequence[float]] | None = None,
+    ) -> Move:
         """Return the move for this sample.
 
         Parameters
@@ -248,6 +292,8 @@ class Controller(Shown, SampledController):
         target : float or mapping of str to float
             [degC] by output name; a single number is the target of every controlled output. A sequence is a
             trajectory: the target now, and those of the samples ahead.
+        coming : mapping of str to sequence of float, optional
+            Measured disturbances of the samples ahead, by name, the first a sample from now; the last stays.
 
         Examples
         --------
@@ -279,10 +325,13 @@ class Controller(Shown, SampledController):
         said = self._absorb(y, d, applied) or (STALE if self.times.stale else "")
         in_force = self._u.copy()
         wanted, wrong = self._wanted(target)
+        self._coming = self._forecast(coming or {})
         if not np.array_equal(wanted, self._target):
             self._side = self._sides(wanted)
         self._target = wanted
         self._ahead = self._trajectory(target)
+        if self.design.ramp_per_s:
+            wanted = self._ramp(wanted)
         u, status, advice = self._decide(wanted, started)
         if status == "ok":  # what happened in this sample, before what has been so for long
             advice = said or advice
@@ -305,6 +354,7 @@ class Controller(Shown, SampledController):
         self._plan = None
         self._y_plan = np.zeros((0, self.model.n_y))
         self._age_s = 0.0  # since the plan was made
+        self._ramped = np.full(len(self._rows), np.nan)
         self._silent_s = 0.0  # that nobody called, where it was too long to know the past
         self._y = y
         self._seen = self.observer.now  # where the estimate stood after the last reading
@@ -400,7 +450,7 @@ class Controller(Shown, SampledController):
     def _decide(self, wanted: Array, started: float) -> tuple[Array, str, str]:
         """Return the drives, the status and the advice: optimiser, else plan, else PI, else off."""
         if not np.isfinite(wanted).all():
-            return self._neutral, "off", "no target yet: drive to zero"
+            return self._safe, "off", f"no target yet: {self._away}"
         if (self._unread_s > 0).all():
             return self._without_readings()
         if self.clock() - started >= self.design.deadline_s:
@@ -422,14 +472,15 @@ class Controller(Shown, SampledController):
         u = self._first_of(self._plan)
         if outside:
             return u, "infeasible", "the drive that was applied is out of range: brought back"
+        end, zone = outcome.y[-1, self._rows], self.optimiser.zone
         missed = self.reach.missed(
             self.observer,
             self._u,
             self._d,
             y=self._y[self._rows],
-            target=wanted,
+            target=np.where(zone > 0, np.clip(end, wanted - zone, wanted + zone), wanted),
             side=self._side,
-            ahead=outcome.y[-1, self._rows],
+            ahead=end,
             seen=self._unread_s == 0,
         )
         if missed is not None:
@@ -459,8 +510,58 @@ class Controller(Shown, SampledController):
             x = self.model.next_state(x, last + observer.drive_bias, d)
         guess, biases = self._guess(wanted, last), (observer.output_bias, observer.drive_bias)
         caution = min(max(1.0, float(np.max(np.abs(observer.innovation))) / _CAUTION), _MOST_CAUTION)
+        if self._coming is not None:
+            d = np.where(np.isfinite(self._coming), self._coming, self._d) + observer.disturbance_bias
         sample = Sample(x, last, guess, d, wanted, self._side, *biases, self._slew_s, self._lost, caution)
-        return self.optimiser.solve(sample._replace(ahead=self._ahead))
+        sample = sample._replace(ahead=self._ahead, prices=self._prices())
+        found, changes = self.optimiser.solve(sample), 0
+        for _ in range(1, self.design.iterations if self.model.affine is None else 1):
+            moved = np.abs(found.plan - sample.guess) > _STAYS * self.model.span
+            if found.status != "solved" or not moved.any():
+                break
+            sample, changes = sample._replace(guess=found.plan), changes + found.iterations
+            found = self.optimiser.solve(sample)
+        return replace(found, iterations=found.iterations + changes)
+
+    @property
+    def _away(self) -> str:
+        """Where drives go without a loop, in words."""
+        return "drives to their safe values" if self.design.safe_drive else "drive to zero"
+
+    def _prices(self) -> Array | None:
+        """Return how many times the energy price counts in the samples (N,) that are predicted."""
+        tariff = self.design.tariff
+        if not tariff or not np.isfinite(self.times.now):
+            return None
+        seconds = (self.times.now + self.dt * np.arange(self.optimiser.N)) % DAY
+        starts, factors = np.array(tariff).T
+        at = np.searchsorted(starts, seconds, side="right") - 1  # -1: of the day before
+        return np.asarray(factors[at], dtype=np.float64)
+
+    def _forecast(self, coming: Mapping[str, Sequence[float]]) -> Array | None:
+        """Return what is told of the measured disturbances (N, n_d), NaN where nothing is."""
+        lines = [_line(coming.get(name)) for name in self.model.disturbances]
+        if not any(np.isfinite(line).any() for line in lines):
+            return None
+        at = self.design.move_delay + np.arange(self.optimiser.N) - 1  # in a sample its start is in force
+        told = np.column_stack([line[np.clip(at, 0, len(line) - 1)] for line in lines])
+        told[at < 0] = np.nan
+        return np.where((told >= self.model.coldest) & (told <= self.model.hottest), told, np.nan)
+
+    def _ramp(self, wanted: Array) -> Array:
+        """Return the targets now (n_controlled,), of those that may only ramp a sample further on the way;
+        what is ahead goes on from there."""
+        rates = np.array([self.design.ramp_per_s.get(name, np.inf) for name in self.controlled])
+        shown = self._y[self._rows]
+        begun = np.where(np.isfinite(self._ramped), self._ramped, shown)
+        reach = rates * self.times.waited_s
+        now = np.where(np.isfinite(begun), np.clip(wanted, begun - reach, begun + reach), wanted)
+        self._ramped = now
+        later = (self.design.move_delay + np.arange(1, self.optimiser.N + 1))[:, None] * rates * self.dt
+        ends = np.broadcast_to(wanted, later.shape) if self._ahead is None else self._ahead
+        if np.any(now != wanted) or self._ahead is not None:
+            self._ahead = np.clip(ends, now - later, now + later)
+        return now
 
     def _trajectory(self, target: Trajectory) -> Array | None:
         """Return the targets (N, n_controlled) of the samples that are predicted; None where they stay."""
@@ -486,7 +587,7 @@ class Controller(Shown, SampledController):
             plan = self._young_plan()
             return self._u if plan is None else self._first_of(plan), "fallback_plan", ""
         self._plan = None
-        return self._neutral, "off", f"no reading for {self._unread_s.min():.0f} s: check the sensor"
+        return self._safe, "off", f"no reading for {self._unread_s.min():.0f} s: check the sensor"
 
     def _young_plan(self) -> Array | None:
         return None if self._on_pi or self._age_s > self._patience_s else self.plan
@@ -498,7 +599,7 @@ class Controller(Shown, SampledController):
             return self._first_of(plan), status, advice
         y = self._y[self._rows]
         if not self.pi.loops or not np.isfinite(y).all():
-            return self._neutral, "off", advice
+            return self._safe, "off", advice
         if not self._on_pi:
             self.pi.follow(self._u, y, self._target, self._d)
         self._on_pi = True
@@ -508,6 +609,15 @@ class Controller(Shown, SampledController):
 
     def _predicted(self) -> dict[str, tuple[float, ...]]:
         return {name: tuple(self._y_plan[:, i].tolist()) for i, name in enumerate(self.model.outputs)}
+
+
+def _line(values: object) -> Array:
+    """Return numbers in a row, NaN where they are none."""
+    try:
+        line = np.ravel(np.asarray(values, dtype=float))
+    except (TypeError, ValueError):
+        line = np.empty(0)
+    return line if line.size else np.full(1, np.nan)
 
 
 def design_controller(plant: Plant, **changes: Any) -> Controller:

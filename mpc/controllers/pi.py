@@ -59,6 +59,8 @@ class PIController(SampledController):
         :func:`thermogrip.mpc.design.design.default_design` has it.
     clock : callable, optional
         Where step times come from [s].
+    safe_drive : dict of str to float, optional
+        Where drives go without readings, in their units; 0 where absent.
 
     Examples
     --------
@@ -84,6 +86,7 @@ class PIController(SampledController):
         slew_per_s: Mapping[str, float] | None = None,
         patience_s: float | None = None,
         clock: Callable[[], float] = time.perf_counter,
+        safe_drive: Mapping[str, float] | None = None,
     ) -> None:
         model = PredictionModel(plant) if dt is None else prediction_model(plant, dt)
         ranges = dict(zip(model.drives, zip(model.lowest.tolist(), model.highest.tolist())))
@@ -95,6 +98,7 @@ class PIController(SampledController):
             model.dt * np.array([slews[name] for name in model.drives]),
             max(10.0, 5 * model.dt) if patience_s is None else patience_s,
             clock,
+            safe_drive,
         )
         self.loops = pair_loops(plant, self.controlled) if loops is None else loops
         # of each loop its drive and its output, counted from 0
@@ -113,6 +117,7 @@ class PIController(SampledController):
             drive_range=design.drive_range,
             slew_per_s=design.slew_per_s,
             patience_s=design.patience_s,
+            safe_drive=design.safe_drive,
         )
 
     def reset(self, reading: Readings) -> None:
@@ -148,7 +153,7 @@ class PIController(SampledController):
             if lost:
                 status, advice = "fallback_plan", f"{', '.join(lost)}: no usable reading, the others go on"
         elif self._lost.all():
-            self._u = self._within(self._neutral, self.times.slew_s)
+            self._u = self._within(self._safe, self.times.slew_s)
             status, advice = "off", wrong or "reading lost: drive to zero"
         return self._answer(status, advice, started)
 
@@ -164,7 +169,7 @@ class PIController(SampledController):
                 kept = (1 - loop.setpoint) * (target[i] - self._begun[i])
                 v[j] = loop.feedforward * ahead[j] + loop.Kc * (error[i] - kept) + self._I[at]
             else:
-                v[j] = self._neutral[j] if self._lost[i] else self._u[j]
+                v[j] = self._safe[j] if self._lost[i] else self._u[j]
         u = self._within(v, seconds)
         for at, (loop, (j, i)) in enumerate(zip(self.loops, self._ends)):
             if np.isfinite(error[i]):

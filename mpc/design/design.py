@@ -121,6 +121,7 @@ def check_design(design: Design, plant: Plant) -> Design:
     _check_drives(design, plant, drives)
     _check_loops(design, drives)
     _check_weights(design)
+    _check_wishes(design, drives)
     return design
 
 
@@ -141,8 +142,10 @@ def _numbers_of(design: Design) -> Iterator[tuple[str, Sequence[Any]]]:
         yield f"limits of {name}", ends
     for name, value in design.weights.items():
         yield f"weights of {name}", (value,)
-    for name, value in design.slew_per_s.items():
-        yield f"slew_per_s of {name}", (value,)
+    for key in ("slew_per_s", "zones", "energy_price", "ramp_per_s", "safe_drive"):
+        for name, value in getattr(design, key).items():
+            yield f"{key} of {name}", (value,)
+    yield "tariff", [number for row in design.tariff for number in row]
     for loop in design.loops:
         yield f"the PI of {loop.output}", (loop.Kc, loop.Ti, loop.feedforward, loop.setpoint)
     for name, value in vars(design.noise).items():
@@ -215,7 +218,41 @@ def _check_weights(design: Design) -> None:
     _refuse(wrong, f"noise: a standard deviation must be <= {_MOST_NOISE:g}")
 
 
+def _check_wishes(design: Design, drives: Sequence[str]) -> None:
+    """Refuse what cannot be had together, a line each."""
+    for key in ("zones", "ramp_per_s"):
+        for name, value in getattr(design, key).items():
+            _refuse(name not in design.controlled, f"{key}: {name} is not regulated")
+            _refuse(not value > 0, f"{key} of {name} must be > 0")
+    for name in design.hard:
+        _refuse(name not in design.limits, f"hard: {name} has no limits")
+    for key in ("energy_price", "safe_drive"):
+        for name in getattr(design, key):
+            _refuse(name not in drives, f"{key}: the plant has no drive {name}")
+    for name, value in design.safe_drive.items():
+        low, high = design.drive_range[name]
+        _refuse(
+            not low <= value <= high, f"safe_drive of {name} is {value:g}, beyond its {low:g} to {high:g}"
+        )
+    for name, value in design.energy_price.items():
+        _refuse(value < 0, f"energy_price of {name} must be >= 0")
+        both = design.drive_range[name][0] < 0
+        _refuse(both, f"energy_price: {name} goes both ways, its energy is no multiple of it: write drive")
+        bare = [output for output in design.controlled if output not in design.zones]
+        _refuse(bare, f"energy_price without zones of {', '.join(bare)} would hold them off their targets")
+    times = [second for second, _ in design.tariff]
+    _refuse(design.tariff and not design.energy_price, "tariff: there is no energy_price that it multiplies")
+    wrong = times != sorted(set(times)) or any(not 0 <= second < DAY for second in times)
+    _refuse(wrong, f"tariff: seconds of the day must rise, from 0 to less than {DAY:g}")
+    _refuse(any(factor < 0 for _, factor in design.tariff), "tariff: factors must be >= 0")
+    whole = isinstance(design.iterations, int) and not isinstance(design.iterations, bool)
+    wrong = not whole or not 1 <= design.iterations <= MOST_ITERATIONS
+    _refuse(wrong, f"iterations must be a whole number from 1 to {MOST_ITERATIONS}")
+
+
 SCHEMA, VERSION = "thermogrip.controller", 1
+DAY = 86400.0  # s
+MOST_ITERATIONS = 50
 
 
 @dataclass(frozen=True)
@@ -238,6 +275,16 @@ class Design:
     overshoot: float = 0.15
     # ranges of outputs, e.g. the tank's [degC]; soft
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
+    # half width about the target of an output within which nothing is charged [its unit]
+    zones: dict[str, float] = field(default_factory=dict)
+    hard: tuple[str, ...] = ()  # outputs whose limits give way last
+    # cost of a sample at full drive, beside the squared error of a sample; of drives on one side of 0
+    energy_price: dict[str, float] = field(default_factory=dict)
+    # (second of the day, how many times the price counts from then on), the last one from the day before
+    tariff: tuple[tuple[float, float], ...] = ()
+    ramp_per_s: dict[str, float] = field(default_factory=dict)  # fastest change of a target [units per s]
+    safe_drive: dict[str, float] = field(default_factory=dict)  # where a failing loop goes; 0 where absent
+    iterations: int = 1  # programs a sample: above 1 until the plan stays
     price: float = 50.0  # weight of what exceeds a soft limit [1/degC], and of its square [degC^-2]
     noise: ObserverNoise = field(default_factory=ObserverNoise)
     # whether disturbance states are estimated; without them the loop ends off its target
@@ -249,6 +296,11 @@ class Design:
     # how long the plan is followed without a reading, or with a failing solver, before the next fallback [s];
     # of several controlled outputs, how long the model replaces one that is lost
     patience_s: float = 10.0
+
+    @property
+    def in_python_alone(self) -> tuple[str, ...]:
+        """What of it the C has not."""
+        return tuple(name for name in ("zones", "hard", "energy_price", "ramp_per_s") if getattr(self, name))
 
     @property
     def horizon_s(self) -> float:
@@ -281,6 +333,9 @@ class Design:
             loops = [{key: of[key] for key in of if key != "Tt"} for of in content["loops"]]
             values["loops"] = tuple(PILoop(**loop) for loop in loops)
             values["noise"] = ObserverNoise(**content["noise"])
+            values["hard"] = tuple(str(name) for name in content.get("hard", ()))
+            tariff = content.get("tariff", ())
+            values["tariff"] = tuple((float(second), float(factor)) for second, factor in tariff)
             for key in ("drive_range", "limits"):
                 values[key] = {str(k): (float(v[0]), float(v[1])) for k, v in content[key].items()}
             return cls(**values)

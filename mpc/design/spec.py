@@ -20,7 +20,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from thermogrip.datasets.atomic_files import read_toml
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.limits import LARGEST
-from thermogrip.mpc.design.design import Design, default_controlled, default_design
+from thermogrip.mpc.design.design import Design, check_design, default_controlled, default_design
 from thermogrip.mpc.plant.prediction import drive_names, drive_range, step_response
 
 if TYPE_CHECKING:
@@ -90,6 +90,13 @@ class Spec(BaseModel):
     lost_gain: Annotated[NotNegative, Field(lt=1)] = 0.15
     limits: dict[str, Ends] | None = None  # soft limits of outputs [degC]
     weights: dict[str, Positive] | None = None  # how many times the errors of an output count
+    zones: dict[str, Positive] | None = None  # half width about a target in which an output may be anywhere
+    hard: list[str] | None = None  # outputs whose limits give way last
+    energy_price: NotNegative | dict[str, NotNegative] | None = None  # of a sample at full drive [degC^2]
+    tariff: list[tuple[NotNegative, NotNegative]] | None = None  # second of the day, times the price then
+    ramp_per_s: Positive | dict[str, Positive] | None = None  # fastest change of a target [degC per s]
+    safe_drive: Finite | dict[str, Finite] | None = None  # where a drive goes without its loop, in its units
+    iterations: Annotated[int, Field(ge=1, le=50)] = 1  # programs a sample, until the plan stays
 
     @model_validator(mode="after")
     def _agree(self) -> Spec:
@@ -184,8 +191,19 @@ class Spec(BaseModel):
             if name not in design.controlled:
                 hint = known_names(name, design.controlled, "these are: {}")
                 raise UserError(f"weights: {name} is not regulated", hint=hint)
+        for name, half in (self.zones or {}).items():
+            for key in ("band_degC", "overshoot_degC", "bias_degC"):
+                if half > getattr(self, key):
+                    narrow = f"{half:g} about {name} is wider than {key}, {getattr(self, key):g}"
+                    raise UserError(f"zones: {narrow}", hint="steps are judged by it: widen it too")
         values["weights"] = dict(self.weights or {})
-        return replace(design, **values, **changes)
+        values |= {"zones": dict(self.zones or {}), "hard": tuple(self.hard or ())}
+        values |= {"tariff": tuple(self.tariff or ()), "iterations": self.iterations}
+        for key in ("energy_price", "safe_drive"):
+            values[key] = _by_drive(key, getattr(self, key), tuple(design.drive_range))
+        ramp = self.ramp_per_s or {}
+        values["ramp_per_s"] = ramp if isinstance(ramp, dict) else dict.fromkeys(design.controlled, ramp)
+        return check_design(replace(design, **values, **changes), plant)
 
 
 def _own_times(plant: Plant) -> dict[str, float]:
@@ -236,9 +254,10 @@ def _ranges(spec: Spec, design: Design) -> dict[str, Range]:
         if low < least - 1e-9 or high > most + 1e-9:
             problem = f"drive_limits: {low:g} to {high:g} of {name} leaves its range"
             raise UserError(problem, hint=f"stay in {least:g} to {most:g}")
-        if least <= 0 <= most and not low <= 0 <= high:
+        safe = _by_drive("safe_drive", spec.safe_drive, tuple(ranges))
+        if least <= 0 <= most and not low <= 0 <= high and name not in safe:
             problem = f"drive_limits: {low:g} to {high:g} of {name} leaves out 0, where a failing loop goes"
-            raise UserError(problem, hint="let them contain 0")
+            raise UserError(problem, hint="let them contain 0, or write safe_drive")
         ranges[name] = (low, high)
     return ranges
 

@@ -65,6 +65,11 @@ class CallTimes:
             self.since += self.seconds
 
     @property
+    def now(self) -> float:
+        """The time of the newest reading [s], NaN where none had one."""
+        return self._time
+
+    @property
     def due(self) -> bool:
         """Whether this call is to move the drives."""
         passed = self.since + self._assumed - self._spent if self.stale else self.since

@@ -263,6 +263,8 @@ class CompiledOptimiser(Optimiser):
 
     def solve(self, sample: Sample) -> Outcome:
         """Improve a plan; see :meth:`Optimiser.solve`."""
+        if sample.d.ndim > 1 or self.design.in_python_alone:
+            return super().solve(sample)
         *parts, slew = self._parts
         for part, values in zip(parts, sample[:8], strict=True):
             part[:] = values.ravel()

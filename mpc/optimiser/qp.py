@@ -13,6 +13,8 @@ step mostly takes one or two iterations.  Everything is scaled before: x = D z w
 row of A D to unit length.  With r_i that length, a slack in scaled units is s/r, so its penalties become w r
 and q r^2.
 
+Where the very same H and A are given again, as of a linear plant, their scales and factors are kept.
+
 A failed solve is an answer with a status, never an exception, and the active set that led there is thrown
 away: the next solve starts cold.
 
@@ -91,6 +93,9 @@ class CondensedQP:
         self.iteration_limit, self.time_limit_s = iteration_limit, time_limit_s
         self.on_info: Callable[[dict[str, Any]], None] | None = None  # gets DAQP's record of each solve
         self._model: Any = None
+        self._given: tuple[Array, Array] | None = None  # the newest H and A, and what was made of them
+        self._scaled: tuple[Array, ...] = ()
+        self._new = True  # whether the solver has not seen them
 
     def forget(self) -> None:
         """Throw the warm start away."""
@@ -101,7 +106,8 @@ class CondensedQP:
         are infinite where there is none."""
         if A.shape != (self.soft.size, f.size):
             raise ValueError(f"A is {A.shape}, not {(self.soft.size, f.size)}")
-        finite = np.isfinite(H).all() and np.isfinite(f).all() and np.isfinite(A).all()
+        same = self._is_same(H, A)
+        finite = np.isfinite(f).all() and (same or (np.isfinite(H).all() and np.isfinite(A).all()))
         if not finite or np.isnan(lower).any() or np.isnan(upper).any():
             return self._failed("not finite", f.size)
         if np.any((lower > upper)[~self.soft]):
@@ -110,20 +116,34 @@ class CondensedQP:
             return self._failed("not convex", f.size)
         return self._solve(H, f, A, lower, upper)
 
+    def _is_same(self, H: Array, A: Array) -> bool:
+        return self._given is not None and H is self._given[0] and A is self._given[1]
+
     def _solve(self, H: Array, f: Array, A: Array, lower: Array, upper: Array) -> QPAnswer:
         """Return the minimiser of a program that may have one."""
-        scale = 1.0 / np.sqrt(np.diag(H))
-        rows = A * scale
-        length = np.maximum(np.linalg.norm(rows, axis=1), 1e-12)
+        if not self._is_same(H, A):
+            scale = 1.0 / np.sqrt(np.diag(H))
+            rows = A * scale
+            length = np.maximum(np.linalg.norm(rows, axis=1), 1e-12)
+            shown = H * np.outer(scale, scale), rows / length[:, None]
+            self._scaled = (scale, length, *(np.ascontiguousarray(each) for each in shown))
+            self._given, self._new = (H, A), True
+        scale, length, *matrices = self._scaled
         idle = self.soft & (length < _SHORT)
-        z, multipliers, flag, iterations = self._run(
-            np.ascontiguousarray(H * np.outer(scale, scale)),
+        given = (
+            matrices[0],
             f * scale,
-            np.ascontiguousarray(rows / length[:, None]),
+            matrices[1],
             np.clip(np.where(idle, -np.inf, lower / length), -_FAR, _FAR),
             np.clip(np.where(idle, np.inf, upper / length), -_FAR, _FAR),
             length,
         )
+        warm = self._model is not None
+        z, multipliers, flag, iterations = self._run(*given)
+        if warm and _FLAGS.get(flag) in ("iteration limit", "cycling"):  # a bad start: without one
+            self.forget()
+            z, multipliers, flag, more = self._run(*given)
+            iterations += more
         if flag <= 0:
             return self._failed(_FLAGS.get(flag, f"solver flag {flag}"), f.size, iterations)
         if not np.isfinite(z).all():
@@ -139,11 +159,14 @@ class CondensedQP:
         """Hand the scaled problem to DAQP: from the last active set where there is one."""
         if self._model is None:
             self._model, started = self._fresh(H, f, A, lower, upper)
-        else:
+        elif self._new:
             started = int(self._model.update(H=H, f=f, A=A, bupper=upper, blower=lower))
+        else:
+            started = int(self._model.update(f=f, bupper=upper, blower=lower))
         if started < 0:
             return np.full(f.size, np.nan), np.zeros(lower.size), started, 0
         self._penalise(length)
+        self._new = False
         z, _, flag, info = self._model.solve()
         if self.on_info is not None:
             self.on_info(info)

@@ -22,13 +22,21 @@ the QP's plan costs more than the guess in the nonlinear simulation, it is taken
 since the far side is a trap (there, heating seems to ask for still more cooling current), plain ramps that
 take the drive back, to none and to the other end, are looked at every fifth sample; so a drive does not stay
 at an end of its range either, where a black box answers nothing at all.
+
+**Zones** replace the squared error of an output by rows about its target, beyond which it costs that and its
+size, (s + s^2) for each sample's weight: the size makes the edge one that a price does not cross by a little.
+An energy price adds ``price_k u_k / span`` for each sample.  Rows of a hard limit cost a thousand times as
+much as of a soft one: they give way where nothing else can.
+
+A linear plant has none of those guards: G, H and the rows of the program are made once, only the free
+response, f and the bounds are new in a sample, and the program's plan is the best there is.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +52,7 @@ _SAFE = 0.75  # of the way to the optimum, where the range runs on beyond it
 FADING = 0.3  # of the gain at rest lost, from which on it is foreseen where it fades
 _LOOK_AROUND = 5  # samples between two trials of the ramps
 _LITTLE = 1e-7  # of its range, that a parked drive may be off in the program
+_DEAR = 1000.0  # times the price of a soft limit, of a hard one
 _BARELY = 1.02  # a plan that is hardly better than the QP's is not worth a jump
 
 
@@ -53,7 +62,7 @@ class Sample(NamedTuple):
     x: Array  # (n_x,) state
     last: Array  # (n_u,) drives that are applied now
     guess: Array  # (n_b, n_u) plan to linearise along
-    d: Array  # (n_d,) disturbances, their bias included
+    d: Array  # (n_d,) disturbances, their bias included; or (N, n_d) of each sample ahead
     target: Array  # (n_controlled,) [degC]
     side: Array  # (n_controlled,) from where a target is approached: +1 below, -1 above, 0 neither
     bias: Array  # (n_y,) reading minus model
@@ -62,6 +71,7 @@ class Sample(NamedTuple):
     lost: Mask | None = None  # (n_controlled,) outputs that cost nothing, and whose drives go to rest
     caution: float = 1.0  # how many times the design's move weight counts
     ahead: Array | None = None  # (N, n_controlled) targets of each sample, where they change
+    prices: Array | None = None  # (N,) how many times the energy price counts in each sample
 
 
 @dataclass(frozen=True)
@@ -109,23 +119,37 @@ class Optimiser:
         self.reach = np.cumsum(gaps)
         self.slews = (gaps[:, None] * self.slew).ravel()
         self._solves, self._move = 0, design.move
+        # of a linear plant: G in the drives' ranges, the rows of the program, and H for what counts
+        self._G: Array | None = None
+        self._A: Array | None = None
+        self._kept: tuple[Any, Array, list[Array]] | None = None
         self._seen_rows, self._parked = list(range(len(self._rows))), list[int]()
         self.neutral = np.clip(np.zeros(model.n_u), self.lowest, self.highest)
+        safe = [design.safe_drive.get(name, rest) for name, rest in zip(model.drives, self.neutral)]
+        self.safe = np.array(safe, dtype=float)
+        self.zone = np.array([design.zones.get(name, 0.0) for name in design.controlled])
+        self._price = np.array([design.energy_price.get(name, 0.0) for name in model.drives])
+        self._begins = np.cumsum(self.blocks) - np.array(self.blocks)
+        self._costs: Array | None = None  # (n_b, n_u) of this sample's energy, in ranges of the drives
         self.at_rest = self._response_at_rest()
         self.pair = self._pairs()
         self.settled_gain = self._settled_gain()
         self.seen = np.abs(self.at_rest) > 0.02 * np.max(np.abs(self.at_rest), axis=0)
-        soft = self.N * (len(self._rows) + len(self._limited))
+        # price of a unit beyond each soft row, of each controlled output and each limit
+        dear = [_DEAR if name in design.hard else 1.0 for name in design.limits]
+        self._dear = design.price * np.array(dear)
+        own = np.where(self.zone[:, None] > 0, self.weight[:, None] * self._weight, design.price)
+        prices = np.concatenate([np.full(2 * n, design.price), own.ravel(), np.repeat(self._dear, self.N)])
         self.qp = CondensedQP(
-            soft=np.concatenate([np.zeros(2 * n, bool), np.ones(soft, bool)]),
-            linear=np.full(2 * n + soft, design.price),
-            quadratic=np.full(2 * n + soft, 2 * design.price),
+            soft=np.arange(prices.size) >= 2 * n,
+            linear=prices,
+            quadratic=2 * prices,
             time_limit_s=max(design.deadline_s, 1e-3),
         )
 
     def solve(self, sample: Sample) -> Outcome:
         """Improve a plan."""
-        x, last, guess, d, now, side, bias, drive_bias, slew_s, lost, caution, ahead = sample
+        x, last, guess, d, now, side, bias, drive_bias, slew_s, lost, caution, ahead, tariff = sample
         self._move = caution * self.design.move
         model, n_u = self.model, self.model.n_u
         # in samples, by how much more or less than in one the first move may go
@@ -137,13 +161,20 @@ class Optimiser:
             side = np.where(lost, 0.0, side)
         if ahead is not None:  # nothing is beyond a target that moves
             side = np.zeros(len(now))
+        self._costs = None
+        if self._price.any():
+            dear = np.ones(self.N) if tariff is None else tariff
+            self._costs = np.add.reduceat(dear, self._begins)[:, None] * self._price
         guess = self._park(guess, last, more)
         y0, G = model.trajectory(x, guess + drive_bias, d, self.blocks)
-        G = G.reshape(self.N, model.n_y, self.n_b * n_u) * np.tile(model.span, self.n_b)
-        authority = self._authority(G)
+        linear = model.affine is not None
+        if self._G is None or not linear:
+            self._G = G.reshape(self.N, model.n_y, self.n_b * n_u) * np.tile(model.span, self.n_b)
+        G = self._G
+        authority = np.ones((self.n_b, n_u)) if linear else self._authority(G)
         y0 = y0 + bias
         z0 = (guess / model.span).ravel()
-        free = y0 - np.einsum("kij,j->ki", G, z0)  # the response without any plan
+        free = y0 - G @ z0  # the response without any plan
         H, f = self._cost(G, free, target, last)
         ends = self._range(guess, drive_bias, authority, last, more)
         A, lower, upper = self._constraints(G, free, target, side, last, ends, more)
@@ -151,6 +182,9 @@ class Optimiser:
         plan = self._park((answer.x * np.tile(model.span, self.n_b)).reshape(self.n_b, n_u), last, more)
         if not answer.solved:
             return Outcome(plan, y0, answer.status, {}, answer.iterations, authority[0])
+        if linear:
+            y = free + G @ (plan / model.span).ravel()
+            return Outcome(plan, y, "solved", self._broken(y), answer.iterations, authority[0])
 
         def predicted(plans: Array) -> Array:
             return self._simulate(x, plans + drive_bias, d) + bias
@@ -173,7 +207,7 @@ class Optimiser:
         if not self._parked:
             return plans
         reach = (self.reach[:, None] + more) * self.slew
-        path = np.clip(self.neutral, last - reach, last + reach)
+        path = np.clip(self.safe, last - reach, last + reach)
         plans = np.array(plans)
         plans[..., self._parked] = path[:, self._parked]
         return plans
@@ -262,7 +296,8 @@ class Optimiser:
     def _simulate(self, x: Array, plans: Array, d: Array) -> Array:
         """Return the outputs (B, N, n_y) of plans (B, n_b, n_u)."""
         states = np.repeat(x[None, :], len(plans), axis=0)
-        y, _ = self.model.run(states, np.repeat(plans, self.blocks, axis=1), d)
+        held = d if d.ndim == 1 else d[None]
+        y, _ = self.model.run(states, np.repeat(plans, self.blocks, axis=1), held)
         return y[:, 1:]
 
     def _ramps(self, last: Array, more: float) -> Array:
@@ -280,17 +315,24 @@ class Optimiser:
         before = np.concatenate([np.broadcast_to(last, (len(plans), 1, last.size)), plans], axis=1)
         cost = self._move * np.sum((np.diff(before, axis=1) / span) ** 2, axis=(1, 2))
         cost += design.drive * np.sum((plans / span) ** 2 * np.array(self.blocks)[:, None], axis=(1, 2))
-        over = []
+        over: list[tuple[float, Array]] = []
+        if self._costs is not None:
+            cost += np.sum(plans / span * self._costs, axis=(1, 2))
         for at in self._seen_rows:
             error = y[:, :, self._rows[at]] - target[:, at]
+            if self.zone[at]:
+                slack = np.maximum(0.0, np.abs(error) - self.zone[at])
+                cost += self.weight[at] * ((slack + slack**2) @ self._weight)
+                continue
             cost += self.weight[at] * (error**2 @ self._weight)
             if side[at]:
-                over.append(np.maximum(0.0, side[at] * error - design.overshoot))
+                over.append((design.price, side[at] * error - design.overshoot))
         for at, row in enumerate(self._limited):
-            over.append(np.maximum(0.0, self._limits[at, 0] - y[:, :, row]))
-            over.append(np.maximum(0.0, y[:, :, row] - self._limits[at, 1]))
-        for slack in over:
-            cost += design.price * np.sum(slack + slack**2, axis=1)
+            over.append((self._dear[at], self._limits[at, 0] - y[:, :, row]))
+            over.append((self._dear[at], y[:, :, row] - self._limits[at, 1]))
+        for price, beyond in over:
+            slack = np.maximum(0.0, beyond)
+            cost += price * np.sum(slack + slack**2, axis=1)
         return np.asarray(cost)
 
     def forget(self) -> None:
@@ -323,15 +365,23 @@ class Optimiser:
         return H, weighted
 
     def _cost(self, G: Array, free: Array, target: Array, last: Array) -> tuple[Array, Array]:
-        rows = [self._rows[at] for at in self._seen_rows]
-        H, weighted = self._hessian(G, rows)
+        tracked = [at for at in self._seen_rows if not self.zone[at]]
+        rows = [self._rows[at] for at in tracked]
+        key = tuple(rows), self._move
+        if self._kept is None or self._kept[0] != key or self.model.affine is None:
+            H, weighted = self._hessian(G, rows)
+            H += 2 * (self._move - self.design.move) * self.differences.T @ self.differences
+            self._kept = key, H, weighted
+        _, H, weighted = self._kept
         f = np.zeros(H.shape[0])
-        for at, row, part in zip(self._seen_rows, rows, weighted):
+        if self._costs is not None:
+            f += self._costs.ravel()
+        for at, row, part in zip(tracked, rows, weighted):
             f += 2 * part @ (free[:, row] - target[:, at])
         before = np.zeros(H.shape[0])
         before[: self.model.n_u] = last / self.model.span
         f -= 2 * self._move * self.differences.T @ before
-        return H + 2 * (self._move - self.design.move) * self.differences.T @ self.differences, f
+        return H, f
 
     def _constraints(
         self,
@@ -348,19 +398,21 @@ class Optimiser:
         before[: self.model.n_u] = last
         slews = self.slews.copy()
         slews[: self.model.n_u] += more * self.slew
-        rows = [self._hard]
+        if self._A is None or self.model.affine is None:
+            self._A = np.vstack([self._hard, *(G[:, row, :] for row in self._rows + self._limited)])
         lower = [ends[0].ravel() / span, (before - slews) / span]
         upper = [ends[1].ravel() / span, (before + slews) / span]
         for at, row in enumerate(self._rows):
-            rows.append(G[:, row, :])
-            far = self.design.overshoot
-            lower.append((target[:, at] - far if side[at] < 0 else -np.inf) - free[:, row])
-            upper.append((target[:, at] + far if side[at] > 0 else np.inf) - free[:, row])
+            far, down, up = self.design.overshoot, side[at] < 0, side[at] > 0
+            if self.zone[at]:
+                far, down = self.zone[at], at in self._seen_rows
+                up = down
+            lower.append((target[:, at] - far if down else -np.inf) - free[:, row])
+            upper.append((target[:, at] + far if up else np.inf) - free[:, row])
         for at, row in enumerate(self._limited):
-            rows.append(G[:, row, :])
             lower.append(self._limits[at, 0] - free[:, row])
             upper.append(self._limits[at, 1] - free[:, row])
-        return np.vstack(rows), np.concatenate(lower), np.concatenate(upper)
+        return self._A, np.concatenate(lower), np.concatenate(upper)
 
     def _broken(self, y: Array) -> dict[str, float]:
         found = {}

@@ -16,7 +16,8 @@ wrong side.
 
 The derivatives are CasADi's, exact, of the model's own step: its instructions for the step and its tangent
 become machine code that runs a direction for each block and drive in one batch. A step with instructions
-that have no such code (a branch) is linearised sample by sample, S+ = A S + B, by CasADi itself.
+that have no such code (a branch) is linearised sample by sample, S+ = A S + B, by CasADi itself. Of a step
+that is linear in state, drives and disturbances together the derivatives never change: they are made once.
 
 **Steady states.**  There x = f(x, u, d), so the outputs are a function y(u) of the drives.  For a Peltier
 element it is a parabola in the cooling direction: pumped heat grows with the current, Joule heat with its
@@ -34,7 +35,7 @@ import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -80,6 +81,14 @@ SPIKE = 6.0
 _NEAR = 5.0  # degC from what the logs showed, where a black box still knows what it does
 
 
+class Response(NamedTuple):
+    """Outputs after 1...N samples of a linear plant, by what they come from."""
+
+    by_x: Array  # (N, n_y, n_x)
+    by_rest: Array  # (N, n_y, n_x), of what is added to the state in every sample
+    G: Array  # (N, n_y, n_b, n_u)
+
+
 class PredictionModel:
     """A plant seen at the controller's sample time, its on/off inputs at 1.
 
@@ -114,6 +123,7 @@ class PredictionModel:
         wanted = sample_time(plant) if dt is None else float(dt)
         self.sub = max(1, round(wanted / plant.dt))
         self.dt = self.sub * plant.dt
+        self._responses: dict[tuple[int, ...], Response] = {}
         self.sub = self._fewest_steps()
 
     def _fewest_steps(self) -> int:
@@ -168,11 +178,11 @@ class PredictionModel:
         return np.array(y, dtype=np.float64)
 
     def run(self, x: Array, u: Array, d: Array) -> tuple[Array, Array]:
-        """Simulate plans u (B, N, n_u) from states x (B, n_x) under d (n_d,) or (B, n_d); return outputs
-        (B, N + 1, n_y) from the start on, and last states (B, n_x)."""
+        """Simulate plans u (B, N, n_u) from states x (B, n_x) under d (n_d,), (B, n_d) or (1, N, n_d); return
+        outputs (B, N + 1, n_y) from the start on, and last states (B, n_x)."""
         fine = np.repeat(self.inputs(u), self.sub, axis=1)
-        d = np.atleast_2d(d)
-        held = np.ascontiguousarray(np.broadcast_to(d[:, None, :], (d.shape[0], fine.shape[1], d.shape[1])))
+        d = np.repeat(d, self.sub, axis=1) if d.ndim == 3 else np.atleast_2d(d)[:, None, :]
+        held = np.ascontiguousarray(np.broadcast_to(d, (d.shape[0], fine.shape[1], d.shape[2])))
         y, x_end = self.model.rollout(
             np.ascontiguousarray(x), fine, held, self.p[None, :], self.dt / self.sub
         )
@@ -180,11 +190,31 @@ class PredictionModel:
 
     def next_state(self, x: Array, u: Array, d: Array) -> Array:
         """Return the state one sample later."""
+        if self.affine is not None:
+            A, B, E, added = self.affine
+            return np.asarray(A @ x + B @ u + E @ d + added)
         _, x_end = self.run(x[None, :], u[None, None, :], d)
         return np.asarray(x_end[0])
 
     def linearise(self, x: Array, u: Array, d: Array) -> tuple[Array, Array, Array, Array]:
         """Return one sample's next state (n_x,), and its derivatives A, B, E by x, u (n_x, n_u) and d."""
+        if self.affine is not None:
+            return self.next_state(x, u, d), *self.affine[:3]
+        return self._derivatives(x, u, d)
+
+    @cached_property
+    def affine(self) -> tuple[Array, Array, Array, Array] | None:
+        """A, B, E of one sample and what is added in it, (n_x,), where the step is linear; else None."""
+        import casadi as ca
+
+        symbols = _symbols(self)
+        after = ca.vertcat(*_step(self, symbols))
+        if any(ca.which_depends(after, ca.vertcat(*symbols), 2, True)):
+            return None
+        added, A, B, E = self._derivatives(*(np.zeros(n) for n in (self.n_x, self.n_u, self.n_d)))
+        return A, B, E, added
+
+    def _derivatives(self, x: Array, u: Array, d: Array) -> tuple[Array, Array, Array, Array]:
         n_x, n_u = self.n_x, self.n_u
         if self._kernel is None:
             found = self._casadi_sample(x, u, d)
@@ -212,8 +242,14 @@ class PredictionModel:
         count, n = len(su), len(u)
         states = np.concatenate([np.broadcast_to(x, (count, self.n_x)), sx], axis=1)
         drives = np.concatenate([np.broadcast_to(u, (count, n, self.n_u)), su], axis=2)
-        held = np.concatenate([np.broadcast_to(d, (count, self.n_d)), sd], axis=1)[:, None]
+        told = np.atleast_2d(d)  # one row holds for all samples
+        rows = [
+            np.broadcast_to(told, (count, *told.shape)),
+            np.broadcast_to(sd[:, None], (count, *told.shape)),
+        ]
+        held = np.concatenate(rows, axis=2)
         fine = np.repeat(drives, self.sub, axis=1)
+        held = held if len(told) == 1 else np.repeat(held, self.sub, axis=1)
         held = np.ascontiguousarray(np.broadcast_to(held, (count, fine.shape[1], 2 * self.n_d)))
         renew = np.zeros(fine.shape[1], dtype=bool)
         y, x_end = self._kernel.rollout(states, fine, held, np.zeros((1, 0)), self.dt / self.sub, renew)
@@ -228,7 +264,21 @@ class PredictionModel:
 
     def trajectory(self, x: Array, plan: Array, d: Array, blocks: Sequence[int]) -> tuple[Array, Array]:
         """Return the outputs (N, n_y) after 1...N samples of a plan (n_b, n_u) of blocks, from state x under
-        disturbances d, and their derivatives (N, n_y, n_b, n_u)."""
+        disturbances d, (n_d,) or (N, n_d), and their derivatives (N, n_y, n_b, n_u), of a linear plant the
+        same array each time."""
+        if self.affine is not None:
+            _, _, E, added = self.affine
+            by_x, by_rest, G = self._response(tuple(blocks))
+            if d.ndim > 1:  # what a sample's disturbances do reaches as far as any
+                B = self.affine[1]
+                inputs = np.repeat(plan, np.asarray(blocks), axis=0) @ B.T + d @ E.T + added
+                states = []
+                for each in inputs:
+                    x = self.affine[0] @ x + each
+                    states.append(x)
+                return np.stack(states) @ self.C.T + self.output(np.zeros(self.n_x)), G
+            y = by_x @ x + by_rest @ (E @ d + added) + np.tensordot(G, plan, axes=2)
+            return y + self.output(np.zeros(self.n_x)), G
         if self._kernel is None:
             return self._trajectory_by_casadi(x, plan, d, blocks)
         n_b, n_u = plan.shape
@@ -239,21 +289,47 @@ class PredictionModel:
         G = y[:, 1:, self.n_y :].transpose(1, 2, 0).reshape(len(u), self.n_y, n_b, n_u)
         return np.ascontiguousarray(y[0, 1:, : self.n_y]), G
 
+    def _response(self, blocks: tuple[int, ...]) -> Response:
+        """Return how a linear plant's outputs answer, made once for these blocks."""
+        if blocks in self._responses:
+            return self._responses[blocks]
+        if self.affine is None:
+            raise RuntimeError("the plant is not linear")
+        A, B, _, _ = self.affine
+        rows, sums = self.C, np.zeros_like(self.C)
+        by_x, by_rest, impulse = [], [], []
+        for _ in range(sum(blocks)):
+            impulse.append(rows @ B)
+            sums = sums + rows
+            rows = rows @ A
+            by_x.append(rows)
+            by_rest.append(sums)
+        # a block's answer is the sum of what its samples do
+        steps = np.concatenate([np.zeros((1, *impulse[0].shape)), np.cumsum(impulse, axis=0)])
+        G, first = np.zeros((len(impulse), self.n_y, len(blocks), self.n_u)), 0
+        for at, length in enumerate(blocks):
+            for k in range(first, len(impulse)):
+                G[k, :, at] = steps[k - first + 1] - steps[max(0, k - first + 1 - length)]
+            first += length
+        self._responses[blocks] = Response(np.stack(by_x), np.stack(by_rest), G)
+        return self._responses[blocks]
+
     def _trajectory_by_casadi(
         self, x: Array, plan: Array, d: Array, blocks: Sequence[int]
     ) -> tuple[Array, Array]:
         """Return what :meth:`trajectory` returns, from CasADi forward sensitivities."""
         n_b, n_u = plan.shape
         sensitivity: Array = np.zeros((self.n_x, n_b, n_u))
-        outputs, gains = [], []
+        outputs, gains = list[Array](), list[Array]()
         for block, length in enumerate(blocks):
             for _ in range(length):
-                x_next, A, B, _ = self._casadi_sample(x, plan[block], d)
+                now = d if d.ndim == 1 else d[len(outputs)]
+                x_next, A, B, _ = self._casadi_sample(x, plan[block], now)
                 sensitivity = np.asarray(np.tensordot(A, sensitivity, axes=1), dtype=np.float64)
                 sensitivity[:, block, :] += B
                 x = x_next.ravel()
                 outputs.append(self.output(x))
-                gains.append(np.tensordot(self.C, sensitivity, axes=1))
+                gains.append(np.asarray(np.tensordot(self.C, sensitivity, axes=1), dtype=np.float64))
         return np.stack(outputs), np.stack(gains)
 
     def _casadi_sample(self, x: Array, u: Array, d: Array) -> list[Array]:

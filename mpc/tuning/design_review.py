@@ -180,8 +180,14 @@ class _Counted(Controller):
 
     iterations: tuple[int, ...] = ()
 
-    def step(self, reading: Readings, target: Trajectory) -> Move:
-        move = super().step(reading, target)
+    def step(
+        self,
+        reading: Readings,
+        target: Trajectory,
+        *,
+        coming: Mapping[str, Sequence[float]] | None = None,
+    ) -> Move:
+        move = super().step(reading, target, coming=coming)
         self.iterations += (self.last_iterations,)
         return move
 

@@ -69,6 +69,11 @@ class Core:
         self._x: Array | None = None
 
     @property
+    def dt(self) -> float:
+        """The plant's own step [s]."""
+        return self.plant.dt
+
+    @property
     def ports(self) -> tuple[Port, ...]:
         """All variables: inputs and disturbances, outputs, parameters, starts."""
         units = self.plant.units
@@ -175,9 +180,17 @@ def to_fmu(plant: Plant, path: str | Path) -> Path:
     ...     to_fmu(prior_plant(load_network("tclab")), f"{folder}/board.fmu").name
     'board.fmu'
     """
+    target = fmu_path(path, plant)
+    Core(plant)  # refuses here what the script would refuse inside
+    content = replace(plant, samples=None).to_dict()
+    return write_fmu(target, content, "thermogrip.sysid.export.fmu", "a plant identified by thermogrip")
+
+
+def fmu_path(path: str | Path, plant: Plant) -> Path:
+    """Return where an FMU of a plant, or of its controller, goes; a UserError where its stem cannot be an
+    identifier, or the plant is in no file."""
     target = Path(path)
-    name = target.stem
-    plain = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) and not keyword.iskeyword(name)
+    plain = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", target.stem) and not keyword.iskeyword(target.stem)
     if target.suffix != ".fmu" or not plain:
         raise UserError(
             "cannot name an FMU", file=target, hint="letters, digits and underscores, ending in .fmu"
@@ -186,16 +199,21 @@ def to_fmu(plant: Plant, path: str | Path) -> Path:
         raise UserError(
             "the plant is a class of your own, which no FMU can hold", hint="write it as a network"
         )
+    return target
+
+
+def write_fmu(target: Path, content: dict[str, Any], core: str, what: str) -> Path:
+    """Write an FMU with this JSON in it and return its path; ``core_of`` of the module ``core`` makes of it
+    what is stepped, ``what`` describes it."""
+    name = target.stem
     builder = needed("pythonfmu.builder", "fmu")
-    Core(plant)  # refuses here what the script would refuse inside
     with tempfile.TemporaryDirectory() as folder, atomic_path(target) as temporary:
         module = f"thermogrip_slave_{name}"
         script, beside = Path(folder) / f"{module}.py", Path(folder) / f"{name}.json"
         # names in it begin with an underscore, so that no name of a plant can hide one of them
         text = (resources.files("thermogrip.sysid.export") / "slave.py.in").read_text(encoding="utf-8")
-        script.write_text(text.format(name=name), encoding="utf-8")
-        content = replace(plant, samples=None).to_dict() | {KEY: provenance()}
-        beside.write_text(json.dumps(content), encoding="utf-8")
+        script.write_text(text.format(name=name, module=core, what=what), encoding="utf-8")
+        beside.write_text(json.dumps(content | {KEY: provenance()}), encoding="utf-8")
         path_before = list(sys.path)
         sys.modules.pop(module, None)  # the builder imports the script by its name
         try:

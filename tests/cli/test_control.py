@@ -189,6 +189,8 @@ def test_an_export_is_compared_with_python_only_where_that_is_asked_for(
         assert shares(done.err, "check") == [25]
         controller.run("export", "c.json", "--out", "c", "--check")
         assert (asked[-1].states, asked[-1].seed) == (3000, 0)
+    library = controller.run("export", "c.json", "--out", "c", "--arduino", *options)
+    assert (library.code, exported[-1].arduino) == ((2, False) if options else (0, True))
 
 
 @pytest.mark.parametrize(("verdicts", "code"), [("pass warn", 0), ("pass fail warn", 3)])

@@ -31,6 +31,7 @@
 #define SLOW_FOR 5        /* and for so many samples in a row */
 #define TINY 1e-9
 #define UNCUT 1e-9 /* of its range: a drive of the PI that is cut by less is not limited */
+#define STAYS 1e-5 /* of its range: a plan that moves by less has converged */
 #define SAME 1e-6 /* of a sample: what is nearer than this is the same time */
 
 /* ---- the loop ---- */
@@ -362,9 +363,19 @@ void tg_guess(const tg_controller *c, const double *last, double *guess)
         }
 }
 
+/* Whether a plan is another one than it was linearised along. */
+static int has_moved(const tg_design *s, const double *guess, const double *plan)
+{
+    for (int i = 0; i < s->n_b * TG_NU; i++)
+        if (fabs(plan[i] - guess[i]) > STAYS * s->span[i % TG_NU])
+            return 1;
+    return 0;
+}
+
 static int optimise(tg_controller *c)
 {
     const tg_design *s = c->design;
+    int status, changes;
     double last[TG_NU], guess[TG_Q_N], x[TG_NX], u[TG_NU], d[TG_SOME(TG_ND)], on_u[TG_NU], on_y[TG_NY];
     tg_biases(c, on_u, d, on_y);
     for (int i = 0; i < TG_ND; i++)
@@ -383,7 +394,15 @@ static int optimise(tg_controller *c)
     c->caution = 1.0;
     for (int i = 0; i < TG_NY; i++)
         c->caution = fmin(fmax(c->caution, fabs(c->innovation[i]) / CAUTION), MOST_CAUTION);
-    return tg_optimise(c, x, last, guess, d, c->target, c->side, on_y, on_u);
+    status = tg_optimise(c, x, last, guess, d, c->target, c->side, on_y, on_u);
+    changes = c->iterations;
+    for (int n = 1; n < s->iterations && status == TG_QP_SOLVED && !s->linear && has_moved(s, guess, c->best); n++) {
+        memcpy(guess, c->best, (size_t)s->n_b * TG_NU * sizeof(double));
+        status = tg_optimise(c, x, last, guess, d, c->target, c->side, on_y, on_u);
+        changes += c->iterations;
+    }
+    c->iterations = changes;
+    return status;
 }
 
 /* Whether there is a plan to follow. */
@@ -441,7 +460,7 @@ static void follow(tg_controller *c, tg_move *move, int status, int advice)
     for (int r = 0; r < s->n_c; r++)
         unread = unread || !isfinite(c->y[s->controlled[r]]);
     if (unread) {
-        memcpy(move->drive, s->neutral, sizeof move->drive);
+        memcpy(move->drive, s->safe, sizeof move->drive);
         move->status = TG_OFF;
         return;
     }
@@ -641,7 +660,7 @@ static void follow_without_readings(tg_controller *c, tg_move *move, double seco
         return;
     }
     c->has_plan = 0;
-    memcpy(move->drive, c->design->neutral, sizeof move->drive);
+    memcpy(move->drive, c->design->safe, sizeof move->drive);
     move->status = TG_OFF;
     move->advice = TG_BLIND;
 }
@@ -666,7 +685,7 @@ static void decide(tg_controller *c, tg_move *move)
     double unread = unread_for(c, &unseen);
     move->status = TG_OK;
     move->advice = TG_ALL_WELL;
-    memcpy(move->drive, s->neutral, sizeof move->drive);
+    memcpy(move->drive, s->safe, sizeof move->drive);
     if (!all_finite(c->target, s->n_c)) {
         move->status = TG_OFF;
         move->advice = TG_NO_TARGET;
@@ -726,7 +745,7 @@ static void keep_within(const tg_controller *c, double *u)
 {
     const tg_design *s = c->design;
     for (int j = 0; j < TG_NU; j++) {
-        double value = isfinite(u[j]) ? u[j] : s->neutral[j];
+        double value = isfinite(u[j]) ? u[j] : s->safe[j];
         double before = fmin(fmax(c->u[j], s->lowest[j]), s->highest[j]);
         double slew = s->slew[j] * (c->slew_s / s->dt);
         value = fmin(fmax(value, before - slew), before + slew);

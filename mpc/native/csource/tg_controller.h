@@ -100,6 +100,8 @@ typedef struct {
     /* what the last optimisation gave */
     double best[TG_Q_N], y_best[TG_NH * TG_NY], authority[TG_Q_N], broken;
     int qp_status, iterations;
+    double kept_caution; /* of a linear plant: for what H was made, and whether there is a G */
+    int kept_lost[TG_NC], has_gains;
     /* room to work in */
     tg_qp qp;
     double G[TG_NH * TG_SOME(TG_NS) * TG_Q_N], y_guess[TG_NH * TG_NY], y_try[TG_NH * TG_NY];

@@ -99,6 +99,7 @@ int tg_host_qp(tg_controller *c, int n, int s, const double *H, const double *f,
     tg_qp *q = &c->qp;
     int status;
     q->n = n;
+    q->kept = 0;
     q->stride = TG_NU;
     q->s = s;
     q->linear = linear;
@@ -116,6 +117,7 @@ int tg_host_qp(tg_controller *c, int n, int s, const double *H, const double *f,
     if (!warm)
         tg_qp_forget(q);
     status = tg_qp_solve(q);
+    q->kept = 0; /* of no plant's program */
     memcpy(x, q->x, (size_t)n * sizeof(double));
     *iterations = q->iterations;
     return status;

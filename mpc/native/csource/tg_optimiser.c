@@ -10,6 +10,7 @@
  * remains, and no block goes further.  Where the simulated cost of the QP's plan is above that of the guess, or
  * every fifth sample, shorter moves and plain ramps are tried too: near the optimum of a Peltier element the
  * linearisation overestimates the effect, and beyond it the gain changes sign.
+ * Of a linear plant G, and the factor of H while the weights stay, are made once, and the QP's plan is the best.
  */
 #include "tg_controller.h"
 #include "tg_model.h"
@@ -49,7 +50,7 @@ static void park(const tg_controller *c, const double *last, double *plan)
         for (int j = 0; j < TG_NU; j++)
             if (is_parked(c, j)) {
                 double room = (s->reach[b] + more_slew(c)) * s->slew[j];
-                plan[b * TG_NU + j] = fmin(fmax(s->neutral[j], last[j] - room), last[j] + room);
+                plan[b * TG_NU + j] = fmin(fmax(s->safe[j], last[j] - room), last[j] + room);
             }
 }
 
@@ -213,24 +214,46 @@ static void set_bounds(tg_controller *c, const double *guess, const double *driv
         }
 }
 
-static void set_cost(tg_controller *c, const double *target, const double *last)
+/* Weight of a controlled output in sample k; 0 where it is lost. */
+static double weight_of(const tg_controller *c, int k, int r)
+{
+    const tg_design *s = c->design;
+    return c->lost[r] ? 0.0 : 2.0 * s->weight[r] * (s->track + (k == s->N - 1 ? s->terminal : 0.0));
+}
+
+static void set_linear_cost(tg_controller *c, const double *target, const double *last)
+{
+    const tg_design *s = c->design;
+    tg_qp *q = &c->qp;
+    int k = 0;
+    memset(q->f, 0, sizeof q->f);
+    for (int b = 0; b < s->n_b; b++)
+        for (int at = 0; at < s->blocks[b]; at++, k++)
+            for (int r = 0; r < s->n_c; r++) {
+                const double *g = c->G + ((size_t)k * TG_NS + (size_t)r) * TG_Q_N;
+                double error = weight_of(c, k, r) * (c->free[k * TG_NS + r] - goal(c, target, k, r));
+                for (int i = 0; i < (b + 1) * TG_NU; i++)
+                    q->f[i] += error * g[i];
+            }
+    for (int j = 0; j < TG_NU; j++)
+        q->f[j] -= 2.0 * c->caution * s->move * last[j] / s->span[j];
+}
+
+static void set_quadratic_cost(tg_controller *c)
 {
     const tg_design *s = c->design;
     tg_qp *q = &c->qp;
     double weight_of_moves = c->caution * s->move;
     int n = q->n, k = 0;
-    memset(q->f, 0, sizeof q->f);
     for (int i = 0; i < n; i++)
         memset(q->H + (size_t)i * TG_Q_N, 0, (size_t)(i + 1) * sizeof(double));
     for (int b = 0; b < s->n_b; b++)
         for (int at = 0; at < s->blocks[b]; at++, k++)
             for (int r = 0; r < s->n_c; r++) {
                 const double *g = c->G + ((size_t)k * TG_NS + (size_t)r) * TG_Q_N;
-                double weight = 2.0 * s->weight[r] * (s->track + (k == s->N - 1 ? s->terminal : 0.0));
-                double error = weight * (c->free[k * TG_NS + r] - goal(c, target, k, r));
-                for (int i = 0; !c->lost[r] && i < (b + 1) * TG_NU; i++) {
+                double weight = weight_of(c, k, r);
+                for (int i = 0; weight > 0.0 && i < (b + 1) * TG_NU; i++) {
                     double share = weight * g[i], *row = q->H + (size_t)i * TG_Q_N;
-                    q->f[i] += error * g[i];
                     for (int j = 0; j <= i; j++)
                         row[j] += share * g[j];
                 }
@@ -241,9 +264,14 @@ static void set_cost(tg_controller *c, const double *target, const double *last)
             q->H[(size_t)i * (TG_Q_N + 1)] += 2.0 * (weight_of_moves * (b < s->n_b - 1 ? 2.0 : 1.0) + s->drive * s->blocks[b]);
             if (b)
                 q->H[(size_t)i * TG_Q_N + (size_t)(i - TG_NU)] -= 2.0 * weight_of_moves;
-            else
-                q->f[i] -= 2.0 * weight_of_moves * last[j] / s->span[j];
         }
+}
+
+/* Whether what was made for the program of the last solve is this one's. */
+static int is_kept(const tg_controller *c)
+{
+    return c->design->linear && c->qp.kept && c->kept_caution == c->caution &&
+           !memcmp(c->kept_lost, c->lost, sizeof c->lost);
 }
 
 static void set_soft_rows(tg_controller *c, const double *target, const double *side)
@@ -265,8 +293,9 @@ static void set_soft_rows(tg_controller *c, const double *target, const double *
                 lower[i] = low - c->free[k * TG_NS + r];
                 upper[i] = high - c->free[k * TG_NS + r];
                 q->filled[i] = (b + 1) * TG_NU;
-                memcpy(q->A + (size_t)i * TG_Q_N, c->G + ((size_t)k * TG_NS + (size_t)r) * TG_Q_N,
-                       (size_t)q->filled[i] * sizeof(double));
+                if (!q->kept)
+                    memcpy(q->A + (size_t)i * TG_Q_N, c->G + ((size_t)k * TG_NS + (size_t)r) * TG_Q_N,
+                           (size_t)q->filled[i] * sizeof(double));
             }
 }
 
@@ -337,6 +366,22 @@ static void find_broken(tg_controller *c)
         }
 }
 
+/* The outputs of a linear plant under the best plan; G has rows of those that count alone, and no other is used. */
+static void follow_gains(tg_controller *c, const double *guess)
+{
+    const tg_design *s = c->design;
+    int k = 0, rows = s->n_c + s->n_l;
+    for (int b = 0; b < s->n_b; b++)
+        for (int at = 0; at < s->blocks[b]; at++, k++)
+            for (int r = 0; r < rows; r++) {
+                const double *g = c->G + ((size_t)k * TG_NS + (size_t)r) * TG_Q_N;
+                double *y = c->y_best + k * TG_NY + row_of(s, r);
+                *y = c->y_guess[k * TG_NY + row_of(s, r)];
+                for (int i = 0; i < (b + 1) * TG_NU; i++)
+                    *y += g[i] * (c->best[i] - guess[i]) / s->span[i % TG_NU];
+            }
+}
+
 int tg_optimise(tg_controller *c, const double *x, const double *last, const double *start, const double *d,
                 const double *target, const double *from, const double *bias, const double *drive_bias)
 {
@@ -356,10 +401,20 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
     park(c, last, guess);
     for (int r = 0; r < s->n_c; r++)
         side[r] = c->lost[r] || c->goals ? 0.0 : from[r]; /* nothing is beyond a target that moves */
-    linearise(c, x, guess, drive_bias, d, bias);
-    find_authority(c);
+    if (s->linear && c->has_gains)
+        simulate(s, x, guess, drive_bias, d, bias, c->y_guess);
+    else {
+        linearise(c, x, guess, drive_bias, d, bias);
+        find_authority(c);
+        c->has_gains = s->linear;
+    }
     find_free(c, guess);
-    set_cost(c, target, last);
+    q->kept = is_kept(c);
+    if (!q->kept)
+        set_quadratic_cost(c);
+    c->kept_caution = c->caution;
+    memcpy(c->kept_lost, c->lost, sizeof c->lost);
+    set_linear_cost(c, target, last);
     set_bounds(c, guess, drive_bias, last);
     set_soft_rows(c, target, side);
     c->qp_status = tg_qp_solve(q);
@@ -371,6 +426,11 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
     for (int i = 0; i < q->n; i++)
         c->best[i] = q->x[i] * s->span[i % TG_NU];
     park(c, last, c->best);
+    if (s->linear) {
+        follow_gains(c, guess);
+        find_broken(c);
+        return c->qp_status;
+    }
     at_guess = merit(c, guess, c->y_guess, target, side, last);
     simulate(s, x, c->best, drive_bias, d, bias, c->y_best);
     cost = merit(c, c->best, c->y_best, target, side, last);

@@ -46,13 +46,13 @@ static int all_finite(const double *a, int n)
 
 static int problem_is_finite(const tg_qp *q)
 {
-    for (int i = 0; i < q->n; i++)
+    for (int i = 0; i < q->n && !q->kept; i++)
         if (!all_finite(q->H + (size_t)i * TG_Q_N, i + 1))
             return 0;
     for (int i = 0; i < 2 * q->n + q->s; i++)
         if (isnan(q->lower[i]) || isnan(q->upper[i]))
             return 0;
-    for (int i = 0; i < q->s; i++)
+    for (int i = 0; i < q->s && !q->kept; i++)
         if (!all_finite(q->A + (size_t)i * TG_Q_N, q->filled[i]))
             return 0;
     return all_finite(q->f, q->n);
@@ -370,10 +370,18 @@ static int worst(const tg_qp *q, int *row, int *side)
     return found;
 }
 
-/* Take the last solve's set in again, where its bounds still exist. */
-static void take_up(tg_qp *q)
+/* Take the last solve's set in again, where its bounds still exist. same: its normals and its factor hold. */
+static void take_up(tg_qp *q, int same)
 {
     int kept = q->n_work;
+    for (int i = 0; same && i < kept; i++)
+        same = (q->side[i] > 0 ? q->upper[q->row[i]] : -q->lower[q->row[i]]) <= FAR;
+    for (int i = 0; same && i < kept; i++) {
+        q->in_set[q->row[i]] = 1;
+        set_right(q, i);
+    }
+    if (same)
+        return;
     q->n_work = 0;
     for (int i = 0; i < kept; i++) {
         int row = q->row[i], side = q->side[i], state = q->state[i];
@@ -419,18 +427,20 @@ static int failed(tg_qp *q, int status)
 int tg_qp_solve(tg_qp *q)
 {
     int row = 0, side = 0, upward = 0, which;
+    int same = q->kept && !q->iterations; /* a factor that was updated is made anew, or its errors would add up */
     q->iterations = 0;
     if (!problem_is_finite(q))
         return failed(q, TG_QP_NOT_FINITE);
     for (int i = 0; i < 2 * q->n; i++)
         if (q->lower[i] > q->upper[i])
             return failed(q, TG_QP_INFEASIBLE);
-    if (!weigh_rows(q) || !factorise(q))
+    if (!q->kept && (!weigh_rows(q) || !factorise(q)))
         return failed(q, TG_QP_NOT_CONVEX);
+    q->kept = 1;
     memcpy(q->c, q->f, (size_t)q->n * sizeof(double));
     forward(q, q->c, 0);
     memset(q->in_set, 0, sizeof q->in_set);
-    take_up(q);
+    take_up(q, same);
     while (q->iterations <= q->iteration_limit) {
         if (q->late && q->late(q->about))
             return failed(q, TG_QP_TIME);

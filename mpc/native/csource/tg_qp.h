@@ -34,7 +34,7 @@ typedef struct {
     double A[TG_Q_S > 0 ? TG_Q_S * TG_Q_N : 1];
     int filled[TG_Q_S > 0 ? TG_Q_S : 1]; /* entries of a soft row before its trailing zeros */
     double linear, quadratic;
-    int iteration_limit;
+    int iteration_limit, kept; /* whether H (its factor), A and filled are those of the last solve */
     int (*late)(void *about); /* asked before every change of the working set: time is up; may be NULL */
     void *about;
     /* the answer */
@@ -62,7 +62,8 @@ extern "C" {
 /* Throw the working set away: the next solve starts cold. */
 void tg_qp_forget(tg_qp *q);
 
-/* Solve; return one of enum tg_qp_status. The working set is kept where it was solved. */
+/* Solve; return one of enum tg_qp_status. The working set is kept where it was solved; whoever gives another H or A
+ * sets kept to 0 before, and it is 1 afterwards where there is a factor. */
 int tg_qp_solve(tg_qp *q);
 
 #ifdef __cplusplus

@@ -196,6 +196,7 @@ def export(
         bool, cli.flag("--check", "Build it (gcc) and compare it with Python on random states.")
     ] = False,
     states: Annotated[int, cli.opt("--states", None, "Random states of --check.", min=1)] = 3_000,
+    arduino: Annotated[bool, cli.flag("--arduino", "Write it as a library of the Arduino IDE.")] = False,
     network: cli.OwnNetwork = None,
     seed: cli.Seed = 0,
     as_json: cli.AsJson = False,
@@ -206,9 +207,11 @@ def export(
     """
     from thermogrip.mpc.controllers.export import check_export, export_controller
 
+    if arduino and check:
+        raise UserError("--check builds a plain export", hint="check it without --arduino first")
     console = Console(as_json)
     loaded = load_controller(controller, network)
-    written = export_controller(loaded, cli.new_folder(out))
+    written = export_controller(loaded, cli.new_folder(out), arduino=arduino)
     console.say(
         f"Wrote {len(written.files)} files to {out}: {written.ram} bytes of RAM a controller, "
         f"{written.constants} of constants."

@@ -56,6 +56,15 @@ _SPEC_WORDS = {
     "lost_gain": "share of the drives that does nothing, tried",
 }
 
+_WISHES = {
+    "zones": "anywhere within, about the target",
+    "hard": "limits that give way last",
+    "energy_price": "price of a sample at full drive",
+    "tariff": "second of the day, times the price",
+    "ramp_per_s": "fastest change of a target [per s]",
+    "safe_drive": "drive without its loop",
+}
+
 
 def tuning_table(tuning: Tuning) -> Cells:
     """Return the comparison of baseline, tuned, PI and LQR, step by step."""
@@ -210,6 +219,7 @@ def spec_section(tuning: Tuning) -> Section:
     spec, design = tuning.spec, tuning.controller.design
     asked = [("steps [degC]", ", ".join(f"{a:g} to {b:g}" for a, b in spec.steps))]
     asked += [(words, getattr(spec, key)) for key, words in _SPEC_WORDS.items()]
+    asked += [(words, str(getattr(spec, key))) for key, words in _WISHES.items() if getattr(spec, key)]
     found: list[tuple[str, Any]] = [
         ("regulated", ", ".join(design.controlled)),
         ("sample time [s]", design.dt),

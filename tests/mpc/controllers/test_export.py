@@ -94,6 +94,42 @@ def test_a_program_in_cpp_includes_links_and_steps_an_export(tmp_path):
 
 
 @needs_gcc
+@pytest.mark.skipif(compiler() is None or shutil.which("g++") is None, reason="no g++ here")
+def test_an_arduino_library_is_laid_out_builds_and_runs_its_example(controller, tmp_path):
+    written = export_controller(controller, tmp_path / "library", arduino=True)
+    folder = written.folder
+    assert {path.name for path in folder.iterdir()} == {"library.properties", "README.md", "src", "examples"}
+    lines = dict(line.split("=", 1) for line in (folder / "library.properties").read_text().splitlines())
+    wanted = "name version author maintainer sentence paragraph category url architectures includes"
+    assert list(lines) == wanted.split()
+    assert (folder / "examples" / "loop" / "loop.ino").is_file()
+    objects = []
+    for source in sorted((folder / "src").glob("*.c")):
+        objects.append(str(tmp_path / f"{source.stem}.o"))
+        subprocess.run(["gcc", "-std=gnu17", "-c", str(source), "-o", objects[-1]], check=True)
+    # what an IDE puts around a sketch; its sensor reads 25 degC after ten readings
+    stub = """#include <cmath>
+#include <cstdio>
+struct { void begin(long) {} void print(const char *s) { std::printf("%s", s); }
+         void println(const char *s) { std::printf("%s\\n", s); } } Serial;
+static unsigned long now_ms = 0;
+static unsigned long millis() { return now_ms; }
+static void delay(unsigned long ms) { now_ms += ms; }
+#include "loop.cpp"
+int main() { setup(); for (int k = 0; k < 60; k++) loop(); std::printf("drive %g\\n", controller.u[0]); }
+"""
+    sketch = (folder / "examples" / "loop" / "loop.ino").read_text()
+    for sensor, said, moved in (("NAN", "off", False), ("25.0", "ok", True)):
+        (tmp_path / "loop.cpp").write_text(sketch.replace("return NAN;", f"return {sensor};"))
+        (tmp_path / "board.cpp").write_text(stub)
+        program = tmp_path / f"board_{said}"
+        command = ["g++", "-std=gnu++17", f"-I{folder / 'src'}", str(tmp_path / "board.cpp"), *objects, "-lm"]
+        subprocess.run([*command, "-o", str(program)], check=True)
+        told = subprocess.run([str(program)], check=True, capture_output=True, text=True).stdout.splitlines()
+        assert told[-2].startswith(said)
+        assert (told[-1] != "drive 0") is moved
+
+
 def test_a_wrong_number_in_the_export_is_found(controller, tmp_path):
     export = export_controller(controller, tmp_path)
     design = tmp_path / "tg_design.c"

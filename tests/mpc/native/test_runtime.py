@@ -44,6 +44,34 @@ def tclab() -> Plant:
     return network_plant("tclab")
 
 
+def test_what_is_kept_of_a_linear_plant_is_what_would_be_made_anew(tank_maker):
+    # lost outputs, and moves that weigh more, are another program; between them the first one comes back
+    plant = tank_maker(joule=0.0)
+    design = default_design(plant, dt=2.0, controlled=("t_tank", "t_surface"), limits=LIMITS)
+    kept, fresh, c = (Controller(plant, design, compiled=last) for last in (False, False, True))
+    assert kept.model.affine is not None
+    x, rng, room = np.full(kept.model.n_x, 25.0), np.random.default_rng(2), np.array([25.0])
+    for k in range(40):
+        x = x + rng.normal(size=x.size)
+        last = rng.uniform(-1, 1, 1)
+        about = {"target": rng.uniform(15, 40, 2), "side": rng.choice([-1.0, 0, 1], 2)}
+        about |= {"bias": 0.2 * rng.normal(size=2), "drive_bias": 0.02 * rng.normal(size=1)}
+        about |= {"lost": np.array([k % 7 == 3, False]), "caution": 4.0 if k % 5 == 4 else 1.0}
+        guess = np.repeat(last[None], kept.optimiser.n_b, axis=0)
+        sample = Sample(x, last, guess, room, **about)
+        one, three = kept.optimiser.solve(sample), c.optimiser.solve(sample)
+        fresh.optimiser = type(kept.optimiser)(fresh.model, design)
+        two = fresh.optimiser.solve(sample)
+        assert one.status == two.status == three.status == "solved"
+        for other in (two, three):
+            np.testing.assert_allclose(one.plan, other.plan, atol=1e-7)
+            rows = [0, 1]
+            np.testing.assert_allclose(one.y[:, rows], other.y[:, rows], atol=1e-6)
+        drives = np.repeat(one.plan + about["drive_bias"], design.blocks, axis=0)
+        y, _ = kept.model.run(x[None], drives[None], room)
+        np.testing.assert_allclose(one.y, y[0, 1:] + about["bias"], atol=1e-6)
+
+
 def test_a_plan_is_the_same_in_c(pair):
     python, c = pair
     rng, d = np.random.default_rng(1), np.array([25.0])

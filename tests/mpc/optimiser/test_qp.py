@@ -196,7 +196,8 @@ def test_a_flag_of_the_solver_is_a_status_and_no_number_is_no_solution(monkeypat
     found = solver.solve(np.array([[4.0]]), np.zeros(1), np.array([[3.0]]), -np.ones(1), np.ones(1))
     solved = flag > 0 and np.isfinite(z)
     assert found.status == ("not finite" if flag > 0 and not solved else status)
-    assert (found.solved, found.iterations, solver._model) == (solved, 7, "warm" if solved else None)
+    tries = 2 if status in ("cycling", "iteration limit") else 1  # once more from nothing
+    assert (found.solved, found.iterations, solver._model) == (solved, 7 * tries, "warm" if solved else None)
     # x = z / 2; a row of length 3 / 2
     np.testing.assert_equal(
         [found.x, found.multipliers, found.slack], [[0.25], [4], [0]] if solved else [[np.nan], [0], [0]]

@@ -1,0 +1,179 @@
+"""Step times over the size of a plant and of a horizon: a rod of n masses, heated at one end, a linear plant.
+
+    OMP_NUM_THREADS=1 peers/bin/python benchmarks/mpc/sizes.py --peer --markdown sizes.md
+
+The loop is closed on a rod that loses a tenth more; 32, then 28 degC, 150 samples each.  CPU ms, median and
+worst: of the whole step in C (filter, program, status), of the program alone in C and in Python, DAQP's own
+solve in the same run, and do-mpc with its defaults on the same model, weights and limits (no soft bands).
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.design.design import Design, default_design, make_blocks
+from thermogrip.mpc.native.runtime import CompiledController, CompiledOptimiser
+from thermogrip.mpc.optimiser.rti import Optimiser, Outcome, Sample
+from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.plant import Plant
+
+Array = NDArray[np.float64]
+STATES, HORIZONS, SAMPLES = (4, 16, 28, 60), (25, 50, 100, 200), 300
+
+
+def rod(n: int, loss: float = 0.004) -> Plant:
+    """Return n masses in a row, the first heated, the fourth read."""
+    flow = np.diag(np.full(n, -loss))
+    for k in range(n - 1):
+        flow[k : k + 2, k : k + 2] += 0.3 * np.array([[-1.0, 1.0], [1.0, -1.0]])
+    whole = np.zeros((n + 1, n + 1))
+    whole[:n, :n], whole[0, n] = flow, 1.0
+    step, C = expm(whole), np.zeros((1, n))
+    C[0, min(3, n - 1)] = 1.0
+    model = StateSpaceModel(("q",), (), ("t",), A=step[:n, :n], B=step[:n, n:], C=C, dt=1.0, y0=[25.0])
+    return Plant(model, {}, dt=1.0, units={"q": "1", "t": "degC"}, valid={"q": (0.0, 1.0), "t": (20.0, 60.0)})
+
+
+@dataclass
+class Clocked:
+    """An optimiser whose solves are timed."""
+
+    optimiser: Optimiser
+
+    def __post_init__(self) -> None:
+        self.seconds: list[float] = []
+        self._solve: Callable[[Sample], Outcome] = self.optimiser.solve
+        vars(self.optimiser)["solve"] = self.solve
+
+    def solve(self, sample: Sample) -> Outcome:
+        """Improve a plan."""
+        began = time.thread_time()
+        found = self._solve(sample)
+        self.seconds.append(time.thread_time() - began)
+        return found
+
+
+def design_of(plant: Plant, N: int, blocks: int) -> Design:
+    """Return the default design with this horizon; a block a sample where there are as many."""
+    lengths = (1,) * N if blocks >= N else make_blocks(N, blocks)
+    return replace(default_design(plant, dt=1.0), blocks=lengths, deadline_s=60.0)
+
+
+def loop(n: int, step: Callable[[float, float], float]) -> None:
+    """Close a loop of (reading, target) -> drive on a rod that is not the model."""
+    truth = Controller(rod(n, 0.0044)).model
+    x, rng = truth.rest(np.array([25.0]), np.zeros(0)), np.random.default_rng(0)
+    for k in range(SAMPLES):
+        drive = step(float(truth.output(x)[0] + 0.02 * rng.standard_normal()), 32.0 if k < 150 else 28.0)
+        x = truth.next_state(x, np.array([drive]), np.zeros(0))
+
+
+def ours(n: int, N: int, blocks: int) -> dict[str, tuple[float, float]]:
+    """Return median and worst [ms] of our steps, by what is timed."""
+    plant, found = rod(n), dict[str, list[float]]()
+    design = design_of(plant, N, blocks)
+    for name, compiled in (("Python", False), ("C", True)):
+        controller = Controller(plant, design, compiled=compiled)
+        clocked, floor = Clocked(controller.optimiser), list[float]()
+        if not compiled:
+            controller.optimiser.qp.on_info = lambda info, kept=floor: kept.append(info["solve_time"])
+        controller.reset({"t": 25.0})
+        if isinstance(controller.optimiser, CompiledOptimiser):
+            assert clocked.optimiser.model.affine is not None
+        loop(n, lambda y, r, of=controller: float(of.step({"t": y}, r).drive))
+        found[f"program, {name}"] = clocked.seconds
+        if floor:
+            found["DAQP's solve"] = floor
+    python = Controller(plant, design)
+    python.reset({"t": 25.0})
+    whole, seconds = CompiledController(python), list[float]()
+    whole.reset(np.array([25.0]), np.zeros(0), python.observer)
+
+    def step(y: float, r: float) -> float:
+        given = np.array([y]), np.zeros(0), np.array([r])
+        began = time.thread_time()
+        drive, _, _ = whole.step(*given)
+        seconds.append(time.thread_time() - began)
+        return float(drive[0])
+
+    loop(n, step)
+    found["step, C"] = seconds
+    return {key: (1e3 * float(np.median(v[5:])), 1e3 * float(np.max(v[5:]))) for key, v in found.items()}
+
+
+def peer(n: int, N: int, samples: int = 25) -> tuple[float, float]:
+    """Return the same of do-mpc with its defaults, its state known."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import do_mpc
+    plant = rod(n)
+    own, design = Controller(plant).model, design_of(plant, N, N)
+    assert own.affine is not None
+    A, B, _, added = own.affine
+    model = do_mpc.model.Model("discrete")
+    x = model.set_variable("_x", "x", (n, 1))
+    u, goal = model.set_variable("_u", "u"), model.set_variable("_tvp", "goal")
+    model.set_rhs("x", A @ x + B @ u + added.reshape(-1, 1))
+    model.setup()
+    controller = do_mpc.controller.MPC(model)
+    controller.set_param(n_horizon=N, t_step=1.0, n_robust=0, store_full_solution=True)
+    controller.set_param(nlpsol_opts={"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": 0})
+    error = (float(own.output(np.zeros(n))[0]) + (own.C @ x)[0] - goal) ** 2
+    controller.set_objective(mterm=design.terminal * error, lterm=design.track * error)
+    controller.set_rterm(u=design.move)
+    controller.bounds["lower", "_u", "u"], controller.bounds["upper", "_u", "u"] = 0.0, 1.0
+    told = controller.get_tvp_template()
+
+    def goals(_now: float) -> object:
+        told["_tvp", :] = 32.0
+        return told
+
+    controller.set_tvp_fun(goals)
+    controller.setup()
+    state = own.rest(np.array([25.0]), np.zeros(0)).reshape(-1, 1)
+    controller.x0 = state
+    controller.set_initial_guess()
+    seconds = []
+    for _ in range(samples):
+        began = time.thread_time()
+        drive = controller.make_step(state)
+        seconds.append(time.thread_time() - began)
+        state = A @ state + B @ drive + added.reshape(-1, 1)
+    return 1e3 * float(np.median(seconds[2:])), 1e3 * float(np.max(seconds[2:]))
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--peer", action="store_true", help="do-mpc beside, at N = 50")
+    parser.add_argument("--markdown", type=Path, help="also write the table here")
+    given = parser.parse_args()
+    columns = ("step, C", "program, C", "program, Python", "DAQP's solve")
+    lines = [f"| states | N | blocks | {' | '.join(columns)} | do-mpc |", "|---" * (len(columns) + 4) + "|"]
+    cases = [(n, 50, blocks) for n in STATES for blocks in (50, 10)]
+    cases += [(16, N, blocks) for N in HORIZONS if N != 50 for blocks in (N, 10) if N * (blocks > 10) < 200]
+    for n, N, blocks in cases:
+        found = ours(n, N, blocks)
+        other = peer(n, N) if given.peer and N == blocks == 50 else None
+        cells = [*(found[key] for key in columns), other]
+        texts = ["" if cell is None else f"{cell[0]:.3f}, {cell[1]:.2f}" for cell in cells]
+        lines.append(f"| {n} | {N} | {blocks} | {' | '.join(texts)} |")
+        print(lines[-1], flush=True)
+    if given.markdown is not None:
+        given.markdown.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

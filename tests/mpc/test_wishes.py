@@ -1,0 +1,267 @@
+"""What a spec may wish beside settling, each shown by a closed loop: zones, prices, ramps, hard limits, a
+safe drive, a forecast, programs to convergence; and what cannot be had together, in one line."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.mpc.makers import crossed, heater, kit, make_tank, network_plant
+from thermogrip.datasets.errors import UserError
+from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Surroundings, Truth, simulate_closed_loop
+from thermogrip.mpc.controllers.export import export_controller
+from thermogrip.mpc.controllers.mpc import Controller, design_controller
+from thermogrip.mpc.design.design import default_design
+from thermogrip.mpc.design.spec import spec_from_dict
+from thermogrip.mpc.native.runtime import compiler
+from thermogrip.sysid.plant.plant import Plant
+
+GCC = pytest.mark.skipif(compiler() is None, reason="no gcc here")
+
+QUIET = Surroundings(noise=0.02, quantum=0.0)
+# the board that closes the loops is not the model: 8 % less heat of one heater, a tenth more loss
+TARIFF = ((0.0, 1.0), (600.0, 3.0), (1200.0, 1.0), (1800.0, 3.0), (2400.0, 1.0))
+
+
+@pytest.fixture(scope="module")
+def board():
+    plant = network_plant("tclab", t1=(20.0, 60.0), t2=(20.0, 60.0))
+    values = plant.values
+    names = list(plant.model.parameters)
+    changed = np.array([values[name] for name in names])
+    changed[0] *= 0.92
+    changed[1] *= 1.1
+    p = dict(zip(names, changed.tolist(), strict=True))
+    return Plant(plant.model, p, dt=plant.dt, units=plant.units, valid=plant.valid)
+
+
+def run(controller: Controller, board, target=40.0, seconds=2400.0, **more) -> ClosedLoop:
+    return simulate_closed_loop(controller, board, [(target, seconds)], surroundings=QUIET, seed=3, **more)
+
+
+def spent(loop: ClosedLoop, tariff=((0.0, 1.0),), begin_s: float = 600.0) -> float:
+    """Seconds of full drive from then on, each as dear as the tariff has it."""
+    starts, factors = np.array(tariff).T
+    time = loop.sample_time
+    dear = factors[np.searchsorted(starts, time, side="right") - 1] * (time >= begin_s)
+    return float(sum(np.sum(drive / 100.0 * dear) for drive in loop.drive.values()) * (time[1] - time[0]))
+
+
+def test_in_a_zone_the_least_energy_is_spent_and_no_more_than_a_tenth_beyond_it_is_seen(board):
+    tracking = run(kit(), board)
+    priced = run(kit(zones={"t1": 1.5, "t2": 1.5}, energy_price={"q1": 1.0, "q2": 1.0}), board)
+    edge = run(kit(), board, 38.5)  # who knew where the cheap edge is
+    late = slice(-1500, None)
+    for name in ("t1", "t2"):
+        assert priced.outputs[name][late].min() > 38.4
+        assert priced.outputs[name][late].max() < 39.0
+    assert spent(priced) < 0.93 * spent(tracking)
+    assert spent(priced) == pytest.approx(spent(edge), rel=0.01)
+    assert set(priced.status) <= {"ok", "mismatch"}
+
+
+def test_without_a_price_an_output_in_its_zone_is_left_alone(board):
+    loop = run(kit(zones={"t1": 1.0, "t2": 1.0}), board)
+    moves = [np.sum(np.abs(np.diff(loop.drive[name][240:]))) for name in ("q1", "q2")]
+    tracked = run(kit(), board)
+    assert max(moves) < 0.1 * max(np.sum(np.abs(np.diff(tracked.drive[name][240:]))) for name in ("q1", "q2"))
+    assert all(np.all(np.abs(loop.outputs[name][-1500:] - 40.0) < 1.1) for name in ("t1", "t2"))
+
+
+def test_a_tariff_heats_before_it_rises(board):
+    zones, price = {"t1": 1.5, "t2": 1.5}, {"q1": 1.0, "q2": 1.0}
+    flat = run(kit(zones=zones, energy_price=price), board)
+    told = run(kit(zones=zones, energy_price=price, tariff=TARIFF), board)
+    rise = np.searchsorted(told.time, 1800.0)
+    assert told.outputs["t1"][rise] > flat.outputs["t1"][rise] + 0.8
+    assert spent(told, TARIFF) < 0.99 * spent(flat, TARIFF)
+    assert all(np.all(np.abs(told.outputs[name][600:] - 40.0) < 1.8) for name in ("t1", "t2"))
+
+
+def test_a_tariff_begins_anew_each_day_and_counts_from_the_readings_time():
+    tariff = ((100.0, 2.0), (200.0, 5.0))
+    controller = kit(zones={"t1": 1.0, "t2": 1.0}, energy_price={"q1": 1.0}, tariff=tariff)
+    reading = {"t1": 25.0, "t2": 25.0, "t_ambient": 25.0}
+    for now, expected in ((0.0, 5.0), (86400.0 + 150.0, 2.0), (3 * 86400.0 + 201.0, 5.0)):
+        controller.reset(reading)
+        controller.step({**reading, "time_s": now}, 30.0)
+        assert controller._prices()[0] == expected
+    assert set(controller._prices()) == {5.0}
+
+
+def test_targets_ramp_no_faster_than_they_may_and_arrive(board):
+    loop = run(kit(ramp_per_s={"t1": 0.04}), board, {"t1": 40.0, "t2": 32.0}, 900.0)
+    time, t1 = loop.time, loop.outputs["t1"]
+    middle = (time > 120) & (time < 320)
+    assert np.polyfit(time[middle], t1[middle], 1)[0] == pytest.approx(0.04, rel=0.03)
+    assert np.max(np.abs(t1[middle] - (25.0 + 0.04 * time[middle]))) < 0.5
+    assert abs(np.mean(t1[-200:]) - 40.0) < 0.05
+    assert abs(loop.outputs["t2"][np.searchsorted(time, 200.0)] - 32.0) < 0.3  # the other one does not ramp
+
+
+def test_a_hard_limit_gives_way_last():
+    # the skin's target needs a tank beyond its limit: a soft one is broken for its sake, a hard one is not
+    plant = make_tank()
+    beyond = {}
+    for hard in ((), ("t_tank",)):
+        design = {"limits": {"t_tank": (5.0, 33.0)}, "price": 0.02, "hard": hard, "dt": 2.0}
+        loop = simulate_closed_loop(
+            design_controller(plant, **design), plant, [(36.0, 900.0)], start=25.0, surroundings=QUIET
+        )
+        beyond[hard] = float(loop.outputs["t_tank"].max() - 33.0)
+    assert beyond[()] > 1.0
+    assert beyond[("t_tank",)] < 0.1
+
+
+def test_a_forecast_of_the_room_is_acted_on_before_it_comes():
+    # a fan's room falls by 10 degC at a time that is known: half a minute ahead the heaters already answer
+    worst, nonsense = {}, {"room": "cold", "a": [1.0]}
+    for told in (False, True):
+        plant = crossed()
+        controller = design_controller(plant, controlled=("a", "b"))
+        truth = Truth(plant, controller.dt, QUIET, 25.0, 0)
+        truth.d = np.array([25.0])
+        controller.reset(truth.reading())
+        errors = []
+        for k in range(200):
+            truth.d = np.array([25.0 if k < 100 else 15.0])
+            ahead = {"room": [25.0 if k + 1 + i < 100 else 15.0 for i in range(60)]}
+            truth.apply(controller.step(truth.reading(), 30.0, coming=ahead if told else None))
+            errors.append(np.abs(truth.y[-1] - 30.0).max())
+        worst[told] = float(np.max(errors[60:]))
+    assert worst[True] < 0.6 * worst[False]
+    for wrong in (nonsense, {"room": []}, {"room": [float("nan"), 1e9]}):
+        move = controller.step(truth.reading(), 30.0, coming=wrong)
+        assert move.status == "ok"
+        truth.apply(move)
+
+
+def test_a_forecast_of_a_plant_that_is_not_linear_is_in_its_prediction():
+    controller = design_controller(make_tank(joule=0.1), dt=2.0)
+    controller.reset({"t_tank": 25.0, "t_surface": 25.0, "t_ambient": 25.0})
+    model, N = controller.model, controller.optimiser.N
+    assert model.affine is None
+    x, plan = controller.observer.x, np.full((controller.optimiser.n_b, 1), 0.3)
+    d = np.full((N, model.n_d), 25.0)
+    d[N // 2 :] = 5.0
+    y, _ = model.trajectory(x, plan, d, controller.design.blocks)
+    by_hand, state = [], x
+    u = np.repeat(plan, controller.design.blocks, axis=0)
+    for k in range(N):
+        state = model.next_state(state, u[k], d[k])
+        by_hand.append(model.output(state))
+    np.testing.assert_allclose(y, by_hand, atol=1e-9)
+    assert y[-1, 0] < model.trajectory(x, plan, d[0], controller.design.blocks)[0][-1, 0] - 0.5
+
+
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=GCC)])
+def test_a_failing_loop_goes_to_its_safe_drive(compiled):
+    plant = network_plant("tclab", t1=(20.0, 60.0), t2=(20.0, 60.0))
+    design = default_design(plant, dt=5.0, safe_drive={"q1": 20.0, "q2": 5.0})
+    controller = Controller(plant, design, compiled=compiled)
+    controller.reset({"t1": 30.0, "t2": 30.0})
+    for k in range(30):
+        lost = float("nan") if k > 3 else 30.0
+        move = controller.step({"t1": lost, "t2": lost}, 35.0)
+    assert (move.status, move.drive, move.pump) == ("off", {"q1": 20.0, "q2": 5.0}, 1)
+    if compiled:
+        drive = np.zeros(2)
+        controller.c.reset(np.array([30.0, 30.0]), np.array([25.0] * controller.model.n_d))
+        lost, room, target = np.full(2, np.nan), np.full(controller.model.n_d, 25.0), np.full(2, 35.0)
+        for _ in range(30):
+            drive, _, _ = controller.c.step(lost, room, target)
+        assert drive.tolist() == [20.0, 5.0]
+
+
+def test_programs_to_convergence_end_where_one_more_changes_nothing():
+    plant = make_tank(joule=0.1)  # its cooling turns over
+    moved, plans = {}, {}
+    for n in (1, 30):
+        controller = design_controller(plant, dt=2.0, iterations=n)
+        reading = {"t_tank": 30.0, "t_surface": 30.0, "t_ambient": 25.0}
+        controller.reset(reading)
+        controller.step(reading, 16.0)
+        plans[n] = controller.plan
+        again = controller._optimise(controller._target)  # from its own plan, of the same state
+        moved[n] = np.max(np.abs(np.repeat(again.plan, controller.design.blocks, axis=0) - plans[n]))
+    assert moved[30] < 2e-5 * 2
+    assert moved[1] > 20 * moved[30]
+
+
+REFUSED = [
+    ({"zones": {"t3": 0.04}}, "zones: t3 is not regulated"),
+    ({"zones": {"t1": 1.0}}, "zones: 1 about t1 is wider than band_degC, 0.25"),
+    ({"energy_price": 1.0}, "energy_price without zones of t1, t2"),
+    ({"tariff": [[0, 1.0]]}, "tariff: there is no energy_price"),
+    ({"ramp_per_s": {"t9": 1.0}}, "ramp_per_s: t9 is not regulated"),
+    ({"hard": ["t1"]}, "hard: t1 has no limits"),
+    ({"safe_drive": {"q1": 120.0}}, "safe_drive of q1 is 120, beyond its 0 to 100"),
+    ({"safe_drive": {"q7": 1.0}}, "safe_drive: the plant has no drive q7"),
+    ({"iterations": 0}, "iterations: input should be greater than or equal to 1"),
+]
+
+
+@pytest.mark.parametrize(("keys", "said"), REFUSED)
+def test_what_cannot_be_had_is_refused_in_one_line(keys, said):
+    plant = network_plant("tclab", t1=(20.0, 60.0), t2=(20.0, 60.0))
+    with pytest.raises(UserError) as refused:
+        spec_from_dict({"steps": [[25.0, 40.0]], **keys}).design(plant)
+    assert refused.value.problem.startswith(said)
+    assert "\n" not in str(refused.value)
+
+
+WIDE = {"band_degC": 1.0, "overshoot_degC": 1.0, "bias_degC": 1.0, "steps": [[25.0, 40.0]]}
+
+
+@pytest.mark.parametrize(
+    ("tariff", "said"),
+    [
+        ([[60, 1.0], [30, 2.0]], "tariff: seconds of the day must rise"),
+        ([[0, 1.0], [86400, 2.0]], "tariff: seconds of the day must rise"),
+    ],
+)
+def test_a_tariff_of_no_day_is_refused(tariff, said):
+    plant = network_plant("tclab", t1=(20.0, 60.0), t2=(20.0, 60.0))
+    keys = {"zones": {"t1": 1.0, "t2": 1.0}, "energy_price": 1.0, "tariff": tariff}
+    with pytest.raises(UserError, match=said):
+        spec_from_dict(WIDE | keys).design(plant)
+
+
+def test_energy_of_a_drive_that_goes_both_ways_has_no_price():
+    keys = {"zones": {"t_surface": 1.0}, "energy_price": 1.0}
+    with pytest.raises(UserError, match="energy_price: drive goes both ways"):
+        spec_from_dict(WIDE | keys).design(make_tank())
+
+
+def test_what_the_c_has_not_is_not_exported_and_no_linear_system(tmp_path):
+    controller = heater(zones={"t": 1.0}, energy_price={"q": 1.0}, ramp_per_s={"t": 0.1})
+    with pytest.raises(UserError, match="the exported C has no zones, no energy_price, no ramp_per_s"):
+        export_controller(controller, tmp_path / "c")
+    assert not (tmp_path / "c").exists()
+    with pytest.raises(UserError, match="zones: a controller that may rest anywhere"):
+        controller.to_control()
+
+
+def test_wishes_are_in_the_controllers_file(tmp_path):
+    wishes = {
+        "zones": {"t1": 1.0, "t2": 2.0},
+        "energy_price": {"q1": 1.0},
+        "tariff": ((0.0, 1.0), (600.0, 3.0)),
+        "safe_drive": {"q2": 10.0},
+        "iterations": 3,
+        "limits": {"t1": (0.0, 60.0)},
+        "hard": ("t1",),
+        "ramp_per_s": {"t2": 0.5},
+    }
+    controller = kit(**wishes)
+    assert Controller.load(controller.save(tmp_path / "c.json")).design == controller.design
+
+
+def test_drives_may_leave_out_none_where_a_safe_drive_is_named():
+    plant = network_plant("tclab", t1=(20.0, 60.0), t2=(20.0, 60.0))
+    limits = {"q1": [10.0, 90.0], "q2": [0.0, 90.0]}
+    spec = {"steps": [[25.0, 40.0]], "drive_limits": limits}
+    with pytest.raises(UserError, match="leaves out 0, where a failing loop goes"):
+        spec_from_dict(spec).design(plant)
+    design = spec_from_dict(spec | {"safe_drive": {"q1": 15.0}}).design(plant)
+    assert (design.drive_range["q1"], design.safe_drive) == ((10.0, 90.0), {"q1": 15.0})
