@@ -21,7 +21,7 @@ KERNELS = tuple(
     for name in (
         "classify/estimators/lstm_training.py",
         "sysid/blackbox/kalman_kernel.py",
-        "sysid/contact/response_table.py",
+        "sysid/contact/table_kernel.py",
         "sysid/contact/time_stepping.py",
         "sysid/effusivity/mode_kernel.py",
         "sysid/models/neural_kernel.py",

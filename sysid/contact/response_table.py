@@ -7,9 +7,8 @@ A response is a smooth function of four numbers,
 and grasps of one kind ask for it at thousands of neighbouring places.  So it is stepped
 (:mod:`thermogrip.sysid.contact.time_stepping`) at the nodes of a regular lattice about the places that are
 asked for, each node once, and is between them the polynomial of the nearest four of ln tau_b and six of the
-others, derivatives included.  Response and slope at all time nodes are combinations of :data:`N_BASIS`
-curves, those of the largest singular values of responses drawn over the whole lattice: only their
-coefficients are kept.
+others, derivatives included.  Response and slope at all time nodes are combinations of 16 curves, those of
+the largest singular values of responses drawn over the whole lattice: only their coefficients are kept.
 
 Once :math:`(C/e)^2` is twelve times the record's length, heat does not reach the far face, and nothing
 depends on C any more: ln C/e ends there.  What lies outside of the lattice is stepped.
@@ -25,11 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array, Mask
-from thermogrip.datasets.compiled import numba
 from thermogrip.sysid.contact.simulation import Stack, gripper_modes, time_nodes
-from thermogrip.sysid.contact.time_stepping import COMPILED, N_STEPPED, VALUE, contacts
+from thermogrip.sysid.contact.table_kernel import N_BASIS, blend
+from thermogrip.sysid.contact.time_stepping import N_STEPPED, VALUE, contacts
 
-N_BASIS = 16
 _NEAR = (6, 6, 6, 4)  # nodes of each direction between which a place is interpolated
 _STEP = np.array([0.35, 0.2, 0.3, 0.15])
 # between what the lattice answers; ln C/e ends by the record's length, ln tau_b is about the gripper's
@@ -141,52 +139,3 @@ def _weights(share: Array, k: int) -> tuple[Array, Array]:
     next, and their derivatives."""
     powers = np.vander(share, len(_WEIGHT[k]), increasing=True)
     return powers @ _WEIGHT[k], powers[:, :-1] @ (_SLOPE[k] / _STEP[k])
-
-
-@numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
-def blend(
-    index: NDArray[np.int32], rows: NDArray[np.float32], cell: NDArray[np.int64], by_e: tuple[Array, Array],
-    by_slab: tuple[Array, Array], by_h: tuple[Array, Array], by_build_up: tuple[Array, Array], wanted: Mask,
-    room: Array, out: Array,
-) -> None:  # fmt: skip
-    """Fill ``out`` (n, 5, N_BASIS): coefficients of the value, and of its derivatives by ln h, ln tau_b, ln e
-    at the same C/e, and ln C/e; one direction after the other."""
-    b, c = room[:3], room[3:7]  # summed over ln tau_b and ln h, and over ln C/e
-    for p in range(cell.shape[0]):
-        w, s = by_build_up[0][p], by_build_up[1][p]
-        w0, w1, w2, w3, s0, s1, s2, s3 = w[0], w[1], w[2], w[3], s[0], s[1], s[2], s[3]
-        moved = wanted[p, 1] or wanted[p, 2]
-        for i in range(by_e[0].shape[1]):
-            x_e, y_e = by_e[0][p, i], by_e[1][p, i]
-            if x_e == 0.0 and not wanted[p, 3]:
-                continue
-            c[:] = 0.0
-            for j in range(by_slab[0].shape[1]):
-                x, y = by_slab[0][p, j], by_slab[1][p, j]
-                if x == 0.0 and not (wanted[p, 3] or wanted[p, 4]):
-                    continue
-                b[:] = 0.0
-                for k in range(by_h[0].shape[1]):
-                    u, v = by_h[0][p, k], by_h[1][p, k]
-                    at = index[cell[p, 0] + i, cell[p, 1] + j, cell[p, 2] + k, cell[p, 3] :]
-                    r0, r1, r2, r3 = rows[at[0]], rows[at[1]], rows[at[2]], rows[at[3]]
-                    if moved:
-                        for q in range(N_BASIS):
-                            one = w0 * r0[q] + w1 * r1[q] + w2 * r2[q] + w3 * r3[q]
-                            b[0, q] += u * one
-                            b[1, q] += v * one
-                            b[2, q] += u * (s0 * r0[q] + s1 * r1[q] + s2 * r2[q] + s3 * r3[q])
-                    else:
-                        for q in range(N_BASIS):
-                            b[0, q] += u * (w0 * r0[q] + w1 * r1[q] + w2 * r2[q] + w3 * r3[q])
-                for q in range(N_BASIS):
-                    c[0, q] += x * b[0, q]
-                    c[1, q] += x * b[1, q]
-                    c[2, q] += x * b[2, q]
-                    c[3, q] += y * b[0, q]
-            for q in range(N_BASIS):
-                out[p, 0, q] += x_e * c[0, q]
-                out[p, 1, q] += x_e * c[1, q]
-                out[p, 2, q] += x_e * c[2, q]
-                out[p, 3, q] += y_e * c[0, q]
-                out[p, 4, q] += x_e * c[3, q]

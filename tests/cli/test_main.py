@@ -73,7 +73,7 @@ demo: --out=thermogrip-demo --seed=0>0 --workers=2>1 --cluster --json=False
 identify: LOG... --out --network --prior --inputs --outputs --disturbances --columns --dt>1e-09
   --models=arx,oe,subspace,sindy,neural,network --average>0 --order>1<20 --delay>1<20
   --leave-one-out=False --grow=False --posterior/--no-posterior=False --report --seed=0>0 --workers=1>1
-  --json=False
+  --cluster --json=False
 fleet: LOGS_BY_RIG --out --network --report --seed=0>0 --workers=1>1 --cluster --json=False
 validate: PLANT LOG... --warmup=5.0>0 --score-from=5.0>0 --average>0 --network --columns --dt>1e-09
   --report --seed=0>0 --json=False
@@ -99,11 +99,12 @@ batch: CONTROLLER PLAN.csv --out --port --protocol --speed=1.0>0.01 --twin --dra
   --stop-early --settle-timeout=900.0>1 --guard --learn --ask/--no-ask=True --live>0<65535
   --foxglove>1<65535 --bridge --on-trip --network --seed=0>0 --json=False
 recover: DIR --out --bad --json=False
-effusivity: GRASPS... --out --calibrate --object-range --report --seed=0>0 --json=False
+effusivity: GRASPS... --out --calibrate --object-range --report --seed=0>0 --workers=1>1 --cluster
+  --json=False
 train: GRASPS... --classifier --out --split --stop-error>0.001<0.5 --quick=False --seed=0>0 --json=False
 classify: MODEL_DIR GRASPS... --out --materials --early=False --next-touch=False --or-unknown=False
   --other-gripper=False --same-gripper=False --known --object-range --serve=False --port>0<65535
-  --seed=0>0 --json=False
+  --seed=0>0 --workers=1>1 --cluster --json=False
 compare: GRASPS... --out --test --classifiers --repeats=20>0 --train-per-class=5>1 --by --curves=False
   --quick=False --seed=0>0 --workers=1>1 --cluster --json=False
 paper: --out --quick=False --seed=0>0 --workers=1>1 --cluster --json=False

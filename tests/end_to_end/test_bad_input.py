@@ -77,7 +77,10 @@ BAD_WORDS: dict[str, tuple[str, tuple[str, ...]]] = {
         "run c.json --target 30 --twin plant.json --object 43 --material coper --out r",
         ("coper", "copper"),
     ),
-    "one grasp in training and test": ("compare grasps.csv --test grasps.csv --out c", ("g000",)),
+    "one file in training and test": (
+        "compare grasps.csv --test grasps.csv --out c",
+        ("grasps.csv", "trained and tested"),
+    ),
 }
 
 

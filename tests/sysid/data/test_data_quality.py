@@ -229,12 +229,27 @@ QUARTER = np.array([0.0, 1.0, 0.0, -1.0])[K % 4]  # a sine of 4 rows, of two ord
         (1000 + 0.9e-6 * (K > 99), 0.0, "fail", "q never moves: nothing can be learnt about it"),
         (1000 + 1.1e-6 * (K > 99), 6.0, "warn",
          "q moves 1 times and excites 6 of 6 orders" + LITTLE),
-        (0.0 * K, 0.0, "warn", "q never moves: nothing can be learnt about it"),  # a switch
-        ((K > 99) * 1.0, 6.0, "ok", "q moves 1 times and excites 6 of 6 orders"),
+        # on or off, and alone: a drive
+        (0.0 * K, 0.0, "fail", "q never moves: nothing can be learnt about it"),
+        ((K > 99) * 1.0, 6.0, "warn", "q moves 1 times and excites 6 of 6 orders" + LITTLE),
     ],
 )  # fmt: skip
 def test_the_excitation_of_an_input_is_counted(q, value, verdict, says):
     assert found_in(K / 10, "excitation", q=q, channel="q") == (value, "orders", verdict, says)
+
+
+@pytest.mark.parametrize(
+    ("pump", "value", "verdict", "says"),
+    [
+        (0.0 * K, 0.0, "warn", "pump never moves: nothing can be learnt about it"),
+        ((K > 99) * 1.0, 6.0, "ok", "pump moves 1 times and excites 6 of 6 orders"),
+    ],
+)
+def test_a_switch_beside_a_drive_may_rest_or_move_once(pump, value, verdict, says):
+    inputs = {name: (u, "1", "input") for name, u in (("q", moved(4)), ("pump", pump))}
+    log = make_log(1.0 * K, inputs | {"t": (K / 10, "degC", "output")})
+    (found,) = (f for f in check_data([log], average=1.0).of("excitation") if f.channel == "pump")
+    assert (found.value, found.unit, found.verdict, found.says) == (value, "orders", verdict, says)
 
 
 @pytest.mark.parametrize(
