@@ -86,15 +86,16 @@ def doors(room: str) -> str:
 
 def help_of_verbs() -> str:
     """Return what ``thermogrip VERB --help`` prints, a section a verb."""
-    from thermogrip.cli.main import app, main
+    from thermogrip.cli.main import main
+    from thermogrip.cli.verbs import VERBS
 
     os.environ["COLUMNS"] = "100"
     parts = []
-    for command in app.registered_commands:
+    for verb in VERBS:
         out = io.StringIO()
         with contextlib.redirect_stdout(out):
-            main([str(command.name), "--help"])
+            main([verb, "--help"])
         text = re.sub(r"\n  (?:--seed N|--json|-h, --help) .*(?:\n {20,}.*)*", "", out.getvalue().rstrip())
         lines = "\n".join(line.rstrip() for line in text.splitlines())
-        parts.append(f"## {command.name}\n\n```text\n{lines}\n```\n")
+        parts.append(f"## {verb}\n\n```text\n{lines}\n```\n")
     return "\n".join(parts)

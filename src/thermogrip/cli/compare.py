@@ -11,7 +11,6 @@ from thermogrip.classify.estimators import classifier_names
 from thermogrip.cli import options as cli
 from thermogrip.cli.classify import Quick, touched_part, training_part
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.parallel import sub_progress
 from thermogrip.report.console import Console
 
 if TYPE_CHECKING:
@@ -83,7 +82,7 @@ def compare(
     from thermogrip.classify.estimators.registry import trainable
     from thermogrip.classify.evaluation.harness import evaluate
     from thermogrip.datasets.grasp_files import read_grasp_files
-    from thermogrip.datasets.parallel import kept_processes
+    from thermogrip.datasets.parallel import kept_processes, sub_progress
 
     pool, names = cli.workers_of(workers, cluster), cli.comma(classifiers)
     models, missing = trainable(names or BY_DEFAULT, quick=quick, seed=seed)
@@ -205,6 +204,7 @@ def _curves(
     from thermogrip.classify.decisions.predict import table_csv
     from thermogrip.classify.evaluation.harness import contact_time_curve, difference_curve, learning_curve
     from thermogrip.datasets.atomic_files import write_atomic
+    from thermogrip.datasets.parallel import sub_progress
     from thermogrip.report.classification import curves_section, decision_section, strips_section
     from thermogrip.sysid.effusivity import calibrate_gripper, effusivity_posterior
 

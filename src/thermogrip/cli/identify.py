@@ -10,7 +10,6 @@ import typer
 from thermogrip.cli import options as cli
 from thermogrip.cli.completion import MODELS
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.parallel import sub_progress
 from thermogrip.report.console import Console
 
 if TYPE_CHECKING:
@@ -151,6 +150,7 @@ def identify(
     have = dict.fromkeys(map(str, logs[0].data_vars), "")  # what a word means may be written otherwise
     known = [None if words is None else tuple(find_column(w, have) for w in words) for words in roles]
     roles = known[0], known[1], known[2]
+    from thermogrip.datasets.parallel import sub_progress
     from thermogrip.report.html import write_report
     from thermogrip.report.plant import identification_sections
     from thermogrip.sysid.identification import identify as fit_models

@@ -131,7 +131,8 @@ def check_kind(ctx: Any, path: str, wanted: str) -> None:
     found, verb = kind_of(path if os.path.exists(path) else path.rpartition("@")[0]), ctx.command.name
     if found in ("", wanted) or {found, wanted} in BOTH:
         return
-    fits = {name: _places(each, found) for name, each in ctx.parent.command.commands.items()}
+    verbs_of, above = ctx.parent.command, ctx.parent
+    fits = {v: _places(verbs_of.get_command(above, v), found) for v in verbs_of.list_commands(above)}
     verbs = [name for name, (_, takes) in fits.items() if takes]
     hint = KINDS[found].get("hint", f"it is for {', '.join(verbs)}")
     if wanted in _PARTS and os.path.isfile(part := Path(path, _PARTS[wanted])):

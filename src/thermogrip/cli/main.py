@@ -20,7 +20,6 @@ from typing import Annotated
 import typer
 
 from thermogrip import __version__
-from thermogrip.cli import classify, compare, control, excite, fleet, identify, project, rig
 from thermogrip.cli.verbs import Verb, Verbs
 from thermogrip.datasets.errors import UserError, known_names, os_fault
 from thermogrip.datasets.media import printable
@@ -56,17 +55,6 @@ def _root(
 
     Identify the plant from logs, tune the MPC, run a session, name the material of what was touched.
     """
-
-
-for _verb in (
-    project.demo, identify.identify, fleet.fleet, identify.validate, identify.simulate, identify.linearise,
-    excite.excite,
-    control.tune, control.retune, control.review, control.export, rig.run, rig.record, rig.virtual,
-    rig.batch, rig.recover,
-    classify.effusivity, classify.train, classify.classify, compare.compare, project.paper,
-    classify.materials, project.init, project.warm_up,
-):  # fmt: skip
-    app.command(_verb.__name__.replace("_", "-"), cls=Verb)(_verb)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -10,10 +10,12 @@ import shlex
 import sys
 import tomllib
 from collections.abc import Sequence
+from difflib import get_close_matches
 from functools import cache
-from importlib import resources
+from importlib import import_module, resources
 from typing import Any
 
+import typer
 from typer.core import TyperCommand, TyperGroup
 
 from thermogrip.cli.kinds import TYPED, check_files
@@ -22,6 +24,15 @@ from thermogrip.datasets.provenance import note_seed
 
 #: Options that may stand alone, and what they mean then: any free port, and the one that Foxglove asks for.
 ALONE = {"--live": "0", "--foxglove": "8765"}
+#: Each verb and its module of this package, in the order of the documentation.
+VERBS = {
+    "demo": "project", "identify": "identify", "fleet": "fleet", "validate": "identify",
+    "simulate": "identify", "linearise": "identify", "excite": "excite",
+    "tune": "control", "retune": "control", "review": "control", "export": "control",
+    "run": "rig", "record": "rig", "virtual": "rig", "batch": "rig", "recover": "rig",
+    "effusivity": "classify", "train": "classify", "classify": "classify", "compare": "compare",
+    "paper": "project", "materials": "classify", "init": "project", "warm-up": "project",
+}  # fmt: skip
 
 
 @cache
@@ -108,8 +119,32 @@ class Verb(TyperCommand):
             formatter.write(f"  thermogrip {self.next({})}\n")
 
 
+def function_of(verb: str) -> Any:
+    """Return the function of a verb."""
+    return getattr(import_module(f"thermogrip.cli.{VERBS[verb]}"), verb.replace("-", "_"))
+
+
 class Verbs(TyperGroup):
-    """The verbs, by job."""
+    """The verbs, by job; each is imported and its options are read when it is asked for."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names of the verbs."""
+        return list(VERBS)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return a verb by its name, None where there is none."""
+        if cmd_name in VERBS and cmd_name not in self.commands:
+            alone = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+            alone.command(cmd_name, cls=Verb)(function_of(cmd_name))
+            self.commands[cmd_name] = typer.main.get_command(alone)
+        return self.commands.get(cmd_name)
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return the verb that was typed; where there is none, name those that are spelt like it."""
+        if args[0] in VERBS or args[0].startswith("-"):
+            return super().resolve_command(ctx, args)
+        like = ", ".join(map(repr, get_close_matches(args[0], VERBS)))
+        return ctx.fail(f"No such command {args[0]!r}.{f' Did you mean {like}?' if like else ''}")
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the help, no word of it broken."""
@@ -119,4 +154,6 @@ class Verbs(TyperGroup):
         """Write a section a job, each verb with the whole first sentence of its help."""
         for job, verbs in jobs().items():
             with formatter.section(job):
-                formatter.write_dl([(name, self.commands[name].get_short_help_str()) for name in verbs])
+                formatter.write_dl(
+                    [(name, self.get_command(ctx, name).get_short_help_str()) for name in verbs]
+                )

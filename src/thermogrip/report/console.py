@@ -19,10 +19,12 @@ from itertools import zip_longest
 from pathlib import Path
 from shutil import get_terminal_size
 from textwrap import TextWrapper, wrap
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from thermogrip.datasets.media import printable
-from thermogrip.datasets.parallel import Progress
+
+if TYPE_CHECKING:
+    from thermogrip.datasets.parallel import Progress
 
 _AT_ONCE = 0.5  # s
 _WIDTH = 100  # columns of what is written to no terminal
