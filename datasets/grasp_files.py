@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError, os_faults
+from thermogrip.datasets.file_names import file_format, file_stem
 from thermogrip.datasets.media import csv_cell, csv_text
 from thermogrip.datasets.netcdf import open_netcdf, record_unit, write_netcdf
 from thermogrip.datasets.schema import (
@@ -39,8 +40,6 @@ from thermogrip.datasets.schema import (
 from thermogrip.datasets.tables import (
     Table,
     check_table,
-    file_format,
-    file_stem,
     read_csv_table,
     read_parquet_frame,
     text_numbers,

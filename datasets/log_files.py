@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets import repair
 from thermogrip.datasets.atomic_files import atomic_path, write_atomic
-from thermogrip.datasets.errors import UserError, as_user_error
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.file_names import file_format, file_stem, split_cut
 from thermogrip.datasets.limits import check_size, check_source
 from thermogrip.datasets.media import csv_cell
 from thermogrip.datasets.netcdf import convention_unit, open_netcdf, write_netcdf
@@ -37,8 +38,6 @@ from thermogrip.datasets.tables import (
     Table,
     check_header,
     check_table,
-    file_format,
-    file_stem,
     read_excel_table,
     read_matlab_table,
     read_parquet_table,
@@ -74,8 +73,6 @@ _STAMP = re.compile(
     r"()(?:(\d{1,4})[-/.](\d{1,2}|[A-Za-z]{3})[-/.](\d{1,4})(?:,?\s+|T|$))?"
     r"(?:(\d{1,2}):(\d{2})(?::(\d{2}(?:[.,]\d+)?))?)?\s*([AaPp][Mm])?\s*(Z|UTC|[+-]\d{2}:?\d{2})?$"
 )
-
-_CUT = re.compile(r"^(?P<path>.+)@(?P<start>[^@:/\\]*):(?P<stop>[^@:/\\]*)$")
 
 
 def read_log(
@@ -228,22 +225,6 @@ def check_written(path: str | Path) -> str:
         problem = f"logs are not written with the ending {Path(path).suffix}"
         raise UserError(problem, file=path, hint="write .csv, .nc or .parquet")
     return kind
-
-
-def split_cut(path: str | Path) -> tuple[Path, float, float]:
-    """Return file, start and stop [s] of ``PATH@START:STOP``; a path that exists is whole, whatever it is."""
-    match = _CUT.match(str(path))
-    if match is None or os.path.exists(path):
-        return Path(path), -np.inf, np.inf
-    ends = []
-    for text, empty in ((match["start"], -np.inf), (match["stop"], np.inf)):
-        hint = "write PATH@START:STOP in seconds"
-        with as_user_error(ValueError, f"{text!r} is not a time", file=str(path), hint=hint):
-            ends.append(float(text) if text.strip() else empty)
-    start, stop = ends
-    if not start < stop:
-        raise UserError(f"the cut {start:g}:{stop:g} is empty", file=str(path), hint="write the start first")
-    return Path(match["path"]), start, stop
 
 
 def _format(path: Path) -> str:

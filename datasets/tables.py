@@ -36,6 +36,7 @@ from numpy.typing import NDArray
 from thermogrip.datasets import limits
 from thermogrip.datasets.atomic_files import read_bytes
 from thermogrip.datasets.errors import UserError, as_user_error, os_faults
+from thermogrip.datasets.file_names import file_format
 from thermogrip.datasets.media import from_csv
 from thermogrip.datasets.netcdf import check_netcdf
 from thermogrip.datasets.repair import name_rows
@@ -43,16 +44,6 @@ from thermogrip.datasets.units import find_column, read_header
 
 if TYPE_CHECKING:
     from pandas import DataFrame
-
-FORMATS = {
-    ".csv": "csv", ".csv.gz": "csv", ".csv.xz": "csv",
-    ".txt": "text", ".dat": "text", ".tsv": "text", ".tab": "text", ".asc": "text", ".log": "text",
-    ".txt.gz": "text", ".txt.xz": "text", ".dat.gz": "text", ".dat.xz": "text",
-    ".mat": "matlab", ".xlsx": "excel",
-    ".nc": "netcdf", ".h5": "netcdf", ".hdf5": "netcdf",
-    ".parquet": "parquet", ".pq": "parquet",
-    ".bag": "rosbag", ".db3": "rosbag", ".mcap": "rosbag",
-}  # fmt: skip
 
 MOST_COLUMNS = 4096  # of a table
 _BEGINNING = 16 << 20  # bytes of a file that are looked at before it is read
@@ -87,24 +78,6 @@ class Table:
     meta: dict[str, str] = field(default_factory=dict)  # the format's entries for the whole file
     notes: tuple[str, ...] = ()  # what the reader repaired
     separator: str = ","
-
-
-def file_format(path: str | Path) -> str:
-    """Return ``"csv"``, ``"netcdf"``, ``"parquet"`` or ``"rosbag"`` by a file name's ending."""
-    ending = _ending(path)
-    if ending not in FORMATS:
-        raise UserError(f"ending {ending!r} is unknown", file=path, hint=f"use one of {' '.join(FORMATS)}")
-    return FORMATS[ending]
-
-
-def file_stem(path: str | Path) -> str:
-    """Return the file name without its ending."""
-    return Path(path).name[: -len(_ending(path)) or None]
-
-
-def _ending(path: str | Path) -> str:
-    name = Path(path).name.lower()
-    return next((e for e in FORMATS if name.endswith(e)), Path(path).suffix.lower())
 
 
 def read_csv_table(

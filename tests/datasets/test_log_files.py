@@ -22,7 +22,8 @@ from scipy.io import savemat
 from thermogrip.datasets import tables
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import example_path
-from thermogrip.datasets.log_files import as_logs, check_log_file, read_clock, read_log, split_cut, write_log
+from thermogrip.datasets.file_names import split_cut
+from thermogrip.datasets.log_files import as_logs, check_log_file, read_clock, read_log, write_log
 from thermogrip.datasets.schema import column, make_log, names
 
 HEAD = "time_s,drive,t_tank_degC\n"

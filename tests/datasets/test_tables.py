@@ -15,11 +15,10 @@ from scipy.io import savemat
 
 from thermogrip.datasets import tables
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.file_names import file_format, file_stem
 from thermogrip.datasets.tables import (
     Table,
     check_table,
-    file_format,
-    file_stem,
     find_layout,
     parse_text,
     read_csv_table,

@@ -214,7 +214,7 @@ def choices(option: str, names: Iterable[str], path: Path, *keys: str) -> None:
 
 def check_columns(paths: Sequence[str], names: Sequence[str]) -> None:
     """Refuse names that are no columns of these logs, before what reads them is loaded."""
-    from thermogrip.datasets.log_files import split_cut
+    from thermogrip.datasets.file_names import split_cut
     from thermogrip.datasets.tables import check_columns
 
     for path in paths:
