@@ -26,6 +26,7 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.limits import LARGEST
 from thermogrip.mpc.closed_loop.simulate import simulate_closed_loop
 from thermogrip.mpc.controllers.linear_equivalent import LinearLaw, linear_law, linear_move
 from thermogrip.mpc.controllers.mpc import Controller
@@ -382,10 +383,17 @@ def limits(controller: Controller, span: tuple[float, float]) -> Check:
             value = float(held.y[model.outputs.index(output)])
             if not low <= value <= high:
                 broken.append(f"{output} is {value:.1f} degC when {target:g} degC is held")
-    seen = ", ".join(f"{key} {low:g} to {high:g} degC" for key, (low, high) in design.limits.items())
+    seen = ", ".join(f"{key} {_range_text(low, high)} degC" for key, (low, high) in design.limits.items())
     if broken:
         return Check(name, "fail", f"{seen}: {'; '.join(broken)}", "widen the limits or narrow the targets")
     return Check(name, "pass", seen)
+
+
+def _range_text(low: float, high: float) -> str:
+    """Return a range in words; an end that is open is left out."""
+    if high >= LARGEST:
+        return f"at least {low:g}"
+    return f"at most {high:g}" if low <= -LARGEST else f"{low:g} to {high:g}"
 
 
 def valid_range(controller: Controller, span: tuple[float, float]) -> Check:
@@ -398,7 +406,9 @@ def valid_range(controller: Controller, span: tuple[float, float]) -> Check:
     for output in controller.controlled:
         low, high = valid[output]
         seen.append(f"{output} was {low:.1f} to {high:.1f} degC in the logs")
-        outside += [f"{target:g} degC" for target in span if not low - 0.5 <= target <= high + 0.5]
+        outside += [
+            f"{output} at {target:g} degC" for target in span if not low - 0.5 <= target <= high + 0.5
+        ]
     if outside:
         fix = "record a log that goes there, or treat the result with care"
         return Check(name, "warn", f"{'; '.join(seen)}; beyond: {', '.join(outside)}", fix)

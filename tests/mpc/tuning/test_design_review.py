@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from tests.mpc.makers import crossed, network_plant
+from thermogrip.datasets.limits import LARGEST
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
 from thermogrip.mpc.design.design import PILoop, default_design
 from thermogrip.mpc.estimator.observer import ObserverNoise
@@ -107,7 +108,7 @@ def test_half_a_degree_beyond_the_logs_is_forgiven_on_either_side(tank, target: 
     for span in ((target, 30.0), (30.0, target)):
         check = checks.valid_range(controller, span)
         assert check.verdict == ("pass" if inside else "warn")
-        assert check.finding.endswith("beyond: " + f"{target:g} degC") != inside
+        assert check.finding.endswith(f"beyond: t_surface at {target:g} degC") != inside
 
 
 @pytest.mark.parametrize(
@@ -203,6 +204,15 @@ def test_an_integrator_holds_any_target_with_no_drive():
     assert checks["targets can be held in steady state"].verdict == "pass"
     assert checks["soft limits agree with the targets"].verdict == "pass"
     assert checks["gain keeps its sign over the drive"].verdict == "warn"
+
+
+@pytest.mark.parametrize(
+    ("ends", "words"),
+    [((15.0, 65.0), "15 to 65"), ((-LARGEST, 65.0), "at most 65"), ((15.0, LARGEST), "at least 15")],
+)
+def test_a_limit_that_is_open_at_one_end_is_written_as_the_other(ends: tuple[float, float], words: str):
+    found = {check.name: check for check in review(adder(limits={"t": ends}))}
+    assert found[LIMITS].finding == f"t {words} degC"
 
 
 def test_where_a_step_starts_need_not_be_a_target():
