@@ -134,6 +134,11 @@ def test_a_run_that_names_no_controller_that_is_there_is_refused(bench: Bench) -
     ("spec", "error", "says"),
     [
         ("spec.toml", UserError("steps: too hot", hint="cooler"), "spec.toml: steps: too hot; cooler"),
+        (
+            "spec.toml",
+            UserError("energy_price without zones", hint="add"),
+            "spec.toml: energy_price without zones; add",
+        ),
         ("spec.toml", UserError("steps: too hot", file="p.json"), "p.json: steps: too hot"),
         ("spec.toml", UserError("no drive: none"), "no drive: none"),
         (None, UserError("steps: too hot"), "steps: too hot"),

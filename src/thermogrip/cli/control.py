@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -154,7 +155,7 @@ def _naming(spec: Path | None, keys: tuple[str, ...]) -> Iterator[None]:
     try:
         yield
     except UserError as error:
-        if spec is None or error.file is not None or error.problem.split(":")[0] not in keys:
+        if spec is None or error.file is not None or re.split(r"\W", error.problem)[0] not in keys:
             raise
         raise UserError(error.problem, file=spec, hint=error.hint) from error
 
