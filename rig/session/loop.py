@@ -216,12 +216,14 @@ class Loop:
         if self.listener is None:
             return
         guard, reading = self.guard, self.reading
+        skin = [guard.skin]
+        skins = [*self.target, *(skin if guard.skin in reading.values else reading.values), *skin]
         snapshot = Snapshot(
             reading.time_s,
             self.phase,
             self.ends - reading.time_s,
             self.dt,
-            next(iter(self.target), guard.skin),
+            skins[0],
             reading.values,
             self.target,
             self.band,

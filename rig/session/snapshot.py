@@ -28,7 +28,7 @@ class Snapshot:
     phase: str  # one of the loop's phases
     left_s: float  # until the phase ends at the latest
     dt: float  # until the next sample [s]
-    skin: str  # the sensor that touches
+    skin: str  # the sensor that touches; on a rig that has none its first
     values: Mapping[str, float]  # readings by sensor [degC], NaN where one is lost
     target: Mapping[str, float]  # by output [degC]; empty where nothing is regulated
     band: float  # within which a target counts as reached [K]

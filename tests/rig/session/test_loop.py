@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import inf, nan
 from typing import Any
 from unittest.mock import Mock, call
@@ -353,6 +354,15 @@ def test_each_sample_shows_the_session_as_it_is() -> None:
     assert first.model_share != first.model_share
     assert last.events[-1].text == "lead_in"
     assert first.events[-1].text == "hold"
+
+
+def test_a_rig_without_the_guards_skin_shows_its_first_sensor() -> None:
+    run = started(Move(drive=40.0))
+    run.target, seen = {}, shown(run)
+    run.sample("hold", 1, 0.1)
+    run.reading = replace(run.reading, values={"t1": 25.0, "t2": 26.0})
+    run.show({"q": 0.0})
+    assert [one.skin for one in seen] == ["t_surface", "t1"]
 
 
 def test_a_view_that_fails_ends_no_session_and_gets_no_more() -> None:
