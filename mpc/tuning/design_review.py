@@ -383,13 +383,13 @@ def limits(controller: Controller, span: tuple[float, float]) -> Check:
             value = float(held.y[model.outputs.index(output)])
             if not low <= value <= high:
                 broken.append(f"{output} is {value:.1f} degC when {target:g} degC is held")
-    seen = ", ".join(f"{key} {_range_text(low, high)} degC" for key, (low, high) in design.limits.items())
+    seen = ", ".join(f"{key} {range_text(low, high)} degC" for key, (low, high) in design.limits.items())
     if broken:
         return Check(name, "fail", f"{seen}: {'; '.join(broken)}", "widen the limits or narrow the targets")
     return Check(name, "pass", seen)
 
 
-def _range_text(low: float, high: float) -> str:
+def range_text(low: float, high: float) -> str:
     """Return a range in words; an end that is open is left out."""
     if high >= LARGEST:
         return f"at least {low:g}"

@@ -211,7 +211,7 @@ def _note_all(axis: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
         else:
             shared.append((x, y, [name]))
     for x, y, names in shared:
-        label = " and ".join(dict.fromkeys(names))
+        label = ", ".join(dict.fromkeys(names))
         axis.annotate(label, (x, y), textcoords="offset points", xytext=(7, 5), fontsize=7, color="#5b6776")
 
 

@@ -17,7 +17,8 @@ weaker drive) is tried one by one on the first draw; the mean of those runs coun
 
 **Bound.**  Before :func:`thermogrip.mpc.tuning.minimum_time.full_drive_bound` no drive inside its limits
 brings the skin into the band.  Staying there takes longer still, since the drive must be taken back in time,
-so a settling time near the bound cannot be improved by weights: the actuator is the limit.
+so a settling time near the bound cannot be improved by weights: the actuator is the limit.  A target that may
+only ramp is in the band no sooner than its ramp brings it there, which is the bound where it is later.
 """
 
 from __future__ import annotations
@@ -200,12 +201,19 @@ def score(results: Sequence[StepResult], spec: Spec, bounds: Bounds) -> float:
 
 
 def bounds_of(plant: Plant, design: Design, spec: Spec, draws: Sequence[int]) -> Bounds:
-    """Return :func:`full_drive_bound` of every step of the spec on these draws."""
+    """Return :func:`full_drive_bound` of every step of the spec on these draws, or the ramp's time."""
     found: Bounds = {}
     for draw in draws:
         for step in spec.steps:
-            found[(*step, draw)] = full_drive_bound(drawn(plant, draw), design, step, spec)
+            drive = full_drive_bound(drawn(plant, draw), design, step, spec)
+            found[(*step, draw)] = float(np.maximum(drive, _ramp_time(design, spec, step)))  # NaN stays NaN
     return found
+
+
+def _ramp_time(design: Design, spec: Spec, step: tuple[float, float]) -> float:
+    """Return when the slowest ramp brings the target of a step into the band of its end [s]; 0 without."""
+    way = max(0.0, abs(step[1] - step[0]) - spec.band_degC)
+    return max((way / rate for rate in design.ramp_per_s.values()), default=0.0)
 
 
 def check_steps(bounds: Bounds) -> None:

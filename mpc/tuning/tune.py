@@ -141,7 +141,7 @@ def verdict_of(
     if beyond:
         return "actuator-limited", _beyond(max(beyond, key=lambda row: row.bound_s), spec)
     ratio = float(np.mean([row.settle_mean_s / max(row.bound_s, 1.0) for row in rows]))
-    against = f"{_limits(rows)} {_simpler(scores)}".strip()
+    against = f"{_limits(rows, spec)} {_simpler(scores, spec)}".strip()
     if won > _WON:
         return "improved", f"Score {100 * won:.0f} % below the default design {unseen}. {against}"
     if ratio <= _NEAR:
@@ -161,18 +161,18 @@ def _beyond(row: Row, spec: Spec) -> str:
     )
 
 
-def _limits(rows: Sequence[Row]) -> str:
-    """Return each step's settling beside what the drive allows."""
-    said = []
+def _limits(rows: Sequence[Row], spec: Spec) -> str:
+    """Return each step's settling beside what the drive allows, and the ramp where there is one."""
+    said, allowed = [], "at this drive and ramp" if spec.ramp_per_s else "at this drive"
     for row in rows:
         settled = np.isfinite(row.settle_mean_s)
         takes = f"takes {row.settle_mean_s:.0f} s" if settled else "does not settle on every draw"
         step = f"{row.start:g} to {row.target:g}"
-        said.append(f"{step} cannot settle under {row.bound_s:.0f} s at this drive, yours {takes}")
+        said.append(f"{step} cannot settle under {row.bound_s:.0f} s {allowed}, yours {takes}")
     return "; ".join(said) + "."
 
 
-def _simpler(scores: Mapping[str, float]) -> str:
+def _simpler(scores: Mapping[str, float], spec: Spec) -> str:
     """Return what a simpler controller makes of it, "" where the MPC is plainly better than both."""
     kept = min(scores["tuned"], scores["baseline"])
     near = {name: scores[name] for name in ("PI", "LQR") if name in scores and scores[name] < 1.03 * kept}
@@ -181,7 +181,11 @@ def _simpler(scores: Mapping[str, float]) -> str:
     name = min(near, key=lambda key: near[key])
     share = 100 * (1 - near[name] / kept)
     how = "as well" if abs(share) < 0.5 else f"{abs(share):.1f} % {'better' if share > 0 else 'worse'}"
-    missing = ", and knows neither limits of outputs nor where a gain turns over" if name == "LQR" else ""
+    wishes = {"zones": spec.zones, "energy prices": spec.energy_price, "ramps": spec.ramp_per_s}
+    unknown = [wish for wish, value in wishes.items() if value]
+    unknown += ["limits of outputs", "where a gain turns over"] if name == "LQR" else []
+    listed = f"{', '.join(unknown[:-1])} or {unknown[-1]}" if unknown[1:] else "".join(unknown)
+    missing = f", and does not know {listed}" if unknown else ""
     return f"{name}, tuned with no fewer trials, scores {how} on this spec{missing}."
 
 

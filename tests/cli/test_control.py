@@ -40,6 +40,7 @@ def tuned(stand_in: StandIn) -> SimpleNamespace:
     )  # fmt: skip
     found.asked = stand_in("thermogrip.mpc.tuning.tune.tune", tune)
     stand_in("thermogrip.report.control.tuning_table", (tuple("abcdefghi"), ROWS))
+    stand_in("thermogrip.report.control.tuning_caption", "Closed loops on 5 draws of the plant")
     stand_in("thermogrip.mpc.tuning.trade_offs.sensitivity_words", ["move matters", "horizon does not"])
     stand_in("thermogrip.report.control.tuning_sections", ["a section"])
     found.pages = stand_in("thermogrip.report.html.write_report")

@@ -40,7 +40,8 @@ def tuning_of(**changes: Any) -> Any:
         steps=STEPS, settle_within_s=180.0, band_degC=0.25, overshoot_degC=0.5, bias_degC=0.1, hold_s=200.0,
         energy_weight=2.0, ambient_degC=25.0, noise_degC=0.04, sensor_offset_degC=0.3, search_draws=2,
         check_draws=5, evaluations=30, moves_weight=0.03, extra_lag=0.4, extra_delay=0.6, lost_gain=0.1,
-        zones={"t1": 1.0}, hard=None, energy_price=None, tariff=None, ramp_per_s=None, safe_drive={},
+        zones={"t1": 1.0}, hard=["t1", "t2"], energy_price=None, tariff=[(0.0, 1.0), (600.0, 3.0)],
+        ramp_per_s=None, safe_drive={}, limits={"t1": (-1e12, 60.0), "t2": (5.0, 70.0)}, weights=None,
     )  # fmt: skip
     design = SimpleNamespace(
         controlled=("t1", "t2"), dt=2.0, horizon_s=60.0, blocks=(1, 2, 4), drive_range={"q": (0.0, 100.0)},
@@ -140,7 +141,7 @@ def test_what_was_asked_stands_beside_the_design() -> None:
     )  # fmt: skip
     assert [value for _, value in asked.rows] == [
         "28 to 38, 28 to 18", "180", "0.25", "0.5", "0.1", "200", "2", "0.03", "25", "0.04", "0.3", "2", "5",
-        "30", "0.4", "0.6", "0.1", "{'t1': 1.0}",
+        "30", "0.4", "0.6", "0.1", "t1 at most 60, t2 5 to 70", "t1 1", "t1, t2", "0: 1, 600: 3",
     ]  # fmt: skip
     assert asked.rows[1] == ("settle within [s]", "180")
     assert dict(found.rows) == {

@@ -68,14 +68,14 @@ def tune(
 def _written(console: Console, found: Tuning, lead: str, out: Path, report: Path | None) -> dict[str, Any]:
     """Write and show what a search found; return the answer."""
     from thermogrip.mpc.tuning.trade_offs import sensitivity_words
-    from thermogrip.report.control import tuning_sections, tuning_table
+    from thermogrip.report.control import tuning_caption, tuning_sections, tuning_table
     from thermogrip.report.html import write_report
 
     found.save(out)
     if report is not None:
         lead = f"{lead}, tuned in simulation on draws of the plant."
         write_report(report, "Tuning", lead, tuning_sections(found))
-    console.table("Closed loops on draws of the plant", *tuning_table(found))
+    console.table(tuning_caption(found), *tuning_table(found))
     console.say(f"{found.verdict}: {found.finding}")
     words = sensitivity_words(found.sensitivity)
     for line in words:

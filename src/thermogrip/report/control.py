@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermogrip.mpc.closed_loop.simulate import session_loop
+from thermogrip.mpc.tuning.design_review import range_text
 from thermogrip.mpc.tuning.figures import (
     closed_loop_chart,
     pareto_figure,
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from thermogrip.mpc.closed_loop.simulate import ClosedLoop
     from thermogrip.mpc.controllers.mpc import Controller
     from thermogrip.mpc.design.design import Design
+    from thermogrip.mpc.design.spec import Spec
     from thermogrip.mpc.interface import Move
     from thermogrip.mpc.tuning.tune import Tuning
     from thermogrip.rig.session.session import Session
@@ -57,6 +59,8 @@ _SPEC_WORDS = {
 }
 
 _WISHES = {
+    "limits": "limits of outputs, soft [degC]",
+    "weights": "how many times the errors of an output count",
     "zones": "anywhere within, about the target",
     "hard": "limits that give way last",
     "energy_price": "price of a sample at full drive",
@@ -84,6 +88,12 @@ def tuning_table(tuning: Tuning) -> Cells:
     )
 
 
+def tuning_caption(tuning: Tuning) -> str:
+    """Return what the comparison ran on."""
+    draws = f"{tuning.spec.check_draws} draws of the plant" if _uncertain(tuning) else "the plant"
+    return f"Closed loops on {draws}"
+
+
 def tuning_sections(tuning: Tuning) -> list[Section]:
     """Return the whole report of a tuning."""
     design = tuning.controller.design
@@ -106,15 +116,13 @@ def tuning_section(tuning: Tuning) -> Section:
         else "It does not meet the spec on every draw."
     )
     scores = ", ".join(f"{name} {value:.3f}" for name, value in tuning.scores.items())
-    checked = f"{tuning.spec.check_draws} draws of the plant" if _uncertain(tuning) else "the plant"
     parts: list[Any] = [
-        Table(*tuning_table(tuning), f"Closed loops on {checked}"),
+        Table(*tuning_table(tuning), tuning_caption(tuning)),
         Plot(steps_chart(tuning.runs), _STEPS_CAPTION),
         Text(
             f"Band {tuning.spec.band_degC:g} degC. {_unseen(tuning)}; "
             f"noise, quantum and a sensor offset of {tuning.spec.sensor_offset_degC:g} degC are unknown to "
-            "the controllers. Before the last column no drive inside its limits brings the output into the "
-            "band, whatever the controller."
+            f"the controllers. {_before_the_last_column(tuning.spec)}"
         ),
         Text(
             f"Scores on these draws, lower is better: {scores}. MPC and LQR were tuned with "
@@ -219,7 +227,7 @@ def spec_section(tuning: Tuning) -> Section:
     spec, design = tuning.spec, tuning.controller.design
     asked = [("steps [degC]", ", ".join(f"{a:g} to {b:g}" for a, b in spec.steps))]
     asked += [(words, getattr(spec, key)) for key, words in _SPEC_WORDS.items()]
-    asked += [(words, str(getattr(spec, key))) for key, words in _WISHES.items() if getattr(spec, key)]
+    asked += [(words, _listed(getattr(spec, key))) for key, words in _WISHES.items() if getattr(spec, key)]
     found: list[tuple[str, Any]] = [
         ("regulated", ", ".join(design.controlled)),
         ("sample time [s]", design.dt),
@@ -242,6 +250,15 @@ def spec_section(tuning: Tuning) -> Section:
         )
     )
     return Section("What was asked, and the answer", parts, f"Seed {tuning.seed}; same seed, same design.")
+
+
+def _listed(value: Any) -> str:
+    """Return a value of the spec as text: by output or drive, and of a tariff by its times."""
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_listed(each)}" for name, each in value.items())
+    if isinstance(value, list):
+        return ", ".join(each if isinstance(each, str) else f"{each[0]:g}: {each[1]:g}" for each in value)
+    return range_text(*value) if isinstance(value, tuple) else f"{value:g}"
 
 
 def session_sections(
@@ -307,6 +324,19 @@ def _trade(rows: list[dict[str, Any]]) -> str:
 def _uncertain(tuning: Tuning) -> bool:
     plant = tuning.controller.plant
     return plant.samples is not None or plant.covariance is not None
+
+
+def _before_the_last_column(spec: Spec) -> str:
+    """Return what the minimum time means."""
+    if spec.ramp_per_s:
+        return (
+            "Before the last column no drive inside its limits brings the output into the band, or the ramp "
+            "has not brought the target there; PI and LQR take the target at once."
+        )
+    return (
+        "Before the last column no drive inside its limits brings the output into the band, whatever the "
+        "controller."
+    )
 
 
 def _unseen(tuning: Tuning) -> str:

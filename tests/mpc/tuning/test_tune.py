@@ -13,7 +13,7 @@ import pytest
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers.mpc import Controller
-from thermogrip.mpc.design.design import Design
+from thermogrip.mpc.design.design import Design, default_design
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.tuning import tune as tuner
 from thermogrip.mpc.tuning.figures import closed_loop_figure
@@ -25,6 +25,7 @@ from thermogrip.mpc.tuning.objective import (
     Search,
     StepResult,
     Trial,
+    bounds_of,
     parameters_of,
     scaled_loops,
     score,
@@ -455,7 +456,7 @@ def rows(bound: float, *results: StepResult) -> list[Row]:
         (BETTER | {"PI": 60.42}, 80.0, 50.0, "improved", "scores 0.7 % worse on this spec."),
         (BETTER | {"PI": 61.2}, 80.0, 50.0, "improved", "scores 2.0 % worse on this spec."),
         (BETTER | {"PI": 61.2, "LQR": 54.0}, 80.0, 50.0, "improved", "trials, scores 10.0 % better"),
-        (BETTER | {"LQR": 54.0}, 80.0, 50.0, "improved", "on this spec, and knows neither limits of outputs"),
+        (BETTER | {"LQR": 54.0}, 80.0, 50.0, "improved", "on this spec, and does not know limits of outputs"),
     ],
 )  # fmt: skip
 def test_the_verdict_and_its_sentence(
@@ -507,6 +508,20 @@ def test_a_row_is_the_mean_and_the_worst_of_its_draws() -> None:
     ],
 )
 def test_a_simpler_controller_that_is_as_good_is_named_with_what_it_does_not_know(scores, name, how):
-    missing = ", and knows neither limits of outputs nor where a gain turns over" if name == "LQR" else ""
+    missing = ", and does not know limits of outputs or where a gain turns over" if name == "LQR" else ""
     said = f"{name}, tuned with no fewer trials, scores {how} on this spec{missing}."
-    assert _simpler(scores) == (said if name else "")
+    assert _simpler(scores, STEP) == (said if name else "")
+    priced = STEP.model_copy(update={"zones": {"t": 1.0}, "energy_price": 0.1})
+    joined = ", " if name == "LQR" else " or "
+    assert not name or f"does not know zones{joined}energy prices" in _simpler(scores, priced)
+
+
+def test_a_step_whose_target_ramps_is_bounded_by_its_ramp(tank) -> None:
+    plain = default_design(tank)
+    ramped = replace(plain, ramp_per_s={"t_surface": 0.02})
+    (free,), (bound,) = (bounds_of(tank, design, STEP, [0]).values() for design in (plain, ramped))
+    (start, target), band = STEP.steps[0], STEP.band_degC
+    assert bound == pytest.approx((target - start - band) / 0.02)
+    assert bound > 2 * free
+    search = Search(tank, STEP.model_copy(update={"hold_s": 900.0}), ramped, 0)
+    assert search.lengths[0] == pytest.approx(1.35 * bound + 40)  # a trial sees it settle
