@@ -117,6 +117,10 @@ class Rig(Protocol):
     def expires_s(self) -> float:
         """How long a drive that is not renewed lasts on the device [s]; infinite where nothing ends it."""
 
+    @property
+    def has_pump(self) -> bool:
+        """Whether there is a pump to switch; where there is none, none is recorded."""
+
     def read(self) -> Reading:
         """Return the newest sample."""
 

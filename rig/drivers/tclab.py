@@ -82,6 +82,11 @@ class TCLabRig(NoticeBook):
         """Infinite: nothing on the board ends its heaters."""
         return float("inf")
 
+    @property
+    def has_pump(self) -> bool:
+        """False: the board has two heaters and nothing else."""
+        return False
+
     def read(self) -> Reading:
         """Return the newest scan; NaN where a sensor is lost, everywhere while the board does not answer (its
         heaters are then what they were set to: nothing there ends them)."""

@@ -133,6 +133,11 @@ class DeviceRig(NoticeBook):
         """How long a drive lives on the device when nobody renews it [s]."""
         return TTL_S
 
+    @property
+    def has_pump(self) -> bool:
+        """Whether the device says that it has a pump."""
+        return self.identity.pump
+
     def read(self) -> Reading:
         """Return the newest sample; NaN everywhere while the device cannot be reached."""
         try:

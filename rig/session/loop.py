@@ -229,7 +229,7 @@ class Loop:
             self.band,
             drive,
             self.rig.units,
-            self.move.pump,
+            self.move.pump if self.rig.has_pump else None,
             guard.margin,
             guard.nearest,
             guard.model_share,
@@ -254,9 +254,9 @@ class Loop:
                     self.recorder.sample(self.rows[-1])
 
     def _orders(self, drive: Mapping[str, float]) -> dict[str, float]:
-        """Return a row's columns of what is applied: the drives, and the pump of the present move."""
+        """Return a row's columns of what is applied: the drives, and the pump of the present move, if any."""
         drives = {join_header(name, self.rig.units[name]): value for name, value in drive.items()}
-        return drives | {"pump": float(self.move.pump)}
+        return drives | ({"pump": float(self.move.pump)} if self.rig.has_pump else {})
 
     def wait(self, seconds: float) -> None:
         """Let time pass and read."""

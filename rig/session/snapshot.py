@@ -34,7 +34,7 @@ class Snapshot:
     band: float  # within which a target counts as reached [K]
     drive: Mapping[str, float]  # applied from now on, by input
     units: Mapping[str, str]  # of the drives
-    pump: int
+    pump: int | None  # None where there is none
     margin: float  # of the sensor that is nearest to its limit [K]
     nearest: str  # that sensor
     model_share: float  # largest deviation from the plant, of what is allowed; NaN where there is no plant

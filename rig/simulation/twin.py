@@ -176,6 +176,11 @@ class Twin:
         """0: its time stops with the program."""
         return 0.0
 
+    @property
+    def has_pump(self) -> bool:
+        """Whether its plant has one."""
+        return "pump" in self.plant.inputs
+
     def read(self) -> Reading:
         """Return the sample at the present time; twice at one time gives the same sample."""
         if self._newest is None or self._newest.time_s != self.time:

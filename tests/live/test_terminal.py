@@ -33,6 +33,7 @@ def test_the_numbers_of_a_session() -> None:
     shown = dict(numbers(bare))
     assert (shown["phase"], shown["drive"], shown["pump"]) == ("lead in", "+0.42 %", "off")
     assert not shown.keys() & {"guard margin", "target of t_surface"}
+    assert "pump" not in dict(numbers(replace(NOW, pump=None)))
 
 
 def test_one_line_has_the_same_numbers_and_what_happened_last() -> None:

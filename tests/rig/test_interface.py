@@ -40,6 +40,7 @@ def test_it_is_a_rig_whose_reading_names_every_sensor_and_what_is_applied(rig: R
     assert isinstance(rig, Rig)
     assert rig.notices() == []
     assert rig.expires_s == (np.inf if "q1" in rig.units else 2.0 if hasattr(rig, "port") else 0.0)
+    assert rig.has_pump is ("q1" not in rig.units)
     reading = rig.read()
     assert all(np.isfinite(value) for value in reading.values.values())
     assert set(reading.drive) == set(rig.units)

@@ -94,7 +94,7 @@ function tiles(now) {
   for (const [name, value] of Object.entries(now.target)) found.push(["target of " + name, value.toFixed(1) + " °C", now.band === null ? "" : "± " + now.band]);
   for (const [name, value] of Object.entries(now.values)) if (name !== now.skin) found.push([name, fixed(value, 2, " °C")]);
   for (const [name, value] of Object.entries(now.drive)) found.push([name, gone ? "0" : kept ? "not known" : value.toFixed(2) + unit(name), gone ? "expired" : ""]);
-  found.push(["pump", gone ? "off" : kept ? "not known" : now.pump ? "on" : "off"]);
+  if (now.pump !== null) found.push(["pump", gone ? "off" : kept ? "not known" : now.pump ? "on" : "off"]);
   if (now.margin !== null) found.push(["guard margin", now.margin.toFixed(1) + " K", "to the limit of " + now.nearest]);
   if (now.model_share !== null) found.push(["off the plant", (100 * now.model_share).toFixed(0) + " %", "of what is allowed"]);
   $("tiles").replaceChildren(...found.map(([name, value, more]) => {

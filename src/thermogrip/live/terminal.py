@@ -32,7 +32,7 @@ def numbers(now: Snapshot) -> list[tuple[str, str]]:
     rows += [(name, _reading(value)) for name, value in others.items()]
     units = {"1": "", "percent": " %", "0_255": " of 255"}
     rows += [(name, f"{value:+.3g}{units.get(now.units[name], '')}") for name, value in now.drive.items()]
-    rows.append(("pump", "on" if now.pump else "off"))
+    rows += [("pump", "on" if now.pump else "off")] if now.pump is not None else []
     left = f", {max(now.left_s, 0.0):.0f} s left" if isfinite(now.left_s) and not now.verdict else ""
     rows.append(("phase", (now.verdict or now.phase.replace("_", " ")) + left))
     if isfinite(now.margin):

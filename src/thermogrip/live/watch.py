@@ -393,7 +393,7 @@ def _drain(waiting: deque[Any]) -> list[Any]:
 def _row(now: Snapshot) -> list[float | None]:
     """Return a snapshot as a row of the page's columns."""
     phase = float(PHASES.index(now.phase)) if now.phase else None
-    head = [now.time_s, phase, float(now.pump), now.target.get(now.skin)]
+    head = [now.time_s, phase, None if now.pump is None else float(now.pump), now.target.get(now.skin)]
     return [*head, *now.values.values(), *now.drive.values()]
 
 

@@ -365,6 +365,14 @@ def test_a_rig_without_the_guards_skin_shows_its_first_sensor() -> None:
     assert [one.skin for one in seen] == ["t_surface", "t1"]
 
 
+@pytest.mark.parametrize(("has_pump", "pump"), [(True, 1), (False, None)])
+def test_a_pump_is_recorded_and_shown_where_there_is_one(has_pump: bool, pump: int | None) -> None:
+    run = started(Move(drive=40.0))
+    run.rig.has_pump, seen = has_pump, shown(run)
+    run.sample("hold", 1, 0.1)
+    assert ("pump" in run.rows[-1], seen[-1].pump) == (has_pump, pump)
+
+
 def test_a_view_that_fails_ends_no_session_and_gets_no_more() -> None:
     run = started(Move(drive=40.0))
     seen = shown(run, fails=True)
