@@ -434,6 +434,7 @@ _STEPS = 40
 _SETTLED = 0.05  # change of -2 ln evidence
 _LEAST_LN_H_SPREAD = 0.2
 _SLOW = 2.3  # ln s: a contact that builds up for as long as it lasts
+_WHITE = 0.003  # K: a search that begins with less ends where rounding stops it
 _SMOOTH = Noise(slow=0.01, correlation_time=1.2, misfit=0.005, growth=1.5, smooth=True)
 _ALWAYS_SD, _SHARE_SD, _ONSET_SD = 0.5, 0.02, 0.2  # of a discrepancy: K, share of the difference, s
 # ln white, ln slow, ln correlation time, ln misfit, growth: how well 200 grasps know each; where they may be
@@ -571,6 +572,7 @@ def _discrepant(
         return bare
     theta = problem.prior.mean.copy()
     theta[SHARED_NAMES.index("ln_build_up")] = _SLOW
+    begin = replace(_SMOOTH, white=max(noise.white, _WHITE))
     start = theta, np.zeros(w.shape), dict(problem.prior.spread), (begin, begin)
     slow = _search(problem, *start, looks[2:], least, progress)
     each = [fit for fit in (found, slow) if fit is not None]
