@@ -18,12 +18,28 @@ import time
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from thermogrip.classify import evaluate, make_classifier
+from thermogrip.classify import GraspClassifier, evaluate, make_classifier
+from thermogrip.classify.estimators.lda import ArrayClassifier
 from thermogrip.classify.estimators.lstm import QUICK_EPOCHS
 from thermogrip.classify.evaluation.comparison import POOLED, Comparison
 from thermogrip.datasets.examples import load_example_grasps
 
 LADDER = "features-lda,pca-lda,bayes,svm-pca,posterior,expansions,rocket,lstm,lstm-paper"
+
+DEEP = {
+    "inception": ("InceptionTimeClassifier", {}),
+    "h-inception": ("InceptionTimeClassifier", {"use_custom_filters": True}),
+    "lite": ("LITETimeClassifier", {}),
+}
+
+
+def made(name: str, epochs: int, members: int) -> GraspClassifier:
+    """Return a classifier of this package or one of aeon's networks by name."""
+    if name in DEEP:
+        kind, params = DEEP[name]
+        path = f"aeon.classification.deep_learning:{kind}"
+        return ArrayClassifier(path, {"n_epochs": epochs, "n_classifiers": members, **params}, random_state=0)
+    return make_classifier(name, seed=0, **({"epochs": epochs} if name.startswith("lstm") else {}))
 
 
 def main() -> None:
@@ -34,17 +50,21 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--classifiers", default=LADDER)
     parser.add_argument("--splits", type=int, default=20)
-    parser.add_argument("--epochs", type=int, default=QUICK_EPOCHS, help="of the LSTMs")
+    parser.add_argument("--epochs", type=int, default=QUICK_EPOCHS, help="of the networks")
+    parser.add_argument("--members", type=int, default=5, help="of an ensemble of networks")
+    parser.add_argument("--conditions", help="these alone, by name")
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     records = [g for name, g in load_example_grasps().items() if name[:4] in ("exp1", "exp2", "exp3", "exp4")]
+    if given.conditions:
+        wanted = given.conditions.split(",")
+        records = [record for record in records if record.attrs["name"] in wanted]
     parts = []
     for name in given.classifiers.split(","):
         file = given.out / f"{name}.json"
         if not file.exists():
             clock = time.perf_counter()
-            epochs = {"epochs": given.epochs} if name.startswith("lstm") else {}
-            model = {name: make_classifier(name, seed=0, **epochs)}
+            model = {name: made(name, given.epochs, given.members)}
             found = evaluate(model, records, split="random", repeats=given.splits, probe=False)
             file.write_text(json.dumps(asdict(found)), encoding="utf-8")
             print(f"{name}: {time.perf_counter() - clock:.0f} s", file=sys.stderr, flush=True)

@@ -433,6 +433,8 @@ _ROUNDS = 3  # of fit and noise
 _STEPS = 40
 _SETTLED = 0.05  # change of -2 ln evidence
 _LEAST_LN_H_SPREAD = 0.2
+_SLOW = 2.3  # ln s: a contact that builds up for as long as it lasts
+_WHITE = 0.003  # K: a search that begins with less ends where rounding stops it
 _SMOOTH = Noise(slow=0.01, correlation_time=1.2, misfit=0.005, growth=1.5, smooth=True)
 _ALWAYS_SD, _SHARE_SD, _ONSET_SD = 0.5, 0.02, 0.2  # of a discrepancy: K, share of the difference, s
 # ln white, ln slow, ln correlation time, ln misfit, growth: how well 200 grasps know each; where they may be
@@ -550,20 +552,46 @@ def _calibrated(
     return replace(found, second=beside)
 
 
+_Fitted = tuple[Problem, Step, Array, Spread, Noise]
+
+
 def _discrepant(
     problem: Problem, last: Step, w: Array, spread: Spread, noise: Noise, progress: Progress
-) -> tuple[Problem, Step, Array, Spread, Noise]:
+) -> _Fitted:
     """Return the fit with a discrepancy in a smooth noise where its evidence is greater, else as it was; a
-    first look at twice three steps decides whether a search is worth it."""
+    first look at twice three steps decides whether a search is worth it.  The evidence has a maximum for
+    contacts that build up fast and one for slow ones, so the search starts at both, and the greater one is
+    the answer."""
     bare = problem, last, w, spread, noise
     least = _log_evidence(problem, last, noise)
     problem, theta = _with_discrepancy(problem, last.theta)
     begin = replace(_SMOOTH, white=noise.white)  # from elsewhere a search may end without misfit
-    for i, steps in enumerate((3, 3, _STEPS, _STEPS)):
+    looks = (3, 3, _STEPS, _STEPS)
+    found = _search(problem, theta, w, spread, (noise, begin), looks, least, progress)
+    if found is None:
+        return bare
+    theta = problem.prior.mean.copy()
+    theta[SHARED_NAMES.index("ln_build_up")] = _SLOW
+    begin = replace(_SMOOTH, white=max(noise.white, _WHITE))
+    start = theta, np.zeros(w.shape), dict(problem.prior.spread), (begin, begin)
+    slow = _search(problem, *start, looks[2:], least, progress)
+    each = [fit for fit in (found, slow) if fit is not None]
+    return max(each, key=lambda fit: _log_evidence(fit[0], fit[1], fit[4]))
+
+
+def _search(
+    problem: Problem, theta: Array, w: Array, spread: Spread, noises: tuple[Noise, Noise],
+    looks: Sequence[int], least: float, progress: Progress,
+) -> _Fitted | None:  # fmt: skip
+    """Return a fit with the problem's discrepancy, after ``looks`` of so many steps, the noise found anew
+    after each; None where the evidence is below ``least`` once the noise is fitted.  ``noises``: to begin
+    with, and from where it is searched."""
+    noise, begin = noises
+    for i, steps in enumerate(looks):
         last, w, spread = _fit(problem, theta, w, spread, noise, progress, steps=steps)
         theta = last.theta
         if i > 0 and _log_evidence(problem, last, noise) < least:
-            return bare
+            return None
         noise = _fit_noise(problem, linearise(problem, theta, w, spread), w, begin)
     return problem, *_fit(problem, theta, w, spread, noise, progress), noise
 

@@ -12,8 +12,13 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.materials import find_material
 from thermogrip.sysid.effusivity import calibration
-from thermogrip.sysid.effusivity.calibration import calibrate_example_gripper, calibrate_gripper
-from thermogrip.sysid.effusivity.data import KNOTS, touches
+from thermogrip.sysid.effusivity.calibration import (
+    Problem,
+    Step,
+    calibrate_example_gripper,
+    calibrate_gripper,
+)
+from thermogrip.sysid.effusivity.data import KNOTS, Noise, touches
 from thermogrip.sysid.effusivity.gripper_model import (
     INSULATOR,
     SHARED_NAMES,
@@ -336,3 +341,46 @@ def test_grasps_of_one_material_add_to_a_prior(device, files):
     assert found.trained_on == (*device.trained_on, "exp2_dT20")
     assert told[-1] == (1.0, "calibrated")
     assert told[:-1] == [(i / 40, "gripper from 2 grasps") for i in range(len(told) - 1)]
+
+
+@pytest.mark.parametrize(("slow", "wanted"), [(7.0, "slow"), (5.0, "fast"), (None, "fast")])
+def test_a_discrepancy_is_searched_from_two_starts_and_the_greater_evidence_is_the_answer(
+    monkeypatch, slow, wanted
+):
+    n = len(SHARED_NAMES) + 4
+    first = calibration.ThetaPrior(np.zeros(n), np.eye(n), dict(calibration.FIRST_SPREAD))
+    problem = Problem(None, None, ("a", "b"), (), np.zeros(3, dtype=np.int64), first, np.zeros(2))
+    bare = Step(np.full(n, 0.5), np.zeros((3, 7)), 1.0, 0.0, 0.0, np.zeros((3, 7)), np.eye(n))
+    begun = []
+
+    def search(problem, theta, w, spread, noises, looks, least, progress):
+        begun.append((theta[SHARED_NAMES.index("ln_build_up")], noises[1].white))
+        evidence = [6.0, slow][len(begun) - 1]
+        fit = problem, ("fast", "slow")[len(begun) - 1], evidence, spread, noises[0]
+        return None if evidence is None else fit
+
+    evidence_of = {"fast": 6.0, "slow": slow}
+
+    def log_evidence(problem, step, noise):
+        return evidence_of[step] if isinstance(step, str) else 0.0
+
+    monkeypatch.setattr(calibration, "_search", search)
+    monkeypatch.setattr(calibration, "_log_evidence", log_evidence)
+    found = calibration._discrepant(problem, bare, bare.w, {}, Noise(white=3e-4), None)
+    assert found[1] == wanted
+    assert [build_up for build_up, _ in begun] == [0.5, pytest.approx(np.log(10), abs=0.01)]
+    # the thermometer's noise that a smoothed record seems to have would end the second search early
+    assert [white for _, white in begun] == [3e-4, 3e-3]
+
+
+def test_a_search_that_explains_less_than_no_discrepancy_is_none(monkeypatch):
+    step = Step(np.zeros(3), np.zeros((2, 7)), 1.0, 0.0, 0.0, np.zeros((2, 7)), np.eye(3))
+    monkeypatch.setattr(
+        calibration, "_fit", lambda problem, theta, w, spread, *rest, **more: (step, w, spread)
+    )
+    monkeypatch.setattr(calibration, "_fit_noise", lambda *parts: Noise())
+    monkeypatch.setattr(calibration, "linearise", lambda *parts: None)
+    for evidence, there in ((1.0, True), (-1.0, False)):
+        monkeypatch.setattr(calibration, "_log_evidence", lambda *parts, value=evidence: value)
+        found = calibration._search(None, step.theta, step.w, {}, (Noise(), Noise()), (3, 3), 0.0, None)
+        assert (found is not None) == there
