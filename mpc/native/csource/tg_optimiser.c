@@ -299,7 +299,9 @@ static void set_soft_rows(tg_controller *c, const double *target, const double *
             }
 }
 
-static void find_free(tg_controller *c, const double *guess)
+/* The outputs that count, by the gains under another plan than the guess, k rows of across numbers each. */
+static void follow_gains(const tg_controller *c, const double *guess, const double *plan, double *out, int across,
+                         int as_outputs)
 {
     const tg_design *s = c->design;
     int k = 0, rows = s->n_c + s->n_l;
@@ -307,10 +309,10 @@ static void find_free(tg_controller *c, const double *guess)
         for (int at = 0; at < s->blocks[b]; at++, k++)
             for (int r = 0; r < rows; r++) {
                 const double *g = c->G + ((size_t)k * TG_NS + (size_t)r) * TG_Q_N;
-                double sum = c->y_guess[k * TG_NY + row_of(s, r)];
+                double y = c->y_guess[k * TG_NY + row_of(s, r)];
                 for (int i = 0; i < (b + 1) * TG_NU; i++)
-                    sum -= g[i] * guess[i] / s->span[i % TG_NU];
-                c->free[k * TG_NS + r] = sum;
+                    y += g[i] * (plan[i] - guess[i]) / s->span[i % TG_NU];
+                out[k * across + (as_outputs ? row_of(s, r) : r)] = y;
             }
 }
 
@@ -366,28 +368,12 @@ static void find_broken(tg_controller *c)
         }
 }
 
-/* The outputs of a linear plant under the best plan; G has rows of those that count alone, and no other is used. */
-static void follow_gains(tg_controller *c, const double *guess)
-{
-    const tg_design *s = c->design;
-    int k = 0, rows = s->n_c + s->n_l;
-    for (int b = 0; b < s->n_b; b++)
-        for (int at = 0; at < s->blocks[b]; at++, k++)
-            for (int r = 0; r < rows; r++) {
-                const double *g = c->G + ((size_t)k * TG_NS + (size_t)r) * TG_Q_N;
-                double *y = c->y_best + k * TG_NY + row_of(s, r);
-                *y = c->y_guess[k * TG_NY + row_of(s, r)];
-                for (int i = 0; i < (b + 1) * TG_NU; i++)
-                    *y += g[i] * (c->best[i] - guess[i]) / s->span[i % TG_NU];
-            }
-}
-
 int tg_optimise(tg_controller *c, const double *x, const double *last, const double *start, const double *d,
                 const double *target, const double *from, const double *bias, const double *drive_bias)
 {
     const tg_design *s = c->design;
     tg_qp *q = &c->qp;
-    double at_guess, cost, guess[TG_Q_N], side[TG_NC];
+    double at_guess, cost, guess[TG_Q_N], side[TG_NC], none[TG_Q_N] = {0.0};
     int uphill;
     q->n = s->n_b * TG_NU;
     q->stride = TG_NU;
@@ -408,7 +394,7 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
         find_authority(c);
         c->has_gains = s->linear;
     }
-    find_free(c, guess);
+    follow_gains(c, guess, none, c->free, TG_NS, 0); /* the response without any plan */
     q->kept = is_kept(c);
     if (!q->kept)
         set_quadratic_cost(c);
@@ -427,7 +413,7 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
         c->best[i] = q->x[i] * s->span[i % TG_NU];
     park(c, last, c->best);
     if (s->linear) {
-        follow_gains(c, guess);
+        follow_gains(c, guess, c->best, c->y_best, TG_NY, 1); /* of a linear plant */
         find_broken(c);
         return c->qp_status;
     }
