@@ -70,9 +70,9 @@ CASES = (
     Case("lag +15 s", Truth(sensor_lag=15.0), True, 1.0),
     Case("second layer inside", Truth(layer=15.0), True),
     Case("second layer outside", Truth(layer=5.0, outside=True), True),
-    Case("fouling 5 % a minute", Truth(fouling=0.05)),
+    Case("fouling 5 % a minute", Truth(fouling=0.05), True),
     Case("dead zone 0.3 A", Truth(dead_zone=0.3), True),
-    Case("Peltier fades by 17 %", Truth(fading=0.17)),
+    Case("Peltier fades by 17 %", Truth(fading=0.17), True),
 )
 
 
