@@ -14,10 +14,10 @@ to 38 and then to 23 degC, ten minutes each, with 0.02 degC of noise on every se
   eight): the furnace of ``truths.py``, which radiates, with a linear model of it and three of its outputs
   controlled, from 23 to 150 and to 180 degC, within 1 degC.
 
-Figures are of what the sensors of controlled outputs show without noise, worst of the seeds: overshoot beyond
-a target, mean error of the last tenth of a target's time, the longest time to stay within 0.25 degC, shares of
-samples by status; of targets out of reach, when that was reported first, for how many samples after it was not,
-and by how much the reported value is off.
+Figures are of what the sensors of controlled outputs show without noise, worst of the seeds: overshoot
+beyond a target, mean error of the last tenth of a target's time, the longest time to stay within 0.25 degC,
+shares of samples by status; of targets out of reach, when that was reported first, for how many samples after
+it was not, and by how much the reported value is off.
 """
 
 from __future__ import annotations
