@@ -66,6 +66,7 @@ _LAG, _SLOW, _ZONE = 0.5, 6.0, 0.02  # apparent delays, apparent delays, of a dr
 _TRIED = 0.3  # standard deviations, of a difference quotient
 _SHORTEST, _LONG = 2, 4  # windows in which a plant may change
 _CHANGE, _UNCHANGED, _PIECES = 0.05, 0.01, 8  # tried change; tolerated one; steps of its ramp
+_SOLVABLE = 1e9  # degC, or standard deviations: a run beyond diverges
 _CHANGES, _MOST_CHANGE = 6.0, 0.5  # standard deviations; of itself
 _MEND = "identify the plant anew"
 
@@ -240,10 +241,12 @@ class StructureMonitor:
         ramp = np.linspace(0.0, _CHANGE, N)[:, None] * np.eye(n_u)[:, None]
         drives = np.concatenate([np.repeat(found.drives[None], n_t, axis=0), found.drives * (1 + ramp)])
         drifting = np.vstack([np.diag(by), np.zeros((n_u, n_t))])
-        base = found.run(found.z[None], found.drives[None], np.zeros((1, n_t)))
-        made = found.run(np.repeat(found.z[None], n_t + n_u, axis=0), drives, drifting) - base
-        a = made[:, self.model.sub :: self.model.sub]
-        honest = self._structures(found, rows, length)
+        with np.errstate(all="ignore"):
+            base = found.run(found.z[None], found.drives[None], np.zeros((1, n_t)))
+            made = found.run(np.repeat(found.z[None], n_t + n_u, axis=0), drives, drifting) - base
+            a, honest = made[:, self.model.sub :: self.model.sub], self._structures(found, rows, length)
+        if not (np.abs(a).max() < _SOLVABLE and np.abs(honest).max() < _SOLVABLE):
+            return None
         tolerated = np.array([one.tolerated for one in self.bank])[:, None]
         known = np.vstack([found.J, tolerated * (honest * found.weight).reshape(len(honest), -1)])
         return self._tested(self.changes, found, known, a)
@@ -288,7 +291,7 @@ class StructureMonitor:
                 at_rows = shown[:, model.sub :: model.sub]
                 J = ((at_rows[1:] - at_rows[0]) * weight / _TRIED).reshape(m, -1)
                 r = ((seen - at_rows[0]) * weight).ravel() + z @ J
-                if not (np.isfinite(J).all() and np.isfinite(r).all()):
+                if not (np.abs(J).max() < _SOLVABLE and np.abs(r).max() < _SOLVABLE):
                     return None
                 last, z = z, np.linalg.solve(J @ J.T + np.eye(m), J @ r)
         return _Fitted(run, last, J, r, shown[0], weight, u)
