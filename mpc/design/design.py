@@ -300,7 +300,7 @@ class Design:
     @property
     def in_python_alone(self) -> tuple[str, ...]:
         """What of it the C has not."""
-        return tuple(name for name in ("zones", "hard", "energy_price", "ramp_per_s") if getattr(self, name))
+        return tuple(name for name in ("tariff", "ramp_per_s") if getattr(self, name))
 
     @property
     def horizon_s(self) -> float:
