@@ -54,6 +54,7 @@ ALL = [
     Benchmark("mpc/twenty_plants.py", quick="--plants 2"),
     Benchmark("mpc/call_periods.py", quick="--draws 0 --controllers MPC"),
     Benchmark("control/mismatch.py", quick="--seeds 4 --only delay"),
+    Benchmark("control/detectable.py"),
     Benchmark("control/faults.py", quick="--seeds 4"),
     Benchmark("control/ten_plants.py", quick="--plants tclab --without do-mpc"),
     Benchmark("classify/engine.py", quick="--grasps 5"),

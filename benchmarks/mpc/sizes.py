@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from thermogrip.mpc.controllers.mpc import Controller
-from thermogrip.mpc.design.design import Design, default_design, make_blocks
+from thermogrip.mpc.design.design import MOST_UNKNOWNS, Design, default_design, make_blocks
 from thermogrip.mpc.native.runtime import CompiledController, CompiledOptimiser
 from thermogrip.mpc.optimiser.rti import Optimiser, Outcome, Sample
 from thermogrip.sysid.models.state_space import StateSpaceModel
@@ -157,22 +157,49 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--peer", action="store_true", help="do-mpc beside, at N = 50")
+    parser.add_argument("--peer", action="store_true", help="do-mpc beside, where each sample is a block")
+    parser.add_argument("--states", default=",".join(map(str, STATES)), help="by commas")
     parser.add_argument("--markdown", type=Path, help="also write the table here")
     given = parser.parse_args()
-    columns = ("step, C", "program, C", "program, Python", "DAQP's solve")
-    lines = [f"| states | N | blocks | {' | '.join(columns)} | do-mpc |", "|---" * (len(columns) + 4) + "|"]
-    cases = [(n, 50, blocks) for n in STATES for blocks in (50, 10)]
-    cases += [(16, N, blocks) for N in HORIZONS if N != 50 for blocks in (N, 10) if N * (blocks > 10) < 200]
-    for n, N, blocks in cases:
+    columns = ("step, C", "program, C", "program, Python", "DAQP's solve", "do-mpc")
+    lines = [f"| states | N | blocks | {' | '.join(columns)} |", "|---" * (len(columns) + 3) + "|"]
+    print(*lines, sep="\n")
+    medians: dict[tuple[int, int, str, str], float] = {}
+    sizes = [int(n) for n in given.states.split(",")]
+    for n, N, kind in ((n, N, kind) for n in sizes for N in HORIZONS for kind in ("N", "10")):
+        blocks = N if kind == "N" else 10
+        if blocks > MOST_UNKNOWNS:
+            continue
         found = ours(n, N, blocks)
-        other = peer(n, N) if given.peer and N == blocks == 50 else None
-        cells = [*(found[key] for key in columns), other]
-        texts = ["" if cell is None else f"{cell[0]:.3f}, {cell[1]:.2f}" for cell in cells]
+        if given.peer and kind == "N":
+            found["do-mpc"] = peer(n, N)
+        medians |= {(n, N, kind, key): value for key, (value, _) in found.items()}
+        texts = [f"{found[key][0]:.3f}, {found[key][1]:.2f}" if key in found else "" for key in columns]
         lines.append(f"| {n} | {N} | {blocks} | {' | '.join(texts)} |")
         print(lines[-1], flush=True)
+    grown = exponents(medians, columns)
+    print(*grown, sep="\n")
     if given.markdown is not None:
-        given.markdown.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        given.markdown.write_text("\n".join([*lines, *grown]) + "\n", encoding="utf-8")
+
+
+def exponents(medians: dict[tuple[int, int, str, str], float], columns: Sequence[str]) -> list[str]:
+    """Return lines of how medians by (states, N, kind of blocks, column) grow with N and with the states."""
+    lines = ["", f"| grows with | at | blocks | {' | '.join(columns)} |", "|---" * (len(columns) + 3) + "|"]
+    for place, name, at in ((1, "N", "states"), (0, "states", "N")):
+        for fixed, kind in sorted({(key[1 - place], key[2]) for key in medians}):
+            cells = []
+            for column in columns:
+                seen = [
+                    (key[place], value)
+                    for key, value in medians.items()
+                    if (key[1 - place], key[2], key[3]) == (fixed, kind, column)
+                ]
+                slope = np.polyfit(*np.log(np.array(seen).T), 1)[0] if len(seen) > 2 else np.nan
+                cells.append(f"{slope:.2f}" if np.isfinite(slope) else "")
+            if any(cells):
+                lines.append(f"| {name} | {fixed} {at} | {kind} | {' | '.join(cells)} |")
+    return lines
 
 
 if __name__ == "__main__":

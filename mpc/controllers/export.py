@@ -81,7 +81,7 @@ class Agreement:
 def export_controller(controller: Controller, folder: str | Path, *, arduino: bool = False) -> Export:
     """Write a controller as C99 into a folder, made where absent; files of the same names are replaced.
 
-    What the C has not (zones, prices, ramps, hard limits) is a UserError. With ``arduino`` the folder is a
+    What the C has not (a tariff, ramps) is a UserError. With ``arduino`` the folder is a
     library of the Arduino IDE, its example a loop to fill in.
     """
     if alone := controller.design.in_python_alone:
@@ -241,8 +241,8 @@ def _twin(controller: Controller) -> _Twin:
     """Return the controller with the C's own method for its program, and a clock that only states move."""
     design: Design = replace(controller.design, deadline_s=1.0)
     twin = _Twin(controller.plant, design, clock=_Clock())
-    soft = twin.optimiser.qp.soft
-    twin.optimiser.qp = ActiveSetQP(soft=soft, linear=design.price, quadratic=2 * design.price)
+    qp = twin.optimiser.qp
+    twin.optimiser.qp = ActiveSetQP(soft=qp.soft, linear=qp.linear, quadratic=qp.quadratic)
     # the C's own start, too: the other takes longer than a step, and each state brings its own estimate
     vars(twin.observer)["reset"] = twin.observer.reset_in_room
     return twin

@@ -9,22 +9,34 @@ steps may be short.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc.interface import STATUSES
+from thermogrip.mpc.design.design import Design
+from thermogrip.mpc.interface import STATUSES, Regulator
+from thermogrip.mpc.plant.prediction import PredictionModel
 from thermogrip.sysid.export.fmu import Port, fmu_path, write_fmu
-
-if TYPE_CHECKING:
-    from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.sysid.plant.plant import Plant
 
 TARGET = "target_"  # with the name of an output
+
+
+class Exportable(Regulator, Protocol):
+    """What an FMU is made of: a controller with its plant, its design, and what its file has."""
+
+    model: PredictionModel
+    plant: Plant
+    design: Design
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what its file has."""
+        ...
 
 
 class Core:
     """A controller that is stepped from outside."""
 
-    def __init__(self, controller: Controller) -> None:
+    def __init__(self, controller: Exportable) -> None:
         self.controller, model = controller, controller.model
         usual = dict(zip(model.outputs, model.usual(controller.design.ambient).tolist(), strict=True))
         self._readings = usual | dict.fromkeys(model.disturbances, controller.design.ambient)
@@ -78,14 +90,7 @@ class Core:
         return self._readings | self._targets
 
 
-def core_of(path: Path) -> Any:
-    """Return the core of the controller in a JSON file of ``Controller.save``."""
-    from thermogrip.mpc.controllers.mpc import Controller
-
-    return Core(Controller.load(path))
-
-
-def to_fmu(controller: Controller, path: str | Path) -> Path:
+def to_fmu(controller: Exportable, path: str | Path) -> Path:
     """Write a controller as an FMU; see :meth:`thermogrip.mpc.controllers.mpc.Controller.to_fmu`."""
     target = fmu_path(path, controller.plant)
     taken = {"pump", "status"} & {*controller.model.outputs, *controller.model.disturbances}
@@ -93,6 +98,5 @@ def to_fmu(controller: Controller, path: str | Path) -> Path:
         raise UserError(
             f"an FMU has a variable {min(taken)} of its own", hint="give that column another name"
         )
-    return write_fmu(
-        target, controller.to_dict(), "thermogrip.mpc.controllers.fmu", "a controller tuned by thermogrip"
-    )
+    runs = "thermogrip.mpc.controllers.fmu_runtime"
+    return write_fmu(target, controller.to_dict(), runs, "a controller tuned by thermogrip")

@@ -48,7 +48,10 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "weight": (False, ("NC",), "how many times the error of each controlled output counts"),
     "move": (False, (), ""),
     "drive": (False, (), ""),
-    "price": (False, (), "of a broken soft row"),
+    "price": (False, (), "of an output in the overshoot band"),
+    "dear": (False, ("NL",), "of one beyond its limits"),
+    "zone": (False, ("NC",), "half width about a target in which an output may be anywhere, 0: none"),
+    "energy": (False, ("NU",), "of a sample at full drive"),
     "overshoot": (False, (), "band beyond the target [degC]"),
     "patience_s": (False, (), "how long a plan is followed without a solve [s]"),
     "ambient": (False, (), "room where none is measured [degC]"),
@@ -195,7 +198,10 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
     same_names = (
         (model, "sub dt span C spike coldest hottest"),
         (design, "move_delay iterations blocks track terminal move drive price overshoot patience_s ambient"),
-        (optimiser, "weight pair strongest seen reach lowest highest slew neutral safe at_rest"),
+        (
+            optimiser,
+            "weight pair strongest seen reach lowest highest slew neutral safe at_rest dear zone energy",
+        ),
         (observer, "fixed offset R Q P0 R_start"),
         (disturbance, "on_drive on_disturbance on_output"),
     )
@@ -257,7 +263,7 @@ def _controller_parts(s: Sizes) -> list[tuple[Any, int]]:
         (whole, z),
         *((number, count) for count in (3, s.NU, s.NX, s.NG, s.NY, 9)),
         (whole, 2),
-        *((number, count) for count in (s.ND, s.NY, s.NU, s.NU, s.NC, s.NC, s.NH * s.NU, s.NC, 2)),
+        *((number, count) for count in (s.ND, s.NY, s.NU, s.NU, s.NC, s.NC, s.NC, s.NH * s.NU, s.NC, 2)),
         *((number, count) for count in (s.NY, s.NY, s.NX, s.NC, 1)),
         *((number, count) for count in (s.NX, s.NU, 1)),
         (whole, 3),
@@ -279,10 +285,10 @@ def _qp_parts(s: Sizes) -> list[tuple[Any, int]]:
     n, soft = s.NB * s.NU, s.NH * s.NS
     rows = 2 * n + soft
     return [
-        (whole, 3),
+        (whole, 4),
         *((number, count) for count in (n * n, n, 2 * rows, soft * n)),
         (whole, soft),
-        (number, 2),
+        *((number, count) for count in (max(1, s.NS), max(1, s.NS), 1)),
         (whole, 2),
         (ctypes.c_void_p, 2),
         (number, n),

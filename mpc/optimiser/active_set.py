@@ -29,14 +29,15 @@ class _Entry:
 
 
 class ActiveSetQP(CondensedQP):
-    """The same program, with one penalty for all soft rows; always cold."""
+    """The same program, always cold; a penalty a row, or one for all."""
 
-    def __init__(self, *, soft: Mask, linear: float, quadratic: float, iteration_limit: int = 500) -> None:
+    def __init__(
+        self, *, soft: Mask, linear: Array | float, quadratic: Array | float, iteration_limit: int = 500
+    ) -> None:
         rows = np.ones(len(soft))
         super().__init__(
             soft=soft, linear=linear * rows, quadratic=quadratic * rows, iteration_limit=iteration_limit
         )
-        self._linear, self._quadratic = linear, quadratic
 
     def _solve(self, H: Array, f: Array, A: Array, lower: Array, upper: Array) -> QPAnswer:
         length = np.linalg.norm(A / np.sqrt(np.diag(H)), axis=1)
@@ -69,8 +70,8 @@ class ActiveSetQP(CondensedQP):
         right = -np.array([self._bound(entry) for entry in self._set]) - m @ self._c
         for at, entry in enumerate(self._set):
             if entry.state == _BROKEN:
-                K[at, at] += 1.0 / self._quadratic
-                right[at] += self._linear / self._quadratic
+                K[at, at] += 1.0 / self.quadratic[entry.row]
+                right[at] += self.linear[entry.row] / self.quadratic[entry.row]
         return K, right
 
     def _bound(self, entry: _Entry) -> float:
@@ -85,8 +86,8 @@ class ActiveSetQP(CondensedQP):
         slack = 1e-13 * float(np.max(np.abs(wanted)))
         share, which, upward = 1.0, -1, False
         for at, (entry, there) in enumerate(zip(self._set, wanted.tolist())):
-            low = self._linear if entry.state == _BROKEN else 0.0
-            high = self._linear if entry.state == _KEPT else np.inf
+            low = self.linear[entry.row] if entry.state == _BROKEN else 0.0
+            high = self.linear[entry.row] if entry.state == _KEPT else np.inf
             here = entry.multiplier
             if there < low - slack:
                 part = (here - low) / (here - there) if here > low else 0.0
@@ -104,9 +105,9 @@ class ActiveSetQP(CondensedQP):
         """Let an entry that has reached the end of its state leave, or go on in the next one."""
         entry = self._set.pop(at)
         if entry.state == _KEPT and upward:
-            self._set.append(_Entry(entry.row, entry.side, _BROKEN, self._linear))
+            self._set.append(_Entry(entry.row, entry.side, _BROKEN, self.linear[entry.row]))
         elif entry.state == _BROKEN:
-            self._set.append(_Entry(entry.row, entry.side, _KEPT, self._linear))
+            self._set.append(_Entry(entry.row, entry.side, _KEPT, self.linear[entry.row]))
 
     def _answer(self) -> Array:
         v = -self._c.copy()
@@ -133,7 +134,7 @@ class ActiveSetQP(CondensedQP):
             rest = np.array([e.side * (self._A[e.row] @ x) - self._bound(e) for e in self._set])
             for at, entry in enumerate(self._set):
                 if entry.state == _BROKEN:
-                    rest[at] -= (entry.multiplier - self._linear) / self._quadratic
+                    rest[at] -= (entry.multiplier - self.linear[entry.row]) / self.quadratic[entry.row]
             for entry, more in zip(self._set, np.linalg.solve(self._system()[0], rest).tolist()):
                 entry.multiplier += more
             x = self._answer()

@@ -128,7 +128,7 @@ class Optimiser:
         safe = [design.safe_drive.get(name, rest) for name, rest in zip(model.drives, self.neutral)]
         self.safe = np.array(safe, dtype=float)
         self.zone = np.array([design.zones.get(name, 0.0) for name in design.controlled])
-        self._price = np.array([design.energy_price.get(name, 0.0) for name in model.drives])
+        self.energy = np.array([design.energy_price.get(name, 0.0) for name in model.drives])
         self._begins = np.cumsum(self.blocks) - np.array(self.blocks)
         self._costs: Array | None = None  # (n_b, n_u) of this sample's energy, in ranges of the drives
         self.at_rest = self._response_at_rest()
@@ -137,9 +137,9 @@ class Optimiser:
         self.seen = np.abs(self.at_rest) > 0.02 * np.max(np.abs(self.at_rest), axis=0)
         # price of a unit beyond each soft row, of each controlled output and each limit
         dear = [_DEAR if name in design.hard else 1.0 for name in design.limits]
-        self._dear = design.price * np.array(dear)
+        self.dear = design.price * np.array(dear)
         own = np.where(self.zone[:, None] > 0, self.weight[:, None] * self._weight, design.price)
-        prices = np.concatenate([np.full(2 * n, design.price), own.ravel(), np.repeat(self._dear, self.N)])
+        prices = np.concatenate([np.full(2 * n, design.price), own.ravel(), np.repeat(self.dear, self.N)])
         self.qp = CondensedQP(
             soft=np.arange(prices.size) >= 2 * n,
             linear=prices,
@@ -162,9 +162,9 @@ class Optimiser:
         if ahead is not None:  # nothing is beyond a target that moves
             side = np.zeros(len(now))
         self._costs = None
-        if self._price.any():
+        if self.energy.any():
             dear = np.ones(self.N) if tariff is None else tariff
-            self._costs = np.add.reduceat(dear, self._begins)[:, None] * self._price
+            self._costs = np.add.reduceat(dear, self._begins)[:, None] * self.energy
         guess = self._park(guess, last, more)
         y0, G = model.trajectory(x, guess + drive_bias, d, self.blocks)
         linear = model.affine is not None
@@ -328,8 +328,8 @@ class Optimiser:
             if side[at]:
                 over.append((design.price, side[at] * error - design.overshoot))
         for at, row in enumerate(self._limited):
-            over.append((self._dear[at], self._limits[at, 0] - y[:, :, row]))
-            over.append((self._dear[at], y[:, :, row] - self._limits[at, 1]))
+            over.append((self.dear[at], self._limits[at, 0] - y[:, :, row]))
+            over.append((self.dear[at], y[:, :, row] - self._limits[at, 1]))
         for price, beyond in over:
             slack = np.maximum(0.0, beyond)
             cost += price * np.sum(slack + slack**2, axis=1)

@@ -32,7 +32,6 @@ from thermogrip.mpc.controllers.linear_equivalent import LinearLaw, linear_law, 
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.spec import Spec, spec_from_dict
 from thermogrip.mpc.estimator.observer import choose_disturbances, detectability_margin
-from thermogrip.mpc.interface import Move, Readings, Trajectory
 from thermogrip.mpc.native.design_struct import ITERATION_LIMIT
 from thermogrip.mpc.optimiser.rti import Optimiser
 from thermogrip.mpc.plant.prediction import PredictionModel, holding_drive, steady_curve, step_response
@@ -181,16 +180,10 @@ class _Counted(Controller):
 
     iterations: tuple[int, ...] = ()
 
-    def step(
-        self,
-        reading: Readings,
-        target: Trajectory,
-        *,
-        coming: Mapping[str, Sequence[float]] | None = None,
-    ) -> Move:
-        move = super().step(reading, target, coming=coming)
+    def _decide(self, wanted: Array, started: float) -> tuple[Array, str, str]:
+        answer = super()._decide(wanted, started)
         self.iterations += (self.last_iterations,)
-        return move
+        return answer
 
 
 def _effort(controller: Controller, span: tuple[float, float]) -> list[Check]:

@@ -234,8 +234,9 @@ def test_energy_of_a_drive_that_goes_both_ways_has_no_price():
 
 
 def test_what_the_c_has_not_is_not_exported_and_no_linear_system(tmp_path):
-    controller = heater(zones={"t": 1.0}, energy_price={"q": 1.0}, ramp_per_s={"t": 0.1})
-    with pytest.raises(UserError, match="the exported C has no zones, no energy_price, no ramp_per_s"):
+    wishes = {"zones": {"t": 1.0}, "energy_price": {"q": 1.0}, "tariff": ((0.0, 1.0), (600.0, 3.0))}
+    controller = heater(**wishes, ramp_per_s={"t": 0.1})
+    with pytest.raises(UserError, match="the exported C has no tariff, no ramp_per_s"):
         export_controller(controller, tmp_path / "c")
     assert not (tmp_path / "c").exists()
     with pytest.raises(UserError, match="zones: a controller that may rest anywhere"):

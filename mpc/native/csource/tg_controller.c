@@ -540,13 +540,35 @@ static double beyond_own_limit(const tg_controller *c, int r)
     return beyond;
 }
 
+/* In place of targets with zones what of them is nearest to the end of the plan; the targets into kept. */
+static void aim(tg_controller *c, double *kept)
+{
+    const tg_design *s = c->design;
+    int other = 0;
+    memcpy(kept, c->target, sizeof c->target);
+    for (int r = 0; r < s->n_c; r++) {
+        double end = c->y_best[(s->N - 1) * TG_NY + s->controlled[r]], zone = s->zone[r];
+        if (zone > 0.0)
+            c->target[r] = fmin(fmax(end, c->target[r] - zone), c->target[r] + zone);
+        other = other || (zone > 0.0 && c->target[r] != c->aim[r]);
+        c->aim[r] = c->target[r];
+    }
+    if (other) {
+        c->in = c->unreachable = 0;
+        c->miss_sum = 0.0;
+    }
+}
+
 /* Whether a target cannot be held: by how much it is missed [degC], 0 where all can. */
 static double missed_by(tg_controller *c)
 {
     const tg_design *s = c->design;
-    double limit = c->unreachable ? CAN : CANNOT, held[TG_NC] = {0.0}, by_w[TG_NC * TG_SOME(TG_NW)] = {0.0};
+    double limit, held[TG_NC] = {0.0}, by_w[TG_NC * TG_SOME(TG_NW)] = {0.0};
     double d[TG_SOME(TG_ND)] = {0.0}, on_u[TG_NU], on_y[TG_NY], scaled = -1.0, worst = 0.0, inflation = 1.0;
+    double kept[TG_NC];
     int away = 0, out = 0, alarm = 0, lost = 0;
+    aim(c, kept);
+    limit = c->unreachable ? CAN : CANNOT;
     record_relaxation(c);
     for (int r = 0; r < s->n_c; r++)
         away = away || (!(c->unread_s[r] > 0.0) &&
@@ -589,6 +611,7 @@ static double missed_by(tg_controller *c)
     }
     if (!lost)
         c->miss_sum = fmin(fmax(0.0, c->miss_sum + fmin(scaled, MISS_CLIP) - MISS_ALLOWANCE), MISS_ALARM);
+    memcpy(c->target, kept, sizeof kept);
     c->in = c->unreachable && !out && !lost ? c->in + 1 : 0;
     c->unreachable = c->unreachable ? c->in < TAKE_BACK : c->miss_sum >= MISS_ALARM || alarm;
     return c->unreachable ? fmax(worst, TINY) : 0.0;

@@ -146,11 +146,11 @@ static double merit(const tg_controller *c, const double *plan, const double *y,
     double cost = 0.0, over = 0.0;
     for (int b = 0; b < s->n_b; b++)
         for (int j = 0; j < TG_NU; j++) {
-            double value = plan[b * TG_NU + j];
+            double value = plan[b * TG_NU + j], energy = s->energy[j] * s->blocks[b];
             double step = (value - (b ? plan[(b - 1) * TG_NU + j] : last[j])) / s->span[j];
             cost += c->caution * s->move * step * step;
             value /= s->span[j];
-            cost += s->drive * value * value * s->blocks[b];
+            cost += s->drive * value * value * s->blocks[b] + energy * value;
         }
     for (int k = 0; k < s->N; k++) {
         const double *row = y + k * TG_NY;
@@ -160,6 +160,11 @@ static double merit(const tg_controller *c, const double *plan, const double *y,
             double slack = side[r] != 0.0 ? side[r] * error - s->overshoot : 0.0;
             if (c->lost[r])
                 continue;
+            if (s->zone[r] > 0.0) {
+                slack = fmax(fabs(error) - s->zone[r], 0.0);
+                cost += s->weight[r] * weight * (slack + slack * slack);
+                continue;
+            }
             cost += s->weight[r] * weight * error * error;
             if (slack > 0.0)
                 over += slack + slack * slack;
@@ -167,9 +172,9 @@ static double merit(const tg_controller *c, const double *plan, const double *y,
         for (int r = 0; r < s->n_l; r++) {
             double value = row[s->limited[r]], low = s->limit_low[r] - value, high = value - s->limit_high[r];
             if (low > 0.0)
-                over += low + low * low;
+                cost += s->dear[r] * (low + low * low);
             if (high > 0.0)
-                over += high + high * high;
+                cost += s->dear[r] * (high + high * high);
         }
     }
     return cost + s->price * over;
@@ -214,11 +219,11 @@ static void set_bounds(tg_controller *c, const double *guess, const double *driv
         }
 }
 
-/* Weight of a controlled output in sample k; 0 where it is lost. */
+/* Weight of the error of a controlled output in sample k; 0 where it is lost, or has a zone. */
 static double weight_of(const tg_controller *c, int k, int r)
 {
     const tg_design *s = c->design;
-    return c->lost[r] ? 0.0 : 2.0 * s->weight[r] * (s->track + (k == s->N - 1 ? s->terminal : 0.0));
+    return c->lost[r] || s->zone[r] > 0.0 ? 0.0 : 2.0 * s->weight[r] * (s->track + (k == s->N - 1 ? s->terminal : 0.0));
 }
 
 static void set_linear_cost(tg_controller *c, const double *target, const double *last)
@@ -227,6 +232,8 @@ static void set_linear_cost(tg_controller *c, const double *target, const double
     tg_qp *q = &c->qp;
     int k = 0;
     memset(q->f, 0, sizeof q->f);
+    for (int i = 0; i < q->n; i++)
+        q->f[i] = s->energy[i % TG_NU] * s->blocks[i / TG_NU];
     for (int b = 0; b < s->n_b; b++)
         for (int at = 0; at < s->blocks[b]; at++, k++)
             for (int r = 0; r < s->n_c; r++) {
@@ -286,6 +293,9 @@ static void set_soft_rows(tg_controller *c, const double *target, const double *
                 if (r >= s->n_c) {
                     low = s->limit_low[r - s->n_c];
                     high = s->limit_high[r - s->n_c];
+                } else if (s->zone[r] > 0.0) {
+                    low = c->lost[r] ? low : goal(c, target, k, r) - s->zone[r];
+                    high = c->lost[r] ? high : goal(c, target, k, r) + s->zone[r];
                 } else if (side[r] < 0.0)
                     low = goal(c, target, k, r) - s->overshoot;
                 else if (side[r] > 0.0)
@@ -299,7 +309,9 @@ static void set_soft_rows(tg_controller *c, const double *target, const double *
             }
 }
 
-static void find_free(tg_controller *c, const double *guess)
+/* The outputs that count, by the gains under another plan than the guess, k rows of across numbers each. */
+static void follow_gains(const tg_controller *c, const double *guess, const double *plan, double *out, int across,
+                         int as_outputs)
 {
     const tg_design *s = c->design;
     int k = 0, rows = s->n_c + s->n_l;
@@ -307,10 +319,10 @@ static void find_free(tg_controller *c, const double *guess)
         for (int at = 0; at < s->blocks[b]; at++, k++)
             for (int r = 0; r < rows; r++) {
                 const double *g = c->G + ((size_t)k * TG_NS + (size_t)r) * TG_Q_N;
-                double sum = c->y_guess[k * TG_NY + row_of(s, r)];
+                double y = c->y_guess[k * TG_NY + row_of(s, r)];
                 for (int i = 0; i < (b + 1) * TG_NU; i++)
-                    sum -= g[i] * guess[i] / s->span[i % TG_NU];
-                c->free[k * TG_NS + r] = sum;
+                    y += g[i] * (plan[i] - guess[i]) / s->span[i % TG_NU];
+                out[k * across + (as_outputs ? row_of(s, r) : r)] = y;
             }
 }
 
@@ -366,20 +378,15 @@ static void find_broken(tg_controller *c)
         }
 }
 
-/* The outputs of a linear plant under the best plan; G has rows of those that count alone, and no other is used. */
-static void follow_gains(tg_controller *c, const double *guess)
+static void set_prices(const tg_design *s, tg_qp *q)
 {
-    const tg_design *s = c->design;
-    int k = 0, rows = s->n_c + s->n_l;
-    for (int b = 0; b < s->n_b; b++)
-        for (int at = 0; at < s->blocks[b]; at++, k++)
-            for (int r = 0; r < rows; r++) {
-                const double *g = c->G + ((size_t)k * TG_NS + (size_t)r) * TG_Q_N;
-                double *y = c->y_best + k * TG_NY + row_of(s, r);
-                *y = c->y_guess[k * TG_NY + row_of(s, r)];
-                for (int i = 0; i < (b + 1) * TG_NU; i++)
-                    *y += g[i] * (c->best[i] - guess[i]) / s->span[i % TG_NU];
-            }
+    q->per = s->n_c + s->n_l;
+    q->ratio = 2.0;
+    for (int r = 0; r < q->per; r++) {
+        int zone = r < s->n_c && s->zone[r] > 0.0;
+        q->price[r] = r >= s->n_c ? s->dear[r - s->n_c] : zone ? s->weight[r] * s->track : s->price;
+        q->at_end[r] = zone ? s->weight[r] * (s->track + s->terminal) : q->price[r];
+    }
 }
 
 int tg_optimise(tg_controller *c, const double *x, const double *last, const double *start, const double *d,
@@ -387,13 +394,12 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
 {
     const tg_design *s = c->design;
     tg_qp *q = &c->qp;
-    double at_guess, cost, guess[TG_Q_N], side[TG_NC];
+    double at_guess, cost, guess[TG_Q_N], side[TG_NC], none[TG_Q_N] = {0.0};
     int uphill;
     q->n = s->n_b * TG_NU;
     q->stride = TG_NU;
     q->s = s->N * (s->n_c + s->n_l);
-    q->linear = s->price;
-    q->quadratic = 2.0 * s->price;
+    set_prices(s, q);
     q->iteration_limit = s->iteration_limit;
     q->late = c->late;
     q->about = c->about;
@@ -408,7 +414,7 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
         find_authority(c);
         c->has_gains = s->linear;
     }
-    find_free(c, guess);
+    follow_gains(c, guess, none, c->free, TG_NS, 0); /* the response without any plan */
     q->kept = is_kept(c);
     if (!q->kept)
         set_quadratic_cost(c);
@@ -427,7 +433,7 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
         c->best[i] = q->x[i] * s->span[i % TG_NU];
     park(c, last, c->best);
     if (s->linear) {
-        follow_gains(c, guess);
+        follow_gains(c, guess, c->best, c->y_best, TG_NY, 1); /* of a linear plant */
         find_broken(c);
         return c->qp_status;
     }

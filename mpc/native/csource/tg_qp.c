@@ -167,6 +167,13 @@ static void make_normal(const tg_qp *q, int row, int side, double *m)
     forward(q, m, from);
 }
 
+/* The price of breaking a soft row. */
+static double price_of(const tg_qp *q, int row)
+{
+    int at = row - 2 * q->n;
+    return at >= q->s - q->per ? q->at_end[at % q->per] : q->price[at % q->per];
+}
+
 /* Set the right side of a row in the set from its bound and its state. */
 static void set_right(tg_qp *q, int i)
 {
@@ -175,7 +182,7 @@ static void set_right(tg_qp *q, int i)
     double sum = -bound;
     for (int j = 0; j < q->n; j++)
         sum -= m[j] * q->c[j];
-    q->right[i] = sum + (q->state[i] == 2 ? q->linear / q->quadratic : 0.0);
+    q->right[i] = sum + (q->state[i] == 2 ? 1.0 / q->ratio : 0.0);
 }
 
 /* Append the factor's row i, whose normal is in place. */
@@ -186,7 +193,7 @@ static void append_fit(tg_qp *q, int i)
     double left = 0.0;
     for (int j = 0; j < q->n; j++)
         left += m[j] * m[j];
-    left += REGULAR * left + (q->state[i] == 2 ? 1.0 / q->quadratic : 0.0);
+    left += REGULAR * left + (q->state[i] == 2 ? 1.0 / (q->ratio * price_of(q, q->row[i])) : 0.0);
     for (int k = 0; k < i; k++) {
         const double *other = q->normal + (size_t)k * TG_Q_N;
         double sum = 0.0;
@@ -259,8 +266,8 @@ static void drop(tg_qp *q, int r)
     q->n_work--;
 }
 
-static double least(const tg_qp *q, int state) { return state == 2 ? q->linear : 0.0; }
-static double most(const tg_qp *q, int state) { return state == 1 ? q->linear : HUGE_VAL; }
+static double least(const tg_qp *q, int i) { return q->state[i] == 2 ? price_of(q, q->row[i]) : 0.0; }
+static double most(const tg_qp *q, int i) { return q->state[i] == 1 ? price_of(q, q->row[i]) : HUGE_VAL; }
 
 /* Take a row into the set. */
 static void put(tg_qp *q, int row, int side, int state, double multiplier)
@@ -282,9 +289,9 @@ static void change(tg_qp *q, int r, int upward)
     int row = q->row[r], side = q->side[r], state = q->state[r];
     drop(q, r);
     if (state == 1 && upward)
-        put(q, row, side, 2, q->linear);
+        put(q, row, side, 2, price_of(q, row));
     if (state == 2)
-        put(q, row, side, 1, q->linear);
+        put(q, row, side, 1, price_of(q, row));
 }
 
 /* Replace b by the solution of K z = b, by the factor. */
@@ -329,7 +336,7 @@ static int go(tg_qp *q, int *upward)
     for (int i = 0; i < q->n_work; i++)
         scale = fmax(scale, fabs(q->wanted[i]));
     for (int i = 0; i < q->n_work; i++) {
-        double low = least(q, q->state[i]), high = most(q, q->state[i]), slack = 1e-13 * scale;
+        double low = least(q, i), high = most(q, i), slack = 1e-13 * scale;
         double there = q->wanted[i], here = q->multiplier[i], part = 1.0;
         if (there < low - slack)
             part = here > low ? (here - low) / (here - there) : 0.0;
@@ -403,7 +410,7 @@ static int refine(tg_qp *q)
         double bound = q->side[i] > 0 ? q->upper[q->row[i]] : -q->lower[q->row[i]];
         q->wanted[i] = value - bound; /* of a kept row it is 0, of a broken one what its multiplier pays */
         if (q->state[i] == 2)
-            q->wanted[i] -= (q->multiplier[i] - q->linear) / q->quadratic;
+            q->wanted[i] -= (q->multiplier[i] - price_of(q, q->row[i])) / (q->ratio * price_of(q, q->row[i]));
     }
     solve_fit(q, q->wanted);
     for (int i = 0; i < q->n_work; i++)

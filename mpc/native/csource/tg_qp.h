@@ -1,6 +1,6 @@
 /* A quadratic program with few unknowns, by a dual active-set method; no malloc.
  *
- *   minimise    1/2 x'Hx + f'x + sum over soft rows ( linear s + 1/2 quadratic s^2 )
+ *   minimise    1/2 x'Hx + f'x + sum over soft rows price (s + 1/2 ratio s^2)
  *   subject to  lower <= x <= upper                   rows 0 .. n-1, hard
  *               lower <= x_i - x_(i-stride) <= upper  rows n .. 2n-1, hard; x_(negative) is 0
  *               lower - s <= A x <= upper + s, s >= 0 rows 2n .. 2n+s-1, soft
@@ -27,13 +27,14 @@ enum tg_qp_status {
 
 typedef struct {
     /* the problem */
-    int n, stride, s;
+    int n, stride, s, per; /* per: soft rows in a sample */
     double H[TG_Q_N * TG_Q_N]; /* lower triangle, rows of TG_Q_N; its Cholesky factor afterwards */
     double f[TG_Q_N];
     double lower[TG_Q_M], upper[TG_Q_M]; /* beyond +-1e15: none */
     double A[TG_Q_S > 0 ? TG_Q_S * TG_Q_N : 1];
     int filled[TG_Q_S > 0 ? TG_Q_S : 1]; /* entries of a soft row before its trailing zeros */
-    double linear, quadratic;
+    double price[TG_NS > 0 ? TG_NS : 1], at_end[TG_NS > 0 ? TG_NS : 1]; /* of a sample's soft rows; of the last one's */
+    double ratio;
     int iteration_limit, kept; /* whether H (its factor), A and filled are those of the last solve */
     int (*late)(void *about); /* asked before every change of the working set: time is up; may be NULL */
     void *about;

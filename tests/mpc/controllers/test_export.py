@@ -147,6 +147,18 @@ def test_a_wrong_number_in_the_export_is_found(controller, tmp_path):
         (heater, {"offset_free": False, "limits": {"t": (10.0, 55.0)}}, False),
         (heater, {"blocks": (1,), "move_delay": 1}, True),
         (kit, {"dt": 10.0, "controlled": ("t2",), "limits": {"t1": (0.0, 50.0)}}, False),  # of two steps each
+        (
+            kit,
+            {
+                "zones": {"t1": 1.5},
+                "limits": {"t1": (20.0, 42.0), "t2": (15.0, 41.0)},
+                "hard": ("t2",),
+                "weights": {"t1": 2.0},
+            },
+            True,
+        ),
+        (kit, {"zones": {"t1": 1.5, "t2": 0.5}, "energy_price": {"q1": 0.5, "q2": 2.0}}, False),
+        (heater, {"zones": {"t": 1.0}, "energy_price": {"q": 0.3}, "limits": {"t": (22.0, 40.0)}}, True),
         (kit, {"blocks": (1, 2, 3)}, True),  # ranges, slews that end on them, a band that is always broken
     ],
 )

@@ -15,7 +15,7 @@ from tests.mpc.makers import network_plant
 from thermogrip.mpc.closed_loop.simulate import Surroundings, Truth
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
 from thermogrip.mpc.design.design import default_design
-from thermogrip.mpc.estimator.structure_monitor import Misfit, StructureMonitor, _Row
+from thermogrip.mpc.estimator.structure_monitor import Misfit, StructureMonitor, _Row, _tested
 from thermogrip.mpc.interface import Move
 from thermogrip.mpc.native.runtime import wanted
 from thermogrip.sysid.plant.plant import Plant
@@ -148,6 +148,31 @@ def test_a_step_of_a_minute_shows_the_structure_and_not_the_numbers(bench, row: 
         assert re.search(words, said[-1]), said
 
 
+@pytest.mark.parametrize(
+    ("row", "within", "words"),
+    [
+        ("model is right", 0.0, None),
+        ("gain -30 %", 0.0, None),
+        ("Peltier fades by 17 %", 240.0, r"(what current does|S) falls by about 1\.[4-9] % a minute"),
+        ("fouling 5 % a minute", 480.0, r"k_fs falls by about [4-6](\.[0-9])? % a minute"),
+    ],
+)
+def test_a_plant_that_changes_is_reported_with_its_rate(
+    bench, monkeypatch, row: str, within: float, words: str | None
+):
+    mismatch, controller = bench
+    monkeypatch.setattr(mismatch, "SECONDS", 300.0)
+    truth = next(case.truth for case in mismatch.CASES if case.name == row)
+    run = mismatch.close_loop(controller, truth, 11, mismatch.TARGETS[:2])
+    if words is None:
+        assert not told(list(run.moves))
+        return
+    at, move = run.first_word()
+    assert at <= within
+    assert move.status == "mismatch"
+    assert re.match(words, move.advice), move.advice
+
+
 def test_z_is_normal_where_the_readings_are_those_of_the_model():
     monitor = StructureMonitor(kit(), design_controller(kit(), dt=DT).model, ("t1", "t2"))
     rng = np.random.default_rng(5)
@@ -161,12 +186,12 @@ def test_z_is_normal_where_the_readings_are_those_of_the_model():
         )
         at = int(rng.integers(len(a)))
         own = 0.0 if granted[at] else tolerated[at] * rng.standard_normal()
-        found = monitor._tested(J, a, r + own * a[at])
+        found = _tested(monitor.bank, J, a, r + own * a[at])
         seen.append((found.z[at], found.chi))
     z, chi = np.array(seen).T
     assert abs(np.std(z) - 1) < 0.05
     assert abs(np.mean(chi) - 1) < 0.2
-    np.testing.assert_allclose(monitor._tested(J, a, 3.0 * a[1]).size[1], 3.0)
+    np.testing.assert_allclose(_tested(monitor.bank, J, a, 3.0 * a[1]).size[1], 3.0)
 
 
 def misfit(monitor: StructureMonitor, z: float, sd: float = 0.1, chi: float = 1.0) -> Misfit:
@@ -195,9 +220,9 @@ def test_a_window_is_of_calls_at_the_sample_time_and_of_drives_near_the_model():
     controller = design_controller(kit(), dt=DT)
     loop(controller, kit())
     monitor = controller.structure
-    assert len(monitor._history) == 2 * monitor.window + 1
+    assert len(monitor._history) == 100
     reading = {"t1": 35.0, "t2": 45.0, "time_s": 396.0}
-    for late, length in ((4.0, 41), (5.0, 1), (4.0, 2), (4.2, 3), (4.6, 1)):
+    for late, length in ((4.0, 5 * monitor.window + 1), (5.0, 1), (4.0, 2), (4.2, 3), (4.6, 1)):
         reading["time_s"] += late
         controller.step(reading, TARGETS[1])
         assert len(monitor._history) == length, late
