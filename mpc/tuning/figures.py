@@ -82,9 +82,7 @@ def closed_loop_chart(
         regulated.append(Curve(label, called, goal, INK, 1.0, "--", step=True, **band))
         regulated.append(Curve(name, t, run.outputs[name], PALETTE[k % 5], 1.6))
     settled = tuple(
-        segment.begin_s + segment.settle_s
-        for segment in run.segments
-        if np.isfinite(segment.settle_s)
+        segment.begin_s + segment.settle_s for segment in run.segments if np.isfinite(segment.settle_s)
     )
     rows = [Panel("regulated [degC]", tuple(regulated), title, 2.4, marks=settled)]
     others = [name for name in run.outputs if name not in run.target]
