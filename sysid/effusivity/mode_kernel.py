@@ -239,15 +239,17 @@ def predicted(
                 by_late = 2.0 * late
             elif at == _C:
                 by_late = -2.0 * late
-            sign = -1.0 if at == _ONSET else 1.0
-            for m in range(n_bin):
-                if vary[p, at] and wanted[p, c]:
-                    extra = delayed[c, m] + by_late * shifted[VALUE, m]
-                    if at == _C:
-                        extra -= delayed[VALUE, m]
-                    slopes[p, m, at] = sign * (difference * own[c, m] + rate * way * extra)
-                else:
+            if not (vary[p, at] and wanted[p, c]):
+                for m in range(n_bin):
                     slopes[p, m, at] = 0.0
+                continue
+            sign = -1.0 if at == _ONSET else 1.0
+            scale, passed = sign * difference, sign * rate * way
+            for m in range(n_bin):
+                extra = delayed[c, m] + by_late * shifted[VALUE, m]
+                if at == _C:
+                    extra -= delayed[VALUE, m]
+                slopes[p, m, at] = scale * own[c, m] + passed * extra
 
 
 @numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
@@ -276,12 +278,20 @@ def normal_equations(
                 a7 += x * own[k, 7]
             white[i, 0], white[i, 1], white[i, 2], white[i, 3] = a0 * s0, a1 * s1, a2 * s2, a3 * s3
             white[i, 4], white[i, 5], white[i, 6], white[i, 7] = a4 * s4, a5 * s5, a6 * s6, a7 * s7
-        matrix[p] = 0.0
-        for i in range(n_bin):
-            for a in range(8):
+        for a in range(8):
+            a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = 0.0
+            for i in range(n_bin):
                 x = white[i, a]
-                for b in range(8):
-                    matrix[p, a, b] += x * white[i, b]
+                a0 += x * white[i, 0]
+                a1 += x * white[i, 1]
+                a2 += x * white[i, 2]
+                a3 += x * white[i, 3]
+                a4 += x * white[i, 4]
+                a5 += x * white[i, 5]
+                a6 += x * white[i, 6]
+                a7 += x * white[i, 7]
+            out = matrix[p, a]
+            out[0], out[1], out[2], out[3], out[4], out[5], out[6], out[7] = a0, a1, a2, a3, a4, a5, a6, a7
 
 
 def products(asked: Asked, whitener: Array, u: Array, sd: Array, *, alike: bool = False) -> Array:
@@ -399,17 +409,18 @@ def _settle(
 
 def marginals(asked: Asked, whitener: Array, u: Array, sd: Array) -> Array:
     """Return ln p(y | u) up to a constant for points ``u`` (n, 7), integrated over level and T_obj, whose
-    prior means are in ``u``; ``sd`` (m, 2) are their sds, each pair with a row of the answer (m, n)."""
+    prior means are in ``u``; ``sd`` (m, n, 2) are their sds, each with a row of the answer (m, n)."""
     at, out = [_LEVEL, _T], np.empty((len(sd), len(u)))
     for begin in range(0, len(u), _AT_ONCE):
         part = slice(begin, begin + _AT_ONCE)
         n = len(u[part])
         unit = np.zeros((n, 7))
         unit[:, at] = 1.0
-        known = products(asked.take(part), whitener, u[part], unit, alike=True)
+        some = asked.take(part)
+        known = products(some, whitener, u[part], unit, alike=bool((some.row == some.row[0]).all()))
         (a, b), d = (known[:, k, k] for k in at), known[:, _LEVEL, _T]
         (g, h), square = (known[:, k, _LEFT] for k in at), known[:, _LEFT, _LEFT]
-        for row, (s, t) in zip(out, sd):
+        for row, (s, t) in zip(out, sd[:, part].transpose(0, 2, 1)):
             p, q, r = 1.0 + s * s * a, 1.0 + t * t * b, s * t * d
             det = p * q - r * r
             x, y = s * g, t * h
