@@ -31,8 +31,9 @@ from thermogrip.sysid.contact.time_stepping import N_STEPPED, VALUE, contacts
 _NEAR = (6, 6, 6, 4)  # nodes of each direction between which a place is interpolated
 _STEP = np.array([0.35, 0.2, 0.3, 0.15])
 # between what the lattice answers; ln C/e ends by the record's length, ln tau_b is about the gripper's
-_LOW, _HIGH = np.array([2.8, -2.4, 4.6, -0.75]), np.array([11.65, 0.0, 9.4, 0.75])
-_DRAWN = 800  # responses that the basis is made of
+_LOW, _HIGH = np.array([2.8, -4.2, 3.85, -1.5]), np.array([11.65, 0.0, 9.4, 0.9])
+# responses that the basis is made of, and a quarter as many of all the lattice, whose beginning is seldom asked
+_DRAWN, _RARE = 800, np.array([0.0, 3.0, 0.75, 0.75])
 _LATE = 12.0  # of the record's length
 # onsets [s] at which bin means are kept, of so many kinds of samples
 _FIRST, _APART, _PLACES, _KINDS = -1.5, 0.02, 116, 16
@@ -58,7 +59,9 @@ class ResponseTable:
         self._index = np.full(shape, -1, dtype=np.int32)
         self._whole = np.zeros(shape, dtype=bool)  # where all nodes about a cell are there
         self._rows, self._n = np.empty((1024, N_BASIS), dtype=np.float32), 0
-        drawn = self._stepped(np.random.default_rng(0).uniform(low, high, (_DRAWN, 4)))
+        rng, most = np.random.default_rng(0), np.maximum(low, low + _RARE)
+        places = [rng.uniform(most, high, (_DRAWN, 4)), rng.uniform(low, high, (_DRAWN // 4, 4))]
+        drawn = self._stepped(np.concatenate(places))
         self._basis = np.linalg.svd(drawn, full_matrices=False)[2][:N_BASIS]
         self._rise, self._slope = map(np.ascontiguousarray, np.split(self._basis, 2, axis=1))
         self._means: dict[tuple[bytes, bytes], tuple[Array, Array]] = {}

@@ -11,6 +11,7 @@ from thermogrip.datasets.compiled import numba
 from thermogrip.sysid.contact.time_stepping import COMPILED
 
 N_BASIS = 16  # curves whose combinations are all responses
+_1, _2, _3, _4, _5, _6 = (k * N_BASIS for k in range(1, 7))
 
 
 @numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
@@ -47,7 +48,7 @@ def blend(
             sums[:] = 0.0
             for k in range(6):
                 u, v = w[2, k], s[2, k]
-                sums[64:] = 0.0
+                sums[_4:] = 0.0
                 for m in range(4):
                     t, z = w[3, m], s[3, m]
                     a, b, c = own[0, j, k, m], own[1, j, k, m], own[2, j, k, m]
@@ -55,23 +56,23 @@ def blend(
                     for q in range(N_BASIS):
                         at = e0 * rows[a, q] + e1 * rows[b, q] + e2 * rows[c, q]
                         at += e3 * rows[d, q] + e4 * rows[f, q] + e5 * rows[g, q]
-                        sums[64 + q] += t * at
-                        sums[80 + q] += z * at
+                        sums[_4 + q] += t * at
+                        sums[_5 + q] += z * at
                     if by_e:
                         for q in range(N_BASIS):
                             at = h0 * rows[a, q] + h1 * rows[b, q] + h2 * rows[c, q]
                             at += h3 * rows[d, q] + h4 * rows[f, q] + h5 * rows[g, q]
-                            sums[96 + q] += t * at
+                            sums[_6 + q] += t * at
                 for q in range(N_BASIS):
-                    sums[q] += u * sums[64 + q]
-                    sums[16 + q] += v * sums[64 + q]
-                    sums[32 + q] += u * sums[80 + q]
-                    sums[48 + q] += u * sums[96 + q]
+                    sums[q] += u * sums[_4 + q]
+                    sums[_1 + q] += v * sums[_4 + q]
+                    sums[_2 + q] += u * sums[_5 + q]
+                    sums[_3 + q] += u * sums[_6 + q]
             for q in range(N_BASIS):
                 out[p, 0, q] += x * sums[q]
-                out[p, 1, q] += x * sums[16 + q]
-                out[p, 2, q] += x * sums[32 + q]
-                out[p, 3, q] += x * sums[48 + q]
+                out[p, 1, q] += x * sums[_1 + q]
+                out[p, 2, q] += x * sums[_2 + q]
+                out[p, 3, q] += x * sums[_3 + q]
                 out[p, 4, q] += y * sums[q]
         if late[p]:
             out[p, 4] = 0.0

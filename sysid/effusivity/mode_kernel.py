@@ -341,35 +341,13 @@ def modes(
     (likelihood x prior density relative to its peak) + ln det of its curvature in units of sd.  Where pairs
     of one row are ``rivals``, one that is hopeless beside the best of them is left there, unsettled.
     """
-    n = len(u)
-    covariance, objective, misfit = np.zeros((n, 7, 7)), np.empty(n), np.empty(n)
-    settled, begin = np.zeros(n, dtype=bool), 0
-    ends = np.append(np.flatnonzero(np.diff(asked.row)) + 1, n) if rivals else np.arange(1, n + 1)
-    while begin < n:  # rivals at once
-        end = int(
-            ends[
-                max(
-                    np.searchsorted(ends, begin + _AT_ONCE, "right") - 1,
-                    np.searchsorted(ends, begin, "right"),
-                )
-            ]
-        )
-        part, begin = slice(begin, end), end
-        found = _settle(asked.take(part), whitener, law[part], u[part], max_steps, rivals)
-        covariance[part], objective[part], misfit[part], settled[part] = found
-    return covariance, objective, misfit, settled
-
-
-def _settle(
-    asked: Asked, whitener: Array, law: Array, u: Array, max_steps: int, rivals: bool
-) -> tuple[Array, Array, Array, Mask]:
     n, (mean, sd, dof) = len(u), law.transpose(1, 0, 2)
     trial, damping = u.copy(), np.full(n, 1e-2)
     at, settled, diagonal = np.arange(n), np.zeros(n, dtype=bool), np.arange(_LEFT)
     cost, matrix, slope, bound = np.full(n, np.inf), np.zeros((n, 8, 8)), np.zeros((n, 7)), np.ones((n, 7))
     best = np.empty(asked.data.level.size)
     for step in range(max_steps + 1):
-        there = products(asked.take(at), whitener, trial[at], sd[at], alike=step == 0)
+        there = _products_of(asked, at, whitener, trial, sd, alike=step == 0)
         off = penalty(trial[at], mean[at], sd[at], dof[at])
         tried = there[:, _LEFT, _LEFT] + off.value
         better = (tried < cost[at]) | (step == 0)
@@ -405,6 +383,17 @@ def _settle(
     inverse = np.linalg.inv(curved)
     covariance = 0.5 * (inverse + inverse.transpose(0, 2, 1)) * (sd[:, :, None] * sd[:, None, :])
     return covariance, cost + np.linalg.slogdet(curved)[1], matrix[:, _LEFT, _LEFT], settled
+
+
+def _products_of(
+    asked: Asked, at: NDArray[np.int64], whitener: Array, u: Array, sd: Array, *, alike: bool
+) -> Array:
+    """Return :func:`products` of some pairs, so many at once that they stay in the processor's cache."""
+    out = np.empty((at.size, _LEFT + 1, _LEFT + 1))
+    for begin in range(0, at.size, _AT_ONCE):
+        part = at[begin : begin + _AT_ONCE]
+        out[begin : begin + _AT_ONCE] = products(asked.take(part), whitener, u[part], sd[part], alike=alike)
+    return out
 
 
 def marginals(asked: Asked, whitener: Array, u: Array, sd: Array) -> Array:
