@@ -32,7 +32,8 @@ _NEAR = (6, 6, 6, 4)  # nodes of each direction between which a place is interpo
 _STEP = np.array([0.35, 0.2, 0.3, 0.15])
 # between what the lattice answers; ln C/e ends by the record's length, ln tau_b is about the gripper's
 _LOW, _HIGH = np.array([2.8, -4.2, 3.85, -1.5]), np.array([11.65, 0.0, 9.4, 0.9])
-# responses that the basis is made of, and a quarter as many of all the lattice, whose beginning is seldom asked
+# responses that the basis is made of, and a quarter as many of all the lattice, whose beginning is seldom
+# asked for
 _DRAWN, _RARE = 800, np.array([0.0, 3.0, 0.75, 0.75])
 _LATE = 12.0  # of the record's length
 # onsets [s] at which bin means are kept, of so many kinds of samples

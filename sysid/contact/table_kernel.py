@@ -118,5 +118,6 @@ def blended_means(
                 factor = -own[0, q]  # a later onset is an earlier time
                 for m in range(n_bin):
                     means[p, last, m] += factor * (
-                        d1 * (values[g + 1, q, m] - values[g, q, m]) + d2 * slopes[g, q, m] + d3 * slopes[g + 1, q, m]
+                        d1 * (values[g + 1, q, m] - values[g, q, m])
+                        + d2 * slopes[g, q, m] + d3 * slopes[g + 1, q, m]
                     )  # fmt: skip

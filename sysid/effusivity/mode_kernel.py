@@ -133,8 +133,8 @@ def bin_means(
     nodes: Array, rise: Array, slope: Array, wanted: Mask, which: NDArray[np.int64], onset: Array,
     row: NDArray[np.int64], times: Array, bins: NDArray[np.int64], count: Array, room: Array, means: Array,
 ) -> None:  # fmt: skip
-    """Fill ``means`` (n, 6, n_bin) of the ``wanted`` curves, ``which`` of these belongs to each pair, the last
-    of them the slope of the first."""
+    """Fill ``means`` (n, 6, n_bin) of the ``wanted`` curves, ``which`` of these belongs to each pair, the
+    last of them the slope of the first."""
     last, n_curve, n_bin = nodes.size - 1, wanted.shape[1], count.shape[1]
     for p in range(row.size):
         i, k, begin = row[p], 0, times.shape[1]
@@ -264,9 +264,8 @@ def normal_equations(
     n_bin = columns.shape[1]
     for p in range(row.size):
         own, w = columns[p], whitener[row[p]]
-        s0, s1, s2, s3, s4, s5, s6, s7 = (
-            scale[p, 0], scale[p, 1], scale[p, 2], scale[p, 3], scale[p, 4], scale[p, 5], scale[p, 6], scale[p, 7]
-        )  # fmt: skip
+        s0, s1, s2, s3 = scale[p, 0], scale[p, 1], scale[p, 2], scale[p, 3]
+        s4, s5, s6, s7 = scale[p, 4], scale[p, 5], scale[p, 6], scale[p, 7]
         for i in range(n_bin):
             a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = 0.0
             for k in range(i + 1):

@@ -72,9 +72,9 @@ def slipped(
     gripper: GripperModel, data: Touches, whitener: Array, beyond: Array | None, sd: Array, u: Array,
     row: NDArray[np.int64] | None = None,
 ) -> Array:  # fmt: skip
-    """Return ln p(y | u) up to a constant for n points ``u`` (n, 7) of the grasps ``row`` (n,), by default the
-    first, integrated over level and T_obj (prior means in ``u``, sds in ``sd``, (7,) or (n, 7)), the latter a
-    slip with a probability of ``SLIPS`` where it is stated."""
+    """Return ln p(y | u) up to a constant for n points ``u`` (n, 7) of the grasps ``row`` (n,), by default
+    the first, integrated over level and T_obj (prior means in ``u``, sds in ``sd``, (7,) or (n, 7)), the
+    latter a slip with a probability of ``SLIPS`` where it is stated."""
     from thermogrip.sysid.effusivity.mode_kernel import marginals
 
     row = np.zeros(len(u), dtype=np.int64) if row is None else row
@@ -122,8 +122,8 @@ def _log_posterior(
     gripper: GripperModel, data: Touches, whitener: Array, common: Prior, points: Array,
     row: NDArray[np.int64],
 ) -> Array:  # fmt: skip
-    """Return the log posterior (n,), up to a constant, of points (n, 5) of the grasps ``row``, of whose priors
-    ``common`` has what does not depend on ln e."""
+    """Return the log posterior (n,), up to a constant, of points (n, 5) of the grasps ``row``, of whose
+    priors ``common`` has what does not depend on ln e."""
     free, mean, sd = free_hypotheses(gripper, points[:, 0]), common.mean[row], common.sd[row]
     u = mean.copy()
     u[:, SAMPLED] = points
@@ -141,8 +141,8 @@ def log_integrals(
     gripper: GripperModel, data: Touches, x: Array, mode: Array, covariance: Array, *,
     noise: tuple[Array, Array] | None = None, row: NDArray[np.int64] | None = None,
 ) -> Array:  # fmt: skip
-    """Return ln p(y | ln e), every nuisance integrated, at effusivities ``x`` (n,) of the grasps ``row`` (n,),
-    by default the first."""
+    """Return ln p(y | ln e), every nuisance integrated, at effusivities ``x`` (n,) of the grasps ``row``
+    (n,), by default the first."""
     gripper.require_known("an integral over one grasp's nuisances")
     row = np.zeros(x.size, dtype=np.int64) if row is None else row
     whitener, log_det = whiten(data, gripper.noise) if noise is None else noise
