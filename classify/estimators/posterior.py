@@ -354,8 +354,16 @@ class PosteriorClassifier(GraspClassifier):
 
 def _of_levels(levels: Sequence[_Level], data: Touches, names: Sequence[str]) -> Floats:
     """Return the log evidence of each candidate for each touch on each level, (n_level, n, n_name)."""
-    found = [fit_candidates(level.device, data, names, level.finish)[0] for level in levels]
-    return np.stack([mode.log_evidence.reshape(-1, len(names)) for mode in found])
+    found: list[Floats] = []
+    start = None
+    for level in levels:
+        begin = (
+            start if level.device is levels[0].device else None
+        )  # of another block the same answer is near
+        mode, *_ = fit_candidates(level.device, data, names, level.finish, start=begin)
+        found.append(mode.log_evidence.reshape(-1, len(names)))
+        start = mode.u.reshape(*found[0].shape, -1) if start is None else start
+    return np.stack(found)
 
 
 def _share(levels: Sequence[_Level], each: Floats) -> Floats:

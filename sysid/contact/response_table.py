@@ -25,15 +25,19 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.sysid.contact.simulation import Stack, gripper_modes, time_nodes
-from thermogrip.sysid.contact.table_kernel import N_BASIS, blend
+from thermogrip.sysid.contact.table_kernel import N_BASIS, blend, blended_means
 from thermogrip.sysid.contact.time_stepping import N_STEPPED, VALUE, contacts
 
 _NEAR = (6, 6, 6, 4)  # nodes of each direction between which a place is interpolated
 _STEP = np.array([0.35, 0.2, 0.3, 0.15])
 # between what the lattice answers; ln C/e ends by the record's length, ln tau_b is about the gripper's
-_LOW, _HIGH = np.array([2.8, -1.2, 4.6, -0.6]), np.array([11.65, 0.0, 9.4, 0.6])
-_DRAWN = 800  # responses that the basis is made of
+_LOW, _HIGH = np.array([2.8, -4.2, 3.85, -1.5]), np.array([11.65, 0.0, 9.4, 0.9])
+# responses that the basis is made of, and a quarter as many of all the lattice, whose beginning is seldom
+# asked for
+_DRAWN, _RARE = 800, np.array([0.0, 3.0, 0.75, 0.75])
 _LATE = 12.0  # of the record's length
+# onsets [s] at which bin means are kept, of so many kinds of samples
+_FIRST, _APART, _PLACES, _KINDS = -1.5, 0.02, 116, 16
 
 
 @lru_cache(maxsize=4)
@@ -56,29 +60,97 @@ class ResponseTable:
         self._index = np.full(shape, -1, dtype=np.int32)
         self._whole = np.zeros(shape, dtype=bool)  # where all nodes about a cell are there
         self._rows, self._n = np.empty((1024, N_BASIS), dtype=np.float32), 0
-        drawn = self._stepped(np.random.default_rng(0).uniform(low, high, (_DRAWN, 4)))
+        rng, most = np.random.default_rng(0), np.maximum(low, low + _RARE)
+        places = [rng.uniform(most, high, (_DRAWN, 4)), rng.uniform(low, high, (_DRAWN // 4, 4))]
+        drawn = self._stepped(np.concatenate(places))
         self._basis = np.linalg.svd(drawn, full_matrices=False)[2][:N_BASIS]
         self._rise, self._slope = map(np.ascontiguousarray, np.split(self._basis, 2, axis=1))
+        self._means: dict[tuple[bytes, bytes], tuple[Array, Array]] = {}
+
+    def inside(self, numbers: Array) -> Mask:
+        """Return which contacts of logarithms ``numbers`` (n, 4) the lattice answers."""
+        z = self._places(numbers)
+        return np.asarray(((z >= self._low) & (z <= self._high)).all(axis=1))
 
     def curves(self, contact: Array, wanted: Mask) -> tuple[Array, Array]:
         """Return the sensor's rise and its slope (n, 5, n_node) of ``contact`` (n, 4) and the ``wanted``
         curves, as :func:`~thermogrip.sysid.contact.time_stepping.contacts`; (n, 1, n_node) where only values
         are."""
-        z = np.log(contact)
-        z[:, 1] = np.minimum(z[:, 1] - z[:, 0], self._high[1])
-        inside = ((z >= self._low) & (z <= self._high)).all(axis=1)
+        numbers = np.log(contact)
+        inside = self.inside(numbers)
         n_curve = N_STEPPED if wanted[:, 1:].any() else 1
         if inside.all():
-            own = self._blended(z, wanted)[:, :n_curve]
+            own = self._blended(numbers, wanted)[:, :n_curve]
             return own @ self._rise, own @ self._slope
-        out, shape = ~inside, (len(z), n_curve, self._nodes.t.size)
+        out, shape = ~inside, (len(numbers), n_curve, self._nodes.t.size)
         rise, slope = np.empty(shape), np.empty(shape)
         if inside.any():
-            own = self._blended(z[inside], wanted[inside])[:, :n_curve]
+            own = self._blended(numbers[inside], wanted[inside])[:, :n_curve]
             rise[inside], slope[inside] = own @ self._rise, own @ self._slope
         stepped = contacts(self._nodes, self._gripper, contact[out], wanted[out])
         rise[out], slope[out] = (part[:, :n_curve] for part in stepped[:2])
         return rise, slope
+
+    def bin_means(
+        self, times: Array, bins: NDArray[np.int64], row: NDArray[np.int64], numbers: Array, stepped: Mask,
+        which: NDArray[np.int64], onset: Array, wanted: Mask, out: Array,
+    ) -> None:  # fmt: skip
+        """Fill ``out`` (n, 6, n_bin): bin means of contacts of logarithms ``numbers`` (k, 4), all inside, as
+        :func:`~thermogrip.sysid.effusivity.mode_kernel.bin_means` of their curves."""
+        own, room = self._blended(numbers, stepped), np.empty(out.shape[2])
+        touched, at = np.unique(row, return_inverse=True)
+        of = [(times[i].tobytes(), bins[i].tobytes()) for i in touched]
+        kinds = list(dict.fromkeys(of))
+        for key in kinds:
+            first = touched[of.index(key)]
+            means = self._basis_means(key, times[first], bins[first], out.shape[2])
+            if len(kinds) == 1:
+                blended_means(*means, _FIRST, _APART, own, which, onset, wanted, room, out)
+                return
+            some = np.array([one == key for one in of])[at]
+            part = np.empty((int(some.sum()), *out.shape[1:]))
+            blended_means(*means, _FIRST, _APART, own, which[some], onset[some], wanted[some], room, part)
+            out[some] = part
+
+    def _basis_means(
+        self, key: tuple[bytes, bytes], times: Array, bins: NDArray[np.int64], n_bin: int
+    ) -> tuple[Array, Array]:
+        """Return bin means of the basis, (n_place, N_BASIS, n_bin), and their derivatives by the onset, of
+        samples at ``times`` in ``bins``, those of negative ones left out."""
+        if key in self._means:
+            return self._means[key]
+        read = bins >= 0
+        since = times[read] - (_FIRST + _APART * np.arange(_PLACES))[:, None]
+        nodes = self._nodes.t
+        k = np.clip(np.searchsorted(nodes, since) - 1, 0, nodes.size - 2)
+        dt = nodes[k + 1] - nodes[k]
+        s = np.clip((since - nodes[k]) / dt, 0.0, 1.0)
+        there = since > 0.0
+        values = [s * s * (3 - 2 * s), s * (1 - s) ** 2 * dt, -s * s * (1 - s) * dt]
+        rates = [6 * s * (1 - s) / dt, (1 - s) * (1 - 3 * s), s * (3 * s - 2)]
+        pick = np.zeros((int(read.sum()), n_bin))
+        pick[np.arange(len(pick)), bins[read]] = 1.0
+        pick /= np.maximum(pick.sum(axis=0), 1.0)
+        means = np.empty((2, _PLACES, N_BASIS, n_bin))
+        for q in range(N_BASIS):
+            r, v = self._rise[q], self._slope[q]
+            high, low_slope, high_slope = r[k + 1] - r[k], v[k], v[k + 1]
+            value = r[k] + values[0] * high + values[1] * low_slope + values[2] * high_slope
+            rate = rates[0] * high + rates[1] * low_slope + rates[2] * high_slope
+            means[0, :, q], means[1, :, q] = (
+                np.where(there, value, 0.0) @ pick,
+                np.where(there, -rate, 0.0) @ pick,
+            )
+        while len(self._means) >= _KINDS:
+            self._means.pop(next(iter(self._means)))
+        self._means[key] = means[0], means[1]
+        return self._means[key]
+
+    def _places(self, numbers: Array) -> Array:
+        """Return where in the lattice contacts are, (n, 4)."""
+        z = numbers.copy()
+        z[:, 1] = np.minimum(z[:, 1] - z[:, 0], self._high[1])
+        return z
 
     def _stepped(self, z: Array) -> Array:
         """Return rise and slope of places z (n, 4), (n, 2 n_node)."""
@@ -89,17 +161,16 @@ class ResponseTable:
         rise, slope, _ = contacts(self._nodes, self._gripper, contact, wanted)
         return np.concatenate([rise[:, VALUE], slope[:, VALUE]], axis=1)
 
-    def _blended(self, z: Array, wanted: Mask) -> Array:
+    def _blended(self, numbers: Array, wanted: Mask) -> Array:
         """Return the coefficients of the curves, (n, 5, N_BASIS)."""
+        z = self._places(numbers)
         place = (z - self._low) / _STEP
         # the last cell holds its end too
         cell = np.minimum(np.floor(place).astype(np.int64), np.array(self._index.shape) - _NEAR)
         self._fill(cell)
-        parts = [_weights(place[:, k] - cell[:, k], k) for k in range(4)]
-        out = np.zeros((len(z), N_STEPPED, N_BASIS))
-        blend(self._index, self._rows, cell, *parts, wanted, np.zeros((9, N_BASIS)), out)
-        out[:, 4, :][z[:, 1] >= self._high[1]] = 0.0
-        out[:, 3] -= out[:, 4]  # by ln e at the same C
+        out, late = np.empty((len(z), N_STEPPED, N_BASIS)), z[:, 1] >= self._high[1]
+        room, sums = np.empty((8, 6)), np.empty(7 * N_BASIS)
+        blend(self._index, self._rows, cell, place - cell, late, _WEIGHT, _STEP, wanted, room, sums, out)
         return out
 
     def _fill(self, cell: NDArray[np.int64]) -> None:
@@ -129,13 +200,7 @@ class ResponseTable:
 
 
 _AT = [np.arange(n) - (n // 2 - 1.0) for n in _NEAR]  # of the nodes, from the one before a place
-# Lagrange's weights as polynomials, (order, node), and their derivatives
-_WEIGHT = [np.linalg.inv(np.vander(at, increasing=True)) for at in _AT]
-_SLOPE = [np.arange(1, len(w))[:, None] * w[1:] for w in _WEIGHT]
-
-
-def _weights(share: Array, k: int) -> tuple[Array, Array]:
-    """Return the weights (n, m) of the nodes of a direction at a ``share`` (n,) of the way from one to the
-    next, and their derivatives."""
-    powers = np.vander(share, len(_WEIGHT[k]), increasing=True)
-    return powers @ _WEIGHT[k], powers[:, :-1] @ (_SLOPE[k] / _STEP[k])
+# Lagrange's weights as polynomials, (direction, order, node); nodes that a direction lacks have none
+_WEIGHT = np.zeros((4, 6, 6))
+for _own, _at in zip(_WEIGHT, _AT):
+    _own[: _at.size, : _at.size] = np.linalg.inv(np.vander(_at, increasing=True))

@@ -1,4 +1,5 @@
-"""The compiled part of :mod:`thermogrip.sysid.contact.response_table`: interpolation between its nodes."""
+"""The compiled part of :mod:`thermogrip.sysid.contact.response_table`: interpolation between its nodes, and
+bin means of what it finds."""
 
 from __future__ import annotations
 
@@ -10,52 +11,113 @@ from thermogrip.datasets.compiled import numba
 from thermogrip.sysid.contact.time_stepping import COMPILED
 
 N_BASIS = 16  # curves whose combinations are all responses
+_1, _2, _3, _4, _5, _6 = (k * N_BASIS for k in range(1, 7))
 
 
 @numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
 def blend(
-    index: NDArray[np.int32], rows: NDArray[np.float32], cell: NDArray[np.int64], by_e: tuple[Array, Array],
-    by_slab: tuple[Array, Array], by_h: tuple[Array, Array], by_build_up: tuple[Array, Array], wanted: Mask,
-    room: Array, out: Array,
+    index: NDArray[np.int32], rows: NDArray[np.float32], cell: NDArray[np.int64], share: Array, late: Mask,
+    weight: Array, step: Array, wanted: Mask, room: Array, sums: Array, out: Array,
 ) -> None:  # fmt: skip
     """Fill ``out`` (n, 5, N_BASIS): coefficients of the value, and of its derivatives by ln h, ln tau_b, ln e
-    at the same C/e, and ln C/e; one direction after the other."""
-    b, c = room[:3], room[3:7]  # summed over ln tau_b and ln h, and over ln C/e
+    at the same C/e, and ln C/e, at a ``share`` (n, 4) of the way through each ``cell``.
+
+    One direction after the other, ln e first: a free effusivity needs no derivative by it.  ``weight`` (4, 6,
+    6) are the nodes' as polynomials (direction, order, node); a ``late`` place lies on nodes of ln C/e, which
+    nothing depends on there."""
+    w, s = room[:4], room[4:]
     for p in range(cell.shape[0]):
-        w, s = by_build_up[0][p], by_build_up[1][p]
-        w0, w1, w2, w3, s0, s1, s2, s3 = w[0], w[1], w[2], w[3], s[0], s[1], s[2], s[3]
-        moved = wanted[p, 1] or wanted[p, 2]
-        for i in range(by_e[0].shape[1]):
-            x_e, y_e = by_e[0][p, i], by_e[1][p, i]
-            if x_e == 0.0 and not wanted[p, 3]:
+        for d in range(4):
+            x = share[p, d]
+            for i in range(6):
+                value = slope = 0.0
+                for o in range(5, -1, -1):
+                    slope = slope * x + value
+                    value = value * x + weight[d, o, i]
+                w[d, i], s[d, i] = value, slope / step[d]
+        e0, e1, e2, e3, e4, e5 = w[0, 0], w[0, 1], w[0, 2], w[0, 3], w[0, 4], w[0, 5]
+        h0, h1, h2, h3, h4, h5 = s[0, 0], s[0, 1], s[0, 2], s[0, 3], s[0, 4], s[0, 5]
+        moved, by_e = wanted[p, 1] or wanted[p, 2], wanted[p, 3]
+        by_slab = (wanted[p, 3] or wanted[p, 4]) and not late[p]
+        own = index[cell[p, 0] :, cell[p, 1] :, cell[p, 2] :, cell[p, 3] :]
+        out[p] = 0.0
+        for j in range(6):
+            x, y = w[1, j], s[1, j]
+            if x == 0.0 and not by_slab:
                 continue
-            c[:] = 0.0
-            for j in range(by_slab[0].shape[1]):
-                x, y = by_slab[0][p, j], by_slab[1][p, j]
-                if x == 0.0 and not (wanted[p, 3] or wanted[p, 4]):
-                    continue
-                b[:] = 0.0
-                for k in range(by_h[0].shape[1]):
-                    u, v = by_h[0][p, k], by_h[1][p, k]
-                    at = index[cell[p, 0] + i, cell[p, 1] + j, cell[p, 2] + k, cell[p, 3] :]
-                    r0, r1, r2, r3 = rows[at[0]], rows[at[1]], rows[at[2]], rows[at[3]]
-                    if moved:
+            sums[:] = 0.0
+            for k in range(6):
+                u, v = w[2, k], s[2, k]
+                sums[_4:] = 0.0
+                for m in range(4):
+                    t, z = w[3, m], s[3, m]
+                    a, b, c = own[0, j, k, m], own[1, j, k, m], own[2, j, k, m]
+                    d, f, g = own[3, j, k, m], own[4, j, k, m], own[5, j, k, m]
+                    for q in range(N_BASIS):
+                        at = e0 * rows[a, q] + e1 * rows[b, q] + e2 * rows[c, q]
+                        at += e3 * rows[d, q] + e4 * rows[f, q] + e5 * rows[g, q]
+                        sums[_4 + q] += t * at
+                        sums[_5 + q] += z * at
+                    if by_e:
                         for q in range(N_BASIS):
-                            one = w0 * r0[q] + w1 * r1[q] + w2 * r2[q] + w3 * r3[q]
-                            b[0, q] += u * one
-                            b[1, q] += v * one
-                            b[2, q] += u * (s0 * r0[q] + s1 * r1[q] + s2 * r2[q] + s3 * r3[q])
-                    else:
-                        for q in range(N_BASIS):
-                            b[0, q] += u * (w0 * r0[q] + w1 * r1[q] + w2 * r2[q] + w3 * r3[q])
+                            at = h0 * rows[a, q] + h1 * rows[b, q] + h2 * rows[c, q]
+                            at += h3 * rows[d, q] + h4 * rows[f, q] + h5 * rows[g, q]
+                            sums[_6 + q] += t * at
                 for q in range(N_BASIS):
-                    c[0, q] += x * b[0, q]
-                    c[1, q] += x * b[1, q]
-                    c[2, q] += x * b[2, q]
-                    c[3, q] += y * b[0, q]
+                    sums[q] += u * sums[_4 + q]
+                    sums[_1 + q] += v * sums[_4 + q]
+                    sums[_2 + q] += u * sums[_5 + q]
+                    sums[_3 + q] += u * sums[_6 + q]
             for q in range(N_BASIS):
-                out[p, 0, q] += x_e * c[0, q]
-                out[p, 1, q] += x_e * c[1, q]
-                out[p, 2, q] += x_e * c[2, q]
-                out[p, 3, q] += y_e * c[0, q]
-                out[p, 4, q] += x_e * c[3, q]
+                out[p, 0, q] += x * sums[q]
+                out[p, 1, q] += x * sums[_1 + q]
+                out[p, 2, q] += x * sums[_2 + q]
+                out[p, 3, q] += x * sums[_3 + q]
+                out[p, 4, q] += y * sums[q]
+        if late[p]:
+            out[p, 4] = 0.0
+        if not moved:
+            out[p, 1:3] = 0.0
+        for q in range(N_BASIS):
+            out[p, 3, q] -= out[p, 4, q]  # by ln e at the same C
+
+
+@numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
+def blended_means(
+    values: Array, slopes: Array, first: float, step: float, coefficients: Array, which: NDArray[np.int64],
+    onset: Array, wanted: Mask, room: Array, means: Array,
+) -> None:  # fmt: skip
+    """Fill ``means`` (n, 6, n_bin): bin means of the ``wanted`` curves of ``coefficients`` (k, 5, N_BASIS),
+    ``which`` of these belongs to each pair, and of the slope of its first, which is the last curve.
+
+    ``values`` and ``slopes`` (n_place, N_BASIS, n_bin) are bin means of the basis and their derivatives by
+    the onset, at onsets ``first``, ``first + step`` and on; between them cubics."""
+    n_bin, last = values.shape[2], means.shape[1] - 1
+    for p in range(which.size):
+        place = (onset[p] - first) / step
+        g = min(int(place), values.shape[0] - 2)
+        x, own = place - g, coefficients[which[p]]
+        w0, w1 = (1.0 + 2.0 * x) * (1.0 - x) * (1.0 - x), x * x * (3.0 - 2.0 * x)
+        w2, w3 = x * (1.0 - x) * (1.0 - x) * step, x * x * (x - 1.0) * step
+        means[p] = 0.0
+        for q in range(N_BASIS):
+            for m in range(n_bin):
+                room[m] = (
+                    w0 * values[g, q, m] + w1 * values[g + 1, q, m]
+                    + w2 * slopes[g, q, m] + w3 * slopes[g + 1, q, m]
+                )  # fmt: skip
+            for c in range(last):
+                if wanted[p, c]:
+                    factor = own[c, q]
+                    for m in range(n_bin):
+                        means[p, c, m] += factor * room[m]
+        if wanted[p, last]:
+            d1 = 6.0 * x * (1.0 - x) / step
+            d2, d3 = (1.0 - x) * (1.0 - 3.0 * x), x * (3.0 * x - 2.0)
+            for q in range(N_BASIS):
+                factor = -own[0, q]  # a later onset is an earlier time
+                for m in range(n_bin):
+                    means[p, last, m] += factor * (
+                        d1 * (values[g + 1, q, m] - values[g, q, m])
+                        + d2 * slopes[g, q, m] + d3 * slopes[g + 1, q, m]
+                    )  # fmt: skip

@@ -17,6 +17,7 @@ with contact time, so that a longer record does not raise confidence faster than
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -24,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtri
 
-from thermogrip.datasets.arrays import Array
+from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps, check_grasps, label_values, log_name
 from thermogrip.sysid.contact.simulation import PUMP_OFF
@@ -71,9 +72,9 @@ def at_knots(t: Array) -> Array:
     return np.stack([np.interp(t, x, row) for row in base], axis=-1)
 
 
-_WHOLE = ("second", "tabled")  # not an array of each touch
-#: Touches from which on a table of their responses pays.
-MANY = 100
+_WHOLE = ("second", "tabled", "common")  # not an array of each touch, or not always
+#: Touches from which on a table of their responses pays, and one of bin means at the same times.
+MANY, ALIKE = 100, 20
 
 
 @dataclass(frozen=True)
@@ -95,12 +96,14 @@ class Touches:
     excursion: Array  # (n,) [K]
     second: Touches | None = None  # what a second sensor of the finger read of the same grasps
     tabled: float = 0.0  # s: responses are of tables that reach so far; 0 where each is stepped
+    common: Mask | None = None  # (n,), whose samples are at the same times as many others'
 
     def take(self, index: NDArray[np.int64]) -> Touches:
         """Return the touches at these rows."""
         own = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name not in _WHOLE}
         second = None if self.second is None else self.second.take(index)
-        return Touches(**own, second=second, tabled=self.tabled)
+        common = None if self.common is None else self.common[index]
+        return Touches(**own, second=second, tabled=self.tabled, common=common)
 
     def known(self, index: NDArray[np.int64]) -> Touches:
         """Return what was known of the touches at these rows, with no readings."""
@@ -175,8 +178,11 @@ def with_tables(data: Touches) -> Touches:
     if data.level.size < MANY:
         return data
     second = None if data.second is None else with_tables(data.second)
+    times = [(t.tobytes(), bins.tobytes()) for t, bins in zip(data.sample_t, data.sample_bin)]
+    often = Counter(times)
+    common = np.array([often[each] >= ALIKE for each in times])
     # contact may begin 1.5 s early; whole seconds, so that records share tables
-    return replace(data, second=second, tabled=float(np.ceil(data.end + 1.5)))
+    return replace(data, second=second, tabled=float(np.ceil(data.end + 1.5)), common=common)
 
 
 def object_range(grasps: Grasps, stated: tuple[float, float] | None = None) -> Array:

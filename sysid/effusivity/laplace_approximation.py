@@ -144,7 +144,7 @@ def jacobian(
     from thermogrip.sysid.effusivity.mode_kernel import readings
 
     y, slopes = readings(pairs_asked(stack, nodes, data, np.arange(len(u)), beyond), u, vary)
-    return y, slopes[:, :N_NUISANCE].transpose(0, 2, 1)
+    return y, slopes[:, :, :N_NUISANCE]
 
 
 def pairs_asked(
@@ -458,7 +458,7 @@ def _slopes(pair: _Pair, here: _Point) -> tuple[Array, Array]:
     vary = np.zeros(us.shape, dtype=bool)
     vary[-1] = True
     y, slopes = readings(asked, us, vary)
-    by_u = slopes[-1, :N_NUISANCE].T
+    by_u = slopes[-1, :, :N_NUISANCE]
     k = by_u @ pair.by_mean
     k[:, _MOVED] = ((y[:-1] - y[-1]) / _DIFFERENCE).T
     if np.isfinite(data.t_ambient[0]):

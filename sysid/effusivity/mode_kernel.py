@@ -3,7 +3,7 @@
 
 Each pair takes damped Gauss-Newton steps on the responses of :mod:`thermogrip.sysid.contact.time_stepping`
 until the next one would gain less than 0.005 nat; that last step is taken on the quadratic model alone, and
-its predicted decrease counted.  What costs is compiled, in two functions that call no other; the rest is
+its predicted decrease counted.  What costs is compiled, in functions that call no other; the rest is
 NumPy's, for some hundred pairs at once, whose arrays stay in the processor's cache.
 """
 
@@ -24,6 +24,9 @@ _LONGEST = 1.5
 # effusivity that ended within 25 nats of the best, none was farther than 1734 after one, 356 after two and
 # 378 after three
 _HOPELESS = {1: 6000.0, 2: 2000.0, 3: 1000.0, 4: 1000.0, 5: 1000.0} | dict.fromkeys(range(6, 99), 120.0)
+# and after any number where the object's temperature is stated: of the points of twelve example conditions
+# that ended within 25 nats none was more than 109 behind
+_HOPELESS_STATED = 1000.0
 _LEAST_DECREASE = 0.01  # of -2 ln posterior: smaller predicted decreases end the search
 _H, _BUILD_UP, _ONSET, _LEVEL, _T, _E, _C = range(7)
 _LEFT = 7  # the column of what is left, after those of the derivatives
@@ -52,61 +55,90 @@ class Asked(NamedTuple):
 
 
 def readings(asked: Asked, u: Array, vary: Mask, *, alike: bool = False) -> tuple[Array, Array]:
-    """Return the bin means (n, n_bin) that ``u`` (n, 7) predicts, and their derivatives (n, 8, n_bin), zero
-    where not ``vary`` (n, 7), with a last row for the caller's use; ``alike`` says that many contacts are the
-    same but for onset and temperatures."""
-    nodes, gripper, data, row, beyond, table = asked
+    """Return the bin means (n, n_bin) that ``u`` (n, 7) predicts, and their derivatives (n, n_bin, 8), zero
+    where not ``vary`` (n, 7), with a last column for the caller's use; ``alike`` says that many contacts are
+    the same but for onset and temperatures."""
+    data, row = asked.data, asked.row
     wanted = np.ones((row.size, RATE + 1), dtype=bool)
     wanted[:, 1:] = vary[:, _CURVES]
-    contact, which = np.ascontiguousarray(np.exp(u[:, (_E, _C, _H, _BUILD_UP)])), np.arange(row.size)
+    onset = np.clip(u[:, _ONSET], EARLIEST_ONSET, LATEST_ONSET)
+    wanted[:, RATE] &= onset == u[:, _ONSET]  # past the range nothing moves
+    numbers, which = np.ascontiguousarray(u[:, (_E, _C, _H, _BUILD_UP)]), np.arange(row.size)
     stepped = wanted[:, :N_STEPPED]
     if alike:
-        key = contact.view(f"V{contact.itemsize * contact.shape[1]}").ravel()
+        key = numbers.view(f"V{numbers.itemsize * numbers.shape[1]}").ravel()
         _, first, which = np.unique(key, return_index=True, return_inverse=True)
-        contact, every = contact[first], np.zeros((first.size, N_STEPPED), dtype=bool)
+        numbers, every = numbers[first], np.zeros((first.size, N_STEPPED), dtype=bool)
         np.logical_or.at(every, which, stepped)
         stepped = every
-    if table is None:
-        rise, slope, _ = contacts(nodes, gripper, contact, np.ascontiguousarray(stepped))
-    else:
-        rise, slope = table.curves(contact, stepped)
+    means = _means(asked, numbers, np.ascontiguousarray(stepped), which, onset, wanted)
     room = data.t_ambient[row]
     known = np.isfinite(room)
     late = np.exp(2.0 * (u[:, _C] - u[:, _E])) / 6.0
     # the block goes to the room by its far face at ``rate`` [1/s], ``way`` [K]
-    far, leak = gripper.numbers[:, 5], np.where(known, gripper.numbers[:, 6], 0.0)
+    far, leak = asked.gripper.numbers[:, 5], np.where(known, asked.gripper.numbers[:, 6], 0.0)
     rate, way = np.where(known, far * np.exp(-u[:, _C]), 0.0), np.where(known, room - u[:, _T], 0.0)
-    onset = np.clip(u[:, _ONSET], EARLIEST_ONSET, LATEST_ONSET)
-    wanted[:, RATE] &= onset == u[:, _ONSET]  # past the range nothing moves
     n_bin, away = data.y.shape[1], np.where(known, leak * (room - u[:, _LEVEL]), 0.0)
-    y, slopes = np.empty((row.size, n_bin)), np.zeros((row.size, _LEFT + 1, n_bin))
+    y, slopes = np.empty((row.size, n_bin)), np.empty((row.size, n_bin, _LEFT + 1))
     late, leak = np.where(rate > 0.0, late, -1.0), np.broadcast_to(leak, row.size)
-    loss = np.stack([late, rate, way, away, leak], axis=1)
-    bin_means(
-        nodes[2], rise, slope, wanted, which, onset, row, data.sample_t, data.sample_bin, data.count, data.t,
-        data.ramp, beyond, u, vary, loss, np.empty((7, data.sample_t.shape[1])),
-        np.empty((3, RATE + 1, n_bin)), y, slopes,
-    )  # fmt: skip
+    loss, scratch = np.stack([late, rate, way, away, leak], axis=1), np.empty((16, n_bin))
+    predicted(
+        means, wanted, row, data.count, data.t, data.ramp, asked.beyond, u, vary, loss, scratch, y, slopes
+    )
     return y, slopes
+
+
+def _means(
+    asked: Asked, numbers: Array, stepped: Mask, which: NDArray[np.int64], onset: Array, wanted: Mask
+) -> Array:
+    """Return the bin means (n, 6, n_bin) of the ``wanted`` curves of contacts of logarithms ``numbers`` (k,
+    4), ``which`` of these belongs to each pair; before contact zero."""
+    nodes, gripper, data, row, _, table = asked
+    out = np.empty((row.size, RATE + 1, data.y.shape[1]))
+    common = np.zeros(row.size, dtype=bool)
+    if table is not None and data.common is not None:
+        common = data.common[row] & table.inside(numbers)[which]
+    if common.all():
+        table.bin_means(data.sample_t, data.sample_bin, row, numbers, stepped, which, onset, wanted, out)
+        return out
+    if common.any():
+        for own in (common, ~common):
+            used, at = np.unique(which[own], return_inverse=True)
+            out[own] = _means(asked.take(own), numbers[used], stepped[used], at, onset[own], wanted[own])
+        return out
+    contact = np.exp(numbers)
+    rise, slope = (
+        contacts(nodes, gripper, contact, stepped)[:2] if table is None else table.curves(contact, stepped)
+    )
+    room = np.empty((7, data.sample_t.shape[1]))
+    bin_means(
+        nodes[2],
+        rise,
+        slope,
+        wanted,
+        which,
+        onset,
+        row,
+        data.sample_t,
+        data.sample_bin,
+        data.count,
+        room,
+        out,
+    )
+    return out
 
 
 @numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
 def bin_means(
     nodes: Array, rise: Array, slope: Array, wanted: Mask, which: NDArray[np.int64], onset: Array,
-    row: NDArray[np.int64], times: Array, bins: NDArray[np.int64], count: Array, t: Array, ramp: Array,
-    beyond: Array, u: Array, vary: Mask, loss: Array, room: Array, parts: Array, y: Array, slopes: Array,
+    row: NDArray[np.int64], times: Array, bins: NDArray[np.int64], count: Array, room: Array, means: Array,
 ) -> None:  # fmt: skip
-    """Fill ``y`` (n, n_bin) and ``slopes`` (n, 8, n_bin) of :func:`readings`.
-
-    Bin means (6, n_bin) of the ``wanted`` curves ``which`` belong to n pairs, the last of them the slope of
-    the first; and where ``late``, first of ``loss`` (n, 5), is not negative the integrals of the means up to
-    ``late`` before, and the means there, by straight lines between the bins with a ``count``, zero before
-    them.  The others of ``loss`` are rate, way, drift of the level and leak."""
-    means, delayed, shifted = parts[0], parts[1], parts[2]
-    last, n_curve, n_bin = nodes.size - 1, wanted.shape[1], t.shape[1]
+    """Fill ``means`` (n, 6, n_bin) of the ``wanted`` curves, ``which`` of these belongs to each pair, the
+    last of them the slope of the first."""
+    last, n_curve, n_bin = nodes.size - 1, wanted.shape[1], count.shape[1]
     for p in range(row.size):
-        i, k, begin, late = row[p], 0, times.shape[1], loss[p, 0]
-        parts[:] = 0.0
+        i, k, begin = row[p], 0, times.shape[1]
+        means[p] = 0.0
         # the node before each sample, -1 before contact, and the weights of values and slopes there and at
         # the next one, by cubic Hermite interpolation
         for j in range(times.shape[1]):
@@ -137,88 +169,139 @@ def bin_means(
                         one = room[4, j] * high + room[5, j] * v[k] + room[6, j] * v[k + 1]
                     else:
                         one = r[k] + room[1, j] * high + room[2, j] * v[k] + room[3, j] * v[k + 1]
-                    means[c, bins[i, j]] += one
+                    means[p, c, bins[i, j]] += one
             for m in range(n_bin):
                 if count[i, m] > 0.0:
-                    means[c, m] /= count[i, m]
-            if late < 0.0:
-                continue
-            curve, summed = means[c], 0.0  # the integral up to ``before``
-            before = after = -1  # the bins on either side
+                    means[p, c, m] /= count[i, m]
+
+
+@numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
+def predicted(
+    means: Array, wanted: Mask, row: NDArray[np.int64], count: Array, t: Array, ramp: Array, beyond: Array,
+    u: Array, vary: Mask, loss: Array, room: Array, y: Array, slopes: Array,
+) -> None:  # fmt: skip
+    """Fill ``y`` (n, n_bin) and ``slopes`` (n, n_bin, 8) of :func:`readings` from the ``means`` (n, 6, n_bin)
+    of ``wanted`` curves, the last of them the slope of the first.
+
+    Where ``late``, first of ``loss`` (n, 5), is not negative, a curve's integral up to ``late`` before, and
+    its value there, count too: by straight lines between the bins with a ``count``, zero before them.  The
+    others of ``loss`` are rate, way, drift of the level and leak."""
+    n_curve, n_bin = wanted.shape[1], t.shape[1]
+    before, after, whole = (
+        room[0],
+        room[1],
+        room[2],
+    )  # bins on either side, -1 before the first, and integrals
+    delayed, shifted = room[4:10], room[10:16]
+    for p in range(row.size):
+        i, late, own = row[p], loss[p, 0], means[p]
+        delayed[:], shifted[:] = 0.0, 0.0
+        if late >= 0.0:
+            low = high = -1
             for m in range(n_bin):
+                before[m] = -1.0
                 if count[i, m] <= 0.0:
                     continue
-                if after < 0:
-                    after = m
-                x = t[i, m] - late
-                while t[i, after] <= x:
-                    if before >= 0:
-                        summed += 0.5 * (t[i, after] - t[i, before]) * (curve[after] + curve[before])
-                    before = after
-                    if after == m:
+                if high < 0:
+                    high = m
+                while t[i, high] <= t[i, m] - late:
+                    low = high
+                    if high == m:
                         break
-                    after += 1
-                    while count[i, after] <= 0.0:
-                        after += 1
-                if before >= 0:
-                    ahead, bend = x - t[i, before], 0.0
-                    if after != before:
-                        bend = (curve[after] - curve[before]) / (t[i, after] - t[i, before])
-                    delayed[c, m] = summed + ahead * (curve[before] + 0.5 * bend * ahead)
-                    shifted[c, m] = curve[before] + bend * ahead
+                    high += 1
+                    while count[i, high] <= 0.0:
+                        high += 1
+                before[m], after[m] = low, high
+            for c in range(n_curve):
+                if not wanted[p, c]:
+                    continue
+                summed, k = 0.0, -1
+                for m in range(n_bin):
+                    if count[i, m] > 0.0:
+                        if k >= 0:
+                            summed += 0.5 * (t[i, m] - t[i, k]) * (own[c, m] + own[c, k])
+                        whole[m], k = summed, m
+                for m in range(n_bin):
+                    if before[m] >= 0.0:
+                        low, high = int(before[m]), int(after[m])
+                        ahead, bend = t[i, m] - late - t[i, low], 0.0
+                        if high != low:
+                            bend = (own[c, high] - own[c, low]) / (t[i, high] - t[i, low])
+                        delayed[c, m] = whole[low] + ahead * (own[c, low] + 0.5 * bend * ahead)
+                        shifted[c, m] = own[c, low] + bend * ahead
         rate, way, difference = loss[p, 1], loss[p, 2], u[p, _T] - u[p, _LEVEL]
         for m in range(n_bin):
-            f, lost = means[VALUE, m] + beyond[p, 1, m], rate * delayed[VALUE, m]
+            f, lost = own[VALUE, m] + beyond[p, 1, m], rate * delayed[VALUE, m]
             y[p, m] = u[p, _LEVEL] + difference * f + way * lost + loss[p, 3] * ramp[i, m] + beyond[p, 0, m]
-            if vary[p, _T]:
-                slopes[p, _T, m] = f - lost
-            if vary[p, _LEVEL]:
-                slopes[p, _LEVEL, m] = 1.0 - f - loss[p, 4] * ramp[i, m]
+            slopes[p, m, _T] = f - lost if vary[p, _T] else 0.0
+            slopes[p, m, _LEVEL] = 1.0 - f - loss[p, 4] * ramp[i, m] if vary[p, _LEVEL] else 0.0
+            slopes[p, m, _LEFT] = 0.0
         for c in range(1, n_curve):
-            at = _CURVES[c - 1]
-            if vary[p, at]:
-                by_late = 0.0
-                if at == _E:  # a denser or less conducting block passes the loss on later
-                    by_late = 2.0 * late
-                elif at == _C:
-                    by_late = -2.0 * late
-                sign = -1.0 if at == _ONSET else 1.0
+            at, by_late = _CURVES[c - 1], 0.0
+            if at == _E:  # a denser or less conducting block passes the loss on later
+                by_late = 2.0 * late
+            elif at == _C:
+                by_late = -2.0 * late
+            if not (vary[p, at] and wanted[p, c]):
                 for m in range(n_bin):
-                    extra = delayed[c, m] + by_late * shifted[VALUE, m]
-                    if at == _C:
-                        extra -= delayed[VALUE, m]
-                    slopes[p, at, m] = sign * (difference * means[c, m] + rate * way * extra)
+                    slopes[p, m, at] = 0.0
+                continue
+            sign = -1.0 if at == _ONSET else 1.0
+            scale, passed = sign * difference, sign * rate * way
+            for m in range(n_bin):
+                extra = delayed[c, m] + by_late * shifted[VALUE, m]
+                if at == _C:
+                    extra -= delayed[VALUE, m]
+                slopes[p, m, at] = scale * own[c, m] + passed * extra
 
 
 @numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
 def normal_equations(
     row: NDArray[np.int64], whitener: Array, columns: Array, scale: Array, white: Array, matrix: Array
 ) -> None:
-    """Fill products (n, 8, 8) of the ``columns`` (n, 8, n_bin), scaled by ``scale`` (n, 8) and whitened by
-    the lower triangles ``whitener`` (n_row, n_bin, n_bin); what has no scale is left out."""
-    n_bin = columns.shape[2]
+    """Fill products (n, 8, 8) of the ``columns`` (n, n_bin, 8), scaled by ``scale`` (n, 8) and whitened by
+    the lower triangles ``whitener`` (n_row, n_bin, n_bin)."""
+    n_bin = columns.shape[1]
     for p in range(row.size):
-        for a in range(columns.shape[1]):
-            if scale[p, a] > 0.0:
-                for i in range(n_bin):
-                    total = 0.0
-                    for k in range(i + 1):
-                        total += whitener[row[p], i, k] * columns[p, a, k]
-                    white[a, i] = total * scale[p, a]
-                for b in range(a + 1):
-                    if scale[p, b] > 0.0:
-                        total = 0.0
-                        for i in range(n_bin):
-                            total += white[a, i] * white[b, i]
-                        matrix[p, a, b] = matrix[p, b, a] = total
+        own, w = columns[p], whitener[row[p]]
+        s0, s1, s2, s3 = scale[p, 0], scale[p, 1], scale[p, 2], scale[p, 3]
+        s4, s5, s6, s7 = scale[p, 4], scale[p, 5], scale[p, 6], scale[p, 7]
+        for i in range(n_bin):
+            a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = 0.0
+            for k in range(i + 1):
+                x = w[i, k]
+                a0 += x * own[k, 0]
+                a1 += x * own[k, 1]
+                a2 += x * own[k, 2]
+                a3 += x * own[k, 3]
+                a4 += x * own[k, 4]
+                a5 += x * own[k, 5]
+                a6 += x * own[k, 6]
+                a7 += x * own[k, 7]
+            white[i, 0], white[i, 1], white[i, 2], white[i, 3] = a0 * s0, a1 * s1, a2 * s2, a3 * s3
+            white[i, 4], white[i, 5], white[i, 6], white[i, 7] = a4 * s4, a5 * s5, a6 * s6, a7 * s7
+        for a in range(8):
+            a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = 0.0
+            for i in range(n_bin):
+                x = white[i, a]
+                a0 += x * white[i, 0]
+                a1 += x * white[i, 1]
+                a2 += x * white[i, 2]
+                a3 += x * white[i, 3]
+                a4 += x * white[i, 4]
+                a5 += x * white[i, 5]
+                a6 += x * white[i, 6]
+                a7 += x * white[i, 7]
+            out = matrix[p, a]
+            out[0], out[1], out[2], out[3], out[4], out[5], out[6], out[7] = a0, a1, a2, a3, a4, a5, a6, a7
 
 
 def products(asked: Asked, whitener: Array, u: Array, sd: Array, *, alike: bool = False) -> Array:
     """Return J' J, and J' r and r' r in the last row and column, (n, 8, 8): J in units of ``sd`` (n, 7), r
     the readings less those that ``u`` predicts, both whitened."""
     y, columns = readings(asked, u, sd > 0.0, alike=alike)
-    np.subtract(asked.data.y[asked.row], y, out=columns[:, _LEFT])
-    matrix = np.zeros((len(u), _LEFT + 1, _LEFT + 1))
+    np.subtract(asked.data.y[asked.row], y, out=columns[:, :, _LEFT])
+    matrix = np.empty((len(u), _LEFT + 1, _LEFT + 1))
     scale = np.ones((len(u), _LEFT + 1))
     scale[:, :_LEFT] = sd
     normal_equations(asked.row, whitener, columns, scale, np.empty(columns.shape[1:]), matrix)
@@ -260,35 +343,13 @@ def modes(
     (likelihood x prior density relative to its peak) + ln det of its curvature in units of sd.  Where pairs
     of one row are ``rivals``, one that is hopeless beside the best of them is left there, unsettled.
     """
-    n = len(u)
-    covariance, objective, misfit = np.zeros((n, 7, 7)), np.empty(n), np.empty(n)
-    settled, begin = np.zeros(n, dtype=bool), 0
-    ends = np.append(np.flatnonzero(np.diff(asked.row)) + 1, n) if rivals else np.arange(1, n + 1)
-    while begin < n:  # rivals at once
-        end = int(
-            ends[
-                max(
-                    np.searchsorted(ends, begin + _AT_ONCE, "right") - 1,
-                    np.searchsorted(ends, begin, "right"),
-                )
-            ]
-        )
-        part, begin = slice(begin, end), end
-        found = _settle(asked.take(part), whitener, law[part], u[part], max_steps, rivals)
-        covariance[part], objective[part], misfit[part], settled[part] = found
-    return covariance, objective, misfit, settled
-
-
-def _settle(
-    asked: Asked, whitener: Array, law: Array, u: Array, max_steps: int, rivals: bool
-) -> tuple[Array, Array, Array, Mask]:
     n, (mean, sd, dof) = len(u), law.transpose(1, 0, 2)
     trial, damping = u.copy(), np.full(n, 1e-2)
     at, settled, diagonal = np.arange(n), np.zeros(n, dtype=bool), np.arange(_LEFT)
     cost, matrix, slope, bound = np.full(n, np.inf), np.zeros((n, 8, 8)), np.zeros((n, 7)), np.ones((n, 7))
-    best = np.empty(asked.data.level.size)
+    best, ahead, stated = np.empty(asked.data.level.size), cost.copy(), np.isfinite(asked.data.t_object)
     for step in range(max_steps + 1):
-        there = products(asked.take(at), whitener, trial[at], sd[at], alike=step == 0)
+        there = _products_of(asked, at, whitener, trial, sd, alike=step == 0)
         off = penalty(trial[at], mean[at], sd[at], dof[at])
         tried = there[:, _LEFT, _LEFT] + off.value
         better = (tried < cost[at]) | (step == 0)
@@ -308,10 +369,12 @@ def _settle(
         cost[at[near]] -= decrease[near]
         settled[at[near]] = True
         left = ~near
-        if rivals and step in _HOPELESS:
+        if rivals:
             best.fill(np.inf)
-            np.minimum.at(best, asked.row, cost)
-            left &= cost[at] - decrease < best[asked.row[at]] + _HOPELESS[step]
+            ahead[at] = cost[at] - np.where(near, 0.0, decrease)  # of those near it is taken off
+            np.minimum.at(best, asked.row, ahead)
+            limit = np.where(stated, _HOPELESS_STATED, _HOPELESS.get(step, np.inf))
+            left &= ahead[at] < (best + limit)[asked.row[at]]
         at, curved, rhs = at[left], curved[left], rhs[left]
         if not at.size:
             break
@@ -326,19 +389,31 @@ def _settle(
     return covariance, cost + np.linalg.slogdet(curved)[1], matrix[:, _LEFT, _LEFT], settled
 
 
+def _products_of(
+    asked: Asked, at: NDArray[np.int64], whitener: Array, u: Array, sd: Array, *, alike: bool
+) -> Array:
+    """Return :func:`products` of some pairs, so many at once that they stay in the processor's cache."""
+    out = np.empty((at.size, _LEFT + 1, _LEFT + 1))
+    for begin in range(0, at.size, _AT_ONCE):
+        part = at[begin : begin + _AT_ONCE]
+        out[begin : begin + _AT_ONCE] = products(asked.take(part), whitener, u[part], sd[part], alike=alike)
+    return out
+
+
 def marginals(asked: Asked, whitener: Array, u: Array, sd: Array) -> Array:
     """Return ln p(y | u) up to a constant for points ``u`` (n, 7), integrated over level and T_obj, whose
-    prior means are in ``u``; ``sd`` (m, 2) are their sds, each pair with a row of the answer (m, n)."""
+    prior means are in ``u``; ``sd`` (m, n, 2) are their sds, each with a row of the answer (m, n)."""
     at, out = [_LEVEL, _T], np.empty((len(sd), len(u)))
     for begin in range(0, len(u), _AT_ONCE):
         part = slice(begin, begin + _AT_ONCE)
         n = len(u[part])
         unit = np.zeros((n, 7))
         unit[:, at] = 1.0
-        known = products(asked.take(part), whitener, u[part], unit, alike=True)
+        some = asked.take(part)
+        known = products(some, whitener, u[part], unit, alike=bool((some.row == some.row[0]).all()))
         (a, b), d = (known[:, k, k] for k in at), known[:, _LEVEL, _T]
         (g, h), square = (known[:, k, _LEFT] for k in at), known[:, _LEFT, _LEFT]
-        for row, (s, t) in zip(out, sd):
+        for row, (s, t) in zip(out, sd[:, part].transpose(0, 2, 1)):
             p, q, r = 1.0 + s * s * a, 1.0 + t * t * b, s * t * d
             det = p * q - r * r
             x, y = s * g, t * h

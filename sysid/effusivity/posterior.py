@@ -33,6 +33,7 @@ from thermogrip.sysid.effusivity.posterior_grid import (
     grid_posteriors,
     mixed,
     mixture_quantiles,
+    rough_evidence,
 )
 
 
@@ -142,10 +143,11 @@ def effusivity_posterior(
         for name, fits in free_touch_fit(gripper, grasps, coupling=coupling, until=until).items():
             found |= dict(zip(rows[name].tolist(), fits))
     names = [str(name) for name in grasps["grasp"].values]
-    return [_row(gripper, name, found[i], share if i in alone else 0.0) for i, name in enumerate(names)]
+    shares = np.where(np.isin(np.arange(len(names)), alone), share, 0.0)
+    return _rows(gripper, names, [found[i] for i in range(len(names))], shares)
 
 
-# grasps about which another gripper is asked one by one, until it is so unlikely, and when no more are asked
+# grasps about which another gripper is asked one by one, until it is so unlikely, and when nobody asks more
 _ASKED, _HARDLY, _UNLIKELY = 5, 0.001, 0.01
 
 
@@ -155,36 +157,55 @@ def _by_either(
     """Return the posteriors of touches that one gripper took, the calibrated one or another, and how likely
     it was another."""
     other, n = another_gripper(gripper), len(own)
-    order = np.unique(np.linspace(0, n - 1, min(n, _ASKED)).astype(int))
-    order = np.concatenate([order, np.setdiff1d(np.arange(n), order)])
-    theirs: dict[int, GridPosterior] = {}
-    odds = float(logit(prior))
-    for some in (*order[:_ASKED, None], order[_ASKED:]):
-        if some.size and expit(odds) > (_HARDLY if len(theirs) < _ASKED else _UNLIKELY):
-            fits = grid_posteriors(other, data.take(some))
-            fits = [fit._replace(x_sd=np.full(fit.x.size, ANOTHER_SCALE_SD)) for fit in fits]
-            odds += sum(fit.log_evidence - own[i].log_evidence for i, fit in zip(some, fits))
-            theirs |= dict(zip(some.tolist(), fits))
-    share = float(expit(odds))
-    if len(theirs) < n or share < _UNLIKELY:
+    odds = prior_odds = float(logit(prior))
+    for i in np.unique(np.linspace(0, n - 1, min(n, _ASKED)).astype(int)):
+        if expit(odds) > _HARDLY:
+            odds += float(rough_evidence(other, data.take(np.array([i])))[0]) - own[i].log_evidence
+    if (share := float(expit(odds))) < _UNLIKELY:
+        return own, share
+    fits = grid_posteriors(other, data)
+    theirs = [fit._replace(x_sd=np.full(fit.x.size, ANOTHER_SCALE_SD)) for fit in fits]
+    odds = prior_odds + sum(fit.log_evidence - one.log_evidence for fit, one in zip(theirs, own))
+    if (share := float(expit(odds))) < _UNLIKELY:
         return own, share
     odds_of = np.log([max(1 - share, 1e-300), share])
     return [mixed([one, theirs[i]], odds_of) for i, one in enumerate(own)], share
 
 
-def _row(gripper: GripperModel, name: str, posterior: GridPosterior, share: float = 0.0) -> EffusivityRow:
-    scale, scale_sd = gripper.effusivity_scale(posterior.x)
-    scatter = np.where(np.exp(posterior.x) < INSULATOR, gripper.spreads.ln_effusivity, 0.0)
-    x, sd = posterior.x - scale, np.sqrt(scale_sd**2 + scatter**2 + posterior.x_sd**2 + 1e-8)
-    low, middle, high = np.exp(mixture_quantiles(posterior.mass, x, sd, (0.05, 0.5, 0.95)))
-    mean = float((posterior.mass * x).sum())
-    variance = float((posterior.mass * ((x - mean) ** 2 + sd**2)).sum())
-    t = mixture_quantiles(posterior.weight, posterior.t_object, posterior.t_object_sd, (0.05, 0.5, 0.95))
+_LEVELS = (0.05, 0.5, 0.95)
+
+
+def _rows(
+    gripper: GripperModel, names: Sequence[str], found: Sequence[GridPosterior], share: Array
+) -> list[EffusivityRow]:
+    x, mass, more = (_padded([p[k] for p in found], edge=k != 1) for k in (0, 1, 7))
+    scale, scale_sd = gripper.effusivity_scale(x)
+    scatter = np.where(np.exp(x) < INSULATOR, gripper.spreads.ln_effusivity, 0.0)
+    x, sd = x - scale, np.sqrt(scale_sd**2 + scatter**2 + more**2 + 1e-8)
+    e = np.exp(mixture_quantiles(mass, x, sd, _LEVELS))
+    mean = (mass * x).sum(axis=1)
+    variance = (mass * ((x - mean[:, None]) ** 2 + sd**2)).sum(axis=1)
+    weight, t_object, t_sd, ln_h = (_padded([p[k] for p in found], edge=k != 3) for k in (3, 4, 5, 6))
+    t = mixture_quantiles(weight, t_object, t_sd, _LEVELS)
     if gripper.discrepancy is not None:  # it has no scale of its own: that of the temperatures it was told
         t = t - gripper.bias
-    return EffusivityRow(
-        grasp_id=name, effusivity=float(middle), effusivity_p05=float(low), effusivity_p95=float(high),
-        t_object=float(t[1]), t_object_p05=float(t[0]), t_object_p95=float(t[2]),
-        h_c=float(np.exp((posterior.weight * posterior.ln_h).sum())),
-        log10_effusivity_sd=float(np.sqrt(variance) / np.log(10)), other_gripper=share,
-    )  # fmt: skip
+    h_c, spread = np.exp((weight * ln_h).sum(axis=1)), np.sqrt(variance) / np.log(10)
+    return [
+        EffusivityRow(
+            grasp_id=name, effusivity=float(e[i, 1]), effusivity_p05=float(e[i, 0]),
+            effusivity_p95=float(e[i, 2]), t_object=float(t[i, 1]), t_object_p05=float(t[i, 0]),
+            t_object_p95=float(t[i, 2]), h_c=float(h_c[i]), log10_effusivity_sd=float(spread[i]),
+            other_gripper=float(share[i]),
+        )
+        for i, name in enumerate(names)
+    ]  # fmt: skip
+
+
+def _padded(parts: Sequence[Array], *, edge: bool) -> Array:
+    """Return arrays (m,) as one (n, longest), padded with their last values or with zeros."""
+    out = np.zeros((len(parts), max(part.size for part in parts)))
+    for row, part in zip(out, parts):
+        row[: part.size] = part
+        if edge:
+            row[part.size :] = part[-1]
+    return out

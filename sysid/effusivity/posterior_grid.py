@@ -43,6 +43,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     SLIPS,
     T_OBJECT,
     H,
+    Prior,
     doubted,
     fit_pairs,
     free_hypotheses,
@@ -60,7 +61,7 @@ SAMPLED = [EFFUSIVITY, H, BUILD_UP, ONSET, CAPACITY]
 
 _REST = np.array([CAPACITY, H, BUILD_UP, ONSET])  # ln C first
 _BACK = [1, 2, 3, 0]  # from there to the order of SAMPLED
-_FIRST, _STEP = 1.15 * np.arange(-3.0, 4.0), 1.15  # of z_0
+_FIRST, _STEP = 1.4 * np.arange(-2.0, 3.0), 1.4  # of z_0
 _OTHERS = np.sqrt(3.0) * np.concatenate([np.eye(3), -np.eye(3)])
 _Z = np.column_stack([np.repeat(_FIRST, 6), np.tile(_OTHERS, (_FIRST.size, 1))])
 # of each point, step exp(3/2) / 6; of 2 pi the power 3/2 from here, -2 from the constants of four priors
@@ -68,21 +69,24 @@ _LOG_WEIGHT = 1.5 - np.log(6.0) - 0.5 * np.log(2 * np.pi) + np.log(_STEP)
 
 
 def slipped(
-    gripper: GripperModel, data: Touches, whitener: Array, beyond: Array, sd: Array, u: Array
-) -> Array:
-    """Return ln p(y | u) up to a constant for n points ``u`` (n, 7) of one grasp, integrated over level and
-    T_obj (prior means in ``u``, sds in ``sd`` (7,)), the latter a slip with a probability of ``SLIPS`` where
-    it is stated."""
+    gripper: GripperModel, data: Touches, whitener: Array, beyond: Array | None, sd: Array, u: Array,
+    row: NDArray[np.int64] | None = None,
+) -> Array:  # fmt: skip
+    """Return ln p(y | u) up to a constant for n points ``u`` (n, 7) of the grasps ``row`` (n,), by default
+    the first, integrated over level and T_obj (prior means in ``u``, sds in ``sd``, (7,) or (n, 7)), the
+    latter a slip with a probability of ``SLIPS`` where it is stated."""
     from thermogrip.sysid.effusivity.mode_kernel import marginals
 
-    row = np.zeros(len(u), dtype=np.int64)
+    row = np.zeros(len(u), dtype=np.int64) if row is None else row
     asked = pairs_asked(gripper.stack, nodes_for(data), data, row, beyond, tabled=True)
-    stated, t_sd = np.isfinite(data.t_object[0]), sd[T_OBJECT]
-    sds = [[sd[LEVEL], t_sd], [sd[LEVEL], t_sd * float(slip_of(t_sd))]]
-    found = marginals(asked, whitener, u, np.array(sds[: 1 + stated]))
-    return np.asarray(
-        np.logaddexp(np.log1p(-SLIPS) + found[0], np.log(SLIPS) + found[1]) if stated else found[0]
-    )
+    stated, sd = np.isfinite(data.t_object[row]), np.broadcast_to(sd, u.shape)
+    own = np.stack([sd[:, LEVEL], sd[:, T_OBJECT]], axis=1)
+    wide = own * np.stack([np.ones(len(u)), slip_of(sd[:, T_OBJECT])], axis=1)
+    found = marginals(asked, whitener, u, np.stack([own, wide]) if stated.any() else own[None])
+    if not stated.any():
+        return found[0]
+    either = np.logaddexp(np.log1p(-SLIPS) + found[0], np.log(SLIPS) + found[1])
+    return np.asarray(np.where(stated, either, found[0]))
 
 
 class MarginalPosterior:
@@ -110,32 +114,48 @@ class MarginalPosterior:
         return value
 
     def _log_posterior(self, points: Array) -> Array:
-        free, common, data = free_hypotheses(self.gripper, points[:, 0]), self._prior, self.data
-        u = np.repeat(common.mean, points.shape[0], axis=0)
-        u[:, SAMPLED] = points
-        log_prior = _log_student(points[:, 1], free.ln_h, free.ln_h_sd)
-        ln_length = np.log(self.gripper.block_length * self.gripper.depth_share)
-        log_prior += _log_student(points[:, 4], free.ln_rho_c + ln_length, free.ln_rho_c_sd)
-        for column, k in ((2, BUILD_UP), (3, ONSET)):
-            dof = np.inf if common.dof is None else common.dof[0, k]
-            log_prior += _log_student(points[:, column], common.mean[0, k], common.sd[0, k], dof)
-        beyond = self.gripper.beyond(data.t, points[:, 0])
-        likelihood = slipped(self.gripper, data, self.whitener, beyond, common.sd[0], u)
-        return np.asarray(log_prior + likelihood)
+        row = np.zeros(len(points), dtype=np.int64)
+        return _log_posterior(self.gripper, self.data, self.whitener, self._prior, points, row)
+
+
+def _log_posterior(
+    gripper: GripperModel, data: Touches, whitener: Array, common: Prior, points: Array,
+    row: NDArray[np.int64],
+) -> Array:  # fmt: skip
+    """Return the log posterior (n,), up to a constant, of points (n, 5) of the grasps ``row``, of whose
+    priors ``common`` has what does not depend on ln e."""
+    free, mean, sd = free_hypotheses(gripper, points[:, 0]), common.mean[row], common.sd[row]
+    u = mean.copy()
+    u[:, SAMPLED] = points
+    log_prior = _log_student(points[:, 1], free.ln_h, free.ln_h_sd)
+    ln_length = np.log(gripper.block_length * gripper.depth_share)
+    log_prior += _log_student(points[:, 4], free.ln_rho_c + ln_length, free.ln_rho_c_sd)
+    for column, k in ((2, BUILD_UP), (3, ONSET)):
+        dof = np.inf if common.dof is None else common.dof[0, k]  # of the gripper
+        log_prior += _log_student(points[:, column], mean[:, k], sd[:, k], dof)
+    beyond = None if gripper.discrepancy is None else gripper.beyond(data.t[row], points[:, 0])
+    return np.asarray(log_prior + slipped(gripper, data, whitener, beyond, sd, u, row))
 
 
 def log_integrals(
     gripper: GripperModel, data: Touches, x: Array, mode: Array, covariance: Array, *,
-    noise: tuple[Array, Array] | None = None,
+    noise: tuple[Array, Array] | None = None, row: NDArray[np.int64] | None = None,
 ) -> Array:  # fmt: skip
-    """Return ln p(y | ln e), every nuisance integrated, at effusivities ``x``."""
-    target = MarginalPosterior(gripper, data, noise)
+    """Return ln p(y | ln e), every nuisance integrated, at effusivities ``x`` (n,) of the grasps ``row``
+    (n,), by default the first."""
+    gripper.require_known("an integral over one grasp's nuisances")
+    row = np.zeros(x.size, dtype=np.int64) if row is None else row
+    whitener, log_det = whiten(data, gripper.noise) if noise is None else noise
+    common = prior_of(gripper, data, free_hypotheses(gripper, np.full(data.level.size, 9.0)))
     root = np.linalg.cholesky(covariance[:, _REST[:, None], _REST[None, :]])
     rest = mode[:, None, _REST] + np.einsum("nij,kj->nki", root, _Z)
     points = np.column_stack([np.repeat(x, _Z.shape[0]), rest.reshape(-1, 4)[:, _BACK]])
-    total = logsumexp(target(points).reshape(x.size, -1), axis=1)
+    each = _log_posterior(gripper, data, whitener, common, points, np.repeat(row, _Z.shape[0]))
+    # effusivities outside the prior's range are none
+    inside = (x >= LN_E_RANGE[0]) & (x <= LN_E_RANGE[1])
+    total = np.where(inside, logsumexp(each.reshape(x.size, -1), axis=1), -np.inf)
     volume = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
-    return np.asarray(total + volume + _LOG_WEIGHT - 0.5 * target.log_det)
+    return np.asarray(total + volume + _LOG_WEIGHT - 0.5 * log_det[row])
 
 
 def _log_student(x: Array, mean: Array | float, sd: Array | float, dof: float = np.inf) -> Array:
@@ -149,6 +169,8 @@ def _log_student(x: Array, mean: Array | float, sd: Array | float, dof: float = 
 N_COARSE = 26
 REFINEMENTS = ((12.0, 12), (7.0, 14))  # nats below the best point that each covers, and its points
 _KNOTS, _REACH = 7, 8.0  # points to integrate at, and how far below the best they go [nat]
+_TOGETHER = 4  # grasps whose integrals are computed at once
+_ROUGH = 18  # points of a density that is wide
 
 
 class GridPosterior(NamedTuple):
@@ -178,12 +200,23 @@ def grid_posteriors(gripper: GripperModel, data: Touches) -> list[GridPosterior]
     """Return the posteriors of ln e: log-uniform prior over :data:`LN_E_RANGE`, h_c unknown."""
     noise = whiten(data, gripper.noise)
     found = _fitted(gripper, data, noise)
-    return [_finished(gripper, data, noise, found, i) for i in range(data.level.size)]
+    value = found.value + _left_out(gripper, data, noise, found)
+    sd = np.sqrt(found.covariance[:, :, T_OBJECT, T_OBJECT])
+    return posteriors_of(found.x, value, found.u[:, :, T_OBJECT], sd, found.u[:, :, H])
 
 
 def free_evidence(gripper: GripperModel, data: Touches) -> Array:
     """Return the log evidence of a free effusivity for each touch, (n,), as :func:`grid_posteriors` do."""
     found = _fitted(gripper, data, whiten(data, gripper.noise))
+    return np.asarray(log_total(found.x, found.value) - np.log(LN_E_RANGE[1] - LN_E_RANGE[0]))
+
+
+def rough_evidence(gripper: GripperModel, data: Touches) -> Array:
+    """Return :func:`free_evidence` by few points, of a gripper under which densities are wide: within 0.15
+    of it."""
+    noise = whiten(data, gripper.noise)
+    grid = np.tile(np.linspace(*LN_E_RANGE, _ROUGH), (data.level.size, 1))
+    found = _evaluate(gripper, data, noise, grid, None)
     return np.asarray(log_total(found.x, found.value) - np.log(LN_E_RANGE[1] - LN_E_RANGE[0]))
 
 
@@ -201,33 +234,36 @@ def _fitted(gripper: GripperModel, data: Touches, noise: tuple[Array, Array]) ->
     return found
 
 
-def _finished(
-    gripper: GripperModel, data: Touches, noise: tuple[Array, Array], found: _Fitted, i: int
-) -> GridPosterior:
-    x, u = found.x[i], found.u[i]
-    one, own = data.take(np.array([i])), (noise[0][i : i + 1], noise[1][i : i + 1])
-    value = found.value[i] + _left_out(gripper, one, own, _Fitted(*(part[i] for part in found)))
-    sd = np.sqrt(found.covariance[i, :, T_OBJECT, T_OBJECT])
-    return posterior_of(x, value, u[:, T_OBJECT], sd, u[:, H])
-
-
 def _left_out(gripper: GripperModel, data: Touches, noise: tuple[Array, Array], found: _Fitted) -> Array:
-    """Return what Laplace's method left out of one grasp's points, (m,), less its mean over the posterior."""
+    """Return what Laplace's method left out of the points (n, m), less its mean over each posterior."""
     from scipy.interpolate import PchipInterpolator
 
     x, value, u, covariance, settled = found
-    near = np.flatnonzero(settled & (value > value.max() - _REACH))
+    out = np.zeros(x.shape)
     # for an uncertain gripper Laplace's method integrates over its parameters too, with a discrepancy the
     # evidence counts less than the integral says
     other = gripper.uncertain or gripper.discrepancy is not None
-    if near.size < _KNOTS or other or (gripper.second is not None and data.second is not None):
-        return np.zeros(x.size)
-    wanted = np.linspace(x[near[0]], x[near[-1]], _KNOTS)
-    at = near[np.unique(np.abs(x[near] - wanted[:, None]).argmin(axis=1))]
-    missing = log_integrals(gripper, data, x[at], u[at], covariance[at], noise=noise) - value[at]
-    everywhere = PchipInterpolator(x[at], missing)(np.clip(x, x[at[0]], x[at[-1]]))
-    weight = np.exp(value - value.max()) * np.gradient(x)
-    return np.asarray(everywhere - (weight * everywhere).sum() / weight.sum())
+    if other or (gripper.second is not None and data.second is not None):
+        return out
+    near = settled & (value > value.max(axis=1, keepdims=True) - _REACH)
+    knots: dict[int, NDArray[np.int64]] = {}
+    for i in np.flatnonzero(near.sum(axis=1) >= _KNOTS).tolist():
+        at = np.flatnonzero(near[i])
+        wanted = np.linspace(x[i, at[0]], x[i, at[-1]], _KNOTS)
+        knots[i] = at[np.unique(np.abs(x[i, at] - wanted[:, None]).argmin(axis=1))]
+    every = list(knots.items())
+    for some in (every[k : k + _TOGETHER] for k in range(0, len(every), _TOGETHER)):
+        row, at = (
+            np.repeat([i for i, _ in some], [k.size for _, k in some]),
+            np.concatenate([k for _, k in some]),
+        )
+        there = x[row, at], u[row, at], covariance[row, at]
+        missing = log_integrals(gripper, data, *there, noise=noise, row=row) - value[row, at]
+        for i, k in some:
+            everywhere = PchipInterpolator(x[i, k], missing[row == i])(np.clip(x[i], x[i, k[0]], x[i, k[-1]]))
+            weight = np.exp(value[i] - value[i].max()) * np.gradient(x[i])
+            out[i] = everywhere - (weight * everywhere).sum() / weight.sum()
+    return out
 
 
 def mixed(parts: Sequence[GridPosterior], log_weight: Array) -> GridPosterior:
@@ -246,19 +282,33 @@ def mixed(parts: Sequence[GridPosterior], log_weight: Array) -> GridPosterior:
 
 
 def mixture_quantiles(weight: Array, mean: Array, sd: Array, levels: tuple[float, ...]) -> Array:
-    """Return quantiles of a mixture of normals, (n_level,), by Newton's method between bounds."""
-    wanted = np.asarray(levels)
-    low = np.full(wanted.size, (mean - 9 * sd).min())
-    high = np.full(wanted.size, (mean + 9 * sd).max())
-    order = np.argsort(mean)
+    """Return quantiles of a mixture of normals (m,), (n_level,), or of several (n, m), (n, n_level), by
+    Newton's method between bounds."""
+    if weight.ndim == 1:
+        return np.asarray(mixture_quantiles(weight[None], mean[None], sd[None], levels)[0])
+    wanted, found = np.asarray(levels), np.empty((len(weight), len(levels)))
+    for begin in range(0, len(weight), 16):  # whose arrays stay in the processor's cache
+        part = slice(begin, begin + 16)
+        found[part] = _quantiles(weight[part], mean[part], sd[part], wanted)
+    return found
+
+
+def _quantiles(weight: Array, mean: Array, sd: Array, wanted: Array) -> Array:
+    low = np.repeat((mean - 9 * sd).min(axis=1, keepdims=True), wanted.size, axis=1)
+    high = np.repeat((mean + 9 * sd).max(axis=1, keepdims=True), wanted.size, axis=1)
     # narrow parts in a row: their means' own quantiles are near
-    x = np.interp(wanted, np.cumsum(weight[order]) - 0.5 * weight[order], mean[order])
-    least = 1e-10 * (high[0] - low[0])
+    order = np.argsort(mean, axis=1, kind="stable")
+    w, m = np.take_along_axis(weight, order, axis=1), np.take_along_axis(mean, order, axis=1)
+    middle = np.cumsum(w, axis=1) - 0.5 * w
+    x = np.stack([np.interp(wanted, at, own) for at, own in zip(middle, m)])
+    least = 1e-7 * (high[:, 0] - low[:, 0]).min()
+    w, m, s = weight[:, None, :], mean[:, None, :], sd[:, None, :]
+    share = w / s / np.sqrt(2 * np.pi)
     for _ in range(60):
-        z = (x[:, None] - mean) / sd
-        over = (weight * ndtr(z)).sum(axis=1) - wanted
+        z = (x[:, :, None] - m) / s
+        over = (w * ndtr(z)).sum(axis=2) - wanted
         low, high = np.where(over < 0, x, low), np.where(over < 0, high, x)
-        density = (weight / sd * np.exp(-0.5 * z**2)).sum(axis=1) / np.sqrt(2 * np.pi)
+        density = (share * np.exp(-0.5 * z**2)).sum(axis=2)
         newton = x - over / np.maximum(density, 1e-300)
         # one that has arrived is itself a bound, and stays
         before, x = x, np.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
@@ -345,30 +395,50 @@ def log_total(x: Array, value: Array) -> Array:
 
 
 def _cubic(x: Array, value: Array, at: NDArray[np.int64], share: Array) -> Array:
-    """Return curves (n, m) through ``value`` at ``x``, between points ``at`` (k,) and the next, a ``share``
-    (n, k) of the way."""
+    """Return curves (n, m) through ``value`` at ``x``, between points ``at``, (k,) or (n, k), and the next, a
+    ``share`` (n, k) of the way."""
     value = np.maximum(value, value.max(axis=1, keepdims=True) - _FAR)
-    d, width, s = slopes(x, value), np.diff(x)[:, at], share
-    y0, y1 = value[:, at], value[:, at + 1]
-    bent = (1 - s) * d[:, at] * width - s * d[:, at + 1] * width + (1 - 2 * s) * (y0 - y1)
+    d, s = slopes(x, value), share
+    at = np.broadcast_to(at, s.shape)
+    y0, d0 = (np.take_along_axis(part, at, axis=1) for part in (value, d))
+    y1, d1 = (np.take_along_axis(part, at + 1, axis=1) for part in (value, d))
+    width = np.take_along_axis(np.diff(x), at, axis=1)
+    bent = (1 - s) * d0 * width - s * d1 * width + (1 - 2 * s) * (y0 - y1)
     return np.asarray(y0 + s * (y1 - y0) + s * (1 - s) * bent)
 
 
 def posterior_of(x: Array, value: Array, t_object: Array, sd: Array, ln_h: Array) -> GridPosterior:
     """Return the posterior of log densities ``value`` at points ``x``, along which these rise; arguments are
     (m,)."""
-    inside = np.flatnonzero(value > value.max() - 20)
-    low, high = x[max(inside[0] - 1, 0)], x[min(inside[-1] + 1, x.size - 1)]
-    fine = np.linspace(low, high, 500)
-    at = np.clip(np.searchsorted(x, fine, "right") - 1, 0, x.size - 2)
-    share = (fine - x[at]) / (x[at + 1] - x[at])
-    log_density = _cubic(x[None], value[None], at, share[None])[0]
-    log_total = float(logsumexp(log_density)) + np.log(fine[1] - fine[0])
-    mass = np.exp(log_density - logsumexp(log_density))
-    weight = np.exp(value - value.max()) * np.gradient(x)
+    return posteriors_of(*(part[None] for part in (x, value, t_object, sd, ln_h)))[0]
+
+
+_FINE = 160  # points of a density
+
+
+def posteriors_of(x: Array, value: Array, t_object: Array, sd: Array, ln_h: Array) -> list[GridPosterior]:
+    """Return :func:`posterior_of` of several grasps; arguments are (n, m)."""
+    inside, last = value > value.max(axis=1, keepdims=True) - 20, x.shape[1] - 1
+    row = np.arange(len(x))
+    low = x[row, np.maximum(inside.argmax(axis=1) - 1, 0)]
+    high = x[row, np.minimum(last - inside[:, ::-1].argmax(axis=1) + 1, last)]
+    fine = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, _FINE)
+    at = np.stack([np.searchsorted(own, there, "right") - 1 for own, there in zip(x, fine)])
+    at = np.clip(at, 0, last - 1)
+    before, after = np.take_along_axis(x, at, axis=1), np.take_along_axis(x, at + 1, axis=1)
+    log_density = _cubic(x, value, at, (fine - before) / (after - before))
+    log_density[:, [0, -1]] -= np.log(2.0)  # by the trapezoidal rule
+    log_sum = logsumexp(log_density, axis=1)
+    evidence = log_sum + np.log(fine[:, 1] - fine[:, 0]) - np.log(LN_E_RANGE[1] - LN_E_RANGE[0])
+    mass = np.exp(log_density - log_sum[:, None])
+    weight = np.exp(value - value.max(axis=1, keepdims=True)) * np.gradient(x, axis=1)
     # tails without mass need no part in the mixtures
-    use = weight > 1e-9 * weight.max()
-    return GridPosterior(
-        fine, mass, log_total - np.log(LN_E_RANGE[1] - LN_E_RANGE[0]), weight[use] / weight[use].sum(),
-        t_object[use], sd[use], ln_h[use], np.zeros(fine.size),
-    )  # fmt: skip
+    use = weight > 1e-9 * weight.max(axis=1, keepdims=True)
+    nothing = np.zeros(_FINE)
+    return [
+        GridPosterior(
+            fine[i], mass[i], float(evidence[i]), weight[i, k] / weight[i, k].sum(), t_object[i, k], sd[i, k],
+            ln_h[i, k], nothing,
+        )
+        for i, k in enumerate(use)
+    ]  # fmt: skip

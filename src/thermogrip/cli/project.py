@@ -149,7 +149,10 @@ def warm_up(as_json: cli.AsJson = False) -> int:
     classify_grasps(PosteriorClassifier().with_device(gripper), grasps, ["copper", "wood"])
     effusivity_posterior(gripper, grasps)
     table = response_table(gripper.stack, 12.0)  # which many grasps need
-    table.curves(np.array([[3e3, 3e4, 1e3, 0.5]]), np.ones((1, N_STEPPED), dtype=bool))
+    contact, first = np.array([[3e3, 3e4, 1e3, 0.5]]), np.zeros(1, dtype=np.int64)
+    stepped, wanted = np.ones((1, N_STEPPED), dtype=bool), np.ones((1, N_STEPPED + 1), dtype=bool)
+    one = np.ones((1, 1)), np.zeros((1, 1), dtype=np.int64), first, np.log(contact), stepped, first
+    table.bin_means(*one, np.zeros(1), wanted, np.empty((1, N_STEPPED + 1, 1)))
     seconds, place = time.process_time() - began, step_contacts.stats.cache_path
     console.say(f"compiled in {seconds:.1f} s of CPU, kept in {place}")
     console.answer({"cpu_s": seconds, "kept_in": place})

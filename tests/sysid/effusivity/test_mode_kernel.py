@@ -43,13 +43,13 @@ def test_the_penalty_is_the_priors_density_beside_its_peak():
 
 def test_products_are_those_of_whitened_columns():
     rng = np.random.default_rng(1)
-    whitener, columns = np.tril(rng.normal(size=(2, 5, 5))), rng.normal(size=(3, 8, 5))
+    whitener, columns = np.tril(rng.normal(size=(2, 5, 5))), rng.normal(size=(3, 5, 8))
     scale, row, matrix = rng.uniform(0.5, 2.0, (3, 8)), np.array([1, 0, 1]), np.zeros((3, 8, 8))
     scale[1, 2] = 0.0  # known: no part of the sums
     above = np.triu(np.full((5, 5), 9.0), 1)
-    kernel.normal_equations.py_func(row, whitener + above, columns, scale, np.empty((8, 5)), matrix)
+    kernel.normal_equations.py_func(row, whitener + above, columns, scale, np.empty((5, 8)), matrix)
     for p in range(3):
-        white = whitener[row[p]] @ (columns[p] * scale[p, :, None]).T
+        white = whitener[row[p]] @ (columns[p] * scale[p])
         np.testing.assert_allclose(matrix[p], white.T @ white, atol=1e-12)
     assert not matrix[1, 2].any()
 
@@ -61,15 +61,19 @@ def means_of(nodes, rise, slope, times, bins, *, onset=0.0, late=-1.0):
     count = np.zeros((1, n))
     count[0, bins[bins >= 0]] = 1.0
     curves = np.zeros((1, 6, len(nodes)))
-    bent, out, loss = curves.copy(), np.empty((3, 6, n)), np.array([[late, 0.0, 0.0, 0.0, 0.0]])
+    bent, means, room = curves.copy(), np.empty((1, 6, n)), np.zeros((16, n))
     curves[0, 0], bent[0, 0] = rise, slope
-    wanted = np.array([[True, False, False, False, False, True]])
+    wanted, at = np.array([[True, False, False, False, False, True]]), np.array([0])
     kernel.bin_means.py_func(
-        np.array(nodes, dtype=float), curves, bent, wanted, np.array([0]), np.array([onset]), np.array([0]),
-        times, bins, count, times, times, np.zeros((1, 2, n)), np.zeros((1, 7)), np.zeros((1, 7), dtype=bool),
-        loss, np.empty((7, n)), out, np.empty((1, n)), np.empty((1, 8, n)),
+        np.array(nodes, dtype=float), curves, bent, wanted, at, np.array([onset]), at, times, bins, count,
+        np.empty((7, n)), means,
     )  # fmt: skip
-    return out[0, 0], out[0, 5], out[1, 0], out[2, 0]
+    kernel.predicted.py_func(
+        means, wanted, at, count, times, times, np.zeros((1, 2, n)), np.zeros((1, 7)),
+        np.zeros((1, 7), dtype=bool), np.array([[late, 0.0, 0.0, 0.0, 0.0]]), room, np.empty((1, n)),
+        np.empty((1, n, 8)),
+    )  # fmt: skip
+    return means[0, 0], means[0, 5], room[4], room[10]
 
 
 def test_samples_find_their_nodes_whichever_way_they_come():

@@ -1,0 +1,170 @@
+"""How much faster two workers are than one, and whether their answers are the same bytes.
+
+    python benchmarks/workers.py FOLDER [effusivity compare tune identify] [--kill] [--files 12]
+
+Each verb runs with one process, with ``--workers 2`` and, where ``distributed`` is installed, on a Dask
+scheduler with two worker processes of this machine, which are there before the clock starts.  Efficiency is
+the wall time of one over twice that of two, the start of the program included.  With ``--kill`` a worker is
+ended by SIGKILL once it has computed for some seconds, and only bytes are compared.
+
+The loop at the end of a line is the CPU time of five million additions right after the run: a machine that
+others share has several speeds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent / "classify"))
+from scale import make
+
+from thermogrip.datasets.examples import copy_examples
+
+LOGS = ("prbs_heating_cooling", "step_up_down", "multisine", "pump_on_off")
+
+
+def verbs(folder: Path, n_files: int) -> dict[str, list[str]]:
+    """Return the command of each verb, without its output."""
+    if not (folder / "prbs_heating_cooling.csv.xz").exists():
+        copy_examples(folder)
+    logs = [str(folder / f"{name}.csv.xz") for name in LOGS]
+    plant = folder / "plant.json"
+    if not plant.exists():
+        ran(["identify", *logs, "--network", "gripper", "--models", "network", "--out", str(plant)])
+    return {
+        "effusivity": ["effusivity", str(make(folder / "many", n_files)), "--out", "answer.csv"],
+        "compare": [
+            "compare", str(folder / "grasps" / "exp1A_obj43_grip23.csv.xz"), "--classifiers",
+            "posterior,bayes,features-lda", "--out", "answer",
+        ],
+        "tune": ["tune", str(plant), "--out", "answer.json"],
+        "identify": [
+            "identify", *logs, "--network", "gripper", "--models", "arx,oe,subspace,sindy,network",
+            "--leave-one-out", "--out", "answer.json",
+        ],
+    }  # fmt: skip
+
+
+def ran(words: list[str], cwd: Path | None = None, kill: bool = False) -> float:
+    """Return the wall time [s] of one run, a worker of which may be killed."""
+    begin = time.perf_counter()
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen([sys.executable, "-m", "thermogrip", *words], cwd=cwd, **quiet) as process:
+        if kill and not killed_one(process.pid):
+            print("  no worker was there to be killed")
+        if process.wait() not in (0, 1):
+            raise SystemExit(f"failed: {words}")
+    return time.perf_counter() - begin
+
+
+def children(pid: int) -> list[int]:
+    """Return the processes that a process started, theirs too."""
+    own = []
+    for task in Path(f"/proc/{pid}/task").glob("*/children"):
+        own += [int(word) for word in task.read_text().split()]
+    return own + [more for child in own for more in children(child)]
+
+
+def cpu_s(pid: int) -> float:
+    """Return the CPU time of a process [s]."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return sum(map(int, fields[11:13])) / os.sysconf("SC_CLK_TCK")
+
+
+def killed_one(pid: int, seconds: float = 6.0) -> bool:
+    """Kill the first worker of a process that has computed so long."""
+    while Path(f"/proc/{pid}/stat").exists() and cpu_s(pid) >= 0:
+        for child in children(pid):
+            if cpu_s(child) > seconds:
+                os.kill(child, signal.SIGKILL)
+                return True
+        if Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z":
+            return False
+        time.sleep(0.1)
+    return False
+
+
+@contextmanager
+def cluster(folder: Path) -> Iterator[tuple[str, int]]:
+    """Give the address of a scheduler with two workers, and the process that started these."""
+    run = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0"]
+    file = folder / "scheduler.json"
+    file.unlink(missing_ok=True)
+    work = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(file)]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": folder}
+    ahead = [*run, "--no-dashboard", "--scheduler-file", str(file)]
+    behind = [*work, "--nworkers", "2", "--nthreads", "1", "--no-dashboard"]
+    with subprocess.Popen(ahead, **quiet) as scheduler, subprocess.Popen(behind, **quiet) as two:
+        from distributed import Client
+
+        try:
+            with Client(scheduler_file=str(file)) as client:
+                client.wait_for_workers(2)
+                address = client.scheduler.address
+            yield address, two.pid
+        finally:
+            two.terminate()
+            two.wait()
+            scheduler.terminate()
+
+
+def digest(folder: Path) -> str:
+    """Return what the output of a run amounts to."""
+    found = hashlib.sha256()
+    for path in sorted(folder.rglob("*")):
+        if path.is_file():
+            found.update(str(path.relative_to(folder)).encode() + path.read_bytes())
+    return found.hexdigest()[:12]
+
+
+def loop() -> float:
+    """Return the CPU time of five million additions [s]."""
+    begin, total = time.process_time(), 0
+    for i in range(5_000_000):
+        total += i
+    return time.process_time() - begin
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("verbs", nargs="*", default=["effusivity", "compare", "tune", "identify"])
+    parser.add_argument("--kill", action="store_true")
+    parser.add_argument("--files", type=int, default=12)
+    given = parser.parse_args()
+    folder = given.folder.resolve()
+    folder.mkdir(parents=True, exist_ok=True)
+    words = verbs(folder, given.files)
+    for verb in given.verbs:
+        alone, first = 0.0, ""
+        for how in ("one process", "two workers", "Dask, two workers"):
+            out = folder / "out"
+            shutil.rmtree(out, ignore_errors=True)
+            out.mkdir()
+            if how.startswith("Dask"):
+                with cluster(folder) as (address, _):
+                    wall = ran([*words[verb], "--cluster", address], out)
+            else:
+                n = "1" if how == "one process" else "2"
+                wall = ran([*words[verb], "--workers", n], out, kill=given.kill and n == "2")
+            alone, first = alone or wall, first or digest(out)
+            same = "same bytes" if digest(out) == first else "OTHER BYTES"
+            share = "" if how == "one process" else f"efficiency {alone / wall / 2:.2f}"
+            print(f"{verb:11s} {how:18s} {wall:7.1f} s  {share:16s} {same}  loop {loop():.2f} s", flush=True)
+
+
+if __name__ == "__main__":
+    main()
