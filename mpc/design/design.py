@@ -285,7 +285,7 @@ class Design:
     ramp_per_s: dict[str, float] = field(default_factory=dict)  # fastest change of a target [units per s]
     safe_drive: dict[str, float] = field(default_factory=dict)  # where a failing loop goes; 0 where absent
     iterations: int = 1  # programs a sample: above 1 until the plan stays
-    price: float = 10.0  # weight of what exceeds a soft limit [1/degC], and of its square [degC^-2]
+    price: float = 50.0  # weight of the square of what exceeds a soft limit [degC^-2]
     noise: ObserverNoise = field(default_factory=ObserverNoise)
     # whether disturbance states are estimated; without them the loop ends off its target
     offset_free: bool = True

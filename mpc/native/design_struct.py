@@ -288,7 +288,7 @@ def _qp_parts(s: Sizes) -> list[tuple[Any, int]]:
         (whole, 4),
         *((number, count) for count in (n * n, n, 2 * rows, soft * n)),
         (whole, soft),
-        *((number, count) for count in (max(1, s.NS), max(1, s.NS), 1)),
+        *((number, count) for count in (max(1, s.NS),) * 3),
         (whole, 2),
         (ctypes.c_void_p, 2),
         (number, n),

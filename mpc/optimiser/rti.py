@@ -23,10 +23,11 @@ since the far side is a trap (there, heating seems to ask for still more cooling
 take the drive back, to none and to the other end, are looked at every fifth sample; so a drive does not stay
 at an end of its range either, where a black box answers nothing at all.
 
-**Zones** replace the squared error of an output by rows about its target, beyond which it costs that and its
-size, (s + s^2) for each sample's weight: the size makes the edge one that a price does not cross by a little.
-An energy price adds ``price_k u_k / span`` for each sample.  Rows of a hard limit cost a thousand times as
-much as of a soft one: they give way where nothing else can.
+A soft row that is exceeded by s costs its price times (s / 5 + s^2).  **Zones** replace the squared error of
+an output by rows about its target, beyond which it costs that and its size, (s + s^2) for each sample's
+weight: the size makes the edge one that a price does not cross by a little.  An energy price adds
+``price_k u_k / span`` for each sample.  Rows of a hard limit cost a thousand times as much as of a soft one:
+they give way where nothing else can.
 
 A linear plant has none of those guards: G, H and the rows of the program are made once, only the free
 response, f and the bounds are new in a sample, and the program's plan is the best there is.
@@ -52,6 +53,9 @@ _SAFE = 0.75  # of the way to the optimum, where the range runs on beyond it
 FADING = 0.3  # of the gain at rest lost, from which on it is foreseen where it fades
 _LOOK_AROUND = 5  # samples between two trials of the ramps
 _LITTLE = 1e-7  # of its range, that a parked drive may be off in the program
+#: Of the price of a square of 1, that a distance of 1 beyond a soft row costs: at 1 the noise of a reading,
+#: which moves all of a prediction, was answered with full drive wherever the band was used.
+FIRST = 0.2
 _DEAR = 1000.0  # times the price of a soft limit, of a hard one
 _BARELY = 1.02  # a plan that is hardly better than the QP's is not worth a jump
 
@@ -138,11 +142,13 @@ class Optimiser:
         # price of a unit beyond each soft row, of each controlled output and each limit
         dear = [_DEAR if name in design.hard else 1.0 for name in design.limits]
         self.dear = design.price * np.array(dear)
-        own = np.where(self.zone[:, None] > 0, self.weight[:, None] * self._weight, design.price)
-        prices = np.concatenate([np.full(2 * n, design.price), own.ravel(), np.repeat(self.dear, self.N)])
+        zoned, by_zone = self.zone[:, None] > 0, self.weight[:, None] * self._weight
+        own, limited = np.where(zoned, by_zone, design.price), np.repeat(self.dear, self.N)
+        first = np.where(zoned, by_zone, FIRST * design.price)
+        prices = np.concatenate([np.full(2 * n, design.price), own.ravel(), limited])
         self.qp = CondensedQP(
             soft=np.arange(prices.size) >= 2 * n,
-            linear=prices,
+            linear=np.concatenate([np.full(2 * n, design.price), first.ravel(), FIRST * limited]),
             quadratic=2 * prices,
             time_limit_s=max(design.deadline_s, 1e-3),
         )
@@ -332,7 +338,7 @@ class Optimiser:
             over.append((self.dear[at], y[:, :, row] - self._limits[at, 1]))
         for price, beyond in over:
             slack = np.maximum(0.0, beyond)
-            cost += price * np.sum(slack + slack**2, axis=1)
+            cost += price * np.sum(FIRST * slack + slack**2, axis=1)
         return np.asarray(cost)
 
     def forget(self) -> None:

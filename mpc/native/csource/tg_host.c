@@ -104,7 +104,7 @@ int tg_host_qp(tg_controller *c, int n, int s, const double *H, const double *f,
     q->s = s;
     q->per = 1;
     q->price[0] = q->at_end[0] = linear;
-    q->ratio = quadratic / linear;
+    q->ratio[0] = quadratic / linear;
     q->iteration_limit = 500;
     for (int i = 0; i < n; i++)
         memcpy(q->H + (size_t)i * TG_Q_N, H + (size_t)i * (size_t)n, (size_t)(i + 1) * sizeof(double));

@@ -18,6 +18,7 @@
 #include <math.h>
 #include <string.h>
 
+#define FIRST 0.2 /* of the price of a square of 1, that a distance of 1 beyond a soft row costs */
 #define SAFE 0.75  /* of the way to the optimum, where the range runs on beyond it */
 #define LOOK_AROUND 5
 #define BARELY 1.02
@@ -167,14 +168,14 @@ static double merit(const tg_controller *c, const double *plan, const double *y,
             }
             cost += s->weight[r] * weight * error * error;
             if (slack > 0.0)
-                over += slack + slack * slack;
+                over += FIRST * slack + slack * slack;
         }
         for (int r = 0; r < s->n_l; r++) {
             double value = row[s->limited[r]], low = s->limit_low[r] - value, high = value - s->limit_high[r];
             if (low > 0.0)
-                cost += s->dear[r] * (low + low * low);
+                cost += s->dear[r] * (FIRST * low + low * low);
             if (high > 0.0)
-                cost += s->dear[r] * (high + high * high);
+                cost += s->dear[r] * (FIRST * high + high * high);
         }
     }
     return cost + s->price * over;
@@ -381,10 +382,10 @@ static void find_broken(tg_controller *c)
 static void set_prices(const tg_design *s, tg_qp *q)
 {
     q->per = s->n_c + s->n_l;
-    q->ratio = 2.0;
     for (int r = 0; r < q->per; r++) {
         int zone = r < s->n_c && s->zone[r] > 0.0;
-        q->price[r] = r >= s->n_c ? s->dear[r - s->n_c] : zone ? s->weight[r] * s->track : s->price;
+        q->price[r] = zone ? s->weight[r] * s->track : FIRST * (r >= s->n_c ? s->dear[r - s->n_c] : s->price);
+        q->ratio[r] = zone ? 2.0 : 2.0 / FIRST;
         q->at_end[r] = zone ? s->weight[r] * (s->track + s->terminal) : q->price[r];
     }
 }

@@ -174,6 +174,9 @@ static double price_of(const tg_qp *q, int row)
     return at >= q->s - q->per ? q->at_end[at % q->per] : q->price[at % q->per];
 }
 
+/* By what its square is dearer. */
+static double ratio_of(const tg_qp *q, int row) { return q->ratio[(row - 2 * q->n) % q->per]; }
+
 /* Set the right side of a row in the set from its bound and its state. */
 static void set_right(tg_qp *q, int i)
 {
@@ -182,7 +185,7 @@ static void set_right(tg_qp *q, int i)
     double sum = -bound;
     for (int j = 0; j < q->n; j++)
         sum -= m[j] * q->c[j];
-    q->right[i] = sum + (q->state[i] == 2 ? 1.0 / q->ratio : 0.0);
+    q->right[i] = sum + (q->state[i] == 2 ? 1.0 / ratio_of(q, q->row[i]) : 0.0);
 }
 
 /* Append the factor's row i, whose normal is in place. */
@@ -193,7 +196,7 @@ static void append_fit(tg_qp *q, int i)
     double left = 0.0;
     for (int j = 0; j < q->n; j++)
         left += m[j] * m[j];
-    left += REGULAR * left + (q->state[i] == 2 ? 1.0 / (q->ratio * price_of(q, q->row[i])) : 0.0);
+    left += REGULAR * left + (q->state[i] == 2 ? 1.0 / (ratio_of(q, q->row[i]) * price_of(q, q->row[i])) : 0.0);
     for (int k = 0; k < i; k++) {
         const double *other = q->normal + (size_t)k * TG_Q_N;
         double sum = 0.0;
@@ -410,7 +413,7 @@ static int refine(tg_qp *q)
         double bound = q->side[i] > 0 ? q->upper[q->row[i]] : -q->lower[q->row[i]];
         q->wanted[i] = value - bound; /* of a kept row it is 0, of a broken one what its multiplier pays */
         if (q->state[i] == 2)
-            q->wanted[i] -= (q->multiplier[i] - price_of(q, q->row[i])) / (q->ratio * price_of(q, q->row[i]));
+            q->wanted[i] -= (q->multiplier[i] / price_of(q, q->row[i]) - 1.0) / ratio_of(q, q->row[i]);
     }
     solve_fit(q, q->wanted);
     for (int i = 0; i < q->n_work; i++)

@@ -34,7 +34,7 @@ typedef struct {
     double A[TG_Q_S > 0 ? TG_Q_S * TG_Q_N : 1];
     int filled[TG_Q_S > 0 ? TG_Q_S : 1]; /* entries of a soft row before its trailing zeros */
     double price[TG_NS > 0 ? TG_NS : 1], at_end[TG_NS > 0 ? TG_NS : 1]; /* of a sample's soft rows; of the last one's */
-    double ratio;
+    double ratio[TG_NS > 0 ? TG_NS : 1];
     int iteration_limit, kept; /* whether H (its factor), A and filled are those of the last solve */
     int (*late)(void *about); /* asked before every change of the working set: time is up; may be NULL */
     void *about;

@@ -1,0 +1,107 @@
+"""A worker that is killed in the middle of its work changes no answer of the verbs that share it out."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import re
+import signal
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.end_to_end.conftest import HEADER, Bench, small_log_rows
+from tests.end_to_end.test_tune_and_run import SPEC
+from thermogrip.datasets.examples import load_example_grasps
+from thermogrip.datasets.grasp_files import write_grasps
+
+pytestmark = pytest.mark.skipif(
+    not Path("/proc/self/stat").exists() or (os.cpu_count() or 1) < 2, reason="needs /proc and two processors"
+)
+
+# how long it took, when it was written, and by which command
+_OWN = re.compile(r'"(fit_s|predict_s_per_grasp|written|command)": [^\n]*')
+
+
+class Killer(threading.Thread):
+    """Kills the first child process that has computed for a second."""
+
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        self.killed = 0
+        self.over = threading.Event()
+
+    def run(self) -> None:
+        while not self.killed and not self.over.wait(0.02):
+            for child in multiprocessing.active_children():
+                if child.pid and cpu_s(child.pid) > 1.0:
+                    os.kill(child.pid, signal.SIGKILL)
+                    self.killed = child.pid
+                    break
+
+
+def cpu_s(pid: int) -> float:
+    """Return the CPU time of a process [s], zero where it has ended."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return sum(map(int, fields[11:13])) / os.sysconf("SC_CLK_TCK")
+
+
+def answer_of(path: Path) -> dict[str, str]:
+    """Return what a verb wrote, without what differs from run to run."""
+    files = [path] if path.is_file() else sorted(path.rglob("*.json"))
+    return {str(file.relative_to(path)): _OWN.sub("", file.read_text()) for file in files}
+
+
+def effusivity(bench: Bench) -> tuple[list[str], str]:
+    record = load_example_grasps()["exp2_dT20"]
+    for k in range(4):
+        write_grasps(record.isel(grasp=np.arange(3) + 3 * k), bench.path / "many" / f"part{k}.csv")
+    return ["effusivity", "many"], "answer.csv"
+
+
+def compare(bench: Bench) -> tuple[list[str], str]:
+    write_grasps(load_example_grasps()["exp2_dT20"], bench.path / "labelled.csv")
+    return ["compare", "labelled.csv", "--classifiers", "features-lda,bayes"], "answer"
+
+
+def tune(bench: Bench) -> tuple[list[str], str]:
+    bench.write("spec.toml", SPEC.replace("evaluations = 2", "evaluations = 6"))
+    return ["tune", "plant.json", "--spec", "spec.toml"], "answer.json"
+
+
+def identify(bench: Bench) -> tuple[list[str], str]:
+    rows = small_log_rows(1200)
+    for k in range(3):
+        bench.write(f"log{k}.csv", "\n".join([HEADER, *rows[400 * k : 400 * (k + 1)]]) + "\n")
+    logs = [f"log{k}.csv" for k in range(3)]
+    return ["identify", *logs, "--models", "arx,oe,subspace", "--leave-one-out"], "answer.json"
+
+
+@pytest.mark.parametrize("verb", [effusivity, compare, tune, identify], ids=lambda verb: verb.__name__)
+def test_a_killed_worker_changes_no_byte(bench: Bench, monkeypatch, verb) -> None:
+    monkeypatch.chdir(bench.path)
+    (bench.path / "many").mkdir(exist_ok=True)
+    words, name = verb(bench)
+    found = []
+    for workers in (1, 2):
+        killer = Killer()
+        if workers == 2:
+            killer.start()
+        begin = time.monotonic()
+        done = bench.run(*words, "--workers", workers, "--out", name)
+        killer.over.set()
+        assert done.code in (0, 3), done
+        assert bool(killer.killed) == (workers == 2), time.monotonic() - begin
+        found.append(answer_of(bench.path / name))
+        if (bench.path / name).is_dir():
+            (bench.path / name).rename(bench.path / f"answer{workers}")
+        else:
+            (bench.path / name).unlink()
+    assert found[0] == found[1]
+    assert found[0]
