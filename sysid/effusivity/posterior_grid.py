@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaln, logsumexp, ndtr
 
 from thermogrip.datasets.arrays import Array, Mask
+from thermogrip.datasets.materials import load_materials
 from thermogrip.sysid.effusivity.data import Touches, whiten
 from thermogrip.sysid.effusivity.gripper_model import GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import (
@@ -56,6 +57,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
 # diamond most (6.3e4, of one isotope 7.7e4); that far from its blocks a calibration's scale is known to 0.30
 # and 0.16 in the logarithm, and two of these are left on either side.
 LN_E_RANGE = (float(np.log(17.0)), float(np.log(1.1e5)))
+_LISTED_SD = 0.3  # of ln e about a material of the table, where objects are likeliest
 SAMPLED = [EFFUSIVITY, H, BUILD_UP, ONSET, CAPACITY]
 
 _REST = np.array([CAPACITY, H, BUILD_UP, ONSET])  # ln C first
@@ -207,8 +209,20 @@ def _finished(
     x, u = found.x[i], found.u[i]
     one, own = data.take(np.array([i])), (noise[0][i : i + 1], noise[1][i : i + 1])
     value = found.value[i] + _left_out(gripper, one, own, _Fitted(*(part[i] for part in found)))
+    if gripper.discrepancy is not None:  # its evidence counts little, so what objects are made of counts
+        value = value + log_listed(x - gripper.effusivity_scale(x)[0])
     sd = np.sqrt(found.covariance[i, :, T_OBJECT, T_OBJECT])
     return posterior_of(x, value, u[:, T_OBJECT], sd, u[:, H])
+
+
+def log_listed(ln_e: Array) -> Array:
+    """Return by how much an effusivity is likelier a priori than by a log-uniform law, its logarithm, under
+    even odds that an object is of some material of the table, each within 30 %, or of any effusivity."""
+    listed = np.log([material.effusivity for material in load_materials().values()])
+    width = LN_E_RANGE[1] - LN_E_RANGE[0]
+    z = (ln_e[:, None] - listed) / _LISTED_SD
+    near = np.exp(-0.5 * z**2).mean(axis=1) / (_LISTED_SD * np.sqrt(2 * np.pi))
+    return np.asarray(np.log(0.5 + 0.5 * width * near))
 
 
 def _left_out(gripper: GripperModel, data: Touches, noise: tuple[Array, Array], found: _Fitted) -> Array:
