@@ -206,4 +206,4 @@ def test_half_of_all_objects_are_near_a_material_of_the_table():
     assert np.trapezoid(density, x) == pytest.approx(1.0, abs=0.01)
     wood, between, far = np.exp(posterior_grid.log_listed(np.log([367.0, 4700.0, 1e5])))
     assert far == pytest.approx(0.5, abs=0.02)
-    assert wood > 3 * between > 1.5
+    assert wood > 2 * between > 1.0
