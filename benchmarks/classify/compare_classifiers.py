@@ -85,7 +85,7 @@ def print_tables(found: Comparison) -> None:
     print("\n| classifier | n | accuracy | log loss | Brier | ECE | if calibrated | p |")
     print("|---|---|---|---|---|---|---|---|")
     for name in found.classifiers:
-        row = rows[name, POOLED]
+        row = rows[name, POOLED if len(found.conditions) > 1 else found.conditions[0]]
         cells = [span(row, "accuracy", "low", "high")]
         cells += [span(row, key, f"{key}_low", f"{key}_high") for key in ("log_loss", "brier", "ece")]
         print(

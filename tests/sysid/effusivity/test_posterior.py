@@ -39,6 +39,7 @@ from thermogrip.sysid.effusivity.posterior_grid import (
     LN_E_RANGE,
     GridPosterior,
     grid_posteriors,
+    log_listed,
     mixture_quantiles,
 )
 
@@ -329,6 +330,7 @@ def test_a_gripper_with_a_discrepancy_answers_as_unsurely_as_its_evidence(device
     value = fit_pairs(
         odd, touches(grasp), np.zeros(x.size, dtype=np.int64), free_hypotheses(odd, x)
     ).log_evidence
+    value = value + log_listed(x - odd.effusivity_scale(x)[0])
     near = value > value.max() - 5
     np.testing.assert_allclose(np.diff(np.log(found.mass[::25])[near]), np.diff(value[near]), atol=0.05)
     (row,) = effusivity_posterior(odd, grasp)

@@ -198,3 +198,12 @@ def test_the_posterior_of_a_normal_density_is_that_density():
     assert found.weight @ found.t_object / 2 == pytest.approx(9.1, abs=1e-3)
     np.testing.assert_allclose(found.t_object_sd, found.t_object / 20)
     np.testing.assert_allclose(found.ln_h, 1.5 * found.t_object)
+
+
+def test_half_of_all_objects_are_near_a_material_of_the_table():
+    x = np.linspace(*posterior_grid.LN_E_RANGE, 4000)
+    density = np.exp(posterior_grid.log_listed(x)) / (x[-1] - x[0])
+    assert np.trapezoid(density, x) == pytest.approx(1.0, abs=0.01)
+    wood, between, far = np.exp(posterior_grid.log_listed(np.log([367.0, 4700.0, 1e5])))
+    assert far == pytest.approx(0.5, abs=0.02)
+    assert wood > 2 * between > 1.0
