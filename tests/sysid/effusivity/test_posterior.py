@@ -29,7 +29,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     prior_of,
 )
 from thermogrip.sysid.effusivity.posterior import (
-    _row,
+    _rows,
     effusivity_posterior,
     material_evidence,
     material_fit,
@@ -73,7 +73,9 @@ def test_either_gripper_s_answer_is_the_mixture_of_both(device):
     assert row.other_gripper == pytest.approx(share, rel=1e-9)
     assert 0.05 < share < 0.95
     means = [(fit.mass * (fit.x - device.effusivity_scale(fit.x)[0])).sum() for fit in (own, other)]
-    alone = [_row(device, "", fit, 0.0).log10_effusivity_sd * np.log(10) for fit in (own, other)]
+    alone = [
+        _rows(device, [""], [fit], np.zeros(1))[0].log10_effusivity_sd * np.log(10) for fit in (own, other)
+    ]
     alone[1] = np.hypot(alone[1], 0.6)  # no block anchors the other one's scale
     mean = (1 - share) * means[0] + share * means[1]
     variance = sum(w * (s**2 + (m - mean) ** 2) for w, s, m in zip((1 - share, share), alone, means))
@@ -261,7 +263,7 @@ def test_a_row_is_made_of_two_mixtures(device):
     for shift in (0.0, 2.0):  # an insulator, a metal
         t, t_sd, x_sd = np.array([20.0, 24.0]), np.array([0.1, 0.2]), shift * np.array([0.0, 0.3])
         made = GridPosterior(x + shift, mass, 0.0, weight, t, t_sd, x, x_sd)
-        row = _row(device, "g", made)
+        row = _rows(device, ["g"], [made], np.zeros(1))[0]
         scale, sd = device.effusivity_scale(made.x)
         sd = np.sqrt(sd**2 + x_sd**2 + (device.spreads.ln_effusivity**2 if shift == 0 else 0.0) + 1e-8)
         below = [
