@@ -14,6 +14,9 @@ Once :math:`(C/e)^2` is twelve times the record's length, heat does not reach th
 depends on C any more: ln C/e ends there.  What lies outside of the lattice is stepped.
 
 Beside the stepped ones responses are off by at most 2e-5 of the initial difference, 0.4 mK of 20 K.
+
+Where many grasps have their samples at the same times, bin means are combinations too: those of the 16 curves
+are kept at onsets 0.02 s apart, and are cubics between.
 """
 
 from __future__ import annotations

@@ -178,14 +178,16 @@ _LEVELS = (0.05, 0.5, 0.95)
 def _rows(
     gripper: GripperModel, names: Sequence[str], found: Sequence[GridPosterior], share: Array
 ) -> list[EffusivityRow]:
-    x, mass, more = (_padded([p[k] for p in found], edge=k != 1) for k in (0, 1, 7))
+    x, mass, more = (_padded([np.asarray(p[k]) for p in found], edge=k != 1) for k in (0, 1, 7))
     scale, scale_sd = gripper.effusivity_scale(x)
     scatter = np.where(np.exp(x) < INSULATOR, gripper.spreads.ln_effusivity, 0.0)
     x, sd = x - scale, np.sqrt(scale_sd**2 + scatter**2 + more**2 + 1e-8)
     e = np.exp(mixture_quantiles(mass, x, sd, _LEVELS))
     mean = (mass * x).sum(axis=1)
     variance = (mass * ((x - mean[:, None]) ** 2 + sd**2)).sum(axis=1)
-    weight, t_object, t_sd, ln_h = (_padded([p[k] for p in found], edge=k != 3) for k in (3, 4, 5, 6))
+    weight, t_object, t_sd, ln_h = (
+        _padded([np.asarray(p[k]) for p in found], edge=k != 3) for k in (3, 4, 5, 6)
+    )
     t = mixture_quantiles(weight, t_object, t_sd, _LEVELS)
     if gripper.discrepancy is not None:  # it has no scale of its own: that of the temperatures it was told
         t = t - gripper.bias

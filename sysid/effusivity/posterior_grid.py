@@ -86,7 +86,7 @@ def slipped(
     wide = own * np.stack([np.ones(len(u)), slip_of(sd[:, T_OBJECT])], axis=1)
     found = marginals(asked, whitener, u, np.stack([own, wide]) if stated.any() else own[None])
     if not stated.any():
-        return found[0]
+        return np.asarray(found[0])
     either = np.logaddexp(np.log1p(-SLIPS) + found[0], np.log(SLIPS) + found[1])
     return np.asarray(np.where(stated, either, found[0]))
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.end_to_end.conftest import HEADER, Bench, small_log_rows
+from tests.end_to_end.conftest import Bench
 from tests.end_to_end.test_tune_and_run import SPEC
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.grasp_files import write_grasps
@@ -71,19 +71,11 @@ def compare(bench: Bench) -> tuple[list[str], str]:
 
 
 def tune(bench: Bench) -> tuple[list[str], str]:
-    bench.write("spec.toml", SPEC.replace("evaluations = 2", "evaluations = 6"))
+    bench.write("spec.toml", SPEC)
     return ["tune", "plant.json", "--spec", "spec.toml"], "answer.json"
 
 
-def identify(bench: Bench) -> tuple[list[str], str]:
-    rows = small_log_rows(1200)
-    for k in range(3):
-        bench.write(f"log{k}.csv", "\n".join([HEADER, *rows[400 * k : 400 * (k + 1)]]) + "\n")
-    logs = [f"log{k}.csv" for k in range(3)]
-    return ["identify", *logs, "--models", "arx,oe,subspace", "--leave-one-out"], "answer.json"
-
-
-@pytest.mark.parametrize("verb", [effusivity, compare, tune, identify], ids=lambda verb: verb.__name__)
+@pytest.mark.parametrize("verb", [effusivity, compare, tune], ids=lambda verb: verb.__name__)
 def test_a_killed_worker_changes_no_byte(bench: Bench, monkeypatch, verb) -> None:
     monkeypatch.chdir(bench.path)
     (bench.path / "many").mkdir(exist_ok=True)
