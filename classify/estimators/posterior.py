@@ -355,14 +355,12 @@ class PosteriorClassifier(GraspClassifier):
 def _of_levels(levels: Sequence[_Level], data: Touches, names: Sequence[str]) -> Floats:
     """Return the log evidence of each candidate for each touch on each level, (n_level, n, n_name)."""
     found: list[Floats] = []
-    start = None
+    first = None  # what the first level found is near what its gripper finds with another block
     for level in levels:
-        begin = (
-            start if level.device is levels[0].device else None
-        )  # of another block the same answer is near
-        mode, *_ = fit_candidates(level.device, data, names, level.finish, start=begin)
+        start = first if level.device is levels[0].device else None
+        mode, *_ = fit_candidates(level.device, data, names, level.finish, start=start)
         found.append(mode.log_evidence.reshape(-1, len(names)))
-        start = mode.u.reshape(*found[0].shape, -1) if start is None else start
+        first = mode.u.reshape(*found[0].shape, -1) if first is None else first
     return np.stack(found)
 
 

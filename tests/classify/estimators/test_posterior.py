@@ -99,7 +99,7 @@ def test_none_of_the_candidates_is_weighed_against_blocks_of_the_training(
         for finish in ("unknown", "known")
     )
     np.testing.assert_allclose(of_other[1], of_same[1], rtol=1e-9)  # a free effusivity has their finish
-    assert not np.allclose(of_other[0], of_same[0], rtol=1e-3)
+    assert np.abs(of_other[0] - of_same[0]).max() > 1.0
 
 
 def test_a_saved_one_predicts_the_same(fitted: PosteriorClassifier, fresh: Grasps, tmp_path: Path) -> None:
@@ -284,7 +284,8 @@ def test_what_a_record_decides_is_the_mixture_of_its_explanations(
         each = 0.9 * np.exp(e - top).mean(axis=1) + 0.1 * own
         odds += prior * each[::-1, None] * np.exp(e - top)
     want = odds / odds.sum(axis=1, keepdims=True)
-    np.testing.assert_allclose(np.exp(known.candidate_log_proba(pair, names)), want, rtol=1e-6)
+    # the levels of a classifier are searched from each other's answers, which end within 0.005 nat
+    np.testing.assert_allclose(np.exp(known.candidate_log_proba(pair, names)), want, rtol=1e-3)
 
 
 def test_one_block_far_from_its_stated_temperature_makes_no_other_gripper(known: PosteriorClassifier) -> None:
