@@ -170,7 +170,7 @@ def test_figures_show_what_they_are_given():
     assert sum(len(c.get_offsets()) for c in empty.axes[0].collections) == 0
     same = [trial_of(100.0, 0.1, 200.0), trial_of(100.1, 0.1, 200.1), trial_of(300.0, 0.1, 90.0)]
     labels = pareto_figure(front_of(same, ["tuned", "LQR, tuned", "60 % of the drive"])).axes[0].texts
-    assert [label.get_text() for label in labels] == ["tuned and LQR", "60 % of the drive"]  # none on another
+    assert [label.get_text() for label in labels] == ["tuned, LQR", "60 % of the drive"]  # none on another
     steps = step_time_figure({"controller": [0.001, 0.002]}, 0.5, 1.0)
     said = [text.get_text() for text in steps.axes[0].get_legend().get_texts()]
     assert any("median 1.5 ms" in line and "slowest 2 ms" in line for line in said)
@@ -190,7 +190,7 @@ def test_designs_share_a_label_where_their_marks_are_one_to_the_eye():
     axis.set(xlim=(0.0, 80.0), ylim=(0.0, 50.0))
     marks = {"A": (10, 20), "B, tuned": (15, 21), "C": (10, 30), "D": (30, 20), "E": (10, 1)}
     _note_all(axis, [{"name": name, "settle_s": x, "energy_s": y} for name, (x, y) in marks.items()])
-    assert [text.get_text() for text in axis.texts] == ["E", "A and B", "C", "D"]
+    assert [text.get_text() for text in axis.texts] == ["E", "A, B", "C", "D"]
 
 
 @pytest.mark.parametrize(
