@@ -166,7 +166,6 @@ def test_controllers_of_any_size_build_and_do_the_same(make, changes, sanitize, 
     controller = make(**changes)
     export = export_controller(controller, tmp_path)
     found = check_export(export, controller, states=40, sanitize=sanitize)
-    # hard limits weigh so much more that rounding counts more
     assert found.difference <= (1e-8 if "hard" in changes else 1e-9)
     assert found.same_status == found.same_iterations == 40
     assert found.passed
