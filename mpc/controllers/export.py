@@ -42,8 +42,7 @@ if TYPE_CHECKING:
 
 _COPIED = (*SOURCES, "tg_design.h", "Makefile", "example.c", "check.c")
 # of a drive's range; where dozens of soft rows are broken, a plan is a small difference of large multipliers,
-# and C as well as Python is up to 1e-10 off the exact one
-# share of a drive's range; rounding, which hard limits weigh most
+# and C as well as Python is up to 1e-10 off the exact one, with hard limits up to 1e-9
 _TOLERANCE = 1e-8
 _RESTS = 200  # from which random states depart
 
