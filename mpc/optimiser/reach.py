@@ -6,7 +6,7 @@ Newton's method for the state and least squares inside the ranges for the drives
 
     x_s+ = x_s + (I - A)^-1 (f(x_s, u_s) - x_s + B z),    min_z |r - y(x_s+)|^2,    u_s+ = u_s + z in range.
 
-An output beyond its target counts ten times, one beyond its limits a hundred times, as in the optimiser.
+An output 1 degC beyond its target counts what it costs the optimiser, one beyond its limits a hundred times.
 Where the gain fades (a Peltier element), the range ends where the optimiser ends it.  A linear plant needs
 one such step.  Where the plant integrates there may be no answer, and then the model says nothing.
 
@@ -49,7 +49,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.mpc.optimiser.rti import Optimiser
+from thermogrip.mpc.optimiser.rti import FIRST, Optimiser
 
 if TYPE_CHECKING:
     from thermogrip.mpc.estimator.observer import Observer
@@ -58,7 +58,7 @@ Mask = NDArray[np.bool_]
 _STEPS, _SWEEPS = 12, 200
 _STRIDE = 0.3  # of its range, that a drive may go in a step
 _CONVERGED = 1e-4  # degC and of the range: the steady state is found
-_BEYOND, _LIMIT = 10.0, 100.0  # weight of an output beyond its target, beyond its limits
+_LIMIT = 100.0  # weight of an output beyond its limits
 _OUT, _IN = 0.1, 0.05  # degC from the target: it cannot be had, it can
 _LEAST_SD = 0.05  # degC, of a steady output where no bias is estimated
 _CLIP, _ALLOWANCE, _ALARM = 2.0, 0.5, 3.0  # of Page's test
@@ -116,6 +116,7 @@ class Reach:
         self._limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2).T
         own = [design.limits.get(name, (-np.inf, np.inf)) for name in design.controlled]
         self._own = np.array(own, dtype=float).T
+        self._beyond = np.sqrt(design.price * (FIRST + 1.0) / design.track)  # weight beyond a target
         self._sd = np.sqrt(observer.R[self._rows])
         pair = optimiser.pair
         self._movers = [
@@ -259,7 +260,7 @@ class Reach:
             own = np.concatenate([weight[:, None] * G[rows], (_LIMIT * np.abs(over))[:, None] * G[limited]])
             z = _least_squares_in_box(own, e, low, high)
             new = y + G @ z
-            weight = np.where(seen & (side * (new[rows] - target) > _IN), _BEYOND, weight)
+            weight = np.where(seen & (side * (new[rows] - target) > _IN), self._beyond, weight)
             over = np.where(new[limited] > self._limits[1] + _IN, 1.0, over)
             over = np.where(new[limited] < self._limits[0] - _IN, -1.0, over)
         return z

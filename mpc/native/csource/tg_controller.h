@@ -20,6 +20,8 @@
 #include "tg_config.h"
 #include "tg_qp.h"
 
+#define FIRST 0.2 /* of the price of a square of 1, that a distance of 1 beyond a soft row costs */
+
 #define TG_L (TG_NX + TG_NW)               /* where what the lagging outputs show begins in them, */
 #define TG_Z (TG_L + 3 * TG_NG)            /* states of the observer; their lags and scales are the last */
 #define TG_SEEDS (TG_NX + TG_NU + TG_ND)   /* directions of a sample's Jacobian */

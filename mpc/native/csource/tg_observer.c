@@ -367,8 +367,7 @@ static const double *sample_jacobian(tg_controller *c, const double *u, const do
 #define SWEEPS 200
 #define STRIDE 0.3 /* of its range, that a drive may go in a step */
 #define CONVERGED 1e-4 /* degC and of the range: the steady state is found */
-#define BEYOND 10.0 /* weight of an output beyond its target */
-#define LIMIT 100.0 /* and of one beyond its limits */
+#define LIMIT 100.0 /* weight of an output beyond its limits */
 #define CAN 0.05    /* degC from the target: within reach */
 #define SIDES (1 + TG_NU + TG_NW)
 #define ROWS (TG_NC + TG_SOME(TG_NL))
@@ -491,7 +490,7 @@ static void nearest(const tg_controller *c, const double *G, const double *y, co
                 value += G[i * TG_NU + j] * z[j];
             if (r < s->n_c) {
                 if (weight[r] > 0.0 && c->side[r] * (value - c->target[r]) > CAN)
-                    weight[r] = BEYOND;
+                    weight[r] = sqrt(s->price * (FIRST + 1.0) / s->track); /* what 1 degC costs the optimiser */
                 continue;
             }
             if (value > s->limit_high[r - s->n_c] + CAN)

@@ -18,7 +18,6 @@
 #include <math.h>
 #include <string.h>
 
-#define FIRST 0.2 /* of the price of a square of 1, that a distance of 1 beyond a soft row costs */
 #define SAFE 0.75  /* of the way to the optimum, where the range runs on beyond it */
 #define LOOK_AROUND 5
 #define BARELY 1.02

@@ -285,7 +285,7 @@ def test_what_a_record_decides_is_the_mixture_of_its_explanations(
         odds += prior * each[::-1, None] * np.exp(e - top)
     want = odds / odds.sum(axis=1, keepdims=True)
     # the levels of a classifier are searched from each other's answers, which end within 0.005 nat
-    np.testing.assert_allclose(np.exp(known.candidate_log_proba(pair, names)), want, rtol=1e-3)
+    np.testing.assert_allclose(np.exp(known.candidate_log_proba(pair, names)), want, rtol=1e-4)
 
 
 def test_one_block_far_from_its_stated_temperature_makes_no_other_gripper(known: PosteriorClassifier) -> None:

@@ -155,9 +155,9 @@ def test_least_squares_in_a_box_is_that_of_scipy():
     ("target", "side", "seen", "z"),
     [
         ([22.0, 26.0], [0.0, 0.0], BOTH, 4.0),
-        ([22.0, 26.0], [1.0, 1.0], BOTH, 206 / 101),  # b beyond its target counts ten times
+        ([22.0, 26.0], [1.0, 1.0], BOTH, 126 / 61),  # b, 1 beyond its target, costs 50 (1 / 5 + 1)
         ([18.0, 14.0], [0.0, 0.0], BOTH, (-8.0 - 40000.0) / 10002),  # a below its limit a hundred times
-        ([22.0, 18.0], [-1.0, -1.0], BOTH, 198 / 101),
+        ([22.0, 18.0], [-1.0, -1.0], BOTH, 118 / 61),
         ([22.0, 26.0], [1.0, 1.0], np.array([False, True]), 6.0),
         ([33.0, 33.0], [0.0, 0.0], BOTH, 80026 / 10002),
     ],
