@@ -187,11 +187,8 @@ def predicted(
     its value there, count too: by straight lines between the bins with a ``count``, zero before them.  The
     others of ``loss`` are rate, way, drift of the level and leak."""
     n_curve, n_bin = wanted.shape[1], t.shape[1]
-    before, after, whole = (
-        room[0],
-        room[1],
-        room[2],
-    )  # bins on either side, -1 before the first, and integrals
+    # bins on either side, -1 before the first, and integrals
+    before, after, whole = room[0], room[1], room[2]
     delayed, shifted = room[4:10], room[10:16]
     for p in range(row.size):
         i, late, own = row[p], loss[p, 0], means[p]
