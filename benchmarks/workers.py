@@ -26,7 +26,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-sys.path[:0] = [str(Path(__file__).parent / "classify"), str(Path(__file__).parents[1])]
+sys.path.insert(0, str(Path(__file__).parent / "classify"))
+sys.path.insert(0, str(Path(__file__).parents[1]))
 from scale import make
 
 from tests.end_to_end.test_killed_workers import cpu_s
