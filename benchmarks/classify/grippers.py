@@ -1,6 +1,6 @@
 """Another gripper: what a few of its grasps of known blocks are worth, and whether the confidence shows it.
 
-    OMP_NUM_THREADS=1 python benchmarks/classify/grippers.py [--grippers 8] [--test 3] [--out FILE.json]
+    OMP_NUM_THREADS=1 python benchmarks/classify/grippers.py [--grippers 8] [--test 3] [--workers N] [--out FILE.json]
 
 A posterior classifier is calibrated on grasps of one gripper (finite_volumes.py: no classifier's model; five
 of each of five materials at four pairs of temperatures) and asked about grasps of others.  The first of these
@@ -25,7 +25,10 @@ import argparse
 import json
 import time
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -55,19 +58,29 @@ def main() -> None:
     )
     parser.add_argument("--seed", type=int, default=100, help="of the training grasps")
     parser.add_argument("--out", type=Path, help="also write every answer here, as JSON")
+    parser.add_argument("--workers", type=int, default=1, help="processes")
     given = parser.parse_args()
     ours = PosteriorClassifier().fit(labelled(FIVE, repeats=5, seed=given.seed))
     rows: list[dict[str, Any]] = []
-    for k in range(given.grippers):
-        rig = Rig(layers=OTHER_LAYERS, lag=0.25, build=0.4) if k == 0 else drawn(k)
-        for name, p, truth, seconds in asked(ours, rig, given.test, 500 + k):
-            rows += [{"gripper": k, "how": name, "truth": t, "p": row.tolist()} for t, row in zip(truth, p)]
-            print(f"gripper {k} | {name} | {summary(p, truth)} | {seconds * 1e3:.0f} ms a grasp", flush=True)
+    with ProcessPoolExecutor(given.workers, mp_context=get_context("spawn")) as pool:
+        for k, answers in enumerate(pool.map(partial(about, ours, given.test), range(given.grippers))):
+            for name, p, truth, seconds in answers:
+                rows += [
+                    {"gripper": k, "how": name, "truth": t, "p": row.tolist()} for t, row in zip(truth, p)
+                ]
+                cost = f"{seconds * 1e3:.0f} ms a grasp"
+                print(f"gripper {k} | {name} | {summary(p, truth)} | {cost}", flush=True)
     print("\n| asked | accuracy | log loss | ECE | stated |\n|---|---|---|---|---|")
     for name in dict.fromkeys(row["how"] for row in rows):
         print(table_row(name, [row for row in rows if row["how"] == name]), flush=True)
     if given.out:
         given.out.write_text(json.dumps(rows))
+
+
+def about(ours: PosteriorClassifier, test: int, k: int) -> list[tuple[str, Array, list[str], float]]:
+    """Return all answers about gripper k."""
+    rig = Rig(layers=OTHER_LAYERS, lag=0.25, build=0.4) if k == 0 else drawn(k)
+    return list(asked(ours, rig, test, 500 + k))
 
 
 def drawn(seed: int) -> Rig:

@@ -1,6 +1,6 @@
 """The engine with two sensors beside emcee: the effusivity of one object that both touched.
 
-    OMP_NUM_THREADS=1 python benchmarks/classify/two_sensor_emcee.py [--grasps 20] [--out F.json]
+    OMP_NUM_THREADS=1 python benchmarks/classify/two_sensor_emcee.py [--grasps 20] [--workers N] [--out F.json]
 
 The example rig's gripper with a passive copy beside it: thicker skin, slower sensor, another noise, its
 thermometer 0.4 K above the first.  Grasps are simulated, a room of 25 degC, five materials in turn, a skin at
@@ -19,7 +19,10 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 
 import emcee
@@ -227,12 +230,14 @@ def main() -> None:
     )
     parser.add_argument("--grasps", type=int, default=20)
     parser.add_argument("--steps", type=int, default=1500)
+    parser.add_argument("--workers", type=int, default=1, help="processes")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
     device, rows = finger(), []
-    for one in grasps_of(device, given.grasps):
-        rows.append(beside(device, one, given.steps))
-        print(json.dumps(rows[-1]), flush=True)
+    with ProcessPoolExecutor(given.workers, mp_context=get_context("spawn")) as pool:
+        for row in pool.map(partial(beside, device, steps=given.steps), grasps_of(device, given.grasps)):
+            rows.append(row)
+            print(json.dumps(row), flush=True)
     off = np.abs([row["deviation"] for row in rows])
     print(
         f"5, 50, 95 %: mean {off.mean(axis=0).round(3)}, farthest {off.max(axis=0).round(3)} sd; within "
