@@ -1,6 +1,6 @@
 """Another gripper: what a few of its grasps of known blocks are worth, and whether the confidence shows it.
 
-    OMP_NUM_THREADS=1 python benchmarks/classify/grippers.py [--grippers 8] [--test 3] [--workers N] [--out FILE.json]
+    OMP_NUM_THREADS=1 python benchmarks/classify/grippers.py [--grippers 8] [--test 3] [--workers N]
 
 A posterior classifier is calibrated on grasps of one gripper (finite_volumes.py: no classifier's model; five
 of each of five materials at four pairs of temperatures) and asked about grasps of others.  The first of these

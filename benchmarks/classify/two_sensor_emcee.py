@@ -1,6 +1,6 @@
 """The engine with two sensors beside emcee: the effusivity of one object that both touched.
 
-    OMP_NUM_THREADS=1 python benchmarks/classify/two_sensor_emcee.py [--grasps 20] [--workers N] [--out F.json]
+    OMP_NUM_THREADS=1 python benchmarks/classify/two_sensor_emcee.py [--grasps 20] [--workers N]
 
 The example rig's gripper with a passive copy beside it: thicker skin, slower sensor, another noise, its
 thermometer 0.4 K above the first.  Grasps are simulated, a room of 25 degC, five materials in turn, a skin at

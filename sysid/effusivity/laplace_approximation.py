@@ -579,12 +579,21 @@ def with_second(
     second = gripper.second
     if second is None or data.second is None:
         return mode
-    others = hypotheses_of_second(gripper, second, hypotheses)
+    beside, own = second_modes(gripper, data, row, hypotheses, mode)
+    return joined_modes(mode, prior, beside, own, second.bias - gripper.bias)
+
+
+def second_modes(
+    gripper: GripperModel, data: Touches, row: NDArray[np.int64], hypotheses: Hypotheses, mode: Mode
+) -> tuple[Mode, Prior]:
+    """Return the modes of pairs by the second sensor alone, and its prior; ``mode`` is the first one's."""
+    assert gripper.second is not None
+    assert data.second is not None
+    second, others = gripper.second, hypotheses_of_second(gripper, gripper.second, hypotheses)
     own = prior_of(second, data.second.known(row), others)
     begin = own.mean.copy()
     begin[:, LEVEL], begin[:, T_OBJECT] = data.second.level[row], mode.u[:, T_OBJECT]
-    beside = _own_modes(second, data.second, row, others, own, begin, 20, None, False)
-    return joined_modes(mode, prior, beside, own, second.bias - gripper.bias)
+    return _own_modes(second, data.second, row, others, own, begin, 20, None, False), own
 
 
 def _own_modes(
@@ -632,6 +641,39 @@ def joined_modes(first: Mode, prior: Prior, second: Mode, own: Prior, apart: flo
     column = first.covariance[:, :, T_OBJECT]
     moved = first.covariance - column[:, :, None] * (column / variance[:, None])[:, None, :]
     return Mode(first.u + (off / variance)[:, None] * column, moved, evidence, settled, misfit)
+
+
+def at_temperature(mode: Mode, prior: Prior, mean: Array, variance: Array) -> Mode:
+    """Return the modes of pairs under another prior of the object's temperature, N(mean, variance), (n,)
+    each."""
+    seen, width = _seen_temperature(mode, prior)
+    own = prior.sd[:, T_OBJECT] ** 2
+    evidence = mode.log_evidence + _log_normal(seen - mean, variance + width)
+    evidence -= _log_normal(seen - prior.mean[:, T_OBJECT], own + width)
+    before = mode.covariance[:, T_OBJECT, T_OBJECT]
+    after = variance * width / (variance + width)
+    column = mode.covariance[:, :, T_OBJECT] / before[:, None]
+    moved = (mean * width + seen * variance) / (variance + width) - mode.u[:, T_OBJECT]
+    covariance = mode.covariance + (after - before)[:, None, None] * column[:, :, None] * column[:, None, :]
+    return mode._replace(
+        u=mode.u + moved[:, None] * column, covariance=covariance, log_evidence=np.asarray(evidence)
+    )
+
+
+def temperatures_by_the_other(
+    first: Mode, prior: Prior, second: Mode, own: Prior, apart: float
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Return mean and variance of the object's temperature as each of two sensors' thermometers shows it, by
+    its prior and what the other sensor saw: arguments as of :func:`joined_modes`."""
+    x0, v0 = prior.mean[:, T_OBJECT], prior.sd[:, T_OBJECT] ** 2
+    (seen, width), (other, other_width) = _seen_temperature(first, prior), _seen_temperature(second, own)
+    other_width = other_width + SENSORS_APART**2
+    by_second = (x0 * other_width + (other - apart) * v0) / (v0 + other_width)
+    by_first = (x0 * width + seen * v0) / (v0 + width)
+    return (
+        (by_second, v0 * other_width / (v0 + other_width)),
+        (by_first + apart, v0 * width / (v0 + width) + SENSORS_APART**2),
+    )
 
 
 def widened(mode: Mode, prior: Prior, n: NDArray[np.int64], bias: float) -> Mode:

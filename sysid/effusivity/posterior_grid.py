@@ -25,6 +25,7 @@ the unit vectors, w_k = 1/6, the rule that is exact for all cubics of three norm
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -45,13 +46,17 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     T_OBJECT,
     H,
     Prior,
+    at_temperature,
     doubted,
     fit_pairs,
     free_hypotheses,
+    joined_modes,
     nodes_for,
     pairs_asked,
     prior_of,
+    second_modes,
     slip_of,
+    temperatures_by_the_other,
 )
 
 # On the gripper's scale.  Of solids at room temperature plastic foams have least (expanded polystyrene, 32),
@@ -117,7 +122,12 @@ class MarginalPosterior:
 
     def _log_posterior(self, points: Array) -> Array:
         row = np.zeros(len(points), dtype=np.int64)
-        return _log_posterior(self.gripper, self.data, self.whitener, self._prior, points, row)
+        prior = _rows(self._prior, row)
+        return _log_posterior(self.gripper, self.data, self.whitener, prior, points, row)
+
+
+def _rows(prior: Prior, row: NDArray[np.int64]) -> Prior:
+    return Prior(prior.mean[row], prior.sd[row], None if prior.dof is None else prior.dof[row])
 
 
 def _log_posterior(
@@ -125,8 +135,8 @@ def _log_posterior(
     row: NDArray[np.int64],
 ) -> Array:  # fmt: skip
     """Return the log posterior (n,), up to a constant, of points (n, 5) of the grasps ``row``, of whose
-    priors ``common`` has what does not depend on ln e."""
-    free, mean, sd = free_hypotheses(gripper, points[:, 0]), common.mean[row], common.sd[row]
+    priors ``common`` has what does not depend on ln e, a row a point."""
+    free, mean, sd = free_hypotheses(gripper, points[:, 0]), common.mean, common.sd
     u = mean.copy()
     u[:, SAMPLED] = points
     log_prior = _log_student(points[:, 1], free.ln_h, free.ln_h_sd)
@@ -147,17 +157,27 @@ def log_integrals(
     (n,), by default the first."""
     gripper.require_known("an integral over one grasp's nuisances")
     row = np.zeros(x.size, dtype=np.int64) if row is None else row
-    whitener, log_det = whiten(data, gripper.noise) if noise is None else noise
+    noise = whiten(data, gripper.noise) if noise is None else noise
     common = prior_of(gripper, data, free_hypotheses(gripper, np.full(data.level.size, 9.0)))
+    total = _integrals(gripper, data, x, mode, covariance, noise, row, _rows(common, row))
+    # effusivities outside the prior's range are none
+    return np.asarray(np.where((x >= LN_E_RANGE[0]) & (x <= LN_E_RANGE[1]), total, -np.inf))
+
+
+def _integrals(
+    gripper: GripperModel, data: Touches, x: Array, mode: Array, covariance: Array,
+    noise: tuple[Array, Array], row: NDArray[np.int64], common: Prior,
+) -> Array:  # fmt: skip
+    """Return :func:`log_integrals` under priors ``common``, a row an effusivity, at any effusivity."""
+    whitener, log_det = noise
     root = np.linalg.cholesky(covariance[:, _REST[:, None], _REST[None, :]])
     rest = mode[:, None, _REST] + np.einsum("nij,kj->nki", root, _Z)
-    points = np.column_stack([np.repeat(x, _Z.shape[0]), rest.reshape(-1, 4)[:, _BACK]])
-    each = _log_posterior(gripper, data, whitener, common, points, np.repeat(row, _Z.shape[0]))
-    # effusivities outside the prior's range are none
-    inside = (x >= LN_E_RANGE[0]) & (x <= LN_E_RANGE[1])
-    total = np.where(inside, logsumexp(each.reshape(x.size, -1), axis=1), -np.inf)
+    n = _Z.shape[0]
+    points = np.column_stack([np.repeat(x, n), rest.reshape(-1, 4)[:, _BACK]])
+    wide = _rows(common, np.repeat(np.arange(x.size), n))
+    each = _log_posterior(gripper, data, whitener, wide, points, np.repeat(row, n))
     volume = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
-    return np.asarray(total + volume + _LOG_WEIGHT - 0.5 * log_det[row])
+    return np.asarray(logsumexp(each.reshape(x.size, -1), axis=1) + volume + _LOG_WEIGHT - 0.5 * log_det[row])
 
 
 def _log_student(x: Array, mean: Array | float, sd: Array | float, dof: float = np.inf) -> Array:
@@ -256,8 +276,7 @@ def _left_out(gripper: GripperModel, data: Touches, noise: tuple[Array, Array], 
     out = np.zeros(x.shape)
     # for an uncertain gripper Laplace's method integrates over its parameters too, with a discrepancy the
     # evidence counts less than the integral says
-    other = gripper.uncertain or gripper.discrepancy is not None
-    if other or (gripper.second is not None and data.second is not None):
+    if gripper.uncertain or gripper.discrepancy is not None:
         return out
     near = settled & (value > value.max(axis=1, keepdims=True) - _REACH)
     knots: dict[int, NDArray[np.int64]] = {}
@@ -272,11 +291,63 @@ def _left_out(gripper: GripperModel, data: Touches, noise: tuple[Array, Array], 
             np.concatenate([k for _, k in some]),
         )
         there = x[row, at], u[row, at], covariance[row, at]
-        missing = log_integrals(gripper, data, *there, noise=noise, row=row) - value[row, at]
+        if gripper.second is not None and data.second is not None:
+            whole = log_integrals_of_two(gripper, data, *there[:2], noise=noise, row=row)
+        else:
+            whole = log_integrals(gripper, data, *there, noise=noise, row=row)
+        missing = whole - value[row, at]
         for i, k in some:
             everywhere = PchipInterpolator(x[i, k], missing[row == i])(np.clip(x[i], x[i, k[0]], x[i, k[-1]]))
             weight = np.exp(value[i] - value[i].max()) * np.gradient(x[i])
             out[i] = everywhere - (weight * everywhere).sum() / weight.sum()
+    return out
+
+
+def log_integrals_of_two(
+    gripper: GripperModel, data: Touches, x: Array, start: Array, *, noise: tuple[Array, Array],
+    row: NDArray[np.int64],
+) -> Array:  # fmt: skip
+    """Return :func:`log_integrals` of two sensors that touched one object, near the modes ``start`` (n, 7).
+
+    Laplace's method has the evidence of both; what it leaves out of each is integrated under what the other
+    one saw of the object's temperature, for a stated temperature that is right and for a slip."""
+    assert gripper.second is not None
+    assert data.second is not None
+    second, hypotheses = gripper.second, free_hypotheses(gripper, x)
+    apart, each = second.bias - gripper.bias, data.known(row)
+    prior, alone = prior_of(gripper, each, hypotheses), replace(gripper, second=None)
+    first = fit_pairs(alone, data, row, hypotheses, start=start, noise=noise, prior=prior)
+    other, own = second_modes(gripper, data, row, hypotheses, first)
+    ln_e = second.found_effusivity(x - gripper.effusivity_scale(x)[0])
+    white = whiten(data.second, second.noise)
+
+    def total(law: Prior) -> Array:
+        mine = at_temperature(first, prior, law.mean[:, T_OBJECT], law.sd[:, T_OBJECT] ** 2)
+        evidence = joined_modes(mine, law, other, own, apart).log_evidence
+        by_other = temperatures_by_the_other(mine, law, other, own, apart)
+        for device, seen, at, mode, before, told, w in (
+            (gripper, data, x, mine, law, by_other[0], noise),
+            (second, data.second, ln_e, other, own, by_other[1], white),
+        ):
+            there = at_temperature(mode, before, *told)
+            under = Prior(_with(before.mean, told[0]), _with(before.sd, np.sqrt(told[1])), before.dof)
+            untold = replace(seen, t_object=np.full(seen.t_object.shape, np.nan))
+            whole = _integrals(device, untold, at, there.u, there.covariance, w, row, under)
+            evidence = evidence + whole - there.log_evidence
+        return np.asarray(evidence)
+
+    stated, right = np.isfinite(each.t_object), total(prior)
+    if not stated.any():
+        return right
+    width = prior.sd[:, T_OBJECT]
+    slip = total(prior._replace(sd=_with(prior.sd, slip_of(width) * width)))
+    return np.asarray(np.where(stated, np.logaddexp(np.log1p(-SLIPS) + right, np.log(SLIPS) + slip), right))
+
+
+def _with(values: Array, t_object: Array) -> Array:
+    """Return nuisances (n, 7) with other temperatures of the object."""
+    out = values.copy()
+    out[:, T_OBJECT] = t_object
     return out
 
 

@@ -36,6 +36,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     Mode,
     Prior,
     as_in_training,
+    at_temperature,
     find_modes,
     fit_pairs,
     free_hypotheses,
@@ -45,6 +46,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     nodes_for,
     predict,
     prior_of,
+    temperatures_by_the_other,
     widened,
 )
 from thermogrip.sysid.effusivity.multi_touch import two_touch_fit
@@ -509,6 +511,21 @@ def test_two_sensors_on_one_object_are_the_joint_normal():
     assert found.u[0, T_OBJECT] == pytest.approx(x0 + gain @ off)
     assert found.covariance[0, T_OBJECT, T_OBJECT] == pytest.approx(v0 - gain @ np.full(2, v0))
     assert found.misfit[0] == 2.0
+
+
+def test_each_sensor_under_the_others_temperature_is_the_joint_answer():
+    priors = normal_prior(20.0, 9.0), normal_prior(22.0, 11.0)
+    modes = normal_mode(14.0, 1.0, evidence=-3.0), normal_mode(15.5, 2.0, evidence=-4.0)
+    joint = joined_modes(modes[0], priors[0], modes[1], priors[1], 0.4)
+    told = temperatures_by_the_other(modes[0], priors[0], modes[1], priors[1], 0.4)
+    mine = at_temperature(modes[0], priors[0], *told[0])
+    np.testing.assert_allclose(mine.u[0, T_OBJECT], joint.u[0, T_OBJECT])
+    np.testing.assert_allclose(mine.covariance, joint.covariance)
+    # the second thermometer shows 0.4 K more and is 0.3 K off, of which it has its share
+    its = at_temperature(modes[1], priors[1], *told[1])
+    variance, own = joint.covariance[0, T_OBJECT, T_OBJECT], its.covariance[0, T_OBJECT, T_OBJECT]
+    assert abs(its.u[0, T_OBJECT] - joint.u[0, T_OBJECT] - 0.4) < 0.3
+    assert own < variance + 0.3**2
 
 
 def test_a_second_sensor_that_saw_nothing_changes_nothing():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.special import logsumexp, ndtr
@@ -9,9 +11,12 @@ from scipy.stats import multivariate_normal, multivariate_t, norm
 from scipy.stats import t as student_t
 
 from thermogrip.datasets.examples import load_example_grasps
+from thermogrip.sysid.contact.simulation import simulate_grasps
 from thermogrip.sysid.effusivity import posterior_grid
-from thermogrip.sysid.effusivity.data import noise_covariance, touches
+from thermogrip.sysid.effusivity.data import noise_covariance, touches, whiten
 from thermogrip.sysid.effusivity.laplace_approximation import (
+    SENSORS_APART,
+    T_OBJECT,
     fit_pairs,
     free_hypotheses,
     nodes_for,
@@ -23,6 +28,7 @@ from thermogrip.sysid.effusivity.posterior_grid import (
     MarginalPosterior,
     grid_posteriors,
     log_integrals,
+    log_integrals_of_two,
     mixture_quantiles,
 )
 
@@ -96,6 +102,62 @@ def test_quantiles_are_those_of_the_summed_density(device, iron):
 
 def x_squared(posterior):
     return (posterior.x - (posterior.mass * posterior.x).sum()) ** 2
+
+
+@pytest.fixture(scope="module")
+def finger(device):
+    """A passive sensor of another skin beside the first, its thermometer 0.4 K above."""
+    stack = replace(device.stack, lag=0.3, z_outer=1.5 * device.stack.z_outer)
+    return replace(device, second=replace(device, stack=stack, bias=device.bias + 0.4))
+
+
+@pytest.mark.parametrize("stated", [17.0, np.nan])
+def test_two_sensors_are_integrated_over_every_temperature_of_their_object(finger, stated):
+    """Beside a sum over the temperatures at both sensors, each held while the rest is integrated."""
+    one, two = (
+        simulate_grasps(
+            replace(own.grip(), t_object_sd=0.0), ["iron"], t_object=18.3, t_gripper=skin, seed=3,
+            ambient=25.0, **own.readings(),
+        )
+        for own, skin in ((finger, 38.0), (finger.second, 28.0))
+    )  # fmt: skip
+    told = {"t_object": ("grasp", [stated]), "t_object_sd": ("grasp", [0.5])}
+    data = touches(one.assign(t_surface_2=two["t_surface"], **told))
+    x, row = np.array([9.3, 9.8, 10.3, 10.8]), np.zeros(4, dtype=np.int64)
+    mode = fit_pairs(finger, data, row, free_hypotheses(finger, x))
+    noise = whiten(data, finger.noise)
+    got = log_integrals_of_two(finger, data, x, mode.u, noise=noise, row=row)
+
+    def held(own, seen, ln_e, t):  # ln p(y | ln e, T_obj), (4, n)
+        untold = replace(seen, second=None, t_object=np.full(1, np.nan))
+        law = prior_of(own, untold.known(row), free_hypotheses(own, ln_e))
+        out = []
+        for at in t:
+            mean, sd = law.mean.copy(), law.sd.copy()
+            mean[:, T_OBJECT], sd[:, T_OBJECT] = at, 1e-3
+            prior, white = law._replace(mean=mean, sd=sd), whiten(untold, own.noise)
+            there = fit_pairs(own, untold, row, free_hypotheses(own, ln_e), prior=prior)
+            out.append(
+                posterior_grid._integrals(own, untold, ln_e, there.u, there.covariance, white, row, prior)
+            )
+        return np.stack(out, axis=1)
+
+    alone, other = replace(finger, second=None), finger.second
+    t = np.linspace(16.4, 19.6, 41)
+    t_2 = t + 0.4
+    ln_e_2 = other.found_effusivity(x - finger.effusivity_scale(x)[0])
+    law = prior_of(finger, data.known(row[:1]), free_hypotheses(finger, x[:1]))
+    mean, sd = law.mean[0, T_OBJECT], law.sd[0, T_OBJECT]
+    before = norm.logpdf(t, mean, sd)
+    if np.isfinite(stated):
+        before = np.logaddexp(np.log(0.95) + before, np.log(0.05) + norm.logpdf(t, mean, 3 * sd))
+    apart = norm.logpdf(t_2[None, :] - t[:, None] - 0.4, 0.0, SENSORS_APART)
+    by_one, by_two = before + held(alone, data, x, t), held(other, data.second, ln_e_2, t_2)
+    both = by_one[:, :, None] + apart + by_two[:, None]
+    want = logsumexp(both, axis=(1, 2)) + 2 * np.log(t[1] - t[0])
+    np.testing.assert_allclose(got, want, atol=0.08)
+    # Laplace's method is off by four times as much from one effusivity to another
+    assert np.ptp(got - want) < 0.25 * np.ptp(want - mode.log_evidence)
 
 
 def test_a_spoiled_record_is_answered_as_by_laplaces_method(device):
