@@ -252,15 +252,24 @@ def noise_fit(data: Touches, noise: Noise, extra: Array, left: Array) -> tuple[f
     z = np.einsum("nij,nj->ni", root, left)
     cost = 0.5 * (z**2).sum() + np.log(np.diagonal(chol, axis1=1, axis2=2)).sum()
     a = np.einsum("nij,ni->nj", root, z)
-    g = root.transpose(0, 2, 1) @ root - a[:, :, None] * a[:, None, :]
-    by_slow, by_misfit = g * slow, (g * misfit).sum(axis=2)
-    x = np.abs(data.t[:, :, None] - data.t[:, None, :]) / noise.correlation_time
+    g = root.transpose(0, 2, 1) @ root
+    g -= a[:, :, None] * a[:, None, :]
+    own = np.diagonal(g, axis1=1, axis2=2) * (data.count > 0)
+    at = np.arange(data.t.shape[1])
+    g[:, at, at] = own
+    # of grasps that share their time axis the sum serves
+    axes, which = _axes(data)
+    shared = np.stack([g[which == k].sum(axis=0) for k in range(len(axes))])
+    x = np.abs(axes[:, :, None] - axes[:, None, :]) / noise.correlation_time
+    by_slow = shared * (noise.slow**2 * noise.correlation(x))
     steep = (
         3 * x**2 / (1 + np.sqrt(3.0) * x) if noise.smooth else x
     )  # slope of -ln correlation by ln distance
+    g *= misfit
+    by_misfit = g.sum(axis=2)
     longer = np.log1p(np.maximum(data.t, 0.0) / 10)
     slopes = [
-        (np.diagonal(g, axis1=1, axis2=2) * white * (data.count > 0)).sum(),
+        (own * white).sum(),
         by_slow.sum(),
         0.5 * (by_slow * steep).sum(),
         by_misfit.sum(),
@@ -274,8 +283,7 @@ def _parts(data: Touches, noise: Noise) -> tuple[Array, Array, Array]:
     t = data.t
     there = data.count > 0
     # grasps of one record share their time axis, and the exponentials cost most
-    alike_all = bool((t == t[0]).all())
-    axes, which = (t[:1], 0) if alike_all else np.unique(t, axis=0, return_inverse=True)
+    axes, which = _axes(data)
     apart = np.abs(axes[:, :, None] - axes[:, None, :])
     slow = noise.slow**2 * noise.correlation(apart / noise.correlation_time)
     u = np.log1p(np.maximum(axes, 0.0) / 0.3)
@@ -284,6 +292,14 @@ def _parts(data: Touches, noise: Noise) -> tuple[Array, Array, Array]:
     misfit = alike[which] * (size * there)[:, :, None] * (size * there)[:, None, :]
     white = np.where(there, noise.white**2 / np.maximum(data.count, 1.0), 1.0)
     return white, slow[which] * (there[:, :, None] & there[:, None, :]), misfit
+
+
+def _axes(data: Touches) -> tuple[Array, NDArray[np.int64]]:
+    """Return the time axes (n_axis, n_bin), and which each grasp has."""
+    if (data.t == data.t[0]).all():
+        return data.t[:1], np.zeros(len(data.t), dtype=np.int64)
+    axes, which = np.unique(data.t, axis=0, return_inverse=True)
+    return axes, which.ravel()
 
 
 def _sum(data: Touches, white: Array, slow: Array, misfit: Array) -> Array:
