@@ -1,12 +1,15 @@
 """Aluminium, wood and cooled wood under one and two sensors, the objects' temperatures unknown.
 
     python benchmarks/classify/ambiguous.py FOLDER [--train 1-20] [--test 21-30] [--within] \
-        [--cases heated,both] [--classifiers A,B] [--out F.json]
+        [--cases heated,both] [--classifiers A,B] [--out F.json] [--own-bound N]
 
 The contacts of ``two_sensors.py`` with all 30 sets: FOLDER is ``robot_study/test`` as published.  The
 question is the material; cooled wood is wood.  Training: the room was 22.7 degC, where aluminium and wood
 lay; of cooled wood no temperature is given.  Test: nothing but the room is known.
 ``--within``: five folds of whole sets within the test sets, in place of the training sets.
+``--own-bound N``: instead, N times as many contacts of cooled wood as the test sets have, drawn from the
+posterior's own calibrated model (spreads, noise, discrepancy), and the errors of the temperatures that it
+then finds: what it would err by if it were true.
 
 Effusivities of 24050 and 367 count as true (the table's aluminium and wood), and 13.7 degC for cooled wood,
 which nobody measured.  What was chosen for the posterior (the widths of a discrepancy, how much evidence
@@ -17,6 +20,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +31,18 @@ from thermogrip.classify.estimators.lda import ArrayClassifier
 from thermogrip.classify.evaluation.metrics import calibration_bins, log_loss
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.effusivity import effusivity_posterior
+from thermogrip.sysid.effusivity.data import noise_covariance, touches
+from thermogrip.sysid.effusivity.laplace_approximation import (
+    EFFUSIVITY,
+    LEVEL,
+    T_OBJECT,
+    Hypotheses,
+    material_hypotheses,
+    nodes_for,
+    predict,
+    prior_of,
+)
+from thermogrip.sysid.effusivity.posterior_grid import grid_posteriors, mixture_quantiles
 
 ROOM, COLD = 22.7, 13.7
 E_TRUE = {"aluminium": 24050.0, "wood": 367.2, "wood_cold": 367.2}
@@ -84,8 +100,12 @@ def main() -> None:
     parser.add_argument("--cases", default="heated,both")
     parser.add_argument("--classifiers", default=f"posterior,{PEERS}")
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--own-bound", type=int)
     given = parser.parse_args()
     test, train = numbers(given.test), numbers(given.train)
+    if given.own_bound:
+        own_bound(given.folder, set(train), set(test), given.own_bound)
+        return
     folds = [(set(train), set(test))]
     if given.within:
         folds = [(set(test) - set(test[k::5]), set(test[k::5])) for k in range(5)]
@@ -100,6 +120,35 @@ def main() -> None:
             )
     if given.out:
         given.out.write_text(json.dumps(rows), encoding="utf-8")
+
+
+def own_bound(folder: Path, train: set[int], test: set[int], n: int) -> None:
+    """Print how far off temperatures of cooled wood are where the calibrated model is the truth."""
+    learnt, _ = contacts(folder, train, both=False, known=True)
+    device = make_classifier("posterior", seed=0).fit(learnt).device_
+    asked, which = contacts(folder, test, both=False, known=False)
+    data = touches(asked.isel(grasp=np.flatnonzero(which == "wood_cold")))
+    wood = material_hypotheses(device, ["wood"])
+    law = prior_of(device, data, Hypotheses(*(np.repeat(h, data.level.size) for h in wood)))
+    beyond = device.beyond(data.t, law.mean[:, EFFUSIVITY])
+    root, rng = np.linalg.cholesky(noise_covariance(data, device.noise)), np.random.default_rng(0)
+    medians, every = [], []
+    for _ in range(n):
+        u = law.mean + law.sd * rng.standard_t(np.minimum(law.dof, 1e6))
+        u[:, T_OBJECT], u[:, LEVEL] = COLD, data.level
+        noise = np.einsum("nij,nj->ni", root, rng.standard_normal(data.y.shape))
+        y = np.where(data.count > 0, predict(device.stack, nodes_for(data), data, u, beyond) + noise, data.y)
+        found = grid_posteriors(device, replace(data, y=y))
+        t = [mixture_quantiles(p.weight, p.t_object, p.t_object_sd, (0.05, 0.5, 0.95)) for p in found]
+        medians.append(float(np.median(np.abs(np.array(t)[:, 1] - COLD))))
+        every += t
+    low, middle, high = np.array(every).T
+    print(
+        f"{middle.size} contacts of cooled wood by the model itself: |T - true| "
+        f"{np.median(np.abs(middle - COLD)):.1f} K in the median, {data.level.size} at a time "
+        f"{min(medians):.1f} to {max(medians):.1f}, at most 5 in {np.mean(np.array(medians) <= 5):.2f}; "
+        f"intervals hold {np.mean((low <= COLD) & (high >= COLD)):.2f}"
+    )
 
 
 def score(folder: Path, name: str, both: bool, folds: list[tuple[set[int], set[int]]]) -> dict[str, float]:
