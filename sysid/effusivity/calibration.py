@@ -436,6 +436,7 @@ def _objective(problem: Problem, theta: Array, w: Array, spread: Spread, whitene
 _ROUNDS = 3  # of fit and noise
 _STEPS = 40
 _SETTLED = 0.05  # change of -2 ln evidence
+_ROUGHLY = 1.0  # before the noise is found anew
 _LEAST_LN_H_SPREAD = 0.2
 _SLOW = 2.3  # ln s: a contact that builds up for as long as it lasts
 _WHITE = 0.003  # K: a search that begins with less ends where rounding stops it
@@ -445,6 +446,7 @@ _ALWAYS_SD, _SHARE_SD, _ONSET_SD = 0.5, 0.02, 0.2  # of a discrepancy: K, share 
 _NOISE_STEPS = np.array([0.01, 0.1, 0.3, 0.1, 0.2])
 _NOISE_RANGE = np.array([(-8.0, 0.0), (-8.0, 0.0), (-1.0, 4.0), (-9.0, -3.0), (0.0, 2.0)])
 _NOISE_SEARCH, _NOISE_SLOPE = 300, 0.01  # steps at most, and nat per such step that end it
+_NOISE_ROUGHLY = 0.3  # where it is found once more
 
 
 def calibrate_gripper(
@@ -529,10 +531,13 @@ def _calibrated(
         def report_round(fraction: float, what: str, i: int = i) -> None:
             report((i + fraction) / rounds, what)
 
-        last, w, spread = _fit(problem, theta, w, spread, noise, report_round)
+        # the noise found after a round makes more difference than the end of its search
+        settled = _SETTLED if i == rounds - 1 else _ROUGHLY
+        last, w, spread = _fit(problem, theta, w, spread, noise, report_round, settled=settled)
         theta = last.theta
         if i < rounds - 1:
-            noise = _fit_noise(problem, linearise(problem, theta, w, spread), w, noise)
+            slope = _NOISE_SLOPE if i == rounds - 2 else _NOISE_ROUGHLY
+            noise = _fit_noise(problem, linearise(problem, theta, w, spread), w, noise, slope)
     if rounds > 1:
         problem, last, w, spread, noise = _discrepant(problem, last, w, spread, noise, report)
     found = _gripper_model(problem, last, spread, noise, length, names, prior)
@@ -596,7 +601,8 @@ def _search(
         theta = last.theta
         if i > 0 and _log_evidence(problem, last, noise) < least:
             return None
-        noise = _fit_noise(problem, linearise(problem, theta, w, spread), w, begin)
+        slope = _NOISE_ROUGHLY if steps < _STEPS else _NOISE_SLOPE
+        noise = _fit_noise(problem, linearise(problem, theta, w, spread), w, begin, slope)
     return problem, *_fit(problem, theta, w, spread, noise, progress), noise
 
 
@@ -709,7 +715,7 @@ def _row(label: str, materials: Mapping[str, Material]) -> Material | None:
 
 def _fit(
     problem: Problem, theta: Array, w: Array, spread: Spread, noise: Noise, progress: Progress,
-    steps: int = _STEPS,
+    steps: int = _STEPS, settled: float = _SETTLED,
 ) -> tuple[Step, Array, Spread]:  # fmt: skip
     """Alternate Gauss-Newton and EM until the evidence settles."""
     whitener, log_det = whiten(problem.data, noise)
@@ -720,14 +726,17 @@ def _fit(
         theta, damping = step.theta, step.damping
         spread, w = renew_spread(problem, spread, step.w, step.variance)
         value = step.objective + step.log_det + float(log_det.sum())
-        if abs(before - value) < _SETTLED:
+        if abs(before - value) < settled:
             break
         before = value
     return step, w, spread
 
 
-def _fit_noise(problem: Problem, lin: Linearised, w: Array, noise: Noise) -> Noise:
-    """Return the noise that makes the linearised residuals likeliest, nuisances marginalised."""
+def _fit_noise(
+    problem: Problem, lin: Linearised, w: Array, noise: Noise, slope: float = _NOISE_SLOPE
+) -> Noise:
+    """Return the noise that makes the linearised residuals likeliest, nuisances marginalised, within
+    ``slope``."""
     data = problem.data
     there = data.count > 0
     j = lin.by_w * there[:, :, None]
@@ -749,11 +758,13 @@ def _fit_noise(problem: Problem, lin: Linearised, w: Array, noise: Noise) -> Noi
         return value, slopes
 
     first = np.array([*np.log([noise.white, noise.slow, noise.correlation_time, noise.misfit]), noise.growth])
-    return unpack(_least(cost, first, n_grasp=data.level.size))
+    return unpack(_least(cost, first, data.level.size, slope))
 
 
-def _least(cost: Callable[[Array], tuple[float, Array]], first: Array, n_grasp: int) -> Array:
-    """Return where the cost of a noise is least, (5,); ``cost`` gives its slopes too."""
+def _least(
+    cost: Callable[[Array], tuple[float, Array]], first: Array, n_grasp: int, slope: float = _NOISE_SLOPE
+) -> Array:
+    """Return where the cost of a noise is least, (5,), within ``slope``; ``cost`` gives its slopes too."""
 
     def scaled(z: Array) -> tuple[float, Array]:
         value, slopes = cost(z * _NOISE_STEPS)
@@ -763,12 +774,12 @@ def _least(cost: Callable[[Array], tuple[float, Array]], first: Array, n_grasp: 
     best = minimize(
         scaled, first / _NOISE_STEPS, jac=True, method="L-BFGS-B",
         bounds=_NOISE_RANGE / _NOISE_STEPS[:, None],
-        options={"maxiter": _NOISE_SEARCH, "ftol": 0.0, "gtol": _NOISE_SLOPE},
+        options={"maxiter": _NOISE_SEARCH, "ftol": 0.0, "gtol": slope},
     )  # fmt: skip
     if not best.success:
         warnings.warn(
             f"the search for the noise of {n_grasp} grasps ended after {best.nit} steps before it settled "
-            f"(slope {np.abs(best.jac).max():.2g}, wanted {_NOISE_SLOPE:g}): {best.message}",
+            f"(slope {np.abs(best.jac).max():.2g}, wanted {slope:g}): {best.message}",
             RuntimeWarning,
             stacklevel=4,
         )
