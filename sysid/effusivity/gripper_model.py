@@ -53,7 +53,7 @@ _FILE_KEYS = {
     "ln_h_of_blocks": "finish", "ln_h_level": "finish_level", "ln_h_slope": "finish_slope",
     "uncertain": "in_doubt",
 }  # fmt: skip
-_WIDER = 1.5  # GripperSpread's numbers are guesses themselves: so wide, answers are right as often as stated
+WIDER = 1.5  # GripperSpread's numbers are guesses themselves: so wide, answers are right as often as stated
 # of ln e on another gripper's scale, which no block of its own anchors: skins go from plain silicone (570) to
 # silicone filled for conduction (1800 W s^0.5 m^-2 K^-1), a factor of three
 ANOTHER_SCALE_SD = 0.6
@@ -145,12 +145,17 @@ class GripperSpread:
 
     def covariance(self, names: Sequence[str]) -> Array:
         """Return the covariance that another gripper adds to the estimates called ``names``, (n, n)."""
-        total = np.zeros((len(names), len(names)))
-        for source in self._sources():
-            column = np.array([source.get(name, source.get(name.split(" ")[0], 0.0)) for name in names])
-            total += np.outer(column, column)
-        own = [self.block_contact**2 if name.startswith("ln_h ") else 0.0 for name in names]
-        return np.asarray(total + np.diag(own))
+        moved = self.directions(names)
+        return np.asarray(moved @ moved.T)
+
+    def directions(self, names: Sequence[str]) -> Array:
+        """Return how far each independent cause moves the estimates called ``names``, (n, n_cause)."""
+        columns = [
+            [source.get(name, source.get(name.split(" ")[0], 0.0)) for name in names]
+            for source in self._sources()
+        ]
+        own = np.diag([self.block_contact if name.startswith("ln_h ") else 0.0 for name in names])
+        return np.column_stack([np.array(columns).T, own[:, own.any(axis=0)]])
 
     def _sources(self) -> list[dict[str, float]]:
         """Return what each independent cause moves, and how far."""
@@ -174,7 +179,7 @@ def another_gripper(gripper: GripperModel, spread: GripperSpread | None = None) 
     if known is None:
         names = (*SHARED_NAMES, *block_names(gripper.materials))
         known = ParameterCovariance(names, np.zeros((len(names), len(names))))
-    extra = (spread or GripperSpread()).covariance(known.names) * (_WIDER**2 if spread is None else 1.0)
+    extra = (spread or GripperSpread()).covariance(known.names) * (WIDER**2 if spread is None else 1.0)
     return replace(
         gripper, uncertainty=ParameterCovariance(known.names, known.covariance + extra), uncertain=True,
         second=None if gripper.second is None else another_gripper(gripper.second, spread),

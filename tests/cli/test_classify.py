@@ -455,7 +455,7 @@ def test_requests_are_answered_by_lines_or_over_http(named: SimpleNamespace, sta
 
 
 @pytest.mark.parametrize("option", ["--early", "--next-touch"])
-@pytest.mark.parametrize("other", [["--other-gripper"], ["--known", "more.csv"]])
+@pytest.mark.parametrize("other", [["--other-gripper"], ["--known", "more.csv"], ["--others", "m"]])
 def test_of_another_gripper_nothing_is_foreseen(
     option: str, other: list[str], named: SimpleNamespace
 ) -> None:
@@ -470,12 +470,14 @@ def test_another_gripper_is_known_by_its_grasps_or_not_at_all(
     asked: list[Any] = []
     named.model = PosteriorClassifier()
     monkeypatch.setattr(
-        PosteriorClassifier, "for_another_gripper", lambda self, known: (asked.append(known), "another")[1]
+        PosteriorClassifier,
+        "for_another_gripper",
+        lambda self, known, others: (asked.append((known, others)), "another")[1],
     )
     words = ["classify", "m", "grasps.csv", "--out", "p.csv"]
     for other in (["--other-gripper"], ["--known", "more.csv"], []):
         assert named.bench.run(*words, *other).code == 0
-    assert asked == [None, [named.record]]
+    assert asked == [(None, []), ([named.record], [])]
     assert [call.args[0] for call in named.asked] == ["another", "another", named.model]
     assert named.bench.run(*words, "--same-gripper").code == 0
     certain = named.asked[-1].args[0]

@@ -308,6 +308,14 @@ def classify(
         list[str] | None,
         cli.opt("--known", "GRASPS", "Labelled grasps of that other gripper, one or more; may be repeated."),
     ] = None,
+    others: Annotated[
+        list[Path] | None,
+        cli.opt(
+            "--others",
+            "MODEL_DIR",
+            "Models of further grippers of the kind, two or more: the option once for each [posterior].",
+        ),
+    ] = None,
     between: ObjectRange = None,
     serve: Annotated[
         bool, cli.flag("--serve", "Answer grasps that come as lines of JSON, until they end.")
@@ -330,7 +338,7 @@ def classify(
     accuracy a second, and the accuracy expected after it; --or-unknown adds answer. A model is trained on
     one gripper and its blocks; each file decides whether another gripper or other blocks explain it better,
     and is then answered as unsurely as these differ. --same-gripper and --other-gripper say which it is,
-    --known what the other one reads of blocks it knows.
+    --known what the other one reads of blocks it knows, --others how far such grippers differ.
 
     A run that was ended goes on where it stopped when it is given again. Workers share out files, which
     they read themselves. --serve takes one object a line,
@@ -339,9 +347,11 @@ def classify(
     stated = _range(between)
     if serve == bool(paths) or serve == (out is not None) or (port is not None and not serve):
         raise UserError("give GRASPS and --out, or --serve alone", hint="--port belongs to --serve")
-    if same_gripper and (other_gripper or known):
-        raise UserError("--same-gripper contradicts --other-gripper and --known", hint="give one of them")
-    if (other_gripper or known) and (early or next_touch):
+    other_gripper = other_gripper or bool(known or others)
+    if same_gripper and other_gripper:
+        problem = "--same-gripper contradicts --other-gripper, --known and --others"
+        raise UserError(problem, hint="give one of them")
+    if other_gripper and (early or next_touch):
         problem = (
             f"{'--early' if early else '--next-touch'} needs a known gripper, and another one is uncertain"
         )
@@ -362,12 +372,13 @@ def classify(
         anywhere(model_dir), cli.comma(candidates), stated, early=early, next_touch=next_touch,
         or_unknown=or_unknown, other_gripper=other_gripper, same_gripper=same_gripper,
         known=tuple(str(anywhere(Path(path))) for path in known or ()),
+        others=tuple(str(anywhere(path)) for path in others or ()),
     )  # fmt: skip
     if serve:
         return _serve(console, ask.answerer(), port)
     assert out is not None
     given = sources(paths or [])
-    asked = [*astuple(ask), stamps([model_dir, *ask.known])]
+    asked = [*astuple(ask), stamps([model_dir, *ask.known, *ask.others])]
     ask.answerer()
     found = Answers(out, ["classify", *asked])
     with _resumable(console, found), console.progress("classify") as progress:
@@ -435,6 +446,7 @@ class _Question:
     other_gripper: bool = False
     same_gripper: bool = False
     known: tuple[str, ...] = ()
+    others: tuple[str, ...] = ()
 
     def prepare(self, record: Grasps) -> Grasps:
         """Return a record of a file as it is."""
@@ -450,7 +462,7 @@ class _Question:
         """Return what answers a record, once a process while the model's files are the same."""
         from thermogrip.datasets.partitions import stamps
 
-        return _answerer(self, str(Path.cwd()), str(stamps([self.model_dir, *self.known])))
+        return _answerer(self, str(Path.cwd()), str(stamps([self.model_dir, *self.known, *self.others])))
 
     def load(self) -> Callable[[Grasps], dict[str, Any]]:
         """Return what answers a record with its rows and why some are out of distribution."""
@@ -462,9 +474,10 @@ class _Question:
 
         model = load_classifier(self.model_dir)
         rule = load_stop_rule(self.model_dir) if self.early else None
-        if self.other_gripper or self.known:
+        if self.other_gripper:
             known = read_grasp_files(self.known) if self.known else None
-            model = _with_gripper(model).for_another_gripper(known)
+            others = [_with_gripper(load_classifier(path)).device_ for path in self.others]
+            model = _with_gripper(model).for_another_gripper(known, others=others)
         if self.same_gripper:
             model = _with_gripper(model).certain()
 
