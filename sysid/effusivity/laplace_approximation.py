@@ -84,7 +84,7 @@ from thermogrip.sysid.contact.simulation import (
     stack_modes,
     time_nodes,
 )
-from thermogrip.sysid.effusivity.data import Touches, noise_covariance, whiten
+from thermogrip.sysid.effusivity.data import Touches, Whitened, noise_covariance, whiten, whiteners
 from thermogrip.sysid.effusivity.gripper_model import (
     INSULATOR,
     LEVEL_SD,
@@ -163,7 +163,7 @@ def pairs_asked(
 
 
 def find_modes(
-    stack: Stack, data: Touches, row: NDArray[np.int64], whitener: tuple[Array, Array], prior: Prior, *,
+    stack: Stack, data: Touches, row: NDArray[np.int64], whitener: Whitened, prior: Prior, *,
     start: Array | None = None, max_steps: int = 20, beyond: Array | None = None, rivals: bool = False,
 ) -> Mode:  # fmt: skip
     """Return mode, covariance and log evidence of every pair by damped Gauss-Newton.
@@ -549,7 +549,7 @@ def prior_of(gripper: GripperModel, data: Touches, hypotheses: Hypotheses) -> Pr
 
 def fit_pairs(
     gripper: GripperModel, data: Touches, row: NDArray[np.int64], hypotheses: Hypotheses, *,
-    start: Array | None = None, max_steps: int = 20, noise: tuple[Array, Array] | None = None,
+    start: Array | None = None, max_steps: int = 20, noise: Whitened | None = None,
     prior: Prior | None = None, rivals: bool = False,
 ) -> Mode:  # fmt: skip
     """Return the modes of pairs, hypothesis i against touch ``row[i]``, integrated over an uncertain
@@ -587,12 +587,18 @@ def with_second(
     return joined_modes(mode, prior, beside, own, second.bias - gripper.bias)
 
 
+def whitened(gripper: GripperModel, data: Touches) -> Whitened:
+    """Return what whitens the first sensor's noise as :func:`fit_pairs` takes it."""
+    # of an uncertain gripper each pair has a matrix of its own
+    return (whiteners if data.tabled and not gripper.uncertain else whiten)(data, gripper.noise)
+
+
 def _own_modes(
     gripper: GripperModel, data: Touches, row: NDArray[np.int64], hypotheses: Hypotheses, prior: Prior,
-    start: Array | None, max_steps: int, noise: tuple[Array, Array] | None, rivals: bool,
+    start: Array | None, max_steps: int, noise: Whitened | None, rivals: bool,
 ) -> Mode:  # fmt: skip
     """Return the modes of pairs by the first sensor alone."""
-    noise = whiten(data, gripper.noise) if noise is None else noise
+    noise = whitened(gripper, data) if noise is None else noise
     if gripper.uncertain:
         block = hypotheses.block.astype(np.int64)
         return uncertain_gripper_modes(

@@ -33,7 +33,7 @@ from scipy.special import gammaln, logsumexp, ndtr
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.materials import load_materials
-from thermogrip.sysid.effusivity.data import Touches, whiten
+from thermogrip.sysid.effusivity.data import Touches, Whitened
 from thermogrip.sysid.effusivity.gripper_model import GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import (
     BUILD_UP,
@@ -52,6 +52,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     pairs_asked,
     prior_of,
     slip_of,
+    whitened,
 )
 
 # On the gripper's scale.  Of solids at room temperature plastic foams have least (expanded polystyrene, 32),
@@ -71,7 +72,7 @@ _LOG_WEIGHT = 1.5 - np.log(6.0) - 0.5 * np.log(2 * np.pi) + np.log(_STEP)
 
 
 def slipped(
-    gripper: GripperModel, data: Touches, whitener: Array, beyond: Array | None, sd: Array, u: Array,
+    gripper: GripperModel, data: Touches, whitener: Any, beyond: Array | None, sd: Array, u: Array,
     row: NDArray[np.int64] | None = None,
 ) -> Array:  # fmt: skip
     """Return ln p(y | u) up to a constant for n points ``u`` (n, 7) of the grasps ``row`` (n,), by default
@@ -97,11 +98,11 @@ class MarginalPosterior:
     n = len(SAMPLED)
 
     def __init__(
-        self, gripper: GripperModel, data: Touches, noise: tuple[Array, Array] | None = None
+        self, gripper: GripperModel, data: Touches, noise: Whitened | None = None
     ) -> None:
         gripper.require_known("an integral over one grasp's nuisances")
         self.gripper, self.data = gripper, data
-        whitener, log_det = whiten(data, gripper.noise) if noise is None else noise
+        whitener, log_det = whitened(gripper, data) if noise is None else noise
         self.whitener, self.log_det = whitener, float(log_det[0])
         # of the prior only what depends on ln e is computed again
         self._prior = prior_of(gripper, data, free_hypotheses(gripper, [9.0]))
@@ -121,7 +122,7 @@ class MarginalPosterior:
 
 
 def _log_posterior(
-    gripper: GripperModel, data: Touches, whitener: Array, common: Prior, points: Array,
+    gripper: GripperModel, data: Touches, whitener: Any, common: Prior, points: Array,
     row: NDArray[np.int64],
 ) -> Array:  # fmt: skip
     """Return the log posterior (n,), up to a constant, of points (n, 5) of the grasps ``row``, of whose
@@ -141,13 +142,13 @@ def _log_posterior(
 
 def log_integrals(
     gripper: GripperModel, data: Touches, x: Array, mode: Array, covariance: Array, *,
-    noise: tuple[Array, Array] | None = None, row: NDArray[np.int64] | None = None,
+    noise: Whitened | None = None, row: NDArray[np.int64] | None = None,
 ) -> Array:  # fmt: skip
     """Return ln p(y | ln e), every nuisance integrated, at effusivities ``x`` (n,) of the grasps ``row``
     (n,), by default the first."""
     gripper.require_known("an integral over one grasp's nuisances")
     row = np.zeros(x.size, dtype=np.int64) if row is None else row
-    whitener, log_det = whiten(data, gripper.noise) if noise is None else noise
+    whitener, log_det = whitened(gripper, data) if noise is None else noise
     common = prior_of(gripper, data, free_hypotheses(gripper, np.full(data.level.size, 9.0)))
     root = np.linalg.cholesky(covariance[:, _REST[:, None], _REST[None, :]])
     rest = mode[:, None, _REST] + np.einsum("nij,kj->nki", root, _Z)
@@ -200,7 +201,7 @@ class _Fitted(NamedTuple):
 
 def grid_posteriors(gripper: GripperModel, data: Touches) -> list[GridPosterior]:
     """Return the posteriors of ln e: log-uniform prior over :data:`LN_E_RANGE`, h_c unknown."""
-    noise = whiten(data, gripper.noise)
+    noise = whitened(gripper, data)
     found = _fitted(gripper, data, noise)
     value = found.value + _left_out(gripper, data, noise, found)
     if gripper.discrepancy is not None:  # its evidence counts little, so what objects are made of counts
@@ -211,20 +212,20 @@ def grid_posteriors(gripper: GripperModel, data: Touches) -> list[GridPosterior]
 
 def free_evidence(gripper: GripperModel, data: Touches) -> Array:
     """Return the log evidence of a free effusivity for each touch, (n,), as :func:`grid_posteriors` do."""
-    found = _fitted(gripper, data, whiten(data, gripper.noise))
+    found = _fitted(gripper, data, whitened(gripper, data))
     return np.asarray(log_total(found.x, found.value) - np.log(LN_E_RANGE[1] - LN_E_RANGE[0]))
 
 
 def rough_evidence(gripper: GripperModel, data: Touches) -> Array:
     """Return :func:`free_evidence` by few points, of a gripper under which densities are wide: within 0.15
     of it."""
-    noise = whiten(data, gripper.noise)
+    noise = whitened(gripper, data)
     grid = np.tile(np.linspace(*LN_E_RANGE, _ROUGH), (data.level.size, 1))
     found = _evaluate(gripper, data, noise, grid, None)
     return np.asarray(log_total(found.x, found.value) - np.log(LN_E_RANGE[1] - LN_E_RANGE[0]))
 
 
-def _fitted(gripper: GripperModel, data: Touches, noise: tuple[Array, Array]) -> _Fitted:
+def _fitted(gripper: GripperModel, data: Touches, noise: Whitened) -> _Fitted:
     """Return the fits at the coarse points and at those of the refinements, along which ln e rises."""
     coarse = np.tile(np.linspace(*LN_E_RANGE, N_COARSE), (data.level.size, 1))
     found = _evaluate(gripper, data, noise, coarse, None)
@@ -248,7 +249,7 @@ def log_listed(ln_e: Array) -> Array:
     return np.asarray(np.log(0.5 + 0.5 * width * near))
 
 
-def _left_out(gripper: GripperModel, data: Touches, noise: tuple[Array, Array], found: _Fitted) -> Array:
+def _left_out(gripper: GripperModel, data: Touches, noise: Whitened, found: _Fitted) -> Array:
     """Return what Laplace's method left out of the points (n, m), less its mean over each posterior."""
     from scipy.interpolate import PchipInterpolator
 
@@ -332,7 +333,7 @@ def _quantiles(weight: Array, mean: Array, sd: Array, wanted: Array) -> Array:
 
 
 def _evaluate(
-    gripper: GripperModel, data: Touches, noise: tuple[Array, Array], grid: Array, start: Array | None
+    gripper: GripperModel, data: Touches, noise: Whitened, grid: Array, start: Array | None
 ) -> _Fitted:
     """Return the fits at the points of a grid (n, m)."""
     n, m = grid.shape
