@@ -260,25 +260,32 @@ def products(
     the readings less those that ``u`` predicts, both whitened."""
     y, columns = readings(asked, u, sd > 0.0, alike=alike)
     np.subtract(asked.data.y[asked.row], y, out=columns[:, :, _LEFT])
-    matrix, scale = squares(whitener, asked.row, columns), np.ones((len(u), _LEFT + 1))
+    scale, matrix = np.ones((len(u), _LEFT + 1)), np.zeros((len(u), _LEFT + 1, _LEFT + 1))
     scale[:, :_LEFT] = sd
+    used = np.flatnonzero((scale > 0.0).any(axis=0))
+    if used.size > _LEFT // 2:
+        matrix = squares(whitener, asked.row, columns)
+    else:
+        matrix[:, used[:, None], used] = squares(whitener, asked.row, columns[:, :, used])
     matrix *= scale[:, :, None]
     matrix *= scale[:, None, :]
     return matrix
 
 
 def squares(whitener: Any, row: NDArray[np.int64], columns: Array) -> Array:
-    """Return the products (n, 8, 8) of ``columns`` (n, n_bin, 8) of touches ``row``, whitened by a
+    """Return the products (n, m, m) of ``columns`` (n, n_bin, m) of touches ``row``, whitened by a
     :class:`~thermogrip.sysid.effusivity.data.Whitener` or by a matrix a touch."""
     alone = isinstance(whitener, np.ndarray)
     kinds, kind = (whitener, row) if alone else (whitener.kinds, whitener.kind[row])
     out = np.empty((row.size, columns.shape[2], columns.shape[2]))
     for k in np.unique(kind):
         at: Any = slice(None) if (kind == k).all() else kind == k
-        white = np.matmul(kinds[k], columns[at])
+        # one product of large matrices is quicker than many of few columns
+        own = columns[at].transpose(0, 2, 1)
+        white = np.matmul(own.reshape(-1, own.shape[2]), kinds[k].T).reshape(own.shape)
         if not alone:
-            white *= whitener.scale[row[at], :, None]
-        out[at] = np.matmul(white.transpose(0, 2, 1), white)
+            white *= whitener.scale[row[at], None, :]
+        out[at] = np.matmul(white, white.transpose(0, 2, 1))
     return out
 
 

@@ -251,8 +251,6 @@ def log_listed(ln_e: Array) -> Array:
 
 def _left_out(gripper: GripperModel, data: Touches, noise: Whitened, found: _Fitted) -> Array:
     """Return what Laplace's method left out of the points (n, m), less its mean over each posterior."""
-    from scipy.interpolate import PchipInterpolator
-
     x, value, u, covariance, settled = found
     out = np.zeros(x.shape)
     # for an uncertain gripper Laplace's method integrates over its parameters too, with a discrepancy the
@@ -267,6 +265,7 @@ def _left_out(gripper: GripperModel, data: Touches, noise: Whitened, found: _Fit
         wanted = np.linspace(x[i, at[0]], x[i, at[-1]], _KNOTS)
         knots[i] = at[np.unique(np.abs(x[i, at] - wanted[:, None]).argmin(axis=1))]
     every = list(knots.items())
+    inner = np.zeros(x.shape)
     for some in (every[k : k + _TOGETHER] for k in range(0, len(every), _TOGETHER)):
         row, at = (
             np.repeat([i for i, _ in some], [k.size for _, k in some]),
@@ -274,11 +273,41 @@ def _left_out(gripper: GripperModel, data: Touches, noise: Whitened, found: _Fit
         )
         there = x[row, at], u[row, at], covariance[row, at]
         missing = log_integrals(gripper, data, *there, noise=noise, row=row) - value[row, at]
-        for i, k in some:
-            everywhere = PchipInterpolator(x[i, k], missing[row == i])(np.clip(x[i], x[i, k[0]], x[i, k[-1]]))
-            weight = np.exp(value[i] - value[i].max()) * np.gradient(x[i])
-            out[i] = everywhere - (weight * everywhere).sum() / weight.sum()
+        inner[row, at] = missing
+    for n_knot in {k.size for _, k in every}:
+        which = np.array([i for i, k in every if k.size == n_knot])
+        at = np.stack([knots[i] for i in which.tolist()])
+        known = np.take_along_axis(x[which], at, axis=1), np.take_along_axis(inner[which], at, axis=1)
+        everywhere = monotone(*known, x[which])
+        weight = np.exp(value[which] - value[which].max(axis=1, keepdims=True)) * np.gradient(x[which], axis=1)
+        mean = (weight * everywhere).sum(axis=1) / weight.sum(axis=1)
+        out[which] = everywhere - mean[:, None]
     return out
+
+
+def monotone(x: Array, y: Array, at: Array) -> Array:
+    """Return curves through ``y`` (n, m) at rising ``x`` (n, m), at points ``at`` (n, k), as at their ends
+    beyond them: cubics that turn nowhere but at points, by the slopes of Fritsch and Butland."""
+    h = np.diff(x)
+    secant, last = np.diff(y) / h, x.shape[1] - 1
+    slope = np.zeros(x.shape)
+    early, later = secant[:, :-1], secant[:, 1:]
+    w1, w2 = h[:, :-1] + 2 * h[:, 1:], 2 * h[:, :-1] + h[:, 1:]
+    turn = (early * later <= 0.0) | (early == 0.0)
+    safe = np.where(turn, 1.0, early), np.where(turn, 1.0, later)
+    slope[:, 1:-1] = np.where(turn, 0.0, (w1 + w2) / (w1 / safe[0] + w2 / safe[1]))
+    for end, near, beyond in ((0, 0, 1), (last, last - 1, last - 2)):
+        h0, h1, s0, s1 = h[:, near], h[:, beyond], secant[:, near], secant[:, beyond]
+        own = ((2 * h0 + h1) * s0 - h0 * s1) / (h0 + h1)
+        own = np.where((s0 * s1 < 0.0) & (np.abs(own) > 3 * np.abs(s0)), 3 * s0, own)
+        slope[:, end] = np.where(own * s0 <= 0.0, 0.0, own)
+    inside = np.clip(at, x[:, :1], x[:, -1:])
+    cell = np.clip((x[:, None, :] <= inside[:, :, None]).sum(axis=2) - 1, 0, last - 1)
+    x0, y0, d0, width = (np.take_along_axis(part, cell, axis=1) for part in (x, y, slope, h))
+    y1, d1 = (np.take_along_axis(part, cell + 1, axis=1) for part in (y, slope))
+    s = (inside - x0) / width
+    bent = (1 - s) * d0 * width - s * d1 * width + (1 - 2 * s) * (y0 - y1)
+    return np.asarray(y0 + s * (y1 - y0) + s * (1 - s) * bent)
 
 
 def mixed(parts: Sequence[GridPosterior], log_weight: Array) -> GridPosterior:
