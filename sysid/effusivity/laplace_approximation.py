@@ -53,7 +53,7 @@ Its solution in dv gives the next guess of theta, t0 + P a with
 
 until the joint density of (v, theta) grows no more.  That is Gauss-Newton for both together, and the evidence
 at its end is Laplace's for both.  Every hypothesis finds a gripper of its own, and starts from that of the
-likeliest one, through a, which unlike theta does not depend on the block.  One that is 50 nats behind is left
+likeliest one, through a, which unlike theta does not depend on the block.  One that is 20 nats behind is left
 there, unsettled.
 
 Where the block is not of the calibration its effusivity is on the scale that the calibration's blocks
@@ -202,7 +202,7 @@ def peak_ratio(dof: Array, vary: Mask) -> Array:
 _AT = {name: i for i, name in enumerate((*SHARED_NAMES, "ln_h", "ln_e"))}
 _ROUNDS = 8
 _STILL = 0.5  # of -2 ln density: a smaller predicted decrease ends the search
-_HOPELESS = 50.0  # nats behind the likeliest
+_HOPELESS = 20.0  # nats behind the likeliest: a first round is within 5 of the last
 _DIFFERENCE = 1e-6
 _LAYERS = [_AT[f"ln_{name}"] for name in LAYER_NAMES]
 _CONTACT = ("lag", "first", "creep", "settle", "g_far")

@@ -97,9 +97,7 @@ class MarginalPosterior:
 
     n = len(SAMPLED)
 
-    def __init__(
-        self, gripper: GripperModel, data: Touches, noise: Whitened | None = None
-    ) -> None:
+    def __init__(self, gripper: GripperModel, data: Touches, noise: Whitened | None = None) -> None:
         gripper.require_known("an integral over one grasp's nuisances")
         self.gripper, self.data = gripper, data
         whitener, log_det = whitened(gripper, data) if noise is None else noise
@@ -279,7 +277,9 @@ def _left_out(gripper: GripperModel, data: Touches, noise: Whitened, found: _Fit
         at = np.stack([knots[i] for i in which.tolist()])
         known = np.take_along_axis(x[which], at, axis=1), np.take_along_axis(inner[which], at, axis=1)
         everywhere = monotone(*known, x[which])
-        weight = np.exp(value[which] - value[which].max(axis=1, keepdims=True)) * np.gradient(x[which], axis=1)
+        weight = np.exp(value[which] - value[which].max(axis=1, keepdims=True)) * np.gradient(
+            x[which], axis=1
+        )
         mean = (weight * everywhere).sum(axis=1) / weight.sum(axis=1)
         out[which] = everywhere - mean[:, None]
     return out
