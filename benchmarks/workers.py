@@ -1,11 +1,12 @@
 """How much faster two workers are than one, and whether their answers are the same bytes.
 
-    python benchmarks/workers.py FOLDER [effusivity compare tune identify] [--kill] [--files 12]
+    python benchmarks/workers.py FOLDER [effusivity compare tune identify] [--kill] [--files 12] [--workers 2]
 
-Each verb runs with one process, with ``--workers 2`` and, where ``distributed`` is installed, on a Dask
-scheduler with two worker processes of this machine, which are there before the clock starts.  Efficiency is
-the wall time of one over twice that of two, the start of the program included.  With ``--kill`` a worker is
-ended by SIGKILL once it has computed for some seconds, and only bytes are compared.
+Each verb runs with one process, with ``--workers 2`` (or as many as are given) and, where ``distributed``
+is installed, on a Dask scheduler with as many worker processes of this machine, which are there before the
+clock starts. Efficiency is the wall time of one over that of n times n, the start of the program included.
+With ``--kill`` a worker is ended by SIGKILL once it has computed for some seconds, and only bytes are
+compared.
 
 The loop at the end of a line is the CPU time of five million additions right after the run: a machine that
 others share has several speeds.
@@ -93,21 +94,21 @@ def killed_one(pid: int, seconds: float = 6.0) -> bool:
 
 
 @contextmanager
-def cluster(folder: Path) -> Iterator[tuple[str, int]]:
-    """Give the address of a scheduler with two workers, and the process that started these."""
+def cluster(folder: Path, n: int = 2) -> Iterator[tuple[str, int]]:
+    """Give the address of a scheduler with ``n`` workers, and the process that started these."""
     run = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0"]
     file = folder / "scheduler.json"
     file.unlink(missing_ok=True)
     work = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(file)]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": folder}
     ahead = [*run, "--no-dashboard", "--scheduler-file", str(file)]
-    behind = [*work, "--nworkers", "2", "--nthreads", "1", "--no-dashboard"]
+    behind = [*work, "--nworkers", str(n), "--nthreads", "1", "--no-dashboard"]
     with subprocess.Popen(ahead, **quiet) as scheduler, subprocess.Popen(behind, **quiet) as two:
         from distributed import Client
 
         try:
             with Client(scheduler_file=str(file)) as client:
-                client.wait_for_workers(2)
+                client.wait_for_workers(n)
                 address = client.scheduler.address
             yield address, two.pid
         finally:
@@ -138,25 +139,26 @@ def main() -> None:
     parser.add_argument("verbs", nargs="*", default=["effusivity", "compare", "tune", "identify"])
     parser.add_argument("--kill", action="store_true")
     parser.add_argument("--files", type=int, default=12)
+    parser.add_argument("--workers", type=int, default=2)
     given = parser.parse_args()
     folder = given.folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
     words = verbs(folder, given.files)
     for verb in given.verbs:
         alone, first = 0.0, ""
-        for how in ("one process", "two workers", "Dask, two workers"):
+        for how in ("one process", f"{given.workers} workers", f"Dask, {given.workers} workers"):
             out = folder / "out"
             shutil.rmtree(out, ignore_errors=True)
             out.mkdir()
             if how.startswith("Dask"):
-                with cluster(folder) as (address, _):
+                with cluster(folder, given.workers) as (address, _):
                     wall = ran([*words[verb], "--cluster", address], out)
             else:
-                n = "1" if how == "one process" else "2"
-                wall = ran([*words[verb], "--workers", n], out, kill=given.kill and n == "2")
+                n = 1 if how == "one process" else given.workers
+                wall = ran([*words[verb], "--workers", str(n)], out, kill=given.kill and n > 1)
             alone, first = alone or wall, first or digest(out)
             same = "same bytes" if digest(out) == first else "OTHER BYTES"
-            share = "" if how == "one process" else f"efficiency {alone / wall / 2:.2f}"
+            share = "" if how == "one process" else f"efficiency {alone / wall / given.workers:.2f}"
             print(f"{verb:11s} {how:18s} {wall:7.1f} s  {share:16s} {same}  loop {loop():.2f} s", flush=True)
 
 

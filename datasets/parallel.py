@@ -13,13 +13,16 @@ Python and the numerical packages that are here.  Workers may join at any time, 
 
 from __future__ import annotations
 
+import asyncio
+import ctypes
 import multiprocessing
 import os
 import sys
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
+from functools import cache, partial
 from importlib.metadata import version
 from importlib.util import find_spec
 from typing import Any, TypeAlias, TypeVar
@@ -33,6 +36,7 @@ Progress: TypeAlias = Callable[[float, str], None]
 Workers: TypeAlias = int | str
 
 _CONNECT_S = 10
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of malloc.h
 _DEATHS = 3  # of processes, without a result between them
 
 #: The processes that :func:`kept_processes` holds, if any.
@@ -173,6 +177,31 @@ def _processes(n: int) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(n, mp_context=multiprocessing.get_context("spawn"))
 
 
+class Replaced:
+    """Processes that answer calls of an event loop as they come, or with one worker a thread; where one is
+    killed all are started again."""
+
+    def __init__(self, workers: int) -> None:
+        self._n = min(workers, os.cpu_count() or 1)
+        self._pool: Executor = self._start()
+
+    def _start(self) -> Executor:
+        return ThreadPoolExecutor(1) if self._n == 1 else _processes(self._n)
+
+    async def call(self, function: Callable[[_Item], _Result], item: _Item) -> _Result:
+        """Return ``function(item)``; UserError if processes are killed again and again over it."""
+        loop = asyncio.get_running_loop()
+        for _ in range(_DEATHS):
+            pool = self._pool
+            try:
+                return await loop.run_in_executor(pool, function, item)
+            except BrokenProcessPool:
+                if pool is self._pool:  # the first that sees it
+                    pool.shutdown(wait=False)
+                    self._pool = self._start()
+        raise UserError("worker processes are killed again and again", hint="memory may be short")
+
+
 def _on_cluster(
     function: Callable[[_Item], _Result], todo: list[_Item], address: str
 ) -> Generator[tuple[int, _Result], None, None]:
@@ -188,7 +217,8 @@ def _on_cluster(
         client = dask.Client(address, timeout=_CONNECT_S, set_as_default=False)
     try:
         _check_cluster(client, address)
-        futures = {future: i for i, future in enumerate(client.map(function, todo, pure=False))}
+        kept = partial(_with_memory_kept, function)
+        futures = {future: i for i, future in enumerate(client.map(kept, todo, pure=False))}
         for future in dask.as_completed(futures, loop=client.loop):
             result = future.result()  # the first fault ends it
             yield futures.pop(future), result
@@ -197,6 +227,24 @@ def _on_cluster(
         raise UserError(problem, hint="give them more memory") from error
     finally:
         client.close()  # which lets go of what is not done
+
+
+def _with_memory_kept(function: Callable[[_Item], _Result], item: _Item) -> _Result:
+    """Return what a function returns, on a worker that keeps freed memory for its next arrays.
+
+    Dask's nanny has the C library give back what is freed at once (MALLOC_TRIM_THRESHOLD_), and arrays of
+    some 100 kB, freed and wanted again a thousand times a second, then cost more than what is computed.
+    """
+    _keep_memory()
+    return function(item)
+
+
+@cache
+def _keep_memory() -> None:
+    """Have glibc keep up to 256 MB of free memory, and take arrays of less than 32 MB from it."""
+    if sys.platform == "linux" and (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
+        mallopt(_TRIM_THRESHOLD, 256 << 20)
+        mallopt(_MMAP_THRESHOLD, 32 << 20)
 
 
 def _check_cluster(client: Any, address: str) -> None:

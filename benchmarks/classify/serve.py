@@ -1,12 +1,12 @@
 """How long an answer of ``classify --serve`` takes, beside the same call in this process.
 
-    python benchmarks/classify/serve.py MODEL_DIR [--grasps 10000] [--in-process 500]
+    python benchmarks/classify/serve.py MODEL_DIR [--grasps 10000] [--in-process 500] [--workers N]
 
-The example condition ``exp1A_obj43_grip23``, each trace with new white noise of 0.02 K.  First one client,
-with a tenth of the requests, then four at once: with one thread that answers each waits for three others.
-Every
-request has a number, which its answer must bring back.  A request is timed from its first byte to the last of
-its answer, over a connection that stays open.
+The example condition ``exp1A_obj43_grip23``, each trace with new white noise of 0.02 K. First one client,
+with a tenth of the requests (at most 500), then four at once: with one thread that answers each waits for
+three others, with four processes (``--workers 4``) for none. Every request has a number, which its answer
+must bring back. A request is timed from its first byte to the last of its answer, over a connection that
+stays open. Progress goes to stderr; memory is that of the server and of all its processes.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def requests(n: int) -> list[bytes]:
     return found
 
 
-def timed(port: int, bodies: list[bytes]) -> list[float]:
+def timed(port: int, bodies: list[bytes], tell: bool = False) -> list[float]:
     """Return the seconds of each answer [s]; an answer to another request, or none, is an error."""
     line, seconds = http.client.HTTPConnection(HOST, port), []
     for body in bodies:
@@ -49,6 +49,8 @@ def timed(port: int, bodies: list[bytes]) -> list[float]:
         response = line.getresponse()
         found = json.loads(response.read())
         seconds.append(time.perf_counter() - begin)
+        if tell and len(seconds) % 250 == 0:
+            print(f"  {len(seconds)} of {len(bodies)} of the first client", file=sys.stderr, flush=True)
         if response.status != 200 or found["id"] != json.loads(body)["id"]:
             raise SystemExit(f"lost: {found}")
     return seconds
@@ -61,9 +63,11 @@ def line_of(name: str, seconds: list[float]) -> str:
 
 
 def peak_mb(pid: int) -> float:
-    """Return the most memory that a process has had [MB]."""
+    """Return the most memory that a process and those that it started have had [MB]."""
     text = Path(f"/proc/{pid}/status").read_text()
-    return int(text.partition("VmHWM:")[2].split()[0]) / 1024
+    started = [task.read_text().split() for task in Path(f"/proc/{pid}/task").glob("*/children")]
+    own = int(text.partition("VmHWM:")[2].split()[0]) / 1024
+    return own + sum(peak_mb(int(child)) for each in started for child in each)
 
 
 def main() -> None:
@@ -71,6 +75,7 @@ def main() -> None:
     parser.add_argument("model", type=Path)
     parser.add_argument("--grasps", type=int, default=10_000)
     parser.add_argument("--in-process", type=int, default=500)
+    parser.add_argument("--workers", type=int, default=1)
     given = parser.parse_args()
     bodies = requests(given.grasps)
     print("             answers  p50 [ms]  p99 [ms]")
@@ -81,16 +86,18 @@ def main() -> None:
         seconds.append(time.perf_counter() - begin)
     print(line_of("in process", seconds[1:]), flush=True)  # the first one loads compiled code
     words = [sys.executable, "-m", "thermogrip", "classify", str(given.model), "--serve", "--port", "0"]
+    words += ["--workers", str(given.workers)]
     with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         port = int(process.stderr.readline().strip().rstrip("/").rpartition(":")[2])
         try:
-            timed(port, bodies[:1])
-            print(line_of("one client", timed(port, bodies[: given.grasps // 10])), flush=True)
+            with ThreadPoolExecutor(4 * given.workers) as pool:  # each process loads compiled code
+                list(pool.map(lambda k: timed(port, bodies[k : k + 1]), range(4 * given.workers)))
+            print(line_of("one client", timed(port, bodies[: min(given.grasps // 10, 500)])), flush=True)
             before = peak_mb(process.pid)
             begin = time.perf_counter()
             with ThreadPoolExecutor(4) as pool:
-                found = list(pool.map(lambda k: timed(port, bodies[k::4]), range(4)))
+                found = list(pool.map(lambda k: timed(port, bodies[k::4], k == 0), range(4)))
             spent = time.perf_counter() - begin
             print(line_of("four clients", [s for each in found for s in each]))
             print(f"{given.grasps / spent:.0f} answers/s; none lost; peak memory of the server "

@@ -6,7 +6,8 @@ back.
 The answer is the row that ``classify`` writes, or ``error``, one line.  Over pipes both are lines of JSON.
 Over HTTP a request is the body of a POST; the server has a loopback address, takes only requests that call it
 by one, and none of a web page: a page elsewhere, opened in a browser here, must not learn what is touched.
-Requests wait for one thread, in the order of their arrival: an answer is all arithmetic.
+Requests wait for one thread, in the order of their arrival: an answer is all arithmetic.  With several
+processes as many are answered at once; one that is lost is replaced, and what it had in hand is asked again.
 """
 
 from __future__ import annotations
@@ -93,16 +94,16 @@ def serve_lines(answer: Answer, requests: BinaryIO, answers: BinaryIO) -> int:
     return n
 
 
-def application(answer: Answer, port: int) -> ASGIApp:
-    """Return the server of answers for uvicorn; it is called by the loopback's names and this port."""
-    import asyncio
-    from concurrent.futures import ThreadPoolExecutor
-
+def application(replies: Callable[[bytes], dict[str, Any]], port: int, workers: int = 1) -> ASGIApp:
+    """Return the server of answers for uvicorn; it is called by the loopback's names and this port.
+    ``replies`` returns what :func:`reply` does; several ``workers`` import it."""
     from starlette.applications import Starlette
     from starlette.responses import JSONResponse
     from starlette.routing import Route
 
-    one_by_one = ThreadPoolExecutor(1)
+    from thermogrip.datasets.parallel import Replaced
+
+    pool = Replaced(workers)
     hosts = {f"{name}:{port}" for name in (HOST, "localhost")}
 
     async def ask(request: Request) -> Response:
@@ -116,8 +117,10 @@ def application(answer: Answer, port: int) -> ASGIApp:
             body += piece
             if len(body) > MOST_BYTES:
                 return JSONResponse(_too_long(), 413, {"connection": "close"})
-        loop = asyncio.get_running_loop()
-        found = await loop.run_in_executor(one_by_one, reply, answer, bytes(body))
+        try:
+            found = await pool.call(replies, bytes(body))
+        except UserError as error:
+            return JSONResponse({"error": str(error)}, 503)
         return JSONResponse(found, 400 if "error" in found else 200)
 
     return Starlette(routes=[Route("/", ask, methods=["POST"])])
@@ -131,11 +134,14 @@ def listen(port: int) -> socket.socket:
         raise UserError(f"port {port} cannot be used ({error.strerror})", hint="choose another") from error
 
 
-def server(answer: Answer, listening: socket.socket) -> Server:
-    """Return what answers over HTTP once its ``run(sockets=[listening])`` is called."""
+def server(
+    replies: Callable[[bytes], dict[str, Any]], listening: socket.socket, workers: int = 1
+) -> Server:  # fmt: skip
+    """Return what answers over HTTP once its ``run(sockets=[listening])`` is called, as
+    :func:`application`."""
     import uvicorn
 
-    app = application(answer, listening.getsockname()[1])
+    app = application(replies, listening.getsockname()[1], workers)
     config = uvicorn.Config(app, log_level="warning", access_log=False, lifespan="off")
     return uvicorn.Server(config)
 

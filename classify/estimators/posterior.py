@@ -74,6 +74,7 @@ GRIPPERS = ("auto", "same", "uncertain", "another")
 _OTHER_GRIPPER, _OTHER_BLOCKS = 0.02, 0.2  # prior probabilities, the latter given the training's gripper
 _SURE = 0.99  # of the training's gripper and blocks, from which on no free effusivity is asked against others
 _ASKED = 5  # grasps of a record about which another gripper is asked first
+_HARDLY = 0.001  # of the odds of another gripper, below which no more grasps are asked
 _NEEDED = 0.05  # of the odds of another gripper, below which its free effusivity is not asked for
 _LIKELY = 0.9  # that a grasp is of another gripper or block, from which on its row says so
 
@@ -260,11 +261,8 @@ class PosteriorClassifier(GraspClassifier):
     def _decided(self, data: Touches, names: Sequence[str], unknown: bool = False) -> _Decided:
         """Return what single touches of one record decide; the odds where a free effusivity is asked for."""
         levels, u = self._levels(), np.log(self.prior_unknown)
-        some = np.unique(np.linspace(0, data.level.size - 1, _ASKED).astype(int))
-        if len(levels) > 1 and some.size < data.level.size:  # another gripper takes 20 times as long to ask
-            each = _of_levels(levels, data.take(some), names)
-            if _share(levels, each)[-1] < 1 - _SURE:
-                levels = [level for level in levels if level.device is self.device_]
+        if levels[-1].device is not self.device_ and _unlikely(levels, data, names):
+            levels = levels[:-1]
         each, prior = _of_levels(levels, data, names), np.log([level.prior for level in levels])[:, None]
         known, free = logsumexp(each, axis=2) - np.log(len(names)), np.full(each.shape[:2], -np.inf)
         sure = _share(levels, each)[0] > _SURE
@@ -368,6 +366,19 @@ def _of_levels(levels: Sequence[_Level], data: Touches, names: Sequence[str]) ->
         found.append(mode.log_evidence.reshape(-1, len(names)))
         first = mode.u.reshape(*found[0].shape, -1) if first is None else first
     return np.stack(found)
+
+
+def _unlikely(levels: Sequence[_Level], data: Touches, names: Sequence[str]) -> bool:
+    """Return whether some grasps, one after another, leave nothing of the last level, which takes 20 times as
+    long to ask."""
+    if data.level.size <= _ASKED:
+        return False
+    found, share = list[Floats](), 1.0
+    for i in np.unique(np.linspace(0, data.level.size - 1, _ASKED).astype(int)):
+        if share > _HARDLY:
+            found.append(_of_levels(levels, data.take(np.array([i])), names))
+            share = float(_share(levels, np.concatenate(found, axis=1))[-1])
+    return share < 1 - _SURE
 
 
 def _share(levels: Sequence[_Level], each: Floats) -> Floats:

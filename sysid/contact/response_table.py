@@ -62,6 +62,7 @@ class ResponseTable:
         shape = np.ceil((high - low) / _STEP).astype(int) + _NEAR
         self._index = np.full(shape, -1, dtype=np.int32)
         self._whole = np.zeros(shape, dtype=bool)  # where all nodes about a cell are there
+        self._kept = np.empty(int(np.prod(shape[1:])) * N_BASIS)  # sums along one ln e
         self._rows, self._n = np.empty((1024, N_BASIS), dtype=np.float32), 0
         rng, most = np.random.default_rng(0), np.maximum(low, low + _RARE)
         places = [rng.uniform(most, high, (_DRAWN, 4)), rng.uniform(low, high, (_DRAWN // 4, 4))]
@@ -172,8 +173,10 @@ class ResponseTable:
         cell = np.minimum(np.floor(place).astype(np.int64), np.array(self._index.shape) - _NEAR)
         self._fill(cell)
         out, late = np.empty((len(z), N_STEPPED, N_BASIS)), z[:, 1] >= self._high[1]
-        room, sums = np.empty((8, 6)), np.empty(7 * N_BASIS)
-        blend(self._index, self._rows, cell, place - cell, late, _WEIGHT, _STEP, wanted, room, sums, out)
+        order, lattice = np.argsort(z[:, 0], kind="stable"), self._index.reshape(len(self._index), -1)
+        kept_of, law = np.zeros(lattice.shape[1], dtype=np.int32), (_WEIGHT, _STEP, wanted, order)
+        where = lattice, self._index.shape, self._rows, cell, place - cell, late
+        blend(*where, *law, self._kept, kept_of, np.empty((8, 6)), out)
         return out
 
     def _fill(self, cell: NDArray[np.int64]) -> None:

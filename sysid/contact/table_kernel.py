@@ -11,74 +11,86 @@ from thermogrip.datasets.compiled import numba
 from thermogrip.sysid.contact.time_stepping import COMPILED
 
 N_BASIS = 16  # curves whose combinations are all responses
-_1, _2, _3, _4, _5, _6 = (k * N_BASIS for k in range(1, 7))
+_1, _2, _3 = (k * N_BASIS for k in range(1, 4))
 
 
 @numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
 def blend(
-    index: NDArray[np.int32], rows: NDArray[np.float32], cell: NDArray[np.int64], share: Array, late: Mask,
-    weight: Array, step: Array, wanted: Mask, room: Array, sums: Array, out: Array,
+    index: NDArray[np.int32], shape: tuple[int, ...], rows: NDArray[np.float32], cell: NDArray[np.int64],
+    share: Array, late: Mask, weight: Array, step: Array, wanted: Mask, order: NDArray[np.int64], kept: Array,
+    kept_of: NDArray[np.int32], room: Array, out: Array,
 ) -> None:  # fmt: skip
     """Fill ``out`` (n, 5, N_BASIS): coefficients of the value, and of its derivatives by ln h, ln tau_b, ln e
     at the same C/e, and ln C/e, at a ``share`` (n, 4) of the way through each ``cell``.
 
-    One direction after the other, ln e first: a free effusivity needs no derivative by it.  ``weight`` (4, 6,
-    6) are the nodes' as polynomials (direction, order, node); a ``late`` place lies on nodes of ln C/e, which
-    nothing depends on there."""
-    w, s = room[:4], room[4:]
-    for p in range(cell.shape[0]):
+    ``index`` (n_e, -1) are the rows of the nodes of a lattice of that ``shape``.  ln e goes first: a free
+    effusivity needs no derivative by it, and sums along it are ``kept`` (-1,) for the next places at the same
+    ln e, neighbours in ``order`` (n,); ``kept_of`` are zeros.  ``weight`` (4, 6, 6) are the nodes' as
+    polynomials (direction, order, node); a ``late`` place lies on nodes of ln C/e, which nothing depends on
+    there."""
+    w, s, (_, _, n_h, n_b), group, last = room[:4], room[4:], shape, 0, -1
+    for i in range(cell.shape[0]):
+        p = order[i]
         for d in range(4):
             x = share[p, d]
-            for i in range(6):
+            for k in range(6):
                 value = slope = 0.0
                 for o in range(5, -1, -1):
                     slope = slope * x + value
-                    value = value * x + weight[d, o, i]
-                w[d, i], s[d, i] = value, slope / step[d]
+                    value = value * x + weight[d, o, k]
+                w[d, k], s[d, k] = value, slope / step[d]
+        moved, by_e = wanted[p, 1] or wanted[p, 2], wanted[p, 3]
+        by_slab = (by_e or wanted[p, 4]) and not late[p]
+        if last < 0 or cell[p, 0] != cell[last, 0] or share[p, 0] != share[last, 0]:
+            group += 1
+        last = p
+        at_e, corner = cell[p, 0], (cell[p, 1] * n_h + cell[p, 2]) * n_b + cell[p, 3]
         e0, e1, e2, e3, e4, e5 = w[0, 0], w[0, 1], w[0, 2], w[0, 3], w[0, 4], w[0, 5]
         h0, h1, h2, h3, h4, h5 = s[0, 0], s[0, 1], s[0, 2], s[0, 3], s[0, 4], s[0, 5]
-        moved, by_e = wanted[p, 1] or wanted[p, 2], wanted[p, 3]
-        by_slab = (wanted[p, 3] or wanted[p, 4]) and not late[p]
-        own = index[cell[p, 0] :, cell[p, 1] :, cell[p, 2] :, cell[p, 3] :]
         out[p] = 0.0
         for j in range(6):
-            x, y = w[1, j], s[1, j]
-            if x == 0.0 and not by_slab:
+            if w[1, j] == 0.0 and not by_slab:
                 continue
-            sums[:] = 0.0
             for k in range(6):
-                u, v = w[2, k], s[2, k]
-                sums[_4:] = 0.0
                 for m in range(4):
-                    t, z = w[3, m], s[3, m]
-                    a, b, c = own[0, j, k, m], own[1, j, k, m], own[2, j, k, m]
-                    d, f, g = own[3, j, k, m], own[4, j, k, m], own[5, j, k, m]
+                    n = corner + (j * n_h + k) * n_b + m
+                    if kept_of[n] == group and not by_e:
+                        continue
+                    kept_of[n] = group
+                    a, b, c = index[at_e, n], index[at_e + 1, n], index[at_e + 2, n]
+                    d, f, g = index[at_e + 3, n], index[at_e + 4, n], index[at_e + 5, n]
                     for q in range(N_BASIS):
                         at = e0 * rows[a, q] + e1 * rows[b, q] + e2 * rows[c, q]
                         at += e3 * rows[d, q] + e4 * rows[f, q] + e5 * rows[g, q]
-                        sums[_4 + q] += t * at
-                        sums[_5 + q] += z * at
+                        kept[n * N_BASIS + q] = at
                     if by_e:
+                        x = w[1, j] * w[2, k] * w[3, m]
                         for q in range(N_BASIS):
                             at = h0 * rows[a, q] + h1 * rows[b, q] + h2 * rows[c, q]
                             at += h3 * rows[d, q] + h4 * rows[f, q] + h5 * rows[g, q]
-                            sums[_6 + q] += t * at
-                for q in range(N_BASIS):
-                    sums[q] += u * sums[_4 + q]
-                    sums[_1 + q] += v * sums[_4 + q]
-                    sums[_2 + q] += u * sums[_5 + q]
-                    sums[_3 + q] += u * sums[_6 + q]
-            for q in range(N_BASIS):
-                out[p, 0, q] += x * sums[q]
-                out[p, 1, q] += x * sums[_1 + q]
-                out[p, 2, q] += x * sums[_2 + q]
-                out[p, 3, q] += x * sums[_3 + q]
-                out[p, 4, q] += y * sums[q]
-        if late[p]:
-            out[p, 4] = 0.0
-        if not moved:
-            out[p, 1:3] = 0.0
+                            out[p, 3, q] += x * at
+        t0, t1, t2, t3 = w[3, 0], w[3, 1], w[3, 2], w[3, 3]
+        z0, z1, z2, z3 = s[3, 0], s[3, 1], s[3, 2], s[3, 3]
         for q in range(N_BASIS):
+            value = by_h = by_b = by_c = 0.0
+            for j in range(6):
+                x, y = w[1, j], s[1, j]
+                if x == 0.0 and not by_slab:
+                    continue
+                for k in range(6):
+                    n = (corner + (j * n_h + k) * n_b) * N_BASIS + q
+                    k0, k1, k2, k3 = kept[n], kept[n + _1], kept[n + _2], kept[n + _3]
+                    at = t0 * k0 + t1 * k1 + t2 * k2 + t3 * k3
+                    value += x * w[2, k] * at
+                    if moved or by_slab:
+                        by_h += x * s[2, k] * at
+                        by_c += y * w[2, k] * at
+                        by_b += x * w[2, k] * (z0 * k0 + z1 * k1 + z2 * k2 + z3 * k3)
+            out[p, 0, q] = value
+            if moved:
+                out[p, 1, q], out[p, 2, q] = by_h, by_b
+            if by_slab:
+                out[p, 4, q] = by_c
             out[p, 3, q] -= out[p, 4, q]  # by ln e at the same C
 
 

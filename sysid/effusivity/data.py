@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -312,6 +312,52 @@ def _sum(data: Touches, white: Array, slow: Array, misfit: Array) -> Array:
 def _inverse(chol: NDArray[np.floating[Any]]) -> Array:
     """Return the inverses of lower triangular matrices (n, n_bin, n_bin)."""
     return np.stack([dtrtri(c, lower=1)[0] for c in chol])
+
+
+class Whitener(NamedTuple):
+    """W of ``n`` touches: that of ``kinds`` (n_kind, n_bin, n_bin) that is each one's ``kind`` (n,), its rows
+    times ``scale`` (n, n_bin)."""
+
+    kinds: Array
+    kind: NDArray[np.int64]
+    scale: Array
+
+
+#: What :func:`whiten` or :func:`whiteners` returns.
+Whitened: TypeAlias = tuple[Any, Array]
+
+
+def whiteners(data: Touches, noise: Noise) -> tuple[Whitener, Array]:
+    r"""Return :func:`whiten`, with one matrix for all touches with the same samples, where they are many.
+
+    Only their excursions A differ: with C_0 the rest of their noise, :math:`V C_0 V' = 1` and :math:`V G V'
+    = diag(d)`, :math:`C = C_0 + A^2 G` has :math:`W = (1 + A^2 d)^{-1/2} V`.
+    """
+    axes = np.concatenate([data.t, data.count], axis=1)
+    _, first, kind = np.unique(axes, axis=0, return_index=True, return_inverse=True)
+    kind = kind.ravel()
+    kinds, scale = list[Array](), np.ones(data.t.shape)
+    own, log_det = np.empty(kind.size, dtype=np.int64), np.empty(kind.size)
+    alone = np.bincount(kind) < ALIKE
+    for k, i in enumerate(first[~alone]):
+        rows, there = np.flatnonzero(kind == kind[i]), data.count[i] > 0
+        one = replace(data.take(np.array([i])), excursion=np.ones(1))
+        white, slow, misfit = _parts(one, noise)
+        chol = np.linalg.cholesky(_sum(one, white, slow, np.zeros(misfit.shape)))
+        root = _inverse(chol)[0]
+        d, turned = np.linalg.eigh(root @ misfit[0] @ root.T)
+        wider = 1.0 + np.square(data.excursion[rows, None]) * np.maximum(d, 0.0)
+        kinds.append((turned.T @ root) * there)
+        scale[rows] = 1.0 / np.sqrt(wider)
+        known = 2.0 * np.log(np.diagonal(chol[0])).sum() + there.sum() * np.log(2 * np.pi)
+        log_det[rows] = known + np.log(wider).sum(axis=1)
+        own[rows] = k
+    rest = np.flatnonzero(alone[kind])
+    if rest.size:
+        w, log_det[rest] = whiten(data.take(rest), noise)
+        own[rest] = len(kinds) + np.arange(rest.size)
+        kinds += list(w)
+    return Whitener(np.stack(kinds), own, scale), log_det
 
 
 def whiten(data: Touches, noise: Noise) -> tuple[Array, Array]:

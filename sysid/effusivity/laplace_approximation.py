@@ -53,7 +53,7 @@ Its solution in dv gives the next guess of theta, t0 + P a with
 
 until the joint density of (v, theta) grows no more.  That is Gauss-Newton for both together, and the evidence
 at its end is Laplace's for both.  Every hypothesis finds a gripper of its own, and starts from that of the
-likeliest one, through a, which unlike theta does not depend on the block.  One that is 50 nats behind is left
+likeliest one, through a, which unlike theta does not depend on the block.  One that is 20 nats behind is left
 there, unsettled.
 
 Where the block is not of the calibration its effusivity is on the scale that the calibration's blocks
@@ -84,7 +84,7 @@ from thermogrip.sysid.contact.simulation import (
     stack_modes,
     time_nodes,
 )
-from thermogrip.sysid.effusivity.data import Touches, noise_covariance, whiten
+from thermogrip.sysid.effusivity.data import Touches, Whitened, noise_covariance, whiten, whiteners
 from thermogrip.sysid.effusivity.gripper_model import (
     INSULATOR,
     LEVEL_SD,
@@ -157,13 +157,14 @@ def pairs_asked(
     from thermogrip.sysid.effusivity.mode_kernel import Asked
 
     shape = (row.size, 2, data.y.shape[1])
-    nothing = np.zeros(shape) if beyond is None else np.ascontiguousarray(np.broadcast_to(beyond, shape))
+    # a copy: for arrays that must not be written to the kernels are compiled anew
+    nothing = np.zeros(shape) if beyond is None else np.array(np.broadcast_to(beyond, shape))
     table = response_table(stack, data.tabled) if tabled and data.tabled else None
     return Asked(nodes, gripper_modes(stack), data, row, nothing, table)
 
 
 def find_modes(
-    stack: Stack, data: Touches, row: NDArray[np.int64], whitener: tuple[Array, Array], prior: Prior, *,
+    stack: Stack, data: Touches, row: NDArray[np.int64], whitener: Whitened, prior: Prior, *,
     start: Array | None = None, max_steps: int = 20, beyond: Array | None = None, rivals: bool = False,
 ) -> Mode:  # fmt: skip
     """Return mode, covariance and log evidence of every pair by damped Gauss-Newton.
@@ -201,7 +202,7 @@ def peak_ratio(dof: Array, vary: Mask) -> Array:
 _AT = {name: i for i, name in enumerate((*SHARED_NAMES, "ln_h", "ln_e"))}
 _ROUNDS = 8
 _STILL = 0.5  # of -2 ln density: a smaller predicted decrease ends the search
-_HOPELESS = 50.0  # nats behind the likeliest
+_HOPELESS = 20.0  # nats behind the likeliest: a first round is within 5 of the last
 _DIFFERENCE = 1e-6
 _LAYERS = [_AT[f"ln_{name}"] for name in LAYER_NAMES]
 _CONTACT = ("lag", "first", "creep", "settle", "g_far")
@@ -549,7 +550,7 @@ def prior_of(gripper: GripperModel, data: Touches, hypotheses: Hypotheses) -> Pr
 
 def fit_pairs(
     gripper: GripperModel, data: Touches, row: NDArray[np.int64], hypotheses: Hypotheses, *,
-    start: Array | None = None, max_steps: int = 20, noise: tuple[Array, Array] | None = None,
+    start: Array | None = None, max_steps: int = 20, noise: Whitened | None = None,
     prior: Prior | None = None, rivals: bool = False,
 ) -> Mode:  # fmt: skip
     """Return the modes of pairs, hypothesis i against touch ``row[i]``, integrated over an uncertain
@@ -596,12 +597,18 @@ def second_modes(
     return _own_modes(second, data.second, row, others, own, begin, 20, None, False), own
 
 
+def whitened(gripper: GripperModel, data: Touches) -> Whitened:
+    """Return what whitens the first sensor's noise as :func:`fit_pairs` takes it."""
+    # of an uncertain gripper each pair has a matrix of its own
+    return (whiteners if data.tabled and not gripper.uncertain else whiten)(data, gripper.noise)
+
+
 def _own_modes(
     gripper: GripperModel, data: Touches, row: NDArray[np.int64], hypotheses: Hypotheses, prior: Prior,
-    start: Array | None, max_steps: int, noise: tuple[Array, Array] | None, rivals: bool,
+    start: Array | None, max_steps: int, noise: Whitened | None, rivals: bool,
 ) -> Mode:  # fmt: skip
     """Return the modes of pairs by the first sensor alone."""
-    noise = whiten(data, gripper.noise) if noise is None else noise
+    noise = whitened(gripper, data) if noise is None else noise
     if gripper.uncertain:
         block = hypotheses.block.astype(np.int64)
         return uncertain_gripper_modes(

@@ -24,9 +24,10 @@ _LONGEST = 1.5
 # effusivity that ended within 25 nats of the best, none was farther than 1734 after one, 356 after two and
 # 378 after three
 _HOPELESS = {1: 6000.0, 2: 2000.0, 3: 1000.0, 4: 1000.0, 5: 1000.0} | dict.fromkeys(range(6, 99), 120.0)
-# and after any number where the object's temperature is stated: of the points of twelve example conditions
-# that ended within 25 nats none was more than 109 behind
-_HOPELESS_STATED = 1000.0
+# and where the object's temperature is stated: of the points and candidates of the example conditions that
+# ended within 25 nats none was farther than 147 behind before a step, 54 after any number; what is left
+# at less than 300 is a start for finer points beside, which then end elsewhere
+_HOPELESS_STATED = {0: 500.0} | dict.fromkeys(range(1, 99), 300.0)
 _LEAST_DECREASE = 0.01  # of -2 ln posterior: smaller predicted decreases end the search
 _H, _BUILD_UP, _ONSET, _LEVEL, _T, _E, _C = range(7)
 _LEFT = 7  # the column of what is left, after those of the derivatives
@@ -252,57 +253,40 @@ def predicted(
                 slopes[p, m, at] = scale * own[c, m] + passed * extra
 
 
-@numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
-def normal_equations(
-    row: NDArray[np.int64], whitener: Array, columns: Array, scale: Array, white: Array, matrix: Array
-) -> None:
-    """Fill products (n, 8, 8) of the ``columns`` (n, n_bin, 8), scaled by ``scale`` (n, 8) and whitened by
-    the lower triangles ``whitener`` (n_row, n_bin, n_bin)."""
-    n_bin = columns.shape[1]
-    for p in range(row.size):
-        own, w = columns[p], whitener[row[p]]
-        s0, s1, s2, s3 = scale[p, 0], scale[p, 1], scale[p, 2], scale[p, 3]
-        s4, s5, s6, s7 = scale[p, 4], scale[p, 5], scale[p, 6], scale[p, 7]
-        for i in range(n_bin):
-            a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = 0.0
-            for k in range(i + 1):
-                x = w[i, k]
-                a0 += x * own[k, 0]
-                a1 += x * own[k, 1]
-                a2 += x * own[k, 2]
-                a3 += x * own[k, 3]
-                a4 += x * own[k, 4]
-                a5 += x * own[k, 5]
-                a6 += x * own[k, 6]
-                a7 += x * own[k, 7]
-            white[i, 0], white[i, 1], white[i, 2], white[i, 3] = a0 * s0, a1 * s1, a2 * s2, a3 * s3
-            white[i, 4], white[i, 5], white[i, 6], white[i, 7] = a4 * s4, a5 * s5, a6 * s6, a7 * s7
-        for a in range(8):
-            a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = 0.0
-            for i in range(n_bin):
-                x = white[i, a]
-                a0 += x * white[i, 0]
-                a1 += x * white[i, 1]
-                a2 += x * white[i, 2]
-                a3 += x * white[i, 3]
-                a4 += x * white[i, 4]
-                a5 += x * white[i, 5]
-                a6 += x * white[i, 6]
-                a7 += x * white[i, 7]
-            out = matrix[p, a]
-            out[0], out[1], out[2], out[3], out[4], out[5], out[6], out[7] = a0, a1, a2, a3, a4, a5, a6, a7
-
-
-def products(asked: Asked, whitener: Array, u: Array, sd: Array, *, alike: bool = False) -> Array:
+def products(
+    asked: Asked, whitener: Any, u: Array, sd: Array, *, alike: bool = False
+) -> Array:  # fmt: skip
     """Return J' J, and J' r and r' r in the last row and column, (n, 8, 8): J in units of ``sd`` (n, 7), r
     the readings less those that ``u`` predicts, both whitened."""
     y, columns = readings(asked, u, sd > 0.0, alike=alike)
     np.subtract(asked.data.y[asked.row], y, out=columns[:, :, _LEFT])
-    matrix = np.empty((len(u), _LEFT + 1, _LEFT + 1))
-    scale = np.ones((len(u), _LEFT + 1))
+    scale, matrix = np.ones((len(u), _LEFT + 1)), np.zeros((len(u), _LEFT + 1, _LEFT + 1))
     scale[:, :_LEFT] = sd
-    normal_equations(asked.row, whitener, columns, scale, np.empty(columns.shape[1:]), matrix)
+    used = np.flatnonzero((scale > 0.0).any(axis=0))
+    if used.size > _LEFT // 2:
+        matrix = squares(whitener, asked.row, columns)
+    else:
+        matrix[:, used[:, None], used] = squares(whitener, asked.row, columns[:, :, used])
+    matrix *= scale[:, :, None]
+    matrix *= scale[:, None, :]
     return matrix
+
+
+def squares(whitener: Any, row: NDArray[np.int64], columns: Array) -> Array:
+    """Return the products (n, m, m) of ``columns`` (n, n_bin, m) of touches ``row``, whitened by a
+    :class:`~thermogrip.sysid.effusivity.data.Whitener` or by a matrix a touch."""
+    alone = isinstance(whitener, np.ndarray)
+    kinds, kind = (whitener, row) if alone else (whitener.kinds, whitener.kind[row])
+    out = np.empty((row.size, columns.shape[2], columns.shape[2]))
+    for k in np.unique(kind):
+        at: Any = slice(None) if (kind == k).all() else kind == k
+        # one product of large matrices is quicker than many of few columns
+        own = columns[at].transpose(0, 2, 1)
+        white = np.matmul(own.reshape(-1, own.shape[2]), kinds[k].T).reshape(own.shape)
+        if not alone:
+            white *= whitener.scale[row[at], None, :]
+        out[at] = np.matmul(white, white.transpose(0, 2, 1))
+    return out
 
 
 class Penalty(NamedTuple):
@@ -331,7 +315,7 @@ def penalty(u: Array, mean: Array, sd: Array, dof: Array) -> Penalty:
 
 
 def modes(
-    asked: Asked, whitener: Array, law: Array, u: Array, max_steps: int, *, rivals: bool = False
+    asked: Asked, whitener: Any, law: Array, u: Array, max_steps: int, *, rivals: bool = False
 ) -> tuple[Array, Array, Array, Mask]:
     """Move ``u`` (n, 7) to the mode of each pair; return covariance (n, 7, 7), objective, misfit and where
     the search settled.
@@ -370,7 +354,7 @@ def modes(
             best.fill(np.inf)
             ahead[at] = cost[at] - np.where(near, 0.0, decrease)  # of those near it is taken off
             np.minimum.at(best, asked.row, ahead)
-            limit = np.where(stated, _HOPELESS_STATED, _HOPELESS.get(step, np.inf))
+            limit = np.where(stated, _HOPELESS_STATED[step], _HOPELESS.get(step, np.inf))
             left &= ahead[at] < (best + limit)[asked.row[at]]
         at, curved, rhs = at[left], curved[left], rhs[left]
         if not at.size:
@@ -387,7 +371,7 @@ def modes(
 
 
 def _products_of(
-    asked: Asked, at: NDArray[np.int64], whitener: Array, u: Array, sd: Array, *, alike: bool
+    asked: Asked, at: NDArray[np.int64], whitener: Any, u: Array, sd: Array, *, alike: bool
 ) -> Array:
     """Return :func:`products` of some pairs, so many at once that they stay in the processor's cache."""
     out = np.empty((at.size, _LEFT + 1, _LEFT + 1))
@@ -397,7 +381,7 @@ def _products_of(
     return out
 
 
-def marginals(asked: Asked, whitener: Array, u: Array, sd: Array) -> Array:
+def marginals(asked: Asked, whitener: Any, u: Array, sd: Array) -> Array:
     """Return ln p(y | u) up to a constant for points ``u`` (n, 7), integrated over level and T_obj, whose
     prior means are in ``u``; ``sd`` (m, n, 2) are their sds, each with a row of the answer (m, n)."""
     at, out = [_LEVEL, _T], np.empty((len(sd), len(u)))

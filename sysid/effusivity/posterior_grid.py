@@ -34,7 +34,7 @@ from scipy.special import gammaln, logsumexp, ndtr
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.materials import load_materials
-from thermogrip.sysid.effusivity.data import Touches, whiten
+from thermogrip.sysid.effusivity.data import Touches, Whitened
 from thermogrip.sysid.effusivity.gripper_model import GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import (
     BUILD_UP,
@@ -57,6 +57,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     second_modes,
     slip_of,
     temperatures_by_the_other,
+    whitened,
 )
 
 # On the gripper's scale.  Of solids at room temperature plastic foams have least (expanded polystyrene, 32),
@@ -76,7 +77,7 @@ _LOG_WEIGHT = 1.5 - np.log(6.0) - 0.5 * np.log(2 * np.pi) + np.log(_STEP)
 
 
 def slipped(
-    gripper: GripperModel, data: Touches, whitener: Array, beyond: Array | None, sd: Array, u: Array,
+    gripper: GripperModel, data: Touches, whitener: Any, beyond: Array | None, sd: Array, u: Array,
     row: NDArray[np.int64] | None = None,
 ) -> Array:  # fmt: skip
     """Return ln p(y | u) up to a constant for n points ``u`` (n, 7) of the grasps ``row`` (n,), by default
@@ -101,12 +102,10 @@ class MarginalPosterior:
 
     n = len(SAMPLED)
 
-    def __init__(
-        self, gripper: GripperModel, data: Touches, noise: tuple[Array, Array] | None = None
-    ) -> None:
+    def __init__(self, gripper: GripperModel, data: Touches, noise: Whitened | None = None) -> None:
         gripper.require_known("an integral over one grasp's nuisances")
         self.gripper, self.data = gripper, data
-        whitener, log_det = whiten(data, gripper.noise) if noise is None else noise
+        whitener, log_det = whitened(gripper, data) if noise is None else noise
         self.whitener, self.log_det = whitener, float(log_det[0])
         # of the prior only what depends on ln e is computed again
         self._prior = prior_of(gripper, data, free_hypotheses(gripper, [9.0]))
@@ -131,7 +130,7 @@ def _rows(prior: Prior, row: NDArray[np.int64]) -> Prior:
 
 
 def _log_posterior(
-    gripper: GripperModel, data: Touches, whitener: Array, common: Prior, points: Array,
+    gripper: GripperModel, data: Touches, whitener: Any, common: Prior, points: Array,
     row: NDArray[np.int64],
 ) -> Array:  # fmt: skip
     """Return the log posterior (n,), up to a constant, of points (n, 5) of the grasps ``row``, of whose
@@ -151,13 +150,13 @@ def _log_posterior(
 
 def log_integrals(
     gripper: GripperModel, data: Touches, x: Array, mode: Array, covariance: Array, *,
-    noise: tuple[Array, Array] | None = None, row: NDArray[np.int64] | None = None,
+    noise: Whitened | None = None, row: NDArray[np.int64] | None = None,
 ) -> Array:  # fmt: skip
     """Return ln p(y | ln e), every nuisance integrated, at effusivities ``x`` (n,) of the grasps ``row``
     (n,), by default the first."""
     gripper.require_known("an integral over one grasp's nuisances")
     row = np.zeros(x.size, dtype=np.int64) if row is None else row
-    noise = whiten(data, gripper.noise) if noise is None else noise
+    noise = whitened(gripper, data) if noise is None else noise
     common = prior_of(gripper, data, free_hypotheses(gripper, np.full(data.level.size, 9.0)))
     total = _integrals(gripper, data, x, mode, covariance, noise, row, _rows(common, row))
     # effusivities outside the prior's range are none
@@ -166,7 +165,7 @@ def log_integrals(
 
 def _integrals(
     gripper: GripperModel, data: Touches, x: Array, mode: Array, covariance: Array,
-    noise: tuple[Array, Array], row: NDArray[np.int64], common: Prior,
+    noise: Whitened, row: NDArray[np.int64], common: Prior,
 ) -> Array:  # fmt: skip
     """Return :func:`log_integrals` under priors ``common``, a row an effusivity, at any effusivity."""
     whitener, log_det = noise
@@ -220,7 +219,7 @@ class _Fitted(NamedTuple):
 
 def grid_posteriors(gripper: GripperModel, data: Touches) -> list[GridPosterior]:
     """Return the posteriors of ln e: log-uniform prior over :data:`LN_E_RANGE`, h_c unknown."""
-    noise = whiten(data, gripper.noise)
+    noise = whitened(gripper, data)
     found = _fitted(gripper, data, noise)
     value = found.value + _left_out(gripper, data, noise, found)
     if gripper.discrepancy is not None:  # its evidence counts little, so what objects are made of counts
@@ -231,20 +230,20 @@ def grid_posteriors(gripper: GripperModel, data: Touches) -> list[GridPosterior]
 
 def free_evidence(gripper: GripperModel, data: Touches) -> Array:
     """Return the log evidence of a free effusivity for each touch, (n,), as :func:`grid_posteriors` do."""
-    found = _fitted(gripper, data, whiten(data, gripper.noise))
+    found = _fitted(gripper, data, whitened(gripper, data))
     return np.asarray(log_total(found.x, found.value) - np.log(LN_E_RANGE[1] - LN_E_RANGE[0]))
 
 
 def rough_evidence(gripper: GripperModel, data: Touches) -> Array:
     """Return :func:`free_evidence` by few points, of a gripper under which densities are wide: within 0.15
     of it."""
-    noise = whiten(data, gripper.noise)
+    noise = whitened(gripper, data)
     grid = np.tile(np.linspace(*LN_E_RANGE, _ROUGH), (data.level.size, 1))
     found = _evaluate(gripper, data, noise, grid, None)
     return np.asarray(log_total(found.x, found.value) - np.log(LN_E_RANGE[1] - LN_E_RANGE[0]))
 
 
-def _fitted(gripper: GripperModel, data: Touches, noise: tuple[Array, Array]) -> _Fitted:
+def _fitted(gripper: GripperModel, data: Touches, noise: Whitened) -> _Fitted:
     """Return the fits at the coarse points and at those of the refinements, along which ln e rises."""
     coarse = np.tile(np.linspace(*LN_E_RANGE, N_COARSE), (data.level.size, 1))
     found = _evaluate(gripper, data, noise, coarse, None)
@@ -268,10 +267,8 @@ def log_listed(ln_e: Array) -> Array:
     return np.asarray(np.log(0.5 + 0.5 * width * near))
 
 
-def _left_out(gripper: GripperModel, data: Touches, noise: tuple[Array, Array], found: _Fitted) -> Array:
+def _left_out(gripper: GripperModel, data: Touches, noise: Whitened, found: _Fitted) -> Array:
     """Return what Laplace's method left out of the points (n, m), less its mean over each posterior."""
-    from scipy.interpolate import PchipInterpolator
-
     x, value, u, covariance, settled = found
     out = np.zeros(x.shape)
     # for an uncertain gripper Laplace's method integrates over its parameters too, with a discrepancy the
@@ -285,6 +282,7 @@ def _left_out(gripper: GripperModel, data: Touches, noise: tuple[Array, Array], 
         wanted = np.linspace(x[i, at[0]], x[i, at[-1]], _KNOTS)
         knots[i] = at[np.unique(np.abs(x[i, at] - wanted[:, None]).argmin(axis=1))]
     every = list(knots.items())
+    inner = np.zeros(x.shape)
     for some in (every[k : k + _TOGETHER] for k in range(0, len(every), _TOGETHER)):
         row, at = (
             np.repeat([i for i, _ in some], [k.size for _, k in some]),
@@ -295,16 +293,22 @@ def _left_out(gripper: GripperModel, data: Touches, noise: tuple[Array, Array], 
             whole = log_integrals_of_two(gripper, data, *there[:2], noise=noise, row=row)
         else:
             whole = log_integrals(gripper, data, *there, noise=noise, row=row)
-        missing = whole - value[row, at]
-        for i, k in some:
-            everywhere = PchipInterpolator(x[i, k], missing[row == i])(np.clip(x[i], x[i, k[0]], x[i, k[-1]]))
-            weight = np.exp(value[i] - value[i].max()) * np.gradient(x[i])
-            out[i] = everywhere - (weight * everywhere).sum() / weight.sum()
+        inner[row, at] = whole - value[row, at]
+    for n_knot in {k.size for _, k in every}:
+        which = np.array([i for i, k in every if k.size == n_knot])
+        at = np.stack([knots[i] for i in which.tolist()])
+        known = np.take_along_axis(x[which], at, axis=1), np.take_along_axis(inner[which], at, axis=1)
+        everywhere = monotone(*known, x[which])
+        weight = np.exp(value[which] - value[which].max(axis=1, keepdims=True)) * np.gradient(
+            x[which], axis=1
+        )
+        mean = (weight * everywhere).sum(axis=1) / weight.sum(axis=1)
+        out[which] = everywhere - mean[:, None]
     return out
 
 
 def log_integrals_of_two(
-    gripper: GripperModel, data: Touches, x: Array, start: Array, *, noise: tuple[Array, Array],
+    gripper: GripperModel, data: Touches, x: Array, start: Array, *, noise: Whitened,
     row: NDArray[np.int64],
 ) -> Array:  # fmt: skip
     """Return :func:`log_integrals` of two sensors that touched one object, near the modes ``start`` (n, 7).
@@ -319,7 +323,7 @@ def log_integrals_of_two(
     first = fit_pairs(alone, data, row, hypotheses, start=start, noise=noise, prior=prior)
     other, own = second_modes(gripper, data, row, hypotheses, first)
     ln_e = second.found_effusivity(x - gripper.effusivity_scale(x)[0])
-    white = whiten(data.second, second.noise)
+    white = whitened(second, data.second)
 
     def total(law: Prior) -> Array:
         mine = at_temperature(first, prior, law.mean[:, T_OBJECT], law.sd[:, T_OBJECT] ** 2)
@@ -349,6 +353,31 @@ def _with(values: Array, t_object: Array) -> Array:
     out = values.copy()
     out[:, T_OBJECT] = t_object
     return out
+
+
+def monotone(x: Array, y: Array, at: Array) -> Array:
+    """Return curves through ``y`` (n, m) at rising ``x`` (n, m), at points ``at`` (n, k), as at their ends
+    beyond them: cubics that turn nowhere but at points, by the slopes of Fritsch and Butland."""
+    h = np.diff(x)
+    secant, last = np.diff(y) / h, x.shape[1] - 1
+    slope = np.zeros(x.shape)
+    early, later = secant[:, :-1], secant[:, 1:]
+    w1, w2 = h[:, :-1] + 2 * h[:, 1:], 2 * h[:, :-1] + h[:, 1:]
+    turn = (early * later <= 0.0) | (early == 0.0)
+    safe = np.where(turn, 1.0, early), np.where(turn, 1.0, later)
+    slope[:, 1:-1] = np.where(turn, 0.0, (w1 + w2) / (w1 / safe[0] + w2 / safe[1]))
+    for end, near, beyond in ((0, 0, 1), (last, last - 1, last - 2)):
+        h0, h1, s0, s1 = h[:, near], h[:, beyond], secant[:, near], secant[:, beyond]
+        own = ((2 * h0 + h1) * s0 - h0 * s1) / (h0 + h1)
+        own = np.where((s0 * s1 < 0.0) & (np.abs(own) > 3 * np.abs(s0)), 3 * s0, own)
+        slope[:, end] = np.where(own * s0 <= 0.0, 0.0, own)
+    inside = np.clip(at, x[:, :1], x[:, -1:])
+    cell = np.clip((x[:, None, :] <= inside[:, :, None]).sum(axis=2) - 1, 0, last - 1)
+    x0, y0, d0, width = (np.take_along_axis(part, cell, axis=1) for part in (x, y, slope, h))
+    y1, d1 = (np.take_along_axis(part, cell + 1, axis=1) for part in (y, slope))
+    s = (inside - x0) / width
+    bent = (1 - s) * d0 * width - s * d1 * width + (1 - 2 * s) * (y0 - y1)
+    return np.asarray(y0 + s * (y1 - y0) + s * (1 - s) * bent)
 
 
 def mixed(parts: Sequence[GridPosterior], log_weight: Array) -> GridPosterior:
@@ -403,7 +432,7 @@ def _quantiles(weight: Array, mean: Array, sd: Array, wanted: Array) -> Array:
 
 
 def _evaluate(
-    gripper: GripperModel, data: Touches, noise: tuple[Array, Array], grid: Array, start: Array | None
+    gripper: GripperModel, data: Touches, noise: Whitened, grid: Array, start: Array | None
 ) -> _Fitted:
     """Return the fits at the points of a grid (n, m)."""
     n, m = grid.shape

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 import os
 import re
@@ -11,13 +12,14 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from types import SimpleNamespace
 
 import pytest
 
 from thermogrip import __version__
 from thermogrip.datasets import parallel
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.parallel import in_order, kept_processes, run_parallel, sub_progress
+from thermogrip.datasets.parallel import Replaced, in_order, kept_processes, run_parallel, sub_progress
 
 OWN = ["__import__('os').getpid()"] * 4  # a process may not find this module, the builtin eval it does
 
@@ -246,3 +248,37 @@ def test_results_come_in_order_as_soon_as_they_can(pools):
 
     assert list(in_order(work, range(9), 3)) == list(range(9))
     assert list(in_order(abs, [-2, -1])) == [2, 1]
+
+
+@pytest.mark.skipif(os.name == "nt" or (os.cpu_count() or 1) < 2, reason="needs POSIX and two processors")
+def test_calls_as_they_come_are_answered_by_processes_that_are_replaced() -> None:
+    async def asked() -> None:
+        pool = Replaced(2)
+        four = {await pool.call(eval, OWN[0]) for _ in range(4)}
+        assert os.getpid() not in four
+        os.kill(next(iter(four)), signal.SIGKILL)
+        found = await asyncio.gather(*(pool.call(math.factorial, n) for n in range(6)))
+        assert found == [math.factorial(n) for n in range(6)]
+        with pytest.raises(UserError, match="killed again and again"):
+            await pool.call(signal.raise_signal, signal.SIGKILL)
+        with pytest.raises(ValueError, match="factorial"):
+            await pool.call(math.factorial, -1)
+
+    asyncio.run(asked())
+
+
+def test_one_worker_is_a_thread_here() -> None:
+    assert asyncio.run(Replaced(1).call(eval, OWN[0])) == os.getpid()
+
+
+def test_on_a_worker_freed_memory_is_kept(monkeypatch) -> None:
+    said: list[tuple[int, int]] = []
+    monkeypatch.setattr(parallel.sys, "platform", "linux")
+    library = SimpleNamespace(mallopt=lambda *pair: said.append(pair))
+    monkeypatch.setattr(parallel.ctypes, "CDLL", lambda _: library)
+    parallel._keep_memory.cache_clear()
+    assert [parallel._with_memory_kept(math.factorial, n) for n in (3, 4)] == [6, 24]
+    assert said == [(-1, 1 << 28), (-3, 1 << 25)]  # once a process
+    monkeypatch.setattr(parallel.ctypes, "CDLL", lambda _: SimpleNamespace())  # a C library without it
+    parallel._keep_memory.cache_clear()
+    assert parallel._with_memory_kept(math.factorial, 3) == 6

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, astuple, dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
@@ -342,7 +342,8 @@ def classify(
 
     A run that was ended goes on where it stopped when it is given again. Workers share out files, which
     they read themselves. --serve takes one object a line,
-    {"time_s": [...], "t_surface_degC": [...], "t_object_nominal_degC": 28}, and writes its answer.
+    {"time_s": [...], "t_surface_degC": [...], "t_object_nominal_degC": 28}, and writes its answer; with
+    --port and --workers so many are answered at once.
     """
     stated = _range(between)
     if serve == bool(paths) or serve == (out is not None) or (port is not None and not serve):
@@ -375,7 +376,7 @@ def classify(
         others=tuple(str(anywhere(path)) for path in others or ()),
     )  # fmt: skip
     if serve:
-        return _serve(console, ask.answerer(), port)
+        return _serve(console, ask, port, pool)
     assert out is not None
     given = sources(paths or [])
     asked = [*astuple(ask), stamps([model_dir, *ask.known, *ask.others])]
@@ -416,10 +417,14 @@ def classify(
     return 0
 
 
-def _serve(console: Console, answer: Callable[[Grasps], dict[str, Any]], port: int | None) -> int:
+def _serve(console: Console, ask: _Question, port: int | None, workers: int | str) -> int:
     """Answer single grasps: from stdin, or over HTTP at a port."""
-    from thermogrip.classify.decisions.serve import HOST, listen, serve_lines, server
+    from thermogrip.classify.decisions.serve import HOST, listen, reply, serve_lines, server
 
+    if isinstance(workers, str) or (workers > 1 and port is None):
+        problem = "--serve --workers is for HTTP on this computer"
+        raise UserError(problem, hint="give --port, and no --cluster")
+    answer = ask.answerer()
     if port is None:
         serve_lines(answer, sys.stdin.buffer, sys.stdout.buffer)
         return 0
@@ -429,7 +434,8 @@ def _serve(console: Console, answer: Callable[[Grasps], dict[str, Any]], port: i
         )
     listening = listen(port)
     sys.stderr.write(f"answers at http://{HOST}:{listening.getsockname()[1]}/\n")
-    server(answer, listening).run(sockets=[listening])
+    replies = partial(reply, answer) if workers == 1 else ask.reply
+    server(replies, listening, workers).run(sockets=[listening])
     return 0
 
 
@@ -457,6 +463,12 @@ class _Question:
         said = _Said()
         cli.warn_of_contacts(said, [part])
         return self.answerer()(part) | {"warnings": said.words}
+
+    def reply(self, request: bytes) -> dict[str, Any]:
+        """Return the answer to one request of a server."""
+        from thermogrip.classify.decisions.serve import reply
+
+        return reply(self.answerer(), request)
 
     def answerer(self) -> Callable[[Grasps], dict[str, Any]]:
         """Return what answers a record, once a process while the model's files are the same."""

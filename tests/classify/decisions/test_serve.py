@@ -9,6 +9,7 @@ import socket
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from threading import Thread
 from typing import Any
 
@@ -90,7 +91,7 @@ def test_lines_are_answered_in_order_and_one_too_long_is_skipped_whole() -> None
 def port() -> Iterator[int]:
     """Return the port of a server that runs during the test."""
     listening = listen(0)
-    found = server(answer, listening)
+    found = server(partial(reply, answer), listening)
     thread = Thread(target=found.run, kwargs={"sockets": [listening]})
     thread.start()
     while not found.started:

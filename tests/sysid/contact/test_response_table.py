@@ -9,6 +9,8 @@ from thermogrip.sysid.contact.simulation import SOFT_FINGER, gripper_modes, time
 from thermogrip.sysid.contact.time_stepping import contacts
 from thermogrip.sysid.effusivity import data as touch_data
 from thermogrip.sysid.effusivity import load_default_gripper
+from thermogrip.sysid.effusivity.laplace_approximation import nodes_for, pairs_asked
+from thermogrip.sysid.effusivity.mode_kernel import readings
 from thermogrip.sysid.effusivity.posterior import effusivity_posterior
 
 END = 12.0
@@ -76,6 +78,51 @@ def test_a_long_block_has_no_far_face(table):
     rise, _ = table.curves(contact, np.ones((2, 5), dtype=bool))
     np.testing.assert_array_equal(rise[0], rise[1])
     assert not rise[:, 4].any()
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_bin_means_of_the_table_are_those_of_stepped_responses(monkeypatch, lost):
+    """Samples at the same times as others', or, of a grasp with a sample lost, at times of their own."""
+    monkeypatch.setattr(touch_data, "MANY", 25)
+    gripper, record = load_default_gripper(), load_example_grasps()["exp1A_obj43_grip23"]
+    if lost:
+        record = record.copy(deep=True)
+        record["t_surface"].values[:2, 40] = np.nan
+    data = touch_data.with_tables(touch_data.touches(record))
+    assert data.common is not None
+    assert data.common[0] == (not lost)
+    assert data.common[2]
+    rng, row = np.random.default_rng(6), np.repeat(np.arange(4), 15)
+    u = np.empty((60, 7))
+    u[:, [5, 6, 0, 1]] = np.log(places(60, 7))
+    u[:, 1] += np.log(gripper.stack.build_up / SOFT_FINGER.build_up)
+    u[:, 2], u[:, 3], u[:, 4] = rng.uniform(-1.6, 0.9, 60), 23.0, 43.0
+    every, found = np.ones((60, 7), dtype=bool), []
+    for tabled in (True, False):
+        asked = pairs_asked(gripper.stack, nodes_for(data), data, row, None, tabled=tabled)
+        found.append(readings(asked, u, every))
+    (y, by_u), (stepped_y, by_stepped_u) = found
+    assert np.abs(y - stepped_y).max() < 20.0 * 3e-5
+    n = slice(0, 7)  # what a caller has in the last column is nothing yet
+    assert np.abs(by_u[:, :, n] - by_stepped_u[:, :, n]).max() < 20.0 * 1e-3
+    assert (y != stepped_y).any()  # it was the table that answered
+    assert np.abs(by_stepped_u[:, :, n]).max(axis=(0, 1)).min() > 0.1
+
+
+def test_places_at_one_ln_e_share_sums_and_no_answer(table):
+    """Beside others at their ln e, in any order, or alone: the same response."""
+    contact = places(12, 8)
+    contact[1::2, 0], contact[::3, 1] = contact[::2, 0], contact[0, 1]
+    wanted = np.ones((12, 5), dtype=bool)
+    wanted[::2, 3] = False
+    wanted[::4, 1:] = False
+    together = table.curves(contact, wanted)
+    order = np.random.default_rng(9).permutation(12)
+    for mixed, one in zip(together, table.curves(contact[order], wanted[order])):
+        np.testing.assert_array_equal(mixed[order], one)
+    for i in range(12):
+        for mixed, one in zip(together, table.curves(contact[[i]], wanted[[i]])):
+            np.testing.assert_allclose(mixed[i, : one.shape[1]], one[0], atol=1e-12)
 
 
 def test_posteriors_are_those_of_stepped_responses(monkeypatch):

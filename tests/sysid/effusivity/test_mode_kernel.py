@@ -9,9 +9,15 @@ from scipy.stats import t as student_t
 
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.sysid.effusivity import mode_kernel as kernel
-from thermogrip.sysid.effusivity.data import touches
+from thermogrip.sysid.effusivity.data import Whitener, touches, whiten
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
-from thermogrip.sysid.effusivity.laplace_approximation import fit_candidates, fit_pairs, material_hypotheses
+from thermogrip.sysid.effusivity.laplace_approximation import (
+    fit_candidates,
+    fit_pairs,
+    material_hypotheses,
+    nodes_for,
+    pairs_asked,
+)
 
 SD = np.array([0.3, 0.5, 0.1, 3.0, 0.4, 0.0, 0.2])
 DOF = np.array([np.inf, 6.0, 4.0, np.inf, np.inf, 5.0, np.inf])
@@ -41,17 +47,33 @@ def test_the_penalty_is_the_priors_density_beside_its_peak():
         assert here.bound[a] == pytest.approx(here.slope[a] / w[a] if w[a] else 1.0)
 
 
-def test_products_are_those_of_whitened_columns():
+@pytest.mark.parametrize("n_column", [8, 3])
+def test_products_are_those_of_whitened_columns(n_column):
     rng = np.random.default_rng(1)
-    whitener, columns = np.tril(rng.normal(size=(2, 5, 5))), rng.normal(size=(3, 5, 8))
-    scale, row, matrix = rng.uniform(0.5, 2.0, (3, 8)), np.array([1, 0, 1]), np.zeros((3, 8, 8))
-    scale[1, 2] = 0.0  # known: no part of the sums
-    above = np.triu(np.full((5, 5), 9.0), 1)
-    kernel.normal_equations.py_func(row, whitener + above, columns, scale, np.empty((5, 8)), matrix)
-    for p in range(3):
-        white = whitener[row[p]] @ (columns[p] * scale[p])
-        np.testing.assert_allclose(matrix[p], white.T @ white, atol=1e-12)
-    assert not matrix[1, 2].any()
+    kinds, columns = rng.normal(size=(2, 5, 5)), rng.normal(size=(4, 5, n_column))
+    row, scale = np.array([1, 0, 1, 2]), rng.uniform(0.5, 2.0, (3, 5))
+    shared = Whitener(kinds, np.array([0, 1, 0]), scale)
+    alone = np.stack([kinds[k] * scale[i, :, None] for i, k in enumerate(shared.kind)])
+    for whitener in (shared, alone):
+        found = kernel.squares(whitener, row, columns)
+        for p in range(4):
+            white = alone[row[p]] @ columns[p]
+            np.testing.assert_allclose(found[p], white.T @ white, atol=1e-12)
+
+
+def test_products_are_in_units_of_each_spread_and_none_of_what_is_known():
+    gripper, record = load_default_gripper(), load_example_grasps()["exp1A_obj43_grip23"]
+    data = touches(record.isel(grasp=[0, 1]))
+    asked = pairs_asked(gripper.stack, nodes_for(data), data, np.array([0, 1]), None)
+    u = np.array([[6.5, np.log(0.5), 0.0, 23.0, 43.0, 8.0, 10.0]]).repeat(2, axis=0)
+    w = whiten(data, gripper.noise)[0]
+    unit = kernel.products(asked, w, u, np.ones((2, 7)))
+    for unknown in (np.array([3, 4]), np.array([0, 1, 3, 4, 5, 6])):
+        sd, scale = np.zeros((2, 7)), np.zeros((2, 8))
+        sd[:, unknown] = [0.5 + 0.1 * unknown, 2.0 + 0.1 * unknown]
+        scale[:, :7], scale[:, 7] = sd, 1.0
+        want = unit * scale[:, :, None] * scale[:, None, :]
+        np.testing.assert_allclose(kernel.products(asked, w, u, sd), want, rtol=1e-9, atol=1e-9)
 
 
 def means_of(nodes, rise, slope, times, bins, *, onset=0.0, late=-1.0):

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.interpolate import PchipInterpolator
 from scipy.special import logsumexp, ndtr
 from scipy.stats import multivariate_normal, multivariate_t, norm
 from scipy.stats import t as student_t
@@ -30,6 +31,7 @@ from thermogrip.sysid.effusivity.posterior_grid import (
     log_integrals,
     log_integrals_of_two,
     mixture_quantiles,
+    monotone,
 )
 
 LEVELS = (0.05, 0.5, 0.95)
@@ -52,6 +54,16 @@ def test_a_level_that_has_arrived_waits_for_the_others(monkeypatch):
     mass = np.exp(-0.5 * ((x - 11.1) / 0.45) ** 2)
     mixture_quantiles(mass / mass.sum(), x, 0.05 + 0.07 * (x - 9.4), LEVELS)
     assert len(rounds) <= 8
+
+
+@pytest.mark.parametrize("n", [3, 4, 7])
+def test_curves_without_turns_between_points_are_those_of_scipy(n):
+    rng = np.random.default_rng(n)
+    x, y = np.sort(rng.uniform(0, 5, (40, n)), axis=1), rng.normal(size=(40, n))
+    y[:9, 1] = y[:9, 2]  # level
+    at = np.concatenate([x, rng.uniform(-1, 6, (40, 20))], axis=1)
+    want = [PchipInterpolator(a, b)(np.clip(c, a[0], a[-1])) for a, b, c in zip(x, y, at)]
+    np.testing.assert_allclose(monotone(x, y, at), want, atol=1e-12)
 
 
 @pytest.fixture(scope="module")
