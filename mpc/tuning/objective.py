@@ -315,12 +315,15 @@ class Search:
         least = min(120.0, spec.hold_s)
         self.lengths = [float(np.clip(1.35 * bound + 40.0, least, spec.hold_s)) for bound in slowest]
         # a plant that settles long after the bound (its delay, what is not known of it) is watched for longer
-        begun = run_trials(self.made("MPC", baseline), plant, spec, self.draws, seed=seed)
-        for at, step in enumerate(spec.steps):
-            settled = np.nan_to_num(
-                [r.settle_s for r in begun if (r.start, r.target) == step], nan=np.inf
-            ).max()
+        for at, settled in enumerate(self._settled()):
             self.lengths[at] = float(np.clip(1.25 * settled + 40.0, self.lengths[at], spec.hold_s))
+
+    def _settled(self) -> list[float]:
+        """Return when the default design has settled on the slowest draw [s], by step; inf where never."""
+        spec, begun = self.spec, self.made("MPC", self.baseline)
+        found = run_trials(begun, self.plant, spec, self.draws, seed=self.seed)
+        times = {step: [r.settle_s for r in found if (r.start, r.target) == step] for step in spec.steps}
+        return [float(np.nan_to_num(times[step], nan=np.inf).max()) for step in spec.steps]
 
     def __getstate__(self) -> dict[str, Any]:
         own = getattr(self.plant.model, "code", None)
