@@ -12,7 +12,8 @@ seeds:
 * offset: mean error of the last fifth of the time after the change; IAE of all three parts [s times unit];
 * energy: integral of the squared drives [s at full drive]; moves: sum of changes in whole ranges.
 
-With ``--keep`` plants and controllers are read from there where they are there already.
+With ``--keep`` plants and controllers are read from there where they are there already; with ``--default``
+nothing is tuned, the MPC is the default design under the spec.
 """
 
 from __future__ import annotations
@@ -248,6 +249,9 @@ def main() -> None:
     parser.add_argument("--seeds", default="0", help="of noise and clouds in the loop, by commas")
     parser.add_argument("--without", default="", help="controllers to leave out: mpc, pi, simc, do-mpc")
     parser.add_argument("--keep", type=Path, help="folder of plants and controllers")
+    parser.add_argument(
+        "--default", action="store_true", help="the default design, untuned, and no PI of tune"
+    )
     parser.add_argument("--markdown", type=Path, help="also write the table here")
     given = parser.parse_args()
     if given.keep is not None:
@@ -258,7 +262,8 @@ def main() -> None:
     for name in given.plants.split(","):
         case = by_name[name]
         found: dict[str, list[Result]] = {}
-        for player_name, player in players(case, given.without.split(","), given.keep):
+        without = [*given.without.split(","), *(["pi"] if given.default else [])]
+        for player_name, player in players(case, without, given.keep, default=given.default):
             found[player_name] = [run(case, player, int(seed)) for seed in given.seeds.split(",")]
             lines.append(row(case, player_name, found[player_name]))
             print(lines[-1], flush=True)
@@ -269,14 +274,17 @@ def main() -> None:
         given.markdown.write_text("\n".join([*lines, "", *marks, ""]), encoding="utf-8")
 
 
-def players(case: Case, without: Sequence[str], keep: Path | None) -> list[tuple[str, Player]]:
+def players(
+    case: Case, without: Sequence[str], keep: Path | None, *, default: bool = False
+) -> list[tuple[str, Player]]:
     """Return who plays; a stage that refuses is printed."""
     logs = logs_of(case)
     found: list[tuple[str, Player]] = []
     spec = spec_from_dict(case.spec)
     try:
         plant = identified(case, logs, keep)
-        controller = tuned(case, plant, spec, keep)
+        wide = spec.widened(plant)
+        controller = Controller(wide, spec.design(wide)) if default else tuned(case, plant, spec, keep)
         if "mpc" not in without:
             found.append(("mpc", Ours(case, controller)))
         if "pi" not in without:

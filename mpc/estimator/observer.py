@@ -48,9 +48,16 @@ controlled output is read through a lag T of its own, 0 at the start and never b
 with s, what was shown last, T and k among the states of the filter.  k is by what share the output moves more
 than the model's since the start: on a ramp a loss or a coupling that is off by a few percent looks like a lag
 that grows with the way gone, and would be taken for one.  It is 0 at the start and becomes uncertain by and
-by, for the first samples of a rise show a lag.  The plan still brings x to the target, not s: whether the
-skin is slow or its sensor, what follows x through a lag does not go beyond it.  Where T would be negative, or
-beyond six samples, the estimate is the conditional mean at that end [2]_.
+by, for the first samples of a rise show a lag.  The way (z - s) and the share a come as a product and are
+both unknown; its derivatives are small where the output stands still, and taken alone they would find a lag
+in noise.  Deviations e, f of a joint Gaussian have var(e f) = var(e) var(f) + cov(e, f)^2, so that a reading
+has
+
+    a'^2 ( var(z - s) var(T) + cov(z - s, T)^2 ),    a' = da/dT = -dt / (dt + T)^2,
+
+of variance besides.  The plan still brings x to the target, not s: whether the skin is slow or its sensor,
+what follows x through a lag does not go beyond it.  Where T would be negative, or beyond six samples, the
+estimate is the conditional mean at that end [2]_.
 
 References
 ----------
@@ -156,7 +163,7 @@ def resting_state_in_room(model: PredictionModel, ambient: float, unit: tuple[fl
 
 
 #: Lag of an output beyond the model's, in samples: standard deviation at the start, most, and per sqrt(s).
-PRIOR_LAG, LONGEST_LAG, _LAG_DRIFT = 3.0, 6.0, 0.02
+PRIOR_LAG, LONGEST_LAG, _LAG_DRIFT = 1.5, 6.0, 0.02
 #: Per sqrt(sample), of the share by which an output moves more than the model's.
 _SCALE_DRIFT = 0.001
 _REPEATS, _SAME = 5, 1e-3  # of the start on a nonlinear plant, and when it is still [degC]
@@ -497,6 +504,7 @@ class Observer:
         if seen.size:
             H = self._shows(self.now, self._shown_now)[1][seen]
             H = H @ self._way if self._share else H
+            R = R + self._doubt()
             PH = self._P @ H.T
             S = H @ PH + np.diag(R[seen])
             gain = np.linalg.solve(S, PH.T).T
@@ -509,6 +517,26 @@ class Observer:
             self._P = left @ self._P @ left.T + (gain * R[seen]) @ gain.T
             self._change(self._inside(gain @ innovation[seen], held))
         return np.asarray(innovation)
+
+    def _doubt(self) -> Array:
+        """Return the variance (n_y,) of readings by the product of how far an output has to go and the share
+        that its lag lets it go in a sample, both unknown."""
+        model, n, n_l = self.model, self._n, len(self.lagged)
+        y = model.output(self.now)[self.lagged]
+        to_go = np.zeros((n_l, n + 3 * n_l))
+        to_go[:, : model.n_x] = model.C[self.lagged] * (1 + self.scale)[:, None]
+        own = np.arange(n_l)
+        to_go[own, n + own] = -1.0
+        to_go[own, n + 2 * n_l + own] = y - self.start
+        if self._share:
+            to_go = to_go @ self._way
+        PG = self._P @ to_go.T
+        at = n + n_l + own
+        slope = model.dt / (model.dt + self.lag) ** 2
+        found = np.zeros(model.n_y)
+        with_lag = PG[at, own]
+        found[self.lagged] = slope**2 * (np.einsum("ij,ji->i", to_go, PG) * self._P[at, at] + with_lag**2)
+        return found
 
     def _inside(self, change: Array, held: Mask) -> Array:
         """Return a change of the states that leaves each lag in its range: the mean, given that end."""

@@ -84,7 +84,7 @@ def draws_of(plant: Plant, count: int) -> list[int]:
 #: From this number on a draw lacks structure: 2001 is draw 1 with the second of :func:`lacking`.
 STRUCTURE = 1000
 #: How much runs on such draws count in the score beside the others, and the most that one is charged.
-LACKING, MOST_LACKING = 0.05, 5.0
+LACKING, MOST_LACKING = 0.05, 50.0
 
 
 @lru_cache(maxsize=16)
@@ -314,6 +314,16 @@ class Search:
         # long enough to see it settle and stay, short enough to try many
         least = min(120.0, spec.hold_s)
         self.lengths = [float(np.clip(1.35 * bound + 40.0, least, spec.hold_s)) for bound in slowest]
+        # a plant that settles long after the bound (its delay, what is not known of it) is watched for longer
+        for at, settled in enumerate(self._settled()):
+            self.lengths[at] = float(np.clip(1.25 * settled + 40.0, self.lengths[at], spec.hold_s))
+
+    def _settled(self) -> list[float]:
+        """Return when the default design has settled on the slowest draw [s], by step; inf where never."""
+        spec, begun = self.spec, self.made("MPC", self.baseline)
+        found = run_trials(begun, self.plant, spec, self.draws, seed=self.seed)
+        times = {step: [r.settle_s for r in found if (r.start, r.target) == step] for step in spec.steps}
+        return [float(np.nan_to_num(times[step], nan=np.inf).max()) for step in spec.steps]
 
     def __getstate__(self) -> dict[str, Any]:
         own = getattr(self.plant.model, "code", None)

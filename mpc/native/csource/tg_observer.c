@@ -16,7 +16,7 @@
 
 #define LARGEST_BIAS 1.0 /* of its range: no drive makes up for more */
 #define REMEMBER 0.2 /* share of the newest innovation in their mean */
-#define PRIOR_LAG 3.0   /* samples: standard deviation of a lag at the start */
+#define PRIOR_LAG 1.5   /* samples: standard deviation of a lag at the start */
 #define LONGEST_LAG 6.0 /* samples */
 #define SAME 1e-6 /* of a sample: what is nearer than this is the same time */
 #define WEAK 0.05 /* of its gain at rest, below which a drive's bias is not learnt */
@@ -103,20 +103,25 @@ static void plain_sensitivity(const tg_controller *c, int i, const double *x, co
         }
 }
 
-/* The same for a reading of now; between two samples times the derivative of the state there. */
-static void sensitivity(const tg_controller *c, int i, double *h)
+/* What plain is of the states of now; between two samples times the derivative of the state there. */
+static void of_now(const tg_controller *c, const double *plain, double *h)
 {
-    double plain[TG_Z];
-    plain_sensitivity(c, i, tg_now(c), shown_now(c), plain);
     if (!(c->share > 0.0)) {
-        memcpy(h, plain, sizeof plain);
+        memcpy(h, plain, TG_Z * sizeof *h);
         return;
     }
-    memset(h, 0, sizeof plain);
+    memset(h, 0, TG_Z * sizeof *h);
     for (int j = 0; j < TG_Z; j++)
         if (plain[j] != 0.0)
             for (int k = 0; k < TG_Z; k++)
                 h[k] += plain[j] * c->jacobian[j * TG_Z + k];
+}
+
+static void sensitivity(const tg_controller *c, int i, double *h)
+{
+    double plain[TG_Z];
+    plain_sensitivity(c, i, tg_now(c), shown_now(c), plain);
+    of_now(c, plain, h);
 }
 
 /* h P. */
@@ -135,6 +140,22 @@ static double seen_by(const double *h, const double *row)
     for (int j = 0; j < TG_Z; j++)
         sum += h[j] * row[j];
     return sum;
+}
+
+/* The variance of how far controlled output r has to go times by what share its lag lets it go in a sample, both
+ * unknown: their derivatives leave it out. */
+static double doubt(const tg_controller *c, int r)
+{
+    const tg_design *s = c->design;
+    int i = s->controlled[r], lag = TG_L + TG_NG + r;
+    double plain[TG_Z] = {0.0}, to_go[TG_Z], row[TG_Z], slope = lag_share(c, r) / (s->dt + c->lag[r]);
+    for (int j = 0; j < TG_NX; j++)
+        plain[j] = s->C[i * TG_NX + j] * (1.0 + c->scale[r]);
+    plain[TG_L + r] = -1.0;
+    plain[TG_L + 2 * TG_NG + r] = output(c, i, tg_now(c)) - c->start[r];
+    of_now(c, plain, to_go);
+    measure(c, to_go, row);
+    return slope * slope * (seen_by(to_go, row) * c->P[lag * (TG_Z + 1)] + row[lag] * row[lag]);
 }
 
 /* Solve S X = B (symmetric positive, X has TG_Z columns) in place, by elimination. */
@@ -196,12 +217,15 @@ static void apply(tg_controller *c, double *change)
     }
 }
 
-/* A lost reading is given no weight: its row of H P is 0. R: variances of the reading. */
-static void correct(tg_controller *c, const double *y, const double *R, double remember)
+/* A lost reading is given no weight: its row of H P is 0. known: variances of the reading. */
+static void correct(tg_controller *c, const double *y, const double *known, double remember)
 {
-    double off[TG_NY], S[TG_NY * TG_NY], HP[TG_NY * TG_Z], gain[TG_NY * TG_Z], PH[TG_NY * TG_Z];
+    double R[TG_NY], off[TG_NY], S[TG_NY * TG_NY], HP[TG_NY * TG_Z], gain[TG_NY * TG_Z], PH[TG_NY * TG_Z];
     double H[TG_NY * TG_Z], change[TG_Z] = {0.0};
     tg_expected(c, off);
+    memcpy(R, known, sizeof R);
+    for (int r = 0; r < TG_NG; r++)
+        R[c->design->controlled[r]] += doubt(c, r);
     for (int a = 0; a < TG_NY; a++)
         sensitivity(c, a, H + a * TG_Z);
     for (int a = 0; a < TG_NY; a++) {

@@ -321,7 +321,7 @@ def test_nearly_every_random_state_is_one_for_the_optimiser():
         state = exports._random_state(twin, rng)
         exports._compare(twin, state, ["0", "0"])
         solved.append(twin.last_iterations > 0)
-    assert np.mean(solved) > 0.8
+    assert np.mean(solved) > 0.75
     assert len(rests) < 60  # a place for each, and a few to start with
 
 

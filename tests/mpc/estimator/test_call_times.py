@@ -97,7 +97,7 @@ def test_at_any_rate_the_loop_is_that_of_the_sample_time(tank, nominal, name, ra
     assert found["settling"] == pytest.approx(own["settling"], abs=0.05 * own["settling"] + late)
     # beyond a sample of 2 s a hold adds 2.5 s of mean delay, 4 % of the settling time
     more = 0.15 if rate == "7 s" else 0.1
-    assert found["overshoot"] == pytest.approx(own["overshoot"], rel=more, abs=0.06)
+    assert found["overshoot"] == pytest.approx(own["overshoot"], rel=more, abs=0.07)
     assert found["bias"] == pytest.approx(own["bias"], abs=0.03)
     assert {move.status for _, move in found["moves"]} <= {"ok"}
 

@@ -13,6 +13,7 @@ from tests.mpc.makers import make_tank, network_plant
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.estimator.observer import (
+    PRIOR_LAG,
     DisturbanceModel,
     Observer,
     ObserverNoise,
@@ -432,6 +433,24 @@ def test_an_output_that_moves_less_than_the_model_is_not_taken_for_one_that_lags
     np.testing.assert_allclose(MODEL.output(observer.x) + observer.output_bias, y + OFFSET, atol=0.1)
 
 
+def test_noise_at_rest_shows_no_lag_and_leaves_it_as_uncertain_as_it_was() -> None:
+    a, dt = float(np.exp(-0.05)), 5.0
+    heater = StateSpaceModel(
+        ("q",), (), ("t",), A=[[a, 40 * (1 - a)], [0, 0]], B=[[0], [1]], C=[[1.0, 0]], dt=dt, y0=[25.0]
+    )
+    model = PredictionModel(Plant(heater, {}, dt=dt, units={"q": "1"}, valid={"q": (0.0, 1.0)}), dt=dt)
+    chosen = choose_disturbances(model, ("t",))
+    for seed in range(10):
+        observer, rng = Observer(model, chosen, lagged=[0]), np.random.default_rng(seed)
+        observer.reset(np.full(1, 25.0), np.zeros(0))
+        observer.expect_lags()
+        for _ in range(5):
+            observer.predict(np.zeros(1), np.zeros(0))
+            observer.update(25.0 + 0.05 * rng.standard_normal(1))
+        assert observer.lag[0] < 0.4 * dt
+        assert observer.lag_sd[0] > 0.8 * PRIOR_LAG * dt
+
+
 def test_where_a_lag_would_be_negative_the_estimate_is_that_without_one() -> None:
     one, other = Observer(MODEL, CHOSEN, NOISE, lagged=[1]), Observer(MODEL, CHOSEN, NOISE)
     for observer in (one, other):
@@ -440,6 +459,7 @@ def test_where_a_lag_would_be_negative_the_estimate_is_that_without_one() -> Non
         for _ in range(2):
             observer.predict(np.array([SPAN]), np.array([25.0]))
     before, one._P[-1], one._P[:, -1] = one.x, 0.0, 0.0
+    other.R = other.R + one._doubt()  # of a lag that may be there
     for observer in (one, other):
         observer.update(observer.reading() + [0.2, 0.5])  # it rises faster than the model
     assert one.lag[0] == pytest.approx(0.0, abs=1e-12)

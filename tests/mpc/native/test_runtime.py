@@ -246,11 +246,9 @@ def test_where_gcc_refuses_trials_run_in_python_and_that_is_reported(plant, tmp_
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(build, "_FLAGS", ("-std=c99", "--no-such-flag"))
     spec = Spec(steps=((25.0, 30.0),), hold_s=60.0)
-    search = Search(plant, spec, spec.design(plant), 0)
     with pytest.warns(UserWarning, match="trials run in Python"):
-        trial = search.evaluate(
-            {**parameters_of(search.baseline, spec), "horizon": sum(search.baseline.blocks)}
-        )
+        search = Search(plant, spec, spec.design(plant), 0)
+    trial = search.evaluate({**parameters_of(search.baseline, spec), "horizon": sum(search.baseline.blocks)})
     assert np.isfinite(trial.score)
 
 

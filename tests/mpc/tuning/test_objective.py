@@ -34,15 +34,17 @@ def search_of(
     spec: Spec = SPEC,
     dt: float = 1.0,
     coldest: float = 27.0,
+    settled: Any = (0.0, 0.0),
     **changes: Any,
 ) -> Search:
     """Return the search of a tank whose shortest times are a function of (start, target, draw), its skin in
-    the logs as cold as that."""
+    the logs as cold as that; its default design has settled after so long."""
     logs = {"t_surface": (coldest, 40.0)}
     plant = _Plant(uncertain=uncertain, draw=lambda k: k, dt=dt, valid=logs, units={})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(objective, "full_drive_bound", lambda drawn, design, step, spec: bounds(*step, drawn))
         patch.setattr(objective, "apparent_delay", lambda plant, controlled: 8.0)
+        patch.setattr(Search, "_settled", lambda self: list(settled))
         return Search(plant, spec, spec.design(make_tank(), **changes), 3)  # type: ignore[arg-type]
 
 
@@ -57,8 +59,20 @@ def test_trials_last_for_what_the_slowest_draw_needs():
     assert long.lengths == [300.0, 300.0]
     short = search_of(lambda *at: 1.0, spec=SPEC.model_copy(update={"hold_s": 90.0}))
     assert short.lengths == [90.0, 90.0]
+    late = search_of(lambda *at: 60.0, settled=(160.0, np.inf))
+    assert late.lengths == [1.25 * 160 + 40, 300.0]  # as long as the default design takes
     sure = search_of(lambda *at: 50.0, uncertain=False)
     assert (sure.draws, sure.unseen, sure.certain, sure.seed, sure.check_seed) == ([0], [0], True, 3, 4)
+
+
+def test_the_default_design_is_watched_until_it_has_settled_on_the_slowest_draw(monkeypatch):
+    search = search_of(lambda *at: 60.0)
+    one = StepResult(*STEPS[0], 1, 50.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 300.0)
+    found = [one, replace(one, draw=2, settle_s=70.0)]
+    found += [replace(each, start=STEPS[1][0], target=STEPS[1][1], settle_s=np.nan) for each in found]
+    monkeypatch.setattr(objective, "run_trials", lambda *given, seed: found)
+    monkeypatch.setattr(search, "made", lambda name, design: None)
+    assert search._settled() == [70.0, np.inf]
 
 
 def test_a_spec_of_which_one_step_can_be_reached_is_searched_and_one_of_which_none_can_is_refused():
@@ -236,7 +250,9 @@ def test_a_score_is_the_mean_and_half_of_what_the_worst_is_above_it():
     assert score([never], SPEC, bounds) == pytest.approx(300 / 50 + 3.0)
     # without structure a run counts a twentieth, and is charged 5 at most
     slow = [replace(one, draw=1001, settle_s=200.0), replace(never, draw=2001)]
-    assert score([one, two, *slow], SPEC, bounds) == pytest.approx(2.5 + 0.05 * (4.0 + 5.0) / 2)
+    assert score([one, two, *slow], SPEC, bounds) == pytest.approx(2.5 + 0.05 * (4.0 + 9.0) / 2)
+    slow[1] = replace(slow[1], last_error=80.0)
+    assert score([one, two, *slow], SPEC, bounds) == pytest.approx(2.5 + 0.05 * (4.0 + 50.0) / 2)
 
 
 def test_a_note_has_none_for_what_is_no_number():
