@@ -148,7 +148,7 @@ class CompiledController:
     def __init__(self, controller: ControllerParts) -> None:
         model = controller.model
         step = _code_of(model)
-        self.sizes: Sizes = sizes_of(controller, step.n_k, step.n_m, room=True)
+        self.sizes: Sizes = sizes_of(controller, step, room=True)
         files = {name: c_source(name) for name in (*SOURCES, "tg_host.c")} | step.files
         self.library = _library(build_library(files | {"tg_config.h": config_header(self.sizes)}))
         k = np.zeros(max(1, step.n_k))

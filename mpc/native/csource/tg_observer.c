@@ -24,7 +24,7 @@
 static double output(const tg_controller *c, int i, const double *x)
 {
     double sum = c->design->y0[i];
-    for (int j = 0; j < TG_NX; j++)
+    for (int j = c->design->read_from[i]; j < c->design->read_to[i]; j++)
         sum += c->design->C[i * TG_NX + j] * x[j];
     return sum;
 }
@@ -314,26 +314,30 @@ void tg_observer_reset(tg_controller *c, const double *y, const double *d)
     tg_observer_set_offsets(c, y, s->fixed);
 }
 
+/* Entry i of direction c, of those that are kept in groups of four. */
+static double *entry(double *of, int n, int i, int c) { return of + (c / 4) * 4 * n + 4 * i + c % 4; }
+
 /* The Jacobian of a sample by tangents of the unit directions; the state one sample later into next.
- * Returned: its rows of TG_SEEDS, by states, drives and disturbances. */
-static const double *sample_jacobian(tg_controller *c, const double *u, const double *d, double *next)
+ * Returned: its entries, by states, drives and disturbances. */
+static double *sample_jacobian(tg_controller *c, const double *u, const double *d, double *next)
 {
     const tg_design *s = c->design;
     double x[TG_NX];
-    double *now = c->seed, *then = c->seed + TG_NX * TG_SEEDS, *swap;
-    memset(now, 0, (size_t)TG_NX * TG_SEEDS * sizeof(double));
-    memset(c->seed_u, 0, (size_t)TG_NU * TG_SEEDS * sizeof(double));
-    memset(c->seed_d, 0, (size_t)TG_SOME(TG_ND) * TG_SEEDS * sizeof(double));
+    double *now = c->seed, *then = c->seed + TG_NX * TG_WIDE, *swap;
+    memset(now, 0, (size_t)TG_NX * TG_WIDE * sizeof(double));
+    memset(c->seed_u, 0, sizeof c->seed_u);
+    memset(c->seed_d, 0, sizeof c->seed_d);
     for (int j = 0; j < TG_NX; j++)
-        now[j * TG_SEEDS + j] = 1.0;
+        *entry(now, TG_NX, j, j) = 1.0;
     for (int j = 0; j < TG_NU; j++)
-        c->seed_u[j * TG_SEEDS + TG_NX + j] = 1.0;
+        *entry(c->seed_u, TG_NU, j, TG_NX + j) = 1.0;
     for (int j = 0; j < TG_ND; j++)
-        c->seed_d[j * TG_SEEDS + TG_NX + TG_NU + j] = 1.0;
+        *entry(c->seed_d, TG_ND, j, TG_NX + TG_NU + j) = 1.0;
     memcpy(x, c->x, sizeof x);
+    tg_model_hold_slopes(u, s->k, c->by_drives);
     for (int part = 0; part < s->sub; part++) {
-        tg_model_partials(x, u, d, s->k, next, c->partials);
-        tg_model_tangent_d(TG_SEEDS, TG_SEEDS, c->partials, s->k, now, c->seed_u, c->seed_d, then);
+        tg_model_partials(x, u, d, s->k, c->by_drives, next, c->partials);
+        tg_model_tangent_d((TG_SEEDS + 3) / 4, c->partials, s->k, c->by_drives, now, c->seed_u, c->seed_d, then);
         memcpy(x, next, sizeof x);
         swap = now;
         now = then;
@@ -341,14 +345,14 @@ static const double *sample_jacobian(tg_controller *c, const double *u, const do
     }
     memset(c->jacobian, 0, sizeof c->jacobian);
     for (int i = 0; i < TG_NX; i++) {
-        const double *row = now + i * TG_SEEDS;
-        memcpy(c->jacobian + i * TG_Z, row, TG_NX * sizeof(double));
+        for (int j = 0; j < TG_NX; j++)
+            c->jacobian[i * TG_Z + j] = *entry(now, TG_NX, i, j);
         for (int k = 0; k < TG_NW; k++) {
             double sum = 0.0;
             for (int j = 0; j < TG_NU; j++)
-                sum += row[TG_NX + j] * s->on_drive[j * TG_NW + k] * s->span[j];
+                sum += *entry(now, TG_NX, i, TG_NX + j) * s->on_drive[j * TG_NW + k] * s->span[j];
             for (int j = 0; j < TG_ND; j++)
-                sum += row[TG_NX + TG_NU + j] * s->on_disturbance[j * TG_NW + k];
+                sum += *entry(now, TG_NX, i, TG_NX + TG_NU + j) * s->on_disturbance[j * TG_NW + k];
             c->jacobian[i * TG_Z + TG_NX + k] = sum;
         }
     }
@@ -515,19 +519,19 @@ int tg_find_steady(tg_controller *c, const double *d, const double *on_u, const 
     for (int j = 0; j < TG_NU; j++)
         u[j] = fmin(fmax(u[j], s->lowest[j]), s->highest[j]);
     for (int step = 0; step < STEADY_STEPS && !found; step++) {
-        const double *rows;
+        double *slopes;
         double moved = 0.0;
         for (int j = 0; j < TG_NU; j++)
             both[j] = u[j] + on_u[j];
         memcpy(c->x, x, sizeof x);
-        rows = sample_jacobian(c, both, d, next);
+        slopes = sample_jacobian(c, both, d, next);
         memcpy(c->x, keep, sizeof keep);
         for (int i = 0; i < TG_NX; i++) {
             for (int j = 0; j < TG_NX; j++)
-                c->spare[i * TG_NX + j] = (i == j ? 1.0 : 0.0) - rows[i * TG_SEEDS + j];
+                c->spare[i * TG_NX + j] = (i == j ? 1.0 : 0.0) - *entry(slopes, TG_NX, i, j);
             X[i * SIDES] = next[i] - x[i];
             for (int j = 0; j < TG_NU; j++)
-                X[i * SIDES + 1 + j] = rows[i * TG_SEEDS + TG_NX + j] * s->span[j];
+                X[i * SIDES + 1 + j] = *entry(slopes, TG_NX, i, TG_NX + j) * s->span[j];
             for (int k = 0; k < TG_NW; k++)
                 X[i * SIDES + 1 + TG_NU + k] = c->jacobian[i * TG_Z + TG_NX + k];
         }
