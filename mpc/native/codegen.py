@@ -22,6 +22,9 @@ with the direction.  A step that is linear in state and disturbances while the d
 element is, x+ = A(u) x + E(u) d + a(u), can be written in that form, row by row: a plan of ten blocks then takes ten
 times the work of A, not as many times as there are samples.  Of all these forms the shortest is written.
 
+Rows of many constants, as of a black box of 20 states, are tables that loops run over: unrolled, a step of 60 states
+is half a megabyte.
+
 A quotient by something known earlier becomes a product with its reciprocal.  Nothing here is CasADi's own C:
 the code needs ``math.h`` and nothing else.
 """
@@ -33,6 +36,10 @@ import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermogrip.datasets.arrays import Array
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import Model
@@ -91,6 +98,7 @@ _HEADS = {
         "tangent_d": f"{_COLUMNS}, const double *restrict su, const double *restrict sd, double *restrict out",
     }.items()
 }
+_LONG, _MANY = 8, 250  # constants in a row, and in all of them, from which on they are a table
 #: How much longer than a product these take.
 _SLOW = {"OP_DIV": 4, "OP_INV": 4, "OP_SQRT": 4, "OP_POW": 20, "OP_CONSTPOW": 20, "OP_EXP": 10, "OP_LOG": 10, "OP_TANH": 20}
 
@@ -113,6 +121,55 @@ class _Line:
     outputs: list[dict[int, int]] = field(default_factory=list)  # by output: entry -> value
     n_u: int = 0
     n_d: int = 0
+
+
+@dataclass(frozen=True)
+class _Table:
+    """Rows of a step that are constants times state, drives and disturbances, and a constant."""
+
+    rows: list[int]
+    slopes: dict[str, Array]  # of "x", "u" and "d"
+    added: Array
+
+    def define(self) -> list[str]:
+        """Return the arrays in C."""
+        if not self.rows:
+            return []
+        parts = {"slope_" + of: values.ravel() for of, values in self.slopes.items() if values.size}
+        lines = [_array("double", name, values) for name, values in (parts | {"added": self.added}).items()]
+        return [_array("int", "table", np.array(self.rows)), *lines]
+
+    def step(self) -> list[str]:
+        """Return the statements of the state one step later."""
+        lines = ["double sum = added[i];"]
+        for of, values in self.slopes.items():
+            if n := values.shape[1]:
+                lines += [f"for (int j = 0; j < {n}; j++)", f"    sum += slope_{of}[{n} * i + j] * {of}[j];"]
+        return self._loop([*lines, "xn[table[i]] = sum;"])
+
+    def tangent(self, along: str) -> list[str]:
+        """Return the statements of a group's four tangents, along directions of x, u, d or some of them."""
+        lines = ["double sum[4] = {0.0};"]
+        for of in along:
+            if n := self.slopes[of].shape[1]:
+                lines += [
+                    f"for (int j = 0; j < {n}; j++)",
+                    "    for (int c = 0; c < 4; c++)",
+                    f"        sum[c] += slope_{of}[{n} * i + j] * s{of}[4 * j + c];",
+                ]
+        return self._loop([*lines, "for (int c = 0; c < 4; c++)", "    out[4 * table[i] + c] = sum[c];"])
+
+    def _loop(self, lines: Sequence[str]) -> list[str]:
+        if not self.rows:
+            return []
+        return [f"    for (int i = 0; i < {len(self.rows)}; i++) {{", *("        " + text for text in lines), "    }"]
+
+
+def _array(kind: str, name: str, values: Array) -> str:
+    """Return a constant array in C."""
+    texts = [repr(value) for value in values.tolist()]
+    rows = [", ".join(texts[at : at + 5]) for at in range(0, len(texts), 5)]
+    return f"static const {kind} {name}[{len(texts)}] = {{\n    " + ",\n    ".join(rows) + "};\n"
 
 
 @dataclass(frozen=True)
@@ -154,12 +211,13 @@ class ModelCode:
 
 def write_model(model: Model, drives: Sequence[int], h: float) -> ModelCode:
     """Return the C of a model's step of length h [s]; inputs that are no drives are switches, and on."""
-    forms = [_straight(form) for form in _graphs(model, drives, h)]
-    return _write(min(forms, key=_work))
+    table, graphs = _graphs(model, drives, h)
+    return _write(min((_straight(form) for form in graphs), key=_work), table)
 
 
-def _graphs(model: Model, drives: Sequence[int], h: float) -> list[Any]:
-    """Return functions (p, x, u, d, sx, su, sd) -> (x+, tangents along sx, with su, with sd): each form of one."""
+def _graphs(model: Model, drives: Sequence[int], h: float) -> tuple[_Table, list[Any]]:
+    """Return what is a table, and of the rest functions (p, x, u, d, sx, su, sd) -> (x+, tangents along sx, with su,
+    with sd): each form of one."""
     import casadi as ca
 
     n_d = len(model.disturbances)
@@ -171,6 +229,8 @@ def _graphs(model: Model, drives: Sequence[int], h: float) -> list[Any]:
         full[at] = value
     lists = [ca.vertsplit(item) if item.numel() else [] for item in (x, d, p)]
     after = ca.vertcat(*model.step(lists[0], full, lists[1], lists[2], h))
+    table = _tabulate(after, x, u, d)
+    after = ca.vertcat(*(0 if i in table.rows else after[i] for i in range(model.n_x)))
     moving, along = ca.vertcat(x, d), (sx, su, sd)
     bent = ca.which_depends(after, moving, 2, True)
     none = ca.DM.zeros(moving.numel(), 1)
@@ -190,7 +250,27 @@ def _graphs(model: Model, drives: Sequence[int], h: float) -> list[Any]:
         for three in (tangents, others):
             results = ca.cse([ca.densify(item) for item in (step, *three)])
             found.append(ca.Function("model", [p, x, u, d, *along], results))
-    return found
+    return table, found
+
+
+def _tabulate(after: Any, x: Any, u: Any, d: Any) -> _Table:
+    """Return the rows of a step whose slopes are many constants."""
+    import casadi as ca
+
+    given, n_x, n_u = ca.vertcat(x, u, d), x.numel(), u.numel()
+    slopes = ca.jacobian(after, given)
+    count = slopes.sparsity().T.colind()
+    long = [i for i in range(n_x) if count[i + 1] - count[i] >= _LONG]
+    if long and any(bent := ca.which_depends(after, given, 2, True)):
+        long = [i for i in long if not bent[i]]
+    added = ca.substitute(after, given, ca.DM.zeros(given.numel(), 1))
+    long = [i for i in long if not ca.symvar(ca.vertcat(slopes[i, :].T, added[i]))]
+    if sum(count[i + 1] - count[i] for i in long) < _MANY:
+        long = []
+    dense = np.array(ca.DM(ca.evalf(ca.densify(slopes[long, :])))).reshape(len(long), given.numel())
+    parts = np.split(dense, [n_x, n_x + n_u], axis=1)
+    level = np.array(ca.DM(ca.evalf(ca.densify(added[long])))).ravel()
+    return _Table(long, dict(zip("xud", parts, strict=True)), level)
 
 
 def _straight(function: Any) -> _Line:
@@ -262,8 +342,8 @@ def _work(line: _Line) -> float:
     return once + 0.5 * (count(step, _DRIVES) + count(both, _DRIVES))
 
 
-def _write(line: _Line) -> ModelCode:
-    outputs = [list(found.items()) for found in line.outputs]
+def _write(line: _Line, table: _Table) -> ModelCode:
+    outputs = [[pair for pair in found.items() if pair[0] not in table.rows] for found in line.outputs]
     roots = [[at for _, at in found] for found in outputs]
     everything = _needed(line, [at for part in roots for at in part])
     k = _hand_over(line, everything, _PARAMETERS, "k")
@@ -282,37 +362,44 @@ def _write(line: _Line) -> ModelCode:
         "prepare": _body(line, _PARAMETERS, k, into["k"]),
         "hold": _body(line, _DRIVES, read, into["h"][: len(read)]),
         "hold_slopes": _body(line, _DRIVES, h, into["h"]),
-        "step": _body(line, _STATE, roots[0], into["xn"]),
+        "step": [*_body(line, _STATE, roots[0], into["xn"]), *table.step()],
         "next": [
             f"    double h[{max(1, len(read))}];",
             "    tg_model_hold(u, k, h);",
             "    tg_model_step(x, u, d, k, h, xn);",
         ],
-        "partials": _body(line, _STATE, roots[0] + m, into["xn"] + into["m"]),
+        "partials": [*_body(line, _STATE, roots[0] + m, into["xn"] + into["m"]), *table.step()],
         "tangent": _body(line, _DIRECTION, roots[1], out[0]),
         "tangent_u": _body(line, _DIRECTION, roots[2], out[1]),
         "tangent_d": _body(line, _DIRECTION, roots[3], out[2]),
     }
-    source = []
-    sizes = {"sx": len(outputs[0]), "su": line.n_u, "sd": line.n_d, "out": len(outputs[0])}
+    source = table.define()
+    n_x = len(line.outputs[0])
+    sizes = {"sx": n_x, "su": line.n_u, "sd": line.n_d, "out": n_x}
+    along = {"tangent": "x", "tangent_u": "xu", "tangent_d": "xud"}
     for part, lines in parts.items():
         head = _HEADS[part]
         arguments = [item.split()[-1].lstrip("*") for item in head[head.index("(") + 1 : -1].split(",")]
-        body = "\n".join(lines)
+        more = table.tangent(along[part]) if part in along else []
+        body = "\n".join([*lines, *more])
         unused = [f"    (void){item};" for item in arguments if not re.search(rf"\b{item}\b", body)]
         if part.startswith("tangent"):
             unused = [text for text in unused if text != "    (void)n;"]
-            lines = _over_groups(lines, [item for item in arguments if item in sizes], sizes)
+            moving = [item for item in arguments if item in sizes]
+            lines = _over_groups(lines, more, moving, sizes)
         source.append("\n".join([head, "{", *unused, *lines, "}", ""]))
     heads = [_HEADS[part].replace(" restrict ", " ").replace("*restrict ", "*") for part in parts]
     header = ";\n".join([*heads, ""])  # C++ has no such word, and to C it is the same declaration
     return ModelCode("\n".join(source), header, len(k), len(h), len(m), line)
 
 
-def _over_groups(lines: Sequence[str], moving: Sequence[str], sizes: Mapping[str, int]) -> list[str]:
-    """Return statements for one direction repeated over groups of four."""
+def _over_groups(
+    lines: Sequence[str], more: Sequence[str], moving: Sequence[str], sizes: Mapping[str, int]
+) -> list[str]:
+    """Return statements for one direction, and more for four, repeated over groups of four."""
     steps = ", ".join(["g++", *(f"{item} += {4 * sizes[item]}" for item in moving if sizes[item])])
     inner = ["        for (int c = 0; c < 4; c++) {", *("        " + item for item in lines), "        }"]
+    inner = [*(inner if lines else []), *("    " + item for item in more)]
     return [f"    for (int g = 0; g < n; {steps}) {{", *inner, "    }"]
 
 

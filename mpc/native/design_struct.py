@@ -298,7 +298,7 @@ def _controller_parts(s: Sizes) -> list[tuple[Any, int]]:
         *((number, count) for count in (n, s.NH * s.NY, n, 1)),
         (whole, 2),
         (number, 1),
-        (whole, s.NC + 2),
+        (whole, s.NC + 3),
         (qp, 1),
         *((number, count) for count in (max(1, s.NE), s.NH * s.NY, s.NH * s.NY, s.NH * some)),
         *((number, count) for count in (2 * s.NX * wide, s.NU * wide, max(1, s.ND) * wide)),

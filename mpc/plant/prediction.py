@@ -211,20 +211,24 @@ class PredictionModel:
         after = ca.vertcat(*_step(self, symbols))
         if any(ca.which_depends(after, ca.vertcat(*symbols), 2, True)):
             return None
-        added, A, B, E = self._derivatives(*(np.zeros(n) for n in (self.n_x, self.n_u, self.n_d)))
+        # CasADi's own: once, which is not worth a compiled step
+        added, A, B, E = self._by_casadi(*(np.zeros(n) for n in (self.n_x, self.n_u, self.n_d)))
         return A, B, E, added
 
     def _derivatives(self, x: Array, u: Array, d: Array) -> tuple[Array, Array, Array, Array]:
         n_x, n_u = self.n_x, self.n_u
         if self._kernel is None:
-            found = self._casadi_sample(x, u, d)
-            return found[0].ravel(), found[1], found[2], found[3]
+            return self._by_casadi(x, u, d)
         along = np.eye(n_x + n_u + self.n_d)
         _, after = self._tangents(
             x, u[None], d, along[:, :n_x], along[:, None, n_x : n_x + n_u], along[:, n_x + n_u :]
         )
         A, B, E = np.split(after[:, n_x:].T, [n_x, n_x + n_u], axis=1)
         return after[0, :n_x], A, B, E
+
+    def _by_casadi(self, x: Array, u: Array, d: Array) -> tuple[Array, Array, Array, Array]:
+        after, A, B, E = self._casadi_sample(x, u, d)
+        return after.ravel(), A, B, E
 
     @cached_property
     def _kernel(self) -> Kernel | None:

@@ -103,7 +103,7 @@ typedef struct {
     double best[TG_Q_N], y_best[TG_NH * TG_NY], authority[TG_Q_N], broken;
     int qp_status, iterations;
     double kept_caution; /* of a linear plant: for what H was made, and whether there is a G */
-    int kept_lost[TG_NC], has_gains, laid_out;
+    int kept_lost[TG_NC], has_gains, laid_out, has_jacobian;
     /* room to work in */
     tg_qp qp;
     double G[TG_SOME(TG_NE)]; /* the response: the soft rows of the program, sample by sample */

@@ -314,6 +314,15 @@ void tg_observer_reset(tg_controller *c, const double *y, const double *d)
     tg_observer_set_offsets(c, y, s->fixed);
 }
 
+static void set_lag_rows(tg_controller *c)
+{
+    for (int r = 0; r < TG_NG; r++) {
+        double *row = c->jacobian + (TG_L + r) * TG_Z;
+        plain_sensitivity(c, c->design->controlled[r], c->x, c->shown, row);
+        memset(row + TG_NX, 0, TG_NW * sizeof(double)); /* without the biases */
+    }
+}
+
 /* Entry i of direction c, of those that are kept in groups of four. */
 static double *entry(double *of, int n, int i, int c) { return of + (c / 4) * 4 * n + 4 * i + c % 4; }
 
@@ -356,15 +365,30 @@ static double *sample_jacobian(tg_controller *c, const double *u, const double *
             c->jacobian[i * TG_Z + TG_NX + k] = sum;
         }
     }
-    for (int r = 0; r < TG_NG; r++) {
-        double *row = c->jacobian + (TG_L + r) * TG_Z;
-        plain_sensitivity(c, s->controlled[r], c->x, c->shown, row);
-        memset(row + TG_NX, 0, TG_NW * sizeof(double)); /* without the biases */
-    }
     for (int k = TG_NX; k < TG_Z; k++)
         if (k < TG_L || k >= TG_L + TG_NG)
             c->jacobian[k * (TG_Z + 1)] = 1.0;
+    set_lag_rows(c);
+    c->has_jacobian = 1;
     return now;
+}
+
+/* The state one sample later into next, and the Jacobian; of a linear plant only what lags is new. */
+static void look_ahead(tg_controller *c, const double *u, const double *d, double *next)
+{
+    const tg_design *s = c->design;
+    double x[TG_NX];
+    if (!s->linear || !c->has_jacobian) {
+        sample_jacobian(c, u, d, next);
+        return;
+    }
+    memcpy(x, c->x, sizeof x);
+    tg_model_hold(u, s->k, c->by_drives);
+    for (int part = 0; part < s->sub; part++) {
+        tg_model_step(x, u, d, s->k, c->by_drives, next);
+        memcpy(x, next, sizeof x);
+    }
+    set_lag_rows(c);
 }
 
 #define STEADY_STEPS 12
@@ -579,6 +603,35 @@ int tg_find_steady(tg_controller *c, const double *d, const double *on_u, const 
     return found;
 }
 
+/* P = J P J'. J is sparse in its last rows, and often in all; its columns are taken four at a time. */
+static void carry_covariance(tg_controller *c)
+{
+    memset(c->spare, 0, sizeof c->spare);
+    for (int i = 0; i < TG_Z; i++) {
+        const double *J = c->jacobian + i * TG_Z;
+        double *restrict row = c->spare + i * TG_Z;
+        int k = 0;
+        for (; k + 4 <= TG_Z; k += 4) {
+            const double *P = c->P + k * TG_Z, *P1 = P + TG_Z, *P2 = P1 + TG_Z, *P3 = P2 + TG_Z;
+            const double J0 = J[k], J1 = J[k + 1], J2 = J[k + 2], J3 = J[k + 3];
+            if (J0 == 0.0 && J1 == 0.0 && J2 == 0.0 && J3 == 0.0)
+                continue;
+            for (int j = 0; j < TG_Z; j++)
+                row[j] += J0 * P[j] + J1 * P1[j] + (J2 * P2[j] + J3 * P3[j]);
+        }
+        for (; k < TG_Z; k++)
+            for (int j = 0; j < TG_Z; j++)
+                row[j] += J[k] * c->P[k * TG_Z + j];
+    }
+    for (int i = 0; i < TG_Z; i++)
+        for (int j = 0; j <= i; j++) {
+            double sum = 0.0;
+            for (int k = 0; k < TG_Z; k++)
+                sum += c->spare[i * TG_Z + k] * c->jacobian[j * TG_Z + k];
+            c->P[i * TG_Z + j] = c->P[j * TG_Z + i] = sum;
+        }
+}
+
 void tg_observer_predict(tg_controller *c, const double *u, const double *d)
 {
     const tg_design *s = c->design;
@@ -588,26 +641,11 @@ void tg_observer_predict(tg_controller *c, const double *u, const double *d)
         on_u[j] += u[j];
     for (int j = 0; j < TG_ND; j++)
         on_d[j] += d[j];
-    sample_jacobian(c, on_u, on_d, next);
+    look_ahead(c, on_u, on_d, next);
     for (int r = 0; r < TG_NG; r++)
         c->shown[r] += lag_share(c, r) * (scaled(c, r, c->x) - c->shown[r]);
     memcpy(c->x, next, sizeof c->x);
-    /* P = J P J' + Q; J is sparse in its last rows, and often in all */
-    memset(c->spare, 0, sizeof c->spare);
-    for (int i = 0; i < TG_Z; i++)
-        for (int k = 0; k < TG_Z; k++) {
-            double share = c->jacobian[i * TG_Z + k];
-            if (share != 0.0)
-                for (int j = 0; j < TG_Z; j++)
-                    c->spare[i * TG_Z + j] += share * c->P[k * TG_Z + j];
-        }
-    for (int i = 0; i < TG_Z; i++)
-        for (int j = 0; j <= i; j++) {
-            double sum = 0.0;
-            for (int k = 0; k < TG_Z; k++)
-                sum += c->spare[i * TG_Z + k] * c->jacobian[j * TG_Z + k];
-            c->P[i * TG_Z + j] = c->P[j * TG_Z + i] = sum;
-        }
+    carry_covariance(c);
     for (int i = 0; i < TG_Z; i++)
         c->P[i * TG_Z + i] += c->held[i] ? 0.0 : (1.0 - c->noised) * s->Q[i];
     stand_on_sample(c);
@@ -642,7 +680,7 @@ void tg_observer_look(tg_controller *c, const double *d)
         on_u[j] += c->dose[j] / c->into_s;
     for (int j = 0; j < TG_ND; j++)
         on_d[j] += d[j];
-    sample_jacobian(c, on_u, on_d, next);
+    look_ahead(c, on_u, on_d, next);
     for (int i = 0; i < TG_NX; i++)
         c->ahead[i] = (1.0 - share) * c->x[i] + share * next[i];
     for (int r = 0; r < TG_NG; r++)
@@ -652,6 +690,7 @@ void tg_observer_look(tg_controller *c, const double *d)
             c->jacobian[i * TG_Z + j] = share * c->jacobian[i * TG_Z + j] + (i == j ? 1.0 - share : 0.0);
         c->P[i * TG_Z + i] += c->held[i] ? 0.0 : (share - c->noised) * s->Q[i];
     }
+    c->has_jacobian = 0;
     for (int i = 0; i < TG_NY; i++)
         c->bent[i] = 4.0 * share * (1.0 - share) * (output(c, i, next) - output(c, i, c->x));
     c->share = c->noised = share;
