@@ -100,7 +100,16 @@ _HEADS = {
 }
 _LONG, _MANY = 8, 250  # constants in a row, and in all of them, from which on they are a table
 #: How much longer than a product these take.
-_SLOW = {"OP_DIV": 4, "OP_INV": 4, "OP_SQRT": 4, "OP_POW": 20, "OP_CONSTPOW": 20, "OP_EXP": 10, "OP_LOG": 10, "OP_TANH": 20}
+_SLOW = {
+    "OP_DIV": 4,
+    "OP_INV": 4,
+    "OP_SQRT": 4,
+    "OP_POW": 20,
+    "OP_CONSTPOW": 20,
+    "OP_EXP": 10,
+    "OP_LOG": 10,
+    "OP_TANH": 20,
+}
 
 
 @dataclass
@@ -162,7 +171,11 @@ class _Table:
     def _loop(self, lines: Sequence[str]) -> list[str]:
         if not self.rows:
             return []
-        return [f"    for (int i = 0; i < {len(self.rows)}; i++) {{", *("        " + text for text in lines), "    }"]
+        return [
+            f"    for (int i = 0; i < {len(self.rows)}; i++) {{",
+            *("        " + text for text in lines),
+            "    }",
+        ]
 
 
 def _array(kind: str, name: str, values: Array) -> str:
@@ -244,9 +257,7 @@ def _graphs(model: Model, drives: Sequence[int], h: float) -> tuple[_Table, list
         A, B, E = (ca.jacobian(step, item) for item in (x, u, d))
         parts = [ca.mtimes(each, by) for each, by in zip((A, B, E), along)]
         tangents = [parts[0], parts[0] + parts[1], parts[0] + parts[1] + parts[2]]
-        others = [
-            ca.jtimes(step, ca.vertcat(*(x, u, d)[:n]), ca.vertcat(*along[:n])) for n in range(1, 4)
-        ]
+        others = [ca.jtimes(step, ca.vertcat(*(x, u, d)[:n]), ca.vertcat(*along[:n])) for n in range(1, 4)]
         for three in (tangents, others):
             results = ca.cse([ca.densify(item) for item in (step, *three)])
             found.append(ca.Function("model", [p, x, u, d, *along], results))

@@ -41,7 +41,16 @@ SOURCES = ("tg_qp.h", "tg_qp.c", "tg_controller.h", "tg_controller.c", "tg_obser
 
 # sums may be done in any order and pairs of operations at once; NaN keeps its meaning
 _FLAGS = (
-    *("-std=c99", "-O2", "-fvect-cost-model=dynamic", "-fno-inline-functions-called-once", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros"),
+    *(
+        "-std=c99",
+        "-O2",
+        "-fvect-cost-model=dynamic",
+        "-fno-inline-functions-called-once",
+        "-march=native",
+        "-fno-math-errno",
+        "-fno-trapping-math",
+        "-fno-signed-zeros",
+    ),
     *("-fassociative-math", "-ffp-contract=fast", "-fPIC", "-shared"),
 )
 

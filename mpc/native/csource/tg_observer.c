@@ -623,13 +623,28 @@ static void carry_covariance(tg_controller *c)
             for (int j = 0; j < TG_Z; j++)
                 row[j] += J[k] * c->P[k * TG_Z + j];
     }
-    for (int i = 0; i < TG_Z; i++)
-        for (int j = 0; j <= i; j++) {
-            double sum = 0.0;
-            for (int k = 0; k < TG_Z; k++)
-                sum += c->spare[i * TG_Z + k] * c->jacobian[j * TG_Z + k];
-            c->P[i * TG_Z + j] = c->P[j * TG_Z + i] = sum;
+    for (int i = 0; i < TG_Z; i++) {
+        const double *row = c->spare + i * TG_Z;
+        int j = 0;
+        for (; j + 4 <= i + 1; j += 4) {
+            const double *J = c->jacobian + j * TG_Z, *J1 = J + TG_Z, *J2 = J1 + TG_Z, *J3 = J2 + TG_Z;
+            double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0;
+            for (int k = 0; k < TG_Z; k++) {
+                s0 += row[k] * J[k];
+                s1 += row[k] * J1[k];
+                s2 += row[k] * J2[k];
+                s3 += row[k] * J3[k];
+            }
+            c->P[i * TG_Z + j] = s0;
+            c->P[i * TG_Z + j + 1] = s1;
+            c->P[i * TG_Z + j + 2] = s2;
+            c->P[i * TG_Z + j + 3] = s3;
         }
+        for (; j <= i; j++)
+            c->P[i * TG_Z + j] = seen_by(c->jacobian + j * TG_Z, row);
+        for (j = 0; j < i; j++)
+            c->P[j * TG_Z + i] = c->P[i * TG_Z + j];
+    }
 }
 
 void tg_observer_predict(tg_controller *c, const double *u, const double *d)
