@@ -6,11 +6,11 @@
 Two loops: the reference problem (a Peltier tank, not linear; ``problem.py``), N = 50; and a rod of n masses,
 heated at one end, linear, closed on a rod that loses a tenth more: 32, then 28 degC, 150 samples each.
 
-CPU ms, median and worst: of the whole step in C (filter, program, status), of the program alone in C, both read
-in C, in Python, DAQP's own solve of the same run, the step over that (of the reference problem the program), and
-do-mpc with its defaults on the same model, weights and limits (no soft bands).  Before a program much else was
-computed in Python: its memory is cold, that of a step is not.  ``--quick`` takes N = 50 alone, and the second half of the
-samples not: 40 s.
+CPU ms, median and worst: of the whole step in C (filter, program, status) and of the program alone in C, both
+read in C; of the program in Python; DAQP's own solve of the same run; the step over that (of the reference
+problem the program); and do-mpc with its defaults on the same model, weights and limits (no soft bands).
+Before a program much else was computed in Python: its memory is cold, that of a step is not.  ``--quick`` takes
+N = 50 alone and half the samples: 50 s.
 """
 
 from __future__ import annotations
@@ -25,10 +25,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm
-
 from ours import Ours
 from problem import run_loop
+from scipy.linalg import expm
 from stopwatch import Stopwatch
 
 from thermogrip.mpc.controllers.mpc import Controller

@@ -1,4 +1,4 @@
-"""CPU time of a call into C, read in C: what the way there from Python takes is not in it, as in DAQP's own time."""
+"""CPU time of a call into C, read in C as DAQP's own time is: the way there from Python is not in it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ static double now(void)
 int timed_call(pointers f, double *took, void **p)
 {
     const double began = now();
-    const int answer = f(p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11], p[12], p[13], p[14]);
+    const int answer = f(p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11], p[12],
+                         p[13], p[14]);
     *took = now() - began;
     return answer;
 }

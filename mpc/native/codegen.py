@@ -1,4 +1,4 @@
-r"""A model's step as plain C99: what depends on its parameters, on the drives, on the state, on a direction, each once.
+r"""A model's step as plain C99: what depends on parameters, drives, state and direction, each once.
 
 CasADi holds the equations as a list of instructions.  Each instruction depends on
 
@@ -9,21 +9,23 @@ CasADi holds the equations as a list of instructions.  Each instruction depends 
 
 and is written into the first function that knows all it needs:
 
-    prepare(p -> k),    hold(u, k -> h),    step(x, u, d, k, h -> x+),    partials(x, u, d, k, h -> x+, m),
-    tangent(m, k, h, sx -> sx+)    and the same with a direction of the drives, su, and of the disturbances, sd.
+    prepare(p -> k),    hold(u, k -> h),    step(x, u, d, k, h -> x+),
+    partials(x, u, d, k, h -> x+, m),    tangent(m, k, h, sx -> sx+)
 
-``hold`` does as much of it as ``step`` reads, ``hold_slopes`` all; ``next`` is hold and step.
+and the last with a direction of the drives, su, and of the disturbances, sd, too.  ``hold`` does as much of it
+as ``step`` reads, ``hold_slopes`` all; ``next`` is hold and step.
 
-``tangent`` runs over many directions, n groups of four side by side, each group's numbers behind those of the last:
-entry i of direction c at [c / 4][i][c % 4].  Of the loop over the four a compiler makes vector instructions.  A dense Jacobian of an implicit step takes ten times the work of the step for
-every sample; a dozen tangents that share their partial derivatives take two or three.  Where the Jacobian is
-sparse and the other way about, its non-zeros are the partial derivatives and the tangent is their product
-with the direction.  A step that is linear in state and disturbances while the drives stand still, as that of a Peltier
-element is, x+ = A(u) x + E(u) d + a(u), can be written in that form, row by row: a plan of ten blocks then takes ten
-times the work of A, not as many times as there are samples.  Of all these forms the shortest is written.
+``tangent`` runs over many directions, n groups of four side by side, each group's numbers behind those of the
+last: entry i of direction c at [c / 4][i][c % 4].  Of the loop over the four a compiler makes vector
+instructions.  A dense Jacobian of an implicit step takes ten times the work of the step for every sample; a
+dozen tangents that share their partial derivatives take two or three.  Where the Jacobian is sparse and the
+other way about, its non-zeros are the partial derivatives and the tangent is their product with the direction.
+A step that is linear in state and disturbances while the drives stand still, as that of a Peltier element is,
+x+ = A(u) x + E(u) d + a(u), can be written in that form, row by row: a plan of ten blocks then takes ten times
+the work of A, not as many times as there are samples.  Of all these forms the shortest is written.
 
-Rows of many constants, as of a black box of 20 states, are tables that loops run over: unrolled, a step of 60 states
-is half a megabyte.
+Rows of many constants, as of a black box of 20 states, are tables that loops run over: unrolled, a step of 60
+states is half a megabyte.
 
 A quotient by something known earlier becomes a product with its reciprocal.  Nothing here is CasADi's own C:
 the code needs ``math.h`` and nothing else.
@@ -229,8 +231,8 @@ def write_model(model: Model, drives: Sequence[int], h: float) -> ModelCode:
 
 
 def _graphs(model: Model, drives: Sequence[int], h: float) -> tuple[_Table, list[Any]]:
-    """Return what is a table, and of the rest functions (p, x, u, d, sx, su, sd) -> (x+, tangents along sx, with su,
-    with sd): each form of one."""
+    """Return what is a table, and each form of the rest as a function (p, x, u, d, sx, su, sd) -> (x+, tangents
+    along sx, with su, with sd)."""
     import casadi as ca
 
     n_d = len(model.disturbances)

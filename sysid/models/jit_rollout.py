@@ -409,8 +409,8 @@ def _ones(n: int) -> NDArray[np.uint8]:
 
 @lru_cache(maxsize=256)
 def _entries(batch: int, own: tuple[int, ...]) -> NDArray[np.int64]:
-    """Return by block which entry of each array a member begins at, each of whose members has so many of its own;
-    places beyond the last member repeat it."""
+    """Return by block which entry of each array a member begins at, where members have so many of their own
+    there; places beyond the last member repeat it."""
     blocks = -(-batch // WIDTH)
     member = np.minimum(np.arange(blocks * WIDTH), batch - 1).reshape(blocks, 1, WIDTH)
     return np.ascontiguousarray(member * np.array(own)[:, None])

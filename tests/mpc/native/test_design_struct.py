@@ -29,7 +29,7 @@ def test_a_search_has_room_for_its_variants_and_an_export_for_itself():
     model = controller.model
     assert (model.n_x, 2, model.n_d, 2) == (tight.NX, tight.NU, tight.ND, tight.NY)
     assert (tight.NG, wide.NG) == (1, 1)
-    assert (5, 7, 6) == (tight.NK, tight.NF, tight.NM)
+    assert (tight.NK, tight.NF, tight.NM) == (5, 7, 6)
     assert model.n_x + controller.disturbance.n_w + 3 == tight.NZ
 
 
