@@ -9,8 +9,8 @@ heated at one end, linear, closed on a rod that loses a tenth more: 32, then 28 
 CPU ms, median and worst: of the whole step in C (filter, program, status) and of the program alone in C, both
 read in C; of the program in Python; DAQP's own solve of the same run; the step over that (of the reference
 problem the program); and do-mpc with its defaults on the same model, weights and limits (no soft bands).
-Before a program much else was computed in Python: its memory is cold, that of a step is not.  ``--quick`` takes
-N = 50 alone and half the samples: 50 s.
+Before a program much else was computed in Python: its memory is cold, that of a step is not.
+``--quick`` takes N = 50 alone and half the samples: 50 s.
 """
 
 from __future__ import annotations

@@ -12,17 +12,18 @@ and is written into the first function that knows all it needs:
     prepare(p -> k),    hold(u, k -> h),    step(x, u, d, k, h -> x+),
     partials(x, u, d, k, h -> x+, m),    tangent(m, k, h, sx -> sx+)
 
-and the last with a direction of the drives, su, and of the disturbances, sd, too.  ``hold`` does as much of it
-as ``step`` reads, ``hold_slopes`` all; ``next`` is hold and step.
+and the last with a direction of the drives, su, and of the disturbances, sd, too.  ``hold`` does as much of
+it as ``step`` reads, ``hold_slopes`` all; ``next`` is hold and step.
 
 ``tangent`` runs over many directions, n groups of four side by side, each group's numbers behind those of the
 last: entry i of direction c at [c / 4][i][c % 4].  Of the loop over the four a compiler makes vector
 instructions.  A dense Jacobian of an implicit step takes ten times the work of the step for every sample; a
-dozen tangents that share their partial derivatives take two or three.  Where the Jacobian is sparse and the
-other way about, its non-zeros are the partial derivatives and the tangent is their product with the direction.
-A step that is linear in state and disturbances while the drives stand still, as that of a Peltier element is,
-x+ = A(u) x + E(u) d + a(u), can be written in that form, row by row: a plan of ten blocks then takes ten times
-the work of A, not as many times as there are samples.  Of all these forms the shortest is written.
+dozen tangents that share their partial derivatives take two or three.  Where the Jacobian is sparse and
+the other way about, its non-zeros are the partial derivatives and the tangent is their product with the
+direction.  A step that is linear in state and disturbances while the drives stand still, as that of a Peltier
+element is, x+ = A(u) x + E(u) d + a(u), can be written in that form, row by row: a plan of ten blocks then
+takes ten times the work of A, not as many times as there are samples.  Of all these forms the shortest is
+written.
 
 Rows of many constants, as of a black box of 20 states, are tables that loops run over: unrolled, a step of 60
 states is half a megabyte.
@@ -85,6 +86,7 @@ _OPERATIONS |= {
 }
 _PARAMETERS, _DRIVES, _STATE, _DIRECTION = 1, 2, 3, 4  # what a value depends on
 _POINT = "const double *x, const double *u, const double *d, const double *k"
+_SU, _SD = "const double *restrict su", "const double *restrict sd"
 _COLUMNS = "int n, const double *m, const double *k, const double *h, const double *restrict sx"
 _HEADS = {
     part: f"void tg_model_{part}({arguments})"
@@ -96,8 +98,8 @@ _HEADS = {
         "next": f"{_POINT}, double *xn",
         "partials": f"{_POINT}, const double *h, double *xn, double *m",
         "tangent": f"{_COLUMNS}, double *restrict out",
-        "tangent_u": f"{_COLUMNS}, const double *restrict su, double *restrict out",
-        "tangent_d": f"{_COLUMNS}, const double *restrict su, const double *restrict sd, double *restrict out",
+        "tangent_u": f"{_COLUMNS}, {_SU}, double *restrict out",
+        "tangent_d": f"{_COLUMNS}, {_SU}, {_SD}, double *restrict out",
     }.items()
 }
 _LONG, _MANY = 8, 250  # constants in a row, and in all of them, from which on they are a table
@@ -231,8 +233,8 @@ def write_model(model: Model, drives: Sequence[int], h: float) -> ModelCode:
 
 
 def _graphs(model: Model, drives: Sequence[int], h: float) -> tuple[_Table, list[Any]]:
-    """Return what is a table, and each form of the rest as a function (p, x, u, d, sx, su, sd) -> (x+, tangents
-    along sx, with su, with sd)."""
+    """Return what is a table, and each form of the rest as a function (p, x, u, d, sx, su, sd) -> (x+,
+    tangents along sx, with su, with sd)."""
     import casadi as ca
 
     n_d = len(model.disturbances)
