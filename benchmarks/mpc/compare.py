@@ -44,11 +44,11 @@ def main() -> None:
     )
     parser.add_argument("--out", type=Path, help="also write the numbers here, as JSON")
     parser.add_argument("--quick", action="store_true", help="150 samples of the slow ones")
-    parser.add_argument("--only", default="", help="comma list of names to run")
+    parser.add_argument("--only", default="", help="names to run, by semicolons")
     given = parser.parse_args()
     chosen = {**PEERS, **{k: v for k, v in OURS.items() if wanted() or "compiled" not in k}}
     if given.only:
-        chosen = {name: make for name, make in chosen.items() if name in given.only.split(",")}
+        chosen = {name: make for name, make in chosen.items() if name in given.only.split(";")}
     rows: dict[str, dict[str, Any]] = {}
     for name, make in chosen.items():
         steps = SHORT.get(name, 150 if given.quick and name in PEERS else None)

@@ -1,24 +1,34 @@
-"""Step times over the size of a plant and of a horizon: a rod of n masses, heated at one end, a linear plant.
+"""Step times over the size of a plant and of a horizon, and how often DAQP's own solve goes into each.
 
+    OMP_NUM_THREADS=1 python benchmarks/mpc/sizes.py --quick
     OMP_NUM_THREADS=1 peers/bin/python benchmarks/mpc/sizes.py --peer --markdown sizes.md
 
-The loop is closed on a rod that loses a tenth more; 32, then 28 degC, 150 samples each.  CPU ms, median and
-worst: of the whole step in C (filter, program, status), of the program alone in C and in Python, DAQP's own
-solve in the same run, and do-mpc with its defaults on the same model, weights and limits (no soft bands).
+Two loops: the reference problem (a Peltier tank, not linear; ``problem.py``), N = 50; and a rod of n masses,
+heated at one end, linear, closed on a rod that loses a tenth more: 32, then 28 degC, 150 samples each.
+
+CPU ms, median and worst: of the whole step in C (filter, program, status) and of the program alone in C, both
+read in C; of the program in Python; DAQP's own solve of the same run; the step over that (of the reference
+problem the program); and do-mpc with its defaults on the same model, weights and limits (no soft bands).
+Before a program much else was computed in Python: its memory is cold, that of a step is not.
+``--quick`` takes N = 50 alone and half the samples: 50 s.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from ours import Ours
+from problem import run_loop
 from scipy.linalg import expm
+from stopwatch import Stopwatch
 
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import MOST_UNKNOWNS, Design, default_design, make_blocks
@@ -69,46 +79,67 @@ def design_of(plant: Plant, N: int, blocks: int) -> Design:
     return replace(default_design(plant, dt=1.0), blocks=lengths, deadline_s=60.0)
 
 
-def loop(n: int, step: Callable[[float, float], float]) -> None:
+def loop(n: int, step: Callable[[float, float], float], samples: int) -> None:
     """Close a loop of (reading, target) -> drive on a rod that is not the model."""
     truth = Controller(rod(n, 0.0044)).model
     x, rng = truth.rest(np.array([25.0]), np.zeros(0)), np.random.default_rng(0)
-    for k in range(SAMPLES):
+    for k in range(samples):
         drive = step(float(truth.output(x)[0] + 0.02 * rng.standard_normal()), 32.0 if k < 150 else 28.0)
         x = truth.next_state(x, np.array([drive]), np.zeros(0))
 
 
-def ours(n: int, N: int, blocks: int) -> dict[str, tuple[float, float]]:
+def ours(n: int, N: int, blocks: int, samples: int) -> dict[str, tuple[float, float]]:
     """Return median and worst [ms] of our steps, by what is timed."""
     plant, found = rod(n), dict[str, list[float]]()
     design = design_of(plant, N, blocks)
     for name, compiled in (("Python", False), ("C", True)):
         controller = Controller(plant, design, compiled=compiled)
         clocked, floor = Clocked(controller.optimiser), list[float]()
-        if not compiled:
+        if isinstance(controller.optimiser, CompiledOptimiser):
+            watch = Stopwatch()
+            controller.optimiser._run = watch.of(controller.optimiser._c.library.tg_host_optimise)
+            clocked.seconds = watch.seconds
+        else:
             controller.optimiser.qp.on_info = lambda info, kept=floor: kept.append(info["solve_time"])
         controller.reset({"t": 25.0})
-        if isinstance(controller.optimiser, CompiledOptimiser):
-            assert clocked.optimiser.model.affine is not None
-        loop(n, lambda y, r, of=controller: float(of.step({"t": y}, r).drive))
+        loop(n, lambda y, r, of=controller: float(of.step({"t": y}, r).drive), samples)
         found[f"program, {name}"] = clocked.seconds
         if floor:
             found["DAQP's solve"] = floor
     python = Controller(plant, design)
     python.reset({"t": 25.0})
-    whole, seconds = CompiledController(python), list[float]()
+    whole, watch = CompiledController(python), Stopwatch()
     whole.reset(np.array([25.0]), np.zeros(0), python.observer)
+    whole.library.tg_host_step = watch.of_step(whole.library.tg_host_step)
 
     def step(y: float, r: float) -> float:
-        given = np.array([y]), np.zeros(0), np.array([r])
-        began = time.thread_time()
-        drive, _, _ = whole.step(*given)
-        seconds.append(time.thread_time() - began)
+        drive, _, _ = whole.step(np.array([y]), np.zeros(0), np.array([r]))
         return float(drive[0])
 
-    loop(n, step)
-    found["step, C"] = seconds
-    return {key: (1e3 * float(np.median(v[5:])), 1e3 * float(np.max(v[5:]))) for key, v in found.items()}
+    loop(n, step, samples)
+    found["step, C"] = watch.seconds
+    del whole.library.tg_host_step  # the library is another controller's, too
+    return in_ms(found)
+
+
+def in_ms(seconds: dict[str, list[float]]) -> dict[str, tuple[float, float]]:
+    """Return median and worst [ms] of each list, its first five left out."""
+    return {key: (1e3 * float(np.median(v[5:])), 1e3 * float(np.max(v[5:]))) for key, v in seconds.items()}
+
+
+def reference(blocks: int, samples: int) -> dict[str, tuple[float, float]]:
+    """Return the same of the reference problem, whose filter is nobody's."""
+    found, watch = dict[str, list[float]](), Stopwatch()
+    compiled = Ours(compiled=True, blocks=blocks)
+    timed, given = watch.of(compiled.optimiser._c.library.tg_host_replan), compiled.replan.args
+    compiled.replan = lambda: timed(*given)
+    run_loop(compiled, steps=samples)
+    found["program, C"] = watch.seconds
+    python, floor = Ours(compiled=False, blocks=blocks), list[float]()
+    python.optimiser.qp.on_info = lambda info: floor.append(info["solve_time"])
+    found["program, Python"] = run_loop(python, steps=samples).cpu.tolist()
+    found["DAQP's solve"] = floor
+    return in_ms(found)
 
 
 def peer(n: int, N: int, samples: int = 25) -> tuple[float, float]:
@@ -160,27 +191,54 @@ def main() -> None:
     parser.add_argument("--peer", action="store_true", help="do-mpc beside, where each sample is a block")
     parser.add_argument("--states", default=",".join(map(str, STATES)), help="by commas")
     parser.add_argument("--markdown", type=Path, help="also write the table here")
+    parser.add_argument("--quick", action="store_true", help="N = 50 alone, half the samples")
     given = parser.parse_args()
-    columns = ("step, C", "program, C", "program, Python", "DAQP's solve", "do-mpc")
+    columns = ("step, C", "program, C", "program, Python", "DAQP's solve", "times DAQP", "do-mpc")
     lines = [f"| states | N | blocks | {' | '.join(columns)} |", "|---" * (len(columns) + 3) + "|"]
+    print(f"5 million additions in Python: {additions():.2f} s", file=sys.stderr)
     print(*lines, sep="\n")
     medians: dict[tuple[int, int, str, str], float] = {}
-    sizes = [int(n) for n in given.states.split(",")]
-    for n, N, kind in ((n, N, kind) for n in sizes for N in HORIZONS for kind in ("N", "10")):
+    sizes, samples = [int(n) for n in given.states.split(",")], SAMPLES // (2 if given.quick else 1)
+    for n, N, kind in cases(sizes, quick=given.quick):
         blocks = N if kind == "N" else 10
-        if blocks > MOST_UNKNOWNS:
-            continue
-        found = ours(n, N, blocks)
-        if given.peer and kind == "N":
+        found = ours(n, N, blocks, samples) if n else reference(blocks, 2 * samples)
+        step = found["step, C" if n else "program, C"][0]
+        found["times DAQP"] = step / found["DAQP's solve"][0], np.nan
+        if given.peer and kind == "N" and n:
             found["do-mpc"] = peer(n, N)
-        medians |= {(n, N, kind, key): value for key, (value, _) in found.items()}
-        texts = [f"{found[key][0]:.3f}, {found[key][1]:.2f}" if key in found else "" for key in columns]
-        lines.append(f"| {n} | {N} | {blocks} | {' | '.join(texts)} |")
+        if n:
+            medians |= {(n, N, kind, key): value for key, (value, _) in found.items()}
+        texts = [cell(key, found) for key in columns]
+        lines.append(f"| {n or 'reference'} | {N} | {blocks} | {' | '.join(texts)} |")
         print(lines[-1], flush=True)
     grown = exponents(medians, columns)
     print(*grown, sep="\n")
     if given.markdown is not None:
         given.markdown.write_text("\n".join([*lines, *grown]) + "\n", encoding="utf-8")
+
+
+def cases(sizes: Sequence[int], *, quick: bool) -> Iterator[tuple[int, int, str]]:
+    """Yield states, samples and kinds of blocks; no states are the reference problem."""
+    for n, N in [(0, 50), *((n, N) for n in sizes for N in ((50,) if quick else HORIZONS))]:
+        for kind in ("N", "10"):
+            if kind == "10" or N <= MOST_UNKNOWNS:
+                yield n, N, kind
+
+
+def cell(key: str, found: dict[str, tuple[float, float]]) -> str:
+    """Return a cell of the table."""
+    if key not in found:
+        return ""
+    median, worst = found[key]
+    return f"{median:.4f}, {worst:.3f}" if np.isfinite(worst) else f"{median:.1f}"
+
+
+def additions() -> float:
+    """Return the CPU time of five million additions [s]."""
+    began, total = time.process_time(), 0
+    for i in range(5_000_000):
+        total += i
+    return time.process_time() - began
 
 
 def exponents(medians: dict[tuple[int, int, str, str], float], columns: Sequence[str]) -> list[str]:

@@ -92,7 +92,7 @@ def export_controller(controller: Controller, folder: str | Path, *, arduino: bo
     folder.mkdir(parents=True, exist_ok=True)
     model = controller.model
     code = write_model(model.model, model.drive_index, model.dt / model.sub)
-    sizes = design_struct.sizes_of(controller, code.n_k, code.n_m, room=False)
+    sizes = design_struct.sizes_of(controller, code, room=False)
     numbers = design_struct.numbers_of(controller, np.array(code.constants(model.p.tolist())))
     files = {name: c_source(name) for name in _COPIED} | code.files
     files |= {

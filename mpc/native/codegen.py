@@ -1,21 +1,32 @@
-r"""A model's step as plain C99: what depends on its parameters, on the state, on a direction, each once.
+r"""A model's step as plain C99: what depends on parameters, drives, state and direction, each once.
 
 CasADi holds the equations as a list of instructions.  Each instruction depends on
 
     1. the parameters alone          (conductances, the factors of an implicit step)
-    2. the state, the drives, too    (the step itself, its partial derivatives)
-    3. the direction, too            (the tangent, linear in the direction)
+    2. the drives, too               (what a constant drive makes of the step)
+    3. the state, too                (the step itself, its partial derivatives)
+    4. the direction, too            (the tangent, linear in the direction)
 
 and is written into the first function that knows all it needs:
 
-    prepare(p -> k),    next(x, u, d, k -> x+),    partials(x, u, d, k -> x+, m),
-    tangent(m, k, sx, su -> sx+)    and the same with a direction of the disturbances, sd.
+    prepare(p -> k),    hold(u, k -> h),    step(x, u, d, k, h -> x+),
+    partials(x, u, d, k, h -> x+, m),    tangent(m, k, h, sx -> sx+)
 
-``tangent`` runs over many directions side by side, column by column in its innermost loop, which a compiler
-turns into vector instructions.  A dense Jacobian of an implicit step takes ten times the work of the step for
-every sample; a dozen tangents that share their partial derivatives take two or three.  Where the Jacobian is
-sparse and the other way about, its non-zeros are the partial derivatives and the tangent is their product
-with the direction; the shorter of the two is written.
+and the last with a direction of the drives, su, and of the disturbances, sd, too.  ``hold`` does as much of
+it as ``step`` reads, ``hold_slopes`` all; ``next`` is hold and step.
+
+``tangent`` runs over many directions, n groups of four side by side, each group's numbers behind those of the
+last: entry i of direction c at [c / 4][i][c % 4].  Of the loop over the four a compiler makes vector
+instructions.  A dense Jacobian of an implicit step takes ten times the work of the step for every sample; a
+dozen tangents that share their partial derivatives take two or three.  Where the Jacobian is sparse and
+the other way about, its non-zeros are the partial derivatives and the tangent is their product with the
+direction.  A step that is linear in state and disturbances while the drives stand still, as that of a Peltier
+element is, x+ = A(u) x + E(u) d + a(u), can be written in that form, row by row: a plan of ten blocks then
+takes ten times the work of A, not as many times as there are samples.  Of all these forms the shortest is
+written.
+
+Rows of many constants, as of a black box of 20 states, are tables that loops run over: unrolled, a step of 60
+states is half a megabyte.
 
 A quotient by something known earlier becomes a product with its reciprocal.  Nothing here is CasADi's own C:
 the code needs ``math.h`` and nothing else.
@@ -24,9 +35,14 @@ the code needs ``math.h`` and nothing else.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermogrip.datasets.arrays import Array
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import Model
@@ -68,19 +84,35 @@ _OPERATIONS |= {
         *("asinh", "acosh", "atanh", "floor", "ceil", "erf", "log1p", "expm1"),
     )
 }
-_STATE = "const double *x, const double *u, const double *d, const double *k, double *xn"
-_COLUMNS = (
-    "int n, int w, const double *m, const double *k, const double *restrict sx, const double *restrict su"
-)
+_PARAMETERS, _DRIVES, _STATE, _DIRECTION = 1, 2, 3, 4  # what a value depends on
+_POINT = "const double *x, const double *u, const double *d, const double *k"
+_SU, _SD = "const double *restrict su", "const double *restrict sd"
+_COLUMNS = "int n, const double *m, const double *k, const double *h, const double *restrict sx"
 _HEADS = {
     part: f"void tg_model_{part}({arguments})"
     for part, arguments in {
         "prepare": "const double *p, double *k",
-        "next": _STATE,
-        "partials": f"{_STATE}, double *m",
+        "hold": "const double *u, const double *k, double *h",
+        "hold_slopes": "const double *u, const double *k, double *h",
+        "step": f"{_POINT}, const double *h, double *xn",
+        "next": f"{_POINT}, double *xn",
+        "partials": f"{_POINT}, const double *h, double *xn, double *m",
         "tangent": f"{_COLUMNS}, double *restrict out",
-        "tangent_d": f"{_COLUMNS}, const double *restrict sd, double *restrict out",
+        "tangent_u": f"{_COLUMNS}, {_SU}, double *restrict out",
+        "tangent_d": f"{_COLUMNS}, {_SU}, {_SD}, double *restrict out",
     }.items()
+}
+_LONG, _MANY = 8, 250  # constants in a row, and in all of them, from which on they are a table
+#: How much longer than a product these take.
+_SLOW = {
+    "OP_DIV": 4,
+    "OP_INV": 4,
+    "OP_SQRT": 4,
+    "OP_POW": 20,
+    "OP_CONSTPOW": 20,
+    "OP_EXP": 10,
+    "OP_LOG": 10,
+    "OP_TANH": 20,
 }
 
 
@@ -91,7 +123,7 @@ class _Value:
     what: str  # CasADi's name of the operation
     text: str  # in C
     uses: tuple[int, ...]
-    stage: int  # 0 a constant, 1 parameters, 2 state, 3 direction
+    stage: int  # 0 a constant, 1 parameters, 2 drives, 3 state, 4 direction
     number: float = 0.0  # a constant, or which entry of an input
     place: str = ""  # where a later function finds it
 
@@ -100,6 +132,61 @@ class _Value:
 class _Line:
     values: list[_Value] = field(default_factory=list)
     outputs: list[dict[int, int]] = field(default_factory=list)  # by output: entry -> value
+    n_u: int = 0
+    n_d: int = 0
+
+
+@dataclass(frozen=True)
+class _Table:
+    """Rows of a step that are constants times state, drives and disturbances, and a constant."""
+
+    rows: list[int]
+    slopes: dict[str, Array]  # of "x", "u" and "d"
+    added: Array
+
+    def define(self) -> list[str]:
+        """Return the arrays in C."""
+        if not self.rows:
+            return []
+        parts = {"slope_" + of: values.ravel() for of, values in self.slopes.items() if values.size}
+        lines = [_array("double", name, values) for name, values in (parts | {"added": self.added}).items()]
+        return [_array("int", "table", np.array(self.rows)), *lines]
+
+    def step(self) -> list[str]:
+        """Return the statements of the state one step later."""
+        lines = ["double sum = added[i];"]
+        for of, values in self.slopes.items():
+            if n := values.shape[1]:
+                lines += [f"for (int j = 0; j < {n}; j++)", f"    sum += slope_{of}[{n} * i + j] * {of}[j];"]
+        return self._loop([*lines, "xn[table[i]] = sum;"])
+
+    def tangent(self, along: str) -> list[str]:
+        """Return the statements of a group's four tangents, along directions of x, u, d or some of them."""
+        lines = ["double sum[4] = {0.0};"]
+        for of in along:
+            if n := self.slopes[of].shape[1]:
+                lines += [
+                    f"for (int j = 0; j < {n}; j++)",
+                    "    for (int c = 0; c < 4; c++)",
+                    f"        sum[c] += slope_{of}[{n} * i + j] * s{of}[4 * j + c];",
+                ]
+        return self._loop([*lines, "for (int c = 0; c < 4; c++)", "    out[4 * table[i] + c] = sum[c];"])
+
+    def _loop(self, lines: Sequence[str]) -> list[str]:
+        if not self.rows:
+            return []
+        return [
+            f"    for (int i = 0; i < {len(self.rows)}; i++) {{",
+            *("        " + text for text in lines),
+            "    }",
+        ]
+
+
+def _array(kind: str, name: str, values: Array) -> str:
+    """Return a constant array in C."""
+    texts = [repr(value) for value in values.tolist()]
+    rows = [", ".join(texts[at : at + 5]) for at in range(0, len(texts), 5)]
+    return f"static const {kind} {name}[{len(texts)}] = {{\n    " + ",\n    ".join(rows) + "};\n"
 
 
 @dataclass(frozen=True)
@@ -108,7 +195,8 @@ class ModelCode:
 
     source: str  # definitions of ``tg_model_prepare`` and the others of the module's text
     header: str  # their declarations
-    n_k: int  # length of what ``prepare`` and ``partials`` leave behind
+    n_k: int  # length of what ``prepare``, ``hold`` and ``partials`` leave behind
+    n_h: int
     n_m: int
     line: _Line
 
@@ -140,14 +228,13 @@ class ModelCode:
 
 def write_model(model: Model, drives: Sequence[int], h: float) -> ModelCode:
     """Return the C of a model's step of length h [s]; inputs that are no drives are switches, and on."""
-    sparse, tangents = (_straight(_graph(model, drives, h, jacobian=way)) for way in (True, False))
-    # a tangent is done for a dozen directions, four side by side; all else once
-    line = min(sparse, tangents, key=lambda item: _work(item, 12.0 / 4.0))
-    return _write(line)
+    table, graphs = _graphs(model, drives, h)
+    return _write(min((_straight(form) for form in graphs), key=_work), table)
 
 
-def _graph(model: Model, drives: Sequence[int], h: float, *, jacobian: bool) -> Any:
-    """Return the function (p, x, u, d, sx, su, sd) -> (x+, tangent, tangent with sd)."""
+def _graphs(model: Model, drives: Sequence[int], h: float) -> tuple[_Table, list[Any]]:
+    """Return what is a table, and each form of the rest as a function (p, x, u, d, sx, su, sd) -> (x+,
+    tangents along sx, with su, with sd)."""
     import casadi as ca
 
     n_d = len(model.disturbances)
@@ -159,15 +246,46 @@ def _graph(model: Model, drives: Sequence[int], h: float, *, jacobian: bool) -> 
         full[at] = value
     lists = [ca.vertsplit(item) if item.numel() else [] for item in (x, d, p)]
     after = ca.vertcat(*model.step(lists[0], full, lists[1], lists[2], h))
-    if jacobian:
-        A, B, E = (ca.jacobian(after, item) for item in (x, u, d))
-        plain = ca.mtimes(A, sx) + ca.mtimes(B, su)
-        whole = plain + ca.mtimes(E, sd)
-    else:
-        plain = ca.jtimes(after, ca.vertcat(x, u), ca.vertcat(sx, su))
-        whole = ca.jtimes(after, ca.vertcat(x, u, d), ca.vertcat(sx, su, sd))
-    results = ca.cse([ca.densify(item) for item in (after, plain, whole)])
-    return ca.Function("model", [p, x, u, d, sx, su, sd], results)
+    table = _tabulate(after, x, u, d)
+    after = ca.vertcat(*(0 if i in table.rows else after[i] for i in range(model.n_x)))
+    moving, along = ca.vertcat(x, d), (sx, su, sd)
+    bent = ca.which_depends(after, moving, 2, True)
+    none = ca.DM.zeros(moving.numel(), 1)
+    at_zero, slopes = ca.substitute([after, ca.jacobian(after, moving)], [moving], [none])
+    straight = at_zero + ca.mtimes(slopes, moving)
+    rows = [after[i] if bent[i] else straight[i] for i in range(model.n_x)]
+    rewritten = ca.vertcat(*rows)
+    steps = [after] if all(bent) else [after, rewritten]
+    found = []
+    for step in steps:
+        A, B, E = (ca.jacobian(step, item) for item in (x, u, d))
+        parts = [ca.mtimes(each, by) for each, by in zip((A, B, E), along)]
+        tangents = [parts[0], parts[0] + parts[1], parts[0] + parts[1] + parts[2]]
+        others = [ca.jtimes(step, ca.vertcat(*(x, u, d)[:n]), ca.vertcat(*along[:n])) for n in range(1, 4)]
+        for three in (tangents, others):
+            results = ca.cse([ca.densify(item) for item in (step, *three)])
+            found.append(ca.Function("model", [p, x, u, d, *along], results))
+    return table, found
+
+
+def _tabulate(after: Any, x: Any, u: Any, d: Any) -> _Table:
+    """Return the rows of a step whose slopes are many constants."""
+    import casadi as ca
+
+    given, n_x, n_u = ca.vertcat(x, u, d), x.numel(), u.numel()
+    slopes = ca.jacobian(after, given)
+    count = slopes.sparsity().T.colind()
+    long = [i for i in range(n_x) if count[i + 1] - count[i] >= _LONG]
+    if long and any(bent := ca.which_depends(after, given, 2, True)):
+        long = [i for i in long if not bent[i]]
+    added = ca.substitute(after, given, ca.DM.zeros(given.numel(), 1))
+    long = [i for i in long if not ca.symvar(ca.vertcat(slopes[i, :].T, added[i]))]
+    if sum(count[i + 1] - count[i] for i in long) < _MANY:
+        long = []
+    dense = np.array(ca.DM(ca.evalf(ca.densify(slopes[long, :])))).reshape(len(long), given.numel())
+    parts = np.split(dense, [n_x, n_x + n_u], axis=1)
+    level = np.array(ca.DM(ca.evalf(ca.densify(added[long])))).ravel()
+    return _Table(long, dict(zip("xud", parts, strict=True)), level)
 
 
 def _straight(function: Any) -> _Line:
@@ -175,9 +293,9 @@ def _straight(function: Any) -> _Line:
     import casadi as ca
 
     names = {getattr(ca, key): key for key in dir(ca) if key.startswith("OP_")}
-    inputs = ("p[{}]", "x[{}]", "u[{}]", "d[{}]", "sx[{} * w + c]", "su[{} * w + c]", "sd[{} * w + c]")
-    stages = (1, 2, 2, 2, 3, 3, 3)
-    line = _Line(outputs=[{} for _ in range(function.n_out())])
+    inputs = ("p[{}]", "x[{}]", "u[{}]", "d[{}]", "sx[{} + c]", "su[{} + c]", "sd[{} + c]")
+    stages = (_PARAMETERS, _STATE, _DRIVES, _STATE, *(_DIRECTION,) * 3)
+    line = _Line([], [{} for _ in range(function.n_out())], function.numel_in(2), function.numel_in(3))
     at: dict[int, int] = {}  # place in CasADi's work vector -> value
     for number in range(function.n_instructions()):
         what = names[function.instruction_id(number)]
@@ -187,7 +305,8 @@ def _straight(function: Any) -> _Line:
             continue
         if what == "OP_INPUT":
             source, entry = out_of
-            value = _Value(what, inputs[source].format(entry), (), stages[source], entry)
+            place = 4 * entry if stages[source] == _DIRECTION else entry
+            value = _Value(what, inputs[source].format(place), (), stages[source], entry)
         elif what == "OP_CONST":
             constant = float(function.instruction_constant(number))
             value = _Value(what, f"({constant!r})", (), 0, constant)
@@ -203,7 +322,12 @@ def _operation(line: _Line, what: str, uses: tuple[int, ...]) -> _Value:
     stage = max(line.values[use].stage for use in uses)
     if what not in _OPERATIONS:
         raise NotImplementedError(f"the model uses {what}, which has no C here")
-    if what == "OP_DIV" and 0 < line.values[uses[1]].stage < stage:
+    divisor = line.values[uses[-1]]
+    if what == "OP_DIV" and divisor.what == "OP_CONST" and divisor.number and stage:
+        constant = 1.0 / divisor.number
+        line.values.append(_Value("OP_CONST", f"({constant!r})", (), 0, constant))
+        return _Value("OP_MUL", "{0} * {1}", (uses[0], len(line.values) - 1), stage)
+    if what == "OP_DIV" and 0 < divisor.stage < stage:
         line.values.append(_Value("OP_INV", "1.0 / {0}", (uses[1],), line.values[uses[1]].stage))
         return _Value("OP_MUL", "{0} * {1}", (uses[0], len(line.values) - 1), stage)
     return _Value(what, _OPERATIONS[what][0], uses, stage)
@@ -219,54 +343,91 @@ def _needed(line: _Line, roots: Sequence[int]) -> set[int]:
     return found
 
 
-def _work(line: _Line, directions: float) -> float:
-    """Return the instructions of a sample and its tangents."""
-    needed = _needed(line, [at for entry in line.outputs[:2] for at in entry.values()])
-    stages = [line.values[at].stage for at in needed if line.values[at].uses]
-    return stages.count(2) + directions * stages.count(3)
+def _work(line: _Line) -> float:
+    """Return the instructions of a sample: a step of the plan, another one with partial derivatives, a dozen
+    tangents, four side by side; drives change in every other sample."""
+    step, tangent = (_needed(line, list(line.outputs[n].values())) for n in (0, 1))
+
+    def count(found: set[int], stage: int) -> float:
+        made = (line.values[at] for at in found if line.values[at].uses)
+        return float(sum(_SLOW.get(value.what, 1) for value in made if value.stage == stage))
+
+    both = step | tangent
+    once = count(step, _STATE) + count(both, _STATE) + 3 * count(tangent, _DIRECTION)
+    return once + 0.5 * (count(step, _DRIVES) + count(both, _DRIVES))
 
 
-def _write(line: _Line) -> ModelCode:
-    outputs = [list(found.items()) for found in line.outputs]
+def _write(line: _Line, table: _Table) -> ModelCode:
+    outputs = [[pair for pair in found.items() if pair[0] not in table.rows] for found in line.outputs]
     roots = [[at for _, at in found] for found in outputs]
     everything = _needed(line, [at for part in roots for at in part])
-    k, m = _hand_over(line, everything, 1, "k"), _hand_over(line, everything, 2, "m")
-    parts = {
-        "prepare": _body(line, 1, k, [f"k[{entry}] = {{}};" for entry in range(len(k))]),
-        "next": _body(line, 2, roots[0], [f"xn[{entry}] = {{}};" for entry, _ in outputs[0]]),
-        "partials": _body(
-            line,
-            2,
-            roots[0] + m,
-            [f"xn[{entry}] = {{}};" for entry, _ in outputs[0]]
-            + [f"m[{entry}] = {{}};" for entry in range(len(m))],
-        ),
-        "tangent": _body(line, 3, roots[1], [f"out[{entry} * w + c] = {{}};" for entry, _ in outputs[1]]),
-        "tangent_d": _body(line, 3, roots[2], [f"out[{entry} * w + c] = {{}};" for entry, _ in outputs[2]]),
+    k = _hand_over(line, everything, _PARAMETERS, "k")
+    # what a step reads comes first
+    h = _hand_over(line, everything, _DRIVES, "h", first=_needed(line, roots[0]))
+    m = _hand_over(line, everything, _STATE, "m")
+    read = [at for at in h if at in _needed(line, roots[0])]
+    into = {
+        "k": [f"k[{entry}] = {{}};" for entry in range(len(k))],
+        "h": [f"h[{entry}] = {{}};" for entry in range(len(h))],
+        "m": [f"m[{entry}] = {{}};" for entry in range(len(m))],
+        "xn": [f"xn[{entry}] = {{}};" for entry, _ in outputs[0]],
     }
-    source = []
+    out = [[f"out[{4 * entry} + c] = {{}};" for entry, _ in outputs[n]] for n in (1, 2, 3)]
+    parts = {
+        "prepare": _body(line, _PARAMETERS, k, into["k"]),
+        "hold": _body(line, _DRIVES, read, into["h"][: len(read)]),
+        "hold_slopes": _body(line, _DRIVES, h, into["h"]),
+        "step": [*_body(line, _STATE, roots[0], into["xn"]), *table.step()],
+        "next": [
+            f"    double h[{max(1, len(read))}];",
+            "    tg_model_hold(u, k, h);",
+            "    tg_model_step(x, u, d, k, h, xn);",
+        ],
+        "partials": [*_body(line, _STATE, roots[0] + m, into["xn"] + into["m"]), *table.step()],
+        "tangent": _body(line, _DIRECTION, roots[1], out[0]),
+        "tangent_u": _body(line, _DIRECTION, roots[2], out[1]),
+        "tangent_d": _body(line, _DIRECTION, roots[3], out[2]),
+    }
+    source = table.define()
+    n_x = len(line.outputs[0])
+    sizes = {"sx": n_x, "su": line.n_u, "sd": line.n_d, "out": n_x}
+    along = {"tangent": "x", "tangent_u": "xu", "tangent_d": "xud"}
     for part, lines in parts.items():
         head = _HEADS[part]
         arguments = [item.split()[-1].lstrip("*") for item in head[head.index("(") + 1 : -1].split(",")]
-        body = "\n".join(lines)
-        unused = [
-            f"    (void){item};" for item in arguments if item not in ("n", "w") and f"{item}[" not in body
-        ]
+        more = table.tangent(along[part]) if part in along else []
+        body = "\n".join([*lines, *more])
+        unused = [f"    (void){item};" for item in arguments if not re.search(rf"\b{item}\b", body)]
         if part.startswith("tangent"):
-            lines = ["    for (int c = 0; c < n; c++) {", *("    " + item for item in lines), "    }"]
+            unused = [text for text in unused if text != "    (void)n;"]
+            moving = [item for item in arguments if item in sizes]
+            lines = _over_groups(lines, more, moving, sizes)
         source.append("\n".join([head, "{", *unused, *lines, "}", ""]))
     heads = [_HEADS[part].replace(" restrict ", " ").replace("*restrict ", "*") for part in parts]
     header = ";\n".join([*heads, ""])  # C++ has no such word, and to C it is the same declaration
-    return ModelCode("\n".join(source), header, len(k), len(m), line)
+    return ModelCode("\n".join(source), header, len(k), len(h), len(m), line)
 
 
-def _hand_over(line: _Line, needed: set[int], stage: int, letter: str) -> list[int]:
-    """Return the values of a stage that a later one reads, and say where it finds them."""
+def _over_groups(
+    lines: Sequence[str], more: Sequence[str], moving: Sequence[str], sizes: Mapping[str, int]
+) -> list[str]:
+    """Return statements for one direction, and more for four, repeated over groups of four."""
+    steps = ", ".join(["g++", *(f"{item} += {4 * sizes[item]}" for item in moving if sizes[item])])
+    inner = ["        for (int c = 0; c < 4; c++) {", *("        " + item for item in lines), "        }"]
+    inner = [*(inner if lines else []), *("    " + item for item in more)]
+    return [f"    for (int g = 0; g < n; {steps}) {{", *inner, "    }"]
+
+
+def _hand_over(
+    line: _Line, needed: set[int], stage: int, letter: str, first: Collection[int] = ()
+) -> list[int]:
+    """Return the values of a stage that a later one reads, those in ``first`` before others, and say where it
+    finds them."""
     later = [at for at in needed if line.values[at].stage > stage]
     read = {use for at in later for use in line.values[at].uses}
-    if stage == 1:  # what is a result of the step is none of the tangent's business
+    if stage < _STATE:  # what is a result of the step is none of the tangent's business
         read |= {at for found in line.outputs for at in found.values()}
-    kept = sorted(at for at in read if line.values[at].stage == stage)
+    kept = sorted((at for at in read if line.values[at].stage == stage), key=lambda at: (at not in first, at))
     for entry, at in enumerate(kept):
         line.values[at].place = f"{letter}[{entry}]"
     return kept

@@ -7,6 +7,7 @@ initialiser of an export, so that none of the three can drift from the others.
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ import numpy as np
 from thermogrip.datasets.arrays import Array
 
 if TYPE_CHECKING:
+    from thermogrip.mpc.native.codegen import ModelCode
     from thermogrip.mpc.optimiser.rti import ControllerParts
 
 ITERATION_LIMIT = 500
@@ -42,6 +44,8 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "iterations": (True, (), "programs a sample, at most"),
     "linear": (True, (), "whether the plant is linear, so that its derivatives never change"),
     "switched": (True, (), "whether there is a pump"),
+    "read_from": (True, ("NY",), "the first state that an output reads, and the first behind the last"),
+    "read_to": (True, ("NY",), ""),
     "dt": (False, (), "sample time [s]"),
     "track": (False, (), "weights of the cost"),
     "terminal": (False, (), ""),
@@ -104,7 +108,9 @@ class Sizes:
     NH: int
     NC: int
     NL: int
-    NK: int  # what the model's ``prepare`` and ``partials`` hand over
+    NE: int  # numbers in the rows of the response
+    NK: int  # what the model's ``prepare``, ``hold`` and ``partials`` hand over
+    NF: int
     NM: int
 
     @property
@@ -122,10 +128,14 @@ class Sizes:
         return tuple(getattr(self, size) for size in _FIELDS[name][1])
 
 
-def sizes_of(controller: ControllerParts, n_k: int, n_m: int, *, room: bool) -> Sizes:
+def sizes_of(controller: ControllerParts, code: ModelCode, *, room: bool) -> Sizes:
     """Return the sizes of a controller; with ``room``, such that its variants in a search fit too."""
     model, design = controller.model, controller.design
     N, n_y = sum(design.blocks), model.n_y
+    controlled, limited = (n_y, n_y) if room else (len(design.controlled), len(design.limits))
+    most = -(-N // 32) * 32 if room else N
+    longest = _whole(len(design.blocks) * model.n_u)
+    entries = most * longest if room else _row_lengths(design.blocks, model.n_u)
     return Sizes(
         NX=model.n_x,
         NU=model.n_u,
@@ -134,17 +144,31 @@ def sizes_of(controller: ControllerParts, n_k: int, n_m: int, *, room: bool) -> 
         NW=controller.disturbance.n_w,
         NG=len(controller.observer.lagged),
         NB=len(design.blocks),
-        NH=-(-N // 32) * 32 if room else N,
-        NC=n_y if room else len(design.controlled),
-        NL=n_y if room else len(design.limits),
-        NK=n_k,
-        NM=n_m,
+        NH=most,
+        NC=controlled,
+        NL=limited,
+        NE=(controlled + limited) * entries,
+        NK=code.n_k,
+        NF=code.n_h,
+        NM=code.n_m,
     )
+
+
+def _whole(n: int) -> int:
+    """Return n numbers in whole groups of four, as the C has its rows."""
+    return -(-n // 4) * 4
+
+
+def _row_lengths(blocks: Sequence[int], n_u: int) -> int:
+    """Return the sum of the lengths of one output's rows: those of four samples are as long as the last."""
+    of_sample = np.repeat(np.arange(1, len(blocks) + 1), blocks)
+    last = np.minimum(np.arange(len(of_sample)) // 4 * 4 + 3, len(of_sample) - 1)
+    return sum(_whole(int(b) * n_u) for b in of_sample[last])
 
 
 def config_header(sizes: Sizes) -> str:
     """Return ``tg_config.h``: the sizes, and the struct of a design."""
-    names = ("NX", "NU", "ND", "NY", "NW", "NG", "NB", "NH", "NC", "NL", "NS", "NK", "NM")
+    names = ("NX", "NU", "ND", "NY", "NW", "NG", "NB", "NH", "NC", "NL", "NS", "NE", "NK", "NF", "NM")
     lines = ["/* Sizes and numbers of one controller. */", "#ifndef TG_CONFIG_H", "#define TG_CONFIG_H", ""]
     lines += [f"#define TG_{name} {getattr(sizes, name)}" for name in names]
     lines += ["", "typedef struct {"]
@@ -218,6 +242,8 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
         "loop_output": [design.controlled.index(loop.output) for loop in loops],
         "linear": model.affine is not None,
         "switched": bool(model.model.switches),
+        "read_from": [int(np.argmax(row != 0)) for row in model.C],
+        "read_to": [model.n_x - int(np.argmax(row[::-1] != 0)) if row.any() else 0 for row in model.C],
         "limit_low": limits[:, 0],
         "limit_high": limits[:, 1],
         "settled_gain": np.zeros(model.n_u) if optimiser.settled_gain is None else optimiser.settled_gain,
@@ -253,7 +279,7 @@ def _controller_parts(s: Sizes) -> list[tuple[Any, int]]:
     """Return kind and length of each part of ``tg_controller``, in order."""
     number, whole = ctypes.c_double, ctypes.c_int
     n, z, some = s.NB * s.NU, s.NZ, max(1, s.NS)
-    wide = max(s.NX + s.NU + s.ND, n)
+    wide = _whole(max(s.NX + s.NU + s.ND, n))
     still = [*((number, count) for count in (s.NU, s.NW, _BINS, 1)), (whole, 3)]
     relaxation = type("tg_relaxation", (ctypes.Structure,), {"_fields_": _laid_out(still)})
     qp = type("tg_qp", (ctypes.Structure,), {"_fields_": _laid_out(_qp_parts(s))})
@@ -272,28 +298,29 @@ def _controller_parts(s: Sizes) -> list[tuple[Any, int]]:
         *((number, count) for count in (n, s.NH * s.NY, n, 1)),
         (whole, 2),
         (number, 1),
-        (whole, s.NC + 1),
+        (whole, s.NC + 3),
         (qp, 1),
-        *((number, count) for count in (s.NH * some * n, s.NH * s.NY, s.NH * s.NY, s.NH * some)),
+        *((number, count) for count in (max(1, s.NE), s.NH * s.NY, s.NH * s.NY, s.NH * some)),
         *((number, count) for count in (2 * s.NX * wide, s.NU * wide, max(1, s.ND) * wide)),
-        *((number, count) for count in (s.NM, z * z, z * z)),
+        *((number, count) for count in (s.NF, s.NM, z * z, z * z)),
     ]
 
 
 def _qp_parts(s: Sizes) -> list[tuple[Any, int]]:
     number, whole, small = ctypes.c_double, ctypes.c_int, ctypes.c_byte
     n, soft = s.NB * s.NU, s.NH * s.NS
-    rows = 2 * n + soft
+    rows, w = 2 * n + soft, _whole(n)
     return [
         (whole, 4),
-        *((number, count) for count in (n * n, n, 2 * rows, soft * n)),
-        (whole, soft),
+        *((number, count) for count in (n * w, w, 2 * rows)),
+        (ctypes.c_void_p, 1),
+        *((whole, max(1, soft)) for _ in range(2)),
         *((number, count) for count in (max(1, s.NS),) * 3),
         (whole, 2),
         (ctypes.c_void_p, 2),
-        (number, n),
-        (whole, 2 + rows),
+        (number, w),
+        (whole, 2 + 2 * rows),
         (small, 2 * rows),
-        *((number, count) for count in (rows, n + rows, rows * n, rows * (rows + 1) // 2, 3 * rows)),
+        *((number, count) for count in (rows, 2 * w + rows, rows * w, rows * (rows + 1) // 2, 3 * rows)),
         (small, rows),
     ]

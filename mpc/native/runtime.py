@@ -41,7 +41,16 @@ SOURCES = ("tg_qp.h", "tg_qp.c", "tg_controller.h", "tg_controller.c", "tg_obser
 
 # sums may be done in any order and pairs of operations at once; NaN keeps its meaning
 _FLAGS = (
-    *("-std=c99", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros"),
+    *(
+        "-std=c99",
+        "-O2",
+        "-fvect-cost-model=dynamic",
+        "-fno-inline-functions-called-once",
+        "-march=native",
+        "-fno-math-errno",
+        "-fno-trapping-math",
+        "-fno-signed-zeros",
+    ),
     *("-fassociative-math", "-ffp-contract=fast", "-fPIC", "-shared"),
 )
 
@@ -148,7 +157,7 @@ class CompiledController:
     def __init__(self, controller: ControllerParts) -> None:
         model = controller.model
         step = _code_of(model)
-        self.sizes: Sizes = sizes_of(controller, step.n_k, step.n_m, room=True)
+        self.sizes: Sizes = sizes_of(controller, step, room=True)
         files = {name: c_source(name) for name in (*SOURCES, "tg_host.c")} | step.files
         self.library = _library(build_library(files | {"tg_config.h": config_header(self.sizes)}))
         k = np.zeros(max(1, step.n_k))

@@ -110,7 +110,8 @@ class Optimiser:
         self._of_row = dict(zip(self._rows, self.weight))
         self._weight = np.full(self.N, design.track)  # of each sample
         self._weight[-1] += design.terminal
-        lengths = np.repeat(np.array(self.blocks, dtype=float), model.n_u)
+        self._lengths = np.array(self.blocks, dtype=float)
+        lengths = np.repeat(self._lengths, model.n_u)
         self._fixed = 2 * (
             design.move * self.differences.T @ self.differences + design.drive * np.diag(lengths)
         )
@@ -317,28 +318,31 @@ class Optimiser:
 
     def _merit(self, plans: Array, y: Array, target: Array, side: Array, last: Array) -> Array:
         """Return the cost (B,) of plans (B, n_b, n_u) whose outputs y (B, N, n_y) were simulated."""
-        design, span = self.design, self.model.span
-        before = np.concatenate([np.broadcast_to(last, (len(plans), 1, last.size)), plans], axis=1)
-        cost = self._move * np.sum((np.diff(before, axis=1) / span) ** 2, axis=(1, 2))
-        cost += design.drive * np.sum((plans / span) ** 2 * np.array(self.blocks)[:, None], axis=(1, 2))
-        over: list[tuple[float, Array]] = []
+        design, shares = self.design, plans / self.model.span
+        moves = shares.copy()
+        moves[:, 1:] -= shares[:, :-1]
+        moves[:, 0] -= last / self.model.span
+        cost = self._move * np.einsum("ijk,ijk->i", moves, moves)
+        cost += design.drive * np.einsum("ijk,ijk,j->i", shares, shares, self._lengths)
         if self._costs is not None:
-            cost += np.sum(plans / span * self._costs, axis=(1, 2))
+            cost += np.einsum("ijk,jk->i", shares, self._costs)
+        over: list[tuple[float, Array]] = []
         for at in self._seen_rows:
             error = y[:, :, self._rows[at]] - target[:, at]
             if self.zone[at]:
                 slack = np.maximum(0.0, np.abs(error) - self.zone[at])
                 cost += self.weight[at] * ((slack + slack**2) @ self._weight)
                 continue
-            cost += self.weight[at] * (error**2 @ self._weight)
+            cost += self.weight[at] * ((error * error) @ self._weight)
             if side[at]:
                 over.append((design.price, side[at] * error - design.overshoot))
         for at, row in enumerate(self._limited):
-            over.append((self.dear[at], self._limits[at, 0] - y[:, :, row]))
-            over.append((self.dear[at], y[:, :, row] - self._limits[at, 1]))
+            low, high = self._limits[at]
+            over.append((self.dear[at], np.maximum(low - y[:, :, row], y[:, :, row] - high)))
         for price, beyond in over:
-            slack = np.maximum(0.0, beyond)
-            cost += price * np.sum(FIRST * slack + slack**2, axis=1)
+            if not beyond.max() <= 0.0:
+                slack = np.maximum(0.0, beyond)
+                cost += price * (FIRST * slack.sum(axis=1) + np.einsum("ij,ij->i", slack, slack))
         return np.asarray(cost)
 
     def forget(self) -> None:

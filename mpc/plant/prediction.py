@@ -124,6 +124,7 @@ class PredictionModel:
         self.sub = max(1, round(wanted / plant.dt))
         self.dt = self.sub * plant.dt
         self._responses: dict[tuple[int, ...], Response] = {}
+        self._directions: dict[tuple[int, ...], tuple[Array, Array, Array]] = {}
         self.sub = self._fewest_steps()
 
     def _fewest_steps(self) -> int:
@@ -180,7 +181,7 @@ class PredictionModel:
     def run(self, x: Array, u: Array, d: Array) -> tuple[Array, Array]:
         """Simulate plans u (B, N, n_u) from states x (B, n_x) under d (n_d,), (B, n_d) or (1, N, n_d); return
         outputs (B, N + 1, n_y) from the start on, and last states (B, n_x)."""
-        fine = np.repeat(self.inputs(u), self.sub, axis=1)
+        fine = self.inputs(u) if self.sub == 1 else np.repeat(self.inputs(u), self.sub, axis=1)
         d = np.repeat(d, self.sub, axis=1) if d.ndim == 3 else np.atleast_2d(d)[:, None, :]
         held = np.ascontiguousarray(np.broadcast_to(d, (d.shape[0], fine.shape[1], d.shape[2])))
         y, x_end = self.model.rollout(
@@ -211,20 +212,24 @@ class PredictionModel:
         after = ca.vertcat(*_step(self, symbols))
         if any(ca.which_depends(after, ca.vertcat(*symbols), 2, True)):
             return None
-        added, A, B, E = self._derivatives(*(np.zeros(n) for n in (self.n_x, self.n_u, self.n_d)))
+        # CasADi's own: once, which is not worth a compiled step
+        added, A, B, E = self._by_casadi(*(np.zeros(n) for n in (self.n_x, self.n_u, self.n_d)))
         return A, B, E, added
 
     def _derivatives(self, x: Array, u: Array, d: Array) -> tuple[Array, Array, Array, Array]:
         n_x, n_u = self.n_x, self.n_u
         if self._kernel is None:
-            found = self._casadi_sample(x, u, d)
-            return found[0].ravel(), found[1], found[2], found[3]
+            return self._by_casadi(x, u, d)
         along = np.eye(n_x + n_u + self.n_d)
         _, after = self._tangents(
             x, u[None], d, along[:, :n_x], along[:, None, n_x : n_x + n_u], along[:, n_x + n_u :]
         )
         A, B, E = np.split(after[:, n_x:].T, [n_x, n_x + n_u], axis=1)
         return after[0, :n_x], A, B, E
+
+    def _by_casadi(self, x: Array, u: Array, d: Array) -> tuple[Array, Array, Array, Array]:
+        after, A, B, E = self._casadi_sample(x, u, d)
+        return after.ravel(), A, B, E
 
     @cached_property
     def _kernel(self) -> Kernel | None:
@@ -240,17 +245,15 @@ class PredictionModel:
         if self._kernel is None:
             raise RuntimeError("no compiled step")
         count, n = len(su), len(u)
-        states = np.concatenate([np.broadcast_to(x, (count, self.n_x)), sx], axis=1)
-        drives = np.concatenate([np.broadcast_to(u, (count, n, self.n_u)), su], axis=2)
+        states = np.empty((count, 2 * self.n_x))
+        states[:, : self.n_x], states[:, self.n_x :] = x, sx
+        drives = np.empty((count, n, 2 * self.n_u))
+        drives[..., : self.n_u], drives[..., self.n_u :] = u, su
         told = np.atleast_2d(d)  # one row holds for all samples
-        rows = [
-            np.broadcast_to(told, (count, *told.shape)),
-            np.broadcast_to(sd[:, None], (count, *told.shape)),
-        ]
-        held = np.concatenate(rows, axis=2)
-        fine = np.repeat(drives, self.sub, axis=1)
-        held = held if len(told) == 1 else np.repeat(held, self.sub, axis=1)
-        held = np.ascontiguousarray(np.broadcast_to(held, (count, fine.shape[1], 2 * self.n_d)))
+        fine = drives if self.sub == 1 else np.repeat(drives, self.sub, axis=1)
+        held = np.empty((count, fine.shape[1], 2 * self.n_d))
+        held[..., : self.n_d] = told if len(told) == 1 else np.repeat(told, self.sub, axis=0)
+        held[..., self.n_d :] = sd[:, None]
         renew = np.zeros(fine.shape[1], dtype=bool)
         y, x_end = self._kernel.rollout(states, fine, held, np.zeros((1, 0)), self.dt / self.sub, renew)
         return y[:, :: self.sub], x_end
@@ -282,12 +285,18 @@ class PredictionModel:
         if self._kernel is None:
             return self._trajectory_by_casadi(x, plan, d, blocks)
         n_b, n_u = plan.shape
-        along = np.eye(n_b * n_u).reshape(n_b * n_u, n_b, n_u)
-        u, su = (np.repeat(values, np.asarray(blocks), axis=-2) for values in (plan, along))
-        none = np.zeros((n_b * n_u, self.n_x)), np.zeros((n_b * n_u, self.n_d))
-        y, _ = self._tangents(x, u, d, none[0], su, none[1])
+        u = np.repeat(plan, blocks, axis=0)
+        y, _ = self._tangents(x, u, d, *self._along_blocks(tuple(blocks)))
         G = y[:, 1:, self.n_y :].transpose(1, 2, 0).reshape(len(u), self.n_y, n_b, n_u)
         return np.ascontiguousarray(y[0, 1:, : self.n_y]), G
+
+    def _along_blocks(self, blocks: tuple[int, ...]) -> tuple[Array, Array, Array]:
+        """Return the directions (B, n_x), (B, N, n_u) and (B, n_d) of a drive in a block each, made once."""
+        if blocks not in self._directions:
+            n = len(blocks) * self.n_u
+            su = np.repeat(np.eye(n).reshape(n, len(blocks), self.n_u), blocks, axis=1)
+            self._directions[blocks] = np.zeros((n, self.n_x)), su, np.zeros((n, self.n_d))
+        return self._directions[blocks]
 
     def _response(self, blocks: tuple[int, ...]) -> Response:
         """Return how a linear plant's outputs answer, made once for these blocks."""

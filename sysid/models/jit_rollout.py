@@ -40,7 +40,7 @@ import operator
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -363,33 +363,34 @@ class Kernel:
         """Simulate a batch."""
         batch, n = len(x0), u.shape[1]
         n_x, n_u, n_d, n_p = self.equations.sizes
-        shapes = ((batch, n_x), (n, n_u), (n, n_d), (n_p,))
-        if not all(a.shape[-len(s) :] == s and len(a) in (1, batch) for a, s in zip((x0, u, d, p), shapes)):
+        ends = x0.shape[1:], u.shape[1:], d.shape[1:], p.shape[1:]
+        lengths = len(u), len(d), len(p)
+        if ends != ((n_x,), (n, n_u), (n, n_d), (n_p,)) or any(m not in (1, batch) for m in lengths):
             raise ValueError(f"shapes {x0.shape}, {u.shape}, {d.shape}, {p.shape} do not belong together")
         if pieces != 1 and not (self._in_pieces and pieces > 1):
             raise ValueError(f"not made for {pieces} steps in a row")
-        moved = np.ones(n + 1, dtype=np.uint8)  # the row behind the last ends the loop
+        moved = _ones(n + 1)  # the row behind the last ends the loop
         if renew is not None:
+            moved = moved.copy()
             moved[:n] = renew
         arrays = [np.ascontiguousarray(a, dtype=float) for a in (x0, u, d, p)]
         n_block = -(-batch // WIDTH)
-        # which entry of each array a member begins at; places beyond the last member repeat it
-        member = np.minimum(np.arange(n_block * WIDTH), batch - 1).reshape(n_block, 1, WIDTH)
-        stride = [a[0].size if len(a) > 1 else 0 for a in arrays]
-        begin = np.ascontiguousarray(member * np.array(stride)[:, None])
+        own = (n_x, *(size if m > 1 else 0 for m, size in zip(lengths, (n * n_u, n * n_d, n_p), strict=True)))
+        begin = _entries(batch, own if batch > 1 else (0,) * 4)
         y, x_end = np.empty((self._n_y, n + 1, n_block * WIDTH)), np.empty((n_x, n_block * WIDTH))
+        addresses = [a.ctypes.data for a in (*arrays, y, x_end, moved, begin)]
 
         def run(block: int) -> None:
             self._rollout(
-                *(a.ctypes.data for a in arrays),
-                begin[block].ctypes.data,
-                y.ctypes.data + block * BYTES,
-                x_end.ctypes.data + block * BYTES,
+                *addresses[:4],
+                addresses[7] + block * begin[0].nbytes,
+                addresses[4] + block * BYTES,
+                addresses[5] + block * BYTES,
                 n,
                 n_block * WIDTH,
                 pieces,
                 h,
-                moved.ctypes.data,
+                addresses[6],
             )
 
         if n_block == 1 or n < _WORTH_THREADS or _cores() == 1:
@@ -398,6 +399,21 @@ class Kernel:
         else:
             list(_threads().map(run, range(n_block)))
         return y.transpose(2, 1, 0)[:batch], x_end.T[:batch]
+
+
+@lru_cache(maxsize=64)
+def _ones(n: int) -> NDArray[np.uint8]:
+    """Return n ones, to be read only."""
+    return np.ones(n, dtype=np.uint8)
+
+
+@lru_cache(maxsize=256)
+def _entries(batch: int, own: tuple[int, ...]) -> NDArray[np.int64]:
+    """Return by block which entry of each array a member begins at, where members have so many of their own
+    there; places beyond the last member repeat it."""
+    blocks = -(-batch // WIDTH)
+    member = np.minimum(np.arange(blocks * WIDTH), batch - 1).reshape(blocks, 1, WIDTH)
+    return np.ascontiguousarray(member * np.array(own)[:, None])
 
 
 def _cores() -> int:

@@ -25,7 +25,7 @@
 #define TG_L (TG_NX + TG_NW)               /* where what the lagging outputs show begins in them, */
 #define TG_Z (TG_L + 3 * TG_NG)            /* states of the observer; their lags and scales are the last */
 #define TG_SEEDS (TG_NX + TG_NU + TG_ND)   /* directions of a sample's Jacobian */
-#define TG_WIDE (TG_SEEDS > TG_Q_N ? TG_SEEDS : TG_Q_N)
+#define TG_WIDE ((((TG_SEEDS > TG_Q_N ? TG_SEEDS : TG_Q_N) + 3) / 4) * 4)
 #define TG_SOME(n) ((n) > 0 ? (n) : 1)
 
 enum tg_status { TG_OK = 0, TG_LATE, TG_INFEASIBLE, TG_FALLBACK_PLAN, TG_FALLBACK_PI, TG_OFF, TG_MISMATCH };
@@ -103,12 +103,14 @@ typedef struct {
     double best[TG_Q_N], y_best[TG_NH * TG_NY], authority[TG_Q_N], broken;
     int qp_status, iterations;
     double kept_caution; /* of a linear plant: for what H was made, and whether there is a G */
-    int kept_lost[TG_NC], has_gains;
+    int kept_lost[TG_NC], has_gains, laid_out, has_jacobian;
     /* room to work in */
     tg_qp qp;
-    double G[TG_NH * TG_SOME(TG_NS) * TG_Q_N], y_guess[TG_NH * TG_NY], y_try[TG_NH * TG_NY];
+    double G[TG_SOME(TG_NE)]; /* the response: the soft rows of the program, sample by sample */
+    double y_guess[TG_NH * TG_NY], y_try[TG_NH * TG_NY];
     double free[TG_NH * TG_SOME(TG_NS)];
     double seed[2 * TG_NX * TG_WIDE], seed_u[TG_NU * TG_WIDE], seed_d[TG_SOME(TG_ND) * TG_WIDE];
+    double by_drives[TG_SOME(TG_NF)]; /* what the drives fix in the model's step */
     double partials[TG_SOME(TG_NM)], jacobian[TG_Z * TG_Z], spare[TG_Z * TG_Z];
 } tg_controller;
 

@@ -106,14 +106,19 @@ int tg_host_qp(tg_controller *c, int n, int s, const double *H, const double *f,
     q->price[0] = q->at_end[0] = linear;
     q->ratio[0] = quadratic / linear;
     q->iteration_limit = 500;
+    q->A = c->G;
+    c->has_gains = c->laid_out = 0;
+    memset(q->H, 0, sizeof q->H);
     for (int i = 0; i < n; i++)
-        memcpy(q->H + (size_t)i * TG_Q_N, H + (size_t)i * (size_t)n, (size_t)(i + 1) * sizeof(double));
+        memcpy(q->H + (size_t)i * (TG_Q_W + 1), H + (size_t)i * (size_t)(n + 1), (size_t)(n - i) * sizeof(double));
     memcpy(q->f, f, (size_t)n * sizeof(double));
     memcpy(q->lower, lower, (size_t)(2 * n + s) * sizeof(double));
     memcpy(q->upper, upper, (size_t)(2 * n + s) * sizeof(double));
     for (int i = 0; i < s; i++) {
-        q->filled[i] = n;
-        memcpy(q->A + (size_t)i * TG_Q_N, A + (size_t)i * (size_t)n, (size_t)n * sizeof(double));
+        q->filled[i] = TG_WHOLE(n);
+        q->start[i] = i * TG_WHOLE(n);
+        memset(c->G + q->start[i], 0, (size_t)q->filled[i] * sizeof(double));
+        memcpy(c->G + q->start[i], A + (size_t)i * (size_t)n, (size_t)n * sizeof(double));
     }
     if (!warm)
         tg_qp_forget(q);

@@ -24,7 +24,7 @@
 static double output(const tg_controller *c, int i, const double *x)
 {
     double sum = c->design->y0[i];
-    for (int j = 0; j < TG_NX; j++)
+    for (int j = c->design->read_from[i]; j < c->design->read_to[i]; j++)
         sum += c->design->C[i * TG_NX + j] * x[j];
     return sum;
 }
@@ -338,26 +338,39 @@ void tg_observer_reset(tg_controller *c, const double *y, const double *d)
     tg_observer_set_offsets(c, y, s->fixed);
 }
 
+static void set_lag_rows(tg_controller *c)
+{
+    for (int r = 0; r < TG_NG; r++) {
+        double *row = c->jacobian + (TG_L + r) * TG_Z;
+        plain_sensitivity(c, c->design->controlled[r], c->x, c->shown, row);
+        memset(row + TG_NX, 0, TG_NW * sizeof(double)); /* without the biases */
+    }
+}
+
+/* Entry i of direction c, of those that are kept in groups of four. */
+static double *entry(double *of, int n, int i, int c) { return of + (c / 4) * 4 * n + 4 * i + c % 4; }
+
 /* The Jacobian of a sample by tangents of the unit directions; the state one sample later into next.
- * Returned: its rows of TG_SEEDS, by states, drives and disturbances. */
-static const double *sample_jacobian(tg_controller *c, const double *u, const double *d, double *next)
+ * Returned: its entries, by states, drives and disturbances. */
+static double *sample_jacobian(tg_controller *c, const double *u, const double *d, double *next)
 {
     const tg_design *s = c->design;
     double x[TG_NX];
-    double *now = c->seed, *then = c->seed + TG_NX * TG_SEEDS, *swap;
-    memset(now, 0, (size_t)TG_NX * TG_SEEDS * sizeof(double));
-    memset(c->seed_u, 0, (size_t)TG_NU * TG_SEEDS * sizeof(double));
-    memset(c->seed_d, 0, (size_t)TG_SOME(TG_ND) * TG_SEEDS * sizeof(double));
+    double *now = c->seed, *then = c->seed + TG_NX * TG_WIDE, *swap;
+    memset(now, 0, (size_t)TG_NX * TG_WIDE * sizeof(double));
+    memset(c->seed_u, 0, sizeof c->seed_u);
+    memset(c->seed_d, 0, sizeof c->seed_d);
     for (int j = 0; j < TG_NX; j++)
-        now[j * TG_SEEDS + j] = 1.0;
+        *entry(now, TG_NX, j, j) = 1.0;
     for (int j = 0; j < TG_NU; j++)
-        c->seed_u[j * TG_SEEDS + TG_NX + j] = 1.0;
+        *entry(c->seed_u, TG_NU, j, TG_NX + j) = 1.0;
     for (int j = 0; j < TG_ND; j++)
-        c->seed_d[j * TG_SEEDS + TG_NX + TG_NU + j] = 1.0;
+        *entry(c->seed_d, TG_ND, j, TG_NX + TG_NU + j) = 1.0;
     memcpy(x, c->x, sizeof x);
+    tg_model_hold_slopes(u, s->k, c->by_drives);
     for (int part = 0; part < s->sub; part++) {
-        tg_model_partials(x, u, d, s->k, next, c->partials);
-        tg_model_tangent_d(TG_SEEDS, TG_SEEDS, c->partials, s->k, now, c->seed_u, c->seed_d, then);
+        tg_model_partials(x, u, d, s->k, c->by_drives, next, c->partials);
+        tg_model_tangent_d((TG_SEEDS + 3) / 4, c->partials, s->k, c->by_drives, now, c->seed_u, c->seed_d, then);
         memcpy(x, next, sizeof x);
         swap = now;
         now = then;
@@ -365,26 +378,41 @@ static const double *sample_jacobian(tg_controller *c, const double *u, const do
     }
     memset(c->jacobian, 0, sizeof c->jacobian);
     for (int i = 0; i < TG_NX; i++) {
-        const double *row = now + i * TG_SEEDS;
-        memcpy(c->jacobian + i * TG_Z, row, TG_NX * sizeof(double));
+        for (int j = 0; j < TG_NX; j++)
+            c->jacobian[i * TG_Z + j] = *entry(now, TG_NX, i, j);
         for (int k = 0; k < TG_NW; k++) {
             double sum = 0.0;
             for (int j = 0; j < TG_NU; j++)
-                sum += row[TG_NX + j] * s->on_drive[j * TG_NW + k] * s->span[j];
+                sum += *entry(now, TG_NX, i, TG_NX + j) * s->on_drive[j * TG_NW + k] * s->span[j];
             for (int j = 0; j < TG_ND; j++)
-                sum += row[TG_NX + TG_NU + j] * s->on_disturbance[j * TG_NW + k];
+                sum += *entry(now, TG_NX, i, TG_NX + TG_NU + j) * s->on_disturbance[j * TG_NW + k];
             c->jacobian[i * TG_Z + TG_NX + k] = sum;
         }
-    }
-    for (int r = 0; r < TG_NG; r++) {
-        double *row = c->jacobian + (TG_L + r) * TG_Z;
-        plain_sensitivity(c, s->controlled[r], c->x, c->shown, row);
-        memset(row + TG_NX, 0, TG_NW * sizeof(double)); /* without the biases */
     }
     for (int k = TG_NX; k < TG_Z; k++)
         if (k < TG_L || k >= TG_L + TG_NG)
             c->jacobian[k * (TG_Z + 1)] = 1.0;
+    set_lag_rows(c);
+    c->has_jacobian = 1;
     return now;
+}
+
+/* The state one sample later into next, and the Jacobian; of a linear plant only what lags is new. */
+static void look_ahead(tg_controller *c, const double *u, const double *d, double *next)
+{
+    const tg_design *s = c->design;
+    double x[TG_NX];
+    if (!s->linear || !c->has_jacobian) {
+        sample_jacobian(c, u, d, next);
+        return;
+    }
+    memcpy(x, c->x, sizeof x);
+    tg_model_hold(u, s->k, c->by_drives);
+    for (int part = 0; part < s->sub; part++) {
+        tg_model_step(x, u, d, s->k, c->by_drives, next);
+        memcpy(x, next, sizeof x);
+    }
+    set_lag_rows(c);
 }
 
 #define STEADY_STEPS 12
@@ -539,19 +567,19 @@ int tg_find_steady(tg_controller *c, const double *d, const double *on_u, const 
     for (int j = 0; j < TG_NU; j++)
         u[j] = fmin(fmax(u[j], s->lowest[j]), s->highest[j]);
     for (int step = 0; step < STEADY_STEPS && !found; step++) {
-        const double *rows;
+        double *slopes;
         double moved = 0.0;
         for (int j = 0; j < TG_NU; j++)
             both[j] = u[j] + on_u[j];
         memcpy(c->x, x, sizeof x);
-        rows = sample_jacobian(c, both, d, next);
+        slopes = sample_jacobian(c, both, d, next);
         memcpy(c->x, keep, sizeof keep);
         for (int i = 0; i < TG_NX; i++) {
             for (int j = 0; j < TG_NX; j++)
-                c->spare[i * TG_NX + j] = (i == j ? 1.0 : 0.0) - rows[i * TG_SEEDS + j];
+                c->spare[i * TG_NX + j] = (i == j ? 1.0 : 0.0) - *entry(slopes, TG_NX, i, j);
             X[i * SIDES] = next[i] - x[i];
             for (int j = 0; j < TG_NU; j++)
-                X[i * SIDES + 1 + j] = rows[i * TG_SEEDS + TG_NX + j] * s->span[j];
+                X[i * SIDES + 1 + j] = *entry(slopes, TG_NX, i, TG_NX + j) * s->span[j];
             for (int k = 0; k < TG_NW; k++)
                 X[i * SIDES + 1 + TG_NU + k] = c->jacobian[i * TG_Z + TG_NX + k];
         }
@@ -599,6 +627,50 @@ int tg_find_steady(tg_controller *c, const double *d, const double *on_u, const 
     return found;
 }
 
+/* P = J P J'. J is sparse in its last rows, and often in all; its columns are taken four at a time. */
+static void carry_covariance(tg_controller *c)
+{
+    memset(c->spare, 0, sizeof c->spare);
+    for (int i = 0; i < TG_Z; i++) {
+        const double *J = c->jacobian + i * TG_Z;
+        double *restrict row = c->spare + i * TG_Z;
+        int k = 0;
+        for (; k + 4 <= TG_Z; k += 4) {
+            const double *P = c->P + k * TG_Z, *P1 = P + TG_Z, *P2 = P1 + TG_Z, *P3 = P2 + TG_Z;
+            const double J0 = J[k], J1 = J[k + 1], J2 = J[k + 2], J3 = J[k + 3];
+            if (J0 == 0.0 && J1 == 0.0 && J2 == 0.0 && J3 == 0.0)
+                continue;
+            for (int j = 0; j < TG_Z; j++)
+                row[j] += J0 * P[j] + J1 * P1[j] + (J2 * P2[j] + J3 * P3[j]);
+        }
+        for (; k < TG_Z; k++)
+            for (int j = 0; j < TG_Z; j++)
+                row[j] += J[k] * c->P[k * TG_Z + j];
+    }
+    for (int i = 0; i < TG_Z; i++) {
+        const double *row = c->spare + i * TG_Z;
+        int j = 0;
+        for (; j + 4 <= i + 1; j += 4) {
+            const double *J = c->jacobian + j * TG_Z, *J1 = J + TG_Z, *J2 = J1 + TG_Z, *J3 = J2 + TG_Z;
+            double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0;
+            for (int k = 0; k < TG_Z; k++) {
+                s0 += row[k] * J[k];
+                s1 += row[k] * J1[k];
+                s2 += row[k] * J2[k];
+                s3 += row[k] * J3[k];
+            }
+            c->P[i * TG_Z + j] = s0;
+            c->P[i * TG_Z + j + 1] = s1;
+            c->P[i * TG_Z + j + 2] = s2;
+            c->P[i * TG_Z + j + 3] = s3;
+        }
+        for (; j <= i; j++)
+            c->P[i * TG_Z + j] = seen_by(c->jacobian + j * TG_Z, row);
+        for (j = 0; j < i; j++)
+            c->P[j * TG_Z + i] = c->P[i * TG_Z + j];
+    }
+}
+
 void tg_observer_predict(tg_controller *c, const double *u, const double *d)
 {
     const tg_design *s = c->design;
@@ -608,26 +680,11 @@ void tg_observer_predict(tg_controller *c, const double *u, const double *d)
         on_u[j] += u[j];
     for (int j = 0; j < TG_ND; j++)
         on_d[j] += d[j];
-    sample_jacobian(c, on_u, on_d, next);
+    look_ahead(c, on_u, on_d, next);
     for (int r = 0; r < TG_NG; r++)
         c->shown[r] += lag_share(c, r) * (scaled(c, r, c->x) - c->shown[r]);
     memcpy(c->x, next, sizeof c->x);
-    /* P = J P J' + Q; J is sparse in its last rows, and often in all */
-    memset(c->spare, 0, sizeof c->spare);
-    for (int i = 0; i < TG_Z; i++)
-        for (int k = 0; k < TG_Z; k++) {
-            double share = c->jacobian[i * TG_Z + k];
-            if (share != 0.0)
-                for (int j = 0; j < TG_Z; j++)
-                    c->spare[i * TG_Z + j] += share * c->P[k * TG_Z + j];
-        }
-    for (int i = 0; i < TG_Z; i++)
-        for (int j = 0; j <= i; j++) {
-            double sum = 0.0;
-            for (int k = 0; k < TG_Z; k++)
-                sum += c->spare[i * TG_Z + k] * c->jacobian[j * TG_Z + k];
-            c->P[i * TG_Z + j] = c->P[j * TG_Z + i] = sum;
-        }
+    carry_covariance(c);
     for (int i = 0; i < TG_Z; i++)
         c->P[i * TG_Z + i] += c->held[i] ? 0.0 : (1.0 - c->noised) * s->Q[i];
     stand_on_sample(c);
@@ -662,7 +719,7 @@ void tg_observer_look(tg_controller *c, const double *d)
         on_u[j] += c->dose[j] / c->into_s;
     for (int j = 0; j < TG_ND; j++)
         on_d[j] += d[j];
-    sample_jacobian(c, on_u, on_d, next);
+    look_ahead(c, on_u, on_d, next);
     for (int i = 0; i < TG_NX; i++)
         c->ahead[i] = (1.0 - share) * c->x[i] + share * next[i];
     for (int r = 0; r < TG_NG; r++)
@@ -672,6 +729,7 @@ void tg_observer_look(tg_controller *c, const double *d)
             c->jacobian[i * TG_Z + j] = share * c->jacobian[i * TG_Z + j] + (i == j ? 1.0 - share : 0.0);
         c->P[i * TG_Z + i] += c->held[i] ? 0.0 : (share - c->noised) * s->Q[i];
     }
+    c->has_jacobian = 0;
     for (int i = 0; i < TG_NY; i++)
         c->bent[i] = 4.0 * share * (1.0 - share) * (output(c, i, next) - output(c, i, c->x));
     c->share = c->noised = share;

@@ -5,7 +5,9 @@
  *
  *     H = 2 ( G'WG + move D'D + drive L ),     f = 2 ( G'W (y0 - G z0 - r) - move D'e ).
  *
- * G is propagated as tangents of the step, a column for each drive of each block that has begun.
+ * G is propagated as tangents of the step, a column for each drive of each block that has begun.  Its rows are the
+ * soft rows of the program, for each sample those of the controlled, then of the limited outputs; the rows of four
+ * samples are as long as the longest of them, so that what is added up over samples is added up for four at once.
  * A Peltier's gain falls in proportion to its drive: the gain along the guess gives the drive at which a quarter
  * remains, and no block goes further.  Where the simulated cost of the QP's plan is above that of the guess, or
  * every fifth sample, shorter moves and plain ramps are tried too: near the optimum of a Peltier element the
@@ -29,9 +31,40 @@ static int row_of(const tg_design *s, int r) { return r < s->n_c ? s->controlled
 static double read_output(const tg_design *s, const double *x, int i)
 {
     double sum = s->y0[i];
-    for (int j = 0; j < TG_NX; j++)
+    for (int j = s->read_from[i]; j < s->read_to[i]; j++)
         sum += s->C[i * TG_NX + j] * x[j];
     return sum;
+}
+
+static const double *response(const tg_controller *c, int k, int r)
+{
+    const tg_design *s = c->design;
+    return c->G + c->qp.start[k * (s->n_c + s->n_l) + r];
+}
+
+/* How long the rows of sample k are. */
+static int length(const tg_controller *c, int k) { return c->qp.filled[k * (c->design->n_c + c->design->n_l)]; }
+
+/* Say where the rows of the response begin, and how long they are: in four samples as long as in the last. */
+static void lay_out(tg_controller *c)
+{
+    const tg_design *s = c->design;
+    int k = 0, i = 0, at = 0;
+    if (c->laid_out)
+        return;
+    for (int b = 0, done = 0; b < s->n_b; b++)
+        for (int left = s->blocks[b]; left > 0; left--, done++) {
+            if (done % 4 != 3 && done != s->N - 1)
+                continue;
+            for (; k <= done; k++)
+                for (int r = 0; r < s->n_c + s->n_l; r++, i++) {
+                    c->qp.start[i] = at;
+                    c->qp.filled[i] = TG_WHOLE((b + 1) * TG_NU);
+                    at += c->qp.filled[i];
+                }
+        }
+    c->qp.A = c->G;
+    c->laid_out = 1;
 }
 
 /* In samples, by how much more or less than in one the first move may go. */
@@ -55,23 +88,45 @@ static void park(const tg_controller *c, const double *last, double *plan)
 }
 
 /* Outputs of a plan, sample by sample, plus the output bias. */
-static void simulate(const tg_design *s, const double *start, const double *plan, const double *drive_bias,
+static void simulate(tg_controller *c, const double *start, const double *plan, const double *drive_bias,
                      const double *d, const double *bias, double *y)
 {
-    double x[TG_NX], next[TG_NX] = {0.0}, u[TG_NU];
+    const tg_design *s = c->design;
+    double both[2][TG_NX], *x = both[0], *next = both[1], u[TG_NU];
     int k = 0;
-    memcpy(x, start, sizeof x);
+    memcpy(x, start, sizeof both[0]);
     for (int b = 0; b < s->n_b; b++) {
         for (int j = 0; j < TG_NU; j++)
             u[j] = plan[b * TG_NU + j] + drive_bias[j];
+        tg_model_hold(u, s->k, c->by_drives);
         for (int at = 0; at < s->blocks[b]; at++, k++) {
             for (int part = 0; part < s->sub; part++) {
-                tg_model_next(x, u, d, s->k, next);
-                memcpy(x, next, sizeof x);
+                double *swap = x;
+                tg_model_step(x, u, d, s->k, c->by_drives, next);
+                x = next;
+                next = swap;
             }
             for (int i = 0; i < TG_NY; i++)
                 y[k * TG_NY + i] = read_output(s, x, i) + bias[i];
         }
+    }
+}
+
+/* Add a share of one state's groups of four columns to a row. */
+static void add_row(double *restrict into, double share, const double *restrict from, int groups)
+{
+    for (int g = 0; g < groups; g++)
+        for (int i = 0; i < 4; i++)
+            into[4 * g + i] += share * from[4 * TG_NX * g + i];
+}
+
+/* Drives of a block as directions of the groups of four columns that they are in. */
+static void seed_drives(tg_controller *c, int begun)
+{
+    memset(c->seed_u, 0, sizeof c->seed_u);
+    for (int j = 0; j < TG_NU; j++) {
+        int column = begun % 4 + j;
+        c->seed_u[(column / 4) * 4 * TG_NU + 4 * j + column % 4] = c->design->span[j];
     }
 }
 
@@ -80,39 +135,39 @@ static void linearise(tg_controller *c, const double *start, const double *guess
                       const double *d, const double *bias)
 {
     const tg_design *s = c->design;
-    double x[TG_NX], next[TG_NX] = {0.0}, u[TG_NU];
-    double *now = c->seed, *then = c->seed + TG_NX * TG_Q_N;
+    double both[2][TG_NX], *x = both[0], *next = both[1], u[TG_NU];
+    double *now = c->seed, *then = c->seed + TG_NX * TG_WIDE;
     int k = 0, rows = s->n_c + s->n_l;
-    memcpy(x, start, sizeof x);
-    memset(now, 0, (size_t)TG_NX * TG_Q_N * sizeof(double));
-    for (int b = 0; b < s->n_b; b++) {
-        int columns = (b + 1) * TG_NU;
-        memset(c->seed_u, 0, (size_t)TG_NU * TG_Q_N * sizeof(double));
-        for (int j = 0; j < TG_NU; j++) {
-            u[j] = guess[b * TG_NU + j] + drive_bias[j];
-            c->seed_u[j * TG_Q_N + b * TG_NU + j] = s->span[j];
-            for (int i = 0; i < TG_NX; i++)
-                now[i * TG_Q_N + b * TG_NU + j] = 0.0;
-        }
+    memcpy(x, start, sizeof both[0]);
+    lay_out(c);
+    for (int b = 0, groups = 0; b < s->n_b; b++) {
+        int begun = b * TG_NU, before = begun / 4 * 4 * TG_NX, needed = TG_WHOLE(begun + TG_NU) / 4;
+        for (int j = 0; j < TG_NU; j++)
+            u[j] = guess[begun + j] + drive_bias[j];
+        seed_drives(c, begun);
+        memset(now + groups * 4 * TG_NX, 0, (size_t)((needed - groups) * 4 * TG_NX) * sizeof(double));
+        groups = needed;
+        tg_model_hold_slopes(u, s->k, c->by_drives);
         for (int at = 0; at < s->blocks[b]; at++, k++) {
             for (int part = 0; part < s->sub; part++) {
-                double *swap = now;
-                tg_model_partials(x, u, d, s->k, next, c->partials);
-                tg_model_tangent(columns, TG_Q_N, c->partials, s->k, now, c->seed_u, then);
-                memcpy(x, next, sizeof x);
+                double *swap = now, *last = x;
+                tg_model_partials(x, u, d, s->k, c->by_drives, next, c->partials);
+                tg_model_tangent(begun / 4, c->partials, s->k, c->by_drives, now, then);
+                tg_model_tangent_u(groups - begun / 4, c->partials, s->k, c->by_drives, now + before, c->seed_u,
+                                   then + before);
+                x = next;
+                next = last;
                 now = then;
                 then = swap;
             }
             for (int i = 0; i < TG_NY; i++)
                 c->y_guess[k * TG_NY + i] = read_output(s, x, i) + bias[i];
             for (int r = 0; r < rows; r++) {
-                const double *from = s->C + row_of(s, r) * TG_NX;
-                double *into = c->G + ((size_t)k * TG_NS + (size_t)r) * TG_Q_N;
-                memset(into, 0, (size_t)columns * sizeof(double));
-                for (int i = 0; i < TG_NX; i++)
-                    if (from[i] != 0.0)
-                        for (int j = 0; j < columns; j++)
-                            into[j] += from[i] * now[i * TG_Q_N + j];
+                int i = row_of(s, r), place = k * rows + r;
+                double *into = c->G + c->qp.start[place];
+                memset(into, 0, (size_t)c->qp.filled[place] * sizeof(double));
+                for (int j = s->read_from[i]; j < s->read_to[i]; j++)
+                    add_row(into, s->C[i * TG_NX + j], now + 4 * j, groups);
             }
         }
     }
@@ -122,14 +177,15 @@ static void linearise(tg_controller *c, const double *start, const double *guess
 static void find_authority(tg_controller *c)
 {
     const tg_design *s = c->design;
-    for (int b = 0, first = 0; b < s->n_b; first += s->blocks[b++])
-        for (int j = 0; j < TG_NU; j++) {
-            int at = b * TG_NU + j;
-            double sum = 0.0;
-            for (int k = first; k < s->N; k++)
-                sum += c->G[((size_t)k * TG_NS + (size_t)s->strongest[j]) * TG_Q_N + (size_t)at];
-            c->authority[at] = s->seen[at] ? sum / s->at_rest[at] : 1.0;
-        }
+    double sums[TG_Q_W];
+    for (int r = 0; r < s->n_c; r++) {
+        memset(sums, 0, sizeof sums);
+        for (int k = 0; k < s->N; k++)
+            tg_add_row(sums, 1.0, response(c, k, r), length(c, k));
+        for (int at = 0; at < s->n_b * TG_NU; at++)
+            if (s->strongest[at % TG_NU] == r)
+                c->authority[at] = s->seen[at] ? sums[at] / s->at_rest[at] : 1.0;
+    }
 }
 
 /* The target of controlled output r in sample k of the prediction. */
@@ -230,20 +286,31 @@ static void set_linear_cost(tg_controller *c, const double *target, const double
 {
     const tg_design *s = c->design;
     tg_qp *q = &c->qp;
-    int k = 0;
     memset(q->f, 0, sizeof q->f);
     for (int i = 0; i < q->n; i++)
         q->f[i] = s->energy[i % TG_NU] * s->blocks[i / TG_NU];
-    for (int b = 0; b < s->n_b; b++)
-        for (int at = 0; at < s->blocks[b]; at++, k++)
-            for (int r = 0; r < s->n_c; r++) {
-                const double *g = c->G + ((size_t)k * TG_NS + (size_t)r) * TG_Q_N;
-                double error = weight_of(c, k, r) * (c->free[k * TG_NS + r] - goal(c, target, k, r));
-                for (int i = 0; i < (b + 1) * TG_NU; i++)
-                    q->f[i] += error * g[i];
-            }
+    for (int k = 0; k < s->N; k++)
+        for (int r = 0; r < s->n_c; r++) {
+            const double *g = response(c, k, r);
+            double error = weight_of(c, k, r) * (c->free[k * TG_NS + r] - goal(c, target, k, r));
+            tg_add_row(q->f, error, g, length(c, k));
+        }
     for (int j = 0; j < TG_NU; j++)
         q->f[j] -= 2.0 * c->caution * s->move * last[j] / s->span[j];
+}
+
+/* Add the squares of four rows, n numbers that end at a multiple of four, to the upper triangle of H. */
+static void add_squares(double *restrict H, int n, const double *weight, const double *restrict g0,
+                        const double *restrict g1, const double *restrict g2, const double *restrict g3)
+{
+    int end = TG_WHOLE(n);
+    for (int i = 0; i < n; i++) {
+        double *row = H + (size_t)i * TG_Q_W;
+        const double s0 = weight[0] * g0[i], s1 = weight[1] * g1[i], s2 = weight[2] * g2[i], s3 = weight[3] * g3[i];
+        for (int j = i & ~3; j < end; j += 4)
+            for (int l = j; l < j + 4; l++)
+                row[l] += s0 * g0[l] + s1 * g1[l] + (s2 * g2[l] + s3 * g3[l]);
+    }
 }
 
 static void set_quadratic_cost(tg_controller *c)
@@ -251,26 +318,26 @@ static void set_quadratic_cost(tg_controller *c)
     const tg_design *s = c->design;
     tg_qp *q = &c->qp;
     double weight_of_moves = c->caution * s->move;
-    int n = q->n, k = 0;
-    for (int i = 0; i < n; i++)
-        memset(q->H + (size_t)i * TG_Q_N, 0, (size_t)(i + 1) * sizeof(double));
-    for (int b = 0; b < s->n_b; b++)
-        for (int at = 0; at < s->blocks[b]; at++, k++)
-            for (int r = 0; r < s->n_c; r++) {
-                const double *g = c->G + ((size_t)k * TG_NS + (size_t)r) * TG_Q_N;
-                double weight = weight_of(c, k, r);
-                for (int i = 0; weight > 0.0 && i < (b + 1) * TG_NU; i++) {
-                    double share = weight * g[i], *row = q->H + (size_t)i * TG_Q_N;
-                    for (int j = 0; j <= i; j++)
-                        row[j] += share * g[j];
-                }
+    memset(q->H, 0, (size_t)q->n * TG_Q_W * sizeof(double));
+    for (int k = 0; k < s->N; k += 4)
+        for (int r = 0; r < s->n_c; r++) {
+            double weight[4] = {0.0};
+            const double *g[4];
+            for (int i = 0; i < 4; i++) {
+                int at = k + i < s->N ? k + i : k;
+                g[i] = response(c, at, r);
+                weight[i] = at == k + i ? weight_of(c, at, r) : 0.0;
             }
+            if (weight[0] > 0.0)
+                add_squares(q->H, length(c, k) < q->n ? length(c, k) : q->n, weight, g[0], g[1], g[2], g[3]);
+        }
     for (int b = 0; b < s->n_b; b++)
         for (int j = 0; j < TG_NU; j++) {
             int i = b * TG_NU + j;
-            q->H[(size_t)i * (TG_Q_N + 1)] += 2.0 * (weight_of_moves * (b < s->n_b - 1 ? 2.0 : 1.0) + s->drive * s->blocks[b]);
-            if (b)
-                q->H[(size_t)i * TG_Q_N + (size_t)(i - TG_NU)] -= 2.0 * weight_of_moves;
+            double *row = q->H + (size_t)i * TG_Q_W;
+            row[i] += 2.0 * (weight_of_moves * (b < s->n_b - 1 ? 2.0 : 1.0) + s->drive * s->blocks[b]);
+            if (b < s->n_b - 1)
+                row[i + TG_NU] -= 2.0 * weight_of_moves;
         }
 }
 
@@ -285,28 +352,24 @@ static void set_soft_rows(tg_controller *c, const double *target, const double *
 {
     const tg_design *s = c->design;
     tg_qp *q = &c->qp;
-    int k = 0, i = 0, rows = s->n_c + s->n_l;
-    for (int b = 0; b < s->n_b; b++)
-        for (int at = 0; at < s->blocks[b]; at++, k++)
-            for (int r = 0; r < rows; r++, i++) {
-                double low = -NONE, high = NONE, *lower = q->lower + 2 * q->n, *upper = q->upper + 2 * q->n;
-                if (r >= s->n_c) {
-                    low = s->limit_low[r - s->n_c];
-                    high = s->limit_high[r - s->n_c];
-                } else if (s->zone[r] > 0.0) {
-                    low = c->lost[r] ? low : goal(c, target, k, r) - s->zone[r];
-                    high = c->lost[r] ? high : goal(c, target, k, r) + s->zone[r];
-                } else if (side[r] < 0.0)
-                    low = goal(c, target, k, r) - s->overshoot;
-                else if (side[r] > 0.0)
-                    high = goal(c, target, k, r) + s->overshoot;
-                lower[i] = low - c->free[k * TG_NS + r];
-                upper[i] = high - c->free[k * TG_NS + r];
-                q->filled[i] = (b + 1) * TG_NU;
-                if (!q->kept)
-                    memcpy(q->A + (size_t)i * TG_Q_N, c->G + ((size_t)k * TG_NS + (size_t)r) * TG_Q_N,
-                           (size_t)q->filled[i] * sizeof(double));
-            }
+    double *lower = q->lower + 2 * q->n, *upper = q->upper + 2 * q->n;
+    int i = 0, rows = s->n_c + s->n_l;
+    for (int k = 0; k < s->N; k++)
+        for (int r = 0; r < rows; r++, i++) {
+            double low = -NONE, high = NONE;
+            if (r >= s->n_c) {
+                low = s->limit_low[r - s->n_c];
+                high = s->limit_high[r - s->n_c];
+            } else if (s->zone[r] > 0.0) {
+                low = c->lost[r] ? low : goal(c, target, k, r) - s->zone[r];
+                high = c->lost[r] ? high : goal(c, target, k, r) + s->zone[r];
+            } else if (side[r] < 0.0)
+                low = goal(c, target, k, r) - s->overshoot;
+            else if (side[r] > 0.0)
+                high = goal(c, target, k, r) + s->overshoot;
+            lower[i] = low - c->free[k * TG_NS + r];
+            upper[i] = high - c->free[k * TG_NS + r];
+        }
 }
 
 /* The outputs that count, by the gains under another plan than the guess, k rows of across numbers each. */
@@ -314,16 +377,15 @@ static void follow_gains(const tg_controller *c, const double *guess, const doub
                          int as_outputs)
 {
     const tg_design *s = c->design;
-    int k = 0, rows = s->n_c + s->n_l;
-    for (int b = 0; b < s->n_b; b++)
-        for (int at = 0; at < s->blocks[b]; at++, k++)
-            for (int r = 0; r < rows; r++) {
-                const double *g = c->G + ((size_t)k * TG_NS + (size_t)r) * TG_Q_N;
-                double y = c->y_guess[k * TG_NY + row_of(s, r)];
-                for (int i = 0; i < (b + 1) * TG_NU; i++)
-                    y += g[i] * (plan[i] - guess[i]) / s->span[i % TG_NU];
-                out[k * across + (as_outputs ? row_of(s, r) : r)] = y;
-            }
+    double z[TG_Q_W] = {0.0};
+    for (int i = 0; i < s->n_b * TG_NU; i++)
+        z[i] = (plan[i] - guess[i]) / s->span[i % TG_NU];
+    for (int k = 0; k < s->N; k++)
+        for (int r = 0; r < s->n_c + s->n_l; r++) {
+            const double *g = response(c, k, r);
+            double y = c->y_guess[k * TG_NY + row_of(s, r)] + tg_product(g, z, length(c, k));
+            out[k * across + (as_outputs ? row_of(s, r) : r)] = y;
+        }
 }
 
 /* Keep a plan where it is the best so far. */
@@ -332,7 +394,7 @@ static void consider(tg_controller *c, const double *x, const double *plan, cons
                      const double *last, double *least)
 {
     double cost;
-    simulate(c->design, x, plan, drive_bias, d, bias, c->y_try);
+    simulate(c, x, plan, drive_bias, d, bias, c->y_try);
     cost = BARELY * merit(c, plan, c->y_try, target, side, last);
     if (cost < *least) { /* a plan that is hardly better is not worth a jump */
         *least = cost;
@@ -408,7 +470,7 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
     for (int r = 0; r < s->n_c; r++)
         side[r] = c->lost[r] || c->goals ? 0.0 : from[r]; /* nothing is beyond a target that moves */
     if (s->linear && c->has_gains)
-        simulate(s, x, guess, drive_bias, d, bias, c->y_guess);
+        simulate(c, x, guess, drive_bias, d, bias, c->y_guess);
     else {
         linearise(c, x, guess, drive_bias, d, bias);
         find_authority(c);
@@ -438,7 +500,7 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
         return c->qp_status;
     }
     at_guess = merit(c, guess, c->y_guess, target, side, last);
-    simulate(s, x, c->best, drive_bias, d, bias, c->y_best);
+    simulate(c, x, c->best, drive_bias, d, bias, c->y_best);
     cost = merit(c, c->best, c->y_best, target, side, last);
     c->solves++;
     uphill = cost > at_guess;

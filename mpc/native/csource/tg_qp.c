@@ -1,6 +1,6 @@
 /* A dual active-set method for a small convex QP with hard and soft rows.
  *
- * With H = LL' and m_i = L^-1 a_i the dual of the problem, for a set W of rows at their bounds with signs
+ * With H = U'U, L = U' and m_i = L^-1 a_i the dual of the problem, for a set W of rows at their bounds with signs
  * s_i (+1 upper, -1 lower), is
  *
  *     maximise over lambda    - 1/2 lambda' K lambda + r' lambda,
@@ -36,97 +36,161 @@ static double *fit_row(tg_qp *q, int i) { return q->fit + (size_t)i * (size_t)(i
 
 void tg_qp_forget(tg_qp *q) { q->n_work = 0; }
 
+/* Whether none of n numbers, a multiple of four, is infinite or no number: 0 times one of those is no number. */
 static int all_finite(const double *a, int n)
 {
-    for (int i = 0; i < n; i++)
-        if (!isfinite(a[i]))
-            return 0;
-    return 1;
+    double sum[4] = {0.0};
+    for (int i = 0; i < n; i += 4)
+        for (int l = 0; l < 4; l++)
+            sum[l] += 0.0 * a[i + l];
+    return (sum[0] + sum[1]) + (sum[2] + sum[3]) == 0.0;
 }
 
 static int problem_is_finite(const tg_qp *q)
 {
     for (int i = 0; i < q->n && !q->kept; i++)
-        if (!all_finite(q->H + (size_t)i * TG_Q_N, i + 1))
+        if (!all_finite(q->H + (size_t)i * TG_Q_W + (i & ~3), TG_WHOLE(q->n) - (i & ~3)))
             return 0;
     for (int i = 0; i < 2 * q->n + q->s; i++)
         if (isnan(q->lower[i]) || isnan(q->upper[i]))
             return 0;
     for (int i = 0; i < q->s && !q->kept; i++)
-        if (!all_finite(q->A + (size_t)i * TG_Q_N, q->filled[i]))
+        if (!all_finite(q->A + q->start[i], q->filled[i]))
             return 0;
-    return all_finite(q->f, q->n);
+    return all_finite(q->f, TG_WHOLE(q->n));
 }
 
-/* How much each row weighs beside the others: 1 over its length, unknowns in units of H_jj^-1/2. */
+double tg_product(const double *a, const double *b, int n)
+{
+    double sum[4] = {0.0};
+    for (int j = 0; j < n; j += 4)
+        for (int l = 0; l < 4; l++)
+            sum[l] += a[j + l] * b[j + l];
+    return (sum[0] + sum[1]) + (sum[2] + sum[3]);
+}
+
+void tg_add_row(double *restrict into, double share, const double *restrict row, int n)
+{
+    for (int j = 0; j < n; j += 4)
+        for (int l = j; l < j + 4; l++)
+            into[l] += share * row[l];
+}
+
+/* The product of two rows of any length. */
+static double dot(const double *a, const double *b, int n)
+{
+    int whole = n & ~3;
+    double sum = tg_product(a, b, whole);
+    for (int j = whole; j < n; j++)
+        sum += a[j] * b[j];
+    return sum;
+}
+
+/* Take v times rows of four from a row, from entry `from` to n, both multiples of four. */
+static void take_four(double *restrict row, const double *restrict u, double v0, double v1, double v2, double v3,
+                      int from, int n)
+{
+    const double *u1 = u + TG_Q_W, *u2 = u1 + TG_Q_W, *u3 = u2 + TG_Q_W;
+    for (int j = from; j < n; j += 4)
+        for (int l = j; l < j + 4; l++)
+            row[l] -= v0 * u[l] + v1 * u1[l] + (v2 * u2[l] + v3 * u3[l]);
+}
+
+/* How much each hard row weighs beside the others: 1 over its length, unknowns in units of H_jj^-1/2. */
 static int weigh_rows(tg_qp *q)
 {
-    double size[TG_Q_N] = {0.0};
     int n = q->n;
     for (int j = 0; j < n; j++) {
-        double diagonal = q->H[(size_t)j * (TG_Q_N + 1)];
+        double diagonal = q->H[(size_t)j * (TG_Q_W + 1)], before = 0.0;
         if (!(diagonal > 0.0))
             return 0;
-        size[j] = 1.0 / sqrt(diagonal);
-        q->weight[j] = 1.0 / size[j];
+        q->weight[j] = sqrt(diagonal);
+        if (j >= q->stride)
+            before = 1.0 / (q->weight[j - q->stride] * q->weight[j - q->stride]);
+        q->weight[n + j] = 1.0 / sqrt(1.0 / diagonal + before);
     }
-    for (int j = 0; j < n; j++) {
-        double before = j >= q->stride ? size[j - q->stride] : 0.0;
-        q->weight[n + j] = 1.0 / sqrt(size[j] * size[j] + before * before);
-    }
-    for (int i = 0; i < q->s; i++) {
-        const double *a = q->A + (size_t)i * TG_Q_N;
-        double sum = 0.0;
-        for (int j = 0; j < q->filled[i]; j++)
-            sum += a[j] * a[j] * size[j] * size[j];
-        q->weight[2 * n + i] = sum > SHORT * SHORT ? 1.0 / sqrt(sum) : 0.0;
-    }
+    for (int i = 0; i < q->s; i++)
+        q->weight[2 * n + i] = -1.0;
     return 1;
 }
 
-/* Replace the lower triangle of H by its Cholesky factor, its diagonal inverted. */
+/* What a row weighs beside the others; 0 where it is too short for any plan to keep it. */
+static double weight_of(tg_qp *q, int row)
+{
+    if (q->weight[row] < 0.0) {
+        int i = row - 2 * q->n, filled = q->filled[i] < q->n ? q->filled[i] : q->n;
+        const double *a = q->A + q->start[i];
+        double sum = 0.0;
+        for (int j = 0; j < filled; j++)
+            sum += a[j] * a[j] / (q->weight[j] * q->weight[j]);
+        q->weight[row] = sum > SHORT * SHORT ? 1.0 / sqrt(sum) : 0.0;
+    }
+    return q->weight[row];
+}
+
+/* Replace the upper triangle of H by U of H = U'U, row by row; its diagonal inverted aside. */
 static int factorise(tg_qp *q)
 {
-    for (int i = 0; i < q->n; i++) {
-        double *row = q->H + (size_t)i * TG_Q_N;
-        double whole = row[i];
-        for (int j = 0; j <= i; j++) {
-            const double *other = q->H + (size_t)j * TG_Q_N;
-            double sum = row[j];
-            for (int k = 0; k < j; k++)
-                sum -= row[k] * other[k];
-            if (j < i)
-                row[j] = sum * other[j];
-            else if (!(sum > 1e-14 * whole))
-                return 0;
-            else
-                row[i] = 1.0 / sqrt(sum);
+    int n = q->n, end = TG_WHOLE(n);
+    for (int i = 0; i < n; i++) {
+        double *row = q->H + (size_t)i * TG_Q_W, inverse;
+        int from = i & ~3, k = 0;
+        for (; k + 4 <= i; k += 4) {
+            const double *u = q->H + (size_t)k * TG_Q_W;
+            take_four(row, u, u[i], u[TG_Q_W + i], u[2 * TG_Q_W + i], u[3 * TG_Q_W + i], from, end);
         }
+        for (; k < i; k++) /* below its diagonal row k is 0 */
+            tg_add_row(row + from, -q->H[(size_t)k * TG_Q_W + (size_t)i], q->H + (size_t)k * TG_Q_W + from, end - from);
+        if (!(row[i] > 1e-14 * q->weight[i] * q->weight[i]))
+            return 0;
+        inverse = 1.0 / sqrt(row[i]);
+        for (int j = from; j < i; j++)
+            row[j] = 0.0;
+        for (int j = from; j < end; j += 4)
+            for (int l = j; l < j + 4; l++)
+                row[l] *= inverse;
+        q->inverse[i] = inverse;
     }
     return 1;
 }
 
-/* Replace b by L^-1 b, where b is 0 before entry `from`. */
+/* Replace b by U'^-1 b, where b is 0 before entry `from` and behind entry n. */
 static void forward(const tg_qp *q, double *b, int from)
 {
-    for (int i = from; i < q->n; i++) {
-        const double *row = q->H + (size_t)i * TG_Q_N;
-        double sum = b[i];
-        for (int k = from; k < i; k++)
-            sum -= row[k] * b[k];
-        b[i] = sum * row[i];
+    int n = q->n, end = TG_WHOLE(n);
+    for (int i = from & ~3; i < n; i += 4) {
+        const double *u = q->H + (size_t)i * TG_Q_W, *inverse = q->inverse + i;
+        double *y = b + i;
+        if (n - i < 4) {
+            for (int k = i; k < n; k++) {
+                b[k] *= q->inverse[k];
+                for (int j = k + 1; j < n; j++)
+                    b[j] -= q->H[(size_t)k * TG_Q_W + (size_t)j] * b[k];
+            }
+        } else {
+            const double *u0 = u + i, *u1 = u0 + TG_Q_W, *u2 = u1 + TG_Q_W;
+            y[0] *= inverse[0];
+            y[1] = (y[1] - u0[1] * y[0]) * inverse[1];
+            y[2] = (y[2] - u0[2] * y[0] - u1[2] * y[1]) * inverse[2];
+            y[3] = (y[3] - u0[3] * y[0] - u1[3] * y[1] - u2[3] * y[2]) * inverse[3];
+            take_four(b, u, y[0], y[1], y[2], y[3], i + 4, end);
+        }
     }
 }
 
-/* Replace b by L'^-1 b. */
+/* Replace b by U^-1 b; it is 0 behind entry n. */
 static void backward(const tg_qp *q, double *b)
 {
-    for (int i = q->n - 1; i >= 0; i--) {
-        const double *row = q->H + (size_t)i * TG_Q_N;
-        double value = b[i] * row[i];
-        b[i] = value;
-        for (int k = 0; k < i; k++)
-            b[k] -= row[k] * value;
+    int n = q->n, end = TG_WHOLE(n);
+    for (int i = (n - 1) & ~3; i >= 0; i -= 4) {
+        int last = n - i < 4 ? n : i + 4;
+        for (int k = last - 1; k >= i; k--) {
+            const double *row = q->H + (size_t)k * TG_Q_W;
+            double sum = b[k] - tg_product(row + i + 4, b + i + 4, end - i - 4);
+            for (int j = k + 1; j < last; j++)
+                sum -= row[j] * b[j];
+            b[k] = sum * q->inverse[k];
+        }
     }
 }
 
@@ -137,17 +201,14 @@ static double value_of(const tg_qp *q, int row)
         return q->x[row];
     if (row < 2 * n)
         return q->x[row - n] - (row - n >= q->stride ? q->x[row - n - q->stride] : 0.0);
-    const double *a = q->A + (size_t)(row - 2 * n) * TG_Q_N;
-    double sum = 0.0;
-    for (int j = 0; j < q->filled[row - 2 * n]; j++)
-        sum += a[j] * q->x[j];
-    return sum;
+    return tg_product(q->A + q->start[row - 2 * n], q->x, q->filled[row - 2 * n]);
 }
 
-static void make_normal(const tg_qp *q, int row, int side, double *m)
+/* Return before which entry, a multiple of four, it is 0. */
+static int make_normal(const tg_qp *q, int row, int side, double *m)
 {
     int n = q->n, from = 0;
-    memset(m, 0, (size_t)n * sizeof *m);
+    memset(m, 0, TG_Q_W * sizeof *m);
     if (row < n) {
         m[row] = side;
         from = row;
@@ -160,11 +221,13 @@ static void make_normal(const tg_qp *q, int row, int side, double *m)
             from = j - q->stride;
         }
     } else {
-        const double *a = q->A + (size_t)(row - 2 * n) * TG_Q_N;
-        for (int j = 0; j < q->filled[row - 2 * n]; j++)
+        const double *a = q->A + q->start[row - 2 * n];
+        int filled = q->filled[row - 2 * n] < n ? q->filled[row - 2 * n] : n;
+        for (int j = 0; j < filled; j++)
             m[j] = side * a[j];
     }
     forward(q, m, from);
+    return from & ~3;
 }
 
 /* The price of breaking a soft row. */
@@ -180,37 +243,25 @@ static double ratio_of(const tg_qp *q, int row) { return q->ratio[(row - 2 * q->
 /* Set the right side of a row in the set from its bound and its state. */
 static void set_right(tg_qp *q, int i)
 {
-    const double *m = q->normal + (size_t)i * TG_Q_N;
     double bound = q->side[i] > 0 ? q->upper[q->row[i]] : -q->lower[q->row[i]];
-    double sum = -bound;
-    for (int j = 0; j < q->n; j++)
-        sum -= m[j] * q->c[j];
+    const double *m = q->normal + (size_t)i * TG_Q_W;
+    double sum = -bound - tg_product(m + q->from[i], q->c + q->from[i], TG_WHOLE(q->n) - q->from[i]);
     q->right[i] = sum + (q->state[i] == 2 ? 1.0 / ratio_of(q, q->row[i]) : 0.0);
 }
 
 /* Append the factor's row i, whose normal is in place. */
 static void append_fit(tg_qp *q, int i)
 {
-    const double *m = q->normal + (size_t)i * TG_Q_N;
-    double *row = fit_row(q, i);
-    double left = 0.0;
-    for (int j = 0; j < q->n; j++)
-        left += m[j] * m[j];
+    const double *m = q->normal + (size_t)i * TG_Q_W;
+    int n = TG_WHOLE(q->n);
+    double *row = fit_row(q, i), left = tg_product(m + q->from[i], m + q->from[i], n - q->from[i]);
     left += REGULAR * left + (q->state[i] == 2 ? 1.0 / (ratio_of(q, q->row[i]) * price_of(q, q->row[i])) : 0.0);
     for (int k = 0; k < i; k++) {
-        const double *other = q->normal + (size_t)k * TG_Q_N;
-        double sum = 0.0;
-        for (int j = 0; j < q->n; j++)
-            sum += m[j] * other[j];
-        row[k] = sum;
+        int from = q->from[i] > q->from[k] ? q->from[i] : q->from[k];
+        row[k] = tg_product(m + from, q->normal + (size_t)k * TG_Q_W + from, n - from);
     }
-    for (int k = 0; k < i; k++) {
-        const double *other = fit_row(q, k);
-        double sum = row[k];
-        for (int j = 0; j < k; j++)
-            sum -= other[j] * row[j];
-        row[k] = sum;
-    }
+    for (int k = 1; k < i; k++)
+        row[k] -= dot(fit_row(q, k), row, k);
     for (int k = 0; k < i; k++) {
         double scaled = row[k] / q->pivot[k];
         left -= scaled * row[k];
@@ -251,8 +302,9 @@ static void remove_fit(tg_qp *q, int r)
 
 static void move_entry(tg_qp *q, int from, int to)
 {
-    memmove(q->normal + (size_t)to * TG_Q_N, q->normal + (size_t)from * TG_Q_N, (size_t)q->n * sizeof(double));
+    memmove(q->normal + (size_t)to * TG_Q_W, q->normal + (size_t)from * TG_Q_W, TG_Q_W * sizeof(double));
     q->row[to] = q->row[from];
+    q->from[to] = q->from[from];
     q->side[to] = q->side[from];
     q->state[to] = q->state[from];
     q->multiplier[to] = q->multiplier[from];
@@ -276,7 +328,7 @@ static double most(const tg_qp *q, int i) { return q->state[i] == 1 ? price_of(q
 static void put(tg_qp *q, int row, int side, int state, double multiplier)
 {
     int i = q->n_work++;
-    make_normal(q, row, side, q->normal + (size_t)i * TG_Q_N);
+    q->from[i] = make_normal(q, row, side, q->normal + (size_t)i * TG_Q_W);
     q->row[i] = row;
     q->side[i] = (signed char)side;
     q->state[i] = (signed char)state;
@@ -301,31 +353,30 @@ static void change(tg_qp *q, int r, int upward)
 static void solve_fit(const tg_qp *q, double *b)
 {
     tg_qp *open = (tg_qp *)q; /* fit_row reads only */
-    for (int i = 0; i < q->n_work; i++) {
-        const double *row = fit_row(open, i);
-        double sum = b[i];
-        for (int j = 0; j < i; j++)
-            sum -= row[j] * b[j];
-        b[i] = sum;
-    }
+    for (int i = 1; i < q->n_work; i++)
+        b[i] -= dot(fit_row(open, i), b, i);
     for (int i = q->n_work - 1; i >= 0; i--)
         b[i] /= q->pivot[i];
     for (int i = q->n_work - 1; i >= 0; i--) {
         const double *row = fit_row(open, i);
-        for (int j = 0; j < i; j++)
+        int whole = i & ~3;
+        tg_add_row(b, -b[i], row, whole);
+        for (int j = whole; j < i; j++)
             b[j] -= row[j] * b[i];
     }
 }
 
 static void make_x(tg_qp *q)
 {
-    for (int j = 0; j < q->n; j++)
+    int end = TG_WHOLE(q->n), i = 0;
+    for (int j = 0; j < end; j++)
         q->x[j] = -q->c[j];
-    for (int i = 0; i < q->n_work; i++) {
-        const double *m = q->normal + (size_t)i * TG_Q_N;
-        for (int j = 0; j < q->n; j++)
-            q->x[j] -= m[j] * q->multiplier[i];
+    for (; i + 4 <= q->n_work; i += 4) {
+        const double *by = q->multiplier + i;
+        take_four(q->x, q->normal + (size_t)i * TG_Q_W, by[0], by[1], by[2], by[3], 0, end);
     }
+    for (; i < q->n_work; i++)
+        tg_add_row(q->x, -q->multiplier[i], q->normal + (size_t)i * TG_Q_W, end);
     backward(q, q->x);
 }
 
@@ -359,17 +410,21 @@ static int go(tg_qp *q, int *upward)
 }
 
 /* Find the row that is broken most; 0 where none is. */
-static int worst(const tg_qp *q, int *row, int *side)
+static int worst(tg_qp *q, int *row, int *side)
 {
     double most_broken = TOLERANCE;
     int found = 0;
     for (int i = 0; i < 2 * q->n + q->s; i++) {
         double value, over, under;
-        if (q->in_set[i] || q->weight[i] == 0.0 || (q->upper[i] > FAR && q->lower[i] < -FAR))
+        if (q->in_set[i] || (q->upper[i] > FAR && q->lower[i] < -FAR))
             continue;
         value = value_of(q, i);
-        over = q->upper[i] > FAR ? 0.0 : (value - q->upper[i]) * q->weight[i];
-        under = q->lower[i] < -FAR ? 0.0 : (q->lower[i] - value) * q->weight[i];
+        over = q->upper[i] > FAR ? 0.0 : value - q->upper[i];
+        under = q->lower[i] < -FAR ? 0.0 : q->lower[i] - value;
+        if (!(over > 0.0 || under > 0.0))
+            continue;
+        over *= weight_of(q, i);
+        under *= weight_of(q, i);
         if (over > most_broken || under > most_broken) {
             *row = i;
             *side = over > under ? 1 : -1;
@@ -396,7 +451,7 @@ static void take_up(tg_qp *q, int same)
     for (int i = 0; i < kept; i++) {
         int row = q->row[i], side = q->side[i], state = q->state[i];
         double multiplier = q->multiplier[i], bound;
-        if (row >= 2 * q->n + q->s || q->weight[row] == 0.0)
+        if (row >= 2 * q->n + q->s || weight_of(q, row) == 0.0)
             continue;
         bound = side > 0 ? q->upper[row] : -q->lower[row];
         if (bound > FAR)
@@ -447,6 +502,7 @@ int tg_qp_solve(tg_qp *q)
     if (!q->kept && (!weigh_rows(q) || !factorise(q)))
         return failed(q, TG_QP_NOT_CONVEX);
     q->kept = 1;
+    memset(q->c, 0, sizeof q->c);
     memcpy(q->c, q->f, (size_t)q->n * sizeof(double));
     forward(q, q->c, 0);
     memset(q->in_set, 0, sizeof q->in_set);

@@ -16,6 +16,10 @@
 #define TG_Q_S (TG_NH * TG_NS)
 #define TG_Q_M (2 * TG_Q_N + TG_Q_S)
 
+/* Rows are stored in whole groups of four numbers, zeros behind their last, and worked through four at a time. */
+#define TG_WHOLE(n) (((n) + 3) & ~3)
+#define TG_Q_W (((TG_Q_N) + 3) / 4 * 4)
+
 enum tg_qp_status {
     TG_QP_SOLVED = 0,
     TG_QP_INFEASIBLE = 1,
@@ -28,29 +32,30 @@ enum tg_qp_status {
 typedef struct {
     /* the problem */
     int n, stride, s, per; /* per: soft rows in a sample */
-    double H[TG_Q_N * TG_Q_N]; /* lower triangle, rows of TG_Q_N; its Cholesky factor afterwards */
-    double f[TG_Q_N];
+    double H[TG_Q_N * TG_Q_W]; /* upper triangle, rows of TG_Q_W; U of H = U'U afterwards */
+    double f[TG_Q_W];
     double lower[TG_Q_M], upper[TG_Q_M]; /* beyond +-1e15: none */
-    double A[TG_Q_S > 0 ? TG_Q_S * TG_Q_N : 1];
-    int filled[TG_Q_S > 0 ? TG_Q_S : 1]; /* entries of a soft row before its trailing zeros */
+    const double *A; /* soft row i begins at start[i] and has filled[i] entries, zeros behind; a multiple of four */
+    int start[TG_Q_S > 0 ? TG_Q_S : 1], filled[TG_Q_S > 0 ? TG_Q_S : 1];
     double price[TG_NS > 0 ? TG_NS : 1], at_end[TG_NS > 0 ? TG_NS : 1]; /* of a sample's soft rows; of the last one's */
     double ratio[TG_NS > 0 ? TG_NS : 1];
-    int iteration_limit, kept; /* whether H (its factor), A and filled are those of the last solve */
+    int iteration_limit, kept; /* whether H (its factor) and A are those of the last solve */
     int (*late)(void *about); /* asked before every change of the working set: time is up; may be NULL */
     void *about;
     /* the answer */
-    double x[TG_Q_N];
+    double x[TG_Q_W];
     int iterations; /* changes of the working set */
     /* the working set, kept from one solve to the next; rows may depend on one another, so that
      * it can be longer than there are unknowns and soft rows */
     int n_work;
-    int row[TG_Q_M];
+    int row[TG_Q_M], from[TG_Q_M]; /* which, and before which entry its normal is 0 */
     signed char side[TG_Q_M];  /* +1 at the upper bound, -1 at the lower */
     signed char state[TG_Q_M]; /* 0 hard, 1 soft and kept, 2 soft and broken */
     double multiplier[TG_Q_M];
     /* room to work in */
-    double c[TG_Q_N], weight[TG_Q_M];
-    double normal[TG_Q_M * TG_Q_N]; /* side * L^-1 a of each row in the set */
+    double c[TG_Q_W], inverse[TG_Q_W]; /* L^-1 f, 1 / U_ii */
+    double weight[TG_Q_M];             /* of a soft row not before it is asked for, -1 */
+    double normal[TG_Q_M * TG_Q_W];    /* side * L^-1 a of each row in the set */
     double fit[TG_Q_M * (TG_Q_M + 1) / 2], pivot[TG_Q_M]; /* LDL' of their products */
     double right[TG_Q_M], wanted[TG_Q_M];
     signed char in_set[TG_Q_M];
@@ -66,6 +71,12 @@ void tg_qp_forget(tg_qp *q);
 /* Solve; return one of enum tg_qp_status. The working set is kept where it was solved; whoever gives another H or A
  * sets kept to 0 before, and it is 1 afterwards where there is a factor. */
 int tg_qp_solve(tg_qp *q);
+
+/* The product of two rows of n numbers, a multiple of four. */
+double tg_product(const double *a, const double *b, int n);
+
+/* Add a share of a row of n numbers, a multiple of four, to another one. */
+void tg_add_row(double *into, double share, const double *row, int n);
 
 #ifdef __cplusplus
 }

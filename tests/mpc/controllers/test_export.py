@@ -209,7 +209,7 @@ def test_what_the_parameters_fix_is_worked_out_without_a_compiler(name):
     assert len(k) == code.n_k
     assert np.isfinite(k).all()
     # every constant has a reader, and no reader is without one
-    read = {int(entry) for entry in re.findall(r"\bk\[(\d+)\]", code.source.split("_next(", 1)[1])}
+    read = {int(entry) for entry in re.findall(r"\bk\[(\d+)\]", code.source.split("_hold(", 1)[1])}
     assert read == set(range(code.n_k))
 
 

@@ -111,18 +111,39 @@ def test_the_step_in_c_is_the_models_with_its_switches_on(
         u, d = rng.uniform(model.lowest, model.highest), 22.0 + rng.normal(size=model.n_d)
         library.tg_model_next(given(x), given(u), given(d), given(k), given(after))
         np.testing.assert_allclose(after, model.next_state(x, u, d), rtol=1e-10)
-    # and its slopes along three directions at once, with and without the disturbances
+    # and its slopes along six directions, two groups of four, with and without drives and disturbances
     _, A, B, E = model.linearise(x, u, d)
-    sx, su, sd = (rng.normal(size=(n, 3)) for n in (model.n_x, model.n_u, model.n_d))
-    m, out = np.zeros(code.n_m), np.zeros((model.n_x, 3))
-    library.tg_model_partials(given(x), given(u), given(d), given(k), given(after), given(m))
+    sx, su, sd = (rng.normal(size=(n, 8)) for n in (model.n_x, model.n_u, model.n_d))
+    h, m, out = np.zeros(code.n_h + 1), np.zeros(code.n_m), np.zeros((2, model.n_x, 4))
+    groups = [np.stack([part[:, :4], part[:, 4:]]) for part in (sx, su, sd)]
+    library.tg_model_hold_slopes(given(u), given(k), given(h))
+    library.tg_model_partials(given(x), given(u), given(d), given(k), given(h), given(after), given(m))
     np.testing.assert_allclose(after, model.next_state(x, u, d), rtol=1e-10)
-    library.tg_model_tangent(3, 3, given(m), given(k), given(sx), given(su), given(out))
-    np.testing.assert_allclose(out, A @ sx + B @ su, atol=1e-9)
-    library.tg_model_tangent_d(3, 3, given(m), given(k), given(sx), given(su), given(sd), given(out))
-    np.testing.assert_allclose(out, A @ sx + B @ su + E @ sd, atol=1e-9)
+    meant = {"": A @ sx, "_u": A @ sx + B @ su, "_d": A @ sx + B @ su + E @ sd}
+    for count, (what, want) in enumerate(meant.items(), 1):
+        tangent = getattr(library, f"tg_model_tangent{what}")
+        kept = [np.ascontiguousarray(group) for group in groups[:count]]
+        tangent(2, given(m), given(k), given(h), *(given(group) for group in kept), given(out))
+        np.testing.assert_allclose(np.hstack([out[0], out[1]]), want, atol=1e-9)
+    # what holds for a step alone is the beginning of what holds for its slopes
+    less = np.full(code.n_h + 1, np.nan)
+    library.tg_model_hold(given(u), given(k), given(less))
+    seen = np.isfinite(less)
+    np.testing.assert_array_equal(less[seen], h[seen])
+    library.tg_model_step(given(x), given(u), given(d), given(k), given(less), given(after))
+    np.testing.assert_allclose(after, model.next_state(x, u, d), rtol=1e-10)
     if name == "gripper":
         assert model.model.switches  # the pump
+
+
+def test_a_step_that_is_linear_while_its_drives_stand_still_is_made_once_for_them():
+    """x+ = x (1 - u/4)^4 + d: after `hold` a product and a sum, however long its powers are."""
+    model: Any = SimpleNamespace(disturbances=("room",), parameters=(), n_x=1, inputs=("q",))
+    model.step = lambda x, u, d, p, h: [x[0] * (1.0 - u[0] / 4.0) ** 4 + d[0]]
+    code = write_model(model, [0], 1.0)
+    step = code.source.split("tg_model_step(", 1)[1].split("\n}\n", 1)[0]
+    assert step.count("const double v") == 2
+    assert "/ (4.0)" not in code.source  # a product with 0.25
 
 
 def test_a_state_that_parameters_alone_decide_is_handed_over():
@@ -147,4 +168,4 @@ def test_an_argument_is_called_unused_exactly_where_the_body_does_not_read_it(na
         rest = re.sub(r"\(void\)\w+;", "", body)
         assert unused == {item for item in arguments if not re.search(rf"\b{item}\b", rest)}, head
         seen += 1
-    assert seen == 5
+    assert seen == 9

@@ -12,12 +12,16 @@ from tests.mpc.makers import heater, kit, make_tank
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.native import design_struct
+from thermogrip.mpc.native.codegen import ModelCode, _Line
 from thermogrip.mpc.native.design_struct import numbers_of, sizes_of
+
+#: Hands over 5, 7 and 6 numbers.
+CODE = ModelCode("", "", 5, 7, 6, _Line())
 
 
 def test_a_search_has_room_for_its_variants_and_an_export_for_itself():
     controller: Controller = kit(controlled=("t2",), limits={"t1": (0.0, 50.0)})
-    tight, wide = (sizes_of(controller, 5, 6, room=room) for room in (False, True))
+    tight, wide = (sizes_of(controller, CODE, room=room) for room in (False, True))
     N = sum(controller.design.blocks)
     assert (tight.NH, tight.NC, tight.NL, tight.NS) == (N, 1, 1, 2)
     assert (wide.NH % 32, wide.NC, wide.NL, wide.NS) == (0, 2, 2, 4)
@@ -25,7 +29,14 @@ def test_a_search_has_room_for_its_variants_and_an_export_for_itself():
     model = controller.model
     assert (model.n_x, 2, model.n_d, 2) == (tight.NX, tight.NU, tight.ND, tight.NY)
     assert (tight.NG, wide.NG) == (1, 1)
-    assert (5, 6, model.n_x + controller.disturbance.n_w + 3) == (tight.NK, tight.NM, tight.NZ)
+    assert (tight.NK, tight.NF, tight.NM) == (5, 7, 6)
+    assert model.n_x + controller.disturbance.n_w + 3 == tight.NZ
+
+
+def test_rows_of_the_response_are_as_long_as_the_last_of_four_samples_in_whole_groups_of_four():
+    """Blocks 1, 1, 3, 2 of two drives: samples 1 to 4 end in block 3, 5 to 7 in block 4, 8 numbers each."""
+    assert design_struct._row_lengths((1, 1, 3, 2), 2) == 4 * 8 + 3 * 8
+    assert design_struct._row_lengths((1,) * 9, 1) == 4 * 4 + 4 * 8 + 12
 
 
 def test_numbers_of_a_design_are_the_plants_offsets_and_its_rest_in_any_room():
@@ -47,7 +58,7 @@ def test_numbers_of_a_design_are_the_plants_offsets_and_its_rest_in_any_room():
 
 
 def test_what_is_smaller_than_its_field_stands_in_the_fields_first_corner():
-    sizes = replace(sizes_of(heater(), 1, 1, room=False), NB=3, NU=4)
+    sizes = replace(sizes_of(heater(), CODE, room=False), NB=3, NU=4)
     found = design_struct._padded(sizes, "at_rest", [[1, 2], [3, 4]])
     assert found.tolist() == [[1, 2, 0, 0], [3, 4, 0, 0], [0, 0, 0, 0]]
 
@@ -59,6 +70,6 @@ def test_what_counts_or_says_whether_is_an_int_in_c_and_all_else_is_a_double():
         for name, values in numbers_of(controller, np.zeros(5)).items()
         if np.size(values)
     }
-    declared = design_struct.config_header(sizes_of(controller, 5, 6, room=False))
+    declared = design_struct.config_header(sizes_of(controller, CODE, room=False))
     for name, whole in kinds.items():
         assert re.search(rf"^    {'int' if whole else 'double'} {name}[;\[]", declared, re.MULTILINE), name
