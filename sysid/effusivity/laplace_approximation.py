@@ -202,7 +202,7 @@ def peak_ratio(dof: Array, vary: Mask) -> Array:
 _AT = {name: i for i, name in enumerate((*SHARED_NAMES, "ln_h", "ln_e"))}
 _ROUNDS = 8
 _STILL = 0.5  # of -2 ln density: a smaller predicted decrease ends the search
-_HOPELESS = 20.0  # nats behind the likeliest: a first round is within 5 of the last
+_HOPELESS = 20.0  # nats behind the likeliest
 _DIFFERENCE = 1e-6
 _LAYERS = [_AT[f"ln_{name}"] for name in LAYER_NAMES]
 _CONTACT = ("lag", "first", "creep", "settle", "g_far")
@@ -336,12 +336,14 @@ def _mean_slopes(data: Touches) -> Array:
 
 def _settle(pair: _Pair, v: Array, a: Array, least: float) -> tuple[Mode, Array]:
     """Return the mode of (v, theta) and its a, from the calibration's gripper or from that of ``a``."""
-    here, settled = _start(pair, v, a), False
-    for _ in range(_ROUNDS):
+    here, settled, before = _start(pair, v, a), False, -np.inf
+    for i in range(_ROUNDS):
         k, j = _slopes(pair, here)
         ahead = _expand(pair, here, k, j)
         settled = ahead.decrease < _STILL
-        if settled or ahead.log_evidence < least:
+        # far from the guess a first round says little, so that what is behind is left where it gains little
+        gain, before = ahead.log_evidence - before, ahead.log_evidence
+        if settled or ahead.log_evidence + gain * (_ROUNDS - i) < least:
             break
         there = _step(pair, here, ahead)
         if there is None:

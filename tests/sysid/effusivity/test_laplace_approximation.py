@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -623,6 +623,29 @@ def test_a_hopeless_hypothesis_is_left_unsettled(device, touched):
     left, _ = laplace._settle(pair, u[0], nothing, np.inf)
     assert (whole.converged.tolist(), left.converged.tolist()) == ([True], [False])
     assert whole.log_evidence[0] > left.log_evidence[0] - 1.0
+
+
+@pytest.mark.parametrize("seed", [1, 6, 8])
+def test_what_is_behind_at_first_may_come_up(device, monkeypatch, seed):
+    """A gripper far from the guess: the first round had iron and copper 50 nats behind, and left them there."""
+    rng = np.random.default_rng(seed)
+
+    def times(sd):
+        return float(np.exp(sd * rng.standard_normal()))
+
+    s = device.stack
+    stack = replace(
+        s, e_outer=s.e_outer * times(0.6), z_outer=s.z_outer * times(0.6), z_inner=s.z_inner * times(0.5),
+        lag=s.lag * times(1.0), build_up=s.build_up * times(0.8), creep=s.creep + 0.2 * rng.standard_normal(),
+    )  # fmt: skip
+    blocks = {name: replace(b, ln_h=b.ln_h - 0.4) for name, b in device.blocks.items()}
+    far = replace(device, stack=stack, blocks=blocks)
+    grasps = simulated(far, FIVE, t_object=43.0, t_gripper=23.0, seed=seed, ambient=25.0)
+    spread = GripperSpread(**{f.name: 3 * getattr(GripperSpread(), f.name) for f in fields(GripperSpread)})
+    wide = another_gripper(device, spread)
+    found = material_posterior(wide, grasps, FIVE)
+    monkeypatch.setattr(laplace, "_HOPELESS", 1e9)
+    np.testing.assert_allclose(found, material_posterior(wide, grasps, FIVE), atol=1e-3)
 
 
 @pytest.mark.parametrize(("cost", "taken"), [(4.9, True), (5.0, False), (None, False)])
