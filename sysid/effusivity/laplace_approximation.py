@@ -157,8 +157,8 @@ def pairs_asked(
     from thermogrip.sysid.effusivity.mode_kernel import Asked
 
     shape = (row.size, 2, data.y.shape[1])
-    # a copy: for arrays that must not be written to the kernels are compiled anew
-    nothing = np.zeros(shape) if beyond is None else np.array(np.broadcast_to(beyond, shape))
+    # a copy in C order: for other kinds of arrays kernels are compiled anew
+    nothing = np.zeros(shape) if beyond is None else np.array(np.broadcast_to(beyond, shape), order="C")
     table = response_table(stack, data.tabled) if tabled and data.tabled else None
     return Asked(nodes, gripper_modes(stack), data, row, nothing, table)
 

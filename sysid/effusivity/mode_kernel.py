@@ -31,6 +31,7 @@ _HOPELESS_STATED = {0: 500.0} | dict.fromkeys(range(1, 99), 300.0)
 _LEAST_DECREASE = 0.01  # of -2 ln posterior: smaller predicted decreases end the search
 _H, _BUILD_UP, _ONSET, _LEVEL, _T, _E, _C = range(7)
 _LEFT = 7  # the column of what is left, after those of the derivatives
+_FEW = 3  # columns
 RATE = 5  # the row of the slope, after the stepped curves
 _CURVES = (_H, _BUILD_UP, _E, _C, _ONSET)  # by which the curves after the value are derivatives
 EARLIEST_ONSET, LATEST_ONSET = -1.5, 0.8  # s after the closed message
@@ -263,7 +264,7 @@ def products(
     scale, matrix = np.ones((len(u), _LEFT + 1)), np.zeros((len(u), _LEFT + 1, _LEFT + 1))
     scale[:, :_LEFT] = sd
     used = np.flatnonzero((scale > 0.0).any(axis=0))
-    if used.size > _LEFT // 2:
+    if used.size > _FEW:
         matrix = squares(whitener, asked.row, columns)
     else:
         matrix[:, used[:, None], used] = squares(whitener, asked.row, columns[:, :, used])
@@ -280,12 +281,16 @@ def squares(whitener: Any, row: NDArray[np.int64], columns: Array) -> Array:
     out = np.empty((row.size, columns.shape[2], columns.shape[2]))
     for k in np.unique(kind):
         at: Any = slice(None) if (kind == k).all() else kind == k
-        # one product of large matrices is quicker than many of few columns
-        own = columns[at].transpose(0, 2, 1)
-        white = np.matmul(own.reshape(-1, own.shape[2]), kinds[k].T).reshape(own.shape)
+        own = columns[at]
+        if own.shape[2] > _FEW:
+            white = np.matmul(kinds[k], own)
+        else:  # one product of large matrices is quicker than many of few columns
+            across = own.transpose(0, 2, 1)
+            white = np.matmul(across.reshape(-1, across.shape[2]), kinds[k].T)
+            white = white.reshape(across.shape).transpose(0, 2, 1)
         if not alone:
-            white *= whitener.scale[row[at], None, :]
-        out[at] = np.matmul(white, white.transpose(0, 2, 1))
+            white *= whitener.scale[row[at], :, None]
+        out[at] = np.matmul(white.transpose(0, 2, 1), white)
     return out
 
 

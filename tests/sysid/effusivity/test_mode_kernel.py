@@ -138,3 +138,13 @@ def test_a_candidate_far_behind_is_left_and_changes_no_other():
     assert (found[:, 2] < found[:, 0] - 60).all()
     np.testing.assert_allclose(raced.u[row < 3][settled.ravel()], alone.u[settled.ravel()], atol=0.05)
     assert (alone.log_evidence.reshape(3, 3)[:, 2] < found[:, 0] - 25).all()
+
+
+def test_kernels_are_compiled_for_one_kind_of_arguments():
+    """An array that must not be written to, or lies in memory in another order, is another kind: 2 s more."""
+    gripper, record = load_default_gripper(), load_example_grasps()["exp1A_obj43_grip23"]
+    data = touches(record.isel(grasp=[0, 1]))
+    for beyond in (None, np.zeros((2, 2, data.y.shape[1])), np.zeros((1, 2, data.y.shape[1]))):
+        found = pairs_asked(gripper.stack, nodes_for(data), data, np.array([0, 1]), beyond).beyond
+        assert found.flags.writeable
+        assert found.flags.c_contiguous
