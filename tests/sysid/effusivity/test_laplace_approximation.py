@@ -627,7 +627,7 @@ def test_a_hopeless_hypothesis_is_left_unsettled(device, touched):
 
 @pytest.mark.parametrize("seed", [1, 6, 8])
 def test_what_is_behind_at_first_may_come_up(device, monkeypatch, seed):
-    """A gripper far from the guess: the first round had iron and copper 50 nats behind, and left them there."""
+    """A gripper far from the guess: the first round had what is right 50 nats behind, and left it there."""
     rng = np.random.default_rng(seed)
 
     def times(sd):
