@@ -23,11 +23,11 @@
  */
 #include "tg_qp.h"
 
-#include <float.h>
 #include <math.h>
 #include <string.h>
 
 #define FAR 1e15
+#define LARGEST 1.7e308 /* number that is finite */
 #define TOLERANCE 1e-10 /* of a row, in units of its own length */
 #define REGULAR 1e-11   /* share of K_ii that keeps its factor regular */
 #define CONTRADICTION 1e-6 /* by which a hard row may stay broken, in units of its length */
@@ -42,7 +42,7 @@ static int all_finite(const double *a, int n)
 {
     int wrong = 0;
     for (int i = 0; i < n; i++)
-        wrong |= !(fabs(a[i]) <= DBL_MAX);
+        wrong |= !(fabs(a[i]) <= LARGEST);
     return !wrong;
 }
 
