@@ -44,7 +44,7 @@ _COPIED = (*SOURCES, "tg_design.h", "Makefile", "example.c", "check.c")
 # of a drive's range; where dozens of soft rows are broken, a plan is a small difference of large multipliers,
 # and C as well as Python is up to 1e-10 off the exact one; with hard limits, a thousand times as dear, 3e-9
 _TOLERANCE, _HARD_TOLERANCE = 1e-9, 1e-8
-_RESTS = 200  # from which random states depart
+_RESTS = 100  # from which random states depart
 
 
 @dataclass(frozen=True)
@@ -218,7 +218,7 @@ class _Twin(Controller):
     _rests: tuple[tuple[Array, Array, Array], ...] = ()
 
     def random_rest(self, rng: np.random.Generator) -> tuple[Array, Array, Array]:
-        """Return readings, measured disturbances and state at rest somewhere in the valid range, one of a few
+        """Return readings, measured disturbances and state at rest somewhere in the valid range, one of a
         hundred: each is a program to solve, which takes longer than a step."""
         if len(self._rests) < _RESTS:
             low, high = _range_of(self)

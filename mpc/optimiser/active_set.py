@@ -64,15 +64,19 @@ class ActiveSetQP(CondensedQP):
 
     def _system(self) -> tuple[Array, Array]:
         """Return K, with its regular share, and the right side, of the set."""
-        m = np.array([entry.side * self._normals[entry.row] for entry in self._set])
+        m = self._normals_of_set()
         K = m @ m.T
-        K[np.diag_indices_from(K)] *= 1 + _REGULAR
+        K.flat[:: len(K) + 1] *= 1 + _REGULAR
         right = -np.array([self._bound(entry) for entry in self._set]) - m @ self._c
         for at, entry in enumerate(self._set):
             if entry.state == _BROKEN:
                 K[at, at] += 1.0 / self.quadratic[entry.row]
                 right[at] += self.linear[entry.row] / self.quadratic[entry.row]
         return K, right
+
+    def _normals_of_set(self) -> Array:
+        sides = np.array([float(entry.side) for entry in self._set])
+        return np.asarray(self._normals[[entry.row for entry in self._set]] * sides[:, None])
 
     def _bound(self, entry: _Entry) -> float:
         lower, upper = self._bounds
@@ -110,9 +114,9 @@ class ActiveSetQP(CondensedQP):
             self._set.append(_Entry(entry.row, entry.side, _KEPT, self.linear[entry.row]))
 
     def _answer(self) -> Array:
-        v = -self._c.copy()
-        for entry in self._set:
-            v -= entry.side * entry.multiplier * self._normals[entry.row]
+        v = -self._c
+        if self._set:
+            v = v - self._normals_of_set().T @ np.array([entry.multiplier for entry in self._set])
         return np.asarray(np.linalg.solve(self._L.T, v))
 
     def _worst(self, x: Array) -> tuple[int, int] | None:

@@ -27,6 +27,7 @@
 #include <string.h>
 
 #define FAR 1e15
+#define LARGEST 1.7e308 /* number that is finite */
 #define TOLERANCE 1e-10 /* of a row, in units of its own length */
 #define REGULAR 1e-11   /* share of K_ii that keeps its factor regular */
 #define CONTRADICTION 1e-6 /* by which a hard row may stay broken, in units of its length */
@@ -36,14 +37,13 @@ static double *fit_row(tg_qp *q, int i) { return q->fit + (size_t)i * (size_t)(i
 
 void tg_qp_forget(tg_qp *q) { q->n_work = 0; }
 
-/* Whether none of n numbers, a multiple of four, is infinite or no number: 0 times one of those is no number. */
+/* Whether none of n numbers is infinite or no number. */
 static int all_finite(const double *a, int n)
 {
-    double sum[4] = {0.0};
-    for (int i = 0; i < n; i += 4)
-        for (int l = 0; l < 4; l++)
-            sum[l] += 0.0 * a[i + l];
-    return (sum[0] + sum[1]) + (sum[2] + sum[3]) == 0.0;
+    int wrong = 0;
+    for (int i = 0; i < n; i++)
+        wrong |= !(fabs(a[i]) <= LARGEST);
+    return !wrong;
 }
 
 static int problem_is_finite(const tg_qp *q)
