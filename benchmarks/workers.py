@@ -34,7 +34,7 @@ from scale import make
 from tests.end_to_end.test_killed_workers import cpu_s
 from thermogrip.datasets.examples import copy_examples
 
-OWN = re.compile(rb'"(fit_s|predict_s_per_grasp|written|command)": [^\n]*')
+OWN = re.compile(rb'"(seconds|fit_s|predict_s_per_grasp|written|command)": [^\n]*')
 LOGS = ("prbs_heating_cooling", "step_up_down", "multisine", "pump_on_off")
 
 
