@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -163,4 +163,5 @@ _Numbers = TypeVar("_Numbers", Noise, Spreads)
 def _middle(parts: Sequence[_Numbers]) -> _Numbers:
     """Return the medians of the numbers of several records of one kind."""
     numbers = [f.name for f in fields(parts[0]) if isinstance(getattr(parts[0], f.name), float)]
-    return replace(parts[0], **{k: float(np.median([getattr(one, k) for one in parts])) for k in numbers})
+    middle: dict[str, Any] = {k: float(np.median([getattr(one, k) for one in parts])) for k in numbers}
+    return replace(parts[0], **middle)

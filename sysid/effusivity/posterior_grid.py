@@ -317,13 +317,13 @@ def log_integrals_of_two(
     one saw of the object's temperature, for a stated temperature that is right and for a slip."""
     assert gripper.second is not None
     assert data.second is not None
-    second, hypotheses = gripper.second, free_hypotheses(gripper, x)
+    second, touched, hypotheses = gripper.second, data.second, free_hypotheses(gripper, x)
     apart, each = second.bias - gripper.bias, data.known(row)
     prior, alone = prior_of(gripper, each, hypotheses), replace(gripper, second=None)
     first = fit_pairs(alone, data, row, hypotheses, start=start, noise=noise, prior=prior)
     other, own = second_modes(gripper, data, row, hypotheses, first)
     ln_e = second.found_effusivity(x - gripper.effusivity_scale(x)[0])
-    white = whitened(second, data.second)
+    white = whitened(second, touched)
 
     def total(law: Prior) -> Array:
         mine = at_temperature(first, prior, law.mean[:, T_OBJECT], law.sd[:, T_OBJECT] ** 2)
@@ -331,7 +331,7 @@ def log_integrals_of_two(
         by_other = temperatures_by_the_other(mine, law, other, own, apart)
         for device, seen, at, mode, before, told, w in (
             (gripper, data, x, mine, law, by_other[0], noise),
-            (second, data.second, ln_e, other, own, by_other[1], white),
+            (second, touched, ln_e, other, own, by_other[1], white),
         ):
             there = at_temperature(mode, before, *told)
             under = Prior(_with(before.mean, told[0]), _with(before.sd, np.sqrt(told[1])), before.dof)
