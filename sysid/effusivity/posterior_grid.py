@@ -335,8 +335,8 @@ def log_integrals_of_two(
         ):
             there = at_temperature(mode, before, *told)
             under = Prior(_with(before.mean, told[0]), _with(before.sd, np.sqrt(told[1])), before.dof)
-            untold = replace(seen, t_object=np.full(seen.t_object.shape, np.nan))
-            whole = _integrals(device, untold, at, there.u, there.covariance, w, row, under)
+            unstated = replace(seen, t_object=np.full(seen.t_object.shape, np.nan))
+            whole = _integrals(device, unstated, at, there.u, there.covariance, w, row, under)
             evidence = evidence + whole - there.log_evidence
         return np.asarray(evidence)
 

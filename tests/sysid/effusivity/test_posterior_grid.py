@@ -141,16 +141,16 @@ def test_two_sensors_are_integrated_over_every_temperature_of_their_object(finge
     got = log_integrals_of_two(finger, data, x, mode.u, noise=noise, row=row)
 
     def held(own, seen, ln_e, t):  # ln p(y | ln e, T_obj), (4, n)
-        untold = replace(seen, second=None, t_object=np.full(1, np.nan))
-        law = prior_of(own, untold.known(row), free_hypotheses(own, ln_e))
+        unstated = replace(seen, second=None, t_object=np.full(1, np.nan))
+        law = prior_of(own, unstated.known(row), free_hypotheses(own, ln_e))
         out = []
         for at in t:
             mean, sd = law.mean.copy(), law.sd.copy()
             mean[:, T_OBJECT], sd[:, T_OBJECT] = at, 1e-3
-            prior, white = law._replace(mean=mean, sd=sd), whiten(untold, own.noise)
-            there = fit_pairs(own, untold, row, free_hypotheses(own, ln_e), prior=prior)
+            prior, white = law._replace(mean=mean, sd=sd), whiten(unstated, own.noise)
+            there = fit_pairs(own, unstated, row, free_hypotheses(own, ln_e), prior=prior)
             out.append(
-                posterior_grid._integrals(own, untold, ln_e, there.u, there.covariance, white, row, prior)
+                posterior_grid._integrals(own, unstated, ln_e, there.u, there.covariance, white, row, prior)
             )
         return np.stack(out, axis=1)
 
