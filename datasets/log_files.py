@@ -109,7 +109,8 @@ def read_log(
     log : Log
         Temperatures in degC, time in s.  ``attrs["repairs"]`` has a line a repair, ``attrs["guesses"]`` a
         line a guessed role with its reason, ``attrs["name"]`` the file's stem and cut, ``attrs["sha256"]``
-        the hash of the file's data.
+        the hash of the file's data, ``attrs["began"]`` the date and time of the first row, if the file has a
+        clock.
 
     Raises
     ------
@@ -135,7 +136,7 @@ def read_log(
     check_header([*table.numbers, *table.text], named, str(file))
     if table.meta.get("schema") not in (None, "thermogrip.log"):
         raise UserError(f"holds a {table.meta['schema']}, not a log", file=file, hint="give a log")
-    data, units, names_of, repairs = _convert(table, dt)
+    data, units, names_of, repairs, began = _convert(table, dt)
     sha256 = hash_columns(data)
     time = data.pop("time")
     del units["time"]
@@ -160,6 +161,8 @@ def read_log(
         if (words := attrs.get("flag_meanings")) and (flagged := names_of[header]) in log:
             log[flagged].attrs["flag_meanings"] = words
     log.attrs["sha256"] = sha256
+    if np.isfinite(began):
+        log.attrs["began"] = str(np.datetime64(round(began), "s")) + "Z"
     log.attrs["guesses"] = "\n".join(guesses)
     if own:
         log.attrs.update({k: v for k, v in table.meta.items() if k not in ("schema", "version")})
@@ -307,13 +310,13 @@ def _frame_table(frame: Any, columns: Sequence[str] | None) -> Table:
 
 def _convert(
     table: Table, dt: float | None
-) -> tuple[dict[str, Floats], dict[str, str], dict[str, str], list[str]]:
+) -> tuple[dict[str, Floats], dict[str, str], dict[str, str], list[str], float]:
     """Return columns in record units by name (``time`` among them), their units, the name of each header,
-    and what was converted."""
+    what was converted, and when the first row was [s since 1970], nan where the file does not say."""
     headers = [*table.numbers, *table.text]
     read = {header: read_header(header, headers) for header in headers}
     read |= {h: (h, attrs["units"], 1.0) for h, attrs in table.attrs.items() if "units" in attrs}
-    time, used, found = _time_of(table, read, dt)
+    time, used, found, zero = _time_of(table, read, dt)
     columns, units, names_of = {"time": time}, {"time": "s"}, dict.fromkeys(used, "time")
     repairs, renamed = [*table.notes, *found], []
     for header, values in table.numbers.items():
@@ -335,7 +338,9 @@ def _convert(
     _check_wide(table, words, [*names_of])
     repairs += [f"read {', '.join(renamed)}"] if renamed else []
     repairs += [f"left out, no numbers: {', '.join(words)}"] if words else []
-    return columns, units, names_of, repairs
+    known = time[np.isfinite(time)]
+    began = zero + float(known.min()) if known.size else np.nan
+    return columns, units, names_of, repairs, began if began >= repair.CLOCK else np.nan
 
 
 def _check_wide(table: Table, words: Sequence[str], numbers: Sequence[str]) -> None:
@@ -355,8 +360,9 @@ def _check_wide(table: Table, words: Sequence[str], numbers: Sequence[str]) -> N
 
 def _time_of(
     table: Table, read: Mapping[str, tuple[str, str, float]], dt: float | None
-) -> tuple[Floats, set[str], list[str]]:
-    """Return the time of each row [s], the headers it was read from, and what was taken for it."""
+) -> tuple[Floats, set[str], list[str], float]:
+    """Return the time of each row [s], the headers it was read from, what was taken for it, and where its
+    zero is on the file's clock [s], nan where it has none."""
     like = [h for h, (n, unit, _) in read.items() if unit in _TIME_UNITS and _TIME.fullmatch(n)]
     # a clock that starts again with each cycle comes after one that does not
     back = {h for h in like if h in table.numbers and (np.diff(table.numbers[h]) < 0).any()}
@@ -365,7 +371,7 @@ def _time_of(
     if dt is not None:
         instead = f" in place of {', '.join([*like, *unnamed])}" if like or unnamed else ""
         note = f"time: rows are {dt:g} s apart, as asked{instead}"
-        return np.asarray(np.arange(len(table.lines)) * dt, dtype=float), {*like, *unnamed}, [note]
+        return np.asarray(np.arange(len(table.lines)) * dt, dtype=float), {*like, *unnamed}, [note], np.nan
     for header in [*like, *unnamed]:
         if header in table.text:
             cells, parts = table.text[header], [header]
@@ -375,7 +381,8 @@ def _time_of(
                 cells = [" ".join(row) for row in zip(*(table.text[h] for h in parts))]
             if (clock := read_clock(cells)) is not None:
                 note = f"time: {' and '.join(parts)} counted from the first row, {cells[0]}{clock[1]}"
-                return clock[0] - clock[0][np.isfinite(clock[0]).argmax()], {*parts}, [note]
+                zero = float(clock[0][np.isfinite(clock[0]).argmax()])
+                return clock[0] - zero, {*parts}, [note], zero
             continue
         values, (name, unit, scale) = table.numbers[header], read[header]
         stated, finite = name == "time" and unit != "1", values[np.isfinite(values)]
@@ -387,15 +394,15 @@ def _time_of(
             scale = next((f for least, f in _EPOCHS if abs(finite[0]) >= least), scale)
         seconds = to_record_unit(values if scale == 1 else values * scale, unit)[0]
         if stated and scale == 1:
-            return seconds, {header}, [f"time: converted from {unit} to s"] if unit != "s" else []
+            return seconds, {header}, [f"time: converted from {unit} to s"] if unit != "s" else [], 0.0
         what = f"{header} is taken as the time in {unit if unit != '1' else 's'}"
         more = "; --dt S sets another step" if header in unnamed else ""
-        return seconds, {header}, [f"time: {what}{'' if scale == 1 else f', times {scale:g}'}{more}"]
+        return seconds, {header}, [f"time: {what}{'' if scale == 1 else f', times {scale:g}'}{more}"], 0.0
     steps = {h: np.unique(v[np.isfinite(v)]) for h, v in table.numbers.items() if _STEP.fullmatch(read[h][0])}
     known = {h: float(v[0]) for h, v in steps.items() if v.size == 1 and v[0] > 0}
     step = next(iter(known.values()), float(table.meta.get("dt", 1.0)))  # a file may have it beside
     note = f"no time column: rows are taken {step:g} s apart; --dt S sets another step"
-    return np.asarray(step * np.arange(len(table.lines)), dtype=float), {*known}, [note]
+    return np.asarray(step * np.arange(len(table.lines)), dtype=float), {*known}, [note], np.nan
 
 
 def _counts(header: str, table: Table) -> bool:

@@ -38,7 +38,7 @@ _SLOW_ROWS = 60.0  # s
 GAP_SECONDS = 10.0
 GAP_STEPS = 5.0
 _FEW, _MOST_MOVED = 0.05, 10  # share of rows whose time may be wrong; rows that one may be out of place
-_CLOCK = 1e8  # s: no log is three years old at its first row
+CLOCK = 1e8  # s: no log is three years old at its first row
 
 
 def order_rows(
@@ -82,7 +82,7 @@ def order_rows(
 
 def from_first_row(time: Floats) -> tuple[Floats, list[str]]:
     """Return times since 1970 [s] counted from the first row, others as they are, and a line if they were."""
-    if not time[0] >= _CLOCK:
+    if not time[0] >= CLOCK:
         return time, []
     repairs = f"time is a clock of seconds since 1970: counted from the first row, {time[0]:.0f} s"
     return np.round(time - time[0], 6), [repairs]

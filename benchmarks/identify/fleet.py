@@ -1,6 +1,6 @@
 """Rigs of one kind alone and pooled: errors of parameters and free runs, the population's coverage, ill rigs.
 
-    python benchmarks/identify/fleet.py [--rigs 30] [--seeds 4] [--workers 2]
+    python benchmarks/identify/fleet.py [--rigs 30] [--seeds 4] [--workers 2] [--months 6]
 
 Each fleet has TCLab boards whose parameters are drawn about a mean that is off the network's own prior: with
 sd 0.15 in the logarithm, of the lags 0.3.  Each board has three logs of 5 min, or one, with random steps,
@@ -9,6 +9,10 @@ Each is scored by a free run of a log of 20 min that no fit saw, noise left out.
 population of the other rigs as prior, which takes the fit's whole curvature; "pooled" the update of its end.
 In a second fleet the first board's G_amb is twice its own (a fan that blows on it).  Simulation and fit share
 the equations: the network is right, and only the number of readings is short.
+
+``--months M`` instead has one log of 15 min of a board a month, whose parameters differ from month to month
+with sd 0.05 in the logarithm; G_amb of the first board grows by 10 % a month (a fan that is turned up), in a
+second fleet it does not.
 """
 
 from __future__ import annotations
@@ -23,6 +27,7 @@ from scipy.signal import lfilter
 
 from thermogrip.datasets.parallel import run_parallel
 from thermogrip.datasets.schema import make_log
+from thermogrip.sysid.greybox.drift import find_drift
 from thermogrip.sysid.greybox.fit import fit_network
 from thermogrip.sysid.greybox.population import pool_rigs, pooled_plant
 from thermogrip.sysid.greybox.problem import prior_plant
@@ -67,6 +72,52 @@ def fitted(given):
     return fit_network(model, logs)
 
 
+def over_months(rng, n, months, growth):
+    """Return the logs of each board, one a month; G_amb of the first grows in ln by ``growth`` a month."""
+    board = prior_plant(load_network("tclab"))
+    prior = np.log([board.values[name] for name in NAMES])
+    logs = []
+    for theta in prior + OFF + SPREAD * rng.normal(size=(n, len(NAMES))):
+        own = []
+        for month in range(months):
+            day = theta + 0.05 * rng.normal(size=theta.size)
+            day[0] += growth * month * (not logs)
+            values = dict(zip(NAMES, np.exp(day).tolist())) | {"t_room": 23.0 + rng.normal()}
+            own.append(log_of(replace(board, values=board.values | values), rng, 15))
+        logs.append(own)
+    return logs
+
+
+def drifts(run, model, n, months, seeds):
+    """Print how often the board that changes is found, alarms among the others, and what is found."""
+    found, alarms, steady, off, scatters = 0, 0, 0, [], []
+    for seed in range(seeds):
+        for growth in (float(np.log(1.1)), 0.0):
+            logs = over_months(np.random.default_rng([seed, months]), n, months, growth)
+            population, _ = pool_rigs(
+                {f"r{k}": plant for k, plant in enumerate(run([(model, own) for own in logs]))}
+            )
+            narrow = population.prior_of(model)
+            plants = run([(narrow, [log]) for own in logs for log in own])
+            fits = {f"r{k}": plants[months * k : months * (k + 1)] for k in range(n)}
+            rigs, scatter = find_drift(fits, {name: [30.0 * m for m in range(months)] for name in fits})
+            changing, at = int(growth > 0), [population.parameters.index(name) for name in NAMES]
+            found += changing * rigs[0].drifts
+            alarms += sum(rig.drifts for rig in rigs[changing:])
+            steady += n - changing
+            scatters.append(scatter[at])
+            truth = np.zeros((n, len(NAMES)))
+            truth[0, 0] = growth * (months - 1)
+            off += [(rig.change[at] - true) / rig.change_sd[at] for rig, true in zip(rigs, truth)]
+            if changing:
+                change, sd = rigs[0].change[at[0]], rigs[0].change_sd[at[0]]
+                said = f"found {change:.2f} +- {sd:.2f}, chance {rigs[0].chance:.2g}"
+                print(f"seed {seed}: ln G_amb changed by {truth[0, 0]:.2f}, {said}", flush=True)
+    covered = np.mean(np.abs(off) < 1.645)
+    print(f"found {found}/{seeds}; alarms {alarms}/{steady}; 90 % intervals of a change cover {covered:.3f}")
+    print(f"scatter from month to month, true 0.05: {np.mean(scatters, axis=0).round(3)}")
+
+
 def errors(plants, theta, checks):
     """Return the rms error of the parameters' logarithms, and of free runs [K]."""
     found = np.log([[plant.values[name] for name in NAMES] for plant in plants])
@@ -83,9 +134,13 @@ def main() -> None:
     parser.add_argument("--rigs", type=int, default=30)
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--months", type=int, default=0)
     given = parser.parse_args()
     run = partial(run_parallel, fitted, workers=given.workers)
     model, n = load_network("tclab"), given.rigs
+    if given.months:
+        drifts(run, model, n, given.months, given.seeds)
+        return
     print("logs  alone ln p, K   pooled ln p, K   refit ln p, K   covered  spread found / true")
     print("      alarms among healthy boards  ill found (chance of each)  seconds of fits and pooling")
     for n_logs in (3, 1):

@@ -57,12 +57,12 @@ from thermogrip.sysid.plant.plant import Plant
 SCHEMA, VERSION = "thermogrip.population", 1
 LEAST_RIGS = 3
 _SEEN = 1e-3  # of the prior's precision: what logs say less about is not counted as told
-_ROUNDS, _STILL = 500, 1e-4
+ROUNDS, STILL = 500, 1e-4
 _FIRST = 0.25  # of the prior's variance, where EM begins
-_ILL = 0.05  # chance that one of a healthy fleet is as far off
+ILL = 0.05  # chance that one of a healthy fleet is as far off
 
 
-class _Told(NamedTuple):
+class Told(NamedTuple):
     """What the logs of n rigs say, in units of the prior."""
 
     precision: Array  # (n, k, k)
@@ -190,7 +190,7 @@ class Rig(NamedTuple):
     @property
     def ill(self) -> bool:
         """Whether fewer than one healthy fleet of twenty has such a rig."""
-        return self.chance < _ILL
+        return self.chance < ILL
 
 
 def pool_rigs(plants: Mapping[str, Plant]) -> tuple[Population, tuple[Rig, ...]]:
@@ -219,7 +219,7 @@ def pool_rigs(plants: Mapping[str, Plant]) -> tuple[Population, tuple[Rig, ...]]
     width = np.array([s.sd_log if s.sd_log is not None else s.sd for s in specs], dtype=float)
     z = (np.array([plant.theta for plant in plants.values()]) - centre) / width
     S = np.array([plant.covariance for plant in plants.values()]) / np.outer(width, width)
-    told = _told(z, S)
+    told = told_by(z, S)
     whole = _pool(told)
 
     def population(found: _Pooled, rigs: Sequence[str]) -> Population:
@@ -234,7 +234,7 @@ def pool_rigs(plants: Mapping[str, Plant]) -> tuple[Population, tuple[Rig, ...]]
     rigs = []
     for i, name in enumerate(names):
         rest = np.arange(len(names)) != i
-        others = _pool(_Told(told.precision[rest], told.information[rest]), whole.variance)
+        others = _pool(Told(told.precision[rest], told.information[rest]), whole.variance)
         spread = np.diag(others.variance) + others.unsure
         off = (z[i] - others.mean) / np.sqrt(np.diagonal(S[i] + spread))
         distance, of_all = _distance(told.precision[i], told.information[i], others, len(names) - 2)
@@ -250,33 +250,33 @@ def _with_prior(spec: Parameter, value: float, sd: float) -> Parameter:
     return spec.model_copy(update={"value": value, "sd_log" if spec.scale == "log" else "sd": sd})
 
 
-def _told(z: Array, S: Array) -> _Told:
+def told_by(z: Array, S: Array) -> Told:
     """Return what logs alone say, from fits with the prior."""
     size, axes = np.linalg.eigh(S)
     size = np.maximum(size, 1e-12)
     seen = 1 / size - 1 > _SEEN
     along = np.einsum("nji,nj->ni", axes, z) / size
     precision = np.einsum("nij,nj,nkj->nik", axes, np.where(seen, 1 / size - 1, 0.0), axes)
-    return _Told(precision, np.einsum("nij,nj->ni", axes, np.where(seen, along, 0.0)))
+    return Told(precision, np.einsum("nij,nj->ni", axes, np.where(seen, along, 0.0)))
 
 
-def _pool(told: _Told, start: Array | None = None) -> _Pooled:
+def _pool(told: Told, start: Array | None = None) -> _Pooled:
     """Return the population by EM."""
     n, k = told.information.shape
     T = np.full(k, _FIRST) if start is None else start
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         found = _given(told, T)
         A = found.covariances / T - np.eye(k)
         unsure = np.einsum("nij,jl,nil->ni", A, found.unsure, A)
         own = np.diagonal(found.covariances, axis1=1, axis2=2)
         renewed = (own + unsure + (found.rigs - found.mean) ** 2).sum(axis=0) / (n - 1)
         moved, T = np.abs(np.log(renewed / T)).max(), renewed
-        if moved < _STILL:
+        if moved < STILL:
             break
     return _given(told, T)
 
 
-def _given(told: _Told, T: Array) -> _Pooled:
+def _given(told: Told, T: Array) -> _Pooled:
     """Return mean and rigs of a population with the variances ``T``."""
     V = np.linalg.inv(told.precision + np.diag(1 / T))
     own = np.einsum("nij,nj->ni", V, told.information)

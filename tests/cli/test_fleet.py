@@ -52,6 +52,35 @@ def test_a_fleet_gives_population_plants_page_and_prior(bench: Bench, rigs: Path
     assert model.specs["G_amb"].value == pytest.approx(np.exp(answer["population"]["mean"][0]))
 
 
+def test_logs_of_several_days_show_which_board_changes(bench: Bench, tmp_path: Path) -> None:
+    board, rng = prior_plant(load_network("tclab")), np.random.default_rng(1)
+    t = np.arange(0.0, 800.0, 4.0)
+    signals = {"q1": (60.0 * (t < 400), "percent", "input"), "q2": (40.0 * (t > 200), "percent", "input")}
+    signals |= {name: (np.full(t.size, 23.0), "degC", "output") for name in ("t1", "t2")}
+    for k, factor in enumerate((0.9, 1.0, 1.1)):
+        (tmp_path / f"days/b{k}").mkdir(parents=True)
+        for month in range(4):
+            more = 1 + 0.25 * month * (k == 1)  # a fan that is turned up
+            truth = replace(board, values=board.values | {"G_amb": 0.013 * factor * more})
+            log = truth.simulate(make_log(t, signals))
+            for name in ("t1", "t2"):
+                log[name] = ("time", log[name].values + 0.1 * rng.normal(size=t.size), log[name].attrs)
+            write_log(log, tmp_path / f"days/b{k}/{month}_2026-0{4 - month}-10.csv")  # the last day first
+    words = ("fleet", str(tmp_path / "days"), "--network", "tclab", "--report", "f.html", "--out", "f")
+    done = bench.run(*words, "--json")
+    answer = json.loads(done.out)
+    assert (done.code, answer["changing"]) == (3, ["b1"])
+    moved = answer["rigs"][1]["from_first_to_last"]
+    assert moved["days"] == [90, 59, 31, 0]
+    assert moved["change"]["G_amb"] == pytest.approx(-np.log(1.75), abs=0.1)  # April's has the least
+    page = (bench.path / "f.html").read_text()
+    assert "Which rig changes?" in page
+    (tmp_path / "days/b2/3_2026-01-10.csv").rename(tmp_path / "days/b2/undated.csv")
+    done = bench.run(*words[:4], "--out", "g", "--json")
+    assert "undated.csv: says no date" in done.err
+    assert json.loads(done.out)["rigs"][0]["from_first_to_last"]["days"] is None
+
+
 def test_folders_that_are_no_fleet_are_refused(bench: Bench, rigs: Path) -> None:
     (rigs / "empty").mkdir()
     done = bench.run("fleet", str(rigs), "--network", "tclab", "--out", "f")

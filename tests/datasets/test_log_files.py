@@ -871,3 +871,23 @@ def test_a_reading_of_one_signal_a_row_is_refused_with_what_makes_columns_of_it(
     assert "pivot_table(index='time_s', columns='sensor', values='state')" in line
     path.write_text("".join(["note,state,time_s\n", *(f"n{k},{k},{k}\n" for k in range(10))]))  # all differ
     assert list(read_log(path).data_vars) == ["state"]
+
+
+@pytest.mark.parametrize(
+    ("rows", "began"),
+    [
+        (["time,q,t_degC", "2026-03-01 10:00:00,0,20", "2026-03-01 10:00:02,1,20.1"], "2026-03-01T10:00:00Z"),
+        (["date,q,t_degC", "01.02.2026 23:59:59,0,20", "02.02.2026 00:00:01,1,20.1"], "2026-02-01T23:59:59Z"),
+        (["time_s,q,t_degC", "1767261600,0,20", "1767261602,1,20.1"], "2026-01-01T10:00:00Z"),
+        (["time_ms,q,t_degC", "1767261600000,0,20", "1767261602000,1,20.1"], "2026-01-01T10:00:00Z"),
+        (["time,q,t_degC", "10:00:00,0,20", "10:00:02,1,20.1"], None),
+        (["time_s,q,t_degC", "5,0,20", "7,1,20.1"], None),
+    ],
+)
+def test_a_log_knows_its_date_where_its_clock_does(tmp_path, rows, began):
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(rows) + "\n")
+    log = read_log(path)
+    assert log.attrs.get("began") == began
+    assert log["time"].values[1] - log["time"].values[0] == pytest.approx(2.0)
+    assert read_log(write_log(log, tmp_path / "log.nc")).attrs.get("began") == began

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -11,6 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from thermogrip.datasets.charts import PALETTE
 from thermogrip.datasets.media import panels
 from thermogrip.report.html import Picture, Section, Table
+from thermogrip.sysid.greybox.drift import Drift
 from thermogrip.sysid.greybox.population import Population, Rig
 from thermogrip.sysid.plant.plant import Plant
 
@@ -44,6 +46,57 @@ def rig_table(
         far = population.parameters[k]
         rows.append((rig.name, word, rig.distance, rig.chance, far, float(rig.deviation[k])))
     return head, rows
+
+
+def drift_table(
+    moved: Sequence[Drift], population: Population, *, dated: bool
+) -> tuple[tuple[str, ...], list[tuple[object, ...]]]:
+    """Return head and rows of how each rig changed, the least likely first."""
+    span = "days" if dated else "logs"
+    head = ("rig", "verdict", span, "farthest parameter", "changed by", "+-", "chance in a steady fleet")
+    rows: list[tuple[object, ...]] = []
+    for rig in sorted(moved, key=lambda each: each.chance):
+        k = rig.farthest
+        change, sd = float(rig.change[k]), float(rig.change_sd[k])
+        log = population.scales[k] == "log"
+        told = f"{100 * np.expm1(change):+.2g} %" if log else f"{change:+.2g}"
+        more = f"{100 * np.exp(change) * sd:.2g} %" if log else f"{sd:.2g}"
+        length = float(rig.days.max()) if dated else rig.days.size
+        word = "changing" if rig.drifts else "ok"
+        rows.append((rig.name, word, length, population.parameters[k], told, more, rig.chance))
+    return head, rows
+
+
+def drift_figure(plant: Plant, population: Population, moved: Sequence[Drift], *, dated: bool) -> Figure:
+    """Draw every parameter of every rig by the time of its logs; rigs that change are named."""
+    n, columns = len(population.parameters), 3
+    figure, axes = panels(-(-n // columns), columns, size=(10.0, 2.6 * -(-n // columns)))
+    ranges = population.intervals(0.9)
+    for k, axis in enumerate(axes.ravel()):
+        if k >= n:
+            axis.set_visible(False)
+            continue
+        name = population.parameters[k]
+        axis.axhspan(*ranges[name], color=PALETTE[0], alpha=0.15, lw=0, label="90 % of new rigs")
+        looks = zip(cycle(PALETTE[1:]), cycle("os^vD"))
+        for rig in sorted(moved, key=lambda each: each.drifts):
+            low, middle, high = (population.natural(rig.theta + q * rig.sd)[:, k] for q in (-1.64, 0.0, 1.64))
+            order = np.argsort(rig.days, kind="stable")
+            if rig.drifts:
+                colour, mark = next(looks)
+                size = np.abs(np.stack([low, high]) - middle)[:, order]
+                axis.errorbar(
+                    rig.days[order], middle[order], size, fmt=f"{mark}-", color=colour, ms=4, label=rig.name
+                )
+            else:
+                axis.plot(rig.days[order], middle[order], "-", color="0.6", lw=0.8, label="other rigs")
+        axis.yaxis.set_major_locator(MaxNLocator(4))
+        axis.set_ylabel(f"{name} [{plant.units.get(name, '1')}]")
+        axis.set_xlabel("days from a rig's first log" if dated else "log")
+    handles, labels = axes.flat[0].get_legend_handles_labels()
+    found = dict(zip(labels, handles))
+    figure.legend(list(found.values()), list(found), loc="outside upper center", fontsize=7, ncols=5)
+    return figure
 
 
 def fleet_figure(plants: Mapping[str, Plant], population: Population, rigs: Sequence[Rig]) -> Figure:
@@ -83,8 +136,15 @@ def fleet_figure(plants: Mapping[str, Plant], population: Population, rigs: Sequ
     return figure
 
 
-def fleet_sections(plants: Mapping[str, Plant], population: Population, rigs: Sequence[Rig]) -> list[Section]:
-    """Return the page's sections."""
+def fleet_sections(
+    plants: Mapping[str, Plant],
+    population: Population,
+    rigs: Sequence[Rig],
+    moved: Sequence[Drift] = (),
+    *,
+    dated: bool = True,
+) -> list[Section]:
+    """Return the page's sections; rigs with too few logs are not among those that ``moved``."""
     ill = [rig.name for rig in rigs if rig.ill]
     words = f"{', '.join(ill)} far from the others." if ill else "No rig is far from the others."
     head, rows = rig_table(rigs, population)
@@ -92,8 +152,27 @@ def fleet_sections(plants: Mapping[str, Plant], population: Population, rigs: Se
     first = next(iter(plants.values()))
     names, numbers = population_table(population, first)
     drawn = "Dots, or crosses of an ill rig: by its own logs, with 90 %. Diamonds: by all rigs together."
-    return [
+    sections = [
         Section("Which rig is ill?", (Table(head, tuple(rows), caption),), words, "bad" if ill else "good"),
         Section("What may a new rig have?", (Table(names, tuple(numbers)),)),
         Section("Each rig", (Picture(fleet_figure(plants, population, rigs), drawn),)),
     ]
+    if moved:
+        sections.insert(1, _drift_section(first, population, moved, dated=dated))
+    return sections
+
+
+def _drift_section(plant: Plant, population: Population, moved: Sequence[Drift], *, dated: bool) -> Section:
+    """Return what changes over time."""
+    changing = [rig.name for rig in moved if rig.drifts]
+    words = f"{', '.join(changing)}." if changing else "No rig is seen to change."
+    head, rows = drift_table(moved, population, dated=dated)
+    caption = (
+        "Trend from a rig's first log to its last, beside how all rigs differ from day to day; less than "
+        "0.05 of chance is a change. The plant of all its logs is then that of their middle: identify it "
+        "again from the last."
+    )
+    drawn = "Each log by itself, with the population and the trend; bars: 90 %."
+    picture = Picture(drift_figure(plant, population, moved, dated=dated), drawn)
+    parts = (Table(head, tuple(rows), caption), picture)
+    return Section("Which rig changes?", parts, words, "bad" if changing else "good")
