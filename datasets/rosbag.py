@@ -24,7 +24,7 @@ import io
 import json
 import os
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.atomic_files import read_bytes, read_toml
-from thermogrip.datasets.errors import UserError, as_user_error, known_names, os_fault
+from thermogrip.datasets.errors import UserError, as_user_error, known_names, os_fault, os_faults
 from thermogrip.datasets.file_names import file_stem
 from thermogrip.datasets.limits import Unpacker, check_size, check_source
 from thermogrip.datasets.schema import ROLES
@@ -52,12 +52,14 @@ _NUMBERS = {"temperature": "degC", "data": ""}  # the one field of a message wit
 
 @dataclass(frozen=True)
 class Column:
-    """Where a column comes from: topic, field (dots and indices), unit, role ("" to guess)."""
+    """Where a column comes from: topic, field (dots and indices), unit, role ("" to guess); the
+    type of its messages, which a bag says itself and a node does not."""
 
     topic: str
     field: str
     unit: str
     role: str = ""
+    type: str = ""
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ class TopicMap:
 
 
 @dataclass(frozen=True)
-class _Message:
+class Message:
     """One decoded message."""
 
     topic: str
@@ -98,7 +100,8 @@ def read_topic_map(path: str | Path) -> TopicMap:
 
 
 def _column(name: str, entry: Any, path: str | Path) -> Column:
-    if not isinstance(entry, dict) or set(entry) - {"topic", "field", "unit", "role"} or "topic" not in entry:
+    keys = {"topic", "field", "unit", "role", "type"}
+    if not isinstance(entry, dict) or set(entry) - keys or "topic" not in entry:
         raise UserError("needs topic, field, unit, role", file=path, column=name, hint="name its topic")
     unit, role = str(entry.get("unit", "1")), str(entry.get("role", ""))
     if unit not in (*UNITS, "1"):
@@ -106,7 +109,9 @@ def _column(name: str, entry: Any, path: str | Path) -> Column:
         raise UserError(problem, file=path, column=name, hint=f"use {' '.join(UNITS)} or 1")
     if role not in (*ROLES, ""):
         raise UserError(f"role {role!r} is unknown", file=path, column=name, hint=known_names(role, ROLES))
-    return Column(str(entry["topic"]), str(entry.get("field", "data")), unit, role)
+    return Column(
+        str(entry["topic"]), str(entry.get("field", "data")), unit, role, str(entry.get("type", ""))
+    )
 
 
 def read_rosbag_table(path: str | Path, topics: TopicMap | None = None) -> Table:
@@ -129,6 +134,40 @@ def read_rosbag_table(path: str | Path, topics: TopicMap | None = None) -> Table
                 values.append(_number(message, column, name, file))
     _check_found(columns, series, seen, file)
     return _table(file, columns, series, "" if wanted is None else wanted.clock, notes)
+
+
+def bag_messages(path: str | Path) -> list[Message]:
+    """Return the messages of a bag in the order of their times."""
+    return sorted(_messages(Path(path), []), key=lambda message: message.time)
+
+
+def column_value(message: Message, column: Column, name: str, source: str | Path) -> float:
+    """Return the number that a message has for a column, in the unit of the records."""
+    value = np.array([_number(message, column, name, Path(source))])
+    return float(to_record_unit(value, column.unit)[0][0])
+
+
+def write_bag(folder: str | Path, messages: Iterable[tuple[str, str, float, float]]) -> Path:
+    """Write numbers as a ROS 2 bag (MCAP) and return its folder, which must not be there yet.
+
+    ``messages`` have topic, type (of ``std_msgs``), time [s] and value.
+    """
+    place = Path(folder)
+    _need("rosbags", place)
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    if place.exists():
+        raise UserError("is there already", file=place, hint="choose a new folder")
+    store, connections = get_typestore(Stores.ROS2_HUMBLE), dict[str, Any]()
+    with os_faults(place), Writer(place, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for topic, kind, seconds, value in messages:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=store)
+            make, whole = store.types[kind], "Float" not in kind
+            content = make(data=(bool(value) if kind.endswith("Bool") else int(value)) if whole else value)
+            writer.write(connections[topic], round(1e9 * seconds), store.serialize_cdr(content, kind))
+    return place
 
 
 def bag_parts(folder: str | Path) -> list[Path]:
@@ -177,7 +216,7 @@ def _map_beside(file: Path) -> TopicMap | None:
     return None
 
 
-def _guess(message: _Message, columns: dict[str, Column], file: Path) -> None:
+def _guess(message: Message, columns: dict[str, Column], file: Path) -> None:
     """Add a column for a topic that is seen for the first time and has one number."""
     if any(column.topic == message.topic for column in columns.values()):
         return
@@ -215,7 +254,7 @@ def _field(content: Any, path: str) -> Any:
     return content
 
 
-def _number(message: _Message, column: Column, name: str, file: Path) -> float:
+def _number(message: Message, column: Column, name: str, file: Path) -> float:
     try:
         return float(_field(message.content, column.field))
     except _NO_NUMBER as error:
@@ -223,7 +262,7 @@ def _number(message: _Message, column: Column, name: str, file: Path) -> float:
         raise UserError(problem, file=file, column=name, hint="correct the field in the topic map") from error
 
 
-def _stamped(message: _Message, stamp: str, file: Path) -> float:
+def _stamped(message: Message, stamp: str, file: Path) -> float:
     if stamp == "log":
         return message.time
     try:
@@ -298,7 +337,7 @@ def _nearest(axis: Floats, times: Floats, values: Floats) -> Floats:
     return np.where(np.abs(times[at] - axis) <= 0.5 * step + 1e-6, values[at], np.nan)
 
 
-def _messages(file: Path, notes: list[str]) -> Iterator[_Message]:
+def _messages(file: Path, notes: list[str]) -> Iterator[Message]:
     if not file.exists():
         raise os_fault(FileNotFoundError(2, "missing"), file)
     if not os.path.isdir(file):
@@ -316,11 +355,11 @@ def _messages(file: Path, notes: list[str]) -> Iterator[_Message]:
         notes += [f"{part.name}: {line}" for line in part_notes]
 
 
-def _messages_of_file(file: Path, notes: list[str]) -> Iterator[_Message]:
+def _messages_of_file(file: Path, notes: list[str]) -> Iterator[Message]:
     return _mcap_messages(file, notes) if file.suffix.lower() == ".mcap" else _bag_messages(file)
 
 
-def _bag_messages(file: Path) -> Iterator[_Message]:
+def _bag_messages(file: Path) -> Iterator[Message]:
     """Yield the messages of a .bag or .db3."""
     _need("rosbags", file)
     from rosbags.highlevel import AnyReader, AnyReaderError
@@ -336,7 +375,7 @@ def _bag_messages(file: Path) -> Iterator[_Message]:
             unpack = _bound_chunks(reader, file) if bag1 else _bound_messages(reader, file)
             for connection, stamp, raw in reader.messages():
                 content = reader.deserialize(unpack(raw), connection.msgtype)
-                yield _Message(connection.topic, connection.msgtype, 1e-9 * stamp, content, {})
+                yield Message(connection.topic, connection.msgtype, 1e-9 * stamp, content, {})
     except (AnyReaderError, SerdeError) as error:
         raise UserError(f"cannot be read ({error})", file=file, hint=hint) from error
     except UserError:
@@ -417,7 +456,7 @@ def _mcap_contents(data: bytes, file: Path) -> Iterator[tuple[Any, Any, Any]]:
             yield schemas.get(channel.schema_id), channel, record
 
 
-def _mcap_messages(file: Path, notes: list[str]) -> Iterator[_Message]:
+def _mcap_messages(file: Path, notes: list[str]) -> Iterator[Message]:
     """Yield the messages of an MCAP up to its end, or to its first damage, which is noted."""
     _need("mcap", file)
     from mcap.exceptions import McapError
@@ -432,7 +471,7 @@ def _mcap_messages(file: Path, notes: list[str]) -> Iterator[_Message]:
             content = decoders.decode(schema, channel, message.data)
             count, last = count + 1, 1e-9 * message.log_time
             kind = schema.name if schema is not None else channel.message_encoding
-            yield _Message(channel.topic, kind, last, content, channel.metadata)
+            yield Message(channel.topic, kind, last, content, channel.metadata)
     except UserError:
         raise
     except (McapError, ZstdError, *late) as error:  # of the reader, of an unpacker, and what follows

@@ -60,6 +60,11 @@ class SampledController:
         return self.model.dt
 
     @property
+    def safe_drives(self) -> Array:
+        """Drives (n_u,) of a loop that has failed or ends."""
+        return self._safe.copy()
+
+    @property
     def _lost(self) -> Mask:
         """Which controlled outputs have not been read for longer than patience."""
         return np.asarray(self._unread_s > self._patience_s)

@@ -25,11 +25,11 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_files import read_log, write_log
 from thermogrip.datasets.rosbag import (
     Column,
+    Message,
     TopicMap,
     _Decoders,
     _field,
     _held,
-    _Message,
     _nearest,
     _stamped,
     read_rosbag_table,
@@ -307,8 +307,8 @@ def test_a_message_holds_and_the_nearest_counts_within_half_a_step() -> None:
     assert _nearest(np.array([0.0, 99.0]), times[:1], values[:1]).tolist() == [10.0, 10.0]
 
 
-def said(topic: str, at: float, content: Any, **attrs: str) -> _Message:
-    return _Message(topic, "pkg/Kind", at, content, attrs)
+def said(topic: str, at: float, content: Any, **attrs: str) -> Message:
+    return Message(topic, "pkg/Kind", at, content, attrs)
 
 
 SAID = [
@@ -322,7 +322,7 @@ SAID = [
 ]  # fmt: skip
 
 
-def table_of(monkeypatch: Any, messages: list[_Message], topics: TopicMap | None = None) -> Any:
+def table_of(monkeypatch: Any, messages: list[Message], topics: TopicMap | None = None) -> Any:
     monkeypatch.setattr(rosbag, "_messages", lambda _file, _notes: iter(messages))
     return read_rosbag_table("run.mcap", topics)
 
@@ -372,7 +372,7 @@ def test_a_map_names_the_clock_or_the_topic_with_most_messages_is_it(monkeypatch
     ],
 )  # fmt: skip
 def test_topics_that_make_no_table_are_one_line(
-    monkeypatch: pytest.MonkeyPatch, messages: list[_Message], words: str
+    monkeypatch: pytest.MonkeyPatch, messages: list[Message], words: str
 ) -> None:
     with pytest.raises(UserError, match=re.escape(words)):
         table_of(monkeypatch, messages)

@@ -198,14 +198,26 @@ def export(
     ] = False,
     states: Annotated[int, cli.opt("--states", None, "Random states of --check.", min=1)] = 3_000,
     arduino: Annotated[bool, cli.flag("--arduino", "Write it as a library of the Arduino IDE.")] = False,
+    ros2: Annotated[bool, cli.flag("--ros2", "Write it as a ROS 2 node in Python, not as C.")] = False,
     network: cli.OwnNetwork = None,
     seed: cli.Seed = 0,
     as_json: cli.AsJson = False,
 ) -> int:
-    """Write a controller as C99 without malloc.
+    """Write a controller as C99 without malloc, or as a ROS 2 node.
 
-    The folder needs a C compiler and nothing of thermogrip: library, example, Makefile, README.
+    The folder of C needs a compiler and nothing of thermogrip: library, example, Makefile, README. The node
+    needs thermogrip; topics.toml in its folder says which topic is what.
     """
+    if ros2:
+        if arduino or check:
+            raise UserError("--ros2 writes a node, no C", hint="leave --arduino and --check out")
+        from thermogrip.mpc.controllers.ros2_node import write_node
+
+        console = Console(as_json)
+        files = write_node(load_controller(controller, network), cli.new_folder(out))
+        console.say(f"Wrote {', '.join(files)} to {out}: edit topics.toml, then python3 thermogrip_node.py")
+        console.answer({"out": out, "files": files})
+        return 0
     from thermogrip.mpc.controllers.export import check_export, export_controller
 
     if arduino and check:

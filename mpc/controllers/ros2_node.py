@@ -1,0 +1,232 @@
+"""A controller between ROS 2 topics: messages in, messages out, without ROS.
+
+The node that :func:`write_node` writes does what ROS needs (subscriptions, a timer of the controller's sample
+time, publishers) and has this loop do the rest, so that the same loop answers a recorded bag
+(:func:`replay_bag`).  A topic map (:class:`~thermogrip.datasets.rosbag.TopicMap`) names the topic of each
+reading, of each target (``target_<output>``), of each drive, of ``pump`` and of ``status`` (the place in
+:data:`thermogrip.mpc.interface.STATUSES`); the same file tells ``identify`` what a bag of the session holds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from thermogrip.datasets.atomic_files import write_atomic
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.rosbag import (
+    Column,
+    Message,
+    TopicMap,
+    bag_messages,
+    column_value,
+    read_topic_map,
+    write_bag,
+)
+from thermogrip.mpc.controllers.fmu import TARGET
+from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.interface import STATUSES
+
+#: An output that was not heard for so many sample times is lost; a measured disturbance stays.
+KEPT_SAMPLES = 3
+_OF_NODE = {"pump": "std_msgs/msg/Bool", "status": "std_msgs/msg/UInt8"}
+_TEMPERATURE, _NUMBER = "sensor_msgs/msg/Temperature", "std_msgs/msg/Float64"
+_SENT = (
+    "Float64",
+    "Float32",
+    "Int64",
+    "Int32",
+    "Int16",
+    "Int8",
+    "UInt64",
+    "UInt32",
+    "UInt16",
+    "UInt8",
+    "Bool",
+)
+
+
+class _Heard(NamedTuple):
+    value: float  # in the unit of the records
+    time: float  # s, of the node's clock
+
+
+class TopicLoop:
+    """A controller whose readings and targets come as messages.
+
+    ``hear`` takes a message of a topic, ``tick`` is called every sample time and returns what is published,
+    a number by topic.  Until every controlled output and every target was heard it returns nothing.
+    ``advice`` is a clause for the operator, empty while all is well.
+
+    Raises
+    ------
+    UserError
+        If the map lacks a controlled output, its target or a drive, or a unit or a type cannot be.
+    """
+
+    def __init__(self, controller: Controller, topics: TopicMap, *, file: str | Path = "topics") -> None:
+        self.controller, self._columns = controller, dict(topics.columns)
+        model = controller.model
+        self._targets = {TARGET + name: name for name in controller.controlled}
+        needed = (*controller.controlled, *self._targets, *model.drives)
+        for name in (name for name in needed if name not in self._columns):
+            hint = f"add [columns.{name}], or write the folder again"
+            raise UserError(f"has no column {name}", file=file, hint=hint)
+        self._readings = [name for name in (*model.outputs, *model.disturbances) if name in self._columns]
+        self._published = [name for name in (*model.drives, *_OF_NODE) if name in self._columns]
+        for name in self._published:
+            kind, unit = self._type(name), controller.plant.units.get(name, "1")
+            if not kind.startswith("std_msgs/msg/") or kind.rpartition("/")[2] not in _SENT:
+                problem = f"publishes {kind}"
+                raise UserError(problem, file=file, column=name, hint=f"type = {_NUMBER!r}, field = 'data'")
+            if self._columns[name].unit != unit or self._columns[name].field != "data":
+                problem = f"is published as field 'data' in {unit!r}, the map says otherwise"
+                raise UserError(problem, file=file, column=name, hint="convert it where it is received")
+        self.reset()
+
+    @property
+    def dt(self) -> float:
+        """Sample time [s]."""
+        return self.controller.dt
+
+    @property
+    def subscriptions(self) -> tuple[tuple[str, str], ...]:
+        """Topics to hear, with their types, each once."""
+        return tuple(
+            {self._columns[n].topic: self._type(n) for n in (*self._readings, *self._targets)}.items()
+        )
+
+    @property
+    def publications(self) -> tuple[tuple[str, str], ...]:
+        """Topics that are published, with their types."""
+        return tuple((self._columns[name].topic, self._type(name)) for name in self._published)
+
+    def _type(self, name: str) -> str:
+        column = self._columns[name]
+        usual = _TEMPERATURE if column.field == "temperature" else _NUMBER
+        return column.type or _OF_NODE.get(name, usual)
+
+    def reset(self) -> None:
+        """Forget the past: it starts at rest at what is heard from now on."""
+        self._heard: dict[str, _Heard] = {}
+        self.running, self.advice = False, ""
+
+    def hear(self, topic: str, message: Any, seconds: float) -> None:
+        """Take the readings and targets of a message that came at this time of the node's clock [s]."""
+        for name in (*self._readings, *self._targets):
+            column = self._columns[name]
+            if column.topic == topic:
+                told = Message(topic, self._type(name), seconds, message, {})
+                self._heard[name] = _Heard(column_value(told, column, name, "topics.toml"), seconds)
+
+    def tick(self, seconds: float) -> dict[str, float]:
+        """Return what is published at this time of the node's clock [s], a number by topic."""
+        waiting = [n for n in (*self.controller.controlled, *self._targets) if n not in self._heard]
+        if waiting and not self.running:
+            self.advice = f"no message yet of {', '.join(self._columns[name].topic for name in waiting)}"
+            return {}
+        reading = {name: self._reading(name, seconds) for name in self._readings if name in self._heard}
+        if not self.running:
+            self.controller.reset(reading)
+            self.running = True
+        targets = {output: self._heard[name].value for name, output in self._targets.items()}
+        move = self.controller.step({"time_s": seconds, **reading}, targets)
+        self.advice = move.advice
+        drives = self.controller.model.drives
+        answer = dict(zip(drives, move.drives(drives), strict=True))
+        return self._by_topic(
+            answer | {"pump": float(move.pump), "status": float(STATUSES.index(move.status))}
+        )
+
+    def stop(self) -> dict[str, float]:
+        """Return what is published at the end: drives at their safe values, the pump off."""
+        safe = dict(zip(self.controller.model.drives, self.controller.safe_drives.tolist(), strict=True))
+        return self._by_topic(safe | {"pump": 0.0, "status": float(STATUSES.index("off"))})
+
+    def _reading(self, name: str, seconds: float) -> float:
+        heard = self._heard[name]
+        old = seconds - heard.time > KEPT_SAMPLES * self.dt
+        return math.nan if old and name in self.controller.model.outputs else heard.value
+
+    def _by_topic(self, answer: Mapping[str, float]) -> dict[str, float]:
+        return {self._columns[name].topic: answer[name] for name in self._published}
+
+
+def write_node(controller: Controller, folder: str | Path) -> tuple[str, ...]:
+    """Write a controller as a ROS 2 node into a folder, made where absent, and return the names of its files.
+
+    ``topics.toml`` is left as it is where it is there already.
+    """
+    place = Path(folder)
+    place.mkdir(parents=True, exist_ok=True)
+    controller.save(place / "controller.json")
+    source = resources.files("thermogrip.mpc.controllers") / "ros2_node.py.in"
+    write_atomic(place / "thermogrip_node.py", source.read_text(encoding="utf-8"))
+    if not (place / "topics.toml").exists():
+        write_atomic(place / "topics.toml", _topics_of(controller))
+    load_loop(place)
+    return "controller.json", "thermogrip_node.py", "topics.toml"
+
+
+def load_loop(folder: str | Path) -> TopicLoop:
+    """Return the loop of a folder that :func:`write_node` wrote."""
+    file = Path(folder) / "topics.toml"
+    return TopicLoop(Controller.load(Path(folder) / "controller.json"), read_topic_map(file), file=file)
+
+
+def replay_bag(loop: TopicLoop, bag: str | Path, out: str | Path) -> int:
+    """Write what a loop answers to a recorded bag as a ROS 2 bag (MCAP), and return how many times.
+
+    It ticks every sample time from the bag's first message on that it hears, and sees what came until then.
+    """
+    heard = {topic for topic, _ in loop.subscriptions}
+    types, count = dict(loop.publications), 0
+
+    def answers() -> Iterator[tuple[str, str, float, float]]:
+        nonlocal count
+        start = due = math.nan
+        loop.reset()
+        ticks = 0
+        for message in bag_messages(bag):
+            if message.topic not in heard:
+                continue
+            if math.isnan(start):
+                start = due = message.time
+            while message.time > due:
+                for topic, value in loop.tick(due).items():
+                    yield topic, types[topic], due, value
+                count += loop.running
+                ticks += 1
+                due = start + ticks * loop.dt
+            loop.hear(message.topic, message.content, message.time)
+        for topic, value in ({} if math.isnan(due) else loop.tick(due)).items():
+            yield topic, types[topic], due, value
+        count += loop.running
+
+    write_bag(out, answers())
+    return count
+
+
+def _topics_of(controller: Controller) -> str:
+    """Return a topic map to edit."""
+    model, units = controller.model, controller.plant.units
+    lines = [
+        "# Which field of which topic is which reading, target or drive: edit the topics, fields, units and",
+        "# types.  Readings and targets may have any type and unit (degC K degF percent ...); drives are",
+        "# published as std_msgs numbers in the unit below.  `identify` reads a bag of the session by this.",
+        'schema = "thermogrip.topics"',
+        "version = 1",
+    ]
+    roles = dict.fromkeys(model.outputs, "output") | dict.fromkeys(model.disturbances, "disturbance")
+    roles |= {TARGET + name: "other" for name in controller.controlled}
+    roles |= dict.fromkeys(model.drives, "input") | dict.fromkeys(_OF_NODE, "other")
+    for name, role in roles.items():
+        unit = units.get(name.removeprefix(TARGET), "1")
+        kind = _OF_NODE.get(name, _NUMBER)
+        column = Column(f"/thermogrip/{name}", "data", unit, role, kind)
+        said = [f'{key} = "{value}"' for key, value in vars(column).items()]
+        lines += ["", f"[columns.{name}]", *said]
+    return "\n".join(lines) + "\n"
