@@ -45,8 +45,10 @@ from thermogrip.datasets.tables import (
     text_numbers,
 )
 from thermogrip.datasets.units import rename_hint, split_header, to_record_unit
+from thermogrip.datasets.zarr_store import is_store, open_store, store_slices
 
 if TYPE_CHECKING:
+    import xarray as xr
     from pandas import DataFrame
 
     from thermogrip.datasets.schema import Grasps
@@ -91,8 +93,10 @@ def read_grasps(path: str | Path) -> Grasps:
     >>> dict(grasps.sizes), str(grasps["material"].values[0]), float(grasps["t_object"][0])
     ({'grasp': 40, 'time': 121}, 'copper', 43.0)
     """
+    if is_store(path):
+        return read_stored_grasps(path)
     if file_format(path) not in ("csv", "netcdf", "parquet"):
-        raise UserError("grasps are CSV, NetCDF or Parquet", file=path, hint="use one of them")
+        raise UserError("grasps are CSV, NetCDF, Parquet or Zarr", file=path, hint="use one of them")
     if file_format(path) == "parquet":
         frame = read_parquet_frame(path)
         if "grasp_id" not in frame:
@@ -100,11 +104,25 @@ def read_grasps(path: str | Path) -> Grasps:
             raise UserError(problem, file=path, hint="a grasp file has grasp_id,time_s,t_surface_degC")
         return from_frame(frame, file_stem(path))
     if file_format(path) == "netcdf":
-        grasps = _read_netcdf(path)
+        grasps = _of_dataset(open_netcdf(path), path)
     else:
         samples, per_grasp, repairs = _read_csv(path)
         grasps = make_grasps(*samples, **per_grasp)
         grasps.attrs["repairs"] = "\n".join(repairs)
+    return _whole(grasps, path)
+
+
+def read_stored_grasps(path: str | Path, start: int = 0, stop: int | None = None) -> Grasps:
+    """Return the grasps from ``start`` to ``stop`` of a Zarr store, by default all, as
+    :func:`read_grasps`."""
+    grasps = _of_dataset(open_store(path, start, stop), path)
+    if stop is not None:
+        grasps.attrs["name"] += f"[{start}:{stop}]"
+    return _whole(grasps, path)
+
+
+def _whole(grasps: Grasps, path: str | Path) -> Grasps:
+    """Return grasps with their level before contact; UserError where one has no sample on either side."""
     grasps = with_lead_in(grasps)
     time, seen = grasps["time"].values, np.isfinite(grasps["t_surface"].values)
     for side, has, hint in (
@@ -141,7 +159,10 @@ def from_frame(frame: DataFrame, name: str = "DataFrame") -> Grasps:
 
 def check_grasp_file(path: str | Path) -> None:
     """Refuse what is no file or folder of grasps by names, beginnings and what is declared."""
-    for file in _in_folder(Path(path)) if os.path.isdir(path) else [Path(path)]:
+    for file in list_grasp_files([path]):
+        if is_store(file):
+            store_slices(file)
+            continue
         check_table(file, labels=True)
         if file_format(file) == "csv":
             check_table(_meta_path(file))
@@ -196,7 +217,7 @@ def list_grasp_files(paths: Sequence[str | Path]) -> list[Path]:
     """Return the grasp files in paths and folders, as of :func:`read_grasp_files`, unread."""
     files: list[Path] = []
     for path in (Path(name) for given in paths for name in _matching(given)):
-        files += _in_folder(path) if path.is_dir() else [path]
+        files += _in_folder(path) if path.is_dir() and not is_store(path) else [path]
     return files
 
 
@@ -208,7 +229,7 @@ def _matching(path: str | Path) -> list[str]:
 
 def grasp_file_parts(path: Path) -> list[Path]:
     """Return the files that hold the grasps of one: itself, and of a CSV its meta file."""
-    return [path, _meta_path(path)] if file_format(path) == "csv" else [path]
+    return [path, _meta_path(path)] if not is_store(path) and file_format(path) == "csv" else [path]
 
 
 def shared_grasps(first: Sequence[Grasps], second: Sequence[Grasps]) -> list[str]:
@@ -233,10 +254,11 @@ def _print_of(samples: Floats) -> bytes:
 
 def _in_folder(folder: Path) -> list[Path]:
     with os_faults(folder):
-        files = sorted(p for p in folder.iterdir() if p.name.lower().endswith((*_ENDINGS, ".nc", ".parquet")))
+        endings = (*_ENDINGS, ".nc", ".parquet")
+        files = sorted(p for p in folder.iterdir() if p.name.lower().endswith(endings) or is_store(p))
     files = [p for p in files if not file_stem(p).endswith("_meta") and not p.name.startswith(".")]
     if not files:
-        hint = "give a folder with .csv, .nc or .parquet files"
+        hint = "give a folder with .csv, .nc, .parquet or .zarr in it"
         raise UserError("holds no grasp files", file=folder, hint=hint)
     return files
 
@@ -453,8 +475,8 @@ def _read_csv(path: str | Path) -> tuple[tuple[Floats, Floats, list[str]], dict[
     return (axis, gridded["t_surface"], order), per_grasp, repairs + more + left_out
 
 
-def _read_netcdf(path: str | Path) -> Grasps:
-    data = open_netcdf(path)
+def _of_dataset(data: xr.Dataset, path: str | Path) -> Grasps:
+    """Return the grasps of what a NetCDF file or a Zarr store holds."""
     schema = data.attrs.get("schema", "thermogrip.grasps")
     if schema != "thermogrip.grasps":
         raise UserError(f"holds a {schema}, not grasps", file=path, hint="give a file of grasps")

@@ -97,7 +97,7 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
     options: dict[str, Any] = {"engine": "h5netcdf", "decode_times": False, "decode_timedelta": False}
     with _not_damaged(path), xr.open_dataset(path, **options) as data:
         loaded = data.load()
-    return from_cf(_text_as_str(loaded))
+    return from_cf(text_as_str(loaded))
 
 
 def _not_damaged(path: str | Path) -> AbstractContextManager[None]:
@@ -183,7 +183,7 @@ def convention_unit(unit: str, name: str, file: str) -> str:
     return known
 
 
-def _text_as_str(data: xr.Dataset) -> xr.Dataset:
+def text_as_str(data: xr.Dataset) -> xr.Dataset:
     """Turn the object arrays that variable-length text is read as into arrays of str."""
     for key, variable in data.variables.items():
         if variable.dtype.kind in "OS":

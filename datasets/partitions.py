@@ -27,10 +27,16 @@ import numpy as np
 from thermogrip import __version__
 from thermogrip.datasets.atomic_files import atomic_path, open_append
 from thermogrip.datasets.errors import UserError, as_user_error, os_faults
-from thermogrip.datasets.grasp_files import grasp_file_parts, list_grasp_files, read_grasps
+from thermogrip.datasets.grasp_files import (
+    grasp_file_parts,
+    list_grasp_files,
+    read_grasps,
+    read_stored_grasps,
+)
 from thermogrip.datasets.media import csv_text
 from thermogrip.datasets.parallel import Progress, Workers, in_order
 from thermogrip.datasets.schema import Grasps, label_values, log_name
+from thermogrip.datasets.zarr_store import is_store, store_slices
 
 #: Single touches of one file that are answered at once.
 PART = 500
@@ -46,11 +52,18 @@ class Source(NamedTuple):
 
 
 def sources(paths: Sequence[str | Path]) -> list[Source]:
-    """Return the files of grasps in paths and folders, unread."""
+    """Return the files of grasps in paths and folders, and the slices of Zarr stores, unread."""
     found = []
     for path in list_grasp_files(paths):
         marks = stamps(grasp_file_parts(path))
         size = sum(mark[1] for mark in marks)
+        if is_store(path):
+            slices, newest = store_slices(path), max(mark[2] for mark in marks)
+            for start, stop in slices:
+                read = partial(read_stored_grasps, path.absolute(), start, stop)
+                stamp = [[str(path), size, newest], start, stop]
+                found.append(Source(f"{path.name}[{start}:{stop}]", size // len(slices), stamp, read))
+            continue
         found.append(Source(path.name, size, marks, partial(read_grasps, path.absolute())))
     return found
 

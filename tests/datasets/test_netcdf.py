@@ -160,7 +160,7 @@ def test_what_an_array_takes_in_memory_is_what_it_declares(
 
 def test_text_of_any_kind_is_text_and_units_are_those_of_the_conventions() -> None:
     data = xr.Dataset({"a": (("x", "y"), np.array([[b"p", b"qq"]])), "b": ("x", np.array([1.5], object))})
-    found = netcdf._text_as_str(data)
+    found = netcdf.text_as_str(data)
     assert (found["a"].values.tolist(), found["b"].values.tolist()) == ([["p", "qq"]], ["1.5"])
     ours = [netcdf.convention_unit(unit, "a", "f") for unit in ("degrees_C", "%", "", repr(1 / 255), "V")]
     assert ours == ["degC", "percent", "1", "0_255", "V"]

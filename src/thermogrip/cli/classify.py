@@ -273,7 +273,9 @@ def classify(
     model_dir: Annotated[Path, cli.arg("MODEL_DIR", "Folder that train wrote.")],
     paths: Annotated[
         list[str] | None,
-        cli.arg("GRASPS...", "Grasp files (CSV with its _meta.csv, NetCDF, Parquet), folders or patterns."),
+        cli.arg(
+            "GRASPS...", "Grasp files (CSV with its _meta.csv, NetCDF, Parquet, Zarr), folders or patterns."
+        ),
     ] = None,
     out: Annotated[Path | None, cli.opt("--out", "FILE.csv", "Where the predictions go.")] = None,
     candidates: Annotated[

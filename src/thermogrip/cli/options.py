@@ -151,7 +151,8 @@ OwnNetwork = Annotated[
     ),
 ]
 GraspFiles = Annotated[
-    list[str], arg("GRASPS...", "Grasp files (CSV with its _meta.csv, NetCDF, Parquet), folders or patterns.")
+    list[str],
+    arg("GRASPS...", "Grasp files (CSV with its _meta.csv, NetCDF, Parquet, Zarr), folders or patterns."),
 ]
 
 
