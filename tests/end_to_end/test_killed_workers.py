@@ -17,13 +17,17 @@ from tests.end_to_end.conftest import Bench
 from tests.end_to_end.test_tune_and_run import SPEC
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.grasp_files import write_grasps
+from thermogrip.datasets.log_files import write_log
+from thermogrip.datasets.schema import make_log
+from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.models.network import load_network
 
 pytestmark = pytest.mark.skipif(
     not Path("/proc/self/stat").exists() or (os.cpu_count() or 1) < 2, reason="needs /proc and two processors"
 )
 
 # how long it took, when it was written, and by which command
-_OWN = re.compile(r'"(fit_s|predict_s_per_grasp|written|command)": [^\n]*')
+_OWN = re.compile(r'"(fit_s|predict_s_per_grasp|seconds|written|command)": [^\n]*')
 
 
 class Killer(threading.Thread):
@@ -75,7 +79,22 @@ def tune(bench: Bench) -> tuple[list[str], str]:
     return ["tune", "plant.json", "--spec", "spec.toml"], "answer.json"
 
 
-@pytest.mark.parametrize("verb", [effusivity, compare, tune], ids=lambda verb: verb.__name__)
+def identify(bench: Bench) -> tuple[list[str], str]:
+    """Three logs of a board, each left out in turn."""
+    board, rng, t = prior_plant(load_network("tclab")), np.random.default_rng(0), np.arange(0.0, 400.0, 2.0)
+    for k in range(3):
+        drives = [np.repeat(rng.uniform(0, 80, 10), 20) for _ in range(2)]
+        signals = {f"q{i + 1}": (drive, "percent", "input") for i, drive in enumerate(drives)}
+        signals |= {name: (np.full(t.size, 23.0), "degC", "output") for name in ("t1", "t2")}
+        log = board.simulate(make_log(t, signals))
+        for name in ("t1", "t2"):
+            log[name] = ("time", log[name].values + 0.1 * rng.normal(size=t.size), log[name].attrs)
+        write_log(log, bench.path / f"log{k}.csv")
+    words = "identify log0.csv log1.csv log2.csv --network tclab --models network --leave-one-out"
+    return words.split(), "answer.json"
+
+
+@pytest.mark.parametrize("verb", [effusivity, compare, tune, identify], ids=lambda verb: verb.__name__)
 def test_a_killed_worker_changes_no_byte(bench: Bench, monkeypatch, verb) -> None:
     monkeypatch.chdir(bench.path)
     (bench.path / "many").mkdir(exist_ok=True)
