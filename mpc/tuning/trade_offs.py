@@ -194,6 +194,9 @@ def _words(item: Sensitivity) -> str:
     most = max(item.overshoot_low, item.overshoot_high)
     changes = np.abs(np.array([item.settle_low_s, item.settle_high_s]) - item.settle_s)
     same = bool(np.all(changes < _SETTLE))
+    if same and abs(item.overshoot_low - item.overshoot_high) <= _OVERSHOOT:
+        end = f"30 % change neither settling ({here}) nor overshoot"
+        return f"{name} matters {now} for how the drives move; {end}"
     return f"{said}; overshoot up to {most:.2f} K" if same else said
 
 

@@ -239,6 +239,7 @@ def test_what_matters_comes_first_and_has_its_overshoot_where_settling_stays():
     items = [
         found("move", 0.9, **wide), found("terminal", 0.1), found("else", -0.4, settle_high_s=101.4),
         found("horizon", 0.2, free_low=1.0, settle_low_s=nan), found("blocks", 0.15, overshoot_low=0.34),
+        found("state_walk", 0.05, overshoot_low=0.19),
     ]  # fmt: skip
     ends = "at 30 % less, 101 s at 30 % more, 100 s as it is"
     assert sensitivity_words(items) == [
@@ -246,6 +247,8 @@ def test_what_matters_comes_first_and_has_its_overshoot_where_settling_stays():
         f"the horizon matters (now 2): settling not on every draw {ends}",
         f"the number of blocks matters (now 2): settling 100 s {ends}; overshoot up to 0.34 K",
         f"the terminal weight matters (now 2): settling 100 s {ends}; overshoot up to 0.20 K",
+        "the process noise of the states matters (now 2) for how the drives move; 30 % change neither "
+        "settling (100 s) nor overshoot",
         "settling does not depend on the move weight (now 2) between 1.23 and 20",
     ]
     assert found("move", np.inf).to_dict() == vars(found("move", 0.0)) | {"elasticity": None}
