@@ -59,8 +59,8 @@ def drift_table(
         k = rig.farthest
         change, sd = float(rig.change[k]), float(rig.change_sd[k])
         log = population.scales[k] == "log"
-        told = f"{100 * np.expm1(change):+.2g} %" if log else f"{change:+.2g}"
-        more = f"{100 * np.exp(change) * sd:.2g} %" if log else f"{sd:.2g}"
+        told = f"{100 * np.expm1(change):+.0f} %" if log else f"{change:+.2g}"
+        more = f"{100 * np.exp(change) * sd:.0f} %" if log else f"{sd:.2g}"
         length = float(rig.days.max()) if dated else rig.days.size
         word = "changing" if rig.drifts else "ok"
         rows.append((rig.name, word, length, population.parameters[k], told, more, rig.chance))

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 ICONS = {"plain": "i Result", "good": "\u2713 Good", "warn": "! Caution", "bad": "\u2715 Bad"}
 TONES = tuple(ICONS)
 #: Cells of tables that are verdicts.
-VERDICTS = {"pass": "good", "ok": "good", "warn": "warn", "fail": "bad", "ill": "bad"}
+VERDICTS = {"pass": "good", "ok": "good", "warn": "warn", "fail": "bad", "ill": "bad", "changing": "bad"}
 #: Numbers in all charts of a page, and points in one of their curves, at most.
 MOST_NUMBERS, MOST_POINTS = 200_000, 2400
 _SUPERSCRIPT = re.compile(r"(\$\^\{-?[0-9.]+\}\$)")
