@@ -460,6 +460,8 @@ def identify(
     if network is None:
         logs = _without_still(logs)
     u, y, d = signals(logs, inputs=inputs, outputs=outputs, disturbances=disturbances)
+    still = _still_inputs(network, logs, u)
+    u = [name for name in u if name not in still]  # a network has a prior of what never moves, others nothing
     candidates = _candidates(models, network)
     if leave_one_out and len(logs) < 2:
         raise UserError("leaving one log out needs at least two logs", hint="give another log")
@@ -513,7 +515,7 @@ def identify(
     parts.next()
     plant, lost = _with_draws(fitted, logs, parts, posterior=posterior, draws=draws, seed=seed)
     lists = {"input": inputs, "output": outputs, "disturbance": disturbances}
-    roles, unused = _signal_roles(logs, (u, d, y), lists, network)
+    roles, unused = _signal_roles(logs, ([*u, *still], d, y), lists, network, still)
     notes = (*converted, *refused, *unused, *lost, *_plant_notes(chosen, plant))
     # the same warm-up as on what was held out, or errors of the start would stand beside ones without
     whole = [
@@ -586,6 +588,15 @@ def _without_still(logs: list[Log]) -> list[Log]:
     return logs
 
 
+def _still_inputs(network: GreyModel | None, logs: Sequence[Log], u: Sequence[str]) -> list[str]:
+    """Return the inputs of a network, switches aside, that never move, if others of them do."""
+    still = [name for name in u if not _moves(logs, name)] if network is not None else []
+    if not still or network is None:
+        return []
+    still = [name for name in still if name not in network.switches]
+    return still if len(still) < len(u) else []
+
+
 def _moves(logs: Sequence[Log], name: str) -> bool:
     """Tell whether the readings of a column, if it has any, differ over the logs."""
     values = np.concatenate([column(log, name) for log in logs if name in log])
@@ -603,6 +614,7 @@ def _signal_roles(
     groups: tuple[Sequence[str], Sequence[str], Sequence[str]],
     lists: Mapping[str, Sequence[str] | None],
     network: GreyModel | None,
+    still: Sequence[str] = (),
 ) -> tuple[tuple[SignalRole, ...], list[str]]:
     """Return what each column of the logs was taken for: inputs, disturbances, outputs, the rest.
 
@@ -621,6 +633,8 @@ def _signal_roles(
             why = "named"
         elif of_network.get(name) == role and network is not None:
             why = f"network {network.name}"
+            if name in still:
+                why += "; it never moves: what it does is known from the prior only"
         elif name in guesses:
             why, guessed = guesses[name], True
             taken_for = why.startswith(

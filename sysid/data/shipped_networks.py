@@ -4,7 +4,7 @@ A network fits logs that have a column for each of its signals: of the same name
 no network's names are there, as many columns of each role in units that convert (a switch reads 0 or 1), in
 the order in which they stand. The latter only where one network alone fits, and where an output is a
 temperature by its unit or its name. The network then has the columns' names. One whose inputs the logs do not
-move is none: nothing could be learnt about it.
+move is none, unless it is asked for: nothing could be learnt about them.
 """
 
 from __future__ import annotations
@@ -41,6 +41,14 @@ def shipped_network(logs: Sequence[Log]) -> NetworkModel | None:
     likely = [_fitting(network, _by_role(network, logs), logs) for network in networks]
     alone = [network for network in likely if network is not None]
     return alone[0] if len(alone) == 1 else None
+
+
+def in_columns(model: NetworkModel, log: Log) -> NetworkModel:
+    """Return a network under the names of a log's columns where these differ in case alone, else as it is."""
+    columns = _by_name(model.network, log)
+    if columns is None or all(old == new for old, new in columns.items()):
+        return model
+    return NetworkModel(renamed(model.network, columns))
 
 
 def _fitting(network: Network, columns: Mapping[str, str] | None, logs: Sequence[Log]) -> NetworkModel | None:

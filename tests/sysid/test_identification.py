@@ -18,6 +18,7 @@ from thermogrip.datasets.schema import log_name, make_log
 from thermogrip.sysid import Plant, identification, identify
 from thermogrip.sysid.blackbox.fit import fit_black_box
 from thermogrip.sysid.blackbox.order_selection import Structure, folds, held_out_runs
+from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.identification import (
     SHOWN,
     Held,
@@ -26,6 +27,7 @@ from thermogrip.sysid.identification import (
     stated_error,
     warm_up_of_fit,
 )
+from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import HeldOut, PlantScores, fit_logs
 from thermogrip.sysid.validation.free_run import free_run
@@ -319,6 +321,32 @@ def test_impossible_wishes_are_refused_in_one_line(how, says):
     with pytest.raises(UserError, match=says) as caught:
         identify(plant_log(), average=2.0, **how)
     assert "\n" not in str(caught.value)
+
+
+def test_a_heater_that_never_moves_keeps_its_prior_in_a_network_that_is_named():
+    board, rng = prior_plant(load_network("tclab")), np.random.default_rng(0)
+    t = np.arange(0.0, 800.0, 4.0)
+    signals = {"q1": (60.0 * (t > 40) * (t < 500), "percent", "input"), "q2": (0 * t, "percent", "input")}
+    signals |= {name: (np.full(t.size, 23.0), "degC", "output") for name in ("t1", "t2")}
+    true = board.values | {"power_1": 1.3 * board.values["power_1"]}
+    log = replace(board, values=true).simulate(make_log(t, signals))
+    for name in ("t1", "t2"):
+        log[name] = ("time", log[name].values + 0.1 * rng.normal(size=t.size), log[name].attrs)
+    found = identify(log, "tclab", models=["network"])
+    plant = found.plant
+    assert plant.values["power_1"] == pytest.approx(true["power_1"], rel=0.1)
+    assert plant.values["power_2"] == pytest.approx(board.values["power_2"], rel=1e-3)
+    sd = np.sqrt(plant.covariance[plant.free.index("power_2")][plant.free.index("power_2")])
+    assert sd == pytest.approx(board.model.specs["power_2"].sd_log, rel=1e-2)
+    whys = {role.name: (role.role, role.why) for role in found.signals}
+    assert whys["q2"] == (
+        "input", "network tclab; it never moves: what it does is known from the prior only"
+    )  # fmt: skip
+    # black boxes beside it have the heater that moved
+    both = identify(log, "tclab", models=["arx", "network"])
+    assert {row.model for row in both.rows} == {"arx", "network"}
+    with pytest.raises(UserError, match=r"q1 never moves.*q2 never moves"):
+        identify(log.assign(q1=log["q2"]), "tclab", models=["network"])
 
 
 def test_data_that_say_nothing_are_refused():

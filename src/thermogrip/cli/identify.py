@@ -137,11 +137,14 @@ def identify(
     from thermogrip.sysid.plant.log_grid import roles_of
 
     table: dict[str, Any] = {"columns": cli.comma(columns), "dt": dt}
-    if wanted_network is None:
-        logs = cli.load_logs(paths, *roles, **table)
-        if a_network:
-            from thermogrip.sysid.data.shipped_networks import shipped_network
+    from thermogrip.sysid.data.shipped_networks import in_columns, shipped_network
+    from thermogrip.sysid.models.network import NetworkModel
 
+    if wanted_network is None or isinstance(wanted_network, NetworkModel):
+        logs = cli.load_logs(paths, *roles, **table)
+        if wanted_network is not None:
+            wanted_network = in_columns(wanted_network, logs[0])
+        elif a_network:
             wanted_network = shipped_network(logs)
     if wanted_network is not None:  # what a network calls its own has the role that it has there
         logs = cli.load_logs(paths, *roles, known=roles_of(wanted_network), **table)

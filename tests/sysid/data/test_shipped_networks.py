@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.data.shipped_networks import renamed, shipped_network
+from thermogrip.sysid.data.shipped_networks import in_columns, renamed, shipped_network
+from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.models.network_spec import builtin_networks, named_network
 
 TIME = np.arange(200.0)
@@ -73,6 +74,17 @@ def test_a_network_whose_input_never_moves_is_none():
     )
     assert shipped_network([log]) is None
     assert shipped_network([log, log.assign(q2=log["q1"])]).name == "tclab"
+
+
+def test_a_network_that_is_named_takes_columns_in_any_case_and_stays_itself_in_its_own():
+    model = NetworkModel(named_network("tclab"))
+    signals = dict.fromkeys(("Q1", "Q2"), (DRIVE, "percent", "input"))
+    log = make_log(TIME, signals | dict.fromkeys(("T1", "t2"), (WARM, "degC", "output")))
+    found = in_columns(model, log)
+    assert (found.inputs, found.outputs) == (("Q1", "Q2"), ("T1", "t2"))
+    own = log.rename({"Q1": "q1", "Q2": "q2", "T1": "t1"})
+    assert in_columns(model, own) is model
+    assert in_columns(model, log.drop_vars("Q2")) is model  # which says what is missing
 
 
 def test_where_two_networks_fit_by_role_none_is_chosen():
