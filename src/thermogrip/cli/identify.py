@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,7 +14,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from thermogrip.datasets.parallel import Progress
     from thermogrip.datasets.schema import Log
@@ -131,23 +132,14 @@ def identify(
     wanted_network = cli.find_network(network or DEFAULT_NETWORK) if named else None
     if prior is not None:
         wanted_network = _with_prior(prior, wanted_network, a_network)
-    to_grow = _growable(wanted_network) if grow else None
+    if grow:
+        _growable(wanted_network)  # refused before anything is read
     console = Console(as_json)
     from thermogrip.datasets.units import find_column
-    from thermogrip.sysid.plant.log_grid import roles_of
 
-    table: dict[str, Any] = {"columns": cli.comma(columns), "dt": dt}
-    from thermogrip.sysid.data.shipped_networks import in_columns, shipped_network
-    from thermogrip.sysid.models.network import NetworkModel
-
-    if wanted_network is None or isinstance(wanted_network, NetworkModel):
-        logs = cli.load_logs(paths, *roles, **table)
-        if wanted_network is not None:
-            wanted_network = in_columns(wanted_network, logs[0])
-        elif a_network:
-            wanted_network = shipped_network(logs)
-    if wanted_network is not None:  # what a network calls its own has the role that it has there
-        logs = cli.load_logs(paths, *roles, known=roles_of(wanted_network), **table)
+    read = partial(cli.load_logs, paths, *roles, columns=cli.comma(columns), dt=dt)
+    logs, wanted_network = _read(read, wanted_network, shipped=a_network)
+    to_grow = _growable(wanted_network) if grow else None
     repairs = _repaired(console, logs)
     have = dict.fromkeys(map(str, logs[0].data_vars), "")  # what a word means may be written otherwise
     known = [None if words is None else tuple(find_column(w, have) for w in words) for words in roles]
@@ -205,6 +197,27 @@ def identify(
     more = {"dynamics": None if dynamics is None else dynamics.to_dict(), "repairs": repairs}
     console.answer(_identified(found, plant, record, growth, out) | more)
     return cli.ANSWER_IS_NO if posterior and (record is None or not record.converged) else 0
+
+
+def _read(
+    read: Callable[..., list[Log]], network: GreyModel | None, *, shipped: bool
+) -> tuple[list[Log], GreyModel | None]:
+    """Return the logs, and the network under the names of their columns: the given one, or a shipped one.
+
+    What a network calls its own has the role that it has there, so that logs are read again where it is found
+    by their columns.
+    """
+    from thermogrip.sysid.data.shipped_networks import in_columns, shipped_network
+    from thermogrip.sysid.models.network import NetworkModel
+    from thermogrip.sysid.plant.log_grid import roles_of
+
+    logs = read() if network is None else read(known=roles_of(network))
+    found = network
+    if network is None and shipped:
+        found = shipped_network(logs)
+    elif isinstance(network, NetworkModel):
+        found = in_columns(network, logs[0])
+    return (logs if found is network or found is None else read(known=roles_of(found))), found
 
 
 def _with_prior(path: Path, network: GreyModel | None, wanted: bool) -> NetworkModel:
