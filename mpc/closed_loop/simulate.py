@@ -189,7 +189,9 @@ class Truth:
         self.rng = np.random.default_rng(seed)
         self.late = round(around.move_delay_s / native.dt)
         self.sees = native.dt / (native.dt + around.sensor_lag_s)  # share of a change that is shown at once
-        if held is None and (self.late or around.drive_share != 1):  # what was applied before counts: what holds the start
+        if held is None and (
+            self.late or around.drive_share != 1
+        ):  # what was applied before counts: what holds the start
             pushed = native.neutral + np.diag(0.01 * native.span)
             plans = np.vstack([native.neutral[None], pushed])[:, None]
             _, after = native.run(np.repeat(self.x[None], len(plans), axis=0), plans, self.d)

@@ -38,8 +38,8 @@ mean of its neighbours, and nothing is smeared from sample to sample, because x 
 The noise of the states grows with the seconds, by s Q in the share s of a sample.  Every reading counts, also
 one that comes before a move is due; but where the output moves, a straight line between two samples is not
 its path, and the standard deviation of such a reading is larger by 4 s (1 - s) times its move. What the line
-leaves out has the same sign within a sample and looks like a lag (below): readings between two moves leave lags
-and scales where they are.
+leaves out has the same sign within a sample and looks like a lag (below): readings between two moves leave
+lags and scales where they are.
 
 **A plant that is slower than the model.**  A sensor's pocket, a layer or a longer tube that the model lacks
 looks like a drive that is too weak, until it looks like one that is too strong, and the loop swings.  So each

@@ -13,13 +13,13 @@ M is by how many full drives the drives move in all: of two designs that settle 
 less to noise wins.  A step that never settles is charged its whole length and twice its last error.  Over the
 runs, the score is the mean plus half of what the worst is above it: the draws stand for what the plant may
 be.  All of them have the model's structure.  What that may lack (sensors that are slower, a longer delay, a
-weaker drive) is tried one by one on the first draw, for as long as a step is held, since such runs settle last;
-their mean counts a little.
+weaker drive) is tried one by one on the first draw, for as long as a step is held, since such runs settle
+last; their mean counts a little.
 
-**Trials.**  A step begins where drives have held its start for long, and the controller is told these drives, as
-a running loop knows them; M counts from there. Readings are as noisy as those of the logs were found to be (which
-includes the logs' quantum), unless the spec states a noise; where the logs did not tell, they have the spec's and
-a thermocouple's quantum.
+**Trials.**  A step begins where drives have held its start for long, and the controller is told these drives,
+as a running loop knows them; M counts from there. Readings are as noisy as those of the logs were found to be
+(which includes the logs' quantum), unless the spec states a noise; where the logs did not tell, they have the
+spec's and a thermocouple's quantum.
 
 **Bound.**  Before :func:`thermogrip.mpc.tuning.minimum_time.full_drive_bound` no drive inside its limits
 brings the skin into the band.  Staying there takes longer still, since the drive must be taken back in time,
@@ -431,9 +431,7 @@ class Search:
     def evaluate_in_other_noise(self, item: tuple[dict[str, float], int]) -> Trial:
         """Return a trial of an MPC at full length in another noise than the search's, counted from 1."""
         parameters, other = item
-        return self.evaluate(
-            parameters, lengths=[self.spec.hold_s] * len(self.spec.steps), other_noise=other
-        )
+        return self.evaluate(parameters, lengths=[self.spec.hold_s] * len(self.spec.steps), other_noise=other)
 
     def check(self, item: tuple[str, Design, int]) -> list[StepResult]:
         """Return the results of a controller on one draw, at full length."""

@@ -60,6 +60,7 @@ from thermogrip.mpc.tuning.trade_offs import (
     Pareto,
     Sensitivity,
     front_of,
+    non_dominated,
     scan_of,
     sensitivity_of,
     sensitivity_words,
@@ -213,8 +214,9 @@ _WORTH = 0.01  # by which a traded design must be better on the spec's own score
 _ALIKE = 0.02  # of designs with as much of the drive that differ by less in score the one that moves least;
 # by no more than this either where noise alone makes a greater difference
 _ALIKE_IN_NOISE = 0.05
+_STILL = 0.05  # by which one must move less than another to be taken for it
 _NOISES = 2  # besides the search's, in which designs are tried ...
-_CONTENDERS, _CONTEND = 6, 0.1  # ... so many, whose score in that of the search is within this of the least
+_CONTENDERS, _CONTEND = 5, 0.1  # ... so many, whose score in the search's is within this of the least
 
 
 @dataclass(frozen=True)
@@ -392,17 +394,28 @@ def _trade(
     tried = run_parallel(search.evaluate_at_length, items, workers, progress, what="trade-offs")
     pareto = front_of(tried, names)
     own = [trial for trial in tried if trial.controller == "MPC"]
-    taken = _best(own)
-    if taken.score >= (1 - _WORTH) * own[0].score:  # else a cap pays: energy is weighted
-        taken = own[0]
-    share = taken.parameters.get("drive_share", 1.0)
-    same = [trial for trial in own if trial.parameters.get("drive_share", 1.0) == share]
-    near = [trial for trial in same if trial.score <= (1 + _CONTEND) * taken.score]
-    near = sorted(near, key=lambda trial: trial.score)[:_CONTENDERS]
+    near = _contenders(own)
     again = [(trial.parameters, noise) for trial in near for noise in range(1, 1 + _NOISES)]
-    tried = run_parallel(search.evaluate_in_other_noise, again, workers, what="the same in other noise")
-    still = near[_stillest([[near[k], *tried[_NOISES * k :][:_NOISES]] for k in range(len(near))])]
+    others = run_parallel(search.evaluate_in_other_noise, again, workers, what="the same in other noise")
+    noises = [[near[k], *others[_NOISES * k :][:_NOISES]] for k in range(len(near))]
+    still = near[_stillest(noises)]
     return pareto, best if still is own[0] else search.evaluate(still.parameters)
+
+
+def _share(trial: Trial) -> float:
+    return trial.parameters.get("drive_share", 1.0)
+
+
+def _contenders(own: Sequence[Trial]) -> list[Trial]:
+    """Return the first of these designs and those that may be taken in its place: near the least score, with
+    as much of the drive and none both scoring less and moving less, or the best one with less of it."""
+    least = min(trial.score for trial in own)
+    near = [trial for trial in own[1:] if trial.score <= (1 + _CONTEND) * least]
+    whole = [trial for trial in near if _share(trial) == _share(own[0])]
+    front = non_dominated([(trial.score, trial.travel) for trial in whole]) if whole else ()
+    still = sorted((trial for trial, kept in zip(whole, front) if kept), key=lambda trial: trial.travel)
+    capped = [trial for trial in near if _share(trial) != _share(own[0])]
+    return [own[0], *still[: _CONTENDERS - 1], *([_best(capped)] if capped else [])]
 
 
 def _stillest(found: Sequence[Sequence[Trial]]) -> int:
@@ -411,20 +424,24 @@ def _stillest(found: Sequence[Sequence[Trial]]) -> int:
 
     They tell a difference of their means that is above its standard error: the rule of one standard error, by
     which of models that predict alike the simplest is taken [1]_. Below 2 % none counts; above 5 % each does,
-    for two or three noises are few.
+    for three noises are few. A difference of moves that is below 5 % does not count either. With less of the
+    drive than the first, a design must be better than it by 1 %.
 
     References
     ----------
     .. [1] L. Breiman, J. Friedman, R. Olshen, C. Stone, "Classification and Regression Trees", 1984, 3.4.3.
     """
     scores = np.array([[trial.score for trial in trials] for trials in found])
-    least = int(np.argmin(scores.mean(axis=1)))
+    travels = np.array([np.mean([trial.travel for trial in trials]) for trials in found])
+    shares, means = np.array([_share(trials[0]) for trials in found]), scores.mean(axis=1)
+    whole = shares == shares[0]
+    least = int(np.argmin(np.where(whole | (means < (1 - _WORTH) * means[0]), means, np.inf)))
     more = scores - scores[least]
     error = more.std(axis=1, ddof=1) / np.sqrt(scores.shape[1])
-    unit = scores[least].mean()
-    alike = more.mean(axis=1) <= np.clip(error, _ALIKE * unit, _ALIKE_IN_NOISE * unit)
-    travels = np.array([np.mean([trial.travel for trial in trials]) for trials in found])
-    return int(np.argmin(np.where(alike, travels, np.inf)))
+    told = np.clip(error, _ALIKE * means[least], _ALIKE_IN_NOISE * means[least])
+    alike = (more.mean(axis=1) <= told) & (shares == shares[least])
+    still = alike & (travels <= (1 + _STILL) * travels[alike].min())
+    return int(np.argmin(np.where(still, means, np.inf)))
 
 
 def _search_all(
