@@ -210,6 +210,10 @@ def _lacking(plant: Plant, design: Design, spec: Spec, results: Sequence[StepRes
 
 # to begin with: dearer moves than in the default design, a filter that trusts readings less, other horizons
 _LOOK = (("move", (10.0, 100.0, 1000.0)), ("state_walk", (0.3, 0.1)), ("horizon", (0.7, 1.5)))
+# where each part of the work ends, in shares of its CPU time (of a furnace): bounds and compilation, the first
+# look, the search (within it MPC and PI), trade-offs, the comparison
+_BEGUN, _LOOKED, _SEARCHED, _TRADED, _COMPARED = 0.09, 0.13, 0.67, 0.8, 0.87
+_MPC_DONE, _PI_DONE = 0.1, 0.92
 _WORTH = 0.01  # by which a traded design must be better on the spec's own score to be taken
 _ALIKE = 0.02  # of designs with as much of the drive that differ by less in score the one that moves least;
 # by no more than this either where noise alone makes a greater difference
@@ -313,14 +317,17 @@ def tune(
     search = Search(plant, spec, baseline, seed)
     start = parameters_of(baseline, spec)
     looked = run_parallel(search.evaluate, [start], workers, what="default design")
+    if progress is not None:
+        progress(_BEGUN, "default design")
     for at, (parameter, factors) in enumerate(_LOOK):
         first = _best(looked).parameters
         values = [factor * first[parameter] for factor in factors]
         look = [{**first, parameter: float(round(v)) if parameter == "horizon" else v} for v in values]
-        share = sub_progress(progress, 0.02 * at, 0.02 * (at + 1))
+        width = (_LOOKED - _BEGUN) / len(_LOOK)
+        share = sub_progress(progress, _BEGUN + width * at, _BEGUN + width * (at + 1))
         looked += run_parallel(search.evaluate, look, workers, share, what=PARAMETER_WORDS[parameter])
-    found = _search_all(search, looked, workers, sub_progress(progress, 0.06, 0.6))
-    pareto, best = _trade(search, found, workers, sub_progress(progress, 0.6, 0.7))
+    found = _search_all(search, looked, workers, sub_progress(progress, _LOOKED, _SEARCHED))
+    pareto, best = _trade(search, found, workers, sub_progress(progress, _SEARCHED, _TRADED))
     tuned = search.design(best.parameters)
     candidates = {
         "baseline": baseline,
@@ -328,7 +335,7 @@ def tune(
         "PI": replace(tuned, loops=scaled_loops(baseline.loops, _best(found["PI"]).parameters)),
         "LQR": search.design(_best(found["LQR"]).parameters),
     }
-    results = _compare(search, candidates, workers, sub_progress(progress, 0.7, 0.85))
+    results = _compare(search, candidates, workers, sub_progress(progress, _TRADED, _COMPARED))
     scores = {name: score(part, spec, search.bounds) for name, part in results.items()}
     own = {name: [result for result in part if result.draw < STRUCTURE] for name, part in results.items()}
     moved = {name: np.mean([result.travel for result in part]) for name, part in own.items()}
@@ -336,7 +343,7 @@ def tune(
     kept = "tuned" if scores["tuned"] < alike * scores["baseline"] else "baseline"
     about = best if kept == "tuned" else search.evaluate(start)
     items = [(search, parameter, about.parameters, about) for parameter in PARAMETER_WORDS]
-    share = sub_progress(progress, 0.85, 1.0)
+    share = sub_progress(progress, _COMPARED, 1.0)
     sensitivity = run_parallel(sensitivity_of, items, workers, share, what="sensitivities")
     history = tuple(tried for part in found.values() for tried in part)
     rows = tuple(row for name, part in own.items() for row in rows_of(name, part, spec, search.bounds))
@@ -461,7 +468,7 @@ def _search_all(
         (search, "LQR", [lqr], n, None),
     ]
     if workers == 1:
-        shares = ((0.0, 0.5), (0.5, 0.65), (0.65, 1.0))
+        shares = ((0.0, _MPC_DONE), (_MPC_DONE, _PI_DONE), (_PI_DONE, 1.0))
         parts = [sub_progress(progress, *share) for share in shares]
         tried = [_optimise((*item[:4], part)) for item, part in zip(items, parts, strict=True)]
     else:
@@ -495,13 +502,19 @@ def _optimise(item: tuple[Search, str, list[dict[str, float]], int, Progress | N
     names = [parameter for parameter, _, _ in parameters]
     low = np.log([small for _, small, _ in parameters])
     high = np.log([large for _, _, large in parameters])
-    tried = [] if name == "MPC" else [evaluate(start) for start in starts[:evaluations]]
+    tried: list[Trial] = []
+
+    def look(parameters: dict[str, float]) -> None:
+        tried.append(evaluate(parameters))
+        if progress is not None:
+            progress(min(len(tried) / evaluations, 1.0), f"weights of the {name}")
+
+    for first in starts[:evaluations] if name != "MPC" else ():
+        look(first)
     start = _best(tried).parameters if tried else starts[0]
 
     def cost(z: Array, gradient: Array) -> float:
-        tried.append(evaluate({**start, **dict(zip(names, np.exp(z).tolist(), strict=True))}))
-        if progress is not None:
-            progress(min(len(tried) / evaluations, 1.0), f"weights of the {name}")
+        look({**start, **dict(zip(names, np.exp(z).tolist(), strict=True))})
         return tried[-1].score
 
     optimiser = nlopt.opt(nlopt.LN_SBPLX, len(names))

@@ -440,6 +440,9 @@ def test_the_file_holds_what_was_found(done: Done):
     assert "A step moves the drives by 2.0 times full drive, 2.0 with the default design." in notes["finding"]
     assert done.shares == sorted(done.shares)
     assert done.shares[-1] == 1.0
+    # what comes before the first trial counts, and each of the PI's starts is reported: no step is long
+    assert done.shares[0] > 0.05
+    assert np.diff(done.shares).max() < 0.05
 
 
 STEP = Spec(steps=((28.0, 36.0),), settle_within_s=100.0, overshoot_degC=0.5, bias_degC=0.2)
