@@ -210,8 +210,8 @@ def _lacking(plant: Plant, design: Design, spec: Spec, results: Sequence[StepRes
 
 # to begin with: dearer moves than in the default design, a filter that trusts readings less, other horizons
 _LOOK = (("move", (10.0, 100.0, 1000.0)), ("state_walk", (0.3, 0.1)), ("horizon", (0.7, 1.5)))
-# where each part of the work ends, in shares of its CPU time (of a furnace): bounds and compilation, the first
-# look, the search (within it MPC and PI), trade-offs, the comparison
+# where each part of the work ends, in shares of its CPU time (a furnace's): bounds and compilation, a look
+# about, the search (within it MPC and PI), trade-offs, the comparison
 _BEGUN, _LOOKED, _SEARCHED, _TRADED, _COMPARED = 0.09, 0.13, 0.67, 0.8, 0.87
 _MPC_DONE, _PI_DONE = 0.1, 0.92
 _WORTH = 0.01  # by which a traded design must be better on the spec's own score to be taken
