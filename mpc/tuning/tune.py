@@ -419,7 +419,8 @@ def _contenders(own: Sequence[Trial]) -> list[Trial]:
     least = min(trial.score for trial in own)
     near = [trial for trial in own[1:] if trial.score <= (1 + _CONTEND) * least]
     whole = [trial for trial in near if _share(trial) == _share(own[0])]
-    front = non_dominated([(trial.score, trial.travel) for trial in whole]) if whole else ()
+    points = np.array([(trial.score, trial.travel) for trial in whole]).reshape(-1, 2)
+    front = non_dominated(points)
     still = sorted((trial for trial, kept in zip(whole, front) if kept), key=lambda trial: trial.travel)
     capped = [trial for trial in near if _share(trial) != _share(own[0])]
     return [own[0], *still[: _CONTENDERS - 1], *([_best(capped)] if capped else [])]
