@@ -11,7 +11,7 @@ For each target of the schedule:
 * **overshoot**: the largest excursion beyond the target, on the far side from where the segment began;
 * **bias**: the mean error of the last 120 s (or the last fifth of a shorter segment);
 * **energy**: the integral of the squared drive, in seconds at full drive;  **travel**: the sum of its
-  changes.
+  changes, that to the first drive included.
 
 The log of a session on hardware has what was read and applied, without the controller's status, its advice
 and its step times.  :class:`RecordedController` keeps these, and :func:`session_loop` puts both together as
@@ -29,7 +29,7 @@ import numpy as np
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.schema import Log, column, names
 from thermogrip.mpc.interface import Controller, Move, Readings, Regulator, Target
-from thermogrip.mpc.plant.prediction import held_state, prediction_model
+from thermogrip.mpc.plant.prediction import held_start, prediction_model
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
@@ -41,6 +41,7 @@ class Surroundings:
 
     ambient: float = 25.0  # of the room [degC]
     noise: float = 0.04  # standard deviation of a reading [degC]
+    noises: dict[str, float] = field(default_factory=dict)  # the same of outputs that have another, by name
     quantum: float = 0.0625  # step of a reading [degC]; 0 is none
     # the same of sensors that have another, by name, ambient included [degC]
     quanta: dict[str, float] = field(default_factory=dict)
@@ -49,7 +50,13 @@ class Surroundings:
     move_delay_s: float = 0.0  # time between a reading and the moment its move is applied [s]
     sensor_lag_s: float = 0.0  # by how much every sensor is slower than the plant's outputs [s]
     drive_share: float = 1.0  # share of a drive, counted from the one that holds the start, that acts
-    held: tuple[str, ...] = ()  # outputs that drives have held at the start for long; else all is as warm
+    # outputs that drives have held at the start for long, drives that the controller is told; else all is as
+    # warm
+    held: tuple[str, ...] = ()
+
+    def noises_of(self, names: tuple[str, ...]) -> Array:
+        """Return the standard deviation of a reading of each of these sensors (n,) [degC]."""
+        return np.array([self.noises.get(name, self.noise) for name in names], dtype=float)
 
     def steps_of(self, names: tuple[str, ...]) -> Array:
         """Return the step of a reading of each of these sensors (n,) [degC]."""
@@ -139,7 +146,8 @@ def simulate_closed_loop(
     around = Surroundings() if surroundings is None else surroundings
     truth = Truth(plant, controller.dt, around, start, seed)
     controlled = tuple(controller.controlled)
-    controller.reset(truth.reading())
+    begun = truth.begun()
+    controller.reset(truth.reading() | begun)
     targets: list[dict[str, float]] = []
     readings: list[dict[str, float]] = []
     moves: list[Move] = []
@@ -148,7 +156,7 @@ def simulate_closed_loop(
         wanted = dict(target) if isinstance(target, Mapping) else dict.fromkeys(controlled, float(target))
         for _ in range(max(1, round(seconds / controller.dt))):
             reading = truth.reading()
-            move = controller.step(reading, target)
+            move = controller.step(reading if moves else reading | begun, target)
             truth.apply(move)
             targets.append(wanted)
             readings.append(reading)
@@ -170,28 +178,38 @@ class Truth:
         self.d = np.full(native.n_d, around.ambient)
         warmth = around.ambient if start is None else start
         self.x = native.rest(np.full(native.n_y, warmth), self.d)
+        held: Array | None = None
         if around.held:
-            self.x = held_state(native, around.held, warmth, tuple(self.d.tolist()))
+            self.x, held = held_start(native, around.held, warmth, tuple(self.d.tolist()))
+        self.known = held is not None  # whether there is a drive that holds the start
         self.moves: list[Array] = []
-        self.before = native.neutral
+        self.before = native.neutral if held is None else held
         given = [plant.offsets.get(name, 0.0) + around.offset.get(name, 0.0) for name in native.outputs]
         self.offset = np.array(given, dtype=float)
         self.rng = np.random.default_rng(seed)
         self.late = round(around.move_delay_s / native.dt)
         self.sees = native.dt / (native.dt + around.sensor_lag_s)  # share of a change that is shown at once
-        if self.late or around.drive_share != 1:  # what was applied before counts: what holds the start
+        if held is None and (
+            self.late or around.drive_share != 1
+        ):  # what was applied before counts: what holds the start
             pushed = native.neutral + np.diag(0.01 * native.span)
             plans = np.vstack([native.neutral[None], pushed])[:, None]
             _, after = native.run(np.repeat(self.x[None], len(plans), axis=0), plans, self.d)
             by_drive = (after[1:] - after[0]).T / (0.01 * native.span)
-            held = native.neutral + np.linalg.lstsq(by_drive, self.x - after[0], rcond=None)[0]
-            self.before = np.clip(held, native.lowest, native.highest)
+            found = native.neutral + np.linalg.lstsq(by_drive, self.x - after[0], rcond=None)[0]
+            self.before = np.clip(found, native.lowest, native.highest)
         self.y = [native.output(self.x) + self.offset]
         self.time = 0.0
 
+    def begun(self) -> dict[str, float]:
+        """Return the drives that hold the start by name, as a reading has them; none where none do."""
+        return dict(zip(self.model.drives, self.before.tolist(), strict=True)) if self.known else {}
+
     def reading(self) -> dict[str, float]:
         """Return what the sensors show now."""
-        values = self.y[-1] + self.around.noise * self.rng.standard_normal(self.model.n_y)
+        values = self.y[-1] + self.around.noises_of(self.model.outputs) * self.rng.standard_normal(
+            self.model.n_y
+        )
         found = dict(zip(self.model.outputs, values.tolist(), strict=True))
         for name, value in zip(self.model.disturbances, self.d, strict=True):
             found[name] = float(value) + self.around.offset.get(name, 0.0)
@@ -229,12 +247,15 @@ def record_loop(
     fine = np.asarray(model.dt * np.arange(y.shape[0]), dtype=np.float64)
     drives = np.array([move.drives(model.drives) for move in moves])
     scaled, full = drive_shares(drives, model.lowest, model.highest)
+    before, _ = drive_shares(truth.before[None], model.lowest, model.highest)
+    jumps = np.abs(np.diff(scaled, axis=0, prepend=before)).sum(axis=1)
     segments = []
     for first, last in zip([0, *stops[:-1]], stops):
         rows, part = slice(first * truth.sub, last * truth.sub + 1), slice(first, last)
         for i, name in ((model.outputs.index(name), name) for name in controlled):
             goal = targets[first][name]
-            segments.append(segment_of(name, fine[rows], y[rows, i], goal, scaled[part], full[part], band))
+            found = segment_of(name, fine[rows], y[rows, i], goal, scaled[part], full[part], band)
+            segments.append(replace(found, travel=float(jumps[part].sum())))
     return ClosedLoop(
         time=fine,
         outputs={name: y[:, i] for i, name in enumerate(model.outputs)},

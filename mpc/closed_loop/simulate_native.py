@@ -42,7 +42,7 @@ def compiled_loop(
     around = Surroundings() if surroundings is None else surroundings
     truth = Truth(plant, controller.dt, around, start, seed)
     model = truth.model
-    controller.reset(truth.reading())
+    controller.reset(truth.reading() | truth.begun())
     counts = [max(1, round(seconds / controller.dt)) for _, seconds in schedule]
     wanted = np.repeat([float(target) for target, _ in schedule], counts)
     target = np.ascontiguousarray(np.repeat(wanted[:, None], len(controller.controlled), axis=1))
@@ -63,7 +63,7 @@ def _loop_in_c(
     n_y + n_d), outputs first, drives (n, n_u), and places (n,) in :data:`thermogrip.mpc.interface.STATUSES`,
     and leave in ``truth.y`` what the plant did."""
     model, around, n = truth.model, truth.around, len(target)
-    noise = around.noise * truth.rng.standard_normal((n, model.n_y))
+    noise = around.noises_of(model.outputs) * truth.rng.standard_normal((n, model.n_y))
     d_offset = np.array([around.offset.get(name, 0.0) for name in model.disturbances])
     quanta = around.steps_of((*model.outputs, *model.disturbances))
     y = np.zeros((n * truth.sub + 1, model.n_y))
@@ -79,6 +79,7 @@ def _loop_in_c(
         truth.late,
         ctypes.c_double(truth.sees),
         ctypes.c_double(around.drive_share),
+        int(truth.known),
         *(address(values) for values in (truth.before, observed, truth.d, noise)),
         *(address(values) for values in (quanta, d_offset, target, y, reading, drive, status)),
     )

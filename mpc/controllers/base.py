@@ -59,6 +59,11 @@ class SampledController:
         """Sample time [s]."""
         return self.model.dt
 
+    def _applied(self, reading: Readings, otherwise: Array) -> Array:
+        """Return the drives (n_u,) that a reading says were applied, else these."""
+        given = np.array([number(reading, name) for name in self.model.drives])
+        return np.where(np.isfinite(given), given, otherwise)
+
     @property
     def safe_drives(self) -> Array:
         """Drives (n_u,) of a loop that has failed or ends."""

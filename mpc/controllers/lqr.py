@@ -129,11 +129,13 @@ class LQRController(SampledController):
         self.reset({})
 
     def reset(self, reading: Readings) -> None:
-        """Forget the past; the plant is at rest at this reading."""
+        """Forget the past; the plant is at rest at this reading, its drive at zero or as the reading has
+        it."""
         y, d = self._read(reading)
         self._d = np.where(np.isfinite(d), d, self.design.ambient)
         self.observer.reset(y, self._d)
         self._forget()
+        self._u = self._applied(reading, self._u)
         self._fresh = True
         self.times.reset()
 

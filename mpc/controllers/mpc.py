@@ -52,7 +52,7 @@ from thermogrip.mpc.design.design import DAY, SCHEMA, VERSION, Design, check_des
 from thermogrip.mpc.estimator.call_times import RESTART_S, opening, shifted
 from thermogrip.mpc.estimator.reading_checks import ReadingMonitor, follows, is_off
 from thermogrip.mpc.estimator.structure_monitor import StructureMonitor
-from thermogrip.mpc.interface import Move, Readings, Trajectory, number
+from thermogrip.mpc.interface import Move, Readings, Trajectory
 from thermogrip.mpc.optimiser.reach import Reach
 from thermogrip.mpc.optimiser.rti import Optimiser, Outcome, Sample
 from thermogrip.mpc.plant.prediction import prediction_model
@@ -251,7 +251,7 @@ class Controller(Shown, SampledController):
         return to_control(self)
 
     def reset(self, reading: Readings) -> None:
-        """Forget the past; the plant is at rest at this reading, its drive at zero.
+        """Forget the past; the plant is at rest at this reading, its drive at zero or as the reading has it.
 
         Parameters
         ----------
@@ -270,6 +270,7 @@ class Controller(Shown, SampledController):
         array([30., 30.])
         """
         self._start(*self._read(reading))
+        self._u = self._in_force = self._applied(reading, self._u)
         self.pi.reset(reading)
         self.times.reset()
 
@@ -314,7 +315,7 @@ class Controller(Shown, SampledController):
         y, d = self._read(reading)
         if is_off(self.model.model.switches, reading):
             return self._pause(y, d, target, started)
-        applied = self._applied(reading)
+        applied = self._applied(reading, self._in_force)
         self._pass(self.times.seconds, applied)
         if not self.times.due:
             if not self.times.stale:
@@ -364,10 +365,6 @@ class Controller(Shown, SampledController):
         self.structure.forget()
         self.reach.forget()
         self.optimiser.forget()
-
-    def _applied(self, reading: Readings) -> Array:
-        given = np.array([number(reading, name) for name in self.model.drives])
-        return np.where(np.isfinite(given), given, self._in_force)
 
     def _pass(self, seconds: float, applied: Array) -> None:
         """Let the estimate and the plan go on by so many seconds under the drives that were applied."""

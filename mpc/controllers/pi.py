@@ -121,15 +121,20 @@ class PIController(SampledController):
         )
 
     def reset(self, reading: Readings) -> None:
-        """Forget the past; the plant is at rest at this reading."""
+        """Forget the past; the plant is at rest at this reading, under the drive that holds it or that the
+        reading has."""
         self._forget()
         self._I = np.zeros(len(self.loops))
+        self._u = self._applied(reading, self._u)
         y, room = self._read(reading)
         self._target = self._begun = y[self._rows]
         self._room = np.full(self.model.n_d, np.nan)
         if np.isfinite(self._target).all():  # what the feed-forward leaves of the drive that holds this
             held = self._held(self._target, np.where(np.isfinite(room), room, ROOM))
-            self._I = np.array([(1 - p.feedforward) * held[j] for p, (j, _) in zip(self.loops, self._ends)])
+            rest = self._applied(reading, held)
+            self._I = np.array(
+                [rest[j] - p.feedforward * held[j] for p, (j, _) in zip(self.loops, self._ends)]
+            )
         self.times.reset()
 
     def step(self, reading: Readings, target: Trajectory) -> Move:

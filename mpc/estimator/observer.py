@@ -37,7 +37,9 @@ u the mean of the drives since x and F the Jacobian of the sample.  A register b
 mean of its neighbours, and nothing is smeared from sample to sample, because x itself is never interpolated.
 The noise of the states grows with the seconds, by s Q in the share s of a sample.  Every reading counts, also
 one that comes before a move is due; but where the output moves, a straight line between two samples is not
-its path, and the standard deviation of such a reading is larger by 4 s (1 - s) times its move.
+its path, and the standard deviation of such a reading is larger by 4 s (1 - s) times its move. What the line
+leaves out has the same sign within a sample and looks like a lag (below): readings between two moves leave
+lags and scales where they are.
 
 **A plant that is slower than the model.**  A sensor's pocket, a layer or a longer tube that the model lacks
 looks like a drive that is too weak, until it looks like one that is too strong, and the loop swings.  So each
@@ -489,16 +491,18 @@ class Observer:
 
     def refine(self, y: Array) -> None:
         """Correct the estimate with a reading (n_y,) between two moves; the mean innovation is that of
-        moves."""
-        self._correct(y, self.R + self._bent**2)
+        moves, and what a straight line leaves out is not taken for a lag."""
+        held = self._held.copy()
+        held[self._n + len(self.lagged) :] = True
+        self._correct(y, self.R + self._bent**2, held=held)
 
     @property
     def innovation_bias(self) -> float:
         """How far the mean innovation is from 0, in standard deviations of that mean; the largest of all."""
         return float(np.max(np.abs(self.innovation)) * np.sqrt((2 - _REMEMBER) / _REMEMBER))
 
-    def _correct(self, y: Array, R: Array, *, remember: float = 0.0) -> Array:
-        """Correct the estimate with a reading whose variances are R (n_y,)."""
+    def _correct(self, y: Array, R: Array, *, remember: float = 0.0, held: Mask | None = None) -> Array:
+        """Correct the estimate with a reading whose variances are R (n_y,), but for states that are held."""
         innovation = y - self.reading()
         seen = np.flatnonzero(np.isfinite(y))
         if seen.size:
@@ -511,7 +515,7 @@ class Observer:
             mean = self.innovation.copy()
             mean[seen] += remember * (innovation[seen] / np.sqrt(np.diag(S)) - mean[seen])
             self.innovation = mean
-            held = np.asarray(self._held, dtype=bool)  # C holds whole numbers
+            held = np.asarray(self._held if held is None else held, dtype=bool)  # C holds whole numbers
             gain[held] = 0.0
             left = np.eye(self._P.shape[0]) - gain @ H  # Joseph's form: right for any gain
             self._P = left @ self._P @ left.T + (gain * R[seen]) @ gain.T

@@ -610,21 +610,29 @@ def holding_drive(
 _HELD = 0.25  # degC: a start that drives miss by less is held
 
 
-@lru_cache(maxsize=256)
 def held_state(
     model: PredictionModel, controlled: tuple[str, ...], start: float, d: tuple[float, ...]
 ) -> Array:
+    """Return the state (n_x,) of :func:`held_start`."""
+    return held_start(model, controlled, start, d)[0]
+
+
+@lru_cache(maxsize=256)
+def held_start(
+    model: PredictionModel, controlled: tuple[str, ...], start: float, d: tuple[float, ...]
+) -> tuple[Array, Array | None]:
     """Return the state (n_x,) in which drives inside their range hold the controlled outputs at ``start``
-    [degC] for good; where none do, that of a plant which is as warm all over, without a drive."""
+    [degC] for good, and these drives (n_u,); where none do, that of a plant which is as warm all over, and
+    None."""
     wanted = np.full(len(controlled), start)
     held = holding_drive(model, controlled, wanted, d)
-    x = model.steady_state(held.u, d)
+    x, u = model.steady_state(held.u, d), held.u
     if not np.isfinite(x).all():  # an integrator
         x, u = _balance(model, [model.outputs.index(name) for name in controlled], wanted, np.array(d))
         held = replace(held, miss=held.miss if np.all((model.lowest <= u) & (u <= model.highest)) else np.inf)
     if held.miss < _HELD and np.isfinite(x).all():
-        return np.asarray(x)
-    return model.rest(np.full(model.n_y, start), d)
+        return np.asarray(x), u
+    return model.rest(np.full(model.n_y, start), d), None
 
 
 def _balance(model: PredictionModel, rows: list[int], wanted: Array, d: Array) -> tuple[Array, Array]:

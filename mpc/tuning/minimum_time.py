@@ -29,7 +29,7 @@ from scipy.sparse import diags_array, kron, vstack
 from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.design.design import Design
 from thermogrip.mpc.design.spec import Spec
-from thermogrip.mpc.plant.prediction import PredictionModel, held_state, prediction_model
+from thermogrip.mpc.plant.prediction import PredictionModel, held_start, prediction_model
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
@@ -58,10 +58,12 @@ class _Race:
         offset = plant.offsets.get(output, 0.0) + spec.sensor_offset_degC
         self.goal = self.side * (step[1] - offset) - spec.band_degC
         self.d = np.full(model.n_d, spec.ambient_degC)
-        self.x = held_state(model, tuple(design.controlled), step[0], tuple(self.d.tolist()))
+        self.x, held = held_start(model, tuple(design.controlled), step[0], tuple(self.d.tolist()))
         self.low, self.high = np.array([design.drive_range[name] for name in model.drives]).T
         self.slew = np.array([design.slew_per_s[name] for name in model.drives]) * design.dt
         self.neutral = np.clip(np.zeros(model.n_u), self.low, self.high)
+        # the drive before the step, from which the slew counts
+        self.begun = self.neutral if held is None else np.clip(held, self.low, self.high)
         self.n = max(2, round(spec.hold_s / design.dt))
         self.sub = max(1, round(design.dt / model.dt))
 
@@ -102,7 +104,7 @@ class _Race:
         rows: Any = kron(change, np.eye(n_u)).tocsr()
         slews = np.tile(self.slew, used)
         start = np.zeros(used * n_u)
-        start[:n_u] = self.neutral
+        start[:n_u] = self.begun
         room = trust * (self.high - self.low) if np.isfinite(trust) else self.high - self.low
         low = np.maximum(self.low, plan[:used] - room).ravel()
         high = np.minimum(self.high, plan[:used] + room).ravel()
@@ -137,8 +139,8 @@ class _Race:
     def _ramp(self, level: Array) -> Array:
         """Return the plan (n, n_u) that goes to a level as fast as the slew allows."""
         k = np.arange(1, self.n + 1)[:, None]
-        away = level - self.neutral
-        return np.asarray(self.neutral + np.sign(away) * np.minimum(np.abs(away), k * self.slew))
+        away = level - self.begun
+        return np.asarray(self.begun + np.sign(away) * np.minimum(np.abs(away), k * self.slew))
 
     def _heights(self, plans: Array) -> Array:
         """Return s y (plans, native samples) from the start on."""

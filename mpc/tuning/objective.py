@@ -13,7 +13,13 @@ M is by how many full drives the drives move in all: of two designs that settle 
 less to noise wins.  A step that never settles is charged its whole length and twice its last error.  Over the
 runs, the score is the mean plus half of what the worst is above it: the draws stand for what the plant may
 be.  All of them have the model's structure.  What that may lack (sensors that are slower, a longer delay, a
-weaker drive) is tried one by one on the first draw; the mean of those runs counts a little.
+weaker drive) is tried one by one on the first draw, for as long as a step is held, since such runs settle
+last; their mean counts a little.
+
+**Trials.**  A step begins where drives have held its start for long, and the controller is told these drives,
+as a running loop knows them; M counts from there. Readings are as noisy as those of the logs were found to be
+(which includes the logs' quantum), unless the spec states a noise; where the logs did not tell, they have the
+spec's and a thermocouple's quantum.
 
 **Bound.**  Before :func:`thermogrip.mpc.tuning.minimum_time.full_drive_bound` no drive inside its limits
 brings the skin into the band.  Staying there takes longer still, since the drive must be taken back in time,
@@ -24,7 +30,7 @@ only ramp is in the band no sooner than its ramp brings it there, which is the b
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -125,12 +131,27 @@ def drawn(plant: Plant, draw: int) -> Plant:
     return plant.draw(draw)
 
 
-def surroundings_of(spec: Spec, controlled: Sequence[str], disturbances: Sequence[str]) -> Surroundings:
-    """Return the room and the sensors of the trials: the controlled ones are off, and the room's are."""
+def surroundings_of(
+    spec: Spec,
+    controlled: Sequence[str],
+    disturbances: Sequence[str],
+    shown: Mapping[str, float] | None = None,
+) -> Surroundings:
+    """Return the room and the sensors of the trials: the controlled ones are off, and the room's are;
+    ``shown`` is the noise that the logs have by output, of which their quantum is a part."""
+    known = {name: sd for name, sd in (shown or {}).items() if np.isfinite(sd)}
+    stated = "noise_degC" in spec.model_fields_set
     offset = dict.fromkeys(controlled, spec.sensor_offset_degC)
     offset |= dict.fromkeys(disturbances, 1.5 * spec.sensor_offset_degC)
     room = spec.ambient_degC
-    return Surroundings(ambient=room, noise=spec.noise_degC, offset=offset, held=tuple(controlled))
+    return Surroundings(
+        ambient=room,
+        noise=spec.noise_degC,
+        noises={} if stated else known,
+        quanta=dict.fromkeys(known, 0.0),
+        offset=offset,
+        held=tuple(controlled),
+    )
 
 
 def trial(
@@ -148,7 +169,8 @@ def trial(
     if isinstance(controller, Controller) and controller.c is not None:
         from thermogrip.mpc.closed_loop.simulate_native import compiled_loop as loop
     structure, draw = divmod(draw, STRUCTURE)
-    around = surroundings_of(spec, controller.controlled, plant.disturbances)
+    shown = plant.scores.reading_sd
+    around = surroundings_of(spec, controller.controlled, plant.disturbances, shown)
     if structure:
         around = replace(around, **lacking(plant, spec, controller.controlled)[structure - 1][1])
     return loop(
@@ -367,9 +389,15 @@ class Search:
         )
 
     def evaluate(
-        self, parameters: dict[str, float], name: str = "MPC", lengths: Sequence[float] | None = None
+        self,
+        parameters: dict[str, float],
+        name: str = "MPC",
+        lengths: Sequence[float] | None = None,
+        *,
+        other_noise: int = 0,
     ) -> Trial:
-        """Return the trial of an ``"MPC"``, ``"PI"`` or ``"LQR"``; ``lengths`` are seconds by step."""
+        """Return the trial of an ``"MPC"``, ``"PI"`` or ``"LQR"``; ``lengths`` are seconds by step, and other
+        noise than the search's is counted from 1."""
         spec, lengths = self.spec, self.lengths if lengths is None else lengths
         if name == "PI":
             loops = scaled_loops(self.baseline.loops, parameters)
@@ -379,8 +407,11 @@ class Search:
         else:
             controller = self.made(name, self.design(parameters))
         # trials of the LQR, which is there for comparison, take ten times as long
-        draws = self.draws if name == "LQR" else [*self.draws, *self.lacking]
-        found = run_trials(controller, self.plant, spec, draws, lengths=lengths, seed=self.seed)
+        # the comparison of a plant without draws has a seed of its own
+        seed = self.seed + (other_noise and other_noise + 1)
+        found = run_trials(controller, self.plant, spec, self.draws, lengths=lengths, seed=seed)
+        if name != "LQR":
+            found += run_trials(controller, self.plant, spec, self.lacking, seed=seed)
         results = [result for result in found if result.draw < STRUCTURE]
         return Trial(
             controller=name,
@@ -396,6 +427,11 @@ class Search:
         """Return a trial at full length: slow ones settle too."""
         name, parameters = item
         return self.evaluate(parameters, name, [self.spec.hold_s] * len(self.spec.steps))
+
+    def evaluate_in_other_noise(self, item: tuple[dict[str, float], int]) -> Trial:
+        """Return a trial of an MPC at full length in another noise than the search's, counted from 1."""
+        parameters, other = item
+        return self.evaluate(parameters, lengths=[self.spec.hold_s] * len(self.spec.steps), other_noise=other)
 
     def check(self, item: tuple[str, Design, int]) -> list[StepResult]:
         """Return the results of a controller on one draw, at full length."""

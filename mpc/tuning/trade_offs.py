@@ -35,7 +35,7 @@ from thermogrip.mpc.tuning.objective import Record, Search, Trial, parameters_of
 RESOLUTION = (1.0, 0.05, 0.005)
 
 _CAPS = (0.9, 0.75, 0.6, 0.5)
-_MOVES = (0.1, 10.0, 100.0)
+_MOVES = (0.1, 3.0, 10.0, 30.0, 100.0)
 _TRUST = (0.3, 0.1)
 _KEPT = 6  # of the search's own trials
 

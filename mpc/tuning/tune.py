@@ -60,6 +60,7 @@ from thermogrip.mpc.tuning.trade_offs import (
     Pareto,
     Sensitivity,
     front_of,
+    non_dominated,
     scan_of,
     sensitivity_of,
     sensitivity_words,
@@ -209,8 +210,17 @@ def _lacking(plant: Plant, design: Design, spec: Spec, results: Sequence[StepRes
 
 # to begin with: dearer moves than in the default design, a filter that trusts readings less, other horizons
 _LOOK = (("move", (10.0, 100.0, 1000.0)), ("state_walk", (0.3, 0.1)), ("horizon", (0.7, 1.5)))
+# where each part of the work ends, in shares of its CPU time (a furnace's): bounds and compilation, a look
+# about, the search (within it MPC and PI), trade-offs, the comparison
+_BEGUN, _LOOKED, _SEARCHED, _TRADED, _COMPARED = 0.09, 0.13, 0.67, 0.8, 0.87
+_MPC_DONE, _PI_DONE = 0.1, 0.92
 _WORTH = 0.01  # by which a traded design must be better on the spec's own score to be taken
-_ALIKE = 0.02  # of designs with as much of the drive that differ by less in score the one that moves least
+_ALIKE = 0.02  # of designs with as much of the drive that differ by less in score the one that moves least;
+# by no more than this either where noise alone makes a greater difference
+_ALIKE_IN_NOISE = 0.05
+_STILL = 0.05  # by which one must move less than another to be taken for it
+_NOISES = 2  # besides the search's, in which designs are tried ...
+_CONTENDERS, _CONTEND = 5, 0.1  # ... so many, whose score in the search's is within this of the least
 
 
 @dataclass(frozen=True)
@@ -307,14 +317,17 @@ def tune(
     search = Search(plant, spec, baseline, seed)
     start = parameters_of(baseline, spec)
     looked = run_parallel(search.evaluate, [start], workers, what="default design")
+    if progress is not None:
+        progress(_BEGUN, "default design")
     for at, (parameter, factors) in enumerate(_LOOK):
         first = _best(looked).parameters
         values = [factor * first[parameter] for factor in factors]
         look = [{**first, parameter: float(round(v)) if parameter == "horizon" else v} for v in values]
-        share = sub_progress(progress, 0.02 * at, 0.02 * (at + 1))
+        width = (_LOOKED - _BEGUN) / len(_LOOK)
+        share = sub_progress(progress, _BEGUN + width * at, _BEGUN + width * (at + 1))
         looked += run_parallel(search.evaluate, look, workers, share, what=PARAMETER_WORDS[parameter])
-    found = _search_all(search, looked, workers, sub_progress(progress, 0.06, 0.6))
-    pareto, best = _trade(search, found, workers, sub_progress(progress, 0.6, 0.7))
+    found = _search_all(search, looked, workers, sub_progress(progress, _LOOKED, _SEARCHED))
+    pareto, best = _trade(search, found, workers, sub_progress(progress, _SEARCHED, _TRADED))
     tuned = search.design(best.parameters)
     candidates = {
         "baseline": baseline,
@@ -322,7 +335,7 @@ def tune(
         "PI": replace(tuned, loops=scaled_loops(baseline.loops, _best(found["PI"]).parameters)),
         "LQR": search.design(_best(found["LQR"]).parameters),
     }
-    results = _compare(search, candidates, workers, sub_progress(progress, 0.7, 0.85))
+    results = _compare(search, candidates, workers, sub_progress(progress, _TRADED, _COMPARED))
     scores = {name: score(part, spec, search.bounds) for name, part in results.items()}
     own = {name: [result for result in part if result.draw < STRUCTURE] for name, part in results.items()}
     moved = {name: np.mean([result.travel for result in part]) for name, part in own.items()}
@@ -330,7 +343,7 @@ def tune(
     kept = "tuned" if scores["tuned"] < alike * scores["baseline"] else "baseline"
     about = best if kept == "tuned" else search.evaluate(start)
     items = [(search, parameter, about.parameters, about) for parameter in PARAMETER_WORDS]
-    share = sub_progress(progress, 0.85, 1.0)
+    share = sub_progress(progress, _COMPARED, 1.0)
     sensitivity = run_parallel(sensitivity_of, items, workers, share, what="sensitivities")
     history = tuple(tried for part in found.values() for tried in part)
     rows = tuple(row for name, part in own.items() for row in rows_of(name, part, spec, search.bounds))
@@ -388,14 +401,55 @@ def _trade(
     tried = run_parallel(search.evaluate_at_length, items, workers, progress, what="trade-offs")
     pareto = front_of(tried, names)
     own = [trial for trial in tried if trial.controller == "MPC"]
-    taken = _best(own)
-    if taken.score >= (1 - _WORTH) * own[0].score:  # else a cap pays: energy is weighted
-        taken = own[0]
-    share = taken.parameters.get("drive_share", 1.0)
-    near = [trial for trial in own if trial.score <= (1 + _ALIKE) * taken.score]
-    same = [trial for trial in near if trial.parameters.get("drive_share", 1.0) == share]
-    still = min([taken, *same], key=lambda trial: trial.travel)
+    near = _contenders(own)
+    again = [(trial.parameters, noise) for trial in near for noise in range(1, 1 + _NOISES)]
+    others = run_parallel(search.evaluate_in_other_noise, again, workers, what="the same in other noise")
+    noises = [[near[k], *others[_NOISES * k :][:_NOISES]] for k in range(len(near))]
+    still = near[_stillest(noises)]
     return pareto, best if still is own[0] else search.evaluate(still.parameters)
+
+
+def _share(trial: Trial) -> float:
+    return trial.parameters.get("drive_share", 1.0)
+
+
+def _contenders(own: Sequence[Trial]) -> list[Trial]:
+    """Return the first of these designs and those that may be taken in its place: near the least score, with
+    as much of the drive and none both scoring less and moving less, or the best one with less of it."""
+    least = min(trial.score for trial in own)
+    near = [trial for trial in own[1:] if trial.score <= (1 + _CONTEND) * least]
+    whole = [trial for trial in near if _share(trial) == _share(own[0])]
+    points = np.array([(trial.score, trial.travel) for trial in whole]).reshape(-1, 2)
+    front = non_dominated(points)
+    still = sorted((trial for trial, kept in zip(whole, front) if kept), key=lambda trial: trial.travel)
+    capped = [trial for trial in near if _share(trial) != _share(own[0])]
+    return [own[0], *still[: _CONTENDERS - 1], *([_best(capped)] if capped else [])]
+
+
+def _stillest(found: Sequence[Sequence[Trial]]) -> int:
+    """Return which of these designs moves least, of those that score as the best does as far as trials tell;
+    of each there is a trial in each of the same noises.
+
+    They tell a difference of their means that is above its standard error: the rule of one standard error, by
+    which of models that predict alike the simplest is taken [1]_. Below 2 % none counts; above 5 % each does,
+    for three noises are few. A difference of moves that is below 5 % does not count either. With less of the
+    drive than the first, a design must be better than it by 1 %.
+
+    References
+    ----------
+    .. [1] L. Breiman, J. Friedman, R. Olshen, C. Stone, "Classification and Regression Trees", 1984, 3.4.3.
+    """
+    scores = np.array([[trial.score for trial in trials] for trials in found])
+    travels = np.array([np.mean([trial.travel for trial in trials]) for trials in found])
+    shares, means = np.array([_share(trials[0]) for trials in found]), scores.mean(axis=1)
+    whole = shares == shares[0]
+    least = int(np.argmin(np.where(whole | (means < (1 - _WORTH) * means[0]), means, np.inf)))
+    more = scores - scores[least]
+    error = more.std(axis=1, ddof=1) / np.sqrt(scores.shape[1])
+    told = np.clip(error, _ALIKE * means[least], _ALIKE_IN_NOISE * means[least])
+    alike = (more.mean(axis=1) <= told) & (shares == shares[least])
+    still = alike & (travels <= (1 + _STILL) * travels[alike].min())
+    return int(np.argmin(np.where(still, means, np.inf)))
 
 
 def _search_all(
@@ -415,7 +469,7 @@ def _search_all(
         (search, "LQR", [lqr], n, None),
     ]
     if workers == 1:
-        shares = ((0.0, 0.5), (0.5, 0.65), (0.65, 1.0))
+        shares = ((0.0, _MPC_DONE), (_MPC_DONE, _PI_DONE), (_PI_DONE, 1.0))
         parts = [sub_progress(progress, *share) for share in shares]
         tried = [_optimise((*item[:4], part)) for item, part in zip(items, parts, strict=True)]
     else:
@@ -449,13 +503,19 @@ def _optimise(item: tuple[Search, str, list[dict[str, float]], int, Progress | N
     names = [parameter for parameter, _, _ in parameters]
     low = np.log([small for _, small, _ in parameters])
     high = np.log([large for _, _, large in parameters])
-    tried = [] if name == "MPC" else [evaluate(start) for start in starts[:evaluations]]
+    tried: list[Trial] = []
+
+    def look(parameters: dict[str, float]) -> None:
+        tried.append(evaluate(parameters))
+        if progress is not None:
+            progress(min(len(tried) / evaluations, 1.0), f"weights of the {name}")
+
+    for first in starts[:evaluations] if name != "MPC" else ():
+        look(first)
     start = _best(tried).parameters if tried else starts[0]
 
     def cost(z: Array, gradient: Array) -> float:
-        tried.append(evaluate({**start, **dict(zip(names, np.exp(z).tolist(), strict=True))}))
-        if progress is not None:
-            progress(min(len(tried) / evaluations, 1.0), f"weights of the {name}")
+        look({**start, **dict(zip(names, np.exp(z).tolist(), strict=True))})
         return tried[-1].score
 
     optimiser = nlopt.opt(nlopt.LN_SBPLX, len(names))

@@ -153,15 +153,16 @@ static void look(const tg_truth *plant, double *y)
  *
  * observed: the estimate that the observer starts from: x, w, shown, lag, scale, P,
  * found_offset and start, one behind the other; per_sample: the plant's steps in a sample; late: steps after
- * which a drive acts, acts: the share of it that does, both counted from the drives `before`; sees: share of a
+ * which a drive acts, acts: the share of it that does, both counted from the drives `before`, of which
+ * the controller is told or not; sees: share of a
  * change that sensors show at once; noise: n rows of TG_NY readings' errors; quanta: of each of the TG_NY + TG_ND readings, 0 none; d_offset: what
  * a sensor of a disturbance shows too much; target: n rows of n_c.
  * Into y: n per_sample + 1 rows of TG_NY, without noise and quantum; reading: n rows of TG_NY + TG_ND;
  * drive: n rows of TG_NU; status: n.
  */
 void tg_host_loop(tg_controller *c, const tg_design *design, tg_truth *plant, int n, int per_sample, int late,
-                  double sees, double acts, const double *before, const double *observed, const double *d,
-                  const double *noise, const double *quanta, const double *d_offset, const double *target,
+                  double sees, double acts, int told, const double *before, const double *observed,
+                  const double *d, const double *noise, const double *quanta, const double *d_offset, const double *target,
                   double *y, double *reading, double *drive, int *status)
 {
     look(plant, y);
@@ -186,7 +187,7 @@ void tg_host_loop(tg_controller *c, const tg_design *design, tg_truth *plant, in
             memcpy(c->found_offset, observed + TG_Z + TG_Z * TG_Z, sizeof c->found_offset);
             memcpy(c->start, observed + TG_Z + TG_Z * TG_Z + TG_NY, sizeof c->start);
         }
-        move = tg_step(c, NAN, shown, shown + TG_NY, NULL, target + t * design->n_c);
+        move = tg_step(c, NAN, shown, shown + TG_NY, told && !t ? before : NULL, target + t * design->n_c);
         memcpy(drive + t * TG_NU, move.drive, sizeof move.drive);
         status[t] = move.status;
         for (int part = 0; part < per_sample; part++) {

@@ -218,7 +218,8 @@ static void apply(tg_controller *c, double *change)
 }
 
 /* A lost reading is given no weight: its row of H P is 0. known: variances of the reading. */
-static void correct(tg_controller *c, const double *y, const double *known, double remember)
+/* Correct the estimate by a reading of variances `known`; one between two moves leaves lags and scales. */
+static void correct(tg_controller *c, const double *y, const double *known, double remember, int between)
 {
     double R[TG_NY], off[TG_NY], S[TG_NY * TG_NY], HP[TG_NY * TG_Z], gain[TG_NY * TG_Z], PH[TG_NY * TG_Z];
     double H[TG_NY * TG_Z], change[TG_Z] = {0.0};
@@ -247,7 +248,7 @@ static void correct(tg_controller *c, const double *y, const double *known, doub
     eliminate(S, gain); /* row a of gain: what reading a does to each state */
     for (int a = 0; a < TG_NY; a++)
         for (int j = 0; j < TG_Z; j++) {
-            if (c->held[j])
+            if (c->held[j] || (between && j >= TG_L + TG_NG))
                 gain[a * TG_Z + j] = 0.0;
             change[j] += gain[a * TG_Z + j] * off[a];
         }
@@ -266,17 +267,17 @@ static void correct(tg_controller *c, const double *y, const double *known, doub
     apply(c, change);
 }
 
-static void correct_now(tg_controller *c, const double *y, double remember)
+static void correct_now(tg_controller *c, const double *y, double remember, int between)
 {
     double R[TG_NY];
     for (int i = 0; i < TG_NY; i++)
         R[i] = c->design->R[i] + c->bent[i] * c->bent[i];
-    correct(c, y, R, remember);
+    correct(c, y, R, remember, between);
 }
 
-void tg_observer_update(tg_controller *c, const double *y) { correct_now(c, y, REMEMBER); }
+void tg_observer_update(tg_controller *c, const double *y) { correct_now(c, y, REMEMBER, 0); }
 
-void tg_observer_refine(tg_controller *c, const double *y) { correct_now(c, y, 0.0); }
+void tg_observer_refine(tg_controller *c, const double *y) { correct_now(c, y, 0.0, 1); }
 
 void tg_observer_set_offsets(tg_controller *c, const double *y, const int *which)
 {
@@ -324,7 +325,7 @@ void tg_observer_reset(tg_controller *c, const double *y, const double *d)
     for (int r = 0; r < TG_NG; r++)
         c->shown[r] = output(c, s->controlled[r], c->x);
     stand_on_sample(c);
-    correct(c, y, s->R_start, 0.0);
+    correct(c, y, s->R_start, 0.0, 0);
     for (int r = 0; r < TG_NG; r++) { /* at rest every output shows what the model has */
         int at = TG_L + r, i = s->controlled[r];
         double row[TG_Z], h[TG_Z] = {0.0};

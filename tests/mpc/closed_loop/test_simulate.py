@@ -127,7 +127,7 @@ def test_one_drive_at_its_limit_is_enough() -> None:
 
 
 def test_surroundings_are_those_of_a_thermocouple_amplifier_where_nothing_is_given() -> None:
-    assert Surroundings() == Surroundings(25.0, 0.04, 1 / 16, {}, {}, 0.0, 0.0, 1.0, ())
+    assert Surroundings() == Surroundings(25.0, 0.04, {}, 1 / 16, {}, {}, 0.0, 0.0, 1.0, ())
     assert all(kind.__dataclass_params__.frozen for kind in (Surroundings, Segment, ClosedLoop))
 
 
@@ -250,6 +250,30 @@ def test_a_schedule_is_recorded_segment_by_segment() -> None:
     assert first.overshoot == pytest.approx(top - 30.0)
     assert run.drive["q"].tolist() == [1.0] * 5 + [0.0] * 10
     assert run.drive_range == {"q": (-1.0, 1.0)}
+
+
+def test_a_controller_is_told_the_drive_that_holds_the_start_and_moves_count_from_there() -> None:
+    plan: Any = Plan([0.5] * 5 + [-0.25] * 5)
+    quiet = Surroundings(noise=0.0, quantum=0.0, held=("a",))
+    run = simulate_closed_loop(plan, lag(), [(35.0, 10.0), (20.0, 10.0)], start=30.0, surroundings=quiet)
+    # 20 K at full drive, so that a quarter of it holds 5 K more than the room
+    assert plan.begun[0]["q"] == plan.seen[0][0]["q"] == pytest.approx(0.25, abs=1e-6)
+    assert "q" not in plan.seen[1][0]  # it knows what it asked for
+    assert set(run.readings) == {"a", "b", "t_ambient"}
+    assert [part.travel for part in run.segments] == pytest.approx([0.25, 0.75], abs=1e-6)
+    # where no drive holds the start the plant is as warm all over, and nothing is told
+    loose: Any = Plan([0.5] * 5)
+    run = simulate_closed_loop(loose, lag(), [(35.0, 10.0)], start=90.0, surroundings=quiet)
+    assert "q" not in loose.begun[0]
+    assert run.segments[0].travel == pytest.approx(0.5)
+
+
+def test_each_output_has_its_own_noise() -> None:
+    around = Surroundings(noise=0.3, noises={"b": 0.01}, quantum=0.0)
+    truth = Truth(lag(), 1.0, around, 25.0, 0)
+    rows = [truth.reading() for _ in range(500)]
+    spread = {name: np.std([row[name] for row in rows]) for name in ("a", "b")}
+    assert spread == pytest.approx({"a": 0.3, "b": 0.01}, rel=0.15)
 
 
 # ---- a session ----

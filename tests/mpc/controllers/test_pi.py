@@ -154,3 +154,18 @@ def test_from_rest_the_drive_that_holds_the_reading_goes_on_without_feedforward(
     controller.reset(here)
     for _ in range(3):
         assert controller.step(here, TARGET).drive == pytest.approx({"q1": 30.0, "q2": 40.0}, abs=1e-4)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
+def test_a_start_under_a_drive_that_is_told_goes_on_from_it(share: float):
+    """The plant's own drive holds 30 and 29.5 degC at 25 and 35 % in place of the model's 30 and 40."""
+    loops = tuple(replace(loop, feedforward=share) for loop in LOOPS)
+    controller = pi(loops=loops, slew_per_s={"q1": 2.0, "q2": 2.0})
+    here, told = {"a": 30.0, "b": 29.5, "room": 22.0}, {"q1": 25.0, "q2": 35.0}
+    controller.reset(here | told)
+    for _ in range(3):
+        assert controller.step(here, TARGET).drive == pytest.approx(told, abs=1e-4)
+    controller.reset(here | told)
+    # 2 a second from there on, up and down
+    moved = controller.step(here, {"a": 60.0, "b": 20.0}).drive
+    assert moved == pytest.approx({"q1": 21.0, "q2": 39.0}, abs=1e-4)

@@ -94,10 +94,12 @@ def test_at_any_rate_the_loop_is_that_of_the_sample_time(tank, nominal, name, ra
         pytest.skip("no gcc here")
     found, own = closed_loop(makers(tank)[name](), RATES[rate]()), nominal[name]
     late = 7.0 if rate == "7 s" else 3.0  # a change is felt as late as it is called
+    # that much later than at 2 s on average [s]; the skin passes its target at 0.026 degC/s
+    felt = 2.5 if rate == "7 s" else 1.2
     assert found["settling"] == pytest.approx(own["settling"], abs=0.05 * own["settling"] + late)
     # beyond a sample of 2 s a hold adds 2.5 s of mean delay, 4 % of the settling time
     more = 0.15 if rate == "7 s" else 0.1
-    assert found["overshoot"] == pytest.approx(own["overshoot"], rel=more, abs=0.07)
+    assert found["overshoot"] == pytest.approx(own["overshoot"], rel=more, abs=0.026 * felt)
     assert found["bias"] == pytest.approx(own["bias"], abs=0.03)
     assert {move.status for _, move in found["moves"]} <= {"ok"}
 

@@ -451,6 +451,26 @@ def test_noise_at_rest_shows_no_lag_and_leaves_it_as_uncertain_as_it_was() -> No
         assert observer.lag_sd[0] > 0.8 * PRIOR_LAG * dt
 
 
+def test_a_reading_between_two_moves_is_not_taken_for_a_lag() -> None:
+    """The curve of a rise within a sample lies below the straight line that the filter has there."""
+    lags = {}
+    for name in ("refine", "update"):
+        observer = Observer(MODEL, CHOSEN, NOISE, lagged=[1])
+        observer.reset(LEVEL + OFFSET, np.array([25.0]))
+        observer.expect_lags()
+        observer.predict(np.array([SPAN]), np.array([25.0]))
+        observer.advance(0.5 * DT, np.array([SPAN]), np.array([25.0]))
+        observer.look(np.array([25.0]))
+        before = observer.x, observer.lag_sd, observer.scale
+        getattr(observer, name)(observer.reading() - [0.0, 0.3])
+        lags[name] = observer.lag[0]
+        assert np.abs(observer.x - before[0]).max() > 1e-4  # it corrects the states all the same
+        if name == "refine":
+            assert (observer.lag_sd, observer.scale) == (pytest.approx(before[1]), before[2])
+    assert lags["refine"] == 0.0
+    assert lags["update"] > 0.01 * DT
+
+
 def test_where_a_lag_would_be_negative_the_estimate_is_that_without_one() -> None:
     one, other = Observer(MODEL, CHOSEN, NOISE, lagged=[1]), Observer(MODEL, CHOSEN, NOISE)
     for observer in (one, other):

@@ -127,6 +127,10 @@ def test_the_filter_is_the_same_in_c(pair):
             part.hold_drives(weak)
             part.predict(u, d)
             part.update(y)
+            part.advance(0.4 * python.dt, u, d)
+            part.look(d)
+            part.refine(y)
+            part.advance(0.6 * python.dt, u, d)
         np.testing.assert_allclose(c.observer.x, python.observer.x, atol=1e-11)
         np.testing.assert_allclose(c.observer.w, python.observer.w, atol=1e-12)
         for name in ("shown", "lag", "lag_sd", "scale", "output_bias"):
@@ -135,19 +139,20 @@ def test_the_filter_is_the_same_in_c(pair):
     assert abs(c.observer.scale[0]) > 1e-5
 
 
+@pytest.mark.parametrize("held", [(), ("t_surface",)])
 @pytest.mark.parametrize(
     "lacks", [{"move_delay_s": 1.0}, {"move_delay_s": 7.0, "sensor_lag_s": 3.0, "drive_share": 0.8}]
 )
-def test_a_loop_is_the_same_in_python_with_c_parts_and_wholly_in_c(pair, tank_maker, lacks):
+def test_a_loop_is_the_same_in_python_with_c_parts_and_wholly_in_c(pair, tank_maker, lacks, held):
     python, c = pair
     truth = tank_maker(heat=0.1, joule=0.055, loss=1 / 600, delay=9)
     around = Surroundings(ambient=23.0, offset={"t_surface": 0.3, "t_ambient": -0.4}, **lacks)
-    around = replace(around, quanta={"t_ambient": 0.1})
-    schedule = [(35.0, 120.0), (22.0, 120.0)]
+    around = replace(around, quanta={"t_ambient": 0.1}, noises={"t_tank": 0.2}, held=held)
+    schedule, start = [(35.0, 120.0), (22.0, 120.0)], 30.0 if held else None
     runs = [
-        simulate_closed_loop(python, truth, schedule, surroundings=around, seed=5),
-        simulate_closed_loop(c, truth, schedule, surroundings=around, seed=5),
-        compiled_loop(c, truth, schedule, surroundings=around, seed=5),
+        simulate_closed_loop(python, truth, schedule, start=start, surroundings=around, seed=5),
+        simulate_closed_loop(c, truth, schedule, start=start, surroundings=around, seed=5),
+        compiled_loop(c, truth, schedule, start=start, surroundings=around, seed=5),
     ]
     for run in runs[1:]:
         np.testing.assert_allclose(run.drive["drive"], runs[0].drive["drive"], atol=1e-9)

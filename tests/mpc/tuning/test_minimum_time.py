@@ -80,6 +80,15 @@ def test_the_bound_is_of_what_the_sensor_reads_at_the_drive_of_that_side(
     assert full_drive_bound(plant, design, step, spec) == np.ceil(seconds - 1e-9)
 
 
+def test_the_slew_counts_from_the_drive_that_holds_the_start():
+    plant = plant_of([[0.95]], [[1.0]], [[1.0]])  # 20 K at full drive, 25 degC without
+    spec = spec_of(steps=[(35.0, 40.0)], slew_per_s=0.02)
+    made = _Race(plant, spec.design(plant), (35.0, 40.0), spec, "t")
+    assert made._ramp(np.array([1.0]))[:5, 0] == pytest.approx([0.6, 0.7, 0.8, 0.9, 1.0], abs=1e-6)
+    made = _Race(plant, spec.design(plant), (90.0, 95.0), spec, "t")  # nothing holds it
+    assert made._ramp(np.array([1.0]))[:2, 0] == pytest.approx([0.1, 0.2])
+
+
 @pytest.mark.parametrize("step", [STEP, (25.0, 22.0)])
 def test_no_plan_of_a_tank_with_a_lagging_skin_arrives_or_settles_sooner(step):
     A = [[0.97, 0.0], [0.25, 0.75]]

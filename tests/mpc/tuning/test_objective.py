@@ -40,7 +40,8 @@ def search_of(
     """Return the search of a tank whose shortest times are a function of (start, target, draw), its skin in
     the logs as cold as that; its default design has settled after so long."""
     logs = {"t_surface": (coldest, 40.0)}
-    plant = _Plant(uncertain=uncertain, draw=lambda k: k, dt=dt, valid=logs, units={})
+    scores = SimpleNamespace(reading_sd={})
+    plant = _Plant(uncertain=uncertain, draw=lambda k: k, dt=dt, valid=logs, units={}, scores=scores)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(objective, "full_drive_bound", lambda drawn, design, step, spec: bounds(*step, drawn))
         patch.setattr(objective, "apparent_delay", lambda plant, controlled: 8.0)
@@ -86,13 +87,14 @@ def test_each_controller_is_tried_for_its_own_length(monkeypatch: pytest.MonkeyP
     seen: list[Any] = []
 
     def run(
-        controller: Any, plant: Any, spec: Spec, draws: Any, *, lengths: Any, seed: int
+        controller: Any, plant: Any, spec: Spec, draws: Any, *, seed: int, lengths: Any = None
     ) -> list[StepResult]:
         seen.append((controller, draws, lengths, seed))
+        if draws == search.lacking:
+            return [StepResult(28.0, 36.0, 2001, 90.0, 0.3, 0.0, 0.0, 99.0, 0.0, 0.5, 100.0)]
         return [
             StepResult(28.0, 36.0, 1, 80.0, 0.1, 0.0, 0.0, 20.0, 1.0, 0.5, 100.0),
             StepResult(28.0, 20.0, 2, 100.0, 0.2, 0.0, 0.0, 40.0, 1.0, 0.5, 100.0),
-            StepResult(28.0, 36.0, 2001, 90.0, 0.3, 0.0, 0.0, 99.0, 0.0, 0.5, 100.0),
         ]
 
     monkeypatch.setattr(objective, "run_trials", run)
@@ -102,10 +104,16 @@ def test_each_controller_is_tried_for_its_own_length(monkeypatch: pytest.MonkeyP
     pi = {"Kc": 2.0, "Ti": 1.0, "setpoint": 1.0, "feedforward": 0.5}
     tried = [search.evaluate({"move": 7.0}), search.evaluate(pi, "PI"), search.evaluate({"move": 4.0}, "LQR")]
     search.evaluate_at_length(("PI", pi))
-    lengths = [search.lengths, [300.0, 300.0], search.lengths, [300.0, 300.0]]
-    names = [("MPC", 7.0), ("PI", 2.0), ("LQR", 4.0), ("PI", 2.0)]
-    draws = [[1, 2] if name == "LQR" else [1, 2, 1001, 2001, 3001] for name, _ in names]
-    assert seen == [(*given, 3) for given in zip(names, draws, lengths, strict=True)]
+    search.evaluate_in_other_noise(({"move": 9.0}, 2))
+    whole = [300.0, 300.0]
+    own = [(("MPC", 7.0), search.lengths, 3), (("PI", 2.0), whole, 3), (("LQR", 4.0), search.lengths, 3)]
+    own += [(("PI", 2.0), whole, 3), (("MPC", 9.0), whole, 6)]  # 4 is what a sure plant is compared with
+    wanted = []
+    for of, length, seed in own:
+        wanted.append((of, [1, 2], length, seed))
+        # what lacks structure settles last: for as long as a step is held
+        wanted += [(of, [1001, 2001, 3001], None, seed)] if of[0] != "LQR" else []
+    assert seen == wanted
     # the mean, and half of what the worst is above it; a move; what lacks structure
     cost = (80 + 100) / 120 + 0.5 * (100 - 90) / 60 + 0.01 + 0.05 * (90 / 60 + 10 * 0.03)
     assert tried[0] == Trial("MPC", {"move": 7.0}, pytest.approx(cost), 90.0, 0.2, 30.0, 1.0)
@@ -137,7 +145,9 @@ def test_the_trial_from_a_cold_start_is_of_the_pi_alone(monkeypatch: pytest.Monk
     assert {key for key in search.bounds if key[0] == 20.0} == {(20.0, 36.0, 1), (20.0, 36.0, 2)}
     seen: list[Any] = []
 
-    def run(controller: Any, plant: Any, spec: Spec, draws: Any, *, lengths: Any, seed: int) -> Any:
+    def run(controller: Any, plant: Any, spec: Spec, draws: Any, *, seed: int, lengths: Any = None) -> Any:
+        if draws == search.lacking:
+            return []
         seen.append((list(spec.steps), lengths))
         return [StepResult(*spec.steps[-1], 1, 80.0, 0.1, 0.0, 0.0, 20.0, 1.0, 0.5, 100.0)]
 
@@ -165,11 +175,13 @@ def test_a_trial_has_a_sensor_that_is_off_and_a_seed_of_its_draw(monkeypatch: py
 
     monkeypatch.setattr(objective, "simulate_closed_loop", loop)
     monkeypatch.setattr(objective, "apparent_delay", lambda plant, controlled: 8.0)
-    plant: Any = _Plant(disturbances=("room",), draw=lambda k: {"draw": k})
+    scores = SimpleNamespace(reading_sd={"b": 0.07, "c": np.inf})
+    plant: Any = _Plant(disturbances=("room",), draw=lambda k: {"draw": k}, scores=scores)
     controller: Any = SimpleNamespace(controlled=("a", "b"))
     found = objective.run_trials(controller, plant, SPEC, [1, 2], lengths=[50.0, 60.0], seed=4)
     offset = {"a": 0.4, "b": 0.4, "room": pytest.approx(0.6)}
-    around = Surroundings(ambient=25.0, noise=0.04, offset=offset, held=("a", "b"))
+    noises = {"b": 0.07}  # what the logs showed, their quantum included; of the others the usual
+    around = Surroundings(25.0, 0.04, noises, quanta={"b": 0.0}, offset=offset, held=("a", "b"))
     assert seen == [
         ({"draw": draw}, [(target, length)],
          {"start": 28.0, "surroundings": around, "band": 0.3, "seed": 4000 + draw})
@@ -189,6 +201,10 @@ def test_a_trial_has_a_sensor_that_is_off_and_a_seed_of_its_draw(monkeypatch: py
     assert [words for words, _ in objective.lacking(plant, SPEC, ("a",))] == [
         "sensors slower by 4 s", "delay longer by 4 s", "drive weaker by 15 %",
     ]  # fmt: skip
+    stated = Spec(steps=STEPS, noise_degC=0.1)
+    objective.run_trials(controller, plant, stated, [1])
+    around = seen[-1][2]["surroundings"]
+    assert (around.noise, around.noises, around.quanta) == (0.1, {}, {"b": 0.0})
     fewer = SPEC.model_copy(update={"extra_lag": 0.0, "lost_gain": 0.0})
     assert len(objective.lacking(plant, fewer, ("a",))) == 1
 
