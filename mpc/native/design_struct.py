@@ -16,10 +16,14 @@ import numpy as np
 from thermogrip.datasets.arrays import Array
 
 if TYPE_CHECKING:
+    from thermogrip.mpc.design.design import Design
+    from thermogrip.mpc.estimator.observer import DisturbanceModel
     from thermogrip.mpc.native.codegen import ModelCode
     from thermogrip.mpc.optimiser.rti import ControllerParts
+    from thermogrip.mpc.plant.prediction import PredictionModel
 
 ITERATION_LIMIT = 500
+_INTEGRATES = 1e10  # condition of I - A, from which on a plant has no steady state worth the name
 _BINS = 12  # TG_BINS of tg_controller.h
 
 #: name -> (whole number?, shape in names of sizes, comment)
@@ -90,6 +94,12 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "rest": (False, ("NX",), "state at rest where all is at `ambient`"),
     "rest_level": (False, ("NX",), "how it answers to the mean of the readings"),
     "rest_d": (False, ("NX", "ND"), "and to the measured disturbances"),
+    "settles": (True, (), "whether what follows says where a linear plant settles"),
+    "settled_by": (False, ("NY", "NV"), "outputs at rest by shares of the drives, disturbances, and biases"),
+    "settled": (False, ("NY",), "and without them"),
+    "by_x": (False, ("NO", "NX"), "of a linear plant, the soft rows of each sample by the state,"),
+    "by_d": (False, ("NO", "ND"), "by the disturbances,"),
+    "by_none": (False, ("NO",), "and without them"),
     "P_rest": (False, ("NX", "NX"), "covariance of the states in which the plant may rest"),
 }
 
@@ -109,6 +119,7 @@ class Sizes:
     NC: int
     NL: int
     NE: int  # numbers in the rows of the response
+    NO: int  # soft rows of all samples, of a linear plant
     NK: int  # what the model's ``prepare``, ``hold`` and ``partials`` hand over
     NF: int
     NM: int
@@ -117,6 +128,11 @@ class Sizes:
     def NS(self) -> int:
         """Soft rows of a sample."""
         return self.NC + self.NL
+
+    @property
+    def NV(self) -> int:
+        """Drives, measured disturbances and disturbance states."""
+        return self.NU + self.ND + self.NW
 
     @property
     def NZ(self) -> int:
@@ -148,6 +164,7 @@ def sizes_of(controller: ControllerParts, code: ModelCode, *, room: bool) -> Siz
         NC=controlled,
         NL=limited,
         NE=(controlled + limited) * entries,
+        NO=0 if model.affine is None else most * (controlled + limited),
         NK=code.n_k,
         NF=code.n_h,
         NM=code.n_m,
@@ -168,7 +185,25 @@ def _row_lengths(blocks: Sequence[int], n_u: int) -> int:
 
 def config_header(sizes: Sizes) -> str:
     """Return ``tg_config.h``: the sizes, and the struct of a design."""
-    names = ("NX", "NU", "ND", "NY", "NW", "NG", "NB", "NH", "NC", "NL", "NS", "NE", "NK", "NF", "NM")
+    names = (
+        "NX",
+        "NU",
+        "ND",
+        "NY",
+        "NW",
+        "NG",
+        "NB",
+        "NH",
+        "NC",
+        "NL",
+        "NS",
+        "NE",
+        "NV",
+        "NO",
+        "NK",
+        "NF",
+        "NM",
+    )
     lines = ["/* Sizes and numbers of one controller. */", "#ifndef TG_CONFIG_H", "#define TG_CONFIG_H", ""]
     lines += [f"#define TG_{name} {getattr(sizes, name)}" for name in names]
     lines += ["", "typedef struct {"]
@@ -218,6 +253,7 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
     model, design, optimiser = controller.model, controller.design, controller.optimiser
     observer, disturbance, loops = controller.observer, controller.disturbance, design.loops
     rest = observer.rest_in_room()
+    rows = [model.outputs.index(name) for name in (*design.controlled, *design.limits)]
     limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2)
     same_names = (
         (model, "sub dt span C spike coldest hottest"),
@@ -236,8 +272,8 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
         "n_l": len(design.limits),
         "n_loops": len(loops),
         "iteration_limit": ITERATION_LIMIT,
-        "controlled": [model.outputs.index(name) for name in design.controlled],
-        "limited": [model.outputs.index(name) for name in design.limits],
+        "controlled": rows[: len(design.controlled)],
+        "limited": rows[len(design.controlled) :],
         "loop_drive": [model.drives.index(loop.drive) for loop in loops],
         "loop_output": [design.controlled.index(loop.output) for loop in loops],
         "linear": model.affine is not None,
@@ -254,7 +290,39 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
         "rest_level": rest.by_level,
         "rest_d": rest.by_d,
         "P_rest": rest.P,
+        **_free_response(model, design, rows),
+        **_settled(model, disturbance),
     }
+
+
+def _free_response(model: PredictionModel, design: Design, rows: list[int]) -> dict[str, Any]:
+    """Return what a linear plant's outputs of these rows are in each sample where drives are 0, by the
+    state, by the disturbances, and besides."""
+    if model.affine is None:
+        return {"by_x": np.zeros((0, model.n_x)), "by_d": np.zeros((0, model.n_d)), "by_none": np.zeros(0)}
+    _, _, E, added = model.affine
+    by_x, by_rest, _ = model.response(design.blocks)
+    by_none = by_rest @ added + model.output(np.zeros(model.n_x))
+    parts = {"by_x": by_x, "by_d": by_rest @ E, "by_none": by_none}
+    return {
+        name: part[:, rows].reshape(len(part) * len(rows), *part.shape[2:]) for name, part in parts.items()
+    }
+
+
+def _settled(model: PredictionModel, disturbance: DisturbanceModel) -> dict[str, Any]:
+    """Return the outputs of a linear plant at rest by drives, disturbances and disturbance states."""
+    sides = model.n_u + model.n_d + disturbance.n_w
+    nothing = {"settles": False, "settled_by": np.zeros((model.n_y, sides)), "settled": np.zeros(model.n_y)}
+    if model.affine is None:
+        return nothing
+    A, B, E, added = model.affine
+    away, by_share = np.eye(model.n_x) - A, B * model.span
+    if not np.linalg.cond(away) < _INTEGRATES:
+        return nothing
+    by_w = by_share @ disturbance.on_drive + E @ disturbance.on_disturbance
+    by = model.C @ np.linalg.solve(away, np.column_stack([by_share, E, by_w, added]))
+    level = by[:, -1] + model.output(np.zeros(model.n_x))
+    return {"settles": True, "settled_by": by[:, :-1], "settled": level}
 
 
 def _padded(sizes: Sizes, name: str, values: Any) -> Array:

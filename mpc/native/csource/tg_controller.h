@@ -154,6 +154,10 @@ double tg_planned(const tg_controller *c, int k, int j); /* drive j in the k-th 
 void tg_guess(const tg_controller *c, const double *last, double *guess);
 void tg_keep_plan(tg_controller *c);
 void tg_advance_plan(tg_controller *c);
+/* Outputs of a plan, sample by sample, plus the output bias. */
+void tg_simulate(tg_controller *c, const double *start, const double *plan, const double *drive_bias, const double *d,
+                 const double *bias, double *y);
+/* Improve a plan; y_best has the outputs that count, of a plant that is not linear all. */
 int tg_optimise(tg_controller *c, const double *x, const double *last, const double *guess, const double *d,
                 const double *target, const double *side, const double *bias, const double *drive_bias);
 

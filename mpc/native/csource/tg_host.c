@@ -34,6 +34,19 @@ void tg_host_forget(tg_controller *c)
     c->has_plan = 0;
 }
 
+/* Whether each output has a target or a limit. */
+static int all_count(const tg_design *s)
+{
+    int counts[TG_NY] = {0}, sum = 0;
+    for (int r = 0; r < s->n_c; r++)
+        counts[s->controlled[r]] = 1;
+    for (int r = 0; r < s->n_l; r++)
+        counts[s->limited[r]] = 1;
+    for (int i = 0; i < TG_NY; i++)
+        sum += counts[i];
+    return sum == TG_NY;
+}
+
 int tg_host_optimise(tg_controller *c, const double *x, const double *last, const double *guess,
                      const double *d, const double *target, const double *side, const double *bias,
                      const double *drive_bias, const double *slew_s, double *plan, double *y, double *authority,
@@ -44,7 +57,10 @@ int tg_host_optimise(tg_controller *c, const double *x, const double *last, cons
     c->caution = slew_s[1];
     status = tg_optimise(c, x, last, guess, d, target, side, bias, drive_bias);
     memcpy(plan, c->best, (size_t)c->qp.n * sizeof(double));
-    memcpy(y, c->y_best, (size_t)c->design->N * TG_NY * sizeof(double));
+    if (status == TG_QP_SOLVED && c->design->linear && !all_count(c->design))
+        tg_simulate(c, x, plan, drive_bias, d, bias, y);
+    else
+        memcpy(y, c->y_best, (size_t)c->design->N * TG_NY * sizeof(double));
     memcpy(authority, c->authority, (size_t)c->qp.n * sizeof(double));
     *over = c->broken;
     *iterations = c->iterations;
