@@ -378,6 +378,8 @@ def _qp_parts(s: Sizes) -> list[tuple[Any, int]]:
     number, whole, small = ctypes.c_double, ctypes.c_int, ctypes.c_byte
     n, soft = s.NB * s.NU, s.NH * s.NS
     rows, w = 2 * n + soft, _whole(n)
+    lean = soft >= 4 * n
+    kept = 4 * n + 8 if lean else rows
     return [
         (whole, 4),
         *((number, count) for count in (n * w, w, 2 * rows)),
@@ -389,6 +391,9 @@ def _qp_parts(s: Sizes) -> list[tuple[Any, int]]:
         (number, w),
         (whole, 2 + 2 * rows),
         (small, 2 * rows),
-        *((number, count) for count in (rows, 2 * w + rows, rows * w, rows * (rows + 1) // 2, 3 * rows)),
+        *((number, count) for count in (rows, 2 * w + rows, rows * w, kept * (kept + 1) // 2, kept, rows)),
+        *((number, count) for count in ((n * w, n * w, kept * w) if lean else (1, 1, 1))),
+        (whole, kept + 2),
+        (number, 2 * rows),
         (small, rows),
     ]

@@ -61,6 +61,9 @@ def test_what_is_kept_of_a_linear_plant_is_what_would_be_made_anew(tank_maker):
         about |= {"lost": np.array([k % 7 == 3, False]), "caution": 4.0 if k % 5 == 4 else 1.0}
         guess = np.repeat(last[None], kept.optimiser.n_b, axis=0)
         sample = Sample(x, last, guess, room, **about)
+        if k % 9 == 8:  # nothing of a program that fails is kept
+            lost = sample._replace(x=np.full(x.size, np.nan))
+            assert c.optimiser.solve(lost).status == "not finite"
         one, three = kept.optimiser.solve(sample), c.optimiser.solve(sample)
         fresh.optimiser = type(kept.optimiser)(fresh.model, design)
         two = fresh.optimiser.solve(sample)
