@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import subprocess
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,6 +31,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import markdown
 from thermogrip.datasets.parallel import Progress
 from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.design.design import DAY
 from thermogrip.mpc.interface import STATUSES
 from thermogrip.mpc.native import design_struct
 from thermogrip.mpc.native.codegen import write_model
@@ -82,12 +83,8 @@ class Agreement:
 def export_controller(controller: Controller, folder: str | Path, *, arduino: bool = False) -> Export:
     """Write a controller as C99 into a folder, made where absent; files of the same names are replaced.
 
-    What the C has not (a tariff, ramps) is a UserError. With ``arduino`` the folder is a
-    library of the Arduino IDE, its example a loop to fill in.
+    With ``arduino`` the folder is a library of the Arduino IDE, its example a loop to fill in.
     """
-    if alone := controller.design.in_python_alone:
-        hint = "run it from Python, or tune without"
-        raise UserError(f"the exported C has no {', no '.join(alone)}", hint=hint)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     model = controller.model
@@ -204,12 +201,16 @@ class _State:
     d_now: Array
     wanted: Array
     late: bool  # the deadline passes before the optimiser can start
+    time_s: float = np.nan  # of the last sample, where there is a tariff
+    ramped: Array = field(default_factory=lambda: np.empty(0))  # where targets are that may only ramp
 
     def flat(self) -> Array:
         """Return the line that the C program reads."""
         has = [float(self.plan is not None)]
         before = (self.x, self.w, self.d, self.u, has, self.plan_text.ravel(), self.target, self.side)
-        return np.concatenate([*before, self.y, self.d_now, self.wanted, [float(self.late)]])
+        ramped = self.ramped if self.ramped.size else np.full(len(self.wanted), np.nan)
+        after = (self.y, self.d_now, self.wanted, [float(self.late), self.time_s], ramped)
+        return np.concatenate([*before, *after])
 
 
 class _Twin(Controller):
@@ -237,6 +238,10 @@ class _Twin(Controller):
         self._u = self._in_force = state.u.copy()
         self._plan = None if state.plan is None else state.plan.copy()
         self._target, self._side, self._fresh = state.target.copy(), state.side.copy(), False
+        self.times.reset()
+        self.times.begin(state.time_s)
+        if state.ramped.size:
+            self._ramped = state.ramped.copy()
 
 
 def _twin(controller: Controller) -> _Twin:
@@ -283,6 +288,8 @@ def _random_state(twin: _Twin, rng: np.random.Generator) -> _State:
         room + 0.1 * rng.normal(size=model.n_d),
         wanted,
         late,
+        rng.uniform(0.0, DAY) if design.tariff else np.nan,
+        target + far * rng.normal(size=n_c) if design.ramp_per_s and rng.random() < 0.9 else np.empty(0),
     )
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -60,6 +60,13 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "dear": (False, ("NL",), "of one beyond its limits"),
     "zone": (False, ("NC",), "half width about a target in which an output may be anywhere, 0: none"),
     "energy": (False, ("NU",), "of a sample at full drive"),
+    "ramp": (False, ("NC",), "fastest change of a target [its unit per s], 0: any"),
+    "tariff_from": (
+        False,
+        ("NT",),
+        "seconds of the day, and how often the price of energy counts from then on",
+    ),
+    "tariff": (False, ("NT",), ""),
     "overshoot": (False, (), "band beyond the target [degC]"),
     "patience_s": (False, (), "how long a plan is followed without a solve [s]"),
     "ambient": (False, (), "room where none is measured [degC]"),
@@ -119,6 +126,8 @@ class Sizes:
     NC: int
     NL: int
     NE: int  # numbers in the rows of the response
+    NR: int  # targets of all samples, where some may only ramp
+    NT: int  # changes of the price in a day
     NO: int  # soft rows of all samples, of a linear plant
     NK: int  # what the model's ``prepare``, ``hold`` and ``partials`` hand over
     NF: int
@@ -164,6 +173,8 @@ def sizes_of(controller: ControllerParts, code: ModelCode, *, room: bool) -> Siz
         NC=controlled,
         NL=limited,
         NE=(controlled + limited) * entries,
+        NR=most * controlled if design.ramp_per_s else 0,
+        NT=len(design.tariff),
         NO=0 if model.affine is None else most * (controlled + limited),
         NK=code.n_k,
         NF=code.n_h,
@@ -185,25 +196,7 @@ def _row_lengths(blocks: Sequence[int], n_u: int) -> int:
 
 def config_header(sizes: Sizes) -> str:
     """Return ``tg_config.h``: the sizes, and the struct of a design."""
-    names = (
-        "NX",
-        "NU",
-        "ND",
-        "NY",
-        "NW",
-        "NG",
-        "NB",
-        "NH",
-        "NC",
-        "NL",
-        "NS",
-        "NE",
-        "NV",
-        "NO",
-        "NK",
-        "NF",
-        "NM",
-    )
+    names = [*(entry.name for entry in fields(Sizes)), "NS", "NV"]
     lines = ["/* Sizes and numbers of one controller. */", "#ifndef TG_CONFIG_H", "#define TG_CONFIG_H", ""]
     lines += [f"#define TG_{name} {getattr(sizes, name)}" for name in names]
     lines += ["", "typedef struct {"]
@@ -272,6 +265,9 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
         "n_l": len(design.limits),
         "n_loops": len(loops),
         "iteration_limit": ITERATION_LIMIT,
+        "ramp": [design.ramp_per_s.get(name, 0.0) for name in design.controlled],
+        "tariff_from": [second for second, _ in design.tariff],
+        "tariff": [factor for _, factor in design.tariff],
         "controlled": rows[: len(design.controlled)],
         "limited": rows[len(design.controlled) :],
         "loop_drive": [model.drives.index(loop.drive) for loop in loops],
@@ -358,16 +354,17 @@ def _controller_parts(s: Sizes) -> list[tuple[Any, int]]:
         *((number, count) for count in (3, s.NU, s.NX, s.NG, s.NY, 9)),
         (whole, 2),
         *((number, count) for count in (s.ND, s.NY, s.NU, s.NU, s.NC, s.NC, s.NC, s.NH * s.NU, s.NC, 2)),
-        *((number, count) for count in (s.NY, s.NY, s.NX, s.NC, 1)),
+        *((number, count) for count in (s.NY, s.NY, s.NX, s.NC, 1, s.NB, s.NC)),
         *((number, count) for count in (s.NX, s.NU, 1)),
         (whole, 3),
         (relaxation, s.NC),
-        (whole, 6 + s.NY + s.NG + s.NC),
+        (whole, 7 + s.NY + s.NG + s.NC),
         *((number, count) for count in (n, s.NH * s.NY, n, 1)),
         (whole, 2),
         (number, 1),
         (whole, s.NC + 3),
         (qp, 1),
+        (number, max(1, s.NR)),
         *((number, count) for count in (max(1, s.NE), s.NH * s.NY, s.NH * s.NY, s.NH * some)),
         *((number, count) for count in (2 * s.NX * wide, s.NU * wide, max(1, s.ND) * wide)),
         *((number, count) for count in (s.NF, s.NM, z * z, z * z)),

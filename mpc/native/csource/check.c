@@ -1,7 +1,8 @@
 /* Read states, one a line, and answer what the controller does there: status, iterations, drives, plan.
  *
  * A line: x, w, measured disturbances, drives, whether there is a plan, the plan, target and side of before,
- * reading, its disturbances, target, whether time is up; numbers as %a or "nan".
+ * reading, its disturbances, target, whether time is up, the time of before, where targets ramp; numbers as %a or
+ * "nan".
  */
 #include "tg_design.h"
 
@@ -44,7 +45,8 @@ int main(void)
         if (!read_numbers(c->w, TG_NW) || !read_numbers(c->d, TG_ND) || !read_numbers(c->u, TG_NU) ||
             !read_numbers(&planned, 1) || !read_numbers(c->plan, tg_the_design.N * TG_NU) ||
             !read_numbers(c->target, TG_NC) || !read_numbers(c->side, TG_NC) || !read_numbers(y, TG_NY) ||
-            !read_numbers(d, TG_ND) || !read_numbers(target, TG_NC) || !read_numbers(&late, 1))
+            !read_numbers(d, TG_ND) || !read_numbers(target, TG_NC) || !read_numbers(&late, 1) ||
+            !read_numbers(&c->time_s, 1) || !read_numbers(c->ramped, TG_NC))
             return 1;
         for (int r = 0; r < TG_NG; r++) { /* it shows what the state has, and began there */
             c->shown[r] = tg_the_design.y0[tg_the_design.controlled[r]];

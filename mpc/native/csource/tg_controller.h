@@ -94,10 +94,13 @@ typedef struct {
     double seen[TG_NX];                 /* the state after the newest reading */
     double integral[TG_NC];             /* of the PI controller */
     double caution;                     /* how many times the weight of moves counts */
+    double dear[TG_NB];                 /* samples of each block, each as often as the price of energy counts then */
+    double ramped[TG_NC];               /* where targets are that may only ramp */
     double steady_x[TG_NX], steady_u[TG_NU], miss_sum; /* nearest to the targets, and evidence that they are missed */
     int has_steady, in, unreachable;                   /* samples in a row within reach again */
     tg_relaxation relaxation[TG_NC];
     int has_plan, fresh, solves, on_pi, status, advice, spikes[TG_NY];
+    int ramps; /* whether targets are on their way in path */
     int slow_for[TG_NG], lost[TG_NC]; /* samples in a row that an output was slower; those that cost nothing */
     /* what the last optimisation gave */
     double best[TG_Q_N], y_best[TG_NH * TG_NY], authority[TG_Q_N], broken;
@@ -106,6 +109,7 @@ typedef struct {
     int kept_lost[TG_NC], has_gains, laid_out, has_jacobian;
     /* room to work in */
     tg_qp qp;
+    double path[TG_SOME(TG_NR)]; /* in place of goals, where targets may only ramp */
     double G[TG_SOME(TG_NE)]; /* the response: the soft rows of the program, sample by sample */
     double y_guess[TG_NH * TG_NY], y_try[TG_NH * TG_NY];
     double free[TG_NH * TG_SOME(TG_NS)];
@@ -154,6 +158,7 @@ double tg_planned(const tg_controller *c, int k, int j); /* drive j in the k-th 
 void tg_guess(const tg_controller *c, const double *last, double *guess);
 void tg_keep_plan(tg_controller *c);
 void tg_advance_plan(tg_controller *c);
+void tg_set_prices(tg_controller *c); /* of the samples ahead of its time */
 /* Outputs of a plan, sample by sample, plus the output bias. */
 void tg_simulate(tg_controller *c, const double *start, const double *plan, const double *drive_bias, const double *d,
                  const double *bias, double *y);

@@ -55,6 +55,8 @@ int tg_host_optimise(tg_controller *c, const double *x, const double *last, cons
     int status;
     c->slew_s = slew_s[0];
     c->caution = slew_s[1];
+    c->ramps = 0; /* goals ramp already */
+    memcpy(c->dear, slew_s + 2, (size_t)c->design->n_b * sizeof(double));
     status = tg_optimise(c, x, last, guess, d, target, side, bias, drive_bias);
     memcpy(plan, c->best, (size_t)c->qp.n * sizeof(double));
     if (status == TG_QP_SOLVED && c->design->linear && !all_count(c->design))
@@ -77,6 +79,7 @@ int tg_host_replan(tg_controller *c, const double *x, const double *last, const 
     tg_advance_plan(c);
     c->slew_s = 0.0;
     c->caution = 1.0;
+    tg_set_prices(c);
     tg_guess(c, last, guess);
     status = tg_optimise(c, x, last, guess, d, target, side, bias, drive_bias);
     if (status == TG_QP_SOLVED)
@@ -201,6 +204,7 @@ void tg_host_loop(tg_controller *c, const tg_design *design, tg_truth *plant, in
             memcpy(c->P, observed + TG_Z, sizeof c->P);
             memcpy(c->found_offset, observed + TG_Z + TG_Z * TG_Z, sizeof c->found_offset);
             memcpy(c->start, observed + TG_Z + TG_Z * TG_Z + TG_NY, sizeof c->start);
+            c->time_s = -design->dt; /* the first reading is at 0 */
         }
         move = tg_step(c, NAN, shown, shown + TG_NY, NULL, target + t * design->n_c);
         memcpy(drive + t * TG_NU, move.drive, sizeof move.drive);

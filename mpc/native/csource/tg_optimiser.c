@@ -191,6 +191,10 @@ static void find_authority(tg_controller *c)
 /* The target of controlled output r in sample k of the prediction. */
 static double goal(const tg_controller *c, const double *target, int k, int r)
 {
+#if TG_NR > 0
+    if (c->ramps)
+        return c->path[k * c->design->n_c + r];
+#endif
     return c->goals ? c->goals[k * c->design->n_c + r] : target[r];
 }
 
@@ -202,7 +206,7 @@ static double merit(const tg_controller *c, const double *plan, const double *y,
     double cost = 0.0, over = 0.0;
     for (int b = 0; b < s->n_b; b++)
         for (int j = 0; j < TG_NU; j++) {
-            double value = plan[b * TG_NU + j], energy = s->energy[j] * s->blocks[b];
+            double value = plan[b * TG_NU + j], energy = s->energy[j] * c->dear[b];
             double step = (value - (b ? plan[(b - 1) * TG_NU + j] : last[j])) / s->span[j];
             cost += c->caution * s->move * step * step;
             value /= s->span[j];
@@ -288,7 +292,7 @@ static void set_linear_cost(tg_controller *c, const double *target, const double
     tg_qp *q = &c->qp;
     memset(q->f, 0, sizeof q->f);
     for (int i = 0; i < q->n; i++)
-        q->f[i] = s->energy[i % TG_NU] * s->blocks[i / TG_NU];
+        q->f[i] = s->energy[i % TG_NU] * c->dear[i / TG_NU];
     for (int k = 0; k < s->N; k++)
         for (int r = 0; r < s->n_c; r++) {
             const double *g = response(c, k, r);
@@ -499,7 +503,7 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
     memcpy(guess, start, (size_t)q->n * sizeof(double));
     park(c, last, guess);
     for (int r = 0; r < s->n_c; r++)
-        side[r] = c->lost[r] || c->goals ? 0.0 : from[r]; /* nothing is beyond a target that moves */
+        side[r] = c->lost[r] || c->goals || c->ramps ? 0.0 : from[r]; /* nothing is beyond a target that moves */
     if (!s->linear || !c->has_gains) {
         linearise(c, x, guess, drive_bias, d, bias);
         find_authority(c);

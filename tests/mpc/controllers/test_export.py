@@ -159,6 +159,17 @@ def test_a_wrong_number_in_the_export_is_found(controller, tmp_path):
         ),
         (kit, {"zones": {"t1": 1.5, "t2": 0.5}, "energy_price": {"q1": 0.5, "q2": 2.0}}, False),
         (heater, {"zones": {"t": 1.0}, "energy_price": {"q": 0.3}, "limits": {"t": (22.0, 40.0)}}, True),
+        (
+            kit,
+            {
+                "zones": {"t1": 1.5, "t2": 0.5},
+                "energy_price": {"q1": 0.5, "q2": 2.0},
+                "tariff": ((3600.0, 1.0), (43200.0, 4.0), (43300.0, 2.0)),
+                "ramp_per_s": {"t2": 0.02},
+            },
+            True,
+        ),
+        (heater, {"ramp_per_s": {"t": 0.1}, "move_delay": 1, "limits": {"t": (22.0, 40.0)}}, False),
         (kit, {"blocks": (1, 2, 3)}, True),  # ranges, slews that end on them, a band that is always broken
     ],
 )
