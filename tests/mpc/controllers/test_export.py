@@ -164,7 +164,7 @@ def test_a_wrong_number_in_the_export_is_found(controller, tmp_path):
             {
                 "zones": {"t1": 1.5, "t2": 0.5},
                 "energy_price": {"q1": 0.5, "q2": 2.0},
-                "tariff": ((3600.0, 1.0), (43200.0, 4.0), (43300.0, 2.0)),
+                "tariff": ((36000.0, 1.0), (43200.0, 4.0), (64800.0, 2.0)),
                 "ramp_per_s": {"t2": 0.02},
             },
             True,
