@@ -208,11 +208,11 @@ def config_header(sizes: Sizes) -> str:
     return "\n".join([*lines, "} tg_design;", "", "#endif", ""])
 
 
-def structure_of(sizes: Sizes) -> type[ctypes.Structure]:
-    """Return ``tg_design`` as ctypes sees it."""
+def structure_of(sizes: Sizes, number: Any = ctypes.c_double) -> type[ctypes.Structure]:
+    """Return ``tg_design`` as ctypes sees it, of numbers of this kind."""
     fields = []
     for name, (whole, shape, _) in _FIELDS.items():
-        kind = ctypes.c_int if whole else ctypes.c_double
+        kind = ctypes.c_int if whole else number
         fields.append((name, kind * max(1, int(np.prod(sizes.shape(name)))) if shape else kind))
     return type("tg_design", (ctypes.Structure,), {"_fields_": fields})
 
@@ -329,29 +329,33 @@ def _padded(sizes: Sizes, name: str, values: Any) -> Array:
     return full
 
 
-def bytes_of(s: Sizes) -> tuple[int, int]:
+def bytes_of(s: Sizes, *, single: bool = False) -> tuple[int, int]:
     """Return what ``sizeof`` says of a controller and of a design."""
-    controller = type("tg_controller", (ctypes.Structure,), {"_fields_": _laid_out(_controller_parts(s))})
-    return ctypes.sizeof(controller), ctypes.sizeof(structure_of(s))
+    number = ctypes.c_float if single else ctypes.c_double
+    parts = {"_fields_": _laid_out(_controller_parts(s, number))}
+    controller = type("tg_controller", (ctypes.Structure,), parts)
+    return ctypes.sizeof(controller), ctypes.sizeof(structure_of(s, number))
 
 
 def _laid_out(parts: list[tuple[Any, int]]) -> list[tuple[str, Any]]:
     return [(f"part{at}", kind * max(1, count)) for at, (kind, count) in enumerate(parts)]
 
 
-def _controller_parts(s: Sizes) -> list[tuple[Any, int]]:
+def _controller_parts(s: Sizes, number: Any) -> list[tuple[Any, int]]:
     """Return kind and length of each part of ``tg_controller``, in order."""
-    number, whole = ctypes.c_double, ctypes.c_int
+    whole = ctypes.c_int
     n, z, some = s.NB * s.NU, s.NZ, max(1, s.NS)
     wide = _whole(max(s.NX + s.NU + s.ND, n))
     still = [*((number, count) for count in (s.NU, s.NW, _BINS, 1)), (whole, 3)]
     relaxation = type("tg_relaxation", (ctypes.Structure,), {"_fields_": _laid_out(still)})
-    qp = type("tg_qp", (ctypes.Structure,), {"_fields_": _laid_out(_qp_parts(s))})
+    qp = type("tg_qp", (ctypes.Structure,), {"_fields_": _laid_out(_qp_parts(s, number))})
     return [
         (ctypes.c_void_p, 4),
         *((number, count) for count in (s.NX, s.NW, s.NG, s.NG, s.NG, s.NG, z * z, s.NY, s.NY)),
         (whole, z),
-        *((number, count) for count in (3, s.NU, s.NX, s.NG, s.NY, 9)),
+        *((number, count) for count in (3, s.NU, s.NX, s.NG, s.NY)),
+        (ctypes.c_double, 2),
+        (number, 7),
         (whole, 2),
         *((number, count) for count in (s.ND, s.NY, s.NU, s.NU, s.NC, s.NC, s.NC, s.NH * s.NU, s.NC, 2)),
         *((number, count) for count in (s.NY, s.NY, s.NX, s.NC, 1, s.NB, s.NC)),
@@ -371,8 +375,8 @@ def _controller_parts(s: Sizes) -> list[tuple[Any, int]]:
     ]
 
 
-def _qp_parts(s: Sizes) -> list[tuple[Any, int]]:
-    number, whole, small = ctypes.c_double, ctypes.c_int, ctypes.c_byte
+def _qp_parts(s: Sizes, number: Any) -> list[tuple[Any, int]]:
+    whole, small = ctypes.c_int, ctypes.c_byte
     n, soft = s.NB * s.NU, s.NH * s.NS
     rows, w = 2 * n + soft, _whole(n)
     lean = soft >= 4 * n

@@ -85,7 +85,7 @@ tune: PLANT --out --spec --report --network --seed=0>0 --workers=1>1 --cluster -
 retune: DIR LOG... --out=retuned.json --controller --spec --report --network --seed=0>0 --workers=1>1
   --json=False
 review: CONTROLLER --report --network --seed=0>0 --json=False
-export: CONTROLLER --out --check=False --states=3000>1 --arduino=False --network
+export: CONTROLLER --out --check=False --states=3000>1 --arduino=False --single=False --network
   --seed=0>0 --json=False
 run: CONTROLLER --target --out --port --protocol --speed=1.0>0.01 --twin --draw=0>0 --from --hold=0.0>0
   --object --material --grasp-time=10.0>0.5 --stop-early --settle-timeout=900.0>1 --guard --learn

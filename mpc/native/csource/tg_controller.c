@@ -104,9 +104,10 @@ void tg_reset(tg_controller *c, const tg_design *design, const double *y, const 
 /* Note a call at this time: the seconds that passed, each once, whether a move is due, and for how many seconds
  * the slew limit counts.  A stale reading gives no elapsed time; such a call is taken to be as
  * far from the last as calls usually are.  A clock that went back by far and runs on from there was restarted. */
-static int is_due(tg_controller *c, double now)
+static int is_due(tg_controller *c, tg_time now)
 {
-    double before = c->time_s, dt = c->design->dt, passed;
+    const tg_time before = c->time_s;
+    double dt = c->design->dt, passed;
     c->passed_s = 0.0;
     c->stale = 0;
     if (!isfinite(now)) {
@@ -116,10 +117,10 @@ static int is_due(tg_controller *c, double now)
         c->passed_s = dt;
         c->time_s = now;
     } else if (now > before) {
-        c->passed_s = now - before;
+        c->passed_s = (double)(now - before);
         c->time_s = now;
     } else if (before - now > RESTART_S && now > c->back_s) {
-        c->passed_s = now - c->back_s + c->interval_s;
+        c->passed_s = (double)(now - c->back_s) + c->interval_s;
         c->time_s = now;
     } else
         c->stale = 1;
@@ -357,7 +358,7 @@ void tg_set_prices(tg_controller *c)
             continue;
         c->dear[b] = 0.0;
         for (int left = s->blocks[b]; left > 0; left--, k++) {
-            double second = fmod(c->time_s + s->dt * k, DAY), factor = s->tariff[TG_NT - 1]; /* of the day before */
+            double second = (double)fmod(c->time_s + s->dt * k, DAY), factor = s->tariff[TG_NT - 1]; /* of the day before */
             if (second < 0.0)
                 second += DAY;
             for (int i = 0; i < TG_NT && s->tariff_from[i] <= second; i++)
@@ -837,7 +838,7 @@ static void set_pump(tg_move *move)
         move->pump = move->pump || move->drive[j] != 0.0;
 }
 
-tg_move tg_step(tg_controller *c, double time_s, const double *y, const double *d, const double *applied,
+tg_move tg_step(tg_controller *c, tg_time time_s, const double *y, const double *d, const double *applied,
                 const double *target)
 {
     tg_move move;

@@ -62,6 +62,8 @@ typedef struct {
     double over;    /* by how much a limit will be broken, a target missed [degC], an output late [s]: where advised */
 } tg_move;
 
+typedef double tg_time; /* seconds of any clock */
+
 #define TG_BINS 12
 
 /* Means of a reading since the drives stand still, and drives and biases then. */
@@ -85,7 +87,8 @@ typedef struct {
     double dose[TG_NU], ahead[TG_NX], shown_ahead[TG_NG]; /* the drives summed over those seconds, the state there */
     double bent[TG_NY];                /* how far an output may be from the straight line between two samples */
     /* when it was called */
-    double time_s, back_s, interval_s, passed_s, since_s, assumed_s, spent_s, waited_s, slew_s;
+    tg_time time_s, back_s;
+    double interval_s, passed_s, since_s, assumed_s, spent_s, waited_s, slew_s;
     int repeats, stale;
     /* loop */
     double d[TG_SOME(TG_ND)], y[TG_NY], u[TG_NU], in_force[TG_NU], target[TG_NC], side[TG_NC], aim[TG_NC];
@@ -129,7 +132,7 @@ void tg_reset(tg_controller *c, const tg_design *design, const double *y, const 
  * time_s: of the reading, or NAN; then one sample time has passed.  applied: what the drives really did since
  * the last step, or NULL.  Called more often than its sample time it holds its move until the call that is
  * nearest to it; called more seldom it moves each time. */
-tg_move tg_step(tg_controller *c, double time_s, const double *y, const double *d, const double *applied,
+tg_move tg_step(tg_controller *c, tg_time time_s, const double *y, const double *d, const double *applied,
                 const double *target);
 
 const char *tg_status_text(int status);

@@ -19,7 +19,15 @@
 #define PRIOR_LAG 1.5   /* samples: standard deviation of a lag at the start */
 #define LONGEST_LAG 6.0 /* samples */
 #define SAME 1e-6 /* of a sample: what is nearer than this is the same time */
+#ifdef TG_SINGLE
+#define ROUNDED 6e-8
+#define LEAST_SHARE 1e-6
+#define LEAST_TRACE 1e-30
+#else
 #define ROUNDED 1e-16 /* of the length of a row, that its sum is rounded by at least */
+#define LEAST_SHARE 1e-12 /* of the trace, added to a curvature that may be 0 */
+#define LEAST_TRACE 1e-300
+#endif
 #define WEAK 0.05 /* of its gain at rest, below which a drive's bias is not learnt */
 
 static double output(const tg_controller *c, int i, const double *x)
@@ -489,7 +497,7 @@ static void squares_in_box(int n, const double *weight, const double *G, const d
             double slope = f[j], best;
             for (int k = 0; k < TG_NU; k++)
                 slope -= H[j * TG_NU + k] * z[k];
-            best = z[j] + slope / (H[j * TG_NU + j] + 1e-12 * fmax(trace, 1e-300));
+            best = z[j] + slope / (H[j * TG_NU + j] + LEAST_SHARE * fmax(trace, LEAST_TRACE));
             best = fmin(fmax(best, low[j]), high[j]);
             moved = fmax(moved, fabs(best - z[j]));
             z[j] = best;

@@ -24,7 +24,11 @@
 #define SAFE 0.75  /* of the way to the optimum, where the range runs on beyond it */
 #define LOOK_AROUND 5
 #define BARELY 1.02
+#ifdef TG_SINGLE
+#define LITTLE 1e-5
+#else
 #define LITTLE 1e-7 /* of its range, that a parked drive may be off in the program */
+#endif
 #define NONE 1e30
 
 static int row_of(const tg_design *s, int r) { return r < s->n_c ? s->controlled[r] : s->limited[r - s->n_c]; }

@@ -19,7 +19,7 @@
  * Rows may depend on one another: a range and a sum of slews that ends on it.  Every K_ii therefore includes a
  * share of 1e-11 of itself, which keeps the factor regular and the dual strictly concave; multipliers that
  * contradict each other diverge until one reaches its bound. The effect of that share on x is removed at
- * the end by one step of refinement with K itself. Hard rows that cannot be fulfilled together show there.
+ * the end by a step of refinement with K itself (in single numbers, whose share is 3e-7, by as many as it takes). Hard rows that cannot be fulfilled together show there.
  *
  * Soft rows may be broken by the dozen, the others are hardly more than there are unknowns. Where soft rows are many
  * (TG_Q_LEAN), the broken ones, b, are eliminated from K z = r, D their diagonal:
@@ -33,11 +33,25 @@
 #include <string.h>
 
 #define FAR 1e15
+#ifdef TG_SINGLE
+#define LARGEST 3.4e38
+#define TOLERANCE 1e-5
+#define REGULAR 3e-7
+#define CONTRADICTION 3e-2
+#define SHORT 1e-3
+#define CONVEX 1e-6
+#define REACHED 1e-6
+#define REFINEMENTS 8
+#else
 #define LARGEST 1.7e308 /* number that is finite */
 #define TOLERANCE 1e-10 /* of a row, in units of its own length */
 #define REGULAR 1e-11   /* share of K_ii that keeps its factor regular */
 #define CONTRADICTION 1e-6 /* by which a hard row may stay broken, in units of its length */
 #define SHORT 1e-5      /* a soft row shorter than this cannot be kept by any plan */
+#define CONVEX 1e-14    /* of H_ii, that a pivot is at least */
+#define REACHED 1e-13   /* of the largest multiplier: what ends by less beyond its bound is on it */
+#define REFINEMENTS 1
+#endif
 
 static double *fit_row(tg_qp *q, int i) { return q->fit + (size_t)i * (size_t)(i + 1) / 2; }
 
@@ -147,7 +161,7 @@ static int factorise(tg_qp *q)
         }
         for (; k < i; k++) /* below its diagonal row k is 0 */
             tg_add_row(row + from, -q->H[(size_t)k * TG_Q_W + (size_t)i], q->H + (size_t)k * TG_Q_W + from, end - from);
-        if (!(row[i] > 1e-14 * q->weight[i] * q->weight[i]))
+        if (!(row[i] > CONVEX * q->weight[i] * q->weight[i]))
             return 0;
         inverse = 1.0 / sqrt(row[i]);
         for (int j = from; j < i; j++)
@@ -433,7 +447,7 @@ static void drop(tg_qp *q, int r)
 }
 
 static double least(const tg_qp *q, int i) { return q->state[i] == 2 ? price_of(q, q->row[i]) : 0.0; }
-static double most(const tg_qp *q, int i) { return q->state[i] == 1 ? price_of(q, q->row[i]) : HUGE_VAL; }
+static double most(const tg_qp *q, int i) { return q->state[i] == 1 ? price_of(q, q->row[i]) : INFINITY; }
 
 /* Take a row into the set. */
 static void put(tg_qp *q, int row, int side, int state, double multiplier)
@@ -533,7 +547,7 @@ static int go(tg_qp *q, int *upward)
     for (int i = 0; i < q->n_work; i++)
         scale = fmax(scale, fabs(q->wanted[i]));
     for (int i = 0; i < q->n_work; i++) {
-        double low = least(q, i), high = most(q, i), slack = 1e-13 * scale;
+        double low = least(q, i), high = most(q, i), slack = REACHED * scale;
         double there = q->wanted[i], here = q->multiplier[i], part = 1.0;
         if (there < low - slack)
             part = here > low ? (here - low) / (here - there) : 0.0;
@@ -665,7 +679,10 @@ int tg_qp_solve(tg_qp *q)
         }
         make_x(q);
         if (!worst(q, &row, &side)) {
-            if (!refine(q))
+            int held = 0;
+            for (int turn = 0; turn < REFINEMENTS && !held; turn++)
+                held = refine(q);
+            if (!held)
                 return failed(q, TG_QP_INFEASIBLE);
             return all_finite(q->x, q->n) ? TG_QP_SOLVED : failed(q, TG_QP_NOT_FINITE);
         }

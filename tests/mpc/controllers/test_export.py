@@ -22,8 +22,11 @@ from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.interface import STATUSES, Move
 from thermogrip.mpc.native.codegen import write_model
 from thermogrip.mpc.native.runtime import compiler
+from thermogrip.mpc.native.single_precision import in_single
 from thermogrip.sysid.models.network import load_network
 
+#: The word, outside of comments.
+DOUBLE = r"(?s)/\*.*?\*/|\b(double)\b"
 needs_gcc = pytest.mark.skipif(compiler() is None or shutil.which("make") is None, reason="no gcc here")
 
 
@@ -182,6 +185,45 @@ def test_controllers_of_any_size_build_and_do_the_same(make, changes, sanitize, 
     assert found.passed
 
 
+@needs_gcc
+@pytest.mark.parametrize(
+    ("make", "changes"),
+    [
+        (heater, {"ramp_per_s": {"t": 0.1}}),
+        (kit, {"limits": {"t1": (20.0, 42.0)}}),  # its factor is of the rows that hold, the broken ones apart
+    ],
+)
+def test_in_single_numbers_the_same_states_are_solved(make, changes, tmp_path):
+    """Statuses are the same, and drives to 5 % of their range, in half the memory; no double is left."""
+    controller = make(**changes)
+    double = export_controller(controller, tmp_path / "double")
+    single = export_controller(controller, tmp_path / "single", single=True)
+    found = check_export(single, controller, states=150)
+    assert found.passed
+    assert found.others == 0
+    assert 1e-9 < found.difference < 0.05
+    assert single.ram < 0.55 * double.ram
+    sources = [path.read_text() for path in (tmp_path / "single").glob("tg_*.[ch]")]
+    assert [word for text in sources for word in re.findall(DOUBLE, text) if word] == ["double"]  # seconds
+    example = subprocess.run([tmp_path / "single" / "example"], capture_output=True, text=True, check=True)
+    last = example.stdout.splitlines()[-1].split()
+    assert abs(float(last[3]) - float(last[5])) < 0.05
+
+
+def test_a_hard_limit_is_not_exported_in_single_numbers(tmp_path):
+    controller = kit(limits={"t1": (20.0, 42.0)}, hard=("t1",))
+    with pytest.raises(UserError, match="a hard limit is a thousand times as dear") as refused:
+        export_controller(controller, tmp_path / "c", single=True)
+    assert "\n" not in str(refused.value)
+    assert not (tmp_path / "c").exists()
+
+
+def test_constants_become_single_and_texts_stay():
+    text = '/* 1.5 double */ double a = 1.5e-3 + x[2] * 1e-50; char *s = "1.5 double"; int n = 12; // 2.0'
+    wanted = '/* 1.5 double */ float a = 1.5e-3f + x[2] * 0.0f; char *s = "1.5 double"; int n = 12; // 2.0'
+    assert in_single({"a.c": text, "README.md": text}) == {"a.c": wanted, "README.md": text}
+
+
 @pytest.mark.skipif(os.name == "nt", reason="links need a privilege there")
 def test_an_export_is_not_written_through_a_link(tmp_path):
     (tmp_path / "elsewhere").write_text("somebody's")
@@ -235,6 +277,30 @@ def test_an_export_passes_where_drives_statuses_and_iterations_are_the_same(
     difference: float, status: int, iterations: int, passed: bool
 ):
     assert Agreement(7, difference, 3, status, iterations, 1, 1, 1).passed == passed
+
+
+@pytest.mark.parametrize(
+    ("difference", "others", "passed"), [(0.02, 2, True), (0.02, 3, False), (0.06, 0, False)]
+)
+def test_single_numbers_pass_with_iterations_of_their_own_and_hardly_another_status(
+    difference: float, others: int, passed: bool
+):
+    found = Agreement(2000, difference, 3, 2000, 7, 1, 1, 1, 0.05, single=True, others=others)
+    assert found.passed == passed
+
+
+def test_states_that_single_numbers_answer_otherwise_are_counted_and_not_in_the_difference(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    answers = iter([(0.01, True, True, False), (0.7, True, False, False), (0.2, True, True, True)])
+    monkeypatch.setattr(exports, "compiler", lambda: "gcc")
+    monkeypatch.setattr(exports, "_make", lambda folder, *targets: None)
+    monkeypatch.setattr(exports, "_answers", lambda export, given, sanitize: ["0 1"] * len(given))
+    monkeypatch.setattr(exports, "_compare", lambda twin, state, answer: next(answers))
+    monkeypatch.setattr(exports, "_footprint", lambda folder: (7000, 300))
+    made = exports.Export(tmp_path, (), 100, 50, single=True)
+    found = exports.check_export(made, heater(), states=3)
+    assert (found.difference, found.others, found.same_status, found.passed) == (0.01, 2, 2, False)
 
 
 def test_sanitizers_must_not_change_an_answer():
