@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import subprocess
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,10 +31,12 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import markdown
 from thermogrip.datasets.parallel import Progress
 from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.design.design import DAY
 from thermogrip.mpc.interface import STATUSES
 from thermogrip.mpc.native import design_struct
 from thermogrip.mpc.native.codegen import write_model
 from thermogrip.mpc.native.runtime import SOURCES, c_source, compiler
+from thermogrip.mpc.native.single_precision import in_single
 from thermogrip.mpc.optimiser.active_set import ActiveSetQP
 
 if TYPE_CHECKING:
@@ -44,6 +46,9 @@ _COPIED = (*SOURCES, "tg_design.h", "Makefile", "example.c", "check.c")
 # of a drive's range; where dozens of soft rows are broken, a plan is a small difference of large multipliers,
 # and C as well as Python is up to 1e-10 off the exact one; with hard limits, a thousand times as dear, 3e-9
 _TOLERANCE, _HARD_TOLERANCE = 1e-9, 1e-8
+# in numbers of four bytes, and of how many states one may be answered otherwise: where rows depend on others
+# (ranges, slews that end on them), a float may not tell which of them hold, and the last plan goes on
+_SINGLE_TOLERANCE, _SINGLE_STATES = 0.05, 1000
 _RESTS = 100  # from which random states depart
 
 
@@ -55,6 +60,7 @@ class Export:
     files: tuple[str, ...]
     ram: int  # bytes of one controller, everything it needs at run time but the stack
     constants: int  # bytes of the design
+    single: bool = False  # whether its numbers have four bytes
 
 
 @dataclass(frozen=True)
@@ -71,23 +77,29 @@ class Agreement:
     ram: int
     stack: int
     tolerance: float = _TOLERANCE  # of the difference
+    single: bool = False  # in numbers of four bytes, whose iterations are others
+    others: int = 0  # states that these answer otherwise; they are not in the difference
 
     @property
     def passed(self) -> bool:
         """Whether C and Python do the same."""
         exact = self.same_status == self.same_iterations == self.states
+        if self.single:
+            exact = _SINGLE_STATES * self.others <= self.states
         return exact and self.difference <= self.tolerance
 
 
-def export_controller(controller: Controller, folder: str | Path, *, arduino: bool = False) -> Export:
+def export_controller(
+    controller: Controller, folder: str | Path, *, arduino: bool = False, single: bool = False
+) -> Export:
     """Write a controller as C99 into a folder, made where absent; files of the same names are replaced.
 
-    What the C has not (a tariff, ramps) is a UserError. With ``arduino`` the folder is a
-    library of the Arduino IDE, its example a loop to fill in.
+    With ``arduino`` the folder is a library of the Arduino IDE, its example a loop to fill in; with
+    ``single`` numbers have four bytes.
     """
-    if alone := controller.design.in_python_alone:
-        hint = "run it from Python, or tune without"
-        raise UserError(f"the exported C has no {', no '.join(alone)}", hint=hint)
+    if single and controller.design.hard:
+        problem = "a hard limit is a thousand times as dear as a soft one, which single numbers cannot hold"
+        raise UserError(problem, hint="export it without, or tune with soft limits")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     model = controller.model
@@ -101,14 +113,16 @@ def export_controller(controller: Controller, folder: str | Path, *, arduino: bo
         + design_struct.initialiser(sizes, numbers)
         + "\n};\n",
     }
-    ram, constants = design_struct.bytes_of(sizes)
+    ram, constants = design_struct.bytes_of(sizes, single=single)
     files["README.md"] = _readme(controller, sizes, ram, constants)
     if arduino:
         files = _as_library(controller, files)
+    if single:
+        files = in_single(files)
     for name, content in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         write_atomic(folder / name, content)
-    return Export(folder, tuple(sorted(files)), ram, constants)
+    return Export(folder, tuple(sorted(files)), ram, constants, single)
 
 
 def _as_library(controller: Controller, files: dict[str, str]) -> dict[str, str]:
@@ -164,16 +178,21 @@ def check_export(
             progress(at / states, "states")
     flash, stack = _footprint(export.folder)
     difference, free, status, iterations = found.T
+    alike = np.ones(states, dtype=bool)
+    if export.single:
+        alike = (status > 0) & (difference <= _SINGLE_TOLERANCE)
     return Agreement(
         states,
-        float(difference.max()),
+        float(np.max(difference, where=alike, initial=0.0)),
         int(np.sum(free)),
         int(np.sum(status)),
         int(np.sum(iterations)),
         flash,
         export.ram,
         stack,
-        _HARD_TOLERANCE if controller.design.hard else _TOLERANCE,
+        _SINGLE_TOLERANCE if export.single else _HARD_TOLERANCE if controller.design.hard else _TOLERANCE,
+        export.single,
+        int(np.sum(~alike)),
     )
 
 
@@ -204,12 +223,16 @@ class _State:
     d_now: Array
     wanted: Array
     late: bool  # the deadline passes before the optimiser can start
+    time_s: float = np.nan  # of the last sample, where there is a tariff
+    ramped: Array = field(default_factory=lambda: np.empty(0))  # where targets are that may only ramp
 
     def flat(self) -> Array:
         """Return the line that the C program reads."""
         has = [float(self.plan is not None)]
         before = (self.x, self.w, self.d, self.u, has, self.plan_text.ravel(), self.target, self.side)
-        return np.concatenate([*before, self.y, self.d_now, self.wanted, [float(self.late)]])
+        ramped = self.ramped if self.ramped.size else np.full(len(self.wanted), np.nan)
+        after = (self.y, self.d_now, self.wanted, [float(self.late), self.time_s], ramped)
+        return np.concatenate([*before, *after])
 
 
 class _Twin(Controller):
@@ -237,6 +260,10 @@ class _Twin(Controller):
         self._u = self._in_force = state.u.copy()
         self._plan = None if state.plan is None else state.plan.copy()
         self._target, self._side, self._fresh = state.target.copy(), state.side.copy(), False
+        self.times.reset()
+        self.times.begin(state.time_s)
+        if state.ramped.size:
+            self._ramped = state.ramped.copy()
 
 
 def _twin(controller: Controller) -> _Twin:
@@ -283,6 +310,8 @@ def _random_state(twin: _Twin, rng: np.random.Generator) -> _State:
         room + 0.1 * rng.normal(size=model.n_d),
         wanted,
         late,
+        rng.uniform(0.0, DAY) if design.tariff else np.nan,
+        target + far * rng.normal(size=n_c) if design.ramp_per_s and rng.random() < 0.9 else np.empty(0),
     )
 
 

@@ -121,7 +121,7 @@ class Controller(Shown, SampledController):
         self.disturbance = self.observer.disturbance
         self.optimiser = Optimiser(self.model, design)
         self.c: CompiledController | None = None
-        if compiled and not design.in_python_alone:
+        if compiled:
             self._compile()
         self.pi = PIController.of(plant, design, tuple(replace(p, feedforward=0.0) for p in design.loops))
         self.monitor = ReadingMonitor(self.model.n_y, len(self.observer.lagged), spike=self.model.spike)

@@ -301,11 +301,6 @@ class Design:
     patience_s: float = 10.0
 
     @property
-    def in_python_alone(self) -> tuple[str, ...]:
-        """What of it the C has not."""
-        return tuple(name for name in ("tariff", "ramp_per_s") if getattr(self, name))
-
-    @property
     def horizon_s(self) -> float:
         """Length of the prediction [s]."""
         return self.dt * sum(self.blocks)

@@ -42,6 +42,10 @@ class CallTimes:
         self.seconds = self.since = self._assumed = self._spent = 0.0
         self.stale = False
 
+    def begin(self, now: float) -> None:
+        """Take a call before the first one to have been at this time [s]."""
+        self._time = now
+
     def call(self, reading: Mapping[str, float]) -> None:
         """Note a call with this reading."""
         now, before = number(reading, "time_s"), self._time

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,10 +16,14 @@ import numpy as np
 from thermogrip.datasets.arrays import Array
 
 if TYPE_CHECKING:
+    from thermogrip.mpc.design.design import Design
+    from thermogrip.mpc.estimator.observer import DisturbanceModel
     from thermogrip.mpc.native.codegen import ModelCode
     from thermogrip.mpc.optimiser.rti import ControllerParts
+    from thermogrip.mpc.plant.prediction import PredictionModel
 
 ITERATION_LIMIT = 500
+_INTEGRATES = 1e10  # condition of I - A, from which on a plant has no steady state worth the name
 _BINS = 12  # TG_BINS of tg_controller.h
 
 #: name -> (whole number?, shape in names of sizes, comment)
@@ -56,6 +60,13 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "dear": (False, ("NL",), "of one beyond its limits"),
     "zone": (False, ("NC",), "half width about a target in which an output may be anywhere, 0: none"),
     "energy": (False, ("NU",), "of a sample at full drive"),
+    "ramp": (False, ("NC",), "fastest change of a target [its unit per s], 0: any"),
+    "tariff_from": (
+        False,
+        ("NT",),
+        "seconds of the day, and how often the price of energy counts from then on",
+    ),
+    "tariff": (False, ("NT",), ""),
     "overshoot": (False, (), "band beyond the target [degC]"),
     "patience_s": (False, (), "how long a plan is followed without a solve [s]"),
     "ambient": (False, (), "room where none is measured [degC]"),
@@ -90,6 +101,12 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "rest": (False, ("NX",), "state at rest where all is at `ambient`"),
     "rest_level": (False, ("NX",), "how it answers to the mean of the readings"),
     "rest_d": (False, ("NX", "ND"), "and to the measured disturbances"),
+    "settles": (True, (), "whether what follows says where a linear plant settles"),
+    "settled_by": (False, ("NY", "NV"), "outputs at rest by shares of the drives, disturbances, and biases"),
+    "settled": (False, ("NY",), "and without them"),
+    "by_x": (False, ("NO", "NX"), "of a linear plant, the soft rows of each sample by the state,"),
+    "by_d": (False, ("NO", "ND"), "by the disturbances,"),
+    "by_none": (False, ("NO",), "and without them"),
     "P_rest": (False, ("NX", "NX"), "covariance of the states in which the plant may rest"),
 }
 
@@ -109,6 +126,9 @@ class Sizes:
     NC: int
     NL: int
     NE: int  # numbers in the rows of the response
+    NR: int  # targets of all samples, where some may only ramp
+    NT: int  # changes of the price in a day
+    NO: int  # soft rows of all samples, of a linear plant
     NK: int  # what the model's ``prepare``, ``hold`` and ``partials`` hand over
     NF: int
     NM: int
@@ -117,6 +137,11 @@ class Sizes:
     def NS(self) -> int:
         """Soft rows of a sample."""
         return self.NC + self.NL
+
+    @property
+    def NV(self) -> int:
+        """Drives, measured disturbances and disturbance states."""
+        return self.NU + self.ND + self.NW
 
     @property
     def NZ(self) -> int:
@@ -148,6 +173,9 @@ def sizes_of(controller: ControllerParts, code: ModelCode, *, room: bool) -> Siz
         NC=controlled,
         NL=limited,
         NE=(controlled + limited) * entries,
+        NR=most * controlled if design.ramp_per_s else 0,
+        NT=len(design.tariff),
+        NO=0 if model.affine is None else most * (controlled + limited),
         NK=code.n_k,
         NF=code.n_h,
         NM=code.n_m,
@@ -168,7 +196,7 @@ def _row_lengths(blocks: Sequence[int], n_u: int) -> int:
 
 def config_header(sizes: Sizes) -> str:
     """Return ``tg_config.h``: the sizes, and the struct of a design."""
-    names = ("NX", "NU", "ND", "NY", "NW", "NG", "NB", "NH", "NC", "NL", "NS", "NE", "NK", "NF", "NM")
+    names = [*(entry.name for entry in fields(Sizes)), "NS", "NV"]
     lines = ["/* Sizes and numbers of one controller. */", "#ifndef TG_CONFIG_H", "#define TG_CONFIG_H", ""]
     lines += [f"#define TG_{name} {getattr(sizes, name)}" for name in names]
     lines += ["", "typedef struct {"]
@@ -180,11 +208,11 @@ def config_header(sizes: Sizes) -> str:
     return "\n".join([*lines, "} tg_design;", "", "#endif", ""])
 
 
-def structure_of(sizes: Sizes) -> type[ctypes.Structure]:
-    """Return ``tg_design`` as ctypes sees it."""
+def structure_of(sizes: Sizes, number: Any = ctypes.c_double) -> type[ctypes.Structure]:
+    """Return ``tg_design`` as ctypes sees it, of numbers of this kind."""
     fields = []
     for name, (whole, shape, _) in _FIELDS.items():
-        kind = ctypes.c_int if whole else ctypes.c_double
+        kind = ctypes.c_int if whole else number
         fields.append((name, kind * max(1, int(np.prod(sizes.shape(name)))) if shape else kind))
     return type("tg_design", (ctypes.Structure,), {"_fields_": fields})
 
@@ -218,6 +246,7 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
     model, design, optimiser = controller.model, controller.design, controller.optimiser
     observer, disturbance, loops = controller.observer, controller.disturbance, design.loops
     rest = observer.rest_in_room()
+    rows = [model.outputs.index(name) for name in (*design.controlled, *design.limits)]
     limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2)
     same_names = (
         (model, "sub dt span C spike coldest hottest"),
@@ -236,8 +265,11 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
         "n_l": len(design.limits),
         "n_loops": len(loops),
         "iteration_limit": ITERATION_LIMIT,
-        "controlled": [model.outputs.index(name) for name in design.controlled],
-        "limited": [model.outputs.index(name) for name in design.limits],
+        "ramp": [design.ramp_per_s.get(name, 0.0) for name in design.controlled],
+        "tariff_from": [second for second, _ in design.tariff],
+        "tariff": [factor for _, factor in design.tariff],
+        "controlled": rows[: len(design.controlled)],
+        "limited": rows[len(design.controlled) :],
         "loop_drive": [model.drives.index(loop.drive) for loop in loops],
         "loop_output": [design.controlled.index(loop.output) for loop in loops],
         "linear": model.affine is not None,
@@ -254,7 +286,39 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
         "rest_level": rest.by_level,
         "rest_d": rest.by_d,
         "P_rest": rest.P,
+        **_free_response(model, design, rows),
+        **_settled(model, disturbance),
     }
+
+
+def _free_response(model: PredictionModel, design: Design, rows: list[int]) -> dict[str, Any]:
+    """Return what a linear plant's outputs of these rows are in each sample where drives are 0, by the
+    state, by the disturbances, and besides."""
+    if model.affine is None:
+        return {"by_x": np.zeros((0, model.n_x)), "by_d": np.zeros((0, model.n_d)), "by_none": np.zeros(0)}
+    _, _, E, added = model.affine
+    by_x, by_rest, _ = model.response(design.blocks)
+    by_none = by_rest @ added + model.output(np.zeros(model.n_x))
+    parts = {"by_x": by_x, "by_d": by_rest @ E, "by_none": by_none}
+    return {
+        name: part[:, rows].reshape(len(part) * len(rows), *part.shape[2:]) for name, part in parts.items()
+    }
+
+
+def _settled(model: PredictionModel, disturbance: DisturbanceModel) -> dict[str, Any]:
+    """Return the outputs of a linear plant at rest by drives, disturbances and disturbance states."""
+    sides = model.n_u + model.n_d + disturbance.n_w
+    nothing = {"settles": False, "settled_by": np.zeros((model.n_y, sides)), "settled": np.zeros(model.n_y)}
+    if model.affine is None:
+        return nothing
+    A, B, E, added = model.affine
+    away, by_share = np.eye(model.n_x) - A, B * model.span
+    if not np.linalg.cond(away) < _INTEGRATES:
+        return nothing
+    by_w = by_share @ disturbance.on_drive + E @ disturbance.on_disturbance
+    by = model.C @ np.linalg.solve(away, np.column_stack([by_share, E, by_w, added]))
+    level = by[:, -1] + model.output(np.zeros(model.n_x))
+    return {"settles": True, "settled_by": by[:, :-1], "settled": level}
 
 
 def _padded(sizes: Sizes, name: str, values: Any) -> Array:
@@ -265,51 +329,58 @@ def _padded(sizes: Sizes, name: str, values: Any) -> Array:
     return full
 
 
-def bytes_of(s: Sizes) -> tuple[int, int]:
+def bytes_of(s: Sizes, *, single: bool = False) -> tuple[int, int]:
     """Return what ``sizeof`` says of a controller and of a design."""
-    controller = type("tg_controller", (ctypes.Structure,), {"_fields_": _laid_out(_controller_parts(s))})
-    return ctypes.sizeof(controller), ctypes.sizeof(structure_of(s))
+    number = ctypes.c_float if single else ctypes.c_double
+    parts = {"_fields_": _laid_out(_controller_parts(s, number))}
+    controller = type("tg_controller", (ctypes.Structure,), parts)
+    return ctypes.sizeof(controller), ctypes.sizeof(structure_of(s, number))
 
 
 def _laid_out(parts: list[tuple[Any, int]]) -> list[tuple[str, Any]]:
     return [(f"part{at}", kind * max(1, count)) for at, (kind, count) in enumerate(parts)]
 
 
-def _controller_parts(s: Sizes) -> list[tuple[Any, int]]:
+def _controller_parts(s: Sizes, number: Any) -> list[tuple[Any, int]]:
     """Return kind and length of each part of ``tg_controller``, in order."""
-    number, whole = ctypes.c_double, ctypes.c_int
+    whole = ctypes.c_int
     n, z, some = s.NB * s.NU, s.NZ, max(1, s.NS)
     wide = _whole(max(s.NX + s.NU + s.ND, n))
     still = [*((number, count) for count in (s.NU, s.NW, _BINS, 1)), (whole, 3)]
     relaxation = type("tg_relaxation", (ctypes.Structure,), {"_fields_": _laid_out(still)})
-    qp = type("tg_qp", (ctypes.Structure,), {"_fields_": _laid_out(_qp_parts(s))})
+    qp = type("tg_qp", (ctypes.Structure,), {"_fields_": _laid_out(_qp_parts(s, number))})
     return [
         (ctypes.c_void_p, 4),
         *((number, count) for count in (s.NX, s.NW, s.NG, s.NG, s.NG, s.NG, z * z, s.NY, s.NY)),
         (whole, z),
-        *((number, count) for count in (3, s.NU, s.NX, s.NG, s.NY, 9)),
+        *((number, count) for count in (3, s.NU, s.NX, s.NG, s.NY)),
+        (ctypes.c_double, 2),
+        (number, 7),
         (whole, 2),
         *((number, count) for count in (s.ND, s.NY, s.NU, s.NU, s.NC, s.NC, s.NC, s.NH * s.NU, s.NC, 2)),
-        *((number, count) for count in (s.NY, s.NY, s.NX, s.NC, 1)),
+        *((number, count) for count in (s.NY, s.NY, s.NX, s.NC, 1, s.NB, s.NC)),
         *((number, count) for count in (s.NX, s.NU, 1)),
         (whole, 3),
         (relaxation, s.NC),
-        (whole, 6 + s.NY + s.NG + s.NC),
+        (whole, 7 + s.NY + s.NG + s.NC),
         *((number, count) for count in (n, s.NH * s.NY, n, 1)),
         (whole, 2),
         (number, 1),
         (whole, s.NC + 3),
         (qp, 1),
+        (number, max(1, s.NR)),
         *((number, count) for count in (max(1, s.NE), s.NH * s.NY, s.NH * s.NY, s.NH * some)),
         *((number, count) for count in (2 * s.NX * wide, s.NU * wide, max(1, s.ND) * wide)),
         *((number, count) for count in (s.NF, s.NM, z * z, z * z)),
     ]
 
 
-def _qp_parts(s: Sizes) -> list[tuple[Any, int]]:
-    number, whole, small = ctypes.c_double, ctypes.c_int, ctypes.c_byte
+def _qp_parts(s: Sizes, number: Any) -> list[tuple[Any, int]]:
+    whole, small = ctypes.c_int, ctypes.c_byte
     n, soft = s.NB * s.NU, s.NH * s.NS
     rows, w = 2 * n + soft, _whole(n)
+    lean = soft >= 4 * n
+    kept = 4 * n + 8 if lean else rows
     return [
         (whole, 4),
         *((number, count) for count in (n * w, w, 2 * rows)),
@@ -321,6 +392,9 @@ def _qp_parts(s: Sizes) -> list[tuple[Any, int]]:
         (number, w),
         (whole, 2 + 2 * rows),
         (small, 2 * rows),
-        *((number, count) for count in (rows, 2 * w + rows, rows * w, rows * (rows + 1) // 2, 3 * rows)),
+        *((number, count) for count in (rows, 2 * w + rows, rows * w, kept * (kept + 1) // 2, kept, rows)),
+        *((number, count) for count in ((n * w, n * w, kept * w) if lean else (1, 1, 1))),
+        (whole, kept + 2),
+        (number, 2 * rows),
         (small, rows),
     ]

@@ -257,7 +257,7 @@ class CompiledOptimiser(Optimiser):
         self._lost = c.view("lost", (len(self.design.controlled),))
         n_c = len(self.design.controlled)
         # one block of memory for what goes in, so that a call costs next to nothing
-        lengths = (model.n_x, n_u, n, model.n_d, n_c, n_c, model.n_y, n_u, 2)
+        lengths = (model.n_x, n_u, n, model.n_d, n_c, n_c, model.n_y, n_u, 2 + self.n_b)
         self._given = np.zeros(sum(lengths))
         ends = np.cumsum(lengths)
         self._parts = [self._given[end - length : end] for end, length in zip(ends, lengths)]
@@ -272,12 +272,13 @@ class CompiledOptimiser(Optimiser):
 
     def solve(self, sample: Sample) -> Outcome:
         """Improve a plan; see :meth:`Optimiser.solve`."""
-        if sample.d.ndim > 1 or self.design.in_python_alone:
+        if sample.d.ndim > 1:
             return super().solve(sample)
         *parts, slew = self._parts
         for part, values in zip(parts, sample[:8], strict=True):
             part[:] = values.ravel()
-        slew[:] = self.design.dt if sample.slew_s is None else sample.slew_s, sample.caution
+        slew[:2] = self.design.dt if sample.slew_s is None else sample.slew_s, sample.caution
+        slew[2:] = self.counted(sample.prices)
         self._lost[:] = 0 if sample.lost is None else sample.lost
         if sample.ahead is None:
             status = QP_STATUS[self._run(*self._arguments)]

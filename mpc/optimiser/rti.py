@@ -170,8 +170,7 @@ class Optimiser:
             side = np.zeros(len(now))
         self._costs = None
         if self.energy.any():
-            dear = np.ones(self.N) if tariff is None else tariff
-            self._costs = np.add.reduceat(dear, self._begins)[:, None] * self.energy
+            self._costs = self.counted(tariff)[:, None] * self.energy
         guess = self._park(guess, last, more)
         y0, G = model.trajectory(x, guess + drive_bias, d, self.blocks)
         linear = model.affine is not None
@@ -201,6 +200,10 @@ class Optimiser:
 
         plan, y = self._best(plan, guess, y0, last, more, predicted, merit)
         return Outcome(plan, y, "solved", self._broken(y), answer.iterations, authority[0])
+
+    def counted(self, tariff: Array | None) -> Array:
+        """Return the samples of each block (n_b,), each as often as the energy price counts in it."""
+        return self._lengths if tariff is None else np.asarray(np.add.reduceat(tariff, self._begins))
 
     def _pairs(self) -> NDArray[np.int_]:
         """Return which controlled output each drive is there for: its PI loop's, else what it moves most."""

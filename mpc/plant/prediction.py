@@ -271,7 +271,7 @@ class PredictionModel:
         same array each time."""
         if self.affine is not None:
             _, _, E, added = self.affine
-            by_x, by_rest, G = self._response(tuple(blocks))
+            by_x, by_rest, G = self.response(tuple(blocks))
             if d.ndim > 1:  # what a sample's disturbances do reaches as far as any
                 B = self.affine[1]
                 inputs = np.repeat(plan, np.asarray(blocks), axis=0) @ B.T + d @ E.T + added
@@ -298,7 +298,7 @@ class PredictionModel:
             self._directions[blocks] = np.zeros((n, self.n_x)), su, np.zeros((n, self.n_d))
         return self._directions[blocks]
 
-    def _response(self, blocks: tuple[int, ...]) -> Response:
+    def response(self, blocks: tuple[int, ...]) -> Response:
         """Return how a linear plant's outputs answer, made once for these blocks."""
         if blocks in self._responses:
             return self._responses[blocks]

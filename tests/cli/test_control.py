@@ -197,6 +197,12 @@ def test_an_export_is_compared_with_python_only_where_that_is_asked_for(
         assert (asked[-1].states, asked[-1].seed) == (3000, 0)
     library = controller.run("export", "c.json", "--out", "c", "--arduino", *options)
     assert (library.code, exported[-1].arduino) == ((2, False) if options else (0, True))
+    assert not exported[-1].single
+    made = replace(made, single=True, tolerance=0.2)
+    told = controller.run(*words, "--single").out.splitlines()[-1]
+    assert exported[-1].single
+    if options:
+        assert told == "C and Python do the same to 0.2 of a range, but in 0 states."
 
 
 @pytest.mark.parametrize(("verdicts", "code"), [("pass warn", 0), ("pass fail warn", 3)])

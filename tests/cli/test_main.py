@@ -85,8 +85,8 @@ tune: PLANT --out --spec --report --network --seed=0>0 --workers=1>1 --cluster -
 retune: DIR LOG... --out=retuned.json --controller --spec --report --network --seed=0>0 --workers=1>1
   --json=False
 review: CONTROLLER --report --network --seed=0>0 --json=False
-export: CONTROLLER --out --check=False --states=3000>1 --arduino=False --ros2=False --network
-  --seed=0>0 --json=False
+export: CONTROLLER --out --check=False --states=3000>1 --arduino=False --single=False --ros2=False
+  --network --seed=0>0 --json=False
 run: CONTROLLER --target --out --port --protocol --speed=1.0>0.01 --twin --draw=0>0 --from --hold=0.0>0
   --object --material --grasp-time=10.0>0.5 --stop-early --settle-timeout=900.0>1 --guard --learn
   --live>0<65535 --foxglove>1<65535 --bridge --on-trip --report --network --seed=0>0 --json=False

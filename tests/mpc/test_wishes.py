@@ -9,7 +9,7 @@ import pytest
 from tests.mpc.makers import crossed, heater, kit, make_tank, network_plant
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Surroundings, Truth, simulate_closed_loop
-from thermogrip.mpc.controllers.export import export_controller
+from thermogrip.mpc.closed_loop.simulate_native import compiled_loop
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.design.spec import spec_from_dict
@@ -233,14 +233,33 @@ def test_energy_of_a_drive_that_goes_both_ways_has_no_price():
         spec_from_dict(WIDE | keys).design(make_tank())
 
 
-def test_what_the_c_has_not_is_not_exported_and_no_linear_system(tmp_path):
-    wishes = {"zones": {"t": 1.0}, "energy_price": {"q": 1.0}, "tariff": ((0.0, 1.0), (600.0, 3.0))}
-    controller = heater(**wishes, ramp_per_s={"t": 0.1})
-    with pytest.raises(UserError, match="the exported C has no tariff, no ramp_per_s"):
-        export_controller(controller, tmp_path / "c")
-    assert not (tmp_path / "c").exists()
+def test_what_may_rest_anywhere_is_no_linear_system():
     with pytest.raises(UserError, match="zones: a controller that may rest anywhere"):
-        controller.to_control()
+        heater(zones={"t": 1.0}).to_control()
+
+
+WISHES = {
+    "tariff": {"zones": {"t1": 1.5, "t2": 1.5}, "energy_price": {"q1": 1.0, "q2": 1.0}, "tariff": TARIFF},
+    "ramp": {"ramp_per_s": {"t1": 0.04}, "limits": {"t2": (20.0, 50.0)}},
+}
+
+
+@GCC
+@pytest.mark.parametrize("wish", WISHES)
+def test_a_loop_of_tariffs_or_ramps_is_the_same_in_c(board, wish):
+    """Step by step with C's parts, and wholly in C, whose first reading is at 0 s too."""
+    controller = kit(**WISHES[wish])
+    compiled = Controller(controller.plant, controller.design, compiled=True)
+    plain = run(
+        kit(**{key: WISHES[wish][key] for key in WISHES[wish] if key not in ("tariff", "ramp_per_s")}), board
+    )
+    ours = run(controller, board)
+    wholly = compiled_loop(compiled, board, [(40.0, 2400.0)], surroundings=QUIET, seed=3)
+    for loop in (run(compiled, board), wholly):
+        for name in ("q1", "q2"):
+            np.testing.assert_allclose(loop.drive[name], ours.drive[name], atol=1e-6)
+            assert np.abs(loop.drive[name] - plain.drive[name]).max() > 5.0
+        assert loop.status == ours.status
 
 
 def test_wishes_are_in_the_controllers_file(tmp_path):

@@ -1,7 +1,8 @@
 /* Read states, one a line, and answer what the controller does there: status, iterations, drives, plan.
  *
  * A line: x, w, measured disturbances, drives, whether there is a plan, the plan, target and side of before,
- * reading, its disturbances, target, whether time is up; numbers as %a or "nan".
+ * reading, its disturbances, target, whether time is up, the time of before, where targets ramp; numbers as %a or
+ * "nan".
  */
 #include "tg_design.h"
 
@@ -20,7 +21,7 @@ static int read_numbers(double *into, int n)
     for (int i = 0; i < n; i++) {
         if (scanf("%63s", word) != 1)
             return 0;
-        into[i] = strtod(word, NULL);
+        into[i] = (double)strtod(word, NULL);
     }
     return 1;
 }
@@ -28,7 +29,7 @@ static int read_numbers(double *into, int n)
 int main(void)
 {
     tg_controller *c = &controller;
-    double y[TG_NY], d[TG_SOME(TG_ND)], target[TG_NC], planned, late;
+    double y[TG_NY], d[TG_SOME(TG_ND)], target[TG_NC], planned, late, time_s;
     double cold[TG_NY], room[TG_SOME(TG_ND)];
     for (int i = 0; i < TG_NY; i++)
         cold[i] = tg_the_design.ambient;
@@ -44,7 +45,8 @@ int main(void)
         if (!read_numbers(c->w, TG_NW) || !read_numbers(c->d, TG_ND) || !read_numbers(c->u, TG_NU) ||
             !read_numbers(&planned, 1) || !read_numbers(c->plan, tg_the_design.N * TG_NU) ||
             !read_numbers(c->target, TG_NC) || !read_numbers(c->side, TG_NC) || !read_numbers(y, TG_NY) ||
-            !read_numbers(d, TG_ND) || !read_numbers(target, TG_NC) || !read_numbers(&late, 1))
+            !read_numbers(d, TG_ND) || !read_numbers(target, TG_NC) || !read_numbers(&late, 1) ||
+            !read_numbers(&time_s, 1) || !read_numbers(c->ramped, TG_NC))
             return 1;
         for (int r = 0; r < TG_NG; r++) { /* it shows what the state has, and began there */
             c->shown[r] = tg_the_design.y0[tg_the_design.controlled[r]];
@@ -52,6 +54,7 @@ int main(void)
                 c->shown[r] += tg_the_design.C[tg_the_design.controlled[r] * TG_NX + j] * c->x[j];
             c->start[r] = c->shown[r];
         }
+        c->time_s = time_s;
         c->late = time_is_up;
         c->about = &late;
         c->fresh = 0;

@@ -33,6 +33,7 @@
 #define UNCUT 1e-9 /* of its range: a drive of the PI that is cut by less is not limited */
 #define STAYS 1e-5 /* of its range: a plan that moves by less has converged */
 #define SAME 1e-6 /* of a sample: what is nearer than this is the same time */
+#define DAY 86400.0 /* s */
 
 /* ---- the loop ---- */
 
@@ -67,9 +68,10 @@ static void start(tg_controller *c, const double *y, const double *d)
     for (int j = 0; j < TG_NU; j++)
         c->u[j] = c->in_force[j] = s->neutral[j];
     for (int r = 0; r < TG_NC; r++) {
-        c->target[r] = NAN;
+        c->target[r] = c->ramped[r] = NAN;
         c->side[r] = 0.0;
     }
+    c->ramps = 0;
     c->has_plan = c->solves = c->on_pi = 0;
     memset(c->spikes, 0, sizeof c->spikes);
     memset(c->slow_for, 0, sizeof c->slow_for);
@@ -102,9 +104,10 @@ void tg_reset(tg_controller *c, const tg_design *design, const double *y, const 
 /* Note a call at this time: the seconds that passed, each once, whether a move is due, and for how many seconds
  * the slew limit counts.  A stale reading gives no elapsed time; such a call is taken to be as
  * far from the last as calls usually are.  A clock that went back by far and runs on from there was restarted. */
-static int is_due(tg_controller *c, double now)
+static int is_due(tg_controller *c, tg_time now)
 {
-    double before = c->time_s, dt = c->design->dt, passed;
+    const tg_time before = c->time_s;
+    double dt = c->design->dt, passed;
     c->passed_s = 0.0;
     c->stale = 0;
     if (!isfinite(now)) {
@@ -114,10 +117,10 @@ static int is_due(tg_controller *c, double now)
         c->passed_s = dt;
         c->time_s = now;
     } else if (now > before) {
-        c->passed_s = now - before;
+        c->passed_s = (double)(now - before);
         c->time_s = now;
     } else if (before - now > RESTART_S && now > c->back_s) {
-        c->passed_s = now - c->back_s + c->interval_s;
+        c->passed_s = (double)(now - c->back_s) + c->interval_s;
         c->time_s = now;
     } else
         c->stale = 1;
@@ -318,6 +321,55 @@ static int set_target(tg_controller *c, const double *target)
     return wrong;
 }
 
+/* Where targets that may only ramp are now, and in the samples ahead, towards what is asked then. */
+static void ramp(tg_controller *c)
+{
+#if TG_NR > 0
+    const tg_design *s = c->design;
+    c->ramps = c->goals != NULL;
+    for (int r = 0; r < s->n_c; r++) {
+        double begun = isfinite(c->ramped[r]) ? c->ramped[r] : c->y[s->controlled[r]], reach = s->ramp[r] * c->waited_s;
+        c->ramped[r] = c->target[r];
+        if (s->ramp[r] > 0.0 && isfinite(begun))
+            c->ramped[r] = fmin(fmax(c->target[r], begun - reach), begun + reach);
+        c->ramps = c->ramps || c->ramped[r] != c->target[r];
+    }
+    for (int k = 0; c->ramps && k < s->N; k++)
+        for (int r = 0; r < s->n_c; r++) {
+            double end = c->goals ? c->goals[k * s->n_c + r] : c->target[r];
+            double reach = (s->move_delay + k + 1) * s->ramp[r] * s->dt;
+            if (s->ramp[r] > 0.0)
+                end = fmin(fmax(end, c->ramped[r] - reach), c->ramped[r] + reach);
+            c->path[k * s->n_c + r] = end;
+        }
+#else
+    memcpy(c->ramped, c->target, sizeof c->ramped);
+#endif
+}
+
+void tg_set_prices(tg_controller *c)
+{
+    const tg_design *s = c->design;
+    int k = 0;
+    for (int b = 0; b < s->n_b; b++) {
+        c->dear[b] = s->blocks[b];
+#if TG_NT > 0
+        if (!isfinite(c->time_s))
+            continue;
+        c->dear[b] = 0.0;
+        for (int left = s->blocks[b]; left > 0; left--, k++) {
+            double second = (double)fmod(c->time_s + s->dt * k, DAY), factor = s->tariff[TG_NT - 1]; /* of the day before */
+            if (second < 0.0)
+                second += DAY;
+            for (int i = 0; i < TG_NT && s->tariff_from[i] <= second; i++)
+                factor = s->tariff[i];
+            c->dear[b] += factor;
+        }
+#endif
+    }
+    (void)k;
+}
+
 /* Between two samples what is planned is the mean of the two; the last sample of a plan stays. */
 double tg_planned(const tg_controller *c, int k, int j)
 {
@@ -394,11 +446,12 @@ static int optimise(tg_controller *c)
     c->caution = 1.0;
     for (int i = 0; i < TG_NY; i++)
         c->caution = fmin(fmax(c->caution, fabs(c->innovation[i]) / CAUTION), MOST_CAUTION);
-    status = tg_optimise(c, x, last, guess, d, c->target, c->side, on_y, on_u);
+    tg_set_prices(c);
+    status = tg_optimise(c, x, last, guess, d, c->ramped, c->side, on_y, on_u);
     changes = c->iterations;
     for (int n = 1; n < s->iterations && status == TG_QP_SOLVED && !s->linear && has_moved(s, guess, c->best); n++) {
         memcpy(guess, c->best, (size_t)s->n_b * TG_NU * sizeof(double));
-        status = tg_optimise(c, x, last, guess, d, c->target, c->side, on_y, on_u);
+        status = tg_optimise(c, x, last, guess, d, c->ramped, c->side, on_y, on_u);
         changes += c->iterations;
     }
     c->iterations = changes;
@@ -540,7 +593,8 @@ static double beyond_own_limit(const tg_controller *c, int r)
     return beyond;
 }
 
-/* In place of targets with zones what of them is nearest to the end of the plan; the targets into kept. */
+/* In place of targets that ramp where they are now, and with zones what of them is nearest to the end of the plan; the
+ * targets into kept. */
 static void aim(tg_controller *c, double *kept)
 {
     const tg_design *s = c->design;
@@ -548,9 +602,10 @@ static void aim(tg_controller *c, double *kept)
     memcpy(kept, c->target, sizeof c->target);
     for (int r = 0; r < s->n_c; r++) {
         double end = c->y_best[(s->N - 1) * TG_NY + s->controlled[r]], zone = s->zone[r];
+        c->target[r] = c->ramped[r];
         if (zone > 0.0)
             c->target[r] = fmin(fmax(end, c->target[r] - zone), c->target[r] + zone);
-        other = other || (zone > 0.0 && c->target[r] != c->aim[r]);
+        other = other || c->target[r] != c->aim[r];
         c->aim[r] = c->target[r];
     }
     if (other) {
@@ -783,7 +838,7 @@ static void set_pump(tg_move *move)
         move->pump = move->pump || move->drive[j] != 0.0;
 }
 
-tg_move tg_step(tg_controller *c, double time_s, const double *y, const double *d, const double *applied,
+tg_move tg_step(tg_controller *c, tg_time time_s, const double *y, const double *d, const double *applied,
                 const double *target)
 {
     tg_move move;
@@ -812,6 +867,7 @@ tg_move tg_step(tg_controller *c, double time_s, const double *y, const double *
         said = TG_STALE;
     memcpy(in_force, c->u, sizeof in_force);
     wrong = set_target(c, target);
+    ramp(c);
     decide(c, &move);
     if (move.status == TG_OK && said != TG_ALL_WELL)
         move.advice = said; /* events of this sample before lasting conditions */

@@ -62,6 +62,8 @@ typedef struct {
     double over;    /* by how much a limit will be broken, a target missed [degC], an output late [s]: where advised */
 } tg_move;
 
+typedef double tg_time; /* seconds of any clock */
+
 #define TG_BINS 12
 
 /* Means of a reading since the drives stand still, and drives and biases then. */
@@ -85,7 +87,8 @@ typedef struct {
     double dose[TG_NU], ahead[TG_NX], shown_ahead[TG_NG]; /* the drives summed over those seconds, the state there */
     double bent[TG_NY];                /* how far an output may be from the straight line between two samples */
     /* when it was called */
-    double time_s, back_s, interval_s, passed_s, since_s, assumed_s, spent_s, waited_s, slew_s;
+    tg_time time_s, back_s;
+    double interval_s, passed_s, since_s, assumed_s, spent_s, waited_s, slew_s;
     int repeats, stale;
     /* loop */
     double d[TG_SOME(TG_ND)], y[TG_NY], u[TG_NU], in_force[TG_NU], target[TG_NC], side[TG_NC], aim[TG_NC];
@@ -94,10 +97,13 @@ typedef struct {
     double seen[TG_NX];                 /* the state after the newest reading */
     double integral[TG_NC];             /* of the PI controller */
     double caution;                     /* how many times the weight of moves counts */
+    double dear[TG_NB];                 /* samples of each block, each as often as the price of energy counts then */
+    double ramped[TG_NC];               /* where targets are that may only ramp */
     double steady_x[TG_NX], steady_u[TG_NU], miss_sum; /* nearest to the targets, and evidence that they are missed */
     int has_steady, in, unreachable;                   /* samples in a row within reach again */
     tg_relaxation relaxation[TG_NC];
     int has_plan, fresh, solves, on_pi, status, advice, spikes[TG_NY];
+    int ramps; /* whether targets are on their way in path */
     int slow_for[TG_NG], lost[TG_NC]; /* samples in a row that an output was slower; those that cost nothing */
     /* what the last optimisation gave */
     double best[TG_Q_N], y_best[TG_NH * TG_NY], authority[TG_Q_N], broken;
@@ -106,6 +112,7 @@ typedef struct {
     int kept_lost[TG_NC], has_gains, laid_out, has_jacobian;
     /* room to work in */
     tg_qp qp;
+    double path[TG_SOME(TG_NR)]; /* in place of goals, where targets may only ramp */
     double G[TG_SOME(TG_NE)]; /* the response: the soft rows of the program, sample by sample */
     double y_guess[TG_NH * TG_NY], y_try[TG_NH * TG_NY];
     double free[TG_NH * TG_SOME(TG_NS)];
@@ -125,7 +132,7 @@ void tg_reset(tg_controller *c, const tg_design *design, const double *y, const 
  * time_s: of the reading, or NAN; then one sample time has passed.  applied: what the drives really did since
  * the last step, or NULL.  Called more often than its sample time it holds its move until the call that is
  * nearest to it; called more seldom it moves each time. */
-tg_move tg_step(tg_controller *c, double time_s, const double *y, const double *d, const double *applied,
+tg_move tg_step(tg_controller *c, tg_time time_s, const double *y, const double *d, const double *applied,
                 const double *target);
 
 const char *tg_status_text(int status);
@@ -154,6 +161,11 @@ double tg_planned(const tg_controller *c, int k, int j); /* drive j in the k-th 
 void tg_guess(const tg_controller *c, const double *last, double *guess);
 void tg_keep_plan(tg_controller *c);
 void tg_advance_plan(tg_controller *c);
+void tg_set_prices(tg_controller *c); /* of the samples ahead of its time */
+/* Outputs of a plan, sample by sample, plus the output bias. */
+void tg_simulate(tg_controller *c, const double *start, const double *plan, const double *drive_bias, const double *d,
+                 const double *bias, double *y);
+/* Improve a plan; y_best has the outputs that count, of a plant that is not linear all. */
 int tg_optimise(tg_controller *c, const double *x, const double *last, const double *guess, const double *d,
                 const double *target, const double *side, const double *bias, const double *drive_bias);
 

@@ -34,6 +34,19 @@ void tg_host_forget(tg_controller *c)
     c->has_plan = 0;
 }
 
+/* Whether each output has a target or a limit. */
+static int all_count(const tg_design *s)
+{
+    int counts[TG_NY] = {0}, sum = 0;
+    for (int r = 0; r < s->n_c; r++)
+        counts[s->controlled[r]] = 1;
+    for (int r = 0; r < s->n_l; r++)
+        counts[s->limited[r]] = 1;
+    for (int i = 0; i < TG_NY; i++)
+        sum += counts[i];
+    return sum == TG_NY;
+}
+
 int tg_host_optimise(tg_controller *c, const double *x, const double *last, const double *guess,
                      const double *d, const double *target, const double *side, const double *bias,
                      const double *drive_bias, const double *slew_s, double *plan, double *y, double *authority,
@@ -42,9 +55,14 @@ int tg_host_optimise(tg_controller *c, const double *x, const double *last, cons
     int status;
     c->slew_s = slew_s[0];
     c->caution = slew_s[1];
+    c->ramps = 0; /* goals ramp already */
+    memcpy(c->dear, slew_s + 2, (size_t)c->design->n_b * sizeof(double));
     status = tg_optimise(c, x, last, guess, d, target, side, bias, drive_bias);
     memcpy(plan, c->best, (size_t)c->qp.n * sizeof(double));
-    memcpy(y, c->y_best, (size_t)c->design->N * TG_NY * sizeof(double));
+    if (status == TG_QP_SOLVED && c->design->linear && !all_count(c->design))
+        tg_simulate(c, x, plan, drive_bias, d, bias, y);
+    else
+        memcpy(y, c->y_best, (size_t)c->design->N * TG_NY * sizeof(double));
     memcpy(authority, c->authority, (size_t)c->qp.n * sizeof(double));
     *over = c->broken;
     *iterations = c->iterations;
@@ -61,6 +79,7 @@ int tg_host_replan(tg_controller *c, const double *x, const double *last, const 
     tg_advance_plan(c);
     c->slew_s = 0.0;
     c->caution = 1.0;
+    tg_set_prices(c);
     tg_guess(c, last, guess);
     status = tg_optimise(c, x, last, guess, d, target, side, bias, drive_bias);
     if (status == TG_QP_SOLVED)
@@ -186,6 +205,7 @@ void tg_host_loop(tg_controller *c, const tg_design *design, tg_truth *plant, in
             memcpy(c->P, observed + TG_Z, sizeof c->P);
             memcpy(c->found_offset, observed + TG_Z + TG_Z * TG_Z, sizeof c->found_offset);
             memcpy(c->start, observed + TG_Z + TG_Z * TG_Z + TG_NY, sizeof c->start);
+            c->time_s = -design->dt; /* the first reading is at 0 */
         }
         move = tg_step(c, NAN, shown, shown + TG_NY, told && !t ? before : NULL, target + t * design->n_c);
         memcpy(drive + t * TG_NU, move.drive, sizeof move.drive);

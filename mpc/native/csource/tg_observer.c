@@ -19,6 +19,15 @@
 #define PRIOR_LAG 1.5   /* samples: standard deviation of a lag at the start */
 #define LONGEST_LAG 6.0 /* samples */
 #define SAME 1e-6 /* of a sample: what is nearer than this is the same time */
+#ifdef TG_SINGLE
+#define ROUNDED 6e-8
+#define LEAST_SHARE 1e-6
+#define LEAST_TRACE 1e-30
+#else
+#define ROUNDED 1e-16 /* of the length of a row, that its sum is rounded by at least */
+#define LEAST_SHARE 1e-12 /* of the trace, added to a curvature that may be 0 */
+#define LEAST_TRACE 1e-300
+#endif
 #define WEAK 0.05 /* of its gain at rest, below which a drive's bias is not learnt */
 
 static double output(const tg_controller *c, int i, const double *x)
@@ -489,7 +498,7 @@ static void squares_in_box(int n, const double *weight, const double *G, const d
             double slope = f[j], best;
             for (int k = 0; k < TG_NU; k++)
                 slope -= H[j * TG_NU + k] * z[k];
-            best = z[j] + slope / (H[j * TG_NU + j] + 1e-12 * fmax(trace, 1e-300));
+            best = z[j] + slope / (H[j * TG_NU + j] + LEAST_SHARE * fmax(trace, LEAST_TRACE));
             best = fmin(fmax(best, low[j]), high[j]);
             moved = fmax(moved, fabs(best - z[j]));
             z[j] = best;
@@ -555,51 +564,80 @@ static void nearest(const tg_controller *c, const double *G, const double *y, co
     }
 }
 
+/* The steady state as seen from x: what is missing of it in X, a column by each drive and bias behind, and the outputs
+ * there, y, by the drives, G; 0 where there is none. */
+static int look_for_steady(tg_controller *c, const double *x, const double *u, const double *d, const double *on_u,
+                           double *X, double *y, double *G)
+{
+    const tg_design *s = c->design;
+    double keep[TG_NX], both[TG_NU], next[TG_NX] = {0.0}, *slopes;
+    for (int j = 0; j < TG_NU; j++)
+        both[j] = u[j] + on_u[j];
+    memcpy(keep, c->x, sizeof keep);
+    memcpy(c->x, x, sizeof keep);
+    slopes = sample_jacobian(c, both, d, next);
+    memcpy(c->x, keep, sizeof keep);
+    for (int i = 0; i < TG_NX; i++) {
+        for (int j = 0; j < TG_NX; j++)
+            c->spare[i * TG_NX + j] = (i == j ? 1.0 : 0.0) - *entry(slopes, TG_NX, i, j);
+        X[i * SIDES] = next[i] - x[i];
+        for (int j = 0; j < TG_NU; j++)
+            X[i * SIDES + 1 + j] = *entry(slopes, TG_NX, i, TG_NX + j) * s->span[j];
+        for (int k = 0; k < TG_NW; k++)
+            X[i * SIDES + 1 + TG_NU + k] = c->jacobian[i * TG_Z + TG_NX + k];
+    }
+    if (!solve_sides(c->spare, X))
+        return 0;
+    for (int r = 0; r < TG_NY; r++) {
+        const double *C = s->C + r * TG_NX;
+        y[r] = s->y0[r];
+        for (int i = 0; i < TG_NX; i++) {
+            y[r] += C[i] * (x[i] + X[i * SIDES]);
+            for (int j = 0; j < TG_NU; j++)
+                G[r * TG_NU + j] += C[i] * X[i * SIDES + 1 + j];
+        }
+    }
+    return 1;
+}
+
+/* The same outputs of a plant that is linear, and settles. */
+static void settle(const tg_design *s, const double *u, const double *d, const double *on_u, double *y, double *G)
+{
+    for (int r = 0; r < TG_NY; r++) {
+        const double *by = s->settled_by + r * TG_NV;
+        y[r] = s->settled[r];
+        for (int j = 0; j < TG_NU; j++) {
+            G[r * TG_NU + j] = by[j];
+            y[r] += by[j] * (u[j] + on_u[j]) / s->span[j];
+        }
+        for (int j = 0; j < TG_ND; j++)
+            y[r] += by[TG_NU + j] * d[j];
+    }
+}
+
 int tg_find_steady(tg_controller *c, const double *d, const double *on_u, const double *on_y, double *held, double *by_w)
 {
     const tg_design *s = c->design;
-    double keep[TG_NX], x[TG_NX], u[TG_NU], both[TG_NU] = {0.0}, next[TG_NX] = {0.0}, X[TG_NX * SIDES] = {0.0};
+    double x[TG_NX], u[TG_NU], X[TG_NX * SIDES] = {0.0};
     double G[TG_NY * TG_NU] = {0.0}, y[TG_NY] = {0.0}, low[TG_NU] = {0.0}, high[TG_NU] = {0.0}, z[TG_NU] = {0.0};
     int found = 0;
-    memcpy(keep, c->x, sizeof keep);
     memcpy(x, c->has_steady ? c->steady_x : tg_now(c), sizeof x);
     memcpy(u, c->has_steady ? c->steady_u : c->u, sizeof u);
     c->has_steady = 0;
     for (int j = 0; j < TG_NU; j++)
         u[j] = fmin(fmax(u[j], s->lowest[j]), s->highest[j]);
     for (int step = 0; step < STEADY_STEPS && !found; step++) {
-        double *slopes;
         double moved = 0.0;
-        for (int j = 0; j < TG_NU; j++)
-            both[j] = u[j] + on_u[j];
-        memcpy(c->x, x, sizeof x);
-        slopes = sample_jacobian(c, both, d, next);
-        memcpy(c->x, keep, sizeof keep);
-        for (int i = 0; i < TG_NX; i++) {
-            for (int j = 0; j < TG_NX; j++)
-                c->spare[i * TG_NX + j] = (i == j ? 1.0 : 0.0) - *entry(slopes, TG_NX, i, j);
-            X[i * SIDES] = next[i] - x[i];
-            for (int j = 0; j < TG_NU; j++)
-                X[i * SIDES + 1 + j] = *entry(slopes, TG_NX, i, TG_NX + j) * s->span[j];
-            for (int k = 0; k < TG_NW; k++)
-                X[i * SIDES + 1 + TG_NU + k] = c->jacobian[i * TG_Z + TG_NX + k];
-        }
-        if (!solve_sides(c->spare, X))
+        memset(G, 0, sizeof G);
+        if (s->settles)
+            settle(s, u, d, on_u, y, G);
+        else if (!look_for_steady(c, x, u, d, on_u, X, y, G))
             return 0;
-        for (int r = 0; r < TG_NY; r++) {
-            const double *C = s->C + r * TG_NX;
-            y[r] = s->y0[r] + on_y[r];
-            for (int j = 0; j < TG_NU; j++)
-                G[r * TG_NU + j] = 0.0;
-            for (int i = 0; i < TG_NX; i++) {
-                y[r] += C[i] * (x[i] + X[i * SIDES]);
-                for (int j = 0; j < TG_NU; j++)
-                    G[r * TG_NU + j] += C[i] * X[i * SIDES + 1 + j];
-            }
-        }
+        for (int r = 0; r < TG_NY; r++)
+            y[r] += on_y[r];
         range_of(s, G, u, on_u, low, high);
         nearest(c, G, y, low, high, z);
-        for (int i = 0; i < TG_NX; i++) {
+        for (int i = 0; i < TG_NX && !s->settles; i++) {
             moved = fmax(moved, fabs(X[i * SIDES]));
             x[i] += X[i * SIDES];
             for (int j = 0; j < TG_NU; j++)
@@ -617,9 +655,10 @@ int tg_find_steady(tg_controller *c, const double *d, const double *on_u, const 
         for (int j = 0; j < TG_NU; j++)
             held[r] += G[i * TG_NU + j] * z[j];
         for (int k = 0; k < TG_NW; k++) {
-            by_w[r * TG_SOME(TG_NW) + k] = s->on_output[i * TG_NW + k];
-            for (int j = 0; j < TG_NX; j++)
-                by_w[r * TG_SOME(TG_NW) + k] += s->C[i * TG_NX + j] * X[j * SIDES + 1 + TG_NU + k];
+            double *by = by_w + r * TG_SOME(TG_NW) + k;
+            *by = s->on_output[i * TG_NW + k] + (s->settles ? s->settled_by[i * TG_NV + TG_NU + TG_ND + k] : 0.0);
+            for (int j = 0; j < TG_NX && !s->settles; j++)
+                *by += s->C[i * TG_NX + j] * X[j * SIDES + 1 + TG_NU + k];
         }
     }
     memcpy(c->steady_x, x, sizeof x);
@@ -628,48 +667,60 @@ int tg_find_steady(tg_controller *c, const double *d, const double *on_u, const 
     return found;
 }
 
-/* P = J P J'. J is sparse in its last rows, and often in all; its columns are taken four at a time. */
+/* Add the rows of M that a row of a matrix asks for, n numbers each, four at a time; it is 0 but from..to. */
+static void add_rows(double *restrict into, const double *row, int from, int to, const double *restrict M, int n)
+{
+    int k = from;
+    for (; k + 4 <= to; k += 4) {
+        const double *M0 = M + k * TG_Z, *M1 = M0 + TG_Z, *M2 = M1 + TG_Z, *M3 = M2 + TG_Z;
+        const double s0 = row[k], s1 = row[k + 1], s2 = row[k + 2], s3 = row[k + 3];
+        if (s0 == 0.0 && s1 == 0.0 && s2 == 0.0 && s3 == 0.0)
+            continue;
+        for (int j = 0; j < n; j++)
+            into[j] += s0 * M0[j] + s1 * M1[j] + (s2 * M2[j] + s3 * M3[j]);
+    }
+    for (; k < to; k++)
+        for (int j = 0; row[k] != 0.0 && j < n; j++)
+            into[j] += row[k] * M[k * TG_Z + j];
+}
+
+/* Where a row of the Jacobian begins and ends: what is left out is less than what its sums are rounded by. */
+static void find_band(const double *row, int *from, int *to)
+{
+    double least = 0.0;
+    for (int j = 0; j < TG_Z; j++)
+        least += row[j] * row[j];
+    least *= ROUNDED * ROUNDED;
+    for (*from = 0; *from < TG_Z && row[*from] * row[*from] <= least;)
+        ++*from;
+    for (*to = TG_Z; *to > *from && row[*to - 1] * row[*to - 1] <= least;)
+        --*to;
+}
+
+/* P = J P J', twice by rows of J, which is sparse in its last rows, and often in all: J P, and J times its transpose,
+ * of whose rows, which are symmetric, the second half is the first of others. */
 static void carry_covariance(tg_controller *c)
 {
+    int from[TG_Z], to[TG_Z];
     memset(c->spare, 0, sizeof c->spare);
     for (int i = 0; i < TG_Z; i++) {
-        const double *J = c->jacobian + i * TG_Z;
-        double *restrict row = c->spare + i * TG_Z;
-        int k = 0;
-        for (; k + 4 <= TG_Z; k += 4) {
-            const double *P = c->P + k * TG_Z, *P1 = P + TG_Z, *P2 = P1 + TG_Z, *P3 = P2 + TG_Z;
-            const double J0 = J[k], J1 = J[k + 1], J2 = J[k + 2], J3 = J[k + 3];
-            if (J0 == 0.0 && J1 == 0.0 && J2 == 0.0 && J3 == 0.0)
-                continue;
-            for (int j = 0; j < TG_Z; j++)
-                row[j] += J0 * P[j] + J1 * P1[j] + (J2 * P2[j] + J3 * P3[j]);
-        }
-        for (; k < TG_Z; k++)
-            for (int j = 0; j < TG_Z; j++)
-                row[j] += J[k] * c->P[k * TG_Z + j];
+        find_band(c->jacobian + i * TG_Z, from + i, to + i);
+        add_rows(c->spare + i * TG_Z, c->jacobian + i * TG_Z, from[i], to[i], c->P, TG_Z);
     }
+    for (int i = 0; i < TG_Z; i++)
+        for (int j = 0; j < i; j++) {
+            double swap = c->spare[i * TG_Z + j];
+            c->spare[i * TG_Z + j] = c->spare[j * TG_Z + i];
+            c->spare[j * TG_Z + i] = swap;
+        }
+    memset(c->P, 0, sizeof c->P);
     for (int i = 0; i < TG_Z; i++) {
-        const double *row = c->spare + i * TG_Z;
-        int j = 0;
-        for (; j + 4 <= i + 1; j += 4) {
-            const double *J = c->jacobian + j * TG_Z, *J1 = J + TG_Z, *J2 = J1 + TG_Z, *J3 = J2 + TG_Z;
-            double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0;
-            for (int k = 0; k < TG_Z; k++) {
-                s0 += row[k] * J[k];
-                s1 += row[k] * J1[k];
-                s2 += row[k] * J2[k];
-                s3 += row[k] * J3[k];
-            }
-            c->P[i * TG_Z + j] = s0;
-            c->P[i * TG_Z + j + 1] = s1;
-            c->P[i * TG_Z + j + 2] = s2;
-            c->P[i * TG_Z + j + 3] = s3;
-        }
-        for (; j <= i; j++)
-            c->P[i * TG_Z + j] = seen_by(c->jacobian + j * TG_Z, row);
-        for (j = 0; j < i; j++)
-            c->P[j * TG_Z + i] = c->P[i * TG_Z + j];
+        int n = TG_WHOLE(i + 1) < TG_Z ? TG_WHOLE(i + 1) : TG_Z;
+        add_rows(c->P + i * TG_Z, c->jacobian + i * TG_Z, from[i], to[i], c->spare, n);
     }
+    for (int i = 0; i < TG_Z; i++)
+        for (int j = 0; j < i; j++)
+            c->P[j * TG_Z + i] = c->P[i * TG_Z + j];
 }
 
 void tg_observer_predict(tg_controller *c, const double *u, const double *d)

@@ -12,7 +12,8 @@
  * remains, and no block goes further.  Where the simulated cost of the QP's plan is above that of the guess, or
  * every fifth sample, shorter moves and plain ramps are tried too: near the optimum of a Peltier element the
  * linearisation overestimates the effect, and beyond it the gain changes sign.
- * Of a linear plant G, and the factor of H while the weights stay, are made once, and the QP's plan is the best.
+ * Of a linear plant G, and the factor of H while the weights stay, are made once, what the state makes of the outputs
+ * is in the design, and the QP's plan is the best.
  */
 #include "tg_controller.h"
 #include "tg_model.h"
@@ -23,7 +24,11 @@
 #define SAFE 0.75  /* of the way to the optimum, where the range runs on beyond it */
 #define LOOK_AROUND 5
 #define BARELY 1.02
+#ifdef TG_SINGLE
+#define LITTLE 1e-5
+#else
 #define LITTLE 1e-7 /* of its range, that a parked drive may be off in the program */
+#endif
 #define NONE 1e30
 
 static int row_of(const tg_design *s, int r) { return r < s->n_c ? s->controlled[r] : s->limited[r - s->n_c]; }
@@ -87,9 +92,8 @@ static void park(const tg_controller *c, const double *last, double *plan)
             }
 }
 
-/* Outputs of a plan, sample by sample, plus the output bias. */
-static void simulate(tg_controller *c, const double *start, const double *plan, const double *drive_bias,
-                     const double *d, const double *bias, double *y)
+void tg_simulate(tg_controller *c, const double *start, const double *plan, const double *drive_bias, const double *d,
+                 const double *bias, double *y)
 {
     const tg_design *s = c->design;
     double both[2][TG_NX], *x = both[0], *next = both[1], u[TG_NU];
@@ -191,6 +195,10 @@ static void find_authority(tg_controller *c)
 /* The target of controlled output r in sample k of the prediction. */
 static double goal(const tg_controller *c, const double *target, int k, int r)
 {
+#if TG_NR > 0
+    if (c->ramps)
+        return c->path[k * c->design->n_c + r];
+#endif
     return c->goals ? c->goals[k * c->design->n_c + r] : target[r];
 }
 
@@ -202,7 +210,7 @@ static double merit(const tg_controller *c, const double *plan, const double *y,
     double cost = 0.0, over = 0.0;
     for (int b = 0; b < s->n_b; b++)
         for (int j = 0; j < TG_NU; j++) {
-            double value = plan[b * TG_NU + j], energy = s->energy[j] * s->blocks[b];
+            double value = plan[b * TG_NU + j], energy = s->energy[j] * c->dear[b];
             double step = (value - (b ? plan[(b - 1) * TG_NU + j] : last[j])) / s->span[j];
             cost += c->caution * s->move * step * step;
             value /= s->span[j];
@@ -288,7 +296,7 @@ static void set_linear_cost(tg_controller *c, const double *target, const double
     tg_qp *q = &c->qp;
     memset(q->f, 0, sizeof q->f);
     for (int i = 0; i < q->n; i++)
-        q->f[i] = s->energy[i % TG_NU] * s->blocks[i / TG_NU];
+        q->f[i] = s->energy[i % TG_NU] * c->dear[i / TG_NU];
     for (int k = 0; k < s->N; k++)
         for (int r = 0; r < s->n_c; r++) {
             const double *g = response(c, k, r);
@@ -372,20 +380,51 @@ static void set_soft_rows(tg_controller *c, const double *target, const double *
         }
 }
 
-/* The outputs that count, by the gains under another plan than the guess, k rows of across numbers each. */
-static void follow_gains(const tg_controller *c, const double *guess, const double *plan, double *out, int across,
-                         int as_outputs)
+#if TG_NO > 0
+/* The outputs that count of a linear plant, without any plan, by state, disturbances and biases of drives. */
+static void free_by_state(tg_controller *c, const double *x, const double *drive_bias, const double *d,
+                          const double *bias)
+{
+    const tg_design *s = c->design;
+    double z[TG_Q_W] = {0.0};
+    int at = 0;
+    for (int i = 0; i < s->n_b * TG_NU; i++)
+        z[i] = drive_bias[i % TG_NU] / s->span[i % TG_NU];
+    for (int k = 0; k < s->N; k++)
+        for (int r = 0; r < s->n_c + s->n_l; r++, at++) {
+            double sum = s->by_none[at] + bias[row_of(s, r)] + tg_product(response(c, k, r), z, length(c, k));
+            for (int j = 0; j < TG_NX; j++)
+                sum += s->by_x[at * TG_NX + j] * x[j];
+            for (int j = 0; j < TG_ND; j++)
+                sum += s->by_d[at * TG_ND + j] * d[j];
+            c->free[k * TG_NS + r] = sum;
+        }
+}
+#else
+/* The outputs that count, without any plan, by the gains under the guess, whose outputs are known. */
+static void free_by_gains(tg_controller *c, const double *guess)
 {
     const tg_design *s = c->design;
     double z[TG_Q_W] = {0.0};
     for (int i = 0; i < s->n_b * TG_NU; i++)
-        z[i] = (plan[i] - guess[i]) / s->span[i % TG_NU];
+        z[i] = guess[i] / s->span[i % TG_NU];
     for (int k = 0; k < s->N; k++)
-        for (int r = 0; r < s->n_c + s->n_l; r++) {
-            const double *g = response(c, k, r);
-            double y = c->y_guess[k * TG_NY + row_of(s, r)] + tg_product(g, z, length(c, k));
-            out[k * across + (as_outputs ? row_of(s, r) : r)] = y;
-        }
+        for (int r = 0; r < s->n_c + s->n_l; r++)
+            c->free[k * TG_NS + r] =
+                c->y_guess[k * TG_NY + row_of(s, r)] - tg_product(response(c, k, r), z, length(c, k));
+}
+#endif
+
+/* The outputs that count of a linear plant under a plan. */
+static void follow_gains(const tg_controller *c, const double *plan, double *y)
+{
+    const tg_design *s = c->design;
+    double z[TG_Q_W] = {0.0};
+    for (int i = 0; i < s->n_b * TG_NU; i++)
+        z[i] = plan[i] / s->span[i % TG_NU];
+    for (int k = 0; k < s->N; k++)
+        for (int r = 0; r < s->n_c + s->n_l; r++)
+            y[k * TG_NY + row_of(s, r)] = c->free[k * TG_NS + r] + tg_product(response(c, k, r), z, length(c, k));
 }
 
 /* Keep a plan where it is the best so far. */
@@ -394,7 +433,7 @@ static void consider(tg_controller *c, const double *x, const double *plan, cons
                      const double *last, double *least)
 {
     double cost;
-    simulate(c, x, plan, drive_bias, d, bias, c->y_try);
+    tg_simulate(c, x, plan, drive_bias, d, bias, c->y_try);
     cost = BARELY * merit(c, plan, c->y_try, target, side, last);
     if (cost < *least) { /* a plan that is hardly better is not worth a jump */
         *least = cost;
@@ -456,7 +495,7 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
 {
     const tg_design *s = c->design;
     tg_qp *q = &c->qp;
-    double at_guess, cost, guess[TG_Q_N], side[TG_NC], none[TG_Q_N] = {0.0};
+    double at_guess, cost, guess[TG_Q_N], side[TG_NC];
     int uphill;
     q->n = s->n_b * TG_NU;
     q->stride = TG_NU;
@@ -468,15 +507,17 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
     memcpy(guess, start, (size_t)q->n * sizeof(double));
     park(c, last, guess);
     for (int r = 0; r < s->n_c; r++)
-        side[r] = c->lost[r] || c->goals ? 0.0 : from[r]; /* nothing is beyond a target that moves */
-    if (s->linear && c->has_gains)
-        simulate(c, x, guess, drive_bias, d, bias, c->y_guess);
-    else {
+        side[r] = c->lost[r] || c->goals || c->ramps ? 0.0 : from[r]; /* nothing is beyond a target that moves */
+    if (!s->linear || !c->has_gains) {
         linearise(c, x, guess, drive_bias, d, bias);
         find_authority(c);
         c->has_gains = s->linear;
     }
-    follow_gains(c, guess, none, c->free, TG_NS, 0); /* the response without any plan */
+#if TG_NO > 0
+    free_by_state(c, x, drive_bias, d, bias);
+#else
+    free_by_gains(c, guess);
+#endif
     q->kept = is_kept(c);
     if (!q->kept)
         set_quadratic_cost(c);
@@ -488,19 +529,18 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
     c->qp_status = tg_qp_solve(q);
     c->iterations = q->iterations;
     c->broken = 0.0;
-    memcpy(c->y_best, c->y_guess, sizeof c->y_best);
     if (c->qp_status != TG_QP_SOLVED)
         return c->qp_status;
     for (int i = 0; i < q->n; i++)
         c->best[i] = q->x[i] * s->span[i % TG_NU];
     park(c, last, c->best);
     if (s->linear) {
-        follow_gains(c, guess, c->best, c->y_best, TG_NY, 1); /* of a linear plant */
+        follow_gains(c, c->best, c->y_best);
         find_broken(c);
         return c->qp_status;
     }
     at_guess = merit(c, guess, c->y_guess, target, side, last);
-    simulate(c, x, c->best, drive_bias, d, bias, c->y_best);
+    tg_simulate(c, x, c->best, drive_bias, d, bias, c->y_best);
     cost = merit(c, c->best, c->y_best, target, side, last);
     c->solves++;
     uphill = cost > at_guess;

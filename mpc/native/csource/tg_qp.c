@@ -19,7 +19,13 @@
  * Rows may depend on one another: a range and a sum of slews that ends on it.  Every K_ii therefore includes a
  * share of 1e-11 of itself, which keeps the factor regular and the dual strictly concave; multipliers that
  * contradict each other diverge until one reaches its bound. The effect of that share on x is removed at
- * the end by one step of refinement with K itself. Hard rows that cannot be fulfilled together show there.
+ * the end by a step of refinement with K itself (in single numbers, whose share is 3e-7, by as many as it takes). Hard rows that cannot be fulfilled together show there.
+ *
+ * Soft rows may be broken by the dozen, the others are hardly more than there are unknowns. Where soft rows are many
+ * (TG_Q_LEAN), the broken ones, b, are eliminated from K z = r, D their diagonal:
+ *
+ *     S = I + sum_b m m'/D,     T = M S^-1 M' + 1e-11 diag(K),     M the normals of the others, h,
+ *     T z_h = r_h - M S^-1 g,   g = sum_b m r_b/D,   v = S^-1 (M' z_h + g),   z_b = (r_b - m'v)/D.
  */
 #include "tg_qp.h"
 
@@ -27,11 +33,25 @@
 #include <string.h>
 
 #define FAR 1e15
+#ifdef TG_SINGLE
+#define LARGEST 3.4e38
+#define TOLERANCE 1e-5
+#define REGULAR 3e-7
+#define CONTRADICTION 3e-2
+#define SHORT 1e-3
+#define CONVEX 1e-6
+#define REACHED 1e-6
+#define REFINEMENTS 8
+#else
 #define LARGEST 1.7e308 /* number that is finite */
 #define TOLERANCE 1e-10 /* of a row, in units of its own length */
 #define REGULAR 1e-11   /* share of K_ii that keeps its factor regular */
 #define CONTRADICTION 1e-6 /* by which a hard row may stay broken, in units of its length */
 #define SHORT 1e-5      /* a soft row shorter than this cannot be kept by any plan */
+#define CONVEX 1e-14    /* of H_ii, that a pivot is at least */
+#define REACHED 1e-13   /* of the largest multiplier: what ends by less beyond its bound is on it */
+#define REFINEMENTS 1
+#endif
 
 static double *fit_row(tg_qp *q, int i) { return q->fit + (size_t)i * (size_t)(i + 1) / 2; }
 
@@ -141,7 +161,7 @@ static int factorise(tg_qp *q)
         }
         for (; k < i; k++) /* below its diagonal row k is 0 */
             tg_add_row(row + from, -q->H[(size_t)k * TG_Q_W + (size_t)i], q->H + (size_t)k * TG_Q_W + from, end - from);
-        if (!(row[i] > 1e-14 * q->weight[i] * q->weight[i]))
+        if (!(row[i] > CONVEX * q->weight[i] * q->weight[i]))
             return 0;
         inverse = 1.0 / sqrt(row[i]);
         for (int j = from; j < i; j++)
@@ -193,6 +213,19 @@ static void backward(const tg_qp *q, double *b)
         }
     }
 }
+
+#if TG_Q_LEAN
+/* Replace b by U'^-1 b of S = U'U; it is 0 behind entry n. */
+static void forward_root(const tg_qp *q, double *b)
+{
+    for (int i = 0; i < q->n; i++) {
+        const double *row = q->root + (size_t)i * TG_Q_W;
+        b[i] /= row[i];
+        for (int j = i + 1; j < q->n; j++)
+            b[j] -= row[j] * b[i];
+    }
+}
+#endif
 
 static double value_of(const tg_qp *q, int row)
 {
@@ -249,13 +282,100 @@ static void set_right(tg_qp *q, int i)
     q->right[i] = sum + (q->state[i] == 2 ? 1.0 / ratio_of(q, q->row[i]) : 0.0);
 }
 
+/* What of its multiplier row i of the set gives way by: the share that keeps K regular, and its price. */
+static void set_give(tg_qp *q, int i)
+{
+    const double *m = q->normal + (size_t)i * TG_Q_W + q->from[i];
+    q->give[i] = REGULAR * tg_product(m, m, TG_WHOLE(q->n) - q->from[i]);
+    if (q->state[i] == 2)
+        q->give[i] += 1.0 / (ratio_of(q, q->row[i]) * price_of(q, q->row[i]));
+}
+
+#if TG_Q_LEAN
+/* Add a share of a normal's product with itself to S. */
+static void add_broken(tg_qp *q, int i, double share)
+{
+    const double *m = q->normal + (size_t)i * TG_Q_W;
+    int n = TG_WHOLE(q->n);
+    for (int j = q->from[i]; j < q->n; j++)
+        if (m[j] != 0.0)
+            tg_add_row(q->soft + (size_t)j * TG_Q_W + (j & ~3), share * m[j], m + (j & ~3), n - (j & ~3));
+}
+
+static void append_fit(tg_qp *q, int i)
+{
+    q->stale = 1;
+    if (q->state[i] == 2)
+        add_broken(q, i, 1.0 / q->give[i]);
+}
+
+static void remove_fit(tg_qp *q, int r)
+{
+    q->stale = 1;
+    if (q->state[r] == 2)
+        add_broken(q, r, -1.0 / q->give[r]);
+}
+
+/* The set begins anew. */
+static void clear_fit(tg_qp *q)
+{
+    memset(q->soft, 0, (size_t)q->n * TG_Q_W * sizeof(double));
+    for (int j = 0; j < q->n; j++)
+        q->soft[(size_t)j * (TG_Q_W + 1)] = 1.0;
+    q->stale = 1;
+}
+
+/* Make U of S = U'U, and the factor of T; 0 where there is no room. */
+static int make_fit(tg_qp *q)
+{
+    int n = q->n, end = TG_WHOLE(n);
+    q->n_other = 0;
+    for (int i = 0; i < q->n_work; i++) {
+        if (q->state[i] == 2)
+            continue;
+        if (q->n_other == TG_Q_K)
+            return 0;
+        q->other[q->n_other++] = i;
+    }
+    q->stale = 0;
+    memcpy(q->root, q->soft, (size_t)n * TG_Q_W * sizeof(double));
+    for (int i = 0; i < n; i++) {
+        double *row = q->root + (size_t)i * TG_Q_W, inverse;
+        for (int k = 0; k < i; k++) {
+            const double *u = q->root + (size_t)k * TG_Q_W;
+            if (u[i] != 0.0)
+                tg_add_row(row + (i & ~3), -u[i], u + (i & ~3), end - (i & ~3));
+        }
+        inverse = 1.0 / sqrt(row[i]); /* S is at least 1 */
+        for (int j = i & ~3; j < end; j++)
+            row[j] *= j < i ? 0.0 : inverse;
+    }
+    for (int a = 0; a < q->n_other; a++) {
+        double *seen = q->seen + (size_t)a * TG_Q_W, *row = fit_row(q, a), left;
+        memcpy(seen, q->normal + (size_t)q->other[a] * TG_Q_W, TG_Q_W * sizeof *seen);
+        forward_root(q, seen);
+        for (int b = 0; b < a; b++)
+            row[b] = tg_product(seen, q->seen + (size_t)b * TG_Q_W, end);
+        left = tg_product(seen, seen, end) + q->give[q->other[a]];
+        for (int b = 1; b < a; b++)
+            row[b] -= dot(fit_row(q, b), row, b);
+        for (int b = 0; b < a; b++) {
+            double scaled = row[b] / q->pivot[b];
+            left -= scaled * row[b];
+            row[b] = scaled;
+        }
+        row[a] = 1.0;
+        q->pivot[a] = left;
+    }
+    return 1;
+}
+#else
 /* Append the factor's row i, whose normal is in place. */
 static void append_fit(tg_qp *q, int i)
 {
     const double *m = q->normal + (size_t)i * TG_Q_W;
     int n = TG_WHOLE(q->n);
-    double *row = fit_row(q, i), left = tg_product(m + q->from[i], m + q->from[i], n - q->from[i]);
-    left += REGULAR * left + (q->state[i] == 2 ? 1.0 / (ratio_of(q, q->row[i]) * price_of(q, q->row[i])) : 0.0);
+    double *row = fit_row(q, i), left = tg_product(m + q->from[i], m + q->from[i], n - q->from[i]) + q->give[i];
     for (int k = 0; k < i; k++) {
         int from = q->from[i] > q->from[k] ? q->from[i] : q->from[k];
         row[k] = tg_product(m + from, q->normal + (size_t)k * TG_Q_W + from, n - from);
@@ -300,8 +420,13 @@ static void remove_fit(tg_qp *q, int r)
     }
 }
 
+static void clear_fit(tg_qp *q) { q->stale = 0; }
+static int make_fit(tg_qp *q) { return !q->stale; }
+#endif
+
 static void move_entry(tg_qp *q, int from, int to)
 {
+    q->give[to] = q->give[from];
     memmove(q->normal + (size_t)to * TG_Q_W, q->normal + (size_t)from * TG_Q_W, TG_Q_W * sizeof(double));
     q->row[to] = q->row[from];
     q->from[to] = q->from[from];
@@ -322,7 +447,7 @@ static void drop(tg_qp *q, int r)
 }
 
 static double least(const tg_qp *q, int i) { return q->state[i] == 2 ? price_of(q, q->row[i]) : 0.0; }
-static double most(const tg_qp *q, int i) { return q->state[i] == 1 ? price_of(q, q->row[i]) : HUGE_VAL; }
+static double most(const tg_qp *q, int i) { return q->state[i] == 1 ? price_of(q, q->row[i]) : INFINITY; }
 
 /* Take a row into the set. */
 static void put(tg_qp *q, int row, int side, int state, double multiplier)
@@ -335,6 +460,7 @@ static void put(tg_qp *q, int row, int side, int state, double multiplier)
     q->multiplier[i] = multiplier;
     q->in_set[row] = 1;
     set_right(q, i);
+    set_give(q, i);
     append_fit(q, i);
 }
 
@@ -349,15 +475,15 @@ static void change(tg_qp *q, int r, int upward)
         put(q, row, side, 1, price_of(q, row));
 }
 
-/* Replace b by the solution of K z = b, by the factor. */
-static void solve_fit(const tg_qp *q, double *b)
+/* Replace b, n numbers, by the solution by the factor, whose own dimension that is. */
+static void solve_factor(const tg_qp *q, double *b, int n)
 {
     tg_qp *open = (tg_qp *)q; /* fit_row reads only */
-    for (int i = 1; i < q->n_work; i++)
+    for (int i = 1; i < n; i++)
         b[i] -= dot(fit_row(open, i), b, i);
-    for (int i = q->n_work - 1; i >= 0; i--)
+    for (int i = n - 1; i >= 0; i--)
         b[i] /= q->pivot[i];
-    for (int i = q->n_work - 1; i >= 0; i--) {
+    for (int i = n - 1; i >= 0; i--) {
         const double *row = fit_row(open, i);
         int whole = i & ~3;
         tg_add_row(b, -b[i], row, whole);
@@ -365,6 +491,37 @@ static void solve_fit(const tg_qp *q, double *b)
             b[j] -= row[j] * b[i];
     }
 }
+
+/* Replace b by the solution of K z = b. */
+#if TG_Q_LEAN
+static void solve_fit(const tg_qp *q, double *b)
+{
+    double v[TG_Q_W] = {0.0}, z[TG_Q_K] = {0.0};
+    int end = TG_WHOLE(q->n);
+    for (int i = 0; i < q->n_work; i++)
+        if (q->state[i] == 2)
+            tg_add_row(v, b[i] / q->give[i], q->normal + (size_t)i * TG_Q_W, end);
+    forward_root(q, v);
+    for (int a = 0; a < q->n_other; a++)
+        z[a] = b[q->other[a]] - tg_product(q->seen + (size_t)a * TG_Q_W, v, end);
+    solve_factor(q, z, q->n_other);
+    for (int a = 0; a < q->n_other; a++) {
+        b[q->other[a]] = z[a];
+        tg_add_row(v, z[a], q->seen + (size_t)a * TG_Q_W, end);
+    }
+    for (int i = q->n - 1; i >= 0; i--) {
+        const double *row = q->root + (size_t)i * TG_Q_W;
+        for (int j = i + 1; j < q->n; j++)
+            v[i] -= row[j] * v[j];
+        v[i] /= row[i];
+    }
+    for (int i = 0; i < q->n_work; i++)
+        if (q->state[i] == 2)
+            b[i] = (b[i] - tg_product(q->normal + (size_t)i * TG_Q_W, v, end)) / q->give[i];
+}
+#else
+static void solve_fit(const tg_qp *q, double *b) { solve_factor(q, b, q->n_work); }
+#endif
 
 static void make_x(tg_qp *q)
 {
@@ -390,7 +547,7 @@ static int go(tg_qp *q, int *upward)
     for (int i = 0; i < q->n_work; i++)
         scale = fmax(scale, fabs(q->wanted[i]));
     for (int i = 0; i < q->n_work; i++) {
-        double low = least(q, i), high = most(q, i), slack = 1e-13 * scale;
+        double low = least(q, i), high = most(q, i), slack = REACHED * scale;
         double there = q->wanted[i], here = q->multiplier[i], part = 1.0;
         if (there < low - slack)
             part = here > low ? (here - low) / (here - there) : 0.0;
@@ -448,6 +605,7 @@ static void take_up(tg_qp *q, int same)
     if (same)
         return;
     q->n_work = 0;
+    clear_fit(q);
     for (int i = 0; i < kept; i++) {
         int row = q->row[i], side = q->side[i], state = q->state[i];
         double multiplier = q->multiplier[i], bound;
@@ -492,7 +650,8 @@ static int failed(tg_qp *q, int status)
 int tg_qp_solve(tg_qp *q)
 {
     int row = 0, side = 0, upward = 0, which;
-    int same = q->kept && !q->iterations; /* a factor that was updated is made anew, or its errors would add up */
+    /* a factor that was updated is made anew, or its errors would add up */
+    int same = q->kept && !q->iterations && q->n_work > 0;
     q->iterations = 0;
     if (!problem_is_finite(q))
         return failed(q, TG_QP_NOT_FINITE);
@@ -510,6 +669,8 @@ int tg_qp_solve(tg_qp *q)
     while (q->iterations <= q->iteration_limit) {
         if (q->late && q->late(q->about))
             return failed(q, TG_QP_TIME);
+        if (q->stale && !make_fit(q))
+            break;
         which = go(q, &upward);
         if (which >= 0) {
             q->iterations++;
@@ -518,7 +679,10 @@ int tg_qp_solve(tg_qp *q)
         }
         make_x(q);
         if (!worst(q, &row, &side)) {
-            if (!refine(q))
+            int held = 0;
+            for (int turn = 0; turn < REFINEMENTS && !held; turn++)
+                held = refine(q);
+            if (!held)
                 return failed(q, TG_QP_INFEASIBLE);
             return all_finite(q->x, q->n) ? TG_QP_SOLVED : failed(q, TG_QP_NOT_FINITE);
         }
