@@ -28,12 +28,14 @@ _HOPELESS = {1: 6000.0, 2: 2000.0, 3: 1000.0, 4: 1000.0, 5: 1000.0} | dict.fromk
 # ended within 25 nats none was farther than 147 behind before a step, 54 after any number; what is left
 # at less than 300 is a start for finer points beside, which then end elsewhere
 _HOPELESS_STATED = {0: 500.0} | dict.fromkeys(range(1, 99), 300.0)
+_BENT, _SHORTEST = 1.5, 0.05  # times the quadratic model's curvature, from which on steps are shorter; part of one
 _LEAST_DECREASE = 0.01  # of -2 ln posterior: smaller predicted decreases end the search
 _H, _BUILD_UP, _ONSET, _LEVEL, _T, _E, _C = range(7)
 _LEFT = 7  # the column of what is left, after those of the derivatives
 _FEW = 3  # columns
 RATE = 5  # the row of the slope, after the stepped curves
-_CURVES = (_H, _BUILD_UP, _E, _C, _ONSET)  # by which the curves after the value are derivatives
+_CURVES = np.array([_H, _BUILD_UP, _E, _C, _ONSET])  # by which the curves after the value are derivatives
+_CONTACT = np.array([_E, _C, _H, _BUILD_UP])
 EARLIEST_ONSET, LATEST_ONSET = -1.5, 0.8  # s after the closed message
 
 Nodes = tuple[Array, NDArray[np.int64], Array]
@@ -58,14 +60,14 @@ class Asked(NamedTuple):
 
 def readings(asked: Asked, u: Array, vary: Mask, *, alike: bool = False) -> tuple[Array, Array]:
     """Return the bin means (n, n_bin) that ``u`` (n, 7) predicts, and their derivatives (n, n_bin, 8), zero
-    where not ``vary`` (n, 7), with a last column for the caller's use; ``alike`` says that many contacts are
-    the same but for onset and temperatures."""
+    where not ``vary`` (n, 7), with what is left of the data in the last column; ``alike`` says that many
+    contacts are the same but for onset and temperatures."""
     data, row = asked.data, asked.row
     wanted = np.ones((row.size, RATE + 1), dtype=bool)
     wanted[:, 1:] = vary[:, _CURVES]
-    onset = np.clip(u[:, _ONSET], EARLIEST_ONSET, LATEST_ONSET)
+    onset = np.minimum(np.maximum(u[:, _ONSET], EARLIEST_ONSET), LATEST_ONSET)
     wanted[:, RATE] &= onset == u[:, _ONSET]  # past the range nothing moves
-    numbers, which = np.ascontiguousarray(u[:, (_E, _C, _H, _BUILD_UP)]), np.arange(row.size)
+    numbers, which = u.take(_CONTACT, axis=1), np.arange(row.size)
     stepped = wanted[:, :N_STEPPED]
     if alike:
         key = numbers.view(f"V{numbers.itemsize * numbers.shape[1]}").ravel()
@@ -73,20 +75,14 @@ def readings(asked: Asked, u: Array, vary: Mask, *, alike: bool = False) -> tupl
         numbers, every = numbers[first], np.zeros((first.size, N_STEPPED), dtype=bool)
         np.logical_or.at(every, which, stepped)
         stepped = every
-    means = _means(asked, numbers, np.ascontiguousarray(stepped), which, onset, wanted)
-    room = data.t_ambient[row]
-    known = np.isfinite(room)
-    late = np.exp(2.0 * (u[:, _C] - u[:, _E])) / 6.0
-    # the block goes to the room by its far face at ``rate`` [1/s], ``way`` [K]
-    far, leak = asked.gripper.numbers[:, 5], np.where(known, asked.gripper.numbers[:, 6], 0.0)
-    rate, way = np.where(known, far * np.exp(-u[:, _C]), 0.0), np.where(known, room - u[:, _T], 0.0)
-    n_bin, away = data.y.shape[1], np.where(known, leak * (room - u[:, _LEVEL]), 0.0)
+    means = _means(asked, numbers, stepped, which, onset, wanted)
+    n_bin = data.y.shape[1]
     y, slopes = np.empty((row.size, n_bin)), np.empty((row.size, n_bin, _LEFT + 1))
-    late, leak = np.where(rate > 0.0, late, -1.0), np.broadcast_to(leak, row.size)
-    loss, scratch = np.stack([late, rate, way, away, leak], axis=1), np.empty((16, n_bin))
+    scratch = np.empty((16, n_bin))
     predicted(
-        means, wanted, row, data.count, data.t, data.ramp, asked.beyond, u, vary, loss, scratch, y, slopes
-    )
+        means, wanted, row, data.count, data.t, data.ramp, data.y, data.t_ambient[row], asked.gripper.numbers,
+        asked.beyond, u, vary, scratch, y, slopes,
+    )  # fmt: skip
     return y, slopes
 
 
@@ -97,17 +93,16 @@ def _means(
     4), ``which`` of these belongs to each pair; before contact zero."""
     nodes, gripper, data, row, _, table = asked
     out = np.empty((row.size, RATE + 1, data.y.shape[1]))
-    common = np.zeros(row.size, dtype=bool)
     if table is not None and data.common is not None:
         common = data.common[row] & table.inside(numbers)[which]
-    if common.all():
-        table.bin_means(data.sample_t, data.sample_bin, row, numbers, stepped, which, onset, wanted, out)
-        return out
-    if common.any():
-        for own in (common, ~common):
-            used, at = np.unique(which[own], return_inverse=True)
-            out[own] = _means(asked.take(own), numbers[used], stepped[used], at, onset[own], wanted[own])
-        return out
+        if common.all():
+            table.bin_means(data.sample_t, data.sample_bin, row, numbers, stepped, which, onset, wanted, out)
+            return out
+        if common.any():
+            for own in (common, ~common):
+                used, at = np.unique(which[own], return_inverse=True)
+                out[own] = _means(asked.take(own), numbers[used], stepped[used], at, onset[own], wanted[own])
+            return out
     contact = np.exp(numbers)
     rise, slope = (
         contacts(nodes, gripper, contact, stepped)[:2] if table is None else table.curves(contact, stepped)
@@ -179,21 +174,26 @@ def bin_means(
 
 @numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
 def predicted(
-    means: Array, wanted: Mask, row: NDArray[np.int64], count: Array, t: Array, ramp: Array, beyond: Array,
-    u: Array, vary: Mask, loss: Array, room: Array, y: Array, slopes: Array,
+    means: Array, wanted: Mask, row: NDArray[np.int64], count: Array, t: Array, ramp: Array, read: Array,
+    ambient: Array, numbers: Array, beyond: Array, u: Array, vary: Mask, room: Array, y: Array, slopes: Array,
 ) -> None:  # fmt: skip
     """Fill ``y`` (n, n_bin) and ``slopes`` (n, n_bin, 8) of :func:`readings` from the ``means`` (n, 6, n_bin)
-    of ``wanted`` curves, the last of them the slope of the first.
+    of ``wanted`` curves, the last of them the slope of the first; ``read`` are the touches' bin means.
 
-    Where ``late``, first of ``loss`` (n, 5), is not negative, a curve's integral up to ``late`` before, and
-    its value there, count too: by straight lines between the bins with a ``count``, zero before them.  The
-    others of ``loss`` are rate, way, drift of the level and leak."""
+    Where the ``ambient`` temperature is known the block goes to the room by its far face at ``rate`` [1/s],
+    ``way`` [K], which counts ``late`` [s] later: a curve's integral up to ``late`` before, and its value
+    there, by straight lines between the bins with a ``count``, zero before them."""
     n_curve, n_bin = wanted.shape[1], t.shape[1]
     # bins on either side, -1 before the first, and integrals
     before, after, whole = room[0], room[1], room[2]
     delayed, shifted = room[4:10], room[10:16]
     for p in range(row.size):
-        i, late, own = row[p], loss[p, 0], means[p]
+        i, own, k = row[p], means[p], min(p, numbers.shape[0] - 1)
+        warmth, rate, way, leak, away = ambient[p], 0.0, 0.0, 0.0, 0.0
+        if np.isfinite(warmth):
+            rate, way, leak = numbers[k, 5] * np.exp(-u[p, _C]), warmth - u[p, _T], numbers[k, 6]
+            away = leak * (warmth - u[p, _LEVEL])
+        late = np.exp(2.0 * (u[p, _C] - u[p, _E])) / 6.0 if rate > 0.0 else -1.0
         delayed[:], shifted[:] = 0.0, 0.0
         if late >= 0.0:
             low = high = -1
@@ -228,13 +228,13 @@ def predicted(
                             bend = (own[c, high] - own[c, low]) / (t[i, high] - t[i, low])
                         delayed[c, m] = whole[low] + ahead * (own[c, low] + 0.5 * bend * ahead)
                         shifted[c, m] = own[c, low] + bend * ahead
-        rate, way, difference = loss[p, 1], loss[p, 2], u[p, _T] - u[p, _LEVEL]
+        difference = u[p, _T] - u[p, _LEVEL]
         for m in range(n_bin):
             f, lost = own[VALUE, m] + beyond[p, 1, m], rate * delayed[VALUE, m]
-            y[p, m] = u[p, _LEVEL] + difference * f + way * lost + loss[p, 3] * ramp[i, m] + beyond[p, 0, m]
+            y[p, m] = u[p, _LEVEL] + difference * f + way * lost + away * ramp[i, m] + beyond[p, 0, m]
             slopes[p, m, _T] = f - lost if vary[p, _T] else 0.0
-            slopes[p, m, _LEVEL] = 1.0 - f - loss[p, 4] * ramp[i, m] if vary[p, _LEVEL] else 0.0
-            slopes[p, m, _LEFT] = 0.0
+            slopes[p, m, _LEVEL] = 1.0 - f - leak * ramp[i, m] if vary[p, _LEVEL] else 0.0
+            slopes[p, m, _LEFT] = read[i, m] - y[p, m]
         for c in range(1, n_curve):
             at, by_late = _CURVES[c - 1], 0.0
             if at == _E:  # a denser or less conducting block passes the loss on later
@@ -254,20 +254,13 @@ def predicted(
                 slopes[p, m, at] = scale * own[c, m] + passed * extra
 
 
-def products(
-    asked: Asked, whitener: Any, u: Array, sd: Array, *, alike: bool = False
-) -> Array:  # fmt: skip
+def products(asked: Asked, whitener: Any, u: Array, sd: Array, *, alike: bool = False) -> Array:
     """Return J' J, and J' r and r' r in the last row and column, (n, 8, 8): J in units of ``sd`` (n, 7), r
     the readings less those that ``u`` predicts, both whitened."""
-    y, columns = readings(asked, u, sd > 0.0, alike=alike)
-    np.subtract(asked.data.y[asked.row], y, out=columns[:, :, _LEFT])
-    scale, matrix = np.ones((len(u), _LEFT + 1)), np.zeros((len(u), _LEFT + 1, _LEFT + 1))
+    columns = readings(asked, u, sd > 0.0, alike=alike)[1]
+    scale = np.ones((len(u), _LEFT + 1))
     scale[:, :_LEFT] = sd
-    used = np.flatnonzero((scale > 0.0).any(axis=0))
-    if used.size > _FEW:
-        matrix = squares(whitener, asked.row, columns)
-    else:
-        matrix[:, used[:, None], used] = squares(whitener, asked.row, columns[:, :, used])
+    matrix = squares(whitener, asked.row, columns)
     matrix *= scale[:, :, None]
     matrix *= scale[:, None, :]
     return matrix
@@ -278,20 +271,25 @@ def squares(whitener: Any, row: NDArray[np.int64], columns: Array) -> Array:
     :class:`~thermogrip.sysid.effusivity.data.Whitener` or by a matrix a touch."""
     alone = isinstance(whitener, np.ndarray)
     kinds, kind = (whitener, row) if alone else (whitener.kinds, whitener.kind[row])
+    if len(kinds) == 1:
+        return _squares(kinds[0], columns, None if alone else whitener.scale[row])
     out = np.empty((row.size, columns.shape[2], columns.shape[2]))
     for k in np.unique(kind):
         at: Any = slice(None) if (kind == k).all() else kind == k
-        own = columns[at]
-        if own.shape[2] > _FEW:
-            white = np.matmul(kinds[k], own)
-        else:  # one product of large matrices is quicker than many of few columns
-            across = own.transpose(0, 2, 1)
-            white = np.matmul(across.reshape(-1, across.shape[2]), kinds[k].T)
-            white = white.reshape(across.shape).transpose(0, 2, 1)
-        if not alone:
-            white *= whitener.scale[row[at], :, None]
-        out[at] = np.matmul(white.transpose(0, 2, 1), white)
+        out[at] = _squares(kinds[k], columns[at], None if alone else whitener.scale[row[at]])
     return out
+
+
+def _squares(matrix: Array, columns: Array, scale: Array | None) -> Array:
+    if columns.shape[2] > _FEW:
+        white = np.matmul(matrix, columns)
+    else:  # one product of large matrices is quicker than many of few columns
+        across = columns.transpose(0, 2, 1)
+        white = np.matmul(across.reshape(-1, across.shape[2]), matrix.T)
+        white = white.reshape(across.shape).transpose(0, 2, 1)
+    if scale is not None:
+        white *= scale[:, :, None]
+    return np.asarray(np.matmul(white.transpose(0, 2, 1), white))
 
 
 class Penalty(NamedTuple):
@@ -306,17 +304,66 @@ class Penalty(NamedTuple):
 def penalty(u: Array, mean: Array, sd: Array, dof: Array) -> Penalty:
     """Return the penalty of points ``u`` (n, 7): normal where ``dof`` is infinite, else Student's t; none and
     curvature 1 where ``sd`` is zero."""
-    vary = sd > 0.0
-    w = np.divide(u - mean, sd, out=np.zeros(u.shape), where=vary)
-    square, slope, one = w * w, w, np.ones(u.shape)
-    heavy = vary & np.isfinite(dof)
-    if not heavy.any():
-        return Penalty(square.sum(axis=1), slope, one, one)
-    nu = np.where(heavy, dof, 1.0)
-    bound = np.where(heavy, (nu + 1.0) / (nu + square), 1.0)
-    own = np.where(heavy, np.maximum(bound * (nu - square) / (nu + square), 1e-3), 1.0)
-    value = np.where(heavy, (nu + 1.0) * np.log1p(square / nu), square)
-    return Penalty(value.sum(axis=1), slope * bound, bound, own)
+    return Law.of(mean, sd, dof).penalty(u)
+
+
+class Law(NamedTuple):
+    """A prior as the search takes it: mean, 1 / sd, 0 where that is zero, and 1 / degrees of freedom, 0 where
+    these are infinite, (n, 7) each; whether some are not."""
+
+    mean: Array
+    per_sd: Array
+    per_dof: Array
+    heavy: bool
+
+    @classmethod
+    def of(cls, mean: Array, sd: Array, dof: Array) -> Law:
+        """Return the law of means, sds and degrees of freedom."""
+        vary = sd > 0.0
+        per_dof = np.where(vary, 1.0 / dof, 0.0)
+        return cls(mean, vary / np.where(vary, sd, 1.0), per_dof, bool(per_dof.any()))
+
+    def take(self, index: Any) -> Law:
+        """Return some of the pairs' laws."""
+        return Law(self.mean[index], self.per_sd[index], self.per_dof[index], self.heavy)
+
+    def penalty(self, u: Array) -> Penalty:
+        """Return the penalty of points ``u`` (n, 7)."""
+        w = (u - self.mean) * self.per_sd
+        square = w * w
+        if not self.heavy:
+            one = np.ones(u.shape)
+            return Penalty(square.sum(axis=1), w, one, one)
+        k = self.per_dof
+        far = square * k
+        tail = 1.0 + far
+        bound = (1.0 + k) / tail
+        own = np.maximum(bound * (1.0 - far) / tail, 1e-3)
+        value = np.log1p(far) * (1.0 + k) / np.maximum(k, 1e-300)
+        return Penalty(np.where(k > 0.0, value, square).sum(axis=1), w * bound, bound, own)
+
+
+class _Search(NamedTuple):
+    """Where pairs are on their way to the mode: what was the best point of each, and what to try next."""
+
+    at: NDArray[np.int64]  # which pairs
+    asked: Asked
+    law: Law
+    sd: Array
+    trial: Array
+    point: Array
+    cost: Array
+    matrix: Array
+    slope: Array
+    bound: Array
+    damping: Array
+    part: Array  # of the next steps
+    slope_gain: Array  # what the trial's step should gain by its slope, and lose by its bend
+    bend: Array
+
+    def take(self, index: Any) -> _Search:
+        """Return some of the pairs."""
+        return _Search(*(part.take(index) if isinstance(part, Asked | Law) else part[index] for part in self))
 
 
 def modes(
@@ -328,77 +375,108 @@ def modes(
     The prior of each is its ``law`` (n, 3, 7): mean, sd, degrees of freedom.  The objective is -2 ln
     (likelihood x prior density relative to its peak) + ln det of its curvature in units of sd.  Where pairs
     of one row are ``rivals``, one that is hopeless beside the best of them is left there, unsettled.
+
+    Where readings are not explained, they may bend along a step twice as much as their slopes say, so that
+    whole steps go to and fro across the mode.  So what a step gains tells how much they bend along it, and
+    where that is more than 1.5 times the quadratic model's the next step is as much shorter.
     """
     n, (mean, sd, dof) = len(u), law.transpose(1, 0, 2)
-    trial, damping = u.copy(), np.full(n, 1e-2)
-    at, settled, diagonal = np.arange(n), np.zeros(n, dtype=bool), np.arange(_LEFT)
-    cost, matrix, slope, bound = np.full(n, np.inf), np.zeros((n, 8, 8)), np.zeros((n, 7)), np.ones((n, 7))
-    best, ahead, stated = np.empty(asked.data.level.size), cost.copy(), np.isfinite(asked.data.t_object)
+    whole, diagonal = Law.of(mean, sd, dof), np.arange(_LEFT)
+    none, settled = np.full(n, np.inf), np.zeros(n, dtype=bool)
+    cost, matrix = none.copy(), np.empty((n, 8, 8))
+    best, ahead, stated = np.empty(asked.data.level.size), none.copy(), np.isfinite(asked.data.t_object)
+    here = _Search(
+        np.arange(n), asked, whole, sd, u.copy(), u, none, matrix, u, u, np.full(n, 1e-2), none, none, none
+    )
     for step in range(max_steps + 1):
-        there = _products_of(asked, at, whitener, trial, sd, alike=step == 0)
-        off = penalty(trial[at], mean[at], sd[at], dof[at])
-        tried = there[:, _LEFT, _LEFT] + off.value
-        better = (tried < cost[at]) | (step == 0)
-        new = at[better]
-        u[new], cost[new], matrix[new] = trial[new], tried[better], there[better]
-        slope[new], bound[new] = off.slope[better], off.bound[better]
-        damping[at] = np.where(better, np.maximum(damping[at] * 0.1, 1e-9), damping[at] * 10.0)
-        at = at[damping[at] <= 1e9]
-        if step == max_steps or not at.size:
-            break
-        rhs, curved = matrix[at, :_LEFT, _LEFT] - slope[at], matrix[at, :_LEFT, :_LEFT]
-        curved[:, diagonal, diagonal] += bound[at]
+        here = _moved(here, _products_of(here.asked, whitener, here.trial, here.sd, alike=step == 0), step)
+        rhs, curved = here.matrix[:, :_LEFT, _LEFT] - here.slope, here.matrix[:, :_LEFT, :_LEFT].copy()
+        curved[:, diagonal, diagonal] += here.bound
         last = np.linalg.solve(curved, rhs[:, :, None])[:, :, 0]
         decrease = (last * rhs).sum(axis=1)
         near = decrease < _LEAST_DECREASE
-        u[at[near]] += last[near] * sd[at[near]]
-        cost[at[near]] -= decrease[near]
-        settled[at[near]] = True
-        left = ~near
+        left = ~near & (here.damping <= 1e9)
+        if step == max_steps:
+            near[:], left[:] = False, False
         if rivals:
             best.fill(np.inf)
-            ahead[at] = cost[at] - np.where(near, 0.0, decrease)  # of those near it is taken off
+            ahead[here.at] = here.cost - decrease
             np.minimum.at(best, asked.row, ahead)
             limit = np.where(stated, _HOPELESS_STATED[step], _HOPELESS.get(step, np.inf))
-            left &= ahead[at] < (best + limit)[asked.row[at]]
-        at, curved, rhs = at[left], curved[left], rhs[left]
-        if not at.size:
-            break
-        curved[:, diagonal, diagonal] *= 1.0 + damping[at, None]
-        move = np.linalg.solve(curved, rhs[:, :, None])[:, :, 0] * sd[at]
-        longest = np.abs(move[:, (_H, _BUILD_UP, _E, _C)]).max(axis=1)  # no logarithm moves too far
-        trial[at] = u[at] + np.minimum(1.0, _LONGEST / np.maximum(longest, 1e-300))[:, None] * move
+            left &= ahead[here.at] < (best + limit)[here.asked.row]
+        if not left.all():
+            done = ~left
+            at = here.at[done]
+            u[at] = here.point[done] + np.where(near[done, None], last[done] * here.sd[done], 0.0)
+            cost[at] = here.cost[done] - np.where(near[done], decrease[done], 0.0)
+            matrix[at], settled[at] = here.matrix[done], near[done]
+            if done.all():
+                break
+            here, curved, rhs = here.take(left), curved[left], rhs[left]
+        own = curved[:, diagonal, diagonal]
+        curved[:, diagonal, diagonal] = own * (1.0 + here.damping[:, None])
+        move = np.linalg.solve(curved, rhs[:, :, None])[:, :, 0]
+        gain, kept = (move * rhs).sum(axis=1), here.damping * (own * move**2).sum(axis=1)
+        move *= here.sd
+        # no logarithm moves too far
+        longest = np.abs(move.take(_CONTACT, axis=1)).max(axis=1)
+        part = np.minimum(here.part, _LONGEST / np.maximum(longest, 1e-300))
+        here = here._replace(
+            trial=here.point + part[:, None] * move, slope_gain=2.0 * part * gain,
+            bend=part * part * (gain - kept),
+        )  # fmt: skip
     curved = matrix[:, :_LEFT, :_LEFT]
-    curved[:, diagonal, diagonal] += penalty(u, mean, sd, dof).own
+    curved[:, diagonal, diagonal] += whole.penalty(u).own
     inverse = np.linalg.inv(curved)
     covariance = 0.5 * (inverse + inverse.transpose(0, 2, 1)) * (sd[:, :, None] * sd[:, None, :])
     return covariance, cost + np.linalg.slogdet(curved)[1], matrix[:, _LEFT, _LEFT], settled
 
 
-def _products_of(
-    asked: Asked, at: NDArray[np.int64], whitener: Any, u: Array, sd: Array, *, alike: bool
-) -> Array:
-    """Return :func:`products` of some pairs, so many at once that they stay in the processor's cache."""
-    out = np.empty((at.size, _LEFT + 1, _LEFT + 1))
-    for begin in range(0, at.size, _AT_ONCE):
-        part = at[begin : begin + _AT_ONCE]
-        out[begin : begin + _AT_ONCE] = products(asked.take(part), whitener, u[part], sd[part], alike=alike)
-    return out
+def _moved(here: _Search, there: Array, step: int) -> _Search:
+    """Return where pairs are after they were tried, and how the next steps are damped."""
+    off = here.law.penalty(here.trial)
+    tried, damping = there[:, _LEFT, _LEFT] + off.value, here.damping
+    new = here._replace(point=here.trial, cost=tried, matrix=there, slope=off.slope, bound=off.bound)
+    if step == 0:
+        return new._replace(damping=0.1 * damping, part=np.ones(tried.size))
+    better = tried < here.cost
+    bent = (here.slope_gain + tried - here.cost) / here.bend
+    new = new._replace(
+        damping=np.where(better, np.maximum(damping * 0.1, 1e-9), damping * 10.0),
+        part=np.where(bent > _BENT, np.maximum(1.0 / np.maximum(bent, 1.0), _SHORTEST), 1.0),
+    )
+    if better.all():
+        return new
+    row = better[:, None]
+    return new._replace(
+        point=np.where(row, here.trial, here.point), cost=np.where(better, tried, here.cost),
+        matrix=np.where(row[:, :, None], there, here.matrix), slope=np.where(row, off.slope, here.slope),
+        bound=np.where(row, off.bound, here.bound),
+    )  # fmt: skip
+
+
+def _products_of(asked: Asked, whitener: Any, u: Array, sd: Array, *, alike: bool) -> Array:
+    """Return :func:`products`, of so many pairs at once that they stay in the processor's cache."""
+    if len(u) <= _AT_ONCE:
+        return products(asked, whitener, u, sd, alike=alike)
+    parts = [slice(begin, begin + _AT_ONCE) for begin in range(0, len(u), _AT_ONCE)]
+    return np.concatenate([products(asked.take(p), whitener, u[p], sd[p], alike=alike) for p in parts])
 
 
 def marginals(asked: Asked, whitener: Any, u: Array, sd: Array) -> Array:
     """Return ln p(y | u) up to a constant for points ``u`` (n, 7), integrated over level and T_obj, whose
     prior means are in ``u``; ``sd`` (m, n, 2) are their sds, each with a row of the answer (m, n)."""
-    at, out = [_LEVEL, _T], np.empty((len(sd), len(u)))
+    at, out = [_LEVEL, _T, _LEFT], np.empty((len(sd), len(u)))
     for begin in range(0, len(u), _AT_ONCE):
         part = slice(begin, begin + _AT_ONCE)
-        n = len(u[part])
-        unit = np.zeros((n, 7))
-        unit[:, at] = 1.0
+        vary = np.zeros((len(u[part]), _LEFT), dtype=bool)
+        vary[:, at[:2]] = True
         some = asked.take(part)
-        known = products(some, whitener, u[part], unit, alike=bool((some.row == some.row[0]).all()))
-        (a, b), d = (known[:, k, k] for k in at), known[:, _LEVEL, _T]
-        (g, h), square = (known[:, k, _LEFT] for k in at), known[:, _LEFT, _LEFT]
+        alike = bool((some.row == some.row[0]).all())
+        columns = readings(some, u[part], vary, alike=alike)[1].take(at, axis=2)
+        known = squares(whitener, some.row, columns)
+        a, b, d, square = known[:, 0, 0], known[:, 1, 1], known[:, 0, 1], known[:, 2, 2]
+        g, h = known[:, 0, 2], known[:, 1, 2]
         for row, (s, t) in zip(out, sd[:, part].transpose(0, 2, 1)):
             p, q, r = 1.0 + s * s * a, 1.0 + t * t * b, s * t * d
             det = p * q - r * r

@@ -90,10 +90,12 @@ def means_of(nodes, rise, slope, times, bins, *, onset=0.0, late=-1.0):
         np.array(nodes, dtype=float), curves, bent, wanted, at, np.array([onset]), at, times, bins, count,
         np.empty((7, n)), means,
     )  # fmt: skip
+    u, numbers = np.zeros((1, 7)), np.zeros((1, 7))
+    if late >= 0:  # (C / e)^2 / 6, by a block that loses heat to its room
+        u[0, 6], numbers[0, 5] = 0.5 * np.log(6 * late + 1e-30), 1.0
     kernel.predicted.py_func(
-        means, wanted, at, count, times, times, np.zeros((1, 2, n)), np.zeros((1, 7)),
-        np.zeros((1, 7), dtype=bool), np.array([[late, 0.0, 0.0, 0.0, 0.0]]), room, np.empty((1, n)),
-        np.empty((1, n, 8)),
+        means, wanted, at, count, times, times, times, np.zeros(1), numbers, np.zeros((1, 2, n)), u,
+        np.zeros((1, 7), dtype=bool), room, np.empty((1, n)), np.empty((1, n, 8)),
     )  # fmt: skip
     return means[0, 0], means[0, 5], room[4], room[10]
 
