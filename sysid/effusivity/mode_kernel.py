@@ -9,7 +9,7 @@ NumPy's, for some hundred pairs at once, whose arrays stay in the processor's ca
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,8 @@ _HOPELESS = {1: 6000.0, 2: 2000.0, 3: 1000.0, 4: 1000.0, 5: 1000.0} | dict.fromk
 # ended within 25 nats none was farther than 147 behind before a step, 54 after any number; what is left
 # at less than 300 is a start for finer points beside, which then end elsewhere
 _HOPELESS_STATED = {0: 500.0} | dict.fromkeys(range(1, 99), 300.0)
-_BENT, _SHORTEST = 1.5, 0.05  # times the quadratic model's curvature, from which on steps are shorter; part of one
+# times the quadratic model's curvature: from which on steps are shorter, and from which on they are damped
+_BENT, _FAR = 1.5, 4.0
 _LEAST_DECREASE = 0.01  # of -2 ln posterior: smaller predicted decreases end the search
 _H, _BUILD_UP, _ONSET, _LEVEL, _T, _E, _C = range(7)
 _LEFT = 7  # the column of what is left, after those of the derivatives
@@ -36,6 +37,7 @@ _FEW = 3  # columns
 RATE = 5  # the row of the slope, after the stepped curves
 _CURVES = np.array([_H, _BUILD_UP, _E, _C, _ONSET])  # by which the curves after the value are derivatives
 _CONTACT = np.array([_E, _C, _H, _BUILD_UP])
+_LINEAR = np.array([_LEVEL, _T])
 EARLIEST_ONSET, LATEST_ONSET = -1.5, 0.8  # s after the closed message
 
 Nodes = tuple[Array, NDArray[np.int64], Array]
@@ -347,7 +349,6 @@ class _Search(NamedTuple):
     """Where pairs are on their way to the mode: what was the best point of each, and what to try next."""
 
     at: NDArray[np.int64]  # which pairs
-    asked: Asked
     law: Law
     sd: Array
     trial: Array
@@ -363,7 +364,167 @@ class _Search(NamedTuple):
 
     def take(self, index: Any) -> _Search:
         """Return some of the pairs."""
-        return _Search(*(part.take(index) if isinstance(part, Asked | Law) else part[index] for part in self))
+        return _Search(*(part.take(index) if isinstance(part, Law) else part[index] for part in self))
+
+
+class Pairs(Protocol):
+    """What a search asks of its pairs, ``at`` some of them."""
+
+    def products(self, at: NDArray[np.int64], u: Array, *, first: bool) -> Array:
+        """Return J' J, and J' r and r' r in the last row and column, J in units of the priors' sds."""
+        ...
+
+    def longest(self, at: NDArray[np.int64], move: Array) -> Array:
+        """Return by how much steps move the logarithms among the unknowns at most, (n,)."""
+        ...
+
+    def hopeful(self, step: int, at: NDArray[np.int64], cost: Array, decrease: Array) -> Mask | None:
+        """Return which are worth another step beside the others; None for all."""
+        ...
+
+
+class Found(NamedTuple):
+    """Where a search ended: points, products and -2 ln posterior there, and where it settled."""
+
+    u: Array
+    matrix: Array
+    cost: Array
+    settled: Mask
+
+
+def search(
+    pairs: Pairs, law: Law, sd: Array, u: Array, max_steps: int, *, least: float = _LEAST_DECREASE
+) -> Found:
+    """Return where damped Gauss-Newton steps from ``u`` (n, m) end, under priors of a ``law`` and of ``sd``
+    (n, m): where the next step would gain less than ``least``, which then counts as taken.
+
+    Where readings are not explained, they may bend along a step twice as much as their slopes say, so that
+    whole steps go to and fro across the mode.  So what a step gains tells how much they bend along it, and
+    where that is more than 1.5 times the quadratic model's the next step is as much shorter.
+    """
+    n, m = u.shape
+    diagonal, none = np.arange(m), np.full(n, np.inf)
+    found = Found(u.copy(), np.empty((n, m + 1, m + 1)), none.copy(), np.zeros(n, dtype=bool))
+    here = _Search(np.arange(n), law, sd, u, u, none, found.matrix, u, u, np.full(n, 1e-2), none, none, none)
+    for step in range(max_steps + 1):
+        here = _moved(*_refitted(here, pairs.products(here.at, here.trial, first=step == 0)), step)
+        rhs, curved = here.matrix[:, :m, m] - here.slope, here.matrix[:, :m, :m].copy()
+        curved[:, diagonal, diagonal] += here.bound
+        last = np.linalg.solve(curved, rhs[:, :, None])[:, :, 0]
+        decrease = (last * rhs).sum(axis=1)
+        near = decrease < least
+        left = ~near & (here.damping <= 1e9)
+        if step == max_steps:
+            near[:], left[:] = False, False
+        hopeful = pairs.hopeful(step, here.at, here.cost, decrease)
+        if hopeful is not None:
+            left &= hopeful
+        if not left.all():
+            done = ~left
+            at = here.at[done]
+            found.u[at] = here.point[done] + np.where(near[done, None], last[done] * here.sd[done], 0.0)
+            found.cost[at] = here.cost[done] - np.where(near[done], decrease[done], 0.0)
+            found.matrix[at], found.settled[at] = here.matrix[done], near[done]
+            if done.all():
+                break
+            here, curved, rhs = here.take(left), curved[left], rhs[left]
+        own = curved[:, diagonal, diagonal]
+        curved[:, diagonal, diagonal] = own * (1.0 + here.damping[:, None])
+        move = np.linalg.solve(curved, rhs[:, :, None])[:, :, 0]
+        gain, kept = (move * rhs).sum(axis=1), here.damping * (own * move**2).sum(axis=1)
+        move *= here.sd
+        # no logarithm moves too far
+        part = np.minimum(here.part, _LONGEST / np.maximum(pairs.longest(here.at, move), 1e-300))
+        here = here._replace(
+            trial=here.point + part[:, None] * move, slope_gain=2.0 * part * gain,
+            bend=part * part * (gain - kept),
+        )  # fmt: skip
+    return found
+
+
+def _refitted(here: _Search, there: Array) -> tuple[_Search, Array]:
+    """Return the trials and their products with level and T_obj, in which readings are linear, at their best:
+    these go along with a step in all else, which is larger without bending."""
+    trial, square = here.trial.copy(), there[:, _LINEAR[:, None], _LINEAR]
+    away = (trial[:, _LINEAR] - here.law.mean[:, _LINEAR]) * here.law.per_sd[:, _LINEAR]
+    a, d, b = square[:, 0, 0] + 1.0, square[:, 0, 1], square[:, 1, 1] + 1.0
+    (g, h), before = (there[:, _LINEAR, -1] - away).T, trial[:, _T] - trial[:, _LEVEL]
+    move = np.stack([b * g - d * h, a * h - d * g], axis=1) / (a * b - d * d)[:, None]
+    trial[:, _LINEAR] += move * here.sd[:, _LINEAR]
+    matrix, steps = there.copy(), move[:, None, :]
+    by_move = (there[:, :, _LINEAR] * steps).sum(axis=2)
+    matrix[:, :, -1] -= by_move
+    matrix[:, -1, :-1] = matrix[:, :-1, -1]
+    matrix[:, -1, -1] -= by_move[:, -1] - (square * steps * move[:, :, None]).sum(axis=(1, 2))
+    # other slopes go with the difference of object and skin
+    grown = np.where(
+        np.abs(before) > 0.1, (trial[:, _T] - trial[:, _LEVEL]) / np.where(before == 0.0, 1.0, before), 1.0
+    )
+    scale = np.ones(matrix.shape[:2])
+    scale[:, :-1] = np.minimum(np.maximum(grown, 0.2), 5.0)[:, None]
+    scale[:, _LINEAR] = 1.0
+    matrix *= scale[:, :, None]
+    matrix *= scale[:, None, :]
+    return here._replace(trial=trial), matrix
+
+
+def _moved(here: _Search, there: Array, step: int) -> _Search:
+    """Return where pairs are after they were tried, and how the next steps are made."""
+    off = here.law.penalty(here.trial)
+    tried, damping = there[:, -1, -1] + off.value, here.damping
+    new = here._replace(point=here.trial, cost=tried, matrix=there, slope=off.slope, bound=off.bound)
+    if step == 0:
+        return new._replace(damping=0.1 * damping, part=np.ones(tried.size))
+    better = tried < here.cost
+    bent = (here.slope_gain + tried - here.cost) / here.bend
+    far = bent > _FAR
+    damping = np.where(better, np.maximum(damping * 0.1, 1e-9), damping * 10.0)
+    damping = np.where(far, np.maximum(damping, 0.1 * np.minimum(bent, 1e6)), damping)
+    part = np.where((bent > _BENT) & ~far, 1.0 / np.maximum(bent, 1.0), 1.0)
+    new = new._replace(damping=damping, part=np.where(np.isfinite(tried), part, 0.3 * here.part))
+    if better.all():
+        return new
+    row = better[:, None]
+    return new._replace(
+        point=np.where(row, here.trial, here.point), cost=np.where(better, tried, here.cost),
+        matrix=np.where(row[:, :, None], there, here.matrix), slope=np.where(row, off.slope, here.slope),
+        bound=np.where(row, off.bound, here.bound),
+    )  # fmt: skip
+
+
+class _Touched(NamedTuple):
+    """Pairs of one gripper, as :func:`modes` searches them."""
+
+    asked: Asked
+    whitener: Any
+    sd: Array
+    rivals: bool
+    ahead: Array  # (n,), what the next step should come to
+
+    def products(self, at: NDArray[np.int64], u: Array, *, first: bool) -> Array:
+        """Return the products of some pairs, so many at once that they stay in the processor's cache."""
+        parts = [at[begin : begin + _AT_ONCE] for begin in range(0, at.size, _AT_ONCE)]
+        points = np.split(u, range(_AT_ONCE, at.size, _AT_ONCE))
+        found = [
+            products(self.asked.take(part), self.whitener, point, self.sd[part], alike=first)
+            for part, point in zip(parts, points)
+        ]
+        return found[0] if len(found) == 1 else np.concatenate(found)
+
+    def longest(self, at: NDArray[np.int64], move: Array) -> Array:
+        """Return by how much steps move the logarithms among the unknowns at most, (n,)."""
+        return np.asarray(np.abs(move.take(_CONTACT, axis=1)).max(axis=1))
+
+    def hopeful(self, step: int, at: NDArray[np.int64], cost: Array, decrease: Array) -> Mask | None:
+        """Return which are worth another step beside the best of their touch."""
+        if not self.rivals:
+            return None
+        row, data = self.asked.row, self.asked.data
+        best, stated = np.full(data.level.size, np.inf), np.isfinite(data.t_object)
+        self.ahead[at] = cost - decrease
+        np.minimum.at(best, row, self.ahead)
+        limit = np.where(stated, _HOPELESS_STATED[step], _HOPELESS.get(step, np.inf))
+        return np.asarray(self.ahead[at] < (best + limit)[row[at]])
 
 
 def modes(
@@ -375,92 +536,26 @@ def modes(
     The prior of each is its ``law`` (n, 3, 7): mean, sd, degrees of freedom.  The objective is -2 ln
     (likelihood x prior density relative to its peak) + ln det of its curvature in units of sd.  Where pairs
     of one row are ``rivals``, one that is hopeless beside the best of them is left there, unsettled.
-
-    Where readings are not explained, they may bend along a step twice as much as their slopes say, so that
-    whole steps go to and fro across the mode.  So what a step gains tells how much they bend along it, and
-    where that is more than 1.5 times the quadratic model's the next step is as much shorter.
     """
-    n, (mean, sd, dof) = len(u), law.transpose(1, 0, 2)
-    whole, diagonal = Law.of(mean, sd, dof), np.arange(_LEFT)
-    none, settled = np.full(n, np.inf), np.zeros(n, dtype=bool)
-    cost, matrix = none.copy(), np.empty((n, 8, 8))
-    best, ahead, stated = np.empty(asked.data.level.size), none.copy(), np.isfinite(asked.data.t_object)
-    here = _Search(
-        np.arange(n), asked, whole, sd, u.copy(), u, none, matrix, u, u, np.full(n, 1e-2), none, none, none
-    )
-    for step in range(max_steps + 1):
-        here = _moved(here, _products_of(here.asked, whitener, here.trial, here.sd, alike=step == 0), step)
-        rhs, curved = here.matrix[:, :_LEFT, _LEFT] - here.slope, here.matrix[:, :_LEFT, :_LEFT].copy()
-        curved[:, diagonal, diagonal] += here.bound
-        last = np.linalg.solve(curved, rhs[:, :, None])[:, :, 0]
-        decrease = (last * rhs).sum(axis=1)
-        near = decrease < _LEAST_DECREASE
-        left = ~near & (here.damping <= 1e9)
-        if step == max_steps:
-            near[:], left[:] = False, False
-        if rivals:
-            best.fill(np.inf)
-            ahead[here.at] = here.cost - decrease
-            np.minimum.at(best, asked.row, ahead)
-            limit = np.where(stated, _HOPELESS_STATED[step], _HOPELESS.get(step, np.inf))
-            left &= ahead[here.at] < (best + limit)[here.asked.row]
-        if not left.all():
-            done = ~left
-            at = here.at[done]
-            u[at] = here.point[done] + np.where(near[done, None], last[done] * here.sd[done], 0.0)
-            cost[at] = here.cost[done] - np.where(near[done], decrease[done], 0.0)
-            matrix[at], settled[at] = here.matrix[done], near[done]
-            if done.all():
-                break
-            here, curved, rhs = here.take(left), curved[left], rhs[left]
-        own = curved[:, diagonal, diagonal]
-        curved[:, diagonal, diagonal] = own * (1.0 + here.damping[:, None])
-        move = np.linalg.solve(curved, rhs[:, :, None])[:, :, 0]
-        gain, kept = (move * rhs).sum(axis=1), here.damping * (own * move**2).sum(axis=1)
-        move *= here.sd
-        # no logarithm moves too far
-        longest = np.abs(move.take(_CONTACT, axis=1)).max(axis=1)
-        part = np.minimum(here.part, _LONGEST / np.maximum(longest, 1e-300))
-        here = here._replace(
-            trial=here.point + part[:, None] * move, slope_gain=2.0 * part * gain,
-            bend=part * part * (gain - kept),
-        )  # fmt: skip
-    curved = matrix[:, :_LEFT, :_LEFT]
-    curved[:, diagonal, diagonal] += whole.penalty(u).own
+    (mean, sd, dof), n = law.transpose(1, 0, 2), len(u)
+    own = Law.of(mean, sd, dof)
+    found = search(_Touched(asked, whitener, sd, rivals, np.full(n, np.inf)), own, sd, u, max_steps)
+    u[:] = found.u
+    inverse, log_det = curvature(found.matrix, own.penalty(u).own)
+    covariance = inverse * (sd[:, :, None] * sd[:, None, :])
+    return covariance, found.cost + log_det, found.matrix[:, _LEFT, _LEFT], found.settled
+
+
+def curvature(matrix: Array, own: Array) -> tuple[Array, Array]:
+    """Return the inverse (n, m, m) of the curvatures of ``matrix`` (n, m + 1, m + 1), the priors' ``own`` (n,
+    m) added, and the logarithm of their determinants."""
+    curved, at = matrix[:, :-1, :-1].copy(), np.arange(own.shape[1])
+    curved[:, at, at] += own
+    sign, log_det = np.linalg.slogdet(curved)
+    if not ((sign > 0.0) & np.isfinite(log_det)).all():  # not every LAPACK notices a NaN
+        raise np.linalg.LinAlgError("the curvature of a grasp's posterior is not positive definite")
     inverse = np.linalg.inv(curved)
-    covariance = 0.5 * (inverse + inverse.transpose(0, 2, 1)) * (sd[:, :, None] * sd[:, None, :])
-    return covariance, cost + np.linalg.slogdet(curved)[1], matrix[:, _LEFT, _LEFT], settled
-
-
-def _moved(here: _Search, there: Array, step: int) -> _Search:
-    """Return where pairs are after they were tried, and how the next steps are damped."""
-    off = here.law.penalty(here.trial)
-    tried, damping = there[:, _LEFT, _LEFT] + off.value, here.damping
-    new = here._replace(point=here.trial, cost=tried, matrix=there, slope=off.slope, bound=off.bound)
-    if step == 0:
-        return new._replace(damping=0.1 * damping, part=np.ones(tried.size))
-    better = tried < here.cost
-    bent = (here.slope_gain + tried - here.cost) / here.bend
-    new = new._replace(
-        damping=np.where(better, np.maximum(damping * 0.1, 1e-9), damping * 10.0),
-        part=np.where(bent > _BENT, np.maximum(1.0 / np.maximum(bent, 1.0), _SHORTEST), 1.0),
-    )
-    if better.all():
-        return new
-    row = better[:, None]
-    return new._replace(
-        point=np.where(row, here.trial, here.point), cost=np.where(better, tried, here.cost),
-        matrix=np.where(row[:, :, None], there, here.matrix), slope=np.where(row, off.slope, here.slope),
-        bound=np.where(row, off.bound, here.bound),
-    )  # fmt: skip
-
-
-def _products_of(asked: Asked, whitener: Any, u: Array, sd: Array, *, alike: bool) -> Array:
-    """Return :func:`products`, of so many pairs at once that they stay in the processor's cache."""
-    if len(u) <= _AT_ONCE:
-        return products(asked, whitener, u, sd, alike=alike)
-    parts = [slice(begin, begin + _AT_ONCE) for begin in range(0, len(u), _AT_ONCE)]
-    return np.concatenate([products(asked.take(p), whitener, u[p], sd[p], alike=alike) for p in parts])
+    return 0.5 * (inverse + inverse.transpose(0, 2, 1)), log_det
 
 
 def marginals(asked: Asked, whitener: Any, u: Array, sd: Array) -> Array:
