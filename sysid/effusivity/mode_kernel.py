@@ -30,6 +30,7 @@ _HOPELESS = {1: 6000.0, 2: 2000.0, 3: 1000.0, 4: 1000.0, 5: 1000.0} | dict.fromk
 _HOPELESS_STATED = {0: 500.0} | dict.fromkeys(range(1, 99), 300.0)
 # times the quadratic model's curvature: from which on steps are shorter, and from which on they are damped
 _BENT, _FAR = 1.5, 4.0
+_HARDLY = 1e-3  # a damping that counts as none
 _LEAST_DECREASE = 0.01  # of -2 ln posterior: smaller predicted decreases end the search
 _H, _BUILD_UP, _ONSET, _LEVEL, _T, _E, _C = range(7)
 _LEFT = 7  # the column of what is left, after those of the derivatives
@@ -37,7 +38,6 @@ _FEW = 3  # columns
 RATE = 5  # the row of the slope, after the stepped curves
 _CURVES = np.array([_H, _BUILD_UP, _E, _C, _ONSET])  # by which the curves after the value are derivatives
 _CONTACT = np.array([_E, _C, _H, _BUILD_UP])
-_LINEAR = np.array([_LEVEL, _T])
 EARLIEST_ONSET, LATEST_ONSET = -1.5, 0.8  # s after the closed message
 
 Nodes = tuple[Array, NDArray[np.int64], Array]
@@ -70,7 +70,7 @@ def readings(asked: Asked, u: Array, vary: Mask, *, alike: bool = False) -> tupl
     onset = np.minimum(np.maximum(u[:, _ONSET], EARLIEST_ONSET), LATEST_ONSET)
     wanted[:, RATE] &= onset == u[:, _ONSET]  # past the range nothing moves
     numbers, which = u.take(_CONTACT, axis=1), np.arange(row.size)
-    stepped = wanted[:, :N_STEPPED]
+    stepped = wanted[:, :N_STEPPED].copy()  # for arrays of another layout kernels are compiled anew
     if alike:
         key = numbers.view(f"V{numbers.itemsize * numbers.shape[1]}").ravel()
         _, first, which = np.unique(key, return_index=True, return_inverse=True)
@@ -428,11 +428,18 @@ def search(
             if done.all():
                 break
             here, curved, rhs = here.take(left), curved[left], rhs[left]
-        own = curved[:, diagonal, diagonal]
-        curved[:, diagonal, diagonal] = own * (1.0 + here.damping[:, None])
-        move = np.linalg.solve(curved, rhs[:, :, None])[:, :, 0]
-        gain, kept = (move * rhs).sum(axis=1), here.damping * (own * move**2).sum(axis=1)
-        move *= here.sd
+        gain, kept, move = decrease, 0.0, last
+        if not left.all():
+            gain, move = decrease[left], last[left]
+        damped = here.damping > _HARDLY
+        if damped.any():
+            own = curved[:, diagonal, diagonal]
+            curved[:, diagonal, diagonal] = own * (1.0 + here.damping[:, None])
+            shorter = np.linalg.solve(curved, rhs[:, :, None])[:, :, 0]
+            kept = np.where(damped, here.damping * (own * shorter**2).sum(axis=1), 0.0)
+            move = np.where(damped[:, None], shorter, move)
+            gain = np.where(damped, (shorter * rhs).sum(axis=1), gain)
+        move = move * here.sd
         # no logarithm moves too far
         part = np.minimum(here.part, _LONGEST / np.maximum(pairs.longest(here.at, move), 1e-300))
         here = here._replace(
@@ -445,27 +452,27 @@ def search(
 def _refitted(here: _Search, there: Array) -> tuple[_Search, Array]:
     """Return the trials and their products with level and T_obj, in which readings are linear, at their best:
     these go along with a step in all else, which is larger without bending."""
-    trial, square = here.trial.copy(), there[:, _LINEAR[:, None], _LINEAR]
-    away = (trial[:, _LINEAR] - here.law.mean[:, _LINEAR]) * here.law.per_sd[:, _LINEAR]
-    a, d, b = square[:, 0, 0] + 1.0, square[:, 0, 1], square[:, 1, 1] + 1.0
-    (g, h), before = (there[:, _LINEAR, -1] - away).T, trial[:, _T] - trial[:, _LEVEL]
-    move = np.stack([b * g - d * h, a * h - d * g], axis=1) / (a * b - d * d)[:, None]
-    trial[:, _LINEAR] += move * here.sd[:, _LINEAR]
-    matrix, steps = there.copy(), move[:, None, :]
-    by_move = (there[:, :, _LINEAR] * steps).sum(axis=2)
-    matrix[:, :, -1] -= by_move
-    matrix[:, -1, :-1] = matrix[:, :-1, -1]
-    matrix[:, -1, -1] -= by_move[:, -1] - (square * steps * move[:, :, None]).sum(axis=(1, 2))
+    law, trial, lin = here.law, here.trial.copy(), there[:, _LEVEL : _T + 1]
+    away = ((trial - law.mean) * law.per_sd)[:, _LEVEL : _T + 1]
+    a, d, b = lin[:, 0, _LEVEL] + 1.0, lin[:, 0, _T], lin[:, 1, _T] + 1.0
+    g, h = lin[:, 0, -1] - away[:, 0], lin[:, 1, -1] - away[:, 1]
+    det, before = a * b - d * d, trial[:, _T] - trial[:, _LEVEL]
+    level, warmer = (b * g - d * h) / det, (a * h - d * g) / det
+    trial[:, _LEVEL] += level * here.sd[:, _LEVEL]
+    trial[:, _T] += warmer * here.sd[:, _T]
+    gone = level[:, None] * lin[:, 0] + warmer[:, None] * lin[:, 1]
+    there[:, -1, -1] += level * gone[:, _LEVEL] + warmer * gone[:, _T] - 2.0 * gone[:, -1]
+    there[:, :-1, -1] -= gone[:, :-1]
+    there[:, -1, :-1] = there[:, :-1, -1]
     # other slopes go with the difference of object and skin
-    grown = np.where(
-        np.abs(before) > 0.1, (trial[:, _T] - trial[:, _LEVEL]) / np.where(before == 0.0, 1.0, before), 1.0
-    )
-    scale = np.ones(matrix.shape[:2])
-    scale[:, :-1] = np.minimum(np.maximum(grown, 0.2), 5.0)[:, None]
-    scale[:, _LINEAR] = 1.0
-    matrix *= scale[:, :, None]
-    matrix *= scale[:, None, :]
-    return here._replace(trial=trial), matrix
+    apart = np.abs(before) > 0.1
+    grown = (trial[:, _T] - trial[:, _LEVEL]) / np.where(apart, before, np.inf)
+    scale = np.empty(there.shape[:2])
+    scale[:] = np.where(apart, np.minimum(np.maximum(grown, 0.2), 5.0), 1.0)[:, None]
+    scale[:, _LEVEL : _T + 1] = scale[:, -1:] = 1.0
+    there *= scale[:, :, None]
+    there *= scale[:, None, :]
+    return here._replace(trial=trial), there
 
 
 def _moved(here: _Search, there: Array, step: int) -> _Search:
