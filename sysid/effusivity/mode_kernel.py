@@ -31,6 +31,7 @@ _HOPELESS_STATED = {0: 500.0} | dict.fromkeys(range(1, 99), 300.0)
 # times the quadratic model's curvature: from which on steps are shorter, and from which on they are damped
 _BENT, _FAR = 1.5, 4.0
 _HARDLY = 1e-3  # a damping that counts as none
+_STALE = 0.01  # K that a temperature may move for slopes by the rest to stay
 _LEAST_DECREASE = 0.01  # of -2 ln posterior: smaller predicted decreases end the search
 _H, _BUILD_UP, _ONSET, _LEVEL, _T, _E, _C = range(7)
 _LEFT = 7  # the column of what is left, after those of the derivatives
@@ -361,6 +362,7 @@ class _Search(NamedTuple):
     part: Array  # of the next steps
     slope_gain: Array  # what the trial's step should gain by its slope, and lose by its bend
     bend: Array
+    stale: Mask  # whether slopes at the best point are those of another temperature
 
     def take(self, index: Any) -> _Search:
         """Return some of the pairs."""
@@ -405,14 +407,29 @@ def search(
     n, m = u.shape
     diagonal, none = np.arange(m), np.full(n, np.inf)
     found = Found(u.copy(), np.empty((n, m + 1, m + 1)), none.copy(), np.zeros(n, dtype=bool))
-    here = _Search(np.arange(n), law, sd, u, u, none, found.matrix, u, u, np.full(n, 1e-2), none, none, none)
+    here = _Search(
+        np.arange(n),
+        law,
+        sd,
+        u,
+        u,
+        none,
+        found.matrix,
+        u,
+        u,
+        np.full(n, 1e-2),
+        none,
+        none,
+        none,
+        found.settled,
+    )
     for step in range(max_steps + 1):
         here = _moved(*_refitted(here, pairs.products(here.at, here.trial, first=step == 0)), step)
         rhs, curved = here.matrix[:, :m, m] - here.slope, here.matrix[:, :m, :m].copy()
         curved[:, diagonal, diagonal] += here.bound
         last = np.linalg.solve(curved, rhs[:, :, None])[:, :, 0]
         decrease = (last * rhs).sum(axis=1)
-        near = decrease < least
+        near = (decrease < least) & ~here.stale
         left = ~near & (here.damping <= 1e9)
         if step == max_steps:
             near[:], left[:] = False, False
@@ -442,6 +459,7 @@ def search(
         move = move * here.sd
         # no logarithm moves too far
         part = np.minimum(here.part, _LONGEST / np.maximum(pairs.longest(here.at, move), 1e-300))
+        part = np.where(here.stale, 0.0, part)  # slopes anew before another step
         here = here._replace(
             trial=here.point + part[:, None] * move, slope_gain=2.0 * part * gain,
             bend=part * part * (gain - kept),
@@ -449,9 +467,10 @@ def search(
     return found
 
 
-def _refitted(here: _Search, there: Array) -> tuple[_Search, Array]:
+def _refitted(here: _Search, there: Array) -> tuple[_Search, Array, Mask]:
     """Return the trials and their products with level and T_obj, in which readings are linear, at their best:
-    these go along with a step in all else, which is larger without bending."""
+    these go along with a step in all else, which is larger without bending; and whether other slopes, which
+    go with the difference of object and skin, must be asked for anew."""
     law, trial, lin = here.law, here.trial.copy(), there[:, _LEVEL : _T + 1]
     away = ((trial - law.mean) * law.per_sd)[:, _LEVEL : _T + 1]
     a, d, b = lin[:, 0, _LEVEL] + 1.0, lin[:, 0, _T], lin[:, 1, _T] + 1.0
@@ -464,7 +483,6 @@ def _refitted(here: _Search, there: Array) -> tuple[_Search, Array]:
     there[:, -1, -1] += level * gone[:, _LEVEL] + warmer * gone[:, _T] - 2.0 * gone[:, -1]
     there[:, :-1, -1] -= gone[:, :-1]
     there[:, -1, :-1] = there[:, :-1, -1]
-    # other slopes go with the difference of object and skin
     apart = np.abs(before) > 0.1
     grown = (trial[:, _T] - trial[:, _LEVEL]) / np.where(apart, before, np.inf)
     scale = np.empty(there.shape[:2])
@@ -472,18 +490,23 @@ def _refitted(here: _Search, there: Array) -> tuple[_Search, Array]:
     scale[:, _LEVEL : _T + 1] = scale[:, -1:] = 1.0
     there *= scale[:, :, None]
     there *= scale[:, None, :]
-    return here._replace(trial=trial), there
+    far = ~apart | (grown < 0.2) | (grown > 5.0)
+    stale = far & (np.abs(trial[:, _T] - trial[:, _LEVEL] - before) > _STALE)
+    return here._replace(trial=trial), there, stale
 
 
-def _moved(here: _Search, there: Array, step: int) -> _Search:
+def _moved(here: _Search, there: Array, stale: Mask, step: int) -> _Search:
     """Return where pairs are after they were tried, and how the next steps are made."""
     off = here.law.penalty(here.trial)
     tried, damping = there[:, -1, -1] + off.value, here.damping
-    new = here._replace(point=here.trial, cost=tried, matrix=there, slope=off.slope, bound=off.bound)
+    new = here._replace(
+        point=here.trial, cost=tried, matrix=there, slope=off.slope, bound=off.bound, stale=stale
+    )
     if step == 0:
         return new._replace(damping=0.1 * damping, part=np.ones(tried.size))
-    better = tried < here.cost
-    bent = (here.slope_gain + tried - here.cost) / here.bend
+    better = (tried < here.cost) | here.stale
+    bent = (here.slope_gain + tried - here.cost) / np.maximum(here.bend, 1e-300)
+    bent = np.where(here.stale, 0.0, bent)
     far = bent > _FAR
     damping = np.where(better, np.maximum(damping * 0.1, 1e-9), damping * 10.0)
     damping = np.where(far, np.maximum(damping, 0.1 * np.minimum(bent, 1e6)), damping)
@@ -495,7 +518,7 @@ def _moved(here: _Search, there: Array, step: int) -> _Search:
     return new._replace(
         point=np.where(row, here.trial, here.point), cost=np.where(better, tried, here.cost),
         matrix=np.where(row[:, :, None], there, here.matrix), slope=np.where(row, off.slope, here.slope),
-        bound=np.where(row, off.bound, here.bound),
+        bound=np.where(row, off.bound, here.bound), stale=np.where(better, stale, here.stale),
     )  # fmt: skip
 
 
