@@ -366,7 +366,8 @@ class _Search(NamedTuple):
 
     def take(self, index: Any) -> _Search:
         """Return some of the pairs."""
-        return _Search(*(part.take(index) if isinstance(part, Law) else part[index] for part in self))
+        some: Any = (part.take(index) if isinstance(part, Law) else part[index] for part in self)
+        return _Search(*some)
 
 
 class Pairs(Protocol):
@@ -445,7 +446,7 @@ def search(
             if done.all():
                 break
             here, curved, rhs = here.take(left), curved[left], rhs[left]
-        gain, kept, move = decrease, 0.0, last
+        gain, kept, move = decrease, np.zeros(1), last
         if not left.all():
             gain, move = decrease[left], last[left]
         damped = here.damping > _HARDLY
