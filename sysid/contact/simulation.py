@@ -46,6 +46,7 @@ from thermogrip.datasets.schema import Grasps, make_grasps
 LAYER_NAMES = ("e_outer", "z_outer", "e_inner", "z_inner", "g_back", "g_side", "c_side")  # what shapes modes
 
 _N_OUTER, _N_INNER = 5, 26
+_SEEN = np.array([0, _N_OUTER - 1, _N_OUTER])  # cells at the face and about the sensor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,27 +106,31 @@ def time_nodes(end: float, *, first: float = 0.01, per_group: int = 10) -> TimeN
 @lru_cache(maxsize=64)
 def stack_modes(stack: Stack) -> StackModes:
     """Return the gripper's modes: rise at face and sensor per unit flux into the face."""
-    lam, vectors, _, root, half = _solved(stack)
+    matrix, root, half = _assembled(np.array([[getattr(stack, name) for name in LAYER_NAMES]]))
+    lam, vectors = eigh(matrix[0], check_finite=False, driver="evd")
     return StackModes(*(part[0] for part in _modes(lam[None], vectors[None], root, half)))
 
 
-@lru_cache(maxsize=8)
-def _solved(stack: Stack) -> tuple[Array, Array, Array, Array, Array]:
-    """Return eigenvalues (32,), vectors (32, 32), and what :func:`_assembled` gave."""
-    matrix, root, half = _assembled(np.array([[getattr(stack, name) for name in LAYER_NAMES]]))
-    lam, vectors = eigh(matrix[0], check_finite=False, driver="evd")
-    return lam, vectors, matrix, root, half
-
-
-def nearby_modes(stack: Stack, moved: Array) -> StackModes:
-    """Return modes of n grippers to first order about ``stack``; ``moved`` (n, 7) holds their LAYER_NAMES."""
-    lam, vectors, here, _, _ = _solved(stack)
-    matrix, root, half = _assembled(moved)
-    change = vectors.T @ (matrix - here) @ vectors
-    gap = lam[None, :] - lam[:, None] + np.eye(lam.size)
-    turn = change / gap * (1 - np.eye(lam.size))
-    shifted = lam + np.diagonal(change, axis1=1, axis2=2)
-    return _modes(shifted, vectors + vectors @ turn, root, half)
+def nearby_modes(layers: Array, moved: Array) -> tuple[StackModes, StackModes]:
+    """Return modes of n grippers, whose LAYER_NAMES are ``layers`` (n, 7), and of k about each, ``moved`` (n,
+    k, 7), to first order: arrays (n, ...) and (n k, ...)."""
+    n, k, n_layer = moved.shape
+    here, root, half = _assembled(layers)
+    lam, vectors = np.linalg.eigh(here)
+    base = _modes(lam, vectors, root, half)
+    matrix, root, half = _assembled(moved.reshape(n * k, n_layer))
+    apart = matrix.reshape(n, k, *here.shape[1:]) - here[:, None]
+    change = vectors.transpose(0, 2, 1)[:, None] @ (apart @ vectors[:, None])
+    gap = lam[:, None, :] - lam[:, :, None]
+    at = np.arange(lam.shape[1])
+    gap[:, at, at] = np.inf
+    shifted = lam[:, None] + np.diagonal(change, axis1=2, axis2=3)
+    # of the vectors those nodes that count
+    turned = np.zeros(change.shape)
+    near = vectors[:, _SEEN]
+    turned[:, :, _SEEN] = near[:, None] + near[:, None] @ (change / gap[:, None])
+    size = n * k, lam.shape[1]
+    return base, _modes(shifted.reshape(size), turned.reshape(*size, size[1]), root, half)
 
 
 def _assembled(layers: Array) -> tuple[Array, Array, Array]:

@@ -85,71 +85,87 @@ class Slabs(NamedTuple):
 
 def slabs(effusivity: Array, capacity: Array, far: float | Array) -> Slabs:
     """Return the modes of slabs that lose ``far`` [W m^-2 K^-1] by their far faces."""
-    e, c = effusivity[:, None], capacity[:, None]
-    unit, biot = (e / c) ** 2, np.reshape(far, (-1, 1)) * c / e**2
+    modes, _, series = _slabs(effusivity, capacity, far, moved=False)
+    return Slabs(modes[:, 0], modes[:, 1], series[:, 0])
+
+
+def slab_moves(effusivity: Array, capacity: Array, far: float | Array) -> tuple[Array, Array]:
+    """Return derivatives (n, 4, N_MODE) of ln rate and ln weight by ln e, then by ln C, and those (n, 2) of
+    the series resistance."""
+    _, moves, series = _slabs(effusivity, capacity, far, moved=True)
+    return moves, series[:, 1:]
+
+
+def _slabs(
+    effusivity: Array, capacity: Array, far: float | Array, *, moved: bool
+) -> tuple[Array, Array, Array]:
+    """Return what :func:`slab_modes` fills for slabs alone."""
+    n, numbers = effusivity.size, np.zeros((np.size(far), 7))
+    numbers[:, 5] = far
+    modes, moves = np.empty((n, 4, N_MODE)), np.empty((n if moved else 0, 4, N_MODE))
+    series = np.empty((n, 3))
+    slab_modes(np.stack([effusivity, capacity], axis=1), numbers, 1.0, _NODE, _SHARE, modes, moves, series)
+    return modes, moves, series
+
+
+@numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
+def slab_modes(
+    contact: Array, numbers: Array, step: float, node: Array, shares: Array, modes: Array, moves: Array,
+    series: Array,
+) -> None:  # fmt: skip
+    """Fill rates, weights and 1 - exp(-rate ``step``) of slabs' modes, rows 0, 1 and 3 of ``modes`` (n, 4,
+    N_MODE or more), the resistance before them and its derivatives by ln e and ln C, ``series`` (n, 3), and,
+    where ``moves`` (n, 4, N_MODE) has rows, derivatives of ln rate and ln weight by ln e, then by ln C.
+
+    ``contact`` (n, 2 or more) begins with effusivity and heat capacity, ``numbers`` are those of
+    :class:`Gripper`, ``node`` and ``shares`` those of the quadrature."""
     start = _N_EXACT - 0.5
-    top = np.maximum(np.sqrt(_FASTEST / unit) / np.pi, 3 * start)
-    span = np.log(top / start)
-    y, share = np.empty((e.size, N_MODE)), np.empty((e.size, N_MODE))
-    y[:, :_N_GROUPED] = start * np.exp(0.5 * span * (1 + _NODE))
-    y[:, _N_GROUPED:] = np.arange(N_MODE - _N_GROUPED)[::-1]
-    share[:, :_N_GROUPED], share[:, _N_GROUPED:] = span * _SHARE * y[:, :_N_GROUPED], 2.0
-    # next Euler-Maclaurin term, f'(start)/24 as a difference of the modes on either side
-    share[:, _N_GROUPED + 1] *= 1 - 1 / 24
-    share[:, _N_GROUPED] *= 1 / 24
-    beta = _eigenvalues(y, biot)
-    square = beta**2 + biot**2
-    # of a mode that nothing damps half
-    share *= np.divide(square, square + biot, out=np.full(square.shape, 0.5), where=square > 0.0) / c
-    return Slabs(beta**2 * unit, share, 2 / (capacity * np.pi**2 * (unit * top)[:, 0]))
-
-
-def _eigenvalues(y: Array, biot: Array) -> Array:
-    """Return beta = y pi + arctan(Bi / beta), (n, N_MODE); y pi where nothing is lost."""
-    beta = y * np.pi
-    if not biot.any():
-        return beta
-    lost = biot > 0.0
-    # from the left of the root Newton's steps on a concave function never pass it
-    beta[:, -1:] = np.sqrt(biot / (1.0 + 0.5 * biot))
-    for columns in (slice(None), slice(None), slice(None), slice(-1, None)):
-        b, at = beta[:, columns], np.broadcast_to(lost, y.shape)[:, columns]
-        square = b**2 + biot**2
-        angle = np.arctan(np.divide(biot, b, out=np.zeros(b.shape), where=at))
-        b -= np.divide(
-            (b - y[:, columns] * np.pi - angle) * square, square + biot, out=np.zeros(b.shape), where=at
-        )
-    return beta
-
-
-def slab_moves(effusivity: Array, capacity: Array, far: float | Array, rate: Array) -> tuple[Array, Array]:
-    """Return derivatives (n, 4, N_MODE) of ln rate (of the rates ``rate``) and ln weight by ln e, then by
-    ln C, and those (n, 2) of the logarithm of the series resistance."""
-    e, c = effusivity[:, None], capacity[:, None]
-    ratio = np.sqrt(_FASTEST) * c / (np.pi * e * (_N_EXACT - 0.5))
-    free, biot = ratio > 3.0, np.reshape(far, (-1, 1)) * c / e**2
-    moves = np.zeros((e.size, 4, N_MODE))
-    # the span shrinks by ln e and grows by ln C, and with it the place of a grouped mode
-    along = np.zeros((e.size, N_MODE))
-    along[:, :_N_GROUPED] = np.where(free, 0.5 * (1 + _NODE), 0.0)
-    moves[:, 1] = -along
-    moves[:, 1, :_N_GROUPED] -= np.where(free, 1.0 / np.log(np.maximum(ratio, 3.0)), 0.0)
-    moves[:, 0] = 2.0 - 2.0 * along
-    moves[:, 2], moves[:, 3] = -moves[:, 0], -1.0 - moves[:, 1]
-    if biot.any():
-        beta = np.sqrt(rate) * c / e
-        square = beta**2 + biot**2
-        some = np.where(square > 0.0, square, 1.0)  # a mode that nothing damps does not move
-        angle = np.arctan(biot / np.where(beta > 0.0, beta, 1.0))
-        place = (
-            (beta - angle) / np.where(beta > 0.0, beta, 1.0) * square / (some + biot)
-        )  # d ln beta / d ln y
-        by_biot = biot / (some + biot)  # d ln beta / d ln Bi
-        for at, sign, power in ((0, -1.0, -2.0), (2, 1.0, 1.0)):
-            d = sign * along * place + power * by_biot
-            moves[:, at] = np.where(biot > 0.0, 2.0 * d - 2.0 * sign, moves[:, at])
-            moves[:, at + 1] += (2.0 * (beta**2 * d + biot**2 * power) / some - power) * by_biot
-    return moves, np.where(free, (-1.0, 0.0), (-2.0, 1.0))
+    for p in range(contact.shape[0]):
+        e, c, own = contact[p, 0], contact[p, 1], numbers[min(p, numbers.shape[0] - 1)]
+        unit, biot = (e / c) ** 2, own[5] * c / (e * e)
+        top = np.sqrt(_FASTEST / unit) / np.pi
+        # past it modes are too fast to count; a slab whose first dozen are has groups of a fixed span
+        free = top > 3.0 * start
+        top = top if free else 3.0 * start
+        span, beyond = np.log(top / start), 2.0 / (c * np.pi**2 * unit * top)
+        series[p, 0] = own[0] + beyond
+        series[p, 1], series[p, 2] = (-beyond, 0.0) if free else (-2.0 * beyond, beyond)
+        for j in range(N_MODE):
+            y, share, along, by_span = N_MODE - 1.0 - j, 2.0, 0.0, 0.0
+            if j < _N_GROUPED:
+                y = start * np.exp(0.5 * span * (1.0 + node[j]))
+                share = span * shares[j] * y
+                if free:  # the span shrinks by ln e and grows by ln C, and with it the place of a mode
+                    along, by_span = 0.5 * (1.0 + node[j]), 1.0 / span
+            elif j < _N_GROUPED + 2:  # next Euler-Maclaurin term, f'(start)/24 as a difference of modes
+                share = 2.0 / 24.0 if j == _N_GROUPED else 2.0 - 2.0 / 24.0
+            beta, part, place, by_biot = np.pi * y, 1.0, 1.0, 0.0
+            square = beta * beta
+            if biot > 0.0:
+                if j == N_MODE - 1:
+                    # from the left of the root Newton's steps on a concave function never pass it
+                    beta = np.sqrt(biot / (1.0 + 0.5 * biot))
+                for _ in range(5):
+                    square = beta * beta + biot * biot
+                    part = (np.pi * y + np.arctan(biot / beta) - beta) * square / (square + biot)
+                    beta += part
+                    if part < 1e-9 * beta:  # digits double with each step
+                        break
+                square = beta * beta + biot * biot
+                part, by_biot = square / (square + biot), biot / (square + biot)
+                place = np.pi * y / beta * part  # d ln beta / d ln y
+            elif j == N_MODE - 1:
+                part = 0.5  # a mode that nothing damps counts half
+            rate = beta * beta * unit
+            modes[p, 0, j], modes[p, 1, j], modes[p, 3, j] = rate, share * part / c, -np.expm1(-rate * step)
+            if moves.shape[0] > 0:
+                by_e, by_c = -along * place - 2.0 * by_biot, along * place + by_biot
+                moves[p, 0, j], moves[p, 2, j] = 2.0 * by_e + 2.0, 2.0 * by_c - 2.0
+                moves[p, 1, j], moves[p, 3, j] = -along - by_span, along + by_span - 1.0
+                if biot > 0.0:
+                    lost, kept = biot * biot / square, beta * beta / square
+                    moves[p, 1, j] += (2.0 * (kept * by_e - 2.0 * lost) + 2.0) * by_biot
+                    moves[p, 3, j] += (2.0 * (kept * by_c + lost) - 1.0) * by_biot
 
 
 class Gripper(NamedTuple):
@@ -189,25 +205,17 @@ def contacts(
     ``nodes`` are dt, repeat and t of :class:`~thermogrip.sysid.contact.simulation.TimeNodes`.  Of the curves
     (n, 5), the value and its derivatives by ln h, ln tau_b, ln e, ln C, only the ``wanted`` are filled.
     """
-    (e, c, h, build_up), (dt, repeat, t) = contact.T, nodes
-    n, far, own = e.size, gripper.numbers[:, 5], gripper.modes
-    block = slabs(e, c, far)
-    series = np.zeros((n, 3))
-    series[:, 0] = gripper.numbers[:, 0] + block.resistance
-    moves = np.empty((0, 4, N_MODE))
-    if wanted[:, BY_E:].any():
-        moves, d_series = slab_moves(e, c, far, block.rate)
-        series[:, 1:] = d_series * block.resistance[:, None]
-    modes = np.zeros((n, 4, N_MODE + own.shape[2]))
-    modes[:, 0, :N_MODE], modes[:, 1, :N_MODE], modes[:, :3, N_MODE:] = block.rate, block.weight, own
-    modes[:, 3, :N_MODE] = -np.expm1(-block.rate * dt[0])
-    modes[:, 3, N_MODE:] = -np.expm1(-own[:, 0] * dt[0])
+    (dt, repeat, t), n, own = nodes, len(contact), gripper.modes
+    modes, series = np.zeros((n, 4, N_MODE + own.shape[2])), np.empty((n, 3))
+    moves = np.empty((n if wanted[:, BY_E:].any() else 0, 4, N_MODE))
+    modes[:, :3, N_MODE:], modes[:, 3, N_MODE:] = own, -np.expm1(-own[:, 0] * dt[0])
+    slab_modes(contact, gripper.numbers, dt[0], _NODE, _SHARE, modes, moves, series)
     rise, slope, flux = (
         np.empty((n, N_STEPPED, t.size)),
         np.empty((n, N_STEPPED, t.size)),
         np.empty((n, t.size)),
     )
-    grown = conductance(t, h, build_up, gripper.numbers)
+    grown = conductance(t, contact[:, 2], contact[:, 3], gripper.numbers)
     room = np.zeros((17, modes.shape[2]))
     step_contacts(repeat, dt, modes, moves, series, grown, wanted, room, rise, slope, flux)
     return rise, slope, flux

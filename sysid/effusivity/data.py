@@ -129,15 +129,16 @@ def touches(
         second = touches(beside, until=until, at=at)
     check_grasps(grasps)
     where = log_name(grasps)
-    ids = np.asarray(grasps["grasp"].values).astype(str)[at]
+    found = grasps.variables  # a DataArray made of one costs more than to bin it
+    ids = np.asarray(found["grasp"].values).astype(str)[at]
     sd, t_object, t_ambient = (
         number_values(grasps, name)[at] for name in ("t_object_sd", "t_object", "t_ambient")
     )
     for i in np.flatnonzero(sd < 0):
         raise UserError(f"grasp {str(ids[i])!r} has a negative t_object_sd", file=where)
-    time = np.asarray(grasps["time"].values, dtype=float)
+    time = np.asarray(found["time"].values, dtype=float)
     keep = (time > _EDGES[0]) & (time < min(_EDGES[-1], np.inf if until is None else until + 1e-9))
-    time, data = time[keep], np.asarray(grasps["t_surface"].values, dtype=float)[at][:, keep]
+    time, data = time[keep], np.asarray(found["t_surface"].values, dtype=float)[at][:, keep]
     good = np.isfinite(data) & ~check_quality(grasps).masked[at][:, keep]
     for i in np.flatnonzero((good & (time > 0.15)).sum(axis=1) < 1):
         raise UserError(f"grasp {str(ids[i])!r} has no sample after contact", file=where, hint="remove it")

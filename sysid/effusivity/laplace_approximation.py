@@ -41,20 +41,15 @@ Uncertain grippers
 
 A calibration leaves theta (:mod:`thermogrip.sysid.effusivity.gripper_model`) with a covariance P.  theta
 moves the response, and the prior means of the nuisances: u = v + M (theta - t0), with v as it was for the
-gripper t0.  With J = df/du and K = df/dtheta, the latter along with u, the prediction around a guess (v, t)
-is f + J dv + K dtheta, and theta ~ N(t0, P) makes the data a problem in v alone, with more noise and shifted
-readings:
+gripper t0.  With theta = t0 + R z, R R' = P, the unknowns are v and z, and z ~ N(0, 1) is one more prior:
+the search for the mode and Laplace's method around it are those of u alone, for both together, and the
+evidence at the end is integrated over both.
 
-    y - f + K (t - t0) = J dv + noise,   cov(noise) = C + K P K' = S.
-
-Its solution in dv gives the next guess of theta, t0 + P a with
-
-    a = K' S^-1 [y - f + K (t - t0) - J dv],
-
-until the joint density of (v, theta) grows no more.  That is Gauss-Newton for both together, and the evidence
-at its end is Laplace's for both.  Every hypothesis finds a gripper of its own, and starts from that of the
-likeliest one, through a, which unlike theta does not depend on the block.  One that is 20 nats behind is left
-there, unsettled.
+Every hypothesis finds a gripper of its own.  From the calibration's gripper the way there may be long, with
+one that was right 50 nats behind after the first step, so a search is not left early.  The likeliest
+hypothesis of a touch begins there, and each other one where the one before it along ln e ended, if that is
+nearer: z as the same a, theta = t0 + P a, since P depends on the block.  The density of a free effusivity
+falls to either side of the likeliest, so beyond a point that is 20 nats behind no other is searched.
 
 Where the block is not of the calibration its effusivity is on the scale that the calibration's blocks
 define, so P is taken given theirs; the scale's own uncertainty is added where effusivities are reported.
@@ -63,12 +58,11 @@ define, so P is taken given theirs; the scale's own uncertainty is added where e
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg.lapack import dpotrf, dpotri, dpotrs, dtrtrs
 from scipy.special import gammaln
 
 from thermogrip.datasets.arrays import Array, Mask
@@ -78,13 +72,11 @@ from thermogrip.sysid.contact.simulation import (
     LAYER_NAMES,
     Stack,
     TimeNodes,
-    contact_numbers,
     gripper_modes,
     nearby_modes,
-    stack_modes,
     time_nodes,
 )
-from thermogrip.sysid.effusivity.data import Touches, Whitened, noise_covariance, whiten, whiteners
+from thermogrip.sysid.effusivity.data import Touches, Whitened, whiten, whiteners
 from thermogrip.sysid.effusivity.gripper_model import (
     INSULATOR,
     LEVEL_SD,
@@ -92,7 +84,6 @@ from thermogrip.sysid.effusivity.gripper_model import (
     UNKNOWN_OBJECT_SD,
     GripperModel,
     stack_numbers,
-    stack_of,
 )
 
 H, BUILD_UP, ONSET, LEVEL, T_OBJECT, EFFUSIVITY, CAPACITY = range(7)
@@ -200,54 +191,19 @@ def peak_ratio(dof: Array, vary: Mask) -> Array:
 
 
 _AT = {name: i for i, name in enumerate((*SHARED_NAMES, "ln_h", "ln_e"))}
-_ROUNDS = 8
-_STILL = 0.5  # of -2 ln density: a smaller predicted decrease ends the search
+_STEPS = 90
+_BESIDE = 3  # hypotheses that start from where the one before them ended
+_STILL = 0.1  # of -2 ln density: a smaller predicted decrease ends the search
 _HOPELESS = 20.0  # nats behind the likeliest
 _DIFFERENCE = 1e-6
-_LAYERS = [_AT[f"ln_{name}"] for name in LAYER_NAMES]
-_CONTACT = ("lag", "first", "creep", "settle", "g_far")
-_BY_LOGARITHM = np.array([name != "creep" for name in _CONTACT])
-_MOVED = [*_LAYERS, _AT["ln_lag"], _AT["ln_first"], _AT["creep"], _AT["ln_settle"], _AT["ln_g_far"]]
-
-
-class _Pair(NamedTuple):
-    """A touch under a hypothesis: one row of data, whitener and noise C, prior of v, P, numbers of t0."""
-
-    data: Touches
-    nodes: TimeNodes
-    whitener: Array
-    noise: Array
-    prior: Prior
-    dof: Array
-    covariance: Array
-    centre: Array
-    by_mean: Array  # (7, n_theta): how theta moves the prior's mean of u
-    constant: float  # what neither guess nor gripper changes of the log evidence
-    beyond: Array  # (1, 2, n_bin)
-
-
-@dataclass(frozen=True)
-class _Point:
-    """A guess: ``v`` (7,), the gripper t0 + P a, what it comes to, and -2 ln density there."""
-
-    v: Array
-    a: Array
-    moved: Array
-    u: Array
-    stack: Stack
-    left: Array
-    cost: float
-
-
-class _Expansion(NamedTuple):
-    """The solution around a guess: step of v, new a, predicted decrease, evidence, and factors at its end."""
-
-    dv: Array
-    a: Array
-    decrease: float
-    log_evidence: float
-    curved: Array  # (7, 7), Cholesky factor of the curvature in units of the prior's sd
-    chol: Array  # that of S
+_LAYERS = np.array([_AT[f"ln_{name}"] for name in LAYER_NAMES])
+_CONTACT = ("ln_lag", "ln_first", "creep", "ln_settle", "ln_g_far", "leak")
+_NUMBERS = np.array([_AT[name] for name in _CONTACT])
+_BY_LOGARITHM = np.array([name.startswith("ln_") for name in _CONTACT])
+_MOVED = [*_LAYERS, *_NUMBERS[:-1]]
+_LOGARITHMS = np.array([H, BUILD_UP, EFFUSIVITY, CAPACITY])
+_FARTHER = 2.0  # times as many standard deviations as logarithms a step may move
+_AT_ONCE = 16  # pairs, whose curves stay in the processor's cache
 
 
 def uncertain_gripper_modes(
@@ -263,41 +219,230 @@ def uncertain_gripper_modes(
     first = find_modes(
         gripper.stack, data, row, whitener, prior, start=start, max_steps=max_steps, beyond=beyond
     )
-    pairs = _pairs(gripper, data, row, whitener, prior, block)
-    found: list[Mode | None] = [None] * row.size
-    for touch in np.unique(row):
-        at = np.flatnonzero(row == touch)
-        a, best = np.zeros(len(_AT)), -np.inf
-        for i in at[np.argsort(-first.log_evidence[at], kind="stable")]:
-            mode, its_a = _settle(pairs[i], first.u[i], a, best - _HOPELESS)
-            found[i] = mode
-            if mode.log_evidence[0] > best:
-                a, best = its_a, float(mode.log_evidence[0])
-    return Mode(*(np.concatenate(part) for part in zip(*(m for m in found if m is not None))))
+    pairs = WithGripper.of(gripper, data, row, whitener[0], prior, block, beyond)
+    found, asked = pairs.nothing_found(), np.zeros(row.size, dtype=bool)
+    along = bool((block < 0).all() and not (prior.sd[:, EFFUSIVITY] > 0.0).any())
+    order = np.lexsort((prior.mean[:, EFFUSIVITY], row))
+    ends = np.searchsorted(row[order], np.arange(data.level.size + 1)).tolist()
+    likely, sides = first.log_evidence[order], []
+    for begin, end in pairwise(ends):
+        if end > begin:
+            lead = begin + int(np.argmax(likely[begin:end]))
+            sides += [(lead, 1, end), (lead, -1, begin - 1)]
+    leads = order[[lead for lead, way, _ in sides if way > 0]]
+    pairs.settle(found, first.u, leads, None)
+    asked[leads] = True
+    while sides := [side for side in sides if side[0] + side[1] != side[2]]:
+        turns = [[*range(place, end, way)][1 : _BESIDE + 1] for place, way, end in sides]
+        at = order[np.concatenate(turns)]
+        beside = order[np.repeat([side[0] for side in sides], [len(turn) for turn in turns])]
+        pairs.settle(found, first.u, at, beside)
+        asked[at] = True
+        sides = [(turn[-1], way, end) for turn, (_, way, end) in zip(turns, sides)]
+        if along:  # the density of an effusivity falls to either side
+            enough = pairs.best + 2 * _HOPELESS
+            sides = [s for s in sides if found.cost[order[s[0]]] < enough[row[order[s[0]]]]]
+    mode = pairs.mode(found, whitener[1], Prior(prior.mean, pairs.sd[:, :N_NUISANCE], prior.dof))
+    if asked.all():
+        return mode
+    best = np.full(data.level.size, -np.inf)
+    np.maximum.at(best, row[asked], mode.log_evidence[asked])
+    behind = np.minimum(first.log_evidence, best[row] - _HOPELESS)
+    first = first._replace(log_evidence=behind, converged=np.zeros(row.size, dtype=bool))
+    pick = [np.where(asked.reshape(-1, *[1] * (own.ndim - 1)), own, rest) for own, rest in zip(mode, first)]
+    return Mode(*pick)
 
 
-def _pairs(
-    gripper: GripperModel, data: Touches, row: NDArray[np.int64], whitener: tuple[Array, Array], prior: Prior,
-    block: NDArray[np.int64],
-) -> list[_Pair]:  # fmt: skip
-    own = np.array([gripper.blocks[gripper.materials[b]].ln_h_sd if b >= 0 else 0.0 for b in block])
-    sd = prior.sd.copy()
-    # how well the block's mean is known is in the covariance
-    sd[:, H] = np.sqrt(np.maximum(sd[:, H] ** 2 - own**2, 1e-12))
-    covariance = {b: _covariance(gripper, b) for b in set(block.tolist())}
-    noise, nodes = noise_covariance(data, gripper.noise), nodes_for(data)
-    centre = stack_numbers(gripper.stack)
-    dof = np.full(sd.shape, np.inf) if prior.dof is None else prior.dof
-    there = (data.count > 0).sum(axis=1)
-    constant = peak_ratio(dof, sd > 0) - 0.5 * np.log(2 * np.pi) * there[row]
-    out = []
-    for i, r in enumerate(row.tolist()):
-        own_prior = Prior(prior.mean[i : i + 1], sd[i : i + 1])
-        one = data.take(np.array([r]))
-        known = covariance[int(block[i])], centre, _mean_slopes(one), float(constant[i])
-        beyond = gripper.beyond(one.t, own_prior.mean[:, EFFUSIVITY])
-        out.append(_Pair(one, nodes, whitener[0][r], noise[r], own_prior, dof[i], *known, beyond))
-    return out
+class WithGripper(NamedTuple):
+    """Pairs whose unknowns are v (7,) and the gripper, theta = t0 + R z, as a search takes them."""
+
+    data: Touches
+    nodes: TimeNodes
+    whitener: Array
+    row: NDArray[np.int64]
+    beyond: Array  # (n, 2, n_bin)
+    centre: Array  # (n_number,), the stack's numbers of t0
+    root: Array  # (n, n_theta, n_z), R R' = P
+    by_mean: Array  # (n, 7, n_theta): how theta moves the prior's mean of u
+    law: Any
+    sd: Array  # (n, 7 + n_z)
+    best: Array  # (n_touch,), -2 ln posterior
+
+    @classmethod
+    def of(
+        cls, gripper: GripperModel, data: Touches, row: NDArray[np.int64], whitener: Array, prior: Prior,
+        block: NDArray[np.int64], beyond: Array,
+    ) -> WithGripper:  # fmt: skip
+        """Return the pairs of some touches under hypotheses and the blocks of these."""
+        from thermogrip.sysid.effusivity.mode_kernel import Law
+
+        own = np.array([gripper.blocks[gripper.materials[b]].ln_h_sd if b >= 0 else 0.0 for b in block])
+        sd = prior.sd.copy()
+        # how well the block's mean is known is in the covariance
+        sd[:, H] = np.sqrt(np.maximum(sd[:, H] ** 2 - own**2, 1e-12))
+        kinds, kind = np.unique(block, return_inverse=True)
+        roots = _roots(np.stack([_covariance(gripper, b) for b in kinds.tolist()]))
+        n, n_z = row.size, roots.shape[2]
+        dof = np.full(sd.shape, np.inf) if prior.dof is None else prior.dof
+        rest = np.zeros((n, n_z))
+        law = Law.of(
+            np.concatenate([prior.mean, rest], axis=1), np.concatenate([sd, rest + 1.0], axis=1),
+            np.concatenate([dof, rest + np.inf], axis=1),
+        )  # fmt: skip
+        return cls(
+            data, nodes_for(data), whitener, row, np.array(np.broadcast_to(beyond, (n, 2, data.y.shape[1]))),
+            stack_numbers(gripper.stack), roots[kind], _mean_slopes(data)[row], law,
+            np.concatenate([sd, rest + 1.0], axis=1), np.full(data.level.size, np.inf),
+        )  # fmt: skip
+
+    def nothing_found(self) -> Any:
+        """Return what :meth:`settle` fills."""
+        from thermogrip.sysid.effusivity.mode_kernel import Found
+
+        n, m = self.sd.shape
+        return Found(
+            np.zeros((n, m)), np.zeros((n, m + 1, m + 1)), np.full(n, np.inf), np.zeros(n, dtype=bool)
+        )
+
+    def settle(self, found: Any, v: Array, at: NDArray[np.int64], beside: NDArray[np.int64] | None) -> None:
+        """Search the modes of some pairs, from ``v`` (n, 7) and the guess, or from where the search of those
+        ``beside`` ended, where that is better."""
+        from thermogrip.sysid.effusivity.mode_kernel import search
+
+        begin = np.zeros((at.size, self.sd.shape[1]))
+        begin[:, :N_NUISANCE] = v[at]
+        if beside is not None:
+            there = begin.copy()
+            there[:, :N_NUISANCE] = found.u[beside, :N_NUISANCE]
+            there[:, :N_NUISANCE] += (self.law.mean[at] - self.law.mean[beside])[:, :N_NUISANCE]
+            there[:, N_NUISANCE:] = self.moved_alike(found.u[beside, N_NUISANCE:], beside, at)
+            better = self.costs(at, there) < self.costs(at, begin)
+            begin[better] = there[better]
+        for whole, part in zip(
+            found, search(_Some(self, at), self.law.take(at), self.sd[at], begin, _STEPS, least=_STILL)
+        ):
+            whole[at] = part
+        np.minimum.at(self.best, self.row[at], found.cost[at])
+
+    def moved_alike(self, z: Array, of: NDArray[np.int64], at: NDArray[np.int64]) -> Array:
+        """Return the z of pairs ``at`` for grippers that pairs ``of`` found, through a, theta = t0 + P a."""
+        a = np.linalg.pinv(self.root[of].transpose(0, 2, 1), rcond=1e-6) @ z[:, :, None]
+        return np.asarray((self.root[at].transpose(0, 2, 1) @ a)[:, :, 0])
+
+    def costs(self, at: NDArray[np.int64], x: Array) -> Array:
+        """Return -2 ln posterior of points (n, 7 + n_z), infinite where there can be no such gripper."""
+        columns, able = self.columns(at, x, slopes=False)
+        white = self.whitener[self.row[at]] @ columns
+        cost = (white[:, :, -1] ** 2).sum(axis=1) + self.law.take(at).penalty(x).value
+        return np.asarray(np.where(able, cost, np.inf))
+
+    def products(self, at: NDArray[np.int64], x: Array) -> Array:
+        """Return J' J, and J' r and r' r in the last row and column, in units of the prior's sd."""
+        columns, able = self.columns(at, x, slopes=True)
+        white = self.whitener[self.row[at]] @ columns
+        matrix = np.matmul(white.transpose(0, 2, 1), white)
+        scale = np.ones((at.size, matrix.shape[1]))
+        scale[:, :-1] = self.sd[at]
+        matrix *= scale[:, :, None]
+        matrix *= scale[:, None, :]
+        matrix[~able, -1, -1] = np.inf
+        return np.asarray(matrix)
+
+    def columns(self, at: NDArray[np.int64], x: Array, *, slopes: bool) -> tuple[Array, Mask]:
+        """Return derivatives of the bin means by v and z, and what is left, (n, n_bin, 7 + n_z + 1), and
+        where there can be such a gripper; where no slopes are asked for, what is left alone."""
+        from thermogrip.sysid.contact.time_stepping import grippers
+        from thermogrip.sysid.effusivity.mode_kernel import Asked, readings
+
+        data, row, n, by_mean = self.data, self.row[at], at.size, self.by_mean[at]
+        moved = (self.root[at] @ x[:, N_NUISANCE:, None])[:, :, 0]
+        numbers = self.centre + moved[:, : self.centre.size]
+        able = _able(numbers)
+        numbers = np.where(able[:, None], numbers, self.centre)
+        u = x[:, :N_NUISANCE] + (by_mean @ moved[:, :, None])[:, :, 0]
+        k = len(_MOVED) + 1 if slopes else 1
+        layers = np.exp(numbers[:, _LAYERS])
+        steps = np.eye(len(_LAYERS)) * _DIFFERENCE if slopes else np.empty((0, len(_LAYERS)))
+        base, near = nearby_modes(layers, layers[:, None] * np.exp(steps))
+        own = np.where(_BY_LOGARITHM, np.exp(numbers[:, _NUMBERS]), numbers[:, _NUMBERS])
+        contact = np.empty((n, k, 1 + own.shape[1]))
+        contact[:, :, 0], contact[:, :, 1:] = base.resistance[:, None], own[:, None]
+        parts = [np.repeat(part[:, None], k, axis=1) for part in base[:3]]
+        if slopes:
+            m = len(_LAYERS)
+            contact[:, :m, 0] = near.resistance.reshape(n, m)
+            for j in range(own.shape[1] - 1):
+                contact[:, m + j, 1 + j] += _DIFFERENCE * (own[:, j] if _BY_LOGARITHM[j] else 1.0)
+            for part, there in zip(parts, near[:3]):
+                part[:, :m] = there.reshape(n, m, -1)
+        lam, face, sensor = (part.reshape(n * k, -1) for part in parts)
+        each = np.repeat(row, k)
+        device = grippers(lam, face, sensor, contact.reshape(n * k, -1))
+        asked = Asked(self.nodes, device, data, each, np.repeat(self.beyond[at], k, axis=0), None)
+        vary = np.zeros((n * k, N_NUISANCE), dtype=bool)
+        vary[k - 1 :: k] = slopes
+        y, found = readings(asked, np.repeat(u, k, axis=0), vary)
+        own_columns = found[k - 1 :: k]
+        if not slopes:
+            return own_columns[:, :, -1:], able
+        by_u = own_columns[:, :, :N_NUISANCE]
+        by_theta = by_u @ by_mean
+        y = y.reshape(n, k, -1)
+        by_theta[:, :, _MOVED] = ((y[:, :-1] - y[:, -1:]) / _DIFFERENCE).transpose(0, 2, 1)
+        away = np.where(np.isfinite(data.t_ambient[row]), data.t_ambient[row] - u[:, LEVEL], 0.0)
+        by_theta[:, :, _AT["leak"]] = away[:, None] * data.ramp[row]
+        return np.concatenate([by_u, by_theta @ self.root[at], own_columns[:, :, -1:]], axis=2), able
+
+    def mode(self, found: Any, log_det: Array, prior: Prior) -> Mode:
+        """Return the modes where a search ended, of u = v + M (theta - t0)."""
+        from thermogrip.sysid.effusivity.mode_kernel import curvature
+
+        inverse, log_curved = curvature(found.matrix, self.law.penalty(found.u).own)
+        turn = self.by_mean @ self.root
+        u = found.u[:, :N_NUISANCE] + (turn @ found.u[:, N_NUISANCE:, None])[:, :, 0]
+        whole = np.concatenate([np.broadcast_to(np.eye(N_NUISANCE), (len(u), 7, 7)), turn], axis=2)
+        whole = whole * self.sd[:, None, :]
+        covariance = whole @ inverse @ whole.transpose(0, 2, 1)
+        dof = np.full(u.shape, np.inf) if prior.dof is None else prior.dof
+        evidence = -0.5 * (found.cost + log_curved + log_det[self.row]) + peak_ratio(dof, prior.sd > 0)
+        return Mode(u, covariance, evidence, found.settled, found.matrix[:, -1, -1])
+
+
+class _Some(NamedTuple):
+    """Some of the pairs, of which a search asks in turn some."""
+
+    whole: WithGripper
+    at: NDArray[np.int64]
+
+    def products(self, at: NDArray[np.int64], u: Array, *, first: bool) -> Array:
+        """Return the products of some pairs."""
+        every = self.at[at]
+        parts = range(0, at.size, _AT_ONCE)
+        found = [self.whole.products(every[i : i + _AT_ONCE], u[i : i + _AT_ONCE]) for i in parts]
+        return np.concatenate(found)
+
+    def longest(self, at: NDArray[np.int64], move: Array) -> Array:
+        """Return by how much steps move the logarithms among the unknowns at most, (n,)."""
+        far = np.concatenate([move[:, _LOGARITHMS], move[:, N_NUISANCE:] / _FARTHER], axis=1)
+        return np.asarray(np.abs(far).max(axis=1))
+
+    def hopeful(self, step: int, at: NDArray[np.int64], cost: Array, decrease: Array) -> Mask | None:
+        """Return None: far from the guess, steps say little about where they end."""
+        return None
+
+
+def _able(numbers: Array) -> Mask:
+    """Return which numbers (n, n_number) are those of a stack."""
+    able = np.isfinite(numbers).all(axis=1) & (np.abs(numbers) < 60.0).all(axis=1)
+    return np.asarray(able & (numbers[:, _AT["ln_first"]] <= 0.0) & (numbers[:, _AT["creep"]] >= -0.2))
+
+
+def _roots(covariance: Array) -> Array:
+    """Return R (k, n, m) with R R' = ``covariance`` (k, n, n), m the most directions of any that vary."""
+    size, vectors = np.linalg.eigh(covariance)
+    n = int((size > 1e-12 * size.max(axis=1, keepdims=True)).sum(axis=1).max())
+    n = max(n, 1)
+    return np.asarray((vectors * np.sqrt(np.maximum(size, 0.0))[:, None, :])[:, :, -n:])
 
 
 def _covariance(gripper: GripperModel, block: int) -> Array:
@@ -322,152 +467,15 @@ def _covariance(gripper: GripperModel, block: int) -> Array:
 
 
 def _mean_slopes(data: Touches) -> Array:
-    """Return the derivative of the prior mean of one touch's u by theta, (7, n_theta)."""
-    known = bool(np.isfinite(data.t_object[0]))
-    out = np.zeros((N_NUISANCE, len(_AT)))
+    """Return the derivatives of the prior means of u by theta, (n, 7, n_theta)."""
+    known = np.isfinite(data.t_object)
+    out = np.zeros((known.size, N_NUISANCE, len(_AT)))
     for k, name in ((BUILD_UP, "ln_build_up"), (ONSET, "onset"), (CAPACITY, "ln_depth"), (H, "ln_h")):
-        out[k, _AT[name]] = 1.0
-    out[EFFUSIVITY, _AT["ln_e"]] = 1.0
-    if known:
-        out[T_OBJECT, _AT["bias"]] = 1.0
-        out[T_OBJECT, _AT["transit_loss"]] = np.nan_to_num(data.t_ambient[0] - data.t_object[0])
+        out[:, k, _AT[name]] = 1.0
+    out[:, EFFUSIVITY, _AT["ln_e"]] = 1.0
+    out[known, T_OBJECT, _AT["bias"]] = 1.0
+    out[known, T_OBJECT, _AT["transit_loss"]] = np.nan_to_num(data.t_ambient - data.t_object)[known]
     return out
-
-
-def _settle(pair: _Pair, v: Array, a: Array, least: float) -> tuple[Mode, Array]:
-    """Return the mode of (v, theta) and its a, from the calibration's gripper or from that of ``a``."""
-    here, settled, before = _start(pair, v, a), False, -np.inf
-    for i in range(_ROUNDS):
-        k, j = _slopes(pair, here)
-        ahead = _expand(pair, here, k, j)
-        settled = ahead.decrease < _STILL
-        # far from the guess a first round says little, so that what is behind is left where it gains little
-        gain, before = ahead.log_evidence - before, ahead.log_evidence
-        if settled or ahead.log_evidence + gain * (_ROUNDS - i) < least:
-            break
-        there = _step(pair, here, ahead)
-        if there is None:
-            break
-        here = there
-    u = here.u + ahead.dv + pair.by_mean @ (pair.covariance @ ahead.a - here.moved)
-    covariance = _whole_covariance(pair, ahead, k, j)
-    misfit = float(((pair.whitener @ here.left) ** 2).sum())
-    mode = Mode(
-        u[None], covariance[None], np.array([ahead.log_evidence]), np.array([settled]), np.array([misfit])
-    )
-    return mode, here.a
-
-
-def _start(pair: _Pair, v: Array, a: Array) -> _Point:
-    here = _point(pair, v, np.zeros(a.size))
-    assert here is not None
-    there = _point(pair, v, a) if a.any() else None
-    return there if there is not None and there.cost < here.cost else here
-
-
-def _point(pair: _Pair, v: Array, a: Array) -> _Point | None:
-    moved = pair.covariance @ a
-    try:
-        stack = stack_of(pair.centre + moved[: pair.centre.size])
-    except ValueError:
-        return None
-    u = v + pair.by_mean @ moved
-    left = np.where(
-        pair.data.count[0] > 0,
-        pair.data.y[0] - predict(stack, pair.nodes, pair.data, u[None], pair.beyond)[0], 0.0,
-    )  # fmt: skip
-    cost = float(((pair.whitener @ left) ** 2).sum()) + _penalty(pair, v)[0] + float(a @ moved)
-    return _Point(v, a, moved, u, stack, left, cost)
-
-
-def _penalty(pair: _Pair, v: Array) -> tuple[float, Array, Array, Array]:
-    """Return the prior's -2 ln density, its slopes, bounds of the curvatures and these, (7,) each."""
-    from thermogrip.sysid.effusivity.mode_kernel import penalty
-
-    value, *parts = penalty(v[None], pair.prior.mean, pair.prior.sd, pair.dof[None])
-    return float(value[0]), parts[0][0], parts[1][0], parts[2][0]
-
-
-def _expand(pair: _Pair, here: _Point, k: Array, j: Array) -> _Expansion:
-    """Return the solution of the problem that is linear in v and theta around a guess."""
-    sd = pair.prior.sd[0]
-    value, slope, bound, own = _penalty(pair, here.v)
-    chol = np.linalg.cholesky(pair.noise + k @ pair.covariance @ k.T)
-    white = dtrtrs(chol, np.column_stack([j * sd, here.left + k @ here.moved]), lower=1)[0]
-    jw, rest = white[:, :-1], white[:, -1]
-    square = jw.T @ jw
-    dw = dpotrs(_factor(square + np.diag(bound)), jw.T @ rest - slope, lower=1)[0]
-    after = rest - jw @ dw
-    cost = float(after @ after + value + 2 * slope @ dw + dw @ (bound * dw))
-    curved = _factor(square + np.diag(own))
-    log_det = float(np.log(np.diagonal(chol)).sum() + np.log(np.diagonal(curved)).sum())
-    evidence = pair.constant - 0.5 * cost - log_det
-    a = k.T @ dtrtrs(chol, after, lower=1, trans=1)[0]
-    return _Expansion(sd * dw, a, here.cost - cost, evidence, curved, np.asarray(chol))
-
-
-def _factor(matrix: Array) -> Array:
-    """Return the lower Cholesky factor of a curvature."""
-    low, info = dpotrf(matrix, lower=1)
-    # not every LAPACK notices a NaN
-    if info != 0 or not np.isfinite(np.diagonal(low)).all():
-        raise np.linalg.LinAlgError("the curvature of a grasp's posterior is not positive definite")
-    return np.asarray(low)
-
-
-def _step(pair: _Pair, here: _Point, ahead: _Expansion) -> _Point | None:
-    """Return the point there, or on the way, where the density is higher; None if there is none."""
-    part = 1.0
-    for _ in range(6):
-        there = _point(pair, here.v + part * ahead.dv, here.a + part * (ahead.a - here.a))
-        if there is not None and there.cost < here.cost:
-            return there
-        part *= 0.4
-    return None
-
-
-def _whole_covariance(pair: _Pair, ahead: _Expansion, k: Array, j: Array) -> Array:
-    """Return the covariance of u = v + M (theta - t0), (7, 7)."""
-    p, sd = pair.covariance, pair.prior.sd[0]
-    lower = dpotri(ahead.curved, lower=1)[0]
-    known = (np.tril(lower) + np.tril(lower, -1).T) * sd[:, None] * sd[None, :]
-    gain = dpotrs(ahead.chol, k @ p, lower=1)[0].T
-    turn = np.eye(N_NUISANCE) - pair.by_mean @ gain @ j
-    left = pair.by_mean @ (p - gain @ k @ p) @ pair.by_mean.T
-    return np.asarray(turn @ known @ turn.T + left)
-
-
-def _slopes(pair: _Pair, here: _Point) -> tuple[Array, Array]:
-    """Return the derivatives of the bin means by theta, (n_bin, n_theta), and by u, (n_bin, 7)."""
-    from thermogrip.sysid.contact.time_stepping import grippers
-    from thermogrip.sysid.effusivity.mode_kernel import readings
-
-    data, u, stack = pair.data, here.u, here.stack
-    n = len(_LAYERS)
-    layers = np.repeat([[getattr(stack, name) for name in LAYER_NAMES]], n, axis=0)
-    layers[np.arange(n), np.arange(n)] *= np.exp(_DIFFERENCE)
-    near, base = nearby_modes(stack, layers), stack_modes(stack)
-    own = contact_numbers(stack, base)
-    contact = np.repeat(own[None], len(_MOVED) + 1, axis=0)
-    contact[:n, 0] = near.resistance
-    contact[np.arange(n, n + 5), np.arange(1, 6)] += _DIFFERENCE * np.where(_BY_LOGARITHM, own[1:6], 1.0)
-    lam, face, sensor = (
-        np.concatenate([moved, np.repeat(here_[None], len(_CONTACT) + 1, axis=0)])
-        for moved, here_ in zip(near[:3], base[:3])
-    )
-    asked = pairs_asked(stack, pair.nodes, data, np.zeros(len(contact), dtype=np.int64), pair.beyond)
-    asked = asked._replace(gripper=grippers(lam, face, sensor, contact))
-    us = np.repeat(u[None], len(contact), axis=0)
-    vary = np.zeros(us.shape, dtype=bool)
-    vary[-1] = True
-    y, slopes = readings(asked, us, vary)
-    by_u = slopes[-1, :, :N_NUISANCE]
-    k = by_u @ pair.by_mean
-    k[:, _MOVED] = ((y[:-1] - y[-1]) / _DIFFERENCE).T
-    if np.isfinite(data.t_ambient[0]):
-        k[:, _AT["leak"]] = (data.t_ambient[0] - u[LEVEL]) * data.ramp[0]
-    there = (data.count[0] > 0)[:, None]
-    return k * there, by_u * there
 
 
 class Hypotheses(NamedTuple):

@@ -9,7 +9,7 @@ NumPy's, for some hundred pairs at once, whose arrays stay in the processor's ca
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,12 +28,17 @@ _HOPELESS = {1: 6000.0, 2: 2000.0, 3: 1000.0, 4: 1000.0, 5: 1000.0} | dict.fromk
 # ended within 25 nats none was farther than 147 behind before a step, 54 after any number; what is left
 # at less than 300 is a start for finer points beside, which then end elsewhere
 _HOPELESS_STATED = {0: 500.0} | dict.fromkeys(range(1, 99), 300.0)
+# times the quadratic model's curvature: from which on steps are shorter, and from which on they are damped
+_BENT, _FAR = 1.5, 4.0
+_HARDLY = 1e-3  # a damping that counts as none
+_STALE = 0.01  # K that a temperature may move for slopes by the rest to stay
 _LEAST_DECREASE = 0.01  # of -2 ln posterior: smaller predicted decreases end the search
 _H, _BUILD_UP, _ONSET, _LEVEL, _T, _E, _C = range(7)
 _LEFT = 7  # the column of what is left, after those of the derivatives
 _FEW = 3  # columns
 RATE = 5  # the row of the slope, after the stepped curves
-_CURVES = (_H, _BUILD_UP, _E, _C, _ONSET)  # by which the curves after the value are derivatives
+_CURVES = np.array([_H, _BUILD_UP, _E, _C, _ONSET])  # by which the curves after the value are derivatives
+_CONTACT = np.array([_E, _C, _H, _BUILD_UP])
 EARLIEST_ONSET, LATEST_ONSET = -1.5, 0.8  # s after the closed message
 
 Nodes = tuple[Array, NDArray[np.int64], Array]
@@ -58,35 +63,29 @@ class Asked(NamedTuple):
 
 def readings(asked: Asked, u: Array, vary: Mask, *, alike: bool = False) -> tuple[Array, Array]:
     """Return the bin means (n, n_bin) that ``u`` (n, 7) predicts, and their derivatives (n, n_bin, 8), zero
-    where not ``vary`` (n, 7), with a last column for the caller's use; ``alike`` says that many contacts are
-    the same but for onset and temperatures."""
+    where not ``vary`` (n, 7), with what is left of the data in the last column; ``alike`` says that many
+    contacts are the same but for onset and temperatures."""
     data, row = asked.data, asked.row
     wanted = np.ones((row.size, RATE + 1), dtype=bool)
     wanted[:, 1:] = vary[:, _CURVES]
-    onset = np.clip(u[:, _ONSET], EARLIEST_ONSET, LATEST_ONSET)
+    onset = np.minimum(np.maximum(u[:, _ONSET], EARLIEST_ONSET), LATEST_ONSET)
     wanted[:, RATE] &= onset == u[:, _ONSET]  # past the range nothing moves
-    numbers, which = np.ascontiguousarray(u[:, (_E, _C, _H, _BUILD_UP)]), np.arange(row.size)
-    stepped = wanted[:, :N_STEPPED]
+    numbers, which = u.take(_CONTACT, axis=1), np.arange(row.size)
+    stepped = wanted[:, :N_STEPPED].copy()  # for arrays of another layout kernels are compiled anew
     if alike:
         key = numbers.view(f"V{numbers.itemsize * numbers.shape[1]}").ravel()
         _, first, which = np.unique(key, return_index=True, return_inverse=True)
         numbers, every = numbers[first], np.zeros((first.size, N_STEPPED), dtype=bool)
         np.logical_or.at(every, which, stepped)
         stepped = every
-    means = _means(asked, numbers, np.ascontiguousarray(stepped), which, onset, wanted)
-    room = data.t_ambient[row]
-    known = np.isfinite(room)
-    late = np.exp(2.0 * (u[:, _C] - u[:, _E])) / 6.0
-    # the block goes to the room by its far face at ``rate`` [1/s], ``way`` [K]
-    far, leak = asked.gripper.numbers[:, 5], np.where(known, asked.gripper.numbers[:, 6], 0.0)
-    rate, way = np.where(known, far * np.exp(-u[:, _C]), 0.0), np.where(known, room - u[:, _T], 0.0)
-    n_bin, away = data.y.shape[1], np.where(known, leak * (room - u[:, _LEVEL]), 0.0)
+    means = _means(asked, numbers, stepped, which, onset, wanted)
+    n_bin = data.y.shape[1]
     y, slopes = np.empty((row.size, n_bin)), np.empty((row.size, n_bin, _LEFT + 1))
-    late, leak = np.where(rate > 0.0, late, -1.0), np.broadcast_to(leak, row.size)
-    loss, scratch = np.stack([late, rate, way, away, leak], axis=1), np.empty((16, n_bin))
+    scratch = np.empty((16, n_bin))
     predicted(
-        means, wanted, row, data.count, data.t, data.ramp, asked.beyond, u, vary, loss, scratch, y, slopes
-    )
+        means, wanted, row, data.count, data.t, data.ramp, data.y, data.t_ambient[row], asked.gripper.numbers,
+        asked.beyond, u, vary, scratch, y, slopes,
+    )  # fmt: skip
     return y, slopes
 
 
@@ -97,17 +96,16 @@ def _means(
     4), ``which`` of these belongs to each pair; before contact zero."""
     nodes, gripper, data, row, _, table = asked
     out = np.empty((row.size, RATE + 1, data.y.shape[1]))
-    common = np.zeros(row.size, dtype=bool)
     if table is not None and data.common is not None:
         common = data.common[row] & table.inside(numbers)[which]
-    if common.all():
-        table.bin_means(data.sample_t, data.sample_bin, row, numbers, stepped, which, onset, wanted, out)
-        return out
-    if common.any():
-        for own in (common, ~common):
-            used, at = np.unique(which[own], return_inverse=True)
-            out[own] = _means(asked.take(own), numbers[used], stepped[used], at, onset[own], wanted[own])
-        return out
+        if common.all():
+            table.bin_means(data.sample_t, data.sample_bin, row, numbers, stepped, which, onset, wanted, out)
+            return out
+        if common.any():
+            for own in (common, ~common):
+                used, at = np.unique(which[own], return_inverse=True)
+                out[own] = _means(asked.take(own), numbers[used], stepped[used], at, onset[own], wanted[own])
+            return out
     contact = np.exp(numbers)
     rise, slope = (
         contacts(nodes, gripper, contact, stepped)[:2] if table is None else table.curves(contact, stepped)
@@ -179,21 +177,26 @@ def bin_means(
 
 @numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
 def predicted(
-    means: Array, wanted: Mask, row: NDArray[np.int64], count: Array, t: Array, ramp: Array, beyond: Array,
-    u: Array, vary: Mask, loss: Array, room: Array, y: Array, slopes: Array,
+    means: Array, wanted: Mask, row: NDArray[np.int64], count: Array, t: Array, ramp: Array, read: Array,
+    ambient: Array, numbers: Array, beyond: Array, u: Array, vary: Mask, room: Array, y: Array, slopes: Array,
 ) -> None:  # fmt: skip
     """Fill ``y`` (n, n_bin) and ``slopes`` (n, n_bin, 8) of :func:`readings` from the ``means`` (n, 6, n_bin)
-    of ``wanted`` curves, the last of them the slope of the first.
+    of ``wanted`` curves, the last of them the slope of the first; ``read`` are the touches' bin means.
 
-    Where ``late``, first of ``loss`` (n, 5), is not negative, a curve's integral up to ``late`` before, and
-    its value there, count too: by straight lines between the bins with a ``count``, zero before them.  The
-    others of ``loss`` are rate, way, drift of the level and leak."""
+    Where the ``ambient`` temperature is known the block goes to the room by its far face at ``rate`` [1/s],
+    ``way`` [K], which counts ``late`` [s] later: a curve's integral up to ``late`` before, and its value
+    there, by straight lines between the bins with a ``count``, zero before them."""
     n_curve, n_bin = wanted.shape[1], t.shape[1]
     # bins on either side, -1 before the first, and integrals
     before, after, whole = room[0], room[1], room[2]
     delayed, shifted = room[4:10], room[10:16]
     for p in range(row.size):
-        i, late, own = row[p], loss[p, 0], means[p]
+        i, own, k = row[p], means[p], min(p, numbers.shape[0] - 1)
+        warmth, rate, way, leak, away = ambient[p], 0.0, 0.0, 0.0, 0.0
+        if np.isfinite(warmth):
+            rate, way, leak = numbers[k, 5] * np.exp(-u[p, _C]), warmth - u[p, _T], numbers[k, 6]
+            away = leak * (warmth - u[p, _LEVEL])
+        late = np.exp(2.0 * (u[p, _C] - u[p, _E])) / 6.0 if rate > 0.0 else -1.0
         delayed[:], shifted[:] = 0.0, 0.0
         if late >= 0.0:
             low = high = -1
@@ -228,13 +231,13 @@ def predicted(
                             bend = (own[c, high] - own[c, low]) / (t[i, high] - t[i, low])
                         delayed[c, m] = whole[low] + ahead * (own[c, low] + 0.5 * bend * ahead)
                         shifted[c, m] = own[c, low] + bend * ahead
-        rate, way, difference = loss[p, 1], loss[p, 2], u[p, _T] - u[p, _LEVEL]
+        difference = u[p, _T] - u[p, _LEVEL]
         for m in range(n_bin):
             f, lost = own[VALUE, m] + beyond[p, 1, m], rate * delayed[VALUE, m]
-            y[p, m] = u[p, _LEVEL] + difference * f + way * lost + loss[p, 3] * ramp[i, m] + beyond[p, 0, m]
+            y[p, m] = u[p, _LEVEL] + difference * f + way * lost + away * ramp[i, m] + beyond[p, 0, m]
             slopes[p, m, _T] = f - lost if vary[p, _T] else 0.0
-            slopes[p, m, _LEVEL] = 1.0 - f - loss[p, 4] * ramp[i, m] if vary[p, _LEVEL] else 0.0
-            slopes[p, m, _LEFT] = 0.0
+            slopes[p, m, _LEVEL] = 1.0 - f - leak * ramp[i, m] if vary[p, _LEVEL] else 0.0
+            slopes[p, m, _LEFT] = read[i, m] - y[p, m]
         for c in range(1, n_curve):
             at, by_late = _CURVES[c - 1], 0.0
             if at == _E:  # a denser or less conducting block passes the loss on later
@@ -254,20 +257,13 @@ def predicted(
                 slopes[p, m, at] = scale * own[c, m] + passed * extra
 
 
-def products(
-    asked: Asked, whitener: Any, u: Array, sd: Array, *, alike: bool = False
-) -> Array:  # fmt: skip
+def products(asked: Asked, whitener: Any, u: Array, sd: Array, *, alike: bool = False) -> Array:
     """Return J' J, and J' r and r' r in the last row and column, (n, 8, 8): J in units of ``sd`` (n, 7), r
     the readings less those that ``u`` predicts, both whitened."""
-    y, columns = readings(asked, u, sd > 0.0, alike=alike)
-    np.subtract(asked.data.y[asked.row], y, out=columns[:, :, _LEFT])
-    scale, matrix = np.ones((len(u), _LEFT + 1)), np.zeros((len(u), _LEFT + 1, _LEFT + 1))
+    columns = readings(asked, u, sd > 0.0, alike=alike)[1]
+    scale = np.ones((len(u), _LEFT + 1))
     scale[:, :_LEFT] = sd
-    used = np.flatnonzero((scale > 0.0).any(axis=0))
-    if used.size > _FEW:
-        matrix = squares(whitener, asked.row, columns)
-    else:
-        matrix[:, used[:, None], used] = squares(whitener, asked.row, columns[:, :, used])
+    matrix = squares(whitener, asked.row, columns)
     matrix *= scale[:, :, None]
     matrix *= scale[:, None, :]
     return matrix
@@ -278,20 +274,25 @@ def squares(whitener: Any, row: NDArray[np.int64], columns: Array) -> Array:
     :class:`~thermogrip.sysid.effusivity.data.Whitener` or by a matrix a touch."""
     alone = isinstance(whitener, np.ndarray)
     kinds, kind = (whitener, row) if alone else (whitener.kinds, whitener.kind[row])
+    if len(kinds) == 1:
+        return _squares(kinds[0], columns, None if alone else whitener.scale[row])
     out = np.empty((row.size, columns.shape[2], columns.shape[2]))
     for k in np.unique(kind):
         at: Any = slice(None) if (kind == k).all() else kind == k
-        own = columns[at]
-        if own.shape[2] > _FEW:
-            white = np.matmul(kinds[k], own)
-        else:  # one product of large matrices is quicker than many of few columns
-            across = own.transpose(0, 2, 1)
-            white = np.matmul(across.reshape(-1, across.shape[2]), kinds[k].T)
-            white = white.reshape(across.shape).transpose(0, 2, 1)
-        if not alone:
-            white *= whitener.scale[row[at], :, None]
-        out[at] = np.matmul(white.transpose(0, 2, 1), white)
+        out[at] = _squares(kinds[k], columns[at], None if alone else whitener.scale[row[at]])
     return out
+
+
+def _squares(matrix: Array, columns: Array, scale: Array | None) -> Array:
+    if columns.shape[2] > _FEW:
+        white = np.matmul(matrix, columns)
+    else:  # one product of large matrices is quicker than many of few columns
+        across = columns.transpose(0, 2, 1)
+        white = np.matmul(across.reshape(-1, across.shape[2]), matrix.T)
+        white = white.reshape(across.shape).transpose(0, 2, 1)
+    if scale is not None:
+        white *= scale[:, :, None]
+    return np.asarray(np.matmul(white.transpose(0, 2, 1), white))
 
 
 class Penalty(NamedTuple):
@@ -306,17 +307,255 @@ class Penalty(NamedTuple):
 def penalty(u: Array, mean: Array, sd: Array, dof: Array) -> Penalty:
     """Return the penalty of points ``u`` (n, 7): normal where ``dof`` is infinite, else Student's t; none and
     curvature 1 where ``sd`` is zero."""
-    vary = sd > 0.0
-    w = np.divide(u - mean, sd, out=np.zeros(u.shape), where=vary)
-    square, slope, one = w * w, w, np.ones(u.shape)
-    heavy = vary & np.isfinite(dof)
-    if not heavy.any():
-        return Penalty(square.sum(axis=1), slope, one, one)
-    nu = np.where(heavy, dof, 1.0)
-    bound = np.where(heavy, (nu + 1.0) / (nu + square), 1.0)
-    own = np.where(heavy, np.maximum(bound * (nu - square) / (nu + square), 1e-3), 1.0)
-    value = np.where(heavy, (nu + 1.0) * np.log1p(square / nu), square)
-    return Penalty(value.sum(axis=1), slope * bound, bound, own)
+    return Law.of(mean, sd, dof).penalty(u)
+
+
+class Law(NamedTuple):
+    """A prior as the search takes it: mean, 1 / sd, 0 where that is zero, and 1 / degrees of freedom, 0 where
+    these are infinite, (n, 7) each; whether some are not."""
+
+    mean: Array
+    per_sd: Array
+    per_dof: Array
+    heavy: bool
+
+    @classmethod
+    def of(cls, mean: Array, sd: Array, dof: Array) -> Law:
+        """Return the law of means, sds and degrees of freedom."""
+        vary = sd > 0.0
+        per_dof = np.where(vary, 1.0 / dof, 0.0)
+        return cls(mean, vary / np.where(vary, sd, 1.0), per_dof, bool(per_dof.any()))
+
+    def take(self, index: Any) -> Law:
+        """Return some of the pairs' laws."""
+        return Law(self.mean[index], self.per_sd[index], self.per_dof[index], self.heavy)
+
+    def penalty(self, u: Array) -> Penalty:
+        """Return the penalty of points ``u`` (n, 7)."""
+        w = (u - self.mean) * self.per_sd
+        square = w * w
+        if not self.heavy:
+            one = np.ones(u.shape)
+            return Penalty(square.sum(axis=1), w, one, one)
+        k = self.per_dof
+        far = square * k
+        tail = 1.0 + far
+        bound = (1.0 + k) / tail
+        own = np.maximum(bound * (1.0 - far) / tail, 1e-3)
+        value = np.log1p(far) * (1.0 + k) / np.maximum(k, 1e-300)
+        return Penalty(np.where(k > 0.0, value, square).sum(axis=1), w * bound, bound, own)
+
+
+class _Search(NamedTuple):
+    """Where pairs are on their way to the mode: what was the best point of each, and what to try next."""
+
+    at: NDArray[np.int64]  # which pairs
+    law: Law
+    sd: Array
+    trial: Array
+    point: Array
+    cost: Array
+    matrix: Array
+    slope: Array
+    bound: Array
+    damping: Array
+    part: Array  # of the next steps
+    slope_gain: Array  # what the trial's step should gain by its slope, and lose by its bend
+    bend: Array
+    stale: Mask  # whether slopes at the best point are those of another temperature
+
+    def take(self, index: Any) -> _Search:
+        """Return some of the pairs."""
+        some: Any = (part.take(index) if isinstance(part, Law) else part[index] for part in self)
+        return _Search(*some)
+
+
+class Pairs(Protocol):
+    """What a search asks of its pairs, ``at`` some of them."""
+
+    def products(self, at: NDArray[np.int64], u: Array, *, first: bool) -> Array:
+        """Return J' J, and J' r and r' r in the last row and column, J in units of the priors' sds."""
+        ...
+
+    def longest(self, at: NDArray[np.int64], move: Array) -> Array:
+        """Return by how much steps move the logarithms among the unknowns at most, (n,)."""
+        ...
+
+    def hopeful(self, step: int, at: NDArray[np.int64], cost: Array, decrease: Array) -> Mask | None:
+        """Return which are worth another step beside the others; None for all."""
+        ...
+
+
+class Found(NamedTuple):
+    """Where a search ended: points, products and -2 ln posterior there, and where it settled."""
+
+    u: Array
+    matrix: Array
+    cost: Array
+    settled: Mask
+
+
+def search(
+    pairs: Pairs, law: Law, sd: Array, u: Array, max_steps: int, *, least: float = _LEAST_DECREASE
+) -> Found:
+    """Return where damped Gauss-Newton steps from ``u`` (n, m) end, under priors of a ``law`` and of ``sd``
+    (n, m): where the next step would gain less than ``least``, which then counts as taken.
+
+    Where readings are not explained, they may bend along a step twice as much as their slopes say, so that
+    whole steps go to and fro across the mode.  So what a step gains tells how much they bend along it, and
+    where that is more than 1.5 times the quadratic model's the next step is as much shorter.
+    """
+    n, m = u.shape
+    diagonal, none = np.arange(m), np.full(n, np.inf)
+    found = Found(u.copy(), np.empty((n, m + 1, m + 1)), none.copy(), np.zeros(n, dtype=bool))
+    here = _Search(
+        np.arange(n),
+        law,
+        sd,
+        u,
+        u,
+        none,
+        found.matrix,
+        u,
+        u,
+        np.full(n, 1e-2),
+        none,
+        none,
+        none,
+        found.settled,
+    )
+    for step in range(max_steps + 1):
+        here = _moved(*_refitted(here, pairs.products(here.at, here.trial, first=step == 0)), step)
+        rhs, curved = here.matrix[:, :m, m] - here.slope, here.matrix[:, :m, :m].copy()
+        curved[:, diagonal, diagonal] += here.bound
+        last = np.linalg.solve(curved, rhs[:, :, None])[:, :, 0]
+        decrease = (last * rhs).sum(axis=1)
+        near = (decrease < least) & ~here.stale
+        left = ~near & (here.damping <= 1e9)
+        if step == max_steps:
+            near[:], left[:] = False, False
+        hopeful = pairs.hopeful(step, here.at, here.cost, decrease)
+        if hopeful is not None:
+            left &= hopeful
+        if not left.all():
+            done = ~left
+            at = here.at[done]
+            found.u[at] = here.point[done] + np.where(near[done, None], last[done] * here.sd[done], 0.0)
+            found.cost[at] = here.cost[done] - np.where(near[done], decrease[done], 0.0)
+            found.matrix[at], found.settled[at] = here.matrix[done], near[done]
+            if done.all():
+                break
+            here, curved, rhs = here.take(left), curved[left], rhs[left]
+        gain, kept, move = decrease, np.zeros(1), last
+        if not left.all():
+            gain, move = decrease[left], last[left]
+        damped = here.damping > _HARDLY
+        if damped.any():
+            own = curved[:, diagonal, diagonal]
+            curved[:, diagonal, diagonal] = own * (1.0 + here.damping[:, None])
+            shorter = np.linalg.solve(curved, rhs[:, :, None])[:, :, 0]
+            kept = np.where(damped, here.damping * (own * shorter**2).sum(axis=1), 0.0)
+            move = np.where(damped[:, None], shorter, move)
+            gain = np.where(damped, (shorter * rhs).sum(axis=1), gain)
+        move = move * here.sd
+        # no logarithm moves too far
+        part = np.minimum(here.part, _LONGEST / np.maximum(pairs.longest(here.at, move), 1e-300))
+        part = np.where(here.stale, 0.0, part)  # slopes anew before another step
+        here = here._replace(
+            trial=here.point + part[:, None] * move, slope_gain=2.0 * part * gain,
+            bend=part * part * (gain - kept),
+        )  # fmt: skip
+    return found
+
+
+def _refitted(here: _Search, there: Array) -> tuple[_Search, Array, Mask]:
+    """Return the trials and their products with level and T_obj, in which readings are linear, at their best:
+    these go along with a step in all else, which is larger without bending; and whether other slopes, which
+    go with the difference of object and skin, must be asked for anew."""
+    law, trial, lin = here.law, here.trial.copy(), there[:, _LEVEL : _T + 1]
+    away = ((trial - law.mean) * law.per_sd)[:, _LEVEL : _T + 1]
+    a, d, b = lin[:, 0, _LEVEL] + 1.0, lin[:, 0, _T], lin[:, 1, _T] + 1.0
+    g, h = lin[:, 0, -1] - away[:, 0], lin[:, 1, -1] - away[:, 1]
+    det, before = a * b - d * d, trial[:, _T] - trial[:, _LEVEL]
+    level, warmer = (b * g - d * h) / det, (a * h - d * g) / det
+    trial[:, _LEVEL] += level * here.sd[:, _LEVEL]
+    trial[:, _T] += warmer * here.sd[:, _T]
+    gone = level[:, None] * lin[:, 0] + warmer[:, None] * lin[:, 1]
+    there[:, -1, -1] += level * gone[:, _LEVEL] + warmer * gone[:, _T] - 2.0 * gone[:, -1]
+    there[:, :-1, -1] -= gone[:, :-1]
+    there[:, -1, :-1] = there[:, :-1, -1]
+    apart = np.abs(before) > 0.1
+    grown = (trial[:, _T] - trial[:, _LEVEL]) / np.where(apart, before, np.inf)
+    scale = np.empty(there.shape[:2])
+    scale[:] = np.where(apart, np.minimum(np.maximum(grown, 0.2), 5.0), 1.0)[:, None]
+    scale[:, _LEVEL : _T + 1] = scale[:, -1:] = 1.0
+    there *= scale[:, :, None]
+    there *= scale[:, None, :]
+    far = ~apart | (grown < 0.2) | (grown > 5.0)
+    stale = far & (np.abs(trial[:, _T] - trial[:, _LEVEL] - before) > _STALE)
+    return here._replace(trial=trial), there, stale
+
+
+def _moved(here: _Search, there: Array, stale: Mask, step: int) -> _Search:
+    """Return where pairs are after they were tried, and how the next steps are made."""
+    off = here.law.penalty(here.trial)
+    tried, damping = there[:, -1, -1] + off.value, here.damping
+    new = here._replace(
+        point=here.trial, cost=tried, matrix=there, slope=off.slope, bound=off.bound, stale=stale
+    )
+    if step == 0:
+        return new._replace(damping=0.1 * damping, part=np.ones(tried.size))
+    better = (tried < here.cost) | here.stale
+    bent = (here.slope_gain + tried - here.cost) / np.maximum(here.bend, 1e-300)
+    bent = np.where(here.stale, 0.0, bent)
+    far = bent > _FAR
+    damping = np.where(better, np.maximum(damping * 0.1, 1e-9), damping * 10.0)
+    damping = np.where(far, np.maximum(damping, 0.1 * np.minimum(bent, 1e6)), damping)
+    part = np.where((bent > _BENT) & ~far, 1.0 / np.maximum(bent, 1.0), 1.0)
+    new = new._replace(damping=damping, part=np.where(np.isfinite(tried), part, 0.3 * here.part))
+    if better.all():
+        return new
+    row = better[:, None]
+    return new._replace(
+        point=np.where(row, here.trial, here.point), cost=np.where(better, tried, here.cost),
+        matrix=np.where(row[:, :, None], there, here.matrix), slope=np.where(row, off.slope, here.slope),
+        bound=np.where(row, off.bound, here.bound), stale=np.where(better, stale, here.stale),
+    )  # fmt: skip
+
+
+class _Touched(NamedTuple):
+    """Pairs of one gripper, as :func:`modes` searches them."""
+
+    asked: Asked
+    whitener: Any
+    sd: Array
+    rivals: bool
+    ahead: Array  # (n,), what the next step should come to
+
+    def products(self, at: NDArray[np.int64], u: Array, *, first: bool) -> Array:
+        """Return the products of some pairs, so many at once that they stay in the processor's cache."""
+        parts = [at[begin : begin + _AT_ONCE] for begin in range(0, at.size, _AT_ONCE)]
+        points = np.split(u, range(_AT_ONCE, at.size, _AT_ONCE))
+        found = [
+            products(self.asked.take(part), self.whitener, point, self.sd[part], alike=first)
+            for part, point in zip(parts, points)
+        ]
+        return found[0] if len(found) == 1 else np.concatenate(found)
+
+    def longest(self, at: NDArray[np.int64], move: Array) -> Array:
+        """Return by how much steps move the logarithms among the unknowns at most, (n,)."""
+        return np.asarray(np.abs(move.take(_CONTACT, axis=1)).max(axis=1))
+
+    def hopeful(self, step: int, at: NDArray[np.int64], cost: Array, decrease: Array) -> Mask | None:
+        """Return which are worth another step beside the best of their touch."""
+        if not self.rivals:
+            return None
+        row, data = self.asked.row, self.asked.data
+        best, stated = np.full(data.level.size, np.inf), np.isfinite(data.t_object)
+        self.ahead[at] = cost - decrease
+        np.minimum.at(best, row, self.ahead)
+        limit = np.where(stated, _HOPELESS_STATED[step], _HOPELESS.get(step, np.inf))
+        return np.asarray(self.ahead[at] < (best + limit)[row[at]])
 
 
 def modes(
@@ -329,76 +568,41 @@ def modes(
     (likelihood x prior density relative to its peak) + ln det of its curvature in units of sd.  Where pairs
     of one row are ``rivals``, one that is hopeless beside the best of them is left there, unsettled.
     """
-    n, (mean, sd, dof) = len(u), law.transpose(1, 0, 2)
-    trial, damping = u.copy(), np.full(n, 1e-2)
-    at, settled, diagonal = np.arange(n), np.zeros(n, dtype=bool), np.arange(_LEFT)
-    cost, matrix, slope, bound = np.full(n, np.inf), np.zeros((n, 8, 8)), np.zeros((n, 7)), np.ones((n, 7))
-    best, ahead, stated = np.empty(asked.data.level.size), cost.copy(), np.isfinite(asked.data.t_object)
-    for step in range(max_steps + 1):
-        there = _products_of(asked, at, whitener, trial, sd, alike=step == 0)
-        off = penalty(trial[at], mean[at], sd[at], dof[at])
-        tried = there[:, _LEFT, _LEFT] + off.value
-        better = (tried < cost[at]) | (step == 0)
-        new = at[better]
-        u[new], cost[new], matrix[new] = trial[new], tried[better], there[better]
-        slope[new], bound[new] = off.slope[better], off.bound[better]
-        damping[at] = np.where(better, np.maximum(damping[at] * 0.1, 1e-9), damping[at] * 10.0)
-        at = at[damping[at] <= 1e9]
-        if step == max_steps or not at.size:
-            break
-        rhs, curved = matrix[at, :_LEFT, _LEFT] - slope[at], matrix[at, :_LEFT, :_LEFT]
-        curved[:, diagonal, diagonal] += bound[at]
-        last = np.linalg.solve(curved, rhs[:, :, None])[:, :, 0]
-        decrease = (last * rhs).sum(axis=1)
-        near = decrease < _LEAST_DECREASE
-        u[at[near]] += last[near] * sd[at[near]]
-        cost[at[near]] -= decrease[near]
-        settled[at[near]] = True
-        left = ~near
-        if rivals:
-            best.fill(np.inf)
-            ahead[at] = cost[at] - np.where(near, 0.0, decrease)  # of those near it is taken off
-            np.minimum.at(best, asked.row, ahead)
-            limit = np.where(stated, _HOPELESS_STATED[step], _HOPELESS.get(step, np.inf))
-            left &= ahead[at] < (best + limit)[asked.row[at]]
-        at, curved, rhs = at[left], curved[left], rhs[left]
-        if not at.size:
-            break
-        curved[:, diagonal, diagonal] *= 1.0 + damping[at, None]
-        move = np.linalg.solve(curved, rhs[:, :, None])[:, :, 0] * sd[at]
-        longest = np.abs(move[:, (_H, _BUILD_UP, _E, _C)]).max(axis=1)  # no logarithm moves too far
-        trial[at] = u[at] + np.minimum(1.0, _LONGEST / np.maximum(longest, 1e-300))[:, None] * move
-    curved = matrix[:, :_LEFT, :_LEFT]
-    curved[:, diagonal, diagonal] += penalty(u, mean, sd, dof).own
+    (mean, sd, dof), n = law.transpose(1, 0, 2), len(u)
+    own = Law.of(mean, sd, dof)
+    found = search(_Touched(asked, whitener, sd, rivals, np.full(n, np.inf)), own, sd, u, max_steps)
+    u[:] = found.u
+    inverse, log_det = curvature(found.matrix, own.penalty(u).own)
+    covariance = inverse * (sd[:, :, None] * sd[:, None, :])
+    return covariance, found.cost + log_det, found.matrix[:, _LEFT, _LEFT], found.settled
+
+
+def curvature(matrix: Array, own: Array) -> tuple[Array, Array]:
+    """Return the inverse (n, m, m) of the curvatures of ``matrix`` (n, m + 1, m + 1), the priors' ``own`` (n,
+    m) added, and the logarithm of their determinants."""
+    curved, at = matrix[:, :-1, :-1].copy(), np.arange(own.shape[1])
+    curved[:, at, at] += own
+    sign, log_det = np.linalg.slogdet(curved)
+    if not ((sign > 0.0) & np.isfinite(log_det)).all():  # not every LAPACK notices a NaN
+        raise np.linalg.LinAlgError("the curvature of a grasp's posterior is not positive definite")
     inverse = np.linalg.inv(curved)
-    covariance = 0.5 * (inverse + inverse.transpose(0, 2, 1)) * (sd[:, :, None] * sd[:, None, :])
-    return covariance, cost + np.linalg.slogdet(curved)[1], matrix[:, _LEFT, _LEFT], settled
-
-
-def _products_of(
-    asked: Asked, at: NDArray[np.int64], whitener: Any, u: Array, sd: Array, *, alike: bool
-) -> Array:
-    """Return :func:`products` of some pairs, so many at once that they stay in the processor's cache."""
-    out = np.empty((at.size, _LEFT + 1, _LEFT + 1))
-    for begin in range(0, at.size, _AT_ONCE):
-        part = at[begin : begin + _AT_ONCE]
-        out[begin : begin + _AT_ONCE] = products(asked.take(part), whitener, u[part], sd[part], alike=alike)
-    return out
+    return 0.5 * (inverse + inverse.transpose(0, 2, 1)), log_det
 
 
 def marginals(asked: Asked, whitener: Any, u: Array, sd: Array) -> Array:
     """Return ln p(y | u) up to a constant for points ``u`` (n, 7), integrated over level and T_obj, whose
     prior means are in ``u``; ``sd`` (m, n, 2) are their sds, each with a row of the answer (m, n)."""
-    at, out = [_LEVEL, _T], np.empty((len(sd), len(u)))
+    at, out = [_LEVEL, _T, _LEFT], np.empty((len(sd), len(u)))
     for begin in range(0, len(u), _AT_ONCE):
         part = slice(begin, begin + _AT_ONCE)
-        n = len(u[part])
-        unit = np.zeros((n, 7))
-        unit[:, at] = 1.0
+        vary = np.zeros((len(u[part]), _LEFT), dtype=bool)
+        vary[:, at[:2]] = True
         some = asked.take(part)
-        known = products(some, whitener, u[part], unit, alike=bool((some.row == some.row[0]).all()))
-        (a, b), d = (known[:, k, k] for k in at), known[:, _LEVEL, _T]
-        (g, h), square = (known[:, k, _LEFT] for k in at), known[:, _LEFT, _LEFT]
+        alike = bool((some.row == some.row[0]).all())
+        columns = readings(some, u[part], vary, alike=alike)[1].take(at, axis=2)
+        known = squares(whitener, some.row, columns)
+        a, b, d, square = known[:, 0, 0], known[:, 1, 1], known[:, 0, 1], known[:, 2, 2]
+        g, h = known[:, 0, 2], known[:, 1, 2]
         for row, (s, t) in zip(out, sd[:, part].transpose(0, 2, 1)):
             p, q, r = 1.0 + s * s * a, 1.0 + t * t * b, s * t * d
             det = p * q - r * r

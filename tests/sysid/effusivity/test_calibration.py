@@ -51,6 +51,8 @@ def calibrated(name):
 
 @pytest.mark.parametrize("name", ["exp2_dT20", "exp4_cooled5_obj18_grip38_40s"])
 def test_no_noise_nearby_is_likelier_than_that_of_a_calibration(name):
+    """By more than the slope at which the last search may end allows over the way there: the cost is convex
+    about its least value."""
     device, searches = calibrated(name)
     assert len(searches) == 3  # the last for the first look at a discrepancy, of which there is none
     assert device.discrepancy is None
@@ -60,7 +62,7 @@ def test_no_noise_nearby_is_likelier_than_that_of_a_calibration(name):
     for k, size in enumerate((0.002, 0.02, 0.02, 0.02, 0.02)):
         for side in (-1, 1):
             inside = np.clip(found + side * size * np.eye(5)[k], *calibration._NOISE_RANGE.T)
-            assert cost(inside)[0] > best - 2e-3
+            assert cost(inside)[0] > best - calibration._NOISE_SLOPE * size / calibration._NOISE_STEPS[k]
 
 
 def narrow(q):
@@ -85,17 +87,19 @@ def test_a_search_that_is_cut_short_says_so(monkeypatch):
 
 
 def test_the_bundled_gripper_is_what_its_training_grasps_make():
-    """Within what the ends of its searches leave, a twentieth of what the grasps leave open."""
+    """Within what the ends of its searches leave: one that ends at a change of 0.05 in -2 ln evidence, half
+    of it left, is off by at most 0.16 standard deviations along its last step, and a file made by another
+    end of it 0.011 in any of its numbers, 0.9 % in the growth of the noise, 0.2 % in spreads."""
     bundled, again = load_default_gripper(), calibrate_example_gripper()
     known = again.uncertainty
     labels = [name.partition(" ")[2] for name in known.names if name.startswith("ln_e ")]
     nothing = np.zeros(len(known.names))
     ends = [calibration.gripper_theta(gripper, labels, nothing) for gripper in (bundled, again)]
     off = np.abs(ends[1] - ends[0]) / np.sqrt(np.diag(known.covariance))
-    assert off.max() < 0.05, dict(zip(known.names, off.round(3)))
-    for part in ("noise", "spreads"):
+    assert off.max() < 0.02, dict(zip(known.names, off.round(3)))
+    for part, close in (("noise", 0.01), ("spreads", 3e-3)):
         for name, value in vars(getattr(bundled, part)).items():
-            assert getattr(getattr(again, part), name) == pytest.approx(value, rel=0.01), (part, name)
+            assert getattr(getattr(again, part), name) == pytest.approx(value, rel=close), (part, name)
     assert again.trained_on == bundled.trained_on
 
 

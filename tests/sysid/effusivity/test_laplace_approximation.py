@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +17,7 @@ from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import make_grasps
 from thermogrip.sysid.contact.simulation import far_response, step_response
 from thermogrip.sysid.effusivity import laplace_approximation as laplace
+from thermogrip.sysid.effusivity import mode_kernel
 from thermogrip.sysid.effusivity.calibration import calibrate_gripper
 from thermogrip.sysid.effusivity.data import touches, whiten
 from thermogrip.sysid.effusivity.gripper_model import (
@@ -26,15 +26,16 @@ from thermogrip.sysid.effusivity.gripper_model import (
     ParameterCovariance,
     another_gripper,
     block_names,
-    stack_of,
 )
 from thermogrip.sysid.effusivity.laplace_approximation import (
+    EFFUSIVITY,
     N_NUISANCE,
     ONSET,
     T_OBJECT,
     Hypotheses,
     Mode,
     Prior,
+    WithGripper,
     as_in_training,
     at_temperature,
     find_modes,
@@ -56,6 +57,7 @@ from thermogrip.sysid.effusivity.posterior import (
     material_fit,
     material_posterior,
 )
+from thermogrip.sysid.effusivity.posterior_grid import LN_E_RANGE
 from thermogrip.sysid.effusivity.predictive import rest_of_contact
 
 from ...oracles.emcee_posterior import emcee_posterior
@@ -278,31 +280,33 @@ def test_evidence_is_the_integral_over_the_grippers(exact, touched, name):
     assert np.abs(found - material_evidence(exact, touched, FIVE))[near].max() > 0.3
 
 
+def pairs_of(gripper, data, hypotheses, block):
+    """Return pairs of one touch with an uncertain gripper."""
+    row = np.zeros(len(block), dtype=np.int64)
+    prior = prior_of(gripper, data.known(row), hypotheses)
+    beyond = gripper.beyond(data.t[row], prior.mean[:, EFFUSIVITY])
+    return WithGripper.of(gripper, data, row, whiten(data, gripper.noise)[0], prior, np.array(block), beyond)
+
+
 def test_derivatives_by_the_gripper_are_those_of_its_readings(device, touched):
+    """By each direction of the prior's covariance, in units of its sd."""
     other = another_gripper(device)
     data, row = touches(touched.isel(grasp=[1])), np.zeros(1, dtype=np.int64)
     hypotheses = material_hypotheses(device, ["copper"])
-    u = fit_pairs(device, data, row, hypotheses).u
-    pair = laplace._pairs(
-        other, data, row, whiten(data, device.noise), prior_of(device, data, hypotheses), np.array([1])
-    )[0]
-    slopes, _ = laplace._slopes(pair, laplace._point(pair, u[0], np.zeros(len(laplace._AT))))
-    for name, i in laplace._AT.items():
-        step = np.zeros(len(laplace._AT))
-        step[i] = 1e-6 if name == "leak" else 1e-4
-        there, back = (
-            predict(
-                stack_of(pair.centre + sign * step[: SHARED_NAMES.index("onset")]),
-                pair.nodes,
-                data,
-                u + sign * pair.by_mean @ step,
-            )[0]
-            for sign in (1, -1)
-        )
-        expected = (there - back) / (2 * step[i])
-        np.testing.assert_allclose(
-            slopes[:, i], expected, atol=2e-3 * np.abs(expected).max() + 1e-3, err_msg=name
-        )
+    pairs = pairs_of(other, data, hypotheses, [1])
+    x = np.zeros((1, pairs.sd.shape[1]))
+    x[:, :7] = fit_pairs(device, data, row, hypotheses).u
+    columns, able = pairs.columns(row, x, slopes=True)
+    assert able.all()
+    for k in range(x.shape[1]):
+        step = np.zeros(x.shape)
+        step[0, k] = 1e-4 / np.maximum(np.abs(pairs.root[0, :, k - 7]).max() if k >= 7 else 1.0, 0.03)
+        back, there = (pairs.columns(row, x + sign * step, slopes=False)[0][0, :, 0] for sign in (1, -1))
+        slope = (there - back) / (2 * step[0, k])
+        scale = np.abs(slope).max()
+        np.testing.assert_allclose(columns[0, :, k], slope, atol=2e-3 * scale + 1e-6, err_msg=str(k))
+    left = pairs.columns(row, x, slopes=False)[0]
+    np.testing.assert_allclose(left[0, :, 0], columns[0, :, -1], atol=1e-12)
 
 
 def test_theta_moves_the_prior_means_as_another_device_would(device, touched):
@@ -320,7 +324,7 @@ def test_theta_moves_the_prior_means_as_another_device_would(device, touched):
             "blocks": {**device.blocks, "copper": replace(copper, ln_effusivity=copper.ln_effusivity + step)}
         },
     }
-    slopes = laplace._mean_slopes(data)
+    slopes = laplace._mean_slopes(data)[0]
     for name, i in laplace._AT.items():
         other = replace(device, **moved.get(name, {}))
         there = prior_of(other, data, material_hypotheses(other, ["copper"])).mean[0]
@@ -367,11 +371,13 @@ def test_effusivity_by_another_gripper_is_less_well_known(device, touched):
 
 @pytest.mark.parametrize("value", [-2.0, np.nan])
 def test_a_curvature_that_is_none_is_an_error_and_no_answer(value):
-    matrix = np.eye(7)
-    np.testing.assert_array_equal(laplace._factor(4 * matrix), 2 * matrix)
-    matrix[4, 4] = value
-    with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
-        laplace._factor(matrix)
+    matrix, own = 3 * np.eye(8)[None], np.ones((1, 7))
+    inverse, log_det = mode_kernel.curvature(matrix, own)
+    np.testing.assert_allclose(inverse[0], np.eye(7) / 4)
+    assert log_det[0] == pytest.approx(7 * np.log(4))
+    matrix[0, 4, 4] = value
+    with np.errstate(invalid="ignore"), pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
+        mode_kernel.curvature(matrix, own)
 
 
 def test_what_needs_a_known_gripper_is_refused(device, touched):
@@ -591,43 +597,10 @@ def test_the_second_sensor_is_asked_about_the_same_material(device):
     assert other.ln_h_sd[1] > 2 * other.ln_h_sd[0]
 
 
-def test_a_step_is_shortened_to_two_fifths_until_the_density_rises(monkeypatch):
-    here = SimpleNamespace(v=np.zeros(7), a=np.ones(3), cost=5.0)
-    ahead = SimpleNamespace(dv=np.full(7, 2.0), a=np.full(3, 3.0))
-    for falls_at, tried in ((0.4**2, 3), (0.4**5, 6), (0.4**6, 6)):
-        parts = []
-
-        def point(pair, v, a, parts=parts, falls_at=falls_at):
-            part = v[0] / 2.0
-            parts.append(part)
-            np.testing.assert_allclose(a, 1 + 2 * part)
-            return None if part == 1.0 else SimpleNamespace(cost=4.9 if part <= falls_at * 1.001 else 5.0)
-
-        monkeypatch.setattr(laplace, "_point", point)
-        found = laplace._step(None, here, ahead)
-        np.testing.assert_allclose(parts, 0.4 ** np.arange(tried))
-        assert (found is None) == (falls_at == 0.4**6)
-
-
-def test_a_hopeless_hypothesis_is_left_unsettled(device, touched):
-    """Where it is already behind,
-    whatever one more round would bring; from the other's gripper where it is better."""
-    other = another_gripper(device)
-    data, row = touches(touched.isel(grasp=[1])), np.zeros(1, dtype=np.int64)
-    hypotheses = material_hypotheses(device, ["brass"])
-    u = fit_pairs(device, data, row, hypotheses).u
-    prior = prior_of(device, data, hypotheses)
-    pair = laplace._pairs(other, data, row, whiten(data, device.noise), prior, np.array([0]))[0]
-    nothing = np.zeros(len(laplace._AT))
-    whole, _ = laplace._settle(pair, u[0], nothing, -np.inf)
-    left, _ = laplace._settle(pair, u[0], nothing, np.inf)
-    assert (whole.converged.tolist(), left.converged.tolist()) == ([True], [False])
-    assert whole.log_evidence[0] > left.log_evidence[0] - 1.0
-
-
 @pytest.mark.parametrize("seed", [1, 6, 8])
 def test_what_is_behind_at_first_may_come_up(device, monkeypatch, seed):
-    """A gripper far from the guess: the first round had what is right 50 nats behind, and left it there."""
+    """A gripper far from the guess: the first round had what is right 50 nats behind, and left it there.
+    No number of steps finds more."""
     rng = np.random.default_rng(seed)
 
     def times(sd):
@@ -644,23 +617,47 @@ def test_what_is_behind_at_first_may_come_up(device, monkeypatch, seed):
     spread = GripperSpread(**{f.name: 3 * getattr(GripperSpread(), f.name) for f in fields(GripperSpread)})
     wide = another_gripper(device, spread)
     found = material_posterior(wide, grasps, FIVE)
+    monkeypatch.setattr(laplace, "_STEPS", 98)
+    np.testing.assert_allclose(found, material_posterior(wide, grasps, FIVE), atol=5e-3)
+
+
+def test_a_search_starts_beside_the_likeliest_hypothesis_where_that_is_better(device, touched, monkeypatch):
+    """From its gripper and nuisances; where a search from the guess begins nearer, from there."""
+    other = another_gripper(device)
+    data, row = touches(touched.isel(grasp=[1])), np.zeros(2, dtype=np.int64)
+    hypotheses = material_hypotheses(device, ["copper", "brass"])
+    v = fit_pairs(device, data, row, hypotheses).u
+    v[1, 0] += 1.0  # the guess begins farther
+    pairs, own, begun, cost = pairs_of(other, data, hypotheses, [1, 0]), mode_kernel.search, [], []
+
+    def search(asked, law, sd, u, *rest, **given):
+        begun.append(bool(u[0, N_NUISANCE:].any()))
+        return own(asked, law, sd, u, *rest, **given)
+
+    monkeypatch.setattr(mode_kernel, "search", search)
+    for off in (0.0, 30.0):
+        found = pairs.nothing_found()
+        pairs.settle(found, v, np.array([0]), None)
+        found.u[0, N_NUISANCE:] += off
+        pairs.settle(found, v, np.array([1]), np.array([0]))
+        assert found.settled.all()
+        cost.append(found.cost[1])
+    assert begun == [False, True, False, False]
+    assert cost[0] == pytest.approx(cost[1], abs=0.1)
+
+
+def test_points_of_a_free_effusivity_far_behind_are_not_searched(device, touched, monkeypatch):
+    """Beyond one that is 20 nats behind; what is likely is as if all were."""
+    other, data = another_gripper(device), touches(touched.isel(grasp=[1]))
+    x = np.linspace(*LN_E_RANGE, 12)
+    row = np.zeros(x.size, dtype=np.int64)
+    found = fit_pairs(other, data, row, free_hypotheses(other, x))
     monkeypatch.setattr(laplace, "_HOPELESS", 1e9)
-    np.testing.assert_allclose(found, material_posterior(wide, grasps, FIVE), atol=1e-3)
-
-
-@pytest.mark.parametrize(("cost", "taken"), [(4.9, True), (5.0, False), (None, False)])
-def test_a_search_starts_from_the_likeliest_hypothesis_gripper_where_that_is_better(monkeypatch, cost, taken):
-    asked = []
-
-    def point(pair, v, a):
-        asked.append(a.any())
-        found = cost if a.any() else 5.0
-        return None if found is None else SimpleNamespace(a=a, cost=found)
-
-    monkeypatch.setattr(laplace, "_point", point)
-    assert laplace._start(None, np.zeros(7), np.ones(3)).a.any() == taken
-    assert not laplace._start(None, np.zeros(7), np.zeros(3)).a.any()
-    assert asked == [False, True, False]
+    whole = fit_pairs(other, data, row, free_hypotheses(other, x))
+    near = whole.log_evidence > whole.log_evidence.max() - 15
+    np.testing.assert_allclose(found.log_evidence[near], whole.log_evidence[near], atol=1e-9)
+    assert (found.log_evidence[~near] < whole.log_evidence.max() - 12).all()
+    assert found.converged.sum() < x.size
 
 
 @pytest.mark.parametrize("off", [0.0, 0.7, 2.5])

@@ -17,6 +17,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     material_hypotheses,
     nodes_for,
     pairs_asked,
+    prior_of,
 )
 
 SD = np.array([0.3, 0.5, 0.1, 3.0, 0.4, 0.0, 0.2])
@@ -90,10 +91,12 @@ def means_of(nodes, rise, slope, times, bins, *, onset=0.0, late=-1.0):
         np.array(nodes, dtype=float), curves, bent, wanted, at, np.array([onset]), at, times, bins, count,
         np.empty((7, n)), means,
     )  # fmt: skip
+    u, numbers = np.zeros((1, 7)), np.zeros((1, 7))
+    if late >= 0:  # (C / e)^2 / 6, by a block that loses heat to its room
+        u[0, 6], numbers[0, 5] = 0.5 * np.log(6 * late + 1e-30), 1.0
     kernel.predicted.py_func(
-        means, wanted, at, count, times, times, np.zeros((1, 2, n)), np.zeros((1, 7)),
-        np.zeros((1, 7), dtype=bool), np.array([[late, 0.0, 0.0, 0.0, 0.0]]), room, np.empty((1, n)),
-        np.empty((1, n, 8)),
+        means, wanted, at, count, times, times, times, np.zeros(1), numbers, np.zeros((1, 2, n)), u,
+        np.zeros((1, 7), dtype=bool), room, np.empty((1, n)), np.empty((1, n, 8)),
     )  # fmt: skip
     return means[0, 0], means[0, 5], room[4], room[10]
 
@@ -148,3 +151,17 @@ def test_kernels_are_compiled_for_one_kind_of_arguments():
         found = pairs_asked(gripper.stack, nodes_for(data), data, np.array([0, 1]), beyond).beyond
         assert found.flags.writeable
         assert found.flags.c_contiguous
+
+
+def test_a_search_that_begins_at_the_skins_temperature_ends_where_others_do():
+    """Where object and skin are alike slopes say nothing of the rest, until the temperature has moved."""
+    gripper, record = load_default_gripper(), load_example_grasps()["exp1A_obj43_grip23"]
+    data = touches(record.isel(grasp=[0]).assign(t_object=("grasp", [np.nan])))
+    row, one = np.zeros(1, dtype=np.int64), material_hypotheses(gripper, ["brass"])
+    usual = fit_pairs(gripper, data, row, one)
+    start = prior_of(gripper, data, one).mean
+    start[:, 3] = start[:, 4] = data.level
+    found = fit_pairs(gripper, data, row, one, start=start)
+    assert found.converged.all()
+    np.testing.assert_allclose(found.u, usual.u, atol=0.02)
+    assert found.log_evidence[0] == pytest.approx(usual.log_evidence[0], abs=5e-3)
