@@ -339,7 +339,8 @@ def tune(
     scores = {name: score(part, spec, search.bounds) for name, part in results.items()}
     own = {name: [result for result in part if result.draw < STRUCTURE] for name, part in results.items()}
     moved = {name: np.mean([result.travel for result in part]) for name, part in own.items()}
-    alike = 1 + _ALIKE if moved["tuned"] < moved["baseline"] else 1.0
+    stiller = moved["tuned"] < moved["baseline"] / (1 + _STILL)
+    alike = 1 + (_ALIKE_IN_NOISE if stiller else _ALIKE if moved["tuned"] < moved["baseline"] else 0.0)
     kept = "tuned" if scores["tuned"] < alike * scores["baseline"] else "baseline"
     about = best if kept == "tuned" else search.evaluate(start)
     items = [(search, parameter, about.parameters, about) for parameter in PARAMETER_WORDS]
