@@ -104,6 +104,9 @@ _LONGEST_SAMPLE = 3600.0  # s
 _COARSE = 1.0  # range of an output below which the filter's numbers, made for degC, are too coarse
 _MOST_DELAY = 10.0  # delays in a lag, from which on the bias of a drive is learnt more slowly
 _OUTPUT_DRIFT = 0.03  # degC per sqrt(sample), by which a bias of an output may drift in a default design
+# of a drive of a black box [of its range per sqrt(s)]: where the first samples of a response are off, a loop
+# that learns sooner rings; what lasts is learnt sooner (mpc/estimator/observer.py)
+_BLACK_BOX_DRIFT = 7e-4
 _MOST_NOISE = 1e6  # of a state, a reading or a bias, in any unit
 _ROOMS = (-60.0, 150.0)  # degC: no room is beyond
 
@@ -428,7 +431,10 @@ def default_design(
         "loops": pair_loops(plant, controlled),
         "noise": ObserverNoise(
             # what is learnt sooner than a delay shows it is noise
-            drive=ObserverNoise.drive * min(1.0, min(ratios) / _MOST_DELAY) ** 1.5,
+            drive=min(
+                ObserverNoise.drive * min(1.0, min(ratios) / _MOST_DELAY) ** 1.5,
+                _BLACK_BOX_DRIFT if plant.scores.structure else np.inf,
+            ),
             output=_OUTPUT_DRIFT / dt**0.5,
         ),
         "deadline_s": 0.5 * dt,

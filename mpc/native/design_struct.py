@@ -96,6 +96,7 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "offset": (False, ("NY",), "sensor offsets [degC]"),
     "R": (False, ("NY",), "variance of a reading"),
     "Q": (False, ("NZ",), "variance that a sample adds"),
+    "Q_lasting": (False, ("NZ",), "the same while innovations stay on one side"),
     "P0": (False, ("NW",), "variance of the disturbance states at rest"),
     "R_start": (False, ("NY",), "variance of a reading at rest"),
     "rest": (False, ("NX",), "state at rest where all is at `ambient`"),
@@ -255,7 +256,7 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
             optimiser,
             "weight pair strongest seen reach lowest highest slew neutral safe at_rest dear zone energy",
         ),
-        (observer, "fixed offset R Q P0 R_start"),
+        (observer, "fixed offset R Q Q_lasting P0 R_start"),
         (disturbance, "on_drive on_disturbance on_output"),
     )
     return {name: getattr(part, name) for part, names in same_names for name in names.split()} | {

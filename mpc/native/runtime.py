@@ -142,7 +142,7 @@ def _truth_library(model: _ByStructure, drives: tuple[int, ...], h: float) -> ct
 @cache
 def _library(path: Path) -> ctypes.CDLL:
     library = ctypes.CDLL(str(path))
-    doubles, integers = "x w shown lag scale start P found_offset innovation between", "held lost"
+    doubles, integers = "x w shown lag scale start P found_offset innovation lasting between", "held lost"
     for names, kind in ((doubles, ctypes.c_double), (integers, ctypes.c_int)):
         for name in names.split():
             getattr(library, f"tg_host_{name}").restype = ctypes.POINTER(kind)
@@ -317,6 +317,7 @@ class CompiledObserver(Observer):
             "_held": c.view("held", (n_z,)),
             "found_offset": c.view("found_offset", (like.model.n_y,)),
             "innovation": c.view("innovation", (like.model.n_y,)),
+            "lasting": c.view("lasting", (like.model.n_y,)),
         }
         for name, value in like.__dict__.items():
             setattr(self, name, value)

@@ -28,6 +28,9 @@ _HOPELESS = {1: 6000.0, 2: 2000.0, 3: 1000.0, 4: 1000.0, 5: 1000.0} | dict.fromk
 # ended within 25 nats none was farther than 147 behind before a step, 54 after any number; what is left
 # at less than 300 is a start for finer points beside, which then end elsewhere
 _HOPELESS_STATED = {0: 500.0} | dict.fromkeys(range(1, 99), 300.0)
+# times what even the best leaves unexplained, more: where none explains the readings yet, as of a contact
+# that began later than was said, the right one may be that far behind
+_UNEXPLAINED = 3.0
 # times the quadratic model's curvature: from which on steps are shorter, and from which on they are damped
 _BENT, _FAR = 1.5, 4.0
 _HARDLY = 1e-3  # a damping that counts as none
@@ -555,6 +558,7 @@ class _Touched(NamedTuple):
         self.ahead[at] = cost - decrease
         np.minimum.at(best, row, self.ahead)
         limit = np.where(stated, _HOPELESS_STATED[step], _HOPELESS.get(step, np.inf))
+        limit = limit + _UNEXPLAINED * np.maximum(best, 0.0)
         return np.asarray(self.ahead[at] < (best + limit)[row[at]])
 
 

@@ -24,6 +24,7 @@ double *tg_host_start(tg_controller *c) { return c->start; }
 double *tg_host_P(tg_controller *c) { return c->P; }
 double *tg_host_found_offset(tg_controller *c) { return c->found_offset; }
 double *tg_host_innovation(tg_controller *c) { return c->innovation; }
+double *tg_host_lasting(tg_controller *c) { return c->lasting; }
 int *tg_host_lost(tg_controller *c) { return c->lost; }
 int *tg_host_held(tg_controller *c) { return c->held; }
 double *tg_host_between(tg_controller *c) { return &c->into_s; }

@@ -16,6 +16,8 @@
 
 #define LARGEST_BIAS 1.0 /* of its range: no drive makes up for more */
 #define REMEMBER 0.2 /* share of the newest innovation in their mean */
+#define LASTING 0.02 /* the same in the mean that shows what lasts, */
+#define LASTS 0.30151134457776363 /* from where on it does: 3 sqrt(q / (2 - q)) at q = LASTING */
 #define PRIOR_LAG 1.5   /* samples: standard deviation of a lag at the start */
 #define LONGEST_LAG 6.0 /* samples */
 #define SAME 1e-6 /* of a sample: what is nearer than this is the same time */
@@ -251,8 +253,11 @@ static void correct(tg_controller *c, const double *y, const double *known, doub
             S[a * TG_NY + b] =
                 (isfinite(y[a]) ? seen_by(H + a * TG_Z, HP + b * TG_Z) : 0.0) + (a == b ? R[a] : 0.0);
     for (int a = 0; a < TG_NY; a++)
-        if (isfinite(y[a]))
-            c->innovation[a] += remember * (off[a] / sqrt(S[a * (TG_NY + 1)]) - c->innovation[a]);
+        if (isfinite(y[a])) {
+            double scaled = off[a] / sqrt(S[a * (TG_NY + 1)]);
+            c->innovation[a] += remember * (scaled - c->innovation[a]);
+            c->lasting[a] += (remember > 0.0 ? LASTING : 0.0) * (scaled - c->lasting[a]);
+        }
     memcpy(gain, HP, sizeof gain);
     eliminate(S, gain); /* row a of gain: what reading a does to each state */
     for (int a = 0; a < TG_NY; a++)
@@ -324,6 +329,7 @@ void tg_observer_reset(tg_controller *c, const double *y, const double *d)
     memset(c->held, 0, sizeof c->held);
     memset(c->found_offset, 0, sizeof c->found_offset);
     memset(c->innovation, 0, sizeof c->innovation);
+    memset(c->lasting, 0, sizeof c->lasting);
     memset(c->P, 0, sizeof c->P);
     for (int i = 0; i < TG_NX; i++)
         memcpy(c->P + i * TG_Z, s->P_rest + i * TG_NX, TG_NX * sizeof(double));
@@ -697,6 +703,15 @@ static void find_band(const double *row, int *from, int *to)
         --*to;
 }
 
+/* Variance that a sample adds to each state. */
+static const double *added(const tg_controller *c)
+{
+    double most = 0.0;
+    for (int i = 0; i < TG_NY; i++)
+        most = fmax(most, fabs(c->lasting[i]));
+    return most > LASTS ? c->design->Q_lasting : c->design->Q;
+}
+
 /* P = J P J', twice by rows of J, which is sparse in its last rows, and often in all: J P, and J times its transpose,
  * of whose rows, which are symmetric, the second half is the first of others. */
 static void carry_covariance(tg_controller *c)
@@ -737,8 +752,9 @@ void tg_observer_predict(tg_controller *c, const double *u, const double *d)
         c->shown[r] += lag_share(c, r) * (scaled(c, r, c->x) - c->shown[r]);
     memcpy(c->x, next, sizeof c->x);
     carry_covariance(c);
+    const double *Q = added(c);
     for (int i = 0; i < TG_Z; i++)
-        c->P[i * TG_Z + i] += c->held[i] ? 0.0 : (1.0 - c->noised) * s->Q[i];
+        c->P[i * TG_Z + i] += c->held[i] ? 0.0 : (1.0 - c->noised) * Q[i];
     stand_on_sample(c);
 }
 
@@ -776,10 +792,11 @@ void tg_observer_look(tg_controller *c, const double *d)
         c->ahead[i] = (1.0 - share) * c->x[i] + share * next[i];
     for (int r = 0; r < TG_NG; r++)
         c->shown_ahead[r] = c->shown[r] + share * lag_share(c, r) * (scaled(c, r, c->x) - c->shown[r]);
+    const double *Q = added(c);
     for (int i = 0; i < TG_Z; i++) {
         for (int j = 0; j < TG_Z; j++)
             c->jacobian[i * TG_Z + j] = share * c->jacobian[i * TG_Z + j] + (i == j ? 1.0 - share : 0.0);
-        c->P[i * TG_Z + i] += c->held[i] ? 0.0 : (share - c->noised) * s->Q[i];
+        c->P[i * TG_Z + i] += c->held[i] ? 0.0 : (share - c->noised) * Q[i];
     }
     c->has_jacobian = 0;
     for (int i = 0; i < TG_NY; i++)

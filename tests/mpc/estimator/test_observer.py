@@ -495,3 +495,35 @@ def test_readings_of_a_black_box_count_by_no_more_than_their_own_noise_and_the_m
     old, new = ([*default_design(p).observer(PredictionModel(p, dt=2.0)).R] for p in plants)
     assert old == pytest.approx([81.0, 0.01])
     assert new == pytest.approx([0.25, 0.01])
+
+
+@pytest.mark.parametrize("structure", ["", "na 2"])
+def test_a_black_box_learns_a_load_that_lasts_sooner_and_a_network_as_before(structure: str) -> None:
+    plain = MODEL.plant
+    made = PredictionModel(replace(plain, scores=PlantScores(structure=structure)), dt=DT)
+    noise = replace(NOISE, drive=1e-3)
+    observer, same = Observer(made, CHOSEN, noise), Observer(MODEL, CHOSEN, noise)
+    x, room = MODEL.rest(LEVEL, np.array([25.0])), np.array([25.0])
+    for each in (observer, same):
+        each.reset(MODEL.output(x) + OFFSET, room)
+        each.lasting = np.array([0.31, 0.0])  # just beyond 3 sqrt(0.02 / 1.98)
+        before = each._P.copy()
+        F = each._sample(np.zeros(1), room)[2]
+        each.predict(np.zeros(1), room)
+        added = np.diag(each._P - F @ before @ F.T)
+        drive = MODEL.n_x + int(np.argmax(each.is_drive))
+        times = 25.0 if each is observer and structure else 1.0
+        want = each.Q * np.where(np.arange(added.size) == drive, times, 1.0)
+        np.testing.assert_allclose(added, want, rtol=1e-6, atol=1e-12)
+    observer.lasting = np.array([0.30, -0.30])  # within
+    before, F = observer._P.copy(), observer._sample(np.zeros(1), room)[2]
+    observer.predict(np.zeros(1), room)
+    np.testing.assert_allclose(np.diag(observer._P - F @ before @ F.T), observer.Q, rtol=1e-6, atol=1e-12)
+    # a fiftieth of the newest innovation of a move, nothing of a reading between two
+    observer.lasting = np.array([0.1, 0.1])
+    held = observer.lasting.copy()
+    observer.refine(observer.reading() + 0.5)
+    np.testing.assert_array_equal(observer.lasting, held)
+    observer.update(observer.reading() + [0.5, np.nan])
+    assert observer.lasting[1] == held[1]
+    assert observer.lasting[0] > held[0]

@@ -23,6 +23,7 @@ from thermogrip.mpc.native.runtime import build_library, compiler, wanted
 from thermogrip.mpc.optimiser.rti import Sample
 from thermogrip.mpc.tuning.objective import Search, parameters_of
 from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.fit_record import PlantScores
 from thermogrip.sysid.plant.plant import Plant
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no gcc here")
@@ -190,6 +191,30 @@ def test_a_rod_of_many_masses_is_the_same_in_c():
     assert set(statuses[:80]) == {"ok"}
     assert statuses.index("infeasible") == 81  # found by the steady state
     assert set(statuses[81:]) == {"infeasible"}
+
+
+def test_a_load_on_a_black_box_is_learnt_alike_in_c():
+    """Innovations that stay on one side make a drive's bias move faster, in all three at the same sample."""
+    plant = replace(rod(8), scores=PlantScores(structure="na 2"))
+    design = default_design(plant, controlled=("a", "b"))
+    assert design.noise.drive < 0.002
+    python, c = Controller(plant, design), Controller(plant, design, compiled=True)
+    whole, truth, rng = InC(plant, design), python.model, np.random.default_rng(4)
+    x, d, told = np.full(truth.n_x, 25.0), np.array([25.0]), []
+    reading, applied = dict.fromkeys(("a", "b", "c"), 25.0) | {"room": 25.0}, dict[str, float]()
+    for controller in (python, c, whole):
+        controller.reset(reading)
+    for k in range(160):
+        y = truth.output(x) + 0.02 * rng.standard_normal(3)
+        reading = dict(zip(("a", "b", "c"), y.tolist())) | {"room": 25.0} | applied
+        one, two, three = (each.step(reading, 32.0) for each in (python, c, whole))
+        ours, applied = np.array(one.drives(truth.drives)), dict(one.drive)
+        for move in (two, three):
+            np.testing.assert_allclose(move.drives(truth.drives), ours, atol=1e-9)
+        np.testing.assert_allclose(c.observer.lasting, python.observer.lasting, atol=1e-9)
+        told.append(np.abs(python.observer.lasting).max() * np.sqrt(99))
+        x = truth.next_state(x, ours - 0.15 * (k >= 60), d)
+    assert max(told[:60]) < 3 < max(told[60:])
 
 
 @pytest.mark.parametrize("held", [(), ("t_surface",)])
