@@ -647,9 +647,11 @@ static int failed(tg_qp *q, int status)
     return status;
 }
 
+static int search(tg_qp *q);
+
 int tg_qp_solve(tg_qp *q)
 {
-    int row = 0, side = 0, upward = 0, which;
+    int status, warm;
     /* a factor that was updated is made anew, or its errors would add up */
     int same = q->kept && !q->iterations && q->n_work > 0;
     q->iterations = 0;
@@ -666,6 +668,23 @@ int tg_qp_solve(tg_qp *q)
     forward(q, q->c, 0);
     memset(q->in_set, 0, sizeof q->in_set);
     take_up(q, same);
+    warm = q->n_work > 0;
+    status = search(q);
+    if (status == TG_QP_ITERATIONS && warm) { /* the last solve's set led astray, or had no room: from nothing */
+        int before = q->iterations;
+        q->iterations = 0;
+        memset(q->in_set, 0, sizeof q->in_set);
+        clear_fit(q);
+        status = search(q);
+        q->iterations += before;
+    }
+    return status;
+}
+
+/* Go from the set that is there to the answer. */
+static int search(tg_qp *q)
+{
+    int row = 0, side = 0, upward = 0, which;
     while (q->iterations <= q->iteration_limit) {
         if (q->late && q->late(q->about))
             return failed(q, TG_QP_TIME);
