@@ -461,7 +461,8 @@ def identify(
         logs = _without_still(logs)
     u, y, d = signals(logs, inputs=inputs, outputs=outputs, disturbances=disturbances)
     still = _still_inputs(network, logs, u)
-    u = [name for name in u if name not in still]  # a network has a prior of what never moves, others nothing
+    # a network has a prior of what never moves, others nothing
+    u = tuple(name for name in u if name not in still)
     candidates = _candidates(models, network)
     if leave_one_out and len(logs) < 2:
         raise UserError("leaving one log out needs at least two logs", hint="give another log")
