@@ -352,7 +352,7 @@ def _controller_parts(s: Sizes, number: Any) -> list[tuple[Any, int]]:
     qp = type("tg_qp", (ctypes.Structure,), {"_fields_": _laid_out(_qp_parts(s, number))})
     return [
         (ctypes.c_void_p, 4),
-        *((number, count) for count in (s.NX, s.NW, s.NG, s.NG, s.NG, s.NG, z * z, s.NY, s.NY)),
+        *((number, count) for count in (s.NX, s.NW, s.NG, s.NG, s.NG, s.NG, z * z, s.NY, s.NY, s.NY)),
         (whole, z),
         *((number, count) for count in (3, s.NU, s.NX, s.NG, s.NY)),
         (ctypes.c_double, 2),

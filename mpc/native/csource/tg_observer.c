@@ -740,7 +740,6 @@ static void carry_covariance(tg_controller *c)
 
 void tg_observer_predict(tg_controller *c, const double *u, const double *d)
 {
-    const tg_design *s = c->design;
     double next[TG_NX] = {0.0}, on_u[TG_NU], on_d[TG_SOME(TG_ND)] = {0.0}, on_y[TG_NY];
     tg_biases(c, on_u, on_d, on_y);
     for (int j = 0; j < TG_NU; j++)
