@@ -63,6 +63,7 @@ ALL = [
     Benchmark("classify/grippers.py", quick="--grippers 1"),
     Benchmark("classify/transfer.py", quick="--sets 1 --test 3 --classifiers posterior,pca-lda"),
     Benchmark("classify/touches.py", "--out {out}", "--splits 1 --parts two --out {out}"),
+    Benchmark("classify/late.py"),
     Benchmark("classify/lstm.py", quick="--measure 5", needs=("torch",)),
     Benchmark("classify/hold.py", "{data}", "{data} --classifiers bayes,pca-lda"),
     Benchmark("classify/scale.py", "{out}/scale --files 2 20 --kill", "{out}/scale --files 1 3 --kill"),

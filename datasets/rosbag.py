@@ -52,8 +52,8 @@ _NUMBERS = {"temperature": "degC", "data": ""}  # the one field of a message wit
 
 @dataclass(frozen=True)
 class Column:
-    """Where a column comes from: topic, field (dots and indices), unit, role ("" to guess); the
-    type of its messages, which a bag says itself and a node does not."""
+    """Where a column comes from: topic, field (dots and indices), unit, role ("" to guess), and the type of
+    its messages, which a bag says itself and a node does not."""
 
     topic: str
     field: str

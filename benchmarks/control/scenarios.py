@@ -29,6 +29,20 @@ from thermogrip.mpc.plant.prediction import prediction_model
 ROWS, BEYOND, SCENARIOS = ("model is right", "every number off", "gain -30 %", "gain +30 %"), 0.15, 5
 
 
+def program(one, sample):
+    """Return H, f, A, bounds, and the free response and its derivatives of one plant's optimiser."""
+    more = 0.0 if sample.slew_s is None else sample.slew_s / one.design.dt - 1.0
+    one._move = sample.caution * one.design.move
+    target = np.broadcast_to(sample.target, (one.N, len(sample.target)))
+    y0, G = one.model.trajectory(sample.x, sample.guess + sample.drive_bias, sample.d, one.blocks)
+    G = G.reshape(one.N, one.model.n_y, -1) * np.tile(one.model.span, one.n_b)
+    free = y0 + sample.bias - G @ (sample.guess / one.model.span).ravel()
+    H, f = one._cost(G, free, target, sample.last)
+    ends = one._range(sample.guess, sample.drive_bias, one._authority(G), sample.last, more)
+    bounds = one._constraints(G, free, target, sample.side, sample.last, ends, more)
+    return H, f, *bounds, free, G
+
+
 class ScenarioOptimiser(Optimiser):
     """The program of a design over several plants that share the first move."""
 
@@ -51,22 +65,9 @@ class ScenarioOptimiser(Optimiser):
             time_limit_s=10.0,
         )
 
-    def program(self, sample):
-        """Return H, f, A, bounds, and the free response and its derivatives of one plant."""
-        more = 0.0 if sample.slew_s is None else sample.slew_s / self.design.dt - 1.0
-        self._move = sample.caution * self.design.move
-        target = np.broadcast_to(sample.target, (self.N, len(sample.target)))
-        y0, G = self.model.trajectory(sample.x, sample.guess + sample.drive_bias, sample.d, self.blocks)
-        G = G.reshape(self.N, self.model.n_y, -1) * np.tile(self.model.span, self.n_b)
-        free = y0 + sample.bias - G @ (sample.guess / self.model.span).ravel()
-        H, f = self._cost(G, free, target, sample.last)
-        ends = self._range(sample.guess, sample.drive_bias, self._authority(G), sample.last, more)
-        bounds = self._constraints(G, free, target, sample.side, sample.last, ends, more)
-        return H, f, *bounds, free, G
-
     def solve(self, sample):
         """Improve a plan."""
-        programs = [Optimiser.program(each, sample) for each in (self, *self.others)]
+        programs = [program(each, sample) for each in (self, *self.others)]
         count = len(programs)
         H = sum(E.T @ p[0] @ E for E, p in zip(self.places, programs)) / count
         f = sum(E.T @ p[1] for E, p in zip(self.places, programs)) / count
@@ -83,9 +84,6 @@ class ScenarioOptimiser(Optimiser):
         """Start afresh."""
         super().forget()
         self.joint.forget()
-
-
-Optimiser.program = ScenarioOptimiser.program
 
 
 def figures(controller, case, seed):

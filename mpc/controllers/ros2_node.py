@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from importlib import resources
+from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,19 +35,9 @@ from thermogrip.mpc.interface import STATUSES
 KEPT_SAMPLES = 3
 _OF_NODE = {"pump": "std_msgs/msg/Bool", "status": "std_msgs/msg/UInt8"}
 _TEMPERATURE, _NUMBER = "sensor_msgs/msg/Temperature", "std_msgs/msg/Float64"
-_SENT = (
-    "Float64",
-    "Float32",
-    "Int64",
-    "Int32",
-    "Int16",
-    "Int8",
-    "UInt64",
-    "UInt32",
-    "UInt16",
-    "UInt8",
-    "Bool",
-)
+_SENT = {
+    "Bool", "Float32", "Float64", "Int8", "Int16", "Int32", "Int64", "UInt8", "UInt16", "UInt32", "UInt64"
+}  # fmt: skip
 
 
 class _Heard(NamedTuple):
@@ -112,7 +103,7 @@ class TopicLoop:
     def reset(self) -> None:
         """Forget the past: it starts at rest at what is heard from now on."""
         self._heard: dict[str, _Heard] = {}
-        self.running, self.advice = False, ""
+        self._running, self.advice = False, ""
 
     def hear(self, topic: str, message: Any, seconds: float) -> None:
         """Take the readings and targets of a message that came at this time of the node's clock [s]."""
@@ -125,13 +116,13 @@ class TopicLoop:
     def tick(self, seconds: float) -> dict[str, float]:
         """Return what is published at this time of the node's clock [s], a number by topic."""
         waiting = [n for n in (*self.controller.controlled, *self._targets) if n not in self._heard]
-        if waiting and not self.running:
+        if waiting and not self._running:
             self.advice = f"no message yet of {', '.join(self._columns[name].topic for name in waiting)}"
             return {}
         reading = {name: self._reading(name, seconds) for name in self._readings if name in self._heard}
-        if not self.running:
+        if not self._running:
             self.controller.reset(reading)
-            self.running = True
+            self._running = True
         targets = {output: self._heard[name].value for name, output in self._targets.items()}
         move = self.controller.step({"time_s": seconds, **reading}, targets)
         self.advice = move.advice
@@ -182,32 +173,28 @@ def replay_bag(loop: TopicLoop, bag: str | Path, out: str | Path) -> int:
 
     It ticks every sample time from the bag's first message on that it hears, and sees what came until then.
     """
-    heard = {topic for topic, _ in loop.subscriptions}
-    types, count = dict(loop.publications), 0
+    types = dict(loop.publications)
+    answered = [(seconds, answer) for seconds, answer in _ticks(loop, bag) if answer]
+    said = ((topic, types[topic], at, value) for at, answer in answered for topic, value in answer.items())
+    write_bag(out, said)
+    return len(answered)
 
-    def answers() -> Iterator[tuple[str, str, float, float]]:
-        nonlocal count
-        start = due = math.nan
-        loop.reset()
-        ticks = 0
-        for message in bag_messages(bag):
-            if message.topic not in heard:
-                continue
-            if math.isnan(start):
-                start = due = message.time
-            while message.time > due:
-                for topic, value in loop.tick(due).items():
-                    yield topic, types[topic], due, value
-                count += loop.running
-                ticks += 1
-                due = start + ticks * loop.dt
-            loop.hear(message.topic, message.content, message.time)
-        for topic, value in ({} if math.isnan(due) else loop.tick(due)).items():
-            yield topic, types[topic], due, value
-        count += loop.running
 
-    write_bag(out, answers())
-    return count
+def _ticks(loop: TopicLoop, bag: str | Path) -> Iterator[tuple[float, dict[str, float]]]:
+    """Yield the time of each tick [s] and what the loop then answers."""
+    topics, at = {topic for topic, _ in loop.subscriptions}, 0
+    heard = [message for message in bag_messages(bag) if message.topic in topics]
+    if not heard:
+        raise UserError("has none of the loop's topics", file=bag, hint="correct topics.toml")
+    loop.reset()
+    for k in count():
+        due = heard[0].time + k * loop.dt
+        while at < len(heard) and heard[at].time <= due:
+            loop.hear(heard[at].topic, heard[at].content, heard[at].time)
+            at += 1
+        yield due, loop.tick(due)
+        if at == len(heard):
+            return
 
 
 def _topics_of(controller: Controller) -> str:

@@ -412,21 +412,9 @@ def search(
     diagonal, none = np.arange(m), np.full(n, np.inf)
     found = Found(u.copy(), np.empty((n, m + 1, m + 1)), none.copy(), np.zeros(n, dtype=bool))
     here = _Search(
-        np.arange(n),
-        law,
-        sd,
-        u,
-        u,
-        none,
-        found.matrix,
-        u,
-        u,
-        np.full(n, 1e-2),
-        none,
-        none,
-        none,
-        found.settled,
-    )
+        at=np.arange(n), law=law, sd=sd, trial=u, point=u, cost=none, matrix=found.matrix, slope=u, bound=u,
+        damping=np.full(n, 1e-2), part=none, slope_gain=none, bend=none, stale=found.settled,
+    )  # fmt: skip
     for step in range(max_steps + 1):
         here = _moved(*_refitted(here, pairs.products(here.at, here.trial, first=step == 0)), step)
         rhs, curved = here.matrix[:, :m, m] - here.slope, here.matrix[:, :m, :m].copy()

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import expit, logit
+from scipy.special import expit, logit, softmax
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.grasp_files import Records, as_grasps
@@ -107,8 +107,7 @@ def material_posterior(
 ) -> Array:  # fmt: skip
     """Return probabilities of the candidates, (n_grasp, n_candidate), at equal prior odds; rows sum to 1."""
     evidence = material_evidence(gripper, grasps, candidates, finish=finish, until=until)
-    odds = np.exp(evidence - evidence.max(axis=1, keepdims=True))
-    return np.asarray(odds / odds.sum(axis=1, keepdims=True))
+    return np.asarray(softmax(evidence, axis=1))
 
 
 def effusivity_posterior(

@@ -26,7 +26,15 @@ from scipy.stats import t as t_law
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.greybox.population import ILL, ROUNDS, STILL, Told, told_by
+from thermogrip.sysid.greybox.population import (
+    ILL,
+    ROUNDS,
+    STILL,
+    Told,
+    in_prior_units,
+    prior_units,
+    told_by,
+)
 from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.plant.plant import Plant
 
@@ -112,13 +120,10 @@ def find_drift(
             raise UserError(f"logs of rig {name} are of one time", hint="give their dates")
     assert isinstance(model, NetworkModel)
     specs = [model.specs[name] for name in first.free]
-    centre = np.array([np.log(s.value) if s.scale == "log" else s.value for s in specs])
-    width = np.array([s.sd_log if s.sd_log is not None else s.sd for s in specs], dtype=float)
+    centre, width = prior_units(specs)
     told, taus = [], []
     for name in names:
-        z = (np.array([plant.theta for plant in fits[name]]) - centre) / width
-        S = np.array([plant.covariance for plant in fits[name]]) / np.outer(width, width)
-        told.append(told_by(z, S))
+        told.append(told_by(*in_prior_units(fits[name], centre, width)))
         at = np.asarray(days[name], dtype=float)
         taus.append((at - at.min()) / np.ptp(at) - 0.5)
     T = _day_to_day(told, taus)

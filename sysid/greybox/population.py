@@ -38,7 +38,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -215,10 +215,8 @@ def pool_rigs(plants: Mapping[str, Plant]) -> tuple[Population, tuple[Rig, ...]]
             raise UserError(f"rig {name} has no fit of the others' thermal network", hint="leave it out")
     assert isinstance(model, NetworkModel)
     specs = [model.specs[name] for name in first.free]
-    centre = np.array([np.log(s.value) if s.scale == "log" else s.value for s in specs])
-    width = np.array([s.sd_log if s.sd_log is not None else s.sd for s in specs], dtype=float)
-    z = (np.array([plant.theta for plant in plants.values()]) - centre) / width
-    S = np.array([plant.covariance for plant in plants.values()]) / np.outer(width, width)
+    centre, width = prior_units(specs)
+    z, S = in_prior_units(plants.values(), centre, width)
     told = told_by(z, S)
     whole = _pool(told)
 
@@ -244,6 +242,20 @@ def pool_rigs(plants: Mapping[str, Plant]) -> tuple[Population, tuple[Rig, ...]]
         of_others = population(others, [other for other in names if other != name])
         rigs.append(Rig(name, centre + width * whole.rigs[i], covariance, off, distance, chance, of_others))
     return population(whole, names), tuple(rigs)
+
+
+def prior_units(specs: Sequence[Parameter]) -> tuple[Array, Array]:
+    """Return where theta is 0 and by how much it is 1 (k,) in units of the prior of these parameters."""
+    centre = np.array([np.log(s.value) if s.scale == "log" else s.value for s in specs])
+    width = np.array([s.sd_log if s.sd_log is not None else s.sd for s in specs], dtype=float)
+    return centre, width
+
+
+def in_prior_units(plants: Iterable[Plant], centre: Array, width: Array) -> tuple[Array, Array]:
+    """Return theta (n, k) of fits and its covariances (n, k, k) in units of the prior."""
+    fits = list(plants)
+    z = (np.array([plant.theta for plant in fits]) - centre) / width
+    return z, np.array([plant.covariance for plant in fits]) / np.outer(width, width)
 
 
 def _with_prior(spec: Parameter, value: float, sd: float) -> Parameter:

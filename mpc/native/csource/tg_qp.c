@@ -647,7 +647,35 @@ static int failed(tg_qp *q, int status)
     return status;
 }
 
-static int search(tg_qp *q);
+/* Go from the set that is there to the answer. */
+static int search(tg_qp *q)
+{
+    int row = 0, side = 0, upward = 0, which;
+    while (q->iterations <= q->iteration_limit) {
+        if (q->late && q->late(q->about))
+            return failed(q, TG_QP_TIME);
+        if (q->stale && !make_fit(q))
+            break;
+        which = go(q, &upward);
+        if (which >= 0) {
+            q->iterations++;
+            change(q, which, upward);
+            continue;
+        }
+        make_x(q);
+        if (!worst(q, &row, &side)) {
+            int held = 0;
+            for (int turn = 0; turn < REFINEMENTS && !held; turn++)
+                held = refine(q);
+            if (!held)
+                return failed(q, TG_QP_INFEASIBLE);
+            return all_finite(q->x, q->n) ? TG_QP_SOLVED : failed(q, TG_QP_NOT_FINITE);
+        }
+        q->iterations++;
+        put(q, row, side, row >= 2 * q->n ? 1 : 0, 0.0);
+    }
+    return failed(q, TG_QP_ITERATIONS);
+}
 
 int tg_qp_solve(tg_qp *q)
 {
@@ -679,34 +707,4 @@ int tg_qp_solve(tg_qp *q)
         q->iterations += before;
     }
     return status;
-}
-
-/* Go from the set that is there to the answer. */
-static int search(tg_qp *q)
-{
-    int row = 0, side = 0, upward = 0, which;
-    while (q->iterations <= q->iteration_limit) {
-        if (q->late && q->late(q->about))
-            return failed(q, TG_QP_TIME);
-        if (q->stale && !make_fit(q))
-            break;
-        which = go(q, &upward);
-        if (which >= 0) {
-            q->iterations++;
-            change(q, which, upward);
-            continue;
-        }
-        make_x(q);
-        if (!worst(q, &row, &side)) {
-            int held = 0;
-            for (int turn = 0; turn < REFINEMENTS && !held; turn++)
-                held = refine(q);
-            if (!held)
-                return failed(q, TG_QP_INFEASIBLE);
-            return all_finite(q->x, q->n) ? TG_QP_SOLVED : failed(q, TG_QP_NOT_FINITE);
-        }
-        q->iterations++;
-        put(q, row, side, row >= 2 * q->n ? 1 : 0, 0.0);
-    }
-    return failed(q, TG_QP_ITERATIONS);
 }

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from itertools import cycle
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -17,6 +18,7 @@ from thermogrip.sysid.greybox.population import Population, Rig
 from thermogrip.sysid.plant.plant import Plant
 
 _OWN = "by its own logs"
+_COLUMNS = 3  # of panels
 
 
 def population_table(
@@ -67,16 +69,29 @@ def drift_table(
     return head, rows
 
 
+def _panels(population: Population, height: float) -> tuple[Figure, dict[str, Axes]]:
+    """Return a figure with a panel a parameter, so high each [in], and the panels by name."""
+    n = len(population.parameters)
+    rows = -(-n // _COLUMNS)
+    figure, axes = panels(rows, _COLUMNS, size=(10.0, rows * height))
+    for axis in axes.flat[n:]:
+        axis.set_visible(False)
+    return figure, dict(zip(population.parameters, axes.flat))
+
+
+def _with_legend(figure: Figure, columns: int) -> Figure:
+    """Return a figure with what its first panel shows, each once, above it."""
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    found = dict(zip(labels, handles))
+    figure.legend(list(found.values()), list(found), loc="outside upper center", fontsize=7, ncols=columns)
+    return figure
+
+
 def drift_figure(plant: Plant, population: Population, moved: Sequence[Drift], *, dated: bool) -> Figure:
     """Draw every parameter of every rig by the time of its logs; rigs that change are named."""
-    n, columns = len(population.parameters), 3
-    figure, axes = panels(-(-n // columns), columns, size=(10.0, 2.6 * -(-n // columns)))
+    figure, axes = _panels(population, 2.6)
     ranges = population.intervals(0.9)
-    for k, axis in enumerate(axes.ravel()):
-        if k >= n:
-            axis.set_visible(False)
-            continue
-        name = population.parameters[k]
+    for k, (name, axis) in enumerate(axes.items()):
         axis.axhspan(*ranges[name], color=PALETTE[0], alpha=0.15, lw=0, label="90 % of new rigs")
         looks = zip(cycle(PALETTE[1:]), cycle("os^vD"))
         for rig in sorted(moved, key=lambda each: each.drifts):
@@ -93,24 +108,15 @@ def drift_figure(plant: Plant, population: Population, moved: Sequence[Drift], *
         axis.yaxis.set_major_locator(MaxNLocator(4))
         axis.set_ylabel(f"{name} [{plant.units.get(name, '1')}]")
         axis.set_xlabel("days from a rig's first log" if dated else "log")
-    handles, labels = axes.flat[0].get_legend_handles_labels()
-    found = dict(zip(labels, handles))
-    figure.legend(list(found.values()), list(found), loc="outside upper center", fontsize=7, ncols=5)
-    return figure
+    return _with_legend(figure, 5)
 
 
 def fleet_figure(plants: Mapping[str, Plant], population: Population, rigs: Sequence[Rig]) -> Figure:
     """Draw every parameter of every rig, by its own logs and pooled, on the population's 90 % interval."""
-    n, columns = len(population.parameters), 3
-    rows = -(-n // columns)
-    figure, axes = panels(rows, columns, size=(10.0, rows * (0.9 + 0.17 * len(rigs))))
+    figure, axes = _panels(population, 0.9 + 0.17 * len(rigs))
     ranges = population.intervals(0.9)
     y, called = np.arange(len(rigs)), [f"{rig.name} (ill)" if rig.ill else rig.name for rig in rigs]
-    for k, axis in enumerate(axes.ravel()):
-        if k >= n:
-            axis.set_visible(False)
-            continue
-        name = population.parameters[k]
+    for k, (name, axis) in enumerate(axes.items()):
         axis.axvspan(*ranges[name], color=PALETTE[0], alpha=0.15, lw=0, label="90 % of new rigs")
         for place, rig in zip(y, rigs):
             own = plants[rig.name]
@@ -127,13 +133,10 @@ def fleet_figure(plants: Mapping[str, Plant], population: Population, rigs: Sequ
         margin = 0.15 * (max(values) - min(values))
         axis.set_xlim(min(values) - margin, max(values) + margin)  # a short log's interval may be far wider
         axis.xaxis.set_major_locator(MaxNLocator(4))
-        axis.set_yticks(y, called if k % columns == 0 else [], fontsize=7)
+        axis.set_yticks(y, called if k % _COLUMNS == 0 else [], fontsize=7)
         axis.set_ylim(len(rigs) - 0.5, -0.5)
         axis.set_xlabel(f"{name} [{next(iter(plants.values())).units.get(name, '1')}]")
-    handles, labels = axes.flat[0].get_legend_handles_labels()
-    found = dict(zip(labels, handles))
-    figure.legend(list(found.values()), list(found), loc="outside upper center", fontsize=7, ncols=3)
-    return figure
+    return _with_legend(figure, 3)
 
 
 def fleet_sections(
