@@ -52,6 +52,7 @@ from thermogrip.sysid.blackbox.fit import (
 )
 from thermogrip.sysid.blackbox.order_selection import HARDLY_MORE, excess_within_noise, folds, held_out_runs
 from thermogrip.sysid.data.data_quality import DataCheck, Evidence, check_data, evidence
+from thermogrip.sysid.data.rest_before import with_rest
 from thermogrip.sysid.plant.fit_record import (
     HELD_OUT_SHARE,
     OTHER_KIND_GAIN_SD,
@@ -61,7 +62,7 @@ from thermogrip.sysid.plant.fit_record import (
     TAIL,
     HeldOut,
 )
-from thermogrip.sysid.plant.log_grid import match_logs, misfit, roles_of, signals
+from thermogrip.sysid.plant.log_grid import match_logs, misfit, moved_before, roles_of, signals
 from thermogrip.sysid.plant.log_grid import rows_of as log_rows
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run, no_input_baseline
@@ -463,6 +464,7 @@ def identify(
     still = _still_inputs(network, logs, u)
     # a network has a prior of what never moves, others nothing
     u = tuple(name for name in u if name not in still)
+    logs, rested = with_rest(logs, u, y)
     candidates = _candidates(models, network)
     if leave_one_out and len(logs) < 2:
         raise UserError("leaving one log out needs at least two logs", hint="give another log")
@@ -472,6 +474,7 @@ def identify(
         says, kept = "; ".join(f.says for f in failed), [n for n in u if n not in {f.channel for f in failed}]
         hint = "move it in the experiment, or leave it out"
         hint += f" with --inputs {','.join(kept)}" if 0 < len(kept) < len(u) else ""
+        hint += moved_before(logs[0])
         raise UserError(says, file=log_name(logs[0]), column=failed[0].channel, hint=hint)
     cases = list(cases_of(logs, leave_one_out))
     boxes = [] if leave_one_out else [model for model in candidates if model != "network"]
@@ -517,7 +520,7 @@ def identify(
     plant, lost = _with_draws(fitted, logs, parts, posterior=posterior, draws=draws, seed=seed)
     lists = {"input": inputs, "output": outputs, "disturbance": disturbances}
     roles, unused = _signal_roles(logs, ([*u, *still], d, y), lists, network, still)
-    notes = (*converted, *refused, *unused, *lost, *_plant_notes(chosen, plant))
+    notes = (*converted, *rested, *refused, *unused, *lost, *_plant_notes(chosen, plant))
     # the same warm-up as on what was held out, or errors of the start would stand beside ones without
     whole = [
         Held(log, log_name(log), 0.0 if leave_one_out else warm_up_of(log["time"].values)) for log in logs

@@ -3,9 +3,9 @@
 One-step error cannot choose a model: on a slow plant the last reading alone predicts the next one well,
 input or not. Every structure is therefore fitted on part of the training data and *simulated* over the
 rest: the readings of a short warm-up set its state, and the remaining rows score it. With three or more
-logs each log is held out in turn; with fewer, each of four consecutive blocks. A log that alone moves an
-input (the only one that stops the pump) is not held out: a model fitted to the others cannot know that
-input.
+logs each log is held out in turn; with fewer, each of four consecutive blocks. A log or block that alone
+moves an input (the only one that stops the pump, the one with the step) is not held out: a model fitted to
+the others cannot know that input.
 
 **The one-standard-error rule.** With e_sf the error of structure s on fold f and b the best structure, the
 smallest structure is taken for which
@@ -32,7 +32,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import product
+from itertools import pairwise, product
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -56,6 +56,7 @@ FEWEST = 20  # rows of a block that is held out
 
 _ALIKE = 0.98  # correlation of an input with its square: a line leaves a fifth of the square's spread
 
+_MOVED = 0.01  # of an input's range: less is noise of its reading
 _SHORT = 0.25  # of a held-out part: the memory of an offset that fades
 
 
@@ -109,10 +110,11 @@ class Choice:
 def folds(grid: Grid, *, blocks: int = _BLOCKS) -> Iterator[tuple[str, Grid, tuple[Segment, ...]]]:
     """Yield (what is held out, the training grid, the held-out segments)."""
     if len(grid.logs) >= 3:
-        candidates = [name for name in grid.logs if _may_be_held_out(grid, name)]
-        for name in candidates if len(candidates) >= 2 else grid.logs:
-            rest = [segment for segment in grid.segments if segment.log != name]
-            yield name, grid.having(rest), tuple(s for s in grid.segments if s.log == name)
+        parts = [
+            (name, [s for s in grid.segments if s.log == name], [s for s in grid.segments if s.log != name])
+            for name in grid.logs
+        ]
+        yield from _of_known_inputs(grid, parts)
         return
     total = sum(len(segment.time) for segment in grid.segments)
     if total < FEWEST * blocks:
@@ -120,10 +122,21 @@ def folds(grid: Grid, *, blocks: int = _BLOCKS) -> Iterator[tuple[str, Grid, tup
             f"{total} rows of {grid.dt:g} s are too short to hold a part out",
             hint="give a longer log or average less",
         )
-    for block in range(blocks):
-        first, last = round(total * block / blocks), round(total * (block + 1) / blocks)
-        inside, outside = _split(grid.segments, first, last)
-        yield f"block {block + 1} of {blocks}", grid.having(outside), tuple(inside)
+    edges = [round(total * block / blocks) for block in range(blocks + 1)]
+    labels = [f"block {block + 1} of {blocks}" for block in range(blocks)]
+    cut = [_split(grid.segments, *pair) for pair in pairwise(edges)]
+    yield from _of_known_inputs(grid, [(label, *both) for label, both in zip(labels, cut)])
+
+
+def _of_known_inputs(
+    grid: Grid, parts: Sequence[tuple[str, list[Segment], list[Segment]]]
+) -> Iterator[tuple[str, Grid, tuple[Segment, ...]]]:
+    """Yield the parts (what, held out, rest) as folds: those whose rest moves each input that they move, or
+    all where these are fewer than two."""
+    range_of = np.ptp(np.concatenate([segment.u for segment in grid.segments]), axis=0)
+    known = [part for part in parts if _moves_all(part[2], than=part[1], least=_MOVED * range_of)]
+    for label, held, rest in known if len(known) >= 2 else parts:
+        yield label, grid.having(rest), tuple(held)
 
 
 def held_out_runs(grid: Grid, held: Sequence[Segment]) -> list[Segment]:
@@ -376,11 +389,10 @@ def _one_standard_error(table: Mapping[Structure, Array], most: float = HARDLY_M
     return min(good, key=lambda s: (s.size, float(logs[s].mean())))
 
 
-def _may_be_held_out(grid: Grid, name: str) -> bool:
-    """Return whether every input that this log moves is moved by another one as well."""
-    own = np.concatenate([segment.u for segment in grid.segments if segment.log == name])
-    others = np.concatenate([segment.u for segment in grid.segments if segment.log != name])
-    return not np.any((np.ptp(own, axis=0) > 0) & (np.ptp(others, axis=0) == 0))
+def _moves_all(rest: Sequence[Segment], *, than: Sequence[Segment], least: Array) -> bool:
+    """Return whether the rest moves every input that these segments move by more than ``least``."""
+    own, others = (np.concatenate([segment.u for segment in some]) for some in (than, rest))
+    return not np.any((np.ptp(own, axis=0) > least) & (np.ptp(others, axis=0) <= least))
 
 
 def _split(segments: Sequence[Segment], first: int, last: int) -> tuple[list[Segment], list[Segment]]:

@@ -45,7 +45,7 @@ def shipped_network(logs: Sequence[Log]) -> NetworkModel | None:
 
 def in_columns(model: NetworkModel, log: Log) -> NetworkModel:
     """Return a network under the names of a log's columns where these differ in case alone, else as it is."""
-    columns = _by_name(model.network, log)
+    columns = _by_name(model.network, log, needs_inputs=False)
     if columns is None or all(old == new for old, new in columns.items()):
         return model
     return NetworkModel(renamed(model.network, columns))
@@ -84,13 +84,17 @@ def renamed(network: Network, columns: Mapping[str, str]) -> Network:
     return network_from_dict(content)
 
 
-def _by_name(network: Network, log: Log) -> dict[str, str] | None:
-    """Return the column of each signal that is called like it, in whatever case; None where one is absent."""
+def _by_name(network: Network, log: Log, *, needs_inputs: bool = True) -> dict[str, str] | None:
+    """Return the column of each signal that is called like it, in whatever case; None where one is absent. An
+    input may be where it is not needed; it then has the case of the others."""
     written: dict[str, list[str]] = {}
     for name in log.data_vars:
         written.setdefault(str(name).lower(), []).append(str(name))
     found = {name: written.get(name.lower(), []) for group in _tables(network) for name in group}
     found |= {name: [name] for name in found if name in log}
+    if not needs_inputs:
+        upper = all(same[0].isupper() for same in found.values() if same)
+        found |= {n: [n.upper() if upper else n] for n in network.inputs if not found[n]}
     return {name: same[0] for name, same in found.items()} if all(map(len, found.values())) else None
 
 

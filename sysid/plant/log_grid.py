@@ -312,9 +312,20 @@ def signals(
     for chosen, what in ((u, "input"), (y, "output")):
         if not chosen:
             have = ", ".join(str(name) for name in logs[0].data_vars)
-            hint = f"name it with --{what}s, of {have}"
+            hint = f"name it with --{what}s, of {have}" + (moved_before(logs[0]) if what == "input" else "")
             raise UserError(f"no {what} among the columns", file=log_name(logs[0]), hint=hint)
     return u, y, d
+
+
+def moved_before(log: Log) -> str:
+    """Return a mend, to be added to another one, of a log with a column that was likely moved just before its
+    first row: its readings alone change."""
+    lines = (line.split(": ", 1) for line in str(log.attrs.get("guesses", "")).splitlines())
+    for name, why in lines:
+        level = float(column(log, name)[0]) if name in log and why.endswith("it never moves") else 0.0
+        if level:
+            return f"; if {name} was not {level:g} before, write a row with its value of then above the first"
+    return ""
 
 
 def quantum(values: Array) -> float:
@@ -467,7 +478,8 @@ def roles_of(model: Signals) -> dict[str, str]:
 
 def misfit(model: Signals, log: Log) -> UserError | None:
     """Return why the model cannot take this log (a signal that is absent, a unit), None where it can."""
-    lost = [f"{role} {name}" for name, role in roles_of(model).items() if name not in log]
+    off = inputs_off(model, log)
+    lost = [f"{role} {name}" for name, role in roles_of(model).items() if name not in log and name not in off]
     if lost:
         have = ", ".join(str(name) for name in log.data_vars)
         return UserError(f"has no {', no '.join(lost)}", file=log_name(log), hint=f"its columns are {have}")
@@ -478,11 +490,29 @@ def misfit(model: Signals, log: Log) -> UserError | None:
     return None
 
 
+def inputs_off(model: Signals, log: Log) -> list[str]:
+    """Return the model's inputs that a log lacks and that may be taken as 0 throughout: the log has another
+    of its inputs, and none beside them that could be this one by another name; a switch may as well be on."""
+    if set(names_of(log, "input")) - set(model.inputs) or not any(name in log for name in model.inputs):
+        return []
+    ranges, inner = dict(getattr(model, "valid", {})), getattr(model, "model", model)
+    if (network := getattr(inner, "network", None)) is not None:
+        ranges |= {name: item.range for name, item in network.inputs.items()}
+    absent = [name for name in model.inputs if name not in log and name in ranges]
+    return [n for n in absent if n not in inner.switches and ranges[n][0] <= 0 <= ranges[n][1]]
+
+
 def match_logs(model: Signals, logs: Logs, *, keep_others: bool = False) -> tuple[list[Log], list[str]]:
-    """Return logs in the model's roles and units (one that fits is returned itself), and what was converted,
-    a line a column."""
+    """Return logs in the model's roles and units (one that fits is returned itself), and what was converted
+    or taken as 0, a line a column."""
     known, said = roles_of(model), dict[str, None]()
     logs = as_logs(logs, known=known)
+    for at, log in enumerate(logs):
+        for name in inputs_off(model, log):
+            unit = model.units.get(name, "1")
+            attrs = {"units": unit, "role": "input"}
+            logs[at] = logs[at].assign({name: ("time", np.zeros(log.sizes["time"]), attrs)})
+            said[f"{name}: no such column, taken as 0{'' if unit == '1' else f' {unit}'} throughout"] = None
     matched = list(logs)
     largest = {name: _largest([column(log, name) for log in logs]) for name in known}
     for at, log in enumerate(logs):

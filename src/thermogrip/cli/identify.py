@@ -389,11 +389,12 @@ def validate(
 
     It sees the inputs and disturbances of the whole log, and measured outputs of the warm-up only."""
     if columns is None:
-        cli.check_columns(paths, cli.listed(plant, "inputs", "outputs", "disturbances"))
+        cli.check_columns(paths, cli.needed_columns(plant))
+    from thermogrip.sysid.plant.log_grid import roles_of
+
     loaded = cli.load_plant(plant, network)
     console = Console(as_json)
-    roles = loaded.inputs, loaded.outputs, loaded.disturbances
-    logs = cli.load_logs(paths, *roles, columns=cli.comma(columns), dt=dt)
+    logs = cli.load_logs(paths, known=roles_of(loaded), columns=cli.comma(columns), dt=dt)
     from thermogrip.report.html import write_report
     from thermogrip.report.plant import band_words, free_run_section, run_table
     from thermogrip.sysid.identification import warm_up_of_fit
@@ -465,14 +466,13 @@ def simulate(
 
     check_written(cli.new_file(out))
     if columns is None:
-        cli.check_columns([path], cli.listed(plant, "inputs", "outputs", "disturbances"))
+        cli.check_columns([path], cli.needed_columns(plant))
     from thermogrip.datasets.schema import column
-    from thermogrip.sysid.plant.log_grid import match_logs
+    from thermogrip.sysid.plant.log_grid import match_logs, roles_of
 
     console = Console(as_json)
     loaded = cli.load_plant(plant, network)
-    roles = loaded.inputs, loaded.outputs, loaded.disturbances
-    (log,) = cli.load_logs([path], *roles, columns=cli.comma(columns), dt=dt)
+    (log,) = cli.load_logs([path], known=roles_of(loaded), columns=cli.comma(columns), dt=dt)
     repairs = _repaired(console, [log])[log.attrs["name"]]
     (log,), converted = match_logs(loaded, [log])
     for line in converted:

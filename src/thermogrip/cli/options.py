@@ -206,6 +206,13 @@ def listed(path: Path, *keys: str) -> list[str]:
         return []
 
 
+def needed_columns(plant: Path) -> list[str]:
+    """Return the columns without which no log is one of this plant's, by its JSON file; of several inputs one
+    may be absent."""
+    inputs = listed(plant, "inputs")
+    return (inputs if len(inputs) == 1 else []) + listed(plant, "outputs", "disturbances")
+
+
 def choices(option: str, names: Iterable[str], path: Path, *keys: str) -> None:
     """Refuse names that a JSON file of ours does not list under these keys."""
     if known := listed(path, *keys):

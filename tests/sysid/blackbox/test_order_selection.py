@@ -71,6 +71,14 @@ def test_two_logs_are_cut_into_four_blocks_of_twenty_rows_at_least():
     assert len(list(selection.folds(grid_of(rows(80))))) == 4
     with pytest.raises(UserError, match="79 rows of 2 s are too short"):
         next(selection.folds(grid_of(rows(79))))
+    # a step in block 1 is seen by no other block, one in block 2 by the levels before and after it
+    for at, blocks in ((5, "234"), (30, "1234")):
+        step = segment(
+            np.arange(80.0)[:, None],
+            0.001 * np.arange(80)[:, None] % 0.02 + 9.0 * (np.arange(80) >= at)[:, None],
+        )
+        labels = [label for label, _, _ in selection.folds(grid_of(step, inputs=("q",)))]
+        assert labels == [f"block {n} of 4" for n in blocks]
     # of a block its second half is run once more, of a whole log not
     assert spans(selection.held_out_runs(grid, [rows(7), rows(4)])) == [
         ("a", 0, 7), ("a", 0, 4), ("a", 3, 7), ("a", 2, 4),

@@ -39,6 +39,17 @@ def test_each_network_is_found_by_its_names_in_whatever_case(name):
     assert {*found.inputs, *found.disturbances, *found.outputs} == {*signals}
 
 
+def test_a_named_network_takes_a_log_without_one_of_its_inputs_in_the_case_of_the_others():
+    log = make_log(
+        TIME, {"Q1": (DRIVE, "percent", "input"), "T1": (WARM, "1", "output"), "T2": (WARM, "1", "output")}
+    )
+    assert shipped_network([log]) is None
+    tclab = NetworkModel(named_network("tclab"))
+    assert in_columns(tclab, log).inputs == ("Q1", "Q2")
+    assert in_columns(tclab, log.rename(Q1="q1", T1="t1", T2="t2")).inputs == ("q1", "q2")
+    assert in_columns(tclab, log.drop_vars("T2")) is tclab  # an output is needed
+
+
 def test_two_heaters_and_two_temperatures_are_a_tclab_in_the_order_of_the_columns():
     found = shipped_network([board(**TEMPERATURES)])
     assert (found.name, found.inputs, found.outputs) == ("tclab", ("q_1", "Q2"), ("TC1", "TC2"))
@@ -84,7 +95,7 @@ def test_a_network_that_is_named_takes_columns_in_any_case_and_stays_itself_in_i
     assert (found.inputs, found.outputs) == (("Q1", "Q2"), ("T1", "t2"))
     own = log.rename({"Q1": "q1", "Q2": "q2", "T1": "t1"})
     assert in_columns(model, own) is model
-    assert in_columns(model, log.drop_vars("Q2")) is model  # which says what is missing
+    assert in_columns(model, log.drop_vars("t2")) is model  # which says what is missing
 
 
 def test_where_two_networks_fit_by_role_none_is_chosen():

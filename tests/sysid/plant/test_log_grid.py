@@ -20,6 +20,7 @@ from thermogrip.sysid.plant.log_grid import (
     bridge,
     cut_stretches,
     dominant_time,
+    inputs_off,
     make_grid,
     match_logs,
     misfit,
@@ -643,6 +644,30 @@ def test_what_was_converted_is_reported_once_and_columns_take_the_models_roles()
     assert match_logs(bare(p="percent"), [log.assign(p=log["p"] / 100)])[1] == [
         "p: converted from 1 to percent"
     ]
+
+
+@pytest.mark.parametrize(
+    ("ranges", "switches", "beside", "off"),
+    [
+        ({"q": (0, 9), "p": (0, 100)}, (), {}, ["p"]),
+        ({"q": (0, 9), "p": (5, 100)}, (), {}, []),  # it cannot be 0
+        ({"q": (0, 9)}, (), {}, []),  # nothing is known of its range
+        ({"q": (0, 9), "p": (0, 1)}, ("p",), {}, []),  # a pump that is not logged may well run
+        ({"q": (0, 9), "p": (0, 100)}, (), {"heater": (T, "1", "input")}, []),  # may be p by another name
+        ({"q": (0, 9), "p": (0, 100)}, (), {"heater": (T, "1", "other")}, ["p"]),
+    ],
+)
+def test_an_input_that_a_log_lacks_is_off_where_nothing_else_can_be_it(ranges, switches, beside, off):
+    model = bare(p="percent")
+    model.valid, model.switches = ranges, switches
+    log = log_of(T, room=(T, "degC", "disturbance"), **beside)
+    assert inputs_off(model, log) == off
+    assert (misfit(model, log) is None) is bool(off)
+    if off:
+        (matched,), lines = match_logs(model, [log])
+        assert lines == ["p: no such column, taken as 0 percent throughout"]
+        assert (matched["p"].attrs["role"], np.ptp(matched["p"].values), "p" in log) == ("input", 0.0, False)
+    assert inputs_off(model, log.drop_vars("q")) == []  # no input at all is another log
 
 
 def test_a_log_that_does_not_fit_is_refused_by_what_it_lacks():

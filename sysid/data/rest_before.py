@@ -1,0 +1,81 @@
+"""Rest before a log that begins with its only move.
+
+A step test is often recorded from the step on: a row or two of the plant at rest, the step, and no other
+move. What a plant does from an unknown start is then the same as what the step does to it, so no gain follows
+from such a log alone. It does if the plant rested before the first row, as its readings up to the step say
+where they are flat.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from thermogrip.datasets.arrays import Array
+from thermogrip.datasets.schema import Log, columns, log_name
+from thermogrip.sysid.data.data_quality import reading_excess
+from thermogrip.sysid.plant.fit_record import fit_logs
+from thermogrip.sysid.plant.log_grid import quantum, rows_of
+
+_EARLY = 10  # rows: more of them before the move are a rest of their own
+_ADDED = 50  # rows
+_MOVED = 0.01  # of an input's range: less is noise of its reading
+_FLAT = 6.0  # sd of the readings' noise: ten of them differ by more once in a thousand times
+
+
+def with_rest(
+    logs: Sequence[Log], inputs: Sequence[str], outputs: Sequence[str]
+) -> tuple[list[Log], list[str]]:
+    """Return the logs, and a line for each to which rows of rest were added at its start: of logs whose
+    inputs move in their first ten rows alone, those with flat readings up to the move.
+
+    >>> from thermogrip.datasets.schema import make_log
+    >>> t = np.arange(300.0)
+    >>> y = 21 + 20 * (1 - np.exp(-np.maximum(t - 1, 0) / 80))
+    >>> log = make_log(t, {"q": (40.0 * (t > 0), "percent", "input"), "t": (y, "degC", "output")})
+    >>> rested, said = with_rest([log], ["q"], ["t"])
+    >>> rested[0].sizes["time"], float(rested[0].time[0]), float(rested[0].t[0]), len(said)
+    (350, -50.0, 21.0, 1)
+    """
+    u = [columns(log, inputs) for log in logs]
+    least = _MOVED * np.ptp(np.concatenate(u), axis=0)
+    moved = [np.flatnonzero(np.any(np.abs(np.diff(each, axis=0)) > least, axis=1)) + 1 for each in u]
+    if not any(map(len, moved)) or any(rows[-1] > _EARLY for rows in moved if len(rows)):
+        return list(logs), []
+    out, said = [], []
+    for log, rows in zip(logs, moved):
+        if not len(rows) or not (at_rest := _first_readings(log, outputs, int(rows[0]) + 1)):
+            out.append(log)
+            continue
+        out.append(_begun_earlier(log, at_rest))
+        said.append(
+            f"{log_name(log)}: begins with the only move of an input; taken to have rested at its first "
+            f"readings before ({_ADDED} rows of that are in the fit): record a minute of rest to make sure"
+        )
+    return out, said
+
+
+def _first_readings(log: Log, outputs: Sequence[str], n: int) -> dict[str, float]:
+    """Return the mean of the first n readings of each output; none where those of one move, or are lost."""
+    whole = columns(log, outputs)
+    noise = reading_excess([rows_of(log, (), outputs, ())], outputs, np.inf)
+    means = {}
+    for name, y in zip(outputs, whole.T):
+        first: Array = y[:n][np.isfinite(y[:n])]
+        if not first.size or np.ptp(first) > max(1.01 * quantum(y), _FLAT * noise[name]):
+            return {}
+        means[name] = float(first.mean())
+    return means
+
+
+def _begun_earlier(log: Log, readings: dict[str, float]) -> Log:
+    """Return the log with its first row held before it, and these readings."""
+    time = np.asarray(log["time"].values, dtype=float)
+    step = float(np.median(np.diff(time)))
+    longer = log.isel(time=np.r_[np.zeros(_ADDED, dtype=int), : len(time)])
+    before = time[0] - step * np.arange(_ADDED, 0, -1)
+    longer = longer.assign_coords(time=("time", np.r_[before, time], log["time"].attrs))
+    for name, value in readings.items():
+        longer[name] = longer[name].copy(data=np.r_[np.full(_ADDED, value), log[name].values])
+    return longer.assign_attrs(sha256=fit_logs([log])[0].sha256)
