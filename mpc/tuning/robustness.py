@@ -46,7 +46,7 @@ def peak_sensitivity(plant: Plant, loop: PILoop, dt: float, *, lag: float = 0.0,
     >>> plant = Plant(kit, p, dt=kit.dt, units=kit.units, valid=heaters)
     >>> loop = simc(plant, "q1", "t1")
     >>> [round(peak_sensitivity(plant, loop, 2.0, lag=lag), 1) for lag in (0.0, 5.0)]
-    [1.6, 2.1]
+    [1.8, 2.6]
     """
     answer = step_response(plant, loop.drive, loop.output)
     model = PredictionModel(plant, dt=plant.dt)
