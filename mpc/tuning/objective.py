@@ -14,7 +14,8 @@ less to noise wins.  A step that never settles is charged its whole length and t
 runs, the score is the mean plus half of what the worst is above it: the draws stand for what the plant may
 be.  All of them have the model's structure.  What that may lack (sensors that are slower, a longer delay, a
 weaker drive) is tried one by one on the first draw, for as long as a step is held, since such runs settle
-last; their mean counts a little.
+last; their mean counts a little. Beyond five bounds such a run counts by its logarithm: one that does not
+settle lasts as long as the spec holds a step, which has nothing to do with the plant.
 
 **Trials.**  A step begins where drives have held its start for long, and the controller is told these drives,
 as a running loop knows them; M counts from there. Readings are as noisy as those of the logs were found to be
@@ -89,8 +90,8 @@ def draws_of(plant: Plant, count: int) -> list[int]:
 
 #: From this number on a draw lacks structure: 2001 is draw 1 with the second of :func:`lacking`.
 STRUCTURE = 1000
-#: How much runs on such draws count in the score beside the others, and the most that one is charged.
-LACKING, MOST_LACKING = 0.05, 50.0
+#: How much runs on such draws count in the score beside the others, and beyond what one counts by its log.
+LACKING, LATE = 0.05, 5.0
 
 
 @lru_cache(maxsize=16)
@@ -218,7 +219,8 @@ def score(results: Sequence[StepResult], spec: Spec, bounds: Bounds) -> float:
         cost += 10 * max(0.0, abs(result.bias) - 0.9 * spec.bias_degC) if settled else 0.0
         cost += spec.energy_weight * result.energy_s / unit + spec.moves_weight * result.travel
         costs[result.draw >= STRUCTURE].append(cost)
-    own, others = costs[0], np.minimum(costs[1], MOST_LACKING)
+    own, others = costs[0], np.array(costs[1])
+    others = np.where(others > LATE, LATE * (1 + np.log(np.maximum(others, LATE) / LATE)), others)
     return float(0.5 * (np.mean(own) + np.max(own)) + LACKING * np.sum(others) / max(1, len(others)))
 
 
@@ -285,6 +287,7 @@ PI_PARAMETERS = (
 )
 #: Of a PI whose delay is below two steps of the plant: no log shows it, SIMC's gain is the highest tried.
 PI_OF_UNSEEN_DELAY = (("Kc", 0.2, 1.0), ("Ti", 0.6, 5.0), *PI_PARAMETERS[2:])
+LONGEST_TI = 1.5  # of a PI's gain, both in those of SIMC: a load's integrated error is at most half more
 LQR_PARAMETERS = (
     ("move", 0.02, 500.0),
     ("drive", 1e-4, 100.0),
@@ -485,7 +488,7 @@ def parameters_of(design: Design, spec: Spec) -> dict[str, float]:
 def scaled_loops(loops: tuple[PILoop, ...], factors: dict[str, float]) -> tuple[PILoop, ...]:
     """Return PI loops with each number times its factor, feed-forward and setpoint weight as given; a step of
     the load leaves an integrated error of Ti / Kc, at most half more than that of the loops given."""
-    Ti = min(factors["Ti"], 1.5 * factors["Kc"])
+    Ti = min(factors["Ti"], LONGEST_TI * factors["Kc"])
     return tuple(
         replace(
             loop,

@@ -264,11 +264,15 @@ def test_a_score_is_the_mean_and_half_of_what_the_worst_is_above_it():
     assert score([replace(one, draw=4)], SPEC, bounds) == pytest.approx(150.0)
     never = replace(one, settle_s=np.nan, last_error=-1.5, bias=5.0)  # its bias is not charged besides
     assert score([never], SPEC, bounds) == pytest.approx(300 / 50 + 3.0)
-    # without structure a run counts a twentieth, and is charged 5 at most
+    # without structure a run counts a twentieth, beyond 5 by its logarithm
     slow = [replace(one, draw=1001, settle_s=200.0), replace(never, draw=2001)]
-    assert score([one, two, *slow], SPEC, bounds) == pytest.approx(2.5 + 0.05 * (4.0 + 9.0) / 2)
+    assert score([one, two, *slow], SPEC, bounds) == pytest.approx(
+        2.5 + 0.05 * (4.0 + 5 + 5 * np.log(9.0 / 5)) / 2
+    )
     slow[1] = replace(slow[1], last_error=80.0)
-    assert score([one, two, *slow], SPEC, bounds) == pytest.approx(2.5 + 0.05 * (4.0 + 50.0) / 2)
+    assert score([one, two, *slow], SPEC, bounds) == pytest.approx(
+        2.5 + 0.05 * (4.0 + 5 + 5 * np.log(166 / 5)) / 2
+    )
 
 
 def test_a_note_has_none_for_what_is_no_number():

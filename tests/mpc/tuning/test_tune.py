@@ -13,7 +13,7 @@ import pytest
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers.mpc import Controller
-from thermogrip.mpc.design.design import Design, default_design
+from thermogrip.mpc.design.design import Design, PILoop, default_design
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.tuning import tune as tuner
 from thermogrip.mpc.tuning.figures import closed_loop_figure
@@ -182,6 +182,12 @@ class Done:
     def best(self, name: str) -> Trial:
         return min(self.tried(name), key=lambda trial: trial.score)
 
+    def pi(self) -> Trial:
+        """The one that bears most of those that score within 5 % of the best."""
+        tried, least = self.tried("PI"), self.best("PI").score
+        near = [trial for trial in tried if trial.score <= 1.05 * least]
+        return min(near, key=lambda trial: trial.parameters["Kc"] / trial.parameters["Ti"])
+
 
 def tuned(tank: Any, spec: Spec = SPEC, **changes: Any) -> Done:
     made: list[Paper] = []
@@ -199,6 +205,7 @@ def tuned(tank: Any, spec: Spec = SPEC, **changes: Any) -> Done:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tuner, "Search", search)
         patch.setattr(tuner, "trial", run)
+        patch.setattr(tuner, "worst_sensitivity", lambda plant, loops, dt: loops[0].Kc / loops[0].Ti)
         found = tune(tank, spec, seed=4, progress=lambda share, what: shares.append(share))
     return Done(found, made[0], ran, shares)
 
@@ -225,7 +232,8 @@ def test_moves_filters_and_horizons_are_looked_at_and_the_best_is_searched_from(
 def test_every_controller_has_as_many_trials_and_keeps_to_its_ranges(done: Done):
     for name, parameters in {"MPC": MPC_PARAMETERS, "PI": PI_PARAMETERS, "LQR": LQR_PARAMETERS}.items():
         tried = done.tried(name)
-        assert len(tried) == (3 if name == "PI" else 1) * SPEC.evaluations
+        sturdier = 11 if name == "PI" else 0  # beside the best: 3 gains, 4 integral times
+        assert len(tried) == (3 if name == "PI" else 1) * SPEC.evaluations + sturdier
         for parameter, low, high in parameters:
             values = np.array([trial.parameters[parameter] for trial in tried])
             assert np.all((values >= low) & (values <= high)), parameter
@@ -256,7 +264,7 @@ def test_what_is_compared_is_the_best_of_each_on_draws_that_the_search_has_not_s
         assert [draw for of, _, draw in done.search.checked if of == name] == [*UNSEEN, 1101, 2101, 3101]
     assert designs["baseline"] == base
     assert designs["tuned"] == done.search.design(done.best("MPC").parameters)
-    loops = scaled_loops(base.loops, done.best("PI").parameters)
+    loops = scaled_loops(base.loops, done.pi().parameters)
     assert designs["PI"] == replace(designs["tuned"], loops=loops)
     assert designs["LQR"] == done.search.design(done.best("LQR").parameters)
     assert "on unseen draws" in done.tuning.finding
@@ -264,7 +272,7 @@ def test_what_is_compared_is_the_best_of_each_on_draws_that_the_search_has_not_s
 
 
 def test_the_kept_design_falls_back_to_the_tuned_pi(done: Done):
-    loops = scaled_loops(done.search.baseline.loops, done.best("PI").parameters)
+    loops = scaled_loops(done.search.baseline.loops, done.pi().parameters)
     assert done.tuning.controller.design == replace(
         done.search.design(done.best("MPC").parameters), loops=loops
     )
@@ -277,7 +285,7 @@ def test_where_the_search_won_nothing_the_default_is_kept_and_is_what_is_reporte
         return step_result(name, draw, settle_s=settle, bias=0.2 if name == "tuned" else 0.01)
 
     done = tuned(tank, evaluate_check=evaluate)
-    base, loops = done.search.baseline, scaled_loops(done.search.baseline.loops, done.best("PI").parameters)
+    base, loops = done.search.baseline, scaled_loops(done.search.baseline.loops, done.pi().parameters)
     assert done.tuning.controller.design == replace(base, loops=loops)
     assert done.tuning.verdict == "flat"
     assert "yours takes 140 s" in done.tuning.finding
@@ -359,7 +367,7 @@ def test_of_designs_that_trials_cannot_tell_apart_the_one_that_moves_least_is_ta
         evaluate_in_other_noise=lambda item: at_length(("MPC", item[0]), item[1]),
     )
     found = {name: [at_length((name, {"move": 1.0}))] for name in ("MPC", "PI", "LQR")}
-    _, best = tuner._trade(search, found, 1, None)
+    _, best = tuner._trade(search, found, found["PI"][0], 1, None)
     assert best.parameters == {"move": taken}
 
 
@@ -376,8 +384,8 @@ def test_a_pi_that_is_better_at_length_is_shown_and_not_taken_for_an_mpc(tank: A
     done = tuned(tank, pi_at_length=0.5)
     assert done.tuning.controller.design.move == done.best("MPC").parameters["move"]
     shown = dict(zip(done.tuning.pareto.names, done.tuning.pareto.trials, strict=True))
-    for name in ("PI", "LQR"):
-        assert shown[f"{name}, tuned"].parameters == done.best(name).parameters
+    assert shown["PI, tuned"].parameters == done.pi().parameters
+    assert shown["LQR, tuned"].parameters == done.best("LQR").parameters
     assert done.tuning.pareto.best[done.tuning.pareto.names.index("PI, tuned")]
 
 
@@ -423,6 +431,43 @@ def test_a_pi_of_an_unseen_delay_goes_beyond_its_limits_only_where_it_does_not_s
     done = tuned(tank, pi=PI_OF_UNSEEN_DELAY, creeps=creeps)
     assert (done.best("PI").parameters["Kc"] > 1.0) == wider
     assert max(trial.parameters["Kc"] for trial in done.tried("PI")) <= (5.0 if wider else 1.0)
+
+
+@pytest.mark.parametrize(
+    ("rise", "low", "taken"),
+    [
+        (0.02, 0.2, (0.7, 0.8)),  # 2 % for each step off the best; of three steps it would be 6 %
+        (0.03, 0.2, (0.85, 0.5 * 1.25)),  # 5 % are 1.7 steps; of two apart the one of less gain bears as much
+        (0.03, 0.9, (1.0, 0.5 * 1.25)),  # no gain below what may be searched
+        (0.2, 0.2, (1.0, 0.5)),
+    ],
+)
+def test_of_pis_that_score_alike_the_one_is_taken_that_bears_most(
+    monkeypatch: pytest.MonkeyPatch, rise: float, low: float, taken: tuple[float, float]
+):
+    best = {"Kc": 1.0, "Ti": 0.5, "setpoint": 0.3, "feedforward": 0.1}
+
+    def evaluate(parameters: dict[str, float], name: str) -> Trial:
+        assert (name, parameters["setpoint"], parameters["feedforward"]) == ("PI", 0.3, 0.1)
+        off = max(
+            np.log(1 / parameters["Kc"]) / np.log(1 / 0.85), np.log(parameters["Ti"] / 0.5) / np.log(1.25)
+        )
+        return Trial("PI", parameters, 2.0 * (1 + rise * float(off)), 50.0, 0.1, 5.0)
+
+    def bears(plant: str, loops: Any, dt: float) -> float:
+        assert (plant, dt) == ("plant", 2.0)
+        return float(loops[0].Kc / loops[0].Ti)
+
+    monkeypatch.setattr(tuner, "worst_sensitivity", bears)
+    base = SimpleNamespace(loops=(PILoop("q", "t", 4.0, 30.0),), dt=2.0)
+    ranges = (("Kc", low, 5.0), *PI_PARAMETERS[1:])
+    search: Any = SimpleNamespace(evaluate=evaluate, plant="plant", baseline=base, pi=ranges)
+    worse = replace(evaluate(best, "PI"), score=5.0, parameters=best | {"Ti": 9.0})
+    tried, found = tuner._sturdiest(search, [worse, evaluate(best, "PI")], 1)
+    assert (found.parameters["Kc"], found.parameters["Ti"]) == pytest.approx(taken)
+    assert {**found.parameters, "Kc": 1.0, "Ti": 0.5} == best
+    # none beyond what leaves half more of a load's integrated error than SIMC
+    assert all(trial.parameters["Ti"] <= 1.5 * trial.parameters["Kc"] + 1e-12 for trial in tried[1:])
 
 
 def test_the_file_holds_what_was_found(done: Done):
