@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
@@ -53,6 +53,27 @@ def _ends(value: Any) -> Any:
 Ends = Annotated[Range, BeforeValidator(_ends)]
 
 
+class Settling(BaseModel):
+    """What is asked of one output, where it is not what is asked of all."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    within_s: Positive | None = None  # this soon: sooner wins nothing, so it may go gently
+    band_degC: Positive | None = None
+    overshoot_degC: Positive | None = None
+    bias_degC: Positive | None = None
+
+
+class Asked(NamedTuple):
+    """What is asked of one output."""
+
+    within_s: float
+    band_degC: float
+    overshoot_degC: float
+    bias_degC: float
+    pace_s: float  # within_s, where it is the output's own: sooner wins nothing; else 0
+
+
 class Spec(BaseModel):
     """What is wanted of a controller; the defaults are those of :data:`SPEC_TEMPLATE`."""
 
@@ -68,6 +89,7 @@ class Spec(BaseModel):
     band_degC: Positive = 0.25  # half width of the settling band
     overshoot_degC: Positive = 0.3  # largest
     bias_degC: Positive = 0.05  # largest mean error at the end
+    settling: dict[str, Settling] | None = None  # of single outputs, what differs from the four above
     hold_s: Annotated[float, Field(ge=10, le=36000)] = 600.0  # how long a step is simulated
     energy_weight: NotNegative = 0.0  # seconds of settling that are worth one second at full drive
     moves_weight: NotNegative = 0.01  # share of the minimum time that is worth one move by a full drive less
@@ -103,6 +125,9 @@ class Spec(BaseModel):
         for start, target in self.steps:
             if abs(start - target) <= self.band_degC:
                 raise ValueError(f"steps: {start:g} -> {target:g} stays inside the band")
+            for name, own in (self.settling or {}).items():
+                if abs(start - target) <= (own.band_degC or 0.0):
+                    raise ValueError(f"steps: {start:g} -> {target:g} stays inside the band of {name}")
         ranges: dict[str, dict[str, Range]] = {"limits": self.limits or {}}
         if self.drive_limits is not None:
             one = self.drive_limits
@@ -113,10 +138,34 @@ class Spec(BaseModel):
                     raise ValueError(f"{key}: {low:g} to {high:g} is empty")
         if isinstance(self.output, list) and len(set(self.output)) < len(self.output):
             raise ValueError("output: names one twice")
-        if "settle_within_s" in self.model_fields_set and self.settle_within_s > self.hold_s:
-            seen = f"longer than each step is simulated (hold_s, {self.hold_s:g} s)"
-            raise ValueError(f"settle_within_s: {self.settle_within_s:g} s is {seen}")
+        times = {f"settling of {name}": own.within_s or 0.0 for name, own in (self.settling or {}).items()}
+        if "settle_within_s" in self.model_fields_set:
+            times["settle_within_s"] = self.settle_within_s
+        for key, seconds in times.items():
+            if seconds > self.hold_s:
+                seen = f"longer than each step is simulated (hold_s, {self.hold_s:g} s)"
+                raise ValueError(f"{key}: {seconds:g} s is {seen}")
         return self
+
+    def asked(self, output: str) -> Asked:
+        """Return what is asked of an output, which is what is asked of all where nothing is its own."""
+        own = (self.settling or {}).get(output, Settling())
+        return Asked(
+            own.within_s or self.settle_within_s,
+            own.band_degC or self.band_degC,
+            own.overshoot_degC or self.overshoot_degC,
+            own.bias_degC or self.bias_degC,
+            own.within_s or 0.0,
+        )
+
+    @property
+    def ramps(self) -> bool:
+        """Whether a target may ramp."""
+        return bool(self.ramp_per_s) or any(own.within_s for own in (self.settling or {}).values())
+
+    def way(self, step: tuple[float, float], output: str) -> float:
+        """Return how far a step leads an output until it is in its band [degC]."""
+        return max(0.0, abs(step[1] - step[0]) - self.asked(output).band_degC)
 
     @classmethod
     def of(cls, plant: Plant) -> Spec:
@@ -193,8 +242,9 @@ class Spec(BaseModel):
                 raise UserError(f"weights: {name} is not regulated", hint=hint)
         for name, half in (self.zones or {}).items():
             for key in ("band_degC", "overshoot_degC", "bias_degC"):
-                if half > getattr(self, key):
-                    narrow = f"{half:g} about {name} is wider than {key}, {getattr(self, key):g}"
+                most = getattr(self.asked(name), key)
+                if half > most:
+                    narrow = f"{half:g} about {name} is wider than {key}, {most:g}"
                     raise UserError(f"zones: {narrow}", hint="steps are judged by it: widen it too")
         values["weights"] = dict(self.weights or {})
         values |= {"zones": dict(self.zones or {}), "hard": tuple(self.hard or ())}
@@ -203,6 +253,7 @@ class Spec(BaseModel):
             values[key] = _by_drive(key, getattr(self, key), tuple(design.drive_range))
         ramp = self.ramp_per_s or {}
         values["ramp_per_s"] = ramp if isinstance(ramp, dict) else dict.fromkeys(design.controlled, ramp)
+        _check_settling(self, design.controlled, values["ramp_per_s"])
         return check_design(replace(design, **values, **changes), plant)
 
 
@@ -244,6 +295,18 @@ def _check_length(spec: Spec, dt: float) -> None:
             f"hold_s: {spec.hold_s:g} s are less than {_SAMPLES} samples of {dt:g} s",
             hint="simulate each step for longer, or give a shorter sample_time_s",
         )
+
+
+def _check_settling(spec: Spec, controlled: tuple[str, ...], ramps: Mapping[str, float]) -> None:
+    """Refuse what is asked of an output that has no target, or sooner than its ramp is there."""
+    for name, own in (spec.settling or {}).items():
+        if name not in controlled:
+            hint = known_names(name, controlled, "these are: {}")
+            raise UserError(f"settling: {name} is not regulated", hint=hint)
+        takes = max(spec.way(step, name) for step in spec.steps) / ramps.get(name, np.inf)
+        if own.within_s is not None and takes > own.within_s:
+            late = f"{name} is asked within {own.within_s:g} s, and its ramp_per_s takes {takes:g} s"
+            raise UserError(f"settling: {late}", hint="leave out one: within_s makes a ramp itself")
 
 
 def _ranges(spec: Spec, design: Design) -> dict[str, Range]:
