@@ -97,6 +97,9 @@ def export_controller(
     With ``arduino`` the folder is a library of the Arduino IDE, its example a loop to fill in; with
     ``single`` numbers have four bytes.
     """
+    if controller.design.on_off:
+        problem = f"on_off: C does not choose when {', '.join(controller.design.on_off)} goes over"
+        raise UserError(problem, hint="export a controller whose spec leaves it on")
     if single and controller.design.hard:
         problem = "a hard limit is a thousand times as dear as a soft one, which single numbers cannot hold"
         raise UserError(problem, hint="export it without, or tune with soft limits")

@@ -117,6 +117,9 @@ def to_control(controller: ControllerParts) -> Any:
     """Return the law as a python-control ``StateSpace``; see :meth:`Controller.to_control`."""
     from thermogrip.sysid.export.linearise import control_system
 
+    if controller.design.on_off:
+        problem = f"on_off: what switches {', '.join(controller.design.on_off)} is no linear system"
+        raise UserError(problem, hint="leave it on")
     if controller.design.zones:
         problem = "zones: a controller that may rest anywhere in them is no linear system"
         raise UserError(problem, hint="tune without them")

@@ -21,7 +21,13 @@ from thermogrip.datasets.atomic_files import read_toml
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.limits import LARGEST
 from thermogrip.mpc.design.design import Design, check_design, default_controlled, default_design
-from thermogrip.mpc.plant.prediction import drive_names, drive_range, step_response
+from thermogrip.mpc.plant.prediction import (
+    drive_names,
+    drive_range,
+    graded_drives,
+    step_response,
+    switching,
+)
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
@@ -62,6 +68,16 @@ class Settling(BaseModel):
     band_degC: Positive | None = None
     overshoot_degC: Positive | None = None
     bias_degC: Positive | None = None
+
+
+class OnOff(BaseModel):
+    """An input that the controller switches on and off."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    min_on_s: NotNegative = 0.0  # how long it stays on, and off, at least
+    min_off_s: NotNegative = 0.0
+    price: NotNegative = 0.0  # of a sample while it is on [degC^2]
 
 
 class Asked(NamedTuple):
@@ -119,6 +135,7 @@ class Spec(BaseModel):
     ramp_per_s: Positive | dict[str, Positive] | None = None  # fastest change of a target [degC per s]
     safe_drive: Finite | dict[str, Finite] | None = None  # where a drive goes without its loop, in its units
     iterations: Annotated[int, Field(ge=1, le=50)] = 1  # programs a sample, until the plan stays
+    on_off: dict[str, OnOff] | None = None  # a pump or valve that the controller switches
 
     @model_validator(mode="after")
     def _agree(self) -> Spec:
@@ -207,9 +224,11 @@ class Spec(BaseModel):
         return re.sub(r"(?m) +$", "", text)
 
     def widened(self, plant: Plant) -> Plant:
-        """Return the plant with drives as wide as the spec has them, where only the logs showed how wide."""
+        """Return the plant with the drives of the spec: those that it switches, and as wide as it has them
+        where only the logs showed how wide."""
+        plant = switching(plant, list(self.on_off or {}))
         ranges = dict(plant.valid)
-        for name, (low, high) in _by_drive("drive_limits", self.drive_limits, drive_names(plant)).items():
+        for name, (low, high) in _by_drive("drive_limits", self.drive_limits, graded_drives(plant)).items():
             (least, most), unit = drive_range(plant, name), plant.units.get(name, "1")
             of_unit = unit in ("percent", "0_255") or (unit == "1" and -1.0 <= least < most <= 1.0)
             if not of_unit:
@@ -231,8 +250,10 @@ class Spec(BaseModel):
             ambient=self.ambient_degC,
         )
         _check_length(self, design.dt)
-        slews = {**design.slew_per_s, **_by_drive("slew_per_s", self.slew_per_s, tuple(design.slew_per_s))}
-        values: dict[str, Any] = {"drive_range": _ranges(self, design), "slew_per_s": slews}
+        graded = graded_drives(plant)
+        slews = {**design.slew_per_s, **_by_drive("slew_per_s", self.slew_per_s, graded)}
+        switches = {n: (one.min_on_s, one.min_off_s, one.price) for n, one in (self.on_off or {}).items()}
+        values: dict[str, Any] = {"drive_range": _ranges(self, design, graded), "slew_per_s": slews}
         if self.patience_s is not None:
             values["patience_s"] = self.patience_s
         values |= {"limits": _limits(self, plant, design), "overshoot": 0.5 * self.overshoot_degC}
@@ -248,9 +269,9 @@ class Spec(BaseModel):
                     raise UserError(f"zones: {narrow}", hint="steps are judged by it: widen it too")
         values["weights"] = dict(self.weights or {})
         values |= {"zones": dict(self.zones or {}), "hard": tuple(self.hard or ())}
-        values |= {"tariff": tuple(self.tariff or ()), "iterations": self.iterations}
-        for key in ("energy_price", "safe_drive"):
-            values[key] = _by_drive(key, getattr(self, key), tuple(design.drive_range))
+        values |= {"tariff": tuple(self.tariff or ()), "iterations": self.iterations, "on_off": switches}
+        values["energy_price"] = _by_drive("energy_price", self.energy_price, graded)
+        values["safe_drive"] = _by_drive("safe_drive", self.safe_drive, drive_names(plant), of_all=graded)
         ramp = self.ramp_per_s or {}
         values["ramp_per_s"] = ramp if isinstance(ramp, dict) else dict.fromkeys(design.controlled, ramp)
         _check_settling(self, design.controlled, values["ramp_per_s"])
@@ -260,7 +281,7 @@ class Spec(BaseModel):
 def _own_times(plant: Plant) -> dict[str, float]:
     """Return the output that each drive moves most, of those that are left, with its delay and lag [s]."""
     times: dict[str, float] = {}
-    for drive in drive_names(plant):
+    for drive in graded_drives(plant):
         answers = {name: step_response(plant, drive, name) for name in plant.outputs if name not in times}
         name = max(answers, key=lambda each: abs(answers[each].gain), default="")
         if name and answers[name].gain:
@@ -309,10 +330,10 @@ def _check_settling(spec: Spec, controlled: tuple[str, ...], ramps: Mapping[str,
             raise UserError(f"settling: {late}", hint="leave out one: within_s makes a ramp itself")
 
 
-def _ranges(spec: Spec, design: Design) -> dict[str, Range]:
-    """Return the range of each drive under a spec."""
+def _ranges(spec: Spec, design: Design, graded: tuple[str, ...]) -> dict[str, Range]:
+    """Return the range of each drive under a spec; those that are on or off have none to choose."""
     ranges = dict(design.drive_range)
-    for name, (low, high) in _by_drive("drive_limits", spec.drive_limits, tuple(ranges)).items():
+    for name, (low, high) in _by_drive("drive_limits", spec.drive_limits, graded).items():
         least, most = ranges[name]
         if low < least - 1e-9 or high > most + 1e-9:
             problem = f"drive_limits: {low:g} to {high:g} of {name} leaves its range"
@@ -382,11 +403,14 @@ def spec_from_dict(content: Mapping[str, Any], *, file: str | Path | None = None
         raise UserError(problem, file=file, hint=hint) from error
 
 
-def _by_drive(key: str, value: Any, drives: tuple[str, ...]) -> dict[str, Any]:
+def _by_drive(
+    key: str, value: Any, drives: tuple[str, ...], *, of_all: tuple[str, ...] | None = None
+) -> dict[str, Any]:
+    """Return a value by drive; a single one is that of all these, or of ``of_all``."""
     if value is None:
         return {}
     if not isinstance(value, dict):
-        return dict.fromkeys(drives, value)
+        return dict.fromkeys(drives if of_all is None else of_all, value)
     for name in value:
         if name not in drives:
             hint = known_names(name, drives, "it has {}")

@@ -47,7 +47,7 @@ from thermogrip.mpc.design.design import Design, PILoop, make_blocks
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.interface import Regulator
 from thermogrip.mpc.native.runtime import wanted
-from thermogrip.mpc.plant.prediction import drive_names, step_response
+from thermogrip.mpc.plant.prediction import graded_drives, step_response
 from thermogrip.mpc.tuning.minimum_time import full_drive_bound
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ LACKING, MOST_LACKING = 0.05, 50.0
 @lru_cache(maxsize=16)
 def apparent_delay(plant: Plant, controlled: tuple[str, ...]) -> float:
     """Return the longest apparent delay [s] of a controlled output behind the drive that moves it most."""
-    drives = drive_names(plant)
+    drives = graded_drives(plant)
     answers = [[step_response(plant, drive, output) for drive in drives] for output in controlled]
     delays = [max(of, key=lambda answer: abs(answer.gain)).delay for of in answers]
     return max(*delays, plant.dt)
@@ -359,7 +359,7 @@ class Search:
 
     def __init__(self, plant: Plant, spec: Spec, baseline: Design, seed: int) -> None:
         self.plant, self.spec, self.seed = plant, spec, seed
-        self._compiled = wanted()
+        self._compiled = wanted() and not baseline.on_off
         self.draws = draws_of(plant, spec.search_draws)
         self.certain = self.draws == [0]  # no draws: the comparison takes the same plant, and fresh noise
         self.check_seed = seed + 1 if self.certain else seed

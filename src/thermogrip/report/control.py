@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermogrip.mpc.closed_loop.simulate import session_loop
-from thermogrip.mpc.design.spec import Settling
+from thermogrip.mpc.design.spec import OnOff, Settling
 from thermogrip.mpc.tuning.design_review import range_text
 from thermogrip.mpc.tuning.figures import (
     closed_loop_chart,
@@ -71,6 +71,7 @@ _WISHES = {
     "tariff": "second of the day, times the price",
     "ramp_per_s": "fastest change of a target [per s]",
     "safe_drive": "drive without its loop",
+    "on_off": "switched by the controller",
 }
 
 
@@ -265,6 +266,9 @@ def _bands(band: float | Mapping[str, float]) -> str:
 
 def _listed(value: Any) -> str:
     """Return a value of the spec as text: by output or drive, and of a tariff by its times."""
+    if isinstance(value, OnOff):
+        least = f"at least {value.min_on_s:g} s on, {value.min_off_s:g} s off"
+        return f"{least}, a sample on costs {value.price:g}"
     if isinstance(value, Settling):
         own = {_SPEC_WORDS[f"settle_{key}" if key == "within_s" else key]: each for key, each in value}
         return ", ".join(f"{words} {each:g}" for words, each in own.items() if each is not None)
