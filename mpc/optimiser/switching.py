@@ -1,8 +1,8 @@
 r"""When an input that is on or off goes over: of the few sequences that it may follow the cheapest.
 
 A pump, a valve or a compressor has two positions, and a device may ask that it stays in each for some time.
-Over the blocks of a plan it may stay, go over at the start of one block for good, or go over as soon as it
-may and back as soon as it may: at most two sequences more than blocks.  With the positions of a sequence the
+Over the blocks of a plan it may stay, go over for good (as soon as it may, a block later, halfway, or at the
+last), or go over as soon as it may and back as soon as it may: six sequences at most.  With the positions of a sequence the
 other drives' program is the usual one, the input a drive whose plan is given.  Its cost, with what the input
 costs while it is on, is compared:
 
@@ -38,7 +38,8 @@ def sequences(begins_s: Array, position: float, wait_s: float, stays_s: float) -
     others go over once ``wait_s`` are over, the second back again after ``stays_s``."""
     may = np.flatnonzero(begins_s >= wait_s - _EARLY)
     found = [np.full(len(begins_s), position)]
-    for first in may:
+    starts = {may[0], may[min(1, len(may) - 1)], may[len(may) // 2], may[-1]} if len(may) else set()
+    for first in sorted(starts):
         after = np.full(len(begins_s), position)
         after[first:] = 1.0 - position
         found.append(after)

@@ -133,6 +133,8 @@ def test_the_sequences_of_an_input():
         [0, 0, 0, 1],
     ]
     assert sequences(begins, 1.0, 7.0, 100.0).tolist() == [[1, 1, 1, 1], [1, 1, 0, 0], [1, 1, 1, 0]]
+    ten = sequences(np.arange(10.0), 0.0, 2.0, 3.0)
+    assert ten.sum(axis=1).tolist() == [0, 3, 8, 7, 4, 1]
     assert sequences(begins, 1.0, 25.0, 0.0).tolist() == [[1, 1, 1, 1]]
 
 
