@@ -2,9 +2,9 @@ r"""When an input that is on or off goes over: of the few sequences that it may 
 
 A pump, a valve or a compressor has two positions, and a device may ask that it stays in each for some time.
 Over the blocks of a plan it may stay, go over for good (as soon as it may, a block later, halfway, or at the
-last), or go over as soon as it may and back as soon as it may: six sequences at most.  With the positions of a sequence the
-other drives' program is the usual one, the input a drive whose plan is given.  Its cost, with what the input
-costs while it is on, is compared:
+last), or go over as soon as it may and back as soon as it may: six sequences at most.  With the positions of
+a sequence the other drives' program is the usual one, the input a drive whose plan is given.  Its cost, with
+what the input costs while it is on, is compared:
 
     min over sequences s of  min over plans v of  J(v, s) + price * samples on.
 
