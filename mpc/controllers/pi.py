@@ -175,6 +175,7 @@ class PIController(SampledController):
         ahead, error = self._feedforward(target, d), target - y
         self._begun = np.where(np.isfinite(self._begun), self._begun, y)
         v = ahead.copy()
+        v[self.model.on_off] = 1.0  # nobody decides: it is on
         for at, (loop, (j, i)) in enumerate(zip(self.loops, self._ends)):
             if np.isfinite(error[i]):
                 kept = (1 - loop.setpoint) * (target[i] - self._begun[i])

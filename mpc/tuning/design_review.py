@@ -480,10 +480,12 @@ def hessian(controller: Controller) -> Check:
 def scaling(controller: Controller) -> Check:
     """Drives are scaled by their ranges and temperatures count in degC, so the gains must be comparable."""
     name, (model, optimiser) = "variables are well scaled", (controller.model, controller.optimiser)
-    response = np.abs(optimiser.at_rest).max(axis=0)
+    graded = [j for j in range(model.n_u) if j not in model.on_off]
+    response = np.abs(optimiser.at_rest[:, graded]).max(axis=0)
     # summed over the horizon: what a whole range of a drive moves on average
     moved = response / sum(controller.design.blocks)
-    gains = ", ".join(f"{drive} {gain:.3g} degC" for drive, gain in zip(model.drives, moved))
+    names = [model.drives[j] for j in graded]
+    gains = ", ".join(f"{drive} {gain:.3g} degC" for drive, gain in zip(names, moved))
     finding = f"a whole range of a drive moves its output over the horizon by {gains}"
     least, most = float(np.min(moved)), float(np.max(moved))
     nothing = "leave out the drive that moves nothing, or widen its drive_limits"
