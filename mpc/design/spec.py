@@ -253,7 +253,7 @@ class Spec(BaseModel):
         graded = graded_drives(plant)
         slews = {**design.slew_per_s, **_by_drive("slew_per_s", self.slew_per_s, graded)}
         switches = {n: (one.min_on_s, one.min_off_s, one.price) for n, one in (self.on_off or {}).items()}
-        values: dict[str, Any] = {"drive_range": _ranges(self, design, graded), "slew_per_s": slews}
+        values: dict[str, Any] = {"drive_range": _ranges(self, design), "slew_per_s": slews}
         if self.patience_s is not None:
             values["patience_s"] = self.patience_s
         values |= {"limits": _limits(self, plant, design), "overshoot": 0.5 * self.overshoot_degC}
@@ -330,9 +330,10 @@ def _check_settling(spec: Spec, controlled: tuple[str, ...], ramps: Mapping[str,
             raise UserError(f"settling: {late}", hint="leave out one: within_s makes a ramp itself")
 
 
-def _ranges(spec: Spec, design: Design, graded: tuple[str, ...]) -> dict[str, Range]:
+def _ranges(spec: Spec, design: Design) -> dict[str, Range]:
     """Return the range of each drive under a spec; those that are on or off have none to choose."""
     ranges = dict(design.drive_range)
+    graded = tuple(name for name in ranges if name not in (spec.on_off or {}))
     for name, (low, high) in _by_drive("drive_limits", spec.drive_limits, graded).items():
         least, most = ranges[name]
         if low < least - 1e-9 or high > most + 1e-9:
