@@ -49,8 +49,14 @@ class Move:
     plan: dict[str, tuple[float, ...]] = field(default_factory=dict)
 
     def drives(self, names: Sequence[str]) -> list[float]:
-        """Return what to apply in the order of these inputs."""
-        return [self.drive[name] for name in names] if isinstance(self.drive, dict) else [float(self.drive)]
+        """Return what to apply in the order of these inputs; a pump among them that is switched has its own
+        field."""
+        pump = float(self.pump)
+        if isinstance(self.drive, dict):
+            given = {"pump": pump} | self.drive
+            return [given[name] for name in names]
+        one = float(self.drive)
+        return [pump if name == "pump" and len(names) > 1 else one for name in names]
 
 
 class Controller(Protocol):

@@ -94,7 +94,7 @@ class ClosedLoop:
     status: tuple[str, ...]  # its k statuses
     advice: tuple[str, ...]  # its k advices
     seconds: Array  # (k,), time of each step [s]
-    band: float  # for settling [degC]
+    band: float | Mapping[str, float]  # for settling [degC], by output where they differ
     drive_range: dict[str, tuple[float, float]]
     segments: tuple[Segment, ...]
 
@@ -111,7 +111,7 @@ def simulate_closed_loop(
     *,
     start: float | None = None,
     surroundings: Surroundings | None = None,
-    band: float = 0.25,
+    band: float | Mapping[str, float] = 0.25,
     seed: int = 0,
 ) -> ClosedLoop:
     """Return the record of a controller that is run against a plant.
@@ -127,8 +127,8 @@ def simulate_closed_loop(
     start : float, optional
         Temperature at which the whole plant rests at first [degC]; the room's where absent.
     surroundings : Surroundings, optional
-    band : float, optional
-        Half width of the settling band [degC].
+    band : float or mapping of str to float, optional
+        Half width of the settling band [degC], by output where they differ.
     seed : int, optional
         Of the noise.
 
@@ -238,7 +238,7 @@ def record_loop(
     readings: list[dict[str, float]],
     moves: list[Move],
     stops: list[int],
-    band: float,
+    band: float | Mapping[str, float],
 ) -> ClosedLoop:
     """Return the record of a run: targets and readings [degC] and moves by sample, a segment, which ends at
     one of the samples ``stops``, for each stop and controlled output; ``band`` is that of settling [degC]."""
@@ -254,7 +254,8 @@ def record_loop(
         rows, part = slice(first * truth.sub, last * truth.sub + 1), slice(first, last)
         for i, name in ((model.outputs.index(name), name) for name in controlled):
             goal = targets[first][name]
-            found = segment_of(name, fine[rows], y[rows, i], goal, scaled[part], full[part], band)
+            width = band_of(band, name)
+            found = segment_of(name, fine[rows], y[rows, i], goal, scaled[part], full[part], width)
             segments.append(replace(found, travel=float(jumps[part].sum())))
     return ClosedLoop(
         time=fine,
@@ -272,6 +273,11 @@ def record_loop(
         drive_range={n: (float(a), float(b)) for n, a, b in zip(model.drives, model.lowest, model.highest)},
         segments=tuple(segments),
     )
+
+
+def band_of(band: float | Mapping[str, float], output: str) -> float:
+    """Return the half width of an output's settling band [degC]."""
+    return band[output] if isinstance(band, Mapping) else band
 
 
 def drive_shares(drives: Array, lowest: Array, highest: Array) -> tuple[Array, Mask]:

@@ -7,7 +7,7 @@ here, with the same noise from the same seed; a search for weights spends its ti
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,7 +31,7 @@ def compiled_loop(
     *,
     start: float | None = None,
     surroundings: Surroundings | None = None,
-    band: float = 0.25,
+    band: float | Mapping[str, float] = 0.25,
     seed: int = 0,
 ) -> ClosedLoop:
     """Run a compiled controller (else a ValueError) as :func:`simulate_closed_loop` does, with the same

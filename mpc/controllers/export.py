@@ -17,10 +17,11 @@ a loop of its own, C and Python stay within 1e-11 all the way.
 from __future__ import annotations
 
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -41,6 +42,7 @@ from thermogrip.mpc.optimiser.active_set import ActiveSetQP
 
 if TYPE_CHECKING:
     from thermogrip.mpc.design.design import Design
+    from thermogrip.mpc.estimator.observer import Observer
 
 _COPIED = (*SOURCES, "tg_design.h", "Makefile", "example.c", "check.c")
 # of a drive's range; where dozens of soft rows are broken, a plan is a small difference of large multipliers,
@@ -97,6 +99,9 @@ def export_controller(
     With ``arduino`` the folder is a library of the Arduino IDE, its example a loop to fill in; with
     ``single`` numbers have four bytes.
     """
+    if controller.design.on_off:
+        problem = f"on_off: C does not choose when {', '.join(controller.design.on_off)} goes over"
+        raise UserError(problem, hint="export a controller whose spec leaves it on")
     if single and controller.design.hard:
         problem = "a hard limit is a thousand times as dear as a soft one, which single numbers cannot hold"
         raise UserError(problem, hint="export it without, or tune with soft limits")
@@ -273,8 +278,24 @@ def _twin(controller: Controller) -> _Twin:
     qp = twin.optimiser.qp
     twin.optimiser.qp = ActiveSetQP(soft=qp.soft, linear=qp.linear, quadratic=qp.quadratic)
     # the C's own start, too: the other takes longer than a step, and each state brings its own estimate
-    vars(twin.observer)["reset"] = twin.observer.reset_in_room
+    vars(twin.observer)["reset"] = _remembered(twin.observer)
     return twin
+
+
+def _remembered(observer: Observer) -> Callable[[Array, Array], None]:
+    """Return the C's start of an observer, worked out once for each reading and room: there are a hundred."""
+    kept: dict[bytes, dict[str, Any]] = {}
+
+    def reset(y: Array, d: Array) -> None:
+        key = y.tobytes() + d.tobytes()
+        if key not in kept:
+            observer.reset_in_room(y, d)
+            kept[key] = {
+                name: copy(v) for name, v in vars(observer).items() if isinstance(v, np.ndarray | float)
+            }
+        vars(observer).update({name: copy(value) for name, value in kept[key].items()})
+
+    return reset
 
 
 def _random_state(twin: _Twin, rng: np.random.Generator) -> _State:

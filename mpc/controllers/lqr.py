@@ -113,7 +113,9 @@ class LQRController(SampledController):
         model = prediction_model(plant, design.dt)
         slew = design.dt * np.array([design.slew_per_s[name] for name in model.drives])
         super().__init__(
-            model, design.controlled, design.drive_range, slew, design.patience_s, clock, design.safe_drive
+            *(model, design.controlled, design.drive_range, slew, design.patience_s, clock),
+            design.safe_drive,
+            design.on_off,
         )
         self.design = design
         if observer is None:
@@ -135,6 +137,7 @@ class LQRController(SampledController):
         self._d = np.where(np.isfinite(d), d, self.design.ambient)
         self.observer.reset(y, self._d)
         self._forget()
+        self._begin_positions()
         self._u = self._applied(reading, self._u)
         self._fresh = True
         self.times.reset()

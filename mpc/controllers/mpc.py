@@ -55,6 +55,7 @@ from thermogrip.mpc.estimator.structure_monitor import StructureMonitor
 from thermogrip.mpc.interface import Move, Readings, Trajectory
 from thermogrip.mpc.optimiser.reach import Reach
 from thermogrip.mpc.optimiser.rti import Optimiser, Outcome, Sample
+from thermogrip.mpc.optimiser.switching import choose
 from thermogrip.mpc.plant.prediction import prediction_model
 
 if TYPE_CHECKING:
@@ -114,7 +115,9 @@ class Controller(Shown, SampledController):
         model = prediction_model(plant, design.dt)
         slew = design.dt * np.array([design.slew_per_s[name] for name in model.drives])
         super().__init__(
-            model, design.controlled, design.drive_range, slew, design.patience_s, clock, design.safe_drive
+            *(model, design.controlled, design.drive_range, slew, design.patience_s, clock),
+            design.safe_drive,
+            design.on_off,
         )
         self.plant, self.design, self.notes = plant, design, dict(notes or {})
         self.observer = design.observer(self.model)
@@ -128,6 +131,8 @@ class Controller(Shown, SampledController):
         self.structure = StructureMonitor(plant, self.model, self.controlled)
         self.reach = Reach(self.optimiser, self.observer)
         self.last_iterations = 0  # of the program, in the last step
+        self.asked: Sample  # of the program, in the last step
+        self._waits = 0.0  # seconds until an on/off drive may go over, where it is to
         self._slew_s = self.dt  # for which the slew limit counts in this step
         self._in_force: Array
         self._plan: Array | None  # (N, n_u), as it was made ``_age_s`` ago
@@ -137,6 +142,8 @@ class Controller(Shown, SampledController):
         self._start(np.full(self.model.n_y, np.nan), np.full(self.model.n_d, design.ambient))
 
     def _compile(self) -> None:
+        if self.design.on_off:
+            raise NotImplementedError("no C chooses when an input is on or off")
         from thermogrip.mpc.native.runtime import CompiledController, CompiledObserver, CompiledOptimiser
 
         self.c = CompiledController(self)
@@ -270,6 +277,7 @@ class Controller(Shown, SampledController):
         array([30., 30.])
         """
         self._start(*self._read(reading))
+        self._begin_positions()
         self._u = self._in_force = self._applied(reading, self._u)
         self.pi.reset(reading)
         self.times.reset()
@@ -313,7 +321,7 @@ class Controller(Shown, SampledController):
         self.times.call(reading)
         self._slew_s = self.times.slew_s
         y, d = self._read(reading)
-        if is_off(self.model.model.switches, reading):
+        if is_off([name for name in self.model.model.switches if name not in self.model.drives], reading):
             return self._pause(y, d, target, started)
         applied = self._applied(reading, self._in_force)
         self._pass(self.times.seconds, applied)
@@ -496,7 +504,12 @@ class Controller(Shown, SampledController):
             return u, "fallback_plan", self._unseen(parked)
         lags = self.monitor.slower(self.observer)
         doubt = self.structure.said or ("" if self.structure.denies else lags)
-        return (u, "mismatch", doubt) if doubt else (u, "ok", follows(self.observer, self.controlled))
+        if doubt:
+            return u, "mismatch", doubt
+        said = follows(self.observer, self.controlled)
+        if self._waits and not said:
+            said = f"{', '.join(self.design.on_off)} may go over in {self._waits:.0f} s"
+        return u, "ok", said
 
     def _optimise(self, wanted: Array) -> Outcome:
         last = np.clip(self._u, self.optimiser.lowest, self.optimiser.highest)
@@ -511,6 +524,25 @@ class Controller(Shown, SampledController):
             d = np.where(np.isfinite(self._coming), self._coming, self._d) + observer.disturbance_bias
         sample = Sample(x, last, guess, d, wanted, self._side, *biases, self._slew_s, self._lost, caution)
         sample = sample._replace(ahead=self._ahead, prices=self._prices())
+        self._waits, self.asked = 0.0, sample
+        for name, (on_s, off_s, price) in self.design.on_off.items():
+            j = self.model.drives.index(name)
+            at = float(round(last[j]))
+            choice = choose(
+                self.optimiser,
+                j,
+                lambda: self._converged(sample),
+                position=at,
+                wait_s=self._wait_s(j),
+                stays_s=off_s if at else on_s,
+                price=price,
+            )
+            self._waits = choice.wait_s
+            return choice.outcome
+        return self._converged(sample)
+
+    def _converged(self, sample: Sample) -> Outcome:
+        """Return what one program gives, or as many as the design asks for until the plan stays."""
         found, changes = self.optimiser.solve(sample), 0
         for _ in range(1, self.design.iterations if self.model.affine is None else 1):
             moved = np.abs(found.plan - sample.guess) > _STAYS * self.model.span

@@ -61,6 +61,8 @@ class PIController(SampledController):
         Where step times come from [s].
     safe_drive : dict of str to float, optional
         Where drives go without readings, in their units; 0 where absent.
+    on_off : dict of str to tuple of float, optional
+        As in :class:`~thermogrip.mpc.design.design.Design`.
 
     Examples
     --------
@@ -87,6 +89,7 @@ class PIController(SampledController):
         patience_s: float | None = None,
         clock: Callable[[], float] = time.perf_counter,
         safe_drive: Mapping[str, float] | None = None,
+        on_off: Mapping[str, tuple[float, float, float]] | None = None,
     ) -> None:
         model = PredictionModel(plant) if dt is None else prediction_model(plant, dt)
         ranges = dict(zip(model.drives, zip(model.lowest.tolist(), model.highest.tolist())))
@@ -99,6 +102,7 @@ class PIController(SampledController):
             max(10.0, 5 * model.dt) if patience_s is None else patience_s,
             clock,
             safe_drive,
+            on_off,
         )
         self.loops = pair_loops(plant, self.controlled) if loops is None else loops
         # of each loop its drive and its output, counted from 0
@@ -118,12 +122,14 @@ class PIController(SampledController):
             slew_per_s=design.slew_per_s,
             patience_s=design.patience_s,
             safe_drive=design.safe_drive,
+            on_off=design.on_off,
         )
 
     def reset(self, reading: Readings) -> None:
         """Forget the past; the plant is at rest at this reading, under the drive that holds it or that the
         reading has."""
         self._forget()
+        self._begin_positions()
         self._I = np.zeros(len(self.loops))
         self._u = self._applied(reading, self._u)
         y, room = self._read(reading)
@@ -169,6 +175,7 @@ class PIController(SampledController):
         ahead, error = self._feedforward(target, d), target - y
         self._begun = np.where(np.isfinite(self._begun), self._begun, y)
         v = ahead.copy()
+        v[self.model.on_off] = 1.0  # nobody decides: it is on
         for at, (loop, (j, i)) in enumerate(zip(self.loops, self._ends)):
             if np.isfinite(error[i]):
                 kept = (1 - loop.setpoint) * (target[i] - self._begun[i])

@@ -40,6 +40,7 @@ from thermogrip.mpc.plant.prediction import (
     PredictionModel,
     drive_names,
     drive_range,
+    graded_drives,
     sample_time,
     step_response,
 )
@@ -77,7 +78,7 @@ def simc(plant: Plant, drive: str, output: str, *, tau_c: float | None = None) -
 
 def default_controlled(plant: Plant) -> tuple[str, ...]:
     """Return what to control where nobody said: the skin, else the last outputs, one for each drive."""
-    n_u = len(drive_names(plant))
+    n_u = len(graded_drives(plant))
     if n_u == 1 and "t_surface" in plant.outputs:
         return ("t_surface",)
     return tuple(plant.outputs[-n_u:])
@@ -85,7 +86,7 @@ def default_controlled(plant: Plant) -> tuple[str, ...]:
 
 def pair_loops(plant: Plant, controlled: tuple[str, ...]) -> tuple[PILoop, ...]:
     """Return one SIMC loop for each controlled output, on the drive of largest gain that is still free."""
-    free = list(drive_names(plant))
+    free = list(graded_drives(plant))
     loops = []
     for output in controlled:
         gains = {drive: abs(step_response(plant, drive, output).gain) for drive in free}
@@ -243,6 +244,12 @@ def _check_wishes(design: Design, drives: Sequence[str]) -> None:
         _refuse(both, f"energy_price: {name} goes both ways, its energy is no multiple of it: write drive")
         bare = [output for output in design.controlled if output not in design.zones]
         _refuse(bare, f"energy_price without zones of {', '.join(bare)} would hold them off their targets")
+    for name, numbers in design.on_off.items():
+        _refuse(name not in drives, f"on_off: {name} is no on/off input that the controller switches")
+        _refuse(min(numbers) < 0, f"on_off of {name} must be >= 0")
+        short = 1 / design.dt > (1 + 1e-9) * design.slew_per_s[name]
+        _refuse(short, f"slew_per_s of {name} must let it go over in a sample: it is on or off")
+    _refuse(len(design.on_off) > 1, "on_off: one input is switched, not several")
     times = [second for second, _ in design.tariff]
     _refuse(design.tariff and not design.energy_price, "tariff: there is no energy_price that it multiplies")
     wrong = times != sorted(set(times)) or any(not 0 <= second < DAY for second in times)
@@ -288,6 +295,8 @@ class Design:
     ramp_per_s: dict[str, float] = field(default_factory=dict)  # fastest change of a target [units per s]
     safe_drive: dict[str, float] = field(default_factory=dict)  # where a failing loop goes; 0 where absent
     iterations: int = 1  # programs a sample: above 1 until the plan stays
+    # drives that are on or off: least seconds on and off, and the cost of a sample while on
+    on_off: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     price: float = 50.0  # weight of the square of what exceeds a soft limit [degC^-2]
     noise: ObserverNoise = field(default_factory=ObserverNoise)
     # whether disturbance states are estimated; without them the loop ends off its target
@@ -334,6 +343,8 @@ class Design:
             values["hard"] = tuple(str(name) for name in content.get("hard", ()))
             tariff = content.get("tariff", ())
             values["tariff"] = tuple((float(second), float(factor)) for second, factor in tariff)
+            switches = content.get("on_off", {}).items()
+            values["on_off"] = {str(k): (float(v[0]), float(v[1]), float(v[2])) for k, v in switches}
             for key in ("drive_range", "limits"):
                 values[key] = {str(k): (float(v[0]), float(v[1])) for k, v in content[key].items()}
             return cls(**values)
@@ -408,10 +419,13 @@ def default_design(
     dt = max(1, round((sample_time(plant) if dt is None else dt) / plant.dt)) * plant.dt
     drives = drive_names(plant)
     ranges = {name: drive_range(plant, name) for name in drives}
-    slews = {name: 0.125 * (high - low) for name, (low, high) in ranges.items()}
+    if not (graded := graded_drives(plant)):
+        hint = "an on/off input is switched beside a drive that can be graded"
+        raise UserError("on_off leaves no other drive", hint=hint)
+    slews = {name: (0.125 if name in graded else 1 / dt) * (b - a) for name, (a, b) in ranges.items()}
     lengths, ratios = [], []
     for output in controlled:
-        answers = [step_response(plant, drive, output) for drive in drives]
+        answers = [step_response(plant, drive, output) for drive in graded]
         best = max(answers, key=lambda answer: abs(answer.gain))
         if not np.isfinite(best.gain) or best.gain == 0:
             how = "moves" if np.isfinite(best.gain) else "has a finite effect on"

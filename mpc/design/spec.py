@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
@@ -21,7 +21,13 @@ from thermogrip.datasets.atomic_files import read_toml
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.limits import LARGEST
 from thermogrip.mpc.design.design import Design, check_design, default_controlled, default_design
-from thermogrip.mpc.plant.prediction import drive_names, drive_range, step_response
+from thermogrip.mpc.plant.prediction import (
+    drive_names,
+    drive_range,
+    graded_drives,
+    step_response,
+    switching,
+)
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
@@ -53,6 +59,37 @@ def _ends(value: Any) -> Any:
 Ends = Annotated[Range, BeforeValidator(_ends)]
 
 
+class Settling(BaseModel):
+    """What is asked of one output, where it is not what is asked of all."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    within_s: Positive | None = None  # this soon: sooner wins nothing, so it may go gently
+    band_degC: Positive | None = None
+    overshoot_degC: Positive | None = None
+    bias_degC: Positive | None = None
+
+
+class OnOff(BaseModel):
+    """An input that the controller switches on and off."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    min_on_s: NotNegative = 0.0  # how long it stays on, and off, at least
+    min_off_s: NotNegative = 0.0
+    price: NotNegative = 0.0  # of a sample while it is on [degC^2]
+
+
+class Asked(NamedTuple):
+    """What is asked of one output."""
+
+    within_s: float
+    band_degC: float
+    overshoot_degC: float
+    bias_degC: float
+    pace_s: float  # within_s, where it is the output's own: sooner wins nothing; else 0
+
+
 class Spec(BaseModel):
     """What is wanted of a controller; the defaults are those of :data:`SPEC_TEMPLATE`."""
 
@@ -68,6 +105,7 @@ class Spec(BaseModel):
     band_degC: Positive = 0.25  # half width of the settling band
     overshoot_degC: Positive = 0.3  # largest
     bias_degC: Positive = 0.05  # largest mean error at the end
+    settling: dict[str, Settling] | None = None  # of single outputs, what differs from the four above
     hold_s: Annotated[float, Field(ge=10, le=36000)] = 600.0  # how long a step is simulated
     energy_weight: NotNegative = 0.0  # seconds of settling that are worth one second at full drive
     moves_weight: NotNegative = 0.01  # share of the minimum time that is worth one move by a full drive less
@@ -97,12 +135,16 @@ class Spec(BaseModel):
     ramp_per_s: Positive | dict[str, Positive] | None = None  # fastest change of a target [degC per s]
     safe_drive: Finite | dict[str, Finite] | None = None  # where a drive goes without its loop, in its units
     iterations: Annotated[int, Field(ge=1, le=50)] = 1  # programs a sample, until the plan stays
+    on_off: dict[str, OnOff] | None = None  # a pump or valve that the controller switches
 
     @model_validator(mode="after")
     def _agree(self) -> Spec:
         for start, target in self.steps:
             if abs(start - target) <= self.band_degC:
                 raise ValueError(f"steps: {start:g} -> {target:g} stays inside the band")
+            for name, own in (self.settling or {}).items():
+                if abs(start - target) <= (own.band_degC or 0.0):
+                    raise ValueError(f"steps: {start:g} -> {target:g} stays inside the band of {name}")
         ranges: dict[str, dict[str, Range]] = {"limits": self.limits or {}}
         if self.drive_limits is not None:
             one = self.drive_limits
@@ -113,10 +155,34 @@ class Spec(BaseModel):
                     raise ValueError(f"{key}: {low:g} to {high:g} is empty")
         if isinstance(self.output, list) and len(set(self.output)) < len(self.output):
             raise ValueError("output: names one twice")
-        if "settle_within_s" in self.model_fields_set and self.settle_within_s > self.hold_s:
-            seen = f"longer than each step is simulated (hold_s, {self.hold_s:g} s)"
-            raise ValueError(f"settle_within_s: {self.settle_within_s:g} s is {seen}")
+        times = {f"settling of {name}": own.within_s or 0.0 for name, own in (self.settling or {}).items()}
+        if "settle_within_s" in self.model_fields_set:
+            times["settle_within_s"] = self.settle_within_s
+        for key, seconds in times.items():
+            if seconds > self.hold_s:
+                seen = f"longer than each step is simulated (hold_s, {self.hold_s:g} s)"
+                raise ValueError(f"{key}: {seconds:g} s is {seen}")
         return self
+
+    def asked(self, output: str) -> Asked:
+        """Return what is asked of an output, which is what is asked of all where nothing is its own."""
+        own = (self.settling or {}).get(output, Settling())
+        return Asked(
+            own.within_s or self.settle_within_s,
+            own.band_degC or self.band_degC,
+            own.overshoot_degC or self.overshoot_degC,
+            own.bias_degC or self.bias_degC,
+            own.within_s or 0.0,
+        )
+
+    @property
+    def ramps(self) -> bool:
+        """Whether a target may ramp."""
+        return bool(self.ramp_per_s) or any(own.within_s for own in (self.settling or {}).values())
+
+    def way(self, step: tuple[float, float], output: str) -> float:
+        """Return how far a step leads an output until it is in its band [degC]."""
+        return max(0.0, abs(step[1] - step[0]) - self.asked(output).band_degC)
 
     @classmethod
     def of(cls, plant: Plant) -> Spec:
@@ -158,9 +224,11 @@ class Spec(BaseModel):
         return re.sub(r"(?m) +$", "", text)
 
     def widened(self, plant: Plant) -> Plant:
-        """Return the plant with drives as wide as the spec has them, where only the logs showed how wide."""
+        """Return the plant with the drives of the spec: those that it switches, and as wide as it has them
+        where only the logs showed how wide."""
+        plant = switching(plant, list(self.on_off or {}))
         ranges = dict(plant.valid)
-        for name, (low, high) in _by_drive("drive_limits", self.drive_limits, drive_names(plant)).items():
+        for name, (low, high) in _by_drive("drive_limits", self.drive_limits, graded_drives(plant)).items():
             (least, most), unit = drive_range(plant, name), plant.units.get(name, "1")
             of_unit = unit in ("percent", "0_255") or (unit == "1" and -1.0 <= least < most <= 1.0)
             if not of_unit:
@@ -182,7 +250,9 @@ class Spec(BaseModel):
             ambient=self.ambient_degC,
         )
         _check_length(self, design.dt)
-        slews = {**design.slew_per_s, **_by_drive("slew_per_s", self.slew_per_s, tuple(design.slew_per_s))}
+        graded = graded_drives(plant)
+        slews = {**design.slew_per_s, **_by_drive("slew_per_s", self.slew_per_s, graded)}
+        switches = {n: (one.min_on_s, one.min_off_s, one.price) for n, one in (self.on_off or {}).items()}
         values: dict[str, Any] = {"drive_range": _ranges(self, design), "slew_per_s": slews}
         if self.patience_s is not None:
             values["patience_s"] = self.patience_s
@@ -193,23 +263,25 @@ class Spec(BaseModel):
                 raise UserError(f"weights: {name} is not regulated", hint=hint)
         for name, half in (self.zones or {}).items():
             for key in ("band_degC", "overshoot_degC", "bias_degC"):
-                if half > getattr(self, key):
-                    narrow = f"{half:g} about {name} is wider than {key}, {getattr(self, key):g}"
+                most = getattr(self.asked(name), key)
+                if half > most:
+                    narrow = f"{half:g} about {name} is wider than {key}, {most:g}"
                     raise UserError(f"zones: {narrow}", hint="steps are judged by it: widen it too")
         values["weights"] = dict(self.weights or {})
         values |= {"zones": dict(self.zones or {}), "hard": tuple(self.hard or ())}
-        values |= {"tariff": tuple(self.tariff or ()), "iterations": self.iterations}
-        for key in ("energy_price", "safe_drive"):
-            values[key] = _by_drive(key, getattr(self, key), tuple(design.drive_range))
+        values |= {"tariff": tuple(self.tariff or ()), "iterations": self.iterations, "on_off": switches}
+        values["energy_price"] = _by_drive("energy_price", self.energy_price, graded)
+        values["safe_drive"] = _by_drive("safe_drive", self.safe_drive, drive_names(plant), of_all=graded)
         ramp = self.ramp_per_s or {}
         values["ramp_per_s"] = ramp if isinstance(ramp, dict) else dict.fromkeys(design.controlled, ramp)
+        _check_settling(self, design.controlled, values["ramp_per_s"])
         return check_design(replace(design, **values, **changes), plant)
 
 
 def _own_times(plant: Plant) -> dict[str, float]:
     """Return the output that each drive moves most, of those that are left, with its delay and lag [s]."""
     times: dict[str, float] = {}
-    for drive in drive_names(plant):
+    for drive in graded_drives(plant):
         answers = {name: step_response(plant, drive, name) for name in plant.outputs if name not in times}
         name = max(answers, key=lambda each: abs(answers[each].gain), default="")
         if name and answers[name].gain:
@@ -246,10 +318,23 @@ def _check_length(spec: Spec, dt: float) -> None:
         )
 
 
+def _check_settling(spec: Spec, controlled: tuple[str, ...], ramps: Mapping[str, float]) -> None:
+    """Refuse what is asked of an output that has no target, or sooner than its ramp is there."""
+    for name, own in (spec.settling or {}).items():
+        if name not in controlled:
+            hint = known_names(name, controlled, "these are: {}")
+            raise UserError(f"settling: {name} is not regulated", hint=hint)
+        takes = max(spec.way(step, name) for step in spec.steps) / ramps.get(name, np.inf)
+        if own.within_s is not None and takes > own.within_s:
+            late = f"{name} is asked within {own.within_s:g} s, and its ramp_per_s takes {takes:g} s"
+            raise UserError(f"settling: {late}", hint="leave out one: within_s makes a ramp itself")
+
+
 def _ranges(spec: Spec, design: Design) -> dict[str, Range]:
-    """Return the range of each drive under a spec."""
+    """Return the range of each drive under a spec; those that are on or off have none to choose."""
     ranges = dict(design.drive_range)
-    for name, (low, high) in _by_drive("drive_limits", spec.drive_limits, tuple(ranges)).items():
+    graded = tuple(name for name in ranges if name not in (spec.on_off or {}))
+    for name, (low, high) in _by_drive("drive_limits", spec.drive_limits, graded).items():
         least, most = ranges[name]
         if low < least - 1e-9 or high > most + 1e-9:
             problem = f"drive_limits: {low:g} to {high:g} of {name} leaves its range"
@@ -319,11 +404,14 @@ def spec_from_dict(content: Mapping[str, Any], *, file: str | Path | None = None
         raise UserError(problem, file=file, hint=hint) from error
 
 
-def _by_drive(key: str, value: Any, drives: tuple[str, ...]) -> dict[str, Any]:
+def _by_drive(
+    key: str, value: Any, drives: tuple[str, ...], *, of_all: tuple[str, ...] | None = None
+) -> dict[str, Any]:
+    """Return a value by drive; a single one is that of all these, or of ``of_all``."""
     if value is None:
         return {}
     if not isinstance(value, dict):
-        return dict.fromkeys(drives, value)
+        return dict.fromkeys(drives if of_all is None else of_all, value)
     for name in value:
         if name not in drives:
             hint = known_names(name, drives, "it has {}")

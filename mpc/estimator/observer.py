@@ -279,7 +279,7 @@ def choose_disturbances(
 def _in_order(model: PredictionModel, controlled: tuple[str, ...]) -> list[tuple[str, int]]:
     first = [i for i, name in enumerate(model.outputs) if name in controlled]
     rest = [i for i in range(model.n_y) if i not in first]
-    order = [("input", j) for j in range(model.n_u)]
+    order = [("input", j) for j in range(model.n_u) if j not in model.on_off]
     order += [("output", i) for i in first + rest]
     return order + [("disturbance", k) for k in range(model.n_d)]
 

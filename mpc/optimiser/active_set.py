@@ -45,8 +45,9 @@ class ActiveSetQP(CondensedQP):
         self._weight = 1.0 / np.where(self._idle, 1.0, length)
         L = np.linalg.cholesky(H)
         self._A, self._bounds = A, (np.clip(lower, -1e30, 1e30), np.clip(upper, -1e30, 1e30))
-        self._normals, self._c = np.linalg.solve(L, A.T).T, np.linalg.solve(L, f)
-        self._L, self._set, iterations = L, list[_Entry](), 0
+        self._back = np.linalg.inv(L)
+        self._normals, self._c = A @ self._back.T, self._back @ f
+        self._set, iterations = list[_Entry](), 0
         while iterations <= self.iteration_limit:
             ended = self._go()
             if ended is not None:
@@ -117,7 +118,7 @@ class ActiveSetQP(CondensedQP):
         v = -self._c
         if self._set:
             v = v - self._normals_of_set().T @ np.array([entry.multiplier for entry in self._set])
-        return np.asarray(np.linalg.solve(self._L.T, v))
+        return np.asarray(self._back.T @ v)
 
     def _worst(self, x: Array) -> tuple[int, int] | None:
         """Return the row that is broken most outside the set, and at which of its bounds."""

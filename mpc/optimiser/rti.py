@@ -91,6 +91,7 @@ class Outcome:
     # (n_u,) response of the controlled outputs to each drive's next block, over that at rest: below 0 the
     # gain has turned over
     authority: Array
+    cost: float = np.nan  # of the plan, where positions of on/off drives are given
 
 
 class Optimiser:
@@ -129,6 +130,7 @@ class Optimiser:
         self._A: Array | None = None
         self._kept: tuple[Any, Array, list[Array]] | None = None
         self._seen_rows, self._parked = list(range(len(self._rows))), list[int]()
+        self.positions: dict[int, Array] = {}  # (n_b,) of an on/off drive, in the next solve
         self.neutral = np.clip(np.zeros(model.n_u), self.lowest, self.highest)
         safe = [design.safe_drive.get(name, rest) for name, rest in zip(model.drives, self.neutral)]
         self.safe = np.array(safe, dtype=float)
@@ -190,7 +192,8 @@ class Optimiser:
             return Outcome(plan, y0, answer.status, {}, answer.iterations, authority[0])
         if linear:
             y = free + G @ (plan / model.span).ravel()
-            return Outcome(plan, y, "solved", self._broken(y), answer.iterations, authority[0])
+            cost = self._merit(plan[None], y[None], target, side, last)[0] if self.positions else np.nan
+            return Outcome(plan, y, "solved", self._broken(y), answer.iterations, authority[0], cost)
 
         def predicted(plans: Array) -> Array:
             return self._simulate(x, plans + drive_bias, d) + bias
@@ -199,7 +202,8 @@ class Optimiser:
             return self._merit(plans, y, target, side, last)
 
         plan, y = self._best(plan, guess, y0, last, more, predicted, merit)
-        return Outcome(plan, y, "solved", self._broken(y), answer.iterations, authority[0])
+        cost = merit(plan[None], y[None])[0] if self.positions else np.nan
+        return Outcome(plan, y, "solved", self._broken(y), answer.iterations, authority[0], cost)
 
     def counted(self, tariff: Array | None) -> Array:
         """Return the samples of each block (n_b,), each as often as the energy price counts in it."""
@@ -213,13 +217,16 @@ class Optimiser:
         return pair
 
     def _park(self, plans: Array, last: Array, more: float) -> Array:
-        """Return plans (..., n_b, n_u) whose parked drives go to rest as fast as the slew allows."""
-        if not self._parked:
+        """Return plans (..., n_b, n_u) whose parked drives go to rest as fast as the slew allows, and whose
+        on/off drives are where they are to be."""
+        if not self._parked and not self.positions:
             return plans
         reach = (self.reach[:, None] + more) * self.slew
         path = np.clip(self.safe, last - reach, last + reach)
         plans = np.array(plans)
         plans[..., self._parked] = path[:, self._parked]
+        for j, positions in self.positions.items():
+            plans[..., j] = positions
         return plans
 
     def _best(
@@ -288,7 +295,8 @@ class Optimiser:
         least = np.where(away * held > 0, np.abs(held) - reach, 0.0)  # what the slew allows
         low, high = self.faded_range(away, drive_bias, authority, self.neutral, least)
         little = np.zeros(self.model.n_u)
-        little[self._parked] = _LITTLE * self.model.span[self._parked]
+        given = [*self._parked, *self.positions]
+        little[given] = _LITTLE * self.model.span[given]
         return self._park(low, last, more) - little, self._park(high, last, more) + little
 
     def faded_range(

@@ -42,17 +42,35 @@ from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from thermogrip.datasets.arrays import Array, Values
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, known_names
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.jit_rollout import Kernel
     from thermogrip.sysid.plant.plant import Plant
 
 
+#: The unit of an input that is on or off and that the controller switches; others of these stay on.
+ON_OFF = "on_off"
+
+
 def drive_names(plant: Plant) -> tuple[str, ...]:
-    """Return the inputs that a controller moves: all but those that are on or off."""
-    switches = tuple(plant.model.switches)
-    return tuple(name for name in plant.model.inputs if name not in switches)
+    """Return the inputs that a controller moves: all but those that are on or off and not its own."""
+    others = [name for name in plant.model.switches if plant.units.get(name) != ON_OFF]
+    return tuple(name for name in plant.model.inputs if name not in others)
+
+
+def graded_drives(plant: Plant) -> tuple[str, ...]:
+    """Return the drives that have more than two positions."""
+    return tuple(name for name in drive_names(plant) if plant.units.get(name) != ON_OFF)
+
+
+def switching(plant: Plant, names: Sequence[str]) -> Plant:
+    """Return the plant whose on/off inputs of these names the controller switches."""
+    for name in names:
+        if name not in plant.model.switches:
+            hint = known_names(name, plant.model.switches, "these are: {}")
+            raise UserError(f"on_off: the plant has no on/off input {name}", hint=hint)
+    return replace(plant, units={**plant.units, **dict.fromkeys(names, ON_OFF)}) if names else plant
 
 
 def drive_range(plant: Plant, name: str) -> tuple[float, float]:
@@ -64,6 +82,8 @@ def drive_range(plant: Plant, name: str) -> tuple[float, float]:
         return (-100.0 if low < 0 else 0.0), 100.0
     if unit == "0_255":
         return 0.0, 255.0
+    if unit == ON_OFF:
+        return 0.0, 1.0
     if unit == "1" and low >= -1.05 and high <= 1.05:
         return (-1.0 if low < 0 else 0.0), 1.0
     if not low < high:
@@ -90,12 +110,13 @@ class Response(NamedTuple):
 
 
 class PredictionModel:
-    """A plant seen at the controller's sample time, its on/off inputs at 1.
+    """A plant seen at the controller's sample time, on/off inputs that are no drives at 1.
 
     ``drives``, ``outputs`` and ``disturbances`` name u, y and d; ``dt`` is the sample time [s], ``sub`` the
     model's steps in it.  A drive is between ``lowest`` and ``highest``, ``span`` wide, the unit in which
     drives are scaled, and ``neutral`` is no drive or what is nearest to none, all (n_u,).  A reading is
-    between ``coldest`` and ``hottest``, and within ``spike`` (n_y,) of its prediction.
+    between ``coldest`` and ``hottest``, and within ``spike`` (n_y,) of its prediction.  Drives ``on_off`` are
+    0 or 1, at rest 1.
     """
 
     def __init__(self, plant: Plant, *, dt: float | None = None) -> None:
@@ -114,6 +135,8 @@ class PredictionModel:
         self.lowest, self.highest = ranges[:, 0], ranges[:, 1]
         self.span = self.highest - self.lowest
         self.neutral = np.clip(np.zeros(self.n_u), self.lowest, self.highest)
+        self.on_off = [j for j, name in enumerate(self.drives) if plant.units.get(name) == ON_OFF]
+        self.neutral[self.on_off] = 1.0
         seen = np.array([plant.valid.get(name, (-np.inf, np.inf)) for name in self.outputs], dtype=float)
         self._seen, spread = seen, np.nan_to_num(seen[:, 1] - seen[:, 0], posinf=0.0)
         away = np.nan_to_num(seen + spread[:, None] * [-1.0, 1.0], posinf=0.0, neginf=0.0)
@@ -540,7 +563,7 @@ def sample_time(plant: Plant) -> float:
     """
     found = []
     for output in plant.model.outputs:
-        answers = [step_response(plant, drive, output) for drive in drive_names(plant)]
+        answers = [step_response(plant, drive, output) for drive in graded_drives(plant)]
         best = max(answers, key=lambda answer: abs(answer.gain))
         if best.gain:
             low, high = plant.valid.get(output, (-np.inf, np.inf))

@@ -166,13 +166,17 @@ def lacks_structure(controller: Controller, swing: tuple[float, float]) -> Check
     numbers = [STRUCTURE * at + draws_of(plant, 1)[0] for at in range(1, len(tried) + 1)]
     found = run_trials(Controller(plant, controller.design), plant, spec, numbers)
     times = [f"{r.settle_s:.0f} s" if np.isfinite(r.settle_s) else "never" for r in found]
+    asked = [spec.asked(r.output) for r in found]
+    late = [of.pace_s and not r.settle_s <= of.pace_s for of, r in zip(asked, found, strict=True)]
     seen = [
-        f"{words}: {time}, overshoot {r.overshoot:.2f}"
-        for (words, _), time, r in zip(tried, times, found, strict=True)
+        f"{tried[r.draw // STRUCTURE - 1][0]}: {f'{r.output} ' if r.output else ''}{time}"
+        f"{f' (asked {of.pace_s:g} s)' if slow else ''}, overshoot {r.overshoot:.2f}"
+        for of, slow, time, r in zip(asked, late, times, found, strict=True)
     ]
     move = controller.design.move
     fix = f"raise the move weight (now {move:.3g}), or identify on a log of the closed loop and tune again"
-    return _graded(name, "; ".join(seen) or "nothing is tried", warn=("never" in times, fix))
+    slow = "never" in times or any(late)
+    return _graded(name, "; ".join(seen) or "nothing is tried", warn=(slow, fix))
 
 
 class _Counted(Controller):
@@ -476,10 +480,12 @@ def hessian(controller: Controller) -> Check:
 def scaling(controller: Controller) -> Check:
     """Drives are scaled by their ranges and temperatures count in degC, so the gains must be comparable."""
     name, (model, optimiser) = "variables are well scaled", (controller.model, controller.optimiser)
-    response = np.abs(optimiser.at_rest).max(axis=0)
+    graded = [j for j in range(model.n_u) if j not in model.on_off]
+    response = np.abs(optimiser.at_rest[:, graded]).max(axis=0)
     # summed over the horizon: what a whole range of a drive moves on average
     moved = response / sum(controller.design.blocks)
-    gains = ", ".join(f"{drive} {gain:.3g} degC" for drive, gain in zip(model.drives, moved))
+    names = [model.drives[j] for j in graded]
+    gains = ", ".join(f"{drive} {gain:.3g} degC" for drive, gain in zip(names, moved))
     finding = f"a whole range of a drive moves its output over the horizon by {gains}"
     least, most = float(np.min(moved)), float(np.max(moved))
     nothing = "leave out the drive that moves nothing, or widen its drive_limits"

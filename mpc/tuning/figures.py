@@ -15,7 +15,7 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.charts import INK, PALETTE, SOFT, Chart, Curve, Panel, draw_chart
 from thermogrip.datasets.limits import LARGEST
 from thermogrip.datasets.media import panels
-from thermogrip.mpc.closed_loop.simulate import ClosedLoop
+from thermogrip.mpc.closed_loop.simulate import ClosedLoop, band_of
 from thermogrip.mpc.tuning.trade_offs import PARAMETER_WORDS, Sensitivity
 
 if TYPE_CHECKING:
@@ -77,8 +77,9 @@ def closed_loop_chart(
     ends = called[[0, -1]]
     regulated, driven = [], []
     for k, (name, goal) in enumerate(run.target.items()):
-        band = {"low": goal - run.band, "high": goal + run.band}
-        label = f"target, \N{PLUS-MINUS SIGN}{run.band:g} degC"
+        half = band_of(run.band, name)
+        band = {"low": goal - half, "high": goal + half}
+        label = f"target, \N{PLUS-MINUS SIGN}{half:g} degC"
         regulated.append(Curve(label, called, goal, INK, 1.0, "--", step=True, **band))
         regulated.append(Curve(name, t, run.outputs[name], PALETTE[k % 5], 1.6))
     settled = tuple(

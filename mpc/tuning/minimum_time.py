@@ -38,10 +38,13 @@ _LEVELS = np.linspace(0.4, 1.0, 13)
 _CLIMBS = 12
 
 
-def full_drive_bound(plant: Plant, design: Design, step: tuple[float, float], spec: Spec) -> float:
-    """Return the shortest time [s] in which a step (start, target) [degC] can settle, whatever the
-    controller; NaN where it cannot within ``hold_s``."""
-    return max(_Race(plant, design, step, spec, name).shortest_time() for name in design.controlled)
+def full_drive_bound(
+    plant: Plant, design: Design, step: tuple[float, float], spec: Spec, output: str = ""
+) -> float:
+    """Return the shortest time [s] in which a step (start, target) [degC] can settle, of all controlled
+    outputs or of one, whatever the controller; NaN where it cannot within ``hold_s``."""
+    asked = (output,) if output else design.controlled
+    return max(_Race(plant, design, step, spec, name).shortest_time() for name in asked)
 
 
 class _Race:
@@ -56,7 +59,7 @@ class _Race:
         self.row, self.side = model.outputs.index(output), float(np.sign(step[1] - step[0]))
         # what the sensors would read, so that all chase the same temperature
         offset = plant.offsets.get(output, 0.0) + spec.sensor_offset_degC
-        self.goal = self.side * (step[1] - offset) - spec.band_degC
+        self.goal = self.side * (step[1] - offset) - spec.asked(output).band_degC
         self.d = np.full(model.n_d, spec.ambient_degC)
         self.x, held = held_start(model, tuple(design.controlled), step[0], tuple(self.d.tolist()))
         self.low, self.high = np.array([design.drive_range[name] for name in model.drives]).T

@@ -40,7 +40,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Surroundings, simulate_closed_loop
+from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Segment, Surroundings, simulate_closed_loop
 from thermogrip.mpc.controllers.lqr import LQRController
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
@@ -48,7 +48,7 @@ from thermogrip.mpc.design.design import Design, PILoop, make_blocks
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.interface import Regulator
 from thermogrip.mpc.native.runtime import wanted
-from thermogrip.mpc.plant.prediction import drive_names, step_response
+from thermogrip.mpc.plant.prediction import graded_drives, step_response
 from thermogrip.mpc.tuning.minimum_time import full_drive_bound
 
 if TYPE_CHECKING:
@@ -81,6 +81,7 @@ class StepResult(Record):
     travel: float
     full_share: float
     length_s: float
+    output: str = ""  # the one it is of, where each is judged by itself
 
 
 def draws_of(plant: Plant, count: int) -> list[int]:
@@ -97,7 +98,7 @@ LACKING, LATE = 0.05, 5.0
 @lru_cache(maxsize=16)
 def apparent_delay(plant: Plant, controlled: tuple[str, ...]) -> float:
     """Return the longest apparent delay [s] of a controlled output behind the drive that moves it most."""
-    drives = drive_names(plant)
+    drives = graded_drives(plant)
     answers = [[step_response(plant, drive, output) for drive in drives] for output in controlled]
     delays = [max(of, key=lambda answer: abs(answer.gain)).delay for of in answers]
     return max(*delays, plant.dt)
@@ -155,6 +156,11 @@ def surroundings_of(
     )
 
 
+def bands_of(spec: Spec, controlled: Sequence[str]) -> float | dict[str, float]:
+    """Return the half width of the settling band [degC], by output where they may differ."""
+    return {name: spec.asked(name).band_degC for name in controlled} if spec.settling else spec.band_degC
+
+
 def trial(
     controller: Regulator,
     plant: Plant,
@@ -180,7 +186,7 @@ def trial(
         [(step[1], length_s)],
         start=step[0],
         surroundings=around,
-        band=spec.band_degC,
+        band=bands_of(spec, controller.controlled),
         seed=1000 * seed + draw,
     )
 
@@ -194,16 +200,28 @@ def run_trials(
     lengths: Sequence[float] | None = None,
     seed: int = 0,
 ) -> list[StepResult]:
-    """Run every step of the spec on these draws; ``lengths`` are seconds by step, ``hold_s`` where absent."""
+    """Run every step of the spec on these draws; ``lengths`` are seconds by step, ``hold_s`` where absent.
+    Where the spec has ``settling`` there is a result for each output, else one of the worst."""
     results = []
     for at, step in enumerate(spec.steps):
         length = spec.hold_s if lengths is None else lengths[at]
         for draw in draws:
-            results.append(_result(trial(controller, plant, spec, step, draw, length, seed), step, draw))
+            run = trial(controller, plant, spec, step, draw, length, seed)
+            if spec.settling:
+                results += [_result(run, [part], step, draw, part.output) for part in run.segments]
+            else:
+                results.append(_result(run, run.segments, step, draw))
     return results
 
 
-Bounds = dict[tuple[float, float, int], float]
+#: By start, target and draw; where outputs are judged apart by output too.
+Bounds = dict[tuple[float, float, int] | tuple[float, float, int, str], float]
+
+
+def bound_of(bounds: Bounds, result: StepResult) -> float:
+    """Return the shortest time [s] of what a result is of."""
+    key = (result.start, result.target, result.draw % STRUCTURE)
+    return bounds[(*key, result.output) if result.output else key]
 
 
 def score(results: Sequence[StepResult], spec: Spec, bounds: Bounds) -> float:
@@ -211,12 +229,13 @@ def score(results: Sequence[StepResult], spec: Spec, bounds: Bounds) -> float:
     times [s]."""
     costs: tuple[list[float], list[float]] = [], []
     for result in results:
-        bound = bounds[(result.start, result.target, result.draw % STRUCTURE)]
-        unit = max(bound if np.isfinite(bound) else result.length_s, 1.0)
+        bound, asked = bound_of(bounds, result), spec.asked(result.output)
+        unit = max(bound if np.isfinite(bound) else result.length_s, asked.pace_s, 1.0)
         settled = np.isfinite(result.settle_s)
-        cost = result.settle_s / unit if settled else result.length_s / unit + 2 * abs(result.last_error)
-        cost += 10 * max(0.0, result.overshoot - 0.9 * spec.overshoot_degC)
-        cost += 10 * max(0.0, abs(result.bias) - 0.9 * spec.bias_degC) if settled else 0.0
+        taken = max(result.settle_s, asked.pace_s)  # sooner than an output's own time wins nothing
+        cost = taken / unit if settled else result.length_s / unit + 2 * abs(result.last_error)
+        cost += 10 * max(0.0, result.overshoot - 0.9 * asked.overshoot_degC)
+        cost += 10 * max(0.0, abs(result.bias) - 0.9 * asked.bias_degC) if settled else 0.0
         cost += spec.energy_weight * result.energy_s / unit + spec.moves_weight * result.travel
         costs[result.draw >= STRUCTURE].append(cost)
     own, others = costs[0], np.array(costs[1])
@@ -229,15 +248,39 @@ def bounds_of(plant: Plant, design: Design, spec: Spec, draws: Sequence[int]) ->
     found: Bounds = {}
     for draw in draws:
         for step in spec.steps:
-            drive = full_drive_bound(drawn(plant, draw), design, step, spec)
-            found[(*step, draw)] = float(np.maximum(drive, _ramp_time(design, spec, step)))  # NaN stays NaN
+            if not spec.settling:
+                found[(*step, draw)] = full_drive_bound(drawn(plant, draw), design, step, spec)
+                continue
+            for name in design.controlled:
+                found[(*step, draw, name)] = full_drive_bound(drawn(plant, draw), design, step, spec, name)
+            found[(*step, draw)] = max(found[(*step, draw, name)] for name in design.controlled)
+    return ramped_bounds(found, design, spec)
+
+
+def ramped_bounds(bounds: Bounds, design: Design, spec: Spec) -> Bounds:
+    """Return these bounds, or when the slowest ramp brings the target of a step into the band of its end."""
+    found: Bounds = {}
+    for key, bound in bounds.items():
+        of = {name: rate for name, rate in design.ramp_per_s.items() if key[3:] in ((), (name,))}
+        times = [spec.way(key[:2], name) / rate for name, rate in of.items()]
+        found[key] = float(np.maximum(bound, max(times, default=0.0)))  # NaN stays NaN
     return found
 
 
-def _ramp_time(design: Design, spec: Spec, step: tuple[float, float]) -> float:
-    """Return when the slowest ramp brings the target of a step into the band of its end [s]; 0 without."""
-    way = max(0.0, abs(step[1] - step[0]) - spec.band_degC)
-    return max((way / rate for rate in design.ramp_per_s.values()), default=0.0)
+#: An output that the drive can bring into its band in this share of the time that is asked of it alone goes
+#: gently: its target ramps, for so long at most.
+AT_EASE, RAMPED = 0.7, 0.8
+
+
+def paced(design: Design, spec: Spec, bounds: Bounds) -> Design:
+    """Return the design with a ramp for each output that may take its time, as slow as its longest step."""
+    ramps = dict(design.ramp_per_s)
+    for name in design.controlled:
+        asked = spec.asked(name).pace_s
+        slowest = max((bound for key, bound in bounds.items() if key[3:] == (name,)), default=np.inf)
+        if name not in ramps and slowest <= AT_EASE * asked:
+            ramps[name] = max(spec.way(step, name) for step in spec.steps) / (RAMPED * asked)
+    return replace(design, ramp_per_s=ramps)
 
 
 def check_steps(bounds: Bounds) -> None:
@@ -250,8 +293,9 @@ def check_steps(bounds: Bounds) -> None:
         )
 
 
-def _result(run: ClosedLoop, step: tuple[float, float], draw: int) -> StepResult:
-    parts = run.segments
+def _result(
+    run: ClosedLoop, parts: Sequence[Segment], step: tuple[float, float], draw: int, output: str = ""
+) -> StepResult:
     settles = [part.settle_s for part in parts]
     worst = max(parts, key=lambda part: abs(part.bias))
     last = max((run.outputs[p.output][-1] - p.target for p in parts), key=abs)
@@ -267,6 +311,7 @@ def _result(run: ClosedLoop, step: tuple[float, float], draw: int) -> StepResult
         travel=parts[0].travel,
         full_share=parts[0].full_share,
         length_s=parts[0].end_s - parts[0].begin_s,
+        output=output,
     )
 
 
@@ -316,14 +361,16 @@ class Search:
     """Evaluates designs on the search's draws; made of plain data, so that it travels to other processes."""
 
     def __init__(self, plant: Plant, spec: Spec, baseline: Design, seed: int) -> None:
-        self.plant, self.spec, self.baseline, self.seed = plant, spec, baseline, seed
-        self._compiled = wanted()
+        self.plant, self.spec, self.seed = plant, spec, seed
+        self._compiled = wanted() and not baseline.on_off
         self.draws = draws_of(plant, spec.search_draws)
         self.certain = self.draws == [0]  # no draws: the comparison takes the same plant, and fresh noise
         self.check_seed = seed + 1 if self.certain else seed
         # the comparison takes draws that the search has not seen
         self.unseen = [draw + _CHECK_FROM if draw else 0 for draw in draws_of(plant, spec.check_draws)]
         self.bounds = bounds_of(plant, baseline, spec, sorted({*self.draws, *self.unseen}))
+        self.baseline = baseline = paced(baseline, spec, self.bounds)
+        self.bounds = ramped_bounds(self.bounds, baseline, spec)
         cold = cold_steps(plant, spec, baseline.controlled)
         self.pi_spec = spec.model_copy(update={"steps": [*spec.steps, *cold]})  # of the PI's trials
         if cold:

@@ -51,6 +51,7 @@ from thermogrip.mpc.tuning.objective import (
     Search,
     StepResult,
     Trial,
+    bound_of,
     lacking,
     parameters_of,
     scaled_loops,
@@ -94,14 +95,16 @@ class Row(Record):
     travel_mean: float
     full_share: float
     bound_s: float  # before this no drive within the limits is in the band [s], mean over the draws
+    output: str = ""  # the one it is of, where each is judged by itself
 
 
 def rows_of(name: str, results: Sequence[StepResult], spec: Spec, bounds: Bounds) -> list[Row]:
-    """Return a controller's rows, one a step of the spec."""
-    return [
-        _row(name, step, [result for result in results if (result.start, result.target) == step], bounds)
-        for step in spec.steps
-    ]
+    """Return a controller's rows, one a step of the spec, of each output where they are judged apart."""
+    outputs = dict.fromkeys(result.output for result in results)
+    of: dict[Any, list[StepResult]] = {(step, output): [] for step in spec.steps for output in outputs}
+    for result in results:
+        of[(result.start, result.target), result.output].append(result)
+    return [_row(name, step, part, bounds) for (step, _), part in of.items()]
 
 
 def _row(name: str, step: tuple[float, float], part: Sequence[StepResult], bounds: Bounds) -> Row:
@@ -123,16 +126,18 @@ def _row(name: str, step: tuple[float, float], part: Sequence[StepResult], bound
         energy_worst_s=float(np.max(energy)),
         travel_mean=float(np.mean([result.travel for result in part])),
         full_share=float(np.mean([result.full_share for result in part])),
-        bound_s=float(np.mean([bounds[(*step, result.draw)] for result in part])),
+        bound_s=float(np.mean([bound_of(bounds, result) for result in part])),
+        output=part[0].output,
     )
 
 
 def meets_spec(result: StepResult, spec: Spec) -> bool:
     """Return whether one run is as wanted."""
+    asked = spec.asked(result.output)
     return (
-        result.settle_s <= spec.settle_within_s  # False where NaN
-        and result.overshoot <= spec.overshoot_degC
-        and abs(result.bias) <= spec.bias_degC
+        result.settle_s <= asked.within_s  # False where NaN
+        and result.overshoot <= asked.overshoot_degC
+        and abs(result.bias) <= asked.bias_degC
     )
 
 
@@ -141,7 +146,7 @@ def verdict_of(
 ) -> tuple[str, str]:
     """Return the verdict and its numbers in words."""
     won = 1 - min(scores["tuned"], scores["baseline"]) / scores["baseline"]
-    beyond = [row for row in rows if row.bound_s > spec.settle_within_s]
+    beyond = [row for row in rows if row.bound_s > spec.asked(row.output).within_s]
     if beyond:
         return "actuator-limited", _beyond(max(beyond, key=lambda row: row.bound_s), spec)
     ratio = float(np.mean([row.settle_mean_s / max(row.bound_s, 1.0) for row in rows]))
@@ -155,24 +160,27 @@ def verdict_of(
 
 def _beyond(row: Row, spec: Spec) -> str:
     """Return the sentence about a step that no controller can do in time."""
-    step = f"{row.start:g} to {row.target:g} degC"
+    step = f"{row.start:g} to {row.target:g} degC{row.output and f' of {row.output}'}"
     if not np.isfinite(row.bound_s):
         return f"{step} cannot be reached at this drive; no weight changes that."
     takes = f"takes {row.settle_mean_s:.0f} s" if np.isfinite(row.settle_mean_s) else "does not settle"
+    asked = f"{spec.asked(row.output).within_s:g} s are asked"
     return (
-        f"{step} cannot settle under {row.bound_s:.0f} s at this drive, and {spec.settle_within_s:g} s are "
-        f"asked; yours {takes}; no weight changes that."
+        f"{step} cannot settle under {row.bound_s:.0f} s at this drive, and {asked}; yours {takes}; "
+        f"no weight changes that."
     )
 
 
 def _limits(rows: Sequence[Row], spec: Spec) -> str:
     """Return each step's settling beside what the drive allows, and the ramp where there is one."""
-    said, allowed = [], "at this drive and ramp" if spec.ramp_per_s else "at this drive"
+    said, allowed = [], "at this drive and ramp" if spec.ramps else "at this drive"
     for row in rows:
         settled = np.isfinite(row.settle_mean_s)
         takes = f"takes {row.settle_mean_s:.0f} s" if settled else "does not settle on every draw"
-        step = f"{row.start:g} to {row.target:g}"
-        said.append(f"{step} cannot settle under {row.bound_s:.0f} s {allowed}, yours {takes}")
+        step = f"{row.start:g} to {row.target:g}{row.output and f' of {row.output}'}"
+        pace = spec.asked(row.output).pace_s
+        least = f"may take {pace:g} s" if pace else f"cannot settle under {row.bound_s:.0f} s {allowed}"
+        said.append(f"{step} {least}, yours {takes}")
     return "; ".join(said) + "."
 
 
@@ -185,7 +193,7 @@ def _simpler(scores: Mapping[str, float], spec: Spec) -> str:
     name = min(near, key=lambda key: near[key])
     share = 100 * (1 - near[name] / kept)
     how = "as well" if abs(share) < 0.5 else f"{abs(share):.1f} % {'better' if share > 0 else 'worse'}"
-    wishes = {"zones": spec.zones, "energy prices": spec.energy_price, "ramps": spec.ramp_per_s}
+    wishes = {"zones": spec.zones, "energy prices": spec.energy_price, "ramps": spec.ramps}
     unknown = [wish for wish, value in wishes.items() if value]
     unknown += ["limits of outputs", "where a gain turns over"] if name == "LQR" else []
     listed = f"{', '.join(unknown[:-1])} or {unknown[-1]}" if unknown[1:] else "".join(unknown)
@@ -316,8 +324,8 @@ def tune(
     """
     spec = Spec.of(plant) if spec is None else spec
     plant = spec.widened(plant)
-    baseline = spec.design(plant)
-    search = Search(plant, spec, baseline, seed)
+    search = Search(plant, spec, spec.design(plant), seed)
+    baseline = search.baseline
     start = parameters_of(baseline, spec)
     looked = run_parallel(search.evaluate, [start], workers, what="default design")
     if progress is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,6 +12,8 @@ from matplotlib.figure import Figure
 
 from thermogrip.datasets.charts import Chart
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Segment
+from thermogrip.mpc.design.spec import OnOff, Settling, Spec
+from thermogrip.mpc.tuning.tune import Row
 from thermogrip.report import control
 from thermogrip.report.html import Plot, Table, Text
 
@@ -42,6 +45,7 @@ def tuning_of(**changes: Any) -> Any:
         check_draws=5, evaluations=30, moves_weight=0.03, extra_lag=0.4, extra_delay=0.6, lost_gain=0.1,
         zones={"t1": 1.0}, hard=["t1", "t2"], energy_price=None, tariff=[(0.0, 1.0), (600.0, 3.0)],
         ramp_per_s=None, safe_drive={}, limits={"t1": (-1e12, 60.0), "t2": (5.0, 70.0)}, weights=None,
+        settling=None, ramps=False, on_off=None,
     )  # fmt: skip
     design = SimpleNamespace(
         controlled=("t1", "t2"), dt=2.0, horizon_s=60.0, blocks=(1, 2, 4), drive_range={"q": (0.0, 100.0)},
@@ -96,6 +100,26 @@ def test_a_tuned_controller_stands_with_its_scores_and_what_it_did_not_know(
     assert f"lower is better: tuned 1.235, PI 2.000. {words}" in scores.text
     tuning.controller.plant = SimpleNamespace(samples=np.eye(1), covariance=None)
     assert control._uncertain(tuning)
+
+
+def test_outputs_that_are_judged_apart_have_their_own_rows_and_bands():
+    spec = Spec(
+        steps=STEPS,
+        settling={"t2": Settling(within_s=600.0, band_degC=0.5)},
+        on_off={"valve": OnOff(min_on_s=60.0, price=0.2)},
+    )
+    start, target = STEPS[0]
+    row = Row("tuned", start, target, 80.0, 85.0, 0.1, 0.2, 0.0, 0.0, 20.0, 21.0, 2.0, 0.5, 60.0, "t1")
+    tuning = tuning_of(spec=spec, rows=[row, replace(row, output="t2")])
+    _, rows = control.tuning_table(tuning)
+    assert [of[1] for of in rows] == [f"{start:g} to {target:g}, {name}" for name in ("t1", "t2")]
+    _, _, about, _ = control.tuning_section(tuning).parts
+    assert about.text.startswith("Band 0.25 degC of t1, 0.5 degC of t2. ")
+    assert "or the ramp" in about.text
+    asked = dict(control.spec_section(tuning).parts[0].rows)
+    switched = "valve at least 60 s on, 0 s off, a sample on costs 0.2"
+    assert asked["switched by the controller"] == switched
+    assert asked["of single outputs"] == "t2 settle within [s] 600, band, half width [degC] 0.5"
 
 
 @pytest.mark.parametrize(("known", "draws"), [(True, 2), (False, 1)])
@@ -308,7 +332,7 @@ def test_what_never_settled_has_no_bias_and_several_outputs_no_common_figures() 
 def test_steps_of_a_tuning_stand_in_the_order_of_the_spec() -> None:
     row = {
         "settle_mean_s": 10.04, "settle_worst_s": NAN, "overshoot_mean": 0.12345, "overshoot_worst": 0.5,
-        "bias_worst": 0.01, "energy_mean_s": 7.0, "bound_s": INF,
+        "bias_worst": 0.01, "energy_mean_s": 7.0, "bound_s": INF, "output": "",
     }  # fmt: skip
     tuning = SimpleNamespace(
         spec=SimpleNamespace(steps=[(28.0, 38.0), (28.0, 18.0)]),

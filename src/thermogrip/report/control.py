@@ -5,11 +5,13 @@ As in :mod:`thermogrip.report.classification`, each function returns sections wh
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermogrip.mpc.closed_loop.simulate import session_loop
+from thermogrip.mpc.design.spec import OnOff, Settling
 from thermogrip.mpc.tuning.design_review import range_text
 from thermogrip.mpc.tuning.figures import (
     closed_loop_chart,
@@ -17,6 +19,7 @@ from thermogrip.mpc.tuning.figures import (
     sensitivity_figure,
     step_time_figure,
 )
+from thermogrip.mpc.tuning.objective import bands_of
 from thermogrip.mpc.tuning.trade_offs import sensitivity_words
 from thermogrip.report.console import Cells, Columns, cells, short
 from thermogrip.report.html import Picture, Plot, Section, Table, Text
@@ -59,6 +62,7 @@ _SPEC_WORDS = {
 }
 
 _WISHES = {
+    "settling": "of single outputs",
     "limits": "limits of outputs, soft [degC]",
     "weights": "how many times the errors of an output count",
     "zones": "anywhere within, about the target",
@@ -67,6 +71,7 @@ _WISHES = {
     "tariff": "second of the day, times the price",
     "ramp_per_s": "fastest change of a target [per s]",
     "safe_drive": "drive without its loop",
+    "on_off": "switched by the controller",
 }
 
 
@@ -74,7 +79,7 @@ def tuning_table(tuning: Tuning) -> Cells:
     """Return the comparison of baseline, tuned, PI and LQR, step by step."""
     columns: Columns = (
         ("controller", lambda row: row.controller),
-        ("step [degC]", lambda row: f"{row.start:g} to {row.target:g}"),
+        ("step [degC]", lambda row: f"{row.start:g} to {row.target:g}{row.output and f', {row.output}'}"),
         ("settles in [s], mean", lambda row: _shown(row.settle_mean_s)),
         ("worst", lambda row: _shown(row.settle_worst_s)),
         ("overshoot [K], mean", lambda row: _rounded(row.overshoot_mean)),
@@ -120,7 +125,7 @@ def tuning_section(tuning: Tuning) -> Section:
         Table(*tuning_table(tuning), tuning_caption(tuning)),
         Plot(steps_chart(tuning.runs), _STEPS_CAPTION),
         Text(
-            f"Band {tuning.spec.band_degC:g} degC. {_unseen(tuning)}; "
+            f"Band {_bands(bands_of(tuning.spec, tuning.controller.design.controlled))}. {_unseen(tuning)}; "
             f"noise, quantum and a sensor offset of {tuning.spec.sensor_offset_degC:g} degC are unknown to "
             f"the controllers. {_before_the_last_column(tuning.spec)}"
         ),
@@ -194,7 +199,7 @@ def loop_section(run: ClosedLoop, design: Design, title: str, *, tone: str = "")
     counts = ", ".join(f"{count} {status}" for status, count in statuses.items())
     chart = closed_loop_chart(run, limits=design.limits, slew_per_s=design.slew_per_s)
     caption = (
-        f"Shaded: the band of \N{PLUS-MINUS SIGN}{run.band:g} degC; dotted across: settled. Grey: limits of "
+        f"Shaded: the band of \N{PLUS-MINUS SIGN}{_bands(run.band)}; dotted across: settled. Grey: limits of "
         f"drive and slew. By status: {counts}."
     )
     parts: list[Any] = [Plot(chart, caption)]
@@ -252,8 +257,21 @@ def spec_section(tuning: Tuning) -> Section:
     return Section("What was asked, and the answer", parts, f"Seed {tuning.seed}; same seed, same design.")
 
 
+def _bands(band: float | Mapping[str, float]) -> str:
+    """Return the half width of the settling band in words, by output where they differ."""
+    if not isinstance(band, Mapping):
+        return f"{band:g} degC"
+    return ", ".join(f"{half:g} degC of {name}" for name, half in band.items())
+
+
 def _listed(value: Any) -> str:
     """Return a value of the spec as text: by output or drive, and of a tariff by its times."""
+    if isinstance(value, OnOff):
+        least = f"at least {value.min_on_s:g} s on, {value.min_off_s:g} s off"
+        return f"{least}, a sample on costs {value.price:g}"
+    if isinstance(value, Settling):
+        own = {_SPEC_WORDS[f"settle_{key}" if key == "within_s" else key]: each for key, each in value}
+        return ", ".join(f"{words} {each:g}" for words, each in own.items() if each is not None)
     if isinstance(value, dict):
         return ", ".join(f"{name} {_listed(each)}" for name, each in value.items())
     if isinstance(value, list):
@@ -328,7 +346,7 @@ def _uncertain(tuning: Tuning) -> bool:
 
 def _before_the_last_column(spec: Spec) -> str:
     """Return what the minimum time means."""
-    if spec.ramp_per_s:
+    if spec.ramps:
         return (
             "Before the last column no drive inside its limits brings the output into the band, or the ramp "
             "has not brought the target there; PI and LQR take the target at once."

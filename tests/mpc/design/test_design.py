@@ -285,7 +285,7 @@ def test_a_drive_of_the_other_sign_has_a_loop_of_the_other_sign_and_one_of_no_ga
 def test_the_skin_is_controlled_by_one_drive_and_by_several_the_last_outputs(
     drives: int, outputs: str, controlled: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("thermogrip.mpc.design.design.drive_names", lambda plant: tuple("uv"[:drives]))
+    monkeypatch.setattr("thermogrip.mpc.design.design.graded_drives", lambda plant: tuple("uv"[:drives]))
     plant: Any = SimpleNamespace(outputs=tuple(outputs.split()))
     assert default_controlled(plant) == tuple(controlled.split())
 
