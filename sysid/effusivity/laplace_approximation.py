@@ -135,7 +135,7 @@ def jacobian(
     from thermogrip.sysid.effusivity.mode_kernel import readings
 
     y, slopes = readings(pairs_asked(stack, nodes, data, np.arange(len(u)), beyond), u, vary)
-    return y, slopes[:, :, :N_NUISANCE]
+    return y, slopes[:, :N_NUISANCE].transpose(0, 2, 1)
 
 
 def pairs_asked(
@@ -382,7 +382,7 @@ class WithGripper(NamedTuple):
         vary = np.zeros((n * k, N_NUISANCE), dtype=bool)
         vary[k - 1 :: k] = slopes
         y, found = readings(asked, np.repeat(u, k, axis=0), vary)
-        own_columns = found[k - 1 :: k]
+        own_columns = found[k - 1 :: k].transpose(0, 2, 1)
         if not slopes:
             return own_columns[:, :, -1:], able
         by_u = own_columns[:, :, :N_NUISANCE]
