@@ -24,9 +24,9 @@ def blend(
 
     ``index`` (n_e, -1) are the rows of the nodes of a lattice of that ``shape``.  ln e goes first: a free
     effusivity needs no derivative by it, and sums along it are ``kept`` (-1, N_BASIS) for the next places at
-    the same ln e, neighbours in ``order`` (n,); ``kept_of`` are zeros, ``sums`` (5, N_BASIS) room.  ``weight`` (4, 6, 6) are the nodes' as
-    polynomials (direction, order, node); a ``late`` place lies on nodes of ln C/e, which nothing depends on
-    there."""
+    the same ln e, neighbours in ``order`` (n,); ``kept_of`` are zeros, ``sums`` (5, N_BASIS) room.
+    ``weight`` (4, 6, 6) are the nodes' as polynomials (direction, order, node); a ``late`` place lies on
+    nodes of ln C/e, which nothing depends on there."""
     w, s, (_, _, n_h, n_b), group, last = room[:4], room[4:], shape, 0, -1
     for i in range(cell.shape[0]):
         p = order[i]

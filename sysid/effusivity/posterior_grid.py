@@ -258,8 +258,8 @@ def _evidence_near(gripper: GripperModel, data: Touches, near: Array) -> Array:
     """Return the log evidence of a free effusivity for each touch of an object of stated temperature, (n,),
     NaN where that is not sure.
 
-    One search with ln e free finds where the density is, how wide, and how the other unknowns go along; points
-    about it start there, and more follow where it has not ended, or falls steeply between points."""
+    One search with ln e free finds where the density is, how wide, and how the other unknowns go along;
+    points about it start there, and more follow where it has not ended, or falls steeply between points."""
     row, noise = np.arange(data.level.size), whitened(gripper, data)
     lowest, highest = LN_E_RANGE
     free = free_hypotheses(gripper, np.clip(near[:, EFFUSIVITY], lowest, highest))
@@ -609,7 +609,9 @@ def log_total(x: Array, value: Array, slopes_of: Callable[[Array, Array], Array]
     place = np.broadcast_to((_GAUSS + 0.5)[None, None], (n, m - 1, _GAUSS.size)).reshape(n, -1)
     at = np.repeat(np.arange(m - 1), _GAUSS.size)
     share = _SHARE * np.diff(x)[:, :, None]
-    return np.asarray(logsumexp(_cubic(x, value, at, place, slopes_of) + np.log(share).reshape(n, -1), axis=1))
+    return np.asarray(
+        logsumexp(_cubic(x, value, at, place, slopes_of) + np.log(share).reshape(n, -1), axis=1)
+    )
 
 
 def _cubic(
