@@ -249,7 +249,7 @@ def free_evidence(gripper: GripperModel, data: Touches, near: Array | None = Non
 
 _AROUND, _SIDE = 9, 4.0  # points about the density's place, and how many of its sds to either side
 _ANYWHERE = 1.0  # of ln e about a candidate's, where its density is looked for
-_ENDED, _STEEP = 9.0, 3.0  # nats below the best where a density may end; and that it may fall beside the best
+_ENDED, _STEEP = 7.0, 3.0  # nats below the best where a density may end; and that it may fall beside the best
 _MORE, _ROUNDS = 4, 4  # points at a time, and how often, until that is so
 _SURE = 0.02  # nats by which two kinds of cubics may differ
 
