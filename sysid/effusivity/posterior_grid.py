@@ -251,7 +251,8 @@ _AROUND, _SIDE = 9, 4.0  # points about the density's place, and how many of its
 _ANYWHERE = 1.0  # of ln e about a candidate's, where its density is looked for
 _ENDED, _STEEP = 7.0, 3.0  # nats below the best where a density may end; and that it may fall beside the best
 _MORE, _ROUNDS = 4, 4  # points at a time, and how often, until that is so
-_SURE = 0.02  # nats by which two kinds of cubics may differ
+_SURE = 0.008  # nats by which two kinds of cubics may differ
+_HALVED = 8  # cells that are halved where they differ by more
 
 
 def _evidence_near(gripper: GripperModel, data: Touches, near: Array) -> Array:
@@ -276,7 +277,8 @@ def _evidence_near(gripper: GripperModel, data: Touches, near: Array) -> Array:
         wanted = [_more(x, value) for x, value in zip(found.x, found.value)]
         done = np.array([more is None for more in wanted])
         if done.any():
-            out[at[done]] = _sure_total(_Fitted(*(part[done] for part in found)))
+            ended = _Fitted(*(part[done] for part in found))
+            out[at[done]] = _halved_total(gripper, some.take(np.flatnonzero(done)), ended)
         if done.all() or again == _ROUNDS:
             break
         at, found = at[~done], _Fitted(*(part[~done] for part in found))
@@ -307,6 +309,21 @@ def _more(x: Array, value: Array) -> Array | None:
         return None
     first = min(max(best - _MORE // 2, 0), x.size - 1 - _MORE)
     return np.asarray(0.5 * (x[first : first + _MORE] + x[first + 1 : first + 1 + _MORE]))
+
+
+def _halved_total(gripper: GripperModel, data: Touches, found: _Fitted) -> Array:
+    """Return :func:`_sure_total`, with points between those that count most where that is not sure."""
+    total = _sure_total(found)
+    rest = np.flatnonzero(np.isnan(total))
+    if rest.size:
+        some, found = data.take(rest), _Fitted(*(part[rest] for part in found))
+        cells = np.sort(np.argsort(found.value[:, :-1] + found.value[:, 1:], axis=1)[:, -_HALVED:], axis=1)
+        middles = 0.5 * (found.x[:, :-1] + found.x[:, 1:])
+        grid = np.take_along_axis(middles, cells, axis=1)
+        start = _between(grid, found.x, found.u)
+        more = _evaluate(gripper, some, whitened(gripper, some), grid, start)
+        total[rest] = _sure_total(_joined(found, more))
+    return total
 
 
 def _sure_total(found: _Fitted) -> Array:
