@@ -295,7 +295,8 @@ class StreamedComparison(Comparison):
         table = []
         for (first, second, where), pair in self.counts.pairs.items():
             if where == condition:
-                right, lost = (_mean(*pair.sums[:, k].tolist(), pair.n, self.level) for k in range(2))
+                (a, b), (a2, b2) = pair.sums.tolist()
+                right, lost = _mean(a, a2, pair.n, self.level), _mean(b, b2, pair.n, self.level)
                 only = [int(n) for n in pair.only]
                 table.append({
                     "first": first, "second": second, "condition": condition, "n": pair.n,

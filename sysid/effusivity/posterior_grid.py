@@ -303,7 +303,7 @@ def _more(x: Array, value: Array) -> Array | None:
         if right:
             end = min(x[-1] + n * 1.5 * (x[-1] - x[-2]), LN_E_RANGE[1])
             parts.append(x[-1] + (end - x[-1]) * share)
-        return np.concatenate(parts)
+        return np.asarray(np.concatenate(parts))
     beside = value[max(best - 1, 0) : best + 2]
     if value[best] - beside.min() <= _STEEP:
         return None
@@ -316,7 +316,8 @@ def _halved_total(gripper: GripperModel, data: Touches, found: _Fitted) -> Array
     total = _sure_total(found)
     rest = np.flatnonzero(np.isnan(total))
     if rest.size:
-        some, found = data.take(rest), _Fitted(*(part[rest] for part in found))
+        left: Any = (part[rest] for part in found)
+        some, found = data.take(rest), _Fitted(*left)
         cells = np.sort(np.argsort(found.value[:, :-1] + found.value[:, 1:], axis=1)[:, -_HALVED:], axis=1)
         middles = 0.5 * (found.x[:, :-1] + found.x[:, 1:])
         grid = np.take_along_axis(middles, cells, axis=1)

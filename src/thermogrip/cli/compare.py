@@ -110,7 +110,7 @@ def compare(
     cli.warn_of_contacts(console, [*records, *(tests or ())])
     records = touched_part(console, records)
     tests = None if tests is None else touched_part(console, tests)
-    found = {}
+    found: dict[str, Comparison] = {}
     with kept_processes(pool), console.progress("compare") as progress:
         given = tests is not None or large or _has_split(records)
         anew = tests is None and not large and repeats > 0
@@ -194,7 +194,7 @@ def kept_answers(out: Path, question: Sequence[Any]) -> Answers:
 
 def _streamed(
     console: Console, models: Mapping[str, GraspClassifier], records: Sequence[Grasps], test: Sequence[str],
-    out: Path, question: Sequence[Any], pool: Workers, progress: Progress,
+    out: Path, question: Sequence[Any], pool: Workers, progress: Progress | None,
 ) -> StreamedComparison:  # fmt: skip
     """Return the comparison on test files that are read part by part."""
     from thermogrip.classify.evaluation.streamed import fitted_classifiers, streamed_comparison
@@ -203,7 +203,8 @@ def _streamed(
     from thermogrip.datasets.partitions import sources
 
     def told(done: float, what: str) -> None:
-        progress(0.2 + 0.8 * done, f"test: {what}")
+        if progress is not None:
+            progress(0.2 + 0.8 * done, f"test: {what}")
 
     trained = sub_progress(progress, 0.0, 0.2)
     ask = _Asked(fitted_classifiers(models, records, workers=pool, progress=trained))
