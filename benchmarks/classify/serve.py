@@ -1,12 +1,14 @@
 """How long an answer of ``classify --serve`` takes, beside the same call in this process.
 
     python benchmarks/classify/serve.py MODEL_DIR [--grasps 10000] [--in-process 500] [--workers N]
+        [--same-gripper]
 
 The example condition ``exp1A_obj43_grip23``, each trace with new white noise of 0.02 K. First one client,
 with a tenth of the requests (at most 500), then four at once: with one thread that answers each waits for
 three others, with four processes (``--workers 4``) for none. Every request has a number, which its answer
 must bring back. A request is timed from its first byte to the last of its answer, over a connection that
-stays open. Progress goes to stderr; memory is that of the server and of all its processes.
+stays open. With ``--same-gripper``, as for a robot whose gripper is the training's, no answer asks whether
+another one took the grasp. Progress goes to stderr; memory is that of the server and of all its processes.
 """
 
 from __future__ import annotations
@@ -76,17 +78,18 @@ def main() -> None:
     parser.add_argument("--grasps", type=int, default=10_000)
     parser.add_argument("--in-process", type=int, default=500)
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--same-gripper", action="store_true")
     given = parser.parse_args()
     bodies = requests(given.grasps)
     print("             answers  p50 [ms]  p99 [ms]")
-    answer, seconds = _Question(given.model).answerer(), []
+    answer, seconds = _Question(given.model, same_gripper=given.same_gripper).answerer(), []
     for body in [bodies[0], *bodies[: given.in_process]]:
         begin = time.perf_counter()
         answer(grasp_of(json.loads(body)))
         seconds.append(time.perf_counter() - begin)
     print(line_of("in process", seconds[1:]), flush=True)  # the first one loads compiled code
     words = [sys.executable, "-m", "thermogrip", "classify", str(given.model), "--serve", "--port", "0"]
-    words += ["--workers", str(given.workers)]
+    words += ["--workers", str(given.workers)] + ["--same-gripper"] * given.same_gripper
     with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         port = int(process.stderr.readline().strip().rstrip("/").rpartition(":")[2])

@@ -1,6 +1,6 @@
 """Rigs of one kind alone and pooled: errors of parameters and free runs, the population's coverage, ill rigs.
 
-    python benchmarks/identify/fleet.py [--rigs 30] [--seeds 4] [--workers 2] [--months 6]
+    python benchmarks/identify/fleet.py [--rigs 30] [--seeds 4] [--workers 2] [--months 6] [--power 1000]
 
 Each fleet has TCLab boards whose parameters are drawn about a mean that is off the network's own prior: with
 sd 0.15 in the logarithm, of the lags 0.3.  Each board has three logs of 5 min, or one, with random steps,
@@ -13,6 +13,10 @@ the equations: the network is right, and only the number of readings is short.
 ``--months M`` instead has one log of 15 min of a board a month, whose parameters differ from month to month
 with sd 0.05 in the logarithm; G_amb of the first board grows by 10 % a month (a fan that is turned up), in a
 second fleet it does not.
+
+``--power DRAWS`` says how often the doubled G_amb is found where fits are what they say they are: normal
+about the truth with the covariance that one board's fit has.  Beside it two tests that know what ours must
+find out, at the same chance of an alarm in a healthy fleet: the population, and which parameter is ill.
 """
 
 from __future__ import annotations
@@ -24,12 +28,22 @@ from functools import partial
 
 import numpy as np
 from scipy.signal import lfilter
+from scipy.stats import norm
 
 from thermogrip.datasets.parallel import run_parallel
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.greybox.drift import find_drift
 from thermogrip.sysid.greybox.fit import fit_network
-from thermogrip.sysid.greybox.population import pool_rigs, pooled_plant
+from thermogrip.sysid.greybox.population import (
+    ILL,
+    Told,
+    against_others,
+    in_prior_units,
+    pool_rigs,
+    pooled_plant,
+    prior_units,
+    told_by,
+)
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.network import load_network
 
@@ -118,6 +132,41 @@ def drifts(run, model, n, months, seeds):
     print(f"scatter from month to month, true 0.05: {np.mean(scatters, axis=0).round(3)}")
 
 
+def power(model, n, draws):
+    """Print how often the ill board is found where fits are normal, by ours and by tests that know more."""
+    print("logs  sd of ln G_amb by a fit   found by us   knowing the population   and the parameter   alarms")
+    for n_logs in (3, 1):
+        rng = np.random.default_rng([7, n_logs])
+        _, [logs], _ = fleet(rng, 1, n_logs)
+        plant = fit_network(model, logs)
+        specs = [model.specs[name] for name in plant.free]
+        centre, width = prior_units(specs)
+        z, S = in_prior_units([plant], centre, width)
+        precision = told_by(z, S).precision[0]
+        size, axes = np.linalg.eigh(precision)
+        seen = size > 1e-3
+        root = axes[:, seen] / np.sqrt(size[seen])
+        at = [plant.free.index(name) for name in NAMES]
+        sd = np.zeros(len(plant.free))
+        sd[at] = SPREAD / width[at]
+        found, alarms = np.zeros(3), 0
+        for _ in range(draws):
+            theta = sd * rng.normal(size=(n, sd.size))
+            theta[0, at[0]] += np.log(2.0) / width[at[0]]
+            seen_as = theta + rng.normal(size=(n, int(seen.sum()))) @ root.T
+            told = Told(np.tile(precision, (n, 1, 1)), seen_as @ precision)
+            fits = told.information @ S[0]
+            chances = [against_others(told, fits[i], S[0], i)[3] for i in (0, 1)]
+            off = np.abs(fits[0]) / np.sqrt(np.diagonal(S[0] @ precision @ np.diag(sd**2) @ precision @ S[0]
+                                                        + S[0] @ precision @ S[0]))  # fmt: skip
+            known = [2 * n * len(NAMES) * norm.sf(off[at].max()), 2 * n * norm.sf(off[at[0]])]
+            found += np.array([chances[0], *known]) < ILL
+            alarms += chances[1] < ILL
+        by_fit = width[at[0]] * np.sqrt(S[0, at[0], at[0]])
+        shares = "   ".join(f"{share:.3f}" for share in found / draws)
+        print(f"{n_logs:4d}  {by_fit:.3f}   {shares}   {alarms}/{draws}", flush=True)
+
+
 def errors(plants, theta, checks):
     """Return the rms error of the parameters' logarithms, and of free runs [K]."""
     found = np.log([[plant.values[name] for name in NAMES] for plant in plants])
@@ -135,9 +184,13 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--months", type=int, default=0)
+    parser.add_argument("--power", type=int, default=0, metavar="DRAWS")
     given = parser.parse_args()
     run = partial(run_parallel, fitted, workers=given.workers)
     model, n = load_network("tclab"), given.rigs
+    if given.power:
+        power(model, n, given.power)
+        return
     if given.months:
         drifts(run, model, n, given.months, given.seeds)
         return

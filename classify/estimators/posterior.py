@@ -263,12 +263,16 @@ class PosteriorClassifier(GraspClassifier):
         levels, u = self._levels(), np.log(self.prior_unknown)
         if levels[-1].device is not self.device_ and _unlikely(levels, data, names):
             levels = levels[:-1]
-        each, prior = _of_levels(levels, data, names), np.log([level.prior for level in levels])[:, None]
+        each, modes = _of_levels(levels, data, names)
+        prior = np.log([level.prior for level in levels])[:, None]
         known, free = logsumexp(each, axis=2) - np.log(len(names)), np.full(each.shape[:2], -np.inf)
         sure = _share(levels, each)[0] > _SURE
         own = np.array([level.device is self.device_ for level in levels])
         if unknown or not sure:
-            free[own] = free_evidence(self.device_, data)
+            # the level and the candidate that explain each touch best
+            best = np.concatenate(each[own], axis=1).argmax(axis=1)
+            near = np.concatenate(modes[own], axis=1)[np.arange(best.size), best]
+            free[own] = free_evidence(self.device_, data, near)
         explained = known if sure else np.logaddexp(np.log(1 - self.prior_unknown) + known, u + free)
         others = explained.sum(axis=1, keepdims=True) - explained
         weight = normalised((prior + others).T).T
@@ -356,16 +360,17 @@ class PosteriorClassifier(GraspClassifier):
         self.coupling_ = Coupling.load(file) if file.exists() else None
 
 
-def _of_levels(levels: Sequence[_Level], data: Touches, names: Sequence[str]) -> Floats:
-    """Return the log evidence of each candidate for each touch on each level, (n_level, n, n_name)."""
-    found: list[Floats] = []
-    first = None  # what the first level found is near what its gripper finds with another block
+def _of_levels(levels: Sequence[_Level], data: Touches, names: Sequence[str]) -> tuple[Floats, Floats]:
+    """Return the log evidence of each candidate for each touch on each level, (n_level, n, n_name), and the
+    nuisances there, (n_level, n, n_name, 7)."""
+    found, modes = list[Floats](), list[Floats]()
     for level in levels:
-        start = first if level.device is levels[0].device else None
+        # what the first level found is near what its gripper finds with another block
+        start = modes[0] if modes and level.device is levels[0].device else None
         mode, *_ = fit_candidates(level.device, data, names, level.finish, start=start)
         found.append(mode.log_evidence.reshape(-1, len(names)))
-        first = mode.u.reshape(*found[0].shape, -1) if first is None else first
-    return np.stack(found)
+        modes.append(mode.u.reshape(*found[0].shape, -1))
+    return np.stack(found), np.stack(modes)
 
 
 def _unlikely(levels: Sequence[_Level], data: Touches, names: Sequence[str]) -> bool:
@@ -376,7 +381,7 @@ def _unlikely(levels: Sequence[_Level], data: Touches, names: Sequence[str]) -> 
     found, share = list[Floats](), 1.0
     for i in np.unique(np.linspace(0, data.level.size - 1, _ASKED).astype(int)):
         if share > _HARDLY:
-            found.append(_of_levels(levels, data.take(np.array([i])), names))
+            found.append(_of_levels(levels, data.take(np.array([i])), names)[0])
             share = float(_share(levels, np.concatenate(found, axis=1))[-1])
     return share < 1 - _SURE
 

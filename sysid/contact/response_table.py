@@ -62,7 +62,7 @@ class ResponseTable:
         shape = np.ceil((high - low) / _STEP).astype(int) + _NEAR
         self._index = np.full(shape, -1, dtype=np.int32)
         self._whole = np.zeros(shape, dtype=bool)  # where all nodes about a cell are there
-        self._kept = np.empty(int(np.prod(shape[1:])) * N_BASIS)  # sums along one ln e
+        self._kept = np.empty((int(np.prod(shape[1:])), N_BASIS))  # sums along one ln e
         self._rows, self._n = np.empty((1024, N_BASIS), dtype=np.float32), 0
         rng, most = np.random.default_rng(0), np.maximum(low, low + _RARE)
         places = [rng.uniform(most, high, (_DRAWN, 4)), rng.uniform(low, high, (_DRAWN // 4, 4))]
@@ -103,7 +103,8 @@ class ResponseTable:
         :func:`~thermogrip.sysid.effusivity.mode_kernel.bin_means` of their curves."""
         own, room = self._blended(numbers, stepped), np.empty(out.shape[2])
         touched, at = np.unique(row, return_inverse=True)
-        of = [(times[i].tobytes(), bins[i].tobytes()) for i in touched]
+        one = (times[touched] == times[touched[0]]).all() and (bins[touched] == bins[touched[0]]).all()
+        of = [(times[i].tobytes(), bins[i].tobytes()) for i in (touched[:1] if one else touched)]
         kinds = list(dict.fromkeys(of))
         for key in kinds:
             first = touched[of.index(key)]
@@ -176,7 +177,8 @@ class ResponseTable:
         order, lattice = np.argsort(z[:, 0], kind="stable"), self._index.reshape(len(self._index), -1)
         kept_of, law = np.zeros(lattice.shape[1], dtype=np.int32), (_WEIGHT, _STEP, wanted, order)
         where = lattice, self._index.shape, self._rows, cell, place - cell, late
-        blend(*where, *law, self._kept, kept_of, np.empty((8, 6)), out)
+        room = np.empty((8, 6)), np.empty((N_STEPPED, N_BASIS))
+        blend(*where, *law, self._kept, kept_of, *room, out)
         return out
 
     def _fill(self, cell: NDArray[np.int64]) -> None:

@@ -11,23 +11,22 @@ from thermogrip.datasets.compiled import numba
 from thermogrip.sysid.contact.time_stepping import COMPILED
 
 N_BASIS = 16  # curves whose combinations are all responses
-_1, _2, _3 = (k * N_BASIS for k in range(1, 4))
 
 
 @numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
 def blend(
     index: NDArray[np.int32], shape: tuple[int, ...], rows: NDArray[np.float32], cell: NDArray[np.int64],
     share: Array, late: Mask, weight: Array, step: Array, wanted: Mask, order: NDArray[np.int64], kept: Array,
-    kept_of: NDArray[np.int32], room: Array, out: Array,
+    kept_of: NDArray[np.int32], room: Array, sums: Array, out: Array,
 ) -> None:  # fmt: skip
     """Fill ``out`` (n, 5, N_BASIS): coefficients of the value, and of its derivatives by ln h, ln tau_b, ln e
     at the same C/e, and ln C/e, at a ``share`` (n, 4) of the way through each ``cell``.
 
     ``index`` (n_e, -1) are the rows of the nodes of a lattice of that ``shape``.  ln e goes first: a free
-    effusivity needs no derivative by it, and sums along it are ``kept`` (-1,) for the next places at the same
-    ln e, neighbours in ``order`` (n,); ``kept_of`` are zeros.  ``weight`` (4, 6, 6) are the nodes' as
-    polynomials (direction, order, node); a ``late`` place lies on nodes of ln C/e, which nothing depends on
-    there."""
+    effusivity needs no derivative by it, and sums along it are ``kept`` (-1, N_BASIS) for the next places at
+    the same ln e, neighbours in ``order`` (n,); ``kept_of`` are zeros, ``sums`` (5, N_BASIS) room.
+    ``weight`` (4, 6, 6) are the nodes' as polynomials (direction, order, node); a ``late`` place lies on
+    nodes of ln C/e, which nothing depends on there."""
     w, s, (_, _, n_h, n_b), group, last = room[:4], room[4:], shape, 0, -1
     for i in range(cell.shape[0]):
         p = order[i]
@@ -47,7 +46,7 @@ def blend(
         at_e, corner = cell[p, 0], (cell[p, 1] * n_h + cell[p, 2]) * n_b + cell[p, 3]
         e0, e1, e2, e3, e4, e5 = w[0, 0], w[0, 1], w[0, 2], w[0, 3], w[0, 4], w[0, 5]
         h0, h1, h2, h3, h4, h5 = s[0, 0], s[0, 1], s[0, 2], s[0, 3], s[0, 4], s[0, 5]
-        out[p] = 0.0
+        sums[:] = 0.0
         for j in range(6):
             if w[1, j] == 0.0 and not by_slab:
                 continue
@@ -62,36 +61,41 @@ def blend(
                     for q in range(N_BASIS):
                         at = e0 * rows[a, q] + e1 * rows[b, q] + e2 * rows[c, q]
                         at += e3 * rows[d, q] + e4 * rows[f, q] + e5 * rows[g, q]
-                        kept[n * N_BASIS + q] = at
+                        kept[n, q] = at
                     if by_e:
                         x = w[1, j] * w[2, k] * w[3, m]
                         for q in range(N_BASIS):
                             at = h0 * rows[a, q] + h1 * rows[b, q] + h2 * rows[c, q]
                             at += h3 * rows[d, q] + h4 * rows[f, q] + h5 * rows[g, q]
-                            out[p, 3, q] += x * at
+                            sums[3, q] += x * at
         t0, t1, t2, t3 = w[3, 0], w[3, 1], w[3, 2], w[3, 3]
         z0, z1, z2, z3 = s[3, 0], s[3, 1], s[3, 2], s[3, 3]
-        for q in range(N_BASIS):
-            value = by_h = by_b = by_c = 0.0
-            for j in range(6):
-                x, y = w[1, j], s[1, j]
-                if x == 0.0 and not by_slab:
+        for j in range(6):
+            x, y = w[1, j], s[1, j]
+            if x == 0.0 and not by_slab:
+                continue
+            for k in range(6):
+                n, b0 = corner + (j * n_h + k) * n_b, x * w[2, k]
+                b1, b2 = x * s[2, k], y * w[2, k]
+                if not (moved or by_slab):
+                    for q in range(N_BASIS):
+                        at = t0 * kept[n, q] + t1 * kept[n + 1, q] + t2 * kept[n + 2, q] + t3 * kept[n + 3, q]
+                        sums[0, q] += b0 * at
                     continue
-                for k in range(6):
-                    n = (corner + (j * n_h + k) * n_b) * N_BASIS + q
-                    k0, k1, k2, k3 = kept[n], kept[n + _1], kept[n + _2], kept[n + _3]
+                for q in range(N_BASIS):
+                    k0, k1, k2, k3 = kept[n, q], kept[n + 1, q], kept[n + 2, q], kept[n + 3, q]
                     at = t0 * k0 + t1 * k1 + t2 * k2 + t3 * k3
-                    value += x * w[2, k] * at
-                    if moved or by_slab:
-                        by_h += x * s[2, k] * at
-                        by_c += y * w[2, k] * at
-                        by_b += x * w[2, k] * (z0 * k0 + z1 * k1 + z2 * k2 + z3 * k3)
-            out[p, 0, q] = value
-            if moved:
-                out[p, 1, q], out[p, 2, q] = by_h, by_b
-            if by_slab:
-                out[p, 4, q] = by_c
-            out[p, 3, q] -= out[p, 4, q]  # by ln e at the same C
+                    sums[0, q] += b0 * at
+                    sums[1, q] += b1 * at
+                    sums[2, q] += b0 * (z0 * k0 + z1 * k1 + z2 * k2 + z3 * k3)
+                    sums[4, q] += b2 * at
+        if not moved:
+            sums[1:3] = 0.0
+        if not by_slab:
+            sums[4] = 0.0
+        for q in range(N_BASIS):
+            out[p, 0, q], out[p, 1, q], out[p, 2, q] = sums[0, q], sums[1, q], sums[2, q]
+            out[p, 3, q], out[p, 4, q] = sums[3, q] - sums[4, q], sums[4, q]  # by ln e at the same C
 
 
 @numba.njit(**COMPILED)  # type: ignore[untyped-decorator]

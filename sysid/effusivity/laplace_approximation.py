@@ -46,7 +46,8 @@ the search for the mode and Laplace's method around it are those of u alone, for
 evidence at the end is integrated over both.
 
 Every hypothesis finds a gripper of its own.  From the calibration's gripper the way there may be long, with
-one that was right 50 nats behind after the first step, so a search is not left early.  The likeliest
+one that was right 50 nats behind after the first step, so a search is left only after a dozen of them, where
+it would end 20 nats behind and gains less than that in four.  The likeliest
 hypothesis of a touch begins there, and each other one where the one before it along ln e ended, if that is
 nearer: z as the same a, theta = t0 + P a, since P depends on the block.  The density of a free effusivity
 falls to either side of the likeliest, so beyond a point that is 20 nats behind no other is searched.
@@ -135,7 +136,7 @@ def jacobian(
     from thermogrip.sysid.effusivity.mode_kernel import readings
 
     y, slopes = readings(pairs_asked(stack, nodes, data, np.arange(len(u)), beyond), u, vary)
-    return y, slopes[:, :, :N_NUISANCE]
+    return y, slopes[:, :N_NUISANCE].transpose(0, 2, 1)
 
 
 def pairs_asked(
@@ -195,6 +196,7 @@ _STEPS = 90
 _BESIDE = 3  # hypotheses that start from where the one before them ended
 _STILL = 0.1  # of -2 ln density: a smaller predicted decrease ends the search
 _HOPELESS = 20.0  # nats behind the likeliest
+_EARLIEST, _PACE = 12, 4  # steps before a search may be left, and over which its gains are looked at
 _DIFFERENCE = 1e-6
 _LAYERS = np.array([_AT[f"ln_{name}"] for name in LAYER_NAMES])
 _CONTACT = ("ln_lag", "ln_first", "creep", "ln_settle", "ln_g_far", "leak")
@@ -319,7 +321,7 @@ class WithGripper(NamedTuple):
             better = self.costs(at, there) < self.costs(at, begin)
             begin[better] = there[better]
         for whole, part in zip(
-            found, search(_Some(self, at), self.law.take(at), self.sd[at], begin, _STEPS, least=_STILL)
+            found, search(_Some.of(self, at), self.law.take(at), self.sd[at], begin, _STEPS, least=_STILL)
         ):
             whole[at] = part
         np.minimum.at(self.best, self.row[at], found.cost[at])
@@ -382,7 +384,7 @@ class WithGripper(NamedTuple):
         vary = np.zeros((n * k, N_NUISANCE), dtype=bool)
         vary[k - 1 :: k] = slopes
         y, found = readings(asked, np.repeat(u, k, axis=0), vary)
-        own_columns = found[k - 1 :: k]
+        own_columns = found[k - 1 :: k].transpose(0, 2, 1)
         if not slopes:
             return own_columns[:, :, -1:], able
         by_u = own_columns[:, :, :N_NUISANCE]
@@ -413,6 +415,12 @@ class _Some(NamedTuple):
 
     whole: WithGripper
     at: NDArray[np.int64]
+    before: Array  # (_PACE, n), -2 ln posterior at the last steps
+
+    @classmethod
+    def of(cls, whole: WithGripper, at: NDArray[np.int64]) -> _Some:
+        """Return some of the pairs, before any step."""
+        return cls(whole, at, np.full((_PACE, at.size), np.inf))
 
     def products(self, at: NDArray[np.int64], u: Array, *, first: bool) -> Array:
         """Return the products of some pairs."""
@@ -427,8 +435,14 @@ class _Some(NamedTuple):
         return np.asarray(np.abs(far).max(axis=1))
 
     def hopeful(self, step: int, at: NDArray[np.int64], cost: Array, decrease: Array) -> Mask | None:
-        """Return None: far from the guess, steps say little about where they end."""
-        return None
+        """Return which are worth another step; far from the guess, the first ones say little about where they
+        end."""
+        gain = self.before[step % _PACE, at] - cost
+        self.before[step % _PACE, at] = cost
+        if step < _EARLIEST:
+            return None
+        behind = cost - decrease - self.whole.best[self.whole.row[self.at[at]]]
+        return np.asarray((behind < 2 * _HOPELESS) | (gain > behind))
 
 
 def _able(numbers: Array) -> Mask:

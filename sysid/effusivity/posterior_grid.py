@@ -24,7 +24,7 @@ the unit vectors, w_k = 1/6, the rule that is exact for all cubics of three norm
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -228,10 +228,113 @@ def grid_posteriors(gripper: GripperModel, data: Touches) -> list[GridPosterior]
     return posteriors_of(found.x, value, found.u[:, :, T_OBJECT], sd, found.u[:, :, H])
 
 
-def free_evidence(gripper: GripperModel, data: Touches) -> Array:
-    """Return the log evidence of a free effusivity for each touch, (n,), as :func:`grid_posteriors` do."""
-    found = _fitted(gripper, data, whitened(gripper, data))
-    return np.asarray(log_total(found.x, found.value) - np.log(LN_E_RANGE[1] - LN_E_RANGE[0]))
+def free_evidence(gripper: GripperModel, data: Touches, near: Array | None = None) -> Array:
+    """Return the log evidence of a free effusivity for each touch, (n,), as :func:`grid_posteriors` do.
+
+    Where the modes ``near`` (n, 7) of a likely candidate are given and the object's temperature is stated,
+    the density is looked for from there (:func:`_evidence_near`)."""
+    out = np.full(data.level.size, np.nan)
+    by_one = gripper.second is None or data.second is None
+    if near is not None and by_one and gripper.discrepancy is None and not gripper.uncertain:
+        at = np.flatnonzero(np.isfinite(data.t_object))
+        if at.size:
+            out[at] = _evidence_near(gripper, data if at.size == out.size else data.take(at), near[at])
+    rest = np.flatnonzero(np.isnan(out))
+    if rest.size:
+        some = data if rest.size == out.size else data.take(rest)
+        found = _fitted(gripper, some, whitened(gripper, some))
+        out[rest] = log_total(found.x, found.value) - np.log(LN_E_RANGE[1] - LN_E_RANGE[0])
+    return out
+
+
+_AROUND, _SIDE = 9, 4.0  # points about the density's place, and how many of its sds to either side
+_ANYWHERE = 1.0  # of ln e about a candidate's, where its density is looked for
+_ENDED, _STEEP = 7.0, 3.0  # nats below the best where a density may end; and that it may fall beside the best
+_MORE, _ROUNDS = 4, 4  # points at a time, and how often, until that is so
+_SURE = 0.008  # nats by which two kinds of cubics may differ
+_HALVED = 8  # cells that are halved where they differ by more
+
+
+def _evidence_near(gripper: GripperModel, data: Touches, near: Array) -> Array:
+    """Return the log evidence of a free effusivity for each touch of an object of stated temperature, (n,),
+    NaN where that is not sure.
+
+    One search with ln e free finds where the density is, how wide, and how the other unknowns go along;
+    points about it start there, and more follow where it has not ended, or falls steeply between points."""
+    row, noise = np.arange(data.level.size), whitened(gripper, data)
+    lowest, highest = LN_E_RANGE
+    free = free_hypotheses(gripper, np.clip(near[:, EFFUSIVITY], lowest, highest))
+    law = prior_of(gripper, data, free._replace(ln_e_sd=np.full(row.size, _ANYWHERE)))
+    mode = fit_pairs(gripper, data, row, free, start=near, noise=noise, prior=law)
+    place, spread = mode.u[:, EFFUSIVITY], np.sqrt(mode.covariance[:, EFFUSIVITY, EFFUSIVITY])
+    low, high = np.clip([place - _SIDE * spread, place + _SIDE * spread], lowest, highest)
+    grid = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, _AROUND)
+    along = mode.covariance[:, :, EFFUSIVITY] / spread[:, None] ** 2
+    start = mode.u[:, None] + along[:, None] * (grid - place[:, None])[:, :, None]
+    found = _evaluate(gripper, data, noise, grid, start)
+    out, at, some = np.full(row.size, np.nan), row, data
+    for again in range(_ROUNDS + 1):
+        wanted = [_more(x, value) for x, value in zip(found.x, found.value)]
+        done = np.array([more is None for more in wanted])
+        if done.any():
+            ended = _Fitted(*(part[done] for part in found))
+            out[at[done]] = _halved_total(gripper, some.take(np.flatnonzero(done)), ended)
+        if done.all() or again == _ROUNDS:
+            break
+        at, found = at[~done], _Fitted(*(part[~done] for part in found))
+        some, grid = data.take(at), np.stack([more for more in wanted if more is not None])
+        more = _evaluate(gripper, some, whitened(gripper, some), grid, _between(grid, found.x, found.u))
+        found = _joined(found, more)
+    return np.asarray(out - np.log(highest - lowest))
+
+
+def _more(x: Array, value: Array) -> Array | None:
+    """Return points that a density lacks of which ``value`` is the logarithm at rising ``x``: beyond an end
+    where it has not ended, or beside the best; None where it lacks none."""
+    best = int(value.argmax())
+    left = value[0] > value[best] - _ENDED and x[0] > LN_E_RANGE[0]
+    right = value[-1] > value[best] - _ENDED and x[-1] < LN_E_RANGE[1]
+    if left or right:
+        n = _MORE // (2 if left and right else 1)
+        parts, share = [], np.arange(1, n + 1) / n
+        if left:
+            end = max(x[0] - n * 1.5 * (x[1] - x[0]), LN_E_RANGE[0])
+            parts.append(x[0] + (end - x[0]) * share[::-1])
+        if right:
+            end = min(x[-1] + n * 1.5 * (x[-1] - x[-2]), LN_E_RANGE[1])
+            parts.append(x[-1] + (end - x[-1]) * share)
+        return np.asarray(np.concatenate(parts))
+    beside = value[max(best - 1, 0) : best + 2]
+    if value[best] - beside.min() <= _STEEP:
+        return None
+    first = min(max(best - _MORE // 2, 0), x.size - 1 - _MORE)
+    return np.asarray(0.5 * (x[first : first + _MORE] + x[first + 1 : first + 1 + _MORE]))
+
+
+def _halved_total(gripper: GripperModel, data: Touches, found: _Fitted) -> Array:
+    """Return :func:`_sure_total`, with points between those that count most where that is not sure."""
+    total = _sure_total(found)
+    rest = np.flatnonzero(np.isnan(total))
+    if rest.size:
+        left: Any = (part[rest] for part in found)
+        some, found = data.take(rest), _Fitted(*left)
+        cells = np.sort(np.argsort(found.value[:, :-1] + found.value[:, 1:], axis=1)[:, -_HALVED:], axis=1)
+        middles = 0.5 * (found.x[:, :-1] + found.x[:, 1:])
+        grid = np.take_along_axis(middles, cells, axis=1)
+        start = _between(grid, found.x, found.u)
+        more = _evaluate(gripper, some, whitened(gripper, some), grid, start)
+        total[rest] = _sure_total(_joined(found, more))
+    return total
+
+
+def _sure_total(found: _Fitted) -> Array:
+    """Return the logarithms of the integrals of densities, (n,), NaN where points that count have not
+    settled, or two ways of interpolation differ."""
+    x, value, _, _, settled = found
+    counts = value > value.max(axis=1, keepdims=True) - _ENDED
+    total = log_total(x, value, smooth_slopes)
+    sure = (settled | ~counts).all(axis=1) & (np.abs(total - log_total(x, value)) < _SURE)
+    return np.asarray(np.where(sure, total, np.nan))
 
 
 def rough_evidence(gripper: GripperModel, data: Touches) -> Array:
@@ -250,11 +353,16 @@ def _fitted(gripper: GripperModel, data: Touches, noise: Whitened) -> _Fitted:
     for widen, n_point in REFINEMENTS:
         grid = np.stack([refined(x, value, widen, n_point) for x, value in zip(found.x, found.value)])
         more = _evaluate(gripper, data, noise, grid, _between(grid, found.x, found.u))
-        found = _Fitted(*(np.concatenate(pair, axis=1) for pair in zip(found, more)))
-        order = np.argsort(found.x, axis=1)
-        row = np.arange(len(order))[:, None]
-        found = _Fitted(*(part[row, order] for part in found))
+        found = _joined(found, more)
     return found
+
+
+def _joined(found: _Fitted, more: _Fitted) -> _Fitted:
+    """Return fits at more points, along which ln e rises."""
+    found = _Fitted(*(np.concatenate(pair, axis=1) for pair in zip(found, more)))
+    order = np.argsort(found.x, axis=1)
+    row = np.arange(len(order))[:, None]
+    return _Fitted(*(part[row, order] for part in found))
 
 
 def log_listed(ln_e: Array) -> Array:
@@ -498,21 +606,40 @@ def slopes(x: Array, value: Array) -> Array:
 _GAUSS, _SHARE = (0.5 * v for v in np.polynomial.legendre.leggauss(8))
 
 
-def log_total(x: Array, value: Array) -> Array:
+def smooth_slopes(x: Array, value: Array) -> Array:
+    """Return slopes of curves ``value`` (n, m) at ``x`` (n, m), those of the quartics through five points."""
+    m = x.shape[1]
+    first = np.clip(np.arange(m) - 2, 0, m - 5)
+    at, own = first[:, None] + np.arange(5), np.arange(m) - first
+    near, same = x[:, at], np.arange(5) == own[:, None]
+    apart = near[:, :, :, None] - near[:, :, None, :]
+    apart[:, :, np.arange(5), np.arange(5)] = 1.0
+    weight = 1.0 / apart.prod(axis=3)
+    factor = weight / weight[:, np.arange(m), own][:, :, None]
+    share = np.where(same, 0.0, factor / np.where(same, 1.0, x[:, :, None] - near))
+    return np.asarray((share * (value[:, at] - value[:, :, None])).sum(axis=2))
+
+
+def log_total(x: Array, value: Array, slopes_of: Callable[[Array, Array], Array] = slopes) -> Array:
     """Return the logarithms of the integrals of densities whose logarithms are ``value`` (n, m) at ``x``
     (n, m), cubics between them, (n,)."""
     n, m = x.shape
     place = np.broadcast_to((_GAUSS + 0.5)[None, None], (n, m - 1, _GAUSS.size)).reshape(n, -1)
     at = np.repeat(np.arange(m - 1), _GAUSS.size)
     share = _SHARE * np.diff(x)[:, :, None]
-    return np.asarray(logsumexp(_cubic(x, value, at, place) + np.log(share).reshape(n, -1), axis=1))
+    return np.asarray(
+        logsumexp(_cubic(x, value, at, place, slopes_of) + np.log(share).reshape(n, -1), axis=1)
+    )
 
 
-def _cubic(x: Array, value: Array, at: NDArray[np.int64], share: Array) -> Array:
+def _cubic(
+    x: Array, value: Array, at: NDArray[np.int64], share: Array,
+    slopes_of: Callable[[Array, Array], Array] = slopes,
+) -> Array:  # fmt: skip
     """Return curves (n, m) through ``value`` at ``x``, between points ``at``, (k,) or (n, k), and the next, a
     ``share`` (n, k) of the way."""
     value = np.maximum(value, value.max(axis=1, keepdims=True) - _FAR)
-    d, s = slopes(x, value), share
+    d, s = slopes_of(x, value), share
     at = np.broadcast_to(at, s.shape)
     y0, d0 = (np.take_along_axis(part, at, axis=1) for part in (value, d))
     y1, d1 = (np.take_along_axis(part, at + 1, axis=1) for part in (value, d))

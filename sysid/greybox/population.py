@@ -231,17 +231,26 @@ def pool_rigs(plants: Mapping[str, Plant]) -> tuple[Population, tuple[Rig, ...]]
 
     rigs = []
     for i, name in enumerate(names):
-        rest = np.arange(len(names)) != i
-        others = _pool(Told(told.precision[rest], told.information[rest]), whole.variance)
-        spread = np.diag(others.variance) + others.unsure
-        off = (z[i] - others.mean) / np.sqrt(np.diagonal(S[i] + spread))
-        distance, of_all = _distance(told.precision[i], told.information[i], others, len(names) - 2)
-        of_one = 2 * off.size * float(t_law.sf(np.abs(off).max(), len(names) - 2))
-        chance = min(1.0, 2 * len(names) * min(of_all, of_one))
+        others, off, distance, chance = against_others(told, z[i], S[i], i, whole.variance)
         covariance = whole.covariances[i] * np.outer(width, width)
         of_others = population(others, [other for other in names if other != name])
         rigs.append(Rig(name, centre + width * whole.rigs[i], covariance, off, distance, chance, of_others))
     return population(whole, names), tuple(rigs)
+
+
+def against_others(
+    told: Told, z: Array, S: Array, i: int, start: Array | None = None
+) -> tuple[_Pooled, Array, float, float]:
+    """Return the population without rig ``i``, and deviation, distance and chance of that :class:`Rig`, whose
+    fit is ``z`` (k,) with covariance ``S`` (k, k)."""
+    n = len(told.information)
+    rest = np.arange(n) != i
+    others = _pool(Told(told.precision[rest], told.information[rest]), start)
+    spread = np.diag(others.variance) + others.unsure
+    off = (z - others.mean) / np.sqrt(np.diagonal(S + spread))
+    distance, of_all = _distance(told.precision[i], told.information[i], others, n - 2)
+    of_one = 2 * off.size * float(t_law.sf(np.abs(off).max(), n - 2))
+    return others, off, distance, min(1.0, 2 * n * min(of_all, of_one))
 
 
 def prior_units(specs: Sequence[Parameter]) -> tuple[Array, Array]:

@@ -150,7 +150,7 @@ def effusivity(
     # the bundled gripper may have taken these grasps or not
     ask = _Effusivity(device, coupling, longest, stated, 0.0 if calibrate else 0.5)
     found = Answers(out, ["effusivity", stated, seed, stamps(calibrate or [])])
-    with _resumable(console, found), console.progress("effusivity") as progress:
+    with resumable(console, found), console.progress("effusivity") as progress:
         found.find(given, ask.prepare, ask.answer, progress, workers=pool, warn=console.warn)
     _warn_of_torn(console, found)
     found.write(out, lambda cell: f"{cell:.6g}" if isinstance(cell, float) else cell)
@@ -384,7 +384,7 @@ def classify(
     asked = [*astuple(ask), stamps([model_dir, *ask.known, *ask.others])]
     ask.answerer()
     found = Answers(out, ["classify", *asked])
-    with _resumable(console, found), console.progress("classify") as progress:
+    with resumable(console, found), console.progress("classify") as progress:
         found.find(given, ask.prepare, ask.answer, progress, workers=pool, warn=console.warn)
     _warn_of_torn(console, found)
     found.write(out, cell_text)
@@ -462,7 +462,7 @@ class _Question:
 
     def answer(self, part: Grasps) -> dict[str, Any]:
         """Return the rows of a part, and warnings of it."""
-        said = _Said()
+        said = Said()
         cli.warn_of_contacts(said, [part])
         return self.answerer()(part) | {"warnings": said.words}
 
@@ -524,7 +524,7 @@ def _answerer(ask: _Question, _folder: str, _files: str) -> Callable[[Grasps], d
     return ask.load()
 
 
-class _Said:
+class Said:
     """Warnings, kept."""
 
     def __init__(self) -> None:
@@ -554,7 +554,7 @@ class _Effusivity:
         from thermogrip.classify.decisions.predict import unexplained_effusivities
         from thermogrip.sysid.effusivity.data import with_object_range
 
-        said = _Said()
+        said = Said()
         cli.warn_of_contacts(said, [part])
         record = _as_taught(said, part, self.longest, self.coupling)
         ranged = with_object_range(record, self.stated)
@@ -674,7 +674,7 @@ def _warn_of_torn(console: Console, found: Answers) -> None:
 
 
 @contextmanager
-def _resumable(console: Console, found: Answers) -> Iterator[None]:
+def resumable(console: Console, found: Answers) -> Iterator[None]:
     """Say of work that ends early what is kept."""
     try:
         yield

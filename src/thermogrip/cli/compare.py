@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from thermogrip.classify.estimators import classifier_names
 from thermogrip.cli import options as cli
-from thermogrip.cli.classify import Quick, touched_part, training_part
+from thermogrip.cli.classify import Quick, Said, touched_part, training_part
 from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
 
@@ -17,12 +17,15 @@ if TYPE_CHECKING:
     from thermogrip.classify.estimators.base import GraspClassifier
     from thermogrip.classify.evaluation.comparison import Comparison
     from thermogrip.classify.evaluation.decision_time import Decisions
-    from thermogrip.datasets.parallel import Progress
+    from thermogrip.classify.evaluation.streamed import FittedClassifiers, StreamedComparison
+    from thermogrip.datasets.parallel import Progress, Workers
+    from thermogrip.datasets.partitions import Answers
     from thermogrip.datasets.schema import Grasps
     from thermogrip.report.html import Section
 
 BY_DEFAULT = ("lstm", "posterior", "bayes", "features-lda", "pca-lda")
 MOST_CONDITIONS = 4  # that are printed one by one
+LARGE = 32e6  # bytes of test files, some 9000 grasps as CSV: beyond them they are read part by part
 
 
 def compare(
@@ -74,6 +77,10 @@ def compare(
     Each file is one condition; its candidates are the materials of its training grasps. Without --test the
     shipped split (column split) is used where it exists, and then --repeats random splits by grasp, on
     which the LSTM trains for 200 epochs. Grasps that show no contact are left out.
+
+    Training grasps are in memory. Files of --test that are larger than 32 MB together are read part by part,
+    and memory does not grow with them: the predictions are kept beside DIR, and a run that was ended goes on
+    where it stopped, once its classifiers are trained anew.
     """
     if both := {*grasps} & {*(test or ())}:
         hint = "give others to --test, or leave it out: a part of each material is then held back"
@@ -83,6 +90,7 @@ def compare(
     from thermogrip.classify.evaluation.harness import evaluate
     from thermogrip.datasets.grasp_files import read_grasp_files
     from thermogrip.datasets.parallel import kept_processes, sub_progress
+    from thermogrip.datasets.partitions import stamps
 
     pool, names = cli.workers_of(workers, cluster), cli.comma(classifiers)
     models, missing = trainable(names or BY_DEFAULT, quick=quick, seed=seed)
@@ -91,8 +99,9 @@ def compare(
     left_out = tuple(f"left out: {error}" for error in missing)
     fast, _ = trainable(models, quick=True, seed=seed)
     records = read_grasp_files(grasps)
-    tests = read_grasp_files(test) if test else None
-    if tests is None and not repeats and not by and not _has_split(records):
+    large = bool(test) and size_of(test or []) > LARGE
+    tests = read_grasp_files(test) if test and not large else None
+    if tests is None and not large and not repeats and not by and not _has_split(records):
         raise UserError("nothing to score", hint="give --test, a column split, or --repeats")
     cli.new_folder(out)
     console = Console(as_json)
@@ -101,16 +110,19 @@ def compare(
     cli.warn_of_contacts(console, [*records, *(tests or ())])
     records = touched_part(console, records)
     tests = None if tests is None else touched_part(console, tests)
-    found = {}
+    found: dict[str, Comparison] = {}
     with kept_processes(pool), console.progress("compare") as progress:
-        given = tests is not None or _has_split(records)
-        anew = tests is None and repeats > 0
+        given = tests is not None or large or _has_split(records)
+        anew = tests is None and not large and repeats > 0
         if given and anew and (why := _unsplittable(records, repeats, train_per_class, seed)):
             console.warn(f"no random splits: {why}")
             anew = False
         parts = _shares(given, anew, by is not None, curves)
         shares = {name: sub_progress(progress, *share) for name, share in parts.items()}
-        if given:
+        if large and test:
+            question = [[*models], quick, seed, stamps(grasps)]
+            found["files"] = _streamed(console, models, records, test, out, question, pool, shares["given"])
+        elif given:
             found["files" if tests is not None else "shipped"] = evaluate(
                 models, records, test=tests, seed=seed, workers=pool, progress=shares["given"]
             )
@@ -135,7 +147,71 @@ def compare(
             more += _curves(console, fast, records, found, seed, pool, shares["curves"], out)
     found = {name: replace(each, notes=(*left_out, *each.notes)) for name, each in found.items()}
     _write_comparisons(console, found, out, more)
+    if large:
+        kept_answers(out, []).remove()
     return 0
+
+
+def size_of(paths: Sequence[str]) -> int:
+    """Return the size of grasp files, of what there is [byte]."""
+    from thermogrip.datasets.grasp_files import grasp_file_parts, list_grasp_files
+    from thermogrip.datasets.partitions import stamps
+
+    there = [path for path in list_grasp_files(paths) if path.exists()]
+    return sum(mark[1] for path in there for mark in stamps(grasp_file_parts(path)))
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What is asked about each part of large test files."""
+
+    models: FittedClassifiers
+
+    def prepare(self, record: Grasps) -> Grasps:
+        """Return a record of a file as it is."""
+        return record
+
+    def answer(self, part: Grasps) -> dict[str, Any]:
+        """Return the predictions for a part, and warnings of it."""
+        from thermogrip.sysid.effusivity.quality import check_grasps
+
+        said = Said()
+        cli.warn_of_contacts(said, [part])
+        touched = check_grasps(part).usable_grasps(part)
+        if touched is None or touched.sizes["grasp"] < part.sizes["grasp"]:
+            n = part.sizes["grasp"] - (0 if touched is None else touched.sizes["grasp"])
+            said.warn(f"{part.attrs['name']}: {n} left out: they cannot be answered for")
+        nothing: dict[str, Any] = {"rows": [], "times": {}, "faults": []}
+        return (nothing if touched is None else self.models.answer(touched)) | {"warnings": said.words}
+
+
+def kept_answers(out: Path, question: Sequence[Any]) -> Answers:
+    """Return the predictions that are kept beside a folder."""
+    from thermogrip.datasets.partitions import Answers
+
+    return Answers(out.absolute(), ["compare", *question])
+
+
+def _streamed(
+    console: Console, models: Mapping[str, GraspClassifier], records: Sequence[Grasps], test: Sequence[str],
+    out: Path, question: Sequence[Any], pool: Workers, progress: Progress | None,
+) -> StreamedComparison:  # fmt: skip
+    """Return the comparison on test files that are read part by part."""
+    from thermogrip.classify.evaluation.streamed import fitted_classifiers, streamed_comparison
+    from thermogrip.cli.classify import resumable
+    from thermogrip.datasets.parallel import sub_progress
+    from thermogrip.datasets.partitions import sources
+
+    def told(done: float, what: str) -> None:
+        if progress is not None:
+            progress(0.2 + 0.8 * done, f"test: {what}")
+
+    trained = sub_progress(progress, 0.0, 0.2)
+    ask = _Asked(fitted_classifiers(models, records, workers=pool, progress=trained))
+    found = kept_answers(out, question)
+    with resumable(console, found):
+        found.find(sources(test), ask.prepare, ask.answer, told, workers=pool, warn=console.warn)
+    return streamed_comparison(found, ask.models, seed=int(question[2]))
 
 
 def _features(models: Mapping[str, GraspClassifier], records: Sequence[Grasps]) -> list[Section]:

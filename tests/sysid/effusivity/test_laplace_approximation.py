@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -36,6 +37,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     Mode,
     Prior,
     WithGripper,
+    _Some,
     as_in_training,
     at_temperature,
     find_modes,
@@ -693,3 +695,14 @@ def test_a_temperature_that_nobody_stated_is_no_slip(device):
     got = laplace.fit_candidates(device, data, ["copper"])[0]
     for a, b in zip(got, plain):
         np.testing.assert_array_equal(a, b)
+
+
+def test_a_search_for_another_gripper_is_left_late_and_only_where_it_no_longer_gains():
+    """Of three behind the best one stands still, one comes nearer by more in four steps than it lacks."""
+    some = _Some.of(SimpleNamespace(best=np.array([50.0]), row=np.zeros(3, dtype=int)), np.arange(3))
+    at, found = np.arange(3), []
+    for step in range(14):
+        cost = np.array([200.0 - 0.5 * step, 1500.0 - 100.0 * step, 60.0])
+        found.append(some.hopeful(step, at, cost, np.full(3, 0.1)))
+    assert found[:12] == [None] * 12
+    assert [list(each) for each in found[12:]] == [[False, True, True]] * 2

@@ -51,15 +51,15 @@ def test_the_penalty_is_the_priors_density_beside_its_peak():
 @pytest.mark.parametrize("n_column", [8, 3])
 def test_products_are_those_of_whitened_columns(n_column):
     rng = np.random.default_rng(1)
-    kinds, columns = rng.normal(size=(2, 5, 5)), rng.normal(size=(4, 5, n_column))
+    kinds, columns = rng.normal(size=(2, 5, 5)), rng.normal(size=(4, n_column, 5))
     row, scale = np.array([1, 0, 1, 2]), rng.uniform(0.5, 2.0, (3, 5))
     shared = Whitener(kinds, np.array([0, 1, 0]), scale)
     alone = np.stack([kinds[k] * scale[i, :, None] for i, k in enumerate(shared.kind)])
     for whitener in (shared, alone):
         found = kernel.squares(whitener, row, columns)
         for p in range(4):
-            white = alone[row[p]] @ columns[p]
-            np.testing.assert_allclose(found[p], white.T @ white, atol=1e-12)
+            white = columns[p] @ alone[row[p]].T
+            np.testing.assert_allclose(found[p], white @ white.T, atol=1e-12)
 
 
 def test_products_are_in_units_of_each_spread_and_none_of_what_is_known():
@@ -96,7 +96,7 @@ def means_of(nodes, rise, slope, times, bins, *, onset=0.0, late=-1.0):
         u[0, 6], numbers[0, 5] = 0.5 * np.log(6 * late + 1e-30), 1.0
     kernel.predicted.py_func(
         means, wanted, at, count, times, times, times, np.zeros(1), numbers, np.zeros((1, 2, n)), u,
-        np.zeros((1, 7), dtype=bool), room, np.empty((1, n)), np.empty((1, n, 8)),
+        np.zeros((1, 7), dtype=bool), room, np.empty((1, n)), np.empty((1, 8, n)),
     )  # fmt: skip
     return means[0, 0], means[0, 5], room[4], room[10]
 

@@ -18,6 +18,7 @@ from thermogrip.sysid.effusivity.data import noise_covariance, touches, whiten
 from thermogrip.sysid.effusivity.laplace_approximation import (
     SENSORS_APART,
     T_OBJECT,
+    fit_candidates,
     fit_pairs,
     free_hypotheses,
     nodes_for,
@@ -25,13 +26,18 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     prior_of,
 )
 from thermogrip.sysid.effusivity.posterior_grid import (
+    LN_E_RANGE,
     SAMPLED,
     MarginalPosterior,
+    _evidence_near,
+    _more,
+    free_evidence,
     grid_posteriors,
     log_integrals,
     log_integrals_of_two,
     mixture_quantiles,
     monotone,
+    smooth_slopes,
 )
 
 LEVELS = (0.05, 0.5, 0.95)
@@ -281,3 +287,47 @@ def test_half_of_all_objects_are_near_a_material_of_the_table():
     wood, between, far = np.exp(posterior_grid.log_listed(np.log([367.0, 4700.0, 1e5])))
     assert far == pytest.approx(0.5, abs=0.02)
     assert wood > 2 * between > 1.0
+
+
+@pytest.mark.parametrize("material", ["copper", "iron", "wood"])
+def test_a_density_that_is_looked_for_from_a_candidate_has_the_integral_of_many_points(
+    device, monkeypatch, material
+):
+    """Copper's density ends at the range's edge, wood's lies between two coarse points."""
+    record = load_example_grasps()["exp1A_obj43_grip23"]
+    data = touches(record.isel(grasp=np.flatnonzero(record["material"].values == material)[:3]))
+    names = ["copper", "iron", "wood"]
+    modes = fit_candidates(device, data, names)[0]
+    for own in (material, "iron"):  # also from one beside
+        near = modes.u.reshape(3, 3, -1)[:, names.index(own)]
+        quick = _evidence_near(device, data, near)
+        sure = np.isfinite(quick)
+        assert sure.sum() >= 2
+        with monkeypatch.context() as fine:
+            fine.setattr(posterior_grid, "N_COARSE", 60)
+            fine.setattr(posterior_grid, "REFINEMENTS", ((12.0, 40), (8.0, 40)))
+            want = free_evidence(device, data)
+        np.testing.assert_allclose(quick[sure], want[sure], atol=0.03)
+        assert np.abs(quick[sure] - want[sure]).max() > 0.0  # by other points
+        np.testing.assert_allclose(free_evidence(device, data, near), want, atol=0.03)
+
+
+def test_a_density_that_has_not_ended_is_followed_and_a_steep_one_gets_points_between():
+    x = np.linspace(5.0, 6.0, 9)
+    assert _more(x, -8.0 * np.square((x - 5.5) / 0.25)) is None
+    beyond = _more(x, -0.5 * np.square((x - 6.2) / 0.2))
+    assert beyond is not None
+    assert (beyond > x[-1]).all()
+    between = _more(x, -0.5 * np.square((x - 5.5) / 0.03))
+    assert between is not None
+    assert ((between > 5.2) & (between < 5.8)).all()
+    edge = np.linspace(LN_E_RANGE[0], LN_E_RANGE[0] + 1.0, 9)  # there is nothing beyond
+    assert _more(edge, -12.0 * (edge - edge[0])) is None
+
+
+def test_slopes_by_five_points_are_those_of_a_quartic():
+    rng = np.random.default_rng(3)
+    x, c = np.sort(rng.uniform(0, 3, (5, 9)), axis=1), rng.normal(size=5)
+    want = np.polynomial.polynomial.polyval(x, np.polynomial.polynomial.polyder(c))
+    found = smooth_slopes(x, np.polynomial.polynomial.polyval(x, c))
+    np.testing.assert_allclose(found, want, rtol=1e-6, atol=1e-8)
