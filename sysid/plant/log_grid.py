@@ -495,7 +495,8 @@ def inputs_off(model: Signals, log: Log) -> list[str]:
     of its inputs, and none beside them that could be this one by another name; a switch may as well be on."""
     if set(names_of(log, "input")) - set(model.inputs) or not any(name in log for name in model.inputs):
         return []
-    ranges, inner = dict(getattr(model, "valid", {})), getattr(model, "model", model)
+    ranges: dict[str, tuple[float, float]] = dict(getattr(model, "valid", {}))
+    inner: GreyModel = getattr(model, "model", model)
     if (network := getattr(inner, "network", None)) is not None:
         ranges |= {name: item.range for name, item in network.inputs.items()}
     absent = [name for name in model.inputs if name not in log and name in ranges]
