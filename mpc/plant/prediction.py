@@ -68,7 +68,9 @@ def switching(plant: Plant, names: Sequence[str]) -> Plant:
     """Return the plant whose on/off inputs of these names the controller switches."""
     for name in names:
         if name not in plant.model.switches:
-            hint = known_names(name, plant.model.switches, "these are: {}")
+            hint = "it has none: such an input is 0 or 1 in all logs"
+            if plant.model.switches:
+                hint = known_names(name, plant.model.switches, "these are: {}")
             raise UserError(f"on_off: the plant has no on/off input {name}", hint=hint)
     return replace(plant, units={**plant.units, **dict.fromkeys(names, ON_OFF)}) if names else plant
 

@@ -20,6 +20,7 @@ from thermogrip.mpc.design.design import check_design
 from thermogrip.mpc.design.spec import spec_from_dict
 from thermogrip.mpc.interface import Move
 from thermogrip.mpc.optimiser.switching import sequences
+from thermogrip.mpc.plant.prediction import switching
 from thermogrip.mpc.tuning.design_review import eigenvalues, loops_of, scaling
 
 INLET, ROOM, DT = 15.0, 25.0, 5.0
@@ -222,6 +223,13 @@ def test_what_cannot_be_had_is_refused_in_one_line(keys, said):
         designed()
     assert refused.value.problem.startswith(said)
     assert "\n" not in str(refused.value)
+
+
+def test_a_plant_without_an_on_off_input_says_so():
+    with pytest.raises(
+        UserError, match="no on/off input q1; it has none: such an input is 0 or 1 in all logs"
+    ):
+        switching(network_plant("tclab", t1=(15.0, 70.0), t2=(15.0, 70.0)), ["q1"])
 
 
 def test_a_design_names_one_input_that_the_controller_switches_and_lets_it_go_over():
