@@ -23,7 +23,7 @@ import shlex
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from itertools import chain, count, islice
@@ -134,14 +134,16 @@ def parse_text(data: bytes, file: str, columns: Sequence[str] | None = None) -> 
     return replace(table, numbers=kept)
 
 
-def check_columns(path: Path, names: Sequence[str] | None) -> None:
-    """Refuse names that are no columns of a text table, from its beginning; others pass."""
+def check_columns(path: Path, names: Sequence[str] | None, optional: Collection[str] = ()) -> None:
+    """Refuse names that are no columns of a text table, from its beginning; others pass, as do optional ones
+    that a header lacks."""
     if names and path.is_file() and file_format(path) in ("csv", "text"):
         headers = find_layout(_any_coding(_text_of(path, _BEGINNING))[0], str(path)).names
         check_header(headers, names, str(path))
         known = dict.fromkeys((read_header(header, headers)[0] for header in headers), "")
         for name in names:
-            find_column(name, known, str(path))
+            if name not in optional:
+                find_column(name, known, str(path))
 
 
 def check_header(headers: Sequence[str], names: Sequence[str], file: str) -> None:

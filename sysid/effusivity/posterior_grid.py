@@ -250,6 +250,8 @@ def free_evidence(gripper: GripperModel, data: Touches, near: Array | None = Non
 _AROUND, _SIDE = 9, 4.0  # points about the density's place, and how many of its sds to either side
 _ANYWHERE = 1.0  # of ln e about a candidate's, where its density is looked for
 _ENDED, _STEEP = 7.0, 3.0  # nats below the best where a density may end; and that it may fall beside the best
+_NARROWEST = 1e-3  # of ln e, between the ends of the first points: a density may lie at an end of the range
+_SAME = 1e-9  # of ln e: an end that is so near that of the range is there
 _MORE, _ROUNDS = 4, 4  # points at a time, and how often, until that is so
 _SURE = 0.008  # nats by which two kinds of cubics may differ
 _HALVED = 8  # cells that are halved where they differ by more
@@ -267,7 +269,8 @@ def _evidence_near(gripper: GripperModel, data: Touches, near: Array) -> Array:
     law = prior_of(gripper, data, free._replace(ln_e_sd=np.full(row.size, _ANYWHERE)))
     mode = fit_pairs(gripper, data, row, free, start=near, noise=noise, prior=law)
     place, spread = mode.u[:, EFFUSIVITY], np.sqrt(mode.covariance[:, EFFUSIVITY, EFFUSIVITY])
-    low, high = np.clip([place - _SIDE * spread, place + _SIDE * spread], lowest, highest)
+    low = np.clip(place - _SIDE * spread, lowest, highest - _NARROWEST)
+    high = np.clip(place + _SIDE * spread, low + _NARROWEST, highest)
     grid = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, _AROUND)
     along = mode.covariance[:, :, EFFUSIVITY] / spread[:, None] ** 2
     start = mode.u[:, None] + along[:, None] * (grid - place[:, None])[:, :, None]
@@ -292,8 +295,8 @@ def _more(x: Array, value: Array) -> Array | None:
     """Return points that a density lacks of which ``value`` is the logarithm at rising ``x``: beyond an end
     where it has not ended, or beside the best; None where it lacks none."""
     best = int(value.argmax())
-    left = value[0] > value[best] - _ENDED and x[0] > LN_E_RANGE[0]
-    right = value[-1] > value[best] - _ENDED and x[-1] < LN_E_RANGE[1]
+    left = value[0] > value[best] - _ENDED and x[0] > LN_E_RANGE[0] + _SAME
+    right = value[-1] > value[best] - _ENDED and x[-1] < LN_E_RANGE[1] - _SAME
     if left or right:
         n = _MORE // (2 if left and right else 1)
         parts, share = [], np.arange(1, n + 1) / n

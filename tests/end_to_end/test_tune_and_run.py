@@ -154,7 +154,7 @@ def test_a_cluster_finds_the_same_controller_bit_for_bit(lab: Bench):
         cluster.close()
     assert there.controller.design == here.controller.design
     assert there.scores == here.scores
-    assert there.history == here.history
+    assert str(there.history) == str(here.history)  # a PI that does not settle has nan
     assert [row.to_dict() for row in there.rows] == [row.to_dict() for row in here.rows]
     assert there.pareto.rows() == here.pareto.rows()
     assert [item.to_dict() for item in there.sensitivity] == [item.to_dict() for item in here.sensitivity]

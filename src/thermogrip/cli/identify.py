@@ -389,7 +389,7 @@ def validate(
 
     It sees the inputs and disturbances of the whole log, and measured outputs of the warm-up only."""
     if columns is None:
-        cli.check_columns(paths, cli.needed_columns(plant))
+        cli.check_columns_of(plant, paths)
     from thermogrip.sysid.plant.log_grid import roles_of
 
     loaded = cli.load_plant(plant, network)
@@ -466,7 +466,7 @@ def simulate(
 
     check_written(cli.new_file(out))
     if columns is None:
-        cli.check_columns([path], cli.needed_columns(plant))
+        cli.check_columns_of(plant, [path])
     from thermogrip.datasets.schema import column
     from thermogrip.sysid.plant.log_grid import match_logs, roles_of
 

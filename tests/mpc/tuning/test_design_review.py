@@ -228,7 +228,7 @@ def stub(**design) -> Any:
     usual = {"controlled": ("t",), "dt": 2.0, "horizon_s": 40.0, "blocks": (1, 3), "slew_per_s": {"q": 0.1}}
     usual |= {"drive_range": {"q": (-1.0, 3.0)}, "limits": {}, "ambient": 22.0}
     model = SimpleNamespace(drives=("p", "q"), n_u=2, n_d=1, outputs=("t",), span=np.array([1.0, 4.0]))
-    vars(model).update(model=None, lowest=np.array([0.0, -1.0]), highest=np.array([1.0, 3.0]))
+    vars(model).update(model=None, on_off=(), lowest=np.array([0.0, -1.0]), highest=np.array([1.0, 3.0]))
     return SimpleNamespace(design=SimpleNamespace(**usual | design), model=model, plant=None, dt=2.0)
 
 

@@ -16,6 +16,7 @@ from thermogrip.sysid.contact.simulation import simulate_grasps
 from thermogrip.sysid.effusivity import posterior_grid
 from thermogrip.sysid.effusivity.data import noise_covariance, touches, whiten
 from thermogrip.sysid.effusivity.laplace_approximation import (
+    EFFUSIVITY,
     SENSORS_APART,
     T_OBJECT,
     fit_candidates,
@@ -323,6 +324,23 @@ def test_a_density_that_has_not_ended_is_followed_and_a_steep_one_gets_points_be
     assert ((between > 5.2) & (between < 5.8)).all()
     edge = np.linspace(LN_E_RANGE[0], LN_E_RANGE[0] + 1.0, 9)  # there is nothing beyond
     assert _more(edge, -12.0 * (edge - edge[0])) is None
+    low = edge[0] + 4e-16 * np.abs(edge[0]) + edge - edge[0]  # rounding leaves nothing between it and the end
+    assert low[0] != LN_E_RANGE[0]
+    assert _more(low, -12.0 * (low - low[0])) is None
+    high = np.linspace(LN_E_RANGE[1] - 1.0, np.nextafter(LN_E_RANGE[1], 0.0), 9)
+    assert _more(high, 12.0 * (high - high[-1])) is None
+
+
+def test_a_density_beyond_the_range_is_looked_for_at_its_end(device):
+    record = load_example_grasps()["exp1A_obj43_grip23"]
+    data = touches(record.isel(grasp=np.flatnonzero(record["material"].values == "copper")[:2]))
+    near = fit_candidates(device, data, ["copper"])[0].u.reshape(2, 1, -1)[:, 0]
+    for end in LN_E_RANGE:  # a start from which the search ends beyond the range, or at its end
+        far = near.copy()
+        far[:, EFFUSIVITY] = end
+        with np.errstate(all="raise"):
+            found = free_evidence(device, data, far)
+        np.testing.assert_allclose(found, free_evidence(device, data), atol=0.1)
 
 
 def test_slopes_by_five_points_are_those_of_a_quartic():
