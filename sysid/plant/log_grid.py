@@ -37,7 +37,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -496,7 +496,7 @@ def inputs_off(model: Signals, log: Log) -> list[str]:
     if set(names_of(log, "input")) - set(model.inputs) or not any(name in log for name in model.inputs):
         return []
     ranges: dict[str, tuple[float, float]] = dict(getattr(model, "valid", {}))
-    inner: GreyModel = getattr(model, "model", model)
+    inner: Any = getattr(model, "model", model)
     if (network := getattr(inner, "network", None)) is not None:
         ranges |= {name: item.range for name, item in network.inputs.items()}
     absent = [name for name in model.inputs if name not in log and name in ranges]
