@@ -186,7 +186,12 @@ class Replaced:
         self._pool: Executor = self._start()
 
     def _start(self) -> Executor:
-        return ThreadPoolExecutor(1) if self._n == 1 else _processes(self._n)
+        if self._n == 1:
+            return ThreadPoolExecutor(1)
+        pool = _processes(self._n)
+        for _ in range(self._n):  # all at once: one that begins while the pool breaks is waited for without end
+            pool.submit(os.getpid)
+        return pool
 
     async def call(self, function: Callable[[_Item], _Result], item: _Item) -> _Result:
         """Return ``function(item)``; UserError if processes are killed again and again over it."""
