@@ -189,7 +189,7 @@ class Replaced:
         if self._n == 1:
             return ThreadPoolExecutor(1)
         pool = _processes(self._n)
-        for _ in range(self._n):  # all at once: one that begins while the pool breaks is waited for without end
+        for _ in range(self._n):  # all at once: one that begins as the pool breaks is waited for without end
             pool.submit(os.getpid)
         return pool
 

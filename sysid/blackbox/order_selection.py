@@ -43,7 +43,7 @@ from thermogrip.sysid.models.lti import StartPrior, estimate_starts, evaluate_te
 from thermogrip.sysid.models.model import Model as PlantModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import RUN_GAIN_LARGE, SEVERAL
-from thermogrip.sysid.plant.log_grid import Grid, Segment
+from thermogrip.sysid.plant.log_grid import MOVED, Grid, Segment
 
 Array = NDArray[np.float64]
 
@@ -56,7 +56,6 @@ FEWEST = 20  # rows of a block that is held out
 
 _ALIKE = 0.98  # correlation of an input with its square: a line leaves a fifth of the square's spread
 
-_MOVED = 0.01  # of an input's range: less is noise of its reading
 _SHORT = 0.25  # of a held-out part: the memory of an offset that fades
 
 
@@ -134,7 +133,7 @@ def _of_known_inputs(
     """Yield the parts (what, held out, rest) as folds: those whose rest moves each input that they move, or
     all where these are fewer than two."""
     range_of = np.ptp(np.concatenate([segment.u for segment in grid.segments]), axis=0)
-    known = [part for part in parts if _moves_all(part[2], than=part[1], least=_MOVED * range_of)]
+    known = [part for part in parts if _moves_all(part[2], than=part[1], least=MOVED * range_of)]
     for label, held, rest in known if len(known) >= 2 else parts:
         yield label, grid.having(rest), tuple(held)
 

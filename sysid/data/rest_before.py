@@ -16,11 +16,10 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.schema import Log, columns, log_name
 from thermogrip.sysid.data.data_quality import reading_excess
 from thermogrip.sysid.plant.fit_record import fit_logs
-from thermogrip.sysid.plant.log_grid import quantum, rows_of
+from thermogrip.sysid.plant.log_grid import MOVED, quantum, rows_of
 
 _EARLY = 10  # rows: more of them before the move are a rest of their own
 _ADDED = 50  # rows
-_MOVED = 0.01  # of an input's range: less is noise of its reading
 _FLAT = 6.0  # sd of the readings' noise: ten of them differ by more once in a thousand times
 
 
@@ -39,7 +38,7 @@ def with_rest(
     (350, -50.0, 21.0, 1)
     """
     u = [columns(log, inputs) for log in logs]
-    least = _MOVED * np.ptp(np.concatenate(u), axis=0)
+    least = MOVED * np.ptp(np.concatenate(u), axis=0)
     moved = [np.flatnonzero(np.any(np.abs(np.diff(each, axis=0)) > least, axis=1)) + 1 for each in u]
     if not any(map(len, moved)) or any(rows[-1] > _EARLY for rows in moved if len(rows)):
         return list(logs), []

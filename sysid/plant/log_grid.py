@@ -49,6 +49,7 @@ from thermogrip.datasets.resample import gaps as gaps_of
 from thermogrip.datasets.resample import held_means
 from thermogrip.datasets.schema import Log, column, columns, log_name
 from thermogrip.datasets.schema import names as names_of
+from thermogrip.datasets.units import guess_role
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import GreyModel
@@ -58,6 +59,7 @@ if TYPE_CHECKING:
 
 GAP = 10.0  # [s], beyond it the input is unknown
 BRIDGED = 5  # rows
+MOVED = 0.01  # of an input's range: less is noise of its reading
 _GRIDS = 4  # arrays of a run's size that are held at a time
 
 
@@ -318,12 +320,12 @@ def signals(
 
 
 def moved_before(log: Log) -> str:
-    """Return a mend, to be added to another one, of a log with a column that was likely moved just before its
-    first row: its readings alone change."""
-    lines = (line.split(": ", 1) for line in str(log.attrs.get("guesses", "")).splitlines())
-    for name, why in lines:
-        level = float(column(log, name)[0]) if name in log and why.endswith("it never moves") else 0.0
-        if level:
+    """Return a mend, to be added to another one, of a log with a drive by name that was likely moved just
+    before its first row: its readings alone change."""
+    for name, item in log.items():
+        level = float(column(log, str(name))[0])
+        drive = guess_role(str(name), str(item.attrs.get("units", "1"))) == "input"
+        if drive and level and not np.ptp(item.values):
             return f"; if {name} was not {level:g} before, write a row with its value of then above the first"
     return ""
 

@@ -24,6 +24,7 @@ from thermogrip.sysid.plant.log_grid import (
     make_grid,
     match_logs,
     misfit,
+    moved_before,
     quantum,
     rows_of,
     signals,
@@ -668,6 +669,18 @@ def test_an_input_that_a_log_lacks_is_off_where_nothing_else_can_be_it(ranges, s
         assert lines == ["p: no such column, taken as 0 percent throughout"]
         assert (matched["p"].attrs["role"], np.ptp(matched["p"].values), "p" in log) == ("input", 0.0, False)
     assert inputs_off(model, log.drop_vars("q")) == []  # no input at all is another log
+
+
+def test_a_drive_that_was_on_before_the_log_is_named_and_a_room_is_not():
+    room, t, still = (25.0 + 0 * T, "degC"), (T, "degC", "output"), 50.0 + 0 * T
+    log = make_log(T, {"t_room": (*room, "other"), "Q1": (still, "percent", "other"), "t": t})
+    assert moved_before(log) == (
+        "; if Q1 was not 50 before, write a row with its value of then above the first"
+    )
+    assert moved_before(log.assign(Q1=log["Q1"] * 0)) == ""
+    assert moved_before(log.drop_vars("Q1")) == ""
+    with pytest.raises(UserError, match=r"no input among the columns; .*if Q1 was not 50 before"):
+        signals([log])
 
 
 def test_a_log_that_does_not_fit_is_refused_by_what_it_lacks():
