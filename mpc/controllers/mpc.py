@@ -131,7 +131,6 @@ class Controller(Shown, SampledController):
         self.structure = StructureMonitor(plant, self.model, self.controlled)
         self.reach = Reach(self.optimiser, self.observer)
         self.last_iterations = 0  # of the program, in the last step
-        self.asked: Sample  # of the program, in the last step
         self._waits = 0.0  # seconds until an on/off drive may go over, where it is to
         self._slew_s = self.dt  # for which the slew limit counts in this step
         self._in_force: Array
@@ -524,22 +523,23 @@ class Controller(Shown, SampledController):
             d = np.where(np.isfinite(self._coming), self._coming, self._d) + observer.disturbance_bias
         sample = Sample(x, last, guess, d, wanted, self._side, *biases, self._slew_s, self._lost, caution)
         sample = sample._replace(ahead=self._ahead, prices=self._prices())
-        self._waits, self.asked = 0.0, sample
-        for name, (on_s, off_s, price) in self.design.on_off.items():
-            j = self.model.drives.index(name)
-            at = float(round(last[j]))
-            choice = choose(
-                self.optimiser,
-                j,
-                lambda: self._converged(sample),
-                position=at,
-                wait_s=self._wait_s(j),
-                stays_s=off_s if at else on_s,
-                price=price,
-            )
-            self._waits = choice.wait_s
-            return choice.outcome
-        return self._converged(sample)
+        self._waits = 0.0
+        if not self.design.on_off:
+            return self._converged(sample)
+        ((name, (on_s, off_s, price)),) = self.design.on_off.items()
+        j = self.model.drives.index(name)
+        at = float(round(last[j]))
+        choice = choose(
+            self.optimiser,
+            j,
+            lambda: self._converged(sample),
+            position=at,
+            wait_s=self._wait_s(j),
+            stays_s=off_s if at else on_s,
+            price=price,
+        )
+        self._waits = choice.wait_s
+        return choice.outcome
 
     def _converged(self, sample: Sample) -> Outcome:
         """Return what one program gives, or as many as the design asks for until the plan stays."""
