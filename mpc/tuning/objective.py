@@ -7,15 +7,17 @@ name travel, and the file is run where it arrives), so that other processes can 
 what the spec forbids is charged on top, steeply:
 
     score = (settle + energy_weight E) / bound + moves_weight M
-            + 10 (overshoot - 0.9 allowed)+ + 10 (|bias| - 0.9 allowed)+
+            + 3 (overshoot / allowed - 0.9)+ + (|bias| / allowed - 0.9)+ / 2
 
 M is by how many full drives the drives move in all: of two designs that settle alike, the one that answers
-less to noise wins.  A step that never settles is charged its whole length and twice its last error.  Over the
-runs, the score is the mean plus half of what the worst is above it: the draws stand for what the plant may
-be.  All of them have the model's structure.  What that may lack (sensors that are slower, a longer delay, a
-weaker drive) is tried one by one on the first draw, for as long as a step is held, since such runs settle
-last; their mean counts a little. Beyond five bounds such a run counts by its logarithm: one that does not
-settle lasts as long as the spec holds a step, which has nothing to do with the plant.
+less to noise wins. A step that never settles is charged its whole length and half of its last error in bands.
+So a plant in mK, with a spec in mK, has the score of the same plant in K. Where a design is tried in several
+noises, a step on a draw costs their mean. Over the runs, the score is the mean plus half of what the worst is
+above it: the draws stand for what the plant may be. All of them have the model's structure. What that may
+lack (sensors that are slower, a longer delay, a weaker drive) is tried one by one on the first draw, for as
+long as a step is held, since such runs settle last; their mean counts a little. Beyond five bounds such a run
+counts by its logarithm: one that does not settle lasts as long as the spec holds a step, which has nothing to
+do with the plant.
 
 **Trials.**  A step begins where drives have held its start for long, and the controller is told these drives,
 as a running loop knows them; M counts from there. Readings are as noisy as those of the logs were found to be
@@ -93,6 +95,11 @@ def draws_of(plant: Plant, count: int) -> list[int]:
 STRUCTURE = 1000
 #: How much runs on such draws count in the score beside the others, and beyond what one counts by its log.
 LACKING, LATE = 0.05, 5.0
+# what the whole allowed overshoot and bias more cost, and a band of error where a step does not settle
+_OVERSHOOT, _BIAS, _ERROR = 3.0, 0.5, 0.5
+#: Of what is allowed, that costs nothing.
+FREE = 0.9
+_NOISES = 3  # in which an MPC is tried where its trials run in C: one noise alone moves a score by a tenth
 
 
 @lru_cache(maxsize=16)
@@ -227,18 +234,22 @@ def bound_of(bounds: Bounds, result: StepResult) -> float:
 def score(results: Sequence[StepResult], spec: Spec, bounds: Bounds) -> float:
     """Return the score of a set of trials, see the module's text; lower is better; ``bounds`` are shortest
     times [s]."""
-    costs: tuple[list[float], list[float]] = [], []
+    costs: dict[tuple[float, float, int, str], list[float]] = {}
     for result in results:
         bound, asked = bound_of(bounds, result), spec.asked(result.output)
         unit = max(bound if np.isfinite(bound) else result.length_s, asked.pace_s, 1.0)
         settled = np.isfinite(result.settle_s)
         taken = max(result.settle_s, asked.pace_s)  # sooner than an output's own time wins nothing
-        cost = taken / unit if settled else result.length_s / unit + 2 * abs(result.last_error)
-        cost += 10 * max(0.0, result.overshoot - 0.9 * asked.overshoot_degC)
-        cost += 10 * max(0.0, abs(result.bias) - 0.9 * asked.bias_degC) if settled else 0.0
+        cost = taken / unit
+        if not settled:
+            cost = result.length_s / unit + _ERROR * abs(result.last_error) / asked.band_degC
+        cost += _OVERSHOOT * max(0.0, result.overshoot / asked.overshoot_degC - FREE)
+        cost += _BIAS * max(0.0, abs(result.bias) / asked.bias_degC - FREE) if settled else 0.0
         cost += spec.energy_weight * result.energy_s / unit + spec.moves_weight * result.travel
-        costs[result.draw >= STRUCTURE].append(cost)
-    own, others = costs[0], np.array(costs[1])
+        costs.setdefault((result.start, result.target, result.draw, result.output), []).append(cost)
+    of = {key: float(np.mean(noises)) for key, noises in costs.items()}
+    own = [cost for (_, _, draw, _), cost in of.items() if draw < STRUCTURE]
+    others = np.array([cost for (_, _, draw, _), cost in of.items() if draw >= STRUCTURE])
     others = np.where(others > LATE, LATE * (1 + np.log(np.maximum(others, LATE) / LATE)), others)
     return float(0.5 * (np.mean(own) + np.max(own)) + LACKING * np.sum(others) / max(1, len(others)))
 
@@ -321,7 +332,7 @@ MPC_PARAMETERS = (
     ("terminal", 0.3, 300.0),
     ("overshoot_share", 0.05, 0.9),
     ("drive_walk", 1e-5, 2e-2),
-    ("output_walk", 2e-4, 2e-2),
+    ("output_walk", 2e-4, 0.3),
     ("state_walk", 5e-4, 5e-3),
 )
 PI_PARAMETERS = (
@@ -372,7 +383,7 @@ class Search:
         self.baseline = baseline = paced(baseline, spec, self.bounds)
         self.bounds = ramped_bounds(self.bounds, baseline, spec)
         cold = cold_steps(plant, spec, baseline.controlled)
-        self.pi_spec = spec.model_copy(update={"steps": [*spec.steps, *cold]})  # of the PI's trials
+        self.whole_spec = spec.model_copy(update={"steps": [*spec.steps, *cold]})  # of trials at full length
         if cold:
             begun = spec.model_copy(update={"steps": cold})
             self.bounds |= bounds_of(plant, baseline, begun, self.draws)
@@ -382,8 +393,11 @@ class Search:
         unseen = apparent_delay(plant, baseline.controlled) < 2 * plant.dt
         own = PI_OF_UNSEEN_DELAY if unseen else PI_PARAMETERS
         self.pi: Sequence[tuple[str, float, float]] = own[:-1] if self.certain else own
+        if self._compiled and self._in_c(baseline) is not None:
+            self.lengths = [spec.hold_s] * len(spec.steps)
+            return
+        # long enough to see it settle and stay, short enough to try many in Python
         slowest = [max(self.bounds[(*step, draw)] for draw in self.draws) for step in spec.steps]
-        # long enough to see it settle and stay, short enough to try many
         least = min(120.0, spec.hold_s)
         self.lengths = [float(np.clip(1.35 * bound + 40.0, least, spec.hold_s)) for bound in slowest]
         # a plant that settles long after the bound (its delay, what is not known of it) is watched for longer
@@ -436,32 +450,62 @@ class Search:
             overshoot=base.overshoot if share is None else share * self.spec.overshoot_degC,
             noise=noise,
             drive_range=_capped(base.drive_range, parameters.get("drive_share", 1.0)),
+            ramp_per_s={**base.ramp_per_s, **self._ramps(parameters["ramp"])}
+            if "ramp" in parameters
+            else base.ramp_per_s,
         )
+
+    @property
+    def resolution(self) -> float:
+        """Half a reading, over the minimum time: settling times are multiples of a reading."""
+        found = [bound for key, bound in self.bounds.items() if key[2] in self.draws and np.isfinite(bound)]
+        return float(0.5 * self.plant.dt / np.mean(found))
+
+    @property
+    def at_once(self) -> list[str]:
+        """The controlled outputs whose targets need not ramp."""
+        return [name for name in self.baseline.controlled if name not in self.baseline.ramp_per_s]
+
+    def _ramps(self, times: float) -> dict[str, float]:
+        """Return how fast targets may change: a step's ramp lasts so many times its bound, or longer."""
+        spec, rates = self.spec, dict.fromkeys(self.at_once, np.inf)
+        for step in spec.steps:
+            found = np.array([self.bounds[(*step, draw)] for draw in self.draws])
+            if np.isfinite(found).any():
+                lasts = times * float(np.mean(found[np.isfinite(found)]))
+                rates = {name: min(rate, spec.way(step, name) / lasts) for name, rate in rates.items()}
+        return rates
 
     def evaluate(
         self,
         parameters: dict[str, float],
         name: str = "MPC",
-        lengths: Sequence[float] | None = None,
         *,
+        at_length: bool = False,
         other_noise: int = 0,
     ) -> Trial:
-        """Return the trial of an ``"MPC"``, ``"PI"`` or ``"LQR"``; ``lengths`` are seconds by step, and other
-        noise than the search's is counted from 1."""
-        spec, lengths = self.spec, self.lengths if lengths is None else lengths
+        """Return the trial of an ``"MPC"``, ``"PI"`` or ``"LQR"``, at full length if asked; other noise
+        than the search's is counted from 1."""
         if name == "PI":
             loops = scaled_loops(self.baseline.loops, parameters)
             controller: Regulator = PIController.of(self.plant, self.baseline, loops)
-            # for as long as a step is held, to see what its integrator has still to do
-            spec, lengths = self.pi_spec, [spec.hold_s] * len(self.pi_spec.steps)
         else:
             controller = self.made(name, self.design(parameters))
-        # trials of the LQR, which is there for comparison, take ten times as long
+        quick = name == "MPC" and self._compiled  # in C: a tenth of the time
+        # a PI for as long as a step is held, to see what its integrator has still to do; and what is quick:
+        # the end of a short run is not the bias that stays
+        whole = quick or name == "PI"
+        spec = self.whole_spec if whole else self.spec
+        lengths = None if whole or at_length else self.lengths
+        count = _NOISES if quick else 1
         # the comparison of a plant without draws has a seed of its own
-        seed = self.seed + (other_noise and other_noise + 1)
-        found = run_trials(controller, self.plant, spec, self.draws, lengths=lengths, seed=seed)
+        noises = range(count * other_noise, count * (other_noise + 1))
+        seeds = [self.seed + (noise and noise + 1) for noise in noises]
+        found: list[StepResult] = []
+        for seed in seeds:
+            found += run_trials(controller, self.plant, spec, self.draws, lengths=lengths, seed=seed)
         if name != "LQR":
-            found += run_trials(controller, self.plant, spec, self.lacking, seed=seed)
+            found += run_trials(controller, self.plant, spec, self.lacking, seed=seeds[0])
         results = [result for result in found if result.draw < STRUCTURE]
         return Trial(
             controller=name,
@@ -476,12 +520,12 @@ class Search:
     def evaluate_at_length(self, item: tuple[str, dict[str, float]]) -> Trial:
         """Return a trial at full length: slow ones settle too."""
         name, parameters = item
-        return self.evaluate(parameters, name, [self.spec.hold_s] * len(self.spec.steps))
+        return self.evaluate(parameters, name, at_length=True)
 
     def evaluate_in_other_noise(self, item: tuple[dict[str, float], int]) -> Trial:
         """Return a trial of an MPC at full length in another noise than the search's, counted from 1."""
         parameters, other = item
-        return self.evaluate(parameters, lengths=[self.spec.hold_s] * len(self.spec.steps), other_noise=other)
+        return self.evaluate(parameters, at_length=True, other_noise=other)
 
     def check(self, item: tuple[str, Design, int]) -> list[StepResult]:
         """Return the results of a controller on one draw, at full length."""
@@ -499,14 +543,18 @@ class Search:
         return controller
 
     def _controller(self, design: Design) -> Controller:
-        if self._compiled:
-            try:
-                return Controller(self.plant, design, compiled=True)
-            except (RuntimeError, NotImplementedError, TypeError, OSError) as error:
-                # a gcc without headers, a step that has no C, a home that cannot be written
-                warnings.warn(f"trials run in Python, ten times slower: {error}", stacklevel=2)
-                self._compiled = False
-        return Controller(self.plant, design)
+        made = self._in_c(design) if self._compiled else None
+        return Controller(self.plant, design) if made is None else made
+
+    def _in_c(self, design: Design) -> Controller | None:
+        """Return the controller in C, None from the first time on that it cannot be had."""
+        try:
+            return Controller(self.plant, design, compiled=True)
+        except (RuntimeError, NotImplementedError, TypeError, OSError) as error:
+            # a gcc without headers, a step that has no C, a home that cannot be written
+            warnings.warn(f"trials run in Python, ten times slower: {error}", stacklevel=2)
+            self._compiled = False
+            return None
 
 
 def _capped(ranges: dict[str, tuple[float, float]], share: float) -> dict[str, tuple[float, float]]:

@@ -6,8 +6,9 @@ wanted.  Differences that nobody could see (a second, a quantum of the sensor, h
 not count: the objectives are rounded to them before they are compared.
 
 What a user can trade on a saturated plant is mostly the drive itself, so the scan beside the search's own
-trials caps it (to 90, 75, 60 and 50 % of its range), and makes moves cheaper and dearer. A filter that trusts
-readings less spares moves too; its bias takes longer to go than trials of the search last, so try it here.
+trials caps it (to 90, 75, 60 and 50 % of its range), lets targets ramp, and makes moves cheaper and dearer. A
+filter that trusts readings less spares moves too; its bias takes longer to go than trials of the search last,
+so try it here.
 
 **Which weights matter.**  Of the cost J of a parameter k (a weight, the horizon, the number of blocks) the
 elasticity is taken by a central difference over a third up and down,
@@ -37,6 +38,7 @@ RESOLUTION = (1.0, 0.05, 0.005)
 _CAPS = (0.9, 0.75, 0.6, 0.5)
 _MOVES = (0.1, 3.0, 10.0, 30.0, 100.0)
 _TRUST = (0.3, 0.1)
+_RAMPS = (1.0, 1.3)  # of the minimum time
 _KEPT = 6  # of the search's own trials
 
 
@@ -74,10 +76,12 @@ def non_dominated(points: ArrayLike) -> Mask:
     return np.asarray(finite & ~beaten)
 
 
-def scan_of(best: dict[str, float], history: Sequence[Trial]) -> list[tuple[str, dict[str, float]]]:
-    """Return what to run at full length: the search's trials that stand out, then caps, dearer moves and
-    filters that trust readings less."""
-    points = [(trial.settle_s, trial.overshoot, trial.score) for trial in history]
+def scan_of(
+    best: dict[str, float], history: Sequence[Trial], *, ramps: bool = False
+) -> list[tuple[str, dict[str, float]]]:
+    """Return what to run at full length: the search's trials that stand out, then caps, ramps where there
+    may be some, dearer moves and filters that trust readings less."""
+    points = [(trial.settle_s, trial.overshoot, trial.score, trial.travel) for trial in history]
     shown = [
         trial for trial, kept in zip(history, non_dominated(points)) if kept and trial.parameters != best
     ]
@@ -85,6 +89,9 @@ def scan_of(best: dict[str, float], history: Sequence[Trial]) -> list[tuple[str,
     found = [("tuned", dict(best)), *(("tried by the search", dict(trial.parameters)) for trial in shown)]
     own = best.get("drive_share", 1.0)
     found += [(f"{100 * cap:.0f} % of the drive", {**best, "drive_share": cap}) for cap in _CAPS if cap < own]
+    for times in _RAMPS if ramps else ():
+        if times != best.get("ramp"):
+            found.append((f"targets ramp for {times:g} times the minimum time", {**best, "ramp": times}))
     for factor in _MOVES:
         found.append((f"moves {factor:g} times as dear", {**best, "move": factor * best["move"]}))
     for factor in _TRUST if "state_walk" in best else ():
@@ -117,6 +124,7 @@ PARAMETER_WORDS = {
     "output_walk": "the process noise of the output's bias",
     "horizon": "the horizon",
     "blocks": "the number of blocks",
+    "ramp": "the target's ramp",
 }
 
 _FACTORS = (1.3, 3.0, 10.0)

@@ -41,6 +41,7 @@ from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import Design
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.tuning.objective import (
+    FREE,
     LONGEST_TI,
     LQR_PARAMETERS,
     MPC_PARAMETERS,
@@ -208,6 +209,13 @@ def _moved(kept: Sequence[Row], rows: Sequence[Row]) -> str:
     return f"A step moves the drives by {own:.1f} times full drive, {default:.1f} with the default design."
 
 
+def _ramps(design: Design, default: Design, plant: Plant) -> str:
+    """Return how fast targets may change where they step in the default design, else ""."""
+    own = {name: rate for name, rate in design.ramp_per_s.items() if name not in default.ramp_per_s}
+    said = ", ".join(f"{name} by {rate:.2g} {plant.units.get(name, 'degC')}/s" for name, rate in own.items())
+    return f"Targets ramp, which spares overshoot: {said}." if own else ""
+
+
 def _lacking(plant: Plant, design: Design, spec: Spec, results: Sequence[StepResult]) -> str:
     """Return what becomes of a plant that has what its model lacks."""
     said = []
@@ -219,8 +227,16 @@ def _lacking(plant: Plant, design: Design, spec: Spec, results: Sequence[StepRes
     return f"Where the model lacks structure: {'; '.join(said)}." if said else ""
 
 
-# to begin with: dearer moves than in the default design, a filter that trusts readings less, other horizons
-_LOOK = (("move", (10.0, 100.0, 1000.0)), ("state_walk", (0.3, 0.1)), ("horizon", (0.7, 1.5)))
+# to begin with: dearer moves than in the default design, a filter that trusts readings less, or more, other
+# horizons
+_LOOK = (
+    ("move", (10.0, 100.0, 1000.0)),
+    ("state_walk", (0.3, 0.1)),
+    ("output_walk", (3.0, 10.0)),
+    ("horizon", (0.7, 1.5)),
+)
+# targets that ramp for so many times the minimum time, where the best so far overshoots
+_RAMPS = (1.3, 1.7)
 # where each part of the work ends, in shares of its CPU time (a furnace's): bounds and compilation, a look
 # about, the search (within it MPC and PI), trade-offs, the comparison
 _BEGUN, _LOOKED, _SEARCHED, _TRADED, _COMPARED = 0.09, 0.13, 0.67, 0.8, 0.87
@@ -337,6 +353,7 @@ def tune(
         width = (_LOOKED - _BEGUN) / len(_LOOK)
         share = sub_progress(progress, _BEGUN + width * at, _BEGUN + width * (at + 1))
         looked += run_parallel(search.evaluate, look, workers, share, what=PARAMETER_WORDS[parameter])
+    looked += _ramped(search, _best(looked), workers)
     found = _search_all(search, looked, workers, sub_progress(progress, _LOOKED, _SEARCHED))
     found["PI"], pi = _sturdiest(search, found["PI"], workers)
     pareto, best = _trade(search, found, pi, workers, sub_progress(progress, _SEARCHED, _TRADED))
@@ -355,7 +372,8 @@ def tune(
     alike = 1 + (_ALIKE_IN_NOISE if stiller else _ALIKE if moved["tuned"] < moved["baseline"] else 0.0)
     kept = "tuned" if scores["tuned"] < alike * scores["baseline"] else "baseline"
     about = best if kept == "tuned" else search.evaluate(start)
-    items = [(search, parameter, about.parameters, about) for parameter in PARAMETER_WORDS]
+    of = [parameter for parameter in PARAMETER_WORDS if parameter in about.parameters]
+    items = [(search, parameter, about.parameters, about) for parameter in of]
     share = sub_progress(progress, _COMPARED, 1.0)
     sensitivity = run_parallel(sensitivity_of, items, workers, share, what="sensitivities")
     history = tuple(tried for part in found.values() for tried in part)
@@ -366,7 +384,9 @@ def tune(
     settling = {name: score(part, still, search.bounds) for name, part in own.items()}
     verdict, finding = verdict_of(spec, settling, kept_rows, unseen=unseen)
     missing = [result for result in results[kept] if result.draw >= STRUCTURE]
-    finding = f"{finding} {_moved(kept_rows, rows)} {_lacking(plant, baseline, spec, missing)}".strip()
+    more = [_moved(kept_rows, rows), _ramps(candidates[kept], baseline, plant)]
+    more.append(_lacking(plant, baseline, spec, missing))
+    finding = " ".join(part for part in (finding, *more) if part)
     meets = all(meets_spec(result, spec) for result in own[kept])
     notes = {
         "verdict": verdict,
@@ -401,6 +421,19 @@ def tune(
 
 def _best(trials: Sequence[Trial]) -> Trial:
     return min(trials, key=lambda trial: trial.score)
+
+
+def _ramped(search: Search, best: Trial, workers: Workers) -> list[Trial]:
+    """Return trials of the best design whose targets ramp, none where it keeps to the allowed overshoot.
+
+    A step far beyond what was seen before shows how wrong a model is only on its way; on a ramp the filter
+    has the time to learn it, and loads are still met with all of the drive.
+    """
+    allowed = min(search.spec.asked(name).overshoot_degC for name in search.baseline.controlled)
+    if best.overshoot <= FREE * allowed or not search.at_once:
+        return []
+    look = [{**best.parameters, "ramp": times} for times in _RAMPS]
+    return run_parallel(search.evaluate, look, workers, what=PARAMETER_WORDS["ramp"])
 
 
 # of the best PI's gain and integral time, in what is tried of sturdier ones
@@ -444,7 +477,8 @@ def _trade(
 ) -> tuple[Pareto, Trial]:
     """Return designs about the best one at full length, beside the best PI and LQR; and the one to take."""
     best = _best(found["MPC"])
-    scanned = [(name, ("MPC", parameters)) for name, parameters in scan_of(best.parameters, found["MPC"])]
+    scan = scan_of(best.parameters, found["MPC"], ramps=bool(search.at_once))
+    scanned = [(name, ("MPC", parameters)) for name, parameters in scan]
     others = {"PI": pi, "LQR": _best(found["LQR"])}
     scanned += [(f"{name}, tuned", (name, trial.parameters)) for name, trial in others.items()]
     names, items = zip(*scanned, strict=True)
@@ -455,7 +489,7 @@ def _trade(
     again = [(trial.parameters, noise) for trial in near for noise in range(1, 1 + _NOISES)]
     louder = run_parallel(search.evaluate_in_other_noise, again, workers, what="the same in other noise")
     noises = [[near[k], *louder[_NOISES * k :][:_NOISES]] for k in range(len(near))]
-    still = near[_stillest(noises)]
+    still = near[_stillest(noises, search.resolution)]
     return pareto, best if still is own[0] else search.evaluate(still.parameters)
 
 
@@ -476,14 +510,15 @@ def _contenders(own: Sequence[Trial]) -> list[Trial]:
     return [own[0], *still[: _CONTENDERS - 1], *([_best(capped)] if capped else [])]
 
 
-def _stillest(found: Sequence[Sequence[Trial]]) -> int:
+def _stillest(found: Sequence[Sequence[Trial]], resolution: float = 0.0) -> int:
     """Return which of these designs moves least, of those that score as the best does as far as trials tell;
     of each there is a trial in each of the same noises.
 
     They tell a difference of their means that is above its standard error: the rule of one standard error, by
-    which of models that predict alike the simplest is taken [1]_. Below 2 % none counts; above 5 % each does,
-    for three noises are few. A difference of moves that is below 5 % does not count either. With less of the
-    drive than the first, a design must be better than it by 1 %.
+    which of models that predict alike the simplest is taken [1]_. Below 2 %, and below the ``resolution`` of
+    a settling time, none counts; above 5 % each does, for three noises are few. A difference of moves that is
+    below 5 % does not count either. With less of the drive than the first, a design must be better than it by
+    1 %.
 
     References
     ----------
@@ -496,7 +531,8 @@ def _stillest(found: Sequence[Sequence[Trial]]) -> int:
     least = int(np.argmin(np.where(whole | (means < (1 - _WORTH) * means[0]), means, np.inf)))
     more = scores - scores[least]
     error = more.std(axis=1, ddof=1) / np.sqrt(scores.shape[1])
-    told = np.clip(error, _ALIKE * means[least], _ALIKE_IN_NOISE * means[least])
+    lowest = min(max(_ALIKE, resolution), _ALIKE_IN_NOISE)
+    told = np.clip(error, lowest * means[least], _ALIKE_IN_NOISE * means[least])
     alike = (more.mean(axis=1) <= told) & (shares == shares[least])
     still = alike & (travels <= (1 + _STILL) * travels[alike].min())
     return int(np.argmin(np.where(still, means, np.inf)))

@@ -46,6 +46,7 @@ def search_of(
         patch.setattr(objective, "full_drive_bound", lambda drawn, design, step, spec: bounds(*step, drawn))
         patch.setattr(objective, "apparent_delay", lambda plant, controlled: 8.0)
         patch.setattr(Search, "_settled", lambda self: list(settled))
+        patch.setattr(objective, "wanted", lambda: False)  # trials in Python
         return Search(plant, spec, spec.design(make_tank(), **changes), 3)  # type: ignore[arg-type]
 
 
@@ -90,6 +91,7 @@ def test_each_controller_is_tried_for_its_own_length(monkeypatch: pytest.MonkeyP
         controller: Any, plant: Any, spec: Spec, draws: Any, *, seed: int, lengths: Any = None
     ) -> list[StepResult]:
         seen.append((controller, draws, lengths, seed))
+        assert list(spec.steps) == STEPS
         if draws == search.lacking:
             return [StepResult(28.0, 36.0, 2001, 90.0, 0.3, 0.0, 0.0, 99.0, 0.0, 0.5, 100.0)]
         return [
@@ -105,9 +107,8 @@ def test_each_controller_is_tried_for_its_own_length(monkeypatch: pytest.MonkeyP
     tried = [search.evaluate({"move": 7.0}), search.evaluate(pi, "PI"), search.evaluate({"move": 4.0}, "LQR")]
     search.evaluate_at_length(("PI", pi))
     search.evaluate_in_other_noise(({"move": 9.0}, 2))
-    whole = [300.0, 300.0]
-    own = [(("MPC", 7.0), search.lengths, 3), (("PI", 2.0), whole, 3), (("LQR", 4.0), search.lengths, 3)]
-    own += [(("PI", 2.0), whole, 3), (("MPC", 9.0), whole, 6)]  # 4 is what a sure plant is compared with
+    own = [(("MPC", 7.0), search.lengths, 3), (("PI", 2.0), None, 3), (("LQR", 4.0), search.lengths, 3)]
+    own += [(("PI", 2.0), None, 3), (("MPC", 9.0), None, 6)]  # 4 is what a sure plant is compared with
     wanted = []
     for of, length, seed in own:
         wanted.append((of, [1, 2], length, seed))
@@ -118,6 +119,14 @@ def test_each_controller_is_tried_for_its_own_length(monkeypatch: pytest.MonkeyP
     cost = (80 + 100) / 120 + 0.5 * (100 - 90) / 60 + 0.01 + 0.05 * (90 / 60 + 10 * 0.03)
     assert tried[0] == Trial("MPC", {"move": 7.0}, pytest.approx(cost), 90.0, 0.2, 30.0, 1.0)
     assert [trial.controller for trial in tried] == ["MPC", "PI", "LQR"]
+    # in C an MPC is tried at full length in three noises, and in three others
+    seen.clear()
+    search._compiled = True
+    search.evaluate({"move": 7.0})
+    search.evaluate_in_other_noise(({"move": 7.0}, 1))
+    assert {length for _, _, length, _ in seen} == {None}
+    assert [seed for _, draws, _, seed in seen if draws == [1, 2]] == [3, 5, 6, 7, 8, 9]
+    assert [seed for _, draws, _, seed in seen if draws != [1, 2]] == [3, 7]
 
 
 FAR = SPEC.model_copy(update={"ambient_degC": 20.0})  # 16 degC below the first target, steps are of 8
@@ -156,8 +165,11 @@ def test_the_trial_from_a_cold_start_is_of_the_pi_alone(monkeypatch: pytest.Monk
     monkeypatch.setattr(objective.PIController, "of", lambda plant, base, loops: "PI")
     for name in ("MPC", "PI", "LQR"):
         search.evaluate({"Kc": 1.0, "Ti": 1.0, "setpoint": 1.0, "feedforward": 0.5}, name)
-    cold = ([*STEPS, (20.0, 36.0)], [300.0] * 3)
+    cold = ([*STEPS, (20.0, 36.0)], None)
     assert seen == [(STEPS, search.lengths), cold, (STEPS, search.lengths)]
+    search._compiled = True  # and of an MPC in C, whose trials take no time
+    search.evaluate({"move": 3.0})
+    assert seen[3:] == [cold] * 3
 
 
 def test_a_trial_has_a_sensor_that_is_off_and_a_seed_of_its_draw(monkeypatch: pytest.MonkeyPatch):
@@ -263,16 +275,54 @@ def test_a_score_is_the_mean_and_half_of_what_the_worst_is_above_it():
     assert score([replace(one, draw=3)], SPEC, bounds) == pytest.approx(0.5)
     assert score([replace(one, draw=4)], SPEC, bounds) == pytest.approx(150.0)
     never = replace(one, settle_s=np.nan, last_error=-1.5, bias=5.0)  # its bias is not charged besides
-    assert score([never], SPEC, bounds) == pytest.approx(300 / 50 + 3.0)
+    assert score([never], SPEC, bounds) == pytest.approx(300 / 50 + 0.5 * 1.5 / 0.3)
     # without structure a run counts a twentieth, beyond 5 by its logarithm
     slow = [replace(one, draw=1001, settle_s=200.0), replace(never, draw=2001)]
     assert score([one, two, *slow], SPEC, bounds) == pytest.approx(
-        2.5 + 0.05 * (4.0 + 5 + 5 * np.log(9.0 / 5)) / 2
+        2.5 + 0.05 * (4.0 + 5 + 5 * np.log(8.5 / 5)) / 2
     )
     slow[1] = replace(slow[1], last_error=80.0)
     assert score([one, two, *slow], SPEC, bounds) == pytest.approx(
-        2.5 + 0.05 * (4.0 + 5 + 5 * np.log(166 / 5)) / 2
+        2.5 + 0.05 * (4.0 + 5 + 5 * np.log((6 + 40 / 0.3) / 5)) / 2
     )
+
+
+def test_a_step_in_several_noises_counts_by_their_mean():
+    one = StepResult(28.0, 36.0, 1, 150.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 300.0)
+    others = [replace(one, draw=2, settle_s=settle) for settle in (40.0, 60.0)]
+    bounds = {(28.0, 36.0, draw): 50.0 for draw in (1, 2)}
+    assert score([one, *others], SPEC, bounds) == pytest.approx(2.0 + 0.5 * (3.0 - 2.0))
+
+
+def test_a_score_does_not_depend_on_the_unit_of_the_outputs():
+    results = [
+        StepResult(28.0, 36.0, 1, 150.0, 0.5, 0.02, 0.1, 3.0, 2.0, 0.5, 300.0),
+        StepResult(28.0, 36.0, 2, np.nan, 0.2, 0.5, 0.7, 3.0, 2.0, 0.5, 300.0),
+        StepResult(28.0, 36.0, 3, 90.0, 0.1, -0.09, 0.0, 3.0, 2.0, 0.5, 300.0),
+    ]
+    sizes = ("start", "target", "overshoot", "bias", "last_error")
+    milli = [replace(r, **{name: 1000 * getattr(r, name) for name in sizes}) for r in results]
+    small = SPEC.model_copy(update={"band_degC": 300.0, "overshoot_degC": 300.0, "bias_degC": 50.0})
+    bounds = {(28.0, 36.0, draw): 50.0 for draw in (1, 2, 3)}
+    big = {(1000 * start, 1000 * end, draw): bound for (start, end, draw), bound in bounds.items()}
+    for pair in zip(results, milli, strict=True):
+        assert score([pair[0]], SPEC, bounds) == pytest.approx(score([pair[1]], small, big), rel=1e-12)
+    # three times what is allowed beyond nine tenths of it, and half of it for the bias
+    assert score(results[:1], SPEC, bounds) == pytest.approx(3 + 0.02 + 3 * (0.5 / 0.3 - 0.9))
+    assert score(results[2:], SPEC, bounds) == pytest.approx(1.8 + 0.02 + 0.5 * (0.09 / 0.05 - 0.9))
+
+
+def test_a_ramp_lasts_so_many_times_the_minimum_time_of_the_slower_step():
+    search = search_of(lambda start, target, draw: (60.0 if target > 30 else 20.0) + draw)
+    (rate,) = search.design({"ramp": 1.5}).ramp_per_s.values()
+    assert rate == pytest.approx((8 - 0.3) / (1.5 * 61.5))  # of two draws the mean
+    assert search.design({}).ramp_per_s == {}
+    assert search.at_once == ["t_surface"]
+    own = search_of(lambda *at: 60.0, spec=SPEC.model_copy(update={"ramp_per_s": 0.01}))
+    assert (own.at_once, own.design({"ramp": 1.5}).ramp_per_s) == ([], {"t_surface": 0.01})
+    one = search_of(lambda start, target, draw: np.inf if target > 30 else 20.0)
+    assert one.design({"ramp": 1.0}).ramp_per_s == {"t_surface": pytest.approx(7.7 / 20)}
+    assert search.resolution == pytest.approx(0.5 / np.mean([61, 62, 21, 22]))
 
 
 def test_a_note_has_none_for_what_is_no_number():

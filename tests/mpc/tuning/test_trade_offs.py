@@ -65,6 +65,18 @@ def test_the_scan_has_the_best_first_and_no_trial_twice():
     assert found[0] == ("tuned", best)
     assert [parameters for _, parameters in found].count(best) == 1
     assert {parameters.get("drive_share", 1.0) for _, parameters in found} > {1.0, 0.5}
+    ramps = [parameters.get("ramp") for _, parameters in scan_of(best, history, ramps=True)]
+    assert [times for times in ramps if times] == [1.0, 1.3]
+    ramped = scan_of(best | {"ramp": 1.3}, history, ramps=True)
+    assert [name for name, _ in ramped if "ramp" in name] == ["targets ramp for 1 times the minimum time"]
+
+
+def test_a_trial_that_moves_least_is_run_at_full_length_too():
+    best = {"move": 1.0}
+    still = Trial("MPC", {"move": 9.0}, 1.2, 110.0, 0.1, 200.0, travel=1.0)
+    beaten = Trial("MPC", {"move": 8.0}, 1.3, 120.0, 0.1, 200.0, travel=2.0)
+    found = scan_of(best, [Trial("MPC", best, 1.0, 100.0, 0.1, 200.0, travel=2.0), still, beaten])
+    assert [parameters for name, parameters in found if name == "tried by the search"] == [{"move": 9.0}]
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import FrozenInstanceError, dataclass, field, replace
+from functools import partial
 from math import inf, nan
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +16,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import Design, PILoop, default_design
 from thermogrip.mpc.design.spec import Spec
+from thermogrip.mpc.tuning import objective
 from thermogrip.mpc.tuning import tune as tuner
 from thermogrip.mpc.tuning.figures import closed_loop_figure
 from thermogrip.mpc.tuning.objective import (
@@ -118,19 +120,24 @@ class Paper:
     capped: float = 1.0  # score at full length of 75 % of the drive, over that of all of it
     pi_at_length: float = 5.0
     creeps: float = 0.0  # up to this gain a PI does not settle
+    ramped: float = 1.0  # score of a ramp of 1.3, over that of none
+    overshoots: float = 0.1
     evaluate_check: Callable[[str, int], StepResult] | None = None
     checked: list[tuple[str, Design, int]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.check_seed = self.seed + 7
         self.bounds = {(*step, draw): 100.0 for step in STEPS for draw in (*self.draws, *self.unseen)}
+        self.at_once, self.resolution = ["t_surface"], 0.0
+        self._ramps = partial(Search._ramps, self)  # type: ignore[arg-type]
 
     def design(self, parameters: dict[str, float]) -> Design:
         return Search.design(self, parameters)  # type: ignore[arg-type]
 
     def evaluate(self, parameters: dict[str, float], name: str = "MPC") -> Trial:
         best, lowest = {"MPC": (BEST, 1.0), "PI": (BEST_PI, 1.5), "LQR": (BEST_LQR, 1.2)}[name]
-        return self.trial(name, parameters, valley(parameters, best, lowest))
+        ramp = {1.3: self.ramped}.get(parameters.get("ramp", 0.0), 1.0)
+        return self.trial(name, parameters, ramp * valley(parameters, best, lowest))
 
     def evaluate_at_length(self, item: tuple[str, dict[str, float]]) -> Trial:
         name, parameters = item
@@ -140,7 +147,9 @@ class Paper:
         return self.trial(
             name,
             parameters,
-            caps.get(parameters.get("drive_share", 1.0), 1.5) * valley(parameters, BEST, 1.0),
+            caps.get(parameters.get("drive_share", 1.0), 1.5)
+            * {1.3: self.ramped, 1.0: 1.5}.get(parameters.get("ramp", 0.0), 1.0)
+            * valley(parameters, BEST, 1.0),
         )
 
     def evaluate_in_other_noise(self, item: tuple[dict[str, float], int]) -> Trial:
@@ -149,7 +158,7 @@ class Paper:
     def trial(self, name: str, parameters: dict[str, float], value: float) -> Trial:
         if parameters.get("Kc", np.inf) <= self.creeps:
             return Trial(name, dict(parameters), value + 5.0, np.nan, 0.1, 50.0)
-        return Trial(name, dict(parameters), value, 100.0 * value, 0.1, 50.0)
+        return Trial(name, dict(parameters), value, 100.0 * value, self.overshoots, 50.0)
 
     def check(self, item: tuple[str, Design, int]) -> list[StepResult]:
         name, _, draw = item
@@ -217,16 +226,32 @@ def done(tank: Any) -> Done:
 
 def test_moves_filters_and_horizons_are_looked_at_and_the_best_is_searched_from(done: Done):
     start = parameters_of(done.search.baseline, SPEC)
-    first, rest = done.tried("MPC")[:8], done.tried("MPC")[8:]
+    first, rest = done.tried("MPC")[:10], done.tried("MPC")[10:]
     assert first[0].parameters == start
-    assert [trial.parameters["move"] for trial in first] == [1.0, 10.0, 100.0, 1000.0, *[10.0] * 4]  # best: 6
-    walks = [trial.parameters["state_walk"] for trial in first[3:]]
+    assert [trial.parameters["move"] for trial in first] == [1.0, 10.0, 100.0, 1000.0, *[10.0] * 6]  # best: 6
+    walks = [trial.parameters["state_walk"] for trial in first[3:8]]
     assert walks == pytest.approx([0.005, 0.0015, 0.0005, 0.005, 0.005])  # it does nothing here
-    assert [trial.parameters["horizon"] for trial in first[5:]] == [38.0, 27.0, 57.0]
+    walk = start["output_walk"]
+    trusts = [trial.parameters["output_walk"] for trial in first[5:]]
+    assert trusts == pytest.approx([walk, 3 * walk, 10 * walk, walk, walk])
+    assert [trial.parameters["horizon"] for trial in first[7:]] == [38.0, 27.0, 57.0]
     assert {trial.parameters["horizon"] for trial in rest} == {57.0}
     assert rest[0].parameters == pytest.approx(
-        first[7].parameters
+        first[9].parameters
     )  # the search begins where the look was best
+    assert not any("ramp" in trial.parameters for trial in done.tried("MPC"))  # nothing overshoots
+
+
+def test_where_the_best_look_overshoots_targets_that_ramp_are_looked_at_and_searched_from(tank: Any):
+    done = tuned(tank, ramped=0.5, overshoots=0.28)
+    first, rest = done.tried("MPC")[10:12], done.tried("MPC")[12:]
+    assert [trial.parameters["ramp"] for trial in first] == [1.3, 1.7]
+    assert {trial.parameters["ramp"] for trial in rest} == {1.3}
+    design = done.tuning.controller.design
+    assert design.ramp_per_s == {"t_surface": pytest.approx((8 - 0.25) / 130)}
+    assert "Targets ramp, which spares overshoot: t_surface by 0.06 degC/s." in done.tuning.finding
+    assert "ramp" in {found.knob for found in done.tuning.sensitivity}
+    assert not any("ramp" in t.parameters for t in tuned(tank, ramped=1.5, overshoots=0.28).tried("MPC")[12:])
 
 
 def test_every_controller_has_as_many_trials_and_keeps_to_its_ranges(done: Done):
@@ -362,6 +387,8 @@ def test_of_designs_that_trials_cannot_tell_apart_the_one_that_moves_least_is_ta
         return Trial(name, parameters, value, 100.0, 0.1, 50.0, travel)
 
     search: Any = SimpleNamespace(
+        at_once=[],
+        resolution=0.0,
         evaluate_at_length=at_length,
         evaluate=lambda parameters: at_length(("MPC", parameters)),
         evaluate_in_other_noise=lambda item: at_length(("MPC", item[0]), item[1]),
@@ -583,12 +610,13 @@ def test_a_simpler_controller_that_is_as_good_is_named_with_what_it_does_not_kno
     assert not name or f"does not know zones{joined}energy prices" in _simpler(scores, priced)
 
 
-def test_a_step_whose_target_ramps_is_bounded_by_its_ramp(tank) -> None:
+def test_a_step_whose_target_ramps_is_bounded_by_its_ramp(tank, monkeypatch) -> None:
     plain = default_design(tank)
     ramped = replace(plain, ramp_per_s={"t_surface": 0.02})
     (free,), (bound,) = (bounds_of(tank, design, STEP, [0]).values() for design in (plain, ramped))
     (start, target), band = STEP.steps[0], STEP.band_degC
     assert bound == pytest.approx((target - start - band) / 0.02)
     assert bound > 2 * free
+    monkeypatch.setattr(objective, "wanted", lambda: False)  # in C a trial lasts as long as a step is held
     search = Search(tank, STEP.model_copy(update={"hold_s": 900.0}), ramped, 0)
     assert search.lengths[0] == pytest.approx(1.35 * bound + 40)  # a trial sees it settle
