@@ -14,7 +14,7 @@ and beyond it more current heats. Three guards stand there. A Peltier's gain fad
 drive, to nothing at the optimum: from what is left of it along the guess, against that at rest, follows
 where the optimum is, and how far a block may go, as a share of the way there,
 
-    share = max(9/10, min(e, 3 - 2 e)),     e = end of the range / optimum
+    share = max(17/20, min(e, 3 - 2 e)),     e = end of the range / optimum
 
 (``docs/explanation/mpc.md`` says what that costs).  The bias of the drive that the observer has found is
 counted where the gain is evaluated, not in the share: it is a heat flow, and heat moves no optimum.  Where
@@ -49,7 +49,7 @@ from thermogrip.mpc.optimiser.qp import CondensedQP
 from thermogrip.mpc.plant.prediction import PredictionModel
 
 _SHARES = np.array([0.5, 0.25, 0.1, 0.0])
-_SAFE = 0.9  # of the way to the optimum, where the range runs on beyond it
+_SAFE = 0.85  # of the way to the optimum, where the range runs on beyond it
 FADING = 0.3  # of the gain at rest lost, from which on it is foreseen where it fades
 _LOOK_AROUND = 5  # samples between two trials of the ramps
 _LITTLE = 1e-7  # of its range, that a parked drive may be off in the program

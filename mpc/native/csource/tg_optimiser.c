@@ -21,7 +21,7 @@
 #include <math.h>
 #include <string.h>
 
-#define SAFE 0.9  /* of the way to the optimum, where the range runs on beyond it */
+#define SAFE 0.85  /* of the way to the optimum, where the range runs on beyond it */
 #define LOOK_AROUND 5
 #define BARELY 1.02
 #ifdef TG_SINGLE

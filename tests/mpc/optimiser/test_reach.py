@@ -25,7 +25,7 @@ LIMIT = {"t_tank": (8.0, 50.0)}
 OWN = {"t_surface": (20.0, 48.0)}  # of what is controlled
 LEAKY = {"heat": 0.14, "loss": 1 / 150}  # 45.6 degC at most, and the model expects 102
 WEAK = {"heat": 0.02}  # 38.7 degC at most
-OPTIMUM = {"joule": 0.1}  # 5.5 degC at least, as far as its drive may go
+OPTIMUM = {"joule": 0.1}  # 4.5 degC at least, as far as its drive may go
 
 #: truth, its model, limits, targets with seconds, after how many samples at most the last target is reported
 #: as unreachable (None: never), and the value that can be held
@@ -38,9 +38,9 @@ ROWS = {
     "half a degree above its own limit": ({}, {}, OWN, [(34, 180), (48.5, 400)], 0, 48.0),
     "half a degree below its own limit": ({}, {}, OWN, [(34, 180), (19.5, 400)], 0, 20.0),
     "hardly above its own limit": ({}, {}, OWN, [(34, 180), (48.08, 400)], None, 0),
-    "an optimum": (OPTIMUM, OPTIMUM, {}, [(0, 600)], 2, 5.5),
-    "far beyond an optimum": (OPTIMUM, OPTIMUM, {}, [(-20, 600)], 3, 5.5),
-    "nearly an optimum": (OPTIMUM, OPTIMUM, {}, [(6, 600)], None, 0),
+    "an optimum": (OPTIMUM, OPTIMUM, {}, [(0, 600)], 2, 4.5),
+    "far beyond an optimum": (OPTIMUM, OPTIMUM, {}, [(-20, 600)], 3, 4.5),
+    "nearly an optimum": (OPTIMUM, OPTIMUM, {}, [(5, 600)], None, 0),
     "an end of the drive": (WEAK, WEAK, {}, [(42, 600)], 1, 38.7),
     "hardly beyond an end of the drive": (WEAK, WEAK, {}, [(39.5, 600)], 12, 38.7),
     "nearly an end of the drive": (WEAK, WEAK, {}, [(38, 600)], None, 0),
@@ -172,9 +172,9 @@ def test_the_range_ends_where_a_gain_fades():
     made, bias = reach(), np.array([5.0, 9.0])
     G = np.array([[0.0, 0.7 * 51], [0.5 * 25, 0.0]])  # of a and b, half and seven tenths of those at rest
     low, high = made._range(G, np.array([20.0, 20.0]), bias)
-    assert (low.tolist(), high.tolist()) == ([-50.0, 0.0], [37.5, 80.0])  # 0.75 * 25 / 0.5
+    assert (low.tolist(), high.tolist()) == ([-50.0, 0.0], [42.5, 80.0])  # 0.85 * 25 / 0.5
     low, high = made._range(G, np.array([-20.0, 20.0]), bias)
-    assert (low.tolist(), high.tolist()) == ([-22.5, 0.0], [100.0, 80.0])  # 0.75 * 15 / 0.5
+    assert (low.tolist(), high.tolist()) == ([-25.5, 0.0], [100.0, 80.0])  # 0.85 * 15 / 0.5
     # the way of q1 is from 10 on: 57.1 = 25 / 0.4375 to the optimum, of which 3 - 2.1 for its end at 60
     made.model = SimpleNamespace(neutral=np.array([10.0, 0.0]), span=MODEL.span)
     G[1, 0] = 0.5625 * 25
@@ -182,7 +182,7 @@ def test_the_range_ends_where_a_gain_fades():
         [10 - 0.9 * 25 / 0.4375, 0]
     )
     assert made._range(G, np.array([25.0, 20.0]), bias)[1].tolist() == pytest.approx(
-        [10 + 0.75 * 20 / 0.4375, 80]
+        [10 + 0.85 * 20 / 0.4375, 80]
     )
     made._optimiser.settled_gain = None
     assert made._range(G, np.array([20.0, 20.0]), bias)[1].tolist() == [100.0, 80.0]
