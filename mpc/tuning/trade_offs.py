@@ -38,7 +38,8 @@ RESOLUTION = (1.0, 0.05, 0.005)
 _CAPS = (0.9, 0.75, 0.6, 0.5)
 _MOVES = (0.1, 3.0, 10.0, 30.0, 100.0)
 _TRUST = (0.3, 0.1)
-_RAMPS = (1.0, 1.3)  # of the minimum time
+#: How many minimum times the targets of ramped designs take.
+RAMPS = (1.3, 1.7)
 _KEPT = 6  # of the search's own trials
 
 
@@ -89,7 +90,7 @@ def scan_of(
     found = [("tuned", dict(best)), *(("tried by the search", dict(trial.parameters)) for trial in shown)]
     own = best.get("drive_share", 1.0)
     found += [(f"{100 * cap:.0f} % of the drive", {**best, "drive_share": cap}) for cap in _CAPS if cap < own]
-    for times in _RAMPS if ramps else ():
+    for times in RAMPS if ramps else ():
         if times != best.get("ramp"):
             found.append((f"targets ramp for {times:g} times the minimum time", {**best, "ramp": times}))
     for factor in _MOVES:

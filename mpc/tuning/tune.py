@@ -62,6 +62,7 @@ from thermogrip.mpc.tuning.objective import (
 from thermogrip.mpc.tuning.robustness import worst_sensitivity
 from thermogrip.mpc.tuning.trade_offs import (
     PARAMETER_WORDS,
+    RAMPS,
     Pareto,
     Sensitivity,
     front_of,
@@ -235,8 +236,6 @@ _LOOK = (
     ("output_walk", (3.0, 10.0)),
     ("horizon", (0.7, 1.5)),
 )
-# targets that ramp for so many times the minimum time, where the best so far overshoots
-_RAMPS = (1.3, 1.7)
 # where each part of the work ends, in shares of its CPU time (a furnace's): bounds and compilation, a look
 # about, the search (within it MPC and PI), trade-offs, the comparison
 _BEGUN, _LOOKED, _SEARCHED, _TRADED, _COMPARED = 0.09, 0.13, 0.67, 0.8, 0.87
@@ -432,7 +431,7 @@ def _ramped(search: Search, best: Trial, workers: Workers) -> list[Trial]:
     allowed = min(search.spec.asked(name).overshoot_degC for name in search.baseline.controlled)
     if best.overshoot <= FREE * allowed or not search.at_once:
         return []
-    look = [{**best.parameters, "ramp": times} for times in _RAMPS]
+    look = [{**best.parameters, "ramp": times} for times in RAMPS]
     return run_parallel(search.evaluate, look, workers, what=PARAMETER_WORDS["ramp"])
 
 

@@ -66,9 +66,9 @@ def test_the_scan_has_the_best_first_and_no_trial_twice():
     assert [parameters for _, parameters in found].count(best) == 1
     assert {parameters.get("drive_share", 1.0) for _, parameters in found} > {1.0, 0.5}
     ramps = [parameters.get("ramp") for _, parameters in scan_of(best, history, ramps=True)]
-    assert [times for times in ramps if times] == [1.0, 1.3]
+    assert [times for times in ramps if times] == [1.3, 1.7]
     ramped = scan_of(best | {"ramp": 1.3}, history, ramps=True)
-    assert [name for name, _ in ramped if "ramp" in name] == ["targets ramp for 1 times the minimum time"]
+    assert [name for name, _ in ramped if "ramp" in name] == ["targets ramp for 1.7 times the minimum time"]
 
 
 def test_a_trial_that_moves_least_is_run_at_full_length_too():

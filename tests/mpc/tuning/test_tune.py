@@ -148,7 +148,7 @@ class Paper:
             name,
             parameters,
             caps.get(parameters.get("drive_share", 1.0), 1.5)
-            * {1.3: self.ramped, 1.0: 1.5}.get(parameters.get("ramp", 0.0), 1.0)
+            * {1.3: self.ramped, 1.7: 1.5}.get(parameters.get("ramp", 0.0), 1.0)
             * valley(parameters, BEST, 1.0),
         )
 
