@@ -95,7 +95,9 @@ def tuning_table(tuning: Tuning) -> Cells:
 
 def tuning_caption(tuning: Tuning) -> str:
     """Return what the comparison ran on."""
-    draws = f"{tuning.spec.check_draws} draws of the plant" if _uncertain(tuning) else "the plant"
+    count = tuning.spec.check_draws
+    several = f"{count} draw{'' if count == 1 else 's'} of the plant"
+    draws = several if _uncertain(tuning) else "the plant"
     return f"Closed loops on {draws}"
 
 
