@@ -794,10 +794,10 @@ def _log_normal(x: Array, variance: Array) -> Array:
 
 def fit_candidates(
     gripper: GripperModel, data: Touches, candidates: Sequence[str | Material], finish: str = "known", *,
-    start: Array | None = None,
+    start: Array | None = None, noise: Whitened | None = None,
 ) -> tuple[Mode, Prior, NDArray[np.int64]]:  # fmt: skip
     """Return modes of every touch under every candidate, (n m,) rows, from nuisances ``start`` (n, m, 7), and
-    the prior and the touch of each."""
+    the prior and the touch of each; ``noise`` is :func:`whitened` where a caller has it."""
     one = material_hypotheses(gripper, candidates, finish)
     n, m = data.level.size, len(candidates)
     row = np.repeat(np.arange(n), m)
@@ -805,7 +805,7 @@ def fit_candidates(
     begin = None if start is None else start.reshape(n * m, -1)
     each = data.known(row)
     prior = prior_of(gripper, each, hypotheses)
-    mode = fit_pairs(gripper, data, row, hypotheses, start=begin, prior=prior, rivals=True)
+    mode = fit_pairs(gripper, data, row, hypotheses, start=begin, noise=noise, prior=prior, rivals=True)
     return doubted(gripper, each, prior, mode), prior, row
 
 

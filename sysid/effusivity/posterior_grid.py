@@ -34,7 +34,7 @@ from scipy.special import gammaln, logsumexp, ndtr
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.materials import load_materials
-from thermogrip.sysid.effusivity.data import Touches, Whitened
+from thermogrip.sysid.effusivity.data import Touches, Whitened, taken
 from thermogrip.sysid.effusivity.gripper_model import GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import (
     BUILD_UP,
@@ -228,21 +228,25 @@ def grid_posteriors(gripper: GripperModel, data: Touches) -> list[GridPosterior]
     return posteriors_of(found.x, value, found.u[:, :, T_OBJECT], sd, found.u[:, :, H])
 
 
-def free_evidence(gripper: GripperModel, data: Touches, near: Array | None = None) -> Array:
-    """Return the log evidence of a free effusivity for each touch, (n,), as :func:`grid_posteriors` do.
+def free_evidence(
+    gripper: GripperModel, data: Touches, near: Array | None = None, *, noise: Whitened | None = None
+) -> Array:
+    """Return the log evidence of a free effusivity for each touch, (n,), as :func:`grid_posteriors` do;
+    ``noise`` is :func:`whitened` where a caller has it.
 
     Where the modes ``near`` (n, 7) of a likely candidate are given and the object's temperature is stated,
     the density is looked for from there (:func:`_evidence_near`)."""
-    out = np.full(data.level.size, np.nan)
+    out, noise = np.full(data.level.size, np.nan), whitened(gripper, data) if noise is None else noise
     by_one = gripper.second is None or data.second is None
     if near is not None and by_one and gripper.discrepancy is None and not gripper.uncertain:
         at = np.flatnonzero(np.isfinite(data.t_object))
         if at.size:
-            out[at] = _evidence_near(gripper, data if at.size == out.size else data.take(at), near[at])
+            some = data if at.size == out.size else data.take(at)
+            out[at] = _evidence_near(gripper, some, near[at], taken(noise, at))
     rest = np.flatnonzero(np.isnan(out))
     if rest.size:
         some = data if rest.size == out.size else data.take(rest)
-        found = _fitted(gripper, some, whitened(gripper, some))
+        found = _fitted(gripper, some, taken(noise, rest))
         out[rest] = log_total(found.x, found.value) - np.log(LN_E_RANGE[1] - LN_E_RANGE[0])
     return out
 
@@ -257,13 +261,13 @@ _SURE = 0.008  # nats by which two kinds of cubics may differ
 _HALVED = 8  # cells that are halved where they differ by more
 
 
-def _evidence_near(gripper: GripperModel, data: Touches, near: Array) -> Array:
+def _evidence_near(gripper: GripperModel, data: Touches, near: Array, noise: Whitened) -> Array:
     """Return the log evidence of a free effusivity for each touch of an object of stated temperature, (n,),
     NaN where that is not sure.
 
     One search with ln e free finds where the density is, how wide, and how the other unknowns go along;
     points about it start there, and more follow where it has not ended, or falls steeply between points."""
-    row, noise = np.arange(data.level.size), whitened(gripper, data)
+    row = np.arange(data.level.size)
     lowest, highest = LN_E_RANGE
     free = free_hypotheses(gripper, np.clip(near[:, EFFUSIVITY], lowest, highest))
     law = prior_of(gripper, data, free._replace(ln_e_sd=np.full(row.size, _ANYWHERE)))
@@ -275,18 +279,19 @@ def _evidence_near(gripper: GripperModel, data: Touches, near: Array) -> Array:
     along = mode.covariance[:, :, EFFUSIVITY] / spread[:, None] ** 2
     start = mode.u[:, None] + along[:, None] * (grid - place[:, None])[:, :, None]
     found = _evaluate(gripper, data, noise, grid, start)
-    out, at, some = np.full(row.size, np.nan), row, data
+    out, at, some, white = np.full(row.size, np.nan), row, data, noise
     for again in range(_ROUNDS + 1):
         wanted = [_more(x, value) for x, value in zip(found.x, found.value)]
         done = np.array([more is None for more in wanted])
         if done.any():
-            ended = _Fitted(*(part[done] for part in found))
-            out[at[done]] = _halved_total(gripper, some.take(np.flatnonzero(done)), ended)
+            ended, which = _Fitted(*(part[done] for part in found)), np.flatnonzero(done)
+            out[at[done]] = _halved_total(gripper, some.take(which), taken(white, which), ended)
         if done.all() or again == _ROUNDS:
             break
         at, found = at[~done], _Fitted(*(part[~done] for part in found))
-        some, grid = data.take(at), np.stack([more for more in wanted if more is not None])
-        more = _evaluate(gripper, some, whitened(gripper, some), grid, _between(grid, found.x, found.u))
+        some, white = data.take(at), taken(noise, at)
+        grid = np.stack([more for more in wanted if more is not None])
+        more = _evaluate(gripper, some, white, grid, _between(grid, found.x, found.u))
         found = _joined(found, more)
     return np.asarray(out - np.log(highest - lowest))
 
@@ -314,7 +319,7 @@ def _more(x: Array, value: Array) -> Array | None:
     return np.asarray(0.5 * (x[first : first + _MORE] + x[first + 1 : first + 1 + _MORE]))
 
 
-def _halved_total(gripper: GripperModel, data: Touches, found: _Fitted) -> Array:
+def _halved_total(gripper: GripperModel, data: Touches, noise: Whitened, found: _Fitted) -> Array:
     """Return :func:`_sure_total`, with points between those that count most where that is not sure."""
     total = _sure_total(found)
     rest = np.flatnonzero(np.isnan(total))
@@ -325,7 +330,7 @@ def _halved_total(gripper: GripperModel, data: Touches, found: _Fitted) -> Array
         middles = 0.5 * (found.x[:, :-1] + found.x[:, 1:])
         grid = np.take_along_axis(middles, cells, axis=1)
         start = _between(grid, found.x, found.u)
-        more = _evaluate(gripper, some, whitened(gripper, some), grid, start)
+        more = _evaluate(gripper, some, taken(noise, rest), grid, start)
         total[rest] = _sure_total(_joined(found, more))
     return total
 
