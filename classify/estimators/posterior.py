@@ -262,7 +262,9 @@ class PosteriorClassifier(GraspClassifier):
         """Return what single touches of one record decide; the odds where a free effusivity is asked for."""
         levels, u, noise = self._levels(), np.log(self.prior_unknown), whitened(self.device_, data)
         own = np.array([level.device is self.device_ for level in levels])
-        each, modes = _of_levels([level for level in levels if level.device is self.device_], data, names, noise)
+        each, modes = _of_levels(
+            [level for level in levels if level.device is self.device_], data, names, noise
+        )
         if not own.all() and _unlikely(levels, data, names, each, modes[0]):
             levels, own = levels[:-1], own[:-1]
         elif not own.all():
