@@ -1,6 +1,7 @@
 """Many independent pieces of work on local processes or on a Dask cluster.
 
-Local processes are spawned, not forked: a fork copies locks that numerical libraries hold, and hangs.  So
+Local processes are not forked from this one: a fork copies locks that numerical libraries hold, and hangs.
+They are spawned, on Linux forked from a server that was spawned and has only imported, once for all.  So
 the function must be importable (defined at the top of a module) and its items must pickle; only the user's
 own processes read them, those that this one started or those of the cluster that was named.  Results come
 back in the order of the items, whatever the order of finishing.  What a killed process had in hand is done
@@ -18,13 +19,14 @@ import ctypes
 import multiprocessing
 import os
 import sys
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from functools import cache, partial
 from importlib.metadata import version
 from importlib.util import find_spec
+from multiprocessing import forkserver
 from typing import Any, TypeAlias, TypeVar
 from warnings import catch_warnings, simplefilter
 
@@ -173,8 +175,30 @@ def _on_processes(
                 pool.shutdown(wait=True)
 
 
+def begin_processes(workers: Workers, modules: Sequence[str]) -> None:
+    """Begin to import ``modules`` for local processes, beside what this one imports meanwhile."""
+    if sys.platform == "linux" and not isinstance(workers, str) and min(workers, os.cpu_count() or 1) > 1:
+        _serving(modules)
+
+
+def _serving(modules: Sequence[str]) -> None:
+    """Start the server that processes are forked from, if there is none, with these modules."""
+    multiprocessing.set_forkserver_preload(list(modules))
+    safe = os.environ.get("PYTHONSAFEPATH")
+    os.environ["PYTHONSAFEPATH"] = "1"  # modules are ours, not those of the folder it happens to run in
+    try:
+        forkserver.ensure_running()
+    finally:
+        del os.environ["PYTHONSAFEPATH"]
+        if safe is not None:
+            os.environ["PYTHONSAFEPATH"] = safe
+
+
 def _processes(n: int) -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(n, mp_context=multiprocessing.get_context("spawn"))
+    if sys.platform != "linux":  # macOS has libraries that fail after any fork
+        return ProcessPoolExecutor(n, mp_context=multiprocessing.get_context("spawn"))
+    _serving(sorted(name for name in sys.modules if name.startswith("thermogrip.")))
+    return ProcessPoolExecutor(n, mp_context=multiprocessing.get_context("forkserver"))
 
 
 class Replaced:

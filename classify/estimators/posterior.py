@@ -262,12 +262,11 @@ class PosteriorClassifier(GraspClassifier):
         """Return what single touches of one record decide; the odds where a free effusivity is asked for."""
         levels, u, noise = self._levels(), np.log(self.prior_unknown), whitened(self.device_, data)
         own = np.array([level.device is self.device_ for level in levels])
-        each, modes = _of_levels(
-            [level for level in levels if level.device is self.device_], data, names, noise
-        )
-        if not own.all() and _unlikely(levels, data, names, each, modes[0]):
+        n_own = int(own.sum())
+        each, modes = _of_levels(levels[:n_own], data, names, noise)
+        if n_own < own.size and _unlikely(levels, data, names, each, modes[0]):
             levels, own = levels[:-1], own[:-1]
-        elif not own.all():
+        elif n_own < own.size:
             each = np.concatenate([each, _of_levels(levels[-1:], data, names)[0]])
         prior = np.log([level.prior for level in levels])[:, None]
         known, free = logsumexp(each, axis=2) - np.log(len(names)), np.full(each.shape[:2], -np.inf)
