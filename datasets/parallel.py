@@ -18,6 +18,7 @@ import asyncio
 import ctypes
 import multiprocessing
 import os
+import signal
 import sys
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
@@ -26,7 +27,7 @@ from contextlib import closing, contextmanager
 from functools import cache, partial
 from importlib.metadata import version
 from importlib.util import find_spec
-from multiprocessing import forkserver
+from multiprocessing import forkserver, resource_tracker
 from typing import Any, TypeAlias, TypeVar
 from warnings import catch_warnings, simplefilter
 
@@ -186,9 +187,12 @@ def _serving(modules: Sequence[str]) -> None:
     multiprocessing.set_forkserver_preload(list(modules))
     safe = os.environ.get("PYTHONSAFEPATH")
     os.environ["PYTHONSAFEPATH"] = "1"  # modules are ours, not those of the folder it happens to run in
+    resource_tracker.ensure_running()  # which leaves SIGINT unblocked
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # a Ctrl-C is for its processes
     try:
         forkserver.ensure_running()
     finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
         del os.environ["PYTHONSAFEPATH"]
         if safe is not None:
             os.environ["PYTHONSAFEPATH"] = safe
@@ -198,7 +202,16 @@ def _processes(n: int) -> ProcessPoolExecutor:
     if sys.platform != "linux":  # macOS has libraries that fail after any fork
         return ProcessPoolExecutor(n, mp_context=multiprocessing.get_context("spawn"))
     _serving(sorted(name for name in sys.modules if name.startswith("thermogrip.")))
-    return ProcessPoolExecutor(n, mp_context=multiprocessing.get_context("forkserver"))
+    ends = signal.getsignal(signal.SIGINT) is not signal.SIG_IGN  # by Ctrl-C: not under nohup
+    context = multiprocessing.get_context("forkserver")
+    return ProcessPoolExecutor(n, mp_context=context, initializer=_unblocked if ends else None)
+
+
+def _unblocked() -> None:
+    """Let Ctrl-C end what a process does, which the server has blocked; one from before is forgotten."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 class Replaced:
