@@ -496,8 +496,8 @@ def _moved(here: _Search, there: Array, stale: Mask, step: int) -> _Search:
     if step == 0:
         return new._replace(damping=0.1 * damping, part=np.ones(tried.size))
     better = (tried < here.cost) | here.stale
-    bent = (here.slope_gain + tried - here.cost) / np.maximum(here.bend, 1e-300)
-    bent = np.where(here.stale, 0.0, bent)
+    bend = np.where(here.stale, 1.0, np.maximum(here.bend, 1e-300))  # of no step none
+    bent = np.where(here.stale, 0.0, (here.slope_gain + tried - here.cost) / bend)
     far = bent > _FAR
     damping = np.where(better, np.maximum(damping * 0.1, 1e-9), damping * 10.0)
     damping = np.where(far, np.maximum(damping, 0.1 * np.minimum(bent, 1e6)), damping)
