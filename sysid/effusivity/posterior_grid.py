@@ -590,8 +590,9 @@ def _evaluate(
 
 def _between(x: Array, knots: Array, values: Array) -> Array:
     """Return ``values`` (n, n_knot, 7) at ``knots`` (n, n_knot), along which these rise, at ``x`` (n, m): by
-    the cubic of the four around, beyond the ends by the parabola of the next three, in exp(-x / 2): what a
-    touch says goes with 1 / e where e is large, with ln e where it is small."""
+    the cubic of the four around, beyond the ends by the parabola of the next three, in exp(-x / 2) (what a
+    touch says goes with 1 / e where e is large, with ln e where it is small), as far from them as they are
+    from each other at most."""
     n_near = 4
     row, inside = np.arange(len(x))[:, None], (x > knots[:, :1]) & (x < knots[:, -1:])
     first = (knots[:, None, :] <= x[:, :, None]).sum(axis=2) - n_near // 2
@@ -609,7 +610,8 @@ def _between(x: Array, knots: Array, values: Array) -> Array:
                 weight *= np.where(inside | (out != k), one, 1.0)
         weight = np.where(inside | (out != j), weight, 0.0)
         total += weight[:, :, None] * values[row, at[:, :, j]]
-    return total
+    low, high = values.min(axis=1, keepdims=True), values.max(axis=1, keepdims=True)
+    return np.asarray(np.clip(total, 2 * low - high, 2 * high - low))
 
 
 def refined(x: Array, value: Array, widen: float, n_point: int) -> Array:

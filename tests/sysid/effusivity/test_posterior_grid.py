@@ -365,7 +365,13 @@ def test_what_goes_with_one_over_the_root_of_e_is_met_between_points_and_beyond(
     got = posterior_grid._between(inside, knots, curve(knots, 3))
     np.testing.assert_allclose(got, curve(inside, 3), rtol=1e-7)
     got = posterior_grid._between(beyond, knots, curve(knots, 2))
-    np.testing.assert_allclose(got, curve(beyond, 2), rtol=1e-6)
+    ends = curve(knots, 2).min(axis=1, keepdims=True), curve(knots, 2).max(axis=1, keepdims=True)
+    far = 2 * ends[0] - ends[1], 2 * ends[1] - ends[0]
+    np.testing.assert_allclose(got, np.clip(curve(beyond, 2), *far), rtol=1e-6)
+    assert (got == np.clip(got, *far)).all()
+    assert (got[:, 1] != far[0][:, 0]).all()
+    farther = posterior_grid._between(beyond - 3.0, knots, curve(knots, 2))[:, 0]
+    assert ((farther == far[0][:, 0]) | (farther == far[1][:, 0])).all()
 
 
 def test_points_are_moved_a_little_to_places_that_other_touches_have():
