@@ -27,7 +27,6 @@ from contextlib import closing, contextmanager
 from functools import cache, partial
 from importlib.metadata import version
 from importlib.util import find_spec
-from multiprocessing import forkserver, resource_tracker
 from typing import Any, TypeAlias, TypeVar
 from warnings import catch_warnings, simplefilter
 
@@ -184,6 +183,8 @@ def begin_processes(workers: Workers, modules: Sequence[str]) -> None:
 
 def _serving(modules: Sequence[str]) -> None:
     """Start the server that processes are forked from, if there is none, with these modules."""
+    from multiprocessing import forkserver, resource_tracker  # Windows may have neither
+
     multiprocessing.set_forkserver_preload(list(modules))
     safe = os.environ.get("PYTHONSAFEPATH")
     os.environ["PYTHONSAFEPATH"] = "1"  # modules are ours, not those of the folder it happens to run in
