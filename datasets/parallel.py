@@ -1,6 +1,7 @@
 """Many independent pieces of work on local processes or on a Dask cluster.
 
-Local processes are spawned, not forked: a fork copies locks that numerical libraries hold, and hangs.  So
+Local processes are not forked from this one: a fork copies locks that numerical libraries hold, and hangs.
+They are spawned, on Linux forked from a server that was spawned and has only imported, once for all.  So
 the function must be importable (defined at the top of a module) and its items must pickle; only the user's
 own processes read them, those that this one started or those of the cluster that was named.  Results come
 back in the order of the items, whatever the order of finishing.  What a killed process had in hand is done
@@ -17,8 +18,9 @@ import asyncio
 import ctypes
 import multiprocessing
 import os
+import signal
 import sys
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
@@ -173,8 +175,44 @@ def _on_processes(
                 pool.shutdown(wait=True)
 
 
+def begin_processes(workers: Workers, modules: Sequence[str]) -> None:
+    """Begin to import ``modules`` for local processes, beside what this one imports meanwhile."""
+    if sys.platform == "linux" and not isinstance(workers, str) and min(workers, os.cpu_count() or 1) > 1:
+        _serving(modules)
+
+
+def _serving(modules: Sequence[str]) -> None:
+    """Start the server that processes are forked from, if there is none, with these modules."""
+    from multiprocessing import forkserver, resource_tracker  # Windows may have neither
+
+    multiprocessing.set_forkserver_preload(list(modules))
+    safe = os.environ.get("PYTHONSAFEPATH")
+    os.environ["PYTHONSAFEPATH"] = "1"  # modules are ours, not those of the folder it happens to run in
+    resource_tracker.ensure_running()  # which leaves SIGINT unblocked
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # a Ctrl-C is for its processes
+    try:
+        forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        del os.environ["PYTHONSAFEPATH"]
+        if safe is not None:
+            os.environ["PYTHONSAFEPATH"] = safe
+
+
 def _processes(n: int) -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(n, mp_context=multiprocessing.get_context("spawn"))
+    if sys.platform != "linux":  # macOS has libraries that fail after any fork
+        return ProcessPoolExecutor(n, mp_context=multiprocessing.get_context("spawn"))
+    _serving(sorted(name for name in sys.modules if name.startswith("thermogrip.")))
+    ends = signal.getsignal(signal.SIGINT) is not signal.SIG_IGN  # by Ctrl-C: not under nohup
+    context = multiprocessing.get_context("forkserver")
+    return ProcessPoolExecutor(n, mp_context=context, initializer=_unblocked if ends else None)
+
+
+def _unblocked() -> None:
+    """Let Ctrl-C end what a process does, which the server has blocked; one from before is forgotten."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 class Replaced:

@@ -56,9 +56,9 @@ from thermogrip.classify.estimators.base import (
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.materials import load_materials
 from thermogrip.datasets.schema import Grasps, has_touch_groups, label_values
-from thermogrip.sysid.effusivity.data import Touches, touches, with_tables
+from thermogrip.sysid.effusivity.data import Touches, Whitened, touches, with_tables
 from thermogrip.sysid.effusivity.gripper_model import GripperModel, GripperSpread, another_gripper
-from thermogrip.sysid.effusivity.laplace_approximation import fit_candidates
+from thermogrip.sysid.effusivity.laplace_approximation import fit_candidates, whitened
 from thermogrip.sysid.effusivity.multi_touch import (
     Coupling,
     free_touch_fit,
@@ -260,19 +260,22 @@ class PosteriorClassifier(GraspClassifier):
 
     def _decided(self, data: Touches, names: Sequence[str], unknown: bool = False) -> _Decided:
         """Return what single touches of one record decide; the odds where a free effusivity is asked for."""
-        levels, u = self._levels(), np.log(self.prior_unknown)
-        if levels[-1].device is not self.device_ and _unlikely(levels, data, names):
-            levels = levels[:-1]
-        each, modes = _of_levels(levels, data, names)
+        levels, u, noise = self._levels(), np.log(self.prior_unknown), whitened(self.device_, data)
+        own = np.array([level.device is self.device_ for level in levels])
+        n_own = int(own.sum())
+        each, modes = _of_levels(levels[:n_own], data, names, noise)
+        if n_own < own.size and _unlikely(levels, data, names, each, modes[0]):
+            levels, own = levels[:-1], own[:-1]
+        elif n_own < own.size:
+            each = np.concatenate([each, _of_levels(levels[-1:], data, names)[0]])
         prior = np.log([level.prior for level in levels])[:, None]
         known, free = logsumexp(each, axis=2) - np.log(len(names)), np.full(each.shape[:2], -np.inf)
         sure = _share(levels, each)[0] > _SURE
-        own = np.array([level.device is self.device_ for level in levels])
         if unknown or not sure:
             # the level and the candidate that explain each touch best
             best = np.concatenate(each[own], axis=1).argmax(axis=1)
-            near = np.concatenate(modes[own], axis=1)[np.arange(best.size), best]
-            free[own] = free_evidence(self.device_, data, near)
+            near = np.concatenate(modes, axis=1)[np.arange(best.size), best]
+            free[own] = free_evidence(self.device_, data, near, noise=noise)
         explained = known if sure else np.logaddexp(np.log(1 - self.prior_unknown) + known, u + free)
         others = explained.sum(axis=1, keepdims=True) - explained
         weight = normalised((prior + others).T).T
@@ -360,28 +363,37 @@ class PosteriorClassifier(GraspClassifier):
         self.coupling_ = Coupling.load(file) if file.exists() else None
 
 
-def _of_levels(levels: Sequence[_Level], data: Touches, names: Sequence[str]) -> tuple[Floats, Floats]:
-    """Return the log evidence of each candidate for each touch on each level, (n_level, n, n_name), and the
-    nuisances there, (n_level, n, n_name, 7)."""
+def _of_levels(
+    levels: Sequence[_Level], data: Touches, names: Sequence[str], noise: Whitened | None = None,
+    start: Floats | None = None,
+) -> tuple[Floats, Floats]:  # fmt: skip
+    """Return the log evidence of each candidate for each touch on each level of one gripper, (n_level, n,
+    n_name), and the nuisances there, (n_level, n, n_name, 7), from those of ``start`` on."""
     found, modes = list[Floats](), list[Floats]()
     for level in levels:
         # what the first level found is near what its gripper finds with another block
-        start = modes[0] if modes and level.device is levels[0].device else None
-        mode, *_ = fit_candidates(level.device, data, names, level.finish, start=start)
+        begin = modes[0] if modes else start
+        mode, *_ = fit_candidates(level.device, data, names, level.finish, start=begin, noise=noise)
         found.append(mode.log_evidence.reshape(-1, len(names)))
         modes.append(mode.u.reshape(*found[0].shape, -1))
     return np.stack(found), np.stack(modes)
 
 
-def _unlikely(levels: Sequence[_Level], data: Touches, names: Sequence[str]) -> bool:
+def _unlikely(
+    levels: Sequence[_Level], data: Touches, names: Sequence[str], own: Floats, modes: Floats
+) -> bool:
     """Return whether some grasps, one after another, leave nothing of the last level, which takes 20 times as
-    long to ask."""
+    long to ask; ``own`` is the evidence of the others, ``modes`` are those of the first."""
     if data.level.size <= _ASKED:
         return False
     found, share = list[Floats](), 1.0
-    for i in np.unique(np.linspace(0, data.level.size - 1, _ASKED).astype(int)):
+    asked = np.unique(np.linspace(0, data.level.size - 1, _ASKED).astype(int))
+    # a grasp that moved the temperature far tells most of a gripper
+    for i in asked[np.argsort(-data.excursion[asked], kind="stable")]:
         if share > _HARDLY:
-            found.append(_of_levels(levels, data.take(np.array([i])), names)[0])
+            at = np.array([i])
+            theirs = _of_levels(levels[-1:], data.take(at), names, start=modes[at])[0]
+            found.append(np.concatenate([own[:, at], theirs]))
             share = float(_share(levels, np.concatenate(found, axis=1))[-1])
     return share < 1 - _SURE
 

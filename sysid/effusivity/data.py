@@ -328,6 +328,14 @@ class Whitener(NamedTuple):
 Whitened: TypeAlias = tuple[Any, Array]
 
 
+def taken(noise: Whitened, at: NDArray[np.int64]) -> Whitened:
+    """Return what whitens some of the touches."""
+    matrix, log_det = noise
+    if isinstance(matrix, Whitener):
+        return Whitener(matrix.kinds, matrix.kind[at], matrix.scale[at]), log_det[at]
+    return matrix[at], log_det[at]
+
+
 def whiteners(data: Touches, noise: Noise) -> tuple[Whitener, Array]:
     r"""Return :func:`whiten`, with one matrix for all touches with the same samples, where they are many.
 

@@ -158,13 +158,15 @@ def pairs_asked(
 def find_modes(
     stack: Stack, data: Touches, row: NDArray[np.int64], whitener: Whitened, prior: Prior, *,
     start: Array | None = None, max_steps: int = 20, beyond: Array | None = None, rivals: bool = False,
+    rough: float = 0.0,
 ) -> Mode:  # fmt: skip
     """Return mode, covariance and log evidence of every pair by damped Gauss-Newton.
 
     Pair p is touch ``row[p]`` under row p of ``prior``; ``whitener`` is what
     :func:`~thermogrip.sysid.effusivity.data.whiten` returns for ``data``.  It starts at the prior's mean with
     the level as measured, or at ``start`` (n_pair, 7); a pair that has not settled within ``max_steps`` is
-    hopeless in practice, and where pairs of one touch are ``rivals`` one far behind the best is left early.
+    hopeless in practice, and where pairs of one touch are ``rivals`` one far behind the best is left early,
+    or roughly found (``rough``, :func:`~thermogrip.sysid.effusivity.mode_kernel.modes`).
     """
     from thermogrip.sysid.effusivity.mode_kernel import modes
 
@@ -178,7 +180,9 @@ def find_modes(
         pairs_asked(stack, nodes_for(data), data, row, beyond, tabled=True),
         np.stack([prior.mean, prior.sd, dof], axis=1),
     )
-    covariance, objective, misfit, settled = modes(asked, w_matrix, law, u, max_steps, rivals=rivals)
+    covariance, objective, misfit, settled = modes(
+        asked, w_matrix, law, u, max_steps, rivals=rivals, rough=rough
+    )
     evidence = -0.5 * (objective + log_det[row]) + peak_ratio(dof, vary)
     return Mode(u, covariance, evidence, settled, misfit)
 
@@ -444,6 +448,10 @@ class _Some(NamedTuple):
         behind = cost - decrease - self.whole.best[self.whole.row[self.at[at]]]
         return np.asarray((behind < 2 * _HOPELESS) | (gain > behind))
 
+    def slack(self, at: NDArray[np.int64]) -> float:
+        """Return how many times the least decrease a last step may gain."""
+        return 1.0
+
 
 def _able(numbers: Array) -> Mask:
     """Return which numbers (n, n_number) are those of a stack."""
@@ -575,7 +583,7 @@ def prior_of(gripper: GripperModel, data: Touches, hypotheses: Hypotheses) -> Pr
 def fit_pairs(
     gripper: GripperModel, data: Touches, row: NDArray[np.int64], hypotheses: Hypotheses, *,
     start: Array | None = None, max_steps: int = 20, noise: Whitened | None = None,
-    prior: Prior | None = None, rivals: bool = False,
+    prior: Prior | None = None, rivals: bool = False, rough: float = 0.0,
 ) -> Mode:  # fmt: skip
     """Return the modes of pairs, hypothesis i against touch ``row[i]``, integrated over an uncertain
     gripper's parameters, a second sensor used; ``noise`` and ``prior`` are
@@ -583,7 +591,7 @@ def fit_pairs(
     prior = prior_of(gripper, data.known(row), hypotheses) if prior is None else prior
     # what else counts may bring another one up
     rivals = rivals and gripper.discrepancy is None and (gripper.second is None or data.second is None)
-    mode = _own_modes(gripper, data, row, hypotheses, prior, start, max_steps, noise, rivals)
+    mode = _own_modes(gripper, data, row, hypotheses, prior, start, max_steps, noise, rivals, rough)
     mode = with_second(gripper, data, row, hypotheses, prior, mode)
     n = (data.count[row] > 0).sum(axis=1)
     if gripper.second is not None and data.second is not None:
@@ -618,7 +626,7 @@ def second_modes(
     own = prior_of(second, data.second.known(row), others)
     begin = own.mean.copy()
     begin[:, LEVEL], begin[:, T_OBJECT] = data.second.level[row], mode.u[:, T_OBJECT]
-    return _own_modes(second, data.second, row, others, own, begin, 20, None, False), own
+    return _own_modes(second, data.second, row, others, own, begin, 20, None), own
 
 
 def whitened(gripper: GripperModel, data: Touches) -> Whitened:
@@ -629,7 +637,7 @@ def whitened(gripper: GripperModel, data: Touches) -> Whitened:
 
 def _own_modes(
     gripper: GripperModel, data: Touches, row: NDArray[np.int64], hypotheses: Hypotheses, prior: Prior,
-    start: Array | None, max_steps: int, noise: Whitened | None, rivals: bool,
+    start: Array | None, max_steps: int, noise: Whitened | None, rivals: bool = False, rough: float = 0.0,
 ) -> Mode:  # fmt: skip
     """Return the modes of pairs by the first sensor alone."""
     noise = whitened(gripper, data) if noise is None else noise
@@ -640,8 +648,9 @@ def _own_modes(
         )
     beyond = None if gripper.discrepancy is None else gripper.beyond(data.t[row], prior.mean[:, EFFUSIVITY])
     return find_modes(
-        gripper.stack, data, row, noise, prior, start=start, max_steps=max_steps, beyond=beyond, rivals=rivals
-    )
+        gripper.stack, data, row, noise, prior, start=start, max_steps=max_steps, beyond=beyond,
+        rivals=rivals, rough=rough,
+    )  # fmt: skip
 
 
 def hypotheses_of_second(gripper: GripperModel, second: GripperModel, one: Hypotheses) -> Hypotheses:
@@ -794,10 +803,10 @@ def _log_normal(x: Array, variance: Array) -> Array:
 
 def fit_candidates(
     gripper: GripperModel, data: Touches, candidates: Sequence[str | Material], finish: str = "known", *,
-    start: Array | None = None,
+    start: Array | None = None, noise: Whitened | None = None,
 ) -> tuple[Mode, Prior, NDArray[np.int64]]:  # fmt: skip
     """Return modes of every touch under every candidate, (n m,) rows, from nuisances ``start`` (n, m, 7), and
-    the prior and the touch of each."""
+    the prior and the touch of each; ``noise`` is :func:`whitened` where a caller has it."""
     one = material_hypotheses(gripper, candidates, finish)
     n, m = data.level.size, len(candidates)
     row = np.repeat(np.arange(n), m)
@@ -805,7 +814,7 @@ def fit_candidates(
     begin = None if start is None else start.reshape(n * m, -1)
     each = data.known(row)
     prior = prior_of(gripper, each, hypotheses)
-    mode = fit_pairs(gripper, data, row, hypotheses, start=begin, prior=prior, rivals=True)
+    mode = fit_pairs(gripper, data, row, hypotheses, start=begin, noise=noise, prior=prior, rivals=True)
     return doubted(gripper, each, prior, mode), prior, row
 
 

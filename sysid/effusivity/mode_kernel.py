@@ -288,9 +288,9 @@ def squares(whitener: Any, row: NDArray[np.int64], columns: Array) -> Array:
 def _squares(matrix: Array, columns: Array, scale: Array | None) -> Array:
     # one product of large matrices is quicker than many of few rows
     white = np.matmul(columns.reshape(-1, columns.shape[2]), matrix.T).reshape(columns.shape)
-    if scale is not None:
-        white *= scale[:, None, :]
-    return np.asarray(np.matmul(white, white.transpose(0, 2, 1)))
+    # of two arrays: for one and its own transpose NumPy takes a slower way
+    twice = white.copy() if scale is None else white * np.square(scale)[:, None, :]
+    return np.asarray(np.matmul(white, twice.transpose(0, 2, 1)))
 
 
 class Penalty(NamedTuple):
@@ -383,6 +383,10 @@ class Pairs(Protocol):
         """Return which are worth another step beside the others; None for all."""
         ...
 
+    def slack(self, at: NDArray[np.int64]) -> Array | float:
+        """Return how many times the least decrease a last step may gain, once :meth:`hopeful` was asked."""
+        ...
+
 
 class Found(NamedTuple):
     """Where a search ended: points, products and -2 ln posterior there, and where it settled."""
@@ -416,11 +420,11 @@ def search(
         curved[:, diagonal, diagonal] += here.bound
         last = np.linalg.solve(curved, rhs[:, :, None])[:, :, 0]
         decrease = (last * rhs).sum(axis=1)
-        near = (decrease < least) & ~here.stale
+        hopeful = pairs.hopeful(step, here.at, here.cost, decrease)
+        near = (decrease < least * pairs.slack(here.at)) & ~here.stale
         left = ~near & (here.damping <= 1e9)
         if step == max_steps:
             near[:], left[:] = False, False
-        hopeful = pairs.hopeful(step, here.at, here.cost, decrease)
         if hopeful is not None:
             left &= hopeful
         if not left.all():
@@ -492,8 +496,8 @@ def _moved(here: _Search, there: Array, stale: Mask, step: int) -> _Search:
     if step == 0:
         return new._replace(damping=0.1 * damping, part=np.ones(tried.size))
     better = (tried < here.cost) | here.stale
-    bent = (here.slope_gain + tried - here.cost) / np.maximum(here.bend, 1e-300)
-    bent = np.where(here.stale, 0.0, bent)
+    bend = np.where(here.stale, 1.0, np.maximum(here.bend, 1e-300))  # of no step none
+    bent = np.where(here.stale, 0.0, (here.slope_gain + tried - here.cost) / bend)
     far = bent > _FAR
     damping = np.where(better, np.maximum(damping * 0.1, 1e-9), damping * 10.0)
     damping = np.where(far, np.maximum(damping, 0.1 * np.minimum(bent, 1e6)), damping)
@@ -516,7 +520,9 @@ class _Touched(NamedTuple):
     whitener: Any
     sd: Array
     rivals: bool
+    rough: float  # nats behind the best of its touch, up to which a pair may be the rougher the farther it is
     ahead: Array  # (n,), what the next step should come to
+    best: Array  # (n_touch,), of that
 
     def products(self, at: NDArray[np.int64], u: Array, *, first: bool) -> Array:
         """Return the products of some pairs, so many at once that they stay in the processor's cache."""
@@ -536,28 +542,38 @@ class _Touched(NamedTuple):
         """Return which are worth another step beside the best of their touch."""
         if not self.rivals:
             return None
-        row, data = self.asked.row, self.asked.data
-        best, stated = np.full(data.level.size, np.inf), np.isfinite(data.t_object)
-        self.ahead[at] = cost - decrease
+        row, stated, best = self.asked.row, np.isfinite(self.asked.data.t_object), self.best
+        self.ahead[at], best[:] = cost - decrease, np.inf
         np.minimum.at(best, row, self.ahead)
         limit = np.where(stated, _HOPELESS_STATED[step], _HOPELESS.get(step, np.inf))
         limit = limit + _UNEXPLAINED * np.maximum(best, 0.0)
         return np.asarray(self.ahead[at] < (best + limit)[row[at]])
 
+    def slack(self, at: NDArray[np.int64]) -> Array | float:
+        """Return how many times the least decrease a last step may gain: where pairs are summed one counts
+        the less the farther it is behind."""
+        if not (self.rivals and self.rough):
+            return 1.0
+        behind = 0.5 * (self.ahead[at] - self.best[self.asked.row[at]])
+        return np.asarray(np.exp(np.minimum(behind, self.rough)))
+
 
 def modes(
-    asked: Asked, whitener: Any, law: Array, u: Array, max_steps: int, *, rivals: bool = False
-) -> tuple[Array, Array, Array, Mask]:
+    asked: Asked, whitener: Any, law: Array, u: Array, max_steps: int, *, rivals: bool = False,
+    rough: float = 0.0,
+) -> tuple[Array, Array, Array, Mask]:  # fmt: skip
     """Move ``u`` (n, 7) to the mode of each pair; return covariance (n, 7, 7), objective, misfit and where
     the search settled.
 
     The prior of each is its ``law`` (n, 3, 7): mean, sd, degrees of freedom.  The objective is -2 ln
     (likelihood x prior density relative to its peak) + ln det of its curvature in units of sd.  Where pairs
-    of one row are ``rivals``, one that is hopeless beside the best of them is left there, unsettled.
+    of one row are ``rivals``, one that is hopeless beside the best of them is left there, unsettled, and one
+    k nats behind may be exp(k) times as far from its mode, k up to ``rough``.
     """
     (mean, sd, dof), n = law.transpose(1, 0, 2), len(u)
     own = Law.of(mean, sd, dof)
-    found = search(_Touched(asked, whitener, sd, rivals, np.full(n, np.inf)), own, sd, u, max_steps)
+    ahead, best = np.full(n, np.inf), np.full(asked.data.level.size, np.inf)
+    found = search(_Touched(asked, whitener, sd, rivals, rough, ahead, best), own, sd, u, max_steps)
     u[:] = found.u
     inverse, log_det = curvature(found.matrix, own.penalty(u).own)
     covariance = inverse * (sd[:, :, None] * sd[:, None, :])

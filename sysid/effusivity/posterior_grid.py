@@ -34,7 +34,7 @@ from scipy.special import gammaln, logsumexp, ndtr
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.materials import load_materials
-from thermogrip.sysid.effusivity.data import Touches, Whitened
+from thermogrip.sysid.effusivity.data import Touches, Whitened, taken
 from thermogrip.sysid.effusivity.gripper_model import GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import (
     BUILD_UP,
@@ -208,13 +208,15 @@ class GridPosterior(NamedTuple):
 
 
 class _Fitted(NamedTuple):
-    """Points ``x`` (n, m), log evidence, modes (n, m, 7), their covariances and whether they settled."""
+    """Points ``x`` (n, m), log evidence, modes (n, m, 7), their covariances, whether they settled, and where
+    they are if no stated temperature is a slip, from which neighbours start."""
 
     x: Array
     value: Array
     u: Array
     covariance: Array
     settled: Mask
+    plain: Array
 
 
 def grid_posteriors(gripper: GripperModel, data: Touches) -> list[GridPosterior]:
@@ -228,42 +230,50 @@ def grid_posteriors(gripper: GripperModel, data: Touches) -> list[GridPosterior]
     return posteriors_of(found.x, value, found.u[:, :, T_OBJECT], sd, found.u[:, :, H])
 
 
-def free_evidence(gripper: GripperModel, data: Touches, near: Array | None = None) -> Array:
-    """Return the log evidence of a free effusivity for each touch, (n,), as :func:`grid_posteriors` do.
+def free_evidence(
+    gripper: GripperModel, data: Touches, near: Array | None = None, *, noise: Whitened | None = None
+) -> Array:
+    """Return the log evidence of a free effusivity for each touch, (n,), as :func:`grid_posteriors` do;
+    ``noise`` is :func:`whitened` where a caller has it.
 
     Where the modes ``near`` (n, 7) of a likely candidate are given and the object's temperature is stated,
     the density is looked for from there (:func:`_evidence_near`)."""
-    out = np.full(data.level.size, np.nan)
+    out, noise = np.full(data.level.size, np.nan), whitened(gripper, data) if noise is None else noise
     by_one = gripper.second is None or data.second is None
     if near is not None and by_one and gripper.discrepancy is None and not gripper.uncertain:
         at = np.flatnonzero(np.isfinite(data.t_object))
         if at.size:
-            out[at] = _evidence_near(gripper, data if at.size == out.size else data.take(at), near[at])
+            some = data if at.size == out.size else data.take(at)
+            out[at] = _evidence_near(gripper, some, near[at], taken(noise, at))
     rest = np.flatnonzero(np.isnan(out))
     if rest.size:
         some = data if rest.size == out.size else data.take(rest)
-        found = _fitted(gripper, some, whitened(gripper, some))
+        found = _fitted(gripper, some, taken(noise, rest))
         out[rest] = log_total(found.x, found.value) - np.log(LN_E_RANGE[1] - LN_E_RANGE[0])
     return out
 
 
 _AROUND, _SIDE = 9, 4.0  # points about the density's place, and how many of its sds to either side
+_INNER = [1, 3, 4, 5, 7]  # of these: the others start between them
 _ANYWHERE = 1.0  # of ln e about a candidate's, where its density is looked for
 _ENDED, _STEEP = 7.0, 3.0  # nats below the best where a density may end; and that it may fall beside the best
+_FEWEST = 7  # points of a density that have not ended
 _NARROWEST = 1e-3  # of ln e, between the ends of the first points: a density may lie at an end of the range
 _SAME = 1e-9  # of ln e: an end that is so near that of the range is there
 _MORE, _ROUNDS = 4, 4  # points at a time, and how often, until that is so
 _SURE = 0.008  # nats by which two kinds of cubics may differ
 _HALVED = 8  # cells that are halved where they differ by more
+_ROUGH_TO = 3.0  # nats behind the best up to which points are found the more roughly
 
 
-def _evidence_near(gripper: GripperModel, data: Touches, near: Array) -> Array:
+def _evidence_near(gripper: GripperModel, data: Touches, near: Array, noise: Whitened) -> Array:
     """Return the log evidence of a free effusivity for each touch of an object of stated temperature, (n,),
     NaN where that is not sure.
 
     One search with ln e free finds where the density is, how wide, and how the other unknowns go along;
-    points about it start there, and more follow where it has not ended, or falls steeply between points."""
-    row, noise = np.arange(data.level.size), whitened(gripper, data)
+    points about it start there, others between these, and more follow where it has not ended, or falls
+    steeply between points."""
+    row = np.arange(data.level.size)
     lowest, highest = LN_E_RANGE
     free = free_hypotheses(gripper, np.clip(near[:, EFFUSIVITY], lowest, highest))
     law = prior_of(gripper, data, free._replace(ln_e_sd=np.full(row.size, _ANYWHERE)))
@@ -271,29 +281,44 @@ def _evidence_near(gripper: GripperModel, data: Touches, near: Array) -> Array:
     place, spread = mode.u[:, EFFUSIVITY], np.sqrt(mode.covariance[:, EFFUSIVITY, EFFUSIVITY])
     low = np.clip(place - _SIDE * spread, lowest, highest - _NARROWEST)
     high = np.clip(place + _SIDE * spread, low + _NARROWEST, highest)
-    grid = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, _AROUND)
+    grid = _rounded(low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, _AROUND))
     along = mode.covariance[:, :, EFFUSIVITY] / spread[:, None] ** 2
     start = mode.u[:, None] + along[:, None] * (grid - place[:, None])[:, :, None]
-    found = _evaluate(gripper, data, noise, grid, start)
-    out, at, some = np.full(row.size, np.nan), row, data
+    outer = np.delete(np.arange(_AROUND), _INNER)
+    found = _evaluate(gripper, data, noise, grid[:, _INNER], start[:, _INNER], _ROUGH_TO)
+    found = _beside(gripper, data, noise, grid[:, outer], found, _ROUGH_TO)
+    out, at, some, white = np.full(row.size, np.nan), row, data, noise
     for again in range(_ROUNDS + 1):
         wanted = [_more(x, value) for x, value in zip(found.x, found.value)]
         done = np.array([more is None for more in wanted])
         if done.any():
-            ended = _Fitted(*(part[done] for part in found))
-            out[at[done]] = _halved_total(gripper, some.take(np.flatnonzero(done)), ended)
+            ended, which = _Fitted(*(part[done] for part in found)), np.flatnonzero(done)
+            out[at[done]] = _halved_total(gripper, some.take(which), taken(white, which), ended)
         if done.all() or again == _ROUNDS:
             break
         at, found = at[~done], _Fitted(*(part[~done] for part in found))
-        some, grid = data.take(at), np.stack([more for more in wanted if more is not None])
-        more = _evaluate(gripper, some, whitened(gripper, some), grid, _between(grid, found.x, found.u))
-        found = _joined(found, more)
+        some, white = data.take(at), taken(noise, at)
+        grid = _rounded(np.stack([more for more in wanted if more is not None]), found.x)
+        found = _beside(gripper, some, white, grid, found, _ROUGH_TO)
     return np.asarray(out - np.log(highest - lowest))
+
+
+def _rounded(grid: Array, beside: Array | None = None) -> Array:
+    """Return points (n, m) moved by a sixteenth of the least distance between them, or to those ``beside``,
+    or less, to multiples of a power of two, which many touches have in common: what a table sums along ln e
+    is the same there.  Those at the ends of the range stay."""
+    least = np.diff(grid).min(axis=1, keepdims=True)
+    if beside is not None:
+        least = np.minimum(least, np.abs(grid[:, :, None] - beside[:, None]).min(axis=(1, 2))[:, None])
+    unit = np.exp2(np.floor(np.log2(0.125 * least)))
+    lowest, highest = LN_E_RANGE
+    inside = (grid > lowest + unit) & (grid < highest - unit)
+    return np.asarray(np.where(inside, np.round(grid / unit) * unit, grid))
 
 
 def _more(x: Array, value: Array) -> Array | None:
     """Return points that a density lacks of which ``value`` is the logarithm at rising ``x``: beyond an end
-    where it has not ended, or beside the best; None where it lacks none."""
+    where it has not ended, or beside the best where it is steep or has few; None where it lacks none."""
     best = int(value.argmax())
     left = value[0] > value[best] - _ENDED and x[0] > LN_E_RANGE[0] + _SAME
     right = value[-1] > value[best] - _ENDED and x[-1] < LN_E_RANGE[1] - _SAME
@@ -307,14 +332,14 @@ def _more(x: Array, value: Array) -> Array | None:
             end = min(x[-1] + n * 1.5 * (x[-1] - x[-2]), LN_E_RANGE[1])
             parts.append(x[-1] + (end - x[-1]) * share)
         return np.asarray(np.concatenate(parts))
-    beside = value[max(best - 1, 0) : best + 2]
-    if value[best] - beside.min() <= _STEEP:
+    beside, many = value[max(best - 1, 0) : best + 2], (value > value[best] - _ENDED).sum() >= _FEWEST
+    if many and value[best] - beside.min() <= _STEEP:
         return None
     first = min(max(best - _MORE // 2, 0), x.size - 1 - _MORE)
     return np.asarray(0.5 * (x[first : first + _MORE] + x[first + 1 : first + 1 + _MORE]))
 
 
-def _halved_total(gripper: GripperModel, data: Touches, found: _Fitted) -> Array:
+def _halved_total(gripper: GripperModel, data: Touches, noise: Whitened, found: _Fitted) -> Array:
     """Return :func:`_sure_total`, with points between those that count most where that is not sure."""
     total = _sure_total(found)
     rest = np.flatnonzero(np.isnan(total))
@@ -324,16 +349,14 @@ def _halved_total(gripper: GripperModel, data: Touches, found: _Fitted) -> Array
         cells = np.sort(np.argsort(found.value[:, :-1] + found.value[:, 1:], axis=1)[:, -_HALVED:], axis=1)
         middles = 0.5 * (found.x[:, :-1] + found.x[:, 1:])
         grid = np.take_along_axis(middles, cells, axis=1)
-        start = _between(grid, found.x, found.u)
-        more = _evaluate(gripper, some, whitened(gripper, some), grid, start)
-        total[rest] = _sure_total(_joined(found, more))
+        total[rest] = _sure_total(_beside(gripper, some, taken(noise, rest), grid, found, _ROUGH_TO))
     return total
 
 
 def _sure_total(found: _Fitted) -> Array:
     """Return the logarithms of the integrals of densities, (n,), NaN where points that count have not
     settled, or two ways of interpolation differ."""
-    x, value, _, _, settled = found
+    x, value, settled = found.x, found.value, found.settled
     counts = value > value.max(axis=1, keepdims=True) - _ENDED
     total = log_total(x, value, smooth_slopes)
     sure = (settled | ~counts).all(axis=1) & (np.abs(total - log_total(x, value)) < _SURE)
@@ -355,13 +378,16 @@ def _fitted(gripper: GripperModel, data: Touches, noise: Whitened) -> _Fitted:
     found = _evaluate(gripper, data, noise, coarse, None)
     for widen, n_point in REFINEMENTS:
         grid = np.stack([refined(x, value, widen, n_point) for x, value in zip(found.x, found.value)])
-        more = _evaluate(gripper, data, noise, grid, _between(grid, found.x, found.u))
-        found = _joined(found, more)
+        found = _beside(gripper, data, noise, grid, found)
     return found
 
 
-def _joined(found: _Fitted, more: _Fitted) -> _Fitted:
-    """Return fits at more points, along which ln e rises."""
+def _beside(
+    gripper: GripperModel, data: Touches, noise: Whitened, grid: Array, found: _Fitted, rough: float = 0.0
+) -> _Fitted:
+    """Return fits also at the points of a grid (n, k), along which ln e rises: they start between those
+    found."""
+    more = _evaluate(gripper, data, noise, grid, _between(grid, found.x, found.plain), rough)
     found = _Fitted(*(np.concatenate(pair, axis=1) for pair in zip(found, more)))
     order = np.argsort(found.x, axis=1)
     row = np.arange(len(order))[:, None]
@@ -380,7 +406,7 @@ def log_listed(ln_e: Array) -> Array:
 
 def _left_out(gripper: GripperModel, data: Touches, noise: Whitened, found: _Fitted) -> Array:
     """Return what Laplace's method left out of the points (n, m), less its mean over each posterior."""
-    x, value, u, covariance, settled = found
+    x, value, u, covariance, settled, _ = found
     out = np.zeros(x.shape)
     # for an uncertain gripper Laplace's method integrates over its parameters too, with a discrepancy the
     # evidence counts less than the integral says
@@ -543,36 +569,49 @@ def _quantiles(weight: Array, mean: Array, sd: Array, wanted: Array) -> Array:
 
 
 def _evaluate(
-    gripper: GripperModel, data: Touches, noise: Whitened, grid: Array, start: Array | None
-) -> _Fitted:
-    """Return the fits at the points of a grid (n, m)."""
+    gripper: GripperModel, data: Touches, noise: Whitened, grid: Array, start: Array | None,
+    rough: float = 0.0,
+) -> _Fitted:  # fmt: skip
+    """Return the fits at the points of a grid (n, m), as ``rough`` as
+    :func:`~thermogrip.sysid.effusivity.mode_kernel.modes` takes them."""
     n, m = grid.shape
     row = np.repeat(np.arange(n), m)
     hypotheses = free_hypotheses(gripper, grid)
     each = data.known(row)
     prior = prior_of(gripper, each, hypotheses)
     begin = None if start is None else start.reshape(n * m, -1)
-    mode = fit_pairs(gripper, data, row, hypotheses, start=begin, noise=noise, prior=prior, rivals=True)
-    mode = doubted(gripper, each, prior, mode)
-    found: list[Any] = [mode.log_evidence, mode.u, mode.covariance, mode.converged]
+    plain = fit_pairs(
+        gripper, data, row, hypotheses, start=begin, noise=noise, prior=prior, rivals=True, rough=rough
+    )
+    mode = doubted(gripper, each, prior, plain)
+    found: list[Any] = [mode.log_evidence, mode.u, mode.covariance, mode.converged, plain.u]
     return _Fitted(grid, *(part.reshape(n, m, *part.shape[1:]) for part in found))
 
 
 def _between(x: Array, knots: Array, values: Array) -> Array:
     """Return ``values`` (n, n_knot, 7) at ``knots`` (n, n_knot), along which these rise, at ``x`` (n, m): by
-    the cubic of the four around."""
-    row = np.arange(len(x))[:, None]
-    first = (knots[:, None, :] <= x[:, :, None]).sum(axis=2) - 2
-    at = np.clip(first, 0, knots.shape[1] - 4)[:, :, None] + np.arange(4)
-    near = knots[row[:, :, None], at]
+    the cubic of the four around, beyond the ends by the parabola of the next three, in exp(-x / 2) (what a
+    touch says goes with 1 / e where e is large, with ln e where it is small), as far from them as they are
+    from each other at most."""
+    n_near = 4
+    row, inside = np.arange(len(x))[:, None], (x > knots[:, :1]) & (x < knots[:, -1:])
+    first = (knots[:, None, :] <= x[:, :, None]).sum(axis=2) - n_near // 2
+    first = np.clip(first, 0, knots.shape[1] - n_near)
+    at = first[:, :, None] + np.arange(n_near)
+    place, near = np.exp(-0.5 * x), np.exp(-0.5 * knots)[row[:, :, None], at]
+    # the node that a parabola leaves out: the last one before the first knot, the first beyond the last
+    out = np.where(x <= knots[:, :1], n_near - 1, 0)
     total = np.zeros((*x.shape, values.shape[2]))
-    for j in range(4):
-        others = [k for k in range(4) if k != j]
-        weight = np.prod(
-            (x[:, :, None] - near[:, :, others]) / (near[:, :, [j]] - near[:, :, others]), axis=2
-        )
+    for j in range(n_near):
+        weight = np.ones(x.shape)
+        for k in range(n_near):
+            if k != j:
+                one = (place - near[:, :, k]) / (near[:, :, j] - near[:, :, k])
+                weight *= np.where(inside | (out != k), one, 1.0)
+        weight = np.where(inside | (out != j), weight, 0.0)
         total += weight[:, :, None] * values[row, at[:, :, j]]
-    return total
+    low, high = values.min(axis=1, keepdims=True), values.max(axis=1, keepdims=True)
+    return np.asarray(np.clip(total, 2 * low - high, 2 * high - low))
 
 
 def refined(x: Array, value: Array, widen: float, n_point: int) -> Array:

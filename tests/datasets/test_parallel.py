@@ -7,6 +7,7 @@ import math
 import os
 import re
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -60,6 +61,27 @@ def test_processes_that_are_kept_do_the_work_of_every_call_and_then_end() -> Non
 def test_processes_that_are_killed_again_and_again_are_one_line():
     with pytest.raises(UserError, match="worker processes are killed again and again"):
         run_parallel(signal.raise_signal, [signal.SIGKILL] * 3, workers=2)
+
+
+@pytest.mark.skipif(
+    sys.platform != "linux" or (os.cpu_count() or 1) < 2, reason="needs Linux and two processors"
+)
+def test_processes_begin_with_the_modules_that_were_named_and_not_with_files_of_the_folder(tmp_path):
+    (tmp_path / "colorsys.py").write_text("OWN = 1")
+    program = """if __name__ == "__main__":
+        import os, sys
+        from thermogrip.datasets.parallel import begin_processes, run_parallel
+        sys.path.remove("")
+        begin_processes(2, ["no_such_module", "colorsys"])
+        module = "__import__('sys').modules.get('colorsys')"
+        found = run_parallel(eval, [f"({module} is None, hasattr({module}, 'OWN'))"] * 2, 2)
+        print(found, "PYTHONSAFEPATH" in os.environ)
+    """
+    given = {key: value for key, value in os.environ.items() if key != "PYTHONSAFEPATH"}
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, env=given, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "[(False, False), (False, False)] False"
 
 
 @pytest.fixture

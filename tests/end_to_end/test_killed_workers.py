@@ -31,7 +31,7 @@ _OWN = re.compile(r'"(fit_s|predict_s_per_grasp|seconds|written|command)": [^\n]
 
 
 class Killer(threading.Thread):
-    """Kills the first child process that has computed for a second."""
+    """Kills the first child process that has computed for a third of a second."""
 
     def __init__(self) -> None:
         super().__init__(daemon=True)
@@ -41,7 +41,7 @@ class Killer(threading.Thread):
     def run(self) -> None:
         while not self.killed and not self.over.wait(0.02):
             for child in multiprocessing.active_children():
-                if child.pid and cpu_s(child.pid) > 1.0:
+                if child.pid and cpu_s(child.pid) > 0.3:
                     os.kill(child.pid, signal.SIGKILL)
                     self.killed = child.pid
                     break

@@ -26,6 +26,14 @@ if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
     from thermogrip.sysid.effusivity import Coupling, EffusivityRow, GripperModel
 
+# what processes that answer import; dask.array by xarray, where it is installed
+_NEEDED = (
+    "thermogrip.classify.decisions.predict",
+    "thermogrip.classify.estimators.posterior",
+    "thermogrip.sysid.contact.response_table",
+    "thermogrip.sysid.effusivity.mode_kernel",
+    "dask.array",
+)
 _BUNDLED = 40.0  # s: the longest contacts that taught the bundled gripper
 
 
@@ -141,7 +149,7 @@ def effusivity(
     """
     stated = _range(between)
     cli.new_file(out, (".csv", ".parquet"))
-    pool = cli.workers_of(workers, cluster)
+    pool = cli.workers_of(workers, cluster, *_NEEDED)
     console = Console(as_json)
     from thermogrip.datasets.partitions import Answers, sources, stamps
 
@@ -361,7 +369,7 @@ def classify(
         raise UserError(problem, hint="leave it out, or train on grasps of the new gripper")
     if out is not None:
         cli.new_file(out, (".csv", ".parquet"))
-    pool = cli.workers_of(workers, cluster)
+    pool = cli.workers_of(workers, cluster, *_NEEDED)
     from thermogrip.datasets.materials import load_materials
 
     own = [name for name in cli.comma(candidates) or () if name not in load_materials()]

@@ -92,7 +92,8 @@ def compare(
     from thermogrip.datasets.parallel import kept_processes, sub_progress
     from thermogrip.datasets.partitions import stamps
 
-    pool, names = cli.workers_of(workers, cluster), cli.comma(classifiers)
+    pool = cli.workers_of(workers, cluster, "thermogrip.classify.evaluation.harness")
+    names = cli.comma(classifiers)
     models, missing = trainable(names or BY_DEFAULT, quick=quick, seed=seed)
     if not models:
         raise missing[0]

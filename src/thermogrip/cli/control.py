@@ -48,7 +48,7 @@ def tune(
     from thermogrip.mpc.design.spec import Spec, read_spec
     from thermogrip.mpc.tuning.tune import tune as search
 
-    pool = cli.workers_of(workers, cluster)
+    pool = cli.workers_of(workers, cluster, "thermogrip.mpc.tuning.tune")
     loaded = cli.load_plant(plant, network)
     wanted = Spec.of(loaded) if spec is None else read_spec(spec)
     console = Console(as_json)

@@ -121,7 +121,8 @@ def identify(
 
     Checks the data, fits candidate models, scores each by free run on held-out data, keeps the best one.
     """
-    wanted, pool = cli.comma(models) or (), cli.workers_of(workers, cluster)
+    wanted = cli.comma(models) or ()
+    pool = cli.workers_of(workers, cluster, "thermogrip.sysid.identification")
     assert out is not None  # its callback names one
     cli.new_file(out, (".json",))
     roles = cli.comma(inputs), cli.comma(outputs), cli.comma(disturbances)

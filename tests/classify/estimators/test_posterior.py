@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,15 +13,17 @@ from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
 
 from thermogrip.classify import classify_grasps, load_classifier, make_classifier, save_classifier
+from thermogrip.classify.estimators import posterior as estimator
 from thermogrip.classify.estimators.base import pick
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.contact.simulation import simulate_grasps
-from thermogrip.sysid.effusivity.data import KNOTS, touches
+from thermogrip.sysid.effusivity.data import KNOTS, Touches, touches
 from thermogrip.sysid.effusivity.gripper_model import (
     Discrepancy,
+    GripperModel,
     GripperSpread,
     another_gripper,
     load_default_gripper,
@@ -263,6 +266,26 @@ def test_a_record_decides_which_gripper_took_it(known: PosteriorClassifier, stra
     home = load_example_grasps()["exp1A_obj43_grip23"]
     np.testing.assert_allclose(known.predict_proba(home), same.predict_proba(home), atol=1e-4)
     assert not any("note" in row for row in classify_grasps(known, home))
+
+
+def test_another_gripper_is_asked_about_the_grasp_that_moved_the_temperature_most(
+    known: PosteriorClassifier, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    home, asked = load_example_grasps()["exp1A_obj43_grip23"], list[str]()
+    fit = estimator.fit_candidates
+
+    def counted(device: GripperModel, data: Touches, *args: Any, **options: Any) -> Any:
+        if device.uncertain:
+            asked.extend(data.grasp_id.tolist())
+        return fit(device, data, *args, **options)
+
+    monkeypatch.setattr(estimator, "fit_candidates", counted)
+    known.predict_proba(home)
+    data = touches(home)
+    first = np.linspace(0, data.level.size - 1, 5).astype(int)
+    order = data.grasp_id[first[np.argsort(-data.excursion[first])]].tolist()
+    assert asked == order[: len(asked)]
+    assert len(asked) <= 2
 
 
 def test_what_a_record_decides_is_the_mixture_of_its_explanations(

@@ -13,7 +13,7 @@ from scipy.stats import t as student_t
 
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.sysid.contact.simulation import simulate_grasps
-from thermogrip.sysid.effusivity import posterior_grid
+from thermogrip.sysid.effusivity import mode_kernel, posterior_grid
 from thermogrip.sysid.effusivity.data import noise_covariance, touches, whiten
 from thermogrip.sysid.effusivity.laplace_approximation import (
     EFFUSIVITY,
@@ -25,6 +25,7 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     nodes_for,
     predict,
     prior_of,
+    whitened,
 )
 from thermogrip.sysid.effusivity.posterior_grid import (
     LN_E_RANGE,
@@ -301,7 +302,7 @@ def test_a_density_that_is_looked_for_from_a_candidate_has_the_integral_of_many_
     modes = fit_candidates(device, data, names)[0]
     for own in (material, "iron"):  # also from one beside
         near = modes.u.reshape(3, 3, -1)[:, names.index(own)]
-        quick = _evidence_near(device, data, near)
+        quick = _evidence_near(device, data, near, whitened(device, data))
         sure = np.isfinite(quick)
         assert sure.sum() >= 2
         with monkeypatch.context() as fine:
@@ -315,7 +316,7 @@ def test_a_density_that_is_looked_for_from_a_candidate_has_the_integral_of_many_
 
 def test_a_density_that_has_not_ended_is_followed_and_a_steep_one_gets_points_between():
     x = np.linspace(5.0, 6.0, 9)
-    assert _more(x, -8.0 * np.square((x - 5.5) / 0.25)) is None
+    assert _more(x, -8.0 * np.square((x - 5.5) / 0.45)) is None
     beyond = _more(x, -0.5 * np.square((x - 6.2) / 0.2))
     assert beyond is not None
     assert (beyond > x[-1]).all()
@@ -323,12 +324,12 @@ def test_a_density_that_has_not_ended_is_followed_and_a_steep_one_gets_points_be
     assert between is not None
     assert ((between > 5.2) & (between < 5.8)).all()
     edge = np.linspace(LN_E_RANGE[0], LN_E_RANGE[0] + 1.0, 9)  # there is nothing beyond
-    assert _more(edge, -12.0 * (edge - edge[0])) is None
+    assert _more(edge, -9.0 * (edge - edge[0])) is None
     low = edge[0] + 4e-16 * np.abs(edge[0]) + edge - edge[0]  # rounding leaves nothing between it and the end
     assert low[0] != LN_E_RANGE[0]
-    assert _more(low, -12.0 * (low - low[0])) is None
+    assert _more(low, -9.0 * (low - low[0])) is None
     high = np.linspace(LN_E_RANGE[1] - 1.0, np.nextafter(LN_E_RANGE[1], 0.0), 9)
-    assert _more(high, 12.0 * (high - high[-1])) is None
+    assert _more(high, 9.0 * (high - high[-1])) is None
 
 
 def test_a_density_beyond_the_range_is_looked_for_at_its_end(device):
@@ -349,3 +350,72 @@ def test_slopes_by_five_points_are_those_of_a_quartic():
     want = np.polynomial.polynomial.polyval(x, np.polynomial.polynomial.polyder(c))
     found = smooth_slopes(x, np.polynomial.polynomial.polyval(x, c))
     np.testing.assert_allclose(found, want, rtol=1e-6, atol=1e-8)
+
+
+def test_what_goes_with_one_over_the_root_of_e_is_met_between_points_and_beyond():
+    """Cubics of it between the points, parabolas beyond them."""
+    rng = np.random.default_rng(4)
+    knots = np.sort(rng.uniform(8.0, 11.0, (3, 9)), axis=1)
+    inside, beyond = np.linspace(knots[:, 0], knots[:, -1], 13).T, np.array([[7.0, 12.0]] * 3)
+
+    def curve(x, degree):
+        powers = np.exp(-0.5 * (x - 9.0))[..., None] ** np.arange(degree + 1)
+        return powers @ np.array([[1.0, -2.0], [0.5, 3.0], [2.0, -1.0], [-0.7, 0.3]])[: degree + 1]
+
+    got = posterior_grid._between(inside, knots, curve(knots, 3))
+    np.testing.assert_allclose(got, curve(inside, 3), rtol=1e-7)
+    got = posterior_grid._between(beyond, knots, curve(knots, 2))
+    ends = curve(knots, 2).min(axis=1, keepdims=True), curve(knots, 2).max(axis=1, keepdims=True)
+    far = 2 * ends[0] - ends[1], 2 * ends[1] - ends[0]
+    np.testing.assert_allclose(got, np.clip(curve(beyond, 2), *far), rtol=1e-6)
+    assert (got == np.clip(got, *far)).all()
+    assert (got[:, 1] != far[0][:, 0]).all()
+    farther = posterior_grid._between(beyond - 3.0, knots, curve(knots, 2))[:, 0]
+    assert ((farther == far[0][:, 0]) | (farther == far[1][:, 0])).all()
+
+
+def test_points_are_moved_a_little_to_places_that_other_touches_have():
+    rng = np.random.default_rng(5)
+    first, apart = rng.uniform(8.0, 9.0, (40, 1)), rng.uniform(0.1, 0.19, (40, 1))
+    grid = first + apart * np.arange(9)
+    grid[0] = LN_E_RANGE[1] - 0.1 * np.arange(9)[::-1]
+    got = posterior_grid._rounded(grid)
+    assert (np.abs(got - grid) <= apart / 16 + 1e-12)[1:].all()
+    assert got[0, -1] == LN_E_RANGE[1]
+    assert np.unique(got[1:]).size < 0.5 * grid[1:].size
+    near = grid[:, :1] + 0.01 * apart  # nothing comes upon a point that is there
+    assert (np.abs(posterior_grid._rounded(grid, near) - grid) <= 0.001 * apart).all(where=grid < 11.6)
+
+
+def test_a_density_with_few_points_gets_more():
+    x = np.linspace(9.0, LN_E_RANGE[1], 9)
+    assert _more(x, -7.5 * np.square((x - x[-1]) / (x[-1] - x[1]))) is None
+    few = _more(x, -7.5 * np.square((x - x[-1]) / (x[-1] - x[2])))
+    assert few is not None
+    assert few.size == 4
+    assert few.max() < x[-1]
+
+
+def test_points_far_behind_are_found_roughly_and_the_best_as_ever(device, monkeypatch):
+    record = load_example_grasps()["exp1A_obj43_grip23"]
+    data = touches(record.isel(grasp=np.flatnonzero(record["material"].values == "iron")[:1]))
+    x, asked = np.linspace(8.9, 10.2, 9), []
+    products = mode_kernel._Touched.products
+
+    def counted(self, at, u, *, first):
+        asked.append(at.size)
+        return products(self, at, u, first=first)
+
+    monkeypatch.setattr(mode_kernel._Touched, "products", counted)
+    found = {}
+    for rough in (0.0, 3.0):
+        asked.clear()
+        args = device, data, np.zeros(9, dtype=np.int64), free_hypotheses(device, x)
+        found[rough] = fit_pairs(*args, rivals=True, rough=rough), sum(asked)
+    (exact, most), (rough, fewer) = found[0.0], found[3.0]
+    assert fewer < most
+    behind = exact.log_evidence.max() - exact.log_evidence
+    assert behind.max() > 3.0
+    off = np.abs(rough.log_evidence - exact.log_evidence)
+    assert (off < 0.02 * np.exp(np.minimum(behind, 3.0)))[exact.converged].all()
+    assert off[behind == 0.0] == 0.0
