@@ -39,6 +39,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from scipy.signal import lfilter
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.plant.prediction import PredictionModel, step_response
@@ -123,6 +124,7 @@ class LateDrives:
 class _Row(NamedTuple):
     x: Array  # the filter's after the reading
     w: Array
+    shown: Array  # (n_y,) what the filter expected to read, after the reading
     y: Array
     u: Array  # applied until here
     d: Array
@@ -139,8 +141,10 @@ class LateDriveMonitor:
     """Looks in one closed loop for drives that act ``late`` (n_u,) [s]; ``said`` is what it found."""
 
     def __init__(self, model: PredictionModel, controlled: Sequence[str]) -> None:
-        self.model, self._controlled = model, tuple(controlled)
-        self._window, self._most = 0, 0.0
+        self.model = model
+        delays = apparent_delays(model.plant, model.drives, tuple(controlled), model.dt)
+        self._window = window_of(max(delays) / model.dt)
+        self._most = self._window / DELAYS
         self.forget()
 
     def forget(self) -> None:
@@ -166,12 +170,8 @@ class LateDriveMonitor:
         """Note a sample: the filter after reading y (n_y,), and what was applied before it, drives u (n_u,)
         and measured disturbances d (n_d,); return whether drives are late by another time, on which the
         filter then is."""
-        if not self._window:
-            model = self.model
-            found = apparent_delays(model.plant, model.drives, self._controlled, model.dt)
-            self._most = max(found) / model.dt
-            self._window = window_of(self._most)
-        self._rows.append(_Row(observer.now.copy(), observer.w.copy(), y, u, d))
+        x, w, shown = observer.now.copy(), observer.w.copy(), observer.reading()
+        self._rows.append(_Row(x, w, shown, y, u, d))
         self._count += 1
         if observer.innovation_bias > _UNQUIET:
             self._unquiet = self._count
@@ -184,8 +184,7 @@ class LateDriveMonitor:
         """Find by how many samples drives are late; return whether that is another number."""
         rows, now = list(self._rows), self.late / self.model.dt
         n = int(np.count_nonzero(np.isfinite([row.y for row in rows[1 - self._window :]])))
-        fits = {tuple(now.tolist()): self._fitted(observer, rows, now)}
-        here = fits[tuple(now.tolist())]
+        here, fits = self._fitted(observer, rows, now, lags=observer.lag), dict[tuple[float, ...], _Fit]()
         if here.v < _EXPLAINED:
             return False
 
@@ -198,9 +197,11 @@ class LateDriveMonitor:
         n_u, best = self.model.n_u, now
         for way in [*np.eye(n_u), np.ones(n_u)][: n_u + (n_u > 1)]:
             s = min((now + way * (late - now) for late in self._most * _COARSE), key=cost)
-            for step in self._most * _FINER if cost(s) < cost(best) else ():
+            for step in self._most * _FINER if cost(s) < here.L else ():
                 s = min((np.clip(s + k * step * way, 0.0, self._most) for k in (0, -1, 1)), key=cost)
             best = min((best, s), key=cost)
+        if not cost(best) < np.inf:
+            return False
         found = fits[tuple(best.tolist())]
         enough = n * np.log(_EXPLAINED)
         if not (np.isfinite(here.L) and enough < here.L - found.L):
@@ -220,11 +221,14 @@ class LateDriveMonitor:
             if k:
                 observer.predict(u, row.d)
                 observer.update(row.y)
-            self._rows.append(row._replace(x=observer.x.copy(), w=observer.w.copy()))
+            x, w, shown = observer.x.copy(), observer.w.copy(), observer.reading()
+            self._rows.append(row._replace(x=x, w=w, shown=shown))
 
-    def _fitted(self, observer: Observer, rows: list[_Row], late: Array) -> _Fit:
+    def _fitted(
+        self, observer: Observer, rows: list[_Row], late: Array, *, lags: Array | None = None
+    ) -> _Fit:
         """Return the most likely run of the model over the last window, drives being late by so many samples
-        (n_u,)."""
+        (n_u,) and outputs that may lag by ``lags`` [s]."""
         model = self.model
         u = _delayed(np.array([row.u for row in rows]), late)[-self._window :][1:]
         rows = rows[-self._window :]
@@ -245,6 +249,10 @@ class LateDriveMonitor:
             held = d + (w @ found.on_disturbance.T)[:, None]
             shown, _ = model.run(x, pushed, held)
             shown = shown[:, 1:] + (w @ found.on_output.T)[:, None] + offset
+            for i, lag in zip(observer.lagged, () if lags is None else lags):
+                keep = lag / (model.dt + lag)
+                begin = np.full((len(z), 1), keep * first.shown[i])
+                shown[:, :, i] = lfilter([1 - keep], [1, -keep], shown[:, :, i], axis=1, zi=begin)[0]
             return np.asarray(((seen - shown) * weight).reshape(len(z), -1))
 
         m = len(center)
