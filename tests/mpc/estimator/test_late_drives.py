@@ -12,7 +12,6 @@ from tests.mpc.makers import network_plant
 from thermogrip.mpc.closed_loop.simulate import Surroundings, Truth, simulate_closed_loop
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
 from thermogrip.mpc.estimator.late_drives import LateDrives
-from thermogrip.mpc.interface import Move
 from thermogrip.sysid.plant.plant import Plant
 
 STEP = [(38.0, 300.0)]
@@ -57,23 +56,27 @@ def test_drives_that_are_not_late_act_as_they_are_to_the_last_bit():
 
 
 @pytest.mark.parametrize(
-    "changes", [{"move_delay_s": 4.5}, {"sensor_lag_s": 4.5}], ids=["a late drive", "all sensors slower"]
+    ("changes", "settling"),
+    [({"move_delay_s": 4.5}, 1.8), ({"sensor_lag_s": 4.5}, 0.99)],
+    ids=["a late drive", "all sensors slower"],
 )
-def test_a_loop_that_swings_with_status_ok_is_reported_in_a_window_and_settles(changes: Mapping[str, float]):
-    plant = gripper()
-    around = replace(AROUND, **changes)
+def test_what_every_output_shows_is_reported_in_a_window_and_not_taken_for_biases(
+    changes: Mapping[str, float], settling: float
+):
+    plant, around = gripper(), replace(AROUND, **changes)
     controller = of(plant)
     run = simulate_closed_loop(controller, plant, STEP, surroundings=around)
     blind = simulate_closed_loop(of(plant, looks=False), plant, STEP, surroundings=around)
-    window = controller.lateness._window * controller.dt
-    assert run.status.index("mismatch") * controller.dt <= 1.2 * window
+    assert run.status.index("mismatch") * controller.dt <= controller.lateness._window * controller.dt
     assert set(run.status[run.status.index("mismatch") :]) == {"mismatch"}
-    assert "later than in the model by about" in run.advice[-1]
-    assert controller.lateness.late[0] == pytest.approx(4.5, abs=1.6)
-    assert run.segments[0].settle_s <= 3 * window
-    assert abs(run.segments[0].bias) < 0.05
-    assert not blind.segments[0].settle_s <= run.segments[0].settle_s
-    assert blind.segments[0].travel > 2 * run.segments[0].travel
+    assert run.advice[-1].startswith("drive acts later than in the model by about 4.")
+    assert controller.lateness.late[0] == pytest.approx(4.5, abs=0.4)
+    assert run.segments[0].settle_s < 180.0
+    assert run.segments[0].overshoot < 0.1
+    assert abs(run.segments[0].bias) < 0.01
+    assert set(blind.status) == {"ok"}
+    assert blind.segments[0].settle_s > settling * run.segments[0].settle_s
+    assert blind.segments[0].travel > 1.1 * run.segments[0].travel
 
 
 @pytest.mark.parametrize(
@@ -88,22 +91,6 @@ def test_drives_that_are_hardly_late_are_left_as_they_are(changes: Mapping[str, 
     blind = simulate_closed_loop(of(plant, looks=False), plant, STEP, surroundings=around)
     np.testing.assert_array_equal(run.drive["drive"], blind.drive["drive"])
     assert "mismatch" not in run.status
-
-
-def test_of_two_drives_the_one_that_is_late_is_named():
-    plant = network_plant("tclab", t1=(20.0, 60.0), t2=(20.0, 60.0))
-    plant = replace(plant, noise=dict.fromkeys(plant.outputs, 0.05))
-    controller = design_controller(plant, dt=4.0)
-    world, moves = Truth(plant, 4.0, AROUND, None, 3), list[Move]()
-    controller.reset(world.reading())
-    for k in range(60):
-        moves.append(
-            controller.step(world.reading(), {"t1": 45.0, "t2": 38.0} if k < 30 else {"t1": 35.0, "t2": 45.0})
-        )
-        q1 = moves[max(0, k - 3)].drive["q1"] if k >= 3 else 0.0
-        world.apply(Move({"q1": q1, "q2": moves[-1].drive["q2"]}))
-    np.testing.assert_allclose(controller.lateness.late, [12.0, 0.0], atol=1.5)
-    assert moves[-1].advice.startswith("q1 acts later than in the model by about 1")
 
 
 def test_the_filter_that_was_led_through_the_window_shows_what_is_read():
