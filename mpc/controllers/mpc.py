@@ -19,6 +19,9 @@ A loop must never be left without an answer, so every failure has a next best on
 * ``mismatch``: the optimiser's move, as for a plant that is known not to be the model
   (:mod:`thermogrip.mpc.estimator.structure_monitor`; in Python alone), or to be slower.
 
+Where drives act later than the model has it (:mod:`thermogrip.mpc.estimator.late_drives`; in Python alone),
+the estimate runs on what acts, and the plan begins where a move of now begins to act.
+
 Where mean innovations exceed 3 standard deviations, the weight of moves is multiplied by their third, up
 to 30 times: a gain that is off by 30 % does not swing.
 
