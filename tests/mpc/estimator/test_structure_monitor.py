@@ -104,15 +104,18 @@ def test_of_60_draws_none_is_reported():
     ("around", "words"),
     [
         (Surroundings(sensor_lag_s=8.0), "t[12] (is slower|has a second mass)"),
-        # 8 s within 1, by the window after the rise; later ones, of a plant that hardly moves, say up to 13
-        (Surroundings(move_delay_s=8.0), r"t[12] is slower than the model by about (7|8)\.\d s"),
+        # by the filter's lag or by the monitor, or by both drives together
+        (
+            Surroundings(move_delay_s=8.0),
+            r"(t[12] is slower than the model|q1, q2 act later than in the model) by about (7|8)",
+        ),
     ],
 )
 def test_what_the_model_lacks_is_reported_in_two_windows(around: Surroundings, words: str):
     moves = loop(design_controller(kit(), dt=DT), kit().draw(1), around, 1)
     assert [move.status for move in moves].index("mismatch") <= 40
     assert re.search(words, told(moves)[0])
-    assert re.match("t[12] (is slower|has a second mass)", told(moves)[-1])
+    assert re.match("t[12] (is slower|has a second mass)|q1, q2 act later", told(moves)[-1])
 
 
 @pytest.fixture(scope="module")
