@@ -13,7 +13,8 @@ step mostly takes one or two iterations.  Everything is scaled before: x = D z w
 row of A D to unit length.  With r_i that length, a slack in scaled units is s/r, so its penalties become w r
 and q r^2.
 
-Where the very same H and A are given again, as of a linear plant, their scales and factors are kept.
+The first rows may be the unknowns themselves, which DAQP takes as bounds.  Where the very same H and A are
+given again, as of a linear plant, their scales and factors are kept.
 
 A failed solve is an answer with a status, never an exception, and the active set that led there is thrown
 away: the next solve starts cold.
@@ -80,6 +81,7 @@ class CondensedQP:
         quadratic: Any,
         iteration_limit: int = 500,
         time_limit_s: float = 0.0,
+        bounds: int = 0,  # how many first rows of A are the first unknowns themselves
     ) -> None:
         self.soft = np.asarray(soft, dtype=bool)
         self.linear = np.asarray(linear, dtype=float)
@@ -90,7 +92,8 @@ class CondensedQP:
             )
         if np.any(self.linear[self.soft] < 0) or np.any(self.quadratic[self.soft] < 0):
             raise ValueError("penalties must be >= 0")
-        self.iteration_limit, self.time_limit_s = iteration_limit, time_limit_s
+        self.iteration_limit, self.time_limit_s, self._bounds = iteration_limit, time_limit_s, bounds
+        self._hard, self._priced = ~self.soft, np.where(self.soft, self.linear, 0.0)
         self.on_info: Callable[[dict[str, Any]], None] | None = None  # gets DAQP's record of each solve
         self._model: Any = None
         self._given: tuple[Array, Array] | None = None  # the newest H and A, and what was made of them
@@ -110,9 +113,9 @@ class CondensedQP:
         finite = np.isfinite(f).all() and (same or (np.isfinite(H).all() and np.isfinite(A).all()))
         if not finite or np.isnan(lower).any() or np.isnan(upper).any():
             return self._failed("not finite", f.size)
-        if np.any((lower > upper)[~self.soft]):
+        if ((lower > upper) & self._hard).any():
             return self._failed("infeasible", f.size)
-        if np.any(np.diag(H) <= 0):
+        if (H.diagonal() <= 0).any():
             return self._failed("not convex", f.size)
         return self._solve(H, f, A, lower, upper)
 
@@ -122,22 +125,19 @@ class CondensedQP:
     def _solve(self, H: Array, f: Array, A: Array, lower: Array, upper: Array) -> QPAnswer:
         """Return the minimiser of a program that may have one."""
         if not self._is_same(H, A):
-            scale = 1.0 / np.sqrt(np.diag(H))
-            rows = A * scale
-            length = np.maximum(np.linalg.norm(rows, axis=1), 1e-12)
-            shown = H * np.outer(scale, scale), rows / length[:, None]
-            self._scaled = (scale, length, *(np.ascontiguousarray(each) for each in shown))
+            scale = 1.0 / np.sqrt(H.diagonal())
+            rows = A[self._bounds :] * scale
+            lengths = np.maximum(np.sqrt(np.einsum("ij,ij->i", rows, rows)), 1e-12)
+            rows /= lengths[:, None]
+            length = np.concatenate([scale[: self._bounds], lengths])
+            self._scaled = scale, length, H * scale * scale[:, None], rows
             self._given, self._new = (H, A), True
         scale, length, *matrices = self._scaled
+        least, most = np.maximum(lower / length, -_FAR), np.minimum(upper / length, _FAR)
         idle = self.soft & (length < _SHORT)
-        given = (
-            matrices[0],
-            f * scale,
-            matrices[1],
-            np.clip(np.where(idle, -np.inf, lower / length), -_FAR, _FAR),
-            np.clip(np.where(idle, np.inf, upper / length), -_FAR, _FAR),
-            length,
-        )
+        if idle.any():
+            least[idle], most[idle] = -_FAR, _FAR
+        given = (matrices[0], f * scale, matrices[1], least, most, length)
         warm = self._model is not None
         z, multipliers, flag, iterations = self._run(*given)
         if warm and _FLAGS.get(flag) in ("iteration limit", "cycling"):  # a bad start: without one
@@ -191,7 +191,7 @@ class CondensedQP:
     def _penalise(self, length: Array) -> None:
         """Set the penalties in scaled units; DAQP takes the reciprocal of the quadratic one."""
         reciprocal = 1.0 / np.maximum(self.quadratic * length**2, LEAST_QUADRATIC)
-        linear = np.where(self.soft, self.linear * length, 0.0)
+        linear = self._priced * length
         self._model.soft_weights(reciprocal, reciprocal, linear, linear)
 
     def _failed(self, status: str, n: int, iterations: int = 0) -> QPAnswer:
