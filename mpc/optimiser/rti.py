@@ -117,17 +117,18 @@ class Optimiser:
         self._weight[-1] += design.terminal
         self._lengths = np.array(self.blocks, dtype=float)
         lengths = np.repeat(self._lengths, model.n_u)
-        self._fixed = 2 * (
-            design.move * self._moves + design.drive * np.diag(lengths)
-        )
+        self._drive_cost = design.drive * lengths
+        self._fixed = 2 * (design.move * self._moves + np.diag(self._drive_cost))
         ranges = np.array([design.drive_range[name] for name in model.drives])
         self.lowest, self.highest = ranges.T
+        self._whole = tuple(np.broadcast_to(end, (self.n_b, model.n_u)) for end in ranges.T)
         self.slew = design.dt * np.array([design.slew_per_s[name] for name in model.drives])
         # a later block may differ by what the slew allows between the middles of the two
         middles = np.cumsum(self.blocks) - 0.5 * np.array(self.blocks) + 0.5
         gaps = np.concatenate([[1.0], np.diff(middles)])
         self.reach = np.cumsum(gaps)
         self.slews = (gaps[:, None] * self.slew).ravel()
+        self._slew_shares = self.slews / self._spans
         self._solves, self._move = 0, design.move
         # of a linear plant: G in the drives' ranges, the rows of the program, and H for what counts
         self._G: Array | None = None
@@ -159,12 +160,11 @@ class Optimiser:
             linear=np.concatenate([np.full(2 * n, design.price), first.ravel(), FIRST * limited]),
             quadratic=2 * prices,
             time_limit_s=max(design.deadline_s, 1e-3),
-            bounds=n,
         )
 
     @cached_property
     def _along(self) -> AlongPlan | None:
-        return self.model.along(self.blocks)
+        return self.model.along(self.blocks, self.model.span)
 
     def solve(self, sample: Sample) -> Outcome:
         """Improve a plan."""
@@ -175,7 +175,7 @@ class Optimiser:
         more = 0.0 if slew_s is None else slew_s / self.design.dt - 1.0
         self._seen_rows = [at for at in range(len(self._rows)) if lost is None or not lost[at]]
         self._parked = [j for j in range(n_u) if lost is not None and lost[self.pair[j]]]
-        target = np.broadcast_to(now, (self.N, len(now))) if ahead is None else ahead
+        target = now[None] if ahead is None else ahead  # (1 or N, n_controlled)
         if lost is not None:
             side = np.where(lost, 0.0, side)
         if ahead is not None:  # nothing is beyond a target that moves
@@ -185,13 +185,7 @@ class Optimiser:
             self._costs = self.counted(tariff)[:, None] * self.energy
         guess = self._park(guess, last, more)
         linear = model.affine is not None
-        if self._along is None:
-            y0, G = model.trajectory(x, guess + drive_bias, d, self.blocks)
-        else:
-            y0, G = self._along.trajectory(x, guess + drive_bias, d)
-        if self._G is None or not linear:
-            self._G = np.multiply(G.reshape(self.N, model.n_y, self.n_b * n_u), self._spans)
-        G = self._G
+        y0, G = self._linearised(x, guess + drive_bias, d)
         authority = np.ones((self.n_b, n_u)) if linear else self._authority(G)
         y0 = y0 + bias
         free = y0 - G @ (guess / model.span).ravel()  # the response without any plan
@@ -216,6 +210,16 @@ class Optimiser:
         plan, y = self._best(plan, guess, y0, last, more, predicted, merit)
         cost = merit(plan[None], y[None])[0] if self.positions else np.nan
         return Outcome(plan, y, "solved", self._broken(y), answer.iterations, authority[0], cost)
+
+    def _linearised(self, x: Array, plan: Array, d: Array) -> tuple[Array, Array]:
+        """Return the outputs along a plan, and G (N, n_y, n) by drives in their ranges."""
+        if self._along is not None:
+            y, G = self._along.trajectory(x, plan, d)
+            return y, G.reshape(self.N, self.model.n_y, -1)
+        y, G = self.model.trajectory(x, plan, d, self.blocks)
+        if self._G is None or self.model.affine is None:
+            self._G = G.reshape(self.N, self.model.n_y, -1) * self._spans
+        return y, self._G
 
     def counted(self, tariff: Array | None) -> Array:
         """Return the samples of each block (n_b,), each as often as the energy price counts in it."""
@@ -273,8 +277,10 @@ class Optimiser:
     def _response(self, G: Array) -> Array:
         """Return the response (n_b, n_u) to each block, summed over time, of the output moved most."""
         G = G.reshape(self.N, self.model.n_y, self.n_b, self.model.n_u)
-        of = [G[:, self._rows[at], :, j].sum(axis=0) for j, at in enumerate(self.strongest)]
-        return np.stack(of, axis=1)
+        found = np.empty(G.shape[2:])
+        for j, at in enumerate(self.strongest):
+            np.add.reduce(G[:, self._rows[at], :, j], axis=0, out=found[:, j])
+        return found
 
     def _response_at_rest(self) -> Array:
         """Set which output each drive moves most; return the response at rest (n_b, n_u) of that one."""
@@ -311,7 +317,7 @@ class Optimiser:
             least = np.where(away * held > 0, np.abs(held) - reach, 0.0)  # what the slew allows
             low, high = self.faded_range(away, drive_bias, authority, self.neutral, least)
         else:
-            low, high = (np.broadcast_to(end, guess.shape) for end in (self.lowest, self.highest))
+            low, high = self._whole
         if not self._parked and not self.positions:
             return low, high
         little = np.zeros(self.model.n_u)
@@ -351,14 +357,14 @@ class Optimiser:
 
     def _merit(self, plans: Array, y: Array, target: Array, side: Array, last: Array) -> Array:
         """Return the cost (B,) of plans (B, n_b, n_u) whose outputs y (B, N, n_y) were simulated."""
-        design, shares = self.design, plans / self.model.span
+        design, n_u = self.design, self.model.n_u
+        shares = plans.reshape(len(plans), -1) / self._spans
         moves = shares.copy()
-        moves[:, 1:] -= shares[:, :-1]
-        moves[:, 0] -= last / self.model.span
-        cost = self._move * np.einsum("ijk,ijk->i", moves, moves)
-        cost += design.drive * np.einsum("ijk,ijk,j->i", shares, shares, self._lengths)
+        moves[:, n_u:] -= shares[:, :-n_u]
+        moves[:, :n_u] -= last / self.model.span
+        cost = self._move * np.sum(moves * moves, axis=1) + (shares * shares) @ self._drive_cost
         if self._costs is not None:
-            cost += np.einsum("ijk,jk->i", shares, self._costs)
+            cost += shares @ self._costs.ravel()
         over: list[tuple[float, Array]] = []
         for at in self._seen_rows:
             error = y[:, :, self._rows[at]] - target[:, at]
@@ -370,7 +376,7 @@ class Optimiser:
             if side[at]:
                 over.append((design.price, side[at] * error - design.overshoot))
         for at, row in enumerate(self._limited):
-            low, high = self._limits[at]
+            low, high = self._limits[at].tolist()
             over.append((self.dear[at], np.maximum(low - y[:, :, row], y[:, :, row] - high)))
         for price, beyond in over:
             if not beyond.max() <= 0.0:
@@ -436,15 +442,17 @@ class Optimiser:
         more: float,
     ) -> tuple[Array, Array, Array]:
         n, n_u, N = self.n_b * self.model.n_u, self.model.n_u, self.N
-        if self._A is None or self.model.affine is None:
-            self._A = np.concatenate([self._hard, *(G[:, row, :] for row in self._rows + self._limited)])
+        soft = self._rows + self._limited
+        if self._A is None:
+            self._A = np.concatenate([self._hard, *(G[:, row] for row in soft)])
+        elif self.model.affine is None:
+            self._A[2 * n :].reshape(len(soft), N, n)[...] = G[:, soft].transpose(1, 0, 2)
         lower, upper = np.empty(len(self._A)), np.empty(len(self._A))
         lower[:n], upper[:n] = ends[0].ravel() / self._spans, ends[1].ravel() / self._spans
-        slews = self.slews / self._spans
-        slews[:n_u] += more * self.slew / self.model.span
-        lower[n : 2 * n], upper[n : 2 * n] = -slews, slews
-        lower[n : n + n_u] += last / self.model.span
-        upper[n : n + n_u] += last / self.model.span
+        first, before = slice(n, n + n_u), last / self.model.span
+        reach = self._slew_shares[:n_u] + more * self.slew / self.model.span
+        lower[n : 2 * n], upper[n : 2 * n] = -self._slew_shares, self._slew_shares
+        lower[first], upper[first] = before - reach, before + reach
         rows = slice(2 * n, 2 * n + N)
         for at, row in enumerate(self._rows):
             far, down, up = self.design.overshoot, side[at] < 0, side[at] > 0
@@ -462,7 +470,7 @@ class Optimiser:
     def _broken(self, y: Array) -> dict[str, float]:
         found = {}
         for at, (name, row) in enumerate(zip(self.design.limits, self._limited)):
-            low, high = self._limits[at]
+            low, high = self._limits[at].tolist()
             over = float(max(low - y[:, row].min(), y[:, row].max() - high))
             if over > 0.1:
                 found[name] = over

@@ -27,9 +27,10 @@ _PLANS = 8  # that take no longer than one
 
 
 class AlongPlan:
-    """Runs of one model, ``kernel`` its step with the derivative in one direction, over these blocks."""
+    """Runs of one model, ``kernel`` its step with the derivative in one direction, over these blocks;
+    derivatives are by drives in these units (n_u,)."""
 
-    def __init__(self, model: PredictionModel, kernel: Kernel, blocks: Sequence[int]) -> None:
+    def __init__(self, model: PredictionModel, kernel: Kernel, blocks: Sequence[int], unit: Array) -> None:
         from thermogrip.sysid.models.jit_rollout import Batch
 
         self._sizes = model.n_x, model.n_u, model.n_y, model.n_d
@@ -38,7 +39,7 @@ class AlongPlan:
         self._block = np.repeat(np.arange(len(blocks)), lengths)  # of each step
         rows, step = int(lengths.sum()), model.dt / model.sub
         self._by_drive = Batch(kernel, batch=n, n=rows, h=step)
-        along = np.eye(n).reshape(n, len(blocks), model.n_u)
+        along = np.eye(n).reshape(n, len(blocks), model.n_u) * unit
         self._by_drive.u[..., model.n_u :] = along[:, self._block]
         self._plans = Batch(kernel, batch=_PLANS, n=rows, h=step)
 

@@ -281,15 +281,15 @@ class PredictionModel:
                 return np.stack(states) @ self.C.T + self.output(np.zeros(self.n_x)), G
             y = by_x @ x + by_rest @ (E @ d + added) + np.tensordot(G, plan, axes=2)
             return y + self.output(np.zeros(self.n_x)), G
-        along = self.along(blocks)
+        along = self.along(blocks, np.ones(self.n_u))
         return self._trajectory_by_casadi(x, plan, d, blocks) if along is None else along.trajectory(x, plan, d)
 
-    def along(self, blocks: Sequence[int]) -> AlongPlan | None:
-        """Return what runs plans of these blocks again and again; None where the step is linear or more than
-        arithmetic."""
+    def along(self, blocks: Sequence[int], unit: Array) -> AlongPlan | None:
+        """Return what runs plans of these blocks again and again, its derivatives by drives in these units;
+        None where the step is linear or more than arithmetic."""
         if self.affine is not None or self._kernel is None:
             return None
-        return AlongPlan(self, self._kernel, blocks)
+        return AlongPlan(self, self._kernel, blocks, unit)
 
     def response(self, blocks: tuple[int, ...]) -> Response:
         """Return how a linear plant's outputs answer, made once for these blocks."""
