@@ -27,7 +27,6 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -94,7 +93,6 @@ class CondensedQP:
             raise ValueError("penalties must be >= 0")
         self.iteration_limit, self.time_limit_s = iteration_limit, time_limit_s
         self._hard, self._priced = ~self.soft, np.where(self.soft, self.linear, 0.0)
-        self.on_info: Callable[[dict[str, Any]], None] | None = None  # gets DAQP's record of each solve
         self._model: Any = None
         self._given: tuple[Array, Array] | None = None  # the newest H and A, and what was made of them
         self._scaled: tuple[Array, ...] = ()
@@ -170,8 +168,6 @@ class CondensedQP:
         self._penalise(length)
         self._new = False
         z, _, flag, info = self._model.solve()
-        if self.on_info is not None:
-            self.on_info(info)
         return np.asarray(z), np.asarray(info["lam"]), int(flag), int(info["iterations"])
 
     def _fresh(self, f: Array, A: Array, lower: Array, upper: Array) -> tuple[Any, int]:
