@@ -374,7 +374,7 @@ def _controller_parts(s: Sizes, number: Any) -> list[tuple[Any, int]]:
         (number, max(1, s.NR)),
         *((number, count) for count in (max(1, s.NE), s.NH * s.NY, s.NH * s.NY, s.NH * some)),
         *((number, count) for count in (2 * s.NX * wide, s.NU * wide, max(1, s.ND) * wide)),
-        *((number, count) for count in (s.NF, s.NM, z * z, z * z)),
+        *((number, count) for count in (4 * max(1, s.NF), s.NM, z * z, z * z)),
     ]
 
 
