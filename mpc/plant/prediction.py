@@ -282,7 +282,9 @@ class PredictionModel:
             y = by_x @ x + by_rest @ (E @ d + added) + np.tensordot(G, plan, axes=2)
             return y + self.output(np.zeros(self.n_x)), G
         along = self.along(blocks, np.ones(self.n_u))
-        return self._trajectory_by_casadi(x, plan, d, blocks) if along is None else along.trajectory(x, plan, d)
+        return (
+            self._trajectory_by_casadi(x, plan, d, blocks) if along is None else along.trajectory(x, plan, d)
+        )
 
     def along(self, blocks: Sequence[int], unit: Array) -> AlongPlan | None:
         """Return what runs plans of these blocks again and again, its derivatives by drives in these units;

@@ -393,10 +393,10 @@ class Kernel:
         begin = _entries(batch, own if batch > 1 else (0,) * 4)
         y = np.empty((self._n_y, n + 1, n_block * WIDTH))
         x_end = np.empty((arrays[0].shape[1], n_block * WIDTH))
-        *given, to_y, to_end, to_moved, to_begin = (
-            a.ctypes.data for a in (*arrays, y, x_end, moved, begin)
-        )
-        into = [(to_begin + k * begin[0].nbytes, to_y + k * BYTES, to_end + k * BYTES) for k in range(n_block)]
+        *given, to_y, to_end, to_moved, to_begin = (a.ctypes.data for a in (*arrays, y, x_end, moved, begin))
+        into = [
+            (to_begin + k * begin[0].nbytes, to_y + k * BYTES, to_end + k * BYTES) for k in range(n_block)
+        ]
         calls = [(*given, *places, n, n_block * WIDTH, pieces, h, to_moved) for places in into]
         return y.transpose(2, 1, 0)[:batch], x_end.T[:batch], calls, begin
 
