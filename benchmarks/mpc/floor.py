@@ -1,4 +1,4 @@
-"""How long DAQP's own solve takes: of a loop's programs as they stand, H and A given to it, its set of last time."""
+"""How long DAQP's own solve takes of the programs of a loop, H and A given to it, from its last set."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ Array = NDArray[np.float64]
 
 
 class Floor:
-    """Solves the programs of a :class:`CondensedQP` in its place, and keeps the seconds that DAQP says it took,
-    its setup (factors of H and A) not counted."""
+    """Solves the programs of a :class:`CondensedQP` in its place, and keeps the seconds that DAQP says it
+    took, its setup (factors of H and A) not counted."""
 
     def __init__(self, qp: CondensedQP) -> None:
         self.seconds: list[float] = []

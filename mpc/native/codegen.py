@@ -13,9 +13,9 @@ and is written into the first function that knows all it needs:
     partials(x, u, d, k, h -> x+, m),    tangent(m, k, h, sx -> sx+)
 
 and the last with a direction of the drives, su, and of the disturbances, sd, too.  ``hold`` does as much of
-it as ``step`` reads, ``hold_slopes`` all; ``next`` is hold and step.  Both run over the drives of n blocks, at
-most four, entry i of block c at [4 i + c], so that a compiler may take four at once: a Peltier's are one long
-chain of products.
+it as ``step`` reads, ``hold_slopes`` all; ``next`` is hold and step.  Both run over the drives of n blocks,
+at most four, entry i of block c at [4 i + c], so that a compiler may take four at once: a Peltier's are one
+long chain of products.
 
 ``tangent`` runs over many directions, n groups of four side by side, each group's numbers behind those of the
 last: entry i of direction c at [c / 4][i][c % 4].  Of the loop over the four a compiler makes vector

@@ -121,7 +121,8 @@ class Optimiser:
         self._fixed = 2 * (design.move * self._moves + np.diag(self._drive_cost))
         ranges = np.array([design.drive_range[name] for name in model.drives])
         self.lowest, self.highest = ranges.T
-        self._whole = tuple(np.broadcast_to(end, (self.n_b, model.n_u)) for end in ranges.T)
+        low, high = (np.broadcast_to(end, (self.n_b, model.n_u)) for end in ranges.T)
+        self._whole = low, high
         self.slew = design.dt * np.array([design.slew_per_s[name] for name in model.drives])
         # a later block may differ by what the slew allows between the middles of the two
         middles = np.cumsum(self.blocks) - 0.5 * np.array(self.blocks) + 0.5

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from tests.mpc.makers import network_plant
 
+from tests.mpc.makers import network_plant
 from thermogrip.mpc.plant.prediction import PredictionModel
 
 BLOCKS = (1, 2, 3, 1)
