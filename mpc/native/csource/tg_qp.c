@@ -96,24 +96,6 @@ void tg_add_row(double *restrict into, double share, const double *restrict row,
             into[l] += share * row[l];
 }
 
-/* The products of a row with four rows that lie TG_Q_W apart, from an entry to n, both multiples of four. */
-static void four_products(const double *restrict m, const double *restrict rows, int from, int n, double *out)
-{
-    const double *r1 = rows + TG_Q_W, *r2 = r1 + TG_Q_W, *r3 = r2 + TG_Q_W;
-    double s0[4] = {0.0}, s1[4] = {0.0}, s2[4] = {0.0}, s3[4] = {0.0};
-    for (int j = from; j < n; j += 4)
-        for (int l = 0; l < 4; l++) {
-            s0[l] += m[j + l] * rows[j + l];
-            s1[l] += m[j + l] * r1[j + l];
-            s2[l] += m[j + l] * r2[j + l];
-            s3[l] += m[j + l] * r3[j + l];
-        }
-    out[0] = (s0[0] + s0[1]) + (s0[2] + s0[3]);
-    out[1] = (s1[0] + s1[1]) + (s1[2] + s1[3]);
-    out[2] = (s2[0] + s2[1]) + (s2[2] + s2[3]);
-    out[3] = (s3[0] + s3[1]) + (s3[2] + s3[3]);
-}
-
 /* The product of two rows of any length. */
 static double dot(const double *a, const double *b, int n)
 {
@@ -388,6 +370,24 @@ static int make_fit(tg_qp *q)
     return 1;
 }
 #else
+/* The products of a row with four rows that lie TG_Q_W apart, from an entry to n, both multiples of four. */
+static void four_products(const double *restrict m, const double *restrict rows, int from, int n, double *out)
+{
+    const double *r1 = rows + TG_Q_W, *r2 = r1 + TG_Q_W, *r3 = r2 + TG_Q_W;
+    double s0[4] = {0.0}, s1[4] = {0.0}, s2[4] = {0.0}, s3[4] = {0.0};
+    for (int j = from; j < n; j += 4)
+        for (int l = 0; l < 4; l++) {
+            s0[l] += m[j + l] * rows[j + l];
+            s1[l] += m[j + l] * r1[j + l];
+            s2[l] += m[j + l] * r2[j + l];
+            s3[l] += m[j + l] * r3[j + l];
+        }
+    out[0] = (s0[0] + s0[1]) + (s0[2] + s0[3]);
+    out[1] = (s1[0] + s1[1]) + (s1[2] + s1[3]);
+    out[2] = (s2[0] + s2[1]) + (s2[2] + s2[3]);
+    out[3] = (s3[0] + s3[1]) + (s3[2] + s3[3]);
+}
+
 /* Append the factor's row i, whose normal is in place. */
 static void append_fit(tg_qp *q, int i)
 {
