@@ -24,6 +24,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from floor import Floor
 from numpy.typing import NDArray
 from ours import Ours
 from problem import run_loop
@@ -94,18 +95,16 @@ def ours(n: int, N: int, blocks: int, samples: int) -> dict[str, tuple[float, fl
     design = design_of(plant, N, blocks)
     for name, compiled in (("Python", False), ("C", True)):
         controller = Controller(plant, design, compiled=compiled)
-        clocked, floor = Clocked(controller.optimiser), list[float]()
+        clocked = Clocked(controller.optimiser)
         if isinstance(controller.optimiser, CompiledOptimiser):
             watch = Stopwatch()
             controller.optimiser._run = watch.of(controller.optimiser._c.library.tg_host_optimise)
             clocked.seconds = watch.seconds
         else:
-            controller.optimiser.qp.on_info = lambda info, kept=floor: kept.append(info["solve_time"])
+            found["DAQP's solve"] = floor(n, plant, design, samples)
         controller.reset({"t": 25.0})
         loop(n, lambda y, r, of=controller: float(of.step({"t": y}, r).drive), samples)
         found[f"program, {name}"] = clocked.seconds
-        if floor:
-            found["DAQP's solve"] = floor
     python = Controller(plant, design)
     python.reset({"t": 25.0})
     whole, watch = CompiledController(python), Stopwatch()
@@ -122,6 +121,15 @@ def ours(n: int, N: int, blocks: int, samples: int) -> dict[str, tuple[float, fl
     return in_ms(found)
 
 
+def floor(n: int, plant: Plant, design: Design, samples: int) -> list[float]:
+    """Return DAQP's own seconds for each sample of the loop."""
+    controller = Controller(plant, design, compiled=False)
+    own = Floor(controller.optimiser.qp)
+    controller.reset({"t": 25.0})
+    loop(n, lambda y, r: float(controller.step({"t": y}, r).drive), samples)
+    return own.seconds
+
+
 def in_ms(seconds: dict[str, list[float]]) -> dict[str, tuple[float, float]]:
     """Return median and worst [ms] of each list, its first five left out."""
     return {key: (1e3 * float(np.median(v[5:])), 1e3 * float(np.max(v[5:]))) for key, v in seconds.items()}
@@ -135,10 +143,11 @@ def reference(blocks: int, samples: int) -> dict[str, tuple[float, float]]:
     compiled.replan = lambda: timed(*given)
     run_loop(compiled, steps=samples)
     found["program, C"] = watch.seconds
-    python, floor = Ours(compiled=False, blocks=blocks), list[float]()
-    python.optimiser.qp.on_info = lambda info: floor.append(info["solve_time"])
-    found["program, Python"] = run_loop(python, steps=samples).cpu.tolist()
-    found["DAQP's solve"] = floor
+    found["program, Python"] = run_loop(Ours(compiled=False, blocks=blocks), steps=samples).cpu.tolist()
+    python = Ours(compiled=False, blocks=blocks)
+    own = Floor(python.optimiser.qp)
+    run_loop(python, steps=samples)
+    found["DAQP's solve"] = own.seconds
     return in_ms(found)
 
 

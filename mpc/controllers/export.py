@@ -370,7 +370,8 @@ def _run(program: Path, text: str) -> list[str]:
     command = [str(program.resolve())]
     done = subprocess.run(command, input=text, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise UserError(f"the export stopped: {done.stderr.strip()[:300]}", hint="report it: it must not")
+        why = done.stderr.strip()[:300] or f"exit code {done.returncode}"  # a trap says nothing
+        raise UserError(f"the export stopped: {why}", hint="report it: it must not")
     return done.stdout.splitlines()
 
 

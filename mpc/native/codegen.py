@@ -13,7 +13,9 @@ and is written into the first function that knows all it needs:
     partials(x, u, d, k, h -> x+, m),    tangent(m, k, h, sx -> sx+)
 
 and the last with a direction of the drives, su, and of the disturbances, sd, too.  ``hold`` does as much of
-it as ``step`` reads, ``hold_slopes`` all; ``next`` is hold and step.
+it as ``step`` reads, ``hold_slopes`` all; ``next`` is hold and step.  Both run over the drives of n blocks,
+at most four, entry i of block c at [4 i + c], so that a compiler may take four at once: a Peltier's are one
+long chain of products.
 
 ``tangent`` runs over many directions, n groups of four side by side, each group's numbers behind those of the
 last: entry i of direction c at [c / 4][i][c % 4].  Of the loop over the four a compiler makes vector
@@ -92,8 +94,8 @@ _HEADS = {
     part: f"void tg_model_{part}({arguments})"
     for part, arguments in {
         "prepare": "const double *p, double *k",
-        "hold": "const double *u, const double *k, double *h",
-        "hold_slopes": "const double *u, const double *k, double *h",
+        "hold": "int n, const double *restrict u, const double *k, double *restrict h",
+        "hold_slopes": "int n, const double *restrict u, const double *k, double *restrict h",
         "step": f"{_POINT}, const double *h, double *xn",
         "next": f"{_POINT}, double *xn",
         "partials": f"{_POINT}, const double *h, double *xn, double *m",
@@ -368,19 +370,19 @@ def _write(line: _Line, table: _Table) -> ModelCode:
     read = [at for at in h if at in _needed(line, roots[0])]
     into = {
         "k": [f"k[{entry}] = {{}};" for entry in range(len(k))],
-        "h": [f"h[{entry}] = {{}};" for entry in range(len(h))],
+        "h": [f"h[{4 * entry}] = {{}};" for entry in range(len(h))],
         "m": [f"m[{entry}] = {{}};" for entry in range(len(m))],
         "xn": [f"xn[{entry}] = {{}};" for entry, _ in outputs[0]],
     }
     out = [[f"out[{4 * entry} + c] = {{}};" for entry, _ in outputs[n]] for n in (1, 2, 3)]
     parts = {
         "prepare": _body(line, _PARAMETERS, k, into["k"]),
-        "hold": _body(line, _DRIVES, read, into["h"][: len(read)]),
-        "hold_slopes": _body(line, _DRIVES, h, into["h"]),
+        "hold": _over_drives(_body(line, _DRIVES, read, into["h"][: len(read)]), line.n_u),
+        "hold_slopes": _over_drives(_body(line, _DRIVES, h, into["h"]), line.n_u),
         "step": [*_body(line, _STATE, roots[0], into["xn"]), *table.step()],
         "next": [
-            f"    double h[{max(1, len(read))}];",
-            "    tg_model_hold(u, k, h);",
+            f"    double h[{4 * max(1, len(read))}];",
+            "    tg_model_hold(1, u, k, h);",
             "    tg_model_step(x, u, d, k, h, xn);",
         ],
         "partials": [*_body(line, _STATE, roots[0] + m, into["xn"] + into["m"]), *table.step()],
@@ -408,6 +410,13 @@ def _write(line: _Line, table: _Table) -> ModelCode:
     return ModelCode("\n".join(source), header, len(k), len(h), len(m), line)
 
 
+def _over_drives(lines: Sequence[str], n_u: int) -> list[str]:
+    """Return statements for the drives of one block, repeated over n of them."""
+    if not lines:
+        return ["    (void)n;"]
+    return [f"    for (; n > 0; n--, u += {n_u}, h++) {{", *("    " + item for item in lines), "    }"]
+
+
 def _over_groups(
     lines: Sequence[str], more: Sequence[str], moving: Sequence[str], sizes: Mapping[str, int]
 ) -> list[str]:
@@ -429,7 +438,7 @@ def _hand_over(
         read |= {at for found in line.outputs for at in found.values()}
     kept = sorted((at for at in read if line.values[at].stage == stage), key=lambda at: (at not in first, at))
     for entry, at in enumerate(kept):
-        line.values[at].place = f"{letter}[{entry}]"
+        line.values[at].place = f"{letter}[{4 * entry if letter == 'h' else entry}]"
     return kept
 
 

@@ -133,6 +133,7 @@ class Sizes:
     NK: int  # what the model's ``prepare``, ``hold`` and ``partials`` hand over
     NF: int
     NM: int
+    LEAN: int  # whether soft rows are so many that the broken ones are eliminated
 
     @property
     def NS(self) -> int:
@@ -180,6 +181,7 @@ def sizes_of(controller: ControllerParts, code: ModelCode, *, room: bool) -> Siz
         NK=code.n_k,
         NF=code.n_h,
         NM=code.n_m,
+        LEAN=int(N * (len(design.controlled) + len(design.limits)) >= 4 * len(design.blocks) * model.n_u),
     )
 
 
@@ -372,7 +374,7 @@ def _controller_parts(s: Sizes, number: Any) -> list[tuple[Any, int]]:
         (number, max(1, s.NR)),
         *((number, count) for count in (max(1, s.NE), s.NH * s.NY, s.NH * s.NY, s.NH * some)),
         *((number, count) for count in (2 * s.NX * wide, s.NU * wide, max(1, s.ND) * wide)),
-        *((number, count) for count in (s.NF, s.NM, z * z, z * z)),
+        *((number, count) for count in (4 * max(1, s.NF), s.NM, z * z, z * z)),
     ]
 
 
@@ -380,8 +382,7 @@ def _qp_parts(s: Sizes, number: Any) -> list[tuple[Any, int]]:
     whole, small = ctypes.c_int, ctypes.c_byte
     n, soft = s.NB * s.NU, s.NH * s.NS
     rows, w = 2 * n + soft, _whole(n)
-    lean = soft >= 4 * n
-    kept = 4 * n + 8 if lean else rows
+    kept = 4 * n + 8 if s.LEAN else rows
     return [
         (whole, 4),
         *((number, count) for count in (n * w, w, 2 * rows)),
@@ -394,7 +395,7 @@ def _qp_parts(s: Sizes, number: Any) -> list[tuple[Any, int]]:
         (whole, 2 + 2 * rows),
         (small, 2 * rows),
         *((number, count) for count in (rows, 2 * w + rows, rows * w, kept * (kept + 1) // 2, kept, rows)),
-        *((number, count) for count in ((n * w, n * w, kept * w) if lean else (1, 1, 1))),
+        *((number, count) for count in ((n * w, n * w, kept * w) if s.LEAN else (1, 1, 1))),
         (whole, kept + 2),
         (number, 2 * rows),
         (small, rows),

@@ -37,6 +37,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -46,6 +47,7 @@ from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.mpc.design.design import Design
 from thermogrip.mpc.estimator.observer import DisturbanceModel, Observer
 from thermogrip.mpc.optimiser.qp import CondensedQP
+from thermogrip.mpc.plant.along_plan import AlongPlan
 from thermogrip.mpc.plant.prediction import PredictionModel
 
 _SHARES = np.array([0.5, 0.25, 0.1, 0.0])
@@ -105,7 +107,9 @@ class Optimiser:
         self._limited = [model.outputs.index(name) for name in design.limits]
         self._limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2)
         n = self.n_b * model.n_u
+        self._spans = np.tile(model.span, self.n_b)  # of each unknown
         self.differences = np.kron(np.eye(self.n_b) - np.eye(self.n_b, k=-1), np.eye(model.n_u))
+        self._moves = self.differences.T @ self.differences
         self._hard = np.vstack([np.eye(n), self.differences])
         self.weight = np.array([design.weights.get(name, 1.0) for name in design.controlled])
         self._of_row = dict(zip(self._rows, self.weight))
@@ -113,17 +117,19 @@ class Optimiser:
         self._weight[-1] += design.terminal
         self._lengths = np.array(self.blocks, dtype=float)
         lengths = np.repeat(self._lengths, model.n_u)
-        self._fixed = 2 * (
-            design.move * self.differences.T @ self.differences + design.drive * np.diag(lengths)
-        )
+        self._drive_cost = design.drive * lengths
+        self._fixed = 2 * (design.move * self._moves + np.diag(self._drive_cost))
         ranges = np.array([design.drive_range[name] for name in model.drives])
         self.lowest, self.highest = ranges.T
+        low, high = (np.broadcast_to(end, (self.n_b, model.n_u)) for end in ranges.T)
+        self._whole = low, high
         self.slew = design.dt * np.array([design.slew_per_s[name] for name in model.drives])
         # a later block may differ by what the slew allows between the middles of the two
         middles = np.cumsum(self.blocks) - 0.5 * np.array(self.blocks) + 0.5
         gaps = np.concatenate([[1.0], np.diff(middles)])
         self.reach = np.cumsum(gaps)
         self.slews = (gaps[:, None] * self.slew).ravel()
+        self._slew_shares = self.slews / self._spans
         self._solves, self._move = 0, design.move
         # of a linear plant: G in the drives' ranges, the rows of the program, and H for what counts
         self._G: Array | None = None
@@ -142,6 +148,7 @@ class Optimiser:
         self.pair = self._pairs()
         self.settled_gain = self._settled_gain()
         self.seen = np.abs(self.at_rest) > 0.02 * np.max(np.abs(self.at_rest), axis=0)
+        self._per_rest = np.where(self.seen, self.at_rest, 1.0)
         # price of a unit beyond each soft row, of each controlled output and each limit
         dear = [_DEAR if name in design.hard else 1.0 for name in design.limits]
         self.dear = design.price * np.array(dear)
@@ -156,6 +163,10 @@ class Optimiser:
             time_limit_s=max(design.deadline_s, 1e-3),
         )
 
+    @cached_property
+    def _along(self) -> AlongPlan | None:
+        return self.model.along(self.blocks, self.model.span)
+
     def solve(self, sample: Sample) -> Outcome:
         """Improve a plan."""
         x, last, guess, d, now, side, bias, drive_bias, slew_s, lost, caution, ahead, tariff = sample
@@ -165,7 +176,7 @@ class Optimiser:
         more = 0.0 if slew_s is None else slew_s / self.design.dt - 1.0
         self._seen_rows = [at for at in range(len(self._rows)) if lost is None or not lost[at]]
         self._parked = [j for j in range(n_u) if lost is not None and lost[self.pair[j]]]
-        target = np.broadcast_to(now, (self.N, len(now))) if ahead is None else ahead
+        target = now[None] if ahead is None else ahead  # (1 or N, n_controlled)
         if lost is not None:
             side = np.where(lost, 0.0, side)
         if ahead is not None:  # nothing is beyond a target that moves
@@ -174,20 +185,16 @@ class Optimiser:
         if self.energy.any():
             self._costs = self.counted(tariff)[:, None] * self.energy
         guess = self._park(guess, last, more)
-        y0, G = model.trajectory(x, guess + drive_bias, d, self.blocks)
         linear = model.affine is not None
-        if self._G is None or not linear:
-            self._G = G.reshape(self.N, model.n_y, self.n_b * n_u) * np.tile(model.span, self.n_b)
-        G = self._G
+        y0, G = self._linearised(x, guess + drive_bias, d)
         authority = np.ones((self.n_b, n_u)) if linear else self._authority(G)
         y0 = y0 + bias
-        z0 = (guess / model.span).ravel()
-        free = y0 - G @ z0  # the response without any plan
+        free = y0 - G @ (guess / model.span).ravel()  # the response without any plan
         H, f = self._cost(G, free, target, last)
         ends = self._range(guess, drive_bias, authority, last, more)
         A, lower, upper = self._constraints(G, free, target, side, last, ends, more)
         answer = self.qp.solve(H, f, A, lower, upper)
-        plan = self._park((answer.x * np.tile(model.span, self.n_b)).reshape(self.n_b, n_u), last, more)
+        plan = self._park((answer.x * self._spans).reshape(self.n_b, n_u), last, more)
         if not answer.solved:
             return Outcome(plan, y0, answer.status, {}, answer.iterations, authority[0])
         if linear:
@@ -204,6 +211,16 @@ class Optimiser:
         plan, y = self._best(plan, guess, y0, last, more, predicted, merit)
         cost = merit(plan[None], y[None])[0] if self.positions else np.nan
         return Outcome(plan, y, "solved", self._broken(y), answer.iterations, authority[0], cost)
+
+    def _linearised(self, x: Array, plan: Array, d: Array) -> tuple[Array, Array]:
+        """Return the outputs along a plan, and G (N, n_y, n) by drives in their ranges."""
+        if self._along is not None:
+            y, G = self._along.trajectory(x, plan, d)
+            return y, G.reshape(self.N, self.model.n_y, -1)
+        y, G = self.model.trajectory(x, plan, d, self.blocks)
+        if self._G is None or self.model.affine is None:
+            self._G = G.reshape(self.N, self.model.n_y, -1) * self._spans
+        return y, self._G
 
     def counted(self, tariff: Array | None) -> Array:
         """Return the samples of each block (n_b,), each as often as the energy price counts in it."""
@@ -240,17 +257,20 @@ class Optimiser:
         merit: Callable[[Array, Array], Array],
     ) -> tuple[Array, Array]:
         """Return the QP's plan, or one that the nonlinear simulation finds better, with its outputs."""
-        plans, y = plan[None], predicted(plan[None])
-        at_guess, at_plan = merit(np.stack([guess, plan]), np.stack([y_guess, y[0]]))
-        dearer = at_plan > at_guess
         self._solves += 1
-        others = guess + _SHARES[:, None, None] * (plan - guess) if dearer else plans[:0]
-        if dearer or self._solves % _LOOK_AROUND == 1:
-            others = np.concatenate([others, self._park(self._ramps(last, more), last, more)])
-        if not len(others):
+        plans = plan[None]
+        if self._solves % _LOOK_AROUND == 1:
+            plans = np.concatenate([plans, self._park(self._ramps(last, more), last, more)])
+        y = predicted(plans)
+        costs = merit(np.concatenate([guess[None], plans]), np.concatenate([y_guess[None], y]))
+        at_guess, costs = costs[0], costs[1:]
+        if costs[0] > at_guess:
+            shorter = guess + _SHARES[:, None, None] * (plan - guess)
+            tried = predicted(shorter)
+            plans, y = np.concatenate([plans[:1], shorter, plans[1:]]), np.concatenate([y[:1], tried, y[1:]])
+            costs = np.concatenate([costs[:1], merit(shorter, tried), costs[1:]])
+        if len(plans) == 1:
             return plan, y[0]
-        plans, y = np.concatenate([plans, others]), np.concatenate([y, predicted(others)])
-        costs = merit(plans, y)
         costs[1:] *= _BARELY
         best = int(np.argmin(costs))
         return plans[best], y[best]
@@ -258,8 +278,10 @@ class Optimiser:
     def _response(self, G: Array) -> Array:
         """Return the response (n_b, n_u) to each block, summed over time, of the output moved most."""
         G = G.reshape(self.N, self.model.n_y, self.n_b, self.model.n_u)
-        sums = G[:, self._rows].sum(axis=0)
-        return np.asarray(sums[self.strongest, :, np.arange(self.model.n_u)].T)
+        found = np.empty(G.shape[2:])
+        for j, at in enumerate(self.strongest):
+            np.add.reduce(G[:, self._rows[at], :, j], axis=0, out=found[:, j])
+        return found
 
     def _response_at_rest(self) -> Array:
         """Set which output each drive moves most; return the response at rest (n_b, n_u) of that one."""
@@ -284,16 +306,21 @@ class Optimiser:
 
     def _authority(self, G: Array) -> Array:
         """Return each block's response over that at rest, (n_b, n_u); 1 where the horizon hides it."""
-        return np.where(self.seen, self._response(G) / np.where(self.seen, self.at_rest, 1.0), 1.0)
+        return np.where(self.seen, self._response(G) / self._per_rest, 1.0)
 
     def _range(
         self, guess: Array, drive_bias: Array, authority: Array, last: Array, more: float
     ) -> tuple[Array, Array]:
         """Return the range (n_b, n_u) of each block: no further than where its gain will have faded."""
-        away, held = guess - self.neutral, last - self.neutral
-        reach = (self.reach[:, None] + more) * self.slew
-        least = np.where(away * held > 0, np.abs(held) - reach, 0.0)  # what the slew allows
-        low, high = self.faded_range(away, drive_bias, authority, self.neutral, least)
+        if (authority < 1 - FADING).any():
+            away, held = guess - self.neutral, last - self.neutral
+            reach = (self.reach[:, None] + more) * self.slew
+            least = np.where(away * held > 0, np.abs(held) - reach, 0.0)  # what the slew allows
+            low, high = self.faded_range(away, drive_bias, authority, self.neutral, least)
+        else:
+            low, high = self._whole
+        if not self._parked and not self.positions:
+            return low, high
         little = np.zeros(self.model.n_u)
         given = [*self._parked, *self.positions]
         little[given] = _LITTLE * self.model.span[given]
@@ -313,6 +340,8 @@ class Optimiser:
 
     def _simulate(self, x: Array, plans: Array, d: Array) -> Array:
         """Return the outputs (B, N, n_y) of plans (B, n_b, n_u)."""
+        if self._along is not None:
+            return self._along.outputs(x, plans, d)
         states = np.repeat(x[None, :], len(plans), axis=0)
         held = d if d.ndim == 1 else d[None]
         y, _ = self.model.run(states, np.repeat(plans, self.blocks, axis=1), held)
@@ -329,14 +358,14 @@ class Optimiser:
 
     def _merit(self, plans: Array, y: Array, target: Array, side: Array, last: Array) -> Array:
         """Return the cost (B,) of plans (B, n_b, n_u) whose outputs y (B, N, n_y) were simulated."""
-        design, shares = self.design, plans / self.model.span
+        design, n_u = self.design, self.model.n_u
+        shares = plans.reshape(len(plans), -1) / self._spans
         moves = shares.copy()
-        moves[:, 1:] -= shares[:, :-1]
-        moves[:, 0] -= last / self.model.span
-        cost = self._move * np.einsum("ijk,ijk->i", moves, moves)
-        cost += design.drive * np.einsum("ijk,ijk,j->i", shares, shares, self._lengths)
+        moves[:, n_u:] -= shares[:, :-n_u]
+        moves[:, :n_u] -= last / self.model.span
+        cost = self._move * np.sum(moves * moves, axis=1) + (shares * shares) @ self._drive_cost
         if self._costs is not None:
-            cost += np.einsum("ijk,jk->i", shares, self._costs)
+            cost += shares @ self._costs.ravel()
         over: list[tuple[float, Array]] = []
         for at in self._seen_rows:
             error = y[:, :, self._rows[at]] - target[:, at]
@@ -348,7 +377,7 @@ class Optimiser:
             if side[at]:
                 over.append((design.price, side[at] * error - design.overshoot))
         for at, row in enumerate(self._limited):
-            low, high = self._limits[at]
+            low, high = self._limits[at].tolist()
             over.append((self.dear[at], np.maximum(low - y[:, :, row], y[:, :, row] - high)))
         for price, beyond in over:
             if not beyond.max() <= 0.0:
@@ -370,7 +399,7 @@ class Optimiser:
         """
         n_u, span = self.model.n_u, np.tile(self.model.span, self.n_b)
         H, weighted = self._hessian(G, rows)
-        linear = 2 * np.stack(weighted, axis=2)
+        linear = np.stack(weighted, axis=2)
         before = np.zeros((H.shape[0], n_u))
         before[:n_u] = np.diag(1 / self.model.span)
         last = 2 * self.design.move * self.differences.T @ before
@@ -378,11 +407,11 @@ class Optimiser:
         return H, on_free, span[:, None] * np.linalg.solve(H, last)
 
     def _hessian(self, G: Array, rows: Sequence[int]) -> tuple[Array, list[Array]]:
-        """Return H, and by output the response (n, N) of each sample times its weight."""
+        """Return H, and by output the response (n, N) of each sample times twice its weight."""
         H = self._fixed.copy()
-        weighted = [G[:, row, :].T * (self._of_row[row] * self._weight) for row in rows]
+        weighted = [G[:, row, :].T * (2 * self._of_row[row] * self._weight) for row in rows]
         for row, part in zip(rows, weighted):
-            H += 2 * part @ G[:, row, :]
+            H += part @ G[:, row, :]
         return H, weighted
 
     def _cost(self, G: Array, free: Array, target: Array, last: Array) -> tuple[Array, Array]:
@@ -391,17 +420,16 @@ class Optimiser:
         key = tuple(rows), self._move
         if self._kept is None or self._kept[0] != key or self.model.affine is None:
             H, weighted = self._hessian(G, rows)
-            H += 2 * (self._move - self.design.move) * self.differences.T @ self.differences
+            if self._move != self.design.move:
+                H += 2 * (self._move - self.design.move) * self._moves
             self._kept = key, H, weighted
         _, H, weighted = self._kept
         f = np.zeros(H.shape[0])
         if self._costs is not None:
             f += self._costs.ravel()
         for at, row, part in zip(tracked, rows, weighted):
-            f += 2 * part @ (free[:, row] - target[:, at])
-        before = np.zeros(H.shape[0])
-        before[: self.model.n_u] = last / self.model.span
-        f -= 2 * self._move * self.differences.T @ before
+            f += part @ (free[:, row] - target[:, at])
+        f[: self.model.n_u] -= 2 * self._move * (last / self.model.span)
         return H, f
 
     def _constraints(
@@ -414,31 +442,37 @@ class Optimiser:
         ends: tuple[Array, Array],
         more: float,
     ) -> tuple[Array, Array, Array]:
-        n, span = self.n_b * self.model.n_u, np.tile(self.model.span, self.n_b)
-        before = np.zeros(n)
-        before[: self.model.n_u] = last
-        slews = self.slews.copy()
-        slews[: self.model.n_u] += more * self.slew
-        if self._A is None or self.model.affine is None:
-            self._A = np.vstack([self._hard, *(G[:, row, :] for row in self._rows + self._limited)])
-        lower = [ends[0].ravel() / span, (before - slews) / span]
-        upper = [ends[1].ravel() / span, (before + slews) / span]
+        n, n_u, N = self.n_b * self.model.n_u, self.model.n_u, self.N
+        soft = self._rows + self._limited
+        if self._A is None:
+            self._A = np.concatenate([self._hard, *(G[:, row] for row in soft)])
+        elif self.model.affine is None:
+            self._A[2 * n :].reshape(len(soft), N, n)[...] = G[:, soft].transpose(1, 0, 2)
+        lower, upper = np.empty(len(self._A)), np.empty(len(self._A))
+        lower[:n], upper[:n] = ends[0].ravel() / self._spans, ends[1].ravel() / self._spans
+        first, before = slice(n, n + n_u), last / self.model.span
+        reach = self._slew_shares[:n_u] + more * self.slew / self.model.span
+        lower[n : 2 * n], upper[n : 2 * n] = -self._slew_shares, self._slew_shares
+        lower[first], upper[first] = before - reach, before + reach
+        rows = slice(2 * n, 2 * n + N)
         for at, row in enumerate(self._rows):
             far, down, up = self.design.overshoot, side[at] < 0, side[at] > 0
             if self.zone[at]:
                 far, down = self.zone[at], at in self._seen_rows
                 up = down
-            lower.append((target[:, at] - far if down else -np.inf) - free[:, row])
-            upper.append((target[:, at] + far if up else np.inf) - free[:, row])
+            left = target[:, at] - free[:, row]
+            lower[rows], upper[rows] = left - far if down else -np.inf, left + far if up else np.inf
+            rows = slice(rows.stop, rows.stop + N)
         for at, row in enumerate(self._limited):
-            lower.append(self._limits[at, 0] - free[:, row])
-            upper.append(self._limits[at, 1] - free[:, row])
-        return self._A, np.concatenate(lower), np.concatenate(upper)
+            lower[rows], upper[rows] = self._limits[at, :, None] - free[:, row]
+            rows = slice(rows.stop, rows.stop + N)
+        return self._A, lower, upper
 
     def _broken(self, y: Array) -> dict[str, float]:
         found = {}
         for at, (name, row) in enumerate(zip(self.design.limits, self._limited)):
-            over = float(np.max(np.maximum(self._limits[at, 0] - y[:, row], y[:, row] - self._limits[at, 1])))
+            low, high = self._limits[at].tolist()
+            over = float(max(low - y[:, row].min(), y[:, row].max() - high))
             if over > 0.1:
                 found[name] = over
         return found

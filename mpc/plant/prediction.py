@@ -43,6 +43,7 @@ from scipy.optimize import least_squares
 
 from thermogrip.datasets.arrays import Array, Values
 from thermogrip.datasets.errors import UserError, known_names
+from thermogrip.mpc.plant.along_plan import AlongPlan, SampleDerivatives
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.jit_rollout import Kernel
@@ -149,7 +150,6 @@ class PredictionModel:
         self.sub = max(1, round(wanted / plant.dt))
         self.dt = self.sub * plant.dt
         self._responses: dict[tuple[int, ...], Response] = {}
-        self._directions: dict[tuple[int, ...], tuple[Array, Array, Array]] = {}
         self.sub = self._fewest_steps()
 
     def _fewest_steps(self) -> int:
@@ -226,7 +226,7 @@ class PredictionModel:
         """Return one sample's next state (n_x,), and its derivatives A, B, E by x, u (n_x, n_u) and d."""
         if self.affine is not None:
             return self.next_state(x, u, d), *self.affine[:3]
-        return self._derivatives(x, u, d)
+        return self._by_casadi(x, u, d) if self._sample is None else self._sample(x, u, d)
 
     @cached_property
     def affine(self) -> tuple[Array, Array, Array, Array] | None:
@@ -241,17 +241,6 @@ class PredictionModel:
         added, A, B, E = self._by_casadi(*(np.zeros(n) for n in (self.n_x, self.n_u, self.n_d)))
         return A, B, E, added
 
-    def _derivatives(self, x: Array, u: Array, d: Array) -> tuple[Array, Array, Array, Array]:
-        n_x, n_u = self.n_x, self.n_u
-        if self._kernel is None:
-            return self._by_casadi(x, u, d)
-        along = np.eye(n_x + n_u + self.n_d)
-        _, after = self._tangents(
-            x, u[None], d, along[:, :n_x], along[:, None, n_x : n_x + n_u], along[:, n_x + n_u :]
-        )
-        A, B, E = np.split(after[:, n_x:].T, [n_x, n_x + n_u], axis=1)
-        return after[0, :n_x], A, B, E
-
     def _by_casadi(self, x: Array, u: Array, d: Array) -> tuple[Array, Array, Array, Array]:
         after, A, B, E = self._casadi_sample(x, u, d)
         return after.ravel(), A, B, E
@@ -264,24 +253,9 @@ class PredictionModel:
         steps = _TangentSteps(self)
         return Kernel(steps) if steps.are_arithmetic else None
 
-    def _tangents(self, x: Array, u: Array, d: Array, sx: Array, su: Array, sd: Array) -> tuple[Array, Array]:
-        """Run samples u (N, n_u) with directions sx (B, n_x), su (B, N, n_u), sd (B, n_d) to outputs (B, N +
-        1, 2 n_y) and the last state (B, 2 n_x), values first, then directions."""
-        if self._kernel is None:
-            raise RuntimeError("no compiled step")
-        count, n = len(su), len(u)
-        states = np.empty((count, 2 * self.n_x))
-        states[:, : self.n_x], states[:, self.n_x :] = x, sx
-        drives = np.empty((count, n, 2 * self.n_u))
-        drives[..., : self.n_u], drives[..., self.n_u :] = u, su
-        told = np.atleast_2d(d)  # one row holds for all samples
-        fine = drives if self.sub == 1 else np.repeat(drives, self.sub, axis=1)
-        held = np.empty((count, fine.shape[1], 2 * self.n_d))
-        held[..., : self.n_d] = told if len(told) == 1 else np.repeat(told, self.sub, axis=0)
-        held[..., self.n_d :] = sd[:, None]
-        renew = np.zeros(fine.shape[1], dtype=bool)
-        y, x_end = self._kernel.rollout(states, fine, held, np.zeros((1, 0)), self.dt / self.sub, renew)
-        return y[:, :: self.sub], x_end
+    @cached_property
+    def _sample(self) -> SampleDerivatives | None:
+        return None if self._kernel is None else SampleDerivatives(self, self._kernel)
 
     @cached_property
     def C(self) -> Array:
@@ -307,21 +281,17 @@ class PredictionModel:
                 return np.stack(states) @ self.C.T + self.output(np.zeros(self.n_x)), G
             y = by_x @ x + by_rest @ (E @ d + added) + np.tensordot(G, plan, axes=2)
             return y + self.output(np.zeros(self.n_x)), G
-        if self._kernel is None:
-            return self._trajectory_by_casadi(x, plan, d, blocks)
-        n_b, n_u = plan.shape
-        u = np.repeat(plan, blocks, axis=0)
-        y, _ = self._tangents(x, u, d, *self._along_blocks(tuple(blocks)))
-        G = y[:, 1:, self.n_y :].transpose(1, 2, 0).reshape(len(u), self.n_y, n_b, n_u)
-        return np.ascontiguousarray(y[0, 1:, : self.n_y]), G
+        along = self.along(blocks, np.ones(self.n_u))
+        return (
+            self._trajectory_by_casadi(x, plan, d, blocks) if along is None else along.trajectory(x, plan, d)
+        )
 
-    def _along_blocks(self, blocks: tuple[int, ...]) -> tuple[Array, Array, Array]:
-        """Return the directions (B, n_x), (B, N, n_u) and (B, n_d) of a drive in a block each, made once."""
-        if blocks not in self._directions:
-            n = len(blocks) * self.n_u
-            su = np.repeat(np.eye(n).reshape(n, len(blocks), self.n_u), blocks, axis=1)
-            self._directions[blocks] = np.zeros((n, self.n_x)), su, np.zeros((n, self.n_d))
-        return self._directions[blocks]
+    def along(self, blocks: Sequence[int], unit: Array) -> AlongPlan | None:
+        """Return what runs plans of these blocks again and again, its derivatives by drives in these units;
+        None where the step is linear or more than arithmetic."""
+        if self.affine is not None or self._kernel is None:
+            return None
+        return AlongPlan(self, self._kernel, blocks, unit)
 
     def response(self, blocks: tuple[int, ...]) -> Response:
         """Return how a linear plant's outputs answer, made once for these blocks."""

@@ -117,7 +117,7 @@ typedef struct {
     double y_guess[TG_NH * TG_NY], y_try[TG_NH * TG_NY];
     double free[TG_NH * TG_SOME(TG_NS)];
     double seed[2 * TG_NX * TG_WIDE], seed_u[TG_NU * TG_WIDE], seed_d[TG_SOME(TG_ND) * TG_WIDE];
-    double by_drives[TG_SOME(TG_NF)]; /* what the drives fix in the model's step */
+    double by_drives[4 * TG_SOME(TG_NF)]; /* what the drives of four blocks fix in the model's step */
     double partials[TG_SOME(TG_NM)], jacobian[TG_Z * TG_Z], spare[TG_Z * TG_Z];
 } tg_controller;
 

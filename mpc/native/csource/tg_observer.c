@@ -383,7 +383,7 @@ static double *sample_jacobian(tg_controller *c, const double *u, const double *
     for (int j = 0; j < TG_ND; j++)
         *entry(c->seed_d, TG_ND, j, TG_NX + TG_NU + j) = 1.0;
     memcpy(x, c->x, sizeof x);
-    tg_model_hold_slopes(u, s->k, c->by_drives);
+    tg_model_hold_slopes(1, u, s->k, c->by_drives);
     for (int part = 0; part < s->sub; part++) {
         tg_model_partials(x, u, d, s->k, c->by_drives, next, c->partials);
         tg_model_tangent_d((TG_SEEDS + 3) / 4, c->partials, s->k, c->by_drives, now, c->seed_u, c->seed_d, then);
@@ -423,7 +423,7 @@ static void look_ahead(tg_controller *c, const double *u, const double *d, doubl
         return;
     }
     memcpy(x, c->x, sizeof x);
-    tg_model_hold(u, s->k, c->by_drives);
+    tg_model_hold(1, u, s->k, c->by_drives);
     for (int part = 0; part < s->sub; part++) {
         tg_model_step(x, u, d, s->k, c->by_drives, next);
         memcpy(x, next, sizeof x);

@@ -92,21 +92,30 @@ static void park(const tg_controller *c, const double *last, double *plan)
             }
 }
 
+/* The drives of a block and of the next ones, four at most, biases included; return of how many. */
+static int drives_of(const tg_controller *c, const double *plan, const double *drive_bias, int b, double *u)
+{
+    int blocks = c->design->n_b - b < 4 ? c->design->n_b - b : 4;
+    for (int i = 0; i < blocks * TG_NU; i++)
+        u[i] = plan[b * TG_NU + i] + drive_bias[i % TG_NU];
+    return blocks;
+}
+
 void tg_simulate(tg_controller *c, const double *start, const double *plan, const double *drive_bias, const double *d,
                  const double *bias, double *y)
 {
     const tg_design *s = c->design;
-    double both[2][TG_NX], *x = both[0], *next = both[1], u[TG_NU];
+    double both[2][TG_NX], *x = both[0], *next = both[1], four[4 * TG_NU];
     int k = 0;
     memcpy(x, start, sizeof both[0]);
     for (int b = 0; b < s->n_b; b++) {
-        for (int j = 0; j < TG_NU; j++)
-            u[j] = plan[b * TG_NU + j] + drive_bias[j];
-        tg_model_hold(u, s->k, c->by_drives);
+        const double *u = four + b % 4 * TG_NU, *h = c->by_drives + b % 4;
+        if (b % 4 == 0)
+            tg_model_hold(drives_of(c, plan, drive_bias, b, four), four, s->k, c->by_drives);
         for (int at = 0; at < s->blocks[b]; at++, k++) {
             for (int part = 0; part < s->sub; part++) {
                 double *swap = x;
-                tg_model_step(x, u, d, s->k, c->by_drives, next);
+                tg_model_step(x, u, d, s->k, h, next);
                 x = next;
                 next = swap;
             }
@@ -139,26 +148,25 @@ static void linearise(tg_controller *c, const double *start, const double *guess
                       const double *d, const double *bias)
 {
     const tg_design *s = c->design;
-    double both[2][TG_NX], *x = both[0], *next = both[1], u[TG_NU];
+    double both[2][TG_NX], *x = both[0], *next = both[1], four[4 * TG_NU];
     double *now = c->seed, *then = c->seed + TG_NX * TG_WIDE;
     int k = 0, rows = s->n_c + s->n_l;
     memcpy(x, start, sizeof both[0]);
     lay_out(c);
     for (int b = 0, groups = 0; b < s->n_b; b++) {
         int begun = b * TG_NU, before = begun / 4 * 4 * TG_NX, needed = TG_WHOLE(begun + TG_NU) / 4;
-        for (int j = 0; j < TG_NU; j++)
-            u[j] = guess[begun + j] + drive_bias[j];
+        const double *u = four + b % 4 * TG_NU, *h = c->by_drives + b % 4;
         seed_drives(c, begun);
         memset(now + groups * 4 * TG_NX, 0, (size_t)((needed - groups) * 4 * TG_NX) * sizeof(double));
         groups = needed;
-        tg_model_hold_slopes(u, s->k, c->by_drives);
+        if (b % 4 == 0)
+            tg_model_hold_slopes(drives_of(c, guess, drive_bias, b, four), four, s->k, c->by_drives);
         for (int at = 0; at < s->blocks[b]; at++, k++) {
             for (int part = 0; part < s->sub; part++) {
                 double *swap = now, *last = x;
-                tg_model_partials(x, u, d, s->k, c->by_drives, next, c->partials);
-                tg_model_tangent(begun / 4, c->partials, s->k, c->by_drives, now, then);
-                tg_model_tangent_u(groups - begun / 4, c->partials, s->k, c->by_drives, now + before, c->seed_u,
-                                   then + before);
+                tg_model_partials(x, u, d, s->k, h, next, c->partials);
+                tg_model_tangent(begun / 4, c->partials, s->k, h, now, then);
+                tg_model_tangent_u(groups - begun / 4, c->partials, s->k, h, now + before, c->seed_u, then + before);
                 x = next;
                 next = last;
                 now = then;

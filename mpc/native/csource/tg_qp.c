@@ -22,7 +22,7 @@
  * the end by a step of refinement with K itself (in single numbers, whose share is 3e-7, by as many as it takes). Hard rows that cannot be fulfilled together show there.
  *
  * Soft rows may be broken by the dozen, the others are hardly more than there are unknowns. Where soft rows are many
- * (TG_Q_LEAN), the broken ones, b, are eliminated from K z = r, D their diagonal:
+ * (TG_LEAN), the broken ones, b, are eliminated from K z = r, D their diagonal:
  *
  *     S = I + sum_b m m'/D,     T = M S^-1 M' + 1e-11 diag(K),     M the normals of the others, h,
  *     T z_h = r_h - M S^-1 g,   g = sum_b m r_b/D,   v = S^-1 (M' z_h + g),   z_b = (r_b - m'v)/D.
@@ -214,7 +214,7 @@ static void backward(const tg_qp *q, double *b)
     }
 }
 
-#if TG_Q_LEAN
+#if TG_LEAN
 /* Replace b by U'^-1 b of S = U'U; it is 0 behind entry n. */
 static void forward_root(const tg_qp *q, double *b)
 {
@@ -291,7 +291,7 @@ static void set_give(tg_qp *q, int i)
         q->give[i] += 1.0 / (ratio_of(q, q->row[i]) * price_of(q, q->row[i]));
 }
 
-#if TG_Q_LEAN
+#if TG_LEAN
 /* Add a share of a normal's product with itself to S. */
 static void add_broken(tg_qp *q, int i, double share)
 {
@@ -370,19 +370,39 @@ static int make_fit(tg_qp *q)
     return 1;
 }
 #else
+/* The products of a row with four rows that lie TG_Q_W apart, from an entry to n, both multiples of four. */
+static void four_products(const double *restrict m, const double *restrict rows, int from, int n, double *out)
+{
+    const double *r1 = rows + TG_Q_W, *r2 = r1 + TG_Q_W, *r3 = r2 + TG_Q_W;
+    double s0[4] = {0.0}, s1[4] = {0.0}, s2[4] = {0.0}, s3[4] = {0.0};
+    for (int j = from; j < n; j += 4)
+        for (int l = 0; l < 4; l++) {
+            s0[l] += m[j + l] * rows[j + l];
+            s1[l] += m[j + l] * r1[j + l];
+            s2[l] += m[j + l] * r2[j + l];
+            s3[l] += m[j + l] * r3[j + l];
+        }
+    out[0] = (s0[0] + s0[1]) + (s0[2] + s0[3]);
+    out[1] = (s1[0] + s1[1]) + (s1[2] + s1[3]);
+    out[2] = (s2[0] + s2[1]) + (s2[2] + s2[3]);
+    out[3] = (s3[0] + s3[1]) + (s3[2] + s3[3]);
+}
+
 /* Append the factor's row i, whose normal is in place. */
 static void append_fit(tg_qp *q, int i)
 {
     const double *m = q->normal + (size_t)i * TG_Q_W;
     int n = TG_WHOLE(q->n);
     double *row = fit_row(q, i), left = tg_product(m + q->from[i], m + q->from[i], n - q->from[i]) + q->give[i];
-    for (int k = 0; k < i; k++) {
-        int from = q->from[i] > q->from[k] ? q->from[i] : q->from[k];
-        row[k] = tg_product(m + from, q->normal + (size_t)k * TG_Q_W + from, n - from);
-    }
-    for (int k = 1; k < i; k++)
+    int k = 0;
+
+    for (; k + 4 <= i; k += 4)
+        four_products(m, q->normal + (size_t)k * TG_Q_W, q->from[i], n, row + k);
+    for (; k < i; k++)
+        row[k] = tg_product(m + q->from[i], q->normal + (size_t)k * TG_Q_W + q->from[i], n - q->from[i]);
+    for (k = 1; k < i; k++)
         row[k] -= dot(fit_row(q, k), row, k);
-    for (int k = 0; k < i; k++) {
+    for (k = 0; k < i; k++) {
         double scaled = row[k] / q->pivot[k];
         left -= scaled * row[k];
         row[k] = scaled;
@@ -493,7 +513,7 @@ static void solve_factor(const tg_qp *q, double *b, int n)
 }
 
 /* Replace b by the solution of K z = b. */
-#if TG_Q_LEAN
+#if TG_LEAN
 static void solve_fit(const tg_qp *q, double *b)
 {
     double v[TG_Q_W] = {0.0}, z[TG_Q_K] = {0.0};

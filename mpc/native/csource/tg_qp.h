@@ -20,11 +20,11 @@
 #define TG_WHOLE(n) (((n) + 3) & ~3)
 #define TG_Q_W (((TG_Q_N) + 3) / 4 * 4)
 
-/* Of few unknowns and many soft rows the factor is of the rows that hold alone, of which there are hardly more than
- * unknowns; those that are broken are in a matrix of the unknowns.  So the room grows with the rows, not their square. */
-#define TG_Q_LEAN (TG_Q_S >= 4 * TG_Q_N)
-#define TG_Q_K (TG_Q_LEAN ? 4 * TG_Q_N + 8 : TG_Q_M)
-#define TG_Q_L (TG_Q_LEAN ? TG_Q_N * TG_Q_W : 1)
+/* Of few unknowns and many soft rows (TG_LEAN: four times as many) the factor is of the rows that hold alone, of which
+ * there are hardly more than unknowns; those that are broken are in a matrix of the unknowns.  So the room grows with
+ * the rows, not their square. */
+#define TG_Q_K (TG_LEAN ? 4 * TG_Q_N + 8 : TG_Q_M)
+#define TG_Q_L (TG_LEAN ? TG_Q_N * TG_Q_W : 1)
 
 enum tg_qp_status {
     TG_QP_SOLVED = 0,
@@ -65,7 +65,7 @@ typedef struct {
     double fit[TG_Q_K * (TG_Q_K + 1) / 2], pivot[TG_Q_K]; /* LDL' of their products */
     double give[TG_Q_M];                   /* what of its multiplier a row in the set gives way by */
     double soft[TG_Q_L], root[TG_Q_L];     /* 1 and the products of the broken rows, and U of it */
-    double seen[TG_Q_LEAN ? TG_Q_K * TG_Q_W : 1]; /* U'^-1 of the normals of the others, */
+    double seen[TG_LEAN ? TG_Q_K * TG_Q_W : 1]; /* U'^-1 of the normals of the others, */
     int other[TG_Q_K], n_other, stale;     /* which those are, and whether all this is to be made anew */
     double right[TG_Q_M], wanted[TG_Q_M];
     signed char in_set[TG_Q_M];

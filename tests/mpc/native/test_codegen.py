@@ -114,9 +114,9 @@ def test_the_step_in_c_is_the_models_with_its_switches_on(
     # and its slopes along six directions, two groups of four, with and without drives and disturbances
     _, A, B, E = model.linearise(x, u, d)
     sx, su, sd = (rng.normal(size=(n, 8)) for n in (model.n_x, model.n_u, model.n_d))
-    h, m, out = np.zeros(code.n_h + 1), np.zeros(code.n_m), np.zeros((2, model.n_x, 4))
+    h, m, out = np.zeros(4 * code.n_h + 1), np.zeros(code.n_m), np.zeros((2, model.n_x, 4))
     groups = [np.stack([part[:, :4], part[:, 4:]]) for part in (sx, su, sd)]
-    library.tg_model_hold_slopes(given(u), given(k), given(h))
+    library.tg_model_hold_slopes(1, given(u), given(k), given(h))
     library.tg_model_partials(given(x), given(u), given(d), given(k), given(h), given(after), given(m))
     np.testing.assert_allclose(after, model.next_state(x, u, d), rtol=1e-10)
     meant = {"": A @ sx, "_u": A @ sx + B @ su, "_d": A @ sx + B @ su + E @ sd}
@@ -126,11 +126,18 @@ def test_the_step_in_c_is_the_models_with_its_switches_on(
         tangent(2, given(m), given(k), given(h), *(given(group) for group in kept), given(out))
         np.testing.assert_allclose(np.hstack([out[0], out[1]]), want, atol=1e-9)
     # what holds for a step alone is the beginning of what holds for its slopes
-    less = np.full(code.n_h + 1, np.nan)
-    library.tg_model_hold(given(u), given(k), given(less))
+    less = np.full(4 * code.n_h + 1, np.nan)
+    library.tg_model_hold(1, given(u), given(k), given(less))
     seen = np.isfinite(less)
     np.testing.assert_array_equal(less[seen], h[seen])
     library.tg_model_step(given(x), given(u), given(d), given(k), given(less), given(after))
+    np.testing.assert_allclose(after, model.next_state(x, u, d), rtol=1e-10)
+    # and of four blocks each is what it is alone
+    drives, each = rng.uniform(model.lowest, model.highest, (4, model.n_u)), np.zeros(4 * code.n_h + 1)
+    drives[2] = u
+    library.tg_model_hold_slopes(4, given(drives), given(k), given(each))
+    np.testing.assert_allclose(each[2:-1:4], h[:-1:4], rtol=1e-12, atol=1e-12)
+    library.tg_model_step(given(x), given(u), given(d), given(k), given(each[2:]), given(after))
     np.testing.assert_allclose(after, model.next_state(x, u, d), rtol=1e-10)
     if name == "gripper":
         assert model.model.switches  # the pump
