@@ -11,14 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from threading import Lock
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
 
 if TYPE_CHECKING:
-    from thermogrip.mpc.plant.prediction import PredictionModel
     from thermogrip.sysid.models.jit_rollout import Batch, Kernel
 
 __all__ = ["AlongPlan", "SampleDerivatives"]
@@ -26,11 +25,22 @@ __all__ = ["AlongPlan", "SampleDerivatives"]
 _PLANS = 8  # that take no longer than one
 
 
+class Sizes(Protocol):
+    """What of a prediction model says how large its runs are."""
+
+    n_x: int
+    n_u: int
+    n_y: int
+    n_d: int
+    sub: int  # steps of the model in a sample
+    dt: float  # s, of a sample
+
+
 class AlongPlan:
     """Runs of one model, ``kernel`` its step with the derivative in one direction, over these blocks;
     derivatives are by drives in these units (n_u,)."""
 
-    def __init__(self, model: PredictionModel, kernel: Kernel, blocks: Sequence[int], unit: Array) -> None:
+    def __init__(self, model: Sizes, kernel: Kernel, blocks: Sequence[int], unit: Array) -> None:
         from thermogrip.sysid.models.jit_rollout import Batch
 
         self._sizes = model.n_x, model.n_u, model.n_y, model.n_d
@@ -73,7 +83,7 @@ class AlongPlan:
 class SampleDerivatives:
     """One sample's next state and its derivatives."""
 
-    def __init__(self, model: PredictionModel, kernel: Kernel) -> None:
+    def __init__(self, model: Sizes, kernel: Kernel) -> None:
         from thermogrip.sysid.models.jit_rollout import Batch
 
         n_x, n_u, n_d = self._sizes = model.n_x, model.n_u, model.n_d
