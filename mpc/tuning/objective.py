@@ -456,12 +456,6 @@ class Search:
         )
 
     @property
-    def resolution(self) -> float:
-        """Half a reading, over the minimum time: settling times are multiples of a reading."""
-        found = [bound for key, bound in self.bounds.items() if key[2] in self.draws and np.isfinite(bound)]
-        return float(0.5 * self.plant.dt / np.mean(found))
-
-    @property
     def at_once(self) -> list[str]:
         """The controlled outputs whose targets need not ramp."""
         return [name for name in self.baseline.controlled if name not in self.baseline.ramp_per_s]

@@ -36,7 +36,7 @@ from thermogrip.mpc.tuning.objective import Record, Search, Trial, parameters_of
 RESOLUTION = (1.0, 0.05, 0.005)
 
 _CAPS = (0.9, 0.75, 0.6, 0.5)
-_MOVES = (0.1, 3.0, 10.0, 30.0, 100.0)
+_MOVES = (0.1, 0.3, 3.0, 10.0, 30.0, 100.0)
 _TRUST = (0.3, 0.1)
 #: How many minimum times the targets of ramped designs take.
 RAMPS = (1.3, 1.7)

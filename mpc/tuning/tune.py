@@ -488,7 +488,7 @@ def _trade(
     again = [(trial.parameters, noise) for trial in near for noise in range(1, 1 + _NOISES)]
     louder = run_parallel(search.evaluate_in_other_noise, again, workers, what="the same in other noise")
     noises = [[near[k], *louder[_NOISES * k :][:_NOISES]] for k in range(len(near))]
-    still = near[_stillest(noises, search.resolution)]
+    still = near[_stillest(noises)]
     return pareto, best if still is own[0] else search.evaluate(still.parameters)
 
 
@@ -509,15 +509,14 @@ def _contenders(own: Sequence[Trial]) -> list[Trial]:
     return [own[0], *still[: _CONTENDERS - 1], *([_best(capped)] if capped else [])]
 
 
-def _stillest(found: Sequence[Sequence[Trial]], resolution: float = 0.0) -> int:
+def _stillest(found: Sequence[Sequence[Trial]]) -> int:
     """Return which of these designs moves least, of those that score as the best does as far as trials tell;
     of each there is a trial in each of the same noises.
 
     They tell a difference of their means that is above its standard error: the rule of one standard error, by
-    which of models that predict alike the simplest is taken [1]_. Below 2 %, and below the ``resolution`` of
-    a settling time, none counts; above 5 % each does, for three noises are few. A difference of moves that is
-    below 5 % does not count either. With less of the drive than the first, a design must be better than it by
-    1 %.
+    which of models that predict alike the simplest is taken [1]_. Below 2 % none counts; above 5 % each does,
+    for three noises are few. A difference of moves that is below 5 % does not count either. With less of the
+    drive than the first, a design must be better than it by 1 %.
 
     References
     ----------
@@ -530,8 +529,7 @@ def _stillest(found: Sequence[Sequence[Trial]], resolution: float = 0.0) -> int:
     least = int(np.argmin(np.where(whole | (means < (1 - _WORTH) * means[0]), means, np.inf)))
     more = scores - scores[least]
     error = more.std(axis=1, ddof=1) / np.sqrt(scores.shape[1])
-    lowest = min(max(_ALIKE, resolution), _ALIKE_IN_NOISE)
-    told = np.clip(error, lowest * means[least], _ALIKE_IN_NOISE * means[least])
+    told = np.clip(error, _ALIKE * means[least], _ALIKE_IN_NOISE * means[least])
     alike = (more.mean(axis=1) <= told) & (shares == shares[least])
     still = alike & (travels <= (1 + _STILL) * travels[alike].min())
     return int(np.argmin(np.where(still, means, np.inf)))

@@ -111,7 +111,8 @@ def test_the_scan_has_six_of_the_search_by_score_smaller_drives_other_move_weigh
     assert found[7:] == [
         ("60 % of the drive", best | {"drive_share": 0.6}),
         ("50 % of the drive", best | {"drive_share": 0.5}),
-        ("moves 0.1 times as dear", best | {"move": 0.2}), ("moves 3 times as dear", best | {"move": 6.0}),
+        ("moves 0.1 times as dear", best | {"move": 0.2}), ("moves 0.3 times as dear", best | {"move": 0.6}),
+        ("moves 3 times as dear", best | {"move": 6.0}),
         ("moves 10 times as dear", best | {"move": 20.0}), ("moves 30 times as dear", best | {"move": 60.0}),
         ("moves 100 times as dear", best | {"move": 200.0}),
     ]  # fmt: skip

@@ -128,7 +128,7 @@ class Paper:
     def __post_init__(self) -> None:
         self.check_seed = self.seed + 7
         self.bounds = {(*step, draw): 100.0 for step in STEPS for draw in (*self.draws, *self.unseen)}
-        self.at_once, self.resolution = ["t_surface"], 0.0
+        self.at_once = ["t_surface"]
         self._ramps = partial(Search._ramps, self)  # type: ignore[arg-type]
 
     def design(self, parameters: dict[str, float]) -> Design:
@@ -376,8 +376,8 @@ def test_of_designs_that_trials_cannot_tell_apart_the_one_that_moves_least_is_ta
     others: tuple[float, float, float], still: float, taken: float
 ):
     """With as much of the drive as the best."""
-    scores = {0.1: 1.0, 1.0: 1.0, 3.0: 1.3, 10.0: others[0], 30.0: 1.4, 100.0: 1.5}
-    travels = {0.1: 10.0, 1.0: 1.0, 3.0: 1.0, 10.0: still, 30.0: 0.1, 100.0: 0.1}
+    scores = {0.1: 1.0, 0.3: 1.0, 1.0: 1.0, 3.0: 1.3, 10.0: others[0], 30.0: 1.4, 100.0: 1.5}
+    travels = {0.1: 10.0, 0.3: 5.0, 1.0: 1.0, 3.0: 1.0, 10.0: still, 30.0: 0.1, 100.0: 0.1}
 
     def at_length(item: tuple[str, dict[str, float]], noise: int = 0) -> Trial:
         name, parameters = item
@@ -388,7 +388,6 @@ def test_of_designs_that_trials_cannot_tell_apart_the_one_that_moves_least_is_ta
 
     search: Any = SimpleNamespace(
         at_once=[],
-        resolution=0.0,
         evaluate_at_length=at_length,
         evaluate=lambda parameters: at_length(("MPC", parameters)),
         evaluate_in_other_noise=lambda item: at_length(("MPC", item[0]), item[1]),
