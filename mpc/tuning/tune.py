@@ -422,14 +422,18 @@ def _best(trials: Sequence[Trial]) -> Trial:
     return min(trials, key=lambda trial: trial.score)
 
 
+def _allowed(search: Search) -> float:
+    """Return the overshoot that every output is allowed."""
+    return min(search.spec.asked(name).overshoot_degC for name in search.baseline.controlled)
+
+
 def _ramped(search: Search, best: Trial, workers: Workers) -> list[Trial]:
     """Return trials of the best design whose targets ramp, none where it keeps to the allowed overshoot.
 
     A step far beyond what was seen before shows how wrong a model is only on its way; on a ramp the filter
     has the time to learn it, and loads are still met with all of the drive.
     """
-    allowed = min(search.spec.asked(name).overshoot_degC for name in search.baseline.controlled)
-    if best.overshoot <= FREE * allowed or not search.at_once:
+    if best.overshoot <= FREE * _allowed(search) or not search.at_once:
         return []
     look = [{**best.parameters, "ramp": times} for times in RAMPS]
     return run_parallel(search.evaluate, look, workers, what=PARAMETER_WORDS["ramp"])
@@ -488,7 +492,7 @@ def _trade(
     again = [(trial.parameters, noise) for trial in near for noise in range(1, 1 + _NOISES)]
     louder = run_parallel(search.evaluate_in_other_noise, again, workers, what="the same in other noise")
     noises = [[near[k], *louder[_NOISES * k :][:_NOISES]] for k in range(len(near))]
-    still = near[_stillest(noises)]
+    still = near[_stillest(noises, search.plant.dt, _allowed(search))]
     return pareto, best if still is own[0] else search.evaluate(still.parameters)
 
 
@@ -509,14 +513,15 @@ def _contenders(own: Sequence[Trial]) -> list[Trial]:
     return [own[0], *still[: _CONTENDERS - 1], *([_best(capped)] if capped else [])]
 
 
-def _stillest(found: Sequence[Sequence[Trial]]) -> int:
+def _stillest(found: Sequence[Sequence[Trial]], reading_s: float = 0.0, allowed: float = 0.0) -> int:
     """Return which of these designs moves least, of those that score as the best does as far as trials tell;
     of each there is a trial in each of the same noises.
 
     They tell a difference of their means that is above its standard error: the rule of one standard error, by
     which of models that predict alike the simplest is taken [1]_. Below 2 % none counts; above 5 % each does,
-    for three noises are few. A difference of moves that is below 5 % does not count either. With less of the
-    drive than the first, a design must be better than it by 1 %.
+    for three noises are few. Nor do they tell settling times apart that differ by less than half a reading in
+    the mean, where no design overshoots. A difference of moves that is below 5 % does not count either. With
+    less of the drive than the first, a design must be better than it by 1 %.
 
     References
     ----------
@@ -530,7 +535,10 @@ def _stillest(found: Sequence[Sequence[Trial]]) -> int:
     more = scores - scores[least]
     error = more.std(axis=1, ddof=1) / np.sqrt(scores.shape[1])
     told = np.clip(error, _ALIKE * means[least], _ALIKE_IN_NOISE * means[least])
-    alike = (more.mean(axis=1) <= told) & (shares == shares[least])
+    settles = np.array([np.mean([trial.settle_s for trial in trials]) for trials in found])
+    quiet = np.array([max(trial.overshoot for trial in trials) <= FREE * allowed for trials in found])
+    unseen = (settles - settles[least] < 0.5 * reading_s) & quiet & quiet[least]
+    alike = ((more.mean(axis=1) <= told) | unseen) & (shares == shares[least])
     still = alike & (travels <= (1 + _STILL) * travels[alike].min())
     return int(np.argmin(np.where(still, means, np.inf)))
 

@@ -388,6 +388,9 @@ def test_of_designs_that_trials_cannot_tell_apart_the_one_that_moves_least_is_ta
 
     search: Any = SimpleNamespace(
         at_once=[],
+        plant=SimpleNamespace(dt=0.0),
+        spec=SPEC,
+        baseline=SimpleNamespace(controlled=("t",)),
         evaluate_at_length=at_length,
         evaluate=lambda parameters: at_length(("MPC", parameters)),
         evaluate_in_other_noise=lambda item: at_length(("MPC", item[0]), item[1]),
@@ -395,6 +398,19 @@ def test_of_designs_that_trials_cannot_tell_apart_the_one_that_moves_least_is_ta
     found = {name: [at_length((name, {"move": 1.0}))] for name in ("MPC", "PI", "LQR")}
     _, best = tuner._trade(search, found, found["PI"][0], 1, None)
     assert best.parameters == {"move": taken}
+
+
+@pytest.mark.parametrize(
+    ("later", "overshoot", "taken"),
+    [(29.0, 0.26, 1), (31.0, 0.1, 0), (29.0, 0.28, 0)],  # of 60 s a reading and 0.3 degC allowed
+)
+def test_half_a_reading_of_settling_is_no_difference_where_nothing_overshoots(later, overshoot, taken):
+    def trials(score: float, settle: float, over: float, travel: float) -> list[Trial]:
+        return [Trial("MPC", {"move": travel}, score, settle, over, 50.0, travel)] * 3
+
+    found = [trials(1.0, 1320.0, 0.1, 4.0), trials(1.04, 1320.0 + later, overshoot, 1.5)]
+    assert tuner._stillest(found, 60.0, 0.3) == taken
+    assert tuner._stillest(found) == 0
 
 
 def test_a_default_that_scores_alike_and_moves_more_is_not_kept(tank: Any):
