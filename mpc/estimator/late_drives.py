@@ -200,7 +200,7 @@ class LateDriveMonitor:
             for step in self._most * _FINER if cost(s) < here.L else ():
                 s = min((np.clip(s + k * step * way, 0.0, self._most) for k in (0, -1, 1)), key=cost)
             best = min((best, s), key=cost)
-        if not cost(best) < np.inf:
+        if np.array_equal(best, now) or not cost(best) < np.inf:
             return False
         found = fits[tuple(best.tolist())]
         enough = n * np.log(_EXPLAINED)

@@ -11,7 +11,7 @@ import pytest
 from tests.mpc.makers import network_plant
 from thermogrip.mpc.closed_loop.simulate import Surroundings, Truth, simulate_closed_loop
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
-from thermogrip.mpc.estimator.late_drives import LateDrives
+from thermogrip.mpc.estimator.late_drives import LateDriveMonitor, LateDrives, _Fit
 from thermogrip.sysid.plant.plant import Plant
 
 STEP = [(38.0, 300.0)]
@@ -115,3 +115,21 @@ def test_a_reset_forgets_that_drives_are_late():
     controller.reset({"t_tank": 25.0, "t_surface": 25.0, "t_ambient": 25.0})
     assert not controller.drives.late.any()
     assert not controller.lateness.said
+
+
+def test_a_lateness_that_is_known_already_leads_no_filter(monkeypatch: pytest.MonkeyPatch):
+    controller = of(gripper())
+    controller.reset({"t_tank": 25.0, "t_surface": 25.0, "t_ambient": 25.0})
+    look, before = controller.lateness, controller.observer.now.copy()
+    best = [0.0]
+
+    def fitted(*given: object, lags: object = None) -> _Fit:
+        late = np.asarray(given[3])
+        return _Fit(100.0 if lags is not None else 50.0 + 9 * abs(late[0] - best[0]), 9.0, before, look.late)
+
+    monkeypatch.setattr(LateDriveMonitor, "_fitted", fitted)
+    monkeypatch.setattr(LateDriveMonitor, "_lead", lambda *given: None)
+    assert not look._look(controller.observer)
+    best[0] = 2.0
+    assert look._look(controller.observer)
+    assert look.late[0] == pytest.approx(2.0 * controller.dt, rel=0.1)
