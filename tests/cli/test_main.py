@@ -16,7 +16,7 @@ import pytest
 import typer
 
 from thermogrip.cli.main import main
-from thermogrip.cli.verbs import VERBS, function_of
+from thermogrip.cli.verbs import VERBS, Verb, function_of
 from thermogrip.datasets.errors import UserError
 
 HEAVY = ["numpy", "scipy", "xarray", "pandas", "casadi", "numba", "llvmlite", "nlopt", "emcee", "arviz"]
@@ -171,6 +171,25 @@ def test_what_is_next_is_said_on_stderr_with_what_was_given(
     assert main(["materials", "copper", "--json"]) == 0
     assert main(["materials", "gold leaf"]) == 2
     assert "next:" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "target"),
+    [
+        ('{"notes": {"spec": {"steps": [[150, 200.5], [200, 220]]}}}', "200.5"),
+        ('{"notes": {}}', "38"),
+        ("", "38"),
+    ],
+)
+def test_what_is_next_of_a_controller_goes_to_a_target_that_it_was_tuned_for(
+    text: str, target: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "c.json"
+    file.write_text(text, encoding="utf-8")
+    assert Verb("review").next({"controller": file}).endswith(f"--target {target} --out DIR")
+    assert (
+        Verb("export").next({"controller": "none.json"}) == "run none.json --port DEV --target 38 --out DIR"
+    )
 
 
 def test_help_is_as_wide_as_the_terminal_and_at_most_100_columns_of_a_pipe(

@@ -5,14 +5,17 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import sys
 import tomllib
 from collections.abc import Sequence
+from contextlib import suppress
 from difflib import get_close_matches
 from functools import cache
 from importlib import import_module, resources
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -96,6 +99,7 @@ class Verb(TyperCommand):
             return printable(shlex.join([str(self.name), *typed, "--out", file]))
         for name, value in given.items():
             words[name] = printable(shlex.join(map(str, value if isinstance(value, list) else [value])))
+        words.setdefault("target", _target(given.get("controller")))
         return str(then).format(**words)
 
     def get_short_help_str(self, limit: int = 200) -> str:
@@ -117,6 +121,14 @@ class Verb(TyperCommand):
                 formatter.write(f"  thermogrip {line}\n")
         with formatter.section("Next"):
             formatter.write(f"  thermogrip {self.next({})}\n")
+
+
+def _target(controller: Any) -> str:
+    """Return the first target that a controller in a file was tuned for, 38 where it was tuned for none."""
+    with suppress(OSError, ValueError, KeyError, TypeError, IndexError):
+        steps = json.loads(Path(controller).read_text(encoding="utf-8"))["notes"]["spec"]["steps"]
+        return f"{float(steps[0][1]):g}"
+    return "38"
 
 
 def function_of(verb: str) -> Any:
