@@ -91,7 +91,7 @@ class LateDrives:
     >>> drives.late = np.array([3.0])
     >>> for u in (0.2, 0.4, 0.8):
     ...     drives.apply(2.0, np.array([u]))
-    >>> [float(drives.acting(begin, 2.0, u).round(3)) for begin in (-2.0, 0.0, 2.0, 4.0)]
+    >>> [round(drives.acting(at, 2.0, np.array([0.8])).item(), 3) for at in (-2.0, 0.0, 2.0, 4.0)]
     [0.3, 0.6, 0.8, 0.8]
     """
 
