@@ -374,6 +374,7 @@ class Search:
     def __init__(self, plant: Plant, spec: Spec, baseline: Design, seed: int) -> None:
         self.plant, self.spec, self.seed = plant, spec, seed
         self._compiled = wanted() and not baseline.on_off
+        self.noises = _NOISES
         self.draws = draws_of(plant, spec.search_draws)
         self.certain = self.draws == [0]  # no draws: the comparison takes the same plant, and fresh noise
         self.check_seed = seed + 1 if self.certain else seed
@@ -491,7 +492,7 @@ class Search:
         whole = quick or name == "PI"
         spec = self.whole_spec if whole else self.spec
         lengths = None if whole or at_length else self.lengths
-        count = _NOISES if quick else 1
+        count = self.noises if quick else 1
         # the comparison of a plant without draws has a seed of its own
         noises = range(count * other_noise, count * (other_noise + 1))
         seeds = [self.seed + (noise and noise + 1) for noise in noises]

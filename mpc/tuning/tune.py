@@ -370,7 +370,8 @@ def tune(
     stiller = moved["tuned"] < moved["baseline"] / (1 + _STILL)
     alike = 1 + (_ALIKE_IN_NOISE if stiller else _ALIKE if moved["tuned"] < moved["baseline"] else 0.0)
     kept = "tuned" if scores["tuned"] < alike * scores["baseline"] else "baseline"
-    about = best if kept == "tuned" else search.evaluate(start)
+    search.noises = 1  # from here on: what a number does shows in one noise too
+    about = search.evaluate(best.parameters if kept == "tuned" else start)
     of = [parameter for parameter in PARAMETER_WORDS if parameter in about.parameters]
     items = [(search, parameter, about.parameters, about) for parameter in of]
     share = sub_progress(progress, _COMPARED, 1.0)
