@@ -8,15 +8,21 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Surroundings, Truth, record_loop
+from thermogrip.mpc.closed_loop.simulate import (
+    ClosedLoop,
+    Surroundings,
+    Truth,
+    record_loop,
+    simulate_closed_loop,
+)
 from thermogrip.mpc.controllers.base import as_drive
 from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.controllers.pi import UNCUT, PIController
 from thermogrip.mpc.interface import STATUSES, Move
 from thermogrip.mpc.native.runtime import CompiledController, CompiledTruth, address
 
@@ -25,7 +31,7 @@ if TYPE_CHECKING:
 
 
 def compiled_loop(
-    controller: Controller,
+    controller: Controller | PIController,
     plant: Plant,
     schedule: Sequence[tuple[float, float]],
     *,
@@ -36,53 +42,108 @@ def compiled_loop(
 ) -> ClosedLoop:
     """Run a compiled controller (else a ValueError) as :func:`simulate_closed_loop` does, with the same
     arguments, against a plant of the same signals whose equations and step may be others; the record has no
-    advices and no step times."""
+    advices and no step times.  PI loops, which go to one target, run in Python where a reading is absurd."""
     if controller.c is None:
         raise ValueError("the controller is not compiled")
     around = Surroundings() if surroundings is None else surroundings
     truth = Truth(plant, controller.dt, around, start, seed)
-    model = truth.model
-    controller.reset(truth.reading() | truth.begun())
+    begun, controlled = truth.reading(), tuple(controller.controlled)
+    controller.reset(begun | truth.begun())
     counts = [max(1, round(seconds / controller.dt)) for _, seconds in schedule]
     wanted = np.repeat([float(target) for target, _ in schedule], counts)
-    target = np.ascontiguousarray(np.repeat(wanted[:, None], len(controller.controlled), axis=1))
-    observed = np.concatenate([values.ravel() for values in controller.observer.estimate().values()])
-    reading, drive, status = _loop_in_c(controller.c, observed, truth, target)
-    names = (*model.outputs, *model.disturbances)
-    readings = [dict(zip(names, row)) for row in reading.tolist()]
-    controlled = tuple(controller.controlled)
+    target = np.ascontiguousarray(np.repeat(wanted[:, None], len(controlled), axis=1))
+    run = _Run(truth, len(target))
+    if isinstance(controller, Controller):
+        _run_mpc(controller.c, controller, run, target, told=truth.known)
+    elif len(schedule) > 1 or not _run_pi(controller.c, controller, run, target[0], begun):
+        loop = simulate_closed_loop
+        return loop(controller, plant, schedule, start=start, surroundings=around, band=band, seed=seed)
+    names = (*truth.model.outputs, *truth.model.disturbances)
+    readings = [dict(zip(names, row)) for row in run.reading.tolist()]
     targets = [dict(zip(controlled, row)) for row in target.tolist()]
-    moves = [Move(as_drive(model.drives, row), status=STATUSES[code]) for row, code in zip(drive, status)]
+    drives, truth.y = truth.model.drives, list(run.y)
+    moves = [Move(as_drive(drives, row), status=STATUSES[code]) for row, code in zip(run.drive, run.status)]
     return record_loop(truth, controlled, targets, readings, moves, np.cumsum(counts).tolist(), band)
 
 
-def _loop_in_c(
-    c: CompiledController, observed: Array, truth: Truth, target: Array
-) -> tuple[Array, Array, NDArray[np.int32]]:
-    """Run the loop from an observer's flat estimate to targets (n, n_controlled) [degC]; return readings (n,
-    n_y + n_d), outputs first, drives (n, n_u), and places (n,) in :data:`thermogrip.mpc.interface.STATUSES`,
-    and leave in ``truth.y`` what the plant did."""
-    model, around, n = truth.model, truth.around, len(target)
-    noise = around.noises_of(model.outputs) * truth.rng.standard_normal((n, model.n_y))
-    d_offset = np.array([around.offset.get(name, 0.0) for name in model.disturbances])
-    quanta = around.steps_of((*model.outputs, *model.disturbances))
-    y = np.zeros((n * truth.sub + 1, model.n_y))
-    reading, drive = np.zeros((n, model.n_y + model.n_d)), np.zeros((n, model.n_u))
-    status = np.zeros(n, dtype=np.int32)
-    plant_in_c, held = CompiledTruth(model).at(truth.x, truth.offset)
+class _Around(ctypes.Structure):
+    _fields_ = [
+        *((name, ctypes.c_int) for name in ("per_sample", "late")),
+        *((name, ctypes.c_double) for name in ("sees", "acts")),
+        *((name, ctypes.c_void_p) for name in ("before", "d", "noise", "quanta", "d_offset")),
+    ]
+
+
+class _Run:
+    """The plant, its surroundings and the record of n samples, as C has them: outputs in steps of the plant,
+    and by sample readings, outputs first, drives, and places in :data:`thermogrip.mpc.interface.STATUSES`."""
+
+    def __init__(self, truth: Truth, n: int) -> None:
+        model, around = truth.model, truth.around
+        noise = around.noises_of(model.outputs) * truth.rng.standard_normal((n, model.n_y))
+        offset = np.array([around.offset.get(name, 0.0) for name in model.disturbances])
+        quanta = around.steps_of((*model.outputs, *model.disturbances))
+        self.y = np.zeros((n * truth.sub + 1, model.n_y))
+        self.reading, self.drive = np.zeros((n, model.n_y + model.n_d)), np.zeros((n, model.n_u))
+        self.status = np.full(n, STATUSES.index("ok"), dtype=np.int32)
+        self.plant, held = CompiledTruth(model).at(truth.x, truth.offset)
+        self._held = (held, truth.before, truth.d, noise, quanta, offset)  # they live as long as this
+        places = [address(values) for values in self._held[1:]]
+        self.around = _Around(truth.sub, truth.late, truth.sees, around.drive_share, *places)
+
+
+def _run_mpc(c: CompiledController, controller: Controller, run: _Run, target: Array, *, told: bool) -> None:
+    """Run an MPC that was reset to targets (n, n_controlled) [degC], told of the drives before or not."""
+    observed = np.concatenate([values.ravel() for values in controller.observer.estimate().values()])
     c.library.tg_host_loop(
         c.state,
-        ctypes.byref(c.design),
-        ctypes.byref(plant_in_c),
-        n,
-        truth.sub,
-        truth.late,
-        ctypes.c_double(truth.sees),
-        ctypes.c_double(around.drive_share),
-        int(truth.known),
-        *(address(values) for values in (truth.before, observed, truth.d, noise)),
-        *(address(values) for values in (quanta, d_offset, target, y, reading, drive, status)),
+        *(ctypes.byref(part) for part in (c.design, run.plant, run.around)),
+        len(target),
+        int(told),
+        *(address(values) for values in (observed, target, run.y, run.reading, run.drive, run.status)),
     )
+
+
+def _run_pi(
+    c: CompiledController, controller: PIController, run: _Run, target: Array, begun: Mapping[str, float]
+) -> bool:
+    """Run PI loops that were reset at a reading to a target (n_controlled,) [degC]; return whether all
+    readings were plausible."""
+    model = controller.model
+    d = np.array([begun[name] for name in model.disturbances])
+    if not ((d >= model.coldest) & (d <= model.hottest)).all():
+        return False
+    loops, held = _loops_at(controller, target, d)
+    places = [ctypes.byref(part) for part in (loops, run.plant, run.around)]
+    written = [address(values) for values in (run.y, run.reading, run.drive)]
+    done = c.library.tg_host_loop_pi(*places, len(run.status), *written)
     del held  # it had to live until here
-    truth.y = list(y)
-    return reading, drive, status
+    return bool(done)
+
+
+class _Loops(ctypes.Structure):
+    _arrays_ = "drive output Kc Ti target kept ahead lowest highest slew uncut integral u"
+    _fields_ = [
+        ("n", ctypes.c_int),
+        *((name, ctypes.c_double) for name in ("dt", "coldest", "hottest")),
+        *((name, ctypes.c_void_p) for name in _arrays_.split()),
+    ]
+
+
+def _loops_at(controller: PIController, target: Array, d: Array) -> tuple[_Loops, Any]:
+    """Return PI loops that were reset, for a target (n_controlled,) and disturbances (n_d,), and what the C
+    struct points to."""
+    model, loops = controller.model, controller.loops
+    rows = [model.outputs.index(controller.controlled[i]) for _, i in controller.ends]
+    ahead, kept = controller.terms(target, d)
+    places = [np.array(values, dtype=np.int32) for values in ([j for j, _ in controller.ends], rows)]
+    numbers = [
+        [loop.Kc for loop in loops],
+        [loop.Ti for loop in loops],
+        target[[i for _, i in controller.ends]],
+        *(kept, ahead, controller.lowest, controller.highest, controller.slew, UNCUT * model.span),
+        *(controller.integral, controller.applied),
+    ]
+    held = [*places, *(np.array(values, dtype=float) for values in numbers)]
+    bounds = (controller.dt, model.coldest, model.hottest)
+    return _Loops(len(loops), *bounds, *(address(values) for values in held)), held

@@ -31,10 +31,12 @@ from thermogrip.mpc.interface import Move, Readings, Trajectory
 from thermogrip.mpc.plant.prediction import ROOM, PredictionModel, holding_drive, prediction_model
 
 if TYPE_CHECKING:
+    from thermogrip.mpc.native.runtime import CompiledController
     from thermogrip.sysid.plant.plant import Plant
 
 
-_UNCUT = 1e-9  # of a range: a drive that is cut by less is not limited
+#: Of a range: a drive that is cut by less is not limited.
+UNCUT = 1e-9
 
 
 class PIController(SampledController):
@@ -105,10 +107,12 @@ class PIController(SampledController):
             on_off,
         )
         self.loops = pair_loops(plant, self.controlled) if loops is None else loops
-        # of each loop its drive and its output, counted from 0
-        self._ends = [(model.drives.index(p.drive), self.controlled.index(p.output)) for p in self.loops]
-        self._I, self._begun = np.zeros(len(self.loops)), np.full(len(self.controlled), np.nan)
+        # of each loop its drive and its controlled output, counted from 0
+        self.ends = [(model.drives.index(p.drive), self.controlled.index(p.output)) for p in self.loops]
+        self.integral, self._begun = np.zeros(len(self.loops)), np.full(len(self.controlled), np.nan)
         self._room = np.full(model.n_d, np.nan)
+        #: An MPC of the same plant and drives in C, in whose library trials of these loops can run.
+        self.c: CompiledController | None = None
 
     @classmethod
     def of(cls, plant: Plant, design: Design, loops: tuple[PILoop, ...]) -> PIController:
@@ -130,7 +134,7 @@ class PIController(SampledController):
         reading has."""
         self._forget()
         self._begin_positions()
-        self._I = np.zeros(len(self.loops))
+        self.integral = np.zeros(len(self.loops))
         self._u = self._applied(reading, self._u)
         y, room = self._read(reading)
         self._target = self._begun = y[self._rows]
@@ -138,8 +142,8 @@ class PIController(SampledController):
         if np.isfinite(self._target).all():  # what the feed-forward leaves of the drive that holds this
             held = self._held(self._target, np.where(np.isfinite(room), room, ROOM))
             rest = self._applied(reading, held)
-            self._I = np.array(
-                [rest[j] - p.feedforward * held[j] for p, (j, _) in zip(self.loops, self._ends)]
+            self.integral = np.array(
+                [rest[j] - p.feedforward * held[j] for p, (j, _) in zip(self.loops, self.ends)]
             )
         self.times.reset()
 
@@ -172,23 +176,39 @@ class PIController(SampledController):
         """Return the limited drives (n_u,) after so many seconds, and integrate; readings y (n_controlled,)
         are NaN where lost, d (n_d,) feeds the holding drive [degC]."""
         seconds = self.dt if seconds is None else seconds
-        ahead, error = self._feedforward(target, d), target - y
+        error = target - y
         self._begun = np.where(np.isfinite(self._begun), self._begun, y)
+        ahead, kept = self.terms(target, d)
         v = ahead.copy()
         v[self.model.on_off] = 1.0  # nobody decides: it is on
-        for at, (loop, (j, i)) in enumerate(zip(self.loops, self._ends)):
+        for at, (loop, (j, i)) in enumerate(zip(self.loops, self.ends)):
             if np.isfinite(error[i]):
-                kept = (1 - loop.setpoint) * (target[i] - self._begun[i])
-                v[j] = loop.feedforward * ahead[j] + loop.Kc * (error[i] - kept) + self._I[at]
+                v[j] = ahead[j] + loop.Kc * (error[i] - kept[at]) + self.integral[at]
             else:
                 v[j] = self._safe[j] if self._lost[i] else self._u[j]
         u = self._within(v, seconds)
-        for at, (loop, (j, i)) in enumerate(zip(self.loops, self._ends)):
+        for at, (loop, (j, i)) in enumerate(zip(self.loops, self.ends)):
             if np.isfinite(error[i]):
                 inward = (u[j] - v[j]) * loop.Kc * error[i] > 0
-                if inward or abs(u[j] - v[j]) <= _UNCUT * self.model.span[j]:
-                    self._I[at] += seconds * loop.Kc / loop.Ti * error[i]
+                if inward or abs(u[j] - v[j]) <= UNCUT * self.model.span[j]:
+                    self.integral[at] += seconds * loop.Kc / loop.Ti * error[i]
         return u
+
+    def terms(self, target: Array, d: Array) -> tuple[Array, Array]:
+        """Return the feed-forward (n_u,), weighted where a loop is, and of each loop the part of its error
+        that its setpoint weight leaves out."""
+        ahead = self._feedforward(target, d).copy()
+        for loop, (j, _) in zip(self.loops, self.ends):
+            ahead[j] *= loop.feedforward
+        kept = [
+            (1 - loop.setpoint) * (target[i] - self._begun[i]) for loop, (_, i) in zip(self.loops, self.ends)
+        ]
+        return ahead, np.array(kept)
+
+    @property
+    def applied(self) -> Array:
+        """Drives (n_u,) of the last move."""
+        return self._u
 
     def hold(self, u: Array) -> None:
         """Note the drives (n_u,) that were applied, from which the slew limit counts."""
@@ -199,8 +219,8 @@ class PIController(SampledController):
         drives u (n_u,): a bumpless take-over."""
         self._u, self._begun = np.asarray(u, dtype=float), target
         ahead, error = self._feedforward(target, d), target - y
-        for at, (loop, (j, i)) in enumerate(zip(self.loops, self._ends)):
-            self._I[at] = self._u[j] - loop.feedforward * ahead[j] - loop.Kc * error[i]
+        for at, (loop, (j, i)) in enumerate(zip(self.loops, self.ends)):
+            self.integral[at] = self._u[j] - loop.feedforward * ahead[j] - loop.Kc * error[i]
 
     def _feedforward(self, target: Array, d: Array) -> Array:
         """Return the drives that hold the target, where a loop uses them."""

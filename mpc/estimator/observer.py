@@ -135,7 +135,14 @@ def resting_state(
     model: PredictionModel, x: Array, v: Array, level: float, d: Array, *, unit: Array
 ) -> RestingState:
     """Return where a plant at rest may be, linearised at state x (n_x,) and drive v (n_u,), for a mean
-    reading ``level`` [degC]; ``unit`` (n_x,) is what counts as 1 degC of each state."""
+    reading ``level`` [degC]; ``unit`` (n_x,) is what counts as 1 degC of each state. Shared: read it."""
+    at = (tuple(values.tolist()) for values in (x, v, d, unit))
+    return _resting_state(model, level, *at)
+
+
+@lru_cache(maxsize=256)  # trials of many designs begin at the same readings
+def _resting_state(model: PredictionModel, level: float, *at: tuple[float, ...]) -> RestingState:
+    x, v, d, unit = (np.array(values) for values in at)
     after, A, B, E = model.linearise(x, v, d)
     away = np.eye(model.n_x) - A
     push = after - A @ x + B @ (model.neutral - v)

@@ -33,7 +33,7 @@ only ramp is in the band no sooner than its ramp brings it there, which is the b
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -54,6 +54,7 @@ from thermogrip.mpc.plant.prediction import graded_drives, step_response
 from thermogrip.mpc.tuning.minimum_time import full_drive_bound
 
 if TYPE_CHECKING:
+    from thermogrip.mpc.native.runtime import CompiledController
     from thermogrip.sysid.plant.plant import Plant
 
 
@@ -99,7 +100,8 @@ LACKING, LATE = 0.05, 5.0
 _OVERSHOOT, _BIAS, _ERROR = 3.0, 0.5, 0.5
 #: Of what is allowed, that costs nothing.
 FREE = 0.9
-_NOISES = 3  # in which an MPC is tried where its trials run in C: one noise alone moves a score by a tenth
+#: In which an MPC is tried where its trials run in C: one noise alone moves a score by a tenth.
+NOISES = 3
 
 
 @lru_cache(maxsize=16)
@@ -179,23 +181,22 @@ def trial(
 ) -> ClosedLoop:
     """Run a step (start, target) [degC] of the spec on one draw of the plant for so many seconds, wholly in C
     where the controller is in C."""
-    loop: Callable[..., ClosedLoop] = simulate_closed_loop
-    if isinstance(controller, Controller) and controller.c is not None:
-        from thermogrip.mpc.closed_loop.simulate_native import compiled_loop as loop
     structure, draw = divmod(draw, STRUCTURE)
     shown = plant.scores.reading_sd
     around = surroundings_of(spec, controller.controlled, plant.disturbances, shown)
     if structure:
         around = replace(around, **lacking(plant, spec, controller.controlled)[structure - 1][1])
-    return loop(
-        controller,
-        drawn(plant, draw),
-        [(step[1], length_s)],
-        start=step[0],
-        surroundings=around,
-        band=bands_of(spec, controller.controlled),
-        seed=1000 * seed + draw,
-    )
+    truth, schedule = drawn(plant, draw), [(step[1], length_s)]
+    about: dict[str, Any] = {
+        "surroundings": around,
+        "band": bands_of(spec, controller.controlled),
+        "seed": 1000 * seed + draw,
+    }
+    if isinstance(controller, Controller | PIController) and controller.c is not None:
+        from thermogrip.mpc.closed_loop.simulate_native import compiled_loop
+
+        return compiled_loop(controller, truth, schedule, start=step[0], **about)
+    return simulate_closed_loop(controller, truth, schedule, start=step[0], **about)
 
 
 def run_trials(
@@ -374,7 +375,7 @@ class Search:
     def __init__(self, plant: Plant, spec: Spec, baseline: Design, seed: int) -> None:
         self.plant, self.spec, self.seed = plant, spec, seed
         self._compiled = wanted() and not baseline.on_off
-        self.noises = _NOISES
+        self._library: CompiledController | None = None  # in which trials of PI loops run
         self.draws = draws_of(plant, spec.search_draws)
         self.certain = self.draws == [0]  # no draws: the comparison takes the same plant, and fresh noise
         self.check_seed = seed + 1 if self.certain else seed
@@ -394,9 +395,6 @@ class Search:
         unseen = apparent_delay(plant, baseline.controlled) < 2 * plant.dt
         own = PI_OF_UNSEEN_DELAY if unseen else PI_PARAMETERS
         self.pi: Sequence[tuple[str, float, float]] = own[:-1] if self.certain else own
-        if self._compiled and self._in_c(baseline) is not None:
-            self.lengths = [spec.hold_s] * len(spec.steps)
-            return
         # long enough to see it settle and stay, short enough to try many in Python
         slowest = [max(self.bounds[(*step, draw)] for draw in self.draws) for step in spec.steps]
         least = min(120.0, spec.hold_s)
@@ -415,7 +413,7 @@ class Search:
     def __getstate__(self) -> dict[str, Any]:
         own = getattr(self.plant.model, "code", None)
         where = None if own is None else (str(Path(own.file).resolve()), own.name)
-        return {**self.__dict__, "plant": self.plant.to_dict(), "own": where}
+        return {**self.__dict__, "_library": None, "plant": self.plant.to_dict(), "own": where}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         from thermogrip.sysid.plant.plant import Plant
@@ -478,12 +476,12 @@ class Search:
         *,
         at_length: bool = False,
         other_noise: int = 0,
+        noises: int = NOISES,
     ) -> Trial:
         """Return the trial of an ``"MPC"``, ``"PI"`` or ``"LQR"``, at full length if asked; other noise
-        than the search's is counted from 1."""
+        than the search's is counted from 1, and only an MPC in C is tried in several ``noises``."""
         if name == "PI":
-            loops = scaled_loops(self.baseline.loops, parameters)
-            controller: Regulator = PIController.of(self.plant, self.baseline, loops)
+            controller: Regulator = self._pi(scaled_loops(self.baseline.loops, parameters))
         else:
             controller = self.made(name, self.design(parameters))
         quick = name == "MPC" and self._compiled  # in C: a tenth of the time
@@ -492,10 +490,10 @@ class Search:
         whole = quick or name == "PI"
         spec = self.whole_spec if whole else self.spec
         lengths = None if whole or at_length else self.lengths
-        count = self.noises if quick else 1
+        count = noises if quick else 1
         # the comparison of a plant without draws has a seed of its own
-        noises = range(count * other_noise, count * (other_noise + 1))
-        seeds = [self.seed + (noise and noise + 1) for noise in noises]
+        others = range(count * other_noise, count * (other_noise + 1))
+        seeds = [self.seed + (noise and noise + 1) for noise in others]
         found: list[StepResult] = []
         for seed in seeds:
             found += run_trials(controller, self.plant, spec, self.draws, lengths=lengths, seed=seed)
@@ -517,6 +515,10 @@ class Search:
         name, parameters = item
         return self.evaluate(parameters, name, at_length=True)
 
+    def at_length(self, trial: Trial) -> bool:
+        """Return whether a trial of the search was already at full length."""
+        return trial.controller == "PI" or (trial.controller == "MPC" and self._compiled)
+
     def evaluate_in_other_noise(self, item: tuple[dict[str, float], int]) -> Trial:
         """Return a trial of an MPC at full length in another noise than the search's, counted from 1."""
         parameters, other = item
@@ -531,11 +533,19 @@ class Search:
         """Return the controller of a design, ``"PI"``, ``"LQR"`` or by any other name an MPC, with filter and
         optimiser in C where there is a compiler."""
         if name == "PI":
-            return PIController.of(self.plant, self.baseline, design.loops)
+            return self._pi(design.loops)
         controller = self._controller(design)
         if name == "LQR":
             return LQRController(self.plant, design, observer=controller.observer)
         return controller
+
+    def _pi(self, loops: tuple[PILoop, ...]) -> PIController:
+        """Return PI loops whose trials run in C where the default design's do."""
+        made = PIController.of(self.plant, self.baseline, loops)
+        if self._library is None and self._compiled:
+            self._library = self._controller(self.baseline).c
+        made.c = self._library
+        return made
 
     def _controller(self, design: Design) -> Controller:
         made = self._in_c(design) if self._compiled else None

@@ -161,7 +161,7 @@ def sensitivity_of(item: tuple[Search, str, dict[str, float], Trial]) -> Sensiti
         free[side] = value
         for factor in _FACTORS[:1] if parameter in _STRUCTURE else _FACTORS:
             changed = {**best, parameter: value * factor**side}
-            tried = search.evaluate(changed)
+            tried = search.evaluate(changed, noises=1)
             ends.setdefault(side, tried)
             if not _unseen(tried, here):
                 break

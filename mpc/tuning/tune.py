@@ -241,7 +241,7 @@ _LOOK = (
 _BEGUN, _LOOKED, _SEARCHED, _TRADED, _COMPARED = 0.09, 0.13, 0.67, 0.8, 0.87
 _MPC_DONE, _PI_DONE = 0.1, 0.92
 _WORTH = 0.01  # by which a traded design must be better on the spec's own score to be taken
-_ALIKE = 0.02  # of designs with as much of the drive that differ by less in score the one that moves least;
+_ALIKE = 0.01  # of designs with as much of the drive that differ by less in score the one that moves least;
 # by no more than this either where noise alone makes a greater difference
 _ALIKE_IN_NOISE = 0.05
 _STILL = 0.05  # by which one must move less than another to be taken for it
@@ -370,8 +370,8 @@ def tune(
     stiller = moved["tuned"] < moved["baseline"] / (1 + _STILL)
     alike = 1 + (_ALIKE_IN_NOISE if stiller else _ALIKE if moved["tuned"] < moved["baseline"] else 0.0)
     kept = "tuned" if scores["tuned"] < alike * scores["baseline"] else "baseline"
-    search.noises = 1  # from here on: what a number does shows in one noise too
-    about = search.evaluate(best.parameters if kept == "tuned" else start)
+    # what a number does shows in one noise too
+    about = search.evaluate(best.parameters if kept == "tuned" else start, noises=1)
     of = [parameter for parameter in PARAMETER_WORDS if parameter in about.parameters]
     items = [(search, parameter, about.parameters, about) for parameter in of]
     share = sub_progress(progress, _COMPARED, 1.0)
@@ -485,8 +485,13 @@ def _trade(
     scanned = [(name, ("MPC", parameters)) for name, parameters in scan]
     others = {"PI": pi, "LQR": _best(found["LQR"])}
     scanned += [(f"{name}, tuned", (name, trial.parameters)) for name, trial in others.items()]
-    names, items = zip(*scanned, strict=True)
-    tried = run_parallel(search.evaluate_at_length, items, workers, progress, what="trade-offs")
+    names = [name for name, _ in scanned]
+    known = [trial for trial in (*found["MPC"], pi) if search.at_length(trial)]
+    looked = {_named(trial.controller, trial.parameters): trial for trial in known}
+    items = [item for _, item in scanned if _named(*item) not in looked]
+    done = run_parallel(search.evaluate_at_length, items, workers, progress, what="trade-offs")
+    looked |= {_named(*item): trial for item, trial in zip(items, done, strict=True)}
+    tried = [looked[_named(*item)] for _, item in scanned]
     pareto = front_of(tried, names)
     own = [trial for trial in tried if trial.controller == "MPC"]
     near = _contenders(own)
@@ -495,6 +500,10 @@ def _trade(
     noises = [[near[k], *louder[_NOISES * k :][:_NOISES]] for k in range(len(near))]
     still = near[_stillest(noises, search.plant.dt, _allowed(search))]
     return pareto, best if still is own[0] else search.evaluate(still.parameters)
+
+
+def _named(controller: str, parameters: dict[str, float]) -> tuple[str, tuple[tuple[str, float], ...]]:
+    return controller, tuple(sorted(parameters.items()))
 
 
 def _share(trial: Trial) -> float:
@@ -519,7 +528,7 @@ def _stillest(found: Sequence[Sequence[Trial]], reading_s: float = 0.0, allowed:
     of each there is a trial in each of the same noises.
 
     They tell a difference of their means that is above its standard error: the rule of one standard error, by
-    which of models that predict alike the simplest is taken [1]_. Below 2 % none counts; above 5 % each does,
+    which of models that predict alike the simplest is taken [1]_. Below 1 % none counts; above 5 % each does,
     for three noises are few. Nor do they tell settling times apart that differ by less than half a reading in
     the mean, where no design overshoots. A difference of moves that is below 5 % does not count either. With
     less of the drive than the first, a design must be better than it by 1 %.

@@ -169,33 +169,62 @@ static void look(const tg_truth *plant, double *y)
     }
 }
 
+/* Surroundings of a closed loop: per_sample: the plant's steps in a sample; late: steps after which a drive
+ * acts, acts: the share of it that does, both counted from the drives before; sees: share of a change that
+ * sensors show at once; d: disturbances; noise: TG_NY readings' errors a sample; quanta: of each of the
+ * TG_NY + TG_ND readings, 0 none; d_offset: what a sensor of a disturbance shows too much. */
+typedef struct {
+    int per_sample, late;
+    double sees, acts;
+    const double *before, *d, *noise, *quanta, *d_offset;
+} tg_around;
+
+/* What sensors show in sample t of outputs row. */
+static void read_sensors(const tg_around *a, int t, const double *row, double *shown)
+{
+    for (int i = 0; i < TG_NY; i++)
+        shown[i] = row[i] + a->noise[t * TG_NY + i];
+    for (int i = 0; i < TG_ND; i++)
+        shown[TG_NY + i] = a->d[i] + a->d_offset[i];
+    for (int i = 0; i < TG_NY + TG_ND; i++)
+        if (a->quanta[i] > 0.0)
+            shown[i] = rint(shown[i] / a->quanta[i]) * a->quanta[i];
+}
+
+/* Let sample t pass under the drives given so far, TG_NU a sample; outputs go behind row. */
+static void pass(const tg_around *a, tg_truth *plant, int t, const double *drive, double *row)
+{
+    for (int part = 0; part < a->per_sample; part++) {
+        double *swap = plant->x, u[TG_NU];
+        const int since = t * a->per_sample + part - a->late;
+        const double *given = since < 0 ? a->before : drive + since / a->per_sample * TG_NU;
+        for (int j = 0; j < TG_NU; j++)
+            u[j] = a->acts == 1.0 ? given[j] : a->before[j] + a->acts * (given[j] - a->before[j]);
+        plant->next(plant->x, u, a->d, plant->k, plant->after);
+        plant->x = plant->after;
+        plant->after = swap;
+        row += TG_NY;
+        look(plant, row);
+        for (int i = 0; a->sees < 1.0 && i < TG_NY; i++)
+            row[i] = row[i - TG_NY] + a->sees * (row[i] - row[i - TG_NY]);
+    }
+}
+
 /* A closed loop of n samples against a plant that is not the model.
  *
- * observed: the estimate that the observer starts from: x, w, shown, lag, scale, P,
- * found_offset and start, one behind the other; per_sample: the plant's steps in a sample; late: steps after
- * which a drive acts, acts: the share of it that does, both counted from the drives `before`, of which
- * the controller is told or not; sees: share of a
- * change that sensors show at once; noise: n rows of TG_NY readings' errors; quanta: of each of the TG_NY + TG_ND readings, 0 none; d_offset: what
- * a sensor of a disturbance shows too much; target: n rows of n_c.
+ * observed: the estimate that the observer starts from: x, w, shown, lag, scale, P, found_offset and start,
+ * one behind the other; told: whether the controller is told of the drives before; target: n rows of n_c.
  * Into y: n per_sample + 1 rows of TG_NY, without noise and quantum; reading: n rows of TG_NY + TG_ND;
  * drive: n rows of TG_NU; status: n.
  */
-void tg_host_loop(tg_controller *c, const tg_design *design, tg_truth *plant, int n, int per_sample, int late,
-                  double sees, double acts, int told, const double *before, const double *observed,
-                  const double *d, const double *noise, const double *quanta, const double *d_offset, const double *target,
-                  double *y, double *reading, double *drive, int *status)
+void tg_host_loop(tg_controller *c, const tg_design *design, tg_truth *plant, const tg_around *around, int n, int told,
+                  const double *observed, const double *target, double *y, double *reading, double *drive, int *status)
 {
     look(plant, y);
     for (int t = 0; t < n; t++) {
-        double *shown = reading + t * (TG_NY + TG_ND), *row = y + (size_t)t * (size_t)per_sample * TG_NY;
+        double *shown = reading + t * (TG_NY + TG_ND), *row = y + (size_t)t * (size_t)around->per_sample * TG_NY;
         tg_move move;
-        for (int i = 0; i < TG_NY; i++)
-            shown[i] = row[i] + noise[t * TG_NY + i];
-        for (int i = 0; i < TG_ND; i++)
-            shown[TG_NY + i] = d[i] + d_offset[i];
-        for (int i = 0; i < TG_NY + TG_ND; i++)
-            if (quanta[i] > 0.0)
-                shown[i] = rint(shown[i] / quanta[i]) * quanta[i];
+        read_sensors(around, t, row, shown);
         if (!t) {
             tg_reset(c, design, shown, shown + TG_NY);
             memcpy(c->x, observed, sizeof c->x);
@@ -208,22 +237,57 @@ void tg_host_loop(tg_controller *c, const tg_design *design, tg_truth *plant, in
             memcpy(c->start, observed + TG_Z + TG_Z * TG_Z + TG_NY, sizeof c->start);
             c->time_s = -design->dt; /* the first reading is at 0 */
         }
-        move = tg_step(c, NAN, shown, shown + TG_NY, told && !t ? before : NULL, target + t * design->n_c);
+        move = tg_step(c, NAN, shown, shown + TG_NY, told && !t ? around->before : NULL, target + t * design->n_c);
         memcpy(drive + t * TG_NU, move.drive, sizeof move.drive);
         status[t] = move.status;
-        for (int part = 0; part < per_sample; part++) {
-            double *swap = plant->x, u[TG_NU];
-            const int since = t * per_sample + part - late;
-            const double *given = since < 0 ? before : drive + since / per_sample * TG_NU;
-            for (int j = 0; j < TG_NU; j++)
-                u[j] = acts == 1.0 ? given[j] : before[j] + acts * (given[j] - before[j]);
-            plant->next(plant->x, u, d, plant->k, plant->after);
-            plant->x = plant->after;
-            plant->after = swap;
-            row += TG_NY;
-            look(plant, row);
-            for (int i = 0; sees < 1.0 && i < TG_NY; i++)
-                row[i] = row[i - TG_NY] + sees * (row[i] - row[i - TG_NY]);
-        }
+        pass(around, plant, t, drive, row);
     }
+}
+
+/* PI loops, see thermogrip.mpc.controllers.pi: n of them, each on a drive and an output; ahead: feed-forward
+ * of each drive; kept: what setpoint weights leave out; slew: of a sample; uncut: by which a drive may be cut
+ * and not be limited; u: drives before the first sample. */
+typedef struct {
+    int n;
+    double dt, coldest, hottest; /* readings beyond these are none */
+    const int *drive, *output;
+    const double *Kc, *Ti, *target, *kept, *ahead, *lowest, *highest, *slew, *uncut;
+    double *integral, *u;
+} tg_loops;
+
+static void step_pi(const tg_loops *p, const double *shown, double *drive)
+{
+    double wanted[TG_NU];
+    memcpy(wanted, p->ahead, sizeof wanted);
+    for (int l = 0; l < p->n; l++)
+        wanted[p->drive[l]] =
+            p->ahead[p->drive[l]] + p->Kc[l] * (p->target[l] - shown[p->output[l]] - p->kept[l]) + p->integral[l];
+    for (int j = 0; j < TG_NU; j++) {
+        double before = fmin(fmax(p->u[j], p->lowest[j]), p->highest[j]);
+        double slewed = fmin(fmax(wanted[j], before - p->slew[j]), before + p->slew[j]);
+        drive[j] = p->u[j] = fmin(fmax(slewed, p->lowest[j]), p->highest[j]);
+    }
+    for (int l = 0; l < p->n; l++) {
+        int j = p->drive[l];
+        double change = p->Kc[l] * (p->target[l] - shown[p->output[l]]), cut = drive[j] - wanted[j];
+        if (cut * change > 0.0 || fabs(cut) <= p->uncut[j])
+            p->integral[l] += p->dt / p->Ti[l] * change;
+    }
+}
+
+/* As tg_host_loop, of PI loops; 0, and nothing that counts, where a reading is absurd. */
+int tg_host_loop_pi(const tg_loops *loops, tg_truth *plant, const tg_around *around, int n, double *y, double *reading,
+                    double *drive)
+{
+    look(plant, y);
+    for (int t = 0; t < n; t++) {
+        double *shown = reading + t * (TG_NY + TG_ND), *row = y + (size_t)t * (size_t)around->per_sample * TG_NY;
+        read_sensors(around, t, row, shown);
+        for (int i = 0; i < TG_NY; i++)
+            if (!(shown[i] >= loops->coldest && shown[i] <= loops->hottest))
+                return 0;
+        step_pi(loops, shown, drive + t * TG_NU);
+        pass(around, plant, t, drive, row);
+    }
+    return 1;
 }

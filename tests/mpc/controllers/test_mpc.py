@@ -481,14 +481,14 @@ def test_a_controller_has_what_its_design_says_and_a_reset_forgets_the_rest():
             [16, 28],
         ]
     two._unread_s, two._silent_s, two._on_pi, two._age_s = np.ones(2), 40.0, True, 9.0
-    two._target, two._side, two._plan, two.pi._I = np.ones(2), np.ones(2), OLD, np.ones(2)
+    two._target, two._side, two._plan, two.pi.integral = np.ones(2), np.ones(2), OLD, np.ones(2)
     two.optimiser._solves, two.reach._unreachable, two.times.since = 3, True, 9.0
     two.monitor._spikes[:], two._fresh, two._u = 2, False, np.array([9.0, 9.0])
     two.reset({"a": 31.0, "b": NAN, "room": NAN})
     assert (two._unread_s.tolist(), two._silent_s, two._on_pi, two._age_s) == ([0.0, 0.0], 0.0, False, 0.0)
     np.testing.assert_equal([two._target, two._side], [np.full(2, NAN), np.zeros(2)])
     np.testing.assert_equal([two._y, two._d, two._u, two._in_force], [[31, NAN], [25], [5, 0], [5, 0]])
-    assert (two._plan, two._y_plan.shape, two.pi._I.tolist()) == (None, (0, 2), [0.0, 0.0])
+    assert (two._plan, two._y_plan.shape, two.pi.integral.tolist()) == (None, (0, 2), [0.0, 0.0])
     assert (two.optimiser._solves, two.reach._unreachable, two.times.since) == (0, False, 0.0)
     assert (two.monitor._spikes.tolist(), two._fresh, two.plan) == ([0, 0], True, None)
     np.testing.assert_equal(two.monitor._last, [31.0, NAN])

@@ -42,7 +42,7 @@ def test_its_moves_and_its_integrators_are_those_of_the_equations():
         move = controller.step({"a": a, "b": b, "room": 22.0, "time_s": now}, TARGET)
         assert (move.status, move.advice, move.pump, move.seconds) == ("ok", "", 1, 1)
         assert move.drive == pytest.approx({"q1": q1, "q2": q2}, abs=2e-4)
-        assert pytest.approx([of_a, of_b], abs=2e-4) == controller._I
+        assert pytest.approx([of_a, of_b], abs=2e-4) == controller.integral
     assert controller._unread_s.tolist() == [0.0, 0.0]
     held = controller.step({"a": 40.0, "b": 40.0, "room": 22.0, "time_s": 5.5}, TARGET)
     assert (held.drive, held.advice) == (move.drive, "called before its sample time: the move is held")
@@ -52,10 +52,10 @@ def test_its_moves_and_its_integrators_are_those_of_the_equations():
     assert said == {("fallback_plan", "b: no usable reading, the others go on")}
     drives = [each.drive["q1"] for each in lost]
     assert drives == pytest.approx([26.96, 18.96, 10.96, 2.96], abs=1e-4)  # held for 3 s, then to rest
-    assert controller._I[1] == pytest.approx(-0.265, abs=1e-4)
+    assert controller.integral[1] == pytest.approx(-0.265, abs=1e-4)
     assert lost[0].drive["q2"] == pytest.approx(20.0 + 3.6, abs=2e-4)
     controller.reset({"a": 23.0, "b": 24.0})
-    assert controller._I.tolist() == pytest.approx(controller._unread_s.tolist()) == [0.0, 0.0]
+    assert controller.integral.tolist() == pytest.approx(controller._unread_s.tolist()) == [0.0, 0.0]
     assert controller._target.tolist() == [24.0, 23.0]
     assert np.isnan(controller._room).all()
 
@@ -101,7 +101,7 @@ def test_a_drive_without_a_loop_gets_what_is_fed_forward(share: float, narrow: f
 def test_an_unknown_room_is_one_of_25_degrees_and_the_last_that_was_read_stays():
     controller = pi(slew_per_s={"q1": 100.0})
     for room, ahead in ((NAN, 18.0), (23.6, 24.0), (NAN, 24.0)):  # (29.5 - room) / 0.25
-        controller._I[:] = 0.0
+        controller.integral[:] = 0.0
         move = controller.step({"a": 30.0, "b": 29.5, "room": room}, TARGET)
         assert move.drive["q1"] == pytest.approx(ahead, abs=1e-4)
 
@@ -110,9 +110,9 @@ def test_a_take_over_starts_from_the_drives_that_are_applied():
     controller = pi()
     y, target, d = np.array([27.0, 26.0]), np.array([29.5, 30.0]), np.array([22.0])
     controller.follow(np.array([33.0, 61.0]), y, target, d)
-    assert pytest.approx([61 - 20 - 12, 33 - 30 - 5], abs=1e-4) == controller._I
+    assert pytest.approx([61 - 20 - 12, 33 - 30 - 5], abs=1e-4) == controller.integral
     np.testing.assert_allclose(controller.propose(y, target, d), [33.0, 61.0])
-    np.testing.assert_allclose(controller._I, [29 + 2 * 0.6, -2 + 2 * 0.125], atol=1e-4)
+    np.testing.assert_allclose(controller.integral, [29 + 2 * 0.6, -2 + 2 * 0.125], atol=1e-4)
 
 
 def test_a_setpoint_weight_answers_a_new_target_less_and_a_reading_as_before():
@@ -124,7 +124,7 @@ def test_a_setpoint_weight_answers_a_new_target_less_and_a_reading_as_before():
     # of the steps of 8 and 7.5 degC half is left to the integrator
     assert one["q2"] - two["q2"] == pytest.approx(3.0 * 4.0, abs=1e-4)
     assert one["q1"] - two["q1"] == pytest.approx(2.0 * 3.75, abs=1e-4)
-    assert pytest.approx(weighted._I) == whole._I
+    assert pytest.approx(weighted.integral) == whole.integral
     warmer = {"a": 23.0, "b": 22.5, "room": 22.0}
     one, two = whole.step(warmer, TARGET).drive, weighted.step(warmer, TARGET).drive
     assert (one["q2"] - two["q2"], one["q1"] - two["q1"]) == pytest.approx((12.0, 7.5), abs=1e-4)

@@ -13,9 +13,10 @@ import pytest
 from scipy.linalg import expm
 
 from tests.mpc.makers import InC, ask_late, network_plant
-from thermogrip.mpc.closed_loop.simulate import Surroundings, Truth, simulate_closed_loop
+from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Surroundings, Truth, simulate_closed_loop
 from thermogrip.mpc.closed_loop.simulate_native import compiled_loop
 from thermogrip.mpc.controllers.mpc import Controller
+from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.native import runtime as build
@@ -242,6 +243,60 @@ def test_a_loop_is_the_same_in_python_with_c_parts_and_wholly_in_c(pair, tank_ma
         assert run.status == runs[0].status
         one, two = run.segments[1], runs[0].segments[1]
         assert (one.overshoot, one.travel, one.bias) == pytest.approx((two.overshoot, two.travel, two.bias))
+
+
+LOOP = {"setpoint": 0.4, "feedforward": 0.7}
+
+
+@pytest.mark.parametrize("held", [(), ("t_surface",)])
+@pytest.mark.parametrize(
+    "lacks", [{"move_delay_s": 1.0}, {"move_delay_s": 7.0, "sensor_lag_s": 3.0, "drive_share": 0.8}]
+)
+def test_a_loop_of_a_pi_is_the_same_in_c(pair, tank_maker, lacks, held):
+    truth = tank_maker(heat=0.1, joule=0.055, loss=1 / 600, delay=9)
+    around = Surroundings(ambient=23.0, offset={"t_surface": 0.3, "t_ambient": -0.4}, **lacks)
+    around = replace(around, quanta={"t_ambient": 0.1}, noises={"t_tank": 0.2}, held=held)
+    loops = tuple(replace(loop, **LOOP, Kc=4 * loop.Kc) for loop in pair[1].design.loops)
+    runs = _with_pi(pair[1], loops, truth, [(44.0, 240.0)], start=30.0, surroundings=around, seed=5)
+    _same_loops(*runs)
+    assert runs[0].segments[0].full_share > 0.1  # the integrator stood for a while
+
+
+def test_two_loops_of_a_pi_are_the_same_in_c(tclab):
+    c = Controller(tclab, default_design(tclab, dt=4.0), compiled=True)
+    loops = tuple(replace(loop, **LOOP, Kc=(1 + k) * loop.Kc) for k, loop in enumerate(c.design.loops))
+    _same_loops(*_with_pi(c, loops, tclab, [(40.0, 300.0)], seed=1))
+    several = _with_pi(c, loops, tclab, [(40.0, 100.0), (35.0, 100.0)], seed=1)  # C goes to one target
+    _same_loops(*several)
+    assert [segment.target for segment in several[1].segments] == [40.0, 40.0, 35.0, 35.0]
+
+
+def test_a_pi_in_c_that_reads_what_cannot_be_answers_as_python_does(tclab):
+    c = Controller(tclab, default_design(tclab, dt=4.0), compiled=True)
+    for wrong in ({"t1": 900.0}, {"t_ambient": -900.0}):
+        around = Surroundings(
+            offset={name: wrong.get(name, 0.0) for name in (*tclab.outputs, *tclab.disturbances)}
+        )
+        runs = _with_pi(c, c.design.loops, tclab, [(40.0, 100.0)], surroundings=around)
+        _same_loops(*runs)
+        assert ("fallback_plan" in runs[1].status) == ("t1" in wrong)
+
+
+def _with_pi(c, loops, truth, schedule, **about) -> tuple[ClosedLoop, ClosedLoop]:
+    """Return the loop of a PI under the limits of a compiled controller's design, in Python and in C."""
+    python, compiled = (PIController.of(c.plant, c.design, loops) for _ in range(2))
+    compiled.c = c.c
+    loop = simulate_closed_loop(python, truth, schedule, **about)
+    return loop, compiled_loop(compiled, truth, schedule, **about)
+
+
+def _same_loops(one: ClosedLoop, two: ClosedLoop) -> None:
+    for part in ("drive", "outputs", "readings", "target"):
+        for name, values in getattr(one, part).items():
+            np.testing.assert_allclose(getattr(two, part)[name], values, atol=1e-9)
+    assert two.status == one.status
+    for ours, theirs in zip(two.segments, one.segments, strict=True):
+        assert (ours.overshoot, ours.travel) == pytest.approx((theirs.overshoot, theirs.travel))
 
 
 NAN = float("nan")

@@ -102,7 +102,7 @@ def test_each_controller_is_tried_for_its_own_length(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(objective, "run_trials", run)
     monkeypatch.setattr(search, "made", lambda name, design: (name, design.move))
     scale = search.baseline.loops[0].Kc
-    monkeypatch.setattr(objective.PIController, "of", lambda plant, base, loops: ("PI", loops[0].Kc / scale))
+    monkeypatch.setattr(search, "_pi", lambda loops: ("PI", loops[0].Kc / scale))
     pi = {"Kc": 2.0, "Ti": 1.0, "setpoint": 1.0, "feedforward": 0.5}
     tried = [search.evaluate({"move": 7.0}), search.evaluate(pi, "PI"), search.evaluate({"move": 4.0}, "LQR")]
     search.evaluate_at_length(("PI", pi))
@@ -162,7 +162,7 @@ def test_the_trial_from_a_cold_start_is_of_the_pi_alone(monkeypatch: pytest.Monk
 
     monkeypatch.setattr(objective, "run_trials", run)
     monkeypatch.setattr(search, "made", lambda name, design: name)
-    monkeypatch.setattr(objective.PIController, "of", lambda plant, base, loops: "PI")
+    monkeypatch.setattr(search, "_pi", lambda loops: "PI")
     for name in ("MPC", "PI", "LQR"):
         search.evaluate({"Kc": 1.0, "Ti": 1.0, "setpoint": 1.0, "feedforward": 0.5}, name)
     cold = ([*STEPS, (20.0, 36.0)], None)

@@ -137,7 +137,7 @@ class PowerLaw:
     def __init__(self, power: float, jump: bool = False) -> None:
         self.power, self.jump = power, jump
 
-    def evaluate(self, parameters):
+    def evaluate(self, parameters, *, noises=3):
         value = parameters["move"]
         settle = 130.0 if self.jump and value > 4 else 100.0
         return Trial("MPC", parameters, value**self.power, settle, 0.1, 50.0)
