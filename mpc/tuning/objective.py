@@ -487,9 +487,9 @@ class Search:
         quick = name == "MPC" and self._compiled  # in C: a tenth of the time
         # a PI for as long as a step is held, to see what its integrator has still to do; and what is quick:
         # the end of a short run is not the bias that stays
-        whole = quick or name == "PI"
+        whole = quick or name == "PI" or at_length
         spec = self.whole_spec if whole else self.spec
-        lengths = None if whole or at_length else self.lengths
+        lengths = None if whole else self.lengths
         count = noises if quick else 1
         # the comparison of a plant without draws has a seed of its own
         others = range(count * other_noise, count * (other_noise + 1))

@@ -52,7 +52,7 @@ def tuning_of(**changes: Any) -> Any:
         slew_per_s={"q": 5.0}, move=0.125, terminal=3.0, overshoot=0.75, deadline_s=0.5, limits={},
         noise=SimpleNamespace(drive=0.01, output=0.02),
     )  # fmt: skip
-    plant = SimpleNamespace(samples=None, covariance=np.eye(1))
+    plant = SimpleNamespace(samples=None, covariance=np.eye(1), valid={}, units={})
     rows = [
         {"controller": of, "name": name, "settle_s": settle, "overshoot_degC": 0.12345, "energy_s": 20.04,
          "best": best}
@@ -69,7 +69,8 @@ def tuning_of(**changes: Any) -> Any:
         "pareto": SimpleNamespace(rows=lambda: rows),
         "runs": {"28 to 38, MPC": run, "28 to 38, PI": run, "28 to 18, MPC": run},
         "controller": SimpleNamespace(
-            design=design, plant=plant, disturbance=SimpleNamespace(names=("q", "t1"))
+            design=design, plant=plant, controlled=design.controlled,
+            disturbance=SimpleNamespace(names=("q", "t1")),
         ),
     }  # fmt: skip
     return SimpleNamespace(**made | changes)
@@ -137,6 +138,13 @@ def test_designs_stand_from_the_fastest_to_those_that_never_settle(
     assert table.caption == f"Means over steps and the draws of the search ({draws}), 200 s each"
     assert section.verdict == "Nothing: the fastest design (50 s) is as frugal as any."
     assert drawn["pareto"] == [((tuning.pareto,), {})]
+    # where the logs were as cold as the room, further away than any step
+    tuning.controller.plant.valid = {"t1": (20.0, 60.0), "t2": (20.0, 60.0)}
+    tuning.spec.ambient_degC = 20.0
+    _, table = control.pareto_section(tuning).parts
+    way = f", the way from 20 to {STEPS[0][1]:g} degC included"
+    assert table.caption == f"Means over steps and the draws of the search ({draws}), 200 s each{way}"
+    assert f"draws of the search{way}." in control.sensitivity_section(tuning).parts[0].caption
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from thermogrip.mpc.tuning.figures import (
     sensitivity_figure,
     step_time_figure,
 )
-from thermogrip.mpc.tuning.objective import bands_of
+from thermogrip.mpc.tuning.objective import bands_of, cold_steps
 from thermogrip.mpc.tuning.trade_offs import sensitivity_words
 from thermogrip.report.console import Cells, Columns, cells, short
 from thermogrip.report.html import Picture, Plot, Section, Table, Text
@@ -162,10 +162,18 @@ def pareto_section(tuning: Tuning) -> Section:
         ),
         Table(
             *cells(columns, rows),
-            f"Means over steps and the draws of the search ({draws}), {tuning.spec.hold_s:g} s each",
+            f"Means over steps and the draws of the search ({draws}), {tuning.spec.hold_s:g} s each"
+            f"{_cold(tuning)}",
         ),
     )
     return Section("What can be traded?", parts, _trade(rows))
+
+
+def _cold(tuning: Tuning) -> str:
+    """Return that trials begin in the cold too, where they do."""
+    controller = tuning.controller
+    cold = cold_steps(controller.plant, tuning.spec, controller.controlled)
+    return "".join(f", the way from {start:g} to {end:g} degC included" for start, end in cold)
 
 
 def sensitivity_section(tuning: Tuning) -> Section:
@@ -181,7 +189,8 @@ def sensitivity_section(tuning: Tuning) -> Section:
         Picture(
             sensitivity_figure(tuning.sensitivity),
             "How far each number may go, by factors of up to ten, before settling moves by 1 s or 1 %, "
-            "overshoot by 0.02 K or the score by 1 %. Horizon and blocks were moved by 30 % only.",
+            "overshoot by 0.02 K or the score by 1 %. Horizon and blocks were moved by 30 % only. Settling "
+            f"is the mean of steps and draws of the search{_cold(tuning)}.",
         ),
         *(Text(f"{line[0].upper()}{line[1:]}.") for line in words),
     ]
