@@ -488,8 +488,8 @@ class StepResponse:
     """How one output answers to a step of one drive, from rest."""
 
     gain: float  # settled change of the output for a whole range of the drive [degC]
-    delay: float  # apparent dead time: where the steepest tangent leaves zero [s]
-    lag: float  # dominant lag: gain over the steepest slope [s]
+    delay: float  # apparent dead time: where the steepest tangent towards the gain leaves zero [s]
+    lag: float  # dominant lag: gain over the steepest slope towards it [s]
     time: Array  # (n,) the response for a whole range of the drive [s], [degC]
     y: Array
 
@@ -517,8 +517,9 @@ def step_response(
         if abs(slope[-1]) < 1e-3 * np.max(np.abs(slope)) or t[-1] >= longest:
             break
         seconds = t[-1]
-    at = int(np.argmax(np.abs(slope)))
-    gain, steepest = float(response[-1]), float(slope[at])
+    gain = float(response[-1])
+    at = int(np.argmax(slope * np.sign(gain)))  # what first goes the other way is part of the delay
+    steepest = float(slope[at])
     if gain == 0 or steepest == 0:
         return StepResponse(0.0, float("inf"), float("inf"), t, response)
     delay = max(0.0, float(t[at] - response[at] / steepest))

@@ -179,6 +179,22 @@ def test_a_step_is_watched_until_it_is_over(dt, time_constant, longest, end):
     assert answer.delay == pytest.approx(11 * dt - 50 * (1 - np.exp(-dt / time_constant)) / slope)
 
 
+def test_what_first_goes_the_other_way_is_delay():
+    """y = K (1 - exp(-t/T)) - k (1 - exp(-t/tau)), which falls faster at first than it ever rises, comes back
+    to where it began after about k T/K."""
+    K, T, k, tau, dt = 10.0, 150.0, 0.1, 0.3, 0.1
+    decay = np.exp(-dt / np.array([T, tau]))
+    gains = (1 - decay) * [K, k]
+    model = StateSpaceModel(
+        ("q",), (), ("t",), A=np.diag(decay), B=gains[:, None], C=[[1.0, -1.0]], c=25.0 * (1 - decay), dt=dt
+    )
+    plant = Plant(model, {}, dt=dt, units={"q": "1"}, valid={"q": (0.0, 1.0), "t": (0.0, 60.0)})
+    answer = step_response(plant, "q", "t")
+    assert answer.y.min() < -0.04
+    assert answer.delay == pytest.approx(k * T / K, rel=0.1)
+    assert answer.lag == pytest.approx(T, rel=0.02)
+
+
 def test_a_drive_that_moves_nothing_has_no_delay_and_no_lag():
     answer = step_response(block(10, 50.0, gain=0.0), "q", "t")
     assert (answer.gain, answer.delay, answer.lag) == (0.0, np.inf, np.inf)
