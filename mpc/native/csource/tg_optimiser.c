@@ -33,14 +33,17 @@
 
 static int row_of(const tg_design *s, int r) { return r < s->n_c ? s->controlled[r] : s->limited[r - s->n_c]; }
 
-static double read_output(const tg_design *s, const double *x, int i)
+/* What all outputs read. */
+static void read_outputs(const tg_design *s, const double *x, const double *bias, double *y)
 {
-    const double *C = s->C + i * TG_NX;
-    int j = s->read_from[i];
-    double sum = s->y0[i] + C[j] * x[j]; /* most read one state */
-    while (++j < s->read_to[i])
-        sum += C[j] * x[j];
-    return sum;
+    for (int i = 0; i < TG_NY; i++) {
+        const double *C = s->C + i * TG_NX;
+        int j = s->read_from[i], end = s->read_to[i];
+        double sum = s->y0[i] + bias[i] + C[j] * x[j]; /* most are of one state */
+        while (++j < end)
+            sum += C[j] * x[j];
+        y[i] = sum;
+    }
 }
 
 static const double *response(const tg_controller *c, int k, int r)
@@ -121,8 +124,7 @@ void tg_simulate(tg_controller *c, const double *start, const double *plan, cons
                 x = next;
                 next = swap;
             }
-            for (int i = 0; i < TG_NY; i++)
-                y[k * TG_NY + i] = read_output(s, x, i) + bias[i];
+            read_outputs(s, x, bias, y + k * TG_NY);
         }
     }
 }
@@ -190,8 +192,7 @@ static void linearise(tg_controller *c, const double *start, const double *guess
                 now = then;
                 then = swap;
             }
-            for (int i = 0; i < TG_NY; i++)
-                c->y_guess[k * TG_NY + i] = read_output(s, x, i) + bias[i];
+            read_outputs(s, x, bias, c->y_guess + k * TG_NY);
             for (int r = 0; r < rows; r++) {
                 int place = k * rows + r;
                 read_row(s, row_of(s, r), now, groups, c->G + c->qp.start[place], c->qp.filled[place]);
@@ -352,7 +353,7 @@ static void set_linear_cost(tg_controller *c, const double *target, const double
             for (int i = 0; i < n; i++)
                 error[i] = weight_of(c, k + i, r) * (goal[(k + i) * apart] - free[i * rows]);
             if (n == 4)
-                tg_take_four(q->f, g, beside, error[0], error[1], error[2], error[3], 0, length(c, k));
+                tg_take_four(q->f, g, beside, error[0], error[1], error[2], error[3], length(c, k));
             for (int i = 0; n < 4 && i < n; i++)
                 tg_add_row(q->f, -error[i], g + i * beside, length(c, k));
         }
@@ -361,17 +362,16 @@ static void set_linear_cost(tg_controller *c, const double *target, const double
         q->f[j] -= 2.0 * c->caution * s->move * last[j] / s->span[j];
 }
 
-/* Add the squares of four rows, n numbers that end at a multiple of four, to the upper triangle of H. */
+/* Add the squares of four rows, n numbers that end at a multiple of four, to the lower triangle of H. */
 static void add_squares(double *restrict H, int n, const double *weight, const double *restrict g0,
                         const double *restrict g1, const double *restrict g2, const double *restrict g3)
 {
-    int end = TG_WHOLE(n);
     for (int i = 0; i < n; i++) {
         double *row = H + (size_t)i * TG_Q_W;
         const double s0 = weight[0] * g0[i], s1 = weight[1] * g1[i], s2 = weight[2] * g2[i], s3 = weight[3] * g3[i];
-        for (int j = i & ~3; j < end; j += 4)
+        for (int j = 0; j <= i; j += 4)
             for (int l = j; l < j + 4; l++)
-                row[l] += s0 * g0[l] + s1 * g1[l] + (s2 * g2[l] + s3 * g3[l]);
+                row[l] = row[l] + s0 * g0[l] + s1 * g1[l] + s2 * g2[l] + s3 * g3[l];
     }
 }
 
@@ -380,7 +380,8 @@ static void set_quadratic_cost(tg_controller *c)
     const tg_design *s = c->design;
     tg_qp *q = &c->qp;
     double weight_of_moves = c->caution * s->move;
-    memset(q->H, 0, (size_t)q->n * TG_Q_W * sizeof(double));
+    for (int i = 0; i < q->n; i++)
+        memset(q->H + (size_t)i * TG_Q_W, 0, (size_t)TG_WHOLE(i + 1) * sizeof(double));
     for (int k = 0; k < s->N; k += 4)
         for (int r = 0; r < s->n_c; r++) {
             double weight[4] = {0.0};
@@ -398,8 +399,8 @@ static void set_quadratic_cost(tg_controller *c)
             int i = b * TG_NU + j;
             double *row = q->H + (size_t)i * TG_Q_W;
             row[i] += 2.0 * (weight_of_moves * (b < s->n_b - 1 ? 2.0 : 1.0) + s->drive * s->blocks[b]);
-            if (b < s->n_b - 1)
-                row[i + TG_NU] -= 2.0 * weight_of_moves;
+            if (b)
+                row[i - TG_NU] -= 2.0 * weight_of_moves;
         }
 }
 
