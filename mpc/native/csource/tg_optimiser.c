@@ -416,7 +416,7 @@ static void set_soft_rows(tg_controller *c, const double *target, const double *
     const tg_design *s = c->design;
     tg_qp *q = &c->qp;
     int rows = s->n_c + s->n_l;
-    for (int r = 0, apart; r < rows; r++) {
+    for (int r = 0, apart = 0; r < rows; r++) {
         double *lower = q->lower + 2 * q->n + r, *upper = q->upper + 2 * q->n + r;
         const double *goal = NULL, *free = c->free + r;
         double low = -NONE, high = NONE;

@@ -128,15 +128,14 @@ static void four_products(const double *restrict m, const double *restrict r0, c
 
 void tg_soft_values(const tg_qp *q, const double *x, double *values)
 {
-    int i = 0;
-    while (i < q->s) {
-        const double *row = q->A + q->start[i];
-        int n = q->filled[i];
-        if (i + 3 < q->s && q->filled[i + 3] == n) { /* rows grow */
+    const double *row = q->A;
+    for (int i = 0, end = 0, n; i < q->s;) {
+        for (n = q->filled[i]; end < q->s && q->filled[end] == n;)
+            end++;
+        for (; i + 4 <= end; i += 4, row += 4 * n)
             four_products(x, row, row + n, row + 2 * n, row + 3 * n, n, values + i);
-            i += 4;
-        } else
-            values[i++] = tg_product(row, x, n);
+        for (; i < end; i++, row += n)
+            values[i] = tg_product(row, x, n);
     }
 }
 
@@ -550,14 +549,13 @@ static void solve_fit(tg_qp *q, double *b) { solve_factor(q, b, q->n_work); }
 
 static void make_x(tg_qp *q)
 {
-    int end = TG_WHOLE(q->n), i = 0;
+    int end = TG_WHOLE(q->n), to = 0, i = 0;
     for (int j = 0; j < end; j++)
         q->x[j] = -q->c[j];
+    for (int k = 0; k < q->n_work; k++)
+        to = q->to[k] > to ? q->to[k] : to;
     for (; i + 4 <= q->n_work; i += 4) {
         const double *by = q->multiplier + i;
-        int to = 0;
-        for (int k = i; k < i + 4; k++)
-            to = q->to[k] > to ? q->to[k] : to;
         tg_take_four(q->x, q->normal + (size_t)i * TG_Q_W, TG_Q_W, by[0], by[1], by[2], by[3], to);
     }
     for (; i < q->n_work; i++)
