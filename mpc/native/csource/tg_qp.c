@@ -58,14 +58,14 @@ static double *fit_row(tg_qp *q, int i) { return q->fit + (size_t)i * (size_t)(i
 
 void tg_qp_forget(tg_qp *q) { q->n_work = 0; }
 
-/* Whether none of n numbers, a multiple of four, is infinite or no number. */
+/* Whether none of n numbers, a multiple of four, is infinite or no number, nor their sum. */
 static int all_finite(const double *a, int n)
 {
-    double wrong[4] = {0.0};
+    double sum[4] = {0.0};
     for (int i = 0; i < n; i += 4)
         for (int l = 0; l < 4; l++)
-            wrong[l] += fabs(a[i + l]) <= LARGEST ? 0.0 : 1.0;
-    return (wrong[0] + wrong[1]) + (wrong[2] + wrong[3]) == 0.0;
+            sum[l] += fabs(a[i + l]);
+    return (sum[0] + sum[1]) + (sum[2] + sum[3]) <= LARGEST;
 }
 
 static int problem_is_finite(const tg_qp *q)
