@@ -118,7 +118,7 @@ class ActiveSetQP(CondensedQP):
 
     def _values(self) -> Array:
         """Return what all rows are."""
-        return self._free_value - self._K[:, self._rows] @ self._pushes() if self._rows else self._free_value
+        return self._free_value - self._pushes() @ self._K[self._rows] if self._rows else self._free_value
 
     def _worst(self) -> tuple[int, int] | None:
         """Return the row that is broken most outside the set, and at which of its bounds."""
