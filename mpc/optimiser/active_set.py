@@ -40,7 +40,10 @@ class ActiveSetQP(CondensedQP):
         normals, c = A @ back.T, back @ f
         self._K, along = normals @ normals.T, normals @ c
         self._right = {1: -upper - along, -1: lower + along}
-        self._free, self._by = -back.T @ c, normals @ back  # x without a row in the set, and what each does to it
+        self._free, self._by = (
+            -back.T @ c,
+            normals @ back,
+        )  # x without a row in the set, and what each does to it
         self._free_value = A @ self._free
         # of each row in the set: which, its bound (+1 upper, -1 lower), its state, and how much pushes there
         self._rows, self._sides = list[int](), list[int]()
