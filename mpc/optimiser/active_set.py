@@ -1,9 +1,9 @@
 r"""The dual active-set method of the exported C, in NumPy: what its iterations are compared with.
 
-The theory is at the head of ``csource/tg_qp.c``.  K is worked out once, of all rows, and its factor of those in
-the set is made anew at every iteration, by LAPACK; the C makes products of the rows that it takes in alone and
-updates its factor row by row.  Both take the same rows in and out in the same order, so that not only their
-answers but also their iterations must agree.
+The theory is at the head of ``csource/tg_qp.c``.  K is worked out once, of all rows, and its factor of those
+in the set is made anew at every iteration, by LAPACK; the C makes products of the rows that it takes in alone
+and updates its factor row by row.  Both take the same rows in and out in the same order, so that not only
+their answers but also their iterations must agree.
 """
 
 from __future__ import annotations
