@@ -40,10 +40,8 @@ class ActiveSetQP(CondensedQP):
         normals, c = A @ back.T, back @ f
         self._K, along = normals @ normals.T, normals @ c
         self._right = {1: -upper - along, -1: lower + along}
-        self._free, self._by = (
-            -back.T @ c,
-            normals @ back,
-        )  # x without a row in the set, and what each does to it
+        # x without a row in the set, and what each does to it
+        self._free, self._by = -back.T @ c, normals @ back
         self._free_value = A @ self._free
         # of each row in the set: which, its bound (+1 upper, -1 lower), its state, and how much pushes there
         self._rows, self._sides = list[int](), list[int]()
@@ -107,9 +105,8 @@ class ActiveSetQP(CondensedQP):
 
     def _change(self, at: int, upward: bool) -> None:
         """Let a row that has reached the end of its state leave, or go on in the next one."""
-        row, side, state, _ = (
-            part.pop(at) for part in (self._rows, self._sides, self._states, self._multipliers)
-        )
+        row, side, state = self._rows.pop(at), self._sides.pop(at), self._states.pop(at)
+        self._multipliers.pop(at)
         if state == _KEPT and upward:
             self._put(row, side, _BROKEN, float(self.linear[row]))
         elif state == _BROKEN:
@@ -117,11 +114,13 @@ class ActiveSetQP(CondensedQP):
 
     def _pushes(self) -> Array:
         """Return the multipliers of the set, positive at upper bounds."""
-        return np.array(self._multipliers) * self._sides
+        return np.asarray(np.array(self._multipliers) * np.array(self._sides, dtype=float))
 
     def _values(self) -> Array:
         """Return what all rows are."""
-        return self._free_value - self._pushes() @ self._K[self._rows] if self._rows else self._free_value
+        if not self._rows:
+            return np.asarray(self._free_value)
+        return np.asarray(self._free_value - self._pushes() @ self._K[self._rows])
 
     def _worst(self) -> tuple[int, int] | None:
         """Return the row that is broken most outside the set, and at which of its bounds."""
