@@ -1,31 +1,21 @@
 r"""The dual active-set method of the exported C, in NumPy: what its iterations are compared with.
 
-The theory is at the head of ``csource/tg_qp.c``.  Here every factor is made anew at every iteration, by
-NumPy; the C updates its own row by row.  Both take the same rows in and out in the same order, so that
-not only their answers but also their iterations must agree.
+The theory is at the head of ``csource/tg_qp.c``.  K is worked out once, of all rows, and its factor of those
+in the set is made anew at every iteration, by LAPACK; the C makes products of the rows that it takes in alone
+and updates its factor row by row.  Both take the same rows in and out in the same order, so that not only
+their answers but also their iterations must agree.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
+from scipy.linalg.lapack import dposv
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.mpc.optimiser.qp import CondensedQP, QPAnswer
 
 _REGULAR, _TOLERANCE, _SHORT, _CONTRADICTION, _FAR = 1e-11, 1e-10, 1e-5, 1e-6, 1e15
 _HARD, _KEPT, _BROKEN = 0, 1, 2
-
-
-@dataclass
-class _Entry:
-    """A row in the working set: +1 at its upper bound, -1 at its lower, and how much pushes there."""
-
-    row: int
-    side: int
-    state: int
-    multiplier: float
 
 
 class ActiveSetQP(CondensedQP):
@@ -41,114 +31,133 @@ class ActiveSetQP(CondensedQP):
 
     def _solve(self, H: Array, f: Array, A: Array, lower: Array, upper: Array) -> QPAnswer:
         length = np.linalg.norm(A / np.sqrt(np.diag(H)), axis=1)
-        self._idle = self.soft & (length <= _SHORT)
-        self._weight = 1.0 / np.where(self._idle, 1.0, length)
-        L = np.linalg.cholesky(H)
-        self._A, self._bounds = A, (np.clip(lower, -1e30, 1e30), np.clip(upper, -1e30, 1e30))
-        self._back = np.linalg.inv(L)
-        self._normals, self._c = A @ self._back.T, self._back @ f
-        self._set, iterations = list[_Entry](), 0
+        idle = self.soft & (length <= _SHORT)
+        self._weight = 1.0 / np.where(idle, 1.0, length)
+        self._given_bounds = lower, upper
+        self._lower = np.where(idle | (lower < -_FAR), -np.inf, lower)
+        self._upper = np.where(idle | (upper > _FAR), np.inf, upper)
+        back = np.linalg.inv(np.linalg.cholesky(H))
+        normals, c = A @ back.T, back @ f
+        self._K, along = normals @ normals.T, normals @ c
+        self._right = {1: -upper - along, -1: lower + along}
+        # x without a row in the set, and what each does to it
+        self._free, self._by = -back.T @ c, normals @ back
+        self._free_value = A @ self._free
+        # of each row in the set: which, its bound (+1 upper, -1 lower), its state, and how much pushes there
+        self._rows, self._sides = list[int](), list[int]()
+        self._states, self._multipliers = list[int](), list[float]()
+        iterations = 0
         while iterations <= self.iteration_limit:
             ended = self._go()
             if ended is not None:
                 iterations += 1
                 self._change(*ended)
                 continue
-            x = self._answer()
-            found = self._worst(x)
+            found = self._worst()
             if found is None:
-                return self._refined(iterations)
+                return self._refined(iterations, f.size)
             iterations += 1
             row, side = found
-            self._set.append(_Entry(row, side, _KEPT if self.soft[row] else _HARD, 0.0))
+            self._put(row, side, _KEPT if self.soft[row] else _HARD, 0.0)
         return self._failed("iteration limit", f.size, iterations)
+
+    def _put(self, row: int, side: int, state: int, multiplier: float) -> None:
+        self._rows.append(row)
+        self._sides.append(side)
+        self._states.append(state)
+        self._multipliers.append(multiplier)
 
     def _system(self) -> tuple[Array, Array]:
         """Return K, with its regular share, and the right side, of the set."""
-        m = self._normals_of_set()
-        K = m @ m.T
+        rows, sides = np.array(self._rows), np.array(self._sides, dtype=float)
+        K = self._K[rows[:, None], rows] * sides[:, None] * sides
         K.flat[:: len(K) + 1] *= 1 + _REGULAR
-        right = -np.array([self._bound(entry) for entry in self._set]) - m @ self._c
-        for at, entry in enumerate(self._set):
-            if entry.state == _BROKEN:
-                K[at, at] += 1.0 / self.quadratic[entry.row]
-                right[at] += self.linear[entry.row] / self.quadratic[entry.row]
+        right = np.where(sides > 0, self._right[1][rows], self._right[-1][rows])
+        for at, (row, state) in enumerate(zip(self._rows, self._states)):
+            if state == _BROKEN:
+                K[at, at] += 1.0 / self.quadratic[row]
+                right[at] += self.linear[row] / self.quadratic[row]
         return K, right
-
-    def _normals_of_set(self) -> Array:
-        sides = np.array([float(entry.side) for entry in self._set])
-        return np.asarray(self._normals[[entry.row for entry in self._set]] * sides[:, None])
-
-    def _bound(self, entry: _Entry) -> float:
-        lower, upper = self._bounds
-        return float(upper[entry.row] if entry.side > 0 else -lower[entry.row])
 
     def _go(self) -> tuple[int, bool] | None:
         """Go toward the multipliers that fulfil the set; return who ended first, and whether upward."""
-        if not self._set:
+        if not self._rows:
             return None
-        wanted = np.linalg.solve(*self._system())
-        slack = 1e-13 * float(np.max(np.abs(wanted)))
+        wanted = _solution(*self._system()).tolist()
+        slack = 1e-13 * max(map(abs, wanted))
         share, which, upward = 1.0, -1, False
-        for at, (entry, there) in enumerate(zip(self._set, wanted.tolist())):
-            low = self.linear[entry.row] if entry.state == _BROKEN else 0.0
-            high = self.linear[entry.row] if entry.state == _KEPT else np.inf
-            here = entry.multiplier
+        for at, (row, state, here, there) in enumerate(
+            zip(self._rows, self._states, self._multipliers, wanted)
+        ):
+            low = self.linear[row] if state == _BROKEN else 0.0
             if there < low - slack:
                 part = (here - low) / (here - there) if here > low else 0.0
-            elif there > high + slack:
+            elif state == _KEPT and there > self.linear[row] + slack:
+                high = self.linear[row]
                 part = (high - here) / (there - here) if here < high else 0.0
             else:
                 continue
             if which < 0 or part < share:
-                share, which, upward = part, at, there > high
-        for entry, there in zip(self._set, wanted.tolist()):
-            entry.multiplier += share * (there - entry.multiplier)
+                share, which, upward = part, at, there > low
+        pairs = zip(self._multipliers, wanted)
+        self._multipliers = [here + share * (there - here) for here, there in pairs]
         return None if which < 0 else (which, upward)
 
     def _change(self, at: int, upward: bool) -> None:
-        """Let an entry that has reached the end of its state leave, or go on in the next one."""
-        entry = self._set.pop(at)
-        if entry.state == _KEPT and upward:
-            self._set.append(_Entry(entry.row, entry.side, _BROKEN, self.linear[entry.row]))
-        elif entry.state == _BROKEN:
-            self._set.append(_Entry(entry.row, entry.side, _KEPT, self.linear[entry.row]))
+        """Let a row that has reached the end of its state leave, or go on in the next one."""
+        row, side, state = self._rows.pop(at), self._sides.pop(at), self._states.pop(at)
+        self._multipliers.pop(at)
+        if state == _KEPT and upward:
+            self._put(row, side, _BROKEN, float(self.linear[row]))
+        elif state == _BROKEN:
+            self._put(row, side, _KEPT, float(self.linear[row]))
 
-    def _answer(self) -> Array:
-        v = -self._c
-        if self._set:
-            v = v - self._normals_of_set().T @ np.array([entry.multiplier for entry in self._set])
-        return np.asarray(self._back.T @ v)
+    def _pushes(self) -> Array:
+        """Return the multipliers of the set, positive at upper bounds."""
+        return np.asarray(np.array(self._multipliers) * np.array(self._sides, dtype=float))
 
-    def _worst(self, x: Array) -> tuple[int, int] | None:
+    def _values(self) -> Array:
+        """Return what all rows are."""
+        if not self._rows:
+            return np.asarray(self._free_value)
+        return np.asarray(self._free_value - self._pushes() @ self._K[self._rows])
+
+    def _worst(self) -> tuple[int, int] | None:
         """Return the row that is broken most outside the set, and at which of its bounds."""
-        lower, upper = self._bounds
-        value = self._A @ x
-        over = np.where(upper > _FAR, 0.0, (value - upper) * self._weight)
-        under = np.where(lower < -_FAR, 0.0, (lower - value) * self._weight)
+        value = self._values()
+        over, under = (value - self._upper) * self._weight, (self._lower - value) * self._weight
         most = np.maximum(over, under)
-        most[[entry.row for entry in self._set]] = 0.0
-        most[self._idle] = 0.0
+        most[self._rows] = 0.0
         row = int(np.argmax(most))
         return (row, 1 if over[row] > under[row] else -1) if most[row] > _TOLERANCE else None
 
-    def _refined(self, iterations: int) -> QPAnswer:
+    def _refined(self, iterations: int, n: int) -> QPAnswer:
         """Take back what the regular share did, and look whether the hard rows hold."""
-        x, multipliers = self._answer(), np.zeros(len(self.soft))
-        if self._set:
-            rest = np.array([e.side * (self._A[e.row] @ x) - self._bound(e) for e in self._set])
-            for at, entry in enumerate(self._set):
-                if entry.state == _BROKEN:
-                    rest[at] -= (entry.multiplier - self.linear[entry.row]) / self.quadratic[entry.row]
-            for entry, more in zip(self._set, np.linalg.solve(self._system()[0], rest).tolist()):
-                entry.multiplier += more
-            x = self._answer()
-        hard = [e for e in self._set if e.state == _HARD]
-        over = [(e.side * (self._A[e.row] @ x) - self._bound(e)) * self._weight[e.row] for e in hard]
-        if over and not max(over) < _CONTRADICTION:
-            return QPAnswer(np.full(x.size, np.nan), "infeasible", iterations, multipliers, multipliers)
-        for entry in self._set:
-            multipliers[entry.row] += entry.side * entry.multiplier
-        value = self._A @ x
-        slack = np.maximum(0.0, np.maximum(value - self._bounds[1], self._bounds[0] - value))
+        multipliers = np.zeros(len(self.soft))
+        if self._rows:
+            rest = self._beyond()
+            for at, (row, state) in enumerate(zip(self._rows, self._states)):
+                if state == _BROKEN:
+                    rest[at] -= (self._multipliers[at] - self.linear[row]) / self.quadratic[row]
+            more = _solution(self._system()[0], rest).tolist()
+            self._multipliers = [now + add for now, add in zip(self._multipliers, more)]
+            over = np.where(np.array(self._states) == _HARD, self._beyond() * self._weight[self._rows], 0.0)
+            if not over.max() < _CONTRADICTION:
+                return QPAnswer(np.full(n, np.nan), "infeasible", iterations, multipliers, multipliers)
+            multipliers[self._rows] = self._pushes()
+        x, value = self._free - self._by.T @ multipliers, self._values()
+        lower, upper = self._given_bounds  # of those too short to be kept as well
+        slack = np.maximum(0.0, np.maximum(value - upper, lower - value))
         return QPAnswer(x, "solved", iterations, multipliers, np.where(self.soft, slack, 0.0))
+
+    def _beyond(self) -> Array:
+        """Return by how much each row in the set is beyond its bound."""
+        value = self._values()[self._rows]
+        ends = zip(value.tolist(), self._rows, self._sides)
+        return np.array([v - self._upper[r] if s > 0 else self._lower[r] - v for v, r, s in ends])
+
+
+def _solution(K: Array, right: Array) -> Array:
+    """Return K^-1 right by Cholesky's method; where rounding has left K without a root, by elimination."""
+    _, found, failed = dposv(K, right)
+    return np.linalg.solve(K, right) if failed else np.asarray(found)

@@ -260,9 +260,12 @@ class Reach:
             own = np.concatenate([weight[:, None] * G[rows], (_LIMIT * np.abs(over))[:, None] * G[limited]])
             z = _least_squares_in_box(own, e, low, high)
             new = y + G @ z
+            before = weight, over
             weight = np.where(seen & (side * (new[rows] - target) > _IN), self._beyond, weight)
             over = np.where(new[limited] > self._limits[1] + _IN, 1.0, over)
             over = np.where(new[limited] < self._limits[0] - _IN, -1.0, over)
+            if np.array_equal(weight, before[0]) and np.array_equal(over, before[1]):
+                break  # another pass is the same
         return z
 
     def _range(self, G: Array, u: Array, drive_bias: Array) -> tuple[Array, Array]:

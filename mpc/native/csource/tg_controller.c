@@ -370,17 +370,29 @@ void tg_set_prices(tg_controller *c)
     (void)k;
 }
 
-/* Between two samples what is planned is the mean of the two; the last sample of a plan stays. */
-double tg_planned(const tg_controller *c, int k, int j)
+/* How many whole samples ago a plan was made, and the share of one. */
+static int samples_ago(const tg_controller *c, double *share)
 {
-    const tg_design *s = c->design;
-    double samples = c->age_s / s->dt, whole = fmin(floor(samples + SAME), s->N - 1.0);
-    double share = fmin(samples - whole, 1.0);
-    int at = k + (int)whole, last = s->N - 1;
+    double samples = c->age_s / c->design->dt, whole = fmin(floor(samples + SAME), c->design->N - 1.0);
+    *share = fmin(samples - whole, 1.0);
+    return (int)whole;
+}
+
+/* Between two samples what is planned is the mean of the two; the last sample of a plan stays. */
+static double planned(const tg_controller *c, int at, double share, int j)
+{
+    int last = c->design->N - 1;
     double now = c->plan[(at < last ? at : last) * TG_NU + j];
     if (share <= SAME)
         return now;
     return (1.0 - share) * now + share * c->plan[(at + 1 < last ? at + 1 : last) * TG_NU + j];
+}
+
+double tg_planned(const tg_controller *c, int k, int j)
+{
+    double share;
+    int ago = samples_ago(c, &share);
+    return planned(c, k + ago, share, j);
 }
 
 /* What of the plan to apply until the next call: who is called late will be called late again, so it is the mean
@@ -405,12 +417,13 @@ static void open_plan(const tg_controller *c, double *drive)
 void tg_guess(const tg_controller *c, const double *last, double *guess)
 {
     const tg_design *s = c->design;
-    int k = 0;
+    double share;
+    int k = samples_ago(c, &share);
     for (int b = 0; b < s->n_b; b++, k += s->blocks[b - 1])
         for (int j = 0; j < TG_NU; j++) {
             double sum = 0.0;
             for (int at = 0; at < s->blocks[b]; at++)
-                sum += c->has_plan ? tg_planned(c, k + at, j) : 0.0;
+                sum += c->has_plan ? planned(c, k + at, share, j) : 0.0;
             guess[b * TG_NU + j] = c->has_plan ? sum / s->blocks[b] : last[j];
         }
 }

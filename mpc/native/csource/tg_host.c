@@ -130,7 +130,7 @@ int tg_host_qp(tg_controller *c, int n, int s, const double *H, const double *f,
     c->has_gains = c->laid_out = 0;
     memset(q->H, 0, sizeof q->H);
     for (int i = 0; i < n; i++)
-        memcpy(q->H + (size_t)i * (TG_Q_W + 1), H + (size_t)i * (size_t)(n + 1), (size_t)(n - i) * sizeof(double));
+        memcpy(q->H + (size_t)i * TG_Q_W, H + (size_t)i * (size_t)n, (size_t)(i + 1) * sizeof(double));
     memcpy(q->f, f, (size_t)n * sizeof(double));
     memcpy(q->lower, lower, (size_t)(2 * n + s) * sizeof(double));
     memcpy(q->upper, upper, (size_t)(2 * n + s) * sizeof(double));

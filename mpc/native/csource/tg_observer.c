@@ -543,7 +543,7 @@ static void nearest(const tg_controller *c, const double *G, const double *y, co
     double own[ROWS * TG_NU] = {0.0}, e[ROWS] = {0.0}, weight[ROWS] = {0.0}, over[ROWS] = {0.0};
     for (int r = 0; r < s->n_c; r++)
         weight[r] = c->unread_s[r] > 0.0 ? 0.0 : 1.0;
-    for (int pass = 0; pass < rows; pass++) {
+    for (int pass = 0, changed = 1; pass < rows && changed; pass++) {
         for (int r = 0; r < rows; r++) {
             int i = r < s->n_c ? s->controlled[r] : s->limited[r - s->n_c];
             double end = r < s->n_c ? c->target[r] : over[r] > 0.0 ? s->limit_high[r - s->n_c] : s->limit_low[r - s->n_c];
@@ -551,14 +551,16 @@ static void nearest(const tg_controller *c, const double *G, const double *y, co
             memcpy(own + r * TG_NU, G + i * TG_NU, TG_NU * sizeof(double));
         }
         squares_in_box(rows, weight, own, e, low, high, z);
+        changed = 0;
         for (int r = 0; r < rows; r++) {
             int i = r < s->n_c ? s->controlled[r] : s->limited[r - s->n_c];
-            double value = y[i];
+            double value = y[i], before = r < s->n_c ? weight[r] : over[r];
             for (int j = 0; j < TG_NU; j++)
                 value += G[i * TG_NU + j] * z[j];
             if (r < s->n_c) {
                 if (weight[r] > 0.0 && c->side[r] * (value - c->target[r]) > CAN)
                     weight[r] = sqrt(s->price * (FIRST + 1.0) / s->track); /* what 1 degC costs the optimiser */
+                changed = changed || weight[r] != before;
                 continue;
             }
             if (value > s->limit_high[r - s->n_c] + CAN)
@@ -566,6 +568,7 @@ static void nearest(const tg_controller *c, const double *G, const double *y, co
             if (value < s->limit_low[r - s->n_c] - CAN)
                 over[r] = -1.0;
             weight[r] = over[r] != 0.0 ? LIMIT : 0.0;
+            changed = changed || over[r] != before;
         }
     }
 }

@@ -33,12 +33,17 @@
 
 static int row_of(const tg_design *s, int r) { return r < s->n_c ? s->controlled[r] : s->limited[r - s->n_c]; }
 
-static double read_output(const tg_design *s, const double *x, int i)
+/* What all outputs read. */
+static void read_outputs(const tg_design *s, const double *x, const double *bias, double *y)
 {
-    double sum = s->y0[i];
-    for (int j = s->read_from[i]; j < s->read_to[i]; j++)
-        sum += s->C[i * TG_NX + j] * x[j];
-    return sum;
+    for (int i = 0; i < TG_NY; i++) {
+        const double *C = s->C + i * TG_NX;
+        int j = s->read_from[i], end = s->read_to[i];
+        double sum = s->y0[i] + bias[i] + C[j] * x[j]; /* most are of one state */
+        while (++j < end)
+            sum += C[j] * x[j];
+        y[i] = sum;
+    }
 }
 
 static const double *response(const tg_controller *c, int k, int r)
@@ -119,8 +124,7 @@ void tg_simulate(tg_controller *c, const double *start, const double *plan, cons
                 x = next;
                 next = swap;
             }
-            for (int i = 0; i < TG_NY; i++)
-                y[k * TG_NY + i] = read_output(s, x, i) + bias[i];
+            read_outputs(s, x, bias, y + k * TG_NY);
         }
     }
 }
@@ -131,6 +135,22 @@ static void add_row(double *restrict into, double share, const double *restrict 
     for (int g = 0; g < groups; g++)
         for (int i = 0; i < 4; i++)
             into[4 * g + i] += share * from[4 * TG_NX * g + i];
+}
+
+/* What output i shows of the columns that have begun, into a row; zeros behind. */
+static void read_row(const tg_design *s, int i, const double *now, int groups, double *restrict into, int filled)
+{
+    const double *C = s->C + i * TG_NX;
+    int j = s->read_from[i];
+    const double *restrict from = now + 4 * j;
+    const double share = C[j];
+    for (int g = 0; g < groups; g++)
+        for (int l = 0; l < 4; l++)
+            into[4 * g + l] = share * from[4 * TG_NX * g + l];
+    for (int l = 4 * groups; l < filled; l++)
+        into[l] = 0.0;
+    while (++j < s->read_to[i])
+        add_row(into, C[j], now + 4 * j, groups);
 }
 
 /* Drives of a block as directions of the groups of four columns that they are in. */
@@ -172,14 +192,10 @@ static void linearise(tg_controller *c, const double *start, const double *guess
                 now = then;
                 then = swap;
             }
-            for (int i = 0; i < TG_NY; i++)
-                c->y_guess[k * TG_NY + i] = read_output(s, x, i) + bias[i];
+            read_outputs(s, x, bias, c->y_guess + k * TG_NY);
             for (int r = 0; r < rows; r++) {
-                int i = row_of(s, r), place = k * rows + r;
-                double *into = c->G + c->qp.start[place];
-                memset(into, 0, (size_t)c->qp.filled[place] * sizeof(double));
-                for (int j = s->read_from[i]; j < s->read_to[i]; j++)
-                    add_row(into, s->C[i * TG_NX + j], now + 4 * j, groups);
+                int place = k * rows + r;
+                read_row(s, row_of(s, r), now, groups, c->G + c->qp.start[place], c->qp.filled[place]);
             }
         }
     }
@@ -200,14 +216,55 @@ static void find_authority(tg_controller *c)
     }
 }
 
-/* The target of controlled output r in sample k of the prediction. */
-static double goal(const tg_controller *c, const double *target, int k, int r)
+/* The targets of controlled output r in the prediction: the first one, and how far they are apart. */
+static const double *goals_of(const tg_controller *c, const double *target, int r, int *apart)
 {
+    *apart = c->design->n_c;
 #if TG_NR > 0
     if (c->ramps)
-        return c->path[k * c->design->n_c + r];
+        return c->path + r;
 #endif
-    return c->goals ? c->goals[k * c->design->n_c + r] : target[r];
+    if (c->goals)
+        return c->goals + r;
+    *apart = 0;
+    return target + r;
+}
+
+/* What values, TG_NY apart, cost that are less than low or more than high. */
+static double cost_beyond(const tg_design *s, const double *values, double low, double high)
+{
+    double cost = 0.0;
+    for (int k = 0; k < s->N; k++) {
+        double under = low - values[k * TG_NY], over = values[k * TG_NY] - high;
+        if (under > 0.0)
+            cost += FIRST * under + under * under;
+        if (over > 0.0)
+            cost += FIRST * over + over * over;
+    }
+    return cost;
+}
+
+/* What the errors of controlled output r cost. */
+static double cost_of(const tg_controller *c, const double *values, const double *goal, int apart, int r, double side)
+{
+    const tg_design *s = c->design;
+    double sum = 0.0, over = 0.0, last = 0.0;
+    if (s->zone[r] > 0.0) {
+        for (int k = 0; k < s->N; k++) {
+            double slack = fabs(values[k * TG_NY] - goal[k * apart]) - s->zone[r];
+            last = slack > 0.0 ? slack + slack * slack : 0.0;
+            sum += last;
+        }
+        return s->weight[r] * (s->track * sum + s->terminal * last);
+    }
+    for (int k = 0; k < s->N; k++) {
+        double error = values[k * TG_NY] - goal[k * apart], slack = side * error - s->overshoot;
+        last = error * error;
+        sum += last;
+        if (slack > 0.0 && side != 0.0)
+            over += FIRST * slack + slack * slack;
+    }
+    return s->weight[r] * (s->track * sum + s->terminal * last) + s->price * over;
 }
 
 /* The cost of a plan whose outputs y were simulated. */
@@ -215,7 +272,7 @@ static double merit(const tg_controller *c, const double *plan, const double *y,
                     const double *side, const double *last)
 {
     const tg_design *s = c->design;
-    double cost = 0.0, over = 0.0;
+    double cost = 0.0;
     for (int b = 0; b < s->n_b; b++)
         for (int j = 0; j < TG_NU; j++) {
             double value = plan[b * TG_NU + j], energy = s->energy[j] * c->dear[b];
@@ -224,32 +281,14 @@ static double merit(const tg_controller *c, const double *plan, const double *y,
             value /= s->span[j];
             cost += s->drive * value * value * s->blocks[b] + energy * value;
         }
-    for (int k = 0; k < s->N; k++) {
-        const double *row = y + k * TG_NY;
-        double weight = s->track + (k == s->N - 1 ? s->terminal : 0.0);
-        for (int r = 0; r < s->n_c; r++) {
-            double error = row[s->controlled[r]] - goal(c, target, k, r);
-            double slack = side[r] != 0.0 ? side[r] * error - s->overshoot : 0.0;
-            if (c->lost[r])
-                continue;
-            if (s->zone[r] > 0.0) {
-                slack = fmax(fabs(error) - s->zone[r], 0.0);
-                cost += s->weight[r] * weight * (slack + slack * slack);
-                continue;
-            }
-            cost += s->weight[r] * weight * error * error;
-            if (slack > 0.0)
-                over += FIRST * slack + slack * slack;
+    for (int r = 0, apart; r < s->n_c; r++)
+        if (!c->lost[r]) {
+            const double *goal = goals_of(c, target, r, &apart);
+            cost += cost_of(c, y + s->controlled[r], goal, apart, r, side[r]);
         }
-        for (int r = 0; r < s->n_l; r++) {
-            double value = row[s->limited[r]], low = s->limit_low[r] - value, high = value - s->limit_high[r];
-            if (low > 0.0)
-                cost += s->dear[r] * (FIRST * low + low * low);
-            if (high > 0.0)
-                cost += s->dear[r] * (FIRST * high + high * high);
-        }
-    }
-    return cost + s->price * over;
+    for (int r = 0; r < s->n_l; r++)
+        cost += s->dear[r] * cost_beyond(s, y + s->limited[r], s->limit_low[r], s->limit_high[r]);
+    return cost;
 }
 
 double tg_allowed_share(double end, double best, double span)
@@ -305,27 +344,34 @@ static void set_linear_cost(tg_controller *c, const double *target, const double
     memset(q->f, 0, sizeof q->f);
     for (int i = 0; i < q->n; i++)
         q->f[i] = s->energy[i % TG_NU] * c->dear[i / TG_NU];
-    for (int k = 0; k < s->N; k++)
-        for (int r = 0; r < s->n_c; r++) {
-            const double *g = response(c, k, r);
-            double error = weight_of(c, k, r) * (c->free[k * TG_NS + r] - goal(c, target, k, r));
-            tg_add_row(q->f, error, g, length(c, k));
+    for (int r = 0, apart, rows = s->n_c + s->n_l; r < s->n_c; r++) {
+        const double *goal = goals_of(c, target, r, &apart);
+        for (int k = 0; k < s->N; k += 4) {
+            const double *g = response(c, k, r), *free = c->free + k * rows + r;
+            double error[4] = {0.0};
+            int n = s->N - k < 4 ? s->N - k : 4, beside = rows * length(c, k);
+            for (int i = 0; i < n; i++)
+                error[i] = weight_of(c, k + i, r) * (goal[(k + i) * apart] - free[i * rows]);
+            if (n == 4)
+                tg_take_four(q->f, g, beside, error[0], error[1], error[2], error[3], length(c, k));
+            for (int i = 0; n < 4 && i < n; i++)
+                tg_add_row(q->f, -error[i], g + i * beside, length(c, k));
         }
+    }
     for (int j = 0; j < TG_NU; j++)
         q->f[j] -= 2.0 * c->caution * s->move * last[j] / s->span[j];
 }
 
-/* Add the squares of four rows, n numbers that end at a multiple of four, to the upper triangle of H. */
+/* Add the squares of four rows, n numbers that end at a multiple of four, to the lower triangle of H. */
 static void add_squares(double *restrict H, int n, const double *weight, const double *restrict g0,
                         const double *restrict g1, const double *restrict g2, const double *restrict g3)
 {
-    int end = TG_WHOLE(n);
     for (int i = 0; i < n; i++) {
         double *row = H + (size_t)i * TG_Q_W;
         const double s0 = weight[0] * g0[i], s1 = weight[1] * g1[i], s2 = weight[2] * g2[i], s3 = weight[3] * g3[i];
-        for (int j = i & ~3; j < end; j += 4)
+        for (int j = 0; j <= i; j += 4)
             for (int l = j; l < j + 4; l++)
-                row[l] += s0 * g0[l] + s1 * g1[l] + (s2 * g2[l] + s3 * g3[l]);
+                row[l] = row[l] + s0 * g0[l] + s1 * g1[l] + s2 * g2[l] + s3 * g3[l];
     }
 }
 
@@ -334,7 +380,8 @@ static void set_quadratic_cost(tg_controller *c)
     const tg_design *s = c->design;
     tg_qp *q = &c->qp;
     double weight_of_moves = c->caution * s->move;
-    memset(q->H, 0, (size_t)q->n * TG_Q_W * sizeof(double));
+    for (int i = 0; i < q->n; i++)
+        memset(q->H + (size_t)i * TG_Q_W, 0, (size_t)TG_WHOLE(i + 1) * sizeof(double));
     for (int k = 0; k < s->N; k += 4)
         for (int r = 0; r < s->n_c; r++) {
             double weight[4] = {0.0};
@@ -352,8 +399,8 @@ static void set_quadratic_cost(tg_controller *c)
             int i = b * TG_NU + j;
             double *row = q->H + (size_t)i * TG_Q_W;
             row[i] += 2.0 * (weight_of_moves * (b < s->n_b - 1 ? 2.0 : 1.0) + s->drive * s->blocks[b]);
-            if (b < s->n_b - 1)
-                row[i + TG_NU] -= 2.0 * weight_of_moves;
+            if (b)
+                row[i - TG_NU] -= 2.0 * weight_of_moves;
         }
 }
 
@@ -368,24 +415,27 @@ static void set_soft_rows(tg_controller *c, const double *target, const double *
 {
     const tg_design *s = c->design;
     tg_qp *q = &c->qp;
-    double *lower = q->lower + 2 * q->n, *upper = q->upper + 2 * q->n;
-    int i = 0, rows = s->n_c + s->n_l;
-    for (int k = 0; k < s->N; k++)
-        for (int r = 0; r < rows; r++, i++) {
-            double low = -NONE, high = NONE;
-            if (r >= s->n_c) {
-                low = s->limit_low[r - s->n_c];
-                high = s->limit_high[r - s->n_c];
-            } else if (s->zone[r] > 0.0) {
-                low = c->lost[r] ? low : goal(c, target, k, r) - s->zone[r];
-                high = c->lost[r] ? high : goal(c, target, k, r) + s->zone[r];
-            } else if (side[r] < 0.0)
-                low = goal(c, target, k, r) - s->overshoot;
-            else if (side[r] > 0.0)
-                high = goal(c, target, k, r) + s->overshoot;
-            lower[i] = low - c->free[k * TG_NS + r];
-            upper[i] = high - c->free[k * TG_NS + r];
+    int rows = s->n_c + s->n_l;
+    for (int r = 0, apart = 0; r < rows; r++) {
+        double *lower = q->lower + 2 * q->n + r, *upper = q->upper + 2 * q->n + r;
+        const double *goal = NULL, *free = c->free + r;
+        double low = -NONE, high = NONE;
+        if (r >= s->n_c) {
+            low = s->limit_low[r - s->n_c];
+            high = s->limit_high[r - s->n_c];
+        } else if (s->zone[r] > 0.0 ? !c->lost[r] : side[r] != 0.0) {
+            goal = goals_of(c, target, r, &apart);
+            if (s->zone[r] > 0.0 || side[r] < 0.0)
+                low = s->zone[r] > 0.0 ? -s->zone[r] : -s->overshoot;
+            if (s->zone[r] > 0.0 || side[r] > 0.0)
+                high = s->zone[r] > 0.0 ? s->zone[r] : s->overshoot;
         }
+        for (int k = 0; k < s->N; k++) {
+            double at = (goal ? goal[k * apart] : 0.0) - free[k * rows];
+            lower[k * rows] = low + at;
+            upper[k * rows] = high + at;
+        }
+    }
 }
 
 #if TG_NO > 0
@@ -398,14 +448,15 @@ static void free_by_state(tg_controller *c, const double *x, const double *drive
     int at = 0;
     for (int i = 0; i < s->n_b * TG_NU; i++)
         z[i] = drive_bias[i % TG_NU] / s->span[i % TG_NU];
+    tg_soft_values(&c->qp, z, c->free);
     for (int k = 0; k < s->N; k++)
         for (int r = 0; r < s->n_c + s->n_l; r++, at++) {
-            double sum = s->by_none[at] + bias[row_of(s, r)] + tg_product(response(c, k, r), z, length(c, k));
+            double sum = s->by_none[at] + bias[row_of(s, r)] + c->free[at];
             for (int j = 0; j < TG_NX; j++)
                 sum += s->by_x[at * TG_NX + j] * x[j];
             for (int j = 0; j < TG_ND; j++)
                 sum += s->by_d[at * TG_ND + j] * d[j];
-            c->free[k * TG_NS + r] = sum;
+            c->free[at] = sum;
         }
 }
 #else
@@ -416,10 +467,12 @@ static void free_by_gains(tg_controller *c, const double *guess)
     double z[TG_Q_W] = {0.0};
     for (int i = 0; i < s->n_b * TG_NU; i++)
         z[i] = guess[i] / s->span[i % TG_NU];
-    for (int k = 0; k < s->N; k++)
-        for (int r = 0; r < s->n_c + s->n_l; r++)
-            c->free[k * TG_NS + r] =
-                c->y_guess[k * TG_NY + row_of(s, r)] - tg_product(response(c, k, r), z, length(c, k));
+    tg_soft_values(&c->qp, z, c->free);
+    for (int r = 0, rows = s->n_c + s->n_l; r < rows; r++) {
+        const double *y = c->y_guess + row_of(s, r);
+        for (int k = 0; k < s->N; k++)
+            c->free[k * rows + r] = y[k * TG_NY] - c->free[k * rows + r];
+    }
 }
 #endif
 
@@ -430,9 +483,9 @@ static void follow_gains(const tg_controller *c, const double *plan, double *y)
     double z[TG_Q_W] = {0.0};
     for (int i = 0; i < s->n_b * TG_NU; i++)
         z[i] = plan[i] / s->span[i % TG_NU];
-    for (int k = 0; k < s->N; k++)
-        for (int r = 0; r < s->n_c + s->n_l; r++)
-            y[k * TG_NY + row_of(s, r)] = c->free[k * TG_NS + r] + tg_product(response(c, k, r), z, length(c, k));
+    for (int k = 0, at = 0; k < s->N; k++)
+        for (int r = 0; r < s->n_c + s->n_l; r++, at++)
+            y[k * TG_NY + row_of(s, r)] = c->free[at] + tg_product(response(c, k, r), z, length(c, k));
 }
 
 /* Keep a plan where it is the best so far. */
@@ -479,12 +532,15 @@ static void try_others(tg_controller *c, const double *x, const double *guess, c
 static void find_broken(tg_controller *c)
 {
     const tg_design *s = c->design;
-    c->broken = 0.0;
-    for (int k = 0; k < s->N; k++)
-        for (int r = 0; r < s->n_l; r++) {
+    double most = 0.0;
+    for (int r = 0; r < s->n_l; r++)
+        for (int k = 0; k < s->N; k++) {
             double value = c->y_best[k * TG_NY + s->limited[r]];
-            c->broken = fmax(c->broken, fmax(s->limit_low[r] - value, value - s->limit_high[r]));
+            double under = s->limit_low[r] - value, over = value - s->limit_high[r];
+            most = under > most ? under : most;
+            most = over > most ? over : most;
         }
+    c->broken = most;
 }
 
 static void set_prices(const tg_design *s, tg_qp *q)

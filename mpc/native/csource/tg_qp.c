@@ -1,18 +1,19 @@
 /* A dual active-set method for a small convex QP with hard and soft rows.
  *
- * With H = U'U, L = U' and m_i = L^-1 a_i the dual of the problem, for a set W of rows at their bounds with signs
+ * With H = UU' and m_i = U^-1 a_i the dual of the problem, for a set W of rows at their bounds with signs
  * s_i (+1 upper, -1 lower), is
  *
  *     maximise over lambda    - 1/2 lambda' K lambda + r' lambda,
- *     K_ij = s_i s_j m_i'm_j,     r_i = - s_i b_i - s_i m_i'c,     c = L^-1 f,
+ *     K_ij = s_i s_j m_i'm_j,     r_i = - s_i b_i - s_i m_i'c,     c = U^-1 f,
  *
- * with lambda >= 0.  A soft row with penalties w, q adds to it: up to lambda = w its bound holds; beyond, it is
+ * with lambda >= 0.  Rows that end at an entry have normals that end there: those of the first moves, which are at
+ * their bounds most of the time, are short.  A soft row with penalties w, q adds to it: up to lambda = w its bound holds; beyond, it is
  * broken by (lambda - w)/q, which adds 1/q to K_ii and w/q to r_i.  So the dual is concave, piecewise
  * quadratic, and a row is in one of four states: outside the set, hard, soft and kept, soft and broken.
  *
  * Start anywhere with lambda >= 0. Solve K lambda* = r (an LDL' factor of K, updated row by row); go toward
  * lambda* until the first multiplier reaches the end of its state, which then changes; repeat. Where all of
- * lambda* is reached, x = L'^-1 (-c - sum s_i m_i lambda_i) fulfils all rows in the set; take in the row that
+ * lambda* is reached, x = U'^-1 (-c - sum s_i m_i lambda_i) fulfils all rows in the set; take in the row that
  * is broken most, or be done.  Each move raises the dual, so that no set comes twice.  (D. Goldfarb, A. Idnani,
  * Mathematical Programming 27, 1983, is the method without soft rows.)
  *
@@ -57,26 +58,27 @@ static double *fit_row(tg_qp *q, int i) { return q->fit + (size_t)i * (size_t)(i
 
 void tg_qp_forget(tg_qp *q) { q->n_work = 0; }
 
-/* Whether none of n numbers is infinite or no number. */
+/* Whether none of n numbers, a multiple of four, is infinite or no number, nor their sum. */
 static int all_finite(const double *a, int n)
 {
-    int wrong = 0;
-    for (int i = 0; i < n; i++)
-        wrong |= !(fabs(a[i]) <= LARGEST);
-    return !wrong;
+    double sum[4] = {0.0};
+    for (int i = 0; i < n; i += 4)
+        for (int l = 0; l < 4; l++)
+            sum[l] += fabs(a[i + l]);
+    return (sum[0] + sum[1]) + (sum[2] + sum[3]) <= LARGEST;
 }
 
 static int problem_is_finite(const tg_qp *q)
 {
+    int last = q->s - 1; /* the rows of A are one behind the other */
     for (int i = 0; i < q->n && !q->kept; i++)
-        if (!all_finite(q->H + (size_t)i * TG_Q_W + (i & ~3), TG_WHOLE(q->n) - (i & ~3)))
+        if (!all_finite(q->H + (size_t)i * TG_Q_W, TG_WHOLE(i + 1)))
             return 0;
     for (int i = 0; i < 2 * q->n + q->s; i++)
         if (isnan(q->lower[i]) || isnan(q->upper[i]))
             return 0;
-    for (int i = 0; i < q->s && !q->kept; i++)
-        if (!all_finite(q->A + q->start[i], q->filled[i]))
-            return 0;
+    if (q->s && !q->kept && !all_finite(q->A, q->start[last] + q->filled[last]))
+        return 0;
     return all_finite(q->f, TG_WHOLE(q->n));
 }
 
@@ -106,14 +108,44 @@ static double dot(const double *a, const double *b, int n)
     return sum;
 }
 
-/* Take v times rows of four from a row, from entry `from` to n, both multiples of four. */
-static void take_four(double *restrict row, const double *restrict u, double v0, double v1, double v2, double v3,
-                      int from, int n)
+/* The products of a row with four rows of n numbers, a multiple of four. */
+static void four_products(const double *restrict m, const double *restrict r0, const double *restrict r1,
+                          const double *restrict r2, const double *restrict r3, int n, double *out)
 {
-    const double *u1 = u + TG_Q_W, *u2 = u1 + TG_Q_W, *u3 = u2 + TG_Q_W;
-    for (int j = from; j < n; j += 4)
+    double s0[4] = {0.0}, s1[4] = {0.0}, s2[4] = {0.0}, s3[4] = {0.0};
+    for (int j = 0; j < n; j += 4)
+        for (int l = 0; l < 4; l++) {
+            s0[l] += m[j + l] * r0[j + l];
+            s1[l] += m[j + l] * r1[j + l];
+            s2[l] += m[j + l] * r2[j + l];
+            s3[l] += m[j + l] * r3[j + l];
+        }
+    out[0] = (s0[0] + s0[1]) + (s0[2] + s0[3]);
+    out[1] = (s1[0] + s1[1]) + (s1[2] + s1[3]);
+    out[2] = (s2[0] + s2[1]) + (s2[2] + s2[3]);
+    out[3] = (s3[0] + s3[1]) + (s3[2] + s3[3]);
+}
+
+void tg_soft_values(const tg_qp *q, const double *x, double *values)
+{
+    const double *row = q->A;
+    for (int i = 0, end = 0, n; i < q->s;) {
+        for (n = q->filled[i]; end < q->s && q->filled[end] == n;)
+            end++;
+        for (; i + 4 <= end; i += 4, row += 4 * n)
+            four_products(x, row, row + n, row + 2 * n, row + 3 * n, n, values + i);
+        for (; i < end; i++, row += n)
+            values[i] = tg_product(row, x, n);
+    }
+}
+
+void tg_take_four(double *restrict row, const double *restrict u, int apart, double v0, double v1, double v2,
+                  double v3, int n)
+{
+    const double *u1 = u + apart, *u2 = u1 + apart, *u3 = u2 + apart;
+    for (int j = 0; j < n; j += 4)
         for (int l = j; l < j + 4; l++)
-            row[l] -= v0 * u[l] + v1 * u1[l] + (v2 * u2[l] + v3 * u3[l]);
+            row[l] -= v0 * u[l] + v1 * u1[l] + v2 * u2[l] + v3 * u3[l];
 }
 
 /* How much each hard row weighs beside the others: 1 over its length, unknowns in units of H_jj^-1/2. */
@@ -121,13 +153,14 @@ static int weigh_rows(tg_qp *q)
 {
     int n = q->n;
     for (int j = 0; j < n; j++) {
-        double diagonal = q->H[(size_t)j * (TG_Q_W + 1)], before = 0.0;
+        double diagonal = q->H[(size_t)j * (TG_Q_W + 1)];
         if (!(diagonal > 0.0))
             return 0;
-        q->weight[j] = sqrt(diagonal);
-        if (j >= q->stride)
-            before = 1.0 / (q->weight[j - q->stride] * q->weight[j - q->stride]);
-        q->weight[n + j] = 1.0 / sqrt(1.0 / diagonal + before);
+        q->weight[j] = q->weight[n + j] = sqrt(diagonal);
+        if (j >= q->stride) {
+            double before = q->H[(size_t)(j - q->stride) * (TG_Q_W + 1)];
+            q->weight[n + j] = sqrt(diagonal * (before / (diagonal + before)));
+        }
     }
     for (int i = 0; i < q->s; i++)
         q->weight[2 * n + i] = -1.0;
@@ -148,84 +181,80 @@ static double weight_of(tg_qp *q, int row)
     return q->weight[row];
 }
 
-/* Replace the upper triangle of H by U of H = U'U, row by row; its diagonal inverted aside. */
-static int factorise(tg_qp *q)
+/* Replace the lower triangle of n rows of a matrix by U' of UU', row by row from the last, on its diagonal what its own
+ * is the inverse of; 0 where a pivot is too small a share of the squares in weight (NULL: not above 0). */
+static int factorise(double *H, int n, const double *weight)
 {
-    int n = q->n, end = TG_WHOLE(n);
-    for (int i = 0; i < n; i++) {
-        double *row = q->H + (size_t)i * TG_Q_W, inverse;
-        int from = i & ~3, k = 0;
-        for (; k + 4 <= i; k += 4) {
-            const double *u = q->H + (size_t)k * TG_Q_W;
-            take_four(row, u, u[i], u[TG_Q_W + i], u[2 * TG_Q_W + i], u[3 * TG_Q_W + i], from, end);
+    for (int i = n - 1; i >= 0; i--) {
+        double *row = H + (size_t)i * TG_Q_W, inverse;
+        int end = TG_WHOLE(i + 1), k = n - 1;
+        for (; k > i && k % 4 != 3; k--) /* what they do to entries behind the diagonal does not count */
+            tg_add_row(row, -H[(size_t)k * TG_Q_W + (size_t)i], H + (size_t)k * TG_Q_W, end);
+        for (; k - 4 >= i; k -= 4) {
+            const double *u = H + (size_t)(k - 3) * TG_Q_W;
+            tg_take_four(row, u, TG_Q_W, u[i], u[TG_Q_W + i], u[2 * TG_Q_W + i], u[3 * TG_Q_W + i], end);
         }
-        for (; k < i; k++) /* below its diagonal row k is 0 */
-            tg_add_row(row + from, -q->H[(size_t)k * TG_Q_W + (size_t)i], q->H + (size_t)k * TG_Q_W + from, end - from);
-        if (!(row[i] > CONVEX * q->weight[i] * q->weight[i]))
+        for (; k > i; k--)
+            tg_add_row(row, -H[(size_t)k * TG_Q_W + (size_t)i], H + (size_t)k * TG_Q_W, end);
+        if (!(row[i] > (weight ? CONVEX * weight[i] * weight[i] : 0.0)))
             return 0;
         inverse = 1.0 / sqrt(row[i]);
-        for (int j = from; j < i; j++)
-            row[j] = 0.0;
-        for (int j = from; j < end; j += 4)
+        for (int j = 0; j < end; j += 4)
             for (int l = j; l < j + 4; l++)
                 row[l] *= inverse;
-        q->inverse[i] = inverse;
+        row[i] = inverse;
     }
     return 1;
 }
 
-/* Replace b by U'^-1 b, where b is 0 before entry `from` and behind entry n. */
-static void forward(const tg_qp *q, double *b, int from)
+/* Replace b by U^-1 b, U' as factorise leaves it; b is 0 behind entry n. */
+static void backward(const double *U, int n, double *b)
 {
-    int n = q->n, end = TG_WHOLE(n);
-    for (int i = from & ~3; i < n; i += 4) {
-        const double *u = q->H + (size_t)i * TG_Q_W, *inverse = q->inverse + i;
+    for (int i = (n - 1) & ~3; i >= 0; i -= 4) {
+        const double *u = U + (size_t)i * TG_Q_W, *u0 = u + i, *u1 = u0 + TG_Q_W, *u2 = u1 + TG_Q_W, *u3 = u2 + TG_Q_W;
         double *y = b + i;
         if (n - i < 4) {
-            for (int k = i; k < n; k++) {
-                b[k] *= q->inverse[k];
-                for (int j = k + 1; j < n; j++)
-                    b[j] -= q->H[(size_t)k * TG_Q_W + (size_t)j] * b[k];
+            for (int k = n - i - 1; k >= 0; k--) {
+                const double *row = u0 + (size_t)k * TG_Q_W;
+                y[k] *= row[k];
+                for (int j = 0; j < k; j++)
+                    y[j] -= row[j] * y[k];
+                tg_add_row(b, -y[k], row - i, i);
             }
         } else {
-            const double *u0 = u + i, *u1 = u0 + TG_Q_W, *u2 = u1 + TG_Q_W;
-            y[0] *= inverse[0];
-            y[1] = (y[1] - u0[1] * y[0]) * inverse[1];
-            y[2] = (y[2] - u0[2] * y[0] - u1[2] * y[1]) * inverse[2];
-            y[3] = (y[3] - u0[3] * y[0] - u1[3] * y[1] - u2[3] * y[2]) * inverse[3];
-            take_four(b, u, y[0], y[1], y[2], y[3], i + 4, end);
+            y[3] *= u3[3];
+            y[2] = (y[2] - u3[2] * y[3]) * u2[2];
+            y[1] = (y[1] - u3[1] * y[3] - u2[1] * y[2]) * u1[1];
+            y[0] = (y[0] - u3[0] * y[3] - u2[0] * y[2] - u1[0] * y[1]) * u0[0];
+            tg_take_four(b, u, TG_Q_W, y[0], y[1], y[2], y[3], i);
         }
     }
 }
 
-/* Replace b by U^-1 b; it is 0 behind entry n. */
-static void backward(const tg_qp *q, double *b)
+/* Replace b, n numbers and zeros behind, by U'^-1 b. */
+static void forward(const double *U, int n, double *b)
 {
-    int n = q->n, end = TG_WHOLE(n);
-    for (int i = (n - 1) & ~3; i >= 0; i -= 4) {
-        int last = n - i < 4 ? n : i + 4;
-        for (int k = last - 1; k >= i; k--) {
-            const double *row = q->H + (size_t)k * TG_Q_W;
-            double sum = b[k] - tg_product(row + i + 4, b + i + 4, end - i - 4);
-            for (int j = k + 1; j < last; j++)
-                sum -= row[j] * b[j];
-            b[k] = sum * q->inverse[k];
+    for (int i = 0; i < n; i += 4) {
+        const double *u = U + (size_t)i * TG_Q_W, *u0 = u + i, *u1 = u0 + TG_Q_W, *u2 = u1 + TG_Q_W, *u3 = u2 + TG_Q_W;
+        double *y = b + i, sum[4] = {0.0};
+        if (n - i < 4) {
+            for (int k = 0; k < n - i; k++) {
+                const double *row = u0 + (size_t)k * TG_Q_W;
+                y[k] -= tg_product(row - i, b, i);
+                for (int j = 0; j < k; j++)
+                    y[k] -= row[j] * y[j];
+                y[k] *= row[k];
+            }
+        } else {
+            if (i)
+                four_products(b, u, u + TG_Q_W, u + 2 * TG_Q_W, u + 3 * TG_Q_W, i, sum);
+            y[0] = (y[0] - sum[0]) * u0[0];
+            y[1] = (y[1] - sum[1] - u1[0] * y[0]) * u1[1];
+            y[2] = (y[2] - sum[2] - u2[0] * y[0] - u2[1] * y[1]) * u2[2];
+            y[3] = (y[3] - sum[3] - u3[0] * y[0] - u3[1] * y[1] - u3[2] * y[2]) * u3[3];
         }
     }
 }
-
-#if TG_LEAN
-/* Replace b by U'^-1 b of S = U'U; it is 0 behind entry n. */
-static void forward_root(const tg_qp *q, double *b)
-{
-    for (int i = 0; i < q->n; i++) {
-        const double *row = q->root + (size_t)i * TG_Q_W;
-        b[i] /= row[i];
-        for (int j = i + 1; j < q->n; j++)
-            b[j] -= row[j] * b[i];
-    }
-}
-#endif
 
 static double value_of(const tg_qp *q, int row)
 {
@@ -237,30 +266,24 @@ static double value_of(const tg_qp *q, int row)
     return tg_product(q->A + q->start[row - 2 * n], q->x, q->filled[row - 2 * n]);
 }
 
-/* Return before which entry, a multiple of four, it is 0. */
+/* Return behind how many entries, a multiple of four, it is 0. */
 static int make_normal(const tg_qp *q, int row, int side, double *m)
 {
-    int n = q->n, from = 0;
+    int n = q->n, last = row < n ? row : row - n;
     memset(m, 0, TG_Q_W * sizeof *m);
-    if (row < n) {
-        m[row] = side;
-        from = row;
-    } else if (row < 2 * n) {
-        int j = row - n;
-        m[j] = side;
-        from = j;
-        if (j >= q->stride) {
-            m[j - q->stride] = -side;
-            from = j - q->stride;
-        }
+    if (row < 2 * n) {
+        m[last] = side;
+        if (row >= n && last >= q->stride)
+            m[last - q->stride] = -side;
     } else {
         const double *a = q->A + q->start[row - 2 * n];
         int filled = q->filled[row - 2 * n] < n ? q->filled[row - 2 * n] : n;
         for (int j = 0; j < filled; j++)
             m[j] = side * a[j];
+        last = filled - 1;
     }
-    forward(q, m, from);
-    return from & ~3;
+    backward(q->H, last + 1, m);
+    return TG_WHOLE(last + 1);
 }
 
 /* The price of breaking a soft row. */
@@ -278,17 +301,34 @@ static void set_right(tg_qp *q, int i)
 {
     double bound = q->side[i] > 0 ? q->upper[q->row[i]] : -q->lower[q->row[i]];
     const double *m = q->normal + (size_t)i * TG_Q_W;
-    double sum = -bound - tg_product(m + q->from[i], q->c + q->from[i], TG_WHOLE(q->n) - q->from[i]);
+    double sum = -bound - tg_product(m, q->c, q->to[i]);
     q->right[i] = sum + (q->state[i] == 2 ? 1.0 / ratio_of(q, q->row[i]) : 0.0);
 }
 
 /* What of its multiplier row i of the set gives way by: the share that keeps K regular, and its price. */
 static void set_give(tg_qp *q, int i)
 {
-    const double *m = q->normal + (size_t)i * TG_Q_W + q->from[i];
-    q->give[i] = REGULAR * tg_product(m, m, TG_WHOLE(q->n) - q->from[i]);
+    const double *m = q->normal + (size_t)i * TG_Q_W;
+    q->give[i] = REGULAR * tg_product(m, m, q->to[i]);
     if (q->state[i] == 2)
         q->give[i] += 1.0 / (ratio_of(q, q->row[i]) * price_of(q, q->row[i]));
+}
+
+/* Replace b by L^-1 b, n numbers, L the factor's, whose diagonal is 1. */
+static void before_rows(tg_qp *q, double *b, int n)
+{
+    int k = 0;
+    for (; k + 4 <= n; k += 4) {
+        const double *r0 = fit_row(q, k), *r1 = r0 + k + 1, *r2 = r1 + k + 2, *r3 = r2 + k + 3;
+        double sum[4];
+        four_products(b, r0, r1, r2, r3, k, sum);
+        b[k] -= sum[0];
+        b[k + 1] -= sum[1] + r1[k] * b[k];
+        b[k + 2] -= sum[2] + r2[k] * b[k] + r2[k + 1] * b[k + 1];
+        b[k + 3] -= sum[3] + r3[k] * b[k] + r3[k + 1] * b[k + 1] + r3[k + 2] * b[k + 2];
+    }
+    for (; k < n; k++)
+        b[k] -= dot(fit_row(q, k), b, k);
 }
 
 #if TG_LEAN
@@ -296,10 +336,9 @@ static void set_give(tg_qp *q, int i)
 static void add_broken(tg_qp *q, int i, double share)
 {
     const double *m = q->normal + (size_t)i * TG_Q_W;
-    int n = TG_WHOLE(q->n);
-    for (int j = q->from[i]; j < q->n; j++)
+    for (int j = 0; j < q->to[i]; j++)
         if (m[j] != 0.0)
-            tg_add_row(q->soft + (size_t)j * TG_Q_W + (j & ~3), share * m[j], m + (j & ~3), n - (j & ~3));
+            tg_add_row(q->soft + (size_t)j * TG_Q_W, share * m[j], m, TG_WHOLE(j + 1));
 }
 
 static void append_fit(tg_qp *q, int i)
@@ -325,7 +364,7 @@ static void clear_fit(tg_qp *q)
     q->stale = 1;
 }
 
-/* Make U of S = U'U, and the factor of T; 0 where there is no room. */
+/* Make U of S = UU', and the factor of T; 0 where there is no room. */
 static int make_fit(tg_qp *q)
 {
     int n = q->n, end = TG_WHOLE(n);
@@ -339,26 +378,16 @@ static int make_fit(tg_qp *q)
     }
     q->stale = 0;
     memcpy(q->root, q->soft, (size_t)n * TG_Q_W * sizeof(double));
-    for (int i = 0; i < n; i++) {
-        double *row = q->root + (size_t)i * TG_Q_W, inverse;
-        for (int k = 0; k < i; k++) {
-            const double *u = q->root + (size_t)k * TG_Q_W;
-            if (u[i] != 0.0)
-                tg_add_row(row + (i & ~3), -u[i], u + (i & ~3), end - (i & ~3));
-        }
-        inverse = 1.0 / sqrt(row[i]); /* S is at least 1 */
-        for (int j = i & ~3; j < end; j++)
-            row[j] *= j < i ? 0.0 : inverse;
-    }
+    if (!factorise(q->root, n, NULL)) /* S is at least 1 */
+        return 0;
     for (int a = 0; a < q->n_other; a++) {
         double *seen = q->seen + (size_t)a * TG_Q_W, *row = fit_row(q, a), left;
         memcpy(seen, q->normal + (size_t)q->other[a] * TG_Q_W, TG_Q_W * sizeof *seen);
-        forward_root(q, seen);
+        backward(q->root, q->to[q->other[a]] < n ? q->to[q->other[a]] : n, seen);
         for (int b = 0; b < a; b++)
             row[b] = tg_product(seen, q->seen + (size_t)b * TG_Q_W, end);
         left = tg_product(seen, seen, end) + q->give[q->other[a]];
-        for (int b = 1; b < a; b++)
-            row[b] -= dot(fit_row(q, b), row, b);
+        before_rows(q, row, a);
         for (int b = 0; b < a; b++) {
             double scaled = row[b] / q->pivot[b];
             left -= scaled * row[b];
@@ -370,38 +399,20 @@ static int make_fit(tg_qp *q)
     return 1;
 }
 #else
-/* The products of a row with four rows that lie TG_Q_W apart, from an entry to n, both multiples of four. */
-static void four_products(const double *restrict m, const double *restrict rows, int from, int n, double *out)
-{
-    const double *r1 = rows + TG_Q_W, *r2 = r1 + TG_Q_W, *r3 = r2 + TG_Q_W;
-    double s0[4] = {0.0}, s1[4] = {0.0}, s2[4] = {0.0}, s3[4] = {0.0};
-    for (int j = from; j < n; j += 4)
-        for (int l = 0; l < 4; l++) {
-            s0[l] += m[j + l] * rows[j + l];
-            s1[l] += m[j + l] * r1[j + l];
-            s2[l] += m[j + l] * r2[j + l];
-            s3[l] += m[j + l] * r3[j + l];
-        }
-    out[0] = (s0[0] + s0[1]) + (s0[2] + s0[3]);
-    out[1] = (s1[0] + s1[1]) + (s1[2] + s1[3]);
-    out[2] = (s2[0] + s2[1]) + (s2[2] + s2[3]);
-    out[3] = (s3[0] + s3[1]) + (s3[2] + s3[3]);
-}
-
 /* Append the factor's row i, whose normal is in place. */
 static void append_fit(tg_qp *q, int i)
 {
     const double *m = q->normal + (size_t)i * TG_Q_W;
-    int n = TG_WHOLE(q->n);
-    double *row = fit_row(q, i), left = tg_product(m + q->from[i], m + q->from[i], n - q->from[i]) + q->give[i];
-    int k = 0;
+    int k = 0, n = q->to[i];
+    double *row = fit_row(q, i), left = tg_product(m, m, n) + q->give[i];
 
-    for (; k + 4 <= i; k += 4)
-        four_products(m, q->normal + (size_t)k * TG_Q_W, q->from[i], n, row + k);
+    for (; k + 4 <= i; k += 4) {
+        const double *by = q->normal + (size_t)k * TG_Q_W;
+        four_products(m, by, by + TG_Q_W, by + 2 * TG_Q_W, by + 3 * TG_Q_W, n, row + k);
+    }
     for (; k < i; k++)
-        row[k] = tg_product(m + q->from[i], q->normal + (size_t)k * TG_Q_W + q->from[i], n - q->from[i]);
-    for (k = 1; k < i; k++)
-        row[k] -= dot(fit_row(q, k), row, k);
+        row[k] = tg_product(m, q->normal + (size_t)k * TG_Q_W, n);
+    before_rows(q, row, i);
     for (k = 0; k < i; k++) {
         double scaled = row[k] / q->pivot[k];
         left -= scaled * row[k];
@@ -444,16 +455,16 @@ static void clear_fit(tg_qp *q) { q->stale = 0; }
 static int make_fit(tg_qp *q) { return !q->stale; }
 #endif
 
-static void move_entry(tg_qp *q, int from, int to)
+static void move_entry(tg_qp *q, int from, int into)
 {
-    q->give[to] = q->give[from];
-    memmove(q->normal + (size_t)to * TG_Q_W, q->normal + (size_t)from * TG_Q_W, TG_Q_W * sizeof(double));
-    q->row[to] = q->row[from];
-    q->from[to] = q->from[from];
-    q->side[to] = q->side[from];
-    q->state[to] = q->state[from];
-    q->multiplier[to] = q->multiplier[from];
-    q->right[to] = q->right[from];
+    q->give[into] = q->give[from];
+    memmove(q->normal + (size_t)into * TG_Q_W, q->normal + (size_t)from * TG_Q_W, TG_Q_W * sizeof(double));
+    q->row[into] = q->row[from];
+    q->to[into] = q->to[from];
+    q->side[into] = q->side[from];
+    q->state[into] = q->state[from];
+    q->multiplier[into] = q->multiplier[from];
+    q->right[into] = q->right[from];
 }
 
 /* Take entry r out of the set. */
@@ -473,7 +484,7 @@ static double most(const tg_qp *q, int i) { return q->state[i] == 1 ? price_of(q
 static void put(tg_qp *q, int row, int side, int state, double multiplier)
 {
     int i = q->n_work++;
-    q->from[i] = make_normal(q, row, side, q->normal + (size_t)i * TG_Q_W);
+    q->to[i] = make_normal(q, row, side, q->normal + (size_t)i * TG_Q_W);
     q->row[i] = row;
     q->side[i] = (signed char)side;
     q->state[i] = (signed char)state;
@@ -496,15 +507,13 @@ static void change(tg_qp *q, int r, int upward)
 }
 
 /* Replace b, n numbers, by the solution by the factor, whose own dimension that is. */
-static void solve_factor(const tg_qp *q, double *b, int n)
+static void solve_factor(tg_qp *q, double *b, int n)
 {
-    tg_qp *open = (tg_qp *)q; /* fit_row reads only */
-    for (int i = 1; i < n; i++)
-        b[i] -= dot(fit_row(open, i), b, i);
+    before_rows(q, b, n);
     for (int i = n - 1; i >= 0; i--)
         b[i] /= q->pivot[i];
     for (int i = n - 1; i >= 0; i--) {
-        const double *row = fit_row(open, i);
+        const double *row = fit_row(q, i);
         int whole = i & ~3;
         tg_add_row(b, -b[i], row, whole);
         for (int j = whole; j < i; j++)
@@ -514,14 +523,14 @@ static void solve_factor(const tg_qp *q, double *b, int n)
 
 /* Replace b by the solution of K z = b. */
 #if TG_LEAN
-static void solve_fit(const tg_qp *q, double *b)
+static void solve_fit(tg_qp *q, double *b)
 {
     double v[TG_Q_W] = {0.0}, z[TG_Q_K] = {0.0};
     int end = TG_WHOLE(q->n);
     for (int i = 0; i < q->n_work; i++)
         if (q->state[i] == 2)
-            tg_add_row(v, b[i] / q->give[i], q->normal + (size_t)i * TG_Q_W, end);
-    forward_root(q, v);
+            tg_add_row(v, b[i] / q->give[i], q->normal + (size_t)i * TG_Q_W, q->to[i]);
+    backward(q->root, q->n, v);
     for (int a = 0; a < q->n_other; a++)
         z[a] = b[q->other[a]] - tg_product(q->seen + (size_t)a * TG_Q_W, v, end);
     solve_factor(q, z, q->n_other);
@@ -529,32 +538,29 @@ static void solve_fit(const tg_qp *q, double *b)
         b[q->other[a]] = z[a];
         tg_add_row(v, z[a], q->seen + (size_t)a * TG_Q_W, end);
     }
-    for (int i = q->n - 1; i >= 0; i--) {
-        const double *row = q->root + (size_t)i * TG_Q_W;
-        for (int j = i + 1; j < q->n; j++)
-            v[i] -= row[j] * v[j];
-        v[i] /= row[i];
-    }
+    forward(q->root, q->n, v);
     for (int i = 0; i < q->n_work; i++)
         if (q->state[i] == 2)
-            b[i] = (b[i] - tg_product(q->normal + (size_t)i * TG_Q_W, v, end)) / q->give[i];
+            b[i] = (b[i] - tg_product(q->normal + (size_t)i * TG_Q_W, v, q->to[i])) / q->give[i];
 }
 #else
-static void solve_fit(const tg_qp *q, double *b) { solve_factor(q, b, q->n_work); }
+static void solve_fit(tg_qp *q, double *b) { solve_factor(q, b, q->n_work); }
 #endif
 
 static void make_x(tg_qp *q)
 {
-    int end = TG_WHOLE(q->n), i = 0;
+    int end = TG_WHOLE(q->n), to = 0, i = 0;
     for (int j = 0; j < end; j++)
         q->x[j] = -q->c[j];
+    for (int k = 0; k < q->n_work; k++)
+        to = q->to[k] > to ? q->to[k] : to;
     for (; i + 4 <= q->n_work; i += 4) {
         const double *by = q->multiplier + i;
-        take_four(q->x, q->normal + (size_t)i * TG_Q_W, by[0], by[1], by[2], by[3], 0, end);
+        tg_take_four(q->x, q->normal + (size_t)i * TG_Q_W, TG_Q_W, by[0], by[1], by[2], by[3], to);
     }
     for (; i < q->n_work; i++)
-        tg_add_row(q->x, -q->multiplier[i], q->normal + (size_t)i * TG_Q_W, end);
-    backward(q, q->x);
+        tg_add_row(q->x, -q->multiplier[i], q->normal + (size_t)i * TG_Q_W, q->to[i]);
+    forward(q->H, q->n, q->x);
 }
 
 /* Go toward the multipliers that fulfil the set; return -1 where they are reached, else who ended first. */
@@ -589,19 +595,19 @@ static int go(tg_qp *q, int *upward)
 /* Find the row that is broken most; 0 where none is. */
 static int worst(tg_qp *q, int *row, int *side)
 {
-    double most_broken = TOLERANCE;
-    int found = 0;
-    for (int i = 0; i < 2 * q->n + q->s; i++) {
-        double value, over, under;
-        if (q->in_set[i] || (q->upper[i] > FAR && q->lower[i] < -FAR))
+    double most_broken = TOLERANCE, *value = q->wanted;
+    int found = 0, n = q->n;
+    for (int j = 0; j < n; j++) {
+        value[j] = q->x[j];
+        value[n + j] = q->x[j] - (j >= q->stride ? q->x[j - q->stride] : 0.0);
+    }
+    tg_soft_values(q, q->x, value + 2 * n);
+    for (int i = 0; i < 2 * n + q->s; i++) {
+        double over = value[i] - q->upper[i], under = q->lower[i] - value[i];
+        if (!(over > 0.0 || under > 0.0) || q->in_set[i])
             continue;
-        value = value_of(q, i);
-        over = q->upper[i] > FAR ? 0.0 : value - q->upper[i];
-        under = q->lower[i] < -FAR ? 0.0 : q->lower[i] - value;
-        if (!(over > 0.0 || under > 0.0))
-            continue;
-        over *= weight_of(q, i);
-        under *= weight_of(q, i);
+        over = q->upper[i] > FAR ? 0.0 : over * weight_of(q, i);
+        under = q->lower[i] < -FAR ? 0.0 : under * weight_of(q, i);
         if (over > most_broken || under > most_broken) {
             *row = i;
             *side = over > under ? 1 : -1;
@@ -689,7 +695,7 @@ static int search(tg_qp *q)
                 held = refine(q);
             if (!held)
                 return failed(q, TG_QP_INFEASIBLE);
-            return all_finite(q->x, q->n) ? TG_QP_SOLVED : failed(q, TG_QP_NOT_FINITE);
+            return all_finite(q->x, TG_WHOLE(q->n)) ? TG_QP_SOLVED : failed(q, TG_QP_NOT_FINITE);
         }
         q->iterations++;
         put(q, row, side, row >= 2 * q->n ? 1 : 0, 0.0);
@@ -708,12 +714,12 @@ int tg_qp_solve(tg_qp *q)
     for (int i = 0; i < 2 * q->n; i++)
         if (q->lower[i] > q->upper[i])
             return failed(q, TG_QP_INFEASIBLE);
-    if (!q->kept && (!weigh_rows(q) || !factorise(q)))
+    if (!q->kept && (!weigh_rows(q) || !factorise(q->H, q->n, q->weight)))
         return failed(q, TG_QP_NOT_CONVEX);
     q->kept = 1;
     memset(q->c, 0, sizeof q->c);
     memcpy(q->c, q->f, (size_t)q->n * sizeof(double));
-    forward(q, q->c, 0);
+    backward(q->H, q->n, q->c);
     memset(q->in_set, 0, sizeof q->in_set);
     take_up(q, same);
     warm = q->n_work > 0;

@@ -38,10 +38,11 @@ enum tg_qp_status {
 typedef struct {
     /* the problem */
     int n, stride, s, per; /* per: soft rows in a sample */
-    double H[TG_Q_N * TG_Q_W]; /* upper triangle, rows of TG_Q_W; U of H = U'U afterwards */
+    double H[TG_Q_N * TG_Q_W]; /* lower triangle, rows of TG_Q_W; U' of H = UU' afterwards, its diagonal inverted */
     double f[TG_Q_W];
     double lower[TG_Q_M], upper[TG_Q_M]; /* beyond +-1e15: none */
-    const double *A; /* soft row i begins at start[i] and has filled[i] entries, zeros behind; a multiple of four */
+    const double *A; /* soft row i begins at start[i], where the one before ends, and has filled[i] entries, zeros
+                      * behind; a multiple of four, and no fewer than the row before */
     int start[TG_Q_S > 0 ? TG_Q_S : 1], filled[TG_Q_S > 0 ? TG_Q_S : 1];
     double price[TG_NS > 0 ? TG_NS : 1], at_end[TG_NS > 0 ? TG_NS : 1]; /* of a sample's soft rows; of the last one's */
     double ratio[TG_NS > 0 ? TG_NS : 1];
@@ -54,20 +55,20 @@ typedef struct {
     /* the working set, kept from one solve to the next; rows may depend on one another, so that
      * it can be longer than there are unknowns and soft rows */
     int n_work;
-    int row[TG_Q_M], from[TG_Q_M]; /* which, and before which entry its normal is 0 */
+    int row[TG_Q_M], to[TG_Q_M]; /* which, and behind how many entries its normal is 0 */
     signed char side[TG_Q_M];  /* +1 at the upper bound, -1 at the lower */
     signed char state[TG_Q_M]; /* 0 hard, 1 soft and kept, 2 soft and broken */
     double multiplier[TG_Q_M];
     /* room to work in */
-    double c[TG_Q_W], inverse[TG_Q_W]; /* L^-1 f, 1 / U_ii */
+    double c[TG_Q_W];                  /* U^-1 f */
     double weight[TG_Q_M];             /* of a soft row not before it is asked for, -1 */
-    double normal[TG_Q_M * TG_Q_W];    /* side * L^-1 a of each row in the set */
+    double normal[TG_Q_M * TG_Q_W];    /* side * U^-1 a of each row in the set */
     double fit[TG_Q_K * (TG_Q_K + 1) / 2], pivot[TG_Q_K]; /* LDL' of their products */
     double give[TG_Q_M];                   /* what of its multiplier a row in the set gives way by */
     double soft[TG_Q_L], root[TG_Q_L];     /* 1 and the products of the broken rows, and U of it */
-    double seen[TG_LEAN ? TG_Q_K * TG_Q_W : 1]; /* U'^-1 of the normals of the others, */
+    double seen[TG_LEAN ? TG_Q_K * TG_Q_W : 1]; /* U^-1 of the normals of the others, */
     int other[TG_Q_K], n_other, stale;     /* which those are, and whether all this is to be made anew */
-    double right[TG_Q_M], wanted[TG_Q_M];
+    double right[TG_Q_M], wanted[TG_Q_M]; /* wanted: of the rows in the set; at times a value of each row */
     signed char in_set[TG_Q_M];
 } tg_qp;
 
@@ -84,6 +85,12 @@ int tg_qp_solve(tg_qp *q);
 
 /* The product of two rows of n numbers, a multiple of four. */
 double tg_product(const double *a, const double *b, int n);
+
+/* Take v times four rows of n numbers, a multiple of four, that lie `apart` from each other, from a row. */
+void tg_take_four(double *into, const double *rows, int apart, double v0, double v1, double v2, double v3, int n);
+
+/* The values of all soft rows at x, which has zeros behind. */
+void tg_soft_values(const tg_qp *q, const double *x, double *values);
 
 /* Add a share of a row of n numbers, a multiple of four, to another one. */
 void tg_add_row(double *into, double share, const double *row, int n);
