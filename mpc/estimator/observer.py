@@ -383,7 +383,8 @@ class Observer:
     def reset_in_room(self, y: Array, d: Array) -> None:
         """Start as :meth:`reset`, with the plant linearised where all rests in the room: what the C does."""
         rest = self.rest_in_room()
-        x = rest.x + rest.by_level * (self._level(y, d) - self.ambient) + rest.by_d @ (d - self.ambient)
+        x = rest.x + rest.by_level * (self._level(y, d) - self.ambient)
+        x = x + rest.by_d @ (d - self.model.undisturbed(self.ambient))
         self._begin(x, rest.P, y)
 
     def _level(self, y: Array, d: Array) -> float:

@@ -263,9 +263,9 @@ def reachable(controller: Controller, span: tuple[float, float], rooms: Sequence
     design, model = controller.design, controller.model
     low, high = np.array([design.drive_range[name] for name in model.drives]).T
     missed, near = [], []
-    for room in rooms if model.n_d else rooms[:1]:
+    for room in rooms if model.rooms.any() else rooms[:1]:
         for target in span:
-            d = np.full(model.n_d, room)
+            d = model.undisturbed(room)
             found = holding_drive(model, design.controlled, np.full(len(design.controlled), target), d)
             outside = np.any(found.u < low - 1e-6) or np.any(found.u > high + 1e-6)
             text = f"{target:g} degC in a room of {room:g} degC"
@@ -284,9 +284,11 @@ def reachable(controller: Controller, span: tuple[float, float], rooms: Sequence
     if near:
         fix = "expect slow settling there, leave some drive in reserve"
         return Check(name, "warn", f"within 3 % of the drive's limit: {', '.join(near)}", fix)
-    return Check(
-        name, "pass", f"{span[0]:g} to {span[1]:g} degC in rooms of {', '.join(f'{r:g}' for r in rooms)} degC"
-    )
+    others = zip(model.disturbances, model.undisturbed(rooms[0]).tolist(), model.rooms, strict=True)
+    amid = [f"{name} of {d:.4g}" for name, d, room in others if not room]
+    if model.rooms.any() or not amid:
+        amid = [f"rooms of {', '.join(f'{r:g}' for r in rooms)} degC", *amid]
+    return Check(name, "pass", f"{span[0]:g} to {span[1]:g} degC in {', '.join(amid)}")
 
 
 def _known(model: PredictionModel) -> tuple[Array, Array]:
@@ -300,7 +302,7 @@ def _known(model: PredictionModel) -> tuple[Array, Array]:
 def gain_sign(controller: Controller) -> Check:
     """A Peltier element cools less beyond its optimum current: dT/du changes sign there."""
     design, model = controller.design, controller.model
-    name, d = "gain keeps its sign over the drive", np.full(controller.model.n_d, controller.design.ambient)
+    name, d = "gain keeps its sign over the drive", model.undisturbed(design.ambient)
     seen, bad = [], []
     for drive, (low, high) in design.drive_range.items():
         curve = steady_curve(model, drive, design.controlled[0], d)
@@ -373,7 +375,7 @@ def limits(controller: Controller, span: tuple[float, float]) -> Check:
     name = "soft limits agree with the targets"
     if not design.limits:
         return Check(name, "pass", "no limits of outputs")
-    d, broken = np.full(model.n_d, design.ambient), []
+    d, broken = model.undisturbed(design.ambient), []
     for target in span:
         held = holding_drive(model, design.controlled, np.full(len(design.controlled), target), d)
         for output, (low, high) in design.limits.items():
@@ -439,7 +441,7 @@ def detectable(controller: Controller) -> Check:
         fix = "set offset_free"
         return Check(name, "fail", "no disturbance states: the loop ends off its target", fix)
     chosen = choose_disturbances(model, controller.controlled, ambient=controller.design.ambient)
-    d = np.full(model.n_d, controller.design.ambient)
+    d = model.undisturbed(controller.design.ambient)
     scale = np.array([0.01 if label.startswith("input") else 1.0 for label in chosen.names])
     margins, (low, high) = [], _known(model)
     for share in (0.1, 0.3, 0.5, 0.7, 0.9):
