@@ -173,7 +173,7 @@ def review(
 ) -> int:
     """Check a controller's design.
 
-    Each check passes, warns or fails, and says the fix.
+    Each check passes, warns or fails, and says the fix; one that had nothing to try says so.
     """
     loaded = load_controller(controller, network)  # first: a design that cannot be is refused sooner
     from thermogrip.mpc.tuning.design_review import review as check
