@@ -6,16 +6,16 @@ The reactor is the van de Vusse CSTR of do-mpc's documentation ("CSTR": A to B t
 its numbers, bounds, horizon (20 samples of 18 s), start and uncertainties: alpha, on the activation energy of
 the side reaction, in .95, 1, 1.05, and beta, on the rate of the first, in .9, 1, 1.1.  B is to come to 0.6
 mol/l, the reactor is to stay below 140 degC, and all states are measured.  The truth below is the equations
-once more, by Runge-Kutta steps of half a second, with alpha and beta at the nine pairs' corners and middle, and
-drawn evenly in their ranges.
+once more, by Runge-Kutta steps of half a second, with alpha and beta at the corners and the middle of their
+ranges, and drawn evenly in them.
 
 * **do-mpc** as in its example, by its own package: one scenario, or nine that branch once.
 * **ours**: the equations as a user's class, do-mpc's weights in shares of the drives' ranges (one weight for
-  both drives, the geometric mean of the two), the limit of 140 degC hard, the filter with its biases; one
-  scenario, or nine that share the first move (``scenarios.py``).
+  both drives, the geometric mean of the two), the limit of 140 degC hard, five programs a sample at most, the
+  filter with its biases; one scenario, or nine that share the first move (``scenarios.py``).
 
-Figures: the most above 140 degC and for how long, when B stays within 1 % of 0.6 mol/l, the sum of do-mpc's own
-stage costs, B's offset in the last ten samples, and milliseconds a step, median and most (CPU).
+Figures: the most above 140 degC and for how long, when B stays within 1 % of 0.6 mol/l, the sum of do-mpc's
+own stage costs, B's offset in the last ten samples, and milliseconds a step, median and most (CPU).
 """
 
 from __future__ import annotations

@@ -71,6 +71,7 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "patience_s": (False, (), "how long a plan is followed without a solve [s]"),
     "ambient": (False, (), "room where none is measured [degC]"),
     "room": (True, (), "which measured disturbance is the room's temperature, -1: none"),
+    "warm": (True, ("NY",), "whether an output is one whose mean is the level at rest"),
     "usual_d": (False, ("ND",), "measured disturbances where none is read"),
     "least_d": (False, ("ND",), "what they may be"),
     "most_d": (False, ("ND",), ""),
@@ -256,7 +257,7 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
     rows = [model.outputs.index(name) for name in (*design.controlled, *design.limits)]
     limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2)
     same_names = (
-        (model, "sub dt span C spike coldest hottest least_d most_d"),
+        (model, "sub dt span C spike coldest hottest least_d most_d warm"),
         (design, "move_delay iterations blocks track terminal move drive price overshoot patience_s ambient"),
         (
             optimiser,

@@ -18,11 +18,11 @@ where the optimum is, and how far a block may go, as a share of the way there,
 
 (``docs/explanation/mpc.md`` says what that costs).  The bias of the drive that the observer has found is
 counted where the gain is evaluated, not in the share: it is a heat flow, and heat moves no optimum.  A
-drive that is no loop's and serves a limit is not held so, nor is any where a plan is improved until it stays.
-Where the QP's plan costs more than the guess in the nonlinear simulation, it is taken only part of the way.  And
-since the far side is a trap (there, heating seems to ask for still more cooling current), plain ramps that
-take the drive back, to none and to the other end, are looked at every fifth sample; so a drive does not stay
-at an end of its range either, where a black box answers nothing at all.
+drive that serves a limit and no loop is not held so, nor is any where a plan is improved until it stays.
+Where the QP's plan costs more than the guess in the nonlinear simulation, it is taken only part of the way.
+And since the far side is a trap (there, heating seems to ask for still more cooling current), plain ramps
+that take the drive back, to none and to the other end, are looked at every fifth sample; so a drive does not
+stay at an end of its range either, where a black box answers nothing at all.
 
 A soft row that is exceeded by s costs its price times (s / 5 + s^2).  **Zones** replace the squared error of
 an output by rows about its target, beyond which it costs that and its size, (s + s^2) for each sample's

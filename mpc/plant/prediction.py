@@ -122,9 +122,9 @@ class PredictionModel:
     model's steps in it.  A drive is between ``lowest`` and ``highest``, ``span`` wide, the unit in which
     drives are scaled, and ``neutral`` is no drive or what is nearest to none, all (n_u,).  A reading is
     between ``coldest`` and ``hottest``, and within ``spike`` (n_y,) of its prediction.  Drives ``on_off`` are
-    0 or 1, at rest 1.  Of the measured disturbances ``rooms`` (n_d,) are temperatures of the room; ``seen_d``
-    (n_d, 2) is what the logs showed, ``least_d`` to ``most_d`` what may be read, and a difference of less
-    than ``close_d`` is none.
+    0 or 1, at rest 1.  Outputs ``warm`` (n_y,) share a level at rest: the temperatures, or all.  Of the
+    measured disturbances ``rooms`` (n_d,) are temperatures of the room; ``seen_d`` (n_d, 2) is what the logs
+    showed, ``least_d`` to ``most_d`` what may be read, and a difference of less than ``close_d`` is none.
     """
 
     def __init__(self, plant: Plant, *, dt: float | None = None) -> None:
@@ -147,6 +147,8 @@ class PredictionModel:
         self.on_off = [j for j, name in enumerate(self.drives) if plant.units.get(name) == ON_OFF]
         self.neutral[self.on_off] = 1.0
         seen = np.array([plant.valid.get(name, (-np.inf, np.inf)) for name in self.outputs], dtype=float)
+        warm = np.array([plant.units.get(name, "degC") == "degC" for name in self.outputs])
+        self.warm: Mask = warm if warm.any() else ~warm
         self._seen, spread = seen, np.nan_to_num(seen[:, 1] - seen[:, 0], posinf=0.0)
         away = np.nan_to_num(seen + spread[:, None] * [-1.0, 1.0], posinf=0.0, neginf=0.0)
         self.spike = np.maximum(SPIKE, 0.1 * spread)

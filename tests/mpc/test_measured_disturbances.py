@@ -7,7 +7,7 @@ C; the truths are equations of their own.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -21,6 +21,7 @@ from thermogrip.mpc.controllers.fmu import Core
 from thermogrip.mpc.controllers.lqr import LQRController
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
+from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.design.spec import Spec, spec_from_dict
 from thermogrip.mpc.native.runtime import compiler
 from thermogrip.mpc.tuning.design_review import reachable
@@ -31,6 +32,7 @@ from thermogrip.rig.simulation.twin import Twin
 from thermogrip.sysid.export.linearise import operating_point
 from thermogrip.sysid.identification import identify
 from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.models.user_model import own_model
 from thermogrip.sysid.plant.plant import Plant
 
 needs_gcc = pytest.mark.skipif(compiler() is None, reason="no gcc here")
@@ -298,3 +300,69 @@ def test_a_loop_may_run_amid_another_value():
         Controller(plant, SUN.spec().design(plant)), plant, [(28.0, 3000.0)], start=24.0, surroundings=around
     )
     assert float(run.drive["heat"][-10:].mean()) == pytest.approx(SUN.held(28.0, 100.0), abs=1.0)
+
+
+# ---- outputs in several units ----
+
+
+class Tank:
+    """A heated tank with an inflow: its level in percent has nothing to do with its temperature."""
+
+    inputs: ClassVar[dict[str, Any]] = {
+        "inflow": {"unit": "l/min", "range": (1.0, 9.0)},
+        "heat": {"unit": "kW", "range": (0.0, 10.0)},
+    }
+    outputs: ClassVar[dict[str, Any]] = {"level": "percent", "t": "degC"}
+    states: ClassVar[dict[str, Any]] = {"level": 5.0, "t": 2.0}
+    parameters: ClassVar[dict[str, Any]] = {"out": 0.5}
+    dt = 2.0
+
+    def rhs(self, x: Any, u: Any, d: Any, p: Any) -> list[Any]:
+        """Return dx/dt of level and temperature."""
+        level = np.maximum(x.level, 1.0)
+        return [
+            0.01 * (10.0 * u.inflow - p.out * level * (1.0 + 0.001 * level)),
+            (14.3 * u.heat - u.inflow * (x.t - 15.0)) / level / 6.0,
+        ]
+
+
+def mixed(**changes: Any) -> Controller:
+    """Return a controller of the level."""
+    model = own_model(Tank)
+    valid = {"inflow": (1.0, 9.0), "heat": (0.0, 10.0), "level": (60.0, 98.0), "t": (15.0, 60.0)}
+    plant = Plant(model, {"out": 0.5}, dt=2.0, units=model.units, valid=valid, noise={"level": 0.1, "t": 0.1})
+    return Controller(plant, default_design(plant, controlled=("level",), dt=4.0, **changes))
+
+
+def test_only_temperatures_share_a_level_at_the_start():
+    controller = mixed()
+    assert controller.model.warm.tolist() == [False, True]
+    controller.reset({"level": 90.0, "t": 31.0})
+    # the mean of 60 is neither level nor temperature
+    assert controller.observer.x == pytest.approx([90.0, 31.0], abs=0.5)
+    assert controller.observer.found_offset == pytest.approx([0.0, 0.0], abs=0.5)
+
+
+@needs_gcc
+def test_nor_do_they_in_c():
+    controller = mixed()
+    c = InC(controller.plant, controller.design)
+    y, d = np.array([90.0, 31.0]), np.zeros(0)
+    controller.observer.reset_in_room(y, d)
+    c.c.reset(y, d)
+    np.testing.assert_allclose(c.c.view("x", (2,)), controller.observer.x, atol=1e-9)
+
+
+def test_a_drive_that_serves_a_limit_alone_is_not_held_to_its_gain_on_a_target():
+    controller = mixed(limits={"t": (10.0, 50.0)})
+    drives = list(controller.model.drives)
+    assert [loop.drive for loop in controller.design.loops] == ["inflow"]
+    seen = controller.optimiser.seen
+    assert seen[:, drives.index("inflow")].any()
+    assert not seen[:, drives.index("heat")].any()
+    # a plan that is improved until it stays is judged by its simulation alone
+    assert not mixed(limits={"t": (10.0, 50.0)}, iterations=3).optimiser.seen.any()
+    # without a limit to serve the gain is all that speaks for a drive
+    plain = mixed().optimiser
+    rest = np.abs(plain.at_rest)
+    np.testing.assert_array_equal(plain.seen, rest > 0.02 * rest.max(axis=0))

@@ -315,7 +315,7 @@ void tg_observer_reset(tg_controller *c, const double *y, const double *d)
     double level = 0.0;
     int known = 0;
     for (int i = 0; i < TG_NY; i++)
-        if (isfinite(y[i])) {
+        if (s->warm[i] && isfinite(y[i])) {
             level += y[i] - s->offset[i];
             known++;
         }
