@@ -202,6 +202,12 @@ def to_record_unit(values: NDArray[np.float64], unit: str) -> tuple[NDArray[np.f
     return values, unit
 
 
+def is_room_temperature(name: str, unit: str) -> bool:
+    """Tell whether a measured disturbance is the temperature of the surroundings: no other quantity, and not
+    that of what flows in."""
+    return unit == "degC" and not _INFLOW.search(name.lower())
+
+
 def guess_role(name: str, unit: str) -> str:
     """Return the role that a name and a unit suggest: input, disturbance, output or other."""
     return explain_role(name, unit)[0]

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from mismatch import CASES, TARGETS, asked, close_loop, draws, model_of
@@ -46,12 +47,14 @@ def program(one, sample):
 class ScenarioOptimiser(Optimiser):
     """The program of a design over several plants that share the first move."""
 
-    def __init__(self, plants, design):
+    def __init__(self, plants, design, *, own=False):
+        """With ``own`` each plant is linearised along its own plan of the sample before, not along the first
+        one's."""
         models = [prediction_model(plant, design.dt) for plant in plants]
         super().__init__(models[0], design)
         self.others = [Optimiser(model, design) for model in models[1:]]
         n, n_u, count = self.n_b * self.model.n_u, self.model.n_u, len(models)
-        self.places = []
+        self.places, self.own, self.kept = [], own, None
         for s in range(count):
             place = np.zeros((n, n_u + count * (n - n_u)))
             place[:n_u, :n_u] = np.eye(n_u)
@@ -67,7 +70,13 @@ class ScenarioOptimiser(Optimiser):
 
     def solve(self, sample):
         """Improve a plan."""
-        programs = [program(each, sample) for each in (self, *self.others)]
+        guesses = [sample.guess] * (1 + len(self.others))
+        if self.own and self.kept is not None:
+            begun, plans = self.kept
+            # the same sample once more, or the next one
+            guesses[1:] = plans if np.array_equal(begun, sample.x) else [self._later(plan) for plan in plans]
+        each = (self, *self.others)
+        programs = [program(one, sample._replace(guess=guess)) for one, guess in zip(each, guesses)]
         count = len(programs)
         H = sum(E.T @ p[0] @ E for E, p in zip(self.places, programs)) / count
         f = sum(E.T @ p[1] for E, p in zip(self.places, programs)) / count
@@ -75,15 +84,25 @@ class ScenarioOptimiser(Optimiser):
         answer = self.joint.solve(H, f, A, *(np.concatenate([p[k] for p in programs]) for k in (3, 4)))
         authority = self._authority(programs[0][6])[0]
         plan = (self.places[0] @ answer.x * np.tile(self.model.span, self.n_b)).reshape(self.n_b, -1)
+        unit = np.tile(self.model.span, self.n_b)
+        plans = [(E @ answer.x * unit).reshape(self.n_b, -1) for E in self.places[1:]]
+        self.kept = (sample.x, plans) if answer.solved else None
         if not answer.solved:
             return Outcome(plan, programs[0][5], answer.status, {}, answer.iterations, authority)
         y = self._simulate(sample.x, plan[None] + sample.drive_bias, sample.d)[0] + sample.bias
         return Outcome(plan, y, "solved", self._broken(y), answer.iterations, authority)
 
+    def _later(self, plan):
+        """Return a plan (n_b, n_u) a sample on."""
+        plan, ends = np.repeat(plan, self.blocks, axis=0), np.cumsum([0, *self.blocks])
+        plan = np.vstack([plan[1:], plan[-1:]])
+        return np.array([plan[a:b].mean(axis=0) for a, b in pairwise(ends)])
+
     def forget(self):
         """Start afresh."""
         super().forget()
         self.joint.forget()
+        self.kept = None
 
 
 def figures(controller, case, seed):

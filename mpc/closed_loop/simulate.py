@@ -53,6 +53,8 @@ class Surroundings:
     # outputs that drives have held at the start for long, drives that the controller is told; else all is as
     # warm
     held: tuple[str, ...] = ()
+    # measured disturbances by name; where absent, what the plant has where nobody reads them
+    disturbances: dict[str, float] = field(default_factory=dict)
 
     def noises_of(self, names: tuple[str, ...]) -> Array:
         """Return the standard deviation of a reading of each of these sensors (n,) [degC]."""
@@ -175,7 +177,8 @@ class Truth:
         self.dt = self.sub * native.dt
         if abs(self.dt - dt) > 1e-6 * dt:
             raise ValueError(f"the controller's {dt:g} s are not a multiple of the plant's {native.dt:g} s")
-        self.d = np.full(native.n_d, around.ambient)
+        d = dict(zip(native.disturbances, native.undisturbed(around.ambient).tolist(), strict=True))
+        self.d = np.array([around.disturbances.get(name, d[name]) for name in d], dtype=float)
         warmth = around.ambient if start is None else start
         self.x = native.rest(np.full(native.n_y, warmth), self.d)
         held: Array | None = None

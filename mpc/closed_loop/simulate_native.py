@@ -111,7 +111,7 @@ def _run_pi(
     readings were plausible."""
     model = controller.model
     d = np.array([begun[name] for name in model.disturbances])
-    if not ((d >= model.coldest) & (d <= model.hottest)).all():
+    if not ((d >= model.least_d) & (d <= model.most_d)).all():
         return False
     loops, held = _loops_at(controller, target, d)
     places = [ctypes.byref(part) for part in (loops, run.plant, run.around)]

@@ -83,10 +83,16 @@ class SampledController:
         value = number(reading, name)
         return value if self.model.coldest <= value <= self.model.hottest else float("nan")
 
+    def _measured(self, reading: Readings) -> Array:
+        """Return the measured disturbances (n_d,) of a reading, NaN where they cannot be."""
+        model = self.model
+        d = np.array([number(reading, name) for name in model.disturbances], dtype=float)
+        return np.where((model.least_d <= d) & (d <= model.most_d), d, np.nan)
+
     def _read(self, reading: Readings) -> tuple[Array, Array]:
         """Return the outputs (n_y,) and disturbances (n_d,) of a reading [degC], NaN where they cannot be."""
         y = np.array([self._clean(reading, name) for name in self.model.outputs])
-        return y, np.array([self._clean(reading, name) for name in self.model.disturbances])
+        return y, self._measured(reading)
 
     def _given(self, reading: Readings, target: Trajectory) -> tuple[Array, Array, Array, str]:
         """Return outputs, disturbances and targets in force [degC], and what is wrong; a stale reading is

@@ -251,7 +251,8 @@ class _Twin(Controller):
         if len(self._rests) < _RESTS:
             low, high = _range_of(self)
             y = rng.uniform(low, high) + 0.02 * (high - low) * rng.normal(size=self.model.n_y)
-            room = np.full(self.model.n_d, self.design.ambient) + rng.normal(size=self.model.n_d)
+            around = 2 * self.model.close_d * rng.normal(size=self.model.n_d)  # of a room 1 degC
+            room = self.model.undisturbed(self.design.ambient) + around
             self._rests += ((y, room, self.model.rest(y, room)),)
             return self._rests[-1]
         return self._rests[rng.integers(_RESTS)]
@@ -328,7 +329,7 @@ def _random_state(twin: _Twin, rng: np.random.Generator) -> _State:
     none = rng.random() < (0.5 if late else 0.05)  # late and without a plan, it is the PI's turn
     return _State(
         *(x, w, room, u, None if none else plan, plan, target, rng.choice([-1.0, 0.0, 1.0], n_c), y),
-        room + 0.1 * rng.normal(size=model.n_d),
+        room + 0.2 * model.close_d * rng.normal(size=model.n_d),
         wanted,
         late,
         rng.uniform(0.0, DAY) if design.tariff else np.nan,
@@ -427,6 +428,8 @@ def _readme(controller: Controller, sizes: design_struct.Sizes, ram: int, consta
     low, high = _range_of(controller)
     ranges = "; ".join(f"{markdown(name)} in [{a:g}, {b:g}]" for name, (a, b) in design.drive_range.items())
     n_d, controlled = max(1, model.n_d), design.controlled
+    d, units = model.undisturbed(design.ambient), model.plant.units
+    d_names = [f"{markdown(name)} [{units.get(name, 'degC')}]" for name in model.disturbances]
     return c_source("README.md.in").format(
         model=model,
         design=design,
@@ -438,8 +441,8 @@ def _readme(controller: Controller, sizes: design_struct.Sizes, ram: int, consta
         y_example=", ".join(["25.0"] * model.n_y),
         y_names=_listed(model.outputs),
         n_d_room=n_d,
-        d_example=", ".join([f"{design.ambient:.1f}"] * n_d),
-        d_names=_listed(model.disturbances) + " [degC]" if model.n_d else "none",
+        d_example=", ".join(f"{value:.1f}" for value in d) if model.n_d else f"{design.ambient:.1f}",
+        d_names=", ".join(d_names) or "none",
         n_c=len(controlled),
         c_names=_listed(controlled),
         c_example=", ".join(["35.0"] * len(controlled)),
@@ -455,7 +458,7 @@ def _readme(controller: Controller, sizes: design_struct.Sizes, ram: int, consta
 def _rest_error(controller: Controller, low: float, high: float) -> float:
     """Return by how much the state at rest is off that is linearised in the room, at most [degC]."""
     model, ambient = controller.model, controller.design.ambient
-    room = np.full(model.n_d, ambient)
+    room = model.undisturbed(ambient)
     observer = controller.design.observer(model)
     worst = 0.0
     for level in np.linspace(low, high, 5):

@@ -39,7 +39,8 @@ class Core:
     def __init__(self, controller: Exportable) -> None:
         self.controller, model = controller, controller.model
         usual = dict(zip(model.outputs, model.usual(controller.design.ambient).tolist(), strict=True))
-        self._readings = usual | dict.fromkeys(model.disturbances, controller.design.ambient)
+        d = model.undisturbed(controller.design.ambient).tolist()
+        self._readings = usual | dict(zip(model.disturbances, d, strict=True))
         self._targets = {TARGET + name: usual[name] for name in controller.controlled}
         self._answer = dict(zip(model.drives, model.neutral.tolist(), strict=True)) | {
             "pump": 1.0,

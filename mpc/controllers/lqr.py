@@ -134,7 +134,7 @@ class LQRController(SampledController):
         """Forget the past; the plant is at rest at this reading, its drive at zero or as the reading has
         it."""
         y, d = self._read(reading)
-        self._d = np.where(np.isfinite(d), d, self.design.ambient)
+        self._d = np.where(np.isfinite(d), d, self.model.undisturbed(self.design.ambient))
         self.observer.reset(y, self._d)
         self._forget()
         self._begin_positions()
@@ -203,7 +203,7 @@ class LQRController(SampledController):
         """Return the law about a target, worked out once for it, half a degree of room and what is lost."""
         lost = self._lost
         parked = tuple((drive, float(self._safe[drive])) for drive in self._parked(lost))
-        wanted, room = tuple(np.round(target, 2).tolist()), tuple((np.round(2 * self._d) / 2).tolist())
+        wanted, room = tuple(np.round(target, 2).tolist()), self.model.rounded_d(self._d)
         key = wanted + room + tuple(lost.tolist())
         if key not in self._laws:
             try:

@@ -144,7 +144,7 @@ class Controller(Shown, SampledController):
         self._ahead: Array | None = None  # targets of the samples that are predicted, where they change
         self._coming: Array | None = None  # (N, n_d) measured disturbances of those, NaN where not told
         self._ramped = np.full(len(design.controlled), np.nan)  # where targets are that may only ramp
-        self._start(np.full(self.model.n_y, np.nan), np.full(self.model.n_d, design.ambient))
+        self._start(np.full(self.model.n_y, np.nan), self.model.undisturbed(design.ambient))
 
     def _compile(self) -> None:
         if self.design.on_off:
@@ -360,7 +360,7 @@ class Controller(Shown, SampledController):
     # ---- one step, in order ----
 
     def _start(self, y: Array, d: Array) -> None:
-        self._d = np.where(np.isfinite(d), d, self.design.ambient)
+        self._d = np.where(np.isfinite(d), d, self.model.undisturbed(self.design.ambient))
         self.observer.reset(y, self._d)
         self.observer.expect_lags()
         self._forget()

@@ -110,7 +110,7 @@ class PIController(SampledController):
         # of each loop its drive and its controlled output, counted from 0
         self.ends = [(model.drives.index(p.drive), self.controlled.index(p.output)) for p in self.loops]
         self.integral, self._begun = np.zeros(len(self.loops)), np.full(len(self.controlled), np.nan)
-        self._room = np.full(model.n_d, np.nan)
+        self._room, self._usual_d = np.full(model.n_d, np.nan), model.undisturbed(ROOM)
         #: An MPC of the same plant and drives in C, in whose library trials of these loops can run.
         self.c: CompiledController | None = None
 
@@ -140,7 +140,7 @@ class PIController(SampledController):
         self._target = self._begun = y[self._rows]
         self._room = np.full(self.model.n_d, np.nan)
         if np.isfinite(self._target).all():  # what the feed-forward leaves of the drive that holds this
-            held = self._held(self._target, np.where(np.isfinite(room), room, ROOM))
+            held = self._held(self._target, np.where(np.isfinite(room), room, self._usual_d))
             rest = self._applied(reading, held)
             self.integral = np.array(
                 [rest[j] - p.feedforward * held[j] for p, (j, _) in zip(self.loops, self.ends)]
@@ -161,7 +161,7 @@ class PIController(SampledController):
         self._unread_s = np.where(usable, 0.0, self._unread_s + self.times.waited_s)
         status, advice = "fallback_plan", wrong or "reading lost: the drive is held"
         if usable.any():
-            d = np.where(np.isfinite(self._room), self._room, ROOM)
+            d = np.where(np.isfinite(self._room), self._room, self._usual_d)
             self._u = self.propose(y, wanted, d, seconds=self.times.slew_s)
             lost = [name for name, seen in zip(self.controlled, usable) if not seen]
             status, advice = "ok", wrong
@@ -230,7 +230,7 @@ class PIController(SampledController):
 
     def _held(self, target: Array, d: Array) -> Array:
         """Return the drives that hold the target; worked out once for a target and half a degree of room."""
-        wanted, room = tuple(np.round(target, 2).tolist()), tuple((np.round(2 * d) / 2).tolist())
+        wanted, room = tuple(np.round(target, 2).tolist()), self.model.rounded_d(d)
         return np.asarray(
             np.clip(held_drive(self.model, self.controlled, wanted, room), self.lowest, self.highest)
         )

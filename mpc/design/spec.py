@@ -116,6 +116,8 @@ class Spec(BaseModel):
     patience_s: NotNegative | None = None  # how long the model replaces a lost reading
     output: str | Annotated[list[str], Field(min_length=1)] | None = None  # what is regulated
     ambient_degC: Temperature = 25.0  # of the simulations' room
+    # a measured disturbance there, and where nobody reads it: the median of the logs, or the room's
+    disturbances: dict[str, Finite] | None = None
     noise_degC: Annotated[Deviation, Field(ge=0)] = 0.04  # of a reading there
     sensor_offset_degC: Deviation = 0.2  # by how much sensors are off there
     search_draws: Annotated[int, Field(ge=1, le=50)] = 2  # of the plant, in the search
@@ -210,8 +212,9 @@ class Spec(BaseModel):
             wanted[key] = float(f"{max(least, share * (above - below)):.2g}")
         wanted["settle_within_s"] = float(f"{np.clip(3 * max(times.values()), 7.5, 27000):.2g}")
         wanted["hold_s"] = float(f"{wanted['settle_within_s'] / 0.75:.2g}")
-        if plant.disturbances and plant.disturbances[0] in plant.valid:
-            room = float(np.mean(plant.valid[plant.disturbances[0]]))
+        rooms = [name for name in plant.disturbances if plant.is_room(name) and name in plant.valid]
+        if rooms:
+            room = float(np.mean(plant.valid[rooms[0]]))
             wanted["ambient_degC"] = round(min(max(room, -20.0), 150.0), 1)
         return cls(**wanted)
 
@@ -225,7 +228,12 @@ class Spec(BaseModel):
 
     def widened(self, plant: Plant) -> Plant:
         """Return the plant with the drives of the spec: those that it switches, and as wide as it has them
-        where only the logs showed how wide."""
+        where only the logs showed how wide; and with its measured disturbances."""
+        for name in self.disturbances or ():
+            if name not in plant.disturbances:
+                hint = known_names(name, plant.disturbances, "these are: {}")
+                raise UserError(f"disturbances: the plant has no measured disturbance {name}", hint=hint)
+        plant = replace(plant, nominal=plant.nominal | (self.disturbances or {}))
         plant = switching(plant, list(self.on_off or {}))
         ranges = dict(plant.valid)
         for name, (low, high) in _by_drive("drive_limits", self.drive_limits, graded_drives(plant)).items():
@@ -234,6 +242,19 @@ class Spec(BaseModel):
             if not of_unit:
                 ranges[name] = (min(low, least), max(high, most))
         return replace(plant, valid=ranges)
+
+    def surroundings_in_words(self, plant: Plant) -> str:
+        """Return what measured disturbances are taken for in the trials, and where nobody reads them; empty
+        where the room's temperature is the only one."""
+        plant, said = self.widened(plant), []
+        usual = plant.undisturbed(self.ambient_degC).tolist()
+        for name, value in zip(plant.disturbances, usual, strict=True):
+            whence = "the middle of the logs" if name in plant.valid else "the plant does not say what it was"
+            whence = "the logs' median" if name in plant.nominal else whence
+            whence = "the spec" if name in (self.disturbances or {}) else whence
+            if not plant.is_room(name) or whence == "the spec":
+                said.append(f"{name} is taken as {value if np.isfinite(value) else 0.0:.4g} ({whence})")
+        return "; ".join(said)
 
     def design(self, plant: Plant, **changes: Any) -> Design:
         """Return the plant's default design under this spec; a key that does not fit it is a UserError."""

@@ -88,7 +88,8 @@ and one Kalman update with the readings is the weighted least-squares answer for
 together.  A state that would leave its place by degrees within a sample is not accepted, whatever the sensors
 read: they are off.  What is left open between a state that moves and a sensor that is off is in the
 covariance, and the next readings decide.  A slow mode moves little wherever it is; what no reading shows of
-it stays within 10 degC of where the plant's own ``rest`` has it at the mean of the readings.
+it stays within 10 degC of where the plant's own ``rest`` has it at the mean of the readings; of outputs in
+several units the temperatures alone share a mean, others are as they read.
 
 For a nonlinear plant the update is repeated at its own answer (Gauss-Newton).
 """
@@ -132,17 +133,17 @@ class RestingState:
 
 
 def resting_state(
-    model: PredictionModel, x: Array, v: Array, level: float, d: Array, *, unit: Array
+    model: PredictionModel, x: Array, v: Array, y: Array, d: Array, *, unit: Array
 ) -> RestingState:
-    """Return where a plant at rest may be, linearised at state x (n_x,) and drive v (n_u,), for a mean
-    reading ``level`` [degC]; ``unit`` (n_x,) is what counts as 1 degC of each state. Shared: read it."""
-    at = (tuple(values.tolist()) for values in (x, v, d, unit))
-    return _resting_state(model, level, *at)
+    """Return where a plant at rest may be, linearised at state x (n_x,) and drive v (n_u,), for outputs y
+    (n_y,), temperatures all at the mean of their readings; ``unit`` (n_x,) is what counts as 1 degC of each
+    state. Shared: read it."""
+    return _resting_state(model, *(tuple(values.tolist()) for values in (x, v, y, d, unit)))
 
 
 @lru_cache(maxsize=256)  # trials of many designs begin at the same readings
-def _resting_state(model: PredictionModel, level: float, *at: tuple[float, ...]) -> RestingState:
-    x, v, d, unit = (np.array(values) for values in at)
+def _resting_state(model: PredictionModel, *at: tuple[float, ...]) -> RestingState:
+    x, v, y, d, unit = (np.array(values) for values in at)
     after, A, B, E = model.linearise(x, v, d)
     away = np.eye(model.n_x) - A
     push = after - A @ x + B @ (model.neutral - v)
@@ -154,7 +155,7 @@ def _resting_state(model: PredictionModel, level: float, *at: tuple[float, ...])
     P = np.linalg.inv(0.5 * (information + information.T))
 
     def own(step: float, change: Array) -> Array:
-        return model.rest(np.full(model.n_y, level + step), d + change)
+        return model.rest(np.where(model.warm, y + step, y), d + change)
 
     still = np.zeros(model.n_d)
     mean = P @ (weighted @ push + weak * own(0.0, still))
@@ -171,8 +172,10 @@ def resting_state_in_room(model: PredictionModel, ambient: float, unit: tuple[fl
     """Return :func:`resting_state` linearised where all rests in a room of ``ambient`` [degC], or amid what
     the logs showed."""
     x, v, d = model.at_rest(ambient)
-    level = float(np.mean(model.usual(ambient)))
-    rest = resting_state(model, x, v, level, d, unit=np.array(unit))
+    usual = model.usual(ambient)
+    level = float(np.mean(usual[model.warm]))
+    y = np.where(model.warm, level, usual)
+    rest = resting_state(model, x, v, y, d, unit=np.array(unit))
     return replace(rest, x=rest.x + (ambient - level) * rest.by_level)
 
 
@@ -377,9 +380,11 @@ class Observer:
     def reset(self, y: Array, d: Array) -> None:
         """Start at rest at reading y (n_y,), NaN where a sensor is lost; see the module's theory."""
         model, level = self.model, self._level(y, d)
-        x, v = model.rest(np.full(model.n_y, level), d), model.neutral
+        own = np.where(np.isfinite(y), y - self.offset, model.usual(self.ambient))
+        rests = np.where(model.warm, level, own)
+        x, v = model.rest(rests, d), model.neutral
         for _ in range(_REPEATS):
-            rest = resting_state(model, x, v, level, d, unit=self.unit)
+            rest = resting_state(model, x, v, rests, d, unit=self.unit)
             self._begin(rest.x, rest.P, y)
             moved = np.max(np.abs(self.x - x) / self.unit)
             x = self.x
@@ -390,11 +395,12 @@ class Observer:
     def reset_in_room(self, y: Array, d: Array) -> None:
         """Start as :meth:`reset`, with the plant linearised where all rests in the room: what the C does."""
         rest = self.rest_in_room()
-        x = rest.x + rest.by_level * (self._level(y, d) - self.ambient) + rest.by_d @ (d - self.ambient)
+        x = rest.x + rest.by_level * (self._level(y, d) - self.ambient)
+        x = x + rest.by_d @ (d - self.model.undisturbed(self.ambient))
         self._begin(x, rest.P, y)
 
     def _level(self, y: Array, d: Array) -> float:
-        known = np.isfinite(y)
+        known = np.isfinite(y) & self.model.warm
         return float(np.mean((y - self.offset)[known])) if known.any() else self.model.room(d)
 
     def rest_in_room(self) -> RestingState:

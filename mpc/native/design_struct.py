@@ -70,6 +70,11 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "overshoot": (False, (), "band beyond the target [degC]"),
     "patience_s": (False, (), "how long a plan is followed without a solve [s]"),
     "ambient": (False, (), "room where none is measured [degC]"),
+    "room": (True, (), "which measured disturbance is the room's temperature, -1: none"),
+    "warm": (True, ("NY",), "whether an output is one whose mean is the level at rest"),
+    "usual_d": (False, ("ND",), "measured disturbances where none is read"),
+    "least_d": (False, ("ND",), "what they may be"),
+    "most_d": (False, ("ND",), ""),
     "spike": (False, ("NY",), "off its prediction a reading is a loose plug, unless it stays [degC]"),
     "coldest": (False, (), "what a reading may be [degC]"),
     "hottest": (False, (), ""),
@@ -99,7 +104,7 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "Q_lasting": (False, ("NZ",), "the same while innovations stay on one side"),
     "P0": (False, ("NW",), "variance of the disturbance states at rest"),
     "R_start": (False, ("NY",), "variance of a reading at rest"),
-    "rest": (False, ("NX",), "state at rest where all is at `ambient`"),
+    "rest": (False, ("NX",), "state at rest where all is at `ambient` and `usual_d`"),
     "rest_level": (False, ("NX",), "how it answers to the mean of the readings"),
     "rest_d": (False, ("NX", "ND"), "and to the measured disturbances"),
     "settles": (True, (), "whether what follows says where a linear plant settles"),
@@ -252,7 +257,7 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
     rows = [model.outputs.index(name) for name in (*design.controlled, *design.limits)]
     limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2)
     same_names = (
-        (model, "sub dt span C spike coldest hottest"),
+        (model, "sub dt span C spike coldest hottest least_d most_d warm"),
         (design, "move_delay iterations blocks track terminal move drive price overshoot patience_s ambient"),
         (
             optimiser,
@@ -266,6 +271,8 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
         "N": sum(design.blocks),
         "n_c": len(design.controlled),
         "n_l": len(design.limits),
+        "room": int(np.argmax(model.rooms)) if model.rooms.any() else -1,
+        "usual_d": model.undisturbed(design.ambient),
         "n_loops": len(loops),
         "iteration_limit": ITERATION_LIMIT,
         "ramp": [design.ramp_per_s.get(name, 0.0) for name in design.controlled],

@@ -17,11 +17,12 @@ where the optimum is, and how far a block may go, as a share of the way there,
     share = max(17/20, min(e, 3 - 2 e)),     e = end of the range / optimum
 
 (``docs/explanation/mpc.md`` says what that costs).  The bias of the drive that the observer has found is
-counted where the gain is evaluated, not in the share: it is a heat flow, and heat moves no optimum.  Where
-the QP's plan costs more than the guess in the nonlinear simulation, it is taken only part of the way.  And
-since the far side is a trap (there, heating seems to ask for still more cooling current), plain ramps that
-take the drive back, to none and to the other end, are looked at every fifth sample; so a drive does not stay
-at an end of its range either, where a black box answers nothing at all.
+counted where the gain is evaluated, not in the share: it is a heat flow, and heat moves no optimum.  A
+drive that serves a limit and no loop is not held so, nor is any where a plan is improved until it stays.
+Where the QP's plan costs more than the guess in the nonlinear simulation, it is taken only part of the way.
+And since the far side is a trap (there, heating seems to ask for still more cooling current), plain ramps
+that take the drive back, to none and to the other end, are looked at every fifth sample; so a drive does not
+stay at an end of its range either, where a black box answers nothing at all.
 
 A soft row that is exceeded by s costs its price times (s / 5 + s^2).  **Zones** replace the squared error of
 an output by rows about its target, beyond which it costs that and its size, (s + s^2) for each sample's
@@ -148,6 +149,11 @@ class Optimiser:
         self.pair = self._pairs()
         self.settled_gain = self._settled_gain()
         self.seen = np.abs(self.at_rest) > 0.02 * np.max(np.abs(self.at_rest), axis=0)
+        # of a drive that is no loop's and serves a limit, what it does to a target may fade or turn over; and
+        # a plan that is improved until it stays is judged by its simulation, wherever a gain changes its sign
+        paired = {loop.drive for loop in design.loops}
+        guarded = [name in paired or not (paired and design.limits) for name in model.drives]
+        self.seen &= np.array(guarded) & (design.iterations == 1)
         self._per_rest = np.where(self.seen, self.at_rest, 1.0)
         # price of a unit beyond each soft row, of each controlled output and each limit
         dear = [_DEAR if name in design.hard else 1.0 for name in design.limits]

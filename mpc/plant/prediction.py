@@ -41,7 +41,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
-from thermogrip.datasets.arrays import Array, Values
+from thermogrip.datasets.arrays import Array, Mask, Values
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.mpc.plant.along_plan import AlongPlan, SampleDerivatives
 
@@ -101,6 +101,9 @@ ROOM = 25.0
 PLAUSIBLE = (-60.0, 200.0)
 #: A reading so far from the prediction is a loose plug, unless it stays [degC]; of a wide range, a tenth.
 SPIKE = 6.0
+# of a disturbance that is no temperature, in ranges of the logs: how far outside none is, what is no change
+_FAR, _CLOSE = 10.0, 0.02
+_ANY = 1e30
 _NEAR = 5.0  # degC from what the logs showed, where a black box still knows what it does
 
 
@@ -119,7 +122,9 @@ class PredictionModel:
     model's steps in it.  A drive is between ``lowest`` and ``highest``, ``span`` wide, the unit in which
     drives are scaled, and ``neutral`` is no drive or what is nearest to none, all (n_u,).  A reading is
     between ``coldest`` and ``hottest``, and within ``spike`` (n_y,) of its prediction.  Drives ``on_off`` are
-    0 or 1, at rest 1.
+    0 or 1, at rest 1.  Outputs ``warm`` (n_y,) share a level at rest: the temperatures, or all.  Of the
+    measured disturbances ``rooms`` (n_d,) are temperatures of the room; ``seen_d`` (n_d, 2) is what the logs
+    showed, ``least_d`` to ``most_d`` what may be read, and a difference of less than ``close_d`` is none.
     """
 
     def __init__(self, plant: Plant, *, dt: float | None = None) -> None:
@@ -133,6 +138,7 @@ class PredictionModel:
         self.disturbances, self.outputs = tuple(self.model.disturbances), tuple(self.model.outputs)
         self.n_x, self.n_u, self.n_y = int(self.model.n_x), len(self.drives), len(self.outputs)
         self.n_d = len(self.disturbances)
+        self.rooms: Mask = np.array([plant.is_room(name) for name in self.disturbances], dtype=bool)
         self.drive_index = [self.model.inputs.index(name) for name in self.drives]
         ranges = np.array([drive_range(plant, name) for name in self.drives])
         self.lowest, self.highest = ranges[:, 0], ranges[:, 1]
@@ -141,11 +147,21 @@ class PredictionModel:
         self.on_off = [j for j, name in enumerate(self.drives) if plant.units.get(name) == ON_OFF]
         self.neutral[self.on_off] = 1.0
         seen = np.array([plant.valid.get(name, (-np.inf, np.inf)) for name in self.outputs], dtype=float)
+        warm = np.array([plant.units.get(name, "degC") == "degC" for name in self.outputs])
+        self.warm: Mask = warm if warm.any() else ~warm
         self._seen, spread = seen, np.nan_to_num(seen[:, 1] - seen[:, 0], posinf=0.0)
         away = np.nan_to_num(seen + spread[:, None] * [-1.0, 1.0], posinf=0.0, neginf=0.0)
         self.spike = np.maximum(SPIKE, 0.1 * spread)
         self.coldest = min(PLAUSIBLE[0], float(away[:, 0].min()))
         self.hottest = max(PLAUSIBLE[1], float(away[:, 1].max()))
+        seen = np.array([plant.valid.get(name, (0.0, 0.0)) for name in self.disturbances], dtype=float)
+        self.seen_d = seen.reshape(-1, 2)
+        low, high = self.seen_d.T
+        far = np.where(high > low, _FAR * (high - low), _ANY)
+        self.least_d = np.where(self.rooms, self.coldest, low - far)
+        self.most_d = np.where(self.rooms, self.hottest, high + far)
+        some = np.where(high > low, high - low, np.maximum(1.0, np.abs(high)))
+        self.close_d = np.where(self.rooms, 0.5, _CLOSE * some)
         wanted = sample_time(plant) if dt is None else float(dt)
         self.sub = max(1, round(wanted / plant.dt))
         self.dt = self.sub * plant.dt
@@ -157,7 +173,7 @@ class PredictionModel:
         implicit network is as good for control at four times its own step, and a controller's time goes into
         these."""
         own = self.sub
-        d = np.full(self.n_d, ROOM)
+        d = self.undisturbed(ROOM)
         x = self.rest(self.usual(ROOM), d)[None, :]
         plan = np.repeat(np.stack([self.highest, self.lowest]), 30, axis=0)[None]
         exact, _ = self.run(x, plan, d)
@@ -184,12 +200,17 @@ class PredictionModel:
     def at_rest(self, ambient: float) -> tuple[Array, Array, Array]:
         """Return state, drives and disturbances where all is at rest in a room of this temperature [degC];
         where no log was there, amid what the logs showed."""
-        d, y, v = np.full(self.n_d, ambient), self.usual(ambient), self.neutral
+        d, y, v = self.undisturbed(ambient), self.usual(ambient), self.neutral
         if np.any(y != ambient):
             logs = [self.plant.valid.get(name, (rest, rest)) for name, rest in zip(self.drives, v)]
             v = np.clip(np.mean(np.array(logs, dtype=float), axis=1), self.lowest, self.highest)
         x = self.model.rest(y, self.inputs(v), d, self.p)
         return np.asarray(x, dtype=np.float64), v, d
+
+    def undisturbed(self, ambient: float) -> Array:
+        """Return the measured disturbances (n_d,) where nobody reads them, in a room of this temperature
+        [degC]; what is no temperature and of which the plant says nothing is 0."""
+        return np.nan_to_num(self.plant.undisturbed(ambient))
 
     def usual(self, ambient: float) -> Array:
         """Return outputs (n_y,) that are as warm as the room [degC], or the middle of what the logs showed of
@@ -374,9 +395,15 @@ class PredictionModel:
         return self.output(self.steady_state(u, d))
 
     def room(self, d: ArrayLike) -> float:
-        """Return the room's temperature [degC] as the measured disturbances give it, 25 where they do not."""
-        d = np.asarray(d, float).reshape(-1)
-        return float(d[0]) if d.size and np.isfinite(d[0]) else ROOM
+        """Return the room's temperature [degC] as the first measured disturbance that is one gives it, 25
+        where it does not."""
+        known = np.asarray(d, float).reshape(-1)[self.rooms][:1]
+        return float(known[0]) if np.isfinite(known).any() else ROOM
+
+    def rounded_d(self, d: Array) -> tuple[float, ...]:
+        """Return measured disturbances (n_d,) to the step within which what holds a target is the same."""
+        steps: list[float] = (np.round(d / self.close_d) * self.close_d).tolist()
+        return tuple(steps)
 
 
 def _symbols(model: PredictionModel, prefix: str = "") -> list[Any]:

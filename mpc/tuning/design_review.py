@@ -30,15 +30,18 @@ from thermogrip.datasets.limits import LARGEST
 from thermogrip.mpc.closed_loop.simulate import simulate_closed_loop
 from thermogrip.mpc.controllers.linear_equivalent import LinearLaw, linear_law, linear_move
 from thermogrip.mpc.controllers.mpc import Controller
-from thermogrip.mpc.design.spec import Spec, spec_from_dict
+from thermogrip.mpc.design.spec import Asked, Spec, spec_from_dict
 from thermogrip.mpc.estimator.observer import choose_disturbances, detectability_margin
 from thermogrip.mpc.native.design_struct import ITERATION_LIMIT
 from thermogrip.mpc.optimiser.rti import Optimiser
 from thermogrip.mpc.plant.prediction import PredictionModel, holding_drive, steady_curve, step_response
-from thermogrip.mpc.tuning.objective import STRUCTURE, draws_of, lacking, run_trials
+from thermogrip.mpc.tuning.objective import STRUCTURE, StepResult, draws_of, lacking, run_trials
 from thermogrip.sysid.models.model import BlackBox
 
+#: The verdict of a check that had nothing to try: it neither passes nor warns.
+NOT_TRIED = "not tried"
 _RANK = {"pass": 0, "warn": 1, "fail": 2}
+_FAR_BEYOND = 3.0  # times the overshoot or the offset that is asked
 _KELVIN = 273.15
 _SLOW = 0.9995  # an eigenvalue beyond which a loop hardly settles
 _IDLE = 1e-4  # relative change of the move below which a doubled weight does nothing
@@ -53,7 +56,7 @@ class Check:
     ----------
     name : str
     verdict : str
-        ``"pass"``, ``"warn"`` or ``"fail"``.
+        ``"pass"``, ``"warn"`` or ``"fail"``; ``"not tried"`` where there was nothing to try.
     finding : str
         With numbers.
     fix : str
@@ -79,7 +82,7 @@ def _graded(
 def worst(checks: Sequence[Check]) -> str:
     """Return the worst verdict of a review."""
     rank: Callable[[str], int] = _RANK.__getitem__
-    return max((check.verdict for check in checks), key=rank, default="pass")
+    return max((check.verdict for check in checks if check.verdict in _RANK), key=rank, default="pass")
 
 
 def review(
@@ -153,7 +156,8 @@ def _steps(controller: Controller) -> tuple[list[float], list[float]]:
 
 
 def lacks_structure(controller: Controller, swing: tuple[float, float]) -> Check:
-    """A plant may have what its model lacks: the spec's first step, with each of that in turn."""
+    """A plant may have what its model lacks: the spec's first step, with each of that in turn, must settle
+    without more overshoot and offset than the spec allows."""
     name, plant = "settles where the model lacks structure", controller.plant
     noted = controller.notes.get("spec")
     spec = (
@@ -165,18 +169,36 @@ def lacks_structure(controller: Controller, swing: tuple[float, float]) -> Check
     tried = lacking(plant, spec, controller.controlled)
     numbers = [STRUCTURE * at + draws_of(plant, 1)[0] for at in range(1, len(tried) + 1)]
     found = run_trials(Controller(plant, controller.design), plant, spec, numbers)
-    times = [f"{r.settle_s:.0f} s" if np.isfinite(r.settle_s) else "never" for r in found]
-    asked = [spec.asked(r.output) for r in found]
-    late = [of.pace_s and not r.settle_s <= of.pace_s for of, r in zip(asked, found, strict=True)]
-    seen = [
-        f"{tried[r.draw // STRUCTURE - 1][0]}: {f'{r.output} ' if r.output else ''}{time}"
-        f"{f' (asked {of.pace_s:g} s)' if slow else ''}, overshoot {r.overshoot:.2f}"
-        for of, slow, time, r in zip(asked, late, times, found, strict=True)
-    ]
+    if not tried:
+        return Check(name, NOT_TRIED, "the spec's extra_lag, extra_delay and lost_gain are 0")
+    (start, target), words = spec.steps[0], [tried[r.draw // STRUCTURE - 1][0] for r in found]
+    seen, beyond = zip(*(_lacked(r, spec.asked(r.output), of) for of, r in zip(words, found, strict=True)))
     move = controller.design.move
     fix = f"raise the move weight (now {move:.3g}), or identify on a log of the closed loop and tune again"
-    slow = "never" in times or any(late)
-    return _graded(name, "; ".join(seen) or "nothing is tried", warn=(slow, fix))
+    finding = f"{start:g} to {target:g} degC, each alone: {'; '.join(seen)}"
+    # of defaults that nobody asked for it is a warning
+    failed = isinstance(noted, Mapping) and max(beyond) > _FAR_BEYOND
+    return _graded(name, finding, fail=(failed, fix), warn=(max(beyond) > 1, fix))
+
+
+def _lacked(result: StepResult, asked: Asked, what: str) -> tuple[str, float]:
+    """Return what a step did on a plant that has what its model lacks, in words, and how many times as much
+    as was asked: of overshoot, or of offset; just more than once where it is late or never settles."""
+    settled = bool(np.isfinite(result.settle_s))
+    late = not settled or bool(asked.pace_s and result.settle_s > asked.pace_s)
+    over, off = result.overshoot / asked.overshoot_degC, abs(result.bias) / asked.bias_degC
+    # one that settled is inside its band, one that never does swings, or stands outside of it
+    beyond = min(off, _FAR_BEYOND) if settled else abs(result.bias) / asked.band_degC
+    name = f"{result.output} " if result.output else ""
+    parts = [
+        f"settles in {result.settle_s:.0f} s" if settled else "never settles",
+        f"overshoot {result.overshoot:.2f}",
+        f"offset {result.bias:.2f}",
+    ]
+    gone = (late and asked.pace_s > 0, over > 1, off > 1)
+    limits = (asked.pace_s, asked.overshoot_degC, asked.bias_degC)
+    said = [part + f" (asked {most:g})" * broken for part, broken, most in zip(parts, gone, limits)]
+    return f"{what}: {name}{', '.join(said)}", max(over, beyond, 1.01 if late else 0.0)
 
 
 class _Counted(Controller):
@@ -263,9 +285,9 @@ def reachable(controller: Controller, span: tuple[float, float], rooms: Sequence
     design, model = controller.design, controller.model
     low, high = np.array([design.drive_range[name] for name in model.drives]).T
     missed, near = [], []
-    for room in rooms if model.n_d else rooms[:1]:
+    for room in rooms if model.rooms.any() else rooms[:1]:
         for target in span:
-            d = np.full(model.n_d, room)
+            d = model.undisturbed(room)
             found = holding_drive(model, design.controlled, np.full(len(design.controlled), target), d)
             outside = np.any(found.u < low - 1e-6) or np.any(found.u > high + 1e-6)
             text = f"{target:g} degC in a room of {room:g} degC"
@@ -284,9 +306,11 @@ def reachable(controller: Controller, span: tuple[float, float], rooms: Sequence
     if near:
         fix = "expect slow settling there, leave some drive in reserve"
         return Check(name, "warn", f"within 3 % of the drive's limit: {', '.join(near)}", fix)
-    return Check(
-        name, "pass", f"{span[0]:g} to {span[1]:g} degC in rooms of {', '.join(f'{r:g}' for r in rooms)} degC"
-    )
+    others = zip(model.disturbances, model.undisturbed(rooms[0]).tolist(), model.rooms, strict=True)
+    amid = [f"{name} of {d:.4g}" for name, d, room in others if not room]
+    if model.rooms.any() or not amid:
+        amid = [f"rooms of {', '.join(f'{r:g}' for r in rooms)} degC", *amid]
+    return Check(name, "pass", f"{span[0]:g} to {span[1]:g} degC in {', '.join(amid)}")
 
 
 def _known(model: PredictionModel) -> tuple[Array, Array]:
@@ -300,7 +324,7 @@ def _known(model: PredictionModel) -> tuple[Array, Array]:
 def gain_sign(controller: Controller) -> Check:
     """A Peltier element cools less beyond its optimum current: dT/du changes sign there."""
     design, model = controller.design, controller.model
-    name, d = "gain keeps its sign over the drive", np.full(controller.model.n_d, controller.design.ambient)
+    name, d = "gain keeps its sign over the drive", model.undisturbed(design.ambient)
     seen, bad = [], []
     for drive, (low, high) in design.drive_range.items():
         curve = steady_curve(model, drive, design.controlled[0], d)
@@ -373,7 +397,7 @@ def limits(controller: Controller, span: tuple[float, float]) -> Check:
     name = "soft limits agree with the targets"
     if not design.limits:
         return Check(name, "pass", "no limits of outputs")
-    d, broken = np.full(model.n_d, design.ambient), []
+    d, broken = model.undisturbed(design.ambient), []
     for target in span:
         held = holding_drive(model, design.controlled, np.full(len(design.controlled), target), d)
         for output, (low, high) in design.limits.items():
@@ -439,7 +463,7 @@ def detectable(controller: Controller) -> Check:
         fix = "set offset_free"
         return Check(name, "fail", "no disturbance states: the loop ends off its target", fix)
     chosen = choose_disturbances(model, controller.controlled, ambient=controller.design.ambient)
-    d = np.full(model.n_d, controller.design.ambient)
+    d = model.undisturbed(controller.design.ambient)
     scale = np.array([0.01 if label.startswith("input") else 1.0 for label in chosen.names])
     margins, (low, high) = [], _known(model)
     for share in (0.1, 0.3, 0.5, 0.7, 0.9):

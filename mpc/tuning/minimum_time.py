@@ -60,7 +60,7 @@ class _Race:
         # what the sensors would read, so that all chase the same temperature
         offset = plant.offsets.get(output, 0.0) + spec.sensor_offset_degC
         self.goal = self.side * (step[1] - offset) - spec.asked(output).band_degC
-        self.d = np.full(model.n_d, spec.ambient_degC)
+        self.d = model.undisturbed(spec.ambient_degC)
         self.x, held = held_start(model, tuple(design.controlled), step[0], tuple(self.d.tolist()))
         self.low, self.high = np.array([design.drive_range[name] for name in model.drives]).T
         self.slew = np.array([design.slew_per_s[name] for name in model.drives]) * design.dt

@@ -33,7 +33,7 @@ only ramp is in the band no sooner than its ramp brings it there, which is the b
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -102,6 +102,7 @@ _OVERSHOOT, _BIAS, _ERROR = 3.0, 0.5, 0.5
 FREE = 0.9
 #: In which an MPC is tried where its trials run in C: one noise alone moves a score by a tenth.
 NOISES = 3
+_SENSOR_OFF = 0.02  # of what the logs showed, a sensor of a disturbance that is no temperature of the room
 
 
 @lru_cache(maxsize=16)
@@ -145,21 +146,24 @@ def drawn(plant: Plant, draw: int) -> Plant:
 def surroundings_of(
     spec: Spec,
     controlled: Sequence[str],
-    disturbances: Sequence[str],
-    shown: Mapping[str, float] | None = None,
+    plant: Plant,
 ) -> Surroundings:
-    """Return the room and the sensors of the trials: the controlled ones are off, and the room's are;
-    ``shown`` is the noise that the logs have by output, of which their quantum is a part."""
-    known = {name: sd for name, sd in (shown or {}).items() if np.isfinite(sd)}
+    """Return the room and the sensors of the trials: the controlled ones are off, the room's are, and those
+    of other disturbances by a share of what the logs showed; noise is that of the logs by output, of which
+    their quantum is a part."""
+    known = {name: sd for name, sd in plant.scores.reading_sd.items() if np.isfinite(sd)}
     stated = "noise_degC" in spec.model_fields_set
     offset = dict.fromkeys(controlled, spec.sensor_offset_degC)
-    offset |= dict.fromkeys(disturbances, 1.5 * spec.sensor_offset_degC)
+    others = [name for name in plant.disturbances if not plant.is_room(name)]
+    for name in plant.disturbances:
+        low, high = plant.valid.get(name, (0.0, 0.0))
+        offset[name] = _SENSOR_OFF * (high - low) if name in others else 1.5 * spec.sensor_offset_degC
     room = spec.ambient_degC
     return Surroundings(
         ambient=room,
         noise=spec.noise_degC,
         noises={} if stated else known,
-        quanta=dict.fromkeys(known, 0.0),
+        quanta=dict.fromkeys([*known, *others], 0.0),
         offset=offset,
         held=tuple(controlled),
     )
@@ -182,8 +186,7 @@ def trial(
     """Run a step (start, target) [degC] of the spec on one draw of the plant for so many seconds, wholly in C
     where the controller is in C."""
     structure, draw = divmod(draw, STRUCTURE)
-    shown = plant.scores.reading_sd
-    around = surroundings_of(spec, controller.controlled, plant.disturbances, shown)
+    around = surroundings_of(spec, controller.controlled, plant)
     if structure:
         around = replace(around, **lacking(plant, spec, controller.controlled)[structure - 1][1])
     truth, schedule = drawn(plant, draw), [(step[1], length_s)]

@@ -232,7 +232,7 @@ class RigFilter:
         """Start at a time [s] at readings y (n_y,) and disturbances d (n_d,), NaN where there is none."""
         plant = self.model.plant
         usual = float(np.nanmean(y)) if np.isfinite(y).any() else 25.0
-        self.d = np.where(np.isfinite(d), d, usual)
+        self.d = np.where(np.isfinite(d), d, np.nan_to_num(plant.undisturbed(usual)))
         rest = np.where(np.isfinite(y), y - self.model.offsets, usual)
         self.at_rest = self._agree(y)
         if not self.at_rest:  # outputs that disagree are at no rest: the reference says how warm it is

@@ -90,7 +90,7 @@ class Twin:
     ambient : float, optional
         Room temperature [degC].
     disturbances : dict of str to float, optional
-        Values of measured disturbances other than the room's temperature.
+        Values of measured disturbances; by default the plant's own, of the room's temperature ``ambient``.
     t_start : float, optional
         Temperature of everything at the start [degC]; default ambient.
     noise : float, optional
@@ -186,7 +186,8 @@ class Twin:
         if self._newest is None or self._newest.time_s != self.time:
             true = self.truth()
             values = {name: self._sensor(name, value) for name, value in true.items()}
-            values |= {name: round(float(v), 1) for name, v in zip(self.plant.disturbances, self._d)}
+            known = dict(zip(self.plant.disturbances, self._d.tolist(), strict=True))
+            values |= {name: round(known[name], 1) for name in room_disturbances(self.plant)}
             self._newest = Reading(self.time, values, dict(self._drive), self._pump)
         return Reading(self.time, self._newest.values, dict(self._drive), self._pump)
 
@@ -272,13 +273,13 @@ class Twin:
         )
 
     def _disturbance_vector(self, given: Mapping[str, float]) -> Array:
-        """Return the disturbances in the plant's order: the room's temperature, or as given."""
-        rooms = room_disturbances(self.plant)
-        for name in self.plant.disturbances:
-            if name not in given and name not in rooms:
-                problem = f"the plant has the disturbance {name!r}"
+        """Return the disturbances in the plant's order: as given, or where nobody reads them."""
+        usual = dict(zip(self.plant.disturbances, self.plant.undisturbed(self.ambient).tolist(), strict=True))
+        for name, value in usual.items():
+            if name not in given and np.isnan(value):
+                problem = f"the plant does not say what its disturbance {name!r} was in the logs"
                 raise UserError(problem, hint=f"give it: disturbances={{{name!r}: ..}}")
-        return np.array([given.get(name, self.ambient) for name in self.plant.disturbances], dtype=float)
+        return np.array([given.get(name, value) for name, value in usual.items()], dtype=float)
 
     def _accumulate(self, seconds: float) -> None:
         self._applied += seconds * self._input_vector()

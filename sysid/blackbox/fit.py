@@ -301,7 +301,7 @@ def _plant(grid: Grid, choice: Choice, logs: Sequence[Log]) -> Plant:
         held_out_rmse={name: float(v) for name, v in zip(grid.outputs, rmse)},
         held_out_by_part={name: part.tolist() for name, part in zip(grid.outputs, choice.rmse.T)},
     )
-    return Plant(
+    plant = Plant(
         choice.model,
         {},
         dt=grid.dt,
@@ -315,3 +315,5 @@ def _plant(grid: Grid, choice: Choice, logs: Sequence[Log]) -> Plant:
         inputs_end_at_row=grid.ends,
         offset_memory=prior.memory,
     )
+    d = np.concatenate([segment.d for segment in grid.segments])
+    return plant.with_medians(dict(zip(grid.disturbances, d.T)))

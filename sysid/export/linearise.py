@@ -182,7 +182,8 @@ def operating_point(
             hint = known_names(name, plant.inputs + plant.disturbances, "its inputs and disturbances are {}")
             raise UserError(f"the plant has no {name} there", hint=hint)
     u = [given_u.get(name, 1.0 if name in plant.model.switches else 0.0) for name in plant.inputs]
-    d = [given_d.get(name, _usual(plant, name)) for name in plant.disturbances]
+    usual = np.nan_to_num(plant.undisturbed(ROOM)).tolist()
+    d = [given_d.get(name, value) for name, value in zip(plant.disturbances, usual)]
     return np.array(u, dtype=float), np.array(d, dtype=float)
 
 
@@ -191,12 +192,6 @@ def state_labels(plant: Plant) -> tuple[str, ...]:
     if not isinstance(plant.model, GreyModel):
         return tuple(f"x{k + 1}" for k in range(plant.model.n_x))
     return tuple(name.replace(".", "_") for name in plant.model.states)
-
-
-def _usual(plant: Plant, name: str) -> float:
-    if plant.units.get(name, "degC") == "degC":
-        return ROOM
-    return float(np.mean(plant.valid.get(name, (0.0, 0.0))))
 
 
 def _output(plant: Plant, x: Array) -> Array:

@@ -259,6 +259,7 @@ def fit_network(
         starts=wanted,
     )
     valid = {name: (float(np.nanmin(values)), float(np.nanmax(values))) for name, values in seen.items()}
+    plant = plant.with_medians({name: seen[name] for name in model.disturbances})
     report(1.0, "fitted")
     return replace(plant, valid=valid, fitted_to=fit_record.fit_logs(logs), scores=scores)
 

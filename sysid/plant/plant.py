@@ -68,6 +68,9 @@ class Plant(Shown, plant_data.PlantData):
         The output that defines the temperature scale; it has no offset.
     valid : dict of str to (float, float), optional
         Range of each signal in the logs of the fit.
+    nominal : dict of str to float, optional
+        What a measured disturbance is where nobody reads it; of a fit the median of its logs, but for the
+        room's temperature.
     logs : tuple of str, optional
         Names of the logs of the fit.
     scores : PlantScores, optional

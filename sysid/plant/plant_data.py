@@ -33,6 +33,7 @@ from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.atomic_files import atomic_path, read_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import LARGEST, MOST_NUMBER, STEP_RANGE, array_within, number_within
+from thermogrip.datasets.units import is_room_temperature
 from thermogrip.sysid.models.model import Model
 from thermogrip.sysid.plant.fit_record import FitLog, PlantScores
 
@@ -56,6 +57,7 @@ class PlantData:
     nuisance: dict[str, float] = field(default_factory=dict)
     reference: str | None = None
     valid: dict[str, tuple[float, float]] = field(default_factory=dict)
+    nominal: dict[str, float] = field(default_factory=dict)
     logs: tuple[str, ...] = ()
     scores: PlantScores = field(default_factory=PlantScores)
     verdict: str = ""
@@ -95,6 +97,27 @@ class PlantData:
     def disturbances(self) -> tuple[str, ...]:
         """Names of the measured disturbances."""
         return self.model.disturbances
+
+    def is_room(self, name: str) -> bool:
+        """Tell whether a measured disturbance is the temperature of the room."""
+        return is_room_temperature(name, self.units.get(name, "degC"))
+
+    def undisturbed(self, ambient: float) -> Array:
+        """Return the measured disturbances (n_d,) where nobody reads them: ``nominal``, else ``ambient``
+        [degC] for the room's temperature and the middle of the logs for another; NaN where none of these is
+        known of what is no temperature."""
+        found = []
+        for name in self.disturbances:
+            temperature = self.units.get(name, "degC") == "degC"
+            otherwise = float(np.mean(self.valid.get(name, (ambient if temperature else np.nan,) * 2)))
+            found.append(self.nominal.get(name, ambient if self.is_room(name) else otherwise))
+        return np.array(found, dtype=np.float64)
+
+    def with_medians(self, seen: Mapping[str, Array]) -> Self:
+        """Return the plant with the medians of measured disturbances (n,) by name for nominal values, but for
+        the room's temperature."""
+        medians = {name: float(np.nanmedian(values)) for name, values in seen.items()}
+        return replace(self, nominal={name: v for name, v in medians.items() if not self.is_room(name)})
 
     @property
     def p(self) -> Array:
@@ -206,6 +229,8 @@ def plain_content(plant: PlantData) -> dict[str, Any]:
         content["inputs_end_at_row"] = True
     if np.isfinite(plant.offset_memory):
         content["offset_memory"] = plant.offset_memory
+    if plant.nominal:
+        content["nominal"] = plant.nominal
     if plant.refits:
         content["refits"] = [model.to_dict() for model in plant.refits]
     return content
@@ -227,6 +252,7 @@ def fields_of(content: Mapping[str, Any]) -> dict[str, Any]:
             "nuisance": _numbers(content, "nuisance", 0.0, _MOST_ERROR),
             "reference": content["reference"],
             "valid": _valid(content["valid"]),
+            "nominal": _numbers(content, "nominal") if "nominal" in content else {},
             "logs": tuple(str(name) for name in content["logs"]),
             "fitted_to": tuple(_fit_log(log) for log in content.get("fitted_to", ())),
             "scores": PlantScores.from_json(content["scores"]),

@@ -45,7 +45,7 @@ def tuning_of(**changes: Any) -> Any:
         check_draws=5, evaluations=30, moves_weight=0.03, extra_lag=0.4, extra_delay=0.6, lost_gain=0.1,
         zones={"t1": 1.0}, hard=["t1", "t2"], energy_price=None, tariff=[(0.0, 1.0), (600.0, 3.0)],
         ramp_per_s=None, safe_drive={}, limits={"t1": (-1e12, 60.0), "t2": (5.0, 70.0)}, weights=None,
-        settling=None, ramps=False, on_off=None,
+        settling=None, ramps=False, on_off=None, disturbances=None,
     )  # fmt: skip
     design = SimpleNamespace(
         controlled=("t1", "t2"), dt=2.0, horizon_s=60.0, blocks=(1, 2, 4), drive_range={"q": (0.0, 100.0)},

@@ -130,7 +130,7 @@ def test_what_is_regulated_is_guarded_without_a_plant_too() -> None:
 
 def test_a_twin_has_its_room_in_every_measured_temperature_and_asks_for_the_rest() -> None:
     assert Twin(PLANT, ambient=21.0).read().values[ROOM] == 21.0
-    with pytest.raises(UserError, match="the plant has the disturbance 'heat_ambient'"):
+    with pytest.raises(UserError, match="does not say what its disturbance 'heat_ambient' was in the logs"):
         Twin(swapped("heat_ambient", units={"heat_ambient": "W"}))
 
 

@@ -34,7 +34,7 @@ int main(void)
     for (int i = 0; i < TG_NY; i++)
         cold[i] = tg_the_design.ambient;
     for (int i = 0; i < TG_SOME(TG_ND); i++)
-        room[i] = tg_the_design.ambient;
+        room[i] = tg_the_design.usual_d[i];
     printf("ram %lu design %lu\n", (unsigned long)sizeof(tg_controller), (unsigned long)sizeof(tg_design));
     for (;;) {
         tg_move move;

@@ -22,7 +22,7 @@ int main(void)
     const tg_design *s = &tg_the_design;
     double x[TG_NX], next[TG_NX], y[TG_NY], d[TG_SOME(TG_ND)], target[TG_NC];
     for (int i = 0; i < TG_SOME(TG_ND); i++)
-        d[i] = s->ambient;
+        d[i] = s->usual_d[i];
     memcpy(x, s->rest, sizeof x);
     look(x, y);
     for (int r = 0; r < TG_NC; r++)

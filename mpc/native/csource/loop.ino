@@ -8,8 +8,8 @@ static bool begun = false;
 // A reading of output i [degC]. NAN means lost: until your sensor is read here, the drives stay at rest.
 static double read_output(int i) { (void)i; return NAN; }
 
-// What disturbance i measures, the room's temperature say [degC].
-static double read_disturbance(int i) { (void)i; return tg_the_design.ambient; }
+// What disturbance i measures, the room's temperature say [degC]; NAN where nobody does.
+static double read_disturbance(int i) { return tg_the_design.usual_d[i]; }
 
 // Apply drive j, a number in its range; the pump runs where pump is 1.
 static void write_drive(int j, double value, int pump) { (void)j; (void)value; (void)pump; }

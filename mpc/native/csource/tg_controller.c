@@ -42,6 +42,11 @@ static double clean(const tg_design *s, double value)
     return value >= s->coldest && value <= s->hottest ? value : NAN;
 }
 
+static double clean_measured(const tg_design *s, int i, double value)
+{
+    return value >= s->least_d[i] && value <= s->most_d[i] ? value : NAN;
+}
+
 static int all_finite(const double *a, int n)
 {
     for (int i = 0; i < n; i++)
@@ -62,7 +67,7 @@ static void start(tg_controller *c, const double *y, const double *d)
 {
     const tg_design *s = c->design;
     for (int i = 0; i < TG_ND; i++)
-        c->d[i] = isfinite(d[i]) ? d[i] : s->ambient;
+        c->d[i] = isfinite(d[i]) ? d[i] : s->usual_d[i];
     tg_observer_reset(c, y, c->d);
     tg_observer_expect_lags(c);
     for (int j = 0; j < TG_NU; j++)
@@ -96,7 +101,7 @@ void tg_reset(tg_controller *c, const tg_design *design, const double *y, const 
     for (int i = 0; i < TG_NY; i++)
         clean_y[i] = clean(design, y[i]);
     for (int i = 0; i < TG_ND; i++)
-        clean_d[i] = clean(design, d[i]);
+        clean_d[i] = clean_measured(design, i, d[i]);
     start(c, clean_y, clean_d);
     forget_calls(c);
 }
@@ -862,7 +867,7 @@ tg_move tg_step(tg_controller *c, tg_time time_s, const double *y, const double 
     for (int i = 0; i < TG_NY; i++)
         clean_y[i] = c->stale ? NAN : clean(c->design, y[i]);
     for (int i = 0; i < TG_ND; i++)
-        clean_d[i] = clean(c->design, d[i]);
+        clean_d[i] = clean_measured(c->design, i, d[i]);
     for (int j = 0; j < TG_NU; j++)
         did[j] = applied && isfinite(applied[j]) ? applied[j] : c->in_force[j];
     pass(c, did);

@@ -315,15 +315,15 @@ void tg_observer_reset(tg_controller *c, const double *y, const double *d)
     double level = 0.0;
     int known = 0;
     for (int i = 0; i < TG_NY; i++)
-        if (isfinite(y[i])) {
+        if (s->warm[i] && isfinite(y[i])) {
             level += y[i] - s->offset[i];
             known++;
         }
-    level = known ? level / known : (TG_ND > 0 && isfinite(d[0]) ? d[0] : 25.0);
+    level = known ? level / known : (s->room >= 0 && isfinite(d[s->room]) ? d[s->room] : 25.0);
     for (int j = 0; j < TG_NX; j++) {
         c->x[j] = s->rest[j] + s->rest_level[j] * (level - s->ambient);
         for (int i = 0; i < TG_ND; i++)
-            c->x[j] += s->rest_d[j * TG_ND + i] * (d[i] - s->ambient);
+            c->x[j] += s->rest_d[j * TG_ND + i] * (d[i] - s->usual_d[i]);
     }
     memset(c->w, 0, sizeof c->w);
     memset(c->held, 0, sizeof c->held);

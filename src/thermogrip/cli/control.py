@@ -58,6 +58,10 @@ def tune(
             f"No --spec: steps {steps}, each within {wanted.band_degC:g} after {wanted.settle_within_s:g} s; "
             f"'thermogrip init spec --like {plant} --out spec.toml' writes what was taken, to edit"
         )
+    if taken := wanted.surroundings_in_words(loaded):
+        console.say(
+            f"In the trials, and where nobody reads it: {taken}; 'disturbances' in the spec replaces it"
+        )
     with kept_processes(pool), console.progress("tune") as progress, _naming(spec, tuple(Spec.model_fields)):
         found = search(loaded, wanted, progress=progress, workers=pool, seed=seed)
     result = _written(console, found, f"A controller for {plant.name}", out, report)
@@ -169,7 +173,7 @@ def review(
 ) -> int:
     """Check a controller's design.
 
-    Each check passes, warns or fails, and says the fix.
+    Each check passes, warns or fails, and says the fix; one that had nothing to try says so.
     """
     loaded = load_controller(controller, network)  # first: a design that cannot be is refused sooner
     from thermogrip.mpc.tuning.design_review import review as check

@@ -93,7 +93,10 @@ def review_section(checks: Sequence[Check]) -> Section:
     """Return the section of a design review."""
     failed = [check.name for check in checks if check.verdict == "fail"]
     warned = [check.name for check in checks if check.verdict == "warn"]
-    verdict = f"{len(checks) - len(failed) - len(warned)} of {len(checks)} checks pass."
+    passed = [check for check in checks if check.verdict == "pass"]
+    verdict = f"{len(passed)} of {len(checks)} checks pass."
+    if idle := [check.name for check in checks if check.verdict not in ("pass", "warn", "fail")]:
+        verdict += f" Not tried: {', '.join(idle)}."
     if warned:
         verdict += f" Warnings: {', '.join(warned)}."
     if failed:

@@ -62,6 +62,7 @@ _SPEC_WORDS = {
 }
 
 _WISHES = {
+    "disturbances": "measured, in the simulations and where nobody reads them",
     "settling": "of single outputs",
     "limits": "limits of outputs, soft [degC]",
     "weights": "how many times the errors of an output count",

@@ -127,7 +127,7 @@ def test_one_drive_at_its_limit_is_enough() -> None:
 
 
 def test_surroundings_are_those_of_a_thermocouple_amplifier_where_nothing_is_given() -> None:
-    assert Surroundings() == Surroundings(25.0, 0.04, {}, 1 / 16, {}, {}, 0.0, 0.0, 1.0, ())
+    assert Surroundings() == Surroundings(25.0, 0.04, {}, 1 / 16, {}, {}, 0.0, 0.0, 1.0, (), {})
     assert all(kind.__dataclass_params__.frozen for kind in (Surroundings, Segment, ClosedLoop))
 
 

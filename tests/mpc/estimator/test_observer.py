@@ -246,11 +246,11 @@ def test_how_the_rest_of_a_peltier_plant_answers_to_level_and_room() -> None:
     plant = PredictionModel(network_plant("gripper"), dt=2.0)
     x, v, room = plant.at_rest(22.0)
     unit = np.linspace(0.5, 1.5, plant.n_x)
-    rest, steps = resting_state(plant, x, v, 25.0, room, unit=unit), np.eye(plant.n_d)
+    rest, steps = resting_state(plant, x, v, np.full(plant.n_y, 25.0), room, unit=unit), np.eye(plant.n_d)
     np.testing.assert_allclose(rest.P, rest.P.T, rtol=1e-12)
 
     def mean(level: float, step: np.ndarray) -> np.ndarray:
-        return resting_state(plant, x, v, level, room + step, unit=unit).x
+        return resting_state(plant, x, v, np.full(plant.n_y, level), room + step, unit=unit).x
 
     none = np.zeros(plant.n_d)
     np.testing.assert_allclose(rest.by_level, (mean(26.0, none) - mean(24.0, none)) / 2, atol=1e-7)
@@ -259,7 +259,9 @@ def test_how_the_rest_of_a_peltier_plant_answers_to_level_and_room() -> None:
 
 
 def test_the_past_drive_of_a_state_is_the_likeliest_that_held_it() -> None:
-    rest = resting_state(MODEL, np.array([1.0, 2.0]), np.array([40.0]), 26.0, np.array([22.0]), unit=UNIT)
+    rest = resting_state(
+        MODEL, np.array([1.0, 2.0]), np.array([40.0]), np.full(2, 26.0), np.array([22.0]), unit=UNIT
+    )
     x, W = np.array([3.0, -1.0]), 1 / (0.2 * UNIT) ** 2
     left = x - A @ x - E * 22.0  # what the drive has to make up for, but for 0.2 degC a sample
     assert rest.past_drive(x) == pytest.approx(SPAN * (B * W @ left) / (B * W @ B + 1))

@@ -13,11 +13,13 @@ from tests.mpc.makers import crossed, network_plant
 from thermogrip.datasets.limits import LARGEST
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
 from thermogrip.mpc.design.design import PILoop, default_design
+from thermogrip.mpc.design.spec import Asked
 from thermogrip.mpc.estimator.observer import ObserverNoise
 from thermogrip.mpc.plant.prediction import PredictionModel
 from thermogrip.mpc.tuning import design_review as checks
-from thermogrip.mpc.tuning.design_review import review, worst
-from thermogrip.mpc.tuning.objective import apparent_delay
+from thermogrip.mpc.tuning.design_review import Check, review, worst
+from thermogrip.mpc.tuning.objective import StepResult, apparent_delay
+from thermogrip.report.classification import review_section
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.plant import Plant
 
@@ -228,6 +230,8 @@ def stub(**design) -> Any:
     usual = {"controlled": ("t",), "dt": 2.0, "horizon_s": 40.0, "blocks": (1, 3), "slew_per_s": {"q": 0.1}}
     usual |= {"drive_range": {"q": (-1.0, 3.0)}, "limits": {}, "ambient": 22.0}
     model = SimpleNamespace(drives=("p", "q"), n_u=2, n_d=1, outputs=("t",), span=np.array([1.0, 4.0]))
+    model.disturbances, model.rooms = ("t_room",), np.array([True])
+    model.undisturbed = lambda ambient: np.array([ambient])
     vars(model).update(model=None, on_off=(), lowest=np.array([0.0, -1.0]), highest=np.array([1.0, 3.0]))
     return SimpleNamespace(design=SimpleNamespace(**usual | design), model=model, plant=None, dt=2.0)
 
@@ -499,8 +503,67 @@ def test_a_plant_that_has_what_its_model_lacks_settles_or_is_warned_of(
     controller = Controller(tank, default_design(tank, dt=4.0, move=move), notes=notes)
     found = checks.lacks_structure(controller, (20.0, 30.0))
     assert found.verdict == verdict
-    words = [part.split(":")[0] for part in found.finding.split("; ")]
+    lead, seen = found.finding.split(", each alone: ")
+    assert lead == "18 to 43 degC"
+    words = [part.split(":")[0] for part in seen.split("; ")]
     delay = apparent_delay(tank, ("t_surface",))
     late = [f"sensors slower by {0.5 * delay:.2g} s", f"delay longer by {0.5 * delay:.2g} s"]
     assert words == [*late, "drive weaker by 10 %"]
     assert ("never" in found.finding) == (verdict == "warn")
+
+
+ASKED = Asked(450.0, 0.25, 0.3, 0.05, 0.0)
+STEP = StepResult(18.0, 43.0, 1000, 60.0, 0.1, 0.02, 0.0, 1.0, 1.0, 0.5, 600.0)
+SWINGS = {"settle_s": np.nan, "overshoot": 5.0}
+NEVER = "never settles, overshoot 0.10, offset"
+
+
+@pytest.mark.parametrize(
+    ("changes", "said", "verdict"),
+    [
+        ({}, "settles in 60 s, overshoot 0.10, offset 0.02", "pass"),
+        ({"overshoot": 0.5}, "settles in 60 s, overshoot 0.50 (asked 0.3), offset 0.02", "warn"),
+        ({"overshoot": 1.0}, "settles in 60 s, overshoot 1.00 (asked 0.3), offset 0.02", "fail"),
+        ({"bias": -0.09}, "settles in 60 s, overshoot 0.10, offset -0.09 (asked 0.05)", "warn"),
+        ({"bias": -0.24}, "settles in 60 s, overshoot 0.10, offset -0.24 (asked 0.05)", "warn"),
+        (
+            {"settle_s": np.nan, "bias": -0.3},
+            f"{NEVER} -0.30 (asked 0.05)",
+            "warn",
+        ),
+        (
+            {"settle_s": np.nan, "bias": -0.8},
+            f"{NEVER} -0.80 (asked 0.05)",
+            "fail",
+        ),
+        (SWINGS, "never settles, overshoot 5.00 (asked 0.3), offset 0.02", "fail"),
+    ],
+)
+def test_structure_that_lacks_is_judged_by_overshoot_and_offset_too(
+    tank: Any, changes: dict[str, float], said: str, verdict: str, monkeypatch: pytest.MonkeyPatch
+):
+    notes = {"spec": {"steps": [[18.0, 43.0]]}}
+    controller = Controller(tank, default_design(tank, dt=4.0), notes=notes)
+    monkeypatch.setattr(checks, "run_trials", lambda *given: [replace(STEP, **changes)])
+    found = checks.lacks_structure(controller, (18.0, 43.0))
+    delay = 0.5 * apparent_delay(tank, ("t_surface",))
+    assert found.finding == f"18 to 43 degC, each alone: sensors slower by {delay:.2g} s: {said}"
+    assert (found.verdict, bool(found.fix)) == (verdict, verdict != "pass")
+    nobody = checks.lacks_structure(Controller(tank, controller.design), (18.0, 43.0))  # asked for anything
+    assert nobody.verdict == ("pass" if verdict == "pass" else "warn")
+    assert checks._lacked(replace(STEP, settle_s=70.0), ASKED._replace(pace_s=65.0), "x")[1] == 1.01
+
+
+def test_where_nothing_is_tried_it_does_not_say_pass(tank: Any):
+    none = dict.fromkeys(("extra_lag", "extra_delay", "lost_gain"), 0.0)
+    controller = Controller(tank, default_design(tank, dt=4.0), notes={"spec": none})
+    found = checks.lacks_structure(controller, (18.0, 43.0))
+    assert (found.verdict, found.fix) == ("not tried", "")
+    assert found.finding == "the spec's extra_lag, extra_delay and lost_gain are 0"
+    others = [Check("a", "pass", ""), Check("b", "warn", "", "do")]
+    assert worst([found]) == "pass"
+    assert worst([found, *others]) == "warn"
+    section = review_section([found, *others])
+    name = "settles where the model lacks structure"
+    assert section.verdict == f"1 of 3 checks pass. Not tried: {name}. Warnings: b."
+    assert review_section([found, others[0]]).tone == "good"

@@ -188,7 +188,9 @@ def test_a_trial_has_a_sensor_that_is_off_and_a_seed_of_its_draw(monkeypatch: py
     monkeypatch.setattr(objective, "simulate_closed_loop", loop)
     monkeypatch.setattr(objective, "apparent_delay", lambda plant, controlled: 8.0)
     scores = SimpleNamespace(reading_sd={"b": 0.07, "c": np.inf})
-    plant: Any = _Plant(disturbances=("room",), draw=lambda k: {"draw": k}, scores=scores)
+    plant: Any = _Plant(
+        disturbances=("room",), draw=lambda k: {"draw": k}, scores=scores, valid={}, is_room=lambda name: True
+    )
     controller: Any = SimpleNamespace(controlled=("a", "b"))
     found = objective.run_trials(controller, plant, SPEC, [1, 2], lengths=[50.0, 60.0], seed=4)
     offset = {"a": 0.4, "b": 0.4, "room": pytest.approx(0.6)}

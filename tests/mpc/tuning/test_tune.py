@@ -34,6 +34,7 @@ from thermogrip.mpc.tuning.objective import (
     surroundings_of,
 )
 from thermogrip.mpc.tuning.tune import Row, Tuning, _simpler, meets_spec, rows_of, tune, verdict_of
+from thermogrip.sysid.plant.fit_record import PlantScores
 
 QUICK = Spec(steps=[(28, 36)], hold_s=200.0, evaluations=3, sample_time_s=4.0, settle_within_s=200.0)
 
@@ -44,7 +45,11 @@ def tuning(tank):
 
 
 def test_in_the_trials_the_sensor_of_a_room_of_any_name_is_off():
-    offset = surroundings_of(QUICK, ("t_ambient_block",), ("t_room",)).offset
+    units = {"t_room": "degC", "t_ambient_block": "degC"}
+    plant: Any = SimpleNamespace(
+        disturbances=("t_room",), valid={}, scores=PlantScores(), is_room=lambda name: units[name] == "degC"
+    )
+    offset = surroundings_of(QUICK, ("t_ambient_block",), plant).offset
     assert offset["t_room"] == 1.5 * offset["t_ambient_block"] != 0
     assert len(offset) == 2
 
