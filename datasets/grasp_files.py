@@ -13,12 +13,13 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 from collections.abc import Sequence
 from glob import glob
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,7 @@ from thermogrip.datasets.schema import (
     check_grasps,
     log_name,
     make_grasps,
+    make_plain_grasps,
     with_lead_in,
 )
 from thermogrip.datasets.tables import (
@@ -66,7 +68,7 @@ _ENDINGS = (".csv", ".csv.gz", ".csv.xz")
 _NEEDED = ("time", "t_surface")  # how the columns begin that are read as numbers
 
 
-def read_grasps(path: str | Path) -> Grasps:
+def read_grasps(path: str | Path, *, plain: bool = False) -> Grasps:
     """Return the grasps in a file.
 
     Parameters
@@ -74,6 +76,8 @@ def read_grasps(path: str | Path) -> Grasps:
     path : str or Path
         A CSV file with its meta file beside it, NetCDF, or Parquet with a row a sample, in which each row
         repeats what is known of its grasp.
+    plain : bool, optional
+        Grasps of CSV as arrays alone (:mod:`thermogrip.datasets.plain_record`).
 
     Returns
     -------
@@ -107,7 +111,7 @@ def read_grasps(path: str | Path) -> Grasps:
         grasps = _of_dataset(open_netcdf(path), path)
     else:
         samples, per_grasp, repairs = _read_csv(path)
-        grasps = make_grasps(*samples, **per_grasp)
+        grasps = (make_plain_grasps if plain else make_grasps)(*samples, **per_grasp)
         grasps.attrs["repairs"] = "\n".join(repairs)
     return _whole(grasps, path)
 
@@ -138,11 +142,12 @@ def _whole(grasps: Grasps, path: str | Path) -> Grasps:
 
 def as_grasps(grasps: Records) -> list[Grasps]:
     """Return records as they are, those of files and DataFrames as they are read."""
-    from pandas import DataFrame
-
     given = list(grasps) if isinstance(grasps, Sequence) and not isinstance(grasps, str) else [grasps]
     files = [read_grasps(each) if isinstance(each, str | Path) else each for each in given]
-    return [from_frame(each) if isinstance(each, DataFrame) else each for each in files]
+    pandas: Any = sys.modules.get("pandas")  # of which nothing can be where it was not imported
+    if pandas is None:
+        return cast("list[Grasps]", files)
+    return [from_frame(each) if isinstance(each, pandas.DataFrame) else each for each in files]
 
 
 def from_frame(frame: DataFrame, name: str = "DataFrame") -> Grasps:

@@ -14,7 +14,6 @@ Python and the numerical packages that are here.  Workers may join at any time, 
 
 from __future__ import annotations
 
-import asyncio
 import ctypes
 import multiprocessing
 import os
@@ -233,6 +232,8 @@ class Replaced:
 
     async def call(self, function: Callable[[_Item], _Result], item: _Item) -> _Result:
         """Return ``function(item)``; UserError if processes are killed again and again over it."""
+        import asyncio  # which a program without an event loop has no need of
+
         loop = asyncio.get_running_loop()
         for _ in range(_DEATHS):
             pool = self._pool

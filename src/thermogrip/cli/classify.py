@@ -153,7 +153,7 @@ def effusivity(
     console = Console(as_json)
     from thermogrip.datasets.partitions import Answers, sources, stamps
 
-    given = sources(grasps)
+    given = sources(grasps, plain=True)
     device, coupling, longest = calibrated_device(console, calibrate or [], seed)
     # the bundled gripper may have taken these grasps or not
     ask = _Effusivity(device, coupling, longest, stated, 0.0 if calibrate else 0.5)
@@ -388,7 +388,7 @@ def classify(
     if serve:
         return _serve(console, ask, port, pool)
     assert out is not None
-    given = sources(paths or [])
+    given = sources(paths or [], plain=True)
     asked = [*astuple(ask), stamps([model_dir, *ask.known, *ask.others])]
     ask.answerer()
     found = Answers(out, ["classify", *asked])
