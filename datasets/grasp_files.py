@@ -28,7 +28,7 @@ from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError, os_faults
 from thermogrip.datasets.file_names import file_format, file_stem
 from thermogrip.datasets.media import csv_cell, csv_text
-from thermogrip.datasets.netcdf import open_netcdf, record_unit, write_netcdf
+from thermogrip.datasets.netcdf import open_netcdf, open_plain_netcdf, record_unit, write_netcdf
 from thermogrip.datasets.schema import (
     GRASP_LABELS,
     GRASP_NUMBERS,
@@ -77,7 +77,7 @@ def read_grasps(path: str | Path, *, plain: bool = False) -> Grasps:
         A CSV file with its meta file beside it, NetCDF, or Parquet with a row a sample, in which each row
         repeats what is known of its grasp.
     plain : bool, optional
-        Grasps of CSV as arrays alone (:mod:`thermogrip.datasets.plain_record`).
+        Grasps of CSV, and of NetCDF of ours, as arrays alone (:mod:`thermogrip.datasets.plain_record`).
 
     Returns
     -------
@@ -108,7 +108,8 @@ def read_grasps(path: str | Path, *, plain: bool = False) -> Grasps:
             raise UserError(problem, file=path, hint="a grasp file has grasp_id,time_s,t_surface_degC")
         return from_frame(frame, file_stem(path))
     if file_format(path) == "netcdf":
-        grasps = _of_dataset(open_netcdf(path), path)
+        found: Any = open_plain_netcdf(path) if plain else None
+        grasps = _of_dataset(open_netcdf(path) if found is None else found, path)
     else:
         samples, per_grasp, repairs = _read_csv(path)
         grasps = (make_plain_grasps if plain else make_grasps)(*samples, **per_grasp)

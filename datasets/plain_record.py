@@ -30,6 +30,16 @@ class PlainVariable(NamedTuple):
         """Return the values, NaN where they are not kept."""
         return self._replace(values=np.where(kept, self.values, np.nan))
 
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Return the type of the values."""
+        return self.values.dtype
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Return the lengths of the dimensions."""
+        return self.values.shape
+
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         return np.array(self.values, dtype=dtype) if copy else np.asarray(self.values, dtype=dtype)
 
@@ -74,7 +84,14 @@ class PlainGrasps:
         return self.sizes["grasp"]
 
     def __getitem__(self, key: Any) -> Any:
-        return self.variables[key] if isinstance(key, str) else self.whole()[key]
+        if isinstance(key, str):
+            return self.variables[key]
+        if isinstance(key, list) and all(isinstance(name, str) for name in key):
+            return PlainGrasps(self.coords | {name: self.variables[name] for name in key}, self.attrs)
+        return self.whole()[key]
+
+    def __setitem__(self, name: str, variable: Any) -> None:
+        self.variables[name] = _variable(*variable)
 
     def isel(self, *, grasp: Any) -> PlainGrasps:
         """Return the grasps at some positions, or of a mask."""
@@ -103,6 +120,8 @@ class PlainGrasps:
     def assign(self, **variables: Any) -> PlainGrasps:
         """Return the record with other values."""
         return PlainGrasps(self.variables | {k: _variable(*v) for k, v in variables.items()}, self.attrs)
+
+    assign_coords = assign
 
     def drop_vars(self, names: str, *, errors: str = "raise") -> PlainGrasps:
         """Return the record without a variable."""
