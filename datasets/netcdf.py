@@ -61,10 +61,8 @@ _LONG_NAMES = {
 # with which the HDF5 stack reports damage
 _DAMAGE = (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError)
 #: Attributes that are HDF5's own, and those by which numbers are not as they stand.
-_OF_HDF5 = frozenset(
-    {"CLASS", "NAME", "REFERENCE_LIST", "DIMENSION_LIST", "_Netcdf4Dimid", "_Netcdf4Coordinates"}
-)
-_CODED = frozenset({"scale_factor", "add_offset", "missing_value", "_Unsigned", "_Encoding", "dtype"})
+_OF_HDF5 = ("CLASS", "NAME", "REFERENCE_LIST", "DIMENSION_LIST", "_Netcdf4Dimid", "_Netcdf4Coordinates")
+_CODED = {"scale_factor", "add_offset", "missing_value", "_Unsigned", "_Encoding", "dtype"}
 _MOST_MEMBERS = 4096  # of a file
 _PART = 16 << 20  # bytes of text that are looked at in one piece
 
@@ -107,8 +105,8 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
 
 
 def open_plain_netcdf(path: str | Path) -> PlainGrasps | None:
-    """Return the grasps in a NetCDF-4 file that we wrote, as arrays alone and as :func:`open_netcdf` reads them;
-    None of any other file."""
+    """Return the grasps in a NetCDF-4 file of ours as arrays alone, like :func:`open_netcdf`; None of any
+    other file."""
     check_netcdf(path)
     h5py = import_module("h5py")
     with _not_damaged(path), h5py.File(path, "r") as file:

@@ -94,8 +94,8 @@ class PlainGrasps:
         self.variables[name] = _variable(*variable)
 
     def isel(self, *, grasp: Any) -> PlainGrasps:
-        """Return the grasps at some positions, or of a mask."""
-        return self._cut("grasp", np.atleast_1d(np.asarray(grasp)))
+        """Return the grasps at some positions, of a slice or of a mask."""
+        return self._cut("grasp", grasp if isinstance(grasp, slice) else np.atleast_1d(grasp))
 
     def sel(self, **at: Any) -> Any:
         """Return the samples in a slice of time, its end included."""
