@@ -19,7 +19,7 @@ from glob import glob
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,10 +144,10 @@ def _whole(grasps: Grasps, path: str | Path) -> Grasps:
 def as_grasps(grasps: Records) -> list[Grasps]:
     """Return records as they are, those of files and DataFrames as they are read."""
     given = list(grasps) if isinstance(grasps, Sequence) and not isinstance(grasps, str) else [grasps]
-    files = [read_grasps(each) if isinstance(each, str | Path) else each for each in given]
+    files: list[Any] = [read_grasps(each) if isinstance(each, str | Path) else each for each in given]
     pandas: Any = sys.modules.get("pandas")  # of which nothing can be where it was not imported
     if pandas is None:
-        return cast("list[Grasps]", files)
+        return files
     return [from_frame(each) if isinstance(each, pandas.DataFrame) else each for each in files]
 
 
