@@ -145,12 +145,14 @@ def _numba() -> Any:
         def get_source_stamp(self) -> str:
             return sources_digest()
 
+    class InSetFolder(BySources, caching.UserProvidedCacheLocator):  # type: ignore[misc]
+        """In the folder of NUMBA_CACHE_DIR, where that is set."""
+
     class BesideModule(BySources, caching.InTreeCacheLocator):  # type: ignore[misc]
         """Beside the kernel's module."""
 
     class OfUser(BySources, caching.UserWideCacheLocator):  # type: ignore[misc]
         """In the user's cache folder, where that of the module cannot be written."""
 
-    # after the folder of NUMBA_CACHE_DIR
-    caching.CacheImpl._locator_classes[1:1] = [BesideModule, OfUser]
+    caching.CacheImpl._locator_classes[:0] = [InSetFolder, BesideModule, OfUser]
     return numba
