@@ -14,6 +14,7 @@ Python and the numerical packages that are here.  Workers may join at any time, 
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import multiprocessing
 import os
@@ -22,7 +23,7 @@ import sys
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from functools import cache, partial
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -191,11 +192,22 @@ def _serving(modules: Sequence[str]) -> None:
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # a Ctrl-C is for its processes
     try:
         forkserver.ensure_running()
+        atexit.unregister(_end_server)
+        atexit.register(_end_server, forkserver)
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         del os.environ["PYTHONSAFEPATH"]
         if safe is not None:
             os.environ["PYTHONSAFEPATH"] = safe
+
+
+def _end_server(forkserver: Any) -> None:
+    """End the server with the program: it would first import all that it began with, and who waits for the
+    end of stderr would wait for it."""
+    pid = getattr(forkserver._forkserver, "_forkserver_pid", None)
+    if pid is not None:
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGTERM)
 
 
 def _processes(n: int) -> ProcessPoolExecutor:
