@@ -11,12 +11,15 @@ from __future__ import annotations
 
 from importlib.resources import files
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.grasp_files import read_grasps
 from thermogrip.datasets.log_files import read_log
-from thermogrip.datasets.schema import Grasps, Log
+
+if TYPE_CHECKING:
+    from thermogrip.datasets.schema import Grasps, Log
 
 EXAMPLE_LOGS = ("prbs_heating_cooling", "step_up_down", "multisine", "pump_on_off")
 

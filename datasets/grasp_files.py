@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 from collections.abc import Sequence
 from glob import glob
 from itertools import pairwise
@@ -27,7 +28,7 @@ from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError, os_faults
 from thermogrip.datasets.file_names import file_format, file_stem
 from thermogrip.datasets.media import csv_cell, csv_text
-from thermogrip.datasets.netcdf import open_netcdf, record_unit, write_netcdf
+from thermogrip.datasets.netcdf import open_netcdf, open_plain_netcdf, record_unit, write_netcdf
 from thermogrip.datasets.schema import (
     GRASP_LABELS,
     GRASP_NUMBERS,
@@ -35,6 +36,7 @@ from thermogrip.datasets.schema import (
     check_grasps,
     log_name,
     make_grasps,
+    make_plain_grasps,
     with_lead_in,
 )
 from thermogrip.datasets.tables import (
@@ -66,7 +68,7 @@ _ENDINGS = (".csv", ".csv.gz", ".csv.xz")
 _NEEDED = ("time", "t_surface")  # how the columns begin that are read as numbers
 
 
-def read_grasps(path: str | Path) -> Grasps:
+def read_grasps(path: str | Path, *, plain: bool = False) -> Grasps:
     """Return the grasps in a file.
 
     Parameters
@@ -74,6 +76,8 @@ def read_grasps(path: str | Path) -> Grasps:
     path : str or Path
         A CSV file with its meta file beside it, NetCDF, or Parquet with a row a sample, in which each row
         repeats what is known of its grasp.
+    plain : bool, optional
+        Grasps of CSV, and of NetCDF of ours, as arrays alone (:mod:`thermogrip.datasets.plain_record`).
 
     Returns
     -------
@@ -104,10 +108,11 @@ def read_grasps(path: str | Path) -> Grasps:
             raise UserError(problem, file=path, hint="a grasp file has grasp_id,time_s,t_surface_degC")
         return from_frame(frame, file_stem(path))
     if file_format(path) == "netcdf":
-        grasps = _of_dataset(open_netcdf(path), path)
+        found: Any = open_plain_netcdf(path) if plain else None
+        grasps = _of_dataset(open_netcdf(path) if found is None else found, path)
     else:
         samples, per_grasp, repairs = _read_csv(path)
-        grasps = make_grasps(*samples, **per_grasp)
+        grasps = (make_plain_grasps if plain else make_grasps)(*samples, **per_grasp)
         grasps.attrs["repairs"] = "\n".join(repairs)
     return _whole(grasps, path)
 
@@ -138,11 +143,12 @@ def _whole(grasps: Grasps, path: str | Path) -> Grasps:
 
 def as_grasps(grasps: Records) -> list[Grasps]:
     """Return records as they are, those of files and DataFrames as they are read."""
-    from pandas import DataFrame
-
     given = list(grasps) if isinstance(grasps, Sequence) and not isinstance(grasps, str) else [grasps]
-    files = [read_grasps(each) if isinstance(each, str | Path) else each for each in given]
-    return [from_frame(each) if isinstance(each, DataFrame) else each for each in files]
+    files: list[Any] = [read_grasps(each) if isinstance(each, str | Path) else each for each in given]
+    pandas: Any = sys.modules.get("pandas")  # of which nothing can be where it was not imported
+    if pandas is None:
+        return files
+    return [from_frame(each) if isinstance(each, pandas.DataFrame) else each for each in files]
 
 
 def from_frame(frame: DataFrame, name: str = "DataFrame") -> Grasps:

@@ -14,7 +14,7 @@ Python and the numerical packages that are here.  Workers may join at any time, 
 
 from __future__ import annotations
 
-import asyncio
+import atexit
 import ctypes
 import multiprocessing
 import os
@@ -23,7 +23,7 @@ import sys
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from functools import cache, partial
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -192,11 +192,22 @@ def _serving(modules: Sequence[str]) -> None:
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # a Ctrl-C is for its processes
     try:
         forkserver.ensure_running()
+        atexit.unregister(_end_server)
+        atexit.register(_end_server, forkserver)
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         del os.environ["PYTHONSAFEPATH"]
         if safe is not None:
             os.environ["PYTHONSAFEPATH"] = safe
+
+
+def _end_server(forkserver: Any) -> None:
+    """End the server with the program: it would first import all that it began with, and who waits for the
+    end of stderr would wait for it."""
+    pid = getattr(forkserver._forkserver, "_forkserver_pid", None)
+    if pid is not None:
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGTERM)
 
 
 def _processes(n: int) -> ProcessPoolExecutor:
@@ -233,6 +244,8 @@ class Replaced:
 
     async def call(self, function: Callable[[_Item], _Result], item: _Item) -> _Result:
         """Return ``function(item)``; UserError if processes are killed again and again over it."""
+        import asyncio  # which a program without an event loop has no need of
+
         loop = asyncio.get_running_loop()
         for _ in range(_DEATHS):
             pool = self._pool

@@ -20,7 +20,7 @@ from functools import partial
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -35,8 +35,11 @@ from thermogrip.datasets.grasp_files import (
 )
 from thermogrip.datasets.media import csv_text
 from thermogrip.datasets.parallel import Progress, Workers, in_order
-from thermogrip.datasets.schema import Grasps, label_values, log_name
+from thermogrip.datasets.schema import label_values, log_name
 from thermogrip.datasets.zarr_store import is_store, store_slices
+
+if TYPE_CHECKING:
+    from thermogrip.datasets.schema import Grasps
 
 #: Single touches of one file that are answered at once.
 PART = 500
@@ -51,8 +54,9 @@ class Source(NamedTuple):
     read: Callable[[], Grasps]
 
 
-def sources(paths: Sequence[str | Path]) -> list[Source]:
-    """Return the files of grasps in paths and folders, and the slices of Zarr stores, unread."""
+def sources(paths: Sequence[str | Path], *, plain: bool = False) -> list[Source]:
+    """Return the files of grasps in paths and folders, and the slices of Zarr stores, unread; ``plain`` as of
+    :func:`~thermogrip.datasets.grasp_files.read_grasps`."""
     found = []
     for path in list_grasp_files(paths):
         marks = stamps(grasp_file_parts(path))
@@ -64,7 +68,7 @@ def sources(paths: Sequence[str | Path]) -> list[Source]:
                 stamp = [[str(path), size, newest], start, stop]
                 found.append(Source(f"{path.name}[{start}:{stop}]", size // len(slices), stamp, read))
             continue
-        found.append(Source(path.name, size, marks, partial(read_grasps, path.absolute())))
+        found.append(Source(path.name, size, marks, partial(read_grasps, path.absolute(), plain=plain)))
     return found
 
 

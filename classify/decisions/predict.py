@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +44,7 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import csv_text
-from thermogrip.datasets.schema import Grasps, has_touch_groups, label_values, log_name, unit_names
+from thermogrip.datasets.schema import has_touch_groups, label_values, log_name, unit_names
 from thermogrip.sysid.effusivity.data import (
     Touches,
     object_range,
@@ -67,6 +67,9 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
 )
 from thermogrip.sysid.effusivity.posterior import EffusivityRow
 from thermogrip.sysid.effusivity.quality import NO_CONTACT, check_grasps, number_values
+
+if TYPE_CHECKING:
+    from thermogrip.datasets.schema import Grasps
 
 Row: TypeAlias = dict[str, Any]
 

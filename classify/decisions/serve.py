@@ -16,11 +16,11 @@ import json
 import math
 import socket
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias
 
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.grasp_files import META_NAMES
-from thermogrip.datasets.schema import GRASP_NUMBERS, Grasps, make_grasps, with_lead_in
+from thermogrip.datasets.schema import GRASP_NUMBERS, make_grasps, with_lead_in
 
 if TYPE_CHECKING:
     from starlette.requests import Request
@@ -28,10 +28,12 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp
     from uvicorn import Server
 
+    from thermogrip.datasets.schema import Grasps
+
 MOST_BYTES = 1 << 18  # of a request
 HOST = "127.0.0.1"
 #: What returns the ``rows`` of a record, and by grasp why some are ``strange``.
-Answer = Callable[[Grasps], Mapping[str, Any]]
+Answer: TypeAlias = "Callable[[Grasps], Mapping[str, Any]]"
 
 _TRACES = {"time_s": "time", "t_surface_degC": "t_surface", "t_surface_2_degC": "t_surface_2"}
 _NUMBERS = {META_NAMES.get(name, name) + ("" if unit == "1" else f"_{unit}"): name

@@ -30,7 +30,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -50,10 +50,13 @@ from thermogrip.classify.estimators.registry import load_classifier
 from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import LARGEST, array_within, number_within
-from thermogrip.datasets.schema import HOTTEST, Grasps, log_name, make_grasps
+from thermogrip.datasets.schema import HOTTEST, log_name, make_grasps
 from thermogrip.sysid.effusivity.posterior import material_fit
 from thermogrip.sysid.effusivity.predictive import rest_of_contact
 from thermogrip.sysid.effusivity.quality import GraspQuality, check_grasps
+
+if TYPE_CHECKING:
+    from thermogrip.datasets.schema import Grasps
 
 TIMES = (0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
 RULE_FILE = "stop_rule.json"  # beside classifier.json

@@ -13,13 +13,16 @@ Labels of an array may be of any type; ``classes_`` and predictions are of the s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, Grasps, make_grasps, with_lead_in
+from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, make_grasps, with_lead_in
+
+if TYPE_CHECKING:
+    from thermogrip.datasets.schema import Grasps
 
 _STEP = 0.1  # s
 _CHANNELS = 2

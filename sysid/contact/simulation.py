@@ -33,15 +33,17 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import eigh
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.materials import find_material
-from thermogrip.datasets.schema import Grasps, make_grasps
+from thermogrip.datasets.schema import make_grasps
+
+if TYPE_CHECKING:
+    from thermogrip.datasets.schema import Grasps
 
 LAYER_NAMES = ("e_outer", "z_outer", "e_inner", "z_inner", "g_back", "g_side", "c_side")  # what shapes modes
 
@@ -107,7 +109,7 @@ def time_nodes(end: float, *, first: float = 0.01, per_group: int = 10) -> TimeN
 def stack_modes(stack: Stack) -> StackModes:
     """Return the gripper's modes: rise at face and sensor per unit flux into the face."""
     matrix, root, half = _assembled(np.array([[getattr(stack, name) for name in LAYER_NAMES]]))
-    lam, vectors = eigh(matrix[0], check_finite=False, driver="evd")
+    lam, vectors = np.linalg.eigh(matrix[0])
     return StackModes(*(part[0] for part in _modes(lam[None], vectors[None], root, half)))
 
 

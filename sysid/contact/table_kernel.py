@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array, Mask
-from thermogrip.datasets.compiled import numba
+from thermogrip.datasets.compiled import kernel
 from thermogrip.sysid.contact.time_stepping import COMPILED
 
 N_BASIS = 16  # curves whose combinations are all responses
 
 
-@numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
+@kernel(**COMPILED)
 def blend(
     index: NDArray[np.int32], shape: tuple[int, ...], rows: NDArray[np.float32], cell: NDArray[np.int64],
     share: Array, late: Mask, weight: Array, step: Array, wanted: Mask, order: NDArray[np.int64], kept: Array,
@@ -98,7 +98,7 @@ def blend(
             out[p, 3, q], out[p, 4, q] = sums[3, q] - sums[4, q], sums[4, q]  # by ln e at the same C
 
 
-@numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
+@kernel(**COMPILED)
 def blended_means(
     values: Array, slopes: Array, first: float, step: float, coefficients: Array, which: NDArray[np.int64],
     onset: Array, wanted: Mask, room: Array, means: Array,

@@ -26,7 +26,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +38,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.grasp_files import Records, as_grasps
 from thermogrip.datasets.materials import Material, find_material, load_materials
 from thermogrip.datasets.parallel import Progress
-from thermogrip.datasets.schema import Grasps, log_name
+from thermogrip.datasets.schema import log_name
 from thermogrip.sysid.contact.simulation import TimeNodes
 from thermogrip.sysid.effusivity.data import (
     KNOTS,
@@ -80,6 +80,9 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     nodes_for,
     predict,
 )
+
+if TYPE_CHECKING:
+    from thermogrip.datasets.schema import Grasps
 
 # of SHARED_NAMES: prior mean and sd; all wide, in the units of the name
 _WIDE: dict[str, tuple[float, float]] = {

@@ -19,18 +19,20 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dtrtri
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.schema import Grasps, check_grasps, label_values, log_name
+from thermogrip.datasets.schema import check_grasps, label_values, log_name
 from thermogrip.sysid.contact.simulation import PUMP_OFF
 from thermogrip.sysid.effusivity.quality import check_grasps as check_quality
 from thermogrip.sysid.effusivity.quality import number_values
+
+if TYPE_CHECKING:
+    from thermogrip.datasets.schema import Grasps
 
 UNKNOWN_OBJECT_RANGE = 20.0  # K about the room, or the gripper where no room is stated
 _EDGES = np.concatenate(
@@ -311,8 +313,13 @@ def _sum(data: Touches, white: Array, slow: Array, misfit: Array) -> Array:
 
 
 def _inverse(chol: NDArray[np.floating[Any]]) -> Array:
-    """Return the inverses of lower triangular matrices (n, n_bin, n_bin)."""
-    return np.stack([dtrtri(c, lower=1)[0] for c in chol])
+    """Return the inverses of lower triangular matrices (n, n_bin, n_bin), row after row of all at once: by L
+    L^-1 = 1 a row follows from those above it."""
+    out = np.zeros(chol.shape)
+    for i, pivot in enumerate(np.moveaxis(np.diagonal(chol, axis1=1, axis2=2), 1, 0)):
+        out[:, i, i] = 1.0 / pivot
+        out[:, i, :i] = -(chol[:, None, i, :i] @ out[:, :i, :i])[:, 0] / pivot[:, None]
+    return out
 
 
 class Whitener(NamedTuple):

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array, Mask
-from thermogrip.datasets.compiled import numba
+from thermogrip.datasets.compiled import kernel
 from thermogrip.sysid.contact.time_stepping import COMPILED, N_STEPPED, VALUE, Gripper, contacts
 
 _AT_ONCE = 1024  # pairs
@@ -130,7 +130,7 @@ def _means(
     return out
 
 
-@numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
+@kernel(**COMPILED)
 def bin_means(
     nodes: Array, rise: Array, slope: Array, wanted: Mask, which: NDArray[np.int64], onset: Array,
     row: NDArray[np.int64], times: Array, bins: NDArray[np.int64], count: Array, room: Array, means: Array,
@@ -177,7 +177,7 @@ def bin_means(
                     means[p, c, m] /= count[i, m]
 
 
-@numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
+@kernel(**COMPILED)
 def predicted(
     means: Array, wanted: Mask, row: NDArray[np.int64], count: Array, t: Array, ramp: Array, read: Array,
     ambient: Array, numbers: Array, beyond: Array, u: Array, vary: Mask, room: Array, y: Array, slopes: Array,

@@ -59,13 +59,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import stdtr
 
 from thermogrip.datasets.repair import SPIKE_FLOOR_K, SPIKE_LENGTH, find_spikes
-from thermogrip.datasets.schema import Grasps, has_touch_groups, label_values
+from thermogrip.datasets.schema import has_touch_groups, label_values
+
+if TYPE_CHECKING:
+    from thermogrip.datasets.schema import Grasps
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -95,6 +98,7 @@ _REST = 60.0  # s between two touches, where the record does not say
 _FROM, _UNTIL = -5.0, -0.4  # s: some contacts are made before the message
 _LEAST = 6  # readings
 _CHANCE = 1e-5
+_CERTAIN = 4.4  # sd: a smaller slope is more likely than that with any number of readings
 _READ_WHOLE = 1.2  # a contact up to so many times as long as the longest known one is not worth a word
 _LATEST = 0.7  # s
 _MOVES_BEFORE = 0.04  # of the difference, within the record before contact: the pump's stop moves 0.005
@@ -139,9 +143,13 @@ class GraspQuality:
     def unsettled(self) -> Flags:
         """Return which grasps touched while their skin was surely still moving, (n,)."""
         slope, sd = self.drift
+        off = np.abs(slope) / np.maximum(sd, 1e-9)
+        if not (off > _CERTAIN).any():  # NaN compares false
+            return np.zeros(off.shape, dtype=bool)
+        from scipy.special import stdtr
+
         n = np.isfinite(self._trace.clean[:, self._trace.near]).sum(axis=1)
-        chance = 2 * stdtr(np.maximum(n - 2, 1), -np.abs(slope) / np.maximum(sd, 1e-9))
-        return np.asarray(chance < _CHANCE)
+        return np.asarray(2 * stdtr(np.maximum(n - 2, 1), -off) < _CHANCE)
 
     def usable_grasps(self, grasps: Grasps) -> Grasps | None:
         """Return the usable grasps with all their samples (None where there are none), a block's ``rest``

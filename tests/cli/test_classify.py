@@ -54,7 +54,7 @@ def gripper(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
 
     made = SimpleNamespace(bench=bench, why=[])
     made.records = [record_of(["a", "b"], "one"), record_of(["c"], "two")]
-    stand_in("thermogrip.datasets.partitions.sources", lambda paths: unread(*made.records))
+    stand_in("thermogrip.datasets.partitions.sources", lambda paths, plain: unread(*made.records))
     stand_in("thermogrip.datasets.partitions.stamps", [])
     made.warned = stand_in("thermogrip.cli.options.warn_of_contacts")
     made.calibrated = stand_in("thermogrip.cli.classify.calibrated_device", ("device", "coupling", 9.0))
@@ -366,7 +366,7 @@ def named(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
     """Return a bench whose classifier and its answers are stand-ins."""
     made = SimpleNamespace(bench=bench, record=record_of(["a", "b"]), model="a model")
     (bench.path / "m").mkdir()
-    stand_in("thermogrip.datasets.partitions.sources", lambda paths: unread(made.record))
+    stand_in("thermogrip.datasets.partitions.sources", lambda paths, plain: unread(made.record))
     stand_in("thermogrip.datasets.partitions.stamps", [])
     stand_in("thermogrip.datasets.grasp_files.read_grasp_files", lambda paths: [made.record])
     made.warned = stand_in("thermogrip.cli.options.warn_of_contacts")

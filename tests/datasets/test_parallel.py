@@ -93,6 +93,20 @@ def pools(monkeypatch):
     return made
 
 
+@pytest.mark.skipif(
+    sys.platform != "linux" or (os.cpu_count() or 1) < 2, reason="needs POSIX and two processors"
+)
+def test_a_program_that_ends_early_leaves_no_server_that_holds_its_stderr(tmp_path):
+    """Who reads stderr to its end, as `2>&1 | head` does, need not wait for what the server imports."""
+    (tmp_path / "slow.py").write_text("import time\ntime.sleep(60)\n")
+    code = "from thermogrip.datasets.parallel import begin_processes; begin_processes(2, ['slow'])"
+    path = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
+    begin = time.monotonic()
+    run = [sys.executable, "-c", code]
+    subprocess.run(run, check=True, capture_output=True, timeout=50, env=os.environ | {"PYTHONPATH": path})
+    assert time.monotonic() - begin < 40
+
+
 def test_no_more_processes_are_started_than_there_are_items_or_processors(pools, monkeypatch):
     seen = []
     got = run_parallel(math.factorial, [4, 1, 3, 2, 0], workers=3, progress=lambda *a: seen.append(a))

@@ -26,13 +26,15 @@ if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
     from thermogrip.sysid.effusivity import Coupling, EffusivityRow, GripperModel
 
-# what processes that answer import; dask.array by xarray, where it is installed
+# what processes that answer import, with what these import at first use
 _NEEDED = (
     "thermogrip.classify.decisions.predict",
     "thermogrip.classify.estimators.posterior",
     "thermogrip.sysid.contact.response_table",
     "thermogrip.sysid.effusivity.mode_kernel",
-    "dask.array",
+    "numba",
+    "pyarrow.csv",
+    "scipy.special",
 )
 _BUNDLED = 40.0  # s: the longest contacts that taught the bundled gripper
 
@@ -45,17 +47,19 @@ def calibrated_device(
     With it: how blocks move between touches, where the grasps identify it, and how long the contacts of the
     training lasted [s].
     """
-    from thermogrip.datasets.grasp_files import read_grasp_files
-    from thermogrip.datasets.schema import has_touch_groups
-    from thermogrip.sysid.effusivity import calibrate_gripper, load_default_gripper
-    from thermogrip.sysid.effusivity.multi_touch import learn_coupling
-    from thermogrip.sysid.effusivity.quality import longest_contact
-
     if not calibrate:
+        from thermogrip.sysid.effusivity import load_default_gripper
+
         console.warn(
             "the bundled gripper's calibration is used; give --calibrate with labelled grasps of yours"
         )
         return load_default_gripper(), None, _BUNDLED
+    from thermogrip.datasets.grasp_files import read_grasp_files
+    from thermogrip.datasets.schema import has_touch_groups
+    from thermogrip.sysid.effusivity import calibrate_gripper
+    from thermogrip.sysid.effusivity.multi_touch import learn_coupling
+    from thermogrip.sysid.effusivity.quality import longest_contact
+
     labelled = read_grasp_files(calibrate)
     cli.warn_of_contacts(console, labelled)
     labelled = touched_part(console, labelled)
@@ -153,7 +157,7 @@ def effusivity(
     console = Console(as_json)
     from thermogrip.datasets.partitions import Answers, sources, stamps
 
-    given = sources(grasps)
+    given = sources(grasps, plain=True)
     device, coupling, longest = calibrated_device(console, calibrate or [], seed)
     # the bundled gripper may have taken these grasps or not
     ask = _Effusivity(device, coupling, longest, stated, 0.0 if calibrate else 0.5)
@@ -388,7 +392,7 @@ def classify(
     if serve:
         return _serve(console, ask, port, pool)
     assert out is not None
-    given = sources(paths or [])
+    given = sources(paths or [], plain=True)
     asked = [*astuple(ask), stamps([model_dir, *ask.known, *ask.others])]
     ask.answerer()
     found = Answers(out, ["classify", *asked])

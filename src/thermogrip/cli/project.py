@@ -138,14 +138,16 @@ def warm_up(as_json: cli.AsJson = False) -> int:
 
     from thermogrip.classify.decisions.predict import classify_grasps
     from thermogrip.classify.estimators.posterior import PosteriorClassifier
-    from thermogrip.datasets.examples import load_example_grasps
+    from thermogrip.datasets.examples import example_path
+    from thermogrip.datasets.grasp_files import read_grasps
     from thermogrip.sysid.contact.response_table import response_table
     from thermogrip.sysid.contact.time_stepping import N_STEPPED, step_contacts
     from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
     from thermogrip.sysid.effusivity.posterior import effusivity_posterior
 
     console, began = Console(as_json), time.process_time()
-    gripper, grasps = load_default_gripper(), load_example_grasps()["exp2_dT20"].isel(grasp=[0])
+    grasps = read_grasps(example_path("exp2_dT20"), plain=True).isel(grasp=[0])
+    gripper = load_default_gripper()
     classify_grasps(PosteriorClassifier().with_device(gripper), grasps, ["copper", "wood"])
     effusivity_posterior(gripper, grasps)
     table = response_table(gripper.stack, 12.0)  # which many grasps need
