@@ -33,6 +33,8 @@ _STATUS_OK = 0
 _COUNTS = ("NRT_incref", "NRT_decref")
 _LIBRARY = ("acos", "asin", "atan", "atan2", "cos", "cosh", "exp", "expm1", "fmod", "log", "log1p", "memcpy",
             "memset", "pow", "sin", "sinh", "sqrt", "tan", "tanh")  # fmt: skip
+#: Versions of numba whose calling convention this is; it is nobody's promise.
+_TRIED = ("0.63.",)
 #: What must be as when the code was compiled, beside the sources of the kernels.
 _OWN_SETTINGS = ("NUMBA_CACHE_DIR", "NUMBA_NUM_THREADS")
 
@@ -40,9 +42,10 @@ _engines: list[Any] = []  # code lives as long as what linked it
 
 
 def possible() -> bool:
-    """Return whether this process may link kept code: on Linux, with numba as it comes."""
+    """Return whether this process may link kept code: on Linux, with a numba that was tried, as it comes."""
     others = [name for name in os.environ if name.startswith("NUMBA_") and name not in _OWN_SETTINGS]
-    return sys.platform == "linux" and platform.machine() in ("x86_64", "aarch64") and not others
+    here = sys.platform == "linux" and platform.machine() in ("x86_64", "aarch64")
+    return here and not others and version("numba").startswith(_TRIED)
 
 
 def folders(source: Path) -> list[Path]:

@@ -199,3 +199,11 @@ def test_a_program_that_has_imported_numba_calls_it_at_once(made, monkeypatch):
 def test_code_is_kept_for_numba_as_it_comes_alone(monkeypatch):
     monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
     assert not native_code.possible()
+
+
+def test_code_is_kept_for_a_numba_that_was_tried_alone(monkeypatch):
+    monkeypatch.setattr(native_code, "version", lambda name: "0.63.7")
+    usual = native_code.possible()
+    monkeypatch.setattr(native_code, "version", lambda name: "0.630.0")
+    assert not native_code.possible()
+    assert usual == (sys.platform == "linux")
