@@ -149,11 +149,10 @@ class Optimiser:
         self.pair = self._pairs()
         self.settled_gain = self._settled_gain()
         self.seen = np.abs(self.at_rest) > 0.02 * np.max(np.abs(self.at_rest), axis=0)
-        # of a drive that is no loop's and serves a limit, what it does to a target may fade or turn over; and
-        # a plan that is improved until it stays is judged by its simulation, wherever a gain changes its sign
+        # of a drive that is no loop's and serves a limit, what it does to a target may fade or turn over
         paired = {loop.drive for loop in design.loops}
         guarded = [name in paired or not (paired and design.limits) for name in model.drives]
-        self.seen &= np.array(guarded) & (design.iterations == 1)
+        self.seen &= np.array(guarded)
         self._per_rest = np.where(self.seen, self.at_rest, 1.0)
         # price of a unit beyond each soft row, of each controlled output and each limit
         dear = [_DEAR if name in design.hard else 1.0 for name in design.limits]

@@ -41,7 +41,7 @@ from thermogrip.sysid.models.model import BlackBox
 #: The verdict of a check that had nothing to try: it neither passes nor warns.
 NOT_TRIED = "not tried"
 _RANK = {"pass": 0, "warn": 1, "fail": 2}
-_FAR_BEYOND = 3.0  # times the overshoot or the offset that is asked
+_FAR_BEYOND = 3.0  # bands
 _KELVIN = 273.15
 _SLOW = 0.9995  # an eigenvalue beyond which a loop hardly settles
 _IDLE = 1e-4  # relative change of the move below which a doubled weight does nothing
@@ -172,23 +172,22 @@ def lacks_structure(controller: Controller, swing: tuple[float, float]) -> Check
     if not tried:
         return Check(name, NOT_TRIED, "the spec's extra_lag, extra_delay and lost_gain are 0")
     (start, target), words = spec.steps[0], [tried[r.draw // STRUCTURE - 1][0] for r in found]
-    seen, beyond = zip(*(_lacked(r, spec.asked(r.output), of) for of, r in zip(words, found, strict=True)))
+    seen, graded = zip(*(_lacked(r, spec.asked(r.output), of) for of, r in zip(words, found, strict=True)))
     move = controller.design.move
     fix = f"raise the move weight (now {move:.3g}), or identify on a log of the closed loop and tune again"
     finding = f"{start:g} to {target:g} degC, each alone: {'; '.join(seen)}"
     # of defaults that nobody asked for it is a warning
-    failed = isinstance(noted, Mapping) and max(beyond) > _FAR_BEYOND
-    return _graded(name, finding, fail=(failed, fix), warn=(max(beyond) > 1, fix))
+    failed = isinstance(noted, Mapping) and "fail" in graded
+    return _graded(name, finding, fail=(failed, fix), warn=(set(graded) != {"pass"}, fix))
 
 
-def _lacked(result: StepResult, asked: Asked, what: str) -> tuple[str, float]:
-    """Return what a step did on a plant that has what its model lacks, in words, and how many times as much
-    as was asked: of overshoot, or of offset; just more than once where it is late or never settles."""
+def _lacked(result: StepResult, asked: Asked, what: str) -> tuple[str, str]:
+    """Return what a step did on a plant that has what its model lacks, in words, and graded: it fails where
+    it never settles, and goes three bands too far or ends as far off."""
     settled = bool(np.isfinite(result.settle_s))
     late = not settled or bool(asked.pace_s and result.settle_s > asked.pace_s)
     over, off = result.overshoot / asked.overshoot_degC, abs(result.bias) / asked.bias_degC
-    # one that settled is inside its band, one that never does swings, or stands outside of it
-    beyond = min(off, _FAR_BEYOND) if settled else abs(result.bias) / asked.band_degC
+    lost = not settled and max(abs(result.bias), result.overshoot) > _FAR_BEYOND * asked.band_degC
     name = f"{result.output} " if result.output else ""
     parts = [
         f"settles in {result.settle_s:.0f} s" if settled else "never settles",
@@ -196,9 +195,10 @@ def _lacked(result: StepResult, asked: Asked, what: str) -> tuple[str, float]:
         f"offset {result.bias:.2f}",
     ]
     gone = (late and asked.pace_s > 0, over > 1, off > 1)
-    limits = (asked.pace_s, asked.overshoot_degC, asked.bias_degC)
-    said = [part + f" (asked {most:g})" * broken for part, broken, most in zip(parts, gone, limits)]
-    return f"{what}: {name}{', '.join(said)}", max(over, beyond, 1.01 if late else 0.0)
+    limits = (f"{asked.pace_s:g} s", f"{asked.overshoot_degC:g}", f"{asked.bias_degC:g}")
+    said = [part + f" (asked {most})" * broken for part, broken, most in zip(parts, gone, limits)]
+    verdict = "fail" if lost else "warn" if late or over > 1 or off > 1 else "pass"
+    return f"{what}: {name}{', '.join(said)}", verdict
 
 
 class _Counted(Controller):

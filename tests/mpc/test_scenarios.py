@@ -104,7 +104,7 @@ def test_the_prediction_of_a_slow_computer_counts_from_when_its_move_is_applied(
 def test_anti_windup_takes_overshoot_away(tank, monkeypatch):
     over = []
     for uncut in (1e-9, np.inf):  # np.inf: the integrator goes on while the drive is limited
-        monkeypatch.setattr("thermogrip.mpc.controllers.pi._UNCUT", uncut)
+        monkeypatch.setattr("thermogrip.mpc.controllers.pi.UNCUT", uncut)
         pi = PIController(tank, dt=2.0)
         over.append(run(pi, tank, 18.0, 43.0, seconds=900.0)[1].overshoot)
     assert over[0] < 0.7 * over[1]

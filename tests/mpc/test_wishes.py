@@ -183,7 +183,7 @@ def test_an_output_that_the_drive_brings_there_just_in_time_does_not_ramp(board)
 
 def test_a_review_says_of_each_output_how_long_it_takes_where_structure_is_missing():
     controller = paced_kit(SETTLING)
-    spec = {"steps": [[25.0, 40.0]], "settle_within_s": 150.0, "hold_s": 900.0}
+    spec = {"steps": [[25.0, 40.0]], "settle_within_s": 150.0, "hold_s": 900.0, "overshoot_degC": 9.0}
     for within, verdict in ((600.0, "pass"), (300.0, "warn")):
         controller.notes["spec"] = spec | {"settling": {"t2": {"within_s": within, "band_degC": 0.5}}}
         check = lacks_structure(controller, (25.0, 40.0))
