@@ -160,4 +160,4 @@ class ActiveSetQP(CondensedQP):
 def _solution(K: Array, right: Array) -> Array:
     """Return K^-1 right by Cholesky's method; where rounding has left K without a root, by elimination."""
     _, found, failed = dposv(K, right)
-    return np.linalg.solve(K, right) if failed else np.asarray(found)
+    return np.asarray(np.linalg.solve(K, right) if failed else found, dtype=np.float64)
