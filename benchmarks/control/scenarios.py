@@ -52,6 +52,10 @@ class ScenarioOptimiser(Optimiser):
         one's."""
         models = [prediction_model(plant, design.dt) for plant in plants]
         super().__init__(models[0], design)
+        if (
+            design.iterations > 1
+        ):  # improved until it stays, it is judged by its simulation, not by a gain at rest
+            self.seen[:] = False
         self.others = [Optimiser(model, design) for model in models[1:]]
         n, n_u, count = self.n_b * self.model.n_u, self.model.n_u, len(models)
         self.places, self.own, self.kept = [], own, None
