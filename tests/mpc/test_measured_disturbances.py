@@ -360,8 +360,8 @@ def test_a_drive_that_serves_a_limit_alone_is_not_held_to_its_gain_on_a_target()
     seen = controller.optimiser.seen
     assert seen[:, drives.index("inflow")].any()
     assert not seen[:, drives.index("heat")].any()
-    # a plan that is improved until it stays is judged by its simulation alone
-    assert not mixed(limits={"t": (10.0, 50.0)}, iterations=3).optimiser.seen.any()
+    # a plan that is improved until it stays needs it too: beyond an optimum it would go to and fro
+    np.testing.assert_array_equal(mixed(limits={"t": (10.0, 50.0)}, iterations=3).optimiser.seen, seen)
     # without a limit to serve the gain is all that speaks for a drive
     plain = mixed().optimiser
     rest = np.abs(plain.at_rest)
