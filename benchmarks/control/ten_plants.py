@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+from more_truths import MORE_CASES
 from opponents import DoMPC, SimcPI, first_order
 from truths import CASES, Array, Case, Signal, record
 
@@ -256,7 +257,7 @@ def main() -> None:
     given = parser.parse_args()
     if given.keep is not None:
         given.keep.mkdir(parents=True, exist_ok=True)
-    by_name = {case.name: case for case in CASES}
+    by_name = {case.name: case for case in (*CASES, *MORE_CASES)}
     lines, marks = [HEAD], []
     print(HEAD)
     for name in given.plants.split(","):
