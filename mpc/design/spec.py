@@ -124,7 +124,7 @@ class Spec(BaseModel):
     check_draws: Annotated[int, Field(ge=1, le=200)] = 5  # of the plant, in the final comparison
     evaluations: Annotated[int, Field(ge=1, le=10000)] = 20  # designs that the search may try
     # what the plant may have that the model lacks: a lag of every sensor and a delay of the drives, in its
-    # apparent delays, and a share of the drives that does nothing; 0 is not tried
+    # apparent delays, and a share of the drives that does nothing; 0 is not tried, more than this is expected
     extra_lag: Annotated[NotNegative, Field(le=10)] = 0.5
     extra_delay: Annotated[NotNegative, Field(le=10)] = 0.5
     lost_gain: Annotated[NotNegative, Field(lt=1)] = 0.15

@@ -15,7 +15,8 @@ So a plant in mK, with a spec in mK, has the score of the same plant in K. Where
 noises, a step on a draw costs their mean. Over the runs, the score is the mean plus half of what the worst is
 above it: the draws stand for what the plant may be. All of them have the model's structure. What that may
 lack (sensors that are slower, a longer delay, a weaker drive) is tried one by one on the first draw, for as
-long as a step is held, since such runs settle last; their mean counts a little. Beyond five bounds such a run
+long as a step is held, since such runs settle last; their mean counts a little. What a spec doubts more
+than the default does is expected: it counts as any other draw. Beyond five bounds a run that lacks structure
 counts by its logarithm: one that does not settle lasts as long as the spec holds a step, which has nothing to
 do with the plant.
 
@@ -124,6 +125,23 @@ def lacking(plant: Plant, spec: Spec, controlled: Sequence[str]) -> list[tuple[s
         (lost, f"drive weaker by {100 * lost:.2g} %", {"drive_share": 1.0 - lost}),
     ]
     return [(words, changes) for value, words, changes in tried if value > 0]
+
+
+_DOUBTS = ("extra_lag", "extra_delay", "lost_gain")  # in the order of :func:`lacking`
+
+
+def expected(spec: Spec) -> set[int]:
+    """Return which structures of :func:`lacking`, counted from 1, the spec doubts more than the default does:
+    a user who states that the sensor may be slower by 6 s wants a design for it."""
+    tried = [name for name in _DOUBTS if getattr(spec, name) > 0]
+    usual = {name: Spec.model_fields[name].default for name in tried}
+    return {at for at, name in enumerate(tried, start=1) if getattr(spec, name) > usual[name]}
+
+
+def counting(results: Sequence[StepResult], spec: Spec) -> list[StepResult]:
+    """Return the results whose plant is as its model is, or as the spec expects it to be."""
+    planned = expected(spec) | {0}
+    return [result for result in results if result.draw // STRUCTURE in planned]
 
 
 def cold_steps(plant: Plant, spec: Spec, controlled: Sequence[str]) -> list[tuple[float, float]]:
@@ -252,9 +270,13 @@ def score(results: Sequence[StepResult], spec: Spec, bounds: Bounds) -> float:
         cost += spec.energy_weight * result.energy_s / unit + spec.moves_weight * result.travel
         costs.setdefault((result.start, result.target, result.draw, result.output), []).append(cost)
     of = {key: float(np.mean(noises)) for key, noises in costs.items()}
-    own = [cost for (_, _, draw, _), cost in of.items() if draw < STRUCTURE]
-    others = np.array([cost for (_, _, draw, _), cost in of.items() if draw >= STRUCTURE])
-    others = np.where(others > LATE, LATE * (1 + np.log(np.maximum(others, LATE) / LATE)), others)
+    planned = expected(spec) | {0}
+    own, others = [], []
+    for (_, _, draw, _), cost in of.items():
+        structure = draw // STRUCTURE
+        if structure and cost > LATE:
+            cost = LATE * (1 + np.log(cost / LATE))
+        (own if structure in planned else others).append(cost)
     return float(0.5 * (np.mean(own) + np.max(own)) + LACKING * np.sum(others) / max(1, len(others)))
 
 
@@ -495,14 +517,19 @@ class Search:
         lengths = None if whole else self.lengths
         count = noises if quick else 1
         # the comparison of a plant without draws has a seed of its own
-        others = range(count * other_noise, count * (other_noise + 1))
-        seeds = [self.seed + (noise and noise + 1) for noise in others]
+        those = range(count * other_noise, count * (other_noise + 1))
+        seeds = [self.seed + (noise and noise + 1) for noise in those]
         found: list[StepResult] = []
+        counted = expected(self.spec)
+        others = [draw for draw in self.lacking if draw // STRUCTURE not in counted]
+        planned = [draw for draw in self.lacking if draw // STRUCTURE in counted]
         for seed in seeds:
             found += run_trials(controller, self.plant, spec, self.draws, lengths=lengths, seed=seed)
+            if planned:  # which settles last: for as long as a step is held
+                found += run_trials(controller, self.plant, spec, planned, seed=seed)
         if name != "LQR":
-            found += run_trials(controller, self.plant, spec, self.lacking, seed=seeds[0])
-        results = [result for result in found if result.draw < STRUCTURE]
+            found += run_trials(controller, self.plant, spec, others, seed=seeds[0])
+        results = counting(found, self.spec)
         return Trial(
             controller=name,
             parameters=dict(parameters),

@@ -53,6 +53,7 @@ from thermogrip.mpc.tuning.objective import (
     StepResult,
     Trial,
     bound_of,
+    counting,
     lacking,
     parameters_of,
     scaled_loops,
@@ -365,7 +366,7 @@ def tune(
     }
     results = _compare(search, candidates, workers, sub_progress(progress, _TRADED, _COMPARED))
     scores = {name: score(part, spec, search.bounds) for name, part in results.items()}
-    own = {name: [result for result in part if result.draw < STRUCTURE] for name, part in results.items()}
+    own = {name: counting(part, spec) for name, part in results.items()}
     moved = {name: np.mean([result.travel for result in part]) for name, part in own.items()}
     stiller = moved["tuned"] < moved["baseline"] / (1 + _STILL)
     alike = 1 + (_ALIKE_IN_NOISE if stiller else _ALIKE if moved["tuned"] < moved["baseline"] else 0.0)

@@ -129,6 +129,43 @@ def test_each_controller_is_tried_for_its_own_length(monkeypatch: pytest.MonkeyP
     assert [seed for _, draws, _, seed in seen if draws != [1, 2]] == [3, 7]
 
 
+def test_what_a_spec_doubts_more_than_the_default_is_tried_and_counts_as_any_draw(monkeypatch):
+    assert objective.expected(SPEC) == set()
+    doubts = {"extra_lag": 0.0, "extra_delay": 0.6, "lost_gain": 0.15}
+    late = SPEC.model_copy(update=doubts)
+    assert objective.expected(late) == {1}  # the first of the two that are tried
+    assert objective.expected(SPEC.model_copy(update={"lost_gain": 0.2})) == {3}
+    assert objective.expected(SPEC.model_copy(update={"lost_gain": 0.1})) == set()
+
+    search = search_of(lambda *at: 60.0, spec=late)
+    monkeypatch.setattr(search, "made", lambda name, design: name)
+    search._compiled, seen = True, []
+
+    def run(controller: Any, plant: Any, spec: Spec, draws: Any, *, seed: int, lengths: Any = None) -> Any:
+        seen.append((controller, tuple(draws), seed))
+        return [
+            StepResult(28.0, 36.0, at, 60.0, 0.1 + at / 2e4, 0.0, 0.0, 0.0, 0.0, 0.5, 300.0) for at in draws
+        ]
+
+    monkeypatch.setattr(objective, "run_trials", run)
+    tried = search.evaluate({"move": 7.0})
+    own = [(draws, seed) for seed in (3, 5, 6) for draws in ((1, 2), (1001,))]  # in each of three noises
+    assert seen == [("MPC", *item) for item in [*own, ((2001,), 3)]]
+    # a ramp may help; the overshoot with a weaker drive does not count
+    assert tried.overshoot == pytest.approx(0.15005)
+    seen.clear()
+    search.evaluate({"move": 7.0}, "LQR")
+    assert seen == [("LQR", (1, 2), 3), ("LQR", (1001,), 3)]
+
+    results = run("MPC", None, late, [1, 1001, 2001], seed=3)
+    results[1] = replace(results[1], settle_s=240.0)
+    results[2] = replace(results[2], settle_s=120.0)
+    bounds = {(28.0, 36.0, 1): 60.0}
+    assert score(results, late, bounds) == pytest.approx(2.5 + 0.5 * 1.5 + 0.05 * 2.0)
+    assert score(results, SPEC, bounds) == pytest.approx(1.0 + 0.05 * (4.0 + 2.0) / 2)
+    assert objective.counting(results, late) == results[:2]
+
+
 FAR = SPEC.model_copy(update={"ambient_degC": 20.0})  # 16 degC below the first target, steps are of 8
 
 
