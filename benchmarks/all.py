@@ -21,7 +21,7 @@ import threading
 import time
 from importlib.util import find_spec
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 HERE = Path(__file__).parent
 
@@ -35,7 +35,9 @@ class Benchmark(NamedTuple):
     needs: tuple[str, ...] = ()
 
 
-# {data}: the folder of public data; {out}: that of the results; {model}: a posterior of the example grasps
+PEERS = ("sippy", "nfoursid", "sysidentpy", "jax_sysid")
+# {data}: the folder of public data; {out}: that of the results; {grasps}: the example grasps; {model}: a
+# posterior of some of them; {plant}, {controller}: of the example logs
 ALL = [
     Benchmark("terminal/mistakes.py"),
     Benchmark("hostile/files.py", quick="--only csv"),
@@ -44,24 +46,62 @@ ALL = [
         "identify/peers.py",
         "{data} --out {out}/peers.json",
         "{data} --out {out}/peers.json --only tclab_prbs",
-        ("sippy", "nfoursid", "sysidentpy", "jax_sysid"),
+        PEERS,
     ),
+    Benchmark("abroad/peers.py", "{data}", "{data} --sets house", PEERS),
     Benchmark("identify/bands.py", "{data}", "{data} --kinds arx"),
     Benchmark("identify/left.py", quick="--logs 5 --only tclab"),
     Benchmark("identify/lost.py", quick="--seeds 1 --only tclab"),
     Benchmark("identify/fleet.py", "--seeds 4", "--rigs 6 --seeds 1"),
     Benchmark("abroad/score.py", "{data}", "{data} --sets house,dryer"),
+    Benchmark("abroad/feedthrough.py", "{data}", "{data} --sets house"),
+    Benchmark("abroad/step_tests.py", "{data}", "{data}"),
     Benchmark("coverage/study.py", "table", "table"),
     Benchmark("coverage/ranks.py", "run --count 100", "run --count 5"),
+    Benchmark("coverage/merged.py"),
+    Benchmark("coverage/starts.py"),
+    Benchmark("excite/predicted_precision.py"),
     Benchmark("mpc/compare.py", quick="--quick", needs=("do_mpc",)),
+    Benchmark("mpc/sizes.py", "--peer", "--quick --states 4"),
     Benchmark("mpc/twenty_plants.py", quick="--plants 2"),
     Benchmark("mpc/call_periods.py", quick="--draws 0 --controllers MPC"),
     Benchmark("control/mismatch.py", quick="--seeds 4 --only delay"),
     Benchmark("control/detectable.py"),
     Benchmark("control/faults.py", quick="--seeds 4"),
-    Benchmark("control/ten_plants.py", quick="--plants tclab --without do-mpc"),
+    Benchmark(
+        "control/ten_plants.py", "--keep {out}/ten", "--plants tclab --without do-mpc --keep {out}/ten"
+    ),
+    Benchmark("control/late.py", "--keep {out}/ten", "--keep {out}/ten --plants tclab --times 1,2"),
+    Benchmark("control/moving_horizon.py", quick="--seeds 0"),
+    Benchmark("control/multistage.py", quick="--draws 1 --steps 10", needs=("do_mpc",)),
+    Benchmark("control/scenarios.py", quick="--seeds 0 --draws 2"),
     Benchmark("classify/engine.py", quick="--grasps 5"),
-    Benchmark("classify/table.py", "--splits 20", "--splits 2 --quick"),
+    Benchmark(
+        "classify/table.py", "--splits 20 --out {out}/table.json", "--splits 2 --quick --out {out}/table.json"
+    ),
+    Benchmark("classify/chance.py", "{out}/table.json", "{out}/table.json"),
+    Benchmark(
+        "classify/compare_classifiers.py",
+        "--out {out}/comparison",
+        "--out {out}/comparison --splits 1 --classifiers posterior,pca-lda",
+    ),
+    Benchmark(
+        "classify/confidence.py",
+        "--comparison {out}/comparison/posterior.json",
+        "--comparison {out}/comparison/posterior.json --refits 0",
+    ),
+    Benchmark("classify/bayes.py", "{grasps}", "{grasps} --splits 1"),
+    Benchmark("classify/block_loss.py"),
+    Benchmark("classify/no_difference.py", quick="--sets 4 --refits 1 --generic 2"),
+    Benchmark("classify/own_bound.py", quick="--repeats 4"),
+    Benchmark("classify/room.py", quick="--test 2"),
+    Benchmark("classify/truth.py", quick="--repeats 1"),
+    Benchmark("classify/unlike_training.py", quick="--parts stop --sets 2"),
+    Benchmark("classify/two_sensor_emcee.py", quick="--grasps 1 --steps 300"),
+    Benchmark("classify/two_sensors.py", "{data}", "{data} --sensors heated --classifiers vote"),
+    Benchmark(
+        "classify/ambiguous.py", "{data}", "{data} --train 1-5 --test 21-22 --classifiers posterior,pca-lda"
+    ),
     Benchmark("classify/fresh.py", quick="--sets 1 --test 5 --hundreds 0"),
     Benchmark("classify/grippers.py", quick="--grippers 1"),
     Benchmark("classify/transfer.py", quick="--sets 1 --test 3 --classifiers posterior,pca-lda"),
@@ -71,21 +111,55 @@ ALL = [
     Benchmark("classify/hold.py", "{data}", "{data} --classifiers bayes,pca-lda"),
     Benchmark("classify/scale.py", "{out}/scale --files 2 20 --kill", "{out}/scale --files 1 3 --kill"),
     Benchmark("classify/serve.py", "{model}", "{model} --grasps 400 --in-process 50", ("uvicorn",)),
+    Benchmark("workers.py", "{out}/workers", "{out}/workers effusivity --files 2"),
     Benchmark("rig/jitter.py"),
+    Benchmark("rig/fuzz.py", quick="--inputs 20000"),
+    Benchmark("rig/live.py", quick="--seconds 10 --block 5 --viewers 1", needs=("uvicorn",)),
+    Benchmark("rig/board.py"),
+    Benchmark(
+        "rig/nominal.py",
+        "--plant {plant} --controller {controller} --out {out}/nominal.json",
+        "--plant {plant} --controller {controller} --minutes 1 --draws 2 --out {out}/nominal.json",
+    ),
     Benchmark("rig/day.py", "--out {out}/day", "--hours 0.5 --grasps 5 --minutes 5 --out {out}/day"),
 ]
+#: What these write is a page of the docs, from results of the others.
+NOT_RUN = ("rig/faults.py",)
+MADE = ("grasps", "model", "plant", "controller")
+LOGS = ("prbs_heating_cooling", "step_up_down", "multisine", "pump_on_off")
+MISSING = 77  # the exit code of a benchmark that lacks a tool of the system
 
 
-def model_of(out: Path) -> Path:
-    """Return a posterior trained on the example grasps, made where it is absent."""
-    from thermogrip.datasets.examples import example_path
+def made(name: str, out: Path) -> Path:
+    """Return what benchmarks are about, made from the examples where it is absent: see :data:`ALL`."""
+    from thermogrip.datasets.examples import copy_examples
 
-    model = out / "model"
-    if not model.exists():
-        grasps = str(example_path("exp1A_obj43_grip23"))
-        words = ["train", grasps, "--classifier", "posterior", "--split", "all", "--out", str(model)]
-        subprocess.run([sys.executable, "-m", "thermogrip", *words], check=True)
-    return model
+    examples = out / "examples"
+    if not examples.exists():
+        copy_examples(examples)
+    at = {"grasps": examples / "grasps", "model": out / "model", "plant": out / "plant.json"}
+    if name == "controller":
+        at[name] = out / "controller.json"
+        if not at[name].exists():
+            default_controller(made("plant", out)).save(at[name])
+    elif not at[name].exists():
+        logs = [str(examples / f"{log}.csv.xz") for log in LOGS]
+        words = {
+            "model": ["train", str(at["grasps"] / "exp1A_obj43_grip23.csv.xz"), "--classifier", "posterior",
+                      "--split", "all"],
+            "plant": ["identify", *logs, "--network", "gripper", "--models", "network"],
+        }[name]  # fmt: skip
+        subprocess.run([sys.executable, "-m", "thermogrip", *words, "--out", str(at[name])], check=True)
+    return at[name]
+
+
+def default_controller(plant: Path) -> Any:
+    """Return the controller of a plant that nobody tuned."""
+    from thermogrip.mpc import Controller, Spec
+    from thermogrip.sysid import Plant
+
+    of = Plant.load(plant)
+    return Controller(of, Spec.of(of).design(of))
 
 
 def left_out(benchmark: Benchmark, words: str, data: Path | None) -> str:
@@ -147,13 +221,14 @@ def main() -> int:
             if not given.list:
                 part.write_text(f"`{said}`: left out, {why}.\n", encoding="utf-8")
             continue
-        model = model_of(given.out) if "{model}" in words else None
-        filled = words.format(data=given.data, out=given.out, model=model).split()
+        named = {name: made(name, given.out) for name in MADE if f"{{{name}}}" in words}
+        filled = words.format(data=given.data, out=given.out, **named).split()
         command = [sys.executable, str(HERE / benchmark.program), *filled]
         to = part_of(given.out, benchmark, ".txt")
         code, wall, cpu = ran(command, to, 60 * given.limit)
-        failed += code != 0
-        about = f"{wall:.0f} s, {cpu:.0f} s of CPU" + (f", exit code {code}" if code else "")
+        failed += code not in (0, MISSING)
+        end = ", a tool is missing" if code == MISSING else f", exit code {code}" if code else ""
+        about = f"{wall:.0f} s, {cpu:.0f} s of CPU{end}"
         print(f"{said}  ({about})", flush=True)
         printed = to.read_text(encoding="utf-8", errors="replace").rstrip()
         rows = [f"## {benchmark.program}", "", f"`{said}` ({about})", "", "```", printed, "```", ""]

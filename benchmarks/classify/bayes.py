@@ -32,7 +32,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--own", default="pca-lda")
     given = parser.parse_args()
-    files = [f for f in sorted(given.folder.glob("*.csv")) if not f.name.endswith("_meta.csv")]
+    files = [f for f in sorted(given.folder.glob("*.csv*")) if "_meta.csv" not in f.name]
     records = [read_grasps(f) for f in files]
     single = [g for g in records if not scored_apart(g)]
     known = [g for g in single if set(np.unique(g["material"].values)) <= trained(single)]
