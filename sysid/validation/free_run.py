@@ -184,6 +184,7 @@ def free_run(
     # means over the fit's own blocks: an error as slow as the log correlates with no input, but shows here
     blocks = _blocks_of_fit(plant, rows.time)
     beyond = _beyond_fit(plant, residual, _beside(plant, rows, run, scored, blocks).outputs if blocks else {})
+    gain = _gain_note(plant, log, rows.y - np.where(scored[:, None], run, np.nan), units) if tests else []
     outside = _outside(plant, {name: column(log, name) for name in plant.valid if name in log})
     unseen = [name for name in outside if name not in plant.outputs]
     notes = (
@@ -192,6 +193,7 @@ def free_run(
         *_notes(float(rows.time[0]), found, held, no_better),
         *_residual_notes(whiteness, residual, units, warmup, unseen),
         *_excess_notes(plant, beyond, units),
+        *gain,
         *_outside_notes(plant, outside),
     )
     exceeds_fit = {name: here / there for name, (here, there) in beyond.items()}
@@ -355,6 +357,22 @@ def _excess_notes(
         f"by {there:.2g} {units[name]} in the fit: slow terms are missing, or the plant is not quite what it "
         "was in the fit"
         for name, (here, there) in beyond.items()
+    ]
+
+
+def _gain_note(plant: Plant, log: Log, miss: Array, units: Mapping[str, str]) -> list[str]:
+    """Return what a gain that is not that of the fit explains, where it is most of the error."""
+    from thermogrip.sysid.validation.prediction_bands import gain_of_run  # scipy.special
+
+    found = gain_of_run(plant, miss, log)
+    if found is None:
+        return []
+    gain, left = found
+    sizes = ", ".join(f"{name} {rms:.2g} {units[name]}" for name, rms in zip(plant.outputs, left))
+    how = f"{100 * abs(gain):.0f} % {'more' if gain > 0 else 'less'}"
+    return [
+        f"most of the error is one gain: inputs that do {how} than in the fit would leave {sizes}; another "
+        "supply, or another cooling? Identify with this log as well"
     ]
 
 

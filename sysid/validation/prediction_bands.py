@@ -96,6 +96,8 @@ from thermogrip.sysid.plant.simulation import find_starts
 SHORT = 0.1  # of the level: a part on which the expected coverage falls short by more is reported
 #: Standard deviation of a black box's gain on a run whose inputs have e times the effect they had in the fit.
 GAIN_OF_SIZE = 0.4
+_DIVERGED = 1e6  # of an output's spread
+_SMALL = 0.05  # change of the inputs by which their effect is found
 _UNLIKE = 0.1  # of the run's error: what a run unlike the fit adds, from which it is reported
 
 
@@ -182,6 +184,11 @@ def between_runs(plant: Plant, logs: Sequence[Log], gain: float = RUN_GAIN_SD) -
     none of its own."""
     if not 0 < len(plant.logs) < SEVERAL:
         return {}
+    return effect_of_inputs(plant, logs, gain)
+
+
+def effect_of_inputs(plant: Plant, logs: Sequence[Log], gain: float) -> dict[str, Array]:
+    """Return by output what inputs that do less by so large a share change at each row of the logs."""
     moving = set(plant.inputs) - set(plant.model.switches)
     nearest = {name: np.clip(0.0, *plant.valid.get(name, (0.0, 0.0))) for name in moving}
     changes = []
@@ -193,6 +200,28 @@ def between_runs(plant: Plant, logs: Sequence[Log], gain: float = RUN_GAIN_SD) -
             log[name] = log[name].copy(data=u - gain * (u - nearest[name]))
         changes.append(change - columns(plant.simulate(log), plant.outputs))
     return dict(zip(plant.outputs, np.concatenate(changes).T))
+
+
+def gain_of_run(plant: Plant, miss: Array, log: Log) -> tuple[float, Array] | None:
+    """Return by how large a share the inputs did more in a run than in the fit, by least squares of what the
+    free run missed (n, n_y), NaN where it is not scored, in the spread of each output; and what that leaves
+    (n_y,) as rms. None where it is within two standard deviations of what differs from run to run, or leaves
+    half of the squared error."""
+    effects = effect_of_inputs(plant, [log], _SMALL)
+    effect = np.array([effects[name] for name in plant.outputs]).T / _SMALL
+    spread = np.array([np.nanstd(column(log, name)) for name in plant.outputs])
+    with np.errstate(over="ignore", invalid="ignore"):  # a run that diverged has no gain
+        known = (
+            np.isfinite(miss) & (np.abs(effect) < _DIVERGED * spread) & (np.abs(miss) < _DIVERGED * spread)
+        )
+    size, gap = (np.where(known, each / np.where(spread > 0, spread, 1.0), 0.0) for each in (effect, miss))
+    if not np.any(size):
+        return None
+    gain = float(np.sum(size * gap) / np.sum(size**2))
+    if abs(gain) <= 2 * RUN_GAIN_SD or np.sum((gap - gain * size) ** 2) > 0.5 * np.sum(gap**2):
+        return None
+    left = np.where(known, miss - gain * effect, np.nan)
+    return gain, np.sqrt(np.nanmean(left**2, axis=0))
 
 
 def beyond_range(plant: Plant, logs: Sequence[Log]) -> dict[str, float]:

@@ -302,6 +302,28 @@ def test_an_error_of_more_than_twice_that_of_the_fit_is_stated(here, noise, seco
 
 
 @pytest.mark.parametrize(
+    ("gain", "pole", "how"),
+    [
+        (0.5 / 1.25, 0.95, "25 % more"),
+        (0.5 / 0.8, 0.95, "20 % less"),
+        (0.5 / 1.08, 0.95, None),
+        (0.25, 0.975, None),
+    ],
+)
+def test_one_gain_that_explains_most_of_the_error_is_said_and_a_lag_is_not_taken_for_it(gain, pole, how):
+    log = lag_log(4000, noise=0.1, seed=1)
+    two = log.assign(r=log["t"] * 10 + 3)
+    model = StateSpaceModel(
+        ("q",), (), ("t", "r"), A=[[pole]], B=[[gain]], C=[[1.0], [10.0]], dt=1.0, spread=[[4.0]]
+    )
+    plant = Plant(model, {}, dt=1.0, noise={"t": 0.01, "r": 0.1}, offsets={"r": 3.0})
+    said = [note for note in free_run(plant, two).notes if "most of the error is one gain" in note]
+    assert bool(said) == bool(how)
+    if how:
+        assert f"inputs that do {how} than in the fit would leave t 0.1 degC, r 1" in said[0]
+
+
+@pytest.mark.parametrize(
     ("far", "rows", "share"),
     [(-0.11, 2, 2), (2.11, 2, 2), (2.11, 1, None), (-0.1, 9, None), (2.1, 9, None), (-0.101, 25, 25)],
 )
