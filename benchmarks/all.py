@@ -75,7 +75,7 @@ ALL = [
     Benchmark("control/moving_horizon.py", quick="--seeds 0"),
     Benchmark("control/multistage.py", quick="--draws 1 --steps 10", needs=("do_mpc",)),
     Benchmark("control/scenarios.py", quick="--seeds 0 --draws 2"),
-    Benchmark("classify/engine.py", quick="--grasps 5"),
+    Benchmark("classify/engine.py", quick="--grasps 5", needs=("jax", "numpyro")),
     Benchmark(
         "classify/table.py", "--splits 20 --out {out}/table.json", "--splits 2 --quick --out {out}/table.json"
     ),

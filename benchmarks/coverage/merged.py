@@ -30,7 +30,7 @@ def mode(problem: Problem, z: Array) -> Array:
     """Return the mode of the hierarchical likelihood, three linearisations from the fit at most."""
     for _ in range(3):
         data = linearise_logs(problem, z, problem.by_log(z, central=True))
-        width = [1.5] * data.terms + [0.7] * (len(data.kinds) - data.terms)
+        width = [1.5] * data.n_responses + [0.7] * (len(data.kinds) - data.n_responses)
         said = information(learn_error_model(data.logs, z, width=width), data.logs, z)
         step = np.clip(said.mean[: z.size] - z, -1.0, 1.0)
         z = np.clip(z + step, *problem.box)
