@@ -77,6 +77,22 @@ def tuning_of(**changes: Any) -> Any:
 
 
 @pytest.mark.parametrize(
+    ("figures", "tone"),
+    [
+        ({}, "good"),
+        ({"settle_s": 460.0}, "warn"),
+        ({"settle_s": np.nan}, "warn"),
+        ({"overshoot": 0.31}, "warn"),
+        ({"bias": -0.06}, "warn"),
+    ],
+)
+def test_a_step_is_good_where_each_output_is_as_the_spec_asks(figures: dict, tone: str) -> None:
+    met = {"output": "t1", "settle_s": 440.0, "overshoot": 0.29, "bias": -0.04}
+    run: Any = SimpleNamespace(segments=[SimpleNamespace(**met), SimpleNamespace(**met | figures)])
+    assert control._tone(Spec(steps=STEPS), run) == tone
+
+
+@pytest.mark.parametrize(
     ("meets", "known", "tone", "says", "of"),
     [
         (True, True, "good", "It meets the spec on every draw.", "5 draws of the plant"),

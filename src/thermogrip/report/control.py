@@ -110,10 +110,25 @@ def tuning_sections(tuning: Tuning) -> list[Section]:
         tuning_section(tuning),
         pareto_section(tuning),
         sensitivity_section(tuning),
-        *(loop_section(run, design, f"The step from {step} degC") for step, run in steps.items()),
+        *(
+            loop_section(run, design, f"The step from {step} degC", tone=_tone(tuning.spec, run))
+            for step, run in steps.items()
+        ),
         timing_section([float(seconds) for run in steps.values() for seconds in run.seconds], design),
         spec_section(tuning),
     ]
+
+
+def _tone(spec: Spec, run: ClosedLoop) -> str:
+    """Return "good" where every output of a step is as the spec asks, else "warn"."""
+    asked = [(segment, spec.asked(segment.output)) for segment in run.segments]
+    met = [
+        of.settle_s <= wanted.within_s
+        and of.overshoot <= wanted.overshoot_degC
+        and abs(of.bias) <= wanted.bias_degC
+        for of, wanted in asked
+    ]  # False where it does not settle
+    return "good" if all(met) else "warn"
 
 
 def tuning_section(tuning: Tuning) -> Section:
