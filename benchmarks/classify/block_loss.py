@@ -33,8 +33,8 @@ def fitted():
     """Return the calibration on the bundled training grasps, and problem, last step, w, spreads and noise."""
     seen, fit = [], calibration._fit
 
-    def spy(problem, theta, w, spread, noise, progress):
-        step, w, spread = fit(problem, theta, w, spread, noise, progress)
+    def spy(problem, theta, w, spread, noise, progress, **how):
+        step, w, spread = fit(problem, theta, w, spread, noise, progress, **how)
         seen.append((problem, step.theta, w, spread, noise))
         return step, w, spread
 
