@@ -33,17 +33,30 @@
 
 static int row_of(const tg_design *s, int r) { return r < s->n_c ? s->controlled[r] : s->limited[r - s->n_c]; }
 
-/* What all outputs read. */
-static void read_outputs(const tg_design *s, const double *x, const double *bias, double *y)
+/* What all outputs read: of one state each, or of all between two, and a level. */
+typedef struct {
+    double level[TG_NY], share[TG_NY];
+    int from[TG_NY], single;
+} tg_outputs;
+
+static void set_outputs(const tg_design *s, const double *bias, tg_outputs *of)
 {
+    of->single = 1;
     for (int i = 0; i < TG_NY; i++) {
-        const double *C = s->C + i * TG_NX;
-        int j = s->read_from[i], end = s->read_to[i];
-        double sum = s->y0[i] + bias[i] + C[j] * x[j]; /* most are of one state */
-        while (++j < end)
-            sum += C[j] * x[j];
-        y[i] = sum;
+        of->from[i] = s->read_from[i];
+        of->share[i] = s->C[i * TG_NX + of->from[i]];
+        of->level[i] = s->y0[i] + bias[i];
+        of->single = of->single && s->read_to[i] <= of->from[i] + 1;
     }
+}
+
+static void read_outputs(const tg_design *s, const tg_outputs *of, const double *x, double *y)
+{
+    for (int i = 0; i < TG_NY; i++)
+        y[i] = of->level[i] + of->share[i] * x[of->from[i]];
+    for (int i = 0; !of->single && i < TG_NY; i++)
+        for (int j = of->from[i] + 1; j < s->read_to[i]; j++)
+            y[i] += s->C[i * TG_NX + j] * x[j];
 }
 
 static const double *response(const tg_controller *c, int k, int r)
@@ -111,8 +124,10 @@ void tg_simulate(tg_controller *c, const double *start, const double *plan, cons
 {
     const tg_design *s = c->design;
     double both[2][TG_NX], *x = both[0], *next = both[1], four[4 * TG_NU];
+    tg_outputs outputs;
     int k = 0;
     memcpy(x, start, sizeof both[0]);
+    set_outputs(s, bias, &outputs);
     for (int b = 0; b < s->n_b; b++) {
         const double *u = four + b % 4 * TG_NU, *h = c->by_drives + b % 4;
         if (b % 4 == 0)
@@ -124,7 +139,7 @@ void tg_simulate(tg_controller *c, const double *start, const double *plan, cons
                 x = next;
                 next = swap;
             }
-            read_outputs(s, x, bias, y + k * TG_NY);
+            read_outputs(s, &outputs, x, y + k * TG_NY);
         }
     }
 }
@@ -156,7 +171,7 @@ static void read_row(const tg_design *s, int i, const double *now, int groups, d
 /* Drives of a block as directions of the groups of four columns that they are in. */
 static void seed_drives(tg_controller *c, int begun)
 {
-    memset(c->seed_u, 0, sizeof c->seed_u);
+    memset(c->seed_u, 0, (size_t)(TG_WHOLE(begun % 4 + TG_NU) * TG_NU) * sizeof(double));
     for (int j = 0; j < TG_NU; j++) {
         int column = begun % 4 + j;
         c->seed_u[(column / 4) * 4 * TG_NU + 4 * j + column % 4] = c->design->span[j];
@@ -170,15 +185,18 @@ static void linearise(tg_controller *c, const double *start, const double *guess
     const tg_design *s = c->design;
     double both[2][TG_NX], *x = both[0], *next = both[1], four[4 * TG_NU];
     double *now = c->seed, *then = c->seed + TG_NX * TG_WIDE;
+    tg_outputs outputs;
     int k = 0, rows = s->n_c + s->n_l;
+    const int *from = c->qp.start, *filled = c->qp.filled;
     memcpy(x, start, sizeof both[0]);
+    set_outputs(s, bias, &outputs);
     lay_out(c);
     for (int b = 0, groups = 0; b < s->n_b; b++) {
         int begun = b * TG_NU, before = begun / 4 * 4 * TG_NX, needed = TG_WHOLE(begun + TG_NU) / 4;
         const double *u = four + b % 4 * TG_NU, *h = c->by_drives + b % 4;
         seed_drives(c, begun);
-        memset(now + groups * 4 * TG_NX, 0, (size_t)((needed - groups) * 4 * TG_NX) * sizeof(double));
-        groups = needed;
+        for (; groups < needed; groups++)
+            memset(now + groups * 4 * TG_NX, 0, 4 * TG_NX * sizeof(double));
         if (b % 4 == 0)
             tg_model_hold_slopes(drives_of(c, guess, drive_bias, b, four), four, s->k, c->by_drives);
         for (int at = 0; at < s->blocks[b]; at++, k++) {
@@ -192,11 +210,9 @@ static void linearise(tg_controller *c, const double *start, const double *guess
                 now = then;
                 then = swap;
             }
-            read_outputs(s, x, bias, c->y_guess + k * TG_NY);
-            for (int r = 0; r < rows; r++) {
-                int place = k * rows + r;
-                read_row(s, row_of(s, r), now, groups, c->G + c->qp.start[place], c->qp.filled[place]);
-            }
+            read_outputs(s, &outputs, x, c->y_guess + k * TG_NY);
+            for (int r = 0; r < rows; r++, from++, filled++)
+                read_row(s, row_of(s, r), now, groups, c->G + *from, *filled);
         }
     }
 }
@@ -351,24 +367,37 @@ static void set_linear_cost(tg_controller *c, const double *target, const double
             double error[4] = {0.0};
             int n = s->N - k < 4 ? s->N - k : 4, beside = rows * length(c, k);
             for (int i = 0; i < n; i++)
-                error[i] = weight_of(c, k + i, r) * (goal[(k + i) * apart] - free[i * rows]);
+                error[i] = weight_of(c, k + i, r) * (free[i * rows] - goal[(k + i) * apart]);
             if (n == 4)
-                tg_take_four(q->f, g, beside, error[0], error[1], error[2], error[3], length(c, k));
+                tg_add_four(q->f, g, beside, error[0], error[1], error[2], error[3], length(c, k));
             for (int i = 0; n < 4 && i < n; i++)
-                tg_add_row(q->f, -error[i], g + i * beside, length(c, k));
+                tg_add_row(q->f, error[i], g + i * beside, length(c, k));
         }
     }
     for (int j = 0; j < TG_NU; j++)
         q->f[j] -= 2.0 * c->caution * s->move * last[j] / s->span[j];
 }
 
-/* Add the squares of four rows, n numbers that end at a multiple of four, to the lower triangle of H. */
+/* Add the squares of four rows, n numbers that end at a multiple of four, to the lower triangle of H, two rows of it at
+ * once. */
 static void add_squares(double *restrict H, int n, const double *weight, const double *restrict g0,
                         const double *restrict g1, const double *restrict g2, const double *restrict g3)
 {
-    for (int i = 0; i < n; i++) {
-        double *row = H + (size_t)i * TG_Q_W;
-        const double s0 = weight[0] * g0[i], s1 = weight[1] * g1[i], s2 = weight[2] * g2[i], s3 = weight[3] * g3[i];
+    const double w0 = weight[0], w1 = weight[1], w2 = weight[2], w3 = weight[3];
+    int i = 0;
+    for (; i + 2 <= n; i += 2) {
+        double *restrict row = H + (size_t)i * TG_Q_W, *restrict next = row + TG_Q_W;
+        const double s0 = w0 * g0[i], s1 = w1 * g1[i], s2 = w2 * g2[i], s3 = w3 * g3[i];
+        const double t0 = w0 * g0[i + 1], t1 = w1 * g1[i + 1], t2 = w2 * g2[i + 1], t3 = w3 * g3[i + 1];
+        for (int j = 0; j <= i; j += 4)
+            for (int l = j; l < j + 4; l++) {
+                row[l] = row[l] + s0 * g0[l] + s1 * g1[l] + s2 * g2[l] + s3 * g3[l];
+                next[l] = next[l] + t0 * g0[l] + t1 * g1[l] + t2 * g2[l] + t3 * g3[l];
+            }
+    }
+    if (i < n) {
+        double *restrict row = H + (size_t)i * TG_Q_W;
+        const double s0 = w0 * g0[i], s1 = w1 * g1[i], s2 = w2 * g2[i], s3 = w3 * g3[i];
         for (int j = 0; j <= i; j += 4)
             for (int l = j; l < j + 4; l++)
                 row[l] = row[l] + s0 * g0[l] + s1 * g1[l] + s2 * g2[l] + s3 * g3[l];
