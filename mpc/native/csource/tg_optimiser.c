@@ -378,29 +378,64 @@ static void set_linear_cost(tg_controller *c, const double *target, const double
         q->f[j] -= 2.0 * c->caution * s->move * last[j] / s->span[j];
 }
 
-/* Add the squares of four rows, n numbers that end at a multiple of four, to the lower triangle of H, two rows of it at
- * once. */
-static void add_squares(double *restrict H, int n, const double *weight, const double *restrict g0,
-                        const double *restrict g1, const double *restrict g2, const double *restrict g3)
+/* Sum up over n rows of the response, begun at start, apart apart, the products of their numbers i to i + 3 with j to
+ * j + 3, and with those of `beside`, into 4 rows of 8: all sums stay in registers. */
+static void sum_products(const double *restrict G, const int *restrict start, int apart, int n, int i, int j, int beside,
+                         double *restrict out)
 {
-    const double w0 = weight[0], w1 = weight[1], w2 = weight[2], w3 = weight[3];
-    int i = 0;
-    for (; i + 2 <= n; i += 2) {
-        double *restrict row = H + (size_t)i * TG_Q_W, *restrict next = row + TG_Q_W;
-        const double s0 = w0 * g0[i], s1 = w1 * g1[i], s2 = w2 * g2[i], s3 = w3 * g3[i];
-        const double t0 = w0 * g0[i + 1], t1 = w1 * g1[i + 1], t2 = w2 * g2[i + 1], t3 = w3 * g3[i + 1];
-        for (int j = 0; j <= i; j += 4)
-            for (int l = j; l < j + 4; l++) {
-                row[l] = row[l] + s0 * g0[l] + s1 * g1[l] + s2 * g2[l] + s3 * g3[l];
-                next[l] = next[l] + t0 * g0[l] + t1 * g1[l] + t2 * g2[l] + t3 * g3[l];
-            }
+    double a0[4] = {0.0}, a1[4] = {0.0}, a2[4] = {0.0}, a3[4] = {0.0};
+    double b0[4] = {0.0}, b1[4] = {0.0}, b2[4] = {0.0}, b3[4] = {0.0};
+    for (; n > 0; n--, start += apart) {
+        const double *g = G + *start + j, *h = G + *start + beside, *v = G + *start + i;
+        const double v0 = v[0], v1 = v[1], v2 = v[2], v3 = v[3];
+        for (int l = 0; l < 4; l++) {
+            a0[l] += v0 * g[l];
+            a1[l] += v1 * g[l];
+            a2[l] += v2 * g[l];
+            a3[l] += v3 * g[l];
+            b0[l] += v0 * h[l];
+            b1[l] += v1 * h[l];
+            b2[l] += v2 * h[l];
+            b3[l] += v3 * h[l];
+        }
     }
-    if (i < n) {
-        double *restrict row = H + (size_t)i * TG_Q_W;
-        const double s0 = w0 * g0[i], s1 = w1 * g1[i], s2 = w2 * g2[i], s3 = w3 * g3[i];
-        for (int j = 0; j <= i; j += 4)
-            for (int l = j; l < j + 4; l++)
-                row[l] = row[l] + s0 * g0[l] + s1 * g1[l] + s2 * g2[l] + s3 * g3[l];
+    for (int l = 0; l < 4; l++) {
+        out[l] = a0[l];
+        out[4 + l] = b0[l];
+        out[8 + l] = a1[l];
+        out[12 + l] = b1[l];
+        out[16 + l] = a2[l];
+        out[20 + l] = b2[l];
+        out[24 + l] = a3[l];
+        out[28 + l] = b3[l];
+    }
+}
+
+/* Add what the errors of controlled output r cost to the lower triangle of H, four rows and eight columns at once; the
+ * first output's is put there. */
+static void add_squares(tg_controller *c, int r)
+{
+    static const double none[8] = {0.0};
+    tg_qp *q = &c->qp;
+    const int rows = c->design->n_c + c->design->n_l, last = c->design->N - 1;
+    const int *start = q->start + r, *filled = q->filled + r;
+    const double weight = weight_of(c, 0, r), at_last = weight_of(c, last, r), *end = c->G + start[last * rows];
+    double sums[32];
+    if (r && !(at_last > 0.0)) /* lost, or of a zone */
+        return;
+    for (int i = 0, first = 0; i < q->n; i += 4) {
+        for (; first < last && *filled <= i; first++)
+            filled += rows;
+        for (int j = 0; j <= i; j += 8) {
+            const int wide = j + 4 <= i ? 8 : 4;
+            sum_products(c->G, start + first * rows, rows, last - first, i, j, j + wide - 4, sums);
+            for (int a = 0; a < 4 && i + a < q->n; a++) {
+                double *row = q->H + (size_t)(i + a) * TG_Q_W + j;
+                const double own = at_last * end[i + a], *before = r ? row : none;
+                for (int l = 0; l < wide; l++)
+                    row[l] = before[l] + weight * sums[8 * a + l] + own * end[j + l];
+            }
+        }
     }
 }
 
@@ -409,20 +444,8 @@ static void set_quadratic_cost(tg_controller *c)
     const tg_design *s = c->design;
     tg_qp *q = &c->qp;
     double weight_of_moves = c->caution * s->move;
-    for (int i = 0; i < q->n; i++)
-        memset(q->H + (size_t)i * TG_Q_W, 0, (size_t)TG_WHOLE(i + 1) * sizeof(double));
-    for (int k = 0; k < s->N; k += 4)
-        for (int r = 0; r < s->n_c; r++) {
-            double weight[4] = {0.0};
-            const double *g[4];
-            for (int i = 0; i < 4; i++) {
-                int at = k + i < s->N ? k + i : k;
-                g[i] = response(c, at, r);
-                weight[i] = at == k + i ? weight_of(c, at, r) : 0.0;
-            }
-            if (weight[0] > 0.0)
-                add_squares(q->H, length(c, k) < q->n ? length(c, k) : q->n, weight, g[0], g[1], g[2], g[3]);
-        }
+    for (int r = 0; r < s->n_c; r++)
+        add_squares(c, r);
     for (int b = 0; b < s->n_b; b++)
         for (int j = 0; j < TG_NU; j++) {
             int i = b * TG_NU + j;
