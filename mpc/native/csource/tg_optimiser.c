@@ -223,8 +223,13 @@ static void find_authority(tg_controller *c)
     const tg_design *s = c->design;
     double sums[TG_Q_W];
     for (int r = 0; r < s->n_c; r++) {
+        int k = 0, apart;
         memset(sums, 0, sizeof sums);
-        for (int k = 0; k < s->N; k++)
+        for (; k + 4 <= s->N; k += 4) {
+            apart = (s->n_c + s->n_l) * length(c, k);
+            tg_add_four(sums, response(c, k, r), apart, 1.0, 1.0, 1.0, 1.0, length(c, k));
+        }
+        for (; k < s->N; k++)
             tg_add_row(sums, 1.0, response(c, k, r), length(c, k));
         for (int at = 0; at < s->n_b * TG_NU; at++)
             if (s->strongest[at % TG_NU] == r)
@@ -321,20 +326,22 @@ static void set_bounds(tg_controller *c, const double *guess, const double *driv
     for (int b = 0; b < s->n_b; b++)
         for (int j = 0; j < TG_NU; j++) {
             int at = b * TG_NU + j;
-            double away = guess[at] - s->neutral[j], held = last[j] - s->neutral[j];
-            double lost = 1.0 - c->authority[at], best = fabs(away + drive_bias[j]) / fmax(lost, TG_FADING);
-            double end = fabs((away < 0.0 ? s->lowest[j] : s->highest[j]) - s->neutral[j]);
-            double room = best * tg_allowed_share(end, best, s->span[j]);
-            double still = away * held > 0.0 ? fabs(held) - (s->reach[b] + more) * s->slew[j] : 0.0;
+            double away = guess[at] - s->neutral[j], lost = 1.0 - c->authority[at];
             double low = s->lowest[j], high = s->highest[j];
             double gap = (s->reach[b] - (b ? s->reach[b - 1] : -more)) * s->slew[j];
             double before = b ? 0.0 : last[j];
-            if (room < still)
-                room = still; /* what the slew allows */
-            if (lost > TG_FADING && away < 0.0 && s->neutral[j] - room > low)
-                low = s->neutral[j] - room;
-            if (lost > TG_FADING && away > 0.0 && s->neutral[j] + room < high)
-                high = s->neutral[j] + room;
+            if (lost > TG_FADING) {
+                double best = fabs(away + drive_bias[j]) / lost, held = last[j] - s->neutral[j];
+                double end = fabs((away < 0.0 ? low : high) - s->neutral[j]);
+                double room = best * tg_allowed_share(end, best, s->span[j]);
+                double still = away * held > 0.0 ? fabs(held) - (s->reach[b] + more) * s->slew[j] : 0.0;
+                if (room < still)
+                    room = still; /* what the slew allows */
+                if (away < 0.0 && s->neutral[j] - room > low)
+                    low = s->neutral[j] - room;
+                if (away > 0.0 && s->neutral[j] + room < high)
+                    high = s->neutral[j] + room;
+            }
             if (is_parked(c, j)) {
                 low = guess[at] - LITTLE * s->span[j];
                 high = guess[at] + LITTLE * s->span[j];

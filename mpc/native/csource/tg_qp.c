@@ -62,10 +62,17 @@ void tg_qp_forget(tg_qp *q) { q->n_work = 0; }
 /* Whether none of n numbers, a multiple of four, is infinite or no number, nor their sum. */
 static int all_finite(const double *a, int n)
 {
-    double sum[4] = {0.0};
-    for (int i = 0; i < n; i += 4)
-        for (int l = 0; l < 4; l++)
+    double sum[4] = {0.0}, next[4] = {0.0};
+    int i = 0;
+    for (; i + 8 <= n; i += 8)
+        for (int l = 0; l < 4; l++) {
             sum[l] += fabs(a[i + l]);
+            next[l] += fabs(a[i + 4 + l]);
+        }
+    for (int l = 0; i < n && l < 4; l++)
+        sum[l] += fabs(a[i + l]);
+    for (int l = 0; l < 4; l++)
+        sum[l] += next[l];
     return (sum[0] + sum[1]) + (sum[2] + sum[3]) <= LARGEST;
 }
 
@@ -135,13 +142,16 @@ static void four_products(const double *restrict m, const double *restrict r0, c
 void tg_soft_values(const tg_qp *q, const double *x, double *values)
 {
     const double *row = q->A;
-    for (int i = 0, end = 0, n; i < q->s;) {
-        for (n = q->filled[i]; end < q->s && q->filled[end] == n;)
-            end++;
-        for (; i + 4 <= end; i += 4, row += 4 * n)
+    for (int i = 0; i < q->s;) {
+        const int n = q->filled[i];
+        if (i + 4 <= q->s && q->filled[i + 3] == n) {
             four_products(x, row, row + n, row + 2 * n, row + 3 * n, n, values + i);
-        for (; i < end; i++, row += n)
-            values[i] = tg_product(row, x, n);
+            row += 4 * n;
+            i += 4;
+        } else {
+            values[i++] = tg_product(row, x, n);
+            row += n;
+        }
     }
 }
 
@@ -212,29 +222,34 @@ static double weight_of(tg_qp *q, int row)
     return q->weight[row];
 }
 
-/* Divide row i of a factor by the root of its pivot, on the diagonal, and put the inverse there; 0 where the pivot is
- * too small a share of the square in weight (NULL: not above 0), or not finite. */
-static int finish_row(double *restrict row, int i, const double *weight)
+/* Whether a pivot is more than a small share of the square in weight (NULL: than 0), and finite. */
+static int is_pivot(double pivot, const double *weight)
 {
-    double inverse;
-    if (!(row[i] > (weight ? CONVEX * weight[i] * weight[i] : 0.0) && row[i] <= LARGEST))
-        return 0;
-    inverse = 1.0 / sqrt(row[i]);
+    return pivot > (weight ? CONVEX * *weight * *weight : 0.0) && pivot <= LARGEST;
+}
+
+/* Divide row i of a factor by the root of its pivot, on the diagonal, and put the inverse there. */
+static void finish_row(double *restrict row, int i)
+{
+    const double inverse = 1.0 / sqrt(row[i]);
     for (int j = 0; j <= i; j += 4)
         for (int l = j; l < j + 4; l++)
             row[l] *= inverse;
     row[i] = inverse;
-    return 1;
 }
 
 /* Replace the lower triangle of n rows of a matrix by U' of UU', two rows at once, from the last, on its diagonal what
- * its own is the inverse of; 0 as finish_row.  What becomes of entries behind the diagonal does not count. */
+ * its own is the inverse of; 0 where one is no pivot.  What becomes of entries behind the diagonal does not count. */
 static int factorise(double *H, int n, const double *weight)
 {
     int i = n - 1;
-    if (n % 2 && !finish_row(H + (size_t)i * TG_Q_W, i, weight))
-        return 0;
-    for (i -= n % 2; i > 0; i -= 2) {
+    if (n % 2) {
+        if (!is_pivot(H[(size_t)i * (TG_Q_W + 1)], weight ? weight + i : NULL))
+            return 0;
+        finish_row(H + (size_t)i * TG_Q_W, i);
+        i--;
+    }
+    for (; i > 0; i -= 2) {
         double *row = H + (size_t)i * TG_Q_W, *before = row - TG_Q_W;
         int end = TG_WHOLE(i + 1), k = n - 1;
         if (n % 2) {
@@ -253,36 +268,60 @@ static int factorise(double *H, int n, const double *weight)
                 add_two_twice(row, before, u, -v[0], -v[TG_Q_W], -w[0], -w[TG_Q_W], end);
             k -= rows;
         }
-        if (!finish_row(row, i, weight))
+        if (!is_pivot(row[i], weight ? weight + i : NULL))
             return 0;
-        tg_add_row(before, -row[i - 1], row, end);
-        if (!finish_row(before, i - 1, weight))
+        tg_add_row(before, -row[i - 1] / row[i], row, end); /* does not wait for the root */
+        if (!is_pivot(before[i - 1], weight ? weight + i - 1 : NULL))
             return 0;
+        finish_row(row, i);
+        finish_row(before, i - 1);
     }
     return 1;
+}
+
+/* The last block of backward where it has fewer than four rows; return how many rows are before it. */
+static int last_block(const double *U, int n, double *b)
+{
+    const int i = n & ~3;
+    for (int k = n - 1; k >= i; k--) {
+        const double *row = U + (size_t)k * TG_Q_W;
+        b[k] *= row[k];
+        for (int j = i; j < k; j++)
+            b[j] -= row[j] * b[k];
+        tg_add_row(b, -b[k], row, i);
+    }
+    return i;
+}
+
+/* A block of four rows of backward, u where their square begins. */
+static void square_block(const double *u0, double *y)
+{
+    const double *u1 = u0 + TG_Q_W, *u2 = u1 + TG_Q_W, *u3 = u2 + TG_Q_W;
+    y[3] *= u3[3];
+    y[2] = (y[2] - u3[2] * y[3]) * u2[2];
+    y[1] = (y[1] - u3[1] * y[3] - u2[1] * y[2]) * u1[1];
+    y[0] = (y[0] - u3[0] * y[3] - u2[0] * y[2] - u1[0] * y[1]) * u0[0];
 }
 
 /* Replace b by U^-1 b, U' as factorise leaves it; b is 0 behind entry n. */
 static void backward(const double *U, int n, double *b)
 {
-    for (int i = (n - 1) & ~3; i >= 0; i -= 4) {
-        const double *u = U + (size_t)i * TG_Q_W, *u0 = u + i, *u1 = u0 + TG_Q_W, *u2 = u1 + TG_Q_W, *u3 = u2 + TG_Q_W;
-        double *y = b + i;
-        if (n - i < 4) {
-            for (int k = n - i - 1; k >= 0; k--) {
-                const double *row = u0 + (size_t)k * TG_Q_W;
-                y[k] *= row[k];
-                for (int j = 0; j < k; j++)
-                    y[j] -= row[j] * y[k];
-                tg_add_row(b, -y[k], row - i, i);
-            }
-        } else {
-            y[3] *= u3[3];
-            y[2] = (y[2] - u3[2] * y[3]) * u2[2];
-            y[1] = (y[1] - u3[1] * y[3] - u2[1] * y[2]) * u1[1];
-            y[0] = (y[0] - u3[0] * y[3] - u2[0] * y[2] - u1[0] * y[1]) * u0[0];
-            tg_add_four(b, u, TG_Q_W, -y[0], -y[1], -y[2], -y[3], i);
-        }
+    for (int i = last_block(U, n, b) - 4; i >= 0; i -= 4) {
+        const double *u = U + (size_t)i * TG_Q_W, *y = b + i;
+        square_block(u + i, b + i);
+        tg_add_four(b, u, TG_Q_W, -y[0], -y[1], -y[2], -y[3], i);
+    }
+}
+
+/* The same of two: neither waits for the other. */
+static void backward_two(const double *U, int n, double *b, double *c)
+{
+    last_block(U, n, c);
+    for (int i = last_block(U, n, b) - 4; i >= 0; i -= 4) {
+        const double *u = U + (size_t)i * TG_Q_W, *y = b + i, *z = c + i;
+        square_block(u + i, b + i);
+        square_block(u + i, c + i);
+        add_four_twice(b, c, u, -y[0], -y[1], -y[2], -y[3], -z[0], -z[1], -z[2], -z[3], i);
     }
 }
 
@@ -321,8 +360,8 @@ static double value_of(const tg_qp *q, int row)
     return tg_product(q->A + q->start[row - 2 * n], q->x, q->filled[row - 2 * n]);
 }
 
-/* Return behind how many entries, a multiple of four, it is 0. */
-static int make_normal(const tg_qp *q, int row, int side, double *m)
+/* Put a row with its sign there; return behind how many entries, a multiple of four, it and its normal are 0. */
+static int write_row(const tg_qp *q, int row, int side, double *m)
 {
     int n = q->n, last = row < n ? row : row - n;
     memset(m, 0, TG_Q_W * sizeof *m);
@@ -337,9 +376,10 @@ static int make_normal(const tg_qp *q, int row, int side, double *m)
             m[j] = side * a[j];
         last = filled - 1;
     }
-    backward(q->H, last + 1, m);
     return TG_WHOLE(last + 1);
 }
+
+static int fewer(int a, int b) { return a < b ? a : b; }
 
 /* The price of breaking a soft row. */
 static double price_of(const tg_qp *q, int row)
@@ -352,12 +392,22 @@ static double price_of(const tg_qp *q, int row)
 static double ratio_of(const tg_qp *q, int row) { return q->ratio[(row - 2 * q->n) % q->per]; }
 
 /* Set the right side of a row in the set from its bound and its state. */
-static void set_right(tg_qp *q, int i)
+static void set_right(tg_qp *q, int i, double by_c)
 {
     double bound = q->side[i] > 0 ? q->upper[q->row[i]] : -q->lower[q->row[i]];
-    const double *m = q->normal + (size_t)i * TG_Q_W;
-    double sum = -bound - tg_product(m, q->c, q->to[i]);
-    q->right[i] = sum + (q->state[i] == 2 ? 1.0 / ratio_of(q, q->row[i]) : 0.0);
+    q->right[i] = (q->state[i] == 2 ? 1.0 / ratio_of(q, q->row[i]) : 0.0) - bound - by_c;
+}
+
+/* Of all rows in the set. */
+static void set_all_right(tg_qp *q)
+{
+    for (int i = 0; i < q->n_work; i += 4) {
+        const double *m = q->normal + (size_t)i * TG_Q_W;
+        double by_c[4];
+        four_products(q->c, m, m + TG_Q_W, m + 2 * TG_Q_W, m + 3 * TG_Q_W, TG_WHOLE(q->n), by_c);
+        for (int k = 0; k < 4 && i + k < q->n_work; k++)
+            set_right(q, i + k, by_c[k]);
+    }
 }
 
 /* What of its multiplier row i of the set gives way by: the share that keeps K regular, and its price. */
@@ -607,25 +657,28 @@ static void drop(tg_qp *q, int r)
 static double least(const tg_qp *q, int i) { return q->state[i] == 2 ? price_of(q, q->row[i]) : 0.0; }
 static double most(const tg_qp *q, int i) { return q->state[i] == 1 ? price_of(q, q->row[i]) : INFINITY; }
 
-/* Put a row behind the set's, the factor left as it is. */
+/* Put a row behind the set's; its normal is still to be made of it. */
 static void place(tg_qp *q, int row, int side, int state, double multiplier)
 {
     int i = q->n_work++;
-    q->to[i] = make_normal(q, row, side, q->normal + (size_t)i * TG_Q_W);
+    q->to[i] = write_row(q, row, side, q->normal + (size_t)i * TG_Q_W);
     q->row[i] = row;
     q->side[i] = (signed char)side;
     q->state[i] = (signed char)state;
     q->multiplier[i] = multiplier;
     q->in_set[row] = 1;
-    set_right(q, i);
-    set_give(q, i);
 }
 
 /* Take a row into the set. */
 static void put(tg_qp *q, int row, int side, int state, double multiplier)
 {
+    int i = q->n_work;
+    double *m = q->normal + (size_t)i * TG_Q_W;
     place(q, row, side, state, multiplier);
-    append_fit(q, q->n_work - 1);
+    backward(q->H, fewer(q->to[i], q->n), m);
+    set_right(q, i, tg_product(m, q->c, q->to[i]));
+    set_give(q, i);
+    append_fit(q, i);
 }
 
 /* Entry r has reached the bound of its state: it leaves the set, or becomes broken, or kept. */
@@ -757,12 +810,12 @@ static void take_up(tg_qp *q, int same)
     int kept = q->n_work;
     for (int i = 0; same && i < kept; i++)
         same = (q->side[i] > 0 ? q->upper[q->row[i]] : -q->lower[q->row[i]]) <= FAR;
-    for (int i = 0; same && i < kept; i++) {
-        q->in_set[q->row[i]] = 1;
-        set_right(q, i);
-    }
-    if (same)
+    if (same) {
+        for (int i = 0; i < kept; i++)
+            q->in_set[q->row[i]] = 1;
+        set_all_right(q);
         return;
+    }
     q->n_work = 0;
     clear_fit(q);
     for (int i = 0; i < kept; i++) {
@@ -775,6 +828,16 @@ static void take_up(tg_qp *q, int same)
             continue;
         place(q, row, side, state, multiplier);
     }
+    for (int i = 0; i + 2 <= q->n_work; i += 2) {
+        double *m = q->normal + (size_t)i * TG_Q_W;
+        int end = q->to[i] > q->to[i + 1] ? q->to[i] : q->to[i + 1];
+        backward_two(q->H, fewer(end, q->n), m, m + TG_Q_W);
+    }
+    if (q->n_work % 2)
+        backward(q->H, fewer(q->to[q->n_work - 1], q->n), q->normal + (size_t)(q->n_work - 1) * TG_Q_W);
+    set_all_right(q);
+    for (int i = 0; i < q->n_work; i++)
+        set_give(q, i);
     append_all(q);
 }
 
