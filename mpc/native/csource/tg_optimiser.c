@@ -33,17 +33,30 @@
 
 static int row_of(const tg_design *s, int r) { return r < s->n_c ? s->controlled[r] : s->limited[r - s->n_c]; }
 
-/* What all outputs read. */
-static void read_outputs(const tg_design *s, const double *x, const double *bias, double *y)
+/* What all outputs read: of one state each, or of all between two, and a level. */
+typedef struct {
+    double level[TG_NY], share[TG_NY];
+    int from[TG_NY], single;
+} tg_outputs;
+
+static void set_outputs(const tg_design *s, const double *bias, tg_outputs *of)
 {
+    of->single = 1;
     for (int i = 0; i < TG_NY; i++) {
-        const double *C = s->C + i * TG_NX;
-        int j = s->read_from[i], end = s->read_to[i];
-        double sum = s->y0[i] + bias[i] + C[j] * x[j]; /* most are of one state */
-        while (++j < end)
-            sum += C[j] * x[j];
-        y[i] = sum;
+        of->from[i] = s->read_from[i];
+        of->share[i] = s->C[i * TG_NX + of->from[i]];
+        of->level[i] = s->y0[i] + bias[i];
+        of->single = of->single && s->read_to[i] <= of->from[i] + 1;
     }
+}
+
+static void read_outputs(const tg_design *s, const tg_outputs *of, const double *x, double *y)
+{
+    for (int i = 0; i < TG_NY; i++)
+        y[i] = of->level[i] + of->share[i] * x[of->from[i]];
+    for (int i = 0; !of->single && i < TG_NY; i++)
+        for (int j = of->from[i] + 1; j < s->read_to[i]; j++)
+            y[i] += s->C[i * TG_NX + j] * x[j];
 }
 
 static const double *response(const tg_controller *c, int k, int r)
@@ -111,8 +124,10 @@ void tg_simulate(tg_controller *c, const double *start, const double *plan, cons
 {
     const tg_design *s = c->design;
     double both[2][TG_NX], *x = both[0], *next = both[1], four[4 * TG_NU];
+    tg_outputs outputs;
     int k = 0;
     memcpy(x, start, sizeof both[0]);
+    set_outputs(s, bias, &outputs);
     for (int b = 0; b < s->n_b; b++) {
         const double *u = four + b % 4 * TG_NU, *h = c->by_drives + b % 4;
         if (b % 4 == 0)
@@ -124,7 +139,7 @@ void tg_simulate(tg_controller *c, const double *start, const double *plan, cons
                 x = next;
                 next = swap;
             }
-            read_outputs(s, x, bias, y + k * TG_NY);
+            read_outputs(s, &outputs, x, y + k * TG_NY);
         }
     }
 }
@@ -156,7 +171,7 @@ static void read_row(const tg_design *s, int i, const double *now, int groups, d
 /* Drives of a block as directions of the groups of four columns that they are in. */
 static void seed_drives(tg_controller *c, int begun)
 {
-    memset(c->seed_u, 0, sizeof c->seed_u);
+    memset(c->seed_u, 0, (size_t)(TG_WHOLE(begun % 4 + TG_NU) * TG_NU) * sizeof(double));
     for (int j = 0; j < TG_NU; j++) {
         int column = begun % 4 + j;
         c->seed_u[(column / 4) * 4 * TG_NU + 4 * j + column % 4] = c->design->span[j];
@@ -170,15 +185,18 @@ static void linearise(tg_controller *c, const double *start, const double *guess
     const tg_design *s = c->design;
     double both[2][TG_NX], *x = both[0], *next = both[1], four[4 * TG_NU];
     double *now = c->seed, *then = c->seed + TG_NX * TG_WIDE;
+    tg_outputs outputs;
     int k = 0, rows = s->n_c + s->n_l;
+    const int *from = c->qp.start, *filled = c->qp.filled;
     memcpy(x, start, sizeof both[0]);
+    set_outputs(s, bias, &outputs);
     lay_out(c);
     for (int b = 0, groups = 0; b < s->n_b; b++) {
         int begun = b * TG_NU, before = begun / 4 * 4 * TG_NX, needed = TG_WHOLE(begun + TG_NU) / 4;
         const double *u = four + b % 4 * TG_NU, *h = c->by_drives + b % 4;
         seed_drives(c, begun);
-        memset(now + groups * 4 * TG_NX, 0, (size_t)((needed - groups) * 4 * TG_NX) * sizeof(double));
-        groups = needed;
+        for (; groups < needed; groups++)
+            memset(now + groups * 4 * TG_NX, 0, 4 * TG_NX * sizeof(double));
         if (b % 4 == 0)
             tg_model_hold_slopes(drives_of(c, guess, drive_bias, b, four), four, s->k, c->by_drives);
         for (int at = 0; at < s->blocks[b]; at++, k++) {
@@ -192,11 +210,9 @@ static void linearise(tg_controller *c, const double *start, const double *guess
                 now = then;
                 then = swap;
             }
-            read_outputs(s, x, bias, c->y_guess + k * TG_NY);
-            for (int r = 0; r < rows; r++) {
-                int place = k * rows + r;
-                read_row(s, row_of(s, r), now, groups, c->G + c->qp.start[place], c->qp.filled[place]);
-            }
+            read_outputs(s, &outputs, x, c->y_guess + k * TG_NY);
+            for (int r = 0; r < rows; r++, from++, filled++)
+                read_row(s, row_of(s, r), now, groups, c->G + *from, *filled);
         }
     }
 }
@@ -207,8 +223,13 @@ static void find_authority(tg_controller *c)
     const tg_design *s = c->design;
     double sums[TG_Q_W];
     for (int r = 0; r < s->n_c; r++) {
+        int k = 0, apart;
         memset(sums, 0, sizeof sums);
-        for (int k = 0; k < s->N; k++)
+        for (; k + 4 <= s->N; k += 4) {
+            apart = (s->n_c + s->n_l) * length(c, k);
+            tg_add_four(sums, response(c, k, r), apart, 1.0, 1.0, 1.0, 1.0, length(c, k));
+        }
+        for (; k < s->N; k++)
             tg_add_row(sums, 1.0, response(c, k, r), length(c, k));
         for (int at = 0; at < s->n_b * TG_NU; at++)
             if (s->strongest[at % TG_NU] == r)
@@ -305,20 +326,22 @@ static void set_bounds(tg_controller *c, const double *guess, const double *driv
     for (int b = 0; b < s->n_b; b++)
         for (int j = 0; j < TG_NU; j++) {
             int at = b * TG_NU + j;
-            double away = guess[at] - s->neutral[j], held = last[j] - s->neutral[j];
-            double lost = 1.0 - c->authority[at], best = fabs(away + drive_bias[j]) / fmax(lost, TG_FADING);
-            double end = fabs((away < 0.0 ? s->lowest[j] : s->highest[j]) - s->neutral[j]);
-            double room = best * tg_allowed_share(end, best, s->span[j]);
-            double still = away * held > 0.0 ? fabs(held) - (s->reach[b] + more) * s->slew[j] : 0.0;
+            double away = guess[at] - s->neutral[j], lost = 1.0 - c->authority[at];
             double low = s->lowest[j], high = s->highest[j];
             double gap = (s->reach[b] - (b ? s->reach[b - 1] : -more)) * s->slew[j];
             double before = b ? 0.0 : last[j];
-            if (room < still)
-                room = still; /* what the slew allows */
-            if (lost > TG_FADING && away < 0.0 && s->neutral[j] - room > low)
-                low = s->neutral[j] - room;
-            if (lost > TG_FADING && away > 0.0 && s->neutral[j] + room < high)
-                high = s->neutral[j] + room;
+            if (lost > TG_FADING) {
+                double best = fabs(away + drive_bias[j]) / lost, held = last[j] - s->neutral[j];
+                double end = fabs((away < 0.0 ? low : high) - s->neutral[j]);
+                double room = best * tg_allowed_share(end, best, s->span[j]);
+                double still = away * held > 0.0 ? fabs(held) - (s->reach[b] + more) * s->slew[j] : 0.0;
+                if (room < still)
+                    room = still; /* what the slew allows */
+                if (away < 0.0 && s->neutral[j] - room > low)
+                    low = s->neutral[j] - room;
+                if (away > 0.0 && s->neutral[j] + room < high)
+                    high = s->neutral[j] + room;
+            }
             if (is_parked(c, j)) {
                 low = guess[at] - LITTLE * s->span[j];
                 high = guess[at] + LITTLE * s->span[j];
@@ -351,27 +374,75 @@ static void set_linear_cost(tg_controller *c, const double *target, const double
             double error[4] = {0.0};
             int n = s->N - k < 4 ? s->N - k : 4, beside = rows * length(c, k);
             for (int i = 0; i < n; i++)
-                error[i] = weight_of(c, k + i, r) * (goal[(k + i) * apart] - free[i * rows]);
+                error[i] = weight_of(c, k + i, r) * (free[i * rows] - goal[(k + i) * apart]);
             if (n == 4)
-                tg_take_four(q->f, g, beside, error[0], error[1], error[2], error[3], length(c, k));
+                tg_add_four(q->f, g, beside, error[0], error[1], error[2], error[3], length(c, k));
             for (int i = 0; n < 4 && i < n; i++)
-                tg_add_row(q->f, -error[i], g + i * beside, length(c, k));
+                tg_add_row(q->f, error[i], g + i * beside, length(c, k));
         }
     }
     for (int j = 0; j < TG_NU; j++)
         q->f[j] -= 2.0 * c->caution * s->move * last[j] / s->span[j];
 }
 
-/* Add the squares of four rows, n numbers that end at a multiple of four, to the lower triangle of H. */
-static void add_squares(double *restrict H, int n, const double *weight, const double *restrict g0,
-                        const double *restrict g1, const double *restrict g2, const double *restrict g3)
+/* Sum up over n rows of the response, begun at start, apart apart, the products of their numbers i to i + 3 with j to
+ * j + 3, and with those of `beside`, into 4 rows of 8: all sums stay in registers. */
+static void sum_products(const double *restrict G, const int *restrict start, int apart, int n, int i, int j, int beside,
+                         double *restrict out)
 {
-    for (int i = 0; i < n; i++) {
-        double *row = H + (size_t)i * TG_Q_W;
-        const double s0 = weight[0] * g0[i], s1 = weight[1] * g1[i], s2 = weight[2] * g2[i], s3 = weight[3] * g3[i];
-        for (int j = 0; j <= i; j += 4)
-            for (int l = j; l < j + 4; l++)
-                row[l] = row[l] + s0 * g0[l] + s1 * g1[l] + s2 * g2[l] + s3 * g3[l];
+    double a0[4] = {0.0}, a1[4] = {0.0}, a2[4] = {0.0}, a3[4] = {0.0};
+    double b0[4] = {0.0}, b1[4] = {0.0}, b2[4] = {0.0}, b3[4] = {0.0};
+    for (; n > 0; n--, start += apart) {
+        const double *g = G + *start + j, *h = G + *start + beside, *v = G + *start + i;
+        const double v0 = v[0], v1 = v[1], v2 = v[2], v3 = v[3];
+        for (int l = 0; l < 4; l++) {
+            a0[l] += v0 * g[l];
+            a1[l] += v1 * g[l];
+            a2[l] += v2 * g[l];
+            a3[l] += v3 * g[l];
+            b0[l] += v0 * h[l];
+            b1[l] += v1 * h[l];
+            b2[l] += v2 * h[l];
+            b3[l] += v3 * h[l];
+        }
+    }
+    for (int l = 0; l < 4; l++) {
+        out[l] = a0[l];
+        out[4 + l] = b0[l];
+        out[8 + l] = a1[l];
+        out[12 + l] = b1[l];
+        out[16 + l] = a2[l];
+        out[20 + l] = b2[l];
+        out[24 + l] = a3[l];
+        out[28 + l] = b3[l];
+    }
+}
+
+/* Add what the errors of controlled output r cost to the lower triangle of H, four rows and eight columns at once; the
+ * first output's is put there. */
+static void add_squares(tg_controller *c, int r)
+{
+    static const double none[8] = {0.0};
+    tg_qp *q = &c->qp;
+    const int rows = c->design->n_c + c->design->n_l, last = c->design->N - 1;
+    const int *start = q->start + r, *filled = q->filled + r;
+    const double weight = weight_of(c, 0, r), at_last = weight_of(c, last, r), *end = c->G + start[last * rows];
+    double sums[32];
+    if (r && !(at_last > 0.0)) /* lost, or of a zone */
+        return;
+    for (int i = 0, first = 0; i < q->n; i += 4) {
+        for (; first < last && *filled <= i; first++)
+            filled += rows;
+        for (int j = 0; j <= i; j += 8) {
+            const int wide = j + 4 <= i ? 8 : 4;
+            sum_products(c->G, start + first * rows, rows, last - first, i, j, j + wide - 4, sums);
+            for (int a = 0; a < 4 && i + a < q->n; a++) {
+                double *row = q->H + (size_t)(i + a) * TG_Q_W + j;
+                const double own = at_last * end[i + a], *before = r ? row : none;
+                for (int l = 0; l < wide; l++)
+                    row[l] = before[l] + weight * sums[8 * a + l] + own * end[j + l];
+            }
+        }
     }
 }
 
@@ -380,20 +451,8 @@ static void set_quadratic_cost(tg_controller *c)
     const tg_design *s = c->design;
     tg_qp *q = &c->qp;
     double weight_of_moves = c->caution * s->move;
-    for (int i = 0; i < q->n; i++)
-        memset(q->H + (size_t)i * TG_Q_W, 0, (size_t)TG_WHOLE(i + 1) * sizeof(double));
-    for (int k = 0; k < s->N; k += 4)
-        for (int r = 0; r < s->n_c; r++) {
-            double weight[4] = {0.0};
-            const double *g[4];
-            for (int i = 0; i < 4; i++) {
-                int at = k + i < s->N ? k + i : k;
-                g[i] = response(c, at, r);
-                weight[i] = at == k + i ? weight_of(c, at, r) : 0.0;
-            }
-            if (weight[0] > 0.0)
-                add_squares(q->H, length(c, k) < q->n ? length(c, k) : q->n, weight, g[0], g[1], g[2], g[3]);
-        }
+    for (int r = 0; r < s->n_c; r++)
+        add_squares(c, r);
     for (int b = 0; b < s->n_b; b++)
         for (int j = 0; j < TG_NU; j++) {
             int i = b * TG_NU + j;

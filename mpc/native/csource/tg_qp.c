@@ -34,6 +34,7 @@
 #include <string.h>
 
 #define FAR 1e15
+#define TOGETHER 64 /* rows of a factor, four of which are made at once */
 #ifdef TG_SINGLE
 #define LARGEST 3.4e38
 #define TOLERANCE 1e-5
@@ -61,25 +62,37 @@ void tg_qp_forget(tg_qp *q) { q->n_work = 0; }
 /* Whether none of n numbers, a multiple of four, is infinite or no number, nor their sum. */
 static int all_finite(const double *a, int n)
 {
-    double sum[4] = {0.0};
-    for (int i = 0; i < n; i += 4)
-        for (int l = 0; l < 4; l++)
+    double sum[4] = {0.0}, next[4] = {0.0};
+    int i = 0;
+    for (; i + 8 <= n; i += 8)
+        for (int l = 0; l < 4; l++) {
             sum[l] += fabs(a[i + l]);
+            next[l] += fabs(a[i + 4 + l]);
+        }
+    for (int l = 0; i < n && l < 4; l++)
+        sum[l] += fabs(a[i + l]);
+    for (int l = 0; l < 4; l++)
+        sum[l] += next[l];
     return (sum[0] + sum[1]) + (sum[2] + sum[3]) <= LARGEST;
 }
 
-static int problem_is_finite(const tg_qp *q)
+/* Whether H, or what became of it where it has no factor, is. */
+static int matrix_is_finite(const tg_qp *q)
 {
-    int last = q->s - 1; /* the rows of A are one behind the other */
-    for (int i = 0; i < q->n && !q->kept; i++)
+    for (int i = 0; i < q->n; i++)
         if (!all_finite(q->H + (size_t)i * TG_Q_W, TG_WHOLE(i + 1)))
             return 0;
+    return 1;
+}
+
+/* Whether all else is: bounds, rows, the linear cost. */
+static int problem_is_finite(const tg_qp *q)
+{
+    int last = q->s - 1, wrong = 0; /* the rows of A are one behind the other */
     for (int i = 0; i < 2 * q->n + q->s; i++)
-        if (isnan(q->lower[i]) || isnan(q->upper[i]))
-            return 0;
-    if (q->s && !q->kept && !all_finite(q->A, q->start[last] + q->filled[last]))
-        return 0;
-    return all_finite(q->f, TG_WHOLE(q->n));
+        wrong |= isnan(q->lower[i]) | isnan(q->upper[i]);
+    return !wrong && (q->kept || !q->s || all_finite(q->A, q->start[last] + q->filled[last])) &&
+           all_finite(q->f, TG_WHOLE(q->n));
 }
 
 double tg_product(const double *a, const double *b, int n)
@@ -129,23 +142,51 @@ static void four_products(const double *restrict m, const double *restrict r0, c
 void tg_soft_values(const tg_qp *q, const double *x, double *values)
 {
     const double *row = q->A;
-    for (int i = 0, end = 0, n; i < q->s;) {
-        for (n = q->filled[i]; end < q->s && q->filled[end] == n;)
-            end++;
-        for (; i + 4 <= end; i += 4, row += 4 * n)
+    for (int i = 0; i < q->s;) {
+        const int n = q->filled[i];
+        if (i + 4 <= q->s && q->filled[i + 3] == n) {
             four_products(x, row, row + n, row + 2 * n, row + 3 * n, n, values + i);
-        for (; i < end; i++, row += n)
-            values[i] = tg_product(row, x, n);
+            row += 4 * n;
+            i += 4;
+        } else {
+            values[i++] = tg_product(row, x, n);
+            row += n;
+        }
     }
 }
 
-void tg_take_four(double *restrict row, const double *restrict u, int apart, double v0, double v1, double v2,
-                  double v3, int n)
+/* Added and not taken: of sums a compiler makes one instruction a term, of differences not. */
+void tg_add_four(double *restrict row, const double *restrict u, int apart, double v0, double v1, double v2, double v3,
+                 int n)
 {
     const double *u1 = u + apart, *u2 = u1 + apart, *u3 = u2 + apart;
     for (int j = 0; j < n; j += 4)
         for (int l = j; l < j + 4; l++)
-            row[l] -= v0 * u[l] + v1 * u1[l] + v2 * u2[l] + v3 * u3[l];
+            row[l] = row[l] + v0 * u[l] + v1 * u1[l] + v2 * u2[l] + v3 * u3[l];
+}
+
+/* Add shares v of four rows, TG_Q_W apart, to a row and w to another one: each number that is read counts twice. */
+static void add_four_twice(double *restrict row, double *restrict other, const double *restrict u, double v0, double v1,
+                           double v2, double v3, double w0, double w1, double w2, double w3, int n)
+{
+    const double *u1 = u + TG_Q_W, *u2 = u1 + TG_Q_W, *u3 = u2 + TG_Q_W;
+    for (int j = 0; j < n; j += 4)
+        for (int l = j; l < j + 4; l++) {
+            row[l] = row[l] + v0 * u[l] + v1 * u1[l] + v2 * u2[l] + v3 * u3[l];
+            other[l] = other[l] + w0 * u[l] + w1 * u1[l] + w2 * u2[l] + w3 * u3[l];
+        }
+}
+
+/* The same of two rows. */
+static void add_two_twice(double *restrict row, double *restrict other, const double *restrict u, double v0, double v1,
+                          double w0, double w1, int n)
+{
+    const double *u1 = u + TG_Q_W;
+    for (int j = 0; j < n; j += 4)
+        for (int l = j; l < j + 4; l++) {
+            row[l] = row[l] + v0 * u[l] + v1 * u1[l];
+            other[l] = other[l] + w0 * u[l] + w1 * u1[l];
+        }
 }
 
 /* How much each hard row weighs beside the others: 1 over its length, unknowns in units of H_jj^-1/2. */
@@ -181,53 +222,106 @@ static double weight_of(tg_qp *q, int row)
     return q->weight[row];
 }
 
-/* Replace the lower triangle of n rows of a matrix by U' of UU', row by row from the last, on its diagonal what its own
- * is the inverse of; 0 where a pivot is too small a share of the squares in weight (NULL: not above 0). */
+/* Whether a pivot is more than a small share of the square in weight (NULL: than 0), and finite. */
+static int is_pivot(double pivot, const double *weight)
+{
+    return pivot > (weight ? CONVEX * *weight * *weight : 0.0) && pivot <= LARGEST;
+}
+
+/* Divide row i of a factor by the root of its pivot, on the diagonal, and put the inverse there. */
+static void finish_row(double *restrict row, int i)
+{
+    const double inverse = 1.0 / sqrt(row[i]);
+    for (int j = 0; j <= i; j += 4)
+        for (int l = j; l < j + 4; l++)
+            row[l] *= inverse;
+    row[i] = inverse;
+}
+
+/* Replace the lower triangle of n rows of a matrix by U' of UU', two rows at once, from the last, on its diagonal what
+ * its own is the inverse of; 0 where one is no pivot.  What becomes of entries behind the diagonal does not count. */
 static int factorise(double *H, int n, const double *weight)
 {
-    for (int i = n - 1; i >= 0; i--) {
-        double *row = H + (size_t)i * TG_Q_W, inverse;
-        int end = TG_WHOLE(i + 1), k = n - 1;
-        for (; k > i && k % 4 != 3; k--) /* what they do to entries behind the diagonal does not count */
-            tg_add_row(row, -H[(size_t)k * TG_Q_W + (size_t)i], H + (size_t)k * TG_Q_W, end);
-        for (; k - 4 >= i; k -= 4) {
-            const double *u = H + (size_t)(k - 3) * TG_Q_W;
-            tg_take_four(row, u, TG_Q_W, u[i], u[TG_Q_W + i], u[2 * TG_Q_W + i], u[3 * TG_Q_W + i], end);
-        }
-        for (; k > i; k--)
-            tg_add_row(row, -H[(size_t)k * TG_Q_W + (size_t)i], H + (size_t)k * TG_Q_W, end);
-        if (!(row[i] > (weight ? CONVEX * weight[i] * weight[i] : 0.0)))
+    int i = n - 1;
+    if (n % 2) {
+        if (!is_pivot(H[(size_t)i * (TG_Q_W + 1)], weight ? weight + i : NULL))
             return 0;
-        inverse = 1.0 / sqrt(row[i]);
-        for (int j = 0; j < end; j += 4)
-            for (int l = j; l < j + 4; l++)
-                row[l] *= inverse;
-        row[i] = inverse;
+        finish_row(H + (size_t)i * TG_Q_W, i);
+        i--;
+    }
+    for (; i > 0; i -= 2) {
+        double *row = H + (size_t)i * TG_Q_W, *before = row - TG_Q_W;
+        int end = TG_WHOLE(i + 1), k = n - 1;
+        if (n % 2) {
+            const double *u = H + (size_t)k * TG_Q_W;
+            tg_add_row(row, -u[i], u, end);
+            tg_add_row(before, -u[i - 1], u, end);
+            k--;
+        }
+        while (k > i) { /* rows that are done: two, then four, two at the end */
+            int rows = k % 4 == 3 && k - i >= 4 ? 4 : 2;
+            const double *u = H + (size_t)(k - rows + 1) * TG_Q_W, *v = u + i, *w = v - 1;
+            if (rows == 4)
+                add_four_twice(row, before, u, -v[0], -v[TG_Q_W], -v[2 * TG_Q_W], -v[3 * TG_Q_W], -w[0], -w[TG_Q_W],
+                               -w[2 * TG_Q_W], -w[3 * TG_Q_W], end);
+            else
+                add_two_twice(row, before, u, -v[0], -v[TG_Q_W], -w[0], -w[TG_Q_W], end);
+            k -= rows;
+        }
+        if (!is_pivot(row[i], weight ? weight + i : NULL))
+            return 0;
+        tg_add_row(before, -row[i - 1] / row[i], row, end); /* does not wait for the root */
+        if (!is_pivot(before[i - 1], weight ? weight + i - 1 : NULL))
+            return 0;
+        finish_row(row, i);
+        finish_row(before, i - 1);
     }
     return 1;
+}
+
+/* The last block of backward where it has fewer than four rows; return how many rows are before it. */
+static int last_block(const double *U, int n, double *b)
+{
+    const int i = n & ~3;
+    for (int k = n - 1; k >= i; k--) {
+        const double *row = U + (size_t)k * TG_Q_W;
+        b[k] *= row[k];
+        for (int j = i; j < k; j++)
+            b[j] -= row[j] * b[k];
+        tg_add_row(b, -b[k], row, i);
+    }
+    return i;
+}
+
+/* A block of four rows of backward, u where their square begins. */
+static void square_block(const double *u0, double *y)
+{
+    const double *u1 = u0 + TG_Q_W, *u2 = u1 + TG_Q_W, *u3 = u2 + TG_Q_W;
+    y[3] *= u3[3];
+    y[2] = (y[2] - u3[2] * y[3]) * u2[2];
+    y[1] = (y[1] - u3[1] * y[3] - u2[1] * y[2]) * u1[1];
+    y[0] = (y[0] - u3[0] * y[3] - u2[0] * y[2] - u1[0] * y[1]) * u0[0];
 }
 
 /* Replace b by U^-1 b, U' as factorise leaves it; b is 0 behind entry n. */
 static void backward(const double *U, int n, double *b)
 {
-    for (int i = (n - 1) & ~3; i >= 0; i -= 4) {
-        const double *u = U + (size_t)i * TG_Q_W, *u0 = u + i, *u1 = u0 + TG_Q_W, *u2 = u1 + TG_Q_W, *u3 = u2 + TG_Q_W;
-        double *y = b + i;
-        if (n - i < 4) {
-            for (int k = n - i - 1; k >= 0; k--) {
-                const double *row = u0 + (size_t)k * TG_Q_W;
-                y[k] *= row[k];
-                for (int j = 0; j < k; j++)
-                    y[j] -= row[j] * y[k];
-                tg_add_row(b, -y[k], row - i, i);
-            }
-        } else {
-            y[3] *= u3[3];
-            y[2] = (y[2] - u3[2] * y[3]) * u2[2];
-            y[1] = (y[1] - u3[1] * y[3] - u2[1] * y[2]) * u1[1];
-            y[0] = (y[0] - u3[0] * y[3] - u2[0] * y[2] - u1[0] * y[1]) * u0[0];
-            tg_take_four(b, u, TG_Q_W, y[0], y[1], y[2], y[3], i);
-        }
+    for (int i = last_block(U, n, b) - 4; i >= 0; i -= 4) {
+        const double *u = U + (size_t)i * TG_Q_W, *y = b + i;
+        square_block(u + i, b + i);
+        tg_add_four(b, u, TG_Q_W, -y[0], -y[1], -y[2], -y[3], i);
+    }
+}
+
+/* The same of two: neither waits for the other. */
+static void backward_two(const double *U, int n, double *b, double *c)
+{
+    last_block(U, n, c);
+    for (int i = last_block(U, n, b) - 4; i >= 0; i -= 4) {
+        const double *u = U + (size_t)i * TG_Q_W, *y = b + i, *z = c + i;
+        square_block(u + i, b + i);
+        square_block(u + i, c + i);
+        add_four_twice(b, c, u, -y[0], -y[1], -y[2], -y[3], -z[0], -z[1], -z[2], -z[3], i);
     }
 }
 
@@ -266,8 +360,8 @@ static double value_of(const tg_qp *q, int row)
     return tg_product(q->A + q->start[row - 2 * n], q->x, q->filled[row - 2 * n]);
 }
 
-/* Return behind how many entries, a multiple of four, it is 0. */
-static int make_normal(const tg_qp *q, int row, int side, double *m)
+/* Put a row with its sign there; return behind how many entries, a multiple of four, it and its normal are 0. */
+static int write_row(const tg_qp *q, int row, int side, double *m)
 {
     int n = q->n, last = row < n ? row : row - n;
     memset(m, 0, TG_Q_W * sizeof *m);
@@ -282,9 +376,10 @@ static int make_normal(const tg_qp *q, int row, int side, double *m)
             m[j] = side * a[j];
         last = filled - 1;
     }
-    backward(q->H, last + 1, m);
     return TG_WHOLE(last + 1);
 }
+
+static int fewer(int a, int b) { return a < b ? a : b; }
 
 /* The price of breaking a soft row. */
 static double price_of(const tg_qp *q, int row)
@@ -297,12 +392,22 @@ static double price_of(const tg_qp *q, int row)
 static double ratio_of(const tg_qp *q, int row) { return q->ratio[(row - 2 * q->n) % q->per]; }
 
 /* Set the right side of a row in the set from its bound and its state. */
-static void set_right(tg_qp *q, int i)
+static void set_right(tg_qp *q, int i, double by_c)
 {
     double bound = q->side[i] > 0 ? q->upper[q->row[i]] : -q->lower[q->row[i]];
-    const double *m = q->normal + (size_t)i * TG_Q_W;
-    double sum = -bound - tg_product(m, q->c, q->to[i]);
-    q->right[i] = sum + (q->state[i] == 2 ? 1.0 / ratio_of(q, q->row[i]) : 0.0);
+    q->right[i] = (q->state[i] == 2 ? 1.0 / ratio_of(q, q->row[i]) : 0.0) - bound - by_c;
+}
+
+/* Of all rows in the set. */
+static void set_all_right(tg_qp *q)
+{
+    for (int i = 0; i < q->n_work; i += 4) {
+        const double *m = q->normal + (size_t)i * TG_Q_W;
+        double by_c[4];
+        four_products(q->c, m, m + TG_Q_W, m + 2 * TG_Q_W, m + 3 * TG_Q_W, TG_WHOLE(q->n), by_c);
+        for (int k = 0; k < 4 && i + k < q->n_work; k++)
+            set_right(q, i + k, by_c[k]);
+    }
 }
 
 /* What of its multiplier row i of the set gives way by: the share that keeps K regular, and its price. */
@@ -331,6 +436,78 @@ static void before_rows(tg_qp *q, double *b, int n)
         b[k] -= dot(fit_row(q, k), b, k);
 }
 
+/* Make row i of the factor of the products there, the last with itself. */
+static void finish_fit(tg_qp *q, int i, double give)
+{
+    double *row = fit_row(q, i), left = row[i] + give;
+    before_rows(q, row, i);
+    for (int k = 0; k < i; k++) {
+        double scaled = row[k] / q->pivot[k];
+        left -= scaled * row[k];
+        row[k] = scaled;
+    }
+    row[i] = 1.0;
+    q->pivot[i] = left;
+}
+
+/* Append rows i to i + 3 of the factor, i + 4 <= TOGETHER, of the products of these rows, behind to of which a row is 0.
+ * They are made side by side, number k of row i + c at [4 k + c], so that no sum is across. */
+static void append_four(tg_qp *q, const double *rows, const int *to, int i, const double *give)
+{
+    const double *by = rows + (size_t)i * TG_Q_W;
+    double room[4 * TOGETHER], *own = room + 4 * i, own0[4], own1[4], own2[4], own3[4];
+    for (int k = 0; k < i + 4; k++)
+        four_products(rows + (size_t)k * TG_Q_W, by, by + TG_Q_W, by + 2 * TG_Q_W, by + 3 * TG_Q_W, to[k], room + 4 * k);
+    for (int c = 0; c < 4; c++) {
+        own0[c] = own[c];
+        own1[c] = own[4 + c];
+        own2[c] = own[8 + c];
+        own3[c] = own[12 + c];
+    }
+    for (int k = 0; k < i; k++) {
+        const double *row = fit_row(q, k), *before = room, inverse = 1.0 / q->pivot[k];
+        double *value = room + 4 * k, sum[4] = {0.0}, next[4] = {0.0}, scaled[4];
+        for (int j = 0; j + 2 <= k; j += 2, before += 8)
+            for (int c = 0; c < 4; c++) {
+                sum[c] += row[j] * before[c];
+                next[c] += row[j + 1] * before[4 + c];
+            }
+        if (k % 2)
+            for (int c = 0; c < 4; c++)
+                sum[c] += row[k - 1] * before[c];
+        for (int c = 0; c < 4; c++) {
+            value[c] = value[c] - sum[c] - next[c];
+            scaled[c] = inverse * value[c];
+        }
+        for (int c = 0; c < 4; c++) {
+            own0[c] -= value[0] * scaled[c];
+            own1[c] -= value[1] * scaled[c];
+            own2[c] -= value[2] * scaled[c];
+            own3[c] -= value[3] * scaled[c];
+        }
+        for (int c = 0; c < 4; c++)
+            fit_row(q, i + c)[k] = scaled[c];
+    }
+    for (int c = 0; c < 4; c++) {
+        own[c] = own0[c];
+        own[4 + c] = own1[c];
+        own[8 + c] = own2[c];
+        own[12 + c] = own3[c];
+    }
+    for (int c = 0; c < 4; c++)
+        own[5 * c] += give[c];
+    for (int b = 0; b < 4; b++) { /* and the square of theirs */
+        double *row = fit_row(q, i + b) + i;
+        for (int k = 0; k < b; k++) {
+            row[k] = own[4 * k + b] / own[5 * k];
+            for (int c = b; c < 4; c++)
+                own[4 * b + c] -= row[k] * own[4 * k + c];
+        }
+        row[b] = 1.0;
+        q->pivot[i + b] = own[5 * b];
+    }
+}
+
 #if TG_LEAN
 /* Add a share of a normal's product with itself to S. */
 static void add_broken(tg_qp *q, int i, double share)
@@ -346,6 +523,12 @@ static void append_fit(tg_qp *q, int i)
     q->stale = 1;
     if (q->state[i] == 2)
         add_broken(q, i, 1.0 / q->give[i]);
+}
+
+static void append_all(tg_qp *q)
+{
+    for (int i = 0; i < q->n_work; i++)
+        append_fit(q, i);
 }
 
 static void remove_fit(tg_qp *q, int r)
@@ -381,20 +564,15 @@ static int make_fit(tg_qp *q)
     if (!factorise(q->root, n, NULL)) /* S is at least 1 */
         return 0;
     for (int a = 0; a < q->n_other; a++) {
-        double *seen = q->seen + (size_t)a * TG_Q_W, *row = fit_row(q, a), left;
+        double *seen = q->seen + (size_t)a * TG_Q_W;
         memcpy(seen, q->normal + (size_t)q->other[a] * TG_Q_W, TG_Q_W * sizeof *seen);
         backward(q->root, q->to[q->other[a]] < n ? q->to[q->other[a]] : n, seen);
-        for (int b = 0; b < a; b++)
-            row[b] = tg_product(seen, q->seen + (size_t)b * TG_Q_W, end);
-        left = tg_product(seen, seen, end) + q->give[q->other[a]];
-        before_rows(q, row, a);
-        for (int b = 0; b < a; b++) {
-            double scaled = row[b] / q->pivot[b];
-            left -= scaled * row[b];
-            row[b] = scaled;
-        }
-        row[a] = 1.0;
-        q->pivot[a] = left;
+    }
+    for (int a = 0; a < q->n_other; a++) {
+        double *row = fit_row(q, a);
+        for (int b = 0; b <= a; b++)
+            row[b] = tg_product(q->seen + (size_t)a * TG_Q_W, q->seen + (size_t)b * TG_Q_W, end);
+        finish_fit(q, a, q->give[q->other[a]]);
     }
     return 1;
 }
@@ -403,23 +581,22 @@ static int make_fit(tg_qp *q)
 static void append_fit(tg_qp *q, int i)
 {
     const double *m = q->normal + (size_t)i * TG_Q_W;
-    int k = 0, n = q->to[i];
-    double *row = fit_row(q, i), left = tg_product(m, m, n) + q->give[i];
-
-    for (; k + 4 <= i; k += 4) {
+    double *row = fit_row(q, i);
+    for (int k = 0; k <= i; k += 4) { /* with itself, and at the end with up to three that do not count */
         const double *by = q->normal + (size_t)k * TG_Q_W;
-        four_products(m, by, by + TG_Q_W, by + 2 * TG_Q_W, by + 3 * TG_Q_W, n, row + k);
+        four_products(m, by, by + TG_Q_W, by + 2 * TG_Q_W, by + 3 * TG_Q_W, q->to[i], row + k);
     }
-    for (; k < i; k++)
-        row[k] = tg_product(m, q->normal + (size_t)k * TG_Q_W, n);
-    before_rows(q, row, i);
-    for (k = 0; k < i; k++) {
-        double scaled = row[k] / q->pivot[k];
-        left -= scaled * row[k];
-        row[k] = scaled;
-    }
-    row[i] = 1.0;
-    q->pivot[i] = left;
+    finish_fit(q, i, q->give[i]);
+}
+
+/* Append all rows of the set from the first. */
+static void append_all(tg_qp *q)
+{
+    int i = 0;
+    for (; i + 4 <= q->n_work && i + 4 <= TOGETHER; i += 4)
+        append_four(q, q->normal, q->to, i, q->give + i);
+    for (; i < q->n_work; i++)
+        append_fit(q, i);
 }
 
 /* Take row r out of the factor: the remainder is a rank-one change of the rows behind. */
@@ -480,17 +657,26 @@ static void drop(tg_qp *q, int r)
 static double least(const tg_qp *q, int i) { return q->state[i] == 2 ? price_of(q, q->row[i]) : 0.0; }
 static double most(const tg_qp *q, int i) { return q->state[i] == 1 ? price_of(q, q->row[i]) : INFINITY; }
 
-/* Take a row into the set. */
-static void put(tg_qp *q, int row, int side, int state, double multiplier)
+/* Put a row behind the set's; its normal is still to be made of it. */
+static void place(tg_qp *q, int row, int side, int state, double multiplier)
 {
     int i = q->n_work++;
-    q->to[i] = make_normal(q, row, side, q->normal + (size_t)i * TG_Q_W);
+    q->to[i] = write_row(q, row, side, q->normal + (size_t)i * TG_Q_W);
     q->row[i] = row;
     q->side[i] = (signed char)side;
     q->state[i] = (signed char)state;
     q->multiplier[i] = multiplier;
     q->in_set[row] = 1;
-    set_right(q, i);
+}
+
+/* Take a row into the set. */
+static void put(tg_qp *q, int row, int side, int state, double multiplier)
+{
+    int i = q->n_work;
+    double *m = q->normal + (size_t)i * TG_Q_W;
+    place(q, row, side, state, multiplier);
+    backward(q->H, fewer(q->to[i], q->n), m);
+    set_right(q, i, tg_product(m, q->c, q->to[i]));
     set_give(q, i);
     append_fit(q, i);
 }
@@ -556,7 +742,7 @@ static void make_x(tg_qp *q)
         to = q->to[k] > to ? q->to[k] : to;
     for (; i + 4 <= q->n_work; i += 4) {
         const double *by = q->multiplier + i;
-        tg_take_four(q->x, q->normal + (size_t)i * TG_Q_W, TG_Q_W, by[0], by[1], by[2], by[3], to);
+        tg_add_four(q->x, q->normal + (size_t)i * TG_Q_W, TG_Q_W, -by[0], -by[1], -by[2], -by[3], to);
     }
     for (; i < q->n_work; i++)
         tg_add_row(q->x, -q->multiplier[i], q->normal + (size_t)i * TG_Q_W, q->to[i]);
@@ -624,12 +810,12 @@ static void take_up(tg_qp *q, int same)
     int kept = q->n_work;
     for (int i = 0; same && i < kept; i++)
         same = (q->side[i] > 0 ? q->upper[q->row[i]] : -q->lower[q->row[i]]) <= FAR;
-    for (int i = 0; same && i < kept; i++) {
-        q->in_set[q->row[i]] = 1;
-        set_right(q, i);
-    }
-    if (same)
+    if (same) {
+        for (int i = 0; i < kept; i++)
+            q->in_set[q->row[i]] = 1;
+        set_all_right(q);
         return;
+    }
     q->n_work = 0;
     clear_fit(q);
     for (int i = 0; i < kept; i++) {
@@ -640,8 +826,19 @@ static void take_up(tg_qp *q, int same)
         bound = side > 0 ? q->upper[row] : -q->lower[row];
         if (bound > FAR)
             continue;
-        put(q, row, side, state, multiplier);
+        place(q, row, side, state, multiplier);
     }
+    for (int i = 0; i + 2 <= q->n_work; i += 2) {
+        double *m = q->normal + (size_t)i * TG_Q_W;
+        int end = q->to[i] > q->to[i + 1] ? q->to[i] : q->to[i + 1];
+        backward_two(q->H, fewer(end, q->n), m, m + TG_Q_W);
+    }
+    if (q->n_work % 2)
+        backward(q->H, fewer(q->to[q->n_work - 1], q->n), q->normal + (size_t)(q->n_work - 1) * TG_Q_W);
+    set_all_right(q);
+    for (int i = 0; i < q->n_work; i++)
+        set_give(q, i);
+    append_all(q);
 }
 
 /* Fulfil the rows of the set as K itself requires; return whether the hard ones are. */
@@ -715,7 +912,7 @@ int tg_qp_solve(tg_qp *q)
         if (q->lower[i] > q->upper[i])
             return failed(q, TG_QP_INFEASIBLE);
     if (!q->kept && (!weigh_rows(q) || !factorise(q->H, q->n, q->weight)))
-        return failed(q, TG_QP_NOT_CONVEX);
+        return failed(q, matrix_is_finite(q) ? TG_QP_NOT_CONVEX : TG_QP_NOT_FINITE);
     q->kept = 1;
     memset(q->c, 0, sizeof q->c);
     memcpy(q->c, q->f, (size_t)q->n * sizeof(double));

@@ -62,8 +62,8 @@ typedef struct {
     /* room to work in */
     double c[TG_Q_W];                  /* U^-1 f */
     double weight[TG_Q_M];             /* of a soft row not before it is asked for, -1 */
-    double normal[TG_Q_M * TG_Q_W];    /* side * U^-1 a of each row in the set */
-    double fit[TG_Q_K * (TG_Q_K + 1) / 2], pivot[TG_Q_K]; /* LDL' of their products */
+    double normal[(TG_Q_M + 3) * TG_Q_W]; /* side * U^-1 a of each row in the set; groups of four are whole */
+    double fit[TG_Q_K * (TG_Q_K + 1) / 2 + 3], pivot[TG_Q_K]; /* LDL' of their products */
     double give[TG_Q_M];                   /* what of its multiplier a row in the set gives way by */
     double soft[TG_Q_L], root[TG_Q_L];     /* 1 and the products of the broken rows, and U of it */
     double seen[TG_LEAN ? TG_Q_K * TG_Q_W : 1]; /* U^-1 of the normals of the others, */
@@ -86,8 +86,8 @@ int tg_qp_solve(tg_qp *q);
 /* The product of two rows of n numbers, a multiple of four. */
 double tg_product(const double *a, const double *b, int n);
 
-/* Take v times four rows of n numbers, a multiple of four, that lie `apart` from each other, from a row. */
-void tg_take_four(double *into, const double *rows, int apart, double v0, double v1, double v2, double v3, int n);
+/* Add v times four rows of n numbers, a multiple of four, that lie `apart` from each other, to a row. */
+void tg_add_four(double *into, const double *rows, int apart, double v0, double v1, double v2, double v3, int n);
 
 /* The values of all soft rows at x, which has zeros behind. */
 void tg_soft_values(const tg_qp *q, const double *x, double *values);
