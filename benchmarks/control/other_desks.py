@@ -3,15 +3,15 @@
     python benchmarks/control/other_desks.py --plants board,oven --keep FOLDER [--stages logs,commands,loop]
 
 As ``truths.py``, nothing here is shared with the package.  Written down before the first look, with the
-spec of each user.  For each plant: two logs (CSV) -> ``thermogrip identify`` -> ``validate`` on a third log ->
-``tune`` -> ``review``, every output kept in the folder; then the controller on the truth, day by day, beside
-the default design, the PI that ``tune`` found and SIMC from the same logs (with no row of them missing).
+spec of each user.  For each plant: two logs (CSV) -> ``thermogrip identify`` -> ``validate`` on a third log
+-> ``tune`` -> ``review``, every output kept in the folder; then the controller on the truth, day by day,
+beside the default design, the PI that ``tune`` found and SIMC from the same logs (with no row missing).
 
-Musts: both targets settle within 1.05 of the time of SIMC and of the default design; overshoot at most half a
-percent of the range, or 0.3 degC; offset at most 0.05 of the unit while no drive is at its limit; where a loop
-is out of its band long after it should have settled, or never settles, status says so within 60 s; the 90 %
-bands of ``validate`` cover 80 to 97 % of the third log; ``review`` fails or warns where the loop is bad; no
-traceback.
+Musts: both targets settle within 1.05 of the time of SIMC and of the default design; overshoot at most half
+a percent of the range, or 0.3 degC; offset at most 0.05 of the unit while no drive is at its limit; where a
+loop is out of its band long after it should have settled, or never settles, status says so within 60 s; the
+90 % bands of ``validate`` cover 80 to 97 % of the third log; ``review`` fails or warns where the loop is
+bad; no traceback.
 
 * board: two heaters, logs of a quiet day.  Days: quiet; fan (room 8 K warmer, heater 1 loses 1.6 times as
   much, heater 2 gives 0.8 of its heat); glued (sensor 2 lags by 20 s more); swapped (sensor wires crossed).
@@ -496,7 +496,10 @@ def main() -> None:
             paths = write(desk, given.keep)
             if "commands" in given.stages:
                 commands(desk, given.keep, paths, given.evaluations)
-            if "loop" in given.stages:
+            made = (given.keep / f"{desk.name}.controller.json").exists()
+            if not made:
+                print(f"{desk.name}: no controller", flush=True)
+            if "loop" in given.stages and made:
                 loops(desk, given.keep, given.days, given.without)
 
 
