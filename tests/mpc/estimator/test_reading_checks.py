@@ -11,6 +11,7 @@ from thermogrip.mpc.estimator.reading_checks import ReadingMonitor, follows, is_
 
 NAN = float("nan")
 EXPECTED = np.array([30.0, 20.0])
+SPIKE = np.array([6.0, 6.0])
 
 
 @pytest.mark.parametrize(
@@ -79,7 +80,7 @@ def test_a_reading_that_stays_while_two_degrees_are_expected_of_it_is_stuck_unti
 def test_what_the_model_does_not_explain_is_reported_of_the_drive_first(
     bias: float, offsets: list[float], switches: tuple[str, ...], said: str
 ) -> None:
-    model = SimpleNamespace(model=SimpleNamespace(switches=switches), outputs=("tank", "skin"))
+    model = SimpleNamespace(model=SimpleNamespace(switches=switches), outputs=("tank", "skin"), spike=SPIKE)
     off = SimpleNamespace(disturbance=SimpleNamespace(on_drive=np.eye(1)), model=model, w=np.array([bias]))
     off.offset = np.array([0.25, -0.5])
     off.output_bias = off.offset + offsets
