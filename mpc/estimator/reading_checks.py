@@ -118,7 +118,8 @@ def follows(observer: Observer, controlled: tuple[str, ...]) -> str:
     """Return the report where the model no longer explains the plant; empty where it does."""
     pump = "does the pump run" if observer.model.model.switches else ""
     if too_weak(observer):
-        return f"{', '.join(controlled)} does not follow the drive: {pump or 'is it another plant'}?"
+        do = "does" if len(controlled) == 1 else "do"
+        return f"{', '.join(controlled)} {do} not follow the drive: {pump or 'is it another plant'}?"
     off = np.abs(observer.output_bias - observer.offset)
     far = off / (_SHARE * observer.model.spike)
     if np.any(far >= 1.0):

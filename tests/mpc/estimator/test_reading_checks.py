@@ -62,6 +62,15 @@ def test_a_reading_that_stays_while_two_degrees_are_expected_of_it_is_stuck_unti
     assert monitor.stuck.tolist() == [False, False]
 
 
+def test_of_a_wide_range_more_is_expected_of_a_reading_before_it_is_stuck():
+    monitor = ReadingMonitor(2, spike=np.array([22.5, 6.0]))
+    monitor.forget(np.array([30.0, 20.0]))
+    monitor.expect(np.array([7.4, 2.1]))
+    assert monitor.screen(np.array([30.0, 20.0]), EXPECTED)[0] == pytest.approx([30.0, NAN], nan_ok=True)
+    monitor.expect(np.array([0.2, 0.0]))
+    assert monitor.stuck.all()
+
+
 @pytest.mark.parametrize(
     ("bias", "offsets", "switches", "said"),
     [
