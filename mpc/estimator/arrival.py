@@ -2,7 +2,7 @@
 
 What a filter with a disturbance on each output assumes explains any reading, so a plant that is not its model
 can pass for one that is.  But each plan says when an output arrives at its target.  An output that is
-promised in t seconds and is still off after 3 t and five samples is overdue; it is there again once it has
+promised in t seconds and is still off after 3 t and ten samples is overdue; it is there again once it has
 been near for five samples in a row, so that a swing through the target is no arrival.  Near is within what
 the output may overshoot, or four standard deviations of a reading, of its target or its zone; noise that the
 model does not know of is less in a mean of some three readings, and overdue is what that and the reading of
@@ -20,7 +20,8 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 
-_LATE, _SAMPLES = 3.0, 5  # how many promised times, and samples besides; samples that make an arrival
+_LATE, _SLACK = 3.0, 10  # how many promised times are given, and samples besides: loads must be learnt too
+_SAMPLES = 5  # in a row that make an arrival
 _REMEMBER = 0.3  # share of the newest error in their mean
 _READINGS = 4.0  # standard deviations of a reading that are near
 
@@ -63,7 +64,7 @@ class ArrivalMonitor:
         arrives = np.abs(ahead - target) - zone <= self._near
         promised = self.dt * (1.0 + np.argmax(arrives, axis=0))
         begins = arrives.any(axis=0) & (off > self._near) & np.isinf(self._due)
-        self._due = np.where(begins, _LATE * promised + _SAMPLES * self.dt, self._due)
+        self._due = np.where(begins, _LATE * promised + _SLACK * self.dt, self._due)
         self._late = np.where(begins, -promised, self._late)
         overdue = (self._due < 0) & (off > self._near) & (np.abs(error) - zone > self._near)
         if not overdue.any():
@@ -71,5 +72,5 @@ class ArrivalMonitor:
         k = int(np.argmax(np.where(overdue, off / self._near, 0.0)))
         return (
             f"{self.names[k]} should have been at {target[k]:.4g} {self._late[k]:.0f} s ago and is "
-            f"{off[k]:.2g} off: the plant is not its model, identify it anew"
+            f"{off[k]:.2g} off: a load, or another plant than the model"
         )
