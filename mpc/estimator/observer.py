@@ -279,7 +279,8 @@ def choose_disturbances(
     if len(chosen) < min(wanted, len(controlled)):
         raise UserError(
             f"no disturbance model of {wanted} states is detectable from {', '.join(model.outputs)}",
-            hint="control an output that a drive can move",
+            hint="control an output that a drive can move"
+            + (": identify does not call this plant good" if "; not good: " in model.plant.verdict else ""),
         )
     on_drive, on_disturbance, on_output = _matrices(model, chosen)
     names = {"input": model.drives, "output": model.outputs, "disturbance": model.disturbances}

@@ -145,6 +145,7 @@ def review(
         *_effort(controller, swing),
         _stand_in(controller),
         valid_range(controller, span),
+        called_good(controller),
     ]
 
 
@@ -474,6 +475,17 @@ def valid_range(controller: Controller, span: tuple[float, float]) -> Check:
         fix = "record a log that goes there, or treat the result with care"
         return Check(name, "warn", f"{'; '.join(seen)}; beyond: {', '.join(outside)}", fix)
     return Check(name, "pass", "; ".join(seen))
+
+
+def called_good(controller: Controller) -> Check:
+    """What rests on a plant that its own logs contradict looks as sound as what rests on a good one."""
+    name, verdict = "identify calls the plant good", controller.plant.verdict
+    head, bad, why = verdict.partition("; not good: ")
+    fix = "identify on longer logs, or on logs that excite it more, and tune again"
+    if bad:
+        return Check(name, "warn", f"{head}; not good: {why.split(';')[0]}", fix)
+    head, good, _ = verdict.partition("; good for ")
+    return Check(name, "pass", head if good else f"no verdict, of {len(controller.plant.logs)} logs")
 
 
 def beyond_logs(

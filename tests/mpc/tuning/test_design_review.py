@@ -593,6 +593,19 @@ def test_every_step_of_the_spec_must_settle_where_the_model_is_right(
     assert checks.as_asked(Controller(tank, design), (18.0, 43.0)).verdict in ("pass", "warn")
 
 
+@pytest.mark.parametrize(
+    ("said", "verdict", "finding"),
+    [
+        ("oe: expected RMSE 0.1; good for simulation; on another", "pass", "oe: expected RMSE 0.1"),
+        ("oe: RMSE 9; not good: no better on a; on another", "warn", "oe: RMSE 9; not good: no better on a"),
+        ("", "pass", "no verdict, of 2 logs"),
+    ],
+)
+def test_a_plant_that_identify_does_not_call_good_is_warned_of(said: str, verdict: str, finding: str):
+    check = checks.called_good(SimpleNamespace(plant=SimpleNamespace(verdict=said, logs=("a", "b"))))
+    assert (check.verdict, check.finding, bool(check.fix)) == (verdict, finding, verdict == "warn")
+
+
 def test_an_observer_that_needs_longer_than_a_step_has_is_warned_of():
     law, asked = SimpleNamespace(forgets=np.array([[np.exp(-2 / 700)]])), stub()
     assert checks.observer_stable(asked, SimpleNamespace(law=law), (20.0, 30.0)).verdict == "pass"
