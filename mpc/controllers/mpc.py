@@ -17,7 +17,8 @@ A loop must never be left without an answer, so every failure has a next best on
   feed-forward: the drive that is taken over has it);
 * ``off``: no reading to act on, or the pump is off; the drive goes to zero;
 * ``mismatch``: the optimiser's move, as for a plant that is known not to be the model
-  (:mod:`thermogrip.mpc.estimator.structure_monitor`; in Python alone), or to be slower.
+  (:mod:`thermogrip.mpc.estimator.structure_monitor`; in Python alone), or to be slower, or that is not where
+  its plan said long ago (:mod:`thermogrip.mpc.estimator.arrival`; in Python alone).
 
 Where drives act later than the model has it (:mod:`thermogrip.mpc.estimator.late_drives`; in Python alone),
 the estimate runs on what acts, and the plan begins where a move of now begins to act.
@@ -52,9 +53,10 @@ from thermogrip.mpc.controllers.base import STALE, SampledController
 from thermogrip.mpc.controllers.linear_equivalent import to_control
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import DAY, SCHEMA, VERSION, Design, check_design, default_design
+from thermogrip.mpc.estimator.arrival import ArrivalMonitor
 from thermogrip.mpc.estimator.call_times import RESTART_S, SAME, opening, shifted
 from thermogrip.mpc.estimator.late_drives import MOST, LateDriveMonitor, LateDrives
-from thermogrip.mpc.estimator.reading_checks import ReadingMonitor, follows, is_off
+from thermogrip.mpc.estimator.reading_checks import ReadingMonitor, follows, is_off, too_weak
 from thermogrip.mpc.estimator.structure_monitor import StructureMonitor
 from thermogrip.mpc.interface import Move, Readings, Trajectory
 from thermogrip.mpc.optimiser.reach import Reach
@@ -135,6 +137,8 @@ class Controller(Shown, SampledController):
         self.structure = StructureMonitor(plant, self.model, self.controlled)
         self.lateness = LateDriveMonitor(self.model, self.controlled)
         self.drives = LateDrives(self.model.n_u, longest=MOST * self.dt)
+        most = 2.0 * design.overshoot  # half of what may be overshot is what plans keep to
+        self.arrival = ArrivalMonitor.of(self.controlled, self.dt, most, self.observer.R[self._rows])
         self.reach = Reach(self.optimiser, self.observer)
         self.last_iterations = 0  # of the program, in the last step
         self._waits = 0.0  # seconds until an on/off drive may go over, where it is to
@@ -348,6 +352,8 @@ class Controller(Shown, SampledController):
         if self.design.ramp_per_s:
             wanted = self._ramp(wanted)
         u, status, advice = self._decide(wanted, started)
+        if status not in ("ok", "mismatch", "late"):
+            self.arrival.restart()  # no plan is followed, or none arrives
         if status == "ok":  # what happened in this sample, before what has been so for long
             advice = said or advice
         if wrong and status == "ok":
@@ -381,6 +387,7 @@ class Controller(Shown, SampledController):
         self.drives.late = self.lateness.late
         self.drives.begin(self._u)
         self.reach.forget()
+        self.arrival.restart()
         self.optimiser.forget()
 
     def _pass(self, seconds: float, applied: Array) -> None:
@@ -493,6 +500,9 @@ class Controller(Shown, SampledController):
         if outside:
             return u, "infeasible", "the drive that was applied is out of range: brought back"
         end, zone = outcome.y[-1, self._rows], self.optimiser.zone
+        overdue = self.arrival.note(
+            self._y[self._rows], wanted, outcome.y[:, self._rows], self.times.waited_s, zone
+        )
         missed = self.reach.missed(
             self.observer,
             self._u,
@@ -506,7 +516,8 @@ class Controller(Shown, SampledController):
         if missed is not None:
             what = f"{self.controlled[missed[0]]} at {wanted[missed[0]]:.1f} degC"
             advice = f"no drive holds {what}: {missed[1]:.1f} degC can be held"
-            return u, "infeasible", advice
+            other = follows(self.observer, self.controlled) if too_weak(self.observer) else ""
+            return u, "infeasible", f"{advice}, if the model is right; {other}" if other else advice
         if outcome.broken:
             name, over = max(outcome.broken.items(), key=lambda item: item[1])
             advice = f"limit of {name} will be broken by {over:.1f} degC: choose a nearer target"
@@ -519,6 +530,8 @@ class Controller(Shown, SampledController):
             return u, "fallback_plan", self._unseen(parked)
         lags = self.monitor.slower(self.observer)
         doubt = self.lateness.said or self.structure.said or ("" if self.structure.denies else lags)
+        if overdue and not doubt:
+            doubt = "; ".join(filter(None, (overdue, follows(self.observer, self.controlled))))
         if doubt:
             return u, "mismatch", doubt
         said = follows(self.observer, self.controlled)

@@ -111,6 +111,7 @@ from thermogrip.mpc.plant.prediction import ROOM, PredictionModel
 #: Standard deviation of a sensor's offset that nobody knows [degC].
 OFFSET = 0.3
 _RATE = 0.2  # degC a sample, of a plant that is reported to be at rest
+_NOISIEST = 4.0  # times the sensor's noise that a reading of a black box may have
 _FAR = 10.0  # degC from the plant's own rest, of what neither rest nor readings hold
 
 
@@ -278,7 +279,8 @@ def choose_disturbances(
     if len(chosen) < min(wanted, len(controlled)):
         raise UserError(
             f"no disturbance model of {wanted} states is detectable from {', '.join(model.outputs)}",
-            hint="control an output that a drive can move",
+            hint="control an output that a drive can move"
+            + (": identify does not call this plant good" if "; not good: " in model.plant.verdict else ""),
         )
     on_drive, on_disturbance, on_output = _matrices(model, chosen)
     names = {"input": model.drives, "output": model.outputs, "disturbance": model.disturbances}
@@ -332,10 +334,12 @@ class Observer:
         plant = model.plant
         self.offset = np.array([float(plant.offsets.get(name, 0.0)) for name in model.outputs])
         sd = [plant.noise.get(name, self.noise.reading) for name in model.outputs]
-        # a black box has the noise that shares a first error with the state best: at most sensor and model
+        # a black box has the noise that shares a first error with the state best: at most sensor and model;
+        # what a free run strays by lasts, and is no noise: of a poor model so many times the sensor's
         known, errs = plant.scores.reading_sd, plant.scores.held_out_rmse
         own = [np.hypot(known.get(n, np.inf), errs.get(n, np.inf)) for n in model.outputs]
-        self.R = np.maximum(np.minimum(sd, own), 0.02) ** 2
+        most = [_NOISIEST * known.get(n, 0.0) or np.inf for n in model.outputs]
+        self.R = np.maximum(np.minimum(np.minimum(sd, own), most), 0.02) ** 2
         self._H = np.hstack([model.C, disturbance.on_output])
         # a state's own unit: its spread, seen against the spread of the outputs
         spread = np.sqrt(np.maximum(np.diag(np.atleast_2d(plant.model.spread)), 1e-12))

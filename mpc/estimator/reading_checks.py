@@ -11,16 +11,18 @@ the changes that the model expects of it sum up,
 
     m+ = m + |C (f(x, u, d) - x)|  with its sign,      m = 0 whenever the reading changes.
 
-Beyond 2 degC it is taken for lost until it moves.  (The estimate follows the frozen reading meanwhile, so
-that only what each sample adds is summed, not where the model would have gone by itself.)
+Beyond 2 degC (of a wide range: a thirtieth of it, for readings in coarse steps stay where they are while a
+model is a little off) it is taken for lost until it moves.  (The estimate follows the frozen reading
+meanwhile, so that only what each sample adds is summed, not where the model would have gone by itself.)
 
 **A plant that does not follow.**  The bias that the observer had to assume for the drive is beyond 30 % of
-its range, or that of an output 2 degC: a pump that is off, a plug that has fallen off, another plant.
+its range, or that of an output 2 degC, or a thirtieth of a wide range: a pump that is off, a plug that has
+fallen off, another plant.
 
 **A plant that is slower.**  The observer has found an output to lag behind the model by more than 0.65
 of a sample and five standard deviations, in five in a row, from readings that show it to a quarter of a
-sample: a structure that the model lacks.  (Where a drive is far from the model, a lag explains too little to
-be accepted.)  It is reported until the lag is below a quarter of a sample.
+sample: a structure that the model lacks.  (Where a drive is far from the model, a
+lag explains too little to be accepted.)  It is reported until the lag is below a quarter of a sample.
 """
 
 from __future__ import annotations
@@ -38,9 +40,10 @@ if TYPE_CHECKING:
     from thermogrip.mpc.estimator.observer import Observer
 
 _LEFT_OUT = 3  # samples in a row, at most, that a jump is left out for
-_STUCK = 2.0  # degC that the model expects of a reading that has not moved at all
+#: Of a jump (6 degC, or a tenth of a wide range): what the model expects of a reading that has not moved at
+#: all, and a bias of an output that is no small error of the model.
+_SHARE = 1 / 3
 _FOLLOWS_DRIVE = 0.3  # of its range: a larger bias of a drive is not a small error of the model
-_FOLLOWS_OUTPUT = 2.0  # degC: a larger bias of an output is not a small error of the model
 
 # of a lag behind the model: least, least once reported, largest standard deviation [samples], least in those
 _SLOWER, _STILL_SLOWER, _SHOWN_TO, _SLOWER_SD = 0.65, 0.25, 0.25, 5.0
@@ -81,7 +84,7 @@ class ReadingMonitor:
     @property
     def stuck(self) -> Mask:
         """Which readings (n_y,) have stayed the same too long to be true."""
-        return np.asarray(np.abs(self._moved) > _STUCK)
+        return np.asarray(np.abs(self._moved) > _SHARE * self._spike)
 
     def screen(self, y: Array, expected: Array) -> tuple[Array, Mask]:
         """Return a reading y (n_y,) [degC], NaN where it cannot be, and which of its sensors (n_y,) have
@@ -115,10 +118,12 @@ def follows(observer: Observer, controlled: tuple[str, ...]) -> str:
     """Return the report where the model no longer explains the plant; empty where it does."""
     pump = "does the pump run" if observer.model.model.switches else ""
     if too_weak(observer):
-        return f"{', '.join(controlled)} does not follow the drive: {pump or 'is it another plant'}?"
+        do = "does" if len(controlled) == 1 else "do"
+        return f"{', '.join(controlled)} {do} not follow the drive: {pump or 'is it another plant'}?"
     off = np.abs(observer.output_bias - observer.offset)
-    if np.any(off >= _FOLLOWS_OUTPUT):
-        name = observer.model.outputs[int(np.argmax(off))]
+    far = off / (_SHARE * observer.model.spike)
+    if np.any(far >= 1.0):
+        name = observer.model.outputs[int(np.argmax(far))]
         return f"{name} is far from the model: {pump}{', ' * bool(pump)}is the sensor in place?"
     return ""
 

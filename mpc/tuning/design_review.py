@@ -42,6 +42,8 @@ from thermogrip.sysid.models.model import BlackBox
 NOT_TRIED = "not tried"
 _RANK = {"pass": 0, "warn": 1, "fail": 2}
 _FAR_BEYOND = 3.0  # bands
+_LONGEST_S = 3600.0  # for which an error of the observer may last, where no spec says how long a step may
+_TRIED = 2  # draws, besides the plant itself, on which the spec's steps are run
 _KELVIN = 273.15
 _SLOW = 0.9995  # an eigenvalue beyond which a loop hardly settles
 _IDLE = 1e-4  # relative change of the move below which a doubled weight does nothing
@@ -130,7 +132,7 @@ def review(
         gain_sign(controller),
         peltier_optimum(controller, span, draws),
         detectable(controller),
-        observer_stable(controller, loops[0]),
+        observer_stable(controller, loops[0], swing),
         offset_free(loops),
         eigenvalues(loops),
         hessian(controller),
@@ -138,10 +140,12 @@ def review(
         weights(controller),
         room_to_move(controller),
         limits(controller, span),
+        as_asked(controller, swing),
         lacks_structure(controller, swing),
         *_effort(controller, swing),
         _stand_in(controller),
         valid_range(controller, span),
+        called_good(controller),
     ]
 
 
@@ -159,16 +163,46 @@ def _steps(controller: Controller) -> tuple[list[float], list[float]]:
     return [], [float(low), float(high)]
 
 
+def as_asked(controller: Controller, swing: tuple[float, float]) -> Check:
+    """Where the model is right, on the plant itself and on draws of it, every step of the spec must settle as
+    asked; of targets that nobody asked for nothing fails."""
+    name, plant = "settles as asked where the model is right", controller.plant
+    spec, noted = _spec_of(controller, swing)
+    numbers = sorted({0, *draws_of(plant, _TRIED)})
+    found = run_trials(Controller(plant, controller.design), plant, spec, numbers)
+    seen, graded = [], []
+    for step in spec.steps:
+        of_step = [r for r in found if (r.start, r.target) == step]
+        words, verdicts = zip(*(_stepped(r, spec.asked(r.output), timed=noted) for r in of_step))
+        worst_of = max(range(len(of_step)), key=lambda k: (_RANK[verdicts[k]], _late(of_step[k])))
+        seen.append(f"{step[0]:g} to {step[1]:g} degC: {words[worst_of]}")
+        never = any(not np.isfinite(r.settle_s) for r in of_step)
+        graded.append("fail" if never and noted else verdicts[worst_of])
+    finding = f"the worst of {len(numbers)}: {'; '.join(seen)}" if len(numbers) > 1 else "; ".join(seen)
+    fix = "ask for less, or identify on logs in which the drive is held for longer, and tune again"
+    return _graded(name, finding, fail=("fail" in graded, fix), warn=(set(graded) != {"pass"}, fix))
+
+
+def _spec_of(controller: Controller, swing: tuple[float, float]) -> tuple[Spec, bool]:
+    """Return the spec that the controller was tuned for, and whether there is one: else a step over the
+    swing."""
+    noted = controller.notes.get("spec")
+    if isinstance(noted, Mapping):
+        # a file that tells every default may have one that is longer than its steps
+        long = "settle_within_s" in noted and noted["settle_within_s"] > noted.get("hold_s", np.inf)
+        return spec_from_dict({k: v for k, v in noted.items() if not (long and k == "settle_within_s")}), True
+    return Spec(steps=[(swing[0], max(swing[0] + 1.0, swing[1]))]), False
+
+
+def _late(result: StepResult) -> float:
+    return float(np.nan_to_num(result.settle_s, nan=np.inf))
+
+
 def lacks_structure(controller: Controller, swing: tuple[float, float]) -> Check:
     """A plant may have what its model lacks: the spec's first step, with each of that in turn, must settle
     without more overshoot and offset than the spec allows."""
     name, plant = "settles where the model lacks structure", controller.plant
-    noted = controller.notes.get("spec")
-    spec = (
-        spec_from_dict({key: value for key, value in noted.items() if key != "settle_within_s"})
-        if isinstance(noted, Mapping)
-        else Spec(steps=[(swing[0], max(swing[0] + 1.0, swing[1]))])
-    )
+    spec, stated = _spec_of(controller, swing)
     spec = spec.model_copy(update={"steps": spec.steps[:1]})
     tried = lacking(plant, spec, controller.controlled)
     numbers = [STRUCTURE * at + draws_of(plant, 1)[0] for at in range(1, len(tried) + 1)]
@@ -176,20 +210,23 @@ def lacks_structure(controller: Controller, swing: tuple[float, float]) -> Check
     if not tried:
         return Check(name, NOT_TRIED, "the spec's extra_lag, extra_delay and lost_gain are 0")
     (start, target), words = spec.steps[0], [tried[r.draw // STRUCTURE - 1][0] for r in found]
-    seen, graded = zip(*(_lacked(r, spec.asked(r.output), of) for of, r in zip(words, found, strict=True)))
+    tests = [_stepped(r, spec.asked(r.output)) for r in found]
+    seen = [f"{of}: {said}" for of, (said, _) in zip(words, tests, strict=True)]
+    graded = [verdict for _, verdict in tests]
     move = controller.design.move
     fix = f"raise the move weight (now {move:.3g}), or identify on a log of the closed loop and tune again"
     finding = f"{start:g} to {target:g} degC, each alone: {'; '.join(seen)}"
     # of defaults that nobody asked for it is a warning
-    failed = isinstance(noted, Mapping) and "fail" in graded
+    failed = stated and "fail" in graded
     return _graded(name, finding, fail=(failed, fix), warn=(set(graded) != {"pass"}, fix))
 
 
-def _lacked(result: StepResult, asked: Asked, what: str) -> tuple[str, str]:
-    """Return what a step did on a plant that has what its model lacks, in words, and graded: it fails where
-    it never settles, and goes three bands too far or ends as far off."""
+def _stepped(result: StepResult, asked: Asked, *, timed: bool = False) -> tuple[str, str]:
+    """Return what a step did, in words, and graded: it fails where it never settles, and goes three bands too
+    far or ends as far off; its time counts where an output has one of its own, or where ``timed``."""
+    within = asked.within_s if timed else asked.pace_s
     settled = bool(np.isfinite(result.settle_s))
-    late = not settled or bool(asked.pace_s and result.settle_s > asked.pace_s)
+    late = not settled or bool(within and result.settle_s > within)
     over, off = result.overshoot / asked.overshoot_degC, abs(result.bias) / asked.bias_degC
     lost = not settled and max(abs(result.bias), result.overshoot) > _FAR_BEYOND * asked.band_degC
     name = f"{result.output} " if result.output else ""
@@ -198,11 +235,11 @@ def _lacked(result: StepResult, asked: Asked, what: str) -> tuple[str, str]:
         f"overshoot {result.overshoot:.2f}",
         f"offset {result.bias:.2f}",
     ]
-    gone = (late and asked.pace_s > 0, over > 1, off > 1)
-    limits = (f"{asked.pace_s:g} s", f"{asked.overshoot_degC:g}", f"{asked.bias_degC:g}")
+    gone = (late and within > 0, over > 1, off > 1)
+    limits = (f"{within:g} s", f"{asked.overshoot_degC:g}", f"{asked.bias_degC:g}")
     said = [part + f" (asked {most})" * broken for part, broken, most in zip(parts, gone, limits)]
     verdict = "fail" if lost else "warn" if late or over > 1 or off > 1 else "pass"
-    return f"{what}: {name}{', '.join(said)}", verdict
+    return f"{name}{', '.join(said)}", verdict
 
 
 class _Counted(Controller):
@@ -440,6 +477,17 @@ def valid_range(controller: Controller, span: tuple[float, float]) -> Check:
     return Check(name, "pass", "; ".join(seen))
 
 
+def called_good(controller: Controller) -> Check:
+    """What rests on a plant that its own logs contradict looks as sound as what rests on a good one."""
+    name, verdict = "identify calls the plant good", controller.plant.verdict
+    head, bad, why = verdict.partition("; not good: ")
+    fix = "identify on longer logs, or on logs that excite it more, and tune again"
+    if bad:
+        return Check(name, "warn", f"{head}; not good: {why.split(';')[0]}", fix)
+    head, good, _ = verdict.partition("; good for ")
+    return Check(name, "pass", head if good else f"no verdict, of {len(controller.plant.logs)} logs")
+
+
 def beyond_logs(
     controller: Controller, target: float | Mapping[str, float], *, grasps: bool = False
 ) -> list[str]:
@@ -577,17 +625,19 @@ def eigenvalues(loops: Sequence[LinearLoop]) -> Check:
     return Check(name, "pass", finding + (": a slow part of the plant, as without the loop" if slow else ""))
 
 
-def observer_stable(controller: Controller, loop: LinearLoop) -> Check:
-    """The estimate must forget where it started, disturbances included."""
+def observer_stable(controller: Controller, loop: LinearLoop, swing: tuple[float, float]) -> Check:
+    """The estimate must forget where it started, disturbances included, before a step is to have settled."""
     name = "observer forgets its errors"
     size = largest_eigenvalue(loop.law.forgets)
     slow = -controller.dt / np.log(size) if 0 < size < 1 else float("inf")
+    spec, noted = _spec_of(controller, swing)
+    within = spec.settle_within_s if noted else _LONGEST_S
     finding = f"largest eigenvalue {size:.4f}: an error falls to a third in {slow:.0f} s"
     return _graded(
         name,
-        finding,
+        finding + (f", a step has {within:.0f} s" if slow > within else ""),
         fail=(size >= 1 - 1e-9, "measure another output, or give the observer's drive noise a value"),
-        warn=(slow > 3600, "raise the observer's drive and output noise: it learns too slowly"),
+        warn=(slow > within, "raise the observer's drive and output noise: it learns too slowly"),
     )
 
 

@@ -144,7 +144,9 @@ FAULTS: Mapping[str, Fault] = {
     "the pump stops and the rig reports it": Fault(
         ["off"], 30, given(pump=0), meanwhile="stopped", advice="pump is off"
     ),
-    "the pump stops and nobody reports it": Fault(["ok"], 75, meanwhile="stopped", advice="pump", back=0.4),
+    "the pump stops and nobody reports it": Fault(
+        ["ok", "mismatch"], 75, meanwhile="stopped", advice="pump", back=0.4
+    ),
     "the plant has 30 % less power": Fault(["ok"], 60, world="less power", target=38.0),
     "the plant has 30 % more power": Fault(["ok"], 60, world="more power", target=38.0),
     "the delay is 30 % longer": Fault(["ok"], 60, world="longer delay", target=38.0),
@@ -291,7 +293,9 @@ def test_fault(row, drivers, worlds):
         if (row, path) == ("the pump stops and the rig reports it", "all in C"):
             continue  # tg_step gets no pump: its README asks for a reset afterwards
         record, during = run(drivers(path), fault, worlds)
-        assert list(dict.fromkeys(record.status[during])) == fault.said
+        # what is overdue is told in Python alone
+        said = [word for word in fault.said if path != "all in C" or word != "mismatch"]
+        assert list(dict.fromkeys(record.status[during])) == said
         assert any(re.search(fault.advice, text) for text in record.advice[during])
         assert min(record.skin + record.tank) > LIMITS["t_tank"][0]
         assert max(record.skin + record.tank) < LIMITS["t_tank"][1] + 1.0
@@ -299,5 +303,6 @@ def test_fault(row, drivers, worlds):
         assert not record.advice[-1]
         assert abs(np.mean(record.skin[-30:]) - HOLD) < fault.back
         first = first or record
-        assert record.status == first.status
+        alike = first.status if path != "all in C" else [w.replace("mismatch", "ok") for w in first.status]
+        assert record.status == alike
         np.testing.assert_allclose(record.drive, first.drive, atol=1e-9, err_msg=path)

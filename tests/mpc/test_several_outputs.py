@@ -124,7 +124,7 @@ def test_there_is_no_offset_as_long_as_the_drives_are_inside_their_limits(power)
     assert 0 < max(moves[-1].drive.values()) < 99
     np.testing.assert_allclose(seen[-100:].mean(axis=0), 15.0, atol=0.02)
     assert {move.status for move in moves} == {"ok"}
-    assert ("does not follow the drive" in moves[-1].advice) == (power < 0.6)
+    assert ("h1, h2 do not follow the drive" in moves[-1].advice) == (power < 0.6)
 
 
 @pytest.mark.parametrize("kind", [Controller, LQRController])

@@ -19,9 +19,10 @@
 #define KEPT (-3.0)    /* and from which on that is revoked */
 #define CONTRADICTED 2.0 /* standard deviations that a bias moves while the drives stand still */
 #define INNOVATION_SD 0.3333333333333333 /* of a mean innovation: sqrt(q / (2 - q)) at REMEMBER q = 0.2 */
-#define STUCK 2.0      /* degC that the model expects of a reading that has not moved at all */
+/* of a jump: what the model expects of a reading that has not moved at all, and a bias of an output
+   that is no small error of the model */
+#define SHARE (1.0 / 3.0)
 #define FOLLOWS_DRIVE 0.3   /* of its range: a larger bias of a drive is not a small error of the model */
-#define FOLLOWS_OUTPUT 2.0  /* degC: a larger bias of an output is not a small error of the model */
 #define CAUTION 3.0      /* standard deviations of a mean innovation, from which on moves weigh more, */
 #define MOST_CAUTION 30.0 /* and at most so many times */
 #define SLOWER 0.65       /* samples that an output lags behind the model: a structure that the model lacks; */
@@ -191,7 +192,7 @@ static int drop_stuck(tg_controller *c, double *y)
             c->moved[i] = 0.0;
         if (isfinite(y[i]))
             c->last_y[i] = y[i];
-        if (fabs(c->moved[i]) > STUCK) {
+        if (fabs(c->moved[i]) > SHARE * c->design->spike[i]) {
             y[i] = NAN;
             stuck = 1;
         }
@@ -713,7 +714,7 @@ static int does_not_follow(const tg_controller *c)
         return 1;
     tg_biases(c, on_u, on_d, on_y);
     for (int j = 0; j < TG_NY; j++)
-        if (fabs(on_y[j] - s->offset[j]) >= FOLLOWS_OUTPUT)
+        if (fabs(on_y[j] - s->offset[j]) >= SHARE * s->spike[j])
             return 1;
     return 0;
 }

@@ -489,14 +489,14 @@ def test_where_a_lag_would_be_negative_the_estimate_is_that_without_one() -> Non
     np.testing.assert_allclose([*one.x, *one.w], [*other.x, *other.w], atol=1e-9)
 
 
-def test_readings_of_a_black_box_count_by_no_more_than_their_own_noise_and_the_models_error():
+def test_readings_of_a_black_box_count_by_no_more_than_their_own_noise_and_the_models_error_or_four_times():
     old = replace(make_tank(), noise={"t_tank": 9.0, "t_surface": 0.1})
     errs = {"t_tank": 0.4, "t_surface": 0.2}
-    scores = PlantScores(reading_sd={"t_tank": 0.3, "t_surface": 0.01}, held_out_rmse=errs)
+    scores = PlantScores(reading_sd={"t_tank": 0.3, "t_surface": 0.02}, held_out_rmse=errs)
     plants = old, replace(old, scores=scores)
     old, new = ([*default_design(p).observer(PredictionModel(p, dt=2.0)).R] for p in plants)
     assert old == pytest.approx([81.0, 0.01])
-    assert new == pytest.approx([0.25, 0.01])
+    assert new == pytest.approx([0.25, 0.08**2])
 
 
 @pytest.mark.parametrize("structure", ["", "na 2"])

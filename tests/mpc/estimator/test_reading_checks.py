@@ -11,6 +11,7 @@ from thermogrip.mpc.estimator.reading_checks import ReadingMonitor, follows, is_
 
 NAN = float("nan")
 EXPECTED = np.array([30.0, 20.0])
+SPIKE = np.array([6.0, 6.0])
 
 
 @pytest.mark.parametrize(
@@ -61,6 +62,15 @@ def test_a_reading_that_stays_while_two_degrees_are_expected_of_it_is_stuck_unti
     assert monitor.stuck.tolist() == [False, False]
 
 
+def test_of_a_wide_range_more_is_expected_of_a_reading_before_it_is_stuck():
+    monitor = ReadingMonitor(2, spike=np.array([22.5, 6.0]))
+    monitor.forget(np.array([30.0, 20.0]))
+    monitor.expect(np.array([7.4, 2.1]))
+    assert monitor.screen(np.array([30.0, 20.0]), EXPECTED)[0] == pytest.approx([30.0, NAN], nan_ok=True)
+    monitor.expect(np.array([0.2, 0.0]))
+    assert monitor.stuck.all()
+
+
 @pytest.mark.parametrize(
     ("bias", "offsets", "switches", "said"),
     [
@@ -79,7 +89,7 @@ def test_a_reading_that_stays_while_two_degrees_are_expected_of_it_is_stuck_unti
 def test_what_the_model_does_not_explain_is_reported_of_the_drive_first(
     bias: float, offsets: list[float], switches: tuple[str, ...], said: str
 ) -> None:
-    model = SimpleNamespace(model=SimpleNamespace(switches=switches), outputs=("tank", "skin"))
+    model = SimpleNamespace(model=SimpleNamespace(switches=switches), outputs=("tank", "skin"), spike=SPIKE)
     off = SimpleNamespace(disturbance=SimpleNamespace(on_drive=np.eye(1)), model=model, w=np.array([bias]))
     off.offset = np.array([0.25, -0.5])
     off.output_bias = off.offset + offsets

@@ -233,7 +233,9 @@ def stub(**design) -> Any:
     model.disturbances, model.rooms = ("t_room",), np.array([True])
     model.undisturbed = lambda ambient: np.array([ambient])
     vars(model).update(model=None, on_off=(), lowest=np.array([0.0, -1.0]), highest=np.array([1.0, 3.0]))
-    return SimpleNamespace(design=SimpleNamespace(**usual | design), model=model, plant=None, dt=2.0)
+    return SimpleNamespace(
+        design=SimpleNamespace(**usual | design), model=model, plant=None, dt=2.0, notes={}
+    )
 
 
 @pytest.mark.parametrize(
@@ -319,8 +321,8 @@ def test_iterations_near_their_limit_are_counted_with_their_rows(most, verdict):
 )  # fmt: skip
 def test_an_observer_forgets_within_an_hour(size, verdict, seconds):
     law = SimpleNamespace(forgets=np.array([[0.1, 2.0], [0.0, -size]]))
-    check = checks.observer_stable(stub(), SimpleNamespace(law=law))
-    assert (check.verdict, check.finding.endswith(f"to a third in {seconds}")) == (verdict, True)
+    check = checks.observer_stable(stub(), SimpleNamespace(law=law), (20.0, 30.0))
+    assert (check.verdict, f"to a third in {seconds}" in check.finding) == (verdict, True)
 
 
 @pytest.mark.parametrize(("left", "verdict"), [(0.0499, "pass"), (0.05, "fail"), (np.nan, "fail")])
@@ -551,7 +553,68 @@ def test_structure_that_lacks_is_judged_by_overshoot_and_offset_too(
     assert (found.verdict, bool(found.fix)) == (verdict, verdict != "pass")
     nobody = checks.lacks_structure(Controller(tank, controller.design), (18.0, 43.0))  # asked for anything
     assert nobody.verdict == ("pass" if verdict == "pass" else "warn")
-    assert checks._lacked(replace(STEP, settle_s=70.0), ASKED._replace(pace_s=65.0), "x")[1] == "warn"
+    assert checks._stepped(replace(STEP, settle_s=70.0), ASKED._replace(pace_s=65.0))[1] == "warn"
+
+
+@pytest.mark.parametrize(
+    ("changes", "said", "verdict"),
+    [
+        ({}, "settles in 60 s, overshoot 0.10, offset 0.02", "pass"),
+        ({"settle_s": 451.0}, "settles in 451 s (asked 450 s), overshoot 0.10, offset 0.02", "warn"),
+        ({"bias": 0.06}, "settles in 60 s, overshoot 0.10, offset 0.06 (asked 0.05)", "warn"),
+        (
+            {"settle_s": np.nan},
+            "never settles (asked 450 s), overshoot 0.10, offset 0.02",
+            "fail",
+        ),
+    ],
+)
+def test_every_step_of_the_spec_must_settle_where_the_model_is_right(
+    tank: Any, changes: dict[str, float], said: str, verdict: str, monkeypatch: pytest.MonkeyPatch
+):
+    design = default_design(tank, dt=4.0)
+    last = replace(STEP, start=43.0, target=30.0)
+    results = [
+        STEP,
+        replace(last, draw=0),
+        replace(last, **changes),
+    ]  # the worst draw of the last step counts
+    monkeypatch.setattr(checks, "run_trials", lambda *given: results)
+    for steps in ({"settle_within_s": 450.0}, {}):  # of the defaults
+        spec = {"steps": [[18.0, 43.0], [43.0, 30.0]], **steps}
+        found = checks.as_asked(Controller(tank, design, notes={"spec": spec}), (18.0, 43.0))
+        assert (found.verdict, bool(found.fix)) == (verdict, verdict != "pass")
+        assert found.finding.endswith(f"overshoot 0.10, offset 0.02; 43 to 30 degC: {said}")
+    # a file that tells the default beside shorter steps is read
+    short = spec | {"settle_within_s": 450.0, "hold_s": 90.0}
+    assert checks.as_asked(Controller(tank, design, notes={"spec": short}), (18.0, 43.0)).verdict == verdict
+    nobody = replace(STEP, start=18.0, target=43.0, **changes)
+    monkeypatch.setattr(checks, "run_trials", lambda *given: [nobody])
+    assert checks.as_asked(Controller(tank, design), (18.0, 43.0)).verdict in ("pass", "warn")
+
+
+@pytest.mark.parametrize(
+    ("said", "verdict", "finding"),
+    [
+        ("oe: expected RMSE 0.1; good for simulation; on another", "pass", "oe: expected RMSE 0.1"),
+        ("oe: RMSE 9; not good: no better on a; on another", "warn", "oe: RMSE 9; not good: no better on a"),
+        ("", "pass", "no verdict, of 2 logs"),
+    ],
+)
+def test_a_plant_that_identify_does_not_call_good_is_warned_of(said: str, verdict: str, finding: str):
+    check = checks.called_good(SimpleNamespace(plant=SimpleNamespace(verdict=said, logs=("a", "b"))))
+    assert (check.verdict, check.finding, bool(check.fix)) == (verdict, finding, verdict == "warn")
+
+
+def test_an_observer_that_needs_longer_than_a_step_has_is_warned_of():
+    law, asked = SimpleNamespace(forgets=np.array([[np.exp(-2 / 700)]])), stub()
+    assert checks.observer_stable(asked, SimpleNamespace(law=law), (20.0, 30.0)).verdict == "pass"
+    asked.notes = {"spec": {"settle_within_s": 600.0}}
+    check = checks.observer_stable(asked, SimpleNamespace(law=law), (20.0, 30.0))
+    assert (check.verdict, check.finding.split(": ")[1]) == (
+        "warn",
+        "an error falls to a third in 700 s, a step has 600 s",
+    )
 
 
 def test_where_nothing_is_tried_it_does_not_say_pass(tank: Any):
