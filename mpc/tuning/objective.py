@@ -32,10 +32,10 @@ only ramp is in the band no sooner than its ramp brings it there, which is the b
 
 from __future__ import annotations
 
+import lzma
 import pickle
 import threading
 import warnings
-import zlib
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -412,7 +412,7 @@ def _unpacked_here(packed: bytes) -> Search:
 
 @lru_cache(maxsize=16)
 def _unpacked(packed: bytes, thread: int) -> Search:
-    state = pickle.loads(zlib.decompress(packed))  # noqa: S301  as processes send it
+    state = pickle.loads(lzma.decompress(packed))  # noqa: S301  as processes send it
     search = object.__new__(Search)
     search.__dict__.update(state, plant=_plant_of(state["plant"], thread))
     remember_codes(search._codes)
@@ -516,7 +516,7 @@ class Search:
             where = None if own is None else (str(Path(own.file).resolve()), own.name)
             here = {"_made": {}, "_library": None, "_packed": None, "_built": None, "workers": 1}
             plant = pickle.dumps((self.plant.to_dict(), where))
-            self._packed = zlib.compress(pickle.dumps({**self.__dict__, **here, "plant": plant}), 1)
+            self._packed = lzma.compress(pickle.dumps({**self.__dict__, **here, "plant": plant}), preset=1)
         return _unpacked_here, (self._packed,)
 
     def __copy__(self) -> Search:

@@ -686,5 +686,12 @@ def _runs(search: Search, controller: Controller, lqr: Design, workers: Workers)
 def _shown(item: tuple[Search, str, Design, tuple[float, float]]) -> ClosedLoop:
     search, name, design, step = item
     made = Controller(search.plant, design) if name == "MPC" else search.made(name, design)
-    draw, spec = search.unseen[0], search.spec
-    return trial(made, search.plant, spec, step=step, draw=draw, length_s=spec.hold_s, seed=search.check_seed)
+    return trial(
+        made,
+        plant=search.plant,
+        spec=search.spec,
+        step=step,
+        draw=search.unseen[0],
+        length_s=search.spec.hold_s,
+        seed=search.check_seed,
+    )

@@ -72,7 +72,7 @@ def test_the_default_design_is_watched_until_it_has_settled_on_the_slowest_draw(
     one = StepResult(*STEPS[0], 1, 50.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 300.0)
     found = [one, replace(one, draw=2, settle_s=70.0)]
     found += [replace(each, start=STEPS[1][0], target=STEPS[1][1], settle_s=np.nan) for each in found]
-    monkeypatch.setattr(objective, "run_trials", lambda *given, seed: found)
+    monkeypatch.setattr(objective, "run_trials", lambda *given, **named: found)
     monkeypatch.setattr(search, "made", lambda name, design: None)
     assert search._settled() == [70.0, np.inf]
 
