@@ -17,6 +17,7 @@ from __future__ import annotations
 import atexit
 import ctypes
 import multiprocessing
+import operator
 import os
 import signal
 import sys
@@ -203,6 +204,24 @@ def sub_progress(progress: Progress | None, start: float, stop: float, name: str
         progress(start + (stop - start) * min(max(fraction, 0.0), 1.0), text)
 
     return show
+
+
+def joint_progress(progress: Progress | None, shares: Sequence[float]) -> list[Progress | None]:
+    """Return the progress of each of some parts of a whole that are done side by side, or in turn; ``shares``
+    are theirs of the whole."""
+    done = [0.0] * len(shares)
+
+    def part(at: int) -> Progress | None:
+        if progress is None:
+            return None
+
+        def show(fraction: float, what: str) -> None:
+            done[at] = min(max(fraction, 0.0), 1.0)
+            progress(sum(map(operator.mul, done, shares)), what)
+
+        return show
+
+    return [part(at) for at in range(len(shares))]
 
 
 def _done(

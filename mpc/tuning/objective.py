@@ -414,7 +414,8 @@ def _unpacked_here(packed: bytes) -> Search:
 def _unpacked(packed: bytes, thread: int) -> Search:
     state = pickle.loads(lzma.decompress(packed))  # noqa: S301  as processes send it
     search = object.__new__(Search)
-    search.__dict__.update(state, plant=_plant_of(state["plant"], thread))
+    search.__dict__.update(state, plant=_plant_of(state["plant"], thread), workers=1)
+    search._made, search._library, search._packed, search._built = {}, None, None, _Built()
     remember_codes(search._codes)
     return search
 
@@ -514,9 +515,10 @@ class Search:
         if self._packed is None:
             own = getattr(self.plant.model, "code", None)
             where = None if own is None else (str(Path(own.file).resolve()), own.name)
-            here = {"_made": {}, "_library": None, "_packed": None, "_built": None, "workers": 1}
+            apart = ("_made", "_library", "_packed", "_built", "workers")
+            state = {key: value for key, value in self.__dict__.items() if key not in apart}
             plant = pickle.dumps((self.plant.to_dict(), where))
-            self._packed = lzma.compress(pickle.dumps({**self.__dict__, **here, "plant": plant}), preset=1)
+            self._packed = lzma.compress(pickle.dumps({**state, "plant": plant}), preset=1)
         return _unpacked_here, (self._packed,)
 
     def __copy__(self) -> Search:

@@ -38,6 +38,7 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.parallel import (
     Progress,
     Workers,
+    joint_progress,
     kept_processes,
     run_parallel,
     run_threads,
@@ -576,7 +577,7 @@ def _search_all(
     plain = pi | {"feedforward": 0.05}
     others = [plain | dict(zip(_SPREAD, values.tolist())) for values in _spread(search.pi)]
     lqr = {**parameters_of(search.baseline, search.spec), "drive": 1e-2}
-    parts = _jointly(progress, (_MPC_DONE, _PI_DONE - _MPC_DONE, 1.0 - _PI_DONE))
+    parts = joint_progress(progress, (_MPC_DONE, _PI_DONE - _MPC_DONE, 1.0 - _PI_DONE))
     items = [
         (search, "MPC", [_best(looked).parameters], max(0, n - len(looked)), parts[0]),
         (search, "PI", [pi, plain, *others][search.certain :], 3 * n, parts[1]),
@@ -585,23 +586,6 @@ def _search_all(
     tried = run_threads(_optimise, items, workers)
     found = {name: trials for (_, name, *_), trials in zip(items, tried, strict=True)}
     return {**found, "MPC": [*looked, *found["MPC"]]}
-
-
-def _jointly(progress: Progress | None, shares: Sequence[float]) -> list[Progress | None]:
-    """Return the progress of each of some parts of a whole that are done side by side or in turn."""
-    done = np.zeros(len(shares))
-
-    def part(at: int) -> Progress | None:
-        if progress is None:
-            return None
-
-        def show(fraction: float, what: str) -> None:
-            done[at] = fraction
-            progress(float(done @ shares), what)
-
-        return show
-
-    return [part(at) for at in range(len(shares))]
 
 
 _SPREAD = {"Kc": (0.4, 2.5), "Ti": (0.4, 2.5), "setpoint": (0.2, 1.0), "feedforward": (0.05, 1.0)}
