@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import FrozenInstanceError, dataclass, field, replace
 from functools import partial
@@ -71,6 +72,17 @@ def test_the_same_seed_finds_the_same_controller(tank, tuning):
     again = tune(tank, QUICK)
     assert again.controller.design == tuning.controller.design
     assert again.scores == tuning.scores
+
+
+@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="needs two processors")
+def test_two_processes_find_the_same_to_the_last_bit(tank, tuning):
+    both = tune(tank, QUICK, workers=2)
+    for part in ("history", "rows", "scores", "pareto", "sensitivity", "finding"):
+        assert repr(getattr(both, part)) == repr(getattr(tuning, part)), part  # NaN and every digit too
+    assert both.controller.design == tuning.controller.design
+    for title, run in tuning.runs.items():
+        assert run.drive.keys() == both.runs[title].drive.keys()
+        assert all(np.array_equal(run.drive[name], both.runs[title].drive[name]) for name in run.drive)
 
 
 def test_a_target_out_of_reach_is_refused(tank):
