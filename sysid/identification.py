@@ -767,9 +767,9 @@ _Fold: TypeAlias = "tuple[Plant | str, FreeRun | str | None]"
 
 def _fitted_or_why(item: tuple[_Asked, str, Sequence[Log], Held]) -> _Fold:
     """Return the plant of a candidate fitted to some logs and its run over another, or why there is none."""
-    *asked, held = item
+    asked, model, train, held = item
     try:
-        fitted = _fit(*asked, None)
+        fitted = _fit(asked, model, train, None)
     except UserError as error:
         return str(error), None
     plant = fitted if isinstance(fitted, Plant) else fitted.plant
