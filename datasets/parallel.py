@@ -17,11 +17,20 @@ from __future__ import annotations
 import atexit
 import ctypes
 import multiprocessing
+import operator
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures import (
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    as_completed,
+)
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager, suppress
 from functools import cache, partial
@@ -41,8 +50,16 @@ _CONNECT_S = 10
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of malloc.h
 _DEATHS = 3  # of processes, without a result between them
 
-#: The processes that :func:`kept_processes` holds, if any.
+_THREADS = 32  # of run_threads, which mostly wait
+
+#: The processes that :func:`kept_processes` holds, if any, and its connections to schedulers by address.
 _kept: list[ProcessPoolExecutor] = []
+_kept_size: list[int] = []
+_clients: dict[str, Any] = {}
+_keeping: list[str] = []
+_lock = threading.Lock()  # of these
+#: In a thread of :func:`run_threads`: set once the others are no longer wanted.
+_thread = threading.local()
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -55,21 +72,60 @@ def run_parallel(
     progress: Progress | None = None,
     *,
     what: str = "working",
+    elsewhere: bool = False,
 ) -> list[_Result]:
     """Return ``[function(item) for item in items]``, computed on so many processes or on a cluster.
 
     ``function`` must be importable; the first exception that it raises stops the rest and is raised here.
-    With one worker it runs in this process; more are never started than there are items or processors.
+    With one worker it runs in this process, and so does a single item unless it is to run ``elsewhere``;
+    more are never started than there are items or processors.
     ``progress`` is called with the fraction done and ``what``. UserError if processes are killed again and
     again, or the cluster cannot be reached, has no workers, or has other versions.
     """
     todo = list(items)
     found: dict[int, _Result] = {}
-    with closing(_done(function, todo, workers)) as done:
+    with closing(_done(function, todo, workers, elsewhere)) as done:
         for i, result in done:
             found[i] = result
             if progress is not None:
                 progress(len(found) / len(todo), what)
+    return [found[i] for i in range(len(todo))]
+
+
+def run_threads(
+    function: Callable[[_Item], _Result],
+    items: Iterable[_Item],
+    workers: Workers = 1,
+    progress: Progress | None = None,
+    *,
+    what: str = "working",
+) -> list[_Result]:
+    """Return ``[function(item) for item in items]``, each in a thread of this process, for functions that
+    call :func:`run_parallel` with these workers: what one waits for leaves them to the others.
+
+    Arguments are those of :func:`run_parallel`; with one worker it is one item after the other. A fault ends
+    the other threads when they next ask for work.
+    """
+    todo = list(items)
+    if workers == 1 or len(todo) < 2:
+        return run_parallel(function, todo, 1, progress, what=what)
+    over = threading.Event()
+
+    def begin() -> None:
+        _thread.over = over
+
+    found: dict[int, _Result] = {}
+    with ThreadPoolExecutor(min(len(todo), _THREADS), initializer=begin) as threads:
+        try:
+            futures = {threads.submit(function, item): i for i, item in enumerate(todo)}
+            for future in as_completed(futures):
+                found[futures[future]] = future.result()
+                if progress is not None:
+                    progress(len(found) / len(todo), what)
+        except BaseException:
+            over.set()
+            threads.shutdown(wait=False, cancel_futures=True)
+            raise
     return [found[i] for i in range(len(todo))]
 
 
@@ -91,16 +147,37 @@ def in_order(
 @contextmanager
 def kept_processes(workers: Workers) -> Iterator[None]:
     """Let every :func:`run_parallel` of the block that shares its work out use the same local processes, for
-    each takes seconds to import and to load compiled code."""
-    n = 1 if isinstance(workers, str) else min(workers, os.cpu_count() or 1)
+    each takes seconds to import and to load compiled code, or the same connection to a scheduler."""
+    if isinstance(workers, str):
+        with _kept_client(workers):
+            yield
+        return
+    n = min(workers, os.cpu_count() or 1)
     if n == 1 or _kept:
         yield
         return
     _kept.append(_processes(n))
+    _kept_size.append(n)
     try:
         yield
     finally:
+        _kept_size.pop()
         _kept.pop().shutdown(wait=True, cancel_futures=True)
+
+
+@contextmanager
+def _kept_client(address: str) -> Iterator[None]:
+    if address in _keeping:
+        yield
+        return
+    _keeping.append(address)
+    try:
+        yield
+    finally:
+        _keeping.remove(address)
+        client = _clients.pop(address, None)
+        if client is not None:
+            client.close()
 
 
 def check_workers(workers: Workers) -> Workers:
@@ -129,17 +206,38 @@ def sub_progress(progress: Progress | None, start: float, stop: float, name: str
     return show
 
 
+def joint_progress(progress: Progress | None, shares: Sequence[float]) -> list[Progress | None]:
+    """Return the progress of each of some parts of a whole that are done side by side, or in turn; ``shares``
+    are theirs of the whole."""
+    done = [0.0] * len(shares)
+
+    def part(at: int) -> Progress | None:
+        if progress is None:
+            return None
+
+        def show(fraction: float, what: str) -> None:
+            done[at] = min(max(fraction, 0.0), 1.0)
+            progress(sum(map(operator.mul, done, shares)), what)
+
+        return show
+
+    return [part(at) for at in range(len(shares))]
+
+
 def _done(
-    function: Callable[[_Item], _Result], todo: list[_Item], workers: Workers
+    function: Callable[[_Item], _Result], todo: list[_Item], workers: Workers, elsewhere: bool = False
 ) -> Generator[tuple[int, _Result], None, None]:
     """Yield the place of each item and its result, in the order of finishing."""
     check_workers(workers)
+    over = getattr(_thread, "over", None)
+    if over is not None and over.is_set():
+        raise CancelledError
     if isinstance(workers, str):
         if todo:
             yield from _on_cluster(function, todo, workers)
         return
     n = min(workers, len(todo), os.cpu_count() or 1)
-    if n <= 1:
+    if n < 1 or (n == 1 and not (elsewhere and _kept)):
         yield from enumerate(map(function, todo))
     else:
         yield from _on_processes(function, todo, n)
@@ -150,7 +248,8 @@ def _on_processes(
 ) -> Generator[tuple[int, _Result], None, None]:
     left, deaths = dict(enumerate(todo)), 0
     while left:
-        pool = _kept[0] if _kept else _processes(n)
+        kept = bool(_kept)
+        pool = _kept[0] if kept else _processes(n)
         futures: dict[Future[_Result], int] = {}
         try:
             futures |= {pool.submit(function, item): i for i, item in left.items()}
@@ -165,13 +264,14 @@ def _on_processes(
                 raise UserError(
                     "worker processes are killed again and again", hint="lower --workers; memory may be short"
                 ) from error
-            if _kept:
-                _kept[0].shutdown(wait=True)
-                _kept[0] = _processes(n)
+            with _lock:
+                if kept and pool is _kept[0]:  # the first thread that sees it
+                    pool.shutdown(wait=True)
+                    _kept[0] = _processes(_kept_size[0])
         finally:
             for future in futures:
                 future.cancel()  # what has not begun
-            if not _kept:
+            if not kept:
                 pool.shutdown(wait=True)
 
 
@@ -212,11 +312,16 @@ def _end_server(forkserver: Any) -> None:
 
 def _processes(n: int) -> ProcessPoolExecutor:
     if sys.platform != "linux":  # macOS has libraries that fail after any fork
-        return ProcessPoolExecutor(n, mp_context=multiprocessing.get_context("spawn"))
-    _serving(sorted(name for name in sys.modules if name.startswith("thermogrip.")))
-    ends = signal.getsignal(signal.SIGINT) is not signal.SIG_IGN  # by Ctrl-C: not under nohup
-    context = multiprocessing.get_context("forkserver")
-    return ProcessPoolExecutor(n, mp_context=context, initializer=_unblocked if ends else None)
+        pool = ProcessPoolExecutor(n, mp_context=multiprocessing.get_context("spawn"))
+    else:
+        _serving(sorted(name for name in sys.modules if name.startswith("thermogrip.")))
+        ends = signal.getsignal(signal.SIGINT) is not signal.SIG_IGN  # by Ctrl-C: not under nohup
+        context = multiprocessing.get_context("forkserver")
+        pool = ProcessPoolExecutor(n, mp_context=context, initializer=_unblocked if ends else None)
+    # All at once, as where processes are forked: one that is started as the pool breaks is waited for without
+    # end, or it finds the pool's pipes closed, and submit() raises OSError or ValueError.
+    setattr(pool, "_safe_to_dynamically_spawn_children", False)  # noqa: B010  typeshed has no such name
+    return pool
 
 
 def _unblocked() -> None:
@@ -238,8 +343,7 @@ class Replaced:
         if self._n == 1:
             return ThreadPoolExecutor(1)
         pool = _processes(self._n)
-        for _ in range(self._n):  # all at once: one that begins as the pool breaks is waited for without end
-            pool.submit(os.getpid)
+        pool.submit(os.getpid)  # which starts all of them
         return pool
 
     async def call(self, function: Callable[[_Item], _Result], item: _Item) -> _Result:
@@ -264,7 +368,30 @@ def _on_cluster(
     import distributed
 
     dask: Any = distributed  # its functions have no types
+    with _lock:
+        kept_one = address in _keeping
+        client = _clients.get(address) or _connected(dask, address)
+        if kept_one:
+            _clients[address] = client
+    futures: dict[Any, int] = {}
+    try:
+        kept = partial(_with_memory_kept, function)
+        futures |= {future: i for i, future in enumerate(client.map(kept, todo, pure=False))}
+        for future in dask.as_completed(futures, loop=client.loop):
+            result = future.result()  # the first fault ends it
+            yield futures.pop(future), result
+    except dask.KilledWorker as error:
+        problem = f"workers of {address} are killed again and again"
+        raise UserError(problem, hint="give them more memory") from error
+    finally:
+        if kept_one:
+            client.cancel(list(futures))
+        else:
+            client.close()  # which lets go of what is not done
 
+
+def _connected(dask: Any, address: str) -> Any:
+    """Return a client of a scheduler whose workers run this code."""
     hint = "start one with 'dask scheduler', or check the address"
     # its own words about versions are a table; _check_cluster says it in one line
     lost = as_user_error((OSError, ValueError), f"no scheduler answers at {address}", hint=hint)
@@ -273,16 +400,10 @@ def _on_cluster(
         client = dask.Client(address, timeout=_CONNECT_S, set_as_default=False)
     try:
         _check_cluster(client, address)
-        kept = partial(_with_memory_kept, function)
-        futures = {future: i for i, future in enumerate(client.map(kept, todo, pure=False))}
-        for future in dask.as_completed(futures, loop=client.loop):
-            result = future.result()  # the first fault ends it
-            yield futures.pop(future), result
-    except dask.KilledWorker as error:
-        problem = f"workers of {address} are killed again and again"
-        raise UserError(problem, hint="give them more memory") from error
-    finally:
-        client.close()  # which lets go of what is not done
+    except BaseException:
+        client.close()
+        raise
+    return client
 
 
 def _with_memory_kept(function: Callable[[_Item], _Result], item: _Item) -> _Result:

@@ -496,18 +496,20 @@ def identify(
             return best if train is logs else fit_without_tail(best, train)
         return _fit((network, settings, seed), model, train, report)
 
-    folds_done: dict[tuple[str, int], Plant | str] = {}
+    folds_done: dict[tuple[str, int], _Fold] = {}
     if leave_one_out and workers != 1:
         from thermogrip.sysid.models.network import NetworkModel
 
         # a class of the user's own is known in this process alone
         shared = network if isinstance(network, NetworkModel) else None
         some = [model for model in finalists if model != "network" or shared is not None]
-        pairs = [(model, train) for train, _ in cases for model in some]
-        items = [((shared, settings, seed), *pair) for pair in pairs]
+        # what takes longest first: a process that begins with it last leaves others idle
+        some.sort(key=lambda model: _LONGEST.index(model) if model in _LONGEST else len(_LONGEST))
+        folds = [(model, train, held) for model in some for train, held in cases]
+        items = [((shared, settings, seed), *fold) for fold in folds]
         report = parts.part("left out", of=len(items))
         found = run_parallel(_fitted_or_why, items, workers, report, what="fitting")
-        folds_done = {(model, id(train)): plant for (model, train), plant in zip(pairs, found)}
+        folds_done = {(model, id(train)): each for (model, train, _), each in zip(folds, found)}
     scored, more, tried = _compare(fit, finalists, cases, parts, folds_done)
     rows, refused = rows + scored, refused + more
     chosen = choose_model(scored, len(cases)) or (best.kind if best else None)
@@ -742,6 +744,8 @@ def _fit_or_refusal(item: tuple[str, Sequence[Log], dict[str, Any]]) -> BlackBox
         return f"{kind}: {error}"
 
 
+_LONGEST = ("neural", "subspace", "oe", "sindy", "network")  # of the candidates, by time for a fit
+
 _Asked: TypeAlias = "tuple[GreyModel | None, dict[str, Any], int]"  # network, settings of black boxes, seed
 
 
@@ -756,13 +760,23 @@ def _fit(asked: _Asked, model: str, train: Sequence[Log], report: Progress | Non
     return fit_network(network, train, seed=seed, progress=report)
 
 
-def _fitted_or_why(item: tuple[_Asked, str, Sequence[Log]]) -> Plant | str:
-    """Return the plant of a candidate fitted to some logs, or why it could not be."""
+#: A plant, or why it could not be fitted, and its run over what is held out, why there is none, or None where
+#: nobody has run it.
+_Fold: TypeAlias = "tuple[Plant | str, FreeRun | str | None]"
+
+
+def _fitted_or_why(item: tuple[_Asked, str, Sequence[Log], Held]) -> _Fold:
+    """Return the plant of a candidate fitted to some logs and its run over another, or why there is none."""
+    asked, model, train, held = item
     try:
-        fitted = _fit(*item, None)
+        fitted = _fit(asked, model, train, None)
     except UserError as error:
-        return str(error)
-    return fitted if isinstance(fitted, Plant) else fitted.plant
+        return str(error), None
+    plant = fitted if isinstance(fitted, Plant) else fitted.plant
+    try:
+        return plant, run_held_out(plant, held, unseen=True)
+    except UserError as error:
+        return plant, str(error)
 
 
 def _compare(
@@ -770,10 +784,10 @@ def _compare(
     candidates: Sequence[str],
     cases: Sequence[tuple[list[Log], Held]],
     parts: _Parts,
-    plants: dict[tuple[str, int], Plant | str],
+    folds: dict[tuple[str, int], _Fold],
 ) -> tuple[list[Row], list[str], dict[str, dict[str, FreeRun]]]:
     """Return the rows of every candidate on what is held out, which could not be fitted, and why, and by
-    candidate and what was held out its free runs; ``plants`` are those fitted already, or why not."""
+    candidate and what was held out its free runs; ``folds`` are those done already."""
     rows: list[Row] = []
     runs: dict[str, dict[str, FreeRun]] = {}
     refused: list[str] = []
@@ -782,15 +796,15 @@ def _compare(
         for model in candidates:
             what = f"{model} without {held.name}"
             try:
-                if (model, id(train)) not in plants:
+                if (model, id(train)) not in folds:
                     fitted = fit(model, train, parts.part(what))
-                    plants[model, id(train)] = fitted if isinstance(fitted, Plant) else fitted.plant
-                plant = plants[model, id(train)]
-                if isinstance(plant, str):
-                    refused.append(f"{what}: {plant}")
+                    folds[model, id(train)] = (fitted if isinstance(fitted, Plant) else fitted.plant), None
+                plant, run = folds[model, id(train)]
+                if isinstance(plant, str) or isinstance(run, str):
+                    refused.append(f"{what}: {plant if isinstance(plant, str) else run}")
                     parts.next()
                     continue
-                run = run_held_out(plant, held, unseen=True)
+                run = run_held_out(plant, held, unseen=True) if run is None else run
                 rows += rows_of(model, plant, held.name, run, held_out=True)
                 runs.setdefault(model, {})[held.name] = run
             except UserError as error:

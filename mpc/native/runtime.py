@@ -17,10 +17,11 @@ import os
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Sequence
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,9 +111,29 @@ def _machine(gcc: str) -> str:
 QP_STATUS = ("solved", "infeasible", "iteration limit", "not convex", "not finite", "time limit")
 
 
-@cache
+_codes: dict[tuple[_ByStructure, tuple[int, ...], float], ModelCode] = {}
+
+
 def _written(model: _ByStructure, drives: tuple[int, ...], h: float) -> ModelCode:
-    return write_model(model.model, drives, h)
+    key = (model, drives, h)
+    if key not in _codes:
+        _codes[key] = write_model(model.model, drives, h)
+    return _codes[key]
+
+
+#: Structure, drives and step of a model, and its C.
+KnownCode: TypeAlias = tuple[str, tuple[int, ...], float, ModelCode]
+
+
+def known_codes() -> list[KnownCode]:
+    """Return the C of models that this process has written, for :func:`remember_codes` of another one."""
+    return [(model.text, drives, h, code) for (model, drives, h), code in _codes.items() if model.complete]
+
+
+def remember_codes(codes: Sequence[KnownCode]) -> None:
+    """Take over what another process has written, which takes half a second each."""
+    for text, drives, h, code in codes:
+        _codes.setdefault((_ByStructure.named(text), drives, h), code)
 
 
 def _code_of(model: PredictionModel) -> ModelCode:
@@ -124,8 +145,16 @@ class _ByStructure:
 
     def __init__(self, model: Model) -> None:
         # equations in a file of the user's own are not in what a model saves: only itself is the same
-        complete = model.kind in ("network", "statespace", "sindy")
-        self.model, self.text = model, repr(model.to_dict()) if complete else f"{model.kind} {id(model)}"
+        self.complete = model.kind in ("network", "statespace", "sindy")
+        self.model = model
+        self.text = repr(model.to_dict()) if self.complete else f"{model.kind} {id(model)}"
+
+    @classmethod
+    def named(cls, text: str) -> _ByStructure:
+        """Return what counts as a model of these equations, without the model."""
+        made = object.__new__(cls)
+        made.text, made.complete = text, True
+        return made
 
     def __hash__(self) -> int:
         return hash(self.text)

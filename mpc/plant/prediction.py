@@ -35,7 +35,7 @@ import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -107,6 +107,11 @@ _ANY = 1e30
 _NEAR = 5.0  # degC from what the logs showed, where a black box still knows what it does
 
 
+#: A state and the drives that hold it, of a model by controlled outputs, start and disturbances.
+HeldStart: TypeAlias = tuple[Array, Array | None]
+HeldStarts: TypeAlias = dict[tuple[tuple[str, ...], float, tuple[float, ...]], HeldStart]
+
+
 class Response(NamedTuple):
     """Outputs after 1...N samples of a linear plant, by what they come from."""
 
@@ -166,6 +171,7 @@ class PredictionModel:
         self.sub = max(1, round(wanted / plant.dt))
         self.dt = self.sub * plant.dt
         self._responses: dict[tuple[int, ...], Response] = {}
+        self.held_starts: HeldStarts = {}
         self.sub = self._fewest_steps()
 
     def _fewest_steps(self) -> int:
@@ -640,13 +646,21 @@ def held_state(
     return held_start(model, controlled, start, d)[0]
 
 
-@lru_cache(maxsize=256)
 def held_start(
     model: PredictionModel, controlled: tuple[str, ...], start: float, d: tuple[float, ...]
-) -> tuple[Array, Array | None]:
+) -> HeldStart:
     """Return the state (n_x,) in which drives inside their range hold the controlled outputs at ``start``
     [degC] for good, and these drives (n_u,); where none do, that of a plant which is as warm all over, and
-    None."""
+    None.  The model keeps it."""
+    key = (controlled, start, d)
+    if key not in model.held_starts:
+        model.held_starts[key] = _held_start(model, controlled, start, d)
+    return model.held_starts[key]
+
+
+def _held_start(
+    model: PredictionModel, controlled: tuple[str, ...], start: float, d: tuple[float, ...]
+) -> HeldStart:
     wanted = np.full(len(controlled), start)
     held = holding_drive(model, controlled, wanted, d)
     x, u = model.steady_state(held.u, d), held.u

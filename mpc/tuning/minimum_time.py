@@ -29,7 +29,7 @@ from scipy.sparse import diags_array, kron, vstack
 from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.design.design import Design
 from thermogrip.mpc.design.spec import Spec
-from thermogrip.mpc.plant.prediction import PredictionModel, held_start, prediction_model
+from thermogrip.mpc.plant.prediction import held_start, prediction_model
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
@@ -53,7 +53,7 @@ class _Race:
     def __init__(
         self, plant: Plant, design: Design, step: tuple[float, float], spec: Spec, output: str
     ) -> None:
-        self.model = PredictionModel(plant, dt=plant.dt)
+        self.model = prediction_model(plant, plant.dt)
         self.coarse = prediction_model(plant, design.dt)
         model = self.model
         self.row, self.side = model.outputs.index(output), float(np.sign(step[1] - step[0]))

@@ -33,16 +33,21 @@ only ramp is in the band no sooner than its ramp brings it there, which is the b
 
 from __future__ import annotations
 
+import lzma
+import pickle
+import threading
 import warnings
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.parallel import Workers, run_parallel
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Segment, Surroundings, simulate_closed_loop
 from thermogrip.mpc.controllers.lqr import LQRController
 from thermogrip.mpc.controllers.mpc import Controller
@@ -50,8 +55,8 @@ from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import Design, PILoop, make_blocks
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.interface import Regulator
-from thermogrip.mpc.native.runtime import wanted
-from thermogrip.mpc.plant.prediction import graded_drives, step_response
+from thermogrip.mpc.native.runtime import CompiledTruth, known_codes, remember_codes, wanted
+from thermogrip.mpc.plant.prediction import HeldStarts, graded_drives, prediction_model, step_response
 from thermogrip.mpc.tuning.minimum_time import full_drive_bound
 
 if TYPE_CHECKING:
@@ -394,19 +399,85 @@ class Trial:
     travel: float = 0.0  # mean of how many full drives the drives move
 
 
-class Search:
-    """Evaluates designs on the search's draws; made of plain data, so that it travels to other processes."""
+#: Draws, a seed, and whether a run is for as long as steps are held.
+_Runs: TypeAlias = tuple[Sequence[int], int, bool]
+# closed loops that a process is given at once: a tenth of a second and more
+_RUNS_IN_C, _RUNS_IN_PYTHON, _PI_IN_C = 9, 3, 6
 
-    def __init__(self, plant: Plant, spec: Spec, baseline: Design, seed: int) -> None:
-        self.plant, self.spec, self.seed = plant, spec, seed
+
+class _Part(NamedTuple):
+    """A share of a trial, for one process."""
+
+    name: str
+    parameters: dict[str, float] | None  # None: the default design
+    whole: bool  # whether of all steps, the cold start too
+    runs: Sequence[_Runs]
+
+
+class _Built:
+    """Structures of designs whose C is built."""
+
+    def __init__(self) -> None:
+        self.structures: set[Any] = set()
+        self.locks: defaultdict[Any, threading.Lock] = defaultdict(threading.Lock)
+
+
+def _structure(design: Design) -> Any:
+    """Return on what it depends which C a design needs."""
+    return design.blocks, tuple(design.ramp_per_s)
+
+
+def _unpacked_here(packed: bytes) -> Search:
+    """Return a search that came to this process: the same one each time, of which a thread has its own."""
+    return _unpacked(packed, threading.get_ident())
+
+
+@lru_cache(maxsize=16)
+def _unpacked(packed: bytes, thread: int) -> Search:
+    state = pickle.loads(lzma.decompress(packed))  # noqa: S301  as processes send it
+    search = object.__new__(Search)
+    search.__dict__.update(state, plant=_plant_of(state["plant"], thread), workers=1)
+    search._made, search._library, search._packed, search._built = {}, None, None, _Built()
+    remember_codes(search._codes)
+    return search
+
+
+@lru_cache(maxsize=16)
+def _plant_of(packed: bytes, thread: int) -> Plant:
+    """Return a plant as it travels, with all that is worked out for it; a user's own class is read here."""
+    from thermogrip.sysid.models.user_model import load_object, own_model
+    from thermogrip.sysid.plant.plant import Plant
+
+    content, where = pickle.loads(packed)  # noqa: S301
+    return Plant.from_dict(content, model=None if where is None else own_model(load_object(*where)))
+
+
+class Search:
+    """Evaluates designs on the search's draws.
+
+    It is made of plain data, so that it travels to other processes: what one trial consists of is shared out
+    among ``workers``.  What each process would work out for itself (where draws are at rest, the C of the
+    model) travels along, and a process unpacks the same search once.
+    """
+
+    def __init__(
+        self, plant: Plant, spec: Spec, baseline: Design, seed: int, *, workers: Workers = 1
+    ) -> None:
+        self.plant, self.spec, self.seed, self.workers = plant, spec, seed, workers
         self._compiled = wanted() and not baseline.on_off
         self._library: CompiledController | None = None  # in which trials of PI loops run
+        self._made: dict[str, tuple[dict[str, float] | None, Regulator]] = {}  # for the last part of a name
+        self._built = _Built()
+        self._packed: bytes | None = None
+        self._starts: dict[int, HeldStarts] = {}  # by draw
+        self._codes: list[Any] = []
         self.draws = draws_of(plant, spec.search_draws)
         self.certain = self.draws == [0]  # no draws: the comparison takes the same plant, and fresh noise
         self.check_seed = seed + 1 if self.certain else seed
         # the comparison takes draws that the search has not seen
         self.unseen = [draw + _CHECK_FROM if draw else 0 for draw in draws_of(plant, spec.check_draws)]
-        self.bounds = bounds_of(plant, baseline, spec, sorted({*self.draws, *self.unseen}))
+        self.baseline = baseline
+        self.bounds = self._first_bounds(sorted({*self.draws, *self.unseen}))
         self.baseline = baseline = paced(baseline, spec, self.bounds)
         self.bounds = ramped_bounds(self.bounds, baseline, spec)
         cold = cold_steps(plant, spec, baseline.controlled)
@@ -427,30 +498,55 @@ class Search:
         # a plant that settles long after the bound (its delay, what is not known of it) is watched for longer
         for at, settled in enumerate(self._settled()):
             self.lengths[at] = float(np.clip(1.25 * settled + 40.0, self.lengths[at], spec.hold_s))
+        self._packed = None
+
+    def _first_bounds(self, draws: Sequence[int]) -> Bounds:
+        """Return the bounds on these draws; meanwhile one of several workers writes and builds the C."""
+        if self.workers == 1:
+            return bounds_of(self.plant, self.baseline, self.spec, draws)
+        (self._compiled, self._codes, _), *found = run_parallel(
+            self._begin, [None, *draws], self.workers, what="bounds"
+        )
+        self._built.structures.add(_structure(self.baseline))
+        remember_codes(self._codes)
+        self._packed = None
+        bounds: Bounds = {}
+        for draw, (_, starts, of) in zip(draws, found, strict=True):
+            self._starts[draw] = starts
+            bounds |= of
+        return bounds
+
+    def _begin(self, draw: int | None) -> tuple[bool, Any, Bounds]:
+        """Return whether C can be had, the model's code and nothing; or of a draw where it is at rest, and
+        its bounds."""
+        if draw is None:
+            if self._compiled and self._in_c(self.baseline) is not None:
+                CompiledTruth(prediction_model(self.plant, self.plant.dt))
+            return self._compiled, known_codes(), {}
+        of = bounds_of(self.plant, self.baseline, self.spec, [draw])
+        return True, prediction_model(drawn(self.plant, draw), self.plant.dt).held_starts, of
 
     def _settled(self) -> list[float]:
         """Return when the default design has settled on the slowest draw [s], by step; inf where never."""
-        spec, begun = self.spec, self.made("MPC", self.baseline)
-        found = run_trials(begun, self.plant, spec, self.draws, seed=self.seed)
+        spec = self.spec
+        found = self._results("MPC", None, [(self.draws, self.seed, True)], whole=False)
         times = {step: [r.settle_s for r in found if (r.start, r.target) == step] for step in spec.steps}
         return [float(np.nan_to_num(times[step], nan=np.inf).max()) for step in spec.steps]
 
-    def __getstate__(self) -> dict[str, Any]:
-        own = getattr(self.plant.model, "code", None)
-        where = None if own is None else (str(Path(own.file).resolve()), own.name)
-        return {**self.__dict__, "_library": None, "plant": self.plant.to_dict(), "own": where}
+    def __reduce__(self) -> Any:
+        if self._packed is None:
+            own = getattr(self.plant.model, "code", None)
+            where = None if own is None else (str(Path(own.file).resolve()), own.name)
+            apart = ("_made", "_library", "_packed", "_built", "workers")
+            state = {key: value for key, value in self.__dict__.items() if key not in apart}
+            plant = pickle.dumps((self.plant.to_dict(), where))
+            self._packed = lzma.compress(pickle.dumps({**state, "plant": plant}), preset=1)
+        return _unpacked_here, (self._packed,)
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        from thermogrip.sysid.plant.plant import Plant
-
-        where = state.pop("own")
-        self.__dict__.update(state)
-        model = None
-        if where is not None:
-            from thermogrip.sysid.models.user_model import load_object, own_model
-
-            model = own_model(load_object(*where))
-        self.plant = Plant.from_dict(state["plant"], model=model)
+    def __copy__(self) -> Search:
+        made = object.__new__(type(self))
+        made.__dict__.update(self.__dict__)
+        return made
 
     def design(self, parameters: dict[str, float]) -> Design:
         """Return the baseline with these parameters; those that are not named stay."""
@@ -505,30 +601,25 @@ class Search:
     ) -> Trial:
         """Return the trial of an ``"MPC"``, ``"PI"`` or ``"LQR"``, at full length if asked; other noise
         than the search's is counted from 1, and only an MPC in C is tried in several ``noises``."""
-        if name == "PI":
-            controller: Regulator = self._pi(scaled_loops(self.baseline.loops, parameters))
-        else:
-            controller = self.made(name, self.design(parameters))
         quick = name == "MPC" and self._compiled  # in C: a tenth of the time
         # a PI for as long as a step is held, to see what its integrator has still to do; and what is quick:
         # the end of a short run is not the bias that stays
         whole = quick or name == "PI" or at_length
-        spec = self.whole_spec if whole else self.spec
-        lengths = None if whole else self.lengths
         count = noises if quick else 1
         # the comparison of a plant without draws has a seed of its own
-        those = range(count * other_noise, count * (other_noise + 1))
-        seeds = [self.seed + (noise and noise + 1) for noise in those]
-        found: list[StepResult] = []
+        others = range(count * other_noise, count * (other_noise + 1))
+        seeds = [self.seed + (noise and noise + 1) for noise in others]
         counted = expected(self.spec)
-        others = [draw for draw in self.lacking if draw // STRUCTURE not in counted]
+        lacks = [draw for draw in self.lacking if draw // STRUCTURE not in counted]
         planned = [draw for draw in self.lacking if draw // STRUCTURE in counted]
+        runs = []
         for seed in seeds:
-            found += run_trials(controller, self.plant, spec, self.draws, lengths=lengths, seed=seed)
+            runs.append((self.draws, seed, whole))
             if planned:  # which settles last: for as long as a step is held
-                found += run_trials(controller, self.plant, spec, planned, seed=seed)
+                runs.append((planned, seed, True))
         if name != "LQR":
-            found += run_trials(controller, self.plant, spec, others, seed=seeds[0])
+            runs.append((lacks, seeds[0], True))
+        found = self._results(name, parameters, runs, whole=whole)
         results = counting(found, self.spec)
         return Trial(
             controller=name,
@@ -539,6 +630,66 @@ class Search:
             energy_s=float(np.mean([result.energy_s for result in results])),
             travel=float(np.mean([result.travel for result in results])),
         )
+
+    def _results(
+        self, name: str, parameters: dict[str, float] | None, runs: Sequence[_Runs], *, whole: bool
+    ) -> list[StepResult]:
+        """Return the results of runs, in their order; those of a draw go to one process."""
+        if self.workers == 1:
+            return [result for part in self._run(_Part(name, parameters, whole, runs)) for result in part]
+        if name != "PI" and self._compiled:
+            self._build_once(self.baseline if parameters is None else self.design(parameters))
+        each = [([draw], seed, full) for draws, seed, full in runs for draw in draws]
+        n = _RUNS_IN_C if self._compiled and name != "LQR" else _RUNS_IN_PYTHON
+        n = max(1, (_PI_IN_C if name == "PI" and self._compiled else 1) * n // len(self.spec.steps))
+        parts = [_Part(name, parameters, whole, each[at : at + n]) for at in range(0, len(each), n)]
+        done = run_parallel(self._run, parts, self.workers, elsewhere=True)
+        of = iter([results for part in done for results in part])
+        steps = len((self.whole_spec if whole else self.spec).steps)
+        found: list[StepResult] = []
+        for draws, _, _ in runs:
+            by_draw = [next(of) for _ in draws]
+            for at in range(steps):  # the order of one process: by step, then by draw
+                for results in by_draw:
+                    count = len(results) // steps
+                    found += results[count * at : count * (at + 1)]
+        return found
+
+    def _run(self, part: _Part) -> list[list[StepResult]]:
+        """Return the results of each of a part's runs."""
+        name, parameters, whole, runs = part
+        if name not in self._made or self._made[name][0] != parameters:
+            self._made[name] = (parameters, self._regulator(name, parameters))
+        controller, spec = self._made[name][1], self.whole_spec if whole else self.spec
+        found = []
+        for draws, seed, full in runs:
+            self._know(draws)
+            lengths = None if full else self.lengths
+            found.append(run_trials(controller, self.plant, spec, draws, lengths=lengths, seed=seed))
+        return found
+
+    def _regulator(self, name: str, parameters: dict[str, float] | None) -> Regulator:
+        if parameters is None:
+            return self.made(name, self.baseline)
+        if name == "PI":
+            return self._pi(scaled_loops(self.baseline.loops, parameters))
+        return self.made(name, self.design(parameters))
+
+    def _know(self, draws: Sequence[int]) -> None:
+        """Take over where these draws are at rest, which another process has found."""
+        for draw in {draw % STRUCTURE for draw in draws} & self._starts.keys():
+            prediction_model(drawn(self.plant, draw), self.plant.dt).held_starts |= self._starts[draw]
+
+    def _builds(self, design: Design) -> bool:
+        return self._in_c(design) is not None
+
+    def _build_once(self, design: Design) -> None:
+        """Have one process build the C of a structure, which the others find built: it takes seconds."""
+        structure = _structure(design)
+        with self._built.locks[structure]:
+            if structure not in self._built.structures:
+                run_parallel(self._builds, [design], self.workers, elsewhere=True)
+                self._built.structures.add(structure)
 
     def evaluate_at_length(self, item: tuple[str, dict[str, float]]) -> Trial:
         """Return a trial at full length: slow ones settle too."""
@@ -557,6 +708,7 @@ class Search:
     def check(self, item: tuple[str, Design, int]) -> list[StepResult]:
         """Return the results of a controller on one draw, at full length."""
         name, design, draw = item
+        self._know([draw])
         return run_trials(self.made(name, design), self.plant, self.spec, [draw], seed=self.check_seed)
 
     def made(self, name: str, design: Design) -> Regulator:

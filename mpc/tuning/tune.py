@@ -35,7 +35,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.parallel import Progress, Workers, run_parallel, sub_progress
+from thermogrip.datasets.parallel import (
+    Progress,
+    Workers,
+    joint_progress,
+    kept_processes,
+    run_parallel,
+    run_threads,
+    sub_progress,
+)
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import Design
@@ -338,12 +346,17 @@ def tune(
     >>> found.verdict, [row.controller for row in found.rows]
     ('actuator-limited', ['baseline', 'tuned', 'PI', 'LQR'])
     """
+    with kept_processes(workers):
+        return _tune(plant, spec, progress, workers, seed)
+
+
+def _tune(plant: Plant, spec: Spec | None, progress: Progress | None, workers: Workers, seed: int) -> Tuning:
     spec = Spec.of(plant) if spec is None else spec
     plant = spec.widened(plant)
-    search = Search(plant, spec, spec.design(plant), seed)
+    search = Search(plant, spec, spec.design(plant), seed, workers=workers)
     baseline = search.baseline
     start = parameters_of(baseline, spec)
-    looked = run_parallel(search.evaluate, [start], workers, what="default design")
+    looked = [search.evaluate(start)]
     if progress is not None:
         progress(_BEGUN, "default design")
     for at, (parameter, factors) in enumerate(_LOOK):
@@ -352,7 +365,7 @@ def tune(
         look = [{**first, parameter: float(round(v)) if parameter == "horizon" else v} for v in values]
         width = (_LOOKED - _BEGUN) / len(_LOOK)
         share = sub_progress(progress, _BEGUN + width * at, _BEGUN + width * (at + 1))
-        looked += run_parallel(search.evaluate, look, workers, share, what=PARAMETER_WORDS[parameter])
+        looked += run_threads(search.evaluate, look, workers, share, what=PARAMETER_WORDS[parameter])
     looked += _ramped(search, _best(looked), workers)
     found = _search_all(search, looked, workers, sub_progress(progress, _LOOKED, _SEARCHED))
     found["PI"], pi = _sturdiest(search, found["PI"], workers)
@@ -376,7 +389,7 @@ def tune(
     of = [parameter for parameter in PARAMETER_WORDS if parameter in about.parameters]
     items = [(search, parameter, about.parameters, about) for parameter in of]
     share = sub_progress(progress, _COMPARED, 1.0)
-    sensitivity = run_parallel(sensitivity_of, items, workers, share, what="sensitivities")
+    sensitivity = run_threads(sensitivity_of, items, workers, share, what="sensitivities")
     history = tuple(tried for part in found.values() for tried in part)
     rows = tuple(row for name, part in own.items() for row in rows_of(name, part, spec, search.bounds))
     unseen = "under fresh noise (the plant has no uncertainty)" if search.certain else "on unseen draws"
@@ -414,7 +427,7 @@ def tune(
         sensitivity=tuple(sensitivity),
         history=history,
         meets_spec=meets,
-        runs=_runs(search, controller, candidates["LQR"]),
+        runs=_runs(search, controller, candidates["LQR"], workers),
         spec=spec,
         seed=seed,
     )
@@ -438,7 +451,7 @@ def _ramped(search: Search, best: Trial, workers: Workers) -> list[Trial]:
     if best.overshoot <= FREE * _allowed(search) or not search.at_once:
         return []
     look = [{**best.parameters, "ramp": times} for times in RAMPS]
-    return run_parallel(search.evaluate, look, workers, what=PARAMETER_WORDS["ramp"])
+    return run_threads(search.evaluate, look, workers, what=PARAMETER_WORDS["ramp"])
 
 
 # of the best PI's gain and integral time, in what is tried of sturdier ones
@@ -463,7 +476,7 @@ def _sturdiest(search: Search, tried: list[Trial], workers: Workers) -> tuple[li
         for Kc, Ti in sorted(about, reverse=True)
         if Kc >= low["Kc"] and Ti >= low["Ti"]
     ]
-    tried = [*tried, *run_parallel(partial(search.evaluate, name="PI"), more, workers, what="sturdier PIs")]
+    tried = [*tried, *run_threads(partial(search.evaluate, name="PI"), more, workers, what="sturdier PIs")]
     alike = [trial for trial in tried if trial.score <= (1 + _ALIKE_IN_NOISE) * best.score]
 
     def bears(trial: Trial) -> float:
@@ -490,14 +503,14 @@ def _trade(
     known = [trial for trial in (*found["MPC"], pi) if search.at_length(trial)]
     looked = {_named(trial.controller, trial.parameters): trial for trial in known}
     items = [item for _, item in scanned if _named(*item) not in looked]
-    done = run_parallel(search.evaluate_at_length, items, workers, progress, what="trade-offs")
+    done = run_threads(search.evaluate_at_length, items, workers, progress, what="trade-offs")
     looked |= {_named(*item): trial for item, trial in zip(items, done, strict=True)}
     tried = [looked[_named(*item)] for _, item in scanned]
     pareto = front_of(tried, names)
     own = [trial for trial in tried if trial.controller == "MPC"]
     near = _contenders(own)
     again = [(trial.parameters, noise) for trial in near for noise in range(1, 1 + _NOISES)]
-    louder = run_parallel(search.evaluate_in_other_noise, again, workers, what="the same in other noise")
+    louder = run_threads(search.evaluate_in_other_noise, again, workers, what="the same in other noise")
     noises = [[near[k], *louder[_NOISES * k :][:_NOISES]] for k in range(len(near))]
     still = near[_stillest(noises, search.plant.dt, _allowed(search))]
     return pareto, best if still is own[0] else search.evaluate(still.parameters)
@@ -565,17 +578,13 @@ def _search_all(
     plain = pi | {"feedforward": 0.05}
     others = [plain | dict(zip(_SPREAD, values.tolist())) for values in _spread(search.pi)]
     lqr = {**parameters_of(search.baseline, search.spec), "drive": 1e-2}
+    parts = joint_progress(progress, (_MPC_DONE, _PI_DONE - _MPC_DONE, 1.0 - _PI_DONE))
     items = [
-        (search, "MPC", [_best(looked).parameters], max(0, n - len(looked)), None),
-        (search, "PI", [pi, plain, *others][search.certain :], 3 * n, None),
-        (search, "LQR", [lqr], n, None),
+        (search, "MPC", [_best(looked).parameters], max(0, n - len(looked)), parts[0]),
+        (search, "PI", [pi, plain, *others][search.certain :], 3 * n, parts[1]),
+        (search, "LQR", [lqr], n, parts[2]),
     ]
-    if workers == 1:
-        shares = ((0.0, _MPC_DONE), (_MPC_DONE, _PI_DONE), (_PI_DONE, 1.0))
-        parts = [sub_progress(progress, *share) for share in shares]
-        tried = [_optimise((*item[:4], part)) for item, part in zip(items, parts, strict=True)]
-    else:
-        tried = run_parallel(_optimise, items, workers, progress, what="weights")
+    tried = run_threads(_optimise, items, workers)
     found = {name: trials for (_, name, *_), trials in zip(items, tried, strict=True)}
     return {**found, "MPC": [*looked, *found["MPC"]]}
 
@@ -650,19 +659,24 @@ def _compare(
     return results
 
 
-def _runs(search: Search, controller: Controller, lqr: Design) -> dict[str, ClosedLoop]:
+def _runs(search: Search, controller: Controller, lqr: Design, workers: Workers) -> dict[str, ClosedLoop]:
     """Return every step on the first unseen draw by the controller as it is used, by PI and by LQR."""
-    spec, runs = search.spec, {}
-    run: Any = partial(
-        trial,
+    designs = {"MPC": controller.design, "PI": controller.design, "LQR": lqr}
+    items = [(search, name, design, step) for step in search.spec.steps for name, design in designs.items()]
+    done = run_parallel(_shown, items, workers, what="runs")
+    named = [f"{start:g} to {target:g}, {name}" for _, name, _, (start, target) in items]
+    return dict(zip(named, done, strict=True))
+
+
+def _shown(item: tuple[Search, str, Design, tuple[float, float]]) -> ClosedLoop:
+    search, name, design, step = item
+    made = Controller(search.plant, design) if name == "MPC" else search.made(name, design)
+    return trial(
+        made,
         plant=search.plant,
-        spec=spec,
+        spec=search.spec,
+        step=step,
         draw=search.unseen[0],
-        length_s=spec.hold_s,
+        length_s=search.spec.hold_s,
         seed=search.check_seed,
     )
-    others = {"PI": search.made("PI", controller.design), "LQR": search.made("LQR", lqr)}
-    for step in spec.steps:
-        for name, made in ({"MPC": controller} | others).items():
-            runs[f"{step[0]:g} to {step[1]:g}, {name}"] = run(made, step=step)
-    return runs

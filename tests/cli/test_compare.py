@@ -58,6 +58,7 @@ def scored(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
 
     def evaluate(*_: Any, progress: Any, split: str = "shipped", **__: Any) -> Found:
         progress(0.0, "fold")
+        progress(1.0, "fold")
         return made.of.get(split, Found(split))
 
     made = SimpleNamespace(bench=bench, read={"grasps.csv": MARKED, "more.csv": PLAIN}, of={}, missing=())
@@ -75,6 +76,9 @@ def scored(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
     )
     made.planned = stand_in("thermogrip.classify.evaluation.splits.plan_folds")
     made.scored = stand_in("thermogrip.classify.evaluation.harness.evaluate", evaluate)
+    made.threads = stand_in(  # in turn
+        "thermogrip.datasets.parallel.run_threads", lambda function, items, _: [function(i) for i in items]
+    )
     stand_in("thermogrip.report.classification.comparison_sections", lambda name, found: [f"of {name}"])
     stand_in(
         "thermogrip.report.classification.score_table",
@@ -102,7 +106,7 @@ def test_what_is_split_how_and_by_whom_it_is_scored(
     options = ["--classifiers", "bayes,pca-lda", "--seed", "4", "--workers", "3", "--train-per-class", "2"]
     done = scored.bench.run("compare", *words.split(), *options, "--out", "c")
     assert done.code == 0, done
-    assert shares(done.err, "compare") == at
+    assert list(dict.fromkeys(shares(done.err, "compare"))) == [*at, 100]
     first = scored.read[words.split()[0]]
     for call, name in zip(scored.scored, splits, strict=True):
         assert call.args[1] == [first]
@@ -124,6 +128,8 @@ def test_what_is_split_how_and_by_whom_it_is_scored(
     assert [call.args[1] for call in scored.touched] == [[first], *([tests] if tests else [])]
     assert [call.quick for call in scored.asked] == [False, True]
     assert {call.seed for call in scored.asked} == {4}
+    [call] = scored.threads
+    assert ([*call.args[1]], call.args[2]) == (splits, 3)
     [page] = scored.pages
     assert page.args[0] == Path("c/report.html")
     assert page.args[3] == [f"of {name}" for name in splits]
@@ -198,14 +204,12 @@ def test_of_many_conditions_the_pooled_scores_are_printed(n: int, cut: bool, sco
 
 def test_the_bar_goes_to_each_part_by_its_work() -> None:
     def shares_of(*parts: bool) -> dict[str, float]:
-        found = verb._shares(*parts)
-        assert [start for start, _, _ in found.values()] == [0.0, *(end for _, end, _ in found.values())][:-1]
-        return {name: end for name, (_, end, _) in found.items()}
+        return {name: share for name, (share, _) in verb._shares(*parts).items()}
 
-    ends = {"given": 3 / 35, "random": 10 / 35, "by": 15 / 35, "curves": 1.0}
-    assert shares_of(True, True, True, True) == pytest.approx(ends)
-    assert shares_of(False, True, False, True) == pytest.approx({"random": 7 / 27, "curves": 1.0})
-    assert [title for *_, title in verb._shares(True, True, True, True).values()] == [
+    widths = {"given": 3 / 35, "random": 7 / 35, "by": 5 / 35, "curves": 20 / 35}
+    assert shares_of(True, True, True, True) == pytest.approx(widths)
+    assert shares_of(False, True, False, True) == pytest.approx({"random": 7 / 27, "curves": 20 / 27})
+    assert [title for _, title in verb._shares(True, True, True, True).values()] == [
         "given split", "random splits", "held out in turn", "curves",
     ]  # fmt: skip
 

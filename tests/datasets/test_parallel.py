@@ -20,7 +20,15 @@ import pytest
 from thermogrip import __version__
 from thermogrip.datasets import parallel
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.parallel import Replaced, in_order, kept_processes, run_parallel, sub_progress
+from thermogrip.datasets.parallel import (
+    Replaced,
+    in_order,
+    joint_progress,
+    kept_processes,
+    run_parallel,
+    run_threads,
+    sub_progress,
+)
 
 OWN = ["__import__('os').getpid()"] * 4  # a process may not find this module, the builtin eval it does
 
@@ -55,6 +63,77 @@ def test_processes_that_are_kept_do_the_work_of_every_call_and_then_end() -> Non
     assert len(first | again) <= 2
     assert os.getpid() not in first | again
     assert not first & set(run_parallel(eval, OWN, workers=2))
+
+
+@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="needs two processors")
+def test_a_single_item_is_done_here_unless_it_is_to_run_elsewhere() -> None:
+    with kept_processes(2):
+        assert run_parallel(eval, OWN[:1], 2) == [os.getpid()]
+        assert run_parallel(eval, OWN[:1], 2, elsewhere=True) != [os.getpid()]
+    assert run_parallel(eval, OWN[:1], 1, elsewhere=True) == [os.getpid()]
+
+
+@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="needs two processors")
+def test_all_processes_begin_at_once_for_none_may_begin_as_a_pool_breaks() -> None:
+    pool = parallel._processes(3)
+    try:
+        assert pool.submit(math.factorial, 3).result() == 6
+        assert len(pool._processes) == 3
+    finally:
+        pool.shutdown()
+
+
+@pytest.mark.skipif(os.name == "nt" or (os.cpu_count() or 1) < 2, reason="needs POSIX and two processors")
+def test_kept_processes_of_which_one_is_killed_over_a_single_item_are_as_many_as_before() -> None:
+    with kept_processes(2):
+        with pytest.raises(UserError, match="killed again and again"):
+            run_parallel(signal.raise_signal, [signal.SIGKILL], 2, elsewhere=True)
+        assert run_parallel(abs, [-1], 2, elsewhere=True) == [1]
+        assert len(parallel._kept[0]._processes) == 2
+
+
+@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="needs two processors")
+def test_threads_share_kept_processes_and_give_results_in_order() -> None:
+    meet, seen = threading.Barrier(3, timeout=60), []
+
+    def work(n: int) -> list[int]:
+        meet.wait()  # all three at once
+        return run_parallel(math.factorial, [n, n + 1], 2)
+
+    with kept_processes(2):
+        got = run_threads(work, [3, 1, 2], 2, lambda *a: seen.append(a), what="factorials")
+    assert got == [[6, 24], [1, 2], [2, 6]]
+    assert seen == [(pytest.approx(n / 3), "factorials") for n in (1, 2, 3)]
+    order: list[int] = []
+    assert run_threads(lambda n: order.append(n) or n, [3, 1, 2], 1) == order == [3, 1, 2]
+
+
+def test_a_fault_in_a_thread_ends_the_others_when_they_ask_for_work(pools) -> None:
+    asked, failed = [], threading.Event()
+
+    def work(n: int) -> int:
+        if n == 1:
+            failed.set()
+            raise ValueError("no")
+        failed.wait(10)
+        for _ in range(400):
+            time.sleep(0.005)
+            asked.append(run_parallel(abs, [-n], 2))
+        return n
+
+    with pytest.raises(ValueError, match="no"):
+        run_threads(work, [0, 1, 2], 2)
+    assert len(asked) < 400
+
+
+def test_progress_of_parts_side_by_side_adds_up() -> None:
+    seen: list[tuple[float, str]] = []
+    first, second = joint_progress(lambda share, what: seen.append((share, what)), [0.25, 0.75])
+    for part, share in ((second, 0.5), (first, 1.0), (second, 2.0)):
+        assert part is not None
+        part(share, "x")
+    assert seen == [(0.375, "x"), (0.625, "x"), (1.0, "x")]
+    assert joint_progress(None, [1.0]) == [None]
 
 
 @pytest.mark.skipif(os.name == "nt" or (os.cpu_count() or 1) < 2, reason="needs POSIX and two processors")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -89,7 +90,7 @@ def compare(
     from thermogrip.classify.estimators.registry import trainable
     from thermogrip.classify.evaluation.harness import evaluate
     from thermogrip.datasets.grasp_files import read_grasp_files
-    from thermogrip.datasets.parallel import kept_processes, sub_progress
+    from thermogrip.datasets.parallel import joint_progress, kept_processes, run_threads, sub_progress
     from thermogrip.datasets.partitions import stamps
 
     pool = cli.workers_of(workers, cluster, "thermogrip.classify.evaluation.harness")
@@ -119,27 +120,29 @@ def compare(
             console.warn(f"no random splits: {why}")
             anew = False
         parts = _shares(given, anew, by is not None, curves)
-        shares = {name: sub_progress(progress, *share) for name, share in parts.items()}
+        widths = joint_progress(progress, [share for share, _ in parts.values()])
+        shares = {
+            name: sub_progress(width, 0.0, 1.0, title)
+            for width, (name, (_, title)) in zip(widths, parts.items())
+        }
+        again: dict[str, Any] = {"seed": seed, "workers": pool}
+        asked: dict[str, Callable[[], Comparison]] = {}
         if large and test:
             question = [[*models], quick, seed, stamps(grasps)]
             found["files"] = _streamed(console, models, records, test, out, question, pool, shares["given"])
         elif given:
-            found["files" if tests is not None else "shipped"] = evaluate(
-                models, records, test=tests, seed=seed, workers=pool, progress=shares["given"]
+            asked["files" if tests is not None else "shipped"] = partial(
+                evaluate, models, records, test=tests, progress=shares["given"], **again
             )
         if "random" in shares:
-            found["random"] = evaluate(
-                fast,
-                records,
-                split="random",
-                repeats=repeats,
-                train_per_class=train_per_class,
-                seed=seed,
-                workers=pool,
-                progress=shares["random"],
+            some: dict[str, Any] = {"repeats": repeats, "train_per_class": train_per_class}
+            asked["random"] = partial(
+                evaluate, fast, records, split="random", progress=shares["random"], **some, **again
             )
         if by is not None:
-            found[by] = evaluate(fast, records, split=by, seed=seed, workers=pool, progress=shares["by"])
+            asked[by] = partial(evaluate, fast, records, split=by, progress=shares["by"], **again)
+        # side by side: processes that one of them leaves idle work for another
+        found |= zip(asked, run_threads(lambda name: asked[name](), asked, pool), strict=True)
         found = {name: comparison for name, comparison in found.items() if _scored(console, name, comparison)}
         if not found:
             raise UserError("nothing to score", hint="test on grasps of the materials that were trained")
@@ -242,20 +245,16 @@ def _unsplittable(records: Sequence[Grasps], repeats: int, train_per_class: int,
     return ""
 
 
-def _shares(given: bool, random: bool, by: bool, curves: bool) -> dict[str, tuple[float, float, str]]:
-    """Return from where to where the bar goes for each part of the work, and the part's name."""
+def _shares(given: bool, random: bool, by: bool, curves: bool) -> dict[str, tuple[float, str]]:
+    """Return the share of the bar of each part of the work, and the part's name."""
     weights = {
         "given": (3.0 * given, "given split"),
         "random": (7.0 * random, "random splits"),
         "by": (5.0 * by, "held out in turn"),
         "curves": (20.0 * curves, "curves"),
     }
-    total, done, out = sum(weight for weight, _ in weights.values()), 0.0, {}
-    for name, (weight, title) in weights.items():
-        if weight:
-            out[name] = (done / total, (done + weight) / total, title)
-            done += weight
-    return out
+    total = sum(weight for weight, _ in weights.values())
+    return {name: (weight / total, title) for name, (weight, title) in weights.items() if weight}
 
 
 def _scored(console: Console, name: str, comparison: Comparison) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +15,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.closed_loop.simulate import Segment, Surroundings
 from thermogrip.mpc.design.design import PILoop, make_blocks
 from thermogrip.mpc.design.spec import Spec
+from thermogrip.mpc.plant import prediction
 from thermogrip.mpc.tuning import objective
 from thermogrip.mpc.tuning.objective import Search, StepResult, Trial, parameters_of, scaled_loops, score
 
@@ -72,9 +74,53 @@ def test_the_default_design_is_watched_until_it_has_settled_on_the_slowest_draw(
     one = StepResult(*STEPS[0], 1, 50.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 300.0)
     found = [one, replace(one, draw=2, settle_s=70.0)]
     found += [replace(each, start=STEPS[1][0], target=STEPS[1][1], settle_s=np.nan) for each in found]
-    monkeypatch.setattr(objective, "run_trials", lambda *given, seed: found)
+    monkeypatch.setattr(objective, "run_trials", lambda *given, **named: found)
     monkeypatch.setattr(search, "made", lambda name, design: None)
     assert search._settled() == [70.0, np.inf]
+
+
+@pytest.mark.parametrize("settling", [1, 2])  # results of a step and draw
+def test_what_is_shared_out_comes_back_in_the_order_of_one_process(
+    monkeypatch: pytest.MonkeyPatch, settling: int
+):
+    search, given = search_of(lambda *at: 60.0), []
+
+    def run(controller: Any, plant: Any, spec: Spec, draws: Any, *, seed: int, lengths: Any) -> list[Any]:
+        return [(step, draw, k, seed) for step in spec.steps for draw in draws for k in range(settling)]
+
+    def parallel(function: Any, items: Any, workers: Any, *, elsewhere: bool) -> list[Any]:
+        given.append((len(items), workers, elsewhere))
+        return [function(item) for item in items]
+
+    monkeypatch.setattr(objective, "run_trials", run)
+    monkeypatch.setattr(objective, "run_parallel", parallel)
+    monkeypatch.setattr(search, "made", lambda name, design: name)
+    runs = [(search.draws, 3, True), (search.draws, 5, True), (search.lacking, 3, True)]
+    alone = search._results("MPC", {"move": 2.0}, runs, whole=True)
+    search.workers = 2
+    assert search._results("MPC", {"move": 2.0}, runs, whole=True) == alone
+    assert [(step, draw) for step, draw, k, seed in alone if seed == 5 and k == 0] == [
+        (step, draw) for step in STEPS for draw in (1, 2)
+    ]
+    [(parts, workers, elsewhere)] = given
+    assert (parts > 1, workers, elsewhere) == (True, 2, True)
+
+
+def test_a_search_is_unpacked_once_and_brings_where_its_draws_are_at_rest(tank, monkeypatch):
+    spec = SPEC.model_copy(update={"hold_s": 200.0, "search_draws": 1, "check_draws": 1})
+    search = Search(tank, spec, spec.design(tank), 0)
+    for draw in search.draws:
+        model = prediction.prediction_model(objective.drawn(tank, draw), tank.dt)
+        search._starts[draw] = model.held_starts
+        assert model.held_starts
+    sent = [pickle.dumps(search) for _ in range(2)]
+    there, again = (pickle.loads(each) for each in sent)  # noqa: S301  as a pool does
+    assert there is again
+    assert there is not search
+    assert there.workers == 1
+    monkeypatch.setattr(prediction, "_held_start", None)  # nothing is left to be found
+    part = objective._Part("MPC", None, False, [(search.draws, 0, True)])
+    assert there._run(part) == search._run(part)
 
 
 def test_a_spec_of_which_one_step_can_be_reached_is_searched_and_one_of_which_none_can_is_refused():
