@@ -158,7 +158,8 @@ def pareto_figure(pareto: Pareto) -> Figure:
             label=name if mine else None,
         )
     axis.margins(0.12)
-    named = [row for row in rows if row["name"].endswith("tuned") or row["name"].endswith("% of the drive")]
+    ends = ("tuned", "found by the search", "% of the drive")
+    named = [row for row in rows if row["name"].startswith("tuned") or row["name"].endswith(ends)]
     _note_all(axis, named)
     bar = figure.colorbar(ScalarMappable(colour, "viridis_r"), ax=axis, pad=0.12)
     bar.set_label("overshoot, worst [K]", fontsize=8)

@@ -506,14 +506,17 @@ def _trade(
     done = run_threads(search.evaluate_at_length, items, workers, progress, what="trade-offs")
     looked |= {_named(*item): trial for item, trial in zip(items, done, strict=True)}
     tried = [looked[_named(*item)] for _, item in scanned]
-    pareto = front_of(tried, names)
     own = [trial for trial in tried if trial.controller == "MPC"]
     near = _contenders(own)
     again = [(trial.parameters, noise) for trial in near for noise in range(1, 1 + _NOISES)]
     louder = run_threads(search.evaluate_in_other_noise, again, workers, what="the same in other noise")
     noises = [[near[k], *louder[_NOISES * k :][:_NOISES]] for k in range(len(near))]
     still = near[_stillest(noises, search.plant.dt, _allowed(search))]
-    return pareto, best if still is own[0] else search.evaluate(still.parameters)
+    if still is own[0]:
+        return front_of(tried, names), best
+    at = next(k for k, trial in enumerate(tried) if trial is still)
+    names[0], names[at] = "found by the search", f"tuned: {names[at]}"
+    return front_of(tried, names), search.evaluate(still.parameters)
 
 
 def _named(controller: str, parameters: dict[str, float]) -> tuple[str, tuple[tuple[str, float], ...]]:
