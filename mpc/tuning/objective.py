@@ -276,7 +276,8 @@ def score(results: Sequence[StepResult], spec: Spec, bounds: Bounds) -> float:
         costs.setdefault((result.start, result.target, result.draw, result.output), []).append(cost)
     of = {key: float(np.mean(noises)) for key, noises in costs.items()}
     planned = expected(spec) | {0}
-    own, others = [], []
+    own: list[float] = []
+    others: list[float] = []
     for (_, _, draw, _), cost in of.items():
         structure = draw // STRUCTURE
         if structure and cost > LATE:
