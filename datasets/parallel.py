@@ -36,6 +36,7 @@ from contextlib import closing, contextmanager, suppress
 from functools import cache, partial
 from importlib.metadata import version
 from importlib.util import find_spec
+from multiprocessing.reduction import ForkingPickler
 from typing import Any, TypeAlias, TypeVar
 from warnings import catch_warnings, simplefilter
 
@@ -204,6 +205,21 @@ def sub_progress(progress: Progress | None, start: float, stop: float, name: str
         progress(start + (stop - start) * min(max(fraction, 0.0), 1.0), text)
 
     return show
+
+
+def pack(value: Any) -> bytes:
+    """Return a value as processes send it, smaller, for an item that many tasks have in common; what comes
+    from a file or from anyone else is not to be unpacked."""
+    import lzma  # which not every Python has
+
+    return lzma.compress(bytes(ForkingPickler.dumps(value)), preset=1)
+
+
+def unpack(packed: bytes) -> Any:
+    """Return what :func:`pack` of a process that shares this work has packed."""
+    import lzma
+
+    return ForkingPickler.loads(lzma.decompress(packed))
 
 
 def joint_progress(progress: Progress | None, shares: Sequence[float]) -> list[Progress | None]:

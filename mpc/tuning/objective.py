@@ -33,8 +33,6 @@ only ramp is in the band no sooner than its ramp brings it there, which is the b
 
 from __future__ import annotations
 
-import lzma
-import pickle
 import threading
 import warnings
 from collections import defaultdict
@@ -47,7 +45,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 import numpy as np
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.parallel import Workers, run_parallel
+from thermogrip.datasets.parallel import Workers, pack, run_parallel, unpack
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Segment, Surroundings, simulate_closed_loop
 from thermogrip.mpc.controllers.lqr import LQRController
 from thermogrip.mpc.controllers.mpc import Controller
@@ -435,7 +433,7 @@ def _unpacked_here(packed: bytes) -> Search:
 
 @lru_cache(maxsize=16)
 def _unpacked(packed: bytes, thread: int) -> Search:
-    state = pickle.loads(lzma.decompress(packed))  # noqa: S301  as processes send it
+    state = unpack(packed)
     search = object.__new__(Search)
     search.__dict__.update(state, plant=_plant_of(state["plant"], thread), workers=1)
     search._made, search._library, search._packed, search._built = {}, None, None, _Built()
@@ -449,7 +447,7 @@ def _plant_of(packed: bytes, thread: int) -> Plant:
     from thermogrip.sysid.models.user_model import load_object, own_model
     from thermogrip.sysid.plant.plant import Plant
 
-    content, where = pickle.loads(packed)  # noqa: S301
+    content, where = unpack(packed)
     return Plant.from_dict(content, model=None if where is None else own_model(load_object(*where)))
 
 
@@ -540,8 +538,7 @@ class Search:
             where = None if own is None else (str(Path(own.file).resolve()), own.name)
             apart = ("_made", "_library", "_packed", "_built", "workers")
             state = {key: value for key, value in self.__dict__.items() if key not in apart}
-            plant = pickle.dumps((self.plant.to_dict(), where))
-            self._packed = lzma.compress(pickle.dumps({**state, "plant": plant}), preset=1)
+            self._packed = pack({**state, "plant": pack((self.plant.to_dict(), where))})
         return _unpacked_here, (self._packed,)
 
     def __copy__(self) -> Search:
