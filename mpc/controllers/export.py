@@ -294,7 +294,8 @@ def _remembered(observer: Observer) -> Callable[[Array, Array], None]:
             kept[key] = {
                 name: copy(v) for name, v in vars(observer).items() if isinstance(v, np.ndarray | float)
             }
-        vars(observer).update({name: copy(value) for name, value in kept[key].items()})
+        fresh = {name: v.copy() if isinstance(v, np.ndarray) else v for name, v in kept[key].items()}
+        vars(observer).update(fresh)
 
     return reset
 

@@ -491,7 +491,8 @@ class Observer:
 
     def reading(self) -> Array:
         """Return the reading (n_y,) that the filter expects now."""
-        y, _ = self._shows(self.now, self._shown_now)
+        y = self.model.output(self.now)
+        y[self.lagged] = self._behind(y[self.lagged], self._shown_now)[0]
         return y + self._sensor_bias
 
     @property
@@ -502,14 +503,18 @@ class Observer:
         """Return what the outputs (n_y,) show without biases, and its derivatives by the filter's states."""
         model, n, n_l = self.model, self._n, len(self.lagged)
         y, H = model.output(x), np.hstack([self._H, np.zeros((model.n_y, 3 * n_l))])
-        share = model.dt / (model.dt + self.lag)
-        risen = y[self.lagged] - self.start
-        far = y[self.lagged] + self.scale * risen - shown
-        y[self.lagged] = shown + share * far
+        y[self.lagged], share, risen, far = self._behind(y[self.lagged], shown)
         H[self.lagged, : model.n_x] *= (share * (1 + self.scale))[:, None]
         by_own = np.concatenate([1 - share, -far * share**2 / model.dt, share * risen])
         H[3 * self.lagged, np.arange(n, n + 3 * n_l)] = by_own
         return y, H
+
+    def _behind(self, y: Array, shown: Array) -> tuple[Array, Array, Array, Array]:
+        """Return what lagging outputs y show that showed so much a sample before, the share of the way that this
+        is, how far the model has risen since the start, and the way."""
+        share, risen = self.model.dt / (self.model.dt + self.lag), y - self.start
+        far = y + self.scale * risen - shown
+        return shown + share * far, share, risen, far
 
     def settled_gain(self, step: Array) -> Array:
         """Return the gain (n_x + n_w, n_y) that the filter settles at with this Jacobian of a sample."""

@@ -44,6 +44,7 @@ class ActiveSetQP(CondensedQP):
         self._free, self._by = -back.T @ c, normals @ back
         self._free_value = A @ self._free
         # of each row in the set: which, its bound (+1 upper, -1 lower), its state, and how much pushes there
+        self._prices = list(zip(self.linear.tolist(), self.quadratic.tolist()))
         self._rows, self._sides = list[int](), list[int]()
         self._states, self._multipliers = list[int](), list[float]()
         iterations = 0
@@ -70,13 +71,15 @@ class ActiveSetQP(CondensedQP):
     def _system(self) -> tuple[Array, Array]:
         """Return K, with its regular share, and the right side, of the set."""
         rows, sides = np.array(self._rows), np.array(self._sides, dtype=float)
-        K = self._K[rows[:, None], rows] * sides[:, None] * sides
-        K.flat[:: len(K) + 1] *= 1 + _REGULAR
+        K = self._K[rows[:, None], rows] * (sides[:, None] * sides)
+        diagonal = K.flat[:: len(K) + 1] * (1 + _REGULAR)
         right = np.where(sides > 0, self._right[1][rows], self._right[-1][rows])
         for at, (row, state) in enumerate(zip(self._rows, self._states)):
             if state == _BROKEN:
-                K[at, at] += 1.0 / self.quadratic[row]
-                right[at] += self.linear[row] / self.quadratic[row]
+                linear, quadratic = self._prices[row]
+                diagonal[at] += 1.0 / quadratic
+                right[at] += linear / quadratic
+        K.flat[:: len(K) + 1] = diagonal
         return K, right
 
     def _go(self) -> tuple[int, bool] | None:
@@ -89,12 +92,12 @@ class ActiveSetQP(CondensedQP):
         for at, (row, state, here, there) in enumerate(
             zip(self._rows, self._states, self._multipliers, wanted)
         ):
-            low = self.linear[row] if state == _BROKEN else 0.0
+            price = self._prices[row][0]
+            low = price if state == _BROKEN else 0.0
             if there < low - slack:
                 part = (here - low) / (here - there) if here > low else 0.0
-            elif state == _KEPT and there > self.linear[row] + slack:
-                high = self.linear[row]
-                part = (high - here) / (there - here) if here < high else 0.0
+            elif state == _KEPT and there > price + slack:
+                part = (price - here) / (there - here) if here < price else 0.0
             else:
                 continue
             if which < 0 or part < share:

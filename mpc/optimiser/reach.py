@@ -43,6 +43,7 @@ an optimum Newton's method may not converge), that answer is kept until the plan
 
 from __future__ import annotations
 
+from operator import mul
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -279,14 +280,15 @@ class Reach:
 
 def _least_squares_in_box(G: Array, e: Array, low: Array, high: Array) -> Array:
     """Return z (n,) between low and high that makes |e - G z| least, by coordinates in turn."""
-    H, f = G.T @ G, G.T @ e
-    own = np.diag(H) + 1e-12 * max(np.trace(H), 1e-300)
-    z = np.zeros(len(f))
+    H, f = (G.T @ G).tolist(), (G.T @ e).tolist()  # of a drive or two: lists are faster than arrays
+    least = 1e-12 * max(sum(row[j] for j, row in enumerate(H)), 1e-300)
+    ends, z = list(zip(low.tolist(), high.tolist())), [0.0] * len(f)
     for _ in range(_SWEEPS):
         moved = 0.0
-        for j in range(len(z)):
-            best = min(max(z[j] + (f[j] - H[j] @ z) / own[j], low[j]), high[j])
+        for j, (row, (lowest, highest)) in enumerate(zip(H, ends)):
+            left = f[j] - sum(map(mul, row, z))
+            best = min(max(z[j] + left / (row[j] + least), lowest), highest)
             moved, z[j] = max(moved, abs(best - z[j])), best
         if moved < 1e-9:
             break
-    return z
+    return np.array(z)

@@ -336,6 +336,8 @@ class Optimiser:
     ) -> tuple[Array, Array]:
         """Return the ends of drives ``away`` from neutral, where what is ``left`` of their gain at rest
         will have faded; never nearer than the ``least`` distance."""
+        if not (left < 1 - FADING).any():
+            return self.lowest, self.highest
         best = np.abs(away + bias) / np.maximum(1 - left, FADING)  # where the gain is nothing
         end = np.abs(np.where(away < 0, self.lowest, self.highest) - neutral)
         room = np.maximum(best * allowed_share(end, best, self.model.span), least)
