@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -107,6 +109,33 @@ def test_c_from_the_last_working_set_finds_the_same_answer(in_c, seed):
     assert status == "solved"
     assert warm <= iterations
     np.testing.assert_allclose(x, cold, atol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def in_c_of_fifty(tank_maker) -> CompiledController:
+    plant = tank_maker()
+    return CompiledController(Controller(plant, replace(default_design(plant), blocks=(1,) * 50)))
+
+
+@needs_gcc
+@pytest.mark.parametrize("n", [49, 50])
+@pytest.mark.parametrize("width", [0.02, 0.6, 1.2])
+def test_c_takes_a_long_set_up_again(in_c_of_fifty, n, width):
+    """Its factor is made four rows at once, that of H two, and the last of both are not whole groups."""
+    rng = np.random.default_rng(n)
+    root = rng.normal(size=(n, n))
+    H, f, rows = root @ root.T / n + np.eye(n), 3 * rng.normal(size=n), rng.normal(size=(90, n)) / 7
+    upper = np.concatenate([np.full(n, 0.8), np.full(n, 1.5), np.full(90, width)])
+    weights = {"linear": 3.0, "quadratic": 1.0}
+    A = np.vstack([np.eye(n), np.eye(n) - np.eye(n, k=-1), rows])
+    soft = np.arange(2 * n + 90) >= 2 * n
+    solve_in_c(in_c_of_fifty, H, f, rows, -upper, upper, **weights)
+    near = 1.001 * f
+    own = ActiveSetQP(soft=soft, **weights).solve(H, near, A, -upper, upper)
+    x, status, warm = solve_in_c(in_c_of_fifty, H, near, rows, -upper, upper, **weights, warm=True)
+    assert status == "solved"
+    assert warm < own.iterations / 4
+    np.testing.assert_allclose(x, own.x, atol=1e-9)
 
 
 @needs_gcc
