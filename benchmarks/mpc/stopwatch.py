@@ -1,5 +1,5 @@
-"""CPU time of a call into C, read in C as DAQP's own time is: the way there from Python is not in it, nor what
-it takes to read the clock of a thread (0.4 us; DAQP reads one that takes 0.02)."""
+"""CPU time of a call into C, read in C as DAQP's own time is: the way there from Python is not in it, nor
+what it takes to read the clock of a thread (0.4 us; DAQP reads one that takes 0.02)."""
 
 from __future__ import annotations
 

@@ -510,8 +510,8 @@ class Observer:
         return y, H
 
     def _behind(self, y: Array, shown: Array) -> tuple[Array, Array, Array, Array]:
-        """Return what lagging outputs y show that showed so much a sample before, the share of the way that this
-        is, how far the model has risen since the start, and the way."""
+        """Return what lagging outputs y show that showed so much a sample before, the share of the way that
+        this is, how far the model has risen since the start, and the way."""
         share, risen = self.model.dt / (self.model.dt + self.lag), y - self.start
         far = y + self.scale * risen - shown
         return shown + share * far, share, risen, far

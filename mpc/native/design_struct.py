@@ -401,7 +401,10 @@ def _qp_parts(s: Sizes, number: Any) -> list[tuple[Any, int]]:
         (number, w),
         (whole, 2 + 2 * rows),
         (small, 2 * rows),
-        *((number, count) for count in (rows, w + rows, (rows + 3) * w, kept * (kept + 1) // 2 + 3, kept, rows)),
+        *(
+            (number, count)
+            for count in (rows, w + rows, (rows + 3) * w, kept * (kept + 1) // 2 + 3, kept, rows)
+        ),
         *((number, count) for count in ((n * w, n * w, kept * w) if s.LEAN else (1, 1, 1))),
         (whole, kept + 2),
         (number, 2 * rows),
