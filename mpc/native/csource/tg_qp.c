@@ -34,7 +34,6 @@
 #include <string.h>
 
 #define FAR 1e15
-#define TOGETHER 64 /* rows of a factor, four of which are made at once */
 #ifdef TG_SINGLE
 #define LARGEST 3.4e38
 #define TOLERANCE 1e-5
@@ -450,64 +449,6 @@ static void finish_fit(tg_qp *q, int i, double give)
     q->pivot[i] = left;
 }
 
-/* Append rows i to i + 3 of the factor, i + 4 <= TOGETHER, of the products of these rows, behind to of which a row is 0.
- * They are made side by side, number k of row i + c at [4 k + c], so that no sum is across. */
-static void append_four(tg_qp *q, const double *rows, const int *to, int i, const double *give)
-{
-    const double *by = rows + (size_t)i * TG_Q_W;
-    double room[4 * TOGETHER], *own = room + 4 * i, own0[4], own1[4], own2[4], own3[4];
-    for (int k = 0; k < i + 4; k++)
-        four_products(rows + (size_t)k * TG_Q_W, by, by + TG_Q_W, by + 2 * TG_Q_W, by + 3 * TG_Q_W, to[k], room + 4 * k);
-    for (int c = 0; c < 4; c++) {
-        own0[c] = own[c];
-        own1[c] = own[4 + c];
-        own2[c] = own[8 + c];
-        own3[c] = own[12 + c];
-    }
-    for (int k = 0; k < i; k++) {
-        const double *row = fit_row(q, k), *before = room, inverse = 1.0 / q->pivot[k];
-        double *value = room + 4 * k, sum[4] = {0.0}, next[4] = {0.0}, scaled[4];
-        for (int j = 0; j + 2 <= k; j += 2, before += 8)
-            for (int c = 0; c < 4; c++) {
-                sum[c] += row[j] * before[c];
-                next[c] += row[j + 1] * before[4 + c];
-            }
-        if (k % 2)
-            for (int c = 0; c < 4; c++)
-                sum[c] += row[k - 1] * before[c];
-        for (int c = 0; c < 4; c++) {
-            value[c] = value[c] - sum[c] - next[c];
-            scaled[c] = inverse * value[c];
-        }
-        for (int c = 0; c < 4; c++) {
-            own0[c] -= value[0] * scaled[c];
-            own1[c] -= value[1] * scaled[c];
-            own2[c] -= value[2] * scaled[c];
-            own3[c] -= value[3] * scaled[c];
-        }
-        for (int c = 0; c < 4; c++)
-            fit_row(q, i + c)[k] = scaled[c];
-    }
-    for (int c = 0; c < 4; c++) {
-        own[c] = own0[c];
-        own[4 + c] = own1[c];
-        own[8 + c] = own2[c];
-        own[12 + c] = own3[c];
-    }
-    for (int c = 0; c < 4; c++)
-        own[5 * c] += give[c];
-    for (int b = 0; b < 4; b++) { /* and the square of theirs */
-        double *row = fit_row(q, i + b) + i;
-        for (int k = 0; k < b; k++) {
-            row[k] = own[4 * k + b] / own[5 * k];
-            for (int c = b; c < 4; c++)
-                own[4 * b + c] -= row[k] * own[4 * k + c];
-        }
-        row[b] = 1.0;
-        q->pivot[i + b] = own[5 * b];
-    }
-}
-
 #if TG_LEAN
 /* Add a share of a normal's product with itself to S. */
 static void add_broken(tg_qp *q, int i, double share)
@@ -577,6 +518,66 @@ static int make_fit(tg_qp *q)
     return 1;
 }
 #else
+#define TOGETHER 64 /* rows of a factor, four of which are made at once */
+
+/* Append rows i to i + 3 of the factor, i + 4 <= TOGETHER, of the products of these rows, behind to of which a row is 0.
+ * They are made side by side, number k of row i + c at [4 k + c], so that no sum is across. */
+static void append_four(tg_qp *q, const double *rows, const int *to, int i, const double *give)
+{
+    const double *by = rows + (size_t)i * TG_Q_W;
+    double room[4 * TOGETHER], *own = room + 4 * i, own0[4], own1[4], own2[4], own3[4];
+    for (int k = 0; k < i + 4; k++)
+        four_products(rows + (size_t)k * TG_Q_W, by, by + TG_Q_W, by + 2 * TG_Q_W, by + 3 * TG_Q_W, to[k], room + 4 * k);
+    for (int c = 0; c < 4; c++) {
+        own0[c] = own[c];
+        own1[c] = own[4 + c];
+        own2[c] = own[8 + c];
+        own3[c] = own[12 + c];
+    }
+    for (int k = 0; k < i; k++) {
+        const double *row = fit_row(q, k), *before = room, inverse = 1.0 / q->pivot[k];
+        double *value = room + 4 * k, sum[4] = {0.0}, next[4] = {0.0}, scaled[4];
+        for (int j = 0; j + 2 <= k; j += 2, before += 8)
+            for (int c = 0; c < 4; c++) {
+                sum[c] += row[j] * before[c];
+                next[c] += row[j + 1] * before[4 + c];
+            }
+        if (k % 2)
+            for (int c = 0; c < 4; c++)
+                sum[c] += row[k - 1] * before[c];
+        for (int c = 0; c < 4; c++) {
+            value[c] = value[c] - sum[c] - next[c];
+            scaled[c] = inverse * value[c];
+        }
+        for (int c = 0; c < 4; c++) {
+            own0[c] -= value[0] * scaled[c];
+            own1[c] -= value[1] * scaled[c];
+            own2[c] -= value[2] * scaled[c];
+            own3[c] -= value[3] * scaled[c];
+        }
+        for (int c = 0; c < 4; c++)
+            fit_row(q, i + c)[k] = scaled[c];
+    }
+    for (int c = 0; c < 4; c++) {
+        own[c] = own0[c];
+        own[4 + c] = own1[c];
+        own[8 + c] = own2[c];
+        own[12 + c] = own3[c];
+    }
+    for (int c = 0; c < 4; c++)
+        own[5 * c] += give[c];
+    for (int b = 0; b < 4; b++) { /* and the square of theirs */
+        double *row = fit_row(q, i + b) + i;
+        for (int k = 0; k < b; k++) {
+            row[k] = own[4 * k + b] / own[5 * k];
+            for (int c = b; c < 4; c++)
+                own[4 * b + c] -= row[k] * own[4 * k + c];
+        }
+        row[b] = 1.0;
+        q->pivot[i + b] = own[5 * b];
+    }
+}
+
 /* Append the factor's row i, whose normal is in place. */
 static void append_fit(tg_qp *q, int i)
 {
