@@ -143,7 +143,7 @@ void tg_soft_values(const tg_qp *q, const double *x, double *values)
     const double *row = q->A;
     for (int i = 0; i < q->s;) {
         const int n = q->filled[i];
-        if (i + 4 <= q->s && q->filled[i + 3] == n) {
+        if (TG_Q_S >= 4 && i + 4 <= q->s && q->filled[i + 3] == n) {
             four_products(x, row, row + n, row + 2 * n, row + 3 * n, n, values + i);
             row += 4 * n;
             i += 4;
@@ -520,6 +520,7 @@ static int make_fit(tg_qp *q)
 #else
 #define TOGETHER 64 /* rows of a factor, four of which are made at once */
 
+#if TG_Q_M >= 4
 /* Append rows i to i + 3 of the factor, i + 4 <= TOGETHER, of the products of these rows, behind to of which a row is 0.
  * They are made side by side, number k of row i + c at [4 k + c], so that no sum is across. */
 static void append_four(tg_qp *q, const double *rows, const int *to, int i, const double *give)
@@ -577,6 +578,7 @@ static void append_four(tg_qp *q, const double *rows, const int *to, int i, cons
         q->pivot[i + b] = own[5 * b];
     }
 }
+#endif
 
 /* Append the factor's row i, whose normal is in place. */
 static void append_fit(tg_qp *q, int i)
@@ -594,8 +596,10 @@ static void append_fit(tg_qp *q, int i)
 static void append_all(tg_qp *q)
 {
     int i = 0;
+#if TG_Q_M >= 4
     for (; i + 4 <= q->n_work && i + 4 <= TOGETHER; i += 4)
         append_four(q, q->normal, q->to, i, q->give + i);
+#endif
     for (; i < q->n_work; i++)
         append_fit(q, i);
 }
