@@ -152,8 +152,12 @@ def main() -> None:
             out = folder / "out"
             shutil.rmtree(out, ignore_errors=True)
             out.mkdir()
-            if verb == "tune":
-                os.environ["XDG_CACHE_HOME"] = str(out / "cache")
+            cache = folder / "cache"
+            shutil.rmtree(cache, ignore_errors=True)
+            if verb == "tune":  # the C of the last run is built anew
+                os.environ["XDG_CACHE_HOME"] = str(cache)
+            else:
+                os.environ.pop("XDG_CACHE_HOME", None)
             if how.startswith("Dask"):
                 with cluster(folder, given.workers) as (address, _):
                     wall = ran([*words[verb], "--cluster", address], out)
