@@ -1,6 +1,7 @@
 """How much faster two workers are than one, and whether their answers are the same bytes.
 
-    python benchmarks/workers.py FOLDER [effusivity compare tune identify] [--kill] [--files 12] [--workers 2]
+    python benchmarks/workers.py FOLDER [effusivity compare tune identify] [--kill] [--files 12] [--large]
+        [--workers 2]
 
 Each verb runs with one process, with ``--workers 2`` (or as many as are given) and, where ``distributed``
 is installed, on a Dask scheduler with as many worker processes of this machine, which are there before the
@@ -40,7 +41,7 @@ OWN = re.compile(rb'"(seconds|fit_s|predict_s_per_grasp|written|command)": [^\n]
 LOGS = ("prbs_heating_cooling", "step_up_down", "multisine", "pump_on_off")
 
 
-def verbs(folder: Path, n_files: int) -> dict[str, list[str]]:
+def verbs(folder: Path, n_files: int, *, large: bool = False) -> dict[str, list[str]]:
     """Return the command of each verb, without its output."""
     if not (folder / "prbs_heating_cooling.csv.xz").exists():
         copy_examples(folder)
@@ -48,15 +49,21 @@ def verbs(folder: Path, n_files: int) -> dict[str, list[str]]:
     plant = folder / "plant.json"
     if not plant.exists():
         ran(["identify", *logs, "--network", "gripper", "--models", "network", "--out", str(plant)])
+    grasps, spec, models = folder / "grasps", folder / "spec.toml", "arx,oe,subspace,sindy,network"
+    conditions = ["exp1A_obj43_grip23"]
+    if large:  # one to two minutes of one process
+        conditions += ["exp2_dT10", "exp2_dT15", "exp2_dT20", "exp3A_obj43_grip23", "exp3B_obj28_grip48"]
+        models += ",armax,bj,neural"
+    spec.write_text(f"evaluations = {60 if large else 20}\nsearch_draws = {4 if large else 2}\n")
     return {
         "effusivity": ["effusivity", str(make(folder / "many", n_files)), "--out", "answer.csv"],
         "compare": [
-            "compare", str(folder / "grasps" / "exp1A_obj43_grip23.csv.xz"), "--classifiers",
+            "compare", *(str(grasps / f"{name}.csv.xz") for name in conditions), "--classifiers",
             "posterior,bayes,features-lda", "--out", "answer",
         ],
-        "tune": ["tune", str(plant), "--out", "answer.json"],
+        "tune": ["tune", str(plant), "--spec", str(spec), "--out", "answer.json"],
         "identify": [
-            "identify", *logs, "--network", "gripper", "--models", "arx,oe,subspace,sindy,network",
+            "identify", *logs, "--network", "gripper", "--models", models,
             "--leave-one-out", "--out", "answer.json",
         ],
     }  # fmt: skip
@@ -142,10 +149,11 @@ def main() -> None:
     parser.add_argument("--kill", action="store_true")
     parser.add_argument("--files", type=int, default=12)
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--large", action="store_true", help="more to share: the start counts less")
     given = parser.parse_args()
     folder = given.folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
-    words = verbs(folder, given.files)
+    words = verbs(folder, given.files, large=given.large)
     for verb in given.verbs:
         alone, first = 0.0, ""
         for how in ("one process", f"{given.workers} workers", f"Dask, {given.workers} workers"):
