@@ -55,6 +55,7 @@ ALL = [
     Benchmark("identify/fleet.py", "--seeds 4", "--rigs 6 --seeds 1"),
     Benchmark("abroad/score.py", "{data}", "{data} --sets house,dryer"),
     Benchmark("abroad/feedthrough.py", "{data}", "{data} --sets house"),
+    Benchmark("abroad/other_days.py", "{data}", "{data}"),
     Benchmark("abroad/step_tests.py", "{data}", "{data}"),
     Benchmark("coverage/study.py", "table", "table"),
     Benchmark("coverage/ranks.py", "run --count 100", "run --count 5"),

@@ -271,9 +271,10 @@ def _on_processes(
             futures |= {pool.submit(function, item): i for i, item in left.items()}
             for future in as_completed(futures):
                 result = future.result()
-                del left[futures[future]]
+                i = futures.pop(future)  # it holds the result, of which only the caller may need many
+                del left[i]
                 deaths = 0
-                yield futures[future], result
+                yield i, result
         except BrokenProcessPool as error:  # all of the pool is lost
             deaths += 1
             if deaths > _DEATHS:

@@ -141,6 +141,16 @@ def expected(spec: Spec) -> set[int]:
     return {at for at, name in enumerate(tried, start=1) if getattr(spec, name) > usual[name]}
 
 
+def meets_spec(result: StepResult | Segment, spec: Spec) -> bool:
+    """Return whether one run is as wanted."""
+    asked = spec.asked(result.output)
+    return (
+        result.settle_s <= asked.within_s  # False where NaN
+        and result.overshoot <= asked.overshoot_degC
+        and abs(result.bias) <= asked.bias_degC
+    )
+
+
 def counting(results: Sequence[StepResult], spec: Spec) -> list[StepResult]:
     """Return the results whose plant is as its model is, or as the spec expects it to be."""
     planned = expected(spec) | {0}

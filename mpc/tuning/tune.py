@@ -63,6 +63,7 @@ from thermogrip.mpc.tuning.objective import (
     bound_of,
     counting,
     lacking,
+    meets_spec,
     parameters_of,
     scaled_loops,
     score,
@@ -139,16 +140,6 @@ def _row(name: str, step: tuple[float, float], part: Sequence[StepResult], bound
         full_share=float(np.mean([result.full_share for result in part])),
         bound_s=float(np.mean([bound_of(bounds, result) for result in part])),
         output=part[0].output,
-    )
-
-
-def meets_spec(result: StepResult, spec: Spec) -> bool:
-    """Return whether one run is as wanted."""
-    asked = spec.asked(result.output)
-    return (
-        result.settle_s <= asked.within_s  # False where NaN
-        and result.overshoot <= asked.overshoot_degC
-        and abs(result.bias) <= asked.bias_degC
     )
 
 

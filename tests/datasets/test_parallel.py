@@ -11,10 +11,12 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from thermogrip import __version__
@@ -350,6 +352,16 @@ def test_what_a_killed_process_had_in_hand_is_done_again(tmp_path):
     assert got == list(range(8))
     assert mark.exists()
     assert seen == [pytest.approx(n / 8) for n in range(1, 9)]
+
+
+def test_results_that_were_given_are_not_kept():
+    given, alive = [], 0
+    for result in in_order(np.ones, [3] * 12, 2):
+        given.append(weakref.ref(result))
+        alive = sum(one() is not None for one in given)
+        del result
+    assert len(given) == 12
+    assert alive <= 2  # the last one, and one that waits for the next
 
 
 def test_results_come_in_order_as_soon_as_they_can(pools):

@@ -17,8 +17,8 @@ from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.design.spec import spec_from_dict
 from thermogrip.mpc.native.runtime import compiler
 from thermogrip.mpc.tuning.design_review import lacks_structure
-from thermogrip.mpc.tuning.objective import StepResult, bounds_of, paced, ramped_bounds, score
-from thermogrip.mpc.tuning.tune import meets_spec, rows_of, verdict_of
+from thermogrip.mpc.tuning.objective import StepResult, bounds_of, meets_spec, paced, ramped_bounds, score
+from thermogrip.mpc.tuning.tune import rows_of, verdict_of
 from thermogrip.sysid.plant.plant import Plant
 
 GCC = pytest.mark.skipif(compiler() is None, reason="no gcc here")

@@ -19,7 +19,7 @@ from thermogrip.mpc.tuning.figures import (
     sensitivity_figure,
     step_time_figure,
 )
-from thermogrip.mpc.tuning.objective import bands_of, cold_steps
+from thermogrip.mpc.tuning.objective import bands_of, cold_steps, meets_spec
 from thermogrip.mpc.tuning.trade_offs import sensitivity_words
 from thermogrip.report.console import Cells, Columns, cells, short
 from thermogrip.report.html import Picture, Plot, Section, Table, Text
@@ -121,14 +121,7 @@ def tuning_sections(tuning: Tuning) -> list[Section]:
 
 def _tone(spec: Spec, run: ClosedLoop) -> str:
     """Return "good" where every output of a step is as the spec asks, else "warn"."""
-    asked = [(segment, spec.asked(segment.output)) for segment in run.segments]
-    met = [
-        of.settle_s <= wanted.within_s
-        and of.overshoot <= wanted.overshoot_degC
-        and abs(of.bias) <= wanted.bias_degC
-        for of, wanted in asked
-    ]  # False where it does not settle
-    return "good" if all(met) else "warn"
+    return "good" if all(meets_spec(segment, spec) for segment in run.segments) else "warn"
 
 
 def tuning_section(tuning: Tuning) -> Section:

@@ -29,12 +29,13 @@ from thermogrip.mpc.tuning.objective import (
     StepResult,
     Trial,
     bounds_of,
+    meets_spec,
     parameters_of,
     scaled_loops,
     score,
     surroundings_of,
 )
-from thermogrip.mpc.tuning.tune import Row, Tuning, _simpler, meets_spec, rows_of, tune, verdict_of
+from thermogrip.mpc.tuning.tune import Row, Tuning, _simpler, rows_of, tune, verdict_of
 from thermogrip.sysid.plant.fit_record import PlantScores
 
 QUICK = Spec(steps=[(28, 36)], hold_s=200.0, evaluations=3, sample_time_s=4.0, settle_within_s=200.0)
