@@ -3,7 +3,7 @@ r"""What a controller is made of, beside its plant: one frozen record in the use
 The cost over the horizon of N samples, with blocks b of the plan v, r the target, span the width of a drive:
 
     J = track sum_k |y_k - r|^2 + terminal |y_N - r|^2 + move sum_b |(v_b - v_b-1)/span|^2
-        + drive sum_k |u_k/span|^2 + soft penalties.
+        + travel sum_b |v_b - v_b-1|/span + drive sum_k |u_k/span|^2 + soft penalties.
 
 Temperatures count in degC, so ``move = 1`` means: one whole range in one sample costs as much as 1 degC
 for one sample.  ``default_design`` reads everything off the plant: sample time and horizon from its delay
@@ -104,6 +104,8 @@ LONGEST_HORIZON, MOST_UNKNOWNS = 1000, 200
 _LONGEST_SAMPLE = 3600.0  # s
 _COARSE = 1.0  # range of an output below which the filter's numbers, made for degC, are too coarse
 _MOST_DELAY = 10.0  # delays in a lag, from which on the bias of a drive is learnt more slowly
+_SHORT = 4.0  # samples of a delay, below which a filter allows for longer lags
+_MOST_LAG = 10 / 3  # times the usual standard deviation, that it allows
 _OUTPUT_DRIFT = 0.03  # degC per sqrt(sample), by which a bias of an output may drift in a default design
 # of a drive of a black box [of its range per sqrt(s)]: where the first samples of a response are off, a loop
 # that learns sooner rings; what lasts is learnt sooner (mpc/estimator/observer.py)
@@ -137,7 +139,7 @@ def _refuse(wrong: object, problem: str) -> None:
 
 def _numbers_of(design: Design) -> Iterator[tuple[str, Sequence[Any]]]:
     """Yield each field that holds numbers, with them."""
-    single = ("dt", "track", "terminal", "move", "drive", "overshoot", "price", "ambient")
+    single = ("dt", "track", "terminal", "move", "travel", "drive", "overshoot", "price", "ambient")
     for name in (*single, "deadline_s", "patience_s"):
         yield name, (getattr(design, name),)
     for name, ends in design.drive_range.items():
@@ -214,7 +216,8 @@ def _check_loops(design: Design, drives: Sequence[str]) -> None:
 
 
 def _check_weights(design: Design) -> None:
-    wrong = min(design.track, design.move) <= 0 or min(design.terminal, design.drive, design.price) < 0
+    others = design.terminal, design.travel, design.drive, design.price
+    wrong = min(design.track, design.move) <= 0 or min(others) < 0
     _refuse(wrong, "weights: track and move must be > 0, the others >= 0")
     _refuse(design.overshoot < 0, "overshoot must be >= 0")
     _refuse(min(vars(design.noise).values()) < 0, "noise: a standard deviation must be >= 0")
@@ -280,6 +283,8 @@ class Design:
     # how many times the errors of an output count; 1 where absent
     weights: dict[str, float] = field(default_factory=dict)
     move: float = 1.0  # weight of the squared change of a drive a block, in shares of its range
+    # weight of the change itself: a drive whose move would win less stays where it is
+    travel: float = 0.0
     drive: float = 0.0  # weight of a squared drive a sample, in shares of its range
     # band beyond the target that the prediction keeps out of, on the far side [degC]; soft
     overshoot: float = 0.15
@@ -423,7 +428,7 @@ def default_design(
         hint = "an on/off input is switched beside a drive that can be graded"
         raise UserError("on_off leaves no other drive", hint=hint)
     slews = {name: (0.125 if name in graded else 1 / dt) * (b - a) for name, (a, b) in ranges.items()}
-    lengths, ratios = [], []
+    lengths, ratios, delays = [], [], []
     for output in controlled:
         answers = [step_response(plant, drive, output) for drive in graded]
         best = max(answers, key=lambda answer: abs(answer.gain))
@@ -433,6 +438,7 @@ def default_design(
                 f"no drive {how} {output}",
                 hint="identify it with logs that move the drive, or take another model",
             )
+        delays.append(best.delay)
         lengths.append(min(8 * best.delay, best.delay + 3 * best.lag))
         ratios.append(best.lag / max(best.delay, 1e-3 * best.lag))
     horizon = int(np.clip(np.ceil(max(lengths) / dt), 20, 80))
@@ -450,6 +456,7 @@ def default_design(
                 _BLACK_BOX_DRIFT if plant.scores.structure else np.inf,
             ),
             output=_OUTPUT_DRIFT / dt**0.5,
+            lag=float(np.clip(_SHORT * dt / max([*delays, 1e-3 * dt]), 1.0, _MOST_LAG) * ObserverNoise.lag),
         ),
         "deadline_s": 0.5 * dt,
         "patience_s": max(10.0, 5 * dt),

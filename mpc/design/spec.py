@@ -109,6 +109,8 @@ class Spec(BaseModel):
     hold_s: Annotated[float, Field(ge=10, le=36000)] = 600.0  # how long a step is simulated
     energy_weight: NotNegative = 0.0  # seconds of settling that are worth one second at full drive
     moves_weight: NotNegative = 0.01  # share of the minimum time that is worth one move by a full drive less
+    # times the moves of the PI by SIMC, beyond which moves are charged as overshoot is; 0: no limit
+    moves_limit: NotNegative = 1.5
     # between moves; read off the plant where absent, like the next ones
     sample_time_s: Positive | None = None
     slew_per_s: Positive | dict[str, Positive] | None = None  # largest change of a drive [its units per s]

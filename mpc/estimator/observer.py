@@ -63,8 +63,10 @@ has
     a'^2 ( var(z - s) var(T) + cov(z - s, T)^2 ),    a' = da/dT = -dt / (dt + T)^2,
 
 of variance besides.  The plan still brings x to the target, not s: whether the skin is slow or its sensor,
-what follows x through a lag does not go beyond it.  Where T would be negative, or beyond six samples, the
-estimate is the conditional mean at that end [2]_.
+what follows x through a lag does not go beyond it.  Where T would be negative, or beyond what is looked for
+(six samples, or four times its standard deviation at the start), the estimate is the conditional mean at
+that end [2]_.  Where a delay is as short as a sample or two, a pocket of some samples costs nothing to allow
+for, and much to overlook: T has a larger standard deviation at the start there (``default_design``).
 
 References
 ----------
@@ -180,8 +182,9 @@ def resting_state_in_room(model: PredictionModel, ambient: float, unit: tuple[fl
     return replace(rest, x=rest.x + (ambient - level) * rest.by_level)
 
 
-#: Lag of an output beyond the model's, in samples: standard deviation at the start, most, and per sqrt(s).
-PRIOR_LAG, LONGEST_LAG, _LAG_DRIFT = 1.5, 6.0, 0.02
+#: Lag of an output beyond the model's: the longest, in samples and in standard deviations at the start, and
+#: how far it drifts [s per sqrt(s)].
+LONGEST_LAG, _LONGEST, _LAG_DRIFT = 6.0, 4.0, 0.02
 #: Per sqrt(sample), of the share by which an output moves more than the model's.
 _SCALE_DRIFT = 0.001
 _REPEATS, _SAME = 5, 1e-3  # of the start on a nonlinear plant, and when it is still [degC]
@@ -219,6 +222,7 @@ class ObserverNoise:
     drive: float = 0.002  # process noise of a drive bias [fraction of its range per sqrt(s)]
     output: float = 0.002  # process noise of an output bias [degC per sqrt(s)]
     reading: float = 0.05  # of one reading where the plant does not say [degC]
+    lag: float = 1.5  # of what an output lags behind the model, at the start [samples]
 
 
 def detectability_margin(
@@ -331,6 +335,8 @@ class Observer:
         self.model, self.disturbance, self.ambient = model, disturbance, ambient
         self.lagged = list(lagged)
         self.noise = noise if noise is not None else ObserverNoise()
+        self.first_lag = self.noise.lag * model.dt
+        self.longest_lag = max(LONGEST_LAG, _LONGEST * self.noise.lag) * model.dt
         plant = model.plant
         self.offset = np.array([float(plant.offsets.get(name, 0.0)) for name in model.outputs])
         sd = [plant.noise.get(name, self.noise.reading) for name in model.outputs]
@@ -373,7 +379,7 @@ class Observer:
         """After a reset, allow for outputs that lag behind the model."""
         n_l, P = len(self.lagged), self._P.copy()
         at = np.arange(self._n + n_l, self._n + 2 * n_l)
-        P[at, at] = (PRIOR_LAG * self.model.dt) ** 2
+        P[at, at] = self.first_lag**2
         self._P = P
 
     def hold_drives(self, weak: Mask) -> None:
@@ -599,7 +605,7 @@ class Observer:
     def _inside(self, change: Array, held: Mask) -> Array:
         """Return a change of the states that leaves each lag in its range: the mean, given that end."""
         for at, lag in enumerate(self.lag, start=self._n + len(self.lag)):
-            beyond = lag + change[at] - min(max(lag + change[at], 0.0), LONGEST_LAG * self.model.dt)
+            beyond = lag + change[at] - min(max(lag + change[at], 0.0), self.longest_lag)
             if beyond:
                 change = change - np.where(held, 0.0, self._P[:, at] * (beyond / self._P[at, at]))
         return change
@@ -610,7 +616,7 @@ class Observer:
         w = self.w + change[n_x:n]
         w = np.where(self.is_drive, np.clip(w, -LARGEST_BIAS, LARGEST_BIAS), w)
         lags = slice(n + n_l, n + 2 * n_l)
-        lag = np.clip(self.lag + change[lags], 0.0, LONGEST_LAG * self.model.dt)
+        lag = np.clip(self.lag + change[lags], 0.0, self.longest_lag)
         if self._share:
             change[n_x:n], change[lags] = w - self.w, lag - self.lag
             ahead = self._way @ change

@@ -55,6 +55,7 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "terminal": (False, (), ""),
     "weight": (False, ("NC",), "how many times the error of each controlled output counts"),
     "move": (False, (), ""),
+    "travel": (False, (), ""),
     "drive": (False, (), ""),
     "price": (False, (), "of an output in the overshoot band"),
     "dear": (False, ("NL",), "of one beyond its limits"),
@@ -107,6 +108,8 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "rest": (False, ("NX",), "state at rest where all is at `ambient` and `usual_d`"),
     "rest_level": (False, ("NX",), "how it answers to the mean of the readings"),
     "rest_d": (False, ("NX", "ND"), "and to the measured disturbances"),
+    "first_lag": (False, (), "lag of an output behind the model: standard deviation at the start [s],"),
+    "longest_lag": (False, (), "and the longest"),
     "settles": (True, (), "whether what follows says where a linear plant settles"),
     "settled_by": (False, ("NY", "NV"), "outputs at rest by shares of the drives, disturbances, and biases"),
     "settled": (False, ("NY",), "and without them"),
@@ -131,6 +134,7 @@ class Sizes:
     NH: int
     NC: int
     NL: int
+    NJ: int  # moves, where travel has a price
     NE: int  # numbers in the rows of the response
     NR: int  # targets of all samples, where some may only ramp
     NT: int  # changes of the price in a day
@@ -167,6 +171,7 @@ def sizes_of(controller: ControllerParts, code: ModelCode, *, room: bool) -> Siz
     controlled, limited = (n_y, n_y) if room else (len(design.controlled), len(design.limits))
     most = -(-N // 32) * 32 if room else N
     longest = _whole(len(design.blocks) * model.n_u)
+    moves = len(design.blocks) * model.n_u if design.travel > 0 else 0
     entries = most * longest if room else _row_lengths(design.blocks, model.n_u)
     return Sizes(
         NX=model.n_x,
@@ -179,7 +184,8 @@ def sizes_of(controller: ControllerParts, code: ModelCode, *, room: bool) -> Siz
         NH=most,
         NC=controlled,
         NL=limited,
-        NE=(controlled + limited) * entries,
+        NJ=moves,
+        NE=(controlled + limited) * entries + moves * longest,
         NR=most * controlled if design.ramp_per_s else 0,
         NT=len(design.tariff),
         NO=0 if model.affine is None else most * (controlled + limited),
@@ -258,12 +264,16 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
     limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2)
     same_names = (
         (model, "sub dt span C spike coldest hottest least_d most_d warm"),
-        (design, "move_delay iterations blocks track terminal move drive price overshoot patience_s ambient"),
+        (
+            design,
+            "move_delay iterations blocks track terminal move travel drive price overshoot "
+            "patience_s ambient",
+        ),
         (
             optimiser,
             "weight pair strongest seen reach lowest highest slew neutral safe at_rest dear zone energy",
         ),
-        (observer, "fixed offset R Q Q_lasting P0 R_start"),
+        (observer, "fixed offset R Q Q_lasting P0 R_start first_lag longest_lag"),
         (disturbance, "on_drive on_disturbance on_output"),
     )
     return {name: getattr(part, name) for part, names in same_names for name in names.split()} | {
@@ -379,7 +389,7 @@ def _controller_parts(s: Sizes, number: Any) -> list[tuple[Any, int]]:
         (whole, s.NC + 3),
         (qp, 1),
         (number, max(1, s.NR)),
-        *((number, count) for count in (max(1, s.NE), s.NH * s.NY, s.NH * s.NY, s.NH * some)),
+        *((number, count) for count in (max(1, s.NE), s.NH * s.NY, s.NH * s.NY, s.NH * some + s.NJ)),
         *((number, count) for count in (2 * s.NX * wide, s.NU * wide, max(1, s.ND) * wide)),
         *((number, count) for count in (4 * max(1, s.NF), s.NM, z * z, z * z)),
     ]
@@ -387,15 +397,16 @@ def _controller_parts(s: Sizes, number: Any) -> list[tuple[Any, int]]:
 
 def _qp_parts(s: Sizes, number: Any) -> list[tuple[Any, int]]:
     whole, small = ctypes.c_int, ctypes.c_byte
-    n, soft = s.NB * s.NU, s.NH * s.NS
+    n, soft = s.NB * s.NU, s.NH * s.NS + s.NJ
     rows, w = 2 * n + soft, _whole(n)
     kept = 4 * n + 8 if s.LEAN else rows
     return [
-        (whole, 4),
+        (whole, 5),
         *((number, count) for count in (n * w, w, 2 * rows)),
         (ctypes.c_void_p, 1),
         *((whole, max(1, soft)) for _ in range(2)),
         *((number, count) for count in (max(1, s.NS),) * 3),
+        (number, 1),
         (whole, 2),
         (ctypes.c_void_p, 2),
         (number, w),

@@ -7,10 +7,12 @@ name travel, and the file is run where it arrives), so that other processes can 
 what the spec forbids is charged on top, steeply:
 
     score = (settle + energy_weight E) / bound + moves_weight M
-            + 3 (overshoot / allowed - 0.9)+ + (|bias| / allowed - 0.9)+ / 2
+            + 3 (overshoot / allowed - 0.9)+ + (|bias| / allowed - 0.9)+ / 2 + 3 (M / allowed - 0.9)+
 
 M is by how many full drives the drives move in all: of two designs that settle alike, the one that answers
-less to noise wins. A step that never settles is charged its whole length and half of its last error in bands.
+less to noise wins. The moves allowed are ``moves_limit`` times those of the PI by SIMC in the same trial,
+where that settles: what moves more wears a valve for little. A step that never settles is charged its whole
+length and half of its last error in bands.
 So a plant in mK, with a spec in mK, has the score of the same plant in K. Where a design is tried in several
 noises, a step on a draw costs their mean. Over the runs, the score is the mean plus half of what the worst is
 above it: the draws stand for what the plant may be. All of them have the model's structure. What that may
@@ -38,7 +40,7 @@ import warnings
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
@@ -54,6 +56,7 @@ from thermogrip.mpc.design.design import Design, PILoop, make_blocks
 from thermogrip.mpc.design.spec import Spec
 from thermogrip.mpc.interface import Regulator
 from thermogrip.mpc.native.runtime import CompiledTruth, known_codes, remember_codes, wanted
+from thermogrip.mpc.optimiser.rti import Optimiser
 from thermogrip.mpc.plant.prediction import HeldStarts, graded_drives, prediction_model, step_response
 from thermogrip.mpc.tuning.minimum_time import full_drive_bound
 
@@ -101,11 +104,12 @@ STRUCTURE = 1000
 #: How much runs on such draws count in the score beside the others, and beyond what one counts by its log.
 LACKING, LATE = 0.05, 5.0
 # what the whole allowed overshoot and bias more cost, and a band of error where a step does not settle
-_OVERSHOOT, _BIAS, _ERROR = 3.0, 0.5, 0.5
+_OVERSHOOT, _BIAS, _ERROR, _MOVES = 3.0, 0.5, 0.5, 3.0
 #: Of what is allowed, that costs nothing.
 FREE = 0.9
 #: In which an MPC is tried where its trials run in C: one noise alone moves a score by a tenth.
 NOISES = 3
+_LEAST_SLOPE = 0.02  # of the largest, of a drive that is there for an output
 _SENSOR_OFF = 0.02  # of what the logs showed, a sensor of a disturbance that is no temperature of the room
 
 
@@ -266,9 +270,21 @@ def bound_of(bounds: Bounds, result: StepResult) -> float:
     return bounds[(*key, result.output) if result.output else key]
 
 
-def score(results: Sequence[StepResult], spec: Spec, bounds: Bounds) -> float:
+#: Of the PI by SIMC, by start, target and draw: how many full drives its drives move, where it settles.
+PIMoves = dict[tuple[float, float, int], float]
+
+
+def moves_of(results: Sequence[StepResult]) -> PIMoves:
+    """Return how far drives moved in the runs that settled."""
+    settled = [result for result in results if np.isfinite(result.settle_s)]
+    return {(result.start, result.target, result.draw): result.travel for result in settled}
+
+
+def score(
+    results: Sequence[StepResult], spec: Spec, bounds: Bounds, pi_moves: PIMoves | None = None
+) -> float:
     """Return the score of a set of trials, see the module's text; lower is better; ``bounds`` are shortest
-    times [s]."""
+    times [s]; moves have no limit where those of a PI are not given."""
     costs: dict[tuple[float, float, int, str], list[float]] = {}
     for result in results:
         bound, asked = bound_of(bounds, result), spec.asked(result.output)
@@ -281,6 +297,8 @@ def score(results: Sequence[StepResult], spec: Spec, bounds: Bounds) -> float:
         cost += _OVERSHOOT * max(0.0, result.overshoot / asked.overshoot_degC - FREE)
         cost += _BIAS * max(0.0, abs(result.bias) / asked.bias_degC - FREE) if settled else 0.0
         cost += spec.energy_weight * result.energy_s / unit + spec.moves_weight * result.travel
+        own = (pi_moves or {}).get((result.start, result.target, result.draw % STRUCTURE), np.inf)
+        cost += _MOVES * max(0.0, result.travel / (spec.moves_limit * own) - FREE)
         costs.setdefault((result.start, result.target, result.draw, result.output), []).append(cost)
     of = {key: float(np.mean(noises)) for key, noises in costs.items()}
     planned = expected(spec) | {0}
@@ -392,6 +410,10 @@ LQR_PARAMETERS = (
     ("output_walk", 2e-4, 2e-2),
 )
 
+#: SIMC's PI by itself: it is not told what drive holds a target.
+_SIMC = {"Kc": 1.0, "Ti": 1.0, "setpoint": 1.0, "feedforward": 0.0}
+#: What a design that prices travel is searched by: of the error that a spec allows, what moves no drive.
+STILL = ("still", 0.003, 0.6)
 _CHECK_FROM = 100  # draws of the comparison, apart from those of the search
 
 
@@ -433,7 +455,7 @@ class _Built:
 
 def _structure(design: Design) -> Any:
     """Return on what it depends which C a design needs."""
-    return design.blocks, tuple(design.ramp_per_s)
+    return design.blocks, tuple(design.ramp_per_s), design.travel > 0
 
 
 def _unpacked_here(packed: bytes) -> Search:
@@ -500,6 +522,7 @@ class Search:
         unseen = apparent_delay(plant, baseline.controlled) < 2 * plant.dt
         own = PI_OF_UNSEEN_DELAY if unseen else PI_PARAMETERS
         self.pi: Sequence[tuple[str, float, float]] = own[:-1] if self.certain else own
+        self.pi_moves = self._moves_of_pi()
         # long enough to see it settle and stay, short enough to try many in Python
         slowest = [max(self.bounds[(*step, draw)] for draw in self.draws) for step in spec.steps]
         least = min(120.0, spec.hold_s)
@@ -534,6 +557,15 @@ class Search:
             return self._compiled, known_codes(), {}
         of = bounds_of(self.plant, self.baseline, self.spec, [draw])
         return True, prediction_model(drawn(self.plant, draw), self.plant.dt).held_starts, of
+
+    def _moves_of_pi(self) -> PIMoves:
+        """Return what the PI by SIMC moves, on the search's draws and on those of the comparison."""
+        if not self.spec.moves_limit:
+            return {}
+        unseen = self._results("PI", _SIMC, [(self.unseen, self.check_seed, True)], whole=False)
+        return moves_of(unseen) | moves_of(
+            self._results("PI", _SIMC, [(self.draws, self.seed, True)], whole=True)
+        )
 
     def _settled(self) -> list[float]:
         """Return when the default design has settled on the slowest draw [s], by step; inf where never."""
@@ -574,6 +606,7 @@ class Search:
             blocks=base.blocks if same else make_blocks(horizon, count),
             move=parameters.get("move", base.move),
             terminal=parameters.get("terminal", base.terminal),
+            travel=parameters["still"] * self.travel if "still" in parameters else base.travel,
             drive=parameters.get("drive", base.drive),
             overshoot=base.overshoot if share is None else share * self.spec.overshoot_degC,
             noise=noise,
@@ -582,6 +615,11 @@ class Search:
             if "ramp" in parameters
             else base.ramp_per_s,
         )
+
+    @cached_property
+    def travel(self) -> float:
+        """The price of travel at which a prediction that is off by the allowed bias moves no drive."""
+        return _price_of_travel(self.plant, self.baseline, self.spec)
 
     @property
     def at_once(self) -> list[str]:
@@ -632,7 +670,7 @@ class Search:
         return Trial(
             controller=name,
             parameters=dict(parameters),
-            score=score(found, self.spec, self.bounds),
+            score=score(found, self.spec, self.bounds, self.pi_moves),
             settle_s=float(np.mean([result.settle_s for result in results])),
             overshoot=max(result.overshoot for result in results),
             energy_s=float(np.mean([result.energy_s for result in results])),
@@ -750,6 +788,15 @@ class Search:
             warnings.warn(f"trials run in Python, ten times slower: {error}", stacklevel=2)
             self._compiled = False
             return None
+
+
+def _price_of_travel(plant: Plant, design: Design, spec: Spec) -> float:
+    """Return the price of travel at which a whole prediction that is off by the allowed bias moves no drive:
+    the slope of its squared errors along the drive that answers least over the horizon."""
+    optimiser = Optimiser(prediction_model(plant, design.dt), design)
+    bias = np.array([spec.asked(name).bias_degC for name in design.controlled]) * optimiser.weight
+    slopes = 2 * design.track * np.abs(optimiser.at_rest.sum(axis=0)) * bias[optimiser.strongest]
+    return float(np.min(slopes, where=slopes > _LEAST_SLOPE * slopes.max(), initial=slopes.max()))
 
 
 def _capped(ranges: dict[str, tuple[float, float]], share: float) -> dict[str, tuple[float, float]]:

@@ -38,6 +38,7 @@ RESOLUTION = (1.0, 0.05, 0.005)
 _CAPS = (0.9, 0.75, 0.6, 0.5)
 _MOVES = (0.1, 0.3, 3.0, 10.0, 30.0, 100.0)
 _TRUST = (0.3, 0.1)
+_STILL = (0.03, 0.1, 0.3)
 #: How many minimum times the targets of ramped designs take.
 RAMPS = (1.3, 1.7)
 _KEPT = 6  # of the search's own trials
@@ -95,6 +96,11 @@ def scan_of(
             found.append((f"targets ramp for {times:g} times the minimum time", {**best, "ramp": times}))
     for factor in _MOVES:
         found.append((f"moves {factor:g} times as dear", {**best, "move": factor * best["move"]}))
+    for share in _STILL:
+        if share != best.get("still"):
+            found.append(
+                (f"errors below {share:g} of the allowed bias move nothing", {**best, "still": share})
+            )
     for factor in _TRUST if "state_walk" in best else ():
         trusted = {**best, "state_walk": factor * best["state_walk"]}
         found.append((f"states {factor:g} times as noisy to the filter", trusted))
@@ -126,6 +132,7 @@ PARAMETER_WORDS = {
     "horizon": "the horizon",
     "blocks": "the number of blocks",
     "ramp": "the target's ramp",
+    "still": "the error that moves no drive, in shares of the allowed bias,",
 }
 
 _FACTORS = (1.3, 3.0, 10.0)
@@ -166,7 +173,7 @@ def sensitivity_of(item: tuple[Search, str, dict[str, float], Trial]) -> Sensiti
             if not _unseen(tried, here):
                 break
             # a horizon has a least length: what counts is what the design made of it
-            free[side] = parameters_of(search.design(changed), search.spec)[parameter]
+            free[side] = parameters_of(search.design(changed), search.spec).get(parameter, changed[parameter])
     low, high = ends[-1], ends[1]
     slope = (high.score - low.score) / (2 * np.log(_FACTORS[0]) * here.score)
     return Sensitivity(

@@ -54,6 +54,7 @@ from thermogrip.mpc.tuning.objective import (
     LQR_PARAMETERS,
     MPC_PARAMETERS,
     PI_PARAMETERS,
+    STILL,
     STRUCTURE,
     Bounds,
     Record,
@@ -228,10 +229,11 @@ def _lacking(plant: Plant, design: Design, spec: Spec, results: Sequence[StepRes
     return f"Where the model lacks structure: {'; '.join(said)}." if said else ""
 
 
-# to begin with: dearer moves than in the default design, a filter that trusts readings less, or more, other
-# horizons
+# to begin with: dearer moves than in the default design, a price of travel, a filter that trusts readings
+# less, or more, other horizons
 _LOOK = (
     ("move", (10.0, 100.0, 1000.0)),
+    ("still", (0.03, 0.1, 0.3)),
     ("state_walk", (0.3, 0.1)),
     ("output_walk", (3.0, 10.0)),
     ("horizon", (0.7, 1.5)),
@@ -352,7 +354,7 @@ def _tune(plant: Plant, spec: Spec | None, progress: Progress | None, workers: W
         progress(_BEGUN, "default design")
     for at, (parameter, factors) in enumerate(_LOOK):
         first = _best(looked).parameters
-        values = [factor * first[parameter] for factor in factors]
+        values = [factor * first.get(parameter, 1.0) for factor in factors]
         look = [{**first, parameter: float(round(v)) if parameter == "horizon" else v} for v in values]
         width = (_LOOKED - _BEGUN) / len(_LOOK)
         share = sub_progress(progress, _BEGUN + width * at, _BEGUN + width * (at + 1))
@@ -369,7 +371,7 @@ def _tune(plant: Plant, spec: Spec | None, progress: Progress | None, workers: W
         "LQR": search.design(_best(found["LQR"]).parameters),
     }
     results = _compare(search, candidates, workers, sub_progress(progress, _TRADED, _COMPARED))
-    scores = {name: score(part, spec, search.bounds) for name, part in results.items()}
+    scores = {name: score(part, spec, search.bounds, search.pi_moves) for name, part in results.items()}
     own = {name: counting(part, spec) for name, part in results.items()}
     moved = {name: np.mean([result.travel for result in part]) for name, part in own.items()}
     stiller = moved["tuned"] < moved["baseline"] / (1 + _STILL)
@@ -604,6 +606,8 @@ def _optimise(item: tuple[Search, str, list[dict[str, float]], int, Progress | N
     import nlopt
 
     parameters = {"MPC": MPC_PARAMETERS, "PI": search.pi, "LQR": LQR_PARAMETERS}[name]
+    if "still" in starts[0]:
+        parameters = (*parameters[:1], STILL, *parameters[1:])
     evaluate = partial(search.evaluate, name=name)
     names = [parameter for parameter, _, _ in parameters]
     low = np.log([small for _, small, _ in parameters])

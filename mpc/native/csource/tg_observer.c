@@ -18,8 +18,6 @@
 #define REMEMBER 0.2 /* share of the newest innovation in their mean */
 #define LASTING 0.02 /* the same in the mean that shows what lasts, */
 #define LASTS 0.30151134457776363 /* from where on it does: 3 sqrt(q / (2 - q)) at q = LASTING */
-#define PRIOR_LAG 1.5   /* samples: standard deviation of a lag at the start */
-#define LONGEST_LAG 6.0 /* samples */
 #define SAME 1e-6 /* of a sample: what is nearer than this is the same time */
 #ifdef TG_SINGLE
 #define ROUNDED 6e-8
@@ -196,7 +194,7 @@ static void apply(tg_controller *c, double *change)
     for (int r = 0; r < TG_NG; r++) {
         int at = TG_L + TG_NG + r;
         double lag = c->lag[r] + change[at];
-        double beyond = lag - fmin(fmax(lag, 0.0), LONGEST_LAG * s->dt), share;
+        double beyond = lag - fmin(fmax(lag, 0.0), s->longest_lag), share;
         if (beyond == 0.0)
             continue;
         share = beyond / c->P[at * (TG_Z + 1)];
@@ -212,7 +210,7 @@ static void apply(tg_controller *c, double *change)
         c->w[k] = w;
     }
     for (int r = 0; r < TG_NG; r++) {
-        double lag = fmin(fmax(c->lag[r] + change[TG_L + TG_NG + r], 0.0), LONGEST_LAG * s->dt);
+        double lag = fmin(fmax(c->lag[r] + change[TG_L + TG_NG + r], 0.0), s->longest_lag);
         change[TG_L + TG_NG + r] = lag - c->lag[r];
         c->lag[r] = lag;
     }
@@ -305,7 +303,7 @@ void tg_observer_set_offsets(tg_controller *c, const double *y, const int *which
 void tg_observer_expect_lags(tg_controller *c)
 {
     for (int r = 0; r < TG_NG; r++)
-        c->P[(TG_L + TG_NG + r) * (TG_Z + 1)] = PRIOR_LAG * PRIOR_LAG * c->design->dt * c->design->dt;
+        c->P[(TG_L + TG_NG + r) * (TG_Z + 1)] = c->design->first_lag * c->design->first_lag;
 }
 
 /* Start at rest: one update of a plant that may have been held by any drive, whose sensors may be off. */

@@ -5,6 +5,7 @@
  *
  *     H = 2 ( G'WG + move D'D + drive L ),     f = 2 ( G'W (y0 - G z0 - r) - move D'e ).
  *
+ * Where travel has a price, D z are soft rows behind those of the samples, between e and e.
  * G is propagated as tangents of the step, a column for each drive of each block that has begun.  Its rows are the
  * soft rows of the program, for each sample those of the controlled, then of the limited outputs; the rows of four
  * samples are as long as the longest of them, so that what is added up over samples is added up for four at once.
@@ -26,7 +27,9 @@
 #define BARELY 1.02
 #ifdef TG_SINGLE
 #define LITTLE 1e-5
+#define UNMOVED 1e-3 /* of its range, that costs no travel: two bounds a rounding apart would take turns */
 #else
+#define UNMOVED 0.0
 #define LITTLE 1e-7 /* of its range, that a parked drive may be off in the program */
 #endif
 #define NONE 1e30
@@ -86,6 +89,15 @@ static void lay_out(tg_controller *c)
                     at += c->qp.filled[i];
                 }
         }
+    for (int j = 0, n = s->n_b * TG_NU; s->travel > 0.0 && j < n; j++, i++) { /* travel */
+        c->qp.start[i] = at;
+        c->qp.filled[i] = TG_WHOLE(n);
+        memset(c->G + at, 0, (size_t)c->qp.filled[i] * sizeof(double));
+        c->G[at + j] = 1.0;
+        if (j >= TG_NU)
+            c->G[at + j - TG_NU] = -1.0;
+        at += c->qp.filled[i];
+    }
     c->qp.A = c->G;
     c->laid_out = 1;
 }
@@ -298,7 +310,7 @@ static double merit(const tg_controller *c, const double *plan, const double *y,
         for (int j = 0; j < TG_NU; j++) {
             double value = plan[b * TG_NU + j], energy = s->energy[j] * c->dear[b];
             double step = (value - (b ? plan[(b - 1) * TG_NU + j] : last[j])) / s->span[j];
-            cost += c->caution * s->move * step * step;
+            cost += c->caution * s->move * step * step + s->travel * (fabs(step) + TG_CURVED * step * step);
             value /= s->span[j];
             cost += s->drive * value * value * s->blocks[b] + energy * value;
         }
@@ -470,7 +482,7 @@ static int is_kept(const tg_controller *c)
            !memcmp(c->kept_lost, c->lost, sizeof c->lost);
 }
 
-static void set_soft_rows(tg_controller *c, const double *target, const double *side)
+static void set_soft_rows(tg_controller *c, const double *target, const double *side, const double *last)
 {
     const tg_design *s = c->design;
     tg_qp *q = &c->qp;
@@ -494,6 +506,11 @@ static void set_soft_rows(tg_controller *c, const double *target, const double *
             lower[k * rows] = low + at;
             upper[k * rows] = high + at;
         }
+    }
+    for (int i = 0, at = 2 * q->n + s->N * rows; i < q->moves; i++) {
+        double before = i < TG_NU ? last[i] / s->span[i] : 0.0;
+        q->lower[at + i] = before - UNMOVED;
+        q->upper[at + i] = before + UNMOVED;
     }
 }
 
@@ -622,7 +639,9 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
     int uphill;
     q->n = s->n_b * TG_NU;
     q->stride = TG_NU;
-    q->s = s->N * (s->n_c + s->n_l);
+    q->moves = s->travel > 0.0 ? q->n : 0;
+    q->travel = s->travel;
+    q->s = s->N * (s->n_c + s->n_l) + q->moves;
     set_prices(s, q);
     q->iteration_limit = s->iteration_limit;
     q->late = c->late;
@@ -648,7 +667,7 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
     memcpy(c->kept_lost, c->lost, sizeof c->lost);
     set_linear_cost(c, target, last);
     set_bounds(c, guess, drive_bias, last);
-    set_soft_rows(c, target, side);
+    set_soft_rows(c, target, side, last);
     c->qp_status = tg_qp_solve(q);
     c->iterations = q->iterations;
     c->broken = 0.0;

@@ -13,7 +13,6 @@ from tests.mpc.makers import make_tank, network_plant
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.estimator.observer import (
-    PRIOR_LAG,
     DisturbanceModel,
     Observer,
     ObserverNoise,
@@ -450,7 +449,7 @@ def test_noise_at_rest_shows_no_lag_and_leaves_it_as_uncertain_as_it_was() -> No
             observer.predict(np.zeros(1), np.zeros(0))
             observer.update(25.0 + 0.05 * rng.standard_normal(1))
         assert observer.lag[0] < 0.4 * dt
-        assert observer.lag_sd[0] > 0.8 * PRIOR_LAG * dt
+        assert observer.lag_sd[0] > 0.8 * ObserverNoise.lag * dt
 
 
 def test_a_reading_between_two_moves_is_not_taken_for_a_lag() -> None:

@@ -48,6 +48,7 @@ def search_of(
         patch.setattr(objective, "full_drive_bound", lambda drawn, design, step, spec: bounds(*step, drawn))
         patch.setattr(objective, "apparent_delay", lambda plant, controlled: 8.0)
         patch.setattr(Search, "_settled", lambda self: list(settled))
+        patch.setattr(Search, "_moves_of_pi", lambda self: {})
         patch.setattr(objective, "wanted", lambda: False)  # trials in Python
         return Search(plant, spec, spec.design(make_tank(), **changes), 3)  # type: ignore[arg-type]
 
@@ -370,6 +371,26 @@ def test_a_score_is_the_mean_and_half_of_what_the_worst_is_above_it():
     assert score([one, two, *slow], SPEC, bounds) == pytest.approx(
         2.5 + 0.05 * (4.0 + 5 + 5 * np.log((6 + 40 / 0.3) / 5)) / 2
     )
+
+
+def test_moves_beyond_the_limit_are_charged_as_overshoot_is():
+    """The limit is in moves of the PI by SIMC on the same draw, where that settles; without any, none."""
+    one = StepResult(28.0, 36.0, 1, 150.0, 0.0, 0.0, 0.0, 0.0, 3.0, 0.5, 300.0)
+    simc = [replace(one, travel=1.25), replace(one, draw=2, travel=0.1, settle_s=np.nan)]
+    bounds, pi = {(28.0, 36.0, draw): 50.0 for draw in (1, 2)}, objective.moves_of(simc)
+    spec = SPEC.model_copy(update={"moves_weight": 0.0})
+    assert pi == {(28.0, 36.0, 1): 1.25}
+    found = [score([result], spec, bounds, pi) for result in (one, replace(one, draw=2))]
+    assert found == pytest.approx([3 + 3 * (3.0 / (1.5 * 1.25) - 0.9), 3.0])
+    assert score([replace(one, travel=1.6)], spec, bounds, pi) == pytest.approx(3.0)
+    free = spec.model_copy(update={"moves_limit": 0.0})
+    assert search_of(lambda *at: 60.0, spec=free)._moves_of_pi() == {}
+
+
+def test_a_price_of_travel_is_in_shares_of_what_an_allowed_bias_is_worth():
+    search = search_of(lambda *at: 60.0)
+    vars(search)["travel"] = 40.0
+    assert [search.design(p).travel for p in ({}, {"still": 0.25})] == [0.0, 10.0]
 
 
 def test_a_step_in_several_noises_counts_by_their_mean():

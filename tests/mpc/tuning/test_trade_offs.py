@@ -115,6 +115,8 @@ def test_the_scan_has_six_of_the_search_by_score_smaller_drives_other_move_weigh
         ("moves 3 times as dear", best | {"move": 6.0}),
         ("moves 10 times as dear", best | {"move": 20.0}), ("moves 30 times as dear", best | {"move": 60.0}),
         ("moves 100 times as dear", best | {"move": 200.0}),
+        *((f"errors below {share:g} of the allowed bias move nothing", best | {"still": share})
+          for share in (0.03, 0.1, 0.3)),
     ]  # fmt: skip
     trusting = {"move": 2.0, "state_walk": 0.01}
     assert scan_of(trusting, history[:1])[-2:] == [
