@@ -50,6 +50,7 @@ _COPIED = (*SOURCES, "tg_design.h", "Makefile", "example.c", "check.c")
 _TOLERANCE, _HARD_TOLERANCE = 1e-9, 1e-8
 # in numbers of four bytes, and of how many states one may be answered otherwise: where rows depend on others
 # (ranges, slews that end on them), a float may not tell which of them hold, and the last plan goes on
+_TIES = 0.005  # of the states, in which two rows may be as far broken and either be taken in first
 _SINGLE_TOLERANCE, _SINGLE_STATES = 0.05, 1000
 _RESTS = 100  # from which random states depart
 
@@ -85,7 +86,8 @@ class Agreement:
     @property
     def passed(self) -> bool:
         """Whether C and Python do the same."""
-        exact = self.same_status == self.same_iterations == self.states
+        ties = self.states - self.same_iterations <= max(1, _TIES * self.states)
+        exact = self.same_status == self.states and ties
         if self.single:
             exact = _SINGLE_STATES * self.others <= self.states
         return exact and self.difference <= self.tolerance

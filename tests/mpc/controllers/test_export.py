@@ -278,9 +278,9 @@ def test_what_the_parameters_fix_is_worked_out_without_a_compiler(name):
 
 @pytest.mark.parametrize(
     ("difference", "status", "iterations", "passed"),
-    [(1e-9, 7, 7, True), (1.1e-9, 7, 7, False), (0.0, 6, 7, False), (0.0, 7, 6, False), (0.0, 6, 6, False)],
+    [(1e-9, 7, 7, True), (1.1e-9, 7, 7, False), (0.0, 6, 7, False), (0.0, 7, 6, True), (0.0, 7, 5, False)],
 )
-def test_an_export_passes_where_drives_statuses_and_iterations_are_the_same(
+def test_an_export_passes_where_drives_and_statuses_are_the_same_and_all_iterations_but_one(
     difference: float, status: int, iterations: int, passed: bool
 ):
     assert Agreement(7, difference, 3, status, iterations, 1, 1, 1).passed == passed

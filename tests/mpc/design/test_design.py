@@ -139,6 +139,11 @@ def test_what_nothing_moves_is_no_target():
         default_design(block(10, 50.0, gain=0.0), dt=1.0)
 
 
+def test_a_filter_allows_for_longer_lags_where_a_delay_is_a_sample_or_two():
+    lags = [default_design(block(delay, 100.0), dt=2.0).noise.lag for delay in (0, 2, 4, 8, 40)]
+    assert lags == pytest.approx([5.0, 5.0, 3.0, 1.5, 1.5], rel=0.1)
+
+
 def test_a_bias_is_learnt_more_slowly_where_there_are_less_than_ten_delays_in_a_lag():
     drifts = [
         default_design(block(delay, lag), dt=2.0).noise.drive for delay, lag in ((5, 100.0), (40, 100.0))
@@ -233,7 +238,7 @@ def test_a_field_that_cannot_be_is_named(tank, design, change, says):
     ],
 )
 def test_a_field_at_the_end_of_what_can_be_is_taken(tank, design, change):
-    default_noise = {"state": 0.005, "drive": 0.002, "output": 0.002, "reading": 0.05}
+    default_noise = {"state": 0.005, "drive": 0.002, "output": 0.002, "reading": 0.05, "lag": 1.5}
     found = check_design(Design.from_dict({**design, **change}), tank).to_dict()
     for key, value in change.items():
         assert found[key] == (default_noise | value if key == "noise" else value)
