@@ -196,13 +196,11 @@ def free_run(
         miss = rows.y - np.where(scored[:, None], run, np.nan)
         off, gain = _gain(plant, log, miss, units)
         band = free_run_band(plant, log, simulated, warmup=warmup)
+        readings = _beside(plant, rows, run, scored, None).outputs
         tested = replace(fit_logs([log])[0], start_s=float(rows.time[np.argmax(scored)]))
         verdict = judge(
             band,
-            {
-                name: score(*pair).rmse
-                for name, pair in _beside(plant, rows, run, scored, None).outputs.items()
-            },
+            {name: score(*pair).rmse for name, pair in readings.items()},
             residual.start,
             {name: no_input[name].rmse for name in plant.outputs},
             no_better=no_better,
