@@ -392,16 +392,14 @@ def _excess_notes(
     plant: Plant,
     beyond: Mapping[str, tuple[float, float]],
     units: Mapping[str, str],
-    verdict: Verdict | None,
+    verdict: Verdict | None = None,
 ) -> list[str]:
     """Return by how much outputs exceed the error of the fit."""
-    why = "slow terms are missing"
-    why += (
-        ", within the error that was stated" if _small(verdict) else ", or the plant is not quite what it was"
-    )
+    why = "or the plant is not quite what it was in the fit"
+    why = "within the error that was stated" if _small(verdict) else why
     return [
         f"{name}: means over {plant.scores.average_s:g} s err by {here:.2g} {units[name]}, and "
-        f"by {there:.2g} {units[name]} in the fit: {why}"
+        f"by {there:.2g} {units[name]} in the fit: slow terms are missing, {why}"
         for name, (here, there) in beyond.items()
     ]
 

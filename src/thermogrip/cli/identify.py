@@ -426,7 +426,12 @@ def validate(
             console.say(f"{log.attrs['name']}: {note}")
     answers = [run_answer(log.attrs["name"], run, band) for log, run, band in zip(logs, runs, bands)]
     console.answer({"logs": answers, "repairs": repairs})
-    return 0
+    found = {run.verdict.standing for run in runs if run.verdict is not None}
+    return cli.Done(next((each for each in _URGENT if each in found), ""))
+
+
+#: Of verdicts on several logs, which one says what comes next.
+_URGENT = ("changed", "weak", "as stated", "no test", "seen")
 
 
 def run_answer(name: str, run: FreeRun, band: Band) -> dict[str, Any]:
@@ -444,6 +449,7 @@ def run_answer(name: str, run: FreeRun, band: Band) -> dict[str, Any]:
             "own_error": band.own_error,
             "draws": band.draws,
         },
+        "verdict": run.verdict,
         "notes": run.notes,
     }
 
