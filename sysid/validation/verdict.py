@@ -54,7 +54,10 @@ class Verdict:
 
     def __str__(self) -> str:
         times = ", ".join(f"{name} {ratio:.2g}" for name, ratio in self.over_stated.items())
-        return f"errs {_MEANING[self.standing]} (times the stated error: {times})"
+        how = _MEANING[self.standing]
+        if self.standing != "changed" and max(self.over_stated.values(), default=0.0) > 1.0:
+            how = how.replace("as was stated", "by more than was stated, but no more than chance may do", 1)
+        return f"errs {how} (times the stated error: {times})"
 
 
 def judge(

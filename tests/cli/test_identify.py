@@ -392,6 +392,24 @@ def test_what_comes_after_validate_follows_from_what_it_found(
     assert done.err.endswith(f"next: thermogrip {then}\n")
 
 
+def test_a_plant_that_is_not_good_is_identified_anew_whatever_a_run_says(
+    bench: Bench, stand_in: StandIn
+) -> None:
+    run = SimpleNamespace(notes=(), band=lambda: None, verdict=Verdict("as stated", {"t": 1.0}))
+    stand_in("thermogrip.sysid.validation.free_run.free_run", run)
+    stand_in("thermogrip.report.plant.band_words", "a band")
+    stand_in("thermogrip.report.plant.run_table", ((), ()))
+    stand_in("thermogrip.cli.identify.run_answer", {})
+    file = bench.path / "plant.json"
+    content = json.loads(file.read_text(encoding="utf-8"))
+    file.write_text(
+        json.dumps(content | {"verdict": "arx na 2; not good: 0.9 of no input"}), encoding="utf-8"
+    )
+    done = bench.run("validate", "plant.json", "good.csv")
+    assert "plant.json: identify did not call it good" in words_of(done.out)
+    assert done.err.endswith("next: thermogrip identify LOG_OF_FIT good.csv --out both.json\n")
+
+
 def test_a_warm_up_shorter_than_that_of_the_fit_is_told(bench: Bench, stand_in: StandIn) -> None:
     stand_in("thermogrip.sysid.identification.warm_up_of_fit", 50.0)
     stand_in(

@@ -426,7 +426,12 @@ def validate(
             console.say(f"{log.attrs['name']}: {note}")
     answers = [run_answer(log.attrs["name"], run, band) for log, run, band in zip(logs, runs, bands)]
     console.answer({"logs": answers, "repairs": repairs})
-    found = {run.verdict.standing for run in runs if run.verdict is not None}
+    found: set[str] = {run.verdict.standing for run in runs if run.verdict is not None}
+    if "; not good: " in loaded.verdict:
+        console.say(
+            f"{plant.name}: identify did not call it good, and a run as was stated does not change that"
+        )
+        found.add("weak")
     return cli.Done(next((each for each in _URGENT if each in found), ""))
 
 

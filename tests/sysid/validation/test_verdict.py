@@ -76,6 +76,13 @@ def test_where_no_output_can_beat_no_input_the_log_is_no_test():
     )
 
 
+def test_an_error_between_once_and_twice_what_was_stated_is_reported_as_larger():
+    found = judge(band(a=1.0), {"a": 1.5}, {}, {"a": 9.0}, no_better=(), gain=None, seen=False)
+    assert str(found) == (
+        "errs by more than was stated, but no more than chance may do (times the stated error: a 1.5)"
+    )
+
+
 def test_hours_of_readings_do_not_make_another_plant_of_what_is_real_and_small():
     plant = block()
     run = free_run(plant, log_of(slow=0.1))
