@@ -65,7 +65,9 @@ def log_of(plant: Plant, u: Array, room: float, rng: np.random.Generator) -> Log
     y = np.round((y + 50) / LSB * 10) / 10 * LSB - 50
     heaters = {f"q{k + 1}": (u[:, k], "percent", "input") for k in range(2)}
     outputs = {f"t{k + 1}": (y[:, k], "degC", "output") for k in range(2)}
-    return make_log(np.arange(float(len(u))), heaters | outputs)
+    log = make_log(np.arange(float(len(u))), heaters | outputs)
+    log.attrs["name"] = f"log {rng.integers(10**9)}"
+    return log
 
 
 def fitted(kind: str, logs: list[Log]) -> Plant:
