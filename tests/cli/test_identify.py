@@ -392,10 +392,17 @@ def test_what_comes_after_validate_follows_from_what_it_found(
     assert done.err.endswith(f"next: thermogrip {then}\n")
 
 
+@pytest.mark.parametrize(
+    ("standing", "then"),
+    [
+        ("as stated", "identify LOG_OF_FIT good.csv --out both.json"),
+        ("seen", "excite --kind optimal --minutes 20 --plant plant.json --out schedule.csv"),
+    ],
+)
 def test_a_plant_that_is_not_good_is_identified_anew_whatever_a_run_says(
-    bench: Bench, stand_in: StandIn
+    bench: Bench, stand_in: StandIn, standing: Standing, then: str
 ) -> None:
-    run = SimpleNamespace(notes=(), band=lambda: None, verdict=Verdict("as stated", {"t": 1.0}))
+    run = SimpleNamespace(notes=(), band=lambda: None, verdict=Verdict(standing, {"t": 1.0}))
     stand_in("thermogrip.sysid.validation.free_run.free_run", run)
     stand_in("thermogrip.report.plant.band_words", "a band")
     stand_in("thermogrip.report.plant.run_table", ((), ()))
@@ -407,7 +414,7 @@ def test_a_plant_that_is_not_good_is_identified_anew_whatever_a_run_says(
     )
     done = bench.run("validate", "plant.json", "good.csv")
     assert "plant.json: identify did not call it good" in words_of(done.out)
-    assert done.err.endswith("next: thermogrip identify LOG_OF_FIT good.csv --out both.json\n")
+    assert done.err.endswith(f"next: thermogrip {then}\n")
 
 
 def test_a_warm_up_shorter_than_that_of_the_fit_is_told(bench: Bench, stand_in: StandIn) -> None:
