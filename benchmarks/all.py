@@ -50,6 +50,7 @@ ALL = [
     ),
     Benchmark("abroad/peers.py", "{data}", "{data} --sets house", PEERS),
     Benchmark("identify/bands.py", "{data}", "{data} --kinds arx"),
+    Benchmark("identify/another.py", quick="--pairs 1 --only network"),
     Benchmark("identify/left.py", quick="--logs 5 --only tclab"),
     Benchmark("identify/lost.py", quick="--seeds 1 --only tclab"),
     Benchmark("identify/fleet.py", "--seeds 4", "--rigs 6 --seeds 1"),

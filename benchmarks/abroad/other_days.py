@@ -7,8 +7,8 @@ FOLDER/tclabsp holds ``r01.csv`` ... of github TiagoPrata/TCLabSP (``ens_Identif
 FNR13/TCLab-Predictive-Control (``openloop_data_*.mat``), FOLDER/heeejini ``e1.csv`` ... of heeejini/TCLab
 (``mpc_episode_*_data.csv``); columns are ``time_s``, ``q1_percent``, ``q2_percent``, ``t1_degC`` and
 ``t2_degC``.  They are not part of this project.  Printed by log: the error of the free run over what was
-stated, the share of readings in the 90 % band, whether ``validate`` says that the plant is another one, and
-whether one gain is most of it.
+stated, the share of readings in the 90 % band, the verdict of ``validate``, whether one gain is most of it,
+and whether by its correlations or the error of the fit alone the plant would be called another one.
 """
 
 from __future__ import annotations
@@ -60,9 +60,11 @@ def main() -> None:
                 f"{name} {score.rmse / band.expected[name]:.2f}, {band.inside[name]:.2f}"
                 for name, score in run.scores.items()
             )
-            told = "not what it was" in said or "not quite what it was" in said or "relied on" in said
+            assert run.verdict is not None
+            named = any(t.significant for row in run.residual.tests.values() for t in row.values())
+            alone = " by tests alone" if named or run.exceeds_fit or run.no_better else ""
             gain = " one gain" if "most of the error is one gain" in said else ""
-            print(f"  {file.stem}: {errors}{' told' if told else ''}{gain}", flush=True)
+            print(f"  {file.stem}: {errors} {run.verdict.standing}{gain}{alone}", flush=True)
 
 
 if __name__ == "__main__":

@@ -94,7 +94,9 @@ class _Run:
 
 def _run_mpc(c: CompiledController, controller: Controller, run: _Run, target: Array, *, told: bool) -> None:
     """Run an MPC that was reset to targets (n, n_controlled) [degC], told of the drives before or not."""
-    observed = np.concatenate([values.ravel() for values in controller.observer.estimate().values()])
+    estimate = controller.observer.estimate()
+    estimate["P"] = c.kept(estimate["P"])
+    observed = np.concatenate([values.ravel() for values in estimate.values()])
     c.library.tg_host_loop(
         c.state,
         *(ctypes.byref(part) for part in (c.design, run.plant, run.around)),

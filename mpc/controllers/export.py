@@ -111,8 +111,9 @@ def export_controller(
     folder.mkdir(parents=True, exist_ok=True)
     model = controller.model
     code = write_model(model.model, model.drive_index, model.dt / model.sub)
-    sizes = design_struct.sizes_of(controller, code, room=False)
-    numbers = design_struct.numbers_of(controller, np.array(code.constants(model.p.tolist())))
+    sizes = design_struct.sizes_of(controller, code, room=False, single=single)
+    constants_of = np.array(code.constants(model.p.tolist()))
+    numbers = design_struct.numbers_of(controller, constants_of, single=single)
     files = {name: c_source(name) for name in _COPIED} | code.files
     files |= {
         "tg_config.h": design_struct.config_header(sizes),

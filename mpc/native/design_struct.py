@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
+from thermogrip.mpc.native.modes import Modes, modes_of
 
 if TYPE_CHECKING:
     from thermogrip.mpc.design.design import Design
@@ -117,6 +118,11 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     "by_d": (False, ("NO", "ND"), "by the disturbances,"),
     "by_none": (False, ("NO",), "and without them"),
     "P_rest": (False, ("NX", "NX"), "covariance of the states in which the plant may rest"),
+    "H": (False, ("NY", "NX"), "outputs from the states of P, which are modes of the plant where it has NJ:"),
+    "modes": (False, ("NX", "NJ"), "states by modes,"),
+    "mode_step": (False, ("3", "NJ"), "in a sample by the mode before, itself, and the mode behind,"),
+    "mode_by_w": (False, ("NW", "NJ"), "by the disturbance states,"),
+    "Q_modes": (False, ("NJ", "NJ"), "and what a sample adds to their covariance"),
 }
 
 
@@ -142,6 +148,7 @@ class Sizes:
     NK: int  # what the model's ``prepare``, ``hold`` and ``partials`` hand over
     NF: int
     NM: int
+    NJ: int  # modes in which a linear plant's covariance is kept: as many as states, or 0
     LEAN: int  # whether soft rows are so many that the broken ones are eliminated
 
     @property
@@ -161,10 +168,10 @@ class Sizes:
 
     def shape(self, name: str) -> tuple[int, ...]:
         """Return the shape of a field, as NumPy has it."""
-        return tuple(getattr(self, size) for size in _FIELDS[name][1])
+        return tuple(int(size) if size.isdigit() else getattr(self, size) for size in _FIELDS[name][1])
 
 
-def sizes_of(controller: ControllerParts, code: ModelCode, *, room: bool) -> Sizes:
+def sizes_of(controller: ControllerParts, code: ModelCode, *, room: bool, single: bool = False) -> Sizes:
     """Return the sizes of a controller; with ``room``, such that its variants in a search fit too."""
     model, design = controller.model, controller.design
     N, n_y = sum(design.blocks), model.n_y
@@ -192,8 +199,24 @@ def sizes_of(controller: ControllerParts, code: ModelCode, *, room: bool) -> Siz
         NK=code.n_k,
         NF=code.n_h,
         NM=code.n_m,
+        NJ=0 if filter_modes(controller, single=single) is None else model.n_x,
         LEAN=int(N * (len(design.controlled) + len(design.limits)) >= 4 * len(design.blocks) * model.n_u),
     )
+
+
+def filter_modes(controller: ControllerParts, *, single: bool = False) -> Modes | None:
+    """Return the modes in which the C keeps P, where there are any; ``single`` numbers have no digits to
+    spare for that, and derivatives of a plant that does not settle are asked for in its states."""
+    if single or not controller.disturbance.n_w or not _settles(controller.model):
+        return None
+    return modes_of(controller.model, tuple(controller.observer.unit.tolist()))
+
+
+def _settles(model: PredictionModel) -> bool:
+    """Return whether a plant is linear, and has a steady state."""
+    if model.affine is None:
+        return False
+    return bool(np.linalg.cond(np.eye(model.n_x) - model.affine[0]) < _INTEGRATES)
 
 
 def _whole(n: int) -> int:
@@ -255,7 +278,7 @@ def initialiser(sizes: Sizes, numbers: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
+def numbers_of(controller: ControllerParts, k: Array, *, single: bool = False) -> dict[str, Any]:
     """Return every number of the table for a controller; ``k`` is what ``prepare`` gave."""
     model, design, optimiser = controller.model, controller.design, controller.optimiser
     observer, disturbance, loops = controller.observer, controller.disturbance, design.loops
@@ -308,6 +331,26 @@ def numbers_of(controller: ControllerParts, k: Array) -> dict[str, Any]:
         "P_rest": rest.P,
         **_free_response(model, design, rows),
         **_settled(model, disturbance),
+        **_of_modes(model, controller, filter_modes(controller, single=single)),
+    }
+
+
+def _of_modes(model: PredictionModel, controller: ControllerParts, modes: Modes | None) -> dict[str, Any]:
+    """Return what the filter's covariance needs of a plant in modes."""
+    disturbance, observer = controller.disturbance, controller.observer
+    if modes is None or model.affine is None:
+        shapes = {"modes": (model.n_x, 0), "mode_step": (3, 0), "mode_by_w": (disturbance.n_w, 0)}
+        nothing = {name: np.zeros(shape) for name, shape in (shapes | {"Q_modes": (0, 0)}).items()}
+        return {"H": model.C} | nothing
+    _, B, E, _ = model.affine
+    by_w = B @ (disturbance.on_drive * model.span[:, None]) + E @ disturbance.on_disturbance
+    return {
+        "P_rest": modes.into(observer.rest_in_room().P),
+        "H": model.C @ modes.states,
+        "modes": modes.states,
+        "mode_step": modes.step,
+        "mode_by_w": (modes.inverse @ by_w).T,
+        "Q_modes": modes.into(np.diag(observer.Q[: model.n_x])),
     }
 
 
@@ -329,12 +372,10 @@ def _settled(model: PredictionModel, disturbance: DisturbanceModel) -> dict[str,
     """Return the outputs of a linear plant at rest by drives, disturbances and disturbance states."""
     sides = model.n_u + model.n_d + disturbance.n_w
     nothing = {"settles": False, "settled_by": np.zeros((model.n_y, sides)), "settled": np.zeros(model.n_y)}
-    if model.affine is None:
+    if model.affine is None or not _settles(model):
         return nothing
     A, B, E, added = model.affine
     away, by_share = np.eye(model.n_x) - A, B * model.span
-    if not np.linalg.cond(away) < _INTEGRATES:
-        return nothing
     by_w = by_share @ disturbance.on_drive + E @ disturbance.on_disturbance
     by = model.C @ np.linalg.solve(away, np.column_stack([by_share, E, by_w, added]))
     level = by[:, -1] + model.output(np.zeros(model.n_x))

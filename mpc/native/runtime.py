@@ -29,7 +29,14 @@ from numpy.typing import NDArray
 from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.estimator.observer import Observer
 from thermogrip.mpc.native.codegen import ModelCode, write_model
-from thermogrip.mpc.native.design_struct import Sizes, as_structure, config_header, numbers_of, sizes_of
+from thermogrip.mpc.native.design_struct import (
+    Sizes,
+    as_structure,
+    config_header,
+    filter_modes,
+    numbers_of,
+    sizes_of,
+)
 from thermogrip.mpc.optimiser.rti import Optimiser, Outcome, Sample
 
 if TYPE_CHECKING:
@@ -194,6 +201,7 @@ class CompiledController:
         self.design = as_structure(self.sizes, numbers_of(controller, k[: step.n_k]))
         if ctypes.sizeof(self.design) != self.library.tg_host_design_size():
             raise RuntimeError("the C struct and its table disagree")
+        self.modes = filter_modes(controller)
         self.advice = ""  # of the last step
         self._room = np.zeros(self.library.tg_host_size() // 8 + 8)
         self.state = ctypes.c_void_p(self._room.ctypes.data)
@@ -209,7 +217,9 @@ class CompiledController:
         given = np.ascontiguousarray(y, float), np.ascontiguousarray(d, float)
         self.library.tg_host_reset(self.state, address(given[0]), address(given[1]))
         if like is not None:
-            for name, values in like.estimate().items():
+            estimate = like.estimate()
+            estimate["P"] = self.kept(estimate["P"])
+            for name, values in estimate.items():
                 self.view(name, values.shape)[...] = values
 
     def step(
@@ -238,9 +248,18 @@ class CompiledController:
         self.advice = self.library.tg_advice_text(int(what[2])).decode()
         return drive, int(what[0]), int(what[1])
 
+    def kept(self, P: Array) -> Array:
+        """Return the filter's covariance (n_z, n_z) of states, modes or not, as the C keeps it."""
+        return P if self.modes is None else self.modes.into(P)
+
+    def covariance(self) -> Array:
+        """Return the filter's covariance (n_z, n_z) of states."""
+        P = self.view("P", (self.sizes.NZ, self.sizes.NZ)).copy()
+        return P if self.modes is None else self.modes.out_of(P)
+
     def view(self, name: str, shape: tuple[int, ...]) -> NDArray[Any]:
-        """Return an array that shares memory with a part of the state: ``x``, ``w``, ``P``,
-        ``found_offset``, ``innovation``, ``between`` or ``held``."""
+        """Return an array that shares memory with a part of the state: ``x``, ``w``, ``P``
+        (see :meth:`kept`), ``found_offset``, ``innovation``, ``between`` or ``held``."""
         pointer = getattr(self.library, f"tg_host_{name}")(self.state)
         return np.ctypeslib.as_array(pointer, shape=shape)
 
@@ -353,7 +372,7 @@ class CompiledObserver(Observer):
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name in self.__dict__.get("_views", ()):
-            self._views[name][...] = value
+            self._views[name][...] = self._c.kept(value) if name == "_P" else value
         else:
             object.__setattr__(self, name, value)
 
@@ -361,6 +380,8 @@ class CompiledObserver(Observer):
         views = self.__dict__.get("_views", {})
         if name not in views:
             raise AttributeError(name)
+        if name == "_P":
+            return self._c.covariance()
         return views[name] if name == "_held" else views[name].copy()
 
     def _on_sample(self) -> None:

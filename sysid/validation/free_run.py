@@ -14,7 +14,9 @@ Beside the free run stand
 
 The residual is tested twice (:mod:`thermogrip.sysid.validation.residual_tests`): is it white, and does it
 correlate with an input beyond the effect of an unknown start, uncertain parameters and slow noise? Only the
-latter leads to the note that a term may be missing, for at most one right model in a hundred.
+latter leads to the note that a term may be missing, for at most one right model in a hundred. Whether that
+matters is another question: the verdict goes by how large the error is beside the stated one
+(:mod:`thermogrip.sysid.validation.verdict`).
 
 After a gap of more than 10 s the input is unknown: the run starts afresh from its own warm-up, the next 60
 s are not scored, and the figure with the last row held through the gap is given with it.
@@ -23,7 +25,7 @@ s are not scored, and the figure with the last row held through the gap is given
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -43,6 +45,7 @@ from thermogrip.sysid.validation.residual_tests import (
     cross_correlation,
     residual_correlations,
 )
+from thermogrip.sysid.validation.verdict import EXCEEDS, NO_BETTER, Verdict, judge
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -52,9 +55,7 @@ if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation.prediction_bands import Band
 
-EXCEEDS = 2.0  # times the error of the fit, from which that is reported
 START = 0.1  # share of the squared error due to the start, from which that is reported
-NO_BETTER = 0.8  # of the no-input error: a free run above it has not shown that the input matters
 
 
 @dataclass(frozen=True)
@@ -88,10 +89,14 @@ class FreeRun:
     warmup: float  # seconds whose readings set the state
     plant: Plant  # what was run
     measured: Log  # over what, in the plant's units
+    verdict: Verdict | None = None  # on the plant; None without ``tests``
+    stated: Band | None = None  # the 90 % band, where it is known already
 
     def band(self, level: float = 0.9) -> Band:
         """Return the band about the run that a new run's readings should lie in, and how many of these do;
         see :func:`thermogrip.sysid.validation.prediction_bands.free_run_band`."""
+        if self.stated is not None and level == self.stated.level:
+            return self.stated
         from thermogrip.sysid.validation.prediction_bands import free_run_band  # scipy.special
 
         return free_run_band(self.plant, self.measured, self.log, level=level, warmup=self.warmup)
@@ -184,23 +189,41 @@ def free_run(
     # means over the fit's own blocks: an error as slow as the log correlates with no input, but shows here
     blocks = _blocks_of_fit(plant, rows.time)
     beyond = _beyond_fit(plant, residual, _beside(plant, rows, run, scored, blocks).outputs if blocks else {})
-    gain = _gain_note(plant, log, rows.y - np.where(scored[:, None], run, np.nan), units) if tests else []
+    verdict, band, gain = None, None, list[str]()
+    if tests:
+        from thermogrip.sysid.validation.prediction_bands import free_run_band  # scipy.special
+
+        miss = rows.y - np.where(scored[:, None], run, np.nan)
+        off, gain = _gain(plant, log, miss, units)
+        band = free_run_band(plant, log, simulated, warmup=warmup)
+        readings = _beside(plant, rows, run, scored, None).outputs
+        tested = replace(fit_logs([log])[0], start_s=float(rows.time[np.argmax(scored)]))
+        verdict = judge(
+            band,
+            {name: score(*pair).rmse for name, pair in readings.items()},
+            residual.start,
+            {name: no_input[name].rmse for name in plant.outputs},
+            no_better=no_better,
+            gain=off,
+            seen=bool(said_of_fit(plant.fitted_to, tested)),
+        )
     outside = _outside(plant, {name: column(log, name) for name in plant.valid if name in log})
     unseen = [name for name in outside if name not in plant.outputs]
     notes = (
         *said_of_fit(plant.fitted_to, *fit_logs([log])),
         *converted,
-        *_notes(float(rows.time[0]), found, held, no_better),
-        *_residual_notes(whiteness, residual, units, warmup, unseen),
-        *_excess_notes(plant, beyond, units),
+        *_notes(float(rows.time[0]), found, held, () if _no_test(verdict) else no_better),
+        *_residual_notes(whiteness, residual, units, warmup, unseen, verdict),
+        *_excess_notes(plant, beyond, units, verdict),
         *gain,
         *_outside_notes(plant, outside),
+        *([] if verdict is None else [str(verdict)]),
     )
     exceeds_fit = {name: here / there for name, (here, there) in beyond.items()}
     naive = {"mean": mean, "no_input": no_input}
     return FreeRun(
         simulated, scores, one, naive, held, whiteness, left, residual, exceeds_fit, no_better, notes, warmup,
-        plant, log,
+        plant, log, verdict, band,
     )  # fmt: skip
 
 
@@ -297,14 +320,17 @@ def _residual_notes(
     units: Mapping[str, str],
     warmup: float,
     unseen: list[str],
+    verdict: Verdict | None = None,
 ) -> list[str]:
     """Return notes on the residuals of each output."""
-    notes = []
+    notes, small = [], _small(verdict)
     for name, own in whiteness.items():
         if not own.independent:
             notes.append(f"{name}: residuals are not white; intervals from their variance are narrow")
         significant = {s: f for s, f in residual.tests.get(name, {}).items() if f.significant}
-        notes += [_correlation_note(name, *item, units[name], unseen) for item in significant.items()]
+        notes += [
+            _correlation_note(name, *item, units[name], unseen, small=small) for item in significant.items()
+        ]
         share = residual.start.get(name, 0.0)
         if share > START and not significant:
             notes.append(
@@ -314,8 +340,20 @@ def _residual_notes(
     return notes
 
 
-def _correlation_note(name: str, signal: str, found: CorrelationTest, unit: str, unseen: list[str]) -> str:
-    """Return with what the residual of an output correlates, by how much, and what that may mean."""
+def _no_test(verdict: Verdict | None) -> bool:
+    return verdict is not None and verdict.standing == "no test"
+
+
+def _small(verdict: Verdict | None) -> bool:
+    """Return whether a run is known to err by no more than was stated."""
+    return verdict is not None and verdict.standing != "changed"
+
+
+def _correlation_note(
+    name: str, signal: str, found: CorrelationTest, unit: str, unseen: list[str], *, small: bool = False
+) -> str:
+    """Return with what the residual of an output correlates, by how much, and what that may mean; ``small``:
+    of an error that is no larger than was stated."""
     if signal.endswith(SQUARED):
         curved = "a loss that curves (radiation, free convection)" if unit == "degC" else "a term that curves"
         what, lacks = f"the square of {name}", curved
@@ -323,6 +361,8 @@ def _correlation_note(name: str, signal: str, found: CorrelationTest, unit: str,
         what, lacks = signal, "a delay, lag or term"
     size = f"{found.size:.2g} {unit}".removesuffix(" 1")
     why = f"{lacks} is missing, or the plant is not what it was in the fit"
+    if small:
+        why = f"{lacks} is missing, within the error that was stated"
     if unseen:
         why = f"the fit has not seen {', '.join(unseen)} as here, so this need not be a term that is missing"
     return f"{name}: the residual correlates with {what} (rms {size}, p = {found.p:.1g}): {why}"
@@ -349,28 +389,32 @@ def _beyond_fit(
 
 
 def _excess_notes(
-    plant: Plant, beyond: Mapping[str, tuple[float, float]], units: Mapping[str, str]
+    plant: Plant,
+    beyond: Mapping[str, tuple[float, float]],
+    units: Mapping[str, str],
+    verdict: Verdict | None = None,
 ) -> list[str]:
     """Return by how much outputs exceed the error of the fit."""
+    why = "or the plant is not quite what it was in the fit"
+    why = "within the error that was stated" if _small(verdict) else why
     return [
         f"{name}: means over {plant.scores.average_s:g} s err by {here:.2g} {units[name]}, and "
-        f"by {there:.2g} {units[name]} in the fit: slow terms are missing, or the plant is not quite what it "
-        "was in the fit"
+        f"by {there:.2g} {units[name]} in the fit: slow terms are missing, {why}"
         for name, (here, there) in beyond.items()
     ]
 
 
-def _gain_note(plant: Plant, log: Log, miss: Array, units: Mapping[str, str]) -> list[str]:
-    """Return what a gain that is not that of the fit explains, where it is most of the error."""
+def _gain(plant: Plant, log: Log, miss: Array, units: Mapping[str, str]) -> tuple[float | None, list[str]]:
+    """Return a gain that is not that of the fit, where it is most of the error, and what it explains."""
     from thermogrip.sysid.validation.prediction_bands import gain_of_run  # scipy.special
 
     found = gain_of_run(plant, miss, log)
     if found is None:
-        return []
+        return None, []
     gain, left = found
     sizes = ", ".join(f"{name} {rms:.2g} {units[name]}" for name, rms in zip(plant.outputs, left))
     how = f"{100 * abs(gain):.0f} % {'more' if gain > 0 else 'less'}"
-    return [
+    return gain, [
         f"most of the error is one gain: inputs that do {how} than in the fit would leave {sizes}; another "
         "supply, or another cooling? Identify with this log as well"
     ]

@@ -27,6 +27,7 @@ from thermogrip.sysid.models.network_spec import builtin_networks
 from thermogrip.sysid.plant.log_grid import roles_of
 from thermogrip.sysid.validation.free_run import Score
 from thermogrip.sysid.validation.prediction_bands import Band
+from thermogrip.sysid.validation.verdict import Standing, Verdict
 
 BOARD = plant_from_prior(load_network("tclab"))
 DYNAMICS = plant_dynamics(BOARD, inputs={"q1": 30.0, "q2": 10.0}, draws=9)
@@ -320,6 +321,7 @@ def test_a_plant_is_scored_log_by_log_beside_its_baselines(bench: Bench, stand_i
         naive={"no_input": score(0.3), "mean": score(0.4)},
         residual=SimpleNamespace(to_json=lambda: {"minutes": 1.0}), notes=("a note",),
         band=lambda: Band(0.9, {}, {"t_tank": 0.875, "t_lost": np.nan}, 12, "its errors", {"t_tank": 0.3}),
+        verdict=Verdict("as stated", {"t_tank": 0.33}),
     )  # fmt: skip
     runs = stand_in("thermogrip.sysid.validation.free_run.free_run", run)
     sections = stand_in("thermogrip.report.plant.free_run_section", "a section")
@@ -352,6 +354,7 @@ def test_a_plant_is_scored_log_by_log_beside_its_baselines(bench: Bench, stand_i
 
     one = {"log": "good@:100", "outputs": table(0.1), "one_step": table(0.2), "left": {"minutes": 1.0},
            "naive": {"no_input": table(0.3), "mean": table(0.4)}, "notes": ["a note"],
+           "verdict": {"standing": "as stated", "over_stated": {"t_tank": 0.33}, "gain": None},
            "band": {"level": 0.9, "coverage": {"t_tank": 0.875, "t_lost": None}, "own_error": "its errors",
                     "expected_rmse": {"t_tank": 0.3}, "draws": 12}}  # fmt: skip
     repairs = {"good@:100": ["taken from the start to 100 s"], "good@100:200": ["taken from 100 s to 200 s"]}
@@ -360,9 +363,66 @@ def test_a_plant_is_scored_log_by_log_beside_its_baselines(bench: Bench, stand_i
     assert [(call.warmup, call.score_from, call.average) for call in runs[2:]] == [(5.0, 5.0, None)] * 2
 
 
+@pytest.mark.parametrize(
+    ("standings", "then"),
+    [
+        (("as stated",), "tune plant.json --out controller.json"),
+        (("as stated", "changed"), "identify LOG_OF_FIT good.csv good.csv@100:200 --out both.json"),
+        (("weak", "as stated"), "identify LOG_OF_FIT good.csv good.csv@100:200 --out both.json"),
+        (("no test", "seen"), "excite --kind optimal --minutes 20 --plant plant.json --out schedule.csv"),
+        (("seen", "as stated"), "tune plant.json --out controller.json"),
+        (("seen",), "validate plant.json LOG"),
+    ],
+)
+def test_what_comes_after_validate_follows_from_what_it_found(
+    bench: Bench, stand_in: StandIn, standings: tuple[Standing, ...], then: str
+) -> None:
+    found = iter(standings)
+
+    def run(*_args: Any, **_options: Any) -> SimpleNamespace:
+        return SimpleNamespace(notes=(), band=lambda: None, verdict=Verdict(next(found), {"t": 1.0}))
+
+    stand_in("thermogrip.sysid.validation.free_run.free_run", run)
+    stand_in("thermogrip.report.plant.band_words", "a band")
+    stand_in("thermogrip.report.plant.run_table", ((), ()))
+    stand_in("thermogrip.cli.identify.run_answer", {})
+    logs = ["good.csv", "good.csv@100:200"][: len(standings)]
+    done = bench.run("validate", "plant.json", *logs)
+    assert done.code == 0, done
+    assert done.err.endswith(f"next: thermogrip {then}\n")
+
+
+@pytest.mark.parametrize(
+    ("standing", "then"),
+    [
+        ("as stated", "identify LOG_OF_FIT good.csv --out both.json"),
+        ("seen", "excite --kind optimal --minutes 20 --plant plant.json --out schedule.csv"),
+    ],
+)
+def test_a_plant_that_is_not_good_is_identified_anew_whatever_a_run_says(
+    bench: Bench, stand_in: StandIn, standing: Standing, then: str
+) -> None:
+    run = SimpleNamespace(notes=(), band=lambda: None, verdict=Verdict(standing, {"t": 1.0}))
+    stand_in("thermogrip.sysid.validation.free_run.free_run", run)
+    stand_in("thermogrip.report.plant.band_words", "a band")
+    stand_in("thermogrip.report.plant.run_table", ((), ()))
+    stand_in("thermogrip.cli.identify.run_answer", {})
+    file = bench.path / "plant.json"
+    content = json.loads(file.read_text(encoding="utf-8"))
+    file.write_text(
+        json.dumps(content | {"verdict": "arx na 2; not good: 0.9 of no input"}), encoding="utf-8"
+    )
+    done = bench.run("validate", "plant.json", "good.csv")
+    assert "plant.json: identify did not call it good" in words_of(done.out)
+    assert done.err.endswith(f"next: thermogrip {then}\n")
+
+
 def test_a_warm_up_shorter_than_that_of_the_fit_is_told(bench: Bench, stand_in: StandIn) -> None:
     stand_in("thermogrip.sysid.identification.warm_up_of_fit", 50.0)
-    stand_in("thermogrip.sysid.validation.free_run.free_run", SimpleNamespace(notes=(), band=lambda: None))
+    stand_in(
+        "thermogrip.sysid.validation.free_run.free_run",
+        SimpleNamespace(notes=(), band=lambda: None, verdict=None),
+    )
     stand_in("thermogrip.report.plant.band_words", "a band")
     stand_in("thermogrip.report.plant.run_table", ((), ()))
     stand_in("thermogrip.cli.identify.run_answer", {})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -22,6 +23,7 @@ from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.validation.free_run import FreeRun, free_run
 from thermogrip.sysid.validation.prediction_bands import Band
 from thermogrip.sysid.validation.residual_tests import CorrelationTest, ResidualCorrelations
+from thermogrip.sysid.validation.verdict import Verdict
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +43,9 @@ def test_a_good_free_run_is_green(run: tuple[Plant, Log, FreeRun]) -> None:
     section = free_run_section(found)
     assert section.tone == "good"
     assert section.verdict.startswith("Free run (RMSE): t to 0.0")
-    assert section.verdict.endswith(" degC.")
+    assert re.search(
+        r" degC\. It errs as was stated \(times the stated error: t [\d.]+\)\.$", section.verdict
+    )
     bare = replace(found, scores={name: replace(s, unit="1") for name, s in found.scores.items()})
     assert free_run_section(bare).verdict == section.verdict.replace(" degC", "")
 
@@ -50,7 +54,7 @@ def test_one_that_errs_more_than_its_fit_is_not_green_and_says_by_how_much(
     run: tuple[Plant, Log, FreeRun],
 ) -> None:
     _, _, found = run
-    section = free_run_section(replace(found, exceeds_fit={"t": 3.14}))
+    section = free_run_section(replace(found, exceeds_fit={"t": 3.14}, verdict=None))
     assert section.tone == "warn"
     assert "Above the error of the fit: t 3.1 times." in section.verdict
 
@@ -67,9 +71,15 @@ def test_one_whose_residual_follows_something_is_not_green_and_says_what(
 ) -> None:
     _, _, found = run
     follows = CorrelationTest(p=1e-6, size=0.02, significant=True)
-    section = free_run_section(replace(found, residual=ResidualCorrelations({"t": {signal: follows}}, {})))
+    alike = replace(found, residual=ResidualCorrelations({"t": {signal: follows}}, {}))
+    section = free_run_section(replace(alike, verdict=None))
     assert section.tone == "warn"
     assert words in section.verdict
+    small = free_run_section(alike)  # as small as was stated
+    assert small.tone == "good"
+    assert words in small.verdict
+    for standing, tone in (("seen", "good"), ("changed", "warn"), ("weak", "warn"), ("no test", "warn")):
+        assert free_run_section(replace(alike, verdict=Verdict(standing, {"t": 1.0}))).tone == tone
 
 
 def test_the_prior_of_a_network_stands_beside_what_was_learnt_and_a_black_box_has_none(

@@ -81,6 +81,7 @@ typedef struct {
     double x[TG_NX], w[TG_SOME(TG_NW)];
     double shown[TG_NG], lag[TG_NG];   /* of each controlled output: what it showed a sample before x, its lag [s], */
     double scale[TG_NG], start[TG_NG]; /* by what share it moves more than the model since the start, the model there */
+    /* P and jacobian are of modes in place of x, where the design has TG_NJ of them */
     double P[TG_Z * TG_Z], found_offset[TG_NY], innovation[TG_NY], lasting[TG_NY];
     int held[TG_Z];
     double into_s, share, noised;      /* seconds since x; of a sample: time of the estimate, and the noise in P */

@@ -213,7 +213,7 @@ static void pass(const tg_around *a, tg_truth *plant, int t, const double *drive
 
 /* A closed loop of n samples against a plant that is not the model.
  *
- * observed: the estimate that the observer starts from: x, w, shown, lag, scale, P, found_offset and start,
+ * observed: the estimate that the observer starts from: x, w, shown, lag, scale, P as it is kept, found_offset and start,
  * one behind the other; told: whether the controller is told of the drives before; target: n rows of n_c.
  * Into y: n per_sample + 1 rows of TG_NY, without noise and quantum; reading: n rows of TG_NY + TG_ND;
  * drive: n rows of TG_NU; status: n.

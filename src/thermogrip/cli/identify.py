@@ -426,7 +426,17 @@ def validate(
             console.say(f"{log.attrs['name']}: {note}")
     answers = [run_answer(log.attrs["name"], run, band) for log, run, band in zip(logs, runs, bands)]
     console.answer({"logs": answers, "repairs": repairs})
-    return 0
+    found: set[str] = {run.verdict.standing for run in runs if run.verdict is not None}
+    if "; not good: " in loaded.verdict and found & {"as stated", "seen"}:
+        console.say(
+            f"{plant.name}: identify did not call it good, and a run as was stated does not change that"
+        )
+        found = found - {"as stated"} | {"weak"} if "as stated" in found else {"no test"}
+    return cli.Done(next((each for each in _URGENT if each in found), ""))
+
+
+#: Of verdicts on several logs, which one says what comes next.
+_URGENT = ("changed", "weak", "as stated", "no test", "seen")
 
 
 def run_answer(name: str, run: FreeRun, band: Band) -> dict[str, Any]:
@@ -444,6 +454,7 @@ def run_answer(name: str, run: FreeRun, band: Band) -> dict[str, Any]:
             "own_error": band.own_error,
             "draws": band.draws,
         },
+        "verdict": run.verdict,
         "notes": run.notes,
     }
 

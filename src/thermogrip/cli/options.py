@@ -27,6 +27,18 @@ ANSWER_IS_NO = 3
 SHOWN_REPAIRS = 5
 
 
+class Done(int):
+    """Exit status 0 of a verb, and ``what`` it found, by which the command that comes next is chosen."""
+
+    what: str
+
+    def __new__(cls, what: str) -> Done:
+        """Make one."""
+        made = super().__new__(cls, 0)
+        made.what = what
+        return made
+
+
 def check_controller(path: str) -> None:
     """Look through a controller before what its model needs is loaded."""
     from thermogrip.datasets.limits import STEP_RANGE, number_within

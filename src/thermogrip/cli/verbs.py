@@ -83,15 +83,16 @@ class Verb(TyperCommand):
         if not code and not ctx.params.get("as_json"):
             sys.stdout.flush()
             given = {name: value for name, value in ctx.params.items() if value}
-            sys.stderr.write(f"next: thermogrip {self.next(given, ctx.meta[TYPED])}\n")
+            found = getattr(code, "what", "")
+            sys.stderr.write(f"next: thermogrip {self.next(given, ctx.meta[TYPED], found)}\n")
         return code
 
-    def next(self, given: dict[str, Any], typed: Sequence[str] = ()) -> str:
-        """Return the command that comes next, with what was given in place of its names: what was typed once
-        more where that wrote no file for it."""
+    def next(self, given: dict[str, Any], typed: Sequence[str] = (), found: str = "") -> str:
+        """Return the command that comes next after what the verb ``found``, with what was given in place of
+        its names: what was typed once more where that wrote no file for it."""
         words = {str(param.name): str(param.metavar).split("|")[0].rstrip(".") for param in self.params}
         what = given.get("what", "")
-        then = self.then if isinstance(self.then, str) else self.then[what or "network"]
+        then = self.then if isinstance(self.then, str) else self.then[found or what or next(iter(self.then))]
         if what == "examples":
             words["out"] = "."
         elif typed and "{out}" in then and "out" not in given:

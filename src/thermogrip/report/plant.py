@@ -385,6 +385,8 @@ def free_run_section(
     if run.exceeds_fit:
         times = ", ".join(f"{output} {ratio:.1f} times" for output, ratio in run.exceeds_fit.items())
         verdict += f" Above the error of the fit: {times}."
+    if run.verdict is not None:
+        verdict += f" It {run.verdict}."
     follows, outputs = _followed(run), tuple(run.scores)
     if follows:
         verdict += f" Residual correlation: {'; '.join(follows)}."
@@ -406,11 +408,13 @@ def free_run_section(
             "a line below reports the inputs with which they correlate.",
         ),
     ]
-    parts += [Text(_sentence(note)) for note in run.notes]
+    parts += [Text(_sentence(note)) for note in run.notes if note != str(run.verdict)]
     title = title or f"Free run: {name}" + (" (in the fit)" if seen else "")
-    return Section(
-        title, tuple(parts), verdict, "warn" if run.no_better or run.exceeds_fit or follows else "good"
-    )
+    if run.verdict is None:
+        doubtful = bool(run.no_better or run.exceeds_fit or follows)
+    else:
+        doubtful = bool(run.no_better) or run.verdict.standing not in ("as stated", "seen")
+    return Section(title, tuple(parts), verdict, "warn" if doubtful else "good")
 
 
 def _followed(run: FreeRun) -> list[str]:
