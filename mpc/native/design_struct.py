@@ -140,7 +140,7 @@ class Sizes:
     NH: int
     NC: int
     NL: int
-    NJ: int  # moves, where travel has a price
+    NP: int  # moves, where travel has a price
     NE: int  # numbers in the rows of the response
     NR: int  # targets of all samples, where some may only ramp
     NT: int  # changes of the price in a day
@@ -191,7 +191,7 @@ def sizes_of(controller: ControllerParts, code: ModelCode, *, room: bool, single
         NH=most,
         NC=controlled,
         NL=limited,
-        NJ=moves,
+        NP=moves,
         NE=(controlled + limited) * entries + moves * longest,
         NR=most * controlled if design.ramp_per_s else 0,
         NT=len(design.tariff),
@@ -430,7 +430,7 @@ def _controller_parts(s: Sizes, number: Any) -> list[tuple[Any, int]]:
         (whole, s.NC + 3),
         (qp, 1),
         (number, max(1, s.NR)),
-        *((number, count) for count in (max(1, s.NE), s.NH * s.NY, s.NH * s.NY, s.NH * some + s.NJ)),
+        *((number, count) for count in (max(1, s.NE), s.NH * s.NY, s.NH * s.NY, s.NH * some + s.NP)),
         *((number, count) for count in (2 * s.NX * wide, s.NU * wide, max(1, s.ND) * wide)),
         *((number, count) for count in (4 * max(1, s.NF), s.NM, z * z, z * z)),
     ]
@@ -438,7 +438,7 @@ def _controller_parts(s: Sizes, number: Any) -> list[tuple[Any, int]]:
 
 def _qp_parts(s: Sizes, number: Any) -> list[tuple[Any, int]]:
     whole, small = ctypes.c_int, ctypes.c_byte
-    n, soft = s.NB * s.NU, s.NH * s.NS + s.NJ
+    n, soft = s.NB * s.NU, s.NH * s.NS + s.NP
     rows, w = 2 * n + soft, _whole(n)
     kept = 4 * n + 8 if s.LEAN else rows
     return [

@@ -116,7 +116,7 @@ typedef struct {
     double path[TG_SOME(TG_NR)]; /* in place of goals, where targets may only ramp */
     double G[TG_SOME(TG_NE)]; /* the response: the soft rows of the program, sample by sample */
     double y_guess[TG_NH * TG_NY], y_try[TG_NH * TG_NY];
-    double free[TG_NH * TG_SOME(TG_NS) + TG_NJ];
+    double free[TG_NH * TG_SOME(TG_NS) + TG_NP];
     double seed[2 * TG_NX * TG_WIDE], seed_u[TG_NU * TG_WIDE], seed_d[TG_SOME(TG_ND) * TG_WIDE];
     double by_drives[4 * TG_SOME(TG_NF)]; /* what the drives of four blocks fix in the model's step */
     double partials[TG_SOME(TG_NM)], jacobian[TG_Z * TG_Z], spare[TG_Z * TG_Z];

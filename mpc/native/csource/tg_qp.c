@@ -43,6 +43,7 @@
 #define CONVEX 1e-6
 #define REACHED 1e-6
 #define REFINEMENTS 8
+#define LOOSER(changes) ((double)(1 << (changes) / 50)) /* or rows that a rounding breaks take turns for ever */
 #else
 #define LARGEST 1.7e308 /* number that is finite */
 #define TOLERANCE 1e-10 /* of a row, in units of its own length */
@@ -52,6 +53,7 @@
 #define CONVEX 1e-14    /* of H_ii, that a pivot is at least */
 #define REACHED 1e-13   /* of the largest multiplier: what ends by less beyond its bound is on it */
 #define REFINEMENTS 1
+#define LOOSER(changes) 1.0
 #endif
 
 static double *fit_row(tg_qp *q, int i) { return q->fit + (size_t)i * (size_t)(i + 1) / 2; }
@@ -792,7 +794,7 @@ static int go(tg_qp *q, int *upward)
 /* Find the row that is broken most; 0 where none is. */
 static int worst(tg_qp *q, int *row, int *side)
 {
-    double most_broken = TOLERANCE, *value = q->wanted;
+    double most_broken = TOLERANCE * LOOSER(q->iterations), *value = q->wanted;
     int found = 0, n = q->n;
     for (int j = 0; j < n; j++) {
         value[j] = q->x[j];

@@ -14,7 +14,7 @@
 
 #define TG_CURVED 0.01 /* square of a move beside the move, in the price of travel */
 #define TG_Q_N (TG_NB * TG_NU)
-#define TG_Q_S (TG_NH * TG_NS + TG_NJ)
+#define TG_Q_S (TG_NH * TG_NS + TG_NP)
 #define TG_Q_M (2 * TG_Q_N + TG_Q_S)
 
 /* Rows are stored in whole groups of four numbers, zeros behind their last, and worked through four at a time. */
