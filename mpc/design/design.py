@@ -451,10 +451,9 @@ def default_design(
         "loops": pair_loops(plant, controlled),
         "noise": ObserverNoise(
             # what is learnt sooner than a delay shows it is noise
-            drive=min(
-                ObserverNoise.drive * min(1.0, min(ratios) / _MOST_DELAY) ** 1.5,
-                _BLACK_BOX_DRIFT if plant.scores.structure else np.inf,
-            ),
+            drive=_BLACK_BOX_DRIFT
+            if plant.scores.structure
+            else ObserverNoise.drive * min(1.0, min(ratios) / _MOST_DELAY) ** 1.5,
             output=_OUTPUT_DRIFT / dt**0.5,
             lag=float(np.clip(_SHORT * dt / max([*delays, 1e-3 * dt]), 1.0, _MOST_LAG) * ObserverNoise.lag),
         ),
