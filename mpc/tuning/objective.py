@@ -410,8 +410,6 @@ LQR_PARAMETERS = (
     ("output_walk", 2e-4, 2e-2),
 )
 
-#: SIMC's PI by itself: it is not told what drive holds a target.
-_SIMC = {"Kc": 1.0, "Ti": 1.0, "setpoint": 1.0, "feedforward": 0.0}
 #: What a design that prices travel is searched by: of the error that a spec allows, what moves no drive.
 STILL = ("still", 0.003, 0.6)
 _CHECK_FROM = 100  # draws of the comparison, apart from those of the search
@@ -562,10 +560,17 @@ class Search:
         """Return what the PI by SIMC moves, on the search's draws and on those of the comparison."""
         if not self.spec.moves_limit:
             return {}
-        unseen = self._results("PI", _SIMC, [(self.unseen, self.check_seed, True)], whole=False)
-        return moves_of(unseen) | moves_of(
-            self._results("PI", _SIMC, [(self.draws, self.seed, True)], whole=True)
-        )
+        draws = sorted({*self.unseen, *self.draws})
+        found = run_parallel(self._by_simc, draws, self.workers, what="moves of a PI")
+        return moves_of([result for results in found for result in results])
+
+    def _by_simc(self, draw: int) -> list[StepResult]:
+        """Return the results on a draw of SIMC's PI by itself, at the rate at which readings come; it is not
+        told what drive holds a target."""
+        self._know([draw])
+        loops = tuple(replace(loop, feedforward=0.0) for loop in self.baseline.loops)
+        made = PIController.of(self.plant, replace(self.baseline, dt=self.plant.dt), loops)
+        return run_trials(made, self.plant, self.whole_spec, [draw], seed=self.check_seed)
 
     def _settled(self) -> list[float]:
         """Return when the default design has settled on the slowest draw [s], by step; inf where never."""
