@@ -18,7 +18,8 @@ A loop must never be left without an answer, so every failure has a next best on
 * ``off``: no reading to act on, or the pump is off; the drive goes to zero;
 * ``mismatch``: the optimiser's move, as for a plant that is known not to be the model
   (:mod:`thermogrip.mpc.estimator.structure_monitor`; in Python alone), or to be slower, or that is not where
-  its plan said long ago (:mod:`thermogrip.mpc.estimator.arrival`; in Python alone).
+  its plan said long ago (:mod:`thermogrip.mpc.estimator.arrival`; in Python alone), or that swings about its
+  target (:mod:`thermogrip.mpc.estimator.oscillation`; in Python alone).
 
 Where drives act later than the model has it (:mod:`thermogrip.mpc.estimator.late_drives`; in Python alone),
 the estimate runs on what acts, and the plan begins where a move of now begins to act.
@@ -56,6 +57,7 @@ from thermogrip.mpc.design.design import DAY, SCHEMA, VERSION, Design, check_des
 from thermogrip.mpc.estimator.arrival import ArrivalMonitor
 from thermogrip.mpc.estimator.call_times import RESTART_S, SAME, opening, shifted
 from thermogrip.mpc.estimator.late_drives import MOST, LateDriveMonitor, LateDrives
+from thermogrip.mpc.estimator.oscillation import OscillationMonitor
 from thermogrip.mpc.estimator.reading_checks import ReadingMonitor, follows, is_off, too_weak
 from thermogrip.mpc.estimator.structure_monitor import StructureMonitor
 from thermogrip.mpc.interface import Move, Readings, Trajectory
@@ -139,6 +141,8 @@ class Controller(Shown, SampledController):
         self.drives = LateDrives(self.model.n_u, longest=MOST * self.dt)
         most = 2.0 * design.overshoot  # half of what may be overshot is what plans keep to
         self.arrival = ArrivalMonitor.of(self.controlled, self.dt, most, self.observer.R[self._rows])
+        allowed = [most] * len(self.controlled)
+        self.swings = OscillationMonitor(self.controlled, self.dt, self.lateness.delays, allowed)
         self.reach = Reach(self.optimiser, self.observer)
         self.last_iterations = 0  # of the program, in the last step
         self._waits = 0.0  # seconds until an on/off drive may go over, where it is to
@@ -351,7 +355,9 @@ class Controller(Shown, SampledController):
         self._ahead = self._trajectory(target)
         if self.design.ramp_per_s:
             wanted = self._ramp(wanted)
-        u, status, advice = self._decide(wanted, started)
+        zone = self.optimiser.zone.tolist()
+        swings = self.swings.note(self._y[self._rows], wanted, self.times.waited_s, zone)
+        u, status, advice = self._decide(wanted, started, swings)
         if status not in ("ok", "mismatch", "late"):
             self.arrival.restart()  # no plan is followed, or none arrives
         if status == "ok":  # what happened in this sample, before what has been so for long
@@ -388,6 +394,7 @@ class Controller(Shown, SampledController):
         self.drives.begin(self._u)
         self.reach.forget()
         self.arrival.restart()
+        self.swings.restart()
         self.optimiser.forget()
 
     def _pass(self, seconds: float, applied: Array) -> None:
@@ -474,8 +481,9 @@ class Controller(Shown, SampledController):
         """Return what of a plan (N, n_u) to apply until the next call."""
         return opening(plan, self._slew_s / self.dt)
 
-    def _decide(self, wanted: Array, started: float) -> tuple[Array, str, str]:
-        """Return the drives, the status and the advice: optimiser, else plan, else PI, else off."""
+    def _decide(self, wanted: Array, started: float, swings: str) -> tuple[Array, str, str]:
+        """Return the drives, the status and the advice: optimiser, else plan, else PI, else off; ``swings``
+        is which output swings."""
         if not np.isfinite(wanted).all():
             return self._safe, "off", f"no target yet: {self._away}"
         if (self._unread_s > 0).all():
@@ -530,8 +538,8 @@ class Controller(Shown, SampledController):
             return u, "fallback_plan", self._unseen(parked)
         lags = self.monitor.slower(self.observer)
         doubt = self.lateness.said or self.structure.said or ("" if self.structure.denies else lags)
-        if overdue and not doubt:
-            doubt = "; ".join(filter(None, (overdue, follows(self.observer, self.controlled))))
+        if (swings or overdue) and not doubt:
+            doubt = "; ".join(filter(None, (swings or overdue, follows(self.observer, self.controlled))))
         if doubt:
             return u, "mismatch", doubt
         said = follows(self.observer, self.controlled)
