@@ -42,6 +42,7 @@ _SHORTEST = 6.0  # samples, of a period
 _LONGEST = 5.0  # ultimate periods, of a half swing
 _NOISE = 3.0  # standard deviations of a reading that are no swing
 _READINGS = 30  # of which the noise is the mean
+_SPIKE = 10.0  # variances, as much as one value may show
 
 
 class _Half(NamedTuple):
@@ -59,7 +60,7 @@ class Oscillation:
     >>> signal = Oscillation(shortest=6.0, longest=100.0, allowed=0.3)
     >>> found = [signal.note(sin(0.2 * k), 1.0) for k in range(120)]
     >>> sum(found) > 0, round(signal.amplitude), round(signal.period)
-    (True, 1, 29)
+    (True, 1, 31)
     """
 
     def __init__(self, shortest: float, longest: float, allowed: float) -> None:
@@ -87,7 +88,8 @@ class Oscillation:
     def period(self) -> float:
         """Of the last swings [s]."""
         halves = self._counted()[-_SWINGS:]
-        return 2.0 * (halves[-1].end - halves[0].begin) / len(halves) if halves else inf
+        n = len(halves)
+        return 2.0 * (halves[-1].begin - halves[0].begin) / (n - 1) if n > 1 else inf
 
     @property
     def amplitude(self) -> float:
@@ -106,7 +108,7 @@ class Oscillation:
         self._note_noise(error if value is None else value)
         side = float(error > 0) - float(error < 0) or self._open.side
         if side != self._open.side:
-            self._close(side)
+            self._close(side, self.now - seconds)
         half = self._open
         self._open = half._replace(iae=half.iae + abs(error) * seconds, end=self.now)
         counted = self._counted()
@@ -119,14 +121,16 @@ class Oscillation:
             self._seen = min(self._seen + 1, _READINGS)
             a, b, c, d = self._last
             fourth = a - 4.0 * b + 6.0 * c - 4.0 * d + value
-            self._variance += (fourth * fourth / 70.0 - self._variance) / self._seen
+            known = self._seen == _READINGS
+            most = max(known * _SPIKE * self._variance, self._allowed * self._allowed)
+            self._variance += (min(fourth * fourth / 70.0, most) - self._variance) / self._seen
         self._last = (*self._last[-3:], value)
 
-    def _close(self, side: float) -> None:
+    def _close(self, side: float, begin: float) -> None:
         """Keep the half swing that ends where it counts, and begin one on this side."""
         self._halves = self._counted()[-_SWINGS:]
         self._arrived = self._arrived or self._open.side != 0.0
-        self._open = _Half(side, 0.0, self.now, self.now)
+        self._open = _Half(side, 0.0, begin, begin)
 
     def _counted(self) -> list[_Half]:
         """Return the half swings until now, the open one too where it counts already; two on one side, which
@@ -142,8 +146,9 @@ class Oscillation:
         return [*self._halves, half]
 
     def _swings(self) -> bool:
-        last = self._counted()[-_SWINGS:]
-        return len(last) == _SWINGS and last[-1].iae >= _LEFT * last[0].iae
+        """Return whether it swings: by the half swing that is open, or before it."""
+        both = self._counted()[-_SWINGS:], self._halves[-_SWINGS:]
+        return any(len(last) == _SWINGS and last[-1].iae >= _LEFT * last[0].iae for last in both)
 
 
 class OscillationMonitor:
