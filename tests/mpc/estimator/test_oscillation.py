@@ -88,7 +88,7 @@ def test_a_monitor_says_which_output_begins_anew_with_a_target_and_knows_of_zone
     )
     assert play(None, 40) == ""
     assert play([0.0, 0.8], 999) == ""
-    assert play([0.0, 0.3], 999).startswith("b swings about its target by 0.7")
+    assert play([0.0, 0.3], 999).startswith("b swings about its target by 0.56 ")
 
 
 def test_a_relay_with_hysteresis_swings():
