@@ -17,9 +17,10 @@ A loop must never be left without an answer, so every failure has a next best on
   feed-forward: the drive that is taken over has it);
 * ``off``: no reading to act on, or the pump is off; the drive goes to zero;
 * ``mismatch``: the optimiser's move, as for a plant that is known not to be the model
-  (:mod:`thermogrip.mpc.estimator.structure_monitor`; in Python alone), or to be slower, or that is not where
-  its plan said long ago (:mod:`thermogrip.mpc.estimator.arrival`; in Python alone), or that swings about its
-  target (:mod:`thermogrip.mpc.estimator.oscillation`; in Python alone).
+  (:mod:`thermogrip.mpc.estimator.structure_monitor`; in Python alone), or to be slower; whose output is not
+  where its plan said long ago (:mod:`thermogrip.mpc.estimator.arrival`), or swings about its target
+  (:mod:`thermogrip.mpc.estimator.oscillation`), both in Python alone; or is off its target while a drive's
+  bias exceeds 30 % of its range.
 
 Where drives act later than the model has it (:mod:`thermogrip.mpc.estimator.late_drives`; in Python alone),
 the estimate runs on what acts, and the plan begins where a move of now begins to act.
@@ -356,8 +357,8 @@ class Controller(Shown, SampledController):
         if self.design.ramp_per_s:
             wanted = self._ramp(wanted)
         zone = self.optimiser.zone.tolist()
-        swings = self.swings.note(self._y[self._rows], wanted, self.times.waited_s, zone)
-        u, status, advice = self._decide(wanted, started, swings)
+        self._swings = self.swings.note(self._y[self._rows], wanted, self.times.waited_s, zone)
+        u, status, advice = self._decide(wanted, started)
         if status not in ("ok", "mismatch", "late"):
             self.arrival.restart()  # no plan is followed, or none arrives
         if status == "ok":  # what happened in this sample, before what has been so for long
@@ -394,7 +395,8 @@ class Controller(Shown, SampledController):
         self.drives.begin(self._u)
         self.reach.forget()
         self.arrival.restart()
-        self.swings.restart()
+        self.swings.forget()
+        self._swings = ""  # which output swings
         self.optimiser.forget()
 
     def _pass(self, seconds: float, applied: Array) -> None:
@@ -481,9 +483,8 @@ class Controller(Shown, SampledController):
         """Return what of a plan (N, n_u) to apply until the next call."""
         return opening(plan, self._slew_s / self.dt)
 
-    def _decide(self, wanted: Array, started: float, swings: str) -> tuple[Array, str, str]:
-        """Return the drives, the status and the advice: optimiser, else plan, else PI, else off; ``swings``
-        is which output swings."""
+    def _decide(self, wanted: Array, started: float) -> tuple[Array, str, str]:
+        """Return the drives, the status and the advice: optimiser, else plan, else PI, else off."""
         if not np.isfinite(wanted).all():
             return self._safe, "off", f"no target yet: {self._away}"
         if (self._unread_s > 0).all():
@@ -538,11 +539,11 @@ class Controller(Shown, SampledController):
             return u, "fallback_plan", self._unseen(parked)
         lags = self.monitor.slower(self.observer)
         doubt = self.lateness.said or self.structure.said or ("" if self.structure.denies else lags)
-        if (swings or overdue) and not doubt:
-            doubt = "; ".join(filter(None, (swings or overdue, follows(self.observer, self.controlled))))
-        if doubt:
-            return u, "mismatch", doubt
         said = follows(self.observer, self.controlled)
+        if not doubt and (self._swings or overdue):
+            doubt = "; ".join(filter(None, (self._swings or overdue, said)))
+        if doubt or (self.arrival.away and too_weak(self.observer)):
+            return u, "mismatch", doubt or said
         if self._waits and not said:
             said = f"{', '.join(self.design.on_off)} may go over in {self._waits:.0f} s"
         return u, "ok", said

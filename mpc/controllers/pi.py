@@ -154,7 +154,7 @@ class PIController(SampledController):
             )
         self.times.reset()
         if self._said is not None:
-            self._said.restart()
+            self._said.forget()
 
     @property
     def said(self) -> LoopStatus:

@@ -46,6 +46,7 @@ class ArrivalMonitor:
         self._due = np.full(len(self.names), np.inf)  # seconds until an output is overdue
         self._late = np.zeros(len(self.names))  # seconds since it should have been there
         self._stayed = np.zeros(len(self.names), dtype=int)  # samples in a row that it was near
+        self.away = False  # whether an output is not near
 
     def note(self, y: Array, target: Array, ahead: Array, seconds: float, zone: Array) -> str:
         """Note readings y and targets (n,), and the plan's outputs ``ahead`` (N, n), so many seconds after
@@ -71,7 +72,8 @@ class ArrivalMonitor:
         begins = np.isfinite(promised) & (off > self.near) & np.isinf(self._due)
         self._due = np.where(begins, _LATE * promised + _SLACK * self.dt, self._due)
         self._late = np.where(begins, -promised, self._late)
-        overdue = (self._due < 0) & (off > self.near) & (np.abs(error) - zone > self.near)
+        away = (off > self.near) & (np.abs(error) - zone > self.near)
+        self.away, overdue = bool(away.any()), (self._due < 0) & away
         if not overdue.any():
             return ""
         k = int(np.argmax(np.where(overdue, off / self.near, 0.0)))

@@ -92,10 +92,14 @@ class LoopStatus:
         self.arrival = ArrivalMonitor(outputs, dt, np.full(n, allowed))
         self.restart()
 
+    def forget(self) -> None:
+        """Begin anew, as with other readings."""
+        self.swings.forget()
+        self.restart()
+
     def restart(self) -> None:
-        """Begin anew."""
+        """Begin anew, as towards a new target."""
         n = len(self.drives)
-        self.swings.restart()
         self.arrival.restart()
         self._target = np.full(n, np.nan)
         self._error = np.full(n, np.nan)  # mean of the last errors

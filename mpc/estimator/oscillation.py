@@ -65,6 +65,10 @@ class Oscillation:
 
     def __init__(self, shortest: float, longest: float, allowed: float) -> None:
         self._shortest, self._longest, self._allowed = shortest, longest, allowed
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew, as with other readings."""
         self._last: tuple[float, ...] = ()  # four values
         self._variance, self._seen = 0.0, 0
         self.restart()
@@ -168,9 +172,11 @@ class OscillationMonitor:
         """Amplitudes (n,) from which on swings count."""
         return np.array([signal.least for signal in self._signals])
 
-    def restart(self) -> None:
-        """Begin anew."""
+    def forget(self) -> None:
+        """Begin anew, as with other readings."""
         self._target = []
+        for signal in self._signals:
+            signal.forget()
 
     def note(self, y: Array, target: Array, seconds: float, zone: Sequence[float] | None = None) -> str:
         """Note readings y and targets (n,), so many seconds after the last; return which output swings."""
