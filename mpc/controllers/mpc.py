@@ -19,8 +19,8 @@ A loop must never be left without an answer, so every failure has a next best on
 * ``mismatch``: the optimiser's move, as for a plant that is known not to be the model
   (:mod:`thermogrip.mpc.estimator.structure_monitor`; in Python alone), or to be slower; whose output is not
   where its plan said long ago (:mod:`thermogrip.mpc.estimator.arrival`), or swings about its target
-  (:mod:`thermogrip.mpc.estimator.oscillation`), both in Python alone; or is off its target while a drive's
-  bias exceeds 30 % of its range.
+  (:mod:`thermogrip.mpc.estimator.oscillation`); or goes away from its target while the bias of a drive
+  exceeds 30 % of its range.
 
 Where drives act later than the model has it (:mod:`thermogrip.mpc.estimator.late_drives`; in Python alone),
 the estimate runs on what acts, and the plan begins where a move of now begins to act.
@@ -542,7 +542,7 @@ class Controller(Shown, SampledController):
         said = follows(self.observer, self.controlled)
         if not doubt and (self._swings or overdue):
             doubt = "; ".join(filter(None, (self._swings or overdue, said)))
-        if doubt or (self.arrival.away and too_weak(self.observer)):
+        if doubt or (self.arrival.recedes and too_weak(self.observer)):
             return u, "mismatch", doubt or said
         if self._waits and not said:
             said = f"{', '.join(self.design.on_off)} may go over in {self._waits:.0f} s"

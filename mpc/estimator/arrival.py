@@ -46,7 +46,8 @@ class ArrivalMonitor:
         self._due = np.full(len(self.names), np.inf)  # seconds until an output is overdue
         self._late = np.zeros(len(self.names))  # seconds since it should have been there
         self._stayed = np.zeros(len(self.names), dtype=int)  # samples in a row that it was near
-        self.away = False  # whether an output is not near
+        self._nearest = np.full(len(self.names), np.inf)  # how far off it was at least
+        self.recedes = False  # whether an output has been nearer to its target by more than what is near
 
     def note(self, y: Array, target: Array, ahead: Array, seconds: float, zone: Array) -> str:
         """Note readings y and targets (n,), and the plan's outputs ``ahead`` (N, n), so many seconds after
@@ -73,7 +74,9 @@ class ArrivalMonitor:
         self._due = np.where(begins, _LATE * promised + _SLACK * self.dt, self._due)
         self._late = np.where(begins, -promised, self._late)
         away = (off > self.near) & (np.abs(error) - zone > self.near)
-        self.away, overdue = bool(away.any()), (self._due < 0) & away
+        overdue = away & (self._due < 0)
+        self._nearest = np.fmin(self._nearest, np.maximum(off, 0.0))
+        self.recedes = bool(np.any(away & (off > self._nearest + self.near)))
         if not overdue.any():
             return ""
         k = int(np.argmax(np.where(overdue, off / self.near, 0.0)))

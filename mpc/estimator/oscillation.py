@@ -155,6 +155,11 @@ class Oscillation:
         return any(len(last) == _SWINGS and last[-1].iae >= _LEFT * last[0].iae for last in both)
 
 
+def longest_half_swings(delays: Sequence[float], dt: float) -> list[float]:
+    """Return how long half swings of outputs may last whose apparent ``delays`` these are [s]."""
+    return [_LONGEST * 4.0 * max(delay, 2.0 * dt) for delay in delays]
+
+
 class OscillationMonitor:
     """Controlled outputs, ``names``, whose loops have apparent ``delays`` [s] and may be ``allowed`` (n,) off
     their targets."""
@@ -163,7 +168,7 @@ class OscillationMonitor:
         self, names: Sequence[str], dt: float, delays: Sequence[float], allowed: Sequence[float]
     ) -> None:
         self.names = tuple(names)
-        longest = [_LONGEST * 4.0 * max(delay, 2.0 * dt) for delay in delays]
+        longest = longest_half_swings(delays, dt)
         self._signals = [Oscillation(_SHORTEST * dt, *both) for both in zip(longest, allowed, strict=True)]
         self._target: list[float] = []
 

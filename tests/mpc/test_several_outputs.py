@@ -123,8 +123,7 @@ def test_there_is_no_offset_as_long_as_the_drives_are_inside_their_limits(power)
     moves, seen = run(controller, truth, 15.0, 1200.0)
     assert 0 < max(moves[-1].drive.values()) < 99
     np.testing.assert_allclose(seen[-100:].mean(axis=0), 15.0, atol=0.02)
-    assert moves[-1].status == "ok"
-    assert ("mismatch" in {move.status for move in moves}) == (power < 0.6)  # on the way, when the bias shows
+    assert {move.status for move in moves} == {"ok"}
     assert ("h1, h2 do not follow the drive" in moves[-1].advice) == (power < 0.6)
 
 
