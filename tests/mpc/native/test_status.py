@@ -1,0 +1,69 @@
+"""The C's own arrivals and swings, beside Python's, sample by sample."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.mpc.makers import InC, heater
+from thermogrip.mpc.controllers.mpc import Controller
+
+DT, TARGET = 5.0, 40.0
+
+
+def swinging(amplitude: float, period: float) -> np.ndarray:
+    t = DT * np.arange(150)
+    rng = np.random.default_rng(0)
+    approach = np.linspace(25.0, 39.5, 12)
+    swing = TARGET + amplitude * np.sin(2 * np.pi * t / period) + 0.03 * rng.standard_normal(len(t))
+    swing[[40, 41, 77]] = np.nan
+    return np.concatenate([approach, swing])
+
+
+READINGS = {
+    "swings": swinging(0.6, 60.0),
+    "swings fast": swinging(1.0, 33.0),
+    "rings within what is allowed": swinging(0.2, 60.0),
+    "stays away": np.concatenate(
+        [np.linspace(25.0, 37.0, 12), np.full(150, 37.0) + 0.01 * np.arange(150) % 2]
+    ),
+    "is lost on the way and comes": np.concatenate(
+        [np.linspace(25.0, 30.0, 6), np.full(40, np.nan), np.linspace(30.0, 40.0, 10), np.full(60, 40.0)]
+    ),
+}
+
+
+# towards the target that comes at the end nothing moves
+EXPECTED = {
+    "swings": {"swings"},
+    "swings fast": {"swings", "should"},
+    "rings within what is allowed": {"should"},
+}
+
+
+def of(plain: Controller) -> Controller:
+    """Return the controller without what C does not look for."""
+    made = Controller(plain.plant, plain.design)
+    made.lateness.note = lambda *_: False  # type: ignore[method-assign]
+    return made
+
+
+@pytest.mark.parametrize("what", READINGS)
+@pytest.mark.parametrize("changes", [{}, {"zones": {"t": 0.6}}, {"ramp_per_s": {"t": 0.1}}], ids=str)
+def test_c_says_when_python_does(what: str, changes: dict[str, dict[str, float]]):
+    plain = heater(deadline_s=1e9, **changes)
+    ours, theirs = of(plain), InC(plain.plant, plain.design)
+    statuses, seen = [], set[str]()
+    for k, t in enumerate(READINGS[what].tolist()):
+        target = TARGET if k < 140 else TARGET + 1.0
+        if not k:
+            ours.reset({"t": t})
+            theirs.reset({"t": t})
+        both = [one.step({"t": t, "time_s": DT * k}, target) for one in (ours, theirs)]
+        statuses.append(tuple(move.status for move in both))
+        for word in ("swings about its target", "should have been at"):
+            assert (word in both[0].advice) == (word in both[1].advice), (k, both)
+            seen |= {word[:6]} if word in both[0].advice else set()
+    assert all(one == two for one, two in statuses), [(k, s) for k, s in enumerate(statuses) if s[0] != s[1]]
+    if not changes:
+        assert seen == EXPECTED.get(what, set())
