@@ -193,7 +193,7 @@ class OscillationMonitor:
         said, most = "", 0.0
         for i, (signal, value, goal) in enumerate(zip(self._signals, y.tolist(), goals)):
             error = value - goal
-            if zone is not None and zone[i] > 0:
+            if zone is not None and zone[i] > 0 and isfinite(error):
                 error = max(0.0, abs(error) - zone[i]) * (1.0 if error > 0 else -1.0)
             if signal.note(error, seconds, value) and signal.amplitude / signal.least > most:
                 most = signal.amplitude / signal.least

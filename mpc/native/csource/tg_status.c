@@ -110,9 +110,9 @@ static void note_noise(const tg_controller *c, tg_swing *q, double value)
     double *v = q->last;
     if (q->n_last == 4) {
         double fourth = v[0] - 4.0 * v[1] + 6.0 * v[2] - 4.0 * v[3] + value, most = allowed(c) * allowed(c);
+        q->seen = q->seen < NOISE_OF ? q->seen + 1 : NOISE_OF;
         if (q->seen == NOISE_OF)
             most = fmax(SPIKE * q->variance, most);
-        q->seen = q->seen < NOISE_OF ? q->seen + 1 : NOISE_OF;
         q->variance += (fmin(fourth * fourth / 70.0, most) - q->variance) / q->seen;
         memmove(v, v + 1, 3 * sizeof *v);
         q->n_last = 3;
@@ -179,7 +179,7 @@ double tg_swings(tg_controller *c)
             q->arrived = q->n = 0;
             memset(&q->open, 0, sizeof q->open);
         }
-        if (s->zone[r] > 0.0)
+        if (s->zone[r] > 0.0 && isfinite(error))
             error = (error > 0.0 ? 1.0 : -1.0) * fmax(0.0, fabs(error) - s->zone[r]);
         by = note(c, q, error, value, s->longest[r], &period);
         if (by > most) {
