@@ -844,6 +844,8 @@ static void decide(tg_controller *c, tg_move *move)
         move->status = TG_MISMATCH;
         move->advice = period > 0.0 ? TG_SWINGS_ABOUT : TG_OVERDUE;
         move->over = period > 0.0 ? period : overdue;
+        if (!(period > 0.0) && does_not_follow(c)) /* what may be the cause */
+            move->advice = s->switched ? TG_PUMP : TG_NOT_FOLLOWING;
     } else if (does_not_follow(c)) {
         move->status = c->recedes && is_too_weak(c) ? TG_MISMATCH : TG_OK;
         move->advice = s->switched ? TG_PUMP : TG_NOT_FOLLOWING;
