@@ -26,8 +26,8 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.controllers.base import SampledController
+from thermogrip.mpc.controllers.loop_status import LoopStatus
 from thermogrip.mpc.design.design import Design, PILoop, default_controlled, pair_loops
-from thermogrip.mpc.estimator.loop_status import LoopStatus
 from thermogrip.mpc.interface import Move, Readings, Trajectory
 from thermogrip.mpc.plant.prediction import ROOM, PredictionModel, holding_drive, prediction_model
 

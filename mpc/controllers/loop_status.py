@@ -26,12 +26,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from thermogrip.datasets.arrays import Array, Mask
+from thermogrip.mpc.design.design import PILoop
 from thermogrip.mpc.estimator.arrival import ArrivalMonitor
 from thermogrip.mpc.estimator.oscillation import OscillationMonitor
 from thermogrip.mpc.plant.prediction import PredictionModel, step_response
 
 if TYPE_CHECKING:
-    from thermogrip.mpc.design.design import PILoop
     from thermogrip.sysid.plant.plant import Plant
 
 _CONSTANTS = 4.0  # time constants until a loop is there

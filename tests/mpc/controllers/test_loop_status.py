@@ -10,9 +10,9 @@ import pytest
 from tests.mpc.makers import make_tank, network_plant
 from thermogrip.mpc import simulate_closed_loop
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Surroundings
+from thermogrip.mpc.controllers.loop_status import LoopStatus, settling_time
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import PILoop, default_design
-from thermogrip.mpc.estimator.loop_status import LoopStatus, settling_time
 from thermogrip.mpc.plant.prediction import PredictionModel
 from thermogrip.sysid.plant.plant import Plant
 
