@@ -34,12 +34,7 @@ READINGS = {
 }
 
 
-# towards the target that comes at the end nothing moves
-EXPECTED = {
-    "swings fast": {"swings about", "should have been"},
-    "swings in as much noise": {"swings about", "should have been"},
-    "rings within what is allowed": {"should have been"},
-}
+SWINGS = ("swings fast", "swings in as much noise")  # of what swings slowly a lag is told before
 
 
 def of(plain: Controller) -> Controller:
@@ -71,4 +66,5 @@ def test_c_says_when_python_does(what: str, changes: dict[str, dict[str, float]]
         seen |= {word for word in ("swings about", "should have been") if word in says}
     assert all(one == two for one, two in statuses), [(k, s) for k, s in enumerate(statuses) if s[0] != s[1]]
     if not changes:
-        assert seen == EXPECTED.get(what, set())
+        assert ("swings about" in seen) == (what in SWINGS)
+        assert what not in SWINGS or "should have been" in seen  # nothing moves towards the last target
