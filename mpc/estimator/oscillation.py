@@ -8,11 +8,11 @@ error
 and the mean error 2 a / pi.  After Haegglund [1]_ a half swing counts whose IAE exceeds that of the least
 amplitude at the shortest period: 6 samples.  The least amplitude is what the output may overshoot, or
 three standard deviations of the noise of its readings.  Besides, the mean error must be that of this
-amplitude, for a slow stray has IAE enough, and a half swing of more than 5 ultimate periods is none:
-Haegglund's supervision time, 10 half swings in 50 periods.  The ultimate period of a loop with an apparent
-delay L (2 samples at least) is 4 L.  A loop swings where six half swings, side by turns, follow each other
-with less than a period of quiet between, of which the last has half the IAE of the first at least: the
-damping ratio is below 0.044.
+amplitude, for a slow stray has IAE enough, and a half swing of more than 2.5 ultimate periods is none: a
+loop swings with one of these by its delay, and with some by its integral, and what takes longer is a load.
+The ultimate period of a loop with an apparent delay L (2 samples at least) is 4 L.  A loop swings where six
+half swings, side by turns, follow each other with less than a period of quiet between, of which the last has
+half the IAE of the first at least: the damping ratio is below 0.044.
 
 * One load, or a step, rings out sooner: the approach to a new target does not count.
 * Noise is read off fourth differences of readings, whose variance is 70 times that of white noise, as if of
@@ -39,7 +39,7 @@ from thermogrip.datasets.arrays import Array
 _SWINGS = 6  # half swings in a row
 _LEFT = 0.5  # of the IAE of the first, that the last must have
 _SHORTEST = 6.0  # samples, of a period
-_LONGEST = 5.0  # ultimate periods, of a half swing
+_LONGEST = 2.5  # ultimate periods, of a half swing
 _NOISE = 3.0  # standard deviations of a reading that are no swing
 _READINGS = 30  # of which the noise is the mean
 _SPIKE = 10.0  # variances, as much as one value may show
