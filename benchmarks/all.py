@@ -73,6 +73,7 @@ ALL = [
     Benchmark(
         "control/ten_plants.py", "--keep {out}/ten", "--plants tclab --without do-mpc --keep {out}/ten"
     ),
+    Benchmark("control/swings.py", "--keep {out}/ten", "--keep {out}/ten --plants tclab --samples 300"),
     Benchmark("control/late.py", "--keep {out}/ten", "--keep {out}/ten --plants tclab --times 1,2"),
     Benchmark(
         "control/other_desks.py",

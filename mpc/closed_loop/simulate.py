@@ -55,6 +55,7 @@ class Surroundings:
     held: tuple[str, ...] = ()
     # measured disturbances by name; where absent, what the plant has where nobody reads them
     disturbances: dict[str, float] = field(default_factory=dict)
+    play: float = 0.0  # share of its range by which every drive moves before what it drives follows
 
     def noises_of(self, names: tuple[str, ...]) -> Array:
         """Return the standard deviation of a reading of each of these sensors (n,) [degC]."""
@@ -201,6 +202,7 @@ class Truth:
             by_drive = (after[1:] - after[0]).T / (0.01 * native.span)
             found = native.neutral + np.linalg.lstsq(by_drive, self.x - after[0], rcond=None)[0]
             self.before = np.clip(found, native.lowest, native.highest)
+        self.stem = self.before  # what follows the drives
         self.y = [native.output(self.x) + self.offset]
         self.time = 0.0
 
@@ -227,11 +229,21 @@ class Truth:
         self.moves.append(np.array(move.drives(self.model.drives), dtype=float))
         at = np.arange(first, first + self.sub) // self.sub
         u = np.stack([self.moves[k] if k >= 0 else rest for k in at])
+        if self.around.play:
+            u = self._behind_play(u)
         y, x = self.model.run(self.x[None, :], (rest + self.around.drive_share * (u - rest))[None], self.d)
         self.x = x[0]
         for row in y[0, 1:] + self.offset:
             self.y.append(row if self.sees == 1 else self.y[-1] + self.sees * (row - self.y[-1]))
         self.time += self.dt
+
+    def _behind_play(self, u: Array) -> Array:
+        """Return what follows drives u (n, n_u), step by step."""
+        half, follows = 0.5 * self.around.play * self.model.span, []
+        for row in u:
+            self.stem = np.clip(self.stem, row - half, row + half)
+            follows.append(self.stem)
+        return np.stack(follows)
 
 
 def record_loop(

@@ -42,10 +42,14 @@ def compiled_loop(
 ) -> ClosedLoop:
     """Run a compiled controller (else a ValueError) as :func:`simulate_closed_loop` does, with the same
     arguments, against a plant of the same signals whose equations and step may be others; the record has no
-    advices and no step times.  PI loops, which go to one target, run in Python where a reading is absurd."""
+    advices and no step times.  PI loops, which go to one target, run in Python where a reading is absurd, and
+    all do where drives have play."""
     if controller.c is None:
         raise ValueError("the controller is not compiled")
     around = Surroundings() if surroundings is None else surroundings
+    about: dict[str, Any] = {"start": start, "surroundings": around, "band": band, "seed": seed}
+    if around.play:
+        return simulate_closed_loop(controller, plant, schedule, **about)
     truth = Truth(plant, controller.dt, around, start, seed)
     begun, controlled = truth.reading(), tuple(controller.controlled)
     controller.reset(begun | truth.begun())
@@ -56,8 +60,7 @@ def compiled_loop(
     if isinstance(controller, Controller):
         _run_mpc(controller.c, controller, run, target, told=truth.known)
     elif len(schedule) > 1 or not _run_pi(controller.c, controller, run, target[0], begun):
-        loop = simulate_closed_loop
-        return loop(controller, plant, schedule, start=start, surroundings=around, band=band, seed=seed)
+        return simulate_closed_loop(controller, plant, schedule, **about)
     names = (*truth.model.outputs, *truth.model.disturbances)
     readings = [dict(zip(names, row)) for row in run.reading.tolist()]
     targets = [dict(zip(controlled, row)) for row in target.tolist()]

@@ -17,8 +17,10 @@ A loop must never be left without an answer, so every failure has a next best on
   feed-forward: the drive that is taken over has it);
 * ``off``: no reading to act on, or the pump is off; the drive goes to zero;
 * ``mismatch``: the optimiser's move, as for a plant that is known not to be the model
-  (:mod:`thermogrip.mpc.estimator.structure_monitor`; in Python alone), or to be slower, or that is not where
-  its plan said long ago (:mod:`thermogrip.mpc.estimator.arrival`; in Python alone).
+  (:mod:`thermogrip.mpc.estimator.structure_monitor`; in Python alone), or to be slower; whose output is not
+  where its plan said long ago (:mod:`thermogrip.mpc.estimator.arrival`), or swings about its target
+  (:mod:`thermogrip.mpc.estimator.oscillation`); or goes away from its target while the bias of a drive
+  exceeds 30 % of its range.
 
 Where drives act later than the model has it (:mod:`thermogrip.mpc.estimator.late_drives`; in Python alone),
 the estimate runs on what acts, and the plan begins where a move of now begins to act.
@@ -56,6 +58,7 @@ from thermogrip.mpc.design.design import DAY, SCHEMA, VERSION, Design, check_des
 from thermogrip.mpc.estimator.arrival import ArrivalMonitor
 from thermogrip.mpc.estimator.call_times import RESTART_S, SAME, opening, shifted
 from thermogrip.mpc.estimator.late_drives import MOST, LateDriveMonitor, LateDrives
+from thermogrip.mpc.estimator.oscillation import OscillationMonitor
 from thermogrip.mpc.estimator.reading_checks import ReadingMonitor, follows, is_off, too_weak
 from thermogrip.mpc.estimator.structure_monitor import StructureMonitor
 from thermogrip.mpc.interface import Move, Readings, Trajectory
@@ -139,6 +142,8 @@ class Controller(Shown, SampledController):
         self.drives = LateDrives(self.model.n_u, longest=MOST * self.dt)
         most = 2.0 * design.overshoot  # half of what may be overshot is what plans keep to
         self.arrival = ArrivalMonitor.of(self.controlled, self.dt, most, self.observer.R[self._rows])
+        allowed = [most] * len(self.controlled)
+        self.swings = OscillationMonitor(self.controlled, self.dt, self.lateness.delays, allowed)
         self.reach = Reach(self.optimiser, self.observer)
         self.last_iterations = 0  # of the program, in the last step
         self._waits = 0.0  # seconds until an on/off drive may go over, where it is to
@@ -351,6 +356,8 @@ class Controller(Shown, SampledController):
         self._ahead = self._trajectory(target)
         if self.design.ramp_per_s:
             wanted = self._ramp(wanted)
+        zone = self.optimiser.zone.tolist()
+        self._swings = self.swings.note(self._y[self._rows], wanted, self.times.waited_s, zone)
         u, status, advice = self._decide(wanted, started)
         if status not in ("ok", "mismatch", "late"):
             self.arrival.restart()  # no plan is followed, or none arrives
@@ -388,6 +395,8 @@ class Controller(Shown, SampledController):
         self.drives.begin(self._u)
         self.reach.forget()
         self.arrival.restart()
+        self.swings.forget()
+        self._swings = ""  # which output swings
         self.optimiser.forget()
 
     def _pass(self, seconds: float, applied: Array) -> None:
@@ -530,11 +539,11 @@ class Controller(Shown, SampledController):
             return u, "fallback_plan", self._unseen(parked)
         lags = self.monitor.slower(self.observer)
         doubt = self.lateness.said or self.structure.said or ("" if self.structure.denies else lags)
-        if overdue and not doubt:
-            doubt = "; ".join(filter(None, (overdue, follows(self.observer, self.controlled))))
-        if doubt:
-            return u, "mismatch", doubt
         said = follows(self.observer, self.controlled)
+        if not doubt and (self._swings or overdue):
+            doubt = "; ".join(filter(None, (self._swings or overdue, said)))
+        if doubt or (self.arrival.recedes and too_weak(self.observer)):
+            return u, "mismatch", doubt or said
         if self._waits and not said:
             said = f"{', '.join(self.design.on_off)} may go over in {self._waits:.0f} s"
         return u, "ok", said

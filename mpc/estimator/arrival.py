@@ -31,7 +31,7 @@ class ArrivalMonitor:
     how far from a target an output is there."""
 
     def __init__(self, names: Sequence[str], dt: float, near: Array) -> None:
-        self.names, self.dt, self._near = tuple(names), dt, near
+        self.names, self.dt, self.near = tuple(names), dt, near
         self.restart()
 
     @classmethod
@@ -46,10 +46,19 @@ class ArrivalMonitor:
         self._due = np.full(len(self.names), np.inf)  # seconds until an output is overdue
         self._late = np.zeros(len(self.names))  # seconds since it should have been there
         self._stayed = np.zeros(len(self.names), dtype=int)  # samples in a row that it was near
+        self._nearest = np.full(len(self.names), np.inf)  # how far off it was at least
+        self.recedes = False  # whether an output has been nearer to its target by more than what is near
 
     def note(self, y: Array, target: Array, ahead: Array, seconds: float, zone: Array) -> str:
         """Note readings y and targets (n,), and the plan's outputs ``ahead`` (N, n), so many seconds after
         the last; return which output is overdue."""
+        arrives = np.abs(ahead - target) - zone <= self.near
+        promised = np.where(arrives.any(axis=0), self.dt * (1.0 + np.argmax(arrives, axis=0)), np.inf)
+        return self.expect(y, target, promised, np.full(len(y), seconds), zone)
+
+    def expect(self, y: Array, target: Array, promised: Array, seconds: Array, zone: Array) -> str:
+        """Note readings y and targets (n,) where outputs are promised in so many seconds (n,), inf where not,
+        ``seconds`` (n,) that count having passed since the last; return which output is overdue."""
         if np.any(target != self._target):
             self.restart()
             self._target = target.copy()
@@ -57,19 +66,20 @@ class ArrivalMonitor:
         begun = np.where(np.isfinite(self._error), self._error, error)
         self._error = np.where(np.isfinite(error), begun + _REMEMBER * (error - begun), begun)
         off = np.abs(self._error) - zone
-        self._stayed = np.where(off <= self._near, self._stayed + 1, 0)
+        self._stayed = np.where(off <= self.near, self._stayed + 1, 0)
         there = self._stayed >= _SAMPLES
         self._due = np.where(there, np.inf, self._due - seconds)
         self._late = np.where(there, 0.0, self._late + seconds)
-        arrives = np.abs(ahead - target) - zone <= self._near
-        promised = self.dt * (1.0 + np.argmax(arrives, axis=0))
-        begins = arrives.any(axis=0) & (off > self._near) & np.isinf(self._due)
+        begins = np.isfinite(promised) & (off > self.near) & np.isinf(self._due)
         self._due = np.where(begins, _LATE * promised + _SLACK * self.dt, self._due)
         self._late = np.where(begins, -promised, self._late)
-        overdue = (self._due < 0) & (off > self._near) & (np.abs(error) - zone > self._near)
+        away = (off > self.near) & (np.abs(error) - zone > self.near)
+        overdue = away & (self._due < 0)
+        self._nearest = np.fmin(self._nearest, np.maximum(off, 0.0))
+        self.recedes = bool(np.any(away & (off > self._nearest + self.near)))
         if not overdue.any():
             return ""
-        k = int(np.argmax(np.where(overdue, off / self._near, 0.0)))
+        k = int(np.argmax(np.where(overdue, off / self.near, 0.0)))
         return (
             f"{self.names[k]} should have been at {target[k]:.4g} {self._late[k]:.0f} s ago and is "
             f"{off[k]:.2g} off: a load, or another plant than the model"

@@ -138,12 +138,13 @@ class _Fit(NamedTuple):
 
 
 class LateDriveMonitor:
-    """Looks in one closed loop for drives that act ``late`` (n_u,) [s]; ``said`` is what it found."""
+    """Looks in one closed loop for drives that act ``late`` (n_u,) [s]; ``said`` is what it found, ``delays``
+    are the apparent ones of controlled outputs [s]."""
 
     def __init__(self, model: PredictionModel, controlled: Sequence[str]) -> None:
         self.model = model
-        delays = apparent_delays(model.plant, model.drives, tuple(controlled), model.dt)
-        self._window = window_of(max(delays) / model.dt)
+        self.delays = apparent_delays(model.plant, model.drives, tuple(controlled), model.dt)
+        self._window = window_of(max(self.delays) / model.dt)
         self._most = self._window / DELAYS
         self.forget()
 

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
+from thermogrip.mpc.estimator.late_drives import apparent_delays
+from thermogrip.mpc.estimator.oscillation import longest_half_swings
 from thermogrip.mpc.native.modes import Modes, modes_of
 
 if TYPE_CHECKING:
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
 ITERATION_LIMIT = 500
 _INTEGRATES = 1e10  # condition of I - A, from which on a plant has no steady state worth the name
 _BINS = 12  # TG_BINS of tg_controller.h
+_HALVES = 6  # of TG_SWINGS
 
 #: name -> (whole number?, shape in names of sizes, comment)
 _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
@@ -70,6 +73,7 @@ _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
     ),
     "tariff": (False, ("NT",), ""),
     "overshoot": (False, (), "band beyond the target [degC]"),
+    "longest": (False, ("NC",), "half swing of each controlled output [s]"),
     "patience_s": (False, (), "how long a plan is followed without a solve [s]"),
     "ambient": (False, (), "room where none is measured [degC]"),
     "room": (True, (), "which measured disturbance is the room's temperature, -1: none"),
@@ -283,6 +287,7 @@ def numbers_of(controller: ControllerParts, k: Array, *, single: bool = False) -
     model, design, optimiser = controller.model, controller.design, controller.optimiser
     observer, disturbance, loops = controller.observer, controller.disturbance, design.loops
     rest = observer.rest_in_room()
+    delays = apparent_delays(model.plant, model.drives, design.controlled, model.dt)
     rows = [model.outputs.index(name) for name in (*design.controlled, *design.limits)]
     limits = np.array(list(design.limits.values()), dtype=float).reshape(-1, 2)
     same_names = (
@@ -308,6 +313,7 @@ def numbers_of(controller: ControllerParts, k: Array, *, single: bool = False) -
         "usual_d": model.undisturbed(design.ambient),
         "n_loops": len(loops),
         "iteration_limit": ITERATION_LIMIT,
+        "longest": longest_half_swings(delays, model.dt),
         "ramp": [design.ramp_per_s.get(name, 0.0) for name in design.controlled],
         "tariff_from": [second for second, _ in design.tariff],
         "tariff": [factor for _, factor in design.tariff],
@@ -409,6 +415,10 @@ def _controller_parts(s: Sizes, number: Any) -> list[tuple[Any, int]]:
     wide = _whole(max(s.NX + s.NU + s.ND, n))
     still = [*((number, count) for count in (s.NU, s.NW, _BINS, 1)), (whole, 3)]
     relaxation = type("tg_relaxation", (ctypes.Structure,), {"_fields_": _laid_out(still)})
+    half = type("tg_half", (ctypes.Structure,), {"_fields_": _laid_out([(number, 4)])})
+    swings = [(number, 7), (whole, 4), (half, _HALVES + 1)]
+    swing = type("tg_swing", (ctypes.Structure,), {"_fields_": _laid_out(swings)})
+    arrival = type("tg_arrival", (ctypes.Structure,), {"_fields_": _laid_out([(number, 5), (whole, 1)])})
     qp = type("tg_qp", (ctypes.Structure,), {"_fields_": _laid_out(_qp_parts(s, number))})
     return [
         (ctypes.c_void_p, 4),
@@ -422,8 +432,8 @@ def _controller_parts(s: Sizes, number: Any) -> list[tuple[Any, int]]:
         *((number, count) for count in (s.NY, s.NY, s.NX, s.NC, 1, s.NB, s.NC)),
         *((number, count) for count in (s.NX, s.NU, 1)),
         (whole, 3),
-        (relaxation, s.NC),
-        (whole, 7 + s.NY + s.NG + s.NC),
+        *((kind, s.NC) for kind in (relaxation, arrival, swing)),
+        (whole, 8 + s.NY + s.NG + s.NC),
         *((number, count) for count in (n, s.NH * s.NY, n, 1)),
         (whole, 2),
         (number, 1),

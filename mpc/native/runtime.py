@@ -45,7 +45,8 @@ if TYPE_CHECKING:
     from thermogrip.sysid.models.model import Model
 
 #: The C files that every export shares.
-SOURCES = ("tg_qp.h", "tg_qp.c", "tg_controller.h", "tg_controller.c", "tg_observer.c", "tg_optimiser.c")
+_CODE = ("tg_qp", "tg_controller", "tg_observer", "tg_optimiser", "tg_status")
+SOURCES = ("tg_qp.h", "tg_controller.h", *(f"{name}.c" for name in _CODE))
 
 # sums may be done in any order and pairs of operations at once; NaN keeps its meaning
 _FLAGS = (

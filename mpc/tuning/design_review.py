@@ -35,7 +35,16 @@ from thermogrip.mpc.estimator.observer import choose_disturbances, detectability
 from thermogrip.mpc.native.design_struct import ITERATION_LIMIT
 from thermogrip.mpc.optimiser.rti import Optimiser
 from thermogrip.mpc.plant.prediction import PredictionModel, holding_drive, steady_curve, step_response
-from thermogrip.mpc.tuning.objective import STRUCTURE, StepResult, draws_of, lacking, run_trials
+from thermogrip.mpc.tuning.objective import (
+    STRUCTURE,
+    StepResult,
+    draws_of,
+    lacking,
+    results_of,
+    run_trials,
+    surroundings_of,
+    trial,
+)
 from thermogrip.sysid.models.model import BlackBox
 
 #: The verdict of a check that had nothing to try: it neither passes nor warns.
@@ -46,6 +55,7 @@ _LONGEST_S = 3600.0  # for which an error of the observer may last, where no spe
 _TRIED = 2  # draws, besides the plant itself, on which the spec's steps are run
 _KELVIN = 273.15
 _SLOW = 0.9995  # an eigenvalue beyond which a loop hardly settles
+_PLAY = 0.02  # of a drive's range
 _IDLE = 1e-4  # relative change of the move below which a doubled weight does nothing
 _ILL, _LOST = 1e8, 1e12  # condition of the Hessian
 
@@ -142,6 +152,7 @@ def review(
         limits(controller, span),
         as_asked(controller, swing),
         lacks_structure(controller, swing),
+        has_play(controller, swing),
         *_effort(controller, swing),
         _stand_in(controller),
         valid_range(controller, span),
@@ -219,6 +230,23 @@ def lacks_structure(controller: Controller, swing: tuple[float, float]) -> Check
     # of defaults that nobody asked for it is a warning
     failed = stated and "fail" in graded
     return _graded(name, finding, fail=(failed, fix), warn=(set(graded) != {"pass"}, fix))
+
+
+def has_play(controller: Controller, swing: tuple[float, float]) -> Check:
+    """A valve or a gear may have play that no log shows: behind a little of it every step of the spec must
+    settle without more overshoot and offset than the spec allows.  Of what nobody stated nothing fails."""
+    plant, controlled = controller.plant, controller.controlled
+    spec, _ = _spec_of(controller, swing)
+    around = replace(surroundings_of(spec, controlled, plant), play=_PLAY)
+    loop = Controller(plant, controller.design)
+    found = [trial(loop, plant, spec, step, 0, spec.hold_s, 0, around=around) for step in spec.steps]
+    results = [r for run, step in zip(found, spec.steps) for r in results_of(run, spec, step, 0)]
+    tests = [_stepped(r, spec.asked(r.output)) for r in results]
+    seen = [f"{r.start:g} to {r.target:g} degC: {said}" for r, (said, _) in zip(results, tests)]
+    fix = f"make moves cheaper (weight now {controller.design.move:.3g}), or use a valve or gear without play"
+    finding = f"play of {100 * _PLAY:g} % of each drive's range: {'; '.join(seen)}"
+    bad = any(verdict != "pass" for _, verdict in tests)
+    return _graded("settles where drives have play", finding, warn=(bad, fix))
 
 
 def _stepped(result: StepResult, asked: Asked, *, timed: bool = False) -> tuple[str, str]:

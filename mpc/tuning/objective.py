@@ -217,11 +217,14 @@ def trial(
     draw: int,
     length_s: float,
     seed: int,
+    *,
+    around: Surroundings | None = None,
 ) -> ClosedLoop:
     """Run a step (start, target) [degC] of the spec on one draw of the plant for so many seconds, wholly in C
-    where the controller is in C."""
+    where the controller is in C; in the surroundings of the spec where there are no others."""
     structure, draw = divmod(draw, STRUCTURE)
-    around = surroundings_of(spec, controller.controlled, plant)
+    if around is None:
+        around = surroundings_of(spec, controller.controlled, plant)
     if structure:
         around = replace(around, **lacking(plant, spec, controller.controlled)[structure - 1][1])
     truth, schedule = drawn(plant, draw), [(step[1], length_s)]
@@ -253,11 +256,16 @@ def run_trials(
         length = spec.hold_s if lengths is None else lengths[at]
         for draw in draws:
             run = trial(controller, plant, spec, step, draw, length, seed)
-            if spec.settling:
-                results += [_result(run, [part], step, draw, part.output) for part in run.segments]
-            else:
-                results.append(_result(run, run.segments, step, draw))
+            results += results_of(run, spec, step, draw)
     return results
+
+
+def results_of(run: ClosedLoop, spec: Spec, step: tuple[float, float], draw: int) -> list[StepResult]:
+    """Return what a step on a draw comes to: for each output where the spec has ``settling``, else of the
+    worst."""
+    if spec.settling:
+        return [_result(run, [part], step, draw, part.output) for part in run.segments]
+    return [_result(run, run.segments, step, draw)]
 
 
 #: By start, target and draw; where outputs are judged apart by output too.

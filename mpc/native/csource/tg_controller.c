@@ -86,6 +86,10 @@ static void start(tg_controller *c, const double *y, const double *d)
     memset(c->lost, 0, sizeof c->lost);
     c->has_steady = c->in = c->unreachable = 0;
     memset(c->relaxation, 0, sizeof c->relaxation);
+    tg_forget_arrivals(c);
+    memset(c->swing, 0, sizeof c->swing);
+    for (int r = 0; r < TG_NC; r++)
+        c->swing[r].goal = NAN;
     memset(c->moved, 0, sizeof c->moved);
     memcpy(c->last_y, y, sizeof c->last_y);
     c->fresh = 1;
@@ -777,7 +781,7 @@ void tg_keep_plan(tg_controller *c)
 static void decide(tg_controller *c, tg_move *move)
 {
     const tg_design *s = c->design;
-    double missed, slower;
+    double missed, slower, overdue, period = tg_swings(c);
     int outside = 0, unseen;
     double unread = unread_for(c, &unseen);
     move->status = TG_OK;
@@ -815,7 +819,10 @@ static void decide(tg_controller *c, tg_move *move)
     if (outside) {
         move->status = TG_INFEASIBLE;
         move->advice = TG_OUT_OF_RANGE;
-    } else if (missed = missed_by(c), missed > 0.0) {
+        return;
+    }
+    overdue = tg_overdue(c);
+    if (missed = missed_by(c), missed > 0.0) {
         move->status = TG_INFEASIBLE;
         move->advice = TG_OUT_OF_REACH;
         move->over = missed;
@@ -833,8 +840,16 @@ static void decide(tg_controller *c, tg_move *move)
         move->status = TG_MISMATCH;
         move->advice = TG_SLOWER;
         move->over = slower;
-    } else if (does_not_follow(c))
+    } else if (period > 0.0 || overdue > 0.0) {
+        move->status = TG_MISMATCH;
+        move->advice = period > 0.0 ? TG_SWINGS_ABOUT : TG_OVERDUE;
+        move->over = period > 0.0 ? period : overdue;
+        if (!(period > 0.0) && does_not_follow(c)) /* what may be the cause */
+            move->advice = s->switched ? TG_PUMP : TG_NOT_FOLLOWING;
+    } else if (does_not_follow(c)) {
+        move->status = c->recedes && is_too_weak(c) ? TG_MISMATCH : TG_OK;
         move->advice = s->switched ? TG_PUMP : TG_NOT_FOLLOWING;
+    }
 }
 
 /* Finite, in range, and within the slew limit; range wins over slew. */
@@ -888,6 +903,8 @@ tg_move tg_step(tg_controller *c, tg_time time_s, const double *y, const double 
     wrong = set_target(c, target);
     ramp(c);
     decide(c, &move);
+    if (move.status != TG_OK && move.status != TG_MISMATCH && move.status != TG_LATE)
+        tg_forget_arrivals(c); /* no plan is followed, or none arrives */
     if (move.status == TG_OK && said != TG_ALL_WELL)
         move.advice = said; /* events of this sample before lasting conditions */
     if (wrong && move.status == TG_OK)
@@ -936,6 +953,8 @@ const char *tg_advice_text(int advice)
         "the plant does not follow the model: does the pump run, is the sensor in place?",
         "a controlled output has no usable reading: the model replaces it, then its drive rests; the others go on",
         "an output is slower than the model: identify the plant anew",
+        "an output swings about its target: another plant than the model, a valve or relay that sticks, or loads",
+        "an output should have been at its target long ago: a load, or another plant than the model",
     };
-    return advice >= TG_ALL_WELL && advice <= TG_SLOWER ? text[advice] : "?";
+    return advice >= TG_ALL_WELL && advice <= TG_OVERDUE ? text[advice] : "?";
 }

@@ -50,7 +50,9 @@ enum tg_advice {
     TG_WORLD_CHANGED,
     TG_PUMP,
     TG_UNSEEN,
-    TG_SLOWER
+    TG_SLOWER,
+    TG_SWINGS_ABOUT,
+    TG_OVERDUE
 };
 
 typedef struct {
@@ -59,7 +61,7 @@ typedef struct {
     int status;     /* enum tg_status */
     int advice;     /* enum tg_advice; tg_advice_text has its sentence */
     int iterations; /* of the quadratic program */
-    double over;    /* by how much a limit will be broken, a target missed [degC], an output late [s]: where advised */
+    double over;    /* by how much a limit will be broken, a target missed [degC], an output late; its period [s]: where advised */
 } tg_move;
 
 typedef double tg_time; /* seconds of any clock */
@@ -71,6 +73,26 @@ typedef struct {
     double u[TG_NU], w[TG_SOME(TG_NW)], bins[TG_BINS], sum;
     int count, per, n; /* bins, readings in a bin, readings in the sum */
 } tg_relaxation;
+
+#define TG_SWINGS 6 /* half swings in a row */
+
+/* Which side of its target an output is on, the integral of its error's size, since when and until when [s]. */
+typedef struct {
+    double side, iae, begin, end;
+} tg_half;
+
+typedef struct {
+    double goal, now, last[4], variance; /* its newest readings and their noise */
+    int n_last, seen, arrived, n;
+    tg_half half[TG_SWINGS], open;
+} tg_swing;
+
+/* When an output was promised: a mean error, seconds until it is overdue, and since it should have been
+ * there, and how far off it was at least. */
+typedef struct {
+    double goal, error, due, late, nearest;
+    int stayed;
+} tg_arrival;
 
 typedef struct {
     const tg_design *design;
@@ -103,6 +125,9 @@ typedef struct {
     double steady_x[TG_NX], steady_u[TG_NU], miss_sum; /* nearest to the targets, and evidence that they are missed */
     int has_steady, in, unreachable;                   /* samples in a row within reach again */
     tg_relaxation relaxation[TG_NC];
+    tg_arrival arrival[TG_NC];
+    tg_swing swing[TG_NC];
+    int recedes; /* whether an output has been nearer to its target by more than what is near */
     int has_plan, fresh, solves, on_pi, status, advice, spikes[TG_NY];
     int ramps; /* whether targets are on their way in path */
     int slow_for[TG_NG], lost[TG_NC]; /* samples in a row that an output was slower; those that cost nothing */
@@ -152,6 +177,11 @@ void tg_observer_look(tg_controller *c, const double *d);
 const double *tg_now(const tg_controller *c); /* the state at the time of the estimate */
 void tg_biases(const tg_controller *c, double *on_u, double *on_d, double *on_y);
 void tg_expected(const tg_controller *c, double *y);
+/* For how long an output should have been at its target [s], by the newest plan; 0 where none is overdue. */
+double tg_overdue(tg_controller *c);
+void tg_forget_arrivals(tg_controller *c);
+/* The period of the output that swings the most [s], noting the newest readings; 0 where none does. */
+double tg_swings(tg_controller *c);
 /* The controlled outputs nearest to the targets that drives can hold, and their derivatives by w (n_c rows); 0 where
  * no steady state is found. */
 int tg_find_steady(tg_controller *c, const double *d, const double *on_u, const double *on_y, double *held, double *by_w);

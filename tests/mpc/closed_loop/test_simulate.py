@@ -181,6 +181,16 @@ def test_a_slower_sensor_is_a_first_order_lag_and_a_longer_delay_begins_with_the
     np.testing.assert_allclose([row[0] for row in held.y], [37.0, 37.0, 37.0, 37.05, 37.0975], atol=1e-9)
 
 
+def test_what_follows_a_drive_with_play_stays_behind_by_half_of_it() -> None:
+    truth = Truth(lag(), 1.0, Surroundings(play=0.2), 25.0, 0)  # of a range of 2: 0.2 to either side
+    x, want = 0.0, [25.0]
+    for move, follows in ((0.1, 0.0), (0.5, 0.3), (0.4, 0.3), (0.15, 0.3), (0.0, 0.2), (-0.5, -0.3)):
+        truth.apply(Move(move))
+        x = 0.95 * x + follows
+        want.append(25.0 + x)
+    np.testing.assert_allclose([row[0] for row in truth.y], want, atol=1e-12)
+
+
 def test_readings_have_offsets_noise_and_the_quantum_of_their_converter() -> None:
     around = Surroundings(
         ambient=22.0, noise=0.0, quantum=0.25, quanta={"b": 0.1}, offset={"a": 0.3, "t_ambient": -1.05}

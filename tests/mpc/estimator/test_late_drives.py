@@ -74,7 +74,7 @@ def test_what_every_output_shows_is_reported_in_a_window_and_not_taken_for_biase
     assert run.segments[0].settle_s < 180.0
     assert run.segments[0].overshoot < 0.1
     assert abs(run.segments[0].bias) < 0.01
-    assert set(blind.status) == {"ok"}
+    assert not any("later than" in advice for advice in blind.advice)  # it swings, and may say so
     assert blind.segments[0].settle_s > settling * run.segments[0].settle_s
     assert blind.segments[0].travel > 1.1 * run.segments[0].travel
 

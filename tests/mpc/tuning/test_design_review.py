@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.mpc.makers import crossed, network_plant
+from tests.mpc.makers import crossed, heater, network_plant
 from thermogrip.datasets.limits import LARGEST
 from thermogrip.mpc.controllers.mpc import Controller, design_controller
 from thermogrip.mpc.design.design import PILoop, default_design
@@ -615,6 +615,18 @@ def test_an_observer_that_needs_longer_than_a_step_has_is_warned_of():
         "warn",
         "an error falls to a third in 700 s, a step has 600 s",
     )
+
+
+@pytest.mark.parametrize(("move", "verdict"), [(1.0, "pass"), (3e4, "warn")])
+def test_a_design_that_leaves_an_offset_behind_play_is_warned_of(move: float, verdict: str):
+    """A valve of 2 % of play, on a heater of 40 K: the slower design is left a tenth of a degree off."""
+    spec = {"steps": [[30.0, 40.0], [40.0, 33.0]], "hold_s": 600.0}
+    plant = heater().plant
+    design = default_design(plant, deadline_s=1e9, move=move)
+    check = checks.has_play(Controller(plant, design, notes={"spec": spec}), (30.0, 40.0))
+    assert (check.name, check.verdict) == ("settles where drives have play", verdict)
+    assert check.finding.startswith("play of 2 % of each drive's range: 30 to 40 degC: settles in ")
+    assert bool(check.fix) == (verdict == "warn")
 
 
 def test_where_nothing_is_tried_it_does_not_say_pass(tank: Any):
