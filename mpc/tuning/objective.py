@@ -305,8 +305,8 @@ def score(
         cost += _OVERSHOOT * max(0.0, result.overshoot / asked.overshoot_degC - FREE)
         cost += _BIAS * max(0.0, abs(result.bias) / asked.bias_degC - FREE) if settled else 0.0
         cost += spec.energy_weight * result.energy_s / unit + spec.moves_weight * result.travel
-        own = (pi_moves or {}).get((result.start, result.target, result.draw % STRUCTURE), np.inf)
-        cost += _MOVES * max(0.0, result.travel / (spec.moves_limit * own) - FREE)
+        most = (pi_moves or {}).get((result.start, result.target, result.draw % STRUCTURE), np.inf)
+        cost += _MOVES * max(0.0, result.travel / (spec.moves_limit * most) - FREE)
         costs.setdefault((result.start, result.target, result.draw, result.output), []).append(cost)
     of = {key: float(np.mean(noises)) for key, noises in costs.items()}
     planned = expected(spec) | {0}
