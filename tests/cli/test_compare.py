@@ -84,6 +84,7 @@ def scored(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
         "thermogrip.report.classification.score_table",
         lambda found: (HEAD, tuple(("bayes", name, "0.9", "0.1", "3") for name in found.conditions)),
     )
+    made.drawn = stand_in("thermogrip.report.html.draw")
     made.pages = stand_in("thermogrip.report.html.write_report")
     return made
 
@@ -129,7 +130,8 @@ def test_what_is_split_how_and_by_whom_it_is_scored(
     assert [call.quick for call in scored.asked] == [False, True]
     assert {call.seed for call in scored.asked} == {4}
     [call] = scored.threads
-    assert ([*call.args[1]], call.args[2]) == (splits, 3)
+    assert ([*call.args[1]], call.args[2]) == ([*splits, "features"], 3)
+    assert [call.args[0] for call in scored.drawn] == [*([f"of {name}"] for name in splits), []]
     [page] = scored.pages
     assert page.args[0] == Path("c/report.html")
     assert page.args[3] == [f"of {name}" for name in splits]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import os
+import pickle
 import re
 import signal
 import subprocess
@@ -24,6 +25,7 @@ from thermogrip.datasets import parallel
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.parallel import (
     Replaced,
+    begin_processes,
     in_order,
     joint_progress,
     kept_processes,
@@ -286,8 +288,6 @@ def test_the_progress_of_a_part_stays_in_its_share_and_has_its_name():
 
 
 def test_a_user_error_survives_the_way_between_processes():
-    import pickle
-
     fault = UserError("bad", file="a.csv", row=3, column="x", hint="correct it")
     back = pickle.loads(pickle.dumps(fault))  # noqa: S301  what a process pool does
     assert str(back) == "a.csv, row 3, column x: bad; correct it"
@@ -404,8 +404,61 @@ def test_on_a_worker_freed_memory_is_kept(monkeypatch) -> None:
     library = SimpleNamespace(mallopt=lambda *pair: said.append(pair))
     monkeypatch.setattr(parallel.ctypes, "CDLL", lambda _: library)
     parallel._keep_memory.cache_clear()
-    assert [parallel._with_memory_kept(math.factorial, n) for n in (3, 4)] == [6, 24]
+    assert [on_worker(math.factorial, n) for n in (3, 4)] == [6, 24]
     assert said == [(-1, 1 << 28), (-3, 1 << 25)]  # once a process
     monkeypatch.setattr(parallel.ctypes, "CDLL", lambda _: SimpleNamespace())  # a C library without it
     parallel._keep_memory.cache_clear()
-    assert parallel._with_memory_kept(math.factorial, 3) == 6
+    assert on_worker(math.factorial, 3) == 6
+
+
+def on_worker(function, item):
+    return pickle.loads(parallel._on_worker(pickle.dumps((function, item))))  # noqa: S301
+
+
+def test_a_worker_begins_with_a_task_once_it_has_imported(monkeypatch) -> None:
+    """Two threads that import modules which import each other find one of them half made."""
+    may, begun = threading.Event(), threading.Event()
+    monkeypatch.setattr(parallel, "_importing", [])
+    monkeypatch.setattr(parallel, "import_module", lambda name: may.wait(10))
+    assert parallel._greeted(["slow"]) == parallel._versions()
+    with ThreadPoolExecutor(1) as other:
+        done = other.submit(lambda: begun.set() or on_worker(math.factorial, 3))
+        begun.wait(10)
+        time.sleep(0.05)
+        assert not done.done()
+        may.set()
+        assert done.result() == 6
+
+
+class Unpacked:
+    """Notes each time that it is unpacked."""
+
+    def __reduce__(self):
+        return eval, ("__import__('thermogrip.datasets.parallel').datasets.parallel._unpacked.append(1)",)
+
+
+def test_a_cluster_unpacks_an_item_once_and_not_at_its_scheduler(cluster, monkeypatch) -> None:
+    """The scheduler would import all that an item needs, before a worker may begin."""
+    monkeypatch.setattr(parallel, "_unpacked", [], raising=False)
+    assert run_parallel(repr, [Unpacked() for _ in range(3)], cluster) == ["None"] * 3
+    assert len(parallel._unpacked) == 3
+
+
+def test_a_cluster_imports_from_the_first_word_on_and_its_first_work_has_the_same_client(
+    cluster, monkeypatch
+) -> None:
+    made, connected = [], parallel._connected
+    monkeypatch.setattr(parallel, "_connected", lambda *given: made.append(connected(*given)) or made[-1])
+    monkeypatch.setattr(parallel, "_importing", [])
+    monkeypatch.delitem(sys.modules, "colorsys", raising=False)
+    for _ in range(2):
+        begin_processes(cluster, ["no_such_module", "colorsys"])
+    for thread in parallel._importing:
+        thread.join(10)
+    assert "colorsys" in sys.modules
+    assert run_parallel(math.factorial, [3, 4], cluster) == [6, 24]
+    [client] = made
+    assert client.status == "closed"
+    assert not parallel._clients
+    with pytest.raises(UserError, match="no address of a scheduler"):
+        begin_processes("localhost", ["colorsys"])
