@@ -266,6 +266,16 @@ def test_curves_show_what_more_grasps_time_and_difference_bring(
     assert verb._curves(*given[:2], [record.drop_vars("split")], *given[3:]) == ["curves"]
 
 
+def test_a_fault_of_the_features_is_said_after_that_nothing_was_scored(
+    scored: SimpleNamespace, stand_in: StandIn
+) -> None:
+    stand_in("thermogrip.cli.compare._features", UserError("no features"))
+    words = ["compare", "grasps.csv", "--classifiers", "bayes", "--repeats", "0", "--out", "c"]
+    assert "no features" in scored.bench.run(*words).err
+    scored.of["shipped"] = Found("shipped", empty=True)
+    assert "nothing to score" in scored.bench.run(*words).err
+
+
 def test_the_curves_stand_after_the_scores(scored: SimpleNamespace, stand_in: StandIn) -> None:
     asked = stand_in("thermogrip.cli.compare._curves", [Section("More", ())])
     options = ["--classifiers", "bayes", "--repeats", "0", "--curves", "--seed", "4", "--workers", "3"]
