@@ -322,6 +322,33 @@ def test_a_fault_on_a_cluster_is_raised_here_as_it_was(cluster):
         run_parallel(math.factorial, [3, -1, 4], cluster)
 
 
+@pytest.mark.slow  # starts four processes
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
+def test_a_cluster_does_again_what_a_killed_worker_had_in_hand_and_takes_in_a_late_one(tmp_path) -> None:
+    distributed = pytest.importorskip("distributed")
+    mark, late = tmp_path / "killed", tmp_path / "late"
+    kill = f"{{n}} if __import__('os').path.exists({str(mark)!r}) else " + (
+        f"(open({str(mark)!r}, 'w').close(), __import__('os').kill(__import__('os').getpid(), 9))"
+    )
+    named = f"open({str(late)!r} + str(__import__('os').getpid()), 'w').close()"
+    pid = f"(__import__('time').sleep(0.2), {named}, {{n}})[2]"
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=":0"
+    ) as made:
+        address = made.scheduler_address
+        begin_processes(address, ["thermogrip.datasets.schema"])
+        with kept_processes(address):
+            items = [(kill if n == 3 else pid).format(n=n) for n in range(40)]
+            seen = []
+            for n, found in enumerate(in_order(eval, items, address)):
+                seen.append(found)
+                if n == 0:
+                    made.scale(2)
+            assert seen == list(range(40))
+    assert mark.exists()
+    assert len(list(tmp_path.glob("late*"))) >= 3  # the first, its successor, and the late one
+
+
 def test_a_cluster_that_does_not_answer_is_one_line(monkeypatch):
     monkeypatch.setattr("thermogrip.datasets.parallel._CONNECT_S", 1)
     with pytest.raises(UserError, match="no scheduler answers at tcp"):
