@@ -38,6 +38,7 @@ from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
 from multiprocessing.reduction import ForkingPickler
+from queue import Empty, SimpleQueue
 from typing import Any, TypeAlias, TypeVar
 from warnings import catch_warnings, simplefilter
 
@@ -50,7 +51,9 @@ Workers: TypeAlias = int | str
 
 _CONNECT_S = 10
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of malloc.h
+_SWITCH_S = 5e-4
 _DEATHS = 3  # of processes, without a result between them
+_LOOK_S = 1.0  # without a result: then it is looked whether the processes are alive
 
 _THREADS = 32  # of run_threads, which mostly wait
 
@@ -271,7 +274,7 @@ def _on_processes(
         futures: dict[Future[_Result], int] = {}
         try:
             futures |= {pool.submit(function, item): i for i, item in left.items()}
-            for future in as_completed(futures):
+            for future in _completed(pool, futures):
                 result = future.result()
                 i = futures.pop(future)  # it holds the result, of which only the caller may need many
                 del left[i]
@@ -285,13 +288,37 @@ def _on_processes(
                 ) from error
             with _lock:
                 if kept and pool is _kept[0]:  # the first thread that sees it
-                    pool.shutdown(wait=True)
+                    _ended(pool, broken=True)
                     _kept[0] = _processes(_kept_size[0])
         finally:
             for future in futures:
                 future.cancel()  # what has not begun
             if not kept:
-                pool.shutdown(wait=True)
+                _ended(pool, broken=deaths > 0)
+
+
+def _completed(pool: Executor, futures: Iterable[Future[_Result]]) -> Iterator[Future[_Result]]:
+    """Yield futures as they complete; BrokenProcessPool where the pool broke and left one without an answer.
+
+    CPython answers what a pool that breaks has in hand by a loop over a dictionary, and the thread that does
+    so ends with an exception if an item is submitted meanwhile (3.11, ``terminate_broken``).
+    """
+    done: SimpleQueue[Future[_Result]] = SimpleQueue()
+    left = sum(each.add_done_callback(done.put) is None for each in futures)  # a name would hold the last one
+    while left:
+        try:
+            yield done.get(timeout=_LOOK_S)
+            left -= 1
+        except Empty:
+            pool.submit(int).cancel()  # which a broken pool refuses
+
+
+def _ended(pool: Executor, *, broken: bool) -> None:
+    """End a pool, and the processes that one that broke may have left waiting for work."""
+    processes = [*(getattr(pool, "_processes", None) or {}).values()] if broken else []
+    pool.shutdown(wait=True)
+    for process in processes:
+        process.terminate()
 
 
 def begin_processes(workers: Workers, modules: Sequence[str]) -> None:
@@ -446,6 +473,8 @@ def _on_worker(packed: bytes) -> bytes:
 
     pickle: Any = protocol.pickle  # its functions have no types
     _keep_memory()
+    # what computes lets the thread that talks to others go on: a result waits for it some five times
+    sys.setswitchinterval(_SWITCH_S)
     for thread in _importing:  # else two threads import modules that import each other
         thread.join()
     function, item = pickle.loads(packed)

@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 import weakref
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from types import SimpleNamespace
 
@@ -381,6 +381,39 @@ def test_what_a_killed_process_had_in_hand_is_done_again(tmp_path):
     assert seen == [pytest.approx(n / 8) for n in range(1, 9)]
 
 
+class Silent:
+    """A pool that breaks over its first items and answers none of them."""
+
+    def __init__(self) -> None:
+        self.ended, self.asked, self._processes = [], 0, {1: SimpleNamespace(terminate=self._terminated)}
+
+    def _terminated(self) -> None:
+        self.ended.append("process")
+
+    def submit(self, function, *items):
+        self.asked += 1
+        if not items:
+            raise BrokenProcessPool
+        return Future()
+
+    def shutdown(self, wait=True, cancel_futures=False) -> None:
+        self.ended.append("pool")
+        self._processes = None
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_items_that_a_broken_pool_does_not_answer_are_done_by_the_next_one(monkeypatch, kept) -> None:
+    first = Silent()
+    pools = [first, ThreadPoolExecutor(2)]
+    monkeypatch.setattr(parallel, "_LOOK_S", 0.01)
+    monkeypatch.setattr(parallel.os, "cpu_count", lambda: 8)
+    monkeypatch.setattr(parallel, "_processes", lambda n: pools.pop(0))
+    with kept_processes(2 if kept else 1):
+        assert run_parallel(math.factorial, [3, 4, 5], 2) == [6, 24, 120]
+    assert first.asked == 4
+    assert first.ended[:2] == ["pool", "process"]
+
+
 def test_results_that_were_given_are_not_kept():
     given, alive = [], 0
     for result in in_order(np.ones, [3] * 12, 2):
@@ -427,11 +460,13 @@ def test_one_worker_is_a_thread_here() -> None:
 
 def test_on_a_worker_freed_memory_is_kept(monkeypatch) -> None:
     said: list[tuple[int, int]] = []
+    sys.setswitchinterval(5e-3)
     monkeypatch.setattr(parallel.sys, "platform", "linux")
     library = SimpleNamespace(mallopt=lambda *pair: said.append(pair))
     monkeypatch.setattr(parallel.ctypes, "CDLL", lambda _: library)
     parallel._keep_memory.cache_clear()
     assert [on_worker(math.factorial, n) for n in (3, 4)] == [6, 24]
+    assert sys.getswitchinterval() < 1e-3  # a result waits for the thread that computes the next one
     assert said == [(-1, 1 << 28), (-3, 1 << 25)]  # once a process
     monkeypatch.setattr(parallel.ctypes, "CDLL", lambda _: SimpleNamespace())  # a C library without it
     parallel._keep_memory.cache_clear()
