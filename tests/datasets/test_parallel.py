@@ -474,12 +474,14 @@ def test_on_a_worker_freed_memory_is_kept(monkeypatch) -> None:
 
 
 def on_worker(function, item):
+    pytest.importorskip("distributed")
     return pickle.loads(parallel._on_worker(pickle.dumps((function, item))))  # noqa: S301
 
 
 def test_a_worker_begins_with_a_task_once_it_has_imported(monkeypatch) -> None:
     """Two threads that import modules which import each other find one of them half made."""
     may, begun = threading.Event(), threading.Event()
+    on_worker(math.factorial, 3)  # which imports distributed
     monkeypatch.setattr(parallel, "_importing", [])
     monkeypatch.setattr(parallel, "import_module", lambda name: may.wait(10))
     assert parallel._greeted(["slow"]) == parallel._versions()
