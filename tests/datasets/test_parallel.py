@@ -495,17 +495,18 @@ def test_a_worker_begins_with_a_task_once_it_has_imported(monkeypatch) -> None:
 
 
 class Unpacked:
-    """Notes each time that it is unpacked."""
+    """Notes in which thread it is unpacked."""
 
     def __reduce__(self):
-        return eval, ("__import__('thermogrip.datasets.parallel').datasets.parallel._unpacked.append(1)",)
+        seen = "__import__('thermogrip.datasets.parallel').datasets.parallel._unpacked"
+        return eval, (f"{seen}.append(__import__('threading').current_thread().name)",)
 
 
-def test_a_cluster_unpacks_an_item_once_and_not_at_its_scheduler(cluster, monkeypatch) -> None:
+def test_a_cluster_unpacks_an_item_where_it_computes_and_not_at_its_scheduler(cluster, monkeypatch) -> None:
     """The scheduler would import all that an item needs, before a worker may begin."""
     monkeypatch.setattr(parallel, "_unpacked", [], raising=False)
     assert run_parallel(repr, [Unpacked() for _ in range(3)], cluster) == ["None"] * 3
-    assert len(parallel._unpacked) == 3
+    assert [name[:11] for name in parallel._unpacked] == ["Dask-Worker"] * 3
 
 
 def test_a_cluster_imports_from_the_first_word_on_and_its_first_work_has_the_same_client(
