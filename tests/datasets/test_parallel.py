@@ -506,7 +506,7 @@ def test_a_cluster_unpacks_an_item_where_it_computes_and_not_at_its_scheduler(cl
     """The scheduler would import all that an item needs, before a worker may begin."""
     monkeypatch.setattr(parallel, "_unpacked", [], raising=False)
     assert run_parallel(repr, [Unpacked() for _ in range(3)], cluster) == ["None"] * 3
-    assert [name[:11] for name in parallel._unpacked] == ["Dask-Worker"] * 3
+    assert ["Dask-" in name for name in parallel._unpacked] == [True] * 3
 
 
 def test_a_cluster_imports_from_the_first_word_on_and_its_first_work_has_the_same_client(
