@@ -304,7 +304,11 @@ def _completed(pool: Executor, futures: Iterable[Future[_Result]]) -> Iterator[F
     so ends with an exception if an item is submitted meanwhile (3.11, ``terminate_broken``).
     """
     done: SimpleQueue[Future[_Result]] = SimpleQueue()
-    left = sum(each.add_done_callback(done.put) is None for each in futures)  # a name would hold the last one
+    left = 0
+    for future in futures:
+        future.add_done_callback(done.put)
+        left += 1
+    del future  # it would hold the last result
     while left:
         try:
             yield done.get(timeout=_LOOK_S)
