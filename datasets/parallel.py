@@ -314,7 +314,7 @@ def _completed(pool: Executor, futures: Iterable[Future[_Result]]) -> Iterator[F
             yield done.get(timeout=_LOOK_S)
             left -= 1
         except Empty:
-            pool.submit(int).cancel()  # which a broken pool refuses
+            pool.submit(int)  # which a broken pool refuses; cancelled, it would end that thread as well
 
 
 def _ended(pool: Executor, *, broken: bool) -> None:
