@@ -51,15 +51,17 @@ def verbs(folder: Path, n_files: int, *, large: bool = False) -> dict[str, list[
         ran(["identify", *logs, "--network", "gripper", "--models", "network", "--out", str(plant)])
     grasps, spec, models = folder / "grasps", folder / "spec.toml", "arx,oe,subspace,sindy,network"
     conditions = ["exp1A_obj43_grip23"]
-    if large:  # one to two minutes of one process
+    more: list[str] = []
+    if large:  # two minutes of one process, or more
         conditions += ["exp2_dT10", "exp2_dT15", "exp2_dT20", "exp3A_obj43_grip23", "exp3B_obj28_grip48"]
-        models += ",armax,bj,neural"
+        models += ",armax,bj,parsim,neural"
+        n_files, more = 4 * n_files, ["--repeats", "80"]
     spec.write_text(f"evaluations = {60 if large else 20}\nsearch_draws = {4 if large else 2}\n")
     return {
         "effusivity": ["effusivity", str(make(folder / "many", n_files)), "--out", "answer.csv"],
         "compare": [
             "compare", *(str(grasps / f"{name}.csv.xz") for name in conditions), "--classifiers",
-            "posterior,bayes,features-lda", "--out", "answer",
+            "posterior,bayes,features-lda", *more, "--out", "answer",
         ],
         "tune": ["tune", str(plant), "--spec", str(spec), "--out", "answer.json"],
         "identify": [
@@ -149,7 +151,7 @@ def main() -> None:
     parser.add_argument("--kill", action="store_true")
     parser.add_argument("--files", type=int, default=12)
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--large", action="store_true", help="more to share: the start counts less")
+    parser.add_argument("--large", action="store_true", help="some two minutes of one process")
     given = parser.parse_args()
     folder = given.folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)

@@ -34,9 +34,11 @@ from concurrent.futures import (
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager, suppress
 from functools import cache, partial
+from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
 from multiprocessing.reduction import ForkingPickler
+from queue import Empty, SimpleQueue
 from typing import Any, TypeAlias, TypeVar
 from warnings import catch_warnings, simplefilter
 
@@ -49,7 +51,9 @@ Workers: TypeAlias = int | str
 
 _CONNECT_S = 10
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of malloc.h
+_SWITCH_S = 5e-4
 _DEATHS = 3  # of processes, without a result between them
+_LOOK_S = 1.0  # without a result: then it is looked whether the processes are alive
 
 _THREADS = 32  # of run_threads, which mostly wait
 
@@ -59,6 +63,7 @@ _kept_size: list[int] = []
 _clients: dict[str, Any] = {}
 _keeping: list[str] = []
 _lock = threading.Lock()  # of these
+_importing: list[threading.Thread] = []  # on a worker of a cluster
 #: In a thread of :func:`run_threads`: set once the others are no longer wanted.
 _thread = threading.local()
 
@@ -269,7 +274,7 @@ def _on_processes(
         futures: dict[Future[_Result], int] = {}
         try:
             futures |= {pool.submit(function, item): i for i, item in left.items()}
-            for future in as_completed(futures):
+            for future in _completed(pool, futures):
                 result = future.result()
                 i = futures.pop(future)  # it holds the result, of which only the caller may need many
                 del left[i]
@@ -283,18 +288,54 @@ def _on_processes(
                 ) from error
             with _lock:
                 if kept and pool is _kept[0]:  # the first thread that sees it
-                    pool.shutdown(wait=True)
+                    _ended(pool, broken=True)
                     _kept[0] = _processes(_kept_size[0])
         finally:
             for future in futures:
                 future.cancel()  # what has not begun
             if not kept:
-                pool.shutdown(wait=True)
+                _ended(pool, broken=deaths > 0)
+
+
+def _completed(pool: Executor, futures: Iterable[Future[_Result]]) -> Iterator[Future[_Result]]:
+    """Yield futures as they complete; BrokenProcessPool where the pool broke and left one without an answer.
+
+    CPython answers what a pool that breaks has in hand by a loop over a dictionary, and the thread that does
+    so ends with an exception if an item is submitted meanwhile (3.11, ``terminate_broken``).
+    """
+    done: SimpleQueue[Future[_Result]] = SimpleQueue()
+    left = 0
+    for future in futures:
+        future.add_done_callback(done.put)
+        left += 1
+    del future  # it would hold the last result
+    while left:
+        try:
+            yield done.get(timeout=_LOOK_S)
+            left -= 1
+        except Empty:
+            pool.submit(int)  # which a broken pool refuses; cancelled, it would end that thread as well
+
+
+def _ended(pool: Executor, *, broken: bool) -> None:
+    """End a pool, and the processes that one that broke may have left waiting for work."""
+    processes = [*(getattr(pool, "_processes", None) or {}).values()] if broken else []
+    pool.shutdown(wait=True)
+    for process in processes:
+        process.terminate()
 
 
 def begin_processes(workers: Workers, modules: Sequence[str]) -> None:
-    """Begin to import ``modules`` for local processes, beside what this one imports meanwhile."""
-    if sys.platform == "linux" and not isinstance(workers, str) and min(workers, os.cpu_count() or 1) > 1:
+    """Begin to import ``modules`` for local processes, or on a cluster, beside what this one imports.
+
+    UserError if a cluster cannot be reached, has no workers, or has other versions.
+    """
+    check_workers(workers)
+    if isinstance(workers, str):
+        with _lock:
+            if workers not in _clients:
+                _clients[workers] = _connected(workers, modules)
+    elif sys.platform == "linux" and min(workers, os.cpu_count() or 1) > 1:
         _serving(modules)
 
 
@@ -386,29 +427,36 @@ def _on_cluster(
 
     dask: Any = distributed  # its functions have no types
     with _lock:
-        kept_one = address in _keeping
-        client = _clients.get(address) or _connected(dask, address)
-        if kept_one:
+        kept = address in _keeping
+        client = _clients.get(address) or _connected(address)
+        if kept:
             _clients[address] = client
+        else:  # one that was begun is taken over
+            _clients.pop(address, None)
     futures: dict[Any, int] = {}
     try:
-        kept = partial(_with_memory_kept, function)
-        futures |= {future: i for i, future in enumerate(client.map(kept, todo, pure=False))}
+        # As bytes: the scheduler would import what they need, and unpack and pack them, before a worker may
+        # begin; a thousandth of a second each.
+        packed = [dask.protocol.pickle.dumps((function, item)) for item in todo]
+        futures |= {future: i for i, future in enumerate(client.map(_on_worker, packed, pure=False))}
         for future in dask.as_completed(futures, loop=client.loop):
-            result = future.result()  # the first fault ends it
+            result = dask.protocol.pickle.loads(future.result())  # the first fault ends it
             yield futures.pop(future), result
     except dask.KilledWorker as error:
         problem = f"workers of {address} are killed again and again"
         raise UserError(problem, hint="give them more memory") from error
     finally:
-        if kept_one:
+        if kept:
             client.cancel(list(futures))
         else:
             client.close()  # which lets go of what is not done
 
 
-def _connected(dask: Any, address: str) -> Any:
-    """Return a client of a scheduler whose workers run this code."""
+def _connected(address: str, modules: Sequence[str] = ()) -> Any:
+    """Return a client of a scheduler whose workers run this code, and begin to import ``modules``."""
+    import distributed
+
+    dask: Any = distributed  # its functions have no types
     hint = "start one with 'dask scheduler', or check the address"
     # its own words about versions are a table; _check_cluster says it in one line
     lost = as_user_error((OSError, ValueError), f"no scheduler answers at {address}", hint=hint)
@@ -416,44 +464,68 @@ def _connected(dask: Any, address: str) -> Any:
         simplefilter("ignore", dask.versions.VersionMismatchWarning)
         client = dask.Client(address, timeout=_CONNECT_S, set_as_default=False)
     try:
-        _check_cluster(client, address)
+        _check_cluster(client, address, modules)
     except BaseException:
         client.close()
         raise
     return client
 
 
-def _with_memory_kept(function: Callable[[_Item], _Result], item: _Item) -> _Result:
-    """Return what a function returns, on a worker that keeps freed memory for its next arrays.
+def _on_worker(packed: bytes) -> bytes:
+    """Return what a function returns for an item, packed as they came."""
+    from distributed import protocol
 
-    Dask's nanny has the C library give back what is freed at once (MALLOC_TRIM_THRESHOLD_), and arrays of
-    some 100 kB, freed and wanted again a thousand times a second, then cost more than what is computed.
-    """
+    pickle: Any = protocol.pickle  # its functions have no types
     _keep_memory()
-    return function(item)
+    # what computes lets the thread that talks to others go on: a result waits for it some five times
+    sys.setswitchinterval(_SWITCH_S)
+    for thread in _importing:  # else two threads import modules that import each other
+        thread.join()
+    function, item = pickle.loads(packed)
+    return bytes(pickle.dumps(function(item)))
 
 
 @cache
 def _keep_memory() -> None:
-    """Have glibc keep up to 256 MB of free memory, and take arrays of less than 32 MB from it."""
+    """Have glibc keep up to 256 MB of free memory, and take arrays of less than 32 MB from it.
+
+    Dask's nanny has the C library give back what is freed at once (MALLOC_TRIM_THRESHOLD_), and arrays of
+    some 100 kB, freed and wanted again a thousand times a second, then cost more than what is computed.
+    """
     if sys.platform == "linux" and (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
         mallopt(_TRIM_THRESHOLD, 256 << 20)
         mallopt(_MMAP_THRESHOLD, 32 << 20)
 
 
-def _check_cluster(client: Any, address: str) -> None:
-    """Refuse a cluster without workers, or one that would run other code."""
+def _check_cluster(client: Any, address: str, modules: Sequence[str] = ()) -> None:
+    """Refuse a cluster without workers, or one that would run other code; the others begin to import
+    ``modules``."""
     if not client.scheduler_info()["workers"]:
         raise UserError(f"the cluster at {address} has no workers", hint=f"run 'dask worker {address}'")
     own = _versions()
     hint = f"install thermogrip {__version__} on all of them"
     with as_user_error(ModuleNotFoundError, f"a worker of {address} has no thermogrip", hint=hint):
-        theirs = client.run(_versions).values()
+        theirs = client.run(partial(_greeted, modules)).values()
     differ = {name: {there[name] for there in theirs} - {own[name]} for name in own}
     if any(differ.values()):
         words = [f"{name} {', '.join(sorted(differ[name]))} for {own[name]}" for name in own if differ[name]]
         problem = f"a worker of {address} has {'; '.join(words)}"
         raise UserError(problem, hint="install the same versions on all of them")
+
+
+def _greeted(modules: Sequence[str]) -> dict[str, str]:
+    """Return the versions of this worker, which begins to import ``modules`` in a thread."""
+    if modules:
+        thread = threading.Thread(target=_imported, args=(modules,), daemon=True)
+        thread.start()
+        _importing.append(thread)
+    return _versions()
+
+
+def _imported(modules: Sequence[str]) -> None:
+    for name in modules:
+        with suppress(ImportError):  # a task says it
+            import_module(name)
 
 
 def _versions() -> dict[str, str]:

@@ -505,7 +505,10 @@ def identify(
         some = [model for model in finalists if model != "network" or shared is not None]
         # what takes longest first: a process that begins with it last leaves others idle
         some.sort(key=lambda model: _LONGEST.index(model) if model in _LONGEST else len(_LONGEST))
+        folds: list[tuple[str, list[Log], Held | None]]
         folds = [(model, train, held) for model in some for train, held in cases]
+        if "network" in some:  # the likely one: it is kept also where another errs a little less
+            folds.insert(some.index("network") * len(cases), ("network", logs, None))
         items = [((shared, settings, seed), *fold) for fold in folds]
         report = parts.part("left out", of=len(items))
         found = run_parallel(_fitted_or_why, items, workers, report, what="fitting")
@@ -517,7 +520,8 @@ def identify(
         noisy = [finding.says for finding in checked.of("noise") if finding.verdict != "ok"]
         problem = f"no model could be fitted ({refused[0] if refused else 'none was asked for'})"
         raise UserError(problem, hint="; ".join(noisy) or None)
-    fitted = fit(chosen, logs, parts.part(f"{chosen} on all logs"))
+    begun, _ = folds_done.get((chosen, id(logs)), (None, None))
+    fitted = begun if isinstance(begun, Plant) else fit(chosen, logs, parts.part(f"{chosen} on all logs"))
     parts.next()
     plant, lost = _with_draws(fitted, logs, parts, posterior=posterior, draws=draws, seed=seed)
     lists = {"input": inputs, "output": outputs, "disturbance": disturbances}
@@ -765,8 +769,9 @@ def _fit(asked: _Asked, model: str, train: Sequence[Log], report: Progress | Non
 _Fold: TypeAlias = "tuple[Plant | str, FreeRun | str | None]"
 
 
-def _fitted_or_why(item: tuple[_Asked, str, Sequence[Log], Held]) -> _Fold:
-    """Return the plant of a candidate fitted to some logs and its run over another, or why there is none."""
+def _fitted_or_why(item: tuple[_Asked, str, Sequence[Log], Held | None]) -> _Fold:
+    """Return the plant of a candidate fitted to some logs and its run over another, if any, or why there is
+    none."""
     asked, model, train, held = item
     try:
         fitted = _fit(asked, model, train, None)
@@ -774,7 +779,7 @@ def _fitted_or_why(item: tuple[_Asked, str, Sequence[Log], Held]) -> _Fold:
         return str(error), None
     plant = fitted if isinstance(fitted, Plant) else fitted.plant
     try:
-        return plant, run_held_out(plant, held, unseen=True)
+        return plant, None if held is None else run_held_out(plant, held, unseen=True)
     except UserError as error:
         return plant, str(error)
 

@@ -25,12 +25,12 @@ Whatever the verdict, it reports where a simpler controller, tuned with the same
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -360,8 +360,7 @@ def _tune(plant: Plant, spec: Spec | None, progress: Progress | None, workers: W
         share = sub_progress(progress, _BEGUN + width * at, _BEGUN + width * (at + 1))
         looked += run_threads(search.evaluate, look, workers, share, what=PARAMETER_WORDS[parameter])
     looked += _ramped(search, _best(looked), workers)
-    found = _search_all(search, looked, workers, sub_progress(progress, _LOOKED, _SEARCHED))
-    found["PI"], pi = _sturdiest(search, found["PI"], workers)
+    found, pi = _search_all(search, looked, workers, sub_progress(progress, _LOOKED, _SEARCHED))
     pareto, best = _trade(search, found, pi, workers, sub_progress(progress, _SEARCHED, _TRADED))
     tuned = search.design(best.parameters)
     candidates = {
@@ -377,12 +376,19 @@ def _tune(plant: Plant, spec: Spec | None, progress: Progress | None, workers: W
     stiller = moved["tuned"] < moved["baseline"] / (1 + _STILL)
     alike = 1 + (_ALIKE_IN_NOISE if stiller else _ALIKE if moved["tuned"] < moved["baseline"] else 0.0)
     kept = "tuned" if scores["tuned"] < alike * scores["baseline"] else "baseline"
-    # what a number does shows in one noise too
-    about = search.evaluate(best.parameters if kept == "tuned" else start, noises=1)
-    of = [parameter for parameter in PARAMETER_WORDS if parameter in about.parameters]
-    items = [(search, parameter, about.parameters, about) for parameter in of]
-    share = sub_progress(progress, _COMPARED, 1.0)
-    sensitivity = run_threads(sensitivity_of, items, workers, share, what="sensitivities")
+    # the PI found here also takes over when the optimiser fails
+    final = replace(candidates[kept], loops=candidates["PI"].loops)
+
+    def sensitivities() -> list[Sensitivity]:
+        # what a number does shows in one noise too
+        about = search.evaluate(best.parameters if kept == "tuned" else start, noises=1)
+        of = [parameter for parameter in PARAMETER_WORDS if parameter in about.parameters]
+        items = [(search, parameter, about.parameters, about) for parameter in of]
+        share = sub_progress(progress, _COMPARED, 1.0)
+        return run_threads(sensitivity_of, items, workers, share, what="sensitivities")
+
+    last: list[Callable[[], Any]] = [sensitivities, partial(_runs, search, final, candidates["LQR"], workers)]
+    sensitivity, shown = run_threads(lambda made: made(), last, workers)
     history = tuple(tried for part in found.values() for tried in part)
     rows = tuple(row for name, part in own.items() for row in rows_of(name, part, spec, search.bounds))
     unseen = "under fresh noise (the plant has no uncertainty)" if search.certain else "on unseen draws"
@@ -408,8 +414,7 @@ def _tune(plant: Plant, spec: Spec | None, progress: Progress | None, workers: W
         "rows": [row.to_dict() for row in rows],
         "lacking": [result.to_dict() for result in missing],
     }
-    # the PI found here also takes over when the optimiser fails
-    controller = Controller(plant, replace(candidates[kept], loops=candidates["PI"].loops), notes=notes)
+    controller = Controller(plant, final, notes=notes)
     return Tuning(
         controller=controller,
         verdict=verdict,
@@ -420,7 +425,7 @@ def _tune(plant: Plant, spec: Spec | None, progress: Progress | None, workers: W
         sensitivity=tuple(sensitivity),
         history=history,
         meets_spec=meets,
-        runs=_runs(search, controller, candidates["LQR"], workers),
+        runs=shown,
         spec=spec,
         seed=seed,
     )
@@ -565,24 +570,30 @@ def _stillest(found: Sequence[Sequence[Trial]], reading_s: float = 0.0, allowed:
 
 def _search_all(
     search: Search, looked: list[Trial], workers: Workers, progress: Progress | None
-) -> dict[str, list[Trial]]:
-    """Return the trials of MPC, PI and LQR, after as many evaluations each, the PI after thrice as many."""
+) -> tuple[dict[str, list[Trial]], Trial]:
+    """Return the trials of MPC, PI and LQR, after as many evaluations each, the PI after thrice as many; and
+    the PI to take."""
     n = search.spec.evaluations
     # SIMC, with the drive that holds the target; and without: a plant that has no draws does not know how
     # wrong that drive is
-    pi = {"Kc": 1.0, "Ti": 1.0, "setpoint": 1.0, "feedforward": 0.99}
-    plain = pi | {"feedforward": 0.05}
-    others = [plain | dict(zip(_SPREAD, values.tolist())) for values in _spread(search.pi)]
+    first = {"Kc": 1.0, "Ti": 1.0, "setpoint": 1.0, "feedforward": 0.99}
+    plain = first | {"feedforward": 0.05}
+    starts = [plain | dict(zip(_SPREAD, values.tolist())) for values in _spread(search.pi)]
     lqr = {**parameters_of(search.baseline, search.spec), "drive": 1e-2}
     parts = joint_progress(progress, (_MPC_DONE, _PI_DONE - _MPC_DONE, 1.0 - _PI_DONE))
-    items = [
+    items: list[_Item] = [
         (search, "MPC", [_best(looked).parameters], max(0, n - len(looked)), parts[0]),
-        (search, "PI", [pi, plain, *others][search.certain :], 3 * n, parts[1]),
+        (search, "PI", [first, plain, *starts][search.certain :], 3 * n, parts[1]),
         (search, "LQR", [lqr], n, parts[2]),
     ]
-    tried = run_threads(_optimise, items, workers)
-    found = {name: trials for (_, name, *_), trials in zip(items, tried, strict=True)}
-    return {**found, "MPC": [*looked, *found["MPC"]]}
+
+    def optimised(item: _Item) -> tuple[list[Trial], Trial | None]:
+        tried = _optimise(item)  # and sturdier PIs while the other two are still searched for
+        return _sturdiest(search, tried, workers) if item[1] == "PI" else (tried, None)
+
+    (mpc, _), (loops, pi), (others, _) = run_threads(optimised, items, workers)
+    assert pi is not None
+    return {"MPC": [*looked, *mpc], "PI": loops, "LQR": others}, pi
 
 
 _SPREAD = {"Kc": (0.4, 2.5), "Ti": (0.4, 2.5), "setpoint": (0.2, 1.0), "feedforward": (0.05, 1.0)}
@@ -597,7 +608,11 @@ def _spread(bounds: Sequence[tuple[str, float, float]]) -> Array:
     return np.asarray(np.exp(low + Halton(len(ends), scramble=False).random(33)[1:] * (high - low)))
 
 
-def _optimise(item: tuple[Search, str, list[dict[str, float]], int, Progress | None]) -> list[Trial]:
+#: What searches, of which controller, its starts, the number of evaluations.
+_Item: TypeAlias = "tuple[Search, str, list[dict[str, float]], int, Progress | None]"
+
+
+def _optimise(item: _Item) -> list[Trial]:
     """Minimise a controller's score over its parameters' logarithms from the best of its starts on; return
     every trial."""
     search, name, starts, evaluations, progress = item
@@ -657,9 +672,9 @@ def _compare(
     return results
 
 
-def _runs(search: Search, controller: Controller, lqr: Design, workers: Workers) -> dict[str, ClosedLoop]:
+def _runs(search: Search, design: Design, lqr: Design, workers: Workers) -> dict[str, ClosedLoop]:
     """Return every step on the first unseen draw by the controller as it is used, by PI and by LQR."""
-    designs = {"MPC": controller.design, "PI": controller.design, "LQR": lqr}
+    designs = {"MPC": design, "PI": design, "LQR": lqr}
     items = [(search, name, design, step) for step in search.spec.steps for name, design in designs.items()]
     done = run_parallel(_shown, items, workers, what="runs")
     named = [f"{start:g} to {target:g}, {name}" for _, name, _, (start, target) in items]

@@ -84,6 +84,7 @@ def scored(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
         "thermogrip.report.classification.score_table",
         lambda found: (HEAD, tuple(("bayes", name, "0.9", "0.1", "3") for name in found.conditions)),
     )
+    made.drawn = stand_in("thermogrip.report.html.draw")
     made.pages = stand_in("thermogrip.report.html.write_report")
     return made
 
@@ -129,7 +130,8 @@ def test_what_is_split_how_and_by_whom_it_is_scored(
     assert [call.quick for call in scored.asked] == [False, True]
     assert {call.seed for call in scored.asked} == {4}
     [call] = scored.threads
-    assert ([*call.args[1]], call.args[2]) == (splits, 3)
+    assert ([*call.args[1]], call.args[2]) == ([*splits, "features"], 3)
+    assert [call.args[0] for call in scored.drawn] == [*([f"of {name}"] for name in splits), []]
     [page] = scored.pages
     assert page.args[0] == Path("c/report.html")
     assert page.args[3] == [f"of {name}" for name in splits]
@@ -262,6 +264,16 @@ def test_curves_show_what_more_grasps_time_and_difference_bring(
     assert plain == ["curves"]
     assert seen[1] == (pytest.approx(0.65), "contact time: x")
     assert verb._curves(*given[:2], [record.drop_vars("split")], *given[3:]) == ["curves"]
+
+
+def test_a_fault_of_the_features_is_said_after_that_nothing_was_scored(
+    scored: SimpleNamespace, stand_in: StandIn
+) -> None:
+    stand_in("thermogrip.cli.compare._features", UserError("no features"))
+    words = ["compare", "grasps.csv", "--classifiers", "bayes", "--repeats", "0", "--out", "c"]
+    assert "no features" in scored.bench.run(*words).err
+    scored.of["shipped"] = Found("shipped", empty=True)
+    assert "nothing to score" in scored.bench.run(*words).err
 
 
 def test_the_curves_stand_after_the_scores(scored: SimpleNamespace, stand_in: StandIn) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,7 +17,8 @@ from thermogrip.cli.options import choice, comma, new_file, new_folder, workers_
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import make_log
 from thermogrip.report.console import Console
-from thermogrip.sysid.models.network import NetworkModel
+from thermogrip.sysid.greybox.problem import prior_plant
+from thermogrip.sysid.models.network import NetworkModel, load_network
 
 
 def test_a_list_of_words_is_cut_at_commas_and_names_something() -> None:
@@ -32,11 +35,43 @@ def test_a_list_of_words_is_cut_at_commas_and_names_something() -> None:
         asked("c")
 
 
-def test_work_is_done_by_processes_or_by_the_cluster_that_is_named() -> None:
+def test_work_is_done_by_processes_or_by_the_cluster_that_is_named(stand_in: StandIn) -> None:
     assert workers_of(3, None) == 3
     assert workers_of(3, "tcp://10.0.0.1:8786") == "tcp://10.0.0.1:8786"
+    begun = stand_in("thermogrip.datasets.parallel.begin_processes")
+    for cluster in (None, "tcp://10.0.0.1:8786"):
+        workers_of(3, cluster, "a", "b")
+    assert [call.args for call in begun] == [(3, ("a", "b")), ("tcp://10.0.0.1:8786", ("a", "b"))]
     with pytest.raises(UserError, match="write tcp://HOST:PORT"):
         workers_of(3, "localhost")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "compare grasps.csv --out c",
+        "identify log.csv --out p.json",
+        "tune plant.json --out c.json",
+        "effusivity grasps.csv --out e.csv",
+    ],
+)
+def test_processes_begin_to_import_before_this_one_does(tmp_path: Path, words: str) -> None:
+    (tmp_path / "grasps.csv").write_text("grasp_id,time_s,t_surface_degC\n")
+    (tmp_path / "grasps_meta.csv").write_text("grasp_id,material,t_object_nominal_degC\n")
+    (tmp_path / "log.csv").write_text("t,q,y\n")
+    prior_plant(load_network("tclab")).save(tmp_path / "plant.json")
+    program = f"""if __name__ == "__main__":
+        import os, sys
+        from thermogrip.cli.main import main
+        from thermogrip.datasets import parallel
+        def begin(workers, modules):
+            os.write(1, f"{{workers}} {{'scipy' in sys.modules}} {{all(map(__import__, modules))}}".encode())
+            os._exit(0)
+        parallel.begin_processes = begin
+        main({[*words.split(), "--workers", "2"]!r})
+    """
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True)
+    assert done.stdout == "2 False True", done.stderr
 
 
 def test_a_file_and_a_folder_to_write_are_not_each_other_and_are_made_room_for(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import os
+import pickle
 import re
 import signal
 import subprocess
@@ -12,7 +13,7 @@ import sys
 import threading
 import time
 import weakref
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from types import SimpleNamespace
 
@@ -24,6 +25,7 @@ from thermogrip.datasets import parallel
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.parallel import (
     Replaced,
+    begin_processes,
     in_order,
     joint_progress,
     kept_processes,
@@ -286,8 +288,6 @@ def test_the_progress_of_a_part_stays_in_its_share_and_has_its_name():
 
 
 def test_a_user_error_survives_the_way_between_processes():
-    import pickle
-
     fault = UserError("bad", file="a.csv", row=3, column="x", hint="correct it")
     back = pickle.loads(pickle.dumps(fault))  # noqa: S301  what a process pool does
     assert str(back) == "a.csv, row 3, column x: bad; correct it"
@@ -322,6 +322,33 @@ def test_a_fault_on_a_cluster_is_raised_here_as_it_was(cluster):
         run_parallel(math.factorial, [3, -1, 4], cluster)
 
 
+@pytest.mark.slow  # starts four processes
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
+def test_a_cluster_does_again_what_a_killed_worker_had_in_hand_and_takes_in_a_late_one(tmp_path) -> None:
+    distributed = pytest.importorskip("distributed")
+    mark, late = tmp_path / "killed", tmp_path / "late"
+    kill = f"{{n}} if __import__('os').path.exists({str(mark)!r}) else " + (
+        f"(open({str(mark)!r}, 'w').close(), __import__('os').kill(__import__('os').getpid(), 9))"
+    )
+    named = f"open({str(late)!r} + str(__import__('os').getpid()), 'w').close()"
+    pid = f"(__import__('time').sleep(0.2), {named}, {{n}})[2]"
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=":0"
+    ) as made:
+        address = made.scheduler_address
+        begin_processes(address, ["thermogrip.datasets.schema"])
+        with kept_processes(address):
+            items = [(kill if n == 3 else pid).format(n=n) for n in range(40)]
+            seen = []
+            for n, found in enumerate(in_order(eval, items, address)):
+                seen.append(found)
+                if n == 0:
+                    made.scale(2)
+            assert seen == list(range(40))
+    assert mark.exists()
+    assert len(list(tmp_path.glob("late*"))) >= 3  # the first, its successor, and the late one
+
+
 def test_a_cluster_that_does_not_answer_is_one_line(monkeypatch):
     monkeypatch.setattr("thermogrip.datasets.parallel._CONNECT_S", 1)
     with pytest.raises(UserError, match="no scheduler answers at tcp"):
@@ -352,6 +379,39 @@ def test_what_a_killed_process_had_in_hand_is_done_again(tmp_path):
     assert got == list(range(8))
     assert mark.exists()
     assert seen == [pytest.approx(n / 8) for n in range(1, 9)]
+
+
+class Silent:
+    """A pool that breaks over its first items and answers none of them."""
+
+    def __init__(self) -> None:
+        self.ended, self.asked, self._processes = [], 0, {1: SimpleNamespace(terminate=self._terminated)}
+
+    def _terminated(self) -> None:
+        self.ended.append("process")
+
+    def submit(self, function, *items):
+        self.asked += 1
+        if not items:
+            raise BrokenProcessPool
+        return Future()
+
+    def shutdown(self, wait=True, cancel_futures=False) -> None:
+        self.ended.append("pool")
+        self._processes = None
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_items_that_a_broken_pool_does_not_answer_are_done_by_the_next_one(monkeypatch, kept) -> None:
+    first = Silent()
+    pools = [first, ThreadPoolExecutor(2)]
+    monkeypatch.setattr(parallel, "_LOOK_S", 0.01)
+    monkeypatch.setattr(parallel.os, "cpu_count", lambda: 8)
+    monkeypatch.setattr(parallel, "_processes", lambda n: pools.pop(0))
+    with kept_processes(2 if kept else 1):
+        assert run_parallel(math.factorial, [3, 4, 5], 2) == [6, 24, 120]
+    assert first.asked == 4
+    assert first.ended[:2] == ["pool", "process"]
 
 
 def test_results_that_were_given_are_not_kept():
@@ -400,12 +460,70 @@ def test_one_worker_is_a_thread_here() -> None:
 
 def test_on_a_worker_freed_memory_is_kept(monkeypatch) -> None:
     said: list[tuple[int, int]] = []
+    sys.setswitchinterval(5e-3)
     monkeypatch.setattr(parallel.sys, "platform", "linux")
     library = SimpleNamespace(mallopt=lambda *pair: said.append(pair))
     monkeypatch.setattr(parallel.ctypes, "CDLL", lambda _: library)
     parallel._keep_memory.cache_clear()
-    assert [parallel._with_memory_kept(math.factorial, n) for n in (3, 4)] == [6, 24]
+    assert [on_worker(math.factorial, n) for n in (3, 4)] == [6, 24]
+    assert sys.getswitchinterval() < 1e-3  # a result waits for the thread that computes the next one
     assert said == [(-1, 1 << 28), (-3, 1 << 25)]  # once a process
     monkeypatch.setattr(parallel.ctypes, "CDLL", lambda _: SimpleNamespace())  # a C library without it
     parallel._keep_memory.cache_clear()
-    assert parallel._with_memory_kept(math.factorial, 3) == 6
+    assert on_worker(math.factorial, 3) == 6
+
+
+def on_worker(function, item):
+    pytest.importorskip("distributed")
+    return pickle.loads(parallel._on_worker(pickle.dumps((function, item))))  # noqa: S301
+
+
+def test_a_worker_begins_with_a_task_once_it_has_imported(monkeypatch) -> None:
+    """Two threads that import modules which import each other find one of them half made."""
+    may, begun = threading.Event(), threading.Event()
+    on_worker(math.factorial, 3)  # which imports distributed
+    monkeypatch.setattr(parallel, "_importing", [])
+    monkeypatch.setattr(parallel, "import_module", lambda name: may.wait(10))
+    assert parallel._greeted(["slow"]) == parallel._versions()
+    with ThreadPoolExecutor(1) as other:
+        done = other.submit(lambda: begun.set() or on_worker(math.factorial, 3))
+        begun.wait(10)
+        time.sleep(0.05)
+        assert not done.done()
+        may.set()
+        assert done.result() == 6
+
+
+class Unpacked:
+    """Notes in which thread it is unpacked."""
+
+    def __reduce__(self):
+        seen = "__import__('thermogrip.datasets.parallel').datasets.parallel._unpacked"
+        return eval, (f"{seen}.append(__import__('threading').current_thread().name)",)
+
+
+def test_a_cluster_unpacks_an_item_where_it_computes_and_not_at_its_scheduler(cluster, monkeypatch) -> None:
+    """The scheduler would import all that an item needs, before a worker may begin."""
+    monkeypatch.setattr(parallel, "_unpacked", [], raising=False)
+    assert run_parallel(repr, [Unpacked() for _ in range(3)], cluster) == ["None"] * 3
+    assert ["Dask-" in name for name in parallel._unpacked] == [True] * 3
+
+
+def test_a_cluster_imports_from_the_first_word_on_and_its_first_work_has_the_same_client(
+    cluster, monkeypatch
+) -> None:
+    made, connected = [], parallel._connected
+    monkeypatch.setattr(parallel, "_connected", lambda *given: made.append(connected(*given)) or made[-1])
+    monkeypatch.setattr(parallel, "_importing", [])
+    monkeypatch.delitem(sys.modules, "colorsys", raising=False)
+    for _ in range(2):
+        begin_processes(cluster, ["no_such_module", "colorsys"])
+    for thread in parallel._importing:
+        thread.join(10)
+    assert "colorsys" in sys.modules
+    assert run_parallel(math.factorial, [3, 4], cluster) == [6, 24]
+    [client] = made
+    assert client.status == "closed"
+    assert not parallel._clients
+    with pytest.raises(UserError, match="no address of a scheduler"):
+        begin_processes("localhost", ["colorsys"])

@@ -71,6 +71,45 @@ def test_logs_left_out_on_other_processes_give_the_same(monkeypatch):
     assert "subspace without b: no" in shared.notes
 
 
+def test_the_network_is_fitted_to_all_logs_beside_those_that_leave_one_out(monkeypatch):
+    """Else the other processes have nothing to do meanwhile."""
+    board, own = prior_plant(load_network("tclab")), identification._fit
+    logs, rng, t = [], np.random.default_rng(0), np.arange(0.0, 400.0, 2.0)
+    for name in "ab":
+        drives = [np.repeat(rng.uniform(0, 80, 10), 20) for _ in range(2)]
+        signals = {f"q{i + 1}": (drive, "percent", "input") for i, drive in enumerate(drives)}
+        signals |= {key: (np.full(t.size, 23.0), "degC", "output") for key in ("t1", "t2")}
+        log = board.simulate(make_log(t, signals, name=name))
+        for key in ("t1", "t2"):
+            log[key] = ("time", log[key].values + 0.1 * rng.normal(size=t.size), log[key].attrs)
+        logs.append(log)
+    place: list[str] = ["here"]
+    fits: list[tuple[str, int]] = []
+
+    def fit(asked, model, train, report):
+        fits.append((place[-1], len(train)))
+        return own(asked, model, train, report)
+
+    def parallel(function, items, workers, *_, **__):
+        place.append("elsewhere")
+        found = [function(item) for item in items]
+        place.pop()
+        return found
+
+    monkeypatch.setattr(identification, "_fit", fit)
+    monkeypatch.setattr(identification, "run_parallel", parallel)
+    how = {"network": "tclab", "models": ["network"], "leave_one_out": True, "draws": 0}
+    alone = identify(logs, **how)
+    assert fits == [("here", 1), ("here", 1), ("here", 2)]
+    fits.clear()
+    shared = identify(logs, **how, workers=2)
+    assert fits == [("elsewhere", 2), ("elsewhere", 1), ("elsewhere", 1)]
+    files = [each.plant.to_dict() for each in (shared, alone)]
+    for file in files:
+        assert file["scores"].pop("seconds") > 0
+    assert (shared.rows, files[0]) == (alone.rows, files[1])
+
+
 def test_leaving_one_log_out_gives_a_row_for_every_model_and_log():
     logs = [plant_log(500, seed=s, name=name) for s, name in enumerate("abc")]
     found = identify(logs, models=["arx", "subspace"], leave_one_out=True, average=2.0, draws=0)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING, Annotated, Any
 
 from thermogrip.classify.estimators import classifier_names
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
 BY_DEFAULT = ("lstm", "posterior", "bayes", "features-lda", "pca-lda")
 MOST_CONDITIONS = 4  # that are printed one by one
+NEEDED = ("thermogrip.classify.evaluation.harness", "thermogrip.sysid.effusivity.mode_kernel")  # by workers
 LARGE = 32e6  # bytes of test files, some 9000 grasps as CSV: beyond them they are read part by part
 
 
@@ -87,13 +89,13 @@ def compare(
         hint = "give others to --test, or leave it out: a part of each material is then held back"
         raise UserError("is to be trained and tested on", file=min(both), hint=hint)
 
+    pool = cli.workers_of(workers, cluster, *NEEDED)
     from thermogrip.classify.estimators.registry import trainable
     from thermogrip.classify.evaluation.harness import evaluate
     from thermogrip.datasets.grasp_files import read_grasp_files
     from thermogrip.datasets.parallel import joint_progress, kept_processes, run_threads, sub_progress
     from thermogrip.datasets.partitions import stamps
 
-    pool = cli.workers_of(workers, cluster, "thermogrip.classify.evaluation.harness")
     names = cli.comma(classifiers)
     models, missing = trainable(names or BY_DEFAULT, quick=quick, seed=seed)
     if not models:
@@ -141,16 +143,24 @@ def compare(
             )
         if by is not None:
             asked[by] = partial(evaluate, fast, records, split=by, progress=shares["by"], **again)
-        # side by side: processes that one of them leaves idle work for another
-        found |= zip(asked, run_threads(lambda name: asked[name](), asked, pool), strict=True)
-        found = {name: comparison for name, comparison in found.items() if _scored(console, name, comparison)}
+        page = _Page(left_out)
+
+        def work(name: str) -> Comparison | None:
+            if name == "features":  # which need no other process
+                page.add(name, partial(_features, models, records))
+                return None
+            return page.compared(name, found[name] if name in found else asked[name]())
+
+        # side by side: processes that one of them leaves idle work for another, the page is drawn meanwhile
+        parallel = [*found, *asked, "features"]
+        done = dict(zip(parallel, run_threads(work, parallel, pool), strict=True))
+        found = {name: each for name, each in done.items() if each and _scored(console, name, each, left_out)}
         if not found:
             raise UserError("nothing to score", hint="test on grasps of the materials that were trained")
-        more = _features(models, records)
+        more = page.sections("features")
         if curves:
             more += _curves(console, fast, records, found, seed, pool, shares["curves"], out)
-    found = {name: replace(each, notes=(*left_out, *each.notes)) for name, each in found.items()}
-    _write_comparisons(console, found, out, more)
+    _write_comparisons(console, found, out, [*page.sections(*found), *more])
     if large:
         kept_answers(out, []).remove()
     return 0
@@ -257,11 +267,48 @@ def _shares(given: bool, random: bool, by: bool, curves: bool) -> dict[str, tupl
     return {name: (weight / total, title) for name, (weight, title) in weights.items() if weight}
 
 
-def _scored(console: Console, name: str, comparison: Comparison) -> bool:
-    """Return whether any test grasp could be scored; where none was, the notes say why."""
+class _Page:
+    """Sections of the report, which are made and drawn as soon as they can be, one after the other:
+    matplotlib is not for several threads."""
+
+    def __init__(self, notes: Sequence[str]) -> None:
+        self._notes, self._lock = tuple(notes), Lock()
+        self._sections: dict[str, list[Section]] = {}
+        self._faults: dict[str, UserError] = {}
+
+    def add(self, name: str, make: Callable[[], list[Section]]) -> None:
+        """Make the sections of a name, and draw them."""
+        from thermogrip.report.html import draw
+
+        with self._lock:
+            try:
+                self._sections[name] = made = make()
+                draw(made)
+            except UserError as error:  # said where they are asked for
+                self._faults[name] = error
+
+    def compared(self, name: str, comparison: Comparison) -> Comparison:
+        """Return a comparison with the notes of all of them, its section made."""
+        from thermogrip.report.classification import comparison_sections
+
+        comparison = replace(comparison, notes=(*self._notes, *comparison.notes))
+        if comparison.scores():
+            self.add(name, partial(comparison_sections, name, comparison))
+        return comparison
+
+    def sections(self, *names: str) -> list[Section]:
+        """Return the sections of these names."""
+        for name in names:
+            if name in self._faults:
+                raise self._faults[name]
+        return [section for name in names for section in self._sections[name]]
+
+
+def _scored(console: Console, name: str, comparison: Comparison, known: Sequence[str]) -> bool:
+    """Return whether any test grasp could be scored; where none was, notes that are not known say why."""
     if comparison.scores():
         return True
-    for note in comparison.notes:
+    for note in comparison.notes[len(known) :]:
         console.warn(f"{name}: {note}")
     return False
 
@@ -325,18 +372,14 @@ def _decisions(
 
 
 def _write_comparisons(
-    console: Console, found: dict[str, Comparison], out: Path, more: Sequence[Section]
+    console: Console, found: dict[str, Comparison], out: Path, sections: Sequence[Section]
 ) -> None:
     """Print and write the scores of each kind of split, and the report."""
-    from thermogrip.report.classification import comparison_sections
     from thermogrip.report.html import write_report
 
-    sections = []
     for name, comparison in found.items():
         comparison.save(out / name)
         _show(console, name, comparison)
-        sections += comparison_sections(name, comparison)
-    sections += more
     write_report(out / "report.html", "What was touched", "Classifiers on the same grasps.", sections)
     console.say(f"wrote {out}/report.html and tables beside it")
     splits = {

@@ -44,11 +44,11 @@ def tune(
     baseline, tuned, PI and LQR side by side, what can be traded, and which weights matter.
     """
     cli.new_file(out, (".json",))
+    pool = cli.workers_of(workers, cluster, "thermogrip.mpc.tuning.tune")
     from thermogrip.datasets.parallel import kept_processes
     from thermogrip.mpc.design.spec import Spec, read_spec
     from thermogrip.mpc.tuning.tune import tune as search
 
-    pool = cli.workers_of(workers, cluster, "thermogrip.mpc.tuning.tune")
     loaded = cli.load_plant(plant, network)
     wanted = Spec.of(loaded) if spec is None else read_spec(spec)
     console = Console(as_json)

@@ -193,15 +193,14 @@ def numbers(option: str, text: str | None) -> dict[str, float]:
 
 
 def workers_of(workers: int, cluster: str | None, *modules: str) -> int | str:
-    """Return who does the work: so many local processes, which begin to import ``modules``, or the cluster
-    where one is named."""
+    """Return who does the work: so many local processes, or the cluster where one is named; they begin to
+    import ``modules``."""
     from thermogrip.datasets.parallel import begin_processes, check_workers
 
-    if cluster is not None:
-        return check_workers(cluster)
+    pool = workers if cluster is None else check_workers(cluster)
     if modules:
-        begin_processes(workers, modules)
-    return workers
+        begin_processes(pool, modules)
+    return pool
 
 
 def choice(option: str, value: str, allowed: Sequence[str]) -> str:

@@ -23,7 +23,7 @@ import re
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -108,7 +108,7 @@ class Picture:
     caption: str
     kind: str = "picture"
 
-    @property
+    @cached_property
     def data_uri(self) -> str:
         """Return the figure as a ``data:`` address, SVG or PNG."""
         return _data_uri(self.figure)
@@ -186,6 +186,14 @@ class Section:
     def __post_init__(self) -> None:
         if self.tone not in TONES:
             raise ValueError(f"tone {self.tone!r} is none of {TONES}")
+
+
+def draw(sections: Sequence[Section]) -> None:
+    """Draw the figures of sections now: else they are drawn as the page is written."""
+    for section in sections:
+        for part in section.parts:
+            if isinstance(part, Picture):
+                _ = part.data_uri
 
 
 def html_page(title: str, lead: str, sections: Sequence[Section]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable
 from dataclasses import FrozenInstanceError, dataclass, field, replace
 from functools import partial
@@ -564,6 +565,27 @@ def test_of_pis_that_score_alike_the_one_is_taken_that_bears_most(
     assert {**found.parameters, "Kc": 1.0, "Ti": 0.5} == best
     # none beyond what leaves half more of a load's integrated error than SIMC
     assert all(trial.parameters["Ti"] <= 1.5 * trial.parameters["Kc"] + 1e-12 for trial in tried[1:])
+
+
+def test_sturdier_pis_are_tried_while_others_are_still_searched_for(monkeypatch: pytest.MonkeyPatch):
+    sturdy, spec = threading.Event(), SimpleNamespace(evaluations=2)
+
+    def optimise(item: Any) -> list[str]:
+        if item[1] == "LQR":
+            assert sturdy.wait(20)
+        return [item[1]]
+
+    def sturdiest(search: Any, tried: list[str], workers: int) -> tuple[list[str], str]:
+        sturdy.set()
+        return [*tried, "sturdy"], "sturdy"
+
+    monkeypatch.setattr(tuner, "_optimise", optimise)
+    monkeypatch.setattr(tuner, "_sturdiest", sturdiest)
+    monkeypatch.setattr(tuner, "parameters_of", lambda *_: {})
+    search: Any = SimpleNamespace(spec=spec, pi=PI_PARAMETERS, certain=False, baseline=None)
+    looked: Any = [Trial("MPC", {}, 1.0, 50.0, 0.1, 5.0)]
+    found, pi = tuner._search_all(search, looked, 2, None)
+    assert (pi, found) == ("sturdy", {"MPC": [*looked, "MPC"], "PI": ["PI", "sturdy"], "LQR": ["LQR"]})
 
 
 def test_the_file_holds_what_was_found(done: Done):
