@@ -110,7 +110,7 @@ def test_the_runs_can_be_drawn(tuning):
 
 
 SPEC = Spec(
-    steps=[(28, 36), (28, 20)], hold_s=260.0, evaluations=14, sample_time_s=4.0, settle_within_s=250.0
+    steps=[(28, 36), (28, 20)], hold_s=260.0, evaluations=17, sample_time_s=4.0, settle_within_s=250.0
 )
 STEPS = [(28.0, 36.0), (28.0, 20.0)]
 UNSEEN = [101, 102, 103]
@@ -147,7 +147,7 @@ class Paper:
     def __post_init__(self) -> None:
         self.check_seed = self.seed + 7
         self.bounds = {(*step, draw): 100.0 for step in STEPS for draw in (*self.draws, *self.unseen)}
-        self.at_once = ["t_surface"]
+        self.at_once, self.pi_moves, self.travel = ["t_surface"], {}, 10.0
         self._ramps = partial(Search._ramps, self)  # type: ignore[arg-type]
 
     def design(self, parameters: dict[str, float]) -> Design:
@@ -248,32 +248,34 @@ def done(tank: Any) -> Done:
 
 def test_moves_filters_and_horizons_are_looked_at_and_the_best_is_searched_from(done: Done):
     start = parameters_of(done.search.baseline, SPEC)
-    first, rest = done.tried("MPC")[:10], done.tried("MPC")[10:]
+    first, rest = done.tried("MPC")[:13], done.tried("MPC")[13:]
     assert first[0].parameters == start
-    assert [trial.parameters["move"] for trial in first] == [1.0, 10.0, 100.0, 1000.0, *[10.0] * 6]  # best: 6
-    walks = [trial.parameters["state_walk"] for trial in first[3:8]]
+    assert [trial.parameters["move"] for trial in first] == [1.0, 10.0, 100.0, 1000.0, *[10.0] * 9]  # best: 6
+    shares = [trial.parameters.get("still") for trial in first]
+    assert shares == [*[None] * 4, 0.03, 0.1, 0.3, *[None] * 6]  # the price of travel does nothing here
+    walks = [trial.parameters["state_walk"] for trial in first[6:11]]
     assert walks == pytest.approx([0.005, 0.0015, 0.0005, 0.005, 0.005])  # it does nothing here
     walk = start["output_walk"]
-    trusts = [trial.parameters["output_walk"] for trial in first[5:]]
+    trusts = [trial.parameters["output_walk"] for trial in first[8:]]
     assert trusts == pytest.approx([walk, 3 * walk, 10 * walk, walk, walk])
-    assert [trial.parameters["horizon"] for trial in first[7:]] == [38.0, 27.0, 57.0]
+    assert [trial.parameters["horizon"] for trial in first[10:]] == [38.0, 27.0, 57.0]
     assert {trial.parameters["horizon"] for trial in rest} == {57.0}
     assert rest[0].parameters == pytest.approx(
-        first[9].parameters
+        first[12].parameters
     )  # the search begins where the look was best
     assert not any("ramp" in trial.parameters for trial in done.tried("MPC"))  # nothing overshoots
 
 
 def test_where_the_best_look_overshoots_targets_that_ramp_are_looked_at_and_searched_from(tank: Any):
     done = tuned(tank, ramped=0.5, overshoots=0.28)
-    first, rest = done.tried("MPC")[10:12], done.tried("MPC")[12:]
+    first, rest = done.tried("MPC")[13:15], done.tried("MPC")[15:]
     assert [trial.parameters["ramp"] for trial in first] == [1.3, 1.7]
     assert {trial.parameters["ramp"] for trial in rest} == {1.3}
     design = done.tuning.controller.design
     assert design.ramp_per_s == {"t_surface": pytest.approx((8 - 0.25) / 130)}
     assert "Targets ramp, which spares overshoot: t_surface by 0.06 degC/s." in done.tuning.finding
     assert "ramp" in {found.knob for found in done.tuning.sensitivity}
-    assert not any("ramp" in t.parameters for t in tuned(tank, ramped=1.5, overshoots=0.28).tried("MPC")[12:])
+    assert not any("ramp" in t.parameters for t in tuned(tank, ramped=1.5, overshoots=0.28).tried("MPC")[15:])
 
 
 def test_every_controller_has_as_many_trials_and_keeps_to_its_ranges(done: Done):
@@ -446,9 +448,8 @@ def test_trials_of_the_search_that_were_at_full_length_are_not_run_again():
     )
     found = {name: [trial(name, 1.0), trial(name, 10.0)] for name in ("MPC", "PI", "LQR")}
     pareto, _ = tuner._trade(search, found, found["PI"][0], 1, None)
-    assert [move for name, move in asked if name == "MPC" and move in (1.0, 10.0)] == [
-        1.0
-    ] * 4  # with less drive
+    again = [move for name, move in asked if name == "MPC" and move in (1.0, 10.0)]
+    assert again == [1.0] * 7  # four with less drive, three with a price of travel
     assert [name for name, _ in asked if name != "MPC"] == ["LQR"]
     shown = dict(zip(pareto.names, pareto.trials, strict=True))
     assert shown["moves 10 times as dear"].score == 2.0
