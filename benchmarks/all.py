@@ -70,6 +70,7 @@ ALL = [
     Benchmark("control/mismatch.py", quick="--seeds 4 --only delay"),
     Benchmark("control/detectable.py"),
     Benchmark("control/faults.py", quick="--seeds 4"),
+    Benchmark("control/least_moves.py", quick="--most 240"),
     Benchmark(
         "control/ten_plants.py", "--keep {out}/ten", "--plants tclab --without do-mpc --keep {out}/ten"
     ),
