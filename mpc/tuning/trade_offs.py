@@ -132,7 +132,7 @@ PARAMETER_WORDS = {
     "horizon": "the horizon",
     "blocks": "the number of blocks",
     "ramp": "the target's ramp",
-    "still": "the error that moves no drive, in shares of the allowed bias,",
+    "still": "the price of travel, in allowed biases",
 }
 
 _FACTORS = (1.3, 3.0, 10.0)
