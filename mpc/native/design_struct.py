@@ -182,7 +182,7 @@ def sizes_of(controller: ControllerParts, code: ModelCode, *, room: bool, single
     controlled, limited = (n_y, n_y) if room else (len(design.controlled), len(design.limits))
     most = -(-N // 32) * 32 if room else N
     longest = _whole(len(design.blocks) * model.n_u)
-    moves = len(design.blocks) * model.n_u if design.travel > 0 else 0
+    moves = len(design.blocks) * model.n_u if room or design.travel > 0 else 0
     entries = most * longest if room else _row_lengths(design.blocks, model.n_u)
     return Sizes(
         NX=model.n_x,

@@ -461,7 +461,7 @@ class _Built:
 
 def _structure(design: Design) -> Any:
     """Return on what it depends which C a design needs."""
-    return design.blocks, tuple(design.ramp_per_s), design.travel > 0
+    return design.blocks, tuple(design.ramp_per_s)
 
 
 def _unpacked_here(packed: bytes) -> Search:
