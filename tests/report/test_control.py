@@ -43,7 +43,8 @@ def tuning_of(**changes: Any) -> Any:
         steps=STEPS, settle_within_s=180.0, band_degC=0.25, overshoot_degC=0.5, bias_degC=0.1, hold_s=200.0,
         energy_weight=2.0, ambient_degC=25.0, noise_degC=0.04, sensor_offset_degC=0.3, search_draws=2,
         check_draws=5, evaluations=30, moves_weight=0.03, moves_limit=1.4, extra_lag=0.4, extra_delay=0.6,
-        lost_gain=0.1, zones={"t1": 1.0}, hard=["t1", "t2"], energy_price=None, tariff=[(0.0, 1.0), (600.0, 3.0)],
+        lost_gain=0.1,
+        zones={"t1": 1.0}, hard=["t1", "t2"], energy_price=None, tariff=[(0.0, 1.0), (600.0, 3.0)],
         ramp_per_s=None, safe_drive={}, limits={"t1": (-1e12, 60.0), "t2": (5.0, 70.0)}, weights=None,
         settling=None, ramps=False, on_off=None, disturbances=None,
     )  # fmt: skip
@@ -188,14 +189,15 @@ def test_what_was_asked_stands_beside_the_design() -> None:
         ("asked", "value"), "The spec", ("found", "value"), "The design",
     )  # fmt: skip
     assert [value for _, value in asked.rows] == [
-        "28 to 38, 28 to 18", "180", "0.25", "0.5", "0.1", "200", "2", "0.03", "1.4", "25", "0.04", "0.3", "2",
-        "5", "30", "0.4", "0.6", "0.1", "t1 at most 60, t2 5 to 70", "t1 1", "t1, t2", "0: 1, 600: 3",
+        "28 to 38, 28 to 18", "180", "0.25", "0.5", "0.1", "200", "2", "0.03", "1.4", "25", "0.04", "0.3",
+        "2", "5", "30", "0.4", "0.6", "0.1", "t1 at most 60, t2 5 to 70", "t1 1", "t1, t2", "0: 1, 600: 3",
     ]  # fmt: skip
     assert asked.rows[1] == ("settle within [s]", "180")
     assert dict(found.rows) == {
         "regulated": "t1, t2", "sample time [s]": "2", "horizon [s]": "60", "blocks [samples]": "1 2 4",
         "range of q": "0 to 100", "slew of q [1/s]": "5", "move weight": "0.125", "price of travel": "1.5",
-        "terminal weight": "3", "overshoot band [degC]": "0.75", "process noise of a drive's disturbance": "0.01",
+        "terminal weight": "3",
+        "overshoot band [degC]": "0.75", "process noise of a drive's disturbance": "0.01",
         "process noise of an output's disturbance": "0.02", "disturbances estimated": "q, t1",
     }  # fmt: skip
 
