@@ -65,6 +65,7 @@ ALL = [
     Benchmark("excite/predicted_precision.py"),
     Benchmark("mpc/compare.py", quick="--quick", needs=("do_mpc",)),
     Benchmark("mpc/sizes.py", "--peer", "--quick --states 4"),
+    Benchmark("mpc/hpipm.py", needs=("hpipm_python",)),
     Benchmark("mpc/twenty_plants.py", quick="--plants 2"),
     Benchmark("mpc/call_periods.py", quick="--draws 0 --controllers MPC"),
     Benchmark("control/mismatch.py", quick="--seeds 4 --only delay"),
