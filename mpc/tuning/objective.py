@@ -283,8 +283,8 @@ PIMoves = dict[tuple[float, float, int], float]
 
 
 def moves_of(results: Sequence[StepResult]) -> PIMoves:
-    """Return how far drives moved in the runs that settled."""
-    settled = [result for result in results if np.isfinite(result.settle_s)]
+    """Return how far drives moved in the runs that settled; one that held its start says nothing."""
+    settled = [result for result in results if np.isfinite(result.settle_s) and result.travel > 0]
     return {(result.start, result.target, result.draw): result.travel for result in settled}
 
 
@@ -294,6 +294,7 @@ def score(
     """Return the score of a set of trials, see the module's text; lower is better; ``bounds`` are shortest
     times [s]; moves have no limit where those of a PI are not given."""
     costs: dict[tuple[float, float, int, str], list[float]] = {}
+    times_pi = spec.moves_limit or np.inf
     for result in results:
         bound, asked = bound_of(bounds, result), spec.asked(result.output)
         unit = max(bound if np.isfinite(bound) else result.length_s, asked.pace_s, 1.0)
@@ -306,7 +307,7 @@ def score(
         cost += _BIAS * max(0.0, abs(result.bias) / asked.bias_degC - FREE) if settled else 0.0
         cost += spec.energy_weight * result.energy_s / unit + spec.moves_weight * result.travel
         most = (pi_moves or {}).get((result.start, result.target, result.draw % STRUCTURE), np.inf)
-        cost += _MOVES * max(0.0, result.travel / (spec.moves_limit * most) - FREE)
+        cost += _MOVES * max(0.0, result.travel / (times_pi * most) - FREE)
         costs.setdefault((result.start, result.target, result.draw, result.output), []).append(cost)
     of = {key: float(np.mean(noises)) for key, noises in costs.items()}
     planned = expected(spec) | {0}

@@ -38,7 +38,8 @@ RESOLUTION = (1.0, 0.05, 0.005)
 _CAPS = (0.9, 0.75, 0.6, 0.5)
 _MOVES = (0.1, 0.3, 3.0, 10.0, 30.0, 100.0)
 _TRUST = (0.3, 0.1)
-_STILL = (0.03, 0.1, 0.3)
+#: Errors that move nothing, in allowed biases, at which travel is priced.
+STILL_SHARES = (0.03, 0.1, 0.3)
 #: How many minimum times the targets of ramped designs take.
 RAMPS = (1.3, 1.7)
 _KEPT = 6  # of the search's own trials
@@ -96,7 +97,7 @@ def scan_of(
             found.append((f"targets ramp for {times:g} times the minimum time", {**best, "ramp": times}))
     for factor in _MOVES:
         found.append((f"moves {factor:g} times as dear", {**best, "move": factor * best["move"]}))
-    for share in _STILL:
+    for share in STILL_SHARES:
         if share != best.get("still"):
             found.append(
                 (f"errors below {share:g} of the allowed bias move nothing", {**best, "still": share})

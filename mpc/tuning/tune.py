@@ -74,6 +74,7 @@ from thermogrip.mpc.tuning.robustness import worst_sensitivity
 from thermogrip.mpc.tuning.trade_offs import (
     PARAMETER_WORDS,
     RAMPS,
+    STILL_SHARES,
     Pareto,
     Sensitivity,
     front_of,
@@ -233,7 +234,7 @@ def _lacking(plant: Plant, design: Design, spec: Spec, results: Sequence[StepRes
 # less, or more, other horizons
 _LOOK = (
     ("move", (10.0, 100.0, 1000.0)),
-    ("still", (0.03, 0.1, 0.3)),
+    ("still", STILL_SHARES),
     ("state_walk", (0.3, 0.1)),
     ("output_walk", (3.0, 10.0)),
     ("horizon", (0.7, 1.5)),

@@ -384,6 +384,8 @@ def test_moves_beyond_the_limit_are_charged_as_overshoot_is():
     assert found == pytest.approx([3 + 3 * (3.0 / (1.5 * 1.25) - 0.9), 3.0])
     assert score([replace(one, travel=1.6)], spec, bounds, pi) == pytest.approx(3.0)
     free = spec.model_copy(update={"moves_limit": 0.0})
+    assert score([one], free, bounds, pi) == pytest.approx(3.0)
+    assert objective.moves_of([replace(one, travel=0.0)]) == {}
     assert search_of(lambda *at: 60.0, spec=free)._moves_of_pi() == {}
 
 
