@@ -3,9 +3,11 @@
     python benchmarks/workers.py FOLDER [effusivity compare tune identify] [--kill] [--files 12] [--large]
         [--workers 2]
 
-Each verb runs with one process, with ``--workers 2`` (or as many as are given) and, where ``distributed``
-is installed, on a Dask scheduler with as many worker processes of this machine, which are there before the
-clock starts. Efficiency is the wall time of one over that of n times n, the start of the program included.
+Each verb runs with one process on one core, with ``--workers 2`` (or as many as are given) and, where
+``distributed`` is installed, on a Dask scheduler with as many worker processes of this machine, which are
+there before the clock starts. Efficiency is the wall time of one over that of n times n, the start of the
+program included. One process is kept to one core, for some of its steps (rollouts of networks) run on all
+cores as threads; so it is measured what two cores are worth.
 With ``--kill`` a worker is ended by SIGKILL once it has computed for some seconds, and only bytes are
 compared.
 
@@ -71,11 +73,12 @@ def verbs(folder: Path, n_files: int, *, large: bool = False) -> dict[str, list[
     }  # fmt: skip
 
 
-def ran(words: list[str], cwd: Path | None = None, kill: bool = False) -> float:
+def ran(words: list[str], cwd: Path | None = None, kill: bool = False, *, one_core: bool = False) -> float:
     """Return the wall time [s] of one run, a worker of which may be killed."""
     begin = time.perf_counter()
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    with subprocess.Popen([sys.executable, "-m", "thermogrip", *words], cwd=cwd, **quiet) as process:
+    core = ["taskset", "--cpu-list", str(min(os.sched_getaffinity(0)))] if one_core else []
+    with subprocess.Popen([*core, sys.executable, "-m", "thermogrip", *words], cwd=cwd, **quiet) as process:
         if kill and not killed_one(process.pid):
             print("  no worker was there to be killed")
         if process.wait() not in (0, 1):
@@ -114,6 +117,7 @@ def cluster(folder: Path, n: int = 2) -> Iterator[tuple[str, int]]:
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": folder}
     ahead = [*run, "--no-dashboard", "--scheduler-file", str(file)]
     behind = [*work, "--nworkers", str(n), "--nthreads", "1", "--no-dashboard"]
+    behind += ["--preload", "thermogrip.cli.cluster"]  # as docs/howto/cluster.md starts them
     with subprocess.Popen(ahead, **quiet) as scheduler, subprocess.Popen(behind, **quiet) as two:
         from distributed import Client
 
@@ -173,7 +177,8 @@ def main() -> None:
                     wall = ran([*words[verb], "--cluster", address], out)
             else:
                 n = 1 if how == "one process" else given.workers
-                wall = ran([*words[verb], "--workers", str(n)], out, kill=given.kill and n > 1)
+                one = [*words[verb], "--workers", str(n)]
+                wall = ran(one, out, kill=given.kill and n > 1, one_core=n == 1)
             alone, first = alone or wall, first or digest(out)
             same = "same bytes" if digest(out) == first else "OTHER BYTES"
             share = "" if how == "one process" else f"efficiency {alone / wall / given.workers:.2f}"

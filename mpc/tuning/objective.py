@@ -38,16 +38,16 @@ from __future__ import annotations
 import threading
 import warnings
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.parallel import Workers, pack, run_parallel, unpack
+from thermogrip.datasets.parallel import Progress, Workers, pack, run_parallel, unpack
 from thermogrip.mpc.closed_loop.simulate import ClosedLoop, Segment, Surroundings, simulate_closed_loop
 from thermogrip.mpc.controllers.lqr import LQRController
 from thermogrip.mpc.controllers.mpc import Controller
@@ -441,6 +441,7 @@ class Trial:
 _Runs: TypeAlias = tuple[Sequence[int], int, bool]
 # closed loops that a process is given at once: a tenth of a second and more
 _RUNS_IN_C, _RUNS_IN_PYTHON, _PI_IN_C = 9, 3, 6
+_TRIALS_IN_C = 4  # of PIs
 
 
 class _Part(NamedTuple):
@@ -509,17 +510,18 @@ class Search:
         self._packed: bytes | None = None
         self._starts: dict[int, HeldStarts] = {}  # by draw
         self._codes: list[Any] = []
+        self._by_pi: dict[int, list[StepResult]] = {}  # of SIMC's PI, by draw
         self.draws = draws_of(plant, spec.search_draws)
         self.certain = self.draws == [0]  # no draws: the comparison takes the same plant, and fresh noise
         self.check_seed = seed + 1 if self.certain else seed
         # the comparison takes draws that the search has not seen
         self.unseen = [draw + _CHECK_FROM if draw else 0 for draw in draws_of(plant, spec.check_draws)]
+        cold = cold_steps(plant, spec, baseline.controlled)
+        self.whole_spec = spec.model_copy(update={"steps": [*spec.steps, *cold]})  # of trials at full length
         self.baseline = baseline
         self.bounds = self._first_bounds(sorted({*self.draws, *self.unseen}))
         self.baseline = baseline = paced(baseline, spec, self.bounds)
         self.bounds = ramped_bounds(self.bounds, baseline, spec)
-        cold = cold_steps(plant, spec, baseline.controlled)
-        self.whole_spec = spec.model_copy(update={"steps": [*spec.steps, *cold]})  # of trials at full length
         if cold:
             begun = spec.model_copy(update={"steps": cold})
             self.bounds |= bounds_of(plant, baseline, begun, self.draws)
@@ -540,38 +542,50 @@ class Search:
         self._packed = None
 
     def _first_bounds(self, draws: Sequence[int]) -> Bounds:
-        """Return the bounds on these draws; meanwhile one of several workers writes and builds the C."""
+        """Return the bounds on these draws; meanwhile one of several workers writes and builds the C, and
+        what else needs no bounds is worked out."""
         if self.workers == 1:
             return bounds_of(self.plant, self.baseline, self.spec, draws)
-        (self._compiled, self._codes, _), *found = run_parallel(
-            self._begin, [None, *draws], self.workers, what="bounds"
-        )
+        items: list[Callable[[], Any]] = [self._begin_c, *(partial(self._begin, draw) for draw in draws)]
+        if not self.spec.settling:  # else bounds may pace the default design
+            items.append(self._price)
+        (self._compiled, self._codes), *found = run_parallel(_called, items, self.workers, what="bounds")
         self._built.structures.add(_structure(self.baseline))
         remember_codes(self._codes)
         self._packed = None
         bounds: Bounds = {}
-        for draw, (_, starts, of) in zip(draws, found, strict=True):
+        for draw, (starts, of, by_pi) in zip(draws, found):
             self._starts[draw] = starts
             bounds |= of
+            if by_pi:
+                self._by_pi[draw] = by_pi
+        if not self.spec.settling:
+            self.travel = found[-1]
         return bounds
 
-    def _begin(self, draw: int | None) -> tuple[bool, Any, Bounds]:
-        """Return whether C can be had, the model's code and nothing; or of a draw where it is at rest, and
-        its bounds."""
-        if draw is None:
-            if self._compiled and self._in_c(self.baseline) is not None:
-                CompiledTruth(prediction_model(self.plant, self.plant.dt))
-            return self._compiled, known_codes(), {}
+    def _begin_c(self) -> tuple[bool, list[Any]]:
+        """Return whether C can be had, and the model's code."""
+        if self._compiled and self._in_c(self.baseline) is not None:
+            CompiledTruth(prediction_model(self.plant, self.plant.dt))
+        return self._compiled, known_codes()
+
+    def _begin(self, draw: int) -> tuple[HeldStarts, Bounds, list[StepResult]]:
+        """Return where a draw is at rest, its bounds and, if these cannot pace the default design, what
+        SIMC's PI does."""
         of = bounds_of(self.plant, self.baseline, self.spec, [draw])
-        return True, prediction_model(drawn(self.plant, draw), self.plant.dt).held_starts, of
+        by_pi = self._by_simc(draw) if self.spec.moves_limit and not self.spec.settling else []
+        return prediction_model(drawn(self.plant, draw), self.plant.dt).held_starts, of, by_pi
 
     def _moves_of_pi(self) -> PIMoves:
         """Return what the PI by SIMC moves, on the search's draws and on those of the comparison."""
         if not self.spec.moves_limit:
             return {}
-        draws = sorted({*self.unseen, *self.draws})
-        found = run_parallel(self._by_simc, draws, self.workers, what="moves of a PI")
-        return moves_of([result for results in found for result in results])
+        known, self._by_pi = self._by_pi, {}
+        if not known:
+            draws = sorted({*self.unseen, *self.draws})
+            found = run_parallel(self._by_simc, draws, self.workers, what="moves of a PI")
+            known = dict(zip(draws, found, strict=True))
+        return moves_of([result for results in known.values() for result in results])
 
     def _by_simc(self, draw: int) -> list[StepResult]:
         """Return the results on a draw of SIMC's PI by itself, at the rate at which readings come; it is not
@@ -635,6 +649,9 @@ class Search:
         """The price of travel at which a prediction that is off by the allowed bias moves no drive."""
         return _price_of_travel(self.plant, self.baseline, self.spec)
 
+    def _price(self) -> float:
+        return self.travel
+
     @property
     def at_once(self) -> list[str]:
         """The controlled outputs whose targets need not ramp."""
@@ -691,6 +708,19 @@ class Search:
             travel=float(np.mean([result.travel for result in results])),
         )
 
+    def evaluate_each(
+        self, name: str, several: Sequence[dict[str, float]], progress: Progress | None = None, *, what: str
+    ) -> list[Trial]:
+        """Return the trial of each of several sets of parameters; a process is given some at once."""
+        n = _TRIALS_IN_C if self._compiled else 1
+        parts = [several[at : at + n] for at in range(0, len(several), n)]
+        of = partial(self._trials, name)
+        done = run_parallel(of, parts, self.workers, progress, what=what, elsewhere=True)
+        return [tried for part in done for tried in part]
+
+    def _trials(self, name: str, several: Sequence[dict[str, float]]) -> list[Trial]:
+        return [self.evaluate(parameters, name) for parameters in several]
+
     def _results(
         self, name: str, parameters: dict[str, float] | None, runs: Sequence[_Runs], *, whole: bool
     ) -> list[StepResult]:
@@ -702,6 +732,8 @@ class Search:
         each = [([draw], seed, full) for draws, seed, full in runs for draw in draws]
         n = _RUNS_IN_C if self._compiled and name != "LQR" else _RUNS_IN_PYTHON
         n = max(1, (_PI_IN_C if name == "PI" and self._compiled else 1) * n // len(self.spec.steps))
+        if name != "PI":  # whose searches have others beside them
+            n = min(n, -(-len(each) // 2))
         parts = [_Part(name, parameters, whole, each[at : at + n]) for at in range(0, len(each), n)]
         done = run_parallel(self._run, parts, self.workers, elsewhere=True)
         of = iter([results for part in done for results in part])
@@ -802,6 +834,10 @@ class Search:
             warnings.warn(f"trials run in Python, ten times slower: {error}", stacklevel=2)
             self._compiled = False
             return None
+
+
+def _called(function: Callable[[], Any]) -> Any:
+    return function()
 
 
 def _price_of_travel(plant: Plant, design: Design, spec: Spec) -> float:

@@ -239,10 +239,10 @@ _LOOK = (
     ("output_walk", (3.0, 10.0)),
     ("horizon", (0.7, 1.5)),
 )
-# where each part of the work ends, in shares of its CPU time (a furnace's): bounds and compilation, a look
-# about, the search (within it MPC and PI), trade-offs, the comparison
-_BEGUN, _LOOKED, _SEARCHED, _TRADED, _COMPARED = 0.09, 0.13, 0.67, 0.8, 0.87
-_MPC_DONE, _PI_DONE = 0.1, 0.92
+# where each part of the work ends, in shares of its CPU time (a furnace's): bounds and compilation, the
+# search (shares of MPC, of which so much is a look about, PI and LQR), trade-offs, the comparison
+_BEGUN, _SEARCHED, _TRADED, _COMPARED = 0.09, 0.67, 0.8, 0.87
+_SHARES, _LOOKED = (0.17, 0.76, 0.07), 0.4
 _WORTH = 0.01  # by which a traded design must be better on the spec's own score to be taken
 _ALIKE = 0.01  # of designs with as much of the drive that differ by less in score the one that moves least;
 # by no more than this either where noise alone makes a greater difference
@@ -349,19 +349,7 @@ def _tune(plant: Plant, spec: Spec | None, progress: Progress | None, workers: W
     plant = spec.widened(plant)
     search = Search(plant, spec, spec.design(plant), seed, workers=workers)
     baseline = search.baseline
-    start = parameters_of(baseline, spec)
-    looked = [search.evaluate(start)]
-    if progress is not None:
-        progress(_BEGUN, "default design")
-    for at, (parameter, factors) in enumerate(_LOOK):
-        first = _best(looked).parameters
-        values = [factor * first.get(parameter, 1.0) for factor in factors]
-        look = [{**first, parameter: float(round(v)) if parameter == "horizon" else v} for v in values]
-        width = (_LOOKED - _BEGUN) / len(_LOOK)
-        share = sub_progress(progress, _BEGUN + width * at, _BEGUN + width * (at + 1))
-        looked += run_threads(search.evaluate, look, workers, share, what=PARAMETER_WORDS[parameter])
-    looked += _ramped(search, _best(looked), workers)
-    found, pi = _search_all(search, looked, workers, sub_progress(progress, _LOOKED, _SEARCHED))
+    found, pi = _search_all(search, workers, sub_progress(progress, _BEGUN, _SEARCHED))
     pareto, best = _trade(search, found, pi, workers, sub_progress(progress, _SEARCHED, _TRADED))
     tuned = search.design(best.parameters)
     candidates = {
@@ -382,7 +370,8 @@ def _tune(plant: Plant, spec: Spec | None, progress: Progress | None, workers: W
 
     def sensitivities() -> list[Sensitivity]:
         # what a number does shows in one noise too
-        about = search.evaluate(best.parameters if kept == "tuned" else start, noises=1)
+        found_best = best.parameters if kept == "tuned" else parameters_of(baseline, spec)
+        about = search.evaluate(found_best, noises=1)
         of = [parameter for parameter in PARAMETER_WORDS if parameter in about.parameters]
         items = [(search, parameter, about.parameters, about) for parameter in of]
         share = sub_progress(progress, _COMPARED, 1.0)
@@ -457,7 +446,7 @@ def _ramped(search: Search, best: Trial, workers: Workers) -> list[Trial]:
 _GAINS, _TIMES = (1.0, 0.85, 0.7), (1.0, 1.25, 1.6, 2.0)
 
 
-def _sturdiest(search: Search, tried: list[Trial], workers: Workers) -> tuple[list[Trial], Trial]:
+def _sturdiest(search: Search, tried: list[Trial]) -> tuple[list[Trial], Trial]:
     """Return a PI's trials, with some more of less gain and longer integral times than the best one has, and
     of those that score as it does, as far as trials tell, the one that bears most of what the model lacks.
 
@@ -475,7 +464,7 @@ def _sturdiest(search: Search, tried: list[Trial], workers: Workers) -> tuple[li
         for Kc, Ti in sorted(about, reverse=True)
         if Kc >= low["Kc"] and Ti >= low["Ti"]
     ]
-    tried = [*tried, *run_threads(partial(search.evaluate, name="PI"), more, workers, what="sturdier PIs")]
+    tried = [*tried, *search.evaluate_each("PI", more, what="sturdier PIs")]
     alike = [trial for trial in tried if trial.score <= (1 + _ALIKE_IN_NOISE) * best.score]
 
     def bears(trial: Trial) -> float:
@@ -569,8 +558,23 @@ def _stillest(found: Sequence[Sequence[Trial]], reading_s: float = 0.0, allowed:
     return int(np.argmin(np.where(still, means, np.inf)))
 
 
+def _looked_about(search: Search, workers: Workers, progress: Progress | None) -> list[Trial]:
+    """Return the first trials of an MPC: the default design, and one parameter after the other in steps that
+    the search is too short for."""
+    looked = [search.evaluate(parameters_of(search.baseline, search.spec))]
+    if progress is not None:
+        progress(1 / (1 + len(_LOOK)), "default design")
+    for at, (parameter, factors) in enumerate(_LOOK, start=1):
+        first = _best(looked).parameters
+        values = [factor * first.get(parameter, 1.0) for factor in factors]
+        look = [{**first, parameter: float(round(v)) if parameter == "horizon" else v} for v in values]
+        share = sub_progress(progress, at / (1 + len(_LOOK)), (at + 1) / (1 + len(_LOOK)))
+        looked += run_threads(search.evaluate, look, workers, share, what=PARAMETER_WORDS[parameter])
+    return [*looked, *_ramped(search, _best(looked), workers)]
+
+
 def _search_all(
-    search: Search, looked: list[Trial], workers: Workers, progress: Progress | None
+    search: Search, workers: Workers, progress: Progress | None
 ) -> tuple[dict[str, list[Trial]], Trial]:
     """Return the trials of MPC, PI and LQR, after as many evaluations each, the PI after thrice as many; and
     the PI to take."""
@@ -581,20 +585,25 @@ def _search_all(
     plain = first | {"feedforward": 0.05}
     starts = [plain | dict(zip(_SPREAD, values.tolist())) for values in _spread(search.pi)]
     lqr = {**parameters_of(search.baseline, search.spec), "drive": 1e-2}
-    parts = joint_progress(progress, (_MPC_DONE, _PI_DONE - _MPC_DONE, 1.0 - _PI_DONE))
-    items: list[_Item] = [
-        (search, "MPC", [_best(looked).parameters], max(0, n - len(looked)), parts[0]),
-        (search, "PI", [first, plain, *starts][search.certain :], 3 * n, parts[1]),
-        (search, "LQR", [lqr], n, parts[2]),
-    ]
+    parts = joint_progress(progress, _SHARES)
 
-    def optimised(item: _Item) -> tuple[list[Trial], Trial | None]:
-        tried = _optimise(item)  # and sturdier PIs while the other two are still searched for
-        return _sturdiest(search, tried, workers) if item[1] == "PI" else (tried, None)
+    def mpc() -> tuple[list[Trial], Trial]:
+        looked = _looked_about(search, workers, sub_progress(parts[0], 0.0, _LOOKED))
+        best, left = _best(looked), max(0, n - len(looked))
+        share = sub_progress(parts[0], _LOOKED, 1.0)
+        return [*looked, *_optimise((search, "MPC", [best.parameters], left, share))], best
 
-    (mpc, _), (loops, pi), (others, _) = run_threads(optimised, items, workers)
-    assert pi is not None
-    return {"MPC": [*looked, *mpc], "PI": loops, "LQR": others}, pi
+    def loops() -> tuple[list[Trial], Trial]:
+        item = (search, "PI", [first, plain, *starts][search.certain :], 3 * n, parts[1])
+        return _sturdiest(search, _optimise(item))
+
+    def regulator() -> tuple[list[Trial], Trial]:
+        tried = _optimise((search, "LQR", [lqr], n, parts[2]))
+        return tried, _best(tried)
+
+    of: list[Callable[[], tuple[list[Trial], Trial]]] = [mpc, loops, regulator]
+    (designs, _), (pis, pi), (others, _) = run_threads(lambda made: made(), of, workers)
+    return {"MPC": designs, "PI": pis, "LQR": others}, pi
 
 
 _SPREAD = {"Kc": (0.4, 2.5), "Ti": (0.4, 2.5), "setpoint": (0.2, 1.0), "feedforward": (0.05, 1.0)}
@@ -630,17 +639,17 @@ def _optimise(item: _Item) -> list[Trial]:
     high = np.log([large for _, _, large in parameters])
     tried: list[Trial] = []
 
-    def look(parameters: dict[str, float]) -> None:
-        tried.append(evaluate(parameters))
-        if progress is not None:
-            progress(min(len(tried) / evaluations, 1.0), f"weights of the {name}")
-
-    for first in starts[:evaluations] if name != "MPC" else ():
-        look(first)
+    what = f"weights of the {name}"
+    if name != "MPC":
+        first = starts[:evaluations]
+        share = sub_progress(progress, 0.0, len(first) / evaluations)
+        tried += search.evaluate_each(name, first, share, what=what)
     start = _best(tried).parameters if tried else starts[0]
 
     def cost(z: Array, gradient: Array) -> float:
-        look({**start, **dict(zip(names, np.exp(z).tolist(), strict=True))})
+        tried.append(evaluate({**start, **dict(zip(names, np.exp(z).tolist(), strict=True))}))
+        if progress is not None:
+            progress(min(len(tried) / evaluations, 1.0), what)
         return tried[-1].score
 
     optimiser = nlopt.opt(nlopt.LN_SBPLX, len(names))

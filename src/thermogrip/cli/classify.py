@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from thermogrip.sysid.effusivity import Coupling, EffusivityRow, GripperModel
 
 # what processes that answer import, with what these import at first use
-_NEEDED = (
+NEEDED = (
     "thermogrip.classify.decisions.predict",
     "thermogrip.classify.estimators.posterior",
     "thermogrip.sysid.contact.response_table",
@@ -153,7 +153,7 @@ def effusivity(
     """
     stated = _range(between)
     cli.new_file(out, (".csv", ".parquet"))
-    pool = cli.workers_of(workers, cluster, *_NEEDED)
+    pool = cli.workers_of(workers, cluster, *NEEDED)
     console = Console(as_json)
     from thermogrip.datasets.partitions import Answers, sources, stamps
 
@@ -373,7 +373,7 @@ def classify(
         raise UserError(problem, hint="leave it out, or train on grasps of the new gripper")
     if out is not None:
         cli.new_file(out, (".csv", ".parquet"))
-    pool = cli.workers_of(workers, cluster, *_NEEDED)
+    pool = cli.workers_of(workers, cluster, *NEEDED)
     from thermogrip.datasets.materials import load_materials
 
     own = [name for name in cli.comma(candidates) or () if name not in load_materials()]
