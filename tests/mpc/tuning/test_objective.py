@@ -124,6 +124,49 @@ def test_a_search_is_unpacked_once_and_brings_where_its_draws_are_at_rest(tank, 
     assert there._run(part) == search._run(part)
 
 
+@pytest.mark.parametrize(
+    ("changes", "early"),
+    [({}, 1), ({"moves_limit": 0.0}, 0), ({"settling": {"t_surface": {"within_s": 150.0}}}, 0)],
+)
+def test_what_several_workers_begin_with_is_what_one_finds(tank, monkeypatch, changes: Any, early: int):
+    asked = {"hold_s": 200.0, "search_draws": 1, "check_draws": 1, **changes}
+    spec = Spec.model_validate({**SPEC.model_dump(exclude_unset=True), **asked})
+    monkeypatch.setattr(objective, "wanted", lambda: False)  # trials in Python
+    alone = Search(tank, spec, spec.design(tank), 0)
+    known: list[int] = []
+    moves = Search._moves_of_pi
+
+    def moves_of_pi(self: Search) -> Any:
+        known.append(len(self._by_pi))
+        return moves(self)
+
+    monkeypatch.setattr(
+        objective, "run_parallel", lambda of, items, workers, **_: [of(item) for item in items]
+    )
+    monkeypatch.setattr(Search, "_moves_of_pi", moves_of_pi)
+    shared = Search(tank, spec, spec.design(tank), 0, workers=2)
+    assert known == [early]  # draws of which bounds brought them: not where bounds may pace the design
+    for name in ("bounds", "pi_moves", "travel", "baseline", "lengths", "pi"):
+        assert getattr(shared, name) == getattr(alone, name)
+    assert bool(alone.pi_moves) == (spec.moves_limit > 0)
+
+
+def test_several_pis_go_to_a_process_at_once(monkeypatch: pytest.MonkeyPatch):
+    search, given = search_of(lambda *at: 60.0), []
+
+    def parallel(function: Any, items: Any, workers: Any, progress: Any, **named: Any) -> list[Any]:
+        given.append([len(item) for item in items])
+        return [function(item) for item in items]
+
+    monkeypatch.setattr(objective, "run_parallel", parallel)
+    monkeypatch.setattr(search, "evaluate", lambda parameters, name: (name, parameters["Kc"]))
+    several = [{"Kc": float(k)} for k in range(10)]
+    for compiled, sizes in ((True, [4, 4, 2]), (False, [1] * 10)):  # in Python one takes seconds
+        search._compiled = compiled
+        assert search.evaluate_each("PI", several, what="") == [("PI", float(k)) for k in range(10)]
+        assert given.pop() == sizes
+
+
 def test_a_spec_of_which_one_step_can_be_reached_is_searched_and_one_of_which_none_can_is_refused():
     search_of(lambda start, target, draw: np.inf if target < 30 else 50.0)
     with pytest.raises(UserError, match="full drive does not reach 36 degC, nor any other target"):

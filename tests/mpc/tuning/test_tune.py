@@ -161,6 +161,14 @@ class Paper:
         ramp = {1.3: self.ramped}.get(parameters.get("ramp", 0.0), 1.0)
         return self.trial(name, parameters, ramp * valley(parameters, best, lowest))
 
+    def evaluate_each(self, name: str, several: Any, progress: Any = None, *, what: str) -> list[Trial]:
+        found = []
+        for parameters in several:
+            found.append(self.evaluate(parameters, name))
+            if progress is not None:
+                progress(len(found) / len(several), what)
+        return found
+
     def evaluate_at_length(self, item: tuple[str, dict[str, float]]) -> Trial:
         name, parameters = item
         if name != "MPC":
@@ -559,34 +567,45 @@ def test_of_pis_that_score_alike_the_one_is_taken_that_bears_most(
     monkeypatch.setattr(tuner, "worst_sensitivity", bears)
     base = SimpleNamespace(loops=(PILoop("q", "t", 4.0, 30.0),), dt=2.0)
     ranges = (("Kc", low, 5.0), *PI_PARAMETERS[1:])
-    search: Any = SimpleNamespace(evaluate=evaluate, plant="plant", baseline=base, pi=ranges)
+
+    def evaluate_each(name: str, several: Any, *, what: str) -> list[Trial]:
+        return [evaluate(parameters, name) for parameters in several]
+
+    search: Any = SimpleNamespace(evaluate_each=evaluate_each, plant="plant", baseline=base, pi=ranges)
     worse = replace(evaluate(best, "PI"), score=5.0, parameters=best | {"Ti": 9.0})
-    tried, found = tuner._sturdiest(search, [worse, evaluate(best, "PI")], 1)
+    tried, found = tuner._sturdiest(search, [worse, evaluate(best, "PI")])
     assert (found.parameters["Kc"], found.parameters["Ti"]) == pytest.approx(taken)
     assert {**found.parameters, "Kc": 1.0, "Ti": 0.5} == best
     # none beyond what leaves half more of a load's integrated error than SIMC
     assert all(trial.parameters["Ti"] <= 1.5 * trial.parameters["Kc"] + 1e-12 for trial in tried[1:])
 
 
-def test_sturdier_pis_are_tried_while_others_are_still_searched_for(monkeypatch: pytest.MonkeyPatch):
-    sturdy, spec = threading.Event(), SimpleNamespace(evaluations=2)
+def test_pis_and_regulators_are_searched_for_while_the_mpc_is_looked_about(monkeypatch: pytest.MonkeyPatch):
+    sturdy, regulated, spec = threading.Event(), threading.Event(), SimpleNamespace(evaluations=2)
+    one = Trial("MPC", {}, 1.0, 50.0, 0.1, 5.0)
 
-    def optimise(item: Any) -> list[str]:
+    def look(search: Any, workers: int, progress: Any) -> list[Trial]:
+        assert sturdy.wait(20)
+        assert regulated.wait(20)
+        return [one]
+
+    def optimise(item: Any) -> list[Trial]:
         if item[1] == "LQR":
-            assert sturdy.wait(20)
-        return [item[1]]
+            regulated.set()
+        return [replace(one, controller=item[1])]
 
-    def sturdiest(search: Any, tried: list[str], workers: int) -> tuple[list[str], str]:
+    def sturdiest(search: Any, tried: list[Trial]) -> tuple[list[Trial], str]:
         sturdy.set()
-        return [*tried, "sturdy"], "sturdy"
+        return tried, "sturdy"
 
+    monkeypatch.setattr(tuner, "_looked_about", look)
     monkeypatch.setattr(tuner, "_optimise", optimise)
     monkeypatch.setattr(tuner, "_sturdiest", sturdiest)
     monkeypatch.setattr(tuner, "parameters_of", lambda *_: {})
     search: Any = SimpleNamespace(spec=spec, pi=PI_PARAMETERS, certain=False, baseline=None)
-    looked: Any = [Trial("MPC", {}, 1.0, 50.0, 0.1, 5.0)]
-    found, pi = tuner._search_all(search, looked, 2, None)
-    assert (pi, found) == ("sturdy", {"MPC": [*looked, "MPC"], "PI": ["PI", "sturdy"], "LQR": ["LQR"]})
+    found, pi = tuner._search_all(search, 2, None)
+    each = {name: [trial.controller for trial in tried] for name, tried in found.items()}
+    assert (pi, each) == ("sturdy", {"MPC": ["MPC", "MPC"], "PI": ["PI"], "LQR": ["LQR"]})
 
 
 def test_the_file_holds_what_was_found(done: Done):
