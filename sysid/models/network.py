@@ -537,6 +537,10 @@ class NetworkModel(Described):
 
     def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
         """Return the state (n_x,) of a plant at rest whose sensors read y; see the module's theory."""
+        return self.rest_of_each(y, u, d, np.asarray(p, dtype=float)[None])[0]
+
+    def rest_of_each(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
+        """Return the states (k, n_x) of :meth:`rest` for parameters p (k, n_p), found together."""
         y, u, d, p = (np.asarray(value, dtype=float) for value in (y, u, d, p))
         if not np.isfinite(y).any():
             raise UserError(
@@ -546,45 +550,43 @@ class NetworkModel(Described):
         moved = [i for i, name in enumerate(self.inputs) if name not in self.switches]
         low, high = np.array([self.network.inputs[self.inputs[i]].range for i in moved]).reshape(-1, 2).T
         full = np.array([self.network.inputs[self.inputs[i]].full_scale for i in moved])
-        z = np.concatenate([np.full(self.n_x, level), np.clip(u[moved], low, high) / full])
+        low, high = low / full, high / full
+        z = np.concatenate([np.full(self.n_x, level), np.clip(u[moved] / full, low, high)])
+        z, ahead = np.tile(z, (len(p), 1)), 1e-4 * np.eye(len(z))
+        left = np.arange(len(p))  # each until it has settled by itself, whoever is beside it
         for _ in range(8):  # bilinear and T^4 at most: Gauss-Newton settles in three or four
-            rows = self._rest_residuals(
-                z[:, None] + np.hstack([np.zeros((len(z), 1)), 1e-4 * np.eye(len(z))]),
-                y,
-                u,
-                d,
-                p,
-                moved,
-                full,
-            )
-            move = _bounded_move(
-                (rows[:, 1:] - rows[:, :1]) / 1e-4, rows[:, 0], z[self.n_x :], low / full, high / full
-            )
-            z = z + move
-            z[self.n_x :] = np.clip(z[self.n_x :], low / full, high / full)
-            if np.abs(move).max() < 1e-6:
+            at = z[left]
+            around = np.concatenate([at[:, None], at[:, None] + ahead], axis=1)
+            rows = self._rest_residuals(around, y, u, d, p[left], moved, full)
+            slopes = (rows[:, 1:] - rows[:, :1]).transpose(0, 2, 1) / 1e-4
+            move = _bounded_moves(slopes, rows[:, 0], at[:, self.n_x :], low, high)
+            z[left] = at + move
+            z[left, self.n_x :] = np.clip(z[left, self.n_x :], low, high)
+            left = left[~(np.abs(move).max(axis=1) < 1e-6)]
+            if not left.size:
                 break
-        return np.asarray(z[: self.n_x])
+        return np.asarray(z[:, : self.n_x])
 
     def _rest_residuals(
         self, z: Array, y: Array, u: Array, d: Array, p: Array, moved: list[int], full: Array
     ) -> Array:
-        """Return the residuals (n_r, B) at the columns of ``z``: states, then shares of the moved inputs."""
-        x, v = z[: self.n_x], z[self.n_x :]
+        """Return the residuals (k, B, n_r) at z (k, B, n_z), states and shares of the moved inputs, for
+        parameters p (k, n_p)."""
+        x, v = z[..., : self.n_x], z[..., self.n_x :]
+        states = list(np.moveaxis(x, -1, 0))
         inputs: list[Any] = list(u)
         for at, i in enumerate(moved):
-            inputs[i] = v[at] * full[at]
-        flow = np.array(self.flows(list(x), inputs, list(d), list(p)))
+            inputs[i] = v[..., at] * full[at]
+        flow = self.flows(states, inputs, list(d), list(p.T[:, :, None]))
         known = np.isfinite(y)
-        read = np.array(self.output(list(x), list(p)))
-        return np.concatenate(
-            [
-                flow,
-                _SENSOR_WEIGHT * (read - y[:, None])[known],
-                _INPUT_WEIGHT * (v - (u[moved] / full)[:, None]),
-                _LEVEL_WEIGHT * (x - np.nanmean(y)),
-            ]
-        )
+        read = np.stack(self.output(states, ()), axis=-1)
+        parts = [
+            np.stack(flow, axis=-1),
+            _SENSOR_WEIGHT * (read - y)[..., known],
+            _INPUT_WEIGHT * (v - u[moved] / full),
+            _LEVEL_WEIGHT * (x - np.nanmean(y)),
+        ]
+        return np.concatenate(parts, axis=-1)
 
     def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
         """Simulate a batch, compiled where llvmlite is there."""
@@ -648,18 +650,20 @@ def load_network(name_or_path: str | Path) -> NetworkModel:
     return NetworkModel(named_network(name_or_path))
 
 
-def _bounded_move(jacobian: Array, residual: Array, v: Array, low: Array, high: Array) -> Array:
-    """Return the Gauss-Newton step of states and inputs v; what would leave its range goes to the end of
-    it, and the rest is found for that."""
-    move = np.asarray(np.linalg.lstsq(jacobian, -residual, rcond=None)[0])
-    first = move.size - v.size
-    wanted = v + move[first:]
-    beyond = np.append(np.zeros(first, dtype=bool), (wanted < low) | (wanted > high))
-    if beyond.any():
-        move[first:] = np.clip(wanted, low, high) - v
-        left = residual + jacobian[:, beyond] @ move[beyond]
-        move[~beyond] = np.linalg.lstsq(jacobian[:, ~beyond], -left, rcond=None)[0]
-    return move
+def _bounded_moves(jacobian: Array, residual: Array, v: Array, low: Array, high: Array) -> Array:
+    """Return the Gauss-Newton steps (k, n_z) of states and inputs v (k, n_v); what would leave its range goes
+    to the end of it, and the rest is found for that."""
+    span, root = np.linalg.qr(jacobian)
+    moves = -np.linalg.solve(root, span.transpose(0, 2, 1) @ residual[:, :, None])[:, :, 0]
+    first = moves.shape[1] - v.shape[1]
+    wanted = v + moves[:, first:]
+    outside = (wanted < low) | (wanted > high)
+    for k in np.flatnonzero(outside.any(axis=1)):
+        move, beyond = moves[k], np.append(np.zeros(first, dtype=bool), outside[k])
+        move[first:] = np.clip(wanted[k], low, high) - v[k]
+        left = residual[k] + jacobian[k][:, beyond] @ move[beyond]
+        move[~beyond] = np.linalg.lstsq(jacobian[k][:, ~beyond], -left, rcond=None)[0]
+    return np.asarray(moves)
 
 
 @lru_cache(maxsize=64)

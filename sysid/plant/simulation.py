@@ -102,7 +102,9 @@ def _begin(model: Model, p: Array, stretch: Stretch, start: Start) -> Array:
     if start.level is not None or len(p) == 1:
         return np.repeat(start.x0[None], len(p), axis=0)
     y, u, d = _about_start(stretch, start)
-    return np.array([model.rest(y, u, d, row) for row in p]) + start.shift
+    together = getattr(model, "rest_of_each", None)  # of networks: a fit asks for hundreds
+    rests = np.array([model.rest(y, u, d, row) for row in p]) if together is None else together(y, u, d, p)
+    return np.asarray(rests + start.shift)
 
 
 def _about_start(stretch: Stretch, start: Start) -> tuple[Array, Array, Array]:

@@ -525,6 +525,23 @@ def test_rest_is_the_minimum_that_its_theory_names(name: str, y: list[float], u:
     np.testing.assert_allclose(read[np.isfinite(y)], np.array(y)[np.isfinite(y)], atol=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("name", "y", "u", "d"),
+    [("gripper", [38.0, np.nan], [0.3, 1.0], [24.0]), ("tclab", [62.0, 33.0], [90.0, 0.0], [])],
+)
+def test_rest_for_many_parameters_is_that_for_each(name: str, y: list[float], u: list[float], d: list[float]):
+    model = load_network(name)
+    p = model.prior * np.exp(np.random.default_rng(3).normal(0.0, 0.4, (9, model.prior.size)))
+    found = model.rest_of_each(y, u, d, p)
+    np.testing.assert_array_equal(found, [model.rest(y, u, d, row) for row in p])
+    np.testing.assert_allclose(found[-1], model.rest_of_each(y, u, d, p[-1:])[0], rtol=0, atol=0)
+    if name == "tclab":  # all of the heater holds some of them there, and not others
+        nodes, full = len(model.network.nodes), [100.0, 0.0]
+        gains = [sum(model.flows(x, full, d, row)[:nodes]) for x, row in zip(found, p)]
+        assert min(gains) < -0.01
+        assert max(gains) > 0.01
+
+
 # ---- what a file may not say ----
 
 
