@@ -30,6 +30,7 @@ good.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
@@ -509,7 +510,8 @@ def identify(
         folds = [(model, train, held) for model in some for train, held in cases]
         if "network" in some:  # the likely one: it is kept also where another errs a little less
             folds.insert(some.index("network") * len(cases), ("network", logs, None))
-        items = [((shared, settings, seed), *fold) for fold in folds]
+        drawn = 0 if posterior else draws
+        items = [((shared, settings, seed), *fold, drawn) for fold in folds]
         report = parts.part("left out", of=len(items))
         found = run_parallel(_fitted_or_why, items, workers, report, what="fitting")
         folds_done = {(model, id(train)): each for (model, train, _), each in zip(folds, found)}
@@ -523,7 +525,10 @@ def identify(
     begun, _ = folds_done.get((chosen, id(logs)), (None, None))
     fitted = begun if isinstance(begun, Plant) else fit(chosen, logs, parts.part(f"{chosen} on all logs"))
     parts.next()
-    plant, lost = _with_draws(fitted, logs, parts, posterior=posterior, draws=draws, seed=seed)
+    if isinstance(fitted, Plant) and fitted.samples is not None:  # a worker has drawn already
+        plant, lost = fitted, []
+    else:
+        plant, lost = _with_draws(fitted, logs, parts, posterior=posterior, draws=draws, seed=seed)
     lists = {"input": inputs, "output": outputs, "disturbance": disturbances}
     roles, unused = _signal_roles(logs, ([*u, *still], d, y), lists, network, still)
     notes = (*converted, *rested, *refused, *unused, *lost, *_plant_notes(chosen, plant))
@@ -778,14 +783,19 @@ def _fit(asked: _Asked, model: str, train: Sequence[Log], report: Progress | Non
 _Fold: TypeAlias = "tuple[Plant | str, FreeRun | str | None]"
 
 
-def _fitted_or_why(item: tuple[_Asked, str, Sequence[Log], Held | None]) -> _Fold:
-    """Return the plant of a candidate fitted to some logs and its run over another, if any, or why there is
-    none."""
-    asked, model, train, held = item
+def _fitted_or_why(item: tuple[_Asked, str, Sequence[Log], Held | None, int]) -> _Fold:
+    """Return the plant of a candidate fitted to some logs and its run over another, or why there is none; of
+    a network fitted to all logs, with so many draws where it has any."""
+    asked, model, train, held, draws = item
     try:
         fitted = _fit(asked, model, train, None)
     except UserError as error:
         return str(error), None
+    if held is None and draws and isinstance(fitted, Plant):
+        from thermogrip.sysid.greybox.posterior import fit_problem, with_draws
+
+        with suppress(*NO_DRAWS):  # who wants them meets the same fault, and says it
+            fitted = with_draws(fitted, fit_problem(fitted, train), draws, seed=asked[2])
     plant = fitted if isinstance(fitted, Plant) else fitted.plant
     try:
         return plant, None if held is None else run_held_out(plant, held, unseen=True)

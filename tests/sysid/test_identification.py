@@ -18,6 +18,7 @@ from thermogrip.datasets.schema import log_name, make_log
 from thermogrip.sysid import Plant, identification, identify
 from thermogrip.sysid.blackbox.fit import fit_black_box
 from thermogrip.sysid.blackbox.order_selection import Structure, folds, held_out_runs
+from thermogrip.sysid.greybox import posterior
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.identification import (
     SHOWN,
@@ -71,9 +72,10 @@ def test_logs_left_out_on_other_processes_give_the_same(monkeypatch):
     assert "subspace without b: no" in shared.notes
 
 
-def test_the_network_is_fitted_to_all_logs_beside_those_that_leave_one_out(monkeypatch):
-    """Else the other processes have nothing to do meanwhile."""
-    board, own = prior_plant(load_network("tclab")), identification._fit
+@pytest.mark.parametrize(("draws", "fails"), [(0, False), (2, False), (2, True)])
+def test_the_network_is_fitted_to_all_logs_beside_those_that_leave_one_out(monkeypatch, draws, fails):
+    """And drawn from, else the other processes have nothing to do meanwhile."""
+    board, own, drawing = prior_plant(load_network("tclab")), identification._fit, posterior.with_draws
     logs, rng, t = [], np.random.default_rng(0), np.arange(0.0, 400.0, 2.0)
     for name in "ab":
         drives = [np.repeat(rng.uniform(0, 80, 10), 20) for _ in range(2)]
@@ -85,6 +87,13 @@ def test_the_network_is_fitted_to_all_logs_beside_those_that_leave_one_out(monke
         logs.append(log)
     place: list[str] = ["here"]
     fits: list[tuple[str, int]] = []
+    drawn: list[str] = []
+
+    def with_draws(*given, **named):
+        drawn.append(place[-1])
+        if fails:
+            raise UserError("no draws today")
+        return drawing(*given, **named)
 
     def fit(asked, model, train, report):
         fits.append((place[-1], len(train)))
@@ -98,12 +107,17 @@ def test_the_network_is_fitted_to_all_logs_beside_those_that_leave_one_out(monke
 
     monkeypatch.setattr(identification, "_fit", fit)
     monkeypatch.setattr(identification, "run_parallel", parallel)
-    how = {"network": "tclab", "models": ["network"], "leave_one_out": True, "draws": 0}
+    monkeypatch.setattr(posterior, "with_draws", with_draws)
+    how = {"network": "tclab", "models": ["network"], "leave_one_out": True, "draws": draws}
     alone = identify(logs, **how)
-    assert fits == [("here", 1), ("here", 1), ("here", 2)]
+    assert (fits, drawn) == ([("here", 1), ("here", 1), ("here", 2)], ["here"] * (draws > 0))
     fits.clear()
+    drawn.clear()
     shared = identify(logs, **how, workers=2)
     assert fits == [("elsewhere", 2), ("elsewhere", 1), ("elsewhere", 1)]
+    assert drawn == ["elsewhere", "here"][: 0 if not draws else 1 + fails]
+    assert shared.notes == alone.notes
+    assert any("no draws today" in note for note in shared.notes) == fails
     files = [each.plant.to_dict() for each in (shared, alone)]
     for file in files:
         assert file["scores"].pop("seconds") > 0
