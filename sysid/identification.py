@@ -525,9 +525,8 @@ def identify(
     begun, _ = folds_done.get((chosen, id(logs)), (None, None))
     fitted = begun if isinstance(begun, Plant) else fit(chosen, logs, parts.part(f"{chosen} on all logs"))
     parts.next()
-    if isinstance(fitted, Plant) and fitted.samples is not None:  # a worker has drawn already
-        plant, lost = fitted, []
-    else:
+    plant, lost = fitted, list[str]()  # a worker may have drawn already
+    if not isinstance(plant, Plant) or plant.samples is None:
         plant, lost = _with_draws(fitted, logs, parts, posterior=posterior, draws=draws, seed=seed)
     lists = {"input": inputs, "output": outputs, "disturbance": disturbances}
     roles, unused = _signal_roles(logs, ([*u, *still], d, y), lists, network, still)

@@ -537,7 +537,7 @@ class NetworkModel(Described):
 
     def rest(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
         """Return the state (n_x,) of a plant at rest whose sensors read y; see the module's theory."""
-        return self.rest_of_each(y, u, d, np.asarray(p, dtype=float)[None])[0]
+        return np.asarray(self.rest_of_each(y, u, d, np.asarray(p, dtype=float)[None])[0])
 
     def rest_of_each(self, y: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike) -> Array:
         """Return the states (k, n_x) of :meth:`rest` for parameters p (k, n_p), found together."""
