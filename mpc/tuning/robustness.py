@@ -18,12 +18,15 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
+from thermogrip.datasets.arrays import Array
 from thermogrip.mpc.design.design import PILoop
-from thermogrip.mpc.plant.prediction import PredictionModel, step_response
+from thermogrip.mpc.plant.prediction import prediction_model, step_response
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
@@ -48,17 +51,25 @@ def peak_sensitivity(plant: Plant, loop: PILoop, dt: float, *, lag: float = 0.0,
     >>> [round(peak_sensitivity(plant, loop, 2.0, lag=lag), 1) for lag in (0.0, 5.0)]
     [1.8, 2.6]
     """
-    answer = step_response(plant, loop.drive, loop.output)
-    model = PredictionModel(plant, dt=plant.dt)
-    y = answer.y[:: max(1, round(dt / plant.dt))] / model.span[model.drives.index(loop.drive)]
-    w = np.geomspace(2e-4, 1.0, _FREQUENCIES) * np.pi / dt
-    back = np.exp(-1j * w * dt)  # one sample late
-    rises = np.diff(y)
-    powers = np.cumprod(np.broadcast_to(back, (len(rises), len(w))), axis=0)
-    G = rises @ powers + rises[-1] * powers[-1] * back / (1 - back)
+    w, back, G = _frequency_response(plant, loop.drive, loop.output, dt)
     G = G * np.exp(-1j * w * delay) / (1 + 1j * w * lag)
     C = loop.Kc * (1 + dt / loop.Ti * back / (1 - back))
     return float(np.max(1 / np.maximum(np.abs(1 + C * G), 1e-9)))
+
+
+@lru_cache(maxsize=16)
+def _frequency_response(
+    plant: Plant, drive: str, output: str, dt: float
+) -> tuple[Array, NDArray[np.complex128], NDArray[np.complex128]]:
+    """Return frequencies [rad/s], the delay of one sample and the plant there."""
+    model = prediction_model(plant, plant.dt)
+    answer = step_response(plant, drive, output)
+    y = answer.y[:: max(1, round(dt / plant.dt))] / model.span[model.drives.index(drive)]
+    w = np.geomspace(2e-4, 1.0, _FREQUENCIES) * np.pi / dt
+    back = np.exp(-1j * w * dt)
+    rises = np.diff(y)
+    powers = np.cumprod(np.broadcast_to(back, (len(rises), len(w))), axis=0)
+    return w, back, rises @ powers + rises[-1] * powers[-1] * back / (1 - back)
 
 
 def worst_sensitivity(plant: Plant, loops: Sequence[PILoop], dt: float) -> float:
