@@ -57,6 +57,9 @@ _LOOK_S = 1.0  # without a result: then it is looked whether the processes are a
 
 _THREADS = 32  # of run_threads, which mostly wait
 
+#: Who sets one of these wants as many threads of linear algebra.
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
 #: The processes that :func:`kept_processes` holds, if any, and its connections to schedulers by address.
 _kept: list[ProcessPoolExecutor] = []
 _kept_size: list[int] = []
@@ -344,8 +347,11 @@ def _serving(modules: Sequence[str]) -> None:
     from multiprocessing import forkserver, resource_tracker  # Windows may have neither
 
     multiprocessing.set_forkserver_preload(list(modules))
-    safe = os.environ.get("PYTHONSAFEPATH")
-    os.environ["PYTHONSAFEPATH"] = "1"  # modules are ours, not those of the folder it happens to run in
+    asked = {"PYTHONSAFEPATH": "1"}  # modules are ours, not those of the folder it happens to run in
+    # processes of several threads each get in each other's way
+    asked |= dict.fromkeys((name for name in THREADS if name not in os.environ), "1")
+    kept = {name: os.environ[name] for name in asked if name in os.environ}
+    os.environ |= asked
     resource_tracker.ensure_running()  # which leaves SIGINT unblocked
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # a Ctrl-C is for its processes
     try:
@@ -354,9 +360,9 @@ def _serving(modules: Sequence[str]) -> None:
         atexit.register(_end_server, forkserver)
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        del os.environ["PYTHONSAFEPATH"]
-        if safe is not None:
-            os.environ["PYTHONSAFEPATH"] = safe
+        for name in asked:
+            del os.environ[name]
+        os.environ |= kept
 
 
 def _end_server(forkserver: Any) -> None:

@@ -158,13 +158,15 @@ def test_processes_begin_with_the_modules_that_were_named_and_not_with_files_of_
         begin_processes(2, ["no_such_module", "colorsys"])
         module = "__import__('sys').modules.get('colorsys')"
         found = run_parallel(eval, [f"({module} is None, hasattr({module}, 'OWN'))"] * 2, 2)
-        print(found, "PYTHONSAFEPATH" in os.environ)
+        threads = run_parallel(os.getenv, ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"], 2)
+        print(found, threads, "PYTHONSAFEPATH" in os.environ, "OPENBLAS_NUM_THREADS" in os.environ)
     """
-    given = {key: value for key, value in os.environ.items() if key != "PYTHONSAFEPATH"}
+    apart = ("PYTHONSAFEPATH", *parallel.THREADS)
+    given = {key: value for key, value in os.environ.items() if key not in apart} | {"OMP_NUM_THREADS": "3"}
     done = subprocess.run(
         [sys.executable, "-c", program], cwd=tmp_path, env=given, capture_output=True, text=True, check=True
     )
-    assert done.stdout.strip() == "[(False, False), (False, False)] False"
+    assert done.stdout.strip() == "[(False, False), (False, False)] ['3', '1'] False False"
 
 
 @pytest.fixture
