@@ -17,7 +17,6 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from glob import glob
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -27,7 +26,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError, os_faults
-from thermogrip.datasets.file_names import file_format, file_stem
+from thermogrip.datasets.file_names import file_format, file_stem, matching_files
 from thermogrip.datasets.media import csv_cell, csv_text
 from thermogrip.datasets.netcdf import open_netcdf, open_plain_netcdf, record_unit, write_netcdf
 from thermogrip.datasets.schema import (
@@ -174,9 +173,9 @@ def _check_cells(frame: DataFrame, file: str) -> None:
     """Refuse a text where a number should be, and rows that say different things of one grasp."""
     import pandas as pd
 
-    known = [name for name in frame.columns if _meta_name(name)[0] in (*GRASP_NUMBERS, *GRASP_LABELS)]
+    known = [name for name in frame.columns if _meta_name(name, file)[0] in (*GRASP_NUMBERS, *GRASP_LABELS)]
     for name in frame.columns:
-        if not name.startswith(_NEEDED) and _meta_name(name)[0] not in GRASP_NUMBERS:
+        if not name.startswith(_NEEDED) and _meta_name(name, file)[0] not in GRASP_NUMBERS:
             continue
         cells = frame[name].astype(object)
         text = cells.map(lambda cell: isinstance(cell, str) and cell.strip().lower() not in ("", "nan"))
@@ -286,12 +285,6 @@ def distinct_names(files: Sequence[Path]) -> list[str | None]:
     return found
 
 
-def matching_files(path: str | Path) -> list[str]:
-    """Return what a pattern with *, ? or [] that a shell left names, in order; else the path itself."""
-    found = [] if os.path.exists(path) else sorted(glob(str(path), recursive=True))
-    return [name for name in found if not file_stem(name).endswith("_meta")] or [str(path)]
-
-
 def grasp_file_parts(path: Path) -> list[Path]:
     """Return the files that hold the grasps of one: itself, and of a CSV its meta file."""
     return [path, _meta_path(path)] if not is_store(path) and file_format(path) == "csv" else [path]
@@ -319,11 +312,13 @@ def _print_of(samples: Floats) -> bytes:
 
 def _in_folder(folder: Path) -> list[Path]:
     with os_faults(folder):
-        endings = (*_ENDINGS, ".nc", ".parquet")
+        endings = (*_ENDINGS, ".nc", ".parquet", ".pq")
         files = sorted(p for p in folder.iterdir() if p.name.lower().endswith(endings) or is_store(p))
     files = [p for p in files if not file_stem(p).endswith("_meta") and not p.name.startswith(".")]
     if not files:
         hint = "give a folder with .csv, .nc, .parquet or .zarr in it"
+        if any(path.is_dir() for path in folder.iterdir()):
+            hint += f", or a pattern in quotes: '{folder}/*/*.parquet'"
         raise UserError("holds no grasp files", file=folder, hint=hint)
     return files
 
@@ -476,9 +471,13 @@ def _meta_path(path: str | Path) -> Path:
     return found
 
 
-def _meta_name(header: str) -> tuple[str, str]:
-    """Return what a record calls a column of the meta file, and its unit."""
-    name, unit = split_header(header) if re.fullmatch(r"\S+", header) else ("", "")
+def _meta_name(header: str, file: str | None = None) -> tuple[str, str]:
+    """Return what a record calls a column of the meta file, and its unit; no name where it means nothing."""
+    if not re.fullmatch(r"\S+", header) or not header.lower().startswith(
+        ("grasp_id", *GRASP_LABELS, *GRASP_NUMBERS)
+    ):
+        return "", ""
+    name, unit = split_header(header, file=file)
     return name.lower() if name.lower() in GRASP_LABELS else _FROM_META.get(name, name), unit  # "Material"
 
 
@@ -491,7 +490,7 @@ def _meta_of(table: Table, order: list[str], file: str) -> tuple[dict[str, Any],
     found: dict[str, Any] = {}
     strange = []
     for header, cells in table.text.items():
-        name, unit = _meta_name(header)
+        name, unit = _meta_name(header, str(path))
         if name in found:
             raise UserError(f"gives {name} a second time", file=path, column=header, hint="keep one")
         if name in GRASP_NUMBERS:
