@@ -210,6 +210,7 @@ def test_a_fault_is_one_line_that_names_its_place(pair, long, meta, expected):
     line = refused(pair(long, meta))
     for part in expected:
         assert part in line
+    assert "identify" not in line  # whose --columns a log has
 
 
 @pytest.mark.parametrize("name", ["a.csv", "a.nc"])
@@ -394,6 +395,12 @@ def test_a_fault_in_parquet_names_its_file_row_and_column(
     assert line.startswith(str(path))
     assert expected in line
     assert "identify" not in line
+
+
+def test_parquet_of_either_ending_is_found_in_a_folder(frame, tmp_path):
+    for name in ("a.parquet", "b.pq"):
+        frame.to_parquet(tmp_path / name)
+    assert [record.attrs["name"] for record in read_grasp_files([tmp_path])] == ["a", "b"]
 
 
 def test_what_the_rows_of_a_grasp_may_differ_in_is_left_out_and_reported(frame, tmp_path):

@@ -288,6 +288,25 @@ def test_no_run_begins_while_another_one_writes_its_table(folder: Path, tmp_path
     Work().run(folder, out).remove()
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no such locks")
+def test_a_run_that_begins_as_another_one_ends_has_a_file_of_its_own(
+    folder: Path, tmp_path: Path, whole: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import fcntl
+
+    out, lock, ended = tmp_path / "o.csv", fcntl.flock, list[int]()
+
+    def late(file: int, how: int) -> None:
+        if not ended:  # the other run removes the file between the two calls
+            ended.append(file)
+            (tmp_path / "o.csv.partial").unlink()
+        lock(file, how)
+
+    monkeypatch.setattr(fcntl, "flock", late)
+    Work().run(folder, out).remove()
+    assert (len(ended), out.read_bytes() == whole) == (1, True)
+
+
 @pytest.mark.parametrize(
     ("out", "given", "problem"),
     [
