@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
+from glob import glob
 from pathlib import Path
 
 from thermogrip.datasets.errors import UserError, as_user_error
@@ -53,3 +54,10 @@ def split_cut(path: str | Path) -> tuple[Path, float, float]:
     if not start < stop:
         raise UserError(f"the cut {start:g}:{stop:g} is empty", file=str(path), hint="write the start first")
     return Path(match["path"]), start, stop
+
+
+def matching_files(path: str | Path) -> list[str]:
+    """Return what a pattern with *, ? or [] that a shell left names, in order, without meta files of grasps;
+    else the path itself."""
+    found = [] if os.path.exists(path) else sorted(glob(str(path), recursive=True))
+    return [name for name in found if not file_stem(name).endswith("_meta")] or [str(path)]

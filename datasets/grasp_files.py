@@ -14,11 +14,11 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Sequence
-from glob import glob
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError, os_faults
-from thermogrip.datasets.file_names import file_format, file_stem
+from thermogrip.datasets.file_names import file_format, file_stem, matching_files
 from thermogrip.datasets.media import csv_cell, csv_text
 from thermogrip.datasets.netcdf import open_netcdf, open_plain_netcdf, record_unit, write_netcdf
 from thermogrip.datasets.schema import (
@@ -68,7 +68,7 @@ _ENDINGS = (".csv", ".csv.gz", ".csv.xz")
 _NEEDED = ("time", "t_surface")  # how the columns begin that are read as numbers
 
 
-def read_grasps(path: str | Path, *, plain: bool = False) -> Grasps:
+def read_grasps(path: str | Path, *, plain: bool = False, name: str | None = None) -> Grasps:
     """Return the grasps in a file.
 
     Parameters
@@ -78,6 +78,8 @@ def read_grasps(path: str | Path, *, plain: bool = False) -> Grasps:
         repeats what is known of its grasp.
     plain : bool, optional
         Grasps of CSV, and of NetCDF of ours, as arrays alone (:mod:`thermogrip.datasets.plain_record`).
+    name : str, optional
+        What the record is called, by default as its file.
 
     Returns
     -------
@@ -98,7 +100,7 @@ def read_grasps(path: str | Path, *, plain: bool = False) -> Grasps:
     ({'grasp': 40, 'time': 121}, 'copper', 43.0)
     """
     if is_store(path):
-        return read_stored_grasps(path)
+        return read_stored_grasps(path, name=name)
     if file_format(path) not in ("csv", "netcdf", "parquet"):
         raise UserError("grasps are CSV, NetCDF, Parquet or Zarr", file=path, hint="use one of them")
     if file_format(path) == "parquet":
@@ -106,21 +108,21 @@ def read_grasps(path: str | Path, *, plain: bool = False) -> Grasps:
         if "grasp_id" not in frame:
             problem = "no column grasp_id"
             raise UserError(problem, file=path, hint="a grasp file has grasp_id,time_s,t_surface_degC")
-        return from_frame(frame, file_stem(path))
+        return from_frame(frame, name or file_stem(path), file=path)
     if file_format(path) == "netcdf":
         found: Any = open_plain_netcdf(path) if plain else None
-        grasps = _of_dataset(open_netcdf(path) if found is None else found, path)
-    else:
-        samples, per_grasp, repairs = _read_csv(path)
-        grasps = (make_plain_grasps if plain else make_grasps)(*samples, **per_grasp)
-        grasps.attrs["repairs"] = "\n".join(repairs)
-    return _whole(grasps, path)
+        return _whole(_of_dataset(open_netcdf(path) if found is None else found, path, name), path)
+    samples, meta = _sample_table(path), _meta_path(path)
+    make = make_plain_grasps if plain else make_grasps
+    return _of_tables(samples, read_csv_table(meta, text=None), name or file_stem(path), make)
 
 
-def read_stored_grasps(path: str | Path, start: int = 0, stop: int | None = None) -> Grasps:
+def read_stored_grasps(
+    path: str | Path, start: int = 0, stop: int | None = None, *, name: str | None = None
+) -> Grasps:
     """Return the grasps from ``start`` to ``stop`` of a Zarr store, by default all, as
     :func:`read_grasps`."""
-    grasps = _of_dataset(open_store(path, start, stop), path)
+    grasps = _of_dataset(open_store(path, start, stop), path, name)
     if stop is not None:
         grasps.attrs["name"] += f"[{start}:{stop}]"
     return _whole(grasps, path)
@@ -151,16 +153,47 @@ def as_grasps(grasps: Records) -> list[Grasps]:
     return [from_frame(each) if isinstance(each, pandas.DataFrame) else each for each in files]
 
 
-def from_frame(frame: DataFrame, name: str = "DataFrame") -> Grasps:
+def from_frame(frame: DataFrame, name: str = "DataFrame", *, file: str | Path | None = None) -> Grasps:
     """Return the grasps of a table with a row a sample, in which each row repeats what is known of its grasp;
-    columns as in the two files of :func:`read_grasps`."""
-    samples = [name for name in map(str, frame.columns) if name.startswith(_OF_SAMPLES)]
-    with TemporaryDirectory() as folder:
-        path = Path(folder, f"{name}.csv")
-        frame[samples].to_csv(path, index=False)
-        rest = frame.drop(columns=[name for name in samples if name != "grasp_id"])
-        rest.drop_duplicates("grasp_id").to_csv(Path(folder, f"{name}_meta.csv"), index=False)
-        return read_grasps(path)
+    columns as in the two files of :func:`read_grasps`.  What is refused is named by ``file`` and its row,
+    the first one 1."""
+    where = str(file or name)
+    frame = frame.rename(columns=str).reset_index(drop=True)
+    samples = [column for column in frame.columns if column.startswith(_OF_SAMPLES)]
+    rest = frame.drop(columns=[column for column in samples if column != "grasp_id"])
+    if "grasp_id" in rest:
+        _check_cells(frame, where)
+        rest = rest.drop_duplicates("grasp_id")
+    long = _sample_table(where, frame[samples].to_csv(index=False).encode())
+    meta = read_csv_table(where, text=None, data=rest.to_csv(index=False).encode())
+    return _of_tables(replace(long, lines=long.lines - 1), meta, name, make_grasps)
+
+
+def _check_cells(frame: DataFrame, file: str) -> None:
+    """Refuse a text where a number should be, and rows that say different things of one grasp."""
+    import pandas as pd
+
+    known = [name for name in frame.columns if _meta_name(name, file)[0] in (*GRASP_NUMBERS, *GRASP_LABELS)]
+    for name in frame.columns:
+        if not name.startswith(_NEEDED) and _meta_name(name, file)[0] not in GRASP_NUMBERS:
+            continue
+        cells = frame[name].astype(object)
+        text = cells.map(lambda cell: isinstance(cell, str) and cell.strip().lower() not in ("", "nan"))
+        wrong = text & pd.to_numeric(cells, errors="coerce").isna()
+        if wrong.any():
+            at = int(wrong.argmax())
+            hint = "write a number, or leave the cell empty"
+            raise UserError(f"{cells[at][:40]!r} is no number", file=file, row=at + 1, column=name, hint=hint)
+    differ = frame[["grasp_id", *known]].drop_duplicates().duplicated("grasp_id")
+    if not differ.any():
+        return
+    at = int(differ.index[differ][0])
+    grasp = frame["grasp_id"][at]
+    first = int((frame["grasp_id"] == grasp).argmax())
+    name = next(each for each in known if frame[each].iloc[[first, at]].nunique(dropna=False) > 1)
+    problem = f"{frame[name][at]!s} of grasp {grasp!r} was {frame[name][first]!s} in row {first + 1}"
+    hint = "repeat in each row what is known of its grasp"
+    raise UserError(problem, file=file, row=at + 1, column=name, hint=hint)
 
 
 def check_grasp_file(path: str | Path) -> None:
@@ -209,12 +242,13 @@ def write_grasps(grasps: Grasps, path: str | Path) -> Path:
 
 def read_grasp_files(paths: Sequence[str | Path]) -> list[Grasps]:
     """Return the records of several files as of :func:`read_grasps`; a folder is all its grasp files, in
-    order of name, and no two files may have one name."""
+    order of name, and no file may be given twice."""
     records: dict[str, Grasps] = {}
-    for file in list_grasp_files(paths):
-        grasps = read_grasps(file)
-        if log_name(grasps) in records:
-            raise UserError("is given twice", file=file, hint="give each file once")
+    files = list_grasp_files(paths)
+    for file, name in zip(files, distinct_names(files)):
+        grasps = read_grasps(file, name=name)
+        if log_name(grasps) in records:  # two NetCDF files may call themselves alike
+            grasps.attrs["name"] = str(file)
         records[log_name(grasps)] = grasps
     return list(records.values())
 
@@ -222,15 +256,33 @@ def read_grasp_files(paths: Sequence[str | Path]) -> list[Grasps]:
 def list_grasp_files(paths: Sequence[str | Path]) -> list[Path]:
     """Return the grasp files in paths and folders, as of :func:`read_grasp_files`, unread."""
     files: list[Path] = []
-    for path in (Path(name) for given in paths for name in _matching(given)):
+    for path in (Path(name) for given in paths for name in matching_files(given)):
         files += _in_folder(path) if path.is_dir() and not is_store(path) else [path]
     return files
 
 
-def _matching(path: str | Path) -> list[str]:
-    """Return what a pattern with *, ? or [] that a shell left names, in order; else the path itself."""
-    found = [] if os.path.exists(path) else sorted(glob(str(path), recursive=True))
-    return [name for name in found if not file_stem(name).endswith("_meta")] or [str(path)]
+def distinct_names(files: Sequence[Path]) -> list[str | None]:
+    """Return for each file None, or where another one has its stem a name with as many of the folders above
+    it as tell them apart; UserError where a file is given twice."""
+    places = [os.path.abspath(file) for file in files]
+    seen: set[str] = set()
+    for file, place in zip(files, places):
+        if place in seen:
+            raise UserError("is given twice", file=file, hint="give each file once")
+        seen.add(place)
+    names = [file_stem(file) for file in files]
+    alike = {name for name, n in Counter(names).items() if n > 1}
+    found: list[str | None] = [None] * len(files)
+    depth = 1
+    while alike:
+        found = [
+            "/".join(Path(place).parts[-depth:]) if name in alike else longer
+            for name, place, longer in zip(names, places, found)
+        ]
+        names = [longer or name for name, longer in zip(names, found)]
+        alike = {name for name, n in Counter(names).items() if n > 1}
+        depth += 1
+    return found
 
 
 def grasp_file_parts(path: Path) -> list[Path]:
@@ -260,18 +312,24 @@ def _print_of(samples: Floats) -> bytes:
 
 def _in_folder(folder: Path) -> list[Path]:
     with os_faults(folder):
-        endings = (*_ENDINGS, ".nc", ".parquet")
+        endings = (*_ENDINGS, ".nc", ".parquet", ".pq")
         files = sorted(p for p in folder.iterdir() if p.name.lower().endswith(endings) or is_store(p))
     files = [p for p in files if not file_stem(p).endswith("_meta") and not p.name.startswith(".")]
     if not files:
         hint = "give a folder with .csv, .nc, .parquet or .zarr in it"
+        if any(path.is_dir() for path in folder.iterdir()):
+            hint += f", or a pattern in quotes: '{folder}/*/*.parquet'"
         raise UserError("holds no grasp files", file=folder, hint=hint)
     return files
 
 
-def _read_samples(path: str | Path) -> tuple[list[str], Floats, dict[str, Floats], list[str]]:
+def _sample_table(path: str | Path, data: bytes | None = None) -> Table:
+    return read_csv_table(path, text=lambda header: not header.startswith(_NEEDED), data=data)
+
+
+def _samples_of(table: Table) -> tuple[list[str], Floats, dict[str, Floats], list[str]]:
     """Return grasp_id of each row, its time [s], the temperature channels [degC], and what was repaired."""
-    table = read_csv_table(path, text=lambda header: not header.startswith(_NEEDED))
+    path = table.file
     if "grasp_id" not in table.text:
         problem = "no column grasp_id"
         raise UserError(problem, file=path, hint="a grasp file has grasp_id,time_s,t_surface_degC")
@@ -413,17 +471,26 @@ def _meta_path(path: str | Path) -> Path:
     return found
 
 
-def _read_meta(path: Path, order: list[str], file: str) -> tuple[dict[str, Any], list[str]]:
+def _meta_name(header: str, file: str | None = None) -> tuple[str, str]:
+    """Return what a record calls a column of the meta file, and its unit; no name where it means nothing."""
+    if not re.fullmatch(r"\S+", header) or not header.lower().startswith(
+        ("grasp_id", *GRASP_LABELS, *GRASP_NUMBERS)
+    ):
+        return "", ""
+    name, unit = split_header(header, file=file)
+    return name.lower() if name.lower() in GRASP_LABELS else _FROM_META.get(name, name), unit  # "Material"
+
+
+def _meta_of(table: Table, order: list[str], file: str) -> tuple[dict[str, Any], list[str]]:
     """Return the per-grasp columns in the order of the sample file, and a line on those that are left out."""
-    table = read_csv_table(path, text=None)
+    path = Path(table.file)
     if "grasp_id" not in table.text:
         raise UserError("no column grasp_id", file=path, hint="give each grasp's name as in the sample file")
     rows = _matched(table, order, path, file)
     found: dict[str, Any] = {}
     strange = []
     for header, cells in table.text.items():
-        name, unit = split_header(header) if re.fullmatch(r"\S+", header) else ("", "")
-        name = name.lower() if name.lower() in GRASP_LABELS else _FROM_META.get(name, name)  # "Material"
+        name, unit = _meta_name(header, str(path))
         if name in found:
             raise UserError(f"gives {name} a second time", file=path, column=header, hint="keep one")
         if name in GRASP_NUMBERS:
@@ -469,25 +536,29 @@ def _with_defaults(per_grasp: dict[str, Any], n: int, stem: str) -> dict[str, An
     return filled
 
 
-def _read_csv(path: str | Path) -> tuple[tuple[Floats, Floats, list[str]], dict[str, Any], list[str]]:
-    """Return time, samples and names of the grasps of a file, what is known of each, and repairs."""
-    stem = file_stem(path)
-    ids, time, channels, repairs = _read_samples(path)
+def _of_tables(samples: Table, meta: Table, name: str, make: Callable[..., Grasps]) -> Grasps:
+    """Return the grasps of a table with a row a sample and one with a row a grasp."""
+    ids, time, channels, repairs = _samples_of(samples)
     order, index = _in_order(ids)
-    axis, gridded, more = _onto_one_axis(order, index, time, channels, str(path))
-    meta, left_out = _read_meta(_meta_path(path), order, str(path))
-    per_grasp = _with_defaults(meta, len(order), stem)
-    per_grasp |= {"name": stem, "t_surface_2": gridded.get("t_surface_2")}
-    return (axis, gridded["t_surface"], order), per_grasp, repairs + more + left_out
+    axis, gridded, more = _onto_one_axis(order, index, time, channels, samples.file)
+    about, left_out = _meta_of(meta, order, samples.file)
+    per_grasp = _with_defaults(about, len(order), name)
+    per_grasp |= {"name": name, "t_surface_2": gridded.get("t_surface_2")}
+    try:
+        grasps = make(axis, gridded["t_surface"], order, **per_grasp)
+    except UserError as error:  # which knows the record's name alone
+        raise UserError(error.problem, file=samples.file, column=error.column, hint=error.hint) from error
+    grasps.attrs["repairs"] = "\n".join(repairs + more + left_out)
+    return _whole(grasps, samples.file)
 
 
-def _of_dataset(data: xr.Dataset, path: str | Path) -> Grasps:
+def _of_dataset(data: xr.Dataset, path: str | Path, called: str | None = None) -> Grasps:
     """Return the grasps of what a NetCDF file or a Zarr store holds."""
     schema = data.attrs.get("schema", "thermogrip.grasps")
     if schema != "thermogrip.grasps":
         raise UserError(f"holds a {schema}, not grasps", file=path, hint="give a file of grasps")
-    stem = file_stem(path)
-    data.attrs.setdefault("name", stem)
+    stem = called or file_stem(path)
+    data.attrs["name"] = called or data.attrs.get("name", stem)
     known = {"t_surface", "t_surface_2", *GRASP_NUMBERS, *GRASP_LABELS}
     data = data[[name for name in data.data_vars if name in known]]
     if "grasp" in data.coords:

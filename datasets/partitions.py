@@ -4,9 +4,10 @@ Files are read one at a time, and one of many single touches is answered in part
 as a file of its own.  What was answered is kept beside the output in ``NAME.partial``, a line of JSON a part,
 forced to disk before the next part begins (with several workers, before that of a later file).  Ctrl-C,
 ``kill -9`` and a full disk leave whole lines and at most the beginning of one.  The same command takes those
-of its lines that are of the same files (name, size, time of writing) in the same order, cuts off the rest,
-and goes on: as a part's answer depends on nothing but the part, the end is the same bytes.  Memory holds one
-file and one part, whatever the number of files.
+of its lines that are of its files as they are (name, size, time of writing) and answers what is missing: as a
+part's answer depends on nothing but the part, the end is the same bytes.  Lines to another command stay until
+this one is done, behind a line with the question of theirs.  Memory holds one file and one part, and where
+the lines of the others begin.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from importlib.util import find_spec
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -27,7 +28,9 @@ import numpy as np
 from thermogrip import __version__
 from thermogrip.datasets.atomic_files import atomic_path, open_append
 from thermogrip.datasets.errors import UserError, as_user_error, os_faults
+from thermogrip.datasets.file_names import matching_files
 from thermogrip.datasets.grasp_files import (
+    distinct_names,
     grasp_file_parts,
     list_grasp_files,
     read_grasps,
@@ -58,18 +61,35 @@ def sources(paths: Sequence[str | Path], *, plain: bool = False) -> list[Source]
     """Return the files of grasps in paths and folders, and the slices of Zarr stores, unread; ``plain`` as of
     :func:`~thermogrip.datasets.grasp_files.read_grasps`."""
     found = []
-    for path in list_grasp_files(paths):
+    files = list_grasp_files(paths)
+    for path, name in zip(files, distinct_names(files)):
         marks = stamps(grasp_file_parts(path))
         size = sum(mark[1] for mark in marks)
         if is_store(path):
             slices, newest = store_slices(path), max(mark[2] for mark in marks)
             for start, stop in slices:
-                read = partial(read_stored_grasps, path.absolute(), start, stop)
+                read = partial(read_stored_grasps, path.absolute(), start, stop, name=name)
                 stamp = [[str(path), size, newest], start, stop]
                 found.append(Source(f"{path.name}[{start}:{stop}]", size // len(slices), stamp, read))
             continue
-        found.append(Source(path.name, size, marks, partial(read_grasps, path.absolute(), plain=plain)))
+        read = partial(read_grasps, path.absolute(), plain=plain, name=name)
+        found.append(Source(path.name, size, marks, read))
     return found
+
+
+def check_apart(out: str | Path, paths: Sequence[str | Path]) -> None:
+    """Refuse an output that is among the files that are read, or would be the next time."""
+    place, hint = Path(os.path.realpath(out)), "choose another name or folder for --out"
+    for given in paths:
+        if place.match(os.path.realpath(given)) and not os.path.isdir(given):
+            raise UserError("is to be read and written", file=out, hint=hint)
+        for path in map(Path, matching_files(given)):
+            if path.is_dir():
+                folder = path.resolve()
+                if place.parent == folder or (is_store(path) and place.is_relative_to(folder)):
+                    raise UserError("is in a folder that is read", file=out, hint=hint)
+            elif place in [part.resolve() for part in grasp_file_parts(path)]:
+                raise UserError("is to be read and written", file=out, hint=hint)
 
 
 def stamps(paths: Sequence[str | Path]) -> list[Any]:
@@ -126,8 +146,11 @@ class Answers:
         self.path = out.with_name(f"{out.name}.partial")
         head = {"partial": 1, "thermogrip": __version__, "question": list(question)}
         self._head: dict[str, Any] = json.loads(json.dumps(head, default=str))
-        self.grasps, self._own = 0, False
-        self._answered = 0.0  # share of the file to go on with
+        self.grasps = 0
+        self._others = 0  # grasps of lines that are not used
+        self._file = -1  # locked until it is closed
+        self._end = 0  # of its last line
+        self._places: list[list[int]] = []  # where the lines of each source begin
 
     def find(
         self,
@@ -140,65 +163,74 @@ class Answers:
         warn: Callable[[str], None] = lambda _: None,
     ) -> Answers:
         """Answer every part that has no answer yet; return the answers of all."""
-        with os_faults(self.path):
-            file = open_append(self.path)
+        self._file = _locked(self.path)
         try:
-            _lock(file, self.path)
-            self._own = True
-            at, part, end = self._known(given)
-            os.ftruncate(file, end)
-            if not end:
-                self._append(file, self._head)
-            tasks = [Task(each, 0, prepare, answer) for each in given[at:]]
-            tasks[:1] = [task._replace(first=part) for task in tasks[:1]]
-            self._find(file, tasks, given, progress, workers, warn)
+            known = self._known()
         except BaseException:
-            if self._own and not self.grasps:
-                self.remove()
+            self.close()
             raise
-        finally:
-            os.close(file)
+        try:
+            self._places = [[place for place, _ in known.get(_key(each), ())] for each in given]
+            parts = [known[_key(each)][0][1]["parts"] if at else 1 for each, at in zip(given, self._places)]
+            self.grasps = sum(line["grasps"] for each in given for _, line in known.get(_key(each), ()))
+            self._others -= self.grasps
+            if self._others:
+                more = "are of files as they were, or to another command, and are not used"
+                warn(f"{self.path}: {self._others} answers in it {more}")
+            tasks = {
+                k: Task(each, len(at), prepare, answer)
+                for k, (each, at, n) in enumerate(zip(given, self._places, parts))
+                if len(at) < n
+            }
+            whole = max(sum(each.size for each in given), 1)
+            done = sum(each.size * len(at) / n for each, at, n in zip(given, self._places, parts))
+            self._find(tasks, done / whole, whole, progress, workers, warn)
+        except BaseException:
+            if not self.grasps + self._others:
+                self.remove()
+            self.close()
+            raise
         return self
 
     def _find(
-        self, file: int, tasks: list[Task], given: Sequence[Source], progress: Progress, workers: Workers,
+        self, tasks: dict[int, Task], done: float, whole: int, progress: Progress, workers: Workers,
         warn: Callable[[str], None],
     ) -> None:  # fmt: skip
-        whole, begin, before = max(sum(each.size for each in given), 1), time.monotonic(), self.grasps
-        done, names = whole - sum(task.source.size for task in tasks), set[str]()
-        ahead = tasks[0].source.size * self._answered if tasks else 0.0
-        progress((done + ahead) / whole, "grasps")  # with which share this run begins
+        begin, before = time.monotonic(), self.grasps
+        progress(done, "grasps")  # with which share this run begins
         alone = workers == 1 or len(tasks) == 1
-        answered = (task.lines() for task in tasks) if alone else in_order(_whole, tasks, workers)
-        for task, lines in zip(tasks, answered):
+        todo = [*tasks.values()]
+        answered = (task.lines() for task in todo) if alone else in_order(_whole, todo, workers)
+        for (at, task), lines in zip(tasks.items(), answered):
             for line in lines:
-                if line["part"] == task.first and line["name"] in names:
-                    raise UserError("is given twice", file=task.source.name, hint="give each file once")
-                names.add(line["name"])
                 for words in line.pop("warnings", ()):
                     warn(words)
-                self._append(file, line)
+                self._places[at].append(self._append(line))
                 self.grasps += line["grasps"]
                 rate = (self.grasps - before) / max(time.monotonic() - begin, 1e-3)
-                words = f"grasps: {self.grasps}, {rate:.3g}/s, {task.source.name}"
-                progress((done + task.source.size * (line["part"] + 1) / line["parts"]) / whole, words)
-            done += task.source.size
+                done += task.source.size / line["parts"] / whole
+                progress(done, f"grasps: {self.grasps}, {rate:.3g}/s, {task.source.name}")
 
-    def _known(self, given: Sequence[Source]) -> tuple[int, int, int]:
-        """Return the file and the part to go on with, and where in the file of answers."""
-        at = part = end = 0
-        for line, last in self._lines():
-            if not end:
-                if line != self._head:
-                    break
-            elif at == len(given) or [line.get("of"), line.get("part")] != [given[at].stamp, part]:
-                break
+    def _known(self) -> dict[str, list[tuple[int, dict[str, Any]]]]:
+        """Return the lines to this question of each file, and where they begin; what is torn is cut off."""
+        found: dict[str, list[tuple[int, dict[str, Any]]]] = {}
+        ours = False
+        for line, end in self._lines():
+            if "partial" in line:
+                ours = line == self._head
+            elif not self._end:
+                hint = "move it away, or choose another --out"
+                raise UserError("is no file of kept answers", file=self.path, hint=hint)
             else:
-                self.grasps += line["grasps"]
-                at, part = (at + 1, 0) if part + 1 == line["parts"] else (at, part + 1)
-                self._answered = part / line["parts"]
-            end = last
-        return at, part, end
+                self._others += line["grasps"]
+                lines = found.setdefault(json.dumps(line["of"]), []) if ours else []
+                if line["part"] == len(lines):
+                    lines.append((self._end, {name: line[name] for name in ("parts", "grasps")}))
+            self._end = end
+        os.ftruncate(self._file, self._end)
+        if not ours:
+            self._append(self._head)
+        return found
 
     def _lines(self) -> Iterator[tuple[dict[str, Any], int]]:
         """Yield each whole line and where it ends."""
@@ -215,15 +247,20 @@ class Answers:
                 yield line, end
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        return (line for line, _ in islice(self._lines(), 1, None))
+        with os_faults(self.path), open(self.path, "rb") as file:
+            for place in chain.from_iterable(self._places):
+                file.seek(place)
+                yield json.loads(file.readline())
 
-    def _append(self, file: int, line: dict[str, Any]) -> None:
-        """Write one line and force it to disk."""
+    def _append(self, line: dict[str, Any]) -> int:
+        """Write one line and force it to disk; return where it begins."""
         rest = memoryview(json.dumps(line, default=_as_python).encode() + b"\n")
+        place, self._end = self._end, self._end + len(rest)
         with os_faults(self.path):
             while rest:
-                rest = rest[os.write(file, rest) :]
-            os.fsync(file)
+                rest = rest[os.write(self._file, rest) :]
+            os.fsync(self._file)
+        return place
 
     def write(self, out: Path, cell: Callable[[Any], Any]) -> None:
         """Write the ``rows`` of all parts as CSV or, by the ending of ``out``, Parquet, whole or not at all.
@@ -232,7 +269,7 @@ class Answers:
         """
         names = list(dict.fromkeys(name for part in self for row in part["rows"] for name in row))
         with atomic_path(out) as path:
-            if out.suffix == ".parquet":
+            if out.suffix.lower() == ".parquet":
                 self._write_parquet(path, names)
                 return
             with open(path, "w", encoding="utf-8", newline="") as file:
@@ -252,21 +289,46 @@ class Answers:
                 columns = [pa.array([row.get(f.name) for row in part["rows"]], f.type) for f in schema]
                 file.write_table(pa.table(columns, schema=schema))
 
+    def close(self) -> None:
+        """Let another run have the file."""
+        file, self._file = self._file, -1
+        if file >= 0:
+            os.close(file)
+
     def remove(self) -> None:
         """Remove what is kept on disk."""
+        if os.name == "nt":  # where no open file can be removed
+            self.close()
         with suppress(OSError):
             self.path.unlink()
+        self.close()
 
 
-def _lock(file: int, path: Path) -> None:
-    """Refuse a file that another process writes, where the system knows such locks."""
-    if find_spec("fcntl") is None:
-        return
-    import fcntl
+def _key(source: Source) -> str:
+    """Return what a line of this source has as ``of``."""
+    return json.dumps(source.stamp)
 
-    busy = {"file": path, "hint": "wait for that run, or choose another --out"}
-    with as_user_error(BlockingIOError, "is being written by another run", **busy):
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+def _locked(path: Path) -> int:
+    """Return the descriptor of a file that no other process writes, where the system knows such locks."""
+    while True:
+        with os_faults(path):
+            file = open_append(path)
+        if find_spec("fcntl") is None:
+            return file
+        import fcntl
+
+        busy = {"file": path, "hint": "wait for that run, or choose another --out"}
+        try:
+            with as_user_error(BlockingIOError, "is being written by another run", **busy):
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            with suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(file), os.stat(path)):
+                    return file
+        except BaseException:
+            os.close(file)
+            raise
+        os.close(file)  # the run that had it has ended and removed it
 
 
 def _as_python(value: Any) -> Any:

@@ -83,15 +83,19 @@ class Table:
 
 
 def read_csv_table(
-    path: str | Path, *, text: Callable[[str], bool] | frozenset[str] | None = frozenset()
+    path: str | Path,
+    *,
+    text: Callable[[str], bool] | frozenset[str] | None = frozenset(),
+    data: bytes | None = None,
 ) -> Table:
     """Return the columns of a CSV file, plain, ``.gz`` or ``.xz``.
 
     Lines that start with ``#`` before the header are skipped. The separator is a comma, or a semicolon or tab
     if the header has no comma; then numbers may have a decimal comma, which is noted. ``text`` names the
-    columns to leave as text, or states that of a header; None is all of them.
+    columns to leave as text, or states that of a header; None is all of them; ``data`` is what the file
+    holds, where that is known.
     """
-    data = _text_of(path)
+    data = _text_of(path) if data is None else data
     layout = Layout(*_header(data, str(path)), ())
     is_text = text if callable(text) else lambda name: text is None or name in text
     words = frozenset(name for name in layout.names if is_text(name))
@@ -373,7 +377,7 @@ def _parse_table(
         elif not name.startswith(_LEFT_OUT):
             notes += _read_cells(name, column, (numbers, text, faults), lines, separator, broken, file)
     if faults:
-        raise _joined(faults, names)
+        raise _joined(faults, names if broken else ())  # what may be broken is a log
     notes = tuple(dict.fromkeys([*layout.notes, *notes]))
     return Table(file, numbers, text, lines, notes=notes, separator=separator)
 
@@ -427,7 +431,7 @@ def _shown(cell: str) -> str:
 
 
 def _joined(faults: Sequence[UserError], names: Sequence[str]) -> UserError:
-    """Return all that is wrong with a file as one error, with the option that reads the rest of it."""
+    """Return all that is wrong with a file as one error, of a log with what reads the rest of it."""
     first, bad = faults[0], {fault.column for fault in faults}
     kept = ",".join("-" if name in bad else name.replace(",", " ") for name in names)
     hint = first.hint

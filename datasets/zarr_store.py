@@ -4,6 +4,9 @@ A store names the codecs that unpack its chunks, and one of them may be Python's
 its metadata are read as JSON first, and arrays whose codecs are not known to unpack bytes and nothing else
 are refused.  Variables, dimensions, units and attributes are those of a NetCDF file
 (:mod:`~thermogrip.datasets.netcdf`).
+
+A chunk without a file holds the fill value, by the format of Zarr.  A store that was copied in part looks
+alike, so readings without a file are noted among the repairs, and refused where they would be numbers.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ import json
 import math
 from collections.abc import Iterator
 from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -40,6 +44,16 @@ class _Array(NamedTuple):
     shape: tuple[int, ...]
     chunks: tuple[int, ...]
     codecs: tuple[str, ...]
+    fill: Any = None
+    chunk_name: str = ""  # how it begins
+    separator: str = "."  # of the places in it
+
+    def absent(self, folder: Path, start: int, stop: int) -> list[str]:
+        """Return the names of chunks without a file, of the rows from ``start`` to ``stop``."""
+        rows = range(start // self.chunks[0], -(-stop // self.chunks[0]))
+        others = (range(-(-n // chunk)) for n, chunk in zip(self.shape[1:], self.chunks[1:]))
+        names = (self.chunk_name + self.separator.join(map(str, at)) for at in product(rows, *others))
+        return [name for name in names if not (folder / name).is_file()]
 
 
 def is_store(path: str | Path) -> bool:
@@ -62,6 +76,7 @@ def open_store(path: str | Path, start: int = 0, stop: int | None = None) -> xr.
     """Return the grasps from ``start`` to ``stop`` of a store, loaded; UserError if it cannot be read, holds
     other codecs than those that unpack bytes, or too much."""
     arrays = _checked(Path(path))
+    lost = _lost_readings(Path(path), arrays, start, stop)
     if find_spec("zarr") is None:
         raise UserError("needs the package zarr", file=path, hint="pip install thermogrip[zarr]")
     import xarray as xr
@@ -77,7 +92,26 @@ def open_store(path: str | Path, start: int = 0, stop: int | None = None) -> xr.
         data = xr.open_zarr(path, chunks=None, **options)
         if "grasp" in data.dims:
             data = data.isel(grasp=slice(start, stop))
+        if lost:
+            data.attrs["repairs"] = "\n".join(filter(None, [str(data.attrs.get("repairs", "")), lost]))
         return from_cf(text_as_str(data.load()))
+
+
+def _lost_readings(store: Path, arrays: dict[str, _Array], start: int, stop: int | None) -> str:
+    """Return in words which readings have no file; UserError where they would be numbers."""
+    array = arrays.get("t_surface")
+    if array is None or 0 in array.chunks:
+        return ""
+    absent = array.absent(store / "t_surface", start, array.shape[0] if stop is None else stop)
+    if not absent:
+        return ""
+    words, hint = (
+        f"{len(absent)} chunk(s) of t_surface have no file, {absent[0]} first",
+        "copy the store again",
+    )
+    if array.fill not in ("NaN", None):
+        raise UserError(words, file=store, column="t_surface", hint=hint)
+    return f"{words}: no readings there, or {hint}"
 
 
 def _checked(store: Path) -> dict[str, _Array]:
@@ -110,9 +144,21 @@ def _described(file: Path) -> _Array:
         shape = tuple(int(n) for n in about["shape"])
         if about["zarr_format"] == 2:
             own = [about.get("compressor"), *(about.get("filters") or ())]
-            return _Array(shape, tuple(map(int, about["chunks"])), tuple(str(c["id"]) for c in own if c))
+            codecs, separator = tuple(str(c["id"]) for c in own if c), about.get("dimension_separator", ".")
+            return _Array(shape, tuple(map(int, about["chunks"])), codecs, about["fill_value"], "", separator)
         chunks = about["chunk_grid"]["configuration"]["chunk_shape"]
-        return _Array(shape, tuple(map(int, chunks)), tuple(_names(about["codecs"])))
+        keys = about["chunk_key_encoding"]
+        begin, usual = ("c", "/") if keys["name"] == "default" else ("", ".")
+        separator = str(keys.get("configuration", {}).get("separator", usual))
+        begin += separator if begin else ""
+        return _Array(
+            shape,
+            tuple(map(int, chunks)),
+            tuple(_names(about["codecs"])),
+            about["fill_value"],
+            begin,
+            separator,
+        )
 
 
 def _names(codecs: Any) -> Iterator[str]:

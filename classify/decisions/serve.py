@@ -5,7 +5,8 @@ of the grasp under the names of a meta file (``t_object_nominal_degC``, ...); ``
 back.
 The answer is the row that ``classify`` writes, or ``error``, one line.  Over pipes both are lines of JSON.
 Over HTTP a request is the body of a POST; the server has a loopback address, takes only requests that call it
-by one, and none of a web page: a page elsewhere, opened in a browser here, must not learn what is touched.
+by one, and none of a web page: a page elsewhere, opened in a browser here, must not learn what is touched.  A
+body must come within some seconds: one that never ends would hold up the end of the server.
 Requests wait for one thread, in the order of their arrival: an answer is all arithmetic.  With several
 processes as many are answered at once; one that is lost is replaced, and what it had in hand is asked again.
 """
@@ -14,6 +15,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import socket
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
 
 MOST_BYTES = 1 << 18  # of a request
+BODY_S = 10.0  # for the body of a request to come
 HOST = "127.0.0.1"
 #: What returns the ``rows`` of a record, and by grasp why some are ``strange``.
 Answer: TypeAlias = "Callable[[Grasps], Mapping[str, Any]]"
@@ -99,8 +102,11 @@ def serve_lines(answer: Answer, requests: BinaryIO, answers: BinaryIO) -> int:
 def application(replies: Callable[[bytes], dict[str, Any]], port: int, workers: int = 1) -> ASGIApp:
     """Return the server of answers for uvicorn; it is called by the loopback's names and this port.
     ``replies`` returns what :func:`reply` does; several ``workers`` import it."""
+    import asyncio
+
     from starlette.applications import Starlette
-    from starlette.responses import JSONResponse
+    from starlette.requests import ClientDisconnect
+    from starlette.responses import JSONResponse, Response
     from starlette.routing import Route
 
     from thermogrip.datasets.parallel import Replaced
@@ -114,11 +120,20 @@ def application(replies: Callable[[bytes], dict[str, Any]], port: int, workers: 
             why = "refused: this comes from a web page"
         if why:
             return JSONResponse({"error": why}, 403)
-        body = bytearray()
-        async for piece in request.stream():
-            body += piece
-            if len(body) > MOST_BYTES:
-                return JSONResponse(_too_long(), 413, {"connection": "close"})
+        body, end = bytearray(), {"connection": "close"}
+        declared = request.headers.get("content-length", "0")  # digits, or it does not come this far
+        if len(declared) > 18 or int(declared) > MOST_BYTES:
+            return JSONResponse(_too_long(), 413, end)
+        try:
+            async with asyncio.timeout(BODY_S):
+                async for piece in request.stream():
+                    body += piece
+                    if len(body) > MOST_BYTES:
+                        return JSONResponse(_too_long(), 413, end)
+        except TimeoutError:
+            return JSONResponse({"error": f"the request did not come within {BODY_S:g} s"}, 408, end)
+        except ClientDisconnect:  # nobody is there to read an answer
+            return Response(status_code=400)
         try:
             found = await pool.call(replies, bytes(body))
         except UserError as error:
@@ -155,7 +170,8 @@ def _content(request: bytes) -> dict[str, Any]:
         raise UserError(f"is no JSON ({error})", hint="write an object on one line") from error
     if not isinstance(given, dict):
         raise UserError("is no JSON object", hint="write an object on one line")
-    if not isinstance(given.get("id", 0), str | int):
+    name = given.get("id", 0)
+    if not isinstance(name, str | int) or (isinstance(name, str) and re.search("[\ud800-\udfff]", name)):
         del given["id"]
         raise UserError("id is no text and no whole number", hint="leave it out, or number the requests")
     return given

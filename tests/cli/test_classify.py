@@ -102,6 +102,19 @@ def test_effusivities_are_printed_written_and_answered(gripper: SimpleNamespace)
     assert (answer["without_contact"], answer["unexplained"], answer["out"]) == ([], {"a": "odd"}, "e.csv")
 
 
+def test_grasps_may_be_a_pattern_and_are_not_written_over(gripper: SimpleNamespace) -> None:
+    run, path = gripper.bench.run, gripper.bench.path
+    assert run("effusivity", "gr?sps*.csv", "--out", "e.csv").code == 0
+    assert run("effusivity", "gr?ps*.csv", "--out", "e.csv").code == 2
+    files = {each: each.read_bytes() for each in path.glob("*.csv")}
+    for out in ("grasps.csv", "grasps_meta.csv", "grasps2.csv"):
+        done = run("effusivity", "grasps*.csv", "--out", out)
+        assert (done.code, len(done.said)) == (2, 1)
+        assert f"{out}: is to be read and written; choose another name or folder" in done.said[0]
+    assert run("effusivity", "more.csv", "--calibrate", "grasps.csv", "--out", "grasps.csv").code == 2
+    assert {each: each.read_bytes() for each in path.glob("*.csv")} == files
+
+
 def test_the_bundled_gripper_may_be_another_one(gripper: SimpleNamespace, stand_in: StandIn) -> None:
     posteriors = stand_in(
         "thermogrip.sysid.effusivity.posterior.effusivity_posterior",

@@ -210,6 +210,7 @@ def test_a_fault_is_one_line_that_names_its_place(pair, long, meta, expected):
     line = refused(pair(long, meta))
     for part in expected:
         assert part in line
+    assert "identify" not in line  # whose --columns a log has
 
 
 @pytest.mark.parametrize("name", ["a.csv", "a.nc"])
@@ -353,3 +354,68 @@ def test_parquet_with_a_row_a_sample_is_the_csv(tmp_path):
     samples.merge(meta, on="grasp_id").to_parquet(tmp_path / "parquet" / "warm.parquet")
     [found] = read_grasp_files([tmp_path / "parquet"])
     assert found.identical(csv)
+
+
+@pytest.fixture
+def frame():
+    import pandas as pd
+
+    times = [-0.1, 0.0, 0.1]
+    rows = [(g, t, 23.0 + t, "iron", 43.0) for g in ("g0", "g1") for t in times]
+    return pd.DataFrame(
+        rows, columns=["grasp_id", "time_s", "t_surface_degC", "material", "t_object_nominal_degC"]
+    )
+
+
+@pytest.mark.parametrize(
+    ("column", "row", "value", "expected"),
+    [
+        ("t_surface_degC", 5, "warm", "row 5, column t_surface_degC: 'warm' is no number"),
+        ("t_object_nominal_degC", 6, "hot", "row 6, column t_object_nominal_degC: 'hot' is no number"),
+        ("t_object_nominal_degC", 5, 20.0, "row 5, column t_object_nominal_degC: 20.0 of grasp 'g1' was"),
+        ("material", 3, "wood", "row 3, column material: wood of grasp 'g0' was iron in row 1"),
+        ("t_object_nominal_degC", 2, None, "of grasp 'g0' was 43.0 in row 1"),
+        ("grasp_id", 2, None, "row 2, column grasp_id: is empty"),
+        ("time_s", 4, None, "row 4: has no time"),
+        ("time_s", 3, -0.2, "grasp 'g0': time runs back"),
+        ("t_surface_degC", 2, 5000.0, "grasp 'g0' has a t_surface of 5000 degC"),
+    ],
+)  # fmt: skip
+def test_a_fault_in_parquet_names_its_file_row_and_column(
+    frame, tmp_path, monkeypatch, column, row, value, expected
+):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "full"))  # nothing is written on the way
+    path = tmp_path / "part.parquet"
+    cells = frame[column].tolist()
+    cells[row - 1] = value
+    if isinstance(value, str):
+        cells = [str(cell) for cell in cells]
+    frame.assign(**{column: cells}).to_parquet(path)
+    line = refused(path)
+    assert line.startswith(str(path))
+    assert expected in line
+    assert "identify" not in line
+
+
+def test_parquet_of_either_ending_is_found_in_a_folder(frame, tmp_path):
+    for name in ("a.parquet", "b.pq"):
+        frame.to_parquet(tmp_path / name)
+    assert [record.attrs["name"] for record in read_grasp_files([tmp_path])] == ["a", "b"]
+
+
+def test_what_the_rows_of_a_grasp_may_differ_in_is_left_out_and_reported(frame, tmp_path):
+    path = tmp_path / "part.parquet"
+    frame.assign(force_N=range(6)).to_parquet(path)
+    assert read_grasps(path).attrs["repairs"].startswith("part.parquet: not used: force_N; known are")
+
+
+def test_two_files_that_call_themselves_alike_are_both_read(tmp_path, small_grasps):
+    for k in range(2):
+        write_grasps(small_grasps.assign_coords(grasp=[f"{k}{n}" for n in range(6)]), tmp_path / f"{k}.nc")
+    assert [r.attrs["name"] for r in read_grasp_files([tmp_path])] == ["small", str(tmp_path / "1.nc")]
+
+
+def test_a_folder_of_folders_says_the_pattern_for_it(tmp_path, small_grasps):
+    (tmp_path / "may").mkdir()
+    with pytest.raises(UserError, match=r"holds no grasp files.*or a pattern in quotes: '.*/\*/\*.parquet'"):
+        read_grasp_files([tmp_path])

@@ -16,7 +16,7 @@ import pytest
 from thermogrip.datasets import parallel, partitions
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.grasp_files import write_grasps
-from thermogrip.datasets.partitions import Answers, parts_of, sources
+from thermogrip.datasets.partitions import Answers, check_apart, parts_of, sources
 from thermogrip.datasets.schema import Grasps, make_grasps
 
 Answer = Callable[[Grasps], dict[str, Any]]
@@ -65,10 +65,17 @@ class Work:
             rows[0]["note"] = "a column of its own"
         return {"rows": rows}
 
-    def run(self, folder: Path, out: Path, question: str = "?") -> Answers:
-        found = Answers(out, [question])
-        found.find(sources([folder]), self.prepare, self.answer, lambda share, _: self.shares.append(share))
+    def run(self, folder: Path, out: Path, question: str = "?", said: list[str] | None = None) -> Answers:
+        found, warn = Answers(out, [question]), [].append if said is None else said.append
+        found.find(
+            sources([folder]),
+            self.prepare,
+            self.answer,
+            lambda share, _: self.shares.append(share),
+            warn=warn,
+        )
         found.write(out, lambda cell: "" if cell is None else cell)
+        found.close()
         return found
 
 
@@ -129,7 +136,8 @@ def test_what_was_done_of_other_files_or_asked_otherwise_is_done_anew(
         Work(0).run(folder, out)  # keeps what is of file a
     changed = Work()
     changed.run(folder, out)
-    assert (changed.asked[0], out.read_bytes() == whole) == (["b0", "b1"], True)
+    assert [names[0] for names in changed.asked] == ["b0", "b2", "b4", "c2", "c4"]
+    assert out.read_bytes() == whole
     other = Work()
     other.run(folder, out, "another question")
     assert (len(other.asked), out.read_bytes() == whole) == (9, True)
@@ -201,8 +209,8 @@ def test_answers_as_parquet_have_the_rows_of_the_table(folder: Path, tmp_path: P
     import pandas as pd
 
     work = Work()
-    work.run(folder, tmp_path / "o.parquet").remove()
-    frame = pd.read_parquet(tmp_path / "o.parquet")
+    work.run(folder, tmp_path / "o.PARQUET").remove()
+    frame = pd.read_parquet(tmp_path / "o.PARQUET")
     table = pd.read_csv(tmp_path / "whole.csv")
     pd.testing.assert_frame_equal(frame, table, check_dtype=False)
 
@@ -211,13 +219,116 @@ def test_a_pattern_that_a_shell_left_is_filled_in(folder: Path) -> None:
     assert [each.name for each in sources([str(folder / "[ac]*.csv")])] == ["a.csv", "c.csv"]
 
 
-def test_two_files_of_one_name_are_refused(folder: Path, tmp_path: Path) -> None:
-    (tmp_path / "more").mkdir()
-    write_grasps(record_of("a"), tmp_path / "more" / "a.csv")
-    with pytest.raises(UserError, match="given twice"):
-        Answers(tmp_path / "o.csv", []).find(
-            sources([folder, tmp_path / "more"]), Work().prepare, Work().answer, lambda *_: None
-        )
+def test_files_of_one_name_in_several_folders_are_told_apart_by_these(folder: Path, tmp_path: Path) -> None:
+    for name in ("may", "june"):
+        (tmp_path / "year" / name).mkdir(parents=True)
+        write_grasps(record_of("a"), tmp_path / "year" / name / "a.csv")
+    given = sources([str(tmp_path / "year" / "*" / "a.csv"), folder / "b.csv"])
+    assert [each.read().attrs["name"] for each in given] == ["june/a.csv", "may/a.csv", "b"]
+    assert (
+        Answers(tmp_path / "o.csv", []).find(given, Work().prepare, Work().answer, lambda *_: None).grasps
+        == 3 * N
+    )
+
+
+def test_a_file_that_is_given_twice_is_refused_before_any_is_read(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"b\.csv: is given twice"):
+        sources([folder, folder / ".." / "grasps" / "b.csv"])
+
+
+def test_an_answer_to_another_command_waits_for_it(folder: Path, tmp_path: Path, whole: bytes) -> None:
+    out, said = tmp_path / "o.csv", list[str]()
+    with pytest.raises(KeyboardInterrupt):
+        Work(7).run(folder, out)
+    with pytest.raises(KeyboardInterrupt):
+        Work(2).run(folder, out, "typed by mistake", said)
+    assert said[0].startswith(
+        f"{out}.partial: {N + N + 2} answers in it are of files as they were, or to another"
+    )
+    again = Work()
+    again.run(folder, out)
+    assert (len(again.asked), out.read_bytes() == whole) == (2, True)
+
+
+@pytest.mark.parametrize("change", ["first", "between", "gone"])
+def test_files_that_come_or_go_leave_the_answers_of_the_others(
+    change: str, folder: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "o.csv"
+    with pytest.raises(KeyboardInterrupt):
+        Work(7).run(folder, out)
+    if change == "gone":
+        (folder / "a.csv").unlink()
+    else:
+        name = {"first": "0", "between": "bb"}[change]
+        write_grasps(record_of(name), folder / f"{name}.csv")
+    again = Work()
+    again.run(folder, out).remove()
+    assert len(again.asked) == 2 + 3 * (change != "gone")
+    Work().run(folder, tmp_path / "anew.csv").remove()
+    assert out.read_bytes() == (tmp_path / "anew.csv").read_bytes()
+
+
+def test_a_file_that_is_no_file_of_answers_stays_as_it_is(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "o.csv.partial").write_text('{"mine": 1}\n')
+    with pytest.raises(UserError, match="is no file of kept answers; move it away"):
+        Work().run(folder, tmp_path / "o.csv")
+    assert (tmp_path / "o.csv.partial").read_text() == '{"mine": 1}\n'
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such locks")
+def test_no_run_begins_while_another_one_writes_its_table(folder: Path, tmp_path: Path) -> None:
+    out, first = tmp_path / "o.csv", Answers(tmp_path / "o.csv", ["?"])
+    first.find(sources([folder]), Work().prepare, Work().answer, lambda *_: None)
+    with pytest.raises(UserError, match="written by another run"):
+        Work().run(folder, out, "another question")
+    first.write(out, str)
+    first.remove()
+    assert len(out.read_text().splitlines()) == 1 + N_FILES * N
+    Work().run(folder, out).remove()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such locks")
+def test_a_run_that_begins_as_another_one_ends_has_a_file_of_its_own(
+    folder: Path, tmp_path: Path, whole: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import fcntl
+
+    out, lock, ended = tmp_path / "o.csv", fcntl.flock, list[int]()
+
+    def late(file: int, how: int) -> None:
+        if not ended:  # the other run removes the file between the two calls
+            ended.append(file)
+            (tmp_path / "o.csv.partial").unlink()
+        lock(file, how)
+
+    monkeypatch.setattr(fcntl, "flock", late)
+    Work().run(folder, out).remove()
+    assert (len(ended), out.read_bytes() == whole) == (1, True)
+
+
+@pytest.mark.parametrize(
+    ("out", "given", "problem"),
+    [
+        ("a.csv", ["a.csv"], "is to be read and written"),
+        ("a_meta.csv", ["b.csv", "a.csv"], "is to be read and written"),
+        ("new.csv", ["."], "is in a folder that is read"),
+        ("new.csv", ["*.csv"], "is to be read and written"),
+        ("store/0.csv", ["store"], "is in a folder that is read"),
+        ("new.csv", ["a.csv", "store"], ""),
+        ("more/new.csv", [".", "*.csv"], ""),
+    ],
+)
+def test_an_output_is_no_file_that_is_read(out: str, given: list[str], problem: str, folder: Path) -> None:
+    for name in ("more", "store"):
+        (folder / name).mkdir()
+    (folder / "store" / "zarr.json").write_text("{}")
+    paths = [folder / name for name in given]
+    if not problem:
+        check_apart(folder / out, paths)
+        return
+    with pytest.raises(UserError, match=problem):
+        check_apart(folder / out, paths)
 
 
 @pytest.mark.parametrize(("groups", "parts"), [(["", "", "", "", ""], 3), (["", "x", "x", "", ""], 1)])

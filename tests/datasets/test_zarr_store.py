@@ -13,7 +13,13 @@ import xarray as xr
 from thermogrip.datasets import zarr_store
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.examples import load_example_grasps
-from thermogrip.datasets.grasp_files import check_grasp_file, list_grasp_files, read_grasps, write_grasps
+from thermogrip.datasets.grasp_files import (
+    check_grasp_file,
+    list_grasp_files,
+    read_grasps,
+    read_stored_grasps,
+    write_grasps,
+)
 from thermogrip.datasets.netcdf import as_cf
 from thermogrip.datasets.partitions import sources
 from thermogrip.datasets.zarr_store import store_slices
@@ -101,6 +107,23 @@ def test_a_store_whose_chunk_is_damaged_is_one_line(tmp_path):
     chunk = store / "t_surface" / "0.0"
     chunk.write_bytes(chunk.read_bytes()[:20])
     with pytest.raises(UserError, match="is damaged or no Zarr store"):
+        read_grasps(store)
+
+
+@pytest.mark.parametrize("zarr_format", [2, 3])
+def test_readings_without_a_file_are_noted_or_refused(tmp_path, zarr_format):
+    store = stored(tmp_path / "warm.zarr", zarr_format)
+    assert not read_grasps(store).attrs.get("repairs")
+    name = "1.2" if zarr_format == 2 else "c/1/2"
+    (store / "t_surface" / name).unlink()
+    [line] = read_grasps(store).attrs["repairs"].splitlines()
+    assert (
+        line
+        == f"1 chunk(s) of t_surface have no file, {name} first: no readings there, or copy the store again"
+    )
+    assert not read_stored_grasps(store, 20, 40).attrs.get("repairs")
+    change(store / "t_surface" / (".zarray" if zarr_format == 2 else "zarr.json"), fill_value=0.0)
+    with pytest.raises(UserError, match=f"column t_surface: 1 chunk.s. .*{name} first; copy the store again"):
         read_grasps(store)
 
 

@@ -155,8 +155,9 @@ def effusivity(
     cli.new_file(out, (".csv", ".parquet"))
     pool = cli.workers_of(workers, cluster, *NEEDED)
     console = Console(as_json)
-    from thermogrip.datasets.partitions import Answers, sources, stamps
+    from thermogrip.datasets.partitions import Answers, check_apart, sources, stamps
 
+    check_apart(out, [*grasps, *(calibrate or ())])
     given = sources(grasps, plain=True)
     device, coupling, longest = calibrated_device(console, calibrate or [], seed)
     # the bundled gripper may have taken these grasps or not
@@ -379,7 +380,7 @@ def classify(
     own = [name for name in cli.comma(candidates) or () if name not in load_materials()]
     cli.choices("--materials", own, model_dir / "classifier.json", "classes")
     from thermogrip.classify.decisions.predict import cell_text
-    from thermogrip.datasets.partitions import Answers, sources, stamps
+    from thermogrip.datasets.partitions import Answers, check_apart, sources, stamps
 
     console = Console(as_json)
     anywhere = Path.absolute if cluster else Path  # its workers run in other folders
@@ -392,6 +393,7 @@ def classify(
     if serve:
         return _serve(console, ask, port, pool)
     assert out is not None
+    check_apart(out, [*(paths or ()), *(known or ())])
     given = sources(paths or [], plain=True)
     asked = [*astuple(ask), stamps([model_dir, *ask.known, *ask.others])]
     ask.answerer()

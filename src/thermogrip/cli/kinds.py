@@ -19,6 +19,7 @@ from typing import Any
 
 from thermogrip.datasets.atomic_files import read_toml
 from thermogrip.datasets.errors import UserError, known_names
+from thermogrip.datasets.file_names import matching_files
 
 KINDS: dict[str, dict[str, Any]] = tomllib.loads(
     (resources.files("thermogrip.cli") / "kinds.toml").read_text(encoding="utf-8")
@@ -163,6 +164,11 @@ def _joined(ctx: Any, word: str) -> str:
     return ""
 
 
+def _meant(path: str, kind: str) -> list[str]:
+    """Return the files that a path is, where a pattern may stand for them."""
+    return matching_files(path) if kind == "grasps" else [path]
+
+
 def check_files(ctx: Any) -> None:
     """Refuse what is not there, of another kind, or not whole among what a verb was given."""
     given = []
@@ -173,6 +179,7 @@ def check_files(ctx: Any) -> None:
     given.sort(key=lambda each: each[1] != "network")  # a misspelt name is refused before files are read
     named = ("network", "page", "port")  # which need no file
     there = [(path, kind) for path, kind in given if kind not in named or os.path.isfile(path)]
+    there = [(each, kind) for path, kind in there for each in _meant(path, kind)]
     for path, _ in there:
         check_exists(path, _joined(ctx, path))
     for path, kind in there:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from thermogrip.classify.decisions import serve
 from thermogrip.classify.decisions.serve import HOST, MOST_BYTES, grasp_of, listen, reply, serve_lines, server
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Grasps
@@ -62,7 +63,8 @@ def test_a_request_has_the_names_of_a_meta_file() -> None:
      ({"t_surface_degC": [10**400, 24, 25]}, "no finite number"),
      ({"t_surface_degC": [None, None, None]}, "no temperature"),
      ({"t_ambient_degC": True}, "t_ambient_degC has 'True'"),
-     ({"id": [1]}, "id is no text and no whole number")],
+     ({"id": [1]}, "id is no text and no whole number"),
+     ({"id": "\ud800"}, "id is no text and no whole number")],  # half a character, which no answer can hold
 )  # fmt: skip
 def test_what_is_no_grasp_is_refused_in_one_line(more: dict[str, Any], words: str) -> None:
     found = asked(**more)
@@ -135,9 +137,38 @@ def test_over_http_too_only_grasps_are_answered(port: int) -> None:
 def test_a_body_that_is_too_long_is_refused_before_it_is_read(port: int) -> None:
     client = socket.create_connection((HOST, port), timeout=20)
     head = f"POST / HTTP/1.1\r\nHost: {HOST}:{port}\r\nContent-Length: {1 << 40}\r\n\r\n"
-    client.sendall(head.encode() + b"x" * (MOST_BYTES + 1))
+    client.sendall(head.encode() + b"x")
     assert client.recv(100).startswith(b"HTTP/1.1 413")
     client.close()
+
+
+def test_a_body_in_chunks_is_read_as_far_as_it_may_be_long(port: int) -> None:
+    body = json.dumps(GRASP).encode()
+    client = http.client.HTTPConnection(HOST, port, timeout=20)
+    client.request("POST", "/", iter([body[:9], body[9:]]), encode_chunked=True)
+    assert json.loads(client.getresponse().read())["material"] == "iron"
+    client.putrequest("POST", "/")
+    client.putheader("Transfer-Encoding", "chunked")
+    client.endheaders()
+    client.send(b"%x\r\n" % (MOST_BYTES + 1) + b"x" * (MOST_BYTES + 1))
+    assert client.getresponse().status == 413
+    client.close()
+
+
+def test_a_client_that_stops_midway_holds_nothing_up(
+    port: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    head = f"POST / HTTP/1.1\r\nHost: {HOST}:{port}\r\nContent-Length: 100\r\n\r\n{{".encode()
+    gone = socket.create_connection((HOST, port), timeout=20)
+    gone.sendall(head)
+    gone.close()
+    monkeypatch.setattr(serve, "BODY_S", 0.2)
+    waits = socket.create_connection((HOST, port), timeout=20)
+    waits.sendall(head)
+    assert post(port, json.dumps(GRASP).encode())[0] == 200
+    assert waits.recv(100).startswith(b"HTTP/1.1 408")
+    waits.close()
+    assert not caplog.records
 
 
 @pytest.mark.parametrize(
