@@ -85,7 +85,12 @@ def test_folders_that_are_no_fleet_are_refused(bench: Bench, rigs: Path) -> None
     (rigs / "empty").mkdir()
     done = bench.run("fleet", str(rigs), "--network", "tclab", "--out", "f")
     assert (done.code, "has no log" in done.err) == (2, True)
-    (rigs / "empty").rmdir()
+    (rigs / "empty").rename(rigs / ".hidden")  # of a notebook, say
+    (rigs / "b1/deep").mkdir()
+    (rigs / "b1/log.csv").rename(rigs / "b1/deep/log.csv")
+    done = bench.run("fleet", str(rigs), "--network", "tclab", "--out", "f")
+    assert (done.code, "not deeper" in done.err) == (2, True)
+    (rigs / "b1/deep/log.csv").rename(rigs / "b1/log.csv")
     (rigs / "b2/log.csv").unlink()
     (rigs / "b2").rmdir()
     done = bench.run("fleet", str(rigs), "--network", "tclab", "--out", "f")
@@ -99,3 +104,36 @@ def test_a_prior_needs_its_network(bench: Bench, rigs: Path) -> None:
     done = bench.run("identify", log, "--prior", log, "--out", "p.json")
     assert done.code == 2
     assert not (bench.path / "p.json").exists()
+
+
+def test_a_fault_names_file_and_column_and_leaves_no_folder(bench: Bench, rigs: Path) -> None:
+    words = ("fleet", str(rigs), "--network", "tclab", "--out", "f")
+    log, text = rigs / "b2/log.csv", (rigs / "b2/log.csv").read_text()
+    log.write_text(text.replace("q1_percent", "q1_W"))
+    done = bench.run(*words)
+    assert (done.code, f"{log}, column q1: is in 'W'" in done.err) == (2, True)
+    log.write_text("".join(text.splitlines(keepends=True)[:6]))
+    done = bench.run(*words)
+    assert (done.code, "b2/log: too short" in done.err) == (2, True)
+    assert not (bench.path / "f").exists()
+
+
+def test_what_is_repaired_missing_or_no_log_is_told(bench: Bench, rigs: Path) -> None:
+    log = rigs / "b2/log.csv"
+    rows = [line.split(",") for line in log.read_text().splitlines()]
+    q1 = rows[0].index("q1_percent")
+    rows[9][rows[0].index("t1_degC")] = "hello"
+    log.write_text("\n".join(",".join(row[:q1] + row[q1 + 1 :]) for row in rows))
+    (rigs / "b0/notes.md").write_text("new fan")
+    (rigs / "loose.csv").write_text("")
+    done = bench.run("fleet", str(rigs), "--network", "tclab", "--out", "f", "--json")
+    assert done.code == 0
+    for told in (
+        f"{log}: t1_degC: 1 cell(s) that are no numbers left empty (row 10: 'hello')",
+        "rig b2: q1: no such column, taken as 0 percent",
+        "rig b2: q1 never moves",
+        f"{rigs / 'b0/notes.md'}: is no log and left out",
+        f"{rigs / 'loose.csv'}: is in no rig's folder",
+    ):
+        assert told in done.err
+    assert json.loads(done.out)["misfit"] == ["b2"]
