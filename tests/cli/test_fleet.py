@@ -137,3 +137,17 @@ def test_what_is_repaired_missing_or_no_log_is_told(bench: Bench, rigs: Path) ->
     ):
         assert told in done.err
     assert json.loads(done.out)["misfit"] == ["b2"]
+
+
+def test_what_many_logs_have_in_common_is_told_once(bench: Bench, rigs: Path) -> None:
+    for log in rigs.glob("b*/log.csv"):
+        head, *rows = log.read_text().splitlines()
+        at = head.split(",").index("t1_degC")
+        cells = [row.split(",") for row in rows]
+        for row in cells:
+            row[at] = f"{float(row[at]) + 273.15:.2f}"
+        log.write_text("\n".join([head.replace("t1_degC", "t1_K"), *(",".join(row) for row in cells)]))
+    done = bench.run("fleet", str(rigs), "--network", "tclab", "--out", "f", "--json")
+    assert done.code == 0
+    assert done.err.count("converted from K to degC") == 1
+    assert f"{rigs / 'b0/log.csv'} (and 2 more logs): t1: converted from K to degC" in done.err

@@ -66,6 +66,7 @@ def fleet(
     if not isinstance(model, NetworkModel):
         raise UserError("these logs are of no thermal network", file=folder, hint="name one with --network")
     logs = [_read(console, model, name, files) for name, files in paths.items()]
+    _warn_of_repairs(console, paths, logs)
     fresh = not out.exists()
     cli.new_folder(out)
     try:
@@ -185,15 +186,12 @@ def _rigs(console: Console, folder: Path) -> dict[str, list[str]]:
 
 
 def _read(console: Console, model: NetworkModel, rig: str, files: Sequence[str]) -> list[Log]:
-    """Return the logs of a rig under its name, and warn of what was repaired, converted or is missing."""
+    """Return the logs of a rig under its name, and warn of inputs that are missing or never move."""
     import numpy as np
 
     from thermogrip.sysid.plant.log_grid import match_logs, roles_of
 
     logs = cli.load_logs(files, known=roles_of(model))
-    for file, log in zip(files, logs):
-        for line in filter(None, str(log.attrs.get("repairs", "")).splitlines()):
-            console.warn(f"{file}: {line}")
     matched, said = match_logs(model, [log.assign_attrs(name=file) for file, log in zip(files, logs)])
     for line in said:
         console.warn(f"rig {rig}: {line}")
@@ -202,3 +200,18 @@ def _read(console: Console, model: NetworkModel, rig: str, files: Sequence[str])
         if max(float(np.nanmax(each)) for each in values) <= min(float(np.nanmin(each)) for each in values):
             console.warn(f"rig {rig}: {name} never moves; what it does is known from the other rigs only")
     return [log.assign_attrs(name=f"{rig}/{log.attrs['name']}") for log in logs]
+
+
+def _warn_of_repairs(
+    console: Console, paths: Mapping[str, Sequence[str]], logs: Sequence[Sequence[Log]]
+) -> None:
+    """Warn of what was repaired or converted while logs were read, once of what many have in common."""
+    found: dict[str, list[str]] = {}
+    for files, own in zip(paths.values(), logs):
+        for file, log in zip(files, own):
+            for line in filter(None, str(log.attrs.get("repairs", "")).splitlines()):
+                if "counted from the first row" not in line:  # a clock, which is no fault
+                    found.setdefault(line, []).append(file)
+    for line, files in found.items():
+        more = f" (and {len(files) - 1} more logs)" if len(files) > 1 else ""
+        console.warn(f"{files[0]}{more}: {line}")
