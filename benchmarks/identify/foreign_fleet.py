@@ -167,12 +167,14 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--noise", type=float, default=0.15, help="of the new rigs of prior [K]")
+    parser.add_argument("--network", default="tclab", help="of the new rigs of prior")
     parser.add_argument("--write-only", action="store_true")
     given = parser.parse_args()
     case, out = given.case, given.out
     folder = out / "rigs"
     if case == "prior":
-        new_rigs(out, given.seed)
+        new_rigs(out, given.seed, given.noise, given.network)
         return
     theta = write_fleet(case, folder, given.seed)
     out.joinpath("truth.json").write_text(json.dumps(theta.tolist()))
@@ -268,18 +270,18 @@ def against_alone(case, out, theta, seed):
         print(f"free run of 20 min: alone {one:.2f} K, pooled {other:.2f} K")
 
 
-def new_rigs(out, seed):
+def new_rigs(out, seed, noise, network):
     """Print the errors of ten new rigs, one log of 5 min each, with and without the population as prior."""
     prior = out / "fleet" / "population.json"
     rng, rows, inside = np.random.default_rng([seed, 99]), [], []
     truths = rigs_of("dressed", rng)[:10]
     for i, theta in enumerate(truths):
         log = out / f"new/{i}.csv"
-        record(log, theta, rng, minutes=5)
+        record(log, theta, rng, minutes=5, noise=noise)
         both = []
         for more in ((), ("--prior", prior)):
             plant = out / f"new/{i}{'_with' * bool(more)}.json"
-            thermogrip("identify", log, "--network", "tclab", "--models", "network", "--out", plant, *more)
+            thermogrip("identify", log, "--network", network, "--models", "network", "--out", plant, *more)
             value, bands = theta_of(plant)
             both += [((value - theta) ** 2).mean()]
             inside.append(((bands[:, 0] < theta) & (theta < bands[:, 1])).mean())

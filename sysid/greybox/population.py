@@ -368,4 +368,7 @@ def pooled_plant(plant: Plant, rig: Rig) -> Plant:
         name: float(np.clip(value, *plant.bounds.get(name, (-np.inf, np.inf))))
         for name, value in values.items()
     }
-    return replace(plant, values=plant.values | inside, covariance=rig.covariance, samples=None)
+    scores = replace(plant.scores, seconds=None)  # of one fit, and another at every run
+    return replace(
+        plant, values=plant.values | inside, covariance=rig.covariance, samples=None, scores=scores
+    )

@@ -39,6 +39,7 @@ def test_a_fleet_gives_population_plants_page_and_prior(bench: Bench, rigs: Path
     done = bench.run(*words)
     answer = json.loads(done.out)
     assert (done.code, answer["ill"]) == (0, [])
+    assert "t1: fits leave 0.09" in done.err  # of 0.1, where the network expects 0.4
     low, high = answer["population"]["intervals_90"]["G_amb"]
     assert low < 0.013 < high
     assert [rig["rig"] for rig in answer["rigs"]] == ["b0", "b1", "b2"]
@@ -50,6 +51,14 @@ def test_a_fleet_gives_population_plants_page_and_prior(bench: Bench, rigs: Path
     assert json.loads(done.out)["model"] == "network"
     model = Plant.load(bench.path / "p.json").model
     assert model.specs["G_amb"].value == pytest.approx(np.exp(answer["population"]["mean"][0]))
+
+
+def test_two_runs_write_the_same_but_for_provenance(bench: Bench, rigs: Path) -> None:
+    for out in ("f", "g"):
+        assert bench.run("fleet", str(rigs), "--network", "tclab", "--out", out).code == 0
+    for one in (bench.path / "f").iterdir():
+        first, again = (json.loads((bench.path / out / one.name).read_text()) for out in ("f", "g"))
+        assert first | {"provenance": None} == again | {"provenance": None}
 
 
 def test_logs_of_several_days_show_which_board_changes(bench: Bench, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Annotated
 
 from thermogrip.cli import options as cli
@@ -72,11 +73,12 @@ def fleet(
     try:
         with console.progress("fleet") as progress:
             found = run_parallel(partial(_fitted, model, seed), logs, pool, progress, what="fitting rigs")
-    except UserError:  # of a log that is too short, say
+    except (UserError, KeyboardInterrupt):  # a log is too short, say
         if fresh:
             out.rmdir()
         raise
     plants = dict(zip(paths, found))
+    _warn_of_sd(console, model, found)
     population, rigs = pool_rigs(plants)
     population.save(out / "population.json")
     for rig in rigs:
@@ -215,3 +217,15 @@ def _warn_of_repairs(
     for line, files in found.items():
         more = f" (and {len(files) - 1} more logs)" if len(files) > 1 else ""
         console.warn(f"{files[0]}{more}: {line}")
+
+
+def _warn_of_sd(console: Console, model: NetworkModel, plants: Sequence[Plant]) -> None:
+    """Warn of outputs whose sd in the network is far above what fits leave: it is what the population is
+    weighed against."""
+    for name, output in model.network.outputs.items():
+        left = median(plant.noise[name] for plant in plants)
+        if left < output.sd / 2:
+            console.warn(
+                f"{name}: fits leave {left:.2g} K, the network's sd is {output.sd:g}; lower it in a copy of the "
+                "network, or the population pulls a rig away from what its logs say"
+            )

@@ -158,7 +158,9 @@ def drift_figure(plant: Plant, population: Population, moved: Sequence[Drift], *
                 axis.plot(rig.days[order], middle[order], "-", color="0.6", lw=0.8, label="other rigs")
         axis.yaxis.set_major_locator(MaxNLocator(4))
         axis.set_ylabel(f"{name} [{plant.units.get(name, '1')}]")
-        axis.set_xlabel("days from a rig's first log" if dated else "log")
+        axis.set_xlabel("days from a rig's first log" if dated else "log, from the first on")
+        if not dated:
+            axis.xaxis.set_major_locator(MaxNLocator(integer=True))
     return _with_legend(figure, 5)
 
 
