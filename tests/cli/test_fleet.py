@@ -135,6 +135,7 @@ def test_what_is_repaired_missing_or_no_log_is_told(bench: Bench, rigs: Path) ->
     log.write_text("\n".join(",".join(row[:q1] + row[q1 + 1 :]) for row in rows))
     (rigs / "b0/notes.md").write_text("new fan")
     (rigs / "loose.csv").write_text("")
+    (rigs / "b1/again.csv").write_text((rigs / "b0/log.csv").read_text())
     done = bench.run("fleet", str(rigs), "--network", "tclab", "--out", "f", "--json")
     assert done.code == 0
     for told in (
@@ -143,6 +144,7 @@ def test_what_is_repaired_missing_or_no_log_is_told(bench: Bench, rigs: Path) ->
         "rig b2: q1 never moves",
         f"{rigs / 'b0/notes.md'}: is no log and left out",
         f"{rigs / 'loose.csv'}: is in no rig's folder",
+        f"{rigs / 'b1/again.csv'}: has the data of {rigs / 'b0/log.csv'}",
     ):
         assert told in done.err
     assert json.loads(done.out)["misfit"] == ["b2"]

@@ -209,8 +209,11 @@ def _warn_of_repairs(
 ) -> None:
     """Warn of what was repaired or converted while logs were read, once of what many have in common."""
     found: dict[str, list[str]] = {}
+    seen: dict[str, str] = {}
     for files, own in zip(paths.values(), logs):
         for file, log in zip(files, own):
+            if (first := seen.setdefault(str(log.attrs.get("sha256", file)), file)) != file:
+                console.warn(f"{file}: has the data of {first}, and counts as another log; take one away")
             for line in filter(None, str(log.attrs.get("repairs", "")).splitlines()):
                 if "counted from the first row" not in line:  # a clock, which is no fault
                     found.setdefault(line, []).append(file)
@@ -226,6 +229,6 @@ def _warn_of_sd(console: Console, model: NetworkModel, plants: Sequence[Plant]) 
         left = median(plant.noise[name] for plant in plants)
         if left < output.sd / 2:
             console.warn(
-                f"{name}: fits leave {left:.2g} K, the network's sd is {output.sd:g}; lower it in a copy of the "
-                "network, or the population pulls a rig away from what its logs say"
+                f"{name}: fits leave {left:.2g} K, the network's sd is {output.sd:g}; lower it in a copy of "
+                "the network, or the population pulls a rig away from what its logs say"
             )
