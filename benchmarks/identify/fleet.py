@@ -39,6 +39,7 @@ from thermogrip.sysid.greybox.population import (
     Told,
     against_others,
     in_prior_units,
+    is_of_rig,
     pool_rigs,
     pooled_plant,
     prior_units,
@@ -142,12 +143,15 @@ def power(model, n, draws):
         specs = [model.specs[name] for name in plant.free]
         centre, width = prior_units(specs)
         z, S = in_prior_units([plant], centre, width)
+        own = np.array([is_of_rig(spec) for spec in specs])  # a room is integrated out
+        z, S, width = z[:, own], S[:, own][:, :, own], width[own]
         precision = told_by(z, S).precision[0]
         size, axes = np.linalg.eigh(precision)
         seen = size > 1e-3
         root = axes[:, seen] / np.sqrt(size[seen])
-        at = [plant.free.index(name) for name in NAMES]
-        sd = np.zeros(len(plant.free))
+        free = [name for name, part in zip(plant.free, own) if part]
+        at = [free.index(name) for name in NAMES]
+        sd = np.zeros(len(free))
         sd[at] = SPREAD / width[at]
         found, alarms = np.zeros(3), 0
         for _ in range(draws):

@@ -32,6 +32,7 @@ from thermogrip.sysid.greybox.population import (
     STILL,
     Told,
     in_prior_units,
+    is_of_rig,
     prior_units,
     told_by,
 )
@@ -49,7 +50,7 @@ class Drift(NamedTuple):
 
     name: str
     days: Array  # (m,) of its logs, from the first
-    theta: Array  # (m, k) what each log, the population and the trend say together
+    theta: Array  # (m, k) what each log, the population and the trend say of the rig's parameters
     sd: Array  # (m, k) of that
     change: Array  # (k,) of theta from the first log to the last
     change_sd: Array  # (k,)
@@ -127,22 +128,26 @@ def find_drift(
         at = np.asarray(days[name], dtype=float)
         taus.append((at - at.min()) / np.ptp(at) - 0.5)
     T = _day_to_day(told, taus)
-    own_part = np.array([spec.unit != "degC" for spec in specs])
+    own_part = np.array([is_of_rig(spec) for spec in specs])
     k, dof = len(specs), sum(tau.size - 2 for tau in taus)
     found = []
     for name, own, tau in zip(names, told, taus):
         trend = _trend(own, tau, T)
         slope, C = trend.beta[k:], trend.covariance
         steady = np.diagonal(C[k:, k:] - C[k:, k:] @ C[k:, k:] / _SLOPE**2)
-        seen = own_part & (steady > _FLAT * _SLOPE**2)
-        ratio = np.where(seen, np.abs(slope) / np.sqrt(np.where(seen, steady, 1.0)), 0.0)
-        chance = min(1.0, 2 * k * len(names) * float(t_law.sf(ratio.max(), dof)))
+        seen = (steady > _FLAT * _SLOPE**2)[own_part]
+        ratio = np.where(seen, np.abs(slope[own_part]) / np.sqrt(np.where(seen, steady[own_part], 1.0)), 0.0)
+        chance = min(1.0, 2 * ratio.size * len(names) * float(t_law.sf(ratio.max(), dof)))
         at = np.asarray(days[name], dtype=float)
-        found.append(Drift(
-            name, at - at.min(), centre + width * trend.days, width * trend.day_sd, width * slope,
-            width * np.sqrt(np.diagonal(C)[k:]), chance, int(ratio.argmax()),
-        ))  # fmt: skip
-    return tuple(found), width * np.sqrt(T)
+        theta, sd, change, change_sd = (
+            (first_part + width * value)[..., own_part]
+            for first_part, value in (
+                (centre, trend.days), (0.0, trend.day_sd), (0.0, slope), (0.0, np.sqrt(np.diagonal(C)[k:]))
+            )
+        )  # fmt: skip
+        farthest = int(ratio.argmax())
+        found.append(Drift(name, at - at.min(), theta, sd, change, change_sd, chance, farthest))
+    return tuple(found), (width * np.sqrt(T))[own_part]
 
 
 def _day_to_day(told: Sequence[Told], taus: Sequence[Array]) -> Array:

@@ -23,12 +23,16 @@ found of one piece [1]_.
 those are half as wide again.  That is the prior for the next rig (`identify --prior`), and b_i, V_i is what
 all rigs together say of one (partial pooling).
 
+**A temperature** (of the room) is no part of a rig: each has its own, with the prior of the network, that is
+integrated out, and the population says nothing of it.
+
 **A rig that is ill** is far from what the others predict.  With the eigenvectors of its
 :math:`\Lambda_i = U l U'`, its information :math:`w = l^{-1/2} U' \eta_i` is N(F' mu, 1 + F' (T + C) F),
 F = U l^{1/2}, of the population of the others.  The squared distance over its r dimensions is compared with
 an F distribution of r and N - 2 degrees of freedom, and its farthest parameter with Student's t of N - 2,
 times the number of parameters: one that is far off may be lost among others that are not.  Twice the smaller
-of both, times the number of rigs, is the chance of such a rig in a healthy fleet.
+of both, times the number of rigs, is the chance of such a rig in a healthy fleet.  Its plant is that of its
+own logs, and the population is that of the others, while three are left.
 
 References
 ----------
@@ -59,6 +63,7 @@ LEAST_RIGS = 3
 _SEEN = 1e-3  # of the prior's precision: what logs say less about is not counted as told
 ROUNDS, STILL = 500, 1e-4
 _FIRST = 0.25  # of the prior's variance, where EM begins
+MISFIT = 3.0  # times the median error of the fleet's fits
 ILL = 0.05  # chance that one of a healthy fleet is as far off
 
 
@@ -132,8 +137,9 @@ class Population:
         """Return the network with the population in place of its priors; UserError if it is of another."""
         specs, known = dict(model.network.parameters), dict(zip(self.parameters, range(len(self.parameters))))
         free = {name for name, spec in specs.items() if not spec.fixed}
-        if free != set(known):
-            odd = ", ".join(sorted(free ^ set(known)))
+        odd_ones = {name for name in free ^ set(known) if name not in free or is_of_rig(specs[name])}
+        if odd_ones:
+            odd = ", ".join(sorted(odd_ones))
             problem = (
                 f"the population is of network {self.network!r}, {model.network.name!r} differs in {odd}"
             )
@@ -143,6 +149,8 @@ class Population:
         wide = np.sqrt(dof / (dof - 2)) if dof > 2 else 2.0
         values = self.natural(np.array(self.mean))
         for name, k in known.items():
+            if not is_of_rig(specs[name]):
+                continue
             low, high = specs[name].bounds
             value, sd = float(np.clip(values[k], low, high)), float(wide * self.sd[k])
             specs[name] = _with_prior(specs[name], value, sd)
@@ -180,9 +188,9 @@ class Rig(NamedTuple):
     """One rig against the population of the others."""
 
     name: str
-    pooled: Array  # (k,) theta by all rigs together
-    covariance: Array  # (k, k) of that
-    deviation: Array  # (k,) of its own fit from the others' mean, in sd
+    pooled: Array  # theta by all rigs together, of the plant's free parameters
+    covariance: Array  # of that
+    deviation: Array  # (k,) of its own fit from the others' mean, in sd, of the population's parameters
     distance: float  # squared, per dimension; about 1 of a healthy rig
     chance: float  # of a rig as far off or farther, if all were healthy
     others: Population
@@ -194,7 +202,7 @@ class Rig(NamedTuple):
 
 
 def pool_rigs(plants: Mapping[str, Plant]) -> tuple[Population, tuple[Rig, ...]]:
-    """Return the population of rigs and each of them against it.
+    """Return the population of the healthy rigs and each rig against that of the others.
 
     Parameters
     ----------
@@ -217,25 +225,40 @@ def pool_rigs(plants: Mapping[str, Plant]) -> tuple[Population, tuple[Rig, ...]]
     specs = [model.specs[name] for name in first.free]
     centre, width = prior_units(specs)
     z, S = in_prior_units(plants.values(), centre, width)
-    told = told_by(z, S)
-    whole = _pool(told)
+    own = np.array([is_of_rig(spec) for spec in specs])
+    if not own.any():
+        raise UserError(f"network {model.network.name!r} has no free parameter of a rig", hint="free one")
+    told = told_by(z[:, own], S[:, own][:, :, own])
+    variance = _pool(told).variance
+    against = [against_others(told, z[i, own], S[i][np.ix_(own, own)], i, variance) for i in range(len(z))]
+    ill = np.array([chance < ILL for *_, chance in against])
+    kept = ~ill if (~ill).sum() >= LEAST_RIGS else np.full(ill.size, True)
+    whole = _pool(Told(told.precision[kept], told.information[kept]), variance)
 
     def population(found: _Pooled, rigs: Sequence[str]) -> Population:
-        mean, spread = centre + width * found.mean, width * np.sqrt(found.variance)
-        sure = width * np.sqrt(np.diagonal(found.unsure))
-        scales = tuple(spec.scale for spec in specs)
+        mean, spread = centre[own] + width[own] * found.mean, width[own] * np.sqrt(found.variance)
+        sure = width[own] * np.sqrt(np.diagonal(found.unsure))
+        parts = [(name, spec.scale) for name, spec, part in zip(first.free, specs, own) if part]
         return Population(
-            str(model.network.name), first.free, scales, tuple(mean.tolist()), tuple(spread.tolist()),
-            tuple(sure.tolist()), tuple(rigs),
+            str(model.network.name), tuple(name for name, _ in parts), tuple(scale for _, scale in parts),
+            tuple(mean.tolist()), tuple(spread.tolist()), tuple(sure.tolist()), tuple(rigs),
         )  # fmt: skip
 
+    # what is no part of a rig keeps the network's prior
+    mean, precision = np.zeros(own.size), np.ones(own.size)
+    mean[own], precision[own] = whole.mean, 1 / whole.variance
+    everything = told_by(z, S)
     rigs = []
     for i, name in enumerate(names):
-        others, off, distance, chance = against_others(told, z[i], S[i], i, whole.variance)
-        covariance = whole.covariances[i] * np.outer(width, width)
+        others, off, distance, chance = against[i]
+        theta, covariance = z[i], S[i]
+        if kept[i]:
+            covariance = np.linalg.inv(everything.precision[i] + np.diag(precision))
+            theta = covariance @ (everything.information[i] + precision * mean)
         of_others = population(others, [other for other in names if other != name])
-        rigs.append(Rig(name, centre + width * whole.rigs[i], covariance, off, distance, chance, of_others))
-    return population(whole, names), tuple(rigs)
+        pooled, covariance = centre + width * theta, covariance * np.outer(width, width)
+        rigs.append(Rig(name, pooled, covariance, off, distance, chance, of_others))
+    return population(whole, [name for name, keep in zip(names, kept) if keep]), tuple(rigs)
 
 
 def against_others(
@@ -251,6 +274,11 @@ def against_others(
     distance, of_all = _distance(told.precision[i], told.information[i], others, n - 2)
     of_one = 2 * off.size * float(t_law.sf(np.abs(off).max(), n - 2))
     return others, off, distance, min(1.0, 2 * n * min(of_all, of_one))
+
+
+def is_of_rig(spec: Parameter) -> bool:
+    """Return whether a parameter is a rig's own: a temperature is that of the room."""
+    return spec.unit != "degC"
 
 
 def prior_units(specs: Sequence[Parameter]) -> tuple[Array, Array]:
@@ -320,6 +348,19 @@ def _distance(precision: Array, information: Array, others: _Pooled, dof: int) -
     return distance, float(f_law.sf(distance, off.size, dof))
 
 
+def poorly_fitted(plants: Mapping[str, Plant]) -> tuple[str, ...]:
+    """Return the rigs whose fit leaves more than three times the error of the fleet's median, in an output:
+    the network does not describe these logs, so that their parameters say little of the rig."""
+    most = {
+        name: MISFIT
+        * float(np.median([plant.noise[name] for plant in plants.values() if name in plant.noise]))
+        for name in {name for plant in plants.values() for name in plant.noise}
+    }
+    return tuple(
+        rig for rig, plant in plants.items() if any(error > most[name] for name, error in plant.noise.items())
+    )
+
+
 def pooled_plant(plant: Plant, rig: Rig) -> Plant:
     """Return a rig's plant with the parameters and the covariance that all rigs together give it."""
     values = dict(zip(plant.free, plant.natural(rig.pooled).tolist()))
@@ -327,4 +368,7 @@ def pooled_plant(plant: Plant, rig: Rig) -> Plant:
         name: float(np.clip(value, *plant.bounds.get(name, (-np.inf, np.inf))))
         for name, value in values.items()
     }
-    return replace(plant, values=plant.values | inside, covariance=rig.covariance, samples=None)
+    scores = replace(plant.scores, seconds=None)  # of one fit, and another at every run
+    return replace(
+        plant, values=plant.values | inside, covariance=rig.covariance, samples=None, scores=scores
+    )

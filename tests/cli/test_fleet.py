@@ -39,6 +39,7 @@ def test_a_fleet_gives_population_plants_page_and_prior(bench: Bench, rigs: Path
     done = bench.run(*words)
     answer = json.loads(done.out)
     assert (done.code, answer["ill"]) == (0, [])
+    assert "t1: fits leave 0.09" in done.err  # of 0.1, where the network expects 0.4
     low, high = answer["population"]["intervals_90"]["G_amb"]
     assert low < 0.013 < high
     assert [rig["rig"] for rig in answer["rigs"]] == ["b0", "b1", "b2"]
@@ -50,6 +51,14 @@ def test_a_fleet_gives_population_plants_page_and_prior(bench: Bench, rigs: Path
     assert json.loads(done.out)["model"] == "network"
     model = Plant.load(bench.path / "p.json").model
     assert model.specs["G_amb"].value == pytest.approx(np.exp(answer["population"]["mean"][0]))
+
+
+def test_two_runs_write_the_same_but_for_provenance(bench: Bench, rigs: Path) -> None:
+    for out in ("f", "g"):
+        assert bench.run("fleet", str(rigs), "--network", "tclab", "--out", out).code == 0
+    for one in (bench.path / "f").iterdir():
+        first, again = (json.loads((bench.path / out / one.name).read_text()) for out in ("f", "g"))
+        assert first | {"provenance": None} == again | {"provenance": None}
 
 
 def test_logs_of_several_days_show_which_board_changes(bench: Bench, tmp_path: Path) -> None:
@@ -85,7 +94,12 @@ def test_folders_that_are_no_fleet_are_refused(bench: Bench, rigs: Path) -> None
     (rigs / "empty").mkdir()
     done = bench.run("fleet", str(rigs), "--network", "tclab", "--out", "f")
     assert (done.code, "has no log" in done.err) == (2, True)
-    (rigs / "empty").rmdir()
+    (rigs / "empty").rename(rigs / ".hidden")  # of a notebook, say
+    (rigs / "b1/deep").mkdir()
+    (rigs / "b1/log.csv").rename(rigs / "b1/deep/log.csv")
+    done = bench.run("fleet", str(rigs), "--network", "tclab", "--out", "f")
+    assert (done.code, "not deeper" in done.err) == (2, True)
+    (rigs / "b1/deep/log.csv").rename(rigs / "b1/log.csv")
     (rigs / "b2/log.csv").unlink()
     (rigs / "b2").rmdir()
     done = bench.run("fleet", str(rigs), "--network", "tclab", "--out", "f")
@@ -99,3 +113,52 @@ def test_a_prior_needs_its_network(bench: Bench, rigs: Path) -> None:
     done = bench.run("identify", log, "--prior", log, "--out", "p.json")
     assert done.code == 2
     assert not (bench.path / "p.json").exists()
+
+
+def test_a_fault_names_file_and_column_and_leaves_no_folder(bench: Bench, rigs: Path) -> None:
+    words = ("fleet", str(rigs), "--network", "tclab", "--out", "f")
+    log, text = rigs / "b2/log.csv", (rigs / "b2/log.csv").read_text()
+    log.write_text(text.replace("q1_percent", "q1_W"))
+    done = bench.run(*words)
+    assert (done.code, f"{log}, column q1: is in 'W'" in done.err) == (2, True)
+    log.write_text("".join(text.splitlines(keepends=True)[:6]))
+    done = bench.run(*words)
+    assert (done.code, "b2/log: too short" in done.err) == (2, True)
+    assert not (bench.path / "f").exists()
+
+
+def test_what_is_repaired_missing_or_no_log_is_told(bench: Bench, rigs: Path) -> None:
+    log = rigs / "b2/log.csv"
+    rows = [line.split(",") for line in log.read_text().splitlines()]
+    q1 = rows[0].index("q1_percent")
+    rows[9][rows[0].index("t1_degC")] = "hello"
+    log.write_text("\n".join(",".join(row[:q1] + row[q1 + 1 :]) for row in rows))
+    (rigs / "b0/notes.md").write_text("new fan")
+    (rigs / "loose.csv").write_text("")
+    (rigs / "b1/again.csv").write_text((rigs / "b0/log.csv").read_text())
+    done = bench.run("fleet", str(rigs), "--network", "tclab", "--out", "f", "--json")
+    assert done.code == 0
+    for told in (
+        f"{log}: t1_degC: 1 cell(s) that are no numbers left empty (row 10: 'hello')",
+        "rig b2: q1: no such column, taken as 0 percent",
+        "rig b2: q1 never moves",
+        f"{rigs / 'b0/notes.md'}: is no log and left out",
+        f"{rigs / 'loose.csv'}: is in no rig's folder",
+        f"{rigs / 'b1/again.csv'}: has the data of {rigs / 'b0/log.csv'}",
+    ):
+        assert told in done.err
+    assert json.loads(done.out)["misfit"] == ["b2"]
+
+
+def test_what_many_logs_have_in_common_is_told_once(bench: Bench, rigs: Path) -> None:
+    for log in rigs.glob("b*/log.csv"):
+        head, *rows = log.read_text().splitlines()
+        at = head.split(",").index("t1_degC")
+        cells = [row.split(",") for row in rows]
+        for row in cells:
+            row[at] = f"{float(row[at]) + 273.15:.2f}"
+        log.write_text("\n".join([head.replace("t1_degC", "t1_K"), *(",".join(row) for row in cells)]))
+    done = bench.run("fleet", str(rigs), "--network", "tclab", "--out", "f", "--json")
+    assert done.code == 0
+    assert done.err.count("converted from K to degC") == 1
+    assert f"{rigs / 'b0/log.csv'} (and 2 more logs): t1: converted from K to degC" in done.err

@@ -246,5 +246,8 @@ def test_letters_that_the_font_has_not_are_no_warning(tmp_path: Path) -> None:
 
     figure = Figure()
     figure.subplots().set_title("木")
+    large = picture(9_000).figure  # one that goes in as png
+    large.axes[0].set_title("木")
+    assert Picture(large, "").data_uri.startswith("data:image/png")
     write_report(tmp_path / "r.html", "t", "l", [Section("s", (Picture(figure, "木"),), "v")])
     assert "木" in (tmp_path / "r.html").read_text(encoding="utf-8")

@@ -22,6 +22,7 @@ import json
 import re
 import warnings
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib import resources
@@ -45,7 +46,15 @@ if TYPE_CHECKING:
 ICONS = {"plain": "i Result", "good": "\u2713 Good", "warn": "! Caution", "bad": "\u2715 Bad"}
 TONES = tuple(ICONS)
 #: Cells of tables that are verdicts.
-VERDICTS = {"pass": "good", "ok": "good", "warn": "warn", "fail": "bad", "ill": "bad", "changing": "bad"}
+VERDICTS = {
+    "pass": "good",
+    "ok": "good",
+    "warn": "warn",
+    "misfit": "warn",
+    "fail": "bad",
+    "ill": "bad",
+    "changing": "bad",
+}
 #: Numbers in all charts of a page, and points in one of their curves, at most.
 MOST_NUMBERS, MOST_POINTS = 200_000, 2400
 _SUPERSCRIPT = re.compile(r"(\$\^\{-?[0-9.]+\}\$)")
@@ -294,6 +303,14 @@ def _literal(text: str) -> str:
     return "".join(part if at % 2 else _DOLLAR.sub(r"\\$", part) for at, part in enumerate(parts))
 
 
+@contextmanager
+def _letters() -> Iterator[None]:
+    """Draw a label in letters that the font has not without a warning: the tables have the word."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font")
+        yield
+
+
 def _data_uri(figure: Figure) -> str:
     from matplotlib import rc_context
 
@@ -302,16 +319,15 @@ def _data_uri(figure: Figure) -> str:
     look: dict[str, Any] = {"facecolor": "none"}  # the page's own paper shows, in the dark too
     for axes in figure.axes:
         axes.set_facecolor("none")
-    with warnings.catch_warnings(), rc_context({"svg.hashsalt": "thermogrip"}):  # its ids are no random ones
-        # a label in letters that the font has not: the tables have the word
-        warnings.filterwarnings("ignore", message="Glyph .* missing from font")
+    with rc_context({"svg.hashsalt": "thermogrip"}), _letters():  # its ids are no random ones
         figure.savefig(svg, format="svg", metadata={"Date": None, "Creator": None}, **look)
     if svg.tell() <= SVG_LIMIT:
         return "data:image/svg+xml;base64," + base64.b64encode(svg.getvalue()).decode()
     from PIL import Image
 
     whole, png = io.BytesIO(), io.BytesIO()
-    figure.savefig(whole, format="png", dpi=130, **look)
+    with _letters():
+        figure.savefig(whole, format="png", dpi=130, **look)
     few = Image.open(whole).quantize(_COLOURS, method=Image.Quantize.FASTOCTREE)  # keeps what is transparent
     few.save(png, format="png", optimize=True)
     return "data:image/png;base64," + base64.b64encode(png.getvalue()).decode()

@@ -152,6 +152,7 @@ def a_log(seed: int, *, seconds: int = 600, memory: float = CORRELATION_TIME) ->
 BOARD = prior_plant(load_network("tclab"))
 N_FREE = len(BOARD.free)
 WIDTH = np.array([BOARD.model.specs[n].sd_log or BOARD.model.specs[n].sd for n in BOARD.free])
+OWN = np.array([name != "t_room" for name in BOARD.free])  # what is a rig's, not the room's
 OFF, SPREAD = np.full(N_FREE, 0.4), np.array([0.1, 0.3, 0.1, 0.2, 0.4, 0.2, 0.3])  # in sd of the prior
 
 

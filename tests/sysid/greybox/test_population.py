@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.sysid.greybox.makers import BOARD, N_FREE, OFF, SPREAD, WIDTH, fits, plant_at
+from tests.sysid.greybox.makers import BOARD, N_FREE, OFF, OWN, SPREAD, WIDTH, fits, plant_at
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.greybox import population as kernel
 from thermogrip.sysid.greybox.population import Population, check_population, pool_rigs, pooled_plant
@@ -16,7 +16,8 @@ from thermogrip.sysid.models.network import load_network
 
 
 def standard(theta):
-    return (theta - BOARD.theta) / WIDTH
+    own = slice(None) if np.shape(theta)[-1] == N_FREE else OWN
+    return (theta - BOARD.theta[own]) / WIDTH[own]
 
 
 def test_a_known_population_is_found_and_its_intervals_cover_new_rigs():
@@ -24,14 +25,14 @@ def test_a_known_population_is_found_and_its_intervals_cover_new_rigs():
     for _ in range(20):
         z, plants = fits(12, rng)
         found, rigs = pool_rigs(plants)
-        spreads.append(np.array(found.spread) / WIDTH)
-        half = kernel.t_law.ppf(0.95, 11) * found.sd / WIDTH
-        new = OFF + SPREAD * rng.normal(size=(100, N_FREE))
+        spreads.append(np.array(found.spread) / WIDTH[OWN])
+        half = kernel.t_law.ppf(0.95, 11) * found.sd / WIDTH[OWN]
+        new = (OFF + SPREAD * rng.normal(size=(100, N_FREE)))[:, OWN]
         inside.append(np.abs(new - standard(np.array(found.mean))) < half)
         alone = [standard(plant.theta) for plant in plants.values()]
         errors.append([np.square(alone - z), np.square([standard(rig.pooled) for rig in rigs] - z)])
     assert 0.87 < np.mean(inside) < 0.95
-    np.testing.assert_allclose(np.mean(spreads, axis=0), SPREAD, rtol=0.35)
+    np.testing.assert_allclose(np.mean(spreads, axis=0), SPREAD[OWN], rtol=0.35)
     alone, pooled = np.mean(errors, axis=(0, 2, 3))
     assert pooled < 0.8 * alone
 
@@ -40,8 +41,8 @@ def test_rigs_that_are_known_exactly_have_their_own_values_and_spread():
     z = np.random.default_rng(1).normal(size=(9, N_FREE)) * SPREAD
     found, rigs = pool_rigs({f"r{i}": plant_at(row, 1e-8 * np.eye(N_FREE)) for i, row in enumerate(z)})
     # N - 1 of the prior on the spread, and one more that the mean takes
-    want = np.square(z - z.mean(axis=0)).sum(axis=0) / 7
-    np.testing.assert_allclose((np.array(found.spread) / WIDTH) ** 2, want, rtol=0.02)
+    want = np.square(z - z.mean(axis=0)).sum(axis=0)[OWN] / 7
+    np.testing.assert_allclose((np.array(found.spread) / WIDTH[OWN]) ** 2, want, rtol=0.02)
     np.testing.assert_allclose([standard(rig.pooled) for rig in rigs], z, atol=1e-5)
 
 
@@ -63,9 +64,9 @@ def test_a_rig_whose_log_says_nothing_is_as_the_others():
     _, plants = fits(10, np.random.default_rng(3))
     found, rigs = pool_rigs(plants | {"silent": plant_at(np.zeros(N_FREE), np.eye(N_FREE))})
     silent = rigs[-1]
-    np.testing.assert_allclose(silent.pooled, found.mean, rtol=1e-6)
+    np.testing.assert_allclose(silent.pooled[OWN], found.mean, rtol=1e-6)
     assert (silent.distance, silent.ill) == (1.0, False)
-    assert (np.sqrt(np.diag(silent.covariance)) >= found.spread).all()
+    assert (np.sqrt(np.diag(silent.covariance))[OWN] >= found.spread).all()
 
 
 @pytest.mark.parametrize("off", [0.0, 2.0])
@@ -76,6 +77,44 @@ def test_a_rig_with_one_parameter_far_off_is_ill_and_the_others_are_not(off):
     _, rigs = pool_rigs(plants)
     assert [rig.name for rig in rigs if rig.ill] == (["r3"] if off else [])
     assert np.abs(rigs[3].deviation).argmax() == 0 or not off
+
+
+def test_the_population_is_of_the_healthy_and_an_ill_rig_keeps_what_its_own_logs_say():
+    _, plants = fits(12, np.random.default_rng(10))
+    one = plants["r3"]
+    off = replace(one, values=one.values | {"G_amb": one.values["G_amb"] * np.exp(3 * WIDTH[0])})
+    found, rigs = pool_rigs(plants | {"r3": off})
+    healthy, _ = pool_rigs({name: plant for name, plant in plants.items() if name != "r3"})
+    assert (rigs[3].ill, found.rigs) == (True, healthy.rigs)
+    np.testing.assert_allclose(found.spread, healthy.spread, rtol=1e-2)
+    np.testing.assert_allclose(rigs[3].pooled, off.theta)
+    np.testing.assert_allclose(rigs[3].covariance, off.covariance)
+    three = {f"r{i}": plant_at(np.zeros(N_FREE) + 1e-4 * i**2, 1e-9 * np.eye(N_FREE)) for i in range(4)}
+    found, rigs = pool_rigs(
+        dict(list(three.items())[:2]) | {"odd": plant_at(np.ones(N_FREE), three["r0"].covariance)}
+    )
+    assert len(found.rigs) == 3  # two make no population
+
+
+def test_a_warm_room_makes_no_rig_ill_and_no_rig_is_drawn_to_the_others_room():
+    rng, sure = np.random.default_rng(11), 1e-3 * np.eye(N_FREE)
+    sure[0, ~OWN] = sure[~OWN, 0] = 0.9e-3  # what a log says of the room says something of the loss
+    plants = {f"r{i}": plant_at(0.1 * rng.normal(size=N_FREE) * OWN, sure) for i in range(10)}
+    cold, _ = pool_rigs(plants)
+    in_sun = replace(plants["r4"], values=plants["r4"].values | {"t_room": 32.0})
+    warm, rigs = pool_rigs(plants | {"r4": in_sun})
+    assert not any(rig.ill for rig in rigs)
+    assert "t_room" not in warm.parameters
+    assert pooled_plant(in_sun, rigs[4]).values["t_room"] == pytest.approx(32.0, abs=0.1)
+    np.testing.assert_allclose(warm.mean, cold.mean, atol=0.02)
+    model = load_network("tclab")
+    assert warm.prior_of(model).specs["t_room"] == model.specs["t_room"]
+    # a file of before still has it
+    old = replace(
+        warm, parameters=(*warm.parameters, "t_room"), scales=(*warm.scales, "linear"),
+        mean=(*warm.mean, 30.0), spread=(*warm.spread, 0.1), mean_sd=(*warm.mean_sd, 0.1),
+    )  # fmt: skip
+    assert old.prior_of(model).specs["t_room"] == model.specs["t_room"]
 
 
 def test_healthy_fleets_raise_few_alarms():
