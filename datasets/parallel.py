@@ -55,6 +55,7 @@ _SWITCH_S = 5e-4
 _DEATHS = 3  # of processes, without a result between them
 _LOOK_S = 1.0  # without a result: then it is looked whether the processes are alive
 
+_SENT = 16  # items to a cluster at once: it has work while the others are packed
 _THREADS = 32  # of run_threads, which mostly wait
 
 #: Who sets one of these wants as many threads of linear algebra.
@@ -443,8 +444,9 @@ def _on_cluster(
     try:
         # As bytes: the scheduler would import what they need, and unpack and pack them, before a worker may
         # begin; a thousandth of a second each.
-        packed = [dask.protocol.pickle.dumps((function, item)) for item in todo]
-        futures |= {future: i for i, future in enumerate(client.map(_on_worker, packed, pure=False))}
+        for at in range(0, len(todo), _SENT):
+            packed = [dask.protocol.pickle.dumps((function, item)) for item in todo[at : at + _SENT]]
+            futures |= {future: at + i for i, future in enumerate(client.map(_on_worker, packed, pure=False))}
         for future in dask.as_completed(futures, loop=client.loop):
             result = dask.protocol.pickle.loads(future.result())  # the first fault ends it
             yield futures.pop(future), result
