@@ -752,16 +752,8 @@ def _fit_or_refusal(item: tuple[str, Sequence[Log], dict[str, Any]]) -> BlackBox
         return f"{kind}: {error}"
 
 
-_LONGEST = (
-    "neural",
-    "bj",
-    "armax",
-    "subspace",
-    "parsim",
-    "oe",
-    "sindy",
-    "network",
-)  # of the candidates, by time for a fit
+#: Of the candidates, by time for a fit.
+_LONGEST = ("neural", "bj", "armax", "subspace", "parsim", "oe", "sindy", "network")
 
 _Asked: TypeAlias = "tuple[GreyModel | None, dict[str, Any], int]"  # network, settings of black boxes, seed
 
