@@ -21,7 +21,7 @@ def test_the_page_names_the_ill_rig_and_draws_all(ill):
     population, rigs = pool_rigs(plants)
     first, numbers, each = fleet_sections(plants, population, rigs)
     assert (first.tone, first.verdict) == (
-        ("bad", "odd (power_2 +17.8 sd) far from the others.")
+        ("bad", "Far from the others: odd (power_2 +17.8 sd).")
         if ill
         else ("good", "No rig is surely unlike the others.")
     )
@@ -53,8 +53,7 @@ def test_the_page_names_the_rig_that_changes_and_draws_every_log():
     sections = fleet_sections(plants, population, rigs, moved)
     section = sections[1]
     assert (section.title, section.tone) == ("Which rig changes?", "bad")
-    assert section.verdict.startswith("r2 (")
-    assert section.verdict.endswith("from first log to last.")
+    assert section.verdict.startswith("Changed from first log to last: r2 (")
     table, picture = section.parts
     assert [row[0] for row in table.rows if row[1] == "changing"] == ["r2"]
     axes = [axis for axis in picture.figure.axes if axis.get_visible()]

@@ -61,7 +61,7 @@ def ill_words(plants: Mapping[str, Plant], rigs: Sequence[Rig], population: Popu
         return f"{rig.name} ({population.parameters[k]} {rig.deviation[k]:+.1f} sd)"
 
     ill = [off(rig) for rig in rigs if rig.ill]
-    words = f"{', '.join(ill)} far from the others." if ill else "No rig is surely unlike the others."
+    words = f"Far from the others: {', '.join(ill)}." if ill else "No rig is surely unlike the others."
     next_one = min((rig for rig in rigs if not rig.ill), key=lambda rig: rig.chance, default=None)
     if next_one is not None and next_one.chance < _NEAR:
         words += f" {off(next_one)} is as far off as one in {_percent(next_one.chance)} of healthy fleets."
@@ -89,7 +89,9 @@ def drift_words(moved: Sequence[Drift], population: Population) -> str:
         return f"{rig.name} ({population.parameters[rig.farthest]} {_changed(rig, population)})"
 
     changing = [by(rig) for rig in moved if rig.drifts]
-    words = f"{', '.join(changing)} from first log to last." if changing else "No rig surely changes."
+    words = (
+        f"Changed from first log to last: {', '.join(changing)}." if changing else "No rig surely changes."
+    )
     next_one = min((rig for rig in moved if not rig.drifts), key=lambda rig: rig.chance, default=None)
     if next_one is not None and next_one.chance < _NEAR:
         words += f" {by(next_one)} moves as one does in {_percent(next_one.chance)} of steady fleets."
