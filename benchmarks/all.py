@@ -53,10 +53,6 @@ ALL = [
     Benchmark("identify/another.py", quick="--pairs 1 --only network"),
     Benchmark("identify/left.py", quick="--logs 5 --only tclab"),
     Benchmark("identify/lost.py", quick="--seeds 1 --only tclab"),
-    Benchmark("identify/fleet.py", "--seeds 4", "--rigs 6 --seeds 1"),
-    Benchmark(
-        "identify/foreign_fleet.py", "wide --out {out}/foreign_wide", "copies --out {out}/foreign_copies"
-    ),
     Benchmark("abroad/score.py", "{data}", "{data} --sets house,dryer"),
     Benchmark("abroad/feedthrough.py", "{data}", "{data} --sets house"),
     Benchmark("abroad/other_days.py", "{data}", "{data}"),

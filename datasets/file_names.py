@@ -30,11 +30,6 @@ def file_format(path: str | Path) -> str:
     return FORMATS[ending]
 
 
-def is_table(path: str | Path) -> bool:
-    """Return whether a file's ending is one of a log's or of grasps."""
-    return _ending(path) in FORMATS
-
-
 def file_stem(path: str | Path) -> str:
     """Return the file name without its ending."""
     return Path(path).name[: -len(_ending(path)) or None]

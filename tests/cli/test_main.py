@@ -62,18 +62,17 @@ def test_python_dash_m_is_the_command() -> None:
 
 def test_the_verbs_are_those_of_the_contract() -> None:
     verbs = "demo identify validate simulate excite tune review export run effusivity train classify compare"
-    more = "warm-up fleet retune linearise paper materials init record recover virtual batch"
+    more = "warm-up retune linearise paper materials init record recover virtual batch"
     assert set(VERBS) == {*verbs.split(), *more.split()}
 
 
 #: Each verb's arguments and options as scripts use them: =default, >least, <most.
 OPTIONS = """
 demo: --out=thermogrip-demo --seed=0>0 --workers=2>1 --cluster --json=False
-identify: LOG... --out --network --prior --inputs --outputs --disturbances --columns --dt>1e-09
+identify: LOG... --out --network --inputs --outputs --disturbances --columns --dt>1e-09
   --models=arx,oe,subspace,sindy,neural,network --average>0 --order>1<20 --delay>1<20
   --leave-one-out=False --grow=False --posterior/--no-posterior=False --report --seed=0>0 --workers=1>1
   --cluster --json=False
-fleet: LOGS_BY_RIG --out --network --report --seed=0>0 --workers=1>1 --cluster --json=False
 validate: PLANT LOG... --warmup=5.0>0 --score-from=5.0>0 --average>0 --network --columns --dt>1e-09
   --report --seed=0>0 --json=False
 simulate: PLANT LOG --out --warmup=5.0>0 --bands=False --network --columns --dt>1e-09 --seed=0>0

@@ -37,7 +37,6 @@ MISTAKES = {
     # networks, models, classifiers
     "identify log.csv --network griper": "did you mean 'gripper'?",
     "excite --kind prbs --minutes 5 --network tclb --out s.csv": "did you mean 'tclab'?",
-    "fleet data --network tclba --out f": "did you mean 'tclab'?",
     "init network --like tclba": "did you mean 'tclab'?",
     "identify log.csv --network net.tml": "did you mean 'net.toml'?",
     "identify log.csv --network own.py:Tnak": "did you mean 'Tank'?",
@@ -114,8 +113,6 @@ MISTAKES = {
     "classify run grasps.csv --out p.csv": "not a trained classifier; it is for retune, recover",
     "recover run/samples.csv": "give run",
     "retune controller.json log.csv --out c.json": "write retune DIR LOG... --controller CONTROLLER",
-    "identify log.csv --prior plant.json": "is a plant, not a population of rigs",
-    "fleet log.csv --out f": "give a folder with one folder of logs a rig",
     "recover log.csv": "is a log, not the folder of a run",
     "tune plant.json --spec guard.toml --out c.json": "is a guard's settings, not a spec of tune",
     "identify log.csv --network spec.toml": "is a spec of tune, not a thermal network; it is for tune",

@@ -71,9 +71,6 @@ def identify(
             "where absent, the shipped one whose columns the logs have.",
         ),
     ] = None,
-    prior: Annotated[
-        Path | None, cli.opt("--prior", "POPULATION", "population.json of fleet, as prior of its network.")
-    ] = None,
     inputs: Annotated[str | None, cli.opt("--inputs", "A,B", "Columns that are moved.")] = None,
     outputs: Annotated[str | None, cli.opt("--outputs", "C,D", "Columns to predict.")] = None,
     disturbances: Annotated[
@@ -131,8 +128,6 @@ def identify(
     a_network = "network" in wanted and network != "none"
     named = a_network and bool(network or grow)
     wanted_network = cli.find_network(network or DEFAULT_NETWORK) if named else None
-    if prior is not None:
-        wanted_network = _with_prior(prior, wanted_network, a_network)
     if grow:
         _growable(wanted_network)  # refused before anything is read
     console = Console(as_json)
@@ -219,20 +214,6 @@ def _read(
     elif isinstance(network, NetworkModel):
         found = in_columns(network, logs[0])
     return (logs if found is network or found is None else read(known=roles_of(found))), found
-
-
-def _with_prior(path: Path, network: GreyModel | None, wanted: bool) -> NetworkModel:
-    """Return the network, by default that of the population, with the population as its prior."""
-    from thermogrip.sysid.greybox.population import Population
-    from thermogrip.sysid.models.network import NetworkModel
-
-    population = Population.load(path)
-    if not wanted:
-        raise UserError("--prior without a network to fit", hint="leave out --network none, or --prior")
-    model = cli.find_network(population.network) if network is None else network
-    if not isinstance(model, NetworkModel):
-        raise UserError("--prior is of a thermal network", hint="name one with --network")
-    return population.prior_of(model)
 
 
 def _sampled(

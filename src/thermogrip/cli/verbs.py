@@ -29,7 +29,7 @@ from thermogrip.datasets.provenance import note_seed
 ALONE = {"--live": "0", "--foxglove": "8765"}
 #: Each verb and its module of this package, in the order of the documentation.
 VERBS = {
-    "demo": "project", "identify": "identify", "fleet": "fleet", "validate": "identify",
+    "demo": "project", "identify": "identify", "validate": "identify",
     "simulate": "identify", "linearise": "identify", "excite": "excite",
     "tune": "control", "retune": "control", "review": "control", "export": "control",
     "run": "rig", "record": "rig", "virtual": "rig", "batch": "rig", "recover": "rig",
