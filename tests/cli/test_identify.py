@@ -139,7 +139,7 @@ def test_words_reach_the_fit_by_their_meaning(room: SimpleNamespace) -> None:
     [page] = room.pages
     assert page.args == (Path("r.html"), "Identification", "From log a, log a.", ["a section"])
     [asked] = room.sections
-    assert (asked.args[0], asked.args[2:]) == (room.found, (BOARD, None, None, DYNAMICS))
+    assert (asked.args[0], asked.args[2:]) == (room.found, (BOARD, None, DYNAMICS))
     assert room.asked[0].args == (BOARD,)
     assert shares(done.err, "identify") == [0, 50]
     assert done.err.count("warning: log a: one row dropped\n") == 2
@@ -169,7 +169,6 @@ def test_what_was_found_is_printed(room: SimpleNamespace) -> None:
         assert words in said
     assert said.startswith("Columns of the logs")
     assert "Free parameters of the plant" in said
-    assert "Growth" not in said
     assert not room.pages
     room.found = found_of("arx", plant=small_plant())
     assert "Free parameters" not in room.bench.run("identify", "good.csv", "--out", "p.json").out
@@ -196,7 +195,7 @@ def test_the_answer_of_identify_is_what_was_found(room: SimpleNamespace) -> None
             name: {"value": BOARD.values[name], "unit": BOARD.units[name]} for name in BOARD.free
         },
         "intervals_90": {name: list(ends) for name, ends in BOARD.intervals(0.9).items()},
-        "identifiability": ["U is identifiable"], "growth": None, "posterior": None,
+        "identifiability": ["U is identifiable"], "posterior": None,
         "searched": [
             {"model": "arx", "structure": "na 1, nb 1, delay 1", "error": 0.25, "folds": [0.2, 0.3125],
              "kept": True}
@@ -265,41 +264,6 @@ def test_a_posterior_is_an_answer_of_yes_where_it_has_converged(
     if used:
         assert shares(done.err, "identify") == [0, 30, 80]
         assert "posterior: c" in done.err
-
-
-def test_a_network_is_grown_before_the_fit_and_that_is_reported(
-    room: SimpleNamespace, stand_in: StandIn
-) -> None:
-    term = SimpleNamespace(output="t1", term="q1", share=0.25, tau=123.4)
-    growth = SimpleNamespace(network=load_network("tclab"), evaluations=4, residual=(), rows=())
-
-    def grow(*_: Any, progress: Any, **__: Any) -> SimpleNamespace:
-        progress(0.5, "g")
-        return growth
-
-    asked = stand_in("thermogrip.sysid.growth.stepwise.grow", grow)
-    stand_in("thermogrip.sysid.growth.stepwise.growth_table", (["round", "why"], [["1", "noise"]]))
-    words = ["identify", "good.csv", "--network", "tclab", "--grow", "--outputs", "t1", "--out", "p.json"]
-    done = room.bench.run(*words, "--json", "--report", "p.html")
-    assert done.code == 0, done
-    assert shares(done.err, "identify") == [20, 40, 70]
-    assert (asked[0].args[0].name, len(asked[0].args[1]), asked[0].outputs) == ("tclab", 1, ("t1",))
-    assert room.fits[0].args[1] is growth.network
-    assert room.sections[0].args[4] is growth
-    assert json.loads(done.out)["growth"] == {"looks": 4, "rows": [], "residual": []}
-    growth.residual = (term,)
-    said = words_of(room.bench.run(*words).out)
-    assert said.startswith("Growth, 4 ")
-    assert "1 noise" in said
-    assert "t1 " in said
-    assert "q1 (25 % of the residual's variance, 123 s)" in said
-
-
-@pytest.mark.parametrize("words", ["--network none", "--models arx"])
-def test_nothing_but_a_network_grows(words: str, room: SimpleNamespace) -> None:
-    done = room.bench.run("identify", "good.csv", "--grow", *words.split(), "--out", "p.json")
-    assert (done.code, len(done.said)) == (2, 1)
-    assert "--grow has no thermal network to grow; name one with --network" in done.said[0]
 
 
 def test_a_model_that_runs_slowly_says_why(room: SimpleNamespace) -> None:

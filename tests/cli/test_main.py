@@ -71,7 +71,7 @@ OPTIONS = """
 demo: --out=thermogrip-demo --seed=0>0 --workers=2>1 --cluster --json=False
 identify: LOG... --out --network --inputs --outputs --disturbances --columns --dt>1e-09
   --models=arx,oe,subspace,sindy,neural,network --average>0 --order>1<20 --delay>1<20
-  --leave-one-out=False --grow=False --posterior/--no-posterior=False --report --seed=0>0 --workers=1>1
+  --leave-one-out=False --posterior/--no-posterior=False --report --seed=0>0 --workers=1>1
   --cluster --json=False
 validate: PLANT LOG... --warmup=5.0>0 --score-from=5.0>0 --average>0 --network --columns --dt>1e-09
   --report --seed=0>0 --json=False

@@ -56,7 +56,6 @@ REFUSED = {
     "identify x.csv --network n.toml --out p.json": "n.toml: is nested too deeply",
     "identify x.csv --network n.py --out p.json": "n.py: names no class",
     "identify x.csv --network n.py:Tank --out p.json": "n.py: no such file",
-    "identify x.csv --network none --grow --out p.json": "--grow has no thermal network to grow",
     "validate x.csv x.csv --network n.py:Tank": "n.py: no such file",
     "identify nofile.csv@10:20 --out p.json": "nofile.csv@10:20: no such file or folder",
     "validate x.csv nofile.csv": "nofile.csv: no such file or folder",  # before plants are looked through

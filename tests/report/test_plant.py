@@ -196,25 +196,7 @@ def test_an_identification_has_its_tables_and_verdict(good: bool, tone: str) -> 
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_growth_and_posterior_stand_where_there_are_any(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("thermogrip.sysid.growth.stepwise.growth_table", lambda _: (["round"], [["1"]]))
-
-    def growth_of(*changes: tuple[str, str, str]) -> SimpleNamespace:
-        rows = [
-            SimpleNamespace(candidate=name, verdict=verdict, change=change)
-            for name, verdict, change in changes
-        ]
-        return SimpleNamespace(evaluations=4, rows=rows, residual=())
-
-    kept = growth_of(("base", "kept", "base"), ("lag", "kept", "add"), ("hum", "refused", "add"))
-    kept.residual = (SimpleNamespace(output="t", term="q", share=0.25),)
-    section = plant.growth_section(kept)
-    assert section.verdict == "Kept: lag."
-    assert section.parts[0].rows == (("1",),)
-    assert section.parts[1].text.startswith("4 comparisons on the same held-out logs")
-    assert "of t depends on q (25 % of its variance)." in section.parts[2].text
-    none = plant.growth_section(growth_of(("base", "kept", "base")))
-    assert (none.verdict, len(none.parts)) == ("No change earned its place.", 2)
+def test_parameters_stand_where_there_are_any(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plant, "free_run_section", lambda *args, **options: (args, options))
     asked: list[tuple[object, ...]] = []
     monkeypatch.setattr(
@@ -224,12 +206,11 @@ def test_growth_and_posterior_stand_where_there_are_any(monkeypatch: pytest.Monk
     found = identified()
     found.runs = (SimpleNamespace(warmup=9.0),)
     board = plant_from_prior(load_network("tclab"))
-    sections = plant.identification_sections(found, ["a log"], board, None, kept)
+    sections = plant.identification_sections(found, ["a log"], board, None)
     assert asked == [(board, "a log", 9.0, 9.0, found.runs[0])]
     assert sections[-1] == (("a run",), {"seen": True})
-    assert [section.title for section in sections[:3]] == [
+    assert [section.title for section in sections[:2]] == [
         "Which plant is behind the logs?", "How well are its parameters known?",
-        "Which terms does the network need?",
     ]  # fmt: skip
     black = SimpleNamespace(free=())
     assert len(plant.identification_sections(found, ["a log"], black, None)) == 2

@@ -20,15 +20,12 @@ if TYPE_CHECKING:
     from thermogrip.datasets.schema import Log
     from thermogrip.sysid.export.dynamics import Dynamics
     from thermogrip.sysid.greybox import Posterior
-    from thermogrip.sysid.growth import Growth
     from thermogrip.sysid.identification import Identification, Row
     from thermogrip.sysid.models.model import GreyModel
-    from thermogrip.sysid.models.network import NetworkModel
     from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation import Band, FreeRun
 
 USUAL_MODELS = ",".join(model for model in MODELS if model not in ("armax", "bj", "parsim"))
-DEFAULT_NETWORK = "gripper"  # of --grow
 NO_POSTERIOR = "no posterior: the model that was kept is a black box, only networks have parameters to sample"
 
 
@@ -99,12 +96,6 @@ def identify(
     leave_one_out: Annotated[
         bool, cli.flag("--leave-one-out", "Score each log by a fit to the others.")
     ] = False,
-    grow: Annotated[
-        bool,
-        cli.flag(
-            "--grow", "Try terms that the network lacks, and its own, on held-out logs; print what was kept."
-        ),
-    ] = False,
     posterior: Annotated[
         bool, cli.flag("--posterior/--no-posterior", "Sample the parameters' posterior until it converges.")
     ] = False,
@@ -126,16 +117,12 @@ def identify(
     if columns is None:
         cli.check_columns(paths, [name for names in roles for name in names or ()])
     a_network = "network" in wanted and network != "none"
-    named = a_network and bool(network or grow)
-    wanted_network = cli.find_network(network or DEFAULT_NETWORK) if named else None
-    if grow:
-        _growable(wanted_network)  # refused before anything is read
+    wanted_network = cli.find_network(network) if a_network and network else None
     console = Console(as_json)
     from thermogrip.datasets.units import find_column
 
     read = partial(cli.load_logs, paths, *roles, columns=cli.comma(columns), dt=dt)
     logs, wanted_network = _read(read, wanted_network, shipped=a_network)
-    to_grow = _growable(wanted_network) if grow else None
     repairs = _repaired(console, logs)
     have = dict.fromkeys(map(str, logs[0].data_vars), "")  # what a word means may be written otherwise
     known = [None if words is None else tuple(find_column(w, have) for w in words) for words in roles]
@@ -145,13 +132,8 @@ def identify(
     from thermogrip.report.plant import identification_sections
     from thermogrip.sysid.identification import identify as fit_models
 
-    growth, record, lost = None, None, NO_POSTERIOR
+    record, lost = None, NO_POSTERIOR
     with console.progress("identify") as progress:
-        if to_grow is not None:
-            from thermogrip.sysid.growth.stepwise import grow as try_terms
-
-            growth = try_terms(to_grow, logs, outputs=roles[1], progress=sub_progress(progress, 0.0, 0.4))
-            wanted_network = growth.network
         found = fit_models(
             logs,
             wanted_network,
@@ -164,7 +146,7 @@ def identify(
             draws=0 if posterior else 24,
             seed=seed,
             workers=pool,
-            progress=sub_progress(progress, 0.4 if grow else 0.0, 0.6 if posterior else 1.0),
+            progress=sub_progress(progress, 0.0, 0.6 if posterior else 1.0),
             early=lambda rows: console.early(*_so_far(rows)),
         )
         plant = found.plant
@@ -179,9 +161,9 @@ def identify(
     dynamics, nothing = _dynamics(plant)
     if report is not None:
         lead = f"From {', '.join(log.attrs['name'] for log in logs)}."
-        sections = identification_sections(found, logs, plant, record, growth, dynamics)
+        sections = identification_sections(found, logs, plant, record, dynamics)
         write_report(report, "Identification", lead, sections)
-    _show_identified(console, found, plant, growth, dynamics)
+    _show_identified(console, found, plant, dynamics)
     if dynamics is None:
         console.say(nothing)
     if posterior:
@@ -191,7 +173,7 @@ def identify(
     if slow:
         console.warn(f"{plant.model.kind} model not compiled, tens of times slower: {slow}")
     more = {"dynamics": None if dynamics is None else dynamics.to_dict(), "repairs": repairs}
-    console.answer(_identified(found, plant, record, growth, out) | more)
+    console.answer(_identified(found, plant, record, out) | more)
     return cli.ANSWER_IS_NO if posterior and (record is None or not record.converged) else 0
 
 
@@ -257,17 +239,6 @@ def _repaired(console: Console, logs: Sequence[Log]) -> dict[str, list[str]]:
     return found
 
 
-def _growable(network: GreyModel | None) -> NetworkModel:
-    """Return the network, or raise UserError unless it is made of named parts."""
-    if network is not None:
-        from thermogrip.sysid.models.network import NetworkModel
-
-        if isinstance(network, NetworkModel):
-            return network
-    hint = "name one with --network, or leave it out"
-    raise UserError("--grow has no thermal network to grow", hint=hint)
-
-
 def _dynamics(plant: Plant) -> tuple[Dynamics | None, str]:
     """Return gains and responses of the plant, or in words why it has none."""
     from thermogrip.sysid.export.dynamics import plant_dynamics
@@ -279,9 +250,9 @@ def _dynamics(plant: Plant) -> tuple[Dynamics | None, str]:
 
 
 def _show_identified(
-    console: Console, found: Identification, plant: Plant, growth: Growth | None, dynamics: Dynamics | None
+    console: Console, found: Identification, plant: Plant, dynamics: Dynamics | None
 ) -> None:
-    """Print growth, models, parameters and their identifiability, gains, the data check and the verdict."""
+    """Print models, parameters and their identifiability, gains, the data check and the verdict."""
     from thermogrip.report.plant import (
         gain_table,
         held_out_table,
@@ -291,15 +262,6 @@ def _show_identified(
     )
     from thermogrip.sysid.greybox.identifiability import identifiability_report
 
-    if growth is not None:
-        from thermogrip.sysid.growth.stepwise import growth_table
-
-        head, rows = growth_table(growth)
-        title = f"Growth, {growth.evaluations} evaluations on held-out logs"
-        console.table(title, tuple(head), [tuple(r) for r in rows])
-        for term in growth.residual:
-            share = f"{100 * term.share:.0f} % of the residual's variance, {term.tau:.3g} s"
-            console.say(f"before growth, the residual of {term.output} correlated with {term.term} ({share})")
     console.table("Columns of the logs", *signal_table(found))
     console.table("Free runs (RMSE)", *held_out_table(found.rows))
     if plant.free:
@@ -319,18 +281,16 @@ def _show_identified(
 
 
 def _identified(
-    found: Identification, plant: Plant, record: Posterior | None, growth: Growth | None, out: Path
+    found: Identification, plant: Plant, record: Posterior | None, out: Path
 ) -> dict[str, Any]:
     """Return the JSON answer of ``identify``."""
     from thermogrip.sysid.greybox.identifiability import identifiability_report
 
-    sampled, grown = None, None
+    sampled = None
     if record is not None:
         sampled = {
             key: getattr(record, key) for key in ("converged", "verdict", "tau", "n_steps", "likelihood")
         }
-    if growth is not None:
-        grown = {"looks": growth.evaluations, "rows": growth.rows, "residual": growth.residual}
     return {
         "model": found.model,
         "good": found.good,
@@ -344,7 +304,6 @@ def _identified(
         },
         "intervals_90": plant.intervals(0.9),
         "identifiability": identifiability_report(plant),
-        "growth": grown,
         "posterior": sampled,
         "searched": found.searched,
         "notes": found.notes,

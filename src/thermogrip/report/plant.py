@@ -1,4 +1,4 @@
-"""Sections of the page of a plant: the models compared, its parameters, growth, posterior, free runs.
+"""Sections of the page of a plant: the models compared, its parameters, posterior, free runs.
 
 As in :mod:`thermogrip.report.classification`, each function returns sections whose verdict is a sentence.
 """
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from thermogrip.datasets.schema import Log
     from thermogrip.sysid.export.dynamics import Dynamics
     from thermogrip.sysid.greybox import Posterior
-    from thermogrip.sysid.growth import Growth
     from thermogrip.sysid.identification import Identification, Row, Searched
     from thermogrip.sysid.plant.plant import Plant
     from thermogrip.sysid.validation import Band, FreeRun
@@ -143,11 +142,10 @@ def identification_sections(
     logs: Sequence[Log],
     plant: Plant,
     record: Posterior | None,
-    growth: Growth | None = None,
     dynamics: Dynamics | None = None,
 ) -> list[Section]:
     """Return the report of an identification: the model comparison, what was held out, parameters, responses,
-    growth, every log.
+    every log.
 
     ``plant`` is the chosen one, with samples where ``record`` says how they were drawn.  Its free runs
     are those of the comparison, now with residual tests.
@@ -161,8 +159,6 @@ def identification_sections(
         sections.append(parameters_section(plant, record))
     if dynamics is not None:
         sections.append(dynamics_section(dynamics))
-    if growth is not None:
-        sections.append(growth_section(growth))
     for log, known in zip(logs, found.runs):
         run = free_run(plant, log, known.warmup, known.warmup, known=known)
         sections.append(free_run_section(run, seen=True))
@@ -233,29 +229,6 @@ def dynamics_section(found: Dynamics) -> Section:
 
 def _spaced(unit: str) -> str:
     return "" if unit == "1" else f" {unit}"
-
-
-def growth_section(growth: Growth) -> Section:
-    """Return the section of the growth of a network: what was tried, what it gained, why it was refused."""
-    from thermogrip.sysid.growth.stepwise import growth_table
-
-    head, rows = growth_table(growth)
-    kept = [row.candidate for row in growth.rows if row.verdict == "kept" and row.change != "base"]
-    verdict = f"Kept: {', '.join(kept)}." if kept else "No change earned its place."
-    still = "; ".join(
-        f"the residual of {term.output} depends on {term.term} ({100 * term.share:.0f} % of its variance)"
-        for term in growth.residual
-    )
-    parts: list[Any] = [
-        Table(tuple(head), tuple(tuple(row) for row in rows), "Held-out RMSE of each candidate, in free run"),
-        Text(
-            f"{growth.evaluations} comparisons on the same held-out logs: the best of so many is biased by "
-            "chance. A term is kept if it gains more than its standard error and is identifiable."
-        ),
-    ]
-    if still:
-        parts.append(Text(_sentence(f"Before growth, {still}")))
-    return Section("Which terms does the network need?", tuple(parts), verdict)
 
 
 def parameters_section(plant: Plant, record: Posterior | None = None) -> Section:

@@ -1,2 +1,0 @@
-from thermogrip.sysid.growth.stepwise import Growth as Growth
-from thermogrip.sysid.growth.stepwise import grow as grow
