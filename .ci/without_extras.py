@@ -18,7 +18,6 @@ EXTRAS = (
     "distributed",
     "foxglove",
     "mcap",
-    "pythonfmu",
     "rosbags",
     "starlette",
     "torch",

@@ -193,34 +193,6 @@ class Controller(Shown, SampledController):
             "plant": self.plant.to_dict(draws=_KEPT_DRAWS),
         }
 
-    def to_fmu(self, path: str | Path) -> Path:
-        """Write the controller as an FMU (FMI 2.0, co-simulation) and return the path.
-
-        Parameters
-        ----------
-        path : str or Path
-            Ends in ``.fmu``; its stem becomes the model's identifier.
-
-        Raises
-        ------
-        UserError
-            If pythonfmu is not installed, the name cannot be an identifier, or the plant is a class of the
-            user's own.
-
-        Examples
-        --------
-        >>> from tempfile import TemporaryDirectory
-        >>> from thermogrip.sysid.greybox.problem import prior_plant
-        >>> from thermogrip.sysid.models.network import load_network
-        >>> controller = design_controller(prior_plant(load_network("tclab")), dt=5.0)
-        >>> with TemporaryDirectory() as folder:
-        ...     controller.to_fmu(f"{folder}/loop.fmu").name
-        'loop.fmu'
-        """
-        from thermogrip.mpc.controllers.fmu import to_fmu
-
-        return to_fmu(self, path)
-
     @classmethod
     def load(cls, path: str | Path, *, model: Model | None = None) -> Controller:
         """Return the controller that :meth:`save` wrote.

@@ -27,12 +27,12 @@ from thermogrip.datasets.rosbag import (
     read_topic_map,
     write_bag,
 )
-from thermogrip.mpc.controllers.fmu import TARGET
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.interface import STATUSES
 
 #: An output that was not heard for so many sample times is lost; a measured disturbance stays.
 KEPT_SAMPLES = 3
+TARGET = "target_"  # with the name of an output
 _OF_NODE = {"pump": "std_msgs/msg/Bool", "status": "std_msgs/msg/UInt8"}
 _TEMPERATURE, _NUMBER = "sensor_msgs/msg/Temperature", "std_msgs/msg/Float64"
 _SENT = {

@@ -1,4 +1,4 @@
-"""A plant for other libraries: linearised, python-control, scipy, CasADi, FMU."""
+"""A plant for other libraries: linearised, python-control, scipy, CasADi."""
 
 from thermogrip import lazy_exports
 

@@ -1,7 +1,6 @@
 import typing
 
 from thermogrip.sysid.export.dynamics import plant_dynamics as plant_dynamics
-from thermogrip.sysid.export.fmu import to_fmu as to_fmu
 from thermogrip.sysid.export.linearise import linearise_plant as linearise_plant
 from thermogrip.sysid.export.linearise import to_casadi as to_casadi
 from thermogrip.sysid.export.linearise import to_control as to_control

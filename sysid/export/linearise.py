@@ -15,12 +15,11 @@ a model of the user's own, and for a black box the logarithm of [[A, B], [0, 1]]
 the hold; a delay (a pole at zero) has no such logarithm and is refused.
 
 :func:`to_control` and :func:`to_scipy` hand these on; :func:`to_casadi` is one step of the plant itself, for
-optimisation, with exact derivatives.  The nonlinear plant as an FMU is in :mod:`thermogrip.sysid.export.fmu`.
+optimisation, with exact derivatives.
 """
 
 from __future__ import annotations
 
-import importlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -348,7 +347,12 @@ def to_control(
 
 def control_system(labels: Any, numbers: Sequence[Any], name: str) -> Any:
     """Return A, B, C, D, dt as a ``StateSpace`` with the inputs, outputs and states that ``labels`` has."""
-    return needed("control", "control").StateSpace(
+    try:
+        import control
+    except ImportError as error:
+        hint = "pip install 'thermogrip[control]', or pip install control"
+        raise UserError("control is not installed", hint=hint) from error
+    return control.StateSpace(
         *numbers,
         **{what: list(getattr(labels, what)) for what in ("inputs", "outputs", "states")},
         name=name,
@@ -437,15 +441,4 @@ def to_casadi(plant: Plant, *, dt: float | None = None) -> Any:
         raise UserError(
             f"the class cannot be written in symbols ({type(error).__name__}: {error})".splitlines()[0],
             hint="use plain arithmetic in it, and no branch on a state, an input or a parameter",
-        ) from error
-
-
-def needed(module: str, extra: str) -> Any:
-    """Return an optional library, or raise the one line that says how to install it."""
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        package = module.split(".")[0]
-        raise UserError(
-            f"{package} is not installed", hint=f"pip install 'thermogrip[{extra}]', or pip install {package}"
         ) from error

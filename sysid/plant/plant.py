@@ -270,9 +270,6 @@ class Plant(Shown, plant_data.PlantData):
         """Return one step as a CasADi function; see :func:`thermogrip.sysid.export.linearise.to_casadi`."""
         return _exporter("to_casadi")(self, dt=dt)
 
-    def to_fmu(self, path: str | Path) -> Path:
-        """Write the plant as an FMU and return the path; see :func:`thermogrip.sysid.export.fmu.to_fmu`."""
-        return Path(_exporter("to_fmu")(self, path))
 
 
 def _exporter(name: str) -> Callable[..., Any]:

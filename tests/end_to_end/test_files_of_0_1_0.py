@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -66,20 +65,6 @@ def test_a_run_folder_of_0_1_0_is_whole(tmp_path: Path, capsys: pytest.CaptureFi
     assert main(["recover", str(tmp_path / "run"), "--json"]) == 0
     assert main(["validate", str(OLD / "plant_network.json"), str(tmp_path / "run" / "samples.csv")]) == 0
     capsys.readouterr()
-
-
-def test_the_code_in_an_fmu_of_0_1_0_finds_its_runtime(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("pythonfmu")
-    shutil.copy(OLD / "fmu" / "thermogrip_slave_plant.py", tmp_path)
-    shutil.copy(OLD / "plant_network.json", tmp_path / "plant.json")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    slave = __import__("thermogrip_slave_plant").plant(instance_name="plant", resources=str(tmp_path))
-    slave.exit_initialization_mode()
-    assert slave.do_step(0.0, 1.0)
-    assert slave.core.get("t_surface") == pytest.approx(slave.core.get("t_tank"), abs=5.0)
-    del sys.modules["thermogrip_slave_plant"]
 
 
 def test_tables_of_0_1_0_have_the_same_columns_and_numbers() -> None:

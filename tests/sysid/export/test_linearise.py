@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -12,8 +12,6 @@ from scipy.linalg import expm
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.blackbox.sindy import SindyModel
-from thermogrip.sysid.export import linearise as libraries
-from thermogrip.sysid.export.fmu import Core
 from thermogrip.sysid.export.linearise import linearise_plant
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.network import load_network
@@ -156,113 +154,6 @@ def test_the_casadi_step_is_the_plants_step(name):
         np.testing.assert_allclose(np.array(seen).ravel(), y[k, 0], rtol=1e-9, atol=1e-9)
 
 
-def _fmu_inputs(plant: Plant, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(2)
-    u = np.repeat(rng.uniform(0.0, 0.6, (n // 20, len(plant.inputs))), 20, axis=0)
-    u[:, [name in plant.model.switches for name in plant.inputs]] = 1.0
-    d = np.full((n, len(plant.disturbances)), 22.0)
-    columns = ["time", *plant.inputs, *plant.disturbances]
-    table = np.zeros(n + 1, dtype=[(name, float) for name in columns])
-    table["time"] = plant.dt * np.arange(n + 1)
-    for k, name in enumerate((*plant.inputs, *plant.disturbances)):
-        both = np.hstack([u, d])
-        table[name] = [*both[:, k], both[-1, k]]
-    return u, d, table
-
-
-@pytest.mark.parametrize("name", ["gripper", "black box"])
-def test_an_fmu_run_by_fmpy_is_the_plant_to_the_last_digit(name, tmp_path):
-    fmpy = pytest.importorskip("fmpy")
-    pytest.importorskip("pythonfmu")
-    validation = importlib.import_module("fmpy.validation")
-    plant, n = PLANTS[name], 200
-    path = plant.to_fmu(tmp_path / f"{name.replace(' ', '_')}.fmu")
-    assert validation.validate_fmu(str(path)) == []
-    described = {v.name: v for v in fmpy.read_model_description(str(path)).modelVariables}
-    assert described["t_surface"].causality == "output"
-    assert described["t_surface"].unit == "degC"
-    u, d, table = _fmu_inputs(plant, n)
-    start = {"start_t_tank": 24.0, "start_t_surface": 23.5} | dict(zip(plant.inputs, u[0]))
-    start |= dict(zip(plant.disturbances, d[0]))
-    p = plant.p.copy()
-    if name == "gripper":
-        start["flow"] = p[plant.model.parameters.index("flow")] = 20.0
-        assert described["flow"].unit == "W/K"
-    run = fmpy.simulate_fmu(
-        str(path),
-        stop_time=n * plant.dt,
-        step_size=plant.dt,
-        output_interval=plant.dt,
-        input=table,
-        start_values=start,
-        output=list(plant.outputs),
-    )
-    x0 = plant.model.rest([24.0, 23.5], u[0], d[0], p)
-    y, _ = plant.model.rollout(x0[None], u[None], d[None], p[None], plant.dt)
-    got = np.stack([run[output] for output in plant.outputs], axis=1)
-    np.testing.assert_allclose(got, y[0], atol=1e-9)
-
-
-def test_a_communication_step_may_be_long_or_odd_for_a_network_only():
-    core = Core(PLANTS["tclab"])
-    core.set("q1", 60.0)
-    core.begin()
-    assert core.advance(30.0)
-    once = core.get("t1")
-    core.begin()
-    assert all(core.advance(2.5) for _ in range(12))  # steps of 0.83 s
-    assert core.get("t1") == pytest.approx(once, abs=1e-3)
-    black = Core(_black_box())
-    assert black.advance(4.0)
-    assert not black.advance(3.0)
-
-
-def test_the_core_of_an_fmu_has_the_variables_of_its_plant():
-    core = Core(PLANTS["gripper"])
-    ports = {port.name: (port.causality, port.variability, port.unit) for port in core.ports}
-    assert list(ports)[:5] == ["drive", "pump", "t_ambient", "t_tank", "t_surface"]
-    assert ports["drive"] == ("input", "continuous", PLANTS["gripper"].units["drive"])
-    assert ports["t_ambient"] == ("input", "continuous", "degC")
-    assert ports["t_tank"] == ("output", "continuous", "degC")
-    assert ports["flow"] == ("parameter", "tunable", "W/K")
-    assert ports["start_t_tank"] == ("parameter", "fixed", "degC")
-    assert len(ports) == len(core.ports) == 5 + len(PLANTS["gripper"].values) + 2
-    assert [core.get(name) for name in ("drive", "pump", "t_ambient", "start_t_tank")] == [
-        0.0,
-        1.0,
-        25.0,
-        25.0,
-    ]
-    assert core.get("t_tank") == pytest.approx(25.0, abs=1e-3)  # at rest before it is begun
-    core.set("start_t_tank", 31.0)
-    core.set("t_ambient", 22.0)
-    core.set("flow", 17.0)
-    assert [core.get(name) for name in ("start_t_tank", "t_ambient", "flow")] == [31.0, 22.0, 17.0]
-    assert core.get("t_tank") == pytest.approx(31.0, abs=1e-2)
-    with pytest.raises(KeyError, match="t_tank"):
-        core.set("t_tank", 3.0)
-    assert core.advance(1.0)  # begins by itself
-    assert core.get("t_tank") != core.get("start_t_tank")
-
-
-def test_starts_are_those_of_a_room_or_nought_where_no_temperature_is_read():
-    model = StateSpaceModel(
-        ("q",), ("wind",), ("t", "n"), A=[[0.9]], B=[[1.0]], E=[[0.0]], C=[[1.0], [2.0]], dt=2.0
-    )
-    units = {"q": "1", "wind": "m/s", "t": "degC", "n": "rpm"}
-    core = Core(Plant(model, {}, dt=2.0, units=units, valid={"wind": (2.0, 8.0)}))
-    assert [core.get(name) for name in ("wind", "start_t", "start_n")] == [5.0, 25.0, 0.0]
-    assert core.ports[-1].unit == "rpm"
-    runaway = Core(Plant(replace(model, A=np.array([[1e300]])), {}, dt=2.0, units=units))
-    assert not runaway.advance(8.0)
-    core.begin()
-    core.set("q", 3.0)
-    before = core.get("t")
-    assert core.advance(4.0 + 1e-9)  # two steps, for all the rounding
-    assert core.get("t") == pytest.approx(0.81 * before + 1.9 * 3.0)
-    assert not core.advance(4.0 + 1e-3)
-
-
 def test_what_has_no_linear_model_is_refused_in_one_line():
     def refused(plant: Plant, says: str, **point) -> None:
         with pytest.raises(UserError, match=says) as found:
@@ -300,24 +191,11 @@ def test_sindy_is_exported_too():
     assert float(x_next) == pytest.approx(0.5 + 0.97 * 30 + 0.4 - 0.09, abs=1e-9)
 
 
-@pytest.mark.parametrize(("library", "extra"), [("control", "control"), ("pythonfmu.builder", "fmu")])
-def test_a_missing_library_is_one_line_with_the_command(library, extra, monkeypatch, tmp_path):
-    def absent(name: str) -> None:
-        raise ImportError(name)
-
-    monkeypatch.setattr(libraries.importlib, "import_module", absent)
-    plant = PLANTS["tclab"]
-    export = plant.to_control if extra == "control" else lambda: plant.to_fmu(tmp_path / "board.fmu")
-    hint = rf"is not installed; pip install 'thermogrip\[{extra}\]', or pip install [a-z]+$"
+def test_a_missing_library_is_one_line_with_the_command(monkeypatch):
+    monkeypatch.setitem(sys.modules, "control", None)
+    hint = r"is not installed; pip install 'thermogrip\[control\]', or pip install control$"
     with pytest.raises(UserError, match=hint):
-        export()
-
-
-def test_an_fmu_wants_a_name_that_is_an_identifier(tmp_path):
-    for name in ("my plant.fmu", "plant.zip", "2nd.fmu", "class.fmu"):
-        with pytest.raises(UserError, match="cannot name an FMU"):
-            PLANTS["tclab"].to_fmu(tmp_path / name)
-    assert list(tmp_path.iterdir()) == []
+        PLANTS["tclab"].to_control()
 
 
 class Tanks:
@@ -340,7 +218,7 @@ class Tanks:
         return [x.lower]
 
 
-def test_a_class_of_ones_own_is_exported_too_but_not_as_an_fmu(tmp_path):
+def test_a_class_of_ones_own_is_exported_too():
     plant = replace(prior_plant(own_model(Tanks)), valid={"pump": (1.0, 5.0)})
     near = linearise_plant(plant, inputs={"pump": 3.0})
     # at rest sqrt(x) = inflow u / outflow = 3, so d rhs/dx = outflow / (2 * 3) and dx/du = 2 * 3
@@ -351,5 +229,3 @@ def test_a_class_of_ones_own_is_exported_too_but_not_as_an_fmu(tmp_path):
     _, end = plant.model.rollout([[4.0, 2.0]], [[[3.0]]], np.zeros((1, 1, 0)), plant.p[None], 4.0)
     np.testing.assert_allclose(np.array(x_next).ravel(), end[0], rtol=1e-9)
     assert float(y) == 2.0
-    with pytest.raises(UserError, match="class of your own, which no FMU can hold"):
-        plant.to_fmu(tmp_path / "tanks.fmu")
