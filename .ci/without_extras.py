@@ -23,7 +23,6 @@ EXTRAS = (
     "torch",
     "uvicorn",
     "websockets",
-    "zarr",
 )
 GRASPS = "grasps/exp3C_obj18_grip38.csv.xz"
 VERBS = (

@@ -47,7 +47,6 @@ from thermogrip.datasets.tables import (
     text_numbers,
 )
 from thermogrip.datasets.units import rename_hint, split_header, to_record_unit
-from thermogrip.datasets.zarr_store import is_store, open_store, store_slices
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -99,10 +98,8 @@ def read_grasps(path: str | Path, *, plain: bool = False, name: str | None = Non
     >>> dict(grasps.sizes), str(grasps["material"].values[0]), float(grasps["t_object"][0])
     ({'grasp': 40, 'time': 121}, 'copper', 43.0)
     """
-    if is_store(path):
-        return read_stored_grasps(path, name=name)
     if file_format(path) not in ("csv", "netcdf", "parquet"):
-        raise UserError("grasps are CSV, NetCDF, Parquet or Zarr", file=path, hint="use one of them")
+        raise UserError("grasps are CSV, NetCDF or Parquet", file=path, hint="use one of them")
     if file_format(path) == "parquet":
         frame = read_parquet_frame(path)
         if "grasp_id" not in frame:
@@ -115,17 +112,6 @@ def read_grasps(path: str | Path, *, plain: bool = False, name: str | None = Non
     samples, meta = _sample_table(path), _meta_path(path)
     make = make_plain_grasps if plain else make_grasps
     return _of_tables(samples, read_csv_table(meta, text=None), name or file_stem(path), make)
-
-
-def read_stored_grasps(
-    path: str | Path, start: int = 0, stop: int | None = None, *, name: str | None = None
-) -> Grasps:
-    """Return the grasps from ``start`` to ``stop`` of a Zarr store, by default all, as
-    :func:`read_grasps`."""
-    grasps = _of_dataset(open_store(path, start, stop), path, name)
-    if stop is not None:
-        grasps.attrs["name"] += f"[{start}:{stop}]"
-    return _whole(grasps, path)
 
 
 def _whole(grasps: Grasps, path: str | Path) -> Grasps:
@@ -199,9 +185,6 @@ def _check_cells(frame: DataFrame, file: str) -> None:
 def check_grasp_file(path: str | Path) -> None:
     """Refuse what is no file or folder of grasps by names, beginnings and what is declared."""
     for file in list_grasp_files([path]):
-        if is_store(file):
-            store_slices(file)
-            continue
         check_table(file, labels=True)
         if file_format(file) == "csv":
             check_table(_meta_path(file))
@@ -257,7 +240,7 @@ def list_grasp_files(paths: Sequence[str | Path]) -> list[Path]:
     """Return the grasp files in paths and folders, as of :func:`read_grasp_files`, unread."""
     files: list[Path] = []
     for path in (Path(name) for given in paths for name in matching_files(given)):
-        files += _in_folder(path) if path.is_dir() and not is_store(path) else [path]
+        files += _in_folder(path) if path.is_dir() else [path]
     return files
 
 
@@ -287,7 +270,7 @@ def distinct_names(files: Sequence[Path]) -> list[str | None]:
 
 def grasp_file_parts(path: Path) -> list[Path]:
     """Return the files that hold the grasps of one: itself, and of a CSV its meta file."""
-    return [path, _meta_path(path)] if not is_store(path) and file_format(path) == "csv" else [path]
+    return [path, _meta_path(path)] if file_format(path) == "csv" else [path]
 
 
 def shared_grasps(first: Sequence[Grasps], second: Sequence[Grasps]) -> list[str]:
@@ -313,10 +296,10 @@ def _print_of(samples: Floats) -> bytes:
 def _in_folder(folder: Path) -> list[Path]:
     with os_faults(folder):
         endings = (*_ENDINGS, ".nc", ".parquet", ".pq")
-        files = sorted(p for p in folder.iterdir() if p.name.lower().endswith(endings) or is_store(p))
+        files = sorted(p for p in folder.iterdir() if p.name.lower().endswith(endings))
     files = [p for p in files if not file_stem(p).endswith("_meta") and not p.name.startswith(".")]
     if not files:
-        hint = "give a folder with .csv, .nc, .parquet or .zarr in it"
+        hint = "give a folder with .csv, .nc or .parquet in it"
         if any(path.is_dir() for path in folder.iterdir()):
             hint += f", or a pattern in quotes: '{folder}/*/*.parquet'"
         raise UserError("holds no grasp files", file=folder, hint=hint)
@@ -553,7 +536,7 @@ def _of_tables(samples: Table, meta: Table, name: str, make: Callable[..., Grasp
 
 
 def _of_dataset(data: xr.Dataset, path: str | Path, called: str | None = None) -> Grasps:
-    """Return the grasps of what a NetCDF file or a Zarr store holds."""
+    """Return the grasps of what a NetCDF file holds."""
     schema = data.attrs.get("schema", "thermogrip.grasps")
     if schema != "thermogrip.grasps":
         raise UserError(f"holds a {schema}, not grasps", file=path, hint="give a file of grasps")

@@ -34,12 +34,10 @@ from thermogrip.datasets.grasp_files import (
     grasp_file_parts,
     list_grasp_files,
     read_grasps,
-    read_stored_grasps,
 )
 from thermogrip.datasets.media import csv_text
 from thermogrip.datasets.parallel import Progress, Workers, in_order
 from thermogrip.datasets.schema import label_values, log_name
-from thermogrip.datasets.zarr_store import is_store, store_slices
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
@@ -58,20 +56,13 @@ class Source(NamedTuple):
 
 
 def sources(paths: Sequence[str | Path], *, plain: bool = False) -> list[Source]:
-    """Return the files of grasps in paths and folders, and the slices of Zarr stores, unread; ``plain`` as of
+    """Return the files of grasps in paths and folders, unread; ``plain`` as of
     :func:`~thermogrip.datasets.grasp_files.read_grasps`."""
     found = []
     files = list_grasp_files(paths)
     for path, name in zip(files, distinct_names(files)):
         marks = stamps(grasp_file_parts(path))
         size = sum(mark[1] for mark in marks)
-        if is_store(path):
-            slices, newest = store_slices(path), max(mark[2] for mark in marks)
-            for start, stop in slices:
-                read = partial(read_stored_grasps, path.absolute(), start, stop, name=name)
-                stamp = [[str(path), size, newest], start, stop]
-                found.append(Source(f"{path.name}[{start}:{stop}]", size // len(slices), stamp, read))
-            continue
         read = partial(read_grasps, path.absolute(), plain=plain, name=name)
         found.append(Source(path.name, size, marks, read))
     return found
@@ -86,7 +77,7 @@ def check_apart(out: str | Path, paths: Sequence[str | Path]) -> None:
         for path in map(Path, matching_files(given)):
             if path.is_dir():
                 folder = path.resolve()
-                if place.parent == folder or (is_store(path) and place.is_relative_to(folder)):
+                if place.parent == folder:
                     raise UserError("is in a folder that is read", file=out, hint=hint)
             elif place in [part.resolve() for part in grasp_file_parts(path)]:
                 raise UserError("is to be read and written", file=out, hint=hint)

@@ -287,7 +287,7 @@ def classify(
     paths: Annotated[
         list[str] | None,
         cli.arg(
-            "GRASPS...", "Grasp files (CSV with its _meta.csv, NetCDF, Parquet, Zarr), folders or patterns."
+            "GRASPS...", "Grasp files (CSV with its _meta.csv, NetCDF, Parquet), folders or patterns."
         ),
     ] = None,
     out: Annotated[Path | None, cli.opt("--out", "FILE.csv", "Where the predictions go.")] = None,

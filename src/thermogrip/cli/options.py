@@ -164,7 +164,7 @@ OwnNetwork = Annotated[
 ]
 GraspFiles = Annotated[
     list[str],
-    arg("GRASPS...", "Grasp files (CSV with its _meta.csv, NetCDF, Parquet, Zarr), folders or patterns."),
+    arg("GRASPS...", "Grasp files (CSV with its _meta.csv, NetCDF, Parquet), folders or patterns."),
 ]
 
 
