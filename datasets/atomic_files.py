@@ -36,9 +36,14 @@ _LONG_KEY = re.compile(
 
 
 def make_folder(path: str | Path) -> None:
-    """Make a folder, and those above it, where there is none; UserError where that is refused."""
+    """Make a folder, and those above it, where there is none, and force their names to disk; UserError where
+    that is refused."""
+    folder = Path(path)
     with os_faults(path):
-        Path(path).mkdir(parents=True, exist_ok=True)
+        missing = [each for each in (folder, *folder.parents) if not each.exists()]
+        folder.mkdir(parents=True, exist_ok=True)
+        for each in missing:
+            _sync_folder(each.parent)
 
 
 # Windows writes a line end of two bytes unless it is asked not to; a child process gets no copy on either

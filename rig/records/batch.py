@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from thermogrip.datasets.atomic_files import read_json, write_json
+from thermogrip.datasets.atomic_files import make_folder, read_json, write_json
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.grasp_files import read_grasps, write_grasps
 from thermogrip.datasets.materials import find_material
@@ -397,5 +397,5 @@ def _keep_plan(path: Path, plan: Sequence[Trial]) -> None:
         if read_json(path / "batch.json", SCHEMA, VERSION).get("plan") != content:
             raise UserError("holds a batch of another plan", file=path, hint="choose another folder")
         return
-    path.mkdir(parents=True, exist_ok=True)
+    make_folder(path)
     write_json(path / "batch.json", {"plan": content}, schema=SCHEMA, version=VERSION)

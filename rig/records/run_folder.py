@@ -3,12 +3,15 @@
 Its files, and which folders are refused, are described in ``docs/reference/files.md``.
 
 **Writing.**  Lines of text are the one format that a killed process leaves whole; everything else is exported
-from it later.  Each line is one ``write``, so that ``kill -9`` loses none, and the files are forced to disk
-once a second, so that a power cut loses at most the last one.
+from it later.  A session waits for no disk: one thread writes the lines, each at once and in one ``write``,
+another forces them to disk, once a second and after each event.  ``kill -9`` loses only lines that a disk
+which hangs has not taken yet, a power cut only those of the last second and of the time that the disk needs
+to force them.
 
 **A full disk.**  A part of a line that still fitted is cut off again.  The folder keeps ``RESERVE`` bytes in
 a file of their own from the start; they are given back then, so that the line at hand, the reason and the
-verdict still find room.  The caller gets the ``OSError``, and the loop switches off.
+verdict still find room.  The caller gets the ``OSError`` at that row or the next one, and the loop switches
+off.  A disk that has not taken the last ``MOST_WAITING`` lines counts as gone.
 
 **Reading.**  A line counts if it is whole: ended, of the header's width, every cell a number or empty.  After
 a power cut a file system may leave half a line, or zeros, at the end; lines after the last whole one are the
@@ -19,12 +22,15 @@ the grasps are made of the whole rows, never of anything else; no measured numbe
 from __future__ import annotations
 
 import csv
+import errno
 import json
 import os
 import platform
 import re
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass
 from datetime import datetime
@@ -36,13 +42,14 @@ from typing import Any
 from thermogrip.datasets.atomic_files import (
     atomic_path,
     file_hash,
+    make_folder,
     open_new,
     read_bytes,
     read_json,
     write_atomic,
     write_json,
 )
-from thermogrip.datasets.errors import UserError, as_user_error, os_faults
+from thermogrip.datasets.errors import UserError, as_user_error, os_fault, os_faults
 from thermogrip.datasets.grasp_files import read_grasps, write_grasps
 from thermogrip.datasets.log_files import write_log
 from thermogrip.datasets.media import csv_text, from_csv
@@ -55,6 +62,10 @@ from thermogrip.rig.session.signals import hold_signals
 
 SCHEMA, VERSION = "thermogrip.run", 1
 RESERVE = 1 << 18  # bytes, for the last words of a run on a full disk
+MOST_WAITING = 6000  # lines for a disk that hangs: ten minutes of the fastest rows (of a grasp, 10 a second)
+# for which a row holds up its caller: less than half of the shortest sample (0.05 s), more than Python needs to
+# change threads (5 ms), so that a disk that is well has the row when the call returns
+_AT_ONCE_S = 0.02
 FILES = ("run.json", "samples.csv", "events.jsonl", "grasps.csv", "grasps_meta.csv")
 _RESERVE, _SUMS = ".reserve", "SHA256SUMS"
 NAMES = (*FILES, _RESERVE, _SUMS)  # of everything that a run may leave
@@ -83,49 +94,52 @@ class RunFolder:
         self._made = made_with(files or {})
         # a run that cannot begin leaves no file behind
         with ExitStack() as undo, os_faults(self.path):
-            self.path.mkdir(parents=True, exist_ok=True)
+            make_folder(self.path)
             refuse_used(self.path)
             self._reserve = _Reserve(self.path / _RESERVE)
             undo.callback(self._reserve.give_back)
-            self._write_about({"verdict": "running"})
-            undo.callback((self.path / "run.json").unlink)
             self._samples = _Lines(self.path / "samples.csv", self._reserve)
             undo.callback(self._samples.remove)
             self._events = _Lines(self.path / "events.jsonl", self._reserve)
+            undo.callback(self._events.remove)
+            self._write_about({"verdict": "running"})  # at last, for it forces the names of all to disk
             undo.pop_all()
         self._header: tuple[str, ...] = ()
-        self._clock, self._synced = clock, clock()
+        self._disk = _Disk(self._samples, self._events)
+        self._clock, self._forced = clock, clock()
         self._closed = False
 
     def sample(self, row: Mapping[str, float]) -> None:
-        """Write one row; the first one sets the columns, and others are a ValueError.  OSError where the disk
-        is full or gone; the row is on disk if the reserve had room for it."""
+        """Take one row; the first one sets the columns, and others are a ValueError.  OSError where the disk
+        is full or gone, or was at an earlier line; the row is on disk if the reserve had room for it."""
         if not self._header:
             self._header = tuple(row)
-            self._samples.write(csv_text([self._header]).rstrip("\n"))
+            self._write(self._samples, csv_text([self._header]).encode())
         if tuple(row) != self._header:
             raise ValueError(f"columns changed from {self._header} to {tuple(row)}")
-        self._samples.write(",".join(_number(value) for value in row.values()))
-        if self._clock() - self._synced >= 1.0:
-            self.sync()
+        line = ",".join(_number(value) for value in row.values())
+        due = self._clock() - self._forced >= 1.0
+        self._write(self._samples, line.encode() + b"\n", force=due, wait_s=_AT_ONCE_S)
 
     def event(self, event: Event) -> None:
-        """Write one event and force it to disk, for events are few and give the reasons; OSError as above."""
-        line: dict[str, Any] = {"time_s": event.time_s, "kind": event.kind, "text": event.text}
-        if event.data:
-            line["data"] = dict(event.data)
-        self._events.write(json.dumps(line, ensure_ascii=False))
-        self.sync()
+        """Take one event, which is forced to disk, for events are few and give the reasons; OSError as
+        above."""
+        self._write(self._events, event_line(event), force=True)
+
+    def _write(self, file: _Lines, line: bytes, *, force: bool = False, wait_s: float = 0.0) -> None:
+        if self._closed:
+            raise OSError(errno.EBADF, "the run folder is closed")
+        if force:
+            self._forced = self._clock()
+        self._disk.write(file, line, force=force, wait_s=wait_s)
 
     def sync(self) -> None:
-        """Force what was written to disk."""
-        self._synced = self._clock()
-        self._samples.sync()
-        self._events.sync()
+        """Wait until everything is written and forced to disk; OSError where the disk refuses."""
+        self._disk.drain()
 
     def finish(self, session: Session) -> None:
         """Write the verdict, and the grasp where there is one; call it before :meth:`close`."""
-        self._reserve.give_back()
+        self._take_all()
         if session.grasps is not None:
             write_grasps(session.grasps, self.path / "grasps.csv")
         figures = {
@@ -138,8 +152,18 @@ class RunFolder:
 
     def played(self, ended: str) -> None:
         """Write that a schedule was played, or what ended it; call it before :meth:`close`."""
-        self._reserve.give_back()
+        self._take_all()
         self._write_about({"verdict": "tripped" if ended else "played", "advice": ended})
+
+    def _take_all(self) -> None:
+        """Wait for the disk; UserError where it refuses a line, and no row or event has said so before."""
+        self._reserve.give_back()
+        known = self._disk.refused
+        try:
+            self.sync()
+        except OSError as error:
+            if not known:
+                raise os_fault(error, self.path) from error
 
     def close(self) -> None:
         """Close the files and write their sums, which no signal interrupts; may be called twice."""
@@ -150,8 +174,7 @@ class RunFolder:
             self._reserve.give_back()
             with suppress(OSError):  # a disk that is gone cannot be forced
                 self.sync()
-            self._samples.close()
-            self._events.close()
+            self._disk.close()
             with suppress(UserError):  # no room for the sums: what is there is whole without them
                 write_sums(self.path)
 
@@ -211,6 +234,78 @@ def refuse_used(folder: Path) -> None:
         raise UserError(problem, file=folder, hint="choose another folder")
 
 
+def event_line(event: Event) -> bytes:
+    """Return an event as a line of ``events.jsonl``; what is no character (half of a UTF-16 pair) is ``?``."""
+    content: dict[str, Any] = {"time_s": event.time_s, "kind": event.kind, "text": event.text}
+    if event.data:
+        content["data"] = dict(event.data)
+    return json.dumps(content, ensure_ascii=False).encode("utf-8", "replace") + b"\n"
+
+
+class _Disk:
+    """Two threads that wait for the disk, so that a session does not.
+
+    They are two because a disk that takes seconds to force what it has still takes lines meanwhile.
+    """
+
+    def __init__(self, *files: _Lines) -> None:
+        self._files = files
+        self._writer = ThreadPoolExecutor(1, "run-folder-write")
+        self._forcer = ThreadPoolExecutor(1, "run-folder-force")
+        self._waiting: deque[Future[None]] = deque()  # lines that are not written yet
+        self._force_asked = False
+        self._fault: OSError | None = None
+        self.refused = False  # whether a caller was told of a fault
+
+    def write(self, file: _Lines, line: bytes, *, force: bool, wait_s: float) -> None:
+        """Hand over a line and wait for it so long at most; OSError where the disk refused this one or one
+        before it, or takes none any more."""
+        while self._waiting and self._waiting[0].done():
+            self._waiting.popleft()
+        if len(self._waiting) < MOST_WAITING:
+            self._waiting.append(self._writer.submit(self._write, file, line, force))
+            wait([self._waiting[-1]], wait_s)
+        elif self._fault is None:
+            self._fault = OSError(errno.ETIMEDOUT, f"the disk has not taken the last {MOST_WAITING} lines")
+        self._raise_fault()
+
+    def drain(self) -> None:
+        """Wait until every line is written and forced; OSError as above."""
+        wait(self._waiting)
+        self._forcer.submit(self._force).result()
+        self._raise_fault()
+
+    def close(self) -> None:
+        """Wait for both threads and close the files."""
+        self._writer.shutdown()
+        self._forcer.shutdown()
+        for file in self._files:
+            file.close()
+
+    def _write(self, file: _Lines, line: bytes, force: bool) -> None:
+        try:
+            file.write(line)
+        except OSError as error:
+            self._fault = error
+        if force and not self._force_asked:
+            self._force_asked = True
+            self._forcer.submit(self._force)
+
+    def _force(self) -> None:
+        self._force_asked = False  # a line that is written from now on asks anew
+        try:
+            for file in self._files:
+                file.sync()
+        except OSError as error:
+            self._fault = error
+
+    def _raise_fault(self) -> None:
+        fault, self._fault = self._fault, None
+        if fault is not None:
+            self.refused = True
+            raise fault
+
+
 class _Lines:
     """A file to which whole lines are appended, or nothing."""
 
@@ -219,16 +314,15 @@ class _Lines:
         self._file = open_new(path)
         self._size = 0
 
-    def write(self, line: str) -> None:
-        data = line.encode() + b"\n"
+    def write(self, line: bytes) -> None:
         try:
-            self._append(data)
+            self._append(line)
         except OSError as first:
             self._cut()
             if not self._reserve.give_back():
                 raise
             try:
-                self._append(data)
+                self._append(line)
             except OSError:
                 self._cut()
                 raise
@@ -250,7 +344,6 @@ class _Lines:
 
     def close(self) -> None:
         os.close(self._file)
-        self._file = -1  # a later write is an OSError, never into another file of that number
 
     def remove(self) -> None:
         self.close()
@@ -400,9 +493,8 @@ def mark_bad(folder: str | Path, why: str) -> None:
     run = read_run(path)
     refuse_links(path)
     at = 0.0 if run.log is None else float(run.log["time"].values[-1])
-    line = json.dumps({"time_s": at, "kind": "bad", "text": why}, ensure_ascii=False)
     before = b"".join(one + b"\n" for one in _events(path / "events.jsonl")[1].lines)
-    write_atomic(path / "events.jsonl", before + line.encode() + b"\n")
+    write_atomic(path / "events.jsonl", before + event_line(Event(at, "bad", why)))
     if (path / "SHA256SUMS").is_file():
         write_sums(path)
 

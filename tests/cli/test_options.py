@@ -91,7 +91,7 @@ def test_a_file_and_a_folder_to_write_are_not_each_other_and_are_made_room_for(t
     assert new_folder(tmp_path / "one" / "two").is_dir()
     with pytest.raises(UserError, match="is a file"):
         new_folder(tmp_path / "file.html")
-    with pytest.raises(UserError, match="cannot make this folder"):
+    with pytest.raises(UserError, match="not a folder; check the path"):
         new_folder(tmp_path / "file.html" / "below")
 
 

@@ -14,6 +14,7 @@ import typer
 from thermogrip.cli.completion import PROTOCOLS as PROTOCOLS
 from thermogrip.cli.completion import completer
 from thermogrip.cli.kinds import check_exists
+from thermogrip.datasets.atomic_files import make_folder
 from thermogrip.datasets.errors import UserError, as_user_error, known_names
 
 if TYPE_CHECKING:
@@ -268,12 +269,7 @@ def new_folder(path: Path) -> Path:
 
 
 def _writable(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(
-            f"cannot make this folder ({error.strerror})", file=folder, hint="choose another place"
-        ) from error
+    make_folder(folder)
     if not os.access(folder, os.W_OK | os.X_OK):
         raise UserError("this folder cannot be written", file=folder, hint="choose another place")
 
