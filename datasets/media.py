@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 _CONTROL = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff\ud800-\udfff]"
 )
+_USER = re.compile(r"(?<=://)[^/@\s]+(?=@)")
 _FORMULA = re.compile(r"'*[=+\-@\t].")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(inf|nan)", re.ASCII)
 _MARKDOWN = re.compile(r"[\\`\[\]<>|*#!]")
@@ -36,6 +37,15 @@ _MARKDOWN = re.compile(r"[\\`\[\]<>|*#!]")
 def printable(text: str) -> str:
     r"""Return text with every control character written out."""
     return _CONTROL.sub(_written_out, text)
+
+
+def without_password(address: str) -> str:
+    """Return an address without the user and the password that it may name.
+
+    >>> without_password("ws://me:secret@robot:9090")
+    'ws://...@robot:9090'
+    """
+    return _USER.sub("...", address)
 
 
 def csv_cell(cell: object) -> object:

@@ -35,6 +35,7 @@ from math import inf, isfinite, nan
 from typing import Any
 
 from thermogrip.datasets.errors import as_user_error
+from thermogrip.datasets.media import without_password
 from thermogrip.datasets.units import split_header
 from thermogrip.rig.clock import BackOff
 from thermogrip.rig.interface import Event
@@ -180,7 +181,8 @@ class Bridge:
         timeout: float = 5.0,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.url, self.messages, self.behind = url, Messages() if messages is None else messages, behind
+        self.url, self._shown = url, without_password(url)
+        self.messages, self.behind = Messages() if messages is None else messages, behind
         self.target: float | None = None
         self.sent, self.dropped = 0, 0
         self.reports: tuple[str, ...] = ()
@@ -250,7 +252,7 @@ class Bridge:
             from websockets.sync.client import connect
         wait, hint = self._timeout, "start rosbridge_server, or check host and port"
         wrong = (OSError, TimeoutError, WebSocketException, ValueError)
-        refused = as_user_error(wrong, "no rosbridge answers ({error})", file=self.url, hint=hint)
+        refused = as_user_error(wrong, "no rosbridge answers ({error})", file=self._shown, hint=hint)
         with refused, ExitStack() as undo:
             opening = connect(self.url, open_timeout=wait, close_timeout=wait, max_size=_MOST_BYTES)
             link = undo.enter_context(opening)
@@ -272,7 +274,7 @@ class Bridge:
             return
         with self._changed:
             if not self._ending:
-                text = f"connected to {self.url} again; {self._not_sent()} were dropped"
+                text = f"connected to {self._shown} again; {self._not_sent()} were dropped"
                 self._report(text)
                 self._waiting.appendleft(partial(self.messages.status, text))
                 self._take(link)
@@ -288,7 +290,7 @@ class Bridge:
             if self._monotonic() - self._since >= _LONGEST_WAIT_S:  # one that ends at once is no success
                 self._back_off.succeeded()
             self._back_off.failed()
-            self._report(f"the connection to {self.url} was lost ({why})")
+            self._report(f"the connection to {self._shown} was lost ({why})")
             self._changed.notify_all()
         _hang_up(link)
 

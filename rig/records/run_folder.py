@@ -63,8 +63,8 @@ from thermogrip.rig.session.signals import hold_signals
 SCHEMA, VERSION = "thermogrip.run", 1
 RESERVE = 1 << 18  # bytes, for the last words of a run on a full disk
 MOST_WAITING = 6000  # lines for a disk that hangs: ten minutes of the fastest rows (of a grasp, 10 a second)
-# for which a row holds up its caller: less than half of the shortest sample (0.05 s), more than Python needs to
-# change threads (5 ms), so that a disk that is well has the row when the call returns
+# for which a row holds up its caller: less than half of the shortest sample (0.05 s), more than Python needs
+# to change threads (5 ms), so that a disk that is well has the row when the call returns
 _AT_ONCE_S = 0.02
 FILES = ("run.json", "samples.csv", "events.jsonl", "grasps.csv", "grasps_meta.csv")
 _RESERVE, _SUMS = ".reserve", "SHA256SUMS"
@@ -235,7 +235,7 @@ def refuse_used(folder: Path) -> None:
 
 
 def event_line(event: Event) -> bytes:
-    """Return an event as a line of ``events.jsonl``; what is no character (half of a UTF-16 pair) is ``?``."""
+    """Return an event as a line of ``events.jsonl``; what is no character (a lone surrogate) is ``?``."""
     content: dict[str, Any] = {"time_s": event.time_s, "kind": event.kind, "text": event.text}
     if event.data:
         content["data"] = dict(event.data)

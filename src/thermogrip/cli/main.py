@@ -22,7 +22,7 @@ import typer
 from thermogrip import __version__
 from thermogrip.cli.verbs import Verb, Verbs
 from thermogrip.datasets.errors import UserError, known_names, os_fault
-from thermogrip.datasets.media import printable
+from thermogrip.datasets.media import printable, without_password
 from thermogrip.datasets.provenance import work
 
 OK, BUG, USER, INTERRUPTED = 0, 1, 2, 130
@@ -67,7 +67,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = [*words[1:], "--help"] if words[0] == "help" else words
     try:
         width = 10_000 if sys.stdout.isatty() else 100  # of help, at most
-        with work(["thermogrip", *words]):
+        with work(["thermogrip", *_without_passwords(words)]):
             code = app(args=words, prog_name="thermogrip", standalone_mode=False, max_content_width=width)
         sys.stdout.flush()
     except (KeyboardInterrupt, typer.Abort):
@@ -94,6 +94,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     if code == INTERRUPTED:  # typer makes a code of a Ctrl-C inside a verb
         return _fail("stopped by Ctrl-C", INTERRUPTED)
     return int(code or OK)
+
+
+def _without_passwords(words: Sequence[str]) -> list[str]:
+    """Return the words of a command line as records keep them: of ``--on-trip`` no more than the program."""
+    kept: list[str] = []
+    for before, word in zip(["", *words], words):
+        command = before == "--on-trip" or word.startswith("--on-trip=")
+        kept.append(without_password(re.sub(r"(?s)\s.*", " ...", word) if command else word))
+    return kept
 
 
 def _fail(line: str, code: int, debug: bool = False) -> int:
