@@ -118,7 +118,7 @@ ALL = [
     Benchmark("classify/late.py"),
     Benchmark("classify/lstm.py", quick="--measure 5", needs=("torch",)),
     Benchmark("classify/hold.py", "{data}", "{data} --classifiers bayes,pca-lda"),
-    Benchmark("classify/scale.py", "{out}/scale --files 2 20 --kill", "{out}/scale --files 1 3 --kill"),
+    Benchmark("classify/scale.py", "{out}/scale --files 2 20", "{out}/scale --files 1 3"),
     Benchmark("classify/serve.py", "{model}", "{model} --grasps 400 --in-process 50", ("uvicorn",)),
     Benchmark("workers.py", "{out}/workers", "{out}/workers effusivity --files 2"),
     Benchmark("rig/jitter.py"),

@@ -96,11 +96,6 @@ def open_new(path: str | Path) -> int:
     return handle
 
 
-def open_append(path: str | Path) -> int:
-    """Return the descriptor of a file that is written at its end, made where there is none; no link."""
-    return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | _NO_LINK | _AS_WRITTEN, 0o666)
-
-
 def read_bytes(path: str | Path, *, share: int = 1) -> bytes:
     """Return the bytes of a file, at most one ``share``-th of what any file may hold."""
     # a null byte in the name is a ValueError

@@ -273,6 +273,21 @@ def grasp_file_parts(path: Path) -> list[Path]:
     return [path, _meta_path(path)] if file_format(path) == "csv" else [path]
 
 
+def check_apart(out: str | Path, paths: Sequence[str | Path]) -> None:
+    """Refuse an output that is among the files that are read, or would be the next time."""
+    place, hint = Path(os.path.realpath(out)), "choose another name or folder for --out"
+    for given in paths:
+        if place.match(os.path.realpath(given)) and not os.path.isdir(given):
+            raise UserError("is to be read and written", file=out, hint=hint)
+        for path in map(Path, matching_files(given)):
+            if path.is_dir():
+                folder = path.resolve()
+                if place.parent == folder:
+                    raise UserError("is in a folder that is read", file=out, hint=hint)
+            elif place in [part.resolve() for part in grasp_file_parts(path)]:
+                raise UserError("is to be read and written", file=out, hint=hint)
+
+
 def shared_grasps(first: Sequence[Grasps], second: Sequence[Grasps]) -> list[str]:
     """Return the grasps of the second list, as ``condition/grasp_id``, that are in the first one too, by
     grasp_id or by their samples: training and test must share none."""

@@ -1,22 +1,20 @@
-"""Wall time, CPU time, peak memory and grasps per core-second of a verb (``effusivity`` by default) by the
-number of grasps, and whether a run that ``kill -9`` ended at 40 % goes on to the same bytes.
+"""Wall time, CPU time, peak memory and grasps per core-second of ``effusivity``, or with ``--classify`` of
+``classify``, by the number of grasps.
 
-    python benchmarks/classify/scale.py FOLDER [--files 2 20] [--kill] [--workers N]
-        [--classify MODEL_DIR | --compare bayes,pca-lda]
+    python benchmarks/classify/scale.py FOLDER [--files 2 20] [--workers N] [--classify MODEL_DIR]
 
 Files of 500 grasps each are made in FOLDER/files by as many processes: traces of the example condition
 ``exp1A_obj43_grip23``, drawn at random, with new white noise of 0.02 K; those that are there are kept, so
 10^4, 10^5 and 3 10^5 grasps (``--files 20 200 600``) take 600 files of 1.8 MB. The rate leaves out the
 start, by the difference of two numbers of files. Memory is that of the largest process. The loop at the end
 of a line is the CPU time of five million additions right after the run: a machine that others share has
-several speeds.  ``compare`` reads its test files part by part from 32 MB on, 18 files.
+several speeds.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -112,23 +110,11 @@ def loop() -> float:
     return time.process_time() - begin
 
 
-def killed(words: list[str], out: Path, lines: int) -> None:
-    """Run the program, and end it by kill -9 once so many parts are answered."""
-    partial = out.with_name(f"{out.name}.partial")
-    process = subprocess.Popen([sys.executable, "-m", "thermogrip", *words], stdout=subprocess.DEVNULL)
-    while not partial.exists() or partial.read_bytes().count(b"\n") <= lines:
-        time.sleep(0.05)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--files", type=int, nargs="+", default=[2, 20])
     parser.add_argument("--classify", metavar="MODEL_DIR")
-    parser.add_argument("--compare", metavar="CLASSIFIERS")
-    parser.add_argument("--kill", action="store_true")
     parser.add_argument("--workers", type=int, default=1)
     given = parser.parse_args()
     verb = ["classify", given.classify] if given.classify else ["effusivity"]
@@ -140,23 +126,11 @@ def main() -> None:
     before: tuple[int, float] | None = None
     for n_files in given.files:
         folder, out = make(given.folder, n_files), given.folder / f"{n_files}.csv"
-        words = [*verb, str(folder)]
-        if given.compare:  # on files beside those of the training
-            out = out.with_suffix("")
-            words = ["compare", str(example_path(EXAMPLE)), "--test", str(folder)]
-            words += ["--classifiers", given.compare, "--workers", str(given.workers)]
-        wall, cpu, memory = ran([*words, "--out", str(out)])
+        wall, cpu, memory = ran([*verb, str(folder), "--out", str(out)])
         n = n_files * PER_FILE
         rate = "" if before is None else f"{(n - before[0]) / (cpu - before[1]):.0f}"
         print(f"{n:6d} {wall:10.0f} {cpu:8.1f} {memory:12.0f}  {rate:10s} loop {loop():.2f}", flush=True)
         before = n, cpu
-    if given.kill:
-        again = given.folder / "killed.csv"
-        again = again.with_suffix("") if given.compare else again
-        killed([*words, "--out", str(again)], again, int(0.4 * n_files))
-        ran([*words, "--out", str(again)])
-        tables = [path / "files" / "predictions.csv" if given.compare else path for path in (again, out)]
-        print("the same bytes:", tables[0].read_bytes() == tables[1].read_bytes())
 
 
 if __name__ == "__main__":

@@ -214,17 +214,18 @@ def write_predictions(rows: Sequence[Row], path: str | Path) -> Path:
     return write_atomic(path, table_csv(rows))
 
 
-def table_csv(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return a table as CSV text: a header from all rows' keys, floats with six digits, None and NaN
-    empty."""
+def table_csv(rows: Sequence[Mapping[str, Any]], unknown: str = "") -> str:
+    """Return a table as CSV text: a header from all rows' keys, floats with six digits, None empty, NaN as
+    ``unknown``."""
     names = list(dict.fromkeys(key for row in rows for key in row))
-    return csv_text([names, *([cell_text(row.get(name)) for name in names] for row in rows)])
+    return csv_text([names, *([_cell(row.get(name), unknown) for name in names] for row in rows)])
 
 
-def cell_text(value: Any) -> str:
-    """Return a cell of such a table."""
-    if value is None or (isinstance(value, float) and np.isnan(value)):
+def _cell(value: Any, unknown: str) -> str:
+    if value is None:
         return ""
+    if isinstance(value, float) and np.isnan(value):
+        return unknown
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 

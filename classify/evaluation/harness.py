@@ -234,7 +234,7 @@ def _jobs(named: Mapping[str, GraspClassifier], plan: Plan, probe: bool) -> list
     for name, classifier in named.items():
         together = [
             classifier.learns_from_all_conditions
-            and taught_together(classifier, fold, plan.training[fold.repeat])
+            and _taught_together(classifier, fold, plan.training[fold.repeat])
             for fold in plan.folds
         ]
         for repeat, training in enumerate(plan.training):
@@ -256,7 +256,7 @@ def _jobs(named: Mapping[str, GraspClassifier], plan: Plan, probe: bool) -> list
     return sorted(jobs, key=lambda job: "epochs" not in job.classifier.get_params())
 
 
-def taught_together(classifier: GraspClassifier, fold: Fold, training: Sequence[Grasps]) -> bool:
+def _taught_together(classifier: GraspClassifier, fold: Fold, training: Sequence[Grasps]) -> bool:
     """Return whether the training grasps of all conditions serve one of them."""
     if classifier.joins_touches:
         return True
@@ -287,15 +287,6 @@ def _run(job: _Job) -> list[_Result]:
 def _tested(
     name: str, classifier: GraspClassifier, fold: Fold, order: int, fit_s: float, *, touch: bool
 ) -> _Result:
-    rows, predict_s = tested_rows(name, classifier, fold, touch=touch)
-    head = {"classifier": name, "repeat": fold.repeat, "condition": fold.condition, "apart": fold.apart}
-    time = head | {"fit_s": fit_s, "predict_s_per_grasp": predict_s}
-    return _Result(name, order, not touch, tuple(rows), time)
-
-
-def tested_rows(
-    name: str, classifier: GraspClassifier, fold: Fold, *, touch: bool
-) -> tuple[list[Row], float]:
     """Return the rows of one fold's test grasps by a fitted classifier, and the seconds a grasp; as if they
     had touched nothing where ``touch`` is not."""
     test = fold.test if touch else untouched(fold.test, seed=2)
@@ -314,7 +305,8 @@ def tested_rows(
     trained = Counter(map(str, grasp_labels(fold.train)))
     for row in rows:
         row["log_loss_base"] = -np.log(trained[row["material"]] / trained.total()) if row["known"] else None
-    return [head | row for row in rows], predict_s
+    time = head | {"fit_s": fit_s, "predict_s_per_grasp": predict_s}
+    return _Result(name, order, not touch, tuple(head | row for row in rows), time)
 
 
 def _rows(

@@ -104,7 +104,7 @@ def brier(p: ArrayLike, true: ArrayLike) -> Floats:
 def calibration_bins(confidence: ArrayLike, correct: ArrayLike) -> list[Bin]:
     """Return confidence beside accuracy in bins of confidence of 0.1; empty bins are left out."""
     c, ok = np.asarray(confidence, dtype=float), np.asarray(correct, dtype=float)
-    of = bin_of(c)
+    of = _bin_of(c)
     return [
         Bin(
             low=float(_EDGES[b]),
@@ -123,13 +123,8 @@ def mcnemar(first: ArrayLike, second: ArrayLike) -> McNemar:
     if a.shape != b.shape:
         raise ValueError(f"the classifiers were tested on {a.size} and {b.size} grasps")
     only_a, only_b = int(np.sum(a & ~b)), int(np.sum(~a & b))
-    return McNemar(only_a, only_b, mcnemar_p(only_a, only_b))
-
-
-def mcnemar_p(only_a: int, only_b: int) -> float:
-    """Return the two-sided p-value of so many grasps that only the first, only the second has right."""
     tail = float(binom.cdf(min(only_a, only_b), only_a + only_b, 0.5)) if only_a + only_b else 0.5
-    return min(1.0, 2 * tail)
+    return McNemar(only_a, only_b, min(1.0, 2 * tail))
 
 
 def sign_flip_p(difference: ArrayLike, *, draws: int = 20_000, seed: int = 0) -> float:
@@ -155,8 +150,8 @@ def auroc(negative: ArrayLike, positive: ArrayLike) -> float:
 
 _DRAWS = 2000
 _FORECASTERS = 1000
-N_BINS = 10  # of confidence
-_EDGES = np.linspace(0, 1, N_BINS + 1)
+_N_BINS = 10  # of confidence
+_EDGES = np.linspace(0, 1, _N_BINS + 1)
 
 
 class Interval(NamedTuple):
@@ -215,7 +210,7 @@ def calibration_interval(
     tests whose grasps are counted from 0."""
     c, of = np.asarray(confidence, dtype=float), np.asarray(grasp, dtype=int)
     right = np.asarray(correct, dtype=float)
-    bins = np.eye(_EDGES.size - 1)[bin_of(c)]  # (n, 10), one in each row
+    bins = np.eye(_EDGES.size - 1)[_bin_of(c)]  # (n, 10), one in each row
     tests = np.bincount(of).astype(float)
     gaps = _by_grasp(bins * (c - right)[:, None], of)
     found = gaps.sum(axis=0) / c.size
@@ -250,7 +245,7 @@ def _bca(draws: Floats, value: float, influence: Floats, level: float) -> tuple[
     return float(low), float(high)
 
 
-def bin_of(confidence: Floats) -> NDArray[np.int64]:
+def _bin_of(confidence: Floats) -> NDArray[np.int64]:
     """Return which bin each confidence is in, (n,)."""
     return np.clip(np.searchsorted(_EDGES, confidence, side="left") - 1, 0, _EDGES.size - 2)
 

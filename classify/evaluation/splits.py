@@ -205,24 +205,24 @@ def _rounds(
 def _from_files(records: Sequence[Grasps], tests: Sequence[Grasps]) -> Plan:
     """Return a fold for each test record, trained on the condition at its temperatures."""
     _refuse_repeated(tests)
-    trains = training_grasps(records)
-    refuse_shared(trains, tests)
+    trains = _training_grasps(records)
+    _refuse_shared(trains, tests)
     folds, notes = [], []
     for test in tests:
-        like = trains[like_it(test, trains)]
+        like = _like_it(test, trains)
         notes.append(f"{log_name(test)}: candidates and training grasps are those of {log_name(like)}")
         folds.append(Fold(log_name(test), 0, like, test, scored_apart(test)))
     return Plan(tuple(folds), (tuple(trains),), tuple(notes))
 
 
-def training_grasps(records: Sequence[Grasps]) -> list[Grasps]:
+def _training_grasps(records: Sequence[Grasps]) -> list[Grasps]:
     """Return of each record what is marked ``train``, or all of one that marks none."""
     marked = [_marked(g, "train") for g in records]
     return [g if part is None else part for g, part in zip(records, marked)]
 
 
-def like_it(test: Grasps, trains: Sequence[Grasps]) -> int:
-    """Return the place of the training condition that a test record is scored on."""
+def _like_it(test: Grasps, trains: Sequence[Grasps]) -> Grasps:
+    """Return the training condition that a test record is scored on."""
     like = trains[0] if len(trains) == 1 else _alike(test, trains)
     if like is None:
         raise UserError(
@@ -230,10 +230,10 @@ def like_it(test: Grasps, trains: Sequence[Grasps]) -> int:
             file=log_name(test),
             hint=f"the training files are {', '.join(map(log_name, trains))}",
         )
-    return next(k for k, train in enumerate(trains) if train is like)
+    return like
 
 
-def refuse_shared(trains: Sequence[Grasps], tests: Sequence[Grasps]) -> None:
+def _refuse_shared(trains: Sequence[Grasps], tests: Sequence[Grasps]) -> None:
     """Refuse a test grasp that is in the training, by its name or by its samples."""
     for train in trains:
         for test in tests:

@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from tests.cli.conftest import Bench, StandIn, shares, words_of
 from thermogrip.classify.decisions.predict import Deviation
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.cli import classify as verb
-from thermogrip.cli.classify import SHOWN, touched_part, training_part
+from thermogrip.cli.classify import SHOWN, say_names, touched_part, training_part
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.materials import load_materials
-from thermogrip.datasets.partitions import Source
 from thermogrip.datasets.schema import Grasps, make_grasps
 from thermogrip.report.console import Console, short
 from thermogrip.sysid.effusivity.posterior import EffusivityRow
@@ -33,13 +33,19 @@ def record_of(ids: Sequence[str], name: str = "mine", **columns: Any) -> Grasps:
     return make_grasps([-1.0, 0.0, 1.0], traces, list(ids), name=name, **columns)
 
 
-def unread(*records: Grasps) -> list[Source]:
-    """Return records as files of one byte each."""
-    return [Source(r.attrs["name"], 1, [r.attrs["name"]], lambda r=r: r) for r in records]  # type: ignore[misc]
-
-
 def effusivity_row(name: str, value: float) -> EffusivityRow:
     return EffusivityRow(name, value, value / 2, 2 * value, 28.0, 27.0, 29.0, 500.0, 0.1)
+
+
+def of_files(stand_in: StandIn, records: Callable[[], list[Grasps]]) -> None:
+    """Let the files of the bench hold these records, one each, whatever is given."""
+    files = [Path("grasps.csv"), Path("more.csv")]
+
+    def read(path: Path, *, plain: bool, name: str | None) -> Grasps:
+        return records()[files.index(Path(path.name))]
+
+    stand_in("thermogrip.datasets.grasp_files.list_grasp_files", lambda paths: files[: len(records())])
+    stand_in("thermogrip.datasets.grasp_files.read_grasps", read)
 
 
 @pytest.fixture
@@ -54,8 +60,7 @@ def gripper(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
 
     made = SimpleNamespace(bench=bench, why=[])
     made.records = [record_of(["a", "b"], "one"), record_of(["c"], "two")]
-    stand_in("thermogrip.datasets.partitions.sources", lambda paths, plain: unread(*made.records))
-    stand_in("thermogrip.datasets.partitions.stamps", [])
+    of_files(stand_in, lambda: made.records)
     made.warned = stand_in("thermogrip.cli.options.warn_of_contacts")
     made.calibrated = stand_in("thermogrip.cli.classify.calibrated_device", ("device", "coupling", 9.0))
     stand_in("thermogrip.cli.classify._as_taught", lambda console, record, *_: record)
@@ -145,16 +150,19 @@ def test_a_grasp_without_a_contact_has_no_effusivity(gripper: SimpleNamespace) -
     assert len(gripper.posteriors) == 2  # of the first record alone, twice
 
 
-def test_a_block_in_two_files_is_warned_of_and_what_was_answered_before_an_end_is_kept(
-    gripper: SimpleNamespace, stand_in: StandIn
-) -> None:
+def test_a_block_in_two_files_is_warned_of(gripper: SimpleNamespace) -> None:
     gripper.records = [
         record_of(["a", "b"], "one", touch_group=["x", "x"], touch=[1.0, 2.0]),
         record_of(["c"], "two", touch_group=["x"], touch=[1.0]),
     ]
-    words = ["effusivity", "grasps.csv", "--out", "e.csv"]
-    assert "touch_group 'x' is in one and in two" in gripper.bench.run(*words).err
-    (gripper.bench.path / "e.csv").unlink()
+    done = gripper.bench.run("effusivity", "grasps.csv", "--out", "e.csv")
+    assert "touch_group 'x' is in one and in two" in done.err
+
+
+@pytest.mark.parametrize(("out", "kept"), [("e.csv", []), ("e.parquet", []), ("e", ["grasps.csv"])])
+def test_an_end_leaves_whole_tables_alone(
+    out: str, kept: list[str], gripper: SimpleNamespace, stand_in: StandIn
+) -> None:
     usual = verb._effusivities
 
     def ended(device: Any, record: Grasps, *more: Any) -> list[EffusivityRow]:
@@ -163,17 +171,22 @@ def test_a_block_in_two_files_is_warned_of_and_what_was_answered_before_an_end_i
         return usual(device, record, *more)
 
     stand_in("thermogrip.cli.classify._effusivities", ended)
-    done = gripper.bench.run(*words)
-    assert (done.code, "2 answers are kept in e.csv.partial; the same command goes on" in done.err) == (
-        130,
-        True,
-    )
-    assert not (gripper.bench.path / "e.csv").exists()
-    stand_in("thermogrip.cli.classify._effusivities", usual)
-    asked = len(gripper.posteriors)
-    assert gripper.bench.run(*words).code == 0
-    assert len(gripper.posteriors) == asked + 1
-    assert not (gripper.bench.path / "e.csv.partial").exists()
+    before = {*gripper.bench.path.iterdir()}
+    assert gripper.bench.run("effusivity", "grasps.csv", "--out", out).code == 130
+    folder = gripper.bench.path / out
+    assert {*gripper.bench.path.iterdir()} - before == ({folder} if kept else set())
+    assert [path.name for path in folder.glob("*")] == kept
+    for name in kept:
+        assert [line.split(",")[0] for line in (folder / name).read_text().splitlines()][1:] == ["a", "b"]
+
+
+def test_answers_as_parquet_and_in_a_folder_are_those_of_the_table(gripper: SimpleNamespace) -> None:
+    for out in ("e.csv", "e.parquet", "e"):
+        assert gripper.bench.run("effusivity", "grasps.csv", "--out", out).code == 0
+    table = pd.read_csv(gripper.bench.path / "e.csv")
+    pd.testing.assert_frame_equal(pd.read_parquet(gripper.bench.path / "e.parquet"), table, check_dtype=False)
+    each = [pd.read_csv(gripper.bench.path / "e" / name) for name in ("grasps.csv", "more.csv")]
+    pd.testing.assert_frame_equal(pd.concat(each, ignore_index=True), table)
 
 
 @pytest.mark.parametrize(("n", "more"), [(SHOWN, ""), (SHOWN + 2, "... and 2 more in the file\n")])
@@ -186,7 +199,7 @@ def test_a_long_table_is_cut_with_a_note(n: int, more: str, gripper: SimpleNames
     gripper.why = ["no contact"] * n
     out = gripper.bench.run("effusivity", "grasps.csv", "--out", "e.csv").out
     names = ", ".join(f"g{k:03d}" for k in range(SHOWN))
-    assert words_of(f"no contact, so no effusivity: {names} {more}") in words_of(out)
+    assert f"no contact, so no effusivity: {names}{' and 2 more' if more else ''} wrote" in words_of(out)
 
 
 @pytest.mark.parametrize(("text", "found"), [(None, None), ("0,12", (0.0, 12.0)), ("-5, 3.5", (-5.0, 3.5))])
@@ -379,8 +392,8 @@ def named(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
     """Return a bench whose classifier and its answers are stand-ins."""
     made = SimpleNamespace(bench=bench, record=record_of(["a", "b"]), model="a model")
     (bench.path / "m").mkdir()
-    stand_in("thermogrip.datasets.partitions.sources", lambda paths, plain: unread(made.record))
-    stand_in("thermogrip.datasets.partitions.stamps", [])
+    verb._answerer.cache_clear()
+    of_files(stand_in, lambda: [made.record])
     stand_in("thermogrip.datasets.grasp_files.read_grasp_files", lambda paths: [made.record])
     made.warned = stand_in("thermogrip.cli.options.warn_of_contacts")
     made.ranged = stand_in("thermogrip.sysid.effusivity.data.with_object_range", lambda *_: "ranged")
@@ -530,11 +543,9 @@ def test_another_touch_and_the_cheaper_answer_are_columns_of_their_own(
 def test_grasps_of_one_note_are_named_in_one_line_up_to_a_number(
     n: int, more: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    rows = [{"grasp_id": f"g{k}", "material": "", "note": "no contact"} for k in range(n)]
-    said = {"grasp_id": "h", "material": "wood", "note": "short"}
-    verb._notes([*rows, said, {"grasp_id": "i", "material": "wood", "note": ""}]).say(Console())
+    say_names(Console(), [*(("no contact", f"g{k}") for k in range(n)), ("short", "h")])
     names = ", ".join(f"g{k}" for k in range(min(n, SHOWN)))
-    assert words_of(capsys.readouterr().out) == words_of(f"no contact, so no name: {names}{more} short: h")
+    assert words_of(capsys.readouterr().out) == words_of(f"no contact: {names}{more} short: h")
 
 
 def test_the_cheaper_answer_is_the_likeliest_candidate_or_unknown() -> None:

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import sys
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, astuple, dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from importlib.util import find_spec
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,7 +19,6 @@ if TYPE_CHECKING:
     from thermogrip.classify.decisions.stopping_rule import StopRule
     from thermogrip.classify.estimators.base import GraspClassifier
     from thermogrip.classify.estimators.posterior import PosteriorClassifier
-    from thermogrip.datasets.partitions import Answers
     from thermogrip.datasets.schema import Grasps
     from thermogrip.sysid.effusivity import Coupling, EffusivityRow, GripperModel
 
@@ -36,6 +32,7 @@ NEEDED = (
     "pyarrow.csv",
     "scipy.special",
 )
+ANSWERS_GO = "Where the table goes (.csv or .parquet), or a folder for a table of each file."
 _BUNDLED = 40.0  # s: the longest contacts that taught the bundled gripper
 
 
@@ -127,7 +124,7 @@ Quick = Annotated[bool, cli.flag("--quick", "200 epochs in place of 2000 for the
 
 def effusivity(
     grasps: cli.GraspFiles,
-    out: Annotated[Path, cli.opt("--out", "FILE.csv", "Where the table goes.")],
+    out: Annotated[Path, cli.opt("--out", "FILE.csv|DIR", ANSWERS_GO)],
     calibrate: Annotated[
         list[str] | None,
         cli.opt("--calibrate", "GRASPS", "Labelled grasps that describe your gripper; may be repeated."),
@@ -148,61 +145,42 @@ def effusivity(
     the sensor's range are left out, and of single touches what is later than the calibration's contacts. A
     single touch that the model does not explain is named.
 
-    A run that was ended goes on where it stopped when it is given again. Workers share out files, which
-    they read themselves.
+    Files are read one by one, workers share them out. Where --out is a folder each file's table is written
+    there when it is done.
     """
     stated = _range(between)
-    cli.new_file(out, (".csv", ".parquet"))
+    check_place(out, [*grasps, *(calibrate or ())])
     pool = cli.workers_of(workers, cluster, *NEEDED)
     console = Console(as_json)
-    from thermogrip.datasets.partitions import Answers, check_apart, sources, stamps
-
-    check_apart(out, [*grasps, *(calibrate or ())])
-    given = sources(grasps, plain=True)
     device, coupling, longest = calibrated_device(console, calibrate or [], seed)
     # the bundled gripper may have taken these grasps or not
     ask = _Effusivity(device, coupling, longest, stated, 0.0 if calibrate else 0.5)
-    found = Answers(out, ["effusivity", stated, seed, stamps(calibrate or [])])
-    with resumable(console, found), console.progress("effusivity") as progress:
-        found.find(given, ask.prepare, ask.answer, progress, workers=pool, warn=console.warn)
-    _warn_of_torn(console, found)
-    found.write(out, lambda cell: f"{cell:.6g}" if isinstance(cell, float) else cell)
+    found = answer_files(console, "effusivity", grasps, ask.answer, out, pool, "nan")
+    rows = [row for each in found for row in each["rows"]]
     shown = [
         (r["grasp_id"], r["effusivity"], r["effusivity_p05"], r["effusivity_p95"], r["t_object"])
-        for r in islice((row for part in found for row in part["rows"]), SHOWN)
+        for r in rows[:SHOWN]
     ]
     head = ("grasp", "effusivity", "5 %", "95 %", "object [degC]")
     console.table("Effusivity [W s^0.5 m^-2 K^-1], median and quantiles", head, shown)
-    _say_more(console, found.grasps)
-    missed, unexplained = _Named(), _Named()
-    for part in found:
-        for name, why in part["missed"].items():
-            missed.add(why, name)
-        for name, why in part["unexplained"].items():
-            unexplained.add(why, name)
-    for why, names in missed.first.items():
-        console.say(f"{why}, so no effusivity: {', '.join(names)}")
-        _say_more(console, missed.count[why])
-    unexplained.say(console)
+    _say_more(console, len(rows))
+    missed = {name: why for each in found for name, why in each["missed"].items()}
+    unexplained = {name: why for each in found for name, why in each["unexplained"].items()}
+    say_names(console, ((f"{why}, so no effusivity", name) for name, why in missed.items()))
+    say_names(console, ((why, name) for name, why in unexplained.items()))
     console.say(f"wrote {out}")
     if report is not None:
         from thermogrip.report.classification import effusivity_section
         from thermogrip.report.html import write_report
 
-        pairs = islice(((row, part["unexplained"]) for part in found for row in part["rows"]), ON_A_PAGE)
-        noted = [(row, why.get(row["grasp_id"], "")) for row, why in pairs]
+        noted = [(row, unexplained.get(row["grasp_id"], "")) for row in rows[:ON_A_PAGE]]
         lead = "How fast the touched objects take up heat, grasp by grasp."
-        write_report(report, "Effusivity", lead, [effusivity_section(noted, found.grasps)])
+        write_report(report, "Effusivity", lead, [effusivity_section(noted, len(rows))])
     if as_json:
-        parts = list(found)
         console.answer({
-            "grasps": [row for part in parts for row in part["rows"]],
-            "without_contact": [name for part in parts for name in part["missed"]],
-            "unexplained": {name: why for part in parts for name, why in part["unexplained"].items()},
-            "out": out,
+            "grasps": rows, "without_contact": [*missed], "unexplained": unexplained, "out": out,
             "report": report,
         })  # fmt: skip
-    found.remove()
     return 0
 
 
@@ -290,7 +268,7 @@ def classify(
             "GRASPS...", "Grasp files (CSV with its _meta.csv, NetCDF, Parquet), folders or patterns."
         ),
     ] = None,
-    out: Annotated[Path | None, cli.opt("--out", "FILE.csv", "Where the predictions go.")] = None,
+    out: Annotated[Path | None, cli.opt("--out", "FILE.csv|DIR", ANSWERS_GO)] = None,
     candidates: Annotated[
         str | None,
         cli.opt(
@@ -355,8 +333,8 @@ def classify(
     and is then answered as unsurely as these differ. --same-gripper and --other-gripper say which it is,
     --known what the other one reads of blocks it knows, --others how far such grippers differ.
 
-    A run that was ended goes on where it stopped when it is given again. Workers share out files, which
-    they read themselves. --serve takes one object a line,
+    Files are read one by one, workers share them out. Where --out is a folder each file's table is written
+    there when it is done. --serve takes one object a line,
     {"time_s": [...], "t_surface_degC": [...], "t_object_nominal_degC": 28}, and writes its answer; with
     --port and --workers so many are answered at once.
     """
@@ -373,15 +351,12 @@ def classify(
         )
         raise UserError(problem, hint="leave it out, or train on grasps of the new gripper")
     if out is not None:
-        cli.new_file(out, (".csv", ".parquet"))
+        check_place(out, [*(paths or ()), *(known or ())])
     pool = cli.workers_of(workers, cluster, *NEEDED)
     from thermogrip.datasets.materials import load_materials
 
     own = [name for name in cli.comma(candidates) or () if name not in load_materials()]
     cli.choices("--materials", own, model_dir / "classifier.json", "classes")
-    from thermogrip.classify.decisions.predict import cell_text
-    from thermogrip.datasets.partitions import Answers, check_apart, sources, stamps
-
     console = Console(as_json)
     anywhere = Path.absolute if cluster else Path  # its workers run in other folders
     ask = _Question(
@@ -389,20 +364,14 @@ def classify(
         or_unknown=or_unknown, other_gripper=other_gripper, same_gripper=same_gripper,
         known=tuple(str(anywhere(Path(path))) for path in known or ()),
         others=tuple(str(anywhere(path)) for path in others or ()),
+        changed_at=_changed_at([model_dir, *(known or ()), *(others or ())]),
     )  # fmt: skip
     if serve:
         return _serve(console, ask, port, pool)
     assert out is not None
-    check_apart(out, [*(paths or ()), *(known or ())])
-    given = sources(paths or [], plain=True)
-    asked = [*astuple(ask), stamps([model_dir, *ask.known, *ask.others])]
-    ask.answerer()
-    found = Answers(out, ["classify", *asked])
-    with resumable(console, found), console.progress("classify") as progress:
-        found.find(given, ask.prepare, ask.answer, progress, workers=pool, warn=console.warn)
-    _warn_of_torn(console, found)
-    found.write(out, cell_text)
-    rows = list(islice((row for part in found for row in part["rows"]), SHOWN))
+    _answerer(ask)
+    found = answer_files(console, "classify", paths or [], ask.answer, out, pool)
+    rows = [row for each in found for row in each["rows"]]
     more = [key for key in ("answer", "next_touch_degC", "next_touch_accuracy") if key in rows[0]]
     shown = [
         (
@@ -413,23 +382,25 @@ def classify(
             row["decided_at_s"],
             *(row[key] for key in more),
         )
-        for row in rows
+        for row in rows[:SHOWN]
     ]
     head = ("grasp", "material", "probability", "p unknown", "decided at [s]", *(_HEADS[key] for key in more))
     console.table("Materials", head, shown)
-    _say_more(console, found.grasps)
-    _notes(row for part in found for row in part["rows"]).say(console)
-    strange = ((name, why) for part in found for name, why in part["strange"].items())
-    for name, why in islice(strange, SHOWN):
+    _say_more(console, len(rows))
+    say_names(
+        console,
+        (
+            (f"{row['note']}{'' if row['material'] else ', so no name'}", row["grasp_id"])
+            for row in rows
+            if row.get("note")
+        ),
+    )
+    strange = {name: why for each in found for name, why in each["strange"].items()}
+    for name, why in [*strange.items()][:SHOWN]:
         console.say(f"{name} is out of distribution: {why}")
     console.say(f"wrote {out}")
     if as_json:
-        parts = list(found)
-        console.answer({
-            "grasps": [row for part in parts for row in part["rows"]],
-            "strange": {name: why for part in parts for name, why in part["strange"].items()}, "out": out,
-        })  # fmt: skip
-    found.remove()
+        console.answer({"grasps": rows, "strange": strange, "out": out})
     return 0
 
 
@@ -440,7 +411,7 @@ def _serve(console: Console, ask: _Question, port: int | None, workers: int | st
     if isinstance(workers, str) or (workers > 1 and port is None):
         problem = "--serve --workers is for HTTP on this computer"
         raise UserError(problem, hint="give --port, and no --cluster")
-    answer = ask.answerer()
+    answer = _answerer(ask)
     if port is None:
         serve_lines(answer, sys.stdin.buffer, sys.stdout.buffer)
         return 0
@@ -469,28 +440,19 @@ class _Question:
     same_gripper: bool = False
     known: tuple[str, ...] = ()
     others: tuple[str, ...] = ()
+    changed_at: int = 0  # of the model's files [ns]: a worker of a cluster loads another model then
 
-    def prepare(self, record: Grasps) -> Grasps:
-        """Return a record of a file as it is."""
-        return record
-
-    def answer(self, part: Grasps) -> dict[str, Any]:
-        """Return the rows of a part, and warnings of it."""
+    def answer(self, record: Grasps) -> dict[str, Any]:
+        """Return the rows of a record, and warnings of it."""
         said = Said()
-        cli.warn_of_contacts(said, [part])
-        return self.answerer()(part) | {"warnings": said.words}
+        cli.warn_of_contacts(said, [record])
+        return _answerer(self)(record) | {"warnings": said.words}
 
     def reply(self, request: bytes) -> dict[str, Any]:
         """Return the answer to one request of a server."""
         from thermogrip.classify.decisions.serve import reply
 
-        return reply(self.answerer(), request)
-
-    def answerer(self) -> Callable[[Grasps], dict[str, Any]]:
-        """Return what answers a record, once a process while the model's files are the same."""
-        from thermogrip.datasets.partitions import stamps
-
-        return _answerer(self, str(Path.cwd()), str(stamps([self.model_dir, *self.known, *self.others])))
+        return reply(_answerer(self), request)
 
     def load(self) -> Callable[[Grasps], dict[str, Any]]:
         """Return what answers a record with its rows and why some are out of distribution."""
@@ -528,14 +490,21 @@ class _Question:
             if self.or_unknown:
                 _answer_or_unknown(rows)
             strange = {row["grasp_id"]: why for row, why in zip(rows, why_strange) if why}
-            return {"rows": rows, "strange": strange} | _of_part(record)
+            return {"rows": rows, "strange": strange}
 
         return answer
 
 
 @lru_cache(maxsize=1)
-def _answerer(ask: _Question, _folder: str, _files: str) -> Callable[[Grasps], dict[str, Any]]:
+def _answerer(ask: _Question) -> Callable[[Grasps], dict[str, Any]]:
+    """Return what answers a record, loaded once a process."""
     return ask.load()
+
+
+def _changed_at(paths: Iterable[str | Path]) -> int:
+    """Return when the last of these files, and of those in these folders, was written [ns]."""
+    files = [file for path in map(Path, paths) for file in (path, *path.glob("*")) if file.is_file()]
+    return max((file.stat().st_mtime_ns for file in files), default=0)
 
 
 class Said:
@@ -559,18 +528,14 @@ class _Effusivity:
     stated: tuple[float, float] | None
     other: float
 
-    def prepare(self, record: Grasps) -> Grasps:
-        """Return a record of a file as it is."""
-        return record
-
-    def answer(self, part: Grasps) -> dict[str, Any]:
-        """Return the rows of a part, what is not explained or missing, and warnings of it."""
+    def answer(self, record: Grasps) -> dict[str, Any]:
+        """Return the rows of a record, what is not explained or missing, and warnings of it."""
         from thermogrip.classify.decisions.predict import unexplained_effusivities
         from thermogrip.sysid.effusivity.data import with_object_range
 
         said = Said()
-        cli.warn_of_contacts(said, [part])
-        record = _as_taught(said, part, self.longest, self.coupling)
+        cli.warn_of_contacts(said, [record])
+        record = _as_taught(said, record, self.longest, self.coupling)
         ranged = with_object_range(record, self.stated)
         found = _effusivities(self.device, ranged, self.coupling, self.other)
         if max(row.other_gripper for row in found) > 0.5:
@@ -583,8 +548,9 @@ class _Effusivity:
         for row in rows:
             row["misfit_sd"] = misfits[row["grasp_id"]].sd if row["grasp_id"] in misfits else float("nan")
         unexplained = {name: found.words for name, found in misfits.items() if found.words}
-        own = {"rows": rows, "unexplained": unexplained, "missed": _missed(record, rows)}
-        return own | _of_part(record) | {"warnings": said.words}
+        return {
+            "rows": rows, "unexplained": unexplained, "missed": _missed(record, rows), "warnings": said.words
+        }  # fmt: skip
 
 
 def materials(
@@ -672,32 +638,6 @@ def _missed(record: Grasps, rows: Sequence[dict[str, Any]]) -> dict[str, str]:
     return {str(name): words for name, words in why if words}
 
 
-def _of_part(record: Grasps) -> dict[str, Any]:
-    """Return what is kept of a part beside its answers: the blocks that were touched."""
-    from thermogrip.sysid.effusivity.quality import touched_groups
-
-    return {"name": str(record.attrs["name"]), "groups": touched_groups(record)}
-
-
-def _warn_of_torn(console: Console, found: Answers) -> None:
-    """Warn of blocks whose touches are in several files."""
-    from thermogrip.sysid.effusivity.quality import torn_names
-
-    for words in torn_names((part["name"], part["groups"]) for part in found):
-        console.warn(words)
-
-
-@contextmanager
-def resumable(console: Console, found: Answers) -> Iterator[None]:
-    """Say of work that ends early what is kept."""
-    try:
-        yield
-    except (KeyboardInterrupt, UserError):
-        if found.grasps:
-            console.warn(f"{found.grasps} answers are kept in {found.path}; the same command goes on")
-        raise
-
-
 def _stop_rule(console: Console, model: GraspClassifier, records: Sequence[Grasps], error: float) -> StopRule:
     """Learn when a contact may end, from grasps of known object temperature."""
     from thermogrip.classify.decisions.stopping_rule import learn_stop_rule
@@ -734,33 +674,86 @@ def _answer_or_unknown(rows: list[dict[str, Any]]) -> None:
         row["answer"] = str(answer)
 
 
-class _Named:
-    """Names by what is said of them: how many, and the first of them."""
+def check_place(out: Path, given: Sequence[str]) -> None:
+    """Refuse a place for answers that cannot be written, or is among the files that are read."""
+    from thermogrip.datasets.grasp_files import check_apart
 
-    def __init__(self) -> None:
-        self.first: dict[str, list[str]] = {}
-        self.count: Counter[str] = Counter()
-
-    def add(self, words: str, name: str) -> None:
-        """Say something of one more name."""
-        self.count[words] += 1
-        if len(names := self.first.setdefault(words, [])) < SHOWN:
-            names.append(name)
-
-    def say(self, console: Console) -> None:
-        """Print a line for each thing that is said."""
-        for words, names in self.first.items():
-            more = self.count[words] - len(names)
-            console.say(f"{words}: {', '.join(names)}{f' and {more} more' if more else ''}")
+    if as_folder := out.is_dir() or not out.suffix:
+        cli.new_folder(out)
+    else:
+        cli.new_file(out, (".csv", ".parquet"))
+    check_apart(out / "answers.csv" if as_folder else out, given)
 
 
-def _notes(rows: Iterable[dict[str, Any]]) -> _Named:
-    """Return the grasps with a note, by note."""
-    found = _Named()
-    for row in rows:
-        if row.get("note"):
-            found.add(f"{row['note']}{'' if row['material'] else ', so no name'}", row["grasp_id"])
+def answer_files(
+    console: Console,
+    verb: str,
+    paths: Sequence[str],
+    answer: Callable[[Grasps], dict[str, Any]],
+    out: Path,
+    workers: int | str,
+    unknown: str = "",
+) -> list[dict[str, Any]]:
+    """Return the answers to files of grasps, read one by one, with the ``rows`` of their tables written; CSV
+    has ``unknown`` for NaN."""
+    from thermogrip.datasets.file_names import file_stem
+    from thermogrip.datasets.grasp_files import distinct_names, list_grasp_files
+    from thermogrip.datasets.parallel import in_order
+    from thermogrip.sysid.effusivity.quality import torn_names
+
+    files = list_grasp_files(paths)
+    todo = [(file.absolute(), name) for file, name in zip(files, distinct_names(files))]
+    found: list[dict[str, Any]] = []
+    with console.progress(verb) as progress:
+        progress(0.0, "grasps")
+        for (file, name), each in zip(todo, in_order(partial(_answer_file, answer), todo, workers)):
+            for words in each["warnings"]:
+                console.warn(words)
+            found.append(each)
+            if out.is_dir():
+                table = file_stem((name or file.name).replace("/", "_"))
+                write_table(each["rows"], out / f"{table}.csv", unknown)
+            progress(len(found) / len(todo), file.name)
+    for words in torn_names((each["name"], each["groups"]) for each in found):
+        console.warn(words)
+    if not out.is_dir():
+        write_table([row for each in found for row in each["rows"]], out, unknown)
     return found
+
+
+def _answer_file(answer: Callable[[Grasps], dict[str, Any]], file: tuple[Path, str | None]) -> dict[str, Any]:
+    """Return the answer to one file of grasps, with its name and the blocks that were touched."""
+    from thermogrip.datasets.grasp_files import read_grasps
+    from thermogrip.sysid.effusivity.quality import touched_groups
+
+    path, name = file
+    record = read_grasps(path, plain=True, name=name)
+    return answer(record) | {"name": str(record.attrs["name"]), "groups": touched_groups(record)}
+
+
+def write_table(rows: Sequence[dict[str, Any]], path: Path, unknown: str = "") -> None:
+    """Write rows as CSV or, by the ending of ``path``, Parquet, whole or not at all; columns are those of all
+    rows, in order of appearance."""
+    from thermogrip.classify.decisions.predict import table_csv
+    from thermogrip.datasets.atomic_files import atomic_path, write_atomic
+
+    if path.suffix.lower() == ".csv":
+        write_atomic(path, table_csv(rows, unknown))
+        return
+    import pandas as pd
+
+    with atomic_path(path) as temporary:
+        pd.DataFrame(rows).to_parquet(temporary, index=False)
+
+
+def say_names(console: Console, said: Iterable[tuple[str, str]]) -> None:
+    """Print what is said of some grasps, each of these texts once with the first grasps of which it is."""
+    names: dict[str, list[str]] = {}
+    for words, name in said:
+        names.setdefault(words, []).append(name)
+    for words, of in names.items():
+        more = f" and {len(of) - SHOWN} more" if len(of) > SHOWN else ""
+        console.say(f"{words}: {', '.join(of[:SHOWN])}{more}")
 
 
 def _is_candidate(key: str) -> bool:

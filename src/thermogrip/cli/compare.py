@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from threading import Lock
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from thermogrip.classify.estimators import classifier_names
 from thermogrip.cli import options as cli
-from thermogrip.cli.classify import Quick, Said, touched_part, training_part
+from thermogrip.cli.classify import Quick, touched_part, training_part
 from thermogrip.datasets.errors import UserError
 from thermogrip.report.console import Console
 
@@ -19,16 +19,13 @@ if TYPE_CHECKING:
     from thermogrip.classify.estimators.base import GraspClassifier
     from thermogrip.classify.evaluation.comparison import Comparison
     from thermogrip.classify.evaluation.decision_time import Decisions
-    from thermogrip.classify.evaluation.streamed import FittedClassifiers, StreamedComparison
-    from thermogrip.datasets.parallel import Progress, Workers
-    from thermogrip.datasets.partitions import Answers
+    from thermogrip.datasets.parallel import Progress
     from thermogrip.datasets.schema import Grasps
     from thermogrip.report.html import Section
 
 BY_DEFAULT = ("lstm", "posterior", "bayes", "features-lda", "pca-lda")
 MOST_CONDITIONS = 4  # that are printed one by one
 NEEDED = ("thermogrip.classify.evaluation.harness", "thermogrip.sysid.effusivity.mode_kernel")  # by workers
-LARGE = 32e6  # bytes of test files, some 9000 grasps as CSV: beyond them they are read part by part
 
 
 def compare(
@@ -80,10 +77,6 @@ def compare(
     Each file is one condition; its candidates are the materials of its training grasps. Without --test the
     shipped split (column split) is used where it exists, and then --repeats random splits by grasp, on
     which the LSTM trains for 200 epochs. Grasps that show no contact are left out.
-
-    Training grasps are in memory. Files of --test that are larger than 32 MB together are read part by part,
-    and memory does not grow with them: the predictions are kept beside DIR, and a run that was ended goes on
-    where it stopped, once its classifiers are trained anew.
     """
     if both := {*grasps} & {*(test or ())}:
         hint = "give others to --test, or leave it out: a part of each material is then held back"
@@ -94,7 +87,6 @@ def compare(
     from thermogrip.classify.evaluation.harness import evaluate
     from thermogrip.datasets.grasp_files import read_grasp_files
     from thermogrip.datasets.parallel import joint_progress, kept_processes, run_threads, sub_progress
-    from thermogrip.datasets.partitions import stamps
 
     names = cli.comma(classifiers)
     models, missing = trainable(names or BY_DEFAULT, quick=quick, seed=seed)
@@ -103,9 +95,8 @@ def compare(
     left_out = tuple(f"left out: {error}" for error in missing)
     fast, _ = trainable(models, quick=True, seed=seed)
     records = read_grasp_files(grasps)
-    large = bool(test) and size_of(test or []) > LARGE
-    tests = read_grasp_files(test) if test and not large else None
-    if tests is None and not large and not repeats and not by and not _has_split(records):
+    tests = read_grasp_files(test) if test else None
+    if tests is None and not repeats and not by and not _has_split(records):
         raise UserError("nothing to score", hint="give --test, a column split, or --repeats")
     cli.new_folder(out)
     console = Console(as_json)
@@ -114,10 +105,9 @@ def compare(
     cli.warn_of_contacts(console, [*records, *(tests or ())])
     records = touched_part(console, records)
     tests = None if tests is None else touched_part(console, tests)
-    found: dict[str, Comparison] = {}
     with kept_processes(pool), console.progress("compare") as progress:
-        given = tests is not None or large or _has_split(records)
-        anew = tests is None and not large and repeats > 0
+        given = tests is not None or _has_split(records)
+        anew = tests is None and repeats > 0
         if given and anew and (why := _unsplittable(records, repeats, train_per_class, seed)):
             console.warn(f"no random splits: {why}")
             anew = False
@@ -129,10 +119,7 @@ def compare(
         }
         again: dict[str, Any] = {"seed": seed, "workers": pool}
         asked: dict[str, Callable[[], Comparison]] = {}
-        if large and test:
-            question = [[*models], quick, seed, stamps(grasps)]
-            found["files"] = _streamed(console, models, records, test, out, question, pool, shares["given"])
-        elif given:
+        if given:
             asked["files" if tests is not None else "shipped"] = partial(
                 evaluate, models, records, test=tests, progress=shares["given"], **again
             )
@@ -149,10 +136,10 @@ def compare(
             if name == "features":  # which need no other process
                 page.add(name, partial(_features, models, records))
                 return None
-            return page.compared(name, found[name] if name in found else asked[name]())
+            return page.compared(name, asked[name]())
 
         # side by side: processes that one of them leaves idle work for another, the page is drawn meanwhile
-        parallel = [*found, *asked, "features"]
+        parallel = [*asked, "features"]
         done = dict(zip(parallel, run_threads(work, parallel, pool), strict=True))
         found = {name: each for name, each in done.items() if each and _scored(console, name, each, left_out)}
         if not found:
@@ -161,71 +148,7 @@ def compare(
         if curves:
             more += _curves(console, fast, records, found, seed, pool, shares["curves"], out)
     _write_comparisons(console, found, out, [*page.sections(*found), *more])
-    if large:
-        kept_answers(out, []).remove()
     return 0
-
-
-def size_of(paths: Sequence[str]) -> int:
-    """Return the size of grasp files, of what there is [byte]."""
-    from thermogrip.datasets.grasp_files import grasp_file_parts, list_grasp_files
-    from thermogrip.datasets.partitions import stamps
-
-    there = [path for path in list_grasp_files(paths) if path.exists()]
-    return sum(mark[1] for path in there for mark in stamps(grasp_file_parts(path)))
-
-
-@dataclass(frozen=True)
-class _Asked:
-    """What is asked about each part of large test files."""
-
-    models: FittedClassifiers
-
-    def prepare(self, record: Grasps) -> Grasps:
-        """Return a record of a file as it is."""
-        return record
-
-    def answer(self, part: Grasps) -> dict[str, Any]:
-        """Return the predictions for a part, and warnings of it."""
-        from thermogrip.sysid.effusivity.quality import check_grasps
-
-        said = Said()
-        cli.warn_of_contacts(said, [part])
-        touched = check_grasps(part).usable_grasps(part)
-        if touched is None or touched.sizes["grasp"] < part.sizes["grasp"]:
-            n = part.sizes["grasp"] - (0 if touched is None else touched.sizes["grasp"])
-            said.warn(f"{part.attrs['name']}: {n} left out: they cannot be answered for")
-        nothing: dict[str, Any] = {"rows": [], "times": {}, "faults": []}
-        return (nothing if touched is None else self.models.answer(touched)) | {"warnings": said.words}
-
-
-def kept_answers(out: Path, question: Sequence[Any]) -> Answers:
-    """Return the predictions that are kept beside a folder."""
-    from thermogrip.datasets.partitions import Answers
-
-    return Answers(out.absolute(), ["compare", *question])
-
-
-def _streamed(
-    console: Console, models: Mapping[str, GraspClassifier], records: Sequence[Grasps], test: Sequence[str],
-    out: Path, question: Sequence[Any], pool: Workers, progress: Progress | None,
-) -> StreamedComparison:  # fmt: skip
-    """Return the comparison on test files that are read part by part."""
-    from thermogrip.classify.evaluation.streamed import fitted_classifiers, streamed_comparison
-    from thermogrip.cli.classify import resumable
-    from thermogrip.datasets.parallel import sub_progress
-    from thermogrip.datasets.partitions import sources
-
-    def told(done: float, what: str) -> None:
-        if progress is not None:
-            progress(0.2 + 0.8 * done, f"test: {what}")
-
-    trained = sub_progress(progress, 0.0, 0.2)
-    ask = _Asked(fitted_classifiers(models, records, workers=pool, progress=trained))
-    found = kept_answers(out, question)
-    with resumable(console, found):
-        found.find(sources(test), ask.prepare, ask.answer, told, workers=pool, warn=console.warn)
-    return streamed_comparison(found, ask.models, seed=int(question[2]))
 
 
 def _features(models: Mapping[str, GraspClassifier], records: Sequence[Grasps]) -> list[Section]:
