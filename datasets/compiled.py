@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import gc
 import hashlib
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -130,6 +131,7 @@ def __getattr__(name: str) -> Any:  # PEP 562: numba is imported when it is need
 @cache
 def _numba() -> Any:
     """Return numba, which keeps code as said above."""
+    os.environ.setdefault("NUMBA_CACHE_DIR", "")  # else .numba_config.yaml of the working folder may name one
     import numba
     from numba.core import caching
 

@@ -26,6 +26,7 @@ from typing import Any
 from llvmlite import binding
 
 from thermogrip.datasets.atomic_files import write_atomic
+from thermogrip.datasets.code_cache import code_cache
 
 _LONGEST = 4 << 20  # bytes of a file
 _STATUS_OK = 0
@@ -52,8 +53,7 @@ def folders(source: Path) -> list[Path]:
     """Return where the code of a module's kernels is kept: the first of these that can be written."""
     if own := os.environ.get("NUMBA_CACHE_DIR"):
         return [Path(own, "thermogrip")]
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return [source.parent / "__pycache__", Path(home, "thermogrip")]
+    return [source.parent / "__pycache__", code_cache()]
 
 
 def keep(overload: Any, file: str, source: Path, digest: str) -> bool:

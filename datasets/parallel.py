@@ -377,6 +377,7 @@ def _end_server(forkserver: Any) -> None:
 
 def _processes(n: int) -> ProcessPoolExecutor:
     if sys.platform != "linux":  # macOS has libraries that fail after any fork
+        os.environ.setdefault("PYTHONSAFEPATH", "1")  # as in _serving
         pool = ProcessPoolExecutor(n, mp_context=multiprocessing.get_context("spawn"))
     else:
         _serving(sorted(name for name in sys.modules if name.startswith("thermogrip.")))

@@ -8,21 +8,22 @@ writer asks :func:`provenance`.  Two runs of one command with one seed differ in
 References
 ----------
 .. [1] https://reproducible-builds.org/specs/source-date-epoch/
+.. [2] https://git-scm.com/docs/gitrepository-layout
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
+import re
 import shlex
-import subprocess
+import stat
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,8 @@ _ROOMS = tuple(
     str(Path(__file__).resolve().parent.parent / room) + os.sep
     for room in ("datasets", "sysid", "mpc", "rig", "classify")
 )  # what they bring belongs to the version
-_PATIENCE_S = 2.0  # for git, in a large repository
+_LONGEST_GIT_FILE = 1 << 20  # bytes; packed-refs of a repository with ten thousand branches and tags
+_COMMIT = re.compile("[0-9a-f]{40}(?:[0-9a-f]{24})?")  # SHA-1 or SHA-256
 
 
 @dataclass
@@ -93,7 +95,7 @@ def provenance() -> dict[str, Any]:
         "thermogrip": __version__,
         "written": _date(),
         "command": shlex.join(now.words),
-        "git": _describe(here) if here else None,
+        "git": _commit_of(here) if here else None,
         "seed": now.seed,
         "inputs": {name.removeprefix(below): digest for name, digest in now.read.items()},
     }
@@ -117,20 +119,40 @@ def _hash(name: str) -> str:
         return ""
 
 
-@cache
-def _describe(folder: str) -> str | None:
-    """Return what ``git describe`` says of the repository about a folder, None where there is none."""
-    command = ["git", "-C", folder, "describe", "--always", "--dirty", "--tags"]
-    try:
-        done = subprocess.run(
-            command,
-            capture_output=True,
-            text=True,
-            timeout=_PATIENCE_S,
-            stdin=subprocess.DEVNULL,
-            env=os.environ | {"GIT_OPTIONAL_LOCKS": "0"},
-            check=False,
-        )
-    except (OSError, subprocess.SubprocessError, UnicodeDecodeError):
+def _commit_of(folder: str) -> str | None:
+    """Return the commit that is checked out in the repository around a folder, None where there is none.
+
+    Git itself is not asked: its configuration, which an unpacked archive may bring, can name programs that it
+    would start.  Its files are read as text [2]_.
+    """
+    place = Path(folder)
+    root = next((p for p in (place, *place.parents) if os.path.lexists(p / ".git")), None)
+    if root is None:
         return None
-    return done.stdout.strip() or None
+    git = root / ".git"
+    if git.is_file():  # of a worktree or a submodule
+        git = root / _git_text(git).removeprefix("gitdir:").strip()
+    head = _git_text(git / "HEAD").strip()
+    if not head.startswith("ref: refs/"):
+        return head if _COMMIT.fullmatch(head) else None
+    ref = head.removeprefix("ref: ")
+    if ".." in ref:
+        return None
+    packed_ref = re.compile(rf"^({_COMMIT.pattern}) {re.escape(ref)}$", re.MULTILINE)
+    for common in (git, git / _git_text(git / "commondir").strip()):  # a worktree has its branches elsewhere
+        if _COMMIT.fullmatch(commit := _git_text(common / ref).strip()):
+            return commit
+        if packed := packed_ref.search(_git_text(common / "packed-refs")):
+            return packed[1]
+    return None
+
+
+def _git_text(path: Path) -> str:
+    """Return a small file of a repository, "" where it is no regular file, is a link, or is too large."""
+    with suppress(OSError, ValueError):
+        place = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
+        with open(place, "rb") as stream:
+            about = os.fstat(place)
+            if stat.S_ISREG(about.st_mode) and about.st_size <= _LONGEST_GIT_FILE:
+                return stream.read(_LONGEST_GIT_FILE).decode("utf-8", "replace")
+    return ""

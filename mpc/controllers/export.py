@@ -16,7 +16,9 @@ a loop of its own, C and Python stay within 1e-11 all the way.
 
 from __future__ import annotations
 
+import shutil
 import subprocess
+import tempfile
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
@@ -174,17 +176,21 @@ def check_export(
     UserError where there is no gcc, or it refuses the code."""
     if compiler() is None:
         raise UserError("no gcc here to build the export with", hint="install gcc, or leave --check out")
-    _make(export.folder, "all", *(("sanitized",) if sanitize else ()))
     twin = _twin(controller)
     rng = np.random.default_rng(seed)
     given = [_random_state(twin, rng) for _ in range(states)]
-    answers = _answers(export, given, sanitize)
+    with tempfile.TemporaryDirectory(dir=export.folder) as place:  # what else is in the folder is not run
+        build = replace(export, folder=Path(place))
+        for name in export.files:
+            shutil.copyfile(export.folder / name, build.folder / name)
+        _make(build.folder, "all", *(("sanitized",) if sanitize else ()))
+        answers = _answers(build, given, sanitize)
+        flash, stack = _footprint(build.folder)
     found = np.zeros((states, 4))
     for at, (state, answer) in enumerate(zip(given, answers, strict=True)):
         found[at] = _compare(twin, state, answer.split())
         if progress is not None and at % 100 == 0:
             progress(at / states, "states")
-    flash, stack = _footprint(export.folder)
     difference, free, status, iterations = found.T
     alike = np.ones(states, dtype=bool)
     if export.single:
@@ -410,7 +416,7 @@ def _make(folder: Path, *targets: str) -> None:
         raise UserError("no make here to build the export with", hint="install make") from None
     if done.returncode:
         problem = done.stderr.strip().splitlines()[0] if done.stderr.strip() else "without a message"
-        raise UserError(f"the export does not build: {problem}", file=folder, hint="report it: it must")
+        raise UserError(f"the export does not build: {problem}", hint="report it: it must")
 
 
 def _footprint(folder: Path) -> tuple[int, int]:

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array
+from thermogrip.datasets.code_cache import code_cache, only_ours
 from thermogrip.mpc.estimator.observer import Observer
 from thermogrip.mpc.native.codegen import ModelCode, write_model
 from thermogrip.mpc.native.design_struct import (
@@ -87,10 +88,9 @@ def build_library(files: dict[str, str]) -> Path:
         raise RuntimeError("no gcc")
     text = "\n".join(f"{name}\n{content}" for name, content in sorted(files.items()))
     key = hashlib.sha256("\n".join([*_FLAGS, _machine(gcc), text]).encode()).hexdigest()[:32]
-    path = _cache() / f"mpc-{key}.so"
-    if path.is_file():
+    path = code_cache() / f"mpc-{key}.so"
+    if path.is_file() and only_ours(path):
         return path
-    path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         for name, content in files.items():
             (Path(folder) / name).write_text(content, encoding="utf-8")
@@ -99,13 +99,10 @@ def build_library(files: dict[str, str]) -> Path:
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
         if done.returncode:
             raise RuntimeError(f"gcc refused: {done.stderr.strip()[:300]}")
-        os.replace(Path(folder) / "built.so", path)  # whole, or not there
+        built = Path(folder) / "built.so"
+        built.chmod(0o755)
+        os.replace(built, path)  # whole, or not there
     return path
-
-
-def _cache() -> Path:
-    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(base) / "thermogrip"
 
 
 @cache

@@ -136,6 +136,23 @@ def test_files_and_modules_that_the_documents_name_are_there(page: Path) -> None
         assert spec or hasattr(importlib.import_module(module), last), f"{page.name} names thermogrip{name}"
 
 
+#: What a module has that starts processes.
+STARTS = re.compile(
+    r"^\s*(?:import|from) (?:subprocess|pty)\b|ProcessPoolExecutor\(|LocalCluster\(|"
+    r"multiprocessing.*\b(?:Process|Pool)\b|"
+    r"\bos\.(?:system|popen|fork|startfile|(?:exec|spawn|posix_spawn)\w*)\(|create_subprocess_",
+    flags=re.MULTILINE,
+)
+
+
+def test_the_security_page_lists_every_module_that_starts_a_process() -> None:
+    rooms = ("datasets", "sysid", "mpc", "rig", "classify", "src")
+    sources = {path: path.read_text("utf-8") for room in rooms for path in (ROOT / room).rglob("*.py")}
+    starting = {path.relative_to(ROOT).as_posix() for path, text in sources.items() if STARTS.search(text)}
+    table = (ROOT / "SECURITY.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"^\| `([\w/]+\.py)`", table, flags=re.MULTILINE)) == starting
+
+
 def test_one_version_stands_everywhere() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert project["version"] == __version__

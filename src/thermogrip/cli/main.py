@@ -15,6 +15,9 @@ import re
 import sys
 import traceback
 from collections.abc import Sequence
+from contextlib import chdir
+from importlib import import_module
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -61,6 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command line, the words after ``thermogrip``, and return its exit code."""
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")  # matrices here are small: threads cost more than they give
+    _ignore_settings_of_folder()
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"] or ["--help"]
@@ -103,6 +107,15 @@ def _without_passwords(words: Sequence[str]) -> list[str]:
         command = before == "--on-trip" or word.startswith("--on-trip=")
         kept.append(without_password(re.sub(r"(?s)\s.*", " ...", word) if command else word))
     return kept
+
+
+def _ignore_settings_of_folder() -> None:
+    """Keep libraries from settings in the working folder, which may be somebody's data: those of Numba name a
+    folder of pickles, which run code, and those of matplotlib can start LaTeX."""
+    os.environ.setdefault("NUMBA_CACHE_DIR", "")  # goes before .numba_config.yaml
+    if os.path.lexists("matplotlibrc"):  # goes before $MATPLOTLIBRC
+        with chdir(Path(__file__).parent):  # no thread runs yet
+            import_module("matplotlib")
 
 
 def _fail(line: str, code: int, debug: bool = False) -> int:

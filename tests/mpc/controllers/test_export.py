@@ -16,7 +16,7 @@ import pytest
 from tests.mpc.makers import heater, kit, network_plant
 from thermogrip.datasets.errors import UserError
 from thermogrip.mpc.controllers import export as exports
-from thermogrip.mpc.controllers.export import Agreement, check_export, export_controller
+from thermogrip.mpc.controllers.export import Agreement, Export, check_export, export_controller
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.design.design import default_design
 from thermogrip.mpc.interface import STATUSES, Move
@@ -36,6 +36,11 @@ def controller(tank_maker) -> Controller:
     return Controller(plant, default_design(plant, limits={"t_tank": (8.0, 45.0)}))
 
 
+def run_example(export: Export) -> subprocess.CompletedProcess[str]:
+    subprocess.run(["make", "-s", "-C", export.folder, "example"], check=True)
+    return subprocess.run([export.folder / "example"], capture_output=True, text=True, check=True)
+
+
 @needs_gcc
 def test_c_and_python_do_the_same_from_random_states(controller, tmp_path):
     export = export_controller(controller, tmp_path)
@@ -47,7 +52,7 @@ def test_c_and_python_do_the_same_from_random_states(controller, tmp_path):
     assert found.ram == export.ram  # what Python counts is what sizeof says
     assert found.flash > export.constants
     assert 0 < found.stack < 10_000
-    done = subprocess.run([tmp_path / "example"], capture_output=True, text=True, check=True)
+    done = run_example(export)
     last = done.stdout.splitlines()[-1].split()
     assert abs(float(last[3]) - float(last[5])) < 0.02  # its own loop settles
 
@@ -212,7 +217,7 @@ def test_in_single_numbers_the_same_states_are_solved(make, changes, tmp_path):
     assert single.ram < 0.55 * double.ram
     sources = [path.read_text() for path in (tmp_path / "single").glob("tg_*.[ch]")]
     assert [word for text in sources for word in re.findall(DOUBLE, text) if word] == ["double"]  # seconds
-    example = subprocess.run([tmp_path / "single" / "example"], capture_output=True, text=True, check=True)
+    example = run_example(single)
     last = example.stdout.splitlines()[-1].split()
     assert abs(float(last[3]) - float(last[5])) < 0.05
 
