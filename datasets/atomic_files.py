@@ -81,8 +81,9 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 def write_atomic(path: str | Path, content: bytes | str) -> Path:
-    """Write ``content`` (text as UTF-8) to ``path`` in one step and return the path."""
-    data = content.encode("utf-8") if isinstance(content, str) else content
+    """Write ``content`` to ``path`` in one step and return the path; text as UTF-8, with ``?`` for what is no
+    character, as in the name of a file that is no text."""
+    data = content.encode("utf-8", "replace") if isinstance(content, str) else content
     flags = os.O_WRONLY | os.O_TRUNC | _NO_LINK | _AS_WRITTEN
     with atomic_path(path) as temporary, open(os.open(temporary, flags), "wb") as file:
         file.write(data)

@@ -10,6 +10,7 @@ move that the guard rejects (:mod:`~thermogrip.rig.guard.guard`), a cable that i
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -27,7 +28,7 @@ from thermogrip.rig.guard.trip import ENDLESS, Trip, TripError
 from thermogrip.rig.interface import DeviceRefusedError, Event, Reading, Rig, SamplingRig
 from thermogrip.rig.serial.port import PortError
 from thermogrip.rig.session.signals import check_stopped, hold_signals
-from thermogrip.rig.session.snapshot import Listener, Operator, Snapshot
+from thermogrip.rig.session.snapshot import MOST_MARKS, Listener, Operator, Snapshot
 
 #: The phases of a session; a log holds their index.
 PHASES = ("settle", "hold", "lead_in", "pump_off", "contact", "release")
@@ -170,7 +171,8 @@ class Loop:
     def check(self) -> bool:
         """Have the guard check the newest reading; say whether the controller may be asked."""
         for why in self.operator.take_bad():
-            self.note("bad", why)
+            if sum(event.kind == "bad" for event in self.events) < MOST_MARKS:
+                self.note("bad", why)
         found = self.guard.check(
             self.reading,
             self.now(),
@@ -285,16 +287,17 @@ class Loop:
         return replace(trip, clear=ENDLESS[trip.kind]) if endless else trip
 
     def _note_notices(self) -> None:
-        """Note what happened on the rig; after a reset or an expired drive the last row's drive is not known,
-        which is a trip."""
+        """Note what happened on the rig, the same thing once, since a line full of noise must not fill the
+        disk; after a reset or an expired drive the last row's drive is not known, which is a trip."""
         trip = None
-        for notice in self.rig.notices():
-            self.note(notice.kind, notice.text)
+        happened = Counter((notice.kind, notice.text) for notice in self.rig.notices())
+        for (kind, text), times in happened.items():
+            self.note(kind, text if times == 1 else f"{text} ({times} times)")
             at = self.reading.time_s
-            if notice.kind == "reset":
-                trip = Trip("device", at, "the device", "to hold the drive", notice.text)
-            elif notice.kind == "expired" and trip is None:
-                trip = Trip("frozen", at, "this program", "a drive renewed within 2 s", notice.text)
+            if kind == "reset":
+                trip = Trip("device", at, "the device", "to hold the drive", text)
+            elif kind == "expired" and trip is None:
+                trip = Trip("frozen", at, "this program", "a drive renewed within 2 s", text)
         if trip is not None:
             raise TripError(trip)
 

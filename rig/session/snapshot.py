@@ -47,12 +47,15 @@ class Snapshot:
 Listener: TypeAlias = Callable[[Snapshot], None]
 
 
+MOST_MARKS = 20  # of one session: reasons that a person may give for a trial
+
+
 class Operator:
     """Requests to a running session, made from any thread."""
 
     def __init__(self) -> None:
         self.stop_asked = ""  # by whom; empty where nobody did
-        self._bad: deque[str] = deque()
+        self._bad: deque[str] = deque(maxlen=MOST_MARKS)
 
     def stop(self, by: str) -> None:
         """Ask the guard to end the session at the next sample; one that is asked for stays asked for."""

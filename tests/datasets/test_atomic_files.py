@@ -157,6 +157,11 @@ def test_json_comes_back(tmp_path, content):
         assert back == KEYS | content
 
 
+def test_what_is_no_character_is_replaced(tmp_path):
+    path = write_json(tmp_path / "a.json", {"file": "log\udcff.csv"}, schema="test", version=1)
+    assert read_json(path, "test", 1)["file"] == "log?.csv"
+
+
 def test_json_has_no_nan(tmp_path):
     with pytest.raises(ValueError, match="JSON"):
         write_json(tmp_path / "a.json", {"x": float("nan")}, schema="s", version=1)

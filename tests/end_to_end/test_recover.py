@@ -36,8 +36,14 @@ def test_a_run_is_written_in_other_formats_and_reads_back(tmp_path: Path, name: 
     assert log["drive"].attrs["role"] == "input"
 
 
-def test_a_run_without_a_row_is_an_answer_of_no(tmp_path: Path) -> None:
+def test_what_comes_next_names_files_that_are_there_and_a_run_without_a_row_is_an_answer_of_no(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     killed(tmp_path / "batch" / "0001")
+    assert main(["recover", str(tmp_path / "batch" / "0001")]) == 0
+    then = f"identify {tmp_path}/batch/0001/samples.csv --out plant.json"
+    assert capsys.readouterr().err == f"next: thermogrip {then}\n"
     assert main(["recover", str(tmp_path / "batch")]) == 0
+    assert capsys.readouterr().err == f"next: thermogrip batch CONTROLLER PLAN.csv --out {tmp_path}/batch\n"
     killed(tmp_path / "batch" / "0002", n=0)
     assert main(["recover", str(tmp_path / "batch")]) == 3

@@ -7,13 +7,14 @@ import json
 import re
 import socket
 import time
+from contextlib import suppress
 from typing import Any
 
 import pytest
 
 from tests.live.conftest import Running, paced_twin
 from thermogrip.datasets.errors import UserError
-from thermogrip.live.server import MOST_ROWS, MOST_TEXT, State, page_text
+from thermogrip.live.server import MOST_ROWS, MOST_TEXT, Requests, State, page_text
 from thermogrip.live.watch import Show, Watch
 from thermogrip.report.console import Console
 
@@ -80,11 +81,56 @@ def _soon(look: Any) -> Any:
     return look()
 
 
-@pytest.mark.parametrize(
-    ("body", "status"), [("{}" * 3000, 413), ("no JSON", 400), ("[1]", 200), ('"text"', 400), ("{}", 200)]
-)
-def test_what_is_no_request_is_refused(body: str, status: int, watch: Watch) -> None:
-    assert ask(watch, "POST", "/answer", body)[0] == status
+def test_what_is_no_request_is_refused_and_is_no_traceback(
+    watch: Watch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for body, status in [
+        ("{}" * 3000, 413), ("no JSON", 400), ("[1]", 400), ('"text"', 400), (r'{"text": "\ud800"}', 400),
+        ("[" * 4000, 400), ('{"text": ' + "[" * 4000, 400), ('{"text": ' + "9" * 4080 + "}", 200),
+    ]:  # fmt: skip
+        assert ask(watch, "POST", "/bad", body)[0] == status, body[:20]
+    marks = _soon(watch.operator.take_bad)
+    assert marks == ["9" * MOST_TEXT]
+    assert capfd.readouterr().err.count("\n") <= 2  # the address, and a line of the view
+
+
+def test_a_body_without_an_end_and_one_that_is_cut_off_cost_nothing(
+    watch: Watch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    host, token = re.fullmatch(r"http://([^/]+)/\?token=(.+)", watch.address).groups()
+    name, port = host.split(":")
+    head = f"POST /bad HTTP/1.1\r\nHost: {host}\r\nOrigin: http://{host}\r\n"
+    head += f"Cookie: thermogrip_{port}={token}\r\n"
+    with socket.create_connection((name, int(port)), timeout=30) as line:  # it says 10, and never ends
+        line.sendall(f"{head}Content-Length: 10\r\nTransfer-Encoding: chunked\r\n\r\n".encode())
+        with suppress(OSError):  # hung up on
+            for _ in range(2000):
+                line.sendall(b"400\r\n" + b"x" * 0x400 + b"\r\n")
+        with suppress(ConnectionError):
+            assert line.recv(100).startswith((b"HTTP/1.1 413", b"HTTP/1.1 400"))
+    with socket.create_connection((name, int(port)), timeout=30) as line:
+        line.sendall(f"{head}Content-Length: 1000\r\n\r\n{{".encode())
+    assert ask(watch, "POST", "/stop") == (200, '{"done":true}')
+    assert _soon(lambda: watch.operator.stop_asked) == "the page"
+    assert watch.operator.take_bad() == []
+    assert capfd.readouterr().err.count("\n") <= 2
+
+
+def test_requests_reach_the_session_at_a_person_s_pace() -> None:
+    state, heard, now = State(), [], [0.0]
+    requests = Requests(state, heard.append, lambda: now[0])
+    state.take(message([], question={"number": 2}))
+    found = []
+    for k in range(3000):  # in a second and a half
+        now[0] = k / 2000
+        found.append(requests.take("bad", {"text": str(k)})[0])
+        assert requests.take("stop", {}) == (200, "")
+        assert requests.take("answer", {"question": "2"}) == (200, "")
+        assert requests.take("answer", {"question": "1"})[0] == 409
+    assert [said["do"] for said in heard] == ["bad", "stop", "answer", "bad"]
+    assert (found.count(200), found.count(429)) == (2, 2998)
+    state.take(message([], question=None))
+    assert requests.take("answer", {"question": "2"})[0] == 409
 
 
 def test_a_mark_is_cut_to_its_length(watch: Watch) -> None:

@@ -25,7 +25,7 @@ from thermogrip.mpc import Controller
 from thermogrip.rig.guard.trip import Trip
 from thermogrip.sysid.plant.plant import Plant
 
-TRIP = Trip("limit", 12.5, "t_surface", "3 to 55 degC", "61.00 degC", figures={"measured": float("inf")})
+TRIP = Trip("limit", 12.5, "skin \udcff", "3 to 55 degC", "61.00 degC", figures={"measured": float("inf")})
 
 
 def python(code: str, *words: str) -> str:
@@ -41,7 +41,8 @@ def test_it_gets_the_trip_as_json_and_its_words_as_they_are(tmp_path: Path) -> N
     command.start(TRIP)
     command.join()
     assert reports == []
-    assert json.loads(out.read_text()) == {**TRIP.as_dict(), "figures": {"measured": None}}
+    sent = {**TRIP.as_dict(), "subject": "skin ?", "figures": {"measured": None}}
+    assert json.loads(out.read_text()) == sent
     assert TRIP.as_dict()["clear"]
 
 

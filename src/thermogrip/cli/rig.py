@@ -424,7 +424,9 @@ def recover(
         export_run(folders[0], out)
         console.say(f"wrote {out}")
     console.answer({"runs": results})
-    return 0 if all(result["rows"] for result in results) else cli.ANSWER_IS_NO
+    if not all(result["rows"] for result in results):
+        return cli.ANSWER_IS_NO
+    return cli.Done("run" if folders == [folder] else "batch")
 
 
 def virtual(

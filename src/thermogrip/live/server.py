@@ -43,6 +43,7 @@ LINGER_S = 600.0  # that a page whose session was killed may still be opened
 MOST_ROWS = 4000  # that are kept; older ones are thinned
 MOST_BYTES = 4096  # of a request
 MOST_TEXT = 200  # characters, of what a viewer says
+MARK_EVERY_S = 1.0  # at most: nobody types another reason in less
 
 
 class State:
@@ -94,6 +95,38 @@ class State:
 
     def _present(self) -> dict[str, Any]:
         return {"lost": self.lost, **self.now}
+
+
+class Requests:
+    """What viewers ask, handed on at a person's pace, since the session takes its time for each.
+
+    A stop and the answer to a question are handed on once, a mark once a second at most.
+    """
+
+    def __init__(
+        self, state: State, ask: Callable[[dict[str, Any]], None], clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._state, self._ask, self._clock = state, ask, clock
+        self._marked, self._done = -float("inf"), set[str]()
+
+    def take(self, do: str, words: dict[str, str]) -> tuple[int, str]:
+        """Take a request; return its HTTP status and why it is refused ("" where it is not)."""
+        state, once = self._state, do
+        if state.lost or state.over:
+            return 409, "the session is not there any more"
+        if do == "bad":
+            if self._clock() - self._marked < MARK_EVERY_S:
+                return 429, "it was marked a moment ago"
+            self._marked, once = self._clock(), ""  # each of them counts
+        elif do == "answer":
+            once = str((state.now.get("question") or {}).get("number", ""))
+            if not once or words.get("question") != once:
+                return 409, "this is not asked any more"
+        if once not in self._done:
+            self._ask({"do": do, **words})
+        if once:
+            self._done.add(once)
+        return 200, ""
 
 
 class Gate:
@@ -152,7 +185,7 @@ def application(state: State, ask: Callable[[dict[str, Any]], None], *, port: in
     from starlette.responses import HTMLResponse, JSONResponse, StreamingResponse
     from starlette.routing import Route
 
-    text, policy = page_text()
+    (text, policy), requests = page_text(), Requests(state, ask)
     safe = {
         "Cache-Control": "no-store", "Content-Security-Policy": policy, "Referrer-Policy": "no-referrer",
         "X-Content-Type-Options": "nosniff", "Cross-Origin-Resource-Policy": "same-origin",
@@ -167,21 +200,31 @@ def application(state: State, ask: Callable[[dict[str, Any]], None], *, port: in
         return StreamingResponse(_events(state), media_type="text/event-stream", headers=safe)
 
     async def act(request: Request) -> Response:
-        if int(request.headers.get("content-length") or MOST_BYTES) >= MOST_BYTES:
-            return JSONResponse({"refused": "too long"}, 413)
+        body = b""
+        async for part in request.stream():
+            body += part
+            if len(body) > MOST_BYTES:
+                return JSONResponse({"refused": "too long"}, 413)
         try:
-            said = json.loads(await request.body())
-            words = {key: str(said[key])[:MOST_TEXT] for key in ("text", "question") if key in said}
-        except (ValueError, TypeError):
-            return JSONResponse({"refused": "no JSON object"}, 400)
-        if state.lost or state.over:
-            return JSONResponse({"refused": "the session is not there any more"}, 409)
-        ask({"do": request.url.path.lstrip("/"), **words})
-        return JSONResponse({"done": True})
+            words = _words(body)
+        except (ValueError, RecursionError):
+            return JSONResponse({"refused": "no JSON object of text"}, 400)
+        status, refused = requests.take(request.url.path.lstrip("/"), words)
+        return JSONResponse({"refused": refused} if refused else {"done": True}, status)
 
     actions = [Route(f"/{name}", act, methods=["POST"]) for name in ("stop", "bad", "answer")]
     app = Starlette(routes=[Route("/", page), Route("/events", events), *actions])
     return Gate(app, port=port, token=token)
+
+
+def _words(body: bytes) -> dict[str, str]:
+    """Return what a request says; ValueError or RecursionError where it is no JSON object of texts."""
+    content = json.loads(body)
+    if not isinstance(content, dict):
+        raise ValueError("no object")
+    words = {key: str(content[key])[:MOST_TEXT] for key in ("text", "question") if key in content}
+    "".join(words.values()).encode()  # a lone surrogate is no character
+    return words
 
 
 async def _events(state: State) -> AsyncIterator[str]:
@@ -246,7 +289,7 @@ def _server(state: State, token: str, listener: socket.socket) -> Server:
 
     app = application(state, _answer, port=listener.getsockname()[1], token=token)
     config = Config(
-        app, loop="asyncio", http="h11", ws="none", lifespan="off", log_level="error", access_log=False,
+        app, loop="asyncio", http="h11", ws="none", lifespan="off", log_level="critical", access_log=False,
         server_header=False, proxy_headers=False, timeout_graceful_shutdown=1,
     )  # fmt: skip
     return Server(config)

@@ -289,7 +289,7 @@ class Watch:
                 self.operator.stop("the page")
             elif asked["do"] == "bad":
                 self.operator.mark_bad(asked.get("text") or "marked on the page")
-            elif asked["do"] == "answer" and asked.get("question", "").isdigit():
+            elif asked["do"] == "answer" and asked.get("question", "").isdecimal():
                 self._answers.put((int(asked["question"]), asked.get("text", "")))
 
     def _close_page(self) -> None:

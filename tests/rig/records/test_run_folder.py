@@ -265,11 +265,13 @@ def test_a_row_has_the_columns_of_the_first_and_a_lost_number_is_an_empty_cell(t
             folder.sample({"time_s": 1.0, "t": 2.0, "a,b": 3.0})
         folder.event(Event(1.5, "lost", "t", {"k": None}))
         folder.event(Event(2.0, "mood", "\u00b0C"))
+        folder.event(Event(3.0, "bad", "half \ud800 a pair"))
     folder.close()
     assert (tmp_path / "run" / "samples.csv").read_text() == 'time_s,"a,b",t\n0.3,,1234.56789\n'
     assert (tmp_path / "run" / "events.jsonl").read_text(encoding="utf-8").splitlines() == [
         '{"time_s": 1.5, "kind": "lost", "text": "t", "data": {"k": null}}',
         '{"time_s": 2.0, "kind": "mood", "text": "\u00b0C"}',
+        '{"time_s": 3.0, "kind": "bad", "text": "half ? a pair"}',
     ]
     sums = (tmp_path / "run" / "SHA256SUMS").read_text().splitlines()
     assert [line[64:] for line in sums] == ["  run.json", "  samples.csv", "  events.jsonl"]
@@ -621,10 +623,11 @@ def test_a_trial_that_is_marked_bad_keeps_every_byte_of_its_samples(
     write(tmp_path / "run", n, close=True)
     before, events = ((tmp_path / "run" / name).read_bytes() for name in ("samples.csv", "events.jsonl"))
     mark_bad(tmp_path / "run", "the block slipped")
+    mark_bad(tmp_path / "run", "half \udcff a pair")  # what a command line has for a byte that is no text
     mark_bad(tmp_path / "run", "twice, by 3 \u00b0C")
     run = read_run(tmp_path / "run")
     assert run.bad == "twice, by 3 \u00b0C"
-    assert run.events[-2] == Event(at, "bad", "the block slipped")
+    assert run.events[-3:-1] == (Event(at, "bad", "the block slipped"), Event(at, "bad", "half ? a pair"))
     assert (tmp_path / "run" / "events.jsonl").read_bytes().startswith(events)
     assert (tmp_path / "run" / "samples.csv").read_bytes() == before
     assert sums_agree(tmp_path / "run") == []

@@ -17,7 +17,7 @@ from thermogrip.rig.guard.trip import ENDLESS, KINDS, TripError
 from thermogrip.rig.interface import DeviceRefusedError, Event, Reading
 from thermogrip.rig.serial.port import PortError
 from thermogrip.rig.session.loop import Loop, log_of_rows, trip_of_device
-from thermogrip.rig.session.snapshot import Snapshot
+from thermogrip.rig.session.snapshot import MOST_MARKS, Snapshot
 
 NONE = call({"q": 0.0}, 0)
 LOST = PortError("lost", "did not answer", file="COM3", hint="check cable")
@@ -234,6 +234,22 @@ def test_after_a_reset_or_an_expired_drive_the_last_row_is_not_known(
             f"{said} it was",
         )
     assert [(e.kind, e.text) for e in run.events[2:]] == [(one, f"{one} it was") for one in kinds]
+
+
+def test_a_line_full_of_noise_is_one_event_a_look() -> None:
+    run = started()
+    run.rig.notices.return_value = [Event(1.0, "damaged", "a line came damaged (crc)")] * 700
+    run.wait(0.5)
+    assert told(run, "damaged") == [(10.5, "a line came damaged (crc) (700 times)")]
+
+
+def test_of_an_operator_s_marks_so_many_are_kept_as_a_person_may_give() -> None:
+    run = started()
+    for k in range(5):
+        for n in range(1000):
+            run.operator.mark_bad(f"{k} {n}")
+        run.check()
+    assert len(told(run, "bad")) == MOST_MARKS
 
 
 def test_a_full_disk_is_one_trip_and_the_session_goes_on_in_memory() -> None:
