@@ -75,14 +75,12 @@ ALL = [
         "control/ten_plants.py", "--keep {out}/ten", "--plants tclab --without do-mpc --keep {out}/ten"
     ),
     Benchmark("control/swings.py", "--keep {out}/ten", "--keep {out}/ten --plants tclab --samples 300"),
-    Benchmark("control/late.py", "--keep {out}/ten", "--keep {out}/ten --plants tclab --times 1,2"),
     Benchmark(
         "control/other_desks.py",
         "--keep {out}/desks",
         "--keep {out}/desks --plants sink --evaluations 5 --without do-mpc",
     ),
     Benchmark("control/moving_horizon.py", quick="--seeds 0"),
-    Benchmark("control/multistage.py", quick="--draws 1 --steps 10", needs=("do_mpc",)),
     Benchmark("control/scenarios.py", quick="--seeds 0 --draws 2"),
     Benchmark("classify/engine.py", quick="--grasps 5", needs=("jax", "numpyro")),
     Benchmark(

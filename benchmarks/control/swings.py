@@ -32,8 +32,8 @@ from truths import CASES, Case
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.spec import spec_from_dict
-from thermogrip.mpc.estimator.late_drives import apparent_delays
 from thermogrip.mpc.estimator.oscillation import OscillationMonitor
+from thermogrip.mpc.plant.prediction import apparent_delays
 from thermogrip.sysid.plant.plant import Plant
 
 WAYS = {"rest": 1.0, "rest, twice the noise": 2.0, "targets": 1.0, "loads": 1.0}

@@ -22,9 +22,6 @@ A loop must never be left without an answer, so every failure has a next best on
   (:mod:`thermogrip.mpc.estimator.oscillation`); or goes away from its target while the bias of a drive
   exceeds 30 % of its range.
 
-Where drives act later than the model has it (:mod:`thermogrip.mpc.estimator.late_drives`; in Python alone),
-the estimate runs on what acts, and the plan begins where a move of now begins to act.
-
 Where mean innovations exceed 3 standard deviations, the weight of moves is multiplied by their third, up
 to 30 times: a gain that is off by 30 % does not swing.
 
@@ -56,8 +53,7 @@ from thermogrip.mpc.controllers.linear_equivalent import to_control
 from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.design.design import DAY, SCHEMA, VERSION, Design, check_design, default_design
 from thermogrip.mpc.estimator.arrival import ArrivalMonitor
-from thermogrip.mpc.estimator.call_times import RESTART_S, SAME, opening, shifted
-from thermogrip.mpc.estimator.late_drives import MOST, LateDriveMonitor, LateDrives
+from thermogrip.mpc.estimator.call_times import RESTART_S, opening, shifted
 from thermogrip.mpc.estimator.oscillation import OscillationMonitor
 from thermogrip.mpc.estimator.reading_checks import ReadingMonitor, follows, is_off, too_weak
 from thermogrip.mpc.estimator.structure_monitor import StructureMonitor
@@ -65,7 +61,7 @@ from thermogrip.mpc.interface import Move, Readings, Trajectory
 from thermogrip.mpc.optimiser.reach import Reach
 from thermogrip.mpc.optimiser.rti import Optimiser, Outcome, Sample
 from thermogrip.mpc.optimiser.switching import choose
-from thermogrip.mpc.plant.prediction import prediction_model
+from thermogrip.mpc.plant.prediction import apparent_delays, prediction_model
 
 if TYPE_CHECKING:
     from thermogrip.mpc.native.runtime import CompiledController
@@ -138,12 +134,11 @@ class Controller(Shown, SampledController):
         self.pi = PIController.of(plant, design, tuple(replace(p, feedforward=0.0) for p in design.loops))
         self.monitor = ReadingMonitor(self.model.n_y, len(self.observer.lagged), spike=self.model.spike)
         self.structure = StructureMonitor(plant, self.model, self.controlled)
-        self.lateness = LateDriveMonitor(self.model, self.controlled)
-        self.drives = LateDrives(self.model.n_u, longest=MOST * self.dt)
         most = 2.0 * design.overshoot  # half of what may be overshot is what plans keep to
         self.arrival = ArrivalMonitor.of(self.controlled, self.dt, most, self.observer.R[self._rows])
         allowed = [most] * len(self.controlled)
-        self.swings = OscillationMonitor(self.controlled, self.dt, self.lateness.delays, allowed)
+        delays = apparent_delays(plant, self.model.drives, tuple(self.controlled), self.dt)
+        self.swings = OscillationMonitor(self.controlled, self.dt, delays, allowed)
         self.reach = Reach(self.optimiser, self.observer)
         self.last_iterations = 0  # of the program, in the last step
         self._waits = 0.0  # seconds until an on/off drive may go over, where it is to
@@ -265,7 +260,6 @@ class Controller(Shown, SampledController):
         self._start(*self._read(reading))
         self._begin_positions()
         self._u = self._in_force = self._applied(reading, self._u)
-        self.drives.begin(self._u)
         self.pi.reset(reading)
         self.times.reset()
 
@@ -362,9 +356,6 @@ class Controller(Shown, SampledController):
         self._on_pi = False
         self.monitor.forget(y)
         self.structure.forget()
-        self.lateness.forget()
-        self.drives.late = self.lateness.late
-        self.drives.begin(self._u)
         self.reach.forget()
         self.arrival.restart()
         self.swings.forget()
@@ -378,8 +369,7 @@ class Controller(Shown, SampledController):
         if seconds > RESTART_S + self.dt:
             # until a reading comes to start again from, no more is predicted than a silence that would count
             self._silent_s, seconds = seconds, RESTART_S
-        self.drives.apply(seconds, applied)
-        self.observer.advance(seconds, self.drives.acting(-seconds, seconds, applied), self._d)
+        self.observer.advance(seconds, applied, self._d)
         self._age_s += seconds
 
     def _absorb(self, y: Array, d: Array, applied: Array) -> str:
@@ -389,7 +379,6 @@ class Controller(Shown, SampledController):
             u, target, side = self._u, self._target, self._side
             self._start(y, np.where(np.isfinite(d), d, self._d))
             self._u, self._in_force, self._fresh = u, applied, False
-            self.drives.begin(applied)
             self._target, self._side, self._y = target, side, y
             return f"no reading for {silent:.0f} s: the estimate was started again"
         if not self._fresh:
@@ -405,11 +394,7 @@ class Controller(Shown, SampledController):
         self.observer.update(y)
         if stays.any() or abs(elapsed - self.dt) > _EVEN * self.dt:
             self.structure.restart()
-            self.lateness.restart()
-        if self.lateness.note(self.observer, y, applied, before):
-            self.drives.late = self.lateness.late
-            self.structure.restart()
-        self.structure.note(self.observer, y, self.drives.acting(-self.dt, self.dt, applied), before)
+        self.structure.note(self.observer, y, applied, before)
         self._y, self._seen = y, self.observer.now
         lost = [name for name, value in zip(self.model.outputs, y) if not np.isfinite(value)]
         lost += [name for name, value in zip(self.model.disturbances, d) if not np.isfinite(value)]
@@ -510,7 +495,7 @@ class Controller(Shown, SampledController):
             parked = [name for name, at in zip(self.model.drives, self.optimiser.pair) if lost[at]]
             return u, "fallback_plan", self._unseen(parked)
         lags = self.monitor.slower(self.observer)
-        doubt = self.lateness.said or self.structure.said or ("" if self.structure.denies else lags)
+        doubt = self.structure.said or ("" if self.structure.denies else lags)
         said = follows(self.observer, self.controlled)
         if not doubt and (self._swings or overdue):
             doubt = "; ".join(filter(None, (self._swings or overdue, said)))
@@ -524,7 +509,7 @@ class Controller(Shown, SampledController):
         last = np.clip(self._u, self.optimiser.lowest, self.optimiser.highest)
         observer = self.observer
         d = self._d + observer.disturbance_bias
-        x = self._when_it_acts(observer.now, d)
+        x = observer.now
         if self.design.move_delay:  # the drive applied now stays for one more sample
             x = self.model.next_state(x, last + observer.drive_bias, d)
         guess, biases = self._guess(wanted, last), (observer.output_bias, observer.drive_bias)
@@ -550,16 +535,6 @@ class Controller(Shown, SampledController):
         )
         self._waits = choice.wait_s
         return choice.outcome
-
-    def _when_it_acts(self, x: Array, d: Array) -> Array:
-        """Return the state (n_x,) when a move of now begins to act."""
-        left, at = float(self.drives.late.max(initial=0.0)), 0.0
-        while left > SAME * self.dt:
-            seconds = min(self.dt, left)
-            u = self.drives.acting(at, seconds, self._u) + self.observer.drive_bias
-            x = x + seconds / self.dt * (self.model.next_state(x, u, d) - x)
-            at, left = at + seconds, left - seconds
-        return x
 
     def _converged(self, sample: Sample) -> Outcome:
         """Return what one program gives, or as many as the design asks for until the plan stays."""

@@ -439,14 +439,6 @@ class Observer:
         self.shown = self.start = self.model.output(self.x)[self.lagged]
         self.set_offsets(y, np.asarray(self.fixed))
 
-    def begin_again(self, x: Array, w: Array, variance: Array) -> None:
-        """Start from state x (n_x,) of variances (n_x,) and biases w (n_w,), as uncertain as after a reset;
-        sensors keep their offsets."""
-        offset = self.found_offset
-        self._begin(x, np.diag(variance), np.full(self.model.n_y, np.nan))
-        self.w, self.found_offset = w, offset
-        self.expect_lags()
-
     def estimate(self) -> dict[str, Array]:
         """Return what the filter knows: ``x``, ``w``, ``shown``, ``lag``, ``scale``, their covariance ``P``,
         ``found_offset`` and ``start``."""

@@ -51,23 +51,18 @@ import numpy as np
 from scipy.signal import lfilter
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.mpc.estimator.late_drives import (
-    ENOUGH,
-    FEWEST,
-    GAIN,
-    SOLVABLE,
-    STATE,
-    apparent_delays,
-    window_of,
-)
 from thermogrip.mpc.estimator.reading_checks import too_weak
-from thermogrip.mpc.plant.prediction import PredictionModel
+from thermogrip.mpc.plant.prediction import PredictionModel, apparent_delays
 
 if TYPE_CHECKING:
     from thermogrip.mpc.estimator.observer import Observer
     from thermogrip.sysid.plant.plant import Plant
 
 REPORTED, TAKEN_BACK, MISFIT = 5.0, 2.0, 4.0
+_DELAYS, _FEWEST = 7.5, 20  # of a window, in apparent delays; the same in samples, at least
+_ENOUGH = 0.7  # of a window, from which on it is looked at
+_STATE, _GAIN = 1.0, 0.2  # standard deviations of each state at its start [degC], and of a drive's gain
+_SOLVABLE = 1e9  # degC, or standard deviations: a run beyond diverges
 _DRIFT = 0.1  # degC of a sensor in a window
 _LAG, _SLOW, _ZONE = 0.5, 6.0, 0.02  # apparent delays, apparent delays, of a drive's range
 _TRIED = 0.3  # standard deviations, of a difference quotient
@@ -138,7 +133,7 @@ class StructureMonitor:
         if self.spread is None:
             return
         self._delays = apparent_delays(plant, model.drives, tuple(controlled), model.dt)
-        self.window = window_of(max(self._delays) / model.dt)
+        self.window = max(_FEWEST, round(_DELAYS * max(self._delays) / model.dt))
         self.bank = [each for name, D in zip(controlled, self._delays) for each in _of_output(name, D)]
         self._share_late = min(1.0, max(self._delays) / 8 / model.dt)
         for name in model.drives:
@@ -191,7 +186,7 @@ class StructureMonitor:
         x, w = observer.now.copy(), observer.w.copy()
         self._history.append(_Row(x, w, observer.reading(), y, u, d))
         self._count += 1
-        enough = max(FEWEST, ENOUGH * self.window)
+        enough = max(_FEWEST, _ENOUGH * self.window)
         if self._count >= enough and self._count % max(1, self.window // 6) == 0:
             found = self.misfit(observer)
             if found is not None:
@@ -248,7 +243,7 @@ class StructureMonitor:
             base = found.run(found.z[None], found.drives[None], np.zeros((1, n_t)))
             made = found.run(np.repeat(found.z[None], n_t + n_u, axis=0), drives, drifting) - base
             a, honest = made[:, self.model.sub :: self.model.sub], self._structures(found, rows, length)
-        if not (np.abs(a).max() < SOLVABLE and np.abs(honest).max() < SOLVABLE):
+        if not (np.abs(a).max() < _SOLVABLE and np.abs(honest).max() < _SOLVABLE):
             return None
         tolerated = np.array([one.tolerated for one in self.bank])[:, None]
         known = np.vstack([found.J, tolerated * (honest * found.weight).reshape(len(honest), -1)])
@@ -257,12 +252,12 @@ class StructureMonitor:
     def _fitted(self, observer: Observer, rows: Sequence[_Row], steps: int) -> _Fitted | None:
         """Return the most likely run of the model over rows; None where it is not finite."""
         model, spread = self.model, self.spread
-        if spread is None or len(rows) < FEWEST:
+        if spread is None or len(rows) < _FEWEST:
             return None
         first, rows = rows[0], rows[1:]
         u, d, y = (np.array([getattr(row, name) for row in rows]) for name in ("u", "d", "y"))
         n_x, n_w, n_t = model.n_x, len(first.w), spread.shape[1]
-        scale = np.concatenate([STATE * observer.unit, np.sqrt(observer.P0 + first.w**2)])
+        scale = np.concatenate([_STATE * observer.unit, np.sqrt(observer.P0 + first.w**2)])
         offset, found = observer.offset + observer.found_offset, observer.disturbance
 
         def run(z: Array, drives: Array, drift: Array | None = None) -> Array:
@@ -270,7 +265,7 @@ class StructureMonitor:
             changing by drift (B, n_free) on the way."""
             xw = np.concatenate([first.x, first.w]) + z[:, : n_x + n_w] * scale
             x, w, rest = xw[:, :n_x], xw[:, n_x:], z[:, n_x + n_w :]
-            pushed = drives * (1 + GAIN * rest[:, None, n_t:])
+            pushed = drives * (1 + _GAIN * rest[:, None, n_t:])
             fine = np.repeat(
                 model.inputs(pushed + (w @ found.on_drive.T * model.span)[:, None]), model.sub, axis=1
             )
@@ -294,7 +289,7 @@ class StructureMonitor:
                 at_rows = shown[:, model.sub :: model.sub]
                 J = ((at_rows[1:] - at_rows[0]) * weight / _TRIED).reshape(m, -1)
                 r = ((seen - at_rows[0]) * weight).ravel() + z @ J
-                if not (np.abs(J).max() < SOLVABLE and np.abs(r).max() < SOLVABLE):
+                if not (np.abs(J).max() < _SOLVABLE and np.abs(r).max() < _SOLVABLE):
                     return None
                 last, z = z, np.linalg.solve(J @ J.T + np.eye(m), J @ r)
         return _Fitted(run, last, J, r, shown[0], weight, u)

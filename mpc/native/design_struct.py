@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.mpc.estimator.late_drives import apparent_delays
 from thermogrip.mpc.estimator.oscillation import longest_half_swings
 from thermogrip.mpc.native.modes import Modes, modes_of
+from thermogrip.mpc.plant.prediction import apparent_delays
 
 if TYPE_CHECKING:
     from thermogrip.mpc.design.design import Design

@@ -559,6 +559,23 @@ def step_response(
     return StepResponse(gain, delay, abs(gain / steepest), t, response)
 
 
+#: Samples: where a delay is longer, what waits for several of them would wait too long.
+LONGEST_DELAY = 200 / 7.5
+
+
+@lru_cache(maxsize=64)
+def apparent_delays(
+    plant: Plant, drives: tuple[str, ...], controlled: tuple[str, ...], dt: float
+) -> tuple[float, ...]:
+    """Return the apparent delay [s] of each controlled output behind the drive that moves it most, of one
+    sample ``dt`` [s] to :data:`LONGEST_DELAY`."""
+    found = []
+    for of in controlled:
+        best = max((step_response(plant, name, of) for name in drives), key=lambda one: abs(one.gain))
+        found.append(float(np.clip(best.delay, dt, LONGEST_DELAY * dt)))
+    return tuple(found)
+
+
 def sample_time(plant: Plant) -> float:
     """Return a sample time [s] for control, on a 1-2-5 grid: a quarter of the longest apparent delay of an
     output behind the drive that moves it most.
