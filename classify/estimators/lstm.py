@@ -15,9 +15,15 @@ and one scale for all temperatures.  Copper and iron, 0.4 K apart on a rise of 5
 the input's spread and take the network long to find.  ``"each_time"`` takes the mean training trace off and
 brings every sample time to spread 1, so that the network sees how grasps differ and not what they share.
 
-Training runs in compiled code (:mod:`thermogrip.classify.estimators.lstm_training`) or, where PyTorch finds
-one, on a GPU; weights and batches are drawn by PyTorch's generator in either case, so that a seed is the
-same training, to rounding.  PyTorch is the extra ``lstm``; prediction needs neither.
+**When training ends.**  A network that has found what tells materials apart goes on to learn the grasps by
+heart.  So one of five groups of training grasps (sessions, else blocks) is held out first, and a network is
+trained on the others until the loss of the held-out ones has not fallen for ``patience`` epochs; a second
+one, on all grasps, is trained for as many epochs as the first needed.  ``patience=None`` is the paper's
+training, all epochs.
+
+``torch.nn.LSTM`` trains, with all series in memory on one thread or on a GPU; weights and batches are drawn
+by PyTorch's generator, so that a seed is the same training on the same machine.  PyTorch is the extra
+``lstm``; prediction does not need it.
 
 **Augmentation.**  Each copy is one real trace plus white noise on every sample and one shift of the whole
 trace, which is what another initial temperature is to a network that sees temperatures.
@@ -25,11 +31,8 @@ trace, which is what another initial temperature is to a network that sees tempe
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
-from multiprocessing import parent_process
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -86,7 +89,6 @@ PAPER_EPOCHS = 2000
 QUICK_EPOCHS = 200
 FEEDS = ("each_time", "trace")
 _LEAST_SD = 0.05  # degC; before contact a smaller spread is noise, not to be blown up
-_MOST_THREADS = 2  # a batch of 100 is two pieces
 
 
 @dataclass(eq=False, repr=False)
@@ -99,7 +101,8 @@ class LstmClassifier(JoinedClassifier):
     own_feed: ClassVar[str] = "each_time"
 
     hidden: int = 32  # size of the state
-    epochs: int = PAPER_EPOCHS  # over the augmented training set; 200 is quick and undertrained
+    epochs: int = PAPER_EPOCHS  # over the augmented training set, at most; 200 is quick and undertrained
+    patience: int | None = 200  # epochs without a lower loss of held-out grasps; None: all epochs
     batch: int = 100  # series
     learning_rate: float = 1e-3  # of Adam
     series_per_class: int = 100  # of :func:`augment`, as the next two
@@ -111,19 +114,32 @@ class LstmClassifier(JoinedClassifier):
     random_state: int = 0  # of weights, copies and batches: the same network on the same machine
 
     def _fit(self, grasps: Grasps, labels: Labels) -> None:
+        from thermogrip.classify.estimators.margins import inner_folds
+
         self._check_params()
         self.times_ = times_from(grasps, self.start)
         real = as_array(grasps, times=self.times_)
+        target = np.searchsorted(self.classes_, labels).astype(np.int64)
+        epochs = self.epochs
+        if self.patience is not None and self.epochs > self.patience:
+            for fitted, held in inner_folds(grasps, labels, seed=self.random_state)[:1]:
+                self.mean_, self.sd_ = self._standard(real[fitted])
+                seen = self._series(real[held]), target[held]
+                series, classes = self._copies(real[fitted], target[fitted])
+                epochs = _train(self, series, classes, epochs=epochs, held_out=seen).best
         self.mean_, self.sd_ = self._standard(real)
+        series, classes = self._copies(real, target)
+        self.weights_, self.loss_curve_, _ = _train(self, series, classes, epochs=epochs)
+
+    def _copies(
+        self, real: Floats, target: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """Return augmented series of traces, and their classes."""
         size, noise, shift = self.series_per_class, self.noise_sd, self.shift_sd
         made = augment(
-            real, labels, series_per_class=size, noise_sd=noise, shift_sd=shift, seed=self.random_state
+            real, target, series_per_class=size, noise_sd=noise, shift_sd=shift, seed=self.random_state
         )
-        target = np.searchsorted(self.classes_, made.labels)
-        series = self._series((made.traces - self.mean_) / self.sd_)
-        weights, epochs = _drawn(self, series.shape, self.classes_.size)
-        train, rate = _trainer(self.device), self.learning_rate
-        self.weights_, self.loss_curve_ = train(weights, series, target, epochs, learning_rate=rate)
+        return self._series(made.traces), target[made.source]
 
     def _check_params(self) -> None:
         if min(self.hidden, self.epochs, self.batch) < 1 or not self.learning_rate > 0:
@@ -136,6 +152,8 @@ class LstmClassifier(JoinedClassifier):
             raise UserError(f"feed is {self.feed!r}", hint=f"use {' or '.join(FEEDS)}")
         if self.device not in ("auto", "cpu", "cuda"):
             raise UserError(f"device is {self.device!r}", hint="use auto, cpu or cuda")
+        if self.patience is not None and self.patience < 1:
+            raise UserError(f"patience is {self.patience}", hint="use at least 1 epoch; None: all of them")
 
     def _standard(self, real: Floats) -> tuple[Floats, Floats]:
         """Return what is taken off the traces and what they are divided by."""
@@ -144,13 +162,12 @@ class LstmClassifier(JoinedClassifier):
         return real.mean(axis=0), np.maximum(real.std(axis=0), _LEAST_SD)
 
     def _series(self, x: Floats) -> NDArray[np.float32]:
-        """Return (n_series, n_time, n_sensor)."""
-        cube = x.reshape(x.shape[0], -1, self.times_.size)
+        """Return traces as the network sees them, (n_series, n_time, n_sensor)."""
+        cube = ((x - self.mean_) / self.sd_).reshape(x.shape[0], -1, self.times_.size)
         return np.ascontiguousarray(cube.transpose(0, 2, 1), dtype=np.float32)
 
     def _log_proba(self, grasps: Grasps) -> Floats:
-        x = (as_array(grasps, times=self.times_) - self.mean_) / self.sd_
-        return _logits(self.weights_, self._series(x))
+        return _logits(self.weights_, self._series(as_array(grasps, times=self.times_)))
 
     def get_state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         arrays = {"times": self.times_, "mean": self.mean_, "sd": self.sd_, "loss_curve": self.loss_curve_}
@@ -165,76 +182,85 @@ class LstmClassifier(JoinedClassifier):
         check_shapes(self.weights_, **{"readout.weight": (k, self.hidden), "readout.bias": (k,)})
 
 
+@dataclass(eq=False, repr=False)
 class PaperLstm(LstmClassifier):
-    """The paper's LSTM as described there, fed with plain temperatures (``"lstm-paper"``)."""
+    """The paper's LSTM as described there, fed with plain temperatures for all epochs (``"lstm-paper"``)."""
 
     own_feed: ClassVar[str] = "trace"
 
+    patience: int | None = None
+
 
 Weights = dict[str, NDArray[Any]]
-Trainer = Callable[..., tuple[Weights, Floats]]
 
 
-def _drawn(
-    model: LstmClassifier, shape: tuple[int, ...], classes: int
-) -> tuple[Weights, list[list[NDArray[np.int64]]]]:
-    """Return the first weights and the rows of each batch of each epoch, as PyTorch draws them."""
-    import torch
-
-    rows, orders = shape[0], []
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(model.random_state)
-        network, readout = torch.nn.LSTM(shape[2], model.hidden), torch.nn.Linear(model.hidden, classes)
-        for _ in range(model.epochs):
-            orders.append(torch.randperm(rows).split(model.batch))  # type: ignore[no-untyped-call]
-    return _named(network, readout), [[b.numpy() for b in order] for order in orders]
+class _Trained(NamedTuple):
+    weights: Weights
+    loss_curve: Floats  # (n_epoch,) mean cross entropy of the training series
+    best: int  # epochs until the least loss of the held-out series; all where none were held out
 
 
-def _trainer(device: str) -> Trainer:
-    import torch
-
-    if device == "cuda" and not torch.cuda.is_available():
-        raise UserError("PyTorch finds no GPU", hint="use device cpu or auto")
-    if device == "cuda" or (device == "auto" and torch.cuda.is_available()):
-        return partial(_train_torch, device="cuda")
-    from thermogrip.classify.estimators.lstm_training import train_network
-
-    # a worker process has its siblings for the other cores
-    threads = 1 if parent_process() is not None else min(os.cpu_count() or 1, _MOST_THREADS)
-    return partial(train_network, threads=threads)
-
-
-def _train_torch(
-    weights: Weights,
-    series: NDArray[np.float32],
-    target: NDArray[np.int64],
-    epochs: Sequence[Sequence[NDArray[np.int64]]],
+def _train(
+    model: LstmClassifier,
+    x: NDArray[np.float32],
+    y: NDArray[np.int64],
     *,
-    learning_rate: float,
-    device: str,
-) -> tuple[Weights, Floats]:
-    """Train in PyTorch, everything on the device from the start: no loader, no copies between the batches."""
+    epochs: int,
+    held_out: tuple[NDArray[np.float32], NDArray[np.int64]] | None = None,
+) -> _Trained:
+    """Return a network trained on series ``x`` (n_series, n_time, n_sensor) of classes ``y``, for so many
+    epochs or until the loss of ``held_out`` has not fallen for ``patience`` of them."""
     import torch
 
-    classes, hidden = weights["readout.weight"].shape
-    x, y = torch.from_numpy(series).to(device), torch.from_numpy(target.astype(np.int64)).to(device)
-    network = torch.nn.LSTM(series.shape[2], hidden, batch_first=True)
-    readout = torch.nn.Linear(hidden, classes)
-    tensors = {k: torch.from_numpy(v.copy()) for k, v in weights.items()}
-    network.load_state_dict(_part(tensors, "lstm."))
-    readout.load_state_dict(_part(tensors, "readout."))
-    network, readout = network.to(device), readout.to(device)
-    adam = torch.optim.Adam([*network.parameters(), *readout.parameters()], lr=learning_rate)
-    losses = torch.zeros(len(epochs), dtype=torch.float64, device=device)
-    for k, batches in enumerate(epochs):
-        for order in batches:
-            rows = torch.from_numpy(order).to(device)
-            loss = torch.nn.functional.cross_entropy(readout(network(x[rows])[1][0][0]), y[rows])
-            adam.zero_grad(set_to_none=True)
-            loss.backward()  # type: ignore[no-untyped-call]
-            adam.step()
-            losses[k] += loss.detach() * (rows.numel() / y.numel())
-    return _named(network, readout), losses.cpu().numpy()
+    device = _device(model.device)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # products of 100 x 32 numbers are too small to share
+    try:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(model.random_state)
+            network = torch.nn.LSTM(x.shape[2], model.hidden, batch_first=True).to(device)
+            readout = torch.nn.Linear(model.hidden, model.classes_.size).to(device)
+            adam = torch.optim.Adam([*network.parameters(), *readout.parameters()], lr=model.learning_rate)
+            series, target = torch.from_numpy(x).to(device), torch.from_numpy(y).to(device)
+            seen = None if held_out is None else tuple(torch.from_numpy(each).to(device) for each in held_out)
+
+            def loss_of(series: Any, target: Any) -> Any:
+                return torch.nn.functional.cross_entropy(readout(network(series)[1][0][0]), target)
+
+            curve, least, best = [], float("inf"), 0
+            for epoch in range(1, epochs + 1):
+                total = torch.zeros((), device=device)
+                for rows in torch.randperm(len(y)).split(model.batch):  # type: ignore[no-untyped-call]
+                    at = rows.to(device)
+                    loss = loss_of(series[at], target[at])
+                    adam.zero_grad(set_to_none=True)
+                    loss.backward()
+                    adam.step()
+                    total += loss.detach() * len(rows)
+                curve.append(total / len(y))
+                if seen is None:
+                    best = epoch
+                    continue
+                with torch.no_grad():
+                    now = float(loss_of(*seen))
+                if now < least:
+                    least, best = now, epoch
+                elif model.patience is not None and epoch - best >= model.patience:
+                    break
+            losses = torch.stack(curve).double().cpu().numpy()
+    finally:
+        torch.set_num_threads(threads)
+    return _Trained(_named(network, readout), losses, best)
+
+
+def _device(name: str) -> str:
+    """Return where to train."""
+    import torch
+
+    there = torch.cuda.is_available()
+    if name == "cuda" and not there:
+        raise UserError("PyTorch finds no GPU", hint="use device cpu or auto")
+    return "cuda" if there and name != "cpu" else "cpu"
 
 
 def _named(network: Any, readout: Any) -> Weights:

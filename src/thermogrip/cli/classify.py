@@ -119,7 +119,7 @@ ObjectRange = Annotated[
         "Objects of unknown temperature are between A and B degC [default: 20 K about the room].",
     ),
 ]
-Quick = Annotated[bool, cli.flag("--quick", "200 epochs in place of 2000 for the LSTM.")]
+Quick = Annotated[bool, cli.flag("--quick", "200 epochs of the LSTM, at most 2000 without.")]
 
 
 def effusivity(

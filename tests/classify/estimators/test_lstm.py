@@ -20,6 +20,7 @@ def test_the_defaults_are_the_papers() -> None:
     network = make_classifier("lstm")
     assert (network.hidden, network.epochs, network.batch, network.series_per_class) == (32, 2000, 100, 100)
     assert make_classifier("lstm", quick=True).epochs == 200
+    assert make_classifier("lstm-paper").patience is None  # all 2000 epochs
     for n in (3, 5):  # one grasp a material becomes the paper's 300 and 500 series
         assert augment(np.zeros((n, 10)), [f"m{i}" for i in range(n)]).traces.shape == (100 * n, 10)
 
@@ -123,6 +124,7 @@ def test_the_network_is_the_recurrence_of_its_docstring(three: Grasps, make_tiny
         ({"feed": "rise"}, "feed is 'rise'; use each_time or trace"),
         ({"device": "tpu"}, "device is 'tpu'; use auto, cpu or cuda"),
         ({"noise_sd": -0.1}, "cannot augment"),
+        ({"patience": 0}, "patience is 0; use at least 1 epoch"),
     ],
 )
 def test_wrong_params_are_refused(
@@ -142,17 +144,18 @@ def test_a_missing_gpu_is_an_error(
         make_tiny_lstm(device="cuda").fit(three)
 
 
-def test_both_trainers_agree(three: Grasps, make_tiny_lstm: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a GPU would run, on this processor: the same weights and batches, losses to rounding."""
-    from functools import partial
+def test_training_ends_where_held_out_grasps_gain_no_more(three: Grasps, make_tiny_lstm: Tiny) -> None:
+    short, long = (make_tiny_lstm(epochs=n, patience=15).fit(three) for n in (15, 1000))
+    assert short.loss_curve_.size == 15  # what is no longer than the patience cannot end before it is over
+    assert 15 < long.loss_curve_.size < 900
+    as_long = make_tiny_lstm(epochs=long.loss_curve_.size, patience=None).fit(three)
+    np.testing.assert_array_equal(as_long.loss_curve_, long.loss_curve_)  # on all grasps, for as many epochs
 
-    from thermogrip.classify.estimators import lstm
 
-    compiled = make_tiny_lstm(epochs=12).fit(three)
-    monkeypatch.setattr(lstm, "_trainer", lambda device: partial(lstm._train_torch, device="cpu"))
-    plain = make_tiny_lstm(epochs=12).fit(three)
-    np.testing.assert_allclose(compiled.loss_curve_, plain.loss_curve_, rtol=2e-5)
-    np.testing.assert_allclose(compiled.predict_proba(three), plain.predict_proba(three), atol=1e-4)
+def test_all_epochs_are_trained_where_no_grasp_can_be_held_out(three: Grasps, make_tiny_lstm: Tiny) -> None:
+    labels = three["material"].values.astype(str)
+    alone = pick(three, [int(np.argmax(labels == name)) for name in np.unique(labels)])
+    assert make_tiny_lstm(epochs=30, patience=2).fit(alone).loss_curve_.size == 30
 
 
 def test_the_papers_feed_has_one_scale_and_ours_one_for_each_time(three: Grasps) -> None:
