@@ -26,7 +26,7 @@ so s is multiplied by t_n / z, Student's quantile over the normal one (1.3 for f
 The error to expect of one part more is neither the larger one nor that of those seen: of n folds and the last
 parts, which lie in them, with the mean square e^2 it is e sqrt(1 + 1 / n) (:func:`expected_error`), as the
 variance of one value more about the mean of n; over 33 outputs of public sets its median ratio to the true
-error is 1.00 (docs/records/black-boxes.md).
+error is 1.00 (docs/records/identification.md).
 
 **Where that is too narrow.** The average over parts does not apply to each: a tank that overflows in one
 stretch and not in the next errs there three times as much. With e_f the error on part f and h_f that on all
