@@ -25,7 +25,6 @@ _ROOMS = Path(__file__).parents[1]
 KERNELS = tuple(
     _ROOMS / name
     for name in (
-        "classify/estimators/lstm_training.py",
         "sysid/blackbox/kalman_kernel.py",
         "sysid/contact/table_kernel.py",
         "sysid/contact/time_stepping.py",

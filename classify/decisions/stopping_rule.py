@@ -12,7 +12,7 @@ the grasps that stop for it are wrong no more often than stated: with k of n wro
 error, the posterior mean of a rate after k of n (Laplace's rule of succession), so that n grasps cannot show
 an error below 1 / (n + 2).  And the classifier itself must expect no more: the mean of 1 - max p over them is
 at most the error too, since training grasps, which calibrated the gripper, are wrong less often than fresh
-ones (``docs/records/classification.md#early-stops``).  g is what the user gives away in accuracy; as learnt it is
+ones (``docs/records/classification.md``).  g is what the user gives away in accuracy; as learnt it is
 lowered until the training grasps lose no more than that.  A rule is for the times at which it was learnt,
 close together at first: evaluating it more often stops earlier and errs more.
 

@@ -194,7 +194,8 @@ class PaperResult:
             names = tuple(head[k].removesuffix(f", {kind}") for k in kept)
             cells = tuple(tuple(row[k] for k in kept) for row in rows)
             caption = (
-                f"Right/n (95 % Clopper-Pearson interval in %), {kind} grasps. LSTM: at most {self.epochs} epochs."
+                f"Right/n (95 % Clopper-Pearson interval in %), {kind} grasps. "
+                f"LSTM: at most {self.epochs} epochs."
             )
             parts += [Table(names, cells, caption, dense=True), Text(about)]
         text, caption_has = AS_IN_THE_TEXT, CASES[0]
