@@ -36,8 +36,7 @@ class Benchmark(NamedTuple):
 
 
 PEERS = ("sippy", "nfoursid", "sysidentpy", "jax_sysid")
-# {data}: the folder of public data; {out}: that of the results; {grasps}: the example grasps; {model}: a
-# posterior of some of them; {plant}, {controller}: of the example logs
+# {data}: the folder of public data; {out}: that of the results; {plant}, {controller}: of the example logs
 ALL = [
     Benchmark("terminal/mistakes.py"),
     Benchmark("hostile/files.py", quick="--only csv"),
@@ -49,77 +48,35 @@ ALL = [
         PEERS,
     ),
     Benchmark("abroad/peers.py", "{data}", "{data} --sets house", PEERS),
-    Benchmark("identify/bands.py", "{data}", "{data} --kinds arx"),
-    Benchmark("identify/another.py", quick="--pairs 1 --only network"),
     Benchmark("identify/left.py", quick="--logs 5 --only tclab"),
     Benchmark("identify/lost.py", quick="--seeds 1 --only tclab"),
     Benchmark("abroad/score.py", "{data}", "{data} --sets house,dryer"),
-    Benchmark("abroad/feedthrough.py", "{data}", "{data} --sets house"),
-    Benchmark("abroad/other_days.py", "{data}", "{data}"),
-    Benchmark("abroad/step_tests.py", "{data}", "{data}"),
     Benchmark("coverage/study.py", "table", "table"),
     Benchmark("coverage/ranks.py", "run --count 100", "run --count 5"),
-    Benchmark("coverage/merged.py"),
     Benchmark("coverage/starts.py"),
     Benchmark("excite/predicted_precision.py"),
     Benchmark("mpc/compare.py", quick="--quick", needs=("do_mpc",)),
     Benchmark("mpc/sizes.py", "--peer", "--quick --states 4"),
-    Benchmark("mpc/hpipm.py", needs=("hpipm_python",)),
     Benchmark("mpc/twenty_plants.py", quick="--plants 2"),
-    Benchmark("mpc/call_periods.py", quick="--draws 0 --controllers MPC"),
     Benchmark("control/mismatch.py", quick="--seeds 4 --only delay"),
-    Benchmark("control/detectable.py"),
-    Benchmark("control/faults.py", quick="--seeds 4"),
-    Benchmark("control/least_moves.py", quick="--most 240"),
     Benchmark(
         "control/ten_plants.py", "--keep {out}/ten", "--plants tclab --without do-mpc --keep {out}/ten"
     ),
-    Benchmark("control/swings.py", "--keep {out}/ten", "--keep {out}/ten --plants tclab --samples 300"),
-    Benchmark(
-        "control/other_desks.py",
-        "--keep {out}/desks",
-        "--keep {out}/desks --plants sink --evaluations 5 --without do-mpc",
-    ),
-    Benchmark("control/moving_horizon.py", quick="--seeds 0"),
-    Benchmark("control/scenarios.py", quick="--seeds 0 --draws 2"),
     Benchmark("classify/engine.py", quick="--grasps 5", needs=("jax", "numpyro")),
-    Benchmark(
-        "classify/table.py", "--splits 20 --out {out}/table.json", "--splits 2 --quick --out {out}/table.json"
-    ),
-    Benchmark("classify/chance.py", "{out}/table.json", "{out}/table.json"),
     Benchmark(
         "classify/compare_classifiers.py",
         "--out {out}/comparison",
         "--out {out}/comparison --splits 1 --classifiers posterior,pca-lda",
     ),
-    Benchmark(
-        "classify/confidence.py",
-        "--comparison {out}/comparison/posterior.json",
-        "--comparison {out}/comparison/posterior.json --refits 0",
-    ),
-    Benchmark("classify/bayes.py", "{grasps}", "{grasps} --splits 1"),
     Benchmark("classify/block_loss.py"),
-    Benchmark("classify/no_difference.py", quick="--sets 4 --refits 1 --generic 2"),
     Benchmark("classify/own_bound.py", quick="--repeats 4"),
-    Benchmark("classify/room.py", quick="--test 2"),
     Benchmark("classify/truth.py", quick="--repeats 1"),
     Benchmark("classify/unlike_training.py", quick="--parts stop --sets 2"),
-    Benchmark("classify/two_sensor_emcee.py", quick="--grasps 1 --steps 300"),
-    Benchmark("classify/two_sensors.py", "{data}", "{data} --sensors heated --classifiers vote"),
-    Benchmark(
-        "classify/ambiguous.py", "{data}", "{data} --train 1-5 --test 21-22 --classifiers posterior,pca-lda"
-    ),
-    Benchmark("classify/fresh.py", quick="--sets 1 --test 5 --hundreds 0"),
     Benchmark("classify/grippers.py", quick="--grippers 1"),
     Benchmark("classify/transfer.py", quick="--sets 1 --test 3 --classifiers posterior,pca-lda"),
     Benchmark("classify/touches.py", "--out {out}", "--splits 1 --parts two --out {out}"),
-    Benchmark("classify/late.py"),
-    Benchmark("classify/lstm.py", quick="--measure 5", needs=("torch",)),
-    Benchmark("classify/hold.py", "{data}", "{data} --classifiers bayes,pca-lda"),
+    Benchmark("classify/lstm.py", quick="--epochs 5 --blocks 2", needs=("torch",)),
     Benchmark("classify/scale.py", "{out}/scale --files 2 20", "{out}/scale --files 1 3"),
-    Benchmark("classify/serve.py", "{model}", "{model} --grasps 400 --in-process 50", ("uvicorn",)),
-    Benchmark("workers.py", "{out}/workers", "{out}/workers effusivity --files 2"),
-    Benchmark("rig/jitter.py"),
     Benchmark("rig/fuzz.py", quick="--inputs 20000"),
     Benchmark("rig/live.py", quick="--seconds 10 --block 5 --viewers 1", needs=("uvicorn",)),
     Benchmark("rig/board.py"),
@@ -132,7 +89,7 @@ ALL = [
 ]
 #: What these write is a page of the docs, from results of the others.
 NOT_RUN = ("rig/faults.py",)
-MADE = ("grasps", "model", "plant", "controller")
+MADE = ("plant", "controller")
 LOGS = ("prbs_heating_cooling", "step_up_down", "multisine", "pump_on_off")
 MISSING = 77  # the exit code of a benchmark that lacks a tool of the system
 
@@ -144,20 +101,15 @@ def made(name: str, out: Path) -> Path:
     examples = out / "examples"
     if not examples.exists():
         copy_examples(examples)
-    at = {"grasps": examples / "grasps", "model": out / "model", "plant": out / "plant.json"}
+    file = out / f"{name}.json"
     if name == "controller":
-        at[name] = out / "controller.json"
-        if not at[name].exists():
-            default_controller(made("plant", out)).save(at[name])
-    elif not at[name].exists():
+        if not file.exists():
+            default_controller(made("plant", out)).save(file)
+    elif not file.exists():
         logs = [str(examples / f"{log}.csv.xz") for log in LOGS]
-        words = {
-            "model": ["train", str(at["grasps"] / "exp1A_obj43_grip23.csv.xz"), "--classifier", "posterior",
-                      "--split", "all"],
-            "plant": ["identify", *logs, "--network", "gripper", "--models", "network"],
-        }[name]  # fmt: skip
-        subprocess.run([sys.executable, "-m", "thermogrip", *words, "--out", str(at[name])], check=True)
-    return at[name]
+        words = ["identify", *logs, "--network", "gripper", "--models", "network", "--out", str(file)]
+        subprocess.run([sys.executable, "-m", "thermogrip", *words], check=True)
+    return file
 
 
 def default_controller(plant: Path) -> Any:
