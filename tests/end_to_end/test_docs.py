@@ -47,7 +47,14 @@ def commands_in(path: Path) -> list[str]:
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 #: records name files, modules and options as they were at the time
 PRESENT = [page for page in PAGES if page.parent.name != "records"]
-WRITTEN = [(page, line) for page in PRESENT for line in commands_in(page)]
+WRITTEN_BY_HAND = [page for page in PRESENT if page.name != "cli.md" and page.parent.name != "python"]
+WRITTEN = [(page, line) for page in WRITTEN_BY_HAND for line in commands_in(page)]
+ROOMS = ("datasets", "sysid", "mpc", "rig", "classify")
+OF_EVERY_VERB = {"--seed", "--json", "--help"}  # of which the page says so once
+LINKED_BY_README = {
+    ROOT / name
+    for name in re.findall(r"\]\(([\w/.-]+\.md)", (ROOT / "README.md").read_text(encoding="utf-8"))
+}
 
 
 @pytest.fixture(autouse=True)
@@ -55,18 +62,46 @@ def _a_wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "100")
 
 
-def test_the_site_has_the_help_of_every_verb_and_documents_every_door() -> None:
-    reference, doors = load_object(SITE, "help_of_verbs")(), load_object(SITE, "doors")
+@pytest.mark.parametrize("page", ["cli.md", *(f"python/{room}.md" for room in ROOMS)])
+def test_the_reference_is_what_the_program_says(page: str) -> None:
+    path = ROOT / "docs" / "reference" / page
+    made = load_object(ROOT / ".ci" / "reference.py", "pages")()[path]
+    assert path.read_text(encoding="utf-8") == made, "not up to date: run python .ci/reference.py"
+
+
+def test_the_reference_has_every_verb_and_every_public_name() -> None:
+    reference = ROOT / "docs" / "reference"
+    verbs = (reference / "cli.md").read_text(encoding="utf-8")
     for verb in VERBS:
-        assert f"## {verb}\n\n```text\nUsage: thermogrip {verb} [OPTIONS]" in reference
-    assert "--network FILE.py:CLASS" in reference
-    assert "--json" not in reference  # every verb's; the page says so once
-    for room in ("datasets", "sysid", "mpc", "rig", "classify"):
-        page = (ROOT / "docs" / "reference" / "python" / f"{room}.md").read_text(encoding="utf-8")
-        assert f"<!-- doors of thermogrip.{room} -->" in page
-        names = importlib.import_module(f"thermogrip.{room}").__all__
-        documented = doors(room)
-        assert all(re.search(rf"(:: .*\.|`){name}\b", documented) for name in names)
+        usage = f"## {verb}\n\n```text\nUsage: thermogrip {verb} [OPTIONS]"
+        assert usage in verbs
+        assert set(re.findall(r"^  (--[\w-]+)", help_of(verb), flags=re.MULTILINE)) - OF_EVERY_VERB <= set(
+            re.findall(r"^  (--[\w-]+)", verbs.partition(usage)[2].partition("```\n")[0], flags=re.MULTILINE)
+        )
+    for room in ROOMS:
+        headings_of_page = headings(reference / "python" / f"{room}.md")
+        for name in importlib.import_module(f"thermogrip.{room}").__all__:
+            assert name.lower() in headings_of_page
+
+
+@pytest.mark.parametrize("page", sorted(LINKED_BY_README), ids=lambda page: page.name)
+def test_a_page_that_readme_leads_to_has_content(page: Path) -> None:
+    assert len(page.read_text(encoding="utf-8").split()) > 50
+
+
+def test_every_module_and_folder_of_the_architecture_is_there() -> None:
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    modules = [path for room in (*ROOMS, "src/thermogrip") for path in (ROOT / room).rglob("*.py")]
+    places = {place for path in modules for place in (path, path.parent)}
+    names = {path.relative_to(ROOT).as_posix().removeprefix("src/thermogrip/") for path in places}
+    rows = re.findall(r"^\| `([\w/]+)/` \|(.*)$", text, flags=re.MULTILINE)
+    listed = [(room, name) for room, row in rows for name in re.findall(r"`([\w/]+)`", row)]
+    for room, name in listed:
+        inside = [place.stem for place in places if place.is_relative_to(ROOT / room)]
+        assert name.rstrip("/") in inside, f"{room} has no {name}"
+    for name in re.findall(r"`([\w/]+\.py|\w+/[\w/]+/)`", text):
+        assert any(f"/{each}".endswith(f"/{name.rstrip('/')}") for each in names), f"there is no {name}"
+    assert len(listed) > 40
 
 
 def test_the_menu_of_the_site_has_every_page() -> None:
@@ -124,7 +159,7 @@ def test_python_in_the_documents_takes_what_there_is(page: Path, code: str) -> N
         assert hasattr(found, name) or submodule, f"{page.name}: {module} has no {name}"
 
 
-@pytest.mark.parametrize("page", PRESENT, ids=[page.name for page in PRESENT])
+@pytest.mark.parametrize("page", WRITTEN_BY_HAND, ids=[page.name for page in WRITTEN_BY_HAND])
 def test_files_and_modules_that_the_documents_name_are_there(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     rooms = "benchmarks|classify|datasets|examples|mpc|rig|src|sysid|tests"
@@ -146,8 +181,9 @@ STARTS = re.compile(
 
 
 def test_the_security_page_lists_every_module_that_starts_a_process() -> None:
-    rooms = ("datasets", "sysid", "mpc", "rig", "classify", "src")
-    sources = {path: path.read_text("utf-8") for room in rooms for path in (ROOT / room).rglob("*.py")}
+    sources = {
+        path: path.read_text("utf-8") for room in (*ROOMS, "src") for path in (ROOT / room).rglob("*.py")
+    }
     starting = {path.relative_to(ROOT).as_posix() for path, text in sources.items() if STARTS.search(text)}
     table = (ROOT / "SECURITY.md").read_text(encoding="utf-8")
     assert set(re.findall(r"^\| `([\w/]+\.py)`", table, flags=re.MULTILINE)) == starting

@@ -1,0 +1,134 @@
+"""Write docs/reference/cli.md and docs/reference/python/ from the program: `python .ci/reference.py`."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import inspect
+import io
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+REFERENCE = Path(__file__).parents[1] / "docs" / "reference"
+ROOMS = {
+    "datasets": "Files of logs and grasps, materials, example data",
+    "sysid": "Identification, plants, effusivity",
+    "mpc": "Controllers, closed loops, tuning",
+    "rig": "Devices, sessions, guard, records",
+    "classify": "Classifiers, their comparison, decisions",
+}
+CLI_HEAD = """# Command line
+
+Every verb has `--seed N`, `--json` (one JSON object on stdout and nothing else) and `--help` besides.
+Exit codes: 0 done; 1 a bug; 2 your input is at fault; 3 done, but the answer is no; 130 Ctrl-C.
+Written by `python .ci/reference.py`.
+"""
+ROOM_HEAD = """# thermogrip.{room}
+
+{subject}: what `from thermogrip.{room} import ...` offers. `help(name)` says the rest.
+Written by `python .ci/reference.py`.
+"""
+_WIDTH = 100
+
+
+def pages() -> dict[Path, str]:
+    """Return the text of every page of the reference that is written from the program."""
+    python = {REFERENCE / "python" / f"{room}.md": page_of_room(room) for room in ROOMS}
+    return {REFERENCE / "cli.md": page_of_verbs(), **python}
+
+
+def page_of_verbs() -> str:
+    """Return what ``thermogrip VERB --help`` prints, a section a verb."""
+    from thermogrip.cli.verbs import VERBS
+
+    sections = [f"## {verb}\n\n```text\n{help_of(verb)}\n```\n" for verb in VERBS]
+    return "\n".join([CLI_HEAD, *sections])
+
+
+def help_of(verb: str) -> str:
+    """Return what ``thermogrip VERB --help`` prints, without the options that every verb has."""
+    from thermogrip.cli.main import main
+
+    os.environ["COLUMNS"] = str(_WIDTH)
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        main([verb, "--help"])
+    text = re.sub(r"\n  (?:--seed N|--json|-h, --help) .*(?:\n {20,}.*)*", "", out.getvalue().rstrip())
+    return "\n".join(line.rstrip() for line in text.splitlines())
+
+
+def page_of_room(room: str) -> str:
+    """Return signature and first sentence of every name that a room exports."""
+    module = importlib.import_module(f"thermogrip.{room}")
+    sections = [section(name, getattr(module, name)) for name in module.__all__]
+    return "\n".join([ROOM_HEAD.format(room=room, subject=ROOMS[room]), *sections])
+
+
+def section(name: str, value: Any) -> str:
+    """Return what the reference says of a public name."""
+    if inspect.ismodule(value):
+        return f"## {name}\n\nA module. {first_sentence(value)}\n"
+    if not callable(value):
+        return f"## {name}\n\nA {type(value).__name__}.\n"
+    text = f"## {name}\n\n```text\n{signature(name, value)}\n```\n\n{first_sentence(value)}\n"
+    if methods := methods_of(value):
+        text += "\n" + "".join(
+            f"- `{method}`: {first_sentence(found)}\n" for method, found in methods.items()
+        )
+    return text
+
+
+def methods_of(value: Any) -> dict[str, Any]:
+    """Return the public methods and properties that a class of ours defines, with their docstrings."""
+    kinds = inspect.getmro(value) if inspect.isclass(value) else ()
+    found: dict[str, Any] = {}
+    for kind in reversed([kind for kind in kinds if kind.__module__.startswith("thermogrip.")]):
+        found |= {name: member for name, member in vars(kind).items() if not name.startswith("_")}
+    routines = {name: getattr(member, "__func__", member) for name, member in found.items()}
+    shown = (inspect.isfunction, inspect.isdatadescriptor)
+    return {name: member for name, member in routines.items() if any(is_kind(member) for is_kind in shown)}
+
+
+def first_sentence(value: Any) -> str:
+    """Return the first sentence of a docstring, on one line."""
+    paragraph = " ".join((inspect.getdoc(value) or "").partition("\n\n")[0].split())
+    sentence = re.split(r"(?<=[.:])\s(?=[A-Z])", paragraph)[0]
+    plain = re.sub(r":\w+:`~?(?:[\w.]+\.)?(\w+)`", r"`\1`", sentence)
+    return plain.replace("``", "`")
+
+
+def signature(name: str, value: Any) -> str:
+    """Return how a function or class is called, a parameter a line where one line is too short."""
+    made = inspect.signature(value)
+    if inspect.isclass(value):
+        made = made.replace(return_annotation=inspect.Signature.empty)
+    line = plain_annotations(f"{name}{made}")
+    if len(line) <= _WIDTH:
+        return line
+    parts, named_only = [], False
+    for parameter in made.parameters.values():
+        if parameter.kind is parameter.KEYWORD_ONLY and not named_only:
+            parts.append("*")
+        named_only = named_only or parameter.kind in (parameter.KEYWORD_ONLY, parameter.VAR_POSITIONAL)
+        parts.append(plain_annotations(str(parameter)))
+    begin, end = f"{name}(\n", plain_annotations(str(made.replace(parameters=()))).removeprefix("(")
+    return begin + "".join(f"    {part},\n" for part in parts) + end
+
+
+def plain_annotations(text: str) -> str:
+    """Return a signature without the quotes of its annotations, and with dots for defaults that are no
+    literals."""
+    text = re.sub(r"(: |-> )'([^']*)'", r"\1\2", text)
+    return re.sub(r"= <[^<>]*>", "= ...", text)
+
+
+def main() -> None:
+    """Write the pages."""
+    for path, text in pages().items():
+        path.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
