@@ -348,7 +348,7 @@ def _as_model(grid: Grid, data: _Data, members: Sequence[_Member], h: int) -> Ne
 def _with_spread(model: NeuralModel, grid: Grid, starts: Array) -> NeuralModel:
     """Return the model with the covariance of its states over the training data; starts (K, n_segment, n)."""
     rows = [
-        model.states(starts[:, at].reshape(1, -1), s.u[None], s.d[None], grid.dt)[0]
+        model.states(starts[:, at], s.u, s.d, grid.dt)
         for at, s in enumerate(grid.segments)
     ]
     spread = np.atleast_2d(np.cov(np.concatenate(rows).T))

@@ -147,32 +147,43 @@ class NeuralModel(BlackBox):
 
     def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
         """Simulate a batch."""
-        x = self.states(x0, u, d, dt)
-        members, n, n_y = len(self.A), self.A.shape[1], len(self.outputs)
-        seen = x.reshape(*x.shape[:2], members, n)[..., :n_y].mean(axis=2)
-        return self.y_middle + self.y_size * seen, x[:, -1]
+        from thermogrip.sysid.models.neural_kernel import run_outputs  # pulls in numba
+
+        drives, times, weights, rails = self._prepared(u, d, dt)
+        x0 = np.asarray(x0, dtype=float).reshape(-1, *self.A.shape[:2])
+        together = [slice(None)] if len(drives) == 1 else [slice(b, b + 1) for b in range(len(x0))]
+        runs = [
+            run_outputs(self.A, weights, self.b.shape[1], x0[rows], w, *rails)
+            for rows, w in zip(together, drives)
+        ]
+        y, x_end = runs[0] if len(runs) == 1 else (np.concatenate(parts) for parts in zip(*runs))
+        y = y[:, ::times]
+        y *= self.y_size
+        y += self.y_middle
+        return y, x_end.reshape(len(x0), self.n_x)
 
     def states(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, dt: float) -> Array:
-        """Return the states (B, N + 1, n_x) of :meth:`rollout`."""
-        from thermogrip.sysid.models.neural_kernel import run_states  # pulls in numba
+        """Return the states (N + 1, n_x) from one x0 (n_x,) under u (N, n_u) and d (N, n_d)."""
+        from thermogrip.sysid.models.neural_kernel import run_states
 
-        x0 = np.asarray(x0, dtype=float)
+        (w,), times, weights, rails = self._prepared(np.asarray(u)[None], np.asarray(d)[None], dt)
+        x0 = np.asarray(x0, dtype=float).reshape(self.A.shape[:2])
+        x = run_states(self.A, weights, self.b.shape[1], x0, w, *rails)
+        return np.moveaxis(x[:, ::times], 0, 1).reshape(-1, self.n_x)
+
+    def _prepared(
+        self, u: ArrayLike, d: ArrayLike, dt: float
+    ) -> tuple[list[Array], int, Array, tuple[Array, Array]]:
+        """Return scaled drives (N, m) of each run, steps per row, weights, and rails in scaled units."""
         w = join_columns(np.asarray(u, dtype=float), np.asarray(d, dtype=float))
         w = np.clip((w - self.w_middle) / self.w_size, -self.reach, self.reach)
         times = max(1, round(dt / self.dt))  # the step of a gap may differ a little from the model's
-        w = np.repeat(w, times, axis=1)
-        members, n, batch = len(self.A), self.A.shape[1], len(x0)
-        low, high = (self.low - self.y_middle) / self.y_size, (self.high - self.y_middle) / self.y_size
-        theta, h = self._theta(), self.b.shape[1]
-        groups = [(slice(0, batch), w[0])] if len(w) == 1 else [(slice(i, i + 1), w[i]) for i in range(batch)]
-        out = np.empty((batch, w.shape[1] + 1, self.n_x))
-        for rows, drive in groups:
-            count = len(x0[rows])
-            start = np.ascontiguousarray(x0[rows].reshape(count * members, n))
-            A, weights = np.tile(self.A, (count, 1, 1)), np.tile(theta, (count, 1))
-            x = run_states(A, weights, h, start, np.ascontiguousarray(drive), low, high)
-            out[rows] = np.moveaxis(x.reshape(count, members, -1, n), 1, 2).reshape(count, -1, self.n_x)
-        return out[:, ::times]
+        w = np.ascontiguousarray(np.repeat(w, times, axis=1))
+        members = len(self.A)
+        parts = (self.B, self.c, self.V, self.W, self.U, self.b)
+        weights = np.hstack([part.reshape(members, -1) for part in parts])
+        rails = (self.low - self.y_middle) / self.y_size, (self.high - self.y_middle) / self.y_size
+        return list(w), times, weights, rails
 
     def to_dict(self) -> dict[str, Any]:
         """Return the model as plain lists and numbers, for JSON (``None``: no rail)."""
@@ -184,11 +195,6 @@ class NeuralModel(BlackBox):
         """Return the rails."""
         open_ends = zip(_RAILS, (-np.inf, np.inf))
         return {key: [free if v is None else v for v in data[key]] for key, free in open_ends}
-
-    def _theta(self) -> Array:
-        members = len(self.A)
-        parts = (self.B, self.c, self.V, self.W, self.U, self.b)
-        return np.hstack([part.reshape(members, -1) for part in parts])
 
     def _advance(self, x: Array, w: Array) -> Array:
         """Return the next states (K, n) of x (K, n) and w (K, m), not clipped."""

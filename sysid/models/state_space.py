@@ -46,6 +46,8 @@ from thermogrip.sysid.models.lti import (
 )
 from thermogrip.sysid.models.model import BlackBox
 
+_AT_ONCE = 2_000_000  # numbers of states at a time, 16 MB, of which a simulation has five copies
+
 
 @dataclass(frozen=True, eq=False)
 class StateSpaceModel(BlackBox):
@@ -148,16 +150,26 @@ class StateSpaceModel(BlackBox):
         return constrained_lstsq(rows, right, fixed, (y - self.y0)[known])[: self.n_x]
 
     def rollout(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, p: ArrayLike, dt: float) -> Run:
-        """Simulate a batch."""
-        x = self.states(x0, u, d, dt)
-        return x @ self.C.T + self.y0, x[:, -1]
+        """Simulate a batch, so many rows at a time that their states have :data:`_AT_ONCE` numbers."""
+        x_end, u, d = (np.asarray(value, dtype=float) for value in (x0, u, d))
+        rows = max(1, _AT_ONCE // max(1, x_end.size * max(1, round(dt / self.dt))))
+        if u.shape[1] <= rows or not self._in_whole_steps(dt):  # others are interpolated over the whole of it
+            x = self.states(x_end, u, d, dt)
+            return x @ self.C.T + self.y0, x[:, -1]
+        y = np.empty((len(x_end), u.shape[1] + 1, len(self.outputs)))
+        for begin in range(0, u.shape[1], rows):
+            part = slice(begin, begin + rows)
+            x = self.states(x_end, u[:, part], d[:, part], dt)
+            y[:, begin : begin + x.shape[1]] = x @ self.C.T + self.y0
+            x_end = x[:, -1]
+        return y, x_end
 
     def states(self, x0: ArrayLike, u: ArrayLike, d: ArrayLike, dt: float) -> Array:
         """Return the states (n_batch, N + 1, n_x) of :meth:`rollout`."""
         x0 = np.asarray(x0, dtype=float)
         u, d = np.asarray(u, dtype=float), np.asarray(d, dtype=float)
         times = round(dt / self.dt)
-        if times < 1 or abs(times * self.dt - dt) > 1e-6 * dt:
+        if not self._in_whole_steps(dt):
             return self._uneven_states(x0, u, d, dt)
         if times > 1:
             u, d = np.repeat(u, times, axis=1), np.repeat(d, times, axis=1)
@@ -224,6 +236,11 @@ class StateSpaceModel(BlackBox):
     @cached_property
     def _term_factors(self) -> list[list[tuple[int, bool]]]:
         return read_terms(self.terms, self.inputs + self.disturbances)
+
+    def _in_whole_steps(self, dt: float) -> bool:
+        """Tell whether ``dt`` [s] is a whole multiple of the model's own step."""
+        times = round(dt / self.dt)
+        return times >= 1 and abs(times * self.dt - dt) <= 1e-6 * dt
 
     def _uneven_states(self, x0: Array, u: Array, d: Array, dt: float) -> Array:
         """Run the nearest whole number of own steps over the stretch and interpolate the states."""

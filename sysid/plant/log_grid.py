@@ -254,7 +254,11 @@ def at_rows(stretch: Stretch, run: Array, dt: float) -> Array:
     place = np.clip(stretch.time / dt, 0.0, run.shape[1] - 1)
     left = np.minimum(place.astype(int), run.shape[1] - 2)
     share = (place - left)[None, :, None]
-    return np.asarray((1 - share) * run[:, left] + share * run[:, left + 1])
+    out, after = run[:, left], run[:, left + 1]  # in place: a run may be long, and a batch large
+    out *= 1 - share
+    after *= share
+    out += after
+    return np.asarray(out)
 
 
 def bridge(y: Array) -> Array:

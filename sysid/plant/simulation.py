@@ -42,6 +42,7 @@ AT_REST = 1.0  # [K] between any two sensors of a rig at rest
 AT_REST_FOR = 5.0  # [s] at most, for the drive may move the rig at once
 _LEAST_NOISE = 1e-6  # of a plant that was fitted to readings without any, in their unit
 _CHANGES = 4_000_000  # steps of all the runs that look for the change within a gap
+_ROUNDING = 1e-8  # of the largest sd of the state: eigenvalues of a covariance are known to 1e-16 of it
 READING_EVERY = 10.0  # [s] between independent readings of a warm-up
 
 
@@ -168,19 +169,23 @@ def _corrected(
 ) -> Start:
     """Shift the start (and, if asked, the sensor offsets) to what the warm-up says."""
     pooled = np.array([plant.offsets.get(name, 0.0) for name in plant.outputs])
+    free = np.array([plant.nuisance.get(name, 0.0) for name in plant.outputs]) * float(offsets)
+    root = symmetric_root(plant.model.spread)
+    size = np.linalg.norm(root, axis=0)  # its columns are orthogonal
+    along = np.divide(root, size**2, out=np.zeros_like(root), where=size > _ROUNDING * size.max())
     for _ in range(2):
         residual, response = _warm(plant, p, stretch, start, start.x0[None], warmup)
-        root = symmetric_root(plant.model.spread)
         blocks = [response @ root]
-        free = np.array([plant.nuisance.get(name, 0.0) for name in plant.outputs]) * float(offsets)
         blocks.append(np.concatenate([np.diag(free / noise) for noise in _noise(plant, stretch, warmup)]))
         known = np.isfinite(residual[0])
         A, r = np.hstack(blocks)[known], residual[0][known]
         # the prior is about the first guess, so what was moved before counts
         beside = np.divide(start.y_offset - pooled, free, out=np.zeros(len(free)), where=free > 0)
-        moved = np.concatenate([np.linalg.lstsq(root, start.shift, rcond=None)[0], beside])
-        rows, right = np.vstack([A, np.eye(A.shape[1])]), np.concatenate([r, -moved])
-        step = np.linalg.lstsq(rows, right, rcond=None)[0]
+        moved = np.concatenate([along.T @ start.shift, beside])
+        # min |A s - r|^2 + |s + moved|^2 within the directions that the few rows of A see
+        axes, seen = np.linalg.qr(A.T)
+        rows, right = np.vstack([seen.T, np.eye(len(seen))]), np.append(r + A @ moved, np.zeros(len(seen)))
+        step = axes @ np.linalg.lstsq(rows, right, rcond=None)[0] - moved
         shift = root @ step[: plant.model.n_x]
         start = replace(
             start,

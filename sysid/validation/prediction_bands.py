@@ -129,15 +129,19 @@ def free_run_band(
     wide = NormalDist().inv_cdf(0.5 + level / 2)
     taken = draws if plant.uncertain else 0
     stretches = cut_stretches(plant, match_logs(plant, [log])[0][0]) if taken else []
-    runs = [plant.draw(k).over(stretches, warmup)[0] for k in range(1, taken + 1)]
+    run, variances = (
+        columns(simulated, plant.outputs),
+        np.zeros((simulated.sizes["time"], len(plant.outputs))),
+    )
+    for k in range(1, taken + 1):
+        variances += (plant.draw(k).over(stretches, warmup)[0] - run) ** 2 / taken
     scored = np.asarray(simulated["scored"].values) > 0
     half, inside, expected = {}, {}, {}
     other_run, unlike = between_runs(plant, [log]), unlike_fit(plant, log, simulated, warmup)
     far = False
     for at, name in enumerate(plant.outputs):
         nominal = column(simulated, name)
-        spread = np.array([run[:, at] - nominal for run in runs]).reshape(taken, len(nominal))
-        variance = np.mean(spread**2, axis=0) if taken else np.zeros(len(nominal))
+        variance = variances[:, at]
         own = _own_variance(plant, name, variance, level) + plant.scores.reading_excess.get(name, 0.0) ** 2
         seen = variance + own + other_run.get(name, 0.0) ** 2
         added = unlike.get(name, 0.0) ** 2
@@ -295,6 +299,7 @@ def _few_parts(plant: Plant, name: str, level: float) -> float:
 
 
 MOST_DISAGREEMENT = 0.4  # of the output's spread in the data of the fit
+_STATES_AT_ONCE = 1_000_000  # numbers, 8 MB
 
 
 def ensemble_disagreement(plant: Plant, log: Log, *, warmup: float = 5.0) -> dict[str, float]:
@@ -303,12 +308,18 @@ def ensemble_disagreement(plant: Plant, log: Log, *, warmup: float = 5.0) -> dic
     if not isinstance(model, NeuralModel) or len(model.A) < 2:
         return {}
     stretches, n_y = cut_stretches(plant, log), len(model.outputs)
-    parts = []
+    rows = max(1, _STATES_AT_ONCE // model.n_x)
+    variance, count = np.zeros(n_y), 0
     for stretch, start in zip(stretches, find_starts(plant, plant.p, stretches, warmup)):
-        d = stretch.d - start.d_offset
-        x = model.states(start.x0[None], stretch.u[None], d[None], plant.dt)[0]
-        parts.append(x.reshape(len(x), *model.A.shape[:2])[:, :, :n_y].var(axis=1))
-    return dict(zip(model.outputs, np.sqrt(np.concatenate(parts).mean(axis=0)).tolist()))
+        x_end = start.x0
+        for begin in range(0, len(stretch.u), rows):
+            part = slice(begin, begin + rows)
+            x = model.states(x_end, stretch.u[part], stretch.d[part] - start.d_offset, plant.dt)
+            fresh = x if begin == 0 else x[1:]
+            members = fresh.reshape(len(fresh), *model.A.shape[:2])[:, :, :n_y]
+            variance += members.var(axis=1).sum(axis=0)
+            count, x_end = count + len(fresh), x[-1]
+    return dict(zip(model.outputs, np.sqrt(variance / count).tolist()))
 
 
 def check_ensemble(plant: Plant, log: Log, *, warmup: float = 5.0) -> None:

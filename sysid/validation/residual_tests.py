@@ -211,6 +211,7 @@ _REST, _AFTER_GAP = 0.1, 3.0  # prior sd of a start at rest, and after a gap
 _BIAS_AT_REST = 0.05  # [K] sd of an ambient's bias after a start at rest
 _MODE = 0.02  # rms of the residual: a start that moves no block by more is left out
 _FARTHEST = 1e6  # rms of the residual: from a start that moves more, the run diverged
+_AT_ONCE = 2_000_000  # outputs of the runs from starts at a time, 16 MB, of which a few copies are alive
 _RANK = 1e-6  # of the largest: directions of x that are the others over again
 
 
@@ -248,9 +249,7 @@ def residual_correlations(
     rms = np.sqrt(np.nanmean(residual**2, axis=0)) if residual is not None else np.zeros(1)
     if residual is None or not rms.all():
         return ResidualCorrelations({}, {})
-    draws = [plant.draw(k) for k in range(1, _DRAWS + 1)] if plant.uncertain else []
-    drawn = _of_draws([draw.over(stretches, warmup)[0] for draw in draws], run, rms)
-    parts = _parts(plant, stretches, residual, drawn, rms, warmup)
+    parts = _parts(plant, stretches, run, residual, rms, warmup)
     if not parts:
         return ResidualCorrelations({}, {})
     signals = list(parts[0].tested)
@@ -276,27 +275,44 @@ class _Blocks:
     """Which rows of a stretch make which block."""
 
     def __init__(self, stretch: Stretch, residual: Array, width: float) -> None:
-        self._known = np.isfinite(residual)
-        some = self._known.any(axis=1)
+        known = np.isfinite(residual)
+        some = known.any(axis=1)
         cell = np.floor(stretch.time / width + 1e-9).astype(int)
         first, last = (int(cell[some][0]), int(cell[some][-1])) if some.any() else (0, -1)
-        self._cell, self.n = cell - first, last - first + 1
-        each = [np.unique(self._cell[known]).size for known in self._known.T]
-        self.enough = min(each) >= max(_FEWEST, self.n / 2)
+        cell, self.n = cell - first, last - first + 1
+        within = (cell >= 0) & (cell < self.n)
+        self._of_outputs = [_Cells.of(cell, rows) for rows in known.T]
+        self._of_inputs = _Cells.of(cell, within)
+        self.enough = min(each.place.size for each in self._of_outputs) >= max(_FEWEST, self.n / 2)
 
     def of_readings(self, values: Array) -> Array:
         """Return means (n, n_y, q) of values (rows, n_y, q) where each output was read; lines between."""
-        return np.stack([self._means(values[:, j], known) for j, known in enumerate(self._known.T)], axis=1)
+        means = [cells.means(values[:, j], self.n) for j, cells in enumerate(self._of_outputs)]
+        return np.stack(means, axis=1)
 
     def of_inputs(self, values: Array) -> Array:
         """Return means (n, q) of values (rows, q) that are known at every row."""
-        return self._means(values, (self._cell >= 0) & (self._cell < self.n))
+        return self._of_inputs.means(values, self.n)
 
-    def _means(self, values: Array, known: Mask) -> Array:
-        place, where, count = np.unique(self._cell[known], return_inverse=True, return_counts=True)
-        at, out = np.arange(self.n), np.empty((self.n, values.shape[1]))
-        for k, column in enumerate(values[known].T):
-            out[:, k] = np.interp(at, place, np.bincount(where, column) / count)
+
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """The blocks of one signal."""
+
+    known: Mask  # which rows of the stretch count
+    place: NDArray[np.int_]  # the blocks that have any of these
+    where: NDArray[np.int_]  # of each known row, which of them
+    count: NDArray[np.int_]  # rows in each
+
+    @classmethod
+    def of(cls, cell: NDArray[np.int_], known: Mask) -> _Cells:
+        return cls(known, *np.unique(cell[known], return_inverse=True, return_counts=True))
+
+    def means(self, values: Array, n: int) -> Array:
+        """Return means (n, q) of values (rows, q), on lines between the blocks that have any."""
+        at, out = np.arange(n), np.empty((n, values.shape[1]))
+        for k, column in enumerate(values.T):
+            out[:, k] = np.interp(at, self.place, np.bincount(self.where, column[self.known]) / self.count)
         return out
 
 
@@ -312,73 +328,103 @@ def _residual(read: Array, run: Array, scored: Mask) -> Array | None:
     return np.where(known, read - run, np.nan)
 
 
-def _of_draws(runs: Sequence[Array], nominal: Array, rms: Array) -> Array:
-    """Return the change of each draw of the parameters, (rows, n_y, n_draw), one sd all together."""
-    out = []
-    for run in runs:
-        change = run - nominal
-        if np.isfinite(change).all():  # a draw that diverges has no information on small changes
-            out.append(change / max(1.0, float((np.abs(change).max(axis=0) / (_WIDE * rms)).max())))
-    return np.stack(out, axis=2) / np.sqrt(len(out)) if out else np.zeros((*nominal.shape, 0))
+@dataclass(frozen=True, eq=False)
+class _Tested:
+    """A stretch that is long enough, its start and its blocks."""
+
+    stretch: Stretch
+    start: Start
+    blocks: _Blocks
+    after_gap: bool
 
 
 def _parts(
-    plant: Plant, stretches: Sequence[Stretch], residual: Array, drawn: Array, rms: Array, warmup: float
+    plant: Plant, stretches: Sequence[Stretch], run: Array, residual: Array, rms: Array, warmup: float
 ) -> list[_Part]:
     """Return the stretches that are long enough."""
     starts = find_starts(plant, plant.p, stretches, warmup)
     step = max(plant.dt, *(float(np.median(np.diff(s.time))) for s in stretches if s.time.size > 1), 1e-9)
     width = step * max(1, int(np.ceil(max(s.time[-1] for s in stretches) / step / _BLOCKS)))
     moved = [k for k in range(len(plant.inputs)) if any(np.ptp(s.u[:, k]) > 0 for s in stretches)]
+    tested = [
+        _Tested(stretch, start, _Blocks(stretch, residual[stretch.rows], width), after_gap=at > 0)
+        for at, (stretch, start) in enumerate(zip(stretches, starts))
+    ]
+    tested = [one for one in tested if one.blocks.enough]
+    draws = _draw_changes(plant, stretches, tested, run, rms, warmup) if tested else []
     out = []
-    for at, (stretch, start) in enumerate(zip(stretches, starts)):
-        rows = residual[stretch.rows]
-        blocks = _Blocks(stretch, rows, width)
-        if not blocks.enough:
-            continue
-        runs = _runs(plant, stretch, start, after_gap=at > 0)
-        fixed = [blocks.of_readings(part) for part in (drawn[stretch.rows], runs.biases)]
+    for one, drawn in zip(tested, draws):
+        blocks, rows = one.blocks, residual[one.stretch.rows]
+        nominal = _run(plant, one, one.start.x0[None])
+        biases = _bias_changes(plant, one, nominal)
         offsets = np.tile(np.diag(np.full(len(rms), _WIDE)), (blocks.n, 1, 1))
         out.append(
             _Part(
-                np.concatenate([offsets, *(part / rms[:, None] for part in fixed)], axis=2),
-                _modes(blocks.of_readings(runs.starts) / rms[:, None]),
-                _tested(plant, stretch, runs.nominal, moved, blocks, width / plant.dt),
+                np.concatenate([offsets, *(part / rms[:, None] for part in (drawn, biases))], axis=2),
+                _modes(_start_changes(plant, one) / rms[:, None]),
+                _signals(plant, one.stretch, nominal[0], moved, blocks, width / plant.dt),
                 blocks.of_readings(rows[:, :, None])[:, :, 0] / rms,
             )
         )
     return out
 
 
-@dataclass(frozen=True, eq=False)
-class _Runs:
-    """The run (N + 1, n_y) of a stretch on its grid, what starts and biases change (rows, n_y, k)."""
+def _draw_changes(
+    plant: Plant,
+    stretches: Sequence[Stretch],
+    tested: Sequence[_Tested],
+    run: Array,
+    rms: Array,
+    warmup: float,
+) -> list[Array]:
+    """Return by stretch the changes (n, n_y, n_draw) of draws of the parameters, one sd all together."""
+    out: list[list[Array]] = [[np.zeros((one.blocks.n, len(rms), 0))] for one in tested]
+    for k in range(1, _DRAWS + 1 if plant.uncertain else 1):
+        change = plant.draw(k).over(stretches, warmup)[0] - run
+        if not np.isfinite(change).all():  # a draw that diverges has no information on small changes
+            continue
+        change /= max(1.0, float((np.abs(change).max(axis=0) / (_WIDE * rms)).max()))
+        for means, one in zip(out, tested):
+            means.append(one.blocks.of_readings(change[one.stretch.rows, :, None]))
+    return [np.concatenate(means, axis=2) / np.sqrt(max(1, len(means) - 1)) for means in out]
 
-    nominal: Array
-    starts: Array
-    biases: Array
+
+def _run(plant: Plant, one: _Tested, x0: Array, bias: Array | float = 0.0) -> Array:
+    """Return runs (B, N + 1, n_y) of a stretch from x0 (B, n_x), its ambients lower by ``bias`` (n_d,)."""
+    d = one.stretch.d - one.start.d_offset - bias
+    return plant.model.rollout(x0, one.stretch.u[None], d[None], plant.p[None], plant.dt)[0]
 
 
-def _runs(plant: Plant, stretch: Stretch, start: Start, *, after_gap: bool) -> _Runs:
+def _start_changes(plant: Plant, one: _Tested) -> Array:
+    """Return what a start further by one prior sd in each direction changes, in means (n, n_y, n_x) over
+    blocks.  A few directions are run at a time and none of their runs is kept, for there may be hundreds."""
     size, axes = np.linalg.eigh(plant.model.spread)
     root = axes * np.sqrt(np.maximum(size, 0.0))
-    root = root * (_AFTER_GAP if after_gap else _REST if start.level is not None else 1.0)
-    d, p = stretch.d - start.d_offset, plant.p[None]
-    # a tenth of it: a state near a limit must not cross it
-    x0 = np.vstack([start.x0, start.x0 + 0.1 * root.T])
-    runs = plant.model.rollout(x0, stretch.u[None], d[None], p, plant.dt)[0]
-    with np.errstate(over="ignore", invalid="ignore"):  # a run from a far start may diverge
-        starts = 10.0 * np.moveaxis(at_rows(stretch, runs[1:] - runs[0], plant.dt), 0, 2)
-    biases = []
+    root = root * (_AFTER_GAP if one.after_gap else _REST if one.start.level is not None else 1.0)
+    together = max(1, _AT_ONCE // (len(one.stretch.u) * len(plant.outputs)))
+    means = []
+    for begin in range(0, len(root), together):
+        # a tenth of it: a state near a limit must not cross it
+        moved = one.start.x0 + 0.1 * root.T[begin : begin + together]
+        with np.errstate(over="ignore", invalid="ignore"):  # a run from a far start may diverge
+            runs = _run(plant, one, np.vstack([one.start.x0, moved]))
+            change = 10.0 * at_rows(one.stretch, runs[1:] - runs[0], plant.dt)
+        np.clip(change, -1e100, 1e100, out=change)
+        np.nan_to_num(change, copy=False, nan=1e100)  # what diverged is left out later
+        means.append(one.blocks.of_readings(np.moveaxis(change, 0, 2)))
+    return np.concatenate(means, axis=2)
+
+
+def _bias_changes(plant: Plant, one: _Tested, nominal: Array) -> Array:
+    """Return what the bias of each ambient changes of the run (1, N + 1, n_y), in means (n, n_y, k)."""
+    changes = [np.zeros((one.blocks.n, len(plant.outputs), 0))]
     for k, name in enumerate(plant.disturbances):
-        bias = min(plant.nuisance.get(name, 0.0), np.inf if start.level is None else _BIAS_AT_REST)
-        if bias > 0:
-            moved = d - bias * (np.arange(d.shape[1]) == k)
-            run = plant.model.rollout(x0[:1], stretch.u[None], moved[None], p, plant.dt)[0]
-            biases.append(at_rows(stretch, run - runs[:1], plant.dt)[0])
-    starts = np.nan_to_num(np.clip(starts, -1e100, 1e100), nan=1e100)  # what diverged is left out later
-    nothing = np.zeros((stretch.time.size, runs.shape[2], 0))
-    return _Runs(runs[0], starts, np.stack(biases, axis=2) if biases else nothing)
+        sd = min(plant.nuisance.get(name, 0.0), np.inf if one.start.level is None else _BIAS_AT_REST)
+        if sd > 0:
+            run = _run(plant, one, one.start.x0[None], sd * (np.arange(len(plant.disturbances)) == k))
+            change = at_rows(one.stretch, run - nominal, plant.dt)[0]
+            changes.append(one.blocks.of_readings(change[:, :, None]))
+    return np.concatenate(changes, axis=2)
 
 
 def _modes(columns_of: Array) -> Array:
@@ -391,7 +437,7 @@ def _modes(columns_of: Array) -> Array:
     return np.asarray(modes.reshape(*columns_of.shape[:2], modes.shape[1]))
 
 
-def _tested(
+def _signals(
     plant: Plant, stretch: Stretch, run: Array, moved: Sequence[int], blocks: _Blocks, steps: float
 ) -> dict[str, Array]:
     """Return x (n, 4) by signal, of about unit size."""

@@ -233,8 +233,8 @@ def test_members_of_two_sizes_are_one_model_in_the_units_of_the_readings():
     ]
     model = neural._averaged(grid, data, members)
     assert (model.A.shape, model.V.shape, model.U.shape) == ((2, 3, 3), (2, 3, 3), (2, 3, 3))
-    x0, drive = np.concatenate([some.padded(3, 3).x0[0] for some in members])[None], u[0][None]
-    rows = model.states(x0, drive[:, :, :2], drive[:, :, 2:], 1.0)[0]
+    x0, drive = np.concatenate([some.padded(3, 3).x0[0] for some in members]), u[0]
+    rows = model.states(x0, drive[:, :2], drive[:, 2:], 1.0)
     spread = np.cov(rows.T)
     np.testing.assert_allclose(model.spread, spread + 1e-8 * np.trace(spread) * np.eye(6), rtol=1e-12)
     n, h = sizes[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from thermogrip.datasets.schema import Log, columns, make_log
 from thermogrip.sysid.greybox.noise_model import Block, band_weights
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import PlantScores
-from thermogrip.sysid.plant.log_grid import Stretch, cut_stretches
+from thermogrip.sysid.plant.log_grid import Stretch, at_rows, cut_stretches
 from thermogrip.sysid.plant.plant import Plant
 from thermogrip.sysid.plant.simulation import Start
 from thermogrip.sysid.validation import residual_tests as tests
@@ -240,6 +241,12 @@ def stretch(n: int, u: float | np.ndarray = 0.0, d: float | None = None) -> Stre
     return Stretch(slice(0, n), np.arange(float(n)), np.zeros((n, 1)), np.zeros((n, 1)) + u, room, 0.0, "a")
 
 
+def in_blocks(rows: Stretch, residual: np.ndarray, start: Start | None = None) -> tests._Tested:
+    """A stretch in blocks of a row."""
+    start = start or Start(np.zeros(1), np.zeros(1), np.zeros(1), np.zeros(1), None, 0.0, "")
+    return tests._Tested(rows, start, tests._Blocks(rows, residual, 1.0), after_gap=False)
+
+
 def test_blocks_are_means_where_read_and_lines_between():
     # cells of 2 s from the first reading on: readings of the 3rd and 5th block are lost
     time, values = np.arange(46.0), np.arange(46.0) ** 2
@@ -315,11 +322,17 @@ def test_directions_of_a_start_that_move_nothing_or_diverge_are_left_out():
 
 
 def test_draws_are_one_sd_all_together_and_of_thirty_rms_at_most():
-    seen = np.ones((30, 1))
-    runs = [seen + {1: 2.0, 2: -90.0, 3: np.inf}.get(k, 0.0) for k in range(1, 25)]
-    sure, found = (tests._of_draws(some, seen, np.array([0.5])) for some in ([], runs))
-    assert (sure.shape, found.shape) == ((30, 1, 0), (30, 1, 23))
-    np.testing.assert_allclose(found[0, 0, :3] * np.sqrt(23), [2.0, -15.0, 0.0])
+    seen, rows = np.ones((30, 1)), stretch(30, 0.0)
+    change = {1: 2.0, 2: -90.0, 3: np.inf}
+    drawn = [SimpleNamespace(over=lambda *_, k=k: (seen + change.get(k, 0.0), [])) for k in range(25)]
+    part = in_blocks(rows, rows.y)
+
+    def changes(uncertain: bool) -> np.ndarray:
+        plant = SimpleNamespace(uncertain=uncertain, draw=drawn.__getitem__)
+        return tests._draw_changes(plant, [rows], [part], seen, np.array([0.5]), 5.0)[0]
+
+    assert (changes(False).shape, changes(True).shape) == ((30, 1, 0), (30, 1, 23))
+    np.testing.assert_allclose(changes(True)[0, 0, :3] * np.sqrt(23), [2.0, -15.0, 0.0])
 
 
 def test_signals_are_lags_of_the_input_and_of_the_square_of_the_output():
@@ -328,7 +341,7 @@ def test_signals_are_lags_of_the_input_and_of_the_square_of_the_output():
     rows = stretch(n, u[:, None])
     blocks = tests._Blocks(rows, np.zeros((n, 1)), 2.0)
     run = np.append(np.zeros(30), np.full(31, 6.1))[:, None]
-    found = tests._tested(plant, rows, run, [0], blocks, 2.0)
+    found = tests._signals(plant, rows, run, [0], blocks, 2.0)
     lags = np.array([1.0, 4.0, 16.0, 64.0]) * 2  # of blocks of 2 s
     after = np.maximum(np.arange(n) - 10, 0.0)[:, None]  # a step of 1 at 10 s
     want = (1 - np.exp(-after / lags)).reshape(30, 2, 4).mean(axis=1)
@@ -349,10 +362,38 @@ def test_a_start_counts_three_times_after_a_gap_and_a_tenth_at_rest(after_gap, l
     )
     plant, n = Plant(model, {}, dt=1.0, nuisance={"room": 0.3}), np.arange(30.0)
     begin = Start(np.ones(1), np.zeros(1), np.zeros(1), np.full(1, 2.0), level, 0.0, "")
-    runs = tests._runs(plant, stretch(30, 1.0, 7.0), begin, after_gap=after_gap)
-    np.testing.assert_allclose(np.abs(runs.starts[:, 0, 0]), start * 0.5 * 2 * 0.9**n)
-    np.testing.assert_allclose(runs.biases[:, 0, 0], -bias * 2 * (1 - 0.9**n))  # 0.1 / (1 - 0.9) = 1
-    np.testing.assert_allclose(runs.nominal[:30, 0], 2 * (10 - 9 * 0.9**n))  # (0.5 + 0.1 * 5) / 0.1
+    rows = stretch(30, 1.0, 7.0)
+    part = replace(in_blocks(rows, rows.y, begin), after_gap=after_gap)
+    nominal = tests._run(plant, part, begin.x0[None])
+    moved, biased = tests._start_changes(plant, part), tests._bias_changes(plant, part, nominal)
+    np.testing.assert_allclose(np.abs(moved[:, 0, 0]), start * 0.5 * 2 * 0.9**n)
+    np.testing.assert_allclose(biased[:, 0, 0], -bias * 2 * (1 - 0.9**n))  # 0.1 / (1 - 0.9) = 1
+    np.testing.assert_allclose(nominal[0, :30, 0], 2 * (10 - 9 * 0.9**n))  # (0.5 + 0.1 * 5) / 0.1
+
+
+def test_starts_run_a_few_at_a_time_move_the_blocks_as_all_runs_together(monkeypatch: pytest.MonkeyPatch):
+    rng, n = np.random.default_rng(21), 400
+    root = rng.standard_normal((7, 7))
+    A = root @ np.diag(np.linspace(0.5, 0.99, 7)) @ np.linalg.inv(root)
+    model = StateSpaceModel(
+        ("q",), (), ("t", "s"), A=A, B=np.ones((7, 1)), C=rng.standard_normal((2, 7)), dt=1.0,
+        spread=root @ root.T,
+    )  # fmt: skip
+    plant, residual = Plant(model, {}, dt=1.0), rng.standard_normal((n, 2))
+    residual[rng.random((n, 2)) < 0.2] = np.nan
+    rows = replace(stretch(n, rng.random((n, 1))), time=np.arange(n) + 0.3 * rng.random(n), y=residual)
+    begin = Start(rng.standard_normal(7), np.zeros(7), np.zeros(2), np.zeros(0), None, 0.0, "")
+    part = tests._Tested(rows, begin, tests._Blocks(rows, residual, 8.0), after_gap=False)
+
+    sizes, axes = np.linalg.eigh(model.spread)
+    x0 = np.vstack([begin.x0, begin.x0 + 0.1 * (axes * np.sqrt(sizes)).T])
+    runs, _ = model.rollout(x0, rows.u[None], rows.d[None], (), 1.0)
+    change = 10 * at_rows(rows, runs[1:] - runs[0], 1.0)
+    block = (rows.time // 8).astype(int)
+    change[:, np.isnan(residual)] = np.nan
+    means = [np.nanmean(change[:, block == b], axis=1).T for b in range(n // 8)]
+    monkeypatch.setattr(tests, "_AT_ONCE", 3 * 2 * n)  # three runs at a time
+    np.testing.assert_allclose(tests._start_changes(plant, part), means, rtol=1e-9, atol=1e-11)
 
 
 def test_correlations_of_nothing_and_of_huge_values():
