@@ -4,7 +4,7 @@ from thermogrip.sysid.effusivity.calibration import calibrate_gripper as calibra
 from thermogrip.sysid.effusivity.gripper_model import GripperModel as GripperModel
 from thermogrip.sysid.experiment.schedules import excite as excite
 from thermogrip.sysid.export.dynamics import plant_dynamics as plant_dynamics
-from thermogrip.sysid.export.linearise import linearise_plant as linearise_plant
+from thermogrip.sysid.plant.linearise import linearise_plant as linearise_plant
 from thermogrip.sysid.greybox.fit import fit_network as fit_network
 from thermogrip.sysid.greybox.posterior import sample_posterior as sample_posterior
 from thermogrip.sysid.identification import identify as identify

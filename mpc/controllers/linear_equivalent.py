@@ -117,7 +117,7 @@ def plan_gains(controller: ControllerParts) -> tuple[Array, Array, Array, Array]
 
 def to_control(controller: ControllerParts) -> Any:
     """Return the law as a python-control ``StateSpace``; see :meth:`Controller.to_control`."""
-    from thermogrip.sysid.export.linearise import control_system
+    from thermogrip.sysid.plant.linearise import control_system
 
     if controller.design.on_off:
         problem = f"on_off: what switches {', '.join(controller.design.on_off)} is no linear system"

@@ -1,6 +1,6 @@
 r"""Poles, gains, step and frequency responses of a plant about an operating point, with their uncertainty.
 
-All follow from the matrices of :func:`thermogrip.sysid.export.linearise.linearise_plant` at the plant's own
+All follow from the matrices of :func:`thermogrip.sysid.plant.linearise.linearise_plant` at the plant's own
 step h, and from the same of other plants that agree with the logs (:meth:`Plant.draw`: posterior samples, or
 refits to resampled logs). Each pole z of the step has the continuous equivalent s = ln(z) / h and the time
 constant -1 / Re s; poles at zero are delays. With G the quantity of the plant and G_k those of the draws, the
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.export.linearise import LinearPlant, composed, linearise_plant
+from thermogrip.sysid.plant.linearise import LinearPlant, composed, linearise_plant
 from thermogrip.sysid.plant.fit_record import RUN_GAIN_SD, SEVERAL
 
 if TYPE_CHECKING:

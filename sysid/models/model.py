@@ -1,4 +1,4 @@
-"""Equations without numbers: what every model offers, and which class reads a saved one back.
+"""Equations without numbers: what every model offers.
 
 With the state x, the inputs u, the measured disturbances d and the parameters p,
 
@@ -16,7 +16,6 @@ either.
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, runtime_checkable
@@ -25,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from thermogrip.datasets.arrays import Array, Mask, Run, Values
-from thermogrip.datasets.errors import UserError, known_names
+from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import STEP_RANGE, array_within, number_within
 from thermogrip.sysid.models.network_spec import Parameter
 
@@ -33,15 +32,6 @@ if TYPE_CHECKING:
     from thermogrip.sysid.models.jit_rollout import Equations
 
 SMOOTH = 20.0  # [s] mean of a measured ambient, for its sensor is slow and coarse
-
-# Which class reads a saved model, by its kind; a file can name no other code.
-_KINDS = {
-    "network": ("thermogrip.sysid.models.network", "NetworkModel"),
-    "statespace": ("thermogrip.sysid.models.state_space", "StateSpaceModel"),
-    "neural": ("thermogrip.sysid.models.neural", "NeuralModel"),
-    "sindy": ("thermogrip.sysid.models.polynomial", "SindyModel"),
-    "own": ("thermogrip.sysid.models.user_model", "OwnModel"),  # which refuses: its code is not in the file
-}
 
 
 class Model(Protocol):
@@ -146,22 +136,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return value.tolist()
     return list(value) if isinstance(value, tuple) else value
-
-
-def load_model(content: Mapping[str, Any], *, code: Model | None = None) -> Model:
-    """Return the model that ``Model.to_dict`` wrote, by its ``kind``."""
-    kind = content.get("kind") if isinstance(content, Mapping) else None
-    if not isinstance(kind, str) or kind not in _KINDS:
-        raise UserError(f"model of kind {kind!r} is unknown", hint=known_names(kind, _KINDS))
-    if code is not None:
-        restored = getattr(code, "restored", None)
-        if restored is None or kind != code.kind:
-            raise UserError(f"its model ({kind}) needs no class", hint="leave the class out")
-        own: Model = restored(content)
-        return own
-    module, name = _KINDS[kind]
-    model: Model = getattr(importlib.import_module(module), name).from_dict(content)
-    return model
 
 
 @runtime_checkable

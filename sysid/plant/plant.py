@@ -6,9 +6,8 @@ A :class:`Plant` is simulated, drawn from, saved, and handed to other libraries.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +18,8 @@ from thermogrip.datasets.atomic_files import check_json, read_json, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import Log, column, log_name, make_log
 from thermogrip.datasets.shown import Shown
-from thermogrip.sysid.models.model import Model, load_model
+from thermogrip.sysid.models.model import Model
+from thermogrip.sysid.models.saved import load_model
 from thermogrip.sysid.plant import plant_data
 from thermogrip.sysid.plant.log_grid import Stretch, at_rows, cut_stretches, match_logs
 from thermogrip.sysid.plant.simulation import AFTER_GAP, Start, find_starts, predict
@@ -251,28 +251,22 @@ class Plant(Shown, plant_data.PlantData):
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise plant_data.not_whole(error) from error
 
-    def free_run(self, log: Log, **how: Any) -> Any:
-        """Return the plant's free run over a log, with its scores and ``band()``; see
-        :func:`thermogrip.sysid.validation.free_run.free_run`."""
-        return import_module("thermogrip.sysid.validation.free_run").free_run(self, log, **how)
-
     def to_control(self, **point: Any) -> Any:
         """Return the plant about an operating point for python-control; see
-        :func:`thermogrip.sysid.export.linearise.to_control`."""
-        return _exporter("to_control")(self, **point)
+        :func:`thermogrip.sysid.plant.linearise.to_control`."""
+        from thermogrip.sysid.plant.linearise import to_control  # pulls in scipy.linalg
+
+        return to_control(self, **point)
 
     def to_scipy(self, **point: Any) -> Any:
         """Return the plant about an operating point for scipy; see
-        :func:`thermogrip.sysid.export.linearise.to_scipy`."""
-        return _exporter("to_scipy")(self, **point)
+        :func:`thermogrip.sysid.plant.linearise.to_scipy`."""
+        from thermogrip.sysid.plant.linearise import to_scipy
+
+        return to_scipy(self, **point)
 
     def to_casadi(self, *, dt: float | None = None) -> Any:
-        """Return one step as a CasADi function; see :func:`thermogrip.sysid.export.linearise.to_casadi`."""
-        return _exporter("to_casadi")(self, dt=dt)
+        """Return one step as a CasADi function; see :func:`thermogrip.sysid.plant.linearise.to_casadi`."""
+        from thermogrip.sysid.plant.linearise import to_casadi
 
-
-
-def _exporter(name: str) -> Callable[..., Any]:
-    """Return a function of :mod:`thermogrip.sysid.export`, which is loaded when it is asked for."""
-    exporter: Callable[..., Any] = getattr(import_module("thermogrip.sysid.export"), name)
-    return exporter
+        return to_casadi(self, dt=dt)

@@ -33,7 +33,7 @@ def grasps_file(tmp_path: Path) -> Path:
 
 LOGS: list[Callable[[Plant, Any], Any]] = [
     lambda plant, log: plant.simulate(log)["t_tank"].values,
-    lambda plant, log: [free_run(plant, log).scores["t_tank"].rmse, plant.free_run(log).band().level],
+    lambda plant, log: [free_run(plant, log).scores["t_tank"].rmse, free_run(plant, log).band().level],
     lambda plant, log: [len(check_data(log, outputs=["t_tank"]).findings)],
     lambda plant, log: identify(
         log, models=["arx"], outputs=["t_tank"], draws=2, order=1

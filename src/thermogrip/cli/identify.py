@@ -476,7 +476,7 @@ def linearise(
     from thermogrip.report.html import write_report
     from thermogrip.report.plant import dynamics_section, gain_table, time_constant_words
     from thermogrip.sysid.export.dynamics import plant_dynamics, usual_point
-    from thermogrip.sysid.export.linearise import linearise_plant, save_linear
+    from thermogrip.sysid.plant.linearise import linearise_plant, save_linear
 
     u, d = usual_point(
         loaded,

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.export.linearise import linearise_plant
+from thermogrip.sysid.plant.linearise import linearise_plant
 from thermogrip.sysid.models.lti import (
     StartPrior,
     constrained_lstsq,

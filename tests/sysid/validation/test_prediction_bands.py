@@ -19,6 +19,7 @@ from thermogrip.sysid.models.neural import NeuralModel
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.plant.fit_record import HeldOut, PlantScores
 from thermogrip.sysid.plant.plant import Plant
+from thermogrip.sysid.validation.free_run import free_run
 from thermogrip.sysid.validation.prediction_bands import (
     GAIN_OF_SIZE,
     MOST_DISAGREEMENT,
@@ -167,7 +168,7 @@ def times(log, factor):
 def test_a_run_like_the_fit_adds_nothing_to_its_band(shown):
     plant, log = shown
     assert np.max(unlike_fit(plant, log, plant.simulate(log), 5.0)["t"]) < 1e-6
-    assert "unlike the fit" not in plant.free_run(log).band().own_error
+    assert "unlike the fit" not in free_run(plant, log).band().own_error
     assert unlike_fit(replace(plant, scores=PlantScores()), log, plant.simulate(log), 5.0) == {}
 
 
@@ -177,7 +178,7 @@ def test_what_lies_beyond_the_readings_of_the_fit_is_in_doubt(shown):
     far = times(log, 1.4)
     added = unlike_fit(steps, far, steps.simulate(far), 5.0)["t"]
     np.testing.assert_allclose(added[[99, 199, 299, 399]], [0.0, 20.0, 0.0, 6.0], atol=1e-3)
-    band = plant.free_run(far).band()
+    band = free_run(plant, far).band()
     assert "unlike the fit" in band.own_error
     assert band.half["t"][199] > 1.64 * 20.0
     assert band.expected["t"] == pytest.approx(np.sqrt(np.mean((band.half["t"][5:] / 1.6449) ** 2)), rel=1e-3)

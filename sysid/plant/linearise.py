@@ -38,7 +38,7 @@ from thermogrip.datasets.provenance import KEY, provenance
 from thermogrip.sysid.models.model import GreyModel
 
 if TYPE_CHECKING:
-    from thermogrip.sysid.plant.plant import Plant
+    from thermogrip.sysid.plant.plant_data import PlantData
 
 ROOM = 25.0  # degC, where no temperature of the room is given
 _NUDGE = 1e-3
@@ -81,7 +81,7 @@ class LinearPlant:
 
 
 def linearise_plant(
-    plant: Plant,
+    plant: PlantData,
     *,
     inputs: Mapping[str, float] | None = None,
     disturbances: Mapping[str, float] | None = None,
@@ -172,7 +172,7 @@ def save_linear(near: LinearPlant, path: str | Path) -> Path:
 
 
 def operating_point(
-    plant: Plant, inputs: Mapping[str, float] | None, disturbances: Mapping[str, float] | None
+    plant: PlantData, inputs: Mapping[str, float] | None, disturbances: Mapping[str, float] | None
 ) -> tuple[Array, Array]:
     """Return u (n_u,) and d (n_d,) from what is named of them; see :func:`linearise_plant`."""
     given_u, given_d = dict(inputs or {}), dict(disturbances or {})
@@ -186,25 +186,25 @@ def operating_point(
     return np.array(u, dtype=float), np.array(d, dtype=float)
 
 
-def state_labels(plant: Plant) -> tuple[str, ...]:
+def state_labels(plant: PlantData) -> tuple[str, ...]:
     """Return names of the states without dots, which signal names may not have."""
     if not isinstance(plant.model, GreyModel):
         return tuple(f"x{k + 1}" for k in range(plant.model.n_x))
     return tuple(name.replace(".", "_") for name in plant.model.states)
 
 
-def _output(plant: Plant, x: Array) -> Array:
+def _output(plant: PlantData, x: Array) -> Array:
     return np.array(plant.model.output(x.tolist(), plant.p.tolist()), dtype=float)
 
 
-def _next(plant: Plant, x: Array, u: Array, d: Array) -> Array:
+def _next(plant: PlantData, x: Array, u: Array, d: Array) -> Array:
     """Return the states (B, n_x) one step after x (B, n_x) under u (B, n_u), d (B, n_d)."""
     p = np.repeat(plant.p[None], len(x), axis=0)
     _, end = plant.model.rollout(x, u[:, None], d[:, None], p, plant.dt)
     return np.asarray(end)
 
 
-def _settled(plant: Plant, u: Array, d: Array) -> Array:
+def _settled(plant: PlantData, u: Array, d: Array) -> Array:
     """Return the state in which the plant stays under u and d, by Newton's method."""
     start = np.full(len(plant.outputs), ROOM)
     x = np.asarray(plant.model.rest(start, u, d, plant.p), dtype=float)
@@ -247,11 +247,11 @@ def _matrices(
     return both[:, :n_x], both[:, n_x:]
 
 
-def _discrete(plant: Plant, x: Array, u: Array, d: Array, moved: Sequence[int]) -> tuple[Array, Array]:
+def _discrete(plant: PlantData, x: Array, u: Array, d: Array, moved: Sequence[int]) -> tuple[Array, Array]:
     return _matrices(lambda *w: _next(plant, *(np.ascontiguousarray(v) for v in w)), x, u, d, moved)
 
 
-def steps_in(plant: Plant, dt: float) -> int:
+def steps_in(plant: PlantData, dt: float) -> int:
     """Return how many of the plant's steps ``dt`` [s] is, or refuse it."""
     n = round(dt / plant.dt)
     if n < 1 or abs(n * plant.dt - dt) > 1e-6 * dt:
@@ -270,7 +270,7 @@ def composed(A: Array, B: Array, n: int) -> tuple[Array, Array]:
 
 
 def _continuous(
-    plant: Plant, x: Array, u: Array, d: Array, moved: Sequence[int], A: Array, B: Array
+    plant: PlantData, x: Array, u: Array, d: Array, moved: Sequence[int], A: Array, B: Array
 ) -> tuple[Array, Array]:
     rate = _rate(plant)
     if rate is not None:
@@ -286,7 +286,7 @@ def _continuous(
     return log[:n_x, :n_x], log[:n_x, n_x:]
 
 
-def _rate(plant: Plant) -> Callable[[Array, Array, Array], Array] | None:
+def _rate(plant: PlantData) -> Callable[[Array, Array, Array], Array] | None:
     """Return dx/dt as a function of batches x, u, d; None: the model has steps only."""
     model: Any = plant.model
     p = plant.p.tolist()
@@ -309,7 +309,7 @@ def _rate(plant: Plant) -> Callable[[Array, Array, Array], Array] | None:
 
 
 def to_control(
-    plant: Plant,
+    plant: PlantData,
     *,
     inputs: Mapping[str, float] | None = None,
     disturbances: Mapping[str, float] | None = None,
@@ -319,13 +319,13 @@ def to_control(
     """Return the plant about an operating point as a python-control ``StateSpace``.
 
     Its signals are changes from that point, by the plant's names (dots in the names of states become
-    underscores); :func:`thermogrip.sysid.export.linearise.linearise_plant` with the same arguments has the
+    underscores); :func:`thermogrip.sysid.plant.linearise.linearise_plant` with the same arguments has the
     point.
 
     Parameters
     ----------
     plant, inputs, disturbances, state, dt
-        As for :func:`thermogrip.sysid.export.linearise.linearise_plant`.
+        As for :func:`thermogrip.sysid.plant.linearise.linearise_plant`.
 
     Raises
     ------
@@ -361,7 +361,7 @@ def control_system(labels: Any, numbers: Sequence[Any], name: str) -> Any:
 
 
 def to_scipy(
-    plant: Plant,
+    plant: PlantData,
     *,
     inputs: Mapping[str, float] | None = None,
     disturbances: Mapping[str, float] | None = None,
@@ -375,7 +375,7 @@ def to_scipy(
     Parameters
     ----------
     plant, inputs, disturbances, state, dt
-        As for :func:`thermogrip.sysid.export.linearise.linearise_plant`.
+        As for :func:`thermogrip.sysid.plant.linearise.linearise_plant`.
 
     Examples
     --------
@@ -394,11 +394,11 @@ def to_scipy(
     return signal.StateSpace(near.A, near.B, near.C, D, dt=dt)
 
 
-def to_casadi(plant: Plant, *, dt: float | None = None) -> Any:
+def to_casadi(plant: PlantData, *, dt: float | None = None) -> Any:
     """Return one step of the plant as a CasADi ``Function`` (x, u, d, p) -> (x_next, y).
 
     y is what the sensors read at x, before the step.  The order within x, u, d, p and y is that of
-    :func:`~thermogrip.sysid.export.linearise.state_labels`, ``plant.inputs`` (switches among them),
+    :func:`~thermogrip.sysid.plant.linearise.state_labels`, ``plant.inputs`` (switches among them),
     ``plant.disturbances``, ``plant.model.parameters`` and ``plant.outputs``; ``plant.p`` are its parameters.
 
     Parameters

@@ -12,7 +12,7 @@ from scipy.linalg import expm
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.blackbox.sindy import SindyModel
-from thermogrip.sysid.export.linearise import linearise_plant
+from thermogrip.sysid.plant.linearise import linearise_plant
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel

@@ -1,0 +1,93 @@
+"""Nothing imports upwards: not late, not for a type, not by a string that a module hands to ``import_module``."""
+
+from __future__ import annotations
+
+import ast
+import re
+import tomllib
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FOLDERS = {"thermogrip": ROOT / "src" / "thermogrip"}
+FOLDERS |= {f"thermogrip.{room}": ROOT / room for room in ("datasets", "sysid", "mpc", "rig", "classify")}
+
+
+def modules() -> dict[str, Path]:
+    """Return every module of the package by its dotted name, stubs of doors in place of these."""
+    out = {}
+    for package, folder in FOLDERS.items():
+        for path in [*folder.rglob("*.py"), *folder.rglob("*.pyi")]:
+            parts = path.relative_to(folder).with_suffix("").parts
+            out[".".join([package, *(part for part in parts if part != "__init__")])] = path
+    return out
+
+
+def named(text: str, known: dict[str, Path]) -> Iterator[tuple[str, int]]:
+    """Yield modules that a source imports, late and for types too, and those that a string in it names."""
+    tree = ast.parse(text)
+    docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        names: list[str] = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
+            names = re.findall(r"^(thermogrip(?:\.\w+)+)(?=$|[:.])", node.value)
+        for name in names:
+            while name not in known and "." in name:
+                name = name.rpartition(".")[0]
+            if name in known:
+                yield name, node.lineno
+
+
+@cache
+def layers() -> list[tuple[str, dict[str, int]]]:
+    """Return the package of each layers contract, and the height of what lies in it."""
+    content = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    out = []
+    for contract in content["tool"]["importlinter"]["contracts"]:
+        if contract["type"] == "layers":
+            rows = [re.split(r"\s*[|]\s*", row) for row in reversed(contract["layers"])]
+            out.append((contract["containers"][0], {part: k for k, row in enumerate(rows) for part in row}))
+    return out
+
+
+def goes_up(importer: str, imported: str) -> bool:
+    """Tell whether an import goes to a higher layer, or to another one at the same height."""
+    for package, height in layers():
+        pair = [name.removeprefix(f"{package}.").split(".")[0] for name in (importer, imported)]
+        if all(name.startswith(f"{package}.") for name in (importer, imported)) and pair[0] != pair[1]:
+            return height[pair[0]] <= height[pair[1]]
+    return False
+
+
+def test_nothing_imports_upwards():
+    known = modules()
+    found = {
+        f"{path.relative_to(ROOT)}:{line} {there}"
+        for here, path in known.items()
+        for there, line in named(path.read_text(encoding="utf-8"), known)
+        if goes_up(here, there)
+    }
+    assert not found
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "def late():\n    from thermogrip.sysid.validation.free_run import free_run",
+        "if TYPE_CHECKING:\n    from thermogrip.sysid import identification",
+        "import_module('thermogrip.sysid.validation.free_run')",
+        "KINDS = {'fit': 'thermogrip.sysid.greybox.fit:fit_network'}\nimport_module(KINDS[kind])",
+        "import_module(f'thermogrip.mpc.{name}')",
+    ],
+)
+def test_an_import_that_goes_up_is_found(source):
+    known = modules()
+    assert any(goes_up("thermogrip.sysid.plant.plant", there) for there, _ in named(source, known))
+    assert not any(goes_up("thermogrip.report.plant", there) for there, _ in named(source, known))
