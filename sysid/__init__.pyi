@@ -4,11 +4,11 @@ from thermogrip.sysid.effusivity.calibration import calibrate_gripper as calibra
 from thermogrip.sysid.effusivity.gripper_model import GripperModel as GripperModel
 from thermogrip.sysid.experiment.schedules import excite as excite
 from thermogrip.sysid.export.dynamics import plant_dynamics as plant_dynamics
-from thermogrip.sysid.plant.linearise import linearise_plant as linearise_plant
 from thermogrip.sysid.greybox.fit import fit_network as fit_network
 from thermogrip.sysid.greybox.posterior import sample_posterior as sample_posterior
 from thermogrip.sysid.identification import identify as identify
 from thermogrip.sysid.models.network import load_network as load_network
 from thermogrip.sysid.models.user_model import own_model as own_model
+from thermogrip.sysid.plant.linearise import linearise_plant as linearise_plant
 from thermogrip.sysid.plant.plant import Plant as Plant
 from thermogrip.sysid.validation.free_run import free_run as free_run

@@ -1,4 +1,4 @@
-"""Nothing imports upwards: not late, not for a type, not by a string that a module hands to ``import_module``."""
+"""Nothing imports upwards: not late, not for a type, not by a string for ``import_module``."""
 
 from __future__ import annotations
 

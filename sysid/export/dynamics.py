@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.plant.linearise import LinearPlant, composed, linearise_plant
 from thermogrip.sysid.plant.fit_record import RUN_GAIN_SD, SEVERAL
+from thermogrip.sysid.plant.linearise import LinearPlant, composed, linearise_plant
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant

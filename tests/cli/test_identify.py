@@ -21,10 +21,10 @@ from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.data.data_quality import Finding
 from thermogrip.sysid.experiment.information import plant_from_prior
 from thermogrip.sysid.export.dynamics import plant_dynamics
-from thermogrip.sysid.plant.linearise import linearise_plant, save_linear
 from thermogrip.sysid.identification import Row, Searched, SignalRole
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.network_spec import builtin_networks
+from thermogrip.sysid.plant.linearise import linearise_plant, save_linear
 from thermogrip.sysid.plant.log_grid import roles_of
 from thermogrip.sysid.validation.free_run import Score
 from thermogrip.sysid.validation.prediction_bands import Band

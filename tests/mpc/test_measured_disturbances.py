@@ -28,10 +28,10 @@ from thermogrip.mpc.tuning.objective import STRUCTURE, run_trials, surroundings_
 from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.session.session import run_session
 from thermogrip.rig.simulation.twin import Twin
-from thermogrip.sysid.plant.linearise import operating_point
 from thermogrip.sysid.identification import identify
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.models.user_model import own_model
+from thermogrip.sysid.plant.linearise import operating_point
 from thermogrip.sysid.plant.plant import Plant
 
 needs_gcc = pytest.mark.skipif(compiler() is None, reason="no gcc here")

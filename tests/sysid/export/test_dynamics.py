@@ -11,9 +11,9 @@ from scipy import signal
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.experiment.information import plant_from_prior
 from thermogrip.sysid.export.dynamics import plant_dynamics
-from thermogrip.sysid.plant.linearise import to_control, to_scipy
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.linearise import to_control, to_scipy
 from thermogrip.sysid.plant.plant import Plant
 
 FAST, SLOW = np.exp(-2.0 / 8.0), np.exp(-2.0 / 50.0)  # steps of 2 s: 8 s and 50 s

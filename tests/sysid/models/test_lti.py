@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from thermogrip.datasets.errors import UserError
-from thermogrip.sysid.plant.linearise import linearise_plant
 from thermogrip.sysid.models.lti import (
     StartPrior,
     constrained_lstsq,
@@ -24,6 +23,7 @@ from thermogrip.sysid.models.lti import (
     whole_steps,
 )
 from thermogrip.sysid.models.state_space import StateSpaceModel
+from thermogrip.sysid.plant.linearise import linearise_plant
 from thermogrip.sysid.plant.plant import Plant
 
 

@@ -10,10 +10,10 @@ import pytest
 from thermogrip.datasets.schema import make_log
 from thermogrip.sysid.experiment.information import plant_from_prior
 from thermogrip.sysid.export.dynamics import plant_dynamics
-from thermogrip.sysid.plant.linearise import linearise_plant
 from thermogrip.sysid.greybox.fit import fit_network
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.network_spec import builtin_networks
+from thermogrip.sysid.plant.linearise import linearise_plant
 from thermogrip.sysid.validation.free_run import free_run
 
 # rows, seconds between them, rows that an input is held, levels of each input, course of each disturbance

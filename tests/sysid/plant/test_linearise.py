@@ -12,11 +12,11 @@ from scipy.linalg import expm
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.sysid.blackbox.sindy import SindyModel
-from thermogrip.sysid.plant.linearise import linearise_plant
 from thermogrip.sysid.greybox.problem import prior_plant
 from thermogrip.sysid.models.network import load_network
 from thermogrip.sysid.models.state_space import StateSpaceModel
 from thermogrip.sysid.models.user_model import own_model
+from thermogrip.sysid.plant.linearise import linearise_plant
 from thermogrip.sysid.plant.plant import Plant
 
 
