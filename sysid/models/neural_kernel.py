@@ -120,7 +120,7 @@ def _follow(
         _advance(A, p, x[row], w[row], t, after)
         for i in range(n):
             x[row + 1, i] = min(max(after[i], low[i]), high[i]) if i < n_y else after[i]
-    return x.shape[0]
+    return int(x.shape[0])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
