@@ -30,6 +30,7 @@ from thermogrip.datasets.provenance import KEY, note_written, provenance
 
 #: A document's part of what a file of records may have (:mod:`thermogrip.datasets.limits`): 8 MiB, 1 MiB.
 JSON_SHARE, _TOML_SHARE = 256, 2048
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 _LONG_KEY = re.compile(
     r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){32}""", re.ASCII
 )  # possessive: linear in the text
@@ -144,7 +145,7 @@ def read_json(path: str | Path, schema: str, version: int) -> dict[str, Any]:
     too_deep = as_user_error(RecursionError, "is nested too deeply", **at)
     with too_deep, as_user_error(ValueError, "is not JSON ({error})", **at):
         try:
-            content = json.loads(text, parse_constant=_refuse_constant)
+            content = parse_json(text, parse_constant=_refuse_constant)
         except json.JSONDecodeError as error:
             problem = f"is not JSON ({error.msg}, column {error.colno})"
             raise UserError(problem, **at, row=error.lineno) from error
@@ -152,6 +153,15 @@ def read_json(path: str | Path, schema: str, version: int) -> dict[str, Any]:
     check_content(content, file=path)
     whole: dict[str, Any] = content
     return whole
+
+
+def parse_json(text: str, **options: Any) -> Any:
+    """Return what a JSON text holds; ValueError where it is none, or has half a character (a lone surrogate),
+    which can be shown and written nowhere; RecursionError where it is nested too deeply."""
+    content = json.loads(text, **options)
+    if _SURROGATE.search(text):  # half of a pair, as a rule
+        json.dumps(content, ensure_ascii=False).encode()
+    return content
 
 
 def check_json(content: Any, schema: str, version: int, *, file: str | Path | None = None) -> None:

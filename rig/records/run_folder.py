@@ -35,7 +35,9 @@ from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
+from math import isfinite
 from pathlib import Path
+from struct import error as StructError
 from types import TracebackType
 from typing import Any
 
@@ -44,6 +46,7 @@ from thermogrip.datasets.atomic_files import (
     file_hash,
     make_folder,
     open_new,
+    parse_json,
     read_bytes,
     read_json,
     write_atomic,
@@ -119,19 +122,20 @@ class RunFolder:
             raise ValueError(f"columns changed from {self._header} to {tuple(row)}")
         line = ",".join(_number(value) for value in row.values())
         due = self._clock() - self._forced >= 1.0
-        self._write(self._samples, line.encode() + b"\n", force=due, wait_s=_AT_ONCE_S)
+        self._write(self._samples, line.encode() + b"\n", force=due)
+        self._disk.check(_AT_ONCE_S)
 
     def event(self, event: Event) -> None:
-        """Take one event, which is forced to disk, for events are few and give the reasons; OSError as
-        above."""
+        """Take one event, which is forced to disk, for events are few and give the reasons; a disk that
+        refuses it is reported by the next row."""
         self._write(self._events, event_line(event), force=True)
 
-    def _write(self, file: _Lines, line: bytes, *, force: bool = False, wait_s: float = 0.0) -> None:
+    def _write(self, file: _Lines, line: bytes, *, force: bool = False) -> None:
         if self._closed:
             raise OSError(errno.EBADF, "the run folder is closed")
         if force:
             self._forced = self._clock()
-        self._disk.write(file, line, force=force, wait_s=wait_s)
+        self._disk.write(file, line, force=force)
 
     def sync(self) -> None:
         """Wait until everything is written and forced to disk; OSError where the disk refuses."""
@@ -257,23 +261,29 @@ class _Disk:
         self._fault: OSError | None = None
         self.refused = False  # whether a caller was told of a fault
 
-    def write(self, file: _Lines, line: bytes, *, force: bool, wait_s: float) -> None:
-        """Hand over a line and wait for it so long at most; OSError where the disk refused this one or one
-        before it, or takes none any more."""
+    def write(self, file: _Lines, line: bytes, *, force: bool) -> None:
+        """Hand over a line."""
         while self._waiting and self._waiting[0].done():
             self._waiting.popleft()
         if len(self._waiting) < MOST_WAITING:
             self._waiting.append(self._writer.submit(self._write, file, line, force))
-            wait([self._waiting[-1]], wait_s)
-        elif self._fault is None:
+        else:
             self._fault = OSError(errno.ETIMEDOUT, f"the disk has not taken the last {MOST_WAITING} lines")
-        self._raise_fault()
+
+    def check(self, wait_s: float | None = None) -> None:
+        """Wait so long at most until every line is written; OSError where the disk refused one since the last
+        call, could not be forced, or took none any more."""
+        self._wait(wait_s)
+        fault, self._fault = self._fault, None
+        if fault is not None:
+            self.refused = True
+            raise fault
 
     def drain(self) -> None:
         """Wait until every line is written and forced; OSError as above."""
-        wait(self._waiting)
+        self._wait()
         self._forcer.submit(self._force).result()
-        self._raise_fault()
+        self.check()
 
     def close(self) -> None:
         """Wait for both threads and close the files."""
@@ -281,6 +291,10 @@ class _Disk:
         self._forcer.shutdown()
         for file in self._files:
             file.close()
+
+    def _wait(self, seconds: float | None = None) -> None:
+        if self._waiting:
+            wait([self._waiting[-1]], seconds)  # they are written in their order
 
     def _write(self, file: _Lines, line: bytes, force: bool) -> None:
         try:
@@ -298,12 +312,6 @@ class _Disk:
                 file.sync()
         except OSError as error:
             self._fault = error
-
-    def _raise_fault(self) -> None:
-        fault, self._fault = self._fault, None
-        if fault is not None:
-            self.refused = True
-            raise fault
 
 
 class _Lines:
@@ -450,7 +458,12 @@ def read_run(folder: str | Path) -> Run:
     rooms = _rooms(header, events)
     log = log_of_rows(rows, rooms, name=path.name, repairs=samples.lost) if len(rows) > 1 else None
     written = (path / "grasps.csv").is_file() and (path / "grasps_meta.csv").is_file()
-    grasps = read_grasps(path / "grasps.csv") if written else _grasp(header, rows, events, rooms)
+    grasps = read_grasps(path / "grasps.csv") if written else None
+    if not written:
+        try:
+            grasps = _grasp(header, rows, events, rooms)
+        except (KeyError, TypeError, ValueError) as error:
+            lost = (*lost, f"events.jsonl: what it says of the grasp makes none ({str(error)[:200]})")
     return Run(about, log, events, grasps, lost)
 
 
@@ -506,7 +519,9 @@ def export_run(folder: str | Path, out: str | Path) -> Path:
         raise UserError("has fewer than two rows", file=folder, hint="give a run that recorded something")
     if path.suffix.lower() != ".mcap":
         return write_log(run.log, path)
-    with atomic_path(path) as temporary:
+    odd = (OverflowError, StructError)
+    no_date = as_user_error(odd, "has a time that MCAP cannot have", file=folder, hint="write .nc or .csv")
+    with atomic_path(path) as temporary, no_date:
         _write_mcap(run, temporary)
     return path
 
@@ -640,10 +655,11 @@ def _events(path: Path) -> tuple[tuple[Event, ...], _Whole]:
 
     def good(at: int, line: bytes) -> bool:
         try:
-            one = json.loads(line)
-            found.append(
-                Event(float(one["time_s"]), str(one["kind"]), str(one["text"]), dict(one.get("data", {})))
-            )
+            one = parse_json(line.decode())
+            time_s, data = float(one["time_s"]), dict(one.get("data", {}))
+            if not isfinite(time_s):
+                return False
+            found.append(Event(time_s, str(one["kind"]), str(one["text"]), data))
         except (ValueError, KeyError, TypeError, RecursionError):
             return False
         return True
@@ -656,7 +672,8 @@ def _rooms(header: list[str], events: tuple[Event, ...]) -> frozenset[str]:
     """Return the room's sensors as the session recorded them, by name for a run of an older version."""
     readings = {h.removesuffix("_degC") for h in header if h.endswith("_degC")}
     kept = next((e.data["rooms"] for e in events if e.kind == "phase" and "rooms" in e.data), None)
-    return frozenset(readings.intersection(kept)) if isinstance(kept, list) else room_sensors(readings)
+    known = isinstance(kept, list)
+    return frozenset(readings.intersection(map(str, kept))) if known else room_sensors(readings)
 
 
 def _grasp(

@@ -88,8 +88,8 @@ def test_without_a_page_questions_are_asked_on_the_terminal(monkeypatch: pytest.
     asked: list[str] = []
     monkeypatch.setattr("typer.prompt", lambda text, **_: (asked.append(text), " q ")[1])
     with Watch("batch", Console()) as watch:
-        assert watch.ask("ready?") == "q"
-    assert asked == ["ready?"]
+        assert watch.ask("ready \x1b[2J?") == "q"
+    assert asked == ["ready \\x1b[2J?"]
 
 
 def test_a_question_on_the_page_may_be_answered_on_the_terminal(

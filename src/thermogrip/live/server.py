@@ -30,6 +30,8 @@ from contextlib import suppress
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
+from thermogrip.datasets.atomic_files import parse_json
+
 if TYPE_CHECKING:
     from starlette.requests import Request
     from starlette.responses import Response
@@ -219,12 +221,10 @@ def application(state: State, ask: Callable[[dict[str, Any]], None], *, port: in
 
 def _words(body: bytes) -> dict[str, str]:
     """Return what a request says; ValueError or RecursionError where it is no JSON object of texts."""
-    content = json.loads(body)
+    content = parse_json(body.decode())
     if not isinstance(content, dict):
         raise ValueError("no object")
-    words = {key: str(content[key])[:MOST_TEXT] for key in ("text", "question") if key in content}
-    "".join(words.values()).encode()  # a lone surrogate is no character
-    return words
+    return {key: str(content[key])[:MOST_TEXT] for key in ("text", "question") if key in content}
 
 
 async def _events(state: State) -> AsyncIterator[str]:

@@ -129,7 +129,7 @@ class Watch:
     ) -> str:
         """Return what is answered, on the terminal, which says what the ``keys`` mean, or on the page."""
         self._view.pause()
-        typed = f"{text}; {keys}" if keys else text
+        typed = printable(f"{text}; {keys}" if keys else text)
         try:
             if not self._reached:
                 return str(typer.prompt(typed, default="", show_default=False)).strip()
@@ -143,7 +143,7 @@ class Watch:
             while True:
                 self._answers.get_nowait()  # typed before there was a question
         self._question = Question(self._asked, text, choices, own_words)
-        sys.stderr.write(f"{printable(typed)} (here or on the page): ")
+        sys.stderr.write(f"{typed} (here or on the page): ")
         sys.stderr.flush()
         if self._typing is None:
             self._typing = threading.Thread(target=self._read_typed, daemon=True)

@@ -200,6 +200,15 @@ def test_a_message_beyond_all_measure_costs_the_connection_and_it_comes_back(ser
     assert "again" in bridge.reports[1]
 
 
+def test_no_record_has_the_password_of_an_address(server: Server) -> None:
+    with Bridge(server.url.replace("://", "://me:hunter2@"), clock=lambda: 0.0) as bridge:
+        assert wait_for(lambda: server.sockets)
+        server.sockets[0].close()
+        assert wait_for(lambda: bridge.reports)
+    assert "the connection to ws://...@" in bridge.reports[0]
+    assert not [line for line in bridge.reports if "hunter2" in line]
+
+
 def test_nobody_there_is_one_line() -> None:
     with pytest.raises(UserError, match="no rosbridge answers"):
         Bridge("ws://127.0.0.1:9", clock=lambda: 0.0, timeout=1.0)

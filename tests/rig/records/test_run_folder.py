@@ -455,7 +455,8 @@ def test_events_that_make_no_sense_are_left_out_and_a_lost_run_json_is_a_run_tha
 ) -> None:
     write(tmp_path / "run", 3).close()
     lines = ['{"time_s": 1, "kind": "bad", "text": ""}', '{"time_s": "x", "kind": "a", "text": "b"}', "[1]",
-             '{"time_s": 2, "text": "b"}',
+             '{"time_s": 2, "text": "b"}', '{"time_s": 1e999, "kind": "a", "text": "b"}',
+             '{"time_s": 2, "kind": "a", "text": "half \\ud800 a pair"}',
              '{"time_s": 3, "kind": "closed", "text": "b", "data": {"k": 1}}']  # fmt: skip
     (tmp_path / "run" / "events.jsonl").write_text("\n".join(lines) + "\n")
     (tmp_path / "run" / "run.json").unlink()
@@ -463,7 +464,7 @@ def test_events_that_make_no_sense_are_left_out_and_a_lost_run_json_is_a_run_tha
     assert run.about == {"about": {}, "verdict": "running"}
     assert run.events == (Event(1.0, "bad", ""), Event(3.0, "closed", "b", {"k": 1}))
     assert run.bad == "bad"
-    assert [line.split(":")[0] for line in run.lost] == [f"events.jsonl, line {at}" for at in (2, 3, 4)]
+    assert [line.split(":")[0] for line in run.lost] == [f"events.jsonl, line {at}" for at in range(2, 7)]
     (tmp_path / "run" / "samples.csv").unlink()
     with pytest.raises(UserError, match="is no run folder"):
         read_run(tmp_path / "run")
@@ -472,6 +473,7 @@ def test_events_that_make_no_sense_are_left_out_and_a_lost_run_json_is_a_run_tha
 @pytest.mark.parametrize(
     ("data", "role"),
     [(None, "disturbance"), ({"rooms": []}, "output"), ({"rooms": ["t_ambient", "t_gone"]}, "disturbance"),
+     ({"rooms": [["t_ambient"], {}]}, "output"),
      ({"rooms": "all"}, "disturbance")],
 )  # fmt: skip
 def test_the_rooms_are_those_that_the_session_wrote_else_by_name(
@@ -585,7 +587,9 @@ NAN = float("nan")
 @pytest.mark.parametrize(
     ("closed", "about", "late", "found"),
     [(4.0, {"grasp_id": "g"}, (24.0, 25.0), [-2.0, -1.0, 0.0, 1.0]), (None, {}, (24.0, 25.0), None),
-     (4.0, {}, (24.0, 25.0), None), (4.0, {"grasp_id": "g"}, (24.0, NAN), None),
+     (4.0, {}, (24.0, 25.0), None), (4.0, {"material": "wood"}, (24.0, 25.0), None),
+     (4.0, {"grasp_id": "g", "t_object": "warm"}, (24.0, 25.0), None),
+     (4.0, {"grasp_id": "g"}, (24.0, NAN), None),
      (4.5, {"grasp_id": "g"}, (24.0, 25.0), None), (4.0, {"grasp_id": "g"}, (24.0,), None)],
 )  # fmt: skip
 @pytest.mark.parametrize("skin", ["t_surface", "t_skin"])
@@ -676,3 +680,12 @@ def test_a_run_without_two_rows_is_not_exported(tmp_path: Path) -> None:
     write(tmp_path / "run", 1).close()
     with pytest.raises(UserError, match="fewer than two rows"):
         export_run(tmp_path / "run", tmp_path / "log.csv")
+
+
+def test_a_time_that_is_no_date_is_one_line(tmp_path: Path) -> None:
+    pytest.importorskip("mcap")
+    folder = write(tmp_path / "run", 2)
+    folder.event(Event(1e300, "odd", ""))
+    folder.close()
+    with pytest.raises(UserError, match=r"has a time that MCAP cannot have; write \.nc or \.csv"):
+        export_run(tmp_path / "run", tmp_path / "run.mcap")

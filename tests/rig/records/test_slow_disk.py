@@ -108,6 +108,25 @@ def test_a_disk_that_cannot_be_forced_any_more_is_a_trip_at_the_next_sample(
     assert bench.device.applied_drive == {"q1": 0.0, "q2": 0.0}
 
 
+def test_a_fault_at_an_event_is_reported_by_the_next_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, faults = RunFolder(tmp_path / "run"), [OSError(errno.EIO, "Input/output error")]
+
+    def once(file: int) -> None:  # as Linux reports what it could not write
+        if faults:
+            raise faults.pop()
+
+    monkeypatch.setattr(os, "fsync", once)
+    folder.event(Event(0.0, "phase", "settle"))
+    assert soon(lambda: not faults)
+    with pytest.raises(OSError, match="Input/output error"):
+        folder.sample({"time_s": 0.0, "t_surface_degC": 25.0})
+    folder.sample({"time_s": 1.0, "t_surface_degC": 25.0})
+    folder.close()
+    assert read_run(tmp_path / "run").log.sizes["time"] == 2
+
+
 def test_rows_that_the_disk_refuses_after_the_last_sample_are_no_silent_loss(
     bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
