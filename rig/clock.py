@@ -36,9 +36,15 @@ class Metronome:
     caught up.
     """
 
-    def __init__(self, clock: Callable[[], float]) -> None:
-        self._clock = clock
+    def __init__(self, clock: Callable[[], float], sleep: Callable[[float], None]) -> None:
+        self._clock, self._sleep = clock, sleep
         self._last = -float("inf")
+
+    def wait(self, seconds: float) -> None:
+        """Let so many seconds pass, less the work since the last wait."""
+        if not seconds >= 0:
+            raise ValueError(f"cannot wait {seconds:g} s")
+        self._sleep(max(0.0, self.next(seconds) - self._clock()))
 
     def next(self, seconds: float) -> float:
         """Return when a wait of so many seconds that begins now is to end."""

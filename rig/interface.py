@@ -125,7 +125,8 @@ class Rig(Protocol):
         """Return the newest sample."""
 
     def apply(self, drive: Mapping[str, float], pump: int) -> None:
-        """Set drive (inside the input's range, else it raises) and pump until the next call."""
+        """Set drive (inside the input's range, else it raises) and pump until the next call, or for as long
+        as a drive lives on the device (``expires_s``)."""
 
     def wait(self, seconds: float) -> None:
         """Let time pass; the twin simulates it, hardware waits."""

@@ -64,7 +64,7 @@ class TCLabRig(NoticeBook):
     ) -> None:
         self.port, self.highest, self.jump, self.timeout = port, highest, jump, timeout
         super().__init__(clock)
-        self._sleep, self._beat = sleep, Metronome(clock)
+        self._beat = Metronome(clock, sleep)
         self._set, self._pump, self._bad = [0.0, 0.0], 0, 0
         self._last: tuple[float, list[float]] | None = None
         self._lost, self.closed = False, False
@@ -120,9 +120,7 @@ class TCLabRig(NoticeBook):
 
     def wait(self, seconds: float) -> None:
         """Let time pass; waits that follow each other end on a grid."""
-        if not seconds >= 0:
-            raise ValueError(f"cannot wait {seconds:g} s")
-        self._sleep(max(0.0, self._beat.next(seconds) - self._clock()))
+        self._beat.wait(seconds)
 
     def grasp(self, material: str, t_object: float) -> None:
         """Raise UserError: a TCLab has no gripper."""

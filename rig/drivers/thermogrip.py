@@ -1,7 +1,7 @@
 """Our firmware as a rig: every request is confirmed, every drive has a time to live, every oddity is noted.
 
-A drive is sent with :data:`TTL_S` to live and renewed while :meth:`DeviceRig.wait` lets time pass, so it ends
-by itself within that time when the program freezes, dies, or loses its cable, and it holds while all is well.
+A drive is sent with :data:`TTL_S` to live, so it ends by itself within that time when the program freezes,
+dies, or loses its cable.  Who wants it to hold applies it again before, as the loop of a session does.
 
 **What fails how.**  A reading that cannot be had is a reading, so a session sees it, records it and can
 decide.  A drive that was not confirmed raises, because it must not count as applied.
@@ -35,7 +35,6 @@ from thermogrip.rig.serial import protocol
 from thermogrip.rig.serial.port import Port, PortError
 
 TTL_S = protocol.MAX_TTL_MS / 1000
-RENEW_S = 0.5  # how often a drive is renewed while time passes
 MOST_TRIES = 12  # of one question on a line that spoils half of it
 
 
@@ -107,9 +106,7 @@ class DeviceRig(NoticeBook):
     ) -> None:
         super().__init__(clock)
         self.port, self.timeout, self.tries = port, timeout, tries
-        self._sleep, self._beat = sleep, Metronome(clock)
-        self._command: tuple[dict[str, float], int] | None = None
-        self._confirmed = 0.0  # when the device last took the drive
+        self._beat = Metronome(clock, sleep)
         self._gathering: Gathering | None = None
         self._host, self._device_clock = protocol.HostEnd(), DeviceClock()
         self._known: protocol.State | None = None
@@ -148,7 +145,7 @@ class DeviceRig(NoticeBook):
             return Reading(self._now(), nothing, dict.fromkeys(self.units, 0.0), 0)
 
     def apply(self, drive: Mapping[str, float], pump: int) -> None:
-        """Drive from now on, until the next call; returns when the device has confirmed it.
+        """Drive from now on, for :data:`TTL_S` or until the next call; returns when the device has confirmed.
 
         Raises PortError where it cannot be reached (what it did last ends by itself), DeviceRefusedError
         where it refuses (a latched fault, a drive while the pump is off, a reset since it was greeted),
@@ -160,22 +157,12 @@ class DeviceRig(NoticeBook):
             if pump or any(counts):
                 raise RuntimeError("the rig is closed")
             return
-        self._command = None  # whatever was renewed so far is over
         idle = not pump and not any(counts)
         self._ask(protocol.Off() if idle else protocol.Drive(protocol.MAX_TTL_MS, pump, counts))
-        self._command, self._confirmed = None if idle else (dict(drive), pump), self._clock()
 
     def wait(self, seconds: float) -> None:
-        """Let time pass, on a grid of consecutive waits, and renew the drive; one that cannot be renewed ends
-        on the device."""
-        if not seconds >= 0:
-            raise ValueError(f"cannot wait {seconds:g} s")
-        end = self._beat.next(seconds)
-        while (left := end - self._clock()) > 0:
-            self._sleep(min(left, RENEW_S))
-            old = self._clock() - self._confirmed >= 2 * RENEW_S  # many short waits follow each other
-            if self._command is not None and (old or end - self._clock() > 0):
-                self._renew()
+        """Let time pass; waits that follow each other end on a grid."""
+        self._beat.wait(seconds)
 
     def sample_every(self, seconds: float) -> bool:
         """Let the device take a reading every so many seconds by its own clock, 0 for none; False where its
@@ -224,7 +211,6 @@ class DeviceRig(NoticeBook):
         """Switch everything off and let the port go; never raises, and may be called twice."""
         if self.closed:
             return
-        self._command = None
         try:
             self._ask(protocol.Off())
         except (PortError, DeviceRefusedError) as error:
@@ -257,23 +243,6 @@ class DeviceRig(NoticeBook):
             return None
         assert isinstance(content, protocol.Taken)
         return content
-
-    def _renew(self) -> None:
-        """Send the drive again; a failure shows at the next reading."""
-        assert self._command is not None
-        drive, pump = self._command
-        if self._clock() - self._confirmed >= TTL_S:  # this program stood still: the loop has to decide anew
-            self._command = None
-            self._note("expired", f"the program stood still for {self._clock() - self._confirmed:.1f} s")
-            return
-        try:
-            self._ask(protocol.Drive(protocol.MAX_TTL_MS, pump, self._counts(drive)))
-            self._confirmed = self._clock()
-        except PortError:
-            self._command = None  # by the time it is back, it has expired: only the loop may drive it again
-        except DeviceRefusedError as refused:
-            self._command = None
-            self._note("refused", str(refused))
 
     def _first_hello(self, seconds: float) -> protocol.Identity:
         """Ask for the device's identity until it answers; an Arduino takes seconds to start."""
@@ -388,7 +357,6 @@ class DeviceRig(NoticeBook):
             case protocol.Boot(cause=cause, count=count):
                 self._note("reset", f"the device was reset ({cause}, boot {count}); everything is off")
                 self._greeted_at, self._known = 0, None
-                self._command = None
             case protocol.Unexpected(why=why):
                 self._note("unexpected", f"a line came that answers nothing ({why})")
             case _:
@@ -402,9 +370,7 @@ class DeviceRig(NoticeBook):
         if state.boot != last.boot:
             self._note("reset", f"the device was reset ({state.cause}, boot {state.boot}); everything is off")
             self._greeted_at = 0
-            self._command = None
         if set(state.faults) - set(last.faults):
             self._note("latched", f"{', '.join(state.faults)}; repair it, then clear the latch")
-            self._command = None
         if state.mode == "expired" and last.mode != "expired":
             self._note("expired", f"a drive outlived its {TTL_S:g} s; drive and pump are off")

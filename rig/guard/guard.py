@@ -2,7 +2,8 @@
 
 It asks, in this order:
 
-    time      did readings and the computer's own clock move on together?  (stale, frozen, clock)
+    time      was the drive renewed in time, and did readings and the computer's own clock move on together?
+              (frozen, stale, clock)
     driver    does the rig apply what was asked?  (driver, device)
     sensors   is each reading plausible?  (lost, jump, stuck, disagree;
               :mod:`~thermogrip.rig.guard.sensor_checks`)
@@ -15,14 +16,21 @@ It asks, in this order:
 and of a move, before it goes out: is it finite, and does it pump heat into standing water?  (drive,
 interlock)
 
-A suspect reading never reaches the controller; the last good one takes its place, for two samples.  The
+A suspect reading never reaches the controller; the last good one takes its place, for two looks.  The
 guard keeps no clock and opens nothing: a reading, the host's time, and what was asked come in, accepted
 values and a :class:`~thermogrip.rig.guard.trip.Trip` come out.  The loop switches off.
 
-**How far beyond a limit.**  A limit trips on the second accepted reading beyond it, so at sample time dt a
-rig that changes by at most r K/s is at most 2 r dt (plus what it does in the time of switching off) beyond
-it.  For the example rig (0.15 K/s at full drive, dt 1.5 s) that is 0.5 K; :data:`LIMIT_MARGIN` is
-guaranteed.
+**The time of a reading** by the computer's clock lies between ``asked`` and ``now``, when it was asked for
+and when it was there.  The rig's clock is wrong where no moments between these allow what it says; however
+late the program is with a reading, it is not wrong for that.  The program itself was late (*frozen*) where a
+drive stood for longer than ``expiry_s`` without being renewed; while nothing is driven it may take its time.
+
+**How far beyond a limit.**  A limit trips on the second accepted reading beyond it.  The loop looks at least
+every :data:`~thermogrip.rig.session.loop.LOOK_S`, whatever the sample time is, so a rig that changes by at
+most r K/s is at most 2 r LOOK_S beyond it, and three times its noise, when power goes off: 0.35 K + 0.1 K for
+a TCLab at full power.  What is in a heater by then still comes, and no check of readings takes it back: the
+same TCLab goes on by 1.3 K from 40 degC.  :data:`LIMIT_MARGIN` holds for both together wherever the heat in
+transit is less than 1.5 K (docs/reference/faults.md has measured figures).
 
 Does it warm when it is heated and cool when it is cooled?  The rules that need no model
 ----------------------------------------------------------------------------------------
@@ -231,9 +239,9 @@ class Guard:
     --------
     >>> guard = Guard()
     >>> guard.start(Reading(0.0, {"t_surface": 25.0}, {"drive": 0.0}, 1), 0.0, {"drive": "1"})
-    >>> guard.asked({"drive": 0.4}, 1)
+    >>> guard.applied({"drive": 0.4}, 1, 0.0)
     >>> guard.check(Reading(1.0, {"t_surface": 25.1}, {"drive": 0.4}, 1), 1.0).trip
-    >>> print(guard.check(Reading(2.0, {"t_surface": 25.2}, {"drive": 0.4}, 1), 12.0, planned=1.0).trip.kind)
+    >>> print(guard.check(Reading(2.0, {"t_surface": 25.2}, {"drive": 0.4}, 1), 12.0).trip.kind)
     frozen
     >>> print(guard.refuse({"drive": 0.4}, 0, 2.0).kind)
     interlock
@@ -257,14 +265,17 @@ class Guard:
         self._time, self._released, self._touched = float("-inf"), float("-inf"), False
         self.margin, self.nearest = float("inf"), ""
 
-    def start(self, reading: Reading, now: float, units: Mapping[str, str]) -> None:
-        """Begin a session at a reading, the host's time [s] and the drives' units, nothing driven yet and
-        what the model knows of the rig from a session that ended well a few minutes ago."""
+    def start(
+        self, reading: Reading, now: float, units: Mapping[str, str], *, asked: float | None = None
+    ) -> None:
+        """Begin a session at a reading, with its times as in :meth:`check` and the drives' units, nothing
+        driven yet and what the model knows of the rig from a session that ended well a few minutes ago."""
         age = reading.time_s - self._time
         known = not self.trips and 0 <= age <= _KEPT_S
         seen = self._ranges
         self._span = {name: range_of(unit, seen.get(name)) or (-1.0, 1.0) for name, unit in units.items()}
-        self._time, self._now, self._fresh_at = reading.time_s, now, now
+        self._time, self._now, self._renewed = reading.time_s, now, now
+        self._fresh = (now if asked is None else asked, now)
         self._seen = float("nan")
         self._drive, self._pump = dict.fromkeys(units, 0.0), reading.pump
         self._differs, self._beyond = 0, dict.fromkeys(reading.values, 0)
@@ -294,9 +305,15 @@ class Guard:
         self.model.adopt(self.model.drift.learnt(self.model.evidence))
         return self.model.drift
 
-    def asked(self, drive: Mapping[str, float], pump: int) -> None:
-        """Note what was applied."""
+    def applied(self, drive: Mapping[str, float], pump: int, now: float) -> Trip | None:
+        """Note what was applied at the host's time ``now`` [s]; return the trip where the drive before it had
+        stood for too long."""
+        late = self._frozen(self._time, now)
         self._drive, self._pump = {name: float(value) for name, value in drive.items()}, int(pump)
+        self._renewed = now
+        if late is not None:
+            self.trips.append(late)
+        return late
 
     def refuse(self, drive: Mapping[str, float], pump: int, time: float) -> Trip | None:
         """Return the trip of a move that must not go out, None where it may."""
@@ -333,14 +350,14 @@ class Guard:
         reading: Reading,
         now: float,
         *,
-        planned: float = 0.0,
+        asked: float | None = None,
         touching: bool = False,
         stop_asked: str = "",
     ) -> Findings:
-        """Return the accepted values of a reading, and whether to go on; ``now`` is the host's time [s],
-        ``planned`` how long the loop meant to wait since the last check [s], ``stop_asked`` who asks for an
-        end."""
-        trip = self._clocks(reading, now, planned)
+        """Return the accepted values of a reading, and whether to go on; it was asked for at the host's time
+        ``asked`` [s] and there at ``now``; ``stop_asked`` is who asks for an end."""
+        between = (now if asked is None else asked, now)
+        trip = self._frozen(reading.time_s, between[0]) or self._clocks(reading, *between)
         if trip is None and stop_asked:
             trip = Trip("operator", reading.time_s, "the operator", "to go on", f"a stop from {stop_asked}")
         seen, late = self._seen == reading.time_s, now > self._now
@@ -350,7 +367,7 @@ class Guard:
         if trip is not None or seen:
             return self._findings(reading, {}, {}, trip)
         self._seen = reading.time_s
-        self._fresh_at = now
+        self._fresh = between
         if self._touched and not touching:
             self._released = reading.time_s
         self._touched = touching
@@ -376,21 +393,24 @@ class Guard:
         self._last = Findings(values, suspect, fresh, trip)
         return self._last
 
-    def _clocks(self, reading: Reading, now: float, planned: float) -> Trip | None:
-        s, here, there = self.settings, now - self._now, reading.time_s - self._time
-        if here > planned + s.expiry_s:
-            expected, measured = f"a reading every {max(planned, 0.1):.2g} s", f"none for {here:.1f} s"
-            return Trip(
-                "frozen", reading.time_s, "this program", expected, measured, figures={"seconds": here}
-            )
-        if there == 0 and now - self._fresh_at > s.stale_s + planned:
-            seconds = now - self._fresh_at
-            expected, measured = f"a new one within {s.stale_s + planned:.2g} s", f"none for {seconds:.1f} s"
-            return Trip("stale", reading.time_s, "readings", expected, measured, figures={"seconds": seconds})
-        since = now - self._fresh_at
-        if there < 0 or (there > 0 and abs(there - since) > s.clock_slack_s):
-            expected, measured = f"{since:+.2f} s since the last reading", f"{there:+.2f} s"
-            figures = {"here": since, "there": there}
+    def _frozen(self, time: float, now: float) -> Trip | None:
+        silence_s = now - self._renewed
+        if not any(self._drive.values()) or silence_s <= self.settings.expiry_s:
+            return None
+        expected = f"a drive renewed within {self.settings.expiry_s:g} s"
+        measured = f"after {silence_s:.1f} s"
+        return Trip("frozen", time, "this program", expected, measured, figures={"seconds": silence_s})
+
+    def _clocks(self, reading: Reading, asked: float, now: float) -> Trip | None:
+        s, there = self.settings, reading.time_s - self._time
+        least, most = asked - self._fresh[1], now - self._fresh[0]
+        if there == 0 and least > s.stale_s:
+            expected, measured = f"a new one within {s.stale_s:g} s", f"none for {least:.1f} s"
+            return Trip("stale", reading.time_s, "readings", expected, measured, figures={"seconds": least})
+        here = min(max(there, least), most)
+        if there < 0 or (there > 0 and abs(there - here) > s.clock_slack_s):
+            expected, measured = f"{here:+.2f} s since the last reading", f"{there:+.2f} s"
+            figures = {"here": here, "there": there}
             return Trip("clock", reading.time_s, "the rig's clock", expected, measured, figures=figures)
         return None
 

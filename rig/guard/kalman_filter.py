@@ -285,7 +285,8 @@ class RigFilter:
     def is_jump(self, at: int, value: float) -> bool:
         """Say whether the innovation of a reading [degC] of output ``at`` is too large."""
         off = abs(value - float(self.expected[at]))
-        return bool(off > max(self.settings.jump_floor, self.settings.jump_k * float(self.spread()[at])))
+        s = self.settings
+        return off > s.jump_floor and bool(off > s.jump_k * self.spread()[at])
 
     def moment(self, time: float, y: Array) -> Estimate:
         """Return the estimate as it is at a time [s], with the readings (n_y,) that came."""

@@ -167,6 +167,7 @@ def _late(path: Array, k: int, steps: float) -> Array:
     return out
 
 
+_COMPARED_EVERY_S = 1.0  # a tenth of the shortest window; it costs half of a look
 _BIAS_AFTER_S = 60.0  # a bias is not evaluated before the filter has seen something
 
 
@@ -237,8 +238,8 @@ def _recent(past: History, begin: Estimate, smooth: float) -> list[Estimate]:
 class ModelMonitor:
     """Follow a rig with its plant; pure: times are passed in.
 
-    ``compared_from`` is when windows may begin [s]; ``compared_now`` says whether the last reading completed
-    a native step of the model, so that there was something to compare; ``evidence`` is of the longest windows
+    ``compared_from`` is when windows may begin [s]; ``compared_now`` says whether the last reading was
+    compared: it completed a native step of the model, and a second had passed since the last one that was; ``evidence`` is of the longest windows
     since the start, where the drift is learnt.
     """
 
@@ -274,6 +275,7 @@ class ModelMonitor:
         self._masked: frozenset[str] = frozenset()
         self._since = np.full(len(self.plant.outputs), self.compared_from)
         self._time, self._compared, self.compared_now, self.share = time, 0, False, 0.0
+        self._compared_at = float("-inf")
         self._weighed = float("-inf")
 
     def predict(
@@ -301,10 +303,10 @@ class ModelMonitor:
         self._filter.correct(y)
         self._past.add(self._filter.moment(time, y))
         done = self._filter.steps.done
-        self.compared_now = done != self._compared
+        self.compared_now = done != self._compared and time >= self._compared_at + _COMPARED_EVERY_S - 1e-6
         if not self.compared_now:
             return []
-        self._compared = done
+        self._compared, self._compared_at = done, time
         compared = self.compare()
         self.share = max((one.excess for one in compared), default=0.0)
         self._weigh(time, compared)

@@ -3,6 +3,10 @@
 :class:`Loop` takes one sample and records it; the phases are those of :mod:`~thermogrip.rig.session.session`.
 It keeps no clock of its own: time is the rig's, and the host's is an argument.
 
+Time passes in *looks* of at most :data:`LOOK_S`, however long a sample is: at each the rig is read, the guard
+checks the reading, the drive is renewed and the session is shown.  The controller's step and the recorded row
+alone are of the sample time.
+
 Whatever is not safe any more ends it with a :class:`~thermogrip.rig.guard.trip.TripError`: a reading or a
 move that the guard rejects (:mod:`~thermogrip.rig.guard.guard`), a cable that is out, a disk that is full.
 """
@@ -14,6 +18,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from math import ceil
 from typing import Any, Protocol
 
 import numpy as np
@@ -29,6 +34,12 @@ from thermogrip.rig.interface import DeviceRefusedError, Event, Reading, Rig, Sa
 from thermogrip.rig.serial.port import PortError
 from thermogrip.rig.session.signals import check_stopped, hold_signals
 from thermogrip.rig.session.snapshot import MOST_MARKS, Listener, Operator, Snapshot
+
+#: Longest time between two looks at a rig [s].  A drive lives 2 s on the device
+#: (:data:`~thermogrip.rig.drivers.thermogrip.TTL_S`): it outlives a computer that comes 1.5 s late, three
+#: looks.  A limit takes two looks, in which a TCLab at full power (0.35 K/s) goes 0.35 K.  Klipper's boards
+#: look every 0.3 s, and four times.
+LOOK_S = 0.5
 
 #: The phases of a session; a log holds their index.
 PHASES = ("settle", "hold", "lead_in", "pump_off", "contact", "release")
@@ -65,7 +76,7 @@ class Loop:
     target: dict[str, float] = field(default_factory=dict)
     touching: bool = False
     by_device: bool = False
-    planned: float = 0.0
+    fresh: bool = False  # whether the newest reading may be handed to the controller
     disk_fault: str = ""
     status: str = "ok"
     move: Move = field(default_factory=lambda: Move(drive=0.0))
@@ -75,12 +86,20 @@ class Loop:
 
     def __post_init__(self) -> None:
         self.rig.notices()  # what happened before is not of this session
-        self.reading: Reading = self.rig.read()
         self.accepted: dict[str, float] = {}
+        self.read(self.rig.read)
 
     def now(self) -> float:
         """Return the host's time [s]; the rig's own where there is no other, as in a simulation."""
         return self.reading.time_s if self.clock is None else self.clock()
+
+    def read(self, read: Callable[[], Reading]) -> None:
+        """Take a reading, with the host's times at which it was asked for and had: how late the loop is with
+        it afterwards is no fault of the rig's clock."""
+        asked = None if self.clock is None else self.clock()
+        self.reading: Reading = read()
+        self.heard = self.now()
+        self.asked = self.heard if asked is None else asked
 
     @property
     def rooms(self) -> frozenset[str]:
@@ -107,7 +126,7 @@ class Loop:
                 raise UserError(problem, hint="check the sensor before starting")
         self.operator.take_bad()  # of what was before
         self.open_gripper()  # a session that lost its rig in contact has left it closed on the object
-        self.guard.start(self.reading, self.now(), self.rig.units)
+        self.guard.start(self.reading, self.heard, self.rig.units, asked=self.asked)
         if self.guard.model is not None and (drift := self.guard.model.drift) is not None:
             self.note("drift", drift.line(), drift.shares())
         if guessed := self.guard.guessed_rooms(self.reading.values):
@@ -118,17 +137,17 @@ class Loop:
             self.note("room", f"the rig does not read {', '.join(unread)}: the controller takes {taken}")
         self.accepted = {**self.reading.values, **self.guard.sensors.last_good()}
         self.controller.reset(self.controller_reading())
+        self.check()
 
     def regulate(self, phase: str, seconds: float) -> Iterator[float]:
         """Run the controller for so long; yield the time passed in this phase at each move."""
         begin = self.reading.time_s
         self.ends, self.dt = begin + seconds, self.controller.dt
         while True:
-            fresh = self.check()  # before the clock is asked how long it has been: it may have jumped
             passed = self.reading.time_s - begin
             if passed >= seconds:
                 return
-            if fresh:
+            if self.fresh:
                 target: Target = self.target if len(self.target) != 1 else next(iter(self.target.values()))
                 self.move = self.controller.step(self.controller_reading(), target)
                 if self.move.status != self.status:
@@ -143,7 +162,6 @@ class Loop:
         """Record n fast samples under the present move."""
         self.dt = dt
         for _ in range(n):
-            self.check()
             self.record(phase)
             self.wait(dt)
             if self.by_device:
@@ -168,34 +186,32 @@ class Loop:
                 self.rows.append({**last, **_measured(reading)})
                 self._write(self.rows[-1])
 
-    def check(self) -> bool:
-        """Have the guard check the newest reading; say whether the controller may be asked."""
+    def check(self) -> None:
+        """Have the guard check the newest reading."""
         for why in self.operator.take_bad():
             if sum(event.kind == "bad" for event in self.events) < MOST_MARKS:
                 self.note("bad", why)
         found = self.guard.check(
             self.reading,
-            self.now(),
-            planned=self.planned,
+            self.heard,
+            asked=self.asked,
             touching=self.touching,
             stop_asked=self.operator.stop_asked,
         )
-        self.planned = 0.0
-        self.accepted = found.values
+        self.accepted, self.fresh = found.values, found.fresh
         for name, why in found.suspect.items():
             text = f"{name} is suspect ({why}); the last good value is used"
             if not any((event.kind, event.text) == ("lost", text) for event in self.events):
                 self.note("lost", text)
         if found.trip is not None:
             raise TripError(self.of_this_rig(found.trip))
-        return found.fresh
 
     def controller_reading(self) -> dict[str, float]:
         """Return the reading for the controller, the last good value where one is lost."""
         return {**self.reading.as_controller_reading(), **self.accepted}
 
-    def record(self, phase: str) -> None:
-        """Apply the present move and write the row; inputs of a row hold from it until the next."""
+    def apply(self) -> dict[str, float]:
+        """Apply the present move, or renew it; return its drive by input."""
         drive = self.move.drive if isinstance(self.move.drive, dict) else self.single(self.move.drive)
         refused = self.guard.refuse(drive, self.move.pump, self.reading.time_s)
         if refused is not None:
@@ -206,7 +222,14 @@ class Loop:
             asked = ", ".join(f"{name} {value:g}" for name, value in drive.items())
             trip = Trip("drive", self.reading.time_s, asked, "a drive that the rig can take", str(error))
             raise TripError(trip) from error
-        self.guard.asked(drive, self.move.pump)
+        late = self.guard.applied(drive, self.move.pump, self.now())
+        if late is not None:
+            raise TripError(self.of_this_rig(late))
+        return drive
+
+    def record(self, phase: str) -> None:
+        """Apply the present move and write the row; inputs of a row hold from it until the next."""
+        drive = self.apply()
         if phase != self.phase:
             first, self.phase = not self.phase, phase
             self.note("phase", phase, {"rooms": sorted(self.rooms)} if first else None)
@@ -264,12 +287,23 @@ class Loop:
         return drives | ({"pump": float(self.move.pump)} if self.rig.has_pump else {})
 
     def wait(self, seconds: float) -> None:
-        """Let time pass and read."""
+        """Let time pass, looking at the rig and renewing its drive; the last look is the next sample."""
+        looks, begin, passed = max(1, ceil(seconds / LOOK_S - 1e-6)), self.reading.time_s, 0
+        while True:
+            self._look(seconds / looks)
+            # a look that came late by whole ones counts as those: the sample keeps its time
+            passed = max(passed + 1, round((self.reading.time_s - begin) / seconds * looks))
+            if passed >= looks:
+                return
+            self.show(self.apply())
+
+    def _look(self, seconds: float) -> None:
+        """Let time pass, read, and have the reading checked."""
         check_stopped()
-        self.planned += seconds
         self.ask(lambda: self.rig.wait(seconds))
-        self.reading = self.ask(self.rig.read)
+        self.read(lambda: self.ask(self.rig.read))
         self._note_notices()
+        self.check()
 
     def ask(self, call: Callable[[], Any]) -> Any:
         """Ask the rig; a lost connection, or a device that refuses, is a trip."""

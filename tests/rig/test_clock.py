@@ -43,7 +43,7 @@ def test_a_clock_that_cannot_run_is_refused(speed: float) -> None:
 def beats(wait: float, *works: float) -> list[float]:
     """Return when each wait ends, on a clock that starts at 0."""
     clock, ends = SteppedClock(), []
-    beat = Metronome(clock)
+    beat = Metronome(clock, clock.sleep)
     for work in works:
         clock.sleep(work)
         ends.append(beat.next(wait))
@@ -64,7 +64,7 @@ def test_after_longer_work_the_grid_starts_anew(wait: float, late: float) -> Non
 
 def test_a_wait_that_begins_before_the_last_has_ended_is_not_put_behind_it() -> None:
     clock = SteppedClock()
-    beat = Metronome(clock)
+    beat = Metronome(clock, clock.sleep)
     assert beat.next(0.4) == 0.4
     clock.sleep(0.1)  # woken early, by a stop for example
     assert beat.next(0.4) == 0.5

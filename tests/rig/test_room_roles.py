@@ -56,7 +56,7 @@ def read_by(guard: Guard, *changes: dict[str, float]) -> list[Findings]:
     found = []
     for k, (change, (a, b)) in enumerate(zip(changes, noise), start=1):
         values = {"t_surface": 25.0 + a, BLOCK: 25.0 + b, ROOM: 25.0, **change}
-        found.append(guard.check(Reading(float(k), values, {"drive": 0.0}, 1), float(k), planned=1.0))
+        found.append(guard.check(Reading(float(k), values, {"drive": 0.0}, 1), float(k)))
     return found
 
 

@@ -6,7 +6,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -184,7 +183,7 @@ def run(
     stop = None if stop_early is None else session_stop(stop_early, tell=watch.posterior)
     loaded = load_controller(controller, network)
     regulator, wanted = RecordedController(loaded), _for_outputs(wanted, loaded.controlled)
-    checks = guard_of(guard, loaded.plant, learn, speed=speed)
+    checks = guard_of(guard, loaded.plant, learn)
     clock = ScaledClock(speed)
     name = f"{twin.name}, draw {draw}" if twin is not None else str(port)
     about: dict[str, Any] = {"controller": controller.name, "target_degC": wanted}
@@ -276,7 +275,7 @@ def batch(
     from thermogrip.rig.records.batch import read_plan, run_batch
 
     trials, loaded = read_plan(plan), load_controller(controller, network)
-    checks = guard_of(guard, loaded.plant, learn, speed=speed)
+    checks = guard_of(guard, loaded.plant, learn)
     clock, console = ScaledClock(speed), Console(as_json)
     watch = _watch("batch", console, out, live, foxglove, on_trip)
     asks = ask and port is not None and not as_json
@@ -345,7 +344,7 @@ def record(
     from thermogrip.rig.session.session import Playback, play
 
     plan = read_log(schedule)
-    checks = guard_of(guard, None, speed=speed)
+    checks = guard_of(guard, None)
     console = Console(as_json)
     watch = _watch("record", console, out, live, foxglove, on_trip)
     clock = ScaledClock(speed)
@@ -543,17 +542,12 @@ def _twin(
     return Twin(plant.draw(draw), seed=seed, t_start=t_start, limits=limits)
 
 
-def guard_of(
-    path: Path | None, plant: Plant | None, learn: Path | None = None, *, speed: float = 1.0
-) -> Guard:
-    """Return the guard of a rig; what no file says is as by default.  Clocks of a virtual device that runs
-    ``speed`` times as fast may be as far apart as those of others, in seconds of the computer."""
+def guard_of(path: Path | None, plant: Plant | None, learn: Path | None = None) -> Guard:
+    """Return the guard of a rig; what no file says is as by default."""
     from thermogrip.rig.guard.guard import Guard, GuardSettings
     from thermogrip.rig.guard.settings import read_guard
 
     settings = GuardSettings() if path is None else read_guard(path)
-    if speed > 1.0:
-        settings = replace(settings, clock_slack_s=speed * settings.clock_slack_s)
     drift = None if learn is None or plant is None else _drift_of(learn, plant, settings.model.drift)
     return Guard(plant, settings, drift=drift)
 

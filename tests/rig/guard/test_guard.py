@@ -33,7 +33,10 @@ def guard_at(skin: float = 25.0, **settings: Any) -> Guard:
 
 
 def check(guard: Guard, one: Reading, *, now: float | None = None, **options: Any) -> Findings:
-    return guard.check(one, one.time_s if now is None else now, planned=1.0, **options)
+    """Check a reading under a drive that was renewed just before."""
+    now = one.time_s if now is None else now
+    guard._renewed = now
+    return guard.check(one, now, **options)
 
 
 def kind(found: Findings) -> str:
@@ -65,30 +68,64 @@ def clock(since: float, there: float) -> tuple[str, ...]:
 
 
 @pytest.mark.parametrize(
-    ("planned", "polls", "want"),
-    [(1.0, [(103.0, 13.0)], None),  # exactly the second of the plan and the device's 2 s
-     (1.0, [(103.1, 13.1)], ("frozen", "this program", "a reading every 1 s", "none for 3.1 s")),
-     (0.05, [(104.0, 14.0)], ("frozen", "this program", "a reading every 0.1 s", "none for 4.0 s")),
-     (1.0, [(101.0, 11.0), (102.0, 11.0), (104.0, 11.0)], None),
-     (1.0, [(101.0, 11.0), (102.0, 11.0), (104.5, 11.0)],
-      ("stale", "readings", "a new one within 3 s", "none for 3.5 s")),
-     (1.0, [(101.0, 12.0)], None), (2.0, [(102.0, 11.0)], None),  # 1 s of slack either way
-     (1.0, [(101.0, 12.5)], clock(1.0, 2.5)), (2.0, [(102.5, 11.0)], clock(2.5, 1.0)),
-     (1.0, [(101.0, 9.5)], clock(1.0, -0.5)),
-     (1.0, [(101.0, 11.0), (102.0, 11.0), (103.0, 13.0)], None)],  # from the last new one
+    ("polls", "want"),
+    [([(113.1, 23.1)], None),
+     ([(101.0, 11.0), (102.0, 11.0), (103.0, 11.0)], None),
+     ([(101.0, 11.0), (102.0, 11.0), (103.5, 11.0)],
+      ("stale", "readings", "a new one within 2 s", "none for 2.5 s")),
+     ([(101.0, 12.0)], None), ([(102.0, 11.0)], None),  # 1 s of slack either way
+     ([(101.0, 12.5)], clock(1.0, 2.5)), ([(102.5, 11.0)], clock(2.5, 1.0)),
+     ([(101.0, 9.5)], clock(1.0, -0.5)),
+     ([(101.0, 11.0), (102.0, 11.0), (103.0, 13.0)], None)],  # from the last new one
 )  # fmt: skip
 def test_readings_and_the_programs_clock_move_on_together(
-    planned: float, polls: list[tuple[float, float]], want: tuple[str, ...] | None
+    polls: list[tuple[float, float]], want: tuple[str, ...] | None
 ) -> None:
     guard = Guard()
     guard.start(reading(10.0, 25.0), 100.0, UNITS)
-    *before, trip = [guard.check(reading(t, 25.0), now, planned=planned).trip for now, t in polls]
+    *before, trip = [guard.check(reading(t, 25.0), now).trip for now, t in polls]
     assert before == [None] * (len(polls) - 1)
     assert said(trip) == want
     if want is not None:
         since, there = polls[-1][0] - 100.0 - (want[0] == "stale"), polls[-1][1] - 10.0
         figures = {"here": since, "there": there} if want[0] == "clock" else {"seconds": since}
         assert trip.figures == pytest.approx(figures)
+
+
+@pytest.mark.parametrize(
+    ("first", "then", "there", "want"),
+    [((100.0, 104.0), (104.1, 104.2), 4.0, None),  # the first came 4 s before the program had it ...
+     ((100.0, 104.0), (104.1, 104.2), 0.15, None),  # ... or as it had it
+     ((100.0, 100.0), (100.5, 105.0), 0.5, None), ((100.0, 100.0), (100.5, 105.0), 5.0, None),
+     ((100.0, 104.0), (104.1, 104.2), 5.5, clock(4.2, 5.5)),
+     ((100.0, 100.0), (102.0, 105.0), 0.5, clock(2.0, 0.5))],
+)  # fmt: skip
+def test_how_late_the_program_is_with_a_reading_is_no_fault_of_the_rigs_clock(
+    first: tuple[float, float], then: tuple[float, float], there: float, want: tuple[str, ...] | None
+) -> None:
+    guard = Guard()
+    guard.start(reading(10.0, 25.0), first[1], UNITS, asked=first[0])
+    assert said(guard.check(reading(10.0 + there, 25.0), then[1], asked=then[0]).trip) == want
+
+
+@pytest.mark.parametrize(
+    ("drive", "renewed", "then", "want"),
+    [(0.4, 2.0, 2.0, ""), (0.4, 2.1, 2.0, "frozen"), (0.0, 60.0, 60.0, ""), (0.4, 0.5, 2.6, "frozen")],
+)
+def test_a_drive_that_nobody_renewed_in_its_time_is_the_programs_fault(
+    drive: float, renewed: float, then: float, want: str
+) -> None:
+    """``renewed`` [s] after it was applied it is applied anew; ``then`` a reading is asked for."""
+    guard = guard_at()
+    assert guard.applied({"drive": drive}, 1, 30.0) is None  # a controller may take its time before it
+    late = guard.applied({"drive": drive}, 1, 30.0 + renewed)
+    asked = 30.0 + renewed + then
+    found = guard.check(reading(asked, 25.0), asked + 5.0, asked=asked)
+    trips = [one for one in (late, found.trip) if one is not None]
+    assert [one.kind for one in trips] == [want] * bool(want)
+    assert guard.trips == trips
+    if renewed > 2.0 and want:
+        assert said(late) == ("frozen", "this program", "a drive renewed within 2 s", "after 2.1 s")
 
 
 def test_a_reading_that_was_seen_is_not_checked_again_and_an_old_one_is_not_fresh() -> None:
@@ -123,7 +160,7 @@ def test_of_two_heaters_each_may_differ_by_the_slack_and_only_both_off_is_the_de
 
     guard = Guard()
     guard.start(at(0.0), 0.0, {"q1": "percent", "q2": "percent"})
-    guard.asked({"q1": 50.0, "q2": 30.0}, 1)
+    guard.applied({"q1": 50.0, "q2": 30.0}, 1, 0.0)
     assert kind(check(guard, at(1.0))) == ""
     trip = check(guard, at(2.0)).trip
     assert said(trip) == want
@@ -134,7 +171,7 @@ def test_of_two_heaters_each_may_differ_by_the_slack_and_only_both_off_is_the_de
 def test_a_driver_that_obeys_in_between_is_not_off_twice(unit: str) -> None:
     guard = Guard()
     guard.start(reading(0.0, 25.0), 0.0, {"drive": unit})
-    guard.asked({"drive": 0.5}, 1)
+    guard.applied({"drive": 0.5}, 1, 0.0)
     drives = (0.0, 0.5, 0.0, 0.45, 0.44, 0.44)  # 0.05 is the slack of a drive of -1 to 1, or of another unit
     kinds = [kind(check(guard, reading(float(k), 25.0, drive=d))) for k, d in enumerate(drives, start=1)]
     assert kinds == ["", "", "", "", "", "driver"]
@@ -172,7 +209,7 @@ def test_the_second_reading_beyond_a_limit_trips(
     skins: tuple[float, ...], drive: float, touching: bool, measured: str
 ) -> None:
     guard = guard_at(skins[0])
-    guard.asked({"drive": drive}, 1)
+    guard.applied({"drive": drive}, 1, 0.0)
     found = [
         check(guard, reading(float(k), skin, drive=drive), touching=touching)
         for k, skin in enumerate(skins, start=1)
@@ -258,7 +295,7 @@ def told(plant: Plant) -> tuple[Guard, Mock]:
 def test_what_the_model_is_given_and_what_it_finds_suspect(plant: Plant) -> None:
     guard, model = told(plant)
     model.compared_from = 1.5
-    guard.asked({"drive": 0.4}, 1)
+    guard.applied({"drive": 0.4}, 1, 0.0)
     model.is_jump.side_effect = lambda name, value: name == "t_tank"
     found = check(guard, reading(1.0, 25.0, tank=25.2, drive=0.4))
     assert found.suspect == {"t_tank": "jump"}
@@ -285,7 +322,7 @@ def test_what_is_known_is_kept_for_five_minutes_after_a_session_that_ended_well(
     plant: Plant, gap: float, tripped: bool, known: bool
 ) -> None:
     guard, model = told(plant)
-    guard.asked({"drive": 0.4}, 1)
+    guard.applied({"drive": 0.4}, 1, 0.0)
     check(guard, reading(1.0, 25.0, drive=0.4), touching=True)
     guard.trips = [Trip("lost", 1.0, "t", "a", "b")] if tripped else []
     begin = 1.0 + gap
@@ -397,7 +434,7 @@ def test_causes_are_named_by_danger_unless_the_sensor_repeats_itself(
 
 def test_a_drive_beyond_the_optimum_for_a_minute_trips(plant: Plant) -> None:
     guard, model = told(plant)
-    guard.asked({"drive": -0.8}, 1)
+    guard.applied({"drive": -0.8}, 1, 0.0)
     # asked at 1, 11, 21 ...; true from 21 to 61, false at 71, true from 81 on: a minute later is 141
     for k in range(1, 142):
         model.past_optimum.return_value = "" if k <= 20 or k == 71 else "drive"
@@ -415,7 +452,7 @@ def test_without_a_model_the_drive_of_the_rules_is_the_largest_share_of_a_range(
     asked = []
     guard.rules = SimpleNamespace(check=lambda *given, **more: asked.append((given, more)))
     for k, (a, b, c, touching) in enumerate([(60.0, -0.5, 0.0, False), (50.0, -0.6, 51.0, True)], start=1):
-        guard.asked({"a": a, "b": b, "c": c}, 1)
+        guard.applied({"a": a, "b": b, "c": c}, 1, float(k))
         values = {"t_tank": 25.0, "t_surface": 25.0, "t_ambient": 20.0}
         check(guard, Reading(float(k), values, {"a": a, "b": b, "c": c}, 1), touching=touching)
     both, tank = {"t_tank": 25.0, "t_surface": 25.0}, {"t_tank": 25.0}
@@ -428,7 +465,7 @@ def test_without_a_model_the_drive_of_the_rules_is_the_largest_share_of_a_range(
 def test_a_skin_is_masked_while_it_touches_and_for_a_minute_after(plant: Plant) -> None:
     guard, model = told(plant)
     for time, touching in ((1.0, False), (2.0, True), (3.0, False), (62.9, False), (63.0, False)):
-        guard._time, guard._now, guard._fresh_at = time - 1.0, time - 1.0, time - 1.0
+        guard._time, guard._now, guard._fresh = time - 1.0, time - 1.0, (time - 1.0,) * 2
         check(guard, reading(time, 25.0), touching=touching)
         assert guard.ready(72.9) == (time < 2.0)
         assert guard.ready(73.0) == (not touching)

@@ -36,6 +36,12 @@ def rig_of(**values: float) -> Mock:
     return rig
 
 
+def pass_time(rig: Mock, seconds: float, *, lost: float) -> None:
+    """Let time pass on a rig whose tank is lost at one moment."""
+    rig.time = round(rig.time + seconds, 9)
+    rig.values["t_tank"] = nan if rig.time == lost else 25.0
+
+
 class Asked:
     """A controller that keeps what it was asked and answers from a script."""
 
@@ -112,19 +118,18 @@ def test_a_start_opens_the_gripper_and_gives_the_controller_the_first_reading() 
 def test_the_controller_is_asked_once_a_sample_time_and_of_fresh_readings_alone() -> None:
     moves = Move(drive=40.0), Move(drive=50.0, status="late", advice="wait"), Move(drive={"q": 60.0})
     run, passed = started(*moves), []
+    run.rig.wait.side_effect = lambda seconds: pass_time(run.rig, seconds, lost=11.0)
     for now in run.regulate("settle", 2.0):
         passed.append(now)
-        run.rig.values["t_tank"] = nan if len(passed) == 2 else 25.0
-        run.reading = run.rig.read()
     assert passed == [0.0, 0.5, 1.0, 1.5]
     assert run.controller.seen[1:] == [(10.0, 30.0), (10.5, 30.0), (11.5, 30.0)]
     assert told(run, "controller") == [(10.5, "late: wait"), (11.5, "ok")]
     assert run.column("q_percent").tolist() == [40.0, 50.0, 50.0, 60.0]
     assert told(run, "lost") == [(11.0, "t_tank is suspect (lost); the last good value is used")]
-    run.rig.values["t_tank"] = nan
     for _ in range(2):
+        run.rig.wait.side_effect = lambda seconds: pass_time(run.rig, seconds, lost=run.rig.time + seconds)
         run.wait(0.5)
-        assert not run.check()
+        assert not run.fresh
         assert run.controller_reading() == {"time_s": run.rig.time, **run.rig.values, "t_tank": 25.0}
     assert len(told(run, "lost")) == 1  # once
     both = started(target={"t_surface": 30.0, "t_tank": 40.0})
@@ -406,7 +411,7 @@ def test_an_operator_marks_a_trial_bad_and_stops_it_through_the_guard() -> None:
     run.operator.mark_bad("it slipped")
     for _ in run.regulate("hold", 1.0):
         pass
-    assert told(run, "bad") == [(10.0, "it slipped")]
+    assert told(run, "bad") == [(10.5, "it slipped")]
     run.operator.stop("the page")
     trip = trip_of(lambda: next(run.regulate("hold", 1.0)))
     assert (trip.kind, trip.measured) == ("operator", "a stop from the page")

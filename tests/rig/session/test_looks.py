@@ -1,0 +1,106 @@
+"""However long a sample is, the rig is looked at and its drive renewed within half a second."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.rig.makers import Bench, SteppedClock
+from tests.rig.session.test_loop import rig_of, shown, started, told, trip_of
+from thermogrip.datasets.schema import Log, make_log
+from thermogrip.mpc.interface import Move
+from thermogrip.rig.guard.guard import LIMIT_MARGIN, Guard, GuardSettings
+from thermogrip.rig.interface import Rig
+from thermogrip.rig.session.loop import LOOK_S
+from thermogrip.rig.session.session import play
+from thermogrip.rig.simulation.twin import Twin
+from thermogrip.rig.simulation.virtual_device import example_plant
+
+DEVICES = ("own firmware", "tclab", "twin")
+LIMIT = 40.0  # degC, of everything
+
+
+@contextmanager
+def rig_named(name: str) -> Iterator[tuple[Rig, Twin, SteppedClock | None]]:
+    """Yield a rig in a room of 23 degC, its plant, and the clock of both where it has one."""
+    if name == "twin":
+        twin = Twin(example_plant(), ambient=23.0, seed=1)
+        yield twin, twin, None
+        return
+    protocol = "tclab" if name == "tclab" else "thermogrip"
+    plant = example_plant(protocol, room=23.0)
+    bench = Bench(plant, protocol=protocol, ambient=23.0, t_start=23.0, seed=1)
+    yield bench.rig, bench.device.bench.twin, bench.clock
+    bench.close()
+
+
+def full_drive(rig: Rig) -> Log:
+    """Return a schedule of three hours at full drive."""
+    full = {"percent": [100.0, 100.0], "1": [1.0, 1.0]}
+    return make_log([0.0, 5400.0], {name: (full[unit], unit, "input") for name, unit in rig.units.items()})
+
+
+@pytest.mark.parametrize("dt", [1.0, 10.0, 60.0, 600.0, 3600.0])
+@pytest.mark.parametrize("device", DEVICES)
+def test_no_limit_is_exceeded_by_two_kelvin_however_long_a_sample_is(device: str, dt: float) -> None:
+    with rig_named(device) as (rig, twin, clock):
+        guard = Guard(settings=GuardSettings(limits=dict.fromkeys(twin.plant.outputs, (5.0, LIMIT))))
+        truths, step = [], twin._step
+        twin._step = lambda: (step(), truths.append(max(twin.truth().values())))
+        log, ended = play(rig, full_drive(rig), dt=dt, guard=guard, clock=clock)
+        assert ended.startswith("limit:")
+        rig.wait(60.0)  # what is in the heater still comes
+        rig.read()
+        assert LIMIT < max(truths) < LIMIT + LIMIT_MARGIN
+        assert np.diff(log["time"].values[:-1]) == pytest.approx(dt)
+
+
+@pytest.mark.parametrize("dt", [0.1, 0.5, 1.5, 60.0])
+def test_a_rig_is_read_checked_renewed_and_shown_within_half_a_second(dt: float) -> None:
+    run = started(Move(drive=40.0), rig=rig_of())
+    run.controller.dt, seen, begin = dt, shown(run), run.rig.time
+    for _ in run.regulate("hold", 1.9 * dt):
+        pass
+    looks = np.diff([begin] + [one.time_s for one in seen[1:]])
+    assert looks.max() <= LOOK_S + 1e-9
+    assert run.rig.apply.call_count == len(seen) == pytest.approx(2 * max(1, dt / LOOK_S))
+    assert run.column("time_s").tolist() == [begin, begin + dt]  # rows and the controller keep their time
+    assert [time for time, _ in run.controller.seen[1:]] == [begin, begin + dt]
+
+
+def test_a_computer_that_comes_late_keeps_the_time_of_its_samples() -> None:
+    run = started(Move(drive=40.0), rig=rig_of())
+    late = iter([0.0, 1.1, 0.0, 0.3] + [0.0] * 99)
+
+    def wait(seconds: float) -> None:
+        run.rig.time = round(run.rig.time + seconds + next(late), 9)
+
+    run.rig.wait.side_effect = wait
+    run.wait(5.0)
+    assert abs(run.rig.time - 15.0) <= 0.5 * LOOK_S
+
+
+@pytest.mark.parametrize("fault", ["operator", "lost", "reset"])
+def test_what_happens_within_a_long_sample_ends_it_there(fault: str) -> None:
+    run = started(Move(drive=40.0), rig=rig_of())
+    step = run.rig.wait.side_effect
+
+    def wait(seconds: float) -> None:
+        step(seconds)
+        if run.rig.time > 20.0:
+            if fault == "operator":
+                run.operator.stop("the page")
+            elif fault == "lost":
+                run.rig.values["t_tank"] = float("nan")
+            else:
+                run.rig.notices.return_value = [replace(run.events[0], kind="reset", text="reset")]
+
+    run.rig.wait.side_effect = wait
+    trip = trip_of(lambda: run.wait(3600.0))
+    assert trip.kind == {"reset": "device"}.get(fault, fault)
+    assert 20.0 < trip.time_s <= 20.0 + 3 * LOOK_S
+    assert fault != "lost" or len(told(run, "lost")) == 1
