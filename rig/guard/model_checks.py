@@ -239,8 +239,8 @@ class ModelMonitor:
     """Follow a rig with its plant; pure: times are passed in.
 
     ``compared_from`` is when windows may begin [s]; ``compared_now`` says whether the last reading was
-    compared: it completed a native step of the model, and a second had passed since the last one that was; ``evidence`` is of the longest windows
-    since the start, where the drift is learnt.
+    compared: it completed a native step of the model, and a second had passed since the last one that was;
+    ``evidence`` is of the longest windows since the start, where the drift is learnt.
     """
 
     def __init__(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,7 +19,6 @@ from thermogrip.live.watch import Watch
 from thermogrip.mpc.controllers.mpc import Controller
 from thermogrip.report.console import Console
 from thermogrip.rig import Session
-from thermogrip.rig.guard.guard import GuardSettings
 from thermogrip.rig.guard.plant_mismatch import USUAL_DRIFT
 from thermogrip.rig.guard.trip import Trip
 from thermogrip.rig.records.batch import Batch, Trial
@@ -293,7 +291,6 @@ def test_a_batch_keeps_on_what_it_ran_and_fails_while_a_trial_is_left(
     assert (type(call.args[1]), len(call.args[2]), call.args[3]) == (Controller, 2, Path("out"))
     assert call.first_touch is verbs._first_touch
     assert guards[0].args == (Path("g.toml"), call.args[1].plant, Path("rig.json"))
-    assert guards[0].speed == (3.0 if on_rig else 1.0)
     files = {"controller": "c.json", "plan": "plan.csv", "guard": "g.toml"} | (
         {} if on_rig else {"plant": "plant.json"}
     )
@@ -482,7 +479,7 @@ def test_a_schedule_is_played_and_its_rows_are_counted(
     [opens], [call] = opened, plays
     assert (opens.args, opens.clock.speed) == (("socket://rig", "tclab"), 4.0)
     assert (tried[0].args[0].attrs["name"], tried[0].args[1:]) == ("good", ({"drive": "1"}, 0.5))
-    assert (guards[0].args, guards[0].speed) == ((Path("g.toml"), None), 4.0)
+    assert guards[0].args == (Path("g.toml"), None)
     assert (call.args[0], call.args[1].attrs["name"], call.dt) == (made, "good", 0.5)
     assert (call.guard, call.clock is opens.clock) == ("a guard", True)
     about = {"schedule": "good.csv", "port": "socket://rig", "sample_s": 0.5, "seed": 3}
@@ -538,13 +535,6 @@ def test_a_guard_has_its_file_or_the_defaults_and_learns_only_of_a_plant(
     assert [call.drift for call in guards] == [None, None, None, "a drift"]
     assert [call.args for call in read] == [(Path("g.toml"),)]
     assert drifts[0].args == (tmp_path, "a plant", 0.125)
-
-
-def test_clocks_of_a_faster_virtual_device_are_as_far_apart_in_seconds_of_the_computer() -> None:
-    usual = GuardSettings()
-    for speed, times in ((1.0, 1.0), (0.5, 1.0), (4.0, 4.0)):
-        wider = replace(usual, clock_slack_s=times * usual.clock_slack_s)
-        assert verbs.guard_of(None, None, speed=speed).settings == wider
 
 
 def test_a_rig_that_nobody_knows_drifts_as_is_usual_or_as_the_guard_file_says(tmp_path: Path) -> None:
