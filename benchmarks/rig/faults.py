@@ -35,6 +35,7 @@ from thermogrip.rig.session.session import run_session
 from thermogrip.rig.simulation.twin import Twin
 
 sys.path.insert(0, str(Path(__file__).parents[2]))  # the drills are tests
+from benchmarks.rig.limits import with_limits
 from tests.rig.fault_injection.drills import DRILLS, Outcome, drill_plants, run_drill
 from tests.rig.fault_injection.host_drills import HOST_DRILLS, HostOutcome, run_host_drill
 
@@ -62,13 +63,13 @@ skin is on its way from 25 to 36 degC or, where marked *held*, was there.
 **A TCLab cannot do this.** Its firmware has no time to live: if its host dies, or its cable is pulled, it heats on
 until somebody pulls the supply. Everything that the host can see is watched on it as well.
 
-**The guard's guarantee**: no limit is exceeded by more than 2 K before power is off.
-
 | fault | found after [s] | by | off after [s] | beyond [K] | rows |
 |---|---|---|---|---|---|
 """
 
 SLOW = """
+## How far beyond a limit
+
 ## Why some take their time
 
 Sooner is lower floors, or fewer repeats, at the cost of false alarms. {cost}
@@ -182,7 +183,7 @@ def main() -> None:
     text = HEAD + "\n".join(lines) + "\n" + slow + SAID + "\n\n".join(said) + "\n"
     ends = [f"- `{kind}`: {clear}" for kind, clear in ENDLESS.items()]
     text += TAIL + "\n".join(kinds) + "\n" + ALONE + "\n".join(ends) + "\n"
-    out.write_text(_tidy(text), encoding="utf-8")
+    out.write_text(with_limits(_tidy(text)), encoding="utf-8")
     options.record.write_text(_tidy(record), encoding="utf-8")
 
 

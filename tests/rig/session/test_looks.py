@@ -2,61 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.rig.makers import Bench, SteppedClock
+from tests.rig.fault_injection.limits import LIMITS, SAMPLES_S, drive_into
 from tests.rig.session.test_loop import rig_of, shown, started, told, trip_of
-from thermogrip.datasets.schema import Log, make_log
 from thermogrip.mpc.interface import Move
-from thermogrip.rig.guard.guard import LIMIT_MARGIN, Guard, GuardSettings
-from thermogrip.rig.interface import Rig
+from thermogrip.rig.guard.guard import LIMIT_MARGIN
 from thermogrip.rig.session.loop import LOOK_S
-from thermogrip.rig.session.session import play
-from thermogrip.rig.simulation.twin import Twin
-from thermogrip.rig.simulation.virtual_device import example_plant
-
-DEVICES = ("own firmware", "tclab", "twin")
-LIMIT = 40.0  # degC, of everything
 
 
-@contextmanager
-def rig_named(name: str) -> Iterator[tuple[Rig, Twin, SteppedClock | None]]:
-    """Yield a rig in a room of 23 degC, its plant, and the clock of both where it has one."""
-    if name == "twin":
-        twin = Twin(example_plant(), ambient=23.0, seed=1)
-        yield twin, twin, None
-        return
-    protocol = "tclab" if name == "tclab" else "thermogrip"
-    plant = example_plant(protocol, room=23.0)
-    bench = Bench(plant, protocol=protocol, ambient=23.0, t_start=23.0, seed=1)
-    yield bench.rig, bench.device.bench.twin, bench.clock
-    bench.close()
-
-
-def full_drive(rig: Rig) -> Log:
-    """Return a schedule of three hours at full drive."""
-    full = {"percent": [100.0, 100.0], "1": [1.0, 1.0]}
-    return make_log([0.0, 5400.0], {name: (full[unit], unit, "input") for name, unit in rig.units.items()})
-
-
-@pytest.mark.parametrize("dt", [1.0, 10.0, 60.0, 600.0, 3600.0])
-@pytest.mark.parametrize("device", DEVICES)
-def test_no_limit_is_exceeded_by_two_kelvin_however_long_a_sample_is(device: str, dt: float) -> None:
-    with rig_named(device) as (rig, twin, clock):
-        guard = Guard(settings=GuardSettings(limits=dict.fromkeys(twin.plant.outputs, (5.0, LIMIT))))
-        truths, step = [], twin._step
-        twin._step = lambda: (step(), truths.append(max(twin.truth().values())))
-        log, ended = play(rig, full_drive(rig), dt=dt, guard=guard, clock=clock)
-        assert ended.startswith("limit:")
-        rig.wait(60.0)  # what is in the heater still comes
-        rig.read()
-        assert LIMIT < max(truths) < LIMIT + LIMIT_MARGIN
-        assert np.diff(log["time"].values[:-1]) == pytest.approx(dt)
+@pytest.mark.parametrize("dt", SAMPLES_S)
+@pytest.mark.parametrize(("device", "limit"), LIMITS)
+def test_no_limit_is_exceeded_by_two_kelvin_however_long_a_sample_is(
+    device: str, limit: float, dt: float
+) -> None:
+    beyond = drive_into(device, limit, dt)
+    assert beyond.ended.startswith("limit:")
+    assert 0.0 < beyond.at_off <= beyond.highest < LIMIT_MARGIN
+    assert beyond.driven < 5.0
+    assert np.diff(beyond.log["time"].values[:-1]) == pytest.approx(dt)
 
 
 @pytest.mark.parametrize("dt", [0.1, 0.5, 1.5, 60.0])
