@@ -17,6 +17,8 @@ from thermogrip.rig.session.loop import LOOK_S
 sys.path.insert(0, str(Path(__file__).parents[2]))  # the runs are tests
 from tests.rig.fault_injection.limits import LIMITS, ROOM, SAMPLES_S, drive_into
 
+# ruff: noqa: E501
+
 BEGIN, END = "## How far beyond a limit", "## "
 NEAR_ROOM = ("TCLab", 28.0)
 TEXT = """\

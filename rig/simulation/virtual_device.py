@@ -2,7 +2,8 @@
 
 The device lives in a thread of its own and moves its plant and its firmware ten times a second of its own
 clock: the computer's, many times that, or one that the host steps.  What it does on a stepped clock depends
-on no scheduler.  :meth:`VirtualDevice.exchange` leaves out thread and cable: the quickest.
+on no scheduler.  On the computer's its time stands still while the computer has no time for it: no board is
+held up, and what a host sent meanwhile came in time.  :meth:`VirtualDevice.exchange` leaves out thread and cable: the quickest.
 
 ``trace`` keeps the truth of the last hour (or as many samples as asked), so that a test knows when the
 drive went to zero and how warm it got, whatever the sensors showed.
@@ -184,6 +185,7 @@ _BOARD = {
 }  # fmt: skip
 SAMPLE_MS = 100
 _POLL_S = 0.02  # of real time
+_HELD_UP_S = 0.05  # of real time, twice and a half a poll: a device that is further behind was held up
 
 
 class VirtualDevice:
@@ -446,6 +448,9 @@ class VirtualDevice:
 
     def _advance(self) -> None:
         """Let plant and firmware catch up with the clock: samples and the end of a drive, in their order."""
+        if self._thread is not None and isinstance(self._clock, ScaledClock):
+            behind = self.time - self.bench.time - _HELD_UP_S * self._clock.speed
+            self._start += max(0.0, behind)
         now = self._now_ms()
         while (due := self._due()) <= now:
             self.bench.advance(due / 1000)

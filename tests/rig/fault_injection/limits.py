@@ -1,4 +1,4 @@
-"""Full drive into a limit with honest sensors: how far beyond it the truth goes, by device and sample time."""
+"""Full drive into a limit with honest sensors: how far beyond it the truth goes."""
 
 from __future__ import annotations
 

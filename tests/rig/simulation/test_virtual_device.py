@@ -204,3 +204,22 @@ def test_an_unheated_tclab_stays_at_the_temperature_of_its_room(clock: SteppedCl
     device = VirtualDevice(protocol="tclab", link="none", clock=clock, ambient=18.0)
     clock.sleep(600.0)
     assert list(device.truth().temperatures.values()) == pytest.approx([18.0, 18.0], abs=1e-6)
+
+
+def test_a_device_that_the_computer_holds_up_counts_no_time_meanwhile(plant: Plant) -> None:
+    class Jumping(ScaledClock):
+        """Slow, and a minute later after a while in which nobody served."""
+
+        late = 0.0
+
+        def __call__(self) -> float:
+            return super().__call__() + self.late
+
+    clock = Jumping(0.01)
+    with VirtualDevice(plant, clock=clock, link="socket") as device:
+        rig = DeviceRig(Port(device.port))
+        rig.apply({"drive": 0.5}, 1)
+        clock.late = 60.0
+        assert device.applied_drive == {"drive": 0.5}
+        assert rig.read().drive == {"drive": 0.5}
+        rig.close()
