@@ -285,11 +285,12 @@ class Watch:
         assert page.stdout is not None
         for text in page.stdout:
             asked = json.loads(text)
-            if asked["do"] == "stop":
+            do = asked.get("do")  # it may also say why it ends
+            if do == "stop":
                 self.operator.stop("the page")
-            elif asked["do"] == "bad":
+            elif do == "bad":
                 self.operator.mark_bad(asked.get("text") or "marked on the page")
-            elif asked["do"] == "answer" and asked.get("question", "").isdecimal():
+            elif do == "answer" and asked.get("question", "").isdecimal():
                 self._answers.put((int(asked["question"]), asked.get("text", "")))
 
     def _close_page(self) -> None:
