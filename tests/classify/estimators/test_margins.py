@@ -6,8 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from scipy.special import log_softmax
-from sklearn.model_selection import cross_val_predict
 
 from thermogrip.classify import make_classifier
 from thermogrip.classify.estimators.base import GraspClassifier, pick
@@ -36,24 +34,15 @@ def test_the_scale_found_is_the_one_that_the_truth_was_drawn_with() -> None:
     margins = rng.standard_normal((20_000, 3))
     p = np.exp(2.5 * margins) / np.exp(2.5 * margins).sum(axis=1, keepdims=True)
     truth = np.array([rng.choice(3, p=row) for row in p])
-    scale, loss = calibrated_scale(margins, truth)
-    assert scale == pytest.approx(2.5, rel=0.05)  # standard error 0.02
-    assert loss == pytest.approx(-np.log(p[np.arange(20_000), truth]).mean(), rel=0.01)
+    assert calibrated_scale(margins, truth) == pytest.approx(2.5, rel=0.05)  # standard error 0.02
+    assert calibrated_scale(margins[:5000, :2], rng.integers(0, 2, 5000)) < 0.1  # of margins that say nothing
 
 
 @pytest.mark.parametrize(("n", "k"), [(6, 2), (30, 2), (6, 3), (40, 4)])
 def test_where_all_are_right_the_truth_counts_as_one_observation_less(n: int, k: int) -> None:
     """Margins 1 for the truth and 0 else: e^s / (e^s + k - 1) = (n + 1) / (n + 2)."""
     truth = np.arange(n) % k
-    scale, _ = calibrated_scale(np.eye(k)[truth], truth)
-    assert scale == pytest.approx(np.log((k - 1) * (n + 1)), rel=1e-3)
-
-
-def test_margins_that_say_nothing_give_equal_probabilities() -> None:
-    rng = np.random.default_rng(1)
-    scale, loss = calibrated_scale(rng.standard_normal((5000, 2)), rng.integers(0, 2, 5000))
-    assert scale < 0.1  # standard error of a slope: 0.02
-    assert loss == pytest.approx(np.log(2), abs=0.001)
+    assert calibrated_scale(np.eye(k)[truth], truth) == pytest.approx(np.log((k - 1) * (n + 1)), rel=1e-3)
 
 
 def test_sessions_stay_whole_inside_the_training_and_grasps_where_there_is_one(make_touches: Maker) -> None:
@@ -81,31 +70,11 @@ def test_two_sessions_are_held_out_one_after_the_other_and_no_fold_lacks_a_mater
     assert whole > 60
 
 
-@pytest.mark.parametrize("materials", [("copper", "zinc"), ("copper", "zinc", "iron")])
-def test_the_machine_taken_is_the_best_of_those_that_scikit_learn_holds_out(
-    make_touches: Maker, materials: tuple[str, ...]
-) -> None:
-    grasps = make_touches(materials, each=16, noise=0.6, seed=2)
-    labels = grasps["material"].values.astype(str)
-    model = SvmPca().fit(grasps)
-    rows, truth = model._rows(grasps), np.searchsorted(model.classes_, labels)
-    losses = []
-    for machine in model._machines(labels.size):
-        folds = inner_folds(grasps, labels)
-        d = cross_val_predict(machine, rows, labels, cv=folds, method="decision_function")
-        losses.append(calibrated_scale(np.stack([-d, d], axis=1) if d.ndim == 1 else d, truth)[1])
-    assert max(losses) > 1.05 * min(losses)
-    assert model.held_out_loss_ == pytest.approx(min(losses), rel=1e-3)
-    d = model.machine_.decision_function(rows)
-    margins = np.stack([-d / 2, d / 2], axis=1) if d.ndim == 1 else d
-    np.testing.assert_allclose(model.predict_log_proba(grasps), log_softmax(model.scale_ * margins, axis=1))
-
-
 def test_labels_without_a_meaning_are_not_learnt(make_touches: Maker) -> None:
-    """What is held out was not seen, so its score is that of no information: a loss of ln 3 and more."""
+    """What is held out was not seen, so probabilities are near those of no information, a third each."""
     model = SvmPca().fit(make_touches(each=12, noise=0.2, seed=1, shuffled=True))
-    assert model.held_out_loss_ > 0.95 * np.log(3)
-    assert model.scale_ < 1.0
+    fresh = make_touches(each=12, noise=0.2, seed=2, name="b")
+    assert model.predict_proba(fresh).max() < 0.6
 
 
 def test_a_level_says_nothing_of_the_material(three: Grasps) -> None:
@@ -117,9 +86,8 @@ def test_a_level_says_nothing_of_the_material(three: Grasps) -> None:
 def test_one_grasp_a_material_leaves_nothing_to_hold_out(machine: GraspClassifier, three: Grasps) -> None:
     single = pick(three, [0, 8, 16])
     assert inner_folds(single, single["material"].values.astype(str)) == []
-    machine.fit(single)
-    assert machine.scale_ == 1.0
-    assert np.isnan(machine.held_out_loss_)
+    np.testing.assert_allclose(machine.fit(single).predict_proba(single).sum(axis=1), 1.0)
+    assert (machine.predict(single) == single["material"].values).all()
 
 
 def test_probabilities_are_calibrated_and_not_one_hot(machine: GraspClassifier, make_touches: Maker) -> None:
@@ -141,18 +109,6 @@ def test_both_sensors_are_seen(machine: GraspClassifier, three: Grasps) -> None:
     """The first sensor alone says nothing here."""
     flat = three.assign(t_surface=0 * three["t_surface"] + 23.0, t_surface_2=three["t_surface"])
     assert np.mean(machine.fit(flat).predict(flat) == flat["material"].values) > 0.9
-
-
-@pytest.mark.slow
-def test_compiled_features_are_those_of_the_same_lines_in_python(
-    monkeypatch: pytest.MonkeyPatch, three: Grasps
-) -> None:
-    with monkeypatch.context() as plain:
-        model = minirocket(plain).fit(three)
-        rows = model._rows(three)
-    compiled = make_classifier("rocket", kernels=200).fit(three)
-    np.testing.assert_allclose(compiled._rows(three), rows, atol=1e-9)
-    assert (compiled.predict(three) == model.predict(three)).all()
 
 
 def test_a_trace_too_short_for_the_kernels_stays_where_it_ended() -> None:
