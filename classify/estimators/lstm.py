@@ -18,8 +18,9 @@ brings every sample time to spread 1, so that the network sees how grasps differ
 **When training ends.**  A network that has found what tells materials apart goes on to learn the grasps by
 heart.  So one of five groups of training grasps (sessions, else blocks) is held out first, and a network is
 trained on the others until the loss of the held-out ones has not fallen for ``patience`` epochs; a second
-one, on all grasps, is trained for as many epochs as the first needed.  ``patience=None`` is the paper's
-training, all epochs.
+one, on all grasps, is trained for as many epochs as the first needed, and is taken from the epoch of the
+least training loss, for losses leap.  ``patience=None`` is the paper's training: all epochs, and the last
+weights.
 
 ``torch.nn.LSTM`` trains, with all series in memory on one thread or on a GPU; weights and batches are drawn
 by PyTorch's generator, so that a seed is the same training on the same machine.  PyTorch is the extra
@@ -197,7 +198,7 @@ Weights = dict[str, NDArray[Any]]
 class _Trained(NamedTuple):
     weights: Weights
     loss_curve: Floats  # (n_epoch,) mean cross entropy of the training series
-    best: int  # epochs until the least loss of the held-out series; all where none were held out
+    best: int  # epochs until the least loss
 
 
 def _train(
@@ -209,7 +210,8 @@ def _train(
     held_out: tuple[NDArray[np.float32], NDArray[np.int64]] | None = None,
 ) -> _Trained:
     """Return a network trained on series ``x`` (n_series, n_time, n_sensor) of classes ``y``, for so many
-    epochs or until the loss of ``held_out`` has not fallen for ``patience`` of them."""
+    epochs or until the loss of ``held_out`` has not fallen for ``patience`` of them; with a patience it is
+    that of the epoch with the least loss, for the loss of a small set leaps now and then."""
     import torch
 
     device = _device(model.device)
@@ -227,7 +229,7 @@ def _train(
             def loss_of(series: Any, target: Any) -> Any:
                 return torch.nn.functional.cross_entropy(readout(network(series)[1][0][0]), target)
 
-            curve, least, best = [], float("inf"), 0
+            curve, least, best, weights = [], float("inf"), epochs, _named(network, readout)
             for epoch in range(1, epochs + 1):
                 total = torch.zeros((), device=device)
                 for rows in torch.randperm(len(y)).split(model.batch):  # type: ignore[no-untyped-call]
@@ -238,19 +240,20 @@ def _train(
                     adam.step()
                     total += loss.detach() * len(rows)
                 curve.append(total / len(y))
-                if seen is None:
-                    best = epoch
+                if model.patience is None:
                     continue
                 with torch.no_grad():
-                    now = float(loss_of(*seen))
+                    now = float(curve[-1] if seen is None else loss_of(*seen))
                 if now < least:
-                    least, best = now, epoch
-                elif model.patience is not None and epoch - best >= model.patience:
+                    least, best, weights = now, epoch, _named(network, readout)
+                elif seen is not None and epoch - best >= model.patience:
                     break
+            if model.patience is None:
+                weights = _named(network, readout)
             losses = torch.stack(curve).double().cpu().numpy()
     finally:
         torch.set_num_threads(threads)
-    return _Trained(_named(network, readout), losses, best)
+    return _Trained(weights, losses, best)
 
 
 def _device(name: str) -> str:
@@ -266,7 +269,7 @@ def _device(name: str) -> str:
 def _named(network: Any, readout: Any) -> Weights:
     """Return the weights of both PyTorch modules by name."""
     parts = {"lstm": network.state_dict(), "readout": readout.state_dict()}
-    return {f"{name}.{k}": v.cpu().numpy() for name, part in parts.items() for k, v in part.items()}
+    return {f"{name}.{k}": v.cpu().numpy().copy() for name, part in parts.items() for k, v in part.items()}
 
 
 def _logits(weights: Mapping[str, NDArray[Any]], series: NDArray[np.float32]) -> Floats:
