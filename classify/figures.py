@@ -47,7 +47,10 @@ def accuracy_figure(comparison: Comparison) -> Figure:
         axis.plot(row["accuracy"], y, MARKERS[k % 8], ms=5, color=PALETTE[k % 8], mec="white", mew=0.5)
         guess = 1 / np.exp(row["log_loss_chance"])
         axis.plot([guess, guess], [y - 0.35 / count, y + 0.35 / count], color=_FAINT, lw=2, zorder=0)
-    labels = [f"{c}  (n = {next(r['n'] for r in rows if r['condition'] == c)})" for c in order]
+    counts = {r["condition"]: (r["n"], r["n_test"]) for r in reversed(rows)}
+    labels = [
+        f"{c}  (n = {n})" if n == of else f"{c}  (n = {n} of {of})" for c in order for n, of in [counts[c]]
+    ]
     axis.set_yticks(range(len(order)), labels)
     for k, name in enumerate(comparison.classifiers):
         axis.plot([], [], MARKERS[k % 8], ls="-", ms=5, color=PALETTE[k % 8], label=name)

@@ -7,8 +7,9 @@ it is.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
@@ -28,6 +29,25 @@ POOLED = "pooled"
 Floats = NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class Caution:
+    """What a score has to be read with."""
+
+    code: str  # ``leak``, ``unseen_material``, ``excluded_material`` or ``session_fault``
+    condition: str  # whose scores it touches
+    words: str
+    classifier: str = ""  # whose score it touches; empty: everybody's
+    detail: str = ""  # of this classifier
+    brief: str = ""  # beside the score; the code where there is none
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "brief", self.brief or self.code.replace("_", " "))
+
+    def to_json(self) -> dict[str, str]:
+        """Return its fields."""
+        return asdict(self)
+
+
 @dataclass(frozen=True, repr=False)
 class Comparison(Shown):
     """The result of :func:`~thermogrip.classify.evaluation.harness.evaluate`."""
@@ -44,6 +64,7 @@ class Comparison(Shown):
     leaks: tuple[Row, ...] = ()
     times: tuple[Row, ...] = ()  # ``classifier, repeat, condition, fit_s, predict_s_per_grasp``
     notes: tuple[str, ...] = ()  # what was left out, and why
+    of_records: tuple[Caution, ...] = ()  # cautions that come from the records and their split
     level: float = field(default=0.95)  # confidence of the intervals
 
     def _facts(self) -> dict[str, object]:
@@ -51,8 +72,9 @@ class Comparison(Shown):
         facts: dict[str, object] = {"split": self.split, "conditions": ", ".join(self.conditions)}
         for row in reversed(self.scores()):  # the first of a classifier stays
             interval = f"({100 * self.level:.0f} %: {row['low']:.3f} to {row['high']:.3f})"
-            facts[row["classifier"]] = f"accuracy {row['accuracy']:.3f} {interval} of {row['n']} grasps"
-        return facts
+            of = f"{row['n']} of {row['n_test']}" if row["n_test"] > row["n"] else str(row["n"])
+            facts[row["classifier"]] = f"accuracy {row['accuracy']:.3f} {interval} of {of} grasps"
+        return facts | {f"caution {k}": words for k, words in enumerate(self.caution_lines(), 1)}
 
     @property
     def classifiers(self) -> tuple[str, ...]:
@@ -82,11 +104,56 @@ class Comparison(Shown):
             f"no interval). {others}"
         )
 
+    @cached_property
+    def cautions(self) -> tuple[Caution, ...]:
+        """What the scores have to be read with: leaks, materials that training lacks and how each classifier
+        answered them, then what the records and their split bring."""
+        leaks = [self._leak(row) for row in self.leaks if row["leak"]]
+        asked = [(condition, name) for condition in self.conditions for name in self.classifiers]
+        tested = [(self._tested(name, condition), condition, name) for condition, name in asked]
+        unseen = [_unseen(*each) for each in tested if not all(row["known"] for row in each[0])]
+        return (*leaks, *unseen, *self.of_records)
+
+    def cautions_of(self, classifier: str, condition: str) -> list[Caution]:
+        """Return the cautions that touch a score; of the pooled one, those of every condition in it."""
+        pool = {str(r["condition"]) for r in self._tested(classifier, condition)}
+        return [c for c in self.cautions if c.classifier in ("", classifier) and c.condition in pool]
+
+    def caution_lines(self) -> list[str]:
+        """Return the cautions in words, one line for what is so of several classifiers."""
+        lines: dict[str, list[str]] = {}
+        for caution in self.cautions:
+            details = lines.setdefault(f"{caution.condition}: {caution.words}", [])
+            details += [caution.detail] if caution.detail else []
+        return ["; ".join([line, *details]) for line, details in lines.items()]
+
+    def _leak(self, row: Row) -> Caution:
+        who, condition = str(row["classifier"]), str(row["condition"])
+        right, chance = (f"{100 * row[key]:.0f} %" for key in ("accuracy", "chance"))
+        return Caution(
+            "leak",
+            condition,
+            "labels can be predicted from samples before contact, so accuracy need not come from touch",
+            who if who in self.classifiers else "",  # the probe's own classifier speaks of the record
+            f"{who}: {right} of n = {row['n']}, chance {chance}",
+        )
+
+    def _tested(self, classifier: str, condition: str) -> list[Row]:
+        """Return the predictions for all test grasps of a condition, of unseen materials among them."""
+        return [
+            r
+            for r in self.predictions
+            if r["classifier"] == classifier
+            and (r["condition"] == condition or (condition == POOLED and not r["apart"]))
+        ]
+
     def scores(self) -> list[Row]:
         """Return a row for each classifier and condition, ``pooled`` ones first where there are several.
 
-        ``n`` distinct grasps, ``tested`` times in all; ``accuracy`` with ``low`` and ``high``
-        (Clopper-Pearson) and ``boot_low``, ``boot_high`` (bootstrap over grasps); ``sd_over_splits``;
+        ``n`` distinct grasps of ``n_test`` in the test, the others of materials that training lacks;
+        ``cautions``, codes of what touches the score, and ``caution``, the same in a few words; ``tested``
+        times in all; ``accuracy`` with ``low``, ``high`` (Clopper-Pearson) and ``boot_low``, ``boot_high``
+        (bootstrap over grasps); ``sd_over_splits``;
         ``log_loss``, ``brier`` and ``ece`` with ``<score>_low`` and ``<score>_high`` over grasps
         (:mod:`~thermogrip.classify.evaluation.metrics`); ``ece_calibrated``, what a calibrated forecaster
         of these confidences would show, and ``ece_p``, how often one would show more; ``confidence``;
@@ -117,6 +184,7 @@ class Comparison(Shown):
         right, loss, brier = mean_intervals(columns, grasp, **settings)
         low, high = s.clopper_pearson(right.value * n, n, level=self.level)
         confidence = np.array([r["confidence"] for r in rows])
+        cautions = self.cautions_of(classifier, condition)
         ece = calibration_interval(confidence, columns[:, 0], grasp, **settings)
         return {
             "classifier": classifier,
@@ -124,6 +192,9 @@ class Comparison(Shown):
             "apart": bool(rows[0]["apart"]),
             "materials": len({r["material"] for r in rows}),
             "n": n,
+            "n_test": len(_distinct(self._tested(classifier, condition))),
+            "cautions": " ".join(dict.fromkeys(caution.code for caution in cautions)),
+            "caution": "; ".join(dict.fromkeys(caution.brief for caution in cautions)),
             "tested": len(rows),
             "accuracy": right.value,
             "low": low,
@@ -239,6 +310,7 @@ class Comparison(Shown):
             "calibration": self._each(self.calibration),
             "differences": [row for c in self._groups() for row in self.differences(c)],
             "leaks": list(self.leaks),
+            "cautions": [caution.to_json() for caution in self.cautions],
             "open_set": self.open_set(),
         }
         for name, rows in tables.items():
@@ -250,6 +322,7 @@ class Comparison(Shown):
             "seed": self.seed,
             "interval": self.interval_note,
             "notes": list(self.notes),
+            "cautions": tables["cautions"],
             "scores": tables["scores"],
             "leaks": tables["leaks"],
         }
@@ -272,13 +345,30 @@ class Comparison(Shown):
         ]
 
     def _rows(self, classifier: str, condition: str) -> list[Row]:
-        return [
-            r
-            for r in self.predictions
-            if r["classifier"] == classifier
-            and r["known"]
-            and (r["condition"] == condition or (condition == POOLED and not r["apart"]))
-        ]
+        return [r for r in self._tested(classifier, condition) if r["known"]]
+
+
+def _distinct(rows: Sequence[Row]) -> set[tuple[str, str]]:
+    """Return the distinct grasps among rows."""
+    return {(str(r["condition"]), str(r["grasp_id"])) for r in rows}
+
+
+def _unseen(rows: Sequence[Row], condition: str, classifier: str) -> Caution:
+    """Return how many test grasps are of materials that training lacks, and how they were answered."""
+    unseen = [r for r in rows if not r["known"]]
+    n, materials = len(_distinct(unseen)), ", ".join(sorted({str(r["material"]) for r in unseen}))
+    answers = ", ".join(f"{name} {k}" for name, k in Counter(r["predicted"] for r in unseen).most_common())
+    stated = [r["p_unknown"] for r in unseen if r["p_unknown"] is not None]
+    unknown = f" (p_unknown above 0.5 for {sum(p > 0.5 for p in stated)})" if stated else ""
+    of = f"{n} of {len(_distinct(rows))} test grasps"
+    return Caution(
+        "unseen_material",
+        condition,
+        f"{of} are of {materials}, which training lacks, and are not scored",
+        classifier,
+        f"{classifier} answered {answers}{unknown}",
+        f"{n} unseen ({materials}): {answers}",
+    )
 
 
 def grasp_numbers(rows: Sequence[Row]) -> NDArray[np.int64]:

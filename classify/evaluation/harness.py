@@ -41,12 +41,13 @@ from thermogrip.classify.estimators.features import LEAST_DIFFERENCE, object_dif
 from thermogrip.classify.estimators.lda import ArrayClassifier
 from thermogrip.classify.estimators.registry import classifier_name, make_classifier
 from thermogrip.classify.evaluation import metrics as s
-from thermogrip.classify.evaluation.comparison import POOLED, Comparison
+from thermogrip.classify.evaluation.comparison import POOLED, Caution, Comparison
 from thermogrip.classify.evaluation.splits import Fold, Plan, plan_folds
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.grasp_files import Records
 from thermogrip.datasets.parallel import Progress, Workers, run_parallel, sub_progress
 from thermogrip.datasets.schema import Grasps, check_grasps, log_name, unit_names
+from thermogrip.sysid.effusivity.quality import contact_faults
 
 LAST_UNTOUCHED = -0.5  # s; contact may precede the "closed" message by 0.3 s
 _LATEST_LEVEL, _LEVEL_SAMPLES = -0.25, 3
@@ -173,7 +174,25 @@ def evaluate(
         leaks=tuple(_leaks([r for r in results if r.probe and r.fault is None])),
         times=tuple(r.time for r in real),
         notes=(*plan.notes, *late, *unable),
+        of_records=(*plan.cautions, *_session_faults(plan)),
     )
+
+
+def _session_faults(plan: Plan) -> list[Caution]:
+    """Return what is wrong with the contacts that a score rests on, those of its own training among them."""
+    out: dict[Caution, None] = {}
+    for fold in plan.folds:
+        for record in (fold.train, fold.test):
+            name = log_name(record)
+            for words in contact_faults(record) if fold.repeat == 0 else ():
+                out[
+                    Caution(
+                        "session_fault",
+                        fold.condition,
+                        f"{name}: {words}" if name != fold.condition else words,
+                    )
+                ] = None
+    return list(out)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.classify.estimators.base import grasp_labels, pick, record_list
+from thermogrip.classify.evaluation.comparison import Caution
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.grasp_files import Records
 from thermogrip.datasets.schema import Grasps, has_touch_groups, log_name, unit_names
@@ -44,11 +45,13 @@ class Fold:
 
 @dataclass(frozen=True)
 class Plan:
-    """All folds; ``training[repeat]``: training grasps of every condition; ``notes``: what is left out."""
+    """All folds; ``training[repeat]``: training grasps of every condition; ``notes``: what is left out;
+    ``cautions``: what the scores have to be read with."""
 
     folds: tuple[Fold, ...]
     training: tuple[tuple[Grasps, ...], ...]
     notes: tuple[str, ...]
+    cautions: tuple[Caution, ...] = ()
 
 
 def plan_folds(
@@ -73,7 +76,10 @@ def plan_folds(
         plan = _held_out(records, split, seed)
     else:
         raise UserError(f"split {split!r} is unknown", hint="use 'shipped', 'random', 'session' or 'block'")
-    return replace(plan, notes=(*plan.notes, *_copies(records), *_strangers(plan.folds)))
+    given = records if test is None else []  # of test files no copy is let in
+    copies = [Caution("leak", name, words) for name, words in _copies(given).items()]
+    notes = (*plan.notes, *_strangers(plan.folds))
+    return replace(plan, notes=notes, cautions=(*plan.cautions, *copies))
 
 
 def scored_apart(grasps: Grasps) -> bool:
@@ -117,12 +123,24 @@ def _random(records: Sequence[Grasps], repeats: int, train_per_class: int, seed:
     if repeats < 1:
         raise UserError(f"{repeats} repeats", hint="give at least one")
     folds: list[Fold] = []
-    notes = []
-    for number, grasps in enumerate(records):
-        name = log_name(grasps)
-        if len(set(grasp_labels(grasps))) < 2:
-            notes.append(f"{name}: grasps of one material: left out")
+    notes, cautions = [], list[Caution]()
+    for number, whole in enumerate(records):
+        name = log_name(whole)
+        few = _too_few(whole, train_per_class)
+        kept = ~np.isin(grasp_labels(whole), list(few))
+        if len(set(grasp_labels(whole)[kept])) < 2:
+            enough = (
+                "grasps of one material"
+                if not few
+                else "grasps of two materials are needed, and " + ("; ".join(few.values()))
+            )
+            notes.append(f"{name}: {enough}: left out")
             continue
+        cautions += [
+            Caution("excluded_material", name, words, brief=f"no {material}")
+            for material, words in few.items()
+        ]
+        grasps = pick(whole, kept) if few else whole
         try:
             splits = list(
                 by_grasp(grasps, train_per_class=train_per_class, repeats=repeats, seed=seed + 7919 * number)
@@ -137,7 +155,18 @@ def _random(records: Sequence[Grasps], repeats: int, train_per_class: int, seed:
     if not folds:
         raise UserError("no condition can be split", hint="; ".join(notes))
     training = tuple(tuple(f.train for f in folds if f.repeat == repeat) for repeat in range(repeats))
-    return Plan(tuple(folds), training, tuple(notes))
+    return Plan(tuple(folds), training, tuple(notes), tuple(cautions))
+
+
+def _too_few(grasps: Grasps, train_per_class: int) -> dict[str, str]:
+    """Return the materials that cannot give so many grasps to train and one to test, and that in words."""
+    labels, units = grasp_labels(grasps), unit_names(grasps)
+    counts = {str(m): np.unique(units[labels == m]).size for m in np.unique(labels)}
+    return {
+        name: f"{name} is left out: {n} grasp(s) cannot give {train_per_class} to train and one to test"
+        for name, n in counts.items()
+        if n <= train_per_class
+    }
 
 
 def _held_out(records: Sequence[Grasps], kind: str, seed: int) -> Plan:
@@ -245,9 +274,9 @@ def _refuse_shared(trains: Sequence[Grasps], tests: Sequence[Grasps]) -> None:
                     column="grasp_id",
                     hint="a grasp may be in one of them only; rename it if it is another grasp",
                 )
-    for copy in _copies([*trains, *tests]):
-        if any(copy.startswith(f"{log_name(test)}/") for test in tests):
-            raise UserError(copy, hint="leave one of the two out")
+    for name, words in _copies([*trains, *tests]).items():
+        if name in map(log_name, tests):
+            raise UserError(words, file=name, hint="leave one of the two out")
 
 
 def _refuse_repeated(records: Sequence[Grasps]) -> None:
@@ -271,21 +300,23 @@ def _refuse_repeated(records: Sequence[Grasps]) -> None:
             seen[key] = log_name(grasps)
 
 
-def _copies(records: Sequence[Grasps]) -> list[str]:
-    """Return a note on each grasp whose samples stand under another name too."""
+def _copies(records: Sequence[Grasps]) -> dict[str, str]:
+    """Return by record how many of its grasps have the samples of others, where any has, in words."""
     seen: dict[bytes, str] = {}
-    notes = []
+    copies: dict[str, list[str]] = {}
     for grasps in records:
         for grasp_id, trace in zip(grasps["grasp"].values, grasps["t_surface"].values):
-            key, own = trace.tobytes(), f"{log_name(grasps)}/{grasp_id}"
+            key, name = trace.tobytes(), log_name(grasps)
             if np.unique(trace[np.isfinite(trace)]).size < _TELLING_VALUES:
                 continue  # a coarse sensor that reads the same twice
             if key in seen:
-                notes.append(
-                    f"{own} has the samples of {seen[key]}: a copy in training and in test is a leak"
-                )
-            seen.setdefault(key, own)
-    return notes
+                copies.setdefault(name, []).append(f"{grasp_id} of {seen[key]}")
+            seen.setdefault(key, f"{name}/{grasp_id}")
+    return {
+        name: f"{len(pairs)} grasp(s) have the samples of another, {pairs[0]} first: a copy in training and "
+        "in test is a leak"
+        for name, pairs in copies.items()
+    }
 
 
 def _strangers(folds: Sequence[Fold]) -> list[str]:

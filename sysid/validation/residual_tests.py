@@ -211,7 +211,7 @@ _REST, _AFTER_GAP = 0.1, 3.0  # prior sd of a start at rest, and after a gap
 _BIAS_AT_REST = 0.05  # [K] sd of an ambient's bias after a start at rest
 _MODE = 0.02  # rms of the residual: a start that moves no block by more is left out
 _FARTHEST = 1e6  # rms of the residual: from a start that moves more, the run diverged
-_AT_ONCE = 2_000_000  # outputs of the runs from starts at a time, 16 MB, of which a few copies are alive
+_AT_ONCE = 1_000_000  # outputs of the runs from starts at a time, 8 MB, of which a few copies are alive
 _RANK = 1e-6  # of the largest: directions of x that are the others over again
 
 
@@ -408,7 +408,9 @@ def _start_changes(plant: Plant, one: _Tested) -> Array:
         moved = one.start.x0 + 0.1 * root.T[begin : begin + together]
         with np.errstate(over="ignore", invalid="ignore"):  # a run from a far start may diverge
             runs = _run(plant, one, np.vstack([one.start.x0, moved]))
-            change = 10.0 * at_rows(one.stretch, runs[1:] - runs[0], plant.dt)
+            runs[1:] -= runs[0]
+            change = at_rows(one.stretch, runs[1:], plant.dt)
+            change *= 10.0
         np.clip(change, -1e100, 1e100, out=change)
         np.nan_to_num(change, copy=False, nan=1e100)  # what diverged is left out later
         means.append(one.blocks.of_readings(np.moveaxis(change, 0, 2)))

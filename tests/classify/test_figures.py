@@ -71,7 +71,8 @@ def _edge(line: Any) -> str:
 def compared() -> Any:
     """Return nine classifiers that were scored in two conditions, the first and the last in one apart."""
     rows = [
-        {"classifier": c, "condition": condition, "apart": condition == "dry", "n": 20 - 3 * i, "low": 0.3,
+        {"classifier": c, "condition": condition, "apart": condition == "dry", "n": 20 - 3 * i,
+         "n_test": 20 - 3 * i, "low": 0.3,
          "accuracy": 0.4 + 0.05 * k, "high": 0.85 + 0.01 * k, "log_loss_chance": np.log(3 + i)}
         for k, c in enumerate(NINE)
         for i, condition in enumerate(("pooled", "dry", "wet"))

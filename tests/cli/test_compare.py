@@ -13,7 +13,7 @@ import pytest
 
 from tests.cli.conftest import Bench, StandIn, shares, words_of
 from thermogrip.classify import make_classifier
-from thermogrip.classify.evaluation.comparison import POOLED
+from thermogrip.classify.evaluation.comparison import POOLED, Caution
 from thermogrip.cli import compare as verb
 from thermogrip.cli.compare import _features
 from thermogrip.datasets.errors import UserError
@@ -34,6 +34,10 @@ class Found:
     conditions: tuple[str, ...] = ("c1",)
     empty: bool = False
     interval_note: str = "exact"
+    cautions: tuple[Caution, ...] = (Caution("leak", "c1", "labels leak"),)
+
+    def caution_lines(self) -> list[str]:
+        return [f"{caution.condition}: {caution.words}" for caution in self.cautions]
 
     def scores(self) -> list[dict[str, Any]]:
         return [] if self.empty else [{"condition": name, "apart": name == "c2"} for name in self.conditions]
@@ -139,14 +143,18 @@ def test_what_is_split_how_and_by_whom_it_is_scored(
     said = words_of(done.out)
     for name in splits:
         assert f"Split: {name} classifier condition accuracy " in said
-    assert said.endswith("bayes c1 0.9 exact note: one note wrote c/report.html and tables beside it")
+    assert said.endswith(
+        "bayes c1 0.9 caution: c1: labels leak exact note: one note wrote c/report.html and tables beside it"
+    )
 
 
 def test_the_answer_holds_scores_notes_and_intervals_of_each_split(scored: SimpleNamespace) -> None:
     scored.missing = (UserError("lstm needs torch"),)
     done = scored.bench.run("compare", "grasps.csv", "--repeats", "0", "--quick", "--out", "c", "--json")
+    caution = {"code": "leak", "condition": "c1", "words": "labels leak", "classifier": "", "detail": ""}
     assert json.loads(done.out) == {
         "splits": {"shipped": {"scores": [{"condition": "c1", "apart": False}], "interval": "exact",
+                               "cautions": [caution | {"brief": "leak"}],
                                "notes": ["left out: lstm needs torch", "one note"]}},
         "out": "c",
     }  # fmt: skip
@@ -196,7 +204,7 @@ def test_where_a_material_has_too_few_grasps_there_are_no_random_splits(
 @pytest.mark.parametrize(("n", "cut"), [(4, False), (5, True)])
 def test_of_many_conditions_the_pooled_scores_are_printed(n: int, cut: bool, scored: SimpleNamespace) -> None:
     names = (POOLED, *(f"c{k}" for k in range(n - 1)))
-    scored.of = {"shipped": Found("shipped", conditions=names)}
+    scored.of = {"shipped": Found("shipped", conditions=names, cautions=())}
     said = words_of(scored.bench.run("compare", "grasps.csv", "--repeats", "0", "--out", "c").out)
     assert (f"Split: shipped; {n} conditions, one by one in the report" in said) == cut
     assert [name in said for name in names] == [not cut or name in (POOLED, "c2") for name in names]

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
@@ -190,6 +191,7 @@ def test_effusivities_inside_their_interval_are_counted_in_the_order_of_the_libr
 )
 def test_who_wins_has_the_least_log_loss_and_is_set_apart_only_where_n_can(p_value: float, more: str) -> None:
     score = {"condition": "pooled", "log_loss_chance": 1.1, "n": 20, "low": 0.683, "high": 0.988}
+    score |= {"n_test": 20}
     scores = [
         score | {"classifier": "b", "log_loss": 0.5, "accuracy": 0.85},
         score | {"classifier": "a", "log_loss": 0.25, "accuracy": 0.9},
@@ -218,7 +220,8 @@ def test_conditions_below_the_line_are_reported_where_there_are_others_above_it(
 
 
 def test_each_score_stands_under_its_name_with_its_own_interval() -> None:
-    row: dict[str, Any] = {"classifier": "a", "condition": "b", "n": 7, "log_loss_chance": 1.099}
+    row: dict[str, Any] = {"classifier": "a", "condition": "b", "n": 7, "n_test": 7, "log_loss_chance": 1.099}
+    row["caution"] = ""
     row["log_loss_base"] = 0.871
     for at, key in enumerate(("accuracy", "log_loss", "brier", "ece")):
         low, high = ("low", "high") if key == "accuracy" else (f"{key}_low", f"{key}_high")
@@ -231,6 +234,25 @@ def test_each_score_stands_under_its_name_with_its_own_interval() -> None:
         "Brier": "0.520 (.12\N{EN DASH}.92)",
         "ECE": "0.530 (.13\N{EN DASH}.93)", "if calibrated": "0.032", "fit [s]": "1.23",
     }  # fmt: skip
+    more = [row | {"n_test": 9, "caution": "2 unseen (zinc): iron 2"}, row]
+    head, beside = classification.score_table(SimpleNamespace(scores=lambda: more))
+    assert head[2:5] == ("n", "accuracy", "caution")
+    assert [line[2] for line in beside] == ["7/9", 7]
+    assert [line[4] for line in beside] == ["2 unseen (zinc): iron 2", ""]
+
+
+def test_a_leak_and_an_unseen_material_stand_in_the_verdict_as_caution() -> None:
+    record = load_example_grasps()["exp2_dT20"]
+    marks = np.where(record["material"].values == "copper", "test", record["split"].values.astype(str))
+    models = {"features-lda": make_classifier("features-lda")}
+    found = evaluate(models, [record.assign(split=("grasp", marks))], seed=0, probe=False)
+    leak = {"classifier": "features-lda", "condition": found.conditions[0], "n": 9, "accuracy": 1.0}
+    leaking = replace(found, leaks=(leak | {"chance": 0.3, "p_value": 0.0, "leak": True},))
+    [before], [section] = (comparison_sections("shipped", each) for each in (found, leaking))
+    assert (before.tone, section.tone) == ("warn", "warn")
+    assert "of copper, which training lacks, and are not scored; features-lda answered" in before.verdict
+    assert "labels can be predicted" not in before.verdict
+    assert section.verdict.startswith(f"{leak['condition']}: labels can be predicted from samples before")
 
 
 @pytest.mark.parametrize("known", [True, False])

@@ -306,7 +306,7 @@ def _write_comparisons(
     write_report(out / "report.html", "What was touched", "Classifiers on the same grasps.", sections)
     console.say(f"wrote {out}/report.html and tables beside it")
     splits = {
-        name: {"scores": c.scores(), "notes": c.notes, "interval": c.interval_note}
+        name: {"scores": c.scores(), "cautions": c.cautions, "notes": c.notes, "interval": c.interval_note}
         for name, c in found.items()
     }
     console.answer({"splits": splits, "out": out})
@@ -329,6 +329,8 @@ def _show(console: Console, name: str, comparison: Comparison) -> None:
         name += f"; {len(comparison.conditions)} conditions, one by one in the report"
     kept = [k for k, title in enumerate(head) if title not in ("Brier", "fit [s]")]  # the page has them
     console.table(f"Split: {name}", [head[k] for k in kept], [[row[k] for k in kept] for row in rows])
+    for line in comparison.caution_lines():
+        console.say(f"caution: {line}")
     console.say(comparison.interval_note)
     for note in comparison.notes:
         console.say(f"note: {note}")

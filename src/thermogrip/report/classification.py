@@ -26,8 +26,9 @@ if TYPE_CHECKING:
 _SCORES: Columns = (
     ("classifier", lambda row: row["classifier"]),
     ("condition", lambda row: row["condition"]),
-    ("n", lambda row: row["n"]),
+    ("n", lambda row: _of_tested(row)),
     ("accuracy", lambda row: _between(row["accuracy"], row["low"], row["high"])),
+    ("caution", lambda row: row["caution"]),
     ("log loss", lambda row: _between(row["log_loss"], row["log_loss_low"], row["log_loss_high"])),
     ("by chance", lambda row: f"{row['log_loss_chance']:.2f}"),
     ("by base rates", lambda row: f"{row['log_loss_base']:.2f}"),
@@ -131,11 +132,7 @@ def comparison_sections(name: str, comparison: Comparison) -> list[Section]:
             f"Confidence beside accuracy, {shown}, in bins of 0.1 with 95 % intervals; below, grasps a bin.",
         ),
     ]
-    leaks = [row for row in comparison.leaks if row["leak"]]
-    if leaks:
-        where = ", ".join(f"{row['classifier']} on {row['condition']}" for row in leaks)
-        parts.append(Text(f"Leak probe: labels can be predicted from samples before contact by {where}."))
-    elif comparison.leaks:
+    if comparison.leaks and not any(row["leak"] for row in comparison.leaks):
         parts.append(Text("Leak probe: from samples before contact no classifier beats chance."))
     if comparison.notes:
         parts.append(Text("Notes: " + "; ".join(comparison.notes) + "."))
@@ -147,7 +144,9 @@ def comparison_sections(name: str, comparison: Comparison) -> list[Section]:
         "block": "Blocks held out",
     }
     title = "Which material?" + (f" {kind[name]}" if name in kind else "")
-    return [Section(title, tuple(parts), _who_wins(comparison, shown), "plain")]
+    cautions = [f"{line}." for line in comparison.caution_lines()]
+    verdict = " ".join([*cautions, _who_wins(comparison, shown)])
+    return [Section(title, tuple(parts), verdict, "warn" if cautions else "plain")]
 
 
 def _below(scores: Sequence[Mapping[str, Any]]) -> str:
@@ -163,8 +162,19 @@ def _confusion_caption(comparison: Comparison, shown: str) -> str:
 
 
 def score_table(comparison: Comparison) -> Cells:
-    """Return all scores, each with its interval."""
-    return cells(_SCORES, comparison.scores())
+    """Return all scores, each with its interval, and what to read each with where there is anything."""
+    rows = comparison.scores()
+    shown = [column for column in _SCORES if column[0] != "caution" or any(row["caution"] for row in rows)]
+    return cells(shown, rows)
+
+
+def _of_test(row: Mapping[str, Any]) -> str:
+    return f" of {row['n_test']} in the test" if row["n_test"] > row["n"] else ""
+
+
+def _of_tested(row: Mapping[str, Any]) -> int | str:
+    """Return how many grasps were scored, of how many tested where some were not."""
+    return f"{row['n']}/{row['n_test']}" if row["n_test"] > row["n"] else int(row["n"])
 
 
 def _seconds(row: dict[str, Any]) -> str:
@@ -373,8 +383,8 @@ def _who_wins(comparison: Comparison, condition: str) -> str:
     best = rows[0]
     said = (
         f"{best['classifier']} has the lowest log loss ({best['log_loss']:.2f}; chance "
-        f"{best['log_loss_chance']:.2f}) and {100 * best['accuracy']:.0f} % right of n = {best['n']} grasps "
-        f"({100 * best['low']:.0f} to {100 * best['high']:.0f} %)."
+        f"{best['log_loss_chance']:.2f}) and {100 * best['accuracy']:.0f} % right of n = {best['n']} grasps"
+        f"{_of_test(best)} ({100 * best['low']:.0f} to {100 * best['high']:.0f} %)."
     )
     for row in rows[1:]:
         said += f" {row['classifier']}: {100 * row['accuracy']:.0f} %, log loss {row['log_loss']:.2f}."

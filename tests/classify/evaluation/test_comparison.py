@@ -175,6 +175,7 @@ def test_each_table_is_a_file_of_its_rows(tmp_path: Path) -> None:
     lines = {file.stem: file.read_text().splitlines() for file in tmp_path.glob("*.csv")}
     assert {name: len(rows) - 1 for name, rows in lines.items()} == {
         "scores": 6,
+        "cautions": 2,
         "predictions": 14,
         "confusion": 4 + 4 + 4 + 1 + 4 + 1,
         "calibration": 5 + 4 + 2 + 1 + 3 + 1,

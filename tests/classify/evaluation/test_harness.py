@@ -120,11 +120,43 @@ def test_a_level_that_follows_the_label_is_found_as_a_leak(make_touches: Maker) 
     planted = make_touches(each=12)
     shift = np.array([{"copper": 0.0, "iron": 1.5, "wood": 3.0}[m] for m in planted["material"].values])
     planted["t_surface"] = (("grasp", "time"), planted["t_surface"].values + shift[:, None])
-    leaks = {r["classifier"]: r for r in evaluate(["features-lda", "pca-lda"], [planted]).leaks}
+    found = evaluate(["features-lda", "pca-lda"], [planted])
+    leaks = {r["classifier"]: r for r in found.leaks}
     assert leaks["untouched traces"]["leak"]
     assert leaks["pca-lda"]["leak"]  # it sees levels
     assert not leaks["features-lda"]["leak"]  # it sees rises only
     assert leaks["pca-lda"]["accuracy"] > 0.9
+    assert {row["cautions"] for row in found.scores()} == {"leak"}  # the record's, so of every number on it
+    assert [c.code for c in found.cautions] == ["leak", "leak"]
+    [line] = found.caution_lines()
+    assert line.startswith("touches: labels can be predicted from samples before contact")
+    assert "pca-lda: 100 % of n = " in line
+    assert "touches: labels can be predicted" in str(found)
+
+
+def test_a_material_that_training_lacks_is_counted_with_its_answers(three: Grasps) -> None:
+    marks = np.where(three["material"].values == "wood", "test", three["split"].values.astype(str))
+    found = evaluate(["features-lda"], [three.assign(split=("grasp", marks))], probe=False)
+    [row] = found.scores()
+    assert (row["n"], row["n_test"], row["cautions"]) == (6, 14, "unseen_material")
+    [caution] = found.cautions
+    assert caution.words == "8 of 14 test grasps are of wood, which training lacks, and are not scored"
+    answers = [r["predicted"] for r in found.predictions if not r["known"]]
+    assert {f"{name} {answers.count(name)}" in caution.detail for name in set(answers)} == {True}
+    assert caution.brief.startswith("8 unseen (wood): ")
+
+
+def test_a_fault_of_contacts_touches_the_scores_that_rest_on_them(three: Grasps, make_touches: Maker) -> None:
+    faulty = make_touches(name="faulty", seed=9)
+    traces = faulty["t_surface"].values.copy()
+    traces[0] = 23 + 0.01 * np.random.default_rng(0).standard_normal(traces.shape[1])
+    faulty["t_surface"] = (("grasp", "time"), traces, three["t_surface"].attrs)
+    found = evaluate(["features-lda"], [three, faulty], probe=False)
+    assert {row["condition"]: row["cautions"] for row in found.scores()} == {
+        "pooled": "session_fault", "touches": "", "faulty": "session_fault",
+    }  # fmt: skip
+    [caution] = found.cautions
+    assert "stay as they are: no contact?" in caution.words
 
 
 class ReadsTheName(JoinedClassifier):
@@ -404,12 +436,12 @@ def test_what_no_training_grasp_is_of_is_reported_as_unscored() -> None:
 def test_a_copy_under_another_name_is_reported_in_splits_and_refused_between_files() -> None:
     whole = grasps("xxxyyy")
     named = whole.assign_coords(grasp=[f"q{i}" for i in range(6)]).assign_attrs(name="b")
-    with pytest.raises(UserError, match="b/q0 has the samples of a/a0: a copy in training and in test"):
+    with pytest.raises(UserError, match=r"b.* q0 of a/a0 first: a copy in training and in test"):
         plan_folds([whole], test=[named])
-    notes = plan_folds([whole, named], split="random", train_per_class=2, repeats=1).notes
-    assert sum("has the samples of" in note for note in notes) == 6
+    cautions = plan_folds([whole, named], split="random", train_per_class=2, repeats=1).cautions
+    assert [(c.code, c.condition, c.words.split()[0]) for c in cautions] == [("leak", "b", "6")]
     still = whole.assign(t_surface=whole["t_surface"] * 0 + 23.0)  # a coarse sensor, no difference
-    assert plan_folds([still], split="random", train_per_class=2, repeats=1).notes == ()
+    assert plan_folds([still], split="random", train_per_class=2, repeats=1).cautions == ()
 
 
 def test_where_sessions_cannot_be_held_out_grasps_are() -> None:

@@ -59,20 +59,20 @@ def test_a_copy_under_another_name_is_noted_where_its_samples_speak() -> None:
     """Ten values that differ do; lost samples are none."""
     rows = [np.arange(12.0) % 10, np.arange(12.0) % 9, np.where(np.arange(12) < 9, np.arange(12.0), np.nan)]
     a, b, c = (make_grasps(np.arange(12) * 0.1 - 0.5, rows, [n + i for i in "012"], name=n) for n in "abc")
-    assert _copies([a, b, c]) == [
-        f"{n}/{n}0 has the samples of a/a0: a copy in training and in test is a leak" for n in "bc"
-    ]
+    copies = _copies([a, b, c])
+    assert list(copies) == ["b", "c"]
+    assert copies["c"].startswith("1 grasp(s) have the samples of another, c0 of a/a0 first")
 
 
 def test_a_copy_in_the_training_and_the_test_file_is_refused(three: Grasps, make_touches: Maker) -> None:
     copy = three.assign_coords(grasp=[f"other-{i}" for i in range(24)]).assign_attrs(name="fresh")
     with pytest.raises(
-        UserError, match=r"fresh/other-0 has the samples of touches/touches-0.*leave one of the"
+        UserError, match=r"fresh.*24 .* the samples of another, other-0 of touches/touches-0.*leave one of"
     ):
         plan_folds([three.drop_vars("split")], test=[copy])
     trainer = three.assign_coords(grasp=copy["grasp"].values).assign_attrs(name="more").drop_vars("split")
-    plan = plan_folds([three, trainer], split="random", repeats=1)  # two of the training: only a note each
-    assert len(plan.notes) == 24
+    plan = plan_folds([three, trainer], split="random", repeats=1)  # of the training: a caution
+    assert [(c.code, c.condition) for c in plan.cautions] == [("leak", "more")]
     fresh = plan_folds([three], test=[make_touches(name="fresh", seed=2)])  # one training file needs no match
     assert fresh.notes == ("fresh: candidates and training grasps are those of touches",)
     strange = plan_folds([three], test=[make_touches(("zinc",), name="strange", seed=2)])
@@ -164,11 +164,23 @@ def test_too_few_grasps_are_reported_not_dropped(three: Grasps, make_touches: Ma
     few = make_touches(each=3, name="few", seed=4)
     plan = plan_folds([three, few], split="random", repeats=1)
     assert {f.condition for f in plan.folds} == {"touches"}
-    assert plan.notes[0].startswith("few: 3 grasp(s) of copper cannot give 5")
-    with pytest.raises(UserError, match="no condition can be split; few: 3 grasp"):
+    assert "few: grasps of two materials are needed" in plan.notes[0]
+    assert "copper is left out: 3 grasp(s) cannot give 5 to train and one to test" in plan.notes[0]
+    with pytest.raises(UserError, match="no condition can be split; few: grasps of two materials"):
         plan_folds([few], split="random")
     with pytest.raises(UserError, match="its training grasps are of one material"):
         plan_folds([pick(three, three["material"].values == "iron")])
+
+
+def test_a_material_with_too_few_grasps_is_left_out_and_the_rest_is_split(three: Grasps) -> None:
+    iron = np.flatnonzero(three["material"].values == "iron")
+    tiny = pick(three, np.setdiff1d(np.arange(three.sizes["grasp"]), iron[1:]))
+    plan = plan_folds([tiny], split="random", repeats=2, train_per_class=3)
+    assert [fold.candidates for fold in plan.folds] == [("copper", "wood")] * 2
+    assert not any("iron" in fold.test["material"].values for fold in plan.folds)
+    [caution] = plan.cautions
+    assert (caution.code, caution.condition) == ("excluded_material", tiny.attrs["name"])
+    assert caution.words == "iron is left out: 1 grasp(s) cannot give 3 to train and one to test"
 
 
 def test_a_condition_without_a_test_part_only_trains(three: Grasps, make_touches: Maker) -> None:
