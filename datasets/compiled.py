@@ -1,12 +1,12 @@
 """Kernels: functions that Numba compiles, with code that is kept while the sources of all are the same.
 
 Numba keeps compiled code beside a module until the module's file is written again: each installation would
-compile all kernels anew, half a minute of work, and a kernel that calls a changed one of another module would
+compile all kernels anew, and a kernel that calls a changed one of another module would
 go on with the old one.  Here a digest of the sources of all kernels decides.
 
 A :func:`kernel` is called without Numba at first, where its code was kept
 (:mod:`thermogrip.datasets.native_code`): a program that answers one grasp ends before Numba would have been
-imported.  One that goes on calling it is given Numba's own function, whose calls take a fifth of the time.
+imported.  One that goes on calling it is given Numba's own function, whose calls are quicker.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ class _Sampled:
 
 class _Estimator:
     """What makes an estimator of a classifier, by scikit-learn's own functions: these are imported when it
-    asks, since that takes a quarter of the time until a first answer."""
+    asks, for an answer needs none of them."""
 
     _estimator_type = "classifier"
 

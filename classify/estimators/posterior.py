@@ -383,8 +383,8 @@ def _of_levels(
 def _unlikely(
     levels: Sequence[_Level], data: Touches, names: Sequence[str], own: Floats, modes: Floats
 ) -> bool:
-    """Return whether some grasps, one after another, leave nothing of the last level, which takes 20 times as
-    long to ask; ``own`` is the evidence of the others, ``modes`` are those of the first."""
+    """Return whether some grasps, one after another, leave nothing of the last level, which takes longest to
+    ask; ``own`` is the evidence of the others, ``modes`` are those of the first."""
     if data.level.size <= _ASKED:
         return False
     found, share = list[Floats](), 1.0

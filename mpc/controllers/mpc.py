@@ -88,8 +88,9 @@ class Controller(Shown, SampledController):
     clock : callable, optional
         Where step times come from [s].
     compiled : bool, optional
-        Whether a sample is worked out in C (:mod:`thermogrip.mpc.native.runtime`): the same answers in a
-        tenth of the time, for which gcc must be there.
+        Whether estimate and program are worked out in C (:mod:`thermogrip.mpc.native.runtime`), for which gcc
+        must be there: the same answers.  The checks of a step stay in Python and take most of its time, so
+        a single step gains little by it; closed loops that run in C as a whole gain much.
 
     Examples
     --------

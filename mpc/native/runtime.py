@@ -136,7 +136,7 @@ def known_codes() -> list[KnownCode]:
 
 
 def remember_codes(codes: Sequence[KnownCode]) -> None:
-    """Take over what another process has written, which takes half a second each."""
+    """Take over what another process has written."""
     for text, drives, h, code in codes:
         _codes.setdefault((_ByStructure.named(text), drives, h), code)
 

@@ -1,10 +1,10 @@
 """The outputs along plans of fixed blocks, and their derivatives, in memory that stays.
 
 A controller asks for the same runs in each sample: one along the plan of the last one, with a direction for
-each block and drive, and a few of plans that may be better.  A run of the compiled step takes 5 to 60 us;
-making arrays for it and finding their addresses takes longer than that.  So they are made once, and what
-changes is written into them: state, drives and disturbances.  Each controller has its own :class:`AlongPlan`,
-which is no place for two at once; a model's :class:`SampleDerivatives` lets one after the other in.
+each block and drive, and a few of plans that may be better.  Making arrays for a run of the compiled step and
+finding their addresses can take longer than the run itself.  So they are made once, and what changes is
+written into them: state, drives and disturbances.  Each controller has its own :class:`AlongPlan`, which is
+no place for two at once; a model's :class:`SampleDerivatives` lets one after the other in.
 """
 
 from __future__ import annotations

@@ -678,7 +678,7 @@ class Search:
     ) -> Trial:
         """Return the trial of an ``"MPC"``, ``"PI"`` or ``"LQR"``, at full length if asked; other noise
         than the search's is counted from 1, and only an MPC in C is tried in several ``noises``."""
-        quick = name == "MPC" and self._compiled  # in C: a tenth of the time
+        quick = name == "MPC" and self._compiled  # whole loops in C: under a tenth of the time
         # a PI for as long as a step is held, to see what its integrator has still to do; and what is quick:
         # the end of a short run is not the bias that stays
         whole = quick or name == "PI" or at_length

@@ -1,6 +1,6 @@
 """The door of the program, ``thermogrip`` and ``python -m thermogrip``.
 
-The command line takes some tenths of a second to be imported.  A Ctrl-C in them is one quiet line too: it
+The command line takes a moment to be imported.  A Ctrl-C in it is one quiet line too: it
 ends the process at once, since nothing was begun, and since Python loses an exception that a signal raises in
 a callback of an import.
 """

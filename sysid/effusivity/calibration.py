@@ -635,7 +635,7 @@ def _with_discrepancy(problem: Problem, theta: Array) -> tuple[Problem, Array]:
 
 
 def calibrate_example_gripper(progress: Progress | None = None) -> GripperModel:
-    """Return the calibration of the bundled rig from the training grasps of exp1 to exp4 (195, in 20 s)."""
+    """Return the calibration of the bundled rig from the training grasps of exp1 to exp4 (195)."""
     from thermogrip.datasets.examples import load_example_grasps
 
     files = load_example_grasps()

@@ -24,8 +24,8 @@ one instruction of LLVM.  So equations that are called once with vectors in plac
 
 leave behind a straight line of instructions: which i, j and k belong together has been looked up, loops are
 unrolled, products with a constant 0 or 1 are gone.  LLVM turns the line into what the machine has (a register
-of AVX-512, two of AVX2, four of SSE2 or NEON).  For a network of 28 states all this takes 0.2 s, and no
-compiler beside llvmlite, which is a Python package.
+of AVX-512, two of AVX2, four of SSE2 or NEON).  All this takes no compiler beside llvmlite, which is a Python
+package.
 
 No branch may depend on a value, for none is known: ``if vector > 0`` raises.  A choice is
 ``np.where(vector > 0, a, b)``; this, ``np.interp`` and NumPy's elementary functions work on vectors, so that

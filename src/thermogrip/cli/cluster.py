@@ -18,9 +18,8 @@ MODULES = (
 
 
 def dask_setup(worker: Any) -> None:
-    """Import what tasks need, some seconds of a first command, and leave out what slows Python on a worker:
-    Dask's profiler, which looks at it a hundred times a second (7 % of an identification), and searches of
-    what was imported for garbage (a tenth of a tuning)."""
+    """Import what tasks need, which the first of them would wait for, and leave out what slows Python on a
+    worker: Dask's profiler, and searches of what was imported for garbage."""
     for name in MODULES:
         import_module(name)
     for name in ("profile", "profile-cycle"):

@@ -171,7 +171,7 @@ def identify(
     console.say(f"wrote {out}")
     slow = getattr(plant.model, "slow_because", "")
     if slow:
-        console.warn(f"{plant.model.kind} model not compiled, tens of times slower: {slow}")
+        console.warn(f"{plant.model.kind} model not compiled, and so slower: {slow}")
     more = {"dynamics": None if dynamics is None else dynamics.to_dict(), "repairs": repairs}
     console.answer(_identified(found, plant, record, out) | more)
     return cli.ANSWER_IS_NO if posterior and (record is None or not record.converged) else 0

@@ -22,8 +22,8 @@ def demo(
 ) -> int:
     """Do all of the below once on the example data.
 
-    Identify, validate, tune, run on the simulated rig, grasp, compare; under 2 minutes on 2 cores, with a
-    report. Without PyTorch the comparison has no LSTM.
+    Identify, validate, tune, run on the simulated rig, grasp, compare; with a report. Without PyTorch the
+    comparison has no LSTM.
     """
     cli.new_folder(out)
     pool = cli.workers_of(workers, cluster)
