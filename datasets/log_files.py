@@ -17,8 +17,8 @@ from __future__ import annotations
 import gzip
 import lzma
 import os
-import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -27,11 +27,13 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets import repair
 from thermogrip.datasets.atomic_files import atomic_path, write_atomic
+from thermogrip.datasets.clock import EPOCH, Clock, clock_of, read_clock, since_first_row
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.file_names import file_format, file_stem, split_cut
 from thermogrip.datasets.limits import check_size, check_source
 from thermogrip.datasets.media import csv_cell
 from thermogrip.datasets.netcdf import convention_unit, open_netcdf, write_netcdf
+from thermogrip.datasets.roles import assign_roles, guess_role
 from thermogrip.datasets.rosbag import bag_parts, read_rosbag_table
 from thermogrip.datasets.schema import check_log, hash_columns, make_log
 from thermogrip.datasets.tables import (
@@ -42,9 +44,10 @@ from thermogrip.datasets.tables import (
     read_matlab_table,
     read_parquet_table,
     read_text_table,
+    switched,
     unused,
 )
-from thermogrip.datasets.units import assign_roles, join_header, read_header, to_record_unit
+from thermogrip.datasets.units import join_header, read_header, to_record_unit
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -55,24 +58,20 @@ Floats = NDArray[np.float64]
 #: What is taken for logs: themselves, DataFrames, paths of files; one or several.
 Logs: TypeAlias = "Log | DataFrame | str | Path | Sequence[Log | DataFrame | str | Path]"
 
-_TIME_UNITS = ("1", "s", "ms", "min")
-_TIME = re.compile(
-    r"(?i)((elapsed|rel|relative|abs|unix|epoch|utc|local|system|log|sample|test|run|date)_?)*"
-    r"(time|timestamp|time_stamp|date|zeit|uhrzeit|datum|tijd|seconds?|secs?|millis|milliseconds|minutes|hours|epoch"
-    r"|clock|t|ts|ms|us)(_(utc|local|stamp|elapsed|abs|rel))?"
-)
-_STEP = re.compile(r"(?i)ts|dt|delta_?t|sampl(e|ing)_?(time|period|interval)")
-_COUNTER = re.compile(r"(?i)c1|x|n|k|i|no|nr|id|index|idx|samples?|rows?|steps?|count(er)?|unnamed.*")
-_TIME_WORDS = {"ms": 1e-3, "milli": 1e-3, "us": 1e-6, "minute": 60.0, "hour": 3600.0}  # that begin a name
-_EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))  # from how much on a number since 1970 is in ns, us, ms
 MOST_SIGNALS = 40  # of a table with a reading of one of them in a row
-_MONOTONE = 0.9  # share of a time's steps that do not run backward
-_MONTH_NAMES = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
-_MONTHS = {m: str(at) for at, m in enumerate(_MONTH_NAMES, 1)}
-_STAMP = re.compile(
-    r"()(?:(\d{1,4})[-/.](\d{1,2}|[A-Za-z]{3})[-/.](\d{1,4})(?:,?\s+|T|$))?"
-    r"(?:(\d{1,2}):(\d{2})(?::(\d{2}(?:[.,]\d+)?))?)?\s*([AaPp][Mm])?\s*(Z|UTC|[+-]\d{2}:?\d{2})?$"
-)
+MOST_STATES = 12  # words of a column that may be the states of a program
+
+
+@dataclass(frozen=True)
+class _Columns:
+    """The columns of a table in the units of records."""
+
+    clock: Clock
+    values: dict[str, Floats]  # by name
+    units: dict[str, str]
+    names_of: dict[str, str]  # the name that each header became
+    repairs: list[str]  # what was converted and left out
+    doubts: list[str]  # what was guessed and decides
 
 
 def read_log(
@@ -108,7 +107,8 @@ def read_log(
     -------
     log : Log
         Temperatures in degC, time in s.  ``attrs["repairs"]`` has a line a repair, ``attrs["guesses"]`` a
-        line a guessed role with its reason, ``attrs["name"]`` the file's stem and cut, ``attrs["sha256"]``
+        line a guessed role with its reason, ``attrs["doubts"]`` one a guess that decides what a fit sees,
+        ``attrs["name"]`` the file's stem and cut, ``attrs["sha256"]``
         the hash of the file's data, ``attrs["began"]`` the date and time of the first row, if the file has a
         clock.
 
@@ -131,39 +131,42 @@ def read_log(
         table = _frame_table(path, columns)
     else:
         file, start, stop = split_cut(path)
-        table = _read_table(file, columns)
+        table = _one_column_a_signal(_read_table(file, columns))
     named = [*(inputs or ()), *(outputs or ()), *(disturbances or ())]
     check_header([*table.numbers, *table.text], named, str(file))
     if table.meta.get("schema") not in (None, "thermogrip.log"):
         raise UserError(f"holds a {table.meta['schema']}, not a log", file=file, hint="give a log")
-    data, units, names_of, repairs, began = _convert(table, dt)
-    sha256 = hash_columns(data)
-    time = data.pop("time")
-    del units["time"]
+    read = _convert(table, dt)
+    data, units, time, repairs = read.values, read.units, read.clock.seconds, read.repairs
+    sha256 = hash_columns({"time": time, **data})
     if not data:
-        what = "a time column and nothing else" if table.numbers else "no column of numbers"
-        raise UserError(f"has {what}", file=file, hint="add inputs and outputs")
+        what = "a time column and nothing else" if read.clock.columns else "no column of numbers"
+        hint = "; ".join(read.doubts) or "add inputs and outputs"
+        raise UserError(f"has {what}", file=file, hint=hint)
     lists = {"inputs": inputs, "outputs": outputs, "disturbances": disturbances}
     of_model = {name: role for name, role in (known or {}).items() if name in units}
+    names_of = read.names_of
     in_file = {names_of[header]: attrs["role"] for header, attrs in table.attrs.items() if attrs.get("role")}
-    roles, reasons = assign_roles(units, given=in_file | of_model, columns=data, file=str(file), **lists)
+    roles = assign_roles(units, given=in_file | of_model, columns=data, file=str(file), **lists)
     own = table.meta.get("schema") == "thermogrip.log"
     if own:
         repairs = [line for line in table.meta.get("repairs", "").splitlines() if line]
     else:
-        time, data, found = _repair(time, data, units, roles, table)
+        time, data, found = _repair(time, data, units, roles.of, table)
         repairs += found
-    guesses = [f"{name}: {why}" for name, why in reasons.items()]
-    variables = {name: (data[name], units[name], roles[name]) for name in data}
+    variables = {name: (data[name], units[name], roles.of[name]) for name in data}
     log = make_log(time, variables, name=str(file), repairs=repairs)  # a fault found here names the file
     log.attrs["name"] = file_stem(file)
     for header, attrs in table.attrs.items():
         if (words := attrs.get("flag_meanings")) and (flagged := names_of[header]) in log:
             log[flagged].attrs["flag_meanings"] = words
     log.attrs["sha256"] = sha256
-    if np.isfinite(began):
+    known = read.clock.seconds[np.isfinite(read.clock.seconds)]
+    began = read.clock.zero + float(known.min(initial=np.inf))
+    if EPOCH[0] <= began <= EPOCH[1]:
         log.attrs["began"] = str(np.datetime64(round(began), "s")) + "Z"
-    log.attrs["guesses"] = "\n".join(guesses)
+    log.attrs["guesses"] = "\n".join(f"{name}: {why}" for name, why in roles.reasons.items())
+    log.attrs["doubts"] = "\n".join(() if own else (*read.doubts, *roles.doubts))
     if own:
         log.attrs.update({k: v for k, v in table.meta.items() if k not in ("schema", "version")})
     return _cut(log, start, stop, file) if (start, stop) != (-np.inf, np.inf) else log
@@ -308,25 +311,24 @@ def _frame_table(frame: Any, columns: Sequence[str] | None) -> Table:
     return Table("DataFrame", numbers, text, np.arange(1, len(frame) + 1))
 
 
-def _convert(
-    table: Table, dt: float | None
-) -> tuple[dict[str, Floats], dict[str, str], dict[str, str], list[str], float]:
-    """Return columns in record units by name (``time`` among them), their units, the name of each header,
-    what was converted, and when the first row was [s since 1970], nan where the file does not say."""
+def _convert(table: Table, dt: float | None) -> _Columns:
+    """Return the columns of a table in the units of records, and its clock."""
     headers = [*table.numbers, *table.text]
     read = {header: read_header(header, headers) for header in headers}
     read |= {h: (h, attrs["units"], 1.0) for h, attrs in table.attrs.items() if "units" in attrs}
-    time, used, found, zero = _time_of(table, read, dt)
-    columns, units, names_of = {"time": time}, {"time": "s"}, dict.fromkeys(used, "time")
-    repairs, renamed = [*table.notes, *found], []
+    clock = clock_of(table, read, dt)
+    columns: dict[str, Floats] = {}
+    units: dict[str, str] = {}
+    names_of = dict.fromkeys(clock.columns, "time")
+    repairs, renamed = [*table.notes, *clock.notes], []
     for header, values in table.numbers.items():
-        if header in used:
+        if header in clock.columns:
             continue
         name, unit, scale = read[header]
         if not np.isfinite(values).any():
             repairs.append(f"{header}: has no number in any row, left out")
             continue
-        names_of[header] = name = unused(name or "c", columns)
+        names_of[header] = name = unused(name or "c", ["time", *columns])
         columns[name], units[name] = to_record_unit(values if scale == 1 else values * scale, unit)
         if header not in (name, f"{name}_{unit}"):
             renamed.append(f"{header!r} as {name}" + ("" if unit == "1" else f" [{unit}]"))
@@ -334,125 +336,57 @@ def _convert(
             repairs.append(f"{name}: converted to {unit} (times {scale:g})")
         if units[name] != unit:
             repairs.append(f"{name}: converted from {unit} to {units[name]}")
-    words = [header for header in table.text if header not in used]
-    _check_wide(table, words, [*names_of])
+        if table.meta.get("schema") != "thermogrip.log" and guess_role(name, units[name]) != "input":
+            columns[name], lost = repair.drop_codes(name, columns[name])
+            repairs += lost
+    words = [header for header in table.text if header not in clock.columns]
     repairs += [f"read {', '.join(renamed)}"] if renamed else []
     repairs += [f"left out, no numbers: {', '.join(words)}"] if words else []
-    known = time[np.isfinite(time)]
-    began = zero + float(known.min()) if known.size else np.nan
-    return columns, units, names_of, repairs, began if began >= repair.CLOCK else np.nan
+    doubts = [clock.doubt] if clock.doubt else []
+    doubts += [doubt for header in words if (doubt := _states(header, table.text[header]))]
+    return _Columns(clock, columns, units, names_of, repairs, doubts)
 
 
-def _check_wide(table: Table, words: Sequence[str], numbers: Sequence[str]) -> None:
-    """Refuse a table of one reading a row, which a column of words says the signal of."""
-    *times, last = numbers or [""]
-    for header in words if len(times) == 1 else ():
-        signals = {*table.text[header]}
-        if 2 <= len(signals) <= MOST_SIGNALS and len(table.lines) >= 5 * len(signals):
-            pivot = f"pivot_table(index={times[0]!r}, columns={header!r}, values={last!r}).ffill()"
-            raise UserError(
-                f"has a reading of one signal in a row, of {', '.join(sorted(signals)[:3])}",
-                file=table.file,
-                column=header,
-                hint=f"give each signal a column: pandas.read_csv({table.file!r}).{pivot}.to_csv('wide.csv')",
-            )
+def _states(header: str, cells: Sequence[str]) -> str:
+    """Return the doubt that a column of a few words may say what was driven, "" of any other text."""
+    states = sorted({cell for cell in cells if cell})
+    if not 2 <= len(states) <= MOST_STATES or len(cells) < 5 * len(states):
+        return ""
+    return (
+        f"{header} has {len(states)} states ({', '.join(states)}) and is left out: where one of them drives "
+        "something, write a column of 0 and 1 for it"
+    )
 
 
-def _time_of(
-    table: Table, read: Mapping[str, tuple[str, str, float]], dt: float | None
-) -> tuple[Floats, set[str], list[str], float]:
-    """Return the time of each row [s], the headers it was read from, what was taken for it, and where its
-    zero is on the file's clock [s], nan where it has none."""
-    like = [h for h, (n, unit, _) in read.items() if unit in _TIME_UNITS and _TIME.fullmatch(n)]
-    # a clock that starts again with each cycle comes after one that does not
-    back = {h for h in like if h in table.numbers and (np.diff(table.numbers[h]) < 0).any()}
-    like.sort(key=lambda header: (header in back, read[header][0] != "time"))
-    unnamed = [h for h in [*table.text, *[*table.numbers][:1]] if h not in like and _counts(h, table)]
-    if dt is not None:
-        instead = f" in place of {', '.join([*like, *unnamed])}" if like or unnamed else ""
-        note = f"time: rows are {dt:g} s apart, as asked{instead}"
-        return np.asarray(np.arange(len(table.lines)) * dt, dtype=float), {*like, *unnamed}, [note], np.nan
-    for header in [*like, *unnamed]:
-        if header in table.text:
-            cells, parts = table.text[header], [header]
-            if ":" not in cells[0]:  # a date, with the time of day in another column
-                of_day = [h for h in table.text if ":" in table.text[h][0] and _counts(h, table)]
-                parts += of_day[:1]
-                cells = [" ".join(row) for row in zip(*(table.text[h] for h in parts))]
-            if (clock := read_clock(cells)) is not None:
-                note = f"time: {' and '.join(parts)} counted from the first row, {cells[0]}{clock[1]}"
-                zero = float(clock[0][np.isfinite(clock[0]).argmax()])
-                return clock[0] - zero, {*parts}, [note], zero
-            continue
-        values, (name, unit, scale) = table.numbers[header], read[header]
-        stated, finite = name == "time" and unit != "1", values[np.isfinite(values)]
-        rising = finite.size > 1 and np.mean(np.diff(finite) >= 0) >= _MONOTONE and np.ptp(finite) > 0
-        if not (stated or rising):
-            continue
-        if unit == "1":
-            scale = next((f for word, f in _TIME_WORDS.items() if name.lower().startswith(word)), 1.0)
-            scale = next((f for least, f in _EPOCHS if abs(finite[0]) >= least), scale)
-        seconds = to_record_unit(values if scale == 1 else values * scale, unit)[0]
-        if stated and scale == 1:
-            return seconds, {header}, [f"time: converted from {unit} to s"] if unit != "s" else [], 0.0
-        what = f"{header} is taken as the time in {unit if unit != '1' else 's'}"
-        more = "; --dt S sets another step" if header in unnamed else ""
-        return seconds, {header}, [f"time: {what}{'' if scale == 1 else f', times {scale:g}'}{more}"], 0.0
-    steps = {h: np.unique(v[np.isfinite(v)]) for h, v in table.numbers.items() if _STEP.fullmatch(read[h][0])}
-    known = {h: float(v[0]) for h, v in steps.items() if v.size == 1 and v[0] > 0}
-    step = next(iter(known.values()), float(table.meta.get("dt", 1.0)))  # a file may have it beside
-    note = f"no time column: rows are taken {step:g} s apart; --dt S sets another step"
-    return np.asarray(step * np.arange(len(table.lines)), dtype=float), {*known}, [note], np.nan
-
-
-def _counts(header: str, table: Table) -> bool:
-    """Return whether a column that is not named as a time may be one: a clock, or even steps."""
-    if header in table.text:
-        return read_clock(table.text[header][:20]) is not None
-    step = np.diff(table.numbers[header])
-    if not _COUNTER.fullmatch(header) or step.size < 4 or not np.all(step > 0):
-        return False
-    return bool(np.mean(np.abs(step - np.median(step)) <= 0.2 * np.median(step)) >= _MONOTONE)
-
-
-def read_clock(cells: Sequence[str]) -> tuple[Floats, str] | None:
-    """Return the seconds that dates and times of day mean (without a date from midnight on, UTC without an
-    offset) and how they were taken; None if they are none."""
-    import pandas as pd
-
-    parts = pd.Series(list(cells), dtype=object).str.strip().str.extract(_STAMP)
-    if parts[[1, 4]].isna().all(axis=1).mean() > 1 - _MONOTONE:
-        return None
-
-    def numbers(key: int) -> Floats:
-        return np.asarray(pd.to_numeric(parts[key].str.replace(",", "."), errors="coerce"), dtype=float)
-
-    hour, minute, second = (np.nan_to_num(numbers(key)) for key in (4, 5, 6))
-    half = parts[7].str.lower()
-    hour = np.where(half.notna() & (hour == 12), 0, hour) + 12.0 * (half == "pm").to_numpy()
-    offset = parts[8].str.replace(":", "").str.extract(r"([+-])(\d{2})(\d{2})")
-    shift = pd.to_numeric(offset[1]) * 60 + pd.to_numeric(offset[2])
-    minute = minute - np.nan_to_num(np.asarray(shift.where(offset[0] == "+", -shift), dtype=float))
-    of_day = 3600 * hour + 60 * minute + second
-    of_day[parts[[1, 4]].isna().all(axis=1)] = np.nan
-    if parts[1].isna().all():
-        steps = np.diff(of_day, prepend=of_day[0])
-        return of_day + 86400.0 * np.cumsum(np.nan_to_num(steps) < -43200), ""
-    parts[2] = parts[2].str.lower().map(_MONTHS).fillna(parts[2])
-    first, middle, last = numbers(1), numbers(2), numbers(3)
-    note = ""
-    if np.nanmax(first) > 31:
-        year, month, day = first, middle, last
-    elif np.nanmax(middle) > 12 or (np.nanmax(first) <= 12 and "/" in str(cells[0])):
-        month, day, year = first, middle, last
-        note = "" if np.nanmax(middle) > 12 else " (taken as month/day)"
-    else:
-        day, month, year = first, middle, last
-    year = np.where(year < 100, year + 2000, year)
-    year[(year < 1900) | (year > 2200)] = np.nan  # beyond what pandas counts in nanoseconds
-    dates = pd.to_datetime(pd.DataFrame({"year": year, "month": month, "day": day}), errors="coerce")
-    days = (dates - pd.Timestamp(0)) / pd.Timedelta(days=1)
-    return np.asarray(days, dtype=float) * 86400.0 + of_day, note
+def _one_column_a_signal(table: Table) -> Table:
+    """Return a table with a reading of one signal in a row, as home hubs export their history, as one with a
+    column a signal, each held until its next reading; any other table as it is."""
+    clocks = [h for h, cells in table.text.items() if read_clock(cells[:20]) is not None]
+    clocks += [h for h in table.numbers if read_header(h)[0] in ("time", "timestamp")]
+    states = {h: switched(cells) for h, cells in table.text.items() if h not in clocks}
+    named = [h for h in states if states[h] is None and 2 <= len({*table.text[h]}) <= MOST_SIGNALS]
+    readings = {h: values for h, values in {**table.numbers, **states}.items() if values is not None}
+    values = [h for h in readings if h not in clocks]
+    if not clocks or len(named) != 1 or len(values) != 1:
+        return table
+    clock, by, value = clocks[0], named[0], values[0]
+    signals = np.array([name.rpartition(".")[2] for name in table.text[by]])
+    if len(table.lines) < 5 * np.unique(signals).size:
+        return table
+    clock_of_text = read_clock(table.text[clock]) if clock in table.text else None
+    time = table.numbers[clock] if clock_of_text is None else clock_of_text[0]
+    order = np.argsort(time, kind="stable")
+    times, first = np.unique(time[order], return_index=True)
+    numbers = {} if clock in table.text else {clock: times}
+    text = {clock: [table.text[clock][order[at]] for at in first]} if clock in table.text else {}
+    for signal in dict.fromkeys(signals.tolist()):
+        own = order[signals[order] == signal]
+        newest = np.searchsorted(time[own], times, side="right") - 1
+        numbers[signal] = np.where(newest < 0, np.nan, readings[value][own[newest]])
+    each = ", ".join(sorted({*signals}))
+    note = f"a reading of one signal in a row: {each} each hold until their next reading"
+    lines = np.arange(1, times.size + 1)
+    return replace(table, numbers=numbers, text=text, lines=lines, notes=(*table.notes, note))
 
 
 def _repair(
@@ -463,9 +397,17 @@ def _repair(
     columns = {name: values[rows] for name, values in columns.items()}
     if time.size < 2:
         raise UserError(f"{time.size} row(s) are not a log", file=table.file, hint="give at least two rows")
-    time, found = repair.from_first_row(time)
+    time, found = since_first_row(time)
     repairs += found + repair.describe_steps(time)
+    inputs = [values for name, values in columns.items() if roles[name] == "input"]
     for name, values in columns.items():
+        if roles[name] == "output" and inputs:
+            moving, found = repair.drop_stuck(name, values, inputs)
+            repairs += found
+            if np.isfinite(moving).any():
+                values = moving
+            else:  # nothing is left of it to be predicted
+                roles[name] = "other"
         columns[name], found = _repair_column(name, values, time, units[name], roles[name], table.file)
         repairs += found
     time, columns, found = _drop_unknown_start(time, columns, roles, table.file)

@@ -15,9 +15,15 @@ increments) otherwise; and the run is a spike only if it is entered and left by 
 larger than the same threshold and than five times the 70 % quantile of the increments around it.  A step is
 entered but not left; the tip of a ramp of any slope is entered and left by increments like those around it:
 both stay.  In rows of a minute or more a plant moves and comes back by itself: there a spike lies outside of
-all other samples as well, by more than their range.  Spikes become NaN, as lost samples are: an output is
-never filled.  A lost input is held from the last row, since that is what an actuator does; a lost disturbance
-is interpolated.
+all other samples as well, by more than their range.
+
+What a sensor writes when it has no reading (:data:`SENSOR_CODES`) is lost, in whatever number of rows, where
+it is entered and left by jumps of more than five times what the other rows hardly ever move (their 99 %
+quantile): a kettle that passes 85 degC does not jump there.  A reading that repeats itself bit by bit while
+the inputs move ten times as far as in any other such run is **stuck**, and lost as well.
+
+All of these become NaN, as lost samples are: an output is never filled.  A lost input is held from the last
+row, since that is what an actuator does; a lost disturbance is interpolated.
 """
 
 from __future__ import annotations
@@ -31,6 +37,19 @@ from thermogrip.datasets.errors import UserError
 
 Floats = NDArray[np.float64]
 
+#: Values that are no readings, in degC, and whose they are.
+SENSOR_CODES = {
+    85.0: "DS18B20 after a power glitch",  # its data sheet: the register's value at power-on
+    -127.0: "DS18B20 not connected",  # DEVICE_DISCONNECTED_C of the DallasTemperature library
+    -242.02: "MAX31865 shorted",  # the PT100 equation at a resistance of 0
+    988.79: "MAX31865 open",  # the same at the end of the converter's range
+    1023.75: "MAX6675 open",  # twelve ones of a quarter of a degree
+    2000.0: "thermocouple open",
+    -273.15: "absolute zero",
+    **dict.fromkeys((999.9, 999.0, 9999.0, -999.0, -9999.0), "a logger's mark of a lost value"),
+    **dict.fromkeys((3276.7, -3276.8, 32767.0, -32768.0, 6553.5, 65535.0), "the end of a 16-bit number"),
+}
+_CODE_JUMP, _STUCK_TRAVEL = 5.0, 10.0  # see the module's text
 SPIKE_FLOOR_K = 0.6
 SPIKE_WINDOW = 21
 SPIKE_LENGTH = 3
@@ -38,7 +57,6 @@ _SLOW_ROWS = 60.0  # s
 GAP_SECONDS = 10.0
 GAP_STEPS = 5.0
 _FEW, _MOST_MOVED = 0.05, 10  # share of rows whose time may be wrong; rows that one may be out of place
-CLOCK = 1e8  # s: no log is three years old at its first row
 
 
 def order_rows(
@@ -62,7 +80,7 @@ def order_rows(
         if back.mean() > _FEW or np.abs(order - np.arange(rows.size)).max() > _MOST_MOVED:
             at = int(np.argmax(np.diff(time[rows]) < 0))
             problem = f"time runs back from {time[rows[at]]:g} s to {time[rows[at + 1]]:g} s"
-            hint = "sort the rows, cut the file there in two, or give the step of all rows with --dt"
+            hint = "cut the file there in two, sort its rows, or give the step of all rows with --dt"
             raise UserError(problem, file=file, row=int(lines[rows[at + 1]]), hint=hint)
         which = name_rows(lines[rows[back]])
         repairs.append(f"{back.sum()} row{_s(int(back.sum()))} out of order sorted ({which})")
@@ -78,14 +96,6 @@ def order_rows(
         which = name_rows(lines[rows[~first]])
         repairs.append(f"{repeats} repeated time stamp{_s(repeats)} dropped ({which})")
     return time[rows[first]], rows[first], repairs
-
-
-def from_first_row(time: Floats) -> tuple[Floats, list[str]]:
-    """Return times since 1970 [s] counted from the first row, others as they are, and a line if they were."""
-    if not time[0] >= CLOCK:
-        return time, []
-    repairs = f"time is a clock of seconds since 1970: counted from the first row, {time[0]:.0f} s"
-    return np.round(time - time[0], 6), [repairs]
 
 
 def describe_steps(time: Floats) -> list[str]:
@@ -148,6 +158,52 @@ def find_spikes(values: Floats, *, floor: float | None, step: float = 0.0) -> ND
         low, high = float(others.min()), float(others.max())
         spikes[seen] &= (good < low - (high - low)) | (good > high + (high - low))
     return spikes
+
+
+def drop_codes(name: str, values: Floats) -> tuple[Floats, list[str]]:
+    """Return a column with what is no reading but a sensor's code as NaN, and a line for each code."""
+    repairs = []
+    for code, whose in SENSOR_CODES.items():
+        rows = np.abs(values - code) < 1e-6
+        if values.size < SPIKE_WINDOW or not rows.any() or rows.all():
+            continue
+        moves = np.abs(np.diff(values))
+        between = rows[1:] ^ rows[:-1]
+        usual = moves[~(rows[1:] | rows[:-1]) & np.isfinite(moves)]
+        if not usual.size:
+            continue
+        least = _CODE_JUMP * float(np.quantile(usual, 0.99))
+        edges = np.flatnonzero(np.diff(rows.astype(int), prepend=0, append=0))
+        for start, stop in edges.reshape(-1, 2).tolist():
+            jumps = [moves[at] for at in (start - 1, stop - 1) if 0 <= at < moves.size and between[at]]
+            rows[start:stop] = all(jump > least or np.isnan(jump) for jump in jumps)
+        if rows.any():
+            values = np.where(rows, np.nan, values)
+            count = int(rows.sum())
+            repairs.append(f"{name}: {count} row{_s(count)} of {code:g} left empty, no reading ({whose})")
+    return values, repairs
+
+
+def drop_stuck(name: str, values: Floats, inputs: Sequence[Floats]) -> tuple[Floats, list[str]]:
+    """Return an output without the run in which it repeats itself although the inputs move, and a line."""
+    spans = [float(np.nanmax(u) - np.nanmin(u)) for u in inputs]
+    travel = np.zeros(values.size)  # of all inputs since the first row, in ranges
+    for u, span in zip(inputs, spans):
+        if span > 0:
+            travel[1:] += np.cumsum(np.abs(np.nan_to_num(np.diff(u))) / span)
+    ends = np.flatnonzero(np.append(np.diff(values) != 0, True))
+    starts = np.append(0, ends[:-1] + 1)
+    moved = travel[ends] - travel[starts]
+    order = np.argsort(moved)
+    other = float(moved[order[-2]]) if moved.size > 1 else 0.0
+    run = slice(int(starts[order[-1]]), int(ends[order[-1]]) + 1)
+    too_little = moved[order[-1]] < max(_STUCK_TRAVEL * other, 2.0)  # a move there and back, at the least
+    if values.size < SPIKE_WINDOW or too_little or not np.isfinite(values[run]).all():
+        return values, []
+    rows = np.zeros(values.size, dtype=bool)
+    rows[run] = True
+    problem = f"{name}: stuck at {values[run.start]:g} for {rows.sum()} rows while the inputs move: left out"
+    return np.where(rows, np.nan, values), [problem]
 
 
 def reject_spikes(

@@ -38,9 +38,10 @@ from thermogrip.datasets.atomic_files import read_bytes, read_toml
 from thermogrip.datasets.errors import UserError, as_user_error, known_names, os_fault, os_faults
 from thermogrip.datasets.file_names import file_stem
 from thermogrip.datasets.limits import Unpacker, check_size, check_source
+from thermogrip.datasets.roles import guess_role
 from thermogrip.datasets.schema import ROLES
 from thermogrip.datasets.tables import Table
-from thermogrip.datasets.units import UNITS, guess_role, split_header, to_record_unit
+from thermogrip.datasets.units import UNITS, split_header, to_record_unit
 
 Floats = NDArray[np.float64]
 

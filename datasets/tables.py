@@ -23,6 +23,7 @@ import shlex
 import warnings
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Callable, Collection, Container, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
@@ -50,19 +51,31 @@ _BEGINNING = 16 << 20  # bytes of a file that are looked at before it is read
 _MOST_EMPTY = 1_000_000  # lines without a cell that are passed over
 
 _NULLS = ["", "nan", "NaN", "NAN", "NA", "N/A", "null", "NULL", "None", "-nan", "#N/A"]
-_LOST = [*_NULLS, "-", "--", "---", "?", "*", "NaT"]
+_LOST = [*_NULLS, "-", "--", "---", "?", "*", "NaT", "unknown", "unavailable"]
 _COMMENT = ("#", "%", "//")  # how a line begins that is no row
 _LEFT_OUT = "\x1f"  # how the name of a column begins that is not kept
 _NAMELESS = "no header: columns named c1 to c{} by position; --columns a,b,... names them"
 _HEAD_LINES = 200  # of a file, that show how it is a table
-_DATE = re.compile(r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}|\d{1,2}:\d{2}")  # how a date or a time of day begins
-# name, number and end of a cell that begins with its column's name; bounded, so that no line takes long
-_LABELLED = re.compile(rb"([A-Za-z_][^:=,;\t\n]{0,63}?) ?[:=] ?([-+.\deE]{1,30}|nan|NaN)([,;\t ]|$)")
+#: A date, a time of day, or both, as a whole cell.
+STAMP = re.compile(
+    r"()(?:(\d{1,4})[-/.](\d{1,2}|[A-Za-z]{3})[-/.](\d{1,4})(?:,?\s+|T|$))?"
+    r"(?:(\d{1,2}):(\d{2})(?::(\d{2}(?:[.,]\d+)?))?)?\s*([AaPp][Mm])?\s*(Z|UTC|[+-]\d{2}:?\d{2})?$"
+)
+_LINE_STAMP = re.compile(
+    r"\W{0,2}((?:\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}[ T]+)?\d{1,2}:\d{2}:\d{2}(?:[.,]\d+)?)|Stats (\d+\.\d+):"
+)  # how a line of a program's log begins: a stamp, or Klipper's seconds
+_NAME = re.compile(r"[A-Za-z_@][^:=,;]{0,63}")
+_LABELLED = re.compile(r"[A-Za-z_@][^:=,;]{0,63}?[:=]([-+.\deE]{1,30}|nan|NaN)")  # a cell, name and number
+_LABELLED_LINES = 10  # with the same names, that are no chance
 _MANY = 0.9  # share of a column's cells, or of a table's lines, that decide what the others should be
 _MOST_BROKEN = 0.05  # share of rows with too few or too many cells that are left out
 _SHORT = 1 << 16  # bytes of a text that is read without Arrow
 _PLAIN = re.compile(r"(-?\d+(\.\d*)?([eE][+-]?\d+)?)?", re.ASCII)  # a cell of it
-_SWITCH = {"on": 1.0, "off": 0.0, "true": 1.0, "false": 0.0, "yes": 1.0, "no": 0.0}
+_SWITCH = {
+    "on": 1.0, "off": 0.0, "true": 1.0, "false": 0.0, "yes": 1.0, "no": 0.0, "open": 1.0, "closed": 0.0,
+    "heating": 1.0, "cooling": 1.0, "active": 1.0, "running": 1.0, "idle": 0.0, "inactive": 0.0,
+    "stopped": 0.0,
+}  # fmt: skip
 _NUMBER = re.compile(
     r"[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|inf|infinity)", re.ASCII | re.IGNORECASE
 )
@@ -249,7 +262,7 @@ def _split(line: str, separator: str) -> list[str]:
 
 def _is_value(cell: str, separator: str) -> bool:
     plain = cell if separator == "," else cell.replace(",", ".")
-    return bool(_NUMBER.fullmatch(plain) or _DATE.match(cell)) or cell in _NULLS
+    return bool(_NUMBER.fullmatch(plain) or STAMP.fullmatch(cell)) or cell in _LOST or cell.lower() in _SWITCH
 
 
 def _values(row: Sequence[str], separator: str) -> float:
@@ -309,22 +322,52 @@ def _any_coding(data: bytes) -> tuple[bytes, tuple[str, ...]]:
 
 
 def _without_labels(data: bytes) -> tuple[bytes, tuple[str, ...]]:
-    """Return a table whose every cell begins with the name of its column, as a serial plotter takes them
-    (``T1:23.5,T2:24.0``), with the names in a header."""
-    lines = [line for line in islice(_lines(data[: 1 << 20]), _HEAD_LINES) if line.strip()]
-    rows = [_LABELLED.findall(line) for line in lines]
-    names = max((tuple(name for name, _, _ in row) for row in rows), key=len, default=())
-    as_named = [row for row in rows if len(names) > 0 and tuple(name for name, _, _ in row) == names]
-    if len(as_named) < max(2, _MANY * len(rows)) or len({*names}) < len(names):
+    """Return the lines of a log that have readings beside their names, as a table with a header.
+
+    So write serial plotters (``T1:23.5,T2:24.0``), printer hosts (``T:22.1 /200.0 @:127``, a target behind
+    its reading) and Klipper (``extruder: target=200 temp=22.1 pwm=0.9``); lines without them are passed over.
+    """
+    head = [line.decode("utf-8", "replace") for line in islice(_lines(data[: 1 << 20]), 5 * _HEAD_LINES)]
+    known = Counter(tuple(_labelled(line)) for line in head)
+    del known[()]
+    names, count = max(known.items(), key=lambda item: (item[1], len(item[0])), default=((), 0))
+    if not names or count < min(_LABELLED_LINES, max(2, _MANY * sum(map(bool, head)))):
         return data, ()
-    by = b"," if all(b"," in end for row in as_named for *_, end in row[:-1]) else b"\t"
-    out = [by.join(names)]
-    for line in _lines(data):
-        cells = _LABELLED.findall(line)
-        if cells:
-            out.append(by.join(value for _, value, _ in cells))
-    shown = ", ".join(name.decode("utf-8", "replace") for name in names)
-    return b"\n".join(out) + b"\n", (f"cells begin with the names of their columns: {shown}",)
+    out: list[str] = []
+    for raw in _lines(data):
+        cells = _labelled(raw.decode("utf-8", "replace"))
+        out.append(",".join(cells[name] for name in names) if cells.keys() >= {*names} else "")
+    passed = sum(not line and bool(raw.strip()) for line, raw in zip(out, _lines(data)))
+    head_row = next((at for at, line in enumerate(out) if line), 0)
+    out[max(head_row - 1, 0) : head_row] = [",".join(names)]  # in place of a line before, if there is one
+    notes = [f"lines have readings beside their names: {', '.join(names)}"]
+    notes += [f"{passed} line(s) without them passed over"] if passed else []
+    return "\n".join(out).encode() + b"\n", tuple(notes)
+
+
+def _labelled(line: str) -> dict[str, str]:
+    """Return the numbers of a line by the names beside them, and its stamp."""
+    stamp, section, last = _LINE_STAMP.match(line), "", ""
+    cells: dict[str, str] = {}
+    if stamp is not None:
+        cells["time" if stamp[1] else "time_s"] = (stamp[1] or stamp[2]).replace(",", ".")
+        line = line[stamp.end() :]
+    words: list[str] = []
+    for piece in re.split(r"[,;\t]", line.replace("/", " /")):
+        joined = re.sub(r" ?([:=/]) (?=[-+.\dn])", r"\1", piece.strip())
+        words += [joined] if _LABELLED.fullmatch(joined) else joined.split()
+    for word in words:
+        mark = next((sign for sign in "=:" if sign in word), "")
+        name, _, value = word.partition(mark) if mark else ("", "", word)
+        name = name.strip()
+        if last and word.startswith("/") and _NUMBER.fullmatch(word[1:]):
+            cells[unused(f"{last}_target", cells)] = word[1:]
+        elif _NAME.fullmatch(name) and (_NUMBER.fullmatch(value) or value in ("nan", "NaN")):
+            last = f"{section}_{name}" if section and mark == "=" else name
+            cells[unused(last, cells)] = value
+        elif mark == ":" and not value:
+            section = name
+    return cells if len(cells) > (stamp is not None) else {}
 
 
 def _parse_table(
@@ -404,10 +447,13 @@ def _read_cells(
             (f"{name}: {wrong.size} cell(s) that are no numbers left empty ({where})",) if wrong.size else ()
         )
         return (*words, *(["numbers have a decimal comma"] if comma else []))
-    if broken and {cell.lower() for cell in cells.unique()} - {""} <= {*_SWITCH}:
-        numbers[name] = cells.str.lower().map(_SWITCH).to_numpy(dtype=float)
-        return (f"{name}: words as {_shown(first)} read as 0 and 1",)
-    if broken and (wrong.size >= _MANY * int((~lost).sum()) or _DATE.match(first)):
+    if broken and (states := switched(cells)) is not None:
+        if not np.isfinite(values).any():
+            numbers[name] = states
+            return (f"{name}: words as {_shown(first)} read as 0 and 1",)
+        text[name] = cells.to_list()  # numbers and switches: the readings of several signals
+        return ()
+    if broken and (wrong.size >= _MANY * int((~lost).sum()) or (first and STAMP.fullmatch(first))):
         text[name] = cells.to_list()
     else:
         faults.append(_cell_fault(first, file, int(lines[wrong[0]]), name))
@@ -424,6 +470,19 @@ def _cell_numbers(column: Any, separator: str) -> tuple[Any, NDArray[np.float64]
     if comma:
         plain = cells.str.replace(",", ".")
     return cells, np.asarray(pd.to_numeric(plain, errors="coerce"), dtype=float), comma
+
+
+def switched(cells: Sequence[str]) -> NDArray[np.float64] | None:
+    """Return the numbers of cells that are numbers or the two states of a switch, NaN where one is lost; None
+    where there are other words, or two of one meaning."""
+    import pandas as pd
+
+    words = pd.Series(cells, dtype=object).astype(str).str.strip().str.lower()
+    values = pd.to_numeric(words, errors="coerce")
+    states = {*words[values.isna()]} - {lost.lower() for lost in _LOST}
+    if not states <= {*_SWITCH} or len({_SWITCH[state] for state in states}) < len(states):
+        return None
+    return np.asarray(values.fillna(words.map(_SWITCH)), dtype=float)
 
 
 def _shown(cell: str) -> str:
@@ -811,7 +870,7 @@ def _rows(data: bytes, skip: int, separator: str, file: str) -> Iterator[tuple[i
 def _cell_fault(cell: str, file: str, line: int, name: str) -> UserError:
     comma = re.fullmatch(r"\s*[+-]?\d+,\d+\s*", cell)
     hint = "write a decimal point" if comma else "write a number, leave the cell empty, or drop the column"
-    if _DATE.match(cell.strip()):
+    if cell.strip() and STAMP.fullmatch(cell.strip()):
         hint = "write seconds since the first row"
     return UserError(f"{_shown(cell)} is not a number", file=file, row=line, column=name, hint=hint)
 

@@ -21,7 +21,7 @@ the same noise no number of repeats proves anything (the model has to).  q is th
 **The room's sensors.**  Losing one is no reason to stop, and no limit holds for it.  Which they are is a
 role: the plant's disturbances that are temperatures, and of the sensors that the plant does not know those
 that the guard file states.  Where it states none the name decides, as in a log
-(:func:`~thermogrip.datasets.units.guess_role`), and the session reports the guess.
+(:func:`~thermogrip.datasets.roles.guess_role`), and the session reports the guess.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from dataclasses import dataclass, field
 from math import ceil, erf, isfinite, log, sqrt
 
 from thermogrip.datasets.limits import keyed
-from thermogrip.datasets.units import guess_role
+from thermogrip.datasets.roles import guess_role
 from thermogrip.rig.guard.trip import Trip
 from thermogrip.sysid.plant.plant import Plant
 

@@ -33,7 +33,7 @@ from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.atomic_files import atomic_path, read_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import LARGEST, MOST_NUMBER, STEP_RANGE, array_within, number_within
-from thermogrip.datasets.units import is_room_temperature
+from thermogrip.datasets.roles import is_room_temperature
 from thermogrip.sysid.models.model import Model
 from thermogrip.sysid.plant.fit_record import FitLog, PlantScores
 

@@ -505,10 +505,11 @@ def test_a_clock_is_seconds_since_1970_or_midnight(cells, seconds, note):
     [
         ("t,time,q1\n5,0,1\n6,2,1\n", [0, 2], ["t", "q1"]),  # the plainer name goes first
         ("time_s,t,q1\n0,5,1\n2,6,1\n", [0, 2], ["t", "q1"]),
-        ("ts,q1\n100000000000000000,1\n100000002500000000,1\n", [0, 2.5], ["q1"]),  # ns
-        ("ts,q1\n100000000000000,1\n100000002500000,1\n", [0, 2.5], ["q1"]),  # us
-        ("ts,q1\n100000000000,1\n100000002500,1\n", [0, 2.5], ["q1"]),  # ms
-        ("ts,q1\n99999999999,1\n100000000001.5,1\n", [0, 2.5], ["q1"]),
+        ("ts,q1\n1700000000000000000,1\n1700000002500000000,1\n", [0, 2.5], ["q1"]),  # ns since 1970
+        ("ts,q1\n1700000000000000,1\n1700000002500000,1\n", [0, 2.5], ["q1"]),  # us
+        ("ts,q1\n1700000000000,1\n1700000002500,1\n", [0, 2.5], ["q1"]),  # ms
+        ("ts,q1\n1700000000,1\n1700000003,1\n", [0, 3], ["q1"]),  # s
+        ("ts,q1\n1700000000,1\n1700000992,1\n", [1.7e6, 1700000.992], ["q1"]),  # ms of a board
         ("hours,q1\n1,1\n1.5,1\n", [3600, 5400], ["q1"]),
         ("minutes,q1\n1,1\n1.5,1\n", [60, 90], ["q1"]),
         ("us,q1\n1000,1\n1500,1\n", [1e-3, 1.5e-3], ["q1"]),
@@ -566,7 +567,7 @@ FOREIGN = [
      ["time: ts is taken as the time in s, times 0.001", "since 1970"]),
     ("millis,q1,y\n500,1,2\n1000,1,3\n", [0.5, 1], "q1 1 input 1|y 1 output 2", ["times 0.001"]),
     ("Elapsed time [h],q1,y\n0,1,2\n0.5,1,3\n", [0, 1800], "q1 1 input 1|y 1 output 2", ["times 3600"]),
-    ("uEst,yEst,Ts (s),\n1,2,4,\n3,2,,\n", [0, 4], "uEst 1 input 1|yEst 1 other 2",
+    ("uEst,yEst,Ts (s),\n1,2,4,\n3,2,,\n", [0, 4], "uEst 1 input 1|yEst 1 output 2",
      ["rows are taken 4 s apart"]),
     ("23:59:59,4,5\n00:00:01,4,6\n", [0, 2], "c2 1 other 4|c3 1 input 5",
      ["c1 counted from the first row, 23:"]),
@@ -860,15 +861,27 @@ def test_empty_lines_are_counted_beside_the_short_rows_too(tmp_path, monkeypatch
         read_log(tmp_path / "a.csv")
 
 
-def test_a_reading_of_one_signal_a_row_is_refused_with_what_makes_columns_of_it(tmp_path):
+def test_a_table_with_a_reading_of_one_signal_in_a_row_has_a_column_for_each_signal(tmp_path):
     path = tmp_path / "long.csv"
     rows = [f"{name},{k},{60 * k}\n" for k in range(10) for name in ("heater", "oven")]
     path.write_text("".join(["sensor,state,time_s\n", *rows]))
-    with pytest.raises(UserError) as caught:
-        read_log(path)
-    line = str(caught.value)
-    assert "column sensor: has a reading of one signal in a row, of heater, oven; give each signal" in line
-    assert "pivot_table(index='time_s', columns='sensor', values='state')" in line
+    log = read_log(path)
+    assert {str(name): item.values.tolist() for name, item in log.items()} == {
+        "heater": [*range(10)],
+        "oven": [*range(10)],
+    }
+    assert "heater, oven each hold until their next reading" in log.attrs["repairs"]
+    history = ["entity_id,state,last_changed\n"]
+    for k in range(20):
+        switch, plate = "on" if k % 2 else "off", "unavailable" if k == 3 else 20 + k
+        history.append(f"switch.heater,{switch},2024-01-13T00:{k:02}:00.5+00:00\n")
+        history.append(f"sensor.plate_temperature,{plate},2024-01-13T00:{k:02}:30.5+00:00\n")
+    path.write_text("".join(history))
+    log = read_log(path)
+    assert (names(log, "input"), column(log, "heater")[:6].tolist()) == (("heater",), [0, 0, 1, 1, 0, 0])
+    assert column(log, "plate_temperature")[1:7].tolist() == [20, 20, 21, 21, 22, 22]
+    assert np.isnan(column(log, "plate_temperature")[[0, 7, 8]]).all()  # not read yet, and lost
+    assert np.diff(log["time"].values).tolist() == [30.0] * 39
     path.write_text("".join(["note,state,time_s\n", *(f"n{k},{k},{k}\n" for k in range(10))]))  # all differ
     assert list(read_log(path).data_vars) == ["state"]
 

@@ -13,6 +13,8 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.repair import (
     check_plausible,
     describe_steps,
+    drop_codes,
+    drop_stuck,
     fill_input,
     find_spikes,
     gap_rows,
@@ -185,7 +187,7 @@ def test_what_is_wrong_with_single_times_is_repaired(stamps, time, rows, line):
 @pytest.mark.parametrize(
     ("stamps", "words"),
     [
-        ([0, 1, 2, 0, 1, 2], "row 5: time runs back from 2 s to 0 s; sort the rows, cut the file"),
+        ([0, 1, 2, 0, 1, 2], "row 5: time runs back from 2 s to 0 s; cut the file there in two"),
         ([*range(40), *range(5, 9)], "row 42: time runs back from 39 s to 5 s"),
         ([*range(100), 50], "row 102: time runs back from 99 s to 50 s"),
         ([0, np.nan, 2, 3], "row 3, column time: has no time"),
@@ -213,3 +215,42 @@ def test_an_input_is_held_and_never_taken_from_later():
     values, lines = fill_input("drive", np.array([np.nan, 0.5, np.nan, np.nan, 0.7]))
     np.testing.assert_array_equal(values, [np.nan, 0.5, 0.5, 0.5, 0.7])
     assert "3 lost values held" in lines[0]
+
+
+def warm(rows=400, step=0.0625, seed=3):
+    """Return a plate that is heated and cools, in steps of a converter."""
+    noise = 0.02 * np.random.default_rng(seed).standard_normal(rows)
+    return np.round((20 + 30 * np.sin(np.pi * np.arange(rows) / 100) ** 2 + noise) / step) * step
+
+
+@pytest.mark.parametrize("code", [85.0, -127.0, 999.9, 2000.0, -242.02])
+@pytest.mark.parametrize("rows", [slice(50, 51), slice(100, 139), slice(0, 7), slice(390, 400)])
+def test_a_sensor_code_is_no_reading_in_however_many_rows(code, rows):
+    values = warm()
+    values[rows] = code
+    kept, lines = drop_codes("t", values)
+    assert np.flatnonzero(np.isnan(kept)).tolist() == [*range(400)[rows]]
+    assert f"of {code:g} left empty, no reading" in lines[0]
+
+
+@pytest.mark.parametrize("step", [0.0625, 0.5, 1.0])
+def test_a_kettle_that_passes_85_degc_or_boils_at_a_code_loses_nothing(step):
+    course = np.concatenate([np.linspace(20, 85, 200), np.full(50, 85.0), np.linspace(85, 100, 50)])
+    kept, lines = drop_codes("kettle", np.round(course / step) * step)
+    assert lines == []
+    assert np.isfinite(kept).all()
+
+
+def test_a_reading_that_stands_still_while_the_heater_swings_is_stuck_and_the_sound_part_stays():
+    heater = np.repeat([0.0, 100.0] * 10, 20)
+    stuck = warm()
+    stuck[200:] = stuck[199]
+    kept, lines = drop_stuck("t", stuck, [heater])
+    assert np.isnan(kept[201:]).all()
+    assert np.isfinite(kept[:199]).all()
+    assert "stuck at " in lines[0]
+    for healthy in (warm(), warm(step=2.0)):
+        assert drop_stuck("t", healthy, [heater]) == (pytest.approx(healthy), [])
+    still = np.full(400, 23.5)
+    assert np.isnan(drop_stuck("t", still, [heater])[0]).all()
+    assert drop_stuck("t", still, [np.r_[np.zeros(200), np.ones(200)]])[1] == []  # one step shows no answer

@@ -223,7 +223,7 @@ def test_cells_are_numbers_switches_times_or_words(text, cells, lines, notes):
 def test_cells_that_begin_with_the_names_of_their_columns(text, cells):
     table = parse_text(text.encode(), "a.txt")
     assert shown(table)[0] == cells
-    assert table.notes == (f"cells begin with the names of their columns: {', '.join(cells)}",)
+    assert table.notes == (f"lines have readings beside their names: {', '.join(cells)}",)
 
 
 def test_labels_must_be_alike_in_the_rows_and_differ_in_a_row():

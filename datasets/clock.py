@@ -1,0 +1,251 @@
+"""The time of each row of a log: which column is its clock, in what unit, and where it wraps or starts again.
+
+A clock is known by its name, else by its behaviour: it rises from row to row in steps that are nearly even.
+Its unit is that of its header.  A header without one leaves the numbers:
+
+* between the years 2000 and 2100 they may be an epoch, in s, ms, us or ns;
+* with decimals, or less than 20 apart, they are seconds, as logs are written;
+* whole numbers further apart are seconds where their steps are whole minutes, and milliseconds or, from
+  100 000 apart, microseconds of a board's counter where they are not.
+
+The last of these is a guess, as is a time that counts rows: it is reported as a doubt, with the option that
+settles it.
+
+A counter of 16 or 32 bits wraps: where the time runs back by 2^16 or 2^32 counts but for one step, it goes
+on.  A board that was reset begins again: where both parts rise on their own, the second one follows after a
+gap, for how long it was off is not known.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.repair import GAP_SECONDS, GAP_STEPS
+from thermogrip.datasets.tables import STAMP, Table
+from thermogrip.datasets.units import to_record_unit
+
+Floats = NDArray[np.float64]
+
+_TIME_UNITS = ("1", "s", "ms", "min")
+_TIME = re.compile(
+    r"(?i)((elapsed|rel|relative|abs|unix|epoch|utc|local|system|log|sample|test|run|date|last)_?)*"
+    r"(time|timestamp|time_stamp|date|zeit|uhrzeit|datum|tijd|seconds?|secs?|millis|milliseconds|micros|minutes"
+    r"|hours|epoch|clock|uptime|changed|updated|t|ts|ms|us)(_(utc|local|stamp|elapsed|abs|rel))?"
+)
+_STEP = re.compile(r"(?i)ts|dt|delta_?t|sampl(e|ing)_?(time|period|interval)")
+_COUNTER = re.compile(r"(?i)x|n|k|i|no|nr|id|index|idx|samples?|rows?|steps?|count(er)?|unnamed.*")
+_TIME_WORDS = {"ms": 1e-3, "milli": 1e-3, "us": 1e-6, "micro": 1e-6, "minute": 60.0, "hour": 3600.0}
+EPOCH = (946684800.0, 4102444800.0)  # s since 1970 of the years 2000 and 2100
+_EPOCH_UNITS = (1.0, 1e-3, 1e-6, 1e-9)  # s a count
+_MONOTONE = 0.9  # share of a clock's steps that do not run backward, and that are nearly even
+_EVEN = 0.2  # of their median, by which nearly even steps differ
+_COUNTS_APART, _MICROSECONDS_APART = 20.0, 1e5  # see the module's text
+_PIECE_ROWS = 20  # of a part of a log that stands alone
+_MONTH_NAMES = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+_MONTHS = {month: str(number) for number, month in enumerate(_MONTH_NAMES, 1)}
+
+
+@dataclass(frozen=True)
+class Clock:
+    """The time of each row of a table."""
+
+    seconds: Floats  # (n_row,), NaN where a row has none
+    columns: frozenset[str]  # the headers that it was read from, or stands in place of
+    notes: tuple[str, ...] = ()  # what was taken for it and what was mended, a line each
+    zero: float = np.nan  # of ``seconds`` on the file's own clock [s]; NaN where it has none
+    doubt: str = ""  # what is a guess, and how to state it
+
+
+def clock_of(table: Table, read: Mapping[str, tuple[str, str, float]], dt: float | None) -> Clock:
+    """Return the clock of a table; ``read`` is name, unit and factor by header, ``dt`` the step that the user
+    states [s]."""
+    named = [h for h, (name, unit, _) in read.items() if unit in _TIME_UNITS and _TIME.fullmatch(name)]
+    # a clock that starts again with each cycle comes after one that does not
+    back = {h for h in named if h in table.numbers and (np.diff(table.numbers[h]) < 0).any()}
+    named.sort(key=lambda header: (header in back, read[header][0] != "time"))
+    others = [h for h in table.text if h not in named and read_clock(table.text[h][:20]) is not None]
+    others += [h for h in table.numbers if h not in named and _behaves_as_clock(h, read[h], table.numbers[h])]
+    if dt is not None:
+        instead = frozenset([*named, *others[:1]])
+        place = f" in place of {', '.join(h for h in [*named, *others[:1]])}" if instead else ""
+        rows = np.arange(len(table.lines), dtype=float)
+        return Clock(rows * dt, instead, (f"time: rows are {dt:g} s apart, as asked{place}",))
+    for header in [*named, *others]:
+        clock = _of_text(header, table) if header in table.text else _of_numbers(header, table, read[header])
+        if clock is not None:
+            return clock
+    return _of_rows(table, read)
+
+
+def _behaves_as_clock(header: str, read: tuple[str, str, float], values: Floats) -> bool:
+    """Tell whether a column that is not named as a time rises in nearly even steps, as only a clock does."""
+    steps = np.diff(values)
+    enough = 4 if re.fullmatch(r"c1", header) or _COUNTER.fullmatch(header) else _PIECE_ROWS
+    if read[1] != "1" or steps.size < enough or not np.all(steps > 0):
+        return False
+    usual = float(np.median(steps))
+    return bool(np.mean(np.abs(steps - usual) <= _EVEN * usual) >= _MONOTONE)
+
+
+def _of_text(header: str, table: Table) -> Clock | None:
+    """Return the clock in a column of dates or times of day, of which a second column may have the hours."""
+    cells, parts = table.text[header], [header]
+    if ":" not in cells[0]:
+        with_hours = [h for h in table.text if ":" in table.text[h][0]]
+        parts += [h for h in with_hours if read_clock(table.text[h][:20]) is not None][:1]
+        cells = [" ".join(row) for row in zip(*(table.text[h] for h in parts))]
+    read = read_clock(cells)
+    if read is None:
+        return None
+    seconds, how = read
+    zero = float(seconds[np.isfinite(seconds).argmax()])
+    note = f"time: {' and '.join(parts)} counted from the first row, {cells[0]}{how}"
+    return Clock(seconds - zero, frozenset(parts), (note,), zero)
+
+
+def _of_numbers(header: str, table: Table, read: tuple[str, str, float]) -> Clock | None:
+    """Return the clock in a column of numbers; None where it does not rise."""
+    counts, (name, unit, scale) = table.numbers[header], read
+    counts, notes = _unwrapped(counts, table.lines)
+    finite = counts[np.isfinite(counts)]
+    stated = name == "time" and unit != "1"
+    rising = finite.size > 1 and np.mean(np.diff(finite) >= 0) >= _MONOTONE and np.ptp(finite) > 0
+    if not (stated or rising):
+        return None
+    doubt = ""
+    if unit == "1":
+        scale, doubt = _seconds_a_count(name, finite)
+    seconds = to_record_unit(counts if scale == 1 else counts * scale, unit)[0]
+    seconds, restarts = _in_pieces(seconds, table.lines)
+    if stated and scale == 1:
+        converted = [f"time: converted from {unit} to s"] if unit != "s" else []
+        return Clock(seconds, frozenset([header]), (*converted, *notes, *restarts), 0.0)
+    what = f"{header} is taken as the time in {unit if unit != '1' else 's'}"
+    factor = "" if scale == 1 else f", times {scale:g}"
+    if _TIME.fullmatch(name) is None and not doubt:
+        step = float(np.median(np.diff(finite)))
+        doubt = f"{header} is taken as the time, its rows {step:g} s apart"
+    note = f"time: {what}{factor}" + ("; --dt S sets another step" if doubt else "")
+    return Clock(seconds, frozenset([header]), (note, *notes, *restarts), 0.0, doubt)
+
+
+def _seconds_a_count(name: str, counts: Floats) -> tuple[float, str]:
+    """Return the seconds that one count of a clock without a unit means, and the doubt, if it is a guess."""
+    word = next((f for begin, f in _TIME_WORDS.items() if name.lower().startswith(begin)), None)
+    epoch = next((f for f in _EPOCH_UNITS if EPOCH[0] <= float(counts[0]) * f <= EPOCH[1]), None)
+    steps = np.diff(counts)
+    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    whole = bool(np.all(counts == np.rint(counts)))
+    of_board = whole and usual >= _COUNTS_APART and not np.all(steps % 60 == 0)
+    if word is not None and (epoch is None or epoch == 1.0):  # a board's counter may be as large as a date
+        return word, ""
+    if epoch is not None and not (epoch == 1.0 and of_board):
+        return epoch, ""
+    if not of_board:
+        minutes = whole and usual >= _COUNTS_APART
+        guess = f"{name} has no unit: taken as seconds, so that rows are {usual:g} s apart" if minutes else ""
+        return 1.0, guess
+    scale, unit = (1e-6, "microseconds") if usual >= _MICROSECONDS_APART else (1e-3, "milliseconds")
+    return scale, f"{name} has no unit: taken as {unit}, so that rows are {usual * scale:g} s apart"
+
+
+def _unwrapped(counts: Floats, lines: NDArray[np.int64]) -> tuple[Floats, list[str]]:
+    """Return a counter that goes on where it wrapped at 16 or 32 bits, and a line for each wrap."""
+    notes: list[str] = []
+    steps = np.diff(counts)
+    back = np.flatnonzero(steps < 0)
+    usual = float(np.nanmedian(steps)) if back.size else 0.0
+    for at in back:
+        for bits in (16, 32):
+            for count in (1.0, 1e-3, 1e-6):  # the file may have it in s already
+                forward = float(steps[at]) + 2.0**bits * count
+                if 0 < forward <= 2 * usual:
+                    counts = counts + np.where(np.arange(counts.size) > at, 2.0**bits * count, 0.0)
+                    notes.append(f"time: a counter of {bits} bits wrapped in row {lines[at + 1]}: it goes on")
+    return counts, notes
+
+
+def _in_pieces(seconds: Floats, lines: NDArray[np.int64]) -> tuple[Floats, list[str]]:
+    """Return times that go on after a gap where the clock started again, and a line for each restart."""
+    back = np.flatnonzero(np.diff(seconds) < 0) + 1
+    pieces = np.split(seconds, back)
+    if not back.size:
+        return seconds, []
+    usual = float(np.nanmedian(np.diff(seconds)))
+    begins = seconds[0] + max(GAP_SECONDS, _PIECE_ROWS * usual)  # a board begins where it began before
+    if any(piece.size < _PIECE_ROWS or piece[0] > begins for piece in pieces):
+        return seconds, []
+    gap = 1.0 + max(GAP_SECONDS, GAP_STEPS * usual)
+    notes = []
+    for at in back:
+        seconds = seconds.copy()
+        seconds[at:] += seconds[at - 1] + gap - seconds[at]
+        notes.append(
+            f"time: the clock starts again in row {lines[at]}: a new segment begins there, after a gap of "
+            "unknown length"
+        )
+    return seconds, notes
+
+
+def _of_rows(table: Table, read: Mapping[str, tuple[str, str, float]]) -> Clock:
+    """Return a clock that counts rows, by a step that stands in the file or of 1 s."""
+    steps = {h: np.unique(v[np.isfinite(v)]) for h, v in table.numbers.items() if _STEP.fullmatch(read[h][0])}
+    stated = {header: float(v[0]) for header, v in steps.items() if v.size == 1 and v[0] > 0}
+    beside = "dt" in table.meta  # a file may have it beside its columns
+    step = next(iter(stated.values()), float(table.meta.get("dt", 1.0)))
+    note = f"no time column: rows are taken {step:g} s apart; --dt S sets another step"
+    doubt = "" if stated or beside else "no column is a clock: rows are taken 1 s apart"
+    return Clock(step * np.arange(len(table.lines), dtype=float), frozenset(stated), (note,), np.nan, doubt)
+
+
+def read_clock(cells: Sequence[str]) -> tuple[Floats, str] | None:
+    """Return the seconds that dates and times of day mean (without a date from midnight on, UTC without an
+    offset) and how they were taken; None if they are none."""
+    import pandas as pd
+
+    parts = pd.Series(list(cells), dtype=object).str.strip().str.extract(STAMP)
+    if parts[[1, 4]].isna().all(axis=1).mean() > 1 - _MONOTONE:
+        return None
+
+    def numbers(key: int) -> Floats:
+        return np.asarray(pd.to_numeric(parts[key].str.replace(",", "."), errors="coerce"), dtype=float)
+
+    hour, minute, second = (np.nan_to_num(numbers(key)) for key in (4, 5, 6))
+    half = parts[7].str.lower()
+    hour = np.where(half.notna() & (hour == 12), 0, hour) + 12.0 * (half == "pm").to_numpy()
+    offset = parts[8].str.replace(":", "").str.extract(r"([+-])(\d{2})(\d{2})")
+    shift = pd.to_numeric(offset[1]) * 60 + pd.to_numeric(offset[2])
+    minute = minute - np.nan_to_num(np.asarray(shift.where(offset[0] == "+", -shift), dtype=float))
+    of_day = 3600 * hour + 60 * minute + second
+    of_day[parts[[1, 4]].isna().all(axis=1)] = np.nan
+    if parts[1].isna().all():
+        steps = np.diff(of_day, prepend=of_day[0])
+        return of_day + 86400.0 * np.cumsum(np.nan_to_num(steps) < -43200), ""
+    parts[2] = parts[2].str.lower().map(_MONTHS).fillna(parts[2])
+    first, middle, last = numbers(1), numbers(2), numbers(3)
+    note = ""
+    if np.nanmax(first) > 31:
+        year, month, day = first, middle, last
+    elif np.nanmax(middle) > 12 or (np.nanmax(first) <= 12 and "/" in str(cells[0])):
+        month, day, year = first, middle, last
+        note = "" if np.nanmax(middle) > 12 else " (taken as month/day)"
+    else:
+        day, month, year = first, middle, last
+    year = np.where(year < 100, year + 2000, year)
+    year[(year < 1900) | (year > 2200)] = np.nan  # beyond what pandas counts in nanoseconds
+    dates = pd.to_datetime(pd.DataFrame({"year": year, "month": month, "day": day}), errors="coerce")
+    days = (dates - pd.Timestamp(0)) / pd.Timedelta(days=1)
+    return np.asarray(days, dtype=float) * 86400.0 + of_day, note
+
+
+def since_first_row(seconds: Floats) -> tuple[Floats, list[str]]:
+    """Return times since 1970 [s] counted from the first row, others as they are, and a line if they were."""
+    if not seconds[0] >= EPOCH[0]:
+        return seconds, []
+    repairs = f"time is a clock of seconds since 1970: counted from the first row, {seconds[0]:.0f} s"
+    return np.round(seconds - seconds[0], 6), [repairs]

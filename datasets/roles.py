@@ -1,0 +1,403 @@
+"""Roles of the columns of a log: input, disturbance, output or other, and what each guess rests on.
+
+Names come first, then units.  Where they show no input or no output, the data do (:func:`roles_of_data`): a
+column that is held between few large moves is an input, one whose next value another column's past helps to
+predict is an output.  With n lags and N rows the help of column i for column j is the gain in the Bayesian
+information criterion,
+
+    G_ij = N log(RSS_j / RSS_ij) - n log N,
+
+RSS_j of j on its own past, RSS_ij with that of i beside it (Granger 1969); beyond 10, with 2 lags and with 6
+(of a smooth input few leave what its output contains of it), it counts.
+
+A column is left out as a copy of another only where the two are one signal within their steps: each is a
+multiple of the other and a constant, over more than two levels.  Of two states every pair would be.  Two
+inputs that always move together cannot be told apart by any fit: one stays and stands for both.
+
+**Doubts.**  A guess that decides what a fit sees is reported as a doubt: roles that the course of a column
+alone shows, a column that is left out although it helps to predict an output, inputs that move together, a
+room that is heated.  Whoever states the roles has none.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.limits import MOST_NUMBER
+from thermogrip.datasets.units import DRIVE, find_column
+
+Floats = NDArray[np.float64]
+
+_SETPOINT = re.compile(
+    r"^(t_?)?(setpoint|set_point|target|sp|set)(_?\d+)?(_.*)?$|^reference(_.*|\d*)$"
+    r"|_(setpoint|set_point|target|sp|set|goal)(_?\d+)?$|^(goal|desired)(_.*|\d*)$"
+)
+_SET_DRIVE = re.compile(r"^set(_.*|\d*)$|_set$|^(goal|desired)")  # set_percent is what a drive is set to
+_OF_DRIVES = ("percent", "V", "A", "W", "0_255")
+_OUTDOORS = re.compile(
+    r"(^|_)(outside|outdoors?|weather|wind|cloud|rain|dew|sol)(_|$)|solar|irradia|^(to|te|text|toa|oat|ghi)$"
+)
+_ROOM = re.compile(r"ambient|(^|_)(amb|room)(_|$)")
+_INPUT = re.compile(
+    DRIVE.pattern + r"|(^|_)(pwm|duty|heater|relay)$|^[a-z]?\d?@$"  # @ is the duty of a printer's board
+)
+_OUTPUT = re.compile(
+    r"^(t|y|temp|temperature|level|outlet|position|speed|pv|angle|velocity|response|measured)(\d*|_.*)$"
+    r"|_(temp|temperature)$"
+)
+_INFLOW = re.compile(r"(^|_)(inlet|inflow|supply_air)(_|$)")
+_BOOKKEEPING = re.compile(
+    r"^(error|err|control_error|integral|derivative|[pid]_?(term|part|action)|k_?[pidc]|pid_[pid]"
+    r"|hour|day|month|year|week|weekday|row|index|id|iteration|sample|record|counter)(_of_[a-z]+|_?no|_?\d+)?$"
+)
+NO_CLUE = "neither its name nor its unit shows what it is"
+_BY_COURSE = "it never moves", "it counts rows or time"
+_HELD_SHARE, _HELD_SIZE = 0.5, 0.05  # of rows with a move; of the range that its median has, at least
+_FEW = 20  # rows: too few to distinguish chance from rule
+_COUNTS = 0.9  # of the rows have the same step
+_SHOWS = 5  # moves of two columns, by which they may be one signal
+_SHARED = 1 / 3  # of the wider one of two ranges: two sensors of one plant
+_EXACT, _ROUNDED = 1e-6, 0.05  # of a column's range; of its standard deviation, that rounding takes at most
+_LAGS, _STRONG, _MOST_ROWS = (2, 6), 10.0, 20_000
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Roles of the columns of a log."""
+
+    of: dict[str, str]  # by name
+    reasons: dict[str, str] = field(default_factory=dict)  # of those that are guesses
+    doubts: tuple[str, ...] = ()  # guesses that decide, a line each
+
+
+def is_room_temperature(name: str, unit: str) -> bool:
+    """Tell whether a measured disturbance is the temperature of the surroundings: no other quantity, and not
+    that of what flows in."""
+    return unit == "degC" and not _INFLOW.search(_words(name))
+
+
+def guess_role(name: str, unit: str) -> str:
+    """Return the role that a name and a unit suggest: input, disturbance, output or other."""
+    return explain_role(name, unit)[0]
+
+
+def explain_role(name: str, unit: str) -> tuple[str, str]:
+    """Return the role that a name and a unit suggest, and why: names come first, then units."""
+    words, celsius = _words(name), unit == "degC"
+    set_drive = _SET_DRIVE.search(words) and unit in _OF_DRIVES
+    rows = (
+        (_SETPOINT.search(words) and not set_drive, "other", "its name is that of a set point"),
+        (_BOOKKEEPING.match(words), "other",
+         "its name is that of a number of the clock's or the controller's"),
+        (_OUTDOORS.search(words) or _ROOM.search(words), "disturbance",
+         "its name is that of the surroundings"),
+        (_INFLOW.search(words) and (celsius or "temp" in words), "disturbance",
+         "its name is that of what flows in"),
+        (_INPUT.search(words) and unit not in ("degC", "s"), "input", "its name is that of a drive"),
+        (_OUTPUT.search(words) and unit != "s", "output", "its name is that of a reading"),
+        (celsius, "output", "its unit is degC"),
+        (unit in ("percent", "V", "0_255"), "input", f"its unit is {unit}"),
+    )  # fmt: skip
+    return next(((role, why) for applies, role, why in rows if applies), ("other", NO_CLUE))
+
+
+def assign_roles(
+    units: dict[str, str],
+    *,
+    inputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None,
+    disturbances: Sequence[str] | None = None,
+    given: Mapping[str, str] | None = None,
+    columns: Mapping[str, Floats] | None = None,
+    file: str | None = None,
+) -> Roles:
+    """Return the role of each variable of ``units`` (name -> unit), and what the guesses among them rest on.
+
+    The lists hold names with or without the unit suffix; a list that is given is complete: no other variable
+    gets its role. ``given`` (name -> role) replaces guesses.  Where names and units show no input or no
+    output, ``columns``, the data, are asked.
+    """
+    lists = {"input": inputs, "output": outputs, "disturbance": disturbances}
+    chosen: dict[str, str] = {}
+    for role, wanted in lists.items():
+        for entry in wanted or ():
+            name = find_column(entry, units, file)
+            if chosen.get(name, role) != role:
+                problem = f"is listed as {chosen[name]} and as {role}"
+                raise UserError(problem, file=file, column=name, hint="choose one")
+            chosen[name] = role
+    stated = dict(given or {}) | chosen
+    guesses = {n: explain_role(n, unit) for n, unit in units.items() if n not in stated}
+    of_course: dict[str, tuple[str, str]] = {}
+    if columns is not None:  # what is beyond all use is no reading, and its squares are none either
+        columns = {n: np.where(np.abs(v) <= MOST_NUMBER, v, np.nan) for n, v in columns.items()}
+        if all(len(values) >= _FEW for values in columns.values()):
+            guesses |= _copies(columns, guesses, units)
+            guesses |= _unlike_inputs(columns, guesses, [n for n, role in stated.items() if role == "input"])
+        guesses |= _controllers(guesses, units)
+        fixed = {name: role for name, (role, why) in guesses.items() if why != NO_CLUE} | stated
+        if not {"input", "output"} <= {*fixed.values()}:
+            of_course = roles_of_data(columns, units, fixed)
+        guesses |= of_course
+        guesses |= _heated_rooms(columns, guesses, stated)
+    roles, reasons = {}, {}
+    for name in units:
+        guess, why = guesses.get(name, (stated.get(name, "other"), ""))
+        roles[name] = chosen.get(name, "other" if lists.get(guess) is not None else guess)
+        if why and roles[name] == guess:
+            reasons[name] = why
+    doubts = () if columns is None else _doubts(columns, roles, reasons, of_course, lists)
+    return Roles(roles, reasons, doubts)
+
+
+def _controllers(
+    guesses: Mapping[str, tuple[str, str]], units: Mapping[str, str]
+) -> dict[str, tuple[str, str]]:
+    """Return ``input`` and ``output`` as a controller calls them, where a set point shows that it does."""
+    by_name = {name.lower(): name for name in guesses}
+    if not {"input", "output"} <= by_name.keys() or not any(_SETPOINT.search(_words(n)) for n in units):
+        return {}
+    why = "beside a set point it is the controller's:"
+    reads, drives = ("output", f"{why} what it reads"), ("input", f"{why} what it drives")
+    return {by_name["input"]: reads, by_name["output"]: drives}
+
+
+def roles_of_data(
+    columns: Mapping[str, Floats], units: Mapping[str, str], fixed: Mapping[str, str]
+) -> dict[str, tuple[str, str]]:
+    """Return role and reason, as the data show them, of the columns (n_row,) that ``fixed`` gives no role."""
+    out: dict[str, tuple[str, str]] = {}
+    for name in [name for name in columns if name not in fixed]:
+        values = columns[name][np.isfinite(columns[name])]
+        steps, rows = np.diff(values), max(values.size, 1)
+        if not steps.any():
+            out[name] = "other", _BY_COURSE[0]
+        elif rows >= _FEW and _mostly_even(steps):
+            out[name] = "other", _BY_COURSE[1]
+        elif _is_held(values):
+            out[name] = "input", f"it is held between {np.count_nonzero(steps)} moves in {rows} rows"
+    roles = {**fixed, **{name: role for name, (role, _) in out.items()}}
+    names = [n for n in columns if roles.get(n) != "other" and np.nanmax(columns[n]) > np.nanmin(columns[n])]
+    gain = _predictive_gain([columns[name] for name in names])
+    open_, net = [n for n in names if n not in roles], dict(zip(names, (gain - gain.T).sum(axis=1)))
+    for name in open_:
+        help_ = gain[:, names.index(name)]
+        if help_.max() > _STRONG:
+            out[name] = "output", f"its course follows {names[int(help_.argmax())]}"
+    roles |= {name: role for name, (role, _) in out.items()}
+    held = next((n for n in names if roles.get(n) == "input" and _is_held(columns[n])), None)
+    read = [n for n in names if roles.get(n) == "output"]
+    for name in [n for n in open_ if n not in roles]:
+        why = "no other column predicts its course"
+        out[name] = ("disturbance" if held or units[name] == "degC" else "input"), why
+        like = next((n for n in read if held and _overlap(columns[name], columns[n]) >= _SHARED), None)
+        if like is not None:
+            out[name] = "output", f"its values lie as those of {like}"
+    roles |= {name: role for name, (role, _) in out.items()}
+    clear = {role for name, role in roles.items() if name not in open_}
+    if len(open_) == 1 and "disturbance" in clear and "output" not in clear:
+        roles[open_[0]], out[open_[0]] = "output", ("output", "there is nothing else to predict")
+    elif open_ and "input" not in roles.values():
+        lead = dict(zip(names, gain.sum(axis=1)))
+        for name in [n for n in open_ if net[n] > 0] or [max(open_, key=lambda n: lead[n])]:
+            more = "it predicts the others more than they predict it"
+            roles[name], out[name] = "input", ("input", more if net[name] > 0 else "no other is likelier one")
+    if len(open_) > 1 and "output" not in roles.values():
+        name = min(reversed(open_), key=lambda n: net[n])
+        out[name] = "output", "the others predict it more than it predicts them"
+    return out
+
+
+def _doubts(
+    columns: Mapping[str, Floats],
+    roles: Mapping[str, str],
+    reasons: Mapping[str, str],
+    of_course: Mapping[str, tuple[str, str]],
+    lists: Mapping[str, Sequence[str] | None],
+) -> tuple[str, ...]:
+    """Return the guesses that decide what a fit sees, a line each."""
+    doubts = []
+    for name, (role, why) in of_course.items():
+        if roles[name] == role in ("input", "output") and reasons.get(name) == why:
+            doubts.append(f"{name} is taken as {role}: {why}")
+    for name, why in reasons.items():
+        if why.startswith(("it always moves with", "it follows the drive")):
+            doubts.append(f"{name}: {why}")
+    if lists["input"] is not None:  # what was not listed was not meant
+        return tuple(doubts)
+    inputs, outputs = ([n for n, r in roles.items() if r == role] for role in ("input", "output"))
+    unclear = [n for n in columns if roles[n] == "other" and reasons.get(n, NO_CLUE) == NO_CLUE]
+    unclear += [n for n, why in reasons.items() if roles[n] == "other" and why.startswith("it moves in most")]
+    moving = [n for n in unclear if np.ptp(columns[n][np.isfinite(columns[n])]) > 0]
+    for name in moving if inputs else ():
+        helped = next((n for n in outputs if _helps_beside(columns, name, n, inputs)), None)
+        if helped is not None:
+            doubts.append(f"{name} is left out ({reasons.get(name, NO_CLUE)}), and helps to predict {helped}")
+    return tuple(doubts)
+
+
+def _helps_beside(columns: Mapping[str, Floats], name: str, output: str, inputs: Sequence[str]) -> bool:
+    """Tell whether the past of a column helps to predict an output beside that of the inputs and its own."""
+    own, *others = _scaled([columns[n] for n in (output, name, *inputs)])
+    return all(_gain(own, others[0], others[1:], lags) > _STRONG for lags in _LAGS)
+
+
+def _heated_rooms(
+    columns: Mapping[str, Floats], guesses: Mapping[str, tuple[str, str]], stated: Mapping[str, str]
+) -> dict[str, tuple[str, str]]:
+    """Return the rooms that are outputs, because a drive heats them; weather is heated by nobody.
+
+    A rig warms the room around it too: beside another output only what is called a room is one.
+    """
+    roles = {name: role for name, (role, _) in guesses.items()} | dict(stated)
+    drives = [n for n, role in roles.items() if role == "input" and n in columns]
+    alone = "output" not in roles.values()
+    out = {}
+    for name, (role, _) in guesses.items():
+        words = _words(name)
+        if role != "disturbance" or _OUTDOORS.search(words) or not _ROOM.search(words) or not drives:
+            continue
+        if not (alone or re.search(r"(^|_)room(_|$)", words)):
+            continue
+        gain = _predictive_gain([columns[name], *(columns[drive] for drive in drives)])
+        if gain[1:, 0].max() > _STRONG:
+            drive = drives[int(gain[1:, 0].argmax())]
+            out[name] = "output", f"it follows the drive {drive}, as no surroundings do"
+    return out
+
+
+def _words(name: str) -> str:
+    """Return a name in lower case with its words apart: ``BeerSet`` as ``beer_set``."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
+
+
+def _mostly_even(steps: Floats) -> bool:
+    usual = np.median(steps)
+    return bool(np.mean(np.abs(steps - usual) < _EXACT * np.abs(usual)) >= _COUNTS)
+
+
+def _is_held(values: Floats) -> bool:
+    """Tell whether a column moves in few rows, and then far, as what a person or a relay sets does."""
+    known = values[np.isfinite(values)]
+    moves = np.abs(np.diff(known))
+    held = 0 < np.count_nonzero(moves) <= _HELD_SHARE * known.size
+    return bool(held and np.median(moves[moves > 0]) >= _HELD_SIZE * np.ptp(known))
+
+
+def _overlap(one: Floats, other: Floats) -> float:
+    """Return the share of the wider range of two columns that both have."""
+    low, high = np.nanmin([one, other], axis=1), np.nanmax([one, other], axis=1)
+    return float((high.min() - low.max()) / (high - low).max())
+
+
+def _unlike_inputs(
+    columns: Mapping[str, Floats], guesses: Mapping[str, tuple[str, str]], stated: Sequence[str]
+) -> dict[str, tuple[str, str]]:
+    """Return the columns that are inputs by unit alone and move in most rows while one of them or of the
+    ``stated`` is held; where none is, a controller moves them."""
+    by_unit = [n for n, (role, why) in guesses.items() if role == "input" and why.startswith("its unit")]
+    likely = [n for n, (role, why) in guesses.items() if role == "input" or why == NO_CLUE]
+    held = next((name for name in (*stated, *likely) if _is_held(columns[name])), None)
+    finite = {name: columns[name][np.isfinite(columns[name])] for name in by_unit}
+    moving = [n for n, v in finite.items() if np.count_nonzero(np.diff(v)) > _HELD_SHARE * len(v)]
+    why = f"it moves in most rows, and {held} is held between its moves, as inputs are"
+    return dict.fromkeys(moving if held else (), ("other", why))
+
+
+def _copies(
+    columns: Mapping[str, Floats], guesses: Mapping[str, tuple[str, str]], units: Mapping[str, str]
+) -> dict[str, tuple[str, str]]:
+    """Return the columns that are one signal with another, or a set point less a reading, and of what.
+
+    Of two copies the one with a clue, else the first, stays.  What is read is no copy of what is driven:
+    under a proportional controller the two are multiples of each other.
+    """
+    moving = {n: v[:_MOST_ROWS] for n, v in columns.items() if np.ptp(v) > 0}  # of lost values none
+    out: dict[str, tuple[str, str]] = {}
+    order = sorted(moving, key=lambda n: (n in guesses) + (guesses.get(n, ("", ""))[1] == NO_CLUE))
+    for at, name in enumerate(order):
+        if name not in guesses:
+            continue
+        (role, why), values = guesses[name], moving[name]
+        for other in [n for n in order[:at] if n not in out]:
+            role_of_other = guesses.get(other, (role, ""))[0]
+            if not _one_signal(values, moving[other]) or {role, role_of_other} == {"input", "output"}:
+                continue
+            if role == role_of_other == "input" and units[name] == units[other]:
+                says = f"it always moves with {other}, and their effects cannot be told apart"
+                out[name] = "other", f"{says}: {other} stands for both"
+            elif min(np.unique(v).size for v in (values, moving[other])) > 2:
+                out[name] = "other", f"it is {other} in another unit"
+            break
+        if name in out or why != NO_CLUE:
+            continue
+        goals = [n for n in moving if n != name and (_SETPOINT.search(_words(n)) or _is_held(moving[n]))]
+        pairs = ((g, n) for g in goals for n in order[:at] if n not in (*goals, *out))
+        both = next(((g, n) for g, n in pairs if _explains(values, moving[g], moving[n])), None)
+        if both is not None:
+            out[name] = "other", f"it is computed from {both[0]} and {both[1]}"
+    return out
+
+
+def _one_signal(one: Floats, other: Floats) -> bool:
+    """Tell whether two columns are multiples of each other and a constant, each within its own steps."""
+    return _explains(one, other) and _explains(other, one)
+
+
+def _explains(y: Floats, *some: Floats) -> bool:
+    """Tell whether a column is a sum of multiples of others but for rounding; of few moves nobody can."""
+    if min(np.count_nonzero(np.diff(v)) for v in (y, some[-1])) < _SHOWS:
+        return False
+    x = np.column_stack([np.ones(y.size), *some])
+    moves = np.abs(np.diff(y))
+    least = max(_EXACT * float(np.ptp(y)), float(moves[moves > 0].min(initial=np.inf)))
+    for rows in (slice(0, 200), slice(None)):
+        left = y[rows] - x[rows] @ np.linalg.lstsq(x[rows], y[rows], rcond=None)[0]
+        if np.abs(left).max() > least or left.std() > _ROUNDED * y.std():
+            return False
+    return True
+
+
+def _predictive_gain(columns: Sequence[Floats]) -> Floats:
+    """Return G (n, n) of the module's theory, the least over the lags; row i helps column j."""
+    n, scaled = len(columns), _scaled(columns)
+    gain = np.zeros((n, n))
+    for j in range(n):
+        for i in (i for i in range(n) if i != j):
+            gain[i, j] = min(_gain(scaled[j], scaled[i], (), lags) for lags in _LAGS)
+    return gain
+
+
+def _scaled(columns: Sequence[Floats]) -> list[Floats]:
+    """Return the first rows of columns, gaps filled, of mean 0 and standard deviation 1."""
+    scaled = []
+    for values in (each[:_MOST_ROWS] for each in columns):
+        at, known = np.arange(values.size), np.isfinite(values)
+        filled = np.interp(at, at[known], values[known]) if known.any() else np.zeros(values.size)
+        scaled.append((filled - filled.mean()) / (np.std(filled) or 1.0))
+    return scaled
+
+
+def _gain(y: Floats, x: Floats, beside: Sequence[Floats], lags: int) -> float:
+    """Return the gain in the information criterion of y, where the past of x stands beside its own and that
+    of others; 0 where it is negative, or rows are too few."""
+    rows = len(y) - lags
+    if rows < 5 * lags:
+        return 0.0
+
+    def past(values: Floats) -> Floats:
+        return np.stack([values[lags - k : len(values) - k] for k in range(1, lags + 1)], axis=1)
+
+    def left(regressors: Sequence[Floats]) -> float:
+        z = np.column_stack([np.ones(rows), *regressors])
+        target = y[lags:]
+        return float(np.sum((target - z @ np.linalg.lstsq(z, target, rcond=None)[0]) ** 2)) + 1e-12 * rows
+
+    known = [past(values) for values in (y, *beside)]
+    return max(0.0, rows * np.log(left(known) / left([*known, past(x)])) - lags * np.log(rows))
