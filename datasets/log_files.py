@@ -71,7 +71,7 @@ class _Columns:
     units: dict[str, str]
     names_of: dict[str, str]  # the name that each header became
     repairs: list[str]  # what was converted and left out
-    doubts: list[str]  # what was guessed and decides
+    doubts: list[str]  # about columns that are left out
 
 
 def read_log(
@@ -107,8 +107,8 @@ def read_log(
     -------
     log : Log
         Temperatures in degC, time in s.  ``attrs["repairs"]`` has a line a repair, ``attrs["guesses"]`` a
-        line a guessed role with its reason, ``attrs["doubts"]`` one a guess that decides what a fit sees,
-        ``attrs["name"]`` the file's stem and cut, ``attrs["sha256"]``
+        line a guessed role with its reason, ``attrs["role_doubts"]`` and ``attrs["clock_doubts"]`` one a
+        guess that decides what a fit sees, ``attrs["name"]`` the file's stem and cut, ``attrs["sha256"]``
         the hash of the file's data, ``attrs["began"]`` the date and time of the first row, if the file has a
         clock.
 
@@ -166,7 +166,8 @@ def read_log(
     if EPOCH[0] <= began <= EPOCH[1]:
         log.attrs["began"] = str(np.datetime64(round(began), "s")) + "Z"
     log.attrs["guesses"] = "\n".join(f"{name}: {why}" for name, why in roles.reasons.items())
-    log.attrs["doubts"] = "\n".join(() if own else (*read.doubts, *roles.doubts))
+    log.attrs["clock_doubts"] = "" if own else read.clock.doubt
+    log.attrs["role_doubts"] = "\n".join(() if own else (*read.doubts, *roles.doubts))
     if own:
         log.attrs.update({k: v for k, v in table.meta.items() if k not in ("schema", "version")})
     return _cut(log, start, stop, file) if (start, stop) != (-np.inf, np.inf) else log
@@ -342,8 +343,7 @@ def _convert(table: Table, dt: float | None) -> _Columns:
     words = [header for header in table.text if header not in clock.columns]
     repairs += [f"read {', '.join(renamed)}"] if renamed else []
     repairs += [f"left out, no numbers: {', '.join(words)}"] if words else []
-    doubts = [clock.doubt] if clock.doubt else []
-    doubts += [doubt for header in words if (doubt := _states(header, table.text[header]))]
+    doubts = [doubt for header in words if (doubt := _states(header, table.text[header]))]
     return _Columns(clock, columns, units, names_of, repairs, doubts)
 
 

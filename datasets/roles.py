@@ -56,6 +56,7 @@ _BOOKKEEPING = re.compile(
     r"^(error|err|control_error|integral|derivative|[pid]_?(term|part|action)|k_?[pidc]|pid_[pid]"
     r"|hour|day|month|year|week|weekday|row|index|id|iteration|sample|record|counter)(_of_[a-z]+|_?no|_?\d+)?$"
 )
+IS_SET_POINT = "its name is that of a set point"
 NO_CLUE = "neither its name nor its unit shows what it is"
 _BY_COURSE = "it never moves", "it counts rows or time"
 _HELD_SHARE, _HELD_SIZE = 0.5, 0.05  # of rows with a move; of the range that its median has, at least
@@ -92,7 +93,7 @@ def explain_role(name: str, unit: str) -> tuple[str, str]:
     words, celsius = _words(name), unit == "degC"
     set_drive = _SET_DRIVE.search(words) and unit in _OF_DRIVES
     rows = (
-        (_SETPOINT.search(words) and not set_drive, "other", "its name is that of a set point"),
+        (_SETPOINT.search(words) and not set_drive, "other", IS_SET_POINT),
         (_BOOKKEEPING.match(words), "other",
          "its name is that of a number of the clock's or the controller's"),
         (_OUTDOORS.search(words) or _ROOM.search(words), "disturbance",

@@ -270,8 +270,11 @@ def choose_model(rows: Sequence[Row], complete: int) -> str | None:
     return "network" if mean.get("network", np.nan) <= WITHIN_NOISE * mean[best] else best
 
 
-def verdict_of(model: str, rows: Sequence[Row], checked: DataCheck, whole_logs: bool) -> tuple[bool, str]:
-    """Return whether the kept candidate may be called good, and why, in a sentence."""
+def verdict_of(
+    model: str, rows: Sequence[Row], checked: DataCheck, whole_logs: bool, doubts: Sequence[str] = ()
+) -> tuple[bool, str]:
+    """Return whether the kept candidate may be called good, and why, in a sentence; a guess that decides,
+    of the ``doubts``, forbids it."""
     held = [row for row in rows if row.held_out and row.model == model]
     tails = [row for row in held if row.log.startswith(TAIL)]
     worst = max(tails or held, key=relative_error)
@@ -284,6 +287,9 @@ def verdict_of(model: str, rows: Sequence[Row], checked: DataCheck, whole_logs: 
     units = dict.fromkeys((row.output, "" if row.unit == "1" else f" {row.unit}") for row in held)
     numbers = ", ".join(f"{name} {stated_error(held, name):.2g}{unit}" for name, unit in units)
     head = f"{model}: expected RMSE of a free run {numbers} (from {where})"
+    if good and doubts:
+        more = f" (and {len(doubts) - 1} more)" if len(doubts) > 1 else ""
+        return False, f"{head}; not good as long as this is a guess: {doubts[0]}{more}"
     if good:
         return True, f"{head}; good for simulation and control on runs like these"
     if share < USEFUL <= relative_error(own):
@@ -360,6 +366,7 @@ class Identification(Shown):
     data_check: DataCheck
     evidence: Evidence  # which temperatures and how many minutes of each kind of drive the plant rests on
     good: bool  # whether the chosen model may be called good
+    doubts: tuple[str, ...]  # guesses about the logs that decide, a line each; none where it is good
     verdict: str  # one sentence
     notes: tuple[str, ...]  # candidates that could not be fitted, and why; the step of a black box, and why
     signals: tuple[SignalRole, ...] = ()  # what each column of the logs was taken for
@@ -538,7 +545,8 @@ def identify(
     runs = tuple(run_held_out(plant, held) for held in whole)
     for held, run in zip(whole, runs):
         rows += rows_of(chosen, plant, held.name, run, held_out=False)
-    good, verdict = verdict_of(chosen, rows, checked, leave_one_out)
+    doubts = _doubts(logs, inputs, outputs)
+    good, verdict = verdict_of(chosen, rows, checked, leave_one_out, doubts)
     other, unlike, effect = _errors_of_other_runs(plant, logs, chosen, rows)
     verdict += _other_runs_said(other, unlike, rows)
     covered = evidence(plant, [log_rows(log, plant.inputs, plant.outputs, ()) for log in logs])
@@ -553,7 +561,7 @@ def identify(
     plant = replace(plant, verdict=verdict, scores=scores)
     searched = tuple(row for some in fits for row in searched_rows(some))
     return Identification(
-        plant, chosen, tuple(rows), checked, covered, good, verdict, notes, roles, runs, searched,
+        plant, chosen, tuple(rows), checked, covered, good, doubts, verdict, notes, roles, runs, searched,
         tried.get(chosen, {}),
     )  # fmt: skip
 
@@ -623,6 +631,15 @@ def _guesses(logs: Sequence[Log]) -> dict[str, str]:
     return dict(line.split(": ", 1) for line in lines if ": " in line)
 
 
+def _doubts(
+    logs: Sequence[Log], inputs: Sequence[str] | None, outputs: Sequence[str] | None
+) -> tuple[str, ...]:
+    """Return the guesses of clock and roles that decide what was fitted; roles that are named are none."""
+    kinds = ["clock_doubts"] + ([] if inputs is not None and outputs is not None else ["role_doubts"])
+    lines = [line for log in logs for kind in kinds for line in str(log.attrs.get(kind, "")).splitlines()]
+    return tuple(dict.fromkeys(lines))
+
+
 def _signal_roles(
     logs: Sequence[Log],
     groups: tuple[Sequence[str], Sequence[str], Sequence[str]],
@@ -677,6 +694,12 @@ def _for_network(
         from thermogrip.sysid.models.network import load_network
 
         network = load_network(network)
+    from thermogrip.sysid.models.network import NetworkModel
+
+    if isinstance(network, NetworkModel):
+        from thermogrip.sysid.data.shipped_networks import in_log_units
+
+        network = in_log_units(network, logs)
     for log in logs:
         reason = misfit(network, log)
         if reason is not None:

@@ -33,7 +33,8 @@ from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.log_files import Logs, as_logs
 from thermogrip.datasets.repair import GAP_SECONDS, GAP_STEPS
 from thermogrip.datasets.resample import gaps
-from thermogrip.datasets.schema import column, log_name
+from thermogrip.datasets.roles import IS_SET_POINT, explain_role
+from thermogrip.datasets.schema import Log, column, log_name
 from thermogrip.sysid.plant.log_grid import Grid, Rows, Segment, make_grid, quantum
 from thermogrip.sysid.plant.plant import Plant
 
@@ -138,6 +139,7 @@ def check_data(
     for at, name in enumerate(u):
         if name not in grid.switches:
             found.append(_feedback(grid, at, name))
+    found += [_set_point(log_name(log), name) for log in logs for name in _set_points(log)]
     found += _shifts(grid)
     return DataCheck(tuple(found))
 
@@ -282,6 +284,20 @@ def _feedback(grid: Grid, at: int, name: str, lags: int = 3) -> Finding:
     if not closed:
         says = f"no sign that {name} was driven by the outputs"
     return Finding("feedback", "", name, explained, "1", "warn" if closed else "ok", says)
+
+
+def _set_points(log: Log) -> list[str]:
+    """Return the columns of a log that are set points by their names."""
+    units = {str(name): str(item.attrs.get("units", "1")) for name, item in log.items()}
+    return [name for name, unit in units.items() if explain_role(name, unit)[1] == IS_SET_POINT]
+
+
+def _set_point(log: str, name: str) -> Finding:
+    says = (
+        f"{name} is a set point: recorded in closed loop, if its controller was on; noise is in the input "
+        "too, so trust simulation-error fits and not one-step fits"
+    )
+    return Finding("feedback", log, name, float("nan"), "1", "warn", says)
 
 
 def _moves(grid: Grid, at: int, *, own: int, others: int) -> tuple[Array, Array]:

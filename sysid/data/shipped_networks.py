@@ -51,6 +51,30 @@ def in_columns(model: NetworkModel, log: Log) -> NetworkModel:
     return NetworkModel(renamed(model.network, columns))
 
 
+def in_log_units(model: NetworkModel, logs: Sequence[Log]) -> NetworkModel:
+    """Return a network that takes its inputs in the logs' units, so that plant and controller speak them.
+
+    A share of full scale is one in every unit: ``full_scale``, ``range`` and ``step`` are written in that of
+    the logs.
+    """
+    inputs = dict(model.network.inputs)
+    for name, item in inputs.items():
+        columns = [log for log in logs if name in log]
+        unit = str(columns[0][name].attrs.get("units", "1")) if columns else item.unit
+        if unit == item.unit or not {unit, item.unit} <= {*SHARES}:
+            continue
+        largest = max(float(np.nanmax(np.abs(column(log, name)), initial=0.0)) for log in columns)
+        bare = unit == "1" and largest > 1 + 1e-9  # a number of the network's own unit, which is not written
+        own, theirs = (1.0, 1.0) if bare else (SHARES[item.unit], SHARES[unit])
+        scaled = {"full_scale": item.full_scale * theirs / own, "unit": unit}
+        scaled["range"] = tuple(end * theirs / own for end in item.range)
+        scaled["step"] = None if item.step is None else item.step * theirs / own
+        inputs[name] = item.model_copy(update=scaled)
+    if all(item is model.network.inputs[name] for name, item in inputs.items()):
+        return model
+    return NetworkModel(model.network.model_copy(update={"inputs": inputs}))
+
+
 def _fitting(network: Network, columns: Mapping[str, str] | None, logs: Sequence[Log]) -> NetworkModel | None:
     """Return the network with these columns as its signals; None where it does not fit the logs."""
     if columns is None:

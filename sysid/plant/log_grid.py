@@ -47,9 +47,9 @@ from thermogrip.datasets.limits import most_bytes
 from thermogrip.datasets.log_files import Logs, as_logs
 from thermogrip.datasets.resample import gaps as gaps_of
 from thermogrip.datasets.resample import held_means
+from thermogrip.datasets.roles import guess_role
 from thermogrip.datasets.schema import Log, column, columns, log_name
 from thermogrip.datasets.schema import names as names_of
-from thermogrip.datasets.roles import guess_role
 
 if TYPE_CHECKING:
     from thermogrip.sysid.models.model import GreyModel

@@ -53,7 +53,7 @@ def found_of(model: str = "network", **changes: Any) -> SimpleNamespace:
         Finding("jitter", "", "", 0.0, "s", "ok", "no jitter"),
     )
     found = {
-        "plant": BOARD, "model": model, "rows": (row("arx"), row(model)), "good": True,
+        "plant": BOARD, "model": model, "rows": (row("arx"), row(model)), "good": True, "doubts": (),
         "verdict": "it is good", "data_check": SimpleNamespace(findings=findings),
         "evidence": Covered(3.0), "notes": ("arx: slow",),
         "signals": (SignalRole("q1", "percent", "input", "its unit", True),),
@@ -200,9 +200,32 @@ def test_the_answer_of_identify_is_what_was_found(room: SimpleNamespace) -> None
             {"model": "arx", "structure": "na 1, nb 1, delay 1", "error": 0.25, "folds": [0.2, 0.3125],
              "kept": True}
         ],
-        "notes": ["arx: slow"], "out": "p.json", "dynamics": DYNAMICS.to_dict(),
+        "notes": ["arx: slow"], "doubts": [], "out": "p.json", "dynamics": DYNAMICS.to_dict(),
         "repairs": {"log a": ["one row dropped", "two rows swapped"]},
     }  # fmt: skip
+
+
+def test_an_answer_that_is_no_ends_with_3_and_says_what_would_help(room: SimpleNamespace) -> None:
+    room.found = found_of(good=False, verdict="not good")
+    done = room.bench.run("identify", "good.csv", "--out", "p.json")
+    assert done.code == 3
+    assert done.err.splitlines()[-1] == "next: thermogrip excite --kind prbs --minutes 30 --out schedule.csv"
+    assert Path("p.json").exists()  # the plant is kept all the same
+
+
+def test_a_guess_that_decides_is_a_warning_and_the_command_that_states_it_comes_next(
+    room: SimpleNamespace,
+) -> None:
+    signals = (
+        SignalRole("q1", "percent", "input", "its unit", True),
+        SignalRole("t1", "degC", "output", "its unit", True),
+        SignalRole("fan 2", "1", "left out", "", True),
+    )
+    room.found = found_of(good=False, doubts=("fan 2 is left out, and helps to predict t1",), signals=signals)
+    done = room.bench.run("identify", "good.csv", "--out", "p.json")
+    assert done.code == 3
+    assert "thermogrip: warning: a guess that decides: fan 2 is left out, and helps to predict t1" in done.err
+    assert done.err.splitlines()[-1] == "next: thermogrip identify good.csv --inputs q1 --outputs t1 --out p.json"
 
 
 @pytest.mark.parametrize(

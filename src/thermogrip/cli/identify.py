@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,6 +12,7 @@ import typer
 from thermogrip.cli import options as cli
 from thermogrip.cli.completion import MODELS
 from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.media import printable
 from thermogrip.report.console import Console
 
 if TYPE_CHECKING:
@@ -174,7 +176,28 @@ def identify(
         console.warn(f"{plant.model.kind} model not compiled, and so slower: {slow}")
     more = {"dynamics": None if dynamics is None else dynamics.to_dict(), "repairs": repairs}
     console.answer(_identified(found, plant, record, out) | more)
-    return cli.ANSWER_IS_NO if posterior and (record is None or not record.converged) else 0
+    for doubt in found.doubts:
+        console.warn(f"a guess that decides: {doubt}")
+    if posterior and (record is None or not record.converged):
+        return cli.ANSWER_IS_NO
+    if found.good:
+        return cli.Done("good")
+    stated = _stating(found, paths, out, dt, logs) if found.doubts else ""
+    return cli.Done("not good", cli.ANSWER_IS_NO, stated)
+
+
+def _stating(
+    found: Identification, paths: Sequence[str], out: Path, dt: float | None, logs: Sequence[Log]
+) -> str:
+    """Return the command that states what was guessed, to be corrected where the guess is wrong."""
+    words = ["identify", *map(str, paths)]
+    for role in ("input", "output", "disturbance"):
+        names = [signal.name for signal in found.signals if signal.role == role]
+        words += [f"--{role}s", ",".join(names)] if names else []
+    if dt is None and any(log.attrs.get("clock_doubts") for log in logs):
+        step = float(logs[0]["time"].diff("time").median())
+        words += ["--dt", f"{step:g}"]
+    return printable(shlex.join([*words, "--out", str(out)]))
 
 
 def _read(
@@ -294,6 +317,7 @@ def _identified(
     return {
         "model": found.model,
         "good": found.good,
+        "doubts": found.doubts,
         "verdict": found.verdict,
         "signals": found.signals,
         "rows": found.rows,

@@ -29,14 +29,16 @@ SHOWN_REPAIRS = 5
 
 
 class Done(int):
-    """Exit status 0 of a verb, and ``what`` it found, by which the command that comes next is chosen."""
+    """Exit status of a verb that has done its work, and ``what`` it found, by which the command that comes
+    next is chosen; ``command`` is that command where what was found decides it."""
 
     what: str
+    command: str
 
-    def __new__(cls, what: str) -> Done:
+    def __new__(cls, what: str, code: int = 0, command: str = "") -> Done:
         """Make one."""
-        made = super().__new__(cls, 0)
-        made.what = what
+        made = super().__new__(cls, code)
+        made.what, made.command = what, command
         return made
 
 

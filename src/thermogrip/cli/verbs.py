@@ -80,11 +80,12 @@ class Verb(TyperCommand):
         note_seed(ctx.params.get("seed"))
         check_files(ctx)
         code = super().invoke(ctx)
-        if not code and not ctx.params.get("as_json"):
+        found = getattr(code, "what", None)  # also where the work is done and the answer is no
+        if (not code or found is not None) and not ctx.params.get("as_json"):
             sys.stdout.flush()
             given = {name: value for name, value in ctx.params.items() if value}
-            found = getattr(code, "what", "")
-            sys.stderr.write(f"next: thermogrip {self.next(given, ctx.meta[TYPED], found)}\n")
+            command = getattr(code, "command", "") or self.next(given, ctx.meta[TYPED], found or "")
+            sys.stderr.write(f"next: thermogrip {command}\n")
         return code
 
     def next(self, given: dict[str, Any], typed: Sequence[str] = (), found: str = "") -> str:

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from thermogrip.datasets.schema import make_log
-from thermogrip.sysid.data.shipped_networks import in_columns, renamed, shipped_network
+from thermogrip.sysid.data.shipped_networks import in_columns, in_log_units, renamed, shipped_network
 from thermogrip.sysid.models.network import NetworkModel
 from thermogrip.sysid.models.network_spec import builtin_networks, named_network
+from thermogrip.sysid.plant.log_grid import match_logs
 
 TIME = np.arange(200.0)
 DRIVE = np.where(TIME % 50 < 20, 60.0, 10.0)
@@ -130,3 +131,28 @@ def test_only_names_of_signals_change():
     assert "valve" not in used
     assert [heater.power for heater in other.heaters.values()] == [h.power for h in network.heaters.values()]
     assert renamed(network, {"heater": "heater"}) is network
+
+
+@pytest.mark.parametrize(
+    ("unit", "values", "full_scale", "top"),
+    [
+        ("percent", DRIVE, 100.0, 100.0),
+        ("0_255", DRIVE * 2.55, 255.0, 255.0),
+        ("1", DRIVE / 100, 1.0, 1.0),
+        ("1", SWITCH, 1.0, 1.0),
+        ("1", DRIVE, 100.0, 100.0),  # without a unit and beyond 1: a number of the network's own unit
+    ],
+)
+def test_a_network_takes_its_inputs_in_the_unit_of_the_log(unit, values, full_scale, top):
+    log = make_log(TIME, {"heater": (values, unit, "input"), "t_hotend": (WARM, "degC", "output")})
+    network = in_log_units(NetworkModel(named_network("hotend")), [log])
+    heater = network.network.inputs["heater"]
+    assert (heater.unit, heater.full_scale, heater.range[1]) == (unit, full_scale, top)
+    assert match_logs(network, [log])[0][0] is log
+    heat = []
+    for model in (network, NetworkModel(named_network("hotend"))):
+        p = [parameter.value for parameter in model.network.parameters.values()]
+        half = model.network.inputs["heater"].full_scale / 2
+        heat.append(np.array(model.flows([25.0, 25.0, 25.0], [half], [], p), dtype=float))
+    np.testing.assert_allclose(*heat, rtol=1e-12)
+    assert heat[0].max() == pytest.approx(20.0)  # W, of a cartridge of 40
