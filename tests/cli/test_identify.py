@@ -225,7 +225,8 @@ def test_a_guess_that_decides_is_a_warning_and_the_command_that_states_it_comes_
     done = room.bench.run("identify", "good.csv", "--out", "p.json")
     assert done.code == 3
     assert "thermogrip: warning: a guess that decides: fan 2 is left out, and helps to predict t1" in done.err
-    assert done.err.splitlines()[-1] == "next: thermogrip identify good.csv --inputs q1 --outputs t1 --out p.json"
+    command = "thermogrip identify good.csv --inputs q1 --outputs t1 --out p.json"
+    assert done.err.splitlines()[-1] == f"next: {command}"
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,130 @@
+"""The time of each row: units by behaviour, counters that wrap, boards that begin again, programs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermogrip.datasets.log_files import read_log
+from thermogrip.datasets.schema import column, names
+
+RNG = np.random.default_rng(0)
+ROWS = 120
+HEATER = np.repeat(RNG.integers(0, 2, ROWS // 8), 8) * 60.0
+PLATE = 20 + np.cumsum(HEATER) * 0.01 + 0.05 * RNG.standard_normal(ROWS)
+
+
+def log_of(tmp_path, clock, header="time"):
+    """Return the log of a file with these cells in its clock."""
+    head = "" if header is None else f"{header},heater_percent,t_plate_degC\n"
+    rows = [f"{stamp},{drive:g},{reading:.2f}\n" for stamp, drive, reading in zip(clock, HEATER, PLATE)]
+    (tmp_path / "log.csv").write_text(head + "".join(rows))
+    columns = ["-", "heater_percent", "t_plate_degC"] if header == "-" else None
+    return read_log(tmp_path / "log.csv", columns=columns)
+
+
+def jittered(step, first=0):
+    """Return the counts of a board that is a few of them late now and then."""
+    return first + step * np.arange(ROWS) + RNG.integers(0, 4, ROWS)
+
+
+@pytest.mark.parametrize(
+    ("header", "counts", "step", "doubt"),
+    [
+        ("time_s", 2 * np.arange(ROWS), 2.0, ""),
+        ("time", 2 * np.arange(ROWS), 2.0, ""),
+        ("t", 0.25 * np.arange(ROWS), 0.25, ""),
+        ("seconds", 300 * np.arange(ROWS), 300.0, "rows are 300 s apart"),
+        ("millis", jittered(500), 0.5, ""),
+        ("time", jittered(500), 0.5, "taken as milliseconds"),
+        ("timestamp", jittered(992, first=1_200_000_000), 0.992, "taken as milliseconds"),  # since it was on
+        ("time", jittered(250_000), 0.25, "taken as microseconds"),
+        ("timestamp", 1_700_000_000 + np.arange(ROWS), 1.0, ""),
+        ("timestamp", jittered(500, first=1_700_000_000_000), 0.5, ""),
+        ("uptime", jittered(1000), 1.0, "taken as milliseconds"),
+        ("c1", jittered(500), 0.5, "taken as milliseconds"),
+        ("row", np.arange(ROWS), 1.0, "rows 1 s apart"),
+    ],
+)
+def test_a_clock_is_known_by_its_name_or_its_behaviour_and_a_guess_is_a_doubt(
+    tmp_path, header, counts, step, doubt
+):
+    log = log_of(tmp_path, counts, header)
+    assert np.median(np.diff(log["time"].values)) == pytest.approx(step, rel=0.01)
+    assert names(log, "input") == ("heater",)
+    assert (doubt in log.attrs["clock_doubts"]) if doubt else log.attrs["clock_doubts"] == ""
+
+
+def test_a_file_without_a_clock_is_a_doubt_and_a_stated_step_is_none(tmp_path):
+    (tmp_path / "log.csv").write_text("heater,t_a\n" + "".join(f"{k % 2},{20 + k % 3}\n" for k in range(30)))
+    assert "rows are taken 1 s apart" in read_log(tmp_path / "log.csv").attrs["clock_doubts"]
+    assert read_log(tmp_path / "log.csv", dt=0.5).attrs["clock_doubts"] == ""
+
+
+@pytest.mark.parametrize("bits", [16, 32])
+@pytest.mark.parametrize(("header", "count"), [("millis", 1e-3), ("micros", 1e-6), ("time_s", 1e-3)])
+def test_a_counter_that_wraps_goes_on(tmp_path, bits, header, count):
+    step = 500
+    counts = (2**bits - 40 * step + step * np.arange(ROWS)) % 2**bits
+    stamps = counts * count if header == "time_s" else counts
+    log = log_of(tmp_path, stamps, header)
+    np.testing.assert_allclose(np.diff(log["time"].values), step * count, rtol=1e-6)
+    assert f"a counter of {bits} bits wrapped in row 42: it goes on" in log.attrs["repairs"]
+
+
+def test_a_board_that_was_reset_begins_a_new_segment_after_a_gap(tmp_path):
+    log = log_of(tmp_path, np.r_[np.arange(70), np.arange(2, 52)] * 1000, "millis")
+    steps = np.diff(log["time"].values)
+    assert np.flatnonzero(steps > 10).tolist() == [69]
+    np.testing.assert_allclose(np.delete(steps, 69), 1.0)
+    assert "the clock starts again in row 72: a new segment begins there" in log.attrs["repairs"]
+
+
+def printer(k):
+    readings = f"T:{PLATE[k]:.2f} /200.00 B:24.77 /0.00 @:{HEATER[k]:g} B@:0"
+    return f"2024-05-04 12:30:{k % 60:02},123 - Recv:  {readings}\n"
+
+
+def klipper(k):
+    part = f"extruder: target=200 temp={PLATE[k]:.2f} pwm={HEATER[k] / 60:.3f}"
+    return f"Stats {1000 + 2 * k}.5: gcodein=0  mcu: mcu_awake=0.00{k % 7} freq=16000135 {part}\n"
+
+
+@pytest.mark.parametrize(
+    ("line", "chatter", "step", "columns"),
+    [
+        (printer, "2024-05-04 12:30:00,500 - Send: N0 M105*0\n", 1.0, ("@", "T", "T_target")),
+        (klipper, "webhooks client 140: New connection\n", 2.0,
+         ("extruder_pwm", "extruder_temp", "extruder_target")),
+    ],
+)  # fmt: skip
+def test_lines_of_a_printer_are_read_with_their_stamps_targets_and_duties(
+    tmp_path, line, chatter, step, columns
+):
+    drive, reading, target = columns
+    text = "".join(line(k) + (chatter if k % 4 == 0 else "") for k in range(60))
+    (tmp_path / "host.log").write_text(text)
+    log = read_log(tmp_path / "host.log")
+    assert np.median(np.diff(log["time"].values)) == step
+    assert log[drive].attrs["role"] == "input"
+    assert (log[reading].attrs["role"], log[target].attrs["role"]) == ("output", "other")
+    np.testing.assert_allclose(column(log, reading), np.round(PLATE[:60], 2))
+    assert "15 line(s) without them passed over" in log.attrs["repairs"]
+
+
+@pytest.mark.parametrize(("on", "off"), [("on", "off"), ("True", "False"), ("heating", "idle")])
+def test_words_beside_stamps_with_a_space_are_a_switch(tmp_path, on, off):
+    rows = [f"2024-01-13 00:00:{k:02},{on if k % 3 else off},{20 + k / 8:.4f},6.0\n" for k in range(60)]
+    (tmp_path / "hub.csv").write_text("timestamp,relay,room,outside\n" + "".join(rows))
+    log = read_log(tmp_path / "hub.csv")
+    assert column(log, "relay")[:4].tolist() == [0, 1, 1, 0]
+    assert log["outside"].attrs["role"] == "disturbance"
+
+
+def test_states_in_words_are_left_out_and_named(tmp_path):
+    states = ("Idle", "Cooling", "Heating", "Waiting to cool")
+    rows = [f"12.09.2024 08:{k:02}:00,{20 + k / 16},19.0,{states[k // 8 % 4]}\n" for k in range(60)]
+    (tmp_path / "brew.csv").write_text("Time,BeerTemp,BeerSet,State\n" + "".join(rows))
+    log = read_log(tmp_path / "brew.csv")
+    assert log["BeerSet"].attrs["role"] == "other"
+    assert "State has 4 states (Cooling, Heating, Idle, Waiting to cool)" in log.attrs["role_doubts"]
