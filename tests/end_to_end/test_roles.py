@@ -66,7 +66,7 @@ def test_an_output_that_is_called_like_a_room_is_an_output_where_the_plant_decla
     assert "setting: converted from 0_255 to percent" in done.err
 
 
-def test_the_names_of_a_network_file_are_inputs_and_outputs_and_its_units_are_converted_to(house: Bench):
+def test_the_names_of_a_network_file_are_inputs_and_outputs_and_the_plant_has_the_log_s_units(house: Bench):
     done = house.run(
         *("identify", "room.csv", "--network", "room.toml", "--models", "network"),
         *("--average", "20", "--out", "found.json", "--json"),
@@ -76,7 +76,7 @@ def test_the_names_of_a_network_file_are_inputs_and_outputs_and_its_units_are_co
     again = json.loads(house.run("validate", "found.json", "room.csv@1000:", "--json").out)
     assert again["logs"][0]["notes"][0].startswith("all of it is in the fit (as room)")
     assert answer["parameters"]["G"]["value"] == pytest.approx(20.0, rel=0.05)
-    assert "setting: converted from 0_255 to percent" in answer["notes"]
+    assert Plant.load(house.path / "found.json").units["setting"] == "0_255"  # as the log has it
 
 
 @pytest.mark.parametrize(
