@@ -161,8 +161,8 @@ def read_log(
         if (words := attrs.get("flag_meanings")) and (flagged := names_of[header]) in log:
             log[flagged].attrs["flag_meanings"] = words
     log.attrs["sha256"] = sha256
-    known = read.clock.seconds[np.isfinite(read.clock.seconds)]
-    began = read.clock.zero + float(known.min(initial=np.inf))
+    finite = read.clock.seconds[np.isfinite(read.clock.seconds)]
+    began = read.clock.zero + float(finite.min(initial=np.inf))
     if EPOCH[0] <= began <= EPOCH[1]:
         log.attrs["began"] = str(np.datetime64(round(began), "s")) + "Z"
     log.attrs["guesses"] = "\n".join(f"{name}: {why}" for name, why in roles.reasons.items())

@@ -401,4 +401,5 @@ def _gain(y: Floats, x: Floats, beside: Sequence[Floats], lags: int) -> float:
         return float(np.sum((target - z @ np.linalg.lstsq(z, target, rcond=None)[0]) ** 2)) + 1e-12 * rows
 
     known = [past(values) for values in (y, *beside)]
-    return max(0.0, rows * np.log(left(known) / left([*known, past(x)])) - lags * np.log(rows))
+    gain = rows * np.log(left(known) / left([*known, past(x)])) - lags * np.log(rows)
+    return max(0.0, float(gain))

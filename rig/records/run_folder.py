@@ -672,8 +672,11 @@ def _rooms(header: list[str], events: tuple[Event, ...]) -> frozenset[str]:
     """Return the room's sensors as the session recorded them, by name for a run of an older version."""
     readings = {h.removesuffix("_degC") for h in header if h.endswith("_degC")}
     kept = next((e.data["rooms"] for e in events if e.kind == "phase" and "rooms" in e.data), None)
-    known = isinstance(kept, list)
-    return frozenset(readings.intersection(map(str, kept))) if known else room_sensors(readings)
+    return (
+        frozenset(readings.intersection(map(str, kept)))
+        if isinstance(kept, list)
+        else room_sensors(readings)
+    )
 
 
 def _grasp(
