@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.repair import GAP_SECONDS, GAP_STEPS
+from thermogrip.datasets.repair import GAP_SECONDS, GAP_STEPS, name_rows
 from thermogrip.datasets.tables import STAMP, Table
 from thermogrip.datasets.units import to_record_unit
 
@@ -181,15 +181,11 @@ def _in_pieces(seconds: Floats, lines: NDArray[np.int64]) -> tuple[Floats, list[
     if any(piece.size < _PIECE_ROWS or piece[0] > begins for piece in pieces):
         return seconds, []
     gap = 1.0 + max(GAP_SECONDS, GAP_STEPS * usual)
-    notes = []
+    seconds = seconds.copy()
     for at in back:
-        seconds = seconds.copy()
         seconds[at:] += seconds[at - 1] + gap - seconds[at]
-        notes.append(
-            f"time: the clock starts again in row {lines[at]}: a new segment begins there, after a gap of "
-            "unknown length"
-        )
-    return seconds, notes
+    where = name_rows(lines[back])
+    return seconds, [f"time: the clock starts again in {where}: new segments, after gaps of unknown length"]
 
 
 def _of_rows(table: Table, read: Mapping[str, tuple[str, str, float]]) -> Clock:

@@ -170,9 +170,10 @@ def drop_codes(name: str, values: Floats) -> tuple[Floats, list[str]]:
         moves = np.abs(np.diff(values))
         between = rows[1:] ^ rows[:-1]
         usual = moves[~(rows[1:] | rows[:-1]) & np.isfinite(moves)]
-        if not usual.size:
+        if not usual.any():  # no reading: it is held between levels, and the code may be one of them
             continue
-        least = _CODE_JUMP * float(np.quantile(usual, 0.99))
+        # a column that hardly ever moves does so by its steps
+        least = _CODE_JUMP * max(float(np.quantile(usual, 0.99)), float(usual[usual > 0].min()))
         edges = np.flatnonzero(np.diff(rows.astype(int), prepend=0, append=0))
         for start, stop in edges.reshape(-1, 2).tolist():
             jumps = [moves[at] for at in (start - 1, stop - 1) if 0 <= at < moves.size and between[at]]

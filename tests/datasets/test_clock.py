@@ -77,7 +77,7 @@ def test_a_board_that_was_reset_begins_a_new_segment_after_a_gap(tmp_path):
     steps = np.diff(log["time"].values)
     assert np.flatnonzero(steps > 10).tolist() == [69]
     np.testing.assert_allclose(np.delete(steps, 69), 1.0)
-    assert "the clock starts again in row 72: a new segment begins there" in log.attrs["repairs"]
+    assert "the clock starts again in row 72: new segments" in log.attrs["repairs"]
 
 
 def printer(k):

@@ -241,6 +241,11 @@ def test_a_kettle_that_passes_85_degc_or_boils_at_a_code_loses_nothing(step):
     assert np.isfinite(kept).all()
 
 
+def test_a_column_that_counts_past_a_code_or_is_held_at_one_loses_nothing():
+    assert drop_codes("grasp", np.repeat(np.arange(80.0, 90.0), 40))[1] == []
+    assert drop_codes("level", np.repeat([20.0, 85.0, 50.0, 85.0], 40))[1] == []
+
+
 def test_a_reading_that_stands_still_while_the_heater_swings_is_stuck_and_the_sound_part_stays():
     heater = np.repeat([0.0, 100.0] * 10, 20)
     stuck = warm()
