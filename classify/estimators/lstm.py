@@ -90,6 +90,7 @@ PAPER_EPOCHS = 2000
 QUICK_EPOCHS = 200
 FEEDS = ("each_time", "trace")
 _LEAST_SD = 0.05  # degC; before contact a smaller spread is noise, not to be blown up
+_LEAST_GAIN = 1e-3  # nats: a loss of nearly nothing falls for thousands of epochs and names no grasp better
 
 
 @dataclass(eq=False, repr=False)
@@ -244,7 +245,7 @@ def _train(
                     continue
                 with torch.no_grad():
                     now = float(curve[-1] if seen is None else loss_of(*seen))
-                if now < least:
+                if now < least - _LEAST_GAIN:
                     least, best, weights = now, epoch, _named(network, readout)
                 elif seen is not None and epoch - best >= model.patience:
                     break
