@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from thermogrip.classify.estimators.bayes import BayesClassifier, Readings
-    from thermogrip.classify.evaluation.decision_time import Decisions
     from thermogrip.sysid.effusivity.posterior import EffusivityRow
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8a8a2a")
@@ -262,33 +261,4 @@ def curve_figure(rows: Sequence[Row], over: str) -> Figure:
         for axis in (left, right):
             axis.set_xticks(sorted({row[over] for row in rows}))
     figure.legend(loc="outside upper center", ncols=min(6, len(names) + 1), frameon=False, fontsize=8)
-    return figure
-
-
-def decision_figure(found: Decisions) -> Figure:
-    """Draw the share of contacts that has ended by each time, and accuracy beside mean time: a marker where
-    contacts ended, with intervals, and a hollow one at their full length."""
-    figure, [[ended, beside]] = panels(1, 2, size=(8.4, 3.6), ticks=7)
-    first: dict[str, dict[str, float]] = {}
-    for row in found.table():
-        first.setdefault(row["classifier"], row)
-    for k, (name, row) in enumerate(first.items()):
-        color, marker = PALETTE[k % 8], MARKERS[k % 8]
-        times = np.sort([r["time"] for r in found.rows if r["classifier"] == name])
-        share = np.arange(1, times.size + 1) / times.size
-        at = np.concatenate([[min(0.3, times[0])], times])
-        ended.step(at, np.concatenate([[0.0], share]), where="post", color=color, label=name)
-        beside.plot([row["time"], row["end"]], [row["accuracy"], row["accuracy_at_end"]], color=color, lw=0.7)
-        beside.plot([row["time_low"], row["time_high"]], [row["accuracy"]] * 2, color=color, lw=1.4)
-        beside.plot([row["time"]] * 2, [row["low"], row["high"]], color=color, lw=1.4)
-        beside.plot(row["time"], row["accuracy"], marker, color=color, ms=6, mec="white")
-        beside.plot(row["end"], row["accuracy_at_end"], marker, mfc="white", mec=color, ms=6)
-    ended.set(xscale="log", xlabel="contact time [s]")
-    ended.set_xticks([0.3, 1, 3, 10], ["0.3", "1", "3", "10"])
-    ended.minorticks_off()
-    if max(row["time"] for row in found.rows) > 20:
-        ended.set_xticks([0.3, 1, 3, 10, 30], ["0.3", "1", "3", "10", "30"])
-    ended.set(ylabel="share of contacts ended", ylim=(0, 1.03))
-    beside.set(xlabel="mean contact time [s]", ylabel="accuracy (hollow: whole contact)", xlim=(0, None))
-    figure.legend(loc="outside upper center", ncols=5, frameon=False, fontsize=8)
     return figure

@@ -125,12 +125,6 @@ class GraspClassifier(_Sampled, _Estimator, ABC):
     learns_from_all_conditions: ClassVar[bool] = False
     """True where the training grasps of every condition describe one gripper together."""
 
-    reads_beginnings: ClassVar[bool] = False
-    """True where a fitted one answers from any beginning of a contact (``growing_windows``)."""
-
-    fits_in_a_blink: ClassVar[bool] = False
-    """True where one more fit costs a fraction of a second, so that each window can have its own."""
-
     joins_touches: ClassVar[bool] = False
     """True where all touches of one block already have their common answer."""
 

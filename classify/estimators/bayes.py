@@ -239,7 +239,6 @@ class BayesClassifier(GraspClassifier):
     """
 
     learns_from_all_conditions: ClassVar[bool] = True
-    fits_in_a_blink: ClassVar[bool] = True
     reads_both_sensors: ClassVar[bool] = True
 
     shrinkage: float | None = None  # nu_0 - d - 1 [grasps]; by default the most evident of a grid

@@ -39,8 +39,6 @@ from thermogrip.datasets.schema import Grasps, log_name
 class _Lda(JoinedClassifier):
     """A shrinkage LDA on rows that a subclass reads from grasps."""
 
-    fits_in_a_blink: ClassVar[bool] = True
-
     @abstractmethod
     def _rows(self, grasps: Grasps) -> Floats:
         """Return one row of numbers for each grasp."""

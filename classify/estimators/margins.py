@@ -107,8 +107,6 @@ def _of_each_class(margins: NDArray[np.floating[Any]]) -> Floats:
 class SvmPca(MarginClassifier):
     """Support vector machine on principal components of the rise (``"svm-pca"``)."""
 
-    fits_in_a_blink: ClassVar[bool] = True
-
     components: int = 10  # kept; fewer where there are fewer grasps
     start: float = 0.0  # first time that is used [s]
     random_state: int = 0  # of the folds inside the training

@@ -111,7 +111,6 @@ class PosteriorClassifier(GraspClassifier):
     """
 
     learns_from_all_conditions: ClassVar[bool] = True
-    reads_beginnings: ClassVar[bool] = True
     joins_touches: ClassVar[bool] = True
     leaves_samples_out: ClassVar[bool] = True
     reads_both_sensors: ClassVar[bool] = True

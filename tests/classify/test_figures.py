@@ -20,7 +20,6 @@ from thermogrip.classify.figures import (
     accuracy_figure,
     confusion_figure,
     curve_figure,
-    decision_figure,
     effusivity_figure,
     feature_figure,
     reliability_figure,
@@ -111,28 +110,6 @@ def points(
     ]  # fmt: skip
 
 
-def decided(latest: float, names: tuple[str, ...]) -> Any:
-    """Return when contacts ended; only the first row of a classifier is drawn beside."""
-    row = {
-        "time": 2.5,
-        "time_low": 1.5,
-        "time_high": 4.0,
-        "accuracy": 0.8,
-        "low": 0.6,
-        "high": 0.9,
-        "end": 9.0,
-    }
-    table = [
-        {"classifier": name, "accuracy_at_end": 0.95 - 0.01 * k} | row | {"time": row["time"] + i + 0.1 * k}
-        for k, name in enumerate(names)
-        for i in range(2)
-    ]
-    times = [
-        {"classifier": name, "time": x + k} for k, name in enumerate(names) for x in (latest - k, 0.2, 1.0)
-    ]
-    return SimpleNamespace(table=lambda: table, rows=times)
-
-
 STRIPS = [strip(c, 300.0 * (k + 1), 250.0 * (k + 1), 420.0 * (k + 1)) for k, c in enumerate("abcdefghi")]
 LIBRARY = {
     "cork": 200.0,
@@ -157,8 +134,6 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "curve of grasps": lambda: curve_figure(points("train_per_class", (5, 2), NINE), "train_per_class"),
     "curve of time": lambda: curve_figure(points("contact_s", (10.0, 3.0), ("a", "b")), "contact_s"),
     "curve of warmth": lambda: curve_figure(points("difference_K", (4.0, 1.0), ("a",), 0.5), "difference_K"),
-    "decisions": lambda: decision_figure(decided(25.0, NINE)),
-    "early decisions": lambda: decision_figure(decided(20.0, ("a",))),
 }
 
 

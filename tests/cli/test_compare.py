@@ -225,7 +225,7 @@ def test_the_bar_goes_to_each_part_by_its_work() -> None:
 
 
 def test_curves_show_what_more_grasps_time_and_difference_bring(
-    stand_in: StandIn, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    stand_in: StandIn, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def curve(*_: Any, progress: Any, **__: Any) -> str:
         progress(0.5, "x")
@@ -240,8 +240,6 @@ def test_curves_show_what_more_grasps_time_and_difference_bring(
     differences = stand_in(f"{curves}.difference_curve", "difference rows")
     drawn = stand_in("thermogrip.report.classification.curves_section", "curves")
     strips = stand_in("thermogrip.report.classification.strips_section", "strips")
-    stand_in("thermogrip.report.classification.decision_section", "decisions")
-    decided = stand_in("thermogrip.cli.compare._decisions", SimpleNamespace(table=lambda: [{"time": 2.0}]))
     calibrated = stand_in("thermogrip.sysid.effusivity.calibration.calibrate_gripper", "device")
     posteriors = stand_in("thermogrip.sysid.effusivity.posterior.effusivity_posterior", lambda d, r: ["row"])
     record = record_of(["train", "test"], t_object=[43.0, 43.0], material=["iron", "wood"])
@@ -249,28 +247,24 @@ def test_curves_show_what_more_grasps_time_and_difference_bring(
     def progress(fraction: float, what: str) -> None:
         seen.append((fraction, what))
 
-    given = (Console(), models, [record], found, 4, 3, progress, tmp_path)
-    assert verb._curves(*given) == ["curves", "decisions", "strips"]
+    given = (Console(), models, [record], found, 4, 3, progress)
+    assert verb._curves(*given) == ["curves", "strips"]
     assert (learning[0].args, learning[0].seed, learning[0].workers) == ((models, [record]), 4, 3)
     assert learning[0].repeats == 5
-    assert seen == [(0.25, "learning curve: x")]
+    assert seen == [(0.3, "learning curve: x")]
     assert "warning: no contact time: too few grasps" in capsys.readouterr().err
     assert differences[0].args == ("first", [record])
     assert drawn[0].args == ({"train_per_class": "rows", "difference_K": "difference rows"},)
-    assert (tmp_path / "decisions.csv").read_text().startswith("time\n2")
-    assert (decided[0].args[:3], calibrated[0].seed) == ((models, [record], 4), 4)
-    decided[0].args[3](0.5, "y")
-    assert seen[-1] == (pytest.approx(0.9), "time to decision: y")
+    assert calibrated[0].seed == 4
     assert calibrated[0].args[0][0]["grasp"].values.tolist() == ["g0"]
     assert posteriors[0].args[0] == "device"
     assert posteriors[0].args[1]["grasp"].values.tolist() == ["g1"]
     assert strips[0].args == (["row"], ["wood"])
-    stand_in("thermogrip.cli.compare._decisions")
     stand_in(f"{curves}.contact_time_curve", curve)
     seen.clear()
     plain = verb._curves(*given[:2], [record.drop_vars("t_object")], *given[3:])
     assert plain == ["curves"]
-    assert seen[1] == (pytest.approx(0.65), "contact time: x")
+    assert seen[1] == (pytest.approx(0.8), "contact time: x")
     assert verb._curves(*given[:2], [record.drop_vars("split")], *given[3:]) == ["curves"]
 
 
@@ -290,35 +284,9 @@ def test_the_curves_stand_after_the_scores(scored: SimpleNamespace, stand_in: St
     assert scored.bench.run("compare", "grasps.csv", *options, "--out", "c").code == 0
     [call] = asked
     assert (call.args[1], call.args[2], list(call.args[3])) == ({"bayes": True}, [MARKED], ["shipped"])
-    assert (call.args[4:6], call.args[7]) == ((4, 3), Path("c"))
+    assert call.args[4:6] == (4, 3)
     first, last = scored.pages[0].args[3]
     assert (first, last.title) == ("of shipped", "More")
-
-
-@pytest.mark.parametrize(
-    ("reads", "blink", "known", "asked"),
-    [
-        (True, False, True, True),
-        (False, True, True, True),
-        (False, False, True, False),
-        (True, True, False, False),
-    ],
-)
-@pytest.mark.parametrize(("record", "split"), [(MARKED, "shipped"), (PLAIN, "random")])
-def test_contacts_are_followed_where_a_classifier_can_and_temperatures_are_known(
-    reads: bool, blink: bool, known: bool, asked: bool, record: Grasps, split: str, stand_in: StandIn
-) -> None:
-    stand_in("thermogrip.classify.evaluation.splits.scored_apart", not known)
-    found = SimpleNamespace(rows=("a row",))
-    times = stand_in("thermogrip.classify.evaluation.decision_time.decision_times", found)
-    models: Any = {"a": SimpleNamespace(reads_beginnings=reads, fits_in_a_blink=blink)}
-    assert (verb._decisions(models, [record], 4, None) is found) == asked
-    assert len(times) == asked
-    if asked:
-        assert times[0].args == (models, [record])
-        assert (times[0].split, times[0].seed, times[0].progress) == (split, 4, None)
-        found.rows = ()
-        assert verb._decisions(models, [record], 4, None) is None
 
 
 def test_the_features_of_bayes_are_those_of_the_training_grasps(capsys: pytest.CaptureFixture[str]) -> None:

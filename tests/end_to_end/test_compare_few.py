@@ -60,7 +60,6 @@ def test_curves_that_need_more_grasps_cost_no_score(
     assert main(["compare", str(file), *options]) == 0
     said = " ".join(capsys.readouterr().err.split())
     assert "no contact time: no condition can be split" in said
-    assert (tmp_path / "c" / "decisions.csv").read_text().count("pca-lda") == 1
     assert (tmp_path / "c" / "report.html").exists()
 
 

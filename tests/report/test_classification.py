@@ -24,14 +24,14 @@ from thermogrip.report.classification import (
     feature_section,
     touch_section,
 )
-from thermogrip.report.html import Picture, Section, Table, Text
+from thermogrip.report.html import Picture, Section, Text
 from thermogrip.sysid.effusivity import EffusivityRow
 
 
 @pytest.fixture(autouse=True)
 def _no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures have tests of their own."""
-    for name in ("accuracy", "confusion", "curve", "decision", "effusivity", "feature", "reliability"):
+    for name in ("accuracy", "confusion", "curve", "effusivity", "feature", "reliability"):
         monkeypatch.setattr(f"thermogrip.classify.figures.{name}_figure", lambda *_, **__: Figure())
     monkeypatch.setattr(classification, "loops_chart", lambda *_, **__: Chart(()))
 
@@ -124,32 +124,6 @@ def test_sessions_that_did_not_settle_are_counted_and_their_advice_shown() -> No
 def test_a_score_stands_with_both_ends_or_alone(ends: tuple[float, float], said: str) -> None:
     assert classification._between(0.5, *ends) == said
     assert classification._between(0.5, None, None) == "0.500"
-
-
-DECIDED = {
-    "classifier": "slow", "condition": "all", "n": 20, "time": 4.0, "time_low": 3.0, "time_high": 5.26,
-    "end": 10.0,
-    "accuracy": 0.9, "low": 0.68, "high": 0.988, "accuracy_at_end": 0.95, "early": 0.8, "error": 0.05,
-    "wrong_early": 0.1, "wrong_early_low": 0.01, "wrong_early_high": 0.32, "expected_early": 0.04,
-}  # fmt: skip
-
-
-def test_the_fastest_classifier_is_reported_with_what_its_short_contacts_cost() -> None:
-    single = DECIDED | {"classifier": "quick", "n": 1, "time": 2.04}
-    single |= {"wrong_early": None, "expected_early": None}
-    found = SimpleNamespace(table=lambda: [DECIDED, single, single | {"time": 1.0}], notes=("one was cut",))
-    section = classification.decision_section(found)
-    assert section.verdict == (
-        "quick ends contacts after 2.0 s of 10 s on average and names 90 % of n = 1 right then (68 to 99 %), "
-        "95 % at the end of contact."
-    )
-    [table] = [part for part in section.parts if isinstance(part, Table)]
-    slow, quick = table.rows[:2]
-    dash = "\N{EN DASH}"
-    assert slow[3:5] == (f"4.00 (3.0{dash}5.3)", "10")
-    assert slow[7:] == ("80 %", f"10 % (1{dash}32)", "4 %", "5 %")
-    assert (quick[3], *quick[8:10]) == ("2.04", "-", "-")
-    assert Text("Notes: one was cut.") in section.parts
 
 
 def test_more_grasps_are_worth_what_the_best_of_the_most_gains() -> None:

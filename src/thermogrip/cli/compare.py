@@ -18,7 +18,6 @@ from thermogrip.report.console import Console
 if TYPE_CHECKING:
     from thermogrip.classify.estimators.base import GraspClassifier
     from thermogrip.classify.evaluation.comparison import Comparison
-    from thermogrip.classify.evaluation.decision_time import Decisions
     from thermogrip.datasets.parallel import Progress
     from thermogrip.datasets.schema import Grasps
     from thermogrip.report.html import Section
@@ -63,7 +62,7 @@ def compare(
     curves: Annotated[
         bool,
         cli.flag(
-            "--curves", "Also learning curve, contact time, time to decision, difference, effusivity strips."
+            "--curves", "Also learning curve, contact time, difference, effusivity strips."
         ),
     ] = False,
     quick: Quick = False,
@@ -146,7 +145,7 @@ def compare(
             raise UserError("nothing to score", hint="test on grasps of the materials that were trained")
         more = page.sections("features")
         if curves:
-            more += _curves(console, fast, records, found, seed, pool, shares["curves"], out)
+            more += _curves(console, fast, records, found, seed, pool, shares["curves"])
     _write_comparisons(console, found, out, [*page.sections(*found), *more])
     return 0
 
@@ -244,21 +243,18 @@ def _curves(
     seed: int,
     workers: int | str,
     progress: Progress | None,
-    out: Path,
 ) -> list[Section]:
     """Return what more grasps, time or difference would bring, and the strips of the shipped test grasps."""
-    from thermogrip.classify.decisions.predict import table_csv
     from thermogrip.classify.evaluation.harness import contact_time_curve, difference_curve, learning_curve
-    from thermogrip.datasets.atomic_files import write_atomic
     from thermogrip.datasets.parallel import sub_progress
-    from thermogrip.report.classification import curves_section, decision_section, strips_section
+    from thermogrip.report.classification import curves_section, strips_section
     from thermogrip.sysid.effusivity import calibrate_gripper, effusivity_posterior
 
     settings: dict[str, Any] = {"seed": seed, "workers": workers, "repeats": 5}
     rows = {}
     for key, title, curve, span in (
-        ("train_per_class", "learning curve", learning_curve, (0.0, 0.5)),
-        ("contact_s", "contact time", contact_time_curve, (0.5, 0.8)),
+        ("train_per_class", "learning curve", learning_curve, (0.0, 0.6)),
+        ("contact_s", "contact time", contact_time_curve, (0.6, 1.0)),
     ):
         try:
             rows[key] = curve(models, records, **settings, progress=sub_progress(progress, *span, title))
@@ -266,9 +262,6 @@ def _curves(
             console.warn(f"no {title}: {error}")
     rows["difference_K"] = difference_curve(next(iter(found.values())), records)
     sections = [curves_section(rows)]
-    if decided := _decisions(models, records, seed, sub_progress(progress, 0.8, 1.0, "time to decision")):
-        sections.append(decision_section(decided))
-        write_atomic(out / "decisions.csv", table_csv(decided.table()))
     if _has_split(records) and all("t_object" in record for record in records):
         device = calibrate_gripper(training_part(Console(True), records, "train"), seed=seed)
         tests = [r.isel(grasp=r["split"].values == "test") for r in records]
@@ -276,22 +269,6 @@ def _curves(
         names = [str(m) for record in tests for m in record["material"].values]
         sections.append(strips_section(strips, names))
     return sections
-
-
-def _decisions(
-    models: dict[str, GraspClassifier], records: Sequence[Grasps], seed: int, progress: Progress | None
-) -> Decisions | None:
-    """Return when contacts could end, where a classifier can be followed through them; on the shipped split
-    where there is one."""
-    from thermogrip.classify.evaluation.decision_time import decision_times
-    from thermogrip.classify.evaluation.splits import scored_apart
-
-    single = [record for record in records if not scored_apart(record)]
-    if not single or not any(m.reads_beginnings or m.fits_in_a_blink for m in models.values()):
-        return None
-    split = "shipped" if _has_split(single) else "random"
-    found = decision_times(models, single, split=split, seed=seed, progress=progress)
-    return found if found.rows else None
 
 
 def _write_comparisons(

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
     from thermogrip.classify.estimators.bayes import BayesClassifier
     from thermogrip.classify.evaluation.comparison import Comparison
-    from thermogrip.classify.evaluation.decision_time import Decisions
     from thermogrip.datasets.schema import Grasps
     from thermogrip.mpc.tuning.design_review import Check
     from thermogrip.rig.session.session import Session
@@ -177,13 +176,6 @@ def _of_tested(row: Mapping[str, Any]) -> int | str:
     return f"{row['n']}/{row['n_test']}" if row["n_test"] > row["n"] else int(row["n"])
 
 
-def _seconds(row: dict[str, Any]) -> str:
-    """Return a mean time with its interval, which one grasp does not have."""
-    if row["n"] < 2:
-        return f"{row['time']:.2f}"
-    return f"{row['time']:.2f} ({row['time_low']:.1f}\N{EN DASH}{row['time_high']:.1f})"
-
-
 def _between(value: float, low: float | None, high: float | None) -> str:
     """Return a score with its interval, as narrow as three digits allow, where it has one."""
     if low is None or high is None:
@@ -216,66 +208,6 @@ def _off_the_page(rows: Sequence[Mapping[str, Any]]) -> str:
     limit = 2 * max(row["log_loss_chance"] for row in rows)
     beyond = dict.fromkeys(str(row["classifier"]) for row in rows if row["log_loss"] > limit)
     return f" Off the page, above twice chance: {', '.join(beyond)}." if beyond else ""
-
-
-def decision_section(found: Decisions) -> Section:
-    """Return the section of when contacts could have ended."""
-    from thermogrip.classify.figures import decision_figure
-
-    table = found.table()
-    caption = (
-        "A contact ends once the classifier is as sure as its training grasps showed to be enough for the "
-        "stated share of wrong answers among those that end early; expected is what it then thought of them "
-        "itself. The stated share is a mean over trainings: a single one of few grasps may miss it. n "
-        "distinct grasps, 95 % intervals."
-    )
-    parts: list[Any] = [
-        Picture(decision_figure(found), "When contacts ended, and how often the answer was right then."),
-        Table(*cells(_DECISIONS, table), caption, dense=True),
-    ]
-    if found.notes:
-        parts.append(Text("Notes: " + "; ".join(found.notes) + "."))
-    return Section("How soon is it decided?", tuple(parts), _shortest(table), "plain")
-
-
-def _percent(share: float | None) -> str:
-    return "-" if share is None else f"{100 * share:.0f} %"
-
-
-def _wrong_early(row: Mapping[str, Any]) -> str:
-    """Return the share of wrong answers among contacts that ended early."""
-    if row["wrong_early"] is None:
-        return "-"
-    low, high = row["wrong_early_low"], row["wrong_early_high"]
-    return f"{_percent(row['wrong_early'])} ({100 * low:.0f}\N{EN DASH}{100 * high:.0f})"
-
-
-_DECISIONS: Columns = (
-    ("classifier", lambda row: row["classifier"]),
-    ("condition", lambda row: row["condition"]),
-    ("n", lambda row: row["n"]),
-    ("mean time [s]", _seconds),
-    ("of [s]", lambda row: f"{row['end']:.3g}"),
-    ("right when ended", lambda row: _between(row["accuracy"], row["low"], row["high"])),
-    ("right at the end", lambda row: f"{row['accuracy_at_end']:.3f}"),
-    ("ended early", lambda row: _percent(row["early"])),
-    ("wrong of these", _wrong_early),
-    ("expected", lambda row: _percent(row["expected_early"])),
-    ("stated", lambda row: f"{100 * row['error']:.2g} %"),
-)
-
-
-def _shortest(table: Sequence[dict[str, Any]]) -> str:
-    """Return what the classifier with the shortest contacts gives for them."""
-    firsts: dict[str, dict[str, Any]] = {}
-    for row in table:
-        firsts.setdefault(row["classifier"], row)
-    row = min(firsts.values(), key=lambda r: r["time"])
-    return (
-        f"{row['classifier']} ends contacts after {row['time']:.1f} s of {row['end']:.3g} s on average and "
-        f"names {100 * row['accuracy']:.0f} % of n = {row['n']} right then ({100 * row['low']:.0f} to "
-        f"{100 * row['high']:.0f} %), {100 * row['accuracy_at_end']:.0f} % at the end of contact."
-    )
 
 
 def _gain(over: str, rows: Sequence[dict[str, Any]]) -> str:
