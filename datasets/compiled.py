@@ -26,7 +26,6 @@ KERNELS = tuple(
     _ROOMS / name
     for name in (
         "sysid/blackbox/kalman_kernel.py",
-        "sysid/contact/table_kernel.py",
         "sysid/contact/time_stepping.py",
         "sysid/effusivity/mode_kernel.py",
         "sysid/models/neural_kernel.py",

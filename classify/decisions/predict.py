@@ -50,7 +50,6 @@ from thermogrip.sysid.effusivity.data import (
     object_range,
     touches,
     with_object_range,
-    with_tables,
 )
 from thermogrip.sysid.effusivity.gripper_model import GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import (
@@ -397,7 +396,7 @@ def _asked(
     NaN where the object's is known; ``stated`` is that of unknown ones, by default 20 K about the room."""
     unknown = np.isnan(number_values(grasps, "t_object"))[at, None]
     ends = np.where(unknown, object_range(grasps, stated)[at], np.nan)
-    return with_tables(touches(with_object_range(grasps, stated), until=until, at=at)), ends
+    return touches(with_object_range(grasps, stated), until=until, at=at), ends
 
 
 def _taken_for(device: GripperModel, named: Sequence[str], **finish: str) -> Hypotheses:

@@ -56,7 +56,7 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.log_space import expit, log_sum, logit
 from thermogrip.datasets.materials import load_materials
 from thermogrip.datasets.schema import has_touch_groups, label_values
-from thermogrip.sysid.effusivity.data import Touches, Whitened, touches, with_tables
+from thermogrip.sysid.effusivity.data import Touches, Whitened, touches
 from thermogrip.sysid.effusivity.gripper_model import GripperModel, GripperSpread, another_gripper
 from thermogrip.sysid.effusivity.laplace_approximation import fit_candidates, whitened
 from thermogrip.sysid.effusivity.multi_touch import (
@@ -221,7 +221,7 @@ class PosteriorClassifier(GraspClassifier):
         evidence, odds = np.empty((group.size, len(names))), np.full(group.size, np.nan)
         words = np.full(group.size, "", dtype=object)
         if single.any():
-            data = with_tables(touches(grasps, until=self.longest_, at=np.flatnonzero(single)))
+            data = touches(grasps, until=self.longest_, at=np.flatnonzero(single))
             found = self._decided(data, names, unknown)
             evidence[single], odds[single] = found.log_evidence, found.odds if unknown else np.nan
             words[single] = found.words

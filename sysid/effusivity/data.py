@@ -17,14 +17,13 @@ with contact time, so that a longer record does not raise confidence faster than
 
 from __future__ import annotations
 
-from collections import Counter
-from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from thermogrip.datasets.arrays import Array, Mask
+from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.schema import check_grasps, label_values, log_name
 from thermogrip.sysid.contact.simulation import PUMP_OFF
@@ -74,10 +73,6 @@ def at_knots(t: Array) -> Array:
     return np.stack([np.interp(t, x, row) for row in base], axis=-1)
 
 
-_WHOLE = ("second", "tabled", "common")  # not an array of each touch, or not always
-#: Touches from which on a table of their responses pays, and one of bin means at the same times.
-MANY, ALIKE = 100, 20
-
 
 @dataclass(frozen=True)
 class Touches:
@@ -97,22 +92,18 @@ class Touches:
     t_ambient: Array  # (n,), of the room [degC]
     excursion: Array  # (n,) [K]
     second: Touches | None = None  # what a second sensor of the finger read of the same grasps
-    tabled: float = 0.0  # s: responses are of tables that reach so far; 0 where each is stepped
-    common: Mask | None = None  # (n,), whose samples are at the same times as many others'
 
     def take(self, index: NDArray[np.int64]) -> Touches:
         """Return the touches at these rows."""
-        own = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name not in _WHOLE}
-        second = None if self.second is None else self.second.take(index)
-        common = None if self.common is None else self.common[index]
-        return Touches(**own, second=second, tabled=self.tabled, common=common)
+        own = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "second"}
+        return Touches(**own, second=None if self.second is None else self.second.take(index))
 
     def known(self, index: NDArray[np.int64]) -> Touches:
         """Return what was known of the touches at these rows, with no readings."""
         own = ("level", "t_object", "t_object_sd", "t_ambient", "excursion")
         numbers = {f.name: getattr(self, f.name)[index if f.name in own else slice(0)]
-                   for f in fields(self) if f.name not in _WHOLE}  # fmt: skip
-        return Touches(**numbers, tabled=self.tabled)
+                   for f in fields(self) if f.name != "second"}  # fmt: skip
+        return Touches(**numbers)
 
     @property
     def end(self) -> float:
@@ -176,18 +167,6 @@ def touches(
     )  # fmt: skip
 
 
-def with_tables(data: Touches) -> Touches:
-    """Return touches whose responses are interpolated where they are many enough."""
-    if data.level.size < MANY:
-        return data
-    second = None if data.second is None else with_tables(data.second)
-    times = [(t.tobytes(), bins.tobytes()) for t, bins in zip(data.sample_t, data.sample_bin)]
-    often = Counter(times)
-    common = np.array([often[each] >= ALIKE for each in times])
-    # contact may begin 1.5 s early; whole seconds, so that records share tables
-    return replace(data, second=second, tabled=float(np.ceil(data.end + 1.5)), common=common)
-
-
 def object_range(grasps: Grasps, stated: tuple[float, float] | None = None) -> Array:
     """Return between what an object of unknown temperature may be, (n_grasp, 2) [degC]: as ``stated``,
     or 20 K about the room, or about the skin where no room is known."""
@@ -234,7 +213,7 @@ def stack_touches(parts: list[Touches]) -> Touches:
 
     seconds = [p.second for p in parts if p.second is not None]
     second = stack_touches(seconds) if len(seconds) == len(parts) else None
-    return Touches(**{f.name: joined(f.name) for f in fields(Touches) if f.name not in _WHOLE}, second=second)
+    return Touches(**{f.name: joined(f.name) for f in fields(Touches) if f.name != "second"}, second=second)
 
 
 def noise_covariance(data: Touches, noise: Noise) -> Array:
@@ -322,58 +301,13 @@ def _inverse(chol: NDArray[np.floating[Any]]) -> Array:
     return out
 
 
-class Whitener(NamedTuple):
-    """W of ``n`` touches: that of ``kinds`` (n_kind, n_bin, n_bin) that is each one's ``kind`` (n,), its rows
-    times ``scale`` (n, n_bin)."""
-
-    kinds: Array
-    kind: NDArray[np.int64]
-    scale: Array
-
-
-#: What :func:`whiten` or :func:`whiteners` returns.
-Whitened: TypeAlias = tuple[Any, Array]
+#: What :func:`whiten` returns.
+Whitened: TypeAlias = tuple[Array, Array]
 
 
 def taken(noise: Whitened, at: NDArray[np.int64]) -> Whitened:
     """Return what whitens some of the touches."""
-    matrix, log_det = noise
-    if isinstance(matrix, Whitener):
-        return Whitener(matrix.kinds, matrix.kind[at], matrix.scale[at]), log_det[at]
-    return matrix[at], log_det[at]
-
-
-def whiteners(data: Touches, noise: Noise) -> tuple[Whitener, Array]:
-    r"""Return :func:`whiten`, with one matrix for all touches with the same samples, where they are many.
-
-    Only their excursions A differ: with C_0 the rest of their noise, :math:`V C_0 V' = 1` and :math:`V G V'
-    = diag(d)`, :math:`C = C_0 + A^2 G` has :math:`W = (1 + A^2 d)^{-1/2} V`.
-    """
-    axes = np.concatenate([data.t, data.count], axis=1)
-    _, first, kind = np.unique(axes, axis=0, return_index=True, return_inverse=True)
-    kind = kind.ravel()
-    kinds, scale = list[Array](), np.ones(data.t.shape)
-    own, log_det = np.empty(kind.size, dtype=np.int64), np.empty(kind.size)
-    alone = np.bincount(kind) < ALIKE
-    for k, i in enumerate(first[~alone]):
-        rows, there = np.flatnonzero(kind == kind[i]), data.count[i] > 0
-        one = replace(data.take(np.array([i])), excursion=np.ones(1))
-        white, slow, misfit = _parts(one, noise)
-        chol = np.linalg.cholesky(_sum(one, white, slow, np.zeros(misfit.shape)))
-        root = _inverse(chol)[0]
-        d, turned = np.linalg.eigh(root @ misfit[0] @ root.T)
-        wider = 1.0 + np.square(data.excursion[rows, None]) * np.maximum(d, 0.0)
-        kinds.append((turned.T @ root) * there)
-        scale[rows] = 1.0 / np.sqrt(wider)
-        known = 2.0 * np.log(np.diagonal(chol[0])).sum() + there.sum() * np.log(2 * np.pi)
-        log_det[rows] = known + np.log(wider).sum(axis=1)
-        own[rows] = k
-    rest = np.flatnonzero(alone[kind])
-    if rest.size:
-        w, log_det[rest] = whiten(data.take(rest), noise)
-        own[rest] = len(kinds) + np.arange(rest.size)
-        kinds += list(w)
-    return Whitener(np.stack(kinds), own, scale), log_det
+    return noise[0][at], noise[1][at]
 
 
 def whiten(data: Touches, noise: Noise) -> tuple[Array, Array]:

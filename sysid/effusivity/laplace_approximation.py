@@ -77,7 +77,7 @@ from thermogrip.sysid.contact.simulation import (
     nearby_modes,
     time_nodes,
 )
-from thermogrip.sysid.effusivity.data import Touches, Whitened, whiten, whiteners
+from thermogrip.sysid.effusivity.data import Touches, Whitened, whiten
 from thermogrip.sysid.effusivity.gripper_model import (
     INSULATOR,
     LEVEL_SD,
@@ -120,7 +120,7 @@ class Mode(NamedTuple):
 
 def nodes_for(data: Touches) -> TimeNodes:
     """Return the time nodes that reach the last sample of an early contact."""
-    return time_nodes(data.tabled or data.end + _EARLIEST_ONSET)
+    return time_nodes(data.end + _EARLIEST_ONSET)
 
 
 def predict(stack: Stack, nodes: TimeNodes, data: Touches, u: Array, beyond: Array | None = None) -> Array:
@@ -140,19 +140,15 @@ def jacobian(
 
 
 def pairs_asked(
-    stack: Stack, nodes: TimeNodes, data: Touches, row: NDArray[np.int64], beyond: Array | None, *,
-    tabled: bool = False,
-) -> Any:  # fmt: skip
-    """Return the pairs of some rows and a gripper as the search takes them, their responses ``tabled``
-    (:mod:`thermogrip.sysid.contact.response_table`) or stepped."""
-    from thermogrip.sysid.contact.response_table import response_table
+    stack: Stack, nodes: TimeNodes, data: Touches, row: NDArray[np.int64], beyond: Array | None
+) -> Any:
+    """Return the pairs of some rows and a gripper as the search takes them."""
     from thermogrip.sysid.effusivity.mode_kernel import Asked
 
     shape = (row.size, 2, data.y.shape[1])
     # a copy in C order: for other kinds of arrays kernels are compiled anew
     nothing = np.zeros(shape) if beyond is None else np.array(np.broadcast_to(beyond, shape), order="C")
-    table = response_table(stack, data.tabled) if tabled and data.tabled else None
-    return Asked(nodes, gripper_modes(stack), data, row, nothing, table)
+    return Asked(nodes, gripper_modes(stack), data, row, nothing)
 
 
 def find_modes(
@@ -176,10 +172,8 @@ def find_modes(
         u[:, LEVEL] = np.where(vary[:, LEVEL], data.level[row], u[:, LEVEL])
     dof = np.full(u.shape, np.inf) if prior.dof is None else prior.dof
     w_matrix, log_det = whitener
-    asked, law = (
-        pairs_asked(stack, nodes_for(data), data, row, beyond, tabled=True),
-        np.stack([prior.mean, prior.sd, dof], axis=1),
-    )
+    asked = pairs_asked(stack, nodes_for(data), data, row, beyond)
+    law = np.stack([prior.mean, prior.sd, dof], axis=1)
     covariance, objective, misfit, settled = modes(
         asked, w_matrix, law, u, max_steps, rivals=rivals, rough=rough
     )
@@ -384,7 +378,7 @@ class WithGripper(NamedTuple):
         lam, face, sensor = (part.reshape(n * k, -1) for part in parts)
         each = np.repeat(row, k)
         device = grippers(lam, face, sensor, contact.reshape(n * k, -1))
-        asked = Asked(self.nodes, device, data, each, np.repeat(self.beyond[at], k, axis=0), None)
+        asked = Asked(self.nodes, device, data, each, np.repeat(self.beyond[at], k, axis=0))
         vary = np.zeros((n * k, N_NUISANCE), dtype=bool)
         vary[k - 1 :: k] = slopes
         y, found = readings(asked, np.repeat(u, k, axis=0), vary)
@@ -631,8 +625,7 @@ def second_modes(
 
 def whitened(gripper: GripperModel, data: Touches) -> Whitened:
     """Return what whitens the first sensor's noise as :func:`fit_pairs` takes it."""
-    # of an uncertain gripper each pair has a matrix of its own
-    return (whiteners if data.tabled and not gripper.uncertain else whiten)(data, gripper.noise)
+    return whiten(data, gripper.noise)
 
 
 def _own_modes(

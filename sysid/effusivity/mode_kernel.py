@@ -56,7 +56,6 @@ class Asked(NamedTuple):
     beyond: (
         Array  # (n, 2, n_bin), the gripper's discrepancy: always [K], and per degree between object and skin
     )
-    table: Any = None  # ResponseTable of the gripper, where its responses are interpolated
 
     def take(self, index: Any) -> Asked:
         """Return some of the pairs, of one gripper."""
@@ -96,22 +95,9 @@ def _means(
 ) -> Array:
     """Return the bin means (n, 6, n_bin) of the ``wanted`` curves of contacts of logarithms ``numbers`` (k,
     4), ``which`` of these belongs to each pair; before contact zero."""
-    nodes, gripper, data, row, _, table = asked
+    nodes, gripper, data, row, _ = asked
     out = np.empty((row.size, RATE + 1, data.y.shape[1]))
-    if table is not None and data.common is not None:
-        common = data.common[row] & table.inside(numbers)[which]
-        if common.all():
-            table.bin_means(data.sample_t, data.sample_bin, row, numbers, stepped, which, onset, wanted, out)
-            return out
-        if common.any():
-            for own in (common, ~common):
-                used, at = np.unique(which[own], return_inverse=True)
-                out[own] = _means(asked.take(own), numbers[used], stepped[used], at, onset[own], wanted[own])
-            return out
-    contact = np.exp(numbers)
-    rise, slope = (
-        contacts(nodes, gripper, contact, stepped)[:2] if table is None else table.curves(contact, stepped)
-    )
+    rise, slope, _ = contacts(nodes, gripper, np.exp(numbers), stepped)
     room = np.empty((7, data.sample_t.shape[1]))
     bin_means(
         nodes[2],
@@ -259,7 +245,7 @@ def predicted(
                 there[at, m] = scale * own[c, m] + passed * extra
 
 
-def products(asked: Asked, whitener: Any, u: Array, sd: Array, *, alike: bool = False) -> Array:
+def products(asked: Asked, whitener: Array, u: Array, sd: Array, *, alike: bool = False) -> Array:
     """Return J' J, and J' r and r' r in the last row and column, (n, 8, 8): J in units of ``sd`` (n, 7), r
     the readings less those that ``u`` predicts, both whitened."""
     columns = readings(asked, u, sd > 0.0, alike=alike)[1]
@@ -271,26 +257,12 @@ def products(asked: Asked, whitener: Any, u: Array, sd: Array, *, alike: bool = 
     return matrix
 
 
-def squares(whitener: Any, row: NDArray[np.int64], columns: Array) -> Array:
-    """Return the products (n, m, m) of ``columns`` (n, m, n_bin) of touches ``row``, whitened by a
-    :class:`~thermogrip.sysid.effusivity.data.Whitener` or by a matrix a touch."""
-    alone = isinstance(whitener, np.ndarray)
-    kinds, kind = (whitener, row) if alone else (whitener.kinds, whitener.kind[row])
-    if len(kinds) == 1:
-        return _squares(kinds[0], columns, None if alone else whitener.scale[row])
-    out = np.empty((row.size, columns.shape[1], columns.shape[1]))
-    for k in np.unique(kind):
-        at: Any = slice(None) if (kind == k).all() else kind == k
-        out[at] = _squares(kinds[k], columns[at], None if alone else whitener.scale[row[at]])
-    return out
-
-
-def _squares(matrix: Array, columns: Array, scale: Array | None) -> Array:
-    # one product of large matrices is quicker than many of few rows
-    white = np.matmul(columns.reshape(-1, columns.shape[2]), matrix.T).reshape(columns.shape)
+def squares(whitener: Array, row: NDArray[np.int64], columns: Array) -> Array:
+    """Return the products (n, m, m) of ``columns`` (n, m, n_bin) of touches ``row``, whitened by a matrix a
+    touch."""
+    white = np.matmul(columns, whitener[row].transpose(0, 2, 1))
     # of two arrays: for one and its own transpose NumPy takes a slower way
-    twice = white.copy() if scale is None else white * np.square(scale)[:, None, :]
-    return np.asarray(np.matmul(white, twice.transpose(0, 2, 1)))
+    return np.asarray(np.matmul(white, white.copy().transpose(0, 2, 1)))
 
 
 class Penalty(NamedTuple):
@@ -592,7 +564,7 @@ def curvature(matrix: Array, own: Array) -> tuple[Array, Array]:
     return 0.5 * (inverse + inverse.transpose(0, 2, 1)), log_det
 
 
-def marginals(asked: Asked, whitener: Any, u: Array, sd: Array) -> Array:
+def marginals(asked: Asked, whitener: Array, u: Array, sd: Array) -> Array:
     """Return ln p(y | u) up to a constant for points ``u`` (n, 7), integrated over level and T_obj, whose
     prior means are in ``u``; ``sd`` (m, n, 2) are their sds, each with a row of the answer (m, n)."""
     at, out = [_LEVEL, _T, _LEFT], np.empty((len(sd), len(u)))

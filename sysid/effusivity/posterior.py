@@ -20,7 +20,7 @@ from thermogrip.datasets.grasp_files import Records, as_grasps
 from thermogrip.datasets.log_space import expit, logit, shares
 from thermogrip.datasets.materials import Material
 from thermogrip.datasets.schema import has_touch_groups
-from thermogrip.sysid.effusivity.data import Touches, touches, with_tables
+from thermogrip.sysid.effusivity.data import Touches, touches
 from thermogrip.sysid.effusivity.gripper_model import (
     ANOTHER_SCALE_SD,
     INSULATOR,
@@ -138,7 +138,7 @@ def effusivity_posterior(
     found: dict[int, GridPosterior] = {}
     share = 0.0
     if alone.size:
-        data = with_tables(touches(grasps.isel(grasp=alone) if rows else grasps, until=until))
+        data = touches(grasps.isel(grasp=alone) if rows else grasps, until=until)
         single = grid_posteriors(gripper, data)
         if other_gripper > 0:
             single, share = _by_either(gripper, data, single, other_gripper)

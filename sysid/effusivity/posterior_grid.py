@@ -87,7 +87,7 @@ def slipped(
     from thermogrip.sysid.effusivity.mode_kernel import marginals
 
     row = np.zeros(len(u), dtype=np.int64) if row is None else row
-    asked = pairs_asked(gripper.stack, nodes_for(data), data, row, beyond, tabled=True)
+    asked = pairs_asked(gripper.stack, nodes_for(data), data, row, beyond)
     stated, sd = np.isfinite(data.t_object[row]), np.broadcast_to(sd, u.shape)
     own = np.stack([sd[:, LEVEL], sd[:, T_OBJECT]], axis=1)
     wide = own * np.stack([np.ones(len(u)), slip_of(sd[:, T_OBJECT])], axis=1)

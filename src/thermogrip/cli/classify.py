@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 NEEDED = (
     "thermogrip.classify.decisions.predict",
     "thermogrip.classify.estimators.posterior",
-    "thermogrip.sysid.contact.response_table",
     "thermogrip.sysid.effusivity.mode_kernel",
     "numba",
     "pyarrow.csv",

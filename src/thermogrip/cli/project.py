@@ -134,14 +134,11 @@ def warm_up(as_json: cli.AsJson = False) -> int:
     For images and new installations. The code is kept beside the package, in the user's cache folder where
     that cannot be written, or in NUMBA_CACHE_DIR.
     """
-    import numpy as np
-
     from thermogrip.classify.decisions.predict import classify_grasps
     from thermogrip.classify.estimators.posterior import PosteriorClassifier
     from thermogrip.datasets.examples import example_path
     from thermogrip.datasets.grasp_files import read_grasps
-    from thermogrip.sysid.contact.response_table import response_table
-    from thermogrip.sysid.contact.time_stepping import N_STEPPED, step_contacts
+    from thermogrip.sysid.contact.time_stepping import step_contacts
     from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
     from thermogrip.sysid.effusivity.posterior import effusivity_posterior
 
@@ -150,11 +147,6 @@ def warm_up(as_json: cli.AsJson = False) -> int:
     gripper = load_default_gripper()
     classify_grasps(PosteriorClassifier().with_device(gripper), grasps, ["copper", "wood"])
     effusivity_posterior(gripper, grasps)
-    table = response_table(gripper.stack, 12.0)  # which many grasps need
-    contact, first = np.array([[3e3, 3e4, 1e3, 0.5]]), np.zeros(1, dtype=np.int64)
-    stepped, wanted = np.ones((1, N_STEPPED), dtype=bool), np.ones((1, N_STEPPED + 1), dtype=bool)
-    one = np.ones((1, 1)), np.zeros((1, 1), dtype=np.int64), first, np.log(contact), stepped, first
-    table.bin_means(*one, np.zeros(1), wanted, np.empty((1, N_STEPPED + 1, 1)))
     seconds, place = time.process_time() - began, step_contacts.stats.cache_path
     console.say(f"compiled in {seconds:.1f} s of CPU, kept in {place}")
     console.answer({"cpu_s": seconds, "kept_in": place})

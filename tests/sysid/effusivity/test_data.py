@@ -19,7 +19,6 @@ from thermogrip.sysid.effusivity.data import (
     stack_touches,
     touches,
     whiten,
-    whiteners,
     with_object_range,
 )
 
@@ -39,22 +38,6 @@ def test_whitener_inverts_the_covariance_and_leaves_lost_bins_out():
         np.testing.assert_allclose(inverse @ part, np.eye(there.sum()), atol=1e-8)
         assert log_det[i] == pytest.approx(np.linalg.slogdet(2 * np.pi * part)[1])
     assert (data.count[1] == 0).any()
-
-
-@pytest.mark.parametrize("smooth", [False, True])
-def test_touches_with_the_same_samples_share_one_whitener(smooth):
-    rng, noise = np.random.default_rng(0), Noise(misfit=0.02, smooth=smooth)
-    y = 30 + rng.uniform(1, 9, (50, 1)) * (TIME > 0) * np.sqrt(np.maximum(TIME, 0.0))
-    y[::2, 40:43] = np.nan  # half of them lack a bin, and two something of their own
-    y[7, 90], y[8, 100] = np.nan, np.nan
-    data = touches(make_grasps(TIME, y, [str(i) for i in range(50)]))
-    shared, log_det = whiteners(data, noise)
-    w, want = whiten(data, noise)
-    assert len(shared.kinds) == 4
-    for i in range(50):
-        own = shared.scale[i, :, None] * shared.kinds[shared.kind[i]]
-        np.testing.assert_allclose(own.T @ own, w[i].T @ w[i], rtol=1e-9, atol=1e-9 * (w[i] ** 2).max())
-    np.testing.assert_allclose(log_det, want, rtol=1e-12)
 
 
 @pytest.mark.parametrize("smooth", [False, True])
