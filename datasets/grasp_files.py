@@ -13,9 +13,8 @@ from __future__ import annotations
 
 import os
 import re
-import sys
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -28,7 +27,7 @@ from thermogrip.datasets.atomic_files import write_atomic
 from thermogrip.datasets.errors import UserError, os_faults
 from thermogrip.datasets.file_names import file_format, file_stem, matching_files
 from thermogrip.datasets.media import csv_cell, csv_text
-from thermogrip.datasets.netcdf import open_netcdf, open_plain_netcdf, record_unit, write_netcdf
+from thermogrip.datasets.netcdf import open_netcdf, record_unit, write_netcdf
 from thermogrip.datasets.schema import (
     GRASP_LABELS,
     GRASP_NUMBERS,
@@ -36,7 +35,6 @@ from thermogrip.datasets.schema import (
     check_grasps,
     log_name,
     make_grasps,
-    make_plain_grasps,
     with_lead_in,
 )
 from thermogrip.datasets.tables import (
@@ -67,7 +65,7 @@ _ENDINGS = (".csv", ".csv.gz", ".csv.xz")
 _NEEDED = ("time", "t_surface")  # how the columns begin that are read as numbers
 
 
-def read_grasps(path: str | Path, *, plain: bool = False, name: str | None = None) -> Grasps:
+def read_grasps(path: str | Path, *, name: str | None = None) -> Grasps:
     """Return the grasps in a file.
 
     Parameters
@@ -75,8 +73,6 @@ def read_grasps(path: str | Path, *, plain: bool = False, name: str | None = Non
     path : str or Path
         A CSV file with its meta file beside it, NetCDF, or Parquet with a row a sample, in which each row
         repeats what is known of its grasp.
-    plain : bool, optional
-        Grasps of CSV, and of NetCDF of ours, as arrays alone (:mod:`thermogrip.datasets.plain_record`).
     name : str, optional
         What the record is called, by default as its file.
 
@@ -107,11 +103,9 @@ def read_grasps(path: str | Path, *, plain: bool = False, name: str | None = Non
             raise UserError(problem, file=path, hint="a grasp file has grasp_id,time_s,t_surface_degC")
         return from_frame(frame, name or file_stem(path), file=path)
     if file_format(path) == "netcdf":
-        found: Any = open_plain_netcdf(path) if plain else None
-        return _whole(_of_dataset(open_netcdf(path) if found is None else found, path, name), path)
+        return _whole(_of_dataset(open_netcdf(path), path, name), path)
     samples, meta = _sample_table(path), _meta_path(path)
-    make = make_plain_grasps if plain else make_grasps
-    return _of_tables(samples, read_csv_table(meta, text=None), name or file_stem(path), make)
+    return _of_tables(samples, read_csv_table(meta, text=None), name or file_stem(path))
 
 
 def _whole(grasps: Grasps, path: str | Path) -> Grasps:
@@ -133,10 +127,9 @@ def as_grasps(grasps: Records) -> list[Grasps]:
     """Return records as they are, those of files and DataFrames as they are read."""
     given = list(grasps) if isinstance(grasps, Sequence) and not isinstance(grasps, str) else [grasps]
     files: list[Any] = [read_grasps(each) if isinstance(each, str | Path) else each for each in given]
-    pandas: Any = sys.modules.get("pandas")  # of which nothing can be where it was not imported
-    if pandas is None:
-        return files
-    return [from_frame(each) if isinstance(each, pandas.DataFrame) else each for each in files]
+    import pandas as pd
+
+    return [from_frame(each) if isinstance(each, pd.DataFrame) else each for each in files]
 
 
 def from_frame(frame: DataFrame, name: str = "DataFrame", *, file: str | Path | None = None) -> Grasps:
@@ -152,7 +145,7 @@ def from_frame(frame: DataFrame, name: str = "DataFrame", *, file: str | Path | 
         rest = rest.drop_duplicates("grasp_id")
     long = _sample_table(where, frame[samples].to_csv(index=False).encode())
     meta = read_csv_table(where, text=None, data=rest.to_csv(index=False).encode())
-    return _of_tables(replace(long, lines=long.lines - 1), meta, name, make_grasps)
+    return _of_tables(replace(long, lines=long.lines - 1), meta, name)
 
 
 def _check_cells(frame: DataFrame, file: str) -> None:
@@ -534,7 +527,7 @@ def _with_defaults(per_grasp: dict[str, Any], n: int, stem: str) -> dict[str, An
     return filled
 
 
-def _of_tables(samples: Table, meta: Table, name: str, make: Callable[..., Grasps]) -> Grasps:
+def _of_tables(samples: Table, meta: Table, name: str) -> Grasps:
     """Return the grasps of a table with a row a sample and one with a row a grasp."""
     ids, time, channels, repairs = _samples_of(samples)
     order, index = _in_order(ids)
@@ -543,7 +536,7 @@ def _of_tables(samples: Table, meta: Table, name: str, make: Callable[..., Grasp
     per_grasp = _with_defaults(about, len(order), name)
     per_grasp |= {"name": name, "t_surface_2": gridded.get("t_surface_2")}
     try:
-        grasps = make(axis, gridded["t_surface"], order, **per_grasp)
+        grasps = make_grasps(axis, gridded["t_surface"], order, **per_grasp)
     except UserError as error:  # which knows the record's name alone
         raise UserError(error.problem, file=samples.file, column=error.column, hint=error.hint) from error
     grasps.attrs["repairs"] = "\n".join(repairs + more + left_out)

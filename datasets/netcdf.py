@@ -29,7 +29,7 @@ import math
 from contextlib import AbstractContextManager
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +37,6 @@ from numpy.typing import NDArray
 from thermogrip.datasets.atomic_files import atomic_path
 from thermogrip.datasets.errors import UserError, as_user_error, os_faults
 from thermogrip.datasets.limits import check_source, check_unpacked, most_bytes, most_unpacked
-from thermogrip.datasets.plain_record import PlainGrasps
 from thermogrip.datasets.units import UNITS, to_record_unit
 
 if TYPE_CHECKING:
@@ -60,9 +59,6 @@ _LONG_NAMES = {
 }
 # with which the HDF5 stack reports damage
 _DAMAGE = (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError)
-#: Attributes that are HDF5's own, and those by which numbers are not as they stand.
-_OF_HDF5 = ("CLASS", "NAME", "REFERENCE_LIST", "DIMENSION_LIST", "_Netcdf4Dimid", "_Netcdf4Coordinates")
-_CODED = {"scale_factor", "add_offset", "missing_value", "_Unsigned", "_Encoding", "dtype"}
 _MOST_MEMBERS = 4096  # of a file
 _PART = 16 << 20  # bytes of text that are looked at in one piece
 
@@ -102,55 +98,6 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
     with _not_damaged(path), xr.open_dataset(path, **options) as data:
         loaded = data.load()
     return from_cf(text_as_str(loaded))
-
-
-def open_plain_netcdf(path: str | Path) -> PlainGrasps | None:
-    """Return the grasps in a NetCDF-4 file of ours as arrays alone, like :func:`open_netcdf`; None of any
-    other file."""
-    check_netcdf(path)
-    h5py = import_module("h5py")
-    with _not_damaged(path), h5py.File(path, "r") as file:
-        attrs = {key: value for key, value in file.attrs.items() if not key.startswith("_")}
-        if attrs.get("schema") != "thermogrip.grasps":
-            return None
-        variables: dict[str, Any] = {}
-        for name, member in file.items():
-            if isinstance(member, h5py.Dataset) and _is_bare_dimension(member):
-                continue
-            found = _plain_variable(name, member) if isinstance(member, h5py.Dataset) else None
-            if found is None:
-                return None
-            variables[name] = found
-    data: Any = PlainGrasps(variables, attrs)
-    return cast(PlainGrasps, from_cf(text_as_str(data)))
-
-
-def _is_bare_dimension(member: Any) -> bool:
-    """Return whether a dimension has a length alone, and no values."""
-    return bytes(member.attrs.get("NAME", b"")).startswith(b"This is a netCDF dimension but not a netCDF")
-
-
-def _plain_variable(name: str, member: Any) -> tuple[tuple[str, ...], NDArray[Any], dict[str, Any]] | None:
-    """Return dimensions, values and attributes of a variable whose numbers are as they stand."""
-    h5py = import_module("h5py")
-    attrs = {key: value for key, value in member.attrs.items() if key not in _OF_HDF5}
-    attrs.pop("coordinates", None)
-    filled = np.asarray(attrs.pop("_FillValue", np.nan), dtype=object).ravel()
-    if not all(isinstance(v, float | np.floating) and np.isnan(v) for v in filled):
-        return None
-    if attrs.keys() & _CODED or any(not isinstance(v, str) and np.size(v) != 1 for v in attrs.values()):
-        return None
-    scale = member.attrs.get("CLASS", b"") == b"DIMENSION_SCALE"
-    if not scale and not all(len(dim) == 1 for dim in member.dims):
-        return None
-    dims = (name,) if scale else tuple(dim[0].name.rpartition("/")[2] for dim in member.dims)
-    if h5py.check_string_dtype(member.dtype) is not None:
-        values = member.asstr()[()]
-    elif member.dtype.kind in "fiu":
-        values = member[()]
-    else:
-        return None
-    return dims, np.asarray(values), attrs
 
 
 def _not_damaged(path: str | Path) -> AbstractContextManager[None]:

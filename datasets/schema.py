@@ -18,13 +18,12 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thermogrip.datasets.errors import UserError, known_names
-from thermogrip.datasets.plain_record import PlainGrasps
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -211,51 +210,30 @@ def make_grasps(
     """
     from thermogrip.datasets.grasp_record import Grasps
 
-    coords, variables, attrs = _parts_of_grasps(time, t_surface, grasp_id, name, t_surface_2, per_grasp)
+    coords: dict[str, Any] = {
+        "grasp": ("grasp", np.asarray([str(g) for g in grasp_id])),
+        "time": ("time", np.asarray(time, dtype=float), {"units": "s"}),
+    }
+    variables: dict[str, Any] = {}
+    for key, values in (("t_surface", t_surface), ("t_surface_2", t_surface_2)):
+        if values is not None:
+            variables[key] = (("grasp", "time"), np.asarray(values, dtype=float), {"units": "degC"})
+    for key, values in per_grasp.items():
+        if key in GRASP_NUMBERS:
+            variables[key] = ("grasp", np.asarray(values, dtype=float), {"units": GRASP_NUMBERS[key]})
+        elif key in GRASP_LABELS:
+            variables[key] = ("grasp", np.asarray([str(v) for v in values]))
+        else:
+            problem = f"a grasp has no {key!r}"
+            raise UserError(problem, hint=known_names(key, [*GRASP_NUMBERS, *GRASP_LABELS]))
+    attrs = {"schema": "thermogrip.grasps", "version": 1, "name": name}
     grasps = Grasps(variables, coords=coords, attrs=attrs)
     check_grasps(grasps)
     return grasps
 
 
-def make_plain_grasps(
-    time: ArrayLike, t_surface: ArrayLike, grasp_id: Sequence[str], *, name: str = "grasps",
-    t_surface_2: ArrayLike | None = None, **per_grasp: Any,
-) -> Grasps:  # fmt: skip
-    """Return :func:`make_grasps` as arrays alone (:mod:`thermogrip.datasets.plain_record`)."""
-    coords, variables, attrs = _parts_of_grasps(time, t_surface, grasp_id, name, t_surface_2, per_grasp)
-    grasps: Any = PlainGrasps(coords | variables, attrs)
-    check_grasps(grasps)
-    return cast("Grasps", grasps)
-
-
-def _parts_of_grasps(
-    time: ArrayLike, t_surface: ArrayLike, grasp_id: Sequence[str], name: str,
-    t_surface_2: ArrayLike | None, per_grasp: Mapping[str, Any],
-) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:  # fmt: skip
-    """Return coordinates, variables and attributes of a record of grasps."""
-    coords: dict[str, Any] = {
-        "grasp": ("grasp", np.asarray([str(g) for g in grasp_id])),
-        "time": ("time", np.asarray(time, dtype=float), {"units": "s"}),
-    }
-    found: dict[str, Any] = {}
-    for key, values in (("t_surface", t_surface), ("t_surface_2", t_surface_2)):
-        if values is not None:
-            found[key] = (("grasp", "time"), np.asarray(values, dtype=float), {"units": "degC"})
-    for key, values in per_grasp.items():
-        if key in GRASP_NUMBERS:
-            found[key] = ("grasp", np.asarray(values, dtype=float), {"units": GRASP_NUMBERS[key]})
-        elif key in GRASP_LABELS:
-            found[key] = ("grasp", np.asarray([str(v) for v in values]))
-        else:
-            problem = f"a grasp has no {key!r}"
-            raise UserError(problem, hint=known_names(key, [*GRASP_NUMBERS, *GRASP_LABELS]))
-    return coords, found, {"schema": "thermogrip.grasps", "version": 1, "name": name}
-
-
 def as_record(data: xr.Dataset) -> Grasps:
     """Return a dataset as the record that counts grasps (:mod:`thermogrip.datasets.grasp_record`)."""
-    if isinstance(data, PlainGrasps):
-        return cast("Grasps", data)
     from thermogrip.datasets.grasp_record import Grasps
 
     return data if isinstance(data, Grasps) else Grasps(data.data_vars, coords=data.coords, attrs=data.attrs)
@@ -271,8 +249,6 @@ def with_lead_in(grasps: Grasps) -> Grasps:
     time = grasps["time"].values
     if time[0] < 0 or "t_gripper" not in grasps or bool(np.isnan(grasps["t_gripper"].values).any()):
         return grasps
-    if isinstance(grasps, PlainGrasps):
-        return with_lead_in(grasps.whole())
     step = float(np.median(np.diff(time)))  # on the grid of the others
     lead = time[0] - step * np.unique(np.round(np.linspace(3.0, 2.0, 5) / step))[::-1]
     level = np.repeat(grasps["t_gripper"].values[:, None], lead.size, axis=1)

@@ -69,8 +69,6 @@ _LABELLED = re.compile(r"[A-Za-z_@][^:=,;]{0,63}?[:=]([-+.\deE]{1,30}|nan|NaN)")
 _LABELLED_LINES = 10  # with the same names, that are no chance
 _MANY = 0.9  # share of a column's cells, or of a table's lines, that decide what the others should be
 _MOST_BROKEN = 0.05  # share of rows with too few or too many cells that are left out
-_SHORT = 1 << 16  # bytes of a text that is read without Arrow
-_PLAIN = re.compile(r"(-?\d+(\.\d*)?([eE][+-]?\d+)?)?", re.ASCII)  # a cell of it
 _SWITCH = {
     "on": 1.0, "off": 0.0, "true": 1.0, "false": 0.0, "yes": 1.0, "no": 0.0, "open": 1.0, "closed": 0.0,
     "heating": 1.0, "cooling": 1.0, "active": 1.0, "running": 1.0, "idle": 0.0, "inactive": 0.0,
@@ -112,31 +110,7 @@ def read_csv_table(
     layout = Layout(*_header(data, str(path)), ())
     is_text = text if callable(text) else lambda name: text is None or name in text
     words = frozenset(name for name in layout.names if is_text(name))
-    if (table := _parse_short(data, layout, str(path), words)) is not None:
-        return table
     return _parse_table(data, layout, str(path), words, broken=0.0)
-
-
-def _parse_short(data: bytes, layout: Layout, file: str, words: frozenset[str]) -> Table | None:
-    """Return the table of a short text whose every cell is a plain number, or empty, or of ``words``; None
-    of any other.  Arrow reads it alike, and takes longer to be imported than that to be read."""
-    if len(data) > _SHORT or layout.separator != "," or not data.isascii() or re.search(rb'["\r\x1f]', data):
-        return None
-    rows = [line.split(",") for line in data.decode("ascii").split("\n")[layout.skip :]]
-    if not rows[-1][0] and len(rows[-1]) == 1:  # behind the last line's end
-        rows.pop()
-    if not rows or len(layout.names) < 2 or any(len(row) != len(layout.names) for row in rows):
-        return None
-    numbers: dict[str, NDArray[np.float64]] = {}
-    text: dict[str, list[str]] = {}
-    for name, cells in zip(layout.names, zip(*rows)):
-        if name in words:
-            text[name] = [from_csv(cell.strip()) for cell in cells]
-        elif all(_PLAIN.fullmatch(cell) for cell in cells):
-            numbers[name] = np.array([float(cell or "nan") for cell in cells])
-        else:
-            return None
-    return Table(file, numbers, text, np.arange(layout.skip + 1, layout.skip + 1 + len(rows)))
 
 
 @dataclass(frozen=True)

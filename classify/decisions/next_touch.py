@@ -31,11 +31,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.special import logsumexp
 
 from thermogrip.classify.estimators.base import Floats, GraspClassifier, Labels, normalised, pick
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.errors import UserError, known_names
-from thermogrip.datasets.log_space import log_sum
 from thermogrip.datasets.schema import make_log, unit_names
 from thermogrip.sysid.effusivity.predictive import PosteriorPredictive, next_touch
 from thermogrip.sysid.effusivity.quality import check_grasps
@@ -85,7 +85,7 @@ def expected_information(forecast: PosteriorPredictive, *, draws: int = 48, seed
         y = mean[at, k, None, :] + z @ chol[at, k].transpose(0, 2, 1)
         off = (y[:, None] - mean[at][:, :, None, :]) @ white[at].transpose(0, 1, 3, 2)
         after = log_p[at][:, :, None] - 0.5 * ((off**2).sum(axis=3) + log_det[at][:, :, None])
-        after = (after - log_sum(after, axis=1, keepdims=True)).transpose(0, 2, 1)
+        after = (after - logsumexp(after, axis=1, keepdims=True)).transpose(0, 2, 1)
         q = np.exp(after)
         later[at] += p[at, k] * entropy(after).mean(axis=1)
         kept = np.take_along_axis(q, best[at][:, None, None], axis=2)[:, :, 0]

@@ -24,14 +24,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias
 
 import numpy as np
+import xarray as xr
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import logsumexp
 
 from thermogrip.classify.estimators.arrays import coded, grasps_of
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.grasp_files import Records as Records
 from thermogrip.datasets.grasp_files import as_grasps
-from thermogrip.datasets.log_space import log_sum
-from thermogrip.datasets.plain_record import is_record
 from thermogrip.datasets.schema import (
     GRASP_LABELS,
     GRASP_NUMBERS,
@@ -288,7 +288,7 @@ class JoinedClassifier(GraspClassifier):
 
 def _are_records(X: Any) -> bool:
     """Return whether something is records, or nothing at all, and no array."""
-    if isinstance(X, str | Path) or is_record(X) or "grasp_id" in getattr(X, "columns", ()):
+    if isinstance(X, str | Path | xr.Dataset) or "grasp_id" in getattr(X, "columns", ()):
         return True
     return isinstance(X, Sequence) and all(map(_are_records, X))
 
@@ -299,7 +299,7 @@ def record_list(X: Any) -> list[Grasps]:
     if not records:
         raise UserError("no grasps were given", hint="give at least one record")
     for at, grasps in enumerate(records):
-        if not is_record(grasps):
+        if not isinstance(grasps, xr.Dataset):
             raise UserError(
                 f"expected Grasps, got {type(grasps).__name__}", hint="use make_grasps or read_grasps"
             )
@@ -501,4 +501,4 @@ def two_or_more(labels: Labels, where: str) -> Labels:
 
 def normalised(log_p: Floats) -> Floats:
     """Return log probabilities whose rows sum to 1 from unnormalised ones."""
-    return np.asarray(log_p - log_sum(log_p, axis=1, keepdims=True))
+    return np.asarray(log_p - logsumexp(log_p, axis=1, keepdims=True))

@@ -42,6 +42,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import expit, logit, logsumexp
 
 from thermogrip.classify.estimators.base import (
     Floats,
@@ -53,7 +54,6 @@ from thermogrip.classify.estimators.base import (
     two_or_more,
 )
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.log_space import expit, log_sum, logit
 from thermogrip.datasets.materials import load_materials
 from thermogrip.datasets.schema import has_touch_groups, label_values
 from thermogrip.sysid.effusivity.data import Touches, Whitened, touches
@@ -236,7 +236,7 @@ class PosteriorClassifier(GraspClassifier):
             groups = free_touch_fit(self.device_, grasps, coupling=self.coupling_) if unknown else {}
             for name, fits in groups.items():
                 at = group == name
-                odds[at] = log_sum(evidence[at], axis=1) - np.log(len(names)) - fits[0].log_evidence
+                odds[at] = logsumexp(evidence[at], axis=1) - np.log(len(names)) - fits[0].log_evidence
         return evidence, np.asarray(expit(logit(self.prior_unknown) - odds)), words.tolist()
 
     @property
@@ -271,7 +271,7 @@ class PosteriorClassifier(GraspClassifier):
         elif n_own < own.size:
             each = np.concatenate([each, _of_levels(levels[-1:], data, names)[0]])
         prior = np.log([level.prior for level in levels])[:, None]
-        known, free = log_sum(each, axis=2) - np.log(len(names)), np.full(each.shape[:2], -np.inf)
+        known, free = logsumexp(each, axis=2) - np.log(len(names)), np.full(each.shape[:2], -np.inf)
         sure = _share(levels, each)[0] > _SURE
         if unknown or not sure:
             # the level and the candidate that explain each touch best
@@ -281,17 +281,18 @@ class PosteriorClassifier(GraspClassifier):
         explained = known if sure else np.logaddexp(np.log(1 - self.prior_unknown) + known, u + free)
         others = explained.sum(axis=1, keepdims=True) - explained
         weight = normalised((prior + others).T).T
-        strange = log_sum(weight + free, axis=0)
+        strange = logsumexp(weight + free, axis=0)
         share = np.exp(normalised(np.column_stack([(weight + known).T, u + strange])))
         words = [*(level.words for level in levels), ""]
         found = [words[int(row.argmax())] if row.max() > _LIKELY else "" for row in share]
         if unknown and not own.all() and (at := np.flatnonzero(share[:, -2] > _NEEDED)).size:
             free[-1, at] = free_evidence(levels[-1].device, data.take(at))
-            strange = log_sum(weight + free, axis=0)
+            strange = logsumexp(weight + free, axis=0)
         # a stranger is none of the training's blocks, whatever another block of a known material may be
         blocks = known[0] if self.finish != "unknown" else _mean_evidence(self.device_, data, names)
         weighed = np.where(own[:, None], blocks, known) + weight
-        return _Decided(log_sum(each + weight[:, :, None], axis=0), log_sum(weighed, axis=0) - strange, found)
+        candidates = logsumexp(each + weight[:, :, None], axis=0)
+        return _Decided(candidates, logsumexp(weighed, axis=0) - strange, found)
 
     def log_prior(self, names: Sequence[str]) -> Floats:
         """Return the log prior odds of some materials, (n_name,)."""
@@ -400,14 +401,14 @@ def _unlikely(
 
 def _share(levels: Sequence[_Level], each: Floats) -> Floats:
     """Return the probability of each level given all touches, (n_level,)."""
-    total = np.log([level.prior for level in levels]) + log_sum(each, axis=2).sum(axis=1)
+    total = np.log([level.prior for level in levels]) + logsumexp(each, axis=2).sum(axis=1)
     return np.asarray(np.exp(normalised(total[None])[0]))
 
 
 def _mean_evidence(device: GripperModel, data: Touches, names: Sequence[str]) -> Floats:
     """Return the log evidence of the training's own blocks, the mean over candidates, (n,)."""
     evidence = fit_candidates(device, data, names, "known")[0].log_evidence
-    return np.asarray(log_sum(evidence.reshape(-1, len(names)), axis=1) - np.log(len(names)))
+    return np.asarray(logsumexp(evidence.reshape(-1, len(names)), axis=1) - np.log(len(names)))
 
 
 def _uncertain_as(device: GripperModel, gripper: str) -> GripperModel:

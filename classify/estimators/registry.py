@@ -26,12 +26,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from thermogrip.classify.estimators import CLASSIFIERS, check_name
 from thermogrip.classify.estimators.base import Floats, GraspClassifier, Labels
 from thermogrip.datasets.atomic_files import make_folder, read_bytes, read_json, write_atomic, write_json
 from thermogrip.datasets.errors import UserError, known_names
-from thermogrip.datasets.log_space import log_sum
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
@@ -263,7 +263,7 @@ class VoteClassifier(GraspClassifier):
 
     def _log_proba(self, grasps: Grasps) -> Floats:
         log_p = np.stack([member.predict_log_proba(grasps) for member in self.members_])
-        return np.asarray(log_sum(log_p, axis=0) - np.log(len(log_p)))
+        return np.asarray(logsumexp(log_p, axis=0) - np.log(len(log_p)))
 
 
 def check_members(members: Sequence[GraspClassifier]) -> None:

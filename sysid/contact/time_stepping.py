@@ -58,7 +58,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array, Mask
-from thermogrip.datasets.compiled import kernel
+from thermogrip.datasets.compiled import numba
 
 # sums over modes may be reordered, so that they run in vector registers; infinities stay what they are
 COMPILED: dict[str, Any] = {
@@ -109,7 +109,7 @@ def _slabs(
     return modes, moves, series
 
 
-@kernel(**COMPILED)
+@numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
 def slab_modes(
     contact: Array, numbers: Array, step: float, node: Array, shares: Array, modes: Array, moves: Array,
     series: Array,
@@ -222,7 +222,7 @@ def contacts(
     return rise, slope, flux
 
 
-@kernel(**COMPILED)
+@numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
 def step_contacts(
     repeat: NDArray[np.int64], dt: Array, modes: Array, moves: Array, series: Array, grown: Array,
     wanted: Mask, room: Array, now: Array, rise: Array, slope: Array, flux: Array,

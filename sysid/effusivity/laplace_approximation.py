@@ -64,10 +64,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import gammaln
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
-from thermogrip.datasets.log_space import log_gamma
 from thermogrip.datasets.materials import Material, find_material
 from thermogrip.sysid.contact.simulation import (
     LAYER_NAMES,
@@ -185,7 +185,7 @@ def peak_ratio(dof: Array, vary: Mask) -> Array:
     """Return the log of Student's peak density over the normal one of the same scale, summed, (n_pair,)."""
     heavy = vary & np.isfinite(dof)
     nu = np.where(heavy, dof, 1.0)
-    ratio = log_gamma(0.5 * (nu + 1)) - log_gamma(0.5 * nu) - 0.5 * np.log(0.5 * nu)
+    ratio = gammaln(0.5 * (nu + 1)) - gammaln(0.5 * nu) - 0.5 * np.log(0.5 * nu)
     return np.asarray(np.where(heavy, ratio, 0.0).sum(axis=1))
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.arrays import Array, Mask
-from thermogrip.datasets.compiled import kernel
+from thermogrip.datasets.compiled import numba
 from thermogrip.sysid.contact.time_stepping import COMPILED, N_STEPPED, VALUE, Gripper, contacts
 
 _AT_ONCE = 1024  # pairs
@@ -116,7 +116,7 @@ def _means(
     return out
 
 
-@kernel(**COMPILED)
+@numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
 def bin_means(
     nodes: Array, rise: Array, slope: Array, wanted: Mask, which: NDArray[np.int64], onset: Array,
     row: NDArray[np.int64], times: Array, bins: NDArray[np.int64], count: Array, room: Array, means: Array,
@@ -163,7 +163,7 @@ def bin_means(
                     means[p, c, m] /= count[i, m]
 
 
-@kernel(**COMPILED)
+@numba.njit(**COMPILED)  # type: ignore[untyped-decorator]
 def predicted(
     means: Array, wanted: Mask, row: NDArray[np.int64], count: Array, t: Array, ramp: Array, read: Array,
     ambient: Array, numbers: Array, beyond: Array, u: Array, vary: Mask, room: Array, y: Array, slopes: Array,

@@ -68,12 +68,12 @@ from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.atomic_files import read_json, write_json
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import number_within
-from thermogrip.datasets.log_space import log_sum
 from thermogrip.datasets.materials import Material
 from thermogrip.datasets.schema import label_values, log_name
 from thermogrip.sysid.contact.simulation import step_response, time_nodes
@@ -376,7 +376,7 @@ def two_touch_fit(
     def ask(loss: float, which: list[int]) -> list[Joint]:
         return _fits(_losing(view, loss), [groups[i] for i in which])
 
-    found = _by_loss(view, groups, ask, lambda fit: float(log_sum(fit.log_evidence) - np.log(m)))
+    found = _by_loss(view, groups, ask, lambda fit: float(logsumexp(fit.log_evidence) - np.log(m)))
     each = [
         _mixed([fit[i] for fit in found.answers], found.log_prior[:, i], view.coupling, float(skin[at[0]]))
         for i, at in enumerate(groups)
@@ -390,7 +390,7 @@ def _mixed(
 ) -> tuple[Array, Array, Array]:
     """Return evidence, temperature and its sd at the first touch, (m,) each, of a mixture over losses."""
     log_z = log_prior[:, None] + np.array([fit.log_evidence for fit in fits])
-    total = log_sum(log_z, axis=0)
+    total = logsumexp(log_z, axis=0)
     share, t = np.exp(log_z - total), np.array([fit.mean[:, 0] for fit in fits])
     own = np.array([fit.covariance[:, 0, 0] for fit in fits]) + coupling.touch_sd(t - skin) ** 2
     mean = (share * t).sum(axis=0)
@@ -461,8 +461,8 @@ def _by_loss(
         says = np.logaddexp(_KNOWN + log_z, _STRANGE + log_z.max(axis=0))
         total = np.log(_LOSS_PRIOR[left]) + says.sum(axis=1)
     log_prior = total[:, None] - says
-    log_prior = log_prior - log_sum(log_prior, axis=0)
-    share = np.exp(log_prior + log_z - log_sum(log_prior + log_z, axis=0))
+    log_prior = log_prior - logsumexp(log_prior, axis=0)
+    share = np.exp(log_prior + log_z - logsumexp(log_prior + log_z, axis=0))
     back = np.argsort(order)
     loss, as_taught = np.exp(_LN_K[left] @ share), share[left == 0].sum(axis=0)
     answers = [[one[i] for i in back] for one in answers]
@@ -546,7 +546,7 @@ def next_touch_prior(
     k = len(_LOSSES) if np.isfinite(view.traces.room[at]).any() else 1
     each = [_moved_on(_losing(view, loss), at, rest) for loss in _LOSSES[:k]]
     log_z = np.array([one[0] for one in each]) + np.log(_LOSS_PRIOR[:k, None] / _LOSS_PRIOR[:k].sum())
-    log_evidence = log_sum(log_z, axis=0)
+    log_evidence = logsumexp(log_z, axis=0)
     share, means = np.exp(log_z - log_evidence), np.array([one[1] for one in each])
     mean = (share[:, :, None] * means).sum(axis=0)
     off = means - mean

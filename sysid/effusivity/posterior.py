@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.special import expit, logit, softmax
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.grasp_files import Records, as_grasps
-from thermogrip.datasets.log_space import expit, logit, shares
 from thermogrip.datasets.materials import Material
 from thermogrip.datasets.schema import has_touch_groups
 from thermogrip.sysid.effusivity.data import Touches, touches
@@ -111,7 +111,7 @@ def material_posterior(
 ) -> Array:  # fmt: skip
     """Return probabilities of the candidates, (n_grasp, n_candidate), at equal prior odds; rows sum to 1."""
     evidence = material_evidence(gripper, grasps, candidates, finish=finish, until=until)
-    return np.asarray(shares(evidence, 1))
+    return np.asarray(softmax(evidence, 1))
 
 
 def effusivity_posterior(

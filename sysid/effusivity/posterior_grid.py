@@ -31,9 +31,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from thermogrip.datasets.arrays import Array, Mask
-from thermogrip.datasets.log_space import log_sum
 from thermogrip.datasets.materials import load_materials
 from thermogrip.sysid.effusivity.data import Touches, Whitened, taken
 from thermogrip.sysid.effusivity.gripper_model import GripperModel
@@ -177,7 +177,7 @@ def _integrals(
     wide = _rows(common, np.repeat(np.arange(x.size), n))
     each = _log_posterior(gripper, data, whitener, wide, points, np.repeat(row, n))
     volume = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
-    return np.asarray(log_sum(each.reshape(x.size, -1), axis=1) + volume + _LOG_WEIGHT - 0.5 * log_det[row])
+    return np.asarray(logsumexp(each.reshape(x.size, -1), axis=1) + volume + _LOG_WEIGHT - 0.5 * log_det[row])
 
 
 def _log_student(x: Array, mean: Array | float, sd: Array | float, dof: float = np.inf) -> Array:
@@ -521,7 +521,7 @@ def monotone(x: Array, y: Array, at: Array) -> Array:
 def mixed(parts: Sequence[GridPosterior], log_weight: Array) -> GridPosterior:
     """Return the mixture of posteriors of one grasp whose prior odds times evidence are ``log_weight``
     (n_part,)."""
-    total = float(log_sum(log_weight))
+    total = float(logsumexp(log_weight))
     share = np.exp(log_weight - total)
 
     def joined(arrays: Iterable[Array]) -> Array:
@@ -671,8 +671,8 @@ def log_total(x: Array, value: Array, slopes_of: Callable[[Array, Array], Array]
     n, m = x.shape
     place = np.broadcast_to((_GAUSS + 0.5)[None, None], (n, m - 1, _GAUSS.size)).reshape(n, -1)
     at = np.repeat(np.arange(m - 1), _GAUSS.size)
-    share = _SHARE * np.diff(x)[:, :, None]
-    return np.asarray(log_sum(_cubic(x, value, at, place, slopes_of) + np.log(share).reshape(n, -1), axis=1))
+    share = (_SHARE * np.diff(x)[:, :, None]).reshape(n, -1)
+    return np.asarray(logsumexp(_cubic(x, value, at, place, slopes_of) + np.log(share), axis=1))
 
 
 def _cubic(
@@ -712,7 +712,7 @@ def posteriors_of(x: Array, value: Array, t_object: Array, sd: Array, ln_h: Arra
     before, after = np.take_along_axis(x, at, axis=1), np.take_along_axis(x, at + 1, axis=1)
     log_density = _cubic(x, value, at, (fine - before) / (after - before))
     log_density[:, [0, -1]] -= np.log(2.0)  # by the trapezoidal rule
-    total = log_sum(log_density, axis=1)
+    total = logsumexp(log_density, axis=1)
     evidence = total + np.log(fine[:, 1] - fine[:, 0]) - np.log(LN_E_RANGE[1] - LN_E_RANGE[0])
     mass = np.exp(log_density - total[:, None])
     weight = np.exp(value - value.max(axis=1, keepdims=True)) * np.gradient(x, axis=1)

@@ -32,9 +32,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import logsumexp
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.datasets.log_space import log_sum
 from thermogrip.datasets.materials import Material
 from thermogrip.sysid.contact.simulation import PUMP_OFF
 from thermogrip.sysid.effusivity.data import Touches, noise_covariance, touches
@@ -86,7 +86,7 @@ def rest_of_contact(
     mode, prior, row = fit_candidates(gripper, data, candidates, finish, start=start)
     n, m = data.level.size, len(candidates)
     log_p = mode.log_evidence.reshape(n, m)
-    log_p = log_p - log_sum(log_p, axis=1, keepdims=True)
+    log_p = log_p - logsumexp(log_p, axis=1, keepdims=True)
     dt = _sample_time(grasps)
     # the next sample is at until + dt
     at = np.arange(until + 0.5 * (_STEP + dt), end, _STEP, dtype=np.float64)
@@ -132,7 +132,7 @@ def next_touch(
     u[:, SHARED] = np.tile(x_mean, (n, 1))
     spread[:, np.array(SHARED)[:, None], SHARED] = np.tile(x_cov, (n, 1, 1))
     y, slopes, covariance = _to_come(gripper, data, u, spread)
-    log_p = np.tile(evidence - log_sum(evidence), (n, 1))
+    log_p = np.tile(evidence - logsumexp(evidence), (n, 1))
     last = touches(grasps)
     if gripper.second is not None and last.second is not None:
         one = material_hypotheses(gripper, candidates, finish)

@@ -41,7 +41,7 @@ def of_files(stand_in: StandIn, records: Callable[[], list[Grasps]]) -> None:
     """Let the files of the bench hold these records, one each, whatever is given."""
     files = [Path("grasps.csv"), Path("more.csv")]
 
-    def read(path: Path, *, plain: bool, name: str | None) -> Grasps:
+    def read(path: Path, *, name: str | None) -> Grasps:
         return records()[files.index(Path(path.name))]
 
     stand_in("thermogrip.datasets.grasp_files.list_grasp_files", lambda paths: files[: len(records())])

@@ -11,8 +11,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as parquet
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.io import savemat
 
 from thermogrip.datasets import tables
@@ -403,38 +401,3 @@ def test_the_beginning_of_utf_16_may_end_within_a_letter(tmp_path, monkeypatch):
     assert shown(read_csv_table(path)) == ({"a": "1", "b": "2"}, [2])
     path.write_bytes(path.read_bytes()[:-1])
     assert "is damaged UTF-16 text; save it as UTF-8" in refusal(read_csv_table, path)
-
-
-@given(
-    st.lists(
-        st.tuples(
-            st.sampled_from(["a", "b c", "", "n/a", "ü", "'=1+1", "x y "]),
-            st.sampled_from(["1", "-2.5", "0.1", "1e-3", "7.", "", "nan", "12345678901234567890", "1e400"])
-            | st.sampled_from([".5", "+1", " 3", "0x1", "1_0", "-0", "1,5"]),
-            st.sampled_from(["0.30000000000000004", "-1e-320", "2.2250738585072014e-308", "8"]),
-        ),
-        min_size=1, max_size=5,
-    ),
-    st.sampled_from(["", "\n", "\n\n"]),
-)  # fmt: skip
-def test_a_short_text_is_read_without_arrow_as_with_it(rows, end):
-    text = "\n".join(["id,x_degC,y", *map(",".join, rows)]) + end
-    layout = tables.Layout(["id", "x_degC", "y"], 1, ",", ())
-    short = tables._parse_short(text.encode(), layout, "f.csv", frozenset({"id"}))
-    if short is None:
-        return
-    whole = tables._parse_table(text.encode(), layout, "f.csv", frozenset({"id"}), broken=0.0)
-    assert (short.text, short.notes, short.separator) == (whole.text, whole.notes, whole.separator)
-    np.testing.assert_array_equal(short.lines, whole.lines)
-    for name in ("x_degC", "y"):
-        np.testing.assert_array_equal(short.numbers[name], whole.numbers[name], strict=True)
-
-
-def test_rows_of_plain_numbers_need_no_arrow_and_others_do():
-    layout = tables.Layout(["id", "x"], 1, ",", ())
-    for rows, taken in (
-        ("a,1\nb,-2.5e3\nc,\n", True), ('"a",1\n', False), ("a,1\r\n", False), ("a,1,2\n", False),
-        ("a,1\n\nb,2\n", False), ("a,0x1\n", False), ("a,1_0\n", False), ("a,inf\n", False), ("ü,1\n", False),
-    ):  # fmt: skip
-        found = tables._parse_short(f"id,x\n{rows}".encode(), layout, "f", frozenset({"id"}))
-        assert (found is not None) == taken, rows

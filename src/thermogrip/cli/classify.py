@@ -22,14 +22,10 @@ if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
     from thermogrip.sysid.effusivity import Coupling, EffusivityRow, GripperModel
 
-# what processes that answer import, with what these import at first use
-NEEDED = (
+NEEDED = (  # by processes that answer
     "thermogrip.classify.decisions.predict",
     "thermogrip.classify.estimators.posterior",
     "thermogrip.sysid.effusivity.mode_kernel",
-    "numba",
-    "pyarrow.csv",
-    "scipy.special",
 )
 ANSWERS_GO = "Where the table goes (.csv or .parquet), or a folder for a table of each file."
 _BUNDLED = 40.0  # s: the longest contacts that taught the bundled gripper
@@ -726,7 +722,7 @@ def _answer_file(answer: Callable[[Grasps], dict[str, Any]], file: tuple[Path, s
     from thermogrip.sysid.effusivity.quality import touched_groups
 
     path, name = file
-    record = read_grasps(path, plain=True, name=name)
+    record = read_grasps(path, name=name)
     return answer(record) | {"name": str(record.attrs["name"]), "groups": touched_groups(record)}
 
 

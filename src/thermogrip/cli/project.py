@@ -143,7 +143,7 @@ def warm_up(as_json: cli.AsJson = False) -> int:
     from thermogrip.sysid.effusivity.posterior import effusivity_posterior
 
     console, began = Console(as_json), time.process_time()
-    grasps = read_grasps(example_path("exp2_dT20"), plain=True).isel(grasp=[0])
+    grasps = read_grasps(example_path("exp2_dT20")).isel(grasp=[0])
     gripper = load_default_gripper()
     classify_grasps(PosteriorClassifier().with_device(gripper), grasps, ["copper", "wood"])
     effusivity_posterior(gripper, grasps)
