@@ -509,6 +509,12 @@ def inputs_off(model: Signals, log: Log) -> list[str]:
     return [n for n in absent if n not in inner.switches and ranges[n][0] <= 0 <= ranges[n][1]]
 
 
+def moved_beside(model: Signals, log: Log) -> list[str]:
+    """Return the inputs of a log, by its own guess, that move in it and that the model does not have."""
+    others = [name for name in names_of(log, "input") if name not in roles_of(model)]
+    return [name for name in others if np.ptp(column(log, name)) > 0]
+
+
 def match_logs(model: Signals, logs: Logs, *, keep_others: bool = False) -> tuple[list[Log], list[str]]:
     """Return logs in the model's roles and units (one that fits is returned itself), and what was converted
     or taken as 0, a line a column."""

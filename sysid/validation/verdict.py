@@ -11,6 +11,9 @@ less the share that the start explains, and s the rms error that the plant's ban
 An error may be of one direction alone, a gain say, which a right plant has beyond 2 s in 4.6 % of its
 runs; of many directions that is rarer.
 
+The share of the start is taken out of the run's error and out of no baseline's: a run whose whole error is
+beyond 2 s, and only without its start within it, is judged by its start, whatever no input would have done.
+
 An output that does not beat a model without input (at most 0.8 of its error) is no ground to rely on the
 plant. Where the stated error is itself that large, no right plant could have done it, and the log is no test.
 """
@@ -31,12 +34,13 @@ __all__ = ["EXCEEDS", "NO_BETTER", "Standing", "Verdict", "judge"]
 EXCEEDS = 2.0  # times the stated error, from which a plant is called another one
 NO_BETTER = 0.8  # of the no-input error: a free run above it has not shown that the input matters
 
-Standing: TypeAlias = Literal["as stated", "seen", "changed", "weak", "no test"]
+Standing: TypeAlias = Literal["as stated", "seen", "changed", "start", "weak", "no test"]
 
 _MEANING: dict[Standing, str] = {
     "as stated": "as was stated",
     "seen": "as was stated, over rows of its own fit; another log is a test",
     "changed": "by more than was stated: the plant is not what it was in the fit, or was never run like this",
+    "start": "by its start: the readings of the warm-up do not set its slow states, score it after more",
     "weak": "as was stated, which is hardly better than no input",
     "no test": "as was stated, but the inputs do too little here to test the plant",
 }
@@ -55,7 +59,7 @@ class Verdict:
     def __str__(self) -> str:
         times = ", ".join(f"{name} {ratio:.2g}" for name, ratio in self.over_stated.items())
         how = _MEANING[self.standing]
-        if self.standing != "changed" and max(self.over_stated.values(), default=0.0) > 1.0:
+        if self.standing not in ("changed", "start") and max(self.over_stated.values(), default=0.0) > 1.0:
             how = how.replace("as was stated", "by more than was stated, but no more than chance may do", 1)
         return f"errs {how} (times the stated error: {times})"
 
@@ -81,6 +85,8 @@ def judge(
     hopeless = [name for name in no_better if band.expected[name] > NO_BETTER * no_input[name]]
     if worst > EXCEEDS or (gain is not None and worst > 1.0):
         return Verdict("changed", over, gain)
+    if any(error > EXCEEDS * band.expected[name] > 0 for name, error in errors.items()):
+        return Verdict("start", over)
     if set(no_better) - set(hopeless):
         return Verdict("weak", over)
     if len(hopeless) == len(errors):

@@ -361,6 +361,7 @@ def test_a_plant_is_scored_log_by_log_beside_its_baselines(bench: Bench, stand_i
         (("no test", "seen"), "excite --kind optimal --minutes 20 --plant plant.json --out schedule.csv"),
         (("seen", "as stated"), "tune plant.json --out controller.json"),
         (("seen",), "validate plant.json LOG"),
+        (("start",), "validate plant.json good.csv --warmup {s} --score-from {s}"),
     ],
 )
 def test_what_comes_after_validate_follows_from_what_it_found(
@@ -378,7 +379,9 @@ def test_what_comes_after_validate_follows_from_what_it_found(
     logs = ["good.csv", "good.csv@100:200"][: len(standings)]
     done = bench.run("validate", "plant.json", *logs)
     assert done.code == 0, done
-    assert done.err.endswith(f"next: thermogrip {then}\n")
+    seconds = done.err.split("--warmup ")[-1].split()[0]
+    assert done.err.endswith(f"next: thermogrip {then.format(s=seconds)}\n")
+    assert standings != ("start",) or 5 < float(seconds) <= 60  # a tenth of a log of ten minutes at most
 
 
 @pytest.mark.parametrize(

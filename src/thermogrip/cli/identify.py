@@ -355,7 +355,7 @@ def validate(
     It sees the inputs and disturbances of the whole log, and measured outputs of the warm-up only."""
     if columns is None:
         cli.check_columns_of(plant, paths)
-    from thermogrip.sysid.plant.log_grid import roles_of
+    from thermogrip.sysid.plant.log_grid import moved_beside, roles_of
 
     loaded = cli.load_plant(plant, network)
     console = Console(as_json)
@@ -373,6 +373,9 @@ def validate(
                 f"{name}: {warmup:g} s of readings set the state, the fit was scored with {needed:g} s; "
                 f"write --warmup {needed:g} --score-from {needed:g}"
             )
+    for log in logs:
+        for name in moved_beside(loaded, log):
+            console.warn(f"{log.attrs['name']}: {name} moves in this log, and the plant has no such input")
     runs = []
     with console.progress("validate") as progress:
         for k, log in enumerate(logs):
@@ -396,11 +399,25 @@ def validate(
             f"{plant.name}: identify did not call it good, and a run as was stated does not change that"
         )
         found = found - {"as stated"} | {"weak"} if "as stated" in found else {"no test"}
-    return cli.Done(next((each for each in _URGENT if each in found), ""))
+    what = next((each for each in _URGENT if each in found), "")
+    if what != "start":
+        return cli.Done(what)
+    seconds = _start_seconds(loaded, logs)
+    more = ["--warmup", f"{seconds:g}", "--score-from", f"{seconds:g}"]
+    command = shlex.join(["validate", str(plant), *map(str, paths), *more])
+    return cli.Done(what, command=printable(command))
+
+
+def _start_seconds(plant: Plant, logs: Sequence[Log]) -> float:
+    """Return a warm-up [s] that shows the slowest time constant of a plant: a tenth of it, or of a log."""
+    shortest = min(float(log["time"][-1] - log["time"][0]) for log in logs)
+    dynamics, _ = _dynamics(plant)
+    slowest = float("inf") if dynamics is None else float(dynamics.time_constants[0])
+    return float(f"{min(slowest, shortest) / 10:.2g}")
 
 
 #: Of verdicts on several logs, which one says what comes next.
-_URGENT = ("changed", "weak", "as stated", "no test", "seen")
+_URGENT = ("changed", "start", "weak", "as stated", "no test", "seen")
 
 
 def run_answer(name: str, run: FreeRun, band: Band) -> dict[str, Any]:

@@ -47,7 +47,9 @@ def band(**expected: float) -> Band:
     [
         ((EXCEEDS, 1.0), {}, None, (), "as stated"),
         ((EXCEEDS + 0.01, 1.0), {}, None, (), "changed"),
-        ((3.0, 1.0), {"a": 0.6}, None, (), "as stated"),  # most of it is the start
+        ((3.0, 1.0), {"a": 0.6}, None, (), "start"),  # most of it is the start
+        ((3.0, 1.0), {"a": 0.6}, None, ("a", "b"), "start"),  # whatever no input would have done
+        ((1.5, 1.0), {"a": 0.6}, None, (), "as stated"),
         ((3.0, 1.0), {"b": 0.6}, None, (), "changed"),
         ((1.1, 0.1), {}, -0.2, (), "changed"),
         ((0.9, 0.1), {}, -0.2, (), "as stated"),  # a gain within what was stated
