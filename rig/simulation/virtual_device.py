@@ -3,7 +3,8 @@
 The device lives in a thread of its own and moves its plant and its firmware ten times a second of its own
 clock: the computer's, many times that, or one that the host steps.  What it does on a stepped clock depends
 on no scheduler.  On the computer's its time stands still while the computer has no time for it: no board is
-held up, and what a host sent meanwhile came in time.  :meth:`VirtualDevice.exchange` leaves out thread and cable: the quickest.
+held up, and what a host sent meanwhile came in time.  :meth:`VirtualDevice.exchange` leaves out thread and
+cable: the quickest.
 
 ``trace`` keeps the truth of the last hour (or as many samples as asked), so that a test knows when the
 drive went to zero and how warm it got, whatever the sensors showed.
