@@ -375,15 +375,19 @@ def _end_server(forkserver: Any) -> None:
             os.kill(pid, signal.SIGTERM)
 
 
-def _processes(n: int) -> ProcessPoolExecutor:
+def _context() -> tuple[Any, Callable[[], None] | None]:
+    """Return how processes are started, and what each does first."""
     if sys.platform != "linux":  # macOS has libraries that fail after any fork
         os.environ.setdefault("PYTHONSAFEPATH", "1")  # as in _serving
-        pool = ProcessPoolExecutor(n, mp_context=multiprocessing.get_context("spawn"))
-    else:
-        _serving(sorted(name for name in sys.modules if name.startswith("thermogrip.")))
-        ends = signal.getsignal(signal.SIGINT) is not signal.SIG_IGN  # by Ctrl-C: not under nohup
-        context = multiprocessing.get_context("forkserver")
-        pool = ProcessPoolExecutor(n, mp_context=context, initializer=_unblocked if ends else None)
+        return multiprocessing.get_context("spawn"), None
+    _serving(sorted(name for name in sys.modules if name.startswith("thermogrip.")))
+    ends = signal.getsignal(signal.SIGINT) is not signal.SIG_IGN  # by Ctrl-C: not under nohup
+    return multiprocessing.get_context("forkserver"), _unblocked if ends else None
+
+
+def _processes(n: int) -> ProcessPoolExecutor:
+    context, unblocked = _context()
+    pool = ProcessPoolExecutor(n, mp_context=context, initializer=unblocked)
     # All at once, as where processes are forked: one that is started as the pool breaks is waited for without
     # end, or it finds the pool's pipes closed, and submit() raises OSError or ValueError.
     setattr(pool, "_safe_to_dynamically_spawn_children", False)  # noqa: B010  typeshed has no such name
@@ -398,34 +402,73 @@ def _unblocked() -> None:
 
 
 class Replaced:
-    """Processes that answer calls of an event loop as they come, or with one worker a thread; where one is
-    killed all are started again."""
+    """Processes that answer calls of an event loop as they come, or with one worker a thread; one that is
+    killed is started again, and what it had in hand is asked again.
+
+    Each has a pipe of its own, whose end says that it died.  A pool of processes is lost as a whole where one
+    dies, and a call that comes while it breaks may wait without end (``terminate_broken`` of CPython 3.11).
+    """
 
     def __init__(self, workers: int) -> None:
-        self._n = min(workers, os.cpu_count() or 1)
-        self._pool: Executor = self._start()
-
-    def _start(self) -> Executor:
-        if self._n == 1:
-            return ThreadPoolExecutor(1)
-        pool = _processes(self._n)
-        pool.submit(os.getpid)  # which starts all of them
-        return pool
+        n = min(workers, os.cpu_count() or 1)
+        self._threads = ThreadPoolExecutor(n)  # each waits for one process
+        self._idle: SimpleQueue[tuple[Any, Any]] = SimpleQueue()
+        for _ in range(n if n > 1 else 0):
+            self._idle.put(_started())
+        self._ask = self._elsewhere if n > 1 else _called
 
     async def call(self, function: Callable[[_Item], _Result], item: _Item) -> _Result:
         """Return ``function(item)``; UserError if processes are killed again and again over it."""
         import asyncio  # which a program without an event loop has no need of
 
         loop = asyncio.get_running_loop()
+        error, result = await loop.run_in_executor(self._threads, self._ask, function, item)
+        if error is not None:
+            raise error
+        return result  # type: ignore[no-any-return]
+
+    def _elsewhere(self, function: Callable[[Any], Any], item: Any) -> tuple[Exception | None, Any]:
         for _ in range(_DEATHS):
-            pool = self._pool
+            process, pipe = self._idle.get()
             try:
-                return await loop.run_in_executor(pool, function, item)
-            except BrokenProcessPool:
-                if pool is self._pool:  # the first that sees it
-                    pool.shutdown(wait=False)
-                    self._pool = self._start()
+                pipe.send((function, item))
+                answer: tuple[Exception | None, Any] = pipe.recv()
+            except (EOFError, OSError):  # it was killed
+                pipe.close()
+                process.join()
+                process, pipe = _started()
+            else:
+                return answer
+            finally:
+                self._idle.put((process, pipe))
         raise UserError("worker processes are killed again and again", hint="memory may be short")
+
+
+def _started() -> tuple[Any, Any]:
+    """Start a process that answers calls, and return it with the pipe to it."""
+    context, unblocked = _context()
+    pipe, theirs = context.Pipe()
+    process = context.Process(target=_answer_calls, args=(theirs, unblocked), daemon=True)
+    process.start()
+    theirs.close()  # so that nothing but the process holds its end
+    return process, pipe
+
+
+def _answer_calls(pipe: Any, unblocked: Callable[[], None] | None) -> None:
+    """Answer calls until the pipe ends, which it does with the program."""
+    if unblocked is not None:
+        unblocked()
+    with suppress(EOFError, KeyboardInterrupt):
+        while True:
+            pipe.send(_called(*pipe.recv()))
+
+
+def _called(function: Callable[[Any], Any], item: Any) -> tuple[Exception | None, Any]:
+    """Return what a function raises, or returns."""
+    try:
+        return None, function(item)
+    except Exception as error:  # for who called
+        return error, None
 
 
 def _on_cluster(

@@ -23,24 +23,15 @@ from thermogrip.report.console import Console
 def test_a_page_that_hangs_holds_up_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_GOODBYE_S", 0.5)
     with Watch("run", Console(), Show(live=0)) as watch:
-        _hang(watch)
-        begin = time.monotonic()
-    assert time.monotonic() - begin < 30.0
-
-
-def _hang(watch: Watch) -> None:
-    assert watch._page is not None
-    os.kill(watch._page.pid, signal.SIGSTOP)
-    wide = replace(NOW, values={f"t_{k}": float(k) for k in range(200)})
-    begin, slowest = time.monotonic(), 0.0
-    while time.monotonic() - begin < 1.5:  # more than a pipe holds
-        before = time.monotonic()
-        for _ in range(200):
+        page = watch._page
+        assert page is not None
+        os.kill(page.pid, signal.SIGSTOP)
+        wide = replace(NOW, values={f"t_{k}": float(k) for k in range(200)})
+        # who waited for the page would wait here: more than the queue and the pipe to it hold
+        for _ in range(3 * module._KEEP):
             watch.listen(wide)
-        slowest = max(slowest, time.monotonic() - before)
-        time.sleep(0.001)
-    assert slowest < 0.5
-    assert len(watch._queue) == module._KEEP  # the oldest are dropped
+        assert len(watch._queue) <= module._KEEP  # the oldest are dropped
+    assert page.poll() is not None
 
 
 def test_without_a_terminal_there_is_a_line_a_second_at_most(capsys: pytest.CaptureFixture[str]) -> None:
