@@ -80,6 +80,33 @@ def as_user_error(
         raise UserError(problem.replace("{error}", str(error)[:200]), **where) from error
 
 
+@contextmanager
+def reading(problem: str, *, file: str | Path | None = None, hint: str) -> Iterator[None]:
+    """Raise whatever stops the reader of a file as the :class:`UserError` of a problem and a reason.
+
+    For parsers of other people's formats and for documents of ours: on damaged content they raise whatever
+    they stumble over, so no list of exceptions is complete.  Nothing but reading belongs in the block.  A
+    UserError keeps its words, and gets the file where it names none.
+
+    >>> with reading("is no log", file="a.bag", hint="copy it again"):
+    ...     b""[3]
+    Traceback (most recent call last):
+    thermogrip.datasets.errors.UserError: a.bag: is no log (IndexError: index out of range); copy it again
+    """
+    try:
+        yield
+    except UserError as error:
+        if error.file is not None or file is None:
+            raise
+        place: dict[str, Any] = {"file": file, "row": error.row, "column": error.column}
+        raise UserError(error.problem, **place, hint=error.hint) from error
+    except Exception as error:
+        # our own checks raise ValueError with a sentence; what else comes says little without its kind
+        words = [] if type(error) is ValueError else [type(error).__name__]
+        reason = ": ".join(filter(None, [*words, str(error)[:200]]))
+        raise UserError(f"{problem} ({reason})" if reason else problem, file=file, hint=hint) from error
+
+
 def known_names(name: object, known: Iterable[str], words: str = "use {}") -> str:
     """Return a hint with the known names in place of the braces, and at its end the one most like ``name``.
 
@@ -88,7 +115,7 @@ def known_names(name: object, known: Iterable[str], words: str = "use {}") -> st
     """
     by_lower = {each.lower(): each for each in known}
     near = get_close_matches(str(name).lower(), by_lower, 1, 0.65)
-    meant = f"did you mean {by_lower[near[0]]!r}?" if near else ""
+    meant = f"did you mean {by_lower[near[0]]!r}?" if near and by_lower[near[0]] != name else ""
     return "; ".join(filter(None, (words.format(", ".join(by_lower.values())), meant)))
 
 

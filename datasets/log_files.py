@@ -30,7 +30,7 @@ from thermogrip.datasets.atomic_files import atomic_path, write_atomic
 from thermogrip.datasets.clock import EPOCH, Clock, clock_of, read_clock, since_first_row
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.file_names import file_format, file_stem, split_cut
-from thermogrip.datasets.limits import check_size, check_source
+from thermogrip.datasets.limits import MOST_NUMBER, check_size, check_source
 from thermogrip.datasets.media import csv_cell
 from thermogrip.datasets.netcdf import convention_unit, open_netcdf, write_netcdf
 from thermogrip.datasets.roles import assign_roles, guess_role
@@ -145,8 +145,11 @@ def read_log(
         raise UserError(f"has {what}", file=file, hint=hint)
     lists = {"inputs": inputs, "outputs": outputs, "disturbances": disturbances}
     of_model = {name: role for name, role in (known or {}).items() if name in units}
-    names_of = read.names_of
-    in_file = {names_of[header]: attrs["role"] for header, attrs in table.attrs.items() if attrs.get("role")}
+    in_file = {
+        name: table.attrs[header]["role"]
+        for header, name in read.names_of.items()
+        if table.attrs.get(header, {}).get("role")
+    }
     roles = assign_roles(units, given=in_file | of_model, columns=data, file=str(file), **lists)
     own = table.meta.get("schema") == "thermogrip.log"
     if own:
@@ -157,9 +160,9 @@ def read_log(
     variables = {name: (data[name], units[name], roles.of[name]) for name in data}
     log = make_log(time, variables, name=str(file), repairs=repairs)  # a fault found here names the file
     log.attrs["name"] = file_stem(file)
-    for header, attrs in table.attrs.items():
-        if (words := attrs.get("flag_meanings")) and (flagged := names_of[header]) in log:
-            log[flagged].attrs["flag_meanings"] = words
+    for header, name in read.names_of.items():
+        if (words := table.attrs.get(header, {}).get("flag_meanings")) and name in log:
+            log[name].attrs["flag_meanings"] = words
     log.attrs["sha256"] = sha256
     finite = read.clock.seconds[np.isfinite(read.clock.seconds)]
     began = read.clock.zero + float(finite.min(initial=np.inf))
@@ -330,6 +333,10 @@ def _convert(table: Table, dt: float | None) -> _Columns:
             repairs.append(f"{header}: has no number in any row, left out")
             continue
         names_of[header] = name = unused(name or "c", ["time", *columns])
+        beyond = np.isfinite(values) & (np.abs(values) > MOST_NUMBER)
+        if beyond.any():
+            values = np.where(beyond, np.nan, values)
+            repairs.append(f"{name}: {beyond.sum()} reading(s) beyond {MOST_NUMBER:g} taken as lost")
         columns[name], units[name] = to_record_unit(values if scale == 1 else values * scale, unit)
         if header not in (name, f"{name}_{unit}"):
             renamed.append(f"{header!r} as {name}" + ("" if unit == "1" else f" [{unit}]"))

@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.atomic_files import atomic_path
-from thermogrip.datasets.errors import UserError, as_user_error, os_faults
+from thermogrip.datasets.errors import UserError, os_faults, reading
 from thermogrip.datasets.limits import check_source, check_unpacked, most_bytes, most_unpacked
 from thermogrip.datasets.units import UNITS, to_record_unit
 
@@ -57,8 +57,6 @@ _LONG_NAMES = {
     "touch": "count of touches of one block",
     "rest": "time since the touch before",
 }
-# with which the HDF5 stack reports damage
-_DAMAGE = (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError)
 _MOST_MEMBERS = 4096  # of a file
 _PART = 16 << 20  # bytes of text that are looked at in one piece
 
@@ -96,13 +94,11 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
 
     options: dict[str, Any] = {"engine": "h5netcdf", "decode_times": False, "decode_timedelta": False}
     with _not_damaged(path), xr.open_dataset(path, **options) as data:
-        loaded = data.load()
-    return from_cf(text_as_str(loaded))
+        return from_cf(text_as_str(data.load()))
 
 
 def _not_damaged(path: str | Path) -> AbstractContextManager[None]:
-    hint = "copy or write it again"
-    return as_user_error(_DAMAGE, "is damaged or not NetCDF-4", file=path, hint=hint)
+    return reading("is damaged or not NetCDF-4", file=path, hint="copy or write it again")
 
 
 def check_hdf5(opened: Any, path: str | Path) -> None:

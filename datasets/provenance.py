@@ -27,6 +27,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from thermogrip.datasets.errors import UserError
+
 KEY = "provenance"
 _ROOMS = tuple(
     str(Path(__file__).resolve().parent.parent / room) + os.sep
@@ -34,6 +36,7 @@ _ROOMS = tuple(
 )  # what they bring belongs to the version
 _LONGEST_GIT_FILE = 1 << 20  # bytes; packed-refs of a repository with ten thousand branches and tags
 _COMMIT = re.compile("[0-9a-f]{40}(?:[0-9a-f]{24})?")  # SHA-1 or SHA-256
+_EPOCH = re.compile("[0-9]{1,11}")
 
 
 @dataclass
@@ -52,6 +55,9 @@ _WORK: ContextVar[_Work | None] = ContextVar("work", default=None)
 @contextmanager
 def work(words: Sequence[str]) -> Iterator[None]:
     """Gather what one command, the words as typed, reads and writes."""
+    if (epoch := os.environ.get("SOURCE_DATE_EPOCH", "")) and not _EPOCH.fullmatch(epoch):
+        # numpy and matplotlib read it too, and raise
+        raise UserError(f"SOURCE_DATE_EPOCH is {epoch!r}", hint="set it to seconds since 1970, or unset it")
     token = _WORK.set(_Work(words))
     try:
         yield
@@ -104,7 +110,7 @@ def provenance() -> dict[str, Any]:
 def _date() -> str:
     """Return the time in UTC, of the environment where that sets one."""
     epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
-    at = time.gmtime(int(epoch) if epoch.isdecimal() and len(epoch) < 12 else None)
+    at = time.gmtime(int(epoch) if _EPOCH.fullmatch(epoch) else None)
     return time.strftime("%Y-%m-%dT%H:%M:%SZ", at)
 
 

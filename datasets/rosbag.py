@@ -23,7 +23,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -35,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermogrip.datasets.atomic_files import read_bytes, read_toml
-from thermogrip.datasets.errors import UserError, as_user_error, known_names, os_fault, os_faults
+from thermogrip.datasets.errors import UserError, known_names, os_fault, os_faults, reading
 from thermogrip.datasets.file_names import file_stem
 from thermogrip.datasets.limits import Unpacker, check_size, check_source
 from thermogrip.datasets.roles import guess_role
@@ -194,12 +193,10 @@ def _listed(path: Path) -> list[str]:
     """Return the files that the metadata of a bag name, without their folders."""
     _need("rosbags", path)
     from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
 
     data = read_bytes(path)
     check_size(len(data), file=path, share=64)
-    wrong = (YAMLError, KeyError, TypeError, ValueError, RecursionError)
-    with as_user_error(wrong, "is no metadata of a ROS 2 bag", file=path, hint="copy the bag again"):
+    with reading("is no metadata of a ROS 2 bag", file=path, hint="copy the bag again"):
         found = YAML(typ="safe").load(data)["rosbag2_bagfile_information"]
         names = [Path(str(name)).name for name in found["relative_file_paths"]]
         packed_whole = str(found.get("compression_mode", "")).lower() == "file"
@@ -363,26 +360,19 @@ def _messages_of_file(file: Path, notes: list[str]) -> Iterator[Message]:
 def _bag_messages(file: Path) -> Iterator[Message]:
     """Yield the messages of a .bag or .db3."""
     _need("rosbags", file)
-    from rosbags.highlevel import AnyReader, AnyReaderError
-    from rosbags.serde import SerdeError
+    from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
     bag1 = file.suffix.lower() == ".bag"
     store = get_typestore(Stores.ROS1_NOETIC if bag1 else Stores.ROS2_HUMBLE)
     hint = "run `rosbag reindex` on it" if bag1 else "copy it again, or export it as MCAP"
-    try:
+    with reading("is damaged or no bag", file=file, hint=hint):
         check_size(check_source(file), file=file)
         with AnyReader([_bag_path(file)], default_typestore=store) as reader:
             unpack = _bound_chunks(reader, file) if bag1 else _bound_messages(reader, file)
             for connection, stamp, raw in reader.messages():
                 content = reader.deserialize(unpack(raw), connection.msgtype)
                 yield Message(connection.topic, connection.msgtype, 1e-9 * stamp, content, {})
-    except (AnyReaderError, SerdeError) as error:
-        raise UserError(f"cannot be read ({error})", file=file, hint=hint) from error
-    except UserError:
-        raise
-    except (struct.error, KeyError, ValueError, EOFError, OSError, RuntimeError) as error:
-        raise UserError(f"is damaged ({type(error).__name__}: {error})", file=file, hint=hint) from error
 
 
 def _bag_path(file: Path) -> Path:
@@ -460,10 +450,6 @@ def _mcap_contents(data: bytes, file: Path) -> Iterator[tuple[Any, Any, Any]]:
 def _mcap_messages(file: Path, notes: list[str]) -> Iterator[Message]:
     """Yield the messages of an MCAP up to its end, or to its first damage, which is noted."""
     _need("mcap", file)
-    from mcap.exceptions import McapError
-    from zstandard import ZstdError
-
-    late = (struct.error, ValueError, EOFError, OSError, KeyError, RuntimeError, MemoryError)
     data, count = read_bytes(file), 0
     last = 0.0
     decoders = _Decoders(file)
@@ -475,11 +461,11 @@ def _mcap_messages(file: Path, notes: list[str]) -> Iterator[Message]:
             yield Message(channel.topic, kind, last, content, channel.metadata)
     except UserError:
         raise
-    except (McapError, ZstdError, *late) as error:  # of the reader, of an unpacker, and what follows
+    except Exception as error:  # whatever damage makes a reader, unpacker or decoder stumble over
+        reason = str(error) or type(error).__name__
         if not count:
             hint = "copy it again; nothing could be read"
-            raise UserError(f"is damaged or no MCAP ({error})", file=file, hint=hint) from error
-        reason = str(error) or type(error).__name__
+            raise UserError(f"is damaged or no MCAP ({reason})", file=file, hint=hint) from error
         notes.append(f"cut off or damaged after {count} messages ({reason}); the rest is lost")
         return
     if not data.endswith(b"\x89MCAP0\r\n"):
@@ -509,17 +495,14 @@ class _Decoders:
     def _type(self, schema: Any) -> str:
         """Return the message's type, registered from the definition in the file."""
         _need("rosbags", self._file)
-        from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
         if self._store is None:
             self._store = get_typestore(Stores.EMPTY)
         if schema.name not in self._known:
             name = schema.name if "/msg/" in schema.name else schema.name.replace("/", "/msg/", 1)
-            problem, wrong = (
-                f"the definition of {schema.name} cannot be read",
-                (TypesysError, UnicodeDecodeError),
-            )
-            with as_user_error(wrong, f"{problem} ({{error}})", file=self._file, hint="write the file again"):
+            problem = f"the definition of {schema.name} cannot be read"
+            with reading(problem, file=self._file, hint="write the file again"):
                 found = get_types_from_msg(schema.data.decode(), name)
                 self._store.register({k: v for k, v in found.items() if k not in self._store.fielddefs})
             self._known[schema.name] = name

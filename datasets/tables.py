@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets import limits
 from thermogrip.datasets.atomic_files import read_bytes
-from thermogrip.datasets.errors import UserError, as_user_error, os_faults
+from thermogrip.datasets.errors import UserError, as_user_error, os_faults, reading
 from thermogrip.datasets.file_names import file_format
 from thermogrip.datasets.media import from_csv
 from thermogrip.datasets.netcdf import check_netcdf
@@ -374,8 +374,11 @@ def _parse_table(
         elif odd:
             notes += (f"{len(odd)} row(s) with too few or too many cells left out ({name_rows(odd, 5)})",)
     if table is None:
-        hint = "open it in an editor and compare its rows"
-        raise faults[0] if faults else UserError("is not a table", file=file, hint=hint)
+        # Arrow refuses a header whose line has no end as well
+        bare = next(_rows(body, skip, separator, file), None) is None
+        problem = "has a header but no rows" if bare else "is not a table"
+        hint = "give at least two rows" if bare else "open it in an editor and compare its rows"
+        raise faults[0] if faults else UserError(problem, file=file, hint=hint)
     _check_empty(body, table.num_rows + len(odd), file)
     lines = _line_numbers(body, skip, table.num_rows + len(odd))
     lines = lines[~np.isin(lines, odd)]
@@ -501,8 +504,7 @@ def read_matlab_table(path: str | Path, columns: Sequence[str] | None = None) ->
     from scipy.io import loadmat
     from scipy.io.matlab import MatReadWarning
 
-    # scipy raises whatever a damaged file makes it stumble over
-    with as_user_error(Exception, "is no MATLAB file, or is damaged", file=path, hint="save it again"):
+    with reading("is no MATLAB file, or is damaged", file=path, hint="save it again"):
         source: Any = io.BytesIO(_unpacked_matlab(raw, path))  # the stubs know names only
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MatReadWarning)  # of objects without names
@@ -578,8 +580,7 @@ def read_excel_table(path: str | Path, columns: Sequence[str] | None = None) -> 
     """Return the first sheet of an Excel workbook, read as its text would be."""
     raw = read_bytes(path)
     absent, hint = "needs the package openpyxl", "pip install openpyxl, or export CSV"
-    # openpyxl raises whatever a damaged file makes it stumble over
-    with as_user_error(Exception, "is no Excel workbook, or is damaged", file=path, hint="export CSV"):
+    with reading("is no Excel workbook, or is damaged", file=path, hint="export CSV"):
         with zipfile.ZipFile(io.BytesIO(raw)) as packed:
             limits.check_unpacked(len(raw), sum(entry.file_size for entry in packed.infolist()), file=path)
         import pandas as pd
@@ -633,10 +634,7 @@ def _open_parquet(path: str | Path, source: Any, packed: int, *, text: bool = Fa
 
 
 def _sound_parquet(path: str | Path) -> AbstractContextManager[None]:
-    import pyarrow as pa
-
-    wrong = (pa.ArrowException, OSError, UnicodeDecodeError)
-    return as_user_error(wrong, "is not Parquet, or is damaged", file=path, hint="write or copy it again")
+    return reading("is not Parquet, or is damaged", file=path, hint="write or copy it again")
 
 
 def _check_parquet(opened: Any, packed: int, path: str | Path, text: bool) -> None:
@@ -704,10 +702,8 @@ def _text_of(path: str | Path, most: int | None = None) -> bytes:
     limits.check_size(limits.check_source(path), file=path)
     openers: dict[str, Any] = {".gz": gzip.open, ".xz": lzma.open}
     opener = openers.get(Path(path).suffix.lower())
-    damage = (gzip.BadGzipFile, lzma.LZMAError, zlib.error, EOFError)
-    problem = "is damaged or not compressed as its name says"
-    spoilt = as_user_error(damage, problem, file=path, hint="copy it again")
-    with os_faults(path), spoilt, open(path, "rb") as file:
+    spoilt = reading("is damaged or not compressed as its name says", file=path, hint="copy it again")
+    with os_faults(path), open(path, "rb") as file, spoilt:
         if opener is None:
             data = limits.read_within(file, limits.most_bytes() if most is None else most)
         else:

@@ -48,7 +48,7 @@ from thermogrip.classify.estimators.base import (
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.classify.estimators.registry import load_classifier
 from thermogrip.datasets.atomic_files import read_json, write_json
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, reading
 from thermogrip.datasets.limits import LARGEST, array_within, number_within
 from thermogrip.datasets.schema import HOTTEST, log_name, make_grasps
 from thermogrip.sysid.effusivity.posterior import material_fit
@@ -97,13 +97,11 @@ class StopRule:
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], *, file: str | Path = "stop rule") -> StopRule:
         """Return the rule that a JSON object describes."""
-        try:
+        with reading("is not a whole stop rule", file=file, hint="train again"):
             numbers = {name: number_within(content, name, *ends) for name, ends in _RANGES.items()}
             times = array_within(content, "times", _RANGES["end"][1]).ravel().tolist()
             n_grasp = int(number_within(content, "n_grasp", 0, LARGEST))
             return cls(times=tuple(times), n_grasp=n_grasp, **numbers)
-        except (KeyError, TypeError, ValueError) as error:
-            raise UserError(f"is not a whole stop rule ({error})", file=file, hint="train again") from error
 
 
 def load_stop_rule(folder: str | Path) -> StopRule:

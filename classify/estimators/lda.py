@@ -158,7 +158,8 @@ class PcaLda(_Lda):
         return {}, named_arrays(self, keys)
 
     def set_state(self, numbers: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
-        set_arrays(self, arrays, times_=(None,), pca_mean_=(None,), axes_=(None, arrays["pca_mean_"].size))
+        n = arrays["times_"].size * (getattr(self, "sensors_", None) or 1)
+        set_arrays(self, arrays, times_=(None,), pca_mean_=(n,), axes_=(None, n))
         self._take_up(arrays, self.axes_.shape[0])
 
 

@@ -17,8 +17,8 @@ confident and wrong costs at most ln n.
 from __future__ import annotations
 
 import inspect
-import json
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -31,7 +31,9 @@ from scipy.special import logsumexp
 from thermogrip.classify.estimators import CLASSIFIERS, check_name
 from thermogrip.classify.estimators.base import Floats, GraspClassifier, Labels
 from thermogrip.datasets.atomic_files import make_folder, read_bytes, read_json, write_atomic, write_json
-from thermogrip.datasets.errors import UserError, known_names
+from thermogrip.datasets.errors import UserError, known_names, reading
+from thermogrip.datasets.limits import array_within
+from thermogrip.datasets.schema import make_grasps
 
 if TYPE_CHECKING:
     from thermogrip.datasets.schema import Grasps
@@ -214,31 +216,44 @@ def load_classifier(folder: str | Path) -> GraspClassifier:
         raise UserError("is not a folder", file=path, hint="give the folder that train --out made")
     file = path / "classifier.json"
     content = read_json(file, _SCHEMA, _VERSION)
-    try:
+    with reading("is damaged", file=file, hint="train the classifier again"):
         if content["name"] not in CLASSIFIERS:  # never an import path: reading a file runs no code
             raise KeyError(content["name"])
         classifier = make_classifier(content["name"], **content["params"])
         classifier.classes_ = np.asarray([str(c) for c in content["classes"]])
-        arrays = {k: np.asarray(v, dtype=float) for k, v in content["arrays"].items()}
         if content["name"] in _NETWORKS:
             arrays = _read_weights(path / "weights.safetensors")
+        else:
+            arrays = {key: array_within(content["arrays"], key) for key in content["arrays"]}
         if content.get("sensors") is not None:
             classifier.sensors_ = int(content["sensors"])
         classifier.set_state(content["numbers"], arrays)
         classifier.load_parts(path)
-    except (KeyError, TypeError, AttributeError, ValueError, IndexError) as error:
-        raise UserError(f"is damaged ({error})", file=file, hint="train the classifier again") from error
+        if arrays:
+            _check_answer(classifier)
     return classifier
 
 
+def _check_answer(classifier: GraspClassifier) -> None:
+    """Raise where a classifier whose numbers each may be cannot answer for a made grasp."""
+    time = np.round(np.arange(-2.0, 10.05, 0.1), 9)
+    rise = 23 + 12 * (1 - np.exp(-np.maximum(time, 0) / 2.5))
+    second = [rise] if getattr(classifier, "sensors_", None) == 2 else None
+    grasp = make_grasps(time, [rise], ["made"], name="made", t_object=[43.0], t_surface_2=second)
+    with suppress(UserError), np.errstate(all="ignore"):  # such as: the training had longer contacts
+        log_p, unknown, _ = classifier.open_set_answer(grasp, classifier.asked())
+        if log_p.shape != (1, len(classifier.classes_)) or unknown.shape != (1,):
+            raise ValueError("its numbers give no answer")
+
+
 def _read_weights(file: Path) -> dict[str, NDArray[Any]]:
-    from safetensors import SafetensorError
     from safetensors.numpy import load
 
-    try:
-        return dict(load(read_bytes(file)))
-    except (SafetensorError, json.JSONDecodeError) as error:
-        raise UserError(f"is damaged ({error})", file=file, hint="train the classifier again") from error
+    with reading("is damaged", file=file, hint="train the classifier again"):
+        arrays = dict(load(read_bytes(file)))
+        for name in arrays:
+            array_within(arrays, name)
+        return arrays
 
 
 @dataclass(eq=False, repr=False)

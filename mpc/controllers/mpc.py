@@ -46,7 +46,7 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.atomic_files import read_json, write_json
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, reading
 from thermogrip.datasets.shown import Shown
 from thermogrip.mpc.controllers.base import STALE, SampledController
 from thermogrip.mpc.controllers.linear_equivalent import to_control
@@ -219,7 +219,8 @@ class Controller(Shown, SampledController):
         from thermogrip.sysid.plant.plant import Plant
 
         content = read_json(path, SCHEMA, VERSION)
-        try:
+        # numbers each of which may be can leave no gain or no estimate together
+        with reading("its numbers make no controller", file=path, hint="tune the controller again"):
             for key in ("design", "notes", "plant"):
                 if not isinstance(content.get(key), dict):
                     raise UserError(f"{key} is missing", hint="tune the controller again")
@@ -227,12 +228,6 @@ class Controller(Shown, SampledController):
             own = isinstance(equations, dict) and equations.get("kind") == "own"
             plant = Plant.from_dict(content["plant"], model=model if own else None)
             return cls(plant, Design.from_dict(content["design"]), notes=content["notes"])
-        except UserError as error:
-            raise UserError(error.problem, file=path, hint=error.hint) from error
-        except (ArithmeticError, np.linalg.LinAlgError, ValueError) as error:
-            # numbers each of which may be, and which together leave no gain or no estimate
-            problem = f"its numbers make no controller ({type(error).__name__}: {str(error)[:120]})"
-            raise UserError(problem, file=path, hint="tune the controller again") from error
 
     def to_control(self) -> Any:
         """Return the controller without its limits as a python-control ``StateSpace`` from readings,

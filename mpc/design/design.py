@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermogrip.datasets.errors import UserError, known_names
+from thermogrip.datasets.errors import UserError, known_names, reading
 from thermogrip.datasets.limits import LARGEST
 from thermogrip.mpc.estimator.observer import Observer, ObserverNoise, choose_disturbances
 from thermogrip.mpc.plant.prediction import (
@@ -333,7 +333,7 @@ class Design:
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> Design:
         """Return the design that :meth:`to_dict` wrote; a missing or wrong field is a :class:`UserError`."""
-        try:
+        with reading("is not a whole controller", hint="tune the controller again"):
             known = {entry.name for entry in fields(cls)}
             unknown = sorted(set(content) - known)
             if unknown:
@@ -353,11 +353,6 @@ class Design:
             for key in ("drive_range", "limits"):
                 values[key] = {str(k): (float(v[0]), float(v[1])) for k, v in content[key].items()}
             return cls(**values)
-        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-            if isinstance(error, UserError):
-                raise
-            problem = f"is not a whole controller ({type(error).__name__}: {error})"
-            raise UserError(problem, hint="tune the controller again") from error
 
 
 def make_blocks(horizon: int, count: int) -> tuple[int, ...]:

@@ -44,7 +44,7 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import read_json, write_json
-from thermogrip.datasets.errors import UserError, as_user_error
+from thermogrip.datasets.errors import UserError, reading
 from thermogrip.sysid.plant.plant import Plant
 
 SCHEMA, VERSION = "thermogrip.plant_drift", 1
@@ -92,8 +92,7 @@ class PlantDrift:
     def load(cls, path: str | Path, plant: Plant) -> PlantDrift:
         """Return what a file holds; one that is damaged or of another plant is a :class:`UserError`."""
         content = read_json(path, SCHEMA, VERSION)
-        wrong, hint = (KeyError, TypeError, ValueError), "remove it to learn anew"
-        with as_user_error(wrong, "is damaged ({error})", file=path, hint=hint):
+        with reading("is damaged", file=path, hint="remove it to learn anew"):
             found = cls._of(content, Path(path))
         if found.plant != _hash(plant) or found.names != tuple(plant.model.parameters):
             hint = "name another file: what is learnt of a rig holds for one plant"

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from thermogrip.datasets.atomic_files import make_folder, read_json, write_json
-from thermogrip.datasets.errors import UserError, known_names
+from thermogrip.datasets.errors import UserError, known_names, reading
 from thermogrip.datasets.grasp_files import read_grasps, write_grasps
 from thermogrip.datasets.materials import find_material
 from thermogrip.datasets.schema import GRASP_LABELS, GRASP_NUMBERS, Grasps, make_grasps
@@ -291,8 +291,10 @@ class _Source:
 def collect(folder: str | Path, *, name: str = "") -> Grasps:
     """Return the grasps of all good trials of a batch as one record; UserError where there is none."""
     path = Path(folder)
-    plan = read_json(path / "batch.json", SCHEMA, VERSION)["plan"]
-    runs = [run for k in range(len(plan)) if (run := good_run(path, k)) is not None]
+    content = read_json(path / "batch.json", SCHEMA, VERSION)
+    with reading("is no plan of a batch", file=path / "batch.json", hint="give the folder of a batch"):
+        n_trial = len(content["plan"])
+    runs = [run for k in range(n_trial) if (run := good_run(path, k)) is not None]
     if not runs:
         raise UserError("has no good grasp yet", file=path, hint="run the batch first")
     parts = [read_grasps(run / "grasps.csv") for run in runs]
@@ -319,12 +321,10 @@ def collect(folder: str | Path, *, name: str = "") -> Grasps:
 def good_run(folder: Path, k: int) -> Path | None:
     """Return the folder of trial k's good run, None where it has none yet."""
     for run in _attempts(folder, k):
-        try:
-            verdict = json.loads((run / "run.json").read_text(encoding="utf-8")).get("verdict")
-        except (OSError, ValueError):
-            continue
-        if verdict == "settled" and (run / "grasps.csv").is_file() and not read_run(run).bad:
-            return run
+        with suppress(UserError):  # a run that cannot be read is not good
+            found = read_run(run)
+            if found.about.get("verdict") == "settled" and (run / "grasps.csv").is_file() and not found.bad:
+                return run
     return None
 
 

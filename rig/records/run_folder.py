@@ -70,6 +70,7 @@ MOST_WAITING = 6000  # lines for a disk that hangs: ten minutes of the fastest r
 # to change threads (5 ms), so that a disk that is well has the row when the call returns
 _AT_ONCE_S = 0.02
 FILES = ("run.json", "samples.csv", "events.jsonl", "grasps.csv", "grasps_meta.csv")
+_GRASPS = ("grasps.csv", "grasps_meta.csv")
 _RESERVE, _SUMS = ".reserve", "SHA256SUMS"
 NAMES = (*FILES, _RESERVE, _SUMS)  # of everything that a run may leave
 _PACKAGES = ("thermogrip", "numpy", "scipy", "xarray", "casadi", "daqp", "pyserial")
@@ -454,17 +455,27 @@ def read_run(folder: str | Path) -> Run:
     about = _about(path)
     header, rows, samples = _samples(path / "samples.csv")
     events, whole = _events(path / "events.jsonl")
-    lost = samples.lost + whole.lost
+    written, unread = _written_grasps(path)
+    lost = samples.lost + whole.lost + unread
     rooms = _rooms(header, events)
     log = log_of_rows(rows, rooms, name=path.name, repairs=samples.lost) if len(rows) > 1 else None
-    written = (path / "grasps.csv").is_file() and (path / "grasps_meta.csv").is_file()
-    grasps = read_grasps(path / "grasps.csv") if written else None
-    if not written:
+    grasps = written
+    if written is None:
         try:
             grasps = _grasp(header, rows, events, rooms)
         except (KeyError, TypeError, ValueError) as error:
             lost = (*lost, f"events.jsonl: what it says of the grasp makes none ({str(error)[:200]})")
     return Run(about, log, events, grasps, lost)
+
+
+def _written_grasps(path: Path) -> tuple[Grasps | None, tuple[str, ...]]:
+    """Return the grasps as the run wrote them, None where it did not, and why they cannot be read."""
+    if not all((path / name).is_file() for name in _GRASPS):
+        return None, ()
+    try:
+        return read_grasps(path / "grasps.csv"), ()
+    except UserError as error:
+        return None, (f"{Path(error.file or _GRASPS[0]).name}: {error.problem}",)
 
 
 def recover(folder: str | Path) -> Recovery:
@@ -485,9 +496,11 @@ def recover(folder: str | Path) -> Recovery:
             kept = _keep(path / name)
             findings.append(f"{name} as it was found is kept as {kept}")
             write_atomic(path / name, b"".join(line + b"\n" for line in whole.lines))
-    if run.grasps is not None and not (path / "grasps.csv").is_file():
+    if run.grasps is not None and _written_grasps(path)[0] is None:
+        there = [name for name in _GRASPS if (path / name).is_file()]
+        findings += [f"{name} as it was found is kept as {_keep(path / name)}" for name in there]
         write_grasps(run.grasps, path / "grasps.csv")
-        findings.append("the grasp that was not written yet was cut from the samples")
+        findings.append("the grasp that was not written whole was cut from the samples")
     verdict = run.about.get("verdict", "running")
     if verdict == "running":
         findings.append("the run did not end by itself: its verdict is now interrupted")

@@ -8,6 +8,7 @@ a callback of an import.
 import os
 import signal
 import sys
+import warnings
 from types import FrameType
 
 
@@ -16,6 +17,8 @@ def main() -> int:
     usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # nohup and its like ignore it
     if usual:
         signal.signal(signal.SIGINT, _leave)
+    if not sys.warnoptions and "--debug" not in sys.argv:  # they name lines of code, not what to do
+        warnings.simplefilter("ignore")
     from thermogrip.cli.main import main as run
 
     if usual:

@@ -34,7 +34,7 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import read_json, write_json
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, reading
 from thermogrip.datasets.limits import number_within
 from thermogrip.datasets.materials import load_materials
 from thermogrip.sysid.contact.simulation import Grip, Stack
@@ -444,7 +444,7 @@ class GripperModel:
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], *, file: str | Path = "device") -> GripperModel:
         """Return the gripper that :meth:`to_dict` described; a wrong entry is a :class:`UserError`."""
-        try:
+        with reading("is not a whole device calibration", file=file, hint="calibrate again"):
             return cls(
                 # files from before blocks had a far face have none
                 stack=Stack(**_numbers({"g_far": 0.0, **content["stack"]}, _OF_STACK)),
@@ -465,9 +465,6 @@ class GripperModel:
                 else None,
                 **_numbers(content, _OF_GRIPPER),
             )
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            problem = f"is not a whole device calibration ({error})"
-            raise UserError(problem, file=file, hint="calibrate again") from error
 
     def save(self, path: str | Path) -> Path:
         """Write the gripper as JSON and return the path."""

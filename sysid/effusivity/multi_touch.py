@@ -72,7 +72,7 @@ from scipy.special import logsumexp
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.atomic_files import read_json, write_json
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, reading
 from thermogrip.datasets.limits import number_within
 from thermogrip.datasets.materials import Material
 from thermogrip.datasets.schema import label_values, log_name
@@ -148,12 +148,9 @@ class Coupling:
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], *, file: str | Path = "coupling") -> Coupling:
         """Return what :meth:`to_dict` described; a wrong entry is a :class:`UserError`."""
-        try:
+        with reading("is not a whole coupling of touches", file=file, hint="train again"):
             numbers = {"longest_rest": np.inf} | dict(content)  # which earlier files do not say
             return cls(**{name: number_within(numbers, name, *ends) for name, ends in _RANGES.items()})
-        except (KeyError, TypeError, ValueError) as error:
-            problem = f"is not a whole coupling of touches ({error})"
-            raise UserError(problem, file=file, hint="train again") from error
 
     def save(self, path: str | Path) -> Path:
         """Write the coupling as JSON and return the path."""

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from thermogrip.datasets.arrays import Array, Mask, Run, Values
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import reading
 from thermogrip.datasets.limits import STEP_RANGE, array_within, number_within
 from thermogrip.sysid.models.network_spec import Parameter
 
@@ -115,14 +115,12 @@ class BlackBox:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
         """Return the model of :meth:`to_dict`; raise :class:`UserError` where a field is missing or wrong."""
-        try:
+        with reading(f"not a {cls.title}", hint="save it again with this version"):
             content: dict[str, Any] = {key: tuple(str(name) for name in data[key]) for key in cls.labels}
             content |= {key: array_within(data, key) for key in cls.arrays}
             if content["spread"].ndim == 2 and not (np.diagonal(content["spread"]) > 0).all():
                 raise ValueError("spread has a variance that is not positive")
             return cls(**content | {"dt": number_within(data, "dt", *STEP_RANGE)} | cls.others(data))
-        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-            raise UserError(f"not a {cls.title} ({error})", hint="save it again with this version") from error
 
     @staticmethod
     def others(data: Mapping[str, Any]) -> dict[str, Any]:

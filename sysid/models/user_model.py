@@ -69,7 +69,7 @@ from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from thermogrip.datasets.arrays import Array, Run, Values
-from thermogrip.datasets.errors import UserError, known_names
+from thermogrip.datasets.errors import UserError, known_names, reading
 from thermogrip.sysid.models.model import Described, FreeRuns, roll_rows
 from thermogrip.sysid.models.network_spec import Parameter
 
@@ -582,10 +582,8 @@ class OwnModel(Described):
         if data.get("sha256") not in (None, self.code.sha256):
             problem = "is not what the plant was fitted with: its file has changed"
             raise self.code.fault(problem, hint="fit the plant again, or give the file as it was")
-        try:
+        with reading("its model is not whole", hint="fit the plant again"):
             pieces, sd = int(data["pieces"]), {str(k): float(v) for k, v in data["sd"].items()}
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise UserError("its model is not whole", hint="fit the plant again") from error
         return replace(self, pieces=max(1, pieces), sd=sd)
 
     @property

@@ -368,8 +368,9 @@ def _chosen_step(logs: Sequence[Rows], outputs: Sequence[str], native: float) ->
     for k, name in enumerate(outputs):
         q = max(quantum(rows.y[:, k]) for rows in logs)
         for times in (1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40, 50):
-            moves = [_rms_move(rows.time, rows.y[:, k], times * native) for rows in logs]
-            if np.sqrt(np.mean(np.square(moves))) >= q:
+            moves = np.array([_rms_move(rows.time, rows.y[:, k], times * native) for rows in logs])
+            moves = moves[np.isfinite(moves)]
+            if not moves.size or np.sqrt(np.mean(np.square(moves))) >= q:
                 break
             if times * native > needed:
                 needed = times * native
@@ -447,11 +448,14 @@ def _area_at(at: Array, s: Array, v: Array, area: Array) -> Array:
 
 
 def _rms_move(time: Array, values: Array, step: float) -> float:
-    """Root mean square change of a reading over ``step`` seconds, of means so that rounding is out."""
+    """Root mean square change of a reading over ``step`` seconds, of means so that rounding is out; NaN of a
+    log that is too short to show one."""
     coarse = max(step, 8 * float(np.median(np.diff(time))))  # the slope over a longer stretch, scaled down
     grid = np.arange(time[0], time[-1], coarse)
     mean = _line_mean(time, values[:, None], grid, coarse)[:, 0]
-    return float(np.sqrt(np.nanmean(np.diff(mean) ** 2)) * step / coarse)
+    moves = np.diff(mean)
+    moves = moves[np.isfinite(moves)]
+    return float(np.sqrt(np.mean(moves**2)) * step / coarse) if moves.size else np.nan
 
 
 def _first_order_times(part: Segment, step: float) -> list[float]:

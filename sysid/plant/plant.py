@@ -15,7 +15,7 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.atomic_files import check_json, read_json, write_json
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, reading
 from thermogrip.datasets.schema import Log, column, log_name, make_log
 from thermogrip.datasets.shown import Shown
 from thermogrip.sysid.models.model import Model
@@ -232,24 +232,18 @@ class Plant(Shown, plant_data.PlantData):
         >>> Plant.load("plant.json").simulate(log)  # doctest: +SKIP
         """
         content = read_json(path, plant_data.SCHEMA, plant_data.VERSION)
-        try:
+        with reading("is not a whole plant", file=path, hint="save the plant again"):
             samples = plant_data.read_samples(Path(path), content.get("samples"), content.get("free", ()))
             draws = content.pop("draws", None)
             return cls._of(content, model, samples if draws is None else plant_data.draws_of(draws))
-        except UserError as error:
-            raise UserError(error.problem, file=path, hint=error.hint) from error
 
     @classmethod
     def _of(cls, content: Mapping[str, Any], model: Model | None, samples: Array | None) -> Plant:
         fields = plant_data.fields_of(content)
-        try:
+        with plant_data.whole_plant():
             equations = load_model(content["model"], code=model)
             refits = tuple(load_model(one) for one in content.get("refits") or ())
             return cls(model=equations, samples=samples, refits=refits, **fields)
-        except UserError:
-            raise
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise plant_data.not_whole(error) from error
 
     def to_control(self, **point: Any) -> Any:
         """Return the plant about an operating point for python-control; see

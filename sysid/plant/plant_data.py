@@ -22,6 +22,7 @@ This module loads no xarray, so that a file can be refused at once.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from statistics import NormalDist
@@ -31,7 +32,7 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.atomic_files import atomic_path, read_json
-from thermogrip.datasets.errors import UserError
+from thermogrip.datasets.errors import UserError, reading
 from thermogrip.datasets.limits import LARGEST, MOST_NUMBER, STEP_RANGE, array_within, number_within
 from thermogrip.datasets.roles import is_room_temperature
 from thermogrip.sysid.models.model import Model
@@ -72,6 +73,8 @@ class PlantData:
         unknown = [name for name in (*self.values, *self.free) if name not in self.model.parameters]
         if unknown:
             raise ValueError(f"the model has no parameter {', '.join(unknown)}")
+        if self.reference is not None and self.reference not in self.outputs:
+            raise ValueError(f"the reference {self.reference!r} is no output of the model")
         n = len(self.free)
         if self.covariance is not None and np.shape(self.covariance) != (n, n):
             raise ValueError(f"covariance is {np.shape(self.covariance)}, not {(n, n)}")
@@ -206,12 +209,10 @@ def check_plant_file(path: str | Path, *, inside: str | None = None) -> dict[str
     should be.
     """
     content = read_json(path, inside or SCHEMA, VERSION)
-    try:
+    with reading("is not whole", file=path, hint="write the file again"):
         if inside and not isinstance(content.get("plant"), dict):
             raise UserError("plant is missing", hint="write the file again")
         fields_of(content["plant"] if inside else content)
-    except UserError as error:
-        raise UserError(error.problem, file=path, hint=error.hint) from error
     return content
 
 
@@ -238,7 +239,7 @@ def plain_content(plant: PlantData) -> dict[str, Any]:
 
 def fields_of(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return the fields of a plant from :func:`plain_content`, but for model and samples."""
-    try:
+    with whole_plant():
         return {
             "values": _numbers(content, "values"),
             "dt": number_within(content, "dt", *STEP_RANGE),
@@ -262,14 +263,11 @@ def fields_of(content: Mapping[str, Any]) -> dict[str, Any]:
             if "offset_memory" in content
             else np.inf,
         }
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise not_whole(error) from error
 
 
-def not_whole(error: Exception) -> UserError:
-    """Return the error for content that is not a whole plant."""
-    problem = f"is not a whole plant ({type(error).__name__}: {error})"
-    return UserError(problem, hint="save the plant again")
+def whole_plant() -> AbstractContextManager[None]:
+    """Raise what a reader stumbles over in content that is not a whole plant."""
+    return reading("is not a whole plant", hint="save the plant again")
 
 
 def thin(samples: Array, draws: int | None) -> Array:
@@ -281,10 +279,8 @@ def thin(samples: Array, draws: int | None) -> Array:
 
 def draws_of(rows: Any) -> Array:
     """Return samples that stand in the JSON itself."""
-    try:
+    with whole_plant():
         return np.asarray(rows, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise not_whole(error) from error
 
 
 def write_samples(path: Path, free: Sequence[str], samples: Array, units: Mapping[str, str]) -> None:
@@ -309,16 +305,11 @@ def read_samples(plant: Path, name: str | None, free: Sequence[str]) -> Array | 
     path = plant.parent / Path(str(name)).name  # beside the plant, wherever both were moved to
     if not path.is_file():
         raise UserError(f"its samples {path.name} are missing", hint="keep the .nc file beside the plant")
-    try:
-        record = open_netcdf(path)
-    except UserError as error:
-        raise UserError(f"its samples {path.name}: {error.problem}", hint=error.hint) from error
-    try:
+    record = open_netcdf(path)
+    with reading("are no samples of the plant", file=path, hint="draw the posterior again"):
         samples = np.asarray(record["samples"].sel(parameter=list(free)).values, dtype=float)
-        if not np.isfinite(samples).all():
+        if samples.ndim != 2 or not np.isfinite(samples).all():
             raise ValueError("a sample is not finite")
-    except (KeyError, TypeError, ValueError) as error:
-        raise UserError(f"its samples {path.name} cannot be read", hint="draw the posterior again") from error
     return samples
 
 

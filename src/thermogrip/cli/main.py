@@ -132,7 +132,8 @@ def _option_line(error: typer.TyperException) -> str:
     path = context.command_path if context is not None else "thermogrip"
     words, about = error.format_message().rstrip("."), vars(error)
     if about.get("possibilities"):
-        words = f"{about['message']}; {known_names(about['option_name'], about['possibilities'], '')}"
+        like = known_names(about["option_name"], about["possibilities"], "")
+        words = "; ".join(filter(None, (about["message"].rstrip("."), like)))
     elif re.fullmatch("-[a-z]", letter := str(about.get("option_name", ""))) and context is not None:
         long = [name for param in context.command.params for name in param.opts if name[1:3] == letter]
         words = f"{words}; options are whole words: {', '.join(long)}" if long else words

@@ -221,7 +221,7 @@ def listed(path: Path, *keys: str) -> list[str]:
         for part in ("plant", "model", "network"):
             content = content.get(part, content)
         return [str(name) for key in keys for name in content[key]]
-    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+    except Exception:  # whatever is wrong with it, its reader says so
         return []
 
 

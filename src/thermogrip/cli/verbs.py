@@ -15,6 +15,7 @@ from contextlib import suppress
 from difflib import get_close_matches
 from functools import cache
 from importlib import import_module, resources
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -103,7 +104,14 @@ class Verb(TyperCommand):
             words[name] = printable(shlex.join(map(str, value if isinstance(value, list) else [value])))
         words.setdefault("target", _target(given.get("controller")))
         words["fit"] = _fit_of(given.get("plant"))
-        return str(then).format(**words)
+        rig = "port" if "port" in given else "twin"
+        words["rig"] = f"--{rig} {words.get(rig, 'PLANT')}"
+        line = str(then).format(**words)
+        own = str(given.get("network", ""))  # a class of the user's own, which no file of a plant holds
+        if ".py:" in own and "--network" not in line:
+            takes_it = "network" in signature(function_of(line.split()[0])).parameters
+            line += f" --network {printable(shlex.quote(own))}" if takes_it else ""
+        return line
 
     def get_short_help_str(self, limit: int = 200) -> str:
         """Return the first sentence of the help, whole."""
@@ -128,7 +136,7 @@ class Verb(TyperCommand):
 
 def _target(controller: Any) -> str:
     """Return the first target that a controller in a file was tuned for, 38 where it was tuned for none."""
-    with suppress(OSError, ValueError, KeyError, TypeError, IndexError):
+    with suppress(Exception):  # what else it may hold costs a better word, not the verb
         steps = json.loads(Path(controller).read_text(encoding="utf-8"))["notes"]["spec"]["steps"]
         return f"{float(steps[0][1]):g}"
     return "38"
@@ -141,7 +149,7 @@ _BESIDE = ("--out", "--report", "--workers", "--cluster", "--backend")
 def _fit_of(plant: Any) -> str:
     """Return the words by which a plant in a file was identified, but for where its results went;
     ``LOG_OF_FIT`` where its logs are not here."""
-    with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
+    with suppress(Exception):
         content = json.loads(Path(plant).read_text(encoding="utf-8"))["provenance"]
         program, verb, *typed = shlex.split(content["command"])
         names = {Path(name).name for name in content["inputs"]}
