@@ -471,7 +471,7 @@ def test_a_schedule_is_played_and_its_rows_are_counted(
     plays = stand_in("thermogrip.rig.session.session.play", play)
     guards = stand_in("thermogrip.cli.rig.guard_of", "a guard")
     monkeypatch.setattr("thermogrip.rig.records.run_folder.RunFolder", Folder)
-    bench.write("g.toml", "")
+    bench.write("g.toml", "[limits]\nt1 = [5, 40]\n")  # which a spec of tune may hold as well
     words = ["record", "good.csv", "--port", "socket://rig", "--out", "r"]
     done = bench.run(*words, "--sample", "0.5", "--guard", "g.toml", "--speed", "4", "--protocol", "tclab",
                      "--seed", "3")  # fmt: skip

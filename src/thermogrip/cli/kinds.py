@@ -70,14 +70,15 @@ def _kind_of_table(head: bytes) -> str:
 
 
 def _kind_of_toml(head: bytes) -> str:
-    """Return which template a TOML file has most keys of."""
+    """Return which template a TOML file has most keys of, "" where two have as many: both may have [limits]."""
     try:
         keys = {*_keys(tomllib.loads(head.decode()))}
     except (ValueError, RecursionError):
         return ""
     shared = {kind: len(keys & template_keys(kind)) for kind in ("spec", "guard")}
-    kind = max(shared, key=lambda each: shared[each])
-    return kind if shared[kind] > len(keys) / 2 else ""
+    most = max(shared.values())
+    alike = [kind for kind, n_keys in shared.items() if n_keys == most]
+    return alike[0] if len(alike) == 1 and most > len(keys) / 2 else ""
 
 
 def template_text(kind: str) -> str:
