@@ -26,11 +26,13 @@ from typing import Any
 from scipy.stats import chi2
 
 from thermogrip.mpc.controllers.pi import PIController
+from thermogrip.mpc.interface import Move, Readings, Target
 from thermogrip.rig.guard.guard import Guard, GuardSettings
 from thermogrip.rig.guard.model_checks import ModelSettings
 from thermogrip.rig.guard.plant_mismatch import PlantDrift
 from thermogrip.rig.guard.sensor_checks import SensorSettings, repeats_needed
 from thermogrip.rig.guard.trip import ENDLESS, KINDS
+from thermogrip.rig.interface import Reading
 from thermogrip.rig.session.session import run_session
 from thermogrip.rig.simulation.twin import Twin
 
@@ -98,6 +100,20 @@ same faults are found so much sooner, and healthy sessions are ended:
 
 Repeats of a sensor are another matter: {repeats}
 {day}"""
+
+UNSEEN = """
+## What no sensor can show
+
+**Sensors that drift together** look like a rig that loses a little more heat, or less. The guard lets a drive be off by 15 % of what is asked for (three times what gains differ by from run to run) and by the error of its own estimate, not by more. When skin and tank come to read 10 K too little within an hour (20 degC: too much), on this rig:
+
+| held at [degC] | found when they are off by [K] | the true skin is then at [degC] |
+|---|---|---|
+{rows}
+
+So leave that much room below what must not be exceeded, or have one of two sensors read by another converter (`[[pairs]]`).
+
+**Without a model** (`record`), no sensor that reads the room is found out before 30 s of full drive have been given, or as much of a lower drive; a mean drive of less than 1/16 is not judged. On this rig water and skin are then {beyond:.1f} K from the room at most. While another sensor answers, one that has come off its place is found by a pair alone; and without a sensor of the room only once none has moved by 1 K since the session began.
+"""
 
 SAID = """
 ## Messages
@@ -178,6 +194,7 @@ def main() -> None:
             share=share, percent=100 * share, n=n, sessions=run["sessions"], hours=run["hours"]
         )
     record += drift_section(controller, outcomes) if stated else ""
+    slow += unseen(controller)
     said = [f"    {o.message}" for o in outcomes if o.drill.name in ("pump stops", "driver gives nothing")]
     kinds = [f"| `{kind}` | {check} | {clear} |" for kind, (check, clear) in KINDS.items()]
     text = HEAD + "\n".join(lines) + "\n" + slow + SAID + "\n\n".join(said) + "\n"
@@ -185,6 +202,52 @@ def main() -> None:
     text += TAIL + "\n".join(kinds) + "\n" + ALONE + "\n".join(ends) + "\n"
     out.write_text(with_limits(_tidy(text)), encoding="utf-8")
     options.record.write_text(_tidy(record), encoding="utf-8")
+
+
+class Together(Twin):
+    """A rig all of whose outputs are off by so many K per hour after half an hour, or read the room."""
+
+    off_place, rate = False, -10.0
+
+    def read(self) -> Reading:
+        """Return what the sensors show."""
+        found, room = super().read(), self.ambient
+        off = self.rate * max(self.time / 3600 - 0.5, 0.0)
+        values = {name: room if self.off_place else value + off for name, value in found.values.items()}
+        return replace(found, values={**values, "t_ambient": room})
+
+
+class Constant:
+    """A controller that asks for one drive."""
+
+    def __init__(self, drive: float) -> None:
+        self.drive, self.dt = drive, 1.0
+
+    def reset(self, reading: Readings) -> None: ...
+
+    def step(self, reading: Readings, target: Target) -> Move:
+        """Return the move."""
+        return Move(drive=self.drive)
+
+
+def unseen(controller: PIController) -> str:
+    """Return how far sensors that are wrong together lead, until that is found."""
+    rows, (known, real) = [], drill_plants()
+    for target in (46.0, 36.0, 20.0):
+        rig = Together(real, ambient=25.0, seed=1)
+        rig.rate = -10.0 if target > 25.0 else 10.0
+        trip = run_session(rig, controller, target, hold=7200.0, guard=Guard(known)).trip
+        off = "never" if trip is None else f"{10 * (rig.time / 3600 - 0.5):.1f}"
+        rows.append(f"| {target:g} | {off} | {rig.truth()['t_surface']:.1f} |")
+        print(rows[-1], trip and trip.line(), flush=True)
+    beyond = []
+    for drive in (1.0, 0.49, 0.25, 0.1, 0.06, -0.06, -0.25, -1.0):
+        rig = Together(real, ambient=25.0, seed=1)
+        rig.off_place = True
+        run_session(rig, Constant(drive), 35.0, guard=Guard(), settle_timeout=7200.0)
+        beyond.append(max(abs(value - rig.ambient) for value in rig.truth().values()))
+        print(f"no model, drive {drive:g}: {beyond[-1]:.1f} K after {rig.time:.0f} s", flush=True)
+    return UNSEEN.format(rows="\n".join(rows), beyond=max(beyond))
 
 
 def drift_section(controller: PIController, outcomes: Sequence[Outcome]) -> str:

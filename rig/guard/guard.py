@@ -35,14 +35,18 @@ transit is less than 1.5 K (docs/reference/faults.md has measured figures).
 Does it warm when it is heated and cool when it is cooled?  The rules that need no model
 ----------------------------------------------------------------------------------------
 
-They are the rules of 3-D printers (Klipper's ``verify_heater``, Marlin's ``WATCH_TEMP``) with a sign, because
-a Peltier drive does both, over a sliding window of ``window`` seconds in which the mean drive was at least
-``drive`` of its range, either way:
+They are the rules of 3-D printers (Klipper's ``verify_heater``, Marlin's ``WATCH_TEMP``), with a sign,
+because a Peltier drive does both, and by energy, because what heats slowly burns as well:
 
-*The wrong way.*  No output may move by more than ``wrong`` kelvin against the drive.
+*No answer.*  Each time the integral of the drive (a share of its range, positive heats) has come to
+``energy`` seconds of full drive, either way, the output that moved most must have moved by ``least`` kelvin
+with the drive since the last time, or one must stand where such a drive holds it:
 
-*Nowhere.*  The output that moves most must move by at least ``least`` kelvin with the drive, unless it is
-already ``far`` kelvin from the room on that side, where a rig at its limit may well stand still.
+    |T - T_room| >= far min(1, 2 |mean drive|) - least,    T on the drive's side of the room.
+
+By ``least`` sensors may disagree as well: a drive that holds no more than that apart, with the defaults 1/16
+of its range, is not judged.  Where no sensor reads the room, the output must stand ``least`` beyond what it
+read before in the session.
 
 *Away.*  Once an output was within ``near`` of its target, the area by which it is beyond ``leave`` kelvin
 from it may not exceed ``area`` kelvin seconds (Klipper's 120).
@@ -50,7 +54,6 @@ from it may not exceed ``area`` kelvin seconds (Klipper's 120).
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from math import isfinite
@@ -68,6 +71,7 @@ from thermogrip.sysid.plant.plant import Plant
 LIMIT_MARGIN = 2.0
 
 _KEPT_S = 300.0
+_ROOMS = (10.0, 35.0)  # degC, where people work: an output outside was heated or cooled before the session
 _OPTIMUM_EVERY_S, _OPTIMUM_FOR_S = 10.0, 60.0
 
 
@@ -75,11 +79,9 @@ _OPTIMUM_EVERY_S, _OPTIMUM_FOR_S = 10.0, 60.0
 class RuleSettings:
     """Numbers of the rules."""
 
-    window: float = keyed(60.0, "window_s", 5, 3600)
-    drive: float = keyed(0.5, "drive", 0.01, 1)
-    wrong: float = keyed(2.0, "wrong_K", 0.05, 50)
+    energy: float = keyed(30.0, "full_drive_s", 1, 3600)  # what half of full drive gives in a minute
     least: float = keyed(1.0, "least_K", 0.05, 50)
-    far: float = keyed(8.0, "far_K", 0.5, 100)
+    far: float = keyed(8.0, "far_K", 0.5, 100)  # at half of full drive
     near: float = keyed(1.0, "near_K", 0.05, 50)
     leave: float = keyed(5.0, "leave_K", 0.1, 50)
     area: float = keyed(120.0, "area_K_s", 1, 1e5)
@@ -94,9 +96,10 @@ class RuleMonitor:
 
     def start(self) -> None:
         """Forget the past."""
-        self._past: deque[tuple[float, float, dict[str, float]]] = deque()
+        self._ranges: dict[str, tuple[float, float]] = {}  # of each output in this session [degC]
         self._been_near: dict[str, tuple[float, float]] = {}  # target, area so far
-        self._last = float("nan")
+        self._time = self._begun = float("nan")
+        self._energy, self._since = 0.0, dict(self._ranges)  # since it was ``_begun``
 
     def check(
         self,
@@ -109,40 +112,55 @@ class RuleMonitor:
     ) -> Trip | None:
         """Return the trip, if any; ``drive`` is what was applied since the last call, -1...1 of its range,
         positive heats; temperatures and targets are in degC, no target where nothing is regulated."""
-        self._past.append((time, drive, dict(accepted)))
-        while self._past and time - self._past[0][0] > self.settings.window:
-            self._past.popleft()
-        return self._moved(time, room) or self._away(time, accepted, target)
+        passed = time - self._time if isfinite(self._time) else 0.0
+        self._time = time
+        if not isfinite(self._begun):
+            self._begun = time
+        self._energy += drive * passed
+        for name, value in accepted.items():
+            for ranges in (self._ranges, self._since):
+                low, high = ranges.get(name, (value, value))
+                ranges[name] = min(low, value), max(high, value)
+        trip = None
+        if accepted and abs(self._energy) >= self.settings.energy:
+            trip = self._no_answer(time, accepted, room)
+            self._begun, self._energy, self._since = time, 0.0, {n: (v, v) for n, v in accepted.items()}
+        return trip or self._away(time, passed, accepted, target)
 
-    def _moved(self, time: float, room: float) -> Trip | None:
-        s, (start, _, first) = self.settings, self._past[0]
-        if time - start < 0.95 * s.window:
+    def _no_answer(self, time: float, outputs: Mapping[str, float], room: float) -> Trip | None:
+        s, seconds = self.settings, time - self._begun
+        mean = self._energy / seconds
+        heats, holds = mean > 0, s.far * min(1.0, 2 * abs(mean))
+        with_drive, against = {}, {}
+        for name, value in outputs.items():
+            low, high = self._since[name]
+            rise, fall = value - low, high - value
+            with_drive[name], against[name] = (rise, fall) if heats else (fall, rise)
+        most = max(with_drive, key=with_drive.__getitem__)
+        beyond = max(self._beyond_room(name, value, room, heats) for name, value in outputs.items())
+        stands = beyond >= (holds - s.least if isfinite(room) else s.least)
+        if with_drive[most] >= s.least or stands or holds <= s.least:
             return None
-        mean = sum(drive for _, drive, _ in self._past) / len(self._past)
-        sign = 1.0 if mean > 0 else -1.0
-        if min(sign * drive for _, drive, _ in self._past) < s.drive:
-            return None
-        last = self._past[-1][2]
-        moved = {name: sign * (last[name] - first[name]) for name in last if name in first}
-        if not moved:
-            return None
-        most = max(moved, key=moved.__getitem__)
-        warmer = "warmer" if sign > 0 else "colder"
-        asked = f"{warmer} in {time - start:.0f} s of drive {mean:+.2f}"
-        worst = min(moved, key=moved.__getitem__)
-        if moved[worst] < -s.wrong:
-            measured = f"{sign * moved[worst]:+.1f} K"
-            return Trip("reversed", time, worst, asked, measured, figures={"moved": sign * moved[worst]})
-        if moved[most] < s.least and sign * (last[most] - room) < s.far:
-            measured = f"{sign * moved[most]:+.1f} K"
-            expected = f"at least {s.least:g} K {asked}"
-            return Trip("driver", time, most, expected, measured, figures={"moved": sign * moved[most]})
-        return None
+        kind = "reversed" if against[most] >= s.least else "driver"
+        change = -against[most] if kind == "reversed" else with_drive[most]
+        change = change if heats else -change
+        asked = f"{'warmer' if heats else 'colder'} in {seconds:.0f} s of drive {mean:+.2f}"
+        check = f"{KINDS['drift'][0]}; or {KINDS[kind][0]}"
+        expected, figures = f"at least {s.least:g} K {asked}", {"moved": change}
+        return Trip(kind, time, most, expected, f"{change:+.1f} K", check=check, figures=figures)
 
-    def _away(self, time: float, accepted: Mapping[str, float], target: Mapping[str, float]) -> Trip | None:
+    def _beyond_room(self, name: str, value: float, room: float, heats: bool) -> float:
+        """Return how far an output is from the room on the drive's side [K]."""
+        low = high = room
+        if not isfinite(room):
+            coldest, warmest = self._ranges[name]
+            low, high = min(coldest, _ROOMS[1]), max(warmest, _ROOMS[0])
+        return value - low if heats else high - value
+
+    def _away(
+        self, time: float, passed: float, accepted: Mapping[str, float], target: Mapping[str, float]
+    ) -> Trip | None:
         s = self.settings
-        passed = time - self._last if self._last == self._last else 0.0
-        self._last = time
         for name, goal in target.items():
             if name not in accepted:
                 continue
@@ -510,9 +528,11 @@ class Guard:
         name = alarm.subject
         if alarm.kind == "bias":
             unit = "of its range" if name in self._drive else "K"
-            expected = f"within {alarm.allowed:g} {unit} of the model"
+            expected = f"within {alarm.allowed:.2g} {unit} of the model"
             kind = "driver" if name in self._drive else "drift"
-            return Trip(kind, time, name, expected, f"{alarm.measured:+.2f} {unit}", figures=figures)
+            measured = f"{alarm.measured:+.2f} {unit}"
+            check = "; or ".join(KINDS[each][0] for each in dict.fromkeys((kind, "drift")))  # all may drift
+            return Trip(kind, time, name, expected, measured, check=check, figures=figures)
         causes = self.model.explain(alarm)
         because, kinds = ", or ".join(cause.text for cause in causes), by_danger(causes, name)
         kind, subject = kinds[0]

@@ -282,6 +282,11 @@ class RigFilter:
         H = self._H(np.arange(len(self.model.plant.outputs)))
         return np.asarray(np.sqrt(np.diag(H @ self._P @ H.T + np.diag(self._R))))
 
+    def bias_spread(self) -> Array:
+        """Return the standard deviations (n_w,) of the drive biases now."""
+        n, m = self.x.size, self.w.size
+        return np.asarray(np.sqrt(np.diag(self._P)[n : n + m]))
+
     def is_jump(self, at: int, value: float) -> bool:
         """Say whether the innovation of a reading [degC] of output ``at`` is too large."""
         off = abs(value - float(self.expected[at]))

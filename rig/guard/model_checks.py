@@ -16,8 +16,15 @@ printers, with a sign, for cooling too, and with the expected number at hand.  A
 meanwhile is another plant, and the floor is larger by ``switching``.  The cause of a larger residual is
 sought as below.
 
-*A bias.*  A sensor that drifts slowly, or a driver that weakens, is followed by the filter's biases b and w,
-which may not exceed ``bias_limit`` and ``drive_limit``.
+*A bias.*  A sensor that drifts slowly, or a driver that weakens, is followed by the filter's biases b and w.
+b may not exceed ``bias_limit``, and w, of standard deviation sd in the filter, not
+
+    sqrt((drive_limit e / s)^2 + (5 sd)^2),
+
+e being what the largest drive of the longest window does in such a window, and s its slope: e / s is that
+drive, but more of it where more drive hardly does more, near a Peltier element's optimum.  What logs show of
+the effect of inputs is that from run to run it differs by 5 % of itself
+(:data:`~thermogrip.sysid.plant.fit_record.RUN_GAIN_SD`), so ``drive_limit`` is three of that.
 
 Of the model alone: would more cooling drive still cool?
 
@@ -52,6 +59,7 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.limits import keyed
 from thermogrip.rig.guard.kalman_filter import Estimate, FilterSettings, History, RigFilter, RigModel
 from thermogrip.rig.guard.plant_mismatch import MOST_DRIFT, Evidence, PlantDrift
+from thermogrip.sysid.plant.fit_record import RUN_GAIN_SD
 from thermogrip.sysid.plant.plant import Plant
 
 
@@ -182,7 +190,8 @@ class ModelSettings(FilterSettings):
     switching: float = keyed(0.5, "switching_K", 0, 20)  # besides, where the pump was switched in it [K]
     smooth: float = keyed(3.0, "smooth_s", 0, 60)  # readings of so long are averaged [s]
     bias_limit: float = keyed(2.0, "bias_limit_K", 0.1, 20)  # of an output [K]
-    drive_limit: float = keyed(0.25, "drive_limit", 0.01, 0.45)  # of a drive's bias, of half its range
+    # of a drive's bias, a share of what was asked for lately
+    drive_limit: float = keyed(3 * RUN_GAIN_SD, "drive_limit", 0.01, 0.45)
     warm_up: float = keyed(60.0, "warm_up_s", 0, 3600)  # nothing is compared where it starts not at rest [s]
     drift: float = keyed(0.0, "drift", 0, MOST_DRIFT)  # share by which each plant parameter may have drifted
 
@@ -426,10 +435,27 @@ class ModelMonitor:
             bias = float(self._filter.b[k])
             if abs(bias) > s.bias_limit and self._since[k] < time:
                 found.append(Residual("bias", self.plant.outputs[k], 0.0, 0.0, bias, s.bias_limit))
-        for name, bias in zip(self.drives, self._filter.w.tolist()):
-            if abs(bias) > s.drive_limit and not self._drifted(compared):
-                found.append(Residual("bias", name, 0.0, 0.0, bias, s.drive_limit))
+        for j, (bias, sd) in enumerate(zip(self._filter.w.tolist(), self._filter.bias_spread().tolist())):
+            if abs(bias) <= 5 * sd:  # five: of 5,700 estimates without a fault the largest was 3.1
+                continue
+            limit = float(np.hypot(s.drive_limit * self._largest_drive(j), 5 * sd))
+            if abs(bias) > limit and not self._drifted(compared):
+                found.append(Residual("bias", self.drives[j], 0.0, 0.0, bias, limit))
         return found
+
+    def _largest_drive(self, j: int) -> float:
+        """Return the largest drive of the longest window by its effect over its slope, a fraction of half its
+        range; infinite where the slope is 0."""
+        model, now, steps, at = self._model, self._filter, self._past.steps, self._model.drive_at[j]
+        applied = steps.rows(steps.first)[0]
+        largest, less = applied[np.abs(applied[:, at]).argmax(), at], 0.01 * model.half[j]
+        u = np.repeat(np.repeat(now.u[None, None], 3, axis=0), len(applied), axis=1)
+        u[:, :, at] = np.array([0.0, largest - np.copysign(less, largest), largest])[:, None]
+        d = np.repeat(np.repeat(now.d[None, None], 3, axis=0), len(applied), axis=1)
+        without, slightly_less, end = model.run(np.repeat(now.x[None], 3, axis=0), u, d)[:, -1]
+        effect, slope = np.abs(end - without), np.abs(end - slightly_less) / 0.01
+        k = int(effect.argmax())
+        return float(effect[k] / slope[k]) if slope[k] > 0 else np.inf
 
 
 def _in_order(names: tuple[str, ...], values: Mapping[str, float]) -> Array:

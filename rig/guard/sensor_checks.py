@@ -2,7 +2,11 @@ r"""Faults of a single sensor that show without any model: lost, jumping, stuck,
 
 *Lost.*  Open and shorted sensors read as not a number, or as the end of the converter's range.  A reading
 that is not finite, or outside what a water loop can be, is suspect; the third in a row trips, for one spike
-(a loose plug) must not end a night's work.
+(a loose plug) must not end a night's work.  So does a quarter of the time without a good reading,
+
+    share += (1 - exp(-passed / 60 s)) (lost - share),    lost = 1 from a suspect reading to the next, else 0.
+
+Where a quarter of all readings is lost at random, three in a row come every 84 readings anyway.
 
 *Jump.*  Water cannot change faster than ``rate``; a reading that does is suspect.  A skin that touches an
 object may.
@@ -28,12 +32,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from math import ceil, erf, isfinite, log, sqrt
+from math import ceil, erf, exp, isfinite, log, sqrt
 
 from thermogrip.datasets.limits import keyed
 from thermogrip.datasets.roles import guess_role
 from thermogrip.rig.guard.trip import Trip
 from thermogrip.sysid.plant.plant import Plant
+
+_LOST_SHARE, _LOST_S = 0.25, 60.0
 
 
 @dataclass(frozen=True)
@@ -58,8 +64,9 @@ class _Memory:
     """What is known of one sensor."""
 
     good: float
-    time: float
-    bad: int = 0
+    time: float  # of ``good`` [s]
+    bad: int = 0  # suspect readings in a row
+    lost_share: float = 0.0  # of the last minute
     same: int = 0
     since: float = 0.0
     last: float = 0.0
@@ -109,6 +116,7 @@ class SensorMonitor:
         self.settings = SensorSettings() if settings is None else settings
         self._memory: dict[str, _Memory] = {}
         self._apart: dict[tuple[str, str], float] = {}
+        self._seen = 0.0  # time of the newest readings [s]
 
     def start(self, time: float, values: Mapping[str, float]) -> None:
         """Forget the past."""
@@ -116,6 +124,7 @@ class SensorMonitor:
             name: _Memory(value if self.plausible(value) else float("nan"), time, since=time, last=value)
             for name, value in values.items()
         }
+        self._seen = time
         self._apart = {}
 
     def plausible(self, value: float) -> bool:
@@ -149,8 +158,10 @@ class SensorMonitor:
         accepted: dict[str, float] = {}
         suspect: dict[str, str] = {}
         trip: Trip | None = None
+        newer, self._seen = 1 - exp((self._seen - time) / _LOST_S), time
         for name, value in values.items():
             memory = self._memory.setdefault(name, _Memory(value, time, since=time, last=value))
+            memory.lost_share += newer * ((memory.bad > 0) - memory.lost_share)
             allowed = self.settings.rate * max(time - memory.time, 0.0) + self.settings.slack
             jump = (
                 isfinite(memory.good) and abs(value - memory.good) > allowed and name not in touching | rooms
@@ -159,7 +170,8 @@ class SensorMonitor:
             if why:
                 suspect[name] = why
                 memory.bad += 1
-                if memory.bad >= self.settings.bad_in_a_row and name not in rooms:
+                often = memory.bad >= self.settings.bad_in_a_row or memory.lost_share >= _LOST_SHARE
+                if often and name not in rooms:
                     trip = trip or self._lost(name, value, time, memory, why)
             else:
                 accepted[name] = value
@@ -175,6 +187,8 @@ class SensorMonitor:
         if why == "jump":
             expected = f"near the last good {memory.good:.2f} degC"
         measured = f"{value:g} degC, {memory.bad} readings in a row"
+        if memory.bad < self.settings.bad_in_a_row:
+            measured = f"{value:g} degC, and suspect for {memory.lost_share:.0%} of the last minute"
         return Trip(why, time, name, expected, measured, figures={"measured": value, "last": memory.good})
 
     def _stuck(self, name: str, value: float, time: float, memory: _Memory) -> Trip | None:

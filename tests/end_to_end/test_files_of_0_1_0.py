@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from thermogrip.classify import classify_grasps, load_classifier
+from thermogrip.cli.kinds import check_guard
 from thermogrip.cli.main import main
 from thermogrip.datasets import read_grasps
 from thermogrip.datasets.examples import load_example_logs
@@ -89,6 +90,7 @@ def test_what_init_of_0_1_0_wrote_is_read() -> None:
     assert sorted(load_network(OLD / "network.toml").parameters) == EXPECTED["network"]
     spec, guard = read_spec(OLD / "spec.toml"), read_guard(OLD / "guard.toml")
     assert {name: getattr(spec, name) for name in EXPECTED["spec"]} == EXPECTED["spec"]
+    check_guard(str(OLD / "guard.toml"))
     assert guard.stale_s == EXPECTED["guard"]["stale_s"]
     assert [*guard.skin_limits] == EXPECTED["guard"]["skin_limits"]
     assert read_topic_map(OLD / "topics.toml").columns

@@ -70,7 +70,7 @@ def _kind_of_table(head: bytes) -> str:
 
 
 def _kind_of_toml(head: bytes) -> str:
-    """Return which template a TOML file has most keys of, "" where two have as many: both may have [limits]."""
+    """Return which template a TOML file has most keys of, "" where two have as many."""
     try:
         keys = {*_keys(tomllib.loads(head.decode()))}
     except (ValueError, RecursionError):
@@ -103,7 +103,8 @@ def _keys(content: dict[str, Any]) -> Iterator[str]:
 
 def check_keys(path: str, kind: str) -> None:
     """Refuse a key that the template of this kind has not."""
-    known, shows = template_keys(kind), f"'thermogrip init {kind}' shows every key"
+    known = template_keys(kind).union(KINDS[kind].get("former", ()))
+    shows = f"'thermogrip init {kind}' shows every key"
     for key in _keys(read_toml(path, hint=shows)):
         if key not in known:
             raise UserError(f"{key}: no such key", file=path, hint=known_names(key, sorted(known), shows))

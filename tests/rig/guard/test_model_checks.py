@@ -107,6 +107,16 @@ def test_a_drift_that_the_filter_follows_ends_at_the_bias_limit(plant: Plant) ->
     assert at < 700.0  # 2 K at 5 mK/s is 400 s
 
 
+def test_two_sensors_that_drift_together_end_where_no_drive_is_so_far_off(plant: Plant) -> None:
+    """Both read 1 K less every two minutes; to the model the drive gives less and less."""
+    followed = Followed(plant)
+    assert followed.drive(0.15, 300.0) == (np.inf, "")
+    at, _ = followed.drive(0.15, 1200.0, error=lambda t: dict.fromkeys(("t_tank", "t_surface"), -t / 120))
+    assert 240.0 < at < 1200.0  # no sooner than 2 K
+    [alarm] = followed.monitor._biases(followed.rig.time, [])
+    assert (alarm.subject, alarm.measured < -alarm.allowed) == ("drive", True)
+
+
 def test_a_sensor_that_the_rig_has_not_makes_nothing_less_known(plant: Plant) -> None:
     """The guard names both sensors that a skin may have; what is known after a touch is the same."""
     spreads = []
@@ -419,17 +429,23 @@ def test_after_a_touch_a_sensors_windows_and_jumps_start_afresh() -> None:
 @pytest.mark.parametrize(
     ("time", "b", "w", "since", "want"),
     [(60.0, 2.01, 0.0, 59.0, [Residual("bias", "b", 0.0, 0.0, 2.01, 2.0)]), (59.9, 2.01, 0.26, 59.0, []),
-     (60.0, -2.0, 0.25, 59.0, []), (60.0, -2.1, 0.0, 60.0, []),
-     (60.0, -2.1, -0.26, 59.0,
-      [Residual("bias", "b", 0.0, 0.0, -2.1, 2.0), Residual("bias", "q", 0.0, 0.0, -0.26, 0.25)])],
+     (60.0, -2.0, 0.149, 59.0, []), (60.0, -2.1, 0.0, 60.0, []),
+     (60.0, -2.1, -0.151, 59.0,
+      [Residual("bias", "b", 0.0, 0.0, -2.1, 2.0), Residual("bias", "q", 0.0, 0.0, -0.151, 0.15)])],
 )  # fmt: skip
 def test_a_bias_beyond_its_limit_is_an_alarm_after_a_minute(
     time: float, b: float, w: float, since: float, want: list[Residual]
 ) -> None:
+    """A drive's: 15 % of the 0.6 that were asked for, and five times its 0.024 in the filter."""
     made = ModelMonitor(integrator(("a", "b")))
     made.reset(0.0, {"a": 0.0, "b": 0.0})
+    for until, drive in ((20.0, -0.6), (59.0, 0.1)):
+        made.predict(until, {"q": drive}, 1, {})
+    n = made._filter.x.size
+    made._filter._P[n, n] = 0.024**2
     made._filter.b[:], made._filter.w[:], made._since[:] = (9.0, b), w, since  # the reference has no bias
-    assert made._biases(time, []) == want
+    found = made._biases(time, [])
+    assert [(*astuple(one)[:-1], pytest.approx(one.allowed)) for one in want] == list(map(astuple, found))
 
 
 # ---- a rig that has drifted, in numbers ----

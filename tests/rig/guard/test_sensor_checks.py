@@ -38,6 +38,28 @@ def test_bad_readings_are_counted_in_a_row() -> None:
     assert (trip.kind, trip.time_s) == ("lost", 6.0)
 
 
+@pytest.mark.parametrize("dt", [0.1, 1.0, 2.0])
+@pytest.mark.parametrize(
+    ("lost", "of", "after"), [(2, 3, 28.0), (1, 3, 83.0), (2, 7, 125.0), (1, 5, inf), (1, 60, inf)]
+)
+def test_a_sensor_that_is_lost_for_a_quarter_of_the_time_trips_however_often_it_is_read(
+    lost: int, of: int, after: float, dt: float
+) -> None:
+    """An average over a minute comes from 0 to 1/4 in -60 s ln(1 - (1/4) / share)."""
+    made, rooms = monitor(), monitor()
+    trips = []
+    for k in range(1, round(600 / dt)):
+        values = {"t": nan if k % of < lost else 25.0 + 0.0625 * (k % 2)}
+        trips += [trip] if (trip := made.check(k * dt, values)[2]) else []
+        assert rooms.check(k * dt, values, rooms=frozenset("t"))[2] is None
+    if after == inf:
+        assert trips == []
+    else:
+        assert trips[0].kind == "lost"
+        assert trips[0].time_s == pytest.approx(after, rel=0.05, abs=3 * of * dt)
+        assert trips[0].measured == "nan degC, and suspect for 25% of the last minute" or dt > 0.1
+
+
 def test_a_change_may_be_the_slack_and_the_rate_since_the_last_good_reading() -> None:
     for change, why in ((0.55, {}), (0.65, {"t": "jump"}), (-0.55, {}), (-0.65, {"t": "jump"})):
         assert monitor().check(0.02, {"t": 25.0 + change})[1] == why  # 0.5 K and 5 K/s

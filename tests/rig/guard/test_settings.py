@@ -105,8 +105,8 @@ sensors.alpha 1e-15 1e-3; sensors.pair_limit_K .1 50; sensors.pair_s 0 3600; mod
 model.switching_K 0 20; model.jump_k 3 100; model.jump_floor_K .1 50; model.bias_limit_K .1 20;
 model.drive_limit .01 .45; model.warm_up_s 0 3600; model.drift 0 .2; model.state_K_per_sqrt_s 1e-4 1;
 model.drive_per_sqrt_s 1e-5 .1; model.output_K_per_sqrt_s 1e-5 1; model.reading_K .001 5;
-no_model.drive .01 1; no_model.window_s 5 3600; no_model.least_K .05 50; no_model.far_K .5 100;
-no_model.wrong_K .05 50; no_model.near_K .05 50; no_model.leave_K .1 50; no_model.area_K_s 1 1e5"""
+no_model.full_drive_s 1 3600; no_model.least_K .05 50; no_model.far_K .5 100; no_model.near_K .05 50;
+no_model.leave_K .1 50; no_model.area_K_s 1 1e5"""
 
 
 def test_each_number_has_a_range_in_which_its_check_works() -> None:
@@ -128,6 +128,19 @@ def test_each_number_has_a_range_in_which_its_check_works() -> None:
         for value in (*ends, ends[0] - step, ends[1] + step):
             with nullcontext() if value in ends else pytest.raises(UserError, match=said):
                 guard_from_dict({table: {key: value}} if table else {key: value})
+
+
+@pytest.mark.parametrize(
+    ("content", "energy"),
+    [({"window_s": 60.0, "drive": 0.5, "wrong_K": 2.0}, 30.0), ({"drive": 0.25}, 15.0),
+     ({"wrong_K": 5}, 30.0), ({"window_s": 40, "full_drive_s": 9}, 9.0)],
+)  # fmt: skip
+def test_what_a_drive_gave_in_a_window_of_version_0_2_0_is_an_energy(
+    content: dict[str, float], energy: float
+) -> None:
+    assert guard_from_dict({"no_model": content}).rules == RuleSettings(energy=energy)
+    with pytest.raises(UserError, match=r"no_model.drive: 2 is not from 0.01 to 1; write full_drive_s"):
+        guard_from_dict({"no_model": {**content, "drive": 2}})
 
 
 WIDE = {"sensors": {"believable_degC": [-50, 150]}}
