@@ -6,14 +6,19 @@ here:
 * **Which answer is whose.**  Old input is thrown away before each question, and one question is open at a
   time. ``SCAN`` gives both temperatures and both heaters at once; heaters that are not what was set mean a
   reset, or an answer that slipped.
-* **What is a number.**  ``digits.three-digits``, ended by CR LF, inside what the converter can give; anything
-  else, also the head of a number that a time-out cut, is asked again.
+* **What is a number.**  ``digits.three-digits``, ended by LF or CR LF, inside what the converter can give;
+  anything else, also the head of a number that a time-out cut, is asked again.
 * **What is plausible.**  A jump of more than ``jump`` since the last scan of less than 10 s ago is asked
   again, and the median of three counts: without a checksum a flipped digit is as good as any other.  A
   converter at its end is an open or shorted sensor: NaN.
 * **Trips.**  Four scans in a row above ``highest`` or with a lost sensor switch both heaters off and latch,
   as our own firmware does; the latch is cleared with :meth:`TCLabRig.clear`.  Where the board could not be
   reached then, its heaters go off at the first scan that shows them on.
+
+* **Which board it is.**  The firmware knows no number of its own.  After a silence or on a new connection it
+  is the same board where its USB interface has the same serial number or, where that has none, where a heater
+  that was on still is, to the last digit.  With the heaters off nothing tells one such board from another: it
+  is not driven any more.
 
 What cannot be done: **nothing ends the heaters when the program is dead or the cable out**; they stay as they
 were until the board loses its power.  They are small (about 1.5 W at most at the ceilings that the firmware
@@ -38,17 +43,17 @@ HEATERS, SENSORS = ("q1", "q2"), ("t1", "t2")
 LOWEST, CEILING = -49.9, 130.0  # degC: outside, the converter is at its end and the sensor open or shorted
 BAD_SCANS = 4
 _FRESH_S = 10.0
-_NUMBER = re.compile(rb"(-?(?:0|[1-9][0-9]{0,3})\.[0-9]{3})\r\n")
-_VERSION = re.compile(rb"TCLab Firmware [ -~]+\r\n")
-_STOP = re.compile(rb"Stop\r\n")
+_NUMBER = re.compile(rb"(-?(?:0|[1-9][0-9]{0,3})\.[0-9]{3})\r?\n")
+_VERSION = re.compile(rb"TCLab Firmware [ -~]+\r?\n")
+_STOP = re.compile(rb"Stop\r?\n")
 
 
 class TCLabRig(NoticeBook):
     """A TCLab behind the rig's interface; inputs ``q1``, ``q2`` in percent, outputs ``t1``, ``t2``.
 
     It trips above ``highest`` [degC], and a change of ``jump`` [K] between two scans is asked again;
-    ``timeout`` of an answer, of which three are waited for, and ``greeting`` of a board that starts are real
-    seconds.
+    ``timeout`` of each line of an answer, of which three are waited for, and ``greeting`` of a board that
+    starts are real seconds.
     """
 
     def __init__(
@@ -68,9 +73,10 @@ class TCLabRig(NoticeBook):
         self._set, self._pump, self._bad = [0.0, 0.0], 0, 0
         self._last: tuple[float, list[float]] | None = None
         self._lost, self.closed = False, False
+        self._known_at, self._heard = 0, 0  # the connection whose board is known; bytes so far
         self.faults: tuple[str, ...] = ()
         port.open()
-        self.version = self._greet(greeting)
+        self.version, self._usb = self._greet(greeting), port.usb
 
     @property
     def units(self) -> dict[str, str]:
@@ -151,6 +157,7 @@ class TCLabRig(NoticeBook):
         for _ in range(max(1, round(seconds / self.timeout))):
             lines = self._once(b"VER", 1, _VERSION)
             if lines:
+                self._known_at = self.port.opened
                 self._set_heaters([0.0, 0.0])
                 return lines[0].decode("ascii").strip()
         self.port.close()
@@ -216,24 +223,45 @@ class TCLabRig(NoticeBook):
         with suppress(PortError):  # one that is not confirmed must not keep the other on: the stop ends both
             self._set_heaters([0.0, 0.0])
         try:
-            self._ask(b"X", 1, _STOP)
+            self._ask(b"X", 1, _STOP, known=False)  # whatever board it is
             self._set = [0.0, 0.0]
         except PortError as error:
             self._note("link", f"could not be switched off: {error}; PULL THE PLUG, the heaters stay on")
 
-    def _ask(self, command: bytes, count: int, form: re.Pattern[bytes]) -> list[bytes]:
-        """Return the lines that answer a command, each of the form; three attempts."""
+    def _check_board(self) -> None:
+        """Raise PortError where another board than before may answer now."""
+        version = self._once(b"VER", 1, _VERSION)
+        if not version or not (scan := self._once(b"SCAN", 4, _NUMBER)):
+            raise PortError("lost", "does not answer", file=self.port.url, hint="check cable and power")
+        heaters_as_set = all(abs(float(now) - then) <= 0.002 for now, then in zip(scan[2:], self._set))
+        same = any(self._set) and heaters_as_set
+        if self._usb is not None or self.port.usb is not None:
+            same = self.port.usb == self._usb
+        if not same or version[0].decode("ascii").strip() != self.version:
+            problem = "may be another board now, or was reset: no serial number and no heater tells"
+            raise PortError("lost", problem, file=self.port.url, hint="start anew")
+        self._known_at = self.port.opened
+
+    def _ask(
+        self, command: bytes, count: int, form: re.Pattern[bytes], *, known: bool = True
+    ) -> list[bytes]:
+        """Return the lines that answer a command, each of the form; three attempts, of a board that is
+        ``known`` or, for what switches off, of any."""
         if self.closed:
             raise PortError("lost", "is closed", file=self.port.url, hint="open the rig again")
         try:
             if not self.port.try_open():
                 raise PortError("lost", "is not there", file=self.port.url, hint="check cable and power")
+            if known and self._known_at != self.port.opened:
+                self._check_board()
+            before = self._heard
             lines: list[bytes] = []
             for _ in range(1 if self._lost else 3):
                 if lines := self._once(command, count, form):
                     break
                 self._note("repeated", f"no whole answer to {command.decode()}; asked again")
             if not lines:
+                self._known_at = self._known_at if self._heard > before else 0  # the cable may be elsewhere
                 raise PortError("lost", "does not answer", file=self.port.url, hint="check cable and power")
         except PortError as error:
             if not self._lost:
@@ -249,11 +277,12 @@ class TCLabRig(NoticeBook):
         """Ask once; empty unless so many whole lines of the form came, and nothing else."""
         self.port.drop_input()
         self.port.write(command + b"\r\n")
-        heard, end = b"", time.monotonic() + self.timeout  # real time, as on any serial line
+        heard, end = b"", time.monotonic() + count * self.timeout  # real time, as on any serial line
         while heard.count(b"\n") < count:
-            piece = self.port.read(max(0.0, end - time.monotonic()))
+            piece = self.port.read(min(self.timeout, max(0.0, end - time.monotonic())))
             if not piece:
                 return []
             heard += piece
+            self._heard += len(piece)
         lines = heard.splitlines(keepends=True)
         return lines if len(lines) == count and all(form.fullmatch(line) for line in lines) else []

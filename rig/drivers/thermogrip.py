@@ -8,7 +8,9 @@ decide.  A drive that was not confirmed raises, because it must not count as app
 
 **The conversation.**  A question that is met with silence, or whose answer came damaged, is repeated with the
 same number, and the device does nothing twice.  A lost port is tried again (with back-off) at each question;
-a device that answers again after it was lost or reset is greeted anew, which switches everything off.
+a device that answers again after it was lost or reset is greeted anew, which switches everything off.  It
+must be the same board: by its own serial number; of firmware that has none by that of its USB interface, or,
+where that has none either, by its count of resets.  Another one is never driven.
 
 **Readings by the device's clock.**  An answer at device time u was made between the moment its question was
 sent and the moment it was received, so the host's time less the device's, the offset o, is bounded by each
@@ -114,6 +116,7 @@ class DeviceRig(NoticeBook):
         self._greeted_at, self._lost, self.closed = 0, False, False
         port.open()
         self.identity = self._first_hello(greeting)
+        self._usb = port.usb
 
     @property
     def units(self) -> dict[str, str]:
@@ -272,7 +275,7 @@ class DeviceRig(NoticeBook):
         except PortError as error:
             if not self._lost:
                 self._note("link", str(error))
-            self._lost = True
+            self._lost, self._greeted_at = True, 0
             raise
         if self._lost:
             self._lost = False
@@ -291,16 +294,28 @@ class DeviceRig(NoticeBook):
         return answer.content.faults
 
     def _greet_if_new(self) -> None:
-        """Open a lost port if that is due, and say hello on a new connection or after a reset."""
+        """Open a lost port if that is due, and say hello on a new connection, after a silence or a reset."""
         if not self.port.try_open():
             raise PortError("lost", "is not there", file=self.port.url, hint="check cable and power")
         if self._greeted_at == self.port.opened:
             return
         self._host.reset()
         answer = self._exchange(protocol.Hello())
-        if not isinstance(answer, protocol.Answer) or answer.content != self.identity:
+        if not isinstance(answer, protocol.Answer) or not self._is_same(answer.content):
             raise PortError("lost", "is another device now", file=self.port.url, hint="start anew")
         self._greeted_at = self.port.opened
+
+    def _is_same(self, identity: protocol.Identity | protocol.State | protocol.Taken) -> bool:
+        """Say whether what has answered to hello is the board of the first hello."""
+        if self.identity.serial or identity != self.identity:
+            return identity == self.identity
+        if self._usb is not None or self.port.usb is not None:
+            return self.port.usb == self._usb
+        if self._known is None:  # a reset was announced, which ends the session
+            return True
+        answer = self._exchange(protocol.Read())
+        state = answer.content if isinstance(answer, protocol.Answer) else None
+        return isinstance(state, protocol.State) and state.boot == self._known.boot
 
     def _exchange(self, request: protocol.Request) -> protocol.Answer | protocol.Refused:
         """Repeat a question until it is answered."""

@@ -14,10 +14,11 @@ bool same(const char *a, const char *b) { return strcmp(a, b) == 0; }
 
 }  // namespace
 
-void Core::begin(const Board &board, const char *cause, uint16_t boot, uint32_t now_ms) {
+void Core::begin(const Board &board, const char *cause, uint16_t boot, uint32_t serial, uint32_t now_ms) {
   board_ = &board;
   cause_ = cause;
   boot_ = boot;
+  serial_ = serial;
   started_ms_ = now_ms;
   expires_ms_ = flow_ms_ = now_ms;
   mode_ = OFF;
@@ -231,13 +232,19 @@ const char *Core::announcement() {
   writer_.put(' ');
   writer_.put_unsigned(boot_);
   writer_.put(' ');
-  writer_.put(VERSION);
+  write_version();
   return said_ = writer_.finish();
+}
+
+void Core::write_version() {
+  writer_.put(VERSION);
+  writer_.put('+');
+  writer_.put_unsigned(serial_);
 }
 
 void Core::write_identity() {
   writer_.put(" ok thermogrip/1 ");
-  writer_.put(VERSION);
+  write_version();
   writer_.put(' ');
   for (uint8_t k = 0; k < board_->n_drives; ++k) {
     const Channel &channel = board_->drives[k];

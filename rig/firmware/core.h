@@ -17,8 +17,9 @@
 
 namespace thermogrip {
 
-const char VERSION[] = "0.1.0";
-const size_t MAX_SHORT = 48;  // bytes of a line that answers no question
+const char VERSION[] = "0.2.0";
+const uint32_t SERIALS = 100000000;  // a board's number is below
+const size_t MAX_SHORT = 56;  // bytes of a line that answers no question
 const uint8_t MAX_DRIVES = 2;
 const uint8_t MAX_SENSORS = 4;
 const uint32_t MAX_TTL_MS = 2000;
@@ -70,8 +71,8 @@ constexpr size_t driven(const Board &b, uint8_t k = 0) {  // "-10000,"
                          : larger(digits(b.drives[k].low), digits(b.drives[k].high)) + 1 +
                                driven(b, static_cast<uint8_t>(k + 1));
 }
-constexpr size_t longest_identity(const Board &b) {  // 65535 ok thermogrip/1 0.1.0 CHANNELS pump NAMES
-  return 5 + 4 + 13 + sizeof VERSION + channels(b) + (b.pump ? 5 : 2) + names(b) - 1;
+constexpr size_t longest_identity(const Board &b) {  // 65535 ok thermogrip/1 0.2.0+12345678 CHANNELS pump NAMES
+  return 5 + 4 + 13 + sizeof VERSION + digits(SERIALS) + channels(b) + (b.pump ? 5 : 2) + names(b) - 1;
 }
 constexpr size_t longest_state(const Board &b) {  // 65535 ok expired UPTIME watchdog BOOT FAULTS 1 1 DRIVES VALUES
   return 5 + 4 + 8 + 11 + 9 + 6 + larger(faults(b) + (b.tachometer ? 5 : 0) + 2 * b.n_drives, 2 + driven(b)) + 4 +
@@ -93,8 +94,9 @@ static_assert(MAX_BODY <= 0xFF, "a line's length has two hexadecimal digits");
 
 class Core {
  public:
-  // cause: power, external, brownout, watchdog, software or unknown; boot: how many resets there were.
-  void begin(const Board &board, const char *cause, uint16_t boot, uint32_t now_ms);
+  // cause: power, external, brownout, watchdog, software or unknown; boot: how many resets there were;
+  // serial: of this one board, below SERIALS.
+  void begin(const Board &board, const char *cause, uint16_t boot, uint32_t serial, uint32_t now_ms);
 
   // Take one byte; the answer (or nothing) is in answer() until the next call.  The board must outlive this.
   void receive(char byte, uint32_t now_ms);
@@ -129,6 +131,7 @@ class Core {
   const char *clear();
   const char *set_drive(char **words, size_t n, uint32_t now_ms);
   const char *set_sampling(char **words, size_t n, uint32_t now_ms);
+  void write_version();
   void write_identity();
   void write_state(uint32_t now_ms);
   void write_faults();
@@ -143,6 +146,7 @@ class Core {
   const Board *board_;
   const char *cause_;
   uint16_t boot_;
+  uint32_t serial_;
   uint32_t started_ms_, expires_ms_, flow_ms_;
   Mode mode_;
   int32_t drive_[MAX_DRIVES];

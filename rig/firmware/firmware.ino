@@ -44,6 +44,20 @@ static uint16_t next_boot() {
   return boot;
 }
 
+// The number of this board, which it takes from the noise of its converter at its first start.
+static uint32_t serial() {
+  uint32_t number;
+  EEPROM.get(2, number);
+  if (number < thermogrip::SERIALS) return number;
+  number = micros();
+  for (uint16_t k = 0; k < 512; ++k) {
+    number = 33 * number + static_cast<uint32_t>(analogRead(PIN_SENSORS[k % BOARD.n_sensors]));
+  }
+  number %= thermogrip::SERIALS;
+  EEPROM.put(2, number);
+  return number;
+}
+
 static void apply() {
   thermogrip::Outputs pins = core.outputs();
   uint8_t width = static_cast<uint8_t>(abs(pins.drive[0]) * 255L / 10000L);
@@ -104,7 +118,7 @@ void setup() {
   pinMode(PIN_TACHO, INPUT_PULLUP);
   attachInterrupt(digitalPinToInterrupt(PIN_TACHO), count_edge, FALLING);
   Serial.begin(115200);
-  core.begin(BOARD, cause(), next_boot(), millis());
+  core.begin(BOARD, cause(), next_boot(), serial(), millis());
   int32_t values[thermogrip::MAX_SENSORS];
   measure(values);
   sample(values, millis());

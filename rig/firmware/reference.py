@@ -96,7 +96,8 @@ class Ring:
         self._due_ms += self.period_ms
 
 
-VERSION = "0.1.0"
+VERSION = "0.2.0"
+SERIALS = 100_000_000  # a board's number is below
 BAD_SAMPLES = 4  # in a row, to latch
 PUMP_STALL_MS = 3000
 _WORDS_OF_A_DEVICE = ("ok", "err", "boot")  # come back where a line echoes; answering them would never end
@@ -155,7 +156,8 @@ class _BadCount:
 
 @dataclass
 class DeviceCore:
-    """One device since its last reset: ``boot`` resets so far, ``started_ms`` on its clock [ms]."""
+    """One device since its last reset: ``boot`` resets so far, ``started_ms`` on its clock [ms], the number
+    ``serial`` of this one board."""
 
     board: Board = field(default_factory=Board)
     cause: str = "power"
@@ -163,6 +165,7 @@ class DeviceCore:
     started_ms: int = 0
     mode: str = "off"
     faults: tuple[str, ...] = ()
+    serial: int = 0
 
     def __post_init__(self) -> None:
         self._parser = protocol.LineParser()
@@ -182,10 +185,15 @@ class DeviceCore:
         return Outputs(int(armed), self._drive, self._pump, self._grip)
 
     @property
+    def version(self) -> str:
+        """The firmware's version and the board's serial number."""
+        return f"{VERSION}+{self.serial}"
+
+    @property
     def identity(self) -> protocol.Identity:
         """The device's identity."""
         names = tuple(sensor.name for sensor in self.board.sensors)
-        return protocol.Identity(VERSION, self.board.drives, self.board.pump, names)
+        return protocol.Identity(self.version, self.board.drives, self.board.pump, names)
 
     @property
     def expires_ms(self) -> int | None:
@@ -194,7 +202,7 @@ class DeviceCore:
 
     def announcement(self) -> bytes:
         """Return the line that a device sends once after a reset."""
-        return protocol.encode_line(0, "boot", self.cause, str(self.boot), VERSION)
+        return protocol.encode_line(0, "boot", self.cause, str(self.boot), self.version)
 
     def state(self, now_ms: int) -> protocol.State:
         """Return the whole state."""

@@ -12,7 +12,8 @@ neither can still open the port and steal bytes; the protocol's checks then see 
 lets nobody open a serial port twice, and has no such lock.
 
 **Coming back.**  A lost port is opened again after 0.1 s, then after twice as long each time, up to 5 s.  USB
-devices may return under another number: a name of ``/dev/serial/by-id`` stays the same.
+devices may return under another number: a name of ``/dev/serial/by-id`` stays the same.  Whether it is the
+same device the driver has to ask; :attr:`Port.usb` is what USB says of it.
 
 Clock and sleep are arguments.  What pyserial itself waits for is real time: a serial line has no other.
 """
@@ -79,8 +80,11 @@ class Port:
     """A serial port, pty or socket that is opened, lost and found again.
 
     ``url`` is ``/dev/ttyACM0``, ``COM3`` or ``socket://127.0.0.1:5000``; a change of ``opened``, which
-    counts, shows that the connection is a new one.
+    counts, shows that the connection is a new one.  ``usb`` are vendor, product and serial number of the USB
+    device that was opened last, None where it is none (or has no serial number).
     """
+
+    usb: tuple[int, int, str] | None = None
 
     def __init__(
         self,
@@ -117,6 +121,7 @@ class Port:
             lock.release()
             raise port_error(self.url, error) from error
         self._lock = lock
+        self.usb = _usb_identity(self.url)
         self.opened += 1
         self._back_off.succeeded()
 
@@ -202,6 +207,17 @@ def port_error(url: str, error: Exception) -> PortError:
         hint = "write /dev/ttyACM0 or socket://HOST:PORT"
         return PortError("absent", f"is no port ({text})", file=url, hint=hint)
     return PortError("absent", f"cannot be opened ({text})", file=url, hint="check name, cable and power")
+
+
+def _usb_identity(url: str) -> tuple[int, int, str] | None:
+    """Return vendor, product and serial number of the USB device behind a port, None where it has none."""
+    from serial.tools.list_ports import comports
+
+    name = os.path.realpath(url)
+    for port in comports():
+        if os.path.realpath(port.device) == name and port.serial_number:
+            return port.vid, port.pid, port.serial_number
+    return None
 
 
 def _own_folder(url: str) -> Path:

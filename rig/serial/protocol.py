@@ -6,7 +6,7 @@ firmware.  The host asks and the device answers once, with the number of the que
     7 drive 2000 1 2500            ->   7 ok armed 81204 power 17 - 1 0 2500 31250,30812,25000
     8 drive 2000 0 2500            ->   8 err interlock
     9 take 118                     ->   9 ok 82310 118 120 24,1,2500,31250,30812,25000 -
-                                        0 boot watchdog 18 0.1.0
+                                        0 boot watchdog 18 0.2.0+5309
 
 Every answer but those of hello and take is the whole state, so one exchange a sample both drives and reads.
 A question that got no answer is asked again with the same number; the device repeats its answer and does
@@ -307,10 +307,15 @@ class Channel:
 class Identity:
     """Identity of a device, in the order of every state."""
 
-    version: str  # of the firmware
+    version: str  # of the firmware and, behind a plus, the board's serial number
     drives: tuple[Channel, ...]
     pump: bool  # whether a pump is to run before anything is driven
     sensors: tuple[str, ...]  # names of the temperatures, in the order of every state
+
+    @property
+    def serial(self) -> str:
+        """The board's serial number, "" of firmware before 0.2.0."""
+        return self.version.partition("+")[2]
 
     def words(self) -> tuple[str, ...]:
         """Return the words after ``ok``."""
@@ -356,7 +361,7 @@ class Refused:
 
 @dataclass(frozen=True)
 class Boot:
-    """The device was reset: why, the count of resets, and its firmware."""
+    """The device was reset: why, the count of resets, and its version as in :class:`Identity`."""
 
     cause: str
     count: int

@@ -16,6 +16,7 @@ the supply cuts it), a stalled pump's in the pump, whatever was commanded.
 
 from __future__ import annotations
 
+import secrets
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -24,7 +25,7 @@ from random import Random
 from typing import Any
 
 from thermogrip.rig.clock import ScaledClock
-from thermogrip.rig.firmware.reference import Board, DeviceCore, Outputs, Sensor, Value
+from thermogrip.rig.firmware.reference import SERIALS, Board, DeviceCore, Outputs, Sensor, Value
 from thermogrip.rig.guard.sensor_checks import room_disturbances
 from thermogrip.rig.serial.protocol import Channel
 from thermogrip.rig.simulation.cable import PtyLink, SocketLink, spoil
@@ -270,6 +271,7 @@ class VirtualDevice:
         self._garbage = 0.0
         self._lost: set[str] = set()  # what does not get through
         self._answer = b""
+        self._serial = secrets.randbelow(SERIALS)
         self.core: DeviceCore | TCLabCore = self._fresh_core("power", 1)
         self._advance()
 
@@ -442,7 +444,7 @@ class VirtualDevice:
     def _fresh_core(self, cause: str, boot: int) -> DeviceCore | TCLabCore:
         if self.protocol == "tclab":
             return TCLabCore(self.bench.board)
-        return DeviceCore(self.bench.board, cause, boot % 2**16, self._now_ms())
+        return DeviceCore(self.bench.board, cause, boot % 2**16, self._now_ms(), serial=self._serial)
 
     def _now_ms(self) -> int:
         return round(1000 * self.time)

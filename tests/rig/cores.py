@@ -29,7 +29,7 @@ def reference(script: list[str]) -> str:
         if word == "board":
             board = BOARDS[rest[0]]
         elif word == "begin":
-            core = DeviceCore(board, rest[0], int(rest[1]), int(rest[2]))
+            core = DeviceCore(board, rest[0], int(rest[1]), int(rest[2]), serial=12345678)
             out += core.announcement()
         elif word == "bytes":
             out += core.receive(bytes.fromhex(rest[0]), int(rest[1]))

@@ -53,7 +53,7 @@ int main() {
     } else if (word == "begin") {
       unsigned boot;
       in >> cause >> boot >> now;
-      core.begin(board, cause.c_str(), static_cast<uint16_t>(boot), now);
+      core.begin(board, cause.c_str(), static_cast<uint16_t>(boot), 12345678, now);
       std::fputs(core.announcement(), stdout);
     } else if (word == "bytes") {
       std::string hex;

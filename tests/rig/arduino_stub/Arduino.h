@@ -10,6 +10,7 @@ const uint8_t PORF = 0, EXTRF = 1, BORF = 2, WDRF = 3;
 void digitalWrite(uint8_t pin, uint8_t value);
 void analogWrite(uint8_t pin, int value);
 int analogRead(uint8_t pin);
+unsigned long micros();
 void pinMode(uint8_t pin, uint8_t mode);
 uint32_t millis();
 void noInterrupts();

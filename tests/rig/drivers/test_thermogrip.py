@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import pairwise
 from unittest.mock import Mock
@@ -21,9 +22,11 @@ from thermogrip.datasets.errors import UserError
 from thermogrip.rig.drivers.background_sampler import Sampler
 from thermogrip.rig.drivers.connect import open_rig, recognise
 from thermogrip.rig.drivers.thermogrip import TTL_S, DeviceClock, DeviceRig, Gathering
+from thermogrip.rig.firmware.reference import DeviceCore
+from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.interface import DeviceRefusedError, Reading
 from thermogrip.rig.serial.port import PortError
-from thermogrip.rig.serial.protocol import Kept, Request, Taken, parse_request
+from thermogrip.rig.serial.protocol import Hello, HostEnd, Kept, Request, Taken, parse_request
 from thermogrip.rig.session.session import run_session
 from thermogrip.rig.simulation.virtual_device import VirtualDevice
 from thermogrip.sysid.plant.plant import Plant
@@ -169,14 +172,71 @@ def test_close_never_raises_and_says_what_it_could_not_do(direct: Bench) -> None
     assert any("ends within 2 s" in notice.text for notice in direct.rig.notices())
 
 
-def test_another_device_on_the_same_port_is_not_taken_for_the_first(direct: Bench, plant: Plant) -> None:
-    direct.device.fault("cable_pulled")
+LANGUAGES = {"thermogrip": {"drive": 0.5}, "tclab": {"q1": 50.0, "q2": 0.0}}
+
+
+@pytest.mark.parametrize("lost", ["cable_pulled", "silence"])  # the port is another one, or the adapter's
+@pytest.mark.parametrize("protocol", LANGUAGES)
+@pytest.mark.parametrize("driven_before", [True, False])
+def test_no_drive_reaches_another_board_that_answers_on_the_same_port(
+    protocol: str, lost: str, driven_before: bool, plant: Plant
+) -> None:
+    """Another one of the same kind, as often reset and greeted by somebody before."""
+    lab = protocol == "tclab"
+    bench = Bench(make_lab() if lab else plant, protocol=protocol, options={"timeout": 0.05})
+    rig, port, wait = bench.rig, bench.rig.port, bench.rig.wait
+    other = VirtualDevice(bench.device.bench.twin.plant, protocol=protocol, link="none", clock=bench.clock)
+    other.exchange(b"Q1 0\r\n" if lab else HostEnd().ask(Hello()))
+    controller = Constant(LANGUAGES[protocol] if driven_before else dict.fromkeys(LANGUAGES[protocol], 0.0))
+
+    def swap(seconds: float) -> None:
+        wait(seconds)
+        if bench.clock() >= 10.0 and port.device is bench.device:
+            bench.device.fault(lost)
+            rig.read()
+            port.device, controller.drive = other, LANGUAGES[protocol]
+
+    rig.wait = swap
+    output = "t1" if lab else "t_surface"
+    trip = run_session(rig, controller, {output: 35.0}, guard=Guard(skin=output), clock=bench.clock).trip
+    assert (trip.kind, trip.time_s < 15.0) == ("cable", True)
+    assert "another" in trip.measured
+    bench.clock.sleep(10.0)
+    other.truth()
+    assert len(other.trace) > 150
+    assert not any(any(moment.drive.values()) for moment in other.trace)
+    rig.close()
+
+
+def test_a_board_that_comes_back_is_driven_on_where_its_number_says_so(direct: Bench) -> None:
+    direct.rig.apply(DRIVE, 1)
+    direct.device.fault("silence")
     direct.rig.read()
-    port = direct.rig.port
-    assert isinstance(port, DirectPort)
-    port.device = VirtualDevice(make_lab(), link="none", clock=direct.clock)
-    with pytest.raises(PortError, match="another device"):
-        direct.rig.apply(DRIVE, 1)
+    direct.device.clear()
+    direct.rig.apply(DRIVE, 1)
+    assert direct.device.applied_drive == DRIVE
+
+
+@pytest.mark.parametrize(
+    ("boot", "usb", "driven"),
+    [(7, "A", True), (8, "A", True), (7, "B", False), (7, None, True), (8, None, False)],
+)
+def test_older_firmware_is_known_by_its_usb_interface_or_its_resets(
+    boot: int, usb: str | None, driven: bool, plant: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(DeviceCore, "version", "0.1.0")
+    bench = Bench(plant, options={"timeout": 0.05})
+    port, bench.device.core.boot = bench.rig.port, 7
+    port.usb = bench.rig._usb = usb and (0x2341, 0x43, "A")
+    bench.rig.read()
+    bench.device.fault("cable_pulled")
+    bench.rig.read()
+    bench.device.clear()
+    bench.device.core.boot, port.usb = boot, usb and (0x2341, 0x43, usb)
+    with nullcontext() if driven else pytest.raises(PortError, match="another device"):
+        bench.rig.apply(DRIVE, 1)
+    assert (bench.device.applied_drive == DRIVE) == driven
+    bench.close()
 
 
 @pytest.mark.parametrize(

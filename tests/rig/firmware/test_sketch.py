@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.rig.cores import BOARDS
-from thermogrip.rig.firmware.reference import DeviceCore
+from thermogrip.rig.firmware.reference import SERIALS, DeviceCore
 from thermogrip.rig.serial.protocol import State, encode_line
 
 SKETCH = Path(str(files("thermogrip.rig"))) / "firmware"
@@ -42,7 +42,7 @@ def test_a_compiler_reads_the_sketch_unless_names_would_cut_a_line_off(
 @pytest.mark.parametrize("board", BOARDS)
 def test_the_longest_lines_are_as_long_as_the_sketch_says(board: str, tmp_path: Path) -> None:
     it = BOARDS[board]
-    core = DeviceCore(it, "watchdog", 65535)
+    core = DeviceCore(it, "watchdog", 65535, serial=SERIALS - 1)
     lowest = tuple(max((c.low, c.high), key=lambda n: len(str(n))) for c in it.drives)
     faults = tuple(f"short:{s.name}" for s in it.sensors if s.guarded) + ("pump",) * it.tachometer
     cold = (-273150,) * len(it.sensors)

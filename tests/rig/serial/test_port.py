@@ -266,6 +266,23 @@ def test_a_device_that_goes_while_it_is_opened_is_absent_and_its_lock_free(
     PortLock("/dev/ttyACM0", tmp_path).release()
 
 
+def test_a_port_knows_the_usb_device_that_was_opened_last(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link = PtyLink()
+    link.plug()
+    name, there = os.path.realpath(link.url), []
+    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: there)
+    port, found = Port(link.url, lock_folder=tmp_path), []
+    for device, serial_number in (("/dev/ttyS7", "A"), (name, None), (name, "A"), (name, "B")):
+        there[:] = [SimpleNamespace(device=device, vid=0x2341, pid=0x43, serial_number=serial_number)]
+        port.open()
+        found.append(port.usb)
+        port.close()
+    assert found == [None, None, (0x2341, 0x43, "A"), (0x2341, 0x43, "B")]
+    link.close()
+
+
 def test_a_full_disk_keeps_no_port_shut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*args: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")

@@ -285,8 +285,8 @@ def test_an_answer_of_another_shape_than_the_device_has_is_not_used() -> None:
 
 def test_a_reset_is_announced_damage_is_reported_and_an_unknown_refusal_is_not_used() -> None:
     host = protocol.HostEnd()
-    assert host.hear(DeviceCore(cause="watchdog", boot=18).announcement()) == [
-        protocol.Boot("watchdog", 18, "0.1.0")
+    assert host.hear(DeviceCore(cause="watchdog", boot=18, serial=5309).announcement()) == [
+        protocol.Boot("watchdog", 18, "0.2.0+5309")
     ]
     assert host.hear(DeviceCore().receive(b"7 reed*06EC819405\n", 0)) == [protocol.Refused(None, "corrupt")]
     host.ask(protocol.Read())
