@@ -65,6 +65,10 @@ skin is on its way from 25 to 36 degC or, where marked *held*, was there.
 **A TCLab cannot do this.** Its firmware has no time to live: if its host dies, or its cable is pulled, it heats on
 until somebody pulls the supply. Everything that the host can see is watched on it as well.
 
+**A board that was exchanged is not driven.** After a silence or a new connection our firmware is known by its serial
+number, older firmware and a TCLab by that of their USB interface. Where that has none, a TCLab is known by a heater that
+still is as it was set, and with its heaters off not at all: the session ends as `cable`.
+
 | fault | found after [s] | by | off after [s] | beyond [K] | rows |
 |---|---|---|---|---|---|
 """

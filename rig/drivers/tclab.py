@@ -4,8 +4,9 @@ The TCLab's protocol has no number, no checksum, no time to live and no trip, so
 here:
 
 * **Which answer is whose.**  Old input is thrown away before each question, and one question is open at a
-  time. ``SCAN`` gives both temperatures and both heaters at once; heaters that are not what was set mean a
-  reset, or an answer that slipped.
+  time.  Whenever an answer did not come, or was not what it had to be, silence is waited for before anything
+  is asked again: a late answer would be taken for the next one.  ``SCAN`` gives both temperatures and both
+  heaters at once; heaters that are not what was set mean a reset, or an answer that slipped.
 * **What is a number.**  ``digits.three-digits``, ended by LF or CR LF, inside what the converter can give;
   anything else, also the head of a number that a time-out cut, is asked again.
 * **What is plausible.**  A jump of more than ``jump`` since the last scan of less than 10 s ago is asked
@@ -14,7 +15,6 @@ here:
 * **Trips.**  Four scans in a row above ``highest`` or with a lost sensor switch both heaters off and latch,
   as our own firmware does; the latch is cleared with :meth:`TCLabRig.clear`.  Where the board could not be
   reached then, its heaters go off at the first scan that shows them on.
-
 * **Which board it is.**  The firmware knows no number of its own.  After a silence or on a new connection it
   is the same board where its USB interface has the same serial number or, where that has none, where a heater
   that was on still is, to the last digit.  With the heaters off nothing tells one such board from another: it
@@ -155,6 +155,7 @@ class TCLabRig(NoticeBook):
     def _greet(self, seconds: float) -> str:
         """Ask for the version until the board answers, and switch the heaters off."""
         for _ in range(max(1, round(seconds / self.timeout))):
+            self._wait_for_silence()
             lines = self._once(b"VER", 1, _VERSION)
             if lines:
                 self._known_at = self.port.opened
@@ -170,6 +171,7 @@ class TCLabRig(NoticeBook):
             text = f"Q{channel + 1} {value:.3f}".encode()
             took = float(self._ask(text, 1, _NUMBER)[0])
             if abs(took - value) > 0.002:
+                self._wait_for_silence()
                 took = float(self._ask(text, 1, _NUMBER)[0])  # an answer that slipped, or was spoilt
             if abs(took - value) > 0.002:
                 problem = f"took {took:g} % where q{channel + 1} = {value:g} %"
@@ -180,6 +182,7 @@ class TCLabRig(NoticeBook):
         """Return temperatures and heaters, of three scans where one jumps or is not what was set."""
         numbers = self._scan()
         if self._suspect(numbers):
+            self._wait_for_silence()
             # each of the three must be whole; a single spoilt digit loses against two that agree
             scans = [numbers, self._scan(), self._scan()]
             numbers = [median(column) for column in zip(*scans)]
@@ -260,6 +263,7 @@ class TCLabRig(NoticeBook):
                 if lines := self._once(command, count, form):
                     break
                 self._note("repeated", f"no whole answer to {command.decode()}; asked again")
+                self._wait_for_silence()
             if not lines:
                 self._known_at = self._known_at if self._heard > before else 0  # the cable may be elsewhere
                 raise PortError("lost", "does not answer", file=self.port.url, hint="check cable and power")
@@ -272,6 +276,12 @@ class TCLabRig(NoticeBook):
             self._note("link", "answers again")
         self._lost = False
         return lines
+
+    def _wait_for_silence(self) -> None:
+        """Let late answers come, and throw them away; of what never falls silent, those of four lines."""
+        end = time.monotonic() + 4 * self.timeout
+        while time.monotonic() < end and self.port.read(self.timeout):
+            pass
 
     def _once(self, command: bytes, count: int, form: re.Pattern[bytes]) -> list[bytes]:
         """Ask once; empty unless so many whole lines of the form came, and nothing else."""

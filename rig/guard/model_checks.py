@@ -59,7 +59,6 @@ from thermogrip.datasets.arrays import Array
 from thermogrip.datasets.limits import keyed
 from thermogrip.rig.guard.kalman_filter import Estimate, FilterSettings, History, RigFilter, RigModel
 from thermogrip.rig.guard.plant_mismatch import MOST_DRIFT, Evidence, PlantDrift
-from thermogrip.sysid.plant.fit_record import RUN_GAIN_SD
 from thermogrip.sysid.plant.plant import Plant
 
 
@@ -190,8 +189,8 @@ class ModelSettings(FilterSettings):
     switching: float = keyed(0.5, "switching_K", 0, 20)  # besides, where the pump was switched in it [K]
     smooth: float = keyed(3.0, "smooth_s", 0, 60)  # readings of so long are averaged [s]
     bias_limit: float = keyed(2.0, "bias_limit_K", 0.1, 20)  # of an output [K]
-    # of a drive's bias, a share of what was asked for lately
-    drive_limit: float = keyed(3 * RUN_GAIN_SD, "drive_limit", 0.01, 0.45)
+    # of a drive's bias, a share of what was asked for lately: three of the 5 % from run to run
+    drive_limit: float = keyed(0.15, "drive_limit", 0.01, 0.45)
     warm_up: float = keyed(60.0, "warm_up_s", 0, 3600)  # nothing is compared where it starts not at rest [s]
     drift: float = keyed(0.0, "drift", 0, MOST_DRIFT)  # share by which each plant parameter may have drifted
 

@@ -277,6 +277,7 @@ def test_a_board_that_is_slow_or_ends_its_lines_otherwise_is_read(
 ) -> None:
     device = VirtualDevice(make_lab(), protocol="tclab", link="none", clock=SteppedClock(), t_start=25.0)
     port = SlowPort(device, ends)
+    port._answer = f"{TCLAB_VERSION}\r\n".encode()  # of whoever asked before, and still under way
     monkeypatch.setattr("thermogrip.rig.drivers.tclab.time.monotonic", lambda: port.now)
     lab = TCLabRig(port)
     lab.apply(HALF, 1)
