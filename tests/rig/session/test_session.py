@@ -285,7 +285,8 @@ class StuckInContact(Twin):
 def test_a_driver_that_sticks_in_a_grasp_is_found_though_samples_are_faster_than_the_model(
     plant: Plant, controller: Any
 ) -> None:
-    """0.2 K/s against the first window's 0.55 K, 0.5 K for the pump and a quarter of the change: 7 s.
+    """0.2 K/s against the first window's 0.55 K, 0.5 K for the pump and a quarter of the change: 7 s; the
+    bias of the drive that the filter finds is sooner too large.
 
     It is compared once a second, and twice.  Where readings between two comparisons count as one that found
     nothing it takes longer.
@@ -294,7 +295,7 @@ def test_a_driver_that_sticks_in_a_grasp_is_found_though_samples_are_faster_than
     session = run_session(rig, controller, 34.0, grasp=("copper", 18.0), grasp_time=20.0, guard=Guard(plant))
     assert session.trip.kind in ("driver", "pump", "model")
     closed = next(event.time_s for event in session.events if event.kind == "closed")
-    assert 6.0 < session.trip.time_s - closed < 9.0
+    assert 4.0 < session.trip.time_s - closed < 9.0
 
 
 # ---- a program that is held up in a grasp: the device has measured, and the rows are filled in ----
