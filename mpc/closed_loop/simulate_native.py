@@ -22,9 +22,10 @@ from thermogrip.mpc.closed_loop.simulate import (
 )
 from thermogrip.mpc.controllers.base import as_drive
 from thermogrip.mpc.controllers.mpc import Controller
-from thermogrip.mpc.controllers.pi import UNCUT, PIController
+from thermogrip.mpc.controllers.pi import PIController
 from thermogrip.mpc.interface import STATUSES, Move
 from thermogrip.mpc.native.runtime import CompiledController, CompiledTruth, address
+from thermogrip.mpc.native.shared_constants import UNCUT
 
 if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant

@@ -58,6 +58,7 @@ from thermogrip.mpc.estimator.oscillation import OscillationMonitor
 from thermogrip.mpc.estimator.reading_checks import ReadingMonitor, follows, is_off, too_weak
 from thermogrip.mpc.estimator.structure_monitor import StructureMonitor
 from thermogrip.mpc.interface import Move, Readings, Trajectory
+from thermogrip.mpc.native.shared_constants import CAUTION, MOST_CAUTION, STAYS, WEAK
 from thermogrip.mpc.optimiser.reach import Reach
 from thermogrip.mpc.optimiser.rti import Optimiser, Outcome, Sample
 from thermogrip.mpc.optimiser.switching import choose
@@ -69,10 +70,7 @@ if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
 _KEPT_DRAWS = 50  # of the posterior, in the controller's file for its review
-_CAUTION, _MOST_CAUTION = 3.0, 30.0  # of a mean innovation, from which on moves weigh more; how much more
 _EVEN = 0.1  # of a sample time, by which calls may differ from it in a window of the structure's monitor
-_STAYS = 1e-5  # of its range: a plan that moves by less has converged
-_WEAK = 0.05  # of its gain at rest, below which a drive's bias is not learnt
 
 
 class Controller(Shown, SampledController):
@@ -452,7 +450,7 @@ class Controller(Shown, SampledController):
             self.last_iterations = outcome.iterations
         except (np.linalg.LinAlgError, ArithmeticError) as error:
             return self._fall_back("fallback_plan", f"the prediction failed: {error}")
-        self.observer.hold_drives(outcome.authority < _WEAK)
+        self.observer.hold_drives(outcome.authority < WEAK)
         if outcome.status != "solved":
             status = {"infeasible": "infeasible", "time limit": "late"}.get(outcome.status, "fallback_plan")
             return self._fall_back(status, f"optimiser: {outcome.status}")
@@ -509,7 +507,7 @@ class Controller(Shown, SampledController):
         if self.design.move_delay:  # the drive applied now stays for one more sample
             x = self.model.next_state(x, last + observer.drive_bias, d)
         guess, biases = self._guess(wanted, last), (observer.output_bias, observer.drive_bias)
-        caution = min(max(1.0, float(np.max(np.abs(observer.innovation))) / _CAUTION), _MOST_CAUTION)
+        caution = min(max(1.0, float(np.max(np.abs(observer.innovation))) / CAUTION), MOST_CAUTION)
         if self._coming is not None:
             d = np.where(np.isfinite(self._coming), self._coming, self._d) + observer.disturbance_bias
         sample = Sample(x, last, guess, d, wanted, self._side, *biases, self._slew_s, self._lost, caution)
@@ -536,7 +534,7 @@ class Controller(Shown, SampledController):
         """Return what one program gives, or as many as the design asks for until the plan stays."""
         found, changes = self.optimiser.solve(sample), 0
         for _ in range(1, self.design.iterations if self.model.affine is None else 1):
-            moved = np.abs(found.plan - sample.guess) > _STAYS * self.model.span
+            moved = np.abs(found.plan - sample.guess) > STAYS * self.model.span
             if found.status != "solved" or not moved.any():
                 break
             sample, changes = sample._replace(guess=found.plan), changes + found.iterations

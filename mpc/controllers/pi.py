@@ -29,15 +29,12 @@ from thermogrip.mpc.controllers.base import SampledController
 from thermogrip.mpc.controllers.loop_status import LoopStatus
 from thermogrip.mpc.design.design import Design, PILoop, default_controlled, pair_loops
 from thermogrip.mpc.interface import Move, Readings, Trajectory
+from thermogrip.mpc.native.shared_constants import UNCUT
 from thermogrip.mpc.plant.prediction import ROOM, PredictionModel, holding_drive, prediction_model
 
 if TYPE_CHECKING:
     from thermogrip.mpc.native.runtime import CompiledController
     from thermogrip.sysid.plant.plant import Plant
-
-
-#: Of a range: a drive that is cut by less is not limited.
-UNCUT = 1e-9
 
 
 class PIController(SampledController):

@@ -20,10 +20,11 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 
-_LATE, _SLACK = 3.0, 10  # how many promised times are given, and samples besides: loads must be learnt too
-_SAMPLES = 5  # in a row that make an arrival
-_REMEMBER = 0.3  # share of the newest error in their mean
-_READINGS = 4.0  # standard deviations of a reading that are near
+# how many promised times are given, and samples besides: loads must be learnt too
+LATE_TIMES, LATE_SAMPLES = 3.0, 10
+ARRIVAL_SAMPLES = 5  # in a row that make an arrival
+NEWEST_ERROR = 0.3  # share of the newest error in their mean
+NEAR_SD = 4.0  # standard deviations of a reading that are near
 
 
 class ArrivalMonitor:
@@ -37,7 +38,7 @@ class ArrivalMonitor:
     @classmethod
     def of(cls, names: Sequence[str], dt: float, overshoot: float, variance: Array) -> ArrivalMonitor:
         """Return the monitor of outputs that may overshoot by so much, with variances of a reading (n,)."""
-        return cls(names, dt, np.maximum(overshoot, _READINGS * np.sqrt(variance)))
+        return cls(names, dt, np.maximum(overshoot, NEAR_SD * np.sqrt(variance)))
 
     def restart(self) -> None:
         """Forget what was promised."""
@@ -64,14 +65,14 @@ class ArrivalMonitor:
             self._target = target.copy()
         error = y - target
         begun = np.where(np.isfinite(self._error), self._error, error)
-        self._error = np.where(np.isfinite(error), begun + _REMEMBER * (error - begun), begun)
+        self._error = np.where(np.isfinite(error), begun + NEWEST_ERROR * (error - begun), begun)
         off = np.abs(self._error) - zone
         self._stayed = np.where(off <= self.near, self._stayed + 1, 0)
-        there = self._stayed >= _SAMPLES
+        there = self._stayed >= ARRIVAL_SAMPLES
         self._due = np.where(there, np.inf, self._due - seconds)
         self._late = np.where(there, 0.0, self._late + seconds)
         begins = np.isfinite(promised) & (off > self.near) & np.isinf(self._due)
-        self._due = np.where(begins, _LATE * promised + _SLACK * self.dt, self._due)
+        self._due = np.where(begins, LATE_TIMES * promised + LATE_SAMPLES * self.dt, self._due)
         self._late = np.where(begins, -promised, self._late)
         away = (off > self.near) & (np.abs(error) - zone > self.near)
         overdue = away & (self._due < 0)

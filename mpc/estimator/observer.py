@@ -188,10 +188,10 @@ LONGEST_LAG, _LONGEST, _LAG_DRIFT = 6.0, 4.0, 0.02
 #: Per sqrt(sample), of the share by which an output moves more than the model's.
 _SCALE_DRIFT = 0.001
 _REPEATS, _SAME = 5, 1e-3  # of the start on a nonlinear plant, and when it is still [degC]
-_REMEMBER = 0.2  # share of the newest innovation in their mean
+NEWEST_INNOVATION = 0.2  # share of the newest innovation in their mean
 # the same in the mean that shows what lasts, from how many of its standard deviations on it does, and how
 # many times as fast a black box then learns what a drive lacks
-_LASTING, _LASTS, _QUICKER = 0.02, 3.0, 5.0
+LASTING, LASTS, _QUICKER = 0.02, 3.0, 5.0
 #: Of a drive, in fractions of its range: no drive makes up for more.
 LARGEST_BIAS = 1.0
 
@@ -527,7 +527,7 @@ class Observer:
 
     def update(self, y: Array) -> Array:
         """Correct the estimate with a reading (n_y,), NaN where lost; return the innovation (n_y,)."""
-        return self._correct(y, self.R + self._bent**2, remember=_REMEMBER)
+        return self._correct(y, self.R + self._bent**2, remember=NEWEST_INNOVATION)
 
     def refine(self, y: Array) -> None:
         """Correct the estimate with a reading (n_y,) between two moves; the mean innovation is that of
@@ -539,7 +539,7 @@ class Observer:
     @property
     def innovation_bias(self) -> float:
         """How far the mean innovation is from 0, in standard deviations of that mean; the largest of all."""
-        return float(np.max(np.abs(self.innovation)) * np.sqrt((2 - _REMEMBER) / _REMEMBER))
+        return float(np.max(np.abs(self.innovation)) * np.sqrt((2 - NEWEST_INNOVATION) / NEWEST_INNOVATION))
 
     def _correct(self, y: Array, R: Array, *, remember: float = 0.0, held: Mask | None = None) -> Array:
         """Correct the estimate with a reading whose variances are R (n_y,), but for states that are held."""
@@ -552,7 +552,7 @@ class Observer:
             PH = self._P @ H.T
             S = H @ PH + np.diag(R[seen])
             gain = np.linalg.solve(S, PH.T).T
-            scaled, last = innovation[seen] / np.sqrt(np.diag(S)), _LASTING if remember else 0.0
+            scaled, last = innovation[seen] / np.sqrt(np.diag(S)), LASTING if remember else 0.0
             mean, lasting = self.innovation.copy(), self.lasting.copy()
             mean[seen] += remember * (scaled - mean[seen])
             lasting[seen] += last * (scaled - lasting[seen])
@@ -571,7 +571,7 @@ class Observer:
 
     def _noise(self, share: float) -> Array:
         """Return the variance that a share of a sample adds to the states."""
-        lasts = np.max(np.abs(self.lasting)) * np.sqrt((2 - _LASTING) / _LASTING) > _LASTS
+        lasts = np.max(np.abs(self.lasting)) * np.sqrt((2 - LASTING) / LASTING) > LASTS
         return np.where(self._held, 0.0, share * (self.Q_lasting if lasts else self.Q))
 
     def _doubt(self) -> Array:

@@ -36,13 +36,13 @@ import numpy as np
 
 from thermogrip.datasets.arrays import Array
 
-_SWINGS = 6  # half swings in a row
-_LEFT = 0.5  # of the IAE of the first, that the last must have
-_SHORTEST = 6.0  # samples, of a period
+SWINGS = 6  # half swings in a row
+LAST_SWING = 0.5  # of the IAE of the first, that the last must have
+SHORTEST_PERIOD = 6.0  # samples, of a period
 _LONGEST = 2.5  # ultimate periods, of a half swing
-_NOISE = 3.0  # standard deviations of a reading that are no swing
-_READINGS = 30  # of which the noise is the mean
-_SPIKE = 10.0  # variances, as much as one value may show
+NOISE_SD = 3.0  # standard deviations of a reading that are no swing
+NOISE_READINGS = 30  # of which the noise is the mean
+SPIKE_VARIANCES = 10.0  # variances, as much as one value may show
 
 
 class _Half(NamedTuple):
@@ -86,19 +86,19 @@ class Oscillation:
     @property
     def least(self) -> float:
         """Amplitude from which on a swing counts."""
-        return max(self._allowed, _NOISE * sqrt(self._variance))
+        return max(self._allowed, NOISE_SD * sqrt(self._variance))
 
     @property
     def period(self) -> float:
         """Of the last swings [s]."""
-        halves = self._counted()[-_SWINGS:]
+        halves = self._counted()[-SWINGS:]
         n = len(halves)
         return 2.0 * (halves[-1].begin - halves[0].begin) / (n - 1) if n > 1 else inf
 
     @property
     def amplitude(self) -> float:
         """Of the last swings."""
-        halves = self._counted()[-_SWINGS:]
+        halves = self._counted()[-SWINGS:]
         seconds = sum(half.end - half.begin for half in halves)
         return 0.5 * pi * sum(half.iae for half in halves) / seconds if halves else 0.0
 
@@ -122,17 +122,17 @@ class Oscillation:
 
     def _note_noise(self, value: float) -> None:
         if len(self._last) == 4:
-            self._seen = min(self._seen + 1, _READINGS)
+            self._seen = min(self._seen + 1, NOISE_READINGS)
             a, b, c, d = self._last
             fourth = a - 4.0 * b + 6.0 * c - 4.0 * d + value
-            known = self._seen == _READINGS
-            most = max(known * _SPIKE * self._variance, self._allowed * self._allowed)
+            known = self._seen == NOISE_READINGS
+            most = max(known * SPIKE_VARIANCES * self._variance, self._allowed * self._allowed)
             self._variance += (min(fourth * fourth / 70.0, most) - self._variance) / self._seen
         self._last = (*self._last[-3:], value)
 
     def _close(self, side: float, begin: float) -> None:
         """Keep the half swing that ends where it counts, and begin one on this side."""
-        self._halves = self._counted()[-_SWINGS:]
+        self._halves = self._counted()[-SWINGS:]
         self._arrived = self._arrived or self._open.side != 0.0
         self._open = _Half(side, 0.0, begin, begin)
 
@@ -151,8 +151,8 @@ class Oscillation:
 
     def _swings(self) -> bool:
         """Return whether it swings: by the half swing that is open, or before it."""
-        both = self._counted()[-_SWINGS:], self._halves[-_SWINGS:]
-        return any(len(last) == _SWINGS and last[-1].iae >= _LEFT * last[0].iae for last in both)
+        both = self._counted()[-SWINGS:], self._halves[-SWINGS:]
+        return any(len(last) == SWINGS and last[-1].iae >= LAST_SWING * last[0].iae for last in both)
 
 
 def longest_half_swings(delays: Sequence[float], dt: float) -> list[float]:
@@ -169,7 +169,9 @@ class OscillationMonitor:
     ) -> None:
         self.names = tuple(names)
         longest = longest_half_swings(delays, dt)
-        self._signals = [Oscillation(_SHORTEST * dt, *both) for both in zip(longest, allowed, strict=True)]
+        self._signals = [
+            Oscillation(SHORTEST_PERIOD * dt, *both) for both in zip(longest, allowed, strict=True)
+        ]
         self._target: list[float] = []
 
     @property

@@ -39,15 +39,15 @@ from thermogrip.mpc.plant.prediction import SPIKE
 if TYPE_CHECKING:
     from thermogrip.mpc.estimator.observer import Observer
 
-_LEFT_OUT = 3  # samples in a row, at most, that a jump is left out for
+LEFT_OUT = 3  # samples in a row, at most, that a jump is left out for
 #: Of a jump (6 degC, or a tenth of a wide range): what the model expects of a reading that has not moved at
 #: all, and a bias of an output that is no small error of the model.
-_SHARE = 1 / 3
-_FOLLOWS_DRIVE = 0.3  # of its range: a larger bias of a drive is not a small error of the model
+SHARE = 1 / 3
+FOLLOWS_DRIVE = 0.3  # of its range: a larger bias of a drive is not a small error of the model
 
 # of a lag behind the model: least, least once reported, largest standard deviation [samples], least in those
-_SLOWER, _STILL_SLOWER, _SHOWN_TO, _SLOWER_SD = 0.65, 0.25, 0.25, 5.0
-_SLOW_FOR = 5  # samples in a row, until it is reported
+SLOWER_BY, STILL_SLOWER, SHOWN_TO, SLOWER_SD = 0.65, 0.25, 0.25, 5.0
+SLOW_FOR = 5  # samples in a row, until it is reported
 
 
 class ReadingMonitor:
@@ -68,10 +68,10 @@ class ReadingMonitor:
     def slower(self, observer: Observer) -> str:
         """Return which output is slower than the model, and by how much; empty where none surely is."""
         lag, sd = observer.lag / observer.model.dt, observer.lag_sd / observer.model.dt
-        sure = ~too_weak(observer) & (lag > _SLOWER) & (lag > _SLOWER_SD * sd) & (sd < _SHOWN_TO)
-        sure |= (self._slow_for == _SLOW_FOR) & (lag > _STILL_SLOWER)
-        self._slow_for = np.where(sure, np.minimum(self._slow_for + 1, _SLOW_FOR), 0)
-        slow = np.where(self._slow_for == _SLOW_FOR, observer.lag, 0.0)
+        sure = ~too_weak(observer) & (lag > SLOWER_BY) & (lag > SLOWER_SD * sd) & (sd < SHOWN_TO)
+        sure |= (self._slow_for == SLOW_FOR) & (lag > STILL_SLOWER)
+        self._slow_for = np.where(sure, np.minimum(self._slow_for + 1, SLOW_FOR), 0)
+        slow = np.where(self._slow_for == SLOW_FOR, observer.lag, 0.0)
         if not slow.any():
             return ""
         name = observer.model.outputs[observer.lagged[int(np.argmax(slow))]]
@@ -84,14 +84,14 @@ class ReadingMonitor:
     @property
     def stuck(self) -> Mask:
         """Which readings (n_y,) have stayed the same too long to be true."""
-        return np.asarray(np.abs(self._moved) > _SHARE * self._spike)
+        return np.asarray(np.abs(self._moved) > SHARE * self._spike)
 
     def screen(self, y: Array, expected: Array) -> tuple[Array, Mask]:
         """Return a reading y (n_y,) [degC], NaN where it cannot be, and which of its sensors (n_y,) have
         jumped and stay there; ``expected`` (n_y,) is the prediction."""
         y, jumped = self._found(y, expected)
         self._spikes = np.where(jumped, self._spikes + 1, np.where(np.isfinite(y), 0, self._spikes))
-        stays = self._spikes > _LEFT_OUT
+        stays = self._spikes > LEFT_OUT
         self._spikes[stays] = 0
         return np.where(jumped & ~stays, np.nan, y), stays
 
@@ -111,7 +111,7 @@ class ReadingMonitor:
 
 def too_weak(observer: Observer) -> np.bool_:
     """Return whether a drive does far less, or far more, than the model has."""
-    return np.any(np.abs(observer.disturbance.on_drive @ observer.w) >= _FOLLOWS_DRIVE)
+    return np.any(np.abs(observer.disturbance.on_drive @ observer.w) >= FOLLOWS_DRIVE)
 
 
 def follows(observer: Observer, controlled: tuple[str, ...]) -> str:
@@ -121,7 +121,7 @@ def follows(observer: Observer, controlled: tuple[str, ...]) -> str:
         do = "does" if len(controlled) == 1 else "do"
         return f"{', '.join(controlled)} {do} not follow the drive: {pump or 'is it another plant'}?"
     off = np.abs(observer.output_bias - observer.offset)
-    far = off / (_SHARE * observer.model.spike)
+    far = off / (SHARE * observer.model.spike)
     if np.any(far >= 1.0):
         name = observer.model.outputs[int(np.argmax(far))]
         return f"{name} is far from the model: {pump}{', ' * bool(pump)}is the sensor in place?"

@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermogrip.datasets.arrays import Array
-from thermogrip.mpc.estimator.oscillation import longest_half_swings
+from thermogrip.mpc.estimator.oscillation import SWINGS, longest_half_swings
 from thermogrip.mpc.native.modes import Modes, modes_of
+from thermogrip.mpc.native.shared_constants import shared_definitions
+from thermogrip.mpc.optimiser.reach import BINS
 from thermogrip.mpc.plant.prediction import apparent_delays
 
 if TYPE_CHECKING:
@@ -27,8 +29,6 @@ if TYPE_CHECKING:
 
 ITERATION_LIMIT = 500
 _INTEGRATES = 1e10  # condition of I - A, from which on a plant has no steady state worth the name
-_BINS = 12  # TG_BINS of tg_controller.h
-_HALVES = 6  # of TG_SWINGS
 
 #: name -> (whole number?, shape in names of sizes, comment)
 _FIELDS: dict[str, tuple[bool, tuple[str, ...], str]] = {
@@ -240,6 +240,7 @@ def config_header(sizes: Sizes) -> str:
     names = [*(entry.name for entry in fields(Sizes)), "NS", "NV"]
     lines = ["/* Sizes and numbers of one controller. */", "#ifndef TG_CONFIG_H", "#define TG_CONFIG_H", ""]
     lines += [f"#define TG_{name} {getattr(sizes, name)}" for name in names]
+    lines += ["", "/* What the C shares with the Python. */", *shared_definitions()]
     lines += ["", "typedef struct {"]
     for name, (whole, _, comment) in _FIELDS.items():
         shape = sizes.shape(name)
@@ -413,10 +414,10 @@ def _controller_parts(s: Sizes, number: Any) -> list[tuple[Any, int]]:
     whole = ctypes.c_int
     n, z, some = s.NB * s.NU, s.NZ, max(1, s.NS)
     wide = _whole(max(s.NX + s.NU + s.ND, n))
-    still = [*((number, count) for count in (s.NU, s.NW, _BINS, 1)), (whole, 3)]
+    still = [*((number, count) for count in (s.NU, s.NW, BINS, 1)), (whole, 3)]
     relaxation = type("tg_relaxation", (ctypes.Structure,), {"_fields_": _laid_out(still)})
     half = type("tg_half", (ctypes.Structure,), {"_fields_": _laid_out([(number, 4)])})
-    swings = [(number, 7), (whole, 4), (half, _HALVES + 1)]
+    swings = [(number, 7), (whole, 4), (half, SWINGS + 1)]
     swing = type("tg_swing", (ctypes.Structure,), {"_fields_": _laid_out(swings)})
     arrival = type("tg_arrival", (ctypes.Structure,), {"_fields_": _laid_out([(number, 5), (whole, 1)])})
     qp = type("tg_qp", (ctypes.Structure,), {"_fields_": _laid_out(_qp_parts(s, number))})

@@ -14,7 +14,7 @@ from scipy.linalg.lapack import dposv
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.mpc.optimiser.qp import CondensedQP, QPAnswer
 
-_REGULAR, _TOLERANCE, _SHORT, _CONTRADICTION, _FAR = 1e-11, 1e-10, 1e-5, 1e-6, 1e15
+REGULAR, TOLERANCE, SHORT, CONTRADICTION, FAR = 1e-11, 1e-10, 1e-5, 1e-6, 1e15
 _HARD, _KEPT, _BROKEN = 0, 1, 2
 
 
@@ -31,11 +31,11 @@ class ActiveSetQP(CondensedQP):
 
     def _solve(self, H: Array, f: Array, A: Array, lower: Array, upper: Array) -> QPAnswer:
         length = np.linalg.norm(A / np.sqrt(np.diag(H)), axis=1)
-        idle = self.soft & (length <= _SHORT)
+        idle = self.soft & (length <= SHORT)
         self._weight = 1.0 / np.where(idle, 1.0, length)
         self._given_bounds = lower, upper
-        self._lower = np.where(idle | (lower < -_FAR), -np.inf, lower)
-        self._upper = np.where(idle | (upper > _FAR), np.inf, upper)
+        self._lower = np.where(idle | (lower < -FAR), -np.inf, lower)
+        self._upper = np.where(idle | (upper > FAR), np.inf, upper)
         back = np.linalg.inv(np.linalg.cholesky(H))
         normals, c = A @ back.T, back @ f
         self._K, along = normals @ normals.T, normals @ c
@@ -72,7 +72,7 @@ class ActiveSetQP(CondensedQP):
         """Return K, with its regular share, and the right side, of the set."""
         rows, sides = np.array(self._rows), np.array(self._sides, dtype=float)
         K = self._K[rows[:, None], rows] * (sides[:, None] * sides)
-        diagonal = K.flat[:: len(K) + 1] * (1 + _REGULAR)
+        diagonal = K.flat[:: len(K) + 1] * (1 + REGULAR)
         right = np.where(sides > 0, self._right[1][rows], self._right[-1][rows])
         for at, (row, state) in enumerate(zip(self._rows, self._states)):
             if state == _BROKEN:
@@ -132,7 +132,7 @@ class ActiveSetQP(CondensedQP):
         most = np.maximum(over, under)
         most[self._rows] = 0.0
         row = int(np.argmax(most))
-        return (row, 1 if over[row] > under[row] else -1) if most[row] > _TOLERANCE else None
+        return (row, 1 if over[row] > under[row] else -1) if most[row] > TOLERANCE else None
 
     def _refined(self, iterations: int, n: int) -> QPAnswer:
         """Take back what the regular share did, and look whether the hard rows hold."""
@@ -145,7 +145,7 @@ class ActiveSetQP(CondensedQP):
             more = _solution(self._system()[0], rest).tolist()
             self._multipliers = [now + add for now, add in zip(self._multipliers, more)]
             over = np.where(np.array(self._states) == _HARD, self._beyond() * self._weight[self._rows], 0.0)
-            if not over.max() < _CONTRADICTION:
+            if not over.max() < CONTRADICTION:
                 return QPAnswer(np.full(n, np.nan), "infeasible", iterations, multipliers, multipliers)
             multipliers[self._rows] = self._pushes()
         x, value = self._free - self._by.T @ multipliers, self._values()

@@ -56,18 +56,18 @@ if TYPE_CHECKING:
     from thermogrip.mpc.estimator.observer import Observer
 Mask = NDArray[np.bool_]
 
-_STEPS, _SWEEPS = 12, 200
-_STRIDE = 0.3  # of its range, that a drive may go in a step
-_CONVERGED = 1e-4  # degC and of the range: the steady state is found
-_LIMIT = 100.0  # weight of an output beyond its limits
-_OUT, _IN = 0.1, 0.05  # degC from the target: it cannot be had, it can
-_LEAST_SD = 0.05  # degC, of a steady output where no bias is estimated
-_CLIP, _ALLOWANCE, _ALARM = 2.0, 0.5, 3.0  # of Page's test
-_TAKE_BACK = 5  # samples in a row
-_BINS = 12  # of a relaxation's means; when they are full, neighbours are joined
-_STILL = 0.01  # of its range: a drive that moves by less is still
-_SURE, _KEPT = 3.0, -3.0  # standard deviations of g, to report and to keep
-_CONTRADICTED = 2.0  # sigma that the bias moves while the drives stand still
+STEADY_STEPS, SWEEPS = 12, 200
+STRIDE = 0.3  # of its range, that a drive may go in a step
+CONVERGED = 1e-4  # degC and of the range: the steady state is found
+BEYOND_LIMIT = 100.0  # weight of an output beyond its limits
+CANNOT, CAN = 0.1, 0.05  # degC from the target: it cannot be had, it can
+LEAST_SD = 0.05  # degC, of a steady output where no bias is estimated
+MISS_CLIP, MISS_ALLOWANCE, MISS_ALARM = 2.0, 0.5, 3.0  # of Page's test
+TAKE_BACK = 5  # samples in a row
+BINS = 12  # of a relaxation's means; when they are full, neighbours are joined
+STILL = 0.01  # of its range: a drive that moves by less is still
+SURE, KEPT = 3.0, -3.0  # standard deviations of g, to report and to keep
+CONTRADICTED = 2.0  # sigma that the bias moves while the drives stand still
 
 
 class _Relaxation:
@@ -86,7 +86,7 @@ class _Relaxation:
         if self.n == self.per:
             self.bins.append(self.sum / self.n)
             self.sum, self.n = 0.0, 0
-            if len(self.bins) == _BINS:
+            if len(self.bins) == BINS:
                 self.bins = [(a + b) / 2 for a, b in zip(self.bins[::2], self.bins[1::2], strict=True)]
                 self.per *= 2
 
@@ -98,7 +98,7 @@ class _Relaxation:
         m1, m2, m3 = np.array(self.bins[-3 * span :]).reshape(3, span).mean(axis=1).tolist()
         left = target - m3
         side = 1.0 if left > 0 else -1.0
-        left, d1, d2 = abs(left) - _OUT, side * (m2 - m1), side * (m3 - m2)
+        left, d1, d2 = abs(left) - CANNOT, side * (m2 - m1), side * (m3 - m2)
         if left <= 0 or d1 <= d2:
             return np.nan, np.nan
         g = d1 * left - d2 * (d2 + left)
@@ -155,29 +155,29 @@ class Reach:
         if not np.array_equal(target, self._target):
             self._target, self._sum, self._in, self._unreachable = target.copy(), 0.0, 0, False
         self._record(y, u, observer.w)
-        limit, lost = _IN if self._unreachable else _OUT, False
+        limit, lost = CAN if self._unreachable else CANNOT, False
         if np.any(np.abs(target - ahead)[seen] > limit):
             held, J = self._held(observer, u, d + observer.disturbance_bias, target, side, seen)
-            lost = held is target and self._sum >= _ALARM  # none was found
+            lost = held is target and self._sum >= MISS_ALARM  # none was found
         else:
             held, J = target, np.zeros((len(target), observer.w.size))
         w_at = slice(self.model.n_x, self.model.n_x + observer.w.size)
         P = observer.estimate()["P"][w_at, w_at]
-        sd = np.maximum(np.sqrt(np.einsum("ij,jk,ik->i", J, P, J)), _LEAST_SD)
+        sd = np.maximum(np.sqrt(np.einsum("ij,jk,ik->i", J, P, J)), LEAST_SD)
         miss = np.where(seen, np.abs(target - held), 0.0)
-        scaled = (miss - _OUT) / (sd * max(1.0, observer.innovation_bias))
+        scaled = (miss - CANNOT) / (sd * max(1.0, observer.innovation_bias))
         if not lost:
-            step = float(np.clip(scaled.max(), -1, _CLIP)) - _ALLOWANCE
-            self._sum = min(max(0.0, self._sum + step), _ALARM)
+            step = float(np.clip(scaled.max(), -1, MISS_CLIP)) - MISS_ALLOWANCE
+            self._sum = min(max(0.0, self._sum + step), MISS_ALARM)
         short, ends = self._readings_say(observer.w, J, sd, miss, target, seen)
         allowed = np.clip(target, *self._own)
-        barred = seen & (np.abs(target - allowed) > _OUT)
+        barred = seen & (np.abs(target - allowed) > CANNOT)
         out = (miss > limit) | short | barred
         if self._unreachable:
             self._in = 0 if out.any() or lost else self._in + 1
-            self._unreachable = self._in < _TAKE_BACK
+            self._unreachable = self._in < TAKE_BACK
         else:
-            self._in, self._unreachable = 0, self._sum >= _ALARM or bool((short | barred).any())
+            self._in, self._unreachable = 0, self._sum >= MISS_ALARM or bool((short | barred).any())
         if not self._unreachable:
             return None
         if out.any():
@@ -190,7 +190,7 @@ class Reach:
     def _record(self, y: Array, u: Array, w: Array) -> None:
         span = self.model.span
         for at, (movers, relaxation) in enumerate(zip(self._movers, self._relaxations, strict=True)):
-            still = np.all(np.abs(u - relaxation.u)[movers] <= _STILL * span[movers])
+            still = np.all(np.abs(u - relaxation.u)[movers] <= STILL * span[movers])
             if not still or not np.isfinite(y[at]):
                 relaxation.restart(u.copy(), w.copy())
             if np.isfinite(y[at]):
@@ -206,10 +206,10 @@ class Reach:
                 continue
             g, end = relaxation.falls_short(float(target[at]), float(self._sd[at]))
             if self._unreachable:
-                short[at] = g > _KEPT
-            elif g > _SURE:
+                short[at] = g > KEPT
+            elif g > SURE:
                 drift = np.sign(end - target[at]) * (J[at] @ (w - relaxation.w))
-                short[at] = miss[at] > _OUT or drift > _CONTRADICTED * sd[at]
+                short[at] = miss[at] > CANNOT or drift > CONTRADICTED * sd[at]
             ends[at] = end
         return short, ends
 
@@ -224,7 +224,7 @@ class Reach:
         x_s, u_s = (observer.now, u) if self._x is None else (self._x, self._u)
         u_s, self._x = np.clip(u_s, lowest, highest), None
         nothing = target, np.zeros((len(target), observer.w.size))
-        for _ in range(_STEPS):
+        for _ in range(STEADY_STEPS):
             after, A, B, E = model.linearise(x_s, u_s + drive_bias, d)
             by_w = B @ (found.on_drive * model.span[:, None]) + E @ found.on_disturbance
             try:
@@ -238,11 +238,11 @@ class Reach:
             y = model.output(x_s + by[:, 0]) + bias
             G = model.C @ by[:, 1 : 1 + model.n_u]
             low, high = self._range(G, u_s, drive_bias)
-            low = np.minimum(np.maximum((low - u_s) / model.span, -_STRIDE), _STRIDE)
-            high = np.maximum(np.minimum((high - u_s) / model.span, _STRIDE), low)
+            low = np.minimum(np.maximum((low - u_s) / model.span, -STRIDE), STRIDE)
+            high = np.maximum(np.minimum((high - u_s) / model.span, STRIDE), low)
             z = self._nearest(G, y, target, side, seen, low, high)
             x_s, u_s = x_s + by[:, 0] + by[:, 1 : 1 + model.n_u] @ z, u_s + z * model.span
-            if np.max(np.abs(by[:, 0])) < _CONVERGED and np.max(np.abs(z)) < _CONVERGED:
+            if np.max(np.abs(by[:, 0])) < CONVERGED and np.max(np.abs(z)) < CONVERGED:
                 self._x, self._u = x_s, u_s
                 return (y + G @ z)[rows], (model.C @ by[:, 1 + model.n_u :] + found.on_output)[rows]
         return nothing
@@ -257,14 +257,18 @@ class Reach:
         z = np.zeros(len(low))
         for _ in range(len(rows) + len(limited)):
             ends = np.where(over > 0, self._limits[1], self._limits[0])
-            e = np.concatenate([weight * (target - y[rows]), _LIMIT * np.abs(over) * (ends - y[limited])])
-            own = np.concatenate([weight[:, None] * G[rows], (_LIMIT * np.abs(over))[:, None] * G[limited]])
+            e = np.concatenate(
+                [weight * (target - y[rows]), BEYOND_LIMIT * np.abs(over) * (ends - y[limited])]
+            )
+            own = np.concatenate(
+                [weight[:, None] * G[rows], (BEYOND_LIMIT * np.abs(over))[:, None] * G[limited]]
+            )
             z = _least_squares_in_box(own, e, low, high)
             new = y + G @ z
             before = weight, over
-            weight = np.where(seen & (side * (new[rows] - target) > _IN), self._beyond, weight)
-            over = np.where(new[limited] > self._limits[1] + _IN, 1.0, over)
-            over = np.where(new[limited] < self._limits[0] - _IN, -1.0, over)
+            weight = np.where(seen & (side * (new[rows] - target) > CAN), self._beyond, weight)
+            over = np.where(new[limited] > self._limits[1] + CAN, 1.0, over)
+            over = np.where(new[limited] < self._limits[0] - CAN, -1.0, over)
             if np.array_equal(weight, before[0]) and np.array_equal(over, before[1]):
                 break  # another pass is the same
         return z
@@ -283,7 +287,7 @@ def _least_squares_in_box(G: Array, e: Array, low: Array, high: Array) -> Array:
     H, f = (G.T @ G).tolist(), (G.T @ e).tolist()  # of a drive or two: lists are faster than arrays
     least = 1e-12 * max(sum(row[j] for j, row in enumerate(H)), 1e-300)
     ends, z = list(zip(low.tolist(), high.tolist())), [0.0] * len(f)
-    for _ in range(_SWEEPS):
+    for _ in range(SWEEPS):
         moved = 0.0
         for j, (row, (lowest, highest)) in enumerate(zip(H, ends)):
             left = f[j] - sum(map(mul, row, z))

@@ -60,18 +60,18 @@ from thermogrip.mpc.optimiser.qp import CondensedQP
 from thermogrip.mpc.plant.along_plan import AlongPlan
 from thermogrip.mpc.plant.prediction import PredictionModel
 
-_SHARES = np.array([0.5, 0.25, 0.1, 0.0])
-_SAFE = 0.85  # of the way to the optimum, where the range runs on beyond it
+SHARES = (0.5, 0.25, 0.1, 0.0)
+SAFE = 0.85  # of the way to the optimum, where the range runs on beyond it
 FADING = 0.3  # of the gain at rest lost, from which on it is foreseen where it fades
-_LOOK_AROUND = 5  # samples between two trials of the ramps
-_LITTLE = 1e-7  # of its range, that a parked drive may be off in the program
+LOOK_AROUND = 5  # samples between two trials of the ramps
+LITTLE = 1e-7  # of its range, that a parked drive may be off in the program
 #: Of the price of a square of 1, that a distance of 1 beyond a soft row costs: at 1 the noise of a reading,
 #: which moves all of a prediction, was answered with full drive wherever the band was used.
 FIRST = 0.2
 _DEAR = 1000.0  # times the price of a soft limit, of a hard one
 #: Square of a move beside the move, in the price of travel: the program's penalties may not be flat.
 CURVED = 0.01
-_BARELY = 1.02  # a plan that is hardly better than the QP's is not worth a jump
+BARELY = 1.02  # a plan that is hardly better than the QP's is not worth a jump
 
 
 class Sample(NamedTuple):
@@ -276,19 +276,19 @@ class Optimiser:
         """Return the QP's plan, or one that the nonlinear simulation finds better, with its outputs."""
         self._solves += 1
         plans = plan[None]
-        if self._solves % _LOOK_AROUND == 1:
+        if self._solves % LOOK_AROUND == 1:
             plans = np.concatenate([plans, self._park(self._ramps(last, more), last, more)])
         y = predicted(plans)
         costs = merit(np.concatenate([guess[None], plans]), np.concatenate([y_guess[None], y]))
         at_guess, costs = costs[0], costs[1:]
         if costs[0] > at_guess:
-            shorter = guess + _SHARES[:, None, None] * (plan - guess)
+            shorter = guess + np.array(SHARES)[:, None, None] * (plan - guess)
             tried = predicted(shorter)
             plans, y = np.concatenate([plans[:1], shorter, plans[1:]]), np.concatenate([y[:1], tried, y[1:]])
             costs = np.concatenate([costs[:1], merit(shorter, tried), costs[1:]])
         if len(plans) == 1:
             return plan, y[0]
-        costs[1:] *= _BARELY
+        costs[1:] *= BARELY
         best = int(np.argmin(costs))
         return plans[best], y[best]
 
@@ -340,7 +340,7 @@ class Optimiser:
             return low, high
         little = np.zeros(self.model.n_u)
         given = [*self._parked, *self.positions]
-        little[given] = _LITTLE * self.model.span[given]
+        little[given] = LITTLE * self.model.span[given]
         return self._park(low, last, more) - little, self._park(high, last, more) + little
 
     def faded_range(
@@ -506,7 +506,7 @@ class Optimiser:
 def allowed_share(end: Array, best: Array, span: Array) -> Array:
     """Return how far a drive may go, as a share of the way to its optimum; its range ends at ``end``."""
     share = end / np.maximum(best, 1e-9 * span)
-    return np.asarray(np.maximum(_SAFE, np.minimum(share, 3 - 2 * share)))
+    return np.asarray(np.maximum(SAFE, np.minimum(share, 3 - 2 * share)))
 
 
 class ControllerParts(Protocol):

@@ -5,36 +5,9 @@
 #include <math.h>
 #include <string.h>
 
-#define RESTART_S 30.0 /* a longer silence than this and the past is unknown */
-#define LEFT_OUT 3     /* samples in a row, at most, that a jump is rejected */
-#define CANNOT 0.1     /* degC from the target: out of reach */
-#define CAN 0.05       /* degC from the target: within reach */
-#define LEAST_SD 0.05  /* degC, of a steady output where no bias is estimated */
-#define MISS_CLIP 2.0      /* of Page's test: the most that a sample adds, */
-#define MISS_ALLOWANCE 0.5 /* what it has to exceed, */
-#define MISS_ALARM 3.0     /* and the sum at which a target is out of reach */
-#define TAKE_BACK 5    /* samples in a row, until that is revoked */
-#define STILL 0.01     /* of its range: a drive that moves by less is constant */
-#define SURE 3.0       /* standard deviations by which a relaxing output falls short */
-#define KEPT (-3.0)    /* and from which on that is revoked */
-#define CONTRADICTED 2.0 /* standard deviations that a bias moves while the drives stand still */
-#define INNOVATION_SD 0.3333333333333333 /* of a mean innovation: sqrt(q / (2 - q)) at REMEMBER q = 0.2 */
 /* of a jump: what the model expects of a reading that has not moved at all, and a bias of an output
    that is no small error of the model */
-#define SHARE (1.0 / 3.0)
-#define FOLLOWS_DRIVE 0.3   /* of its range: a larger bias of a drive is not a small error of the model */
-#define CAUTION 3.0      /* standard deviations of a mean innovation, from which on moves weigh more, */
-#define MOST_CAUTION 30.0 /* and at most so many times */
-#define SLOWER 0.65       /* samples that an output lags behind the model: a structure that the model lacks; */
-#define STILL_SLOWER 0.25 /* the same once that is reported, */
-#define SHOWN_TO 0.25     /* its largest standard deviation, */
-#define SLOWER_SD 5.0     /* the least lag in those, */
-#define SLOW_FOR 5        /* and for so many samples in a row */
 #define TINY 1e-9
-#define UNCUT 1e-9 /* of its range: a drive of the PI that is cut by less is not limited */
-#define STAYS 1e-5 /* of its range: a plan that moves by less has converged */
-#define SAME 1e-6 /* of a sample: what is nearer than this is the same time */
-#define DAY 86400.0 /* s */
 
 /* ---- the loop ---- */
 
@@ -129,7 +102,7 @@ static int is_due(tg_controller *c, tg_time now)
     } else if (now > before) {
         c->passed_s = (double)(now - before);
         c->time_s = now;
-    } else if (before - now > RESTART_S && now > c->back_s) {
+    } else if (before - now > TG_RESTART_S && now > c->back_s) {
         c->passed_s = (double)(now - c->back_s) + c->interval_s;
         c->time_s = now;
     } else
@@ -147,9 +120,9 @@ static int is_due(tg_controller *c, tg_time now)
         c->waited_s = fmax(c->since_s - c->spent_s, fmin(c->since_s, dt));
     }
     c->slew_s = c->waited_s;
-    if (c->stale || c->passed_s > RESTART_S + dt) /* elapsed time and drives are unknown */
+    if (c->stale || c->passed_s > TG_RESTART_S + dt) /* elapsed time and drives are unknown */
         c->slew_s = fmin(c->slew_s, dt);
-    return passed >= dt * (1.0 - SAME) - 0.5 * c->interval_s;
+    return passed >= dt * (1.0 - TG_SAME) - 0.5 * c->interval_s;
 }
 
 static void note_move(tg_controller *c)
@@ -168,10 +141,10 @@ static void pass(tg_controller *c, const double *applied)
     double seconds = c->passed_s;
     if (c->fresh)
         return; /* the estimate begins with this reading */
-    if (seconds > RESTART_S + c->design->dt) {
+    if (seconds > TG_RESTART_S + c->design->dt) {
         /* until a reading comes to start again from, no more is predicted than a silence that would count */
         c->silent_s = seconds;
-        seconds = RESTART_S;
+        seconds = TG_RESTART_S;
     }
     tg_observer_advance(c, seconds, applied, c->d);
     c->age_s += seconds;
@@ -196,7 +169,7 @@ static int drop_stuck(tg_controller *c, double *y)
             c->moved[i] = 0.0;
         if (isfinite(y[i]))
             c->last_y[i] = y[i];
-        if (fabs(c->moved[i]) > SHARE * c->design->spike[i]) {
+        if (fabs(c->moved[i]) > TG_SHARE * c->design->spike[i]) {
             y[i] = NAN;
             stuck = 1;
         }
@@ -216,7 +189,7 @@ static int screen(tg_controller *c, double *y)
             c->spikes[i]++;
         else if (isfinite(y[i]))
             c->spikes[i] = 0;
-        stays[i] = c->spikes[i] > LEFT_OUT;
+        stays[i] = c->spikes[i] > TG_LEFT_OUT;
         if (stays[i])
             c->spikes[i] = 0;
         else if (jumped)
@@ -368,9 +341,9 @@ void tg_set_prices(tg_controller *c)
             continue;
         c->dear[b] = 0.0;
         for (int left = s->blocks[b]; left > 0; left--, k++) {
-            double second = (double)fmod(c->time_s + s->dt * k, DAY), factor = s->tariff[TG_NT - 1]; /* of the day before */
+            double second = (double)fmod(c->time_s + s->dt * k, TG_DAY), factor = s->tariff[TG_NT - 1]; /* of the day before */
             if (second < 0.0)
-                second += DAY;
+                second += TG_DAY;
             for (int i = 0; i < TG_NT && s->tariff_from[i] <= second; i++)
                 factor = s->tariff[i];
             c->dear[b] += factor;
@@ -383,7 +356,7 @@ void tg_set_prices(tg_controller *c)
 /* How many whole samples ago a plan was made, and the share of one. */
 static int samples_ago(const tg_controller *c, double *share)
 {
-    double samples = c->age_s / c->design->dt, whole = fmin(floor(samples + SAME), c->design->N - 1.0);
+    double samples = c->age_s / c->design->dt, whole = fmin(floor(samples + TG_SAME), c->design->N - 1.0);
     *share = fmin(samples - whole, 1.0);
     return (int)whole;
 }
@@ -393,7 +366,7 @@ static double planned(const tg_controller *c, int at, double share, int j)
 {
     int last = c->design->N - 1;
     double now = c->plan[(at < last ? at : last) * TG_NU + j];
-    if (share <= SAME)
+    if (share <= TG_SAME)
         return now;
     return (1.0 - share) * now + share * c->plan[(at + 1 < last ? at + 1 : last) * TG_NU + j];
 }
@@ -410,13 +383,13 @@ double tg_planned(const tg_controller *c, int k, int j)
 static void open_plan(const tg_controller *c, double *drive)
 {
     const tg_design *s = c->design;
-    double samples = fmin(c->slew_s / s->dt, (double)s->N), whole = floor(samples + SAME), rest = samples - whole;
+    double samples = fmin(c->slew_s / s->dt, (double)s->N), whole = floor(samples + TG_SAME), rest = samples - whole;
     for (int j = 0; j < TG_NU; j++) {
         double sum = tg_planned(c, 0, j);
-        if (whole > 1.5 || (whole > 0.5 && rest > SAME)) {
+        if (whole > 1.5 || (whole > 0.5 && rest > TG_SAME)) {
             for (int k = 1; k < (int)whole; k++)
                 sum += tg_planned(c, k, j);
-            if (rest > SAME)
+            if (rest > TG_SAME)
                 sum += rest * tg_planned(c, (int)whole, j);
             sum /= samples;
         }
@@ -442,7 +415,7 @@ void tg_guess(const tg_controller *c, const double *last, double *guess)
 static int has_moved(const tg_design *s, const double *guess, const double *plan)
 {
     for (int i = 0; i < s->n_b * TG_NU; i++)
-        if (fabs(plan[i] - guess[i]) > STAYS * s->span[i % TG_NU])
+        if (fabs(plan[i] - guess[i]) > TG_STAYS * s->span[i % TG_NU])
             return 1;
     return 0;
 }
@@ -468,7 +441,7 @@ static int optimise(tg_controller *c)
     tg_guess(c, last, guess);
     c->caution = 1.0;
     for (int i = 0; i < TG_NY; i++)
-        c->caution = fmin(fmax(c->caution, fabs(c->innovation[i]) / CAUTION), MOST_CAUTION);
+        c->caution = fmin(fmax(c->caution, fabs(c->innovation[i]) / TG_CAUTION), TG_MOST_CAUTION);
     tg_set_prices(c);
     status = tg_optimise(c, x, last, guess, d, c->ramped, c->side, on_y, on_u);
     changes = c->iterations;
@@ -484,7 +457,7 @@ static int optimise(tg_controller *c)
 /* Whether there is a plan to follow. */
 static int is_young(const tg_controller *c)
 {
-    return c->has_plan && c->age_s <= c->design->patience_s * (1.0 + SAME) && !c->on_pi;
+    return c->has_plan && c->age_s <= c->design->patience_s * (1.0 + TG_SAME) && !c->on_pi;
 }
 
 static int time_is_up(const tg_controller *c) { return c->late && c->late(c->about); }
@@ -517,7 +490,7 @@ static void go_on_pi(tg_controller *c, double *drive)
     for (int l = 0; l < s->n_loops; l++) {
         int j = s->loop_drive[l];
         double change = s->Kc[l] * error_of(c, l, 1.0), cut = drive[j] - wanted[j];
-        if (cut * change > 0.0 || fabs(cut) <= UNCUT * (s->highest[j] - s->lowest[j]))
+        if (cut * change > 0.0 || fabs(cut) <= TG_UNCUT * (s->highest[j] - s->lowest[j]))
             c->integral[l] += c->slew_s / s->Ti[l] * change;
     }
 }
@@ -556,7 +529,7 @@ static void record_relaxation(tg_controller *c)
         for (int j = 0; j < TG_NU; j++)
             own = own || s->pair[j] == r;
         for (int j = 0; j < TG_NU; j++)
-            if ((!own || s->pair[j] == r) && fabs(c->u[j] - m->u[j]) > STILL * s->span[j])
+            if ((!own || s->pair[j] == r) && fabs(c->u[j] - m->u[j]) > TG_STILL * s->span[j])
                 still = 0;
         if (!still || !isfinite(y)) {
             memcpy(m->u, c->u, sizeof m->u);
@@ -595,7 +568,7 @@ static double falls_short(const tg_relaxation *m, double target, double sd, doub
         mean[i / span] += m->bins[m->count - 3 * span + i] / span;
     left = target - mean[2];
     side = left > 0.0 ? 1.0 : -1.0;
-    left = fabs(left) - CANNOT;
+    left = fabs(left) - TG_CANNOT;
     d1 = side * (mean[1] - mean[0]);
     d2 = side * (mean[2] - mean[1]);
     if (left <= 0.0 || d1 <= d2)
@@ -646,7 +619,7 @@ static double missed_by(tg_controller *c)
     double kept[TG_NC];
     int away = 0, out = 0, alarm = 0, lost = 0;
     aim(c, kept);
-    limit = c->unreachable ? CAN : CANNOT;
+    limit = c->unreachable ? TG_CAN : TG_CANNOT;
     record_relaxation(c);
     for (int r = 0; r < s->n_c; r++)
         away = away || (!(c->unread_s[r] > 0.0) &&
@@ -656,17 +629,17 @@ static double missed_by(tg_controller *c)
         for (int i = 0; i < TG_ND; i++)
             d[i] += c->d[i];
         away = tg_find_steady(c, d, on_u, on_y, held, by_w);
-        lost = !away && c->miss_sum >= MISS_ALARM; /* the last answer is kept */
+        lost = !away && c->miss_sum >= TG_MISS_ALARM; /* the last answer is kept */
     }
     if (!away)
         memset(by_w, 0, sizeof by_w);
     for (int i = 0; i < TG_NY; i++)
-        inflation = fmax(inflation, fabs(c->innovation[i]) / INNOVATION_SD);
+        inflation = fmax(inflation, fabs(c->innovation[i]) / TG_INNOVATION_SD);
     for (int r = 0; r < s->n_c; r++) {
         const double *J = by_w + r * TG_SOME(TG_NW);
         double y_sd = sqrt(s->R[s->controlled[r]]), sd = 0.0, drift = 0.0, miss, end, g;
         double beyond = beyond_own_limit(c, r);
-        int is_short, is_barred = beyond > CANNOT;
+        int is_short, is_barred = beyond > TG_CANNOT;
         if (c->unread_s[r] > 0.0)
             continue;
         for (int i = 0; i < TG_NW; i++) {
@@ -674,24 +647,24 @@ static double missed_by(tg_controller *c)
             for (int j = 0; j < TG_NW; j++)
                 sd += J[i] * J[j] * c->P[(TG_NX + i) * TG_Z + TG_NX + j];
         }
-        sd = fmax(sqrt(fmax(sd, 0.0)), LEAST_SD);
+        sd = fmax(sqrt(fmax(sd, 0.0)), TG_LEAST_SD);
         miss = away ? fabs(c->target[r] - held[r]) : 0.0;
-        scaled = fmax(scaled, (miss - CANNOT) / (sd * inflation));
+        scaled = fmax(scaled, (miss - TG_CANNOT) / (sd * inflation));
         g = falls_short(&c->relaxation[r], c->target[r], y_sd, &end);
         if (c->unreachable)
-            is_short = g > KEPT;
+            is_short = g > TG_KEPT;
         else
-            is_short = g > SURE && (miss > CANNOT || (end > c->target[r] ? drift : -drift) > CONTRADICTED * sd);
+            is_short = g > TG_SURE && (miss > TG_CANNOT || (end > c->target[r] ? drift : -drift) > TG_CONTRADICTED * sd);
         out = out || miss > limit || is_short || is_barred;
         alarm = alarm || is_short || is_barred;
         worst = fmax(worst, miss > limit ? miss : is_short ? fabs(c->target[r] - end) : 0.0);
         worst = fmax(worst, is_barred ? beyond : 0.0);
     }
     if (!lost)
-        c->miss_sum = fmin(fmax(0.0, c->miss_sum + fmin(scaled, MISS_CLIP) - MISS_ALLOWANCE), MISS_ALARM);
+        c->miss_sum = fmin(fmax(0.0, c->miss_sum + fmin(scaled, TG_MISS_CLIP) - TG_MISS_ALLOWANCE), TG_MISS_ALARM);
     memcpy(c->target, kept, sizeof kept);
     c->in = c->unreachable && !out && !lost ? c->in + 1 : 0;
-    c->unreachable = c->unreachable ? c->in < TAKE_BACK : c->miss_sum >= MISS_ALARM || alarm;
+    c->unreachable = c->unreachable ? c->in < TG_TAKE_BACK : c->miss_sum >= TG_MISS_ALARM || alarm;
     return c->unreachable ? fmax(worst, TINY) : 0.0;
 }
 
@@ -703,7 +676,7 @@ static int is_too_weak(const tg_controller *c)
         double sum = 0.0;
         for (int i = 0; i < TG_NW; i++)
             sum += s->on_drive[j * TG_NW + i] * c->w[i];
-        if (fabs(sum) >= FOLLOWS_DRIVE)
+        if (fabs(sum) >= TG_FOLLOWS_DRIVE)
             return 1;
     }
     return 0;
@@ -718,7 +691,7 @@ static int does_not_follow(const tg_controller *c)
         return 1;
     tg_biases(c, on_u, on_d, on_y);
     for (int j = 0; j < TG_NY; j++)
-        if (fabs(on_y[j] - s->offset[j]) >= SHARE * s->spike[j])
+        if (fabs(on_y[j] - s->offset[j]) >= TG_SHARE * s->spike[j])
             return 1;
     return 0;
 }
@@ -729,10 +702,10 @@ static double slower_by(tg_controller *c)
     double most = 0.0, dt = c->design->dt;
     for (int r = 0; r < TG_NG; r++) {
         double lag = c->lag[r] / dt, sd = sqrt(c->P[(TG_L + TG_NG + r) * (TG_Z + 1)]) / dt;
-        int sure = !is_too_weak(c) && lag > SLOWER && lag > SLOWER_SD * sd && sd < SHOWN_TO;
-        sure = sure || (c->slow_for[r] == SLOW_FOR && lag > STILL_SLOWER);
-        c->slow_for[r] = !sure ? 0 : c->slow_for[r] < SLOW_FOR ? c->slow_for[r] + 1 : SLOW_FOR;
-        if (c->slow_for[r] == SLOW_FOR)
+        int sure = !is_too_weak(c) && lag > TG_SLOWER_BY && lag > TG_SLOWER_SD * sd && sd < TG_SHOWN_TO;
+        sure = sure || (c->slow_for[r] == TG_SLOW_FOR && lag > TG_STILL_SLOWER);
+        c->slow_for[r] = !sure ? 0 : c->slow_for[r] < TG_SLOW_FOR ? c->slow_for[r] + 1 : TG_SLOW_FOR;
+        if (c->slow_for[r] == TG_SLOW_FOR)
             most = fmax(most, c->lag[r]);
     }
     return most;
@@ -753,7 +726,7 @@ static double unread_for(const tg_controller *c, int *one)
 static void follow_without_readings(tg_controller *c, tg_move *move, double seconds)
 {
     move->status = TG_FALLBACK_PLAN;
-    if (seconds <= c->design->patience_s * (1.0 + SAME)) {
+    if (seconds <= c->design->patience_s * (1.0 + TG_SAME)) {
         if (is_young(c))
             open_plan(c, move->drive);
         else
@@ -803,7 +776,7 @@ static void decide(tg_controller *c, tg_move *move)
     for (int j = 0; j < TG_NU; j++)
         outside = outside || c->u[j] < s->lowest[j] - TINY || c->u[j] > s->highest[j] + TINY;
     for (int r = 0; r < s->n_c; r++)
-        c->lost[r] = c->unread_s[r] > s->patience_s * (1.0 + SAME);
+        c->lost[r] = c->unread_s[r] > s->patience_s * (1.0 + TG_SAME);
     optimise(c);
     move->iterations = c->iterations;
     tg_hold_drives(c);

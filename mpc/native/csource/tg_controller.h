@@ -20,8 +20,6 @@
 #include "tg_config.h"
 #include "tg_qp.h"
 
-#define FIRST 0.2 /* of the price of a square of 1, that a distance of 1 beyond a soft row costs */
-
 #define TG_L (TG_NX + TG_NW)               /* where what the lagging outputs show begins in them, */
 #define TG_Z (TG_L + 3 * TG_NG)            /* states of the observer; their lags and scales are the last */
 #define TG_SEEDS (TG_NX + TG_NU + TG_ND)   /* directions of a sample's Jacobian */
@@ -66,15 +64,11 @@ typedef struct {
 
 typedef double tg_time; /* seconds of any clock */
 
-#define TG_BINS 12
-
 /* Means of a reading since the drives stand still, and drives and biases then. */
 typedef struct {
     double u[TG_NU], w[TG_SOME(TG_NW)], bins[TG_BINS], sum;
     int count, per, n; /* bins, readings in a bin, readings in the sum */
 } tg_relaxation;
-
-#define TG_SWINGS 6 /* half swings in a row */
 
 /* Which side of its target an output is on, the integral of its error's size, since when and until when [s]. */
 typedef struct {
@@ -186,7 +180,6 @@ double tg_swings(tg_controller *c);
  * no steady state is found. */
 int tg_find_steady(tg_controller *c, const double *d, const double *on_u, const double *on_y, double *held, double *by_w);
 double tg_allowed_share(double end, double best, double span); /* of the way to an optimum */
-#define TG_FADING 0.3 /* of the gain at rest lost, from which on its fall is predicted */
 void tg_hold_drives(tg_controller *c);
 double tg_planned(const tg_controller *c, int k, int j); /* drive j in the k-th sample from now */
 void tg_guess(const tg_controller *c, const double *last, double *guess);

@@ -17,11 +17,6 @@
 #include <math.h>
 #include <string.h>
 
-#define LARGEST_BIAS 1.0 /* of its range: no drive makes up for more */
-#define REMEMBER 0.2 /* share of the newest innovation in their mean */
-#define LASTING 0.02 /* the same in the mean that shows what lasts, */
-#define LASTS 0.30151134457776363 /* from where on it does: 3 sqrt(q / (2 - q)) at q = LASTING */
-#define SAME 1e-6 /* of a sample: what is nearer than this is the same time */
 #ifdef TG_SINGLE
 #define ROUNDED 6e-8
 #define LEAST_SHARE 1e-6
@@ -31,7 +26,6 @@
 #define LEAST_SHARE 1e-12 /* of the trace, added to a curvature that may be 0 */
 #define LEAST_TRACE 1e-300
 #endif
-#define WEAK 0.05 /* of its gain at rest, below which a drive's bias is not learnt */
 
 static double output(const tg_controller *c, int i, const double *x)
 {
@@ -233,7 +227,7 @@ static void apply(tg_controller *c, double *change)
         double w = c->w[k] + change[TG_NX + k];
         for (int j = 0; j < TG_NU; j++)
             if (s->on_drive[j * TG_NW + k] != 0.0)
-                w = fmin(fmax(w, -LARGEST_BIAS), LARGEST_BIAS);
+                w = fmin(fmax(w, -TG_LARGEST_BIAS), TG_LARGEST_BIAS);
         change[TG_NX + k] = w - c->w[k];
         c->w[k] = w;
     }
@@ -292,7 +286,7 @@ static void correct(tg_controller *c, const double *y, const double *known, doub
         if (isfinite(y[a])) {
             double scaled = off[a] / sqrt(S[a * (TG_NY + 1)]);
             c->innovation[a] += remember * (scaled - c->innovation[a]);
-            c->lasting[a] += (remember > 0.0 ? LASTING : 0.0) * (scaled - c->lasting[a]);
+            c->lasting[a] += (remember > 0.0 ? TG_LASTING : 0.0) * (scaled - c->lasting[a]);
         }
     memcpy(gain, HP, sizeof gain);
     eliminate(S, gain); /* row a of gain: what reading a does to each state */
@@ -324,7 +318,7 @@ static void correct_now(tg_controller *c, const double *y, double remember, int 
     correct(c, y, R, remember, between);
 }
 
-void tg_observer_update(tg_controller *c, const double *y) { correct_now(c, y, REMEMBER, 0); }
+void tg_observer_update(tg_controller *c, const double *y) { correct_now(c, y, TG_NEWEST_INNOVATION, 0); }
 
 void tg_observer_refine(tg_controller *c, const double *y) { correct_now(c, y, 0.0, 1); }
 
@@ -489,12 +483,6 @@ static void look_ahead(tg_controller *c, const double *u, const double *d, doubl
     set_lag_rows(c);
 }
 
-#define STEADY_STEPS 12
-#define SWEEPS 200
-#define STRIDE 0.3 /* of its range, that a drive may go in a step */
-#define CONVERGED 1e-4 /* degC and of the range: the steady state is found */
-#define LIMIT 100.0 /* weight of an output beyond its limits */
-#define CAN 0.05    /* degC from the target: within reach */
 #define SIDES (1 + TG_NU + TG_NW)
 #define ROWS (TG_NC + TG_SOME(TG_NL))
 
@@ -556,7 +544,7 @@ static void squares_in_box(int n, const double *weight, const double *G, const d
         }
         trace += H[j * TG_NU + j];
     }
-    for (int sweep = 0; sweep < SWEEPS; sweep++) {
+    for (int sweep = 0; sweep < TG_SWEEPS; sweep++) {
         double moved = 0.0;
         for (int j = 0; j < TG_NU; j++) {
             double slope = f[j], best;
@@ -587,8 +575,8 @@ static void range_of(const tg_design *s, const double *G, const double *u, const
             low[j] = fmax(low[j], s->neutral[j] - room);
         if (left < 1.0 - TG_FADING && away > 0.0)
             high[j] = fmin(high[j], s->neutral[j] + room);
-        low[j] = fmin(fmax((low[j] - u[j]) / s->span[j], -STRIDE), STRIDE);
-        high[j] = fmax(fmin((high[j] - u[j]) / s->span[j], STRIDE), low[j]);
+        low[j] = fmin(fmax((low[j] - u[j]) / s->span[j], -TG_STRIDE), TG_STRIDE);
+        high[j] = fmax(fmin((high[j] - u[j]) / s->span[j], TG_STRIDE), low[j]);
     }
 }
 
@@ -616,16 +604,16 @@ static void nearest(const tg_controller *c, const double *G, const double *y, co
             for (int j = 0; j < TG_NU; j++)
                 value += G[i * TG_NU + j] * z[j];
             if (r < s->n_c) {
-                if (weight[r] > 0.0 && c->side[r] * (value - c->target[r]) > CAN)
-                    weight[r] = sqrt(s->price * (FIRST + 1.0) / s->track); /* what 1 degC costs the optimiser */
+                if (weight[r] > 0.0 && c->side[r] * (value - c->target[r]) > TG_CAN)
+                    weight[r] = sqrt(s->price * (TG_FIRST + 1.0) / s->track); /* what 1 degC costs the optimiser */
                 changed = changed || weight[r] != before;
                 continue;
             }
-            if (value > s->limit_high[r - s->n_c] + CAN)
+            if (value > s->limit_high[r - s->n_c] + TG_CAN)
                 over[r] = 1.0;
-            if (value < s->limit_low[r - s->n_c] - CAN)
+            if (value < s->limit_low[r - s->n_c] - TG_CAN)
                 over[r] = -1.0;
-            weight[r] = over[r] != 0.0 ? LIMIT : 0.0;
+            weight[r] = over[r] != 0.0 ? TG_BEYOND_LIMIT : 0.0;
             changed = changed || over[r] != before;
         }
     }
@@ -693,7 +681,7 @@ int tg_find_steady(tg_controller *c, const double *d, const double *on_u, const 
     c->has_steady = 0;
     for (int j = 0; j < TG_NU; j++)
         u[j] = fmin(fmax(u[j], s->lowest[j]), s->highest[j]);
-    for (int step = 0; step < STEADY_STEPS && !found; step++) {
+    for (int step = 0; step < TG_STEADY_STEPS && !found; step++) {
         double moved = 0.0;
         memset(G, 0, sizeof G);
         if (s->settles)
@@ -714,7 +702,7 @@ int tg_find_steady(tg_controller *c, const double *d, const double *on_u, const 
             moved = fmax(moved, fabs(z[j]));
             u[j] += z[j] * s->span[j];
         }
-        found = moved < CONVERGED;
+        found = moved < TG_CONVERGED;
     }
     for (int r = 0; r < s->n_c; r++) {
         int i = s->controlled[r];
@@ -753,7 +741,7 @@ static const double *added(const tg_controller *c)
     double most = 0.0;
     for (int i = 0; i < TG_NY; i++)
         most = fmax(most, fabs(c->lasting[i]));
-    return most > LASTS ? c->design->Q_lasting : c->design->Q;
+    return most > TG_LASTS ? c->design->Q_lasting : c->design->Q;
 }
 
 static void add_row(int n, double *restrict into, double a, const double *restrict x)
@@ -876,10 +864,10 @@ void tg_observer_predict(tg_controller *c, const double *u, const double *d)
 void tg_observer_advance(tg_controller *c, double seconds, const double *u, const double *d)
 {
     double dt = c->design->dt, left = seconds, mean[TG_NU];
-    while (c->into_s + left >= dt * (1.0 - SAME)) {
+    while (c->into_s + left >= dt * (1.0 - TG_SAME)) {
         double rest = dt - c->into_s;
         for (int j = 0; j < TG_NU; j++)
-            mean[j] = c->into_s <= SAME * dt ? u[j] : (c->dose[j] + rest * u[j]) / dt;
+            mean[j] = c->into_s <= TG_SAME * dt ? u[j] : (c->dose[j] + rest * u[j]) / dt;
         tg_observer_predict(c, mean, d);
         left -= rest;
     }
@@ -894,7 +882,7 @@ void tg_observer_look(tg_controller *c, const double *d)
     const tg_design *s = c->design;
     double next[TG_NX] = {0.0}, on_u[TG_NU], on_d[TG_SOME(TG_ND)] = {0.0}, on_y[TG_NY];
     double share = c->into_s / s->dt;
-    if (share <= SAME)
+    if (share <= TG_SAME)
         return;
     tg_biases(c, on_u, on_d, on_y);
     for (int j = 0; j < TG_NU; j++)
@@ -922,7 +910,7 @@ void tg_hold_drives(tg_controller *c)
     for (int i = 0; i < TG_NW; i++) {
         c->held[TG_NX + i] = 0;
         for (int j = 0; j < TG_NU; j++)
-            if (s->on_drive[j * TG_NW + i] != 0.0 && c->authority[j] < WEAK)
+            if (s->on_drive[j * TG_NW + i] != 0.0 && c->authority[j] < TG_WEAK)
                 c->held[TG_NX + i] = 1;
     }
 }

@@ -22,15 +22,12 @@
 #include <math.h>
 #include <string.h>
 
-#define SAFE 0.85  /* of the way to the optimum, where the range runs on beyond it */
-#define LOOK_AROUND 5
-#define BARELY 1.02
 #ifdef TG_SINGLE
 #define LITTLE 1e-5
 #define UNMOVED 1e-3 /* of its range, that costs no travel: two bounds a rounding apart would take turns */
 #else
 #define UNMOVED 0.0
-#define LITTLE 1e-7 /* of its range, that a parked drive may be off in the program */
+#define LITTLE TG_LITTLE
 #endif
 #define NONE 1e30
 
@@ -270,9 +267,9 @@ static double cost_beyond(const tg_design *s, const double *values, double low, 
     for (int k = 0; k < s->N; k++) {
         double under = low - values[k * TG_NY], over = values[k * TG_NY] - high;
         if (under > 0.0)
-            cost += FIRST * under + under * under;
+            cost += TG_FIRST * under + under * under;
         if (over > 0.0)
-            cost += FIRST * over + over * over;
+            cost += TG_FIRST * over + over * over;
     }
     return cost;
 }
@@ -295,7 +292,7 @@ static double cost_of(const tg_controller *c, const double *values, const double
         last = error * error;
         sum += last;
         if (slack > 0.0 && side != 0.0)
-            over += FIRST * slack + slack * slack;
+            over += TG_FIRST * slack + slack * slack;
     }
     return s->weight[r] * (s->track * sum + s->terminal * last) + s->price * over;
 }
@@ -327,7 +324,7 @@ static double merit(const tg_controller *c, const double *plan, const double *y,
 double tg_allowed_share(double end, double best, double span)
 {
     double share = end / fmax(best, 1e-9 * span);
-    return fmax(SAFE, fmin(share, 3.0 - 2.0 * share));
+    return fmax(TG_SAFE, fmin(share, 3.0 - 2.0 * share));
 }
 
 static void set_bounds(tg_controller *c, const double *guess, const double *drive_bias, const double *last)
@@ -571,7 +568,7 @@ static void consider(tg_controller *c, const double *x, const double *plan, cons
 {
     double cost;
     tg_simulate(c, x, plan, drive_bias, d, bias, c->y_try);
-    cost = BARELY * merit(c, plan, c->y_try, target, side, last);
+    cost = TG_BARELY * merit(c, plan, c->y_try, target, side, last);
     if (cost < *least) { /* a plan that is hardly better is not worth a jump */
         *least = cost;
         memcpy(c->best, plan, (size_t)c->qp.n * sizeof(double));
@@ -583,7 +580,7 @@ static void try_others(tg_controller *c, const double *x, const double *guess, c
                        const double *target, const double *side, const double *bias, const double *drive_bias,
                        const double *last, double least, int shorter)
 {
-    static const double shares[4] = {0.5, 0.25, 0.1, 0.0};
+    static const double shares[4] = TG_SHARES;
     const tg_design *s = c->design;
     double full[TG_Q_N], plan[TG_Q_N];
     memcpy(full, c->best, sizeof full);
@@ -624,8 +621,8 @@ static void set_prices(const tg_design *s, tg_qp *q)
     q->per = s->n_c + s->n_l;
     for (int r = 0; r < q->per; r++) {
         int zone = r < s->n_c && s->zone[r] > 0.0;
-        q->price[r] = zone ? s->weight[r] * s->track : FIRST * (r >= s->n_c ? s->dear[r - s->n_c] : s->price);
-        q->ratio[r] = zone ? 2.0 : 2.0 / FIRST;
+        q->price[r] = zone ? s->weight[r] * s->track : TG_FIRST * (r >= s->n_c ? s->dear[r - s->n_c] : s->price);
+        q->ratio[r] = zone ? 2.0 : 2.0 / TG_FIRST;
         q->at_end[r] = zone ? s->weight[r] * (s->track + s->terminal) : q->price[r];
     }
 }
@@ -686,7 +683,7 @@ int tg_optimise(tg_controller *c, const double *x, const double *last, const dou
     cost = merit(c, c->best, c->y_best, target, side, last);
     c->solves++;
     uphill = cost > at_guess;
-    if (uphill || c->solves % LOOK_AROUND == 1)
+    if (uphill || c->solves % TG_LOOK_AROUND == 1)
         try_others(c, x, guess, d, target, side, bias, drive_bias, last, cost, uphill);
     find_broken(c);
     return c->qp_status;

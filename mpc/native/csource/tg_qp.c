@@ -33,7 +33,6 @@
 #include <math.h>
 #include <string.h>
 
-#define FAR 1e15
 #ifdef TG_SINGLE
 #define LARGEST 3.4e38
 #define TOLERANCE 1e-5
@@ -46,10 +45,10 @@
 #define LOOSER(changes) ((double)(1 << (changes) / 50)) /* or rows that a rounding breaks take turns for ever */
 #else
 #define LARGEST 1.7e308 /* number that is finite */
-#define TOLERANCE 1e-10 /* of a row, in units of its own length */
-#define REGULAR 1e-11   /* share of K_ii that keeps its factor regular */
-#define CONTRADICTION 1e-6 /* by which a hard row may stay broken, in units of its length */
-#define SHORT 1e-5      /* a soft row shorter than this cannot be kept by any plan */
+#define TOLERANCE TG_TOLERANCE /* of a row, in units of its own length */
+#define REGULAR TG_REGULAR /* share of K_ii that keeps its factor regular */
+#define CONTRADICTION TG_CONTRADICTION /* by which a hard row may stay broken, in units of its length */
+#define SHORT TG_SHORT /* a soft row shorter than this cannot be kept by any plan */
 #define CONVEX 1e-14    /* of H_ii, that a pivot is at least */
 #define REACHED 1e-13   /* of the largest multiplier: what ends by less beyond its bound is on it */
 #define REFINEMENTS 1
@@ -805,8 +804,8 @@ static int worst(tg_qp *q, int *row, int *side)
         double over = value[i] - q->upper[i], under = q->lower[i] - value[i];
         if (!(over > 0.0 || under > 0.0) || q->in_set[i])
             continue;
-        over = q->upper[i] > FAR ? 0.0 : over * weight_of(q, i);
-        under = q->lower[i] < -FAR ? 0.0 : under * weight_of(q, i);
+        over = q->upper[i] > TG_FAR ? 0.0 : over * weight_of(q, i);
+        under = q->lower[i] < -TG_FAR ? 0.0 : under * weight_of(q, i);
         if (over > most_broken || under > most_broken) {
             *row = i;
             *side = over > under ? 1 : -1;
@@ -822,7 +821,7 @@ static void take_up(tg_qp *q, int same)
 {
     int kept = q->n_work;
     for (int i = 0; same && i < kept; i++)
-        same = (q->side[i] > 0 ? q->upper[q->row[i]] : -q->lower[q->row[i]]) <= FAR;
+        same = (q->side[i] > 0 ? q->upper[q->row[i]] : -q->lower[q->row[i]]) <= TG_FAR;
     if (same) {
         for (int i = 0; i < kept; i++)
             q->in_set[q->row[i]] = 1;
@@ -837,7 +836,7 @@ static void take_up(tg_qp *q, int same)
         if (row >= 2 * q->n + q->s || weight_of(q, row) == 0.0)
             continue;
         bound = side > 0 ? q->upper[row] : -q->lower[row];
-        if (bound > FAR)
+        if (bound > TG_FAR)
             continue;
         place(q, row, side, state, multiplier);
     }

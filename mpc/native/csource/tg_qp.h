@@ -12,7 +12,6 @@
 
 #include "tg_config.h"
 
-#define TG_CURVED 0.01 /* square of a move beside the move, in the price of travel */
 #define TG_Q_N (TG_NB * TG_NU)
 #define TG_Q_S (TG_NH * TG_NS + TG_NP)
 #define TG_Q_M (2 * TG_Q_N + TG_Q_S)

@@ -5,16 +5,6 @@
 #include <math.h>
 #include <string.h>
 
-#define LATE 3.0       /* how many times a promised time is given, */
-#define SLACK 10.0     /* and samples besides */
-#define SAMPLES 5      /* in a row that make an arrival */
-#define REMEMBER 0.3   /* share of the newest error in their mean */
-#define READINGS_SD 4.0 /* standard deviations of a reading that are near */
-#define LEFT 0.5       /* of the first half swing, that the last must have */
-#define SHORTEST 6.0   /* samples of a period */
-#define NOISE_SD 3.0   /* standard deviations of a reading that are no swing */
-#define NOISE_OF 30    /* readings of which the noise is the mean */
-#define SPIKE 10.0     /* variances, as much as one value may show */
 #define PI 3.14159265358979323846
 
 /* ---- arrivals ---- */
@@ -47,20 +37,20 @@ double tg_overdue(tg_controller *c)
         tg_arrival *a = c->arrival + r;
         const int i = s->controlled[r];
         const double goal = c->ramped[r], error = c->y[i] - goal, zone = s->zone[r];
-        const double near = fmax(allowed(c), READINGS_SD * sqrt(s->R[i])), begun = isfinite(a->error) ? a->error : error;
+        const double near = fmax(allowed(c), TG_NEAR_SD * sqrt(s->R[i])), begun = isfinite(a->error) ? a->error : error;
         double off;
         int there, at = 0, is_away;
         a->goal = goal;
-        a->error = isfinite(error) ? begun + REMEMBER * (error - begun) : begun;
+        a->error = isfinite(error) ? begun + TG_NEWEST_ERROR * (error - begun) : begun;
         off = fabs(a->error) - zone;
         a->stayed = off <= near ? a->stayed + 1 : 0;
-        there = a->stayed >= SAMPLES;
+        there = a->stayed >= TG_ARRIVAL_SAMPLES;
         a->due = there ? INFINITY : a->due - c->waited_s;
         a->late = there ? 0.0 : a->late + c->waited_s;
         while (at < s->N && !(fabs(c->y_best[at * TG_NY + i] - goal) - zone <= near))
             at++;
         if (at < s->N && off > near && isinf(a->due)) {
-            a->due = LATE * s->dt * (at + 1) + SLACK * s->dt;
+            a->due = TG_LATE_TIMES * s->dt * (at + 1) + TG_LATE_SAMPLES * s->dt;
             a->late = -s->dt * (at + 1);
         }
         is_away = off > near && fabs(error) - zone > near;
@@ -78,7 +68,7 @@ double tg_overdue(tg_controller *c)
 
 static double least(const tg_controller *c, const tg_swing *q)
 {
-    return fmax(allowed(c), NOISE_SD * sqrt(q->variance));
+    return fmax(allowed(c), TG_NOISE_SD * sqrt(q->variance));
 }
 
 /* The half swings until now, the last one that is open too where it counts already, two on one side being one. */
@@ -88,7 +78,7 @@ static int counted(const tg_controller *c, const tg_swing *q, double longest, tg
     const double a = least(c, q), seconds = half.end - half.begin;
     int n = q->n;
     memcpy(found, q->half, (size_t)n * sizeof(tg_half));
-    if (!(half.iae >= a * SHORTEST * c->design->dt / PI && half.iae >= 2.0 / PI * a * seconds && q->arrived &&
+    if (!(half.iae >= a * TG_SHORTEST_PERIOD * c->design->dt / PI && half.iae >= 2.0 / PI * a * seconds && q->arrived &&
           seconds <= longest))
         return n;
     if (n > 0 && found[n - 1].side == half.side) {
@@ -102,7 +92,7 @@ static int counted(const tg_controller *c, const tg_swing *q, double longest, tg
 
 static int rings(const tg_half *half, int n)
 {
-    return n >= TG_SWINGS && half[n - 1].iae >= LEFT * half[n - TG_SWINGS].iae;
+    return n >= TG_SWINGS && half[n - 1].iae >= TG_LAST_SWING * half[n - TG_SWINGS].iae;
 }
 
 static void note_noise(const tg_controller *c, tg_swing *q, double value)
@@ -110,9 +100,9 @@ static void note_noise(const tg_controller *c, tg_swing *q, double value)
     double *v = q->last;
     if (q->n_last == 4) {
         double fourth = v[0] - 4.0 * v[1] + 6.0 * v[2] - 4.0 * v[3] + value, most = allowed(c) * allowed(c);
-        q->seen = q->seen < NOISE_OF ? q->seen + 1 : NOISE_OF;
-        if (q->seen == NOISE_OF)
-            most = fmax(SPIKE * q->variance, most);
+        q->seen = q->seen < TG_NOISE_READINGS ? q->seen + 1 : TG_NOISE_READINGS;
+        if (q->seen == TG_NOISE_READINGS)
+            most = fmax(TG_SPIKE_VARIANCES * q->variance, most);
         q->variance += (fmin(fourth * fourth / 70.0, most) - q->variance) / q->seen;
         memmove(v, v + 1, 3 * sizeof *v);
         q->n_last = 3;

@@ -1,0 +1,64 @@
+"""Numbers that the Python and the C share: written once, in Python, and defined in each ``tg_config.h``.
+
+A constant stands in the module whose rule it belongs to.  Those of rules that lie above this folder, in
+:mod:`thermogrip.mpc.controllers`, stand here.
+"""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+from thermogrip.mpc.design import design
+from thermogrip.mpc.estimator import arrival, call_times, observer, oscillation, reading_checks
+from thermogrip.mpc.optimiser import active_set, reach, rti
+
+CAUTION, MOST_CAUTION = 3.0, 30.0  # of a mean innovation, from which on moves weigh more; how much more
+STAYS = 1e-5  # of its range: a plan that moves by less has converged
+UNCUT = 1e-9  # of its range: a drive of the PI that is cut by less is not limited
+WEAK = 0.05  # of its gain at rest, below which a drive's bias is not learnt
+
+_SHARED: dict[ModuleType, tuple[str, ...]] = {
+    active_set: ("CONTRADICTION", "FAR", "REGULAR", "SHORT", "TOLERANCE"),
+    arrival: ("ARRIVAL_SAMPLES", "LATE_SAMPLES", "LATE_TIMES", "NEAR_SD", "NEWEST_ERROR"),
+    call_times: ("RESTART_S", "SAME"),
+    design: ("DAY",),
+    observer: ("LARGEST_BIAS", "LASTING", "NEWEST_INNOVATION"),
+    oscillation: (
+        *("LAST_SWING", "NOISE_READINGS", "NOISE_SD", "SHORTEST_PERIOD", "SPIKE_VARIANCES", "SWINGS"),
+    ),
+    reach: (
+        *("BEYOND_LIMIT", "BINS", "CAN", "CANNOT", "CONTRADICTED", "CONVERGED", "KEPT", "LEAST_SD"),
+        *("MISS_ALARM", "MISS_ALLOWANCE", "MISS_CLIP", "STEADY_STEPS", "STILL", "STRIDE", "SURE"),
+        *("SWEEPS", "TAKE_BACK"),
+    ),
+    reading_checks: (
+        *("FOLLOWS_DRIVE", "LEFT_OUT", "SHARE", "SHOWN_TO", "SLOWER_BY", "SLOWER_SD", "SLOW_FOR"),
+        "STILL_SLOWER",
+    ),
+    rti: ("BARELY", "CURVED", "FADING", "FIRST", "LITTLE", "LOOK_AROUND", "SAFE", "SHARES"),
+}
+
+
+def shared_constants() -> dict[str, float | tuple[float, ...]]:
+    """Return each shared constant by the name that the C puts behind ``TG_``."""
+    out = {name: getattr(module, name) for module, names in _SHARED.items() for name in names}
+    out |= {"CAUTION": CAUTION, "MOST_CAUTION": MOST_CAUTION, "STAYS": STAYS, "UNCUT": UNCUT, "WEAK": WEAK}
+    # standard deviations of means with an exponential memory, of unit variance
+    out["INNOVATION_SD"] = _sd_of_mean(observer.NEWEST_INNOVATION)
+    out["LASTS"] = observer.LASTS * _sd_of_mean(observer.LASTING)
+    return out
+
+
+def _sd_of_mean(newest: float) -> float:
+    return float((newest / (2 - newest)) ** 0.5)
+
+
+def shared_definitions() -> list[str]:
+    """Return the lines that define the shared constants in C."""
+    return [f"#define TG_{name} {_in_c(value)}" for name, value in sorted(shared_constants().items())]
+
+
+def _in_c(value: float | tuple[float, ...]) -> str:
+    if isinstance(value, tuple):
+        return "{" + ", ".join(repr(float(v)) for v in value) + "}"
+    return f"({value!r})" if value < 0 else repr(value)
