@@ -6,17 +6,19 @@ import errno
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 from inspect import signature
 from pathlib import Path
-from typing import get_args, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 import pytest
 import typer
 
 from thermogrip.cli.main import main
-from thermogrip.cli.verbs import VERBS, Verb, function_of
+from thermogrip.cli.rig import one_rig
+from thermogrip.cli.verbs import VERBS, Verb, Verbs, function_of
 from thermogrip.datasets.errors import UserError
 
 HEAVY = ["numpy", "scipy", "xarray", "pandas", "casadi", "numba", "llvmlite", "nlopt", "emcee", "arviz"]
@@ -188,6 +190,48 @@ def test_what_is_next_of_a_controller_goes_to_a_target_that_it_was_tuned_for(
     assert Verb("review").next({"controller": file}).endswith(f"--target {target} --out DIR")
     assert (
         Verb("export").next({"controller": "none.json"}) == "run none.json --port DEV --target 38 --out DIR"
+    )
+
+
+def alternatives(verb: str) -> list[str]:
+    """Return what a verb may have found, by which the next command is chosen."""
+    then = command_of(verb).then
+    return [""] if isinstance(then, str) else list(then)
+
+
+GIVEN = {
+    "plant": "p.json", "controller": "c.json", "out": "out", "path": "log.csv", "paths": ["a.csv", "b.csv"],
+    "folder": "run", "grasps": ["g.csv"], "like": "tclab",
+}  # fmt: skip
+RIGS = ({}, {"twin": "p.json"}, {"port": "COM3"}, {"network": "own.py:Tank", "twin": "p.json"})
+
+
+@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("given", [{}, *(GIVEN | rig for rig in RIGS)])
+def test_what_is_next_has_the_options_and_arguments_of_its_verb(verb: str, given: dict[str, Any]) -> None:
+    known = {param.name for param in command_of(verb).params} if given else set()
+    for found in alternatives(verb):
+        mine = {name: value for name, value in given.items() if name in known}
+        line = command_of(verb).next(mine, found=found)
+        after, *words = shlex.split(line)
+        command = command_of(after)
+        options, rest, _ = command.make_parser(command.context_class(command)).parse_args(words)
+        assert rest == [], line
+        assert [p.name for p in command.params if p.required and not options.get(p.name)] == [], line
+        if {"port", "twin"} <= {param.name for param in command.params}:
+            one_rig(options.get("port"), options.get("twin"))
+        if "network" in mine and "network" in {param.name for param in command.params}:
+            assert options["network"] == mine["network"], line
+
+
+def command_of(verb: str) -> Any:
+    return Verbs(name="thermogrip").get_command(None, verb)
+
+
+def test_an_option_that_is_like_none_is_refused_in_plain_words(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["materials", "--draws", "3"]) == 2
+    assert capsys.readouterr().err == (
+        "thermogrip: No such option: --draws; see thermogrip materials --help\n"
     )
 
 

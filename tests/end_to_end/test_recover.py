@@ -44,6 +44,7 @@ def test_what_comes_next_names_files_that_are_there_and_a_run_without_a_row_is_a
     then = f"identify {tmp_path}/batch/0001/samples.csv --out plant.json"
     assert capsys.readouterr().err == f"next: thermogrip {then}\n"
     assert main(["recover", str(tmp_path / "batch")]) == 0
-    assert capsys.readouterr().err == f"next: thermogrip batch CONTROLLER PLAN.csv --out {tmp_path}/batch\n"
+    then = f"next: thermogrip batch CONTROLLER PLAN.csv --twin PLANT --out {tmp_path}/batch\n"
+    assert capsys.readouterr().err == then
     killed(tmp_path / "batch" / "0002", n=0)
     assert main(["recover", str(tmp_path / "batch")]) == 3

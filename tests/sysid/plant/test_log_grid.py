@@ -689,3 +689,11 @@ def test_a_log_that_does_not_fit_is_refused_by_what_it_lacks():
     lost = misfit(bare(), log.drop_vars(["p", "t"]))
     assert str(lost) == "a: has no input p, no output t; its columns are q, room"
     assert "is in 'percent', the plant's is in 'W'" in str(misfit(bare(q="W"), log))
+
+
+def test_a_log_that_shows_no_move_over_a_step_says_nothing_of_it():
+    t = np.arange(30.0)
+    y = 25 + 0.1 * (t % 7 == 0) + 0.1 * (t % 5 == 0)
+    y[2:-2] = np.nan
+    drive, t_tank = (1.0 * (t > 5), "1", "input"), (y, "degC", "output")
+    assert make_grid([make_log(t, {"drive": drive, "t_tank": t_tank})]).native == 1.0
