@@ -23,7 +23,9 @@ values and a :class:`~thermogrip.rig.guard.trip.Trip` come out.  The loop switch
 **The time of a reading** by the computer's clock lies between ``asked`` and ``now``, when it was asked for
 and when it was there.  The rig's clock is wrong where no moments between these allow what it says; however
 late the program is with a reading, it is not wrong for that.  The program itself was late (*frozen*) where a
-drive stood for longer than ``expiry_s`` without being renewed; while nothing is driven it may take its time.
+drive stood for longer than ``expiry_s`` without being renewed (:meth:`Guard.late`); while nothing is driven
+it may take its time.  A device that ends its drives itself knows better whether that one has held: the loop
+asks it then.
 
 **How far beyond a limit.**  A limit trips on the second accepted reading beyond it.  The loop looks at least
 every :data:`~thermogrip.rig.session.loop.LOOK_S`, whatever the sample time is, so a rig that changes by at
@@ -260,7 +262,7 @@ class Guard:
     >>> guard.applied({"drive": 0.4}, 1, 0.0)
     >>> guard.check(Reading(1.0, {"t_surface": 25.1}, {"drive": 0.4}, 1), 1.0).trip
     >>> print(guard.check(Reading(2.0, {"t_surface": 25.2}, {"drive": 0.4}, 1), 12.0).trip.kind)
-    frozen
+    clock
     >>> print(guard.refuse({"drive": 0.4}, 0, 2.0).kind)
     interlock
     """
@@ -323,15 +325,20 @@ class Guard:
         self.model.adopt(self.model.drift.learnt(self.model.evidence))
         return self.model.drift
 
-    def applied(self, drive: Mapping[str, float], pump: int, now: float) -> Trip | None:
-        """Note what was applied at the host's time ``now`` [s]; return the trip where the drive before it had
-        stood for too long."""
-        late = self._frozen(self._time, now)
+    def applied(self, drive: Mapping[str, float], pump: int, now: float) -> None:
+        """Note what was applied at the host's time ``now`` [s]."""
         self._drive, self._pump = {name: float(value) for name, value in drive.items()}, int(pump)
         self._renewed = now
-        if late is not None:
-            self.trips.append(late)
-        return late
+
+    def late(self, now: float) -> Trip | None:
+        """Return the trip of a drive that has stood without being renewed until the host's time ``now`` [s],
+        None where that was in time, or nothing was driven."""
+        silence_s = now - self._renewed
+        if not any(self._drive.values()) or silence_s <= self.settings.expiry_s:
+            return None
+        expected = f"a drive renewed within {self.settings.expiry_s:g} s"
+        measured = f"after {silence_s:.1f} s"
+        return Trip("frozen", self._time, "this program", expected, measured, figures={"seconds": silence_s})
 
     def refuse(self, drive: Mapping[str, float], pump: int, time: float) -> Trip | None:
         """Return the trip of a move that must not go out, None where it may."""
@@ -375,7 +382,7 @@ class Guard:
         """Return the accepted values of a reading, and whether to go on; it was asked for at the host's time
         ``asked`` [s] and there at ``now``; ``stop_asked`` is who asks for an end."""
         between = (now if asked is None else asked, now)
-        trip = self._frozen(reading.time_s, between[0]) or self._clocks(reading, *between)
+        trip = self._clocks(reading, *between)
         if trip is None and stop_asked:
             trip = Trip("operator", reading.time_s, "the operator", "to go on", f"a stop from {stop_asked}")
         seen, late = self._seen == reading.time_s, now > self._now
@@ -410,14 +417,6 @@ class Guard:
         values = {**reading.values, **self.sensors.last_good(), **accepted}
         self._last = Findings(values, suspect, fresh, trip)
         return self._last
-
-    def _frozen(self, time: float, now: float) -> Trip | None:
-        silence_s = now - self._renewed
-        if not any(self._drive.values()) or silence_s <= self.settings.expiry_s:
-            return None
-        expected = f"a drive renewed within {self.settings.expiry_s:g} s"
-        measured = f"after {silence_s:.1f} s"
-        return Trip("frozen", time, "this program", expected, measured, figures={"seconds": silence_s})
 
     def _clocks(self, reading: Reading, asked: float, now: float) -> Trip | None:
         s, there = self.settings, reading.time_s - self._time

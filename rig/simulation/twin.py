@@ -26,7 +26,7 @@ grasps.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -107,6 +107,9 @@ class Twin:
         The output that touches.
     recovery : float, optional
         Time constant with which a grasp is forgotten after release [s].
+    pace : callable, optional
+        Called with the seconds of each wait once they are simulated; the ``wait`` of a
+        :class:`~thermogrip.rig.clock.Metronome` lets somebody watch.
 
     Attributes
     ----------
@@ -140,9 +143,11 @@ class Twin:
         limits: Mapping[str, tuple[float, float]] | None = None,
         skin: str = "t_surface",
         recovery: float = 20.0,
+        pace: Callable[[float], None] | None = None,
     ) -> None:
         self.plant, self.ambient, self.skin, self.recovery = plant, ambient, skin, recovery
         self.noise, self.slow_noise, self.slow_time, self.quantum = noise, slow_noise, slow_time, quantum
+        self._pace = pace
         self.offsets = dict(plant.offsets if offsets is None else offsets)
         given = dict(limits or {})
         self.limits = {name: given.get(name) or _input_range(plant, name) for name in self._drives()}
@@ -212,6 +217,8 @@ class Twin:
             self._step()
         self._accumulate(end - self.time)
         self.time = end
+        if self._pace is not None:
+            self._pace(seconds)
 
     def grasp(self, material: str, t_object: float) -> None:
         """Close the gripper on a block of this material, warmed to ``t_object`` [degC, nominal].

@@ -117,6 +117,18 @@ def test_a_rig_on_a_port_drives_what_the_controller_moves(stand_in: StandIn) -> 
     assert closed == [True]
 
 
+@pytest.mark.parametrize(
+    ("given", "pace"),
+    [((None, "p", None, None), None), ((None, "p", 0, None), 10.0), ((None, "p", None, 8765), 10.0),
+     ((3.0, "p", 0, None), 3.0), ((3.0, "p", None, None), 3.0), ((3.0, None, 0, None), None)],
+)  # fmt: skip
+def test_a_twin_that_is_watched_runs_ten_times_as_fast_as_real_time(
+    given: tuple[Any, ...], pace: float | None
+) -> None:
+    """Given are --speed, --twin, --live and --foxglove."""
+    assert verbs._pace(*given) == pace
+
+
 @pytest.mark.parametrize("own", [False, True])
 def test_a_twin_is_a_draw_of_its_plant_within_the_controller_s_ranges(own: bool, stand_in: StandIn) -> None:
     units = {"a": "percent", "b": "0_255", "c": "1", "e": "W"}
@@ -129,7 +141,7 @@ def test_a_twin_is_a_draw_of_its_plant_within_the_controller_s_ranges(own: bool,
     given = (None, "clock", Path("p.json"), "own.py:Own", 4, controller)
     assert verbs.rig_of(None, *given, seed=3, t_start=28.0) == "a twin"
     [twin] = twins
-    assert (twin.args, twin.seed, twin.t_start) == ((("draw", 4),), 3, 28.0)
+    assert (twin.args, twin.seed, twin.t_start, twin.pace) == ((("draw", 4),), 3, 28.0, None)
     assert twin.limits == {"e": (0.0, 100.0)}
     assert [call.args for call in again] == [(Path("p.json"), "own.py:Own")] * own
     if own:
@@ -381,7 +393,7 @@ def test_live_may_stand_alone(words: list[str], shown: str, ran: SimpleNamespace
     made = stand_in("thermogrip.cli.rig._watch", UserError("seen"))
     given = ["run", "c.json", "--target", "40", "--twin", "plant.json", "--out", "r", "--on-trip", "mail me"]
     assert ran.bench.run(*given, "--live", *words).code == 2
-    assert made[0].args[0::2] == ("run", Path("r"), None)
+    assert made[0].args[0::2] == ("run", Path("r"), None, 10.0)
     assert (str(made[0].args[3]), made[0].args[5]) == (shown, "mail me")
     ran.bench.run(*given, "--foxglove")
     assert made[1].args[3:5] == (None, 8765)

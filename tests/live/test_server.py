@@ -6,6 +6,7 @@ import http.client
 import json
 import re
 import socket
+import threading
 import time
 from contextlib import suppress
 from typing import Any
@@ -210,3 +211,23 @@ def test_the_process_ends_with_the_session() -> None:
         assert process is not None
         Running(watch, paced_twin(), settle_timeout=5.0).result()
     assert process.returncode == 0
+
+
+def test_the_page_of_a_twin_stays_until_its_viewer_has_left() -> None:
+    watch = Watch("run", Console(), Show(live=0, pace=10.0)).__enter__()
+    process = watch._page
+    assert process is not None
+    Running(watch, paced_twin(), settle_timeout=5.0).result()
+    leaving = threading.Thread(target=watch.__exit__, args=(None, None, None))
+    leaving.start()
+    host, token = re.fullmatch(r"http://([^/]+)/\?token=(.+)", watch.address).groups()
+    viewer = http.client.HTTPConnection(host, timeout=30)
+    viewer.request("GET", "/events", headers={"Cookie": f"thermogrip_{host.split(':')[1]}={token}"})
+    answer = viewer.getresponse()
+    assert b"not settled" in answer.readline()  # who comes after the end sees it all the same
+    assert _soon(lambda: watch._viewers) == 1
+    assert (leaving.is_alive(), process.poll()) == (True, None)
+    answer.close()
+    viewer.close()
+    leaving.join(60.0)
+    assert (leaving.is_alive(), process.returncode) == (False, 0)

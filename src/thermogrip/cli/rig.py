@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from thermogrip.sysid.plant.plant import Plant
 
 
+WATCHED_SPEED = 10.0  # of a twin [times real time]: settling, minutes long, in a few tens of seconds
 LOWEST_TARGET, HIGHEST_TARGET = 10.0, 50.0  # degC, of the skin
 
 OutOption = Annotated[Path, cli.opt("--out", "DIR", "Folder of the run.")]
@@ -49,7 +50,16 @@ ProtocolOption = Annotated[
         cli.one_of("--protocol", cli.PROTOCOLS),
     ),
 ]
-SpeedOption = Annotated[float, cli.opt("--speed", "X", "With --port: that of a virtual device.", min=0.01)]
+SpeedOption = Annotated[
+    float | None,
+    cli.opt(
+        "--speed",
+        "X",
+        "Times real time: of a virtual device behind --port [default: 1], of a twin [default: 10 where it is "
+        "watched with --live or --foxglove, else as fast as it goes].",
+        min=0.01,
+    ),
+]
 DrawOption = Annotated[
     int, cli.opt("--draw", None, "Posterior draw of the twin's plant (0: the fit).", min=0)
 ]
@@ -138,7 +148,7 @@ def run(
     out: OutOption,
     port: PortOption = None,
     protocol: ProtocolOption = None,
-    speed: SpeedOption = 1.0,
+    speed: SpeedOption = None,
     twin: TwinOption = None,
     draw: DrawOption = 0,
     start: StartOption = None,
@@ -179,18 +189,22 @@ def run(
     if stop_early is not None and grasp is None:
         raise UserError("--stop-early without a grasp", hint="give --object and --material too")
     console = Console(as_json)
-    watch = _watch("run", console, out, live, foxglove, on_trip)
+    pace = _pace(speed, twin, live, foxglove)
+    watch = _watch("run", console, out, live, foxglove, on_trip, pace)
     stop = None if stop_early is None else session_stop(stop_early, tell=watch.posterior)
     loaded = load_controller(controller, network)
     regulator, wanted = RecordedController(loaded), _for_outputs(wanted, loaded.controlled)
     checks = guard_of(guard, loaded.plant, learn)
-    clock = ScaledClock(speed)
+    clock = ScaledClock(pace or speed or 1.0)
     name = f"{twin.name}, draw {draw}" if twin is not None else str(port)
     about: dict[str, Any] = {"controller": controller.name, "target_degC": wanted}
     about |= {"port": port} if twin is None else {"twin": twin.name, "draw": draw}
     about |= {"from_degC": start, "hold_s": hold, "object_degC": obj, "material": material, "seed": seed}
     files = files_of(learn, controller=controller, plant=twin, guard=guard)
-    rig = rig_of(port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=start)
+    paced = pace is not None
+    rig = rig_of(
+        port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=start, paced=paced
+    )
     try:
         for line in beyond_logs(loaded, wanted, grasps=grasp is not None):
             console.warn(line)
@@ -246,7 +260,7 @@ def batch(
     out: Annotated[Path, cli.opt("--out", "DIR", "Folder of the batch.")],
     port: PortOption = None,
     protocol: ProtocolOption = None,
-    speed: SpeedOption = 1.0,
+    speed: SpeedOption = None,
     twin: TwinOption = None,
     draw: DrawOption = 0,
     grasp_time: GraspTimeOption = 10.0,
@@ -276,12 +290,15 @@ def batch(
 
     trials, loaded = read_plan(plan), load_controller(controller, network)
     checks = guard_of(guard, loaded.plant, learn)
-    clock, console = ScaledClock(speed), Console(as_json)
-    watch = _watch("batch", console, out, live, foxglove, on_trip)
+    pace, console = _pace(speed, twin, live, foxglove), Console(as_json)
+    clock, paced = ScaledClock(pace or speed or 1.0), pace is not None
+    watch = _watch("batch", console, out, live, foxglove, on_trip, pace)
     asks = ask and port is not None and not as_json
 
     def opened() -> Rig:
-        return rig_of(port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=None)
+        return rig_of(
+            port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=None, paced=paced
+        )
 
     files = files_of(learn, controller=controller, plan=plan, plant=twin, guard=guard)
     with _bridge(bridge) as through, watch:
@@ -325,7 +342,7 @@ def record(
     protocol: ProtocolOption = None,
     dt: Annotated[float, cli.opt("--sample", "S", "Seconds a row.", min=0.05)] = 1.0,
     guard: GuardOption = None,
-    speed: SpeedOption = 1.0,
+    speed: Annotated[float, cli.opt("--speed", "X", "That of a virtual device.", min=0.01)] = 1.0,
     live: LiveOption = None,
     foxglove: FoxgloveOption = None,
     bridge: BridgeOption = None,
@@ -505,13 +522,15 @@ def files_of(learn: Path | None, **named: Path | None) -> dict[str, Path]:
 
 def rig_of(
     port: str | None, protocol: str | None, clock: ScaledClock, twin: Path | None, network: str | None,
-    draw: int, controller: Controller, *, seed: int, t_start: float | None,
+    draw: int, controller: Controller, *, seed: int, t_start: float | None, paced: bool = False,
 ) -> Rig:  # fmt: skip
-    """Return the rig on a port, or the simulated one."""
+    """Return the rig on a port, or the simulated one, ``paced`` by the clock or as fast as it goes."""
+    from thermogrip.rig.clock import Metronome
     from thermogrip.rig.drivers.connect import open_rig
 
     if twin is not None:
-        return _twin(twin, network, draw, controller, seed=seed, t_start=t_start)
+        pace = Metronome(clock, clock.sleep).wait if paced else None
+        return _twin(twin, network, draw, controller, seed=seed, t_start=t_start, pace=pace)
     if t_start is not None or draw:
         raise UserError("--from and --draw are of the twin", hint="leave them away with --port")
     rig = open_rig(str(port), protocol, clock=clock, sleep=clock.sleep)
@@ -523,9 +542,17 @@ def rig_of(
     return rig
 
 
+def _pace(speed: float | None, twin: Path | None, live: int | None, foxglove: int | None) -> float | None:
+    """Return how many times as fast as real time a twin runs, None where it runs as fast as it goes."""
+    if twin is None or speed is not None:
+        return None if twin is None else speed
+    return None if live is None and foxglove is None else WATCHED_SPEED
+
+
 def _twin(
-    path: Path, network: str | None, draw: int, controller: Controller, *, seed: int, t_start: float | None
-) -> Twin:
+    path: Path, network: str | None, draw: int, controller: Controller, *, seed: int,
+    t_start: float | None, pace: Callable[[float], None] | None = None,
+) -> Twin:  # fmt: skip
     """Return the simulated rig; a drive whose unit does not say its range has the controller's."""
     from thermogrip.rig.interface import UNIT_RANGES
     from thermogrip.rig.simulation.twin import Twin
@@ -539,7 +566,7 @@ def _twin(
         plant = cli.load_plant(path, network)
     ranges = controller.design.drive_range
     limits = {name: ends for name, ends in ranges.items() if plant.units.get(name, "1") not in UNIT_RANGES}
-    return Twin(plant.draw(draw), seed=seed, t_start=t_start, limits=limits)
+    return Twin(plant.draw(draw), seed=seed, t_start=t_start, limits=limits, pace=pace)
 
 
 def guard_of(path: Path | None, plant: Plant | None, learn: Path | None = None) -> Guard:
@@ -608,13 +635,15 @@ def _what_to_grasp(obj: float | None, material: str | None) -> tuple[str, float]
 
 
 def _watch(
-    title: str, console: Console, out: Path, live: int | None, foxglove: int | None, on_trip: str | None
-) -> Watch:
-    """Return what shows a session."""
+    title: str, console: Console, out: Path, live: int | None, foxglove: int | None, on_trip: str | None,
+    pace: float | None = None,
+) -> Watch:  # fmt: skip
+    """Return what shows a session, ``pace`` times as fast as real time where a twin is watched."""
     from thermogrip.live.watch import Show, Watch
 
     layout = out / "foxglove_layout.json"
-    return Watch(title, console, Show(live=live, foxglove=foxglove, on_trip=on_trip, layout=layout))
+    show = Show(live=live, foxglove=foxglove, on_trip=on_trip, layout=layout, pace=pace)
+    return Watch(title, console, show)
 
 
 @contextmanager

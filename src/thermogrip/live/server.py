@@ -60,6 +60,7 @@ class State:
         self.count = self.messages = 0
         self.lost = False  # the session is gone without a verdict
         self.over = False
+        self.viewers = 0
 
     def take(self, message: dict[str, Any]) -> None:
         """Take one message of the session."""
@@ -199,7 +200,17 @@ def application(state: State, ask: Callable[[dict[str, Any]], None], *, port: in
         return response
 
     async def events(request: Request) -> Response:
-        return StreamingResponse(_events(state), media_type="text/event-stream", headers=safe)
+        return StreamingResponse(watched(), media_type="text/event-stream", headers=safe)
+
+    async def watched() -> AsyncIterator[str]:
+        state.viewers += 1
+        ask({"do": "viewers", "count": state.viewers})
+        try:
+            async for event in _events(state):
+                yield event
+        finally:
+            state.viewers -= 1
+            ask({"do": "viewers", "count": state.viewers})
 
     async def act(request: Request) -> Response:
         body = b""

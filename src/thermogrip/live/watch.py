@@ -30,6 +30,7 @@ import typer
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.media import printable
+from thermogrip.live.server import LINGER_S
 from thermogrip.live.terminal import History, line, panel
 from thermogrip.live.trip_command import TripCommand
 from thermogrip.report.console import Console, plain
@@ -43,6 +44,7 @@ _KEEP = 4096  # snapshots that wait
 _SWITCH_S = 5e-4  # after which a thread that shows passes Python's lock on (5 ms elsewhere)
 _PATIENCE_S = 10.0  # for the page's process to start
 _GOODBYE_S = 4.0  # for it to end
+_RELOAD_S = 2.0  # a page that is loaded anew is back within
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,7 @@ class Show:
     foxglove: int | None = None  # port
     on_trip: str | None = None  # command line
     layout: Path | None = None  # where Foxglove's layout goes
+    pace: float | None = None  # of a twin [times real time]: its page stays until it has been looked at
 
     def check(self) -> None:
         """Raise UserError where a package is missing."""
@@ -98,6 +101,7 @@ class Watch:
         self.address = ""
         self._page: subprocess.Popen[bytes] | None = None
         self._reached = False  # whether the page's process takes what is written
+        self._viewers: int | None = None  # who look at the page now; None where nobody has come yet
         self._view = _Lines(title) if not sys.stderr.isatty() else _Panel(title)
 
     def listen(self, snapshot: Snapshot) -> None:
@@ -188,6 +192,9 @@ class Watch:
         if kind is not None:
             stopped = issubclass(kind, KeyboardInterrupt)
             self._verdict = "stopped by Ctrl-C" if stopped else f"failed: {error}"
+        elif self._show.pace is not None and self._reached:
+            with suppress(KeyboardInterrupt):
+                self._stay()
         self._over.set()
         self._thread.join(_GOODBYE_S)
         if self._thread.is_alive() and self._page is not None:  # it writes to a process that hangs
@@ -198,6 +205,19 @@ class Watch:
         if self._command is not None:
             self._command.join()
         sys.setswitchinterval(self._switch)
+
+    def _stay(self) -> None:
+        """Keep the page of a twin until whoever looked at it has left."""
+        self._view.pause()
+        sys.stderr.write("the session has ended; close the page, or press Ctrl-C here\n")
+        sys.stderr.flush()
+        end = time.monotonic() + LINGER_S
+        while self._reached and time.monotonic() < end:
+            if self._viewers:
+                end = float("inf")
+            elif self._viewers == 0:
+                end = min(end, time.monotonic() + _RELOAD_S)
+            time.sleep(EVERY_S)
 
     def _work(self) -> None:
         """Show what is new until the end, and that too."""
@@ -276,6 +296,8 @@ class Watch:
         if show.live is not None:
             self.address = f"http://127.0.0.1:{said['port']}/?token={token}"
             sys.stderr.write(f"live: {self.address}\n")
+        if show.pace is not None:
+            sys.stderr.write(f"the twin runs {show.pace:g} times as fast as real time (--speed)\n")
         if show.foxglove is not None:
             sys.stderr.write(f"foxglove: ws://127.0.0.1:{show.foxglove}, layout {printable(str(layout))}\n")
         sys.stderr.flush()
@@ -286,7 +308,9 @@ class Watch:
         for text in page.stdout:
             asked = json.loads(text)
             do = asked.get("do")  # it may also say why it ends
-            if do == "stop":
+            if do == "viewers":
+                self._viewers = asked["count"]
+            elif do == "stop":
                 self.operator.stop("the page")
             elif do == "bad":
                 self.operator.mark_bad(asked.get("text") or "marked on the page")

@@ -38,10 +38,7 @@ def guard_at(skin: float = 25.0, **settings: Any) -> Guard:
 
 
 def check(guard: Guard, one: Reading, *, now: float | None = None, **options: Any) -> Findings:
-    """Check a reading under a drive that was renewed just before."""
-    now = one.time_s if now is None else now
-    guard._renewed = now
-    return guard.check(one, now, **options)
+    return guard.check(one, one.time_s if now is None else now, **options)
 
 
 def kind(found: Findings) -> str:
@@ -113,24 +110,15 @@ def test_how_late_the_program_is_with_a_reading_is_no_fault_of_the_rigs_clock(
     assert said(guard.check(reading(10.0 + there, 25.0), then[1], asked=then[0]).trip) == want
 
 
-@pytest.mark.parametrize(
-    ("drive", "renewed", "then", "want"),
-    [(0.4, 2.0, 2.0, ""), (0.4, 2.1, 2.0, "frozen"), (0.0, 60.0, 60.0, ""), (0.4, 0.5, 2.6, "frozen")],
-)
-def test_a_drive_that_nobody_renewed_in_its_time_is_the_programs_fault(
-    drive: float, renewed: float, then: float, want: str
-) -> None:
-    """``renewed`` [s] after it was applied it is applied anew; ``then`` a reading is asked for."""
+def test_a_drive_that_nobody_renewed_in_its_time_is_the_programs_fault() -> None:
     guard = guard_at()
-    assert guard.applied({"drive": drive}, 1, 30.0) is None  # a controller may take its time before it
-    late = guard.applied({"drive": drive}, 1, 30.0 + renewed)
-    asked = 30.0 + renewed + then
-    found = guard.check(reading(asked, 25.0), asked + 5.0, asked=asked)
-    trips = [one for one in (late, found.trip) if one is not None]
-    assert [one.kind for one in trips] == [want] * bool(want)
-    assert guard.trips == trips
-    if renewed > 2.0 and want:
-        assert said(late) == ("frozen", "this program", "a drive renewed within 2 s", "after 2.1 s")
+    assert guard.late(60.0) is None  # a controller may take its time before it first drives
+    guard.applied({"drive": 0.4}, 1, 60.0)
+    assert guard.late(62.0) is None
+    want = ("frozen", "this program", "a drive renewed within 2 s", "after 2.1 s")
+    assert said(guard.late(62.1)) == want
+    guard.applied({"drive": 0.0}, 1, 62.1)
+    assert guard.late(90.0) is None
 
 
 def test_a_reading_that_was_seen_is_not_checked_again_and_an_old_one_is_not_fresh() -> None:

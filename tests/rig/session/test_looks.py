@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from tests.rig.fault_injection.limits import LIMITS, SAMPLES_S, drive_into
+from tests.rig.makers import SteppedClock
 from tests.rig.session.test_loop import rig_of, shown, started, told, trip_of
 from thermogrip.mpc.interface import Move
 from thermogrip.rig.guard.guard import LIMIT_MARGIN
+from thermogrip.rig.interface import Event, Reading
 from thermogrip.rig.session.loop import LOOK_S
 
 
@@ -71,3 +73,50 @@ def test_what_happens_within_a_long_sample_ends_it_there(fault: str) -> None:
     assert trip.kind == {"reset": "device"}.get(fault, fault)
     assert 20.0 < trip.time_s <= 20.0 + 3 * LOOK_S
     assert fault != "lost" or len(told(run, "lost")) == 1
+
+
+@pytest.mark.parametrize(
+    ("drive", "expires", "notice", "kind"),
+    [(40.0, 2.0, "", ""), (40.0, 2.0, "expired", "frozen"), (40.0, np.inf, "", "frozen"),
+     (0.0, np.inf, "", "")],
+)  # fmt: skip
+@pytest.mark.parametrize("in_a_wait", [True, False])
+def test_a_program_that_came_late_goes_on_where_the_device_says_that_its_drive_has_held(
+    drive: float, expires: float, notice: str, kind: str, in_a_wait: bool
+) -> None:
+    run, clock = started(Move(drive=drive), rig=rig_of()), SteppedClock(10.0)
+    rig, run.clock, run.rig.expires_s = run.rig, clock, expires
+    rig.read.side_effect = lambda: Reading(clock(), dict(rig.values), rig.apply.call_args.args[0], 1)
+    clock.sleep(30.0)  # a controller may take its time while nothing is driven
+    run.move = Move(drive=drive)
+    run.record("hold")
+    rig.wait.side_effect = lambda seconds: clock.sleep(seconds + 2.2 * in_a_wait)
+    rig.notices.return_value = [Event(42.0, notice, "the drive has ended")] if notice else []
+
+    def go_on() -> None:
+        run.wait(0.5)
+        clock.sleep(2.2 * (not in_a_wait))
+        run.record("hold")
+
+    if kind:
+        trip = trip_of(go_on)
+        assert (trip.kind, "what stopped the program" in trip.check) == (kind, True)
+    else:
+        go_on()
+        lateness = [text.partition(" measured ")[2] for _, text in told(run, "late")]
+        assert lateness == ["after 2.7 s"] * bool(drive)
+
+
+def test_a_computer_that_is_late_at_first_is_no_fault_of_the_rigs_clock() -> None:
+    run, clock = started(Move(drive=40.0), rig=rig_of()), SteppedClock(10.0)
+    late = iter([1.9, 0.0, 1.4, 0.0])  # seconds from a measurement to its end in the program
+
+    def read() -> Reading:
+        reading = Reading(clock(), dict(run.rig.values), run.rig.apply.call_args.args[0], 1)
+        clock.sleep(next(late))
+        return reading
+
+    run.clock, run.rig.read.side_effect, run.rig.wait.side_effect = clock, read, clock.sleep
+    for _ in run.regulate("hold", 2.0):
+        pass
+    assert len(run.rows) >= 2

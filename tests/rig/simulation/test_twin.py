@@ -216,3 +216,11 @@ def test_the_history_shows_when_the_gripper_was_closed(plant: Plant) -> None:
 def test_what_cannot_be_grasped_is_the_users_fault(plant: Plant, skin: str, material: str, said: str) -> None:
     with pytest.raises(UserError, match=said):
         Twin(plant, skin=skin).grasp(material, 43.0)
+
+
+def test_a_twin_keeps_the_pace_of_who_watches_it(plant: Plant) -> None:
+    waited: list[float] = []
+    twin = Twin(plant, pace=waited.append)
+    twin.wait(0.5)
+    twin.wait(2.0)
+    assert (waited, twin.time) == ([0.5, 2.0], 2.5)
