@@ -549,6 +549,11 @@ def test_a_guard_has_its_file_or_the_defaults_and_learns_only_of_a_plant(
     assert drifts[0].args == (tmp_path, "a plant", 0.125)
 
 
+def test_of_a_faster_virtual_device_the_program_may_be_as_late_in_seconds_of_the_computer() -> None:
+    for speed, expiry_s in ((1.0, 2.0), (0.5, 2.0), (4.0, 8.0)):
+        assert verbs.guard_of(None, None, speed=speed).settings.expiry_s == expiry_s
+
+
 def test_a_rig_that_nobody_knows_drifts_as_is_usual_or_as_the_guard_file_says(tmp_path: Path) -> None:
     plant, file = plant_from_prior(load_network("tclab")), tmp_path / "rig.json"
     assert verbs._drift_of(file, plant, 0.0).drift == USUAL_DRIFT

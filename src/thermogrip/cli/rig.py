@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -194,7 +195,7 @@ def run(
     stop = None if stop_early is None else session_stop(stop_early, tell=watch.posterior)
     loaded = load_controller(controller, network)
     regulator, wanted = RecordedController(loaded), _for_outputs(wanted, loaded.controlled)
-    checks = guard_of(guard, loaded.plant, learn)
+    checks = guard_of(guard, loaded.plant, learn, speed=speed or 1.0)
     clock = ScaledClock(pace or speed or 1.0)
     name = f"{twin.name}, draw {draw}" if twin is not None else str(port)
     about: dict[str, Any] = {"controller": controller.name, "target_degC": wanted}
@@ -289,7 +290,7 @@ def batch(
     from thermogrip.rig.records.batch import read_plan, run_batch
 
     trials, loaded = read_plan(plan), load_controller(controller, network)
-    checks = guard_of(guard, loaded.plant, learn)
+    checks = guard_of(guard, loaded.plant, learn, speed=speed or 1.0)
     pace, console = _pace(speed, twin, live, foxglove), Console(as_json)
     clock, paced = ScaledClock(pace or speed or 1.0), pace is not None
     watch = _watch("batch", console, out, live, foxglove, on_trip, pace)
@@ -361,7 +362,7 @@ def record(
     from thermogrip.rig.session.session import Playback, play
 
     plan = read_log(schedule)
-    checks = guard_of(guard, None)
+    checks = guard_of(guard, None, speed=speed)
     console = Console(as_json)
     watch = _watch("record", console, out, live, foxglove, on_trip)
     clock = ScaledClock(speed)
@@ -569,12 +570,17 @@ def _twin(
     return Twin(plant.draw(draw), seed=seed, t_start=t_start, limits=limits, pace=pace)
 
 
-def guard_of(path: Path | None, plant: Plant | None, learn: Path | None = None) -> Guard:
-    """Return the guard of a rig; what no file says is as by default."""
+def guard_of(
+    path: Path | None, plant: Plant | None, learn: Path | None = None, *, speed: float = 1.0
+) -> Guard:
+    """Return the guard of a rig; what no file says is as by default.  Of a virtual device that runs ``speed``
+    times as fast this program may be as late as of others, in seconds of the computer."""
     from thermogrip.rig.guard.guard import Guard, GuardSettings
     from thermogrip.rig.guard.settings import read_guard
 
     settings = GuardSettings() if path is None else read_guard(path)
+    if speed > 1.0:
+        settings = replace(settings, expiry_s=speed * settings.expiry_s)
     drift = None if learn is None or plant is None else _drift_of(learn, plant, settings.model.drift)
     return Guard(plant, settings, drift=drift)
 
