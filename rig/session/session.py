@@ -224,10 +224,10 @@ def run_session(
     progress : callable, optional
         Called with (fraction done, what is being done).
     listener : callable, optional
-        Called with a :class:`~thermogrip.rig.session.snapshot.Snapshot` at each sample, and with a last one
+        Called with a :class:`~thermogrip.rig.session.snapshot.Snapshot` at each look, and with a last one
         that has the verdict; the loop waits for it.
     operator : Operator, optional
-        Whose requests, made in other threads, are looked at each sample.
+        Whose requests, made in other threads, are seen at each look.
 
     Raises
     ------

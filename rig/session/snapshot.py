@@ -1,11 +1,11 @@
-"""What a session shows of itself at each sample, and what an operator may ask of it meanwhile.
+"""What a session shows of itself at each look, and what an operator may ask of it meanwhile.
 
-The loop makes one :class:`Snapshot` a sample and calls its listener with it.  It waits for nobody: a listener
+The loop makes one :class:`Snapshot` a look and calls its listener with it.  It waits for nobody: a listener
 returns at once (it appends to a bounded queue, whose oldest snapshots are dropped), and one that raises gets
 nothing more.  A snapshot stands alone, so that whoever missed some shows the present all the same.
 
-An :class:`Operator` is the way back: requests come from any thread, the loop looks at each sample.  A stop is
-a trip of the guard; a mark is an event.  Neither is an emergency stop: a loop that hangs looks at nothing.
+An :class:`Operator` is the way back: requests come from any thread, the loop sees them at each look.  A stop
+is a trip of the guard; a mark is an event.  Neither is an emergency stop: a loop that hangs looks at nothing.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Operator:
         self._bad: deque[str] = deque(maxlen=MOST_MARKS)
 
     def stop(self, by: str) -> None:
-        """Ask the guard to end the session at the next sample; one that is asked for stays asked for."""
+        """Ask the guard to end the session at the next look; one that is asked for stays asked for."""
         self.stop_asked = by
 
     def mark_bad(self, why: str) -> None:
