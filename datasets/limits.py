@@ -194,7 +194,8 @@ def array_within(content: Mapping[str, Any], key: str, largest: float = LARGEST)
     """Return an array of a document; ValueError where an entry is not finite or beyond ``largest``."""
     import numpy as np  # the command line imports this module, and --help loads no heavy package
 
-    values = np.asarray(content[key], dtype=float)
+    with np.errstate(invalid="ignore"):  # of a NaN in another type
+        values = np.asarray(content[key], dtype=float)
     if not (np.abs(values) <= largest).all():
         raise ValueError(f"{key} has an entry that is not within +-{largest:g}")
     return values

@@ -360,6 +360,13 @@ def _parse_table(
     if table is None:
         counts: list[int] = []
 
+        try:
+            body.decode("utf-8")
+        except UnicodeDecodeError as error:  # Arrow writes a traceback for a row that it cannot hand over
+            row = body.count(b"\n", 0, error.start) + 1
+            hint = "save the file as UTF-8"
+            raise UserError("is not UTF-8 text", file=file, row=row, hint=hint) from error
+
         def leave_out(row: Any) -> str:
             counts.append(row.actual_columns)
             return "skip"
