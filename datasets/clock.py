@@ -178,8 +178,9 @@ def _in_pieces(seconds: Floats, lines: NDArray[np.int64]) -> tuple[Floats, list[
         return seconds, []
     usual = float(np.nanmedian(np.diff(seconds)))
     begins = seconds[0] + max(GAP_SECONDS, _PIECE_ROWS * usual)  # a board begins where it began before
-    if any(piece.size < _PIECE_ROWS or piece[0] > begins for piece in pieces):
-        return seconds, []
+    whole = [piece.size >= _PIECE_ROWS and piece[1] - piece[0] <= GAP_STEPS * usual for piece in pieces]
+    if not all(whole) or any(piece[0] > begins for piece in pieces):
+        return seconds, []  # a stamp that is wrong begins no part that goes on as a clock does
     gap = 1.0 + max(GAP_SECONDS, GAP_STEPS * usual)
     seconds = seconds.copy()
     for at in back:

@@ -169,10 +169,11 @@ def read_log(
     if EPOCH[0] <= began <= EPOCH[1]:
         log.attrs["began"] = str(np.datetime64(round(began), "s")) + "Z"
     log.attrs["guesses"] = "\n".join(f"{name}: {why}" for name, why in roles.reasons.items())
-    log.attrs["clock_doubts"] = "" if own else read.clock.doubt
-    log.attrs["role_doubts"] = "\n".join(() if own else (*read.doubts, *roles.doubts))
     if own:
         log.attrs.update({k: v for k, v in table.meta.items() if k not in ("schema", "version")})
+    else:
+        log.attrs["clock_doubts"] = read.clock.doubt
+        log.attrs["role_doubts"] = "\n".join((*read.doubts, *roles.doubts))
     return _cut(log, start, stop, file) if (start, stop) != (-np.inf, np.inf) else log
 
 

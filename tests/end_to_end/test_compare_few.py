@@ -1,4 +1,4 @@
-"""compare where a material has too few grasps for random splits: the given split is scored all the same."""
+"""compare where a material has too few grasps for random splits: the others are scored."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.grasp_files import write_grasps
 
 
-def test_the_given_split_is_scored_where_no_random_one_can_be(
+def test_random_splits_are_of_the_materials_that_have_grasps_enough(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     grasps = load_example_grasps()["exp2_dT20"]
@@ -30,9 +30,9 @@ def test_the_given_split_is_scored_where_no_random_one_can_be(
     ]
     assert main([*words, "--json"]) == 0
     said = capsys.readouterr()
-    assert list(json.loads(said.out)["splits"]) == ["shipped"]
-    assert "no random splits: no condition can be split; " in said.err
-    assert "1 grasp(s) of wood" in said.err
+    assert list(json.loads(said.out)["splits"]) == ["shipped", "random"]
+    (caution,) = json.loads(said.out)["splits"]["random"]["cautions"]
+    assert caution["words"] == "wood is left out: 1 grasp(s) cannot give 5 to train and one to test"
     assert "UserWarning" not in said.err
 
 

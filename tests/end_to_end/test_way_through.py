@@ -60,8 +60,11 @@ def test_a_plant_becomes_a_controller_that_grasps_and_both_have_whole_pages(benc
     kept = json.loads((bench.path / "c.json").read_text())["notes"]
     assert kept["pareto"] == tuned["pareto"]
     assert len(kept["in_words"]) == len(tuned["sensitivity"])
-    checks = answer(bench, "review", "c.json")["checks"]
-    assert {check["verdict"] for check in checks} <= {"pass", "warn"}
+    # tuned for the plant as it is: with half of its delay more the loop does not settle, and the answer is no
+    checks = answer(bench, "review", "c.json", code=3)["checks"]
+    failed = [check for check in checks if check["verdict"] == "fail"]
+    assert [check["name"] for check in failed] == ["settles where the model lacks structure"]
+    assert "raise the move weight" in failed[0]["fix"]
     run = ["run", "c.json", "--target", "34", "--from", "28", "--twin", "plant.json", "--hold", "150"]
     run += ["--object", "18", "--material", "copper", "--grasp-time", "2", "--out", "r"]
     done = answer(bench, *run, "--report", "r.html")
