@@ -458,12 +458,12 @@ def test_numbers_that_make_no_controller_are_reported_shortly(tank, tmp_path, mo
     path = design_controller(tank, dt=2.0).save(tmp_path / "controller.json")
 
     def broken(content):
-        raise np.linalg.LinAlgError("x" * 200)
+        raise np.linalg.LinAlgError("x" * 300)
 
     monkeypatch.setattr(Design, "from_dict", broken)
     with pytest.raises(UserError) as caught:
         Controller.load(path)
-    assert caught.value.problem == f"its numbers make no controller (LinAlgError: {'x' * 120})"
+    assert caught.value.problem == f"its numbers make no controller (LinAlgError: {'x' * 200})"
     assert (caught.value.hint, caught.value.file) == ("tune the controller again", path)
 
 
