@@ -88,10 +88,12 @@ def reading(problem: str, *, file: str | Path | None = None, hint: str) -> Itera
     they stumble over, so no list of exceptions is complete.  Nothing but reading belongs in the block.  A
     UserError keeps its words, and gets the file where it names none.
 
-    >>> with reading("is no log", file="a.bag", hint="copy it again"):
-    ...     b""[3]
-    Traceback (most recent call last):
-    thermogrip.datasets.errors.UserError: a.bag: is no log (IndexError: index out of range); copy it again
+    >>> try:
+    ...     with reading("is no log", file="a.bag", hint="copy it again"):
+    ...         b""[3]
+    ... except UserError as error:
+    ...     print(error)
+    a.bag: is no log (IndexError: index out of range); copy it again
     """
     try:
         yield
