@@ -194,9 +194,8 @@ def test_one_version_stands_everywhere() -> None:
     assert project["version"] == __version__
     assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
     changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
-    latest = re.search(r"^## \[(.*?)\]", changes, flags=re.MULTILINE)
-    assert latest
-    assert latest[1] == __version__
+    heads = re.findall(r"^## \[(.*?)\]", changes, flags=re.MULTILINE)
+    assert next(head for head in heads if head != "Unreleased") == __version__
 
 
 def test_the_tests_that_are_repeated_with_another_processors_kernels_are_there() -> None:

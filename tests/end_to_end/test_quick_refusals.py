@@ -77,7 +77,7 @@ REFUSED = {
     "review deep.json": "deep.json: is nested too deeply",
     "review large.json": "large.json: design.dt is 1e+200, beyond",
     "review slow.json": "slow.json: has no whole design (ValueError: dt is 1e+09, not 0.001 to 86400)",
-    "export fast.json --out d": "fast.json: is not a whole plant (ValueError: dt is 1e-09",
+    "export fast.json --out d": "fast.json: is not a whole plant (dt is 1e-09",
     "tune short.json --out c.json": "short.json: is not a whole plant",
     "identify empty.csv --out p.json": "empty.csv: is empty",
     "identify binary.csv@10:20 --out p.json": "binary.csv: is not text",

@@ -224,7 +224,8 @@ def test_the_page_of_a_twin_stays_until_its_viewer_has_left() -> None:
     viewer = http.client.HTTPConnection(host, timeout=30)
     viewer.request("GET", "/events", headers={"Cookie": f"thermogrip_{host.split(':')[1]}={token}"})
     answer = viewer.getresponse()
-    assert b"not settled" in answer.readline()  # who comes after the end sees it all the same
+    # who comes after the end sees it all the same, in the first message or in one that was on its way
+    assert any(b"not settled" in answer.readline() for _ in range(20))
     assert _soon(lambda: watch._viewers) == 1
     assert (leaving.is_alive(), process.poll()) == (True, None)
     answer.close()

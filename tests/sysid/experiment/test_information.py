@@ -281,7 +281,7 @@ def test_the_warm_up_informs_of_a_start_that_is_not_known(network: str, rows: in
 @pytest.mark.parametrize(
     ("network", "reference", "known"),
     [
-        ("gripper", "t_ambient", True),
+        ("gripper", "t_tank", True),
         ("gripper", None, False),
         ("tclab", None, False),
         ("tclab", "t1", False),
