@@ -116,7 +116,7 @@ UNSEEN = """
 
 So leave that much room below what must not be exceeded, or have one of two sensors read by another converter (`[[pairs]]`).
 
-**Without a model** (`record`), no sensor that reads the room is found out before 30 s of full drive have been given, or as much of a lower drive; a mean drive of less than 1/16 is not judged. On this rig water and skin are then {beyond:.1f} K from the room at most. While another sensor answers, one that has come off its place is found by a pair alone; and without a sensor of the room only once none has moved by 1 K since the session began.
+**Without a model** (`record`), no sensor that reads the room is found out before 60 s of full drive have been given, or as much of a lower drive; a mean drive of less than 1/16 is not judged. On this rig water and skin are then {beyond:.1f} K from the room at most. While another sensor answers, one that has come off its place is found by a pair alone; and without a sensor of the room only once none has moved by 1 K since the session began.
 """
 
 SAID = """

@@ -41,8 +41,9 @@ They are the rules of 3-D printers (Klipper's ``verify_heater``, Marlin's ``WATC
 because a Peltier drive does both, and by energy, because what heats slowly burns as well:
 
 *No answer.*  Each time the integral of the drive (a share of its range, positive heats) has come to
-``energy`` seconds of full drive, either way, the output that moved most must have moved by ``least`` kelvin
-with the drive since the last time, or one must stand where such a drive holds it:
+``energy`` seconds of full drive, either way and without a change of sign, an output must have moved by
+``least`` kelvin with the drive at some time since the last time, or one must stand where such a drive holds
+it.  A change of sign begins anew, for what was stored before still acts:
 
     |T - T_room| >= far min(1, 2 |mean drive|) - least,    T on the drive's side of the room.
 
@@ -81,7 +82,9 @@ _OPTIMUM_EVERY_S, _OPTIMUM_FOR_S = 10.0, 60.0
 class RuleSettings:
     """Numbers of the rules."""
 
-    energy: float = keyed(30.0, "full_drive_s", 1, 3600)  # what half of full drive gives in a minute
+    # a minute of full drive: what was heated may rise for half of it (of 72 experiments on the example rig
+    # 30 s ended four, 60 s none)
+    energy: float = keyed(60.0, "full_drive_s", 1, 3600)
     least: float = keyed(1.0, "least_K", 0.05, 50)
     far: float = keyed(8.0, "far_K", 0.5, 100)  # at half of full drive
     near: float = keyed(1.0, "near_K", 0.05, 50)
@@ -101,7 +104,9 @@ class RuleMonitor:
         self._ranges: dict[str, tuple[float, float]] = {}  # of each output in this session [degC]
         self._been_near: dict[str, tuple[float, float]] = {}  # target, area so far
         self._time = self._begun = float("nan")
-        self._energy, self._since = 0.0, dict(self._ranges)  # since it was ``_begun``
+        self._energy = 0.0  # since it was ``_begun``
+        self._since = dict(self._ranges)
+        self._moved: dict[str, tuple[float, float]] = {}  # largest rise and fall since then [K]
 
     def check(
         self,
@@ -116,27 +121,33 @@ class RuleMonitor:
         positive heats; temperatures and targets are in degC, no target where nothing is regulated."""
         passed = time - self._time if isfinite(self._time) else 0.0
         self._time = time
-        if not isfinite(self._begun):
-            self._begun = time
+        if not isfinite(self._begun) or drive * self._energy < 0:
+            self._begin(time, accepted)
         self._energy += drive * passed
         for name, value in accepted.items():
             for ranges in (self._ranges, self._since):
                 low, high = ranges.get(name, (value, value))
                 ranges[name] = min(low, value), max(high, value)
+            (low, high), (rise, fall) = self._since[name], self._moved.get(name, (0.0, 0.0))
+            self._moved[name] = max(rise, value - low), max(fall, high - value)
         trip = None
         if accepted and abs(self._energy) >= self.settings.energy:
             trip = self._no_answer(time, accepted, room)
-            self._begun, self._energy, self._since = time, 0.0, {n: (v, v) for n, v in accepted.items()}
+            self._begin(time, accepted)
         return trip or self._away(time, passed, accepted, target)
+
+    def _begin(self, time: float, accepted: Mapping[str, float]) -> None:
+        self._begun, self._energy = time, 0.0
+        self._since = {name: (value, value) for name, value in accepted.items()}
+        self._moved = {}
 
     def _no_answer(self, time: float, outputs: Mapping[str, float], room: float) -> Trip | None:
         s, seconds = self.settings, time - self._begun
         mean = self._energy / seconds
         heats, holds = mean > 0, s.far * min(1.0, 2 * abs(mean))
         with_drive, against = {}, {}
-        for name, value in outputs.items():
-            low, high = self._since[name]
-            rise, fall = value - low, high - value
+        for name in outputs:
+            rise, fall = self._moved[name]
             with_drive[name], against[name] = (rise, fall) if heats else (fall, rise)
         most = max(with_drive, key=with_drive.__getitem__)
         beyond = max(self._beyond_room(name, value, room, heats) for name, value in outputs.items())

@@ -83,16 +83,16 @@ def guard_from_dict(content: Mapping[str, Any], *, file: str | Path | None = Non
 
 
 def _without_former(table: Mapping[str, Any], file: str | Path | None) -> dict[str, Any]:
-    """Return [no_model] of version 0.2.0 by today's keys: a drive for so long is an energy, and what moves
-    the wrong way is no answer."""
+    """Return [no_model] of version 0.2.0 by today's keys: its window of full drive is an energy, and what
+    moves the wrong way is no answer."""
     former = {"window_s": (60.0, (5, 3600)), "drive": (0.5, (0.01, 1)), "wrong_K": (2.0, (0.05, 50))}
     values = {
         name: _number(f"no_model.{name}", table.get(name, usual), span, "write full_drive_s", file)
         for name, (usual, span) in former.items()
     }
     today = {name: value for name, value in table.items() if name not in former}
-    if "window_s" in table or "drive" in table:
-        today.setdefault("full_drive_s", values["window_s"] * values["drive"])
+    if "window_s" in table:
+        today.setdefault("full_drive_s", values["window_s"])
     return today
 
 

@@ -132,8 +132,8 @@ def test_each_number_has_a_range_in_which_its_check_works() -> None:
 
 @pytest.mark.parametrize(
     ("content", "energy"),
-    [({"window_s": 60.0, "drive": 0.5, "wrong_K": 2.0}, 30.0), ({"drive": 0.25}, 15.0),
-     ({"wrong_K": 5}, 30.0), ({"window_s": 40, "full_drive_s": 9}, 9.0)],
+    [({"window_s": 60.0, "drive": 0.5, "wrong_K": 2.0}, 60.0), ({"drive": 0.25}, 60.0),
+     ({"window_s": 40}, 40.0), ({"window_s": 40, "full_drive_s": 9}, 9.0)],
 )  # fmt: skip
 def test_what_a_drive_gave_in_a_window_of_version_0_2_0_is_an_energy(
     content: dict[str, float], energy: float
