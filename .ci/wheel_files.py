@@ -1,4 +1,4 @@
-"""Compare a wheel's files with the tree: what is not listed in pyproject.toml is missing silently."""
+"""Compare a wheel's files with the tree: what setup.py does not find is missing silently."""
 
 import sys
 import zipfile

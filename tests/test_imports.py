@@ -1,4 +1,7 @@
-"""Nothing imports upwards: not late, not for a type, not by a string for ``import_module``."""
+"""Nothing imports upwards: not late, not for a type, not by a string for ``import_module``.
+
+And a heavy package is imported by few modules, inside functions, so that ``thermogrip --help`` is quick.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,35 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FOLDERS = {"thermogrip": ROOT / "src" / "thermogrip"}
 FOLDERS |= {f"thermogrip.{room}": ROOT / room for room in ("datasets", "sysid", "mpc", "rig", "classify")}
+
+#: Who may import a package: modules, or a whole room.
+DOORS = {
+    "arviz": {"sysid.greybox.posterior"},
+    "casadi": {
+        "sysid.models.network", "sysid.greybox.fit", "sysid.plant.linearise", "mpc.plant.prediction",
+        "mpc.native.codegen",
+    },
+    "daqp": {"mpc.optimiser.qp"},
+    "distributed": {"datasets.parallel"},
+    "emcee": {"sysid.greybox.posterior"},
+    "foxglove": {"live.foxglove"},
+    "llvmlite": {"sysid.models.jit_rollout"},
+    "mcap": {"rig.records.run_folder", "datasets.rosbag"},
+    "nlopt": {"sysid.greybox.fit", "mpc.tuning.tune"},
+    "numba": {"datasets.compiled"},
+    "pysindy": {"sysid.blackbox.sindy"},
+    "rosbags": {"datasets.rosbag"},
+    "safetensors": {"classify.estimators.lstm", "classify.estimators.registry"},
+    "serial": {"rig.serial.port"},
+    "starlette": {"live.server", "classify.decisions.serve"},
+    "torch": {"classify.estimators.lstm"},
+    "uvicorn": {"live.server", "classify.decisions.serve"},
+    "websockets": {"rig.records.rosbridge"},
+    "aeon": {"classify"},
+    "sklearn": {"classify", "cli.compare"},
+    # what runs code from a file
+    **{name: set() for name in ("pickle", "joblib", "shelve", "dill", "marshal")},
+}  # fmt: skip
 
 
 def modules() -> dict[str, Path]:
@@ -91,3 +123,40 @@ def test_an_import_that_goes_up_is_found(source):
     known = modules()
     assert any(goes_up("thermogrip.sysid.plant.plant", there) for there, _ in named(source, known))
     assert not any(goes_up("thermogrip.report.plant", there) for there, _ in named(source, known))
+
+
+def external(text: str) -> set[str]:
+    """Return the packages outside of the project that a source imports."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found.add((node.module or "").partition(".")[0])
+    return found
+
+
+def past_its_doors(module: str, package: str) -> bool:
+    """Tell whether a package has doors and a module is none of them."""
+    doors = [f"thermogrip.{door}." for door in DOORS.get(package, ())]
+    return package in DOORS and not f"{module}.".startswith(tuple(doors))
+
+
+def test_a_heavy_package_is_imported_by_its_doors_alone():
+    wrong = {
+        f"{name} imports {package}"
+        for name, path in modules().items()
+        if path.suffix == ".py"
+        for package in external(path.read_text(encoding="utf-8"))
+        if past_its_doors(name, package)
+    }
+    assert not wrong
+
+
+@pytest.mark.parametrize(
+    "source", ["import pickle", "def late():\n    from joblib import load", "import casadi.tools as ca"]
+)
+def test_an_import_past_a_door_is_found(source):
+    (package,) = external(source)
+    assert past_its_doors("thermogrip.datasets.log_files", package)
+    assert not past_its_doors("thermogrip.datasets.log_files", "numpy")
