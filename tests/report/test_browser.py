@@ -65,7 +65,7 @@ def opened(browser: Any, page_file: Path) -> Iterator[Any]:
     """Return what opens the page: any complaint of the browser, and any request but for the page, fails."""
     contexts, faults = [], []
 
-    def open_page(width: int = 1200, **options: Any) -> Any:
+    def open_page(width: int = 1200, *, folded: bool = False, **options: Any) -> Any:
         context = browser.new_context(viewport={"width": width, "height": 900}, **options)
         contexts.append(context)
         page = context.new_page()
@@ -73,6 +73,10 @@ def opened(browser: Any, page_file: Path) -> Iterator[Any]:
         page.on("pageerror", lambda error: faults.append(str(error)))
         page.on("request", lambda r: None if r.url.startswith(("file:", "data:")) else faults.append(r.url))
         page.goto(page_file.as_uri())
+        if not folded:
+            page.locator("summary").click()
+        if not folded and options.get("java_script_enabled", True):
+            page.locator("canvas").nth(6).wait_for()
         return page
 
     yield open_page
@@ -139,6 +143,22 @@ def test_a_name_in_the_legend_hides_its_curve(opened: Any) -> None:
     assert page.evaluate(shown).count(False) == 3  # the curve and the ends of its band
     button.click()
     assert page.evaluate(shown).count(False) == 0
+
+
+def test_details_are_drawn_when_they_are_opened_and_printed_where_they_are_open(opened: Any) -> None:
+    page = opened(folded=True)
+    assert page.locator("section p").filter(visible=True).count() == 2  # the answer, and the first part
+    assert page.locator("canvas").count() == 0
+    page.emulate_media(media="print")
+    assert not page.locator("summary").is_visible()
+    page.emulate_media(media="screen")
+    page.locator("summary").click()
+    page.locator("canvas").nth(6).wait_for()
+    widths = "[...document.querySelectorAll('figure.chart')].flatMap(f => f.plots.map(p => p.width))"
+    assert min(page.evaluate(widths)) > 300
+    page.locator("summary").click()
+    page.locator("summary").click()
+    assert page.locator("canvas").count() == 7  # and not once more
 
 
 def visible(page: Any) -> tuple[bool, bool]:

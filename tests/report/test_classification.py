@@ -89,8 +89,8 @@ def test_a_strange_grasp_stands_with_its_reason() -> None:
     ("verdicts", "said", "tone"),
     [
         ("pass pass", "2 of 2 checks pass.", "good"),
-        ("pass warn pass", "2 of 3 checks pass. Warnings: c1.", "warn"),
-        ("fail warn fail", "0 of 3 checks pass. Warnings: c1. Failed: c0, c2.", "bad"),
+        ("pass warn pass", "2 of 3 checks pass (with a warning: c1).", "warn"),
+        ("fail warn fail", "0 of 3 checks pass (failed: c0, c2; with a warning: c1).", "bad"),
     ],
 )
 def test_a_review_counts_what_passes_and_names_the_rest(verdicts: str, said: str, tone: str) -> None:
@@ -161,7 +161,7 @@ def test_effusivities_inside_their_interval_are_counted_in_the_order_of_the_libr
 
 
 @pytest.mark.parametrize(
-    ("p_value", "more"), [(0.2, " In accuracy n does not separate it from b."), (0.01, "")]
+    ("p_value", "more"), [(0.2, " In accuracy n does not separate a from b."), (0.01, "")]
 )
 def test_who_wins_has_the_least_log_loss_and_is_set_apart_only_where_n_can(p_value: float, more: str) -> None:
     score = {"condition": "pooled", "log_loss_chance": 1.1, "n": 20, "low": 0.683, "high": 0.988}
@@ -177,7 +177,7 @@ def test_who_wins_has_the_least_log_loss_and_is_set_apart_only_where_n_can(p_val
     ]
     found = SimpleNamespace(scores=lambda: scores, differences=lambda condition: pairs)
     assert classification._who_wins(found, "pooled") == (
-        "a has the lowest log loss (0.25; chance 1.10) and 90 % right of n = 20 grasps (68 to 99 %). "
+        "a has the lowest log loss (0.25; chance 1.10) and 90 % right of n = 20 grasps (68 to 99 %).",
         f"b: 85 %, log loss 0.50.{more}"
     )
 

@@ -96,8 +96,8 @@ def test_a_step_is_good_where_each_output_is_as_the_spec_asks(figures: dict, ton
 @pytest.mark.parametrize(
     ("meets", "known", "tone", "says", "of"),
     [
-        (True, True, "good", "It meets the spec on every draw.", "5 draws of the plant"),
-        (False, False, "warn", "It does not meet the spec on every draw.", "the plant"),
+        (True, True, "good", "The controller meets the spec on every draw.", "5 draws of the plant"),
+        (False, False, "warn", "The controller does not meet the spec on every draw.", "the plant"),
     ],
 )
 def test_a_tuned_controller_stands_with_its_scores_and_what_it_did_not_know(
@@ -106,8 +106,9 @@ def test_a_tuned_controller_stands_with_its_scores_and_what_it_did_not_know(
     tuning = tuning_of(meets_spec=meets)
     tuning.controller.plant.covariance = np.eye(1) if known else None
     section = control.tuning_section(tuning)
-    assert (section.verdict, section.tone) == (f"Tuned. {says} Faster.", tone)
-    table, picture, about, scores = section.parts
+    assert (section.verdict, section.tone) == (says, tone)
+    picture, table, finding, about, scores = section.parts
+    assert finding.text == "Tuned. Faster."
     assert (table.head, table.caption) == (control.tuning_table(tuning)[0], f"Closed loops on {of}")
     assert isinstance(picture, Plot)
     unseen = "were not used in the search" if known else "no uncertainty, so the table is of the plant itself"
@@ -131,7 +132,7 @@ def test_outputs_that_are_judged_apart_have_their_own_rows_and_bands():
     tuning = tuning_of(spec=spec, rows=[row, replace(row, output="t2")])
     _, rows = control.tuning_table(tuning)
     assert [of[1] for of in rows] == [f"{start:g} to {target:g}, {name}" for name in ("t1", "t2")]
-    _, _, about, _ = control.tuning_section(tuning).parts
+    *_, about, _ = control.tuning_section(tuning).parts
     assert about.text.startswith("Band 0.25 degC of t1, 0.5 degC of t2. ")
     assert "or the ramp" in about.text
     asked = dict(control.spec_section(tuning).parts[0].rows)
@@ -168,7 +169,7 @@ def test_designs_stand_from_the_fastest_to_those_that_never_settle(
     ("words", "verdict"),
     [
         (["settling does not depend on it", "overshoot rises"],
-         "1 of 2 numbers matter within 30 %: overshoot rises."),
+         "1 of 2 numbers matter within 30 %."),
         (["settling does not depend on it"], "None of the numbers matters within 30 %"),
     ],
 )  # fmt: skip
@@ -184,9 +185,9 @@ def test_numbers_that_matter_are_counted(
 def test_what_was_asked_stands_beside_the_design() -> None:
     section = control.spec_section(tuning_of())
     asked, found = section.parts
-    assert section.verdict == "Seed 7; same seed, same design."
+    assert section.verdict == "Seed 7; the same seed gives the same design."
     assert (asked.head, asked.caption, found.head, found.caption) == (
-        ("asked", "value"), "The spec", ("found", "value"), "The design",
+        ("requested", "value"), "The spec", ("design", "value"), "The design",
     )  # fmt: skip
     assert [value for _, value in asked.rows] == [
         "28 to 38, 28 to 18", "180", "0.25", "0.5", "0.1", "200", "2", "0.03", "1.4", "25", "0.04", "0.3",
@@ -208,7 +209,7 @@ def test_a_tuning_has_a_section_for_each_step_of_the_mpc_and_its_step_times(draw
     assert titles == [
         "Does the controller meet the spec?", "What can be traded?", "Which numbers matter?",
         "The step from 28 to 38 degC", "The step from 28 to 18 degC", "Is it fast enough?",
-        "What was asked, and the answer",
+        "What was requested, and the design",
     ]  # fmt: skip
     [((times, deadline, dt), _)] = drawn["step_time"]
     assert (times["controller"].tolist(), deadline, dt) == ([0.01, 0.02, 0.01, 0.02], 0.5, 2.0)

@@ -93,14 +93,11 @@ def review_section(checks: Sequence[Check]) -> Section:
     """Return the section of a design review."""
     failed = [check.name for check in checks if check.verdict == "fail"]
     warned = [check.name for check in checks if check.verdict == "warn"]
-    passed = [check for check in checks if check.verdict == "pass"]
-    verdict = f"{len(passed)} of {len(checks)} checks pass."
-    if idle := [check.name for check in checks if check.verdict not in ("pass", "warn", "fail")]:
-        verdict += f" Not tried: {', '.join(idle)}."
-    if warned:
-        verdict += f" Warnings: {', '.join(warned)}."
-    if failed:
-        verdict += f" Failed: {', '.join(failed)}."
+    idle = [check.name for check in checks if check.verdict not in ("pass", "warn", "fail")]
+    passed = len(checks) - len(failed) - len(warned) - len(idle)
+    worse = {"failed": failed, "with a warning": warned, "not tried": idle}
+    others = "; ".join(f"{words}: {', '.join(names)}" for words, names in worse.items() if names)
+    verdict = f"{passed} of {len(checks)} checks pass" + (f" ({others})." if others else ".")
     rows = tuple((check.name, check.verdict, check.finding, check.fix) for check in checks)
     tone = "bad" if failed else "warn" if warned else "good"
     return Section(
@@ -144,7 +141,10 @@ def comparison_sections(name: str, comparison: Comparison) -> list[Section]:
     }
     title = "Which material?" + (f" {kind[name]}" if name in kind else "")
     cautions = [f"{line}." for line in comparison.caution_lines()]
-    verdict = " ".join([*cautions, _who_wins(comparison, shown)])
+    best, others = _who_wins(comparison, shown)
+    if others:
+        parts.insert(1, Text(others))
+    verdict = " ".join([*cautions, best])
     return [Section(title, tuple(parts), verdict, "warn" if cautions else "plain")]
 
 
@@ -307,8 +307,9 @@ def feature_section(model: BayesClassifier, records: Sequence[Grasps]) -> Sectio
     return Section("What does bayes look at?", (Picture(figure, caption), table), verdict, "plain")
 
 
-def _who_wins(comparison: Comparison, condition: str) -> str:
-    """Return who is best on the pooled grasps, and what n lets one say about the next."""
+def _who_wins(comparison: Comparison, condition: str) -> tuple[str, str]:
+    """Return who is best on the pooled grasps in a sentence; in others how the next ones do, and what n lets
+    one say about them."""
     rows = sorted(
         (row for row in comparison.scores() if row["condition"] == condition), key=lambda row: row["log_loss"]
     )
@@ -318,14 +319,16 @@ def _who_wins(comparison: Comparison, condition: str) -> str:
         f"{best['log_loss_chance']:.2f}) and {100 * best['accuracy']:.0f} % right of n = {best['n']} grasps"
         f"{_of_test(best)} ({100 * best['low']:.0f} to {100 * best['high']:.0f} %)."
     )
-    for row in rows[1:]:
-        said += f" {row['classifier']}: {100 * row['accuracy']:.0f} %, log loss {row['log_loss']:.2f}."
+    others = [
+        f"{row['classifier']}: {100 * row['accuracy']:.0f} %, log loss {row['log_loss']:.2f}."
+        for row in rows[1:]
+    ]
     close = [
         d
         for d in comparison.differences(condition)
         if best["classifier"] in (d["first"], d["second"]) and d["p_value"] > 0.05
     ]
     if close:
-        others = ", ".join(d["second"] if d["first"] == best["classifier"] else d["first"] for d in close)
-        said += f" In accuracy n does not separate it from {others}."
-    return said
+        names = ", ".join(d["second"] if d["first"] == best["classifier"] else d["first"] for d in close)
+        others.append(f"In accuracy n does not separate {best['classifier']} from {names}.")
+    return said, " ".join(others)

@@ -128,14 +128,15 @@ def _tone(spec: Spec, run: ClosedLoop) -> str:
 def tuning_section(tuning: Tuning) -> Section:
     """Return the section of a tuned controller: verdict, table, closed loops."""
     meets = (
-        "It meets the spec on every draw."
+        "The controller meets the spec on every draw."
         if tuning.meets_spec
-        else "It does not meet the spec on every draw."
+        else "The controller does not meet the spec on every draw."
     )
     scores = ", ".join(f"{name} {value:.3f}" for name, value in tuning.scores.items())
     parts: list[Any] = [
-        Table(*tuning_table(tuning), tuning_caption(tuning)),
         Plot(steps_chart(tuning.runs), _STEPS_CAPTION),
+        Table(*tuning_table(tuning), tuning_caption(tuning)),
+        Text(f"{tuning.verdict.capitalize()}. {tuning.finding}"),
         Text(
             f"Band {_bands(bands_of(tuning.spec, tuning.controller.design.controlled))}. {_unseen(tuning)}; "
             f"noise, quantum and a sensor offset of {tuning.spec.sensor_offset_degC:g} degC are unknown to "
@@ -148,8 +149,7 @@ def tuning_section(tuning: Tuning) -> Section:
         ),
     ]
     tone = "good" if tuning.meets_spec else "warn"
-    verdict = f"{tuning.verdict.capitalize()}. {meets} {tuning.finding}"
-    return Section("Does the controller meet the spec?", tuple(parts), verdict, tone)
+    return Section("Does the controller meet the spec?", tuple(parts), meets, tone, shown=2)
 
 
 def pareto_section(tuning: Tuning) -> Section:
@@ -191,7 +191,7 @@ def sensitivity_section(tuning: Tuning) -> Section:
     words = sensitivity_words(tuning.sensitivity)
     matter = [line for line in words if not line.startswith("settling does not depend")]
     verdict = (
-        f"{len(matter)} of {len(words)} numbers matter within 30 %: {'; '.join(matter)}."
+        f"{len(matter)} of {len(words)} numbers matter within 30 %."
         if matter
         else "None of the numbers matters within 30 %: there is nothing to gain from tuning them by hand."
     )
@@ -249,12 +249,14 @@ def timing_section(seconds: Sequence[float], design: Design) -> Section:
 
 
 def spec_section(tuning: Tuning) -> Section:
-    """Return the section of what was asked, and of the design that answers it."""
+    """Return the section of what was requested, and of the design that was found."""
     spec, design = tuning.spec, tuning.controller.design
-    asked = [("steps [degC]", ", ".join(f"{a:g} to {b:g}" for a, b in spec.steps))]
-    asked += [(words, getattr(spec, key)) for key, words in _SPEC_WORDS.items()]
-    asked += [(words, _listed(getattr(spec, key))) for key, words in _WISHES.items() if getattr(spec, key)]
-    found: list[tuple[str, Any]] = [
+    requested = [("steps [degC]", ", ".join(f"{a:g} to {b:g}" for a, b in spec.steps))]
+    requested += [(words, getattr(spec, key)) for key, words in _SPEC_WORDS.items()]
+    requested += [
+        (words, _listed(getattr(spec, key))) for key, words in _WISHES.items() if getattr(spec, key)
+    ]
+    design_rows: list[tuple[str, Any]] = [
         ("regulated", ", ".join(design.controlled)),
         ("sample time [s]", design.dt),
         ("horizon [s]", design.horizon_s),
@@ -272,11 +274,12 @@ def spec_section(tuning: Tuning) -> Section:
     parts = tuple(
         Table(head, tuple((words, short(value)) for words, value in rows), caption)
         for head, rows, caption in (
-            (("asked", "value"), asked, "The spec"),
-            (("found", "value"), found, "The design"),
+            (("requested", "value"), requested, "The spec"),
+            (("design", "value"), design_rows, "The design"),
         )
     )
-    return Section("What was asked, and the answer", parts, f"Seed {tuning.seed}; same seed, same design.")
+    words = f"Seed {tuning.seed}; the same seed gives the same design."
+    return Section("What was requested, and the design", parts, words, shown=0)
 
 
 def _bands(band: float | Mapping[str, float]) -> str:

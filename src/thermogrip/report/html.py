@@ -185,12 +185,14 @@ Part: TypeAlias = Text | Commands | Table | Picture | Plot
 
 @dataclass(frozen=True)
 class Section:
-    """A question as heading, its answer in a sentence whose colour is the tone, and the evidence."""
+    """A question as heading, its answer in a sentence whose colour is the tone, and the evidence: the first
+    ``shown`` parts, mostly one picture, stand open, the others are folded."""
 
     title: str
     parts: tuple[Part, ...]
     verdict: str = ""
     tone: str = "plain"
+    shown: int = 1
 
     def __post_init__(self) -> None:
         if self.tone not in TONES:

@@ -215,11 +215,11 @@ def time_constant_words(found: Dynamics) -> str:
 def dynamics_section(found: Dynamics) -> Section:
     """Return the section of gains, step and frequency responses."""
     parts = (
-        Table(*gain_table(found), "Gains at rest, with intervals"),
         Plot(
             plots.step_response_chart(found),
             "Response of each output to a step of one unit of each input; shaded: the interval.",
         ),
+        Table(*gain_table(found), "Gains in steady state, with intervals"),
         Plot(plots.bode_chart(found), "Frequency response from each input; shaded: the interval."),
         Picture(plots.pole_figure(found), _POLES),
     )
@@ -237,10 +237,12 @@ def parameters_section(plant: Plant, record: Posterior | None = None) -> Section
     from thermogrip.sysid.greybox.identifiability import identifiability_report
 
     parts: list[Any] = [Table(*parameter_table(plant, record), "Free parameters", dense=True)]
-    verdict, tone = known_words(plant), "plain"
-    found = plant.scores.identifiability
+    verdict, *least = known_words(plant)
+    parts += [Text(words) for words in least]
+    found, tone = plant.scores.identifiability, "plain"
     if found is not None and found.flat:
-        verdict, tone = f"{verdict} Hardly identifiable together: {'; '.join(found.flat)}.", "warn"
+        parts.append(Text(f"These cannot be estimated separately: {'; '.join(found.flat)}."))
+        tone = "warn"
     if record is not None:
         marginals = plots.posterior_figure(record.samples, record.free, record.units, record.fitted)
         tone = tone if record.converged else "warn"
@@ -261,14 +263,15 @@ def parameters_section(plant: Plant, record: Posterior | None = None) -> Section
         ]
     parts += _per_log(plant)
     parts += [Text(_sentence(said)) for said in identifiability_report(plant)]
-    return Section("How well are its parameters known?", tuple(parts), verdict, tone)
+    return Section("How well are its parameters known?", tuple(parts), verdict, tone, shown=0)
 
 
-def known_words(plant: Plant) -> str:
-    """Return how many free parameters are known how well, and which least, by their 90 % intervals."""
+def known_words(plant: Plant) -> list[str]:
+    """Return in a sentence how many free parameters are known how well by their 90 % intervals, and in
+    another which are known least."""
     intervals = plant.intervals(0.9)
     if not intervals:
-        return f"{len(plant.free)} free parameters, without intervals."
+        return [f"{len(plant.free)} free parameters, without intervals."]
     off = {
         name: (high - low) / 2 / max(abs(plant.values[name]), 1e-300)
         for name, (low, high) in intervals.items()
@@ -279,10 +282,11 @@ def known_words(plant: Plant) -> str:
         f"{name} ({intervals[name][0]:.3g} to {intervals[name][1]:.3g}{_spaced(plant.units.get(name, '1'))})"
         for name in least
     )
-    return (
-        f"{near} of {len(off)} parameters known within \N{PLUS-MINUS SIGN}10 %, {half} within "
-        f"\N{PLUS-MINUS SIGN}50 % (90 % intervals); least known: {ends}."
-    )
+    return [
+        f"{near} of {len(off)} parameters are known within \N{PLUS-MINUS SIGN}10 %, {half} within "
+        f"\N{PLUS-MINUS SIGN}50 % (90 % intervals).",
+        f"Known least: {ends}.",
+    ]
 
 
 def parameter_table(plant: Plant, record: Posterior | None = None) -> Cells:

@@ -176,11 +176,10 @@
     }, {passive: false});
   }
 
-  for (const [k, figure] of [...document.querySelectorAll("figure.chart")].entries()) {
+  function chartOf(figure, k) {
     const chart = JSON.parse(figure.querySelector("script").textContent);
     chart.arrays = chart.arrays.map(numbers);
     const room = figure.querySelector(".panels");
-    document.documentElement.classList.add("drawn");
     figure.plots = [];
     const boxes = [];
     for (const column of chart.columns) {
@@ -201,5 +200,13 @@
         if (width !== plot.width) plot.setSize({width, height: plot.height});
       }
     }).observe(room);
+  }
+
+  // what is folded has no width: it is drawn when it is opened
+  for (const [k, figure] of [...document.querySelectorAll("figure.chart")].entries()) {
+    document.documentElement.classList.add("drawn");
+    const folded = figure.closest("details");
+    if (folded) folded.addEventListener("toggle", () => chartOf(figure, k), {once: true});
+    else chartOf(figure, k);
   }
 })();
