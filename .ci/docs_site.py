@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from mkdocs.config.defaults import MkDocsConfig
     from mkdocs.structure.files import Files
+    from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parents[1]
 #: Pages of the site that are files outside of docs/.
@@ -21,6 +22,8 @@ PAGES = {
     "CITATION.cff": "CITATION.cff",
 }
 NOTEBOOKS = ROOT / "build" / "notebooks"
+#: What tells how something came to be answers no question on how to use it.
+NOT_SEARCHED = ("records/", "decisions/", "changelog.md")
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -35,6 +38,12 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for path in sorted(NOTEBOOKS.iterdir()):
         files.append(File.generated(config, f"notebooks/{path.name}", abs_src_path=str(path)))
     return files
+
+
+def on_page_markdown(_markdown: str, page: Page, **_: object) -> None:
+    """Leave pages of the past out of the site's search."""
+    if page.file.src_uri.startswith(NOT_SEARCHED):
+        page.meta["search"] = {"exclude": True}
 
 
 def moved(text: str) -> str:
