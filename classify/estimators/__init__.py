@@ -10,6 +10,7 @@ CLASSIFIERS = {
     "features-lda": ("estimators.lda", "FeaturesLda"),
     "pca-lda": ("estimators.lda", "PcaLda"),
     "expansions": ("estimators.local_polynomials", "ExpansionClassifier"),
+    "forest": ("estimators.lda", "ForestClassifier"),
     "svm-pca": ("estimators.margins", "SvmPca"),
     "rocket": ("estimators.margins", "RocketClassifier"),
     "lstm": ("estimators.lstm", "LstmClassifier"),
@@ -23,7 +24,7 @@ def check_name(name: str) -> None:
     if name not in CLASSIFIERS:
         raise UserError(
             f"no classifier is called {name!r}",
-            hint=known_names(name, CLASSIFIERS, "use {}, or module:Class of a scikit-learn classifier"),
+            hint=known_names(name, CLASSIFIERS, "use {}, or module:Class or module:object of scikit-learn's kind"),
         )
 
 

@@ -12,7 +12,7 @@ import warnings
 from abc import abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any, ClassVar
 
@@ -173,7 +173,8 @@ class ArrayClassifier(JoinedClassifier):
 
     reads_both_sensors: ClassVar[bool] = True
 
-    # a classifier, or its import path (``module:Class``), which is imported: give only what you trust
+    # a classifier or pipeline, or its import path (``module:Class``, ``module:object``), which is imported:
+    # give only what you trust
     estimator: BaseEstimator | str = "sklearn.linear_model.LogisticRegression"
     params: dict[str, Any] | None = None  # its parameters, where a path was given
     start: float = 0.0  # first time that is used [s]
@@ -216,17 +217,34 @@ def imported_estimator(estimator: BaseEstimator | str, params: dict[str, Any] | 
         return clone(estimator)
     module, _, name = estimator.rpartition(":" if ":" in estimator else ".")
     try:
-        made = getattr(import_module(module), name)(**(params or {}))
+        made = getattr(import_module(module), name)
+        if isinstance(made, type):
+            made = made(**(params or {}))
+        elif hasattr(made, "get_params"):
+            made = clone(made).set_params(**(params or {}))
     except (ImportError, AttributeError, ValueError) as error:
         raise UserError(f"{estimator!r} cannot be imported", hint=f"give module:Class ({error})") from error
     except TypeError as error:
         raise UserError(f"{estimator!r} does not take these parameters", hint=str(error)) from error
-    learns = hasattr(made, "fit") and hasattr(made, "predict") and hasattr(made, "get_params")
-    if not learns or isinstance(made, RegressorMixin):
+    if not is_estimator(made) or isinstance(made, RegressorMixin):
         raise UserError(
             f"{estimator!r} is no scikit-learn classifier", hint="it must have fit, and predict a class"
         )
     return made
+
+
+def is_estimator(made: Any) -> bool:
+    """Return whether an object has what scikit-learn asks of a classifier or a pipeline that ends in one."""
+    return all(hasattr(made, method) for method in ("fit", "predict", "get_params"))
+
+
+@dataclass(eq=False, repr=False)
+class ForestClassifier(ArrayClassifier):
+    """A random forest on the traces as they are, scikit-learn's with 500 trees (``"forest"``)."""
+
+    estimator: BaseEstimator | str = "sklearn.ensemble:RandomForestClassifier"
+    params: dict[str, Any] | None = field(default_factory=lambda: {"n_estimators": 500})
+    standardise: bool = False  # a tree's thresholds need no scale
 
 
 @contextmanager

@@ -52,9 +52,10 @@ def make_classifier(
     Parameters
     ----------
     name : str
-        One of :data:`CLASSIFIERS`; or the import path of a scikit-learn classifier, ``module:Class`` (the
-        module is imported, so name only what you trust); or several of these, joined by ``+``, whose
-        probabilities are averaged (:class:`~thermogrip.classify.estimators.registry.VoteClassifier`).
+        One of :data:`CLASSIFIERS`; or the import path of a scikit-learn classifier or pipeline,
+        ``module:Class`` or ``module:object`` (the module is imported, so name only what you trust); or
+        several of these, joined by ``+``, whose probabilities are averaged
+        (:class:`~thermogrip.classify.estimators.registry.VoteClassifier`).
     quick : bool, optional
         200 epochs in place of 2000 for the LSTM; the others are quick as they are.
     seed : int, optional
@@ -110,6 +111,8 @@ def classifier_name(classifier: GraspClassifier) -> str:
     if members is not None:
         return "+".join(classifier_name(member) for member in members)
     inner = getattr(classifier, "estimator", None)
+    if steps := getattr(inner, "steps", None):  # of a pipeline: its last one decides
+        inner = steps[-1][1]
     return inner if isinstance(inner, str) else type(inner if inner is not None else classifier).__name__
 
 

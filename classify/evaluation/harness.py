@@ -38,7 +38,7 @@ from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from thermogrip.classify.decisions.predict import Row, joined_touches
 from thermogrip.classify.estimators.base import Floats, GraspClassifier, grasp_labels, level, pick
 from thermogrip.classify.estimators.features import LEAST_DIFFERENCE, object_difference
-from thermogrip.classify.estimators.lda import ArrayClassifier
+from thermogrip.classify.estimators.lda import ArrayClassifier, is_estimator
 from thermogrip.classify.estimators.registry import classifier_name, make_classifier
 from thermogrip.classify.evaluation import metrics as s
 from thermogrip.classify.evaluation.comparison import POOLED, Caution, Comparison
@@ -113,7 +113,9 @@ def evaluate(
     Parameters
     ----------
     classifiers : sequence of str or estimator, or dict of name to estimator
-        Names as for :func:`~thermogrip.classify.estimators.registry.make_classifier`, or unfitted estimators.
+        Names as for :func:`~thermogrip.classify.estimators.registry.make_classifier`, or unfitted estimators:
+        of thermogrip, or any classifier or pipeline of scikit-learn's kind, which gets the traces as rows
+        (:class:`~thermogrip.classify.estimators.lda.ArrayClassifier`).
     conditions : Grasps, DataFrame, str, Path, or sequence of them
         One record a condition, each under its own name.
     split : {"shipped", "random", "session", "block"}, optional
@@ -222,18 +224,30 @@ def _named(
     if isinstance(classifiers, str):
         raise UserError("classifiers is one word", hint="give a list of names")
     if isinstance(classifiers, Mapping):
-        named = dict(classifiers)
+        named = {name: _grasp_classifier(given, seed) for name, given in classifiers.items()}
     else:
-        made = [make_classifier(c, seed=seed) if isinstance(c, str) else c for c in classifiers]
-        names = [c if isinstance(c, str) else classifier_name(c) for c in classifiers]
         named = {}
-        for name, classifier in zip(names, made):
+        for given in classifiers:
+            classifier = _grasp_classifier(given, seed)
+            name = given if isinstance(given, str) else classifier_name(classifier)
             if name in named:
                 raise UserError(f"two classifiers are called {name!r}", hint="give a dict of names")
             named[name] = classifier
     if not named:
         raise UserError("no classifier is given", hint="name at least one")
     return named
+
+
+def _grasp_classifier(given: Any, seed: int) -> GraspClassifier:
+    """Return a classifier of grasps from its name, itself, or an estimator of rows."""
+    if isinstance(given, GraspClassifier):
+        return given
+    if isinstance(given, str):
+        return make_classifier(given, seed=seed)
+    if isinstance(given, type) or not is_estimator(given):
+        hint = "give a name, or an unfitted estimator with fit, predict and get_params"
+        raise UserError(f"{given!r} is no classifier", hint=hint)
+    return ArrayClassifier(given, random_state=seed)
 
 
 def _late(plan: Plan) -> tuple[str, ...]:

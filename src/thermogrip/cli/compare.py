@@ -39,8 +39,9 @@ def compare(
         cli.opt(
             "--classifiers",
             "LIST",
-            "Those of train, svm-pca, rocket, expansions, A+B (their mean), or module:Class of scikit-learn "
-            "(imported) [default: lstm where PyTorch is installed, posterior, bayes, features-lda, pca-lda].",
+            "Those of train, forest, svm-pca, rocket, expansions, A+B (their mean), or module:Class or "
+            "module:object of scikit-learn (imported) [default: lstm where PyTorch is installed, posterior, "
+            "bayes, features-lda, pca-lda].",
             classifier_names,
         ),
     ] = None,

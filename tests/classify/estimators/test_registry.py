@@ -73,7 +73,7 @@ def test_every_name_makes_a_classifier_without_its_heavy_packages() -> None:
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.split() == ["False"] * 4
     names = {"posterior", "bayes", "features-lda", "pca-lda", "lstm", "lstm-paper"}
-    assert set(CLASSIFIERS) == names | {"expansions", "svm-pca", "rocket"}
+    assert set(CLASSIFIERS) == names | {"expansions", "svm-pca", "rocket", "forest"}
 
 
 def test_what_cannot_be_saved_is_refused_before_it_is_trained() -> None:
@@ -85,6 +85,23 @@ def test_what_cannot_be_saved_is_refused_before_it_is_trained() -> None:
 def test_a_path_with_a_colon_is_the_path_with_a_dot(three: Grasps) -> None:
     by_colon, by_dot = (make_classifier(f"sklearn.neighbors{c}NearestCentroid").fit(three) for c in ":.")
     np.testing.assert_array_equal(by_colon.predict_proba(three), by_dot.predict_proba(three))
+
+
+def test_a_path_may_name_an_object_which_stays_as_it_is(
+    three: Grasps, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "of_the_lab.py").write_text(
+        "from sklearn.neighbors import KNeighborsClassifier\n"
+        "from sklearn.pipeline import make_pipeline\n"
+        "from sklearn.preprocessing import StandardScaler\n"
+        "MODEL, WORD = make_pipeline(StandardScaler(), KNeighborsClassifier(3)), 'a word'\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    model = make_classifier("of_the_lab:MODEL").fit(three)
+    assert not hasattr(sys.modules["of_the_lab"].MODEL, "classes_")
+    assert model.model_.steps[-1][1].n_neighbors == 3
+    with pytest.raises(UserError, match="'of_the_lab:WORD' is no scikit-learn classifier"):
+        make_classifier("of_the_lab:WORD")
 
 
 def test_what_would_run_code_is_not_saved(tmp_path: Path, three: Grasps) -> None:

@@ -11,6 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from sklearn.neighbors import KNeighborsClassifier
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
 
 from thermogrip.classify import evaluate, make_classifier
 from thermogrip.classify.estimators.base import JoinedClassifier, pick
@@ -38,6 +41,30 @@ from thermogrip.datasets.schema import Grasps, make_grasps
 
 Maker = Callable[..., Grasps]
 FAST = ["bayes", "features-lda", "pca-lda"]
+
+
+def test_an_estimator_of_anyone_is_scored_as_its_rows_are_by_itself(three: Grasps) -> None:
+    """A pipeline on traces less their level before contact, without any class of ours."""
+    pipeline = make_pipeline(StandardScaler(), KNeighborsClassifier(3))
+    train, test = (pick(three, three["split"].values == part) for part in ("train", "test"))
+    after = three["time"].values >= 0
+    rows = {}
+    for name, record in (("train", train), ("test", test)):
+        traces = record["t_surface"].transpose("grasp", "time").values
+        rows[name] = (traces - traces[:, three["time"].values < 0].mean(axis=1, keepdims=True))[:, after]
+    truth = test["material"].values
+    p = pipeline.fit(rows["train"], train["material"].values).predict_proba(rows["test"])
+    unfitted = make_pipeline(StandardScaler(), KNeighborsClassifier(3))
+    [row] = evaluate([unfitted], [three], probe=False).scores()
+    assert row["classifier"] == "KNeighborsClassifier"
+    assert row["accuracy"] == (pipeline.classes_[p.argmax(axis=1)] == truth).mean()
+    [named] = evaluate({"mine": KNeighborsClassifier(3)}, [three], probe=False).scores()
+    assert named["classifier"] == "mine"
+    [forest] = evaluate(["forest"], [three], probe=False).scores()
+    assert forest["accuracy"] > 0.8
+    for wrong in (KNeighborsClassifier, 3, three):
+        with pytest.raises(UserError, match="is no classifier; give a name, or an unfitted estimator"):
+            evaluate([wrong], [three], probe=False)  # type: ignore[list-item]
 
 
 @pytest.fixture(scope="module")
@@ -354,7 +381,7 @@ def test_every_table_is_a_file(found: Comparison, three: Grasps, tmp_path: Path)
         ("bayes", "classifiers is one word"),
         ([], "no classifier is given"),
         (["bayes", "bayes"], "two classifiers are called 'bayes'"),
-        (["forest"], "no classifier is called 'forest'"),
+        (["oak"], "no classifier is called 'oak'"),
     ],
 )
 def test_a_wrong_list_of_classifiers_is_refused(three: Grasps, classifiers: list[str], message: str) -> None:
