@@ -24,7 +24,7 @@ def check_name(name: str) -> None:
     if name not in CLASSIFIERS:
         raise UserError(
             f"no classifier is called {name!r}",
-            hint=known_names(name, CLASSIFIERS, "use {}, or module:Class or module:object of scikit-learn's kind"),
+            hint=known_names(name, CLASSIFIERS, "use {}, or module:Class or module:object"),
         )
 
 
