@@ -71,6 +71,17 @@ def test_a_log_whose_column_lost_every_reading_is_read_without_it(bench: Bench) 
     assert "t_ambient" not in read_log(path)
 
 
+def test_a_guess_of_a_column_that_a_file_has_lost_is_no_guess(bench: Bench) -> None:
+    path = write_log(read_log(bench.path / "good.csv"), bench.path / "log.nc")
+    import h5py
+
+    with h5py.File(path, "r+") as file:
+        file.attrs["guesses"] = "gone: input, by its course"
+    small_plant().save(bench.path / "plant.json")
+    done = bench.run("simulate", bench.path / "plant.json", path, "--out", bench.path / "s.csv")
+    assert (done.code, done.err) == (0, "")
+
+
 def test_a_reading_beyond_all_use_is_lost(bench: Bench) -> None:
     text = (bench.path / "good.csv").read_text().splitlines()
     cells = text[9].split(",")

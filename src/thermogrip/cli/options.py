@@ -302,6 +302,8 @@ def load_logs(
         logs.append(read_log(path, inputs, outputs, disturbances, known=roles, columns=columns, dt=dt))
     for line in str(logs[0].attrs.get("guesses", "")).splitlines():
         name, why = line.split(": ", 1)[0], "it never moves"
+        if name not in logs[0]:  # of a file whose column was lost
+            continue
         values = np.concatenate([log[name].values for log in logs if name in log])
         level = float(np.nanmax(values))
         role = logs[0][name].attrs["role"]
