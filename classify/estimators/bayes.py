@@ -126,8 +126,8 @@ class FeatureReader:
 
     A shorter contact has fewer linear features, and those that it has are the same numbers.  The others come
     from a rise that is fitted to the whole of a contact, up to 10 s: of a shorter one they are other numbers,
-    and a classifier was right in 0.2 to 0.5 of 300 such simulated grasps at stated probabilities of 0.7 to
-    1.0.  So with these a contact that is shorter than those of the training is refused.
+    and stated probabilities would be too high.  So with these a contact that is shorter than those of the
+    training is refused.
     """
 
     names: list[str]

@@ -450,8 +450,8 @@ def _sturdiest(search: Search, tried: list[Trial]) -> tuple[list[Trial], Trial]:
     """Return a PI's trials, with some more of less gain and longer integral times than the best one has, and
     of those that score as it does, as far as trials tell, the one that bears most of what the model lacks.
 
-    What no log shows no score shows either: on a plant whose sensor was slower than in the logs by six of
-    their samples, of two PIs 4 % apart in score the better one took twice as long as the other.
+    What no log shows no score shows either: on a plant whose sensor is slower than in the logs the PI of the
+    better score may settle later.
     """
     best = _best(tried)
     low = {name: least for name, least, _ in search.pi}

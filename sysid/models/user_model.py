@@ -27,8 +27,8 @@ prior and again where it ended.
 
 Rollouts are compiled where that can be (:mod:`thermogrip.sysid.models.jit_rollout`): the class's functions
 are called once, whatever they call in turn, and a loop in them is unrolled.  What vectors cannot say
-(sorting, say, or a function of SciPy) is left to NumPy, which runs the same lines on whole batches, tens of
-times slower; :attr:`OwnModel.slow_because` says why.
+(sorting, say, or a function of SciPy) is left to NumPy, which runs the same lines on whole batches, more
+slowly; :attr:`OwnModel.slow_because` says why.
 
 **A step** of length h is
 
