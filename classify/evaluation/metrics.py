@@ -21,8 +21,8 @@ is drawn with replacement is the grasp, with all of its tests: with the sum :mat
           \theta^* = \frac{\sum_i w_i S_i}{\sum_i w_i R_i}.
 
 The interval of a mean is Efron's BCa (J. Am. Stat. Assoc. 82, 1987): quantiles of :math:`\theta^*`, shifted
-for its median bias and its skewness, which log losses have.  Of few grasps it covers less than
-stated.  Losses that no grasp showed are in no draw: where none was wrong, the upper end is too low, and the interval
+for its median bias and its skewness, which log losses have.  Of few grasps it covers less than stated.
+Losses that no grasp showed are in no draw: where none was wrong, the upper end is too low, and the interval
 of the accuracy (Clopper-Pearson) shows by how much.  One grasp shows nothing of how grasps differ, and has no
 interval.
 
