@@ -60,6 +60,7 @@ if TYPE_CHECKING:
 GAP = 10.0  # [s], beyond it the input is unknown
 BRIDGED = 5  # rows
 MOVED = 0.01  # of an input's range: less is noise of its reading
+_LONGEST_GAP = 1_000_000  # steps, behind which a plant is long at rest; a damaged clock may have centuries
 _GRIDS = 4  # arrays of a run's size that are held at a time
 
 
@@ -100,7 +101,7 @@ class Stretch:
     y: Array  # (n, n_y) readings, NaN where lost
     u: Array  # (N, n_u) means of the inputs over each step
     d: Array  # (N, n_d) of the disturbances
-    gap: float  # seconds between the row before and the first row; 0 at the start of a log
+    gap: float  # seconds between the row before and the first row, at most _LONGEST_GAP steps; 0 at the start
     log: str  # name of the log
 
 
@@ -245,7 +246,7 @@ def _stretches(
             beside = held_means(t, rows.d[part], edges)
         else:
             beside = _smooth(t, rows.d[part], edges, smooth)
-        gap = float(t[0] - rows.time[begin - 1]) if begin else 0.0
+        gap = min(float(t[0] - rows.time[begin - 1]), _LONGEST_GAP * step) if begin else 0.0
         yield Stretch(part, t - t[0], rows.y[part], held, beside, gap, rows.log)
 
 

@@ -393,6 +393,16 @@ def test_every_gap_is_carried_over_from_the_stretch_before_it():
     np.testing.assert_allclose(run["a"].values, y[rows, 0], atol=0.05)
 
 
+def test_a_gap_of_centuries_as_a_damaged_clock_has_is_passed_at_rest():
+    t = 2.0 * np.arange(300)
+    q = np.full(t.size, 0.2)
+    made = plant(nuisance={}, offsets={}, noise={"a": 0.01, "b": 0.01})
+    log = log_of(t, truth(q)[:-1], q)
+    later = log.assign_coords(time=np.where(t < 300.0, t, t + 1e11))
+    run = made.simulate(later, warmup=20.0)
+    np.testing.assert_allclose(run["a"].values[-1], log["a"].values[-1], atol=0.05)
+
+
 def test_a_change_is_looked_for_where_the_last_row_before_a_gap_and_the_first_behind_it_differ():
     t = 2.0 * np.arange(200)
     q = np.where(t < 40.0, -0.5, np.where(t < 180.0, 1.5, -0.5))  # first and last are alike
