@@ -14,7 +14,12 @@ A column is left out as a copy of another only where the two are one signal with
 multiple of the other and a constant, over more than two levels.  Of two states every pair would be.  Two
 inputs that always move together cannot be told apart by any fit: one stays and stands for both.
 
-**Doubts.**  A guess that decides what a fit sees is reported as a doubt: roles that the course of a column
+Physics decides between the rest.  What a reading comes to and stays at, level after level, while another
+column drives it, is its set point.  No drive moves the weather: a temperature that none helps to predict, row
+by row or in means over many rows, is a disturbance beside one that is moved.  What is held and helps to
+predict an output beside the known inputs is one more of them.
+
+**Doubts.**  A guess that decides what a fit sees is reported as a doubt: a role that the course of a column
 alone shows, a column that is left out although it helps to predict an output, inputs that move together, a
 room that is heated.  Whoever states the roles has none.
 """
@@ -24,6 +29,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,7 +64,9 @@ _BOOKKEEPING = re.compile(
 )
 IS_SET_POINT = "its name is that of a set point"
 NO_CLUE = "neither its name nor its unit shows what it is"
-_BY_COURSE = "it never moves", "it counts rows or time"
+_NEVER_MOVES, _COUNTS_ROWS = "it never moves", "it counts rows or time"
+BY_UNIT = "its unit is degC"
+FOLLOWED = "comes to its levels and stays there, as to a set point"
 _HELD_SHARE, _HELD_SIZE = 0.5, 0.05  # of rows with a move; of the range that its median has, at least
 _FEW = 20  # rows: too few to distinguish chance from rule
 _COUNTS = 0.9  # of the rows have the same step
@@ -66,6 +74,7 @@ _SHOWS = 5  # moves of two columns, by which they may be one signal
 _SHARED = 1 / 3  # of the wider one of two ranges: two sensors of one plant
 _EXACT, _ROUNDED = 1e-6, 0.05  # of a column's range; of its standard deviation, that rounding takes at most
 _LAGS, _STRONG, _MOST_ROWS = (2, 6), 10.0, 20_000
+_MEANS = 300  # over a log, that show what moves slowly
 
 
 @dataclass(frozen=True)
@@ -102,7 +111,7 @@ def explain_role(name: str, unit: str) -> tuple[str, str]:
          "its name is that of what flows in"),
         (_INPUT.search(words) and unit not in ("degC", "s"), "input", "its name is that of a drive"),
         (_OUTPUT.search(words) and unit != "s", "output", "its name is that of a reading"),
-        (celsius, "output", "its unit is degC"),
+        (celsius, "output", BY_UNIT),
         (unit in ("percent", "V", "0_255"), "input", f"its unit is {unit}"),
     )  # fmt: skip
     return next(((role, why) for applies, role, why in rows if applies), ("other", NO_CLUE))
@@ -135,38 +144,52 @@ def assign_roles(
             chosen[name] = role
     stated = dict(given or {}) | chosen
     guesses = {n: explain_role(n, unit) for n, unit in units.items() if n not in stated}
-    of_course: dict[str, tuple[str, str]] = {}
+    evidence: dict[str, tuple[str, str]] = {}  # of the data alone
     if columns is not None:  # what is beyond all use is no reading, and its squares are none either
         columns = {n: np.where(np.abs(v) <= MOST_NUMBER, v, np.nan) for n, v in columns.items()}
         if all(len(values) >= _FEW for values in columns.values()):
             guesses |= _copies(columns, guesses, units)
             guesses |= _unlike_inputs(columns, guesses, [n for n, role in stated.items() if role == "input"])
         guesses |= _controllers(guesses, units)
+        evidence |= _followed(columns, guesses)
+        guesses |= evidence
         fixed = {name: role for name, (role, why) in guesses.items() if why != NO_CLUE} | stated
         if not {"input", "output"} <= {*fixed.values()}:
-            of_course = roles_of_data(columns, units, fixed)
-        guesses |= of_course
-        guesses |= _heated_rooms(columns, guesses, stated)
+            evidence |= roles_of_data(columns, units, fixed)
+        guesses |= evidence
+        evidence |= _heated_rooms(columns, guesses, stated)
+        guesses |= evidence
+        if not lists["input"]:
+            evidence |= _unnamed_causes(columns, guesses, stated)
+            guesses |= evidence
     roles, reasons = {}, {}
     for name in units:
         guess, why = guesses.get(name, (stated.get(name, "other"), ""))
         roles[name] = chosen.get(name, "other" if lists.get(guess) is not None else guess)
         if why and roles[name] == guess:
             reasons[name] = why
-    doubts = () if columns is None else _doubts(columns, roles, reasons, of_course, lists)
+    doubts = () if columns is None else _doubts(columns, roles, reasons, evidence, lists)
     return Roles(roles, reasons, doubts)
 
 
 def _controllers(
     guesses: Mapping[str, tuple[str, str]], units: Mapping[str, str]
 ) -> dict[str, tuple[str, str]]:
-    """Return ``input`` and ``output`` as a controller calls them, where a set point shows that it does."""
+    """Return the columns that are what a controller calls them, where a set point shows that it does: what it
+    reads, what it drives, and its terms."""
     by_name = {name.lower(): name for name in guesses}
-    if not {"input", "output"} <= by_name.keys() or not any(_SETPOINT.search(_words(n)) for n in units):
+    if not any(_SETPOINT.search(_words(name)) for name in units):
         return {}
-    why = "beside a set point it is the controller's:"
-    reads, drives = ("output", f"{why} what it reads"), ("input", f"{why} what it drives")
-    return {by_name["input"]: reads, by_name["output"]: drives}
+    of_controller = "beside a set point it is the controller's:"
+    out: dict[str, tuple[str, str]] = {}
+    reads, drives = (by_name.keys() & set(words) for words in (("input", "pv"), ("output", "op", "out", "co")))
+    if reads and drives:
+        out |= {by_name[name]: ("output", f"{of_controller} what it reads") for name in reads}
+        out |= {by_name[name]: ("input", f"{of_controller} what it drives") for name in drives}
+    terms = by_name.keys() & {"p", "i", "d"}
+    if len(terms) > 1:
+        out |= {by_name[name]: ("other", f"{of_controller} one of its terms") for name in terms}
+    return out
 
 
 def roles_of_data(
@@ -178,9 +201,9 @@ def roles_of_data(
         values = columns[name][np.isfinite(columns[name])]
         steps, rows = np.diff(values), max(values.size, 1)
         if not steps.any():
-            out[name] = "other", _BY_COURSE[0]
+            out[name] = "other", _NEVER_MOVES
         elif rows >= _FEW and _mostly_even(steps):
-            out[name] = "other", _BY_COURSE[1]
+            out[name] = "other", _COUNTS_ROWS
         elif _is_held(values):
             out[name] = "input", f"it is held between {np.count_nonzero(steps)} moves in {rows} rows"
     roles = {**fixed, **{name: role for name, (role, _) in out.items()}}
@@ -219,17 +242,17 @@ def _doubts(
     columns: Mapping[str, Floats],
     roles: Mapping[str, str],
     reasons: Mapping[str, str],
-    of_course: Mapping[str, tuple[str, str]],
+    evidence: Mapping[str, tuple[str, str]],
     lists: Mapping[str, Sequence[str] | None],
 ) -> tuple[str, ...]:
     """Return the guesses that decide what a fit sees, a line each."""
     doubts = []
-    for name, (role, why) in of_course.items():
-        if roles[name] == role in ("input", "output") and reasons.get(name) == why:
-            doubts.append(f"{name} is taken as {role}: {why}")
+    for name, (role, why) in evidence.items():
+        if reasons.get(name) == why and (role != "other" or why.endswith(FOLLOWED)):
+            doubts.append(f"{name} is {'left out' if role == 'other' else f'taken as {role}'}: {why}")
     for name, why in reasons.items():
-        if why.startswith(("it always moves with", "it follows the drive")):
-            doubts.append(f"{name}: {why}")
+        if why.startswith("it always moves with"):
+            doubts.append(f"{name} is left out: {why}")
     if lists["input"] is not None:  # what was not listed was not meant
         return tuple(doubts)
     inputs, outputs = ([n for n, r in roles.items() if r == role] for role in ("input", "output"))
@@ -271,6 +294,75 @@ def _heated_rooms(
             drive = drives[int(gain[1:, 0].argmax())]
             out[name] = "output", f"it follows the drive {drive}, as no surroundings do"
     return out
+
+
+def _followed(
+    columns: Mapping[str, Floats], guesses: Mapping[str, tuple[str, str]]
+) -> dict[str, tuple[str, str]]:
+    """Return the held columns whose levels a reading comes to while another column drives it, as set points,
+    and the readings that no name shows, as outputs."""
+    likely = [n for n in columns if guesses.get(n, ("", ""))[1] in (NO_CLUE, BY_UNIT)]
+    held = [n for n in likely if _is_held(columns[n])]
+    out: dict[str, tuple[str, str]] = {}
+    for goal in held:
+        read = [n for n in columns if n not in held and guesses.get(n, ("output", ""))[0] in ("output", "other")]
+        reading = next((n for n in read if _comes_to(columns[n], columns[goal])), None)
+        if reading is None:
+            continue
+        drives = [n for n, (role, why) in guesses.items() if role == "input" or why == NO_CLUE]
+        gains = _predictive_gain([columns[reading], *(columns[n] for n in drives if n not in (goal, reading))])
+        if gains[1:, 0].max(initial=0.0) > _STRONG:
+            out[goal] = "other", f"{reading} {FOLLOWED}"
+            if guesses.get(reading, ("", ""))[1] == NO_CLUE:
+                out[reading] = "output", f"it comes to the levels of {goal}"
+    return out
+
+
+def _comes_to(reading: Floats, goal: Floats) -> bool:
+    """Tell whether most of the levels that a goal is held at, three at least, are those that a reading has in
+    the last half of each hold."""
+    bounds = [0, *(np.flatnonzero(np.diff(goal)) + 1), goal.size]
+    holds = [(goal[a], reading[(a + b) // 2 : b]) for a, b in pairwise(bounds) if b - a >= _FEW]
+    pairs = [(level, np.median(part)) for level, part in holds if np.isfinite(part).all()]
+    levels = np.array([level for level, _ in pairs])
+    off = [abs(level - value) <= _HELD_SIZE * np.ptp(levels) for level, value in pairs]
+    return np.unique(levels).size >= 3 and float(np.mean(off)) > 0.5
+
+
+def _unnamed_causes(
+    columns: Mapping[str, Floats], guesses: Mapping[str, tuple[str, str]], stated: Mapping[str, str]
+) -> dict[str, tuple[str, str]]:
+    """Return what acts on the outputs although no name says so: held columns that help to predict one are
+    inputs, temperatures that no drive moves are disturbances."""
+    roles = {name: role for name, (role, _) in guesses.items()} | dict(stated)
+    drives, outputs = ([n for n in columns if roles[n] == role] for role in ("input", "output"))
+    if not drives or not outputs:
+        return {}
+    out = {}
+    for name in [n for n, (_, why) in guesses.items() if why == NO_CLUE and _is_held(columns[n])]:
+        helped = next((n for n in outputs if _helps_beside(columns, name, n, drives)), None)
+        if helped is not None:
+            out[name] = "input", f"it is held between its moves and helps to predict {helped}"
+    moved = {name: _is_moved(columns, name, drives) for name in outputs}
+    for name in [n for n in outputs if guesses.get(n, ("", ""))[1] == BY_UNIT]:
+        if not moved[name] and any(moved[other] for other in outputs):
+            out[name] = "disturbance", f"no drive moves it ({', '.join(drives)})"
+    return out
+
+
+def _is_moved(columns: Mapping[str, Floats], name: str, drives: Sequence[str]) -> bool:
+    """Tell whether the past of a drive helps to predict a column, row by row or in means over many rows."""
+    rows = columns[name][:_MOST_ROWS].size
+    for length in {1, max(1, rows // _MEANS)}:
+        means = [_means(values, length) for values in _scaled([columns[n] for n in (name, *drives)])]
+        if any(_gain(means[0], drive, (), lags) > 0 for drive in means[1:] for lags in _LAGS):
+            return True
+    return False
+
+
+def _means(values: Floats, length: int) -> Floats:
+    """Return the means of so many rows each."""
+    return np.asarray(values[: values.size // length * length].reshape(-1, length).mean(axis=1))
 
 
 def _words(name: str) -> str:
@@ -330,7 +422,7 @@ def _copies(
             role_of_other = guesses.get(other, (role, ""))[0]
             if not _one_signal(values, moving[other]) or {role, role_of_other} == {"input", "output"}:
                 continue
-            if role == role_of_other == "input" and units[name] == units[other]:
+            if _alike_inputs(guesses, name, other) and units[name] == units[other]:
                 says = f"it always moves with {other}, and their effects cannot be told apart"
                 out[name] = "other", f"{says}: {other} stands for both"
             elif min(np.unique(v).size for v in (values, moving[other])) > 2:
@@ -339,11 +431,18 @@ def _copies(
         if name in out or why != NO_CLUE:
             continue
         goals = [n for n in moving if n != name and (_SETPOINT.search(_words(n)) or _is_held(moving[n]))]
+        goals = [n for n in goals if not _one_signal(values, moving[n])]
         pairs = ((g, n) for g in goals for n in order[:at] if n not in (*goals, *out))
         both = next(((g, n) for g, n in pairs if _explains(values, moving[g], moving[n])), None)
         if both is not None:
             out[name] = "other", f"it is computed from {both[0]} and {both[1]}"
     return out
+
+
+def _alike_inputs(guesses: Mapping[str, tuple[str, str]], name: str, other: str) -> bool:
+    """Tell whether two columns have the same claim to be an input: their names, or none."""
+    one, two = guesses[name], guesses.get(other, ("input", ""))
+    return one[0] == two[0] == "input" or one[1] == two[1] == NO_CLUE
 
 
 def _one_signal(one: Floats, other: Floats) -> bool:
