@@ -35,7 +35,7 @@ _TIME_UNITS = ("1", "s", "ms", "min")
 _TIME = re.compile(
     r"(?i)((elapsed|rel|relative|abs|unix|epoch|utc|local|system|log|sample|test|run|date|last)_?)*"
     r"(time|timestamp|time_stamp|date|zeit|uhrzeit|datum|tijd|seconds?|secs?|millis|milliseconds|micros|minutes"
-    r"|hours|epoch|clock|uptime|changed|updated|t|ts|ms|us)(_(utc|local|stamp|elapsed|abs|rel))?"
+    r"|hours|x_value|epoch|clock|uptime|changed|updated|t|ts|ms|us)(_(utc|local|stamp|elapsed|abs|rel))?"
 )
 _STEP = re.compile(r"(?i)ts|dt|delta_?t|sampl(e|ing)_?(time|period|interval)")
 _COUNTER = re.compile(r"(?i)x|n|k|i|no|nr|id|index|idx|samples?|rows?|steps?|count(er)?|unnamed.*")
@@ -84,9 +84,9 @@ def clock_of(table: Table, read: Mapping[str, tuple[str, str, float]], dt: float
 
 def _behaves_as_clock(header: str, read: tuple[str, str, float], values: Floats) -> bool:
     """Tell whether a column that is not named as a time rises in nearly even steps, as only a clock does."""
-    steps = np.diff(values)
+    steps = np.diff(_unwrapped(values, np.arange(values.size))[0])
     enough = 4 if re.fullmatch(r"c1", header) or _COUNTER.fullmatch(header) else _PIECE_ROWS
-    if read[1] != "1" or steps.size < enough or not np.all(steps > 0):
+    if read[1] not in _TIME_UNITS or steps.size < enough or not np.all(steps > 0):
         return False
     usual = float(np.median(steps))
     return bool(np.mean(np.abs(steps - usual) <= _EVEN * usual) >= _MONOTONE)
@@ -119,7 +119,7 @@ def _of_numbers(header: str, table: Table, read: tuple[str, str, float]) -> Cloc
         return None
     doubt = ""
     if unit == "1":
-        scale, doubt = _seconds_a_count(name, finite)
+        scale, doubt = _seconds_a_count(name, finite, wrapped=bool(notes))
     seconds = to_record_unit(counts if scale == 1 else counts * scale, unit)[0]
     seconds, restarts = _in_pieces(seconds, table.lines)
     if stated and scale == 1:
@@ -127,14 +127,14 @@ def _of_numbers(header: str, table: Table, read: tuple[str, str, float]) -> Cloc
         return Clock(seconds, frozenset([header]), (*converted, *notes, *restarts), 0.0)
     what = f"{header} is taken as the time in {unit if unit != '1' else 's'}"
     factor = "" if scale == 1 else f", times {scale:g}"
-    if _TIME.fullmatch(name) is None and not doubt:
+    if _TIME.fullmatch(name) is None and unit == "1" and not doubt:
         step = float(np.median(np.diff(finite)))
         doubt = f"{header} is taken as the time, its rows {step:g} s apart"
     note = f"time: {what}{factor}" + ("; --dt S sets another step" if doubt else "")
     return Clock(seconds, frozenset([header]), (note, *notes, *restarts), 0.0, doubt)
 
 
-def _seconds_a_count(name: str, counts: Floats) -> tuple[float, str]:
+def _seconds_a_count(name: str, counts: Floats, *, wrapped: bool) -> tuple[float, str]:
     """Return the seconds that one count of a clock without a unit means, and the doubt, if it is a guess."""
     word = next((f for begin, f in _TIME_WORDS.items() if name.lower().startswith(begin)), None)
     epoch = next((f for f in _EPOCH_UNITS if EPOCH[0] <= float(counts[0]) * f <= EPOCH[1]), None)
@@ -150,7 +150,9 @@ def _seconds_a_count(name: str, counts: Floats) -> tuple[float, str]:
         minutes = whole and usual >= _COUNTS_APART
         guess = f"{name} has no unit: taken as seconds, so that rows are {usual:g} s apart" if minutes else ""
         return 1.0, guess
-    scale, unit = (1e-6, "microseconds") if usual >= _MICROSECONDS_APART else (1e-3, "milliseconds")
+    # 32 bits of microseconds last for 72 minutes, of milliseconds for 50 days
+    fine = usual >= _MICROSECONDS_APART or (wrapped and counts[-1] > 2**32)
+    scale, unit = (1e-6, "microseconds") if fine else (1e-3, "milliseconds")
     return scale, f"{name} has no unit: taken as {unit}, so that rows are {usual * scale:g} s apart"
 
 

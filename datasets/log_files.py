@@ -17,6 +17,7 @@ from __future__ import annotations
 import gzip
 import lzma
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -71,7 +72,6 @@ class _Columns:
     units: dict[str, str]
     names_of: dict[str, str]  # the name that each header became
     repairs: list[str]  # what was converted and left out
-    doubts: list[str]  # about columns that are left out
 
 
 def read_log(
@@ -141,8 +141,7 @@ def read_log(
     sha256 = hash_columns({"time": time, **data})
     if not data:
         what = "a time column and nothing else" if read.clock.columns else "no column of numbers"
-        hint = "; ".join(read.doubts) or "add inputs and outputs"
-        raise UserError(f"has {what}", file=file, hint=hint)
+        raise UserError(f"has {what}", file=file, hint="add inputs and outputs")
     lists = {"inputs": inputs, "outputs": outputs, "disturbances": disturbances}
     of_model = {name: role for name, role in (known or {}).items() if name in units}
     in_file = {
@@ -173,7 +172,7 @@ def read_log(
         log.attrs.update({k: v for k, v in table.meta.items() if k not in ("schema", "version")})
     else:
         log.attrs["clock_doubts"] = read.clock.doubt
-        log.attrs["role_doubts"] = "\n".join((*read.doubts, *roles.doubts))
+        log.attrs["role_doubts"] = "\n".join(roles.doubts)
     return _cut(log, start, stop, file) if (start, stop) != (-np.inf, np.inf) else log
 
 
@@ -322,6 +321,8 @@ def _convert(table: Table, dt: float | None) -> _Columns:
     read = {header: read_header(header, headers) for header in headers}
     read |= {h: (h, attrs["units"], 1.0) for h, attrs in table.attrs.items() if "units" in attrs}
     clock = clock_of(table, read, dt)
+    table = _states_as_columns(table, clock)
+    read |= {header: (read_header(header)[0], "1", 1.0) for header in table.numbers if header not in read}
     columns: dict[str, Floats] = {}
     units: dict[str, str] = {}
     names_of = dict.fromkeys(clock.columns, "time")
@@ -351,19 +352,25 @@ def _convert(table: Table, dt: float | None) -> _Columns:
     words = [header for header in table.text if header not in clock.columns]
     repairs += [f"read {', '.join(renamed)}"] if renamed else []
     repairs += [f"left out, no numbers: {', '.join(words)}"] if words else []
-    doubts = [doubt for header in words if (doubt := _states(header, table.text[header]))]
-    return _Columns(clock, columns, units, names_of, repairs, doubts)
+    return _Columns(clock, columns, units, names_of, repairs)
 
 
-def _states(header: str, cells: Sequence[str]) -> str:
-    """Return the doubt that a column of a few words may say what was driven, "" of any other text."""
-    states = sorted({cell for cell in cells if cell})
-    if not 2 <= len(states) <= MOST_STATES or len(cells) < 5 * len(states):
-        return ""
-    return (
-        f"{header} has {len(states)} states ({', '.join(states)}) and is left out: where one of them drives "
-        "something, write a column of 0 and 1 for it"
-    )
+def _states_as_columns(table: Table, clock: Clock) -> Table:
+    """Return a table with a column of 0 and 1 for each word of columns that have a few, but for the one of
+    rest: ``off``, ``idle``, else the most frequent."""
+    numbers, text, notes = dict(table.numbers), dict(table.text), []
+    for header in [header for header in table.text if header not in clock.columns]:
+        counts = Counter(cell for cell in text[header] if cell)
+        if not 2 <= len(counts) <= MOST_STATES or len(text[header]) < 5 * len(counts):
+            continue
+        cells = text.pop(header)
+        rest = next((word for word in counts if word.lower() in ("off", "idle", "0")), max(counts, key=counts.__getitem__))
+        made = []
+        for state in sorted(counts.keys() - {rest}):
+            made.append(unused(f"{header}_{state}", numbers))
+            numbers[made[-1]] = np.array([float(cell == state) if cell else np.nan for cell in cells])
+        notes.append(f"{header}: words read as columns of 0 and 1 ({', '.join(made)}), {rest} as rest")
+    return replace(table, numbers=numbers, text=text, notes=(*table.notes, *notes))
 
 
 def _one_column_a_signal(table: Table) -> Table:

@@ -53,9 +53,10 @@ _ROOM = re.compile(r"ambient|(^|_)(amb|room)(_|$)")
 _INPUT = re.compile(
     DRIVE.pattern + r"|(^|_)(pwm|duty|heater|relay)$|^[a-z]?\d?@$"  # @ is the duty of a printer's board
 )
+_READING = re.compile(r"_(temp|temperature)$")  # of a heater too: heater_bed_temp
 _OUTPUT = re.compile(
     r"^(t|y|temp|temperature|level|outlet|position|speed|pv|angle|velocity|response|measured)(\d*|_.*)$"
-    r"|_(temp|temperature)$"
+    r"|" + _READING.pattern
 )
 _INFLOW = re.compile(r"(^|_)(inlet|inflow|supply_air)(_|$)")
 _BOOKKEEPING = re.compile(
@@ -109,7 +110,8 @@ def explain_role(name: str, unit: str) -> tuple[str, str]:
          "its name is that of the surroundings"),
         (_INFLOW.search(words) and (celsius or "temp" in words), "disturbance",
          "its name is that of what flows in"),
-        (_INPUT.search(words) and unit not in ("degC", "s"), "input", "its name is that of a drive"),
+        (_INPUT.search(words) and unit not in ("degC", "s") and not _READING.search(words), "input",
+         "its name is that of a drive"),
         (_OUTPUT.search(words) and unit != "s", "output", "its name is that of a reading"),
         (celsius, "output", BY_UNIT),
         (unit in ("percent", "V", "0_255"), "input", f"its unit is {unit}"),
@@ -422,7 +424,9 @@ def _copies(
             role_of_other = guesses.get(other, (role, ""))[0]
             if not _one_signal(values, moving[other]) or {role, role_of_other} == {"input", "output"}:
                 continue
-            if _alike_inputs(guesses, name, other) and units[name] == units[other]:
+            drives = role == role_of_other == "input"
+            drives |= guesses.get(other, ("", ""))[1] == NO_CLUE == why and _is_held(values)
+            if drives and units[name] == units[other]:
                 says = f"it always moves with {other}, and their effects cannot be told apart"
                 out[name] = "other", f"{says}: {other} stands for both"
             elif min(np.unique(v).size for v in (values, moving[other])) > 2:
@@ -437,12 +441,6 @@ def _copies(
         if both is not None:
             out[name] = "other", f"it is computed from {both[0]} and {both[1]}"
     return out
-
-
-def _alike_inputs(guesses: Mapping[str, tuple[str, str]], name: str, other: str) -> bool:
-    """Tell whether two columns have the same claim to be an input: their names, or none."""
-    one, two = guesses[name], guesses.get(other, ("input", ""))
-    return one[0] == two[0] == "input" or one[1] == two[1] == NO_CLUE
 
 
 def _one_signal(one: Floats, other: Floats) -> bool:

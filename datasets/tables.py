@@ -64,6 +64,11 @@ STAMP = re.compile(
 _LINE_STAMP = re.compile(
     r"\W{0,2}((?:\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}[ T]+)?\d{1,2}:\d{2}:\d{2}(?:[.,]\d+)?)|Stats (\d+\.\d+):"
 )  # how a line of a program's log begins: a stamp, or Klipper's seconds
+_TERMINAL = re.compile(
+    rb"(?m)^\[?((?:\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}[ T]+)?\d{1,2}:\d{2}:\d{2}(?:[.,]\d+)?)(?:\]|\s+->)[ \t]*"
+)  # of PuTTY and others, and of Arduino's serial monitor
+_ESPHOME = re.compile(r"\[(\d{2}:\d{2}:\d{2}[.\d]*)\].*?: '([^',]+)': Sending state ([-+.\d]+|ON|OFF)\b")
+_OF_HEATERS = ("target", "temp", "pwm")  # of a section of Klipper's statistics; what follows is the host's
 _NAME = re.compile(r"[A-Za-z_@][^:=,;]{0,63}")
 _LABELLED = re.compile(r"[A-Za-z_@][^:=,;]{0,63}?[:=]([-+.\deE]{1,30}|nan|NaN)")  # a cell, name and number
 _LABELLED_LINES = 10  # with the same names, that are no chance
@@ -132,7 +137,12 @@ def read_text_table(path: str | Path, columns: Sequence[str] | None = None) -> T
 def parse_text(data: bytes, file: str, columns: Sequence[str] | None = None) -> Table:
     """Return the table in the text of a file; see :func:`read_text_table`."""
     data, coded = _any_coding(data)
+    if data.startswith(b"LabVIEW Measurement"):
+        head, _, rows = data.rpartition(b"***End_of_Header***")
+        data = b"\n" * head.count(b"\n") + rows.lstrip(b"\t\r")
     data, labelled = _without_labels(data)
+    if not labelled:
+        data = _stamps_as_column(data)
     layout = find_layout(data, file)
     names, notes = layout.names, (*coded, *labelled, *layout.notes)
     if columns is not None:
@@ -304,6 +314,10 @@ def _without_labels(data: bytes) -> tuple[bytes, tuple[str, ...]]:
     head = [line.decode("utf-8", "replace") for line in islice(_lines(data[: 1 << 20]), 5 * _HEAD_LINES)]
     known = Counter(tuple(_labelled(line)) for line in head)
     del known[()]
+    if any(_ESPHOME.match(line) for line in head):
+        found = (_ESPHOME.match(line.decode("utf-8", "replace")) for line in _lines(data))
+        rows = (line.expand(r"\1,\2,\3") if line else "" for line in found)
+        return "\n".join(["time,name,state", *rows]).encode(), ("lines of an ESPHome log",)
     names, count = max(known.items(), key=lambda item: (item[1], len(item[0])), default=((), 0))
     if not names or count < min(_LABELLED_LINES, max(2, _MANY * sum(map(bool, head)))):
         return data, ()
@@ -317,6 +331,24 @@ def _without_labels(data: bytes) -> tuple[bytes, tuple[str, ...]]:
     notes = [f"lines have readings beside their names: {', '.join(names)}"]
     notes += [f"{passed} line(s) without them passed over"] if passed else []
     return "\n".join(out).encode() + b"\n", tuple(notes)
+
+
+def _stamps_as_column(data: bytes) -> bytes:
+    """Return the lines of a terminal that begin with a stamp in brackets, or before an arrow, as a table with
+    the stamps as its first column."""
+    head = [line for line in islice(_lines(data[: 1 << 20]), _HEAD_LINES) if line.strip()]
+    stamped = [match for line in head if (match := _TERMINAL.match(line))]
+    if not head or len(stamped) < _MANY * len(head):
+        return data
+    rest = stamped[-1].string[stamped[-1].end() :]
+    separator = next((sign for sign in (b"\t", b";", b"|", b",") if sign in rest), b" ")
+    before, _, after = data.partition(stamped[0][0])
+    names = before.rstrip().rpartition(b"\n")[2]
+    if len(names.split(separator)) == len(rest.split(separator)):
+        before = before.replace(names, b"time" + separator + names)
+    return before + _TERMINAL.sub(
+        lambda match: match[1].replace(b" ", b"T") + separator, stamped[0][0] + after
+    )
 
 
 def _labelled(line: str) -> dict[str, str]:
@@ -337,7 +369,7 @@ def _labelled(line: str) -> dict[str, str]:
         if last and word.startswith("/") and _NUMBER.fullmatch(word[1:]):
             cells[unused(f"{last}_target", cells)] = word[1:]
         elif _NAME.fullmatch(name) and (_NUMBER.fullmatch(value) or value in ("nan", "NaN")):
-            last = f"{section}_{name}" if section and mark == "=" else name
+            last = f"{section}_{name}" if section and name in _OF_HEATERS else name
             cells[unused(last, cells)] = value
         elif mark == ":" and not value:
             section = name
@@ -424,6 +456,10 @@ def _read_cells(
     lost = cells.isin(_LOST if broken else _NULLS)
     wrong = np.flatnonzero(np.isnan(values) & ~lost)
     first = cells.iloc[wrong[0]] if wrong.size else ""
+    states = switched(cells) if broken and cells.iloc[wrong].str.lower().nunique() > 1 else None
+    if states is not None and np.isfinite(values).any():
+        text[name] = cells.to_list()  # numbers and both states of a switch: the readings of several signals
+        return ()
     if wrong.size <= 2 * broken * int((~lost).sum()):
         numbers[name] = values
         where = f"{name_rows(lines[wrong], 5)}: {_shown(first)}"
@@ -432,11 +468,8 @@ def _read_cells(
         )
         return (*words, *(["numbers have a decimal comma"] if comma else []))
     if broken and (states := switched(cells)) is not None:
-        if not np.isfinite(values).any():
-            numbers[name] = states
-            return (f"{name}: words as {_shown(first)} read as 0 and 1",)
-        text[name] = cells.to_list()  # numbers and switches: the readings of several signals
-        return ()
+        numbers[name] = states
+        return (f"{name}: words as {_shown(first)} read as 0 and 1",)
     if broken and (wrong.size >= _MANY * int((~lost).sum()) or (first and STAMP.fullmatch(first))):
         text[name] = cells.to_list()
     else:
