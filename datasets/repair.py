@@ -19,8 +19,13 @@ all other samples as well, by more than their range.
 
 What a sensor writes when it has no reading (:data:`SENSOR_CODES`) is lost, in whatever number of rows, where
 it is entered and left by jumps of more than five times what the other rows hardly ever move (their 99 %
-quantile): a kettle that passes 85 degC does not jump there.  A reading that repeats itself bit by bit while
-the inputs move ten times as far as in any other such run is **stuck**, and lost as well.
+quantile): a kettle that passes 85 degC does not jump there.
+
+A reading that repeats itself bit by bit while the inputs move is **stuck**, and lost as well.  With M the moves
+of the inputs, in ranges, of the whole log, m those within the run that has most of them and k those within
+all other runs but for the first of each (a row's reading is from before its move), a sound reading stays
+through a move with a chance of about p = (k + 1) / (M - m + 2) (Laplace's rule); the run is stuck where
+p^(m - 1) is below 1e-4.
 
 All of these become NaN, as lost samples are: an output is never filled.  A lost input is held from the last
 row, since that is what an actuator does; a lost disturbance is interpolated.
@@ -49,7 +54,7 @@ SENSOR_CODES = {
     **dict.fromkeys((999.9, 999.0, 9999.0, -999.0, -9999.0), "a logger's mark of a lost value"),
     **dict.fromkeys((3276.7, -3276.8, 32767.0, -32768.0, 6553.5, 65535.0), "the end of a 16-bit number"),
 }
-_CODE_JUMP, _STUCK_TRAVEL = 5.0, 10.0  # see the module's text
+_CODE_JUMP, _STUCK_CHANCE = 5.0, 1e-4  # see the module's text
 SPIKE_FLOOR_K = 0.6
 SPIKE_WINDOW = 21
 SPIKE_LENGTH = 3
@@ -195,11 +200,12 @@ def drop_stuck(name: str, values: Floats, inputs: Sequence[Floats]) -> tuple[Flo
     ends = np.flatnonzero(np.append(np.diff(values) != 0, True))
     starts = np.append(0, ends[:-1] + 1)
     moved = travel[ends] - travel[starts]
-    order = np.argsort(moved)
-    other = float(moved[order[-2]]) if moved.size > 1 else 0.0
-    run = slice(int(starts[order[-1]]), int(ends[order[-1]]) + 1)
-    too_little = moved[order[-1]] < max(_STUCK_TRAVEL * other, 2.0)  # a move there and back, at the least
-    if values.size < SPIKE_WINDOW or too_little or not np.isfinite(values[run]).all():
+    at = int(np.argmax(moved))
+    run, most = slice(int(starts[at]), int(ends[at]) + 1), float(moved[at])
+    stayed = float(np.maximum(np.delete(moved, at) - 1, 0).sum())
+    chance = (stayed + 1) / (travel[-1] - most + 2)
+    likely = most <= 2 or chance >= 1 or chance ** (most - 1) > _STUCK_CHANCE
+    if values.size < SPIKE_WINDOW or likely or not np.isfinite(values[run]).all():
         return values, []
     rows = np.zeros(values.size, dtype=bool)
     rows[run] = True

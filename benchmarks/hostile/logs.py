@@ -290,7 +290,7 @@ def heater_and_cooler(rng: Rng) -> Case:
 
 
 def states_in_words(rng: Rng) -> Case:
-    """A fermenter whose drive is a word of three: the column has to be named, or become inputs."""
+    """A fermenter whose drive is a word of three: one input for each of the two."""
     dt, rows = 60.0, 1600
     state = steps(rng, rows, [-1, 0, 1], 10, 50)
     truth = 18 + lag(np.where(state > 0, 9.0, np.where(state < 0, -12.0, 0.0)), dt, 45 * dt)
@@ -302,7 +302,7 @@ def states_in_words(rng: Rng) -> Case:
         "room_temp": (sensor(rng, 18 + lag(rng.normal(0, 12, rows), dt, 60 * dt), 0.03, 0.0625), 2),
     }
     return Case(
-        table(rng, columns), ("state",), ("beer_temp",), dt, free=("room_temp",), asks=r"state\b.*(word|text|number)"
+        table(rng, columns), ("state_HEATING", "state_COOLING"), ("beer_temp",), dt, free=("room_temp",), asks=r"state\b.*(word|text|number)"
     )
 
 
@@ -730,10 +730,10 @@ def home_assistant(rng: Rng) -> Case:
             lines.append(f"{name},{state},{moment}")
     return Case(
         "\n".join(lines) + "\n",
-        ("switch.heater",),
-        ("sensor.living_room",),
+        ("heater",),
+        ("living_room",),
         dt,
-        ("sensor.outdoor",),
+        ("outdoor",),
         asks="entity_id|long|pivot|one column",
     )
 
