@@ -10,8 +10,8 @@ Every finding has a verdict (``ok``, ``warn``, ``fail``) and a consequence in wo
   covariance of n successive values, and the condition of the correlation between the inputs;
 * **feedback** from output to input: with u[k] regressed on its own past, does the past of y help?  An F test
   in which only rows count at which the input moves: a level that is held adds nothing, and an output
-  that settles under it shows how long it has been held.  In closed loop the noise is in the input too, and
-  equation-error fits are biased;
+  that settles under it shows how long it has been held.  A relay is asked whether it is switched at the same
+  readings.  In closed loop the noise is in the input too, and equation-error fits are biased;
 * **drift**: do the two halves of a log differ in the level that a static regression on their input explains,
   and the same **shift between logs**.
 
@@ -33,7 +33,7 @@ from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.log_files import Logs, as_logs
 from thermogrip.datasets.repair import GAP_SECONDS, GAP_STEPS
 from thermogrip.datasets.resample import gaps
-from thermogrip.datasets.roles import IS_SET_POINT, explain_role
+from thermogrip.datasets.roles import FOLLOWED, IS_SET_POINT, explain_role
 from thermogrip.datasets.schema import Log, column, log_name
 from thermogrip.sysid.plant.log_grid import Grid, Rows, Segment, make_grid, quantum
 from thermogrip.sysid.plant.plant import Plant
@@ -45,6 +45,11 @@ _HELD = 0.05  # share of rows with a move, below which an output is constant but
 _NO_NOISE = 1e-6  # of the range of an output
 
 _OWN_LAGS = (3, 6, 12, 24, 48)  # rows of an input's own past, to test it for feedback
+# Of the moves of an input the 5 % largest are a set point's.  Of the others the past of the outputs explains
+# 33 to 99 % in 20 closed loops with a set point in steps, at most 34 % (few moves, by chance) in open ones.
+_USUAL_MOVES, _EXPLAINED_BETWEEN = 0.95, 0.25
+# Differences over ranges, in the median: at most 0.08 in ten thermostats, 0.14 to 1 in 60 relays of any course.
+_SAME_READING, _SWITCHINGS = 0.1, 10
 
 
 @dataclass(frozen=True)
@@ -137,7 +142,9 @@ def check_data(
         found += [_saturation(channels[name]) for name in u if name not in grid.switches]
     found += _excitation(grid)
     for at, name in enumerate(u):
-        if name not in grid.switches:
+        if all(np.unique(segment.u[:, at]).size <= 2 for segment in grid.segments):
+            found.append(_relay_feedback(grid, at, name))
+        elif name not in grid.switches:
             found.append(_feedback(grid, at, name))
     found += [_set_point(log_name(log), name) for log in logs for name in _set_points(log)]
     found += _shifts(grid)
@@ -271,12 +278,13 @@ def _feedback(grid: Grid, at: int, name: str, lags: int = 3) -> Finding:
     if moves < 3 * Z.shape[1]:
         says = f"{name} moves too seldom to be tested for feedback"
         return Finding("feedback", "", name, float("nan"), "1", "ok", says)
-    less, more = (_squares(W, v) for W in (X, Z))
-    extra, left = Z.shape[1] - X.shape[1], moves - Z.shape[1]
-    ratio = (less - more) / extra / max(more / left, 1e-300)
-    chance = float(f_distribution.sf(ratio, extra, left))
-    explained = 1 - more / max(less, 1e-300)
+    explained, chance = _helped(X, Z, v, moves)
     closed = chance < 1e-4 and explained > 0.02
+    steps = np.abs(v - X[:, 0])  # those of a set point hide what a controller does between them
+    usual = (steps > 1e-9 * np.ptp(v)) & (steps <= np.quantile(steps[steps > 0], _USUAL_MOVES))
+    if not closed and usual.sum() >= 3 * Z.shape[1]:
+        explained, chance = _helped(X[usual], Z[usual], v[usual], int(usual.sum()))
+        closed = chance < 1e-4 and explained > _EXPLAINED_BETWEEN
     says = (
         f"{name} follows the outputs ({100 * explained:.0f} % of its moves): recorded in closed loop; noise "
     )
@@ -286,10 +294,47 @@ def _feedback(grid: Grid, at: int, name: str, lags: int = 3) -> Finding:
     return Finding("feedback", "", name, explained, "1", "warn" if closed else "ok", says)
 
 
+def _helped(X: Array, Z: Array, v: Array, moves: int) -> tuple[float, float]:
+    """Return the share of v that Z explains beyond X, and the chance of it if it did not."""
+    less, more = (_squares(W, v) for W in (X, Z))
+    extra, left = Z.shape[1] - X.shape[1], moves - Z.shape[1]
+    ratio = (less - more) / extra / max(more / left, 1e-300)
+    return 1 - more / max(less, 1e-300), float(f_distribution.sf(ratio, extra, left))
+
+
+def _relay_feedback(grid: Grid, at: int, name: str) -> Finding:
+    """Tell whether a relay is switched where an output reaches the same reading again.
+
+    Of two switchings in the same direction the difference of the readings is compared with their range
+    between the two.  A clock switches so as well, once the plant has settled: its holds are all alike.
+    """
+    least, switchings, lengths = np.inf, 0, set[int]()
+    for column in range(len(grid.outputs)):
+        ratios = []
+        for segment in grid.segments:
+            y, edges = segment.y[:, column], np.flatnonzero(np.diff(segment.u[:, at])) + 1
+            lengths |= {*np.diff(edges).tolist()}
+            for first, last in zip(edges[:-2], edges[2:]):
+                part = y[first : last + 1]
+                if np.isfinite(part).all() and np.ptp(part) > 0:
+                    ratios.append(abs(part[-1] - part[0]) / np.ptp(part))
+        if len(ratios) >= _SWITCHINGS:
+            least, switchings = min(least, float(np.median(ratios))), len(ratios)
+    closed = least <= _SAME_READING and len(lengths) > 2
+    says = f"no sign that {name} was driven by the outputs"
+    if closed:
+        says = (
+            f"{name} is switched at the same readings again and again ({switchings} times): recorded in closed "
+            "loop; trust simulation-error fits and not one-step fits"
+        )
+    return Finding("feedback", "", name, least, "1", "warn" if closed else "ok", says)
+
+
 def _set_points(log: Log) -> list[str]:
-    """Return the columns of a log that are set points by their names."""
+    """Return the columns of a log that are set points by their names, or by what follows them."""
     units = {str(name): str(item.attrs.get("units", "1")) for name, item in log.items()}
-    return [name for name, unit in units.items() if explain_role(name, unit)[1] == IS_SET_POINT]
+    by_course = [line.partition(": ")[0] for line in log.attrs.get("guesses", "").splitlines() if FOLLOWED in line]
+    return [n for n, unit in units.items() if explain_role(n, unit)[1] == IS_SET_POINT or n in by_course]
 
 
 def _set_point(log: str, name: str) -> Finding:
