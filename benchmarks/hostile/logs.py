@@ -1,15 +1,15 @@
-"""Logs of plants that nobody has named, as their programs write them: are roles and clock read right, or asked?
+"""Logs of plants that nobody has named, as their programs write them: are they read right, or asked about?
 
-    python benchmarks/hostile/logs.py [--seed N] [--only WORD] [--keep DIR]
+    python benchmarks/hostile/logs.py [--seed N] [--only WORD] [--fit] [--keep DIR]
 
-Every file is simulated here (plants of first and second order with noise and a coarse sensor; rates, gains, names
-and the order of columns are drawn from the seed) and is written with its right answer: which columns are
-inputs, outputs and disturbances, the seconds between rows, and what has to be said about it.  `identify` then reads each
-with no role given.
+Every file is simulated here (plants of first and second order with noise and a coarse sensor; rates, gains,
+names and the order of columns are drawn from the seed) and is written with its right answer: which columns
+are inputs, outputs and disturbances, the seconds between rows, and what has to be said about it.  It is then
+read with no role given, and with --fit identified.
 
 right   the roles and the clock are those of the simulation, and all that has to be said is said.
-asked   refused with the option that would answer, or fitted, called "not good", with a warning that names each
-        column in question and a next command that states roles or clock.
+asked   refused with the option that would answer, or not "good", with a warning that names each column in
+        question.
 wrong   anything else: another role, another clock, or nothing said.
 """
 
@@ -23,7 +23,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from datetime import datetime, timedelta, timezone
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -198,7 +198,10 @@ def two_relays(rng: Rng) -> Case:
     a, b = steps(rng, rows, [0, 1], 15, 70), steps(rng, rows, [0, 1], 15, 70)
     one = 20 + lag(14 * a + 3 * b, dt, 40 * dt)
     two = 20 + lag(4 * a - 9 * b, dt, 70 * dt)
-    first, second = pick(rng, "pump", "relais1", "SSR_A", "heater"), pick(rng, "fan", "relais2", "SSR_B", "chiller")
+    first, second = (
+        pick(rng, "pump", "relais1", "SSR_A", "heater"),
+        pick(rng, "fan", "relais2", "SSR_B", "chiller"),
+    )
     columns = {
         "time_s": (clock(rows, dt, rng), 0),
         first: (a, 0),
@@ -232,7 +235,11 @@ def relay_and_duty(rng: Rng) -> Case:
     dt, rows = float(rng.choice([1, 2])), 1500
     relay, duty = steps(rng, rows, [0, 1], 20, 90), steps(rng, rows, [0, 255], 20, 90)
     truth = 22 + lag(lag(10 * relay + 0.12 * duty, dt, 60 * dt), dt, 5 * dt)
-    a, b, y = pick(rng, "valve", "solenoid"), pick(rng, "pwm", "heater_pwm"), pick(rng, "probe_degC", "oven_degC")
+    a, b, y = (
+        pick(rng, "valve", "solenoid"),
+        pick(rng, "pwm", "heater_pwm"),
+        pick(rng, "probe_degC", "oven_degC"),
+    )
     columns = {
         "t_s": (clock(rows, dt, rng), 1),
         a: (relay, 0),
@@ -302,7 +309,12 @@ def states_in_words(rng: Rng) -> Case:
         "room_temp": (sensor(rng, 18 + lag(rng.normal(0, 12, rows), dt, 60 * dt), 0.03, 0.0625), 2),
     }
     return Case(
-        table(rng, columns), ("state_HEATING", "state_COOLING"), ("beer_temp",), dt, free=("room_temp",), asks=r"state\b.*(word|text|number)"
+        table(rng, columns),
+        ("state_HEATING", "state_COOLING"),
+        ("beer_temp",),
+        dt,
+        free=("room_temp",),
+        asks=r"state\b.*(word|text|number)",
     )
 
 
@@ -315,7 +327,11 @@ def pid_terms(rng: Rng) -> Case:
     target = steps(rng, rows, [40, 55, 70, 85], 180, 400)
     loop = under_pi(rng, target, dt, 21, 1.1, 90 * dt)
     rate = np.gradient(loop.temperature, dt)
-    setpoint, y, u = pick(rng, "Setpoint", "SP", "target"), pick(rng, "Input", "PV", "temp"), pick(rng, "Output", "OP")
+    setpoint, y, u = (
+        pick(rng, "Setpoint", "SP", "target"),
+        pick(rng, "Input", "PV", "temp"),
+        pick(rng, "Output", "OP"),
+    )
     columns = {
         "time_s": (clock(rows, dt, rng), 1),
         setpoint: (target, 1),
@@ -327,7 +343,12 @@ def pid_terms(rng: Rng) -> Case:
         u: (loop.drive, 1),
     }
     return Case(
-        table(rng, columns), (u,), (y,), dt, free=(setpoint, "error", "P", "I", "D"), says=(CLOSED_LOOP, r"\berror\b")
+        table(rng, columns),
+        (u,),
+        (y,),
+        dt,
+        free=(setpoint, "error", "P", "I", "D"),
+        says=(CLOSED_LOOP, r"\berror\b"),
     )
 
 
@@ -356,7 +377,11 @@ def set_point_logged(rng: Rng) -> Case:
     dt, rows = float(rng.choice([2, 5])), 1700
     target = steps(rng, rows, [30, 38, 46, 52], 160, 380)
     loop = under_pi(rng, target, dt, 19, 0.7, 80 * dt)
-    names = [("Sollwert", "Istwert", "Stellgröße"), ("consigne", "mesure", "commande"), ("setpunto", "temperatura", "salida")]
+    names = [
+        ("Sollwert", "Istwert", "Stellgröße"),
+        ("consigne", "mesure", "commande"),
+        ("setpunto", "temperatura", "salida"),
+    ]
     setpoint, y, u = names[int(rng.integers(3))]
     columns = {
         "time_s": (clock(rows, dt, rng), 0),
@@ -413,7 +438,9 @@ def epoch_seconds(rng: Rng) -> Case:
     u, y = open_block(rng, rows, dt)
     stamp = np.round(clock(rows, dt, rng, start=1.6e9 + float(rng.integers(0, 10**7))))
     name = pick(rng, "ts", "created", "Zeit")
-    return Case(table(rng, {name: (stamp, 0), "pwm": (u, 0), "temp": (y, 4)}, first=0), ("pwm",), ("temp",), dt)
+    return Case(
+        table(rng, {name: (stamp, 0), "pwm": (u, 0), "temp": (y, 4)}, first=0), ("pwm",), ("temp",), dt
+    )
 
 
 def wrap_16(rng: Rng) -> Case:
@@ -421,7 +448,9 @@ def wrap_16(rng: Rng) -> Case:
     dt, rows = float(rng.choice([0.1, 0.2])), 1500
     u, y = open_block(rng, rows, dt)
     ms = np.round(1000 * clock(rows, dt, rng, 0.0, start=float(rng.uniform(1, 60)))) % 2**16
-    return Case(table(rng, {"ms": (ms, 0), "pwm": (u, 0), "temp": (y, 4)}), ("pwm",), ("temp",), dt, asks="ms|--dt")
+    return Case(
+        table(rng, {"ms": (ms, 0), "pwm": (u, 0), "temp": (y, 4)}), ("pwm",), ("temp",), dt, asks="ms|--dt"
+    )
 
 
 def bare_wrap_32(rng: Rng) -> Case:
@@ -438,7 +467,9 @@ def reset_in_the_middle(rng: Rng) -> Case:
     cut = int(rows * rng.uniform(0.4, 0.6))
     u1, y1 = open_block(rng, cut, dt)
     u2, y2 = open_block(rng, rows - cut, dt)
-    ms = np.round(1000 * np.concatenate([clock(cut, dt, rng, start=700.0), clock(rows - cut, dt, rng, start=2.0)]))
+    ms = np.round(
+        1000 * np.concatenate([clock(cut, dt, rng, start=700.0), clock(rows - cut, dt, rng, start=2.0)])
+    )
     name = pick(rng, "millis", "time_ms", "t_ms")
     columns = {name: (ms, 0), "duty": (np.r_[u1, u2], 0), "temp_degC": (np.r_[y1, y2], 4)}
     return Case(
@@ -506,7 +537,12 @@ def open_thermocouple(rng: Rng) -> Case:
     other = sensor(rng, 23 + lag(0.1 * u, dt, 150), 0.05, 0.05)
     for start in rng.choice(np.arange(50, rows - 50, 60), 5, replace=False):
         y[start : start + 10] = -242.02
-    columns = {"t_s": (clock(rows, dt, rng), 1), "heat": (u, 0), "pt100_degC": (y, 2), "shell_degC": (other, 2)}
+    columns = {
+        "t_s": (clock(rows, dt, rng), 1),
+        "heat": (u, 0),
+        "pt100_degC": (y, 2),
+        "shell_degC": (other, 2),
+    }
     return Case(table(rng, columns), ("heat",), ("pt100", "shell"), dt, says=(r"-242",))
 
 
@@ -518,7 +554,12 @@ def zero_for_a_half(rng: Rng) -> Case:
     y[int(rows * rng.uniform(0.45, 0.6)) :] = 0.0
     columns = {"t_s": (clock(rows, dt, rng), 1), "heat": (u, 0), "near_degC": (y, 2), "far_degC": (other, 2)}
     return Case(
-        table(rng, columns), ("heat",), ("far",), dt, free=("near",), says=(r"near.*(stuck|lost|\b0\b|held|same value)",)
+        table(rng, columns),
+        ("heat",),
+        ("far",),
+        dt,
+        free=("near",),
+        says=(r"near.*(stuck|lost|\b0\b|held|same value)",),
     )
 
 
@@ -531,7 +572,14 @@ def stuck_sensor(rng: Rng) -> Case:
     y[cut:] = y[cut]
     name = pick(rng, "hot_end_degC", "plate_degC")
     columns = {"time_s": (clock(rows, dt, rng), 1), "heater_percent": (u, 0), name: (y, 4)}
-    return Case(table(rng, columns), ("heater",), (name,), dt, says=("stuck|same value|held|stands still",), asks="stuck|same value")
+    return Case(
+        table(rng, columns),
+        ("heater",),
+        (name,),
+        dt,
+        says=("stuck|same value|held|stands still",),
+        asks="stuck|same value",
+    )
 
 
 def lost_half(rng: Rng) -> Case:
@@ -554,7 +602,10 @@ def outdoors_and_rooms(rng: Rng) -> Case:
     u = steps(rng, rows, [0, 30, 60, 100], 10, 60)
     room = 9 + lag(0.7 * outside, dt, 150 * dt, 5.0) + lag(0.1 * u, dt, 30 * dt)
     second = 6 + lag(0.5 * outside, dt, 200 * dt, 4.0) + lag(0.35 * room, dt, 50 * dt, 6.0)
-    v, o, r, s = [("Ventil_percent", "Aussen_degC", "Wohnzimmer_degC", "Flur_degC"), ("klep_percent", "buiten_degC", "woonkamer_degC", "gang_degC")][int(rng.integers(2))]
+    v, o, r, s = [
+        ("Ventil_percent", "Aussen_degC", "Wohnzimmer_degC", "Flur_degC"),
+        ("klep_percent", "buiten_degC", "woonkamer_degC", "gang_degC"),
+    ][int(rng.integers(2))]
     columns = {
         "time": (stamps(rng, rows, dt), 0),
         v: (u, 0),
@@ -588,7 +639,12 @@ def constant_ambient(rng: Rng) -> Case:
     u = steps(rng, rows, [0, 40, 70, 100], 20, 80)
     y = sensor(rng, block(rng, u, dt, ambient, 0.6, 70), 0.05, 0.1)
     name = pick(rng, "t_ambient_degC", "ambient_degC", "room_degC")
-    columns = {"time_s": (clock(rows, dt, rng), 0), "heater_percent": (u, 0), "block_degC": (y, 1), name: (np.full(rows, ambient), 1)}
+    columns = {
+        "time_s": (clock(rows, dt, rng), 0),
+        "heater_percent": (u, 0),
+        "block_degC": (y, 1),
+        name: (np.full(rows, ambient), 1),
+    }
     return Case(table(rng, columns), ("heater",), ("block",), dt, free=(name,), says=(rf"{name[:-5]}",))
 
 
@@ -606,7 +662,9 @@ def wind_and_door(rng: Rng) -> Case:
         "wind_speed": (wind, 1),
         "hall_degC": (sensor(rng, room, 0.03, 0.05), 2),
     }
-    return Case(table(rng, columns), ("heater",), ("hall",), dt, ("wind_speed",), free=("door",), says=("door",))
+    return Case(
+        table(rng, columns), ("heater",), ("hall",), dt, ("wind_speed",), free=("door",), says=("door",)
+    )
 
 
 # ---- units and duplicates ----
@@ -639,7 +697,12 @@ def duplicate_in_another_unit(rng: Rng) -> Case:
         "tempF": (1.8 * y + 32, 2),
     }
     return Case(
-        table(rng, columns), ("duty|duty_raw",), ("tempC|tempF",), dt, free=("duty", "duty_raw", "tempC", "tempF"), says=(SAME_SIGNAL,)
+        table(rng, columns),
+        ("duty|duty_raw",),
+        ("tempC|tempF",),
+        dt,
+        free=("duty", "duty_raw", "tempC", "tempF"),
+        says=(SAME_SIGNAL,),
     )
 
 
@@ -648,7 +711,9 @@ def decimal_commas(rng: Rng) -> Case:
     dt, rows = float(rng.choice([1, 2])), 1500
     u = steps(rng, rows, [0, 30.5, 60.5, 99.5], 20, 80)
     y = sensor(rng, block(rng, u, dt, 20, 0.55, 60 * dt), 0.05, 0.05)
-    t, a, b = [("temps (s)", "chauffage (%)", "four (°C)"), ("tempo [s]", "riscaldamento [%]", "forno [°C]")][int(rng.integers(2))]
+    t, a, b = [("temps (s)", "chauffage (%)", "four (°C)"), ("tempo [s]", "riscaldamento [%]", "forno [°C]")][
+        int(rng.integers(2))
+    ]
     columns = {t: (clock(rows, dt, rng), 1), a: (u, 1), b: (y, 2)}
     return Case(table(rng, columns, separator=";", decimal=","), (a,), (b,), dt)
 
@@ -659,7 +724,13 @@ def sixty_rows(rng: Rng) -> Case:
     u = steps(rng, rows, [0, 50, 100], 5, 12)
     y = sensor(rng, block(rng, u, dt, 20, 0.5, 80), 0.05, 0.05)
     columns = {"time_s": (clock(rows, dt, rng), 0), "heater_percent": (u, 0), "block_degC": (y, 2)}
-    return Case(table(rng, columns), ("heater",), ("block",), dt, asks=r"\b60\b.*\b\d+ (rows )?(are )?needed|\b\d+\b.*needed.*\b60\b|needs.*\b\d+\b.*\b60\b")
+    return Case(
+        table(rng, columns),
+        ("heater",),
+        ("block",),
+        dt,
+        asks=r"\b60\b.*\b\d+ (rows )?(are )?needed|\b\d+\b.*needed.*\b60\b|needs.*\b\d+\b.*\b60\b",
+    )
 
 
 # ---- programs ----
@@ -677,10 +748,21 @@ def marlin(rng: Rng) -> Case:
     for row in range(rows):
         stamp = (start + timedelta(seconds=row * dt)).strftime("%H:%M:%S.%f")[:-3]
         if rng.random() < 0.08:
-            lines.append(f"{stamp} : " + pick(rng, "N123 G1 X20.1 Y33.7 E1.2*87", "echo:busy: processing", "ok"))
-        lines.append(f"{stamp} : ok T:{hot[row]:.2f} /{target[row]:.2f} B:{bed[row]:.2f} /0.00 @:{u[row]:.0f} B@:0")
+            lines.append(
+                f"{stamp} : " + pick(rng, "N123 G1 X20.1 Y33.7 E1.2*87", "echo:busy: processing", "ok")
+            )
+        lines.append(
+            f"{stamp} : ok T:{hot[row]:.2f} /{target[row]:.2f} B:{bed[row]:.2f} /0.00 @:{u[row]:.0f} B@:0"
+        )
     text = "\n".join(lines) + "\n"
-    return Case(text, ("@|drive|T_duty|duty",), ("T",), dt, free=("B", "T_target", "B_target", "B_duty"), suffix=".log")
+    return Case(
+        text,
+        ("@|drive|T_duty|duty",),
+        ("T",),
+        dt,
+        free=("B", "T_target", "B_target", "B_duty"),
+        suffix=".log",
+    )
 
 
 def klipper(rng: Rng) -> Case:
@@ -691,9 +773,10 @@ def klipper(rng: Rng) -> Case:
     lines = ["Start printer at Fri May  3 14:02:11 2024", "Loaded MCU 'mcu' 100 commands"]
     for row in range(rows):
         lines.append(
-            f"Stats {1200.3 + row * dt:.1f}: gcodein=0  mcu: mcu_awake=0.002 mcu_task_avg=0.000015 bytes_write=15{row:04d} "
-            f"heater_bed: target=0 temp={25 + rng.normal(0, 0.1):.1f} pwm=0.000 sysload=0.31 cputime={3 + 0.05 * row:.3f} "
-            f"memavail=721{int(rng.integers(100, 999))} extruder: target={target[row]:.0f} temp={loop.temperature[row]:.1f} "
+            f"Stats {1200.3 + row * dt:.1f}: gcodein=0  mcu: mcu_awake=0.002 mcu_task_avg=0.000015 "
+            f"bytes_write=15{row:04d} heater_bed: target=0 temp={25 + rng.normal(0, 0.1):.1f} pwm=0.000 "
+            f"sysload=0.31 cputime={3 + 0.05 * row:.3f} memavail=721{int(rng.integers(100, 999))} "
+            f"extruder: target={target[row]:.0f} temp={loop.temperature[row]:.1f} "
             f"pwm={loop.drive[row] / 100:.3f}"
         )
         if rng.random() < 0.05:
@@ -715,7 +798,7 @@ def home_assistant(rng: Rng) -> Case:
     u = steps(rng, rows, [0, 1], 10, 50)
     outside = sensor(rng, weather(rng, rows, dt), 0.02, 0.1)
     room = sensor(rng, 9 + lag(0.8 * outside, dt, 150 * dt, outside[0]) + lag(8 * u, dt, 35 * dt), 0.03, 0.1)
-    start = datetime(2024, 2, 11, 6, 0, tzinfo=timezone.utc)
+    start = datetime(2024, 2, 11, 6, 0, tzinfo=UTC)
     lines = ["entity_id,state,last_changed"]
     series = {"switch.heater": u, "sensor.living_room": room, "sensor.outdoor": outside}
     for name, values in series.items():
@@ -725,7 +808,11 @@ def home_assistant(rng: Rng) -> Case:
             if value == last:
                 continue
             last = value
-            moment = (start + timedelta(seconds=row * dt)).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+            moment = (
+                (start + timedelta(seconds=row * dt))
+                .isoformat(timespec="milliseconds")
+                .replace("+00:00", "Z")
+            )
             state = ("on" if value else "off") if name.startswith("switch") else f"{value:.1f}"
             lines.append(f"{name},{state},{moment}")
     return Case(
@@ -746,11 +833,17 @@ def esphome(rng: Rng) -> Case:
     lines = []
     for row in range(rows):
         stamp = (start + timedelta(seconds=row * dt)).strftime("%H:%M:%S")
-        lines.append(f"[{stamp}][D][sensor:094]: 'Kettle': Sending state {y[row]:.5f} °C with 2 decimals of accuracy")
-        lines.append(f"[{stamp}][D][sensor:094]: 'Duty': Sending state {u[row] / 2.55:.5f} % with 1 decimals of accuracy")
+        lines.append(
+            f"[{stamp}][D][sensor:094]: 'Kettle': Sending state {y[row]:.5f} °C with 2 decimals of accuracy"
+        )
+        lines.append(
+            f"[{stamp}][D][sensor:094]: 'Duty': Sending state {u[row] / 2.55:.5f} % with 1 decimals of accuracy"
+        )
         if rng.random() < 0.1:
             lines.append(f"[{stamp}][D][wifi:123]: WiFi signal -61 dB")
-    return Case("\n".join(lines) + "\n", ("Duty",), ("Kettle",), dt, asks="no column|column|read", suffix=".log")
+    return Case(
+        "\n".join(lines) + "\n", ("Duty",), ("Kettle",), dt, asks="no column|column|read", suffix=".log"
+    )
 
 
 def labview(rng: Rng) -> Case:
@@ -766,7 +859,8 @@ def labview(rng: Rng) -> Case:
         f"Delta_X\t{number(dt, 6, decimal)}\t{number(dt, 6, decimal)}\t", "***End_of_Header***\t\t\t", "X_Value\tDrive\tOven\tComment",
     ]  # fmt: skip
     rows_of = [
-        f"{number(row * dt, 6, decimal)}\t{number(u[row] / 51, 6, decimal)}\t{number(y[row], 6, decimal)}\t" for row in range(rows)
+        f"{number(row * dt, 6, decimal)}\t{number(u[row] / 51, 6, decimal)}\t{number(y[row], 6, decimal)}\t"
+        for row in range(rows)
     ]
     return Case("\n".join(head + rows_of) + "\n", ("Drive",), ("Oven",), dt, suffix=".lvm")
 
@@ -789,7 +883,9 @@ def putty(rng: Rng) -> Case:
     for row in range(rows):
         stamp = (start + timedelta(seconds=row * dt)).strftime("%Y-%m-%d %H:%M:%S")
         lines.append(f"[{stamp}] {y[row]:.2f}\t{u[row]:.0f}")
-    return Case("\n".join(lines) + "\n", ("pwm",), ("temp",), dt, asks="column|stamp|time|header", suffix=".log")
+    return Case(
+        "\n".join(lines) + "\n", ("pwm",), ("temp",), dt, asks="column|stamp|time|header", suffix=".log"
+    )
 
 
 def tclab(rng: Rng) -> Case:
@@ -857,11 +953,17 @@ def judge(case: Case, code: int, answer: dict[str, Any], stderr: str) -> tuple[s
     said = "\n".join([stderr, str(answer["verdict"]), *doubts, *answer["notes"], *checks])
     said += "\n".join(f"{one['name']}: {one['why']}" for one in answer["signals"])
     faults = role_faults(case, answer["signals"])
-    apart = [float(m[1]) for row in answer["data_check"] if (m := re.match(r"rows are ([\d.e+-]+) s apart", row["says"]))]
+    apart = [
+        float(m[1])
+        for row in answer["data_check"]
+        if (m := re.match(r"rows are ([\d.e+-]+) s apart", row["says"]))
+    ]
     if not apart or not abs(apart[0] - case.dt) <= 0.02 * case.dt:
         faults["clock"] = f"rows {apart} s apart, are {case.dt:g}"
     unsaid = [words for words in case.says if not re.search(words, said, re.IGNORECASE)]
-    why = "; ".join([f"{name}: {fault}" for name, fault in faults.items()] + [f"unsaid: {words}" for words in unsaid])
+    why = "; ".join(
+        [f"{name}: {fault}" for name, fault in faults.items()] + [f"unsaid: {words}" for words in unsaid]
+    )
     why += "".join(f"\n    doubt: {doubt}" for doubt in doubts)
     if not faults and not unsaid:
         return "right", why
@@ -888,7 +990,8 @@ def read_only(path: Path) -> tuple[int, dict[str, Any], str]:
         return 2, {}, str(error)
     guesses = dict(line.split(": ", 1) for line in str(log.attrs["guesses"]).splitlines())
     signals = [
-        {"name": str(name), "role": one.attrs["role"], "why": guesses.get(str(name), "")} for name, one in log.items()
+        {"name": str(name), "role": one.attrs["role"], "why": guesses.get(str(name), "")}
+        for name, one in log.items()
     ]
     doubts = [d for kind in ("clock", "role") for d in log.attrs[f"{kind}_doubts"].splitlines()]
     answer = {"data_check": checks, "doubts": doubts, "signals": signals, "verdict": "", "notes": []}
@@ -897,7 +1000,9 @@ def read_only(path: Path) -> tuple[int, dict[str, Any], str]:
 
 def main() -> None:
     """Print a line for every file, and the count of right, asked and wrong."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", default="")
     parser.add_argument("--fit", action="store_true", help="run identify, and not what it reads alone")

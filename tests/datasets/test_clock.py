@@ -121,10 +121,76 @@ def test_words_beside_stamps_with_a_space_are_a_switch(tmp_path, on, off):
     assert log["outside"].attrs["role"] == "disturbance"
 
 
-def test_states_in_words_are_left_out_and_named(tmp_path):
+def test_states_in_words_are_columns_of_0_and_1_but_for_rest(tmp_path):
     states = ("Idle", "Cooling", "Heating", "Waiting to cool")
     rows = [f"12.09.2024 08:{k:02}:00,{20 + k / 16},19.0,{states[k // 8 % 4]}\n" for k in range(60)]
     (tmp_path / "brew.csv").write_text("Time,BeerTemp,BeerSet,State\n" + "".join(rows))
     log = read_log(tmp_path / "brew.csv")
     assert log["BeerSet"].attrs["role"] == "other"
-    assert "State has 4 states (Cooling, Heating, Idle, Waiting to cool)" in log.attrs["role_doubts"]
+    states_found = [str(name).removeprefix("State_") for name in log if "State" in str(name)]
+    assert states_found == ["Cooling", "Heating", "Waiting_to_cool"]
+    assert column(log, "State_Cooling")[[0, 8, 16]].tolist() == [0, 1, 0]
+    assert "State_Cooling is taken as input" in log.attrs["role_doubts"]
+
+
+def row(k):
+    return f"{PLATE[k]:.2f},{HEATER[k]:g}"
+
+
+LABVIEW = (
+    "LabVIEW Measurement\t\nSeparator\tTab\nDate\t2024/02/11\n***End_of_Header***\t\n\t\nChannels\t2\t\t\n"
+    "Samples\t60\t60\t\nDelta_X\t0.5\t0.5\t\n***End_of_Header***\t\t\t\n"
+    "X_Value\tplate_temp\theater\tComment\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "head", "line", "step"),
+    [
+        ("a.lvm", LABVIEW, lambda k: f"{k / 2}\t{row(k).replace(',', chr(9))}\t\n", 0.5),
+        ("putty.log", "=~=~= PuTTY log 2024.03.01 22:55:39 =~=~=\nplate_temp,heater\n",
+         lambda k: f"[2024-03-01 22:55:{k:02}] {row(k)}\n", 1.0),
+        ("monitor.txt", "12:00:00.000 -> plate_temp heater\n",
+         lambda k: f"12:00:{k:02}.250 -> {row(k).replace(',', ' ')}\n", 1.0),
+        ("esphome.log", "[06:00:00][I][app:102]: ESPHome version 2024.2\n",
+         lambda k: f"[06:00:{k:02}][D][sensor:094]: 'plate_temp': Sending state {PLATE[k]:.2f} \u00b0C with\n"
+                   f"[06:00:{k:02}][D][number:012]: 'heater': Sending state {HEATER[k]:.1f}\n", 1.0),
+        ("klippy.log", "Loaded MCU 'mcu' 100 commands\n",
+         lambda k: f"Stats {1200 + 2 * k}.3: gcodein=0 heater: target=0 temp={PLATE[k]:.2f} pwm={HEATER[k]:g} "
+                   f"sysload=0.3{k % 7} cputime={k / 20:.3f}\n", 2.0),
+    ],
+)  # fmt: skip
+def test_logs_of_programs_are_read_with_their_clocks(tmp_path, name, head, line, step):
+    (tmp_path / name).write_text(head + "".join(line(k) for k in range(60)))
+    log = read_log(tmp_path / name)
+    assert np.median(np.diff(log["time"].values)) == step
+    reading, drive = ("heater_temp", "heater_pwm") if name == "klippy.log" else ("plate_temp", "heater")
+    roles = {str(n): v.attrs["role"] for n, v in log.items() if v.attrs["role"] not in ("other", "disturbance")}
+    assert roles == {reading: "output", drive: "input"}
+    np.testing.assert_allclose(column(log, reading), np.round(PLATE[: log.sizes["time"]], 2))
+
+
+def test_a_hub_s_switch_is_read_though_its_words_are_few_beside_the_readings(tmp_path):
+    moment = "2024-02-11T06:{:02}:{:02}.000Z"
+    readings = [f"sensor.hall,{PLATE[k]:.2f},{moment.format(k // 60, k % 60)}\n" for k in range(120)]
+    switch = [f"switch.heater,{word},{moment.format(at // 60, at % 60)}\n"
+              for word, at in (("off", 0), ("on", 40), ("off", 80))]  # fmt: skip
+    (tmp_path / "history.csv").write_text("entity_id,state,last_changed\n" + "".join(switch + readings))
+    assert column(read_log(tmp_path / "history.csv"), "heater")[[0, 45, 85]].tolist() == [0, 1, 0]
+
+
+@pytest.mark.parametrize(("counts", "step"), [((2**32 - 2_000_000 + 50_000 * np.arange(120)) % 2**32, 0.05)])
+def test_a_counter_of_microseconds_that_wraps_is_a_clock_without_a_name(tmp_path, counts, step):
+    rows = [f"{PLATE[k]:.2f},{HEATER[k]:g},{counts[k]}\n" for k in range(counts.size)]
+    (tmp_path / "bare.csv").write_text("".join(rows))
+    log = read_log(tmp_path / "bare.csv")
+    np.testing.assert_allclose(np.diff(log["time"].values), step)
+    assert "taken as microseconds" in log.attrs["clock_doubts"]
+
+
+def test_a_clock_with_a_unit_needs_no_english_name(tmp_path):
+    rows = [f"{2 * k};{PLATE[k]:.2f}\n".replace(".", ",") for k in range(60)]
+    (tmp_path / "four.csv").write_text("temps (s);four (\u00b0C)\n" + "".join(rows))
+    log = read_log(tmp_path / "four.csv")
+    assert np.all(np.diff(log["time"].values) == 2)
+    assert log.attrs["clock_doubts"] == ""

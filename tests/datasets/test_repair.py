@@ -256,6 +256,8 @@ def test_a_reading_that_stands_still_while_the_heater_swings_is_stuck_and_the_so
     assert "stuck at " in lines[0]
     for healthy in (warm(), warm(step=2.0)):
         assert drop_stuck("t", healthy, [heater]) == (pytest.approx(healthy), [])
+    kept, lines = drop_stuck("t", np.r_[warm()[:240], np.full(160, warm()[239])], [heater])  # seven moves
+    assert np.isnan(kept[241:]).all()
     still = np.full(400, 23.5)
     assert np.isnan(drop_stuck("t", still, [heater])[0]).all()
     assert drop_stuck("t", still, [np.r_[np.zeros(200), np.ones(200)]])[1] == []  # one step shows no answer

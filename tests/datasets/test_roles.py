@@ -357,3 +357,56 @@ def test_roles_that_the_course_alone_shows_are_doubts():
 )  # fmt: skip
 def test_names_that_programs_give_their_columns(name, role):
     assert guess_role(name, "1") == role
+
+
+def under_control(target, gain, rows=1800):
+    """Return reading and drive of a PI loop on a plant of one time constant."""
+    rng, y, u, total = np.random.default_rng(6), np.full(rows, 20.0), np.zeros(rows), 0.0
+    for k in range(rows - 1):
+        error = target[k] - y[k] + 0.05 * rng.standard_normal()
+        total += 0.1 * error
+        u[k] = np.clip(gain * error + total, 0, 100)
+        y[k + 1] = y[k] + 0.02 * (20 + 0.8 * u[k] - y[k])
+    return np.round(y, 2), np.round(u, 1)
+
+
+GOALS = np.repeat(np.random.default_rng(1).permutation([30.0, 45.0, 60.0, 38.0, 52.0, 70.0]), 300)
+
+
+def test_what_a_reading_comes_to_is_its_set_point_by_whatever_name():
+    y, u = under_control(GOALS, 5.0)
+    roles = assign_roles({"uno": "1", "due": "1", "tre": "1"}, columns={"uno": GOALS, "due": u, "tre": y})
+    assert roles.of == {"uno": "other", "due": "input", "tre": "output"}
+    assert any(line.startswith("uno is left out: tre comes to its levels") for line in roles.doubts)
+
+
+@pytest.mark.parametrize("names", [("Setpoint", "Input", "Output"), ("SP", "PV", "OP")])
+def test_the_terms_of_a_controller_are_neither_moved_nor_read(names):
+    y, u = under_control(GOALS, 5.0)
+    terms = {"P": 5 * (GOALS - y), "I": np.cumsum(GOALS - y), "D": np.gradient(y)}
+    columns = dict(zip(names, (GOALS, y, u))) | terms
+    roles = assign_roles(dict.fromkeys(columns, "1"), columns=columns)
+    assert [roles.of[name] for name in columns] == ["other", "output", "input", *["other"] * 3]
+
+
+@pytest.mark.parametrize(
+    ("name", "role"), [("chiller", "input"), ("buiten", "disturbance"), ("gang", "output")]
+)
+def test_what_acts_on_an_output_without_a_name_has_its_role_and_a_doubt(name, role):
+    """A second relay, the weather, and a room behind the heated one."""
+    heater, weather = relay(6), 5 + np.cumsum(0.02 * np.random.default_rng(2).standard_normal(3000))
+    behind = 10 + plant_of(plant_of(8 * heater, 0.98), 0.98)
+    other = {"chiller": relay(11), "buiten": weather, "gang": behind}[name]
+    room = 10 + plant_of(8 * heater + other, 0.98)
+    units = {"heater": "1", "kamer": "degC", name: "1" if name == "chiller" else "degC"}
+    roles = assign_roles(units, columns={"heater": heater, "kamer": room, name: other})
+    assert roles.of == {"heater": "input", "kamer": "output", name: role}
+    assert [line.split(" is taken")[0] for line in roles.doubts] == [name] * (role != "output")
+
+
+def test_elements_without_a_clue_that_always_move_together_are_one_pair():
+    course = np.repeat(np.random.default_rng(0).choice([0.0, 20, 50, 80], 150), 20)
+    columns = {"left": course, "right": course, "oven": 20 + plant_of(course)}
+    roles = assign_roles({"left": "1", "right": "1", "oven": "degC"}, columns=columns)
+    assert roles.of == {"left": "input", "right": "other", "oven": "output"}
+    assert any("right is left out: it always moves with left" in line for line in roles.doubts)

@@ -49,6 +49,36 @@ def test_a_controller_in_the_loop_is_found():
     assert "closed loop" in found.says
 
 
+def test_a_controller_is_found_between_the_steps_of_its_set_point():
+    rng, total = np.random.default_rng(2), 0.0
+    y, read, u = np.full(1500, 20.0), np.zeros(1500), np.zeros(1500)
+    for k in range(1500):
+        read[k] = y[k] + 0.05 * rng.standard_normal()
+        error = (40.0, 60.0, 50.0)[k // 500] - read[k]
+        total = min(max(total + 0.1 * error, 0.0), 100.0)
+        u[k] = np.clip(8 * error + total, 0, 100)
+        y[k + 1 :] = y[k] + 0.02 * (20 + 0.8 * u[k] - y[k])
+    log = make_log(np.arange(1500.0), {"q": (u, "1", "input"), "t": (read, "degC", "output")})
+    assert "closed loop" in one([log], "feedback").says
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_a_thermostat_is_known_by_the_readings_at_which_it_switches(closed):
+    rng = np.random.default_rng(3)
+    y, u, since = np.full(2000, 20.0), np.zeros(2000), 0
+    for k in range(1999):
+        on = u[k - 1]
+        if closed:
+            u[k] = float(y[k] < 40 + (0.5 if on else -0.5) + (k > 1000) * 5)
+        else:
+            since = int(rng.integers(15, 70)) if since == 0 else since - 1
+            u[k] = 1 - on if since == 0 else on
+        y[k + 1] = y[k] + 0.01 * (20 + 50 * u[k] - y[k]) + 0.01 * rng.standard_normal()
+    log = make_log(np.arange(2000.0), {"q": (u, "1", "input"), "t": (y, "degC", "output")})
+    found = one([log], "feedback")
+    assert (found.verdict, "closed loop" in found.says) == (("warn", True) if closed else ("ok", False))
+
+
 def test_open_loop_logs_are_not_accused_of_feedback():
     accused = sum(one([plant_log(seed=s)], "feedback").verdict == "warn" for s in range(20))
     assert accused == 0  # the test asks for p < 1e-4: 20 logs give 0.002 false alarms
