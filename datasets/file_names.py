@@ -12,8 +12,8 @@ from thermogrip.datasets.errors import UserError, as_user_error
 
 FORMATS = {
     ".csv": "csv", ".csv.gz": "csv", ".csv.xz": "csv",
-    ".txt": "text", ".dat": "text", ".tsv": "text", ".tab": "text", ".asc": "text", ".log": "text", ".lvm": "text",
-    ".txt.gz": "text", ".txt.xz": "text", ".dat.gz": "text", ".dat.xz": "text",
+    ".txt": "text", ".dat": "text", ".tsv": "text", ".tab": "text", ".asc": "text", ".log": "text",
+    ".lvm": "text", ".txt.gz": "text", ".txt.xz": "text", ".dat.gz": "text", ".dat.xz": "text",
     ".mat": "matlab", ".xlsx": "excel",
     ".nc": "netcdf", ".h5": "netcdf", ".hdf5": "netcdf",
     ".parquet": "parquet", ".pq": "parquet",

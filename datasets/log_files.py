@@ -364,7 +364,10 @@ def _states_as_columns(table: Table, clock: Clock) -> Table:
         if not 2 <= len(counts) <= MOST_STATES or len(text[header]) < 5 * len(counts):
             continue
         cells = text.pop(header)
-        rest = next((word for word in counts if word.lower() in ("off", "idle", "0")), max(counts, key=counts.__getitem__))
+        rest = next(
+            (word for word in counts if word.lower() in ("off", "idle", "0")),
+            max(counts, key=counts.__getitem__),
+        )
         made = []
         for state in sorted(counts.keys() - {rest}):
             made.append(unused(f"{header}_{state}", numbers))

@@ -21,11 +21,11 @@ What a sensor writes when it has no reading (:data:`SENSOR_CODES`) is lost, in w
 it is entered and left by jumps of more than five times what the other rows hardly ever move (their 99 %
 quantile): a kettle that passes 85 degC does not jump there.
 
-A reading that repeats itself bit by bit while the inputs move is **stuck**, and lost as well.  With M the moves
-of the inputs, in ranges, of the whole log, m those within the run that has most of them and k those within
-all other runs but for the first of each (a row's reading is from before its move), a sound reading stays
-through a move with a chance of about p = (k + 1) / (M - m + 2) (Laplace's rule); the run is stuck where
-p^(m - 1) is below 1e-4.
+A reading that repeats itself bit by bit while the inputs move is **stuck**, and lost as well.  With M the
+moves of the inputs, in ranges, of the whole log, m those within the run that has most of them and k those
+within all other runs but for the first of each (a row's reading is from before its move), a sound reading
+stays through a move with a chance of about p = (k + 1) / (M - m + 2) (Laplace's rule); the run is stuck
+where p^(m - 1) is below 1e-4.
 
 All of these become NaN, as lost samples are: an output is never filled.  A lost input is held from the last
 row, since that is what an actuator does; a lost disturbance is interpolated.

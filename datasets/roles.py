@@ -184,7 +184,9 @@ def _controllers(
         return {}
     of_controller = "beside a set point it is the controller's:"
     out: dict[str, tuple[str, str]] = {}
-    reads, drives = (by_name.keys() & set(words) for words in (("input", "pv"), ("output", "op", "out", "co")))
+    reads, drives = (
+        by_name.keys() & set(words) for words in (("input", "pv"), ("output", "op", "out", "co"))
+    )
     if reads and drives:
         out |= {by_name[name]: ("output", f"{of_controller} what it reads") for name in reads}
         out |= {by_name[name]: ("input", f"{of_controller} what it drives") for name in drives}
@@ -307,12 +309,16 @@ def _followed(
     held = [n for n in likely if _is_held(columns[n])]
     out: dict[str, tuple[str, str]] = {}
     for goal in held:
-        read = [n for n in columns if n not in held and guesses.get(n, ("output", ""))[0] in ("output", "other")]
+        read = [
+            n for n in columns if n not in held and guesses.get(n, ("output", ""))[0] in ("output", "other")
+        ]
         reading = next((n for n in read if _comes_to(columns[n], columns[goal])), None)
         if reading is None:
             continue
         drives = [n for n, (role, why) in guesses.items() if role == "input" or why == NO_CLUE]
-        gains = _predictive_gain([columns[reading], *(columns[n] for n in drives if n not in (goal, reading))])
+        gains = _predictive_gain(
+            [columns[reading], *(columns[n] for n in drives if n not in (goal, reading))]
+        )
         if gains[1:, 0].max(initial=0.0) > _STRONG:
             out[goal] = "other", f"{reading} {FOLLOWED}"
             if guesses.get(reading, ("", ""))[1] == NO_CLUE:

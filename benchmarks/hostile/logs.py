@@ -837,7 +837,7 @@ def esphome(rng: Rng) -> Case:
             f"[{stamp}][D][sensor:094]: 'Kettle': Sending state {y[row]:.5f} °C with 2 decimals of accuracy"
         )
         lines.append(
-            f"[{stamp}][D][sensor:094]: 'Duty': Sending state {u[row] / 2.55:.5f} % with 1 decimals of accuracy"
+            f"[{stamp}][D][sensor:094]: 'Duty': Sending state {u[row] / 2.55:.5f} % with 1 decimals"
         )
         if rng.random() < 0.1:
             lines.append(f"[{stamp}][D][wifi:123]: WiFi signal -61 dB")
@@ -852,11 +852,12 @@ def labview(rng: Rng) -> Case:
     u, y = open_block(rng, rows, dt)
     decimal = pick(rng, ".", ",")
     head = [
-        "LabVIEW Measurement\t", "Writer_Version\t2", "Reader_Version\t2", "Separator\tTab", f"Decimal_Separator\t{decimal}",
-        "Multi_Headings\tNo", "X_Columns\tOne", "Time_Pref\tRelative", "Operator\tlab", "Date\t2024/02/11", "Time\t10:11:12,5",
-        "***End_of_Header***\t", "\t", "Channels\t2\t\t", f"Samples\t{rows}\t{rows}\t", "Date\t2024/02/11\t2024/02/11\t",
-        "Time\t10:11:12\t10:11:12\t", "Y_Unit_Label\tVolt\tdegC\t", "X_Dimension\tTime\tTime\t", "X0\t0\t0\t",
-        f"Delta_X\t{number(dt, 6, decimal)}\t{number(dt, 6, decimal)}\t", "***End_of_Header***\t\t\t", "X_Value\tDrive\tOven\tComment",
+        "LabVIEW Measurement\t", "Writer_Version\t2", "Separator\tTab", f"Decimal_Separator\t{decimal}",
+        "X_Columns\tOne", "Time_Pref\tRelative", "Date\t2024/02/11", "Time\t10:11:12,5",
+        "***End_of_Header***\t", "\t", "Channels\t2\t\t", f"Samples\t{rows}\t{rows}\t",
+        "Date\t2024/02/11\t2024/02/11\t", "Time\t10:11:12\t10:11:12\t", "Y_Unit_Label\tVolt\tdegC\t",
+        "X0\t0\t0\t", f"Delta_X\t{number(dt, 6, decimal)}\t{number(dt, 6, decimal)}\t",
+        "***End_of_Header***\t\t\t", "X_Value\tDrive\tOven\tComment",
     ]  # fmt: skip
     rows_of = [
         f"{number(row * dt, 6, decimal)}\t{number(u[row] / 51, 6, decimal)}\t{number(y[row], 6, decimal)}\t"

@@ -48,7 +48,7 @@ _OWN_LAGS = (3, 6, 12, 24, 48)  # rows of an input's own past, to test it for fe
 # Of the moves of an input the 5 % largest are a set point's.  Of the others the past of the outputs explains
 # 33 to 99 % in 20 closed loops with a set point in steps, at most 34 % (few moves, by chance) in open ones.
 _USUAL_MOVES, _EXPLAINED_BETWEEN = 0.95, 0.25
-# Differences over ranges, in the median: at most 0.08 in ten thermostats, 0.14 to 1 in 60 relays of any course.
+# Median of differences over ranges: at most 0.08 in ten thermostats, 0.14 to 1 in 60 relays of any course.
 _SAME_READING, _SWITCHINGS = 0.1, 10
 
 
@@ -274,7 +274,9 @@ def _feedback(grid: Grid, at: int, name: str, lags: int = 3) -> Finding:
     # a smooth input is predicted by many of its own rows: with few of them, outputs that filter it would help
     own = min(_OWN_LAGS, key=lambda n: _bic(*_moves(grid, at, own=n, others=0)))
     (X, v), (Z, _) = (_moves(grid, at, own=own, others=n) for n in (0, lags))
-    moves = np.count_nonzero(np.abs(v - X[:, 0]) > 1e-9 * np.ptp(v)) if len(v) else 0  # X[:, 0] is u[k-1]
+    moves = (
+        int(np.count_nonzero(np.abs(v - X[:, 0]) > 1e-9 * np.ptp(v))) if len(v) else 0
+    )  # X[:, 0] is u[k-1]
     if moves < 3 * Z.shape[1]:
         says = f"{name} moves too seldom to be tested for feedback"
         return Finding("feedback", "", name, float("nan"), "1", "ok", says)
@@ -309,10 +311,10 @@ def _relay_feedback(grid: Grid, at: int, name: str) -> Finding:
     between the two.  A clock switches so as well, once the plant has settled: its holds are all alike.
     """
     least, switchings, lengths = np.inf, 0, set[int]()
-    for column in range(len(grid.outputs)):
+    for output in range(len(grid.outputs)):
         ratios = []
         for segment in grid.segments:
-            y, edges = segment.y[:, column], np.flatnonzero(np.diff(segment.u[:, at])) + 1
+            y, edges = segment.y[:, output], np.flatnonzero(np.diff(segment.u[:, at])) + 1
             lengths |= {*np.diff(edges).tolist()}
             for first, last in zip(edges[:-2], edges[2:]):
                 part = y[first : last + 1]
@@ -324,8 +326,8 @@ def _relay_feedback(grid: Grid, at: int, name: str) -> Finding:
     says = f"no sign that {name} was driven by the outputs"
     if closed:
         says = (
-            f"{name} is switched at the same readings again and again ({switchings} times): recorded in closed "
-            "loop; trust simulation-error fits and not one-step fits"
+            f"{name} is switched at the same readings again and again ({switchings} times): recorded in "
+            "closed loop; trust simulation-error fits and not one-step fits"
         )
     return Finding("feedback", "", name, least, "1", "warn" if closed else "ok", says)
 
@@ -333,7 +335,9 @@ def _relay_feedback(grid: Grid, at: int, name: str) -> Finding:
 def _set_points(log: Log) -> list[str]:
     """Return the columns of a log that are set points by their names, or by what follows them."""
     units = {str(name): str(item.attrs.get("units", "1")) for name, item in log.items()}
-    by_course = [line.partition(": ")[0] for line in log.attrs.get("guesses", "").splitlines() if FOLLOWED in line]
+    by_course = [
+        line.partition(": ")[0] for line in log.attrs.get("guesses", "").splitlines() if FOLLOWED in line
+    ]
     return [n for n, unit in units.items() if explain_role(n, unit)[1] == IS_SET_POINT or n in by_course]
 
 

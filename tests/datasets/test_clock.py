@@ -156,7 +156,7 @@ LABVIEW = (
          lambda k: f"[06:00:{k:02}][D][sensor:094]: 'plate_temp': Sending state {PLATE[k]:.2f} \u00b0C with\n"
                    f"[06:00:{k:02}][D][number:012]: 'heater': Sending state {HEATER[k]:.1f}\n", 1.0),
         ("klippy.log", "Loaded MCU 'mcu' 100 commands\n",
-         lambda k: f"Stats {1200 + 2 * k}.3: gcodein=0 heater: target=0 temp={PLATE[k]:.2f} pwm={HEATER[k]:g} "
+         lambda k: f"Stats {1200 + 2 * k}.3: heater: target=0 temp={PLATE[k]:.2f} pwm={HEATER[k]:g} "
                    f"sysload=0.3{k % 7} cputime={k / 20:.3f}\n", 2.0),
     ],
 )  # fmt: skip
@@ -165,7 +165,9 @@ def test_logs_of_programs_are_read_with_their_clocks(tmp_path, name, head, line,
     log = read_log(tmp_path / name)
     assert np.median(np.diff(log["time"].values)) == step
     reading, drive = ("heater_temp", "heater_pwm") if name == "klippy.log" else ("plate_temp", "heater")
-    roles = {str(n): v.attrs["role"] for n, v in log.items() if v.attrs["role"] not in ("other", "disturbance")}
+    roles = {
+        str(n): v.attrs["role"] for n, v in log.items() if v.attrs["role"] not in ("other", "disturbance")
+    }
     assert roles == {reading: "output", drive: "input"}
     np.testing.assert_allclose(column(log, reading), np.round(PLATE[: log.sizes["time"]], 2))
 
