@@ -69,20 +69,23 @@ def test_what_lies_above_a_curve_is_named() -> None:
     assert said[0].endswith("Off the page, above twice chance: a.")
 
 
-def test_a_strange_grasp_stands_with_its_reason() -> None:
+def test_touches_are_counted_by_what_was_taught_and_what_was_not() -> None:
     record = load_example_grasps()["exp2_dT20"].isel(grasp=[0, 16])
     row = {"p_copper": 1.0, "p_wood": 0.0, "decided_at_s": 10.0}
     rows = [
-        row
-        | {"true": "copper", "material": "copper", "p_unknown": 0.8, "why": "as copper it is cold (4.1 sd)"},
+        row | {"true": "copper", "material": "copper", "p_unknown": 0.8, "why": "as copper it is cold"},
         row | {"true": "wood", "material": "copper", "p_unknown": 0.1, "why": ""},
+        row | {"true": "glass", "material": "copper", "p_unknown": 0.9, "why": ""},
     ]
-    section = touch_section([record], rows, "some grasps")
+    section = touch_section([record], rows, ("copper", "wood"))
     assert section.verdict == (
-        "1 of 2 grasps of the twin were named right. That of copper is marked as unlike any block of the "
-        "training: as copper it is cold (4.1 sd)."
+        "1 of 2 blocks of copper, wood are named right; 1 of 1 that was not taught (glass) is called unknown."
     )
     assert section.tone == "warn"
+    assert Text("Copper: as copper it is cold.") in section.parts
+    sure = [rows[0] | {"p_unknown": 0.1}, rows[2]]
+    assert touch_section([record], sure, ("copper", "wood")).tone == "good"
+    assert touch_section([record], [rows[2] | {"p_unknown": 0.1}], ("copper",)).tone == "warn"
 
 
 @pytest.mark.parametrize(
@@ -112,7 +115,7 @@ def test_sessions_that_did_not_settle_are_counted_and_their_advice_shown() -> No
     ]
     section = classification.session_section(runs, "the twin")
     assert (section.verdict, section.tone) == ("1 of 2 sessions settled on the twin.", "warn")
-    assert section.parts[0].rows[1] == ("second", "tripped", 9.0, 0.1, 0.02)
+    assert section.parts[1].rows[1] == ("second", "tripped", 9.0, 0.1, 0.02)
     assert [part for part in section.parts if isinstance(part, Text)] == [Text("second: look at the pump")]
     assert classification.session_section(runs[:1], "the twin").tone == "good"
 

@@ -56,32 +56,32 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Sessions, list[
 def test_the_twin_settles_and_grasps_each_material(ran: tuple[Path, Sessions, Any]) -> None:
     out, sessions, _ = ran
     assert [title for title, _ in sessions] == [
-        "28 to 38 degC, then copper at 18 degC",
-        "28 to 38 degC, then wood at 18 degC",
+        f"28 to 38 degC, then {name} at 18 degC" for name in demo.TOUCHED
     ]
-    for k, (name, (_, session)) in enumerate(zip(("copper", "wood"), sessions)):
+    assert set(demo.TOUCHED) - set(demo.CANDIDATES) == {"glass"}
+    for k, (name, (_, session)) in enumerate(zip(demo.TOUCHED, sessions)):
         assert session.verdict == "settled"
         assert session.log["t_surface"].values[0] == pytest.approx(28.0, abs=0.3)
         grasp = session.grasps.isel(grasp=0)
         assert (str(grasp["material"].values), float(grasp["t_object"])) == (name, 18.0)
         before = grasp["t_surface"].values[grasp["time"].values < -0.25]
         assert before.mean() == pytest.approx(38.0, abs=0.2)
-        about = json.loads((out / f"run-{name}" / "run.json").read_text())["about"]
+        about = json.loads((out / f"run{k + 1}-{name}" / "run.json").read_text())["about"]
         assert (about["material"], about["seed"]) == (name, SEED + k)
         again = Twin(small_plant(), seed=about["seed"], t_start=28.0).read()
         assert session.log["t_surface"].values[0] == again.values["t_surface"]
 
 
-def test_each_grasp_fills_its_half_of_the_progress(
+def test_each_grasp_fills_its_share_of_the_progress(
     ran: tuple[Path, Sessions, list[tuple[float, str]]],
 ) -> None:
     seen = ran[2]
     fractions = [fraction for fraction, _ in seen]
     assert fractions == sorted(fractions)
-    for name, low, high in (("copper", 0.0, 0.5), ("wood", 0.5, 1.0)):
-        own = [fraction for fraction, what in seen if what.startswith(name)]
-        assert low <= own[0] < low + 0.1
-        assert own[-1] == pytest.approx(high)
+    for k, name in enumerate(demo.TOUCHED[:3]):
+        own = [at for at, what in seen if what.startswith(name) and at <= (k + 1) / 5 + 1e-9]
+        assert k / 5 <= own[0] < k / 5 + 0.05
+        assert own[-1] == pytest.approx((k + 1) / 5)
 
 
 def test_classifiers_are_scored_on_test_grasps_and_trained_for_the_twins_on_training_grasps(
@@ -124,10 +124,10 @@ def test_classifiers_are_scored_on_test_grasps_and_trained_for_the_twins_on_trai
     touched = [session.grasps for _, session in ran[1]]
     section = demo._touch(tmp_path, classifier, touched)
     [table] = [part for part in section.parts if isinstance(part, Table)]
-    assert [row[0] for row in table.rows] == ["copper", "wood"]
-    right = sum(row[0] == row[1] for row in table.rows)
-    assert section.verdict.startswith(f"{right} of 2 grasps of the twin were named right.")
-    assert len((tmp_path / "predictions.csv").read_text().splitlines()) == 3
+    assert [row[0] for row in table.rows] == [*demo.TOUCHED]
+    right = sum(row[0] == row[1] for row in table.rows[:4])
+    assert section.verdict.startswith(f"{right} of 4 blocks of copper, iron, wood are named right; ")
+    assert len((tmp_path / "predictions.csv").read_text().splitlines()) == 6
 
 
 @pytest.mark.parametrize(("workers", "compared"), [(1, (0.87, "x")), (3, (0.76, "train and test"))])

@@ -51,32 +51,38 @@ def session_section(sessions: Sequence[tuple[str, Session]], rig: str) -> Sectio
     """Return the section of sessions on a rig: how each settled, temperatures and drive."""
     rows = tuple((title, s.verdict, s.settle_time, s.overshoot, s.bias) for title, s in sessions)
     head = ("session", "verdict", "settled after [s]", "overshoot [K]", "bias [K]")
-    targets = {title: float(s.log["target_t_surface"].values[0]) for title, s in sessions}
-    chart = loops_chart({title: s.log for title, s in sessions}, targets)
+    title, first = sessions[0]
+    chart = loops_chart({title: first.log}, {title: float(first.log["target_t_surface"].values[0])})
     failed = [title for title, s in sessions if s.verdict != "settled"]
     verdict = f"{len(sessions) - len(failed)} of {len(sessions)} sessions settled on {rig}."
-    parts: list[Any] = [Table(head, rows), Plot(chart, "Sessions: settle, stop the pump, grasp.")]
+    parts: list[Any] = [Plot(chart, "The first session: settle, stop the pump, grasp."), Table(head, rows)]
     parts += [Text(f"{title}: {s.advice}") for title, s in sessions if s.advice]
     return Section("Does it settle and grasp?", tuple(parts), verdict, "warn" if failed else "good")
 
 
-def touch_section(touched: Sequence[Grasps], rows: Sequence[dict[str, Any]], trained_on: str) -> Section:
-    """Return the section of the twin's grasps: the traces, and what the classifier says of them."""
+def touch_section(
+    touched: Sequence[Grasps], rows: Sequence[dict[str, Any]], taught: Sequence[str]
+) -> Section:
+    """Return the section of the twin's grasps: the traces, and what a classifier that was ``taught`` some
+    materials says of them."""
     if not rows:
         return Section("What did it touch?", (), "Nothing: no session came to a grasp.", "warn")
-    right = sum(row["material"] == row["true"] for row in rows)
+    known = [row for row in rows if row["true"] in taught]
+    others = [row for row in rows if row["true"] not in taught]
+    right = sum(row["material"] == row["true"] for row in known)
+    noticed = sum(_unknown(row) for row in others)
+    verdict = f"{right} of {len(known)} blocks of {', '.join(taught)} are named right"
+    if others:
+        names = ", ".join(dict.fromkeys(row["true"] for row in others))
+        verdict += f"; {noticed} of {len(others)} that was not taught ({names}) is called unknown"
     named = [key for key in rows[0] if key.startswith("p_")]
     head = ("true", "answer", *(key.removeprefix("p_") for key in named), "decided at [s]")
     shares = [[None if row[key] is None else round(row[key], 4) for key in named] for row in rows]
     table = tuple((r["true"], r["material"], *of, r["decided_at_s"]) for r, of in zip(rows, shares))
-    verdict = f"{right} of {len(rows)} grasps of the twin were named right."
-    for row in rows:
-        if (row["p_unknown"] or 0.0) > 0.5:
-            why = f": {row['why']}" if row.get("why") else ""
-            verdict += f" That of {row['true']} is marked as unlike any block of the training{why}."
     parts = (
         Plot(grasps_chart({"": touched}), "The grasps as recorded; dotted: the gripper's message."),
-        Table(head, table, f"Posterior classifier, trained on {trained_on}"),
+        Table(head, table, "Posterior classifier, trained on the bundled training grasps"),
+        *(Text(f"{row['true'].capitalize()}: {row['why']}.") for row in rows if row.get("why")),
         Text(
             "Unknown is the probability that the block is none of the candidates; it is beside "
             "them, not in their sum; sd counts the spreads of the training grasps. The twin draws what no "
@@ -84,9 +90,13 @@ def touch_section(touched: Sequence[Grasps], rows: Sequence[dict[str, Any]], tra
             "shows that the stages fit together, not how often they are right."
         ),
     )
-    strange = any((row["p_unknown"] or 0.0) > 0.5 for row in rows)
-    tone = "good" if right == len(rows) and not strange else "warn"
-    return Section("What did it touch?", parts, verdict, tone)
+    wrong = right < len(known) or noticed < len(others) or any(_unknown(row) for row in known)
+    return Section("What did it touch?", parts, f"{verdict}.", "warn" if wrong else "good")
+
+
+def _unknown(row: Mapping[str, Any]) -> bool:
+    """Return whether an answer says that the block is more likely none of the candidates."""
+    return bool((row["p_unknown"] or 0.0) > 0.5)
 
 
 def review_section(checks: Sequence[Check]) -> Section:
