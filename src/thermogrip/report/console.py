@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from thermogrip.datasets.parallel import Progress
 
 _AT_ONCE = 0.5  # s
+_TELLING = 0.05  # share of the work that must be done before its time tells how long the rest will take
 _WIDTH = 100  # columns of what is written to no terminal
 #: Head and rows of a table.
 Cells: TypeAlias = tuple[tuple[str, ...], tuple[tuple[Any, ...], ...]]
@@ -180,7 +181,8 @@ def _lines(title: str) -> Progress:
         stage, step, spent, clear = what.split(":")[0], int(20 * fraction), time.monotonic() - begin, _anew()
         first[:] = first or [fraction if spent < _AT_ONCE else 0.0]
         left_s = spent * (1 - fraction) / max(fraction - first[0], 1e-3)
-        left = f", {left_s:.0f} s left" if spent + left_s > 10 and spent > 1 else ""
+        known = fraction - first[0] > _TELLING and spent > 1 and spent + left_s > 10
+        left = f", {left_s:.0f} s left" if known else ""
         line = f"{title} {100 * fraction:3.0f} % {spent:4.0f} s{left} {printable(what)}"
         if clear:
             sys.stderr.write(clear + f"[{'#' * step:.<20}] {line}"[: get_terminal_size().columns - 1])

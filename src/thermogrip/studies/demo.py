@@ -82,7 +82,7 @@ def run_demo(
         identification_section(found),
         free_run_section(held_out, title="Does it predict the half of a log that was held out?"),
         parameters_section(plant, record),
-        tuning_section(tuning),
+        replace(tuning_section(tuning), shown=1),
         replace(review_section(checks), shown=0),
         session_section(sessions, f"the twin (posterior draw {DRAW})"),
         _touch(out, classifier, touched),
