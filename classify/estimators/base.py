@@ -48,6 +48,7 @@ if TYPE_CHECKING:
 Floats: TypeAlias = NDArray[np.float64]
 Labels: TypeAlias = NDArray[np.str_]
 
+_DIVISORS = ("scale_", "sd")  # arrays of files
 HELD_AT_AN_END = 0.5  # s; a trace that is shorter than its grid by more is refused, not continued
 
 
@@ -466,11 +467,14 @@ def _read_at(grid: Floats, own: Floats, row: Floats, grasps: Grasps, i: int) -> 
 
 
 def check_shapes(arrays: dict[str, NDArray[Any]], **shapes: tuple[int | None, ...]) -> None:
-    """Raise ValueError where an array that was read from a file has not the shape that it must have."""
+    """Raise ValueError where an array that was read from a file has not the shape that it must have, or one
+    that is divided by has what is not positive."""
     for name, shape in shapes.items():
         found = arrays[name].shape
         if len(found) != len(shape) or any(n not in (None, have) for n, have in zip(shape, found)):
             raise ValueError(f"{name} has shape {found}")
+        if name in _DIVISORS and not (arrays[name] > 0).all():
+            raise ValueError(f"{name} is not positive")
 
 
 def set_arrays(

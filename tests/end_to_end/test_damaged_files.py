@@ -111,6 +111,13 @@ def test_a_classifier_whose_parts_do_not_fit_together_is_damaged(bench: Bench) -
     (folder / "classifier.json").write_text(json.dumps(content))
     with pytest.raises(UserError, match=r"classifier.json: is damaged \(pca_mean_ has shape"):
         load_classifier(folder)
+    for name in ("pca-lda", "bayes"):
+        folder = save_classifier(make_classifier(name).fit(grasps), bench.path / name)
+        content = json.loads((folder / "classifier.json").read_text())
+        content["arrays"]["scale_"][0] = 0.0
+        (folder / "classifier.json").write_text(json.dumps(content))
+        with pytest.raises(UserError, match=r"classifier.json: is damaged \(scale_ is not positive"):
+            load_classifier(folder)
 
 
 def test_an_epoch_that_is_no_number_is_refused_before_numpy_reads_it(
