@@ -58,7 +58,7 @@ from it may not exceed ``area`` kelvin seconds (Klipper's 120).
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import isfinite
 
 from thermogrip.datasets.errors import UserError, known_names
@@ -219,6 +219,19 @@ class GuardSettings:
     model: ModelSettings = field(default_factory=ModelSettings)
     rules: RuleSettings = field(default_factory=RuleSettings)
     file: str = field(default="", compare=False)  # where it was read from, for messages
+
+    def below(self, limit: float) -> GuardSettings:
+        """Return these with no sensor above a limit [degC]."""
+
+        def cut(ends: tuple[float, float]) -> tuple[float, float]:
+            if limit <= ends[0]:
+                problem = f"a limit of {limit:g} degC leaves nothing above {ends[0]:g}"
+                raise UserError(problem, hint="raise it")
+            return ends[0], min(ends[1], limit)
+
+        limits = {name: cut(ends) for name, ends in self.limits.items()}
+        skin, others = cut(self.skin_limits), cut(self.other_limits)
+        return replace(self, limits=limits, skin_limits=skin, other_limits=others)
 
     def check_sensors(self, have: Collection[str], rooms: Collection[str]) -> None:
         """Raise UserError where a limit or a pair names a sensor that the rig has not, or the room's."""

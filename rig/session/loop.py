@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from math import ceil
@@ -27,11 +27,12 @@ from numpy.typing import NDArray
 from thermogrip.datasets.errors import UserError, known_names
 from thermogrip.datasets.schema import Log, make_log
 from thermogrip.datasets.units import join_header, split_header
-from thermogrip.mpc.interface import Controller, Move, Target
+from thermogrip.mpc.interface import Controller, Move
 from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.guard.trip import ENDLESS, Trip, TripError
 from thermogrip.rig.interface import DeviceRefusedError, Event, Reading, Rig, SamplingRig
 from thermogrip.rig.serial.port import PortError
+from thermogrip.rig.session.profile import Profile
 from thermogrip.rig.session.signals import check_stopped, hold_signals
 from thermogrip.rig.session.snapshot import MOST_MARKS, Listener, Operator, Snapshot
 
@@ -111,13 +112,7 @@ class Loop:
         self.guard.target = {name: float(value) for name, value in target.items()}
         self.guard.settings.check_sensors(self.reading.values, self.rooms)
         for name, value in target.items():
-            if name not in self.reading.values:
-                hint = known_names(name, self.reading.values, "set a target for one of {}")
-                raise UserError(f"the rig has no sensor {name!r}", hint=hint)
-            lo, hi = self.guard.limits_of(name)
-            if not lo <= value <= hi:
-                problem, hint = f"target {value:g} degC is unsafe", f"choose one from {lo:g} to {hi:g} degC"
-                raise UserError(problem, file=self.guard.settings.file or None, hint=hint)
+            self.check_targets(name, [value])
         self.target = self.guard.target
         self.move = Move(drive=self.no_drive(), pump=1)
         for name, value in self.reading.values.items():
@@ -139,16 +134,31 @@ class Loop:
         self.controller.reset(self.controller_reading())
         self.check()
 
-    def regulate(self, phase: str, seconds: float) -> Iterator[float]:
-        """Run the controller for so long; yield the time passed in this phase at each move."""
+    def check_targets(self, name: str, values: Iterable[float]) -> None:
+        """Raise UserError where an output that has targets is none, or one of them is beyond its limits."""
+        if name not in self.reading.values:
+            hint = known_names(name, self.reading.values, "set a target for one of {}")
+            raise UserError(f"the rig has no sensor {name!r}", hint=hint)
+        lo, hi = self.guard.limits_of(name)
+        for value in values:
+            if not lo <= value <= hi:
+                problem, hint = f"target {value:g} degC is unsafe", f"choose one from {lo:g} to {hi:g} degC"
+                raise UserError(problem, file=self.guard.settings.file or None, hint=hint)
+
+    def regulate(self, phase: str, seconds: float, profile: Profile | None = None) -> Iterator[float]:
+        """Run the controller for so long, its targets those of a profile where there is one; yield the time
+        passed in this phase at each move."""
         begin = self.reading.time_s
         self.ends, self.dt = begin + seconds, self.controller.dt
         while True:
             passed = self.reading.time_s - begin
             if passed >= seconds:
                 return
+            target: Any = self.target if len(self.target) != 1 else next(iter(self.target.values()))
+            if profile is not None:
+                self.target.update(profile.at(passed))
+                target = profile.ahead(passed, self.controller.dt)  # which a controller may look at
             if self.fresh:
-                target: Target = self.target if len(self.target) != 1 else next(iter(self.target.values()))
                 self.move = self.controller.step(self.controller_reading(), target)
                 if self.move.status != self.status:
                     self.status = self.move.status

@@ -50,7 +50,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -63,6 +63,7 @@ from thermogrip.rig.guard.guard import Guard
 from thermogrip.rig.guard.trip import Trip, TripError
 from thermogrip.rig.interface import UNIT_RANGES, Event, Rig
 from thermogrip.rig.session.loop import PHASES, Loop, Recorder
+from thermogrip.rig.session.profile import Profile
 from thermogrip.rig.session.signals import stop_signals
 from thermogrip.rig.session.snapshot import Listener, Operator
 from thermogrip.sysid.effusivity.quality import find_contact
@@ -161,11 +162,12 @@ class Session:
     log: Log
     grasps: Grasps | None  # the one grasp, time 0 at the "closed" message
     events: tuple[Event, ...]  # phases, changes of the controller's status, lost readings, the verdict
-    verdict: str  # ``settled``, ``not settled`` or ``tripped``
+    verdict: str  # ``settled``, ``followed`` (a profile), ``not settled`` or ``tripped``
     advice: str  # what to do about it; empty when settled
-    settle_time: float  # [s], as in :class:`StepFigures`; of the worst output where there are several
+    # [s], as in :class:`StepFigures`; of the worst output where there are several, NaN along a profile
+    settle_time: float
     overshoot: float  # [K], likewise
-    bias: float  # [K], likewise
+    bias: float  # [K], likewise; along a profile the mean error
     # when the skin made contact [s after the "closed" message]; NaN where there was no contact
     contact: float = np.nan
     trip: Trip | None = None  # what ended it, where the guard did
@@ -183,6 +185,7 @@ def run_session(
     grasp_dt: float = 0.1,
     settle_timeout: float = 900.0,
     band: float = 0.25,
+    profile: Profile | None = None,
     guard: Guard | None = None,
     clock: Callable[[], float] | None = None,
     stop: Callable[[Grasps], bool] | None = None,
@@ -213,6 +216,8 @@ def run_session(
         Give up settling after this long [s].
     band : float, optional
         Half width of the band that counts as settled [K].
+    profile : Profile, optional
+        Targets over time to follow to their end, in place of settling at one.
     guard : Guard, optional
         By default one without a model.
     clock : callable, optional
@@ -252,7 +257,13 @@ def run_session(
     with stop_signals():
         try:
             run.start(target if isinstance(target, Mapping) else {output: float(target)})
-            verdict = "settled" if _settle(run, settle_timeout, band) else "not settled"
+            if profile is not None:
+                _follow(run, profile)
+                verdict = "followed"
+            elif _settle(run, settle_timeout, band):
+                verdict = "settled"
+            else:
+                verdict = "not settled"
             if verdict == "settled":
                 for _ in run.regulate("hold", hold):
                     pass
@@ -265,7 +276,7 @@ def run_session(
     if trip is not None:
         run.record_last()
         run.note("tripped", trip.line(), trip.as_dict())
-    if verdict == "settled":
+    if verdict in ("settled", "followed"):
         _learn(run)
     run.note("verdict", verdict)
     run.show(run.no_drive(), verdict=verdict, trip=trip)
@@ -303,6 +314,14 @@ def _settle(run: Loop, timeout: float, band: float) -> bool:
         if all(has_settled(time, error, band=band) for error in errors):
             return True
     return False
+
+
+def _follow(run: Loop, profile: Profile) -> None:
+    """Regulate along a profile to its end."""
+    for name, values in profile.targets.items():
+        run.check_targets(name, values)
+    for passed in run.regulate("hold", profile.seconds, profile):
+        run.report(passed / profile.seconds, "following the profile")
 
 
 def _touch(
@@ -391,14 +410,10 @@ def _result(run: Loop, verdict: str, grasps: Grasps | None, band: float, trip: T
         contact = find_contact(grasps["time"].values, grasps["t_surface"].values[0])
     if contact is None:
         run.note("no contact", "no contact was found: no object, or one as warm as the skin")
-    regulated = run.column("phase") <= PHASES.index("hold")
-    time = run.column("time_s")[regulated]
-    figures = [
-        step_figures(time, run.column(f"{name}_degC")[regulated], value, band=band)
-        for name, value in run.target.items()
-    ]
+    figures = [_figures(run, name, band) for name in run.target]
     advice = {
         "settled": "",
+        "followed": "",
         "not settled": "give it more time, a wider band, or a target that the plant can reach",
         "tripped": "" if trip is None else trip.line(),
     }
@@ -417,8 +432,31 @@ def _result(run: Loop, verdict: str, grasps: Grasps | None, band: float, trip: T
     )
 
 
+def _figures(run: Loop, name: str, band: float) -> StepFigures:
+    """Return the figures of one output, which along a profile is no step."""
+    regulated = run.column("phase") <= PHASES.index("hold")
+    values, targets = run.column(f"{name}_degC")[regulated], run.column(f"target_{name}_degC")[regulated]
+    if np.ptp(targets) > 0:
+        return StepFigures(np.nan, np.nan, float(np.nanmean(values - targets)))
+    return step_figures(run.column("time_s")[regulated], values, float(targets[0]), band=band)
+
+
+class Player(Controller, Protocol):
+    """A controller without a target, which ends: after so many seconds, or when it is done."""
+
+    @property
+    def seconds(self) -> float:
+        """How long it plays at most [s]."""
+
+    @property
+    def done(self) -> bool:
+        """Whether nothing is left to play."""
+
+
 class Playback:
     """A schedule as a controller: it returns the row in force, whatever the reading."""
+
+    done = False  # it ends with its time
 
     def __init__(self, schedule: Log, units: Mapping[str, str], dt: float) -> None:
         self.dt, self._begin = dt, 0.0  # sample time [s]
@@ -463,7 +501,7 @@ class Playback:
 
 def play(
     rig: Rig,
-    schedule: Log,
+    schedule: Log | Player,
     *,
     dt: float = 1.0,
     guard: Guard | None = None,
@@ -475,10 +513,11 @@ def play(
 ) -> tuple[Log, str]:
     """Play a schedule, sampled every ``dt`` [s]; return the log, and the line of the trip that ended it.
 
-    The other arguments are those of :func:`run_session`.  The rig is powered
-    down but not closed at the end; UserError where a trip comes before there are two rows.
+    What plays may also be a :class:`Player` of any kind, with a sample time of its own. The other arguments
+    are those of :func:`run_session`.  The rig is powered down but not closed at the end; UserError where a
+    trip comes before there are two rows.
     """
-    player = Playback(schedule, rig.units, dt)
+    player = Playback(schedule, rig.units, dt) if isinstance(schedule, Log) else schedule
     watch = Guard() if guard is None else guard
     run = Loop(rig, player, recorder, progress, watch, clock, listener, operator or Operator())
     ended, trip = "", None
@@ -487,6 +526,8 @@ def play(
             run.start({})
             for passed in run.regulate("hold", player.seconds):
                 run.report(passed / player.seconds, "playing the schedule")
+                if player.done:
+                    break
         except TripError as tripped:
             trip = tripped.trip
             ended = trip.line()

@@ -64,7 +64,7 @@ def test_python_dash_m_is_the_command() -> None:
 
 def test_the_verbs_are_those_of_the_contract() -> None:
     verbs = "demo identify validate simulate excite tune review export run effusivity train classify compare"
-    more = "warm-up retune linearise paper materials init record recover virtual batch"
+    more = "warm-up retune linearise paper materials init record recover virtual batch autotune"
     assert set(VERBS) == {*verbs.split(), *more.split()}
 
 
@@ -88,8 +88,10 @@ retune: DIR LOG... --out=retuned.json --controller --spec --report --network --s
 review: CONTROLLER --report --network --seed=0>0 --json=False
 export: CONTROLLER --out --check=False --states=3000>1 --arduino=False --single=False --ros2=False
   --network --seed=0>0 --json=False
-run: CONTROLLER --target --out --port --protocol --speed>0.01 --twin --draw=0>0 --from --hold=0.0>0
-  --object --material --grasp-time=10.0>0.5 --stop-early --settle-timeout=900.0>1 --guard --learn
+autotune: --target --out --port --protocol --speed>0.01 --twin --limit --minutes=30.0>1<1440 --spec
+  --guard --live>0<65535 --foxglove>1<65535 --on-trip --workers=1>1 --seed=0>0 --json=False
+run: CONTROLLER --out --target --profile --port --protocol --speed>0.01 --twin --draw=0>0 --from
+  --hold=0.0>0 --object --material --grasp-time=10.0>0.5 --stop-early --settle-timeout=900.0>1 --guard --learn
   --live>0<65535 --foxglove>1<65535 --bridge --on-trip --report --network --seed=0>0 --json=False
 record: SCHEDULE --port --out --protocol --sample=1.0>0.05 --guard --speed=1.0>0.01 --live>0<65535
   --foxglove>1<65535 --bridge --on-trip --seed=0>0 --json=False

@@ -37,7 +37,7 @@ from thermogrip.sysid.models.network import load_network
     ],
 )
 def test_targets_are_one_temperature_or_one_for_each_output(text: str, value: object) -> None:
-    assert verbs._targets(text) == value
+    assert verbs.targets_of(text) == value
 
 
 @pytest.mark.parametrize(
@@ -54,7 +54,7 @@ def test_targets_are_one_temperature_or_one_for_each_output(text: str, value: ob
 )
 def test_a_target_that_is_none_or_burns_is_refused(text: str, words: str) -> None:
     with pytest.raises(UserError, match=words):
-        verbs._targets(text)
+        verbs.targets_of(text)
 
 
 def test_targets_go_to_the_outputs_that_are_regulated() -> None:
@@ -126,7 +126,7 @@ def test_a_twin_that_is_watched_runs_ten_times_as_fast_as_real_time(
     given: tuple[Any, ...], pace: float | None
 ) -> None:
     """Given are --speed, --twin, --live and --foxglove."""
-    assert verbs._pace(*given) == pace
+    assert verbs.pace_of(*given) == pace
 
 
 @pytest.mark.parametrize("own", [False, True])
@@ -390,7 +390,7 @@ def test_after_a_trip_the_operator_is_asked_whether_it_is_cleared(
 
 @pytest.mark.parametrize(("words", "shown"), [([], "0"), (["8642"], "8642"), (["--seed", "3"], "0")])
 def test_live_may_stand_alone(words: list[str], shown: str, ran: SimpleNamespace, stand_in: StandIn) -> None:
-    made = stand_in("thermogrip.cli.rig._watch", UserError("seen"))
+    made = stand_in("thermogrip.cli.rig.watch_of", UserError("seen"))
     given = ["run", "c.json", "--target", "40", "--twin", "plant.json", "--out", "r", "--on-trip", "mail me"]
     assert ran.bench.run(*given, "--live", *words).code == 2
     assert made[0].args[0::2] == ("run", Path("r"), None, 10.0)

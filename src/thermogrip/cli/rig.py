@@ -137,16 +137,25 @@ LearnOption = Annotated[
 @stop_signals()
 def run(
     controller: ControllerFile,
+    out: OutOption,
     target: Annotated[
-        str,
+        str | None,
         cli.opt(
             "--target",
             "DEGC",
             "Skin temperature at contact, 10 to 50; of several outputs t1=40,t2=35.",
-            lambda value: (_targets(value), value)[1],
+            lambda value: value and (targets_of(value), value)[1],
         ),
-    ],
-    out: OutOption,
+    ] = None,
+    profile: Annotated[
+        Path | None,
+        cli.opt(
+            "--profile",
+            "PROFILE.csv",
+            "Follow targets over time in place of one: time_s,target_degC, or a column of each output; the "
+            "controller sees them coming.",
+        ),
+    ] = None,
     port: PortOption = None,
     protocol: ProtocolOption = None,
     speed: SpeedOption = None,
@@ -175,8 +184,9 @@ def run(
     Drive and pump are switched off on every way out, Ctrl-C included. With --object and --material it grasps
     after settling; without them it only regulates.
     """
-    wanted, grasp = _targets(target), _what_to_grasp(obj, material)
+    grasp = _what_to_grasp(obj, material)
     one_rig(port, twin)
+    wanted = _one_goal(target, profile, grasp is not None)
     cli.choices("--target", wanted if isinstance(wanted, dict) else (), controller, "outputs")
     from thermogrip.classify.decisions.stopping_rule import session_stop
     from thermogrip.mpc.closed_loop.simulate import RecordedController
@@ -185,29 +195,36 @@ def run(
     from thermogrip.report.html import write_report
     from thermogrip.rig.clock import ScaledClock
     from thermogrip.rig.records.run_folder import RunFolder
+    from thermogrip.rig.session.profile import read_profile, tracking_error
     from thermogrip.rig.session.session import run_session
 
     if stop_early is not None and grasp is None:
         raise UserError("--stop-early without a grasp", hint="give --object and --material too")
     console = Console(as_json)
-    pace = _pace(speed, twin, live, foxglove)
-    watch = _watch("run", console, out, live, foxglove, on_trip, pace)
+    pace = pace_of(speed, twin, live, foxglove)
+    watch = watch_of("run", console, out, live, foxglove, on_trip, pace)
     stop = None if stop_early is None else session_stop(stop_early, tell=watch.posterior)
     loaded = load_controller(controller, network)
-    regulator, wanted = RecordedController(loaded), _for_outputs(wanted, loaded.controlled)
+    regulator, path = RecordedController(loaded), None
+    if profile is not None:
+        path = read_profile(profile, loaded.controlled, preview_s=loaded.dt * sum(loaded.design.blocks))
+        wanted = path.at(0.0)
+    wanted = _for_outputs(wanted, loaded.controlled)
     checks = guard_of(guard, loaded.plant, learn, speed=speed or 1.0)
     clock = ScaledClock(pace or speed or 1.0)
     name = f"{twin.name}, draw {draw}" if twin is not None else str(port)
     about: dict[str, Any] = {"controller": controller.name, "target_degC": wanted}
     about |= {"port": port} if twin is None else {"twin": twin.name, "draw": draw}
+    about |= {} if profile is None else {"profile": profile.name}
     about |= {"from_degC": start, "hold_s": hold, "object_degC": obj, "material": material, "seed": seed}
-    files = files_of(learn, controller=controller, plant=twin, guard=guard)
+    files = files_of(learn, controller=controller, plant=twin, guard=guard, profile=profile)
     paced = pace is not None
     rig = rig_of(
         port, protocol, clock, twin, network, draw, loaded, seed=seed, t_start=start, paced=paced
     )
     try:
-        for line in beyond_logs(loaded, wanted, grasps=grasp is not None):
+        furthest = wanted if path is None else path.highest()
+        for line in beyond_logs(loaded, furthest, grasps=grasp is not None):
             console.warn(line)
         with (
             _bridge(bridge) as through,
@@ -225,6 +242,7 @@ def run(
                 grasp_time=grasp_time,
                 stop=stop,
                 settle_timeout=settle_timeout,
+                profile=path,
                 guard=checks,
                 clock=None if port is None else clock,
                 recorder=recorder,
@@ -240,13 +258,17 @@ def run(
         lead = f"One session on {name}: what was read, asked and answered, sample by sample."
         write_report(report, "A session", lead, session_sections(session, regulator.moves, loaded, name))
     figures = {"settle_time": session.settle_time, "overshoot": session.overshoot, "bias": session.bias}
-    head = ["verdict", "settled after [s]", "overshoot [K]", "bias [K]"]
-    console.table(f"{name}, to {_said(wanted)} degC", head, [[session.verdict, *figures.values()]])
+    head, goal = ["settled after [s]", "overshoot [K]", "bias [K]"], f"to {_said(wanted)} degC"
+    if profile is not None:
+        rms, largest = tracking_error(session.log, loaded.controlled)
+        figures, goal = {"rms_error": rms, "largest_error": largest}, f"along {profile.name}"
+        head = ["rms error [K]", "largest error [K]"]
+    console.table(f"{name}, {goal}", ["verdict", *head], [[session.verdict, *figures.values()]])
     if session.advice:
         console.say(session.advice)
     console.say(f"wrote {out}")
     console.answer({"verdict": session.verdict, "advice": session.advice, **figures, "out": out})
-    return 0 if session.verdict == "settled" else cli.ANSWER_IS_NO
+    return 0 if session.verdict in ("settled", "followed") else cli.ANSWER_IS_NO
 
 
 @stop_signals()
@@ -291,9 +313,9 @@ def batch(
 
     trials, loaded = read_plan(plan), load_controller(controller, network)
     checks = guard_of(guard, loaded.plant, learn, speed=speed or 1.0)
-    pace, console = _pace(speed, twin, live, foxglove), Console(as_json)
+    pace, console = pace_of(speed, twin, live, foxglove), Console(as_json)
     clock, paced = ScaledClock(pace or speed or 1.0), pace is not None
-    watch = _watch("batch", console, out, live, foxglove, on_trip, pace)
+    watch = watch_of("batch", console, out, live, foxglove, on_trip, pace)
     asks = ask and port is not None and not as_json
 
     def opened() -> Rig:
@@ -364,7 +386,7 @@ def record(
     plan = read_log(schedule)
     checks = guard_of(guard, None, speed=speed)
     console = Console(as_json)
-    watch = _watch("record", console, out, live, foxglove, on_trip)
+    watch = watch_of("record", console, out, live, foxglove, on_trip)
     clock = ScaledClock(speed)
     rig = open_rig(port, protocol, clock=clock, sleep=clock.sleep)
     try:
@@ -523,7 +545,7 @@ def files_of(learn: Path | None, **named: Path | None) -> dict[str, Path]:
 
 def rig_of(
     port: str | None, protocol: str | None, clock: ScaledClock, twin: Path | None, network: str | None,
-    draw: int, controller: Controller, *, seed: int, t_start: float | None, paced: bool = False,
+    draw: int, controller: Controller | None, *, seed: int, t_start: float | None, paced: bool = False,
 ) -> Rig:  # fmt: skip
     """Return the rig on a port, or the simulated one, ``paced`` by the clock or as fast as it goes."""
     from thermogrip.rig.clock import Metronome
@@ -535,7 +557,7 @@ def rig_of(
     if t_start is not None or draw:
         raise UserError("--from and --draw are of the twin", hint="leave them away with --port")
     rig = open_rig(str(port), protocol, clock=clock, sleep=clock.sleep)
-    lacking = set(controller.plant.inputs) - set(rig.units) - {"pump"}
+    lacking = set(controller.plant.inputs) - set(rig.units) - {"pump"} if controller is not None else ()
     if lacking:
         rig.close()
         have = ", ".join(rig.units)
@@ -543,7 +565,7 @@ def rig_of(
     return rig
 
 
-def _pace(speed: float | None, twin: Path | None, live: int | None, foxglove: int | None) -> float | None:
+def pace_of(speed: float | None, twin: Path | None, live: int | None, foxglove: int | None) -> float | None:
     """Return how many times as fast as real time a twin runs, None where it runs as fast as it goes."""
     if twin is None or speed is not None:
         return None if twin is None else speed
@@ -551,7 +573,7 @@ def _pace(speed: float | None, twin: Path | None, live: int | None, foxglove: in
 
 
 def _twin(
-    path: Path, network: str | None, draw: int, controller: Controller, *, seed: int,
+    path: Path, network: str | None, draw: int, controller: Controller | None, *, seed: int,
     t_start: float | None, pace: Callable[[float], None] | None = None,
 ) -> Twin:  # fmt: skip
     """Return the simulated rig; a drive whose unit does not say its range has the controller's."""
@@ -565,22 +587,26 @@ def _twin(
         if network is None:
             raise
         plant = cli.load_plant(path, network)
-    ranges = controller.design.drive_range
+    ranges = {} if controller is None else controller.design.drive_range
     limits = {name: ends for name, ends in ranges.items() if plant.units.get(name, "1") not in UNIT_RANGES}
     return Twin(plant.draw(draw), seed=seed, t_start=t_start, limits=limits, pace=pace)
 
 
 def guard_of(
-    path: Path | None, plant: Plant | None, learn: Path | None = None, *, speed: float = 1.0
-) -> Guard:
-    """Return the guard of a rig; what no file says is as by default.  Of a virtual device that runs ``speed``
-    times as fast this program may be as late as of others, in seconds of the computer."""
+    path: Path | None, plant: Plant | None, learn: Path | None = None, *, speed: float = 1.0,
+    limit: float | None = None,
+) -> Guard:  # fmt: skip
+    """Return the guard of a rig; what no file says is as by default, and nothing may be beyond a ``limit``.
+    Of a virtual device that runs ``speed`` times as fast this program may be as late as of others, in seconds
+    of the computer."""
     from thermogrip.rig.guard.guard import Guard, GuardSettings
     from thermogrip.rig.guard.settings import read_guard
 
     settings = GuardSettings() if path is None else read_guard(path)
     if speed > 1.0:
         settings = replace(settings, expiry_s=speed * settings.expiry_s)
+    if limit is not None:
+        settings = settings.below(limit)
     drift = None if learn is None or plant is None else _drift_of(learn, plant, settings.model.drift)
     return Guard(plant, settings, drift=drift)
 
@@ -599,7 +625,7 @@ def _drift_of(path: Path, plant: Plant, stated: float) -> PlantDrift:
     return found
 
 
-def _targets(target: str) -> float | dict[str, float]:
+def targets_of(target: str) -> float | dict[str, float]:
     """Return one target or targets by output ("38", "t1=40,t2=35"), inside what a skin may be brought to."""
     bare = target.rstrip("degC° ") or "one"
     hint = f"write {bare} [degC], or t1=40,t2=35 for several outputs"
@@ -610,6 +636,16 @@ def _targets(target: str) -> float | dict[str, float]:
             hint = f"choose one from {LOWEST_TARGET:g} to {HIGHEST_TARGET:g} degC"
             raise UserError(f"--target {value:g} degC is outside the rig's range", hint=hint)
     return values
+
+
+def _one_goal(target: str | None, profile: Path | None, grasps: bool) -> float | dict[str, float]:
+    """Return the targets that were typed, none where a profile has them; one of the two must be given."""
+    if (target is None) == (profile is None):
+        given = "no target is given" if target is None else "--target and --profile are both given"
+        raise UserError(given, hint="give --target DEGC, or --profile PROFILE.csv")
+    if target is None and grasps:
+        raise UserError("a profile ends without a grasp", hint="leave --object and --material away")
+    return {} if target is None else targets_of(target)
 
 
 def _for_outputs(target: float | dict[str, float], controlled: tuple[str, ...]) -> float | dict[str, float]:
@@ -640,7 +676,7 @@ def _what_to_grasp(obj: float | None, material: str | None) -> tuple[str, float]
     return material, obj
 
 
-def _watch(
+def watch_of(
     title: str, console: Console, out: Path, live: int | None, foxglove: int | None, on_trip: str | None,
     pace: float | None = None,
 ) -> Watch:  # fmt: skip

@@ -33,7 +33,7 @@ VERBS = {
     "demo": "project", "identify": "identify", "validate": "identify",
     "simulate": "identify", "linearise": "identify", "excite": "excite",
     "tune": "control", "retune": "control", "review": "control", "export": "control",
-    "run": "rig", "record": "rig", "virtual": "rig", "batch": "rig", "recover": "rig",
+    "autotune": "autotune", "run": "rig", "record": "rig", "virtual": "rig", "batch": "rig", "recover": "rig",
     "effusivity": "classify", "train": "classify", "classify": "classify", "compare": "compare",
     "paper": "project", "materials": "classify", "init": "project", "warm-up": "project",
 }  # fmt: skip

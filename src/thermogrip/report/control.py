@@ -309,7 +309,7 @@ def session_sections(
 ) -> list[Section]:
     """Return the report of a session on ``rig`` (in words): its events, its grasp, and its closed loop as the
     sensors read it, from the moves that ``RecordedController`` kept and within the controller's limits."""
-    tone = "good" if session.verdict == "settled" else "bad"
+    tone = "good" if session.verdict in ("settled", "followed") else "bad"
     events = tuple((event.time_s, event.kind, event.text) for event in session.events)
     table = Table(("time [s]", "event", "what"), events, "Events")
     parts: list[Any] = [table, *([Text(f"Advice: {session.advice}.")] if session.advice else [])]

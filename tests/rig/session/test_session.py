@@ -231,6 +231,7 @@ def test_of_several_targets_the_worst_figures_are_the_sessions() -> None:
         "time_s": t, "phase": np.where(t <= 180, t > 100, 4.0), "a_degC": np.where(t < 50, 10.0, 30.2),
         "b_degC": np.where(t < 20, 10.0, np.where(t < 30, 22.0, 19.9)),
     }  # fmt: skip
+    columns |= {"target_a_degC": np.full(t.size, 30.0), "target_b_degC": np.full(t.size, 20.0)}
     columns |= {name: np.where(t <= 180, columns[name], 99.0) for name in ("a_degC", "b_degC")}
     run = SimpleNamespace(
         rows=[{}, {}], target={"a": 30.0, "b": 20.0}, column=columns.__getitem__, events=[], log=lambda: None
