@@ -19,6 +19,8 @@ from hypothesis import settings
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
+for _name in ("FORCE_COLOR", "NO_COLOR", "COLUMNS"):  # what a program shows is not what this terminal wishes
+    os.environ.pop(_name, None)
 
 settings.register_profile("steady", derandomize=True, deadline=None)
 settings.load_profile("steady")
