@@ -45,9 +45,7 @@ def commands_in(path: Path) -> list[str]:
 
 
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
-#: records name files, modules and options as they were at the time
-PRESENT = [page for page in PAGES if page.parent.name != "records"]
-WRITTEN_BY_HAND = [page for page in PRESENT if page.name != "cli.md" and page.parent.name != "python"]
+WRITTEN_BY_HAND = [page for page in PAGES if page.name != "cli.md" and page.parent.name != "python"]
 WRITTEN = [(page, line) for page in WRITTEN_BY_HAND for line in commands_in(page)]
 ROOMS = ("datasets", "sysid", "mpc", "rig", "classify")
 OF_EVERY_VERB = {"--seed", "--json", "--help"}  # of which the page says so once
@@ -147,7 +145,7 @@ def imports_in(code: str) -> list[tuple[str, str]]:
 
 PYTHON = [
     (page, code)
-    for page in PRESENT
+    for page in PAGES
     for code in re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
 ]
 
