@@ -79,7 +79,7 @@ def touch_section(
     head = ("true", "answer", *(key.removeprefix("p_") for key in named), "decided at [s]")
     shares = [[None if row[key] is None else round(row[key], 4) for key in named] for row in rows]
     table = tuple((r["true"], r["material"], *of, r["decided_at_s"]) for r, of in zip(rows, shares))
-    parts = (
+    parts: list[Any] = [
         Plot(grasps_chart({"": touched}), "The grasps as recorded; dotted: the gripper's message."),
         Table(head, table, "Posterior classifier, trained on the bundled training grasps"),
         *(Text(f"{row['true'].capitalize()}: {row['why']}.") for row in rows if row.get("why")),
@@ -89,9 +89,9 @@ def touch_section(
             "two grasps share, such as how far a block is from its nominal temperature. One grasp a material "
             "shows that the stages fit together, not how often they are right."
         ),
-    )
+    ]
     wrong = right < len(known) or noticed < len(others) or any(_unknown(row) for row in known)
-    return Section("What did it touch?", parts, f"{verdict}.", "warn" if wrong else "good")
+    return Section("What did it touch?", tuple(parts), f"{verdict}.", "warn" if wrong else "good")
 
 
 def _unknown(row: Mapping[str, Any]) -> bool:
