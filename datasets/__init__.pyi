@@ -21,10 +21,8 @@ from thermogrip.datasets.schema import make_log as make_log
 if typing.TYPE_CHECKING:  # doors of 0.1.0, which are found and not listed
     from thermogrip.datasets.examples import copy_examples as copy_examples
     from thermogrip.datasets.grasp_files import read_grasp_files as read_grasp_files
-    from thermogrip.datasets.grasp_files import shared_grasps as shared_grasps
     from thermogrip.datasets.materials import Material as Material
     from thermogrip.datasets.materials import load_materials as load_materials
     from thermogrip.datasets.resample import gaps as gaps
-    from thermogrip.datasets.resample import hold_average as hold_average
     from thermogrip.datasets.splits import by_grasp as by_grasp
     from thermogrip.datasets.splits import shipped as shipped

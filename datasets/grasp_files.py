@@ -281,26 +281,6 @@ def check_apart(out: str | Path, paths: Sequence[str | Path]) -> None:
                 raise UserError("is to be read and written", file=out, hint=hint)
 
 
-def shared_grasps(first: Sequence[Grasps], second: Sequence[Grasps]) -> list[str]:
-    """Return the grasps of the second list, as ``condition/grasp_id``, that are in the first one too, by
-    grasp_id or by their samples: training and test must share none."""
-    known: set[str | bytes] = set()
-    for record in first:
-        known |= {str(grasp) for grasp in record["grasp"].values}
-        known |= {_print_of(samples) for samples in record["t_surface"].values}
-    return [
-        f"{log_name(record)}/{grasp}"
-        for record in second
-        for grasp, samples in zip(record["grasp"].values, record["t_surface"].values, strict=True)
-        if str(grasp) in known or _print_of(samples) in known
-    ]
-
-
-def _print_of(samples: Floats) -> bytes:
-    """Return what makes two recordings the same: every sample that is there."""
-    return np.ascontiguousarray(samples[np.isfinite(samples)]).tobytes()
-
-
 def _in_folder(folder: Path) -> list[Path]:
     with os_faults(folder):
         endings = (*_ENDINGS, ".nc", ".parquet", ".pq")

@@ -17,7 +17,7 @@ from itertools import pairwise
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.repair import gap_rows
@@ -66,15 +66,6 @@ def gaps(log: Log, longer_than: float = 10.0) -> list[tuple[int, float, float]]:
     begins = [float(t) for t in str(log.attrs.get(_AFTER_GAP, "")).split()]
     found = np.union1d(gap_rows(time, longer_than), np.flatnonzero(np.isin(time[1:], begins)))
     return [(int(at), float(time[at]), float(time[at + 1])) for at in found]
-
-
-def hold_average(log: Log, wanted: tuple[str, ...], grid: ArrayLike) -> NDArray[np.float64]:
-    """Return the exact means (n_cell, n_wanted) of held variables over the cells between the increasing edges
-    ``grid`` (n_cell + 1,) [s]; before the first row its value is taken, after the last row the last."""
-    edges = np.asarray(grid, dtype=float)
-    if edges.ndim != 1 or edges.size < 2 or np.any(np.diff(edges) <= 0):
-        raise ValueError("need at least two increasing edges")
-    return held_means(log["time"].values, columns(log, wanted), edges)
 
 
 def average(log: Log, seconds: float) -> Log:

@@ -22,8 +22,8 @@ from scipy.signal import lfilter
 from thermogrip.cli.excite import optimal_for, schedule_for
 from thermogrip.datasets.examples import example_path
 from thermogrip.datasets.log_files import read_log
-from thermogrip.datasets.resample import hold_average
-from thermogrip.datasets.schema import Log, make_log
+from thermogrip.datasets.resample import held_means
+from thermogrip.datasets.schema import Log, columns, make_log
 from thermogrip.sysid.experiment.information import ExperimentForecast, plant_from_prior
 from thermogrip.sysid.experiment.optimal import inputs_of
 from thermogrip.sysid.greybox.fit import fit_network
@@ -55,7 +55,7 @@ def third_log() -> None:
     before, after = fit_network("gripper", logs[:2]), fit_network("gripper", logs)
     time = logs[2]["time"].values
     edges = time[0] + before.dt * np.arange(int((time[-1] - time[0]) / before.dt) + 1)
-    u = hold_average(logs[2], before.inputs, edges)
+    u = held_means(time, columns(logs[2], before.inputs), edges)
     forecast = ExperimentForecast(before, draws=0)
     predicted = np.sqrt(np.diag(forecast.covariance(u)))
     now, stated = np.sqrt(np.diag(before.covariance)), np.sqrt(np.diag(after.covariance))

@@ -39,7 +39,6 @@ from thermogrip.datasets.parallel import (
     Progress,
     Workers,
     joint_progress,
-    kept_processes,
     run_parallel,
     run_threads,
     sub_progress,
@@ -340,11 +339,6 @@ def tune(
     >>> found.verdict, [row.controller for row in found.rows]
     ('actuator-limited', ['baseline', 'tuned', 'PI', 'LQR'])
     """
-    with kept_processes(workers):
-        return _tune(plant, spec, progress, workers, seed)
-
-
-def _tune(plant: Plant, spec: Spec | None, progress: Progress | None, workers: Workers, seed: int) -> Tuning:
     spec = Spec.of(plant) if spec is None else spec
     plant = spec.widened(plant)
     search = Search(plant, spec, spec.design(plant), seed, workers=workers)

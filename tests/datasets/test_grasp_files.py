@@ -21,7 +21,6 @@ from thermogrip.datasets.grasp_files import (
     distinct_names,
     read_grasp_files,
     read_grasps,
-    shared_grasps,
     write_grasps,
 )
 from thermogrip.datasets.schema import make_grasps
@@ -261,17 +260,6 @@ def test_a_folder_is_its_grasp_files(tmp_path, small_grasps):
         read_grasp_files([tmp_path / "empty"])
     with pytest.raises(UserError, match="is given twice"):
         read_grasp_files([tmp_path / "b.csv", tmp_path / "b.csv"])
-
-
-def test_the_same_grasp_in_training_and_test_is_found_under_any_name(small_grasps):
-    half = small_grasps.isel(grasp=slice(0, 3))
-    other = small_grasps.isel(grasp=slice(3, 6))
-    assert shared_grasps([half], [other]) == []
-    assert shared_grasps([half], [small_grasps]) == ["small/g0", "small/g1", "small/g2"]
-    renamed = half.assign_coords(grasp=["x0", "x1", "x2"])
-    assert shared_grasps([half], [renamed]) == ["small/x0", "small/x1", "small/x2"]
-    same_id = make_grasps([-0.1, 0.1], [[20.0, 21.0]], ["g1"], name="new")
-    assert shared_grasps([half], [same_id]) == ["new/g1"]
 
 
 def test_columns_that_nobody_asked_for_are_left_out_and_reported(pair):

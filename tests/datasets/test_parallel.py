@@ -13,9 +13,8 @@ import sys
 import threading
 import time
 import weakref
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,7 +27,6 @@ from thermogrip.datasets.parallel import (
     begin_processes,
     in_order,
     joint_progress,
-    kept_processes,
     run_parallel,
     run_threads,
     sub_progress,
@@ -57,55 +55,32 @@ def test_a_fault_in_a_process_is_raised_here_as_it_was():
         run_parallel(math.factorial, [3, -1, 4], workers=2)
 
 
-def test_processes_that_are_kept_do_the_work_of_every_call_and_then_end() -> None:
-    """Each item is this process's child: the same two do four pieces of work, also after a fault."""
-    with kept_processes(2), kept_processes(2):
-        first = set(run_parallel(eval, OWN, workers=2))
-        with pytest.raises(ValueError, match="factorial"):
-            run_parallel(math.factorial, [3, -1, 4], workers=2)
-        again = set(run_parallel(eval, OWN, workers=2))
+@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="needs two processors")
+def test_the_same_processes_do_the_work_of_every_call_also_after_a_fault() -> None:
+    first = set(run_parallel(eval, OWN, workers=2))
+    with pytest.raises(ValueError, match="factorial"):
+        run_parallel(math.factorial, [3, -1, 4], workers=2)
+    again = set(run_parallel(eval, OWN, workers=2))
     assert len(first | again) <= 2
     assert os.getpid() not in first | again
-    assert not first & set(run_parallel(eval, OWN, workers=2))
 
 
 @pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="needs two processors")
 def test_a_single_item_is_done_here_unless_it_is_to_run_elsewhere() -> None:
-    with kept_processes(2):
-        assert run_parallel(eval, OWN[:1], 2) == [os.getpid()]
-        assert run_parallel(eval, OWN[:1], 2, elsewhere=True) != [os.getpid()]
+    assert run_parallel(eval, OWN[:1], 2) == [os.getpid()]
+    assert run_parallel(eval, OWN[:1], 2, elsewhere=True) != [os.getpid()]
     assert run_parallel(eval, OWN[:1], 1, elsewhere=True) == [os.getpid()]
 
 
 @pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="needs two processors")
-def test_all_processes_begin_at_once_for_none_may_begin_as_a_pool_breaks() -> None:
-    pool = parallel._processes(3)
-    try:
-        assert pool.submit(math.factorial, 3).result() == 6
-        assert len(pool._processes) == 3
-    finally:
-        pool.shutdown()
-
-
-@pytest.mark.skipif(os.name == "nt" or (os.cpu_count() or 1) < 2, reason="needs POSIX and two processors")
-def test_kept_processes_of_which_one_is_killed_over_a_single_item_are_as_many_as_before() -> None:
-    with kept_processes(2):
-        with pytest.raises(UserError, match="killed again and again"):
-            run_parallel(signal.raise_signal, [signal.SIGKILL], 2, elsewhere=True)
-        assert run_parallel(abs, [-1], 2, elsewhere=True) == [1]
-        assert len(parallel._kept[0]._processes) == 2
-
-
-@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="needs two processors")
-def test_threads_share_kept_processes_and_give_results_in_order() -> None:
+def test_threads_share_processes_and_give_results_in_order() -> None:
     meet, seen = threading.Barrier(3, timeout=60), []
 
     def work(n: int) -> list[int]:
         meet.wait()  # all three at once
         return run_parallel(math.factorial, [n, n + 1], 2)
 
-    with kept_processes(2):
-        got = run_threads(work, [3, 1, 2], 2, lambda *a: seen.append(a), what="factorials")
+    got = run_threads(work, [3, 1, 2], 2, lambda *a: seen.append(a), what="factorials")
     assert got == [[6, 24], [1, 2], [2, 6]]
     assert seen == [(pytest.approx(n / 3), "factorials") for n in (1, 2, 3)]
     order: list[int] = []
@@ -146,29 +121,6 @@ def test_processes_that_are_killed_again_and_again_are_one_line():
         run_parallel(signal.raise_signal, [signal.SIGKILL] * 3, workers=2)
 
 
-@pytest.mark.skipif(
-    sys.platform != "linux" or (os.cpu_count() or 1) < 2, reason="needs Linux and two processors"
-)
-def test_processes_begin_with_the_modules_that_were_named_and_not_with_files_of_the_folder(tmp_path):
-    (tmp_path / "colorsys.py").write_text("OWN = 1")
-    program = """if __name__ == "__main__":
-        import os, sys
-        from thermogrip.datasets.parallel import begin_processes, run_parallel
-        sys.path.remove("")
-        begin_processes(2, ["no_such_module", "colorsys"])
-        module = "__import__('sys').modules.get('colorsys')"
-        found = run_parallel(eval, [f"({module} is None, hasattr({module}, 'OWN'))"] * 2, 2)
-        threads = run_parallel(os.getenv, ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"], 2)
-        print(found, threads, "PYTHONSAFEPATH" in os.environ, "OPENBLAS_NUM_THREADS" in os.environ)
-    """
-    apart = ("PYTHONSAFEPATH", *parallel.THREADS)
-    given = {key: value for key, value in os.environ.items() if key not in apart} | {"OMP_NUM_THREADS": "3"}
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=tmp_path, env=given, capture_output=True, text=True, check=True
-    )
-    assert done.stdout.strip() == "[(False, False), (False, False)] ['3', '1'] False False"
-
-
 @pytest.fixture
 def pools(monkeypatch):
     """Eight processors, and threads in place of processes: a list of how many each pool was asked for."""
@@ -178,30 +130,17 @@ def pools(monkeypatch):
     return made
 
 
-@pytest.mark.skipif(
-    sys.platform != "linux" or (os.cpu_count() or 1) < 2, reason="needs POSIX and two processors"
-)
-def test_a_program_that_ends_early_leaves_no_server_that_holds_its_stderr(tmp_path):
-    """Who reads stderr to its end, as `2>&1 | head` does, need not wait for what the server imports."""
-    (tmp_path / "slow.py").write_text("import time\ntime.sleep(600)\n")
-    code = "from thermogrip.datasets.parallel import begin_processes; begin_processes(2, ['slow'])"
-    path = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
-    run = [sys.executable, "-c", code]
-    subprocess.run(run, check=True, capture_output=True, timeout=500, env=os.environ | {"PYTHONPATH": path})
-
-
-def test_no_more_processes_are_started_than_there_are_items_or_processors(pools, monkeypatch):
+def test_no_more_processes_are_started_than_there_are_processors(pools, monkeypatch):
     seen = []
     got = run_parallel(math.factorial, [4, 1, 3, 2, 0], workers=3, progress=lambda *a: seen.append(a))
     assert got == [24, 1, 6, 2, 1]
     assert seen[-1] == (1.0, "working")
     assert {round(5 * f) / 5 for f, _ in seen} >= {f for f, _ in seen}
-    for workers in (6, 99, 1):
+    for workers in (99, 1):
         run_parallel(abs, [-1] * 6, workers=workers)
-    run_parallel(abs, [-1] * 20, workers=99)
     monkeypatch.setattr(parallel.os, "cpu_count", lambda: None)
     run_parallel(abs, [-1] * 20, workers=99)
-    assert pools == [3, 6, 6, 8]
+    assert pools == [3, 8]
 
 
 def test_a_fault_stops_what_has_not_begun_and_a_killed_process_is_one_line(pools):
@@ -217,20 +156,6 @@ def test_a_fault_stops_what_has_not_begun_and_a_killed_process_is_one_line(pools
     with pytest.raises(UserError, match=r"killed again and again; lower --workers; memory may be short"):
         run_parallel(work, [1] * 200, workers=2)
     assert len(done) < 100
-
-
-def test_kept_processes_are_those_of_the_outermost_block(pools):
-    for workers in (1, 5, 99):
-        with kept_processes(workers), kept_processes(workers + 1):
-            kept = [*parallel._kept]
-            assert run_parallel(abs, [-1, 2], workers=2) == [1, 2]
-        assert len(kept) == 1
-        assert not parallel._kept
-        with pytest.raises(RuntimeError, match="after shutdown"):
-            kept[0].submit(abs, 1)
-    assert pools == [2, 5, 8]  # one keeps none
-    with kept_processes("tcp://a:1"):
-        assert not parallel._kept
 
 
 class Cluster:
@@ -307,6 +232,8 @@ def cluster():
         dashboard_address=":0",
     )
     yield made.scheduler_address
+    for client in parallel._clients.values():
+        client.close()
     made.close()
 
 
@@ -337,14 +264,13 @@ def test_a_cluster_does_again_what_a_killed_worker_had_in_hand_and_takes_in_a_la
     ) as made:
         address = made.scheduler_address
         begin_processes(address, ["thermogrip.datasets.schema"])
-        with kept_processes(address):
-            items = [(kill if n == 3 else pid).format(n=n) for n in range(40)]
-            seen = []
-            for n, found in enumerate(in_order(eval, items, address)):
-                seen.append(found)
-                if n == 0:
-                    made.scale(2)
-            assert seen == list(range(40))
+        items = [(kill if n == 3 else pid).format(n=n) for n in range(40)]
+        seen = []
+        for n, found in enumerate(in_order(eval, items, address)):
+            seen.append(found)
+            if n == 0:
+                made.scale(2)
+        assert seen == list(range(40))
     assert mark.exists()
     assert len(list(tmp_path.glob("late*"))) >= 3  # the first, its successor, and the late one
 
@@ -357,6 +283,7 @@ def test_a_cluster_that_does_not_answer_is_one_line(monkeypatch):
 
 def test_a_cluster_of_another_version_is_refused(cluster, monkeypatch):
     own = parallel._versions()
+    monkeypatch.setattr(parallel, "_clients", {})
     monkeypatch.setattr(parallel, "_versions", lambda: own | {"thermogrip": "0.0.1", "numpy": "1.0"})
     monkeypatch.setattr(distributed_client(), "run", lambda *_: {"w": own})
     words = rf"has thermogrip {__version__} for 0\.0\.1; numpy .* for 1\.0; install"
@@ -379,39 +306,6 @@ def test_what_a_killed_process_had_in_hand_is_done_again(tmp_path):
     assert got == list(range(8))
     assert mark.exists()
     assert seen == [pytest.approx(n / 8) for n in range(1, 9)]
-
-
-class Silent:
-    """A pool that breaks over its first items and answers none of them."""
-
-    def __init__(self) -> None:
-        self.ended, self.asked, self._processes = [], 0, {1: SimpleNamespace(terminate=self._terminated)}
-
-    def _terminated(self) -> None:
-        self.ended.append("process")
-
-    def submit(self, function, *items):
-        self.asked += 1
-        if not items:
-            raise BrokenProcessPool
-        return Future()
-
-    def shutdown(self, wait=True, cancel_futures=False) -> None:
-        self.ended.append("pool")
-        self._processes = None
-
-
-@pytest.mark.parametrize("kept", [True, False])
-def test_items_that_a_broken_pool_does_not_answer_are_done_by_the_next_one(monkeypatch, kept) -> None:
-    first = Silent()
-    pools = [first, ThreadPoolExecutor(2)]
-    monkeypatch.setattr(parallel, "_LOOK_S", 0.01)
-    monkeypatch.setattr(parallel.os, "cpu_count", lambda: 8)
-    monkeypatch.setattr(parallel, "_processes", lambda n: pools.pop(0))
-    with kept_processes(2 if kept else 1):
-        assert run_parallel(math.factorial, [3, 4, 5], 2) == [6, 24, 120]
-    assert first.asked == 4
-    assert first.ended[:2] == ["pool", "process"]
 
 
 def test_results_that_were_given_are_not_kept():
@@ -477,42 +371,6 @@ def test_one_worker_is_a_thread_here() -> None:
     assert asyncio.run(Replaced(1).call(eval, OWN[0])) == os.getpid()
 
 
-def test_on_a_worker_freed_memory_is_kept(monkeypatch) -> None:
-    said: list[tuple[int, int]] = []
-    sys.setswitchinterval(5e-3)
-    monkeypatch.setattr(parallel.sys, "platform", "linux")
-    library = SimpleNamespace(mallopt=lambda *pair: said.append(pair))
-    monkeypatch.setattr(parallel.ctypes, "CDLL", lambda _: library)
-    parallel._keep_memory.cache_clear()
-    assert [on_worker(math.factorial, n) for n in (3, 4)] == [6, 24]
-    assert sys.getswitchinterval() < 1e-3  # a result waits for the thread that computes the next one
-    assert said == [(-1, 1 << 28), (-3, 1 << 25)]  # once a process
-    monkeypatch.setattr(parallel.ctypes, "CDLL", lambda _: SimpleNamespace())  # a C library without it
-    parallel._keep_memory.cache_clear()
-    assert on_worker(math.factorial, 3) == 6
-
-
-def on_worker(function, item):
-    pytest.importorskip("distributed")
-    return pickle.loads(parallel._on_worker(pickle.dumps((function, item))))  # noqa: S301
-
-
-def test_a_worker_begins_with_a_task_once_it_has_imported(monkeypatch) -> None:
-    """Two threads that import modules which import each other find one of them half made."""
-    may, begun = threading.Event(), threading.Event()
-    on_worker(math.factorial, 3)  # which imports distributed
-    monkeypatch.setattr(parallel, "_importing", [])
-    monkeypatch.setattr(parallel, "import_module", lambda name: may.wait(10))
-    assert parallel._greeted(["slow"]) == parallel._versions()
-    with ThreadPoolExecutor(1) as other:
-        done = other.submit(lambda: begun.set() or on_worker(math.factorial, 3))
-        begun.wait(10)
-        time.sleep(0.05)
-        assert not done.done()
-        may.set()
-        assert done.result() == 6
-
-
 class Unpacked:
     """Notes in which thread it is unpacked."""
 
@@ -528,21 +386,53 @@ def test_a_cluster_unpacks_an_item_where_it_computes_and_not_at_its_scheduler(cl
     assert ["Dask-" in name for name in parallel._unpacked] == [True] * 3
 
 
-def test_a_cluster_imports_from_the_first_word_on_and_its_first_work_has_the_same_client(
-    cluster, monkeypatch
-) -> None:
+
+
+@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="needs two processors")
+def test_processes_begin_with_our_modules_and_not_with_files_of_the_folder(tmp_path):
+    for name in ("colorsys", "joblib", "numpy"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('of the folder')")
+    program = """
+import os, sys
+sys.path.remove("")
+from thermogrip.datasets.parallel import begin_processes, run_parallel
+begin_processes(2, ["no_such_module", "colorsys"])
+found = run_parallel(eval, ["hasattr(__import__('colorsys'), 'hsv_to_rgb')"] * 2, 2)
+threads = run_parallel(os.getenv, ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"], 2)
+print(found, threads, "PYTHONSAFEPATH" in os.environ, "OPENBLAS_NUM_THREADS" in os.environ)
+"""
+    apart = ("PYTHONSAFEPATH", *parallel.THREADS)
+    given = {key: value for key, value in os.environ.items() if key not in apart} | {"OMP_NUM_THREADS": "3"}
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, env=given, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "[True, True] ['3', '1'] False False"
+
+
+@pytest.mark.skipif(os.name == "nt" or (os.cpu_count() or 1) < 2, reason="needs POSIX and two processors")
+def test_a_ctrl_c_ends_the_processes_too(tmp_path):
+    program = """
+import os, signal, threading
+from thermogrip.datasets.parallel import run_parallel
+run_parallel(abs, [-1, 2], 2)
+threading.Timer(1.0, os.killpg, (os.getpgid(0), signal.SIGINT)).start()
+run_parallel(eval, ["__import__('time').sleep(300)"] * 2, 2)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=200, start_new_session=True
+    )
+    assert done.stderr.rstrip().endswith("KeyboardInterrupt")
+    assert done.stderr.count("Traceback") == 1
+
+
+def test_the_client_of_a_scheduler_is_the_same_one_for_every_call(cluster, monkeypatch) -> None:
     made, connected = [], parallel._connected
+    monkeypatch.setattr(parallel, "_clients", {})
     monkeypatch.setattr(parallel, "_connected", lambda *given: made.append(connected(*given)) or made[-1])
-    monkeypatch.setattr(parallel, "_importing", [])
-    monkeypatch.delitem(sys.modules, "colorsys", raising=False)
+    begin_processes(cluster, ["colorsys"])
     for _ in range(2):
-        begin_processes(cluster, ["no_such_module", "colorsys"])
-    for thread in parallel._importing:
-        thread.join(10)
-    assert "colorsys" in sys.modules
-    assert run_parallel(math.factorial, [3, 4], cluster) == [6, 24]
+        assert run_parallel(math.factorial, [3, 4], cluster) == [6, 24]
     [client] = made
-    assert client.status == "closed"
-    assert not parallel._clients
+    client.close()
     with pytest.raises(UserError, match="no address of a scheduler"):
         begin_processes("localhost", ["colorsys"])

@@ -86,7 +86,7 @@ def compare(
     from thermogrip.classify.estimators.registry import trainable
     from thermogrip.classify.evaluation.harness import evaluate
     from thermogrip.datasets.grasp_files import read_grasp_files
-    from thermogrip.datasets.parallel import joint_progress, kept_processes, run_threads, sub_progress
+    from thermogrip.datasets.parallel import joint_progress, run_threads, sub_progress
 
     names = cli.comma(classifiers)
     models, missing = trainable(names or BY_DEFAULT, quick=quick, seed=seed)
@@ -105,7 +105,7 @@ def compare(
     cli.warn_of_contacts(console, [*records, *(tests or ())])
     records = touched_part(console, records)
     tests = None if tests is None else touched_part(console, tests)
-    with kept_processes(pool), console.progress("compare") as progress:
+    with console.progress("compare") as progress:
         given = tests is not None or _has_split(records)
         anew = tests is None and repeats > 0
         if given and anew and (why := _unsplittable(records, repeats, train_per_class, seed)):

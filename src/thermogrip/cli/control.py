@@ -45,7 +45,6 @@ def tune(
     """
     cli.new_file(out, (".json",))
     pool = cli.workers_of(workers, cluster, "thermogrip.mpc.tuning.tune")
-    from thermogrip.datasets.parallel import kept_processes
     from thermogrip.mpc.design.spec import Spec, read_spec
     from thermogrip.mpc.tuning.tune import tune as search
 
@@ -62,7 +61,7 @@ def tune(
         console.say(
             f"In the trials, and where nobody reads it: {taken}; 'disturbances' in the spec replaces it"
         )
-    with kept_processes(pool), console.progress("tune") as progress, _naming(spec, tuple(Spec.model_fields)):
+    with console.progress("tune") as progress, _naming(spec, tuple(Spec.model_fields)):
         found = search(loaded, wanted, progress=progress, workers=pool, seed=seed)
     result = _written(console, found, f"A controller for {plant.name}", out, report)
     console.answer(result)
@@ -115,7 +114,6 @@ def retune(
     controller do on draws of the new plant.
     """
     cli.new_file(out, (".json",))
-    from thermogrip.datasets.parallel import kept_processes
     from thermogrip.mpc.design.spec import Spec, read_spec, spec_from_dict
     from thermogrip.mpc.tuning.retune import retune as search
     from thermogrip.rig.records.run_folder import read_run
@@ -133,7 +131,7 @@ def retune(
     phases = str(done.log["phase"].attrs["flag_meanings"]).split()
     loop = done.log.isel(time=done.log["phase"].values < phases.index("contact"))
     console = Console(as_json)
-    with kept_processes(workers), console.progress("retune") as progress:
+    with console.progress("retune") as progress:
         found = search(old, loop, more, spec=wanted, progress=progress, workers=workers, seed=seed)
     for error in found.errors:
         said = f"old plant {error.old:.3g}, new {error.new:.3g} {error.unit}, rms over the end of {run}"

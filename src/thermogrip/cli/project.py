@@ -58,12 +58,11 @@ def paper(
     """
     cli.new_folder(out)
     pool = cli.workers_of(workers, cluster)
-    from thermogrip.datasets.parallel import kept_processes
     from thermogrip.report.html import write_report
     from thermogrip.studies.paper import repeat_paper
 
     console = Console(as_json)
-    with kept_processes(pool), console.progress("paper") as progress:
+    with console.progress("paper") as progress:
         found = repeat_paper(quick=quick, seed=seed, workers=pool, progress=progress)
     found.bundled.save(out / "bundled")
     found.twin.save(out / "simulated")

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from thermogrip.datasets.parallel import kept_processes, sub_progress
+from thermogrip.datasets.parallel import sub_progress
 from thermogrip.report.classification import (
     comparison_sections,
     review_section,
@@ -67,7 +67,7 @@ def run_demo(
 
     With several workers they compare classifiers, which needs no plant, while this process identifies one.
     """
-    with ThreadPoolExecutor(1) as beside, kept_processes(workers):
+    with ThreadPoolExecutor(1) as beside:
         compare = partial(_compare, out, seed, workers)
         compared = None if workers == 1 else beside.submit(copy_context().run, compare, None)
         found, plant, record, held_out = _identify(out, seed, sub_progress(progress, 0.0, 0.6, "identify"))
