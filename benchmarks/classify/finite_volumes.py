@@ -12,6 +12,7 @@ behind the pipe. Readings are noisy, drift slowly and are rounded to 1/16 degC.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -59,11 +60,36 @@ class Rig:
 
 
 class Batch(NamedTuple):
-    """Cells of n blocks: conductance between neighbours, capacity, loss to the room, all per face area."""
+    """Cells of n blocks: conductance between neighbours, capacity, loss to the room, all per face area, and
+    the resistance from the near face to the middle of the first cell."""
 
     link: Array
     capacity: Array
     loss: Array
+    near: Array  # (n,)
+
+
+@dataclass(frozen=True)
+class Disturbed:
+    """What n grasps have that those of a training have not, (n,) each."""
+
+    length: Array  # [m], of the block
+    cover: Array  # [m], of a film or paint of 0.2 W/mK on its near face; 0 for none
+    onset: Array  # [s], when the contact is disturbed
+    off: Array  # [s], for how long
+    during: Array  # factor on the contact conductance meanwhile
+    after: Array  # and from then on
+
+    @classmethod
+    def not_at_all(cls, n: int) -> Disturbed:
+        """Return n grasps like those of a training."""
+        one = np.ones(n)
+        return cls(LENGTH * one, 0 * one, np.inf * one, 0 * one, one, one)
+
+    def factor(self, t: float) -> Array:
+        """Return the factors on the contact conductance at a time [s] since contact."""
+        during = (t >= self.onset) & (t < self.onset + self.off)
+        return np.where(during, self.during, np.where(t >= self.onset, self.after, 1.0))
 
 
 def labelled(
@@ -74,8 +100,10 @@ def labelled(
     rig: Rig | None = None,
     conditions: tuple[tuple[float, float], ...] = CONDITIONS,
     seconds: float = 10.0,
+    disturb: Callable[[int, np.random.Generator], Disturbed] | None = None,
 ) -> list[Grasps]:
-    """Return one record a condition: nominal object temperatures, ``repeats`` of each material."""
+    """Return one record a condition: nominal object temperatures, ``repeats`` of each material; ``disturb``
+    draws what is unlike a training."""
     rig = rig or Rig()
     out = []
     for k, (t_object, t_gripper) in enumerate(conditions):
@@ -84,9 +112,10 @@ def labelled(
         n = len(names)
         true = t_object + rig.t_object_sd * rng.standard_normal(n)
         room = rng.uniform(*rig.room, n)
-        blocks = _blocks(names, rig, rng)
+        unlike = Disturbed.not_at_all(n) if disturb is None else disturb(n, rng)
+        blocks = _blocks(names, rig, rng, unlike)
         state = np.repeat(true[:, None], N_BLOCK, axis=1)
-        time, y, _ = _touch(blocks, state, names, np.full(n, t_gripper), room, rig, rng, seconds)
+        time, y, _ = _touch(blocks, state, names, np.full(n, t_gripper), room, rig, rng, seconds, unlike)
         ids = [f"c{k}-{seed}-{i}" for i in range(n)]
         out.append(
             make_grasps(
@@ -133,17 +162,23 @@ def touched_twice(
     return record, true
 
 
-def _blocks(names: list[str], rig: Rig, rng: np.random.Generator) -> Batch:
+def _blocks(
+    names: list[str], rig: Rig, rng: np.random.Generator, unlike: Disturbed | None = None
+) -> Batch:
     rows = [find_material(name) for name in names]
     natural = np.where([name == "wood" for name in names], rig.natural_sd, 0.0)
     k = np.array([row.k * rig.grade.get(name, 1.0) for row, name in zip(rows, names)])
     k = k * np.exp(natural * rng.standard_normal(len(rows)))
-    dx = LENGTH / N_BLOCK
-    link = np.repeat((k / dx)[:, None], N_BLOCK - 1, axis=1)
-    capacity = np.repeat(np.array([row.rho * row.c_p * dx for row in rows])[:, None], N_BLOCK, axis=1)
-    loss = np.full(capacity.shape, rig.sides * 4 * dx / LENGTH)
+    unlike = Disturbed.not_at_all(len(names)) if unlike is None else unlike
+    capacity = np.array([row.rho * row.c_p for row in rows])
+    n_cover = np.where(unlike.cover > 0, 3, 0)[:, None]
+    covered = np.arange(N_BLOCK) < n_cover
+    dx = np.where(covered, unlike.cover[:, None] / 3, unlike.length[:, None] / (N_BLOCK - n_cover))
+    half = dx / (2 * np.where(covered, 0.2, k[:, None]))
+    loss = rig.sides * 4 * dx / LENGTH
     loss[:, -1] += rig.far
-    return Batch(link, capacity, loss)
+    whole = dx * np.where(covered, 1.5e6, capacity[:, None])
+    return Batch(1 / (half[:, :-1] + half[:, 1:]), whole, loss, half[:, 0])
 
 
 def _gripper(rig: Rig) -> tuple[Array, Array, int]:
@@ -164,6 +199,7 @@ def _touch(
     rig: Rig,
     rng: np.random.Generator,
     seconds: float = 10.0,
+    unlike: Disturbed | None = None,
 ) -> tuple[Array, Array, Array]:
     """Return sample times, readings (n, n_time) and the blocks' cells when the gripper lets go."""
     n = len(names)
@@ -174,7 +210,8 @@ def _touch(
     link, capacity, sensor = _gripper(rig)
     n_g = capacity.size
     dx0 = rig.layers[0][0] / rig.layers[0][3]
-    resistance = dx0 / (2 * rig.layers[0][1]) + 1 / (2 * blocks.link[:, 0])
+    resistance = dx0 / (2 * rig.layers[0][1]) + blocks.near
+    unlike = Disturbed.not_at_all(n) if unlike is None else unlike
     # gripper reversed, so that its face is next to the block's
     cells = np.concatenate([np.repeat(level[:, None], n_g, axis=1), state], axis=1)
     caps = np.concatenate([np.repeat(capacity[None, ::-1], n, axis=0), blocks.capacity], axis=1)
@@ -188,6 +225,7 @@ def _touch(
     for i in range(steps):
         t = (i + 0.5) * DT
         grown = h * (1 - 0.97 * np.exp(-((t / tau) ** 0.85))) * (1 + 0.1 * np.sqrt(t / 10))
+        grown = grown * unlike.factor(t)
         links[:, n_g - 1] = 1 / (1 / grown + resistance)
         cells = _implicit(cells, caps, links, loss, room)
         lagged[:, i + 1] = keep * lagged[:, i] + (1 - keep) * cells[:, at]

@@ -56,7 +56,7 @@ from thermogrip.classify.estimators.base import (
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.materials import load_materials
 from thermogrip.datasets.schema import has_touch_groups, label_values
-from thermogrip.sysid.effusivity.data import Touches, Whitened, touches
+from thermogrip.sysid.effusivity.data import Touches, Whitened, graded, touches
 from thermogrip.sysid.effusivity.gripper_model import GripperModel, GripperSpread, another_gripper
 from thermogrip.sysid.effusivity.laplace_approximation import fit_candidates, whitened
 from thermogrip.sysid.effusivity.multi_touch import (
@@ -75,6 +75,7 @@ if TYPE_CHECKING:
 FINISHES = ("auto", "known", "unknown")
 GRIPPERS = ("auto", "same", "uncertain", "another")
 _OTHER_GRIPPER, _OTHER_BLOCKS = 0.02, 0.2  # prior probabilities, the latter given the training's gripper
+_SEVERAL = 3  # single touches of a record, from which on it decides
 _SURE = 0.99  # of the training's gripper and blocks, from which on no free effusivity is asked against others
 _ASKED = 5  # grasps of a record about which another gripper is asked first
 _HARDLY = 0.001  # of the odds of another gripper, below which no more grasps are asked
@@ -244,9 +245,10 @@ class PosteriorClassifier(GraspClassifier):
         """``finish`` where only the training's gripper is asked about."""
         return "known" if self.finish == "auto" else self.finish
 
-    def _levels(self) -> list[_Level]:
-        """Return what a record decides between, the training's own gripper and blocks first."""
-        if self.device_.uncertain:
+    def _levels(self, n: int) -> list[_Level]:
+        """Return what a record of ``n`` single touches decides between, the training's own gripper and blocks
+        first; a few touches that these do not explain are no evidence of others."""
+        if self.device_.uncertain or n < _SEVERAL:
             return [_Level(1.0, self.device_, self.as_taught, "")]
         # what another gripper reads beyond the model, nobody knows
         other = _OTHER_GRIPPER if self.gripper == "auto" and self.device_.discrepancy is None else 0.0
@@ -262,7 +264,8 @@ class PosteriorClassifier(GraspClassifier):
 
     def _decided(self, data: Touches, names: Sequence[str], unknown: bool = False) -> _Decided:
         """Return what single touches of one record decide; the odds where a free effusivity is asked for."""
-        levels, u, noise = self._levels(), np.log(self.prior_unknown), whitened(self.device_, data)
+        levels, u = self._levels(data.level.size), np.log(self.prior_unknown)
+        noise = whitened(self.device_, graded(data, self.device_.grades))
         own = np.array([level.device is self.device_ for level in levels])
         n_own = int(own.sum())
         each, modes = _of_levels(levels[:n_own], data, names, noise)

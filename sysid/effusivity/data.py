@@ -13,12 +13,32 @@ The noise of the averages is a sum of three parts,
 white noise (sensor and rounding), slow noise (drift, a drifting reference junction), and what the model
 itself gets wrong, proportional to the excursion A of the grasp; g = (1 + t / 10 s)^p lets that part grow
 with contact time, so that a longer record does not raise confidence faster than truth.
+
+Grasps unlike those of the training
+-----------------------------------
+
+A grasp may differ from all that the gripper was taught by: a slip, a film, paint, a sheet in place of a
+block, a slower sensor, a heater nearby.  There is no end of these, and what has no model is explained by a
+wrong material, which is then sure.  So the model is right but for
+
+- a discrepancy of its trace, a Gaussian process of sd s A (s is the ``share``) whose correlation is the mean
+  of exp(-|dt| / l) for l of 0.5, 2.5 and 10 s, from a slip to a contact's length;
+- nuisances farther from where the training has them, by w in the logarithm of contact conductance, build-up
+  time and the block's heat capacity (a block of another thickness), by proportional amounts in onset and
+  object temperature (:func:`~thermogrip.sysid.effusivity.laplace_approximation.prior_of`).
+
+Nobody knows s and w of a grasp, so each is looked at under five pairs of them, the :data:`GRADES`, and the
+evidence of whatever is asked (a material, an effusivity, a material of none of the blocks) is its sum over
+them, each times its prior probability.  A larger s pays for itself by the determinant of its covariance:
+grasps like those of the training are answered by the first grade as if there were no others, and what gross
+misfit leaves is flat.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, TypeAlias
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +83,21 @@ class Noise:
         return np.asarray(np.exp(-z) * (1 + z) if self.smooth else np.exp(-z))
 
 
+class Grade(NamedTuple):
+    """How unlike those of the training a grasp may be."""
+
+    share: float
+    unlike: float
+    prior: float
+
+
+# One grasp in five is unlike the training: one cannot know from a training, however clean, that none will be.
+# Evidence differs by some ten nats between grades, so that their odds hardly count.
+GRADES = (
+    Grade(0.0, 0.0, 0.8), Grade(0.001, 0.3, 0.05), Grade(0.003, 1.0, 0.05), Grade(0.03, 1.0, 0.05),
+    Grade(0.1, 1.0, 0.05),
+)  # fmt: skip
+_TIMES = (0.5, 2.5, 10.0)  # s, of the discrepancy of a trace
 KNOTS = np.array([-1.0, -0.6, -0.3, 0.0, 0.3, 0.6, 1.0, 1.5, 2.2, 3.2, 4.6, 6.6, 10.0, 16.0, 25.0, 40.0])
 
 
@@ -91,6 +126,8 @@ class Touches:
     t_object_sd: Array  # (n,) [K]
     t_ambient: Array  # (n,), of the room [degC]
     excursion: Array  # (n,) [K]
+    share: Array  # (n,), s: sd of what the model leaves out of the trace, in units of the excursion
+    unlike: Array  # (n,), w: sd by which nuisances are farther from those of the training, in logarithms
     second: Touches | None = None  # what a second sensor of the finger read of the same grasps
 
     def take(self, index: NDArray[np.int64]) -> Touches:
@@ -100,7 +137,7 @@ class Touches:
 
     def known(self, index: NDArray[np.int64]) -> Touches:
         """Return what was known of the touches at these rows, with no readings."""
-        own = ("level", "t_object", "t_object_sd", "t_ambient", "excursion")
+        own = ("level", "t_object", "t_object_sd", "t_ambient", "excursion", "share", "unlike")
         numbers = {f.name: getattr(self, f.name)[index if f.name in own else slice(0)]
                    for f in fields(self) if f.name != "second"}  # fmt: skip
         return Touches(**numbers)
@@ -163,8 +200,17 @@ def touches(
         y=y, t=mean(np.broadcast_to(time, data.shape)),
         count=count, ramp=mean(np.broadcast_to(np.maximum(time - PUMP_OFF, 0.0), data.shape)), level=level,
         t_object=t_object, t_object_sd=sd, t_ambient=t_ambient, excursion=np.abs(away).max(axis=1),
-        second=second,
+        share=np.zeros(level.size), unlike=np.zeros(level.size), second=second,
     )  # fmt: skip
+
+
+def graded(data: Touches, grades: Sequence[Grade]) -> Touches:
+    """Return each touch under each of some grades, (n n_grade,) rows."""
+    n, (share, unlike, _) = data.level.size, np.array(grades).T
+    every = data.take(np.repeat(np.arange(n), len(grades)))
+    share, unlike = np.tile(share, n), np.tile(unlike, n)
+    second = None if every.second is None else replace(every.second, share=share, unlike=unlike)
+    return replace(every, second=second, share=share, unlike=unlike)
 
 
 def object_range(grasps: Grasps, stated: tuple[float, float] | None = None) -> Array:
@@ -272,6 +318,10 @@ def _parts(data: Touches, noise: Noise) -> tuple[Array, Array, Array]:
     alike = noise.correlation(np.abs(u[:, :, None] - u[:, None, :]))
     size = noise.misfit * data.excursion[:, None] * (1 + np.maximum(t, 0.0) / 10) ** noise.growth * (t > 0)
     misfit = alike[which] * (size * there)[:, :, None] * (size * there)[:, None, :]
+    if data.share.any():
+        alike = np.mean([np.exp(-apart / scale) for scale in _TIMES], axis=0)
+        size = (data.share * data.excursion)[:, None] * there
+        misfit += alike[which] * size[:, :, None] * size[:, None, :]
     white = np.where(there, noise.white**2 / np.maximum(data.count, 1.0), 1.0)
     return white, slow[which] * (there[:, :, None] & there[:, None, :]), misfit
 

@@ -38,7 +38,7 @@ from thermogrip.datasets.errors import UserError, reading
 from thermogrip.datasets.limits import number_within
 from thermogrip.datasets.materials import load_materials
 from thermogrip.sysid.contact.simulation import Grip, Stack
-from thermogrip.sysid.effusivity.data import KNOTS, UNKNOWN_OBJECT_RANGE, Noise, at_knots
+from thermogrip.sysid.effusivity.data import GRADES, KNOTS, UNKNOWN_OBJECT_RANGE, Grade, Noise, at_knots
 
 # theta but for the blocks, in the order of the calibration
 SHARED_NAMES = (
@@ -331,6 +331,12 @@ class GripperModel:
     def __post_init__(self) -> None:
         if self.uncertain and self.uncertainty is None:
             raise ValueError("an uncertain gripper needs the covariance of its parameters")
+
+    @property
+    def grades(self) -> tuple[Grade, ...]:
+        """How unlike the training a grasp may be: where the gripper is itself uncertain, or its discrepancy
+        was learnt, the first grade stands for the others."""
+        return GRADES[:1] if self.uncertain or self.discrepancy is not None else GRADES
 
     @property
     def unlisted(self) -> list[str]:

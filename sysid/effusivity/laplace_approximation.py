@@ -64,7 +64,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import gammaln
+from scipy.special import gammaln, logsumexp
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.errors import UserError
@@ -77,7 +77,7 @@ from thermogrip.sysid.contact.simulation import (
     nearby_modes,
     time_nodes,
 )
-from thermogrip.sysid.effusivity.data import Touches, Whitened, whiten
+from thermogrip.sysid.effusivity.data import Touches, Whitened, graded, whiten
 from thermogrip.sysid.effusivity.gripper_model import (
     INSULATOR,
     LEVEL_SD,
@@ -96,6 +96,9 @@ _ALIKE_SD = 1.0  # K
 # Tukey's contaminated normal: one stated temperature of an object in twenty is three times as far off
 SLIPS, _SLIP = 0.05, 3.0
 _TELLING = 0.5  # of the prior variance of the temperature: readings that leave more do not tell a slip
+# s of onset, and share of an object's distance from the skin, where logarithms of the rest are one off: a
+# message that is late by a third of a second, an object that has gone a fifth of its way
+_UNLIKE_ONSET, _UNLIKE_OBJECT = 0.3, 0.2
 _FINISH_SD, _GRADE_SD = 0.4, 0.05  # between blocks of one material: of ln h, and of ln e beside the table's
 
 
@@ -571,6 +574,12 @@ def prior_of(gripper: GripperModel, data: Touches, hypotheses: Hypotheses) -> Pr
     mean[:, EFFUSIVITY], sd[:, EFFUSIVITY] = hypotheses.ln_e, hypotheses.ln_e_sd
     mean[:, CAPACITY] = hypotheses.ln_rho_c + np.log(gripper.block_length * gripper.depth_share)
     sd[:, CAPACITY] = hypotheses.ln_rho_c_sd
+    if data.unlike.any():
+        for k in (H, BUILD_UP, CAPACITY):
+            sd[:, k] = np.hypot(sd[:, k], data.unlike)
+        sd[:, ONSET] = np.hypot(sd[:, ONSET], _UNLIKE_ONSET * data.unlike)
+        away = np.abs(mean[:, T_OBJECT] - data.level)
+        sd[:, T_OBJECT] = np.hypot(sd[:, T_OBJECT], _UNLIKE_OBJECT * data.unlike * away)
     return Prior(mean, sd, dof)
 
 
@@ -799,7 +808,33 @@ def fit_candidates(
     start: Array | None = None, noise: Whitened | None = None,
 ) -> tuple[Mode, Prior, NDArray[np.int64]]:  # fmt: skip
     """Return modes of every touch under every candidate, (n m,) rows, from nuisances ``start`` (n, m, 7), and
-    the prior and the touch of each; ``noise`` is :func:`whitened` where a caller has it."""
+    the prior and the touch of each.
+
+    Evidence is the sum over the gripper's grades, all else that of the grade which counts most; ``noise`` is
+    :func:`whitened` of the graded touches where a caller has it."""
+    n, m, n_grade = data.level.size, len(candidates), len(gripper.grades)
+    begin = None if start is None else np.repeat(start.reshape(n, m, -1), n_grade, axis=0)
+    every = graded(data, gripper.grades)
+    mode, prior, _ = candidate_modes(gripper, every, candidates, finish, start=begin, noise=noise)
+    each = over_grades(gripper, mode.log_evidence.reshape(n, n_grade, m))
+    best = each.argmax(axis=1)
+    at = ((np.arange(n)[:, None] * n_grade + best) * m + np.arange(m)).ravel()
+    dof = None if prior.dof is None else prior.dof[at]
+    mode = Mode(*(part[at] for part in mode))._replace(log_evidence=logsumexp(each, axis=1).ravel())
+    return mode, Prior(prior.mean[at], prior.sd[at], dof), np.repeat(np.arange(n), m)
+
+
+def over_grades(gripper: GripperModel, log_evidence: Array) -> Array:
+    """Return evidences (n, n_grade, ...) times the prior probability of each grade, in logarithms."""
+    log_prior = np.log([grade.prior for grade in gripper.grades])
+    return np.asarray(log_evidence + log_prior.reshape(-1, *[1] * (log_evidence.ndim - 2)))
+
+
+def candidate_modes(
+    gripper: GripperModel, data: Touches, candidates: Sequence[str | Material], finish: str = "known", *,
+    start: Array | None = None, noise: Whitened | None = None,
+) -> tuple[Mode, Prior, NDArray[np.int64]]:  # fmt: skip
+    """Return :func:`fit_candidates` under the grade that each of the touches has."""
     one = material_hypotheses(gripper, candidates, finish)
     n, m = data.level.size, len(candidates)
     row = np.repeat(np.arange(n), m)
@@ -807,8 +842,39 @@ def fit_candidates(
     begin = None if start is None else start.reshape(n * m, -1)
     each = data.known(row)
     prior = prior_of(gripper, each, hypotheses)
-    mode = fit_pairs(gripper, data, row, hypotheses, start=begin, noise=noise, prior=prior, rivals=True)
+    mode = fit_rivals(gripper, data, row, hypotheses, start=begin, noise=noise, prior=prior)
     return doubted(gripper, each, prior, mode), prior, row
+
+
+def fit_rivals(
+    gripper: GripperModel, data: Touches, row: NDArray[np.int64], hypotheses: Hypotheses, *,
+    start: Array | None, noise: Whitened | None, prior: Prior, rough: float = 0.0,
+) -> Mode:  # fmt: skip
+    """Return :func:`fit_pairs` of hypotheses that compete for each touch.
+
+    Where nuisances may be far from usual a density may have several modes (a sheet, or a block in poor
+    contact): then each hypothesis is also looked for from where the likeliest of its touch ended."""
+    noise = whitened(gripper, data) if noise is None else noise
+    mode = fit_pairs(
+        gripper, data, row, hypotheses, start=start, noise=noise, prior=prior, rivals=True, rough=rough
+    )
+    order = np.lexsort((mode.log_evidence, row))
+    likeliest = np.empty(data.level.size, dtype=np.int64)
+    likeliest[row[order]] = order  # of several the last one stays
+    at = np.flatnonzero((data.unlike[row] > 0) & (likeliest[row] != np.arange(row.size)))
+    if not at.size:
+        return mode
+    begin = mode.u[likeliest[row[at]]]
+    begin[:, EFFUSIVITY] = mode.u[at, EFFUSIVITY]
+    dof = None if prior.dof is None else prior.dof[at]
+    again = fit_pairs(
+        gripper, data, row[at], Hypotheses(*(part[at] for part in hypotheses)), start=begin, noise=noise,
+        prior=Prior(prior.mean[at], prior.sd[at], dof), rivals=True, rough=rough,
+    )  # fmt: skip
+    better = again.log_evidence > mode.log_evidence[at]
+    for whole, part in zip(mode, again):
+        whole[at[better]] = part[better]
+    return mode
 
 
 def _trained(gripper: GripperModel, name: str, finish: str) -> tuple[float, ...]:

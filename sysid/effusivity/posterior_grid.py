@@ -35,7 +35,7 @@ from scipy.special import logsumexp
 
 from thermogrip.datasets.arrays import Array, Mask
 from thermogrip.datasets.materials import load_materials
-from thermogrip.sysid.effusivity.data import Touches, Whitened, taken
+from thermogrip.sysid.effusivity.data import Touches, Whitened, graded, taken
 from thermogrip.sysid.effusivity.gripper_model import GripperModel
 from thermogrip.sysid.effusivity.laplace_approximation import (
     BUILD_UP,
@@ -50,9 +50,11 @@ from thermogrip.sysid.effusivity.laplace_approximation import (
     at_temperature,
     doubted,
     fit_pairs,
+    fit_rivals,
     free_hypotheses,
     joined_modes,
     nodes_for,
+    over_grades,
     pairs_asked,
     prior_of,
     second_modes,
@@ -189,6 +191,7 @@ def _log_student(x: Array, mean: Array | float, sd: Array | float, dof: float = 
 
 
 N_COARSE = 26
+_LEAST_GRADE = 1e-4  # probability of a grade that has a part in a posterior
 REFINEMENTS = ((12.0, 12), (7.0, 14))  # nats below the best point that each covers, and its points
 _KNOTS, _REACH = 7, 8.0  # points to integrate at, and how far below the best they go [nat]
 _TOGETHER = 4  # grasps whose integrals are computed at once
@@ -222,6 +225,21 @@ class _Fitted(NamedTuple):
 
 def grid_posteriors(gripper: GripperModel, data: Touches) -> list[GridPosterior]:
     """Return the posteriors of ln e: log-uniform prior over :data:`LN_E_RANGE`, h_c unknown."""
+    n, n_grade = data.level.size, len(gripper.grades)
+    each = _posteriors(gripper, graded(data, gripper.grades))
+    if n_grade == 1:
+        return each
+    evidence = np.array([one.log_evidence for one in each]).reshape(n, n_grade)
+    weight = over_grades(gripper, evidence)
+    likely = weight > logsumexp(weight, axis=1, keepdims=True) + np.log(_LEAST_GRADE)
+    return [
+        mixed([each[i * n_grade + k] for k in np.flatnonzero(likely[i])], weight[i, likely[i]])
+        for i in range(n)
+    ]
+
+
+def _posteriors(gripper: GripperModel, data: Touches) -> list[GridPosterior]:
+    """Return :func:`grid_posteriors` under the grade that each of the touches has."""
     noise = whitened(gripper, data)
     found = _fitted(gripper, data, noise)
     value = found.value + _left_out(gripper, data, noise, found)
@@ -235,10 +253,20 @@ def free_evidence(
     gripper: GripperModel, data: Touches, near: Array | None = None, *, noise: Whitened | None = None
 ) -> Array:
     """Return the log evidence of a free effusivity for each touch, (n,), as :func:`grid_posteriors` do;
-    ``noise`` is :func:`whitened` where a caller has it.
+    ``noise`` is :func:`whitened` of the graded touches where a caller has it.
 
     Where the modes ``near`` (n, 7) of a likely candidate are given and the object's temperature is stated,
     the density is looked for from there (:func:`_evidence_near`)."""
+    n_grade = len(gripper.grades)
+    near = None if near is None else np.repeat(near, n_grade, axis=0)
+    each = _free_evidence(gripper, graded(data, gripper.grades), near, noise)
+    return np.asarray(logsumexp(over_grades(gripper, each.reshape(-1, n_grade)), axis=1))
+
+
+def _free_evidence(
+    gripper: GripperModel, data: Touches, near: Array | None, noise: Whitened | None
+) -> Array:
+    """Return :func:`free_evidence` under the grade that each of the touches has."""
     out, noise = np.full(data.level.size, np.nan), whitened(gripper, data) if noise is None else noise
     by_one = gripper.second is None or data.second is None
     if near is not None and by_one and gripper.discrepancy is None and not gripper.uncertain:
@@ -583,8 +611,8 @@ def _evaluate(
     each = data.known(row)
     prior = prior_of(gripper, each, hypotheses)
     begin = None if start is None else start.reshape(n * m, -1)
-    plain = fit_pairs(
-        gripper, data, row, hypotheses, start=begin, noise=noise, prior=prior, rivals=True, rough=rough
+    plain = fit_rivals(
+        gripper, data, row, hypotheses, start=begin, noise=noise, prior=prior, rough=rough
     )
     mode = doubted(gripper, each, prior, plain)
     found: list[Any] = [mode.log_evidence, mode.u, mode.covariance, mode.converged, plain.u]

@@ -209,4 +209,5 @@ def _coming(level: Array, room: float, end: float, dt: float) -> Touches:
         sample_bin=np.broadcast_to(bins, (n, bins.size)).copy(), y=np.zeros((n, at.size)), t=each(at),
         count=each(count), ramp=each(np.maximum(at - PUMP_OFF, 0.0)), level=level, t_object=unknown,
         t_object_sd=unknown, t_ambient=np.full(n, room), excursion=np.zeros(n),
+        share=np.zeros(n), unlike=np.zeros(n),
     )  # fmt: skip

@@ -369,7 +369,7 @@ def test_a_record_ends_when_its_stream_did_also_where_the_contact_is_late(
         assert row["decided_at_s"] == (touch.decided_at or 10.0)
         np.testing.assert_allclose([row[f"p_{name}"] for name in THREE], decided or p, atol=1e-3)
         batch = np.exp(known.certain().candidate_log_proba(pick(some, [i]), THREE)[0])
-        np.testing.assert_allclose(p, batch, atol=1e-4)
+        np.testing.assert_allclose(p, batch, atol=1e-3)
         np.testing.assert_allclose(list(touch.result().values()), batch, atol=1e-12)
 
 
@@ -386,7 +386,7 @@ def test_a_contact_without_a_reading_yet_is_waited_for(known: PosteriorClassifie
     np.testing.assert_allclose(np.exp(seen.log_p[1, 0]), 1 / 3)
     assert seen.gain[1, 0] == np.inf
     whole = growing_windows(known, some, candidates=THREE, times=(0.5, 1.5))
-    np.testing.assert_allclose(np.exp(seen.log_p[0]), np.exp(whole.log_p[0]), atol=1e-6)
+    np.testing.assert_allclose(np.exp(seen.log_p[0]), np.exp(whole.log_p[0]), atol=1e-5)
     assert classify_grasps(known, lost, THREE, rule=rule)[1]["decided_at_s"] == 1.5
 
 

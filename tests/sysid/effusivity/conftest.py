@@ -6,6 +6,8 @@ import pytest
 
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.schema import Grasps
+from thermogrip.sysid.effusivity import gripper_model
+from thermogrip.sysid.effusivity.data import Grade
 from thermogrip.sysid.effusivity.gripper_model import GripperModel, load_default_gripper
 
 
@@ -17,3 +19,9 @@ def device() -> GripperModel:
 @pytest.fixture(scope="session")
 def files() -> dict[str, Grasps]:
     return load_example_grasps()
+
+
+@pytest.fixture
+def one_grade(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every grasp is like those of the training: answers are those of one model."""
+    monkeypatch.setattr(gripper_model, "GRADES", (Grade(0.0, 0.0, 1.0),))

@@ -240,6 +240,7 @@ def exact(device):
     return replace(device, blocks={k: replace(b, ln_h_sd=0.0) for k, b in device.blocks.items()})
 
 
+@pytest.mark.usefixtures("one_grade")
 def test_an_uncertain_gripper_without_spread_changes_nothing(exact, touched):
     same = another_gripper(exact, NOTHING)
     assert same.uncertain
@@ -262,6 +263,7 @@ def test_degrees_of_freedom_of_a_number_that_has_no_spread_are_none(exact, touch
 
 
 @pytest.mark.parametrize("name", ["lag", "sheet_thickness", "contact", "bias", "build_up"])
+@pytest.mark.usefixtures("one_grade")
 def test_evidence_is_the_integral_over_the_grippers(exact, touched, name):
     """Beside sums over exact grippers on a fine grid of the one number that is uncertain."""
     spread = replace(NOTHING, **{name: 0.3})
@@ -333,6 +335,7 @@ def test_theta_moves_the_prior_means_as_another_device_would(device, touched):
         np.testing.assert_allclose(slopes[:, i], (there - here) / step, atol=1e-9, err_msg=name)
 
 
+@pytest.mark.usefixtures("one_grade")
 def test_an_uncertain_bias_is_a_wider_spread_of_the_object(device, exact, touched):
     """Both are normal and enter alike, so that the answers are the same, temperature and all."""
     found = material_fit(
@@ -663,6 +666,7 @@ def test_points_of_a_free_effusivity_far_behind_are_not_searched(device, touched
 
 
 @pytest.mark.parametrize("off", [0.0, 0.7, 2.5])
+@pytest.mark.usefixtures("one_grade")
 def test_a_stated_temperature_may_be_a_slip(device, off):
     """One in twenty is three times as far off: the mixture of the answers under each, put together again."""
     grasp = load_example_grasps()["exp2_dT20"].isel(grasp=[2])
@@ -687,6 +691,7 @@ def test_a_stated_temperature_may_be_a_slip(device, off):
     assert share[1, 0] > 0.9 if off == 2.5 else share[1, 0] < 0.2
 
 
+@pytest.mark.usefixtures("one_grade")
 def test_a_temperature_that_nobody_stated_is_no_slip(device):
     grasp = load_example_grasps()["exp2_dT20"].isel(grasp=[2])
     data = touches(grasp.assign(t_object=("grasp", [np.nan])))

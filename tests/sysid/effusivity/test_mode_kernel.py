@@ -124,6 +124,7 @@ def test_a_delayed_integral_goes_by_straight_lines_between_the_points_that_count
     assert not means_of(*given)[2].any()
 
 
+@pytest.mark.usefixtures("one_grade")
 def test_a_candidate_far_behind_is_left_and_changes_no_other():
     gripper, record = load_default_gripper(), load_example_grasps()["exp1A_obj43_grip23"]
     data = touches(record.isel(grasp=np.flatnonzero(record["material"].values == "copper")[:3]))

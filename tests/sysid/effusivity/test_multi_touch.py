@@ -88,6 +88,7 @@ def test_a_temperature_far_from_the_skin_is_known_less_well(device, record, monk
     assert near.log_evidence.tolist() == wide.log_evidence.tolist()
 
 
+@pytest.mark.usefixtures("one_grade")
 @pytest.mark.parametrize("sensors", [1, 2])
 def test_one_touch_alone_is_the_single_fit(device, record, sensors):
     """With the scatter of single grasps, known well, a group of one says what the engine says of a grasp."""

@@ -180,6 +180,7 @@ def test_two_sensors_are_integrated_over_every_temperature_of_their_object(finge
     assert np.ptp(got - want) < 0.25 * np.ptp(want - mode.log_evidence)
 
 
+@pytest.mark.usefixtures("one_grade")
 def test_a_spoiled_record_is_answered_as_by_laplaces_method(device):
     """A sensor that runs away: no effusivity fits, no mode settles, and nothing breaks."""
     record = load_example_grasps()["exp3C_obj18_grip38"].isel(grasp=[0])
@@ -292,6 +293,7 @@ def test_half_of_all_objects_are_near_a_material_of_the_table():
 
 
 @pytest.mark.parametrize("material", ["copper", "iron", "wood"])
+@pytest.mark.usefixtures("one_grade")
 def test_a_density_that_is_looked_for_from_a_candidate_has_the_integral_of_many_points(
     device, monkeypatch, material
 ):

@@ -55,6 +55,7 @@ def test_what_comes_later_is_not_looked_at(device, drawn):
     np.testing.assert_array_equal(a.mean, b.mean)
 
 
+@pytest.mark.usefixtures("one_grade")
 def test_a_look_from_an_earlier_one_ends_in_the_same_place(device, drawn):
     few = drawn.isel(grasp=[0, 13, 25])
     early = rest_of_contact(device, few, NAMES, until=1.0)
