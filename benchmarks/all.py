@@ -71,6 +71,7 @@ ALL = [
     Benchmark("classify/block_loss.py"),
     Benchmark("classify/own_bound.py", quick="--repeats 4"),
     Benchmark("classify/truth.py", quick="--repeats 1"),
+    Benchmark("classify/disturbed_grasps.py", quick="--parts rig --each 1"),
     Benchmark("classify/unlike_training.py", quick="--parts stop --sets 2"),
     Benchmark("classify/grippers.py", quick="--grippers 1"),
     Benchmark("classify/transfer.py", quick="--sets 1 --test 3 --classifiers posterior,pca-lda"),

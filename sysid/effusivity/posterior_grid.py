@@ -555,10 +555,11 @@ def mixed(parts: Sequence[GridPosterior], log_weight: Array) -> GridPosterior:
     def joined(arrays: Iterable[Array]) -> Array:
         return np.concatenate([s * array for s, array in zip(share, arrays)])
 
-    return GridPosterior(
-        np.concatenate([p.x for p in parts]), joined(p.mass for p in parts), total,
-        joined(p.weight for p in parts), *(np.concatenate(rest) for rest in zip(*(p[4:] for p in parts))),
-    )  # fmt: skip
+    x = np.concatenate([p.x for p in parts])
+    order = np.argsort(x, kind="stable")
+    t_object, sd, ln_h, x_sd = (np.concatenate(rest) for rest in zip(*(p[4:] for p in parts)))
+    mass, weight = joined(p.mass for p in parts), joined(p.weight for p in parts)
+    return GridPosterior(x[order], mass[order], total, weight, t_object, sd, ln_h, x_sd[order])
 
 
 def mixture_quantiles(weight: Array, mean: Array, sd: Array, levels: tuple[float, ...]) -> Array:

@@ -95,6 +95,7 @@ def sampled_integrals(device, data, x, mode, *, n=6000, seed=0):
     return np.array(out) - 0.5 * target.log_det - 2 * np.log(2 * np.pi)
 
 
+@pytest.mark.usefixtures("one_grade")
 def test_the_sum_is_what_importance_sampling_finds(device, iron):
     posterior = grid_posteriors(device, iron)[0]
     x = np.interp([0.02, 0.3, 0.7, 0.98], np.cumsum(posterior.mass), posterior.x)
@@ -107,6 +108,7 @@ def test_the_sum_is_what_importance_sampling_finds(device, iron):
     assert np.ptp(want - mode.log_evidence) > 0.08
 
 
+@pytest.mark.usefixtures("one_grade")
 def test_quantiles_are_those_of_the_summed_density(device, iron):
     posterior = grid_posteriors(device, iron)[0]
     below = np.cumsum(posterior.mass) - 0.5 * posterior.mass
