@@ -1,7 +1,7 @@
 """Simulation-based calibration of emcee on a small network: are the ranks of truths among samples uniform?
 
     python benchmarks/coverage/ranks.py run --count 100
-    python benchmarks/coverage/ranks.py figure docs/explanation/ranks.svg
+    python benchmarks/coverage/ranks.py figure ranks.svg
 
 A heated block with a lagging sensor; three parameters, all sampled, drawn from their prior; three logs of 15
 minutes, simulated exactly here (no code shared with the fit), with an AR(1) error of 40 s, white noise and a
