@@ -46,7 +46,7 @@ STEPS = ((28.0, 18.0), (18.0, 43.0))  # where controllers differ: from 28 to 38 
 DRAW = 3  # the twin's plant, a draw of the posterior
 T_OBJECT, T_GRIPPER = 18.0, 38.0  # degC
 CANDIDATES = ("copper", "iron", "wood")  # as in the condition at these temperatures
-TOUCHED = ("copper", "iron", "wood", "copper", "glass")  # by the twin; glass is none of the candidates
+TOUCHED = ("copper", "wood", "copper", "wood", "glass")  # by the twin; glass is none of the candidates
 COMPARED = ("exp1A_obj43_grip23", "exp2_dT10", "exp2_dT20", "exp3A_obj43_grip23", "exp3B_obj28_grip48")
 CLASSIFIERS = ("posterior", "bayes", "lstm")
 
