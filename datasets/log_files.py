@@ -34,7 +34,7 @@ from thermogrip.datasets.file_names import file_format, file_stem, split_cut
 from thermogrip.datasets.limits import MOST_NUMBER, check_size, check_source
 from thermogrip.datasets.media import csv_cell
 from thermogrip.datasets.netcdf import convention_unit, open_netcdf, write_netcdf
-from thermogrip.datasets.roles import assign_roles, guess_role
+from thermogrip.datasets.roles import Roles, assign_roles, guess_role
 from thermogrip.datasets.rosbag import bag_parts, read_rosbag_table
 from thermogrip.datasets.schema import check_log, hash_columns, make_log
 from thermogrip.datasets.tables import (
@@ -60,6 +60,7 @@ Floats = NDArray[np.float64]
 Logs: TypeAlias = "Log | DataFrame | str | Path | Sequence[Log | DataFrame | str | Path]"
 
 MOST_SIGNALS = 40  # of a table with a reading of one of them in a row
+LOST_SHARE = 0.25  # of an output: one of the four blocks of a log that are held out would have no reading
 MOST_STATES = 12  # words of a column that may be the states of a program
 
 
@@ -156,6 +157,8 @@ def read_log(
     else:
         time, data, found = _repair(time, data, units, roles.of, table)
         repairs += found
+        if outputs is None:
+            roles = _without_half_lost(roles, time, data)
     variables = {name: (data[name], units[name], roles.of[name]) for name in data}
     log = make_log(time, variables, name=str(file), repairs=repairs)  # a fault found here names the file
     log.attrs["name"] = file_stem(file)
@@ -431,6 +434,21 @@ def _repair(
     time, columns, found = _drop_unknown_start(time, columns, roles, table.file)
     repairs += found + repair.describe_gaps(time, {n: v for n, v in columns.items() if roles[n] == "input"})
     return time, columns, repairs
+
+
+def _without_half_lost(roles: Roles, time: Floats, columns: Mapping[str, Floats]) -> Roles:
+    """Return roles without the outputs that miss a long part of what others have, which a fit would lose."""
+    lost = {n: float(np.isnan(v).mean()) for n, v in columns.items() if roles.of[n] == "output"}
+    whole = next((n for n, share in lost.items() if share < LOST_SHARE / 5), None)
+    out = [n for n, share in lost.items() if share > LOST_SHARE and whole is not None]
+    reasons = {n: f"it has no reading in {100 * lost[n]:.0f} % of the rows, {whole} has" for n in out}
+    doubts = []
+    for name, why in reasons.items():
+        seen = time[np.isfinite(columns[name])]
+        part = f"LOG@{seen[0]:.6g}:{seen[-1]:.6g}"
+        doubts.append(f"{name} is left out: {why}; to fit it too, cut the log to where it reads: {part}")
+    roles_left = roles.of | dict.fromkeys(out, "other")
+    return Roles(roles_left, roles.reasons | reasons, (*roles.doubts, *doubts))
 
 
 def _repair_column(

@@ -18,6 +18,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.io import savemat
+from scipy.signal import lfilter
 
 from thermogrip.datasets import tables
 from thermogrip.datasets.errors import UserError
@@ -904,3 +905,17 @@ def test_a_log_knows_its_date_where_its_clock_does(tmp_path, rows, began):
     assert log.attrs.get("began") == began
     assert log["time"].values[1] - log["time"].values[0] == pytest.approx(2.0)
     assert read_log(write_log(log, tmp_path / "log.nc")).attrs.get("began") == began
+
+
+def test_an_output_without_a_long_part_of_the_readings_is_left_out_beside_a_whole_one(tmp_path):
+    heater, noise = np.repeat([0, 60] * 15, 20), np.random.default_rng(0).standard_normal((2, 600))
+    near, far = (20 + lfilter([1 - a], [1, -a], np.r_[0, heater[:-1]]) for a in (0.9, 0.95))
+    near, far = near + 0.05 * noise[0], far + 0.05 * noise[1]
+    rows = [f"{k},{heater[k]},{near[k] if k < 400 else ''},{far[k]}\n" for k in range(600)]
+    (tmp_path / "half.csv").write_text("time_s,heater,near_degC,far_degC\n" + "".join(rows))
+    log = read_log(tmp_path / "half.csv")
+    assert (log["near"].attrs["role"], log["far"].attrs["role"]) == ("other", "output")
+    assert "near is left out: it has no reading in 33 % of the rows, far has" in log.attrs["role_doubts"]
+    assert "LOG@0:399" in log.attrs["role_doubts"]
+    stated = read_log(tmp_path / "half.csv", outputs=["near", "far"])
+    assert stated["near"].attrs["role"] == "output"
