@@ -1,26 +1,7 @@
 """Records and tables in NetCDF-4 files, through h5netcdf.
 
-NetCDF has the unit of each variable as an attribute, so the names need no suffix. HDF5 stores arrays and
-text; opening a file runs no code. Files are written by the CF conventions, so that xarray, Panoply, ncview
-and their like show them as they are meant; those of others, and older ones, need not be.
-
-What CF 1.11 [1]_ asks of a file, and how a record gives it:
-
-- ``Conventions`` and ``title`` stand in its attributes.
-- Units are UDUNITS [2]_.  It knows ``degC``, ``percent``, ``s``; what is counted from 0 to 255 has the unit
-  1/255, as a number.  A temperature says in ``units_metadata`` whether it is one or a difference of two.
-- A coordinate variable is numeric, increases, and misses nothing.  The names of grasps are text: they are an
-  auxiliary coordinate, ``grasp_id(grasp)``, which the data name in ``coordinates``.
-- What is an index into words (the phase of a session) has ``flag_values`` of its own type beside
-  ``flag_meanings``.
-- Every number has a ``long_name``.  None has a ``standard_name``: there is none for a skin that touches
-  something, and that of ``time`` needs a date to count from, which a log does not have.
-
-References
-----------
-.. [1] https://cfconventions.org/Data/cf-conventions/cf-conventions-1.11/cf-conventions.html, sections 2.2 to
-       2.6, 3.1, 3.5 and 6.1.
-.. [2] https://docs.unidata.ucar.edu/udunits/current/
+NetCDF has the unit of each variable as an attribute, so the names need no suffix.  HDF5 stores arrays and
+text; opening a file runs no code.  Files of other programs may name units by the CF conventions.
 """
 
 from __future__ import annotations
@@ -42,21 +23,7 @@ from thermogrip.datasets.units import UNITS, to_record_unit
 if TYPE_CHECKING:
     import xarray as xr
 
-CONVENTIONS = "CF-1.11"
-UNIT_OF_BYTE = repr(1 / 255)
-
-_ADDED = ("Conventions", "title", "source")
-_LONG_NAMES = {
-    "t_surface": "temperature of the skin",
-    "t_surface_2": "temperature of the skin, second sensor",
-    "t_object": "temperature of the object before contact",
-    "t_object_sd": "standard deviation of the temperature of the object",
-    "t_gripper": "temperature of the skin before contact",
-    "t_ambient": "temperature of the room",
-    "repeat": "count of repeats",
-    "touch": "count of touches of one block",
-    "rest": "time since the touch before",
-}
+_ADDED = ("Conventions", "title", "source")  # to files of versions up to 0.2
 _MOST_MEMBERS = 4096  # of a file
 _PART = 16 << 20  # bytes of text that are looked at in one piece
 
@@ -66,7 +33,7 @@ _ALIASES = {
     "degree_C": "degC", "degrees_C": "degC", "kelvin": "K", "Kelvin": "K", "degK": "K", "°F": "degF",
     "fahrenheit": "degF", "Fahrenheit": "degF", "%": "percent", "volt": "V", "ampere": "A", "watt": "W",
     "second": "s", "seconds": "s", "sec": "s", "milliseconds": "ms", "minutes": "min", "minute": "min",
-    "": "1", UNIT_OF_BYTE: "0_255",
+    "": "1", repr(1 / 255): "0_255",
 }  # fmt: skip
 
 
@@ -94,7 +61,7 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
 
     options: dict[str, Any] = {"engine": "h5netcdf", "decode_times": False, "decode_timedelta": False}
     with _not_damaged(path), xr.open_dataset(path, **options) as data:
-        return from_cf(text_as_str(data.load()))
+        return _of_versions(_text_as_str(data.load()))
 
 
 def _not_damaged(path: str | Path) -> AbstractContextManager[None]:
@@ -147,8 +114,7 @@ def _in_memory(variable: Any) -> int:
 
 
 def write_netcdf(data: xr.Dataset, path: str | Path) -> Path:
-    """Write a record as NetCDF-4 by the CF conventions, in one step, and return the path."""
-    data = as_cf(data)
+    """Write a record as NetCDF-4 in one step, and return the path."""
     packed = {"zlib": True, "complevel": 4, "fletcher32": True, "_FillValue": np.nan}
     encoding: dict[Any, dict[str, Any]] = {
         name: packed
@@ -179,7 +145,7 @@ def convention_unit(unit: str, name: str, file: str) -> str:
     return known
 
 
-def text_as_str(data: xr.Dataset) -> xr.Dataset:
+def _text_as_str(data: xr.Dataset) -> xr.Dataset:
     """Turn the object arrays that variable-length text is read as into arrays of str."""
     for key, variable in data.variables.items():
         if variable.dtype.kind in "OS":
@@ -190,51 +156,11 @@ def text_as_str(data: xr.Dataset) -> xr.Dataset:
     return data
 
 
-def as_cf(data: xr.Dataset) -> xr.Dataset:
-    """Return a record as a file of it is to be."""
-    out = data.copy()
-    of_grasps = "grasp" in out.dims
-    if "grasp" in out.coords:
-        out = out.drop_vars("grasp").assign_coords(grasp_id=("grasp", data["grasp"].values))
-    out.attrs = {
-        "Conventions": CONVENTIONS,
-        "title": str(data.attrs.get("name", "record")),
-        "source": "thermogrip",
-    }
-    out.attrs |= data.attrs
-    for key in [*out.data_vars, "time"]:
-        if key in out.variables:
-            out[key] = _variable(str(key), out[key].variable, of_grasps)
-    return out
-
-
-def from_cf(data: xr.Dataset) -> xr.Dataset:
-    """Return the record that a file holds; without what :func:`as_cf` added."""
+def _of_versions(data: xr.Dataset) -> xr.Dataset:
+    """Return the record that a file holds; one of version 0.2 has the names of grasps elsewhere."""
     if "grasp_id" in data.variables and data["grasp_id"].dims == ("grasp",) and "grasp" not in data.variables:
         names = data["grasp_id"].values.astype(str)
         data = data.drop_vars("grasp_id").assign_coords(grasp=("grasp", names))
     if str(data.attrs.get("schema", "")).startswith("thermogrip."):
         data.attrs = {key: value for key, value in data.attrs.items() if key not in _ADDED}
     return data
-
-
-def _variable(name: str, variable: xr.Variable, of_grasps: bool) -> xr.Variable:
-    attrs: dict[Any, Any] = dict(variable.attrs)
-    values = variable.values
-    if values.dtype.kind not in "fiu":
-        return variable
-    if name == "time":
-        attrs["long_name"] = "time since the gripper closed" if of_grasps else "time of the log"
-    elif of_grasps:
-        attrs.setdefault("long_name", _LONG_NAMES.get(name, name))
-    else:
-        attrs.setdefault("long_name", f"{name} ({attrs.get('role', 'other')})")
-    if attrs.get("units") == "degC":
-        attrs["units_metadata"] = f"temperature: {'difference' if name.endswith('_sd') else 'on_scale'}"
-    if attrs.get("units") == "0_255":
-        attrs["units"] = UNIT_OF_BYTE
-    if "flag_meanings" in attrs:
-        if np.array_equal(values, values.astype(np.int8)):
-            values = values.astype(np.int8)
-        attrs["flag_values"] = np.arange(len(str(attrs["flag_meanings"]).split()), dtype=values.dtype)
-    return type(variable)(variable.dims, values, attrs)
