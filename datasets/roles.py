@@ -36,6 +36,7 @@ from numpy.typing import NDArray
 
 from thermogrip.datasets.errors import UserError
 from thermogrip.datasets.limits import MOST_NUMBER
+from thermogrip.datasets.repair import drop_stuck
 from thermogrip.datasets.units import DRIVE, find_column
 
 Floats = NDArray[np.float64]
@@ -359,10 +360,12 @@ def _unnamed_causes(
 
 
 def _is_moved(columns: Mapping[str, Floats], name: str, drives: Sequence[str]) -> bool:
-    """Tell whether the past of a drive helps to predict a column, row by row or in means over many rows."""
-    rows = columns[name][:_MOST_ROWS].size
-    for length in {1, max(1, rows // _MEANS)}:
-        means = [_means(values, length) for values in _scaled([columns[n] for n in (name, *drives)])]
+    """Tell whether the past of a drive helps to predict a column, row by row or in means over many rows, as
+    long as the column is not stuck."""
+    known = np.isfinite(drop_stuck(name, columns[name], [columns[n] for n in drives])[0])
+    some = [columns[n][known] for n in (name, *drives)]
+    for length in {1, max(1, some[0][:_MOST_ROWS].size // _MEANS)}:
+        means = [_means(values, length) for values in _scaled(some)]
         if any(_gain(means[0], drive, (), lags) > 0 for drive in means[1:] for lags in _LAGS):
             return True
     return False

@@ -81,8 +81,9 @@ def read_header(header: str, others: Sequence[str] = ()) -> tuple[str, str, floa
     (``zone_a``, ``zone_b``, ``zone_c``).  The name is empty where the header has none.
     """
     header = header.strip()
+    series = any(f"{header[:-1]}{letter}" in others for letter in "abdeABDE" if letter != header[-1:])
     for unit in UNITS:
-        if header.endswith(f"_{unit}"):
+        if header.endswith(f"_{unit}") and not (series and len(unit) == 1):
             return _plain(header.removesuffix(f"_{unit}")), unit, 1.0
     found = _UNIT_AT_END.fullmatch(header) if len(header) <= _LONGEST else None
     if found is None:
@@ -94,7 +95,6 @@ def read_header(header: str, others: Sequence[str] = ()) -> tuple[str, str, floa
     unit, scale = _any_unit(word)
     timed = unit in _TIMES and re.search(r"(?i:time|elapsed)|^t$", name) is None
     if inside is None and unit and len(word) == 1 and word != "%":
-        series = any(f"{header[:-1]}{letter}" in others for letter in "aAbBdDeE")
         lower = word.islower() and DRIVE.match(name.lower())
         unit = "" if series or lower or (found["mark"] or "").isspace() else unit
     if (inside is None and timed) or (word == "deg" and not re.match(r"(?i)t\d*(_|$)|.*temp", name)):

@@ -21,8 +21,8 @@ import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -36,26 +36,50 @@ from thermogrip.sysid.data.data_quality import check_data
 
 Series = NDArray[np.float64]
 Rng = np.random.Generator
+Columns = Mapping[str, Series | list[str]]
 
 CLOSED_LOOP = "closed loop|feedback"
-APART = "told apart|always move together|estimated separately"
-SAME_SIGNAL = "same signal|another unit|same readings"
 STATES_ROLES = "--inputs|--outputs|--disturbances|--columns"
 
 
 @dataclass(frozen=True)
 class Case:
-    """A file and its right answer; a column in `free` may have any role or none."""
+    """A log and its right answer: columns by role; those of `free` may have any role or none."""
 
-    text: str
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
     dt: float
-    disturbances: tuple[str, ...] = ()
-    free: tuple[str, ...] = ()
+    inputs: Columns
+    outputs: Columns
+    disturbances: Columns = field(default_factory=dict)
+    free: Columns = field(default_factory=dict)
+    time: tuple[str, Series | list[str]] | None = None  # header and cells; None: time_s
     says: tuple[str, ...] = ()  # regular expressions: all of them, for "right"
     asks: str = STATES_ROLES  # what a refusal has to name
+    separator: str = ","
+    decimal: str = "."
     suffix: str = ".csv"
+    text: str = ""  # where a program writes no table
+
+    def written(self, rng: Rng) -> str:
+        """Return the text of the file, its columns in random order, often with the clock not the first."""
+        if self.text:
+            return self.text
+        columns = {**self.inputs, **self.outputs, **self.disturbances, **self.free}
+        rows = len(next(iter(columns.values())))
+        header, cells = self.time or ("time_s", self.dt * np.arange(rows))
+        names = [str(name) for name in rng.permutation([*columns])]
+        if header:
+            names.insert(int(rng.integers(3)) if rng.random() < 0.3 else 0, header)
+            columns = {**columns, header: cells}
+        lines = zip(*(written(columns[name], self.decimal) for name in names), strict=True)
+        return "\n".join([self.separator.join(names), *map(self.separator.join, lines)]) + "\n"
+
+
+def written(values: Series | list[str], decimal: str) -> list[str]:
+    """Return the cells of a column as a logger would write them; NaN is an empty cell."""
+    if isinstance(values, list):
+        return values
+    cells = (f"{value:.10g}" for value in np.round(values, 4))
+    return ["" if cell == "nan" else cell.replace(".", decimal) for cell in cells]
 
 
 # ---- plants ----
@@ -63,9 +87,7 @@ class Case:
 
 def lag(drive: Series, dt: float, seconds: float, start: float = 0.0) -> Series:
     """Follow `drive`, held between rows, through one time constant."""
-    keep = np.exp(-dt / seconds)
-    out = np.empty(len(drive))
-    state = start
+    keep, state, out = np.exp(-dt / seconds), start, np.empty(len(drive))
     for row, value in enumerate(drive):
         out[row] = state
         state = keep * state + (1 - keep) * value
@@ -75,25 +97,22 @@ def lag(drive: Series, dt: float, seconds: float, start: float = 0.0) -> Series:
 def steps(rng: Rng, rows: int, levels: list[float], shortest: int, longest: int) -> Series:
     """Hold one of `levels` for a random number of rows, then another one."""
     out: list[float] = []
-    last = float("nan")
     while len(out) < rows:
-        level = float(rng.choice([one for one in levels if one != last]))
+        level = float(rng.choice([one for one in levels if one != (out or [None])[-1]]))
         out += [level] * int(rng.integers(shortest, longest + 1))
-        last = level
     return np.array(out[:rows])
 
 
 def weather(rng: Rng, rows: int, dt: float) -> Series:
     """Return a day outdoors: a slow swing and a random walk."""
-    period = rows * dt / rng.uniform(1.2, 2.5)
-    t = np.arange(rows) * dt
-    walk = np.cumsum(rng.normal(0, 0.02, rows))
-    return rng.uniform(4, 12) + rng.uniform(3, 6) * np.sin(2 * np.pi * t / period + rng.uniform(0, 6)) + walk
+    period, t = rows * dt / rng.uniform(1.2, 2.5), np.arange(rows) * dt
+    swing = rng.uniform(3, 6) * np.sin(2 * np.pi * t / period + rng.uniform(0, 6))
+    return np.asarray(rng.uniform(4, 12) + swing + np.cumsum(rng.normal(0, 0.02, rows)))
 
 
-def sensor(rng: Rng, truth: Series, noise: float, step: float) -> Series:
+def sensor(rng: Rng, truth: Series, noise: float = 0.05, step: float = 0.0625) -> Series:
     """Read with noise, in steps of the sensor."""
-    return np.round((truth + rng.normal(0, noise, len(truth))) / step) * step
+    return np.asarray(np.round((truth + rng.normal(0, noise, len(truth))) / step) * step)
 
 
 def block(rng: Rng, drive: Series, dt: float, ambient: float, gain: float, seconds: float) -> Series:
@@ -101,76 +120,29 @@ def block(rng: Rng, drive: Series, dt: float, ambient: float, gain: float, secon
     return ambient + lag(lag(gain * drive, dt, seconds), dt, seconds / rng.uniform(8, 15))
 
 
-@dataclass
-class Loop:
-    """A controlled body: temperature, drive and what the controller computes, row by row."""
-
-    temperature: Series
-    drive: Series
-    error: Series
-    integral: Series
+def heated(rng: Rng, rows: int, dt: float) -> tuple[Series, Series]:
+    """Return a drive of 0 to 255 and the temperature that it makes."""
+    u = steps(rng, rows, [0, 60, 120, 180, 255], 20, 90)
+    return u, sensor(rng, block(rng, u, dt, 23, 0.25, rng.uniform(50, 90) * dt))
 
 
-def under_pi(rng: Rng, target: Series, dt: float, ambient: float, gain: float, seconds: float) -> Loop:
-    """Simulate a PI controller of 0 to 100 on a body of two time constants."""
-    rows = len(target)
-    temperature, drive, error, integral = (np.zeros(rows) for _ in range(4))
-    body = skin = ambient
-    total = 0.0
-    for row in range(rows):
-        temperature[row] = np.round((skin + rng.normal(0, 0.05)) / 0.0625) * 0.0625
-        error[row] = target[row] - temperature[row]
-        total += error[row] * dt * 4 / gain / seconds
-        total = float(np.clip(total, 0, 100))
+def controlled(
+    rng: Rng, target: Series, dt: float, gain: float, seconds: float, *, relay: bool = False
+) -> tuple[Series, Series, Series]:
+    """Return reading, drive and integral of a PI controller of 0 to 100 %, or of a relay, on two lags."""
+    read, drive, integral = (np.zeros(len(target)) for _ in range(3))
+    body = skin = 20.0
+    on, total = 0.0, 0.0
+    for row in range(len(target)):
+        read[row] = np.round((skin + rng.normal(0, 0.04)) / 0.0625) * 0.0625
+        error = target[row] - read[row]
+        on = 1.0 if error > 0.4 else 0.0 if error < -0.4 else on
+        total = float(np.clip(total + error * dt * 4 / gain / seconds, 0, 100))
         integral[row] = total
-        drive[row] = np.round(np.clip(6 / gain * error[row] + total, 0, 100), 1)
-        body += dt / seconds * (ambient + gain * drive[row] - body)
+        drive[row] = on if relay else np.round(np.clip(6 / gain * error + total, 0, 100), 1)
+        body += dt / seconds * (20 + gain * drive[row] - body)
         skin += dt / (seconds / 12) * (body - skin)
-    return Loop(temperature, drive, error, integral)
-
-
-def thermostat(rng: Rng, target: Series, dt: float, ambient: float, gain: float, seconds: float) -> Loop:
-    """Simulate a relay with hysteresis of 0.4 degC."""
-    rows = len(target)
-    temperature, drive = np.zeros(rows), np.zeros(rows)
-    body = skin = ambient
-    on = 0.0
-    for row in range(rows):
-        temperature[row] = np.round((skin + rng.normal(0, 0.03)) / 0.0625) * 0.0625
-        if temperature[row] < target[row] - 0.4:
-            on = 1.0
-        elif temperature[row] > target[row] + 0.4:
-            on = 0.0
-        drive[row] = on
-        body += dt / seconds * (ambient + gain * on - body)
-        skin += dt / (seconds / 15) * (body - skin)
-    return Loop(temperature, drive, target - temperature, drive)
-
-
-# ---- files ----
-
-
-def number(value: float, digits: int, decimal: str = ".") -> str:
-    """Write a number as a logger would; NaN is an empty cell."""
-    return "" if np.isnan(value) else f"{value:.{digits}f}".replace(".", decimal)
-
-
-def table(
-    rng: Rng,
-    columns: dict[str, tuple[Series | list[str], int]],
-    *,
-    separator: str = ",",
-    decimal: str = ".",
-    first: int = 1,
-) -> str:
-    """Write columns of (values, digits) as text; all but the `first` ones in random order."""
-    names = list(columns)
-    order = names[:first] + [names[first + k] for k in rng.permutation(len(names) - first)]
-    cells = [
-        values if isinstance(values, list) else [number(float(value), digits, decimal) for value in values]
-        for values, digits in (columns[name] for name in order)
-    ]
-    return "\n".join([separator.join(order), *map(separator.join, zip(*cells, strict=True))]) + "\n"
+    return read, drive, integral
 
 
 def pick(rng: Rng, *names: str) -> str:
@@ -184,9 +156,9 @@ def stamps(rng: Rng, rows: int, dt: float, form: str = "%Y-%m-%d %H:%M:%S") -> l
     return [(start + timedelta(seconds=row * dt)).strftime(form) for row in range(rows)]
 
 
-def clock(rows: int, dt: float, rng: Rng, jitter: float = 0.0, start: float = 0.0) -> Series:
+def clock(rng: Rng, rows: int, dt: float, jitter: float = 0.0, start: float = 0.0) -> Series:
     """Return seconds with jitter, strictly rising."""
-    return start + dt * np.arange(rows) + rng.uniform(0, jitter, rows) * dt
+    return np.asarray(start + dt * np.arange(rows) + rng.uniform(0, jitter, rows) * dt)
 
 
 # ---- inputs that are nearly alike ----
@@ -196,38 +168,25 @@ def two_relays(rng: Rng) -> Case:
     """Two relays that know nothing of each other, two temperatures."""
     dt, rows = float(rng.choice([5, 10, 30])), 1400
     a, b = steps(rng, rows, [0, 1], 15, 70), steps(rng, rows, [0, 1], 15, 70)
-    one = 20 + lag(14 * a + 3 * b, dt, 40 * dt)
-    two = 20 + lag(4 * a - 9 * b, dt, 70 * dt)
+    kettle = sensor(rng, 20 + lag(14 * a + 3 * b, dt, 40 * dt))
+    pipe = sensor(rng, 20 + lag(4 * a - 9 * b, dt, 70 * dt))
     first, second = (
         pick(rng, "pump", "relais1", "SSR_A", "heater"),
         pick(rng, "fan", "relais2", "SSR_B", "chiller"),
     )
-    columns = {
-        "time_s": (clock(rows, dt, rng), 0),
-        first: (a, 0),
-        second: (b, 0),
-        "kettle_degC": (sensor(rng, one, 0.05, 0.0625), 4),
-        "pipe_degC": (sensor(rng, two, 0.05, 0.0625), 4),
-    }
-    return Case(table(rng, columns), (first, second), ("kettle", "pipe"), dt)
+    return Case(dt, {first: a, second: b}, {"kettle_degC": kettle, "pipe_degC": pipe})
 
 
 def three_relays(rng: Rng) -> Case:
     """Three relays as words, one temperature each, stamps of local time."""
     dt, rows = float(rng.choice([10, 60])), 1500
-    relays = [steps(rng, rows, [0, 1], 12, 60) for _ in range(3)]
-    mixed = [[12, 2, 1], [2, 9, 2], [1, 3, 15]]
-    columns: dict[str, tuple[Series | list[str], int]] = {"time": (stamps(rng, rows, dt), 0)}
+    relays = np.array([steps(rng, rows, [0, 1], 12, 60) for _ in range(3)])
     words = [("off", "on"), ("OFF", "ON"), ("false", "true")][int(rng.integers(3))]
-    for k, relay in enumerate(relays):
-        columns[f"zone{k + 1}_valve"] = ([words[int(value)] for value in relay], 0)
-        drive = sum(gain * other for gain, other in zip(mixed[k], relays, strict=True))
-        truth = 18 + lag(np.asarray(drive), dt, (30 + 15 * k) * dt)
-        columns[f"zone{k + 1}_temperature"] = (sensor(rng, truth, 0.04, 0.1), 1)
-    names = [f"zone{k}" for k in (1, 2, 3)]
-    return Case(
-        table(rng, columns), tuple(f"{n}_valve" for n in names), tuple(f"{n}_temperature" for n in names), dt
-    )
+    mixed = np.array([[12, 2, 1], [2, 9, 2], [1, 3, 15]]) @ relays
+    valves = {f"zone{k + 1}_valve": [words[int(value)] for value in relays[k]] for k in range(3)}
+    truths = [18 + lag(mixed[k], dt, (30 + 15 * k) * dt) for k in range(3)]
+    zones = {f"zone{k + 1}_temperature": sensor(rng, truths[k], 0.04, 0.1) for k in range(3)}
+    return Case(dt, valves, zones, time=("time", stamps(rng, rows, dt)))
 
 
 def relay_and_duty(rng: Rng) -> Case:
@@ -235,32 +194,15 @@ def relay_and_duty(rng: Rng) -> Case:
     dt, rows = float(rng.choice([1, 2])), 1500
     relay, duty = steps(rng, rows, [0, 1], 20, 90), steps(rng, rows, [0, 255], 20, 90)
     truth = 22 + lag(lag(10 * relay + 0.12 * duty, dt, 60 * dt), dt, 5 * dt)
-    a, b, y = (
-        pick(rng, "valve", "solenoid"),
-        pick(rng, "pwm", "heater_pwm"),
-        pick(rng, "probe_degC", "oven_degC"),
-    )
-    columns = {
-        "t_s": (clock(rows, dt, rng), 1),
-        a: (relay, 0),
-        b: (duty, 0),
-        y: (sensor(rng, truth, 0.05, 0.05), 2),
-    }
-    return Case(table(rng, columns), (a, b), (y,), dt)
+    drives = {pick(rng, "valve", "solenoid"): relay, pick(rng, "pwm", "heater_pwm"): duty}
+    return Case(dt, drives, {pick(rng, "probe_degC", "oven_degC"): sensor(rng, truth, 0.05, 0.05)})
 
 
 def elements_together(rng: Rng) -> Case:
     """Two elements that are always driven alike: their effects cannot be told apart."""
-    dt, rows = 1.0, 1500
-    u = steps(rng, rows, [0, 20, 50, 80, 100], 20, 110)
-    truth = 24 + lag(0.5 * u, dt, 80) + lag(0.3 * u, dt, 190)
-    columns = {
-        "seconds": (clock(rows, dt, rng), 0),
-        "element_left": (u, 0),
-        "element_right": (u, 0),
-        "oven_degC": (sensor(rng, truth, 0.1, 0.25), 2),
-    }
-    return Case(table(rng, columns), ("element_left", "element_right"), ("oven",), dt, says=(APART,))
+    u = steps(rng, 1500, [0, 20, 50, 80, 100], 20, 110)
+    oven = sensor(rng, 24 + lag(0.5 * u, 1, 80) + lag(0.3 * u, 1, 190), 0.1, 0.25)
+    return Case(1, {"element_left": u, "element_right": u}, {"oven_degC": oven}, says=("told apart",))
 
 
 def heater_and_cooler(rng: Rng) -> Case:
@@ -268,54 +210,38 @@ def heater_and_cooler(rng: Rng) -> Case:
     dt, rows = 30.0, 2200
     target = steps(rng, rows, [10, 13, 16, 19, 21], 200, 420)
     beer, fridge, heat, cool = 16.0, 16.0, 0.0, 0.0
-    logged = np.zeros((rows, 4))
+    seen = np.zeros((4, rows))
     for row in range(rows):
-        seen = round((beer + rng.normal(0, 0.02)) / 0.0625) * 0.0625
+        read = round((beer + rng.normal(0, 0.02)) / 0.0625) * 0.0625
         air = round((fridge + rng.normal(0, 0.04)) / 0.0625) * 0.0625
-        wanted = target[row] + 3 * (target[row] - seen)
-        heat = float(air < wanted - (0.2 if heat else 0.8))
-        cool = float(not heat and air > wanted + (0.2 if cool else 0.8))
-        logged[row] = seen, air, heat, cool
+        goal = target[row] + 3 * (target[row] - read)
+        heat = float(air < goal - (0.2 if heat else 0.8))
+        cool = float(not heat and air > goal + (0.2 if cool else 0.8))
+        seen[:, row] = heat, cool, read, air
         fridge += dt * ((19 - fridge) / 5000 + (beer - fridge) / 2200 + 0.006 * heat - 0.011 * cool)
         beer += dt * (fridge - beer) / 6000
-    columns = {
-        "Time": (stamps(rng, rows, dt), 0),
-        "Beer Temp": (logged[:, 0], 2),
-        "Beer Set": (target, 1),
-        "Fridge Temp": (logged[:, 1], 2),
-        "Heat": (logged[:, 2], 0),
-        "Cool": (logged[:, 3], 0),
-    }
     return Case(
-        table(rng, columns),
-        ("Heat", "Cool"),
-        ("Beer Temp", "Fridge Temp"),
         dt,
-        free=("Beer Set",),
+        {"Heat": seen[0], "Cool": seen[1]},
+        {"Beer Temp": seen[2], "Fridge Temp": seen[3]},
+        free={"Beer Set": target},
+        time=("Time", stamps(rng, rows, dt)),
         says=(CLOSED_LOOP, "Beer.?Set"),
     )
 
 
 def states_in_words(rng: Rng) -> Case:
-    """A fermenter whose drive is a word of three: one input for each of the two."""
+    """A fermenter whose drive is a word of three: one input for each of the two that act."""
     dt, rows = 60.0, 1600
     state = steps(rng, rows, [-1, 0, 1], 10, 50)
-    truth = 18 + lag(np.where(state > 0, 9.0, np.where(state < 0, -12.0, 0.0)), dt, 45 * dt)
-    words = {-1.0: "COOLING", 0.0: "IDLE", 1.0: "HEATING"}
-    columns = {
-        "timestamp": (stamps(rng, rows, dt), 0),
-        "state": ([words[float(value)] for value in state], 0),
-        "beer_temp": (sensor(rng, truth, 0.03, 0.0625), 2),
-        "room_temp": (sensor(rng, 18 + lag(rng.normal(0, 12, rows), dt, 60 * dt), 0.03, 0.0625), 2),
-    }
-    return Case(
-        table(rng, columns),
-        ("state_HEATING", "state_COOLING"),
-        ("beer_temp",),
-        dt,
-        free=("room_temp",),
-        asks=r"state\b.*(word|text|number)",
-    )
+    beer = sensor(rng, 18 + lag(np.where(state > 0, 9.0, 12 * state), dt, 45 * dt), 0.03)
+    room = sensor(rng, 18 + lag(rng.normal(0, 12, rows), dt, 60 * dt), 0.03)
+    words = [{-1.0: "COOLING", 0.0: "IDLE", 1.0: "HEATING"}[float(value)] for value in state]
+    when = [f"{stamp},{word}" for stamp, word in zip(stamps(rng, rows, dt), words, strict=True)]
+    made = {"state_COOLING": (state < 0) * 1.0, "state_HEATING": (state > 0) * 1.0}
+    lines = [f"{head},{b:.2f},{r:.2f}" for head, b, r in zip(when, beer, room, strict=True)]
+    text = "\n".join(["timestamp,state,beer_temp,room_temp", *lines]) + "\n"
+    return Case(dt, made, {"beer_temp": beer}, free={"room_temp": room}, text=text)
 
 
 # ---- closed loops ----
@@ -323,177 +249,131 @@ def states_in_words(rng: Rng) -> Case:
 
 def pid_terms(rng: Rng) -> Case:
     """A PID log with its error and terms as columns."""
-    dt, rows = float(rng.choice([0.5, 1])), 1800
-    target = steps(rng, rows, [40, 55, 70, 85], 180, 400)
-    loop = under_pi(rng, target, dt, 21, 1.1, 90 * dt)
-    rate = np.gradient(loop.temperature, dt)
-    setpoint, y, u = (
-        pick(rng, "Setpoint", "SP", "target"),
-        pick(rng, "Input", "PV", "temp"),
-        pick(rng, "Output", "OP"),
-    )
-    columns = {
-        "time_s": (clock(rows, dt, rng), 1),
-        setpoint: (target, 1),
-        y: (loop.temperature, 3),
-        "error": (loop.error, 3),
-        "P": (6 / 1.1 * loop.error, 3),
-        "I": (loop.integral, 3),
-        "D": (-2 * rate, 3),
-        u: (loop.drive, 1),
-    }
+    dt = float(rng.choice([0.5, 1]))
+    target = steps(rng, 1800, [40, 55, 70, 85], 180, 400)
+    y, u, integral = controlled(rng, target, dt, 1.1, 90 * dt)
+    terms = {"error": target - y, "P": 6 / 1.1 * (target - y), "I": integral, "D": -2 * np.gradient(y, dt)}
     return Case(
-        table(rng, columns),
-        (u,),
-        (y,),
         dt,
-        free=(setpoint, "error", "P", "I", "D"),
+        {pick(rng, "Output", "OP"): u},
+        {pick(rng, "Input", "PV", "temp"): y},
+        free={pick(rng, "Setpoint", "SP", "target"): target, **terms},
         says=(CLOSED_LOOP, r"\berror\b"),
     )
 
 
 def loop_without_set_point(rng: Rng) -> Case:
     """A PI loop whose set point was not logged."""
-    dt, rows = float(rng.choice([1, 2, 5])), 1600
-    target = steps(rng, rows, [45, 50, 60, 75], 150, 350)
-    loop = under_pi(rng, target, dt, 20, 0.9, 100 * dt)
-    y, u = pick(rng, "reactor_degC", "bad_degC", "tank_degC"), pick(rng, "output_percent", "heater_percent")
-    columns = {"time_s": (clock(rows, dt, rng), 0), y: (loop.temperature, 4), u: (loop.drive, 1)}
-    return Case(table(rng, columns), (u,), (y,), dt, says=(CLOSED_LOOP,))
+    dt = float(rng.choice([1, 2, 5]))
+    y, u, _ = controlled(rng, steps(rng, 1600, [45, 50, 60, 75], 150, 350), dt, 0.9, 100 * dt)
+    name = pick(rng, "reactor_degC", "bad_degC", "tank_degC")
+    return Case(dt, {pick(rng, "output_percent", "heater_percent"): u}, {name: y}, says=(CLOSED_LOOP,))
 
 
-def thermostat_alone(rng: Rng) -> Case:
+def thermostat(rng: Rng) -> Case:
     """A relay with hysteresis, no set point logged."""
-    dt, rows = float(rng.choice([10, 20])), 1600
-    target = steps(rng, rows, [20.0, 21, 22.5, 24], 250, 500)
-    loop = thermostat(rng, target, dt, 12, 25, 120 * dt)
-    u, y = pick(rng, "burner", "chaudiere", "Brenner"), pick(rng, "room_degC", "salon_degC", "Stube_degC")
-    columns = {"time_s": (clock(rows, dt, rng), 0), u: (loop.drive, 0), y: (loop.temperature, 4)}
-    return Case(table(rng, columns), (u,), (y,), dt, says=(CLOSED_LOOP,))
+    dt = float(rng.choice([10, 20]))
+    y, u, _ = controlled(rng, steps(rng, 1600, [28.0, 30, 33, 36], 250, 500), dt, 25, 120 * dt, relay=True)
+    name = pick(rng, "room_degC", "salon_degC", "Stube_degC")
+    return Case(dt, {pick(rng, "burner", "chaudiere", "Brenner"): u}, {name: y}, says=(CLOSED_LOOP,))
 
 
 def set_point_logged(rng: Rng) -> Case:
     """A loop with its set point beside it, in words of another language."""
-    dt, rows = float(rng.choice([2, 5])), 1700
-    target = steps(rng, rows, [30, 38, 46, 52], 160, 380)
-    loop = under_pi(rng, target, dt, 19, 0.7, 80 * dt)
+    dt = float(rng.choice([2, 5]))
+    target = steps(rng, 1700, [30, 38, 46, 52], 160, 380)
+    y, u, _ = controlled(rng, target, dt, 0.7, 80 * dt)
     names = [
         ("Sollwert", "Istwert", "Stellgröße"),
         ("consigne", "mesure", "commande"),
         ("setpunto", "temperatura", "salida"),
-    ]
-    setpoint, y, u = names[int(rng.integers(3))]
-    columns = {
-        "time_s": (clock(rows, dt, rng), 0),
-        setpoint: (target, 1),
-        y: (loop.temperature, 2),
-        u: (loop.drive, 1),
-    }
-    return Case(table(rng, columns), (u,), (y,), dt, free=(setpoint,), says=(CLOSED_LOOP, setpoint))
+    ][int(rng.integers(3))]
+    return Case(dt, {names[2]: u}, {names[1]: y}, free={names[0]: target}, says=(CLOSED_LOOP, names[0]))
 
 
 # ---- clocks ----
 
 
-def open_block(rng: Rng, rows: int, dt: float) -> tuple[Series, Series]:
-    """Return a drive of 0 to 255 and the temperature that it makes."""
-    u = steps(rng, rows, [0, 60, 120, 180, 255], 20, 90)
-    return u, sensor(rng, block(rng, u, dt, 23, 0.25, rng.uniform(50, 90) * dt), 0.06, 0.0625)
-
-
 def bare(rng: Rng, counts: Series, u: Series, y: Series, dt: float) -> Case:
     """Write counts of a clock, drive and reading without a header: columns have their place for a name."""
-    lines = table(rng, {"clock": (counts, 0), "u": (u, 0), "y": (y, 4)}, first=0).split("\n", 1)
-    place = {name: f"c{at}" for at, name in enumerate(lines[0].split(","), 1)}
-    return Case(lines[1], (place["u"],), (place["y"],), dt, asks="clock|time|--dt")
+    columns = {"clock": counts, "u": u, "y": y}
+    order = [str(name) for name in rng.permutation([*columns])]
+    lines = zip(*(written(columns[name], ".") for name in order), strict=True)
+    place = {name: f"c{at}" for at, name in enumerate(order, 1)}
+    text = "\n".join(map(",".join, lines)) + "\n"
+    return Case(dt, {place["u"]: u}, {place["y"]: y}, asks="clock|time|--dt", text=text)
 
 
 def bare_milliseconds(rng: Rng) -> Case:
     """Milliseconds since the board's start, no header at all."""
-    dt, rows = float(rng.choice([0.1, 0.25, 0.5])), 1500
-    u, y = open_block(rng, rows, dt)
-    ms = np.round(1000 * clock(rows, dt, rng, 0.02, start=float(rng.uniform(1, 900))))
-    return bare(rng, ms, u, y, dt)
+    dt = float(rng.choice([0.1, 0.25, 0.5]))
+    u, y = heated(rng, 1500, dt)
+    return bare(rng, np.round(1000 * clock(rng, 1500, dt, 0.02, float(rng.uniform(1, 900)))), u, y, dt)
 
 
 def microseconds(rng: Rng) -> Case:
     """A column `micros`, as Arduino's function is called."""
-    dt, rows = float(rng.choice([0.02, 0.05])), 1500
-    u, y = open_block(rng, rows, dt)
-    us = np.round(1e6 * clock(rows, dt, rng, 0.01, start=3.0))
-    return Case(table(rng, {"micros": (us, 0), "pwm": (u, 0), "temp": (y, 4)}), ("pwm",), ("temp",), dt)
+    dt = float(rng.choice([0.02, 0.05]))
+    u, y = heated(rng, 1500, dt)
+    return Case(dt, {"pwm": u}, {"temp": y}, time=("micros", np.round(1e6 * clock(rng, 1500, dt, 0.01, 3.0))))
 
 
 def bare_epoch_milliseconds(rng: Rng) -> Case:
     """Milliseconds since 1970, no header."""
-    dt, rows = float(rng.choice([1, 10, 30])), 1500
-    u, y = open_block(rng, rows, dt)
-    ms = np.round(1000 * clock(rows, dt, rng, 0.01, start=1.68e9 + float(rng.integers(0, 10**7))))
-    return bare(rng, ms, u, y, dt)
+    dt = float(rng.choice([1, 10, 30]))
+    u, y = heated(rng, 1500, dt)
+    start = 1.68e9 + float(rng.integers(0, 10**7))
+    return bare(rng, np.round(1000 * clock(rng, 1500, dt, 0.01, start)), u, y, dt)
 
 
 def epoch_seconds(rng: Rng) -> Case:
     """Seconds since 1970 under a name that does not say so."""
-    dt, rows = float(rng.choice([5, 15])), 1500
-    u, y = open_block(rng, rows, dt)
-    stamp = np.round(clock(rows, dt, rng, start=1.6e9 + float(rng.integers(0, 10**7))))
-    name = pick(rng, "ts", "created", "Zeit")
-    return Case(
-        table(rng, {name: (stamp, 0), "pwm": (u, 0), "temp": (y, 4)}, first=0), ("pwm",), ("temp",), dt
-    )
+    dt = float(rng.choice([5, 15]))
+    u, y = heated(rng, 1500, dt)
+    seconds = np.round(clock(rng, 1500, dt, start=1.6e9 + float(rng.integers(0, 10**7))))
+    return Case(dt, {"pwm": u}, {"temp": y}, time=(pick(rng, "ts", "created", "Zeit"), seconds))
 
 
 def wrap_16(rng: Rng) -> Case:
     """A counter of 16 bits in milliseconds that begins anew every 65.5 s."""
-    dt, rows = float(rng.choice([0.1, 0.2])), 1500
-    u, y = open_block(rng, rows, dt)
-    ms = np.round(1000 * clock(rows, dt, rng, 0.0, start=float(rng.uniform(1, 60)))) % 2**16
-    return Case(
-        table(rng, {"ms": (ms, 0), "pwm": (u, 0), "temp": (y, 4)}), ("pwm",), ("temp",), dt, asks="ms|--dt"
-    )
+    dt = float(rng.choice([0.1, 0.2]))
+    u, y = heated(rng, 1500, dt)
+    counts = np.round(1000 * clock(rng, 1500, dt, start=float(rng.uniform(1, 60)))) % 2**16
+    return Case(dt, {"pwm": u}, {"temp": y}, time=("ms", counts), asks="ms|--dt")
 
 
 def bare_wrap_32(rng: Rng) -> Case:
     """Microseconds of 32 bits that begin anew in the middle, no header."""
     dt, rows = 0.05, 1600
-    u, y = open_block(rng, rows, dt)
-    us = np.round(2**32 - 1e6 * dt * rows * rng.uniform(0.3, 0.7) + 1e6 * dt * np.arange(rows)) % 2**32
-    return bare(rng, us, u, y, dt)
+    u, y = heated(rng, rows, dt)
+    first = 2**32 - 1e6 * dt * rows * rng.uniform(0.3, 0.7)
+    return bare(rng, np.round(first + 1e6 * dt * np.arange(rows)) % 2**32, u, y, dt)
 
 
 def reset_in_the_middle(rng: Rng) -> Case:
     """The board is reset: its clock begins anew, the block cooled meanwhile."""
     dt, rows = float(rng.choice([0.5, 1])), 1800
     cut = int(rows * rng.uniform(0.4, 0.6))
-    u1, y1 = open_block(rng, cut, dt)
-    u2, y2 = open_block(rng, rows - cut, dt)
-    ms = np.round(
-        1000 * np.concatenate([clock(cut, dt, rng, start=700.0), clock(rows - cut, dt, rng, start=2.0)])
-    )
-    name = pick(rng, "millis", "time_ms", "t_ms")
-    columns = {name: (ms, 0), "duty": (np.r_[u1, u2], 0), "temp_degC": (np.r_[y1, y2], 4)}
-    return Case(
-        table(rng, columns),
-        ("duty",),
-        ("temp",),
-        dt,
-        says=("reset|(begins?|starts?) (anew|again)|goes back|two pieces",),
-        asks="reset|(begins?|starts?) (anew|again)|cut",
-    )
+    (u1, y1), (u2, y2) = heated(rng, cut, dt), heated(rng, rows - cut, dt)
+    ms = np.round(1000 * np.r_[clock(rng, cut, dt, start=700.0), clock(rng, rows - cut, dt, start=2.0)])
+    says = "reset|(begins?|starts?) (anew|again)|goes back|two pieces"
+    time = (pick(rng, "millis", "time_ms", "t_ms"), ms)
+    return Case(dt, {"duty": np.r_[u1, u2]}, {"temp_degC": np.r_[y1, y2]}, time=time, says=(says,), asks=says)
 
 
 def row_counter_and_meter(rng: Rng) -> Case:
     """A row number and an energy meter beside the clock: neither is a clock, an input or an output."""
     dt, rows = float(rng.choice([2, 4])), 1500
-    u, y = open_block(rng, rows, dt)
-    columns = {
-        "time_s": (clock(rows, dt, rng, 0.02), 2),
-        "n": (np.arange(rows, dtype=float), 0),
-        "energy_Wh": (np.cumsum(u) * dt / 3600 * 0.2, 2),
-        "pwm": (u, 0),
-        "temp": (y, 4),
-    }
-    return Case(table(rng, columns, first=0), ("pwm",), ("temp",), dt)
+    u, y = heated(rng, rows, dt)
+    free = {"n": np.arange(rows, dtype=float), "energy_Wh": np.round(np.cumsum(u) * dt / 18000, 2)}
+    case = Case(dt, {"pwm": u}, {"temp": y}, time=("time_s", clock(rng, rows, dt, 0.02)))
+    return Case(
+        dt,
+        {"pwm": u},
+        {"temp": y},
+        time=case.time,
+        text=Case(dt, {"pwm": u}, {"temp": y} | free).written(rng),
+    )
 
 
 # ---- dead sensors ----
@@ -503,13 +383,12 @@ def code_runs(rng: Rng) -> Case:
     """-127 while the probe is unplugged, 85 once after a brown-out."""
     dt, rows = float(rng.choice([2, 5])), 1600
     u = steps(rng, rows, [0, 1], 20, 90)
-    y = sensor(rng, block(rng, u, dt, 19, 28, 70 * dt), 0.04, 0.0625)
+    y = sensor(rng, block(rng, u, dt, 19, 28, 70 * dt), 0.04)
     for start in rng.choice(np.arange(40, rows - 60, 70), 6, replace=False):
         y[start : start + int(rng.integers(2, 40))] = -127
     y[rng.choice(rows, 8, replace=False)] = 85.0
     name = pick(rng, "probe_degC", "T_boiler_degC", "sonde_degC")
-    columns = {"time_s": (clock(rows, dt, rng), 0), "relay": (u, 0), name: (y, 4)}
-    return Case(table(rng, columns), ("relay",), (name,), dt, says=("-127", r"\b85\b"))
+    return Case(dt, {"relay": u}, {name: y}, says=("-127", r"\b85\b"))
 
 
 def code_in_a_disturbance(rng: Rng) -> Case:
@@ -521,75 +400,56 @@ def code_in_a_disturbance(rng: Rng) -> Case:
     seen = sensor(rng, outside, 0.03, 0.1)
     for start in rng.choice(np.arange(40, rows - 60, 70), 5, replace=False):
         seen[start : start + int(rng.integers(3, 25))] = 999.9
-    columns = {
-        "time": (stamps(rng, rows, dt), 0),
-        "valve_percent": (u, 0),
-        "room_degC": (sensor(rng, room, 0.03, 0.05), 2),
-        "outdoor_degC": (seen, 1),
-    }
-    return Case(table(rng, columns), ("valve",), ("room",), dt, ("outdoor",), says=(r"999\.9",))
+    return Case(
+        dt,
+        {"valve_percent": u},
+        {"room_degC": sensor(rng, room, 0.03, 0.05)},
+        {"outdoor_degC": seen},
+        time=("time", stamps(rng, rows, dt)),
+        says=(r"999\.9",),
+    )
+
+
+def near_and_far(rng: Rng, rows: int) -> tuple[Series, Series, Series]:
+    """Return a drive and the readings of two sensors, rows 2 s apart."""
+    u, near = heated(rng, rows, 2.0)
+    return u, near, sensor(rng, 23 + lag(0.12 * u, 2.0, 240), 0.05, 0.05)
 
 
 def open_thermocouple(rng: Rng) -> Case:
     """-242.02 for ten rows at a time (an open PT100), one of two outputs."""
-    dt, rows = 1.0, 1500
-    u, y = open_block(rng, rows, dt)
-    other = sensor(rng, 23 + lag(0.1 * u, dt, 150), 0.05, 0.05)
-    for start in rng.choice(np.arange(50, rows - 50, 60), 5, replace=False):
-        y[start : start + 10] = -242.02
-    columns = {
-        "t_s": (clock(rows, dt, rng), 1),
-        "heat": (u, 0),
-        "pt100_degC": (y, 2),
-        "shell_degC": (other, 2),
-    }
-    return Case(table(rng, columns), ("heat",), ("pt100", "shell"), dt, says=(r"-242",))
+    u, near, far = near_and_far(rng, 1500)
+    for start in rng.choice(np.arange(50, 1450, 60), 5, replace=False):
+        near[start : start + 10] = -242.02
+    return Case(2, {"heat": u}, {"pt100_degC": near, "shell_degC": far}, says=("-242",))
 
 
 def zero_for_a_half(rng: Rng) -> Case:
     """A sensor that reads 0 from the middle on; the other one is sound."""
-    dt, rows = 2.0, 1600
-    u, y = open_block(rng, rows, dt)
-    other = sensor(rng, 23 + lag(0.12 * u, dt, 240), 0.05, 0.05)
-    y[int(rows * rng.uniform(0.45, 0.6)) :] = 0.0
-    columns = {"t_s": (clock(rows, dt, rng), 1), "heat": (u, 0), "near_degC": (y, 2), "far_degC": (other, 2)}
-    return Case(
-        table(rng, columns),
-        ("heat",),
-        ("far",),
-        dt,
-        free=("near",),
-        says=(r"near.*(stuck|lost|\b0\b|held|same value)",),
-    )
+    u, near, far = near_and_far(rng, 1600)
+    near[int(1600 * rng.uniform(0.45, 0.6)) :] = 0.0
+    says = (r"near.*(stuck|lost|\b0\b|held|same value)",)
+    return Case(2, {"heat": u}, {"far_degC": far}, free={"near_degC": near}, says=says)
 
 
 def stuck_sensor(rng: Rng) -> Case:
     """A sensor that holds one value from some row on while the drive swings from 0 to 100."""
     dt, rows = float(rng.choice([1, 2])), 1600
     u = steps(rng, rows, [0, 100], 25, 90)
-    y = sensor(rng, block(rng, u, dt, 21, 0.5, 60 * dt), 0.05, 0.0625)
+    y = sensor(rng, block(rng, u, dt, 21, 0.5, 60 * dt))
     cut = int(rows * rng.uniform(0.55, 0.7))
     y[cut:] = y[cut]
-    name = pick(rng, "hot_end_degC", "plate_degC")
-    columns = {"time_s": (clock(rows, dt, rng), 1), "heater_percent": (u, 0), name: (y, 4)}
+    says = "stuck|same value|held|stands still"
     return Case(
-        table(rng, columns),
-        ("heater",),
-        (name,),
-        dt,
-        says=("stuck|same value|held|stands still",),
-        asks="stuck|same value",
+        dt, {"heater_percent": u}, {pick(rng, "hot_end_degC", "plate_degC"): y}, says=(says,), asks=says
     )
 
 
 def lost_half(rng: Rng) -> Case:
     """One of two outputs has empty cells in one half."""
-    dt, rows = 2.0, 1600
-    u, y = open_block(rng, rows, dt)
-    other = sensor(rng, 23 + lag(0.12 * u, dt, 240), 0.05, 0.05)
-    y[: int(rows * rng.uniform(0.4, 0.55))] = np.nan
-    columns = {"t_s": (clock(rows, dt, rng), 1), "heat": (u, 0), "near_degC": (y, 2), "far_degC": (other, 2)}
-    return Case(table(rng, columns), ("heat",), ("far",), dt, free=("near",), says=("near",))
+    u, near, far = near_and_far(rng, 1600)
+    near[: int(1600 * rng.uniform(0.4, 0.55))] = np.nan
+    return Case(2, {"heat": u}, {"far_degC": far}, free={"near_degC": near}, says=("near",))
 
 
 # ---- surroundings ----
@@ -602,18 +462,20 @@ def outdoors_and_rooms(rng: Rng) -> Case:
     u = steps(rng, rows, [0, 30, 60, 100], 10, 60)
     room = 9 + lag(0.7 * outside, dt, 150 * dt, 5.0) + lag(0.1 * u, dt, 30 * dt)
     second = 6 + lag(0.5 * outside, dt, 200 * dt, 4.0) + lag(0.35 * room, dt, 50 * dt, 6.0)
-    v, o, r, s = [
-        ("Ventil_percent", "Aussen_degC", "Wohnzimmer_degC", "Flur_degC"),
-        ("klep_percent", "buiten_degC", "woonkamer_degC", "gang_degC"),
-    ][int(rng.integers(2))]
-    columns = {
-        "time": (stamps(rng, rows, dt), 0),
-        v: (u, 0),
-        o: (sensor(rng, outside, 0.05, 0.1), 1),
-        r: (sensor(rng, room, 0.03, 0.05), 2),
-        s: (sensor(rng, second, 0.03, 0.05), 2),
+    names = [("Ventil", "Aussen", "Wohnzimmer", "Flur"), ("klep", "buiten", "woonkamer", "gang")][
+        rng.integers(2)
+    ]
+    rooms = {
+        f"{names[2]}_degC": sensor(rng, room, 0.03, 0.05),
+        f"{names[3]}_degC": sensor(rng, second, 0.03, 0.05),
     }
-    return Case(table(rng, columns), (v,), (r, s), dt, (o,))
+    return Case(
+        dt,
+        {f"{names[0]}_percent": u},
+        rooms,
+        {f"{names[1]}_degC": sensor(rng, outside, 0.05, 0.1)},
+        time=("time", stamps(rng, rows, dt)),
+    )
 
 
 def nameless_weather(rng: Rng) -> Case:
@@ -623,48 +485,30 @@ def nameless_weather(rng: Rng) -> Case:
     u = steps(rng, rows, [0, 1], 15, 60)
     room = 8 + lag(outside, dt, 120 * dt, outside[0]) + lag(9 * u, dt, 40 * dt)
     names = [f"ch{k}" for k in rng.permutation(np.arange(1, 4))]
-    columns = {
-        "time_s": (clock(rows, dt, rng), 0),
-        names[0]: (u, 0),
-        names[1]: (sensor(rng, room, 0.03, 0.05), 2),
-        names[2]: (sensor(rng, outside, 0.03, 0.05), 2),
-    }
-    return Case(table(rng, columns), (names[0],), (names[1],), dt, (names[2],))
+    room, outside = sensor(rng, room, 0.03, 0.05), sensor(rng, outside, 0.03, 0.05)
+    return Case(dt, {names[0]: u}, {names[1]: room}, {names[2]: outside})
 
 
 def constant_ambient(rng: Rng) -> Case:
-    """An ambient that was logged and never moves: kept as a disturbance, or its value said."""
-    dt, rows = 1.0, 1400
+    """An ambient that was logged and never moves: kept, or its column named."""
     ambient = float(np.round(rng.uniform(18, 26), 1))
-    u = steps(rng, rows, [0, 40, 70, 100], 20, 80)
-    y = sensor(rng, block(rng, u, dt, ambient, 0.6, 70), 0.05, 0.1)
-    name = pick(rng, "t_ambient_degC", "ambient_degC", "room_degC")
-    columns = {
-        "time_s": (clock(rows, dt, rng), 0),
-        "heater_percent": (u, 0),
-        "block_degC": (y, 1),
-        name: (np.full(rows, ambient), 1),
-    }
-    return Case(table(rng, columns), ("heater",), ("block",), dt, free=(name,), says=(rf"{name[:-5]}",))
+    u = steps(rng, 1400, [0, 40, 70, 100], 20, 80)
+    y = sensor(rng, block(rng, u, 1, ambient, 0.6, 70), 0.05, 0.1)
+    name = pick(rng, "t_ambient", "ambient", "room")
+    free = {f"{name}_degC": np.full(1400, ambient)}
+    return Case(1, {"heater_percent": u}, {"block_degC": y}, free=free, says=(name,))
 
 
 def wind_and_door(rng: Rng) -> Case:
     """A door contact in words and the wind: neither is moved by the heater, both move the room."""
     dt, rows = 60.0, 1700
-    u = steps(rng, rows, [0, 100], 15, 60)
-    door = steps(rng, rows, [0, 1], 30, 90)
-    wind = np.abs(6 + lag(rng.normal(0, 25, rows), dt, 20 * dt))
-    room = 17 + lag(0.09 * u - 4 * door - 0.3 * wind, dt, 35 * dt)
-    columns = {
-        "time": (stamps(rng, rows, dt), 0),
-        "heater_percent": (u, 0),
-        "door": (["open" if value else "closed" for value in door], 0),
-        "wind_speed": (wind, 1),
-        "hall_degC": (sensor(rng, room, 0.03, 0.05), 2),
-    }
-    return Case(
-        table(rng, columns), ("heater",), ("hall",), dt, ("wind_speed",), free=("door",), says=("door",)
-    )
+    u, door = steps(rng, rows, [0, 100], 15, 60), steps(rng, rows, [0, 1], 30, 90)
+    wind = np.round(np.abs(6 + lag(rng.normal(0, 25, rows), dt, 20 * dt)), 1)
+    hall = sensor(rng, 17 + lag(0.09 * u - 4 * door - 0.3 * wind, dt, 35 * dt), 0.03, 0.05)
+    words = ["open" if value else "closed" for value in door]
+    when = ("time", stamps(rng, rows, dt))
+    drives, wind_ = {"heater_percent": u}, {"wind_speed": wind}
+    return Case(dt, drives, {"hall_degC": hall}, wind_, {"door": words}, when, says=("door",))
 
 
 # ---- units and duplicates ----
@@ -672,65 +516,46 @@ def wind_and_door(rng: Rng) -> Case:
 
 def fahrenheit_beside(rng: Rng) -> Case:
     """Two bodies, one in degF and one in degC."""
-    dt, rows = 2.0, 1500
-    u = steps(rng, rows, [0, 35, 70, 100], 20, 80)
-    near, far = block(rng, u, dt, 21, 0.5, 60 * dt), 21 + lag(0.2 * u, dt, 160 * dt)
-    columns = {
-        "time_s": (clock(rows, dt, rng), 0),
-        "power_percent": (u, 0),
-        "smoker_degF": (sensor(rng, 1.8 * near + 32, 0.1, 0.1), 1),
-        "meat_degC": (sensor(rng, far, 0.05, 0.05), 2),
-    }
-    return Case(table(rng, columns), ("power",), ("smoker", "meat"), dt)
+    u = steps(rng, 1500, [0, 35, 70, 100], 20, 80)
+    smoker = sensor(rng, 1.8 * block(rng, u, 2, 21, 0.5, 120) + 32, 0.1, 0.1)
+    meat = sensor(rng, 21 + lag(0.2 * u, 2, 320), 0.05, 0.05)
+    return Case(2, {"power_percent": u}, {"smoker_degF": smoker, "meat_degC": meat})
 
 
 def duplicate_in_another_unit(rng: Rng) -> Case:
     """One sensor in degC and degF, one drive in percent and 0 to 255."""
-    dt, rows = 1.0, 1500
-    u = steps(rng, rows, [0, 20, 40, 60, 80, 100], 20, 80)
-    y = sensor(rng, block(rng, u, dt, 22, 0.7, 65), 0.05, 0.0625)
+    u = steps(rng, 1500, [0, 20, 40, 60, 80, 100], 20, 80)
+    y = sensor(rng, block(rng, u, 1, 22, 0.7, 65))
     columns = {
-        "time_s": (clock(rows, dt, rng), 0),
-        "duty_percent": (u, 0),
-        "duty_raw": (np.round(u * 2.55), 0),
-        "tempC": (y, 2),
-        "tempF": (1.8 * y + 32, 2),
+        "duty_percent": u,
+        "duty_raw": np.round(u * 2.55),
+        "tempC": y,
+        "tempF": np.round(1.8 * y + 32, 2),
     }
-    return Case(
-        table(rng, columns),
-        ("duty|duty_raw",),
-        ("tempC|tempF",),
-        dt,
-        free=("duty", "duty_raw", "tempC", "tempF"),
-        says=(SAME_SIGNAL,),
-    )
+    says = ("same signal|another unit|same readings",)
+    text = Case(1, {}, {}, free=columns).written(rng)
+    return Case(1, {"duty|duty_raw": u}, {"tempC|tempF": y}, free=columns, says=says, text=text)
 
 
 def decimal_commas(rng: Rng) -> Case:
     """Semicolons and decimal commas, French or Italian columns with units in brackets."""
-    dt, rows = float(rng.choice([1, 2])), 1500
-    u = steps(rng, rows, [0, 30.5, 60.5, 99.5], 20, 80)
+    dt = float(rng.choice([1, 2]))
+    u = steps(rng, 1500, [0, 30.5, 60.5, 99.5], 20, 80)
     y = sensor(rng, block(rng, u, dt, 20, 0.55, 60 * dt), 0.05, 0.05)
-    t, a, b = [("temps (s)", "chauffage (%)", "four (°C)"), ("tempo [s]", "riscaldamento [%]", "forno [°C]")][
-        int(rng.integers(2))
-    ]
-    columns = {t: (clock(rows, dt, rng), 1), a: (u, 1), b: (y, 2)}
-    return Case(table(rng, columns, separator=";", decimal=","), (a,), (b,), dt)
+    french, italian = (
+        ("temps (s)", "chauffage (%)", "four (°C)"),
+        ("tempo [s]", "riscaldamento [%]", "forno [°C]"),
+    )
+    when, drive, oven = (french, italian)[int(rng.integers(2))]
+    time = (when, dt * np.arange(1500))
+    return Case(dt, {drive: u}, {oven: y}, time=time, separator=";", decimal=",")
 
 
 def sixty_rows(rng: Rng) -> Case:
-    """Too few rows: refused with the number that is needed and the number there is."""
-    dt, rows = 10.0, 60
-    u = steps(rng, rows, [0, 50, 100], 5, 12)
-    y = sensor(rng, block(rng, u, dt, 20, 0.5, 80), 0.05, 0.05)
-    columns = {"time_s": (clock(rows, dt, rng), 0), "heater_percent": (u, 0), "block_degC": (y, 2)}
-    return Case(
-        table(rng, columns),
-        ("heater",),
-        ("block",),
-        dt,
-        asks=r"\b60\b.*\b\d+ (rows )?(are )?needed|\b\d+\b.*needed.*\b60\b|needs.*\b\d+\b.*\b60\b",
-    )
+    """Too few rows for most fits."""
+    u = steps(rng, 60, [0, 50, 100], 5, 12)
+    y = sensor(rng, block(rng, u, 10, 20, 0.5, 80), 0.05, 0.05)
+    return Case(10, {"heater_percent": u}, {"block_degC": y}, asks=r"\b60\b.*\b80\b|\b80\b.*\b60\b")
 
 
 # ---- programs ----
@@ -738,15 +563,11 @@ def sixty_rows(rng: Rng) -> Case:
 
 def marlin(rng: Rng) -> Case:
     """A printer host's terminal: M105 answers with chatter between."""
-    dt, rows = 1.0, 1300
-    target = steps(rng, rows, [0, 150, 190, 220], 90, 240)
-    u = np.clip(np.round(steps(rng, rows, [0, 30, 60, 90, 127], 20, 70)), 0, 127)
-    hot = block(rng, u, dt, 24, 1.7, 60)
-    bed = 24 + lag(rng.normal(0, 1, rows), dt, 40)
+    rows = 1300
+    target, u = steps(rng, rows, [0, 150, 190, 220], 90, 240), steps(rng, rows, [0, 30, 60, 90, 127], 20, 70)
+    hot, bed = block(rng, u, 1, 24, 1.7, 60), 24 + lag(rng.normal(0, 1, rows), 1, 40)
     lines = []
-    start = datetime(2024, 5, 3, 14, 2, 11)
-    for row in range(rows):
-        stamp = (start + timedelta(seconds=row * dt)).strftime("%H:%M:%S.%f")[:-3]
+    for row, stamp in enumerate(stamps(rng, rows, 1, "%H:%M:%S.000")):
         if rng.random() < 0.08:
             lines.append(
                 f"{stamp} : " + pick(rng, "N123 G1 X20.1 Y33.7 E1.2*87", "echo:busy: processing", "ok")
@@ -754,41 +575,29 @@ def marlin(rng: Rng) -> Case:
         lines.append(
             f"{stamp} : ok T:{hot[row]:.2f} /{target[row]:.2f} B:{bed[row]:.2f} /0.00 @:{u[row]:.0f} B@:0"
         )
-    text = "\n".join(lines) + "\n"
-    return Case(
-        text,
-        ("@|drive|T_duty|duty",),
-        ("T",),
-        dt,
-        free=("B", "T_target", "B_target", "B_duty"),
-        suffix=".log",
-    )
+    free = dict.fromkeys(("B", "T_target", "B_target", "B@"), bed)
+    return Case(1, {"@": u}, {"T": hot}, free=free, suffix=".log", text="\n".join(lines) + "\n")
 
 
 def klipper(rng: Rng) -> Case:
     """klippy.log: one line of statistics a second, key=value."""
-    dt, rows = 1.0, 1300
+    rows = 1300
     target = steps(rng, rows, [60, 120, 180, 200], 100, 300)
-    loop = under_pi(rng, target, dt, 25, 2.4, 70)
+    y, u, _ = controlled(rng, target, 1.0, 2.4, 70)
     lines = ["Start printer at Fri May  3 14:02:11 2024", "Loaded MCU 'mcu' 100 commands"]
     for row in range(rows):
         lines.append(
-            f"Stats {1200.3 + row * dt:.1f}: gcodein=0  mcu: mcu_awake=0.002 mcu_task_avg=0.000015 "
+            f"Stats {1200.3 + row:.1f}: gcodein=0  mcu: mcu_awake=0.002 mcu_task_avg=0.000015 "
             f"bytes_write=15{row:04d} heater_bed: target=0 temp={25 + rng.normal(0, 0.1):.1f} pwm=0.000 "
             f"sysload=0.31 cputime={3 + 0.05 * row:.3f} memavail=721{int(rng.integers(100, 999))} "
-            f"extruder: target={target[row]:.0f} temp={loop.temperature[row]:.1f} "
-            f"pwm={loop.drive[row] / 100:.3f}"
+            f"extruder: target={target[row]:.0f} temp={y[row]:.1f} pwm={u[row] / 100:.3f}"
         )
         if rng.random() < 0.05:
             lines.append("Timeout with MCU 'mcu' (eventtime=1200.1)")
+    free = dict.fromkeys(("extruder_target", "heater_bed_temp", "heater_bed_target", "heater_bed_pwm"), y)
+    text = "\n".join(lines) + "\n"
     return Case(
-        "\n".join(lines) + "\n",
-        ("extruder_pwm",),
-        ("extruder_temp|extruder",),
-        dt,
-        free=("extruder_target", "heater_bed_temp", "heater_bed_target", "heater_bed_pwm"),
-        says=(CLOSED_LOOP,),
-        suffix=".log",
+        1, {"extruder_pwm": u}, {"extruder_temp": y}, {}, free, None, (CLOSED_LOOP,), suffix=".log", text=text
     )
 
 
@@ -800,114 +609,74 @@ def home_assistant(rng: Rng) -> Case:
     room = sensor(rng, 9 + lag(0.8 * outside, dt, 150 * dt, outside[0]) + lag(8 * u, dt, 35 * dt), 0.03, 0.1)
     start = datetime(2024, 2, 11, 6, 0, tzinfo=UTC)
     lines = ["entity_id,state,last_changed"]
-    series = {"switch.heater": u, "sensor.living_room": room, "sensor.outdoor": outside}
-    for name, values in series.items():
-        last = None
-        for row in range(rows):
-            value = float(values[row])
-            if value == last:
-                continue
-            last = value
-            moment = (
-                (start + timedelta(seconds=row * dt))
-                .isoformat(timespec="milliseconds")
-                .replace("+00:00", "Z")
-            )
-            state = ("on" if value else "off") if name.startswith("switch") else f"{value:.1f}"
-            lines.append(f"{name},{state},{moment}")
-    return Case(
-        "\n".join(lines) + "\n",
-        ("heater",),
-        ("living_room",),
-        dt,
-        ("outdoor",),
-        asks="entity_id|long|pivot|one column",
-    )
+    for name, values in {"switch.heater": u, "sensor.living_room": room, "sensor.outdoor": outside}.items():
+        for row in np.flatnonzero(np.diff(values, prepend=np.nan) != 0):
+            moment = (start + timedelta(seconds=int(row) * dt)).isoformat(timespec="milliseconds")
+            state = ("on" if values[row] else "off") if name.startswith("switch") else f"{values[row]:.1f}"
+            lines.append(f"{name},{state},{moment.replace('+00:00', 'Z')}")
+    text = "\n".join(lines) + "\n"
+    return Case(dt, {"heater": u}, {"living_room": room}, {"outdoor": outside}, text=text)
 
 
 def esphome(rng: Rng) -> Case:
     """The log of a board: one line per reading, in words."""
-    dt, rows = 10.0, 1300
-    u, y = open_block(rng, rows, dt)
-    start = datetime(2024, 2, 11, 6, 0)
+    u, y = heated(rng, 1300, 10)
     lines = []
-    for row in range(rows):
-        stamp = (start + timedelta(seconds=row * dt)).strftime("%H:%M:%S")
-        lines.append(
-            f"[{stamp}][D][sensor:094]: 'Kettle': Sending state {y[row]:.5f} °C with 2 decimals of accuracy"
-        )
-        lines.append(
-            f"[{stamp}][D][sensor:094]: 'Duty': Sending state {u[row] / 2.55:.5f} % with 1 decimals"
-        )
+    for row, stamp in enumerate(stamps(rng, 1300, 10, "%H:%M:%S")):
+        for name, value in (("Kettle", f"{y[row]:.5f} °C"), ("Duty", f"{u[row] / 2.55:.5f} %")):
+            lines.append(f"[{stamp}][D][sensor:094]: '{name}': Sending state {value} with 2 decimals")
         if rng.random() < 0.1:
             lines.append(f"[{stamp}][D][wifi:123]: WiFi signal -61 dB")
-    return Case(
-        "\n".join(lines) + "\n", ("Duty",), ("Kettle",), dt, asks="no column|column|read", suffix=".log"
-    )
+    return Case(10, {"Duty": u}, {"Kettle": y}, suffix=".log", text="\n".join(lines) + "\n")
 
 
 def labview(rng: Rng) -> Case:
     """A .lvm file: a header of its own, tabs, decimal commas in half of the seeds."""
-    dt, rows = float(rng.choice([0.1, 0.5])), 1500
-    u, y = open_block(rng, rows, dt)
-    decimal = pick(rng, ".", ",")
+    dt, rows, decimal = float(rng.choice([0.1, 0.5])), 1500, pick(rng, ".", ",")
+    u, y = heated(rng, rows, dt)
+    step = f"{dt:.6f}".replace(".", decimal)
     head = [
         "LabVIEW Measurement\t", "Writer_Version\t2", "Separator\tTab", f"Decimal_Separator\t{decimal}",
         "X_Columns\tOne", "Time_Pref\tRelative", "Date\t2024/02/11", "Time\t10:11:12,5",
         "***End_of_Header***\t", "\t", "Channels\t2\t\t", f"Samples\t{rows}\t{rows}\t",
         "Date\t2024/02/11\t2024/02/11\t", "Time\t10:11:12\t10:11:12\t", "Y_Unit_Label\tVolt\tdegC\t",
-        "X0\t0\t0\t", f"Delta_X\t{number(dt, 6, decimal)}\t{number(dt, 6, decimal)}\t",
+        "X0\t0\t0\t", f"Delta_X\t{step}\t{step}\t",
         "***End_of_Header***\t\t\t", "X_Value\tDrive\tOven\tComment",
     ]  # fmt: skip
-    rows_of = [
-        f"{number(row * dt, 6, decimal)}\t{number(u[row] / 51, 6, decimal)}\t{number(y[row], 6, decimal)}\t"
-        for row in range(rows)
+    lines = [
+        f"{row * dt:.6f}\t{u[row] / 51:.6f}\t{y[row]:.6f}\t".replace(".", decimal) for row in range(rows)
     ]
-    return Case("\n".join(head + rows_of) + "\n", ("Drive",), ("Oven",), dt, suffix=".lvm")
+    return Case(dt, {"Drive": u}, {"Oven": y}, suffix=".lvm", text="\n".join(head + lines) + "\n")
 
 
 def serial_plotter(rng: Rng) -> Case:
     """Labelled values of a serial plotter, without any clock: the step has to be asked."""
-    rows = 1400
-    u, y = open_block(rng, rows, 1.0)
-    text = "".join(f"pwm:{u[row]:.0f},temp:{y[row]:.2f}\n" for row in range(rows))
-    return Case(text, ("pwm",), ("temp",), float("nan"), asks="--dt", suffix=".txt")
+    u, y = heated(rng, 1400, 1.0)
+    text = "".join(f"pwm:{u[row]:.0f},temp:{y[row]:.2f}\n" for row in range(1400))
+    return Case(float("nan"), {"pwm": u}, {"temp": y}, asks="--dt", suffix=".txt", text=text)
 
 
 def putty(rng: Rng) -> Case:
     """A terminal's log with a head of its own and stamps in brackets."""
-    dt, rows = float(rng.choice([1, 2])), 1400
-    u, y = open_block(rng, rows, dt)
-    start = datetime(2024, 3, 1, 22, 55, 40)
-    lines = ["=~=~=~=~=~=~=~=~=~=~=~= PuTTY log 2024.03.01 22:55:39 =~=~=~=~=~=~=~=~=~=~=~="]
-    lines.append("temp\tpwm")
-    for row in range(rows):
-        stamp = (start + timedelta(seconds=row * dt)).strftime("%Y-%m-%d %H:%M:%S")
-        lines.append(f"[{stamp}] {y[row]:.2f}\t{u[row]:.0f}")
-    return Case(
-        "\n".join(lines) + "\n", ("pwm",), ("temp",), dt, asks="column|stamp|time|header", suffix=".log"
-    )
+    dt = float(rng.choice([1, 2]))
+    u, y = heated(rng, 1400, dt)
+    lines = ["=~=~=~=~=~=~=~=~=~=~=~= PuTTY log 2024.03.01 22:55:39 =~=~=~=~=~=~=~=~=~=~=~=", "temp\tpwm"]
+    lines += [f"[{stamp}] {y[row]:.2f}\t{u[row]:.0f}" for row, stamp in enumerate(stamps(rng, 1400, dt))]
+    return Case(dt, {"pwm": u}, {"temp": y}, suffix=".log", text="\n".join(lines) + "\n")
 
 
 def tclab(rng: Rng) -> Case:
     """The table of the TCLab package: Time, T1, T2, Q1, Q2."""
-    dt, rows = 1.0, 1500
-    q1, q2 = steps(rng, rows, [0, 30, 60, 90], 30, 110), steps(rng, rows, [0, 25, 50, 80], 30, 110)
-    one = 22 + lag(lag(0.6 * q1 + 0.15 * q2, dt, 150), dt, 15)
-    two = 22 + lag(lag(0.2 * q1 + 0.4 * q2, dt, 170), dt, 15)
-    columns = {
-        "Time": (clock(rows, dt, rng, 0.01), 3),
-        "T1": (sensor(rng, one, 0.1, 0.32), 2),
-        "T2": (sensor(rng, two, 0.1, 0.32), 2),
-        "Q1": (q1, 1),
-        "Q2": (q2, 1),
-    }
-    return Case(table(rng, columns), ("Q1", "Q2"), ("T1", "T2"), dt)
+    q1, q2 = steps(rng, 1500, [0, 30, 60, 90], 30, 110), steps(rng, 1500, [0, 25, 50, 80], 30, 110)
+    one = 22 + lag(lag(0.6 * q1 + 0.15 * q2, 1, 150), 1, 15)
+    two = 22 + lag(lag(0.2 * q1 + 0.4 * q2, 1, 170), 1, 15)
+    readings = {"T1": sensor(rng, one, 0.1, 0.32), "T2": sensor(rng, two, 0.1, 0.32)}
+    return Case(1, {"Q1": q1, "Q2": q2}, readings, time=("Time", clock(rng, 1500, 1, 0.01)))
 
 
 CASES: tuple[Callable[[Rng], Case], ...] = (
     two_relays, three_relays, relay_and_duty, elements_together, heater_and_cooler, states_in_words,
-    pid_terms, loop_without_set_point, thermostat_alone, set_point_logged,
+    pid_terms, loop_without_set_point, thermostat, set_point_logged,
     bare_milliseconds, microseconds, bare_epoch_milliseconds, epoch_seconds, wrap_16, bare_wrap_32,
     reset_in_the_middle, row_counter_and_meter,
     code_runs, code_in_a_disturbance, open_thermocouple, zero_for_a_half, stuck_sensor, lost_half,
@@ -1015,9 +784,10 @@ def main() -> None:
     for place, make in enumerate(CASES):
         if arguments.only not in make.__name__:
             continue
-        case = make(np.random.default_rng([arguments.seed, place]))
+        rng = np.random.default_rng([arguments.seed, place])
+        case = make(rng)
         path = folder / f"log{place:02}{case.suffix}"  # a name that says nothing
-        path.write_text(case.text, encoding="utf-8")
+        path.write_text(case.written(rng), encoding="utf-8")
         verdict, why = judge(case, *(fitted(path) if arguments.fit else read_only(path)))
         counts[verdict] = counts.get(verdict, 0) + 1
         print(f"{make.__name__:26}{verdict:7}{why}", flush=True)

@@ -139,3 +139,8 @@ def test_a_suffix_that_is_no_unit_is_part_of_the_name(header):
 def test_a_header_without_a_name_is_refused(header):
     with pytest.raises(UserError, match="no name"):
         split_header(header)
+
+
+def test_a_letter_that_numbers_columns_is_no_unit():
+    assert read_header("SSR_A", ["SSR_A", "SSR_B"]) == ("SSR_A", "1", 1.0)
+    assert read_header("heater_A", ["heater_A", "heater_V"]) == ("heater", "A", 1.0)
