@@ -3,8 +3,9 @@ import typing
 from thermogrip.classify.decisions.next_touch import Costs as Costs
 from thermogrip.classify.decisions.next_touch import choose_next_touch as choose_next_touch
 from thermogrip.classify.decisions.next_touch import name_or_unknown as name_or_unknown
-from thermogrip.classify.decisions.predict import classify_grasps as classify_grasps
-from thermogrip.classify.decisions.predict import reasons as reasons
+from thermogrip.classify.decisions.predict import Answer as Answer
+from thermogrip.classify.decisions.predict import Note as Note
+from thermogrip.classify.decisions.predict import answer as answer
 from thermogrip.classify.decisions.stopping_rule import Stream as Stream
 from thermogrip.classify.decisions.stopping_rule import load_stop_rule as load_stop_rule
 from thermogrip.classify.estimators import CLASSIFIERS as CLASSIFIERS
@@ -17,6 +18,7 @@ from thermogrip.classify.evaluation.harness import evaluate as evaluate
 
 if typing.TYPE_CHECKING:  # doors of 0.1.0, which are found and not listed
     from thermogrip.classify.decisions.next_touch import advise_touches as advise_touches
+    from thermogrip.classify.decisions.predict import classify_grasps as classify_grasps
     from thermogrip.classify.decisions.predict import write_predictions as write_predictions
     from thermogrip.classify.decisions.stopping_rule import StopRule as StopRule
     from thermogrip.classify.decisions.stopping_rule import learn_stop_rule as learn_stop_rule

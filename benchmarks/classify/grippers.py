@@ -12,8 +12,6 @@ contact conductance of all blocks and of each, and the heat that blocks lose.  I
 - as that of the training for certain (``gripper="same"``), its numbers taken as exact;
 - as ``for_another_gripper()`` from no known grasp, and from 1, 3, 5, 10, 25 known ones of the other gripper,
   copper and wood in turn at 20 K;
-- as a new one of the population of the other grippers but it, each calibrated on a hundred grasps of its own,
-  from no known grasp and from 1 and 10;
 - beside a calibration of the other gripper from those 10 alone, cold, and from a hundred grasps of all five.
 
 The cold calibration of ten has copper and wood alone: the other three materials come from the library, finish
@@ -28,7 +26,7 @@ import json
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import fields, replace
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -42,13 +40,10 @@ from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.classify.evaluation.metrics import calibration_interval
 from thermogrip.datasets.schema import Grasps
 from thermogrip.sysid.effusivity.calibration import calibrate_gripper
-from thermogrip.sysid.effusivity.gripper_model import GripperSpread
-from thermogrip.sysid.effusivity.population import LEAST, gripper_population
 from thermogrip.sysid.effusivity.posterior import material_posterior
 
 Array = NDArray[np.float64]
 KNOWN = (1, 3, 5, 10, 25)
-NONE = GripperSpread(**{part.name: 0.0 for part in fields(GripperSpread)})  # it is in the population
 
 
 def main() -> None:
@@ -67,11 +62,7 @@ def main() -> None:
     ours = PosteriorClassifier().fit(labelled(FIVE, repeats=5, seed=given.seed))
     rows: list[dict[str, Any]] = []
     with ProcessPoolExecutor(given.workers, mp_context=get_context("spawn")) as pool:
-        every = list(pool.map(calibrated, range(given.grippers)))
-        asks = [
-            pool.submit(about, ours, given.test, k, every[k], every[:k] + every[k + 1 :])
-            for k in range(given.grippers)
-        ]
+        asks = [pool.submit(about, ours, given.test, k) for k in range(given.grippers)]
         for k, answers in enumerate(one.result() for one in asks):
             for name, p, truth, seconds in answers:
                 rows += [
@@ -96,11 +87,9 @@ def calibrated(k: int) -> PosteriorClassifier:
     return PosteriorClassifier().fit(labelled(FIVE, repeats=5, seed=600 + k, rig=rig_of(k)))
 
 
-def about(
-    ours: PosteriorClassifier, test: int, k: int, own: PosteriorClassifier, others: list[PosteriorClassifier]
-) -> list[tuple[str, Array, list[str], float]]:
+def about(ours: PosteriorClassifier, test: int, k: int) -> list[tuple[str, Array, list[str], float]]:
     """Return all answers about gripper k."""
-    return list(asked(ours, rig_of(k), test, 500 + k, own, others))
+    return list(asked(ours, rig_of(k), test, 500 + k, calibrated(k)))
 
 
 def drawn(seed: int) -> Rig:
@@ -127,9 +116,8 @@ def drawn(seed: int) -> Rig:
 
 
 def asked(
-    ours: PosteriorClassifier, rig: Rig, test: int, seed: int, own: PosteriorClassifier,
-    others: list[PosteriorClassifier],
-) -> Iterator[tuple[str, Array, list[str], float]]:  # fmt: skip
+    ours: PosteriorClassifier, rig: Rig, test: int, seed: int, own: PosteriorClassifier
+) -> Iterator[tuple[str, Array, list[str], float]]:
     """Return (how, probabilities, truth, CPU seconds a grasp) of each way to ask about one gripper."""
     fresh = labelled(FIVE, repeats=test, seed=seed, rig=rig)
     truth = [str(m) for record in fresh for m in record["material"].values]
@@ -151,14 +139,6 @@ def asked(
     p = np.concatenate([material_posterior(cold, record, FIVE) for record in fresh])
     yield "cold, 10 known", p, truth, 0.0
     yield "cold, 100 of five", *_with(truth, answer(own))
-    if len(others) >= LEAST:
-        kind = PosteriorClassifier().with_device(gripper_population([one.device_ for one in others]))
-        yield "population, 0 known", *_with(truth, answer(kind))
-        for n in (1, 10):
-            yield (
-                f"population, {n} known",
-                *_with(truth, answer(kind.for_another_gripper(known[n], spread=NONE))),
-            )
 
 
 def _with(truth: list[str], answer: tuple[Array, float]) -> tuple[Array, list[str], float]:

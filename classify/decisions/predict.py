@@ -1,6 +1,7 @@
 """The answer for each grasp: a material, probabilities, and how likely it is none of them.
 
-``material`` is the likeliest known one.  ``p_unknown`` is beside the probabilities, not in their sum.
+``material`` is the likeliest known one, or "unknown" where it is likelier none of them; ``p_unknown`` is
+beside the probabilities, not in their sum.
 Touches of one block (``touch_group``) are one question: a classifier that knows how touches hang together
 answers it from all of them, of another the log probabilities are added, and each row has the common answer.
 ``decided_at_s`` is the contact time that was used: the last sample of the grasp or of its group's last
@@ -17,7 +18,8 @@ a contact that closed badly, or a trace that no such block gives.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
@@ -73,14 +75,83 @@ if TYPE_CHECKING:
 Row: TypeAlias = dict[str, Any]
 
 
-def classify_grasps(
-    classifier: GraspClassifier,
-    X: Records,
-    candidates: Sequence[str] | None = None,
-    *,
-    rule: StopRule | None = None,
-) -> list[Row]:
-    """Return one row a grasp: ``grasp_id, material, p_<material>..., p_unknown, decided_at_s``, and ``note``.
+UNKNOWN = "unknown"  # the material of a grasp that is likelier of none of the candidates
+
+
+@dataclass(frozen=True)
+class Note:
+    """One thing to know of an answer.
+
+    Parameters
+    ----------
+    code : str
+        For programs: ``readings`` (what of them was usable), ``other_touches`` (the answer is theirs),
+        ``beyond_training`` (another gripper, other blocks, a longer rest), ``not_explained``.
+    words : str
+        For people.
+    """
+
+    code: str
+    words: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Answer:
+    """What one grasp touched.
+
+    Parameters
+    ----------
+    grasp_id : str
+    material : str
+        "unknown" where it is likelier none of the candidates, "" without an answer.
+    probabilities : dict of str to float or None
+        Of each candidate if it is one of them; None without an answer.
+    p_unknown : float or None
+        That it is none of them [1]; None where the classifier has no model of other materials.
+    decided_at : float
+        Contact time that was used [s].
+    misfit_sd : float, optional
+        Of a single touch by ``posterior``: that of the trace under the likeliest candidate,
+        standardised [1].
+    deviates : str, optional
+        What that candidate requires that is unusual, where it is likelier none of them.
+    notes : tuple of Note, optional
+        All that there is to know; none hides another.
+    """
+
+    grasp_id: str
+    material: str
+    probabilities: dict[str, float | None]
+    p_unknown: float | None
+    decided_at: float
+    misfit_sd: float | None = None
+    deviates: str = ""
+    notes: tuple[Note, ...] = ()
+
+    @property
+    def nearest(self) -> str:
+        """The likeliest candidate, "" without an answer."""
+        p = {name: value for name, value in self.probabilities.items() if value is not None}
+        return max(p, key=p.__getitem__) if p else ""
+
+    def row(self) -> Row:
+        """Return the answer as a row of a table."""
+        out: Row = {"grasp_id": self.grasp_id, "material": self.material}
+        out |= {f"p_{name}": p for name, p in self.probabilities.items()}
+        out |= {"p_unknown": self.p_unknown, "decided_at_s": self.decided_at}
+        out |= {} if self.misfit_sd is None else {"misfit_sd": self.misfit_sd}
+        out |= {"deviates": self.deviates} if self.deviates else {}
+        if self.notes:
+            out["note"] = "; ".join(note.words for note in self.notes)
+            out["note_codes"] = " ".join(note.code for note in self.notes)
+        return out
+
+
+def answer(
+    classifier: GraspClassifier, X: Records, candidates: Sequence[str] | None = None, *,
+    rule: StopRule | None = None, object_range: tuple[float, float] | None = None, nearest: bool = False,
+) -> list[Answer]:  # fmt: skip
+    """Return what each grasp touched, by all that one needs to know of it.
 
     Parameters
     ----------
@@ -91,11 +162,14 @@ def classify_grasps(
         The materials in question; by default all that the classifier knows.
     rule : StopRule, optional
         Use of each grasp only what was read until this rule would have ended the contact.
+    object_range : (float, float), optional
+        Between what objects of unknown temperature are [degC]; by default 20 K about the room.
+    nearest : bool, optional
+        Name the likeliest candidate also where it is likelier none of them.
 
     Returns
     -------
-    rows : list of dict
-        A grasp that cannot be named has the material ``""`` and None for each probability.
+    answers : list of Answer
 
     Raises
     ------
@@ -108,47 +182,59 @@ def classify_grasps(
     >>> from thermogrip.classify import make_classifier
     >>> from thermogrip.datasets.examples import load_example_grasps
     >>> grasps = load_example_grasps()["exp2_dT20"]
-    >>> row = classify_grasps(make_classifier("features-lda").fit(grasps), grasps)[0]
-    >>> row["material"], round(row["p_copper"], 2), row["decided_at_s"]
-    ('copper', 0.94, 10.0)
+    >>> first = answer(make_classifier("features-lda").fit(grasps), grasps)[0]
+    >>> first.material, round(first.probabilities["copper"], 2), first.decided_at, first.notes
+    ('copper', 0.94, 10.0, ())
     """
     names = [str(c) for c in (classifier.classes_ if candidates is None else candidates)]
     if len(set(names)) < len(names):
         raise UserError("a candidate is named twice", hint="name each once")
-    return [row for grasps in record_list(X) for row in _answers(classifier, grasps, names, rule)]
+    return [
+        found
+        for grasps in record_list(X)
+        for found in _answers(classifier, grasps, names, rule, object_range, nearest=nearest)
+    ]
+
+
+def classify_grasps(
+    classifier: GraspClassifier, X: Records, candidates: Sequence[str] | None = None, **options: Any
+) -> list[Row]:
+    """Return :func:`answer` as rows of a table: ``grasp_id, material, p_<material>..., p_unknown,
+    decided_at_s``, and where there is something to say ``misfit_sd, deviates, note, note_codes``."""
+    return [found.row() for found in answer(classifier, X, candidates, **options)]
 
 
 def _answers(
-    classifier: GraspClassifier, grasps: Grasps, names: list[str], rule: StopRule | None
-) -> list[Row]:
-    """Return the rows of one record: those that can be answered for, and what the others get."""
-    whole = not classifier.leaves_samples_out
+    classifier: GraspClassifier, as_read: Grasps, names: list[str], rule: StopRule | None,
+    object_range: tuple[float, float] | None, *, nearest: bool,
+) -> list[Answer]:  # fmt: skip
+    """Return the answers of one record: those that can be given, and what the others get."""
+    whole, grasps = not classifier.leaves_samples_out, with_object_range(as_read, object_range)
     quality = check_grasps(grasps, longest=classifier.longest_, whole_traces=whole)
-    notes, usable, units = [*quality.note], quality.read(grasps), unit_names(grasps)
-    found, beyond = ([], []) if usable is None else _named(classifier, usable, names, rule)
-    for i, more in zip(np.flatnonzero(quality.usable), beyond):
-        notes[i] = notes[i] or more
+    usable, units = quality.read(grasps), unit_names(grasps)
+    found = [] if usable is None else _named(classifier, usable, names, rule, nearest=nearest)
     of_unit = {} if usable is None else dict(zip(unit_names(usable).tolist(), found))
     last = _last_samples(grasps["time"].values, grasps["t_surface"].values, units)
-    left = iter(found)
-    rows: list[Row] = []
-    for i, grasp_id in enumerate(grasps["grasp"].values):
-        note = notes[i]
+    left, answers = iter(found), list[Answer]()
+    for i, grasp_id in enumerate(grasps["grasp"].values.astype(str).tolist()):
+        notes: tuple[Note, ...] = (Note("readings", quality.note[i]),) if quality.note[i] else ()
         if quality.usable[i]:
-            row = next(left)
+            one = next(left)
+            notes += one.notes
         elif units[i] in of_unit:
-            row, note = dict(of_unit[str(units[i])]), f"{note}: the answer of its block's other touches"
+            one = of_unit[str(units[i])]
+            notes = (Note("other_touches", f"{quality.note[i]}: the answer of its block's other touches"),)
         else:
-            row = _no_name(names, quality.reason[i], float(last[i]))
-        rows.append({"grasp_id": str(grasp_id)} | row | ({"note": note} if note else {}))
-    return rows
+            one = _no_answer(names, quality.reason[i], float(last[i]))
+        answers.append(replace(one, grasp_id=grasp_id, notes=notes))
+    # what a contact that a rule ended would have shown later is no misfit of its answer
+    return answers if rule is not None else _with_misfits(classifier, as_read, answers, object_range)
 
 
 def _named(
-    classifier: GraspClassifier, grasps: Grasps, names: list[str], rule: StopRule | None
-) -> tuple[list[Row], list[str]]:
-    """Return the answers of a classifier to grasps whose usable part is given, without their names, and what
-    makes each overconfident."""
+    classifier: GraspClassifier, grasps: Grasps, names: list[str], rule: StopRule | None, *, nearest: bool
+) -> list[Answer]:
+    """Return the answers of a classifier to grasps whose usable part is given, without their ids."""
     if rule is None:
         units = unit_names(grasps)
         log_p, unknown, beyond = classifier.open_set_answer(grasps, names)
@@ -157,19 +243,54 @@ def _named(
     else:
         log_p, unknown, decided = _stopped(classifier, grasps, names, rule)
         beyond = classifier.beyond_training(grasps)
-    rows: list[Row] = []
+    out = []
     for i, row in enumerate(log_p):
-        answer: Row = {"material": names[int(row.argmax())]}
-        answer |= {f"p_{name}": float(p) for name, p in zip(names, np.exp(row))}
-        answer["p_unknown"] = float(unknown[i]) if np.isfinite(unknown[i]) else None
-        rows.append(answer | {"decided_at_s": float(decided[i])})
-    return rows, beyond
+        p_unknown = float(unknown[i]) if np.isfinite(unknown[i]) else None
+        none = not nearest and p_unknown is not None and p_unknown > _STRANGE
+        out.append(
+            Answer(
+                grasp_id="", material=UNKNOWN if none else names[int(row.argmax())],
+                probabilities={name: float(p) for name, p in zip(names, np.exp(row))}, p_unknown=p_unknown,
+                decided_at=float(decided[i]),
+                notes=(Note("beyond_training", beyond[i]),) if beyond[i] else (),
+            )
+        )  # fmt: skip
+    return out
 
 
-def _no_name(names: list[str], why: str, last: float) -> Row:
-    """Return the row of an unusable grasp; without contact it is none of the candidates for certain."""
-    none: Row = {"material": ""} | {f"p_{name}": None for name in names}
-    return none | {"p_unknown": 1.0 if why == NO_CONTACT else None, "decided_at_s": last}
+def _no_answer(names: list[str], why: str, last: float) -> Answer:
+    """Return the answer of an unusable grasp; without contact it is none of the candidates for certain."""
+    return Answer(
+        grasp_id="", material="", probabilities=dict.fromkeys(names), decided_at=last,
+        p_unknown=1.0 if why == NO_CONTACT else None,
+    )  # fmt: skip
+
+
+def _with_misfits(
+    classifier: GraspClassifier, grasps: Grasps, answers: list[Answer], stated: tuple[float, float] | None
+) -> list[Answer]:
+    """Return the answers to one record with what the likeliest candidate does not explain, and what it
+    requires that is unusual, of single touches by an exactly known gripper."""
+    # an uncertain gripper may be the reason itself
+    if not isinstance(classifier, PosteriorClassifier) or classifier.device_.uncertain:
+        return answers
+    single = label_values(grasps, "touch_group") == ""
+    at = np.array([i for i, one in enumerate(answers) if single[i] and one.nearest], dtype=np.int64)
+    if not at.size:
+        return answers
+    out, model = [*answers], classifier.device_
+    data, ends = _asked(grasps, at, classifier.longest_, stated)
+    named = [answers[i].nearest for i in at]
+    misfits = _unexplained(model, data, ends, _taken_for(model, named, finish=classifier.as_taught))
+    strange = np.flatnonzero([(answers[i].p_unknown or 0.0) > _STRANGE for i in at])
+    words = dict.fromkeys(range(at.size), "")
+    if strange.size:
+        unusual = deviations(model, data.take(strange), [named[k] for k in strange])
+        words |= {k: deviation_words(named[k], row) for k, row in zip(strange.tolist(), unusual)}
+    for k, (i, (misfit, why)) in enumerate(zip(at.tolist(), misfits)):
+        notes = (*out[i].notes, Note("not_explained", why)) if why else out[i].notes
+        out[i] = replace(out[i], misfit_sd=misfit, deviates=words[k], notes=notes)
+    return out
 
 
 def _stopped(
@@ -288,20 +409,6 @@ def _unexplained(device: GripperModel, data: Touches, ends: Array, hypotheses: H
     return out
 
 
-def unexplained_answers(
-    classifier: GraspClassifier, X: Records, rows: Sequence[Row], stated: tuple[float, float] | None = None
-) -> list[Deviation]:
-    """Return for each row of predictions the misfit under its material, and in words what that does not
-    explain, with unknown object temperatures in the range ``stated`` [degC]; NaN and empty as for
-    :func:`reasons`."""
-    out = [Deviation(np.nan, "")] * len(rows)
-    for model, at, data, ends, named in _single_named(classifier, X, rows, stated):
-        hypotheses = _taken_for(model.device_, named, finish=model.as_taught)
-        for i, why in zip(at, _unexplained(model.device_, data, ends, hypotheses)):
-            out[i] = why
-    return out
-
-
 def unexplained_effusivities(
     device: GripperModel,
     grasps: Grasps,
@@ -326,67 +433,6 @@ def deviation_words(material: str, row: Sequence[Deviation]) -> str:
     """Return in words which unusual values a material requires; empty where nothing is unusual."""
     unusual = [f"{s.words} ({s.sd:.1f} sd)" for s in row if s.sd > _UNUSUAL][:2]
     return f"as {material} it needs {' and '.join(unusual)}" if unusual else ""
-
-
-def reasons(classifier: GraspClassifier, X: Records, rows: Sequence[Row]) -> list[str]:
-    """Return for each row of predictions why it is taken for no known material, empty where it is not.
-
-    Parameters
-    ----------
-    classifier : GraspClassifier
-        Only ``posterior`` has a model for that.
-    X : Grasps or list of Grasps
-        What was classified.
-    rows : (n,) sequence of dict
-        As :func:`~thermogrip.classify.decisions.predict.classify_grasps` returned them.
-
-    Returns
-    -------
-    words : (n,) list of str
-        Empty too for touches of one block, which have no nominal temperature, and for grasps without a name.
-
-    Examples
-    --------
-    >>> from thermogrip.classify.estimators.posterior import PosteriorClassifier
-    >>> from thermogrip.datasets.examples import load_example_grasps
-    >>> from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
-    >>> known = PosteriorClassifier().with_device(load_default_gripper())
-    >>> cork = load_example_grasps()["exp6_other_materials_obj43_grip23"].sel(grasp=["u009"])
-    >>> [why] = reasons(known, cork, classify_grasps(known, cork, ["copper", "wood"]))
-    >>> why.split(" and ")[0]
-    "as wood it needs 0.34 times its block's effusivity (12.6 sd)"
-    """
-    out = [""] * len(rows)
-    for model, at, data, _, named in _single_named(classifier, X, rows, least=_STRANGE):
-        for i, name, row in zip(at, named, deviations(model.device_, data, named)):
-            out[i] = deviation_words(name, row)
-    return out
-
-
-def _single_named(
-    classifier: GraspClassifier,
-    X: Records,
-    rows: Sequence[Row],
-    stated: tuple[float, float] | None = None,
-    least: float = -1.0,
-) -> Iterator[tuple[PosteriorClassifier, list[int], Touches, Array, list[str]]]:
-    """Yield of each record the classifier of an exactly known gripper, the rows that name single touches with
-    a ``p_unknown`` above ``least``, these as :func:`_asked` returns them, and their names."""
-    # an uncertain gripper may be the reason itself
-    if not isinstance(classifier, PosteriorClassifier) or classifier.device_.uncertain:
-        return
-    first = 0
-    for grasps in record_list(X):
-        group = label_values(grasps, "touch_group")
-        at = [
-            first + i
-            for i, row in enumerate(rows[first : first + group.size])
-            if group[i] == "" and row["material"] and (row["p_unknown"] or 0.0) > least
-        ]
-        if at:
-            data, ends = _asked(grasps, np.array(at) - first, classifier.longest_, stated)
-            yield classifier, at, data, ends, [str(rows[i]["material"]) for i in at]
-        first += group.size
 
 
 def _asked(

@@ -35,23 +35,21 @@ if TYPE_CHECKING:
 MOST_BYTES = 1 << 18  # of a request
 BODY_S = 10.0  # for the body of a request to come
 HOST = "127.0.0.1"
-#: What returns the ``rows`` of a record, and by grasp why some are ``strange``.
-Answer: TypeAlias = "Callable[[Grasps], Mapping[str, Any]]"
+#: What returns the rows of a record.
+Rows: TypeAlias = "Callable[[Grasps], list[dict[str, Any]]]"
 
 _TRACES = {"time_s": "time", "t_surface_degC": "t_surface", "t_surface_2_degC": "t_surface_2"}
 _NUMBERS = {META_NAMES.get(name, name) + ("" if unit == "1" else f"_{unit}"): name
             for name, unit in GRASP_NUMBERS.items()}  # fmt: skip
 
 
-def reply(answer: Answer, request: bytes) -> dict[str, Any]:
+def reply(answer: Rows, request: bytes) -> dict[str, Any]:
     """Return the answer to one request, or what is wrong with it."""
     given: Any = {}
     try:
         given = _content(request)
-        said = answer(grasp_of(given))
-        found = {key: _plain(value) for key, value in said["rows"][0].items() if key != "grasp_id"}
-        for why in said["strange"].values():
-            found["strange"] = why
+        (row,) = answer(grasp_of(given))
+        found = {key: _plain(value) for key, value in row.items() if key != "grasp_id"}
     except UserError as error:
         found = {"error": str(error)}
     return ({"id": given["id"]} if "id" in given else {}) | found
@@ -81,7 +79,7 @@ def grasp_of(given: Mapping[str, Any]) -> Grasps:
     return record
 
 
-def serve_lines(answer: Answer, requests: BinaryIO, answers: BinaryIO) -> int:
+def serve_lines(answer: Rows, requests: BinaryIO, answers: BinaryIO) -> int:
     """Answer lines of JSON until they end; return how many there were."""
     n = 0
     while line := requests.readline(MOST_BYTES + 2):

@@ -161,22 +161,16 @@ class PosteriorClassifier(GraspClassifier):
         return self
 
     def for_another_gripper(
-        self, known: Records | None = None, *, spread: GripperSpread | None = None,
-        others: Sequence[GripperModel] = (),
-    ) -> PosteriorClassifier:  # fmt: skip
+        self, known: Records | None = None, *, spread: GripperSpread | None = None
+    ) -> PosteriorClassifier:
         """Return this classifier for another gripper of the same kind, ``spread`` from it as their making
-        allows by default, or as this one and two ``others`` or more differ.
+        allows by default.
 
         Of ``known``, grasps of the other gripper whose material is known, one helps most, three to ten of two
         materials reach nearly all.  Without them answers are as uncertain as grippers differ.
         """
         self._check_fitted()
-        if others:
-            from thermogrip.sysid.effusivity.population import gripper_population
-
-            device = gripper_population([self.device_, *others])
-        else:
-            device = another_gripper(self.device_, spread)
+        device = another_gripper(self.device_, spread)
         if known is not None:
             from thermogrip.sysid.effusivity.calibration import calibrate_gripper
 

@@ -3,7 +3,6 @@ from thermogrip.sysid.effusivity.gripper_model import GripperModel as GripperMod
 from thermogrip.sysid.effusivity.gripper_model import another_gripper as another_gripper
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper as load_default_gripper
 from thermogrip.sysid.effusivity.multi_touch import Coupling as Coupling
-from thermogrip.sysid.effusivity.population import gripper_population as gripper_population
 from thermogrip.sysid.effusivity.posterior import EffusivityRow as EffusivityRow
 from thermogrip.sysid.effusivity.posterior import MaterialFit as MaterialFit
 from thermogrip.sysid.effusivity.posterior import effusivity_posterior as effusivity_posterior

@@ -15,7 +15,7 @@ import pandas as pd
 import pytest
 
 from tests.cli.conftest import Bench, StandIn, shares, words_of
-from thermogrip.classify.decisions.predict import Deviation
+from thermogrip.classify.decisions.predict import Answer, Deviation, Note
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.cli import classify as verb
 from thermogrip.cli.classify import SHOWN, say_names, touched_part, training_part
@@ -379,11 +379,16 @@ def test_a_stop_rule_is_learnt_from_grasps_of_known_temperature(
         verb._stop_rule(Console(), "model", records[1:], 0.1)
 
 
-ROWS = (
-    {"grasp_id": "a", "material": "iron", "p_iron": 0.75, "p_wood": 0.25, "p_unknown": 0.125,
-     "decided_at_s": 9.0},
-    {"grasp_id": "b", "material": "", "p_iron": None, "p_wood": None, "p_unknown": None, "decided_at_s": 8.0,
-     "note": "no contact"},
+ANSWERS = (
+    Answer(
+        grasp_id="a", material="iron", probabilities={"iron": 0.75, "wood": 0.25}, p_unknown=0.125,
+        decided_at=9.0, misfit_sd=4.5, deviates="too cold for iron",
+        notes=(Note("far", "far"), Note("odd", "odd")),
+    ),
+    Answer(
+        grasp_id="b", material="", probabilities={"iron": None, "wood": None}, p_unknown=None, decided_at=8.0,
+        notes=(Note("readings", "no contact"),),
+    ),
 )  # fmt: skip
 
 
@@ -399,14 +404,7 @@ def named(bench: Bench, stand_in: StandIn) -> SimpleNamespace:
     made.ranged = stand_in("thermogrip.sysid.effusivity.data.with_object_range", lambda *_: "ranged")
     made.loaded = stand_in("thermogrip.classify.estimators.registry.load_classifier", lambda _: made.model)
     made.rules = stand_in("thermogrip.classify.decisions.stopping_rule.load_stop_rule", "a rule")
-    made.asked = stand_in(
-        "thermogrip.classify.decisions.predict.classify_grasps", lambda *_, **__: [dict(row) for row in ROWS]
-    )
-    made.unexplained = stand_in(
-        "thermogrip.classify.decisions.predict.unexplained_answers",
-        [Deviation(4.5, "odd"), Deviation(float("nan"), "odder")],
-    )
-    made.reasons = stand_in("thermogrip.classify.decisions.predict.reasons", ["too cold for iron", ""])
+    made.asked = stand_in("thermogrip.classify.decisions.predict.answer", lambda *_, **__: [*ANSWERS])
     return made
 
 
@@ -415,28 +413,27 @@ def test_answers_are_printed_written_and_answered(named: SimpleNamespace) -> Non
     done = named.bench.run(*words, "--materials", "iron,wood", "--object-range", "0,12")
     assert done.code == 0, done
     [asked] = named.asked
-    assert (asked.args, asked.rule) == (("a model", ["ranged"], ("iron", "wood")), None)
+    assert (asked.args, asked.rule) == (("a model", named.record, ("iron", "wood")), None)
+    assert (asked.object_range, asked.nearest) == ((0.0, 12.0), False)
     assert named.loaded[0].args == (Path("m"),)
-    assert named.ranged[0].args == (named.record, (0.0, 12.0))
-    assert (named.unexplained[0].args[0], named.unexplained[0].args[1]) == ("a model", [named.record])
-    assert named.unexplained[0].args[3] == (0.0, 12.0)
-    assert (named.reasons[0].args[:2], named.warned[0].args[1]) == (("a model", ["ranged"]), [named.record])
+    assert named.warned[0].args[1] == [named.record]
     said = words_of(done.out)
     assert "grasp material probability p unknown decided at [s]" in said
     assert "a iron 0.75 0.125 9 b - - 8" in said
-    assert said.count("odd: a no contact, so no name: b") == 1
+    assert said.count("far; odd: a no contact, so no name: b") == 1
     assert said.endswith(": too cold for iron wrote p.csv")
     assert (named.bench.path / "p.csv").read_text().splitlines()[1].startswith("a,iron,0.75,0.25,0.125,9")
     answer = json.loads(named.bench.run(*words, "--json").out)
-    first, second = ROWS
     assert answer == {
-        "grasps": [first | {"misfit_sd": 4.5, "note": "odd"}, second],
-        "strange": {"a": "too cold for iron"}, "out": "p.csv",
+        "grasps": [one.row() for one in ANSWERS], "strange": {"a": "too cold for iron"}, "out": "p.csv"
     }  # fmt: skip
+    assert (answer["grasps"][0]["note"], answer["grasps"][0]["note_codes"]) == ("far; odd", "far odd")
+    assert named.bench.run(*words, "--nearest").code == 0
+    assert named.asked[-1].nearest
 
 
 def test_a_single_grasp_is_named(named: SimpleNamespace, stand_in: StandIn) -> None:
-    stand_in("thermogrip.classify.decisions.predict.classify_grasps", [dict(ROWS[0])])
+    stand_in("thermogrip.classify.decisions.predict.answer", [replace(ANSWERS[0], deviates="", notes=())])
     done = named.bench.run("classify", "m", "grasps.csv", "--early", "--out", "p.csv")
     assert (done.code, "a iron 0.75 0.125 9 wrote p.csv" in words_of(done.out)) == (0, True), done
 
@@ -449,8 +446,6 @@ def test_early_answers_are_those_of_the_stop_rule(named: SimpleNamespace) -> Non
         None,
         (Path("m"),),
     )
-    assert not named.unexplained + named.reasons
-    assert json.loads(done.out)["strange"] == {}
 
 
 @pytest.mark.parametrize(
@@ -469,7 +464,7 @@ def test_requests_are_answered_by_lines_or_over_http(named: SimpleNamespace, sta
         "thermogrip.classify.decisions.serve.server", SimpleNamespace(run=lambda sockets: ran.extend(sockets))
     )
     assert named.bench.run("classify", "m", "--serve", "--materials", "iron,wood").code == 0
-    assert lines[0].args[0](named.record)["rows"][0]["material"] == "iron"
+    assert lines[0].args[0](named.record)[0]["material"] == "iron"
     assert named.asked[0].args[2] == ("iron", "wood")
     done = named.bench.run("classify", "m", "--serve", "--port", "0")
     assert (done.code, ran == [served[0].args[1]]) == (0, True), done
@@ -487,7 +482,7 @@ def test_requests_are_answered_by_lines_or_over_http(named: SimpleNamespace, sta
 
 
 @pytest.mark.parametrize("option", ["--early", "--next-touch"])
-@pytest.mark.parametrize("other", [["--other-gripper"], ["--known", "more.csv"], ["--others", "m"]])
+@pytest.mark.parametrize("other", [["--other-gripper"], ["--known", "more.csv"]])
 def test_of_another_gripper_nothing_is_foreseen(
     option: str, other: list[str], named: SimpleNamespace
 ) -> None:
@@ -504,12 +499,12 @@ def test_another_gripper_is_known_by_its_grasps_or_not_at_all(
     monkeypatch.setattr(
         PosteriorClassifier,
         "for_another_gripper",
-        lambda self, known, others: (asked.append((known, others)), "another")[1],
+        lambda self, known: (asked.append(known), "another")[1],
     )
     words = ["classify", "m", "grasps.csv", "--out", "p.csv"]
     for other in (["--other-gripper"], ["--known", "more.csv"], []):
         assert named.bench.run(*words, *other).code == 0
-    assert asked == [(None, []), ([named.record], [])]
+    assert asked == [None, [named.record]]
     assert [call.args[0] for call in named.asked] == ["another", "another", named.model]
     assert named.bench.run(*words, "--same-gripper").code == 0
     certain = named.asked[-1].args[0]
@@ -522,7 +517,7 @@ def test_another_gripper_is_known_by_its_grasps_or_not_at_all(
     assert (refused.code, "train a posterior classifier" in refused.said[0]) == (2, True)
 
 
-def test_another_touch_and_the_cheaper_answer_are_columns_of_their_own(
+def test_another_touch_is_a_column_of_its_own(
     named: SimpleNamespace, stand_in: StandIn
 ) -> None:
     def advise(*_: Any, **__: Any) -> list[dict[str, Any]]:
@@ -531,12 +526,12 @@ def test_another_touch_and_the_cheaper_answer_are_columns_of_their_own(
 
     asked = stand_in("thermogrip.classify.decisions.next_touch.advise_touches", advise)
     words = ["classify", "m", "grasps.csv", "--out", "p.csv", "--materials", "iron,wood"]
-    done = named.bench.run(*words, "--next-touch", "--or-unknown")
+    done = named.bench.run(*words, "--next-touch")
     assert done.code == 0, done
     assert (asked[0].args, asked[0].candidates) == (("a model", "ranged"), ("iron", "wood"))
     said = words_of(done.out)
-    assert "decided at [s] answer touch at [degC] then right" in said
-    assert "a iron 0.75 0.125 9 iron 15 0.9 b - - 8 unknown - -" in said
+    assert "decided at [s] touch at [degC] then right" in said
+    assert "a iron 0.75 0.125 9 15 0.9 b - - 8 - -" in said
 
 
 @pytest.mark.parametrize(("n", "more"), [(1, ""), (SHOWN, ""), (SHOWN + 1, " and 1 more")])
@@ -546,17 +541,6 @@ def test_grasps_of_one_note_are_named_in_one_line_up_to_a_number(
     say_names(Console(), [*(("no contact", f"g{k}") for k in range(n)), ("short", "h")])
     names = ", ".join(f"g{k}" for k in range(min(n, SHOWN)))
     assert words_of(capsys.readouterr().out) == words_of(f"no contact: {names}{more} short: h")
-
-
-def test_the_cheaper_answer_is_the_likeliest_candidate_or_unknown() -> None:
-    rows = [
-        {"p_iron": 0.9, "p_wood": 0.1, "p_unknown": 0.05},
-        {"p_iron": 0.1, "p_wood": 0.9, "p_unknown": 0.05},
-        {"p_iron": 0.9, "p_wood": 0.1, "p_unknown": 0.95},
-        {"p_iron": None, "p_wood": None, "p_unknown": None},
-    ]
-    verb._answer_or_unknown(rows)
-    assert [row["answer"] for row in rows] == ["iron", "wood", "unknown", "unknown"]
 
 
 def test_materials_are_listed_by_their_effusivity(bench: Bench) -> None:

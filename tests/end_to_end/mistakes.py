@@ -27,7 +27,7 @@ MISTAKES = {
     "identify log.csv --input drive": "did you mean '--inputs'?",
     "tune plant.json --ot c.json": "did you mean '--out'?",
     "run controller.json --traget 38 --twin plant.json --out r": "did you mean '--target'?",
-    "classify model grasps.csv --or-unknwon --out p.csv": "did you mean '--or-unknown'?",
+    "classify model grasps.csv --nearset --out p.csv": "did you mean '--nearest'?",
     "compare grasps.csv --classifer bayes --out c": "did you mean '--classifiers'?",
     "warmup": "Did you mean 'warm-up'",
     "export controller.json --out fw --chekc": "did you mean '--check'?",

@@ -45,10 +45,10 @@ def test_a_controller_of_0_1_0_moves_the_same() -> None:
 
 
 # bayes of today divides each grasp's features by its own difference of temperature; posterior knows that a
-# stated temperature of an object may be a slip, and that of this grasp is 1.3 K off
+# grasp may be unlike its training, and the stated temperature of this one is 1.3 K off
 @pytest.mark.parametrize(
     ("name", "tolerance"),
-    [("bayes", 0.02), ("features-lda", 1e-6), ("pca-lda", 1e-6), ("posterior", 0.08), ("lstm", 1e-4)],
+    [("bayes", 0.02), ("features-lda", 1e-6), ("pca-lda", 1e-6), ("posterior", 0.13), ("lstm", 1e-4)],
 )
 def test_a_classifier_of_0_1_0_answers_the_same(name: str, tolerance: float) -> None:
     row = classify_grasps(load_classifier(OLD / name), read_grasps(OLD / "run" / "grasps.csv"))[0]

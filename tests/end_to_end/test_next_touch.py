@@ -12,7 +12,6 @@ from thermogrip.classify import save_classifier
 from thermogrip.classify.estimators.posterior import PosteriorClassifier
 from thermogrip.datasets.examples import load_example_grasps
 from thermogrip.datasets.grasp_files import write_grasps
-from thermogrip.sysid.effusivity import calibrate_gripper
 from thermogrip.sysid.effusivity.gripper_model import load_default_gripper
 
 FIVE = ("brass", "copper", "iron", "wood", "zinc")
@@ -51,11 +50,11 @@ def test_another_touch_is_worth_it_where_metals_are_open(finger):
     assert json.loads(done.out)["grasps"][1]["next_touch_degC"] is None
 
 
-def test_unknown_is_an_answer_beside_the_likeliest_material(finger):
-    assert finger.run("classify", "finger", "cork.csv", "--or-unknown", "--out", "p.csv").code == 0
-    rows = table(finger.path / "p.csv")
-    assert {row["answer"] for row in rows} == {"unknown"}
-    assert {row["material"] for row in rows} == {"wood"}
+def test_a_material_outside_the_candidates_is_unknown_but_for_nearest(finger):
+    assert finger.run("classify", "finger", "cork.csv", "--out", "p.csv").code == 0
+    assert {row["material"] for row in table(finger.path / "p.csv")} == {"unknown"}
+    assert finger.run("classify", "finger", "cork.csv", "--nearest", "--out", "p.csv").code == 0
+    assert {row["material"] for row in table(finger.path / "p.csv")} == {"wood"}
 
 
 def test_another_gripper_is_answered_less_surely_until_it_is_known(finger):
@@ -71,28 +70,3 @@ def test_another_gripper_is_answered_less_surely_until_it_is_known(finger):
     refused = finger.run("classify", "finger", "new.csv", "--known", "new.csv", "--out", "q.csv")
     assert (refused.code, "no material" in refused.said[0]) == (2, True)
     assert not (finger.path / "q.csv").exists()
-
-
-def test_further_grippers_say_how_far_another_one_differs(finger):
-    """Three calibrations of one gripper differ less than grippers do: the answer is surer."""
-    files = load_example_grasps()
-    for name in ("exp2_dT10", "exp2_dT15", "exp2_dT20"):
-        device = calibrate_gripper([files[name]], start=load_default_gripper())
-        save_classifier(PosteriorClassifier().with_device(device), finger.path / name)
-    new = files["exp2_dT10"].isel(grasp=[3, 12]).drop_vars("material")
-    write_grasps(new, finger.path / "new.csv")
-
-    def confidence(*options):
-        done = finger.run("classify", "exp2_dT20", "new.csv", *options, "--out", "p.csv")
-        assert done.code == 0, done.err
-        names = ("copper", "iron", "wood")
-        return np.mean(
-            [max(float(row[f"p_{name}"]) for name in names) for row in table(finger.path / "p.csv")]
-        )
-
-    others = ["--others", "exp2_dT10", "--others", "exp2_dT15"]
-    assert confidence("--other-gripper") < confidence(*others) <= confidence("--same-gripper") + 0.01
-    refused = finger.run("classify", "exp2_dT20", "new.csv", *others[:2], "--out", "q.csv")
-    assert (refused.code, "2 grippers make no population" in refused.said[0]) == (2, True)
-    refused = finger.run("classify", "exp2_dT20", "new.csv", *others, "--same-gripper", "--out", "q.csv")
-    assert (refused.code, "--same-gripper contradicts" in refused.said[0]) == (2, True)

@@ -104,7 +104,7 @@ def training_part(console: Console, records: Sequence[Grasps], split: str | None
 
 
 SHOWN, ON_A_PAGE = 40, 200  # rows of a long table: printed, and in a report
-_HEADS = {"answer": "answer", "next_touch_degC": "touch at [degC]", "next_touch_accuracy": "then right"}
+_HEADS = {"next_touch_degC": "touch at [degC]", "next_touch_accuracy": "then right"}
 
 ObjectRange = Annotated[
     str | None,
@@ -282,8 +282,8 @@ def classify(
             "--next-touch", "Also say at which temperature another touch is worth its time [posterior]."
         ),
     ] = False,
-    or_unknown: Annotated[
-        bool, cli.flag("--or-unknown", "Also give the answer that may be 'unknown' [posterior].")
+    nearest: Annotated[
+        bool, cli.flag("--nearest", "Name the likeliest candidate also where none is likelier [posterior].")
     ] = False,
     other_gripper: Annotated[
         bool, cli.flag("--other-gripper", "Another gripper of the same kind took these grasps [posterior].")
@@ -295,14 +295,6 @@ def classify(
     known: Annotated[
         list[str] | None,
         cli.opt("--known", "GRASPS", "Labelled grasps of that other gripper, one or more; may be repeated."),
-    ] = None,
-    others: Annotated[
-        list[Path] | None,
-        cli.opt(
-            "--others",
-            "MODEL_DIR",
-            "Models of further grippers of the kind, two or more: the option once for each [posterior].",
-        ),
     ] = None,
     between: ObjectRange = None,
     serve: Annotated[
@@ -323,10 +315,11 @@ def classify(
     name, and readings at the end of the sensor's range, or later than contacts of the training lasted, are
     left out: see the column note. With --early the stop rule that train --stop-error learnt says when
     each contact could have ended. --next-touch adds next_touch_degC, empty where no touch gains 0.001 of
-    accuracy a second, and the accuracy expected after it; --or-unknown adds answer. A model is trained on
+    accuracy a second, and the accuracy expected after it. The material is 'unknown' where it is likelier none
+    of the candidates, but for --nearest. A model is trained on
     one gripper and its blocks; each file decides whether another gripper or other blocks explain it better,
     and is then answered as unsurely as these differ. --same-gripper and --other-gripper say which it is,
-    --known what the other one reads of blocks it knows, --others how far such grippers differ.
+    --known what the other one reads of blocks it knows.
 
     Files are read one by one, workers share them out. Where --out is a folder each file's table is written
     there when it is done. --serve takes one object a line,
@@ -336,9 +329,9 @@ def classify(
     stated = _range(between)
     if serve == bool(paths) or serve == (out is not None) or (port is not None and not serve):
         raise UserError("give GRASPS and --out, or --serve alone", hint="--port belongs to --serve")
-    other_gripper = other_gripper or bool(known or others)
+    other_gripper = other_gripper or bool(known)
     if same_gripper and other_gripper:
-        problem = "--same-gripper contradicts --other-gripper, --known and --others"
+        problem = "--same-gripper contradicts --other-gripper and --known"
         raise UserError(problem, hint="give one of them")
     if other_gripper and (early or next_touch):
         problem = (
@@ -356,10 +349,9 @@ def classify(
     anywhere = Path.absolute if cluster else Path  # its workers run in other folders
     ask = _Question(
         anywhere(model_dir), cli.comma(candidates), stated, early=early, next_touch=next_touch,
-        or_unknown=or_unknown, other_gripper=other_gripper, same_gripper=same_gripper,
+        nearest=nearest, other_gripper=other_gripper, same_gripper=same_gripper,
         known=tuple(str(anywhere(Path(path))) for path in known or ()),
-        others=tuple(str(anywhere(path)) for path in others or ()),
-        changed_at=_changed_at([model_dir, *(known or ()), *(others or ())]),
+        changed_at=_changed_at([model_dir, *(known or ())]),
     )  # fmt: skip
     if serve:
         return _serve(console, ask, port, pool)
@@ -367,7 +359,7 @@ def classify(
     _answerer(ask)
     found = answer_files(console, "classify", paths or [], ask.answer, out, pool)
     rows = [row for each in found for row in each["rows"]]
-    more = [key for key in ("answer", "next_touch_degC", "next_touch_accuracy") if key in rows[0]]
+    more = [key for key in ("next_touch_degC", "next_touch_accuracy") if key in rows[0]]
     shown = [
         (
             row["grasp_id"],
@@ -390,7 +382,7 @@ def classify(
             if row.get("note")
         ),
     )
-    strange = {name: why for each in found for name, why in each["strange"].items()}
+    strange = {row["grasp_id"]: row["deviates"] for row in rows if row.get("deviates")}
     for name, why in [*strange.items()][:SHOWN]:
         console.say(f"{name} is out of distribution: {why}")
     console.say(f"wrote {out}")
@@ -430,18 +422,17 @@ class _Question:
     stated: tuple[float, float] | None = None
     early: bool = False
     next_touch: bool = False
-    or_unknown: bool = False
+    nearest: bool = False
     other_gripper: bool = False
     same_gripper: bool = False
     known: tuple[str, ...] = ()
-    others: tuple[str, ...] = ()
     changed_at: int = 0  # of the model's files [ns]: a worker of a cluster loads another model then
 
     def answer(self, record: Grasps) -> dict[str, Any]:
         """Return the rows of a record, and warnings of it."""
         said = Said()
         cli.warn_of_contacts(said, [record])
-        return _answerer(self)(record) | {"warnings": said.words}
+        return {"rows": _answerer(self)(record), "warnings": said.words}
 
     def reply(self, request: bytes) -> dict[str, Any]:
         """Return the answer to one request of a server."""
@@ -449,9 +440,9 @@ class _Question:
 
         return reply(_answerer(self), request)
 
-    def load(self) -> Callable[[Grasps], dict[str, Any]]:
-        """Return what answers a record with its rows and why some are out of distribution."""
-        from thermogrip.classify.decisions.predict import classify_grasps, reasons, unexplained_answers
+    def load(self) -> Callable[[Grasps], list[dict[str, Any]]]:
+        """Return what answers a record with a row a grasp."""
+        from thermogrip.classify.decisions.predict import answer
         from thermogrip.classify.decisions.stopping_rule import load_stop_rule
         from thermogrip.classify.estimators.registry import load_classifier
         from thermogrip.datasets.grasp_files import read_grasp_files
@@ -461,37 +452,28 @@ class _Question:
         rule = load_stop_rule(self.model_dir) if self.early else None
         if self.other_gripper:
             known = read_grasp_files(self.known) if self.known else None
-            others = [_with_gripper(load_classifier(path)).device_ for path in self.others]
-            model = _with_gripper(model).for_another_gripper(known, others=others)
+            model = _with_gripper(model).for_another_gripper(known)
         if self.same_gripper:
             model = _with_gripper(model).certain()
 
-        def answer(record: Grasps) -> dict[str, Any]:
-            ranged = [with_object_range(record, self.stated)]
-            rows = classify_grasps(model, ranged, self.candidates, rule=rule)
-            why_strange = [""] * len(rows)
-            if not self.early:
-                for row, (misfit, why) in zip(rows, unexplained_answers(model, [record], rows, self.stated)):
-                    if misfit == misfit:
-                        row["misfit_sd"] = misfit
-                    if why and not row.get("note"):
-                        row["note"] = why
-                why_strange = reasons(model, ranged, rows)
+        def rows_of(record: Grasps) -> list[dict[str, Any]]:
+            found = answer(
+                model, record, self.candidates, rule=rule, object_range=self.stated, nearest=self.nearest
+            )
+            rows = [one.row() for one in found]
             if self.next_touch:  # at which temperature another touch of its block would be worth most
                 from thermogrip.classify.decisions.next_touch import advise_touches
 
-                for row, advice in zip(rows, advise_touches(model, ranged[0], candidates=self.candidates)):
+                ranged = with_object_range(record, self.stated)
+                for row, advice in zip(rows, advise_touches(model, ranged, candidates=self.candidates)):
                     row |= advice
-            if self.or_unknown:
-                _answer_or_unknown(rows)
-            strange = {row["grasp_id"]: why for row, why in zip(rows, why_strange) if why}
-            return {"rows": rows, "strange": strange}
+            return rows
 
-        return answer
+        return rows_of
 
 
 @lru_cache(maxsize=1)
-def _answerer(ask: _Question) -> Callable[[Grasps], dict[str, Any]]:
+def _answerer(ask: _Question) -> Callable[[Grasps], list[dict[str, Any]]]:
     """Return what answers a record, loaded once a process."""
     return ask.load()
 
@@ -655,18 +637,6 @@ def _with_gripper(model: GraspClassifier) -> PosteriorClassifier:
             "this model knows no gripper that could be another one", hint="train a posterior classifier"
         )
     return model
-
-
-def _answer_or_unknown(rows: list[dict[str, Any]]) -> None:
-    """Add the cheaper answer to each row: its material, or that it is none of them."""
-    from thermogrip.classify.decisions.next_touch import name_or_unknown
-
-    keys = [key for key in rows[0] if _is_candidate(key)]
-    p = [[float("nan") if row[key] is None else row[key] for key in keys] for row in rows]
-    outside = [float("nan") if row["p_unknown"] is None else row["p_unknown"] for row in rows]
-    names = [key.removeprefix("p_") for key in keys]
-    for row, answer in zip(rows, name_or_unknown(p, outside, names)):
-        row["answer"] = str(answer)
 
 
 def check_place(out: Path, given: Sequence[str]) -> None:

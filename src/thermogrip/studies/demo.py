@@ -201,14 +201,13 @@ def _compare(
 
 
 def _touch(out: Path, classifier: GraspClassifier, touched: Sequence[Grasps]) -> Section:
-    from thermogrip.classify.decisions.predict import classify_grasps, reasons, write_predictions
+    from thermogrip.classify.decisions.predict import answer, write_predictions
 
-    rows = [row for grasps in touched for row in classify_grasps(classifier, grasps, CANDIDATES)]
+    rows = [found.row() for found in answer(classifier, list(touched), CANDIDATES)]
     if rows:
         write_predictions(rows, out / "predictions.csv")
     truth = [str(name) for grasps in touched for name in grasps["material"].values]
-    why = reasons(classifier, touched, rows) if rows else []
-    shown = [row | {"true": name, "why": words} for row, name, words in zip(rows, truth, why)]
+    shown = [row | {"true": name, "why": row.get("deviates", "")} for row, name in zip(rows, truth)]
     return touch_section(touched, shown, CANDIDATES)
 
 

@@ -13,16 +13,15 @@ import numpy as np
 import pytest
 
 from thermogrip.classify import (
+    answer,
     classify_grasps,
     make_classifier,
-    reasons,
     write_predictions,
 )
 from thermogrip.classify.decisions.next_touch import advise_touches
 from thermogrip.classify.decisions.predict import (
     deviation_words,
     deviations,
-    unexplained_answers,
     unexplained_effusivities,
 )
 from thermogrip.classify.decisions.stopping_rule import StopRule
@@ -62,7 +61,7 @@ def test_the_table_has_the_columns_of_its_contract(three: Grasps, tmp_path: Path
 
 def test_candidates_are_asked_for_by_name(three: Grasps) -> None:
     model = make_classifier("bayes").fit(three)
-    rows = classify_grasps(model, three, ["wood", "copper"])
+    rows = classify_grasps(model, three, ["wood", "copper"], nearest=True)
     assert {r["material"] for r in rows} == {"wood", "copper"}
     assert "p_iron" not in rows[0]
     with pytest.raises(UserError, match="named twice"):
@@ -231,7 +230,7 @@ def test_what_has_no_answer_asks_for_no_touch_and_has_no_reasons() -> None:
     grasps = still(load_example_grasps()["exp2_dT20"].isel(grasp=[0]), 0)
     model = fitted("posterior")
     assert advise_touches(model, grasps) == [{"next_touch_degC": None, "next_touch_accuracy": None}]
-    assert reasons(model, grasps, classify_grasps(model, grasps)) == [""]
+    assert [one.deviates for one in answer(model, grasps)] == [""]
 
 
 FIVE = ["brass", "copper", "iron", "wood", "zinc"]
@@ -289,22 +288,22 @@ def test_reasons_stand_beside_strange_grasps_alone(device: GripperModel) -> None
     known = files["exp1A_obj43_grip23"].isel(grasp=[0, 8, 16])
     cork = files["exp6_other_materials_obj43_grip23"]
     cork = cork.isel(grasp=cork["material"].values == "cork")
-    rows = classify_grasps(model, [known, cork], FIVE)
-    words = reasons(model, [known, cork], rows)
+    found = answer(model, [known, cork], FIVE)
+    words = [one.deviates for one in found]
     assert words[:3] == ["", "", ""]
     assert len(words) == 3 + cork.sizes["grasp"] > 3
     assert all(text.startswith("as wood it needs 0.3") and "effusivity" in text for text in words[3:])
-    usual = [row | {"p_unknown": p} for row, p in zip(rows[3:], (0.5, 0.51, None))]
-    assert [bool(text) for text in reasons(model, cork.isel(grasp=[0, 1, 2]), usual)] == [False, True, False]
+    assert [one.material for one in found[3:]] == ["unknown"] * (len(words) - 3)
+    assert {one.nearest for one in found[3:]} == {"wood"}
+    assert {one.material for one in answer(model, cork, FIVE, nearest=True)} == {"wood"}
     block = cork.assign(touch_group=("grasp", ["one"] * cork.sizes["grasp"]))
-    assert set(reasons(model, block, rows[3:])) == {""}  # its touches have no nominal temperature
+    assert {one.deviates for one in answer(model, block, FIVE)} == {""}  # no nominal temperature
 
 
 def test_a_classifier_without_physics_gives_no_reasons() -> None:
     record = load_example_grasps()["exp2_dT20"]
     model = make_classifier("features-lda").fit(record)
-    rows = classify_grasps(model, record)
-    assert set(reasons(model, record, rows)) == {""}
+    assert {(one.deviates, one.misfit_sd) for one in answer(model, record)} == {("", None)}
 
 
 @pytest.fixture
@@ -340,10 +339,10 @@ def test_a_stated_range_is_for_objects_of_unknown_temperature(cold: Grasps) -> N
 
 def test_what_the_model_does_not_explain_is_reported(known: PosteriorClassifier, cold: Grasps) -> None:
     def said(grasps: Grasps, stated: tuple[float, float] | None = None) -> list[str]:
-        rows = classify_grasps(known, with_object_range(grasps, stated))
-        found = unexplained_answers(known, grasps, rows, stated)
-        assert [row.sd > 4 for row in found] == ["is not explained by" in row.words for row in found]
-        return [row.words for row in found]
+        found = answer(known, grasps, object_range=stated)
+        words = ["; ".join(n.words for n in one.notes if n.code == "not_explained") for one in found]
+        assert [one.misfit_sd > 4 for one in found] == ["is not explained by" in text for text in words]
+        return words
 
     assert said(load_example_grasps()["exp3C_obj18_grip38"]) == [""] * 24
     assert said(cold) == said(cold, (10.0, 26.0)) == [""] * 3
@@ -358,13 +357,12 @@ def test_what_the_model_does_not_explain_is_reported(known: PosteriorClassifier,
 def test_a_grasp_that_cannot_be_read_leaves_the_others_explained(known: PosteriorClassifier, cold: Grasps):
     after = cold["time"] > 0.0
     lost = cold.assign(t_surface=cold["t_surface"].where(~after | (cold["grasp"] != cold["grasp"][0]), 30.0))
-    rows = classify_grasps(known, lost)
-    assert [bool(row["material"]) for row in rows] == [False, True, True]
-    found = unexplained_answers(known, lost, rows)
-    assert [row.words for row in found] == reasons(known, lost, rows) == [""] * 3
-    assert [bool(np.isfinite(row.sd)) for row in found] == [False, True, True]
-    [whitened] = deviations(known.device_, touches(pick(lost, [1])), [rows[1]["material"]])
-    assert found[1].sd == pytest.approx(next(d.sd for d in whitened if "times its noise" in d.words))
+    found = answer(known, lost)
+    assert [bool(one.material) for one in found] == [False, True, True]
+    assert [one.deviates for one in found] == [""] * 3
+    assert [one.misfit_sd is None for one in found] == [True, False, False]
+    [whitened] = deviations(known.device_, touches(pick(lost, [1])), [found[1].material])
+    assert found[1].misfit_sd == pytest.approx(next(d.sd for d in whitened if "times its noise" in d.words))
 
 
 def test_a_stated_range_narrows_effusivities_and_one_that_is_wrong_is_reported(

@@ -299,7 +299,7 @@ def test_a_rule_out_of_range_is_refused_by_its_file(wrong: dict[str, object], tm
 
 
 def test_predictions_say_when_each_contact_was_decided(known: PosteriorClassifier, fresh: Grasps) -> None:
-    rows = classify_grasps(known, fresh, THREE, rule=StopRule(sure=0.95, gain=0.005))
+    rows = classify_grasps(known, fresh, THREE, rule=StopRule(sure=0.97, gain=0.005))
     right = [row["material"] == m for row, m in zip(rows, fresh["material"].values)]
     assert np.mean(right) >= 8 / 9
     times = np.array([row["decided_at_s"] for row in rows])
@@ -349,7 +349,7 @@ def test_one_callback_serves_grasp_after_grasp_and_tells_what_it_finds(
         assert [at for at, _ in told] == time[time < 3.0].tolist()
 
 
-@pytest.mark.parametrize("late", [0.0, 0.6])
+@pytest.mark.parametrize("late", [0.0, 0.3])
 def test_a_record_ends_when_its_stream_did_also_where_the_contact_is_late(
     late: float, known: PosteriorClassifier, fresh: Grasps
 ) -> None:
