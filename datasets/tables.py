@@ -1,8 +1,8 @@
 """Tables of numbers on disk: text (plain, gzip or xz), Parquet, MATLAB, Excel, read without running code.
 
-Reading is fast first and exact afterwards: the whole file is parsed at once, and only if that fails is it
-read line by line to name the row and the column of the bad cell.  A last line that was cut off (a logger
-that lost power) is dropped and noted; any other ragged line is refused.
+The whole file is parsed at once; only where a row or a cell does not fit is it read line by line, to name
+them.  A last line that was cut off (a logger that lost power) is dropped and noted; any other ragged line is
+refused.
 
 :func:`read_csv_table` reads what thermogrip writes.  :func:`read_text_table` reads what any logger writes:
 the separator is the one of comma, semicolon, tab, bar and blanks that makes the first lines rows of equal
@@ -379,39 +379,29 @@ def _labelled(line: str) -> dict[str, str]:
 def _parse_table(
     data: bytes, layout: Layout, file: str, words: frozenset[str] = frozenset(), broken: float = _MOST_BROKEN
 ) -> Table:
-    """Return the table in a text, first as it should be, else cell by cell.
+    """Return the table in a text: columns of numbers as they are, others cell by cell.
 
     ``words`` are columns to leave as text; up to a share ``broken`` of the rows, and twice as many cells of a
     column, may be left out.  All that is wrong beyond that is named in one error.
     """
     names, separator, skip = layout.names, layout.separator, layout.skip
-    types = {name: "text" if name in words else "number" for name in names}
-    body, table, notes = _parse_as_written(data, skip, separator, types)
+    body, notes = _drop_cut_line(data, len(names), separator)
     faults: list[UserError] = []
     odd: list[int] = []
-    if table is None:
-        counts: list[int] = []
-
-        try:
-            body.decode("utf-8")
-        except UnicodeDecodeError as error:  # Arrow writes a traceback for a row that it cannot hand over
-            row = body.count(b"\n", 0, error.start) + 1
-            hint = "save the file as UTF-8"
-            raise UserError("is not UTF-8 text", file=file, row=row, hint=hint) from error
-
-        def leave_out(row: Any) -> str:
-            counts.append(row.actual_columns)
-            return "skip"
-
-        table = _parse(body, skip, separator, dict.fromkeys(names, "text"), ".", leave_out)
-        if counts or table is None:
-            odd = [at for at, cells in _rows(body, skip, separator, file) if len(cells) != len(names)]
-        if odd and len(odd) > broken * (len(odd) + (table.num_rows if table is not None else 0)):
-            more = f"; {len(odd) - 1} more rows do not fit" if len(odd) > 1 else ""
-            problem = f"has {counts[0] if counts else 0} cell(s), the header has {len(names)}{more}"
-            faults.append(UserError(problem, file=file, row=odd[0], hint="complete or remove the row"))
-        elif odd:
-            notes += (f"{len(odd)} row(s) with too few or too many cells left out ({name_rows(odd, 5)})",)
+    try:
+        body.decode("utf-8")
+    except UnicodeDecodeError as error:  # Arrow writes a traceback for a row that it cannot hand over
+        row = body.count(b"\n", 0, error.start) + 1
+        raise UserError("is not UTF-8 text", file=file, row=row, hint="save the file as UTF-8") from error
+    table, counts = _parse(body, skip, separator, names)
+    if counts or table is None:
+        odd = [at for at, cells in _rows(body, skip, separator, file) if len(cells) != len(names)]
+    if odd and len(odd) > broken * (len(odd) + (table.num_rows if table is not None else 0)):
+        more = f"; {len(odd) - 1} more rows do not fit" if len(odd) > 1 else ""
+        problem = f"has {counts[0] if counts else 0} cell(s), the header has {len(names)}{more}"
+        faults.append(UserError(problem, file=file, row=odd[0], hint="complete or remove the row"))
+    elif odd:
+        notes += (f"{len(odd)} row(s) with too few or too many cells left out ({name_rows(odd, 5)})",)
     if table is None:
         # Arrow refuses a header whose line has no end as well
         bare = next(_rows(body, skip, separator, file), None) is None
@@ -431,8 +421,8 @@ def _parse_table(
         column = table.column(name)
         if name in words:
             text[name] = [from_csv(cell.strip()) for cell in column.to_pylist()]
-        elif str(column.type) != "string":
-            numbers[name] = _to_float(column)
+        elif (values := _plain_numbers(column)) is not None:
+            numbers[name] = values
         elif not name.startswith(_LEFT_OUT):
             notes += _read_cells(name, column, (numbers, text, faults), lines, separator, broken, file)
     if faults:
@@ -701,18 +691,9 @@ def _decode(metadata: dict[bytes, bytes] | None) -> dict[str, str]:
     return {k.decode(errors="replace"): v.decode(errors="replace") for k, v in (metadata or {}).items()}
 
 
-def _to_float(chunked: Any) -> NDArray[np.float64]:
-    """Return a column of float, NaN where it is null, by its buffers: pyarrow's own way imports pandas."""
-    parts = [np.empty(0)]
-    for chunk in chunked.chunks:
-        present, data = chunk.buffers()
-        n, first = len(chunk), chunk.offset
-        values = np.frombuffer(data, dtype=float, count=n, offset=8 * first).copy() if n else np.empty(0)
-        if chunk.null_count:
-            bits = np.unpackbits(np.frombuffer(present, dtype=np.uint8), bitorder="little")
-            values[bits[first : first + n] == 0] = np.nan
-        parts.append(values)
-    return np.concatenate(parts)
+def _to_float(column: Any) -> NDArray[np.float64]:
+    """Return a column of float, NaN where it is null."""
+    return np.array(column.fill_null(np.nan).to_numpy(), dtype=float)
 
 
 def check_table(path: str | Path, *, log: bool = False, labels: bool = False) -> None:
@@ -804,51 +785,44 @@ def _header(data: bytes, file: str) -> tuple[list[str], int, str]:
     return header, skip, separator
 
 
-def _parse_as_written(
-    data: bytes, skip: int, separator: str, types: dict[str, str]
-) -> tuple[bytes, Any, tuple[str, ...]]:
-    """Return the bytes, their pyarrow table or None, and what had to be allowed for to get one."""
-    tries: list[tuple[bytes, tuple[str, ...]]] = [(data, ())]
-    cut, lost = _drop_cut_line(data, len(types), separator)
-    tries += [(cut, lost)] if lost else []
-    for body, dropped in tries:
-        for decimal in "." if separator == "," else ".,":
-            table = _parse(body, skip, separator, types, decimal)
-            if table is not None:
-                commas = () if decimal == "." else ("numbers have a decimal comma",)
-                return body, table, (*dropped, *commas)
-    return cut, None, lost
-
-
-def _parse(
-    data: bytes,
-    skip: int,
-    separator: str,
-    types: dict[str, str],
-    decimal: str,
-    left_out: Callable[[Any], str] | None = None,
-) -> Any:
-    """Return the pyarrow table, or None where a cell does not fit, or a row, unless ``left_out`` takes it."""
+def _parse(data: bytes, skip: int, separator: str, names: Sequence[str]) -> tuple[Any, list[int]]:
+    """Return the columns of text as a pyarrow table, None where they are none, and the number of cells of
+    each row that has too few or too many."""
     import pyarrow as pa
     import pyarrow.csv as arrow_csv
 
+    counts: list[int] = []
+
+    def leave_out(row: Any) -> str:
+        counts.append(row.actual_columns)
+        return "skip"
+
     block = min(len(data) + 1, 1 << 30)
     try:
-        return arrow_csv.read_csv(
+        table = arrow_csv.read_csv(
             pa.BufferReader(data),
             read_options=arrow_csv.ReadOptions(
-                use_threads=False, skip_rows=skip, column_names=list(types), block_size=block
+                use_threads=False, skip_rows=skip, column_names=list(names), block_size=block
             ),
-            parse_options=arrow_csv.ParseOptions(delimiter=separator, invalid_row_handler=left_out),
+            parse_options=arrow_csv.ParseOptions(delimiter=separator, invalid_row_handler=leave_out),
             convert_options=arrow_csv.ConvertOptions(
-                column_types={
-                    n: pa.string() if kind == "text" else pa.float64() for n, kind in types.items()
-                },
-                null_values=_NULLS,
-                strings_can_be_null=False,
-                decimal_point=decimal,
+                column_types=dict.fromkeys(names, pa.string()), strings_can_be_null=False
             ),
         )
+    except pa.ArrowInvalid:
+        return None, counts
+    return table, counts
+
+
+def _plain_numbers(column: Any) -> NDArray[np.float64] | None:
+    """Return the numbers of a column of text that has nothing else, NaN where a cell is empty, or None."""
+    import pyarrow as pa
+    import pyarrow.compute as compute
+
+    cells = compute.utf8_trim_whitespace(column)
+    empty = compute.is_in(cells, value_set=pa.array(_NULLS))
+    try:
+        return _to_float(compute.if_else(empty, pa.scalar(None, pa.string()), cells).cast(pa.float64()))
     except pa.ArrowInvalid:
         return None
 
