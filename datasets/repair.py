@@ -25,7 +25,7 @@ A reading that repeats itself bit by bit while the inputs move is **stuck**, and
 moves of the inputs, in ranges, of the whole log, m those within the run that has most of them and k those
 within all other runs but for the first of each (a row's reading is from before its move), a sound reading
 stays through a move with a chance of about p = (k + 1) / (M - m + 2) (Laplace's rule); the run is stuck
-where p^(m - 1) is below 1e-4.
+where p^(m - 1) is below 1e-3.
 
 All of these become NaN, as lost samples are: an output is never filled.  A lost input is held from the last
 row, since that is what an actuator does; a lost disturbance is interpolated.
@@ -54,7 +54,7 @@ SENSOR_CODES = {
     **dict.fromkeys((999.9, 999.0, 9999.0, -999.0, -9999.0), "a logger's mark of a lost value"),
     **dict.fromkeys((3276.7, -3276.8, 32767.0, -32768.0, 6553.5, 65535.0), "the end of a 16-bit number"),
 }
-_CODE_JUMP, _STUCK_CHANCE = 5.0, 1e-4  # see the module's text
+_CODE_JUMP, _STUCK_CHANCE = 5.0, 1e-3  # see the module's text
 SPIKE_FLOOR_K = 0.6
 SPIKE_WINDOW = 21
 SPIKE_LENGTH = 3

@@ -363,10 +363,12 @@ def _is_moved(columns: Mapping[str, Floats], name: str, drives: Sequence[str]) -
     """Tell whether the past of a drive helps to predict a column, row by row or in means over many rows, as
     long as the column is not stuck."""
     known = np.isfinite(drop_stuck(name, columns[name], [columns[n] for n in drives])[0])
+    if known.sum() < _FEW:
+        return True  # nothing of it speaks against
     some = [columns[n][known] for n in (name, *drives)]
     for length in {1, max(1, some[0][:_MOST_ROWS].size // _MEANS)}:
         means = [_means(values, length) for values in _scaled(some)]
-        if any(_gain(means[0], drive, (), lags) > 0 for drive in means[1:] for lags in _LAGS):
+        if any(_gain(means[0], drive, (), lags) > _STRONG for drive in means[1:] for lags in _LAGS):
             return True
     return False
 
