@@ -691,7 +691,7 @@ CASES: tuple[Callable[[Rng], Case], ...] = (
 
 def plain(name: str) -> str:
     """Reduce a heading to letters and digits without its unit, as `identify` names columns."""
-    bare = re.sub(r"(_percent|_degC|_degF|_Wh|_celsius|\s*[(\[][^)\]]*[)\]])$", "", name)
+    bare = re.sub(r"(_percent|_degC|_degF|_Wh|_A|_celsius|\s*[(\[][^)\]]*[)\]])$", "", name)
     return re.sub(r"[\W_]+", "", bare.lower())
 
 
